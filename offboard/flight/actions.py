@@ -21,7 +21,9 @@ SPOOL_UP_PER_S = 0.7  # thrust ramp before lift-off, in units of gravity
 SPOOL_MAX = 2.0
 SPOOL_UNSEEN = 0.9  # without a new position nothing must lift off, or climb
 SPOOL_KNOWN_S = 0.2  # age of a position that shows the height
-TAKEOFF_HEIGHT_M = 3.0  # of an autopilot's own take-off, which setpoints replace on the way
+# Of an autopilot's own take-off, which setpoints replace on the way: the height of the reference,
+# but above the height that shows lift-off, and no higher than needed
+TAKEOFF_HEIGHTS_M = 1.5, 3.0
 LAND_STREAM_S = 3.0  # if the landing is refused, setpoints stop and the autopilot's failsafe lands
 
 
@@ -212,7 +214,9 @@ def _request_takeoff(flight: FlightState, time_s: float) -> None:
 
     The autopilot's thrust is close to hover thrust; the observer needs it for the take-over.
     """
-    outbox.request(flight, _dialect(flight).take_off(TAKEOFF_HEIGHT_M))
+    least_m, most_m = TAKEOFF_HEIGHTS_M
+    height_m = -float(flight.plan.track.sample(0.0).position_ned_m[2])
+    outbox.request(flight, _dialect(flight).take_off(min(max(height_m, least_m), most_m)))
     gravity_mps2 = flight.model.gravity_mps2
     heading_rad = flight.vehicle.heading_rad
     setpoint.set_command(flight, time_s, Command(gravity_mps2, LEVEL, heading_rad))

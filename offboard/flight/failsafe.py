@@ -104,10 +104,13 @@ def away_from_prediction(flight: FlightState) -> str:
     return ""
 
 
-def estimate_jumps(flight: FlightState) -> str:
-    jumped_m = flight.jumps.recent_m(flight.time_s)
-    exceeds = jumped_m > flight.limits.position_jump_m
-    return f"the estimated position jumped by {jumped_m:.1f} m" if exceeds else ""
+def estimate_contradicts(flight: FlightState) -> str:
+    jumped_m, drift_m = flight.jumps.recent_m(flight.time_s), flight.jumps.drift_m
+    if jumped_m > flight.limits.position_jump_m:
+        return f"the estimated position jumped by {jumped_m:.1f} m"
+    if drift_m > flight.limits.position_jump_m:
+        return f"reported position and velocity differ by {drift_m:.1f} m in a second"
+    return ""
 
 
 def positioning_lost(flight: FlightState) -> str:
@@ -284,9 +287,10 @@ ROWS = (
     ),
     Row(
         "estimator",
-        "jumps of the reported position in the last 10 s",
+        "jumps of the reported position in the last 10 s, or what it differs by from the "
+        "reported velocity in one second",
         "limits.position_jump_m",
-        estimate_jumps,
+        estimate_contradicts,
         HOLD,
         cause="",
     ),

@@ -154,7 +154,7 @@ class Limits(Parameters):
     position_error_m: float = Field(default=5.0, gt=0.1, le=100)
     gps_s: float = Field(default=1.0, ge=0.5, le=600)  # without the fix of the take-off
     accuracy_m: float = Field(default=3.0, gt=0.5, le=100)  # of the position, as the vehicle says
-    position_jump_m: float = Field(default=2.0, gt=0.3, le=100)  # resets of the estimator in 10 s
+    position_jump_m: float = Field(default=2.0, gt=0.3, le=100)  # of the estimate, in 10 s
     prediction_error_m: float = Field(default=2.0, gt=0.1, le=100)  # of the decision before
     hover_thrust: float = Field(default=0.9, gt=0.05, le=1)  # normalised thrust that hovers
     tilt_rad: float = Field(default=1.3, gt=0.2, le=1.5)

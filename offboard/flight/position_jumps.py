@@ -1,7 +1,8 @@
-"""Jumps of the reported position: resets of the vehicle's estimator.
+"""Jumps of the reported position, which are resets of the vehicle's estimator, and its drift: a
+position that moves otherwise than the reported velocity.
 
-No message is needed for them (ODOMETRY.reset_counter: PX4 only): two positions some milliseconds
-apart that no motion joins show a jump, on any autopilot.
+No message is needed for jumps (ODOMETRY.reset_counter: PX4 only): two positions some milliseconds
+apart that no motion joins show one, on any autopilot.
 """
 
 from __future__ import annotations
@@ -23,16 +24,24 @@ LONGEST_GAP_S = 0.5  # after a longer one nothing is concluded
 RECENT_S = 10.0
 NOISES = 6.0  # times the mean difference of successive positions; less is no jump, but noise
 NOISE_SHARE = 0.01  # of the newest difference in this mean
+DRIFT_S = 1.0  # time constant; real PX4 drifts by 0.7 m at most, without a fix by 14 m
 
 
 class PositionJumps:
-    """Finds the jumps between successive positions. `total_ned_m` (3,) is the sum of all."""
+    """Finds the jumps between successive positions. `total_ned_m` (3,) is the sum of all.
+    `drift_m`: by how much positions, without the jumps, and velocities of the last second
+    contradict each other."""
 
     def __init__(self) -> None:
         self._newest: LocalPosition | None = None
         self._jumps: deque[tuple[float, float]] = deque()  # when, by how many metres
         self._noise_m = 0.0  # mean distance between a position and what the one before leads to
         self.total_ned_m: Array = np.zeros(3)
+        self._drift_ned_m = (0.0, 0.0, 0.0)
+
+    @property
+    def drift_m(self) -> float:
+        return math.hypot(*self._drift_ned_m)
 
     def on_position(self, position: LocalPosition) -> Array | None:
         """The jump (3,) from the position before to this one, NED in m; None without one."""
@@ -54,6 +63,11 @@ class PositionJumps:
         least_m += 0.5 * ACCELERATION_MPS2 * passed_s**2
         self._noise_m += NOISE_SHARE * (min(size_m, least_m) - self._noise_m)
         if size_m <= least_m:
+            kept = 1.0 - passed_s / DRIFT_S
+            north, east, down = (
+                kept * drift + new for drift, new in zip(self._drift_ned_m, jump_m, strict=True)
+            )
+            self._drift_ned_m = north, east, down
             return None
         self._jumps.append((position.time_s, size_m))
         jump = np.array(jump_m)

@@ -13,10 +13,11 @@ from enum import IntEnum
 from functools import partial
 
 from offboard.flight.phases import Limits
-from offboard.flight.vehicle_state import VehicleState
+from offboard.flight.vehicle_state import ARMED_KNOWN_S, VehicleState
 from offboard.identification.uncertainty import Estimate
 from offboard.mavlink import senders
 from offboard.mavlink.dialects.base import Dialect, Takeoff, WatchedParameter
+from offboard.mavlink.events import Heartbeat
 from offboard.mavlink.outgoing import ParamRead
 
 TELEMETRY = ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED")
@@ -25,6 +26,7 @@ FIX_3D = 3  # GPS_FIX_TYPE; also stands for better ones
 STARTING_S = 90.0  # of vehicle time: ArduCopter uses a GPS 30 s after its first 3D fix
 REPEAT_S = 0.5  # between two requests for a parameter
 REPLY_TIMEOUT_S = 2.0  # for parameters
+UNANSWERED_S = 3.0  # requests of TIMESYNC, ten a second
 
 
 class Level(IntEnum):
@@ -63,6 +65,7 @@ class Ground:
     rates_hz: Mapping[str, float] | None = field(default_factory=dict)  # None: were not requested
     delay: Estimate | None = None  # of telemetry and setpoint together, s
     measures_delay: bool = False  # replies are still awaited
+    unanswered_s: float = 0.0  # since the newest request of TIMESYNC that was answered
     reads_parameters: bool = False  # replies are still awaited
     systems: str = ""  # of several vehicles, none of which was chosen
     other_sender: bool = False  # another program controls it
@@ -174,6 +177,8 @@ def _no_telemetry(ground: Ground) -> str:
     vehicle, dialect = ground.vehicle, ground.dialect
     newest = {"LOCAL_POSITION_NED": vehicle.position, "ATTITUDE_QUATERNION": vehicle.attitude}
     missing = [name for name, value in newest.items() if value is None]
+    if vehicle.heartbeat is not None and vehicle.age_s(Heartbeat) > ARMED_KNOWN_S:
+        missing.append("HEARTBEAT")
     if not missing:
         return ""
     problem = vehicle.estimator.problem if vehicle.estimator else ""
@@ -201,9 +206,8 @@ def _slow(ground: Ground) -> str:
 
 
 def _may_fly(ground: Ground) -> str:
-    unknown = ground.vehicle.armed and ground.vehicle.landed == "unknown"
-    sentence = "it is armed and does not report whether it flies (EXTENDED_SYS_STATE)"
-    return sentence if unknown else ""
+    unknown = ground.vehicle.landed == "unknown"
+    return "it does not report whether it flies (EXTENDED_SYS_STATE)" if unknown else ""
 
 
 def _reading(ground: Ground) -> str:
@@ -265,8 +269,17 @@ def _empty_battery(ground: Ground) -> str:
     return f"its battery has {charge:.0%} left, limits.battery is {least:.0%}"
 
 
+def unanswered(for_s: float) -> str:
+    """What it may mean that no TIMESYNC was answered for so long; empty if nothing."""
+    if for_s < UNANSWERED_S:
+        return ""
+    return f"TIMESYNC is not answered for {for_s:.0f} s: does the vehicle receive what is sent?"
+
+
 def _measuring(ground: Ground) -> str:
-    return "the delay of the link is being measured" if ground.measures_delay else ""
+    if not ground.measures_delay:
+        return ""
+    return unanswered(ground.unanswered_s) or "the delay of the link is being measured"
 
 
 def _late(ground: Ground) -> str:

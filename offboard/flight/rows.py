@@ -62,7 +62,7 @@ def blind(flight: FlightState) -> str:
         (vehicle.attitude_age_s, "ATTITUDE_QUATERNION"),
         key=lambda each: each[0],
     )
-    return f"no {name} for {age_s:.1f} s" if age_s > flight.limits.blind_s else ""
+    return f"no new {name} for {age_s:.1f} s" if age_s > flight.limits.blind_s else ""
 
 
 def mode_unknown(flight: FlightState) -> str:

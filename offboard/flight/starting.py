@@ -9,7 +9,6 @@ from offboard.flight.rows import (
     Transition,
     blind,
     engaged_in_the_air,
-    longer_than,
     lost,
     lost_armed,
     lost_disarmed,
@@ -21,6 +20,7 @@ from offboard.flight.rows import (
     stop_requested,
 )
 from offboard.flight.state import FlightState
+from offboard.flight.vehicle_state import ARMED_KNOWN_S
 from offboard.mavlink.events import Heartbeat
 
 ARM_DISARM = 400  # MAV_CMD_COMPONENT_ARM_DISARM
@@ -73,6 +73,7 @@ def ground_of(flight: FlightState) -> Ground:
         rates_hz=flight.session.rates_hz,
         delay=flight.clock.delay,
         measures_delay=not flight.clock.delay_is_measured(flight.host_s),
+        unanswered_s=flight.clock.unanswered_s(flight.host_s),
         reads_parameters=not read,
         systems=senders.named(flight.now_s) if senders.ambiguous(flight.now_s) else "",
         other_sender=bool(other_sender(flight)),
@@ -174,9 +175,10 @@ def not_engaged(flight: FlightState) -> str:
     if flight.in_phase_s <= flight.limits.engage_s:
         return ""
     wanted = flight.authority.engage_mode if flight.authority else "offboard mode"
+    unanswered = preflight.unanswered(flight.clock.unanswered_s(flight.host_s))
     return (
         f"the vehicle did not enter {wanted} in {flight.in_phase_s:.0f} s "
-        f"(it shows {flight.vehicle.mode})"
+        f"(it shows {flight.vehicle.mode})" + (unanswered and f"; {unanswered}")
     )
 
 
@@ -207,7 +209,24 @@ def rises(flight: FlightState) -> bool:
 
 
 def disarmed_for_good(flight: FlightState) -> bool:
-    return not flight.vehicle.armed and flight.in_phase_s > DISARMED_SHOWN_S
+    return flight.vehicle.disarmed and flight.in_phase_s > DISARMED_SHOWN_S
+
+
+def not_armed(flight: FlightState) -> str:
+    waited_s, silent_s = flight.in_phase_s, flight.vehicle.age_s(Heartbeat)
+    if waited_s <= flight.limits.arm_s:
+        return ""
+    if silent_s > ARMED_KNOWN_S:
+        return f"no HEARTBEAT for {silent_s:.0f} s: it is not known whether the vehicle has armed"
+    return f"the vehicle did not arm in {waited_s:.0f} s"
+
+
+def not_disarmed(flight: FlightState) -> str:
+    if flight.in_phase_s <= flight.limits.disarm_s:
+        return ""
+    unheard = flight.vehicle.age_s(Heartbeat) > ARMED_KNOWN_S
+    state = "no HEARTBEAT shows whether it is armed" if unheard else "still armed"
+    return f"{state} after {flight.in_phase_s:.0f} s"
 
 
 # ---------------------------------------------------------------------- rows
@@ -309,13 +328,7 @@ def starting(before: tuple[Phase, ...]) -> tuple[Transition, ...]:
             REFUSED,
             reason="the vehicle was disarmed just after it had armed",
         ),
-        Transition(
-            ARM,
-            longer_than("arm_s"),
-            Phase.STAND_DOWN,
-            REFUSED,
-            reason="the vehicle did not arm in {flight.in_phase_s:.0f} s",
-        ),
+        Transition(ARM, not_armed, Phase.STAND_DOWN, REFUSED),
         Transition(
             (Phase.TAKEOFF,),
             stop_requested_on_ground,
@@ -330,11 +343,5 @@ def starting(before: tuple[Phase, ...]) -> tuple[Transition, ...]:
         Transition(STAND_DOWN, rebooted, FAILED, REFUSED, "restart"),
         Transition(STAND_DOWN, silent_for_long, FAILED, REFUSED, "link"),
         Transition(STAND_DOWN, disarmed_for_good, FAILED, reason="disarmed on the ground"),
-        Transition(
-            STAND_DOWN,
-            longer_than("disarm_s"),
-            FAILED,
-            ABORTED,
-            reason="still armed after {flight.in_phase_s:.0f} s",
-        ),
+        Transition(STAND_DOWN, not_disarmed, FAILED, ABORTED),
     )

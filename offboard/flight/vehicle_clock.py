@@ -69,6 +69,7 @@ class VehicleClock:
         self._requests.clear()
         self._delays_s: deque[float] = deque(maxlen=REPLIES_MAX)
         self._began_s = math.inf  # host time of the first request
+        self._answered_s = -math.inf  # host time of the newest request with a reply
         self._settled_delay_s = math.nan
 
     def settle(self) -> None:
@@ -109,6 +110,7 @@ class VehicleClock:
         if asked is None:
             return False
         self._requests.remove(asked)  # a duplicate must not count again
+        self._answered_s = max(self._answered_s, asked[1])
         delay_s = (reply.vehicle_ns - reply.request_ns) * 1e-9
         if 0.0 <= delay_s <= DELAY_MAX_S:
             self._delays_s.append(delay_s)
@@ -156,6 +158,10 @@ class VehicleClock:
         """Whether `delay` is reliable at host time `host_s`, or the vehicle answers nothing."""
         unanswered = not self._delays_s and host_s - self._began_s > DELAY_MAX_S
         return len(self._delays_s) >= REPLIES_MEASURED or unanswered
+
+    def unanswered_s(self, host_s: float) -> float:
+        """For how long at host time `host_s` no request has been answered; 0 before the first."""
+        return max(host_s - max(self._began_s, self._answered_s), 0.0)
 
     @property
     def delay_growth_s(self) -> float:

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from enum import Enum, auto
 
-# Stamps older than the newest by more than _REBOOT_S are late, unless they go on so: so many in a
-# row, over so long, each within _GAP_S of the one before, are a new epoch
+# Stamps older than the newest by more than _REBOOT_S are late, and those ahead of it by more than
+# _NEAR_S are wrong, unless they go on so: so many in a row, over so long, each within _GAP_S of
+# the one before, are a new epoch
 _REBOOT_S = 2.0
 _EPOCH_STAMPS, _EPOCH_S, _GAP_S = 3, 0.1, 10.0
 SILENCE_S = 1.0
 _WRAP_S = 2**32 / 1e3
-_NEAR_S = 600.0  # a stamp this close to the newest, but for the wrap, continues it
+_NEAR_S = 600.0  # a stamp this close to the newest, also but for the wrap, continues it
 
 
 class Age(Enum):
@@ -28,7 +29,8 @@ class Age(Enum):
 
 class VehicleTime:
     """Checks time stamps: those of one message id must increase. One that is far behind the newest
-    is late; a reboot is several of them in a row that go on from each other.
+    is late, one far ahead is wrong; several of them in a row that go on from each other are a new
+    epoch, a reboot if it is behind.
 
     `newest_s` is the newest stamp of any message. `seconds` are monotonic and follow vehicle time,
     or host time while telemetry is missing.
@@ -47,7 +49,7 @@ class VehicleTime:
         self.newest_s = 0.0
         self.seconds = 0.0
         self._last_s: dict[int, float] = {}
-        self._older: list[tuple[int, float]] = []  # far behind the newest, in a row: id and stamp
+        self._other: list[tuple[int, float]] = []  # of another epoch, in a row: id and stamp
         self._counted_s: float | None = None  # the newest stamp that `seconds` has followed
         self._received_s: float | None = None
         self._host_s: float | None = None
@@ -70,27 +72,29 @@ class VehicleTime:
     def check(self, message_id: int, time_s: float) -> Age:
         """`time_s`: the stamp, continued by `wrapped_s`."""
         last_s = self._last_s.get(message_id)
-        if time_s < self.newest_s - _REBOOT_S:
+        ahead_s = time_s - self.newest_s
+        if self._last_s and not -_REBOOT_S <= ahead_s <= _NEAR_S:
             stuck = time_s == last_s
-            return Age.STALE if stuck else self._check_older(message_id, time_s)
-        self._older.clear()
+            return Age.STALE if stuck else self._check_epoch(message_id, time_s)
+        self._other.clear()
         if last_s is not None and time_s <= last_s:
             return Age.STALE
         self._last_s[message_id] = time_s
         self.newest_s = max(self.newest_s, time_s)
         return Age.FRESH
 
-    def _check_older(self, message_id: int, time_s: float) -> Age:
-        repeated = any(each == message_id and time_s <= at_s for each, at_s in self._older)
-        if repeated or (self._older and abs(time_s - self._older[-1][1]) > _GAP_S):
-            self._older.clear()
-        self._older.append((message_id, time_s))
-        if len(self._older) < _EPOCH_STAMPS or time_s - self._older[0][1] < _EPOCH_S:
+    def _check_epoch(self, message_id: int, time_s: float) -> Age:
+        repeated = any(each == message_id and time_s <= at_s for each, at_s in self._other)
+        if repeated or (self._other and abs(time_s - self._other[-1][1]) > _GAP_S):
+            self._other.clear()
+        self._other.append((message_id, time_s))
+        if len(self._other) < _EPOCH_STAMPS or time_s - self._other[0][1] < _EPOCH_S:
             return Age.STALE
-        self._last_s = dict(self._older)
+        rebooted = time_s < self.newest_s
+        self._last_s = dict(self._other)
         self.newest_s = max(self._last_s.values())
-        self._older.clear()
-        return Age.REBOOTED
+        self._other.clear()
+        return Age.REBOOTED if rebooted else Age.FRESH
 
     # --- seconds ---
 

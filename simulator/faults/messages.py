@@ -16,6 +16,7 @@ from simulator.faults.base import (
     until_the_end,
 )
 from simulator.link.impairment import Impairment
+from simulator.mavlink.codec import fields_of
 from simulator.mavlink.view import Stuck
 
 
@@ -56,14 +57,26 @@ class SilentMessage(Timed):
 
 
 class StuckMessage(Timed):
-    """A message that repeats its content; with `stamp_runs` its time stamp increases."""
+    """A message that repeats its content, or only some of its `fields`; with `stamp_runs` its time
+    stamp increases."""
 
     fault: Literal["stuck_message"]
     message: MessageName
+    fields: tuple[str, ...] = ()
     stamp_runs: bool = True
 
+    @model_validator(mode="after")
+    def _has_fields(self) -> StuckMessage:
+        known = fields_of(self.message)
+        if unknown := [each for each in self.fields if each not in known]:
+            raise ValueError(f"{self.message} has no field {unknown[0]}; it has {', '.join(known)}")
+        return self
+
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
-        vehicle.view.stuck[self.message] = Stuck(self.stamp_runs)
+        known = fields_of(self.message)
+        # the first field of telemetry is its time stamp
+        stuck = self.fields or known[1 if self.stamp_runs else 0 :]
+        vehicle.view.stuck[self.message] = Stuck([known.index(each) for each in stuck])
         yield from until_the_end()
         vehicle.view.stuck.pop(self.message, None)
 

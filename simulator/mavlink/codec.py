@@ -51,6 +51,12 @@ def name_of(message_id: int) -> str | None:
     return None if message is None else message.msgname
 
 
+def fields_of(name: str) -> list[str]:
+    """The fields of the message called `name`, in the order of the XML."""
+    message = dialect.mavlink_map[getattr(dialect, f"MAVLINK_MSG_ID_{name}")]
+    return list(message.fieldnames)
+
+
 def message_of(name: str, values: Sequence[object]) -> Any:
     """pymavlink's message; `values` in the field order of the XML, extensions may be left out.
 

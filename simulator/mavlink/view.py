@@ -19,15 +19,14 @@ _GPS, _PREARM = 0x20, 0x10000000  # MAV_SYS_STATUS_SENSOR
 
 @dataclass(slots=True)
 class Stuck:
-    """A message that repeats its content; its first field, the time stamp, may increase."""
+    """A message whose fields with these `indices` keep their values."""
 
-    stamp_runs: bool
-    values: Sequence[Any] | None = None
+    indices: Sequence[int]
+    kept: Sequence[Any] | None = None
 
     def instead_of(self, values: Sequence[Any]) -> Sequence[Any]:
-        if self.values is None:
-            self.values = values
-        return (values[0], *self.values[1:]) if self.stamp_runs else self.values
+        kept = self.kept = self.kept or values
+        return [kept[at] if at in self.indices else value for at, value in enumerate(values)]
 
 
 @dataclass(slots=True)

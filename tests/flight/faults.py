@@ -18,6 +18,7 @@ from simulator.firmware.values import Result, Severity, StatusText
 from simulator.instance import Instance
 
 HEARTBEAT, ATTITUDE, POSITION, PARAM_VALUE, TIMESYNC, TARGET = 0, 31, 32, 22, 111, 83
+EXTENDED_SYS_STATE = 245
 Action = Callable[[Pair], None]
 
 

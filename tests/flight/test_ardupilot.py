@@ -24,7 +24,7 @@ def test_guided_armed_takeoff_and_then_setpoints() -> None:
     asked = [(m.param1, m.param2) for m in pair.commands(SET_MODE)]
     assert set(asked) == {(1.0, GUIDED)}
     (takeoff,) = pair.commands(TAKEOFF)  # once: it was accepted
-    assert takeoff.param7 == pytest.approx(3.0)
+    assert takeoff.param7 == pytest.approx(1.5)  # the height of the reference
     assert all(phase in TRACKING | {Phase.LAND} for _, phase, _ in pair.setpoints)
     begun_s = pair.setpoints[0][0]
     lifted_s = next(at_s for at_s, phase in pair.phases if phase is Phase.CLIMB)

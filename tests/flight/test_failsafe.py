@@ -145,6 +145,10 @@ def _clock(flight: FlightState, **values: object) -> None:
     flight.clock = clock
 
 
+def _jumps(jumped_m: float = 0.0, drift_m: float = 0.0) -> SimpleNamespace:
+    return SimpleNamespace(recent_m=lambda time_s: jumped_m, drift_m=drift_m)
+
+
 def _aged(flight: FlightState, age_s: float) -> None:
     _clock(flight, age_s=lambda stamp_s, host_s: age_s)
 
@@ -209,10 +213,11 @@ MEASURED: list[tuple[str, Callable[[FlightState, Any], None], Any, Any]] = [
     ("prediction", _predicted, 2.0, 2.01),
     (
         "estimator",
-        lambda flight, value: _set(jumps=SimpleNamespace(recent_m=lambda time_s: value))(flight),
+        lambda flight, value: _set(jumps=_jumps(jumped_m=value))(flight),
         2.0,
         2.1,
     ),
+    ("estimator", lambda flight, value: _set(jumps=_jumps(drift_m=value))(flight), 2.0, 2.1),
     ("positioning", _accuracy, 3.0, 3.1),
     ("positioning", _no_fix, 1.0, 2.1),
     ("volume", lambda flight, value: _fly_at(flight, 0.0, -value), 120.0, 120.1),

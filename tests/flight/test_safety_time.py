@@ -123,26 +123,34 @@ def test_a_saturated_link_does_no_harm(fly: Fly) -> None:
 
 POSITION, ATTITUDE = "LOCAL_POSITION_NED", "ATTITUDE_QUATERNION"
 ARMED, IN_FLIGHT = {"after": "armed", "at_s": 0.1}, {"after": "engaged", "at_s": 16.0}
+RISING = {"after": "armed", "at_s": 2.5}
 STUCK = {
-    "armed": (ARMED, [POSITION], "no LOCAL_POSITION_NED for 0.[56] s"),
-    "track": (IN_FLIGHT, [POSITION], "no LOCAL_POSITION_NED for 0.[56] s"),
+    "armed": (ARMED, {POSITION: []}, "no new LOCAL_POSITION_NED for 0.[56] s"),
+    "track": (IN_FLIGHT, {POSITION: []}, "no new LOCAL_POSITION_NED for 0.[56] s"),
     "landing": (
         {"after": "landing", "at_s": 0.5},
-        [POSITION],
+        {POSITION: []},
         "disarmed, landing not confirmed: no LOCAL_POSITION_NED shows it",
     ),
-    "attitude": (IN_FLIGHT, [ATTITUDE], "no ATTITUDE_QUATERNION for 0.[56] s"),
-    "both": (IN_FLIGHT, [POSITION, ATTITUDE], "no telemetry for 1.0 s"),
+    "attitude": (IN_FLIGHT, {ATTITUDE: []}, "no new ATTITUDE_QUATERNION for 0.[56] s"),
+    "both": (IN_FLIGHT, {POSITION: [], ATTITUDE: []}, "no telemetry for 1.0 s"),
+    "height": (ARMED, {POSITION: ["z", "vz"]}, "no new LOCAL_POSITION_NED for 0.[56] s"),
+    "climb": (RISING, {POSITION: ["z", "vz"]}, "no new LOCAL_POSITION_NED for 0.[56] s"),
+    "height alone": (ARMED, {POSITION: ["z"]}, "no new LOCAL_POSITION_NED for 0.[56] s"),
 }
 
 
 @pytest.mark.parametrize(("case", "fly"), alternately(*STUCK))
 def test_telemetry_that_repeats_itself_is_none(case: str, fly: Fly) -> None:
-    """With new stamps and for good, on the ground with a velocity of zero. Thrust is twice what the
+    """With new stamps and for good, on the ground with a velocity of zero; or only the height, with
+    or without its velocity. Thrust is twice what the
     file says; the vehicle stays within 3 m of the height that was seen last, and is never disarmed
     in the air."""
     moment, messages, says = STUCK[case]
-    faults = [{"fault": "stuck_message", "message": each, **moment} for each in messages]
+    faults = [
+        {"fault": "stuck_message", "message": each, "fields": fields, **moment}
+        for each, fields in messages.items()
+    ]
     pair = fly(HIGH, ONE_LAP, scenario=scenario_of(*faults, conditions={"thrust_scale": 2.0}))
     watch = watched(pair)
     seen_m: list[float] = []  # the last true height

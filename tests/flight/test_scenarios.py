@@ -14,6 +14,8 @@ from typing import Any
 import pytest
 from faults import (
     ATTITUDE,
+    EXTENDED_SYS_STATE,
+    HEARTBEAT,
     PARAM_VALUE,
     POSITION,
     both,
@@ -317,6 +319,46 @@ ROWS = (
         says_once_that_nothing_is_heard,
     ),
     Row(
+        "the land detector is not heard",
+        lambda: hover(down=without(EXTENDED_SYS_STATE), limits={"health_s": 5.0}),
+        3,
+        "not ready: it does not report whether it flies (EXTENDED_SYS_STATE)",
+        Phase.FAILED,
+        nothing_sent,
+    ),
+    Row(
+        "it receives nothing any more",
+        lambda: hover(
+            at=[(in_phase(Phase.HEALTH, 0.2), lambda pair: setattr(pair, "up", lambda *_: []))],
+            limits={"health_s": 5.0},
+        ),
+        3,
+        "not ready: TIMESYNC is not answered for 5 s: does the vehicle receive what is sent?",
+        Phase.FAILED,
+        nothing_sent,
+    ),
+    Row(
+        "no HEARTBEAT on the ground",
+        lambda: hover(
+            at=[(in_phase(Phase.HEALTH, 0.2), downlink(without(HEARTBEAT)))],
+            limits={"health_s": 9.0},
+            boot_scale=1.0,
+        ),
+        3,
+        "not ready: no HEARTBEAT arrives",
+        Phase.FAILED,
+        nothing_sent,
+    ),
+    Row(
+        "no HEARTBEAT from the request for the mode on",
+        lambda: hover(at=[(in_phase(Phase.ENGAGE), downlink(without(HEARTBEAT)))]),
+        4,
+        "it is not known whether the vehicle has armed; "
+        "no HEARTBEAT shows whether it is armed after 5 s",
+        Phase.FAILED,
+        disarmed_by_us,
+    ),
+    Row(
         "arming refused",
         lambda: hover(firmware=refusing("arm", "Arming denied: no joystick")),
         3,
@@ -505,7 +547,7 @@ ROWS = (
         "attitude stops",
         in_track(downlink(without(ATTITUDE))),
         4,
-        "no ATTITUDE_QUATERNION for 0.",
+        "no new ATTITUDE_QUATERNION for 0.",
         Phase.DISARMED,
         soft_landing,
     ),

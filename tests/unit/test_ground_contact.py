@@ -25,7 +25,12 @@ class Standing:
         self.vehicle.update(Landed(state), now_s)
 
     def position(self, now_s: float, height_m: float = 0.0, climb_mps: float = 0.0) -> None:
-        event = LocalPosition(now_s, (5.0, -3.0, 2.0 - height_m), (0.0, 0.0, -climb_mps))
+        noise = 1e-6 * now_s  # no estimator repeats itself
+        event = LocalPosition(
+            now_s,
+            (5.0 + noise, noise - 3.0, 2.0 - height_m + noise),
+            (noise, noise, -climb_mps + noise),
+        )
         self.vehicle.update(event, now_s)
         self.contact.on_position(event)
 
@@ -132,7 +137,8 @@ def test_stood_for_fifteen_seconds(
     vehicle.update(Heartbeat("LAND", True, 4, 2), 0.0)
     for number in range(round(10 * for_s) + 1):
         height = height_m + wander_m * (number % 2)
-        event = LocalPosition(0.1 * number, (0.0, 0.0, -height), (0.0, 0.0, 0.0))
+        noise = 1e-6 * number  # no estimator repeats itself
+        event = LocalPosition(0.1 * number, (noise, noise, noise - height), (noise, noise, noise))
         vehicle.update(event, 0.1 * number)
         contact.on_position(event)
     assert contact.stood_for(15.0) is stood

@@ -33,3 +33,14 @@ def test_noise_is_no_jump(sd_m: float) -> None:
 @pytest.mark.parametrize(("sd_m", "jump_m"), [(0.0, 0.35), (0.02, 0.5), (0.1, 2.0)])
 def test_a_jump_is_found_in_noise(sd_m: float, jump_m: float) -> None:
     assert found(sd_m, jump_m) == [pytest.approx(jump_m, abs=6.0 * sd_m + 1e-9)]
+
+
+@pytest.mark.parametrize(("rises_mps", "drift_m"), [(0.0, 1.0), (-0.2, 1.2)])
+def test_a_position_that_leaves_its_velocity_drifts(rises_mps: float, drift_m: float) -> None:
+    """In the steady state by the difference of the two velocities in one second; a jump is none."""
+    jumps = PositionJumps()
+    for time_s in np.arange(1000) / 100.0:
+        height_m = rises_mps * time_s + 5.0 * (time_s >= 5.0)
+        position = LocalPosition(float(time_s), (3.0, 4.0, float(height_m)), (0.0, 0.0, 1.0))
+        jumps.on_position(position)
+    assert jumps.drift_m == pytest.approx(drift_m, rel=0.01)

@@ -403,6 +403,19 @@ def test_a_stamp_that_is_late_is_dropped() -> None:
     assert dropped(session, DropReason.STALE) == 3 + 49
 
 
+def test_a_stamp_that_is_far_ahead_is_dropped_until_others_follow_it() -> None:
+    """One would make those of the present a reboot; several are a clock that jumped."""
+    vehicle = Sender()
+    session = pinned(vehicle)
+    times(session, vehicle.position(60000), vehicle.attitude(60000))
+    for later_ms in range(10, 500, 10):
+        frames = [vehicle.position(60000 + later_ms), vehicle.attitude(1060000 + 100 * later_ms)]
+        assert times(session, *frames) == [60.0 + later_ms / 1e3]
+    assert dropped(session, DropReason.STALE) == 49
+    jumped = [vehicle.position(2000000 + later_ms) for later_ms in range(0, 200, 60)]
+    assert times(session, *jumped) == [2000.12, 2000.18]
+
+
 def test_a_message_that_repeats_its_stamp_for_long_is_stale() -> None:
     vehicle = Sender()
     session = pinned(vehicle)
