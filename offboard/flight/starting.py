@@ -221,7 +221,7 @@ def not_armed(flight: FlightState) -> str:
     return f"the vehicle did not arm in {waited_s:.0f} s"
 
 
-def not_disarmed(flight: FlightState) -> str:
+def still_armed(flight: FlightState) -> str:
     if flight.in_phase_s <= flight.limits.disarm_s:
         return ""
     unheard = flight.vehicle.age_s(Heartbeat) > ARMED_KNOWN_S
@@ -343,5 +343,5 @@ def starting(before: tuple[Phase, ...]) -> tuple[Transition, ...]:
         Transition(STAND_DOWN, rebooted, FAILED, REFUSED, "restart"),
         Transition(STAND_DOWN, silent_for_long, FAILED, REFUSED, "link"),
         Transition(STAND_DOWN, disarmed_for_good, FAILED, reason="disarmed on the ground"),
-        Transition(STAND_DOWN, not_disarmed, FAILED, ABORTED),
+        Transition(STAND_DOWN, still_armed, FAILED, ABORTED),
     )

@@ -91,7 +91,11 @@ def test_arducopter_is_not_flown_without_a_reply_for_guid_options() -> None:
         position = LocalPosition(1.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
         health = SystemHealth(True, None, 1.0)
         vehicle = VehicleState(
-            position=position, attitude=attitude, health=health, parameters=parameters
+            landed="on_ground",
+            position=position,
+            attitude=attitude,
+            health=health,
+            parameters=parameters,
         )
         return Ground(vehicle, Limits(), ARDUPILOT, rates_hz=None)
 

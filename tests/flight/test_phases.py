@@ -182,6 +182,8 @@ EVENTS: dict[str, Setup] = {
     "not_found": _set(silence_s=20.1),
     "not_ready_in_time": _set(began_s=NOW_S - Limits().health_s - 0.1),
     "not_engaged": _set(began_s=NOW_S - Limits.engage_s - 0.1),
+    "not_armed": _set(began_s=NOW_S - Limits.arm_s - 0.1),
+    "still_armed": _set(began_s=NOW_S - Limits.disarm_s - 0.1),
     "not_disarmed": _set(began_s=NOW_S - Limits().land_s - 0.1),
     "blind": _age_attitude,
     "stop_requested": _stop,
