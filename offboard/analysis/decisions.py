@@ -49,7 +49,7 @@ def decision_figures(flown: History) -> dict[str, float]:
         "refused_stale": refusals(Refusal.STALE),
         "refused_not_ours": refusals(Refusal.NOT_OURS),
         "refused_unusable": refusals(Refusal.UNUSABLE),
-        "strangers": float(known("strangers").sum()),
+        "other_datagrams": float(known("other_datagrams").sum()),
         "solve_time_p50_ms": _percentile(solve_ms, 50),
         "solve_time_p99_ms": _percentile(solve_ms, 99),
         "certified_share": len(gap) / len(refused),

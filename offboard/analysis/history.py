@@ -69,7 +69,7 @@ class History:
     reference: t, position 3, velocity 3, acceleration 3, heading (POSITION_TARGET_LOCAL_NED)
     setpoint: t, wall time s, w, x, y, z, thrust (SET_ATTITUDE_TARGET); NaN from the third on for a
         setpoint of the autopilot's own position loop (SET_POSITION_TARGET_LOCAL_NED)
-    identified: t, then value and sd of each constant as in `identification.adoption.record_of`
+    identified: t, then value and sd of each constant as in `identification.vehicle_fit.log_record`
     link_delay: t of the telemetry that a TIMESYNC request followed, its delay in s
     heartbeat: t, armed (1 or 0), MAV_STATE
     landed: t, MAV_LANDED_STATE (EXTENDED_SYS_STATE)

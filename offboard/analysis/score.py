@@ -102,7 +102,7 @@ class Score:
     spread_median: float = _figure("epsilon of Eq. 29, median")
     at_bound_share: float = _figure("share of decisions at a limit")
     cut_short_share: float = _figure("share of decisions cut by deadline")
-    strangers: float = _figure("datagrams of others, frames refused")
+    other_datagrams: float = _figure("datagrams of others, frames refused")
     position_hz: float = _figure("LOCAL_POSITION_NED received", "Hz")
     attitude_hz: float = _figure("ATTITUDE_QUATERNION received", "Hz")
     position_gap_max_s: float = _figure("longest gap of positions", "s")

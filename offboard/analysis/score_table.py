@@ -48,8 +48,10 @@ def summary(score: Score, history: History) -> dict[str, str]:
     elif score.at_bound_share >= AT_LIMIT_SHARE:
         share = f"{100.0 * score.at_bound_share:.0f} % of the decisions"
         rows["at a limit"] = f"{share}: fly slower, or in less wind"
-    if score.strangers > 0:
-        rows["ignored"] = f"{score.strangers:,.0f} datagrams of others or frames without signature"
+    if score.other_datagrams > 0:
+        rows["ignored"] = (
+            f"{score.other_datagrams:,.0f} datagrams of others or frames without signature"
+        )
     if identified := _identified(history):
         rows["identified"] = identified
     return rows

@@ -66,7 +66,7 @@ A YAML file with `law: pd` and other values is given as `--controller my.yaml`. 
 """
 
 from offboard.control.base import (
-    Adopting,
+    Adaptive,
     Certificate,
     Controller,
     ControllerSettings,
@@ -80,7 +80,7 @@ from offboard.model.vehicle import Vehicle
 from offboard.reference.base import FlatSample, Reference
 
 __all__ = [
-    "Adopting",
+    "Adaptive",
     "Certificate",
     "Command",
     "Controller",

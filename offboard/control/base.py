@@ -92,7 +92,7 @@ class DecisionError(ArithmeticError):
 
 
 class Controller(Protocol):
-    """A control law. The flight calls these two methods, and those of `Adopting` if it has them.
+    """A control law. The flight calls these two methods, and those of `Adaptive` if it has them.
 
     Before take-off `decide` is called a few times on a vehicle at rest, so that everything is
     compiled and loaded, then `reset` once; an exception then ends the program before anything is
@@ -141,7 +141,7 @@ class ControllerSettings(Parameters, ABC):
 
 
 @runtime_checkable
-class Adopting(Protocol):
+class Adaptive(Protocol):
     """A controller that can continue with the constants identified in flight. Optional."""
 
     @property
@@ -154,7 +154,7 @@ class Adopting(Protocol):
         """The bandwidth in use, rad/s: at most the configured one."""
         ...
 
-    def adopt(self, vehicle: Vehicle, uncertainty: DelayUncertainty) -> None:
+    def set_vehicle(self, vehicle: Vehicle, uncertainty: DelayUncertainty) -> None:
         """Use `vehicle` from the next decision on, at no more than the bandwidth that its delays
         and their `uncertainty` support (`control.bandwidth`). Called when a setpoint has left."""
         ...

@@ -113,21 +113,21 @@ class Task:
     """What one decision is about.
 
     `lateral` (4, 2), [p, v, b, b'] x [north, east], and `vertical` (3,), [z, v_z, T b_z], are the
-    deviations of the predicted state from the target; `upright` is its b_z. `problem` is the cost
-    of u (4,) and its bounds.
+    deviations of the predicted state from the target; `b_z` is that of its thrust direction.
+    `problem` is the cost of u (4,) and its bounds.
     """
 
     target: Target
     lateral: Array
     vertical: Array
-    upright: float
+    b_z: float
     problem: BoxQuadratic
 
     def inputs(self, deviation: Array) -> Array:
         """u (4,), not clipped, for a deviation (3,) from the feed-forward: b_c north, b_c east and
         vertical thrust."""
         inputs = np.empty(4)
-        inputs[0] = (self.target.thrust_down_feedforward_mps2 + deviation[2]) / self.upright
+        inputs[0] = (self.target.thrust_down_feedforward_mps2 + deviation[2]) / self.b_z
         inputs[1:3] = self.target.tilt_feedforward + deviation[:2]
         inputs[3] = self.target.heading_feedforward_rad
         return inputs
@@ -135,7 +135,7 @@ class Task:
 
 class TrackingLaw:
     """Base class of the laws: makes the `Task` of each decision, for the vehicle and the bandwidth
-    in use, which `adopt` sets.
+    in use, which `set_vehicle` sets.
 
     `limits` are the settings, `vehicle` is the vehicle in use; `lateral` and `vertical` are the
     models of its axes with the optimal cost that follows one held input.
@@ -146,14 +146,14 @@ class TrackingLaw:
         self.configured_radps = self.bandwidth_radps = settings.bandwidth_radps
         self.limits, self._file = settings, vehicle
         self._delays: object = None  # and their uncertainty, that the bandwidth was found for
-        self.adopt(vehicle)
+        self.set_vehicle(vehicle)
 
     def reset(self) -> None:
         """Return to the vehicle file and the configured bandwidth."""
-        self.adopt(self._file)
+        self.set_vehicle(self._file)
 
-    def adopt(self, vehicle: Vehicle, uncertainty: DelayUncertainty | None = None) -> None:
-        """See `base.Adopting.adopt`; without an uncertainty the bandwidth is the configured one."""
+    def set_vehicle(self, vehicle: Vehicle, uncertainty: DelayUncertainty | None = None) -> None:
+        """See `base.Adaptive`; without an uncertainty the bandwidth is the configured one."""
         self.vehicle = vehicle
         self._tilt_ripple = tilt_ripple(vehicle, self.period_s)
         self._thrust_ripple = thrust_ripple(vehicle, self.period_s)
@@ -182,11 +182,11 @@ class TrackingLaw:
         state = situation.state
         target = self.target(situation.reference, situation.time_s, state)
         lateral, vertical = deviations(state, target)
-        upright = float(state.thrust_direction_ned[2])
-        problem = self._problem(target, lateral, vertical, upright)
+        b_z = float(state.thrust_direction_ned[2])
+        problem = self._problem(target, lateral, vertical, b_z)
         if not _finite(problem):
             raise DecisionError("the cost of this decision is not finite")
-        return Task(target, lateral, vertical, upright, problem)
+        return Task(target, lateral, vertical, b_z, problem)
 
     def target(self, reference: Reference, time_s: float, state: PredictedState) -> Target:
         """The target of a decision at `time_s`, for the state predicted to the time when its tilt
@@ -228,19 +228,17 @@ class TrackingLaw:
             heading_feedforward_rad=float(heading),
         )
 
-    def _problem(
-        self, target: Target, lateral: Array, vertical: Array, upright: float
-    ) -> BoxQuadratic:
+    def _problem(self, target: Target, lateral: Array, vertical: Array, b_z: float) -> BoxQuadratic:
         nominal = np.empty(4)
-        nominal[0] = target.thrust_down_feedforward_mps2 / upright
+        nominal[0] = target.thrust_down_feedforward_mps2 / b_z
         nominal[1:3] = target.tilt_feedforward
         nominal[3] = target.heading_feedforward_rad
         curvature = np.empty(4)
-        curvature[0] = self.vertical.curvature * upright**2
+        curvature[0] = self.vertical.curvature * b_z**2
         curvature[1:3] = self.lateral.curvature
         curvature[3] = HEADING_CURVATURE
         slope = np.zeros(4)  # of J at the nominal input
-        slope[0] = upright * (self.vertical.coupling @ vertical)
+        slope[0] = b_z * (self.vertical.coupling @ vertical)
         slope[1:3] = self.lateral.coupling @ lateral
         rest = vertical @ self.vertical.state_cost @ vertical
         rest += np.sum(lateral * (self.lateral.state_cost @ lateral))

@@ -64,7 +64,7 @@ from offboard.estimation.propagation import (
     replay,
     wrapped,
 )
-from offboard.model.axes import acceleration, lateral_model, upright
+from offboard.model.axes import acceleration, b_z_of, lateral_model
 from offboard.model.command import Command
 from offboard.model.frames import (
     heading_from_quaternion,
@@ -235,7 +235,7 @@ def _bring_forward(measured: Array, state: Array, plant: Any, late_s: float) -> 
     """Propagate position and velocity `measured` (6,) by `late_s`, to the time of the state."""
     if late_s <= 0.0:
         return
-    direction = (state[TILT], state[TILT + 1], upright(state[TILT], state[TILT + 1]))
+    direction = (state[TILT], state[TILT + 1], b_z_of(state[TILT], state[TILT + 1]))
     gravity = (0.0, 0.0, plant.gravity)
     for i in range(3):
         speed = state[VELOCITY + i]
@@ -302,7 +302,7 @@ class Observer:
         self._permit_drift(LATERAL)
         self._restart()
 
-    def adopt(self, vehicle: Vehicle) -> None:
+    def set_vehicle(self, vehicle: Vehicle) -> None:
         """Continue with another vehicle model, as identified in flight: thrust and disturbance
         change to what they mean with it, the motion does not. From now on the vertical drift is
         estimated too: before the thrust is identified, an error of its delay looks like drift, and
@@ -375,7 +375,7 @@ class Observer:
             state[TILT : TILT + 2] = north, east
             state[TILT_RATE : TILT_RATE + 2] = 0.0
             state[HEADING], state[HEADING_RATE] = heading, 0.0
-            state[THRUST] = self._gravity / upright(north, east)
+            state[THRUST] = self._gravity / b_z_of(north, east)
             self._time_s = max(self._time_s, time_s)
         else:
             self._go_to(time_s, complete=self._position_at is not None)
@@ -407,11 +407,11 @@ class Observer:
             time_s=thrust_s,
             position_down_m=numbers[POSITION + 2],
             velocity_down_mps=numbers[VELOCITY + 2],
-            thrust_down_mps2=numbers[THRUST] * upright(numbers[TILT], numbers[TILT + 1]),
+            thrust_down_mps2=numbers[THRUST] * b_z_of(numbers[TILT], numbers[TILT + 1]),
         )
         state = self._propagated(tilt_s)
         north, east, rate_n, rate_e = state[TILT : TILT_RATE + 2].tolist()
-        down = upright(north, east)
+        down = b_z_of(north, east)
         rate_d = -(north * rate_n + east * rate_e) / down
         return PredictedState(
             time_s=tilt_s,

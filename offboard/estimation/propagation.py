@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.compiled import entry, kernel
-from offboard.model.axes import acceleration, upright
+from offboard.model.axes import acceleration, b_z_of
 from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
@@ -106,7 +106,7 @@ def _differentiate(
     """Right-hand side at collective thrust `thrust` and the commands now in force."""
     b_n, b_e = state[TILT], state[TILT + 1]
     gravity = (0.0, 0.0, plant.gravity)
-    direction = (b_n, b_e, upright(b_n, b_e))
+    direction = (b_n, b_e, b_z_of(b_n, b_e))
     for axis in range(3):
         velocity = state[VELOCITY + axis]
         rate[POSITION + axis] = velocity

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from offboard.control.base import Adopting, Situation
+from offboard.control.base import Adaptive, Situation
 from offboard.documents.errors import located
 from offboard.flight import outbox, setpoint
-from offboard.flight.online_identification import Adoption, OnlineIdentification
+from offboard.flight.online_identification import OnlineIdentification, VehicleUpdate
 from offboard.flight.phases import Phase
 from offboard.flight.record import (
     IDENTIFIED_ID,
@@ -33,8 +33,8 @@ _BY = {"controller": "the controller failed", "link": "telemetry was too old for
 
 def begin(flight: FlightState) -> None:
     """Before the first decision: the vehicle is not identified yet."""
-    if flight.identification and isinstance(flight.controller, Adopting):
-        flight.controller.adopt(flight.model, flight.identification.uncertainty)
+    if flight.identification and isinstance(flight.controller, Adaptive):
+        flight.controller.set_vehicle(flight.model, flight.identification.uncertainty)
         flight.announced_radps = flight.controller.configured_radps
 
 
@@ -108,11 +108,11 @@ def _send(flight: FlightState, decided: Decided) -> None:
 
 def _identify(flight: FlightState, decided: Decided, identification: OnlineIdentification) -> None:
     try:
-        adoption = identification.learn(
+        update = identification.learn(
             decided.phase, decided.tick.time_s, flight.observer.hover_thrust_estimate
         )
-        if adoption is not None:
-            _adopt(flight, decided.tick.time_s, adoption)
+        if update is not None:
+            _set_vehicle(flight, decided.tick.time_s, update)
     except Exception as error:  # the flight continues with the present vehicle model
         identification.give_up()
         outbox.warn(flight, f"identification stopped: {located(error)}")
@@ -144,35 +144,35 @@ def _remaining(flight: FlightState, began_s: float) -> Callable[[], float] | Non
     return lambda: deadline_s - (flight.stopwatch() - began_s)
 
 
-def _adopt(flight: FlightState, time_s: float, adoption: Adoption) -> None:
-    assert isinstance(flight.controller, Adopting)
-    flight.controller.adopt(adoption.vehicle, adoption.uncertainty)
-    if adoption.vehicle != flight.model:
-        flight.observer.adopt(adoption.vehicle)
-        flight.model = adoption.vehicle
-    if adoption.record:
-        record = SolverRecord(time_s, adoption.record, IDENTIFIED_ID, IDENTIFIED_NAME)
+def _set_vehicle(flight: FlightState, time_s: float, update: VehicleUpdate) -> None:
+    assert isinstance(flight.controller, Adaptive)
+    flight.controller.set_vehicle(update.vehicle, update.uncertainty)
+    if update.vehicle != flight.model:
+        flight.observer.set_vehicle(update.vehicle)
+        flight.model = update.vehicle
+    if update.record:
+        record = SolverRecord(time_s, update.record, IDENTIFIED_ID, IDENTIFIED_NAME)
         outbox.send(flight, record)
-    for sentence in _with_bandwidth(flight, adoption, flight.controller):
+    for sentence in _with_bandwidth(flight, update, flight.controller):
         outbox.announce(flight, sentence)
 
 
 def _with_bandwidth(
-    flight: FlightState, adoption: Adoption, controller: Adopting
+    flight: FlightState, update: VehicleUpdate, controller: Adaptive
 ) -> tuple[str, ...]:
     """The sentences for the user, and the bandwidth in use if it has changed noticeably."""
     used_radps, configured_radps = controller.bandwidth_radps, controller.configured_radps
     changed_radps = abs(used_radps - flight.announced_radps)
     as_configured = used_radps == configured_radps
     if not changed_radps or (changed_radps < NOTICEABLE_RADPS and not as_configured):
-        return adoption.sentences
+        return update.sentences
     flight.announced_radps = used_radps
     text = f"bandwidth limited to {used_radps:.1f} rad/s (configured {configured_radps:.1f})"
     if as_configured:
         text = f"bandwidth {used_radps:.1f} rad/s as configured"
-    if adoption.cause:
-        return (*adoption.sentences, f"{text}: {adoption.cause}")
-    return ("; ".join((*adoption.sentences, text)),)
+    if update.cause:
+        return (*update.sentences, f"{text}: {update.cause}")
+    return ("; ".join((*update.sentences, text)),)
 
 
 def _record(flight: FlightState, decided: Decided, answer_s: float) -> None:

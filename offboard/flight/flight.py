@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 
-from offboard.control.base import Adopting, Controller
+from offboard.control.base import Adaptive, Controller
 from offboard.estimation.observer import Observer
 from offboard.flight import actions, decision, outbox, telemetry, transitions
 from offboard.flight.authority import Standing
@@ -35,7 +35,7 @@ from offboard.flight.phases import (
 from offboard.flight.record import Tick
 from offboard.flight.snapshot import Snapshot
 from offboard.flight.state import FlightState, Outcome
-from offboard.identification.learner import Learned
+from offboard.identification.learner import IdentifiedVehicle
 from offboard.link.interface import Chunk
 from offboard.mavlink.dialects.base import NEVER
 from offboard.mavlink.events import Attitude, ClockBehind, Event, LocalPosition, Rebooted
@@ -62,12 +62,12 @@ class Flight:
     """Flies `plan` with `controller`. `stopwatch` reads host time.
 
     `deadline_s` is the wall time that one decision may take; None in lockstep, where the vehicle
-    waits for each decision. `learned` is what an earlier flight has identified of the vehicle.
+    waits for each decision. `known` is what an earlier flight has identified of the vehicle.
     `before` has ended or waits, with the same session: what it knows of vehicle and link stays
     known.
 
     `state` is the flight's state; `peer` the address that the vehicle sends from, None before it is
-    found; `strangers` the datagrams of other senders, for the log.
+    found; `other_datagrams` the datagrams of other senders, for the log.
     """
 
     def __init__(
@@ -83,13 +83,13 @@ class Flight:
         deadline_s: float | None,
         stopwatch: Callable[[], float],
         identify: IdentifySettings | None = None,
-        learned: Learned | None = None,
+        known: IdentifiedVehicle | None = None,
         service: ServiceOptions | None = None,
         before: Flight | None = None,
     ) -> None:
-        model = learned.vehicle if learned else vehicle
-        if learned:
-            observer.adopt(model)
+        model = known.vehicle if known else vehicle
+        if known:
+            observer.set_vehicle(model)
         self._inputs = InputRecorder(session.settings, kept=service is None)
         self.state = FlightState(
             limits,
@@ -101,19 +101,19 @@ class Flight:
             period_s,
             self._inputs.watch(stopwatch),
             deadline_s,
-            _identification(vehicle, controller, identify, learned),
+            _identification(vehicle, controller, identify, known),
             service,
         )
         self.peer: Hashable | None = None
-        self.strangers = 0
+        self.other_datagrams = 0
         self._tick = -1  # number of the newest
         self._turned_s = math.nan  # host time of the newest turn
         if before is not None:
             self.state.follow(before.state)
-            self.peer, self.strangers = before.peer, before.strangers
+            self.peer, self.other_datagrams = before.peer, before.other_datagrams
             self._turned_s = before._turned_s
             self._tick = before._tick if before.state.period_s == period_s else -1
-        self._recorded_strangers = self.strangers
+        self._recorded_others = self.other_datagrams
         self._news = News()
         self._logged: list[bytes] = []  # frames since the newest `finish_turn`
         self._ticked = self._heard = False  # in this turn
@@ -128,7 +128,7 @@ class Flight:
         """
         flight = self.state
         self._ticked = self._heard = False
-        now_s = self._inputs.begin(now_s, self.strangers)
+        now_s = self._inputs.begin(now_s, self.other_datagrams)
         try:
             before_s = flight.now_s
             self._begin_turn(now_s)
@@ -231,15 +231,15 @@ class Flight:
         missed = number - self._tick - 1 if self._tick >= 0 else 0
         self._tick, self._ticked = number, True
         pause_s = flight.busyness.on_tick(missed, flying=flight.phase in FLYING)
-        ignored = self.strangers + flight.session.counters.forged
+        ignored = self.other_datagrams + flight.session.counters.forged
         flight.tick = Tick(
             flight.time_s,
             flight.telemetry_arrived_s,
             missed,
-            ignored - self._recorded_strangers,
+            ignored - self._recorded_others,
             pause_s,
         )
-        self._recorded_strangers = ignored
+        self._recorded_others = ignored
         return True
 
     def _follow_link(self) -> None:
@@ -328,7 +328,7 @@ class Flight:
 
     def snapshot(self, flights: int = 0) -> Snapshot:
         """The flight at this moment, for displays; `flights` that the service has begun."""
-        return Snapshot(self.state, self.strangers, flights)
+        return Snapshot(self.state, self.other_datagrams, flights)
 
     @property
     def lands_without_log(self) -> bool:
@@ -375,9 +375,9 @@ def _identification(
     vehicle: Vehicle,
     controller: Controller,
     settings: IdentifySettings | None,
-    learned: Learned | None,
+    known: IdentifiedVehicle | None,
 ) -> OnlineIdentification | None:
-    """None for a controller that cannot adopt another vehicle model."""
-    if settings is None or not isinstance(controller, Adopting):
+    """None for a controller that cannot use another vehicle model."""
+    if settings is None or not isinstance(controller, Adaptive):
         return None
-    return OnlineIdentification(vehicle, settings, learned=learned)
+    return OnlineIdentification(vehicle, settings, known=known)

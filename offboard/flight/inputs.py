@@ -25,7 +25,7 @@ from offboard.mavlink.session import Reception, SessionSettings
 PAYLOAD_TYPE = 0xC0F2  # TUNNEL.payload_type; numbers above 32767 need no registration
 _HEAD = struct.Struct("<I")  # number of the piece
 _PIECE_BYTES = 128 - _HEAD.size
-_TURN, _CALL, _PEER, _STRANGERS, _DROPPED, _CHECK = range(6)
+_TURN, _CALL, _PEER, _OTHERS, _DROPPED, _CHECK = range(6)
 SETTINGS = "settings"  # the first call: how the session was set
 
 
@@ -41,7 +41,7 @@ class InputRecorder:
         self._now_us = 0
         self._read_us = 0
         self._peers: dict[Hashable, int] = {}
-        self._strangers = 0
+        self._other_datagrams = 0
         self._chunks: list[bytes] = []  # of the turn in progress
         self._readings: list[bytes] = []
         self._crc = 0  # of the frames since the last check
@@ -56,11 +56,11 @@ class InputRecorder:
             },
         )
 
-    def begin(self, now_s: float, strangers: int) -> float:
+    def begin(self, now_s: float, other_datagrams: int) -> float:
         """A turn begins. Returns its time as it is recorded."""
-        if strangers != self._strangers:
-            self._data += bytes([_STRANGERS]) + _varint(strangers)
-            self._strangers = strangers
+        if other_datagrams != self._other_datagrams:
+            self._data += bytes([_OTHERS]) + _varint(other_datagrams)
+            self._other_datagrams = other_datagrams
         before_us, self._now_us = self._now_us, round(now_s * 1e6)
         self._chunks, self._readings = [], []
         self._head = _zigzag(self._now_us - before_us) if self._timed else b""
@@ -175,7 +175,7 @@ class Call:
 
 
 @dataclass(frozen=True, slots=True)
-class StrangersCounted:
+class OtherDatagrams:
     """The count of datagrams of other senders, before the next turn."""
 
     total: int
@@ -195,7 +195,7 @@ class Check:
     crc: int
 
 
-Entry = TurnInput | Call | StrangersCounted | FramesDropped | Check
+Entry = TurnInput | Call | OtherDatagrams | FramesDropped | Check
 
 
 def entries(payloads: Iterable[bytes]) -> Iterator[Entry]:
@@ -217,8 +217,8 @@ def entries(payloads: Iterable[bytes]) -> Iterator[Entry]:
             elif kind == _PEER:
                 peer = json.loads(reader.take(reader.number()))
                 peers.append(tuple(peer) if isinstance(peer, list) else peer)
-            elif kind == _STRANGERS:
-                yield StrangersCounted(reader.number())
+            elif kind == _OTHERS:
+                yield OtherDatagrams(reader.number())
             elif kind == _DROPPED:
                 yield FramesDropped(reader.number())
             elif kind == _CHECK:

@@ -2,7 +2,7 @@
 
 It gives the `Learner` what arrives and what is sent, flies the steps that show the responses after
 the climb (repeated while the tilt response stays uncertain), says by the phase what may be
-identified, and hands over what is new as an `Adoption`. Time is vehicle time.
+identified, and hands over what is new as a `VehicleUpdate`. Time is vehicle time.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from offboard.identification.learner import (
     FILE_DELAY_S,
     SETTLE_S,
     UNKNOWN_DELAY_S,
-    Learned,
+    IdentifiedVehicle,
     Learner,
     Stage,
 )
@@ -41,7 +41,7 @@ class IdentifySettings(Parameters):
 
 
 @dataclass(frozen=True, slots=True)
-class Adoption:
+class VehicleUpdate:
     """What to fly with from the next tick on.
 
     `vehicle` goes to controller and observer, `uncertainty` to the controller, `cause` says why it
@@ -62,25 +62,29 @@ class OnlineIdentification:
     Args:
         vehicle: constants of the vehicle file.
         settings: see `IdentifySettings`.
-        learned: what an earlier flight has identified; then no steps are flown.
+        known: what an earlier flight has identified; then no steps are flown.
     """
 
     def __init__(
-        self, vehicle: Vehicle, settings: IdentifySettings, *, learned: Learned | None = None
+        self,
+        vehicle: Vehicle,
+        settings: IdentifySettings,
+        *,
+        known: IdentifiedVehicle | None = None,
     ) -> None:
         self._settings = settings
         self._learner = Learner(
             vehicle,
             delay_error_s=UNKNOWN_DELAY_S if settings.online else FILE_DELAY_S,
-            learned=learned if settings.online else None,
+            known=known if settings.online else None,
         )
         if not settings.online:
             self._learner.cause = (
                 f"without identification the vehicle file's delay may be wrong by "
                 f"{1e3 * FILE_DELAY_S:.0f} ms"
             )
-        self._adopted = self._learner.vehicle, self._learner.uncertainty, ""
-        self._has_adopted = False  # in the turn before
+        self._told = self._learner.vehicle, self._learner.uncertainty, ""
+        self._has_updated = False  # in the turn before
         self._excite_s = math.nan
         self._rounds = 1
         self._left_box = self._gave_up = False
@@ -105,9 +109,9 @@ class OnlineIdentification:
             self._learner.recorder.on_position(time_s, position_ned_m, velocity_ned_mps)
 
     def on_command(self, time_s: float, command: Command) -> None:
-        """A command sent; its thrust was scaled with the vehicle adopted last."""
+        """A command sent; its thrust was scaled with the newest vehicle."""
         north, east, _ = command.thrust_direction_ned
-        share = command.thrust_mps2 / self._adopted[0].thrust_max_mps2
+        share = command.thrust_mps2 / self._told[0].thrust_max_mps2
         self._learner.recorder.on_command(time_s, (north, east), share, command.heading_rad)
 
     def on_link_delay(self, link: Estimate | None) -> None:
@@ -118,9 +122,9 @@ class OnlineIdentification:
     def on_hover_thrust(self, hover_thrust: float) -> None:
         """The hover thrust that the vehicle showed before the take-over, with which it is flown."""
         self._learner.set_hover_thrust(hover_thrust)
-        vehicle, uncertainty, cause = self._adopted
+        vehicle, uncertainty, cause = self._told
         flown = vehicle.model_copy(update={"hover_thrust": hover_thrust})
-        self._adopted = flown, uncertainty, cause
+        self._told = flown, uncertainty, cause
 
     def on_link_growth(self, added_s: float, changed_s: float) -> None:
         """The link has added `added_s` to its delay since take-off, and changed by `changed_s`
@@ -144,9 +148,9 @@ class OnlineIdentification:
         return self._settings.online and self._settings.excite and not self._learner.identified
 
     @property
-    def learned(self) -> Learned | None:
+    def result(self) -> IdentifiedVehicle | None:
         """What the next flight of this vehicle may begin with; None if nothing is known."""
-        return self._learner.learned
+        return self._learner.result
 
     @property
     def contradicted(self) -> bool:
@@ -179,7 +183,7 @@ class OnlineIdentification:
 
     # ------------------------------------------------------------------ the station
 
-    def learn(self, phase: Phase, time_s: float, hover_thrust: float) -> Adoption | None:
+    def learn(self, phase: Phase, time_s: float, hover_thrust: float) -> VehicleUpdate | None:
         """What to fly with from the next tick on; where nothing is new, do one piece of work and
         return None. `hover_thrust`: the observer's estimate.
 
@@ -189,12 +193,12 @@ class OnlineIdentification:
             return None
         learner = self._learner
         now = learner.vehicle, learner.uncertainty, learner.cause
-        if not self._has_adopted and (learner.sentences or learner.record or now != self._adopted):
-            self._has_adopted, self._adopted = True, now
-            adoption = Adoption(*now, tuple(learner.sentences), learner.record)
+        if not self._has_updated and (learner.sentences or learner.record or now != self._told):
+            self._has_updated, self._told = True, now
+            update = VehicleUpdate(*now, tuple(learner.sentences), learner.record)
             learner.sentences, learner.record = [], ()
-            return adoption
-        self._has_adopted = False
+            return update
+        self._has_updated = False
         repeats = phase is Phase.EXCITE and self._rounds < MOST_ROUNDS and not self._left_box
         learner.step(time_s, self._stage(phase, time_s), hover_thrust, may_repeat=repeats)
         if learner.repeats_steps:

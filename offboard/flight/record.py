@@ -70,7 +70,7 @@ class TickRecord:
     seed_cost: float = NAN  # cost of the best plan that the search started from
     age_s: float = NAN  # of the telemetry when the setpoint was sent, vehicle time
     refused: float = 0.0  # flags of `setpoint.Refusal`; 0 for a setpoint that was sent
-    strangers: float = 0.0  # datagrams of other senders since the previous record
+    other_datagrams: float = 0.0  # datagrams of other senders since the previous record
     pause_s: float = 0.0  # longest pause of this process since the previous tick; 0 below a period
 
     def data(self) -> tuple[float, ...]:
@@ -102,7 +102,7 @@ class Tick:
     time_s: float = 0.0  # vehicle time
     arrived_s: float = 0.0  # host time of the arrival of the telemetry that caused it
     missed: int = 0  # ticks skipped since the previous one
-    strangers: int = 0  # datagrams of other senders since the previous one
+    other_datagrams: int = 0  # datagrams of other senders since the previous one
     pause_s: float = 0.0  # of this process, since the previous one
 
 
@@ -145,7 +145,7 @@ class Decided:
             seed_cost,
             self.age_s,
             float(self.refused),
-            float(tick.strangers),
+            float(tick.other_datagrams),
             tick.pause_s,
         )
         return TickRecord(*values)

@@ -16,10 +16,10 @@ class Snapshot:
     another thread. SI, NED, vehicle time; NaN or None for what is not known yet. The attributes are
     the fields of the JSON objects.
 
-    `strangers`: datagrams of other senders since the start. `flights`: that the service has begun.
+    `other_datagrams`: of other senders, since the start. `flights`: that the service has begun.
     """
 
-    def __init__(self, state: FlightState, strangers: int, flights: int = 0) -> None:
+    def __init__(self, state: FlightState, other_datagrams: int, flights: int = 0) -> None:
         vehicle, command, link = state.vehicle, state.command, state.clock.delay
         position, attitude = vehicle.position, vehicle.attitude
         sample = (
@@ -56,7 +56,7 @@ class Snapshot:
         self.skipped_ticks = state.busyness.skipped  # in pauses of this process, since take-off
         self.computer = state.busyness.sentence  # that it is too busy; empty if it keeps up
         self.battery = NAN if charge is None else charge  # remaining, of 1
-        self.strangers = strangers
+        self.other_datagrams = other_datagrams
         self.forged = state.session.counters.forged  # frames that signing refused since the start
         self.texts = tuple(state.announced[-TEXTS_KEPT:])  # the newest announcements, oldest first
         self.flights = flights

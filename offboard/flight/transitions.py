@@ -176,7 +176,7 @@ def _begin_engaging(flight: FlightState) -> None:
     """Here, not with the request: a vehicle that shows the mode already passes without one."""
     assert flight.authority is not None
     flight.authority.ask()
-    _adopt_hover_thrust(flight)
+    _set_hover_thrust(flight)
 
 
 def _begin_takeoff(flight: FlightState) -> None:
@@ -201,7 +201,7 @@ def _begin_climb(flight: FlightState, source: Phase) -> None:
     if in_the_air:
         _place_reference(flight, position)
     if in_the_air or flight.takes_off_by_command:
-        _adopt_hover_thrust(flight, SETTLED if source is Phase.STANDBY else DIFFERENT)
+        _set_hover_thrust(flight, SETTLED if source is Phase.STANDBY else DIFFERENT)
     flight.observer.freeze(False)
     decision.begin(flight)
     flight.plan.start_climb(
@@ -234,14 +234,14 @@ def _place_reference(flight: FlightState, position: LocalPosition) -> None:
         flight.plan.origin_ned_m = flight.home_ned_m
 
 
-def _adopt_hover_thrust(flight: FlightState, least: float = DIFFERENT) -> None:
+def _set_hover_thrust(flight: FlightState, least: float = DIFFERENT) -> None:
     """Fly with the hover thrust that the autopilot's own flight shows, if it is another."""
     model = flight.model
     shown = flight.hover.hover_thrust(model, flight.time_s)
     if shown is None or not differs(shown, model, least):
         return
     flight.model = model.model_copy(update={"hover_thrust": shown})
-    flight.observer.adopt(flight.model)
+    flight.observer.set_vehicle(flight.model)
     if flight.identification:
         flight.identification.on_hover_thrust(shown)
     outbox.announce(

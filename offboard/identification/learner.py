@@ -82,7 +82,7 @@ class Stage(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Learned:
+class IdentifiedVehicle:
     """What a flight has identified, for the next one of the same vehicle. The delays of `vehicle`
     contain the link's delay of then, `link_s` (telemetry and setpoint together; 0 if it was not
     measured). `delay` is the delay of the tilt and its standard deviation, s."""
@@ -98,7 +98,7 @@ class Learner:
     Args:
         file: constants of the vehicle file.
         delay_error_s: what its delays may be wrong by.
-        learned: what an earlier flight has identified.
+        known: what an earlier flight has identified.
 
     `vehicle` are the constants to fly with. `delay` is that of the tilt once identified.
     `sentences` for the user and `record` for the log are what is new; who reads them empties them.
@@ -109,14 +109,14 @@ class Learner:
     """
 
     def __init__(
-        self, file: Vehicle, *, delay_error_s: float, learned: Learned | None = None
+        self, file: Vehicle, *, delay_error_s: float, known: IdentifiedVehicle | None = None
     ) -> None:
         self._file = file
-        self.vehicle = learned.vehicle if learned else file
+        self.vehicle = known.vehicle if known else file
         self._unknown_s = delay_error_s
-        self._recalled = learned
-        self.delay: Estimate | None = learned.delay if learned else None
-        self.identified = learned is not None
+        self._recalled = known
+        self.delay: Estimate | None = known.delay if known else None
+        self.identified = known is not None
         self.recorder = Recorder()
         self.sentences: list[str] = []
         self.record: tuple[float, ...] = ()
@@ -163,11 +163,11 @@ class Learner:
         return self.in_doubt or self._contradictions > 0 or bool(self.contradiction)
 
     @property
-    def learned(self) -> Learned | None:
+    def result(self) -> IdentifiedVehicle | None:
         """What the next flight may begin with; None if nothing was identified, or in doubt."""
         if self.delay is None or self.contradicted or not self.identified:
             return None
-        return Learned(self.vehicle, self.delay, self._link_s)
+        return IdentifiedVehicle(self.vehicle, self.delay, self._link_s)
 
     # ------------------------------------------------------------------ before and at take-off
 
@@ -184,7 +184,7 @@ class Learner:
             self.sentences.append(f"link delay {_in_ms(link)}, telemetry and setpoint together")
         self._unknown_s += JUMP_SDS * link.sd
 
-    def _on_other_link(self, recalled: Learned, delay: Estimate, link: Estimate) -> None:
+    def _on_other_link(self, recalled: IdentifiedVehicle, delay: Estimate, link: Estimate) -> None:
         """Adapt what was recalled to the link's delay of now."""
         changed_s = link.value - max(recalled.link_s, DIRECT_LINK_S)
         changed_s = max(changed_s, -self.vehicle.tilt.delay_s, -self.vehicle.yaw.delay_s)

@@ -56,7 +56,7 @@ class Motion:
     """Positions of a trace with the attitude at their times, at least `spacing_s` apart.
 
     `times` (N,), `positions` (3, N) NED in m, `direction_ne` (2, N) thrust direction north and
-    east, `upright` (N,) its part down.
+    east, `b_z` (N,) its part down.
     """
 
     def __init__(self, trace: Trace, spacing_s: float = SPACING_S) -> None:
@@ -68,7 +68,7 @@ class Motion:
         self.direction_ne = np.array(
             [np.interp(self.times, stamps, trace.attitude[:, NORTH + axis]) for axis in (0, 1)]
         )
-        self.upright = np.sqrt(np.maximum(1.0 - np.sum(self.direction_ne**2, axis=0), 0.01))
+        self.b_z = np.sqrt(np.maximum(1.0 - np.sum(self.direction_ne**2, axis=0), 0.01))
         self._sent_at = trace.commands[:, SENT_AT]
         self._sent_thrust = trace.commands[:, SENT_THRUST, None]
 
@@ -109,7 +109,7 @@ def predicted_velocity(motion: Motion, vehicle: Vehicle) -> Array:
     thrust = vehicle.thrust_max_mps2 * motion.thrust(vehicle.thrust_delay_s, vehicle.thrust_lag_s)
     gravity = np.array([[0.0], [0.0], [vehicle.gravity_mps2]])
     push = acceleration(
-        gravity, thrust * np.vstack((motion.direction_ne, motion.upright)), 0.0, 0.0, 0.0
+        gravity, thrust * np.vstack((motion.direction_ne, motion.b_z)), 0.0, 0.0, 0.0
     )
     push -= push.mean(axis=1, keepdims=True)  # a constant disturbance
     drag_ps, steps_s = vehicle.drag_per_mass_ps, np.diff(motion.times)
@@ -260,7 +260,7 @@ def fit_vertical(motion: Motion, gravity_mps2: float, prior: VerticalPrior) -> V
     def innovations(parameters: Array) -> Array:
         inverse, delay_s, lag_s, drag_ps = parameters
         thrust = inverse * motion.thrust(delay_s, lag_s)
-        accelerations = gravity_mps2 * (1.0 - thrust * motion.upright)
+        accelerations = gravity_mps2 * (1.0 - thrust * motion.b_z)
         surprises: Array = vertical.innovations(motion.positions[2:], accelerations[None], drag_ps)[
             0
         ]

@@ -62,14 +62,14 @@ class Senders:
         self.own = Address(1, component_id)
         self.vehicle: VehicleFound | None = None
         self.dialect: Dialect | None = None
-        self.greeted = False  # an autopilot whose clock is behind ours was heard
+        self.clock_behind = False  # an autopilot whose clock is behind ours was heard
         self.systems: dict[int, float] = {}
         self.heard_s = 0.0
         self._wanted = wanted
         self._has_key = has_key
         self._place: Hashable | None = None  # the vehicle's address
 
-    def adopt(self, vehicle: VehicleFound, place: Hashable) -> None:
+    def set_vehicle(self, vehicle: VehicleFound, place: Hashable) -> None:
         """Take this vehicle, which sends from `place`, as ours."""
         self.vehicle, self.dialect, self._place = vehicle, DIALECTS[vehicle.autopilot], place
         self.own = Address(vehicle.system_id, self.own.component_id)
@@ -136,7 +136,7 @@ class Senders:
         if frame.signed and not self._has_key:
             return DropReason.NO_KEY
         vehicle = VehicleFound(frame.system_id, frame.component_id, heard.name)
-        self.adopt(vehicle, place)
+        self.set_vehicle(vehicle, place)
         events.append(vehicle)
         return None
 
@@ -204,15 +204,15 @@ class Senders:
         if len(self.systems) > SYSTEMS_MAX:
             del self.systems[next(iter(self.systems))]
 
-    def greet(self, frame: Frame, now_s: float, events: list[Event]) -> None:
-        """Greet the autopilot whose frame has a right signature and a clock that is behind: its
+    def note_clock_behind(self, frame: Frame, now_s: float, events: list[Event]) -> None:
+        """Note the autopilot whose frame has a right signature and a clock that is behind: its
         clock follows ours with our heartbeat. The frame may be a replay: nothing else is
         believed."""
         heard = self.note(frame, now_s)
         if isinstance(heard, Dialect) and self._wanted in (None, frame.system_id):
             beat = decode(frame, heard)
             assert isinstance(beat, Heartbeat)
-            self.greeted = True
+            self.clock_behind = True
             events.append(ClockBehind(frame.system_id, beat.armed))
 
     def is_for_us(self, ack: Frame) -> bool:

@@ -145,7 +145,7 @@ class Session:
         forged = self._signing.refusal(frame) if self._signing else None
         if forged:
             if forged is DropReason.OLD_STAMP and self.vehicle is None:
-                self.senders.greet(frame, self.link_time_s, arrival.events)
+                self.senders.note_clock_behind(frame, self.link_time_s, arrival.events)
             return forged
         was_found = self.vehicle is not None
         foreign = self.senders.judge(frame, arrival.place, self.link_time_s, arrival.events)
@@ -192,9 +192,9 @@ class Session:
 
     # --- the vehicle ---
 
-    def adopt(self, vehicle: VehicleFound, peer: Hashable) -> None:
+    def set_vehicle(self, vehicle: VehicleFound, peer: Hashable) -> None:
         """Take this vehicle, which sends from `peer`, as ours."""
-        self.senders.adopt(vehicle, peer)
+        self.senders.set_vehicle(vehicle, peer)
         self._begin()
 
     def _begin(self) -> None:
@@ -224,7 +224,7 @@ class Session:
         """
         now_s = self._time.now_s(now_s)
         self._time.on_host(now_s)
-        if not (self.dialect or self.senders.greeted or self.settings.sends_first):
+        if not (self.dialect or self.senders.clock_behind or self.settings.sends_first):
             return ()
         due: list[Outgoing] = []
         link_s = self.link_time_s

@@ -85,6 +85,6 @@ def lead(value: Array, rate: Array, acceleration: Array, response: AxisResponse)
 
 
 @kernel
-def upright(north: float, east: float) -> float:
+def b_z_of(north: float, east: float) -> float:
     """Third component of a unit vector, kept positive whatever the other two are."""
     return math.sqrt(max(1.0 - north * north - east * east, 0.01))

@@ -97,9 +97,9 @@ def quaternion_from_thrust_direction(direction_ned: ArrayLike, heading_rad: Arra
     down = np.where(level, 1.0, down)[()]
     ahead = north * np.cos(heading) + east * np.sin(heading)
     right = east * np.cos(heading) - north * np.sin(heading)
-    upright = np.copysign(1.0, down)
-    phi = np.arctan2(-right, upright * np.hypot(ahead, down))
-    theta = np.arctan2(upright * ahead, upright * down)
+    sign = np.copysign(1.0, down)
+    phi = np.arctan2(-right, sign * np.hypot(ahead, down))
+    theta = np.arctan2(sign * ahead, sign * down)
     return quaternion_from_euler(phi, theta, heading)
 
 

@@ -136,8 +136,8 @@ def nominal_inputs(states: Array, samples: FlatSample, vehicle: Vehicle, tilted:
     inputs[:, 1:] += 0.5 * drag * (rates[1:] + rates[:-1])
     inputs[:, 1:3] /= vehicle.arm_m
     upward = -(samples.acceleration_ned_mps2 + vehicle.drag_per_mass_ps * samples.velocity_ned_mps)
-    upright = np.cos(states[:, PHI]) * np.cos(states[:, THETA]) if tilted else 1.0
-    lift = vehicle.mass_kg * (vehicle.gravity_mps2 + upward[:, 2]) / upright
+    b_z = np.cos(states[:, PHI]) * np.cos(states[:, THETA]) if tilted else 1.0
+    lift = vehicle.mass_kg * (vehicle.gravity_mps2 + upward[:, 2]) / b_z
     inputs[:, THRUST] = 0.5 * (lift[1:] + lift[:-1]) - vehicle.mass_kg * vehicle.gravity_mps2
     return inputs
 

@@ -18,7 +18,7 @@ from offboard.flight.inputs import (
     Check,
     FramesDropped,
     InputsError,
-    StrangersCounted,
+    OtherDatagrams,
     TurnInput,
 )
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
@@ -118,8 +118,8 @@ class Replay:
                         yield turn
                     case FramesDropped(count):
                         del self._leaving[len(self._leaving) - count :]
-                    case StrangersCounted(total):
-                        self.companion.strangers = total
+                    case OtherDatagrams(total):
+                        self.companion.other_datagrams = total
                     case Call(name, arguments) if name in CALLS:
                         getattr(self.companion, name)(*arguments)
                     case Check(crc) if crc != self._crc & 0xFFFF:

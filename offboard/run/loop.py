@@ -39,7 +39,7 @@ class Flown(Protocol):
     """What the loop needs of a companion, or of the flights of a service."""
 
     peer: Hashable | None
-    strangers: int
+    other_datagrams: int
 
     @property
     def phase(self) -> Phase: ...
@@ -144,7 +144,7 @@ class Loop:
             if frame not in dropped:
                 self._log.write(stamp, frame)
         report = self._link.report
-        self._companion.strangers = report.ignored
+        self._companion.other_datagrams = report.ignored
         self._companion.overhear(report.overheard())
         for sentence in report.news():
             self._companion.announce(sentence)

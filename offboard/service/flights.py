@@ -16,7 +16,7 @@ from offboard.flight.phases import ENDS, FLYING, WAITING, Phase, ServiceOptions
 from offboard.flight.snapshot import Snapshot
 from offboard.flight.starting import found_engaged
 from offboard.flight.state import FlightState
-from offboard.identification.learner import Learned
+from offboard.identification.learner import IdentifiedVehicle
 from offboard.link.interface import Chunk
 from offboard.mavlink.session import Session
 from offboard.run.flight import Prepared
@@ -64,8 +64,8 @@ class Record(Protocol):
 class Memory(Protocol):
     """The vehicles that were identified, by key. No method waits."""
 
-    def get(self, key: str, prepared: Prepared) -> Learned | None: ...
-    def keep(self, key: str, prepared: Prepared, learned: Learned) -> None: ...
+    def get(self, key: str, prepared: Prepared) -> IdentifiedVehicle | None: ...
+    def keep(self, key: str, prepared: Prepared, identified: IdentifiedVehicle) -> None: ...
     def discard(self, key: str) -> None: ...
 
 
@@ -102,8 +102,8 @@ class Flights:
         self.announcements = 0
         self.engagements = 0
         self._prepared = source.newest()
-        self._learned: Learned | None = None  # of the vehicle, for the next flight
-        self._recalled: Learned | None = None  # that the present companion began with
+        self._known: IdentifiedVehicle | None = None  # of the vehicle, for the next flight
+        self._recalled: IdentifiedVehicle | None = None  # that the present companion began with
         self._current = self._companion(None)
 
     # ------------------------------------------------------------------ as a companion
@@ -131,13 +131,13 @@ class Flights:
         self._current.peer = place
 
     @property
-    def strangers(self) -> int:
+    def other_datagrams(self) -> int:
         """Datagrams of other senders since the start."""
-        return self._current.strangers
+        return self._current.other_datagrams
 
-    @strangers.setter
-    def strangers(self, number: int) -> None:
-        self._current.strangers = number
+    @other_datagrams.setter
+    def other_datagrams(self, number: int) -> None:
+        self._current.other_datagrams = number
 
     @property
     def outcome(self) -> Outcome | None:
@@ -216,7 +216,7 @@ class Flights:
     def _renew_if_changed(self) -> None:
         """Wait with the newest configuration, and with what is known of the vehicle."""
         newest = self._source.newest()
-        changed = newest is not self._prepared or self._remembered(newest) is not self._learned
+        changed = newest is not self._prepared or self._remembered(newest) is not self._known
         if changed and not self._stopping:
             self._follow(newest)
         for sentence in self._source.news():
@@ -226,18 +226,18 @@ class Flights:
         """Continue with a new companion where the present one has ended or waits."""
         self._collect()
         known = self._remembered(prepared)
-        self._prepared, self._learned = prepared, known
+        self._prepared, self._known = prepared, known
         self._current = self._companion(self._current)
         self._shown = 0
 
     def _companion(self, before: Flight | None) -> Flight:
         self._prepared.controller.reset()
-        self._recalled = self._learned
+        self._recalled = self._known
         return self._prepared.companion(
             self._session,
             self._stopwatch,
             keeps_deadline=self._keeps_deadline,
-            learned=self._learned,
+            known=self._known,
             service=self._options,
             before=before,
         )
@@ -284,7 +284,7 @@ class Flights:
         """The vehicle; empty for one without a number, which cannot be told from others."""
         return self._identity if self.state.vehicle.uid else ""
 
-    def _remembered(self, prepared: Prepared) -> Learned | None:
+    def _remembered(self, prepared: Prepared) -> IdentifiedVehicle | None:
         return self._memory.get(self._key, prepared) if self._key else None
 
     def _keep_identified(self) -> None:
@@ -292,17 +292,17 @@ class Flights:
         if identification is None or not self._key:
             return
         if identification.contradicted:
-            if self._learned is not None:
-                self._learned = None
+            if self._known is not None:
+                self._known = None
                 self._memory.discard(self._key)
                 self._current.announce(
                     "what was identified of this vehicle is contradicted, and discarded: the next "
                     "flight identifies it again"
                 )
-        elif self._learned is None:
-            found = identification.learned
+        elif self._known is None:
+            found = identification.result
             if found is not None:
-                self._learned = found
+                self._known = found
                 self._memory.keep(self._key, self._prepared, found)
 
     # ------------------------------------------------------------------ what the user reads

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from offboard.documents.reading import DocumentError, read, validate
 from offboard.documents.shipped import read_text
-from offboard.identification.learner import Learned
+from offboard.identification.learner import IdentifiedVehicle
 from offboard.identification.uncertainty import Estimate
 from offboard.model.vehicle import Vehicle
 from offboard.run.flight import Prepared
@@ -41,7 +41,7 @@ class VehicleFiles:
 
     def __init__(self, directory: Path, tell: Callable[[str], None]) -> None:
         self._directory = directory
-        self._known: dict[str, tuple[str, Learned]] = {}
+        self._known: dict[str, tuple[str, IdentifiedVehicle]] = {}
         self._clerk = ThreadPoolExecutor(max_workers=1, thread_name_prefix="vehicles")
         for path in sorted(directory.glob("*.yaml")) if directory.is_dir() else ():
             try:
@@ -49,15 +49,15 @@ class VehicleFiles:
             except (DocumentError, OSError) as error:
                 tell(f"{path} is not used: {error}")
 
-    def get(self, key: str, prepared: Prepared) -> Learned | None:
+    def get(self, key: str, prepared: Prepared) -> IdentifiedVehicle | None:
         """What is known of this vehicle, if it was identified from the same vehicle file."""
-        source, learned = self._known.get(key, ("", None))
-        return learned if source == _digest(prepared.config.vehicle) else None
+        source, identified = self._known.get(key, ("", None))
+        return identified if source == _digest(prepared.config.vehicle) else None
 
-    def keep(self, key: str, prepared: Prepared, learned: Learned) -> None:
+    def keep(self, key: str, prepared: Prepared, identified: IdentifiedVehicle) -> None:
         source = _digest(prepared.config.vehicle)
-        self._known[key] = source, learned
-        self._clerk.submit(self._write, key, source, learned)
+        self._known[key] = source, identified
+        self._clerk.submit(self._write, key, source, identified)
 
     def discard(self, key: str) -> None:
         self._known.pop(key, None)
@@ -66,13 +66,13 @@ class VehicleFiles:
     def close(self) -> None:
         self._clerk.shutdown(wait=True)
 
-    def _write(self, key: str, source: str, learned: Learned) -> None:
+    def _write(self, key: str, source: str, identified: IdentifiedVehicle) -> None:
         document = {
             "identified_from": source,
-            "tilt_delay_s": learned.delay.value,
-            "tilt_delay_sd_s": learned.delay.sd,
-            "link_delay_s": learned.link_s,
-            "vehicle": learned.vehicle.model_dump(mode="json"),
+            "tilt_delay_s": identified.delay.value,
+            "tilt_delay_sd_s": identified.delay.sd,
+            "link_delay_s": identified.link_s,
+            "vehicle": identified.vehicle.model_dump(mode="json"),
         }
         path = self._directory / f"{key}.yaml"
         with suppress(OSError):  # then the next start identifies it again
@@ -86,10 +86,12 @@ class VehicleFiles:
             (self._directory / f"{key}.yaml").unlink()
 
 
-def _load(path: Path) -> tuple[str, Learned]:
+def _load(path: Path) -> tuple[str, IdentifiedVehicle]:
     document = validate(read(read_text(path), str(path)), Document, str(path))
     delay = Estimate(document.tilt_delay_s, document.tilt_delay_sd_s)
-    return document.identified_from, Learned(document.vehicle, delay, document.link_delay_s)
+    return document.identified_from, IdentifiedVehicle(
+        document.vehicle, delay, document.link_delay_s
+    )
 
 
 def _digest(vehicle: Vehicle) -> str:

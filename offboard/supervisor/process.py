@@ -107,7 +107,7 @@ class Watch:
             self.newest = message
 
 
-class Rescue:
+class TakeOver:
     """Takes the controller's place: sends on its link what `Recovery` asks for, and logs it."""
 
     def __init__(self, watch: Watch, tell: BackgroundWriter[str]) -> None:
@@ -120,7 +120,7 @@ class Rescue:
         )
         signing = watch.key and Signing.resumed(watch.key, clock.monotonic_s, beat["signing"])
         self._session = Session(SessionSettings(stream=beat["stream"]), signing or None)
-        self._session.adopt(VehicleFound(**beat["vehicle"]), self._peer)
+        self._session.set_vehicle(VehicleFound(**beat["vehicle"]), self._peer)
         self._session.status = ACTIVE, LANDING
         assert self._session.dialect is not None
         self._recovery = Recovery(
@@ -256,7 +256,7 @@ def main() -> None:
     if reason:
         tell = BackgroundWriter[str](lambda said: _tell(channel, said), 1000)
         _announce(channel, tell, f"taking over: {reason}")
-        Rescue(watch, tell).run(reason)
+        TakeOver(watch, tell).run(reason)
         tell.close(CLOSE_S)
         if watch.ended:
             _score(watch.descriptors[-1])

@@ -22,7 +22,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.flight.phases import Anchor, Phase, ServiceOptions, Then
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
-from offboard.identification.learner import Learned
+from offboard.identification.learner import IdentifiedVehicle
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.run import configuration as config
 from offboard.run.flight import Prepared, build
@@ -83,14 +83,14 @@ class Logs:
 class Remembered:
     """A `Memory` without files."""
 
-    known: dict[str, Learned] = field(default_factory=dict)
+    known: dict[str, IdentifiedVehicle] = field(default_factory=dict)
     discarded: list[str] = field(default_factory=list)
 
-    def get(self, key: str, prepared: Prepared) -> Learned | None:
+    def get(self, key: str, prepared: Prepared) -> IdentifiedVehicle | None:
         return self.known.get(key)
 
-    def keep(self, key: str, prepared: Prepared, learned: Learned) -> None:
-        self.known[key] = learned
+    def keep(self, key: str, prepared: Prepared, identified: IdentifiedVehicle) -> None:
+        self.known[key] = identified
 
     def discard(self, key: str) -> None:
         self.known.pop(key, None)

@@ -392,7 +392,7 @@ def test_mass_that_changes_in_flight_is_followed(mass_scale, tmp_path: Path):
     hover = simulated.vehicle("px4_sih").hover_thrust * mass_scale
     identification = pair.companion.identification
     assert identification is not None
-    assert identification.learned.vehicle.hover_thrust == pytest.approx(hover, rel=0.05)
+    assert identification.result.vehicle.hover_thrust == pytest.approx(hover, rel=0.05)
     assert any(line.startswith("identified hover thrust") for line in pair.companion.announced)
 
 
@@ -426,7 +426,7 @@ def test_observer_goes_on_smoothly_with_another_drag():
         observer.on_attitude(time_s, level, (0.0, 0.0, 0.0))
         observer.on_position(time_s, (2.0 * time_s, -time_s, -3.0), (2.0, -1.0, 0.0))
     old = observer.predict(3.0)
-    observer.adopt(after)
+    observer.set_vehicle(after)
     new = observer.predict(3.0)
     change = new.disturbance_ned_mps2 - old.disturbance_ned_mps2
     assert change == pytest.approx(0.8 * old.velocity_ned_mps, abs=0.02)

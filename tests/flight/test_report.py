@@ -169,7 +169,7 @@ def test_a_log_of_another_program_gives_what_it_holds(tmp_path: Path) -> None:
     arducopter = read(ARDUCOPTER)
     assert arducopter.facts["autopilot"] == "ardupilot"
     assert "no ATTITUDE_QUATERNION: the attitude is that of ATTITUDE" in arducopter.missing
-    flooded = replace(arducopter, score=replace(arducopter.score, strangers=31.0))
+    flooded = replace(arducopter, score=replace(arducopter.score, other_datagrams=31.0))
     shown = page([flooded])
     assert "no records of offboard" in shown
     assert "31 datagrams of others" in shown

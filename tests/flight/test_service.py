@@ -141,11 +141,13 @@ def test_a_contradicted_vehicle_is_identified_again() -> None:
     pair, _ = engaged("px4", reference="lemniscate")
     pair.until(lambda: pair.phase is Phase.JOIN, 30.0)
     (key,) = pair.memory.known
-    learned = pair.memory.known[key]
-    late = learned.vehicle.tilt.model_copy(update={"delay_s": 0.2, "natural_frequency_radps": 6.0})
+    identified = pair.memory.known[key]
+    late = identified.vehicle.tilt.model_copy(
+        update={"delay_s": 0.2, "natural_frequency_radps": 6.0}
+    )
     memory = Remembered()
-    wrong = learned.vehicle.model_copy(update={"tilt": late})
-    memory.known[key] = type(learned)(wrong, learned.delay, learned.link_s)
+    wrong = identified.vehicle.model_copy(update={"tilt": late})
+    memory.known[key] = type(identified)(wrong, identified.delay, identified.link_s)
     again, _ = engaged("px4", reference="lemniscate", memory=memory)
     again.run(14.0)
     again.switch("pilot")

@@ -1,7 +1,7 @@
 """Controller stopped in track: the supervisor and PX4's own failsafe for missing setpoints.
 
 The vehicle is the simulated PX4; the controller stops as by SIGSTOP. The supervisor's decisions are
-those of its process (`supervisor.process.Rescue`), without sockets.
+those of its process (`supervisor.process.TakeOver`), without sockets.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Stopped:
         for name, value in QUICK_LANDING.items():
             parameters.set(name, value)
         self.session = Session(SessionSettings())
-        self.session.adopt(VEHICLE, "vehicle")
+        self.session.set_vehicle(VEHICLE, "vehicle")
         self.recovery: Recovery | None = None
         self.feed = self.instance.feed
         self.feed(self.session.encode(CommandLong.message_interval(436, 50.0)))  # CURRENT_MODE

@@ -150,7 +150,7 @@ def test_forged_frames_in_flight_change_nothing_and_are_counted(tmp_path: Path) 
     shown = attacked.companion.snapshot()
     assert shown.forged > 2000
     assert any("frames refused by signing" in line for line in attacked.companion.announced)
-    assert attacked.score(tmp_path).strangers > 800
+    assert attacked.score(tmp_path).other_datagrams > 800
     assert not attacked.failsafes
 
 

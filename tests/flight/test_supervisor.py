@@ -158,7 +158,7 @@ class Beating:
     """A companion whose vehicle is ours; counts what the loop read for it."""
 
     phase, outcome, announced = Phase.TRACK, None, ()
-    strangers = read = 0
+    other_datagrams = read = 0
 
     def __init__(self, peer: Any) -> None:
         self.peer = peer
@@ -389,7 +389,7 @@ def test_it_signs_with_stamps_that_follow_ours(tmp_path: Path) -> None:
     key = bytes(range(32))
     signing = Signing(key, 10**12, clock.monotonic_s)
     ours = Session(SessionSettings(), signing)
-    ours.adopt(VEHICLE, "tcp")
+    ours.set_vehicle(VEHICLE, "tcp")
     link = open_link("tcpin:127.0.0.1:0")
     with socket.socket(fileno=os.dup(link.descriptors()[0])) as listener:
         vehicle = Caller(listener.getsockname()[1])

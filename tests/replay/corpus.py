@@ -21,7 +21,7 @@ from offboard.flight.inputs import (
     Call,
     FramesDropped,
     InputRecorder,
-    StrangersCounted,
+    OtherDatagrams,
     TurnInput,
 )
 from offboard.flight.manifest import PAYLOAD_TYPE as MANIFEST
@@ -117,7 +117,7 @@ def inputs_of(
 ) -> list[ConfigurationRecord]:
     """The inputs as recorded, for the messages that are kept."""
     recorder = InputRecorder(SessionSettings(**recording.settings))  # type: ignore[arg-type]
-    number, strangers = 0, 0
+    number, other_datagrams = 0, 0
     reading = 0.0
     read_again = recorder.watch(lambda: reading)
     for each in recording.entries():
@@ -125,7 +125,7 @@ def inputs_of(
             case TurnInput(now_s, chunks, readings_s):
                 number += 1
                 messages = iter(turns[number])
-                recorder.begin(now_s, strangers)
+                recorder.begin(now_s, other_datagrams)
                 for chunk in chunks:
                     frames = [next(messages).frame for _ in range(chunk.frames)]
                     used = [frame.message_id in USED for frame in frames]
@@ -138,8 +138,8 @@ def inputs_of(
                 recorder.end()
             case Call(name, arguments) if name in CALLS:
                 recorder.call(name, *arguments)
-            case StrangersCounted(total):
-                strangers = total
+            case OtherDatagrams(total):
+                other_datagrams = total
             case FramesDropped(count):
                 recorder.dropped(count)
     return recorder.pieces(all_of_it=True)

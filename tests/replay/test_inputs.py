@@ -15,7 +15,7 @@ from offboard.flight.inputs import (
     Entry,
     InputRecorder,
     InputsError,
-    StrangersCounted,
+    OtherDatagrams,
     TurnInput,
     entries,
 )
@@ -47,12 +47,12 @@ TURNS = st.lists(
 def test_what_is_read_is_what_was_recorded(turns) -> None:
     recorder, pieces = InputRecorder(SessionSettings()), []
     expected: list[Entry] = []
-    strangers, now_us = 0, 0
+    other_datagrams, now_us = 0, 0
     read = recorder.watch(lambda: now_us / 1e6)
     for at_us, counted, chunks, readings, is_tick in turns:
-        if counted != strangers:
-            expected.append(StrangersCounted(counted))
-        strangers, now_us = counted, at_us
+        if counted != other_datagrams:
+            expected.append(OtherDatagrams(counted))
+        other_datagrams, now_us = counted, at_us
         assert recorder.begin(at_us / 1e6 + 2e-7, counted) == at_us / 1e6
         for peer, before_us, frames, unlogged in chunks:
             chunk = Chunk(b"", peer, (at_us - before_us) / 1e6)

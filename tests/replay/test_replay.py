@@ -257,7 +257,7 @@ def test_slow_decisions_a_stop_request_strangers_and_a_signed_link(tmp_path: Pat
         return law
 
     def stop(pair: Pair) -> None:
-        pair.companion.strangers = 31
+        pair.companion.other_datagrams = 31
         pair.companion.announce("31 datagrams of others")
         pair.companion.request_stop("enough")
 

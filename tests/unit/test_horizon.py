@@ -100,8 +100,8 @@ def _flown(state: PredictedState, plan: np.ndarray) -> np.ndarray:
     leaning = pull / np.linalg.norm(pull)
 
     def motion(_: float, x: np.ndarray, tilt: np.ndarray, thrust: float) -> np.ndarray:
-        upright = math.sqrt(1.0 - x[6] ** 2 - x[7] ** 2)
-        acceleration = pull - x[10] * np.array([x[6], x[7], upright]) - c * x[3:6]
+        b_z = math.sqrt(1.0 - x[6] ** 2 - x[7] ** 2)
+        acceleration = pull - x[10] * np.array([x[6], x[7], b_z]) - c * x[3:6]
         twist = wn**2 * (tilt - x[6:8]) - 2.0 * z * wn * x[8:10]
         lag = (thrust - x[10]) / PX4.thrust_lag_s
         return np.concatenate((x[3:6], acceleration, x[8:10], twist, [lag]))
@@ -158,9 +158,9 @@ def test_first_bounds_are_those_of_one_decision() -> None:
     law = horizon()
     for situation in situations(5, 1.0):
         task, _, evaluate = prepared(law, situation)
-        target, box, upright = task.target, task.problem, task.upright
+        target, box, b_z = task.target, task.problem, task.b_z
         for ours, theirs in ((evaluate.lower[0], box.lower), (evaluate.upper[0], box.upper)):
-            thrust = (target.thrust_down_feedforward_mps2 + ours[2]) / upright
+            thrust = (target.thrust_down_feedforward_mps2 + ours[2]) / b_z
             assert thrust == pytest.approx(theirs[0], rel=1e-9)
             assert target.tilt_feedforward + ours[:2] == pytest.approx(theirs[1:3], abs=1e-9)
 
@@ -171,14 +171,14 @@ def test_a_plan_of_zeros_flies_the_reference() -> None:
     sample = reference.sample(5.057)
     start = state_of(np.random.default_rng(0), reference, 0.0)
     target = law.target(reference, 5.0, start)
-    upright = math.sqrt(1.0 - target.direction_ne @ target.direction_ne)
+    b_z = math.sqrt(1.0 - target.direction_ne @ target.direction_ne)
     state = replace(
         start,
         position_ned_m=sample.position_ned_m,
         velocity_ned_mps=sample.velocity_ned_mps,
-        thrust_direction_ned=np.array([*target.direction_ne, upright]),
+        thrust_direction_ned=np.array([*target.direction_ne, b_z]),
         thrust_direction_rate_ned_ps=np.array([*target.direction_rate_ne_ps, 0.0]),
-        thrust_mps2=target.thrust_down_mps2 / upright,
+        thrust_mps2=target.thrust_down_mps2 / b_z,
     )
     _, _, evaluate = prepared(law, Situation(5.0, state, reference, LEVEL))
     plan = evaluate.open_loop(np.zeros((STEPS, 3)))

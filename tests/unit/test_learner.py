@@ -9,7 +9,7 @@ from offboard.flight.online_identification import IdentifySettings, OnlineIdenti
 from offboard.flight.phases import Phase
 from offboard.identification import learner as learning
 from offboard.identification.attitude_fit import ResponseFit, Unexplained
-from offboard.identification.learner import UNKNOWN_DELAY_S, Learned, Learner, Stage
+from offboard.identification.learner import UNKNOWN_DELAY_S, IdentifiedVehicle, Learner, Stage
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_fit import Identified, within_bounds
 from offboard.model.vehicle import AxisResponse, Vehicle
@@ -242,10 +242,10 @@ def test_lasting_contradiction_is_announced_twice(monkeypatch: pytest.MonkeyPatc
 
 
 def test_what_is_recalled_needs_no_steps_and_is_not_adopted_again() -> None:
-    recalled = Learned(FILE, Estimate(0.04, 0.002), 0.0)
-    identification = OnlineIdentification(FILE, IdentifySettings(), learned=recalled)
+    recalled = IdentifiedVehicle(FILE, Estimate(0.04, 0.002), 0.0)
+    identification = OnlineIdentification(FILE, IdentifySettings(), known=recalled)
     assert not identification.wants_excitation
     assert identification.finished(0.0)
     identification.on_phase(Phase.CLIMB, 10.0)
     assert identification.learn(Phase.CLIMB, 10.0, 0.42) is None
-    assert identification.learned == recalled
+    assert identification.result == recalled

@@ -259,7 +259,7 @@ def test_hover_thrust_is_estimated_from_the_disturbance(scale: float) -> None:
     assert observer.hover_thrust_estimate == pytest.approx(PX4.hover_thrust / scale, rel=0.01)
 
     corrected = PX4.model_copy(update={"hover_thrust": observer.hover_thrust_estimate})
-    observer.adopt(corrected)
+    observer.set_vehicle(corrected)
     state = observer.predict(plant.time_s)
     assert observer.hover_thrust_estimate == pytest.approx(PX4.hover_thrust / scale, rel=0.01)
     assert state.disturbance_ned_mps2[2] == pytest.approx(0.0, abs=1e-9)

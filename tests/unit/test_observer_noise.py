@@ -69,7 +69,7 @@ def observe(
     observer.on_command(0.0, Command(G, (0.0, 0.0, 1.0), 0.0))
     positions, disturbances = np.empty_like(flown.positions), np.empty_like(flown.positions)
     if adopted:
-        observer.adopt(VEHICLE)
+        observer.set_vehicle(VEHICLE)
     for i, time_s in enumerate(flown.times.tolist()):
         position = flown.positions[i] + white[0] * rng.standard_normal(3)
         velocity = flown.velocities[i] + white[1] * rng.standard_normal(3)

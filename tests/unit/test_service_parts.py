@@ -21,7 +21,7 @@ from offboard.cli.daemon import may_pass
 from offboard.flight import manifest
 from offboard.flight.flight_plan import CLEAR_M, FlightPlan
 from offboard.flight.pilot_switch import PilotSwitch
-from offboard.identification.learner import Learned
+from offboard.identification.learner import IdentifiedVehicle
 from offboard.identification.uncertainty import Estimate
 from offboard.link import clock
 from offboard.link.interface import LinkError
@@ -44,7 +44,7 @@ REST = (0.0, 0.0, 0.0)  # velocity
 
 def session() -> Session:
     made = Session(SessionSettings())
-    made.adopt(VehicleFound(1, 1, "px4"), "vehicle")
+    made.set_vehicle(VehicleFound(1, 1, "px4"), "vehicle")
     return made
 
 
@@ -200,15 +200,15 @@ def test_a_flight_that_cannot_be_recorded_says_so_and_the_next_one_is(tmp_path: 
 def test_an_identified_vehicle_is_kept_and_used_for_the_same_file_alone(tmp_path: Path) -> None:
     known = build(load("flight", choices={"vehicle": "px4_sih"}))
     found = known.config.vehicle.model_copy(update={"hover_thrust": 0.51})
-    learned = Learned(found, Estimate(0.056, 0.002), 0.008)
+    identified = IdentifiedVehicle(found, Estimate(0.056, 0.002), 0.008)
     files = VehicleFiles(tmp_path / "vehicles", print)
-    files.keep("px4-1-1", known, learned)
-    assert files.get("px4-1-1", known) is learned
+    files.keep("px4-1-1", known, identified)
+    assert files.get("px4-1-1", known) is identified
     files.close()
     told: list[str] = []
     (tmp_path / "vehicles" / "bad.yaml").write_text("tilt_delay_s: no\n")
     again = VehicleFiles(tmp_path / "vehicles", told.append)
-    assert again.get("px4-1-1", known) == learned
+    assert again.get("px4-1-1", known) == identified
     assert again.get("px4-2-1", known) is None
     assert len(told) == 1
     assert "bad.yaml is not used" in told[0]

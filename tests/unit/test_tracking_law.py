@@ -97,16 +97,16 @@ def test_unconstrained_minimiser_is_the_lqr_law() -> None:
             state.thrust_direction_ned[:2] - target.direction_ne,
             state.thrust_direction_rate_ned_ps[:2] - target.direction_rate_ne_ps,
         ]
-        upright = state.thrust_direction_ned[2]
+        b_z = state.thrust_direction_ned[2]
         vertical = [
             state.position_ned_m[2] - target.position_down_m,
             state.velocity_ned_mps[2] - target.velocity_down_mps,
-            state.thrust_mps2 * upright - target.thrust_down_mps2,
+            state.thrust_mps2 * b_z - target.thrust_down_mps2,
         ]
         expected_tilt = target.tilt_feedforward - law.lateral.gain @ np.array(off)
         force = target.thrust_down_feedforward_mps2 - law.vertical.gain @ vertical
         assert minimiser[1:3] == pytest.approx(expected_tilt, abs=1e-9)
-        assert minimiser[0] == pytest.approx(force / upright, abs=1e-9)
+        assert minimiser[0] == pytest.approx(force / b_z, abs=1e-9)
         assert minimiser[3] == pytest.approx(target.heading_feedforward_rad)
         # what an optimal law has left to pay is x' P x
         left = np.sum(np.array(off) * (law.lateral.terminal @ np.array(off)))
@@ -121,16 +121,16 @@ def test_cost_vanishes_on_the_reference_and_never_goes_below_zero() -> None:
         task = law.task(Situation(5.0, state, reference, LEVEL))
         target, problem = task.target, task.problem
         assert problem(np.linalg.solve(problem.hessian, -problem.gradient)) > -1e-9
-    upright = math.sqrt(1 - target.direction_ne @ target.direction_ne)
+    b_z = math.sqrt(1 - target.direction_ne @ target.direction_ne)
     on_it = replace(
         state,
         position_ned_m=np.array([*target.position_ne_m, target.position_down_m]),
         velocity_ned_mps=np.array([*target.velocity_ne_mps, target.velocity_down_mps]),
-        thrust_direction_ned=np.array([*target.direction_ne, upright]),
+        thrust_direction_ned=np.array([*target.direction_ne, b_z]),
         thrust_direction_rate_ned_ps=np.array([*target.direction_rate_ne_ps, 0.0]),
-        thrust_mps2=target.thrust_down_mps2 / upright,
+        thrust_mps2=target.thrust_down_mps2 / b_z,
     )
-    nominal = [target.thrust_down_feedforward_mps2 / upright,
+    nominal = [target.thrust_down_feedforward_mps2 / b_z,
                *target.tilt_feedforward, target.heading_feedforward_rad]  # fmt: skip
     problem = law.task(Situation(5.0, on_it, reference, LEVEL)).problem
     cost = float(problem(np.array(nominal)))

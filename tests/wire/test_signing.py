@@ -230,7 +230,7 @@ def test_what_continues_has_later_stamps_and_refuses_older_ones() -> None:
     assert ours._signing is not None
     signing = Signing.resumed(KEY, lambda: 0.0, ours._signing.state())
     later = Session(SessionSettings(), signing)
-    later.adopt(events.VehicleFound(1, 1, "px4"), PEER)
+    later.set_vehicle(events.VehicleFound(1, 1, "px4"), PEER)
     assert later.receive(frame, PEER, 0.0).events == ()
     assert later.counters.dropped[DropReason.REPLAYED] == 1
     assert later.receive(vehicle.position(1020), PEER, 0.0).events

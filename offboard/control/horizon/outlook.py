@@ -29,7 +29,7 @@ class Outlook:
 
     positions_ned_m, velocities_ned_mps, directions_ned (2 N + 1, 3), each axis at its own times;
     thrusts_tilt_mps2 and thrusts_heave_mps2 (2 N + 1,): T when tilt and when thrust act;
-    uprights_heave (2 N + 1,): b_z when the thrust acts. feedforward (N, 3): b_c north and east and
+    b_z_heave (2 N + 1,): b_z when the thrust acts. feedforward (N, 3): b_c north and east and
     the vertical thrust in the middle of each hold, led. A steady vertical disturbance is nearly
     always a wrong hover thrust or mass; therefore the lateral force of the tilted thrust is taken
     as `thrust_share` of the modelled one.
@@ -40,7 +40,7 @@ class Outlook:
     directions_ned: Array
     thrusts_tilt_mps2: Array
     thrusts_heave_mps2: Array
-    uprights_heave: Array
+    b_z_heave: Array
     feedforward: Array
     thrust_share: float
 
@@ -76,7 +76,7 @@ def look_ahead(law: TrackingLaw, situation: Situation, steps: int) -> Outlook:
         directions_ned=np.ascontiguousarray(b[:count]),
         thrusts_tilt_mps2=flat.thrust_mps2[:count].copy(),
         thrusts_heave_mps2=flat.thrust_mps2[count:].copy(),
-        uprights_heave=b[count:, 2].copy(),
+        b_z_heave=b[count:, 2].copy(),
         feedforward=np.column_stack((led_tilt, led_down)),
         thrust_share=vehicle.gravity_mps2
         / (vehicle.gravity_mps2 + float(state.disturbance_ned_mps2[2])),
@@ -101,10 +101,10 @@ def bounds(outlook: Outlook, task: Task, law: TrackingLaw) -> Bounds:
     centre = np.clip(tilt, -limit, limit)
     lower[:, :2] = np.maximum(centre - reach, -limit) - tilt
     upper[:, :2] = np.minimum(centre + reach, limit) - tilt
-    uprights = outlook.uprights_heave[0:-1:2].copy()
-    uprights[0] = task.upright
-    lower[:, 2] = task.problem.lower[0] * uprights - nominal[:, 2]
-    upper[:, 2] = task.problem.upper[0] * uprights - nominal[:, 2]
+    down = outlook.b_z_heave[0:-1:2].copy()
+    down[0] = task.b_z
+    lower[:, 2] = task.problem.lower[0] * down - nominal[:, 2]
+    upper[:, 2] = task.problem.upper[0] * down - nominal[:, 2]
     return Bounds(lower, upper)
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from offboard.control.gains import CostToGo
 from offboard.control.horizon.outlook import Bounds, Outlook
 from offboard.control.law import Task, TrackingLaw
-from offboard.model.axes import SHORTEST_THRUST_LAG_S, lateral_model, upright
+from offboard.model.axes import SHORTEST_THRUST_LAG_S, b_z_of, lateral_model
 
 Array = NDArray[np.float64]
 
@@ -132,7 +132,7 @@ class Scene:
             ("directions", ahead.directions_ned),
             ("thrusts_tilt", ahead.thrusts_tilt_mps2),
             ("thrusts_heave", ahead.thrusts_heave_mps2),
-            ("uprights", ahead.uprights_heave),
+            ("b_z", ahead.b_z_heave),
             ("feedforward", ahead.feedforward[:, 2]),
             ("lower", self.within.lower),
             ("upper", self.within.upper),
@@ -149,7 +149,7 @@ SCENE = np.dtype(
         ("directions", "f8", (_NODES, 3)),
         ("thrusts_tilt", "f8", _NODES),
         ("thrusts_heave", "f8", _NODES),
-        ("uprights", "f8", _NODES),
+        ("b_z", "f8", _NODES),
         ("feedforward", "f8", MOST_STEPS),
         ("lower", "f8", (MOST_STEPS, 3)),
         ("upper", "f8", (MOST_STEPS, 3)),
@@ -168,7 +168,7 @@ def start_state(task: Task, ahead: Outlook) -> Array:
     start[P:Z] = task.lateral.reshape(-1)
     start[Z:T] = task.vertical
     b_n, b_e = ahead.directions_ned[0, :2]
-    leant = upright(b_n + start[B], b_e + start[B + 1]) - upright(b_n, b_e)
-    thrust, b_z = ahead.thrusts_heave_mps2[0], ahead.uprights_heave[0]
+    leant = b_z_of(b_n + start[B], b_e + start[B + 1]) - b_z_of(b_n, b_e)
+    thrust, b_z = ahead.thrusts_heave_mps2[0], ahead.b_z_heave[0]
     start[T] = (thrust * b_z + start[F]) / (b_z + leant) - thrust
     return start

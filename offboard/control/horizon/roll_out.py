@@ -31,7 +31,7 @@ from offboard.control.horizon.plant import (
     W,
     Z,
 )
-from offboard.model.axes import upright
+from offboard.model.axes import b_z_of
 
 Array = NDArray[np.float64]
 
@@ -189,12 +189,12 @@ def _add_nonlinear_part(
     ref = scene.directions[2 * k : 2 * k + 3]
     thrusts = scene.thrusts_tilt[2 * k : 2 * k + 3]
     heaves = scene.thrusts_heave[2 * k : 2 * k + 3]
-    uprights = scene.uprights[2 * k : 2 * k + 3]
-    led = scene.feedforward[k] / uprights[0]
+    down = scene.b_z[2 * k : 2 * k + 3]
+    led = scene.feedforward[k] / down[0]
     refs = (
-        upright(ref[0, 0], ref[0, 1]),
-        upright(ref[1, 0], ref[1, 1]),
-        upright(ref[2, 0], ref[2, 1]),
+        b_z_of(ref[0, 0], ref[0, 1]),
+        b_z_of(ref[1, 0], ref[1, 1]),
+        b_z_of(ref[2, 0], ref[2, 1]),
     )
     for n in range(chosen.shape[1]):
         f, w, t0 = before[F, n], chosen[2, n], before[T, n]
@@ -203,10 +203,10 @@ def _add_nonlinear_part(
         n1 = tilt[0, 0] * n0 + tilt[0, 1] * before[R, n] + tilt[0, 2] * chosen[0, n]
         e1 = tilt[0, 0] * e0 + tilt[0, 1] * before[R + 1, n] + tilt[0, 2] * chosen[1, n]
         n2, e2 = after[B, n], after[B + 1, n]
-        d0 = upright(ref[0, 0] + n0, ref[0, 1] + e0) - refs[0]
-        d1 = upright(ref[1, 0] + n1, ref[1, 1] + e1) - refs[1]
-        d2 = upright(ref[2, 0] + n2, ref[2, 1] + e2) - refs[2]
-        asked = (scene.feedforward[k] + w) / max(uprights[0] + d0, 0.1)
+        d0 = b_z_of(ref[0, 0] + n0, ref[0, 1] + e0) - refs[0]
+        d1 = b_z_of(ref[1, 0] + n1, ref[1, 1] + e1) - refs[1]
+        d2 = b_z_of(ref[2, 0] + n2, ref[2, 1] + e2) - refs[2]
+        asked = (scene.feedforward[k] + w) / max(down[0] + d0, 0.1)
         asked = _clip(asked, plant.thrust_least_mps2, plant.thrust_most_mps2) - led
         t1 = asked + (t0 - asked) * plant.lag_half
         t2 = asked + (t0 - asked) * plant.lag_full
@@ -217,9 +217,9 @@ def _add_nonlinear_part(
         y0 = g * e0 - share * ((thrusts[0] + t0) * e0 + t0 * ref[0, 1])
         y1 = g * e1 - share * ((thrusts[1] + t1) * e1 + t1 * ref[1, 1])
         y2 = g * e2 - share * ((thrusts[2] + t2) * e2 + t2 * ref[2, 1])
-        z0 = f - ((heaves[0] + t0) * d0 + t0 * uprights[0])
-        z1 = w + (f - w) * plant.lag_half - ((heaves[1] + t1) * d1 + t1 * uprights[1])
-        z2 = w + (f - w) * plant.lag_full - ((heaves[2] + t2) * d2 + t2 * uprights[2])
+        z0 = f - ((heaves[0] + t0) * d0 + t0 * down[0])
+        z1 = w + (f - w) * plant.lag_half - ((heaves[1] + t1) * d1 + t1 * down[1])
+        z2 = w + (f - w) * plant.lag_full - ((heaves[2] + t2) * d2 + t2 * down[2])
         after[P, n] += plant.push_p0 * x0 + plant.push_p1 * x1
         after[P + 1, n] += plant.push_p0 * y0 + plant.push_p1 * y1
         after[V, n] += plant.push_v0 * x0 + plant.push_v1 * x1 + plant.push_v2 * x2
@@ -227,7 +227,7 @@ def _add_nonlinear_part(
         after[Z, n] += plant.push_p0 * z0 + plant.push_p1 * z1
         after[W, n] += plant.push_v0 * z0 + plant.push_v1 * z1 + plant.push_v2 * z2
         after[T, n] = t2
-        after[F, n] = (heaves[2] + t2) * d2 + t2 * uprights[2]
+        after[F, n] = (heaves[2] + t2) * d2 + t2 * down[2]
 
 
 @kernel
