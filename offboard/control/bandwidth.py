@@ -1,10 +1,10 @@
-"""The highest bandwidth with which the loop bears what is not known of the vehicle's delays.
+"""The highest bandwidth at which the loop is stable for every delay that the vehicle may have.
 
 A known delay is compensated by prediction and costs little; the loop becomes unstable where the
-delay differs from the one predicted through. A lateral axis and the vertical one are built as they
-are flown, with another delay of the plant than the modelled one: a decision every period on the
-state predicted by replaying the commands sent, an observer corrected by position and attitude. A
-loop is stable if the eigenvalues of its map over one period are within the unit circle.
+real delay differs from the one used for the prediction. The closed loop of a lateral axis and of
+the vertical one is built with such a difference: a decision every period on the state predicted by
+replaying the commands sent, and an observer updated by position and attitude. It is stable if the
+eigenvalues of its transition matrix over one period are within the unit circle.
 
 The phase margin of the loop's frequency response (`control.stability_margins`) agrees with this to
 10 % for delays below 60 ms, but at 10 Hz and 90 to 310 ms, where the loop gain has several

@@ -161,7 +161,7 @@ class TrackingLaw:
         bandwidth = self.bandwidth_radps
         if uncertainty is None:
             bandwidth = self.configured_radps
-        elif delays != self._delays:  # a drag alone, adopted while it is fast, changes no bandwidth
+        elif delays != self._delays:  # another drag alone changes no bandwidth
             configured = self.configured_radps
             bandwidth = supported_bandwidth(vehicle, uncertainty, self.period_s, configured)
         self._delays = delays
@@ -224,7 +224,7 @@ class TrackingLaw:
             velocity_down_mps=float(sample.velocity_ned_mps[2, 2]),
             thrust_down_mps2=float(thrust_down),
             tilt_feedforward=held_lead(b[1, :2], b1[1, :2], b2[1, :2], vehicle.tilt, period_s),
-            thrust_down_feedforward_mps2=float(led_thrust * b[3, 2]),  # T lags, not T b_z
+            thrust_down_feedforward_mps2=float(led_thrust * b[3, 2]),  # T lags, b_z does not
             heading_feedforward_rad=float(heading),
         )
 

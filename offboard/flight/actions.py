@@ -144,7 +144,7 @@ def _stand_by(flight: FlightState, time_s: float) -> None:
     """PX4 accepts OFFBOARD only while setpoints arrive: stream what changes nothing. On the
     ground no thrust; in the air what the vehicle flies, unless a failsafe flies it, after which
     PX4 would return to OFFBOARD, or it flies setpoints of others."""
-    on_ground, vehicle = flight.contact.certain, flight.vehicle
+    on_ground, vehicle = flight.contact.on_ground, flight.vehicle
     command = Command(0.0, LEVEL, vehicle.heading_rad) if on_ground else _flown(flight)
     quiet = flight.takes_off_by_command or flight.telemetry_is_old or bool(other_sender(flight))
     if on_ground:

@@ -54,14 +54,14 @@ class Authority:
     heard_s: float = -math.inf  # time of the newest report
     reported_s: float = -math.inf  # time of the newest report that counts
     lost_reason: str = ""
-    lost_s: float = math.inf  # time of the loss; -inf if HEARTBEAT, which shows armed too, told it
+    lost_s: float = math.inf  # time of the loss; -inf if a HEARTBEAT reported it
     loss: SetpointLoss = NEVER  # what the autopilot does without setpoints
     arrived_s: float = -math.inf  # host time of the arrival of the newest report
-    _asked_in: str = ""  # the mode shown when we asked
-    _requested: list[str] = field(default_factory=list)  # as the end; without those left behind
+    _asked_in: str = ""  # the mode reported when we asked for `engage_mode`
+    _requested: list[str] = field(default_factory=list)  # hold, land: from the one that it shows on
     _forgot_s: float = -math.inf  # time of a reboot
     _failsafe_shown: bool = False  # a HEARTBEAT shows what `Standing.FAILSAFE` supposes
-    _counts_from_s: float = -math.inf  # host time: what arrived before it is not evidence
+    _counts_from_s: float = -math.inf  # host time: reports that arrived earlier do not count
 
     def on_mode(
         self,
@@ -111,8 +111,8 @@ class Authority:
     def _on_failsafe(
         self, before: str, now_s: float, failsafe: bool, *, heartbeat: bool, sticks: bool | None
     ) -> None:
-        """It shows a mode of its failsafe, after the mode `before`. Only HEARTBEAT tells that from
-        a pilot's choice."""
+        """The vehicle left the mode `before` for one that its failsafe for missing setpoints may
+        have chosen. Only HEARTBEAT (MAV_STATE) tells that from a pilot's choice."""
         left = f"the vehicle left {self.engage_mode} for {self.mode}"
         if heartbeat and not failsafe:
             self.lose(left, now_s, heartbeat)

@@ -162,7 +162,7 @@ def follows_others(flight: FlightState) -> str:
 
 
 def _other_companion(flight: FlightState) -> str:
-    """What it may have to do with a vehicle that does not follow; empty without one."""
+    """Ends the sentence: which other companion computer is on the link, if there is one."""
     other = flight.vehicle.other_companion
     if other is None:
         return ""

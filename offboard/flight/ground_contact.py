@@ -77,14 +77,14 @@ class GroundContact:
         return known and self.vehicle.landed not in ("on_ground", "unknown")
 
     @property
-    def certainly_flies(self) -> bool:
-        """Every sign says that the vehicle flies. In doubt a pilot's switch does not engage: the
-        vehicle may stand on the ground."""
+    def flies(self) -> bool:
+        """Armed, and height and land detector both say that the vehicle flies. Otherwise a pilot's
+        switch does not engage: it may stand on the ground."""
         return self.in_the_air and self.detects_flight and not self.stood_for(STOOD_S)
 
     @property
-    def certain(self) -> bool:
-        """Every sign says that the vehicle stands on the ground."""
+    def on_ground(self) -> bool:
+        """Disarmed, or land detector, height and vertical speed all say that it stands."""
         vehicle = self.vehicle
         if vehicle.disarmed:
             return True
@@ -100,7 +100,7 @@ class GroundContact:
     @property
     def in_the_air(self) -> bool:
         """The vehicle is armed and any sign says that it flies."""
-        return self.vehicle.armed and not self.certain
+        return self.vehicle.armed and not self.on_ground
 
     @property
     def lifted_off(self) -> bool:

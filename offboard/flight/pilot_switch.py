@@ -18,8 +18,8 @@ class PilotSwitch:
     `engaged`: from there it was switched to the mode of setpoints, in the air. `unclaimed`: since
     the service began, or the vehicle rebooted, it has shown the mode of setpoints only, in the air.
     `hasty`: it left that mode and returned, in the air, before a HEARTBEAT could show the other one
-    without a failsafe. `showed_ours`: whether the report before this one showed that mode; None if
-    a failsafe may have changed it.
+    without a failsafe. `showed_ours`: whether the previous report showed the mode of setpoints;
+    None after a failsafe, which may have changed it.
     """
 
     elsewhere: bool = False
@@ -36,15 +36,15 @@ class PilotSwitch:
         elif not ours:
             self.elsewhere = True
 
-    def on_mode(self, *, ours: bool, in_the_air: bool, certainly: bool) -> None:
+    def on_mode(self, *, ours: bool, in_the_air: bool, flies: bool) -> None:
         """Any report of the mode, before `on_heartbeat` of the same message. Only a vehicle that
-        `certainly` flies is engaged."""
+        `flies` by every sign (`GroundContact.flies`) is engaged."""
         if not (ours and in_the_air):
             self.unclaimed = False
         if not ours:
             self.engaged = self.hasty = False
         elif self.elsewhere:
-            self.elsewhere, self.engaged = False, certainly
+            self.elsewhere, self.engaged = False, flies
         elif self.showed_ours is False:
             self.hasty = in_the_air
         self.showed_ours = ours

@@ -52,7 +52,7 @@ def admit(
 
     Args:
         ours: the vehicle is ours to command (`Authority.permits_setpoint`).
-        on_ground: it certainly stands on the ground (`GroundContact.certain`).
+        on_ground: it stands on the ground by every sign (`GroundContact.on_ground`).
         age_s: age of the telemetry that the setpoint was computed from, beyond the known delay of
             the link; 0 for a setpoint that needs none.
         age_limit_s: the greatest age that may leave.
@@ -94,7 +94,7 @@ def clamp(command: Command, vehicle: Vehicle, *, on_ground: bool = False) -> Com
     """`command` limited to the vehicle's thrust and tilt.
 
     A direction tilted by more than `tilt_max_rad` is turned back to that tilt in its own vertical
-    plane. Unless the vehicle certainly stands on the ground, thrust is at least a third of hover.
+    plane. In the air, thrust is at least a third of hover.
     """
     least_mps2 = 0.0 if on_ground else vehicle.thrust_min_mps2
     thrust = min(max(command.thrust_mps2, least_mps2), vehicle.thrust_max_mps2)
@@ -129,7 +129,7 @@ def send(
         command,
         flight.model,
         ours=flight.ours,
-        on_ground=flight.contact.certain,
+        on_ground=flight.contact.on_ground,
         age_s=age_s,
         age_limit_s=flight.limits.setpoint_age_s,
         late_s=late_s,

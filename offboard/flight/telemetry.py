@@ -94,7 +94,7 @@ def _lifting_share(flight: FlightState) -> float:
 
 def _on_telemetry(flight: FlightState, stamp_s: float, arrived_s: float, turned_s: float) -> None:
     flight.telemetry_arrived_s = arrived_s
-    # A stream says only how early it may have arrived: after a pause of ours it would be ahead
+    # Of a stream only the earliest time of arrival is known, which is wrong after a pause of ours
     host_s = turned_s if flight.session.settings.stream else arrived_s
     flight.clock.on_telemetry(stamp_s, flight.session.clock_s(host_s))
 
@@ -149,9 +149,9 @@ def _on_mode(
     )
     ours = mode == flight.authority.engage_mode
     contact = flight.contact
-    flies, switched = contact.in_the_air, ours and flight.pilot.elsewhere
-    flight.pilot.on_mode(ours=ours, in_the_air=flies, certainly=contact.certainly_flies)
-    why = "" if flight.pilot.engaged or not flies else "the vehicle may stand on the ground"
+    in_the_air, switched = contact.in_the_air, ours and flight.pilot.elsewhere
+    flight.pilot.on_mode(ours=ours, in_the_air=in_the_air, flies=contact.flies)
+    why = "" if flight.pilot.engaged or not in_the_air else "the vehicle may stand on the ground"
     if flight.pilot.engaged and other_sender(flight):
         flight.pilot.engaged = False  # it was not switched for us
         why = "another program sends setpoints"

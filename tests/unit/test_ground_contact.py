@@ -49,8 +49,8 @@ def armed(height_m: float = 0.0, climb_mps: float = 0.0, detector: str = "on_gro
 
 def test_a_heartbeat_that_shows_it_disarmed_counts_for_three_seconds() -> None:
     standing = Standing()
-    assert standing.at(2.9).certain
-    assert not standing.at(3.1).certain
+    assert standing.at(2.9).on_ground
+    assert not standing.at(3.1).on_ground
     assert not standing.at(3.1).in_the_air  # nobody has said that it is armed
 
 
@@ -70,12 +70,12 @@ def test_a_heartbeat_that_shows_it_disarmed_counts_for_three_seconds() -> None:
     ],
 )
 def test_when_armed_every_sign_must_say_ground(vehicle: Standing, certain: bool) -> None:
-    assert vehicle.at(1.0).certain is certain
+    assert vehicle.at(1.0).on_ground is certain
     assert vehicle.at(1.0).in_the_air is not certain
 
 
 def test_a_land_detector_that_is_not_heard_any_more_proves_nothing() -> None:
-    assert armed().at(2.4).certain
+    assert armed().at(2.4).on_ground
     assert armed().at(2.6).in_the_air
 
 

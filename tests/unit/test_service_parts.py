@@ -353,7 +353,7 @@ def test_a_switch_counts_in_the_air_from_a_mode_without_failsafe() -> None:
     switch = PilotSwitch()
 
     def shows(ours: bool, failsafe: bool = False, in_the_air: bool = True) -> bool:
-        switch.on_mode(ours=ours, in_the_air=in_the_air, certainly=in_the_air)
+        switch.on_mode(ours=ours, in_the_air=in_the_air, flies=in_the_air)
         switch.on_heartbeat(ours=ours, failsafe=failsafe)
         return switch.engaged
 
@@ -403,9 +403,9 @@ def test_a_moving_vehicle_is_stopped_where_the_reference_starts(speed_mps: float
     assert np.linalg.norm(flown.acceleration_ned_mps2, axis=1).max() < 2.01
 
 
-@pytest.mark.parametrize("certainly", [True, False])
-def test_only_a_vehicle_that_certainly_flies_is_engaged(certainly: bool) -> None:
+@pytest.mark.parametrize("flies", [True, False])
+def test_only_a_vehicle_that_flies_by_every_sign_is_engaged(flies: bool) -> None:
     switch = PilotSwitch()
     switch.on_heartbeat(ours=False, failsafe=False)
-    switch.on_mode(ours=True, in_the_air=True, certainly=certainly)
-    assert switch.engaged is certainly
+    switch.on_mode(ours=True, in_the_air=True, flies=flies)
+    assert switch.engaged is flies

@@ -138,8 +138,8 @@ PX4 = Dialect(
     estimator_message=230,
     estimator_name="ESTIMATOR_STATUS",
     slow_hint="raise MAV_x_RATE of this link, in bytes/s: PX4 slows all messages down to it",
-    # is_gcs_connected of the link: only while a HEARTBEAT of type GCS arrives on it, which ours is
-    # not: it would hide a lost ground station from NAV_DLL_ACT
+    # PX4 sends these texts only on a link on which a HEARTBEAT of type GCS arrives. Ours is not:
+    # PX4 would not notice any more that its real ground station is lost (NAV_DLL_ACT)
     unsaid="PX4 says why to ground stations alone: see QGroundControl",
     oldest=(1, 14),
     loss_time=("COM_OF_LOSS_T", 1.0),
