@@ -122,7 +122,7 @@ class Replay:
                         self.companion.other_datagrams = total
                     case Call(name, arguments) if name in CALLS:
                         getattr(self.companion, name)(*arguments)
-                    case Check(crc) if crc != self._crc & 0xFFFF:
+                    case Check(crc) if crc != self._crc:
                         raise InputsError("received frames are missing or damaged")
                     case Check():
                         self._crc, self._checked_s = 0, self.ended_s

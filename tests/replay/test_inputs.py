@@ -82,8 +82,10 @@ def test_what_is_read_is_what_was_recorded(turns) -> None:
 def recorded(turns: int) -> list[bytes]:
     recorder = InputRecorder(SessionSettings())
     for number in range(turns):
-        recorder.begin(100.0 + 0.01 * number, 0)
-        recorder.chunk(Chunk(b"", "tcp", 100.0 + 0.01 * number), Reception((bytes([number]),)))
+        now_s = 100.0 + 0.01 * number + 1e-6 * (number * 7919 % 1000)
+        recorder.begin(now_s, 0)
+        frame = (number * 104729 % 2**24).to_bytes(3, "big")
+        recorder.chunk(Chunk(b"", "tcp", now_s), Reception((), unlogged=((0, frame),)))
         recorder.end()
     return [piece.data for piece in recorder.pieces(all_of_it=True)]
 
