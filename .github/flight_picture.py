@@ -34,12 +34,15 @@ def tracked(flight: Path) -> tuple[Array, Array, Array]:
     """Time since the start of TRACK (N,), reference and flown position (N, 3), NED in metres."""
     flown = history.gather(tlog.read(tlog.find(flight)))
     track = flown.records["phase"] == PHASE_CODES[Phase.TRACK]
-    begin_s, end_s = flown.record_time_s[track][[0, -1]]
+    begin_s, end_s = flown.records["time_s"][track][[0, -1]]
     times = np.arange(begin_s, end_s, SAMPLE_S)
-    _, first = np.unique(flown.reference[:, 0], return_index=True)
+    _, first = np.unique(flown.reference["time_s"], return_index=True)
     rows = flown.reference[first]
-    reference = CubicHermiteSpline(rows[:, 0], rows[:, 1:4], rows[:, 4:7])(times)
-    columns = (np.interp(times, flown.position[:, 0], flown.position[:, k]) for k in (1, 2, 3))
+    reference = CubicHermiteSpline(
+        rows["time_s"], rows["position_ned_m"], rows["velocity_ned_mps"]
+    )(times)
+    places, stamps = flown.position["position_ned_m"], flown.position["time_s"]
+    columns = (np.interp(times, stamps, axis) for axis in places.T)
     return times - begin_s, reference, np.column_stack(list(columns))
 
 

@@ -7,19 +7,21 @@ are NED in metres relative to the estimator's origin.
 from __future__ import annotations
 
 import math
+import struct
+from array import array
 from collections import Counter
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.analysis.events import Event, modes, ours, vehicle_messages
-from offboard.analysis.sender import Stream, continuous_s
-from offboard.analysis.tlog import LoggedMessage, Tlog, TlogError
-from offboard.analysis.truth import true_positions
+from offboard.analysis.events import Event, Texts, ours
+from offboard.analysis.samples import BOOT_US, Rows, Samples, Wire, continuous_s
+from offboard.analysis.tlog import LoggedMessage, Tlog, TlogError, columns
 from offboard.flight import manifest
 from offboard.flight.record import (
     COMPONENT_ID,
+    FIELDS,
     IDENTIFIED_ID,
     IDENTIFIED_NAME,
     RECORD_COMPONENT_ID,
@@ -31,69 +33,95 @@ from offboard.mavlink.decode import Address, decode_identity
 from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.framing import HEARTBEAT
 from offboard.mavlink.senders import DIALECTS, is_vehicle
+from offboard.model.geodesy import Geodetic, origin_of, position_ned_m
 
 Array = NDArray[np.float64]
-IDENTIFIED_SIZE = 20
 OUR_COMPONENTS = (COMPONENT_ID, RECORD_COMPONENT_ID)
-POSITION_FIELDS = "x y z vx vy vz"
-ATTITUDE_FIELDS = "q1 q2 q3 q4 rollspeed pitchspeed yawspeed"
-REFERENCE_FIELDS = "x y z vx vy vz afx afy afz yaw"
-_TUNNEL = 385  # message id
-_ARRAYS = {RECORD_NAME, IDENTIFIED_NAME}
-_ARMED = 0x80  # MAV_MODE_FLAG_SAFETY_ARMED
 TELEMETRY = (31, 32)  # ATTITUDE_QUATERNION, LOCAL_POSITION_NED
 _SUBSTITUTES = (30, 33)  # ATTITUDE, GLOBAL_POSITION_INT: the clock of logs without these
-_OURS = (
-    "SET_ATTITUDE_TARGET", "SET_POSITION_TARGET_LOCAL_NED", "POSITION_TARGET_LOCAL_NED",
-    "DEBUG_FLOAT_ARRAY", "TIMESYNC", "STATUSTEXT", "TUNNEL",
-)  # fmt: skip
-_THEIRS = (
-    "ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "SIM_STATE", "HIL_STATE_QUATERNION", "HEARTBEAT",
-    "GPS_GLOBAL_ORIGIN", "COMMAND_ACK", "TIMESYNC", "HOME_POSITION", "EXTENDED_SYS_STATE",
-    "STATUSTEXT",
-)  # fmt: skip
-# frequent kinds whose own stamps are used: their place and time in the log are not kept
-_STAMPED = {
-    "ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "POSITION_TARGET_LOCAL_NED", "DEBUG_FLOAT_ARRAY",
+_TUNNEL = 385  # message id
+_ARMED = 0x80  # MAV_MODE_FLAG_SAFETY_ARMED
+
+_TIME = ("time_s", "f8")
+POSITION = [_TIME, ("position_ned_m", "3f4"), ("velocity_ned_mps", "3f4")]
+ATTITUDE = [_TIME, ("quaternion", "4f4"), ("rates_radps", "3f4")]
+SETPOINT = [_TIME, ("unix_s", "f8"), ("quaternion", "4f4"), ("thrust", "f4")]
+# array of History -> its columns
+_DTYPES = {
+    "position": POSITION,
+    "attitude": ATTITUDE,
+    "reference": [
+        *POSITION, ("acceleration_ned_mps2", "3f4"), ("heading_rad", "f4"),
+    ],
+    "setpoint": SETPOINT,
+    "heartbeat": [_TIME, ("armed", "f4"), ("system_status", "f4")],
+    "landed": [_TIME, ("state", "f4")],
+    "identified": [_TIME, ("values", "20f4")],
 }  # fmt: skip
-_BLOCK = 20_000  # records that are converted at once
+_MOTION = {"position_ned_m": "x y z", "velocity_ned_mps": "vx vy vz"}
+# what is kept of the vehicle's messages, and of ours, by array
+_THEIRS = {
+    "position": Wire("LOCAL_POSITION_NED", _MOTION),
+    "attitude": Wire(
+        "ATTITUDE_QUATERNION",
+        {"quaternion": "q1 q2 q3 q4", "rates_radps": "rollspeed pitchspeed yawspeed"},
+    ),
+    "heartbeat": Wire(
+        "HEARTBEAT", {"armed": "base_mode", "system_status": "system_status"}, stamp=None
+    ),
+    "landed": Wire("EXTENDED_SYS_STATE", {"state": "landed_state"}, stamp=None),
+}
+_REFERENCE = Wire(
+    "POSITION_TARGET_LOCAL_NED",
+    {**_MOTION, "acceleration_ned_mps2": "afx afy afz", "heading_rad": "yaw"},
+)
+_ATTITUDE_SETPOINT = Wire("SET_ATTITUDE_TARGET", {"quaternion": "q", "thrust": "thrust"})
+_POSITION_SETPOINT = Wire("SET_POSITION_TARGET_LOCAL_NED", {})
+_PLACE = {"place": "lat lon alt"}
+_HIL = Wire("HIL_STATE_QUATERNION", _PLACE, BOOT_US)
+_HIL_UNSTAMPED = Wire("HIL_STATE_QUATERNION", _PLACE, None)
+_SIM = Wire("SIM_STATE", {"place": "lat_int lon_int alt"}, None)
+_SCALES = {_HIL.name: (1e7, 1e7, 1e3), _SIM.name: (1e7, 1e7, 1.0)}
+_BY_NAME = {wire.name: array for array, wire in _THEIRS.items()}
+_ARRAYS = {RECORD_NAME, IDENTIFIED_NAME}
+_TICK = Wire("DEBUG_FLOAT_ARRAY", {}, BOOT_US)
+_IDENTIFIED = Wire("DEBUG_FLOAT_ARRAY", {"values": "data"}, BOOT_US)
 
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """Rows (N, columns) in the order of arrival, and events. Columns:
+    """Structured arrays (N,) in the order of arrival, and events. Each has `time_s`, and:
 
-    position: t, north, east, down, v_north, v_east, v_down (LOCAL_POSITION_NED)
-    attitude: t, w, x, y, z, p, q, r (ATTITUDE_QUATERNION)
-    truth: t, north, east, down (HIL_STATE_QUATERNION or SIM_STATE; empty without)
-    reference: t, position 3, velocity 3, acceleration 3, heading (POSITION_TARGET_LOCAL_NED)
-    setpoint: t, wall time s, w, x, y, z, thrust (SET_ATTITUDE_TARGET); NaN from the third on for a
-        setpoint of the autopilot's own position loop (SET_POSITION_TARGET_LOCAL_NED)
-    identified: t, then value and sd of each constant as in `identification.vehicle_fit.log_record`
-    link_delay: t of the telemetry that a TIMESYNC request followed, its delay in s
-    heartbeat: t, armed (1 or 0), MAV_STATE
-    landed: t, MAV_LANDED_STATE (EXTENDED_SYS_STATE)
+    position: position_ned_m, velocity_ned_mps (LOCAL_POSITION_NED)
+    attitude: quaternion (w, x, y, z), rates_radps (ATTITUDE_QUATERNION)
+    truth: position_ned_m (HIL_STATE_QUATERNION or SIM_STATE; empty without)
+    reference: position, velocity and acceleration, heading_rad (POSITION_TARGET_LOCAL_NED)
+    setpoint: unix_s, quaternion, thrust (SET_ATTITUDE_TARGET); the last two NaN for a setpoint of
+        the autopilot's own position loop (SET_POSITION_TARGET_LOCAL_NED)
+    identified: values, then sd of each constant as in `identification.vehicle_fit.log_record`
+    link_delay: delay_s, at the telemetry that a TIMESYNC request followed
+    heartbeat: armed (1 or 0), system_status (MAV_STATE)
+    landed: state (MAV_LANDED_STATE of EXTENDED_SYS_STATE)
+    records: the fields of `flight.record.TickRecord`
 
-    `records` (N,) are structured, with the fields of `flight.record.TickRecord`. `phases` and
-    `announcements` are our own, by their records; `modes` and `vehicle_messages` (STATUSTEXT,
-    refused commands) the vehicle's. `vehicle` is the one that was flown, as the log's manifest
-    says; in an older log the first autopilot that was heard. Only its messages, and ours, are used.
-    It and `dialect` are None without one, `dialect` also for one that is not known. `damage` says
-    what could not be read, `damage_s` is the time of the telemetry before the first damage, NaN
-    without.
+    `phases` and `announcements` are our own, by their records; `modes` and `vehicle_messages`
+    (STATUSTEXT, refused commands) the vehicle's. `vehicle` is the one that was flown, as the log's
+    manifest says; in an older log the first autopilot that was heard. Only its messages, and ours,
+    are used. It and `dialect` are None without one, `dialect` also for one that is not known.
+    `damage` says what could not be read, `damage_s` is the time of the telemetry before the first
+    damage, NaN without.
     """
 
-    position: Array
-    attitude: Array
-    truth: Array
-    reference: Array
-    setpoint: Array
-    record_time_s: Array
-    records: NDArray[np.void]
-    identified: Array
-    link_delay: Array
-    heartbeat: Array
-    landed: Array
+    position: Rows
+    attitude: Rows
+    truth: Rows
+    reference: Rows
+    setpoint: Rows
+    records: Rows
+    identified: Rows
+    link_delay: Rows
+    heartbeat: Rows
+    landed: Rows
     phases: tuple[Event, ...]
     announcements: tuple[Event, ...]
     modes: tuple[Event, ...]
@@ -139,136 +167,164 @@ def configuration(log: Tlog) -> str | None:
         raise TlogError(f"{log.path}: {error}") from None
 
 
+class _Ticks(Samples):
+    """Records of the ticks, of any version."""
+
+    def fill(self, rows: Rows, wire: Wire, payloads: bytearray) -> None:
+        ids = columns(wire.name, payloads, "array_id")[:, 0]
+        records = records_of(columns(wire.name, payloads, "data"), ids)
+        for name in FIELDS:
+            rows[name] = records[name]
+
+
+class _Truth(Samples):
+    """True positions from the first known origin of the local frame on. HOME_POSITION gives one
+    point in both frames."""
+
+    origin: Geodetic | None = None
+
+    def move(self, origin: Geodetic) -> None:
+        self.convert()
+        self.origin = origin
+
+    def fill(self, rows: Rows, wire: Wire, payloads: bytearray) -> None:
+        assert self.origin is not None
+        places = columns(wire.name, payloads, wire.fields["place"]) / _SCALES[wire.name]
+        rows["position_ned_m"] = position_ned_m(places, self.origin)
+
+
 class _Collector:
     """Collects the messages of this vehicle and those of `offboard`, which has its system id."""
 
     def __init__(self, vehicle: Address | None, dialect: Dialect | None) -> None:
-        self._vehicle = vehicle
-        self._dialect = dialect
-        self._ours = {name: Stream(name, placed=name not in _STAMPED) for name in _OURS}
-        self._theirs = {name: Stream(name, placed=name not in _STAMPED) for name in _THEIRS}
+        self._vehicle, self._dialect = vehicle, dialect
+        self._samples = {name: Samples(dtype) for name, dtype in _DTYPES.items()}
+        self._ticks = _Ticks([_TIME, *((name, "f4") for name in FIELDS)])
+        self._truth = _Truth([_TIME, ("position_ned_m", "3f4")])
+        self._asked_ns, self._answered_ns = array("q"), array("q")  # of TIMESYNC; ts1, and ts1, tc1
+        self._texts, self._our_texts = Texts("vehicle"), Texts("offboard")
+        self._modes = Texts("vehicle")
+        self._mode = -1
+        self._event_records: list[tuple[float, bytes]] = []
         self._counts: Counter[str] = Counter()
         self._unix_us = (0, 0)
-        self._place = 0
         self._anchor_ms = math.nan
         self._clocks: tuple[int, ...] = TELEMETRY + _SUBSTITUTES
         self.now_ms = math.nan  # stamp of the newest telemetry
         self.damage_ms = math.nan  # of the newest one before the first damage
 
     def add(self, entry: LoggedMessage) -> None:
-        kind, name = entry.frame.message_id, entry.name
-        self._counts[name] += 1
+        self._counts[entry.name] += 1
         self._unix_us = (self._unix_us[0] or entry.unix_us, entry.unix_us)
-        self._place += 1
-        ours = entry.component_id in OUR_COMPONENTS
-        if ours:
-            theirs = self._vehicle is not None and entry.system_id != self._vehicle.system_id
-        else:
-            theirs = (entry.system_id, entry.component_id) != self._vehicle
-        if theirs:  # of another system or component
-            return
-        stream = (self._ours if ours else self._theirs).get(name)
-        if stream is not None and _is_used(entry, ours):
-            stream.add(entry, self._place, self.now_ms)
-        if kind in self._clocks and not ours:
-            if kind in TELEMETRY:
-                self._clocks = TELEMETRY
-            self.now_ms = float(int.from_bytes(entry.frame.payload[:4], "little"))
-            if math.isnan(self._anchor_ms):
-                self._anchor_ms = self.now_ms
+        if entry.component_id in OUR_COMPONENTS:
+            if self._vehicle is None or entry.system_id == self._vehicle.system_id:
+                self._add_ours(entry)
+        elif (entry.system_id, entry.component_id) == self._vehicle:
+            self._add_theirs(entry)
+            kind = entry.frame.message_id
+            if kind in self._clocks:
+                if kind in TELEMETRY:
+                    self._clocks = TELEMETRY
+                self.now_ms = float(int.from_bytes(entry.frame.payload[:4], "little"))
+                if math.isnan(self._anchor_ms):
+                    self._anchor_ms = self.now_ms
+
+    def _keep(self, samples: Samples, wire: Wire, entry: LoggedMessage) -> None:
+        samples.add(wire, entry.frame.payload, self.now_ms, entry.unix_us / 1e6)
+
+    def _add_ours(self, entry: LoggedMessage) -> None:
+        name, payload = entry.name, entry.frame.payload
+        if name == _REFERENCE.name:
+            self._keep(self._samples["reference"], _REFERENCE, entry)
+        elif name == _ATTITUDE_SETPOINT.name:
+            self._keep(self._samples["setpoint"], _ATTITUDE_SETPOINT, entry)
+        elif name == _POSITION_SETPOINT.name:
+            self._keep(self._samples["setpoint"], _POSITION_SETPOINT, entry)
+        elif name == _TICK.name:
+            array_name = payload[10:20].rstrip(b"\0").decode(errors="replace")
+            if int.from_bytes(payload[8:10], "little") == IDENTIFIED_ID:
+                if array_name in _ARRAYS:
+                    self._keep(self._samples["identified"], _IDENTIFIED, entry)
+            elif array_name in _ARRAYS:
+                self._keep(self._ticks, _TICK, entry)
+        elif name == "TIMESYNC":
+            asked_ns, answered_ns = _times_ns(payload)
+            if not answered_ns:
+                self._asked_ns.append(asked_ns)
+        elif name == "TUNNEL":
+            if int.from_bytes(payload[:2], "little") == event_record.PAYLOAD_TYPE:
+                self._event_records.append((self.now_ms, payload[5 : 5 + payload[4]]))
+        elif name == "STATUSTEXT":
+            self._our_texts.add_chunk(entry, self.now_ms)
+
+    def _add_theirs(self, entry: LoggedMessage) -> None:
+        name, payload = entry.name, entry.frame.payload
+        known = _BY_NAME.get(name)
+        if known:
+            self._keep(self._samples[known], _THEIRS[known], entry)
+        if name == "HEARTBEAT":
+            mode = entry.message.custom_mode
+            if self._dialect and mode != self._mode:
+                self._modes.add(self._dialect.mode_name(mode), self.now_ms)
+            self._mode = mode
+        elif name in _SCALES and self._truth.origin:
+            wire = _SIM if name == _SIM.name else _HIL if any(payload[:8]) else _HIL_UNSTAMPED
+            self._keep(self._truth, wire, entry)
+        elif name == "TIMESYNC":
+            asked_ns, answered_ns = _times_ns(payload)
+            if answered_ns:
+                self._answered_ns.extend((asked_ns, answered_ns))
+        elif name == "STATUSTEXT":
+            self._texts.add_chunk(entry, self.now_ms)
+        elif name == "COMMAND_ACK":
+            command, result = entry.message.command, entry.message.result
+            if result not in (0, 5):  # MAV_RESULT_ACCEPTED, MAV_RESULT_IN_PROGRESS
+                self._texts.add(f"command {command} refused, result {result}", self.now_ms)
+        elif name == "GPS_GLOBAL_ORIGIN":
+            at = entry.message
+            self._truth.move(Geodetic(at.latitude / 1e7, at.longitude / 1e7, at.altitude / 1e3))
+        elif name == "HOME_POSITION":
+            at = entry.message
+            place = Geodetic(at.latitude / 1e7, at.longitude / 1e7, at.altitude / 1e3)
+            self._truth.move(origin_of(place, (at.x, at.y, at.z)))
 
     def history(self, damage: str) -> History:
-        """All that was added. Frees what it was made of, so that a long log fits in memory."""
-        record_time_s, records, identified = self._arrays(self._ours.pop("DEBUG_FLOAT_ARRAY"))
-        heartbeat = self._news("HEARTBEAT", "base_mode system_status")
-        heartbeat[:, 1] = (heartbeat[:, 1].astype(np.int64) & _ARMED) > 0
-        events = ours(self._ours["TUNNEL"], self._ours["STATUSTEXT"], self.time_s)
+        """All that was added."""
+        anchor_ms = self._anchor_ms
+        rows = {name: samples.rows(anchor_ms) for name, samples in self._samples.items()}
+        armed = rows["heartbeat"]["armed"].astype(np.int64) & _ARMED
+        rows["heartbeat"]["armed"] = armed > 0
+        events = ours(self._event_records, self._our_texts, anchor_ms)
         return History(
-            attitude=self._table(self._theirs.pop("ATTITUDE_QUATERNION"), ATTITUDE_FIELDS),
-            position=self._table(self._theirs.pop("LOCAL_POSITION_NED"), POSITION_FIELDS),
-            truth=true_positions(self._theirs, self.time_s),
-            reference=self._table(self._ours.pop("POSITION_TARGET_LOCAL_NED"), REFERENCE_FIELDS),
-            setpoint=self._setpoints(),
-            record_time_s=record_time_s,
-            records=records,
-            identified=identified,
+            **rows,
+            truth=self._truth.rows(anchor_ms),
+            records=self._ticks.rows(anchor_ms),
             link_delay=self._link_delay(),
-            heartbeat=heartbeat,
-            landed=self._news("EXTENDED_SYS_STATE", "landed_state"),
             phases=tuple(event for event in events if event.phase),
             announcements=tuple(event for event in events if not event.phase),
-            modes=modes(self._theirs["HEARTBEAT"], self._dialect, self.time_s),
-            vehicle_messages=vehicle_messages(
-                self._theirs["STATUSTEXT"], self._theirs["COMMAND_ACK"], self.time_s
-            ),
+            modes=self._modes.events(anchor_ms),
+            vehicle_messages=self._texts.events(anchor_ms),
             vehicle=self._vehicle,
             dialect=self._dialect,
             messages=self._counts,
             wall_s=(self._unix_us[1] - self._unix_us[0]) / 1e6,
             damage=damage,
-            damage_s=float(self.time_s(self.damage_ms)),
+            damage_s=float(continuous_s(self.damage_ms, anchor_ms)),
         )
 
-    def _arrays(self, stream: Stream) -> tuple[Array, NDArray[np.void], Array]:
-        """Times and records of the ticks; and what was identified."""
-        stamps = stream.columns("time_usec array_id")
-        times, of_ticks = self.time_s(stamps[:, 0] / 1e3), stamps[:, 1] != IDENTIFIED_ID
-        found: list[Array] = []
-        records: list[NDArray[np.void]] = []
-        for first in range(0, max(len(stream), 1), _BLOCK):
-            block = slice(first, first + _BLOCK)
-            data, ticks = stream.columns("data", block), of_ticks[block]
-            records.append(records_of(data[ticks], stamps[block, 1][ticks]))
-            found.append(np.column_stack((times[block][~ticks], data[~ticks, :IDENTIFIED_SIZE])))
-        return times[of_ticks], np.concatenate(records), np.vstack(found)
-
-    # ------------------------------------------------------------------ time
-
-    def time_s(self, stamps_ms: Array | float) -> Array:
-        return continuous_s(np.asarray(stamps_ms, dtype=np.float64), self._anchor_ms)
-
-    def _table(self, stream: Stream, fields: str) -> Array:
-        rows = stream.columns(f"time_boot_ms {fields}")
-        rows[:, 0] = self.time_s(rows[:, 0])
+    def _link_delay(self) -> Rows:
+        """From the vehicle's answers to our TIMESYNC requests."""
+        answers = np.array(self._answered_ns, np.int64).reshape(-1, 2)
+        asked, answered = answers[np.isin(answers[:, 0], np.array(self._asked_ns))].T
+        rows = np.empty(len(asked), [_TIME, ("delay_s", "f8")])
+        rows["time_s"], rows["delay_s"] = 1e-9 * asked, 1e-9 * (answered - asked)
         return rows
 
-    def _news(self, name: str, fields: str) -> Array:
-        """Fields of the vehicle's messages, with the time of the telemetry before as first."""
-        stream = self._theirs[name]
-        return np.column_stack((self.time_s(np.array(stream.now_ms)), stream.columns(fields)))
 
-    # ------------------------------------------------------------------ samples
-
-    def _setpoints(self) -> Array:
-        """Attitude and position setpoints in the order in which they were sent."""
-        attitude = self._ours["SET_ATTITUDE_TARGET"]
-        position = self._ours["SET_POSITION_TARGET_LOCAL_NED"]
-        rows = np.full((len(attitude) + len(position), 7), math.nan)
-        stamps = (attitude.columns("time_boot_ms"), position.columns("time_boot_ms"))
-        rows[:, 0] = self.time_s(np.concatenate(stamps)[:, 0])
-        rows[:, 1] = np.concatenate((attitude.unix_us, position.unix_us)) / 1e6
-        rows[: len(attitude), 2:] = attitude.columns("q thrust")
-        return rows[np.argsort(np.concatenate((attitude.places, position.places)))]
-
-    def _link_delay(self) -> Array:
-        """From the vehicle's answers to our TIMESYNC requests."""
-        requests, answers = (
-            streams["TIMESYNC"].columns("ts1 tc1") for streams in (self._ours, self._theirs)
-        )
-        answered = answers[np.isin(answers[:, 0], requests[:, 0])]
-        return np.column_stack((answered[:, 0], answered[:, 1] - answered[:, 0])) * 1e-9
-
-
-def _is_used(entry: LoggedMessage, ours: bool) -> bool:
-    """Whether a message of a kind that is collected is one of those that we need."""
-    name, payload = entry.name, entry.frame.payload
-    if name == "TIMESYNC":  # our requests, and replies of the vehicle: tc1 is 0 in a request
-        return any(payload[:8]) != ours
-    if name == "DEBUG_FLOAT_ARRAY":
-        return payload[10:20].rstrip(b"\0").decode(errors="replace") in _ARRAYS
-    if name == "TUNNEL":
-        return int.from_bytes(payload[:2], "little") == event_record.PAYLOAD_TYPE
-    return True
+def _times_ns(payload: bytes) -> tuple[int, int]:
+    """ts1 and tc1 of a TIMESYNC; tc1 is 0 in a request."""
+    answered_ns, asked_ns = struct.unpack("<qq", payload[:16].ljust(16, b"\0"))
+    return asked_ns, answered_ns
 
 
 def _vehicle(log: Tlog) -> tuple[Address | None, Dialect | None]:

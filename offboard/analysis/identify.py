@@ -42,26 +42,34 @@ def identify_flight(history: History, vehicle: Vehicle) -> tuple[Identified, Tra
 def _trace(history: History) -> Trace:
     """The part of a log in the air; the whole log if it has no phases of `offboard`."""
     setpoint, attitude = history.setpoint, history.attitude
-    commanded = thrust_direction_from_quaternion(setpoint[:, 2:6])
-    direction = thrust_direction_from_quaternion(attitude[:, 1:5])
-    thrust = setpoint[:, 6]
+    position = history.position
+    commanded = thrust_direction_from_quaternion(setpoint["quaternion"])
+    direction = thrust_direction_from_quaternion(attitude["quaternion"])
+    thrust = setpoint["thrust"].astype(np.float64)
     if history.dialect and history.dialect.thrust_rule is ThrustRule.TILT_COMPENSATED:
         thrust = thrust / np.maximum(commanded[:, 2], 0.3)
     trace = clean(
         np.column_stack(
-            (setpoint[:, 0], commanded[:, :2], thrust, heading_from_quaternion(setpoint[:, 2:6]))
+            (
+                setpoint["time_s"],
+                commanded[:, :2],
+                thrust,
+                heading_from_quaternion(setpoint["quaternion"]),
+            )
         ),
         np.column_stack(
-            (attitude[:, 0], direction[:, :2], heading_from_quaternion(attitude[:, 1:5]))
+            (attitude["time_s"], direction[:, :2], heading_from_quaternion(attitude["quaternion"]))
         ),
-        history.position,
+        np.column_stack(
+            (position["time_s"], position["position_ned_m"], position["velocity_ned_mps"])
+        ),
     )
     return trace.between(*_flown(history))
 
 
 def _flown(history: History) -> tuple[float, float]:
     indices = [PHASE_CODES[phase] for phase in TRACKING]
-    times = history.record_time_s[np.isin(history.records["phase"], indices)]
+    times = history.records["time_s"][np.isin(history.records["phase"], indices)]
     return (times[0] + LIFTED_OFF_S, times[-1]) if len(times) else (-math.inf, math.inf)
 
 

@@ -10,9 +10,8 @@ import math
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
-from offboard.analysis.decisions import decision_figures
 from offboard.analysis.history import History
-from offboard.analysis.link_figures import link_figures
+from offboard.analysis.link_metrics import decision_figures, link_figures
 from offboard.analysis.tracking import passed_s, tracking_figures, window_of
 from offboard.analysis.verdict import judge
 

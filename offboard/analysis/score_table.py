@@ -72,12 +72,12 @@ def _identified(history: History) -> str:
     """The last value of the main constants that the flight identified, empty without one."""
     texts = []
     for column, text in (
-        (1, "delay {:.0f} ms"),
-        (3, "tilt {:.1f} rad/s"),
-        (13, "hover thrust {:.3f}"),
-        (19, "drag {:.2f} 1/s"),
+        (0, "delay {:.0f} ms"),
+        (2, "tilt {:.1f} rad/s"),
+        (12, "hover thrust {:.3f}"),
+        (18, "drag {:.2f} 1/s"),
     ):
-        values = history.identified[:, column]
+        values = history.identified["values"][:, column]
         values = values[np.isfinite(values)]
         if len(values):
             texts.append(text.format(values[-1] * (1e3 if "ms" in text else 1.0)))

@@ -8,13 +8,13 @@ fitness are over the control ticks, as in its Eq. 32.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import BPoly
 
 from offboard.analysis.history import History
-from offboard.analysis.weighted import Weighted, shares, weighted
+from offboard.analysis.samples import Rows, Weighted, each_once, shares, weighted
 from offboard.flight.phases import PHASE_CODES, Phase
 from offboard.model.frames import (
     heading_from_quaternion,
@@ -33,18 +33,18 @@ _FITNESS = ("e_u", "e_v", "e_w", "e_x", "e_y", "e_z", "e_psi")
 
 def window_of(flown: History) -> tuple[float, float] | None:
     """First and last vehicle time of TRACK; None where a signal has less than two samples in it."""
-    times = flown.record_time_s[_in_track(flown)]
+    times = flown.records["time_s"][_in_track(flown)]
     if len(times) < 2 or len(flown.reference) < 2:
         return None
     begin_s, end_s = float(times[0]), float(times[-1])
-    tables = (flown.position, flown.attitude, flown.setpoint)
-    inside = (((rows[:, 0] >= begin_s) & (rows[:, 0] <= end_s)).sum() for rows in tables)
+    stamps = (rows["time_s"] for rows in (flown.position, flown.attitude, flown.setpoint))
+    inside = (((each >= begin_s) & (each <= end_s)).sum() for each in stamps)
     return (begin_s, end_s) if min(inside) >= 2 else None
 
 
 def passed_s(flown: History, window: tuple[float, float]) -> tuple[float, float]:
     """Time of the reference that was tracked, and that for which nothing was decided, in s."""
-    track_s = flown.records["track_time_s"][_ticks(flown, window)]
+    track_s = flown.records["track_time_s"][_ticks(flown, window)].astype(np.float64)
     intervals = np.diff(track_s)
     intervals = np.maximum(intervals[np.isfinite(intervals)], 0.0)  # flown again from its start
     flowing = intervals <= SKIPPED_S
@@ -54,27 +54,39 @@ def passed_s(flown: History, window: tuple[float, float]) -> tuple[float, float]
 def tracking_figures(flown: History, window: tuple[float, float]) -> dict[str, float]:
     """Values of a Score, of the samples in the window."""
     reference, clock = Reference(flown.reference), _Clock(flown)
-
-    def of(rows: Array, values: Array) -> Weighted:
-        return weighted(values, shares(clock.track_s(rows[:, 0])))
-
-    def away(rows: Array, columns: slice, derivative: int = 0) -> Weighted:
-        difference = rows[:, columns] - reference.position(rows[:, 0], derivative)
-        return of(rows, np.linalg.norm(difference, axis=1))
-
     rows, truth, setpoint, attitude = (
         _within(each, window)
         for each in (flown.position, flown.truth, flown.setpoint, flown.attitude)
     )
-    position, velocity = away(rows, slice(1, 4)), away(rows, slice(4, 7), 1)
-    true = away(truth, slice(1, 4))
-    commanded = thrust_direction_from_quaternion(setpoint[:, 2:6])
+
+    def of(rows: Rows, signal: Callable[[Rows], Array]) -> Weighted:
+        values = np.empty(len(rows))
+        for block in _blocks(len(rows)):
+            values[block] = signal(rows[block])
+        return weighted(values, shares(clock.track_s(rows["time_s"])))
+
+    def away(rows: Rows, column: str, derivative: int = 0) -> Weighted:
+        return of(
+            rows,
+            lambda part: np.linalg.norm(
+                part[column] - reference.position(part["time_s"], derivative), axis=1
+            ),
+        )
+
+    def turned_deg(rows: Rows) -> Array:
+        turn = heading_from_quaternion(rows["quaternion"]) - reference.heading(rows["time_s"])
+        return np.asarray(np.abs(np.degrees(wrap_pi(turn))))
+
+    def tilt_deg(rows: Rows) -> Array:
+        direction = thrust_direction_from_quaternion(rows["quaternion"])
+        return np.asarray(np.degrees(np.arccos(np.clip(direction[:, 2], -1.0, 1.0))))
+
+    position, velocity = away(rows, "position_ned_m"), away(rows, "velocity_ned_mps", 1)
+    true = away(truth, "position_ned_m")
+    commanded = thrust_direction_from_quaternion(setpoint["quaternion"])
     steps = np.degrees(np.linalg.norm(np.diff(commanded, axis=0), axis=1))
     fitness = _fitness(flown, reference, window)
-    turn = heading_from_quaternion(attitude[:, 1:5]) - reference.heading(attitude[:, 0])
-    heading = of(attitude, np.abs(np.degrees(wrap_pi(turn))))
-    direction = thrust_direction_from_quaternion(attitude[:, 1:5])
-    tilt = of(attitude, np.degrees(np.arccos(np.clip(direction[:, 2], -1, 1))))
+    heading = of(attitude, turned_deg)
     return {
         "rmse_position_m": position.rms,
         "mean_position_m": position.mean,
@@ -90,29 +102,30 @@ def tracking_figures(flown: History, window: tuple[float, float]) -> dict[str, f
         **fitness,
         "mu_e": sum(fitness.values()),
         "tracked_s": passed_s(flown, window)[0],
-        "thrust_sd": of(setpoint, setpoint[:, 6]).sd,
+        "thrust_sd": of(setpoint, lambda part: part["thrust"]).sd,
         "tilt_command_step_deg": math.sqrt((steps**2).mean()) if len(steps) else math.nan,
-        "tilt_max_deg": tilt.max,
-        "roll_rate_sd_radps": of(attitude, attitude[:, 5]).sd,
-        "pitch_rate_sd_radps": of(attitude, attitude[:, 6]).sd,
-        **_agitation(reference, attitude, shares(clock.track_s(attitude[:, 0]))),
+        "tilt_max_deg": of(attitude, tilt_deg).max,
+        "roll_rate_sd_radps": of(attitude, lambda part: part["rates_radps"][:, 0]).sd,
+        "pitch_rate_sd_radps": of(attitude, lambda part: part["rates_radps"][:, 1]).sd,
+        **_agitation(reference, attitude, shares(clock.track_s(attitude["time_s"]))),
     }
 
 
 def _fitness(flown: History, reference: Reference, window: tuple[float, float]) -> dict[str, float]:
     """Eqs. 31-32: velocities in the body frame, heading in degrees."""
-    ticks = flown.record_time_s[_ticks(flown, window)]
-    attitude = flown.attitude[_nearest(flown.attitude[:, 0], ticks), 1:5]
-    body = rotation_from_quaternion(attitude).swapaxes(-1, -2)
-    at_tick = _at(flown.position, ticks)
-    slip = np.einsum("nij,nj->ni", body, reference.position(ticks, 1) - at_tick[:, 3:6])
-    away = reference.position(ticks) - at_tick[:, 0:3]
-    turn = np.degrees(wrap_pi(reference.heading(ticks) - heading_from_quaternion(attitude)))
+    ticks = flown.records["time_s"][_ticks(flown, window)]
+    attitude, position = flown.attitude, flown.position
+    quaternion = attitude["quaternion"][_nearest(attitude["time_s"], ticks)]
+    body = rotation_from_quaternion(quaternion).swapaxes(-1, -2)
+    velocity = reference.position(ticks, 1) - _at(position, "velocity_ned_mps", ticks)
+    slip = np.einsum("nij,nj->ni", body, velocity)
+    away = reference.position(ticks) - _at(position, "position_ned_m", ticks)
+    turn = np.degrees(wrap_pi(reference.heading(ticks) - heading_from_quaternion(quaternion)))
     squares = (np.column_stack((slip, away, turn)) ** 2).sum(axis=0)
     return {name: float(value) for name, value in zip(_FITNESS, squares, strict=True)}
 
 
-def _agitation(reference: Reference, attitude: Array, weights: Array) -> dict[str, float]:
+def _agitation(reference: Reference, attitude: Rows, weights: Array) -> dict[str, float]:
     """Motion beside that of the reference: thrust direction and rates minus their linear fit by
     the reference's velocity, acceleration and jerk. The fit needs no model of drag and lag.
 
@@ -120,11 +133,13 @@ def _agitation(reference: Reference, attitude: Array, weights: Array) -> dict[st
     little memory.
     """
     factor = np.zeros((0, _EXPLAINED + 4))
-    for first in range(0, len(attitude), _BLOCK):
-        rows, share = attitude[first : first + _BLOCK], weights[first : first + _BLOCK]
-        times, direction = rows[:, 0], thrust_direction_from_quaternion(rows[:, 1:5])
+    for part in _blocks(len(attitude)):
+        rows, share = attitude[part], weights[part]
+        times, direction = rows["time_s"], thrust_direction_from_quaternion(rows["quaternion"])
         explained = [reference.position(times, order)[:, :2] for order in (1, 2, 3)]
-        block = np.hstack((*explained, np.ones((len(times), 1)), direction[:, :2], rows[:, 5:7]))
+        block = np.hstack(
+            (*explained, np.ones((len(times), 1)), direction[:, :2], rows["rates_radps"][:, :2])
+        )
         stacked = np.vstack((factor, np.sqrt(share)[:, None] * block))
         factor = np.linalg.qr(stacked, mode="r")  # type: ignore[assignment]
     regressors, motion = factor[:, :_EXPLAINED], factor[:, _EXPLAINED:]
@@ -140,7 +155,7 @@ def _agitation(reference: Reference, attitude: Array, weights: Array) -> dict[st
 
 def _ticks(flown: History, window: tuple[float, float]) -> NDArray[np.bool_]:
     """The ticks of TRACK in the window."""
-    times = flown.record_time_s
+    times = flown.records["time_s"]
     chosen: NDArray[np.bool_] = _in_track(flown) & (times >= window[0]) & (times <= window[1])
     return chosen
 
@@ -151,8 +166,8 @@ class _Clock:
 
     def __init__(self, flown: History) -> None:
         chosen = _in_track(flown)
-        rows = np.column_stack((flown.record_time_s, flown.records["track_time_s"]))[chosen]
-        self._times, track_s = each_once(rows).T
+        rows = each_once(flown.records[["time_s", "track_time_s"]][chosen])
+        self._times, track_s = rows["time_s"], rows["track_time_s"].astype(np.float64)
         self._passed_s: Array = np.cumsum(np.maximum(np.diff(track_s, prepend=track_s[:1]), 0.0))
 
     def track_s(self, times: Array) -> Array:
@@ -164,36 +179,55 @@ class Reference:
     """The reference as a function of vehicle time (N,): between two records the quintic through
     their positions, velocities and accelerations."""
 
-    def __init__(self, rows: Array) -> None:
-        newest = np.maximum.accumulate(rows[:, 0])
-        rows = rows[np.concatenate(([True], rows[1:, 0] > newest[:-1]))]
-        knots = np.stack((rows[:, 1:4], rows[:, 4:7], rows[:, 7:10]), axis=1)
-        self._times, self._heading = rows[:, 0], np.unwrap(rows[:, 10])
-        self._curve = BPoly.from_derivatives(self._times, knots)
+    def __init__(self, rows: Rows) -> None:
+        newest = np.maximum.accumulate(rows["time_s"])
+        self._rows = rows[np.concatenate(([True], rows["time_s"][1:] > newest[:-1]))]
+        self._heading = np.unwrap(self._rows["heading_rad"].astype(np.float64))
 
     def position(self, times: Array, derivative: int = 0) -> Array:
         """(N, 3) position NED in m, or a derivative of it."""
-        values: Array = self._curve.derivative(derivative)(times)
-        return values
+        stamps = self._rows["time_s"]
+        before = np.clip(np.searchsorted(stamps, times, "right") - 1, 0, len(stamps) - 2)
+        first, last = self._rows[before], self._rows[before + 1]
+        length_s = (last["time_s"] - first["time_s"])[:, None]
+        share = (times[:, None] - first["time_s"][:, None]) / length_s
+        begin, end = (
+            (
+                each["position_ned_m"].astype(np.float64),
+                length_s * each["velocity_ned_mps"],
+                length_s**2 * each["acceleration_ned_mps2"],
+            )
+            for each in (first, last)
+        )
+        away = end[0] - begin[0] - begin[1] - 0.5 * begin[2]  # of the end from the start's parabola
+        turn, bend = end[1] - begin[1] - begin[2], end[2] - begin[2]
+        coefficients: list[Array] = [
+            begin[0],
+            begin[1],
+            0.5 * begin[2],
+            10.0 * away - 4.0 * turn + 0.5 * bend,
+            -15.0 * away + 7.0 * turn - bend,
+            6.0 * away - 3.0 * turn + 0.5 * bend,
+        ]
+        for _ in range(derivative):
+            coefficients = [power * each for power, each in enumerate(coefficients)][1:]
+        values: Array = sum(each * share**power for power, each in enumerate(coefficients))
+        return np.asarray(values / length_s**derivative)
 
     def heading(self, times: Array) -> Array:
-        return np.interp(times, self._times, self._heading)
+        return np.interp(times, self._rows["time_s"], self._heading)
 
 
-def each_once(rows: Array) -> Array:
-    """Rows (N, columns) sorted by time (the first column), the first one of equal times."""
-    if (np.diff(rows[:, 0]) > 0.0).all():
-        return rows
-    _, first = np.unique(rows[:, 0], return_index=True)
-    once: Array = rows[first]
-    return once
-
-
-def _within(rows: Array, window: tuple[float, float]) -> Array:
+def _within(rows: Rows, window: tuple[float, float]) -> Rows:
     """Rows of a window, sorted, each time once."""
     once = each_once(rows)
-    begin, end = np.searchsorted(once[:, 0], (window[0], np.nextafter(window[1], math.inf)))
+    begin, end = np.searchsorted(once["time_s"], (window[0], np.nextafter(window[1], math.inf)))
     return once[begin:end]
+
+
+def _blocks(count: int) -> Iterator[slice]:
+    """Parts of an array: what is computed of one takes little memory."""
+    return (slice(first, first + _BLOCK) for first in range(0, count, _BLOCK))
 
 
 def _in_track(flown: History) -> NDArray[np.bool_]:
@@ -201,9 +235,10 @@ def _in_track(flown: History) -> NDArray[np.bool_]:
     return chosen
 
 
-def _at(rows: Array, times: Array) -> Array:
-    """Columns after the first, interpolated linearly at `times`."""
-    return np.stack([np.interp(times, rows[:, 0], column) for column in rows[:, 1:].T], axis=1)
+def _at(rows: Rows, column: str, times: Array) -> Array:
+    """The column (N, 3), interpolated linearly at `times`."""
+    axes = rows[column].T
+    return np.stack([np.interp(times, rows["time_s"], axis) for axis in axes], axis=1)
 
 
 def _nearest(stamps: Array, times: Array) -> NDArray[np.intp]:

@@ -62,17 +62,23 @@ def landing(flown: History) -> tuple[str, float]:
         touchdown.on_position(position.time_s, place, position.velocity_ned_mps[2])
     if touchdown is None:
         return "not landed", math.nan
-    since = flown.landed[flown.landed[:, 0] >= begun["land"]]
-    on_ground = bool(len(since)) and bool(since[-1, 1] == _ON_GROUND)
+    since = flown.landed[flown.landed["time_s"] >= begun["land"]]
+    on_ground = bool(len(since)) and bool(since["state"][-1] == _ON_GROUND)
     return touchdown.not_landed(on_ground=on_ground), touchdown.speed_mps
 
 
 def _positions(flown: History) -> Iterator[LocalPosition]:
     """In the order of time."""
-    order = np.argsort(flown.position[:, 0], kind="stable")
+    order = np.argsort(flown.position["time_s"], kind="stable")
     for first in range(0, len(order), _BLOCK):
-        for row in flown.position[order[first : first + _BLOCK]].tolist():
-            yield LocalPosition(row[0], tuple(row[1:4]), tuple(row[4:7]))
+        rows = flown.position[order[first : first + _BLOCK]]
+        for place, velocity, time_s in zip(
+            rows["position_ned_m"].tolist(),
+            rows["velocity_ned_mps"].tolist(),
+            rows["time_s"].tolist(),
+            strict=True,
+        ):
+            yield LocalPosition(time_s, tuple(place), tuple(velocity))
 
 
 def begin_times(phases: tuple[Event, ...]) -> dict[str, float]:
@@ -94,7 +100,7 @@ def judge(flown: History, skipped_s: float) -> Verdict:
             pass
         elif not_landed:
             why = not_landed
-        elif not len(flown.heartbeat) or flown.heartbeat[-1, 1]:
+        elif not len(flown.heartbeat) or flown.heartbeat["armed"][-1]:
             why = "not disarmed"
     return Verdict(float(why == REFERENCE_OVER), why, touchdown_mps, reason)
 
@@ -127,4 +133,4 @@ def _given_back(names: list[str]) -> bool:
 def _critical(flown: History) -> bool:
     """Whether the newest HEARTBEAT shows a failsafe or an emergency. A flight whose vehicle was
     taken ends with the first HEARTBEAT since."""
-    return bool(len(flown.heartbeat)) and bool(flown.heartbeat[-1, 2] >= _CRITICAL)
+    return bool(len(flown.heartbeat)) and bool(flown.heartbeat["system_status"][-1] >= _CRITICAL)

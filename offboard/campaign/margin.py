@@ -75,8 +75,9 @@ def _clearance(flown: History, controller: ControllerSettings) -> float:
     path = flown.truth if len(flown.truth) else flown.position
     if not volumes or not begun or not len(path):
         return math.nan
-    rows = path[path[:, 0] >= begun[0]]
+    rows = path[path["time_s"] >= begun[0]]
     if not len(rows):
         return math.nan
-    from_start = rows[:, 1:4] - path[0, 1:4]
-    return float(np.min(clearances(volumes, rows[:, 0] - begun[0], from_start)))
+    places = rows["position_ned_m"].astype(np.float64)
+    from_start = places - path["position_ned_m"][0]
+    return float(np.min(clearances(volumes, rows["time_s"] - begun[0], from_start)))

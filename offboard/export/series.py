@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from offboard.analysis import history, tlog
 from offboard.analysis.events import Event
 from offboard.analysis.history import TELEMETRY, History
+from offboard.analysis.samples import Rows
 from offboard.analysis.tlog import Tlog
 from offboard.documents.errors import UserError
 from offboard.flight.record import FIELDS
@@ -105,24 +106,24 @@ def read(path: Path) -> Flight:
     return Flight(series, events, unix, autopilot, flown.damage)
 
 
-def _rows(flown: History) -> dict[str, Array]:
-    """Rows (N, 1 + columns) that begin with the time, by the name of the series."""
-    decisions = [flown.records[name] for name in FIELDS]
+def _rows(flown: History) -> dict[str, Rows]:
+    """The arrays that are exported, by the name of the series."""
     return {
         "position": flown.position,
         "attitude": flown.attitude,
         "truth": flown.truth,
         "reference": flown.reference,
-        "setpoint": np.delete(flown.setpoint, 1, axis=1),  # without its Unix time
-        "decision": np.column_stack((flown.record_time_s, *decisions)),
+        "setpoint": flown.setpoint[["time_s", "quaternion", "thrust"]],
+        "decision": flown.records,
         "heartbeat": flown.heartbeat,
     }
 
 
-def _series(name: str, rows: Array) -> Series:
+def _series(name: str, rows: Rows) -> Series:
     """Without the samples from before any telemetry, whose time is NaN."""
-    rows = rows[np.isfinite(rows[:, 0])]
-    return Series(name, _COLUMNS[name], rows[:, 0], rows[:, 1:])
+    rows = rows[np.isfinite(rows["time_s"])]
+    columns = [rows[column] for column in rows.dtype.names or () if column != "time_s"]
+    return Series(name, _COLUMNS[name], rows["time_s"], np.column_stack(columns))
 
 
 def _unix(log: Tlog, vehicle: Address | None) -> Array:

@@ -9,6 +9,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
 EARTH_RADIUS_M = 6_371_000.0
 Triple = tuple[float, float, float]
 
@@ -21,16 +24,18 @@ class Geodetic(NamedTuple):
     altitude_m: float = 0.0
 
 
-def position_ned_m(place: Geodetic, origin: Geodetic) -> Triple:
-    """North, east and down of `place` relative to `origin`, m."""
-    latitude, reference = math.radians(place.latitude_deg), math.radians(origin.latitude_deg)
-    turn = math.radians(place.longitude_deg - origin.longitude_deg)
-    sine, cosine = math.sin(latitude), math.cos(latitude)
-    north = math.cos(reference) * sine - math.sin(reference) * cosine * math.cos(turn)
-    east = cosine * math.sin(turn)
-    chord = math.hypot(north, east)
-    scale = EARTH_RADIUS_M * (math.asin(min(chord, 1.0)) / chord if chord > 0.0 else 1.0)
-    return scale * north, scale * east, origin.altitude_m - place.altitude_m
+def position_ned_m(places: ArrayLike, origin: Geodetic) -> NDArray[np.float64]:
+    """North, east and down (..., 3) in m of `places` (..., 3), as in `Geodetic`, relative to
+    `origin`."""
+    latitude_deg, longitude_deg, altitude_m = np.moveaxis(np.asarray(places, np.float64), -1, 0)
+    latitude, reference = np.radians(latitude_deg), math.radians(origin.latitude_deg)
+    turn = np.radians(longitude_deg - origin.longitude_deg)
+    sine, cosine = np.sin(latitude), np.cos(latitude)
+    north = math.cos(reference) * sine - math.sin(reference) * cosine * np.cos(turn)
+    east = cosine * np.sin(turn)
+    chord = np.minimum(np.hypot(north, east), 1.0)
+    scale = EARTH_RADIUS_M / np.sinc(np.arcsin(chord) / math.pi)  # angle over its sine
+    return np.stack((scale * north, scale * east, origin.altitude_m - altitude_m), axis=-1)
 
 
 def origin_of(place: Geodetic, known_ned_m: Triple) -> Geodetic:
@@ -40,7 +45,8 @@ def origin_of(place: Geodetic, known_ned_m: Triple) -> Geodetic:
     latitude, longitude, altitude = place
     altitude += known_ned_m[2]
     for _ in range(3):  # each pass leaves a millionth of the error for every few metres
-        north, east, _down = position_ned_m(place, Geodetic(latitude, longitude, altitude))
+        found = position_ned_m(place, Geodetic(latitude, longitude, altitude))
+        north, east, _down = found.tolist()
         latitude += (north - known_ned_m[0]) / metres
         longitude += (east - known_ned_m[1]) / (metres * shrink)
     return Geodetic(latitude, longitude, altitude)

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
-from numpy.typing import NDArray
 
 from offboard.analysis.figure import (
     BLUE,
@@ -32,6 +31,7 @@ from offboard.analysis.figure import (
     logarithmic,
     panels,
 )
+from offboard.analysis.samples import Rows
 from offboard.analysis.verdict import begin_times
 from offboard.report import timeline
 from offboard.report.flight import Flight
@@ -123,9 +123,9 @@ def _path(drawn: Sequence[Lane]) -> Figure | None:
     return Figure("Path", figure, caption)
 
 
-def _path_of(rows: NDArray[np.float64], name: str, colour: str, dash: str) -> go.Scatter3d:
+def _path_of(rows: Rows, name: str, colour: str, dash: str) -> go.Scatter3d:
     chosen = rows[np.linspace(0, len(rows) - 1, min(len(rows), PATH_POINTS)).astype(int)]
-    north, east, down = chosen[:, 1:4].T
+    north, east, down = chosen["position_ned_m"].T
     return go.Scatter3d(  # east, north, up: right-handed, as plotly draws them
         x=coordinates(east), y=coordinates(north), z=coordinates(-down), mode="lines",
         name=html.escape(name), line={"color": colour, "width": 4, "dash": dash},

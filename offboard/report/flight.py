@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from offboard.analysis import history, tlog
 from offboard.analysis.history import History
+from offboard.analysis.samples import Rows
 from offboard.analysis.score import Score, score
 from offboard.analysis.verdict import begin_times
 from offboard.report.substitutes import completed
@@ -45,14 +45,14 @@ class Flight:
 
     @property
     def begin_s(self) -> float:
-        return min((rows[0, 0] for rows in self._samples if len(rows)), default=0.0)
+        return min((rows["time_s"][0] for rows in self._samples if len(rows)), default=0.0)
 
     @property
     def end_s(self) -> float:
-        return max((rows[-1, 0] for rows in self._samples if len(rows)), default=0.0)
+        return max((rows["time_s"][-1] for rows in self._samples if len(rows)), default=0.0)
 
     @property
-    def _samples(self) -> tuple[NDArray[np.float64], ...]:
+    def _samples(self) -> tuple[Rows, ...]:
         return self.history.position, self.history.attitude, self.history.setpoint
 
 

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from offboard.analysis.figure import BLUE, GREEN, INK, ORANGE, PINK, PURPLE
 from offboard.analysis.history import History
-from offboard.analysis.tracking import Reference, each_once
+from offboard.analysis.samples import Rows, each_once
+from offboard.analysis.tracking import Reference
 from offboard.model.frames import euler_from_quaternion
 
 Array = NDArray[np.float64]
@@ -63,32 +64,37 @@ def tracking(flown: History) -> tuple[Panel, ...]:
         for column, (axis, (colour, dash)) in enumerate(_AXES.items())
     )
     heights = tuple(
-        Curve(name, rows[:, 0], -rows[:, 3], colours[name], main=name == ESTIMATED)
+        Curve(name, rows["time_s"], _height_m(rows), colours[name], main=name == ESTIMATED)
         for name, rows in flights.items()
         if len(rows)
     )
     reference = Curve(
-        "reference", flown.reference[:, 0], -flown.reference[:, 3], INK, main=False, dash="dash"
+        "reference",
+        flown.reference["time_s"],
+        _height_m(flown.reference),
+        INK,
+        main=False,
+        dash="dash",
     )
-    speed = np.linalg.norm(flown.position[:, 4:7], axis=1)
+    speed = np.linalg.norm(flown.position["velocity_ned_mps"], axis=1)
     return (
         Panel("distance from the reference, m", errors),
         Panel("estimated error by axis, m", components),
         Panel("height, m", (*heights, reference)),
-        Panel("speed, m/s", (Curve(ESTIMATED, flown.position[:, 0], speed, BLUE),)),
+        Panel("speed, m/s", (Curve(ESTIMATED, flown.position["time_s"], speed, BLUE),)),
     )
 
 
 def attitude(flown: History) -> tuple[Panel, ...]:
     """Roll, pitch and heading, commanded and flown."""
-    sent = _euler_deg(flown.setpoint[:, 2:6])
-    estimated = _euler_deg(flown.attitude[:, 1:5])
+    sent = _euler_deg(flown.setpoint["quaternion"])
+    estimated = _euler_deg(flown.attitude["quaternion"])
     return tuple(
         Panel(
             f"{title}, deg",
             (
-                Curve(COMMANDED, flown.setpoint[:, 0], sent[:, axis], ORANGE, "steps", False),
-                Curve(ESTIMATED, flown.attitude[:, 0], estimated[:, axis], BLUE),
+                Curve(COMMANDED, flown.setpoint["time_s"], sent[:, axis], ORANGE, "steps", False),
+                Curve(ESTIMATED, flown.attitude["time_s"], estimated[:, axis], BLUE),
             ),
         )
         for axis, title in enumerate(("roll", "pitch", "heading"))
@@ -97,7 +103,9 @@ def attitude(flown: History) -> tuple[Panel, ...]:
 
 def thrust(flown: History) -> tuple[Panel, ...]:
     """Thrust commanded, and the hover thrust that the observer estimates."""
-    commanded = Curve(COMMANDED, flown.setpoint[:, 0], flown.setpoint[:, 6], ORANGE, "steps")
+    commanded = Curve(
+        COMMANDED, flown.setpoint["time_s"], flown.setpoint["thrust"], ORANGE, "steps"
+    )
     hover = _recorded(
         flown, "hover_thrust", "hover thrust, estimated", INK, main=False, dash="dash"
     )
@@ -123,8 +131,8 @@ def decisions(flown: History) -> tuple[Panel, ...]:
 def link(flown: History) -> tuple[Panel, ...]:
     """Ages and delays of the link, and intervals of telemetry."""
     delay = Curve(
-        "delay of the link (TIMESYNC)", flown.link_delay[:, 0], 1e3 * flown.link_delay[:, 1],
-        ORANGE, main=False,
+        "delay of the link (TIMESYNC)", flown.link_delay["time_s"],
+        1e3 * flown.link_delay["delay_s"], ORANGE, main=False,
     )  # fmt: skip
     age = _recorded(flown, "age_s", "telemetry at its setpoint", BLUE, "dots", 1e3)
     late = _recorded(
@@ -136,7 +144,7 @@ def link(flown: History) -> tuple[Panel, ...]:
         1e3,
         main=False,
     )
-    stamps = np.unique(flown.position[:, 0])
+    stamps = np.unique(flown.position["time_s"])
     gaps = Curve("positions", stamps[1:], 1e3 * np.diff(stamps), BLUE, "dots")
     return (
         Panel("age and delay, ms", (age, delay, late)),
@@ -148,9 +156,11 @@ def identification(flown: History) -> tuple[Panel, ...]:
     """What was identified, with its standard deviation, and what the observer estimates."""
 
     def found(column: int, name: str, colour: str, scale: float = 1.0, main: bool = True) -> Curve:
-        rows = flown.identified[np.isfinite(flown.identified[:, column])]
-        value, sd = scale * rows[:, column], scale * rows[:, column + 1]
-        return Curve(name, rows[:, 0], value, colour, "dots", main, sd=sd)
+        values = flown.identified["values"]
+        known = np.isfinite(values[:, column])
+        value, sd = scale * values[known, column : column + 2].T
+        times = flown.identified["time_s"][known]
+        return Curve(name, times, value, colour, "dots", main, sd=sd)
 
     hover = _recorded(flown, "hover_thrust", ESTIMATED, PURPLE, main=False)
     disturbance = tuple(
@@ -160,14 +170,14 @@ def identification(flown: History) -> tuple[Panel, ...]:
     return (
         Panel(
             "identified delay, ms",
-            (found(1, "tilt", BLUE, 1e3), found(7, "yaw", ORANGE, 1e3, main=False)),
+            (found(0, "tilt", BLUE, 1e3), found(6, "yaw", ORANGE, 1e3, main=False)),
         ),
         Panel(
             "identified natural frequency, rad/s",
-            (found(3, "tilt", BLUE), found(9, "yaw", ORANGE, main=False)),
+            (found(2, "tilt", BLUE), found(8, "yaw", ORANGE, main=False)),
         ),
-        Panel("hover thrust, 0 to 1", (found(13, "identified", INK), hover)),
-        Panel("identified drag, 1/s", (found(19, "drag", BLUE),)),
+        Panel("hover thrust, 0 to 1", (found(12, "identified", INK), hover)),
+        Panel("identified drag, 1/s", (found(18, "drag", BLUE),)),
         Panel("estimated disturbance, m/s²", disturbance),
     )
 
@@ -201,7 +211,7 @@ def thinned(values: Array, bins: int = BINS) -> NDArray[np.intp]:
 
 def near_reference(flown: History, times: Array) -> NDArray[np.bool_]:
     """Whether a record of the reference is near each of the times (N,)."""
-    stamps = np.sort(flown.reference[:, 0])
+    stamps = np.sort(flown.reference["time_s"])
     place = np.searchsorted(stamps, times)
     inside = (place > 0) & (place < len(stamps))
     before, after = np.clip(place - 1, 0, None), np.clip(place, None, len(stamps) - 1)
@@ -209,14 +219,19 @@ def near_reference(flown: History, times: Array) -> NDArray[np.bool_]:
     return near
 
 
-def _away(flown: History, rows: Array) -> tuple[Array, Array]:
+def _away(flown: History, rows: Rows) -> tuple[Array, Array]:
     """Times (N,), and position minus reference (N, 3) in m where there is a reference."""
-    if len(np.unique(flown.reference[:, 0])) < 2:
+    if len(np.unique(flown.reference["time_s"])) < 2:
         return np.zeros(0), np.zeros((0, 3))
-    near = near_reference(flown, rows[:, 0])
+    times = rows["time_s"]
+    near = near_reference(flown, times)
     errors = np.full((len(rows), 3), np.nan)
-    errors[near] = rows[near, 1:4] - Reference(flown.reference).position(rows[near, 0])
-    return rows[:, 0], errors
+    errors[near] = rows["position_ned_m"][near] - Reference(flown.reference).position(times[near])
+    return times, errors
+
+
+def _height_m(rows: Rows) -> Array:
+    return np.asarray(-rows["position_ned_m"][:, 2])
 
 
 def _euler_deg(quaternions: Array) -> Array:
@@ -232,4 +247,4 @@ def _recorded(
     *, main: bool = True, dash: str = "solid",
 ) -> Curve:  # fmt: skip
     values = scale * flown.records[field]
-    return Curve(name, flown.record_time_s, values, colour, style, main, dash)
+    return Curve(name, flown.records["time_s"], values, colour, style, main, dash)

@@ -62,7 +62,9 @@ def marks(flight: Flight) -> list[Mark]:
         why = ", ".join(
             flag.name.lower().replace("_", " ") for flag in Refusal(int(refused[row])) if flag.name
         )
-        found.append(Mark("failsafe", float(flown.record_time_s[row]), f"setpoint not sent: {why}"))
+        found.append(
+            Mark("failsafe", float(flown.records["time_s"][row]), f"setpoint not sent: {why}")
+        )
     texts = (*flown.announcements, *flown.vehicle_messages)
     found += [Mark("texts", event.time_s, f"{event.who}: {event.what}") for event in texts]
     return [mark for mark in found if math.isfinite(mark.time_s)]

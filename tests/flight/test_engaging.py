@@ -43,12 +43,12 @@ def swing(pair: Pair, directory: Path) -> tuple[float, float]:
     begin_s = next(at_s for at_s, phase in pair.phases if phase is Phase.TRACK)
 
     def settled(rows):
-        inside = (rows[:, 0] > begin_s + SETTLED_S) & (rows[:, 0] < begin_s + END_S)
+        inside = (rows["time_s"] > begin_s + SETTLED_S) & (rows["time_s"] < begin_s + END_S)
         return rows[inside]
 
-    reference = settled(flown.reference)[0, 1:4]
-    away = settled(flown.position)[:, 1:4] - reference
-    rates = settled(flown.attitude)[:, 5:7]
+    reference = settled(flown.reference)["position_ned_m"][0]
+    away = settled(flown.position)["position_ned_m"] - reference
+    rates = settled(flown.attitude)["rates_radps"][:, :2]
     return float(np.linalg.norm(away, axis=1).max()), float(np.abs(rates).max())
 
 

@@ -61,7 +61,7 @@ def test_a_log_with_parts_missing_is_scored_as_far_as_it_goes(tmp_path: Path) ->
         rows = getattr(flown, part)
         for kept in (rows[:0], rows[:1]):
             assert math.isnan(score(replace(flown, **{part: kept})).rmse_position_m)
-    twice = np.vstack((flown.reference, flown.reference))
+    twice = np.concatenate((flown.reference, flown.reference))
     assert score(replace(flown, reference=twice)).rmse_position_m == whole.rmse_position_m
 
 

@@ -98,10 +98,11 @@ def test_unseen_vehicle_is_identified_from_its_log(name, scenario, tmp_path: Pat
 def second_lap_rmse_m(pair: Pair, directory: Path) -> float:
     flown = history.gather(pair.log(directory))
     begin_s = next(t for t, phase in pair.phases if phase is Phase.TRACK) + 8.0
-    rows = flown.reference[np.append(True, np.diff(flown.reference[:, 0]) > 0.0)]
-    path = CubicHermiteSpline(rows[:, 0], rows[:, 1:4], rows[:, 4:7])
-    lap = flown.position[(flown.position[:, 0] > begin_s) & (flown.position[:, 0] < begin_s + 7.8)]
-    away = lap[:, 1:4] - path(lap[:, 0])
+    rows = flown.reference[np.append(True, np.diff(flown.reference["time_s"]) > 0.0)]
+    path = CubicHermiteSpline(rows["time_s"], rows["position_ned_m"], rows["velocity_ned_mps"])
+    times = flown.position["time_s"]
+    lap = flown.position[(times > begin_s) & (times < begin_s + 7.8)]
+    away = lap["position_ned_m"] - path(lap["time_s"])
     return float(np.sqrt(np.mean(np.sum(away**2, axis=1))))
 
 

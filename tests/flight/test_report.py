@@ -95,7 +95,7 @@ def test_the_path_is_no_mirror_image() -> None:
     """The axes of a scene are right-handed: east, north, up."""
     flight = read(PX4)
     (curve,) = figures([flight])["path"].drawing.data
-    north, east, down = flight.history.position[[0, -1], 1:4].T
+    north, east, down = flight.history.position["position_ned_m"][[0, -1]].T
     ends = [[axis[0], axis[-1]] for axis in (curve.x, curve.y, curve.z)]
     assert np.array(ends) == pytest.approx(np.array([east, north, -down]))
     assert figures([flight])["tracking"].caption == ""  # which has no reference
@@ -159,10 +159,10 @@ def test_a_log_of_another_program_gives_what_it_holds(tmp_path: Path) -> None:
     assert "no setpoints (SET_ATTITUDE_TARGET of offboard, ATTITUDE_TARGET)" in flight.missing
     assert any("positions are of GLOBAL_POSITION_INT" in each for each in flight.missing)
     assert math.isnan(flight.score.completed)
-    climbed = [-part.history.position[:, 3] for part in (whole, flight)]
+    climbed = [-part.history.position["position_ned_m"][:, 2] for part in (whole, flight)]
     assert [np.ptp(each) for each in climbed] == pytest.approx([5.0, 5.0], abs=1.5)
     assert np.ptp(climbed[0]) == pytest.approx(np.ptp(climbed[1]), abs=0.3)
-    rolls = [part.history.attitude[:, 2].max() for part in (whole, flight)]
+    rolls = [part.history.attitude["quaternion"][:, 1].max() for part in (whole, flight)]
     assert rolls[0] == pytest.approx(rolls[1], abs=0.01)
     assert [m.what for m in flight.history.modes] == [m.what for m in whole.history.modes]
     assert all(math.isfinite(m.time_s) for m in flight.history.modes[1:])
@@ -193,7 +193,7 @@ def test_a_damaged_log_is_shown_with_the_place_of_the_damage(tmp_path: Path) -> 
         if e.name in ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED")
     )
     assert float(found[2]) == pytest.approx(expected_s, abs=0.01)
-    assert flight.history.position[-1, 0] == pytest.approx(whole[-1, 0], abs=0.1)
+    assert flight.history.position["time_s"][-1] == pytest.approx(whole["time_s"][-1], abs=0.1)
     assert any(each.startswith("the log ends within an entry, at byte") for each in flight.missing)
 
 

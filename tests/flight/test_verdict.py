@@ -45,7 +45,7 @@ def test_decisions_at_the_tilt_limit_are_counted_and_reported(tmp_path: Path) ->
     pair = make(reference="lemniscate", vehicle="neutral", scenario="wind_light", seed=2)
     pair.track()
     flown = history.gather(pair.log(tmp_path))
-    down = thrust_direction_from_quaternion(flown.setpoint[:, 2:6])[:, 2]
+    down = thrust_direction_from_quaternion(flown.setpoint["quaternion"])[:, 2]
     limited = np.degrees(np.arccos(down)) > 44.9
     assert limited.sum() > 20
     scored = score(flown)
@@ -251,10 +251,10 @@ def test_a_record_says_what_was_sent(tmp_path: Path) -> None:
     assert certified[~excited].all()
     assert 0.0 < certified[excited].mean() < 0.9
     assert score(flown).certified_share == pytest.approx(certified.mean())
-    rows = np.searchsorted(flown.setpoint[:, 0], flown.record_time_s)
-    sent = thrust_direction_from_quaternion(flown.setpoint[rows, 2:6])
+    rows = np.searchsorted(flown.setpoint["time_s"], flown.records["time_s"])
+    sent = thrust_direction_from_quaternion(flown.setpoint["quaternion"][rows])
     recorded = [flown.records[f"thrust_direction_{axis}"] for axis in ("north", "east", "down")]
-    assert np.array_equal(flown.setpoint[rows, 0], flown.record_time_s)
+    assert np.array_equal(flown.setpoint["time_s"][rows], flown.records["time_s"])
     assert np.abs(sent - np.stack(recorded, axis=1)).max() < 1e-6
 
 
@@ -264,23 +264,25 @@ def test_a_record_says_what_was_sent(tmp_path: Path) -> None:
 def beside(flown: History, offset_m: Callable[[np.ndarray], np.ndarray]) -> History:
     """The flight as if the vehicle had been on the reference but for an offset to the north."""
     position = flown.position.copy()
-    for column in (1, 2, 3):
-        reference = flown.reference
-        position[:, column] = np.interp(position[:, 0], reference[:, 0], reference[:, column])
-    position[:, 1] += offset_m(position[:, 0] - track_begin_s(flown))
+    times, reference = position["time_s"], flown.reference
+    for axis in range(3):
+        position["position_ned_m"][:, axis] = np.interp(
+            times, reference["time_s"], reference["position_ned_m"][:, axis]
+        )
+    position["position_ned_m"][:, 0] += offset_m(times - track_begin_s(flown))
     return replace(flown, position=position)
 
 
 def track_begin_s(flown: History) -> float:
     track = flown.records["phase"] == PHASE_CODES[Phase.TRACK]
-    return float(flown.record_time_s[track][0])
+    return float(flown.records["time_s"][track][0])
 
 
 def test_thinned_telemetry_does_not_lower_the_error(flown: History) -> None:
     """1 m off for 0.5 of 3 s: sqrt(1/6) m; with one sample in ten meanwhile, per sample it would be
     0.14 m. A gap of 0.4 s while the error falls from 1 m to 0 counts with its length."""
     off = beside(flown, lambda t: np.where((t >= 1.0) & (t < 1.5), 1.0, 0.0))
-    in_track_s = off.position[:, 0] - track_begin_s(off)
+    in_track_s = off.position["time_s"] - track_begin_s(off)
     expected_m = math.sqrt(0.5 / score(off).tracked_s)
     assert score(off).rmse_position_m == pytest.approx(expected_m, rel=0.03)
     kept = (in_track_s < 1.0) | (in_track_s >= 1.5) | (np.arange(len(in_track_s)) % 10 == 0)
@@ -298,17 +300,18 @@ def jumped(flown: History, by_s: float, *, reference_too: bool) -> History:
     tables = {}
     for name in ("position", "attitude", "truth", "reference", "setpoint", "landed", "heartbeat"):
         rows = getattr(flown, name).copy()
-        rows[rows[:, 0] > moment_s, 0] += by_s
+        rows["time_s"][rows["time_s"] > moment_s] += by_s
         tables[name] = rows
-    times, records = flown.record_time_s.copy(), flown.records.copy()
+    records = flown.records.copy()
+    late = records["time_s"] > moment_s
     if reference_too:
-        records["track_time_s"][times > moment_s] += by_s
-    times[times > moment_s] += by_s
+        records["track_time_s"][late] += by_s
+    records["time_s"][late] += by_s
     phases = tuple(
         replace(event, time_s=event.time_s + (by_s if event.time_s > moment_s else 0.0))
         for event in flown.phases
     )
-    return replace(flown, **tables, record_time_s=times, records=records, phases=phases)
+    return replace(flown, **tables, records=records, phases=phases)
 
 
 @pytest.mark.parametrize("by_s", [3.0, 35.0])
@@ -356,8 +359,8 @@ def test_a_flight_across_the_wrap_of_the_clock(flown: History, tmp_path: Path) -
     assert wrapped.link_delay_p50_ms == pytest.approx(whole.link_delay_p50_ms, abs=1.0)
     again = history.gather(tlog.read(tmp_path / "flight.tlog"))
     for rows in (again.position, again.reference, again.setpoint):
-        assert np.diff(rows[:, 0]).min() >= 0.0
-        assert np.diff(rows[:, 0]).max() < 1.0
+        assert np.diff(rows["time_s"]).min() >= 0.0
+        assert np.diff(rows["time_s"]).max() < 1.0
 
 
 def test_stretch_that_is_too_short_to_be_scored_is_not_flown(tmp_path: Path) -> None:

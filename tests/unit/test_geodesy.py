@@ -48,4 +48,4 @@ def test_origin_is_where_the_place_lies_as_known(known: tuple[float, float, floa
 
 
 def test_a_place_is_at_its_own_origin() -> None:
-    assert position_ned_m(ZURICH, ZURICH) == (0.0, 0.0, 0.0)
+    assert position_ned_m(ZURICH, ZURICH).tolist() == [0.0, 0.0, 0.0]

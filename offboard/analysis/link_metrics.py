@@ -1,0 +1,145 @@
+"""Metrics of the decisions of a flight, and of its link: rates, gaps and repetitions of telemetry,
+gaps of setpoints, delays.
+
+From the columns of a flight to values of a Score, all in vehicle time as in the flight itself.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offboard.analysis.history import History
+from offboard.analysis.verdict import begin_times
+from offboard.flight.phases import PHASE_CODES, Phase
+from offboard.flight.setpoint import Refusal
+
+Array = NDArray[np.float64]
+
+
+def decision_figures(flown: History) -> dict[str, float]:
+    """Values of a Score; empty without records."""
+    columns = flown.records
+    if not len(columns):
+        return {}
+    refused = columns["refused"].astype(np.int64)
+
+    def known(name: str) -> Array:
+        values = columns[name].astype(np.float64)
+        return values[np.isfinite(values)]
+
+    def refusals(flag: int) -> float:
+        return float(((refused & flag) != 0).sum())
+
+    answer_ms, age_ms = 1e3 * known("answer_s"), 1e3 * known("age_s")
+    solve_ms, gap = 1e3 * known("solve_time_s"), known("gap")
+    # A setpoint without certificate was changed by the gate, in EXCITE perhaps by a step
+    changed = np.isnan(columns["at_bound"]) & np.isfinite(columns["thrust_mps2"])
+    limited = changed & (columns["phase"] != PHASE_CODES[Phase.EXCITE])
+    at_bound = np.where(limited, 1.0, columns["at_bound"])
+    return {
+        "decisions": float(len(refused)),
+        "answer_p50_ms": _percentile(answer_ms, 50),
+        "answer_p99_ms": _percentile(answer_ms, 99),
+        "answer_max_ms": _percentile(answer_ms, 100),
+        "setpoint_age_p99_ms": _percentile(age_ms, 99),
+        "setpoint_age_max_ms": _percentile(age_ms, 100),
+        "missed_ticks": float(known("missed_ticks").sum()),
+        "skipped_ticks": float(
+            columns["missed_ticks"][columns["pause_s"] > 0.0].sum(dtype=np.float64)
+        ),
+        "pause_max_s": float(columns["pause_s"].max()),
+        "refused_setpoints": float((refused != 0).sum()),
+        "refused_late": refusals(Refusal.LATE),
+        "refused_stale": refusals(Refusal.STALE),
+        "refused_not_ours": refusals(Refusal.NOT_OURS),
+        "refused_unusable": refusals(Refusal.UNUSABLE),
+        "other_datagrams": float(known("other_datagrams").sum()),
+        "solve_time_p50_ms": _percentile(solve_ms, 50),
+        "solve_time_p99_ms": _percentile(solve_ms, 99),
+        "certified_share": len(gap) / len(refused),
+        "gap_median": _percentile(gap, 50),
+        "gap_max": _percentile(gap, 100),
+        "spread_median": _percentile(known("spread"), 50),
+        "at_bound_share": _mean(at_bound[np.isfinite(at_bound)]),
+        "cut_short_share": _mean(known("cut_short")),
+        "hover_thrust": float(columns["hover_thrust"][-1]),
+    }
+
+
+def _percentile(values: Array, share: float) -> float:
+    return float(np.percentile(values, share)) if len(values) else math.nan
+
+
+def _mean(values: Array) -> float:
+    return float(values.mean()) if len(values) else math.nan
+
+
+def link_figures(flown: History, window: tuple[float, float] | None) -> dict[str, float]:
+    """Values of a Score. `window`: first and last vehicle time of TRACK; without it, the telemetry
+    has none."""
+    armed_s = begin_times(flown.phases).get("takeoff", math.nan)
+    last_s = flown.position["time_s"][-1] if len(flown.position) else math.nan
+    values = {"flight_s": float(last_s - armed_s), **_delay(flown), **_setpoints(flown)}
+    if window is None:
+        return values
+    position, attitude = (
+        _within(rows["time_s"], window) for rows in (flown.position, flown.attitude)
+    )
+    late = int((~_newer(position)).sum())
+    return values | {
+        "position_hz": _hz(position),
+        "attitude_hz": _hz(attitude),
+        "position_gap_max_s": _longest_s(position),
+        "attitude_gap_max_s": _longest_s(attitude),
+        "stale_share": late / (len(position) - 1) if len(position) > 1 else math.nan,
+    }
+
+
+def _within(stamps: Array, window: tuple[float, float]) -> Array:
+    return stamps[(stamps >= window[0]) & (stamps <= window[1])]
+
+
+def _newer(stamps: Array) -> NDArray[np.bool_]:
+    """Which stamps, in the order of arrival, are newer than all before."""
+    newer: NDArray[np.bool_] = np.diff(np.maximum.accumulate(stamps), prepend=-math.inf) > 0.0
+    return newer
+
+
+def _hz(stamps: Array) -> float:
+    span_s = float(np.ptp(stamps)) if len(stamps) else 0.0
+    return (len(np.unique(stamps)) - 1) / span_s if span_s > 0.0 else math.nan
+
+
+def _longest_s(stamps: Array) -> float:
+    return float(np.diff(np.maximum.accumulate(stamps)).max(initial=0.0))
+
+
+def _setpoints(flown: History) -> dict[str, float]:
+    """Figures of the setpoints up to the landing."""
+    end_s = begin_times(flown.phases).get("land", math.inf)
+    rows = flown.setpoint[flown.setpoint["time_s"] < end_s]
+    if len(rows) < 2:
+        return {}
+    span_s = float(rows["time_s"][-1] - rows["time_s"][0])
+    gap_s, wall_gap_s = (float(np.diff(rows[at]).max(initial=0.0)) for at in ("time_s", "unix_s"))
+    return {
+        "setpoint_hz": (len(rows) - 1) / span_s if span_s > 0.0 else math.nan,
+        "setpoint_gap_max_s": gap_s,
+        "setpoint_gap_wall_max_s": wall_gap_s,
+    }
+
+
+def _delay(flown: History) -> dict[str, float]:
+    """Delay of the link (TIMESYNC), and the last one identified: from telemetry to effect."""
+    values = {}
+    if len(flown.link_delay):
+        late_ms = 1e3 * flown.link_delay["delay_s"]
+        values["link_delay_p50_ms"], values["link_delay_p99_ms"] = np.percentile(late_ms, (50, 99))
+    identified = flown.identified["values"]
+    known = identified[np.isfinite(identified[:, 0])]
+    if len(known):
+        values["delay_ms"], values["delay_sd_ms"] = 1e3 * known[-1, :2].astype(np.float64)
+    return {name: float(value) for name, value in values.items()}
