@@ -64,7 +64,7 @@ class LinkMeasures:
     round_trip_s: float | None = None  # of TIMESYNC, median
     late_s: float = 0.0  # greatest age of telemetry beyond the least
     foreign_timesync: int = 0  # replies of the vehicle to requests that are not ours
-    commands_sent: int = 0  # different commands that are acknowledged
+    commands_sent: int = 0  # different commands to which an acknowledgement is due
     acknowledged: Mapping[int, str] = field(default_factory=dict)  # MAV_CMD -> MAV_RESULT
 
 

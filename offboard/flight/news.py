@@ -17,7 +17,8 @@ DROPPED = (
     "{total:.0f} of our messages to the vehicle dropped: this computer was too busy, and they "
     "became too old"
 )
-FIRST_S = 2.5  # in a phase: telemetry has only just been requested
+# In a phase, before the first reason: telemetry has only just been requested, checks are running
+FIRST_S = {Phase.CONNECT: 2.5, Phase.HEALTH: 5.0}
 CHANGED_S = 1.0  # between two reasons
 AGAIN_S = 10.0  # the same reason, in other figures too
 
@@ -32,10 +33,10 @@ class Waiting:
 
     def news(self, state: FlightState, session: Session, now_s: float) -> str:
         """A sentence to say at `now_s`, of any clock; empty without one."""
-        if state.phase not in (Phase.CONNECT, Phase.HEALTH):
+        if state.phase not in FIRST_S:
             self._kind = ""
             return ""
-        if state.in_phase_s < FIRST_S or now_s - self._said_s < CHANGED_S:
+        if state.in_phase_s < FIRST_S[state.phase] or now_s - self._said_s < CHANGED_S:
             return ""
         reason = _unheard(session) if state.phase is Phase.CONNECT else _unready(state)
         kind = re.sub(r"[0-9]+", "", reason)
