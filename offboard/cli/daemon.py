@@ -29,9 +29,9 @@ from offboard.documents.errors import UserError
 STATE = Path("/var/lib/offboard")  # of the unit
 REFUSED = 3
 EXIT_CODES = (
-    "Exit codes: 0 stopped, no vehicle follows it any more; 2 usage or configuration error, "
-    "nothing sent; 3 not begun for now, as another daemon has the connection, the disk is full, or "
-    "stopped before a take-off; 4 ended before the vehicle was handed back, or left armed."
+    "Exit codes: 0 stopped while no vehicle follows it; 2 usage or configuration error, nothing "
+    "sent; 3 cannot begin now (another daemon has the connection, the disk is full), or stopped "
+    "before a take-off; 4 ended before the vehicle was handed back, or left armed."
 )
 OUT = f"Directory of the flights' directories.  [default: {FLIGHTS}]"
 

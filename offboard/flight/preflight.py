@@ -226,25 +226,25 @@ def _prearm(ground: Ground) -> str:
     if vehicle.health is None:
         return "SYS_STATUS does not arrive: it is unknown whether the vehicle can arm"
     if _needs_setpoints(ground):
-        said = vehicle.explanation("") if vehicle.texts else ""
-        return f"its pre-arm checks pass in {vehicle.mode} only while setpoints arrive{said}"
+        return ""
     unsaid = f"{vehicle.unhealthy()} ({dialect.unsaid})"
     told = vehicle.explanation(unsaid) if vehicle.texts else unsaid
     return f"its pre-arm checks do not pass in {vehicle.mode}{told}"
 
 
-def _needs_setpoints(ground: Ground) -> bool:
-    """It is in the mode of setpoints, in which PX4 does not arm without them."""
-    dialect = ground.dialect
-    if dialect is None or dialect.takeoff is not Takeoff.SETPOINT:
-        return False
-    return ground.vehicle.mode == dialect.engage_mode
-
-
-def _leave_mode(ground: Ground) -> str:
-    if ground.dialect is None or not _needs_setpoints(ground):
+def _needs_setpoints(ground: Ground) -> str:
+    """In the mode of setpoints PX4 lets no vehicle arm that receives none, whatever its state."""
+    vehicle, dialect = ground.vehicle, ground.dialect
+    if dialect is None or dialect.takeoff is not Takeoff.SETPOINT or vehicle.health is None:
         return ""
-    return f"select {ground.dialect.hold_mode}, where they can pass"
+    if vehicle.mode != dialect.engage_mode or vehicle.prearm_ok or vehicle.armed:
+        return ""
+    return f"its pre-arm checks pass in {vehicle.mode} only while setpoints arrive"
+
+
+def _other_mode(ground: Ground) -> str:
+    mode = ground.dialect.hold_mode if ground.dialect else ""
+    return f"select {mode}, as `offboard fly` does first"
 
 
 def _rejected(ground: Ground) -> str:
@@ -340,7 +340,8 @@ PREFLIGHT = (
     Row("state", Level.BLOCKS, _may_fly),
     Row("parameters", Level.WAIT, _reading),
     Row("origin", Level.WAIT, _origin),
-    Row("prearm", Level.WAIT, _prearm, _leave_mode, fly_only=True),
+    Row("prearm", Level.WAIT, _prearm, fly_only=True),
+    Row("prearm", Level.WARN, _needs_setpoints, _other_mode, fly_only=True),
     Row("estimator", Level.BLOCKS, _rejected, _ESTIMATOR),
     Row("estimator", Level.WAIT, partial(_no_estimate, starting=True), _ESTIMATOR),
     Row("estimator", Level.BLOCKS, partial(_no_estimate, starting=False), _ESTIMATOR),

@@ -159,12 +159,13 @@ def test_arducopter_says_itself_why_it_cannot_arm() -> None:
 
 
 def test_px4_in_offboard_without_setpoints() -> None:
-    """It is not blamed on the radio, which nobody needs, and passes in the mode that is named."""
+    """It is not blamed on the radio, which nobody needs; `fly` selects the mode that is named."""
     patient = bench()
     patient.instance.autopilot.commander.switch("OFFBOARD")
     (finding,) = patient.consult("prearm")["prearm"].findings
     assert finding.found == "its pre-arm checks pass in OFFBOARD only while setpoints arrive"
-    assert finding.hint == "select AUTO.LOITER, where they can pass"
+    assert finding.hint == "select AUTO.LOITER, as `offboard fly` does first"
+    assert finding.level is WARN
     patient.instance.autopilot.commander.switch("AUTO.LOITER")
     assert said(patient.consult("prearm")) == {}
 
