@@ -9,17 +9,18 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from offboard.export.extra import library
+from offboard.documents.errors import UserError
+from offboard.documents.extras import install
 from offboard.export.series import Array, Flight, Series
 from offboard.link.new_file import new_file
 from offboard.model.frames import enu, flu_in_enu
 
-KIND = "mcap"
 MAP, BODY = "map", "base_link"  # frames: east, north, up; and forward, left, up
 LINE_M = 0.02  # thickness of a path
 COLOURS = {"flown": (0.12, 0.47, 0.71, 1.0), "reference": (1.0, 0.5, 0.05, 1.0)}  # by path, RGBA
@@ -29,8 +30,8 @@ Stamps = Callable[[Array], list[int]]  # vehicle times in s to stamps of the fil
 
 def write_mcap(flight: Flight, path: Path, *, vehicle_time: bool = False) -> None:
     """Write an MCAP file, with Unix time or vehicle time. Raises UserError."""
-    writers = library("mcap.writer", KIND)
-    register = library("mcap_protobuf.schema", KIND).register_schema
+    writers = _library("mcap.writer")
+    register = _library("mcap_protobuf.schema").register_schema
 
     def stamps(time_s: Array) -> list[int]:
         times = time_s if vehicle_time else flight.unix_s(time_s)
@@ -164,5 +165,14 @@ def _texts(flight: Flight, stamps: Stamps) -> Iterator[Stamped]:
 
 def _message(name: str) -> Any:
     """A message class of Foxglove's schemas."""
-    module = library(f"foxglove_schemas_protobuf.{name}_pb2", KIND)
+    module = _library(f"foxglove_schemas_protobuf.{name}_pb2")
     return getattr(module, name)
+
+
+def _library(name: str) -> Any:
+    """Import a library of the extra `export`. Raises UserError with the line that installs it."""
+    try:
+        return import_module(name)
+    except ImportError:
+        needed = name.partition(".")[0]
+        raise UserError(f"--to mcap needs {needed}: {install('export')}") from None
