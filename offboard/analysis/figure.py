@@ -35,6 +35,7 @@ DARK = {
 _TOP_PX, _BOTTOM_PX, _PANEL_PX, _GAP_PX = 48, 90, 150, 36
 _FEW_DECADES = 2  # of a logarithmic axis with ticks at 2 and 5
 _MOST_DECADES = 3  # of one with a tick at each
+_FEW_VALUES, _FLATTENED = 50, 4.0  # of `without_outliers`
 _MARGIN = 0.02  # of its decades, beside its outermost ticks
 _AXIS = {
     "gridcolor": GRID, "zerolinecolor": GRID, "linecolor": GREY, "showline": True,
@@ -108,6 +109,19 @@ def listed(figure: go.Figure, lines: Sequence[tuple[str, bool]], row_px: int, to
         template=STYLE, height=top_px + row_px * len(lines) + 10, showlegend=False,
         margin={"t": top_px, "b": 10},
     )  # fmt: skip
+
+
+def without_outliers(values: NDArray[np.float64]) -> list[float] | None:
+    """The range of an axis that shows 99 % of the values, where it would flatten them to show all;
+    None where it would not."""
+    known = values[np.isfinite(values)]
+    if len(known) < _FEW_VALUES:
+        return None
+    low, high = np.percentile(known, (0.5, 99.5)).tolist()
+    span = high - low
+    if np.ptp(known) <= _FLATTENED * span or not span:
+        return None
+    return [low - 0.1 * span, high + 0.1 * span]
 
 
 def logarithmic(values: Iterable[float]) -> dict[str, Any]:

@@ -55,6 +55,7 @@ _DTYPES = {
     ],
     "setpoint": SETPOINT,
     "heartbeat": [_TIME, ("armed", "f4"), ("system_status", "f4")],
+    "battery": [_TIME, ("voltage_mv", "f4"), ("remaining", "f4")],
     "landed": [_TIME, ("state", "f4")],
     "identified": [_TIME, ("values", "20f4")],
 }  # fmt: skip
@@ -68,6 +69,11 @@ _THEIRS = {
     ),
     "heartbeat": Wire(
         "HEARTBEAT", {"armed": "base_mode", "system_status": "system_status"}, stamp=None
+    ),
+    "battery": Wire(
+        "SYS_STATUS",
+        {"voltage_mv": "voltage_battery", "remaining": "battery_remaining"},
+        stamp=None,
     ),
     "landed": Wire("EXTENDED_SYS_STATE", {"state": "landed_state"}, stamp=None),
 }
@@ -101,6 +107,7 @@ class History:
     identified: values, then sd of each constant as in `identification.vehicle_fit.log_record`
     link_delay: delay_s, at the telemetry that a TIMESYNC request followed
     heartbeat: armed (1 or 0), system_status (MAV_STATE)
+    battery: voltage_mv, remaining in percent; NaN where it is not known (SYS_STATUS)
     landed: state (MAV_LANDED_STATE of EXTENDED_SYS_STATE)
     records: the fields of `flight.record.TickRecord`
 
@@ -121,6 +128,7 @@ class History:
     identified: Rows
     link_delay: Rows
     heartbeat: Rows
+    battery: Rows
     landed: Rows
     phases: tuple[Event, ...]
     announcements: tuple[Event, ...]
@@ -294,6 +302,9 @@ class _Collector:
         rows = {name: samples.rows(anchor_ms) for name, samples in self._samples.items()}
         armed = rows["heartbeat"]["armed"].astype(np.int64) & _ARMED
         rows["heartbeat"]["armed"] = armed > 0
+        for column, unknown in (("voltage_mv", 0xFFFF), ("remaining", -1)):
+            battery = rows["battery"][column]
+            battery[battery == unknown] = math.nan
         events = ours(self._event_records, self._our_texts, anchor_ms)
         return History(
             **rows,

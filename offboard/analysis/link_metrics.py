@@ -85,36 +85,18 @@ def link_figures(flown: History, window: tuple[float, float] | None) -> dict[str
     values = {"flight_s": float(last_s - armed_s), **_delay(flown), **_setpoints(flown)}
     if window is None:
         return values
-    position, attitude = (
-        _within(rows["time_s"], window) for rows in (flown.position, flown.attitude)
-    )
-    late = int((~_newer(position)).sum())
-    return values | {
-        "position_hz": _hz(position),
-        "attitude_hz": _hz(attitude),
-        "position_gap_max_s": _longest_s(position),
-        "attitude_gap_max_s": _longest_s(attitude),
-        "stale_share": late / (len(position) - 1) if len(position) > 1 else math.nan,
-    }
-
-
-def _within(stamps: Array, window: tuple[float, float]) -> Array:
-    return stamps[(stamps >= window[0]) & (stamps <= window[1])]
-
-
-def _newer(stamps: Array) -> NDArray[np.bool_]:
-    """Which stamps, in the order of arrival, are newer than all before."""
-    newer: NDArray[np.bool_] = np.diff(np.maximum.accumulate(stamps), prepend=-math.inf) > 0.0
-    return newer
-
-
-def _hz(stamps: Array) -> float:
-    span_s = float(np.ptp(stamps)) if len(stamps) else 0.0
-    return (len(np.unique(stamps)) - 1) / span_s if span_s > 0.0 else math.nan
-
-
-def _longest_s(stamps: Array) -> float:
-    return float(np.diff(np.maximum.accumulate(stamps)).max(initial=0.0))
+    for name, rows in (("position", flown.position), ("attitude", flown.attitude)):
+        stamps = rows["time_s"]
+        stamps = stamps[(stamps >= window[0]) & (stamps <= window[1])]
+        count = len(np.unique(stamps))
+        intervals = np.diff(np.maximum.accumulate(stamps, out=stamps))
+        late = int((intervals <= 0.0).sum())
+        span_s = float(np.ptp(stamps)) if len(stamps) else 0.0
+        values[f"{name}_hz"] = (count - 1) / span_s if span_s > 0.0 else math.nan
+        values[f"{name}_gap_max_s"] = float(intervals.max(initial=0.0))
+        if name == "position" and len(intervals):
+            values["stale_share"] = late / len(intervals)
+    return values
 
 
 def _setpoints(flown: History) -> dict[str, float]:

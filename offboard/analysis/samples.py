@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.void]
 WRAP_MS = 2**32
 BLOCK = 8192  # messages that are converted at once
+_BISECTIONS = 50
 BOOT_MS, BOOT_US = ("time_boot_ms", 1.0), ("time_usec", 1e-3)  # stamps of messages, in ms
 
 
@@ -107,18 +108,9 @@ def each_once(rows: Rows) -> Rows:
     return rows[np.unique(rows["time_s"], return_index=True)[1]]
 
 
-def shares(times: Array) -> Array:
-    """Time (N,) in s for which each sample stands; `times` (N,) must not decrease.
-
-    Between two samples a signal is taken to change linearly: each sample stands for half of the
-    interval before it and half of the one after it (the trapezoidal rule). So a metric does not
-    depend on how often the signal was sampled, and a gap counts with its length.
-    """
-    weights = np.zeros(len(times))
-    halves = 0.5 * np.diff(times)
-    weights[:-1] += halves
-    weights[1:] += halves
-    return weights
+def blocks(count: int) -> Iterator[slice]:
+    """Parts of an array of hours: what is computed of one takes little memory."""
+    return (slice(first, first + BLOCK) for first in range(0, count, BLOCK))
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,20 +125,33 @@ class Weighted:
 
 
 def weighted(values: Array, weights: Array) -> Weighted:
-    """Metrics of samples (N,) with their `shares` (N,). Those that stand for no time do not
-    count."""
+    """Metrics of samples (N,) with the time (N,) for which each stands; those that stand for none
+    do not count."""
     total = float(weights.sum())
     if not total:
         return Weighted()
-    mean, square = float(weights @ values / total), float(weights @ values**2 / total)
+    mean, square = (
+        float(weights @ values / total),
+        float(np.einsum("i,i,i", weights, values, values) / total),
+    )
     greatest = float(np.max(values, where=weights > 0.0, initial=-math.inf))
-    order = np.argsort(values)
-    ascending = weights[order]
-    at = int(np.searchsorted(np.cumsum(ascending, out=ascending), 0.95 * total))
     return Weighted(
         mean=mean,
         rms=math.sqrt(square),
         sd=math.sqrt(max(square - mean**2, 0.0)),
         max=greatest,
-        p95=min(float(values[order[min(at, len(order) - 1)]]), greatest),
+        p95=_quantile(values, weights, 0.95 * total),
     )
+
+
+def _quantile(values: Array, weights: Array, share: float) -> float:
+    """The least value such that those up to it have the weight `share`. By bisection: to sort the
+    samples of hours takes several times their memory."""
+    low, high = float(values.min()), float(values.max())
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        if np.sum(weights, where=values <= middle) >= share:
+            high = middle
+        else:
+            low = middle
+    return high

@@ -36,7 +36,7 @@ class Score:
     SIM_STATE). RMSE, mean, sd and percentiles of errors and motion are weighted by the time of the
     reference: each sample stands for half of the interval before it and half of the one after it,
     so that telemetry which is thinned or lost counts with the mean of what surrounds it
-    (`analysis.weighted`). `position_gap_max_s` is the longest gap. The figures of the certificate
+    (`analysis.samples`). `position_gap_max_s` is the longest gap. The figures of the certificate
     are of the decisions that were sent as they were certified, a share `certified_share` of all.
     Times are vehicle time. A figure that the log does not hold is NaN.
 

@@ -8,13 +8,14 @@ fitness are over the control ticks, as in its Eq. 32.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from offboard.analysis.history import History
-from offboard.analysis.samples import Rows, Weighted, each_once, shares, weighted
+from offboard.analysis.samples import Rows, Weighted, blocks, each_once, weighted
 from offboard.flight.phases import PHASE_CODES, Phase
 from offboard.model.frames import (
     heading_from_quaternion,
@@ -27,7 +28,6 @@ Array = NDArray[np.float64]
 
 SKIPPED_S = 1.5  # without a decision for longer, the reference was not tracked meanwhile
 _EXPLAINED = 7  # regressors of the agitation: velocity, acceleration, jerk (north, east), and 1
-_BLOCK = 10_000  # samples
 _FITNESS = ("e_u", "e_v", "e_w", "e_x", "e_y", "e_z", "e_psi")
 
 
@@ -54,39 +54,40 @@ def passed_s(flown: History, window: tuple[float, float]) -> tuple[float, float]
 def tracking_figures(flown: History, window: tuple[float, float]) -> dict[str, float]:
     """Values of a Score, of the samples in the window."""
     reference, clock = Reference(flown.reference), _Clock(flown)
-    rows, truth, setpoint, attitude = (
-        _within(each, window)
-        for each in (flown.position, flown.truth, flown.setpoint, flown.attitude)
-    )
 
-    def of(rows: Rows, signal: Callable[[Rows], Array]) -> Weighted:
-        values = np.empty(len(rows))
-        for block in _blocks(len(rows)):
-            values[block] = signal(rows[block])
-        return weighted(values, shares(clock.track_s(rows["time_s"])))
+    def away(rows: Rows, column: str, weights: Array, derivative: int = 0) -> Weighted:
+        def distance(part: Rows) -> Any:
+            expected = reference.position(part["time_s"], derivative)
+            return np.linalg.norm(part[column] - expected, axis=1)
 
-    def away(rows: Rows, column: str, derivative: int = 0) -> Weighted:
-        return of(
-            rows,
-            lambda part: np.linalg.norm(
-                part[column] - reference.position(part["time_s"], derivative), axis=1
-            ),
-        )
+        return weighted(_in_blocks(distance, rows), weights)
 
-    def turned_deg(rows: Rows) -> Array:
-        turn = heading_from_quaternion(rows["quaternion"]) - reference.heading(rows["time_s"])
-        return np.asarray(np.abs(np.degrees(wrap_pi(turn))))
+    def turned_deg(part: Rows) -> Any:
+        turn = heading_from_quaternion(part["quaternion"]) - reference.heading(part["time_s"])
+        return np.abs(np.degrees(wrap_pi(turn)))
 
-    def tilt_deg(rows: Rows) -> Array:
-        direction = thrust_direction_from_quaternion(rows["quaternion"])
-        return np.asarray(np.degrees(np.arccos(np.clip(direction[:, 2], -1.0, 1.0))))
+    def tilt_deg(part: Rows) -> Any:
+        direction = thrust_direction_from_quaternion(part["quaternion"])
+        return np.degrees(np.arccos(np.clip(direction[:, 2], -1.0, 1.0)))
 
-    position, velocity = away(rows, "position_ned_m"), away(rows, "velocity_ned_mps", 1)
-    true = away(truth, "position_ned_m")
-    commanded = thrust_direction_from_quaternion(setpoint["quaternion"])
+    # one array after the other: each may be a copy of hours of telemetry
+    rows = _within(flown.position, window)
+    weights = clock.shares(rows["time_s"])
+    position = away(rows, "position_ned_m", weights)
+    velocity = away(rows, "velocity_ned_mps", weights, 1)
+    rows = _within(flown.truth, window)
+    true = away(rows, "position_ned_m", clock.shares(rows["time_s"]))
+    rows = _within(flown.setpoint, window)
+    commanded = thrust_direction_from_quaternion(rows["quaternion"])
     steps = np.degrees(np.linalg.norm(np.diff(commanded, axis=0), axis=1))
+    thrust = weighted(rows["thrust"].astype(np.float64), clock.shares(rows["time_s"]))
+    rows = _within(flown.attitude, window)
+    weights = clock.shares(rows["time_s"])
+    heading = weighted(_in_blocks(turned_deg, rows), weights)
+    roll_rate, pitch_rate = (
+        weighted(rows["rates_radps"][:, axis].astype(np.float64), weights).sd for axis in (0, 1)
+    )
     fitness = _fitness(flown, reference, window)
-    heading = of(attitude, turned_deg)
     return {
         "rmse_position_m": position.rms,
         "mean_position_m": position.mean,
@@ -102,12 +103,12 @@ def tracking_figures(flown: History, window: tuple[float, float]) -> dict[str, f
         **fitness,
         "mu_e": sum(fitness.values()),
         "tracked_s": passed_s(flown, window)[0],
-        "thrust_sd": of(setpoint, lambda part: part["thrust"]).sd,
+        "thrust_sd": thrust.sd,
         "tilt_command_step_deg": math.sqrt((steps**2).mean()) if len(steps) else math.nan,
-        "tilt_max_deg": of(attitude, tilt_deg).max,
-        "roll_rate_sd_radps": of(attitude, lambda part: part["rates_radps"][:, 0]).sd,
-        "pitch_rate_sd_radps": of(attitude, lambda part: part["rates_radps"][:, 1]).sd,
-        **_agitation(reference, attitude, shares(clock.track_s(attitude["time_s"]))),
+        "tilt_max_deg": weighted(_in_blocks(tilt_deg, rows), weights).max,
+        "roll_rate_sd_radps": roll_rate,
+        "pitch_rate_sd_radps": pitch_rate,
+        **_agitation(reference, rows, weights),
     }
 
 
@@ -133,7 +134,7 @@ def _agitation(reference: Reference, attitude: Rows, weights: Array) -> dict[str
     little memory.
     """
     factor = np.zeros((0, _EXPLAINED + 4))
-    for part in _blocks(len(attitude)):
+    for part in blocks(len(attitude)):
         rows, share = attitude[part], weights[part]
         times, direction = rows["time_s"], thrust_direction_from_quaternion(rows["quaternion"])
         explained = [reference.position(times, order)[:, :2] for order in (1, 2, 3)]
@@ -170,9 +171,20 @@ class _Clock:
         self._times, track_s = rows["time_s"], rows["track_time_s"].astype(np.float64)
         self._passed_s: Array = np.cumsum(np.maximum(np.diff(track_s, prepend=track_s[:1]), 0.0))
 
-    def track_s(self, times: Array) -> Array:
-        passed_s: Array = np.interp(times, self._times, self._passed_s)
-        return passed_s
+    def shares(self, times: Array) -> Array:
+        """Time (N,) in s for which each sample stands; `times` (N,) must not decrease.
+
+        Between two samples a signal is taken to change linearly: each stands for half of the
+        interval before it and half of the one after it (the trapezoidal rule). So a metric does not
+        depend on how often the signal was sampled, and a gap counts with its length.
+        """
+        weights = np.zeros(len(times))
+        for part in blocks(len(times)):
+            passed_s = np.interp(times[part.start : part.stop + 1], self._times, self._passed_s)
+            halves = 0.5 * np.diff(passed_s)
+            weights[part.start : part.start + len(halves)] += halves
+            weights[part.start + 1 : part.start + 1 + len(halves)] += halves
+        return weights
 
 
 class Reference:
@@ -225,9 +237,11 @@ def _within(rows: Rows, window: tuple[float, float]) -> Rows:
     return once[begin:end]
 
 
-def _blocks(count: int) -> Iterator[slice]:
-    """Parts of an array: what is computed of one takes little memory."""
-    return (slice(first, first + _BLOCK) for first in range(0, count, _BLOCK))
+def _in_blocks(signal: Callable[[Rows], Any], rows: Rows) -> Array:
+    values = np.empty(len(rows))
+    for part in blocks(len(rows)):
+        values[part] = signal(rows[part])
+    return values
 
 
 def _in_track(flown: History) -> NDArray[np.bool_]:

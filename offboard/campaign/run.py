@@ -19,11 +19,11 @@ from typing import Self
 from rich.console import Console
 
 from offboard.analysis.requirement import Requirement
+from offboard.campaign.campaign_page import page
 from offboard.campaign.cases import Case, expand
 from offboard.campaign.document import ALL, CampaignFile
 from offboard.campaign.flight import Job
 from offboard.campaign.margin import Promises
-from offboard.campaign.page import page
 from offboard.campaign.progress import Counter
 from offboard.campaign.results import Record, Results, code_hash
 from offboard.campaign.table import ERROR, Row, as_csv, columns, digits, groups, row_of

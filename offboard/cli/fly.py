@@ -117,6 +117,7 @@ def fly(
             flight = options.load(seed, flown.known_vehicle)
             for url in displays.await_ready():
                 displays.tell(f"live: {url}")
+            displays.title(f"{directory.name}: {flight.reference.shape} by {flight.controller.law}")
             outcome = fly_once(
                 flight,
                 directory,
@@ -126,6 +127,7 @@ def fly(
                 progress=displays.show,
                 tell=displays.tell,
             )
+            displays.conclude(outcome.sentence, str(directory / "report.html") if report else "")
     except KeyboardInterrupt:  # before the flight; in flight an interrupt lands the vehicle
         raise CommandError(INTERRUPTED, INTERRUPT) from None
     if outcome.exit_code == 2:

@@ -37,7 +37,10 @@ def identify(
         Path | None, option("FILE", "Vehicle file to write.", "-o", "--output")
     ] = None,
     page: Annotated[
-        Path | None, option("FILE", "Page with the fits.  [default: beside the log]")
+        Path | None,
+        option(
+            "FILE", "Report of the flight with the fits.  [default: identify.html beside the log]"
+        ),
     ] = None,
     connect: Annotated[
         str | None, option("LINK", "Fly the reference `identify` there and use its log.")
@@ -53,15 +56,17 @@ def identify(
     ] = None,
     out_directory: Directory = None,
 ) -> None:
-    """Identify a vehicle from a flight: vehicle file and page.
+    """Identify a vehicle from a flight: vehicle file, and report with the fits.
 
     Identifies delay, attitude response, hover thrust, thrust lag and drag, each with its standard
     deviation. Prints the vehicle file; -o writes it.
     """
     from offboard.analysis import history, tlog
     from offboard.analysis.identify import identify_flight, vehicle_file
-    from offboard.analysis.identify_page import page as fits
     from offboard.link import clock
+    from offboard.report.fits import fits
+    from offboard.report.flight import read
+    from offboard.report.report_page import page as report_page
     from offboard.run.configuration import flown, load
 
     if (flight is None) == (connect is None and not sitl):
@@ -94,14 +99,14 @@ def identify(
         prior = flown(configuration).vehicle
     else:
         prior = load("flight", choices={"vehicle": vehicle}).vehicle
-    arrays = history.gather(log)
-    if arrays.damage:
-        complain(arrays.damage)
-    found, trace = identify_flight(arrays, prior)
+    recorded = read(flight)
+    if recorded.history.damage:
+        complain(recorded.history.damage)
+    found, trace = identify_flight(recorded.sent, prior)
     name = flight.name or flight.resolve().name
     text = vehicle_file(found, prior, name)
     shown = page or free_name(path.with_name("identify.html"))
-    write_new(shown, fits(name, found, trace, prior))
+    write_new(shown, report_page([recorded], fits(found, trace, prior)))
     if not found.supported:
         raise CommandError(f"nothing could be identified from this flight; {shown} says why", 1)
     if output is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from offboard.cli.shared import FLIGHT, CommandError, complain, say
+from offboard.cli.shared import FLIGHT, CommandError, complain, err, say
 
 EXIT_CODES = (
     "Exit codes: 0 all identical, or rounded differently by another computer; 1 a setpoint or a "
@@ -29,7 +29,8 @@ def replay(flight: Annotated[Path, FLIGHT]) -> None:
     recording = read(flight)
     if recording.log.damage:
         complain(recording.log.damage)
-    result = verdict(recording)
+    with err.status("replaying") as status:
+        result = verdict(recording, status.update)
     if result.incomplete:
         complain(result.incomplete)
     sentence = result.comparison.sentence()

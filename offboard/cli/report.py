@@ -30,7 +30,7 @@ def report(
     """
     from offboard.analysis import tlog
     from offboard.report.flight import read
-    from offboard.report.page import page
+    from offboard.report.report_page import page
 
     if output is not None:
         check_new(output, "-o")

@@ -17,7 +17,7 @@ import numpy as np
 
 from offboard.documents.errors import UserError
 from offboard.documents.extras import install
-from offboard.export.series import Array, Flight, Series
+from offboard.export.series import PHASE, Array, Flight, Series, phase_name
 from offboard.link.new_file import new_file
 from offboard.model.frames import enu, flu_in_enu
 
@@ -71,7 +71,10 @@ def _channel(writer: Any, register: Any, flight: Flight, topic: str, message: An
         schema, encoding = register(writer, type(message)), "protobuf"
     else:
         name = topic.rpartition("/")[2]
-        numbers = {column: {"type": "number"} for column in flight.series[name].columns}
+        numbers = {
+            column: {"type": "string" if column == PHASE else "number"}
+            for column in flight.series[name].columns
+        }
         described = {
             "type": "object",
             "properties": {"vehicle_time_s": {"type": "number"}} | numbers,
@@ -93,7 +96,11 @@ def _rows(series: Series, stamps: Stamps) -> Iterator[Stamped]:
         stamps(series.time_s), times, series.values.tolist(), strict=True
     ):
         values = zip(series.columns, row, strict=True)
-        known = {column: value for column, value in values if math.isfinite(value)}
+        known: dict[str, float | str] = {
+            column: phase_name(value) if column == PHASE else value
+            for column, value in values
+            if math.isfinite(value)
+        }
         yield stamp_ns, f"/table/{series.name}", {"vehicle_time_s": time_s} | known
 
 

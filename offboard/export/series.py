@@ -18,6 +18,7 @@ from offboard.analysis.history import TELEMETRY, History
 from offboard.analysis.samples import Rows
 from offboard.analysis.tlog import Tlog
 from offboard.documents.errors import UserError
+from offboard.flight.phases import PHASE_CODES
 from offboard.flight.record import FIELDS
 from offboard.mavlink.decode import Address
 
@@ -49,8 +50,15 @@ _COLUMNS = {
     "decision": tuple(f"decision_{name}" for name in FIELDS),
     "heartbeat": ("armed", "system_status"),
 }
+PHASE = "decision_phase"  # whose numbers tables show as names
 LOCKSTEP_SHARE = 0.05  # of the vehicle's time, by which a flight in real time differs at most
+_PHASES = {code: phase.value for phase, code in PHASE_CODES.items()}
 _AUTOPILOTS = {"px4": "PX4", "ardupilot": "ArduPilot"}  # as MAV_AUTOPILOT names them
+
+
+def phase_name(number: float) -> str:
+    """The name of a phase in the column PHASE."""
+    return _PHASES[int(number)]
 
 
 @dataclass(frozen=True, slots=True)

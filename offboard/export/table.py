@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from offboard.export.series import Array, Flight
+from offboard.export.series import PHASE, Array, Flight, phase_name
 from offboard.link.new_file import new_file
 
 EVENT = "event"
@@ -49,6 +49,9 @@ def _columns(flight: Flight) -> dict[str, Any]:
             values: Array = np.full(len(time_s), np.nan)
             values[first : first + len(part.time_s)] = samples
             columns[column] = values[order]
+            if column == PHASE:
+                names = [phase_name(each) if np.isfinite(each) else None for each in values[order]]
+                columns[column] = np.array(names, dtype=object)
         first += len(part.time_s)
     columns[EVENT] = np.array([text or None for text in texts], dtype=object)[order]
     return columns

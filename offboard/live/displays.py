@@ -27,6 +27,16 @@ class Displays:
         """A sentence about the preparation."""
         self._lines.tell(sentence)
 
+    def title(self, title: str) -> None:
+        """What is flown, for the pages."""
+        for page in self._pages:
+            page.tell(title=title)
+
+    def conclude(self, verdict: str, report: str) -> None:
+        """How the flight ended, and where its report will be, for the pages."""
+        for page in self._pages:
+            page.tell(verdict=verdict, report=report)
+
     def show(self, companion: Flight) -> None:
         for part in tuple(self._working):
             try:

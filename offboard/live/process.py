@@ -18,6 +18,7 @@ from offboard.documents.errors import UserError
 from offboard.flight.snapshot import Snapshot
 from offboard.link import clock
 from offboard.link.background import BackgroundWriter
+from offboard.live.lines import Announcing, News
 from offboard.live.values import as_dict, line
 
 SERVER = "offboard.live.server"
@@ -32,11 +33,10 @@ class NotServed(UserError):
     is_usage = False
 
 
-class Shown(Protocol):
+class Shown(Announcing, Protocol):
     """A companion, or the flights of a service."""
 
     def has_ended(self) -> bool: ...
-    def snapshot(self) -> Snapshot: ...
 
 
 class LiveProcess:
@@ -55,7 +55,8 @@ class LiveProcess:
             bufsize=0,
             start_new_session=True,  # signals of the terminal reach only the controller
         )
-        self._writer = BackgroundWriter[Snapshot](self._write, QUEUED_MAX)
+        self._writer = BackgroundWriter[str | Snapshot](self._write, QUEUED_MAX)
+        self._news = News()
         self._due_s = -math.inf
 
     def await_ready(self) -> str:
@@ -68,7 +69,14 @@ class LiveProcess:
             raise NotServed(f"{self._option}: {answer['error']}")
         return str(answer["url"])
 
+    def tell(self, **values: str) -> None:
+        """What the page says above its values: `title`, or at the end `verdict` and `report`."""
+        self._writer.put(line("flight", **values))
+
     def show(self, companion: Shown) -> None:
+        for sentence in self._news.of(companion):
+            time_s = round(companion.state.time_s, 3)
+            self._writer.put(line("announcement", time_s=time_s, text=sentence))
         now_s = clock.monotonic_s()
         if now_s >= self._due_s or companion.has_ended():
             self._due_s = now_s + PERIOD_S
@@ -92,9 +100,10 @@ class LiveProcess:
         dropped = self._writer.dropped
         return f"{self._option}: {dropped} snapshots dropped, they were not read" if dropped else ""
 
-    def _write(self, snapshots: list[Snapshot]) -> None:
+    def _write(self, items: list[str | Snapshot]) -> None:
         assert self._process.stdin is not None
-        for each in snapshots:
-            data = memoryview(line("snapshot", **as_dict(each)).encode() + b"\n")
+        for each in items:
+            text = each if isinstance(each, str) else line("snapshot", **as_dict(each))
+            data = memoryview(text.encode() + b"\n")
             while data:
                 data = data[self._process.stdin.write(data) :]

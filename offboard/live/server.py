@@ -25,6 +25,7 @@ from offboard.live.metrics import Metrics
 from offboard.live.values import line
 
 KEPT = 3000  # snapshots, five minutes
+TEXTS_KEPT = 100
 CLIENTS_MAX = 20
 CLIENT_QUEUE = 50  # snapshots that a client may be late
 CLIENT_S = 10.0  # in which a client must take one
@@ -43,13 +44,21 @@ class Broadcast:
         self._clients: set[asyncio.Queue[str | None]] = set()
         self._watching: set[web.RequestHandler] = set()
         self._kept: deque[dict[str, Any]] = deque(maxlen=KEPT)
+        self._texts: deque[dict[str, Any]] = deque(maxlen=TEXTS_KEPT)
         self._newest: dict[str, Any] | None = None
+        self._flight: dict[str, Any] = {}
 
     def publish(self, text: str) -> None:
-        """A snapshot as JSON text."""
-        self._newest = json.loads(text)
-        self.metrics.show(self._newest)
-        self._kept.append({name: self._newest[name] for name in _TRACE})
+        """A snapshot, an announcement, or what is known of the flight, as JSON text."""
+        message = json.loads(text)
+        if message["type"] == "snapshot":
+            self._newest = message
+            self.metrics.show(message)
+            self._kept.append({name: message[name] for name in _TRACE})
+        elif message["type"] == "announcement":
+            self._texts.append(message)
+        else:
+            self._flight |= message
         self._put(text)
 
     def end(self) -> None:
@@ -70,7 +79,8 @@ class Broadcast:
             headers={"Content-Type": "text/event-stream", "Cache-Control": "no-store"}
         )
         queue: asyncio.Queue[str | None] = asyncio.Queue(CLIENT_QUEUE)
-        queue.put_nowait(line("history", rows=list(self._kept), newest=self._newest))
+        known = {"newest": self._newest, "texts": list(self._texts), "flight": self._flight}
+        queue.put_nowait(line("history", rows=list(self._kept), **known))
         self._clients.add(queue)
         self._watching.add(request.protocol)
         with suppress(ConnectionError, TimeoutError, asyncio.TimeoutError):
@@ -105,7 +115,7 @@ class _Refused(asyncio.Protocol):
 
 def application(broadcast: Broadcast) -> web.Application:
     """The pages by their paths."""
-    from offboard.live.page import page
+    from offboard.live.live_page import page
 
     shown = page()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from offboard.documents.errors import UserError
@@ -10,6 +11,7 @@ from offboard.replay.recording import Recording
 from offboard.replay.replaying import Replay, Turn
 
 FIELDS_MAX = 8
+TOLD_EVERY = 500  # turns
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,11 +24,15 @@ class Verdict:
     incomplete: str
 
 
-def verdict(recording: Recording) -> Verdict:
-    """Replay a flight and compare it with its log. Raises UserError if nothing can be compared,
+def verdict(recording: Recording, tell: Callable[[str], object] = str) -> Verdict:
+    """Replay a flight and compare it with its log. `tell` is called with sentences about the
+    progress. Raises UserError if nothing can be compared,
     and DocumentError where its configuration cannot be flown by this version."""
     replay = Replay(recording)
-    turns = sum(1 for _ in replay.turns())
+    turns = 0
+    for turns, _ in enumerate(replay.turns(), 1):
+        if turns % TOLD_EVERY == 0:
+            tell(f"replayed up to {replay.ended_s:.0f} s of vehicle time")
     comparison = compare(replay.recorded, replay.replayed)
     if not comparison.compared.total():
         why = replay.stopped or "the log holds no setpoint and no command"

@@ -30,6 +30,7 @@ from offboard.analysis.figure import (
     curve,
     logarithmic,
     panels,
+    without_outliers,
 )
 from offboard.analysis.samples import Rows
 from offboard.analysis.verdict import begin_times
@@ -51,6 +52,7 @@ _CAPTIONS = {  # by the panel that they explain
     ),
     "identified delay, ms": "Bars: one standard deviation.",
 }
+_CUT = "Single values far from all others are outside; two clicks on the figure show them."
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,6 +216,7 @@ def _panels(title: str, flown: Sequence[tuple[Lane, Sequence[Panel]]]) -> Figure
     if not by_title:
         return None
     figure = panels(list(by_title), _axis_title([lane for lane, _ in flown]), PANEL_PX)
+    cut = False
     for place, shown_in in enumerate(by_title.values(), 1):
         for lane, panel in shown_in:
             for each in panel.curves:
@@ -221,18 +224,20 @@ def _panels(title: str, flown: Sequence[tuple[Lane, Sequence[Panel]]]) -> Figure
                     _draw(
                         figure, place, each, lane, named=bool(lane.label) or len(panel.curves) > 1
                     )
+        values = np.concatenate([each.values for _, panel in shown_in for each in panel.curves])
         if shown_in[0][1].logarithmic:
-            values = [each.values for _, panel in shown_in for each in panel.curves]
-            figure.update_yaxes(logarithmic(np.concatenate(values)), row=place)
+            figure.update_yaxes(logarithmic(values), row=place)
+        elif inner := without_outliers(values):
+            figure.update_yaxes(range=inner, row=place)
+            cut = True
     for lane, _ in flown:
         if not lane.label:
             figure.update_layout(shapes=_phase_shapes(lane.flight))
     figure.update_xaxes(range=_extent([lane for lane, _ in flown]))
     figure.update_yaxes(automargin=False, exponentformat="e")
     figure.update_layout(margin_l=LEFT_PX)
-    return Figure(
-        title, figure, " ".join(_CAPTIONS[each] for each in by_title if each in _CAPTIONS)
-    )
+    captions = [_CAPTIONS[each] for each in by_title if each in _CAPTIONS] + [_CUT] * cut
+    return Figure(title, figure, " ".join(captions))
 
 
 def _draw(figure: go.Figure, place: int, each: Curve, lane: Lane, *, named: bool) -> None:

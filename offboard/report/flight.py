@@ -27,10 +27,12 @@ _NO_RECORDS = (
 @dataclass(frozen=True, slots=True)
 class Flight:
     """One log. `facts` are name and value; `missing` has a sentence for each thing that the log
-    lacks; `engage_mode` is the mode of setpoints, empty for an unknown autopilot."""
+    lacks; `engage_mode` is the mode of setpoints, empty for an unknown autopilot. `sent` is the
+    history without substitutes: its setpoints are those that were sent."""
 
     name: str
     history: History
+    sent: History
     score: Score
     facts: dict[str, str]
     missing: tuple[str, ...]
@@ -63,6 +65,7 @@ def read(path: Path) -> Flight:
     missing = [_NO_HEARTBEAT] if flown.vehicle is None else []
     if not len(flown.records):
         missing.append(_NO_RECORDS)
+    sent = flown
     flown, notes = completed(flown, log)
     if flown.damage:
         at = "" if math.isnan(flown.damage_s) else f", at {flown.damage_s:.2f} s of vehicle time"
@@ -79,7 +82,7 @@ def read(path: Path) -> Flight:
         "messages": f"{flown.messages.total()} in {flown.wall_s:.1f} s of computer time",
     }
     return Flight(
-        path.name or path.resolve().name, flown, score(flown), facts, (*missing, *notes),
+        path.name or path.resolve().name, flown, sent, score(flown), facts, (*missing, *notes),
         flown.dialect.engage_mode if flown.dialect else "",
     )  # fmt: skip
 

@@ -102,14 +102,21 @@ def attitude(flown: History) -> tuple[Panel, ...]:
 
 
 def thrust(flown: History) -> tuple[Panel, ...]:
-    """Thrust commanded, and the hover thrust that the observer estimates."""
+    """Thrust commanded, the hover thrust that the observer estimates, and the battery."""
     commanded = Curve(
         COMMANDED, flown.setpoint["time_s"], flown.setpoint["thrust"], ORANGE, "steps"
     )
     hover = _recorded(
         flown, "hover_thrust", "hover thrust, estimated", INK, main=False, dash="dash"
     )
-    return (Panel("thrust, 0 to 1", (commanded, hover)),)
+    times, battery = flown.battery["time_s"], flown.battery
+    remaining = Curve("remaining", times, battery["remaining"], BLUE, "steps")
+    voltage = Curve("voltage", times, 1e-3 * battery["voltage_mv"], BLUE, "steps")
+    return (
+        Panel("thrust, 0 to 1", (commanded, hover)),
+        Panel("battery, %", (remaining,)),
+        Panel("battery, V", (voltage,)),
+    )
 
 
 def decisions(flown: History) -> tuple[Panel, ...]:
@@ -185,7 +192,7 @@ def identification(flown: History) -> tuple[Panel, ...]:
 GROUPS: dict[str, tuple[str, Callable[[History], tuple[Panel, ...]]]] = {
     "tracking": ("Tracking", tracking),
     "attitude": ("Attitude commanded and flown", attitude),
-    "thrust": ("Thrust", thrust),
+    "thrust": ("Thrust and battery", thrust),
     "decisions": ("Decisions", decisions),
     "link": ("Link", link),
     "identification": ("Identified and estimated", identification),

@@ -22,6 +22,7 @@ from typer.testing import CliRunner, Result
 
 from offboard.analysis import tlog
 from offboard.cli.commands import app
+from offboard.flight.phases import Phase
 from offboard.flight.record import RECORD_ID
 from offboard.link.log import entry
 from offboard.mavlink import event_record
@@ -177,6 +178,9 @@ def test_table(flight: Path, messages: dict[tuple[str, bool], list[Any]], tmp_pa
         assert float(row["position_down_m"]) == pytest.approx(sent.z)
         assert float(row["velocity_north_mps"]) == pytest.approx(sent.vx)
         assert row["setpoint_thrust"] == ""
+    phases = [row["decision_phase"] for row in rows if row["source"] == "decision"]
+    assert set(phases) <= {phase.value for phase in Phase}
+    assert "track" in phases
     thrusts = [float(row["setpoint_thrust"]) for row in rows if row["source"] == "setpoint"]
     assert thrusts == pytest.approx([m.thrust for m in messages["SET_ATTITUDE_TARGET", True]])
     assert any("takeoff: armed" in row["event"] for row in rows if row["source"] == "event")

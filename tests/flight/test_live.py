@@ -154,7 +154,9 @@ def test_the_live_page_follows_the_flight_in_both_schemes_and_widths() -> None:
     with serving() as (process, url), opening(url, width=400) as opened:
         pair.at.append((lambda p: p.steps % 25 == 0 and process.show(p.companion), lambda _: None))
         pair.fly()
+        process.tell(title="a flight: lemniscate by pso")
         process.show(pair.companion)
+        process.tell(verdict="flown and landed", report="flights/a/report.html")
         ended = "document.getElementById('phase').innerText.startsWith('disarmed')"
         opened.page.wait_for_function(ended)
         for width in (400, 1280):
@@ -165,7 +167,11 @@ def test_the_live_page_follows_the_flight_in_both_schemes_and_widths() -> None:
                 assert opened.unreadable() == opened.colliding() == []
         drawn = "document.getElementById('plan').data[1].x.length"
         opened.page.wait_for_function(f"{drawn} > 3")
-        assert opened.page.inner_text("#texts li >> nth=0") == pair.companion.announced[-1]
+        last = opened.page.inner_text("#texts li >> nth=0")
+        assert re.fullmatch(rf"\d+\.\d\d s +{re.escape(pair.companion.announced[-1])}", last)
+        assert opened.page.inner_text("h1") == "a flight: lemniscate by pso"
+        assert opened.page.inner_text("#report").endswith("flights/a/report.html")
+        assert opened.page.inner_text("#skipped") == "0"
         assert opened.problems == opened.fetched == []
 
 

@@ -23,11 +23,11 @@ from offboard.analysis.figure import logarithmic
 from offboard.analysis.score import Score
 from offboard.cli.commands import app
 from offboard.flight.phases import Phase
-from offboard.report import page as report_page
+from offboard.report import report_page
 from offboard.report.figures import figures
 from offboard.report.flight import read
-from offboard.report.page import page
 from offboard.report.panels import thinned
+from offboard.report.report_page import page
 from offboard.report.timeline import bands, marks
 
 RECORDINGS = Path(__file__).parents[1] / "wire" / "recordings"

@@ -18,10 +18,10 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from offboard.campaign import workers
+from offboard.campaign.campaign_page import FIGURES, page
 from offboard.campaign.cases import Case
 from offboard.campaign.document import CampaignFile
 from offboard.campaign.margin import LOWEST, Promises, terms
-from offboard.campaign.page import FIGURES, page
 from offboard.campaign.progress import Counter
 from offboard.campaign.results import Record
 from offboard.campaign.run import Campaign

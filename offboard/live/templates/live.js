@@ -1,6 +1,6 @@
 // Fills the page from server-sent events; draws at most twice a second.
 const KEPT = 3000;
-let rows = [], newest = null, changed = false;
+let rows = [], texts = [], newest = null, flight = {}, changed = false;
 const AUTHORITY = {free: "not asked", asked: "asked", ours: "offboard", handed: "handed over",
   lost: "given up"}; // as on the timeline of a report
 const $ = (name) => document.getElementById(name);
@@ -18,13 +18,22 @@ function tell() {
   $("age").textContent = number(newest.telemetry_age_s, 0, "ms", 1e3);
   $("delay").textContent = number(newest.link_delay_s, 0, "ms", 1e3);
   $("missed").textContent = newest.missed_decisions;
+  $("skipped").textContent = newest.skipped_ticks;
   $("computer").textContent = newest.computer || "keeps up";
   $("battery").textContent = number(newest.battery, 0, "%", 100);
-  $("texts").replaceChildren(...[...newest.texts].reverse().map((text) => {
+  $("texts").replaceChildren(...[...texts].reverse().map(({ time_s, text }) => {
     const item = document.createElement("li");
-    item.textContent = text;
+    item.textContent = `${time_s.toFixed(2)} s  ${text}`;
     return item;
   }));
+}
+
+function tellFlight() {
+  if (flight.title) {
+    document.title = `Live: ${flight.title}`;
+    document.querySelector("h1").textContent = flight.title;
+  }
+  if (flight.report) $("report").textContent = `report, in some seconds: ${flight.report}`;
 }
 
 // in tenths of a millimetre: a vehicle at rest has no axis of nanometres
@@ -50,8 +59,13 @@ function redraw() {
 
 function take(message) {
   if (message.type === "history") {
-    rows = message.rows;
-    newest = message.newest;
+    ({ rows, texts, newest, flight } = message);
+    tellFlight();
+  } else if (message.type === "announcement") {
+    texts.push(message);
+  } else if (message.type === "flight") {
+    Object.assign(flight, message);
+    tellFlight();
   } else {
     newest = message;
     rows.push(message);
@@ -67,7 +81,7 @@ source.onmessage = (event) => take(JSON.parse(event.data));
 source.addEventListener("end", () => {
   source.close();
   redraw();
-  $("connection").textContent = "the flight has ended";
+  $("connection").textContent = flight.verdict || "the flight has ended";
 });
 setInterval(redraw, 500);
 for (const query of [dark, narrow]) query.addEventListener("change", () => { changed = true; });

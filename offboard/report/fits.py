@@ -1,8 +1,9 @@
-"""The HTML page of an identification: the constants, and how well they reproduce the flight."""
+"""An identification in a report: the constants, and how well they reproduce the flight."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,11 +11,11 @@ from numpy.typing import NDArray
 from offboard.analysis.estimator_noise import estimator_noise
 from offboard.analysis.figure import BLUE, GREY, RED, Figure, curve, panels
 from offboard.analysis.identify import rows
-from offboard.analysis.page import render
 from offboard.identification.attitude_fit import tilt_signals, yaw_signals
 from offboard.identification.motion_fit import Motion, predicted_velocity
 from offboard.identification.response import second_order
 from offboard.identification.trace import Trace
+from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_fit import Identified
 from offboard.model.vehicle import AxisResponse, Vehicle
 
@@ -23,14 +24,21 @@ Array = NDArray[np.float64]
 SHOWN_S = 20.0  # the figures show the end of the flight; a longer part is too dense to read
 
 
-def page(flight: str, found: Identified, trace: Trace, prior: Vehicle) -> str:
-    """The page as text.
+@dataclass(frozen=True, slots=True)
+class Fits:
+    """`rows` are those of `identify.rows`; `noise` is a sentence, empty where nothing was flown."""
 
-    Args:
-        flight: name of the log.
-        found: what was identified.
-        trace: the part of the log that it was identified from.
-        prior: the vehicle before the identification; supplies what was not identified.
+    title: str
+    rows: list[tuple[str, Estimate | None, str, str]]
+    noise: str
+    figures: list[Figure]
+
+
+def fits(found: Identified, trace: Trace, prior: Vehicle) -> Fits:
+    """Args:
+    found: what was identified.
+    trace: the part of the log that it was identified from.
+    prior: the vehicle before the identification; supplies what was not identified.
     """
     vehicle = found.applied_to(prior)
     last = trace.between(max(trace.begin_s, trace.end_s - SHOWN_S), trace.end_s)
@@ -44,12 +52,17 @@ def page(flight: str, found: Identified, trace: Trace, prior: Vehicle) -> str:
         ]
     if len(trace.commands) and len(last.position) > 2:
         figures.append(_motion(last, vehicle))
-    return render(
-        "analysis/templates/identification.html",
-        title=f"Identified from {found.seconds:.1f} s of {flight}",
-        rows=rows(found),
-        noise=estimator_noise(trace) if found.seconds else None,
-        figures=figures,
+    title = f"Identified from {found.seconds:.1f} s"
+    return Fits(title, list(rows(found)), _noise(trace) if found.seconds else "", figures)
+
+
+def _noise(trace: Trace) -> str:
+    noise = estimator_noise(trace)
+    return (
+        f"Noise of the autopilot's estimate from sample to sample: position "
+        f"{1e3 * noise.position_m:.2g} mm, velocity {1e3 * noise.velocity_mps:.2g} mm/s, attitude "
+        f"{1e3 * noise.attitude_rad:.2g} mrad. Over half a second its velocity and the change of "
+        f"its position differ by {noise.velocity_contradiction_mps:.2g} m/s."
     )
 
 

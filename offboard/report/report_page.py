@@ -10,6 +10,7 @@ from offboard.analysis.page import render
 from offboard.analysis.score import FIGURES
 from offboard.analysis.score_table import summary, verdict
 from offboard.report.figures import figures, letter
+from offboard.report.fits import Fits
 from offboard.report.flight import Flight
 
 _SIGNS = {1.0: ("good", "✓"), 0.0: ("bad", "✗")}
@@ -27,8 +28,9 @@ class Row:
     difference: str = ""
 
 
-def page(flights: Sequence[Flight]) -> str:
-    """The page of one flight or of several, as the text of an HTML file."""
+def page(flights: Sequence[Flight], fits: Fits | None = None) -> str:
+    """The page of one flight or of several, as the text of an HTML file. `fits`: what was
+    identified from the flight."""
     alone = len(flights) == 1
     title = f"Flight {flights[0].name}" if alone else f"{len(flights)} flights side by side"
     return render(
@@ -36,6 +38,7 @@ def page(flights: Sequence[Flight]) -> str:
         title=title,
         verdicts=[_verdict(place, flight, alone) for place, flight in enumerate(flights)],
         figures=figures(flights),
+        fits=fits,
         rows=rows(flights),
         letters=[] if alone else [letter(place) for place in range(len(flights))],
         events=[

@@ -20,6 +20,7 @@ VALUES = {
     "link age": "age",
     "link delay": "delay",
     "missed decisions": "missed",
+    "skipped ticks": "skipped",
     "computer": "computer",
     "battery": "battery",
 }
