@@ -56,10 +56,10 @@ def identify(
     ] = None,
     out_directory: Directory = None,
 ) -> None:
-    """Identify a vehicle from a flight: vehicle file, and report with the fits.
+    """Identify a vehicle from a flight: vehicle file and report.
 
     Identifies delay, attitude response, hover thrust, thrust lag and drag, each with its standard
-    deviation. Prints the vehicle file; -o writes it.
+    deviation. Prints the vehicle file; -o writes it. The report shows the fits.
     """
     from offboard.analysis import history, tlog
     from offboard.analysis.identify import identify_flight, vehicle_file
