@@ -40,6 +40,7 @@ from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
 from simulator.instance import Instance
+from simulator.start import Start
 from simulator.steps import STEP_S
 
 HOST_EPOCH_S = 5000.0
@@ -272,12 +273,14 @@ def make(
     clock: HostClock | None = None,
     system_id: int | None = None,
     key: bytes = b"",
+    aloft: bool = False,
     **options: Any,
 ) -> Pair:
     """A pair as `offboard fly --sitl` makes it. `flies` is the simulated vehicle, `believed` the
     controller's model of it, `learning` the settings of the identification. With `deadline_s` the
     companion does not wait for slow decisions. The vehicle starts and lands faster than by default:
-    what most tests prove depends on neither."""
+    what most tests prove depends on neither. With `aloft` it hovers at the height of the reference
+    when its links open, unless the scenario has a start of its own."""
     named = {"reference": reference, "vehicle": vehicle}
     choices = {part: chosen for part, chosen in named.items() if chosen}
     clock = clock or HostClock()
@@ -287,6 +290,7 @@ def make(
     believed = believed or resolved.vehicle
     controller = resolved.controller.build(believed, period_s=resolved.period_s, seed=resolved.seed)
     observer = Observer(believed)
+    track = config.build_track(resolved)
     companion = Flight(
         vehicle=believed,
         session=Session(
@@ -299,7 +303,7 @@ def make(
         ),
         observer=observer,
         controller=wrap(controller),
-        plan=FlightPlan(config.build_track(resolved)),
+        plan=FlightPlan(track),
         limits=resolved.limits.model_copy(update=limits or {}),
         period_s=resolved.period_s,
         deadline_s=deadline_s,
@@ -307,6 +311,7 @@ def make(
         identify=learning,
     )
     flown = simulated.scenario(scenario) if isinstance(scenario, str) else scenario
+    hovers = Start(height_m=-float(track.sample(0.0).position_ned_m[2])) if aloft else None
     instance = Instance(
         firmware,
         flies or simulated.vehicle(firmware.vehicle),
@@ -314,7 +319,7 @@ def make(
         seed,
         ground_link=False,
         faults=flown.faults,
-        start=flown.start,
+        start=flown.start or hovers,
     )
     if firmware.name == "px4":
         for parameter, value in QUICK_LANDING.items():

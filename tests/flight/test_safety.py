@@ -20,13 +20,17 @@ from pair import SHORT, Bytes, Pair, decode, hover, in_phase, make, on_arducopte
 from watch import (
     ARM,
     BOTH,
+    FIRMWARES,
+    FROM_THE_GROUND,
     HIGH,
     LAND,
+    LOW,
     ONE_LAP,
     REACTION_S,
     SET_MODE,
     Fly,
     alternately,
+    early,
     engage_mode,
     said,
     scenario_of,
@@ -40,8 +44,10 @@ from offboard.flight.positioning import Positioning
 from offboard.flight.state import Outcome
 from offboard.flight.vehicle_state import VehicleState
 from offboard.mavlink.events import EstimatorReport
+from simulator import config as simulated
 from simulator.config import Scenario
 from simulator.firmware.px4 import PX4
+from simulator.start import Start
 
 # -- authority -------------------------------------------------------------------------------------
 
@@ -53,7 +59,7 @@ def test_a_pilot_is_not_overridden(scenario: str, fly: Fly) -> None:
 
     `pilot_comes_back` is back after 0.6 s, long after the flight has ended.
     """
-    pair = fly(scenario=scenario)
+    pair = fly(scenario=early(scenario) if scenario != "pilot_refuses" else scenario)
     watch = watched(pair)
     outcome = pair.fly()
     mode = engage_mode(pair)
@@ -65,7 +71,7 @@ def test_a_pilot_is_not_overridden(scenario: str, fly: Fly) -> None:
     assert sent_after(pair, watch.left_s(mode) - 0.5) != []
 
 
-@BOTH
+@FROM_THE_GROUND
 def test_a_vehicle_that_was_disarmed_is_not_armed_again(fly: Fly) -> None:
     pair = fly(scenario="pilot_disarms")
     watch = watched(pair)
@@ -76,7 +82,7 @@ def test_a_vehicle_that_was_disarmed_is_not_armed_again(fly: Fly) -> None:
     assert watch.top_m < 0.05
 
 
-@BOTH
+@FROM_THE_GROUND
 def test_an_arming_that_is_accepted_late_is_not_taken_for_a_disarming(fly: Fly) -> None:
     """The link loses the first three requests, and every HEARTBEAT for 2.4 s from the fourth on."""
     asked_s: list[float] = []
@@ -103,7 +109,7 @@ def is_arming(frame: bytes) -> bool:
 
 def test_current_mode_shows_the_pilot_without_heartbeats() -> None:
     """ArduCopter has no other report: see test_outages."""
-    pair = make(HIGH, scenario="lost_heartbeat")
+    pair = make(LOW, ONE_LAP, aloft=True, scenario=early("lost_heartbeat"))
     watch = watched(pair)
     outcome = pair.fly()
     left_s = watch.left_s("OFFBOARD")
@@ -144,7 +150,7 @@ def test_a_second_sender_is_refused_before_the_flight(fly: Fly) -> None:
 def test_a_second_sender_is_noticed_in_flight(fly: Fly) -> None:
     """Hold within a second and what HEARTBEAT takes, then land."""
     pair = fly(
-        scenario=another_companion(after="engaged", at_s=20.0, setpoint_rate_hz=10, thrust=0.5)
+        scenario=another_companion(after="engaged", at_s=7.0, setpoint_rate_hz=10, thrust=0.5)
     )
     watch = watched(pair)
     outcome = pair.fly()
@@ -187,7 +193,7 @@ class Beside:
 def test_a_second_flight_is_refused_and_the_first_flies_on(moment: Any, fly: Fly) -> None:
     """By mistake, on another port: it has our ids. It is refused before it sends a setpoint or a
     command that changes the vehicle."""
-    first, second = fly(ONE_LAP), fly()
+    first, second = fly(), fly()
     while not moment(first):
         first.advance()
     second.instance = Beside(first)  # type: ignore[assignment]
@@ -207,7 +213,7 @@ def test_a_second_flight_is_refused_and_the_first_flies_on(moment: Any, fly: Fly
 @BOTH
 def test_a_second_companion_of_other_ids_shows_by_what_it_does(fly: Fly) -> None:
     """Its setpoints are not on our link: the vehicle no longer follows ours, and is landed."""
-    pair = fly(HIGH, scenario="second_sender")
+    pair = fly(HIGH, "reference.laps=2", aloft=False, scenario="second_sender")
     watch = watched(pair)
     outcome = pair.fly()
     assert outcome.exit_code == ExitCode.ABORTED
@@ -268,7 +274,9 @@ def test_a_load_that_full_thrust_does_not_carry_is_landed(fly: Fly) -> None:
 @pytest.mark.parametrize(("scenario", "fly"), alternately("landed_wrong", "landed_lost"))
 def test_in_the_air_it_never_falls(scenario: str, fly: Fly) -> None:
     """The land detector says ground: never less than a third of hover, never fast downwards."""
-    pair = fly(ONE_LAP, scenario=scenario)
+    start = Start(height_m=5.0)  # instead of 10 m and 18 m
+    low = simulated.scenario(scenario).model_copy(update={"start": start})
+    pair = fly(HIGH, scenario=low)
     watch = watched(pair)
     pair.fly()
     hover = pair.companion.state.model.hover_thrust
@@ -279,9 +287,9 @@ def test_in_the_air_it_never_falls(scenario: str, fly: Fly) -> None:
     assert watch.error_m < 0.1
 
 
-@BOTH
+@FROM_THE_GROUND
 def test_one_sample_of_velocity_is_no_lift_off(fly: Fly) -> None:
-    pair = fly(ONE_LAP, scenario="velocity_spike")
+    pair = fly(scenario="velocity_spike")
     watch = watched(pair)
     assert pair.fly().exit_code == ExitCode.FLOWN
     assert -watch.during(Phase.CLIMB)[0].position_ned_m[2] > 0.1
@@ -289,9 +297,9 @@ def test_one_sample_of_velocity_is_no_lift_off(fly: Fly) -> None:
     assert all(after - before < 0.05 for before, after in pairwise(thrusts))
 
 
-@BOTH
+@FROM_THE_GROUND
 def test_twice_the_thrust_does_not_carry_it_away(fly: Fly) -> None:
-    pair = fly(HIGH, ONE_LAP, scenario="thrust_doubled")
+    pair = fly(HIGH, scenario="thrust_doubled")
     watch = watched(pair)
     assert pair.fly().exit_code == ExitCode.FLOWN
     assert watch.top_m < 3.0 + 1.0
@@ -304,7 +312,7 @@ def test_twice_the_thrust_does_not_carry_it_away(fly: Fly) -> None:
 )
 def test_the_volume_is_kept(case: tuple[dict[str, float], str], fly: Fly) -> None:
     limits, says = case
-    pair = fly(HIGH, limits=limits)
+    pair = fly(HIGH, limits=limits, aloft=False)
     watch = watched(pair)
     outcome = pair.fly()
     assert outcome.exit_code == ExitCode.ABORTED
@@ -327,7 +335,8 @@ RETURNS = {"BATT_LOW_MAH": 1000.0, "BATT_LOW_TIMER": 1.0, "BATT_FS_LOW_ACT": 2.0
 def test_an_empty_battery_ends_the_flight(on: str, then: str, tmp_path: Path) -> None:
     """ArduCopter without a battery failsafe is landed; the vehicle's own failsafe has it, and is
     named, though on PX4 the HEARTBEAT that shows it comes after CURRENT_MODE."""
-    pair = {"px4": make, "ardupilot": on_arducopter}[on](scenario="empty_battery")
+    fly = {"px4": make, "ardupilot": on_arducopter}[on]
+    pair = fly(LOW, ONE_LAP, aloft=True, scenario=early("empty_battery"))
     if on == "ardupilot" and then:
         for name, value in RETURNS.items():
             pair.instance.autopilot.parameters.set(name, value)
@@ -350,7 +359,7 @@ def test_a_vehicle_without_thrust_reserve_is_landed(share: float, fly: Fly) -> N
     share of its thrust."""
     scale = float(np.sqrt(share / fly().companion.state.model.hover_thrust))
     heavier = scenario_of(conditions={"mass_scale": scale})
-    pair = fly(HIGH, ONE_LAP, scenario=heavier, learning=IdentifySettings())
+    pair = fly(HIGH, scenario=heavier, learning=IdentifySettings())
     plant = pair.instance.autopilot.plant
     pair.at.append((in_phase(Phase.TRACK, 1.0), lambda flying: plant.scale_mass(scale)))
     outcome = pair.fly()
@@ -363,25 +372,30 @@ def test_a_vehicle_without_thrust_reserve_is_landed(share: float, fly: Fly) -> N
         assert list(pair.failsafes) == ["thrust reserve"]
 
 
-@BOTH
+@FROM_THE_GROUND
 def test_a_load_that_is_only_believed_does_not_end_the_take_off(fly: Fly) -> None:
     """An earlier flight has identified the vehicle with a load that it does not carry any more."""
     file = fly().companion.state.model
-    pair = fly(ONE_LAP, believed=file.model_copy(update={"hover_thrust": 0.93}))
+    pair = fly(believed=file.model_copy(update={"hover_thrust": 0.93}))
     assert pair.fly().exit_code == ExitCode.FLOWN
     assert "thrust reserve" not in pair.failsafes
 
 
+HOVERING = pytest.mark.parametrize(
+    "fly", [partial(fly, *SHORT, reference="hover", aloft=True) for _, fly in FIRMWARES]
+)
+
+
 @BOTH
 def test_a_reset_of_the_estimate_is_flown(fly: Fly) -> None:
-    pair = fly(scenario="estimator_jump")
+    pair = fly(scenario=early("estimator_jump"))
     watch = watched(pair)
     assert pair.fly().exit_code == ExitCode.FLOWN
     assert watch.error_m < 0.7  # of which the jump is 0.5
     assert pair.failsafes == {}
 
 
-@pytest.mark.parametrize("fly", [hover, partial(on_arducopter, *SHORT, reference="hover")])
+@HOVERING
 def test_the_vehicle_does_not_step_with_its_estimate(fly: Fly) -> None:
     """A reset by 1.5 m in a hover: it moves to its place in the new frame at up to 0.5 m/s."""
     pair = fly("reference.duration_s=8.0", scenario=jumping(1.5))
@@ -395,7 +409,7 @@ def test_the_vehicle_does_not_step_with_its_estimate(fly: Fly) -> None:
     assert np.linalg.norm(hovered[-1] - hovered[0]) == pytest.approx(1.5, abs=0.1)
 
 
-@pytest.mark.parametrize("fly", [hover, partial(on_arducopter, *SHORT, reference="hover")])
+@HOVERING
 def test_a_large_reset_of_the_estimate_is_left_to_the_autopilot(fly: Fly) -> None:
     pair = fly(scenario=jumping(3.0))
     outcome = pair.fly()
@@ -423,12 +437,11 @@ def test_a_landing_is_judged_by_the_ground_where_a_reset_has_moved_it(
     assert pair.score(tmp_path).ended_by == "reference over"
 
 
-GPS_LOST = {"fault": "gps_loss", "after": "engaged", "at_s": 16.0, "drift_mps": 0.45}
-SILENT_GPS = {
-    "fault": "silent_message", "message": "GPS_RAW_INT", "after": "engaged", "at_s": 16.0
-}  # fmt: skip
-ON_PX4, ON_ARDUCOPTER = partial(make, HIGH, firmware=PX4), partial(on_arducopter, HIGH)
-ONLY_ESTIMATOR = partial(ON_PX4, limits={"gps_s": 600.0})
+GPS_LOST = {"fault": "gps_loss", "after": "engaged", "at_s": 7.0, "drift_mps": 0.45}
+SILENT_GPS = {"fault": "silent_message", "message": "GPS_RAW_INT", "after": "engaged", "at_s": 7.0}
+ON_PX4 = partial(make, LOW, ONE_LAP, aloft=True, firmware=PX4)
+ON_ARDUCOPTER = partial(on_arducopter, LOW, ONE_LAP, aloft=True)
+ONLY_ESTIMATOR = partial(ON_PX4, "reference.laps=2", limits={"gps_s": 600.0})
 
 
 def test_an_accuracy_that_is_not_reported_any_more_is_lost() -> None:
@@ -486,7 +499,7 @@ def test_a_position_that_needs_no_gps_is_flown(never: bool) -> None:
     """By motion capture, without GPS messages; and with a gap of 0.7 s in the fixes."""
     silent = {"fault": "silent_message", "message": "GPS_RAW_INT"}
     moment = silent if never else {**GPS_LOST, "for_s": 0.7}
-    pair = make(HIGH, ONE_LAP, firmware=PX4, scenario=scenario_of(moment))
+    pair = ON_PX4(scenario=scenario_of(moment))
     assert pair.fly().exit_code == ExitCode.FLOWN
     assert pair.failsafes == {}
 
@@ -495,8 +508,8 @@ def jumping(offset_m: float) -> Scenario:
     return scenario_of(
         {
             "fault": "estimator_jump",
-            "after": "took_off",
-            "at_s": 6.0,
+            "after": "engaged",
+            "at_s": 1.5,
             "offset_ned_m": (0.0, offset_m, 0.0),
         }
     )
@@ -505,18 +518,18 @@ def jumping(offset_m: float) -> Scenario:
 # -- the end ---------------------------------------------------------------------------------------
 
 
-@BOTH
+@FROM_THE_GROUND
 def test_a_fall_in_the_landing_is_not_flown(fly: Fly) -> None:
-    pair = fly(ONE_LAP, scenario="motors_cut")
+    pair = fly(scenario="motors_cut", aloft=True)
     outcome = pair.fly()
     assert outcome.exit_code == ExitCode.ABORTED
     assert "disarmed, landing not confirmed: fell at up to" in outcome.sentence
 
 
-@BOTH
+@FROM_THE_GROUND
 def test_a_vehicle_that_does_not_detect_its_landing_is_left_to_the_user(fly: Fly) -> None:
     """Only its land detector says whether it flies: it is not disarmed, and the user is told."""
-    pair = fly(ONE_LAP, scenario="never_landed", limits={"land_s": 24.0})
+    pair = fly(scenario="never_landed", limits={"land_s": 24.0})
     outcome = pair.fly()
     assert outcome.exit_code == ExitCode.ABORTED
     still_armed = (

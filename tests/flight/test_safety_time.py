@@ -16,17 +16,20 @@ from typing import Any
 import control
 import pytest
 from faults import HEARTBEAT, frame_id, late, shuffling, without
-from pair import SHORT, Bytes, HostClock, Pair, frames_of, hover, in_phase, make, on_arducopter
+from pair import SHORT, Bytes, HostClock, Pair, frames_of, hover, in_phase, on_arducopter
 from watch import (
     ARM,
     BOTH,
+    FIRMWARES,
     HIGH,
     LAND,
+    LOW,
     ONE_LAP,
     SET_MODE,
     Fly,
     Watch,
     alternately,
+    early,
     said,
     scenario_of,
     watched,
@@ -43,7 +46,7 @@ from simulator import config as simulated
 
 DEADLINE_S, PERIOD_S = 0.05, 0.1
 CURRENT_MODE = 436
-QUICK = ("reference.laps=1", "reference.height_m=1.0")
+ON_PX4, ON_ARDUCOPTER = (partial(fly, LOW, ONE_LAP, aloft=True) for _, fly in FIRMWARES)
 IN_TRACK = in_phase(Phase.TRACK, 2.0)
 HARSH = ("all_together", "lossy_20hz", "delay_100ms")
 
@@ -63,7 +66,7 @@ def ages_s(pair: Pair, since_s: float = 0.0) -> list[float]:
     ("scenario", "fly"), alternately("late_link", "later_and_later", "link_saturates")
 )
 def test_a_link_that_becomes_late_ends_in_hold_and_landing(scenario: str, fly: Fly) -> None:
-    pair = fly(HIGH, scenario=scenario, deadline_s=DEADLINE_S)
+    pair = fly(HIGH, "reference.laps=2", aloft=False, scenario=scenario, deadline_s=DEADLINE_S)
     watch = watched(pair)
     outcome = pair.fly()
     assert outcome.exit_code == ExitCode.ABORTED
@@ -86,7 +89,9 @@ def test_a_link_that_becomes_late_ends_in_hold_and_landing(scenario: str, fly: F
     )
 
 
-@pytest.mark.parametrize("fly", [hover, partial(on_arducopter, *SHORT, reference="hover")])
+@pytest.mark.parametrize(
+    "fly", [partial(fly, *SHORT, reference="hover", aloft=True) for _, fly in FIRMWARES]
+)
 def test_nothing_leaves_2_5_s_after_the_last_report_of_the_mode(fly: Fly) -> None:
     """All telemetry stops, so that the vehicle's clock stands still; setpoints would go on."""
     pair = fly(limits={"silence_s": 5.0})
@@ -107,7 +112,7 @@ def test_nothing_leaves_2_5_s_after_the_last_report_of_the_mode(fly: Fly) -> Non
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_reports_of_the_mode_that_arrive_out_of_order_end_no_flight(seed: int) -> None:
-    pair = on_arducopter(*SHORT, reference="hover", down=shuffling(seed))
+    pair = on_arducopter(*SHORT, reference="hover", aloft=True, down=shuffling(seed))
     assert pair.fly().exit_code == ExitCode.FLOWN
 
 
@@ -122,7 +127,7 @@ def test_a_saturated_link_does_no_harm(fly: Fly) -> None:
 
 
 POSITION, ATTITUDE = "LOCAL_POSITION_NED", "ATTITUDE_QUATERNION"
-ARMED, IN_FLIGHT = {"after": "armed", "at_s": 0.1}, {"after": "engaged", "at_s": 16.0}
+ARMED, IN_FLIGHT = {"after": "armed", "at_s": 0.1}, {"after": "engaged", "at_s": 7.0}
 RISING = {"after": "armed", "at_s": 2.5}
 STUCK = {
     "armed": (ARMED, {POSITION: []}, "no new LOCAL_POSITION_NED for 0.[56] s"),
@@ -147,11 +152,13 @@ def test_telemetry_that_repeats_itself_is_none(case: str, fly: Fly) -> None:
     file says; the vehicle stays within 3 m of the height that was seen last, and is never disarmed
     in the air."""
     moment, messages, says = STUCK[case]
+    on_the_ground = moment in (ARMED, RISING)
     faults = [
         {"fault": "stuck_message", "message": each, "fields": fields, **moment}
         for each, fields in messages.items()
     ]
-    pair = fly(HIGH, ONE_LAP, scenario=scenario_of(*faults, conditions={"thrust_scale": 2.0}))
+    scenario = scenario_of(*faults, conditions={"thrust_scale": 2.0})
+    pair = fly(HIGH, scenario=scenario, aloft=not on_the_ground)
     watch = watched(pair)
     seen_m: list[float] = []  # the last true height
     begins = (lambda flying: flying.instance.view.stuck, lambda _: seen_m.append(watch.height_m))
@@ -162,13 +169,13 @@ def test_telemetry_that_repeats_itself_is_none(case: str, fly: Fly) -> None:
     begun_s = next(at_s for at_s, phase in pair.phases if phase is Phase.LAND)
     assert max(-m.position_ned_m[2] for m in watch.moments if m.time_s > begun_s) < seen_m[0] + 3.0
     assert all(m.armed for m in watch.during(Phase.LAND) if m.position_ned_m[2] < -0.1)
-    assert [m.param1 for m in pair.commands(ARM)] == [1.0]
+    assert [m.param1 for m in pair.commands(ARM)] == ([1.0] if on_the_ground else [])
 
 
 @BOTH
 def test_thin_telemetry_is_flown(fly: Fly) -> None:
     """Every tenth position, on a vehicle that is heavier meanwhile."""
-    pair = fly(scenario="thin_telemetry")
+    pair = fly(scenario=early("thin_telemetry", 5.0))
     watch = watched(pair)
     assert pair.fly().exit_code == ExitCode.FLOWN
     assert watch.error_m < 0.3
@@ -195,9 +202,7 @@ class Slow:
 
 def with_slow_law(fly: Fly, seconds: float) -> tuple[Pair, Watch]:
     clock = HostClock()
-    pair = fly(
-        *QUICK, wrap=lambda law: Slow(law, clock, seconds), deadline_s=DEADLINE_S, clock=clock
-    )
+    pair = fly(wrap=lambda law: Slow(law, clock, seconds), deadline_s=DEADLINE_S, clock=clock)
     watch = watched(pair)
     return pair, watch
 
@@ -234,7 +239,7 @@ def test_a_slow_prediction_is_no_failure_of_the_law(
         clock.spend(0.28)
         return predict(*arguments)
 
-    pair = fly(*QUICK, deadline_s=DEADLINE_S, clock=clock)
+    pair = fly(deadline_s=DEADLINE_S, clock=clock)
     pair.at.append((IN_TRACK, lambda _: monkeypatch.setattr(Observer, "predict", slow)))
     outcome = pair.fly()
     assert outcome.exit_code == ExitCode.ABORTED
@@ -318,7 +323,7 @@ def paused(
     **options: Any,
 ) -> tuple[Pair, Watch, float]:
     """The process is stopped, two seconds into the track; the end of the stop."""
-    pair = fly(*QUICK, deadline_s=DEADLINE_S, **options)
+    pair = fly(deadline_s=DEADLINE_S, **options)
     ends_s: list[float] = []
 
     def stop(pair: Pair) -> None:
@@ -354,7 +359,7 @@ def test_after_a_pause_one_setpoint_leaves(seconds: float, fly: Fly, tmp_path: P
 
 def test_what_happens_often_is_told_once_a_second_and_summed_up() -> None:
     """Ten times within 1.3 s messages are dropped, and this process pauses three times."""
-    pair = make(*QUICK, deadline_s=DEADLINE_S)
+    pair = ON_PX4(deadline_s=DEADLINE_S)
     for number in range(10):
         when = in_phase(Phase.TRACK, 2.0 + 0.13 * number)
         pair.at.append((when, lambda pair: pair.companion.on_dropped(2)))
@@ -371,7 +376,7 @@ def test_what_happens_often_is_told_once_a_second_and_summed_up() -> None:
 
 
 def test_after_three_seconds_a_px4_in_its_failsafe_is_landed_without_a_setpoint() -> None:
-    pair, _, end_s = paused(make, 3.0)
+    pair, _, end_s = paused(ON_PX4, 3.0)
     outcome = pair.companion.outcome
     assert outcome is not None
     assert outcome.exit_code == ExitCode.ABORTED
@@ -382,7 +387,7 @@ def test_after_three_seconds_a_px4_in_its_failsafe_is_landed_without_a_setpoint(
 
 def test_after_three_seconds_an_arducopter_gets_nothing_old() -> None:
     """It is still in GUIDED, and ours. The supervisor would have taken over; this is without it."""
-    pair, _, end_s = paused(on_arducopter, 3.0)
+    pair, _, end_s = paused(ON_ARDUCOPTER, 3.0)
     assert pair.went_through(Phase.DISARMED)
     assert said(pair, "this computer paused for 3.00 s")
     assert len([True for at_s, _, _ in pair.setpoints if end_s - 2.9 < at_s < end_s + 0.05]) <= 1
@@ -402,7 +407,7 @@ def test_after_a_pause_a_report_of_the_mode_is_awaited() -> None:
     def just_after_a_beat(pair: Pair) -> bool:
         return IN_TRACK(pair) and 0.28 < pair.time_s - beats_s[-1] < 0.3
 
-    pair, watch, end_s = paused(make, 0.35, down=noting, when=just_after_a_beat)
+    pair, watch, end_s = paused(ON_PX4, 0.35, down=noting, when=just_after_a_beat)
     first_s = next(at_s for at_s, _, _ in pair.setpoints if at_s > end_s - 0.34)
     beat_s = next(at_s for at_s in beats_s if at_s > end_s)
     assert 0.3 < beat_s - end_s < 0.4
@@ -420,7 +425,7 @@ def test_after_a_pause_a_report_of_the_mode_is_awaited() -> None:
 )
 def test_a_jump_of_the_clock_lands(case: tuple[str, str], fly: Fly, tmp_path: Path) -> None:
     scenario, jump = case
-    pair = fly(scenario=scenario, deadline_s=DEADLINE_S)
+    pair = fly(scenario=early(scenario), deadline_s=DEADLINE_S)
     outcome = pair.fly()
     assert outcome.exit_code == ExitCode.ABORTED
     assert outcome.sentence == f"the clock of the vehicle jumped by {jump} s"
@@ -432,7 +437,10 @@ def test_a_jump_of_the_clock_lands(case: tuple[str, str], fly: Fly, tmp_path: Pa
 
 @BOTH
 def test_a_clock_that_wraps_is_flown(fly: Fly) -> None:
-    pair = fly(scenario="clock_wrap", deadline_s=DEADLINE_S)
+    wraps = simulated.scenario("clock_wrap")
+    before_s = 2.0**32 / 1e3 - 22.0  # it has hovered for a while when its links open
+    conditions = wraps.conditions.model_copy(update={"clock_start_s": before_s})
+    pair = fly(scenario=wraps.model_copy(update={"conditions": conditions}), deadline_s=DEADLINE_S)
     watch = watched(pair)
     assert pair.fly().exit_code == ExitCode.FLOWN
     assert watch.error_m < 0.05
@@ -450,7 +458,7 @@ def test_a_normal_flight_needs_no_failsafe(scenario: str, fly: Fly) -> None:
     """As `offboard fly` does it: nothing known of the vehicle, identified in flight. Milder
     scenarios are in test_figures.py."""
     pair = fly(
-        *QUICK,
+        aloft=False,
         scenario=scenario,
         believed=simulated.vehicle("neutral"),
         learning=IdentifySettings(),

@@ -11,26 +11,36 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from pair import Bytes, Filter, Pair, decode, make, on_arducopter, through
+from pair import SHORT, Bytes, Filter, Pair, decode, make, on_arducopter, through
 
 from offboard.flight.phases import TRACKING, Phase
+from simulator import config as simulated
 from simulator.config import Scenario
 
 SET_MODE, LAND, ARM, SET_MESSAGE_INTERVAL = 176, 21, 400, 511  # MAV_CMD
 LOW, HIGH = "reference.height_m=1.0", "reference.height_m=3.0"  # low: a short climb and landing
 ONE_LAP = "reference.laps=1"
-BOTH = pytest.mark.parametrize(
-    "fly", [partial(make, LOW), partial(on_arducopter, LOW)], ids=["px4", "ardupilot"]
+FIRMWARES = (("px4", make), ("ardupilot", on_arducopter))
+# one lap, by a vehicle that hovers when its links open; or a hover after its own take-off
+BOTH, FROM_THE_GROUND = (
+    pytest.mark.parametrize(
+        "fly",
+        [partial(fly, *reference, aloft=aloft, **named) for _, fly in FIRMWARES],
+        ids=[name for name, _ in FIRMWARES],
+    )
+    for reference, named, aloft in (
+        ((LOW, ONE_LAP), {}, True),
+        (SHORT, {"reference": "hover"}, False),
+    )
 )
 
 
 def alternately(*cases: Any) -> list[Any]:
-    """Arguments (case, fly): each case is flown on one of the firmwares, in turn."""
-    flown = [(partial(make, LOW), "px4"), (partial(on_arducopter, LOW), "ardupilot")]
-    each = ((case, *flown[index % 2]) for index, case in enumerate(cases))
+    """Arguments (case, fly), as for `BOTH`: each case is flown on one of the firmwares, in turn."""
+    each = ((case, *FIRMWARES[index % 2]) for index, case in enumerate(cases))
     return [
-        pytest.param(case, fly, id=f"{index}-{name}")
-        for index, (case, fly, name) in enumerate(each)
+        pytest.param(case, partial(fly, LOW, ONE_LAP, aloft=True), id=f"{index}-{name}")
+        for index, (case, name, fly) in enumerate(each)
     ]
 
 
@@ -146,6 +156,16 @@ def said(pair: Pair, words: str) -> bool:
 def scenario_of(*faults: dict[str, Any], **more: Any) -> Scenario:
     """A scenario with these faults."""
     return Scenario.model_validate({"name": "test", "faults": faults, **more})
+
+
+def early(name: str, at_s: float = 7.0) -> Scenario:
+    """A shipped scenario whose faults in track begin in the first lap of a vehicle that hovered."""
+    scenario = simulated.scenario(name)
+    first_s = min(fault.at_s for fault in scenario.faults)
+    earlier = [
+        each.model_copy(update={"at_s": each.at_s - first_s + at_s}) for each in scenario.faults
+    ]
+    return scenario.model_copy(update={"faults": earlier})
 
 
 Fly = Callable[..., Pair]
