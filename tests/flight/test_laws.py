@@ -72,7 +72,7 @@ SHED = {"shape": "box", "north_m": 1.41, "east_m": -1.0, "height_m": 2.5, "size_
 def flown(law: str, tmp_path: Path, *assignments: str) -> tuple[np.ndarray, np.ndarray, float]:
     """Times (n,) of the reference's axis, true positions (n, 3) from the climb to the landing, and
     the RMSE."""
-    pair = flying(law, tmp_path, "reference.laps=1", *assignments)
+    pair = flying(law, tmp_path, "reference.laps=1", *assignments, aloft=True)
     times, places = [], []
     advance = pair.advance
 
