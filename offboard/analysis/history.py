@@ -60,36 +60,35 @@ _DTYPES = {
     "identified": [_TIME, ("values", "20f4")],
 }  # fmt: skip
 _MOTION = {"position_ned_m": "x y z", "velocity_ned_mps": "vx vy vz"}
-# what is kept of the vehicle's messages, and of ours, by array
-_THEIRS = {
-    "position": Wire("LOCAL_POSITION_NED", _MOTION),
-    "attitude": Wire(
-        "ATTITUDE_QUATERNION",
-        {"quaternion": "q1 q2 q3 q4", "rates_radps": "rollspeed pitchspeed yawspeed"},
-    ),
-    "heartbeat": Wire(
-        "HEARTBEAT", {"armed": "base_mode", "system_status": "system_status"}, stamp=None
-    ),
-    "battery": Wire(
-        "SYS_STATUS",
-        {"voltage_mv": "voltage_battery", "remaining": "battery_remaining"},
-        stamp=None,
-    ),
-    "landed": Wire("EXTENDED_SYS_STATE", {"state": "landed_state"}, stamp=None),
-}
-_REFERENCE = Wire(
-    "POSITION_TARGET_LOCAL_NED",
-    {**_MOTION, "acceleration_ned_mps2": "afx afy afz", "heading_rad": "yaw"},
+_ROTATION = {"quaternion": "q1 q2 q3 q4", "rates_radps": "rollspeed pitchspeed yawspeed"}
+_REFERENCE = {**_MOTION, "acceleration_ned_mps2": "afx afy afz", "heading_rad": "yaw"}
+_MODE = {"armed": "base_mode", "system_status": "system_status"}
+_BATTERY = {"voltage_mv": "voltage_battery", "remaining": "battery_remaining"}
+
+
+def _kept(*kinds: tuple[str, Wire]) -> dict[str, tuple[str, Wire]]:
+    return {wire.name: (kind, wire) for kind, wire in kinds}
+
+
+# array of History and fields of its columns, by message
+_THEIRS = _kept(
+    ("position", Wire("LOCAL_POSITION_NED", _MOTION)),
+    ("attitude", Wire("ATTITUDE_QUATERNION", _ROTATION)),
+    ("heartbeat", Wire("HEARTBEAT", _MODE, None)),
+    ("battery", Wire("SYS_STATUS", _BATTERY, None)),
+    ("landed", Wire("EXTENDED_SYS_STATE", {"state": "landed_state"}, None)),
 )
-_ATTITUDE_SETPOINT = Wire("SET_ATTITUDE_TARGET", {"quaternion": "q", "thrust": "thrust"})
-_POSITION_SETPOINT = Wire("SET_POSITION_TARGET_LOCAL_NED", {})
+_OURS = _kept(
+    ("reference", Wire("POSITION_TARGET_LOCAL_NED", _REFERENCE)),
+    ("setpoint", Wire("SET_ATTITUDE_TARGET", {"quaternion": "q", "thrust": "thrust"})),
+    ("setpoint", Wire("SET_POSITION_TARGET_LOCAL_NED", {})),
+)
 _PLACE = {"place": "lat lon alt"}
 _HIL = Wire("HIL_STATE_QUATERNION", _PLACE, BOOT_US)
 _HIL_UNSTAMPED = Wire("HIL_STATE_QUATERNION", _PLACE, None)
 _SIM = Wire("SIM_STATE", {"place": "lat_int lon_int alt"}, None)
 _SCALES = {_HIL.name: (1e7, 1e7, 1e3), _SIM.name: (1e7, 1e7, 1.0)}
-_BY_NAME = {wire.name: array for array, wire in _THEIRS.items()}
-_ARRAYS = {RECORD_NAME, IDENTIFIED_NAME}
+_ARRAYS = {RECORD_NAME.encode(), IDENTIFIED_NAME.encode()}
 _TICK = Wire("DEBUG_FLOAT_ARRAY", {}, BOOT_US)
 _IDENTIFIED = Wire("DEBUG_FLOAT_ARRAY", {"values": "data"}, BOOT_US)
 
@@ -212,7 +211,7 @@ class _Collector:
         self._asked_ns, self._answered_ns = array("q"), array("q")  # of TIMESYNC; ts1, and ts1, tc1
         self._texts, self._our_texts = Texts("vehicle"), Texts("offboard")
         self._modes = Texts("vehicle")
-        self._mode = -1
+        self._mode = ""
         self._event_records: list[tuple[float, bytes]] = []
         self._counts: Counter[str] = Counter()
         self._unix_us = (0, 0)
@@ -224,77 +223,64 @@ class _Collector:
     def add(self, entry: LoggedMessage) -> None:
         self._counts[entry.name] += 1
         self._unix_us = (self._unix_us[0] or entry.unix_us, entry.unix_us)
-        if entry.component_id in OUR_COMPONENTS:
-            if self._vehicle is None or entry.system_id == self._vehicle.system_id:
-                self._add_ours(entry)
-        elif (entry.system_id, entry.component_id) == self._vehicle:
-            self._add_theirs(entry)
-            kind = entry.frame.message_id
-            if kind in self._clocks:
-                if kind in TELEMETRY:
-                    self._clocks = TELEMETRY
-                self.now_ms = float(int.from_bytes(entry.frame.payload[:4], "little"))
-                if math.isnan(self._anchor_ms):
-                    self._anchor_ms = self.now_ms
-
-    def _keep(self, samples: Samples, wire: Wire, entry: LoggedMessage) -> None:
-        samples.add(wire, entry.frame.payload, self.now_ms, entry.unix_us / 1e6)
-
-    def _add_ours(self, entry: LoggedMessage) -> None:
+        ours = entry.component_id in OUR_COMPONENTS
+        if ours and self._vehicle and entry.system_id != self._vehicle.system_id:
+            return
+        if not ours and (entry.system_id, entry.component_id) != self._vehicle:
+            return
         name, payload = entry.name, entry.frame.payload
-        if name == _REFERENCE.name:
-            self._keep(self._samples["reference"], _REFERENCE, entry)
-        elif name == _ATTITUDE_SETPOINT.name:
-            self._keep(self._samples["setpoint"], _ATTITUDE_SETPOINT, entry)
-        elif name == _POSITION_SETPOINT.name:
-            self._keep(self._samples["setpoint"], _POSITION_SETPOINT, entry)
-        elif name == _TICK.name:
-            array_name = payload[10:20].rstrip(b"\0").decode(errors="replace")
-            if int.from_bytes(payload[8:10], "little") == IDENTIFIED_ID:
-                if array_name in _ARRAYS:
-                    self._keep(self._samples["identified"], _IDENTIFIED, entry)
-            elif array_name in _ARRAYS:
-                self._keep(self._ticks, _TICK, entry)
+        if name in (_OURS if ours else _THEIRS):
+            kind, wire = (_OURS if ours else _THEIRS)[name]
+            self._samples[kind].add(wire, payload, self.now_ms, entry.unix_us / 1e6)
         elif name == "TIMESYNC":
-            asked_ns, answered_ns = _times_ns(payload)
-            if not answered_ns:
+            answered_ns, asked_ns = struct.unpack("<qq", payload[:16].ljust(16, b"\0"))
+            if ours and not answered_ns:
                 self._asked_ns.append(asked_ns)
-        elif name == "TUNNEL":
-            if int.from_bytes(payload[:2], "little") == event_record.PAYLOAD_TYPE:
-                self._event_records.append((self.now_ms, payload[5 : 5 + payload[4]]))
-        elif name == "STATUSTEXT":
-            self._our_texts.add_chunk(entry, self.now_ms)
-
-    def _add_theirs(self, entry: LoggedMessage) -> None:
-        name, payload = entry.name, entry.frame.payload
-        known = _BY_NAME.get(name)
-        if known:
-            self._keep(self._samples[known], _THEIRS[known], entry)
-        if name == "HEARTBEAT":
-            mode = entry.message.custom_mode
-            if self._dialect and mode != self._mode:
-                self._modes.add(self._dialect.mode_name(mode), self.now_ms)
-            self._mode = mode
-        elif name in _SCALES and self._truth.origin:
-            wire = _SIM if name == _SIM.name else _HIL if any(payload[:8]) else _HIL_UNSTAMPED
-            self._keep(self._truth, wire, entry)
-        elif name == "TIMESYNC":
-            asked_ns, answered_ns = _times_ns(payload)
-            if answered_ns:
+            elif not ours and answered_ns:
                 self._answered_ns.extend((asked_ns, answered_ns))
         elif name == "STATUSTEXT":
-            self._texts.add_chunk(entry, self.now_ms)
+            (self._our_texts if ours else self._texts).add_chunk(entry, self.now_ms)
+        elif ours:
+            self._add_ours(name, entry)
+        else:
+            self._add_theirs(name, entry)
+        if name == "HEARTBEAT" and self._dialect and not ours:
+            mode = self._dialect.mode_name(int.from_bytes(payload[:4], "little"))
+            if mode != self._mode:
+                self._modes.add(mode, self.now_ms)
+                self._mode = mode
+        if entry.frame.message_id in self._clocks and not ours:
+            if entry.frame.message_id in TELEMETRY:
+                self._clocks = TELEMETRY
+            self.now_ms = float(int.from_bytes(payload[:4], "little"))
+            if math.isnan(self._anchor_ms):
+                self._anchor_ms = self.now_ms
+
+    def _add_ours(self, name: str, entry: LoggedMessage) -> None:
+        payload = entry.frame.payload
+        if name == _TICK.name and payload[10:20].rstrip(b"\0") in _ARRAYS:
+            identified = int.from_bytes(payload[8:10], "little") == IDENTIFIED_ID
+            samples = self._samples["identified"] if identified else self._ticks
+            wire = _IDENTIFIED if identified else _TICK
+            samples.add(wire, payload, self.now_ms, entry.unix_us / 1e6)
+        elif name == "TUNNEL" and payload[:2] == event_record.PAYLOAD_TYPE.to_bytes(2, "little"):
+            self._event_records.append((self.now_ms, payload[5 : 5 + payload[4]]))
+
+    def _add_theirs(self, name: str, entry: LoggedMessage) -> None:
+        if name in _SCALES and self._truth.origin:
+            payload = entry.frame.payload
+            wire = _SIM if name == _SIM.name else _HIL if any(payload[:8]) else _HIL_UNSTAMPED
+            self._truth.add(wire, payload, self.now_ms, entry.unix_us / 1e6)
         elif name == "COMMAND_ACK":
             command, result = entry.message.command, entry.message.result
             if result not in (0, 5):  # MAV_RESULT_ACCEPTED, MAV_RESULT_IN_PROGRESS
                 self._texts.add(f"command {command} refused, result {result}", self.now_ms)
-        elif name == "GPS_GLOBAL_ORIGIN":
-            at = entry.message
-            self._truth.move(Geodetic(at.latitude / 1e7, at.longitude / 1e7, at.altitude / 1e3))
-        elif name == "HOME_POSITION":
+        elif name in ("GPS_GLOBAL_ORIGIN", "HOME_POSITION"):
             at = entry.message
             place = Geodetic(at.latitude / 1e7, at.longitude / 1e7, at.altitude / 1e3)
-            self._truth.move(origin_of(place, (at.x, at.y, at.z)))
+            if name == "HOME_POSITION":
+                place = origin_of(place, (at.x, at.y, at.z))
+            self._truth.move(place)
 
     def history(self, damage: str) -> History:
         """All that was added."""
@@ -330,12 +316,6 @@ class _Collector:
         rows = np.empty(len(asked), [_TIME, ("delay_s", "f8")])
         rows["time_s"], rows["delay_s"] = 1e-9 * asked, 1e-9 * (answered - asked)
         return rows
-
-
-def _times_ns(payload: bytes) -> tuple[int, int]:
-    """ts1 and tc1 of a TIMESYNC; tc1 is 0 in a request."""
-    answered_ns, asked_ns = struct.unpack("<qq", payload[:16].ljust(16, b"\0"))
-    return asked_ns, answered_ns
 
 
 def _vehicle(log: Tlog) -> tuple[Address | None, Dialect | None]:

@@ -88,8 +88,10 @@ def link_figures(flown: History, window: tuple[float, float] | None) -> dict[str
     for name, rows in (("position", flown.position), ("attitude", flown.attitude)):
         stamps = rows["time_s"]
         stamps = stamps[(stamps >= window[0]) & (stamps <= window[1])]
-        count = len(np.unique(stamps))
-        intervals = np.diff(np.maximum.accumulate(stamps, out=stamps))
+        intervals, count = np.diff(stamps), len(stamps)
+        if (intervals <= 0.0).any():
+            count = len(np.unique(stamps))
+            intervals = np.diff(np.maximum.accumulate(stamps))
         late = int((intervals <= 0.0).sum())
         span_s = float(np.ptp(stamps)) if len(stamps) else 0.0
         values[f"{name}_hz"] = (count - 1) / span_s if span_s > 0.0 else math.nan

@@ -70,6 +70,7 @@ def tracking_figures(flown: History, window: tuple[float, float]) -> dict[str, f
         direction = thrust_direction_from_quaternion(part["quaternion"])
         return np.degrees(np.arccos(np.clip(direction[:, 2], -1.0, 1.0)))
 
+    fitness = _fitness(flown, reference, window)
     # one array after the other: each may be a copy of hours of telemetry
     rows = _within(flown.position, window)
     weights = clock.shares(rows["time_s"])
@@ -87,7 +88,6 @@ def tracking_figures(flown: History, window: tuple[float, float]) -> dict[str, f
     roll_rate, pitch_rate = (
         weighted(rows["rates_radps"][:, axis].astype(np.float64), weights).sd for axis in (0, 1)
     )
-    fitness = _fitness(flown, reference, window)
     return {
         "rmse_position_m": position.rms,
         "mean_position_m": position.mean,
@@ -115,14 +115,18 @@ def tracking_figures(flown: History, window: tuple[float, float]) -> dict[str, f
 def _fitness(flown: History, reference: Reference, window: tuple[float, float]) -> dict[str, float]:
     """Eqs. 31-32: velocities in the body frame, heading in degrees."""
     ticks = flown.records["time_s"][_ticks(flown, window)]
-    attitude, position = flown.attitude, flown.position
-    quaternion = attitude["quaternion"][_nearest(attitude["time_s"], ticks)]
-    body = rotation_from_quaternion(quaternion).swapaxes(-1, -2)
-    velocity = reference.position(ticks, 1) - _at(position, "velocity_ned_mps", ticks)
-    slip = np.einsum("nij,nj->ni", body, velocity)
-    away = reference.position(ticks) - _at(position, "position_ned_m", ticks)
-    turn = np.degrees(wrap_pi(reference.heading(ticks) - heading_from_quaternion(quaternion)))
-    squares = (np.column_stack((slip, away, turn)) ** 2).sum(axis=0)
+    quaternion = flown.attitude["quaternion"][_nearest(flown.attitude["time_s"], ticks)]
+    position, velocity = (
+        _at(flown.position, column, ticks) for column in ("position_ned_m", "velocity_ned_mps")
+    )
+    squares = np.zeros(len(_FITNESS))
+    for part in blocks(len(ticks)):
+        body = rotation_from_quaternion(quaternion[part]).swapaxes(-1, -2)
+        slip = np.einsum("nij,nj->ni", body, reference.position(ticks[part], 1) - velocity[part])
+        away = reference.position(ticks[part]) - position[part]
+        turn = reference.heading(ticks[part]) - heading_from_quaternion(quaternion[part])
+        errors = np.column_stack((slip, away, np.degrees(wrap_pi(turn))))
+        squares += (errors**2).sum(axis=0)
     return {name: float(value) for name, value in zip(_FITNESS, squares, strict=True)}
 
 
@@ -167,8 +171,8 @@ class _Clock:
 
     def __init__(self, flown: History) -> None:
         chosen = _in_track(flown)
-        rows = each_once(flown.records[["time_s", "track_time_s"]][chosen])
-        self._times, track_s = rows["time_s"], rows["track_time_s"].astype(np.float64)
+        self._times, first = np.unique(flown.records["time_s"][chosen], return_index=True)
+        track_s = flown.records["track_time_s"][chosen][first].astype(np.float64)
         self._passed_s: Array = np.cumsum(np.maximum(np.diff(track_s, prepend=track_s[:1]), 0.0))
 
     def shares(self, times: Array) -> Array:

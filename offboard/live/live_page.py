@@ -45,7 +45,7 @@ def _plan() -> Figure:
     figure.add_trace(
         go.Scatter(x=[], y=[], mode="markers", showlegend=False, marker={"color": BLUE, "size": 10})
     )
-    figure.update_layout(template=STYLE, height=420)
+    figure.update_layout(template=STYLE, height=560)
     figure.update_xaxes(title_text="east, m")
     figure.update_yaxes(title_text="north, m", scaleanchor="x")
     return Figure("Path from above", figure)
@@ -57,4 +57,5 @@ def _curves() -> Figure:
     )
     for place in (1, 2, 3):
         curve(figure, place, [], [], "estimated", BLUE, showlegend=False)
+    figure.update_yaxes(rangemode="tozero", row=3)
     return Figure("Curves", figure)

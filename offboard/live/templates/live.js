@@ -40,7 +40,7 @@ function tellFlight() {
 const column = (name, axis) => rows.map((row) =>
   row[name] ? Math.round(1e4 * row[name][axis]) / 1e4 : null);
 function redraw() {
-  if (!changed || !newest) return;
+  if (!changed || !newest || !figures.every((figure) => figure.dataset.drawn)) return;
   changed = false;
   tell();
   const [time, down] = [rows.map((row) => row.time_s), column("position_ned_m", 2)];
@@ -53,7 +53,8 @@ function redraw() {
     x: [time, time, time],
     y: [down.map((value) => value === null ? null : -value),
         rows.map((row) => row.position_error_m),
-        rows.map((row) => row.telemetry_age_s === null ? null : 1e3 * row.telemetry_age_s)],
+        rows.map(({ telemetry_age_s: age_s }) =>
+          age_s === null ? null : Math.round(1e4 * age_s) / 10)],
   });
 }
 
