@@ -81,6 +81,6 @@ def test_a_wide_fast_circle_that_begins_far_away(tmp_path: Path) -> None:
     """7.5 m/s at 39 degrees of tilt, 60 m from the take-off point."""
     wide = {"radius_m": 30, "period_s": 25, "laps": 1, "run_in_s": 8, "origin_north_m": 50}
     assignments = (f"reference.{key}={value}" for key, value in wide.items())
-    pair = make(*assignments, scenario="px4_like", reference="circle_course")
+    pair = make(*assignments, scenario="px4_like", reference="circle_course", aloft=True)
     pair.track()
     assert pair.score(tmp_path).rmse_position_m < 0.08

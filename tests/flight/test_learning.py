@@ -35,7 +35,7 @@ from simulator.vehicle.attitude import build_loop
 
 IDENTIFY = IdentifySettings()
 NEUTRAL = simulated.vehicle("neutral")
-FIVE_S = "reference.duration_s=5.0"
+FIVE_S, ONE_LAP = "reference.duration_s=5.0", "reference.laps=1"
 
 
 def unseen(delay_s, frequency, damping, drag_ps, hover_thrust) -> Vehicle:
@@ -144,7 +144,9 @@ def test_second_lap_is_as_good_as_with_the_true_constants(like, seeds, tmp_path:
 def test_slow_thrust_is_identified(lag_s: float, tmp_path: Path):
     """From the steps, though they leave it uncertain. Otherwise it is 0.5 to 1.2 m off."""
     flies = simulated.vehicle("px4_sih").model_copy(update={"thrust_lag_s": lag_s})
-    pair = neutral(scenario="px4_like", learning=IDENTIFY, flies=flies, seed=3)
+    pair = make(
+        ONE_LAP, vehicle="neutral", scenario="px4_like", learning=IDENTIFY, flies=flies, seed=3
+    )
     pair.track()
     assert pair.score(tmp_path).rmse_position_m < 0.06
     model = pair.companion.state.model
@@ -153,7 +155,7 @@ def test_slow_thrust_is_identified(lag_s: float, tmp_path: Path):
 
 
 def test_steps_stay_in_the_box_and_what_they_show_is_announced_and_recorded():
-    pair = neutral(scenario="px4_like", learning=IDENTIFY)
+    pair = make(ONE_LAP, vehicle="neutral", scenario="px4_like", learning=IDENTIFY)
     away = []
 
     def look(now: Pair) -> bool:
@@ -360,7 +362,7 @@ def test_delay_that_is_never_the_same_lowers_the_bandwidth(tmp_path: Path):
 @pytest.mark.parametrize(("scenario", "most_m"), [("calm", 0.2), ("px4_like", 0.65)])
 def test_attitude_loop_that_slows_is_noticed_and_flown(scenario, most_m, tmp_path: Path):
     """From 11.4 to 5 rad/s with the same delay. Unnoticed, it is 0.68 m off, and 0.98 m."""
-    pair = neutral(scenario=scenario, learning=IDENTIFY)
+    pair = neutral(scenario=scenario, learning=IDENTIFY, aloft=True)
     true = simulated.vehicle("px4_sih")
     slow = true.tilt.model_copy(update={"natural_frequency_radps": 5.0})
     loop = build_loop(true.model_copy(update={"tilt": slow}), STEP_S)
@@ -398,7 +400,7 @@ def test_mass_that_changes_in_flight_is_followed(mass_scale, tmp_path: Path):
 
 
 def test_mass_that_stays_is_not_identified_again(tmp_path: Path):
-    pair = neutral(scenario="gusts", learning=IDENTIFY)
+    pair = make(ONE_LAP, vehicle="neutral", scenario="gusts", learning=IDENTIFY, aloft=True)
     pair.track()
     said = [line for line in pair.companion.announced if "identified hover thrust" in line]
     assert not said
