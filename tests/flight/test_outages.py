@@ -21,7 +21,7 @@ CURRENT_MODE = 436
 
 def px4(fallback: float) -> Callable[..., Pair]:
     def make(**options: object) -> Pair:
-        pair = hover(*LONG, **options)
+        pair = hover(*LONG, aloft=True, **options)
         pair.instance.autopilot.parameters.set("COM_OBL_RC_ACT", fallback)
         return pair
 
@@ -29,7 +29,7 @@ def px4(fallback: float) -> Callable[..., Pair]:
 
 
 def arducopter(**options: object) -> Pair:
-    return on_arducopter(*LONG, reference="hover", **options)
+    return on_arducopter(*LONG, reference="hover", aloft=True, **options)
 
 
 VEHICLES = {"px4": px4(POSCTL), "px4, which holds": px4(LOITER), "arducopter": arducopter}
