@@ -189,16 +189,14 @@ def name_of(message_id: int) -> str:
     return kind.msgname if kind else f"UNKNOWN_{message_id}"
 
 
-def columns(
-    name: str, payloads: bytes | bytearray, fields: str, chosen: slice = slice(None)
-) -> NDArray[np.float64]:
-    """Fields of messages named `name` as rows (N, columns); of the `chosen` messages only.
+def columns(name: str, payloads: bytes | bytearray, fields: str) -> NDArray[np.float64]:
+    """Fields of messages named `name` as rows (N, columns).
 
     `payloads` are the N payloads one after the other, each with all the zeros that MAVLink 2 omits
     (see `layout`). `fields` are separated by spaces; an array field fills as many columns as it has
     elements.
     """
-    rows = np.frombuffer(payloads, layout(name))[chosen]
+    rows = np.frombuffer(payloads, layout(name))
     names = fields.split()
     widths = [math.prod(rows.dtype[field].shape) for field in names]
     found = np.empty((len(rows), sum(widths)))

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from offboard.analysis.tlog import layout, name_of
 from offboard.mavlink.framing import SETPOINTS
 from offboard.replay.replaying import Sent
 
 COMMANDS = (75, 76)  # COMMAND_INT, COMMAND_LONG
-ATTITUDE_TARGET = 82
 # Of a field, relative to its value or to 1: another processor or library rounds differently, by up
 # to 1e-8 rad and 6e-8 of thrust between two x86-64 processors
 ROUNDING = 1e-6
@@ -38,22 +36,6 @@ class Difference:
     @property
     def name(self) -> str:
         return name_of(self._either.message_id)
-
-    @property
-    def angle_rad(self) -> float:
-        """Between the two attitudes; NaN without two."""
-        first, second = (_attitude(each) for each in (self.expected, self.actual))
-        if first is None or second is None:
-            return math.nan
-        second = second if first @ second >= 0.0 else -second
-        return 4.0 * math.atan2(
-            float(np.linalg.norm(first - second)), float(np.linalg.norm(first + second))
-        )
-
-    @property
-    def thrust(self) -> float:
-        """Difference of normalised thrust; NaN without two."""
-        return next((d for name, *_, d in self.fields() if name == "thrust"), math.nan)
 
     def fields(self) -> list[tuple[str, float, float, float]]:
         """Name, expected value, actual value and difference of each field that differs."""
@@ -98,15 +80,6 @@ class Comparison:
         return sum(self.compared[kind] for kind in COMMANDS)
 
     @property
-    def largest_angle_rad(self) -> float:
-        """0 where no pair of attitudes differs."""
-        return _largest(each.angle_rad for each in self.differences)
-
-    @property
-    def largest_thrust(self) -> float:
-        return _largest(each.thrust for each in self.differences)
-
-    @property
     def significant(self) -> tuple[Difference, ...]:
         """The differences that are more than rounding."""
         return tuple(each for each in self.differences if not each.is_rounding())
@@ -117,10 +90,11 @@ class Comparison:
         if not self.differences:
             return f"{total}: all identical"
         alone = sum(each.expected is None or each.actual is None for each in self.differences)
-        angle_deg = math.degrees(self.largest_angle_rad)
+        changed = [field for each in self.differences for field in each.fields()]
+        changes = [(by, name) for name, *_, by in changed if not math.isnan(by)]
+        largest, name = max(changes, default=(0.0, "any field"))
         sentence = (
-            f"{len(self.differences)} of {total} differ; largest difference {angle_deg:.3g} deg "
-            f"and {self.largest_thrust:.3g} of thrust"
+            f"{len(self.differences)} of {total} differ; largest difference {largest:.3g} of {name}"
         )
         if alone:
             return f"{sentence}; {alone} were sent on one side only"
@@ -163,13 +137,6 @@ def _fields(sent: Sent) -> dict[str, float]:
     }
 
 
-def _attitude(sent: Sent | None) -> NDArray[np.float64] | None:
-    if sent is None or sent.message_id != ATTITUDE_TARGET:
-        return None
-    quaternion: NDArray[np.float64] = _row(sent)["q"].astype(np.float64)
-    return quaternion / np.linalg.norm(quaternion)
-
-
 def _row(sent: Sent) -> np.void:
     kind = layout(name_of(sent.message_id))
     row: np.void = np.frombuffer(sent.payload[: kind.itemsize].ljust(kind.itemsize, b"\0"), kind)[0]
@@ -178,7 +145,3 @@ def _row(sent: Sent) -> np.void:
 
 def _same(first: float, second: float) -> bool:
     return first == second or (math.isnan(first) and math.isnan(second))
-
-
-def _largest(values: Iterator[float]) -> float:
-    return max((value for value in values if not math.isnan(value)), default=0.0)
