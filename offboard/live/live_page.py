@@ -45,6 +45,9 @@ def _plan() -> Figure:
     figure.add_trace(
         go.Scatter(x=[], y=[], mode="markers", showlegend=False, marker={"color": BLUE, "size": 10})
     )
+    # a vehicle at rest has no axis of millimetres
+    unseen = {"mode": "markers", "opacity": 0, "hoverinfo": "skip", "showlegend": False}
+    figure.add_trace(go.Scatter(x=[-1, 1], y=[-1, 1], **unseen))
     figure.update_layout(template=STYLE, height=560)
     figure.update_xaxes(title_text="east, m")
     figure.update_yaxes(title_text="north, m", scaleanchor="x")

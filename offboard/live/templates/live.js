@@ -48,7 +48,7 @@ function redraw() {
   Plotly.restyle("plan", {
     x: [column("reference_ned_m", 1), east, east.slice(-1)],
     y: [column("reference_ned_m", 0), north, north.slice(-1)],
-  });
+  }, [0, 1, 2]);
   Plotly.restyle("curves", {
     x: [time, time, time],
     y: [down.map((value) => value === null ? null : -value),
