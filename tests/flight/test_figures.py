@@ -24,9 +24,9 @@ from simulator import config as simulated
         ("px4_like", 0.04),
         pytest.param("noise", 0.04, marks=pytest.mark.slow),
         pytest.param("thrust_minus_15", 0.02, marks=pytest.mark.slow),
-        ("mass_plus_20", 0.03),
+        pytest.param("mass_plus_20", 0.03, marks=pytest.mark.slow),
         pytest.param("wind_2mps", 0.03, marks=pytest.mark.slow),
-        ("gusts", 0.06),
+        pytest.param("gusts", 0.06, marks=pytest.mark.slow),
     ],
 )
 def test_default_flight(scenario: str, most_m: float, tmp_path: Path) -> None:

@@ -76,7 +76,13 @@ def taken_over_with(pair: Pair) -> float:
 
 
 @pytest.mark.parametrize(
-    ("factor", "believed", "seed"), [(2.0, 1.0, 1), (2.0, 2.0, 2), (1.5, 0.5, 3), (0.75, 1.0, 4)]
+    ("factor", "believed", "seed"),
+    [
+        (2.0, 1.0, 1),
+        pytest.param(2.0, 2.0, 2, marks=pytest.mark.slow),
+        pytest.param(1.5, 0.5, 3, marks=pytest.mark.slow),
+        (0.75, 1.0, 4),
+    ],
 )
 def test_arducopter_with_another_thrust_stays_at_its_height(factor, believed, seed) -> None:
     """Without, it is 8 m too high with four times the thrust of its file."""

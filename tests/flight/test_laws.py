@@ -96,7 +96,12 @@ def nearest_m(volumes: list[dict[str, Any]], times: np.ndarray, places: np.ndarr
 
 
 @pytest.mark.parametrize(
-    "volumes", [[CROSSING], [AT_THE_TOP, TOWER], pytest.param([SHED], marks=pytest.mark.slow)]
+    "volumes",
+    [
+        [CROSSING],
+        pytest.param([AT_THE_TOP, TOWER], marks=pytest.mark.slow),
+        pytest.param([SHED], marks=pytest.mark.slow),
+    ],
 )
 def test_volumes_are_kept_clear_of(volumes: list[dict[str, Any]], tmp_path: Path) -> None:
     keep_out = f"controller.keep_out={json.dumps(volumes)}"

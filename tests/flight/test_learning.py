@@ -72,7 +72,7 @@ UNSEEN = {
         ("slow", "px4_like"),
         pytest.param("like PX4", "px4_like", marks=pytest.mark.slow),
         pytest.param("late and draggy", "px4_like", marks=pytest.mark.slow),
-        ("late and draggy", "calm"),
+        pytest.param("late and draggy", "calm", marks=pytest.mark.slow),
     ],
 )
 def test_unseen_vehicle_is_identified_from_its_log(name, scenario, tmp_path: Path):
@@ -118,7 +118,7 @@ SEEDS = pytest.mark.parametrize("seeds", [(1,), pytest.param((1, 2), marks=pytes
 
 
 @SEEDS
-@pytest.mark.parametrize("like", [like_px4, like_arducopter])
+@pytest.mark.parametrize("like", [like_px4, pytest.param(like_arducopter, marks=pytest.mark.slow)])
 def test_second_lap_is_as_good_as_with_the_true_constants(like, seeds, tmp_path: Path):
     """Within 20 %; over ten seeds it is within 2 %. The file alone, without the
     hover thrust that ArduCopter shows before the take-over, is much worse."""
@@ -382,7 +382,7 @@ def test_attitude_loop_that_slows_is_noticed_and_flown(scenario, most_m, tmp_pat
     assert pair.score(tmp_path).max_position_m < most_m
 
 
-@pytest.mark.parametrize("mass_scale", [0.8, 1.25])
+@pytest.mark.parametrize("mass_scale", [pytest.param(0.8, marks=pytest.mark.slow), 1.25])
 def test_mass_that_changes_in_flight_is_followed(mass_scale, tmp_path: Path):
     """A load that is dropped or picked up while the reference is flown."""
     pair = neutral(scenario="px4_like", learning=IDENTIFY)

@@ -362,6 +362,7 @@ def test_a_kept_flight_appears_when_it_is_complete(
     assert {path.name for path in kept.iterdir()} >= {"flight.tlog", "flight.yaml", "score.json"}
 
 
+@pytest.mark.slow
 def test_an_interrupted_comparison_keeps_what_landed_and_goes_on(
     spawn: Spawn, tmp_path: Path
 ) -> None:

@@ -174,6 +174,7 @@ def test_undamped_epsilon_is_the_papers() -> None:
     assert max(flight.spreads.max() for flight in flights) < 3.0  # printed 2.0023
 
 
+@pytest.mark.slow
 def test_damped_epsilon_is_the_papers_only_with_the_constant_term() -> None:
     kept, dropped = mean_spread(flown(0.65)), mean_spread(flown(0.65, keep_constant=False))
     assert 2.77e-9 < kept < 2.77e-7  # printed 2.7744e-08
@@ -185,6 +186,7 @@ def test_damped_inputs_do_not_depend_on_the_constant_term() -> None:
         np.testing.assert_allclose(kept.errors, dropped.errors, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_least_damping_gains_least_and_the_rest_gain_alike() -> None:
     costs = {
         d: np.mean([flight.costs.sum() for flight in flown(d)]) for d in (0.3, 0.4, 0.5, 0.65, 0.8)
@@ -243,6 +245,7 @@ def test_errata_name_their_numbers() -> None:
     assert "λ = 0.65: 0 %" in evidence["Table 2, small ε"]
 
 
+@pytest.mark.slow
 def test_unequal_weights_speed_one_step_up_and_then_break_it() -> None:
     found = rows(horizon.weights_table(FLIGHTS), "weights")
     assert found["Q_y = 1 Q_v"]["time_constant_s"] == pytest.approx(39.16, rel=1e-3)
@@ -253,6 +256,7 @@ def test_unequal_weights_speed_one_step_up_and_then_break_it() -> None:
 # ---------------------------------------------------------------- integral term, state limits
 
 
+@pytest.mark.slow
 def test_integral_removes_the_steady_error() -> None:
     for row in tables.integral_table(FLIGHTS).rows:
         if row["law"] == "integral":
@@ -261,6 +265,7 @@ def test_integral_removes_the_steady_error() -> None:
             assert row["steady_m"] > 0.1, row
 
 
+@pytest.mark.slow
 def test_limits_hold_in_every_sample_of_the_path() -> None:
     for row in tables.limits_table(FLIGHTS).rows:
         if row["law"] == "limited":
@@ -342,6 +347,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
         return reproduce(options, Console(file=io.StringIO()))
 
 
+@pytest.mark.slow
 def test_the_page_opens_without_a_network_and_shows_everything(run: Outcome) -> None:
     assert list(run.made) == list(PaperOptions(run.page).labels)
     assert not run.missing
@@ -381,6 +387,7 @@ def _drawn(opened: Opened) -> list[tuple[str, bool, int, int]]:
     return found
 
 
+@pytest.mark.slow
 def test_csv_and_json_say_the_same(run: Outcome) -> None:
     out = run.page.parent
     lines = list(csv.DictReader((out / "table_horizon.csv").open(encoding="utf-8")))
