@@ -22,6 +22,7 @@ from offboard.flight.rows import (
 from offboard.flight.state import FlightState
 
 TAKE_OVER_HEIGHT_M = 1.0  # where setpoints replace the autopilot's own take-off
+DISARMED_S = 1.5  # longer than a period of HEARTBEAT
 DETECTOR_S = 1.0  # EXTENDED_SYS_STATE is requested at 5 Hz
 REST_S = 0.5  # after the end of the reference
 
@@ -78,7 +79,16 @@ def rebooted_in_flight(flight: FlightState) -> str:
 
 
 def disarmed(flight: FlightState) -> str:
-    return "" if flight.vehicle.armed else f"the vehicle disarmed {_when(flight)}"
+    """One HEARTBEAT may be wrong: the land detector shows it too, or a second HEARTBEAT."""
+    flies = flight.contact.detects_flight or flight.phase is Phase.TAKEOFF
+    if flight.vehicle.armed or (flies and flight.vehicle.disarmed_s < DISARMED_S):
+        return ""
+    return f"the vehicle disarmed {_when(flight)}"
+
+
+def disarmed_but_flies(flight: FlightState) -> str:
+    """The land detector contradicts HEARTBEAT, which may be wrong."""
+    return disarmed(flight) if flight.contact.detects_flight else ""
 
 
 def _when(flight: FlightState) -> str:
@@ -115,8 +125,11 @@ def rebooted_disarmed(flight: FlightState) -> bool:
 
 
 def disarmed_elsewhere(flight: FlightState) -> str:
-    """Disarmed, but not landed; the land detector has had time to report."""
-    missing = flight.not_landed() if flight.vehicle.disarmed_s > DETECTOR_S else ""
+    """Disarmed, but not landed; the land detector has had time to report, and a vehicle that still
+    flies by it to be asked to land."""
+    asked = not flight.contact.detects_flight or flight.in_phase_s > DETECTOR_S
+    known = asked and flight.vehicle.disarmed_s > DETECTOR_S
+    missing = flight.not_landed() if known else ""
     return f"disarmed, landing not confirmed: {missing}" if missing else ""
 
 
@@ -175,6 +188,7 @@ def ends_early(phases: tuple[Phase, ...], serves: bool) -> tuple[Transition, ...
     held = tuple(phase for phase in phases if phase not in (Phase.HAND_BACK, Phase.HOLD))
     rows = (
         Transition(phases, rebooted_in_flight, Phase.LAND, ABORTED, "restart"),
+        Transition(phases, disarmed_but_flies, Phase.LAND, ABORTED, "disarmed in flight"),
         Transition(phases, disarmed, Phase.FAILED, ABORTED, "disarmed in flight"),
         Transition(followed, lost, Phase.YIELDED, FLOWN, "pilot"),
         Transition(others, lost, Phase.YIELDED, ABORTED, "pilot"),

@@ -321,6 +321,8 @@ class FlightState:
         self.home_ned_m = moved(self.home_ned_m, jump)
         if self.takeoff_ned_m is not None:
             self.takeoff_ned_m = moved(self.takeoff_ned_m, jump)
+        if self.phase is Phase.TAKEOFF:  # the reference is not in force yet
+            self.plan.origin_ned_m = moved(self.plan.origin_ned_m, jump)
         if self.contact.rest_ned_m is not None:
             self.contact.rest_ned_m = moved(self.contact.rest_ned_m, jump)
         if self.touchdown is not None:

@@ -9,7 +9,7 @@ from offboard.flight.authority import Authority
 from offboard.flight.ground_contact import GroundContact
 from offboard.flight.hover_estimate import HoverEstimate
 from offboard.flight.manifest import vehicle_record
-from offboard.flight.phases import BEFORE_FLIGHT, TRACKING, WAITING
+from offboard.flight.phases import BEFORE_FLIGHT, FLYING, TRACKING, WAITING
 from offboard.flight.position_jumps import PositionJumps
 from offboard.flight.preflight import ParameterReading
 from offboard.flight.rows import other_sender
@@ -117,9 +117,9 @@ def _follow_jump(flight: FlightState, event: LocalPosition) -> None:
     jump_ned_m = flight.jumps.on_position(event)
     if jump_ned_m is not None:
         flight.move_ground(jump_ned_m.tolist())
-    if flight.phase not in TRACKING:
+    if flight.phase not in FLYING:
         flight.jumps.forget()
-    elif jump_ned_m is not None:
+    elif jump_ned_m is not None and flight.phase in TRACKING:
         back_s = flight.plan.follow_jump(event.time_s, jump_ned_m)
         outbox.announce(
             flight,

@@ -6,6 +6,7 @@ both firmwares.
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import replace
 from functools import partial
@@ -15,8 +16,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from faults import HEARTBEAT, frame_id, stop, without
-from pair import SHORT, Bytes, Pair, decode, hover, in_phase, make, on_arducopter
+from faults import HEARTBEAT, downlink, frame_id, stop, without
+from pair import SHORT, Bytes, Pair, decode, frames_of, hover, in_phase, make, on_arducopter
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from watch import (
     ARM,
     BOTH,
@@ -407,6 +409,53 @@ def test_the_vehicle_does_not_step_with_its_estimate(fly: Fly) -> None:
     speeds_mps = np.linalg.norm(hovered[10:] - hovered[:-10], axis=1) / 0.2
     assert 0.3 < speeds_mps.max() < 0.65
     assert np.linalg.norm(hovered[-1] - hovered[0]) == pytest.approx(1.5, abs=0.1)
+
+
+@FROM_THE_GROUND
+def test_a_reset_of_the_estimate_in_the_take_off_moves_its_place(fly: Fly) -> None:
+    """By 1.5 m before lift-off: it flew to the old place, 1.5 m away, at once."""
+    reset = {"fault": "estimator_jump", "after": "armed", "offset_ned_m": (1.5, 0.0, 0.4)}
+    pair = fly(*SHORT, reference="hover", scenario=scenario_of({**reset, "at_s": 0.3}))
+    watch = watched(pair)
+    assert pair.fly().exit_code == ExitCode.FLOWN
+    assert watch.top_m < 2.2  # ArduCopter takes off to 1.5 m by the old height
+    assert max(math.hypot(*m.position_ned_m[:2]) for m in watch.moments) < 0.3
+
+
+def disarmed_heartbeats(most: float) -> Any:
+    """From now on so many HEARTBEATs show the vehicle disarmed, wrongly."""
+    codec, wrong = mavlink.MAVLink(None, srcSystem=1, srcComponent=1), []
+
+    def shown(frame: bytes) -> bytes:
+        if frame_id(frame) != HEARTBEAT or len(wrong) >= most:
+            return frame
+        message = decode(frame)
+        message.base_mode &= ~mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+        wrong.append(message)
+        return bytes(message.pack(codec))
+
+    return downlink(lambda _, each: [b"".join(map(shown, frames_of(d))) for d in each])
+
+
+@pytest.mark.parametrize(("phase", "fly"), alternately(Phase.TRACK, Phase.TAKEOFF, Phase.LAND))
+def test_one_heartbeat_that_shows_it_disarmed_ends_no_flight(phase: Phase, fly: Fly) -> None:
+    """The vehicle was left in the air, and ArduCopter in its own take-off."""
+    wrong = (in_phase(phase, 0.3), disarmed_heartbeats(1))
+    pair = fly(aloft=phase is not Phase.TAKEOFF, at=[wrong])
+    assert pair.fly() == Outcome(ExitCode.FLOWN, "flown and landed")
+    assert pair.at == []
+
+
+@pytest.mark.parametrize(("_", "fly"), alternately("px4", "ardupilot"))
+def test_a_vehicle_that_flies_and_says_that_it_is_disarmed_is_landed(_: str, fly: Fly) -> None:
+    pair = fly(at=[(in_phase(Phase.TRACK, 0.3), disarmed_heartbeats(math.inf))])
+    outcome = pair.fly()
+    assert outcome.exit_code == ExitCode.ABORTED
+    assert outcome.sentence.startswith("the vehicle disarmed in flight")
+    for _ in range(3000):
+        pair.instance.step()
+    assert not pair.instance.autopilot.commander.armed
+    assert pair.instance.autopilot.position_controller.landed
 
 
 @HOVERING
