@@ -179,7 +179,7 @@ def test_the_page_of_a_second_identification_has_a_name_of_its_own(
     (tmp_path / "identify.html").write_text("precious")
     assert call("offboard identify", ".") == (0, "")
     assert (tmp_path / "identify.html").read_text() == "precious"
-    assert f"of {tmp_path.name}</title>" in (tmp_path / "identify-2.html").read_text()
+    assert f"<title>Flight {tmp_path.name}</title>" in (tmp_path / "identify-2.html").read_text()
 
 
 FILES: dict[str, Callable[[Path], object]] = {

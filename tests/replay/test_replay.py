@@ -84,7 +84,7 @@ def test_a_flight_of_this_code_is_identical(tmp_path: Path) -> None:
     subprocess.run((sys.executable, *command, *short), cwd=tmp_path, check=True, timeout=120)
     result = run(tmp_path / "flight")
     assert result.exit_code == 0
-    output = result.output.replace("\n", " ")
+    output = result.stdout.replace("\n", " ")
     assert int(output.split()[0]) > 100
     assert "all identical" in output or "rounding of another computer" in output
 
