@@ -11,9 +11,9 @@ import socket
 import struct
 import sys
 import tempfile
-from contextlib import ExitStack, suppress
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
 
 from offboard.documents.errors import UserError
 
@@ -35,85 +35,61 @@ class Locked(LockError):
         super().__init__(f"another service has the {what}: process {holder or 'unknown'}")
 
 
-class Lock:
-    """Context manager; entering raises LockError. The file stays, with the number of the last
-    process: the kernel releases the lock with the process. `what` the lock is for, for the
-    sentence."""
-
-    def __init__(self, path: Path, what: str) -> None:
-        self._path = path
-        self._what = what
-
-    def __enter__(self) -> None:
+@contextmanager
+def file_lock(path: Path, what: str) -> Iterator[None]:
+    """The file stays, with the number of the last process: the kernel releases the lock with the
+    process. `what` the lock is for, for the sentence. Raises LockError."""
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    except OSError as error:
+        raise LockError(f"the lock {path} cannot be opened: {error.strerror}") from None
+    try:
         try:
-            self._descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        except OSError as error:
-            raise LockError(f"the lock {self._path} cannot be opened: {error.strerror}") from None
-        try:
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
-            holder = os.read(self._descriptor, 20).decode(errors="replace").strip()
-            os.close(self._descriptor)
-            raise Locked(self._what, holder) from None
-        os.ftruncate(self._descriptor, 0)
-        os.write(self._descriptor, f"{os.getpid()}\n".encode())
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        os.close(self._descriptor)
+            holder = os.read(descriptor, 20).decode(errors="replace").strip()
+            raise Locked(what, holder) from None
+        os.ftruncate(descriptor, 0)
+        os.write(descriptor, f"{os.getpid()}\n".encode())
+        yield
+    finally:
+        os.close(descriptor)
 
 
-class NameLock:
-    """Context manager; entering raises Locked. As `Lock`, but by an abstract Unix address (Linux),
-    which all users and units see, and which belongs to a network namespace as ports do."""
-
-    def __init__(self, name: str, what: str) -> None:
-        self._address = f"\0{name}"
-        self._what = what
-
-    def __enter__(self) -> None:
-        with ExitStack() as stack:
-            self._socket = stack.enter_context(socket.socket(socket.AF_UNIX))
-            try:
-                self._socket.bind(self._address)
-                self._socket.listen(_REFUSED_MAX)
-            except OSError:
-                raise Locked(self._what, self._holder()) from None
-            stack.pop_all()
-
-    def _holder(self) -> int:
-        """The process that has bound the address; 0 if it is not known."""
-        with suppress(OSError):
-            self._socket.setblocking(False)
-            self._socket.connect(self._address)
-            shown = self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)
-            return int(struct.unpack("3i", shown)[0])
-        return 0
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._socket.close()
+@contextmanager
+def name_lock(name: str, what: str) -> Iterator[None]:
+    """As `file_lock`, but by an abstract Unix address (Linux), which all users and units see, and
+    which belongs to a network namespace as ports do. Raises Locked."""
+    with socket.socket(socket.AF_UNIX) as held:
+        try:
+            held.bind(f"\0{name}")
+            held.listen(_REFUSED_MAX)
+        except OSError:
+            raise Locked(what, _holder(held, f"\0{name}")) from None
+        yield
 
 
-def connection_lock(connection: str) -> Lock | NameLock:
+def _holder(unbound: socket.socket, address: str) -> int:
+    """The process that has bound the address; 0 if it is not known."""
+    with suppress(OSError):
+        unbound.setblocking(False)
+        unbound.connect(address)
+        shown = unbound.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)
+        return int(struct.unpack("3i", shown)[0])
+    return 0
+
+
+def connection_lock(connection: str) -> AbstractContextManager[None]:
     """One service for each connection, whoever has started it."""
     name = f"offboard-{re.sub(r'[^A-Za-z0-9.]+', '-', connection)}"[:_NAME_MAX]
     what = f"connection {connection}"
     if _LINUX:
-        return NameLock(name, what)
-    return Lock(Path(tempfile.gettempdir()) / f"{name}.lock", what)
+        return name_lock(name, what)
+    return file_lock(Path(tempfile.gettempdir()) / f"{name}.lock", what)
 
 
-def directory_lock(place: Path) -> Lock:
+def directory_lock(place: Path) -> AbstractContextManager[None]:
     """One service for each directory of flights: two would overwrite each other's rolling log."""
     with suppress(OSError):  # opening says why
         place.mkdir(parents=True, exist_ok=True)
-    return Lock(place / "service.lock", f"directory {place} (--out)")
+    return file_lock(place / "service.lock", f"directory {place} (--out)")

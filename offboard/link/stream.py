@@ -11,7 +11,6 @@ import select
 from collections.abc import Callable, Hashable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Protocol
 
 from offboard.link import clock
 from offboard.link.interface import Chunk, LinkReport
@@ -32,52 +31,30 @@ class Stream:
     host: str = ""  # of the other end
 
 
-class Source(Protocol):
-    """Where streams come from. Nothing waits but `wait`."""
-
-    report: LinkReport
-
-    def seek(self) -> None:
-        """A new stream is needed."""
-        ...
-
-    def offer(self, silent_s: float) -> Stream | None:
-        """A new stream, if there is one. `silent_s`: how long the present one has been silent;
-        infinite without one."""
-        ...
-
-    def wait(self, timeout_s: float) -> None:
-        """Wait at most `timeout_s` for a new stream."""
-        ...
-
-    def keep_to(self, host: str) -> None:
-        """The vehicle is at `host`: take no stream from elsewhere."""
-        ...
-
-    def descriptors(self) -> tuple[int, ...]:
-        """Its own descriptors, with which another process can continue it."""
-        ...
-
-    def close(self) -> None: ...
-
-
-class Nowhere:
-    """No source: a stream that breaks is lost."""
+class Source:
+    """Where streams come from; this one has none: a stream that breaks is lost. Nothing waits but
+    `wait`."""
 
     def __init__(self) -> None:
         self.report = LinkReport()
 
-    def seek(self) -> None: ...
+    def seek(self) -> None:
+        """A new stream is needed."""
 
     def offer(self, silent_s: float) -> Stream | None:
+        """A new stream, if there is one. `silent_s`: how long the present one has been silent;
+        infinite without one."""
         return None
 
     def wait(self, timeout_s: float) -> None:
-        select.select([], [], [], max(0.0, timeout_s))
+        """Wait at most `timeout_s` for a new stream."""
+        select.select(self.descriptors(), [], [], max(0.0, timeout_s))
 
-    def keep_to(self, host: str) -> None: ...
+    def keep_to(self, host: str) -> None:
+        """The vehicle is at `host`: take no stream from elsewhere."""
 
     def descriptors(self) -> tuple[int, ...]:
+        """Its own descriptors, with which another process can continue it."""
         return ()
 
     def close(self) -> None: ...

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import select
 import socket
 import sys
 import threading
 from collections.abc import Callable
 from contextlib import suppress
 
-from offboard.link.interface import LinkError, LinkReport, LinkUnavailable
-from offboard.link.stream import Stream
+from offboard.link.interface import LinkError, LinkUnavailable
+from offboard.link.stream import Source, Stream
 from offboard.mavlink.senders import PEER_SILENT_S
 
 CONNECT_S = 5.0
@@ -19,12 +18,12 @@ UNSENT_MAX_S = 5.0  # that nobody acknowledges: the other end is gone
 TCP_NOTSENT_LOWAT = 25  # Linux's option, which the socket module names since Python 3.12
 
 
-class Redial:
+class Redial(Source):
     """Calls `open_stream` in a thread until it succeeds. It may wait, and raise OSError or
     LinkError."""
 
     def __init__(self, open_stream: Callable[[], Stream]) -> None:
-        self.report = LinkReport()
+        super().__init__()
         self._open_stream = open_stream
         self._found: list[Stream] = []  # at most one
         self._closing = threading.Event()
@@ -48,12 +47,6 @@ class Redial:
     def wait(self, timeout_s: float) -> None:
         self._closing.wait(max(0.0, timeout_s))
 
-    def keep_to(self, host: str) -> None:
-        """The address is the same at each attempt."""
-
-    def descriptors(self) -> tuple[int, ...]:
-        return ()
-
     def close(self) -> None:
         self._closing.set()
         self._discard()
@@ -63,17 +56,15 @@ class Redial:
             self._found.pop().close()
 
 
-class Listener:
+class Listener(Source):
     """Accepts one client on `sock`. Another one takes its place when it has been silent; once the
     vehicle was found, only from the vehicle's host."""
 
     def __init__(self, sock: socket.socket) -> None:
+        super().__init__()
         sock.setblocking(False)
-        self.report = LinkReport()
         self._socket = sock
         self._host = ""  # of the vehicle, once it was found
-
-    def seek(self) -> None: ...
 
     def offer(self, silent_s: float) -> Stream | None:
         try:
@@ -86,9 +77,6 @@ class Listener:
             self.report.count(f"{host}:{port}", 1, "connection")
             return None
         return tcp_stream(client, host)
-
-    def wait(self, timeout_s: float) -> None:
-        select.select([self._socket], [], [], max(0.0, timeout_s))
 
     def keep_to(self, host: str) -> None:
         self._host = host

@@ -87,7 +87,14 @@ def run(
             options=options,
             stopwatch=clock.monotonic_s,
         )
-        display = Display(flights, show, preparation, monitor, manager)
+
+        def display() -> None:
+            manager.alive(clock.monotonic_s(), flights.phase.value)
+            preparation.allow(not (flights.in_flight or flights.state.vehicle.armed))
+            show(flights)
+            if monitor:
+                monitor.show(flights)
+
         preparation.start()
         discard(link)
         tell(f"waiting for a vehicle on {vehicle.address}")
@@ -96,7 +103,7 @@ def run(
             link,
             recorder,
             stops=stops,
-            progress=lambda _: display.update(),
+            progress=lambda _: display(),
             supervisor=supervisor,
         ).run()
         manager.stopping()
@@ -156,30 +163,3 @@ class Manager:
         if status != self._status:
             self._status = status
             self._writer.put(f"STATUS={status}")
-
-
-class Display:
-    """What is told to user, monitor and service manager in each turn of the loop."""
-
-    def __init__(
-        self,
-        flights: Flights,
-        show: Callable[[Flights], None],
-        preparation: Preparation,
-        monitor: LiveProcess | None,
-        manager: Manager,
-    ) -> None:
-        self._flights = flights
-        self._show = show
-        self._preparation = preparation
-        self._monitor = monitor
-        self._manager = manager
-
-    def update(self) -> None:
-        now_s = clock.monotonic_s()
-        flights = self._flights
-        self._manager.alive(now_s, flights.phase.value)
-        self._preparation.allow(not (flights.in_flight or flights.state.vehicle.armed))
-        self._show(flights)
-        if self._monitor:
-            self._monitor.show(flights)

@@ -24,7 +24,7 @@ from offboard.link import clock
 from offboard.link.background import BackgroundWriter
 from offboard.link.interface import Link
 from offboard.link.log import append, entry
-from offboard.link.stream import Nowhere, Source, Stream, StreamLink
+from offboard.link.stream import Source, Stream, StreamLink
 from offboard.link.stream_sources import Listener
 from offboard.link.udp import UdpLink
 from offboard.mavlink import event_record, texts
@@ -223,7 +223,7 @@ def _link(descriptors: list[int], stream: str) -> Link:
 def _stream_link(descriptors: list[int], name: str) -> StreamLink:
     """A link with at most one stream, and at most one socket that listens for the next one. Without
     a stream nothing can be asked of the vehicle until it connects again."""
-    source: Source = Nowhere()
+    source = Source()
     stream = None
     for descriptor in descriptors:
         if _listens(descriptor):
