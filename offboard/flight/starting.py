@@ -241,8 +241,8 @@ _ABANDONED = (
     "{flight.vehicle.mode} in the air, and nobody flies the vehicle: a flight was cut short"
 )
 _TOO_SOON = (
-    "not engaged: {flight.vehicle.mode} again before a HEARTBEAT has shown another mode; "
-    "switch again"
+    "not engaged: {flight.vehicle.mode} again before a HEARTBEAT has shown another mode, or while "
+    "a flight ended; switch again"
 )
 
 FLY_BEGINS = (

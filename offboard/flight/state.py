@@ -185,7 +185,8 @@ class FlightState:
         self.pilot = PilotSwitch(
             elsewhere=before.pilot.elsewhere,
             unclaimed=before.ends_engaged,
-            hasty=before.pilot.hasty,
+            # selected while the flight ended: not flown, and not left without anybody
+            hasty=before.pilot.hasty or (before.taken and before.pilot.engaged),
             showed_ours=before.pilot.showed_ours,
         )
 

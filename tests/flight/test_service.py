@@ -485,6 +485,24 @@ def test_what_follows_the_reference(then: str, tmp_path: Path) -> None:
     assert wire.unsafe == []
 
 
+def test_engaged_while_it_lands_it_is_held_and_the_pilot_is_told() -> None:
+    """ArduCopter was left in GUIDED, with nobody to send setpoints, without a word. PX4 refuses
+    OFFBOARD without a stream."""
+    pair, wire = engaged("ardupilot", then="land")
+    pair.until(lambda: pair.phase is Phase.LAND, 30.0)
+    pair.run(1.0)
+    pair.switch("engage")
+    pair.run(4.0)
+    assert pair.phase is Phase.STANDBY
+    assert pair.mode == "BRAKE"
+    assert pair.said("switch again")
+    pair.switch("pilot")
+    pair.run(1.5)
+    pair.switch("engage")
+    pair.until(lambda: pair.phase in TRACKING, 3.0)
+    assert wire.unsafe == []
+
+
 def test_a_take_off_point_that_was_not_seen_is_no_origin() -> None:
     """A service that is started in the air with --anchor origin engages after the next landing."""
     pair, wire = engaged("ardupilot", anchor="origin")
