@@ -59,7 +59,7 @@ def test_settles_after_a_step_of_the_reference(personality: str, tmp_path: Path)
     assert rate_radps < 0.02
 
 
-@pytest.mark.parametrize("personality", ["px4", "ardupilot"])
+@pytest.mark.parametrize("personality", [pytest.param("px4", marks=pytest.mark.slow), "ardupilot"])
 def test_limit_cycle_without_the_feedback_limit(personality: str, tmp_path: Path) -> None:
     """Shows that `feedback_limit` prevents the limit cycle."""
     lifted = like_arducopter(personality, "controller.feedback_limit=1.0")

@@ -46,6 +46,7 @@ def test_default_flight(scenario: str, most_m: float, tmp_path: Path) -> None:
     assert not pair.instance.autopilot.commander.armed
 
 
+@pytest.mark.slow  # in calm: test_laws
 def test_paper_law_flies_and_lands(tmp_path: Path) -> None:
     pair = make("reference.laps=1", "reference.height_m=1.0", name="paper", scenario="px4_like")
     assert pair.fly().exit_code == 0

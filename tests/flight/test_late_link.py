@@ -91,7 +91,9 @@ def flown_at(
 
 
 @pytest.mark.parametrize(
-    ("rates", "way_s"), [((0.9, 1.05), 0.06), ((0.95,), 0.0)], ids=["late", "prompt"]
+    ("rates", "way_s"),
+    [((0.9, 1.05), 0.06), pytest.param((0.95,), 0.0, marks=pytest.mark.slow)],
+    ids=["late", "prompt"],
 )
 def test_simulator_slower_than_real_time_is_flown_as_any_other(
     rates: tuple[float, ...], way_s: float, tmp_path: Path

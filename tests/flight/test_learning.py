@@ -117,8 +117,9 @@ def like_arducopter(**options: Any) -> Pair:
 SEEDS = pytest.mark.parametrize("seeds", [(1,), pytest.param((1, 2), marks=pytest.mark.slow)])
 
 
-@SEEDS
-@pytest.mark.parametrize("like", [like_px4, pytest.param(like_arducopter, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("like", [like_px4, like_arducopter])
+@pytest.mark.parametrize("seeds", [(1, 2)])
 def test_second_lap_is_as_good_as_with_the_true_constants(like, seeds, tmp_path: Path):
     """Within 20 %; over ten seeds it is within 2 %. The file alone, without the
     hover thrust that ArduCopter shows before the take-over, is much worse."""
@@ -220,7 +221,7 @@ def test_vehicle_file_that_telemetry_contradicts_ends_the_flight(frequency, sent
     assert not pair.went_through(Phase.TRACK)
 
 
-@pytest.mark.parametrize("hover_thrust", [0.33, 0.75])
+@pytest.mark.parametrize("hover_thrust", [0.33, pytest.param(0.75, marks=pytest.mark.slow)])
 def test_hover_thrust_far_from_the_vehicle_file_is_identified(hover_thrust, tmp_path: Path):
     pair = with_wrong_file(hover_thrust=hover_thrust)
     pair.track()
@@ -359,7 +360,10 @@ def test_delay_that_is_never_the_same_lowers_the_bandwidth(tmp_path: Path):
     assert second_lap_rmse_m(pair, tmp_path) < 0.3
 
 
-@pytest.mark.parametrize(("scenario", "most_m"), [("calm", 0.2), ("px4_like", 0.65)])
+@pytest.mark.parametrize(
+    ("scenario", "most_m"),
+    [pytest.param("calm", 0.2, marks=pytest.mark.slow), ("px4_like", 0.65)],
+)
 def test_attitude_loop_that_slows_is_noticed_and_flown(scenario, most_m, tmp_path: Path):
     """From 11.4 to 5 rad/s with the same delay. Unnoticed, it is 0.68 m off, and 0.98 m."""
     pair = neutral(scenario=scenario, learning=IDENTIFY, aloft=True)

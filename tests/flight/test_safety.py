@@ -69,6 +69,8 @@ def test_a_pilot_is_not_overridden(scenario: str, fly: Fly) -> None:
     assert f"the vehicle left {mode} for" in outcome.sentence
     assert len(pair.commands(SET_MODE)) == 1
     assert pair.commands(LAND) == []
+    assert pair.companion.phase is Phase.YIELDED
+    assert pair.instance.autopilot.commander.armed
     assert sent_after(pair, watch.left_s(mode) + REACTION_S) == []
     assert sent_after(pair, watch.left_s(mode) - 0.5) != []
 

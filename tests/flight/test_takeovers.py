@@ -35,6 +35,7 @@ from offboard.flight.flight import Output
 from offboard.flight.phases import ENDS, ExitCode, Phase
 from offboard.link.interface import Chunk
 
+QUICK_FLIGHTS = 4  # in every run; the others by `-m slow`
 FLIGHTS = int(os.environ.get("OFFBOARD_TAKEOVERS", "16"))
 HEARTBEAT, CURRENT_MODE = 0, 436
 MOVING = {11, 75, 76, 82, 84, 86}  # SET_MODE, COMMAND_INT, COMMAND_LONG and all setpoints
@@ -216,7 +217,14 @@ def linger(pair: Pair) -> None:
             moment[1](pair)
 
 
-@pytest.mark.parametrize("take_over", [drawn(seed) for seed in range(FLIGHTS)], ids=str)
+@pytest.mark.parametrize(
+    "take_over",
+    [
+        pytest.param(drawn(seed), marks=[pytest.mark.slow] if seed >= QUICK_FLIGHTS else [])
+        for seed in range(FLIGHTS)
+    ],
+    ids=str,
+)
 def test_nothing_leaves_after_a_take_over(take_over: TakeOver) -> None:
     pair, watch, acted = flown(take_over)
     assert pair.companion.phase in ENDS

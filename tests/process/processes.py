@@ -19,6 +19,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 SHORT = ("--reference", "hover", "--set", "reference.duration_s=1", "--set", "reference.height_m=1",
          "--set", "identify.excite=false")  # fmt: skip
 SIGNING_EPOCH_S = 1_420_070_400  # 2015-01-01
+HOVERS = """name: hovers
+description: A vehicle that hovers when its links open, and is healthy a second later.
+conditions: {boot_scale: 0.1}
+start: {height_m: %g}
+"""
 Spawn = Callable[..., subprocess.Popen[str]]
 Called = Callable[..., tuple[int, str, str]]
 
@@ -72,6 +77,13 @@ def spawning(directory: Path) -> Iterator[Spawn]:
                     with suppress(ProcessLookupError):
                         os.kill(pid, signal.SIGKILL)
             process.communicate()
+
+
+def hovering(directory: Path, height_m: float) -> tuple[str, ...]:
+    """Options of a simulator whose vehicle hovers at `height_m` when its links open."""
+    path = directory / "hovers.yaml"
+    path.write_text(HOVERS % height_m)
+    return ("--scenario", str(path))
 
 
 def children(pid: int) -> list[int]:

@@ -21,13 +21,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from processes import SHORT, Spawn, children, free_port
+from processes import SHORT, Spawn, children, free_port, hovering
 
 from offboard.analysis import tlog
 
 HOLD, LAND = 176, 21  # MAV_CMD
 ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
 LONG_S = 60.0
+QUICK_LANDING = ("--param", "MPC_LAND_CRWL=0.7", "--param", "COM_DISARM_LAND=0.5")
 HOVER = (*SHORT, "--set", "reference.duration_s=600")
 LAW_THAT_HANGS = """
 import os
@@ -83,14 +84,15 @@ def carry(master: int, other: socket.socket) -> None:
             return
 
 
-def connections(spawn: Spawn, kind: str, cable: Callable[[int], str]) -> str:
-    """Start a simulator; the address at which it can be flown."""
+def connections(spawn: Spawn, kind: str, directory: Path, cable: Any = None) -> str:
+    """Start a simulator, whose vehicle hovers; the address at which it can be flown."""
     port = free_port()
     listens = kind != "udp"
     link = f"tcpin:127.0.0.1:{port}" if listens else f"udpout:127.0.0.1:{port}"
     # with the longest timeout of its own: on a busy machine its failsafe would come first
-    own_failsafe = ("--param", "COM_OF_LOSS_T=5")
-    simulator = spawn("simulator", "--connect", link, "--gcs", "none", *own_failsafe)
+    own_failsafe = ("--param", "COM_OF_LOSS_T=5", *QUICK_LANDING)
+    hovers = hovering(directory, 1.0)
+    simulator = spawn("simulator", "--connect", link, "--gcs", "none", *own_failsafe, *hovers)
     assert simulator.stdout is not None
     assert simulator.stdout.readline()
     if kind == "serial":
@@ -146,10 +148,8 @@ def story(log: tlog.Tlog) -> list[str]:
     return [text for text, before in zip(kept, ["", *kept], strict=False) if text != before]
 
 
-def test_a_killed_controller_is_survived(
-    spawn: Spawn, cable: Callable[[int], str], tmp_path: Path
-) -> None:
-    flight = tracking(spawn, connections(spawn, "udp", cable))
+def test_a_killed_controller_is_survived(spawn: Spawn, tmp_path: Path) -> None:
+    flight = tracking(spawn, connections(spawn, "udp", tmp_path))
     (supervisor,) = children(flight.pid)
     flight.kill()
     await_end(supervisor)
@@ -170,10 +170,8 @@ def test_a_killed_controller_is_survived(
     assert score["reason"] == "supervisor: taking over: the controller ended in flight"
 
 
-def test_a_stopped_controller_that_continues_sends_nothing(
-    spawn: Spawn, cable: Callable[[int], str], tmp_path: Path
-) -> None:
-    flight = tracking(spawn, connections(spawn, "tcp", cable))
+def test_a_stopped_controller_that_continues_sends_nothing(spawn: Spawn, tmp_path: Path) -> None:
+    flight = tracking(spawn, connections(spawn, "tcp", tmp_path))
     flight.send_signal(signal.SIGSTOP)
     path = tmp_path / "x" / "flight.tlog"
     await_text(path, b"hold requested")
@@ -204,7 +202,7 @@ def test_an_endless_loop_in_a_law(
     )
     (site / "law_that_hangs.py").write_text(LAW_THAT_HANGS)
     modules = os.pathsep.join(filter(None, (str(site), os.environ.get("PYTHONPATH"))))
-    connection = connections(spawn, "serial", cable)
+    connection = connections(spawn, "serial", tmp_path, cable)
     flight = tracking(spawn, connection, "--controller", "hangs", PYTHONPATH=modules)
     (supervisor,) = children(flight.pid)
     (tmp_path / "hang").touch()

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from processes import Called, Spawn, children, free_port, signing
+from processes import Called, Spawn, children, free_port, hovering, signing
 from prometheus_client.parser import text_string_to_metric_families
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -25,8 +25,7 @@ from offboard.analysis import tlog
 from offboard.analysis.flight_score import as_text, score_flight
 from offboard.documents.signing_key import create_key, read_key
 
-NAN = float("nan")
-SET_MODE, ARM, TAKEOFF = 176, 400, 22  # MAV_CMD
+SET_MODE = 176  # MAV_CMD
 LONG_S = 60.0
 ENGAGED = ("excite", "join", "track")
 
@@ -137,15 +136,10 @@ def test_a_pilot_engages_and_a_stop_hands_back(spawn: Spawn, tmp_path: Path) -> 
     other = mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 3, 3).pack(signing(9, 1, key))
     pilot.socket.sendto(other, ("127.0.0.1", port))
     spawn("simulator", "--signing-key", "key", "--connect", f"udpout:127.0.0.1:{port}",
-          "--gcs", f"udpout:127.0.0.1:{pilot.port}", "--param", "MIS_TAKEOFF_ALT=3",
+          "--gcs", f"udpout:127.0.0.1:{pilot.port}", *hovering(tmp_path, 3.0),
           "--param", "COM_OF_LOSS_T=4")  # fmt: skip
     await_phase(service, web, "standby")
     strangers = many_strangers(web, service.pid)
-    armed = lambda m: m.get_type() == "HEARTBEAT" and m.base_mode & 128  # noqa: E731
-    pilot.until(armed, lambda: pilot.command(ARM, 1))
-    pilot.command(TAKEOFF, *(NAN,) * 7)
-    pilot.until(lambda m: m.get_type() == "GLOBAL_POSITION_INT" and m.relative_alt > 2700)
-    pilot.command(SET_MODE, 1, 4, 3)
     pilot.until(shows(0x03040000))
     pilot.until(shows(0x00060000), lambda: pilot.command(SET_MODE, 1, 6, 0))
     await_phase(service, web, *ENGAGED)

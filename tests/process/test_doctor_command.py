@@ -26,14 +26,14 @@ def test_good_vehicle_over_udp(spawn: Spawn, tmp_path: Path) -> None:
     link = f"udpin:127.0.0.1:{port}"
     create_key(path)
     other = signing(9, 1, read_key(path))
-    options = ("--gcs", "none", "--signing-key", str(path), *GOOD_PX4)
+    quick = tmp_path / "quick.yaml"
+    quick.write_text("name: quick\ndescription: It boots fast.\nconditions: {boot_scale: 0.1}\n")
+    options = ("--gcs", "none", "--signing-key", str(path), "--scenario", str(quick), *GOOD_PX4)
     with (
         simulator("--connect", f"udpout:127.0.0.1:{port}", *options) as process,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as beside,
     ):
         process.ready_line()
-        time.sleep(5.0)  # it boots
-        began_s = time.monotonic()
         doctor = spawn("offboard", "doctor", "--connect", link, "--json", "--system", "1",
                        "--signing-key", str(path), XDG_STATE_HOME=str(tmp_path))  # fmt: skip
         while doctor.poll() is None:
@@ -41,7 +41,6 @@ def test_good_vehicle_over_udp(spawn: Spawn, tmp_path: Path) -> None:
             beside.sendto(heartbeat.pack(other), ("127.0.0.1", port))
             time.sleep(0.2)
         output, errors = doctor.communicate(timeout=60)
-        took_s = time.monotonic() - began_s
     assert errors == ""
     report = json.loads(output)
     rows = {row["check"]: row for row in report["rows"]}
@@ -52,10 +51,9 @@ def test_good_vehicle_over_udp(spawn: Spawn, tmp_path: Path) -> None:
     assert report["vehicle"] == {"autopilot": "px4", "system_id": 1}
     assert report["verdict"].startswith(("ready to fly", "not ready yet: delay"))
     assert report["listened_s"] < 10.5
-    assert took_s < 40.0
 
 
-def test_taken_port_names_its_holder(spawn: Spawn) -> None:
+def test_taken_port_names_its_holder(called: Called) -> None:
     holding = (
         "import socket, sys; s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM); "
         "s.bind(('127.0.0.1', 0)); print(s.getsockname()[1], flush=True); sys.stdin.read()"
@@ -65,17 +63,16 @@ def test_taken_port_names_its_holder(spawn: Spawn) -> None:
     ) as holder:
         assert holder.stdout
         port = holder.stdout.readline().strip()
-        doctor = spawn("offboard", "doctor", "port", "--connect", f"udpin:127.0.0.1:{port}")
-        output, errors = doctor.communicate(timeout=60)
-        assert (doctor.returncode, errors) == (3, "")
+        check = ("offboard doctor port", "--connect", f"udpin:127.0.0.1:{port}")
+        code, output, errors = called(*check)
+        assert (code, errors) == (3, "")
         assert output.startswith("blocks  port  connection 'udpin:")
         assert f"(pid {holder.pid})" in output
         assert f"fix: stop {Path(sys.executable).resolve().name[:6]}" in output
         assert holder.stdin
         holder.stdin.close()
-    again = spawn("offboard", "doctor", "port", "--connect", f"udpin:127.0.0.1:{port}")
-    output, _ = again.communicate(timeout=60)
-    assert again.returncode == 0
+    code, output, _ = called(*check)
+    assert code == 0
     assert output.startswith("ok      port")
 
 
