@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from offboard.reference.base import FlatSample, Reference
 from offboard.reference.paused import Paused
 from offboard.reference.track import Track
-from offboard.reference.transfer import Limits, Placed, Shifted, stopping_place, transfer
+from offboard.reference.transfer import Limits, Moved, stopping_place, transfer
 
 Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
@@ -74,7 +74,7 @@ class FlightPlan:
         self, time_s: float, position: Array, velocity: Array, heading_rad: float
     ) -> None:
         """Fly from this position and velocity (3,) to rest at the start of the track."""
-        start = self._placed().sample(0.0)
+        start = Moved(self.track, origin_ned_m=self.origin_ned_m).sample(0.0)
         climb = transfer(
             position,
             start.position_ned_m,
@@ -84,13 +84,13 @@ class FlightPlan:
         )
         self._track_began_s, self._paused = math.nan, None
         self._arrival_s = time_s + climb.duration_s
-        self._planned = Shifted(climb, time_s)
+        self._planned = Moved(climb, time_s)
         self._offset = None
 
     def start_track(self, time_s: float) -> None:
         """Fly the track, whose time 0 is `time_s`."""
         self._track_began_s, self._paused = time_s, None
-        self._planned = Shifted(self._placed(), time_s)
+        self._planned = Moved(self.track, time_s, self.origin_ned_m)
 
     def follow_jump(self, time_s: float, jump_ned_m: Array) -> float:
         """The estimated position has jumped by `jump_ned_m` (3,), not the vehicle: move the
@@ -102,7 +102,7 @@ class FlightPlan:
             jump_ned_m = jump_ned_m + before.position_ned_m
             velocity = before.velocity_ned_mps
         back = transfer(jump_ned_m, np.zeros(3), 0.0, 0.0, RETURN, start_velocity_ned_mps=velocity)
-        self._offset = Shifted(back, time_s)
+        self._offset = Moved(back, time_s)
         return back.duration_s
 
     def pause(self, time_s: float) -> None:
@@ -157,6 +157,3 @@ class FlightPlan:
     def sample(self, time_s: float) -> FlatSample | None:
         """The reference at a vehicle time; None on the ground."""
         return None if self.reference is None else self.reference.sample(time_s)
-
-    def _placed(self) -> Reference:
-        return Placed(self.track, self.origin_ned_m)

@@ -223,11 +223,18 @@ class Hold:
 
 
 @dataclass(frozen=True, slots=True)
-class Shifted:
-    """A reference that begins at `start_s` of another time axis, such as vehicle time."""
+class Moved:
+    """A reference on another time axis and at another place.
+
+    Args:
+        reference: on its own axes.
+        start_s: its time 0 on the new axis, such as vehicle time.
+        origin_ned_m: its origin, such as the take-off point, in the new frame.
+    """
 
     reference: Reference
-    start_s: float
+    start_s: float = 0.0
+    origin_ned_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def duration_s(self) -> float:
@@ -236,21 +243,5 @@ class Shifted:
 
     def sample(self, time_s: float | Array) -> FlatSample:
         """Flat outputs at `time_s` of the new axis, a scalar or an array of any shape."""
-        return self.reference.sample(np.asarray(time_s, dtype=np.float64) - self.start_s)
-
-
-@dataclass(frozen=True, slots=True)
-class Placed:
-    """A reference relative to a point, such as the take-off point, moved there; NED, m."""
-
-    reference: Reference
-    origin_ned_m: tuple[float, float, float]
-
-    @property
-    def duration_s(self) -> float:
-        return self.reference.duration_s
-
-    def sample(self, time_s: float | Array) -> FlatSample:
-        """Flat outputs at `time_s`, a scalar or an array of any shape."""
-        sample = self.reference.sample(time_s)
+        sample = self.reference.sample(np.asarray(time_s, dtype=np.float64) - self.start_s)
         return replace(sample, position_ned_m=sample.position_ned_m + np.array(self.origin_ned_m))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from offboard.reference.paused import STOP_S, Paused
-from offboard.reference.transfer import Shifted
+from offboard.reference.transfer import Moved
 from offboard.run import configuration as config
 
 BEGAN_S, PAUSED_S, RESUMED_S = 100.0, 108.3, 115.0
@@ -19,7 +19,7 @@ DERIVATIVES = ("position_ned_m", "velocity_ned_mps", "acceleration_ned_mps2", "j
 @pytest.fixture(scope="module")
 def paused() -> Paused:
     track = config.build_track(config.load("flight"))
-    return Paused(Shifted(track, BEGAN_S), PAUSED_S).resumed(RESUMED_S)
+    return Paused(Moved(track, BEGAN_S), PAUSED_S).resumed(RESUMED_S)
 
 
 def test_each_derivative_is_that_of_the_one_before(paused: Paused) -> None:

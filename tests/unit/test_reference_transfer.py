@@ -10,7 +10,7 @@ import pytest
 
 from offboard.reference.base import FlatSample
 from offboard.reference.shapes import Circle, HeadingMode
-from offboard.reference.transfer import Hold, Limits, Placed, Shifted, Transfer, transfer
+from offboard.reference.transfer import Hold, Limits, Moved, Transfer, transfer
 
 
 def peaks(flown: Transfer) -> tuple[float, float, float]:
@@ -131,9 +131,9 @@ def test_derivatives_are_those_of_the_position() -> None:
         np.testing.assert_allclose(getattr(flown.sample(times), upper), slope, atol=1e-5)
 
 
-def test_shifted_placed_and_held() -> None:
+def test_moved_and_held() -> None:
     track = Circle(course=HeadingMode.ALONG_VELOCITY).track()
-    moved = Placed(Shifted(track, 100.0), (10.0, -5.0, 2.0))
+    moved = Moved(track, 100.0, (10.0, -5.0, 2.0))
     assert moved.duration_s == track.duration_s + 100.0
     times = np.array([[90.0, 101.0], [110.0, 200.0]])
     there, here = moved.sample(times), track.sample(times - 100.0)
