@@ -25,8 +25,11 @@ from offboard.mavlink.telemetry_rates import SHARE, TelemetryRates, fitted
 from offboard.mavlink.texts import TextAssembler
 from offboard.mavlink.vehicle_time import Age, VehicleTime
 
-# A link may reorder: a report of the mode this close behind a newer one says nothing new
-_REORDERED_FRAMES, _REORDERED_S = 32, 0.1
+# A link may delay single frames: a report of the mode that was sent before one which arrived less
+# than this ago says nothing new. HEARTBEAT comes at 1 Hz.
+_REORDERED_S = 1.3
+_HALF_TURN = 128  # of the sequence number; further ahead is behind
+_GAP_S = 0.25  # without any frame, half a turn may have been lost
 
 
 class Telemetry:
@@ -38,13 +41,16 @@ class Telemetry:
         self.texts = TextAssembler()
         self.rates = TelemetryRates((), 0.0)
         self._capacity_bytes_ps = capacity_bytes_ps
-        self._mode_report = (0, -math.inf)  # sequence number of the newest, and when it arrived
+        self._frames = 0  # sent by the vehicle, as the sequence numbers show; modulo 256 the newest
+        self._heard_s = -math.inf  # when the newest frame arrived
+        self._mode_report = (0, -math.inf)  # number of the newest, and when it arrived
 
     def interpret(
         self, frame: Frame, dialect: Dialect, now_s: float
     ) -> tuple[Event, ...] | DropReason | None:
         """The events of a verified frame of the vehicle, None for a message without decoder; or why
         it is dropped. `now_s`: its arrival."""
+        number = self._number(frame, now_s)
         if frame.message_id == STATUSTEXT:
             return tuple(self.texts.add(decode_text_chunk(frame.payload), now_s))
         event = decode(frame, dialect)
@@ -52,7 +58,7 @@ class Telemetry:
             return event
         if isinstance(event, (LocalPosition, Attitude)):
             return self._stamped(event, frame.message_id, dialect, now_s)
-        if isinstance(event, (Heartbeat, ModeReport)) and self._overtaken(frame, now_s):
+        if isinstance(event, (Heartbeat, ModeReport)) and self._overtaken(number, now_s):
             return DropReason.STALE
         self.rates.count(frame.message_id, self.time.seconds)
         return None if event is None else (event,)
@@ -73,13 +79,20 @@ class Telemetry:
         self.time.on_telemetry(event.time_s, now_s)
         return (Rebooted(event.time_s), event) if age is Age.REBOOTED else (event,)
 
-    def _overtaken(self, frame: Frame, now_s: float) -> bool:
+    def _number(self, frame: Frame, now_s: float) -> int:
+        """The number of the frame in the order of sending, by its 8-bit sequence number."""
+        ahead = (frame.sequence - self._frames) % 256
+        if ahead >= _HALF_TURN and now_s - self._heard_s < _GAP_S:
+            return self._frames + ahead - 256
+        self._frames, self._heard_s = self._frames + ahead, now_s
+        return self._frames
+
+    def _overtaken(self, number: int, now_s: float) -> bool:
         """Whether this report of the mode was sent before the newest one."""
         newest, arrived_s = self._mode_report
-        behind = (newest - frame.sequence) % 256
-        if 0 < behind <= _REORDERED_FRAMES and now_s - arrived_s < _REORDERED_S:
+        if number < newest and now_s - arrived_s < _REORDERED_S:
             return True
-        self._mode_report = frame.sequence, now_s
+        self._mode_report = number, now_s
         return False
 
     def timesync_reply(self, tc1_ns: int, ts1_ns: int) -> TimesyncReply:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from pymavlink.dialects.v20 import development
@@ -179,23 +180,73 @@ def test_current_mode_reports_the_mode() -> None:
     assert session.receive(frame, PEER, 0.0).events == (events.ModeReport("OFFBOARD"),)
 
 
-def test_a_report_of_the_mode_that_a_newer_one_has_overtaken_is_dropped() -> None:
-    """By the vehicle's sequence numbers, for 0.1 s; a pilot's switch is a newer one."""
-    vehicle = Sender(1)
-    session = pinned(vehicle)
-    old, between, new, pilots = (
-        vehicle.heartbeat(custom_mode=3 << 16),
-        vehicle.position(1000),
-        vehicle.heartbeat(custom_mode=OFFBOARD),
-        vehicle.heartbeat(custom_mode=2 << 16),
-    )
-    modes = []
-    for frame, now_s in ((new, 5.0), (between, 5.01), (old, 5.02), (pilots, 5.03), (old, 5.2)):
+MODES = ("MANUAL", "ALTCTL", "POSCTL", "ACRO", "OFFBOARD", "STABILIZED")
+MAIN_MODES = (1, 2, 3, 5, 6, 7)  # of PX4, in the same order
+
+
+def accepted_modes(arrivals: list[tuple[float, int, bytes]], session: Session) -> list[int]:
+    """Numbers of the reports of the mode that count, of frames (time of arrival, number, bytes)."""
+    accepted = []
+    for now_s, number, frame in sorted(arrivals):
         for event in session.receive(frame, PEER, now_s).events:
             if isinstance(event, events.Heartbeat):
-                modes.append((now_s, event.mode))
-    assert modes == [(5.0, "OFFBOARD"), (5.03, "ALTCTL"), (5.2, "POSCTL")]
-    assert dropped(session, DropReason.STALE) == 1
+                assert event.mode == MODES[number % 6]
+                accepted.append(number)
+    return accepted
+
+
+def mode_reports(
+    rng: np.random.Generator, rate_hz: float, vehicle: Sender
+) -> list[tuple[float, int, bytes]]:
+    """20 s of frames at `rate_hz`, a HEARTBEAT with the next mode each second: when it is sent, its
+    number (-1: another message), bytes."""
+    frames, reports = [], 0
+    for k in range(int(20 * rate_hz)):
+        sent_s = 1.0 + k / rate_hz
+        if sent_s >= 1.0 + reports + rng.uniform(0.0, 0.2):
+            mode = MAIN_MODES[reports % 6] << 16
+            frames.append((sent_s, reports, vehicle.heartbeat(custom_mode=mode)))
+            reports += 1
+        else:
+            frames.append((sent_s, -1, vehicle.position(round(1e3 * sent_s))))
+    return frames
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_report_of_the_mode_that_a_newer_one_has_overtaken_is_dropped(seed: int) -> None:
+    """However late it is, up to 127 frames and 1.2 s; those in order count. 5 % are lost."""
+    rng = np.random.default_rng(seed)
+    vehicle = Sender(1)
+    session = pinned(vehicle)
+    frames = mode_reports(rng, rng.uniform(40.0, 100.0), vehicle)
+    late = rng.choice([number for _, number, _ in frames if 0 < number < 18], 5, replace=False)
+    arrivals = [
+        (sent_s + (rng.uniform(0.3, 1.2) if number in late else 0.0), number, frame)
+        for sent_s, number, frame in frames
+        if number >= 0 or rng.uniform() > 0.05
+    ]
+    accepted = accepted_modes(arrivals, session)
+    assert accepted == sorted(accepted)
+    assert set(accepted) >= {number for _, number, _ in frames} - {-1, *late}
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_every_report_of_the_mode_counts_after_outages_and_restarts(seed: int) -> None:
+    """A pilot's switch is not taken for an old report, whatever was lost before it."""
+    rng = np.random.default_rng(seed)
+    vehicle = Sender(1)
+    session = pinned(vehicle)
+    arrivals, end_s = [], 0.0
+    for sent_s, number, frame in mode_reports(rng, rng.uniform(10.0, 480.0), vehicle):
+        if rng.uniform() < 0.01:
+            end_s = sent_s + rng.exponential(0.5)
+        if sent_s >= end_s:
+            arrivals.append((sent_s, number, frame))
+    assert accepted_modes(arrivals, session) == [n for _, n, _ in arrivals if n >= 0]
+    rebooted = Sender(1)  # counts from 0 again
+    beat = rebooted.heartbeat(custom_mode=2 << 16)
+    (event, *_) = session.receive(beat, PEER, arrivals[-1][0] + 1.0).events
+    assert isinstance(event, events.Heartbeat)
 
 
 @pytest.mark.parametrize(
