@@ -11,6 +11,7 @@ from offboard.flight.rows import (
     REBOOTED,
     Condition,
     Transition,
+    in_own_failsafe,
     longer_than,
     lost,
     lost_armed,
@@ -86,21 +87,8 @@ def disarmed(flight: FlightState) -> str:
     return f"the vehicle disarmed {_when(flight)}"
 
 
-def disarmed_but_flies(flight: FlightState) -> str:
-    """The land detector contradicts HEARTBEAT, which may be wrong."""
-    return disarmed(flight) if flight.contact.detects_flight else ""
-
-
 def _when(flight: FlightState) -> str:
     return "before lift-off" if flight.phase is Phase.TAKEOFF else "in flight"
-
-
-def in_own_failsafe(flight: FlightState) -> str:
-    """Setpoints were missing, and the autopilot's failsafe flies the vehicle."""
-    if not stands(flight, Standing.FAILSAFE):
-        return ""
-    mode = flight.vehicle.mode
-    return f"setpoints did not arrive, and the vehicle's own failsafe flies it, in {mode}"
 
 
 def handed(flight: FlightState) -> str:
@@ -125,10 +113,9 @@ def rebooted_disarmed(flight: FlightState) -> bool:
 
 
 def disarmed_elsewhere(flight: FlightState) -> str:
-    """Disarmed, but not landed; the land detector has had time to report, and a vehicle that still
-    flies by it to be asked to land."""
-    asked = not flight.contact.detects_flight or flight.in_phase_s > DETECTOR_S
-    known = asked and flight.vehicle.disarmed_s > DETECTOR_S
+    """Disarmed, but not landed; the land detector has had time to report, and the vehicle was asked
+    to land, as HEARTBEAT may be wrong."""
+    known = flight.vehicle.disarmed_s > DISARMED_S + DETECTOR_S
     missing = flight.not_landed() if known else ""
     return f"disarmed, landing not confirmed: {missing}" if missing else ""
 
@@ -188,8 +175,8 @@ def ends_early(phases: tuple[Phase, ...], serves: bool) -> tuple[Transition, ...
     held = tuple(phase for phase in phases if phase not in (Phase.HAND_BACK, Phase.HOLD))
     rows = (
         Transition(phases, rebooted_in_flight, Phase.LAND, ABORTED, "restart"),
-        Transition(phases, disarmed_but_flies, Phase.LAND, ABORTED, "disarmed in flight"),
-        Transition(phases, disarmed, Phase.FAILED, ABORTED, "disarmed in flight"),
+        # HEARTBEAT may be wrong: what still flies is to land
+        Transition(phases, disarmed, Phase.LAND, ABORTED, "disarmed in flight"),
         Transition(followed, lost, Phase.YIELDED, FLOWN, "pilot"),
         Transition(others, lost, Phase.YIELDED, ABORTED, "pilot"),
         Transition(phases, in_own_failsafe, Phase.LAND, ABORTED, "link"),

@@ -116,6 +116,14 @@ def stands(flight: FlightState, standing: Standing) -> bool:
     return flight.authority is not None and flight.authority.standing is standing
 
 
+def in_own_failsafe(flight: FlightState) -> str:
+    """Setpoints were missing, and the autopilot's failsafe flies the vehicle."""
+    if not stands(flight, Standing.FAILSAFE):
+        return ""
+    mode = flight.vehicle.mode
+    return f"setpoints did not arrive, and the vehicle's own failsafe flies it, in {mode}"
+
+
 def stop_requested(flight: FlightState) -> str:
     return flight.stop_reason
 

@@ -9,6 +9,7 @@ from offboard.flight.rows import (
     Transition,
     blind,
     engaged_in_the_air,
+    in_own_failsafe,
     lost,
     lost_armed,
     lost_disarmed,
@@ -307,7 +308,7 @@ def starting(before: tuple[Phase, ...]) -> tuple[Transition, ...]:
         Transition((Phase.STREAM,), streamed, Phase.ENGAGE),
         Transition(ENGAGE, engaged, Phase.ARM),
         Transition(ENGAGE, not_engaged, FAILED, REFUSED),
-        Transition(ARM, rebooted, FAILED, REFUSED, "restart"),
+        Transition(ARM, rebooted, Phase.STAND_DOWN, REFUSED, "restart"),
         Transition(
             ARM,
             lost_armed,
@@ -317,6 +318,7 @@ def starting(before: tuple[Phase, ...]) -> tuple[Transition, ...]:
             "{flight.authority.lost_reason} as it armed",
         ),
         Transition(ARM, lost_disarmed, FAILED, REFUSED, "pilot"),
+        Transition(ARM, in_own_failsafe, Phase.STAND_DOWN, REFUSED, "link"),
         Transition(ARM, silent, Phase.STAND_DOWN, REFUSED, "link"),
         Transition(ARM, blind, Phase.STAND_DOWN, REFUSED, "link"),
         Transition(ARM, stop_requested, Phase.STAND_DOWN, REFUSED, OPERATOR),
@@ -324,7 +326,7 @@ def starting(before: tuple[Phase, ...]) -> tuple[Transition, ...]:
         Transition(
             ARM,
             disarmed_again,
-            FAILED,
+            Phase.STAND_DOWN,
             REFUSED,
             reason="the vehicle was disarmed just after it had armed",
         ),
@@ -340,7 +342,6 @@ def starting(before: tuple[Phase, ...]) -> tuple[Transition, ...]:
         Transition(
             STAND_DOWN, rises, Phase.LAND, ABORTED, reason="flight is detected as it was to disarm"
         ),
-        Transition(STAND_DOWN, rebooted, FAILED, REFUSED, "restart"),
         Transition(STAND_DOWN, silent_for_long, FAILED, REFUSED, "link"),
         Transition(STAND_DOWN, disarmed_for_good, FAILED, reason="disarmed on the ground"),
         Transition(STAND_DOWN, still_armed, FAILED, ABORTED),

@@ -13,7 +13,6 @@ from functools import cache
 import numpy as np
 
 from offboard.flight import decision, failsafe, flying, outbox, starting
-from offboard.flight.flying import in_own_failsafe
 from offboard.flight.hover_estimate import DIFFERENT, SETTLED, differs
 from offboard.flight.phases import (
     BEFORE_FLIGHT,
@@ -25,7 +24,7 @@ from offboard.flight.phases import (
     ServiceOptions,
 )
 from offboard.flight.pilot_switch import PilotSwitch
-from offboard.flight.rows import REBOOTED, Transition
+from offboard.flight.rows import REBOOTED, Transition, in_own_failsafe
 from offboard.flight.state import FlightState, Outcome
 from offboard.flight.touchdown import Touchdown
 from offboard.mavlink.events import LocalPosition

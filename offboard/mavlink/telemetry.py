@@ -75,6 +75,7 @@ class Telemetry:
         # after the check of the stamp: duplicates must not raise the measured rate
         self.rates.count(message_id, self.time.seconds)
         if age is Age.REBOOTED:
+            self._mode_report = (0, -math.inf)  # it counts anew
             self.request_from(dialect)  # a rebooted vehicle has its default rates
         self.time.on_telemetry(event.time_s, now_s)
         return (Rebooted(event.time_s), event) if age is Age.REBOOTED else (event,)

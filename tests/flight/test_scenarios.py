@@ -474,7 +474,7 @@ ROWS = (
         in_track(kill_motors),
         4,
         "the vehicle disarmed in flight",
-        Phase.FAILED,
+        Phase.DISARMED,
         lambda pair: iter([not pair.instance.autopilot.commander.armed]),
     ),
     # the link
@@ -507,8 +507,8 @@ ROWS = (
         "restart in flight",
         in_track(restart),
         4,
-        "the vehicle restarted in flight; the vehicle restarted and is disarmed",
-        Phase.FAILED,
+        "the vehicle restarted in flight",
+        Phase.DISARMED,
         lambda pair: iter([not pair.instance.autopilot.commander.armed]),
     ),
     Row(
