@@ -14,6 +14,7 @@ from pair import Filter, Pair, make, through
 
 from offboard.analysis.score import Score
 from offboard.flight.online_identification import IdentifySettings
+from offboard.flight.phases import Limits
 
 LAP = ("controller={law: lqr}", "reference.laps=1", "reference.height_m=1.0")
 PLAIN_DELAY_MS = 57.0  # of the vehicle itself
@@ -57,9 +58,12 @@ def test_delay_and_duplicates_are_measured(
     assert score.position_gap_max_s == pytest.approx(1.0 / SENT_HZ, abs=0.007)
 
 
-def test_the_delay_of_the_link_is_measured_before_lift_off(tmp_path: Path) -> None:
+def test_the_delay_of_the_link_is_measured_before_lift_off(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """With 0.3 s, the flight succeeds only if the vehicle replies to TIMESYNC."""
     assert flown_over(late(0.3), tmp_path, aloft=False).rmse_position_m < 0.15
+    monkeypatch.setattr(Limits, "late_s", 20.0)  # instead of 90 s
     silent, slow = without(TIMESYNC), late(0.3)
     unanswered = over(lambda time_s, datagrams: slow(time_s, silent(time_s, datagrams)))
     assert unanswered.fly().exit_code == 4
