@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from offboard.analysis.events import Event
 from offboard.analysis.history import History
-from offboard.flight.position_jumps import PositionJumps
+from offboard.flight.positioning import PositionJumps
 from offboard.flight.touchdown import Touchdown, moved
 from offboard.mavlink.event_record import SUPERVISOR
 from offboard.mavlink.events import LocalPosition

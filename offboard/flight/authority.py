@@ -6,6 +6,8 @@ changed. A report has an age: without a recent one nothing is sent.
 
 One mode is nobody's choice: that of the autopilot's own failsafe for setpoints that did not arrive.
 The vehicle may be asked to land from it, unless sticks are received.
+
+While it is not ours, `PilotSwitch` says whether the pilot of the service has engaged us.
 """
 
 from __future__ import annotations
@@ -203,3 +205,45 @@ class Authority:
     def is_ours(self) -> bool:
         """Nobody else has chosen its mode since it followed us, however old the report is."""
         return self.standing in (Standing.OURS, Standing.FAILSAFE, Standing.HANDED)
+
+
+@dataclass(slots=True)
+class PilotSwitch:
+    """Whether the pilot has switched the vehicle, in the air, to the mode of setpoints, from one
+    that was shown without a failsafe: after a failsafe PX4 returns to OFFBOARD by itself as soon as
+    setpoints arrive. For the service, which does not ask for that mode.
+
+    `elsewhere`: a HEARTBEAT has shown another mode than that of setpoints, without a failsafe.
+    `engaged`: from there it was switched to the mode of setpoints, in the air. `unclaimed`: since
+    the service began, or the vehicle rebooted, it has shown the mode of setpoints only, in the air.
+    `hasty`: it left that mode and returned, in the air, before a HEARTBEAT could show the other one
+    without a failsafe. `showed_ours`: whether the previous report showed the mode of setpoints;
+    None after a failsafe, which may have changed it.
+    """
+
+    elsewhere: bool = False
+    engaged: bool = False
+    unclaimed: bool = False
+    hasty: bool = False
+    showed_ours: bool | None = None
+
+    def on_heartbeat(self, *, ours: bool, failsafe: bool) -> None:
+        """A HEARTBEAT shows the mode of setpoints (`ours`) or another one."""
+        if failsafe:
+            self.elsewhere = self.engaged = self.hasty = False
+            self.showed_ours = None
+        elif not ours:
+            self.elsewhere = True
+
+    def on_mode(self, *, ours: bool, in_the_air: bool, flies: bool) -> None:
+        """Any report of the mode, before `on_heartbeat` of the same message. Only a vehicle that
+        `flies` by every sign (`GroundContact.flies`) is engaged."""
+        if not (ours and in_the_air):
+            self.unclaimed = False
+        if not ours:
+            self.engaged = self.hasty = False
+        elif self.elsewhere:
+            self.elsewhere, self.engaged = False, flies
+        elif self.showed_ours is False:
+            self.hasty = in_the_air
+        self.showed_ours = ours

@@ -16,9 +16,9 @@ from offboard.estimation.observer import Observer
 from offboard.flight import actions, decision, outbox, telemetry, transitions
 from offboard.flight.authority import Standing
 from offboard.flight.busyness import PAUSE_S
+from offboard.flight.display import News, Snapshot
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.inputs import InputRecorder
-from offboard.flight.news import News
 from offboard.flight.online_identification import IdentifySettings, OnlineIdentification
 from offboard.flight.phases import (
     BEFORE_FLIGHT,
@@ -33,7 +33,6 @@ from offboard.flight.phases import (
     ServiceOptions,
 )
 from offboard.flight.record import Tick
-from offboard.flight.snapshot import Snapshot
 from offboard.flight.state import FlightState, Outcome
 from offboard.identification.learner import IdentifiedVehicle
 from offboard.link.interface import Chunk

@@ -17,16 +17,14 @@ import numpy as np
 
 from offboard.control.base import Controller
 from offboard.estimation.observer import Observer
-from offboard.flight.authority import Authority, Standing
+from offboard.flight.authority import Authority, PilotSwitch, Standing
 from offboard.flight.busyness import Busyness
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.ground_contact import DETECTOR_KNOWN_S, GroundContact
 from offboard.flight.hover_estimate import HoverEstimate
 from offboard.flight.online_identification import OnlineIdentification
 from offboard.flight.phases import ENDS, STOPPED, Action, Limits, Phase, Request, ServiceOptions
-from offboard.flight.pilot_switch import PilotSwitch
-from offboard.flight.position_jumps import PositionJumps
-from offboard.flight.positioning import Positioning
+from offboard.flight.positioning import Positioning, PositionJumps
 from offboard.flight.preflight import ParameterReading
 from offboard.flight.record import Decided, Tick
 from offboard.flight.touchdown import Touchdown, moved

@@ -10,7 +10,7 @@ from offboard.flight.ground_contact import GroundContact
 from offboard.flight.hover_estimate import HoverEstimate
 from offboard.flight.manifest import vehicle_record
 from offboard.flight.phases import BEFORE_FLIGHT, FLYING, TRACKING, WAITING
-from offboard.flight.position_jumps import PositionJumps
+from offboard.flight.positioning import PositionJumps
 from offboard.flight.preflight import ParameterReading
 from offboard.flight.rows import other_sender
 from offboard.flight.state import FlightState

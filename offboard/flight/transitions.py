@@ -13,6 +13,7 @@ from functools import cache
 import numpy as np
 
 from offboard.flight import decision, failsafe, flying, outbox, starting
+from offboard.flight.authority import PilotSwitch
 from offboard.flight.hover_estimate import DIFFERENT, SETTLED, differs
 from offboard.flight.phases import (
     BEFORE_FLIGHT,
@@ -23,7 +24,6 @@ from offboard.flight.phases import (
     Request,
     ServiceOptions,
 )
-from offboard.flight.pilot_switch import PilotSwitch
 from offboard.flight.rows import REBOOTED, Transition, in_own_failsafe
 from offboard.flight.state import FlightState, Outcome
 from offboard.flight.touchdown import Touchdown

@@ -15,8 +15,8 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
+from offboard.flight.display import Snapshot
 from offboard.flight.phases import Phase
-from offboard.flight.snapshot import Snapshot
 from offboard.flight.state import FlightState
 from offboard.link import clock
 from offboard.link.background import BackgroundWriter

@@ -15,7 +15,7 @@ from typing import Protocol
 
 from offboard.documents.arguments import split_address
 from offboard.documents.errors import UserError
-from offboard.flight.snapshot import Snapshot
+from offboard.flight.display import Snapshot
 from offboard.link import clock
 from offboard.link.background import BackgroundWriter
 from offboard.live.lines import Announcing, News

@@ -6,7 +6,7 @@ import json
 from typing import Any
 
 from offboard.documents.plain import plain
-from offboard.flight.snapshot import Snapshot
+from offboard.flight.display import Snapshot
 
 DIGITS = 9  # of a float
 

@@ -11,9 +11,9 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Sequence
 from typing import Protocol
 
+from offboard.flight.display import Snapshot
 from offboard.flight.flight import STOPPED, Flight, Outcome, Output
 from offboard.flight.phases import ENDS, FLYING, WAITING, Phase, ServiceOptions
-from offboard.flight.snapshot import Snapshot
 from offboard.flight.starting import found_engaged
 from offboard.flight.state import FlightState
 from offboard.identification.learner import IdentifiedVehicle

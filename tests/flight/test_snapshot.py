@@ -7,8 +7,8 @@ import math
 import pytest
 from pair import hover
 
+from offboard.flight.display import Snapshot
 from offboard.flight.phases import ExitCode
-from offboard.flight.snapshot import Snapshot
 
 
 def test_snapshots_agree_with_the_wire() -> None:

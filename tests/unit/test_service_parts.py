@@ -19,8 +19,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from offboard.analysis import tlog
 from offboard.cli.daemon import may_pass
 from offboard.flight import manifest
+from offboard.flight.authority import PilotSwitch
 from offboard.flight.flight_plan import CLEAR_M, FlightPlan
-from offboard.flight.pilot_switch import PilotSwitch
 from offboard.identification.learner import IdentifiedVehicle
 from offboard.identification.uncertainty import Estimate
 from offboard.link import clock
