@@ -7,13 +7,13 @@ the landing, decisions over the whole flight. A figure that the log does not hol
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from offboard.analysis.history import History
 from offboard.analysis.link_metrics import decision_figures, link_figures
 from offboard.analysis.tracking import passed_s, tracking_figures, window_of
-from offboard.analysis.verdict import judge
+from offboard.analysis.verdict import verdict_figures
 
 NAN = math.nan
 
@@ -126,10 +126,10 @@ def score(flown: History) -> Score:
     """Compute all values of a flight from its columns."""
     window = window_of(flown)
     skipped_s = passed_s(flown, window)[1] if window else 0.0
-    verdict = judge(flown, skipped_s)
-    if verdict.completed == 1.0 and window is None:
-        verdict = replace(verdict, completed=0.0, ended_by="too short at full speed to be scored")
-    values: dict[str, Any] = link_figures(flown, window) | decision_figures(flown)
+    values: dict[str, Any] = verdict_figures(flown, skipped_s)
+    values |= link_figures(flown, window) | decision_figures(flown)
     if window:
         values |= tracking_figures(flown, window)
-    return replace(Score(**values), **asdict(verdict))
+    elif values["completed"] == 1.0:
+        values |= {"completed": 0.0, "ended_by": "too short at full speed to be scored"}
+    return Score(**values)

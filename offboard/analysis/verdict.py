@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,18 +28,6 @@ _BLOCK = 10_000  # positions
 _ON_GROUND = 1  # MAV_LANDED_STATE
 _CRITICAL = 5  # MAV_STATE
 _LANDING_ENDS = {"disarmed", "failed", "yielded"}
-
-
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """`completed`: 1 or 0, NaN for a log without a flight of `offboard`. `ended_by`: a word or a
-    few. `touchdown_mps`: downward speed before the ground was reached, NaN if it was not. `reason`:
-    what the flight announced when it left its regular phases, else empty."""
-
-    completed: float
-    ended_by: str
-    touchdown_mps: float = math.nan
-    reason: str = ""
 
 
 def landing(flown: History) -> tuple[str, float]:
@@ -86,11 +74,17 @@ def begin_times(phases: tuple[Event, ...]) -> dict[str, float]:
     return {event.phase: event.time_s for event in phases}
 
 
-def judge(flown: History, skipped_s: float) -> Verdict:
-    """The verdict on a flight. `skipped_s`: time of the reference for which nothing was decided."""
+def verdict_figures(flown: History, skipped_s: float) -> dict[str, Any]:
+    """Values of a Score. `skipped_s`: time of the reference for which nothing was decided.
+
+    completed: 1 or 0, NaN for a log without a flight of `offboard`
+    ended_by: a word or a few
+    touchdown_mps: downward speed before the ground was reached, NaN if it was not
+    reason: what the flight announced when it left its regular phases, else empty
+    """
     names = [event.phase for event in flown.phases]
     if not flown.phases:
-        return Verdict(math.nan, NO_FLIGHT)
+        return {"completed": math.nan, "ended_by": NO_FLIGHT}
     why, reason = _ended_early(flown)
     not_landed, touchdown_mps = landing(flown)
     if why == REFERENCE_OVER:
@@ -102,7 +96,12 @@ def judge(flown: History, skipped_s: float) -> Verdict:
             why = not_landed
         elif not len(flown.heartbeat) or flown.heartbeat["armed"][-1]:
             why = "not disarmed"
-    return Verdict(float(why == REFERENCE_OVER), why, touchdown_mps, reason)
+    return {
+        "completed": float(why == REFERENCE_OVER),
+        "ended_by": why,
+        "touchdown_mps": touchdown_mps,
+        "reason": reason,
+    }
 
 
 def _ended_early(flown: History) -> tuple[str, str]:
