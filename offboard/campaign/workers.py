@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from offboard.analysis.workers import open_worker, processors, run_all
 from offboard.campaign.flight import Job, fly_job, recorded
 from offboard.campaign.margin import NOT_FLOWN
+from offboard.campaign.processes import open_worker, processors, run_all
 from offboard.campaign.results import Record
 from offboard.documents.arguments import join_address, split_address
 from offboard.documents.errors import UserError, shown

@@ -11,7 +11,7 @@ import time
 
 import pytest
 
-from offboard.analysis.workers import interrupts_deferred, processors
+from offboard.campaign.processes import interrupts_deferred, processors
 
 MASK = "import signal; print(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ()))"
 
