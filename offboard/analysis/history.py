@@ -161,17 +161,18 @@ def gather(log: Tlog) -> History:
 def configuration(log: Tlog) -> str | None:
     """The configuration of the flight as YAML (see `run.configuration.flown`), None without.
     Raises TlogError."""
-    pieces = (
-        entry.tunnelled
-        for entry in log
-        if entry.name == "TUNNEL"
-        and entry.component_id in OUR_COMPONENTS
-        and entry.message.payload_type == manifest.PAYLOAD_TYPE
-    )
+    pieces = (entry.tunnelled for entry in log if record_type(entry) == manifest.PAYLOAD_TYPE)
     try:
         return manifest.join(pieces)
     except ValueError as error:
         raise TlogError(f"{log.path}: {error}") from None
+
+
+def record_type(entry: LoggedMessage) -> int | None:
+    """TUNNEL.payload_type of one of our records, None for any other message."""
+    if entry.frame.message_id != _TUNNEL or entry.component_id not in OUR_COMPONENTS:
+        return None
+    return int.from_bytes(entry.frame.payload[:2], "little")
 
 
 class _Ticks(Samples):
@@ -263,8 +264,8 @@ class _Collector:
             samples = self._samples["identified"] if identified else self._ticks
             wire = _IDENTIFIED if identified else _TICK
             samples.add(wire, payload, self.now_ms, entry.unix_us / 1e6)
-        elif name == "TUNNEL" and payload[:2] == event_record.PAYLOAD_TYPE.to_bytes(2, "little"):
-            self._event_records.append((self.now_ms, payload[5 : 5 + payload[4]]))
+        elif record_type(entry) == event_record.PAYLOAD_TYPE:
+            self._event_records.append((self.now_ms, entry.tunnelled))
 
     def _add_theirs(self, name: str, entry: LoggedMessage) -> None:
         if name in _SCALES and self._truth.origin:
@@ -329,9 +330,8 @@ def _vehicle(log: Tlog) -> tuple[Address | None, Dialect | None]:
             if is_vehicle(identity):
                 heard = Address(entry.system_id, entry.component_id)
                 first = heard, known.get(identity.autopilot)
-        elif kind == _TUNNEL and entry.component_id in OUR_COMPONENTS:
-            is_ours = entry.message.payload_type == manifest.VEHICLE_TYPE
-            flown = manifest.vehicle_of(entry.tunnelled) if is_ours else None
+        elif record_type(entry) == manifest.VEHICLE_TYPE:
+            flown = manifest.vehicle_of(entry.tunnelled)
             if flown and flown.system_id == entry.system_id:
                 found = Address(flown.system_id, flown.component_id)
                 return found, DIALECTS.get(flown.autopilot)

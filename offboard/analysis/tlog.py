@@ -28,6 +28,7 @@ _YEAR_2000_US, _YEAR_2100_US = 946_684_800_000_000, 4_102_444_800_000_000
 _MAGIC = (0xFD, 0xFE)
 _LONGEST = 8 + 280  # bytes of an entry: a signed MAVLink 2 frame
 _BLOCK = 1 << 20
+_TUNNEL_BYTES = 133  # payload_type, target system and component, payload_length, 128 of data
 _codec = dialect.MAVLink(None)
 
 
@@ -62,8 +63,8 @@ class LoggedMessage(NamedTuple):
     @property
     def tunnelled(self) -> bytes:
         """The data of a TUNNEL message, without the zeros that fill it up."""
-        message = self.message
-        return bytes(message.payload[: message.payload_length])
+        payload = self.frame.payload.ljust(_TUNNEL_BYTES, b"\0")
+        return payload[5 : 5 + payload[4]]
 
 
 class Tlog:

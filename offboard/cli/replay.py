@@ -25,19 +25,21 @@ def replay(flight: Annotated[Path, FLIGHT]) -> None:
 
     with loading():
         from offboard.replay.recording import read
+        from offboard.replay.replaying import Replay
         from offboard.replay.verdict import explained, verdict
     recording = read(flight)
     if recording.log.damage:
         complain(recording.log.damage)
+    replayed = Replay(recording)
     with err.status("replaying") as status:
-        result = verdict(recording, status.update)
-    if result.incomplete:
-        complain(result.incomplete)
-    sentence = result.comparison.sentence()
-    if not result.comparison.significant:
-        say(f"{sentence} ({result.turns} turns, up to {result.ended_s:.1f} s of vehicle time)")
+        comparison = verdict(replayed, status.update)
+    if replayed.incomplete:
+        complain(replayed.incomplete)
+    sentence = comparison.sentence()
+    if not comparison.significant:
+        say(f"{sentence} ({replayed.count} turns, up to {replayed.ended_s:.1f} s of vehicle time)")
         return
     say("the first difference:")
-    for line in explained(recording, result.comparison.significant[0]):
+    for line in explained(recording, comparison.significant[0]):
         say(f"  {line}", indent=6)
     raise CommandError(sentence, 1)

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from offboard.analysis import history, tlog
-from offboard.analysis.tlog import LoggedMessage, Tlog
+from offboard.analysis.history import record_type
+from offboard.analysis.tlog import Tlog
 from offboard.documents.errors import UserError
 from offboard.flight import inputs
 from offboard.flight.inputs import SETTINGS, Call, Entry
-from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
-
-_TUNNEL = 385
+from offboard.flight.record import COMPONENT_ID
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,10 +23,6 @@ class Recording:
     configuration: str
     settings: dict[str, object]
     inputs: tuple[bytes, ...]  # the pieces of `flight.inputs`
-
-    @property
-    def lockstep(self) -> bool:
-        return bool(self.settings["lockstep"])
 
     @property
     def signed(self) -> bool:
@@ -56,14 +51,6 @@ def read(flight: Path) -> Recording:
             "a flight of `offboard daemon` goes on with what was received before its log begins"
         )
     return Recording(log, configuration, _settings(path, recorded), recorded)
-
-
-def record_type(message: LoggedMessage) -> int | None:
-    """TUNNEL.payload_type of one of our records, None for any other message."""
-    frame = message.frame
-    if frame.message_id != _TUNNEL or frame.component_id != RECORD_COMPONENT_ID:
-        return None
-    return int.from_bytes(frame.payload[:2], "little")
 
 
 def _settings(path: Path, recorded: tuple[bytes, ...]) -> dict[str, object]:

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+from offboard.analysis.history import record_type
 from offboard.analysis.tlog import LoggedMessage
 from offboard.documents.errors import UserError
 from offboard.documents.signing_key import KEY_BYTES
@@ -25,7 +26,7 @@ from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.link.interface import Chunk
 from offboard.mavlink.framing import Frame
 from offboard.mavlink.signing import Signing
-from offboard.replay.recording import Recording, record_type
+from offboard.replay.recording import Recording
 from offboard.run.configuration import flown
 from offboard.run.flight import Prepared, build, session_of
 
@@ -46,12 +47,11 @@ class Sent:
 
 @dataclass(frozen=True, slots=True)
 class Turn:
-    """One turn: its number, what it was given and what came out; None if it raised an error."""
+    """One turn: its number, and what it was given."""
 
     number: int
     given: TurnInput
     received: tuple[LoggedMessage, ...]
-    output: Output | None
 
 
 class Accepted(Signing):
@@ -64,9 +64,10 @@ class Accepted(Signing):
 class Replay:
     """Replays one flight.
 
-    `turns` gives all turns in order; `recorded` and `replayed` then hold what the log says was sent
-    and what the companion has sent. `stopped` says why the replay ended before the recording;
-    empty if it did not.
+    `turns` gives all turns in order; `count` is the number of those given so far, `ended_s` the
+    vehicle time of the newest telemetry that was replayed. `recorded` and `replayed` then hold what
+    the log says was sent and what the companion has sent. `stopped` says why the replay ended
+    before the recording; empty if it did not.
     """
 
     def __init__(self, recording: Recording) -> None:
@@ -75,13 +76,12 @@ class Replay:
         self.recorded: list[Sent] = []
         self.replayed: list[Sent] = []
         self.stopped = ""
-        self.ended_s = 0.0  # vehicle time of the newest telemetry that was replayed
-        self.lockstep = recording.lockstep
-        self._recording = recording
+        self.ended_s = 0.0
+        self.count = 0
+        self.recording = recording
         self._messages = iter(recording.log)
         self._next: LoggedMessage | None = None
         self._pieces = 0  # of the inputs, found among the messages
-        self._number = 0
         self._leaving: list[Sent] = []  # by the newest turn
         self._crc, self._checked_s = 0, 0.0
         self._readings: Iterator[float] = iter(())
@@ -108,7 +108,7 @@ class Replay:
     def turns(self) -> Iterator[Turn]:
         """Replay turn by turn."""
         try:
-            for entry in self._recording.entries():
+            for entry in self.recording.entries():
                 match entry:
                     case TurnInput():
                         self._leave()
@@ -150,13 +150,13 @@ class Replay:
             chunks.append(Chunk(b"".join(frames), chunk.peer, chunk.arrived_s))
             received += messages
         self._readings, self._read_s = iter(given.readings_s), given.now_s
-        self._number += 1
+        self.count += 1
         output = self._output(chunks, given.now_s)
         self.ended_s = self.companion.state.time_s
         if output:
             self._leaving = [self._sent(frame) for frame in output.send]
             self.companion.finish_turn(math.nan)  # it was not sent
-        return Turn(self._number, given, tuple(received), output)
+        return Turn(self.count, given, tuple(received))
 
     def _output(self, chunks: list[Chunk], now_s: float) -> Output | None:
         try:
@@ -171,9 +171,7 @@ class Replay:
 
     def _sent(self, frame: bytes) -> Sent:
         message_id = int.from_bytes(frame[7:10], "little")
-        return Sent(
-            self.companion.state.time_s, message_id, frame[10 : 10 + frame[1]], self._number
-        )
+        return Sent(self.companion.state.time_s, message_id, frame[10 : 10 + frame[1]], self.count)
 
     def _leave(self) -> None:
         self.replayed += self._leaving
@@ -218,7 +216,7 @@ class Replay:
 
     def _drain(self) -> None:
         """Note what was sent by the turns that the last piece of the inputs ends."""
-        while self._pieces < len(self._recording.inputs):
+        while self._pieces < len(self.recording.inputs):
             message = next(self._messages, None)
             if message is None or not self._note(message):
                 return

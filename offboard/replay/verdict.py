@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from offboard.documents.errors import UserError
 from offboard.replay.difference import Comparison, Difference, compare
@@ -14,30 +13,17 @@ FIELDS_MAX = 8
 TOLD_EVERY = 500  # turns
 
 
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """`turns` were replayed, up to the vehicle time `ended_s`; `incomplete` is that of `Replay`."""
-
-    comparison: Comparison
-    turns: int
-    ended_s: float
-    incomplete: str
-
-
-def verdict(recording: Recording, tell: Callable[[str], object] = str) -> Verdict:
-    """Replay a flight and compare it with its log. `tell` is called with sentences about the
-    progress. Raises UserError if nothing can be compared,
-    and DocumentError where its configuration cannot be flown by this version."""
-    replay = Replay(recording)
-    turns = 0
-    for turns, _ in enumerate(replay.turns(), 1):
-        if turns % TOLD_EVERY == 0:
+def verdict(replay: Replay, tell: Callable[[str], object] = str) -> Comparison:
+    """Replay a flight to its end and compare it with its log. `tell` is called with sentences about
+    the progress. Raises UserError if nothing can be compared."""
+    for turn in replay.turns():
+        if turn.number % TOLD_EVERY == 0:
             tell(f"replayed up to {replay.ended_s:.0f} s of vehicle time")
     comparison = compare(replay.recorded, replay.replayed)
     if not comparison.compared.total():
         why = replay.stopped or "the log holds no setpoint and no command"
-        raise UserError(f"{recording.log.path}: nothing to compare: {why}")
-    return Verdict(comparison, turns, replay.ended_s, replay.incomplete)
+        raise UserError(f"{replay.recording.log.path}: nothing to compare: {why}")
+    return comparison
 
 
 def explained(recording: Recording, difference: Difference) -> list[str]:

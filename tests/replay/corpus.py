@@ -16,6 +16,7 @@ from pathlib import Path
 
 from pymavlink.dialects.v20 import common as mavlink
 
+from offboard.analysis.history import record_type
 from offboard.analysis.tlog import LoggedMessage
 from offboard.flight.inputs import (
     Call,
@@ -33,7 +34,7 @@ from offboard.mavlink.framing import SETPOINTS
 from offboard.mavlink.outgoing import ConfigurationRecord
 from offboard.mavlink.session import Reception, SessionSettings
 from offboard.replay.difference import COMMANDS
-from offboard.replay.recording import Recording, read, record_type
+from offboard.replay.recording import Recording, read
 from offboard.replay.replaying import CALLS, Replay, Sent
 
 FLIGHTS = Path(__file__).parent / "recordings"

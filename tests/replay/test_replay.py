@@ -14,6 +14,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from typer.testing import CliRunner, Result
 
 from offboard.analysis import tlog
+from offboard.analysis.history import record_type
 from offboard.cli.commands import app
 from offboard.control.base import Controller, Decision, Situation
 from offboard.control.pso import PsoLaw
@@ -26,7 +27,8 @@ from offboard.link.log import entry
 from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.replay.difference import compare
-from offboard.replay.recording import read, record_type
+from offboard.replay.recording import read
+from offboard.replay.replaying import Replay
 from offboard.replay.verdict import verdict
 from offboard.run import configuration
 
@@ -107,7 +109,7 @@ def test_a_changed_law_is_found_at_its_first_decision(
     result = run(flight)
     assert " of 215 setpoints and 25 commands differ; largest difference" in reason(result)
     assert getattr(result.exception, "code", None) == 1
-    first = verdict(read(flight)).comparison.significant[0]
+    first = verdict(Replay(read(flight))).significant[0]
     assert CLIMB_BEGAN_S <= first.time_s < CLIMB_BEGAN_S + 0.7
     before, after, by = next(row for name, *row in first.fields() if name == "thrust")
     assert after - before == pytest.approx(by)
@@ -166,16 +168,17 @@ def test_a_lost_message_ends_the_comparison_before_it(tmp_path: Path) -> None:
     data = bytearray(whole.read_bytes())
     data[data.index(lost.frame.raw) + 12] ^= 0x40
     damaged.write_bytes(data)
-    result = verdict(read(damaged))
-    ended = f"replayed up to {result.ended_s:.1f} s of vehicle time: received frames are missing"
-    assert result.incomplete.startswith(ended)
+    replay = Replay(read(damaged))
+    comparison = verdict(replay)
+    ended = f"replayed up to {replay.ended_s:.1f} s of vehicle time: received frames are missing"
+    assert replay.incomplete.startswith(ended)
     answer = run(damaged)
     assert answer.exit_code == 0
     assert "1 damaged entry was skipped" in answer.stderr
     assert ended in answer.stderr
-    assert not result.comparison.differences
-    assert 30 < result.comparison.setpoints < verdict(read(whole)).comparison.setpoints
-    assert result.ended_s == pytest.approx(lost_ms / 1e3, abs=0.3)
+    assert not comparison.differences
+    assert 30 < comparison.setpoints < verdict(Replay(read(whole))).setpoints
+    assert replay.ended_s == pytest.approx(lost_ms / 1e3, abs=0.3)
 
 
 # ------------------------------------------------------------------ unusual inputs
