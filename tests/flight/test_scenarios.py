@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -56,7 +57,7 @@ Checks = Iterator[bool]
 def lemniscate(**options: Any) -> Pair:
     """One lap, 1 m high, by a vehicle that hovers when its links open."""
     quick = ("reference.laps=1", "reference.height_m=1.0", "reference.period_s=6")
-    return make(*quick, aloft=True, **options)
+    return make(*quick, **{"aloft": True, **options})
 
 
 def in_track(action: Callable[[Pair], None], flight: Callable[..., Pair] = lemniscate) -> Any:
@@ -505,7 +506,7 @@ ROWS = (
     ),
     Row(
         "restart in flight",
-        in_track(restart),
+        in_track(restart, partial(lemniscate, aloft=False)),
         4,
         "the vehicle restarted in flight",
         Phase.DISARMED,
