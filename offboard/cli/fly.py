@@ -213,7 +213,7 @@ def _result(
 ) -> str:
     """The last line of --json-lines."""
     from offboard.documents.plain import plain
-    from offboard.live.values import DIGITS, line
+    from offboard.live.display import DIGITS, line
 
     result = {
         "exit_code": code,

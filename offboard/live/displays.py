@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 from offboard.flight.flight import Flight
+from offboard.live.display import Display
 from offboard.live.lines import JsonLines, Terminal
 from offboard.live.process import LiveProcess
 
@@ -16,7 +17,7 @@ class Displays:
 
     def __init__(self, lines: Terminal | JsonLines, pages: Sequence[LiveProcess] = ()) -> None:
         self._lines, self._pages = lines, pages
-        self._parts: list[Terminal | JsonLines | LiveProcess] = [lines, *pages]
+        self._parts: list[Display] = [lines, *pages]
         self._working = list(self._parts)
 
     def await_ready(self) -> list[str]:

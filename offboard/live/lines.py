@@ -9,89 +9,52 @@ import json
 import math
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Protocol
 
 from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
 from offboard.flight.display import Snapshot
-from offboard.flight.phases import Phase
-from offboard.flight.state import FlightState
 from offboard.link import clock
-from offboard.link.background import BackgroundWriter
-from offboard.live.values import as_dict, line
+from offboard.live.display import Display, Shown, json_lines, line
 
 LINES_MAX = 1000  # that wait to be written
-CLOSE_S = 2.0  # for them, after the flight
 STATUS_S = 0.2  # between two status lines, host time
 SNAPSHOT_S = 1.0  # between two JSON snapshots, vehicle time
 
 
-class Announcing(Protocol):
-    """A companion, or the flights of a service. `announced` has the newest sentences, oldest first,
-    `announcements` counts all that there were."""
-
-    @property
-    def announced(self) -> list[str]: ...
-    @property
-    def announcements(self) -> int: ...
-    @property
-    def phase(self) -> Phase: ...
-    @property
-    def state(self) -> FlightState: ...
-    def snapshot(self) -> Snapshot: ...
-
-
-class News:
-    """Announcements, each once."""
-
-    def __init__(self) -> None:
-        self._seen = 0
-
-    def of(self, flown: Announcing) -> list[str]:
-        """Those since the last call."""
-        new, self._seen = flown.announcements - self._seen, flown.announcements
-        return flown.announced[-new:] if new else []
-
-
-class Terminal:
+class Terminal(Display):
     """Prints announcements with `show_line`; below them, where the console is a terminal that can
     do it, one status line in place."""
+
+    LOST = "{} lines of the flight are missing above: the terminal was stopped"
 
     def __init__(self, console: Console, show_line: Callable[[str], None]) -> None:
         in_place = console.is_terminal and not console.is_dumb_terminal
         self._live = _status_line(console) if in_place else None
         self._show_line = show_line
-        self._writer = BackgroundWriter[str | Snapshot](self._write, LINES_MAX)
-        self._news = News()
-        self._due_s = -math.inf
         self._waits = False  # a status is queued: no second one
+        super().__init__(self._write, LINES_MAX)
 
     def tell(self, sentence: str) -> None:
         """A sentence about the preparation."""
         self._writer.put(sentence)
 
-    def show(self, companion: Announcing) -> None:
-        for sentence in self._news.of(companion):
-            self._writer.put(f"{_stamp(companion.state.time_s)}  {sentence}")
+    def announcement(self, shown: Shown, sentence: str) -> str:
+        return f"{_stamp(shown.state.time_s)}  {sentence}"
+
+    def is_due(self, shown: Shown) -> bool:
         now_s = clock.monotonic_s()
-        if self._live and now_s >= self._due_s and not self._waits:
-            self._due_s, self._waits = now_s + STATUS_S, True
-            self._writer.put(companion.snapshot())
+        if not self._live or now_s < self._due_s or self._waits:
+            return False
+        self._due_s, self._waits = now_s + STATUS_S, True
+        return True
 
     def close(self) -> None:
-        self._writer.close(CLOSE_S)
+        super().close()
         if self._live and self._writer.is_free():
             with suppress(OSError, SystemExit):
                 self._live.stop()
-
-    @property
-    def lost(self) -> str:
-        dropped = 0 if self._writer.error else self._writer.dropped  # nobody misses a closed pipe
-        if not dropped:
-            return ""
-        return f"{dropped} lines of the flight are missing above: the terminal was stopped"
 
     def _write(self, items: list[str | Snapshot]) -> None:
         for item in items:
@@ -130,37 +93,24 @@ def _stamp(time_s: float) -> str:
     return f"{time_s:8.2f} s" if time_s else f"{'--':>8} s"
 
 
-class JsonLines:
+class JsonLines(Display):
     """Writes one JSON object a line: snapshots once a second of vehicle time, announcements."""
 
+    LOST = "{} lines were not written: nobody read them"
+
     def __init__(self, write: Callable[[str], object]) -> None:
-        self._print = write
-        self._writer = BackgroundWriter[str](self._write, LINES_MAX)
-        self._news = News()
-        self._due_s = -math.inf
+        super().__init__(lambda items: write(json_lines(items)), LINES_MAX)
 
     def tell(self, sentence: str) -> None:
         """A sentence about the preparation."""
         self._writer.put(line("preparation", text=sentence))
 
-    def show(self, companion: Announcing) -> None:
-        time_s = companion.state.time_s
-        for sentence in self._news.of(companion):
-            self._writer.put(line("announcement", time_s=round(time_s, 3), text=sentence))
-        if not self._due_s - SNAPSHOT_S <= time_s < self._due_s:  # or the clock has jumped back
-            self._due_s = math.floor(time_s / SNAPSHOT_S + 1.0) * SNAPSHOT_S
-            self._writer.put(line("snapshot", **as_dict(companion.snapshot())))
-
-    def close(self) -> None:
-        self._writer.close(CLOSE_S)
-
-    @property
-    def lost(self) -> str:
-        dropped = 0 if self._writer.error else self._writer.dropped
-        return f"{dropped} lines were not written: nobody read them" if dropped else ""
-
-    def _write(self, lines: list[str]) -> None:
-        self._print("".join(f"{each}\n" for each in lines))
+    def is_due(self, shown: Shown) -> bool:
+        time_s = shown.state.time_s
+        if self._due_s - SNAPSHOT_S <= time_s < self._due_s:  # else the clock may have jumped back
+            return False
+        self._due_s = math.floor(time_s / SNAPSHOT_S + 1.0) * SNAPSHOT_S
+        return True
 
 
 class JsonLog(JsonLines):
@@ -168,13 +118,15 @@ class JsonLog(JsonLines):
 
     def tell(self, sentence: str) -> None:
         """A sentence about the service."""
-        self._put("service", sentence)
+        self._writer.put(_logged("service", sentence))
 
-    def show(self, companion: Announcing) -> None:
-        for sentence in self._news.of(companion):
-            time_s = companion.state.time_s
-            self._put(companion.phase.value, sentence, vehicle_time_s=time_s)
+    def announcement(self, shown: Shown, sentence: str) -> str:
+        return _logged(shown.phase.value, sentence, vehicle_time_s=shown.state.time_s)
 
-    def _put(self, phase: str, sentence: str, **more: float) -> None:
-        entry = {"time": clock.utc(), "level": "info", "phase": phase, "event": sentence, **more}
-        self._writer.put(json.dumps(entry))
+    def is_due(self, shown: Shown) -> bool:
+        return False
+
+
+def _logged(phase: str, sentence: str, **more: float) -> str:
+    entry = {"time": clock.utc(), "level": "info", "phase": phase, "event": sentence, **more}
+    return json.dumps(entry)

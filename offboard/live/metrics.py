@@ -22,7 +22,7 @@ COUNTER = "flights"
 
 
 class Metrics(Collector):
-    """What a monitor reads. `show` hands over a snapshot, as `values.as_dict` makes it."""
+    """What a monitor reads. `show` hands over a snapshot as it is in JSON."""
 
     def __init__(self) -> None:
         self._newest: dict[str, Any] = {}

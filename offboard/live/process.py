@@ -7,19 +7,15 @@ counted. The process ends when the pipe closes.
 from __future__ import annotations
 
 import json
-import math
 import subprocess
 import sys
 from contextlib import suppress
-from typing import Protocol
 
 from offboard.documents.arguments import split_address
 from offboard.documents.errors import UserError
 from offboard.flight.display import Snapshot
 from offboard.link import clock
-from offboard.link.background import BackgroundWriter
-from offboard.live.lines import Announcing, News
-from offboard.live.values import as_dict, line
+from offboard.live.display import Display, Shown, json_lines, line
 
 SERVER = "offboard.live.server"
 PERIOD_S = 0.1  # between two snapshots, host time
@@ -33,13 +29,7 @@ class NotServed(UserError):
     is_usage = False
 
 
-class Shown(Announcing, Protocol):
-    """A companion, or the flights of a service."""
-
-    def has_ended(self) -> bool: ...
-
-
-class LiveProcess:
+class LiveProcess(Display):
     """A display in the process `python -m MODULE HOST PORT`, started at once.
 
     The process prints one JSON line when it listens, {"url": ...}, or says why not, {"error": ...}.
@@ -55,9 +45,7 @@ class LiveProcess:
             bufsize=0,
             start_new_session=True,  # signals of the terminal reach only the controller
         )
-        self._writer = BackgroundWriter[str | Snapshot](self._write, QUEUED_MAX)
-        self._news = News()
-        self._due_s = -math.inf
+        super().__init__(self._write, QUEUED_MAX)
 
     def await_ready(self) -> str:
         """Wait until it listens; where. Raises NotServed."""
@@ -73,14 +61,12 @@ class LiveProcess:
         """What the page says above its values: `title`, or at the end `verdict` and `report`."""
         self._writer.put(line("flight", **values))
 
-    def show(self, companion: Shown) -> None:
-        for sentence in self._news.of(companion):
-            time_s = round(companion.state.time_s, 3)
-            self._writer.put(line("announcement", time_s=time_s, text=sentence))
+    def is_due(self, shown: Shown) -> bool:
         now_s = clock.monotonic_s()
-        if now_s >= self._due_s or companion.has_ended():
-            self._due_s = now_s + PERIOD_S
-            self._writer.put(companion.snapshot())
+        if now_s < self._due_s and not shown.has_ended():
+            return False
+        self._due_s = now_s + PERIOD_S
+        return True
 
     def close(self) -> None:
         self._writer.close(CLOSE_S)
@@ -102,8 +88,6 @@ class LiveProcess:
 
     def _write(self, items: list[str | Snapshot]) -> None:
         assert self._process.stdin is not None
-        for each in items:
-            text = each if isinstance(each, str) else line("snapshot", **as_dict(each))
-            data = memoryview(text.encode() + b"\n")
-            while data:
-                data = data[self._process.stdin.write(data) :]
+        data = memoryview(json_lines(items).encode())
+        while data:
+            data = data[self._process.stdin.write(data) :]

@@ -21,8 +21,8 @@ from aiohttp import web
 from prometheus_client import CONTENT_TYPE_LATEST
 
 from offboard.documents.arguments import join_address
+from offboard.live.display import line
 from offboard.live.metrics import Metrics
-from offboard.live.values import line
 
 KEPT = 3000  # snapshots, five minutes
 TEXTS_KEPT = 100

@@ -101,7 +101,7 @@ def test_what_nobody_reads_delays_nothing_and_is_told(
 ) -> None:
     """A server that stands still, and a pipe that is full."""
     monkeypatch.setattr("offboard.live.process.PERIOD_S", 0.0)  # a thousand snapshots
-    monkeypatch.setattr("offboard.live.lines.CLOSE_S", 0.2)
+    monkeypatch.setattr("offboard.live.display.CLOSE_S", 0.2)
     unread, full = os.pipe()
     lines = JsonLines(lambda text: os.write(full, text.encode() * 400))  # more than it holds
     slowest_s = 0.0

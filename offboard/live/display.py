@@ -1,0 +1,91 @@
+"""What all displays of a flight have in common: a thread that writes, announcements each once,
+snapshots when they are due, and both as JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Protocol
+
+from offboard.documents.plain import plain
+from offboard.link.background import BackgroundWriter
+
+if TYPE_CHECKING:  # the process that serves clients starts without the controller
+    from offboard.flight.display import Snapshot
+    from offboard.flight.phases import Phase
+    from offboard.flight.state import FlightState
+
+DIGITS = 9  # of a float
+CLOSE_S = 2.0  # for what is queued, after the flight
+
+
+class Shown(Protocol):
+    """A companion, or the flights of a service. `announced` has the newest sentences, oldest first,
+    `announcements` counts all that there were."""
+
+    @property
+    def announced(self) -> list[str]: ...
+    @property
+    def announcements(self) -> int: ...
+    @property
+    def phase(self) -> Phase: ...
+    @property
+    def state(self) -> FlightState: ...
+    def snapshot(self) -> Snapshot: ...
+    def has_ended(self) -> bool: ...
+
+
+class Display:
+    """Shows a flight. A thread gives texts and snapshots in batches to `write`, so that the loop
+    waits for no terminal, pipe or client; at most `size` wait, what does not fit is dropped."""
+
+    LOST = ""  # the sentence on what was dropped, with its number as {}
+
+    def __init__(self, write: Callable[[list[str | Snapshot]], object], size: int) -> None:
+        self._writer = BackgroundWriter["str | Snapshot"](write, size)
+        self._seen = 0  # announcements
+        self._due_s = -math.inf  # of the next snapshot
+
+    def show(self, shown: Shown) -> None:
+        """Queue what is new. Called in every turn of the loop."""
+        new, self._seen = shown.announcements - self._seen, shown.announcements
+        for sentence in shown.announced[-new:] if new else []:
+            self._writer.put(self.announcement(shown, sentence))
+        if self.is_due(shown):
+            self._writer.put(shown.snapshot())
+
+    def announcement(self, shown: Shown, sentence: str) -> str:
+        """What is written of an announcement."""
+        time_s = round(shown.state.time_s, 3)
+        return line("announcement", time_s=time_s, text=sentence)
+
+    def is_due(self, shown: Shown) -> bool:
+        """Whether to write a snapshot now; the next one is then due later."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Write what is queued."""
+        self._writer.close(CLOSE_S)
+
+    @property
+    def lost(self) -> str:
+        """A sentence on what was not shown, empty if all was."""
+        dropped = 0 if self._writer.error else self._writer.dropped  # nobody misses a closed pipe
+        return self.LOST.format(dropped) if dropped else ""
+
+
+def line(kind: str, **values: Any) -> str:
+    """One JSON object, without line break; its key `type` says what it is."""
+    return json.dumps({"type": kind} | values, allow_nan=False, separators=(",", ":"))
+
+
+def json_lines(items: list[str | Snapshot]) -> str:
+    """Lines of JSON: texts as they are, the fields of a snapshot; what is not known (NaN) is
+    null."""
+    lines = (
+        item if isinstance(item, str) else line("snapshot", **plain(vars(item), DIGITS))
+        for item in items
+    )
+    return "".join(f"{each}\n" for each in lines)
