@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from offboard.analysis import history, tlog
 from offboard.analysis.events import Event
 from offboard.analysis.history import TELEMETRY, History
-from offboard.analysis.samples import Rows
+from offboard.analysis.samples import Rows, continuous_s
 from offboard.analysis.tlog import Tlog
 from offboard.documents.errors import UserError
 from offboard.flight.phases import PHASE_CODES
@@ -137,13 +137,14 @@ def _series(name: str, rows: Rows) -> Series:
 def _unix(log: Tlog, vehicle: Address | None) -> Array:
     """Vehicle time and Unix time of the vehicle's telemetry, each newer than the one before."""
     rows = [
-        (int.from_bytes(message.frame.payload[:4], "little") / 1e3, message.unix_us / 1e6)
+        (int.from_bytes(message.frame.payload[:4], "little"), message.unix_us / 1e6)
         for message in log
         if message.frame.message_id in TELEMETRY
         and (message.system_id, message.component_id) == vehicle
     ]
     stamps = np.reshape(rows, (-1, 2)).astype(np.float64)
     if len(stamps):
+        stamps[:, 0] = continuous_s(stamps[:, 0], stamps[0, 0])
         newest = np.maximum.accumulate(stamps, axis=0)
         stamps = newest[np.r_[True, np.diff(newest[:, 0]) > 0.0]]
     return stamps

@@ -204,6 +204,22 @@ def test_a_log_of_another_program(tmp_path: Path) -> None:
     assert (np.diff(stamps.astype(np.int64)) >= 0).all()
 
 
+def test_unix_time_across_the_wrap_of_time_boot_ms(tmp_path: Path) -> None:
+    """Of a vehicle that runs at twice the speed: a position every 100 ms, recorded every 50 ms."""
+    vehicle, began_us = mavlink.MAVLink(None, srcSystem=1, srcComponent=1), 10**15
+    frames = [mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 3, 3)]
+    for step in range(20):
+        stamp_ms = (2**32 - 950 + 100 * step) % 2**32
+        frames.append(mavlink.MAVLink_local_position_ned_message(stamp_ms, *6 * [0.0]))
+    log = tmp_path / "wrap.tlog"
+    entries = [entry(began_us + 50_000 * n, f.pack(vehicle)) for n, f in enumerate(frames)]
+    log.write_bytes(b"".join(entries))
+    with exported(log, "csv", tmp_path / "wrap.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["source"] == "position"]
+    unix_s = [float(row["unix_time_s"]) for row in rows]
+    assert unix_s == pytest.approx([1e9 + 0.05 * n for n in range(1, 21)], abs=1e-4, rel=0)
+
+
 def test_our_announcements_and_a_second_vehicle(flight: Path, tmp_path: Path) -> None:
     """Vehicle 9, whose clock is 1000 s ahead, changes no time. A record of an event is one more."""
     other = mavlink.MAVLink(None, srcSystem=9, srcComponent=1)
