@@ -1,4 +1,4 @@
-"""The .tlog of a real flight over UDP: what the usual tools read in it."""
+"""The .tlog of a real flight over UDP: what the usual tools and a replay read in it."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from offboard.analysis import history, tlog
+from offboard.cli.commands import app
 from offboard.run import configuration as config
 
 SCRIPTS = Path(sys.executable).parent
@@ -55,6 +57,14 @@ def test_mavlogdump_counts_the_same_messages(flight: Path, scored: dict[str, obj
     dumped = tool("mavlogdump.py", *ALL, "--format", "standard", str(flight / "flight.tlog"))
     counted = Counter(re.findall(r"^\d{4}-\d\d-\d\d [\d:.]+: (\w+) \{", dumped, re.MULTILINE))
     assert counted == scored["messages"]
+
+
+def test_the_replay_of_the_flight_is_identical(flight: Path) -> None:
+    result = CliRunner().invoke(app, ["replay", str(flight)], terminal_width=300)
+    assert result.exit_code == 0
+    output = result.stdout.replace("\n", " ")
+    assert int(output.split()[0]) > 100
+    assert "all identical" in output or "rounding of another computer" in output
 
 
 def test_mavflightmodes_shows_the_same_modes(flight: Path, scored: dict[str, object]) -> None:
