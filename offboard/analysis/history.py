@@ -28,6 +28,7 @@ from offboard.flight.record import (
     RECORD_NAME,
     records_of,
 )
+from offboard.identification.vehicle_fit import RECORDED
 from offboard.mavlink import event_record
 from offboard.mavlink.decode import Address, decode_identity
 from offboard.mavlink.dialects.base import Dialect
@@ -57,7 +58,7 @@ _DTYPES = {
     "heartbeat": [_TIME, ("armed", "f4"), ("system_status", "f4")],
     "battery": [_TIME, ("voltage_mv", "f4"), ("remaining", "f4")],
     "landed": [_TIME, ("state", "f4")],
-    "identified": [_TIME, ("values", "20f4")],
+    "identified": [_TIME, ("values", f"{2 * len(RECORDED)}f4")],
 }  # fmt: skip
 _MOTION = {"position_ned_m": "x y z", "velocity_ned_mps": "vx vy vz"}
 _ROTATION = {"quaternion": "q1 q2 q3 q4", "rates_radps": "rollspeed pitchspeed yawspeed"}
@@ -103,7 +104,7 @@ class History:
     reference: position, velocity and acceleration, heading_rad (POSITION_TARGET_LOCAL_NED)
     setpoint: unix_s, quaternion, thrust (SET_ATTITUDE_TARGET); the last two NaN for a setpoint of
         the autopilot's own position loop (SET_POSITION_TARGET_LOCAL_NED)
-    identified: values, then sd of each constant as in `identification.vehicle_fit.log_record`
+    identified: value and sd of each constant of `identification.vehicle_fit.RECORDED`
     link_delay: delay_s, at the telemetry that a TIMESYNC request followed
     heartbeat: armed (1 or 0), system_status (MAV_STATE)
     battery: voltage_mv, remaining in percent; NaN where it is not known (SYS_STATUS)
@@ -287,6 +288,8 @@ class _Collector:
         """All that was added."""
         anchor_ms = self._anchor_ms
         rows = {name: samples.rows(anchor_ms) for name, samples in self._samples.items()}
+        constants = [_TIME, *((name, "2f4") for name in RECORDED)]
+        rows["identified"] = rows["identified"].view(constants)
         armed = rows["heartbeat"]["armed"].astype(np.int64) & _ARMED
         rows["heartbeat"]["armed"] = armed > 0
         for column, unknown in (("voltage_mv", 0xFFFF), ("remaining", -1)):

@@ -122,8 +122,8 @@ def _delay(flown: History) -> dict[str, float]:
     if len(flown.link_delay):
         late_ms = 1e3 * flown.link_delay["delay_s"]
         values["link_delay_p50_ms"], values["link_delay_p99_ms"] = np.percentile(late_ms, (50, 99))
-    identified = flown.identified["values"]
+    identified = flown.identified["tilt_delay_s"]
     known = identified[np.isfinite(identified[:, 0])]
     if len(known):
-        values["delay_ms"], values["delay_sd_ms"] = 1e3 * known[-1, :2].astype(np.float64)
+        values["delay_ms"], values["delay_sd_ms"] = 1e3 * known[-1].astype(np.float64)
     return {name: float(value) for name, value in values.items()}

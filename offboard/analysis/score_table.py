@@ -71,13 +71,13 @@ def verdict(score: Score) -> str:
 def _identified(history: History) -> str:
     """The last value of the main constants that the flight identified, empty without one."""
     texts = []
-    for column, text in (
-        (0, "delay {:.0f} ms"),
-        (2, "tilt {:.1f} rad/s"),
-        (12, "hover thrust {:.3f}"),
-        (18, "drag {:.2f} 1/s"),
+    for constant, text in (
+        ("tilt_delay_s", "delay {:.0f} ms"),
+        ("tilt_natural_frequency_radps", "tilt {:.1f} rad/s"),
+        ("hover_thrust", "hover thrust {:.3f}"),
+        ("drag_ps", "drag {:.2f} 1/s"),
     ):
-        values = history.identified["values"][:, column]
+        values = history.identified[constant][:, 0]
         values = values[np.isfinite(values)]
         if len(values):
             texts.append(text.format(values[-1] * (1e3 if "ms" in text else 1.0)))

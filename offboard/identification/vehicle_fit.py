@@ -356,9 +356,16 @@ def summary(found: Identified) -> str:
     return "identified " + "; ".join(parts)
 
 
+# in the order of `log_record`
+RECORDED = (
+    "tilt_delay_s", "tilt_natural_frequency_radps", "tilt_damping",
+    "yaw_delay_s", "yaw_natural_frequency_radps", "yaw_damping",
+    "hover_thrust", "thrust_lag_s", "thrust_delay_s", "drag_ps",
+)  # fmt: skip
+
+
 def log_record(found: Identified) -> tuple[float, ...]:
-    """Value and sd of each constant, for the log: tilt (delay, frequency, damping), yaw, hover
-    thrust, thrust lag, thrust delay, drag; NaN for what was not identified."""
+    """Value and sd of each constant of RECORDED, for the log; NaN for what was not identified."""
     estimates: list[Estimate | None] = []
     for fit in (found.tilt, found.yaw):
         estimates += (fit.delay_s, fit.natural_frequency_radps, fit.damping) if fit else (None,) * 3

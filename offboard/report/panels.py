@@ -162,10 +162,12 @@ def link(flown: History) -> tuple[Panel, ...]:
 def identification(flown: History) -> tuple[Panel, ...]:
     """What was identified, with its standard deviation, and what the observer estimates."""
 
-    def found(column: int, name: str, colour: str, scale: float = 1.0, main: bool = True) -> Curve:
-        values = flown.identified["values"]
-        known = np.isfinite(values[:, column])
-        value, sd = scale * values[known, column : column + 2].T
+    def found(
+        constant: str, name: str, colour: str, scale: float = 1.0, main: bool = True
+    ) -> Curve:
+        values = flown.identified[constant]
+        known = np.isfinite(values[:, 0])
+        value, sd = scale * values[known].T
         times = flown.identified["time_s"][known]
         return Curve(name, times, value, colour, "dots", main, sd=sd)
 
@@ -177,14 +179,20 @@ def identification(flown: History) -> tuple[Panel, ...]:
     return (
         Panel(
             "identified delay, ms",
-            (found(0, "tilt", BLUE, 1e3), found(6, "yaw", ORANGE, 1e3, main=False)),
+            (
+                found("tilt_delay_s", "tilt", BLUE, 1e3),
+                found("yaw_delay_s", "yaw", ORANGE, 1e3, main=False),
+            ),
         ),
         Panel(
             "identified natural frequency, rad/s",
-            (found(2, "tilt", BLUE), found(8, "yaw", ORANGE, main=False)),
+            (
+                found("tilt_natural_frequency_radps", "tilt", BLUE),
+                found("yaw_natural_frequency_radps", "yaw", ORANGE, main=False),
+            ),
         ),
-        Panel("hover thrust, 0 to 1", (found(12, "identified", INK), hover)),
-        Panel("identified drag, 1/s", (found(18, "drag", BLUE),)),
+        Panel("hover thrust, 0 to 1", (found("hover_thrust", "identified", INK), hover)),
+        Panel("identified drag, 1/s", (found("drag_ps", "drag", BLUE),)),
         Panel("estimated disturbance, m/s²", disturbance),
     )
 
