@@ -1,5 +1,5 @@
-"""Transfers from a start, at rest or moving, to rest at a target; and references shifted in time or
-space. Used for the climb after take-off and for flying to the start of a track.
+"""Transfers from a start, at rest or moving, to rest at a target; and references moved in time
+and space. Used for the climb after take-off and for flying to the start of a track.
 """
 
 from __future__ import annotations
