@@ -297,6 +297,11 @@ class Flight:
     # ------------------------------------------------------------------ what others ask and say
 
     @property
+    def current(self) -> Flight:
+        """This flight, as the service has several."""
+        return self
+
+    @property
     def phase(self) -> Phase:
         return self.state.phase
 

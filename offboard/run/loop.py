@@ -13,8 +13,8 @@ from contextlib import suppress
 from typing import Any, Protocol
 
 from offboard.documents.errors import located
-from offboard.flight.flight import Outcome, Output
-from offboard.flight.phases import BEFORE_FLIGHT, WAITING, ExitCode, Phase
+from offboard.flight.flight import Flight, Outcome, Output
+from offboard.flight.phases import BEFORE_FLIGHT, WAITING, ExitCode
 from offboard.link import clock
 from offboard.link.interface import Chunk, Link
 from offboard.link.stop import StopRequests
@@ -36,25 +36,13 @@ RESTART_S = 10.0  # between two attempts to start another one
 
 
 class Flown(Protocol):
-    """What the loop needs of a companion, or of the flights of a service."""
-
-    peer: Hashable | None
-    other_datagrams: int
+    """A flight, or the flights of a service, of which `current` waits or flies."""
 
     @property
-    def phase(self) -> Phase: ...
-    @property
-    def outcome(self) -> Outcome | None: ...
+    def current(self) -> Flight: ...
     def turn(self, chunks: Sequence[Chunk], now_s: float) -> Output: ...
-    def finish_turn(self, sent_s: float) -> Sequence[bytes]: ...
     def has_ended(self) -> bool: ...
     def request_stop(self, why: str = ...) -> None: ...
-    def announce(self, sentence: str) -> None: ...
-    def overhear(self, datagrams: Sequence[bytes]) -> None: ...
-    def on_dropped(self, frames: int) -> None: ...
-    def guard(self, guarded: bool) -> None: ...
-    @property
-    def lands_without_log(self) -> bool: ...
 
 
 class Log(Protocol):
@@ -116,7 +104,7 @@ class Loop:
             try:
                 self._turn()
                 self._succeeded_s = clock.monotonic_s()
-                if self._companion.phase in WAITING:
+                if self._companion.current.phase in WAITING:
                     self._error = ""  # the flight that it ended is over
             except BaseException as error:  # a law may even end the program
                 self._hand_back(error)
@@ -140,14 +128,14 @@ class Loop:
             return
         dropped = self._send(output, began_s)
         stamp = clock.unix_us()
-        for frame in self._companion.finish_turn(clock.monotonic_s()):
+        for frame in self._companion.current.finish_turn(clock.monotonic_s()):
             if frame not in dropped:
                 self._log.write(stamp, frame)
         report = self._link.report
-        self._companion.other_datagrams = report.ignored
-        self._companion.overhear(report.overheard())
+        self._companion.current.other_datagrams = report.ignored
+        self._companion.current.overhear(report.overheard())
         for sentence in report.news():
-            self._companion.announce(sentence)
+            self._companion.current.announce(sentence)
         self._check_log()
         self._check_supervisor()
         self._show()
@@ -156,7 +144,7 @@ class Loop:
     def _send(self, output: Output, began_s: float) -> list[bytes]:
         """Send what a turn has decided. This process may have been stopped since the turn began:
         then it is dropped, and returned."""
-        peer = self._companion.peer
+        peer = self._companion.current.peer
         dropped: list[bytes] = []
         for frame in output.send:
             if self._supervisor and clock.monotonic_s() - began_s > STOPPED_S:
@@ -164,7 +152,7 @@ class Loop:
             else:
                 self._link.send(frame, peer)
         if dropped:
-            self._companion.on_dropped(len(dropped))
+            self._companion.current.on_dropped(len(dropped))
         if peer is not None:
             self._link.follow(peer)
             self._beat(output, peer)
@@ -184,22 +172,22 @@ class Loop:
         if supervisor is None:
             return
         guarded = supervisor.guards
-        self._companion.guard(guarded)
+        self._companion.current.guard(guarded)
         if guarded and UNANSWERED in self._warned:
             self._warned.discard(UNANSWERED)
-            self._companion.announce(ANSWERS)
+            self._companion.current.announce(ANSWERS)
         elif supervisor.loaded and not (guarded or supervisor.lost):
             self._warn(UNANSWERED)
         if not supervisor.lost:
             return
         self._warn(UNGUARDED)
         now_s = clock.monotonic_s()
-        if self._companion.phase in WAITING and now_s - self._restarted_s >= RESTART_S:
+        if self._companion.current.phase in WAITING and now_s - self._restarted_s >= RESTART_S:
             self._restarted_s = now_s
             with suppress(SupervisorError):
                 supervisor.restart()
                 self._warned -= {UNGUARDED, UNANSWERED}
-                self._companion.announce("another supervisor is started")
+                self._companion.current.announce("another supervisor is started")
 
     def _taken_over(self) -> bool:
         """Whether the supervisor has the vehicle; then wait until it is done with it."""
@@ -230,14 +218,14 @@ class Loop:
         problem = self._log.problem
         if problem:
             self._warn(problem)
-            if self._companion.lands_without_log:
+            if self._companion.current.lands_without_log:
                 self._companion.request_stop(problem)
 
     def _warn(self, sentence: str) -> None:
         """Announce it once."""
         if sentence not in self._warned:
             self._warned.add(sentence)
-            self._companion.announce(sentence)
+            self._companion.current.announce(sentence)
 
     def _show(self) -> None:
         """Show the progress. A failure does not end the flight."""
@@ -254,7 +242,7 @@ class Loop:
         if ended is None:
             return
         code = ExitCode.ABORTED
-        if self._companion.phase in BEFORE_FLIGHT:
+        if self._companion.current.phase in BEFORE_FLIGHT:
             code = ExitCode.USAGE if ended.unusable else ExitCode.REFUSED
         self._ended_early = Outcome(code, ended.sentence)
 
@@ -263,13 +251,13 @@ class Loop:
     def _outcome(self) -> Outcome:
         """The result; closes the log, so that all that it lost is known."""
         self._log.close()
-        outcome = self._ended_early or self._companion.outcome or self._interrupted()
+        outcome = self._ended_early or self._companion.current.outcome or self._interrupted()
         code, sentence = outcome.exit_code, outcome.sentence
         if self._error:
             code = ExitCode.ABORTED
             sentence = sentence if self._error in sentence else f"{self._error}; {sentence}"
         if self._log.problem:
-            lands = self._companion.lands_without_log
+            lands = self._companion.current.lands_without_log
             code = code or (ExitCode.ABORTED if lands else ExitCode.FLOWN)
             sentence = f"{self._log.problem}: {self._log.lost} entries lost; {sentence}"
         return Outcome(code, sentence, self._log.problem)

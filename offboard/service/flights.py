@@ -8,7 +8,7 @@ vehicle and link stays. No I/O: a log is begun and ended at `Record`, configurat
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from offboard.flight.display import Snapshot
@@ -72,8 +72,9 @@ class Memory(Protocol):
 class Flights:
     """See the module. `stopwatch` reads host time.
 
-    `engagements` counts the flights that have begun. `announced` has the newest sentences for the
-    user, oldest first, `announcements` how many there were.
+    `current` is the flight that waits or flies. `engagements` counts the flights that have begun.
+    `announced` has the newest sentences for the user, oldest first, `announcements` how many there
+    were.
     """
 
     def __init__(
@@ -104,92 +105,48 @@ class Flights:
         self._prepared = source.newest()
         self._known: IdentifiedVehicle | None = None  # of the vehicle, for the next flight
         self._recalled: IdentifiedVehicle | None = None  # that the present companion began with
-        self._current = self._companion(None)
+        self.current = self._companion(None)
 
     # ------------------------------------------------------------------ as a companion
 
     @property
-    def current(self) -> Flight:
-        """The flight that waits or flies."""
-        return self._current
-
-    @property
     def state(self) -> FlightState:
-        return self._current.state
+        return self.current.state
 
     @property
     def phase(self) -> Phase:
-        return self._current.phase
-
-    @property
-    def peer(self) -> Hashable | None:
-        """The address that the vehicle sends from."""
-        return self._current.peer
-
-    @peer.setter
-    def peer(self, place: Hashable | None) -> None:
-        self._current.peer = place
-
-    @property
-    def other_datagrams(self) -> int:
-        """Datagrams of other senders since the start."""
-        return self._current.other_datagrams
-
-    @other_datagrams.setter
-    def other_datagrams(self, number: int) -> None:
-        self._current.other_datagrams = number
+        return self.current.phase
 
     @property
     def outcome(self) -> Outcome | None:
         """How the newest flight ended."""
-        return self._current.outcome
+        return self.current.outcome
 
     def snapshot(self) -> Snapshot:
-        return self._current.snapshot(self.engagements)
+        return self.current.snapshot(self.engagements)
 
     def has_ended(self) -> bool:
         """Whether the service was stopped, and no flight is left."""
-        return self._stopping and self._current.has_ended()
+        return self._stopping and self.current.has_ended()
 
     def request_stop(self, why: str = STOPPED) -> None:
         """Stop the service, after the vehicle was handed back. For another reason than the
         operator's, only the present flight ends."""
         self._stopping |= why == STOPPED
         if self._stopping or self.phase not in WAITING:
-            self._current.request_stop(why)
-        elif self._current.announced[-1:] != [why]:
-            self._current.announce(why)
-
-    def announce(self, sentence: str) -> None:
-        """Report a sentence to the user, the ground station and the log."""
-        self._current.announce(sentence)
-
-    def guard(self, guarded: bool) -> None:
-        """As `Flight.guard`."""
-        self._current.guard(guarded)
-
-    @property
-    def lands_without_log(self) -> bool:
-        """As `Flight.lands_without_log`."""
-        return self._current.lands_without_log
-
-    def overhear(self, datagrams: Sequence[bytes]) -> None:
-        """As `Flight.overhear`."""
-        self._current.overhear(datagrams)
-
-    def on_dropped(self, frames: int) -> None:
-        """As `Flight.on_dropped`."""
-        self._current.on_dropped(frames)
+            self.current.request_stop(why)
+        elif self.current.announced[-1:] != [why]:
+            self.current.announce(why)
 
     def turn(self, chunks: Sequence[Chunk], now_s: float) -> Output:
         """Process all that has arrived; begin the next flight where the last one has ended."""
-        if self._current.has_ended() and not self._stopping:
+        if self.current.has_ended() and not self._stopping:
             self._begin_next()
         if self.phase in WAITING:
             self._renew_if_changed()
             self._look_for_left()
         before = self.phase
-        output = self._current.turn(chunks, now_s)
+        output = self.current.turn(chunks, now_s)
         if before in WAITING and self.phase not in WAITING and self.phase not in ENDS:
             self._begin_record()
         if self._recording and before is not self.phase:
@@ -198,10 +155,6 @@ class Flights:
             self._explain()
         self._collect()
         return output
-
-    def finish_turn(self, sent_s: float) -> list[bytes]:
-        """As `Flight.finish_turn`."""
-        return self._current.finish_turn(sent_s)
 
     def close(self) -> None:
         """The service ends."""
@@ -220,14 +173,14 @@ class Flights:
         if changed and not self._stopping:
             self._follow(newest)
         for sentence in self._source.news():
-            self._current.announce(sentence)
+            self.current.announce(sentence)
 
     def _follow(self, prepared: Prepared) -> None:
         """Continue with a new companion where the present one has ended or waits."""
         self._collect()
         known = self._remembered(prepared)
         self._prepared, self._known = prepared, known
-        self._current = self._companion(self._current)
+        self.current = self._companion(self.current)
         self._shown = 0
 
     def _companion(self, before: Flight | None) -> Flight:
@@ -248,10 +201,10 @@ class Flights:
         self.engagements += 1
         self._recording = True
         directory = self._record.begin(self._session, self._prepared.text, self._identity)
-        self._current.announce(f"flight {self.engagements}, recorded in {directory}")
+        self.current.announce(f"flight {self.engagements}, recorded in {directory}")
         known = self._recalled
         if known:
-            self._current.announce(
+            self.current.announce(
                 f"this vehicle was identified before: tilt delay {1e3 * known.delay.value:.0f} ms, "
                 f"hover thrust {known.vehicle.hover_thrust:.3f}; no identification steps"
             )
@@ -288,14 +241,14 @@ class Flights:
         return self._memory.get(self._key, prepared) if self._key else None
 
     def _keep_identified(self) -> None:
-        identification = self._current.identification
+        identification = self.current.identification
         if identification is None or not self._key:
             return
         if identification.contradicted:
             if self._known is not None:
                 self._known = None
                 self._memory.discard(self._key)
-                self._current.announce(
+                self.current.announce(
                     "what was identified of this vehicle is contradicted, and discarded: the next "
                     "flight identifies it again"
                 )
@@ -315,10 +268,10 @@ class Flights:
         elif not (self._told_left_alone or state.left_engaged) and state.in_phase_s > NAMED_S:
             self._told_left_alone = found_engaged(state)
             if self._told_left_alone:
-                self._current.announce(LEFT_ALONE.format(mode=state.vehicle.mode))
+                self.current.announce(LEFT_ALONE.format(mode=state.vehicle.mode))
 
     def _collect(self) -> None:
-        said = self._current.announced
+        said = self.current.announced
         new = said[self._shown :]
         del said[:-TEXTS_KEPT]  # the companion of a vehicle that waits may live for weeks
         self._shown = len(said)

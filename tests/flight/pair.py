@@ -152,7 +152,7 @@ class Pair:
             self.failsafes[failsafe.row] = failsafe.action
         if self.clock.now_s <= self.host_s:
             self._feed()
-        self._keep(self.companion.finish_turn(self.clock.now_s))
+        self._keep(self.companion.current.finish_turn(self.clock.now_s))
 
     def _keep(self, frames: Iterable[bytes]) -> None:
         self.logged.extend(frames)

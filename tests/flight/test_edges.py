@@ -75,6 +75,10 @@ class Brief:
     def request_stop(self, why: str = "") -> None:
         self.stops += 1
 
+    @property
+    def current(self) -> Brief:
+        return self
+
     def announce(self, sentence: str) -> None:
         self.announced.append(sentence)
 

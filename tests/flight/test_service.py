@@ -254,7 +254,7 @@ def test_engaged_again_before_a_heartbeat_has_shown_the_other_mode() -> None:
     pair.run(2.0)
     pair.switch("engage")
     pair.until(lambda: pair.phase in TRACKING, 1.0)
-    pair.service.guard(False)  # its supervisor has ended, which ends no flight
+    pair.service.current.guard(False)  # its supervisor has ended, which ends no flight
     pair.run(1.0)
     assert pair.phase in TRACKING
     pair.switch("pilot")
@@ -526,7 +526,7 @@ def test_a_new_configuration_is_used_by_the_next_flight(tmp_path: Path) -> None:
 
     pair, _ = engaged("px4")
     pair.run(1.0)
-    assert pair.service.lands_without_log
+    assert pair.service.current.lands_without_log
     pair.source.prepared = prepared(
         "reference.height_m=1.5", "limits.log_lost=go_on", "period_s=0.2",
         reference="hover", vehicle="px4_sih",
@@ -538,7 +538,7 @@ def test_a_new_configuration_is_used_by_the_next_flight(tmp_path: Path) -> None:
     pair.run(2.5)
     assert pair.service.current is not model
     assert float(pair.state.plan.track.sample(0.0).position_ned_m[2]) == -1.5
-    assert not pair.service.lands_without_log
+    assert not pair.service.current.lands_without_log
     ticks = thrusts(pair, pair.time_s - 1.0)
     assert len(ticks) == 5  # by the new period, which counts from another tick
 
@@ -547,7 +547,7 @@ def test_heartbeat_shows_standby_and_the_phase() -> None:
     pair, _ = engaged("px4")
     pair.run(2.0)
     for number in range(500):
-        pair.service.announce(f"{number}")
+        pair.service.current.announce(f"{number}")
         pair.advance()
     assert len(pair.service.current.announced) <= 200  # of one companion, which may wait for weeks
     assert pair.service.announced[-1] == "499"

@@ -163,6 +163,10 @@ class Beating:
     def __init__(self, peer: Any) -> None:
         self.peer = peer
 
+    @property
+    def current(self) -> Beating:
+        return self
+
     def turn(self, chunks: Sequence[Chunk], now_s: float) -> Output:
         self.read += len(chunks)
         return Output(supervised=now(OURS))
