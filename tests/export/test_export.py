@@ -205,7 +205,7 @@ def test_a_log_of_another_program(tmp_path: Path) -> None:
 
 
 def test_unix_time_across_the_wrap_of_time_boot_ms(tmp_path: Path) -> None:
-    """Of a vehicle that runs at twice the speed: a position every 100 ms, recorded every 50 ms."""
+    """The log of a vehicle at twice the speed: a position every 100 ms, recorded every 50 ms."""
     vehicle, began_us = mavlink.MAVLink(None, srcSystem=1, srcComponent=1), 10**15
     frames = [mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 3, 3)]
     for step in range(20):
