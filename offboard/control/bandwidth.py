@@ -25,7 +25,7 @@ from offboard.model.vehicle import DelayUncertainty, Vehicle
 
 Array = NDArray[np.float64]
 
-LEAST_MARGIN_S, SHARE_OF_DELAY = 0.03, 0.15  # jitter, which grows with the delay
+LEAST_MARGIN_S, SHARE_OF_DELAY = 0.04, 0.15  # jitter, which grows with the delay
 SDS = 3.0  # of an identified delay: by how much it may be wrong
 STEP_RADPS, LEAST_RADPS = 0.25, 1.0
 SUBSTEPS = 10  # of a period, at which the observer is corrected
@@ -43,7 +43,7 @@ def supported_bandwidth(
     of the thrust (a modelled delay that is too long makes it unstable, too); never below
     LEAST_RADPS.
 
-    The delay differs by `uncertainty`, at least 30 ms, and for the tilt 15 % of its delay.
+    The delay differs by `uncertainty`, at least 40 ms, and for the tilt 15 % of its delay.
     """
     vehicle = vehicle.later_by(uncertainty.link_s)
     tilt_s = max(LEAST_MARGIN_S, SHARE_OF_DELAY * vehicle.tilt.delay_s, uncertainty.tilt_s)

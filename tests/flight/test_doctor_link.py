@@ -163,13 +163,13 @@ def test_late_link_blocks_and_its_delay_is_measured(firmware: str) -> None:
 
 
 def test_delay_that_lowers_the_bandwidth() -> None:
-    patient = bench(faults=link(latency_s=0.12))
+    patient = bench(faults=link(latency_s=0.2))
     row = patient.consult("configuration")["configuration"]
     assert row.level is WARN
     possible = row.findings[0].hint.rpartition("=")[2]
     assert 1.0 <= float(possible) < 7.0
     again = bench(
-        faults=link(latency_s=0.12), assignments=[f"controller.bandwidth_radps={possible}"]
+        faults=link(latency_s=0.2), assignments=[f"controller.bandwidth_radps={possible}"]
     )
     assert again.consult("configuration")["configuration"].level is OK
 
