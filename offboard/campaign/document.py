@@ -18,15 +18,12 @@ from typing import Annotated, Any, Self
 from pydantic import AfterValidator, Field, model_validator
 
 from offboard.analysis.requirement import Requirement
-from offboard.campaign.margin import Promises
 from offboard.documents import shipped
 from offboard.documents.errors import UserError
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import parse
 
 CASES_MOST = 1_000_000
-ALL = "all"
-_WORST = re.compile(r"worst ([1-9][0-9]{0,3})")
 
 
 def _key(text: str) -> str:
@@ -50,7 +47,7 @@ def _requirement(text: str) -> str:
 
 
 def _kept(text: str) -> str:
-    if text != ALL and not _WORST.fullmatch(text):
+    if not re.fullmatch("all|worst [1-9][0-9]{0,3}", text):
         raise ValueError(f"{text!r} is not understood; write for example 'worst 5', or 'all'")
     return text
 
@@ -61,6 +58,17 @@ Key = Annotated[str, AfterValidator(_key)]
 Ends = Annotated[tuple[float, float], AfterValidator(_ordered)]
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
 Ranges = Annotated[dict[Key, Ends], Field(min_length=1)]
+
+
+class Promises(Parameters):
+    """Limits that a flight must keep; see `flight` for the margin to each."""
+
+    error_m: float = Field(default=0.5, gt=0, le=100)
+    tilt_deg: float = Field(default=60.0, gt=0, le=90)
+    clearance_m: float = Field(default=0.1, gt=0, le=100)
+    age_s: float = Field(default=0.5, gt=0, le=10)
+    at_bound: float = Field(default=0.5, gt=0, le=1)
+    touchdown_mps: float = Field(default=2.0, gt=0, le=20)
 
 
 class Sample(Parameters):
@@ -81,7 +89,7 @@ class Search(Parameters):
 
     ranges: Ranges
     defaults: dict[Key, float] = Field(default_factory=dict)
-    flights: int = Field(default=500, ge=20, le=100_000)
+    flights: int = Field(default=500, ge=80, le=100_000)
     seed: Seed = 1
     seeds: int = Field(default=5, ge=1, le=100)
 
@@ -125,9 +133,8 @@ class CampaignFile(Parameters):
 
     @property
     def kept(self) -> int:
-        """The number of worst flights that are flown again, with their logs."""
-        matched = _WORST.fullmatch(self.keep or "")
-        return int(matched[1]) if matched else 0
+        """The number of worst flights whose logs are kept."""
+        return CASES_MOST if self.keep == "all" else int((self.keep or "worst 0").split()[1])
 
     @property
     def seed_values(self) -> tuple[int, ...]:

@@ -25,17 +25,15 @@ LINES = 20
 
 
 class Counter(Progress):
-    """Context manager that shows how many of at most `planned` flights have ended. With `each`,
-    every flight is a line."""
+    """Context manager that shows how many of at most `planned` flights have ended."""
 
-    def __init__(self, console: Console, planned: int = 0, *, each: bool = False) -> None:
+    def __init__(self, console: Console, planned: int = 0) -> None:
         super().__init__(
             TextColumn("flights"), BarColumn(bar_width=20), MofNCompleteColumn(),
             TextColumn("{task.fields[rate]}"), TimeElapsedColumn(), TimeRemainingColumn(),
             console=console, transient=True, disable=not console.is_terminal,
         )  # fmt: skip
         self.planned = planned
-        self._each = each
         self._task = self.add_task("flights", total=planned, rate="")
         self._begun_s = clock.monotonic_s()
         self._announced = False
@@ -49,18 +47,17 @@ class Counter(Progress):
             already = f", {self._known} already flown" if self._known else ""
             self._say(f"{self.planned} flights{already}")
 
-    def ended(self, sentence: str) -> None:
-        """A flight has ended; `sentence` says how."""
+    def ended(self) -> None:
+        """A flight has ended."""
         self._flown += 1
         done = self._known + self._flown
         self.planned = max(self.planned, done)
         rate = 60.0 * self._flown / max(1e-9, clock.monotonic_s() - self._begun_s)
         self._update(f"{rate:.0f} a minute")
-        every = 1 if self._each else max(1, self.planned // LINES)
+        every = max(1, self.planned // LINES)
         if done % every == 0 or done == self.planned or self._flown == FIRST:
             left = remaining(60.0 * (self.planned - done) / rate)
-            line = f"{done} of {self.planned} flights, {rate:.0f} a minute, {left} left"
-            self._say(f"{line}: {sentence}" if self._each else line)
+            self._say(f"{done} of {self.planned} flights, {rate:.0f} a minute, {left} left")
 
     def ending(self, stops: StopRequests) -> bool:
         """Whether a stop was requested, which is then said, once."""

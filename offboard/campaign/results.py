@@ -29,7 +29,7 @@ PACKAGES = ("numpy", "scipy", "numba", "pymavlink", "daqp", "control")
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """The end of a flight. `margin` and its smallest term are those of `campaign.margin`;
+    """The end of a flight. `margin` and its smallest term are those of `campaign.flight`;
     `figures` those of the score, without NaN."""
 
     exit_code: int
@@ -37,7 +37,6 @@ class Record:
     margin: float
     weakest: str
     figures: dict[str, float] = field(default_factory=dict)
-    terms: dict[str, float] = field(default_factory=dict)
 
     @property
     def completed(self) -> bool:

@@ -7,13 +7,11 @@ whether the flights were flown at once, in shards, on a cluster, or after an int
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from rich.console import Console
@@ -21,12 +19,11 @@ from rich.console import Console
 from offboard.analysis.requirement import Requirement
 from offboard.campaign.campaign_page import page
 from offboard.campaign.cases import Case, expand
-from offboard.campaign.document import ALL, CampaignFile
+from offboard.campaign.document import CampaignFile, Promises
 from offboard.campaign.flight import Job
-from offboard.campaign.margin import Promises
 from offboard.campaign.progress import Counter
 from offboard.campaign.results import Record, Results, code_hash
-from offboard.campaign.table import ERROR, Row, as_csv, columns, digits, groups, row_of
+from offboard.campaign.table import Row, as_csv, columns, groups, row_of
 from offboard.campaign.workers import Flyer, OpenFlyer
 from offboard.documents.errors import DocumentError, UserError, naming
 from offboard.link import clock
@@ -36,7 +33,7 @@ from offboard.run.in_memory import check_scenario_text
 
 KEPT = "flights"
 KEPT_FILES = {"report": "report.html", "log": "flight.tlog"}
-FIRST_TABLE_S = 5.0  # from the first flight to the first table
+TABLE_S = 5.0  # at least, from one table to the next
 TABLE_SHARE = 0.02  # of the time is for tables while it flies
 
 
@@ -44,7 +41,7 @@ class Incomplete(Exception):
     """No further flight begins. `str()` says why, empty by request."""
 
 
-class Runner:
+class Runner(ExitStack):
     """Context manager that flies cases: what is in the folder of results is not flown again.
 
     `open_flyer` is entered when the first case is missing. With `keep`, a directory, the log of
@@ -61,29 +58,20 @@ class Runner:
         keep: Path | None = None,
         written: Callable[[], None] = lambda: None,
     ) -> None:
+        super().__init__()
         self._results = results
         self._promises = promises
         self._open_flyer = open_flyer
         self._counter = counter
         self._keep = keep
         self._written = written
-        self._stack = ExitStack()
         self._flyer: Flyer | None = None
         self.flown: dict[str, Case] = {}  # by key, in order
 
     def __enter__(self) -> Self:
-        stops = self._stack.enter_context(StopRequests())
-        self._ending = partial(self._counter.ending, stops)
-        self._stack.enter_context(self._counter)
+        self._ending = partial(self._counter.ending, self.enter_context(StopRequests()))
+        self.enter_context(self._counter)
         return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        trace: TracebackType | None,
-    ) -> bool | None:
-        return self._stack.__exit__(kind, value, trace)
 
     def fly(self, cases: Sequence[Case]) -> list[Record]:
         """The records of these cases, in their order. Raises Incomplete when one is missing, and
@@ -99,7 +87,7 @@ class Runner:
                 self._written()
             except UserError as error:
                 raise Incomplete(str(error)) from None
-            self._counter.ended(_line(job, record))
+            self._counter.ended()
         found = [known[case.key] for case in cases]
         records = [record for record in found if record is not None]
         if len(records) < len(found):
@@ -117,7 +105,7 @@ class Runner:
         if not cases:
             return
         if self._flyer is None:
-            self._flyer = self._stack.enter_context(self._open_flyer())
+            self._flyer = self.enter_context(self._open_flyer())
         folder = keep.absolute() if keep else None
         jobs = [
             Job(case, self._promises, code_hash(), folder / case.folder if folder else None)
@@ -127,27 +115,6 @@ class Runner:
             yield from self._flyer.fly(jobs, self._ending)
         except UserError as error:
             raise Incomplete(str(error)) from None
-
-
-def _line(job: Job, record: Record) -> str:
-    error_m = record.figures.get(ERROR, math.nan)
-    end = f"{digits(error_m)} m" if record.completed else record.sentence
-    return f"{job.case.folder.rpartition('-')[0]}: {end}"
-
-
-@dataclass(frozen=True, slots=True)
-class Shard:
-    """The part of the cases that one of several computers flies: `number` of `count`."""
-
-    number: int = 1
-    count: int = 1
-
-    def of(self, cases: Sequence[Case]) -> list[Case]:
-        """Every `count`-th case."""
-        return list(cases[self.number - 1 :: self.count])
-
-
-WHOLE = Shard()
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,8 +140,8 @@ class Summary:
 class Campaign:
     """The campaign of a file in a directory, on the simulator or at `link`.
 
-    Raises DocumentError where nothing of it can be flown (with `whole`: where a combination cannot)
-    and UserError for a directory that cannot be used, before the first flight.
+    Raises DocumentError where nothing of it can be flown and UserError for a directory that cannot
+    be used, before the first flight.
     """
 
     def __init__(
@@ -184,33 +151,30 @@ class Campaign:
         directory: Path,
         *,
         link: str | None = None,
-        whole: bool = False,
     ) -> None:
         self.file = file
         self.directory = directory
         with naming(source):
             self.cases = expand(file, link)
-            check(self.cases, whole=whole)
+            check(self.cases)
         self.results = Results(directory, code_hash())
         self._requirements = [Requirement.parse(text) for text in file.require]
-        self._next_table_s = math.inf
+        self._next_table_s = 0.0
 
     def runner(self, open_flyer: OpenFlyer, counter: Counter) -> Runner:
         """What flies the cases of this campaign, and writes table and page while it does."""
-        keep = self.directory / KEPT if self.file.keep == ALL else None
+        keep = self.directory / KEPT if self.file.kept >= len(self.cases) else None
         return Runner(
             self.results, self.file.promises, open_flyer, counter, keep=keep, written=self._written
         )
 
-    def fly(
-        self, open_flyer: OpenFlyer, console: Console, shard: Shard = WHOLE, *, each: bool = False
-    ) -> Summary:
-        """Fly what is not finished and write the table. With `each`, a line for each flight. Raises
-        UserError where no worker can be had."""
-        mine = shard.of(self.cases)
+    def fly(self, open_flyer: OpenFlyer, console: Console, shard: slice = slice(None)) -> Summary:
+        """Fly what is not finished and write the table. `shard`: the cases that are flown here.
+        Raises UserError where no worker can be had."""
+        mine = self.cases[shard]
         stopped = ""
         try:
-            with self.runner(open_flyer, Counter(console, len(mine), each=each)) as runner:
+            with self.runner(open_flyer, Counter(console, len(mine))) as runner:
                 runner.fly(mine)
                 if len(rows := self.rows()) == len(self.cases):
                     runner.keep(self._worst(rows), self.directory / KEPT)
@@ -264,12 +228,10 @@ class Campaign:
     def _written(self) -> None:
         """Write what is known, rarely enough that it does not delay the flights."""
         now_s = clock.monotonic_s()
-        if self._next_table_s == math.inf:
-            self._next_table_s = now_s + FIRST_TABLE_S
         if now_s >= self._next_table_s:
             self.write(self.rows())
             took_s = clock.monotonic_s() - now_s
-            self._next_table_s = now_s + max(FIRST_TABLE_S, took_s / TABLE_SHARE)
+            self._next_table_s = now_s + max(TABLE_S, took_s / TABLE_SHARE)
 
     def _kept(self, rows: Sequence[Row]) -> dict[str, dict[str, str]]:
         """Files of kept flights by case, relative to the page."""
@@ -285,9 +247,9 @@ class Campaign:
         }
 
 
-def check(cases: Sequence[Case], *, whole: bool = False) -> None:
+def check(cases: Sequence[Case]) -> None:
     """Raise DocumentError if none of the cases can be flown, with what is wrong. A single one that
-    cannot is no error: it becomes a row with its reason; with `whole` it is one."""
+    cannot is no error: it becomes a row with its reason."""
     distinct: dict[object, Case] = {}
     for case in cases:
         names = (case.config, case.controller, case.reference, case.vehicle, case.firmware)
@@ -297,11 +259,9 @@ def check(cases: Sequence[Case], *, whole: bool = False) -> None:
     for case in distinct.values():
         try:
             _check_one(case)
+            return
         except DocumentError as error:
             problems += error.problems
-        else:
-            if not whole:
-                return
     if problems:
         raise DocumentError(*dict.fromkeys(problems))
 

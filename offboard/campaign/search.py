@@ -14,7 +14,7 @@ changed. The first K kinds are flown at more seeds.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from offboard.campaign.cases import SEED, Case, Values, rounded
@@ -27,11 +27,11 @@ from offboard.documents.extras import install
 
 Fly = Callable[[Sequence[Case]], list[Record]]  # `Runner.fly`
 BATCH = 20  # flights between two answers of the study
-ROUND_BATCHES = 5  # at least, in a round
 ROUNDS = 4
+AVOIDED = 6  # failures that a round is kept away from
 NEAR = 0.25  # of a range (root mean square): values that are nearer to a failure are penalised
 PENALTY = 2.0
-CANDIDATES = 4  # failures that are reduced, per failure that is wanted
+CANDIDATES = 3  # failures that are reduced, per failure that is wanted
 
 
 class Study:
@@ -110,57 +110,44 @@ class FailureSearch:
     def __init__(self, base: Case, search: Search) -> None:
         self._base = base
         self._search = search
-        batches = max(1, search.flights // BATCH)
-        rounds = max(1, min(ROUNDS, batches // ROUND_BATCHES))
-        self._batches = [batches * (n + 1) // rounds - batches * n // rounds for n in range(rounds)]
         # all before the first flight: a study needs a package
-        self._studies = [Study(search.ranges, search.seed + 1000 * n) for n in range(rounds)]
+        self._studies = [Study(search.ranges, search.seed + 1000 * n) for n in range(ROUNDS)]
 
     def find(self, count: int, fly: Fly) -> list[Failure]:
         """The `count` worst failures that differ. Raises what `fly` raises."""
-        found = self._candidates(list(self._searched(fly)), CANDIDATES * count)
-        candidates = [values for values, _ in found]
+        flown = self._flown(fly)
+        worst = self._worst(flown, CANDIDATES * count)
         failures: dict[tuple[str, tuple[str, ...]], Failure] = {}
-        while candidates and len(failures) < count:
-            together, candidates = candidates[:count], candidates[count:]
-            for failure in self._reduced(together, fly):
-                failures.setdefault(failure.kind, failure)
+        for failure in self._reduced(worst, fly):
+            failures.setdefault(failure.kind, failure)
         return self._at_seeds(list(failures.values())[:count], fly)
 
     def flights_most(self, count: int) -> int:
-        """The flights that `find` takes at most, unless it meets failures of the same kind."""
+        """The flights that `find` takes at most."""
         ranges, seeds = len(self._search.ranges), self._search.seeds
-        return self._search.flights + count * (1 + ranges + seeds)
+        return self._search.flights + count * (CANDIDATES * (1 + ranges) + seeds)
 
     def middle(self) -> Case:
         """The case in the middle of all ranges."""
         return self._case(
-            tuple((key, rounded((a + b) / 2)) for key, (a, b) in self._search.ranges.items())
+            {key: rounded((low + high) / 2) for key, (low, high) in self._search.ranges.items()}
         )
 
-    # --- search ---
-
-    def _searched(self, fly: Fly) -> Iterator[tuple[Values, Record]]:
-        """All values that are flown, with their records."""
-        failures: list[Values] = []
-        for study, batches in zip(self._studies, self._batches, strict=True):
-            found: list[tuple[Values, Record]] = []
-            for _ in range(batches):
+    def _flown(self, fly: Fly) -> list[tuple[Values, Record]]:
+        """All values that are flown, with their records. Each round has a study of its own and is
+        kept away from the failures of the rounds before it."""
+        flown: list[tuple[Values, Record]] = []
+        for study in self._studies:
+            failures = self._worst(flown, AVOIDED)
+            for _ in range(self._search.flights // (ROUNDS * BATCH)):
                 asked = study.ask(BATCH)
-                records = fly([self._case(values) for values in asked])
-                found += zip(asked, records, strict=True)
-                study.tell(
-                    [
-                        record.margin + self._penalty(values, failures)
-                        for values, record in zip(asked, records, strict=True)
-                    ]
-                )
-            yield from found
-            failures += [values for values, _ in self._candidates(found, 2)]
+                records = fly([self._case(dict(values)) for values in asked])
+                ended = list(zip(asked, records, strict=True))
+                study.tell([r.margin + self._penalty(values, failures) for values, r in ended])
+                flown += ended
+        return flown
 
-    def _candidates(
-        self, flown: Sequence[tuple[Values, Record]], count: int
-    ) -> list[tuple[Values, Record]]:
+    def _worst(self, flown: Sequence[tuple[Values, Record]], count: int) -> list[Values]:
         """The worst failures that are not near each other."""
         chosen: list[tuple[Values, Record]] = []
         for values, record in sorted(flown, key=lambda each: each[1].margin):
@@ -170,7 +157,7 @@ class FailureSearch:
             )
             if record.margin < 0.0 and not near and len(chosen) < count:
                 chosen.append((values, record))
-        return chosen
+        return [values for values, _ in chosen]
 
     def _distance(self, values: Values, other: Values) -> float:
         """Root mean square of the differences, as shares of the ranges."""
@@ -186,62 +173,40 @@ class FailureSearch:
         nearest = min((self._distance(values, other) for other in failures), default=NEAR)
         return PENALTY * max(0.0, 1.0 - nearest / NEAR)
 
-    # --- failures ---
-
     def _reduced(self, points: Sequence[Values], fly: Fly) -> list[Failure]:
-        """The failures at `points`, reduced side by side: one flight of each at a time."""
-        reductions = [self._reduction(point) for point in points]
-        cases = [next(reduction) for reduction in reductions]
-        failures: dict[int, Failure] = {}
-        while len(failures) < len(points):
-            active = [at for at in range(len(points)) if at not in failures]
-            records = fly([cases[at] for at in active])
-            for at, record in zip(active, records, strict=True):
-                try:
-                    cases[at] = reductions[at].send(record)
-                except StopIteration as done:
-                    failures[at] = done.value
-        return [failures[at] for at in range(len(points))]
+        """The failures at `points`, reduced side by side: values return to their defaults, those
+        that are nearest to them first, as long as the flight still fails."""
+        defaults, ranges = self._defaults(), self._search.ranges
 
-    def _reduction(self, point: Values) -> Generator[Case, Record, Failure]:
-        """Return values to their defaults, those that are nearest to them first. Yields the case to
-        fly next, and takes its record."""
-        chosen = dict(point)
-        defaults = self._defaults()
-        scale = {key: high - low for key, (low, high) in self._search.ranges.items()}
+        def change(value: tuple[str, float]) -> float:
+            low, high = ranges[value[0]]
+            return abs(value[1] - defaults[value[0]]) / (high - low)
 
-        def change(key: str) -> float:
-            return float(abs(chosen[key] - defaults[key]) / scale[key])
-
-        record = yield self._case(tuple(chosen.items()))
-        for key in sorted(chosen, key=change):
-            trial = {**chosen, key: defaults[key]}
-            shorter = yield self._case(tuple(trial.items()))
-            if shorter.margin < 0.0:
-                chosen, record = trial, shorter
-        changed = tuple((key, v) for key, v in chosen.items() if v != defaults[key])
-        return Failure(self._case(tuple(chosen.items())), record, changed, 0, 0)
+        reduced = [dict(point) for point in points]
+        orders = [[key for key, _ in sorted(point, key=change)] for point in points]
+        records = fly([self._case(values) for values in reduced])
+        for keys in zip(*orders, strict=True):
+            trials = [
+                {**values, key: defaults[key]} for values, key in zip(reduced, keys, strict=True)
+            ]
+            for at, record in enumerate(fly([self._case(values) for values in trials])):
+                if record.margin < 0.0:
+                    reduced[at], records[at] = trials[at], record
+        return [
+            Failure(self._case(values), record, _changed(values, defaults), 0, 0)
+            for values, record in zip(reduced, records, strict=True)
+        ]
 
     def _at_seeds(self, failures: Sequence[Failure], fly: Fly) -> list[Failure]:
         """The failures, each flown at `seeds` more seeds."""
-        seeds = self._search.seeds
-        records = fly(
-            [
-                replace(each.case, seed=each.case.seed + more)
-                for each in failures
-                for more in range(1, seeds + 1)
-            ]
-        )
-        return [
-            replace(
-                failure,
-                failing=sum(r.margin < 0.0 for r in records[at * seeds : (at + 1) * seeds]),
-                seeds=seeds,
-            )
-            for at, failure in enumerate(failures)
-        ]
-
-    # --- cases ---
+        found = []
+        for failure in failures:
+            case = failure.case
+            seeds = range(case.seed + 1, case.seed + 1 + self._search.seeds)
+            records = fly([replace(case, seed=seed) for seed in seeds])
+            failing = sum(record.margin < 0.0 for record in records)
+            found.append(replace(failure, failing=failing, seeds=len(records)))
+        return found
 
     def _defaults(self) -> dict[str, float]:
         ranges = self._search.ranges
@@ -253,10 +218,14 @@ class FailureSearch:
             middle[SEED] = float(self._base.seed)
         return middle | self._search.defaults
 
-    def _case(self, values: Values) -> Case:
-        seed = round(dict(values).get(SEED, self._base.seed))
-        own = tuple((key, value) for key, value in values if key != SEED)
+    def _case(self, values: Mapping[str, float]) -> Case:
+        seed = round(values.get(SEED, self._base.seed))
+        own = tuple((key, value) for key, value in values.items() if key != SEED)
         return replace(self._base.with_values((*self._base.values, *own)), seed=seed)
+
+
+def _changed(values: Mapping[str, float], defaults: Mapping[str, float]) -> Values:
+    return tuple((key, value) for key, value in values.items() if value != defaults[key])
 
 
 def search_of(campaign: Campaign, source: str) -> FailureSearch:

@@ -54,7 +54,6 @@ SHOWN = (
     ("solve_time_p99_ms", "decision\n[ms]"),
 )
 DEFAULT_WIDTH = 80  # of a terminal
-NARROW = 3  # figures that are shown where it is narrower
 LEGEND = (
     "RMSE, maximum: position error, medians of all flights [lowest\N{EN DASH}highest]. "
     "tilt, rates: motion beside the reference's, RMS. decision: 99th percentile of its time.",
@@ -247,18 +246,17 @@ def digits(value: float) -> str:
 
 def show(console: Console, flown: Sequence[Group]) -> None:
     """Print the groups, a block below each other, the legend and why flights failed."""
-    shown = SHOWN if console.width >= DEFAULT_WIDTH else SHOWN[:NARROW]
     table = Table(box=None, pad_edge=False)
     separator = " " if console.width > DEFAULT_WIDTH else "\n"
     table.add_column("controller", overflow="fold")
-    for _, title in shown:
+    for _, title in SHOWN:
         table.add_column(Text(title), justify="right", no_wrap=True)
     for block, members in itertools.groupby(flown, lambda group: group.block):
         table.add_row(Text(f"\n{block}", "bold"))
         for group in members:
             mark, style = ("*", "bold") if group.best else (" ", "" if group.successes else "red")
             part = f" ({group.successes} of {group.flights})" if group.failed else ""
-            medians = [digits(group.spread(figure)[1]) for figure, _ in shown[1:]]
+            medians = [digits(group.spread(figure)[1]) for figure, _ in SHOWN[1:]]
             cells = (group.shown(ERROR).replace(" ", separator), *medians)
             table.add_row(Text(f"{mark} {group.name}{part}"), *map(Text, cells), style=style)
     console.print(table)

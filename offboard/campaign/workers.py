@@ -8,29 +8,39 @@ from __future__ import annotations
 
 import itertools
 import logging
+import multiprocessing
 import os
+import re
+import signal
+import threading
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, CancelledError, Executor
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    wait,
+)
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
-from offboard.campaign.flight import Job, fly_job, recorded
-from offboard.campaign.margin import NOT_FLOWN
-from offboard.campaign.processes import open_worker, processors, run_all
+from offboard.campaign.flight import NOT_FLOWN, Job, fly_job, recorded
 from offboard.campaign.results import Record
-from offboard.documents.arguments import join_address, split_address
 from offboard.documents.errors import UserError, shown
 from offboard.documents.extras import install
 from offboard.flight.flight import STOPPED
 from offboard.flight.phases import ExitCode
-from offboard.link.stream_sources import connect
 from offboard.run.flight import Connection, fly
 
 CONNECT_S = 5.0
-SCHEMES = ("tcp", "tls")
+POLL_S = 0.2
 QUEUED = 2  # flights per thread of a cluster, so that none waits for us
+ORPHANED = 1  # exit code of a worker whose parent has ended
 DIED = Record(
     ExitCode.ABORTED, "the process that flew it ended, twice", NOT_FLOWN, "crash"
 )  # as its worker cannot tell
@@ -48,52 +58,80 @@ class Flyer(Protocol):
 OpenFlyer = Callable[[], AbstractContextManager[Flyer]]
 
 
-@dataclass(frozen=True, slots=True)
 class Workers:
-    """An open set of workers. `check` raises UserError when they are lost."""
+    """An open set of `width` workers.
 
-    width: int
-    open_one: Callable[[], AbstractContextManager[Executor]]
-    check: Callable[[], None] = lambda: None
+    `open_pool` makes their executor when the first flight begins, and a new one after a worker has
+    died. `lost`: the sentence for a cluster that is gone.
+    """
+
+    def __init__(self, width: int, open_pool: Callable[[], Executor], lost: str = "") -> None:
+        self._width = width
+        self._open_pool = open_pool
+        self._lost = lost
+        self._pool: Executor | None = None
 
     def fly(self, jobs: Sequence[Job], ending: Callable[[], bool]) -> Iterator[tuple[Job, Record]]:
-        """Fly jobs, as a `Flyer` does, in any order. A flight whose worker dies is flown a second
-        time; if that worker dies too, `DIED` is its record."""
+        """Fly jobs, as a `Flyer` does, in any order.
+
+        A worker that dies takes the flights of all workers with it. Each of them is flown again,
+        alone; `DIED` is the record of one whose worker dies again.
+        """
         again: list[Job] = []
-        for job, result in self._run(jobs, ending):
-            if isinstance(result, BrokenExecutor):
+        for job, record in self._run(jobs, ending):
+            if record is None:
                 again.append(job)
             else:
-                yield job, _record_of(result)
-        for job, result in self._run(again, ending):
-            yield job, DIED if isinstance(result, BrokenExecutor) else _record_of(result)
+                yield job, record
+        for job in again:
+            for _, record in self._run([job], ending):
+                yield job, record or DIED
 
     def _run(
         self, jobs: Sequence[Job], ending: Callable[[], bool]
-    ) -> Iterator[tuple[Job, Record | BaseException]]:
-        def watched() -> bool:
-            self.check()
-            return ending()
+    ) -> Iterator[tuple[Job, Record | None]]:
+        """Fly jobs side by side; without a record where a worker died."""
+        waiting = deque(jobs)
+        busy: dict[Future[Record], Job] = {}
+        while busy or waiting:
+            if ending():
+                waiting.clear()
+            while waiting and len(busy) < self._width:
+                job = waiting.popleft()
+                busy[self._submit(job)] = job
+            for done in wait(busy, POLL_S, FIRST_COMPLETED).done:
+                yield busy.pop(done), self._record(done)
 
-        for job, result in run_all(jobs, fly_job, self.open_one, self.width, watched):
-            if isinstance(result, CancelledError):  # of a cluster that is lost
-                self.check()
-            yield job, _killed(result)
+    def _submit(self, job: Job) -> Future[Record]:
+        if self._pool is None:
+            self._pool = self._open_pool()
+        try:
+            return _masked(self._pool, job)
+        except BrokenExecutor:
+            self._pool = self._open_pool()
+            return _masked(self._pool, job)
+
+    def _record(self, done: Future[Record]) -> Record | None:
+        try:
+            return done.result()
+        except CancelledError:
+            raise UserError(self._lost) from None
+        except Exception as error:
+            if (
+                isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker"
+            ):  # dask's
+                return None
+            raise
 
 
-def _killed(result: Record | BaseException) -> Record | BaseException:
-    """dask's own error for a worker that died, as that of an executor."""
-    if type(result).__name__ == "KilledWorker":
-        return BrokenExecutor(str(result))
-    return result
-
-
-def _record_of(result: Record | BaseException) -> Record:
-    if isinstance(result, CancelledError):
-        raise UserError("the dask scheduler was lost")
-    if isinstance(result, BaseException):
-        raise result
-    return result
+def _masked(pool: Executor, job: Job) -> Future[Record]:
+    """Submit a job. A process that starts for it inherits the mask: Ctrl-C is for the main process
+    alone. Not around the pool's creation: multiprocessing's tracker, begun there, ends the mask."""
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        return pool.submit(fly_job, job)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,27 +182,50 @@ def _move_aside(directory: Path) -> None:
 
 @contextmanager
 def local_workers(count: int | None) -> Iterator[Workers]:
-    """Worker processes of this computer, each opened when it is first needed. They stay, with
-    their code loaded, from one `Workers.fly` to the next."""
-    idle: list[Executor] = []
+    """Worker processes of this computer, each started when it is first needed."""
+    width = count or processors()
     with ExitStack() as stack:
-
-        @contextmanager
-        def open_one() -> Iterator[Executor]:
-            idle[:] = [worker for worker in idle if _lives(worker)]
-            worker = idle.pop() if idle else stack.enter_context(open_worker())
-            yield worker
-            idle.append(worker)
-
-        yield Workers(count or processors(), open_one)
+        yield Workers(width, lambda: stack.enter_context(_processes(width)))
 
 
-def _lives(worker: Executor) -> bool:
+def processors() -> int:
+    """The number of processors that this process may use (Linux), or that there are."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@contextmanager
+def _processes(width: int) -> Iterator[Executor]:
+    """An executor of processes. An exception in the block kills them; otherwise they end when their
+    work is done."""
+    # spawn: a forked child would share compiled code and threads in unknown states
+    context = multiprocessing.get_context("spawn")
+    os.environ["PYTHONSAFEPATH"] = "1"  # of the child: as `python -P`
+    # of multiprocessing's tracker: it deletes the semaphores of a killed process, and warns of it
+    os.environ.setdefault("PYTHONWARNINGS", "ignore::UserWarning:multiprocessing.resource_tracker")
+    pool = ProcessPoolExecutor(width, mp_context=context, initializer=_start)
     try:
-        worker.submit(os.getpid).result()
-    except BrokenExecutor:
-        return False
-    return True
+        yield pool
+    except BaseException:
+        for child in multiprocessing.active_children():
+            child.kill()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _start() -> None:
+    """In the worker: leave the terminal's process group, and end when the parent ends."""
+    os.setpgrp()
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def follow() -> None:
+        parent.join()
+        os._exit(ORPHANED)
+
+    threading.Thread(target=follow, daemon=True).start()
 
 
 @contextmanager
@@ -179,35 +240,18 @@ def cluster_workers(address: str) -> Iterator[Workers]:
         raise UserError(f"--scheduler needs dask: {install('cluster')}") from None
     for logger in ("distributed", "distributed.client"):  # a scheduler that is lost is our sentence
         logging.getLogger(logger).setLevel(logging.CRITICAL)
-    kind, host, port = _split(address)
+    if not re.fullmatch(r"(tcp|tls)://\S+:[0-9]{1,5}", address):
+        raise UserError(f"--scheduler {shown(address)}: give tcp://HOST:PORT, or tls://HOST:PORT")
     try:
-        connect(host, port).close()  # at once, where dask tries for the whole of its timeout
-        client = Client(
-            f"{kind}://{join_address(host, port)}", timeout=CONNECT_S, set_as_default=False
-        )
-    except (OSError, UnicodeError) as error:
-        reason = " ".join((getattr(error, "strerror", None) or str(error)).split())
-        raise UserError(f"no dask scheduler at {address}: {reason}") from None
+        client = Client(address, timeout=CONNECT_S, set_as_default=False)
+    except OSError as error:
+        reason = " ".join(str(error).split())
+        raise UserError(f"no dask scheduler at {shown(address)}: {reason}") from None
     try:
         threads = sum(client.nthreads().values())
         if not threads:
             raise UserError(f"the dask scheduler at {address} has no worker: start one")
-        executor = client.get_executor(pure=False)
-        yield Workers(
-            QUEUED * threads, lambda: nullcontext(executor), lambda: _check(client, address)
-        )
+        lost = f"the dask scheduler at {address} was lost"
+        yield Workers(QUEUED * threads, lambda: client.get_executor(pure=False), lost)
     finally:
         client.close(timeout=1.0)
-
-
-def _split(address: str) -> tuple[str, str, int]:
-    """Scheme, host and port. Raises UserError."""
-    kind, separator, place = address.rpartition("://")
-    if separator and kind not in SCHEMES:
-        raise UserError(f"--scheduler {shown(address)}: give tcp://HOST:PORT, or tls://HOST:PORT")
-    return kind or SCHEMES[0], *split_address("--scheduler", place)
-
-
-def _check(client: Any, address: str) -> None:
-    if client.status != "running":
-        raise UserError(f"the dask scheduler at {address} was lost")

@@ -14,7 +14,7 @@ import typer
 from offboard.cli.shared import CommandError, Workers, option, out, say
 
 if TYPE_CHECKING:
-    from offboard.campaign.run import Campaign, Shard, Summary
+    from offboard.campaign.run import Campaign, Summary
     from offboard.campaign.workers import OpenFlyer
 
 EXIT_CODES = (
@@ -71,15 +71,14 @@ def campaign(
         _search(flown, source, worst, open_workers)
 
 
-def _shard(text: str | None) -> Shard:
-    from offboard.campaign.run import WHOLE, Shard
-
+def _shard(text: str | None) -> slice:
+    """The cases of shard I/N: every N-th."""
     if text is None:
-        return WHOLE
+        return slice(None)
     matched = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
     if not matched or not 1 <= int(matched[1]) <= int(matched[2]):
         raise CommandError(f"--shard {text}: give I/N with I from 1 to N, for example 2/4")
-    return Shard(int(matched[1]), int(matched[2]))
+    return slice(int(matched[1]) - 1, None, int(matched[2]))
 
 
 @contextmanager

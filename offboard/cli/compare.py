@@ -85,12 +85,12 @@ def compare(
             keep="all",
         )
         directory = out_directory or FLIGHTS / f"compare-{clock.local_stamp()}"
-        flown = Campaign(file, "compare", directory, link=connect, whole=True)
+        flown = Campaign(file, "compare", directory, link=connect)
     vehicle_at_link = ConnectedVehicle(system, signing_key)
     open_flyer: OpenFlyer = (
         (lambda: nullcontext(vehicle_at_link)) if connect else partial(local_workers, workers)
     )
-    conclude(flown.fly(open_flyer, out, each=True), flown)
+    conclude(flown.fly(open_flyer, out), flown)
 
 
 def _parameter(assignment: str) -> tuple[str, tuple[Any]]:

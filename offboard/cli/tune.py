@@ -33,7 +33,7 @@ def tune(
     """
     check_new(profile, "--out")
     with out.status("planning"):
-        from offboard.campaign.margin import Promises
+        from offboard.campaign.document import Promises
         from offboard.campaign.progress import Counter
         from offboard.campaign.results import Results, code_hash
         from offboard.campaign.run import Runner

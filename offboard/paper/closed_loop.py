@@ -22,7 +22,7 @@ from offboard.model.predicted_state import PredictedState
 from offboard.model.state import EULER, PHI, PSI, THETA, THRUST, P, R, U, V, W, X, Z
 from offboard.model.vehicle import Vehicle
 from offboard.paper.controller import flyable_box, heading_frame
-from offboard.paper.extensions import INTEGRATED, ErrorIntegral
+from offboard.paper.extensions import INTEGRATED
 from offboard.paper.law import PAPER_STEP_S, PaperLaw, PaperSettings
 from offboard.paper.plant import (
     LinearPlant,
@@ -245,9 +245,6 @@ class _Controller:
         self._law = PaperLaw(
             self._dynamics, self._inputs, settings, lower, upper, terminal, seed=task.seed
         )
-        integral = settings.integral
-        self._integral = ErrorIntegral(integral, PAPER_STEP_S) if integral else None
-        self._at_bound = False
         self._exact = ExactMinimum(4)
         complete = heading_states if self._nonlinear else linear_states
         self.consistent = complete(path.samples, vehicle)
@@ -256,18 +253,18 @@ class _Controller:
 
     def inputs(self, k: int, state: Array) -> Array:
         """u(k) (4,) for the plant's state x(k) (12,)."""
-        integral = self._summed_error(k, state)
         nominal = None
         seen, target = self._in_axes_of_the_law(state, k + 1)
         if self._to_go:  # needs a reference that the model itself can follow
             seen, _ = self._in_axes_of_the_law(state, k)
             nominal = self._nominal[k]
             target = self._dynamics @ self.consistent[k] + self._inputs @ nominal
+        error = (state - self._path.tracked[k])[list(INTEGRATED)]
+        heading_rad = state[PSI] if self._nonlinear else 0.0
         started = monotonic_s()
-        move = self._law.move(seen, target, integral=integral, nominal=nominal)
+        move = self._law.move(seen, target, error=error, heading_rad=heading_rad, nominal=nominal)
         elapsed_s = monotonic_s() - started
         certificate = certify(move.problem, move.result, self._exact)
-        self._at_bound = certificate.at_bound
         self.quality.append((certificate.cost, certificate.spread, certificate.gap, elapsed_s))
         return move.inputs
 
@@ -279,17 +276,6 @@ class _Controller:
         samples = self._path.samples
         sample = FlatSample(*(getattr(samples, field.name)[k] for field in fields(samples)))
         return heading_frame(_predicted(state), sample)
-
-    def _summed_error(self, k: int, state: Array) -> Array | None:
-        if not self._integral:
-            return None
-        off = (state - self._path.tracked[k])[list(INTEGRATED)]
-        summed = self._integral.add(off, self._at_bound).copy()
-        if self._nonlinear:
-            cosine, sine = np.cos(state[PSI]), np.sin(state[PSI])
-            north, east = summed[0], summed[1]
-            summed[:2] = cosine * north + sine * east, cosine * east - sine * north
-        return summed
 
 
 def cost_to_go(settings: PaperSettings) -> Array:

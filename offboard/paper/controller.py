@@ -21,7 +21,6 @@ from offboard.model.linear import sampled_matrices
 from offboard.model.predicted_state import PredictedState
 from offboard.model.state import PHI, PSI, THETA, THRUST, P, R, U, W, X, Z
 from offboard.model.vehicle import Vehicle
-from offboard.paper.extensions import ErrorIntegral
 from offboard.paper.law import (
     PAPER_ARM_M,
     PAPER_INERTIA_KGM2,
@@ -74,7 +73,6 @@ class PaperController:
             seed=seed,
         )
         self._exact = ExactMinimum(len(lower))
-        self.reset()
 
     def decide(self, situation: Situation) -> Decision:
         target = situation.reference.sample(situation.state.time_s + self._step_s)
@@ -82,30 +80,25 @@ class PaperController:
             raise DecisionError("the predicted state is not finite")
         state, reference = heading_frame(situation.state, target)
         move = self._law.move(
-            state, reference, situation.remaining_s, integral=self._summed(situation)
+            state,
+            reference,
+            situation.remaining_s,
+            error=self._error(situation) if self._settings.integral else None,
+            heading_rad=situation.state.heading_rad,
         )
         if not math.isfinite(move.result.cost):
             raise DecisionError("the cost of this decision is not finite")
         certificate = certify(move.problem, move.result, self._exact)
-        self._held = certificate.at_bound
         return Decision(self._command(move, state, float(target.heading_rad)), certificate)
 
     def reset(self) -> None:
-        integral = self._settings.integral
         self._law.reset()
-        self._integral = ErrorIntegral(integral, self._step_s) if integral else None
-        self._held = False  # whether the last input was at its bound: the integral waits
 
-    def _summed(self, situation: Situation) -> Array | None:
-        """The integral (4,) in the heading frame; summed in NED, where a wind is constant."""
-        if not self._integral:
-            return None
+    def _error(self, situation: Situation) -> Array:
+        """The present error (4,) of position (NED) and heading."""
         state, now = situation.state, situation.reference.sample(situation.state.time_s)
         heading = wrap_pi(state.heading_rad - float(now.heading_rad))
-        error = np.append(state.position_ned_m - now.position_ned_m, heading)
-        summed = self._integral.add(error, self._held).copy()
-        summed[:3] = _turn(-state.heading_rad) @ summed[:3]
-        return summed
+        return np.append(state.position_ned_m - now.position_ned_m, heading)
 
     def _command(self, move: Move, state: Array, target_heading_rad: float) -> Command:
         gravity, limit = self._vehicle.gravity_mps2, self._vehicle.thrust_max_mps2

@@ -54,6 +54,14 @@ class ErrorIntegral:
         return self.value
 
 
+def along_heading(summed: Array, heading_rad: float) -> Array:
+    """A sum (4,) in axes along and across the nose; errors are summed in NED, in which a wind is
+    constant."""
+    cosine, sine = np.cos(heading_rad), np.sin(heading_rad)
+    north, east, down, heading = summed
+    return np.array([cosine * north + sine * east, cosine * east - sine * north, down, heading])
+
+
 def with_error_sum(dynamics: Array, inputs: Array, step_s: float) -> tuple[Array, Array, Array]:
     """A (16, 16) and B (16, 4) of [x, xi] from those of Eq. 14, and E (16, 12) of its reference.
 

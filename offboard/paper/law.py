@@ -15,15 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from offboard.control.quadratic import BoxQuadratic
+from offboard.control.quadratic import BoxQuadratic, at_bound
 from offboard.control.swarm import SwarmResult, SwarmSettings, minimise
 from offboard.documents.parameters import Parameters
 from offboard.paper.extensions import (
     INTEGRATED,
+    ErrorIntegral,
     IntegralSettings,
     LimitedBox,
     StateLimits,
     Weight,
+    along_heading,
     with_error_sum,
 )
 
@@ -92,10 +94,10 @@ class Move:
 class PaperLaw:
     """The law on any plant of Eq. 14: dynamics (12, 12), inputs (12, 4), lower and upper (4,).
 
-    Remembers the last input (for R_du) and the random stream; `reset` forgets both. `terminal`
-    (12, 12) replaces diag(Q): with the Riccati solution of the same weights the minimum is optimal
-    over an infinite horizon. The integral is summed by the caller, who knows the frame
-    (`ErrorIntegral`). Raises ValueError where this plant cannot keep the limits of the settings.
+    Remembers the last input (for R_du), the summed error and the random stream; `reset` forgets
+    them. `terminal` (12, 12) replaces diag(Q): with the Riccati solution of the same weights the
+    minimum is optimal over an infinite horizon. Raises ValueError where this plant cannot keep the
+    limits of the settings.
     """
 
     def __init__(
@@ -109,7 +111,7 @@ class PaperLaw:
         step_s: float = PAPER_STEP_S,
         seed: int = 0,
     ) -> None:
-        self._settings, self._seed = settings, seed
+        self._settings, self._seed, self._step_s = settings, seed, step_s
         self._lower = np.array(settings.lower if lower is None else lower, np.float64)
         self._upper = np.array(settings.upper if upper is None else upper, np.float64)
         weight = np.diag(settings.fitness) if terminal is None else terminal
@@ -130,8 +132,11 @@ class PaperLaw:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the last input and start the random stream anew."""
+        """Forget the last input and the summed error, and start the random stream anew."""
         self._previous = self._hover
+        integral = self._settings.integral
+        self._integral = ErrorIntegral(integral, self._step_s) if integral else None
+        self._held = False  # whether the last input was at its bound: the integral waits
         self._rng = np.random.default_rng(self._seed)
 
     def move(
@@ -140,24 +145,28 @@ class PaperLaw:
         reference_next: Array,
         remaining_s: Callable[[], float] | None = None,
         *,
-        integral: Array | None = None,
+        error: Array | None = None,
+        heading_rad: float = 0.0,
         nominal: Array | None = None,
     ) -> Move:
         """u(k) for the state x(k) (12,) towards x_ref(k+1) (12,), Eq. 27.
 
-        `integral` (4,) is the summed error xi(k), used where the settings weigh it; `nominal` (4,)
-        is u_nom, by default hover; `remaining_s` as in `swarm.minimise`.
+        `error` (4,) is the present one of `INTEGRATED`, NED, which is summed where the settings
+        weigh its sum; `heading_rad` is that of the axes of `state`. `nominal` (4,) is u_nom, by
+        default hover; `remaining_s` as in `swarm.minimise`.
         """
         bounds = self._limits.narrow(state) if self._limits else (self._lower, self._upper)
         whole = state
-        if self._extend_reference is not None:
-            summed = np.zeros(len(INTEGRATED)) if integral is None else integral
-            whole = np.concatenate([state, summed])
+        if self._integral and self._extend_reference is not None:
+            now = np.zeros(len(INTEGRATED)) if error is None else error
+            summed = self._integral.add(now, self._held)
+            whole = np.concatenate([state, along_heading(summed, heading_rad)])
             reference_next = self._extend_reference @ reference_next
         nominal = self._hover if nominal is None else nominal
         problem = BoxQuadratic(self._hessian, *self._slope(whole, reference_next, nominal), *bounds)
         result = minimise(self._settings.swarm, problem, self._rng, remaining_s=remaining_s)
         self._previous = result.best
+        self._held = at_bound(problem, result.best)
         following = whole @ self._dynamics.T + result.best @ self._inputs.T
         return Move(result.best, following[: len(state)], problem, result)
 

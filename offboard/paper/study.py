@@ -1,16 +1,15 @@
 """`offboard paper`: every table and figure of the study, written one after another, and their page.
 
 The run is serial; each table and figure takes its flights from one `Flights`, which flies each
-flight once. An interrupted run keeps what it has written; the page shows it and names the rest.
+flight once. An interrupted run keeps the tables and figures that it has written.
 """
 
 from __future__ import annotations
 
 import json
 import math
-import tempfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
 from pathlib import Path
@@ -97,15 +96,6 @@ class PaperOptions:
         return tuple(dict.fromkeys(chosen)) or (*known("table"), *known("figure"))
 
 
-@dataclass(slots=True)
-class Outcome:
-    """The page, and label -> table or figure; `missing` are the labels that an interrupt left."""
-
-    page: Path
-    made: dict[str, Table | Figure] = field(default_factory=dict)
-    missing: tuple[str, ...] = ()
-
-
 def known(kind: str) -> list[str]:
     """The labels of all tables or figures."""
     return [label for label in MAKERS if label.startswith(kind)]
@@ -130,21 +120,19 @@ def check(options: PaperOptions) -> None:
         options.out.mkdir(parents=True, exist_ok=True)
         if any(options.out.iterdir()):
             raise UserError(f"{options.out} is not empty; choose another directory with --out")
-        with tempfile.TemporaryFile(dir=options.out):
-            pass
     except OSError as error:
         raise _not_written(options.out, error) from None
 
 
-def reproduce(options: PaperOptions, console: Console | None = None) -> Outcome:
+def reproduce(options: PaperOptions, console: Console | None = None) -> dict[str, Table | Figure]:
     """Compute and write everything that `options` ask for, with progress on `console` (stderr).
 
     Writes table_NAME.csv and .json, figure_NAME.json, run.json and paper.html to `options.out`.
-    Raises UserError for invalid options or an output that cannot be written. After an interrupt
-    (KeyboardInterrupt) the page is written nevertheless.
+    Returns tables and figures by label. Raises UserError for invalid options or an output that
+    cannot be written.
     """
     check(options)
-    outcome = Outcome(options.out / PAGE)
+    made: dict[str, Table | Figure] = {}
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
     progress = Progress(*columns, TimeElapsedColumn(), console=console or Console(stderr=True))
     bar = progress.add_task("paper", total=len(options.labels))
@@ -160,23 +148,19 @@ def reproduce(options: PaperOptions, console: Console | None = None) -> Outcome:
         with progress:
             for label in options.labels:
                 progress.update(bar, description=label)
-                outcome.made[label] = MAKERS[label](flights)
-                _write(options.out, label, outcome.made[label])
+                made[label] = MAKERS[label](flights)
+                _write(options.out, label, made[label])
                 progress.advance(bar)
-    except KeyboardInterrupt:
-        outcome.missing = tuple(label for label in options.labels if label not in outcome.made)
+        facts = _facts(options)
+        (options.out / PAGE).write_text(page(made, facts), encoding="utf-8")
+        document = json.dumps({"run": facts}, indent=1) + "\n"
+        (options.out / "run.json").write_text(document, encoding="utf-8")
     except OSError as error:
         raise _not_written(options.out, error) from None
-    facts = _facts(options)
-    outcome.page.write_text(page(outcome.made, outcome.missing, facts), encoding="utf-8")
-    document = json.dumps({"run": facts, "missing": outcome.missing}, indent=1) + "\n"
-    (options.out / "run.json").write_text(document, encoding="utf-8")
-    return outcome
+    return made
 
 
-def page(
-    made: Mapping[str, Table | Figure], missing: tuple[str, ...], facts: Mapping[str, str]
-) -> str:
+def page(made: Mapping[str, Table | Figure], facts: Mapping[str, str]) -> str:
     """The page as text: tables and figures by label, and what describes the run."""
     sections = {
         title: {label: made[label] for label in pieces if label in made}
@@ -187,7 +171,6 @@ def page(
         title=TITLE,
         doi=DOI,
         facts=facts,
-        missing=[f"{label}: interrupted before it was finished" for label in missing],
         sections={title: pieces for title, pieces in sections.items() if pieces},
         shown=shown,
     )

@@ -13,7 +13,7 @@ import subprocess
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -25,11 +25,10 @@ from rich.console import Console
 
 from offboard.campaign import flight, workers
 from offboard.campaign.cases import Case, base_cases
-from offboard.campaign.document import CampaignFile, read_campaign
+from offboard.campaign.document import CampaignFile, Promises, read_campaign
 from offboard.campaign.flight import Job
-from offboard.campaign.margin import Promises
 from offboard.campaign.results import Record, Results, code_hash
-from offboard.campaign.run import WHOLE, Campaign, Shard, Summary
+from offboard.campaign.run import Campaign, Summary
 from offboard.campaign.workers import Workers, cluster_workers, local_workers
 from offboard.documents.errors import DocumentError, UserError
 
@@ -67,13 +66,13 @@ def campaign(text: str, directory: Path) -> Campaign:
 def inline() -> AbstractContextManager[Workers]:  # type: ignore[misc]
     """One worker in this process, whose code is loaded."""
     with ThreadPoolExecutor(1) as pool:
-        yield Workers(1, lambda: nullcontext(pool))
+        yield Workers(1, lambda: pool)
 
 
 def fly(
     flown: Campaign,
     open_workers: Callable[[], AbstractContextManager[Workers]] = inline,
-    shard: Shard = WHOLE,
+    shard: slice = slice(None),
 ) -> Summary:
     return flown.fly(open_workers, Console(file=io.StringIO()), shard)
 
@@ -163,7 +162,7 @@ def test_killed_and_continued_it_is_the_same_table(
 def test_shards_copied_together_are_the_same_table(whole: Path, tmp_path: Path) -> None:
     for number in (1, 2):
         own = tmp_path / f"shard{number}"
-        summary = fly(campaign(FILE, own), shard=Shard(number, 2))
+        summary = fly(campaign(FILE, own), shard=slice(number - 1, None, 2))
         assert (len(summary.rows), summary.missing, summary.mine_missing) == (1, 1, 0)
         shutil.copytree(own / "results", tmp_path / "out" / "results", dirs_exist_ok=True)
     flown = campaign(FILE, tmp_path / "out")
@@ -211,7 +210,7 @@ def test_a_scheduler_that_is_lost_is_one_sentence_and_keeps_what_is_finished(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("address", ["nonsense", "udp://127.0.0.1:9", "tcp://127.0.0.1:9"])
+@pytest.mark.parametrize("address", ["udp://127.0.0.1:9", "tcp://127.0.0.1:9"])
 def test_no_scheduler_is_a_sentence_at_once(address: str, spawn: Spawn) -> None:
     begun_s = time.monotonic()
     process = spawn("offboard", "campaign", "quick", "--out", "x", "--scheduler", address)
@@ -223,7 +222,7 @@ def test_no_scheduler_is_a_sentence_at_once(address: str, spawn: Spawn) -> None:
 
 def test_an_infeasible_case_is_a_row_with_its_reason(tmp_path: Path) -> None:
     flown = campaign(INFEASIBLE, tmp_path / "out")
-    fly(flown, shard=Shard(2, 2))  # the one at 400 m
+    fly(flown, shard=slice(1, None, 2))  # the one at 400 m
     (row,) = rows(tmp_path / "out")
     assert (row["exit_code"], row["success"], row["weakest"]) == ("2", "0", "infeasible")
     assert "landing from 400 m takes" in row["failed"]
@@ -232,19 +231,9 @@ def test_an_infeasible_case_is_a_row_with_its_reason(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        (("controllers: [lqr]", "controlers: [lqr]"), "did you mean controllers?"),
-        (
-            ("controllers: [lqr]", "controllers: []"),
-            "controllers: [] should have at least 1 item, not 0",
-        ),
         (("reference.height_m", "seed"), "parameters.seed: give the seeds with seeds"),
         (("[calm, px4_like]", "[{}, {conditions: {}}]"), "two are called 'unnamed'"),
-        (
-            ("require:", "seeds: 0\nrequire:"),
-            "seeds: 0 should be greater than or equal to 1",
-        ),
         (("[lqr]", "[lqg]"), "there is no controller named 'lqg'"),
-        (("identify.excite", "identify.exite"), "identify.exite is not a known key"),
         (("conditions.mass_scale", "conditions.mass"), "conditions.mass is not a known key"),
         (("[4, 5]", "[5, 4]"), "the range [5, 4] is empty"),
         (("rmse_position_m<", "rmse<"), "there is no figure 'rmse'"),
@@ -411,9 +400,3 @@ def test_interrupted_while_its_processes_load_it_ends_in_order(
     assert (process.returncode, errors.count("\n")) == (4, 1), errors
     assert "the process that flew it ended" not in output
     assert "flights are missing" in errors
-
-
-def test_quick_campaign_is_shipped() -> None:
-    file, _ = read_campaign("quick")
-    assert isinstance(file, CampaignFile)
-    assert file.kept == 3

@@ -31,8 +31,8 @@ RECORDING = Path(__file__).parents[1] / "wire" / "recordings" / "px4-1.16.1-offb
 FOLDERS = ("references", "controllers", "vehicles", "scenarios", "campaigns", "tunings", "")
 COMMANDS = tuple(typer.main.get_command(offboard).commands)  # type: ignore[attr-defined]
 CODES = {"fly": "0 1 2 3 4 130 141", "daemon": "0 2 3 4", "doctor": "0 2 3", "list": "",
-         **dict.fromkeys(("check", "report", "export", "key"), "0 2"),
-         **dict.fromkeys(("score", "identify", "paper", "replay"), "0 1 2"),
+         **dict.fromkeys(("check", "report", "export", "key", "paper"), "0 2"),
+         **dict.fromkeys(("score", "identify", "replay"), "0 1 2"),
          **dict.fromkeys(("campaign", "compare", "tune"), "0 1 2 4")}  # fmt: skip
 HELP = [(offboard, ()), *((offboard, (command,)) for command in COMMANDS), (simulator, ())]
 

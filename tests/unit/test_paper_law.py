@@ -103,14 +103,6 @@ def test_the_input_applied_last_is_what_r_du_holds_on_to() -> None:
     assert np.array_equal(again.problem.gradient, first.problem.gradient)
 
 
-def test_the_final_energy_weights_are_a_tenth_of_the_first() -> None:
-    """Eq. 34 against Eq. 24."""
-    first, final = PaperSettings.first_configuration(), PaperSettings()
-    assert np.array(final.energy) == pytest.approx(0.1 * np.array(first.energy), rel=1e-12)
-    assert first.fitness == (1,) * 12
-    assert first.rate == final.rate == (1, 1, 1, 1)
-
-
 # ---------------------------------------------------------------- over attitude setpoints
 
 
@@ -131,7 +123,7 @@ SUMMED = IntegralSettings(weights=(80.0, 80.0, 15.0, 50.0))
     [PaperSettings(attitude_lead=False), PaperSettings(attitude_lead=True),
      PaperSettings(integral=SUMMED)],
 )  # fmt: skip
-@pytest.mark.parametrize("heading", [0.7, 2.0, -2.9, 3.1])
+@pytest.mark.parametrize("heading", [-2.9, 3.1])
 def test_the_law_is_the_same_at_every_heading(heading: float, settings: PaperSettings) -> None:
     """With the sum of three decisions, where there is one."""
     controller = PaperController(PAPER, settings)
@@ -197,48 +189,6 @@ def test_an_input_accelerates_every_vehicle_as_it_does_the_papers(vehicle: Vehic
     assert thrusts[0] == pytest.approx(0.0, abs=1e-12)
     assert thrusts[1] <= vehicle.thrust_max_mps2 + 1e-12
     assert upper[0] <= 3.942
-
-
-def settled_flight(vehicle: Vehicle, lead: bool, seconds: float) -> tuple[Array, Array]:
-    """Distance and heading per decision, from (1, 0.5, -0.5) m and 0.3 rad off a point at heading
-    2 rad, over an attitude loop of the vehicle's and a point mass with its drag."""
-    controller = PaperController(vehicle, PaperSettings(attitude_lead=lead))
-    reference = Straight(np.zeros(3), np.zeros(3), 2.0)
-    g, h = vehicle.gravity_mps2, 0.01
-    position, velocity = np.array([1.0, 0.5, -0.5]), np.zeros(3)
-    attitude, rates = np.array([0.0, 0.0, 2.3]), np.zeros(3)
-    loops = (vehicle.tilt, vehicle.tilt, vehicle.yaw)
-    wn, z = (
-        np.array([getattr(x, k) for x in loops]) for k in ("natural_frequency_radps", "damping")
-    )
-    command = HOVER
-    distances, headings = [], []
-    for tick in range(round(seconds / 0.1)):
-        state = replace(state_at(position, velocity, *attitude, rates=rates), time_s=0.1 * tick)
-        command = controller.decide(Situation(0.1 * tick, state, reference, command)).command
-        b, psi = np.array(command.thrust_direction_ned), command.heading_rad
-        aligned = Rotation.from_euler("Z", -psi).apply(b)
-        sent = np.array([-np.arcsin(aligned[1]), np.arctan2(aligned[0], aligned[2]), psi])
-        for _ in range(10):
-            rates = rates + h * (wn**2 * (sent - attitude) - 2 * z * wn * rates)
-            attitude = attitude + h * rates
-            down = Rotation.from_euler("ZYX", attitude[::-1]).as_matrix()[:, 2]
-            pull = np.array([0, 0, g]) - command.thrust_mps2 * down
-            velocity = velocity + h * (pull - vehicle.drag_per_mass_ps * velocity)
-            position = position + h * velocity
-        distances.append(np.linalg.norm(position))
-        headings.append(attitude[2])
-    return np.array(distances), np.array(headings)
-
-
-@pytest.mark.parametrize("lead", [False, True])
-@pytest.mark.parametrize("vehicle", VEHICLES.values(), ids=VEHICLES.keys())
-def test_it_flies_and_creeps_towards_its_point(vehicle: Vehicle, lead: bool) -> None:
-    """39 s horizontally: what one step ahead can do, and why there is a cost-to-go."""
-    distances, headings = settled_flight(vehicle, lead, 30.0)
-    assert np.all(np.diff(distances[20:]) < 0)
-    assert distances[-1] / distances[99] == pytest.approx(np.exp(-20 / 37), rel=0.08)
-    assert headings[-1] == pytest.approx(2.0, abs=0.01)
 
 
 def test_a_turn_goes_the_short_way_round() -> None:
@@ -324,6 +274,18 @@ def test_integral_sums_holds_and_stays_within_its_limits() -> None:
     np.testing.assert_allclose(integral.add(np.ones(4), held=True), [0.1, -0.2, 0, 0.05])
     np.testing.assert_allclose(integral.add(np.full(4, np.nan)), [0.1, -0.2, 0, 0.05])
     np.testing.assert_allclose(integral.add(np.array([1e3, -1e3, 0, 0])), [1, -1, 0, 0.05])
+
+
+def test_the_error_is_not_summed_while_an_input_is_at_its_bound() -> None:
+    settings = PaperSettings(rate=(0, 0, 0, 0), integral=SUMMED)
+    law = PaperLaw(*sampled_matrices(PAPER, 0.1), settings)
+    for down_m, held in ((1000.0, True), (0.01, False)):
+        law.reset()
+        target = np.zeros(12)
+        target[11] = down_m
+        moves = [law.move(np.zeros(12), target, error=np.full(4, 1e-3)) for _ in range(2)]
+        first, second = (move.problem.gradient for move in moves)
+        assert np.array_equal(first, second) == held
 
 
 def body_z(roll: float, pitch: float) -> Array:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from scipy.linalg import solve_discrete_are
 
+from offboard.analysis.figure import Figure
 from offboard.control.swarm import certify
 from offboard.documents.errors import UserError
 from offboard.paper import closed_loop, errata, horizon, printed, study, tables
@@ -32,7 +33,7 @@ from offboard.paper.plant import (
     paper_model,
     paper_vehicle,
 )
-from offboard.paper.study import Outcome, PaperOptions, check, reproduce
+from offboard.paper.study import PAGE, PaperOptions, check, reproduce
 from offboard.run.configuration import load
 
 Array = NDArray[np.float64]
@@ -102,31 +103,6 @@ def test_the_cost_to_go_makes_one_step_the_lqr() -> None:
 def test_time_constant_by_horizon(steps: int, time_constant_s: float) -> None:
     slowest = abs(receding(*paper_model(), Q, R, RATE, steps)[0])
     assert -0.1 / math.log(slowest) == pytest.approx(time_constant_s, rel=5e-3)
-
-
-def test_two_steps_against_least_squares() -> None:
-    """The first input of the stacked two-step problem, solved without a recursion."""
-    a, b = paper_model()
-    root_q, root_r, root_s = np.sqrt(Q), np.sqrt(R), np.sqrt(RATE)
-    zero = np.zeros((4, 4))
-    rows = np.vstack(
-        [
-            np.hstack([root_q @ b, np.zeros((12, 4))]),
-            np.hstack([root_q @ a @ b, root_q @ b]),
-            np.hstack([root_r, zero]),
-            np.hstack([zero, root_r]),
-            np.hstack([root_s, zero]),
-            np.hstack([-root_s, root_s]),
-        ]
-    )
-    from_state = np.vstack([root_q @ a, root_q @ a @ a, np.zeros((16, 12))])
-    from_held = np.zeros((40, 4))
-    from_held[32:36] = -root_s
-    first = -np.linalg.pinv(rows)[:4] @ np.hstack([from_state, from_held])
-    closed = np.block([[a + b @ first[:, :12], b @ first[:, 12:]], [first]])
-    expected = np.sort(np.abs(np.linalg.eigvals(closed)))[::-1]
-    found = np.abs(receding(a, b, Q, R, RATE, 2))
-    np.testing.assert_allclose(found[:8], expected[:8], rtol=1e-6)
 
 
 def test_a_long_horizon_is_the_infinite_one() -> None:
@@ -338,20 +314,23 @@ def test_coupled_axes_are_refused() -> None:
 # ---------------------------------------------------------------- the run and its page
 
 
+Run = tuple[PaperOptions, dict[str, tables.Table | Figure]]
+
+
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """Everything, with flights of 5 s."""
     options = PaperOptions(tmp_path_factory.mktemp("paper"), quick=True)
     with pytest.MonkeyPatch.context() as short:
         short.setattr(closed_loop, "fly", lambda task: fly(replace(task, steps=50)))
-        return reproduce(options, Console(file=io.StringIO()))
+        return options, reproduce(options, Console(file=io.StringIO()))
 
 
 @pytest.mark.slow
-def test_the_page_opens_without_a_network_and_shows_everything(run: Outcome) -> None:
-    assert list(run.made) == list(PaperOptions(run.page).labels)
-    assert not run.missing
-    with opening(run.page) as opened:
+def test_the_page_opens_without_a_network_and_shows_everything(run: Run) -> None:
+    options, made = run
+    assert list(made) == list(options.labels)
+    with opening(options.out / PAGE) as opened:
         drawn = _drawn(opened)
         assert opened.fetched == []
         for scheme in ("dark", "light"):
@@ -372,7 +351,7 @@ def test_the_page_opens_without_a_network_and_shows_everything(run: Outcome) -> 
         assert height > 300, name
     assert {name for name, _ in shown} == set(study.known("table"))
     for name, count in shown:
-        table = run.made[name]
+        table = made[name]
         assert isinstance(table, tables.Table)
         assert count == len(table.rows)
 
@@ -388,8 +367,8 @@ def _drawn(opened: Opened) -> list[tuple[str, bool, int, int]]:
 
 
 @pytest.mark.slow
-def test_csv_and_json_say_the_same(run: Outcome) -> None:
-    out = run.page.parent
+def test_csv_and_json_say_the_same(run: Run) -> None:
+    out = run[0].out
     lines = list(csv.DictReader((out / "table_horizon.csv").open(encoding="utf-8")))
     document = json.loads((out / "table_horizon.json").read_text(encoding="utf-8"))
     assert [row["law"] for row in lines] == [row["law"] for row in document["rows"]]
@@ -413,26 +392,3 @@ def test_bad_options_are_one_sentence(
         check(PaperOptions(tmp_path / "never", **changes))
     assert sentence in str(caught.value)
     assert not (tmp_path / "never").exists()
-
-
-def test_an_output_that_is_a_file_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match="cannot be written"):
-        check(PaperOptions(tmp_path / "file" / "below"))
-
-
-def test_an_interrupt_keeps_what_is_finished_and_names_the_rest(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(closed_loop, "fly", interrupted)
-    options = PaperOptions(tmp_path, initial_q=(2.0,), figures=("11",), tables=("bd",))
-    assert options.first_settings.fitness == (2.0,) * 12
-    outcome = reproduce(options, Console(file=io.StringIO()))
-    assert list(outcome.made) == ["table bd"]
-    assert outcome.missing == ("figure 11",)
-    assert "figure 11: interrupted" in outcome.page.read_text(encoding="utf-8")
-    names = {path.name for path in tmp_path.iterdir()}
-    assert names == {"table_bd.csv", "table_bd.json", "paper.html", "run.json"}

@@ -14,13 +14,12 @@ import pytest
 from rich.console import Console
 
 from offboard.campaign.cases import Case
-from offboard.campaign.document import read_campaign
+from offboard.campaign.document import Promises, read_campaign
 from offboard.campaign.flight import Job
-from offboard.campaign.margin import Promises
 from offboard.campaign.progress import Counter
 from offboard.campaign.results import Record, Results
 from offboard.campaign.run import Campaign, Incomplete, Runner
-from offboard.campaign.search import Failure, Study, as_csv, find, search_of
+from offboard.campaign.search import Failure, as_csv, find, search_of
 from offboard.campaign.tune import Tuned, Tuning, judge, profile, read_tune
 from offboard.documents.errors import DocumentError, UserError
 from offboard.run.configuration import load
@@ -71,7 +70,7 @@ def two_regions(case: Case) -> Record:
     rough = max(3.0 - at[EAST], 4.0 * (0.8 - at[GUSTS]))
     margins = {"error": hot, "tilt": rough}
     weakest = min(margins, key=lambda name: margins[name])
-    return Record(0, "flown and landed", margins[weakest], weakest, {}, margins)
+    return Record(0, "flown and landed", margins[weakest], weakest)
 
 
 def searched(directory: Path, most: float = math.inf) -> tuple[Campaign, list[Failure]]:
@@ -114,22 +113,6 @@ def test_a_search_without_its_package_flies_nothing(
     with pytest.raises(UserError, match="a search needs optuna"):
         searched(tmp_path)
     assert not list(tmp_path.rglob("*.json"))
-
-
-def test_a_study_finds_a_corner_that_random_points_miss() -> None:
-    """Six dimensions, 300 points: the mean distance of the best to the minimum, over two seeds."""
-    centre = np.array([0.9, 0.1, 0.8, 0.3, 0.95, 0.6])
-
-    def best(seed: int) -> float:
-        study = Study({f"x{number}": (0.0, 1.0) for number in range(6)}, seed)
-        for _ in range(15):
-            points = np.array([[value for _, value in values] for values in study.ask(20)])
-            study.tell(np.linalg.norm(points - centre, axis=1).tolist())
-        return study.best[1]
-
-    uniform = np.random.default_rng(1).random((2, 300, 6))
-    random = np.linalg.norm(uniform - centre, axis=2).min(axis=1)
-    assert np.mean([best(1), best(2)]) < 0.5 * np.mean(random)
 
 
 TUNE = """
@@ -187,13 +170,12 @@ def test_what_is_better_only_in_training_is_refused(tmp_path: Path) -> None:
     assert not tuned(tmp_path / "t", record=lambda case: bowl(case, 0.5)).verdict.better
 
 
-@pytest.mark.parametrize("flights", [2, pytest.param(50, marks=pytest.mark.slow)])
-def test_an_interrupted_tuning_goes_on_and_finds_the_same(flights: int, tmp_path: Path) -> None:
-    """The first trial, of four flights, has the present values also if it was interrupted."""
+def test_an_interrupted_tuning_goes_on_and_finds_the_same(tmp_path: Path) -> None:
+    """A trial is four flights; the first has the present values, also if it was interrupted."""
     costs: list[float] = []
     with pytest.raises(Incomplete):
-        tuned(tmp_path / "t", most=flights, told=lambda number, cost: costs.append(cost))
-    assert len(costs) == flights // 4
+        tuned(tmp_path / "t", most=10, told=lambda number, cost: costs.append(cost))
+    assert len(costs) == 2
     costs.clear()
     found = tuned(tmp_path / "t", told=lambda number, cost: costs.append(cost))
     assert len(costs) == 40
@@ -207,9 +189,7 @@ def test_an_interrupted_tuning_goes_on_and_finds_the_same(flights: int, tmp_path
         (("[gusts, noise]", "[calm, noise]"), "2 flights are in training and in validation"),
         (("feedback_limit", "feedback"), "ranges.controller.feedback is no number"),
         (("trials: 40", "objective: solve_time_p50_ms"), "is no figure of a lockstep flight"),
-        (("trials: 40", "trails: 40"), "did you mean trials?"),
         ((LIMIT, "scenario.conditions.mass_scale"), "no scenario and no vehicle is tuned"),
-        ((LIMIT, "vehicle.tilt.delay_s"), "no scenario and no vehicle is tuned"),
     ],
 )
 def test_a_file_that_cannot_be_tuned_is_refused(
@@ -227,3 +207,6 @@ def test_a_verdict_needs_a_difference_that_is_no_chance() -> None:
     assert not judge(base, base + noise - noise.mean()).better
     assert not judge(base, base + 0.02).better
     assert not judge(base, base).better  # the same: p = 1
+    crashed = base - 0.02
+    crashed[0] = 5.0  # nineteen are better, but one is not completed
+    assert not judge(base, crashed).better
