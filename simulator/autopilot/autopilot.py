@@ -1,7 +1,7 @@
 """One autopilot on one plant, step by step: it controls the plant and then handles events.
 
-The commander decides about modes, the navigator chooses the motion, the position controller flies
-it, health and monitors report what changes without a request. Knows no MAVLink frames, sockets or
+The commander decides about modes, the guidance chooses the motion, the position controller flies
+it, health reports what changes without a request. Knows no MAVLink frames, sockets or
 clock: its time is the plant's.
 """
 
@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from simulator.autopilot.behaviours import BEHAVIOURS
 from simulator.autopilot.commander import NO_REQUEST, Commander, Request
 from simulator.autopilot.guidance import Guidance
-from simulator.autopilot.health import MONITOR_STEPS, Health, Monitors
+from simulator.autopilot.health import MONITOR_STEPS, Health
 from simulator.autopilot.mission import Mission
-from simulator.autopilot.navigator import Navigator
 from simulator.autopilot.parameters import ParameterTable
 from simulator.autopilot.position_controller import PositionController
 from simulator.autopilot.setpoints import ATTITUDE, SetpointStream
@@ -48,15 +48,11 @@ class Autopilot:
         self.parameters = parameters or ParameterTable(firmware)
         self.mission = mission or Mission(firmware)
         self.state = VehicleState(plant)
-        self.monitors = Monitors(firmware, self.parameters)
         self.stream = SetpointStream(firmware, self.parameters)
-        self.guidance = Guidance(firmware, self.parameters, self.mission)
-        self.health = Health(self.guidance, self.stream, self.monitors, boot_scale)
-        self.navigator = Navigator(self.guidance)
-        self.position_controller = PositionController(self.navigator, self.state)
-        self.commander = Commander(
-            self.navigator, self.position_controller, self.state, self.health
-        )
+        self.guidance = Guidance(firmware, self.parameters, self.mission, BEHAVIOURS)
+        self.health = Health(firmware, self.parameters, self.mission, self.stream, boot_scale)
+        self.position_controller = PositionController(self.guidance, self.state)
+        self.commander = Commander(self.guidance, self.position_controller, self.state, self.health)
 
     def handle(self, event: str, request: Request = NO_REQUEST) -> Result:
         """Handle an event from outside; returns the acknowledgement."""
@@ -77,7 +73,7 @@ class Autopilot:
         if setpoint is None:
             return
         self.stream.newest_s = self.state.time_s
-        self.navigator.follow(setpoint)
+        self.guidance.follow(setpoint)
         self._end_takeoff()
         if isinstance(setpoint, AttitudeSetpoint) and setpoint.event:
             self.handle(setpoint.event)
@@ -87,13 +83,11 @@ class Autopilot:
         direction of flight."""
         self._end_takeoff()
         self.guidance.hold_at(place_ned_m, yaw_rad)
-        if self.navigator.behaviour is Behaviour.SETPOINT:
-            self.navigator.follow(self.guidance.hold)
 
     def _end_takeoff(self) -> None:
         """End the takeoff of a mode that follows setpoints."""
         behaviour = self.commander.mode.behaviour
-        if self.navigator.behaviour is not behaviour:
+        if self.guidance.behaviour is not behaviour:
             self.position_controller.enter(behaviour)
 
     def step(self) -> None:
@@ -124,5 +118,5 @@ class Autopilot:
             yield from commander.flight_time.timeout(now_s, controller.landed)
         if self.state.steps % MONITOR_STEPS == 0:
             battery, has_fix = self.state.truth.battery, self.state.gps_healthy
-            yield from self.monitors.step(now_s, commander.armed, battery, has_fix)
+            yield from self.health.monitor(now_s, commander.armed, battery, has_fix)
             yield from commander.due_events()

@@ -10,72 +10,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from enum import Enum
-from typing import ClassVar
 
-from simulator.autopilot.guidance import Guidance
+from simulator.autopilot.guidance import (
+    ActiveBehaviour,
+    Control,
+    Guidance,
+    stopping_place_ned_m,
+)
 from simulator.autopilot.state import StateEstimate
 from simulator.firmware.values import Behaviour, MotionSetpoint, ReturnYaw, Triple
 
 _FLATTEST = 1000.0  # takeoff: m across per m of climb
 _STILL_MPS = 0.05  # sticks: a slower demand holds the place
-
-
-class Control(Enum):
-    """What the position controller does in a behaviour."""
-
-    MOTION = "flies the motion that the behaviour demands"
-    LEVEL = "level attitude at the least throttle of the sticks"
-    UNCHANGED = "the last demand stays in force"
-
-
-class ActiveBehaviour:
-    """One behaviour; a new object each time that its mode is entered.
-
-    The defaults are those of automatic flight that starts in the air and does not end by itself.
-    """
-
-    control: ClassVar[Control] = Control.MOTION
-    lifts_off: ClassVar[bool] = False  # may leave the ground
-    continues: ClassVar[bool] = False  # a request for its mode does not start it again
-    cannot_climb = False  # a takeoff whose target is not above the vehicle
-
-    def __init__(self, guidance: Guidance) -> None:
-        self.guidance = guidance
-
-    def enter(self, estimate: StateEstimate, place_ned_m: Triple, *, landed: bool) -> None:
-        """Begin, before the first `motion`. `place_ned_m`: where a takeoff climbs to; NaN where it
-        is not specified."""
-
-    def leave(self) -> None:
-        """End: another behaviour begins."""
-
-    def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
-        """Motion demanded in this period; by default `guidance.hold`."""
-        return self.guidance.hold
-
-    def keeps_place(self, following: Behaviour) -> bool:
-        """The behaviour that follows holds the same place; else it holds where it stops."""
-        return False
-
-    @property
-    def landing(self) -> bool:
-        """In the final descent."""
-        return False
-
-    @property
-    def climbing(self) -> bool:
-        """In an automatic takeoff."""
-        return False
-
-    @property
-    def automatic(self) -> bool:
-        """Speeds and turn rates are those of automatic flight."""
-        return True
-
-    @property
-    def speed_mps(self) -> float:
-        """Horizontal speed limit of this behaviour."""
-        return math.inf
 
 
 class Hold(ActiveBehaviour):
@@ -264,7 +210,7 @@ class FlyBySticks(ActiveBehaviour):
         velocity, acceleration, climb_mps, turn_radps = demand
         if landed and climb_mps <= 0.0:
             return descend
-        (x, y, z), stop = guidance.hold_ned_m, guidance.stopping_place_ned_m(estimate)
+        (x, y, z), stop = guidance.hold_ned_m, stopping_place_ned_m(estimate)
         moves = math.hypot(*velocity) > _STILL_MPS
         x, y = stop[:2] if moves else (x, y)
         guidance.hold = MotionSetpoint((x, y, stop[2] if climb_mps else z))
@@ -297,7 +243,7 @@ class FollowSetpoint(ActiveBehaviour):
     continues = True
 
     def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
-        setpoint = self.guidance.setpoint
+        setpoint = self.guidance.newest
         if isinstance(setpoint, MotionSetpoint):
             self.cannot_climb = False
             return setpoint

@@ -12,15 +12,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from simulator.autopilot.behaviours import BEHAVIOURS
+from simulator.autopilot.guidance import Guidance
 from simulator.autopilot.health import FlightTime, Health
-from simulator.autopilot.navigator import Navigator
 from simulator.autopilot.position_controller import PositionController
 from simulator.autopilot.state import VehicleState
 from simulator.firmware.base import AFTER_DELAY, Rule
 from simulator.firmware.values import (
     NAN3,
     Behaviour,
-    Condition,
     Mode,
     MotionSetpoint,
     Result,
@@ -49,17 +48,13 @@ class Commander:
 
     def __init__(
         self,
-        navigator: Navigator,
+        guidance: Guidance,
         controller: PositionController,
         state: VehicleState,
         health: Health,
     ) -> None:
-        self._navigator, self._controller, self._guidance = (
-            navigator,
-            controller,
-            navigator.guidance,
-        )
-        self._firmware, self._parameters = self._guidance.firmware, self._guidance.parameters
+        self._guidance, self._controller = guidance, controller
+        self._firmware, self._parameters = guidance.firmware, guidance.parameters
         self._state, self._health = state, health
         firmware = self._firmware
         self._rows: dict[str, list[Rule]] = {}
@@ -76,7 +71,7 @@ class Commander:
         self._event, self._request = "", NO_REQUEST  # being handled
         self._cause = ""  # event of the failsafe
         self._delayed: tuple[float, str] | None = None  # time and event of a delayed failsafe
-        self._latched: frozenset[str] = frozenset()  # events that only a reboot clears
+        self.latched: frozenset[str] = frozenset()  # events that only a reboot clears
 
     # -- state -------------------------------------------------------------------------------
 
@@ -85,7 +80,7 @@ class Commander:
         """The pre-arm checks pass in the intended mode."""
         if self.rejects_velocity:
             return False
-        return self._health.passes(self.intended, self._state.time_s, latched=bool(self._latched))
+        return self._health.passes(self.intended, self._state.time_s, latched=bool(self.latched))
 
     @property
     def velocity_ratio(self) -> float:
@@ -98,22 +93,6 @@ class Commander:
         """The innovation ratio of the velocity is too large to arm."""
         most = self._firmware.velocity_ratio_most(self._parameters.__getitem__)
         return most > 0.0 and self.velocity_ratio >= most
-
-    @property
-    def heartbeat(self) -> tuple[int, int]:
-        """MAV_MODE_FLAG bits, and MAV_STATE."""
-        condition = Condition(
-            mode=self.mode,
-            reached=self._health.reached,
-            armed=self.armed,
-            landed=self._controller.landed,
-            healthy=self.healthy,
-            failsafe=self.failsafe,
-            faulty=bool(self._latched),
-            setpoint=self._guidance.setpoint,
-        )
-        base_mode, state = self._firmware.heartbeat(condition)
-        return base_mode | (128 if self.armed else 0), state
 
     @property
     def intended(self) -> Mode:
@@ -175,7 +154,7 @@ class Commander:
         if condition.startswith("reached "):
             return condition[8:] in self._health.reached
         if condition.startswith("latched "):
-            return condition[8:] in self._latched
+            return condition[8:] in self.latched
         name, compares, value = condition.partition("=")
         if compares:
             return self._parameters[name] == float(value)
@@ -200,7 +179,7 @@ class Commander:
             if mode.remembered:
                 self._remembered = name
         if mode is not self.mode and not self._firmware.setpoints_outlive_modes:
-            self._guidance.setpoint = None
+            self._guidance.newest = None
         if mode is not self.mode or not BEHAVIOURS[mode.behaviour].continues:
             self._controller.enter(mode.behaviour, self._request.takeoff_ned_m)
         self.mode = mode
@@ -231,15 +210,15 @@ class Commander:
         self.failsafe = False
 
     def _take_off(self) -> None:
-        self._guidance.setpoint = None
+        self._guidance.newest = None
         self._controller.enter(Behaviour.TAKEOFF, self._request.takeoff_ned_m)
 
     def _hold(self) -> None:
-        self._guidance.setpoint = None
+        self._guidance.newest = None
         self._controller.enter(self.mode.behaviour)
 
     def _latch(self) -> None:
-        self._latched |= {self._event}
+        self.latched |= {self._event}
 
     def _reboot(self) -> None:
         self.reboot_requested = True
@@ -262,10 +241,10 @@ CONDITIONS: dict[str, Callable[[Commander], bool]] = {
     "velocity rejected": lambda c: c.rejects_velocity,
     "mission missing": lambda c: not c._guidance.mission.flyable,
     "climb requested": lambda c: c._request.takeoff_ned_m[2] <= c._guidance.home_ned_m[2],
-    "climbing": lambda c: c._navigator.behaviour is Behaviour.TAKEOFF,
-    "attitude setpoint": lambda c: c._navigator.follows_attitude,
-    "motion setpoint": lambda c: isinstance(c._navigator.setpoint, MotionSetpoint),
-    "velocity setpoint": lambda c: c._navigator.follows_velocity,
+    "climbing": lambda c: c._guidance.behaviour is Behaviour.TAKEOFF,
+    "attitude setpoint": lambda c: c._guidance.follows_attitude,
+    "motion setpoint": lambda c: isinstance(c._guidance.setpoint, MotionSetpoint),
+    "velocity setpoint": lambda c: c._guidance.follows_velocity,
 }
 
 ACTIONS: dict[str, Callable[[Commander], None]] = {

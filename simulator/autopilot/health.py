@@ -1,5 +1,5 @@
-"""Start of the autopilot, its pre-arm checks, and monitors: events that nobody requests (ground
-station, battery, position, automatic disarming).
+"""Start of the autopilot, its pre-arm checks, and events that nobody requests: ground station,
+battery, position, takeoff, landing, automatic disarming.
 
 Time limits are the firmware's; its state table decides what an event does and what is refused.
 """
@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from simulator.autopilot.guidance import Guidance
+from simulator.autopilot.mission import Mission
 from simulator.autopilot.parameters import ParameterTable
 from simulator.autopilot.setpoints import SetpointStream
 from simulator.firmware.base import Firmware
@@ -18,68 +18,6 @@ from simulator.firmware.values import Behaviour, Mode
 from simulator.vehicle.battery import BatteryState
 
 MONITOR_STEPS = 25  # 0.1 s
-
-
-@dataclass(slots=True)
-class Monitors:
-    """Ground station, battery and position; each event is reported once."""
-
-    firmware: Firmware
-    parameters: ParameterTable
-    ground_station_lost: bool = False
-    position_lost: bool = False
-    _heartbeat_s: float = math.nan  # last one of a ground station
-    _battery_level: int = 0  # reported; of `firmware.battery_events`
-    _worse_s: float = math.nan  # since when the level is above that
-    _fix_s: float = -math.inf  # last one
-
-    def ground_station_heard(self, now_s: float) -> None:
-        self._heartbeat_s = now_s
-
-    def without_fix_s(self, now_s: float) -> float:
-        """Time since the last GPS fix."""
-        return now_s - self._fix_s
-
-    def step(self, now_s: float, armed: bool, battery: BatteryState, has_fix: bool) -> list[str]:
-        """Events since the last step."""
-        if has_fix:
-            self._fix_s = now_s
-        return [
-            *self._ground_station(now_s),
-            *self._battery(now_s, armed, battery),
-            *self._position(now_s),
-        ]
-
-    def _ground_station(self, now_s: float) -> Iterator[str]:
-        """A ground station that was never heard is not lost."""
-        timeout_s = self.parameters.role("ground_station_timeout_s")
-        timeout_s += self.firmware.ground_station_stays_s
-        lost = now_s - self._heartbeat_s > timeout_s
-        if lost != self.ground_station_lost:
-            self.ground_station_lost = lost
-            yield "ground station lost" if lost else "ground station found"
-
-    def _battery(self, now_s: float, armed: bool, battery: BatteryState) -> Iterator[str]:
-        """A level is reported when it lasts; in flight it only gets worse."""
-        level = 0
-        if armed:
-            level = self.firmware.battery_level(battery, self.parameters.__getitem__)
-        else:
-            self._battery_level = 0
-        if level <= self._battery_level:
-            self._worse_s = math.nan
-            return
-        if math.isnan(self._worse_s):
-            self._worse_s = now_s
-        if now_s - self._worse_s >= self.parameters.role("battery_patience_s"):
-            self._battery_level, self._worse_s = level, math.nan
-            yield self.firmware.battery_events[level - 1]
-
-    def _position(self, now_s: float) -> Iterator[str]:
-        lost = now_s - self._fix_s > self.firmware.position_without_fix_s
-        if lost != self.position_lost:
-            self.position_lost = lost
-            yield "position lost" if lost else "position found"
 
 
 @dataclass(slots=True)
@@ -114,17 +52,33 @@ class FlightTime:
 
 
 class Health:
-    """Health of one vehicle from boot on; `boot_scale` multiplies the times of its start."""
+    """Health of one vehicle from boot on; `boot_scale` multiplies the times of its start.
+
+    Ground station, battery and position are monitored; each event is reported once.
+    """
 
     def __init__(
-        self, guidance: Guidance, stream: SetpointStream, monitors: Monitors, boot_scale: float
+        self,
+        firmware: Firmware,
+        parameters: ParameterTable,
+        mission: Mission,
+        stream: SetpointStream,
+        boot_scale: float,
     ) -> None:
-        self._firmware, self._mission = guidance.firmware, guidance.mission
-        self._parameters, self._stream, self._monitors = guidance.parameters, stream, monitors
+        self._firmware, self._parameters = firmware, parameters
+        self._mission, self._stream = mission, stream
         self.boot_scale = boot_scale
         self.reached: frozenset[str] = frozenset()  # boot events so far
-        times_s = self._firmware.boot_events_s.items()
+        times_s = firmware.boot_events_s.items()
         self._ahead = sorted((at_s * boot_scale, event) for event, at_s in times_s)
+        self.ground_station_lost = False
+        self.position_lost = False  # since a fault took the GPS fix away
+        self._heartbeat_s = math.nan  # last one of a ground station
+        self._battery_level = 0  # reported; of `firmware.battery_events`
+        self._worse_s = math.nan  # since when the level is above that
+        self._fix_s = -math.inf  # last one
+
+    # -- events ------------------------------------------------------------------------------
 
     def boot_events(self, now_s: float) -> Iterator[str]:
         """Boot events since the last call."""
@@ -133,10 +87,52 @@ class Health:
             self.reached |= {event}
             yield event
 
-    @property
-    def position_lost(self) -> bool:
-        """The position estimate is lost since a fault took the fix away."""
-        return self._monitors.position_lost
+    def monitor(
+        self, now_s: float, armed: bool, battery: BatteryState, has_fix: bool
+    ) -> Iterator[str]:
+        """Events of ground station, battery and position since the last call."""
+        if has_fix:
+            self._fix_s = now_s
+        yield from self._ground_station(now_s)
+        yield from self._battery(now_s, armed, battery)
+        lost = self.without_fix_s(now_s) > self._firmware.position_without_fix_s
+        if lost != self.position_lost:
+            self.position_lost = lost
+            yield "position lost" if lost else "position found"
+
+    def _ground_station(self, now_s: float) -> Iterator[str]:
+        """A ground station that was never heard is not lost."""
+        timeout_s = self._parameters.role("ground_station_timeout_s")
+        timeout_s += self._firmware.ground_station_stays_s
+        lost = now_s - self._heartbeat_s > timeout_s
+        if lost != self.ground_station_lost:
+            self.ground_station_lost = lost
+            yield "ground station lost" if lost else "ground station found"
+
+    def _battery(self, now_s: float, armed: bool, battery: BatteryState) -> Iterator[str]:
+        """A level is reported when it lasts; in flight it only gets worse."""
+        level = 0
+        if armed:
+            level = self._firmware.battery_level(battery, self._parameters.__getitem__)
+        else:
+            self._battery_level = 0
+        if level <= self._battery_level:
+            self._worse_s = math.nan
+            return
+        if math.isnan(self._worse_s):
+            self._worse_s = now_s
+        if now_s - self._worse_s >= self._parameters.role("battery_patience_s"):
+            self._battery_level, self._worse_s = level, math.nan
+            yield self._firmware.battery_events[level - 1]
+
+    # -- state -------------------------------------------------------------------------------
+
+    def ground_station_heard(self, now_s: float) -> None:
+        self._heartbeat_s = now_s
+
+    def without_fix_s(self, now_s: float) -> float:
+        """Time since the last GPS fix."""
+        return now_s - self._fix_s
 
     def has_fix(self, now_s: float) -> bool:
         """GPS has its first fix; a fault may take it away."""
@@ -154,8 +150,7 @@ class Health:
             return False
         if firmware.fails_where_unarmable and not mode.arms:
             return False
-        needed = self._parameters.role("ground_station_needed") > 0
-        if needed and self._monitors.ground_station_lost:
+        if self._parameters.role("ground_station_needed") > 0 and self.ground_station_lost:
             return False
         if mode.behaviour is Behaviour.MISSION:
             return self._mission.flyable

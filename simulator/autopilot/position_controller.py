@@ -1,4 +1,4 @@
-"""The position controller: flies the navigator's motion or an attitude setpoint.
+"""The position controller: flies the motion of the guidance or an attitude setpoint.
 
 Motion and estimate in, demand on the attitude loop out; takeoff ramp and land detector. Knows time
 and parameters; knows no modes by name, no rules and no MAVLink. The commander
@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import math
 
-from simulator.autopilot.behaviours import Control
 from simulator.autopilot.ground import LandDetector, TakeoffRamp
-from simulator.autopilot.navigator import Navigator
+from simulator.autopilot.guidance import Control, Guidance
 from simulator.autopilot.position_loop import Limits, PositionLoop, level
 from simulator.autopilot.state import StateEstimate, VehicleState
 from simulator.firmware.values import NAN3, AttitudeSetpoint, Behaviour, MotionSetpoint, Triple
@@ -26,10 +25,10 @@ OFF = Demand()
 class PositionController:
     """Flies one vehicle from arming to disarming."""
 
-    def __init__(self, navigator: Navigator, state: VehicleState) -> None:
-        firmware, parameters = navigator.guidance.firmware, navigator.guidance.parameters
+    def __init__(self, guidance: Guidance, state: VehicleState) -> None:
+        firmware, parameters = guidance.firmware, guidance.parameters
         self._firmware, self._parameters = firmware, parameters
-        self._navigator, self._state = navigator, state
+        self._guidance, self._state = guidance, state
         self._tuned = parameters.changes
         self.loop = PositionLoop(firmware.gains(parameters.__getitem__))
         self.detector = LandDetector(firmware.landing, parameters)
@@ -51,14 +50,14 @@ class PositionController:
 
     def enter(self, behaviour: Behaviour, place_ned_m: Triple = NAN3) -> None:
         """Begin a behaviour. `place_ned_m`: where a takeoff climbs to."""
-        self._navigator.enter(behaviour, self._state.estimate, place_ned_m)
+        self._guidance.enter(behaviour, self._state.estimate, place_ned_m)
         self._next_loop_s = 0.0
         self._setpoint = None
         self.loop.reset(self._state.estimate.yaw_rad)
 
     def arm(self) -> None:
         """Start the motors."""
-        self._navigator.arm(self._state.estimate)
+        self._guidance.arm(self._state.estimate)
         self._ramp.arm()
         if not self.landed:
             self._ramp.skip()
@@ -68,7 +67,7 @@ class PositionController:
 
     def level_off(self) -> None:
         """The stream of attitude setpoints is lost: level attitude, present yaw and height."""
-        self._navigator.level_off(self._state.estimate)
+        self._guidance.level_off(self._state.estimate)
         self.loop.reset(self._state.estimate.yaw_rad)
 
     def step(self, armed: bool) -> Demand:
@@ -78,7 +77,7 @@ class PositionController:
             if not self.landed and self._state.estimate.on_ground:
                 self.detector.set_landed(True)
             return OFF
-        setpoint = self._navigator.setpoint
+        setpoint = self._guidance.setpoint
         if not isinstance(setpoint, AttitudeSetpoint):
             setpoint = None
         elif setpoint is not self._setpoint:
@@ -94,7 +93,7 @@ class PositionController:
         if self._tuned != self._parameters.changes:
             self._tuned = self._parameters.changes
             self.loop.tune(self._firmware.gains(self._parameters.__getitem__))
-        control = self._navigator.active.control
+        control = self._guidance.active.control
         if control is Control.LEVEL:
             thrust = self._parameters.role("stick_thrust_least")
             self._demand(Demand(True, thrust, level(self.loop.yaw_rad)))
@@ -151,11 +150,11 @@ class PositionController:
     # -- motion ------------------------------------------------------------------------------
 
     def _fly_motion(self, estimate: StateEstimate) -> None:
-        navigator, ramp = self._navigator, self._ramp
-        lifts_off = navigator.active.lifts_off
+        guidance, ramp = self._guidance, self._ramp
+        lifts_off = guidance.active.lifts_off
         if self.landed and ramp.spooling and lifts_off:
-            navigator.guidance.hold = MotionSetpoint(estimate.position_ned_m)
-        self.motion = navigator.motion(estimate, landed=self.landed)
+            guidance.hold = MotionSetpoint(estimate.position_ned_m)
+        self.motion = guidance.motion(estimate, landed=self.landed)
         ramp.step(climb_demanded=lifts_off and self._climb_demanded(estimate))
         still = estimate.on_ground and (ramp.lifting or self.landed)
         on_ramp = ramp.lifting and self._firmware.integrates_on_ramp
@@ -177,16 +176,16 @@ class PositionController:
     @property
     def _limits(self) -> Limits:
         """Limits of the motion by behaviour and takeoff ramp."""
-        role, navigator, gains = self._parameters.role, self._navigator, self.loop.gains
-        automatic = navigator.active.automatic
+        role, guidance, gains = self._parameters.role, self._guidance, self.loop.gains
+        automatic = guidance.active.automatic
         up_mps = self._ramp.climb_limit_mps(gains.velocity_z[0])
-        if navigator.active.climbing:
+        if guidance.active.climbing:
             up_mps = min(up_mps, role("takeoff_speed_mps"))
         turn_radps = self.motion.turn_radps
         return Limits(
             hover_thrust=role("hover_thrust"),
             thrust_least=0.0 if self._ramp.lifting else role("thrust_least"),
-            across_mps=navigator.cruise_mps,
+            across_mps=guidance.speed_limit_mps,
             up_mps=up_mps,
             turn_radps=min(turn_radps, gains.turn_radps) if automatic else turn_radps,
             smooth=automatic,
@@ -194,8 +193,8 @@ class PositionController:
 
     def _climb_demanded(self, estimate: StateEstimate) -> bool:
         """A higher place, a climb or an upward acceleration is demanded."""
-        motion, navigator = self.motion, self._navigator
-        if navigator.active.cannot_climb:
+        motion, guidance = self.motion, self._guidance
+        if guidance.active.cannot_climb:
             return False
         return (
             motion.position_ned_m[2] < estimate.position_ned_m[2] - _HIGHER_M

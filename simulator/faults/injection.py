@@ -44,10 +44,7 @@ class Injection:
             (Moment.ARMED, autopilot.commander.armed),
             (Moment.TOOK_OFF, not landed),
             (Moment.ENGAGED, by_setpoint and autopilot.commander.armed),
-            (
-                Moment.LANDING,
-                autopilot.navigator.active.landing and not landed,
-            ),
+            (Moment.LANDING, autopilot.guidance.active.landing and not landed),
             (Moment.LANDED, self._flown and landed),
         ):
             if reached:

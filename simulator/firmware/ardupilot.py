@@ -13,13 +13,12 @@ from typing import Any
 
 from simulator.firmware import ardupilot_messages as telemetry
 from simulator.firmware.ardupilot_rules import RULES
-from simulator.firmware.ardupilot_tables import BY_HAND, BY_POSITION, MODES, PARAMETERS, ROLES
+from simulator.firmware.ardupilot_tables import MODES, PARAMETERS, ROLES
 from simulator.firmware.base import Firmware, Landing, PositionGains, StickFlight
 from simulator.firmware.values import (
     NAN3,
     ArmRequest,
     AttitudeSetpoint,
-    Condition,
     MissionItem,
     ModeRequest,
     MotionSetpoint,
@@ -73,15 +72,6 @@ _RETURN_LEAST_M = 2.0  # RTL_ALT_MIN
 
 class ArduCopter(Firmware):
     """ArduCopter 4.6."""
-
-    def heartbeat(self, now: Condition) -> tuple[int, int]:
-        """base_mode and MAV_STATE: 1 booting, 3 on the ground, 4 in the air, 5 in trouble."""
-        if "initialised" not in now.reached:
-            return BY_POSITION, 1
-        base_mode = BY_HAND if isinstance(now.setpoint, AttitudeSetpoint) else now.mode.base_mode
-        if now.faulty or now.failsafe:
-            return base_mode, 5
-        return base_mode, 4 if now.armed and not now.landed else 3
 
     def command_mode(self, params: tuple[float, ...]) -> ModeRequest:
         """MAV_CMD_DO_SET_MODE (176): param1 base mode, param2 the mode's number."""
@@ -290,8 +280,6 @@ ARDUPILOT = ArduCopter(
     parameters=PARAMETERS,
     parameter_roles=ROLES,
     system_parameter="SYSID_THISMAV",
-    mode_acked_twice=False,
-    set_mode_acked_as=None,
     force_codes={"arm": 2989.0, "disarm": 21196.0},
     takeoff_above_home=True,
     reposition_mode="GUIDED",
@@ -302,21 +290,13 @@ ARDUPILOT = ArduCopter(
         **dict.fromkeys(_FAILED, Result.FAILED),
         532: Result.DENIED,
     },
-    home_mirrored=False,
     global_frames=frozenset({0, 3, 5, 6, 10, 11}),
-    setpoint_mode_needs_stream=False,
     setpoints_as_automatic=True,
-    setpoints_outlive_modes=False,
     setpoints_imply_flight=True,
     setpoint_spool_s=2.8,
-    stream_reaction_s=0.0,
-    strict_missions=False,
     home_item_first=True,
     guided_items=True,
     mission_text=info("Flight plan received"),
-    turning_items=frozenset(),
-    reached_above_landing=False,
-    mission_keeps_speed=False,
     companion_rates_hz=telemetry.COMPANION_RATES_HZ,
     ground_rates_hz=telemetry.GROUND_RATES_HZ,
     messages=builders_in(telemetry),
@@ -325,7 +305,6 @@ ARDUPILOT = ArduCopter(
         "GPS_GLOBAL_ORIGIN": "origin",
         "HOME_POSITION": "origin",
     },
-    message_versions={},
     position_grid_steps=1,
     fixed_streams=frozenset({"TIMESYNC"}),
     not_on_request=frozenset({"TIMESYNC"}),
@@ -339,13 +318,6 @@ ARDUPILOT = ArduCopter(
     interval_refusal_text="No ap_message for mavlink id ({id})",
     too_fast_text="Requested rate for message ID {id} too fast. Increase SCHED_LOOP_RATE",
     request_refusal=Result.FAILED,
-    ground_station_stays_s=0.0,
-    target_component_checked=False,
-    text_suffix="",
-    text_to_ground_stations_only=False,
-    parameters_bytewise=False,
-    parameters_hashed=False,
-    parameters_numbered=False,
     # RADIO_STATUS, RADIO; on USB, which is not simulated, all
     accepted_unsigned=frozenset({109, 166}),
     stamps_follow_clock=True,  # GPS
@@ -362,10 +334,8 @@ ARDUPILOT = ArduCopter(
     first_fix_s=10.2,
     passes_after_s=42.5,
     passes_without_position_after_s=24.0,
-    fails_where_unarmable=False,
     position_without_fix_s=8.0,
     battery_events=("battery low", "battery critical"),
-    integrates_on_ramp=False,
     landing=Landing(
         low_thrust_share=1.0,
         idle_thrust_share=math.inf,

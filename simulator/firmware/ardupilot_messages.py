@@ -7,6 +7,8 @@ from typing import Any
 
 from offboard.model.frames import euler_from_quaternion, rotation_from_quaternion
 from simulator.autopilot.position_loop import GRAVITY_MPS2
+from simulator.firmware.ardupilot_tables import BY_HAND, BY_POSITION
+from simulator.firmware.values import AttitudeSetpoint
 from simulator.mavlink.view import View
 
 COMPANION_RATES_HZ = GROUND_RATES_HZ = {"HEARTBEAT": 1.0, "TIMESYNC": 0.1}
@@ -41,6 +43,19 @@ def _specific_force(view: View) -> tuple[float, float, float]:
     return x, y, z
 
 
+def heartbeat(view: View) -> Sequence[Any]:
+    """MAV_STATE: 1 booting, 3 on the ground, 4 in the air, 5 in trouble."""
+    autopilot, commander = view.autopilot, view.autopilot.commander
+    if "initialised" not in autopilot.health.reached:
+        return view.heartbeat(BY_POSITION, 1)
+    by_hand = isinstance(autopilot.guidance.newest, AttitudeSetpoint)
+    base_mode = BY_HAND if by_hand else commander.mode.base_mode
+    if commander.latched or commander.failsafe:
+        return view.heartbeat(base_mode, 5)
+    in_air = commander.armed and not autopilot.position_controller.landed
+    return view.heartbeat(base_mode, 4 if in_air else 3)
+
+
 def sim_state(view: View) -> Sequence[Any]:
     """True state without time stamp; latitude and longitude have a resolution of 1 cm."""
     truth = view.autopilot.state.truth
@@ -65,7 +80,7 @@ def sim_state(view: View) -> Sequence[Any]:
 def ekf_status_report(view: View) -> Sequence[Any]:
     """Flags by the boot events so far; variances of a good estimate, but for a wrong velocity."""
     reached = view.autopilot.health.reached
-    if view.autopilot.monitors.position_lost:
+    if view.autopilot.health.position_lost:
         reached -= {"position"}
     flags = next((bits for event, bits in _EKF_FLAGS if event in reached), _EKF_UNINITIALISED)
     velocity_ratio = max(0.02, view.autopilot.commander.velocity_ratio)

@@ -7,15 +7,15 @@ autopilot, no message builder and no socket.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from simulator.firmware.values import (
     ArmRequest,
     AttitudeSetpoint,
-    Condition,
     MissionItem,
     Mode,
     ModeRequest,
@@ -158,89 +158,103 @@ class Firmware(ABC):
     system_parameter: str  # holds the system id
 
     # commands
-    mode_acked_twice: bool  # by the receiver before the commander does
-    set_mode_acked_as: int | None  # MAV_CMD in the acknowledgement of SET_MODE; None: there is none
+    mode_acked_twice: bool = False  # by the receiver before the commander does
+    set_mode_acked_as: int | None = (
+        None  # MAV_CMD in the answer to SET_MODE; None: no answer
+    )
     force_codes: Mapping[str, float]  # param2 of MAV_CMD_COMPONENT_ARM_DISARM: arm, disarm
-    takeoff_above_home: bool  # height of MAV_CMD_NAV_TAKEOFF; else above mean sea level
+    takeoff_above_home: bool = False  # height of MAV_CMD_NAV_TAKEOFF; else above mean sea level
     reposition_mode: str  # mode for MAV_CMD_DO_REPOSITION
-    repositions_strictly: bool  # it needs a frame and a place; yaw and speed are ignored
+    repositions_strictly: bool = False  # it needs a frame and a place; yaw and speed are ignored
     speed_refusal: Result  # of MAV_CMD_DO_CHANGE_SPEED without a speed
     # MAV_CMD acknowledged and not carried out: result, None: no acknowledgement. Any other command
     # without a handler is UNSUPPORTED
     command_answers: Mapping[int, Result | None]
 
     # setpoints
-    home_mirrored: bool  # in heights above home, home's own height enters with the wrong sign
+    home_mirrored: bool = (
+        False  # heights above home: home's height has the wrong sign
+    )
     global_frames: frozenset[int]  # MAV_FRAME accepted in SET_POSITION_TARGET_GLOBAL_INT
-    setpoint_mode_needs_stream: bool  # its pre-arm checks fail without a stream
-    setpoints_as_automatic: bool  # flown with the speeds and turn rates of automatic flight
-    setpoints_outlive_modes: bool  # taken in any mode and kept; else in the setpoint mode only
-    setpoints_imply_flight: bool  # any thrust counts as flight; the land detector does not run
-    setpoint_spool_s: float  # from arming until the thrust of a setpoint acts
-    stream_reaction_s: float  # from the time-out of the stream until it counts as lost
+    setpoint_mode_needs_stream: bool = False  # its pre-arm checks fail without a stream
+    setpoints_as_automatic: bool = False  # flown with the speeds and turn rates of automatic flight
+    setpoints_outlive_modes: bool = (
+        False  # taken in any mode; else in the setpoint mode only
+    )
+    setpoints_imply_flight: bool = (
+        False  # any thrust is flight: no land detector
+    )
+    setpoint_spool_s: float = 0.0  # from arming until the thrust of a setpoint acts
+    stream_reaction_s: float = 0.0  # from the time-out of the stream until it counts as lost
 
     # missions
-    strict_missions: bool  # downloads in order only; items are requested in the kind that came last
-    home_item_first: bool  # item 0 of a mission is home
-    guided_items: bool  # an item with current = 2 is a place to fly to now
-    mission_text: StatusText | None  # after an upload
-    turning_items: frozenset[int]  # MAV_CMD whose fourth parameter is a yaw
-    reached_above_landing: bool  # also a landing is "item reached" above its place
-    mission_keeps_speed: bool  # of a change-speed item across a pause
+    strict_missions: bool = (
+        False  # downloads in order only; late and wrong items are refused
+    )
+    home_item_first: bool = False  # item 0 of a mission is home
+    guided_items: bool = False  # an item with current = 2 is a place to fly to now
+    mission_text: StatusText | None = None  # after an upload
+    turning_items: frozenset[int] = frozenset()  # MAV_CMD whose fourth parameter is a yaw
+    reached_above_landing: bool = False  # also a landing is "item reached" above its place
+    mission_keeps_speed: bool = False  # of a change-speed item across a pause
 
     # telemetry
     companion_rates_hz: Mapping[str, float]  # without a request, by link
     ground_rates_hz: Mapping[str, float]
     # message -> builder, beside `simulator.mavlink.messages` or in place of one
     messages: Mapping[str, Callable[[Any], Sequence[Any]]]
-    withheld_until: Mapping[str, str]  # message -> boot event before which it is not sent
+    withheld_until: Mapping[str, str] = field(
+        default_factory=dict
+    )  # by message: boot event
     # message -> version of its content: a message that is due waits until it is a new one
-    message_versions: Mapping[str, Callable[[Any], Hashable]]
+    message_versions: Mapping[str, Callable[[Any], Hashable]] = field(default_factory=dict)
     position_grid_steps: int  # the estimator's position is new at every such step
     fixed_streams: frozenset[str]  # messages whose interval cannot be changed
     not_on_request: frozenset[str]
     never_sent: frozenset[int]  # ids of which an interval is accepted
-    stream_groups: Mapping[int, tuple[str, ...]]  # REQUEST_DATA_STREAM: MAV_DATA_STREAM -> messages
-    rate_max_hz: float
+    stream_groups: Mapping[int, tuple[str, ...]] = field(
+        default_factory=dict
+    )  # by MAV_DATA_STREAM
+    rate_max_hz: float = math.inf
     interval_refusal: Result
-    interval_refusal_text: str  # may name {id}; "": none
-    too_fast_text: str
+    interval_refusal_text: str = ""  # may name {id}; "": none
+    too_fast_text: str = ""
     request_refusal: Result  # of MAV_CMD_REQUEST_MESSAGE
 
     # link
-    ground_station_stays_s: float  # after its last heartbeat
-    target_component_checked: bool
-    text_suffix: str
-    text_to_ground_stations_only: bool
-    parameters_bytewise: bool  # PARAM_VALUE holds the bytes of an integer, not its value
-    parameters_hashed: bool  # a list begins with _HASH_CHECK
-    parameters_numbered: bool  # PARAM_VALUE.param_index is set also outside a list
+    ground_station_stays_s: float = 0.0  # after its last heartbeat
+    target_component_checked: bool = False
+    text_suffix: str = ""
+    text_to_ground_stations_only: bool = False
+    parameters_bytewise: bool = False  # PARAM_VALUE holds the bytes of an integer, not its value
+    parameters_hashed: bool = False  # a list begins with _HASH_CHECK
+    parameters_numbered: bool = False  # PARAM_VALUE.param_index is set also outside a list
     accepted_unsigned: frozenset[int]  # messages that need no signature
-    stamps_follow_clock: bool  # of signatures; else they only count, and follow those of others
+    stamps_follow_clock: bool = (
+        False  # else they only count, and follow those of others
+    )
 
     # health
-    boot_events_s: Mapping[str, float]  # events of the start, s of vehicle time
+    boot_events_s: Mapping[str, float] = field(
+        default_factory=dict
+    )  # events of the start
     sensor_bits: tuple[int, int, int]  # SYS_STATUS with a fix: present, enabled, healthy
     first_fix_s: float  # of GPS
     passes_after_s: float  # boot until the pre-arm checks pass
     passes_without_position_after_s: float  # the same for modes that need none
-    fails_where_unarmable: bool  # pre-arm checks fail in a mode that does not arm
+    fails_where_unarmable: bool = False  # pre-arm checks fail in a mode that does not arm
     position_without_fix_s: float  # until the position estimate is lost
     battery_events: tuple[str, ...]  # of battery levels 1 on
 
     # flight
-    integrates_on_ramp: bool  # position loop, in a takeoff that still stands on the ground
+    integrates_on_ramp: bool = False  # position loop, in a takeoff that still stands on the ground
     landing: Landing
     descend_speed_mps: float  # in a manual mode without stick input
-    sticks: StickFlight | None  # None: not flown by sticks
+    sticks: StickFlight | None = None  # None: not flown by sticks
 
     def mode_named(self, name: str) -> Mode | None:
         """Mode by its name, of which "AUTO." may be left out; None where there is none."""
         return self.modes.get(name) or self.modes.get(f"AUTO.{name}")
-
-    @abstractmethod
-    def heartbeat(self, now: Condition) -> tuple[int, int]:
-        """base_mode without the armed bit, and MAV_STATE."""
 
     @abstractmethod
     def command_mode(self, params: tuple[float, ...]) -> ModeRequest:

@@ -17,12 +17,10 @@ from offboard.model.frames import rotation_from_quaternion
 from simulator.firmware import px4_messages as telemetry
 from simulator.firmware.base import Firmware, Landing, PositionGains
 from simulator.firmware.px4_rules import RULES
-from simulator.firmware.px4_tables import MODES, OFFBOARD, PARAMETERS, RATES, ROLES
+from simulator.firmware.px4_tables import MODES, PARAMETERS, ROLES
 from simulator.firmware.values import (
     ArmRequest,
     AttitudeSetpoint,
-    Behaviour,
-    Condition,
     MissionItem,
     ModeRequest,
     MotionSetpoint,
@@ -80,18 +78,6 @@ _GATE_MPS = 5.0 * 0.3  # EKF2_GPS_V_GATE standard deviations of EKF2_GPS_V_NOISE
 
 class Px4(Firmware):
     """PX4 1.16."""
-
-    def heartbeat(self, now: Condition) -> tuple[int, int]:
-        """base_mode and MAV_STATE. In Offboard base_mode shows which control loops run: none before
-        the first setpoint, the rate loop only for rate setpoints."""
-        base_mode = now.mode.base_mode
-        if now.mode.behaviour is Behaviour.SETPOINT:
-            attitude = now.setpoint if isinstance(now.setpoint, AttitudeSetpoint) else None
-            rates_alone = attitude is not None and attitude.rates_frd_radps is not None
-            base_mode = RATES if now.setpoint is None or rates_alone else OFFBOARD
-        if now.armed:
-            return base_mode, 5 if now.failsafe else 4
-        return base_mode, 3 if now.healthy else 0
 
     def command_mode(self, params: tuple[float, ...]) -> ModeRequest:
         """MAV_CMD_DO_SET_MODE (176): param1 base mode, param2 main mode, param3 sub mode of AUTO.
@@ -308,9 +294,7 @@ PX4 = Px4(
     mode_acked_twice=True,
     set_mode_acked_as=176,
     force_codes={"arm": 21196.0, "disarm": 21196.0},
-    takeoff_above_home=False,
     reposition_mode="AUTO.LOITER",
-    repositions_strictly=False,
     speed_refusal=Result.ACCEPTED,
     command_answers={
         **dict.fromkeys(_TAKEN, Result.ACCEPTED),
@@ -322,32 +306,21 @@ PX4 = Px4(
     home_mirrored=True,
     global_frames=frozenset({5, 6, 11}),
     setpoint_mode_needs_stream=True,
-    setpoints_as_automatic=False,
     setpoints_outlive_modes=True,
-    setpoints_imply_flight=False,
-    setpoint_spool_s=0.0,
     stream_reaction_s=0.036,
     strict_missions=True,
-    home_item_first=False,
-    guided_items=False,
-    mission_text=None,
     turning_items=frozenset({16, 17, 19, 21}),
     reached_above_landing=True,
     mission_keeps_speed=True,
     companion_rates_hz=telemetry.COMPANION_RATES_HZ,
     ground_rates_hz=telemetry.GROUND_RATES_HZ,
     messages=builders_in(telemetry),
-    withheld_until={},
     message_versions=telemetry.VERSIONS,
     position_grid_steps=2,
     fixed_streams=telemetry.ON_EVENT | {"HEARTBEAT"},
     not_on_request=telemetry.ON_EVENT,
     never_sent=telemetry.NEVER_SENT,
-    stream_groups={},
-    rate_max_hz=math.inf,
     interval_refusal=Result.FAILED,
-    interval_refusal_text="",
-    too_fast_text="",
     request_refusal=Result.DENIED,
     ground_station_stays_s=2.5,
     target_component_checked=True,
@@ -358,8 +331,6 @@ PX4 = Px4(
     parameters_numbered=True,
     # of 1.17, as 1.16 has no signing: HEARTBEAT, RADIO_STATUS, ADSB_VEHICLE, COLLISION
     accepted_unsigned=frozenset({0, 109, 246, 247}),
-    stamps_follow_clock=False,
-    boot_events_s={},
     # gyro, accelerometer, magnetometer, absolute pressure, GPS; battery, AHRS; the health bits
     # include the geofence, or MAVProxy reports a breach
     sensor_bits=(0x0300402F, 0x0301402F, 0x0330C83F),
@@ -380,5 +351,4 @@ PX4 = Px4(
         place_below_is_descent=False,
     ),
     descend_speed_mps=0.6,
-    sticks=None,
 )

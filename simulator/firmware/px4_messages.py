@@ -7,6 +7,8 @@ from collections.abc import Hashable, Sequence
 from typing import Any
 
 from simulator.autopilot.position_loop import GRAVITY_MPS2
+from simulator.firmware.px4_tables import OFFBOARD, RATES
+from simulator.firmware.values import AttitudeSetpoint, Behaviour
 from simulator.mavlink.fields import centi, fit, in_body, pressure_hpa
 from simulator.mavlink.view import View
 
@@ -78,6 +80,19 @@ _STANDARD_MODES = {
     "AUTO.LAND": 7,
     "AUTO.TAKEOFF": 8,
 }
+
+
+def heartbeat(view: View) -> Sequence[Any]:
+    """In Offboard base_mode shows which control loops run: none before the first setpoint, the rate
+    loop only for rate setpoints."""
+    commander, setpoint = view.autopilot.commander, view.autopilot.guidance.newest
+    base_mode = commander.mode.base_mode
+    if commander.mode.behaviour is Behaviour.SETPOINT:
+        rates = isinstance(setpoint, AttitudeSetpoint) and setpoint.rates_frd_radps is not None
+        base_mode = RATES if setpoint is None or rates else OFFBOARD
+    if commander.armed:
+        return view.heartbeat(base_mode, 5 if commander.failsafe else 4)
+    return view.heartbeat(base_mode, 3 if commander.healthy else 0)
 
 
 def current_mode(view: View) -> Sequence[Any]:
@@ -160,11 +175,11 @@ def hil_state_quaternion(view: View) -> Sequence[Any]:
 def estimator_status(view: View) -> Sequence[Any]:
     autopilot = view.autopilot
     flags = 895 if autopilot.health.has_fix(autopilot.state.time_s) else 1024
-    if autopilot.monitors.position_lost:
+    if autopilot.health.position_lost:
         flags = 229
     velocity_ratio = max(0.12, autopilot.commander.velocity_ratio)
     # PX4 1.16 SIH without GPS: 0.5 m after 1.7 s, 1.0 after 3.7, 2.2 after 6.7, 4.9 after 10.8
-    passed_s = autopilot.monitors.without_fix_s(autopilot.state.time_s)
+    passed_s = autopilot.health.without_fix_s(autopilot.state.time_s)
     accuracy_m = 0.3 + (0.05 * passed_s + 0.035 * passed_s**2 if math.isfinite(passed_s) else 0.0)
     return (
         view.time_us, flags, velocity_ratio, 0.03, 0.03, 0.14, 0.02, math.nan, accuracy_m, 0.31

@@ -110,20 +110,6 @@ class Mode:
 
 
 @dataclass(frozen=True, slots=True)
-class Condition:
-    """State that HEARTBEAT shows."""
-
-    mode: Mode
-    reached: frozenset[str]  # boot events so far
-    armed: bool
-    landed: bool
-    healthy: bool
-    failsafe: bool
-    faulty: bool
-    setpoint: AttitudeSetpoint | MotionSetpoint | None  # in force
-
-
-@dataclass(frozen=True, slots=True)
 class ModeRequest:
     """Mode that a command asks for by name, or the result to refuse it with."""
 

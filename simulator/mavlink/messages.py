@@ -14,9 +14,6 @@ from typing import Any
 from simulator.mavlink.fields import centi, fit, heading_cdeg, motion_fields, pressure_hpa
 from simulator.mavlink.view import View
 
-_MAV_TYPE_QUADROTOR = 2
-
-
 # -- motion ------------------------------------------------------------------------------------
 
 
@@ -112,19 +109,6 @@ def position_target_local_ned(view: View) -> Sequence[Any]:
 
 
 # -- state, clock, home, mission ---------------------------------------------------------------
-
-
-def heartbeat(view: View) -> Sequence[Any]:
-    autopilot = view.autopilot
-    base_mode, status = autopilot.commander.heartbeat
-    return (
-        _MAV_TYPE_QUADROTOR,
-        autopilot.firmware.mav_autopilot,
-        base_mode,
-        autopilot.commander.mode.custom_mode,
-        status,
-        3,
-    )
 
 
 def sys_status(view: View) -> Sequence[Any]:

@@ -109,7 +109,7 @@ class Server:
         autopilot = self.view.autopilot
         read = autopilot.parameters.__getitem__
         if autopilot.firmware.is_ground_station(message.type, message.system, read):
-            autopilot.monitors.ground_station_heard(autopilot.state.time_s)
+            autopilot.health.ground_station_heard(autopilot.state.time_s)
             self.texts.note_ground_station()
 
     def _command_long(self, message: Message) -> None:

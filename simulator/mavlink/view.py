@@ -72,6 +72,12 @@ class View:
             message = self._messages[name] = message_of(name, values)
         return message
 
+    def heartbeat(self, base_mode: int, state: int) -> tuple[int, ...]:
+        """Fields of HEARTBEAT of a quadrotor; the armed bit is added. `state`: MAV_STATE."""
+        commander, firmware = self.autopilot.commander, self.autopilot.firmware
+        base_mode |= 128 if commander.armed else 0
+        return (2, firmware.mav_autopilot, base_mode, commander.mode.custom_mode, state, 3)
+
     def restart(self, autopilot: Autopilot) -> None:
         """Show another autopilot, after a reboot."""
         autopilot.state.gps_healthy = self.autopilot.state.gps_healthy
@@ -102,7 +108,7 @@ class View:
         """MAV_LANDED_STATE: 1 on ground, 2 in air, 3 taking off, 4 landing."""
         if self.wrong_landed_state is not None:
             return self.wrong_landed_state
-        behaviour = self.autopilot.navigator.active
+        behaviour = self.autopilot.guidance.active
         if self.autopilot.position_controller.landed:
             return 1
         if behaviour.landing:

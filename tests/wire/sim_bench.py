@@ -197,7 +197,8 @@ class Bench:
     @property
     def system_status(self) -> int:
         """MAV_STATE as the next heartbeat will show it."""
-        return self.instance.autopilot.commander.heartbeat[1]
+        view = self.instance.view
+        return int(view.builders["HEARTBEAT"](view)[4])
 
     @property
     def armed(self) -> bool:
