@@ -15,7 +15,7 @@ from simulator.autopilot.position_controller import OFF
 from simulator.faults import Fault
 from simulator.faults.injection import prepare
 from simulator.firmware.base import Firmware
-from simulator.link.impairment import frames
+from simulator.link.framing import frames
 from simulator.mavlink.server import Server
 from simulator.mavlink.signing import Keyring
 from simulator.mavlink.telemetry import builders

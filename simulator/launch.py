@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from typing import NoReturn
 
 from offboard.compiled import prepare
@@ -17,7 +16,7 @@ from simulator import config
 from simulator.firmware.base import Firmware
 from simulator.firmware.catalogue import FIRMWARES
 from simulator.instance import VIRTUAL_EPOCH_US, Instance
-from simulator.link.recorder import Recorder
+from simulator.link.framing import Recorder
 from simulator.link.sockets import Link, LinkError, open_beside, open_link, shifted
 from simulator.options import COMPANION_PORT, NO_LINK, Options, Stop
 from simulator.run import Endpoint, Runner, warm_up
@@ -40,14 +39,14 @@ def launch(options: Options, stopping: Stop) -> int:
         config.check_for(flown, firmware, lockstep=options.lockstep)
         vehicle = config.vehicle(options.vehicle or firmware.vehicle)
         links = [_links(options, number) for number in options.numbers]
-        parameters = _parameters(firmware, options.parameters)
+        _parameters(firmware, options.parameters)
         recorder = _recorder(options)
         prepare(_warn)
         warm_up(Instance(firmware, vehicle, flown.conditions, options.seed, lockstep=True))
-        make = _maker(options, firmware, vehicle, flown, parameters)
         endpoints = []
         for number, (companion, ground) in zip(options.numbers, links, strict=True):
-            instance = make(number, ground is not None)
+            what = (firmware, vehicle, flown)
+            instance = _instance(options, number, *what, ground_link=ground is not None)
             strangers = tuple(open_beside(companion) for _ in instance.strangers)
             endpoints.append(Endpoint(instance, companion, ground, recorder, strangers))
     except (DocumentError, LinkError) as error:
@@ -87,34 +86,30 @@ def _links(options: Options, number: int) -> tuple[Link, Link | None]:
     return companion, open_link(options.gcs, LOCAL_GROUND_PORT + number)
 
 
-def _maker(
+def _instance(
     options: Options,
+    number: int,
     firmware: Firmware,
     vehicle: Vehicle,
     flown: config.Scenario,
-    parameters: dict[str, float],
-) -> Callable[[int, bool], Instance]:
-    """Function that makes the instance with a number, with or without a ground station."""
-    key = read_key(options.signing_key) if options.signing_key else b""
-    epoch_us = VIRTUAL_EPOCH_US if options.lockstep else unix_us()
-
-    def make(number: int, ground_link: bool) -> Instance:
-        return Instance(
-            firmware,
-            vehicle,
-            flown.conditions,
-            options.seed + number - options.numbers[0],
-            system=number + 1,
-            lockstep=options.lockstep,
-            ground_link=ground_link,
-            epoch_us=epoch_us,
-            parameters=parameters,
-            faults=flown.faults,
-            start=flown.start,
-            signing_key=key,
-        )
-
-    return make
+    *,
+    ground_link: bool,
+) -> Instance:
+    """The instance with this number."""
+    return Instance(
+        firmware,
+        vehicle,
+        flown.conditions,
+        options.seed + number - options.numbers[0],
+        system=number + 1,
+        lockstep=options.lockstep,
+        ground_link=ground_link,
+        epoch_us=VIRTUAL_EPOCH_US if options.lockstep else unix_us(),
+        parameters=_parameters(firmware, options.parameters),
+        faults=flown.faults,
+        start=flown.start,
+        signing_key=read_key(options.signing_key) if options.signing_key else b"",
+    )
 
 
 def _recorder(options: Options) -> Recorder | None:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from offboard.documents.repeated import Repeated
 from offboard.link.clock import monotonic_s, unix_us
 from simulator.instance import Instance
-from simulator.link.recorder import Recorder
+from simulator.link.framing import Recorder
 from simulator.link.sockets import Link, wait
 from simulator.steps import STEP_S
 
@@ -24,7 +24,6 @@ RESEND_S = 0.05  # of a barrier, until the companion first sends something
 RESEND_SILENT_S = 1.0
 ANSWER_TIMEOUT_S = 5.0
 FIRST_ANSWER_TIMEOUT_S = 180.0  # a companion may compile first, on a busy machine
-FREE_RUN_S = 60.0  # vehicle time without the companion
 WARM_UP_S = 0.2  # every fast message is due in it
 SPIN_S = 50e-6  # poll without sleeping: most answers arrive sooner than a core wakes up
 POLL_S = 0.05  # longest wait, so that a stop is noticed
@@ -237,9 +236,8 @@ class Runner:
                     f"no companion answered TIMESYNC within {waits_s:g} s:"
                     " start one, or run without --lockstep",
                 )
-            self._report(f"the companion stopped answering at {self._instance.time_s:.2f} s")
-            if not self._free_run():
-                return Outcome(3, "the companion did not answer again")
+            at_s = self._instance.time_s
+            return Outcome(3, f"the companion stopped answering at {at_s:.2f} s")
         return Outcome(0)
 
     def _answered(self, stamp_ns: int, datagrams: list[bytes], timeout_s: float) -> bool:
@@ -261,22 +259,3 @@ class Runner:
                 sent_s = now_s
             wait([self._companion], POLL_S if now_s - begun_s > SPIN_S else 0.0)
         return True
-
-    def _free_run(self) -> bool:
-        """Continue at full speed without the companion; True as soon as it answers again."""
-        instance = self._instance
-        end_s = instance.time_s + FREE_RUN_S
-        known_ns = instance.companion.answered_ns
-        while instance.time_s < end_s and not (instance.idle or self._over()):
-            if not instance.advance_to_barrier(end_s):
-                continue
-            self._endpoint.send_barrier()
-            while (datagram := self._companion.receive()) is not None:
-                self._endpoint.handle(datagram)
-            self._endpoint.read_ground()
-            if instance.companion.answered_ns != known_ns:
-                self._report(f"the companion answers again at {instance.time_s:.2f} s")
-                return True
-        state = "landed and disarmed" if instance.idle else "still flying"
-        self._report(f"without it the vehicle is {state} at {instance.time_s:.1f} s")
-        return False

@@ -18,7 +18,7 @@ from simulator.autopilot.guidance import (
     stopping_place_ned_m,
 )
 from simulator.autopilot.state import StateEstimate
-from simulator.firmware.values import Behaviour, MotionSetpoint, ReturnYaw, Triple
+from simulator.firmware.values import Behaviour, MotionSetpoint, Triple
 
 _FLATTEST = 1000.0  # takeoff: m across per m of climb
 _STILL_MPS = 0.05  # sticks: a slower demand holds the place
@@ -77,11 +77,9 @@ class Land(ActiveBehaviour):
         return descent(guidance.hold_ned_m, land_speed_mps(estimate, guidance))
 
 
-def descent(place_ned_m: Triple, speed_mps: float, yaw_rad: float = math.nan) -> MotionSetpoint:
+def descent(place_ned_m: Triple, speed_mps: float) -> MotionSetpoint:
     """Vertically down at this speed."""
-    north, east, _ = place_ned_m
-    velocity = (math.nan, math.nan, speed_mps)
-    return MotionSetpoint((north, east, math.nan), velocity, yaw_rad=yaw_rad)
+    return MotionSetpoint((*place_ned_m[:2], math.nan), (math.nan, math.nan, speed_mps))
 
 
 def land_speed_mps(estimate: StateEstimate, guidance: Guidance) -> float:
@@ -109,15 +107,12 @@ class Return(ActiveBehaviour):
 
     _stage = Stage.CLIMB
     _wait_until_s = math.inf
-    _yaw: ReturnYaw | None = None
 
     def enter(self, estimate: StateEstimate, place_ned_m: Triple, *, landed: bool) -> None:
-        """Choose the height of the return and its yaw."""
+        """Choose the height of the return."""
         guidance, (x, y, z) = self.guidance, estimate.position_ned_m
-        read, firmware = guidance.parameters.__getitem__, guidance.firmware
-        distance_m = self._distance_home_m(estimate)
-        height_m = firmware.return_height_m(distance_m, read)
-        self._yaw = firmware.return_yaw(distance_m, read)
+        read, distance_m = guidance.parameters.__getitem__, self._distance_home_m(estimate)
+        height_m = guidance.firmware.return_height_m(distance_m, read)
         guidance.hold = MotionSetpoint((x, y, min(z, guidance.home_ned_m[2] - height_m)))
 
     @property
@@ -126,14 +121,10 @@ class Return(ActiveBehaviour):
 
     def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
         self._advance(estimate)
-        yaw_rad = math.nan
-        if self._yaw is ReturnYaw.AS_AT_HOME and self._stage is not Stage.CLIMB:
-            yaw_rad = self.guidance.home_yaw_rad
+        guidance = self.guidance
         if self._stage is Stage.LAND:
-            speed_mps = land_speed_mps(estimate, self.guidance)
-            return descent(self.guidance.hold_ned_m, speed_mps, yaw_rad)
-        along = self._yaw is ReturnYaw.ALONG_PATH
-        return MotionSetpoint(self.guidance.hold_ned_m, yaw_rad=yaw_rad, faces_way=along)
+            return descent(guidance.hold_ned_m, land_speed_mps(estimate, guidance))
+        return MotionSetpoint(guidance.hold_ned_m, faces_way=guidance.firmware.return_faces_way)
 
     def _advance(self, estimate: StateEstimate) -> None:
         """Go through the stages that are complete."""
@@ -154,8 +145,6 @@ class Return(ActiveBehaviour):
             self._stage = Stage.WAIT
         if self._stage is Stage.WAIT and estimate.time_s >= self._wait_until_s:
             self._stage = Stage.LAND
-        if self._yaw is not None and self._stage.value > Stage.FLY.value:
-            self._yaw = ReturnYaw.AS_AT_HOME
 
     def _distance_home_m(self, estimate: StateEstimate) -> float:
         return math.dist(estimate.position_ned_m[:2], self.guidance.home_ned_m[:2])

@@ -1,8 +1,7 @@
 """A mission: its items, its progress, and the place to fly to.
 
-What it reaches (an item, its end, an item
-that returns home) is an event. Knows positions and time; knows no modes, no links and no protocol
-(`simulator.mavlink.mission_transfer`).
+What it reaches (an item, its end, an item that returns home) is an event. Knows positions and time;
+knows no modes, no links and no protocol (`simulator.mavlink.mission_transfer`).
 """
 
 from __future__ import annotations
@@ -54,7 +53,6 @@ class Mission:
     _climb_down_m: float = math.nan  # on the ground: first climb vertically to this height
     _since_s: float = math.nan  # when the current place was reached
     _target_ned_m: Triple = NAN3
-    _approaching: bool = False  # a place that was not near at once
 
     @property
     def first(self) -> int:
@@ -71,7 +69,7 @@ class Mission:
         """Replace the items; the mission starts from its beginning."""
         self.items = items
         self.current, self.reached, self.finished = self.first, -1, False
-        self._since_s = math.nan
+        self.speed_mps, self._since_s = math.inf, math.nan
 
     def go_to(self, number: int) -> bool:
         """Continue with this item; False where there is none."""
@@ -119,18 +117,12 @@ class Mission:
         self.under_way = True
         if self.finished:
             self.go_to(self.first)
-        self.speed_mps = self._speed_before_pause if self.firmware.mission_keeps_speed else math.inf
+            self.speed_mps = math.inf
         self._target_ned_m = here_ned_m
         self._since_s = self._climb_down_m = math.nan
         first = next((item for item in self.items[self.current :] if item.command in _PLACES), None)
         if landed and first is not None and first.command != Kind.LAND:
             self._climb_down_m = self._position(first, home_ned_m)[2]
-
-    @property
-    def _speed_before_pause(self) -> float:
-        done = self.items[: self.current]
-        speeds = [i.params[1] for i in done if i.command == Kind.CHANGE_SPEED and i.params[1] > 0]
-        return speeds[-1] if speeds else math.inf
 
     # -- progress ----------------------------------------------------------------------------
 
@@ -144,10 +136,7 @@ class Mission:
         lands = item.command == Kind.LAND
         if math.isnan(self._since_s) and self._near(item, estimate.position_ned_m):
             self._since_s = estimate.time_s
-            if lands and self.firmware.reached_above_landing and self._approaching:
-                self._report_reached()
-        self._approaching = math.isnan(self._since_s)
-        if self._approaching:
+        if math.isnan(self._since_s):
             return
         if landed if lands else estimate.time_s - self._since_s >= self._stay_s(item):
             self._report_reached()

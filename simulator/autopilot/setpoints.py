@@ -65,7 +65,6 @@ class SetpointStream:
         """Fields of GLOBAL as those of LOCAL in MAV_FRAME 1; a position is whole or ignored."""
         origin, frame, mask = self.firmware.origin, values["coordinate_frame"], values["type_mask"]
         x, y = to_metres(origin, values["lat_int"] * 1e-7, values["lon_int"] * 1e-7)
-        home_down_m *= -1.0 if self.firmware.home_mirrored else 1.0
         z = down_m(values["alt"], frame, origin, home_down_m)
         if frame in TERRAIN_FRAMES:
             z = -values["alt"]

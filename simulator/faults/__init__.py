@@ -10,17 +10,21 @@ from typing import Annotated
 from pydantic import Field
 
 from simulator.faults.base import Direction
-from simulator.faults.estimator import (
+from simulator.faults.messages import ClockJump, LinkFault, SilentMessage, StuckMessage
+from simulator.faults.pilot import PilotDisarms, PilotTakesOver, Reboot, Refusal
+from simulator.faults.senders import SecondSender, SecondVehicle, Stranger
+from simulator.faults.vehicle import (
+    BatteryDrop,
     BlindLandDetector,
     EstimatorJump,
     GpsLoss,
+    MassChange,
+    MotorsCut,
+    ThrustChange,
     VelocityError,
+    WeakMotor,
     WrongLandedState,
 )
-from simulator.faults.messages import ClockJump, LinkFault, SilentMessage, StuckMessage
-from simulator.faults.pilot import PilotDisarms, PilotTakesOver, Reboot, Refusal
-from simulator.faults.power import BatteryDrop, MassChange, MotorsCut, ThrustChange, WeakMotor
-from simulator.faults.senders import SecondSender, SecondVehicle, Stranger
 
 __all__ = ["Direction", "Fault", "GpsLoss", "PilotTakesOver", "Stranger", "VelocityError"]
 

@@ -25,7 +25,6 @@ from simulator.firmware.values import (
     Quaternion,
     ReadParameter,
     Result,
-    ReturnYaw,
     StatusText,
     Triple,
     info,
@@ -62,7 +61,6 @@ _OFFSET = frozenset({_LOCAL_OFFSET_NED, _BODY_NED, _BODY_OFFSET_NED})
 _BODY = frozenset({_BODY_NED, _BODY_OFFSET_NED})
 
 _UNSUPPORTED_FRAME = 2  # MAV_MISSION_RESULT
-_SHOWN = {5: 0, 6: 3, 11: 10}  # MAV_FRAME: without INT
 _PLACE_FRAMES = frozenset({0, 3, 5, 6, 10, 11})
 _PLACES = frozenset({16, 17, 18, 19, 21, 22, 31, 82, 201})  # MAV_CMD of missions that have a place
 
@@ -183,17 +181,10 @@ class ArduCopter(Firmware):
             local[name] += here_m
         return local
 
-    def setpoint_rejection(self, message: str, frame: int | None) -> None:
-        """No text."""
-
     def mission_refusal(self, item: MissionItem) -> tuple[int, StatusText | None] | None:
         if item.command in _PLACES and not (item.frame in _PLACE_FRAMES and math.isfinite(item.z)):
             return _UNSUPPORTED_FRAME, None
         return None
-
-    def mission_frame(self, item: MissionItem, whole: bool) -> int:
-        """Frames without _INT; 0 for an item without a place."""
-        return _SHOWN.get(item.frame, item.frame) if item.command in _PLACES else 0
 
     def is_ground_station(self, kind: int, system: int, parameter: ReadParameter) -> bool:
         """By system id, whatever the MAV_TYPE."""
@@ -246,10 +237,6 @@ class ArduCopter(Firmware):
         """Height of a return above home: under a cone near home (RTL_CONE_SLOPE)."""
         highest_m, slope = parameter("RTL_ALT") * 0.01, parameter("RTL_CONE_SLOPE")
         return min(highest_m, max(distance_m * slope, _RETURN_LEAST_M)) if slope > 0 else highest_m
-
-    def return_yaw(self, distance_m: float, parameter: ReadParameter) -> ReturnYaw | None:
-        """Unchanged by default."""
-        return ReturnYaw.ALONG_PATH if parameter("WP_YAW_BEHAVIOR") in (1.0, 3.0) else None
 
 
 def _vertical(thrust: float, parameter: ReadParameter) -> tuple[float, float | None, str]:

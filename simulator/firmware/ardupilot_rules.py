@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from collections.abc import Mapping
 
 from simulator.firmware.base import Rule
 from simulator.firmware.values import Result, critical, info, warning
 
 _FAILED = Result.FAILED
 _NO_POSITION = warning("Mode change to {mode} failed: requires position")
-_NEED_POSITION = critical("Arm: Need Position Estimate")
 _HEARTBEAT = ("HEARTBEAT",)
 _ORIGIN_AND_HOME = ("GPS_GLOBAL_ORIGIN", "HOME_POSITION")
 _ARMING = Rule("arm", do=("arm",), texts=(info("Arming motors"),), send=_ORIGIN_AND_HOME)
@@ -59,101 +57,35 @@ def _failsafe(
 _BATTERY_MODES = {1: "LAND", 2: "RTL", 3: "SMART_RTL", 4: "SMART_RTL", 7: "BRAKE"}
 _GROUND_MODES = {**_BATTERY_MODES, 1: "RTL", 5: "LAND", 6: "RTL"}
 
-_ARM_REFUSALS = (
-    Rule(
-        "arm",
-        when=("not reached initialised",),
-        result=_FAILED,
-        texts=(critical("Arm: System not initialised"),),
-    ),
-    Rule(
-        "arm",
-        when=("latched thrust not a number",),
-        result=_FAILED,
-        texts=(critical("Arm: Internal Errors 0x400"),),
-    ),
-    *(
-        Rule(
-            "arm",
-            when=(f"latched {event}",),
-            result=_FAILED,
-            texts=(critical("Arm: Battery failsafe"),),
-        )
-        for event in ("battery low", "battery critical")
-    ),
-    Rule(
-        "arm",
-        when=("not reached attitude",),
-        result=_FAILED,
-        texts=(
-            critical("Arm: Need Alt Estimate"),
-            critical("Arm: Accels inconsistent"),
-            critical("Arm: EKF attitude is bad"),
-            critical("Arm: AHRS: waiting for home"),
-        ),
-    ),
-    Rule(
-        "arm",
-        "AUTO",
-        when=("mission missing",),
-        result=_FAILED,
-        texts=(critical("Arm: Mode requires mission"),),
-    ),
-    Rule(
-        "arm",
-        when=("not mode arms",),
-        result=_FAILED,
-        texts=(critical("Arm: {mode} mode not armable"),),
-    ),
-    Rule(
-        "arm",
-        when=("position missing", "not reached origin"),
-        result=_FAILED,
-        texts=(
-            _NEED_POSITION,
-            critical("Arm: AHRS: waiting for home"),
-        ),
-    ),
-    Rule("arm", when=("position missing",), result=_FAILED, texts=(_NEED_POSITION,)),
-    Rule(
-        "arm",
-        when=("not reached gyros",),
-        result=_FAILED,
-        texts=(
-            critical("Arm: Accels inconsistent"),
-            critical("Arm: Gyros inconsistent"),
-        ),
-    ),
-    Rule(
-        "arm",
-        when=("velocity rejected",),
-        result=_FAILED,
-        texts=(critical("Arm: EKF velocity variance"),),
-    ),
-)
 
+def _refusals(event: str, prefix: str, result: Result) -> list[Rule]:
+    """Rows that refuse arming, or (MAV_CMD_RUN_PREARM_CHECKS) say what would; but for the mode."""
 
-def _checks(refusals: Iterable[Rule]) -> list[Rule]:
-    """Rows of MAV_CMD_RUN_PREARM_CHECKS: what refuses arming, but for the mode."""
-    return [
-        replace(
-            rule,
-            event="checks",
-            result=Result.ACCEPTED,
-            texts=tuple(critical(text.text.replace("Arm:", "PreArm:", 1)) for text in rule.texts),
-        )
-        for rule in refusals
-        if "not mode arms" not in rule.when
+    def refuses(*texts: str, when: tuple[str, ...], mode: str = "*") -> Rule:
+        said = tuple(critical(f"{prefix}: {text}") for text in texts)
+        return Rule(event, mode, when, result=result, texts=said)
+
+    imu, home = "Accels inconsistent", "AHRS: waiting for home"
+    not_aligned = ("Need Alt Estimate", imu, "EKF attitude is bad", home)
+    rows = [
+        refuses("System not initialised", when=("not reached initialised",)),
+        refuses("Internal Errors 0x400", when=("latched thrust not a number",)),
+        refuses("Battery failsafe", when=("latched battery low",)),
+        refuses("Battery failsafe", when=("latched battery critical",)),
+        refuses(*not_aligned, when=("not reached attitude",)),
+        refuses("Mode requires mission", when=("mission missing",), mode="AUTO"),
+        refuses("{mode} mode not armable", when=("not mode arms",)),
+        refuses("Need Position Estimate", home, when=("position missing", "not reached origin")),
+        refuses("Need Position Estimate", when=("position missing",)),
+        refuses(imu, "Gyros inconsistent", when=("not reached gyros",)),
+        refuses("EKF velocity variance", when=("velocity rejected",)),
     ]
+    return [row for row in rows if event == "arm" or "not mode arms" not in row.when]
 
 
 RULES = (
     # A mode requested before was acknowledged and is lost
-    Rule(
-        "initialised",
-        to="STABILIZE",
-        texts=(info("ArduPilot Ready"),),
-    ),
+    Rule("initialised", to="STABILIZE", texts=(info("ArduPilot Ready"),)),
     Rule("origin", send=_ORIGIN_AND_HOME),
     Rule(
         "reminder",
@@ -184,9 +116,9 @@ RULES = (
         "return", result=_FAILED, texts=(critical("Mode change to RTL failed: requires position"),)
     ),
     Rule("checks", when=("armed",), result=Result.TEMPORARILY_REJECTED),
-    *_checks(_ARM_REFUSALS),
+    *_refusals("checks", "PreArm", Result.ACCEPTED),
     Rule("arm", when=("armed",)),
-    *_ARM_REFUSALS,
+    *_refusals("arm", "Arm", _FAILED),
     _ARMING,
     Rule("force arm", when=("armed",)),
     Rule("force arm", do=_ARMING.do, texts=_ARMING.texts, send=_ARMING.send),
@@ -215,10 +147,7 @@ RULES = (
             when=("armed", "not landed", "mode needs position", f"FS_EKF_ACTION={value}"),
             to=mode,
             do=("failsafe",),
-            texts=(
-                critical("EKF variance"),
-                critical(f"EKF Failsafe: changed to {mode} Mode"),
-            ),
+            texts=(critical("EKF variance"), critical(f"EKF Failsafe: changed to {mode} Mode")),
             send=_HEARTBEAT,
         )
         for value, mode in ((1, "LAND"), (2, "ALT_HOLD"), (3, "LAND"))

@@ -23,7 +23,6 @@ from simulator.firmware.values import (
     Quaternion,
     ReadParameter,
     Result,
-    ReturnYaw,
     StatusText,
     Triple,
 )
@@ -159,9 +158,7 @@ class Firmware(ABC):
 
     # commands
     mode_acked_twice: bool = False  # by the receiver before the commander does
-    set_mode_acked_as: int | None = (
-        None  # MAV_CMD in the answer to SET_MODE; None: no answer
-    )
+    set_mode_acked_as: int | None = None  # MAV_CMD in the answer to SET_MODE; None: no answer
     force_codes: Mapping[str, float]  # param2 of MAV_CMD_COMPONENT_ARM_DISARM: arm, disarm
     takeoff_above_home: bool = False  # height of MAV_CMD_NAV_TAKEOFF; else above mean sea level
     reposition_mode: str  # mode for MAV_CMD_DO_REPOSITION
@@ -172,49 +169,34 @@ class Firmware(ABC):
     command_answers: Mapping[int, Result | None]
 
     # setpoints
-    home_mirrored: bool = (
-        False  # heights above home: home's height has the wrong sign
-    )
     global_frames: frozenset[int]  # MAV_FRAME accepted in SET_POSITION_TARGET_GLOBAL_INT
     setpoint_mode_needs_stream: bool = False  # its pre-arm checks fail without a stream
     setpoints_as_automatic: bool = False  # flown with the speeds and turn rates of automatic flight
-    setpoints_outlive_modes: bool = (
-        False  # taken in any mode; else in the setpoint mode only
-    )
-    setpoints_imply_flight: bool = (
-        False  # any thrust is flight: no land detector
-    )
+    setpoints_outlive_modes: bool = False  # taken in any mode; else in the setpoint mode only
+    setpoints_imply_flight: bool = False  # any thrust is flight: no land detector
     setpoint_spool_s: float = 0.0  # from arming until the thrust of a setpoint acts
     stream_reaction_s: float = 0.0  # from the time-out of the stream until it counts as lost
 
     # missions
-    strict_missions: bool = (
-        False  # downloads in order only; late and wrong items are refused
-    )
+    requests_kind_of_peer: bool = False  # items of a mission in the kind that came last
     home_item_first: bool = False  # item 0 of a mission is home
     guided_items: bool = False  # an item with current = 2 is a place to fly to now
     mission_text: StatusText | None = None  # after an upload
     turning_items: frozenset[int] = frozenset()  # MAV_CMD whose fourth parameter is a yaw
-    reached_above_landing: bool = False  # also a landing is "item reached" above its place
-    mission_keeps_speed: bool = False  # of a change-speed item across a pause
 
     # telemetry
     companion_rates_hz: Mapping[str, float]  # without a request, by link
     ground_rates_hz: Mapping[str, float]
     # message -> builder, beside `simulator.mavlink.messages` or in place of one
     messages: Mapping[str, Callable[[Any], Sequence[Any]]]
-    withheld_until: Mapping[str, str] = field(
-        default_factory=dict
-    )  # by message: boot event
+    withheld_until: Mapping[str, str] = field(default_factory=dict)  # by message: boot event
     # message -> version of its content: a message that is due waits until it is a new one
     message_versions: Mapping[str, Callable[[Any], Hashable]] = field(default_factory=dict)
     position_grid_steps: int  # the estimator's position is new at every such step
     fixed_streams: frozenset[str]  # messages whose interval cannot be changed
     not_on_request: frozenset[str]
     never_sent: frozenset[int]  # ids of which an interval is accepted
-    stream_groups: Mapping[int, tuple[str, ...]] = field(
-        default_factory=dict
-    )  # by MAV_DATA_STREAM
+    stream_groups: Mapping[int, tuple[str, ...]] = field(default_factory=dict)  # by MAV_DATA_STREAM
     rate_max_hz: float = math.inf
     interval_refusal: Result
     interval_refusal_text: str = ""  # may name {id}; "": none
@@ -230,14 +212,10 @@ class Firmware(ABC):
     parameters_hashed: bool = False  # a list begins with _HASH_CHECK
     parameters_numbered: bool = False  # PARAM_VALUE.param_index is set also outside a list
     accepted_unsigned: frozenset[int]  # messages that need no signature
-    stamps_follow_clock: bool = (
-        False  # else they only count, and follow those of others
-    )
+    stamps_follow_clock: bool = False  # else they only count, and follow those of others
 
     # health
-    boot_events_s: Mapping[str, float] = field(
-        default_factory=dict
-    )  # events of the start
+    boot_events_s: Mapping[str, float] = field(default_factory=dict)  # events of the start
     sensor_bits: tuple[int, int, int]  # SYS_STATUS with a fix: present, enabled, healthy
     first_fix_s: float  # of GPS
     passes_after_s: float  # boot until the pre-arm checks pass
@@ -247,6 +225,7 @@ class Firmware(ABC):
     battery_events: tuple[str, ...]  # of battery levels 1 on
 
     # flight
+    return_faces_way: bool = False  # a return faces the direction of flight
     integrates_on_ramp: bool = False  # position loop, in a takeoff that still stands on the ground
     landing: Landing
     descend_speed_mps: float  # in a manual mode without stick input
@@ -284,25 +263,21 @@ class Firmware(ABC):
     ) -> Mapping[str, Any]:
         """Fields of SET_POSITION_TARGET_LOCAL_NED in another frame, as those in MAV_FRAME 1."""
 
-    @abstractmethod
     def setpoint_rejection(self, message: str, frame: int | None) -> StatusText | None:
         """Text about this message in an unknown MAV_FRAME, or (None) without any demand."""
+        return None
 
     @abstractmethod
     def mission_refusal(self, item: MissionItem) -> tuple[int, StatusText | None] | None:
         """MAV_MISSION_RESULT and text with which an item is refused; None: it is taken."""
 
     @abstractmethod
-    def mission_frame(self, item: MissionItem, whole: bool) -> int:
-        """MAV_FRAME in which an item is sent back, in whole 1e-7 degrees or in degrees."""
-
-    @abstractmethod
     def is_ground_station(self, kind: int, system: int, parameter: ReadParameter) -> bool:
         """Whether a heartbeat with this MAV_TYPE and system id is a ground station's."""
 
-    @abstractmethod
     def obeys_system(self, sender: int, own: int, parameter: ReadParameter) -> bool:
         """Whether messages of this system id are handled."""
+        return True
 
     @abstractmethod
     def velocity_ratio(self, error_mps: float) -> float:
@@ -323,7 +298,3 @@ class Firmware(ABC):
     @abstractmethod
     def return_height_m(self, distance_m: float, parameter: ReadParameter) -> float:
         """Height of a return above home, by the distance to it."""
-
-    @abstractmethod
-    def return_yaw(self, distance_m: float, parameter: ReadParameter) -> ReturnYaw | None:
-        """Yaw of a return, likewise; None: unchanged."""

@@ -27,7 +27,6 @@ from simulator.firmware.values import (
     Quaternion,
     ReadParameter,
     Result,
-    ReturnYaw,
     StatusText,
     Triple,
     critical,
@@ -62,8 +61,7 @@ _LOCAL_NED, _BODY_NED = 1, 8  # MAV_FRAME
 
 _UNSUPPORTED_FRAME, _UNSUPPORTED = 2, 3  # MAV_MISSION_RESULT
 _COMMAND_FRAME = 2  # MAV_FRAME_MISSION: no place
-_IN_WHOLE_DEGREES = {0: 5, 3: 6}  # MAV_FRAME: GLOBAL, GLOBAL_RELATIVE_ALT -> the same _INT
-_IN_DEGREES = {whole: frame for frame, whole in _IN_WHOLE_DEGREES.items()}
+_PLACE_FRAMES = frozenset({0, 3, 5, 6})  # MAV_FRAME: GLOBAL, GLOBAL_RELATIVE_ALT, both with _INT
 _INVALID = critical("IGN MISSION_ITEM: Invalid item")
 # MAV_CMD of missions with a place, and without one
 _PLACES = frozenset({16, 17, 19, 21, 22, 31, 80, 84, 85, 195, 201, 4501})
@@ -200,7 +198,7 @@ class Px4(Firmware):
         return critical(f"{message} coordinate frame {frame} unsupported")
 
     def mission_refusal(self, item: MissionItem) -> tuple[int, StatusText | None] | None:
-        by_place = item.frame in _IN_WHOLE_DEGREES or item.frame in _IN_DEGREES
+        by_place = item.frame in _PLACE_FRAMES
         if not by_place and item.frame != _COMMAND_FRAME:
             return _UNSUPPORTED_FRAME, _INVALID
         if item.command not in (_PLACES if by_place else _ACTS):
@@ -209,17 +207,9 @@ class Px4(Firmware):
             return _UNSUPPORTED_FRAME, _INVALID
         return None
 
-    def mission_frame(self, item: MissionItem, whole: bool) -> int:
-        """The frame of the kind of message that is requested, whatever the upload used."""
-        return (_IN_WHOLE_DEGREES if whole else _IN_DEGREES).get(item.frame, item.frame)
-
     def is_ground_station(self, kind: int, system: int, parameter: ReadParameter) -> bool:
         """By MAV_TYPE, whatever the system id."""
         return kind == _MAV_TYPE_GCS
-
-    def obeys_system(self, sender: int, own: int, parameter: ReadParameter) -> bool:
-        """All systems."""
-        return True
 
     def velocity_ratio(self, error_mps: float) -> float:
         """Squared, as PX4 reports it."""
@@ -267,12 +257,6 @@ class Px4(Firmware):
             height_m = min(distance_m / math.tan(cone_rad), highest_m)
         return min(max(height_m, 2.0 * accepted_m), highest_m)
 
-    def return_yaw(self, distance_m: float, parameter: ReadParameter) -> ReturnYaw:
-        """Far away in the direction of flight, near home as at home."""
-        return (
-            ReturnYaw.AS_AT_HOME if distance_m < parameter("RTL_MIN_DIST") else ReturnYaw.ALONG_PATH
-        )
-
 
 PX4 = Px4(
     name="px4",
@@ -303,15 +287,12 @@ PX4 = Px4(
         211: Result.DENIED,
         224: Result.UNSUPPORTED,  # MISSION_SET_CURRENT does it
     },
-    home_mirrored=True,
     global_frames=frozenset({5, 6, 11}),
     setpoint_mode_needs_stream=True,
     setpoints_outlive_modes=True,
     stream_reaction_s=0.036,
-    strict_missions=True,
+    requests_kind_of_peer=True,
     turning_items=frozenset({16, 17, 19, 21}),
-    reached_above_landing=True,
-    mission_keeps_speed=True,
     companion_rates_hz=telemetry.COMPANION_RATES_HZ,
     ground_rates_hz=telemetry.GROUND_RATES_HZ,
     messages=builders_in(telemetry),
@@ -340,6 +321,7 @@ PX4 = Px4(
     fails_where_unarmable=True,
     position_without_fix_s=5.0,  # EKF2_NOAID_TOUT
     battery_events=("battery low", "battery critical", "battery emergency"),
+    return_faces_way=True,
     integrates_on_ramp=True,
     landing=Landing(
         low_thrust_share=0.95,  # of estimates that wander on the ground, too

@@ -9,8 +9,13 @@ from typing import Any
 from simulator.autopilot.position_loop import GRAVITY_MPS2
 from simulator.firmware.px4_tables import OFFBOARD, RATES
 from simulator.firmware.values import AttitudeSetpoint, Behaviour
-from simulator.mavlink.fields import centi, fit, in_body, pressure_hpa
-from simulator.mavlink.view import View
+from simulator.mavlink.view import (
+    View,
+    centi,
+    fit,
+    in_body,
+    pressure_hpa,
+)
 
 COMPANION_RATES_HZ = {
     "HEARTBEAT": 1.0,
@@ -31,7 +36,6 @@ COMPANION_RATES_HZ = {
     "ESTIMATOR_STATUS": 1.0,
     "SYSTEM_TIME": 1.0,
     "MISSION_CURRENT": 1.0,
-    "PING": 1.0,
     "SCALED_PRESSURE": 1.0,
     "BATTERY_STATUS": 0.5,
     "CURRENT_MODE": 0.5,
@@ -58,7 +62,6 @@ GROUND_RATES_HZ = {
     "BATTERY_STATUS": 0.5,
     "CURRENT_MODE": 0.5,
     "HOME_POSITION": 0.5,
-    "PING": 0.1,
 }
 
 
@@ -184,11 +187,6 @@ def estimator_status(view: View) -> Sequence[Any]:
     return (
         view.time_us, flags, velocity_ratio, 0.03, 0.03, 0.14, 0.02, math.nan, accuracy_m, 0.31
     )  # fmt: skip
-
-
-def ping(view: View) -> Sequence[Any]:
-    view.ping_sequence += 1
-    return (view.time_us, view.ping_sequence & 0xFFFFFFFF, 0, 0)
 
 
 _STATUS_STEPS = 125  # 0.5 s

@@ -11,7 +11,9 @@ _LATER = Result.TEMPORARILY_REJECTED
 _LOST = critical("Failsafe activated")
 _NOT_AVAILABLE = critical("Switching to {mode} is currently not available")
 
-_RTL, _LAND = "AUTO.RTL", "AUTO.LAND"
+_NO_MISSION = critical("Mission start denied! No valid mission")
+_RTL, _LAND, _MISSION = "AUTO.RTL", "AUTO.LAND", "AUTO.MISSION"
+_LANDED = ("landed",)
 _REGAINED = info("GCS connection regained")
 _WARNINGS = {
     "battery low": StatusText(Severity.EMERGENCY, "Low battery"),
@@ -53,6 +55,23 @@ def _delayed(event: str, parameter: str, modes: Mapping[int, str]) -> list[Rule]
     ]
 
 
+def _says(
+    event: str,
+    text: StatusText,
+    *when: str,
+    to: str = "*",
+    do: tuple[str, ...] = (),
+    result: Result = Result.ACCEPTED,
+) -> Rule:
+    """A row with one text."""
+    return Rule(event, when=when, to=to, do=do, result=result, texts=(text,))
+
+
+def _disarms(event: str, *texts: str, when: tuple[str, ...] = ()) -> Rule:
+    """A row that disarms; the mode chosen last comes back."""
+    return Rule(event, when=when, do=("disarm",), to="remembered", texts=tuple(map(info, texts)))
+
+
 RULES = (
     Rule("mode", when=("not armed",), to="requested"),
     Rule("mode", when=("mode can run",), to="requested"),
@@ -63,44 +82,17 @@ RULES = (
     Rule("return", to="AUTO.RTL", texts=(info("Returning to launch"),)),
     Rule("arm", when=("armed",)),
     Rule("arm", when=("ready",), do=("arm",), texts=(info("Armed by external command"),)),
-    Rule(
-        "arm",
-        result=_LATER,
-        texts=(critical("Arming denied: Resolve system health failures first"),),
-    ),
-    Rule(
-        "checks",
-        when=("velocity rejected",),
-        texts=(critical("Preflight Fail: horizontal velocity unstable"),),
-    ),
-    Rule(
-        "checks",
-        when=("fix missing", "COM_ARM_WO_GPS=0"),
-        texts=(critical("Preflight Fail: GPS fix too low"),),
-    ),
-    Rule(
-        "checks",
-        when=("fix missing", "COM_ARM_WO_GPS=1"),
-        texts=(warning("Preflight: GPS fix too low"),),
-    ),
+    _says("arm", critical("Arming denied: Resolve system health failures first"), result=_LATER),
+    _says("checks", critical("Preflight Fail: horizontal velocity unstable"), "velocity rejected"),
+    _says("checks", critical("Preflight Fail: GPS fix too low"), "fix missing", "COM_ARM_WO_GPS=0"),
+    _says("checks", warning("Preflight: GPS fix too low"), "fix missing", "COM_ARM_WO_GPS=1"),
     Rule("force arm", when=("armed",)),
     Rule("force arm", do=("arm",), texts=(info("Armed by external command"),)),
     Rule("disarm", when=("not armed",)),
-    Rule(
-        "disarm",
-        when=("landed",),
-        do=("disarm",),
-        to="remembered",
-        texts=(info("Disarmed by external command"),),
-    ),
+    _disarms("disarm", "Disarmed by external command", when=_LANDED),
     Rule("disarm", result=_LATER, texts=(critical("Disarming denied: not landed"),)),
     Rule("force disarm", when=("not armed",)),
-    Rule(
-        "force disarm",
-        do=("disarm",),
-        to="remembered",
-        texts=(info("Disarmed by external command"),),
-    ),
+    _disarms("force disarm", "Disarmed by external command"),
     *(
         Rule(
             "stream lost",
@@ -133,44 +125,18 @@ RULES = (
     Rule("position found", when=("since position lost",), to="remembered", do=("recover",)),
     Rule("climbed", "AUTO.TAKEOFF", to="AUTO.LOITER"),
     Rule("already higher", texts=(critical("Already higher than takeoff altitude"),)),
-    Rule(
-        "mission",
-        when=("mission missing",),
-        result=Result.DENIED,
-        texts=(critical("Mission start denied! No valid mission"),),
-    ),
-    Rule("mission", when=("armed",), to="AUTO.MISSION"),
-    Rule(
-        "mission",
-        when=("ready",),
-        do=("arm",),
-        to="AUTO.MISSION",
-        texts=(info("Armed by mission start"),),
-    ),
-    Rule(
-        "mission",
-        result=_LATER,
-        texts=(critical("Switching to Mission is currently not available"),),
-    ),
+    _says("mission", _NO_MISSION, "mission missing", result=Result.DENIED),
+    Rule("mission", when=("armed",), to=_MISSION),
+    _says("mission", info("Armed by mission start"), "ready", to=_MISSION, do=("arm",)),
+    _says("mission", critical("Switching to Mission is currently not available"), result=_LATER),
     Rule("mission progress", send=("MISSION_CURRENT",)),
     Rule("item reached", send=("MISSION_ITEM_REACHED",)),
     Rule("mission return", "AUTO.MISSION", to="AUTO.RTL", texts=(info("Returning to launch"),)),
-    Rule(
-        "mission finished",
-        when=("landed",),
-        do=("disarm",),
-        to="remembered",
-        texts=(info("Mission finished, landed"), info("Disarmed by landing")),
-    ),
+    _disarms("mission finished", "Mission finished, landed", "Disarmed by landing", when=_LANDED),
     Rule("mission finished", texts=(info("Mission finished, loitering"),)),
     Rule("reboot", result=Result.DENIED),  # as SITL does, which cannot
     Rule("took off", texts=(info("Takeoff detected"),)),
     Rule("landed", texts=(info("Landing detected"),)),
-    Rule("settled", do=("disarm",), to="remembered", texts=(info("Disarmed by landing"),)),
-    Rule(
-        "idle",
-        do=("disarm",),
-        to="remembered",
-        texts=(info("Disarmed by auto preflight disarming"),),
-    ),
+    _disarms("settled", "Disarmed by landing"),
+    _disarms("idle", "Disarmed by auto preflight disarming"),
 )

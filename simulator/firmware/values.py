@@ -137,10 +137,3 @@ class MissionItem:
     x: int
     y: int
     z: float
-
-
-class ReturnYaw(Enum):
-    """Yaw on the way home."""
-
-    ALONG_PATH = "in the direction of flight"
-    AS_AT_HOME = "as at home when it was set"

@@ -12,11 +12,11 @@ from random import Random
 from pydantic import Field
 
 from offboard.documents.parameters import Parameters
+from simulator.link.framing import frames
 
 # Answers and events, which a rate limit per message does not drop: PARAM_VALUE, MISSION_*,
 # COMMAND_ACK, FILE_TRANSFER_PROTOCOL, TIMESYNC, AUTOPILOT_VERSION, MESSAGE_INTERVAL, STATUSTEXT
 _NOT_STREAMED = frozenset((22, *range(37, 48), 51, 73, 77, 110, 111, 148, 244, 253))
-_MAGIC_V2, _SIGNED, _SIGNATURE_BYTES = 0xFD, 0x01, 13
 
 
 class Impairment(Parameters):
@@ -154,19 +154,3 @@ class LinkDirection:
                 channel.put(datagram, now_us)
             datagrams = channel.take(now_us)
         return datagrams
-
-
-def frames(datagram: bytes) -> list[tuple[int, bytes]]:
-    """(message id, frame) of each MAVLink 2 frame; anything else is one piece with id -1."""
-    found: list[tuple[int, bytes]] = []
-    at = 0
-    while at < len(datagram):
-        left = len(datagram) - at
-        if datagram[at] != _MAGIC_V2 or left < 12:
-            found.append((-1, datagram[at:]))
-            break
-        size = 12 + datagram[at + 1] + (_SIGNATURE_BYTES if datagram[at + 2] & _SIGNED else 0)
-        message_id = int.from_bytes(datagram[at + 7 : at + 10], "little")
-        found.append((message_id, datagram[at : at + size]))
-        at += size
-    return found

@@ -13,9 +13,9 @@ import socket
 from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
 
 from offboard.documents.errors import abridged
+from simulator.link.framing import whole_frames
 
 PEERS_MAX = 16
 DATAGRAM_MAX = 65535
@@ -23,24 +23,12 @@ Address = tuple[str, int]
 CLIENTS_MAX = 16
 READ_BYTES = 65536
 UNSENT_MAX = 1 << 20  # bytes; a client that does not read more is disconnected
-_MAGIC_V1, _MAGIC_V2, _SIGNED, _SIGNATURE_BYTES = 0xFE, 0xFD, 0x01, 13
 # Distance between the ports of two instances, as PX4 and ArduPilot have it
 _PORTS_APART = {"udpout": 1, "udpin": 1, "tcpin": 10}
 
 
 class LinkError(Exception):
     """An address that cannot be used; the message is one sentence."""
-
-
-class Link(Protocol):
-    """One end of a link with any number of peers. No method blocks."""
-
-    @property
-    def port(self) -> int: ...
-    def fileno(self) -> int: ...
-    def send(self, datagrams: Iterable[bytes]) -> None: ...
-    def receive(self) -> bytes | None: ...
-    def close(self) -> None: ...
 
 
 class UdpLink:
@@ -199,21 +187,7 @@ class TcpLink:
         self._listener.close()
 
 
-def whole_frames(data: bytes | bytearray) -> int:
-    """Number of bytes before the first incomplete frame; bytes outside frames count too."""
-    at = 0
-    while at < len(data):
-        length = 1
-        if data[at] in (_MAGIC_V1, _MAGIC_V2):
-            if len(data) - at < 3:
-                return at
-            length = data[at + 1] + (8 if data[at] == _MAGIC_V1 else 12)
-            if data[at] == _MAGIC_V2 and data[at + 2] & _SIGNED:
-                length += _SIGNATURE_BYTES
-            if at + length > len(data):
-                return at
-        at += length
-    return at
+Link = UdpLink | TcpLink
 
 
 def free_ports(count: int) -> list[int]:

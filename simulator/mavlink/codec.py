@@ -14,10 +14,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import all as dialect  # also CURRENT_MODE, which common lacks
 
-from simulator.mavlink.signing import REFUSALS, SIGNATURE_LENGTH, Keyring
-
-MAGIC_V1, MAGIC_V2 = 0xFE, 0xFD
-SIGNED = 0x01  # incompatibility flag: 13 bytes of signature follow
+from simulator.link.framing import MAGIC_V1, MAGIC_V2, SIGNED, frame_length
+from simulator.mavlink.signing import REFUSALS, Keyring
 
 _codec = dialect.MAVLink(None)
 
@@ -128,13 +126,12 @@ class Decoder:
         """Number of bytes to skip, and the message that begins at `at`, if one does."""
         left = len(data) - at
         if data[at] == MAGIC_V2 and left >= 12:
-            length, flags = 12 + data[at + 1], data[at + 2]
-            message_id = int.from_bytes(data[at + 7 : at + 10], "little")
+            flags, message_id = data[at + 2], int.from_bytes(data[at + 7 : at + 10], "little")
         elif data[at] == MAGIC_V1 and left >= 8:
-            length, flags, message_id = 8 + data[at + 1], 0, data[at + 5]
+            flags, message_id = 0, data[at + 5]
         else:
             return self._skip("not a frame")
-        length += SIGNATURE_LENGTH if flags & SIGNED else 0
+        length = frame_length(data, at)
         if flags & ~SIGNED:
             return self._skip("incompatible flags")
         if length > left:

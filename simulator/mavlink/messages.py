@@ -11,8 +11,14 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from simulator.mavlink.fields import centi, fit, heading_cdeg, motion_fields, pressure_hpa
-from simulator.mavlink.view import View
+from simulator.mavlink.view import (
+    View,
+    centi,
+    fit,
+    heading_cdeg,
+    motion_fields,
+    pressure_hpa,
+)
 
 # -- motion ------------------------------------------------------------------------------------
 

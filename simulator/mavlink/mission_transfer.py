@@ -7,25 +7,18 @@ to download.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import IntEnum
 
 from simulator.autopilot.mission import ITEMS_MAX, Kind, Mission
 from simulator.firmware.base import Firmware
-from simulator.firmware.values import MissionItem, critical
+from simulator.firmware.values import MissionItem
 from simulator.mavlink.codec import Message
 from simulator.mavlink.outbox import Outbox, Texts
 
 REPEAT_S, GIVE_UP_S = 0.25, 5.0
-CHECK_S = 0.03  # from the last item until a strict firmware has checked the mission
 Peer = tuple[int, int]  # system, component
-
-_UNEXPECTED = critical("WPM: REJ. CMD: Req. WP was unexpected")
-_BUSY = critical("WPM: IGN MISSION_COUNT: Busy")
-_TIMEOUT = critical("Operation timeout")
-_NOT_REQUESTED = critical("IGN MISSION_ITEM: No transfer")
 
 
 class Ack(IntEnum):
@@ -51,55 +44,27 @@ class Upload:
 
 
 @dataclass(slots=True)
-class Download:
-    """A download in progress: receiver and next item."""
-
-    peer: Peer
-    active_s: float
-    due: int = 0
-
-
-@dataclass(slots=True)
 class MissionTransfer:
-    """Mission transfers of one link; `texts`: of this link."""
+    """Mission transfers of one link; `texts`: of this link. A download needs no state."""
 
     outbox: Outbox
     texts: Texts
     mission: Mission = field(init=False)
     _firmware: Firmware = field(init=False)
     _upload: Upload | None = None
-    _download: Download | None = None
     _taken: int = 0  # count of the last upload
-    _unchecked: tuple[tuple[MissionItem, ...], float] | None = None  # a mission; arrival time
     _whole: bool = False  # the peer uses the _INT messages, in 1e-7 degrees
 
     def __post_init__(self) -> None:
         autopilot = self.outbox.view.autopilot
         self.mission, self._firmware = autopilot.mission, autopilot.firmware
 
-    @property
-    def under_way(self) -> bool:
-        """A transfer waits for its next message or its time-out."""
-        return not (self._upload is None and self._download is None and self._unchecked is None)
-
     def handle(self, message: Message, now_s: float) -> None:
         """Handle one message of the mission protocol addressed to this vehicle."""
-        self._check(math.inf)
         HANDLERS[message.name](self, message, now_s)
-
-    def _check(self, now_s: float) -> None:
-        """Replace the vehicle's mission by the uploaded one once it has been checked."""
-        if self._unchecked is not None and now_s - self._unchecked[1] >= CHECK_S:
-            self.mission.store(self._unchecked[0])
-            self._unchecked = None
 
     def step(self, now_s: float) -> None:
         """Request a missing item again, and give up after a while."""
-        self._check(now_s)
-        if self._download is not None and now_s - self._download.active_s > GIVE_UP_S:
-            self._download = None
-            if self._firmware.strict_missions:
-                self.texts.send(_TIMEOUT)
         upload = self._upload
         if upload is None:
             return
@@ -113,10 +78,7 @@ class MissionTransfer:
 
     def _count(self, message: Message, now_s: float) -> None:
         peer = _sender(message)
-        if self._firmware.strict_missions and self._download is not None:
-            self._acknowledge(peer, Ack.ERROR)
-            self.texts.send(_BUSY)
-        elif message.mission_type:
+        if message.mission_type:
             self._acknowledge(peer, Ack.UNSUPPORTED, message.mission_type)
         elif message.count > ITEMS_MAX:
             self._acknowledge(peer, Ack.NO_SPACE)
@@ -129,18 +91,18 @@ class MissionTransfer:
 
     def _request_item(self, upload: Upload, now_s: float) -> None:
         upload.requested_s = now_s
-        whole = self._whole and self._firmware.strict_missions
+        whole = self._whole and self._firmware.requests_kind_of_peer
         name = "MISSION_REQUEST_INT" if whole else "MISSION_REQUEST"
         self.outbox.send(name, *upload.peer, len(upload.items), 0)
 
     def _item(self, message: Message, now_s: float) -> None:
         self._whole = message.name == "MISSION_ITEM_INT"
         upload, peer = self._upload, _sender(message)
-        if self._firmware.strict_missions and upload is None and self._download is None:
-            self._take_late(message, peer)
-        if upload is None or upload.peer != peer:
+        if upload is None:  # the last one again, whose answer was lost, or one without an upload
+            last = message.seq + 1 == self._taken and not message.mission_type
+            self._acknowledge(peer, Ack.ACCEPTED if last else Ack.ERROR, message.mission_type)
             return
-        if message.seq != len(upload.items):  # a duplicate
+        if upload.peer != peer or message.seq != len(upload.items):  # a duplicate
             return
         item = _read(message)
         refused = self._firmware.mission_refusal(item)
@@ -155,34 +117,17 @@ class MissionTransfer:
         upload.begun_s = now_s
         if len(upload.items) < upload.count:
             self._request_item(upload, now_s)
-        else:
-            self._take(upload, now_s)
-
-    def _take(self, upload: Upload, now_s: float) -> None:
-        """The upload is complete."""
-        if self._firmware.strict_missions:
-            self._unchecked = (tuple(upload.items), now_s)
-        else:
-            self.mission.store(tuple(upload.items))
+            return
+        self.mission.store(tuple(upload.items))
         self._upload, self._taken = None, upload.count
         self._acknowledge(upload.peer, Ack.ACCEPTED)
         if self._firmware.mission_text is not None:
             self.texts.send(self._firmware.mission_text)
 
-    def _take_late(self, message: Message, peer: Peer) -> None:
-        """An item without an upload: the last one repeated, or one that was not requested."""
-        if message.seq + 1 == self._taken and not message.mission_type:
-            self._acknowledge(peer, Ack.ACCEPTED)
-            return
-        self._acknowledge(peer, Ack.ERROR, message.mission_type)
-        self.texts.send(_NOT_REQUESTED)
-
     def _ack(self, message: Message, now_s: float) -> None:
         """MISSION_ACK of the peer: it wants the other kind of request, or cancels."""
-        peer, upload = _sender(message), self._upload
-        if self._download is not None and self._download.peer == peer:
-            self._download = None
-        if upload is None or upload.peer != peer:
+        upload = self._upload
+        if upload is None or upload.peer != _sender(message):
             return
         if message.type == Ack.UNSUPPORTED:
             self._whole = not self._whole
@@ -195,29 +140,21 @@ class MissionTransfer:
 
     # -- down, and the rest ------------------------------------------------------------------
 
-    def _list(self, message: Message, now_s: float) -> None:
-        mission_type, peer = message.mission_type, _sender(message)
-        count = 0 if mission_type else len(self.mission.items)
-        if not mission_type:
-            self._download = Download(peer, now_s)
-        self.outbox.send("MISSION_COUNT", *peer, count, mission_type)
+    def _list(self, message: Message, _: float) -> None:
+        count = 0 if message.mission_type else len(self.mission.items)
+        self.outbox.send("MISSION_COUNT", *_sender(message), count, message.mission_type)
 
-    def _request(self, message: Message, now_s: float) -> None:
+    def _request(self, message: Message, _: float) -> None:
         peer, items = _sender(message), self.mission.items
         self._whole = whole = message.name == "MISSION_REQUEST_INT"
         is_home = self._firmware.home_item_first and message.seq == 0
-        exists = not message.mission_type and (is_home or message.seq < len(items))
-        if self._firmware.strict_missions and not self._is_due(peer, message.seq, exists):
-            return
-        if self._download is not None:
-            self._download.active_s = now_s
-        if not exists:
+        if message.mission_type or not (is_home or message.seq < len(items)):
             self._acknowledge(peer, Ack.INVALID_SEQUENCE, message.mission_type)
             return
         item = self._home() if is_home else items[message.seq]
         places = (item.x, item.y) if whole else (item.x * 1e-7, item.y * 1e-7)
         current = int(message.seq == self.mission.current)
-        head = (*peer, message.seq, self._firmware.mission_frame(item, whole), item.command)
+        head = (*peer, message.seq, item.frame, item.command)
         name = "MISSION_ITEM_INT" if whole else "MISSION_ITEM"
         self.outbox.send(name, *head, current, 1, *item.params, *places, item.z, 0)
 
@@ -227,19 +164,6 @@ class MissionTransfer:
         north_m, east_m, down_m = view.autopilot.guidance.home_ned_m
         place = view.geodetic(north_m, east_m)
         return MissionItem(0, Kind.WAYPOINT, (0.0,) * 4, *place, view.altitude_mm(down_m) * 1e-3)
-
-    def _is_due(self, peer: Peer, number: int, exists: bool) -> bool:
-        """Whether it is the next item or the last one again; any other ends the download."""
-        download = self._download
-        if download is None or download.peer != peer:
-            return False
-        if not exists or number not in (download.due - 1, download.due):
-            self._download = None
-            self._acknowledge(peer, Ack.ERROR)
-            self.texts.send(_UNEXPECTED)
-            return False
-        download.due = number + 1
-        return True
 
     def _clear(self, message: Message, _: float) -> None:
         if message.mission_type in (0, 255):  # the mission, or all

@@ -23,16 +23,14 @@ class ParameterTransfer:
     outbox: Outbox
     _due: list[str] = field(default_factory=list)
 
-    @property
-    def listing(self) -> bool:
-        return bool(self._due)
-
     def handle(self, message: Message) -> None:
         """Handle one message of the parameter protocol addressed to this vehicle."""
         HANDLERS[message.name](self, message)
 
     def step(self) -> None:
         """Queue the next parameters of a requested list."""
+        if not self._due:
+            return
         for name in self._due[:PER_STEP]:
             self._answer(name, listed=True)
         del self._due[:PER_STEP]

@@ -74,10 +74,8 @@ class Server:
 
     def step(self) -> None:
         """Queue what is due at this step: missions, lists of parameters, telemetry."""
-        if self._missions.under_way:
-            self._missions.step(self.view.autopilot.state.time_us * 1e-6)
-        if self._parameters.listing:
-            self._parameters.step()
+        self._missions.step(self.view.autopilot.state.time_us * 1e-6)
+        self._parameters.step()
         for name in self.schedule.take_due():
             self.outbox.send_now(name)
 
@@ -153,11 +151,6 @@ class Server:
         else:
             self.answered_ns = message.ts1
 
-    def _ping(self, message: Message) -> None:
-        if message.target_system == 0 and "PING" in self.view.builders:
-            sender = (message.system, message.component)
-            self.outbox.send("PING", message.time_usec, message.seq, *sender)
-
     def _rc_channels_override(self, message: Message) -> None:
         self._sticks(message, [message.values[f"chan{i}_raw"] for i in range(1, 9)])
 
@@ -206,7 +199,6 @@ HANDLERS: dict[str, Callable[[Server, Message], None]] = {
     **dict.fromkeys((ATTITUDE, LOCAL, GLOBAL), Server._setpoint),
     **dict.fromkeys(MISSION_HANDLERS, Server._mission),
     "TIMESYNC": Server._timesync,
-    "PING": Server._ping,
     **dict.fromkeys(PARAMETER_HANDLERS, Server._parameter),
     "RC_CHANNELS_OVERRIDE": Server._rc_channels_override,
     "MANUAL_CONTROL": Server._manual_control,

@@ -11,7 +11,6 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-SIGNATURE_LENGTH = 13
 EPOCH_UNIX_US = 1_420_070_400 * 1_000_000
 US_PER_TICK = 10
 A_MINUTE = 60 * 1_000_000 // US_PER_TICK

@@ -93,7 +93,6 @@ def advance_airframe(
     wind_ned: Array,
     body_constants: Array,
     rotor_constants: Array,
-    strength: float,
     step_s: float,
     substeps: int,
     inputs: Array,
@@ -101,14 +100,14 @@ def advance_airframe(
 ) -> None:
     """One step in place: `body` (13,) and `rotor` (ROTOR_SIZE,).
 
-    thrust_demand 0..1; turn_demand (3,) angular acceleration FRD rad/s^2; `strength` multiplies
-    the thrust (a failing motor). `inputs` (4,) and `scratch` (3, 13) are work space.
+    thrust_demand 0..1; turn_demand (3,) angular acceleration FRD rad/s^2. `inputs` (4,) and
+    `scratch` (3, 13) are work space.
     """
     before = rotor[THRUST]
     rotor[THRUST] = thrust_demand + (before - thrust_demand) * rotor_constants[1]
     mean = 0.5 * (before + rotor[THRUST])
     north, east, down = body[7], body[8], body[9]
-    inputs[0] = strength * rotor_constants[0] * mean * _ground_gain(body[12], rotor_constants[3])
+    inputs[0] = rotor_constants[0] * mean * _ground_gain(body[12], rotor_constants[3])
     # On the ground it does not rotate
     authority = 0.0 if rotor[CONTACT] > 0.5 else min(mean / rotor_constants[2], 1.0)
     _torques(body, turn_demand, authority, body_constants, inputs)

@@ -14,13 +14,6 @@ from simulator.vehicle.sensors import EstimatorName, WhiteNoise
 from simulator.vehicle.wind import Gusts
 
 
-class Weakening(Parameters):
-    """Thrust multiplied by `thrust_scale` from vehicle time `at_s` on."""
-
-    at_s: float = Field(ge=0, le=1e5)
-    thrust_scale: float = Field(ge=0, le=2)
-
-
 class Conditions(Parameters):
     """Conditions of a flight that the controller does not know."""
 
@@ -30,7 +23,6 @@ class Conditions(Parameters):
     gusts: Gusts = Gusts()
     thrust_scale: float = Field(default=1.0, ge=0.1, le=3)  # 0.85: 15 % less than the model
     mass_scale: float = Field(default=1.0, ge=0.1, le=5)
-    weakening: Weakening | None = None
     ground_effect: bool = False
     battery: Battery = Battery()
     # vehicle clock at the start; its 32-bit milliseconds wrap at 4294967.296 s

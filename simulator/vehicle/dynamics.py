@@ -67,7 +67,7 @@ RECORD = np.dtype(
         # constants
         ("body_constants", "f8", 12),
         ("rotor_constants", "f8", 6),
-        ("air", "f8", 7),
+        ("air", "f8", 5),
         ("error_transition", "f8", (ERROR_COUNT, ERROR_COUNT)),
         ("error_scale", "f8", (ERROR_COUNT, ERROR_COUNT)),
         ("gust_transition", "f8", (GUST_COUNT, GUST_COUNT)),
@@ -153,7 +153,6 @@ def advance_steps(count: int, plants: Any) -> None:
             plant.wind,
             plant.body_constants,
             plant.rotor_constants,
-            plant.air[6] if step * STEP_S >= plant.air[5] else 1.0,
             STEP_S,
             plant.substeps,
             plant.inputs,

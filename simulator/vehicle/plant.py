@@ -7,7 +7,6 @@ compiled call per `advance`. Knows no modes, no arming and no MAVLink.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,14 +19,13 @@ from simulator.vehicle.airframe import (
     CHARGE,
     CONTACT,
     THRUST,
-    Airframe,
     build_airframe,
 )
 from simulator.vehicle.attitude import Demand, build_loop, encode
 from simulator.vehicle.battery import BatteryState
 from simulator.vehicle.conditions import Conditions
 from simulator.vehicle.dynamics import RECORD, advance_steps, draw_gusts, receive_fix, report_state
-from simulator.vehicle.noise import LinearProcess, seed_word
+from simulator.vehicle.noise import seed_word
 from simulator.vehicle.sensors import (
     ATTITUDE,
     POSITION,
@@ -98,31 +96,41 @@ class Plant:
             ground_effect=conditions.ground_effect,
             battery=conditions.battery,
         )
-        self.pack = airframe.pack
-        gusts = dryden(conditions.gusts, STEP_S)
+        loop, gusts = build_loop(vehicle, STEP_S), dryden(conditions.gusts, STEP_S)
+        model = error_model(conditions.estimator, conditions.white_noise)
+        errors, wind_ned_mps = error_process(model, STEP_S), conditions.wind_ned_mps
         constants = {
             "seed": seed_word(seed),
-            **_of_vehicle(vehicle, airframe),
-            **_of_estimator(conditions),
-            **_of_air(conditions, gusts),
+            "substeps": airframe.substeps,
+            "body_constants": airframe.body,
+            "rotor_constants": airframe.rotor,
+            "delays": loop.delays,
+            "gains": loop.gains,
+            "noisy": np.any(errors.scale != 0.0),
+            "lag_s": model.lag_s,
+            "white_sds": white_sds(model),
+            "fix_sds": (*model.receiver.position_m, *model.receiver.velocity_mps),
+            "error_transition": errors.transition,
+            "error_scale": errors.scale,
+            "air": (*wind_ned_mps, *wind_axes(wind_ned_mps)),
+            "gust_transition": gusts.transition,
+            "gust_scale": gusts.scale,
         }
-        for name, value in constants.items():
-            self.record[name] = value
-        self._start(conditions.wind_ned_mps, gusts)
-
-    def _start(self, wind_ned_mps: Triple, gusts: LinearProcess) -> None:
         record = self.record
+        for name, value in constants.items():
+            record[name] = value
+        self.pack = airframe.pack
         self._demand: Demand | None = None
         self._body, self._rotor, self._wind = (
             record[name][0] for name in ("body", "rotor", "wind")
         )
         self._row, self._report = record["row"][0], record["report"][0]
         self._offset_ned_m = record["offset"][0]
-        self._reset_counter = 0
+        self.reset_counter = 0  # estimator resets, modulo 256
         self._body[0] = 1.0
         self._rotor[CONTACT] = 1.0
         self._wind[:] = wind_ned_mps
-        draw_gusts(self.record)
+        draw_gusts(record)
         record["gust"][0] = gusts.stationary_scale @ record["gust_normals"][0]
         record["gusty"] = np.any(record["gust"] != 0.0)
 
@@ -146,7 +154,7 @@ class Plant:
     def reset_estimate(self, offset_ned_m: Triple) -> None:
         """Offset the estimate, and count an estimator reset."""
         self._offset_ned_m += offset_ned_m
-        self._reset_counter = (self._reset_counter + 1) % 256
+        self.reset_counter = (self.reset_counter + 1) % 256
 
     def drift_estimate(self, offset_ned_m: Triple) -> None:
         """Offset the estimate without an estimator reset."""
@@ -203,17 +211,10 @@ class Plant:
         return bool(self._rotor[CONTACT])
 
     @property
-    def reset_counter(self) -> int:
-        """Estimator resets, modulo 256."""
-        return self._reset_counter
-
-    @property
     def estimate(self) -> Estimate:
         """Estimate of the present step; repeated calls give the same one."""
         out = self.report().copy()
-        return Estimate(
-            out[POSITION], out[VELOCITY], out[ATTITUDE], out[RATES], self._reset_counter
-        )
+        return Estimate(out[POSITION], out[VELOCITY], out[ATTITUDE], out[RATES], self.reset_counter)
 
     def report(self) -> Array:
         """Estimate as one array (REPORT_WIDTH,), with the layout of `simulator.vehicle.sensors`;
@@ -221,42 +222,3 @@ class Plant:
         report_state(self.record)
         seen: Array = self._report
         return seen
-
-
-def _of_vehicle(vehicle: Vehicle, airframe: Airframe) -> dict[str, Any]:
-    """Constants of airframe and attitude loop, by their names in the record."""
-    loop = build_loop(vehicle, STEP_S)
-    return {
-        "substeps": airframe.substeps,
-        "body_constants": airframe.body,
-        "rotor_constants": airframe.rotor,
-        "delays": loop.delays,
-        "gains": loop.gains,
-    }
-
-
-def _of_estimator(conditions: Conditions) -> dict[str, Any]:
-    model = error_model(conditions.estimator, conditions.white_noise)
-    errors = error_process(model, STEP_S)
-    return {
-        "noisy": np.any(errors.scale != 0.0),
-        "lag_s": model.lag_s,
-        "white_sds": white_sds(model),
-        "fix_sds": (*model.receiver.position_m, *model.receiver.velocity_mps),
-        "error_transition": errors.transition,
-        "error_scale": errors.scale,
-    }
-
-
-def _of_air(conditions: Conditions, gusts: LinearProcess) -> dict[str, Any]:
-    weakening = conditions.weakening
-    return {
-        "air": (
-            *conditions.wind_ned_mps,
-            *wind_axes(conditions.wind_ned_mps),
-            weakening.at_s if weakening else np.inf,
-            weakening.thrust_scale if weakening else 1.0,
-        ),
-        "gust_transition": gusts.transition,
-        "gust_scale": gusts.scale,
-    }

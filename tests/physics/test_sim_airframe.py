@@ -76,15 +76,6 @@ def test_motors_off_in_the_air_is_free_fall_with_drag():
     assert down[-1] > 3.4  # PX4, zero thrust: 3.4 m/s after 0.6 s from the command
 
 
-def test_nan_thrust_falls_as_zero_thrust_does():
-    falls = [
-        response(hovering(PX4), Demand(True, thrust, LEVEL), 0.6, _down_velocity)[1]
-        for thrust in (math.nan, 0.0)
-    ]
-    assert falls[0][-1] > 3.0
-    assert np.array_equal(falls[0], falls[1])
-
-
 @pytest.mark.parametrize("share", [0.0, 0.5, 0.98])
 def test_vehicle_stays_on_the_ground_below_its_weight(share):
     tilted = attitude(roll_deg=15.0)
@@ -110,24 +101,6 @@ def test_vehicle_lifts_off_just_above_its_weight_and_not_before_the_delay():
     assert not carried[-1]
 
 
-def test_landing_at_seven_tenths_of_a_metre_per_second_ends_at_rest():
-    plant = hovering(PX4)
-    plant.advance(0.5, Demand(True, PX4.hover_thrust, attitude(pitch_deg=-5.0)))
-    heights, speeds = [], []
-    while not plant.truth.on_ground:
-        error = plant.truth.velocity_ned_mps[2] - 0.7
-        thrust = PX4.hover_thrust * (1.0 + error)
-        plant.advance(0.02, Demand(True, thrust, LEVEL))
-        speeds.append(plant.truth.velocity_ned_mps[2])
-        assert len(speeds) < 2000
-    assert speeds[-2] == pytest.approx(0.7, abs=0.15)
-    for _ in range(100):
-        plant.advance(0.02, Demand(True, 0.3 * PX4.hover_thrust, LEVEL))
-        heights.append(-plant.truth.position_ned_m[2])
-    assert max(map(abs, heights)) == 0.0
-    assert np.abs(plant.truth.velocity_ned_mps).max() < 1e-12
-
-
 def test_crash_upside_down_at_speed_is_survived_and_ends_level():
     plant = _climbing(0.9, 4.0)
     plant.advance(0.8, Demand(True, 0.5, attitude(roll_deg=180.0, yaw_deg=40.0)))
@@ -142,16 +115,6 @@ def test_crash_upside_down_at_speed_is_survived_and_ends_level():
     assert np.abs(truth.velocity_ned_mps).max() < 1e-12
 
 
-def test_heading_survives_standing_on_the_ground():
-    plant = hovering(PX4)
-    plant.advance(4.0, Demand(True, PX4.hover_thrust, attitude(yaw_deg=70.0)))
-    heading = euler_from_quaternion(plant.truth.attitude)[2]
-    plant.advance(6.0, Demand(False))
-    assert plant.truth.on_ground
-    assert euler_from_quaternion(plant.truth.attitude)[2] == pytest.approx(heading, abs=0.05)
-    assert math.degrees(heading) == pytest.approx(70.0, abs=2.0)
-
-
 @pytest.mark.parametrize(("thrust_scale", "mass_scale"), [(0.85, 1.0), (1.0, 1.2), (0.85, 1.2)])
 def test_wrong_thrust_and_mass_act_as_they_should(thrust_scale, mass_scale):
     plant = _climbing(
@@ -162,16 +125,6 @@ def test_wrong_thrust_and_mass_act_as_they_should(thrust_scale, mass_scale):
     felt = truth.acceleration_ned_mps2[2] + drag * truth.velocity_ned_mps[2]
     expected = G * (1.0 - 0.8 / PX4.hover_thrust * thrust_scale / mass_scale)
     assert felt == pytest.approx(expected, rel=5e-3)
-
-
-def test_motor_weakening_begins_at_its_time():
-    weakened = {"at_s": 0.8, "thrust_scale": 0.7}
-    plant = _climbing(0.8, 0.8, weakening=weakened)
-    before = plant.truth.acceleration_ned_mps2[2]
-    assert before == pytest.approx(_climbing(0.8, 0.8).truth.acceleration_ned_mps2[2], abs=1e-12)
-    plant.advance(STEP_S, Demand(True, 0.8, LEVEL))
-    after = plant.truth.acceleration_ned_mps2[2]
-    assert after - before == pytest.approx(0.3 * G * 0.8 / PX4.hover_thrust, rel=0.02)
 
 
 def test_ground_effect_lifts_near_the_ground_only():

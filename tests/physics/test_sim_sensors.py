@@ -14,7 +14,6 @@ from simulator.steps import STEP_S
 from simulator.vehicle.attitude import Demand
 from simulator.vehicle.conditions import Conditions
 from simulator.vehicle.plant import Plant
-from simulator.vehicle.sensors import ARDUPILOT_LIKE, PX4_LIKE, YAW, error_process
 
 FLIGHTS, SECONDS, RATE_HZ = 16, 60, 50
 
@@ -92,15 +91,6 @@ def _correlation_time_s(values: np.ndarray) -> np.ndarray:
 )
 def test_error_has_the_measured_standard_deviation(errors, estimator, quantity, measured, slack):
     assert _rms(errors[estimator][quantity]) == pytest.approx(measured, rel=slack)
-
-
-@pytest.mark.parametrize(("model", "sd_deg"), [(PX4_LIKE, 2.5), (ARDUPILOT_LIKE, 0.5)])
-def test_yaw_error_has_the_measured_stationary_statistics(model, sd_deg):
-    """Flights are too short to tell: its correlation time is 15 s."""
-    process = error_process(model, 1.5)
-    assert process.transition[YAW, YAW] == pytest.approx(math.exp(-0.1), rel=1e-9)
-    sd_rad = np.linalg.norm(process.stationary_scale[YAW])
-    assert math.degrees(sd_rad) == pytest.approx(sd_deg, rel=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -185,15 +175,6 @@ def test_px4_position_error_is_smooth_and_its_velocity_error_is_not(errors):
     assert np.all(velocity[:, 1] / velocity[:, 0] < 3.2)
 
 
-def test_px4_position_follows_its_velocity_error_only_in_small_part(errors):
-    """Slope of d e_p / dt on e_v: PX4 .11-.14 N, .13-.17 E, .29-.46 D, where 1 is consistent."""
-    found = errors["px4_like"]
-    rate = np.diff(found["position"], axis=1) * RATE_HZ
-    mean = 0.5 * (found["velocity"][:, 1:] + found["velocity"][:, :-1])
-    slope = np.mean(rate * mean, axis=(0, 1)) / np.mean(mean**2, axis=(0, 1))
-    assert slope == pytest.approx((0.125, 0.15, 0.33), abs=0.1)
-
-
 def test_white_part_is_as_small_as_measured():
     """Between samples 8 ms apart: what is left of a quadratic, the drive of the velocity included.
     PX4: position .05-.07 mm, velocity .0012 / .0041 / .0033 m/s; thrust direction .00006-.00012
@@ -229,33 +210,6 @@ def test_perfect_estimator_reports_the_truth_but_never_the_same_twice():
         seen = standing.estimate
         estimates.append((*np.float32(seen.position_ned_m), *np.float32(seen.velocity_ned_mps)))
     assert len(set(estimates)) == 100
-
-
-def test_white_estimator_has_the_configured_noise_and_nothing_else():
-    noise = {"position_m": 0.05, "velocity_mps": 0.1, "attitude_rad": 0.01}
-    vehicle = load("px4_sih")
-    plant = hovering(vehicle, Conditions(estimator="white", white_noise=noise), seed=9)
-    position, velocity = [], []
-    for _ in range(3000):
-        plant.advance(STEP_S, Demand(True, vehicle.hover_thrust, attitude()))
-        position.append(plant.estimate.position_ned_m - plant.truth.position_ned_m)
-        velocity.append(plant.estimate.velocity_ned_mps - plant.truth.velocity_ned_mps)
-    assert np.std(position, axis=0) == pytest.approx([0.05] * 3, rel=0.06)
-    assert np.std(velocity, axis=0) == pytest.approx([0.1] * 3, rel=0.06)
-    neighbours = np.corrcoef(np.array(position)[1:, 0], np.array(position)[:-1, 0])[0, 1]
-    assert abs(neighbours) < 0.08
-
-
-def test_standing_vehicle_has_a_quiet_estimate():
-    plant = Plant(load("px4_sih"), Conditions(estimator="px4_like"), 3)
-    drift, rates = [], []
-    for _ in range(600):
-        plant.advance(0.1, Demand(False))
-        drift.append(plant.estimate.position_ned_m)
-        rates.append(plant.estimate.rates_frd_radps)
-    assert np.std(rates, axis=0) == pytest.approx((0.007, 0.0035, 0.0014), rel=0.1)
-    assert plant.truth.position_ned_m == pytest.approx([0.0] * 3, abs=1e-12)
-    assert 1e-4 < np.abs(drift).max() < 0.25
 
 
 def test_estimate_reset_jumps_and_is_counted():

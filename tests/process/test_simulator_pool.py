@@ -50,14 +50,6 @@ def gone(pid: int) -> bool:
     return False
 
 
-def test_a_pool_that_dies_takes_its_vehicle_along() -> None:
-    with SimulatorProcess() as simulator, flying(simulator):
-        (orphan,) = vehicles(simulator)
-        os.kill(simulator.pid, signal.SIGKILL)
-        assert gone(simulator.pid)
-    assert gone(orphan)
-
-
 def test_vehicles_with_the_same_seed_send_the_same_datagram(simulator: SimulatorProcess) -> None:
     hellos, pid = [], simulator.pid
     for seed in ("1", "1", "2"):
@@ -117,9 +109,3 @@ def test_a_pool_that_was_lost_is_replaced() -> None:
         with flying(simulator):
             assert simulator.pid != lost
     assert not Path(f"/proc/{simulator.pid}").exists()
-
-
-def test_leaving_it_ends_what_still_flies() -> None:
-    with SimulatorProcess() as simulator, flying(simulator):
-        (vehicle,) = vehicles(simulator)
-    assert gone(vehicle)

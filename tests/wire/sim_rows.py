@@ -11,7 +11,7 @@ from typing import Any
 
 TEXT_CHUNK = 50
 BRIEF_S = 1.2  # a state shorter than that may fall between the heartbeats
-KINDS = ("ack", "text", "state", "landed", "param", "mission")
+KINDS = ("ack", "text", "state", "landed", "filter", "param", "mission")
 
 
 @dataclass
@@ -42,6 +42,8 @@ class Rows:
             self._change("state", time_s, state)
         elif name == "EXTENDED_SYS_STATE":
             self._change("landed", time_s, str(message.landed_state))
+        elif name == "EKF_STATUS_REPORT":
+            self._change("filter", time_s, str(message.flags))
         elif name == "LOCAL_POSITION_NED":
             self.positions_ned_m.append((time_s, message.x, message.y, message.z))
         elif name == "PARAM_VALUE":

@@ -1,4 +1,4 @@
-"""Messages of an autopilot in comparable rows, and recordings to repeat."""
+"""Recorded sessions with real autopilots, repeated with the simulated one."""
 
 from __future__ import annotations
 
@@ -15,59 +15,6 @@ COMPANION_COMPONENT = 191
 # HEARTBEAT, PARAM_VALUE, LOCAL_POSITION_NED, MISSION_..., COMMAND_ACK, EKF_STATUS_REPORT,
 # EXTENDED_SYS_STATE, STATUSTEXT
 HEARD = frozenset({0, 22, 32, 40, 44, 46, 47, 51, 77, 193, 245, 253})
-
-
-class Talk:
-    """One autopilot's side of a talk. `unheard`: beginnings of texts that are left out."""
-
-    def __init__(self, unheard: tuple[str, ...] = ()) -> None:
-        self.acks: list[tuple[int, int, float]] = []
-        self.texts: list[tuple[int, str, float]] = []
-        self.parameters: list[tuple[str, bytes, int]] = []
-        self.parameter_numbers: list[int] = []
-        self.states: list[tuple[int, int, int]] = []
-        self.state_times_s: list[float] = []
-        self.landed: list[int] = []
-        self.landed_times_s: list[float] = []
-        self.filter_flags: list[int] = []
-        self.filter_times_s: list[float] = []
-        self.positions_ned_m: list[tuple[float, float, float, float]] = []
-        self._unheard = unheard
-        self._open_text = ""
-
-    def hear(self, time_s: float, message: Any) -> None:
-        kind = message.get_type()
-        if kind == "COMMAND_ACK":
-            self.acks.append((message.command, message.result, time_s))
-        elif kind == "STATUSTEXT":
-            self._hear_text(time_s, message)
-        elif kind == "PARAM_VALUE":
-            self.parameters.append(
-                (message.param_id, struct.pack("<f", message.param_value), message.param_type)
-            )
-            self.parameter_numbers.append(message.param_index)
-        elif kind == "HEARTBEAT":
-            state = (message.custom_mode, message.base_mode, message.system_status)
-            _note_change(self.states, self.state_times_s, state, time_s)
-        elif kind == "EXTENDED_SYS_STATE":
-            _note_change(self.landed, self.landed_times_s, message.landed_state, time_s)
-        elif kind == "EKF_STATUS_REPORT":
-            _note_change(self.filter_flags, self.filter_times_s, message.flags, time_s)
-        elif kind == "LOCAL_POSITION_NED":
-            self.positions_ned_m.append((time_s, message.x, message.y, message.z))
-
-    def _hear_text(self, time_s: float, message: Any) -> None:
-        self._open_text += message.text
-        if len(message.text) < 50:
-            if not self._open_text.startswith(self._unheard or ("\0",)):
-                self.texts.append((message.severity, self._open_text, time_s))
-            self._open_text = ""
-
-
-def _note_change(rows: list[Any], times_s: list[float], row: Any, time_s: float) -> None:
-    if row not in rows[-1:]:
-        rows.append(row)
-        times_s.append(time_s)
 
 
 def recorded_frames(recording: Path) -> list[tuple[float, bytes, Any]]:

@@ -95,15 +95,6 @@ def test_without_requests_it_sends_heartbeat_timesync_and_home() -> None:
     }
 
 
-def test_texts_are_sent_to_any_client_once_it_has_sent_something() -> None:
-    silent, spoken = bench(heartbeat_type=None), bench(heartbeat_type=None)
-    spoken.send(mavlink.MAVLink_timesync_message(0, 1))
-    for vehicle in (silent, spoken):
-        vehicle.run(1.0)
-    assert silent.texts() == []
-    assert "ArduPilot Ready" in spoken.texts()
-
-
 @pytest.mark.parametrize(
     ("message", "rate_hz"), [(30, 50), (31, 100), (32, 100), (83, 200), (108, 50)]
 )
@@ -117,73 +108,10 @@ def test_granted_rates_are_exact(message: int, rate_hz: float) -> None:
     assert len(vehicle.of(name, begun_s)) == pytest.approx(4 * rate_hz, abs=1)
 
 
-def test_a_refused_rate_leaves_the_old_one() -> None:
-    vehicle = bench()
-    assert vehicle.command(511, 30, 20_000) == [ACCEPTED]
-    assert vehicle.command(511, 30, 2_500) == [DENIED]
-    begun_s = vehicle.time_s
-    vehicle.run(2.0)
-    assert len(vehicle.of("ATTITUDE", begun_s + 1e-6)) == 100
-
-
-def test_all_streams_at_once() -> None:
-    """REQUEST_DATA_STREAM is not acknowledged; position waits for the filter all the same."""
-    vehicle = bench()
-    vehicle.run(1.0)
-    vehicle.send(mavlink.MAVLink_request_data_stream_message(1, 1, 0, 4, 1))
-    vehicle.run(2.0)
-    counts = Counter(m.get_type() for _, m in vehicle.received)
-    assert counts["ATTITUDE"] == counts["SYS_STATUS"] == 8
-    assert counts["LOCAL_POSITION_NED"] == counts["COMMAND_ACK"] == 0
-    vehicle.run(2.0)
-    first_s = vehicle.of("LOCAL_POSITION_NED")[0][0]
-    assert first_s == pytest.approx(41.6 * BOOT_SCALE, abs=0.26)
-
-
-def test_true_state_on_request() -> None:
-    vehicle = flying()
-    assert vehicle.command(512, 108) == [ACCEPTED]
-    _, truth = vehicle.of("SIM_STATE")[-1]
-    assert truth.alt == pytest.approx(584.09 + vehicle.height_m, abs=0.02)
-    assert truth.lat_int == pytest.approx(-353632621, abs=3)
-    assert truth.zacc == pytest.approx(-9.81, abs=0.3)
-
-
 # -- addresses -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("to", "heard"),
-    [((1, 1), True), ((0, 0), True), ((1, 191), True), ((1, 5), True), ((7, 1), False)],
-)
-def test_the_target_component_is_not_checked(to: tuple[int, int], heard: bool) -> None:
-    vehicle = ready()
-    acks = vehicle.command(400, 1, to=to)
-    assert acks == ([ACCEPTED] if heard else [])
-    assert vehicle.armed == heard
-
-
 # -- modes and arming ------------------------------------------------------------------------
-
-
-def test_the_prearm_bit_is_that_of_the_present_mode() -> None:
-    vehicle = bench()
-    vehicle.run(3.0)
-    bits = []
-    for mode in (STABILIZE, GUIDED):
-        ask_mode(vehicle, mode)
-        vehicle.command(512, 1)
-        _, status = vehicle.of("SYS_STATUS")[-1]
-        bits.append(bool(status.onboard_control_sensors_health & 0x10000000))
-    assert bits == [True, False]
-
-
-def test_armed_with_a_noisy_estimate_it_stands_until_a_takeoff_is_requested() -> None:
-    vehicle = ready(estimator=EstimatorName.ARDUPILOT_LIKE)
-    assert vehicle.command(400, 1) == [ACCEPTED]
-    vehicle.run(8.0)
-    assert (vehicle.instance.view.landed_state, vehicle.height_m) == (1, pytest.approx(0.0))
-    assert vehicle.command(22, *(0.0,) * 6, 3.0) == [ACCEPTED]
 
 
 # -- takeoff and landing ---------------------------------------------------------------------
@@ -201,15 +129,6 @@ def test_takeoff_is_refused_on_the_ground_downwards_and_after_the_climb() -> Non
     vehicle.run(8.0)
     assert vehicle.height_m == pytest.approx(4.0, abs=0.15)
     assert vehicle.command(22, *(0.0,) * 6, 6.0) == [FAILED]
-
-
-def test_a_stream_without_thrust_cancels_the_takeoff() -> None:
-    vehicle = ready()
-    vehicle.command(400, 1)
-    assert vehicle.command(22, *(0.0,) * 6, 5.0) == [ACCEPTED]
-    vehicle.run(8.0, lambda: vehicle.attitude(thrust=0.0))
-    assert vehicle.height_m < 0.01
-    assert vehicle.instance.autopilot.position_controller.landed
 
 
 def test_takeoff_by_setpoints_alone() -> None:
@@ -261,13 +180,6 @@ def test_which_attitude_setpoints_are_flown(mask: int, length: float, rolls: boo
     assert (abs(roll_deg(vehicle) - 8.0) < 1.0) == rolls
 
 
-def test_rates_beside_an_attitude_are_added() -> None:
-    """.3 rad/s beside roll 8 settles at 11 degrees."""
-    vehicle = flying()
-    vehicle.run(1.5, lambda: vehicle.attitude(roll(8.0), HOVER, 0, (0.3, 0.0, 0.0)))
-    assert roll_deg(vehicle) == pytest.approx(11.0, abs=0.5)
-
-
 @pytest.mark.parametrize(
     ("thrust", "climb"), [(0.5, 0.0), (1.0, 2.5), (0.75, 1.25), (0.0, -1.5), (2.0, 2.5)]
 )
@@ -290,36 +202,6 @@ def test_a_nan_thrust_is_zero_and_prevents_arming_until_reboot() -> None:
     assert "Arm: Internal Errors 0x400" in vehicle.texts()
 
 
-@pytest.mark.parametrize("mode", [STABILIZE, BRAKE])
-def test_other_modes_ignore_setpoints(mode: int) -> None:
-    vehicle = flying()
-    assert ask_mode(vehicle, mode) == [ACCEPTED]
-    vehicle.run(0.6, lambda: vehicle.attitude(roll(8.0), HOVER))
-    assert abs(roll_deg(vehicle)) < 1.0
-    assert vehicle.mode == mode
-
-
-@pytest.mark.parametrize("timeout_s", [3.0, 0.5])
-def test_a_lost_stream_levels_after_guid_timeout_without_a_text(timeout_s: float) -> None:
-    vehicle = flying()
-    set_parameter(vehicle, "GUID_TIMEOUT", timeout_s)
-    vehicle.run(1.0, lambda: vehicle.attitude(roll(5.0), HOVER))
-    lost_s = vehicle.time_s
-    vehicle.run(timeout_s - 0.1)
-    assert roll_deg(vehicle) == pytest.approx(5.0, abs=0.2)
-    levelled_s = vehicle.run_until(lambda: roll_deg(vehicle) < 2.5, 1.0)
-    assert levelled_s - lost_s == pytest.approx(timeout_s + 0.15, abs=0.15)
-    height_m = vehicle.height_m
-    vehicle.run(4.0)
-    assert vehicle.height_m == pytest.approx(height_m, abs=0.15)
-    drift_mps = math.hypot(*vehicle.instance.autopilot.state.truth.velocity_ned_mps[:2])
-    assert drift_mps > 0.1  # nobody holds the position
-    assert vehicle.texts(lost_s) == []
-    assert vehicle.mode == GUIDED
-    vehicle.run(0.6, lambda: vehicle.attitude(roll(5.0), HOVER))
-    assert roll_deg(vehicle) == pytest.approx(5.0, abs=0.5)
-
-
 @pytest.mark.parametrize(("period_s", "levels"), [(2.94, False), (3.3, True)])
 def test_one_setpoint_in_three_seconds_is_enough(period_s: float, levels: bool) -> None:
     vehicle = flying()
@@ -333,16 +215,6 @@ def test_one_setpoint_in_three_seconds_is_enough(period_s: float, levels: bool) 
         seen_deg.append(roll_deg(vehicle))
     assert (min(seen_deg) < 1.5) == levels
     assert max(seen_deg) == pytest.approx(3.0, abs=0.1)
-
-
-def test_attitude_target_has_the_thrust_before_angle_boost() -> None:
-    vehicle = flying()
-    vehicle.command(511, 83, 20_000)
-    vehicle.run(1.0, lambda: vehicle.attitude(roll(30.0), HOVER))
-    _, echo = vehicle.of("ATTITUDE_TARGET")[-1]
-    assert echo.type_mask == 0
-    assert echo.thrust == pytest.approx(HOVER, abs=1e-6)
-    assert echo.q == pytest.approx(roll(30.0), abs=1e-6)
 
 
 # -- parameters ------------------------------------------------------------------------------
@@ -374,18 +246,6 @@ def test_without_gps_the_position_is_lost_after_eight_seconds(
     assert vehicle.of("EKF_STATUS_REPORT")[-1][1].flags == 831
     assert (vehicle.mode, vehicle.system_status) == (mode, 4)
     assert vehicle.texts(begun_s) == ([*texts, "EKF Failsafe Cleared"] if texts else [])
-
-
-def test_a_mission_of_home_alone_cannot_start() -> None:
-    vehicle = ready()
-    vehicle.send(mavlink.MAVLink_mission_count_message(1, 1, 1))
-    vehicle.send(mavlink.MAVLink_mission_item_int_message(1, 1, 0, 6, 16, 0, 1, *(0,) * 7))
-    assert vehicle.command(400, 1) == [ACCEPTED]
-    assert vehicle.command(300) == [ACCEPTED]
-    vehicle.run(2.0)
-    assert (vehicle.height_m, vehicle.armed) == (0.0, True)
-    vehicle.run(9.0)
-    assert vehicle.texts()[-1] == "Disarming motors"
 
 
 def test_parameters_carry_values_whatever_their_type() -> None:

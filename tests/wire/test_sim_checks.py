@@ -16,55 +16,6 @@ ACCEPTED, TEMPORARILY_REJECTED = 0, 1
 GUIDED = 4
 
 
-def checked(bench: Bench) -> list[str]:
-    since_s = bench.time_s
-    assert bench.command(RUN_CHECKS) == [ACCEPTED]
-    bench.run(0.1)
-    return bench.texts(since_s)
-
-
-def test_healthy_vehicles_say_nothing() -> None:
-    for bench in (Bench(), Bench(firmware=ARDUPILOT, boot_scale=0.1)):
-        bench.boot()
-        assert checked(bench) == []
-
-
-def test_arducopter_says_at_each_stage_of_its_start_what_refuses_arming() -> None:
-    """The same as after an arm command, with another word in front."""
-    bench = Bench(firmware=ARDUPILOT)
-    bench.run(1.0)
-    assert checked(bench) == ["PreArm: System not initialised"]
-    bench.run(4.0)
-    texts = checked(bench)
-    assert "PreArm: EKF attitude is bad" in texts
-    since_s = bench.time_s
-    bench.command(400, 1)
-    assert [t.replace("Arm:", "PreArm:", 1) for t in bench.texts(since_s)] == texts
-    bench.run(20.0)
-    assert checked(bench) == []  # STABILIZE needs no position
-    bench.command(176, 1, GUIDED)
-    assert checked(bench) == ["PreArm: Need Position Estimate"]
-
-
-def test_arducopter_refuses_while_it_is_armed() -> None:
-    bench = Bench(firmware=ARDUPILOT, boot_scale=0.1)
-    bench.boot()
-    assert bench.command(400, 1) == [ACCEPTED]
-    assert bench.command(RUN_CHECKS) == [TEMPORARILY_REJECTED]
-
-
-@pytest.mark.parametrize(
-    ("arm_without_gps", "texts"),
-    [(0, ["Preflight Fail: GPS fix too low"]), (1, ["Preflight: GPS fix too low"]), (2, [])],
-)
-def test_px4_without_a_fix(arm_without_gps: int, texts: list[str]) -> None:
-    lost = Scenario(name="lost", faults=(GpsLoss(fault="gps_loss", at_s=3.0),))
-    bench = Bench(scenario=lost, vehicle=px4_vehicle())
-    bench.instance.autopilot.parameters.set("COM_ARM_WO_GPS", arm_without_gps)
-    bench.run(5.0)
-    assert checked(bench) == texts
-
-
 def test_estimator_reports_lose_the_position_with_the_fix() -> None:
     """PX4 after EKF2_NOAID_TOUT (5 s): the flags that it has before the first fix."""
     lost = Scenario(name="lost", faults=(GpsLoss(fault="gps_loss", at_s=4.0, for_s=8.0),))

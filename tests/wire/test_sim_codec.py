@@ -70,28 +70,9 @@ def test_decodes_frames_of_pymavlink(name: str) -> None:
     assert not decoder.dropped
 
 
-def test_decodes_mavlink_1() -> None:
-    theirs = mavlink.MAVLink(None, srcSystem=3, srcComponent=7)
-    packed = mavlink.MAVLink_param_request_read_message(1, 1, b"COM_OF_LOSS_T", -1).pack(
-        theirs, force_mavlink1=True
-    )
-    (message,) = codec.Decoder().read(packed)
-    assert packed[0] == codec.MAGIC_V1
-    assert message.param_id == "COM_OF_LOSS_T"
-    assert message.param_index == -1
-
-
 def packed_command(number: int) -> bytes:
     message = mavlink.MAVLink_command_long_message(1, 1, number, 0, *(math.nan,) * 7)
     return bytes(message.pack(mavlink.MAVLink(None)))
-
-
-@settings(max_examples=300, deadline=None)
-@given(st.binary(max_size=300), st.integers(0, 65535))
-def test_a_frame_after_garbage_is_decoded_at_once(garbage: bytes, number: int) -> None:
-    decoder = codec.Decoder()
-    decoder.read(garbage)
-    assert [m.command for m in decoder.read(packed_command(number))] == [number]
 
 
 @settings(max_examples=300, deadline=None)

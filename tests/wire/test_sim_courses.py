@@ -124,13 +124,6 @@ def test_a_requested_speed_holds_until_a_setpoint_of_another_kind() -> None:
     assert fastest_mps(bench, 6.0) > 7.0
 
 
-def test_a_speed_requested_before_the_first_setpoint_is_discarded() -> None:
-    bench = copter()
-    assert bench.command(178, 1, 3.0, -1) == [ACCEPTED]
-    ask(bench, LOCAL, (30.0, 0.0, -5.0))
-    assert fastest_mps(bench, 8.0) > 6.0
-
-
 def test_reposition_of_arducopter_needs_a_frame() -> None:
     """ArduCopter takes it as COMMAND_INT alone."""
     bench = copter()
@@ -184,42 +177,6 @@ def test_px4_repositions_with_the_given_speed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("place_m", "up", "texts"),
-    [
-        (None, 4.0, []),  # latitude and longitude 0: so far away that the way there is flat
-        ((0.0, 0.0), -400.0, ["Already higher than takeoff altitude"]),  # above the ground, it says
-    ],
-)
-def test_px4_stays_on_the_ground_if_its_takeoff_does_not_climb(
-    place_m: tuple[float, float] | None, up: float, texts: list[str]
-) -> None:
-    """As scripts that leave the place 0, or give a height above the ground, find out."""
-    bench = Bench()
-    bench.boot()
-    where = (0.0, 0.0) if place_m is None else degrees(bench, *place_m)
-    amsl_m = bench.instance.autopilot.firmware.origin[2] + up
-    assert bench.command(22, -1, 0, 0, NAN, *where, amsl_m) == [ACCEPTED]
-    assert bench.command(400, 1) == [ACCEPTED]
-    bench.run(8.0)
-    assert bench.height_m < 0.05
-    bench.run(3.0)
-    assert not bench.armed
-    wanted = ["Armed by external command", *texts, "Disarmed by auto preflight disarming"]
-    assert bench.texts() == wanted
-
-
-def test_px4_takes_off_to_the_given_place() -> None:
-    bench = Bench()
-    bench.boot()
-    amsl_m = bench.instance.autopilot.firmware.origin[2] + 6.0
-    assert bench.command(22, -1, 0, 0, NAN, *degrees(bench, 10.0, 0.0), amsl_m) == [ACCEPTED]
-    assert bench.command(400, 1) == [ACCEPTED]
-    bench.run(15.0)
-    assert bench.mode == LOITER
-    assert place(bench) == pytest.approx((10.0, 0.0, -6.0), abs=0.8)
-
-
-@pytest.mark.parametrize(
     ("vehicle", "frame", "places_m", "fastest"),
     [
         # metres from the start, second by second, as the real ones went 40 m
@@ -243,14 +200,3 @@ def test_acceleration_and_braking_on_the_way_to_a_place(
     assert max(speeds) == pytest.approx(fastest, abs=1.0)
     bench.run(6.0)
     assert place(bench)[0] == pytest.approx(40.0, abs=0.9)
-
-
-def test_hold_requested_on_the_way_to_a_place_does_not_stop_it() -> None:
-    """It is the mode in which a PX4 goes there."""
-    bench = px4()
-    amsl_m = bench.instance.autopilot.firmware.origin[2] + 3.0
-    reposition(bench, 20.0, 0.0, amsl_m, ABSOLUTE)
-    bench.run(3.0)
-    assert bench.ask_mode(LOITER) == [ACCEPTED, ACCEPTED]
-    bench.run(10.0)
-    assert place(bench)[0] == pytest.approx(20.0, abs=0.9)

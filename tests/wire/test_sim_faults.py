@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import pytest
-from sim_bench import HOVER, OFFBOARD, Bench, px4_vehicle
+from sim_bench import HOVER, Bench
 
 from offboard.documents import shipped
 from offboard.documents.reading import DocumentError
 from simulator import config
 from simulator.config import Scenario
-from simulator.firmware.px4 import PX4
-from simulator.instance import Instance
 
 
 def faulty(*faults: dict[str, Any], seed: int = 1) -> Bench:
@@ -54,22 +51,6 @@ def test_delay_each_way() -> None:
     assert at_s - asked_s == pytest.approx(0.2, abs=0.009)
 
 
-def test_a_link_fault_begins_and_ends() -> None:
-    bench = faulty({"fault": "link", "direction": "down", "loss": 1.0, "at_s": 2.0, "for_s": 1.0})
-    bench.run(5.0)
-    heard_s = [at_s for at_s, _ in bench.of("ATTITUDE")]
-    assert not [at_s for at_s in heard_s if 2.004 < at_s < 2.996]
-    assert max(b - a for a, b in pairwise(heard_s)) == pytest.approx(1.0, abs=0.03)
-
-
-def test_a_corrupting_link_is_survived_and_corrupt_frames_are_dropped() -> None:
-    bench = hovering({"fault": "link", "corruption": 0.3, "loss": 0.1, "duplication": 0.1})
-    hold(bench, 5.0)
-    assert bench.height_m == pytest.approx(3.0, abs=0.2)
-    assert bench.mode == OFFBOARD
-    assert bench.instance.companion.decoder.dropped["checksum"] > 5
-
-
 def test_estimator_jump_increases_the_reset_counter() -> None:
     bench = faulty({"fault": "estimator_jump", "at_s": 2.0, "offset_ned_m": (1.0, 0.0, -0.5)})
     bench.run(4.0)
@@ -97,20 +78,6 @@ def test_gps_loss_drifts_and_jumps_back() -> None:
     found = bench.of("ODOMETRY")[-1][1]
     assert math.hypot(found.x, found.y) < 0.01
     assert found.reset_counter == 1
-
-
-def test_a_silent_message_does_not_affect_the_others() -> None:
-    bench = faulty(
-        {"fault": "silent_message", "message": "LOCAL_POSITION_NED", "at_s": 2.0, "for_s": 2.0}
-    )
-    bench.run(6.0)
-    count = {
-        kind: [sum(a <= at_s < a + 2.0 for at_s, _ in bench.of(kind)) for a in (0.01, 2.01, 4.01)]
-        for kind in ("LOCAL_POSITION_NED", "ODOMETRY")
-    }
-    assert count["LOCAL_POSITION_NED"][1] <= 1
-    assert count["LOCAL_POSITION_NED"][2] >= 58
-    assert count["ODOMETRY"] == pytest.approx([60] * 3, abs=2)
 
 
 @pytest.mark.parametrize("runs", [True, False])
@@ -172,16 +139,6 @@ def test_reboot_in_flight_disarms_and_restarts_time_after_silence() -> None:
     assert bench.height_m == pytest.approx(0.0, abs=0.01)
 
 
-def test_reboot_keeps_the_parameters_and_the_vehicle_flies_again() -> None:
-    bench = faulty({"fault": "reboot", "at_s": 2.0})
-    assert bench.instance.autopilot.parameters.set("MIS_TAKEOFF_ALT", 4.0)
-    bench.run(4.0)
-    bench.boot()
-    assert bench.command(22, *(math.nan,) * 7) == [0]
-    assert bench.command(400, 1) == [0]
-    bench.run_until(lambda: bench.height_m > 3.5, 15.0)
-
-
 def test_a_clock_jump_changes_time_stamps_only() -> None:
     bench = faulty({"fault": "clock_jump", "jump_s": -1.5, "at_s": 2.0})
     bench.run(4.0)
@@ -209,41 +166,6 @@ def test_refusals(of: str, number: int, params: tuple[float, ...], text: str, re
     assert bench.texts() == [text]
     bench.run(2.0, lambda: bench.position(0, 0, -3.0))
     assert bench.command(number, *params)[-1] == 0
-
-
-def test_the_pilot_takes_over() -> None:
-    bench = hovering({"fault": "pilot_takes_over", "at_s": 9.0})
-    since_s = engaged_s(bench)
-    hold(bench, since_s + 10.0 - bench.time_s)
-    assert bench.mode == 0x03040000
-    switched_s = next(
-        at_s for at_s, m in bench.of("HEARTBEAT", since_s + 1) if m.custom_mode == 0x03040000
-    )
-    assert since_s + 8.9 < switched_s <= since_s + 10.1
-
-
-def test_a_flight_with_every_kind_of_fault_is_reproducible() -> None:
-    faults = config.scenario("all_together").faults
-    jump = {"fault": "estimator_jump", "at_s": 3.0, "offset_ned_m": (0.1, 0.0, 0.0)}
-
-    def flown(seed: int) -> bytes:
-        bench = hovering(jump)
-        conditions = config.scenario("all_together").conditions
-        bench.instance = Instance(PX4, px4_vehicle(), conditions, seed, faults=faults)
-        bench.raw.clear()
-        bench.boot()
-        bench.run(0.6, lambda: bench.position(0, 0, -3.0))
-        for _ in range(3):  # one may be lost
-            bench.ask_mode(OFFBOARD)
-            bench.command(400, 1)
-        hold(bench, 6.0)
-        assert bench.height_m > 1.0
-        return bytes(bench.raw)
-
-    first, second, other = flown(3), flown(3), flown(4)
-    assert len(first) > 20_000
-    assert first == second
-    assert first != other
 
 
 BAD = {

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from pymavlink.dialects.v20 import common as mavlink
-from sim_bench import HOVER, LAND, NAN, OFFBOARD, POSCTL, Bench, px4_vehicle
+from sim_bench import HOVER, NAN, OFFBOARD, Bench, px4_vehicle
 
 from simulator.vehicle.sensors import EstimatorName
 
@@ -26,17 +25,6 @@ def offboard_attitude() -> Bench:
 # -- the stream ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("period_s", [0.05])
-def test_stream_loss_trips_a_little_after_one_second(period_s: float) -> None:
-    bench = offboard_attitude()
-    bench.run(1.0, bench.attitude, period_s)
-    bench.attitude()
-    last_s = bench.time_s
-    bench.run(1.5)
-    assert 1.03 <= bench.text_at("Failsafe activated") - last_s <= 1.06
-    assert (bench.mode, bench.system_status) == (POSCTL, 5)
-
-
 def test_until_the_loss_the_last_attitude_and_thrust_continue() -> None:
     bench = offboard_attitude()
     roll = math.radians(8.0)
@@ -47,31 +35,11 @@ def test_until_the_loss_the_last_attitude_and_thrust_continue() -> None:
     assert bench.mode == OFFBOARD
 
 
-def test_without_sticks_it_descends_lands_disarms_and_returns_to_offboard() -> None:
-    bench = offboard_attitude()
-    bench.run(2.5)
-    before_m = bench.height_m
-    bench.run(2.0)
-    assert 0.5 <= (before_m - bench.height_m) / 2.0 <= 0.8
-    bench.run_until(lambda: not bench.armed, 15.0)
-    bench.run(0.1)
-    assert bench.texts()[-2:] == ["Landing detected", "Disarmed by landing"]
-    assert bench.mode == OFFBOARD
-
-
 @pytest.mark.parametrize(("period_s", "trips"), [(0.8, False), (1 / 1.5, False), (1 / 0.9, True)])
 def test_the_least_rate(period_s: float, trips: bool) -> None:
     bench = offboard_attitude()
     bench.run(6.0, bench.attitude, period_s)
     assert ("Failsafe activated" in bench.texts()) is trips
-
-
-def test_a_mode_chosen_in_the_failsafe_stays() -> None:
-    bench = offboard_attitude()
-    bench.run(2.0)
-    assert bench.command(21) == [0]
-    bench.run(1.0, bench.attitude)
-    assert (bench.mode, bench.system_status) == (LAND, 4)
 
 
 # -- automatic flight ------------------------------------------------------------------------
@@ -151,24 +119,6 @@ def test_thrust_outside_its_range_is_clipped_or_zero(
 # -- going where it is told --------------------------------------------------------------------
 
 
-def test_set_mode_sets_the_mode_and_is_acknowledged_once() -> None:
-    bench = Bench()
-    bench.boot()
-    bench.send(mavlink.MAVLink_set_mode_message(1, 1, POSCTL))
-    bench.run(0.05)
-    assert [(m.command, m.result) for _, m in bench.of("COMMAND_ACK")] == [(176, 0)]
-    assert bench.mode == POSCTL
-
-
-def test_stabilized_without_sticks_keeps_the_last_demand() -> None:
-    bench = Bench()
-    bench.instance.autopilot.parameters.set("COM_OBL_RC_ACT", 2)
-    bench.fly_offboard()
-    bench.run(4.0)
-    assert bench.mode == 0x00070000
-    assert bench.height_m == pytest.approx(3.0, abs=0.3)
-
-
 def test_position_gains_and_speeds_are_obeyed_while_flying() -> None:
     bench = Bench()
     bench.fly_offboard()
@@ -176,14 +126,3 @@ def test_position_gains_and_speeds_are_obeyed_while_flying() -> None:
     bench.run(9.0, lambda: bench.position(20, 0, -3))
     speed_mps = math.hypot(*bench.instance.autopilot.state.truth.velocity_ned_mps[:2])
     assert speed_mps == pytest.approx(1.0, abs=0.1)
-
-
-def test_a_landing_is_detected_three_stages_after_ground_contact() -> None:
-    """A second of contact without thrust, and two of rest; LNDMC_TRIG_TIME each."""
-    bench = Bench()
-    bench.fly_offboard(2.0)
-    bench.command(21)
-    plant = bench.instance.autopilot.plant
-    touched_s = bench.run_until(lambda: plant.on_ground, 10.0)
-    bench.run_until(lambda: bench.instance.autopilot.position_controller.landed, 5.0)
-    assert bench.time_s - touched_s == pytest.approx(3.1, abs=0.15)

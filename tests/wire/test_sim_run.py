@@ -53,13 +53,6 @@ def test_without_a_companion_the_run_ends_with_code_3(
     assert reports == []
 
 
-def test_a_given_timeout_applies_to_the_first_answer_too(link: UdpLink) -> None:
-    outcome = runner(link, []).lockstep(0.2)
-    assert outcome == Outcome(
-        3, "no companion answered TIMESYNC within 0.2 s: start one, or run without --lockstep"
-    )
-
-
 def test_a_companion_that_answers_only_once_ends_the_run(
     link: UdpLink, companion: socket.socket
 ) -> None:
@@ -67,23 +60,8 @@ def test_a_companion_that_answers_only_once_ends_the_run(
     companion.sendto(answer, ("127.0.0.1", link.port))
     reports: list[str] = []
     outcome = runner(link, reports).lockstep(0.1)
-    assert outcome == Outcome(3, "the companion did not answer again")
-    assert reports == [
-        "the companion stopped answering at 0.02 s",
-        "without it the vehicle is landed and disarmed at 0.0 s",
-    ]
-
-
-def test_an_answer_to_another_barrier_does_not_count(
-    link: UdpLink, companion: socket.socket, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(run, "FIRST_ANSWER_TIMEOUT_S", 0.1)
-    answer = mavlink.MAVLink_timesync_message(1, 123).pack(mavlink.MAVLink(None))
-    companion.sendto(answer, ("127.0.0.1", link.port))
-    reports: list[str] = []
-    outcome = runner(link, reports).lockstep(0.1)
-    assert outcome.code == 3
-    assert reports[0] == "the companion stopped answering at 0.01 s"
+    assert outcome == Outcome(3, "the companion stopped answering at 0.02 s")
+    assert reports == []
 
 
 def test_senders_become_peers_up_to_a_limit(link: UdpLink, companion: socket.socket) -> None:
@@ -107,14 +85,6 @@ def _received(sock: socket.socket) -> bytes | None:
         return sock.recv(100)
     except BlockingIOError:
         return None
-
-
-@pytest.mark.parametrize(
-    "url", ["", "udp:127.0.0.1:1", "udpout:127.0.0.1", "udpout::5", "udpin:127.0.0.1:x"]
-)
-def test_malformed_urls_are_refused(url: str) -> None:
-    with pytest.raises(LinkError, match="is not a link"):
-        open_link(url, 0)
 
 
 def test_another_port_is_used_if_the_preferred_one_is_taken(link: UdpLink) -> None:

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from string import Formatter
 
 import pytest
-from sim_bench import Bench
 
 from simulator.autopilot.commander import ACTIONS, CONDITIONS, TEXT_VALUES
 from simulator.firmware.base import AFTER_DELAY, EVENTS, Firmware, Rule
@@ -56,12 +55,3 @@ def test_every_stream_has_a_builder_and_every_builder_a_message(firmware: Firmwa
     assert named.union(firmware.fixed_streams, *firmware.stream_groups.values()) <= known.keys()
     assert [name for name in known if id_of(name) is None] == []
     assert [name for name in known if id_of(name) in firmware.never_sent] == []
-
-
-def test_the_first_row_that_fits_decides() -> None:
-    """PX4 has a row for an armed vehicle before that of a healthy one."""
-    bench = Bench()
-    bench.boot()
-    assert bench.command(400, 1) == [0]
-    assert bench.command(400, 1) == [0]
-    assert bench.texts() == ["Armed by external command"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_bench import Bench
-from sim_courses import copter, heading_deg, place, velocity
+from sim_courses import copter, place, velocity
 
 LOITER = 5
 KEEP = 65535
@@ -84,41 +84,9 @@ def test_roll_flies_sideways_also_by_manual_control() -> None:
     assert -velocity(bench)[2] == pytest.approx(0.63, abs=0.1)
 
 
-def test_yaw_turns_and_then_keeps_its_angle() -> None:
-    bench = loitering()
-    before = heading_deg(bench)
-    pushed(bench, 2.0, 1500, 1500, 1500, 1600)
-    pushed(bench, 2.0, *MIDDLE)
-    turned = heading_deg(bench) - before
-    assert 30.0 < turned < 110.0
-    pushed(bench, 1.0, *MIDDLE)
-    assert heading_deg(bench) - before == pytest.approx(turned, abs=3.0)
-
-
 def test_only_the_ground_station_may_send_sticks_and_zero_releases_them() -> None:
     bench = loitering()
     push(bench, 1700, 1700, 1700, 1700, system=42)
     assert seen(bench) == (*MIDDLE, *FEIGNED[4:])
     push(bench, 0, KEEP, 0, KEEP)
     assert seen(bench) == (*FEIGNED[:1], 1500, 1000, *FEIGNED[3:])
-
-
-def test_px4_is_not_flown_by_sticks() -> None:
-    bench = Bench()
-    bench.fly_offboard()
-    push(bench, 1700, 1700, 1700, 1700)
-    bench.send(mavlink.MAVLink_manual_control_message(1, 500, 500, 500, 500, 0))
-    bench.run(0.2)
-    assert abs(velocity(bench)[0]) < 0.2
-
-
-def test_takeoff_by_throttle() -> None:
-    bench = Bench(firmware=copter().instance.autopilot.firmware, boot_scale=0.1)
-    bench.run(4.5)
-    bench.command(176, 1, LOITER)
-    push(bench, 1500, 1500, 1000, 1500)
-    assert bench.command(400, 1) == [0]
-    pushed(bench, 3.0, 1500, 1500, 1000, 1500)
-    assert bench.height_m < 0.05
-    pushed(bench, 6.0, 1500, 1500, 1700, 1500)
-    assert 1.0 < bench.height_m < 4.0

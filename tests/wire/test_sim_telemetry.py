@@ -60,13 +60,6 @@ def test_positions_are_sent_on_the_grid_of_the_estimator_whatever_their_rate() -
     assert stamps == list(range(grid_ms, 1001, grid_ms))
 
 
-def test_a_duration_ends_between_barriers() -> None:
-    instance = _instance()
-    while instance.advance_to_barrier(1.012):
-        instance.barrier()
-    assert instance.steps == 253
-
-
 @pytest.mark.parametrize(
     "body",
     [(np.nan,) * 13, (1.0, *(0.0,) * 9, np.nan, np.inf, -np.inf), (1.0, *(0.0,) * 11, -1e5)],
