@@ -6,6 +6,7 @@ ArduCopter takes values outside the documented range, so the limits are those of
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 from simulator.firmware.base import ParameterSpec, Role
 from simulator.firmware.values import Behaviour, Mode
@@ -14,42 +15,31 @@ from simulator.firmware.values import Behaviour, Mode
 # the position controller runs, not the mode.
 BY_POSITION, BY_HAND = 89, 81
 
+
+def _by_position(name: str, number: int, behaviour: Behaviour, *, arms: bool = True) -> Mode:
+    return Mode(name, name, number, BY_POSITION, behaviour, arms=arms, needs_position=True)
+
+
 MODES = {
     mode.name: mode
     for mode in (
         Mode("STABILIZE", "STABILIZE", 0, BY_HAND, Behaviour.LEVEL),
         Mode("ACRO", "ACRO", 1, BY_HAND, Behaviour.LEVEL),
         Mode("ALT_HOLD", "ALT_HOLD", 2, BY_HAND, Behaviour.DESCEND),
-        Mode("AUTO", "AUTO", 3, BY_POSITION, Behaviour.MISSION, arms=False, needs_position=True),
-        Mode("GUIDED", "GUIDED", 4, BY_POSITION, Behaviour.SETPOINT, needs_position=True),
-        Mode("LOITER", "LOITER", 5, BY_POSITION, Behaviour.DESCEND, needs_position=True),
-        Mode("RTL", "RTL", 6, BY_POSITION, Behaviour.RETURN, arms=False, needs_position=True),
-        Mode("CIRCLE", "CIRCLE", 7, BY_POSITION, Behaviour.HOLD, arms=False, needs_position=True),
+        _by_position("AUTO", 3, Behaviour.MISSION, arms=False),
+        _by_position("GUIDED", 4, Behaviour.SETPOINT),
+        _by_position("LOITER", 5, Behaviour.DESCEND),
+        _by_position("RTL", 6, Behaviour.RETURN, arms=False),
+        _by_position("CIRCLE", 7, Behaviour.HOLD, arms=False),
         Mode("LAND", "LAND", 9, BY_POSITION, Behaviour.LAND, arms=False),
         Mode("DRIFT", "DRIFT", 11, BY_HAND, Behaviour.DESCEND, needs_position=True),
-        Mode("POSHOLD", "POSHOLD", 16, BY_POSITION, Behaviour.DESCEND, needs_position=True),
-        Mode("BRAKE", "BRAKE", 17, BY_POSITION, Behaviour.HOLD, arms=False, needs_position=True),
-        Mode("THROW", "THROW", 18, BY_POSITION, Behaviour.LEVEL, needs_position=True),
-        Mode(
-            "AVOID_ADSB",
-            "AVOID_ADSB",
-            19,
-            BY_POSITION,
-            Behaviour.HOLD,
-            arms=False,
-            needs_position=True,
-        ),
-        Mode("ZIGZAG", "ZIGZAG", 24, BY_POSITION, Behaviour.DESCEND, needs_position=True),
+        _by_position("POSHOLD", 16, Behaviour.DESCEND),
+        _by_position("BRAKE", 17, Behaviour.HOLD, arms=False),
+        _by_position("THROW", 18, Behaviour.LEVEL),
+        _by_position("AVOID_ADSB", 19, Behaviour.HOLD, arms=False),
+        _by_position("ZIGZAG", 24, Behaviour.DESCEND),
         Mode("GUIDED_NOGPS", "GUIDED_NOGPS", 20, BY_HAND, Behaviour.SETPOINT),
-        Mode(
-            "SMART_RTL",
-            "SMARTRTL",
-            21,
-            BY_POSITION,
-            Behaviour.RETURN,
-            arms=False,
-            needs_position=True,
-        ),
+        replace(_by_position("SMART_RTL", 21, Behaviour.RETURN, arms=False), title="SMARTRTL"),
     )
 }
 

@@ -13,26 +13,21 @@ def _by_sticks(name: str, title: str, number: int, behaviour: Behaviour) -> Mode
     return Mode(name, title, number, MANUAL, behaviour, arms=False, needs_sticks=True)
 
 
+def _ends(name: str, title: str, number: int, behaviour: Behaviour) -> Mode:
+    """A mode that ends on the ground: none to arm in or to come back to."""
+    return Mode(name, title, number, AUTO, behaviour, arms=False, remembered=False)
+
+
 MODES = {
     mode.name: mode
     for mode in (
         Mode("AUTO.LOITER", "Hold", 0x03040000, AUTO, Behaviour.HOLD),
         Mode("AUTO.TAKEOFF", "Takeoff", 0x02040000, AUTO, Behaviour.TAKEOFF),
-        Mode("AUTO.LAND", "Land", 0x06040000, AUTO, Behaviour.LAND, arms=False, remembered=False),
-        Mode(
-            "AUTO.RTL", "Return", 0x05040000, AUTO, Behaviour.RETURN, arms=False, remembered=False
-        ),
+        _ends("AUTO.LAND", "Land", 0x06040000, Behaviour.LAND),
+        _ends("AUTO.RTL", "Return", 0x05040000, Behaviour.RETURN),
         Mode("AUTO.MISSION", "Mission", 0x04040000, AUTO, Behaviour.MISSION),
         Mode("AUTO.FOLLOW", "Follow Target", 0x08040000, AUTO, Behaviour.HOLD),
-        Mode(
-            "AUTO.PRECLAND",
-            "Precision Land",
-            0x09040000,
-            AUTO,
-            Behaviour.LAND,
-            arms=False,
-            remembered=False,
-        ),
+        _ends("AUTO.PRECLAND", "Precision Land", 0x09040000, Behaviour.LAND),
         Mode("OFFBOARD", "Offboard", 0x00060000, OFFBOARD, Behaviour.SETPOINT),
         _by_sticks("POSCTL", "Position", 0x00030000, Behaviour.DESCEND),
         _by_sticks("ALTCTL", "Altitude", 0x00020000, Behaviour.DESCEND),

@@ -34,32 +34,34 @@ class LinkError(Exception):
 class UdpLink:
     """One socket and its peers. Send errors lose datagrams and are otherwise ignored."""
 
-    def __init__(self, sock: socket.socket, target: Address | None) -> None:
+    def __init__(
+        self,
+        sock: socket.socket,
+        target: Address | None,
+        peers: dict[Address, None] | None = None,
+    ) -> None:
         self._socket = sock
         self._target = target
-        self._peers: dict[Address, None] = {} if target is None else {target: None}
-
-    def beside(self) -> UdpLink:
-        """A link with another port of the same host, and the same peers."""
-        sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        sock.setblocking(False)
-        sock.bind((self._socket.getsockname()[0], 0))
-        other = UdpLink(sock, None)
-        other._peers = self._peers
-        return other
+        self.peers = peers if peers is not None else {} if target is None else {target: None}
 
     def fileno(self) -> int:
         return self._socket.fileno()
 
     @property
+    def address(self) -> Address:
+        """The local address."""
+        host, port = self._socket.getsockname()
+        return str(host), int(port)
+
+    @property
     def port(self) -> int:
         """The local port."""
-        return int(self._socket.getsockname()[1])
+        return self.address[1]
 
     def send(self, datagrams: Iterable[bytes]) -> None:
         """Send each datagram to every peer."""
         for datagram in datagrams:
-            for peer in self._peers:
+            for peer in self.peers:
                 try:
                     self._socket.sendto(datagram, peer)
                 except OSError:  # refused, unreachable or full: telemetry may be lost
@@ -74,15 +76,15 @@ class UdpLink:
                 continue  # ICMP error for a datagram sent earlier
             except OSError:
                 return None
-            if sender not in self._peers:
+            if sender not in self.peers:
                 self._add_peer(sender)
             return datagram
 
     def _add_peer(self, sender: Address) -> None:
-        if len(self._peers) >= PEERS_MAX:
-            oldest = next(peer for peer in self._peers if peer != self._target)
-            del self._peers[oldest]
-        self._peers[sender] = None
+        if len(self.peers) >= PEERS_MAX:
+            oldest = next(peer for peer in self.peers if peer != self._target)
+            del self.peers[oldest]
+        self.peers[sender] = None
 
     def close(self) -> None:
         self._socket.close()
@@ -250,7 +252,10 @@ def open_beside(link: Link) -> Link:
     """
     if not isinstance(link, UdpLink):
         raise LinkError("fault stranger: it needs a UDP link, where another port can send")
-    return link.beside()
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sock.setblocking(False)
+    sock.bind((link.address[0], 0))
+    return UdpLink(sock, None, link.peers)
 
 
 def shifted(url: str, by: int) -> str:

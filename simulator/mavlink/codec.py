@@ -20,21 +20,13 @@ from simulator.mavlink.signing import REFUSALS, Keyring
 _codec = dialect.MAVLink(None)
 
 
-@dataclass(frozen=True, slots=True)
-class Message:
-    """One decoded frame: `values` by field name, strings without padding, arrays as lists."""
+Message = Any  # pymavlink's: fields are attributes, strings without padding
+Peer = tuple[int, int]  # system, component
 
-    name: str
-    id: int
-    system: int
-    component: int
-    values: dict[str, Any]
 
-    def __getattr__(self, field_name: str) -> Any:
-        try:
-            return self.values[field_name]
-        except KeyError:
-            raise AttributeError(field_name) from None
+def sender_of(message: Message) -> Peer:
+    """Who sent a received message."""
+    return message.get_srcSystem(), message.get_srcComponent()
 
 
 def id_of(name: str) -> int | None:
@@ -146,15 +138,13 @@ class Decoder:
             message = _codec.decode(bytearray(frame))
         except dialect.MAVError:
             return self._skip("checksum")
-        sender = (message.get_srcSystem(), message.get_srcComponent())
         if self.keyring is not None:
             signed = frame if flags & SIGNED else None
-            refused = self.keyring.complaint(message_id, sender, signed)
+            refused = self.keyring.complaint(message_id, sender_of(message), signed)
             if refused:
                 self.dropped[refused] += 1
                 return length, None
-        values = message.to_dict()
-        return length, Message(values.pop("mavpackettype"), message_id, *sender, values)
+        return length, message
 
     def _skip(self, reason: str) -> tuple[int, None]:
         self.dropped[reason] += 1

@@ -54,7 +54,7 @@ class Commands:
         if command.number in answers:
             result = answers[command.number]
         elif (handler := HANDLERS.get(command.number)) is not None:
-            result = handler(self, command)
+            result = handler(self, self._autopilot, command)
         else:
             result = Result.UNSUPPORTED
         if result is not None:
@@ -73,8 +73,7 @@ class Commands:
             "COMMAND_ACK", command.number, int(result), 0, 0, command.system, command.component
         )
 
-    def _set_mode(self, command: Command) -> Result:
-        autopilot = self._autopilot
+    def _set_mode(self, autopilot: Autopilot, command: Command) -> Result:
         if autopilot.firmware.mode_acked_twice:
             self._acknowledge(command, Result.ACCEPTED)
         by_ground_station = command.component == _MISSION_PLANNER
@@ -88,8 +87,7 @@ class Commands:
             return request.refusal
         return autopilot.handle("mode", Request(request.mode, by_ground_station=by_ground_station))
 
-    def _arm_disarm(self, command: Command) -> Result | None:
-        autopilot = self._autopilot
+    def _arm_disarm(self, autopilot: Autopilot, command: Command) -> Result | None:
         request = autopilot.firmware.arm_request(command.params[0])
         if not request.event:
             autopilot.commander.texts += () if request.text is None else (request.text,)
@@ -97,9 +95,8 @@ class Commands:
         forced = command.params[1] == autopilot.firmware.force_codes[request.event]
         return autopilot.handle(f"force {request.event}" if forced else request.event)
 
-    def _takeoff(self, command: Command) -> Result:
+    def _takeoff(self, autopilot: Autopilot, command: Command) -> Result:
         height_m = command.params[6]
-        autopilot = self._autopilot
         home_down_m = autopilot.guidance.home_ned_m[2]
         if autopilot.firmware.takeoff_above_home:
             down_m = home_down_m - height_m
@@ -110,15 +107,13 @@ class Commands:
         north, east, down = finite
         return autopilot.handle("takeoff", Request(takeoff_ned_m=(north, east, down)))
 
-    def _loiter(self, _: Command) -> Result:
-        autopilot = self._autopilot
+    def _loiter(self, autopilot: Autopilot, _: Command) -> Result:
         known = autopilot.commander.knows("loiter")
         return autopilot.handle("loiter") if known else Result.UNSUPPORTED
 
-    def _set_home(self, command: Command) -> Result:
+    def _set_home(self, autopilot: Autopilot, command: Command) -> Result:
         """MAV_CMD_DO_SET_HOME. param1 = 1: here; else a place in degrees and AMSL metres."""
         latitude, longitude, height_m = command.params[4:7]
-        autopilot = self._autopilot
         if command.params[0] == 1.0:
             autopilot.guidance.home_ned_m = autopilot.state.estimate.position_ned_m
         elif math.isfinite(latitude + longitude) and abs(height_m) <= _HEIGHT_MAX_M:
@@ -128,12 +123,11 @@ class Commands:
             return Result.DENIED
         return Result.ACCEPTED
 
-    def _reposition(self, command: Command) -> Result:
+    def _reposition(self, autopilot: Autopilot, command: Command) -> Result:
         """MAV_CMD_DO_REPOSITION: fly to a place and hold there. Coordinates that are not finite
         keep their present value."""
         if command.params[1] != _CHANGE_MODE:
             return Result.UNSUPPORTED
-        autopilot = self._autopilot
         yaw_rad, latitude, longitude, height_m = command.params[3:7]
         strict = autopilot.firmware.repositions_strictly
         speed_mps = math.inf if strict or not command.params[0] > 0.0 else command.params[0]
@@ -172,23 +166,21 @@ class Commands:
         down = down_m(height_m, frame, origin, home_down_m)
         return north, east, down if math.isfinite(down) else here[2]
 
-    def _change_speed(self, command: Command) -> Result:
+    def _change_speed(self, autopilot: Autopilot, command: Command) -> Result:
         """MAV_CMD_DO_CHANGE_SPEED across the ground, in automatic flight until the next mode.
 
         A speed that is not positive restores the default.
         """
         kind, speed_mps = command.params[:2]
-        autopilot = self._autopilot
         if speed_mps > 0.0 and kind in _VERTICAL_SPEEDS:
             return Result.ACCEPTED
         known = 0.0 < speed_mps < math.inf
         autopilot.guidance.cruise_mps = speed_mps if known else math.inf
         return Result.ACCEPTED if known else autopilot.firmware.speed_refusal
 
-    def _turn(self, command: Command) -> Result:
+    def _turn(self, autopilot: Autopilot, command: Command) -> Result:
         """MAV_CMD_CONDITION_YAW: to a yaw, or relative to the present one; degrees."""
         yaw_deg, speed_dps, sense, relative = command.params[:4]
-        autopilot = self._autopilot
         if not autopilot.commander.knows("turn"):
             return Result.UNSUPPORTED
         if math.isfinite(yaw_deg):
@@ -199,12 +191,11 @@ class Commands:
             autopilot.guidance.turn_to(yaw_rad, turn_radps)
         return autopilot.handle("turn")
 
-    def _reboot(self, command: Command) -> Result:
+    def _reboot(self, autopilot: Autopilot, command: Command) -> Result:
         restart = command.params[0] >= 1.0
-        return self._autopilot.handle("reboot") if restart else Result.UNSUPPORTED
+        return autopilot.handle("reboot") if restart else Result.UNSUPPORTED
 
-    def _start_mission(self, command: Command) -> Result:
-        autopilot = self._autopilot
+    def _start_mission(self, autopilot: Autopilot, command: Command) -> Result:
         first = command.params[0] if math.isfinite(command.params[0]) else 0.0
         if not autopilot.commander.knows("mission"):
             return Result.UNSUPPORTED
@@ -212,22 +203,20 @@ class Commands:
             return Result.DENIED
         return autopilot.handle("mission")
 
-    def _set_current_item(self, command: Command) -> Result:
+    def _set_current_item(self, autopilot: Autopilot, command: Command) -> Result:
         number = command.params[0]
-        known = math.isfinite(number) and self._autopilot.mission.go_to(int(number))
+        known = math.isfinite(number) and autopilot.mission.go_to(int(number))
         return Result.ACCEPTED if known else Result.DENIED
 
-    def _set_interval(self, command: Command) -> Result:
+    def _set_interval(self, autopilot: Autopilot, command: Command) -> Result:
         number, interval_us = command.params[:2]
-        firmware = self._autopilot.firmware
-        name = message_name(number)
+        firmware, name = autopilot.firmware, message_name(number)
         if 0 < interval_us < 1e6 / firmware.rate_max_hz:
             return self._refuse_interval(number, firmware.too_fast_text)
         if number in firmware.never_sent and math.isfinite(interval_us):
             return Result.ACCEPTED
-        if name is None or not math.isfinite(interval_us):
-            return self._refuse_interval(number, firmware.interval_refusal_text)
-        if not self.schedule.set_interval(name, interval_us):
+        known = name is not None and math.isfinite(interval_us)
+        if not (known and self.schedule.set_interval(str(name), interval_us)):
             return self._refuse_interval(number, firmware.interval_refusal_text)
         return Result.ACCEPTED
 
@@ -237,19 +226,17 @@ class Commands:
             autopilot.commander.texts.append(info(text.format(id=int(number))))
         return autopilot.firmware.interval_refusal
 
-    def _get_interval(self, command: Command) -> Result:
+    def _get_interval(self, autopilot: Autopilot, command: Command) -> Result:
         name = message_name(command.params[0])
         if name is None or name not in self.outbox.view.builders:
             return Result.DENIED
         self.outbox.send("MESSAGE_INTERVAL", id_of(name), self.schedule.interval_us(name))
         return Result.ACCEPTED
 
-    def _request_message(self, command: Command) -> Result:
+    def _request_message(self, autopilot: Autopilot, command: Command) -> Result:
         name = message_name(command.params[0])
-        firmware = self._autopilot.firmware
-        if name not in self.outbox.view.builders or self.outbox.view.withheld(name):
-            return firmware.request_refusal
-        if name in firmware.not_on_request:
+        view, firmware = self.outbox.view, autopilot.firmware
+        if name not in view.builders or view.withheld(name) or name in firmware.not_on_request:
             return firmware.request_refusal
         return self._send(name)
 
@@ -259,10 +246,10 @@ class Commands:
 
 
 # By MAV_CMD
-HANDLERS: dict[int, Callable[[Commands, Command], Result | None]] = {
+HANDLERS: dict[int, Callable[[Commands, Autopilot, Command], Result | None]] = {
     17: Commands._loiter,  # NAV_LOITER_UNLIM
-    20: lambda commands, _: commands._autopilot.handle("return"),  # NAV_RETURN_TO_LAUNCH
-    21: lambda commands, _: commands._autopilot.handle("land"),  # NAV_LAND
+    20: lambda _, autopilot, __: autopilot.handle("return"),  # NAV_RETURN_TO_LAUNCH
+    21: lambda _, autopilot, __: autopilot.handle("land"),  # NAV_LAND
     22: Commands._takeoff,  # NAV_TAKEOFF
     115: Commands._turn,  # CONDITION_YAW
     176: Commands._set_mode,  # DO_SET_MODE
@@ -273,12 +260,12 @@ HANDLERS: dict[int, Callable[[Commands, Command], Result | None]] = {
     246: Commands._reboot,  # PREFLIGHT_REBOOT_SHUTDOWN
     300: Commands._start_mission,  # MISSION_START
     400: Commands._arm_disarm,  # COMPONENT_ARM_DISARM
-    401: lambda commands, _: commands._autopilot.handle("checks"),  # RUN_PREARM_CHECKS
-    410: lambda commands, _: commands._send("HOME_POSITION"),  # GET_HOME_POSITION
+    401: lambda _, autopilot, __: autopilot.handle("checks"),  # RUN_PREARM_CHECKS
+    410: lambda commands, *_: commands._send("HOME_POSITION"),  # GET_HOME_POSITION
     510: Commands._get_interval,  # GET_MESSAGE_INTERVAL
     511: Commands._set_interval,  # SET_MESSAGE_INTERVAL
     512: Commands._request_message,  # REQUEST_MESSAGE
-    520: lambda commands, _: commands._send("AUTOPILOT_VERSION"),  # REQUEST_AUTOPILOT_CAPABILITIES
+    520: lambda commands, *_: commands._send("AUTOPILOT_VERSION"),  # REQUEST_AUTOPILOT_CAPABILITIES
 }
 
 

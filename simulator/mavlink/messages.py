@@ -85,9 +85,7 @@ def gps_raw_int(view: View) -> Sequence[Any]:
     """Accuracies as PX4's SIH reports them: larger than the errors."""
     if not view.has_fix:
         return (view.time_us, 1, 0, 0, 0, 65535, 65535, 65535, 65535, 0, *(0,) * 6)
-    fix = view.autopilot.plant.fix
-    north, east, down = fix.position_ned_m.tolist()
-    v_north, v_east = fix.velocity_ne_mps.tolist()
+    north, east, down, v_north, v_east = view.autopilot.plant.fix()
     course = heading_cdeg(math.atan2(v_east, v_north))
     speed = fit(math.hypot(v_north, v_east) * 100, 16, signed=False)
     height = view.altitude_mm(down)

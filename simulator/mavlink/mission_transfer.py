@@ -14,11 +14,10 @@ from enum import IntEnum
 from simulator.autopilot.mission import ITEMS_MAX, Kind, Mission
 from simulator.firmware.base import Firmware
 from simulator.firmware.values import MissionItem
-from simulator.mavlink.codec import Message
+from simulator.mavlink.codec import Message, Peer, sender_of
 from simulator.mavlink.outbox import Outbox, Texts
 
 REPEAT_S, GIVE_UP_S = 0.25, 5.0
-Peer = tuple[int, int]  # system, component
 
 
 class Ack(IntEnum):
@@ -61,7 +60,7 @@ class MissionTransfer:
 
     def handle(self, message: Message, now_s: float) -> None:
         """Handle one message of the mission protocol addressed to this vehicle."""
-        HANDLERS[message.name](self, message, now_s)
+        HANDLERS[message.get_type()](self, message, now_s)
 
     def step(self, now_s: float) -> None:
         """Request a missing item again, and give up after a while."""
@@ -77,7 +76,7 @@ class MissionTransfer:
     # -- up ----------------------------------------------------------------------------------
 
     def _count(self, message: Message, now_s: float) -> None:
-        peer = _sender(message)
+        peer = sender_of(message)
         if message.mission_type:
             self._acknowledge(peer, Ack.UNSUPPORTED, message.mission_type)
         elif message.count > ITEMS_MAX:
@@ -96,8 +95,8 @@ class MissionTransfer:
         self.outbox.send(name, *upload.peer, len(upload.items), 0)
 
     def _item(self, message: Message, now_s: float) -> None:
-        self._whole = message.name == "MISSION_ITEM_INT"
-        upload, peer = self._upload, _sender(message)
+        self._whole = message.get_type() == "MISSION_ITEM_INT"
+        upload, peer = self._upload, sender_of(message)
         if upload is None:  # the last one again, whose answer was lost, or one without an upload
             last = message.seq + 1 == self._taken and not message.mission_type
             self._acknowledge(peer, Ack.ACCEPTED if last else Ack.ERROR, message.mission_type)
@@ -127,7 +126,7 @@ class MissionTransfer:
     def _ack(self, message: Message, now_s: float) -> None:
         """MISSION_ACK of the peer: it wants the other kind of request, or cancels."""
         upload = self._upload
-        if upload is None or upload.peer != _sender(message):
+        if upload is None or upload.peer != sender_of(message):
             return
         if message.type == Ack.UNSUPPORTED:
             self._whole = not self._whole
@@ -142,11 +141,11 @@ class MissionTransfer:
 
     def _list(self, message: Message, _: float) -> None:
         count = 0 if message.mission_type else len(self.mission.items)
-        self.outbox.send("MISSION_COUNT", *_sender(message), count, message.mission_type)
+        self.outbox.send("MISSION_COUNT", *sender_of(message), count, message.mission_type)
 
     def _request(self, message: Message, _: float) -> None:
-        peer, items = _sender(message), self.mission.items
-        self._whole = whole = message.name == "MISSION_REQUEST_INT"
+        peer, items = sender_of(message), self.mission.items
+        self._whole = whole = message.get_type() == "MISSION_REQUEST_INT"
         is_home = self._firmware.home_item_first and message.seq == 0
         if message.mission_type or not (is_home or message.seq < len(items)):
             self._acknowledge(peer, Ack.INVALID_SEQUENCE, message.mission_type)
@@ -168,21 +167,17 @@ class MissionTransfer:
     def _clear(self, message: Message, _: float) -> None:
         if message.mission_type in (0, 255):  # the mission, or all
             self.mission.store(())
-        self._acknowledge(_sender(message), Ack.ACCEPTED, message.mission_type)
+        self._acknowledge(sender_of(message), Ack.ACCEPTED, message.mission_type)
 
     def _set_current(self, message: Message, _: float) -> None:
         if self.mission.go_to(message.seq):
             self.outbox.send_now("MISSION_CURRENT")
 
 
-def _sender(message: Message) -> Peer:
-    return message.system, message.component
-
-
 def _read(message: Message) -> MissionItem:
     """MISSION_ITEM_INT, or MISSION_ITEM with its places in degrees."""
     x, y = message.x, message.y
-    if message.name == "MISSION_ITEM":
+    if message.get_type() == "MISSION_ITEM":
         x, y = (_integer(value * 1e7) for value in (x, y))
     params = (message.param1, message.param2, message.param3, message.param4)
     return MissionItem(message.frame, message.command, params, x, y, message.z)

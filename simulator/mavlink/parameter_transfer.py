@@ -25,7 +25,7 @@ class ParameterTransfer:
 
     def handle(self, message: Message) -> None:
         """Handle one message of the parameter protocol addressed to this vehicle."""
-        HANDLERS[message.name](self, message)
+        HANDLERS[message.get_type()](self, message)
 
     def step(self) -> None:
         """Queue the next parameters of a requested list."""

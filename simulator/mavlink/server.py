@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from simulator.autopilot.setpoints import ATTITUDE, GLOBAL, LOCAL
-from simulator.mavlink.codec import Decoder, Message
+from simulator.mavlink.codec import Decoder, Message, sender_of
 from simulator.mavlink.commands import Command, Commands
 from simulator.mavlink.mission_transfer import HANDLERS as MISSION_HANDLERS
 from simulator.mavlink.mission_transfer import MissionTransfer
@@ -89,61 +89,61 @@ class Server:
         """Handle all messages of one datagram; no bytes make this raise."""
         for message in self.decoder.read(datagram):
             self.texts.connected = True
-            handler = HANDLERS.get(message.name)
+            handler = HANDLERS.get(message.get_type())
             if handler is not None and self._is_for_us(message):
                 handler(self, message)
 
     def _is_for_us(self, message: Message) -> bool:
         """Whether its target is this system and its autopilot, or all."""
-        system = message.values.get("target_system", 0)
-        component = message.values.get("target_component", 0)
+        system = getattr(message, "target_system", 0)
+        component = getattr(message, "target_component", 0)
         checked = self.view.autopilot.firmware.target_component_checked
         for_autopilot = component in (0, MAV_COMP_ID_AUTOPILOT) or not checked
         read = self.view.autopilot.parameters.__getitem__
-        obeyed = self.view.autopilot.firmware.obeys_system(message.system, self.view.system, read)
+        obeyed = self.view.autopilot.firmware.obeys_system(
+            message.get_srcSystem(), self.view.system, read
+        )
         return system in (0, self.view.system) and for_autopilot and obeyed
 
     def _heartbeat(self, message: Message) -> None:
         autopilot = self.view.autopilot
         read = autopilot.parameters.__getitem__
-        if autopilot.firmware.is_ground_station(message.type, message.system, read):
+        if autopilot.firmware.is_ground_station(message.type, message.get_srcSystem(), read):
             autopilot.health.ground_station_heard(autopilot.state.time_s)
             self.texts.note_ground_station()
 
     def _command_long(self, message: Message) -> None:
-        params = tuple(message.values[f"param{i}"] for i in range(1, 8))
-        self._commands.run(Command(message.command, params, message.system, message.component))
+        params = tuple(getattr(message, f"param{i}") for i in range(1, 8))
+        self._commands.run(Command(message.command, params, *sender_of(message)))
 
     def _command_int(self, message: Message) -> None:
-        params = tuple(message.values[f"param{i}"] for i in range(1, 5))
+        params = tuple(getattr(message, f"param{i}") for i in range(1, 5))
         params += (message.x * 1e-7, message.y * 1e-7, message.z)
-        sender = (message.system, message.component)
-        self._commands.run(Command(message.command, params, *sender, message.frame))
+        self._commands.run(Command(message.command, params, *sender_of(message), message.frame))
 
     def _setpoint(self, message: Message) -> None:
-        self.view.autopilot.take_setpoint(message.name, message.values)
+        self.view.autopilot.take_setpoint(message.get_type(), message.to_dict())
 
     def _set_mode(self, message: Message) -> None:
-        sender = (message.system, message.component)
-        self._commands.set_mode(message.base_mode, message.custom_mode, sender)
+        self._commands.set_mode(message.base_mode, message.custom_mode, sender_of(message))
 
     def _parameter(self, message: Message) -> None:
         self._parameters.handle(message)
 
     def _mission(self, message: Message) -> None:
         guided = self.view.autopilot.firmware.guided_items
-        if guided and message.name in _ITEMS and message.current == _GUIDED:
+        if guided and message.get_type() in _ITEMS and message.current == _GUIDED:
             self._guided_item(message)
             return
         self._missions.handle(message, self.view.autopilot.state.time_us * 1e-6)
 
     def _guided_item(self, message: Message) -> None:
         """A mission item that is a place to fly to now (ArduPilot, `current` = 2)."""
-        scale = 1e-7 if message.name.endswith("INT") else 1.0
+        scale = 1e-7 if message.get_type().endswith("INT") else 1.0
         place = (message.x * scale, message.y * scale, message.z)
         accepted = self._commands.go_to(place, message.frame)
         result = 0 if accepted else 1  # MAV_MISSION_RESULT
-        self.outbox.send("MISSION_ACK", message.system, message.component, result, 0)
+        self.outbox.send("MISSION_ACK", *sender_of(message), result, 0)
 
     def _timesync(self, message: Message) -> None:
         if message.tc1 == 0:
@@ -152,7 +152,7 @@ class Server:
             self.answered_ns = message.ts1
 
     def _rc_channels_override(self, message: Message) -> None:
-        self._sticks(message, [message.values[f"chan{i}_raw"] for i in range(1, 9)])
+        self._sticks(message, [getattr(message, f"chan{i}_raw") for i in range(1, 9)])
 
     def _manual_control(self, message: Message) -> None:
         """Joystick axes -1000 .. 1000, throttle 0 .. 1000, as pulse widths."""
@@ -166,7 +166,7 @@ class Server:
         read = autopilot.parameters.__getitem__
         if autopilot.guidance.sticks is None:
             return
-        if autopilot.firmware.is_ground_station(0, message.system, read):
+        if autopilot.firmware.is_ground_station(0, message.get_srcSystem(), read):
             autopilot.guidance.sticks.override(widths_us, autopilot.state.time_s)
 
     def _setup_signing(self, message: Message) -> None:
@@ -188,7 +188,7 @@ class Server:
         head = (number & 0xFF, number >> 8, request[2], _FTP_NAK, 1, request[3])
         answer = head + (0,) * 6 + (_FTP_ERROR_NOT_FOUND,)
         padded = answer + (0,) * (len(request) - len(answer))
-        self.outbox.send("FILE_TRANSFER_PROTOCOL", 0, message.system, message.component, padded)
+        self.outbox.send("FILE_TRANSFER_PROTOCOL", 0, *sender_of(message), padded)
 
 
 HANDLERS: dict[str, Callable[[Server, Message], None]] = {

@@ -1,7 +1,7 @@
 """Plant: the simulated vehicle below the autopilot, with air, attitude loop and estimator.
 
-`Plant` takes a `Demand` and a duration and gives the `Truth` and the `Estimate`. Fixed steps, one
-compiled call per `advance`. Knows no modes, no arming and no MAVLink.
+`Plant` takes a `Demand` and a duration and gives the `Truth` and a report of the estimate. Fixed
+steps, one compiled call per `advance`. Knows no modes, no arming and no MAVLink.
 """
 
 from __future__ import annotations
@@ -27,10 +27,6 @@ from simulator.vehicle.conditions import Conditions
 from simulator.vehicle.dynamics import RECORD, advance_steps, draw_gusts, receive_fix, report_state
 from simulator.vehicle.noise import seed_word
 from simulator.vehicle.sensors import (
-    ATTITUDE,
-    POSITION,
-    RATES,
-    VELOCITY,
     error_model,
     error_process,
     white_sds,
@@ -57,25 +53,6 @@ class Truth:
     battery: BatteryState
 
 
-@dataclass(frozen=True, slots=True)
-class Estimate:
-    """Estimated state, as the autopilot reports it. Frames and units as in `Truth`."""
-
-    position_ned_m: Array
-    velocity_ned_mps: Array
-    attitude: Array
-    rates_frd_radps: Array
-    reset_counter: int
-
-
-@dataclass(frozen=True, slots=True)
-class Fix:
-    """GPS fix, NED: position (3,) and velocity (2,)."""
-
-    position_ned_m: Array
-    velocity_ne_mps: Array
-
-
 class Plant:
     """One vehicle, at first on the ground at the origin, level, heading north, motors off.
 
@@ -86,8 +63,6 @@ class Plant:
 
     def __init__(self, vehicle: Vehicle, conditions: Conditions, seed: int) -> None:
         self.record = np.zeros(1, RECORD)
-        self._step = 0
-        self._due_s = 0.0
         airframe = build_airframe(
             vehicle,
             STEP_S,
@@ -134,22 +109,13 @@ class Plant:
         record["gust"][0] = gusts.stationary_scale @ record["gust_normals"][0]
         record["gusty"] = np.any(record["gust"] != 0.0)
 
-    @property
-    def time_s(self) -> float:
-        """Simulated time since the plant was made."""
-        return self._step * STEP_S
-
     def advance(self, duration_s: float, demand: Demand) -> None:
-        """Hold the demand for `duration_s`; a remainder of a step is added to the next call."""
+        """Hold the demand for `duration_s`, rounded to steps."""
         if demand is not self._demand:
             encode(demand, self._row)
             self.record["motors_on"] = demand.motors_on
             self._demand = demand
-        self._due_s += duration_s
-        count = int(self._due_s / STEP_S + 1e-6)
-        self._due_s -= count * STEP_S
-        self._step += count
-        advance_steps(count, self.record)
+        advance_steps(round(duration_s / STEP_S), self.record)
 
     def reset_estimate(self, offset_ned_m: Triple) -> None:
         """Offset the estimate, and count an estimator reset."""
@@ -188,12 +154,12 @@ class Plant:
             battery=self.pack.state(float(self._rotor[CHARGE]), float(self._rotor[THRUST])),
         )
 
-    @property
-    def fix(self) -> Fix:
-        """GPS fix of the present step; repeated calls give the same one."""
+    def fix(self) -> list[float]:
+        """GPS fix of the present step: NED position, then velocity north and east; repeated calls
+        give the same one."""
         receive_fix(self.record)
-        fix = self.record["fix"][0].copy()
-        return Fix(fix[:3], fix[3:])
+        fix: list[float] = self.record["fix"][0].tolist()
+        return fix
 
     def motion(self) -> list[float]:
         """The true motion as floats: attitude wxyz, rates FRD, then NED velocity, position and
@@ -210,15 +176,9 @@ class Plant:
         """Whether the ground carries the vehicle."""
         return bool(self._rotor[CONTACT])
 
-    @property
-    def estimate(self) -> Estimate:
-        """Estimate of the present step; repeated calls give the same one."""
-        out = self.report().copy()
-        return Estimate(out[POSITION], out[VELOCITY], out[ATTITUDE], out[RATES], self.reset_counter)
-
     def report(self) -> Array:
-        """Estimate as one array (REPORT_WIDTH,), with the layout of `simulator.vehicle.sensors`;
-        the next call overwrites it."""
+        """Estimate of the present step as one array (REPORT_WIDTH,), with the layout of
+        `simulator.vehicle.sensors`; repeated calls give the same one and overwrite it."""
         report_state(self.record)
         seen: Array = self._report
         return seen

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from simulator.steps import STEP_S
 from simulator.vehicle.attitude import Demand
 from simulator.vehicle.conditions import Conditions
 from simulator.vehicle.plant import Plant
+from simulator.vehicle.sensors import ATTITUDE, POSITION, RATES, VELOCITY
 
 VEHICLES = Path(__file__).parents[2] / "config" / "vehicles"
 CALM = Conditions()
@@ -37,6 +39,17 @@ def hovering(vehicle: Vehicle, conditions: Conditions = CALM, seed: int = 1) -> 
         thrust = vehicle.hover_thrust * (1.0 + 0.2 * down)
         plant.advance(0.02, Demand(True, thrust, attitude()))
     return plant
+
+
+def estimate_of(plant: Plant) -> SimpleNamespace:
+    """The estimate, with names as in `Truth`."""
+    seen = plant.report().copy()
+    return SimpleNamespace(
+        position_ned_m=seen[POSITION],
+        velocity_ned_mps=seen[VELOCITY],
+        attitude=seen[ATTITUDE],
+        rates_frd_radps=seen[RATES],
+    )
 
 
 def response(plant: Plant, demand: Demand, duration_s: float, read) -> tuple:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from sim_hover import attitude, hovering, load
+from sim_hover import attitude, estimate_of, hovering, load
 
 from simulator.steps import STEP_S
 from simulator.vehicle.attitude import Demand
@@ -23,7 +23,7 @@ ROUGH = Conditions(
 
 
 def _bytes(plant: Plant) -> bytes:
-    truth, estimate = plant.truth, plant.estimate
+    truth, estimate = plant.truth, estimate_of(plant)
     return b"".join(
         part.tobytes()
         for part in (
@@ -68,8 +68,8 @@ def test_same_seed_gives_the_same_bytes_however_time_is_cut(cut):
 
 def test_asking_changes_nothing():
     asked, silent = hovering(PX4, ROUGH), hovering(PX4, ROUGH)
-    first = asked.estimate.position_ned_m
-    assert np.array_equal(first, asked.estimate.position_ned_m)
+    first = estimate_of(asked).position_ned_m
+    assert np.array_equal(first, estimate_of(asked).position_ned_m)
     first[:] = math.nan  # nor does what the asker does with the answer
     asked.truth.attitude[:] = 0.0
     for plant in (asked, silent):
@@ -96,7 +96,7 @@ def test_hostile_demands_never_make_anything_infinite():
         plant.advance(STEP_S * int(generator.integers(1, 4)), demand)
         if not np.isfinite(plant._body).all():
             break
-    truth, estimate = plant.truth, plant.estimate
+    truth, estimate = plant.truth, estimate_of(plant)
     for part in (truth.position_ned_m, truth.velocity_ned_mps, truth.acceleration_ned_mps2):
         assert np.isfinite(part).all()
     assert np.linalg.norm(truth.velocity_ned_mps) < 100.0

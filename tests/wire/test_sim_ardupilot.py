@@ -5,7 +5,6 @@ Expected values are those of ArduCopter 4.6.3 SITL. The start is ten times as fa
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections import Counter
 
@@ -16,8 +15,8 @@ from sim_bench import NAN, Bench
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.vehicle.sensors import EstimatorName
 
-STABILIZE, ALT_HOLD, GUIDED, LOITER, RTL, LAND, BRAKE, GUIDED_NOGPS = 0, 2, 4, 5, 6, 9, 17, 20
-ACCEPTED, DENIED, FAILED = 0, 2, 4
+ALT_HOLD, GUIDED, LAND = 2, 4, 9
+ACCEPTED, FAILED = 0, 4
 ONBOARD = mavlink.MAV_TYPE_ONBOARD_CONTROLLER
 BOOT_SCALE = 0.1
 HOVER = 0.3655
@@ -95,40 +94,7 @@ def test_without_requests_it_sends_heartbeat_timesync_and_home() -> None:
     }
 
 
-@pytest.mark.parametrize(
-    ("message", "rate_hz"), [(30, 50), (31, 100), (32, 100), (83, 200), (108, 50)]
-)
-def test_granted_rates_are_exact(message: int, rate_hz: float) -> None:
-    vehicle = bench()
-    vehicle.run(4.5)
-    assert vehicle.command(511, message, 1e6 / rate_hz) == [ACCEPTED]
-    begun_s = vehicle.time_s
-    vehicle.run(4.0)
-    name = mavlink.mavlink_map[message].msgname
-    assert len(vehicle.of(name, begun_s)) == pytest.approx(4 * rate_hz, abs=1)
-
-
-# -- addresses -------------------------------------------------------------------------------
-
-
-# -- modes and arming ------------------------------------------------------------------------
-
-
 # -- takeoff and landing ---------------------------------------------------------------------
-
-
-def test_takeoff_is_refused_on_the_ground_downwards_and_after_the_climb() -> None:
-    vehicle = ready()
-    assert vehicle.command(22, *(0.0,) * 6, 5.0) == [FAILED]
-    vehicle.command(400, 1)
-    assert vehicle.command(22, *(0.0,) * 6, -1.0) == [FAILED]
-    assert vehicle.command(22, *(NAN,) * 7) == [FAILED]
-    assert vehicle.command(22, *(0.0,) * 6, 3.0) == [ACCEPTED]
-    vehicle.run(4.0)
-    assert vehicle.command(22, *(0.0,) * 6, 4.0) == [ACCEPTED]  # another height on the way
-    vehicle.run(8.0)
-    assert vehicle.height_m == pytest.approx(4.0, abs=0.15)
-    assert vehicle.command(22, *(0.0,) * 6, 6.0) == [FAILED]
 
 
 def test_takeoff_by_setpoints_alone() -> None:
@@ -161,16 +127,11 @@ def test_takeoff_by_setpoints_alone() -> None:
     ("mask", "length", "rolls"),
     [
         (7, 1.0, True),
-        (7 + 8 + 32, 1.0, True),
         (7, -1.0, True),
-        (7, 1.0004, True),
         (7, 1.0006, False),
         (7, 2.0, False),
-        (7, 0.0, False),
         (7, NAN, False),
         (71, 1.0, False),
-        (3, 1.0, False),
-        (4, 1.0, False),
         (199, 1.0, False),
     ],
 )
@@ -263,17 +224,3 @@ def test_parameters_carry_values_whatever_their_type() -> None:
         ("DISARM_DELAY", 0.0, 2, 65535),
     ]
     assert all(name != "NO_SUCH" for name, *_ in told)
-
-
-def test_the_same_seed_gives_the_same_bytes() -> None:
-    received = []
-    for _ in range(2):
-        vehicle = Bench(
-            EstimatorName.ARDUPILOT_LIKE, seed=5, firmware=ARDUPILOT, boot_scale=BOOT_SCALE
-        )
-        for message, period_us in itertools.product((31, 32, 108), (20_000,)):
-            vehicle.command(511, message, period_us)
-        vehicle.run(6.0)
-        received.append(bytes(vehicle.raw))
-    assert len(received[0]) > 10_000
-    assert received[0] == received[1]

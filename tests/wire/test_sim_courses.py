@@ -16,8 +16,8 @@ from sim_courses import copter, heading_deg, place, velocity
 from simulator.geodesy import EARTH_RADIUS_M
 
 ACCEPTED, UNSUPPORTED = 0, 3
-POSITION_ALONE, VELOCITY_ALONE, YAW_TOO = 0xDF8, 0xDC7, 0x9F8
-LOCAL, LOCAL_OFFSET, BODY, BODY_OFFSET = 1, 7, 8, 9  # MAV_FRAME
+POSITION_ALONE, VELOCITY_ALONE = 0xDF8, 0xDC7
+LOCAL = 1  # MAV_FRAME
 RELATIVE, ABSOLUTE = 6, 5
 
 
@@ -77,22 +77,6 @@ def fastest_mps(bench: Bench, duration_s: float) -> float:
     speeds = []
     bench.run(duration_s, lambda: speeds.append(math.hypot(*velocity(bench)[:2])))
     return max(speeds)
-
-
-def test_arducopter_faces_its_direction_of_flight_without_a_yaw() -> None:
-    """At 1 m/s it did; at 0.3 m/s, a twentieth of its speed being 0.5, it did not."""
-    bench = copter()
-    ask(bench, LOCAL, (0.0, 30.0, -5.0))
-    bench.run(3.5)
-    assert off_deg(bench, 90.0) < 3.0
-    bench.run(8.0)
-    slow = {"velocity": (0.3, 0.0, 0.0), "mask": VELOCITY_ALONE}
-    bench.run(4.0, lambda: ask(bench, LOCAL, **slow), 0.25)
-    assert off_deg(bench, 90.0) < 3.0
-    bench.send(mavlink.MAVLink_param_set_message(1, 1, b"WP_YAW_BEHAVIOR", 0, 9))
-    ask(bench, LOCAL, (0.0, 0.0, -5.0))
-    bench.run(4.0)
-    assert off_deg(bench, 90.0) < 3.0
 
 
 @pytest.mark.parametrize(
@@ -166,14 +150,6 @@ def test_px4_faces_its_goal_and_then_takes_the_requested_yaw() -> None:
     assert reposition(bench, 1.0, 30.0, amsl_m, ABSOLUTE) == ACCEPTED  # nearer than NAV_ACC_RAD
     bench.run(4.0)
     assert off_deg(bench, -45.0) < 3.0
-
-
-def test_px4_repositions_with_the_given_speed() -> None:
-    """1.9 m/s of 2 asked."""
-    bench = px4()
-    amsl_m = bench.instance.autopilot.firmware.origin[2] + 3.0
-    assert reposition(bench, 20.0, 0.0, amsl_m, ABSOLUTE, speed=2.0) == ACCEPTED
-    assert fastest_mps(bench, 9.0) == pytest.approx(1.9, abs=0.15)
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ def assault(instance: Instance, seed: int, count: int) -> Decoder:
             instance.advance()
             for datagram_out in (*instance.drain(), *instance.ground.outbox.drain()):
                 messages = reader.read(datagram_out)
-                positions = [m for m in messages if m.name == "LOCAL_POSITION_NED"]
+                positions = [m for m in messages if m.get_type() == "LOCAL_POSITION_NED"]
                 assert all(math.isfinite(m.x + m.y + m.z) for m in positions)
     return reader
 

@@ -254,7 +254,7 @@ def test_arducopter_faces_its_direction_of_flight_and_returns_within_its_mission
         )
     bench.run(0.02)
     assert bench.of("MISSION_ACK")[-1][1].type == 0
-    assert [row[0] for row in download(bench, 0)] == [3, 3, 3, 3]
+    assert [row[0] for row in download(bench, 0)] == [0, 3, 3, 3]
     bench.command(176, 1, 4)
     assert bench.command(400, 1) == [0]
     assert bench.command(300) == [0]

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import all as every
 from pymavlink.dialects.v20 import common as mavlink
-from sim_bench import NAN, OFFBOARD, Bench
+from sim_bench import NAN, Bench
 
 from simulator.firmware.px4 import PX4
 from simulator.firmware.px4_messages import COMPANION_RATES_HZ, GROUND_RATES_HZ
 from simulator.mavlink.outbox import DATAGRAM_MAX
 from simulator.vehicle.sensors import EstimatorName
 
-LOCAL_POSITION, ATTITUDE, HIL_STATE, GPS_RAW = 32, 30, 115, 24
+LOCAL_POSITION, GPS_RAW = 32, 24
 
 
 def read(datagrams: list[bytes]) -> list[object]:
@@ -211,31 +211,6 @@ def test_parameters_take_any_value_and_are_obeyed_within_their_range() -> None:
 
 
 # -- truth -----------------------------------------------------------------------------------
-
-
-def test_true_state_on_request() -> None:
-    bench = Bench(EstimatorName.PX4_LIKE, seed=4)
-    assert bench.command(511, HIL_STATE, 10_000) == [0]
-    bench.boot()
-    bench.run(0.6, bench.attitude)
-    bench.ask_mode(OFFBOARD)
-    bench.command(400, 1)
-    tilted = (math.cos(0.05), math.sin(0.05), 0.0, 0.0)
-    bench.run(3.0, lambda: bench.attitude(tilted, 0.56))
-    at_s, state = bench.of("HIL_STATE_QUATERNION")[-1]
-    bench.run_until(lambda: bench.instance.companion.view.time_ms % 40 == 0, 0.1)
-    bench.run(0.0)
-    at_s, state = bench.of("HIL_STATE_QUATERNION")[-1]
-    truth = bench.instance.autopilot.state.truth
-    assert state.time_usec == round(at_s * 1e6) == round(bench.time_s * 1e6)
-    latitude, longitude, amsl = PX4.origin
-    north = math.radians(state.lat * 1e-7 - latitude) * 6_371_000
-    east = math.radians(state.lon * 1e-7 - longitude) * 6_371_000 * math.cos(math.radians(latitude))
-    assert (north, east) == pytest.approx(truth.position_ned_m[:2], abs=0.012)
-    assert state.alt / 1e3 - amsl == pytest.approx(-truth.position_ned_m[2], abs=0.001)
-    assert state.vy / 100 == pytest.approx(truth.velocity_ned_mps[1], abs=0.006)
-    assert state.attitude_quaternion == pytest.approx(truth.attitude, abs=1e-6)
-    assert abs(east) > 1.0
 
 
 def test_gps_errors_are_as_large_as_those_of_sih() -> None:

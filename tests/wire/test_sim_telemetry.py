@@ -41,7 +41,7 @@ def test_another_rate_of_one_message_does_not_shift_the_others() -> None:
     sent = Counter[str]()
     while instance.time_s < 3.9:
         for datagram in instance.step():
-            sent.update(message.name for message in Decoder().read(datagram))
+            sent.update(message.get_type() for message in Decoder().read(datagram))
     assert "HEARTBEAT" not in sent
     assert sent["ATTITUDE_QUATERNION"] == 20
     assert sent["ATTITUDE"] == 80
@@ -55,7 +55,7 @@ def test_positions_are_sent_on_the_grid_of_the_estimator_whatever_their_rate() -
     while instance.time_s < 1.0:
         for datagram in instance.step():
             messages = Decoder().read(datagram)
-            stamps += [m.time_boot_ms for m in messages if m.name == "LOCAL_POSITION_NED"]
+            stamps += [m.time_boot_ms for m in messages if m.get_type() == "LOCAL_POSITION_NED"]
     grid_ms = 4 * PX4.position_grid_steps
     assert stamps == list(range(grid_ms, 1001, grid_ms))
 
@@ -72,7 +72,7 @@ def test_states_that_are_not_finite_or_out_of_range_are_sent(body: tuple[float, 
     for name in streams:
         streams[name].due_us = 0
     instance.advance_to_barrier()
-    sent = {message.name for message in Decoder().read(b"".join(instance.drain()))}
+    sent = {message.get_type() for message in Decoder().read(b"".join(instance.drain()))}
     assert sent >= {"LOCAL_POSITION_NED", "ODOMETRY", "ATTITUDE", "HIGHRES_IMU", "GPS_RAW_INT"}
 
 
