@@ -11,7 +11,6 @@ from offboard.documents.errors import UserError
 from offboard.documents.reading import DocumentError
 from offboard.documents.signing_key import read_key
 from offboard.link.clock import unix_us
-from offboard.model.vehicle import Vehicle
 from simulator import config
 from simulator.firmware.base import Firmware
 from simulator.firmware.catalogue import FIRMWARES
@@ -39,14 +38,27 @@ def launch(options: Options, stopping: Stop) -> int:
         config.check_for(flown, firmware, lockstep=options.lockstep)
         vehicle = config.vehicle(options.vehicle or firmware.vehicle)
         links = [_links(options, number) for number in options.numbers]
-        _parameters(firmware, options.parameters)
-        recorder = _recorder(options)
+        parameters, recorder = _parameters(firmware, options.parameters), _recorder(options)
+        key = read_key(options.signing_key) if options.signing_key else b""
+        epoch_us = VIRTUAL_EPOCH_US if options.lockstep else unix_us()
         prepare(_warn)
         warm_up(Instance(firmware, vehicle, flown.conditions, options.seed, lockstep=True))
         endpoints = []
         for number, (companion, ground) in zip(options.numbers, links, strict=True):
-            what = (firmware, vehicle, flown)
-            instance = _instance(options, number, *what, ground_link=ground is not None)
+            instance = Instance(
+                firmware,
+                vehicle,
+                flown.conditions,
+                options.seed + number - options.numbers[0],
+                system=number + 1,
+                lockstep=options.lockstep,
+                ground_link=ground is not None,
+                epoch_us=epoch_us,
+                parameters=parameters,
+                faults=flown.faults,
+                start=flown.start,
+                signing_key=key,
+            )
             strangers = tuple(open_beside(companion) for _ in instance.strangers)
             endpoints.append(Endpoint(instance, companion, ground, recorder, strangers))
     except (DocumentError, LinkError) as error:
@@ -55,10 +67,10 @@ def launch(options: Options, stopping: Stop) -> int:
     _announce(options, f"{options.firmware} vehicle {vehicle.name}", flown.name)
     stopping.running = True
     runner = Runner(endpoints, stopping=stopping, report=_warn, duration_s=options.duration_s)
-    by_lockstep = options.lockstep
-    outcome = (
-        runner.lockstep(options.patience_s) if by_lockstep else runner.real_time(options.speed)
-    )
+    if options.lockstep:
+        outcome = runner.lockstep(options.patience_s)
+    else:
+        outcome = runner.real_time(options.speed)
     if outcome.sentence:
         _warn(outcome.sentence)
     if len(options.numbers) > 1:
@@ -84,32 +96,6 @@ def _links(options: Options, number: int) -> tuple[Link, Link | None]:
     if options.gcs == NO_LINK:
         return companion, None
     return companion, open_link(options.gcs, LOCAL_GROUND_PORT + number)
-
-
-def _instance(
-    options: Options,
-    number: int,
-    firmware: Firmware,
-    vehicle: Vehicle,
-    flown: config.Scenario,
-    *,
-    ground_link: bool,
-) -> Instance:
-    """The instance with this number."""
-    return Instance(
-        firmware,
-        vehicle,
-        flown.conditions,
-        options.seed + number - options.numbers[0],
-        system=number + 1,
-        lockstep=options.lockstep,
-        ground_link=ground_link,
-        epoch_us=VIRTUAL_EPOCH_US if options.lockstep else unix_us(),
-        parameters=_parameters(firmware, options.parameters),
-        faults=flown.faults,
-        start=flown.start,
-        signing_key=read_key(options.signing_key) if options.signing_key else b"",
-    )
 
 
 def _recorder(options: Options) -> Recorder | None:

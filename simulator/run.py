@@ -53,19 +53,17 @@ class Endpoint:
     def links(self) -> list[Link]:
         return [self.companion] if self.ground is None else [self.companion, self.ground]
 
-    def send(self) -> None:
-        """Send what both links have queued."""
-        datagrams = self.instance.drain()
+    def send(self, datagrams: list[bytes] | None = None) -> None:
+        """Send these datagrams, by default what is queued for the companion; before them those of
+        senders that are not the vehicle, each from its own port; and what the ground link queued.
+        """
+        datagrams = self.instance.drain() if datagrams is None else datagrams
         self._record(datagrams)
-        self._send_strange()
+        for link, strange in zip(self.strangers, self.instance.strangers, strict=True):
+            link.send(strange)
+            strange.clear()
         self.companion.send(datagrams)
         self.send_ground()
-
-    def _send_strange(self) -> None:
-        """Send the datagrams of senders that are not the vehicle, each from its own port."""
-        for link, datagrams in zip(self.strangers, self.instance.strangers, strict=True):
-            link.send(datagrams)
-            datagrams.clear()
 
     def send_ground(self) -> None:
         datagrams = self.instance.ground.outbox.drain()
@@ -75,10 +73,7 @@ class Endpoint:
     def send_barrier(self) -> tuple[int, list[bytes]]:
         """Send everything queued and the barrier; return its time stamp and its datagrams."""
         stamp_ns, datagrams = self.instance.barrier()
-        self._record(datagrams)
-        self._send_strange()
-        self.companion.send(datagrams)
-        self.send_ground()
+        self.send(datagrams)
         return stamp_ns, datagrams
 
     def read(self) -> bool:

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from offboard.compiled import kernel
 from offboard.model.rigid_body import pack, quaternion_into, rk4_into
 from offboard.model.vehicle import Vehicle
-from simulator.vehicle.battery import Battery, Pack
+from simulator.vehicle.battery import Pack
+from simulator.vehicle.conditions import Conditions
 
 Array = NDArray[np.float64]
 
@@ -47,41 +48,25 @@ class Airframe:
     pack: Pack
 
 
-def build_airframe(
-    vehicle: Vehicle,
-    step_s: float,
-    *,
-    thrust_scale: float = 1.0,
-    mass_scale: float = 1.0,
-    ground_effect: bool = False,
-    battery: Battery | None = None,
-) -> Airframe:
-    """Constants of the simulated vehicle.
-
-    Args:
-        vehicle: the model that the controller has, too.
-        step_s: length of a step.
-        thrust_scale, mass_scale: factors on thrust and mass that the controller does not know.
-        ground_effect: more thrust near the ground.
-        battery: None: the default one.
-    """
-    battery = battery or Battery()
+def build_airframe(vehicle: Vehicle, conditions: Conditions, step_s: float) -> Airframe:
+    """Constants of the simulated vehicle: the model that the controller has, too, with the factors
+    of the conditions on thrust and mass. `step_s`: length of a step."""
     body = pack(vehicle)
     lag_s = vehicle.thrust_lag_s
     rotor = np.array(
         [
-            thrust_scale * vehicle.mass_kg * vehicle.thrust_max_mps2,
+            conditions.thrust_scale * vehicle.mass_kg * vehicle.thrust_max_mps2,
             math.exp(-step_s / lag_s) if lag_s > 0.0 else 0.0,
             _AUTHORITY_SHARE * vehicle.hover_thrust,
-            float(ground_effect),
+            float(conditions.ground_effect),
             vehicle.hover_thrust,
-            battery.hover_current_a,
+            conditions.battery.hover_current_a,
         ]
     )
-    body[0] *= mass_scale
+    body[0] *= conditions.mass_scale
     stiffness = max(body[6:9].max() / body[0], (body[9:12] / body[2:5]).max())
     substeps = max(1, math.ceil(step_s * stiffness / _STIFFNESS_LIMIT))
-    return Airframe(body, rotor, substeps, Pack(battery, vehicle.hover_thrust))
+    return Airframe(body, rotor, substeps, Pack(conditions.battery, vehicle.hover_thrust))
 
 
 @kernel

@@ -63,14 +63,7 @@ class Plant:
 
     def __init__(self, vehicle: Vehicle, conditions: Conditions, seed: int) -> None:
         self.record = np.zeros(1, RECORD)
-        airframe = build_airframe(
-            vehicle,
-            STEP_S,
-            thrust_scale=conditions.thrust_scale,
-            mass_scale=conditions.mass_scale,
-            ground_effect=conditions.ground_effect,
-            battery=conditions.battery,
-        )
+        airframe = build_airframe(vehicle, conditions, STEP_S)
         loop, gusts = build_loop(vehicle, STEP_S), dryden(conditions.gusts, STEP_S)
         model = error_model(conditions.estimator, conditions.white_noise)
         errors, wind_ned_mps = error_process(model, STEP_S), conditions.wind_ned_mps
@@ -84,7 +77,7 @@ class Plant:
             "noisy": np.any(errors.scale != 0.0),
             "lag_s": model.lag_s,
             "white_sds": white_sds(model),
-            "fix_sds": (*model.receiver.position_m, *model.receiver.velocity_mps),
+            "fix_sds": model.receiver,
             "error_transition": errors.transition,
             "error_scale": errors.scale,
             "air": (*wind_ned_mps, *wind_axes(wind_ned_mps)),

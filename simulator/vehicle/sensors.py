@@ -66,14 +66,6 @@ class AxisError:
 
 
 @dataclass(frozen=True, slots=True)
-class ReceiverNoise:
-    """Standard deviations of a GPS fix, NED; new at each fix."""
-
-    position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    velocity_mps: tuple[float, float] = (0.0, 0.0)
-
-
-@dataclass(frozen=True, slots=True)
 class ErrorModel:
     """Errors of one estimator and of its GPS receiver."""
 
@@ -84,7 +76,7 @@ class ErrorModel:
     yaw_time_s: float
     white: WhiteNoise
     lag_s: float  # of position and velocity behind their time stamp
-    receiver: ReceiverNoise = ReceiverNoise()
+    receiver: tuple[float, ...] = (0.0,) * 5  # GPS fix, new at each: position NED, velocity N, E
 
 
 _NONE = AxisError()
@@ -98,7 +90,7 @@ PERFECT = ErrorModel(_NONE, _NONE, _NONE, 0.0, 15.0, _LEAST, 0.0)
 
 # GPS noise of PX4's SIH, measured as GPS_RAW_INT minus truth at 47 deg north. SIH's noise is an
 # angle of longitude to the east, hence the smaller distance.
-SIH_RECEIVER = ReceiverNoise((0.19, 0.13, 0.52), (0.062, 0.072))
+SIH_RECEIVER = (0.19, 0.13, 0.52, 0.062, 0.072)
 
 # PX4 1.16 SITL with its SIH quadrotor, identified from estimate minus truth in hover and on
 # lemniscates. Accelerometer noise drives e_v. e_p does not integrate it: the filter's position

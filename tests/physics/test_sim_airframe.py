@@ -9,7 +9,6 @@ import pytest
 from sim_hover import attitude, hovering, load, response
 
 from offboard.model.frames import euler_from_quaternion, thrust_direction_from_quaternion
-from simulator.steps import STEP_S
 from simulator.vehicle.attitude import Demand
 from simulator.vehicle.battery import Battery
 from simulator.vehicle.conditions import Conditions
@@ -90,15 +89,6 @@ def test_vehicle_stays_on_the_ground_below_its_weight(share):
     if share < 0.9:
         assert np.abs(truth.position_ned_m).max() < 1e-12
         assert np.abs(truth.velocity_ned_mps).max() < 1e-12
-
-
-def test_vehicle_lifts_off_just_above_its_weight_and_not_before_the_delay():
-    plant = Plant(PX4, Conditions(), 1)
-    demand = Demand(True, 1.02 * PX4.hover_thrust, LEVEL)
-    times, carried = response(plant, demand, 1.0, lambda t: t.on_ground)
-    spool_up = PX4.thrust_delay_s + PX4.thrust_lag_s * math.log(1.02 / 0.02)
-    assert times[np.argmin(carried)] == pytest.approx(spool_up, abs=2 * STEP_S)
-    assert not carried[-1]
 
 
 def test_crash_upside_down_at_speed_is_survived_and_ends_level():

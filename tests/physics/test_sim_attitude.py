@@ -12,8 +12,6 @@ from sim_hover import attitude, crossing, estimate_of, euler_deg, hovering, load
 
 from offboard.model.frames import (
     euler_from_quaternion,
-    quaternion_from_euler,
-    thrust_direction_from_quaternion,
 )
 from simulator.steps import STEP_S
 from simulator.vehicle.attitude import Demand
@@ -126,29 +124,6 @@ def test_angular_acceleration_is_limited_on_a_large_step():
     assert np.abs(acceleration).max() == pytest.approx(limit, rel=5e-3)
     assert np.sum(np.abs(acceleration) > 0.99 * limit) >= 10  # it is not grazed but sat on
     assert times[np.argmax(rates > 2.0)] > 2.0 / limit
-
-
-def test_tilt_and_yaw_do_not_disturb_each_other():
-    """The thrust axis turns by the shortest way whatever the nose does meanwhile."""
-    vehicle = load("px4_sih")
-    goal = attitude(roll_deg=8.0, pitch_deg=-5.0, yaw_deg=90.0)
-    directions = []
-    for yaw_deg in (90.0, 0.0):
-        # the same thrust direction with and without turning the nose
-        b = thrust_direction_from_quaternion(np.array(goal))
-        roll = -math.asin(b[1]) if yaw_deg == 0.0 else None
-        if roll is None:
-            quaternion = goal
-        else:
-            quaternion = tuple(quaternion_from_euler(roll, math.atan2(b[0], b[2]), 0.0))
-        _, seen = response(
-            hovering(vehicle),
-            Demand(True, vehicle.hover_thrust, quaternion),
-            2.0,
-            lambda t: thrust_direction_from_quaternion(t.attitude),
-        )
-        directions.append(seen)
-    assert np.abs(directions[0] - directions[1]).max() < 0.01
 
 
 def test_loop_closes_on_the_estimate_and_not_on_the_truth():

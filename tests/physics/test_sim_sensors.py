@@ -9,7 +9,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 from sim_hover import attitude, estimate_of, hovering, load
 
-from offboard.model.frames import thrust_direction_from_quaternion
 from simulator.steps import STEP_S
 from simulator.vehicle.attitude import Demand
 from simulator.vehicle.conditions import Conditions
@@ -164,38 +163,6 @@ def test_ardupilot_error_changes_as_much_as_measured_over_every_time(errors):
     position, velocity = np.array(ARDUPILOT_POSITION_CHANGES_MM), ARDUPILOT_VELOCITY_CHANGES_MMPS
     assert found["position"] == pytest.approx(position, rel=0.25)
     assert found["velocity"][:, 2:] == pytest.approx(np.array(velocity), rel=0.3)
-
-
-def test_px4_position_error_is_smooth_and_its_velocity_error_is_not(errors):
-    """Five times the time: five times the change if smooth (PX4 4.7), 2.2 times if a random walk
-    (PX4's velocity 2.4-2.9)."""
-    position = _changes(errors["px4_like"]["position"])
-    velocity = _changes(errors["px4_like"]["velocity"])
-    assert np.all(position[:, 1] / position[:, 0] > 4.5)
-    assert np.all(velocity[:, 1] / velocity[:, 0] < 3.2)
-
-
-def test_white_part_is_as_small_as_measured():
-    """Between samples 8 ms apart: what is left of a quadratic, the drive of the velocity included.
-    PX4: position .05-.07 mm, velocity .0012 / .0041 / .0033 m/s; thrust direction .00006-.00012
-    rad, here more, because the drive of e_b is white."""
-    vehicle = load("px4_sih")
-    plant = hovering(vehicle, Conditions(estimator="px4_like"), seed=4)
-    samples = []
-    for _ in range(4000):
-        plant.advance(2 * STEP_S, Demand(True, vehicle.hover_thrust, attitude()))
-        truth, seen = plant.truth, estimate_of(plant)
-        b = thrust_direction_from_quaternion(seen.attitude)
-        rates = seen.rates_frd_radps - truth.rates_frd_radps
-        offset = seen.position_ned_m - truth.position_ned_m + 0.004 * truth.velocity_ned_mps
-        speed = seen.velocity_ned_mps - truth.velocity_ned_mps
-        samples.append(np.concatenate([offset, speed, b[:2], rates]))
-    values = np.array(samples)
-    third = np.diff(values, n=3, axis=0).std(axis=0) / math.sqrt(20.0)
-    assert np.all((third[:3] > 3e-5) & (third[:3] < 1.2e-4))
-    assert third[3:6] == pytest.approx((0.0012, 0.0041, 0.0033), rel=0.6)
-    assert np.all((third[6:8] > 6e-5) & (third[6:8] < 5.5e-4))
-    assert values[:, 8:].std(axis=0) == pytest.approx((0.07, 0.035, 0.014), rel=0.1)
 
 
 def test_perfect_estimator_reports_the_truth_but_never_the_same_twice():
