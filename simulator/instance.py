@@ -13,7 +13,7 @@ from offboard.model.vehicle import Vehicle
 from simulator.autopilot.autopilot import Autopilot
 from simulator.autopilot.position_controller import OFF
 from simulator.faults import Fault
-from simulator.faults.injection import prepare
+from simulator.faults.fault import prepare
 from simulator.firmware.base import Firmware
 from simulator.link.framing import frames
 from simulator.mavlink.server import Server

@@ -10,7 +10,7 @@ from offboard.documents.errors import DocumentError
 from offboard.documents.parameters import Parameters
 from simulator.autopilot.autopilot import Autopilot
 from simulator.autopilot.commander import Request
-from simulator.faults.base import ModeName
+from simulator.faults.fault import ModeName
 
 CLIMB_S = 60.0  # for the climb
 SETTLE_S = 2.0

@@ -9,7 +9,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from simulator.faults.base import Direction
+from simulator.faults.fault import Direction
 from simulator.faults.messages import ClockJump, LinkFault, SilentMessage, StuckMessage
 from simulator.faults.pilot import PilotDisarms, PilotTakesOver, Reboot, Refusal
 from simulator.faults.senders import SecondSender, SecondVehicle, Stranger

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from simulator.faults.base import (
+from simulator.faults.fault import (
     Direction,
     Effect,
     MessageName,
@@ -34,6 +34,12 @@ class LinkFault(Timed, Impairment):
         if self.stalled and self.for_s is None:
             raise ValueError("a stalled link needs for_s: what waits arrives when the fault ends")
         return self
+
+    @property
+    def impaired(self) -> tuple[Direction, ...]:
+        """Directions of the link that it impairs."""
+        both = (Direction.DOWN, Direction.UP)
+        return both if self.direction is Direction.BOTH else (self.direction,)
 
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
         for channel in running.channels:

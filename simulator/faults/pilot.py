@@ -8,7 +8,7 @@ from typing import Literal
 from pydantic import Field
 
 from simulator.autopilot.commander import Request
-from simulator.faults.base import Effect, ModeName, Running, Timed, Vehicle, until_the_end
+from simulator.faults.fault import Effect, ModeName, Running, Timed, Vehicle, until_the_end
 from simulator.firmware.values import critical
 
 

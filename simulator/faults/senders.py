@@ -9,7 +9,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from simulator.faults.base import Effect, Running, Timed, Vehicle
+from simulator.faults.fault import Effect, Running, Timed, Vehicle
 from simulator.firmware.base import Firmware
 from simulator.mavlink.codec import Encoder, message_of
 from simulator.mavlink.outbox import MAV_COMP_ID_AUTOPILOT
@@ -112,6 +112,7 @@ class Stranger(Timed):
     """Datagrams from another port of the vehicle's host reach the companion. UDP links only."""
 
     fault: Literal["stranger"]
+    from_another_port = True
     sends: Datagrams = Datagrams.NOISE
     rate_hz: float = Field(default=100.0, gt=0, le=100_000)
     size_bytes: int = Field(default=64, ge=1, le=1400)  # of noise

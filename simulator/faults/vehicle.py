@@ -8,7 +8,7 @@ from typing import Literal
 from pydantic import Field
 
 from offboard.model.vehicle import Triple
-from simulator.faults.base import Effect, Running, Timed, Vehicle, until_the_end
+from simulator.faults.fault import Effect, Running, Timed, Vehicle, until_the_end
 from simulator.steps import STEP_S
 
 _NO_THRUST = 1e-9  # a factor that can be undone

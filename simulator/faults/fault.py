@@ -1,0 +1,183 @@
+"""What every fault has: when it begins, how long it lasts, and an effect on the vehicle; and the
+injection, which begins and ends each fault of a scenario at its time.
+
+An effect is a generator: it begins, then yields until its end. Each yield returns True at a step of
+the vehicle, the step of its beginning among them, and False when the fault ends.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from random import Random
+from typing import Annotated, ClassVar, Protocol
+
+from pydantic import AfterValidator, Field
+
+from offboard.documents.parameters import Parameters
+from simulator.autopilot.autopilot import Autopilot
+from simulator.firmware.catalogue import FIRMWARES
+from simulator.firmware.values import Behaviour
+from simulator.link.impairment import Channel, Impairment, LinkDirection
+from simulator.mavlink.codec import id_of
+from simulator.mavlink.server import Server
+from simulator.mavlink.view import View
+
+Effect = Generator[None, bool, None]
+
+
+def _known(name: str) -> str:
+    if id_of(name) is None:
+        raise ValueError(f"{name[:40]!r} is not a MAVLink message")
+    return name
+
+
+def _flown(name: str) -> str:
+    if all(firmware.mode_named(name) is None for firmware in FIRMWARES.values()):
+        raise ValueError(f"{name[:40]!r} is not a mode of any firmware")
+    return name
+
+
+MessageName = Annotated[str, AfterValidator(_known)]
+ModeName = Annotated[str, AfterValidator(_flown)]  # "AUTO." may be left out
+
+
+class Moment(StrEnum):
+    """Event from which the time of a fault counts: its first occurrence."""
+
+    BOOT = "boot"
+    ARMED = "armed"
+    TOOK_OFF = "took_off"
+    ENGAGED = "engaged"  # the vehicle obeys setpoints
+    LANDING = "landing"  # in the air, in the final descent of a landing
+    LANDED = "landed"  # after a flight
+
+
+class Direction(StrEnum):
+    """Direction of a link seen from the vehicle: telemetry is down, commands are up."""
+
+    DOWN = "down"
+    UP = "up"
+    BOTH = "both"
+
+
+class Vehicle(Protocol):
+    """What faults act on."""
+
+    autopilot: Autopilot
+    view: View
+    companion: Server
+
+    def reboot(self, silent_s: float) -> None: ...
+
+
+class Timed(Parameters):
+    """A fault: when it begins and how long it lasts, seconds of vehicle time; None: for good."""
+
+    at_s: float = Field(default=0.0, ge=0, le=1e5)
+    after: Moment = Moment.BOOT
+    for_s: float | None = Field(default=None, gt=0, le=1e5)
+    from_another_port: ClassVar[bool] = False  # it sends datagrams that the vehicle does not
+
+    @property
+    def impaired(self) -> tuple[Direction, ...]:
+        """Directions of the link that it impairs."""
+        return ()
+
+    @abstractmethod
+    def effect(self, vehicle: Vehicle, running: Running) -> Effect:
+        """What it does to the vehicle, from its beginning to its end."""
+
+
+@dataclass(slots=True)
+class Running:
+    """One fault of a flight and its progress."""
+
+    fault: Timed
+    channels: list[Channel]  # of a link fault
+    random: Random
+    datagrams: list[bytes] = field(default_factory=list)  # of a stranger, to be sent
+    begins_s: float | None = None  # None until the event that starts its delay
+    effect: Effect | None = None  # once it has begun
+    over: bool = False
+
+
+def until_the_end() -> Effect:
+    """Wait for the end of the fault."""
+    while (yield):
+        pass
+
+
+@dataclass(slots=True)
+class Injection:
+    """All faults of one flight. `down` and `up`: directions of the companion link; `strangers`:
+    datagrams that wait to be sent to the companion, each list from a port of its own."""
+
+    down: LinkDirection
+    up: LinkDirection
+    strangers: list[list[bytes]]
+    _waiting: list[Running]
+    _moments: dict[Moment, float] = field(default_factory=dict)
+    _flown: bool = False
+
+    def step(self, now_s: float, vehicle: Vehicle) -> None:
+        """Begin and end the faults due at `now_s`, seconds since the start."""
+        self._note_moments(now_s, vehicle.autopilot)
+        for running in self._waiting:
+            self._advance(running, now_s + 1e-6, vehicle)
+        if any(running.over for running in self._waiting):
+            self._waiting = [running for running in self._waiting if not running.over]
+
+    def _note_moments(self, now_s: float, autopilot: Autopilot) -> None:
+        landed = autopilot.position_controller.landed
+        self._flown = self._flown or not landed
+        by_setpoint = autopilot.commander.mode.behaviour is Behaviour.SETPOINT
+        for moment, reached in (
+            (Moment.BOOT, True),
+            (Moment.ARMED, autopilot.commander.armed),
+            (Moment.TOOK_OFF, not landed),
+            (Moment.ENGAGED, by_setpoint and autopilot.commander.armed),
+            (Moment.LANDING, autopilot.guidance.active.landing and not landed),
+            (Moment.LANDED, self._flown and landed),
+        ):
+            if reached:
+                self._moments.setdefault(moment, now_s)
+
+    def _advance(self, running: Running, now_s: float, vehicle: Vehicle) -> None:
+        fault = running.fault
+        if running.begins_s is None:
+            since_s = self._moments.get(fault.after)
+            if since_s is None:
+                return
+            running.begins_s = since_s + fault.at_s
+        if now_s < running.begins_s:
+            return
+        try:
+            if running.effect is None:
+                running.effect = fault.effect(vehicle, running)
+                next(running.effect)
+            lasts = fault.for_s is None or now_s < running.begins_s + fault.for_s
+            running.effect.send(lasts)
+        except StopIteration:
+            running.over = True
+
+
+def prepare(scenario: Sequence[Timed], seed: int) -> Injection | None:
+    """Faults of one flight, none begun; None when the scenario has none."""
+    if not scenario:
+        return None
+    paths: dict[Direction, list[Channel]] = {Direction.DOWN: [], Direction.UP: []}
+    waiting: list[Running] = []
+    for number, fault in enumerate(scenario):
+        channels = []
+        for direction, path in paths.items():
+            if isinstance(fault, Impairment) and direction in fault.impaired:
+                channels.append(Channel(fault, Random(f"{seed} {number} {direction}")))
+                channels[-1].on = False
+                path.append(channels[-1])
+        waiting.append(Running(fault, channels, Random(f"{seed} {number}")))
+    down, up = (LinkDirection(tuple(path)) for path in paths.values())
+    strangers = [one.datagrams for one in waiting if one.fault.from_another_port]
+    return Injection(down, up, strangers, waiting)
