@@ -1,4 +1,4 @@
-"""The `simulator` process: real UDP, real time and lockstep, start, stop and wrong options."""
+"""The `simulator` process: real UDP, real time and lockstep, vehicles and clients, wrong options."""
 
 from __future__ import annotations
 
@@ -7,11 +7,16 @@ import re
 import signal
 import socket
 import time
+from collections import Counter
+from contextlib import ExitStack
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 from processes import Called
 from sim_peer import OFFBOARD, Peer, simulator
+
+from offboard.documents import shipped
 
 QUIET = ("--gcs", "none")
 FLIGHT_TEXTS = [
@@ -152,6 +157,8 @@ def test_it_can_wait_to_be_spoken_to_and_shifts_its_system() -> None:
             "--log no/such/x.tlog cannot be written: No such file or directory",
         ),
         (("--no-such-option",), "--no-such-option"),
+        (("--instances", "2", "--lockstep"), "--lockstep and --instances exclude each other"),
+        (("--instances", "20", "--instance", "240"), "system ids end at 250"),
     ],
 )
 def test_wrong_options_are_refused(options: tuple[str, ...], says: str, called: Called) -> None:
@@ -188,3 +195,92 @@ def test_a_vehicle_takes_little_memory() -> None:
         status = Path(f"/proc/{process.popen.pid}/status").read_text()
     (peak_kb,) = re.findall(r"VmHWM:\s+(\d+) kB", status)
     assert int(peak_kb) < 190_000
+
+
+# -- several vehicles, several clients ------------------------------------------------------------
+
+
+def free_ports(count: int) -> int:
+    """The first of so many free UDP ports in a row."""
+    for first in range(23000, 30000, count):
+        with ExitStack() as stack:
+            try:
+                for port in range(first, first + count):
+                    sock = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+                    sock.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+            return first
+    raise AssertionError("no free ports")
+
+
+def test_instances_have_ports_and_systems_of_their_own_and_keep_time() -> None:
+    first = free_ports(3)
+    heard: list[list[int]] = []
+    with ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket(type=socket.SOCK_DGRAM)) for _ in range(3)]
+        for port, sock in enumerate(sockets, first):
+            sock.bind(("127.0.0.1", port))
+            sock.settimeout(20.0)
+        options = ("--connect", f"udpout:127.0.0.1:{first}", "--gcs", "none", "--instances", "3")
+        process = stack.enter_context(simulator(*options, "--instance", "4", "--duration", "2"))
+        for sock in sockets:
+            heard.append([datagram[5] for datagram in (sock.recv(2000) for _ in range(20))])
+        output, errors = process.popen.communicate(timeout=20.0)
+    assert heard == [[5] * 20, [6] * 20, [7] * 20]
+    assert process.popen.returncode == 0
+    assert errors == ""
+    lines = output.splitlines()
+    seeds = [re.findall(r"seed (\d+)", line)[0] for line in lines[:3]]
+    assert seeds == ["7", "8", "9"]
+    steps = re.fullmatch(
+        r"3 vehicles: \d+ of (\d+) deadlines missed, at worst .* ms late", lines[3]
+    )
+    assert steps is not None
+    assert int(steps[1]) == 500
+
+
+def gaps(peer: Peer) -> int:
+    """Messages that should have come between those that came."""
+    numbers = [message.get_seq() for _, message in peer.received]
+    return sum((b - a - 1) % 256 for a, b in pairwise(numbers))
+
+
+def test_both_links_serve_several_clients_at_once() -> None:
+    with ExitStack() as stack:
+        companion, station, late, other = (stack.enter_context(Peer()) for _ in range(4))
+        stack.enter_context(
+            simulator(
+                *("--connect", f"udpout:127.0.0.1:{companion.port}"),
+                *("--gcs", f"udpout:127.0.0.1:{station.port}"),
+                *("--scenario", "calm"),
+            )
+        )
+        companion.listen(lambda: companion.vehicle is not None)
+        station.listen(lambda: station.vehicle is not None)
+        assert companion.vehicle != station.vehicle
+        for peer, link in ((late, station), (other, companion)):
+            peer.vehicle = link.vehicle
+            peer.heartbeat()
+        peers = (companion, station, late, other)
+        for peer in peers:
+            peer.listen(lambda peer=peer: peer.time_s > 4.0)
+        late.command(400, 1)  # a client that came later arms; every client of the link is told
+        for peer in (late, station):
+            peer.listen(lambda peer=peer: len(peer.of("COMMAND_ACK")) == 1)
+        for peer in peers:
+            peer.listen(lambda peer=peer: peer.time_s > 5.5)
+            peer.listen(lambda peer=peer: peer.of("HEARTBEAT")[-1].base_mode & 128)
+            assert gaps(peer) == 0
+        assert not companion.of("COMMAND_ACK") + other.of("COMMAND_ACK")
+    rates = [Counter(m.get_type() for _, m in peer.received) for peer in peers]
+    assert rates[0]["ATTITUDE"] > 4 * rates[1]["ATTITUDE"]
+    assert rates[2]["ATTITUDE"] > 30
+    assert late.texts == ["Armed by external command"]
+
+
+def test_scenarios_are_listed_with_what_they_are(called: Called) -> None:
+    code, output, errors = called("simulator", "--list-scenarios")
+    assert (code, errors) == (0, "")
+    listed = dict(re.split(r"\s+", line, maxsplit=1) for line in output.splitlines())
+    assert listed == shipped.descriptions("scenarios")
