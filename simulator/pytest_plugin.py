@@ -103,13 +103,6 @@ def sitl(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Sitl]:
     list`, or a file), `firmware` ("px4" or "ardupilot"), `seed` and `speed` (multiple of real
     time). Without the marker it is a PX4 vehicle in real time. When a test fails, the log is kept
     and its path printed.
-
-    Example:
-
-        @pytest.mark.sitl(firmware="ardupilot", speed=10)
-        def test_has_telemetry(sitl):
-            vehicle = mavutil.mavlink_connection(sitl.connection)
-            assert vehicle.recv_match(type="ATTITUDE", blocking=True, timeout=20)
     """
     marker = request.node.get_closest_marker("sitl")
     named = marker.kwargs if marker else {}

@@ -68,7 +68,9 @@ class ParameterTable:
             return False
         if not self._bytewise and math.isnan(wire):
             return False
-        self._store(spec, self._from_wire(spec, wire))
+        if self._is_bytewise(spec):
+            wire = float(_INT.unpack(_FLOAT.pack(wire))[0])
+        self._store(spec, wire)
         return True
 
     def to_wire(self, name: str) -> tuple[float, int]:
@@ -96,9 +98,6 @@ class ParameterTable:
         elif math.isfinite(value):
             low, high = RANGES[spec.kind]
             self._values[spec.name] = float(min(high, max(low, int(value))))
-
-    def _from_wire(self, spec: ParameterSpec, wire: float) -> float:
-        return float(_INT.unpack(_FLOAT.pack(wire))[0]) if self._is_bytewise(spec) else wire
 
     def _is_bytewise(self, spec: ParameterSpec) -> bool:
         return self._bytewise and spec.kind != "real32"

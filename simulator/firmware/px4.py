@@ -125,13 +125,9 @@ class Px4(Firmware):
             if not (math.isfinite(norm) and norm > 1e-6):
                 return AttitudeSetpoint(None, None, thrust)
             return AttitudeSetpoint((w / norm, x / norm, y / norm, z / norm), None, thrust)
-        rates = (values["body_roll_rate"], values["body_pitch_rate"], values["body_yaw_rate"])
-        finite: Triple = (
-            rates[0] if math.isfinite(rates[0]) else 0.0,
-            rates[1] if math.isfinite(rates[1]) else 0.0,
-            rates[2] if math.isfinite(rates[2]) else 0.0,
-        )
-        return AttitudeSetpoint(None, finite, thrust)
+        given = (values[f"body_{axis}_rate"] for axis in ("roll", "pitch", "yaw"))
+        p, q, r = (rate if math.isfinite(rate) else 0.0 for rate in given)
+        return AttitudeSetpoint(None, (p, q, r), thrust)
 
     def motion_setpoint(self, values: Mapping[str, Any]) -> MotionSetpoint | None:
         """SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME 1; None when nothing is demanded."""

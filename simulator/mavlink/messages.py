@@ -16,7 +16,6 @@ from simulator.mavlink.view import (
     centi,
     fit,
     heading_cdeg,
-    motion_fields,
     pressure_hpa,
 )
 
@@ -109,7 +108,12 @@ def attitude_target(view: View) -> Sequence[Any]:
 
 
 def position_target_local_ned(view: View) -> Sequence[Any]:
-    return (view.time_ms, 1, 0, *motion_fields(view.autopilot.position_controller.motion))
+    """The motion that is flown in MAV_FRAME 1; NaN where nothing is demanded."""
+    motion = view.autopilot.position_controller.motion
+    return (
+        view.time_ms, 1, 0, *motion.position_ned_m, *motion.velocity_ned_mps,
+        *motion.acceleration_ned_mps2, motion.yaw_rad, motion.yaw_rate_radps,
+    )  # fmt: skip
 
 
 # -- state, clock, home, mission ---------------------------------------------------------------

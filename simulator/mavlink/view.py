@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from simulator.autopilot.autopilot import Autopilot
-from simulator.firmware.values import MotionSetpoint, Quaternion, Triple
+from simulator.firmware.values import Quaternion, Triple
 from simulator.geodesy import DEGREES_PER_M, east_degrees_per_m, wrapped_deg
 from simulator.mavlink.codec import message_of
 
@@ -180,15 +180,4 @@ def in_body(attitude: Quaternion, vector_ned: Triple) -> Triple:
         north + 2.0 * (y * c - z * b),
         east + 2.0 * (z * a - x * c),
         down + 2.0 * (x * b - y * a),
-    )
-
-
-def motion_fields(motion: MotionSetpoint) -> tuple[float, ...]:
-    """A setpoint as the fields of POSITION_TARGET_LOCAL_NED: NED, SI, NaN where not demanded."""
-    return (
-        *motion.position_ned_m,
-        *motion.velocity_ned_mps,
-        *motion.acceleration_ned_mps2,
-        motion.yaw_rad,
-        motion.yaw_rate_radps,
     )

@@ -1,4 +1,4 @@
-"""The `simulator` process: real UDP, real time and lockstep, vehicles and clients, wrong options."""
+"""The `simulator` process: real UDP, real time and lockstep, vehicles, clients, wrong options."""
 
 from __future__ import annotations
 
