@@ -53,6 +53,7 @@ class Mission:
     _climb_down_m: float = math.nan  # on the ground: first climb vertically to this height
     _since_s: float = math.nan  # when the current place was reached
     _target_ned_m: Triple = NAN3
+    _approaching: bool = False  # a place that was not near at once
 
     @property
     def first(self) -> int:
@@ -136,7 +137,10 @@ class Mission:
         lands = item.command == Kind.LAND
         if math.isnan(self._since_s) and self._near(item, estimate.position_ned_m):
             self._since_s = estimate.time_s
-        if math.isnan(self._since_s):
+            if lands and self.firmware.reached_above_landing and self._approaching:
+                self._report_reached()
+        self._approaching = math.isnan(self._since_s)
+        if self._approaching:
             return
         if landed if lands else estimate.time_s - self._since_s >= self._stay_s(item):
             self._report_reached()

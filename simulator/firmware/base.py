@@ -182,6 +182,7 @@ class Firmware(ABC):
     home_item_first: bool = False  # item 0 of a mission is home
     guided_items: bool = False  # an item with current = 2 is a place to fly to now
     mission_text: StatusText | None = None  # after an upload
+    reached_above_landing: bool = False  # a landing is "item reached" above its place, too
     turning_items: frozenset[int] = frozenset()  # MAV_CMD whose fourth parameter is a yaw
 
     # telemetry

@@ -288,6 +288,7 @@ PX4 = Px4(
     setpoints_outlive_modes=True,
     stream_reaction_s=0.036,
     requests_kind_of_peer=True,
+    reached_above_landing=True,
     turning_items=frozenset({16, 17, 19, 21}),
     companion_rates_hz=telemetry.COMPANION_RATES_HZ,
     ground_rates_hz=telemetry.GROUND_RATES_HZ,

@@ -68,13 +68,6 @@ def test_at_a_requested_interval_a_change_of_mode_is_reported_at_once() -> None:
     assert len([at_s for at_s, *_ in modes(bench) if at_s > first_s]) == 4  # twice a second
 
 
-def test_in_a_failsafe_mode_and_intention_differ() -> None:
-    bench = engaged()
-    bench.command(511, 436, 50_000)
-    bench.run(2.0)
-    assert modes(bench)[-1][1:] == (POSCTL, OFFBOARD)
-
-
 # -- authority -------------------------------------------------------------------------------------
 
 
@@ -241,20 +234,6 @@ def test_a_flood_is_refused_in_lockstep() -> None:
 
 
 # -- places far away -------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("firmware", [PX4, ARDUPILOT], ids=lambda firmware: firmware.name)
-@pytest.mark.parametrize("place", [(1e38, 8.5, 500.0), (47.0, -3e38, 500.0), (47.0, 8.5, 3e38)])
-def test_home_at_an_impossible_place_does_not_end_the_process(
-    firmware: Firmware, place: tuple[float, float, float]
-) -> None:
-    bench = flying(firmware=firmware, start=HIGH)
-    bench.run(0.1)
-    assert len(bench.command(179, 0, 0, 0, 0, *place)) == 1
-    bench.command(20)
-    bench.run(5.0)
-    bench.command(512, 242)
-    assert bench.of("HOME_POSITION") != []
 
 
 @pytest.mark.parametrize("firmware", [PX4, ARDUPILOT], ids=lambda firmware: firmware.name)

@@ -87,14 +87,6 @@ def _received(sock: socket.socket) -> bytes | None:
         return None
 
 
-def test_another_port_is_used_if_the_preferred_one_is_taken(link: UdpLink) -> None:
-    second = open_link("udpout:127.0.0.1:9", link.port)
-    try:
-        assert second.port != link.port
-    finally:
-        second.close()
-
-
 def test_a_stranger_sends_from_another_port_of_the_same_host(
     link: UdpLink, companion: socket.socket
 ) -> None:

@@ -47,19 +47,6 @@ def test_another_rate_of_one_message_does_not_shift_the_others() -> None:
     assert sent["ATTITUDE"] == 80
 
 
-def test_positions_are_sent_on_the_grid_of_the_estimator_whatever_their_rate() -> None:
-    instance = _instance()
-    faster = mavlink.MAVLink_command_long_message(1, 1, 511, 0, 32, 4_000, 0, 0, 0, 0, 0)
-    instance.feed(faster.pack(mavlink.MAVLink(None, 255, 190)))
-    stamps = []
-    while instance.time_s < 1.0:
-        for datagram in instance.step():
-            messages = Decoder().read(datagram)
-            stamps += [m.time_boot_ms for m in messages if m.get_type() == "LOCAL_POSITION_NED"]
-    grid_ms = 4 * PX4.position_grid_steps
-    assert stamps == list(range(grid_ms, 1001, grid_ms))
-
-
 @pytest.mark.parametrize(
     "body",
     [(np.nan,) * 13, (1.0, *(0.0,) * 9, np.nan, np.inf, -np.inf), (1.0, *(0.0,) * 11, -1e5)],
