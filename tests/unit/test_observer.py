@@ -11,17 +11,9 @@ import pytest
 from attitude_plant import Plant, Truth
 from scipy.integrate import solve_ivp
 
-from offboard.estimation.observer import Noise, Observer
-from offboard.estimation.propagation import (
-    COMMAND_SIZE,
-    LATER,
-    MOTION,
-    NOW,
-    STATE_SIZE,
-    THRUST,
-    plant_of,
-    replay,
-)
+from offboard.estimation.motion import COMMAND_SIZE, STATE_SIZE, THRUST, plant_of, propagate
+from offboard.estimation.noise import Noise
+from offboard.estimation.observer import Observer
 from offboard.model.command import Command
 from offboard.model.frames import quaternion_from_thrust_direction
 from offboard.model.predicted_state import PredictedState
@@ -157,12 +149,8 @@ def test_replay_agrees_with_scipy(damping: float) -> None:
     for a, b in itertools.pairwise(edges):
         u = held(0.5 * (a + b))
         x = solve_ivp(rate, (a, b), x, "DOP853", args=(u,), rtol=1e-11, atol=1e-12).y[:, -1]
-    motion = np.zeros(1, MOTION)
-    motion["states"][0, NOW] = start
-    motion["plant"] = plant_of(vehicle)
-    motion["history"][0, :5], motion["sent"] = sent, 5
-    replay(motion, LATER, 0.0, 1.0)
-    assert motion["states"][0, LATER] == pytest.approx(x, abs=3e-6)
+    propagate(start, plant_of(vehicle), sent, 0.0, 1.0)
+    assert start == pytest.approx(x, abs=3e-6)
 
 
 @pytest.mark.parametrize("about_rad", [0.0, math.pi, -math.pi])

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from offboard.estimation.observer import Noise, Observer
+from offboard.estimation.noise import Noise
+from offboard.estimation.observer import Observer
 from offboard.model.command import Command
 from offboard.model.vehicle import AxisResponse, Vehicle
 
