@@ -213,6 +213,9 @@ class Observer:
 
     def __init__(self, vehicle: Vehicle, noise: Noise | None = None) -> None:
         self._noise = noise or Noise()
+        self._time_s = -math.inf  # vehicle time of the state
+        self._position_at: float | None = None  # time of the newest
+        self._attitude_at: float | None = None
         self._set_vehicle(vehicle)
         self.reset()
 
@@ -432,8 +435,7 @@ class Observer:
     def _restart(self) -> None:
         """Take the next attitude and position as they are."""
         self._time_s = -math.inf
-        self._position_at: float | None = None
-        self._attitude_at: float | None = None
+        self._position_at = self._attitude_at = None
         self._state[THRUST] = self._vehicle.gravity_mps2
         self._reset_covariance()
 

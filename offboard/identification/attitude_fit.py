@@ -95,6 +95,14 @@ class ResponseFit:
     residual_rms: float
     commanded_rms: float
 
+    @property
+    def response(self) -> AxisResponse:
+        return AxisResponse(
+            delay_s=self.delay_s.value,
+            natural_frequency_radps=self.natural_frequency_radps.value,
+            damping=self.damping.value,
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class Unexplained:
