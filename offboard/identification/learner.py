@@ -24,7 +24,7 @@ import numpy as np
 from pydantic import Field
 
 from offboard.documents.parameters import Parameters
-from offboard.identification.attitude_fit import fit_tilt, unexplained
+from offboard.identification.attitude_fit import TILT, fit_axis, unexplained
 from offboard.identification.trace import (
     ATTITUDE_WIDTH,
     COMMAND_WIDTH,
@@ -306,7 +306,7 @@ class Learner(VehicleEstimate):
         contradiction, and adopt it if it is better."""
         over_s = self._time_s - TILT_OVER_S
         trace = self._flown_since(max(self._climb_s + LIFTED_OFF_S, over_s, self._doubted_from_s))
-        tilt = yield from fit_tilt(trace, {})
+        tilt = yield from fit_axis(TILT, trace, {})
         found = Identified(trace.seconds, tilt=tilt)
         self.review_tilt(found, unexplained(trace, self.vehicle.tilt), self._time_s)
 

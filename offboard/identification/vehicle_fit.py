@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from offboard.identification.attitude_fit import ResponseFit, fit_tilt, fit_yaw
+from offboard.identification.attitude_fit import TILT, YAW, ResponseFit, fit_axis
 from offboard.identification.motion_fit import (
     DRAG_SPACING_S,
     DRAG_UPPER_PS,
@@ -133,11 +133,11 @@ def identify_in_pieces(trace: Trace, vehicle: Vehicle) -> Pieces[Identified]:
         reason = f"{seconds:.1f} s of flight, {LEAST_SECONDS:.0f} s are needed"
         names = ("tilt", "yaw", "hover_thrust", "thrust_lag_s", "drag_ps")
         return Identified(0.0, refusals=dict.fromkeys(names, reason))
-    tilt = yield from fit_tilt(trace, refusals)
+    tilt = yield from fit_axis(TILT, trace, refusals)
     yield
     link = _link_delay(tilt, vehicle)
     yaw_delay = _with_link(vehicle.yaw.delay_s, YAW_DELAY_SD_S, link)
-    yaw = yield from fit_yaw(trace, refusals, yaw_delay)
+    yaw = yield from fit_axis(YAW, trace, refusals, yaw_delay)
     yield
     found = Identified(seconds, tilt, yaw, refusals=refusals)
     motion = Motion(trace)

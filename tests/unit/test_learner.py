@@ -183,7 +183,7 @@ def test_learner_announces_what_is_new_in_motion(monkeypatch: pytest.MonkeyPatch
         return fit(0.05).tilt
 
     monkeypatch.setattr(learning, "identify_in_pieces", in_pieces)
-    monkeypatch.setattr(learning, "fit_tilt", tilt_in_pieces)
+    monkeypatch.setattr(learning, "fit_axis", tilt_in_pieces)
     monkeypatch.setattr(learning, "identify_drag", lambda trace, vehicle: Identified(10.0))
 
     def flown(left: Unexplained, shown: float) -> tuple[Learner, list[str]]:
