@@ -151,16 +151,15 @@ def identify_in_pieces(trace: Trace, vehicle: Vehicle) -> Pieces[Identified]:
         "drag_ps": DRAG_PRIOR_PS,
     }
     vertical = fit_vertical(motion, vehicle.gravity_mps2, vehicle.hover_thrust, **known)
-    drag: Estimate | None = None
-    if _fast_enough(motion, refusals):
+    if motion.speed_mps >= LEAST_SPEED_MPS:
         yield
-        hover = vertical["hover_thrust"].value
-        thrust_mps2 = vehicle.gravity_mps2 / hover * _thrust(motion, vertical)
-        drag = _accepted_drag(fit_drag(motion, thrust_mps2, DRAG_PRIOR_PS.value), refusals)
-        if drag is not None:
-            yield
-            known["drag_ps"] = Estimate(drag.value, max(drag.sd, 0.2 * drag.value, 0.05))
-            vertical = fit_vertical(motion, vehicle.gravity_mps2, hover, **known)
+    hover = vertical["hover_thrust"].value
+    thrust_mps2 = vehicle.gravity_mps2 / hover * _thrust(motion, vertical)
+    drag = _drag(motion, thrust_mps2, DRAG_PRIOR_PS.value, refusals)
+    if drag is not None:
+        yield
+        known["drag_ps"] = Estimate(drag.value, max(drag.sd, 0.2 * drag.value, 0.05))
+        vertical = fit_vertical(motion, vehicle.gravity_mps2, hover, **known)
     return replace(found, drag_ps=drag, **_accepted_vertical(motion, vertical, refusals))
 
 
@@ -172,15 +171,15 @@ def identify_drag(trace: Trace, vehicle: Vehicle) -> Identified:
     """The drag alone, given the other constants of `vehicle`; some milliseconds for 25 s of
     flight."""
     refusals: dict[str, str] = {}
-    seconds = trace.seconds
     drag: Estimate | None = None
-    if seconds < LEAST_SECONDS or not (motion := Motion(trace, DRAG_SPACING_S)).sufficient:
+    enough = trace.seconds >= LEAST_SECONDS
+    if not enough or not (motion := Motion(trace, DRAG_SPACING_S)).sufficient:
         refusals["drag_ps"] = "too few positions and commands"
-    elif _fast_enough(motion, refusals):
+    else:
         thrust = motion.thrust(vehicle.thrust_delay_s, vehicle.thrust_lag_s)
-        fit = fit_drag(motion, vehicle.thrust_max_mps2 * thrust, vehicle.drag_per_mass_ps)
-        drag = _accepted_drag(fit, refusals)
-    return Identified(seconds, drag_ps=drag, refusals=refusals)
+        start_ps = vehicle.drag_per_mass_ps
+        drag = _drag(motion, vehicle.thrust_max_mps2 * thrust, start_ps, refusals)
+    return Identified(trace.seconds, drag_ps=drag, refusals=refusals)
 
 
 def _link_delay(tilt: ResponseFit | None, vehicle: Vehicle) -> Estimate:
@@ -194,19 +193,18 @@ def _with_link(delay_s: float, own_sd_s: float, link: Estimate) -> Estimate:
     return Estimate(max(delay_s + link.value, 0.0), math.hypot(own_sd_s, link.sd))
 
 
-def _fast_enough(motion: Motion, refusals: dict[str, str]) -> bool:
-    """Whether the vehicle moved fast enough to show its drag."""
+def _drag(
+    motion: Motion, thrust_mps2: Array, start_ps: float, refusals: dict[str, str]
+) -> Estimate | None:
+    """The drag, if the vehicle moved fast enough to show it."""
     speed_mps = motion.speed_mps
-    if speed_mps >= LEAST_SPEED_MPS:
-        return True
-    refusals["drag_ps"] = (
-        f"horizontal speed {speed_mps:.2f} m/s rms, {LEAST_SPEED_MPS} m/s are needed: "
-        "drag needs motion"
-    )
-    return False
-
-
-def _accepted_drag(drag: Estimate, refusals: dict[str, str]) -> Estimate | None:
+    if speed_mps < LEAST_SPEED_MPS:
+        refusals["drag_ps"] = (
+            f"horizontal speed {speed_mps:.2f} m/s rms, {LEAST_SPEED_MPS} m/s are needed: "
+            "drag needs motion"
+        )
+        return None
+    drag = fit_drag(motion, thrust_mps2, start_ps)
     if not 1e-3 < drag.value < 0.99 * DRAG_UPPER_PS:
         refusals["drag_ps"] = f"the drag is at the limit of the search, {drag.value:.3g} 1/s"
     elif not drag.sd <= DRAG_SD_PS:
