@@ -1,14 +1,15 @@
-"""The observer: the state of the vehicle, now and when a command sent now takes effect.
+"""The observer: a Kalman filter of the vehicle's state, now and when a command sent now acts.
 
-    predict   x(t + h) = f(x(t), commands sent)      `propagation`, with the delay of each axis
-              P <- F P F' + Q                        `kalman.predict`, F linearised about hover
-    update    x <- x + K (z - H x)                   by each attitude and position that arrives
+    predict   x(t + h) = f(x(t), commands sent)      `motion`, with the delay of each axis
+              P <- F P F' + Q                        F = exp(A h), f linearised about hover
+    update    S = H P H' + R,  K = P H' / S          by each attitude and position that arrives
+              x <- x + K (z - H x),  P <- P - K S K'
     reset     on the ground, after a long gap, and after a jump of the vehicle's own estimate
 
-The state x (indices in `propagation`, NED, SI) is position, velocity, thrust direction b and its
-rate, disturbance acceleration d, bias of the reported velocity, thrust, heading and its rate. d
-stands for wind and for errors of thrust and mass, so that it contains the hover thrust. Three
-filters share x, since their axes decouple: north and east (one covariance), down, heading.
+The state x (indices in `motion`, NED, SI) is position, velocity, thrust direction b and its rate,
+disturbance acceleration d, bias of the reported velocity, thrust, heading and its rate. d stands
+for wind and for errors of thrust and mass, so that it contains the hover thrust. R of position and
+velocity, and the drift of d in Q, are estimated as well (`noise`).
 
 The velocity that an autopilot reports need not be the derivative of the position that it reports
 (PX4: wrong by 0.2 to 0.3 m/s for seconds), so velocity comes from the position and from the
@@ -19,51 +20,30 @@ vehicle time.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.compiled import entry, kernel
-from offboard.estimation import kalman
-from offboard.estimation.kalman import (
-    ADAPTATION,
-    AT_ATTITUDE,
-    AT_POSITION,
-    AT_VELOCITY,
-    FILTER,
-    LATERAL,
-    VERTICAL,
-    adapt,
-    innovation_variance,
-    interrupt,
-    measurement_variance,
-    reset_bias,
-    reset_position,
-    update,
-)
-from offboard.estimation.propagation import (
+from offboard.compiled import array, entry, kernel
+from offboard.estimation.motion import (
     BIAS,
     BIAS_TIME_CONSTANT_S,
-    COMMANDS_KEPT,
+    COMMAND_SIZE,
     DISTURBANCE,
     HEADING,
     HEADING_RATE,
-    LATER,
-    MOTION,
-    NOW,
     POSITION,
     SENT_AT,
     SENT_THRUST,
+    STATE_SIZE,
     THRUST,
     TILT,
     TILT_RATE,
     VELOCITY,
     plant_of,
-    replay,
-    wrapped,
+    propagate,
 )
+from offboard.estimation.noise import Noise, NoiseEstimate
 from offboard.model.axes import acceleration, b_z_of, lateral_model
 from offboard.model.command import Command
 from offboard.model.frames import (
@@ -84,175 +64,139 @@ LONGEST_GAP_S = 1.0  # a longer gap or a step back in time restarts; a gap keeps
 # deviations of its innovation and a distance: position (m), velocity (m/s)
 GATE_SDS, GATES = 3.0, (0.3, 0.5)
 DISTURBANCE_LIMIT_MPS2 = 8.0
+COMMANDS_KEPT = 128
 
+# H of position and reported velocity (6, 19), and of attitude (3, 19): thrust direction, heading
+H_POSITION, H_ATTITUDE = np.zeros((6, STATE_SIZE)), np.zeros((3, STATE_SIZE))
+H_POSITION[:, POSITION : VELOCITY + 3] = np.eye(6)
+H_POSITION[3:, BIAS : BIAS + 3] = np.eye(3)
+H_ATTITUDE[range(3), (TILT, TILT + 1, HEADING)] = 1.0
+# Rows of H_POSITION that jump together: position north and east, down, and velocity alike
+TOGETHER = ((0, 2), (2, 3), (3, 5), (5, 6))
 
-@dataclass(frozen=True, slots=True)
-class Noise:
-    """Q by densities per root second, R by standard deviations. These were flown on PX4 and
-    ArduCopter; half or twice the values made no visible difference. Noise of position and velocity
-    and drift of the disturbance are estimated in flight too, and never less than these; the drift
-    at most `disturbance_limit_mps2`."""
-
-    acceleration_mps: float = 0.2
-    disturbance_mps2: float = 0.15
-    disturbance_limit_mps2: float = 1.0
-    tilt_radps: float = 0.6
-    heading_radps: float = 0.6
-    bias_mps: float = 0.08
-    position_sd_m: float = 0.002
-    velocity_sd_mps: float = 0.005
-    attitude_sd_rad: float = 0.001
-
-
-# ---------------------------------------------------------------------- filters
-
-YAW = 2  # after LATERAL and VERTICAL
-# Their states: indices in x for each axis
-PLACES: tuple[list[tuple[int, ...]], ...] = (
-    [
-        (POSITION + i, VELOCITY + i, TILT + i, TILT_RATE + i, DISTURBANCE + i, BIAS + i)
-        for i in (0, 1)
-    ],
-    [(POSITION + 2, VELOCITY + 2, DISTURBANCE + 2, BIAS + 2)],
-    [(HEADING, HEADING_RATE)],
-)
-LATERAL_DISTURBANCE, VERTICAL_DISTURBANCE = 4, 2
-# H: the states of which each measurement is the sum, by row
-MEASURED: tuple[dict[int, tuple[int, ...]], ...] = (
-    {AT_POSITION: (0,), AT_VELOCITY: (1, 5), AT_ATTITUDE: (2,)},
-    {AT_POSITION: (0,), AT_VELOCITY: (1, 3)},
-    {AT_ATTITUDE: (0,)},
-)
 # Standard deviations at the first telemetry, which sets position, velocity and attitude;
 # disturbance and bias start at zero
-START_SDS = ((0.1, 0.3, 0.02, 0.3, 1.0, 0.3), (0.1, 0.3, 1.5, 0.3), (0.05, 0.3))
-
-OBSERVER = np.dtype(
-    [
-        ("time_s", "f8"),  # vehicle time of the state
-        ("motion", MOTION),
-        ("filters", FILTER, 3),
-        ("adaptation", ADAPTATION),
-        ("attitude_variance", "f8"),
-        ("measured", "f8", 6),  # position and velocity, with the indices of the state
-        ("residual", "f8", 6),  # scratch
-    ],
-    align=True,
-)
-"""Record of one observer."""
+START_SDS = np.array([0.1] * 3 + [0.3] * 3 + [0.02] * 2 + [0.3] * 2 + [1.0, 1.0, 1.5] + [0.3] * 3
+                     + [0.0, 0.05, 0.3])  # fmt: skip
 
 
-def models(vehicle: Vehicle, noise: Noise) -> tuple[tuple[Array, Array], ...]:
-    """Dynamics (n, n) of x' = A x, so that F = exp(A h), and noise densities (n,), Q per second, of
-    the lateral, vertical and heading filters: linearised about hover, where the acceleration per
-    error of the thrust direction is g."""
-    motion, drift, bias = noise.acceleration_mps, noise.disturbance_mps2, noise.bias_mps
-    forgetting = -1.0 / BIAS_TIME_CONSTANT_S
-    lateral = np.zeros((6, 6))
-    lateral[:4, :4] = lateral_model(vehicle).dynamics
-    lateral[1, 4], lateral[5, 5] = 1.0, forgetting
-    vertical = np.zeros((4, 4))
-    vertical[0, 1] = vertical[1, 2] = 1.0
-    vertical[1, 1], vertical[3, 3] = -vehicle.drag_per_mass_ps, forgetting
-    heading = np.zeros((2, 2))
+def dynamics_of(vehicle: Vehicle) -> Array:
+    """A (19, 19) of x' = A x: f linearised about hover, where the acceleration per error of the
+    thrust direction is g, without the lag of the thrust."""
+    dynamics = np.zeros((STATE_SIZE, STATE_SIZE))
+    for i in range(3):
+        dynamics[POSITION + i, VELOCITY + i] = dynamics[VELOCITY + i, DISTURBANCE + i] = 1.0
+        dynamics[VELOCITY + i, VELOCITY + i] = -vehicle.drag_per_mass_ps
+        dynamics[BIAS + i, BIAS + i] = -1.0 / BIAS_TIME_CONSTANT_S
+    for i in range(2):
+        axis = POSITION + i, VELOCITY + i, TILT + i, TILT_RATE + i
+        dynamics[np.ix_(axis, axis)] = lateral_model(vehicle).dynamics
     frequency = vehicle.yaw.natural_frequency_radps
-    heading[0, 1] = 1.0
-    heading[1] = -(frequency**2), -2.0 * vehicle.yaw.damping * frequency
-    return (
-        (lateral, np.array([0.0, motion, 0.0, noise.tilt_radps, drift, bias])),
-        (vertical, np.array([0.0, motion, drift, bias])),
-        (heading, np.array([0.0, noise.heading_radps])),
-    )
+    dynamics[HEADING, HEADING_RATE] = 1.0
+    dynamics[HEADING_RATE, HEADING:] = -(frequency**2), -2.0 * vehicle.yaw.damping * frequency
+    return dynamics
 
 
-@entry(OBSERVER, float, float, float, float)
-def update_by_attitude(
-    observers: Any, time_s: float, north: float, east: float, heading: float
+def densities_of(noise: Noise) -> Array:
+    """Process noise (19,) per root second."""
+    densities = np.zeros(STATE_SIZE)
+    densities[VELOCITY : VELOCITY + 3] = noise.acceleration_mps
+    densities[TILT_RATE : TILT_RATE + 2] = noise.tilt_radps
+    densities[DISTURBANCE : DISTURBANCE + 3] = noise.disturbance_mps2
+    densities[BIAS : BIAS + 3] = noise.bias_mps
+    densities[HEADING_RATE] = noise.heading_radps
+    return densities
+
+
+@entry(array(2), array(2), array(1), float, float)
+def predict(
+    covariance: Array, dynamics: Array, densities: Array, interval_s: float, longest_s: float
 ) -> None:
-    """Update by an attitude measured at `time_s`, not later than the state: thrust direction (north
-    and east components) and heading (rad). `observers` is one OBSERVER (1,)."""
-    observer = observers[0]
-    state, late_s = observer.motion.states[NOW], observer.time_s - time_s
-    lateral, yaw = observer.filters[LATERAL], observer.filters[YAW]
-    lateral.innovation[0] = north - state[TILT] + late_s * state[TILT_RATE]
-    lateral.innovation[1] = east - state[TILT + 1] + late_s * state[TILT_RATE + 1]
-    yaw.innovation[0] = wrapped(heading - state[HEADING] + late_s * state[HEADING_RATE])
-    update(state, lateral, AT_ATTITUDE, observer.attitude_variance)
-    update(state, yaw, AT_ATTITUDE, observer.attitude_variance)
-    bound_disturbance(state)
-
-
-@entry(OBSERVER, float)
-def update_by_position(observers: Any, time_s: float) -> None:
-    """Update by the position and velocity in `measured`, which are of `time_s`, not later than the
-    state. One that jumped resets position or bias and leaves the rest."""
-    observer = observers[0]
-    noted, measured = observer.adaptation, observer.measured
-    state = observer.motion.states[NOW]
-    _bring_forward(measured, state, observer.motion.plant, observer.time_s - time_s)
-    _missed(state, measured, noted.innovation)
-    jumped = False
-    for kind in range(2):
-        variance = measurement_variance(noted, kind)
-        for i in range(2):
-            one = observer.filters[i]
-            furthest = 0.0
-            for axis in range(one.axes):
-                innovation = measured[one.places[axis, kind]]
-                for j in range(one.order):
-                    innovation -= one.measures[kind, j] * state[one.places[axis, j]]
-                one.innovation[axis] = innovation
-                furthest = max(furthest, abs(innovation))
-            sd = math.sqrt(innovation_variance(one, kind, variance))
-            if furthest <= GATES[kind] + GATE_SDS * sd:
-                update(state, one, kind, variance)
-                continue
-            jumped = True
-            if kind == AT_POSITION:
-                reset_position(state, one, measured, variance)
-            else:
-                reset_bias(state, one, variance)
-    bound_disturbance(state)
-    if jumped:
-        interrupt(noted)
+    """P <- F P F' + Q over `interval_s`, in place, in steps of at most `longest_s`."""
+    steps = math.ceil(interval_s / longest_s - 1e-6)
+    if steps <= 0:
         return
-    _missed(state, measured, observer.residual)
-    adapt(noted, observer.time_s, observer.residual[:])
-    observer.filters[LATERAL].densities[LATERAL_DISTURBANCE] = noted.density[LATERAL]
-    observer.filters[VERTICAL].densities[VERTICAL_DISTURBANCE] = noted.density[VERTICAL]
+    h, size = interval_s / steps, covariance.shape[0]
+    half, term, moved = np.eye(size), np.eye(size), np.empty((size, size))
+    transition, noise = np.empty((size, size)), np.zeros((size, size))
+    # F = exp(A h / 2) to fourth order, squared
+    for order in range(1, 5):
+        _multiply(term, dynamics, moved)
+        for i in range(size):
+            for j in range(size):
+                term[i, j] = 0.5 * h / order * moved[i, j]
+                half[i, j] += term[i, j]
+    _multiply(half, half, transition)
+    # Q by Simpson's rule, exact for a chain of two integrators
+    for k in range(size):
+        weight = densities[k] ** 2 * h / 6.0
+        noise[k, k] += weight
+        for i in range(size):
+            middle, end = 4.0 * weight * half[i, k], weight * transition[i, k]
+            if end != 0.0:
+                for j in range(size):
+                    noise[i, j] += middle * half[j, k] + end * transition[j, k]
+    for _ in range(steps):
+        _multiply(transition, covariance, moved)
+        for j in range(size):
+            for i in range(size):
+                covariance[i, j] = noise[i, j]
+            for k in range(size):
+                if transition[j, k] != 0.0:
+                    for i in range(size):
+                        covariance[i, j] += moved[i, k] * transition[j, k]
 
 
 @kernel
-def _missed(state: Array, measured: Array, missed: Array) -> None:
-    """Fill `missed` (6,) with measured less estimated position and reported velocity."""
-    for i in range(3):
-        missed[i] = measured[POSITION + i] - state[POSITION + i]
-        missed[3 + i] = measured[VELOCITY + i] - state[VELOCITY + i] - state[BIAS + i]
+def _multiply(left: Array, right: Array, out: Array) -> None:
+    """out = left @ right, of which `left` is sparse; compiles in a tenth of the time of `@`."""
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            out[i, j] = 0.0
+        for k in range(out.shape[0]):
+            if left[i, k] != 0.0:
+                for j in range(out.shape[1]):
+                    out[i, j] += left[i, k] * right[k, j]
 
 
-@kernel
-def _bring_forward(measured: Array, state: Array, plant: Any, late_s: float) -> None:
-    """Propagate position and velocity `measured` (6,) by `late_s`, to the time of the state."""
-    if late_s <= 0.0:
-        return
-    direction = (state[TILT], state[TILT + 1], b_z_of(state[TILT], state[TILT + 1]))
-    gravity = (0.0, 0.0, plant.gravity)
-    for i in range(3):
-        speed = state[VELOCITY + i]
-        measured[POSITION + i] += late_s * speed
-        measured[VELOCITY + i] += late_s * acceleration(
-            gravity[i], state[THRUST] * direction[i], plant.drag_ps, speed, state[DISTURBANCE + i]
-        )
-
-
-@kernel
-def bound_disturbance(state: Array) -> None:
-    """Limit each axis of the disturbance, in place."""
+@entry(array(1), array(2), array(2), array(1), float, float)
+def update(
+    state: Array, covariance: Array, h: Array, measured: Array, variance: float, gate: float
+) -> bool:
+    """Update state (19,) and covariance by `measured` (m,) with H `h` (m, 19) and R = `variance`
+    times the identity: one number after the other, so that S is a number. Returns False, and
+    changes nothing, if one is beyond its gate."""
+    size, projected = state.shape[0], np.empty_like(state)
+    for row in range(h.shape[0]):
+        innovation, total = _innovation(state, covariance, h[row], measured[row], projected)
+        if abs(innovation) > gate + GATE_SDS * math.sqrt(total + variance):
+            return False
+    for row in range(h.shape[0]):
+        innovation, total = _innovation(state, covariance, h[row], measured[row], projected)
+        total += variance
+        for i in range(size):
+            gain = projected[i] / total
+            state[i] += gain * innovation
+            for j in range(i + 1):
+                covariance[i, j] = covariance[j, i] = covariance[i, j] - gain * projected[j]
     for i in range(DISTURBANCE, DISTURBANCE + 3):
         state[i] = min(max(state[i], -DISTURBANCE_LIMIT_MPS2), DISTURBANCE_LIMIT_MPS2)
+    return True
 
 
-# ---------------------------------------------------------------------- observer
+@kernel
+def _innovation(
+    state: Array, covariance: Array, row: Array, measured: float, projected: Array
+) -> tuple[float, float]:
+    """z - H x and H P H' of one `row` of H; `projected` becomes P H'."""
+    innovation, total = measured, 0.0
+    for i in range(state.shape[0]):
+        innovation -= row[i] * state[i]
+        projected[i] = 0.0
+        for j in range(state.shape[0]):
+            projected[i] += covariance[i, j] * row[j]
+        total += row[i] * projected[i]
+    return innovation, total
 
 
 class Observer:
@@ -267,39 +211,21 @@ class Observer:
     """
 
     def __init__(self, vehicle: Vehicle, noise: Noise | None = None) -> None:
-        self._noise = noise = noise or Noise()
-        self._record = record = np.zeros(1, OBSERVER)
-        record["attitude_variance"] = noise.attitude_sd_rad**2
-        self._motion = record["motion"]
-        self._filters = record["filters"][0]
-        self._adaptation = record["adaptation"]
-        self._time = record["time_s"]
-        self._measured: Array = record["measured"][0]
-        self._states: Array = self._motion["states"][0]
-        self._state: Array = self._states[NOW]
-        self._history: Array = self._motion["history"][0]
-        self._position_at: float | None
-        self._attitude_at: float | None
-        self._sent: int
-        for one, places, measured in zip(self._filters, PLACES, MEASURED, strict=True):
-            one["order"], one["axes"] = len(places[0]), len(places)
-            one["places"][: len(places), : len(places[0])] = places
-            for row, summed in measured.items():
-                one["measures"][row, list(summed)] = 1.0
+        self._noise = noise or Noise()
+        self._time_s = -math.inf  # vehicle time of the state
+        self._position_at: float | None = None  # time of the newest
+        self._attitude_at: float | None = None
         self._set_vehicle(vehicle)
         self.reset()
 
     def reset(self) -> None:
         """Forget the previous flight."""
-        noise, noted = self._noise, self._adaptation
         self._frozen = False
-        self._forget_commands()
-        self._state[:] = 0.0
+        self._sent = np.empty((0, COMMAND_SIZE))
+        self._state: Array = np.zeros(STATE_SIZE)
+        self._densities = densities_of(self._noise)
+        self._estimated = NoiseEstimate(self._noise)
         self._rates = np.zeros(3)
-        noted[:] = np.zeros_like(noted)
-        noted["least"] = np.square((noise.position_sd_m, noise.velocity_sd_mps))
-        noted["bounds"] = noted["density"] = noise.disturbance_mps2
-        self._permit_drift(LATERAL)
         self._restart()
 
     def set_vehicle(self, vehicle: Vehicle) -> None:
@@ -307,16 +233,19 @@ class Observer:
         change to what they mean with it, the motion does not. From now on the vertical drift is
         estimated too: before the thrust is identified, an error of its delay looks like drift, and
         a faster correction would make the vehicle oscillate."""
-        scale = self._vehicle.hover_thrust / vehicle.hover_thrust
-        self._history[:, SENT_THRUST] *= scale
-        self._state[THRUST] *= scale
-        down = (self._gravity + self._state[DISTURBANCE + 2]) * scale - vehicle.gravity_mps2
-        slowed = vehicle.drag_per_mass_ps - self._vehicle.drag_per_mass_ps
+        before = self._vehicle
+        scale = before.hover_thrust / vehicle.hover_thrust
+        self._sent[:, SENT_THRUST] *= scale
+        state = self._state
+        state[THRUST] *= scale
+        disturbance = state[DISTURBANCE : DISTURBANCE + 3]
+        down = (before.gravity_mps2 + disturbance[2]) * scale - vehicle.gravity_mps2
+        slowed = vehicle.drag_per_mass_ps - before.drag_per_mass_ps
+        disturbance[2] = down
+        disturbance += slowed * state[VELOCITY : VELOCITY + 3]
+        np.clip(disturbance, -DISTURBANCE_LIMIT_MPS2, DISTURBANCE_LIMIT_MPS2, out=disturbance)
         self._set_vehicle(vehicle)
-        self._permit_drift(VERTICAL)
-        self._state[DISTURBANCE + 2] = down
-        self._state[DISTURBANCE : DISTURBANCE + 3] += slowed * self._state[VELOCITY : VELOCITY + 3]
-        bound_disturbance(self._state)
+        self._estimated.permit_vertical_drift()
 
     @property
     def ready(self) -> bool:
@@ -328,40 +257,35 @@ class Observer:
         """Normalised hover thrust, u_h (1 + d_z / g); right within 3 % five seconds after
         take-off."""
         down = float(self._state[DISTURBANCE + 2])
-        return self._vehicle.hover_thrust * (1.0 + down / self._gravity)
+        return self._vehicle.hover_thrust * (1.0 + down / self._vehicle.gravity_mps2)
 
     @property
     def noise_sds(self) -> tuple[float, float]:
         """Noise of position (m) and reported velocity (m/s), as estimated."""
-        noted = self._adaptation[0]
-        position, velocity = np.sqrt(np.maximum(noted["variance"], noted["least"]))
-        return float(position), float(velocity)
+        position, velocity = np.sqrt(self._estimated.variances).tolist()
+        return position, velocity
 
     @property
     def drift_densities_mps2(self) -> tuple[float, float]:
         """Drift of the disturbance per root second, lateral and vertical, as estimated."""
-        lateral, vertical = self._adaptation["density"][0]
-        return float(lateral), float(vertical)
+        lateral, vertical = self._estimated.drift_mps2.tolist()
+        return lateral, vertical
 
     def freeze(self, grounded: bool) -> None:
         """Stop estimating while the vehicle is on the ground or does not fly our commands: velocity
-        as reported, thrust direction as measured, no disturbance. After that the filters start
-        from there."""
+        as reported, thrust direction as measured, no disturbance. After that the filter starts from
+        there."""
         if grounded != self._frozen:
-            self._reset_filters()
+            self._reset_covariance()
         self._frozen = grounded
 
     def on_command(self, time_s: float, command: Command) -> None:
         """A command sent when the newest telemetry had vehicle time `time_s`."""
         north, east, _ = command.thrust_direction_ned
-        history, sent = self._history, self._sent
-        if sent == COMMANDS_KEPT:
-            history[:-1] = history[1:]
-            sent -= 1
-        if sent and time_s < history[sent - 1, SENT_AT]:
-            time_s = history[sent - 1, SENT_AT]
-        history[sent] = time_s, north, east, command.thrust_mps2, command.heading_rad
-        self._motion["sent"] = self._sent = sent + 1
+        if len(self._sent):
+            time_s = max(time_s, float(self._sent[-1, SENT_AT]))
+        row = time_s, north, east, command.thrust_mps2, command.heading_rad
+        self._sent = np.vstack((self._sent[1 - COMMANDS_KEPT :], row))
 
     def on_attitude(self, time_s: float, q: Quaternion, rates: Triple) -> None:
         """Attitude quaternion (FRD to NED, w first) and body rates (rad/s, FRD) at `time_s`."""
@@ -370,16 +294,21 @@ class Observer:
         north, east, _ = thrust_direction_from_quaternion(q).tolist()
         heading = float(heading_from_quaternion(q))
         self._rates = np.array(rates, dtype=np.float64)
+        state = self._state
         if self._attitude_at is None or self._frozen:
-            state = self._state
             state[TILT : TILT + 2] = north, east
             state[TILT_RATE : TILT_RATE + 2] = 0.0
             state[HEADING], state[HEADING_RATE] = heading, 0.0
-            state[THRUST] = self._gravity / b_z_of(north, east)
+            state[THRUST] = self._vehicle.gravity_mps2 / b_z_of(north, east)
             self._time_s = max(self._time_s, time_s)
         else:
             self._go_to(time_s, complete=self._position_at is not None)
-            update_by_attitude(self._record, time_s, north, east, heading)
+            late_s = self._time_s - time_s
+            rate_n, rate_e, now, turning = state[[TILT_RATE, TILT_RATE + 1, HEADING, HEADING_RATE]]
+            turned = wrap_pi(float(heading - now + late_s * turning))
+            measured = np.array([north + late_s * rate_n, east + late_s * rate_e, now + turned])
+            variance = self._noise.attitude_sd_rad**2
+            update(state, self._covariance, H_ATTITUDE, measured, variance, math.inf)
         self._attitude_at = time_s
 
     def on_position(self, time_s: float, position_ned_m: Triple, velocity_ned_mps: Triple) -> None:
@@ -392,9 +321,56 @@ class Observer:
             self._time_s = max(self._time_s, time_s)
         else:
             self._go_to(time_s, complete=self._attitude_at is not None)
-            self._measured[:] = *position_ned_m, *velocity_ned_mps
-            update_by_position(self._record, time_s)
+            measured = np.array((*position_ned_m, *velocity_ned_mps), dtype=np.float64)
+            if self._time_s > time_s:
+                measured += (self._time_s - time_s) * self._motion()
+            self._update_by_position(measured)
         self._position_at = time_s
+
+    def _motion(self) -> Array:
+        """Velocity and acceleration (6,) now, by the model."""
+        state, gravity = self._state, np.array([0.0, 0.0, self._vehicle.gravity_mps2])
+        north, east = state[TILT : TILT + 2].tolist()
+        velocity, disturbance = state[VELOCITY:TILT], state[DISTURBANCE:BIAS]
+        push = state[THRUST] * np.array([north, east, b_z_of(north, east)])
+        drag_ps = self._vehicle.drag_per_mass_ps
+        accelerated = acceleration(gravity, push, drag_ps, velocity, disturbance)
+        return np.concatenate((velocity, accelerated))
+
+    def _update_by_position(self, measured: Array) -> None:
+        """Update by position and velocity (6,) of now. What jumped is reset, and the rest left."""
+        state, estimated = self._state, self._estimated
+        innovation = measured - H_POSITION @ state
+        variances, jumped = estimated.variances.tolist(), False
+        for first, end in TOGETHER:
+            kind = first // 3  # position or velocity
+            h, z = H_POSITION[first:end], measured[first:end]
+            if not update(state, self._covariance, h, z, variances[kind], GATES[kind]):
+                jumped = True
+                for row in range(first, end):
+                    self._reset(row, measured[row], variances[kind])
+        if jumped:
+            estimated.interrupt()
+            return
+        residual = measured - H_POSITION @ state
+        estimated.update(self._time_s, innovation.reshape(2, 3), residual.reshape(2, 3))
+        self._densities[DISTURBANCE : DISTURBANCE + 2] = estimated.drift_mps2[0]
+        self._densities[DISTURBANCE + 2] = estimated.drift_mps2[1]
+
+    def _reset(self, row: int, measured: float, variance: float) -> None:
+        """After a jump, by the `row` of H_POSITION: take the position as measured, or add the jump
+        of the reported velocity to its bias. The other states stay."""
+        state, covariance = self._state, self._covariance
+        if row < 3:
+            state[POSITION + row] = measured
+            covariance[POSITION + row] = covariance[:, POSITION + row] = 0.0
+            covariance[POSITION + row, POSITION + row] = variance
+            return
+        velocity, bias = VELOCITY + row - 3, BIAS + row - 3
+        state[bias] = measured - state[velocity]
+        covariance[bias] = -covariance[velocity]
+        covariance[:, bias] = covariance[bias]
+        covariance[bias, bias] = covariance[velocity, velocity] + variance
 
     def predict(self, time_s: float) -> PredictedState:
         """The state when the tilt of a command sent at `time_s` begins to act, after the tilt's
@@ -428,64 +404,45 @@ class Observer:
         )
 
     def _propagated(self, time_s: float) -> Array:
-        """A copy of the state, replayed forward to `time_s`."""
-        start_s = self._time_s
-        ahead_s = min(max(time_s - start_s, 0.0), LONGEST_GAP_S)
+        """A copy of the state, propagated to `time_s`."""
+        state = self._state.copy()
+        ahead_s = min(max(time_s - self._time_s, 0.0), LONGEST_GAP_S)
         if self._frozen:
-            state = self._state.copy()
             state[POSITION : POSITION + 3] += ahead_s * state[VELOCITY : VELOCITY + 3]
-            return state
-        replay(self._motion, LATER, start_s, start_s + ahead_s)
-        later: Array = self._states[LATER].copy()
-        return later
+        else:
+            propagate(state, self._plant, self._sent, self._time_s, self._time_s + ahead_s)
+        return state
 
     def _go_to(self, time_s: float, *, complete: bool) -> None:
-        """Propagate state and covariances to `time_s`, or leave them if they are newer. `complete`:
+        """Propagate state and covariance to `time_s`, or leave them if they are newer. `complete`:
         position and attitude have arrived, so that the commands can be replayed."""
-        start_s = self._time_s
-        if time_s <= start_s:
+        if time_s <= self._time_s:
             return
         if complete:
-            replay(self._motion, NOW, start_s, time_s)
-            kalman.predict(self._filters, time_s - start_s, self._longest_s)
+            interval_s = time_s - self._time_s
+            propagate(self._state, self._plant, self._sent, self._time_s, time_s)
+            predict(self._covariance, self._dynamics, self._densities, interval_s, self._longest_s)
         self._time_s = time_s
 
     def _set_vehicle(self, vehicle: Vehicle) -> None:
-        self._vehicle = vehicle
-        self._gravity = vehicle.gravity_mps2
-        self._motion["plant"] = plant_of(vehicle)
+        self._vehicle, self._plant = vehicle, plant_of(vehicle)
+        self._dynamics = dynamics_of(vehicle)
         frequency = max(vehicle.tilt.natural_frequency_radps, vehicle.yaw.natural_frequency_radps)
         damping = max(vehicle.tilt.damping, vehicle.yaw.damping, 0.5)
         self._longest_s = min(0.02, 0.25 / (2.0 * damping * frequency))
-        for one, (dynamics, densities) in zip(
-            self._filters, models(vehicle, self._noise), strict=True
-        ):
-            one["dynamics"][: len(densities), : len(densities)] = dynamics
-            one["densities"][: len(densities)] = densities
-
-    def _permit_drift(self, group: int) -> None:
-        """Let the drift density of this group grow up to the limit."""
-        noise = self._noise
-        limit_mps2 = max(noise.disturbance_mps2, noise.disturbance_limit_mps2)
-        self._adaptation["bounds"][0, group, 1] = limit_mps2
-
-    def _forget_commands(self) -> None:
-        self._motion["sent"] = self._sent = 0
 
     def _restart(self) -> None:
         """Take the next attitude and position as they are."""
         self._time_s = -math.inf
-        self._position_at = None
-        self._attitude_at = None
-        self._state[THRUST] = self._gravity
-        self._reset_filters()
+        self._position_at = self._attitude_at = None
+        self._state[THRUST] = self._vehicle.gravity_mps2
+        self._reset_covariance()
 
-    def _reset_filters(self) -> None:
-        """Covariances, disturbance and bias as at the first message."""
-        for one, sds in zip(self._filters, START_SDS, strict=True):
-            one["covariance"][: len(sds), : len(sds)] = np.diag(np.square(sds))
+    def _reset_covariance(self) -> None:
+        """Covariance, disturbance and bias as at the first message."""
+        self._covariance: Array = np.diag(START_SDS**2)
         self._state[DISTURBANCE : BIAS + 3] = 0.0
-        interrupt(self._adaptation.view(np.recarray)[0])
+        self._estimated.interrupt()
 
     def _is_new(self, time_s: float, last_s: float | None) -> bool:
         """Whether to use a message of `time_s`, the last of its kind having been of `last_s`;
@@ -493,19 +450,9 @@ class Observer:
         now_s = self._time_s
         if abs(time_s - now_s) > LONGEST_GAP_S:
             if time_s < now_s:
-                self._forget_commands()
+                self._sent = np.empty((0, COMMAND_SIZE))
             disturbance = self._state[DISTURBANCE : DISTURBANCE + 3].copy()
             self._restart()
             self._state[DISTURBANCE : DISTURBANCE + 3] = disturbance
             return True
         return time_s >= now_s - LATEST_S and (last_s is None or time_s > last_s)
-
-    @property
-    def _time_s(self) -> float:
-        """Vehicle time of the state."""
-        time_s: float = self._time.item()
-        return time_s
-
-    @_time_s.setter
-    def _time_s(self, time_s: float) -> None:
-        self._time[0] = time_s

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from offboard.control.base import Adaptive, Situation
 from offboard.documents.errors import located
 from offboard.flight import outbox, setpoint
-from offboard.flight.online_identification import OnlineIdentification, VehicleUpdate
 from offboard.flight.phases import Phase
 from offboard.flight.record import (
     IDENTIFIED_ID,
@@ -23,6 +22,7 @@ from offboard.flight.record import (
 )
 from offboard.flight.setpoint import Refusal, Refused
 from offboard.flight.state import FlightState
+from offboard.identification.learner import Learner, VehicleUpdate
 from offboard.mavlink.outgoing import SolverRecord
 from offboard.model.command import Command
 
@@ -106,11 +106,10 @@ def _send(flight: FlightState, decided: Decided) -> None:
         decided.refused, decided.failure = refused.why, str(refused)
 
 
-def _identify(flight: FlightState, decided: Decided, identification: OnlineIdentification) -> None:
+def _identify(flight: FlightState, decided: Decided, identification: Learner) -> None:
     try:
-        update = identification.learn(
-            decided.phase, decided.tick.time_s, flight.observer.hover_thrust_estimate
-        )
+        hover_thrust = flight.observer.hover_thrust_estimate
+        update = identification.learn(decided.tick.time_s, hover_thrust)
         if update is not None:
             _set_vehicle(flight, decided.tick.time_s, update)
     except Exception as error:  # the flight continues with the present vehicle model

@@ -19,7 +19,6 @@ from offboard.flight.busyness import PAUSE_S
 from offboard.flight.display import News, Snapshot
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.inputs import InputRecorder
-from offboard.flight.online_identification import IdentifySettings, OnlineIdentification
 from offboard.flight.phases import (
     BEFORE_FLIGHT,
     ENDS,
@@ -34,7 +33,8 @@ from offboard.flight.phases import (
 )
 from offboard.flight.record import Tick
 from offboard.flight.state import FlightState, Outcome
-from offboard.identification.learner import IdentifiedVehicle
+from offboard.identification.learner import IdentifySettings, Learner
+from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from offboard.link.interface import Chunk
 from offboard.mavlink.dialects.base import NEVER
 from offboard.mavlink.events import Attitude, ClockBehind, Event, LocalPosition, Rebooted
@@ -316,7 +316,7 @@ class Flight:
         return self.state.has_ended and not self.state.awaits_heartbeat
 
     @property
-    def identification(self) -> OnlineIdentification | None:
+    def identification(self) -> Learner | None:
         """What is identified in flight; None with a controller that cannot use it."""
         return self.state.identification
 
@@ -380,8 +380,8 @@ def _identification(
     controller: Controller,
     settings: IdentifySettings | None,
     known: IdentifiedVehicle | None,
-) -> OnlineIdentification | None:
+) -> Learner | None:
     """None for a controller that cannot use another vehicle model."""
     if settings is None or not isinstance(controller, Adaptive):
         return None
-    return OnlineIdentification(vehicle, settings, known=known)
+    return Learner(vehicle, settings, known=known)

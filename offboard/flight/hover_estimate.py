@@ -10,9 +10,12 @@ from __future__ import annotations
 from collections import deque
 
 import numpy as np
+from numpy.typing import NDArray
 
 from offboard.model.axes import acceleration
 from offboard.model.vehicle import HOVER_THRUST_LIMITS, Vehicle
+
+Array = NDArray[np.float64]
 
 WINDOW_S, KEPT_S = 0.5, 1.5
 GROUND_M = 0.2  # lower, the ground may carry it
@@ -26,21 +29,19 @@ class HoverEstimate:
     """Thrust reported and vertical speed of the last KEPT_S, by vehicle time."""
 
     def __init__(self) -> None:
-        self._thrusts: deque[tuple[float, float]] = deque()
-        self._lifts: deque[tuple[float, float]] = deque()
-        self._speeds: deque[tuple[float, float]] = deque()
+        self._thrusts: deque[tuple[float, ...]] = deque()  # time, thrust, its vertical part
+        self._speeds: deque[tuple[float, ...]] = deque()  # time, speed down
 
     def on_thrust(self, time_s: float, thrust: float, lift: float) -> None:
         """The autopilot reports its collective thrust, 0 .. 1; `lift` is its vertical part."""
-        _append(self._thrusts, time_s, thrust)
-        _append(self._lifts, time_s, lift)
+        _append(self._thrusts, (time_s, thrust, lift))
 
     def on_position(self, time_s: float, height_m: float, down_mps: float) -> None:
         """Height above the ground, and vertical velocity, positive down."""
         if height_m < GROUND_M:
             self._speeds.clear()
             return
-        _append(self._speeds, time_s, down_mps)
+        _append(self._speeds, (time_s, down_mps))
 
     def thrust(self, time_s: float) -> float | None:
         """Mean of the thrust that was reported in the WINDOW_S before `time_s`; None without."""
@@ -55,8 +56,8 @@ class HoverEstimate:
         if len(speeds) < LEAST_SPEEDS or speeds[-1, 0] - speeds[0, 0] < LEAST_S:
             return None
         late_s = vehicle.thrust_delay_s + vehicle.thrust_lag_s
-        lifts = _within(self._lifts, speeds[0, 0] - late_s, time_s - late_s)
-        if len(lifts) < LEAST_THRUSTS:
+        thrusts = _within(self._thrusts, speeds[0, 0] - late_s, time_s - late_s)
+        if len(thrusts) < LEAST_THRUSTS:
             return None
         gravity_mps2 = vehicle.gravity_mps2
         a_down_mps2 = float(np.polyfit(speeds[:, 0] - time_s, speeds[:, 1], 1)[0])
@@ -66,7 +67,7 @@ class HoverEstimate:
         )  # solved for the thrust
         if lift_mps2 < LEAST_LIFT * gravity_mps2:
             return None
-        share = float(np.mean(lifts[:, 1])) * gravity_mps2 / lift_mps2
+        share = float(np.mean(thrusts[:, 2])) * gravity_mps2 / lift_mps2
         return share if HOVER_THRUST_LIMITS[0] <= share <= HOVER_THRUST_LIMITS[1] else None
 
 
@@ -76,12 +77,12 @@ def differs(hover_thrust: float, vehicle: Vehicle, least: float = DIFFERENT) -> 
     return abs(hover_thrust / vehicle.hover_thrust - 1.0) > least
 
 
-def _append(samples: deque[tuple[float, float]], time_s: float, value: float) -> None:
-    samples.append((time_s, value))
-    while samples[0][0] < time_s - KEPT_S:
+def _append(samples: deque[tuple[float, ...]], sample: tuple[float, ...]) -> None:
+    samples.append(sample)
+    while samples[0][0] < sample[0] - KEPT_S:
         samples.popleft()
 
 
-def _within(samples: deque[tuple[float, float]], begin_s: float, end_s: float) -> np.ndarray:
+def _within(samples: deque[tuple[float, ...]], begin_s: float, end_s: float) -> Array:
     kept = [each for each in samples if begin_s <= each[0] <= end_s]
-    return np.array(kept).reshape(-1, 2)
+    return np.array(kept, dtype=np.float64)

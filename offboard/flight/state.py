@@ -22,7 +22,6 @@ from offboard.flight.busyness import Busyness
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.ground_contact import DETECTOR_KNOWN_S, GroundContact
 from offboard.flight.hover_estimate import HoverEstimate
-from offboard.flight.online_identification import OnlineIdentification
 from offboard.flight.phases import ENDS, STOPPED, Action, Limits, Phase, Request, ServiceOptions
 from offboard.flight.positioning import Positioning, PositionJumps
 from offboard.flight.preflight import ParameterReading
@@ -30,6 +29,7 @@ from offboard.flight.record import Decided, Tick
 from offboard.flight.touchdown import Touchdown, moved
 from offboard.flight.vehicle_clock import VehicleClock
 from offboard.flight.vehicle_state import VehicleState
+from offboard.identification.learner import Learner
 from offboard.mavlink.dialects.base import Dialect, Takeoff
 from offboard.mavlink.events import Heartbeat, Landed, TimesyncReply
 from offboard.mavlink.outgoing import CommandLong, Outgoing, Record
@@ -104,7 +104,7 @@ class FlightState:
     period_s: float
     stopwatch: Callable[[], float]
     deadline_s: float | None = None
-    identification: OnlineIdentification | None = None
+    identification: Learner | None = None
     service: ServiceOptions | None = None
     vehicle: VehicleState = field(default_factory=VehicleState)
     clock: VehicleClock = field(default_factory=VehicleClock)

@@ -27,9 +27,16 @@ from offboard.flight.phases import (
 from offboard.flight.rows import REBOOTED, Transition, in_own_failsafe
 from offboard.flight.state import FlightState, Outcome
 from offboard.flight.touchdown import Touchdown
+from offboard.identification.learner import Stage
 from offboard.mavlink.events import LocalPosition
 
 TAKEN = "a failsafe of the vehicle has it, as its HEARTBEAT shows"
+STAGES = {
+    Phase.CLIMB: Stage.CLIMB,
+    Phase.EXCITE: Stage.STEPS,
+    Phase.JOIN: Stage.MOTION,
+    Phase.TRACK: Stage.MOTION,
+}  # of the identification
 SERVICE_ONLY = frozenset({Phase.STANDBY, Phase.PAUSE, Phase.HAND_BACK})
 
 
@@ -133,7 +140,8 @@ def _enter(flight: FlightState, row: Transition) -> None:
         if source is Phase.ARM:  # on the ground the time that it takes does no harm
             decision.begin(flight)
     if flight.identification:
-        flight.identification.on_phase(row.target, flight.time_s)
+        stage = STAGES.get(row.target, Stage.OTHER)
+        flight.identification.on_stage(stage, flight.time_s)
     if source in WAITING and row.target in FLYING and flight.authority:
         flight.authority.ask()  # it shows the mode already
     if row.target is Phase.ENGAGE:

@@ -8,7 +8,7 @@ projected out. A link loses commands, which makes outliers, so residuals are tak
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -68,19 +68,6 @@ MODEL_SDS = (0.002, 0.025, 0.025)
 UNEXPLAINED, UNEXPLAINED_SHARE = 0.008, 0.3
 
 
-@dataclass(frozen=True, slots=True)
-class _Axis:
-    """Least commanded motion (rad rms), and the greatest accepted sd of delay (s), natural
-    frequency (relative) and damping."""
-
-    name: str
-    least_command_rad: float
-    sd_limits: tuple[float, float, float]
-    wanders: bool  # see `ResponseProblem`
-
-
-TILT = _Axis("tilt", 0.004, (0.01, 0.15, 0.15), wanders=False)
-YAW = _Axis("yaw", 0.008, (0.04, 0.15, 0.2), wanders=True)
 EXPLAINED = 0.6  # least share of the commanded motion that the fitted response must explain
 
 
@@ -94,6 +81,14 @@ class ResponseFit:
     damping: Estimate
     residual_rms: float
     commanded_rms: float
+
+    @property
+    def response(self) -> AxisResponse:
+        return AxisResponse(
+            delay_s=self.delay_s.value,
+            natural_frequency_radps=self.natural_frequency_radps.value,
+            damping=self.damping.value,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,26 +123,29 @@ def yaw_signals(trace: Trace) -> tuple[Array, Array, Array, Array]:
     return trace.attitude[:, STAMP], signals, trace.commands[:, SENT_AT], commands
 
 
-def fit_tilt(trace: Trace, refusals: dict[str, str]) -> Generator[None, None, ResponseFit | None]:
-    """Both components of the thrust direction, in pieces of some milliseconds. Returns None, and
-    the reason as `refusals["tilt"]`, if `trace` does not determine the response."""
-    return (yield from _fit_axis(TILT, tilt_signals(trace), refusals))
+@dataclass(frozen=True, slots=True)
+class Axis:
+    """Least commanded motion (rad rms), and the greatest accepted sd of delay (s), natural
+    frequency (relative) and damping."""
+
+    name: str
+    signals: Callable[[Trace], tuple[Array, Array, Array, Array]]
+    least_command_rad: float
+    sd_limits: tuple[float, float, float]
+    wanders: bool  # see `ResponseProblem`
 
 
-def fit_yaw(
-    trace: Trace, refusals: dict[str, str], delay: Estimate
+TILT = Axis("tilt", tilt_signals, 0.004, (0.01, 0.15, 0.15), wanders=False)
+YAW = Axis("yaw", yaw_signals, 0.008, (0.04, 0.15, 0.2), wanders=True)
+
+
+def fit_axis(
+    axis: Axis, trace: Trace, refusals: dict[str, str], delay: Estimate | None = None
 ) -> Generator[None, None, ResponseFit | None]:
-    """The heading, as `fit_tilt`; `delay` is what is known of its delay beforehand."""
-    return (yield from _fit_axis(YAW, yaw_signals(trace), refusals, delay))
-
-
-def _fit_axis(
-    axis: _Axis,
-    measured: tuple[Array, Array, Array, Array],
-    refusals: dict[str, str],
-    delay: Estimate | None = None,
-) -> Generator[None, None, ResponseFit | None]:
-    times, _, sent_at, commands = measured
+    """The response of TILT (both components of the thrust direction) or YAW, in pieces of some
+    milliseconds. Returns None, and the reason in `refusals` under the axis's name, if `trace` does
+    not determine it. `delay` is what is known of the delay beforehand."""
+    measured = times, _, sent_at, commands = axis.signals(trace)
     if len(times) < 50 or len(sent_at) < 3:
         refusals[axis.name] = f"{len(times)} attitudes and {len(sent_at)} commands are too few"
         return None
@@ -160,31 +158,33 @@ def _fit_axis(
         return None
     fit = yield from fit_response(*measured, delay, wanders=axis.wanders)
     refusal = _refusal(fit, axis.sd_limits)
-    if refusal is not None:
+    if refusal:
         refusals[axis.name] = refusal
         return None
     return fit
 
 
-def _refusal(fit: ResponseFit, sd_limits: tuple[float, float, float]) -> str | None:
-    """Why a fit is rejected, or None."""
+def _refusal(fit: ResponseFit, sd_limits: tuple[float, float, float]) -> str:
+    """Why a fit is rejected, or empty."""
     if fit.residual_rms > (1.0 - EXPLAINED) * fit.commanded_rms:
         return (
             f"it does not follow its command: {1e3 * fit.residual_rms:.1f} mrad rms of "
             f"{1e3 * fit.commanded_rms:.1f} commanded are unexplained"
         )
-    scales = (1.0, fit.natural_frequency_radps.value, 1.0)
-    names = ("delay (s)", "natural frequency (rad/s)", "damping")
-    estimates = (fit.delay_s, fit.natural_frequency_radps, fit.damping)
-    for index, (name, estimate) in enumerate(zip(names, estimates, strict=True)):
+    frequency = fit.natural_frequency_radps
+    estimates = (
+        ("delay (s)", fit.delay_s, sd_limits[DELAY]),
+        ("natural frequency (rad/s)", frequency, sd_limits[FREQUENCY] * frequency.value),
+        ("damping", fit.damping, sd_limits[DAMPING]),
+    )
+    for index, (name, estimate, limit) in enumerate(estimates):
         margin = 1e-3 * (UPPER[index] - LOWER[index])
         at_lower = index != DELAY and estimate.value < LOWER[index] + margin
         if at_lower or estimate.value > UPPER[index] - margin:
             return f"its {name} is at the limit of the search, {estimate.value:.3g}"
-        limit = sd_limits[index] * scales[index]
         if not estimate.sd <= limit:
             return f"its {name} is uncertain: sd {estimate.sd:.2g}, limit {limit:.2g}; fly steps"
-    return None
+    return ""
 
 
 def unexplained(trace: Trace, response: AxisResponse) -> Unexplained:

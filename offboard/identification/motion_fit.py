@@ -226,44 +226,30 @@ def fit_drag(motion: Motion, thrust_mps2: Array, start_ps: float) -> Estimate:
     return Estimate(float(found.x[0]), math.sqrt(max(variance, 0.0)))
 
 
-@dataclass(frozen=True, slots=True)
-class VerticalPrior:
-    """What is known beforehand: where the search for the hover thrust begins, and thrust delay,
-    thrust lag and drag with their uncertainty."""
-
-    hover_thrust: float
-    delay_s: Estimate
-    lag_s: Estimate
-    drag_ps: Estimate
-
-
-@dataclass(frozen=True, slots=True)
-class VerticalFit:
-    """`thrust_effect_s`, the sum of delay and lag, is better known than its parts."""
-
-    hover_thrust: Estimate
-    thrust_lag_s: Estimate
-    thrust_delay_s: Estimate
-    thrust_effect_s: Estimate
-    drag_ps: Estimate
-
-
-def fit_vertical(motion: Motion, gravity_mps2: float, prior: VerticalPrior) -> VerticalFit:
-    """Hover thrust, delay and lag of the thrust, and vertical drag."""
-    known = (prior.delay_s, prior.lag_s, prior.drag_ps)
+def fit_vertical(
+    motion: Motion,
+    gravity_mps2: float,
+    hover_thrust: float,
+    delay_s: Estimate,
+    lag_s: Estimate,
+    drag_ps: Estimate,
+) -> dict[str, Estimate]:
+    """Hover thrust, delay and lag of the thrust, and vertical drag, given where the search for the
+    hover thrust begins and what is known of the others beforehand. By name; `thrust_effect_s`, the
+    sum of delay and lag, is better known than its parts."""
+    known = (delay_s, lag_s, drag_ps)
     means = np.array([each.value for each in known])
     sds = np.array([each.sd for each in known])
     upper = np.array((50.0, THRUST_DELAY_UPPER_S, LAG_UPPER_S, DRAG_UPPER_PS))
-    start = np.clip([1.0 / prior.hover_thrust, *means], STARTED_FROM, upper - 1e-3)
+    start = np.clip([1.0 / hover_thrust, *means], STARTED_FROM, upper - 1e-3)
     vertical = PositionFilter(motion.times, start[3], VERTICAL)
 
     def innovations(parameters: Array) -> Array:
-        inverse, delay_s, lag_s, drag_ps = parameters
-        thrust = inverse * motion.thrust(delay_s, lag_s)
+        inverse, delay, lag, drag = parameters
+        thrust = inverse * motion.thrust(delay, lag)
         accelerations = gravity_mps2 * (1.0 - thrust * motion.b_z)
-        surprises: Array = vertical.innovations(motion.positions[2:], accelerations[None], drag_ps)[
-            0
-        ]
+        heights, only = motion.positions[2:], accelerations[None]
+        surprises: Array = vertical.innovations(heights, only, drag)[0]
         return surprises
 
     # What is known counts as one innovation of the size that they have
@@ -277,18 +263,18 @@ def fit_vertical(motion: Motion, gravity_mps2: float, prior: VerticalPrior) -> V
         ftol=1e-6,
         max_nfev=12,
     )
-    inverse, delay_s, lag_s, drag_ps = found.x
+    inverse, delay, lag, drag = found.x.tolist()
     rows = len(motion.times) - 1
     lags = lag_count(RELATED_S, motion.spacing_s, rows)
     scores_covariance = long_run_covariance(found.jac[:rows] * found.fun[:rows, None], lags)
     scores_covariance += found.jac[rows:].T @ found.jac[rows:]
     covariance = sandwich(found.jac.T @ found.jac, scores_covariance)
-    found_sds = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    sd = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
     effect_sd_s = FEW_RELATED * math.sqrt(max(float(np.sum(covariance[1:3, 1:3])), 0.0))
-    return VerticalFit(
-        hover_thrust=Estimate(float(1.0 / inverse), float(found_sds[0] / inverse**2)),
-        thrust_lag_s=Estimate(float(lag_s), float(found_sds[2])),
-        thrust_delay_s=Estimate(float(delay_s), float(found_sds[1])),
-        thrust_effect_s=Estimate(float(delay_s + lag_s), effect_sd_s),
-        drag_ps=Estimate(float(drag_ps), float(found_sds[3])),
-    )
+    return {
+        "hover_thrust": Estimate(1.0 / inverse, sd[0] / inverse**2),
+        "thrust_delay_s": Estimate(delay, sd[1]),
+        "thrust_lag_s": Estimate(lag, sd[2]),
+        "thrust_effect_s": Estimate(delay + lag, effect_sd_s),
+        "drag_ps": Estimate(drag, sd[3]),
+    }

@@ -47,6 +47,12 @@ class Trace:
             return math.nan
         return float(min(self.attitude[-1, STAMP], self.position[-1, STAMP]))
 
+    @property
+    def seconds(self) -> float:
+        """Time with both attitude and position; 0 if there is none."""
+        seconds = self.end_s - self.begin_s
+        return max(seconds, 0.0) if math.isfinite(seconds) else 0.0
+
     def between(self, begin_s: float, end_s: float) -> Trace:
         """Telemetry from `begin_s` to `end_s`, and all commands sent until `end_s`."""
         return Trace(
@@ -61,28 +67,19 @@ class Trace:
 def clean(commands: Array, attitude: Array, position: Array) -> Trace:
     """A Trace from rows in the order of arrival. Rows that are not finite or not newer than the one
     before are left out; of commands with one stamp the last is kept."""
-    return Trace(
-        _latest(_ordered(commands, strictly=False)),
-        _ordered(attitude, strictly=True),
-        _ordered(position, strictly=True),
+    commands, attitude, position = (
+        rows[np.isfinite(rows).all(axis=1)] for rows in (commands, attitude, position)
     )
+    commands = commands[commands[:, SENT_AT] >= np.maximum.accumulate(commands[:, SENT_AT])]
+    last_of_stamp = np.append(np.diff(commands[:, SENT_AT]) > 0.0, True)[: len(commands)]
+    return Trace(commands[last_of_stamp], _newer(attitude), _newer(position))
 
 
-def _ordered(rows: Array, *, strictly: bool) -> Array:
-    rows = rows[np.isfinite(rows).all(axis=1)]
-    if not len(rows):
-        return rows
-    newest = np.maximum.accumulate(rows[:, 0])
-    before = np.concatenate(([-np.inf], newest[:-1]))
-    kept: Array = rows[rows[:, 0] > before if strictly else rows[:, 0] >= before]
-    return kept
-
-
-def _latest(rows: Array) -> Array:
-    if not len(rows):
-        return rows
-    kept: Array = rows[np.append(np.diff(rows[:, 0]) > 0.0, True)]
-    return kept
+def _newer(rows: Array) -> Array:
+    """Rows that are newer than all before."""
+    newest = np.maximum.accumulate(rows[:, STAMP])
+    newer: Array = rows[rows[:, STAMP] > np.append(-np.inf, newest)[: len(rows)]]
+    return newer
 
 
 SPACING_S = 0.018  # closer samples are left out: motion and responses are slower
@@ -99,47 +96,10 @@ def thinned(stamps: Array, spacing_s: float) -> NDArray[np.intp]:
     return np.array(kept, dtype=np.intp)
 
 
-class Recorder:
-    """The last `kept_s` seconds of a flight, at up to `rate_hz`, in a fixed amount of memory."""
+class Rows:
+    """The last `capacity` to twice `capacity` rows of `width` numbers."""
 
-    def __init__(self, *, kept_s: float = 30.0, rate_hz: float = 125.0) -> None:
-        rows = math.ceil(kept_s * rate_hz)
-        self._commands = _Rows(rows, COMMAND_WIDTH)
-        self._attitude = _Rows(rows, ATTITUDE_WIDTH)
-        self._position = _Rows(rows, POSITION_WIDTH)
-
-    def on_command(
-        self, time_s: float, direction_ne: tuple[float, float], thrust: float, heading_rad: float
-    ) -> None:
-        """A command sent; `thrust` along the body axis, as a fraction of full throttle."""
-        self._commands.add((time_s, *direction_ne, thrust, heading_rad))
-
-    def on_attitude(
-        self, time_s: float, direction_ne: tuple[float, float], heading_rad: float
-    ) -> None:
-        self._attitude.add((time_s, *direction_ne, heading_rad))
-
-    def on_position(
-        self,
-        time_s: float,
-        position_ned_m: tuple[float, float, float],
-        velocity_ned_mps: tuple[float, float, float],
-    ) -> None:
-        self._position.add((time_s, *position_ned_m, *velocity_ned_mps))
-
-    def trace(self, begin_s: float, end_s: float) -> Trace:
-        """A copy of what was recorded from `begin_s` to `end_s`, with all commands until then."""
-        telemetry = (
-            rows[(rows[:, STAMP] >= begin_s) & (rows[:, STAMP] <= end_s)]
-            for rows in (self._attitude.kept, self._position.kept)
-        )
-        return clean(self._commands.kept, *telemetry).between(begin_s, end_s)
-
-
-class _Rows:
-    """The last `capacity` to twice `capacity` rows."""
-
-    def __init__(self, capacity: int, width: int) -> None:
+    def __init__(self, width: int, capacity: int = 3750) -> None:  # 30 s at 125 Hz
         self._capacity = capacity
         self._rows = np.empty((2 * capacity, width))
         self._count = 0
@@ -149,9 +109,9 @@ class _Rows:
         kept: Array = self._rows[: self._count]
         return kept
 
-    def add(self, row: tuple[float, ...]) -> None:
+    def add(self, *numbers: float) -> None:
         if self._count == len(self._rows):
-            self._rows[: self._capacity] = self._rows[self._capacity :].copy()
+            self._rows[: self._capacity] = self._rows[self._capacity :]
             self._count = self._capacity
-        self._rows[self._count] = row
+        self._rows[self._count] = numbers
         self._count += 1

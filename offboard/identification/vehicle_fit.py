@@ -14,13 +14,11 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from offboard.identification.attitude_fit import ResponseFit, fit_tilt, fit_yaw
+from offboard.identification.attitude_fit import TILT, YAW, ResponseFit, fit_axis
 from offboard.identification.motion_fit import (
     DRAG_SPACING_S,
     DRAG_UPPER_PS,
     Motion,
-    VerticalFit,
-    VerticalPrior,
     fit_drag,
     fit_vertical,
 )
@@ -31,7 +29,6 @@ from offboard.model.vehicle import (
     DELAY_LIMITS_S,
     FREQUENCY_LIMITS_RADPS,
     HOVER_THRUST_LIMITS,
-    AxisResponse,
     Vehicle,
 )
 
@@ -45,6 +42,7 @@ LEAST_SPEED_MPS, LEAST_THRUST_CHANGE = 0.4, 0.015
 DRAG_SD_PS, HOVER_SD, EFFECT_SD_S = 0.2, 0.02, 0.03
 EFFECT_SD = 0.2  # or this fraction of a thrust's long delay and lag
 DRAG_PRIOR_PS = Estimate(0.6, 0.4)
+THRUST_EFFECT = ("thrust_lag_s", "thrust_delay_s", "thrust_effect_s")  # accepted together
 # A link adds the same to all delays. These are the sd of what remains of the delays of yaw and
 # thrust, of the thrust's lag, and of the link's delay while the tilt is not identified.
 YAW_DELAY_SD_S, THRUST_DELAY_SD_S, THRUST_LAG_SD_S, LINK_SD_S = 0.1, 0.03, 0.05, 0.15
@@ -70,28 +68,29 @@ class Identified:
     refusals: Mapping[str, str] = field(default_factory=dict)
 
     @property
+    def estimates(self) -> dict[str, Estimate | None]:
+        """By the names of `BOUNDS`, in the order of the log's records."""
+        of_axes: dict[str, Estimate | None] = {
+            f"{axis}_{name}": getattr(fit, name) if fit else None
+            for axis, fit in (("tilt", self.tilt), ("yaw", self.yaw))
+            for name in AXIS_BOUNDS
+        }
+        return of_axes | {name: getattr(self, name) for name in BODY_BOUNDS}
+
+    @property
     def supported(self) -> bool:
         """Whether anything at all was identified."""
-        found = (self.tilt, self.yaw, self.hover_thrust, self.thrust_lag_s, self.drag_ps)
-        return any(each is not None for each in found)
+        return any(self.estimates.values())
 
     def applied_to(self, vehicle: Vehicle) -> Vehicle:
         """`vehicle` with the identified constants; the others stay as they are."""
         found: dict[str, object] = {}
         for name, fit in (("tilt", self.tilt), ("yaw", self.yaw)):
             if fit is not None:
-                found[name] = AxisResponse(
-                    delay_s=fit.delay_s.value,
-                    natural_frequency_radps=fit.natural_frequency_radps.value,
-                    damping=fit.damping.value,
-                )
-        for name, estimate in (
-            ("hover_thrust", self.hover_thrust),
-            ("thrust_lag_s", self.thrust_lag_s),
-            ("thrust_delay_s", self.thrust_delay_s),
-        ):
-            if estimate is not None:
-                found[name] = estimate.value
+                found[name] = fit.response
+        for name in ("hover_thrust", "thrust_lag_s", "thrust_delay_s"):
+            if getattr(self, name) is not None:
+                found[name] = getattr(self, name).value
         if self.drag_ps is not None:
             found["drag_translation_npmps"] = (self.drag_ps.value * vehicle.mass_kg,) * 3
         return vehicle.model_validate(vehicle.model_dump() | found)
@@ -129,16 +128,16 @@ def completed(pieces: Pieces[Result]) -> Result:
 def identify_in_pieces(trace: Trace, vehicle: Vehicle) -> Pieces[Identified]:
     """`identify`, some milliseconds of work at each step."""
     refusals: dict[str, str] = {}
-    seconds = _seconds(trace)
+    seconds = trace.seconds
     if seconds < LEAST_SECONDS:
         reason = f"{seconds:.1f} s of flight, {LEAST_SECONDS:.0f} s are needed"
         names = ("tilt", "yaw", "hover_thrust", "thrust_lag_s", "drag_ps")
         return Identified(0.0, refusals=dict.fromkeys(names, reason))
-    tilt = yield from fit_tilt(trace, refusals)
+    tilt = yield from fit_axis(TILT, trace, refusals)
     yield
     link = _link_delay(tilt, vehicle)
     yaw_delay = _with_link(vehicle.yaw.delay_s, YAW_DELAY_SD_S, link)
-    yaw = yield from fit_yaw(trace, refusals, yaw_delay)
+    yaw = yield from fit_axis(YAW, trace, refusals, yaw_delay)
     yield
     found = Identified(seconds, tilt, yaw, refusals=refusals)
     motion = Motion(trace)
@@ -146,51 +145,41 @@ def identify_in_pieces(trace: Trace, vehicle: Vehicle) -> Pieces[Identified]:
         reason = f"{motion.counts} are too few"
         refusals |= dict.fromkeys(("hover_thrust", "thrust_lag_s", "drag_ps"), reason)
         return found
-    thrust_delay = _with_link(vehicle.thrust_delay_s, THRUST_DELAY_SD_S, link)
-    thrust_lag = Estimate(vehicle.thrust_lag_s, THRUST_LAG_SD_S)
-    prior = VerticalPrior(vehicle.hover_thrust, thrust_delay, thrust_lag, DRAG_PRIOR_PS)
-    vertical = fit_vertical(motion, vehicle.gravity_mps2, prior)
-    drag: Estimate | None = None
-    if _fast_enough(motion, refusals):
+    known = {
+        "delay_s": _with_link(vehicle.thrust_delay_s, THRUST_DELAY_SD_S, link),
+        "lag_s": Estimate(vehicle.thrust_lag_s, THRUST_LAG_SD_S),
+        "drag_ps": DRAG_PRIOR_PS,
+    }
+    vertical = fit_vertical(motion, vehicle.gravity_mps2, vehicle.hover_thrust, **known)
+    if motion.speed_mps >= LEAST_SPEED_MPS:
         yield
-        hover = vertical.hover_thrust.value
-        delay_and_lag_s = vertical.thrust_delay_s.value, vertical.thrust_lag_s.value
-        thrust_mps2 = vehicle.gravity_mps2 / hover * motion.thrust(*delay_and_lag_s)
-        drag = _accepted_drag(fit_drag(motion, thrust_mps2, DRAG_PRIOR_PS.value), refusals)
-        if drag is not None:
-            yield
-            drag_ps = Estimate(drag.value, max(drag.sd, 0.2 * drag.value, 0.05))
-            prior = replace(prior, hover_thrust=hover, drag_ps=drag_ps)
-            vertical = fit_vertical(motion, vehicle.gravity_mps2, prior)
+    hover = vertical["hover_thrust"].value
+    thrust_mps2 = vehicle.gravity_mps2 / hover * _thrust(motion, vertical)
+    drag = _drag(motion, thrust_mps2, DRAG_PRIOR_PS.value, refusals)
+    if drag is not None:
+        yield
+        known["drag_ps"] = Estimate(drag.value, max(drag.sd, 0.2 * drag.value, 0.05))
+        vertical = fit_vertical(motion, vehicle.gravity_mps2, hover, **known)
     return replace(found, drag_ps=drag, **_accepted_vertical(motion, vertical, refusals))
 
 
-def identify_tilt(trace: Trace) -> Pieces[Identified]:
-    """The tilt response alone, in two pieces."""
-    refusals: dict[str, str] = {}
-    tilt = yield from fit_tilt(trace, refusals)
-    return Identified(_seconds(trace), tilt=tilt, refusals=refusals)
+def _thrust(motion: Motion, vertical: dict[str, Estimate]) -> Array:
+    return motion.thrust(vertical["thrust_delay_s"].value, vertical["thrust_lag_s"].value)
 
 
 def identify_drag(trace: Trace, vehicle: Vehicle) -> Identified:
     """The drag alone, given the other constants of `vehicle`; some milliseconds for 25 s of
     flight."""
     refusals: dict[str, str] = {}
-    seconds = _seconds(trace)
     drag: Estimate | None = None
-    if seconds < LEAST_SECONDS or not (motion := Motion(trace, DRAG_SPACING_S)).sufficient:
+    enough = trace.seconds >= LEAST_SECONDS
+    if not enough or not (motion := Motion(trace, DRAG_SPACING_S)).sufficient:
         refusals["drag_ps"] = "too few positions and commands"
-    elif _fast_enough(motion, refusals):
+    else:
         thrust = motion.thrust(vehicle.thrust_delay_s, vehicle.thrust_lag_s)
-        fit = fit_drag(motion, vehicle.thrust_max_mps2 * thrust, vehicle.drag_per_mass_ps)
-        drag = _accepted_drag(fit, refusals)
-    return Identified(seconds, drag_ps=drag, refusals=refusals)
-
-
-def _seconds(trace: Trace) -> float:
-    """Length of a trace; 0 without attitude or position."""
-    seconds = trace.end_s - trace.begin_s
-    return max(seconds, 0.0) if math.isfinite(seconds) else 0.0
+        start_ps = vehicle.drag_per_mass_ps
+        drag = _drag(motion, vehicle.thrust_max_mps2 * thrust, start_ps, refusals)
+    return Identified(trace.seconds, drag_ps=drag, refusals=refusals)
 
 
 def _link_delay(tilt: ResponseFit | None, vehicle: Vehicle) -> Estimate:
@@ -204,19 +193,18 @@ def _with_link(delay_s: float, own_sd_s: float, link: Estimate) -> Estimate:
     return Estimate(max(delay_s + link.value, 0.0), math.hypot(own_sd_s, link.sd))
 
 
-def _fast_enough(motion: Motion, refusals: dict[str, str]) -> bool:
-    """Whether the vehicle moved fast enough to show its drag."""
+def _drag(
+    motion: Motion, thrust_mps2: Array, start_ps: float, refusals: dict[str, str]
+) -> Estimate | None:
+    """The drag, if the vehicle moved fast enough to show it."""
     speed_mps = motion.speed_mps
-    if speed_mps >= LEAST_SPEED_MPS:
-        return True
-    refusals["drag_ps"] = (
-        f"horizontal speed {speed_mps:.2f} m/s rms, {LEAST_SPEED_MPS} m/s are needed: "
-        "drag needs motion"
-    )
-    return False
-
-
-def _accepted_drag(drag: Estimate, refusals: dict[str, str]) -> Estimate | None:
+    if speed_mps < LEAST_SPEED_MPS:
+        refusals["drag_ps"] = (
+            f"horizontal speed {speed_mps:.2f} m/s rms, {LEAST_SPEED_MPS} m/s are needed: "
+            "drag needs motion"
+        )
+        return None
+    drag = fit_drag(motion, thrust_mps2, start_ps)
     if not 1e-3 < drag.value < 0.99 * DRAG_UPPER_PS:
         refusals["drag_ps"] = f"the drag is at the limit of the search, {drag.value:.3g} 1/s"
     elif not drag.sd <= DRAG_SD_PS:
@@ -227,50 +215,66 @@ def _accepted_drag(drag: Estimate, refusals: dict[str, str]) -> Estimate | None:
 
 
 def _accepted_vertical(
-    motion: Motion, fit: VerticalFit, refusals: dict[str, str]
+    motion: Motion, fit: dict[str, Estimate], refusals: dict[str, str]
 ) -> dict[str, Any]:
     """Those of hover thrust, thrust lag and thrust delay that are certain enough, by name."""
     accepted: dict[str, Any] = {}
-    hover = fit.hover_thrust
+    hover, effect = fit["hover_thrust"], fit["thrust_effect_s"]
     if 0.02 < hover.value < 0.95 and hover.sd <= HOVER_SD * hover.value:
         accepted["hover_thrust"] = hover
     else:
         refusals["hover_thrust"] = (
             f"the hover thrust {hover.value:.3g} is uncertain: sd {hover.sd:.2g}"
         )
-    thrust: Array = motion.thrust(fit.thrust_delay_s.value, fit.thrust_lag_s.value)
-    moved = float(np.std(thrust)) / hover.value
-    most_s = max(EFFECT_SD_S, EFFECT_SD * fit.thrust_effect_s.value)
+    moved = float(np.std(_thrust(motion, fit))) / hover.value
+    most_s = max(EFFECT_SD_S, EFFECT_SD * effect.value)
     if moved < LEAST_THRUST_CHANGE:
         refusals["thrust_lag_s"] = (
             f"the thrust changed by {100.0 * moved:.1f} % rms, {100.0 * LEAST_THRUST_CHANGE:.1f} % "
             "are needed: its lag shows in a climb"
         )
-    elif not fit.thrust_effect_s.sd <= most_s:
+    elif not effect.sd <= most_s:
         refusals["thrust_lag_s"] = (
-            f"delay and lag of the thrust are uncertain: sd {fit.thrust_effect_s.sd:.2g} s, "
-            f"limit {most_s:.2g} s"
+            f"delay and lag of the thrust are uncertain: sd {effect.sd:.2g} s, limit {most_s:.2g} s"
         )
     else:
-        names = ("thrust_lag_s", "thrust_delay_s", "thrust_effect_s")
-        accepted |= {name: getattr(fit, name) for name in names}
+        accepted |= {name: fit[name] for name in THRUST_EFFECT}
     return accepted
 
 
 # ---------------------------------------------------------------------- bounds and texts
 
-# Least and greatest value of each constant, whatever the vehicle file says.
-BOUNDS = {
-    "delay": DELAY_LIMITS_S,
-    "frequency": FREQUENCY_LIMITS_RADPS,
-    "damping": DAMPING_LIMITS,
-    "hover thrust": HOVER_THRUST_LIMITS,
-    "thrust lag": (0.0, 0.4),
-    "thrust delay": (0.0, 0.5),
-    "drag": (0.02, 3.0),
-}
 DELAY_SLACK_S = 0.4  # allowed in addition to the factor: a link may be slow
 LINK_S = 0.03  # a smaller difference of delays is the vehicle's own, not the link's
+
+
+# Least and greatest value of each constant, whatever the vehicle file says; (limits, slack)
+AXIS_BOUNDS = {
+    "delay_s": (DELAY_LIMITS_S, DELAY_SLACK_S),
+    "natural_frequency_radps": (FREQUENCY_LIMITS_RADPS, 0.0),
+    "damping": (DAMPING_LIMITS, 0.0),
+}
+BODY_BOUNDS = {
+    "hover_thrust": (HOVER_THRUST_LIMITS, 0.0),
+    "thrust_lag_s": ((0.0, 0.4), DELAY_SLACK_S),
+    "thrust_delay_s": ((0.0, 0.5), DELAY_SLACK_S),
+    "drag_ps": ((0.02, 3.0), 0.0),
+}
+BOUNDS = {f"{axis}_{name}": AXIS_BOUNDS[name] for axis in ("tilt", "yaw") for name in AXIS_BOUNDS}
+BOUNDS |= BODY_BOUNDS
+RECORDED = tuple(BOUNDS)  # in the log, in this order
+
+
+def constants_of(vehicle: Vehicle) -> dict[str, float]:
+    """The constants of BOUNDS."""
+    axes = {"tilt": vehicle.tilt, "yaw": vehicle.yaw}
+    of_axes = {f"{axis}_{name}": getattr(axes[axis], name) for axis in axes for name in AXIS_BOUNDS}
+    return of_axes | {
+        "hover_thrust": vehicle.hover_thrust,
+        "thrust_lag_s": vehicle.thrust_lag_s,
+        "thrust_delay_s": vehicle.thrust_delay_s,
+        "drag_ps": vehicle.drag_per_mass_ps,
+    }
 
 
 def within_bounds(
@@ -280,43 +284,26 @@ def within_bounds(
     than `factor`, and a sentence about each of those."""
     sentences: list[str] = []
     rejected: dict[str, Any] = {}
-
-    def outside(what: str, value: float, expected: float, kind: str, slack: float = 0.0) -> bool:
-        low, high = BOUNDS[kind]
-        low = max(low, expected / factor - slack)
-        high = min(high, expected * factor + slack)
-        if low <= value <= high:
-            return False
-        sentences.append(
-            f"{what} {value:.3g} contradicts the {expected:.3g} of vehicle {vehicle_file.name} "
-            f"({low:.3g} to {high:.3g} allowed), not adopted"
-        )
-        return True
-
-    for name in ("tilt", "yaw"):
-        fit, axis = getattr(found, name), getattr(vehicle_file, name)
-        if fit is None:
+    expected_of = constants_of(vehicle_file)
+    for name, estimate in found.estimates.items():
+        field = name if name in BODY_BOUNDS else name.partition("_")[0]
+        if estimate is None or field in rejected:
             continue
-        assert isinstance(axis, AxisResponse)
-        frequency = axis.natural_frequency_radps
-        if (
-            outside(f"{name} delay", fit.delay_s.value, axis.delay_s, "delay", DELAY_SLACK_S)
-            or outside(
-                f"{name} frequency", fit.natural_frequency_radps.value, frequency, "frequency"
+        ((least, greatest), slack), expected = BOUNDS[name], expected_of[name]
+        low = max(least, expected / factor - slack)
+        high = min(greatest, expected * factor + slack)
+        if not low <= estimate.value <= high:
+            rejected[field] = None
+            sentences.append(
+                f"{_in_words(name)} {estimate.value:.3g} contradicts the {expected:.3g} of vehicle "
+                f"{vehicle_file.name} ({low:.3g} to {high:.3g} allowed), not adopted"
             )
-            or outside(f"{name} damping", fit.damping.value, axis.damping, "damping")
-        ):
-            rejected[name] = None
-    for name, what, expected, slack in (
-        ("hover_thrust", "hover thrust", vehicle_file.hover_thrust, 0.0),
-        ("thrust_lag_s", "thrust lag", vehicle_file.thrust_lag_s, DELAY_SLACK_S),
-        ("thrust_delay_s", "thrust delay", vehicle_file.thrust_delay_s, DELAY_SLACK_S),
-        ("drag_ps", "drag", vehicle_file.drag_per_mass_ps, 0.0),
-    ):
-        estimate: Estimate | None = getattr(found, name)
-        if estimate is not None and outside(what, estimate.value, expected, what, slack):
-            rejected[name] = None
-    return (replace(found, **rejected) if rejected else found), sentences
+    return replace(found, **rejected), sentences
+
+
+def _in_words(name: str) -> str:
+    """`tilt frequency` of `tilt_natural_frequency_radps`."""
+    return " ".join(word for word in name.split("_") if word not in ("natural", "radps", "s", "ps"))
 
 
 def with_link_delay(found: Identified, target: Vehicle, vehicle_file: Vehicle) -> Vehicle:
@@ -356,21 +343,9 @@ def summary(found: Identified) -> str:
     return "identified " + "; ".join(parts)
 
 
-# in the order of `log_record`
-RECORDED = (
-    "tilt_delay_s", "tilt_natural_frequency_radps", "tilt_damping",
-    "yaw_delay_s", "yaw_natural_frequency_radps", "yaw_damping",
-    "hover_thrust", "thrust_lag_s", "thrust_delay_s", "drag_ps",
-)  # fmt: skip
-
-
 def log_record(found: Identified) -> tuple[float, ...]:
     """Value and sd of each constant of RECORDED, for the log; NaN for what was not identified."""
-    estimates: list[Estimate | None] = []
-    for fit in (found.tilt, found.yaw):
-        estimates += (fit.delay_s, fit.natural_frequency_radps, fit.damping) if fit else (None,) * 3
-    estimates += [found.hover_thrust, found.thrust_lag_s, found.thrust_delay_s, found.drag_ps]
     numbers: list[float] = []
-    for each in estimates:
+    for each in found.estimates.values():
         numbers += (each.value, each.sd) if each else (math.nan, math.nan)
     return tuple(numbers)

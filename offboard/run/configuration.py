@@ -34,8 +34,8 @@ from offboard.documents.reading import (
     validate,
 )
 from offboard.documents.shipped import locate, read_text
-from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import Limits
+from offboard.identification.learner import IdentifySettings
 from offboard.model.vehicle import Vehicle
 from offboard.reference.feasibility import Envelope, check
 from offboard.reference.shapes import SHAPES, FromTable, Shape

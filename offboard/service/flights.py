@@ -16,7 +16,7 @@ from offboard.flight.flight import STOPPED, Flight, Outcome, Output
 from offboard.flight.phases import ENDS, FLYING, WAITING, Phase, ServiceOptions
 from offboard.flight.starting import found_engaged
 from offboard.flight.state import FlightState
-from offboard.identification.learner import IdentifiedVehicle
+from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from offboard.link.interface import Chunk
 from offboard.mavlink.session import Session
 from offboard.run.flight import Prepared

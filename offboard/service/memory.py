@@ -17,8 +17,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from offboard.documents.reading import DocumentError, read, validate
 from offboard.documents.shipped import read_text
-from offboard.identification.learner import IdentifiedVehicle
 from offboard.identification.uncertainty import Estimate
+from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from offboard.model.vehicle import Vehicle
 from offboard.run.flight import Prepared
 

@@ -25,9 +25,9 @@ from offboard.control.base import Controller
 from offboard.estimation.observer import Observer
 from offboard.flight.flight import Flight, Outcome
 from offboard.flight.flight_plan import FlightPlan
-from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import Action, Phase
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
+from offboard.identification.learner import IdentifySettings
 from offboard.link.interface import Chunk
 from offboard.link.log import FlightLog
 from offboard.mavlink.session import Session, SessionSettings

@@ -22,7 +22,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.flight.phases import Anchor, Phase, ServiceOptions, Then
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
-from offboard.identification.learner import IdentifiedVehicle
+from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.run import configuration as config
 from offboard.run.flight import Prepared, build

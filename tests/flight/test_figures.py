@@ -12,8 +12,8 @@ from pair import calm_hover, make
 
 from offboard.analysis import history
 from offboard.analysis.score import score
-from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import Action, Phase
+from offboard.identification.learner import IdentifySettings
 from simulator import config as simulated
 
 

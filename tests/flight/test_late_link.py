@@ -11,9 +11,9 @@ import pytest
 from faults import late
 from pair import Pair, in_phase, make, through
 
-from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import Phase
 from offboard.flight.vehicle_clock import LEAST_GROWTH_S
+from offboard.identification.learner import IdentifySettings
 
 CHANGED_S, BACK_S = 2.0, 8.0  # in track
 CONFIGURED_RADPS = 7.0

@@ -13,8 +13,8 @@ from faults import late, losing, repeating, stuttering, without
 from pair import Filter, Pair, make, through
 
 from offboard.analysis.score import Score
-from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import Limits
+from offboard.identification.learner import IdentifySettings
 
 LAP = ("controller={law: lqr}", "reference.laps=1", "reference.height_m=1.0")
 PLAIN_DELAY_MS = 57.0  # of the vehicle itself

@@ -40,11 +40,11 @@ from watch import (
     watched,
 )
 
-from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import PHASE_CODES, Action, ExitCode, Limits, Phase
 from offboard.flight.positioning import Positioning
 from offboard.flight.state import Outcome
 from offboard.flight.vehicle_state import VehicleState
+from offboard.identification.learner import IdentifySettings
 from offboard.mavlink.events import EstimatorReport
 from simulator import config as simulated
 from simulator.config import Scenario

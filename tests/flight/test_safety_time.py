@@ -40,8 +40,8 @@ from offboard.analysis.score import score
 from offboard.analysis.score_table import summary
 from offboard.control.base import Controller, Decision, Situation
 from offboard.estimation.observer import Observer
-from offboard.flight.online_identification import IdentifySettings, OnlineIdentification
 from offboard.flight.phases import Action, ExitCode, Phase
+from offboard.identification.learner import IdentifySettings, Learner
 from simulator import config as simulated
 
 DEADLINE_S, PERIOD_S = 0.05, 0.1
@@ -264,7 +264,7 @@ def test_no_setpoint_waits_for_the_identification(
 ) -> None:
     """Each of its pieces takes 60 ms, and the decision 2 ms."""
     clock = HostClock()
-    identify = OnlineIdentification.learn
+    identify = Learner.learn
 
     def slow(*arguments: Any) -> Any:
         clock.spend(0.06)
@@ -280,7 +280,7 @@ def test_no_setpoint_waits_for_the_identification(
         law.decide = later  # type: ignore[method-assign]
         return law
 
-    monkeypatch.setattr(OnlineIdentification, "learn", slow)
+    monkeypatch.setattr(Learner, "learn", slow)
     pair = hover(learning=IdentifySettings(), deadline_s=DEADLINE_S, clock=clock, wrap=deciding)
     pair.track()
     result = pair.score(tmp_path)

@@ -13,7 +13,8 @@ import numba
 import numpy as np
 
 from offboard.control.base import Controller, Situation
-from offboard.estimation.observer import Noise, Observer
+from offboard.estimation.noise import Noise
+from offboard.estimation.observer import Observer
 from offboard.model.command import Command
 from offboard.model.frames import quaternion_from_thrust_direction
 from offboard.model.vehicle import Vehicle

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from offboard.control.swarm import SEARCH, iterate
-from offboard.estimation.kalman import FILTER
+from offboard.estimation.motion import PLANT
 
 ROOT = Path(__file__).parents[2]
 OFFSET = "OFFSET = 1.0\n"
@@ -189,7 +189,7 @@ def test_arguments_of_other_types_are_refused(wrong: np.ndarray) -> None:
     with pytest.raises(TypeError, match="No matching definition"):
         iterate(np.zeros(1, SEARCH), rng, bounds, wrong, best, bounds)
     with pytest.raises(TypeError, match="No matching definition"):
-        iterate(np.zeros(1, FILTER), rng, bounds, np.zeros((3, 2, 4)), best, bounds)
+        iterate(np.zeros(1, PLANT), rng, bounds, np.zeros((3, 2, 4)), best, bounds)
 
 
 def test_importing_a_flight_does_not_import_numba() -> None:

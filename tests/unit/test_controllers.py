@@ -14,8 +14,8 @@ from offboard.control.base import Controller, Situation
 from offboard.control.catalogue import names, settings_of
 from offboard.documents import shipped
 from offboard.documents.reading import read
-from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import Limits
+from offboard.identification.learner import IdentifySettings
 from offboard.run.configuration import FlightConfig, read_part
 
 ENDS = ("minimum", "exclusiveMinimum", "maximum")  # of a JSON schema

@@ -11,17 +11,9 @@ import pytest
 from attitude_plant import Plant, Truth
 from scipy.integrate import solve_ivp
 
-from offboard.estimation.observer import Noise, Observer
-from offboard.estimation.propagation import (
-    COMMAND_SIZE,
-    LATER,
-    MOTION,
-    NOW,
-    STATE_SIZE,
-    THRUST,
-    plant_of,
-    replay,
-)
+from offboard.estimation.motion import COMMAND_SIZE, STATE_SIZE, THRUST, plant_of, propagate
+from offboard.estimation.noise import Noise
+from offboard.estimation.observer import Observer
 from offboard.model.command import Command
 from offboard.model.frames import quaternion_from_thrust_direction
 from offboard.model.predicted_state import PredictedState
@@ -157,18 +149,14 @@ def test_replay_agrees_with_scipy(damping: float) -> None:
     for a, b in itertools.pairwise(edges):
         u = held(0.5 * (a + b))
         x = solve_ivp(rate, (a, b), x, "DOP853", args=(u,), rtol=1e-11, atol=1e-12).y[:, -1]
-    motion = np.zeros(1, MOTION)
-    motion["states"][0, NOW] = start
-    motion["plant"] = plant_of(vehicle)
-    motion["history"][0, :5], motion["sent"] = sent, 5
-    replay(motion, LATER, 0.0, 1.0)
-    assert motion["states"][0, LATER] == pytest.approx(x, abs=3e-6)
+    propagate(start, plant_of(vehicle), sent, 0.0, 1.0)
+    assert start == pytest.approx(x, abs=3e-6)
 
 
 @pytest.mark.parametrize("about_rad", [0.0, math.pi, -math.pi])
 def test_prediction_is_exact_on_a_matching_plant(about_rad: float) -> None:
     """Facing south, heading, its telemetry and its commands are now on one side of the wrap, now on
-    the other."""
+    the other. After a gap of half a second the state is right at once."""
     plant = Plant(Truth(PX4, noisy=False), np.random.default_rng(0))
     plant.x[11] = about_rad
     plant.command(replace(LEVEL, heading_rad=about_rad))
@@ -176,25 +164,22 @@ def test_prediction_is_exact_on_a_matching_plant(about_rad: float) -> None:
     observer.on_command(0.0, replace(LEVEL, heading_rad=about_rad))
     pairs = follow(plant, observer, 6.0, seed=5, about_rad=about_rad)[20:]
     assert len(pairs) > 30
+    sent = command(-0.1, 0.05, heading=about_rad)
+    plant.command(sent)
+    observer.on_command(plant.time_s, sent)
+    plant.advance(0.5)
+    pairs.append((observer.predict(plant.time_s - PX4.tilt.delay_s), plant.x.copy()))
+    observer.on_attitude(plant.time_s, plant.attitude(), STILL)
+    observer.on_position(plant.time_s, *plant.position())
+    pairs.append((observer.predict(plant.time_s - PX4.tilt.delay_s), plant.x.copy()))
     for state, truth in pairs:
-        assert state.position_ned_m == pytest.approx(truth[:3], abs=2e-4)
+        assert state.position_ned_m == pytest.approx(truth[:3], abs=4e-4)
         assert state.velocity_ned_mps == pytest.approx(truth[3:6], abs=3e-3)
         assert state.thrust_direction_ned[:2] == pytest.approx(truth[6:8], abs=1e-3)
         assert state.thrust_direction_rate_ned_ps[:2] == pytest.approx(truth[8:10], abs=1e-2)
         assert abs(state.heading_rad) <= math.pi
         apart = math.remainder(state.heading_rad - truth[11], math.tau)
         assert apart == pytest.approx(0.0, abs=1e-3)
-
-
-def test_command_changes_the_prediction_only_after_its_delay() -> None:
-    observer = hovering(until_s=1.0, vehicle=PX4)
-    before = observer.predict(1.0)
-    observer.on_command(1.0, command(0.3, 0.0))
-    at_once, later = observer.predict(1.0), observer.predict(1.05)
-    assert at_once.time_s == pytest.approx(1.057)
-    assert at_once.thrust_direction_ned[0] == before.thrust_direction_ned[0]
-    expected = 0.5 * 0.3 * 11.4**2 * 0.05**2  # the first 50 ms of a second-order step
-    assert later.thrust_direction_ned[0] == pytest.approx(expected, rel=0.3)
 
 
 def test_vertical_is_predicted_to_the_time_when_the_thrust_acts() -> None:
@@ -218,8 +203,7 @@ def test_vertical_is_predicted_to_the_time_when_the_thrust_acts() -> None:
 # ---------------------------------------------------------------- disturbance and bias
 
 
-@pytest.mark.parametrize("gap_s", [0.01, 0.033, 0.05])
-@pytest.mark.parametrize("velocity_sd_mps", [0.005, 1.0])
+@pytest.mark.parametrize(("gap_s", "velocity_sd_mps"), [(0.01, 1.0), (0.033, 0.005), (0.05, 0.005)])
 def test_disturbance_and_velocity_converge_at_any_rate(
     gap_s: float, velocity_sd_mps: float
 ) -> None:
@@ -267,14 +251,18 @@ def test_hover_thrust_is_estimated_from_the_disturbance(scale: float) -> None:
     assert abs(state.velocity_ned_mps[2]) < 0.01
 
 
-def test_disturbance_is_bounded() -> None:
-    observer = Observer(NO_DELAY)
-    observer.on_command(0.0, LEVEL)
+def test_observer_goes_on_smoothly_with_another_drag() -> None:
+    """The predicted acceleration stays the same: the disturbance changes with the drag."""
+    observer = Observer(PX4)
     for i in range(300):
-        time_s = 0.01 * i
-        observer.on_attitude(time_s, UPRIGHT, STILL)
-        observer.on_position(time_s, (6.0 * time_s**2, 0.0, 0.0), (12.0 * time_s, 0.0, 0.0))
-    assert observer.predict(3.0).disturbance_ned_mps2[0] == pytest.approx(8.0)
+        observer.on_attitude(0.01 * i, UPRIGHT, STILL)
+        observer.on_position(0.01 * i, (0.02 * i, -0.01 * i, -3.0), (2.0, -1.0, 0.0))
+    old = observer.predict(3.0)
+    observer.set_vehicle(PX4.model_copy(update={"drag_translation_npmps": (1.82, 1.82, 1.82)}))
+    new = observer.predict(3.0)
+    change = new.disturbance_ned_mps2 - old.disturbance_ned_mps2
+    assert change == pytest.approx(0.8 * old.velocity_ned_mps, abs=0.02)
+    assert new.velocity_ned_mps == pytest.approx(old.velocity_ned_mps, abs=2e-3)
 
 
 # ---------------------------------------------------------------- ground, gaps, jumps
@@ -327,53 +315,27 @@ def test_position_older_than_the_attitude_is_used_at_its_own_time() -> None:
     assert state.velocity_ned_mps[0] == pytest.approx(3.0, abs=5e-3)
 
 
-def test_a_position_jump_is_followed_without_a_velocity_kick() -> None:
+def test_a_jump_is_followed_without_a_velocity_kick() -> None:
+    """A position that jumps, and a velocity, which becomes bias. The next position has little
+    effect: the jump says nothing of the velocity."""
+    kicks = []
+    for position in ((2.0, -1.0, 0.0), STILL):
+        observer = hovering()
+        observer.on_attitude(5.01, UPRIGHT, STILL)
+        observer.on_position(5.01, position, STILL)
+        state = observer.predict(5.01)
+        assert state.position_ned_m == pytest.approx(position, abs=1e-6)
+        assert state.velocity_ned_mps == pytest.approx([0, 0, 0], abs=1e-6)
+        observer.on_position(5.02, (position[0] + 0.01, position[1], 0.0), STILL)
+        kicks.append(observer.predict(5.02).velocity_ned_mps[0])
+    assert 0 < kicks[0] < 0.6 * kicks[1]
     observer = hovering()
-    observer.on_attitude(5.01, UPRIGHT, STILL)
-    observer.on_position(5.01, (2.0, -1.0, 0.0), STILL)
-    state = observer.predict(5.01)
-    assert state.position_ned_m == pytest.approx([2.0, -1.0, 0.0], abs=1e-6)
-    assert state.velocity_ned_mps == pytest.approx([0, 0, 0], abs=1e-6)
-    # the next message has little effect: the jump says nothing of the velocity
-    observer.on_position(5.02, (2.01, -1.0, 0.0), STILL)
-    undisturbed = hovering()
-    undisturbed.on_position(5.01, STILL, STILL)
-    undisturbed.on_position(5.02, (0.01, 0.0, 0.0), STILL)
-    kick = observer.predict(5.02).velocity_ned_mps[0]
-    assert 0 < kick < 0.6 * undisturbed.predict(5.02).velocity_ned_mps[0]
+    for time_s in (5.01, 5.02):
+        observer.on_position(time_s, STILL, (0.0, 2.0, 0.0))
+        assert observer.predict(time_s).velocity_ned_mps == pytest.approx([0, 0, 0], abs=0.01)
 
 
-def test_velocity_jump_is_added_to_the_bias() -> None:
-    observer = hovering()
-    observer.on_position(5.01, STILL, (0.0, 2.0, 0.0))
-    assert observer.predict(5.01).velocity_ned_mps == pytest.approx([0, 0, 0], abs=1e-6)
-    observer.on_position(5.02, STILL, (0.0, 2.0, 0.0))
-    assert observer.predict(5.02).velocity_ned_mps == pytest.approx([0, 0, 0], abs=0.01)
-
-
-def test_a_gap_of_half_a_second_is_replayed() -> None:
-    """No telemetry while a tilt command acts: the predicted position is that of the plant."""
-    plant = Plant(Truth(PX4, noisy=False), np.random.default_rng(0))
-    observer = Observer(PX4)
-    plant.command(LEVEL)
-    observer.on_command(0.0, LEVEL)
-    for _ in range(300):
-        observer.on_attitude(plant.time_s, plant.attitude(), STILL)
-        observer.on_position(plant.time_s, *plant.position())
-        plant.advance(0.01)
-    sent = command(-0.1, 0.05)
-    plant.command(sent)
-    observer.on_command(plant.time_s, sent)
-    plant.advance(0.5)
-    predicted = observer.predict(plant.time_s - PX4.tilt.delay_s)
-    assert predicted.position_ned_m == pytest.approx(plant.x[:3], abs=1e-3)
-    observer.on_attitude(plant.time_s, plant.attitude(), STILL)
-    observer.on_position(plant.time_s, *plant.position())
-    corrected = observer.predict(plant.time_s - PX4.tilt.delay_s)
-    assert corrected.velocity_ned_mps == pytest.approx(plant.x[3:6], abs=0.01)
-
-
-def test_restart_after_a_long_gap_keeps_the_disturbance() -> None:
+def test_restart_after_a_long_gap_keeps_the_disturbance_and_after_a_reboot_the_clock() -> None:
     observer = Observer(NO_DELAY)
     observer.on_command(0.0, LEVEL)
     assert not observer.ready
@@ -390,10 +352,6 @@ def test_restart_after_a_long_gap_keeps_the_disturbance() -> None:
     assert state.position_ned_m == pytest.approx([7.0, 7.0, -7.0])
     assert state.velocity_ned_mps == pytest.approx([1.0, 0.0, 0.0])
     assert state.disturbance_ned_mps2[0] == pytest.approx(0.5, abs=0.05)
-
-
-def test_restart_after_a_reboot_of_the_vehicle() -> None:
-    observer = hovering()
     observer.on_attitude(0.5, UPRIGHT, STILL)
     observer.on_position(0.5, (4.0, 0.0, 0.0), STILL)
     state = observer.predict(0.5)
@@ -419,16 +377,7 @@ def test_state_is_finite_under_any_telemetry() -> None:
         parts = [state.position_ned_m, state.velocity_ned_mps, state.thrust_direction_ned,
                  state.thrust_direction_rate_ned_ps, state.disturbance_ned_mps2]  # fmt: skip
         assert all(np.isfinite(part).all() for part in parts)
+        assert np.abs(state.disturbance_ned_mps2).max() <= 8.0
         assert math.isfinite(state.heading_rad)
         assert math.isfinite(state.thrust_mps2)
         assert np.linalg.norm(state.thrust_direction_ned[:2]) < 10
-
-
-def test_two_observers_agree_to_the_bit() -> None:
-    states = []
-    for _ in range(2):
-        plant = Plant(Truth(PX4), np.random.default_rng(9))
-        plant.command(LEVEL)
-        observer = Observer(PX4)
-        states.append([pair[0].velocity_ned_mps for pair in follow(plant, observer, 2.0, seed=2)])
-    assert np.array_equal(states[0], states[1])

@@ -21,8 +21,8 @@ from offboard.cli.daemon import may_pass
 from offboard.flight import manifest
 from offboard.flight.authority import PilotSwitch
 from offboard.flight.flight_plan import CLEAR_M, FlightPlan
-from offboard.identification.learner import IdentifiedVehicle
 from offboard.identification.uncertainty import Estimate
+from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from offboard.link import clock
 from offboard.link.interface import LinkError
 from offboard.link.lock import Locked, connection_lock, directory_lock

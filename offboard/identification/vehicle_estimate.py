@@ -1,0 +1,293 @@
+"""What one vehicle is, and how sure of its delays: the estimate that fits and the link change.
+
+It begins with the vehicle file, or with what an earlier flight has identified. A fit is adopted
+where it is within bounds and better known than what is in use, or confirmed to be another.
+Telemetry that contradicts the constants in use makes the delay uncertain at once, until a fit
+explains the flight. `vehicle` and `uncertainty` are the result. What they mean for a control law is
+not known here. Times are vehicle time.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+from offboard.identification.attitude_fit import ResponseFit, Unexplained
+from offboard.identification.uncertainty import Estimate
+from offboard.identification.vehicle_fit import (
+    LINK_S,
+    Identified,
+    log_record,
+    summary,
+    with_link_delay,
+    within_bounds,
+)
+from offboard.model.vehicle import DelayUncertainty, Vehicle
+
+# What a delay may be wrong by: of a vehicle file in general; of one that is flown as it is
+UNKNOWN_DELAY_S, FILE_DELAY_S = 0.28, 0.13
+SDS = 3.0  # standard deviations that an identified delay may be wrong by
+DIRECT_LINK_S = 0.004  # link delay without a slow link: age of telemetry
+LINK_DIGITS = 2  # of seconds: a smaller change of the link is ignored
+# After so many contradictions the delay stays uncertain until nothing contradicts for CALM_S
+MOST_CONTRADICTIONS, CALM_S = 2, 20.0
+# A new tilt fit replaces the old one if its delay's sd, or in doubt the tilt that it leaves
+# unexplained, is less than this share of the old one's
+BETTER = 0.7
+LEAST_JUMP_S, JUMP_SDS = 0.015, 4.0  # delays that differ by more contradict each other
+# Delay and lag of the thrust that are less certain than this are not adopted, unless those in use
+# are wrong by more: the height is unstable with 60 ms too much as well as with 90 ms too little
+THRUST_SD_S = 0.02
+FACTOR = 4.0  # greatest ratio, either way, of an identified constant to the vehicle file's
+DECISIVE = ("tilt", "hover_thrust")  # out of bounds, these end the flight
+LINKED = ("yaw", "thrust_delay_s")  # changed with the tilt's delay where not identified themselves
+
+
+@dataclass(frozen=True, slots=True)
+class IdentifiedVehicle:
+    """What a flight has identified, for the next one of the same vehicle. The delays of `vehicle`
+    contain the link's delay of then, `link_s` (telemetry and setpoint together; 0 if it was not
+    measured). `delay` is the delay of the tilt and its standard deviation, s."""
+
+    vehicle: Vehicle
+    delay: Estimate
+    link_s: float
+
+
+class VehicleEstimate:
+    """One vehicle during one flight.
+
+    Args:
+        file: constants of the vehicle file.
+        delay_error_s: what its delays may be wrong by.
+        known: what an earlier flight has identified.
+
+    `vehicle` are the constants to fly with. `delay` is that of the tilt once identified.
+    `sentences` for the user and `record` for the log are what is new; who reads them empties them.
+    `cause` is why the uncertainty of the delay is what it is; empty where a sentence says it.
+    `contradiction` says why the vehicle file must not be flown with, or is empty. `adopted_s`: time
+    of the newest adoption.
+    """
+
+    def __init__(
+        self, file: Vehicle, *, delay_error_s: float, known: IdentifiedVehicle | None = None
+    ) -> None:
+        self.file = file
+        self.vehicle = known.vehicle if known else file
+        self.delay: Estimate | None = known.delay if known else None
+        self.sentences: list[str] = []
+        self.record: tuple[float, ...] = ()
+        self.cause = self.contradiction = ""
+        self.adopted_s = -math.inf
+        self._recalled = known
+        self._unknown_s = delay_error_s
+        self._thrust: Estimate | None = None  # delay and lag of the thrust, once identified
+        self._link_s = 0.0  # the link's delay before the flight
+        self._link = (0.0, 0.0)  # added since take-off, and changed lately
+        self._doubt_s = 0.0  # what the delay may be wrong by because telemetry contradicts it
+        self._contradictions = 0
+        self._calm_from_s = -math.inf  # the time of the last
+        self._other_delay: Estimate | None = None  # seen once, contradicts the one in use
+        self._replaced: dict[str, Any] = {}  # tilt constants before the last adoption
+        self._rejected_drag_ps = math.inf
+
+    @property
+    def uncertainty(self) -> DelayUncertainty:
+        """What is not known of the delays of `vehicle`."""
+        added_s, changed_s = self._link
+        known_s = SDS * self.delay.sd if self.delay else self._unknown_s
+        thrust_s = SDS * self._thrust.sd if self._thrust else 0.0
+        tilt_s = max(known_s, self._doubt_s, changed_s)
+        return DelayUncertainty(tilt_s=tilt_s, thrust_s=thrust_s, link_s=added_s)
+
+    @property
+    def in_doubt(self) -> bool:
+        """Whether telemetry contradicts the delay, and no fit has explained it yet."""
+        return self._doubt_s > 0.0
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether this flight has contradicted the constants in use."""
+        return self.in_doubt or self._contradictions > 0 or bool(self.contradiction)
+
+    @property
+    def result(self) -> IdentifiedVehicle | None:
+        """What the next flight may begin with; None if nothing was identified, or in doubt."""
+        if self.delay is None or self.contradicted:
+            return None
+        return IdentifiedVehicle(self.vehicle, self.delay, self._link_s)
+
+    @property
+    def previous(self) -> Vehicle:
+        """The vehicle with the tilt constants before the last adoption."""
+        return self.vehicle.model_copy(update=self._replaced)
+
+    # ------------------------------------------------------------------ link and take-over
+
+    def on_link_delay(self, link: Estimate | None) -> None:
+        """The link's delay, measured before lift-off; None if the vehicle did not answer. It is in
+        every delay of the vehicle. What remains unknown is the vehicle's own delay and the link's
+        scatter."""
+        if link is None:
+            return
+        self._link_s = link.value
+        if self.delay is not None and self._recalled is not None:
+            self._on_other_link(self._recalled, self.delay, link)
+            return
+        added_s = link.value - DIRECT_LINK_S
+        if added_s >= LINK_S:
+            self.vehicle = self.vehicle.later_by(added_s)
+            self.sentences.append(f"link delay {_in_ms(link)}, telemetry and setpoint together")
+        self._unknown_s += JUMP_SDS * link.sd
+
+    def _on_other_link(self, recalled: IdentifiedVehicle, delay: Estimate, link: Estimate) -> None:
+        """Adapt what was recalled to the link's delay of now."""
+        changed_s = link.value - max(recalled.link_s, DIRECT_LINK_S)
+        changed_s = max(changed_s, -self.vehicle.tilt.delay_s, -self.vehicle.yaw.delay_s)
+        if abs(changed_s) < LINK_S:
+            return
+        self.vehicle = self.vehicle.later_by(changed_s)
+        self.delay = Estimate(delay.value + changed_s, math.hypot(delay.sd, link.sd))
+        self.sentences.append(
+            f"the link delays by {1e3 * changed_s:+.0f} ms since the vehicle was identified"
+        )
+
+    def on_link_growth(self, added_s: float, changed_s: float) -> None:
+        """The link has added `added_s` to its delay since take-off, which the times of commands
+        contain, and has changed by `changed_s` lately: the delay is not known better."""
+        link = round(added_s, LINK_DIGITS), round(changed_s, LINK_DIGITS)
+        if self._link == link:
+            return
+        self._link = link
+        change_ms = round(1e3 * link[0])
+        of_link = f"has grown by {change_ms} ms" if change_ms > 0 else "is that of take-off"
+        of_tilt = f"is {_in_ms(self.delay)}" if self.delay else "is not identified yet"
+        self.cause = f"the link's delay {of_link}, the tilt's {of_tilt}"
+
+    def on_hover_thrust(self, hover_thrust: float) -> None:
+        """The hover thrust that the vehicle showed before the take-over, with which it is flown."""
+        self.vehicle = self.vehicle.model_copy(update={"hover_thrust": hover_thrust})
+
+    # ------------------------------------------------------------------ fits
+
+    def within_bounds(self, found: Identified) -> tuple[Identified, list[str]]:
+        """What may be adopted, and a sentence about each constant that may not."""
+        return within_bounds(found, self.file, FACTOR)
+
+    def adopt(self, found: Identified, time_s: float) -> None:
+        """Use what is within bounds from now on."""
+        within, sentences = self.within_bounds(found)
+        if any(getattr(found, name) and not getattr(within, name) for name in DECISIVE):
+            self.contradiction = "; ".join(sentences)
+        effect = within.thrust_effect_s
+        in_use = Estimate(self.vehicle.thrust_delay_s + self.vehicle.thrust_lag_s, 0.0)
+        if effect and effect.sd > THRUST_SD_S and not _apart(effect, in_use):
+            within = replace(within, thrust_lag_s=None, thrust_delay_s=None, thrust_effect_s=None)
+        applied = within.applied_to(self.vehicle)
+        vehicle = with_link_delay(within, applied, self.file)
+        if within.tilt is not None:
+            moved = [name for name in LINKED if getattr(vehicle, name) != getattr(applied, name)]
+            self._replaced = {name: getattr(self.vehicle, name) for name in ("tilt", *moved)}
+            self.delay = within.tilt.delay_s
+            self._other_delay = None
+        if within.thrust_delay_s is not None:
+            self._thrust = within.thrust_effect_s
+        if vehicle != self.vehicle:
+            self.vehicle, self.adopted_s = vehicle, time_s
+            sentences.insert(0, summary(within))
+        if within.drag_ps is None and found.drag_ps is not None:
+            self._rejected_drag_ps = found.drag_ps.value
+        self.sentences += sentences
+        self.record = log_record(found)
+
+    def review_drag(self, found: Identified, least_ps: float, time_s: float) -> None:
+        """Adopt a drag that differs, by its sd and by `least_ps`, from the one in use and from the
+        one that was out of bounds."""
+        known = (self.vehicle.drag_per_mass_ps, self._rejected_drag_ps)
+        drag = found.drag_ps
+        if drag and all(abs(drag.value - each) > max(least_ps, drag.sd) for each in known):
+            self.adopt(found, time_s)
+
+    def review_tilt(self, found: Identified, now: Unexplained, time_s: float) -> None:
+        """Compare a later fit of the tilt with the constants in use, and adopt it if it is better.
+        `now` is what these leave unexplained in the same stretch of flight."""
+        tilt = found.tilt
+        if now.contradicts:
+            self._calm_from_s = time_s
+        elif time_s >= self._calm_from_s + CALM_S:
+            self._contradictions = 0
+        if tilt is None or self.within_bounds(found)[1]:
+            return
+        if self.delay is None:
+            better = True
+        elif _apart(tilt.delay_s, self.delay):
+            better = self._confirmed(tilt, now)
+            if not better:
+                self._doubt(tilt.delay_s, self.delay)
+                return
+        else:
+            clearer = self.in_doubt and tilt.residual_rms < BETTER * now.rms
+            better = clearer or tilt.delay_s.sd < BETTER * self.delay.sd
+        if better:
+            self.adopt(found, time_s)
+        left = replace(now, rms=tilt.residual_rms) if better else now
+        explained = not left.contradicts if self.in_doubt else better
+        if explained and self._contradictions < MOST_CONTRADICTIONS:
+            self._doubt_s = 0.0
+            self.explain()
+
+    def explain(self, refusal: str = "") -> None:
+        """The delay is as well known as it can be now; `refusal`: why it was not identified."""
+        if self.delay is None:
+            self.cause = f"tilt response not identified, {refusal}"
+            return
+        thrust = f", of the thrust with its lag {_in_ms(self._thrust)}" if self._thrust else ""
+        self.cause = f"identified delay, {_in_ms(self.delay)}{thrust}"
+
+    def _confirmed(self, tilt: ResponseFit, now: Unexplained) -> bool:
+        """Whether something besides this fit shows that the delay is another: a fit before it, or
+        a contradiction that it explains."""
+        if self._other_delay is not None:
+            return not _apart(tilt.delay_s, self._other_delay)
+        once = 0 < self._contradictions < MOST_CONTRADICTIONS
+        explains = tilt.residual_rms < BETTER * now.rms
+        left = replace(now, rms=tilt.residual_rms)
+        return self.in_doubt and once and explains and not left.contradicts
+
+    def _doubt(self, seen: Estimate, known: Estimate) -> None:
+        self._other_delay, self.cause = seen, ""
+        self._doubt_s = max(self._doubt_s, abs(seen.value - known.value) + seen.sd)
+        self.sentences.append(
+            f"tilt delay {_in_ms(seen)} contradicts the identified {_in_ms(known)}"
+        )
+
+    def on_contradiction(self, now: Unexplained, before: Unexplained, time_s: float) -> None:
+        """The tilt does not respond as predicted: its delay may be anything. `now` and `before` are
+        what the constants in use and the ones before them leave unexplained; the latter are used
+        again if they explain more."""
+        self._doubt_s, self.cause = max(self._doubt_s, self._unknown_s), ""
+        self._contradictions += 1
+        self._calm_from_s = time_s
+        vehicle = "identified vehicle" if self.vehicle != self.file else "vehicle file"
+        sentence = (
+            f"the {vehicle} contradicts telemetry: {1e3 * now.rms:.0f} mrad of tilt unexplained "
+            f"(limit {1e3 * now.limit:.0f}, commanded {1e3 * now.commanded_rms:.0f})"
+        )
+        if before.rms < BETTER * now.rms:
+            self.delay = None
+            self.vehicle = self.previous
+            sentence += f"; the previous estimate, with {1e3 * before.rms:.0f} mrad, is used again"
+        if self._contradictions >= MOST_CONTRADICTIONS:
+            sentence += f"; its delay is unknown until nothing contradicts for {CALM_S:.0f} s"
+        self.sentences.append(sentence)
+
+
+def _apart(one: Estimate, other: Estimate) -> bool:
+    """Whether two delays contradict each other."""
+    allowed_s = max(LEAST_JUMP_S, JUMP_SDS * math.hypot(one.sd, other.sd))
+    return abs(one.value - other.value) > allowed_s
+
+
+def _in_ms(delay: Estimate) -> str:
+    return f"{1e3 * delay.value:.0f} +- {1e3 * delay.sd:.0f} ms"
