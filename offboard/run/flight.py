@@ -51,6 +51,7 @@ from offboard.supervisor.supervisor import Supervisor
 REHEARSED_DECISIONS = 5  # the fastest counts: the machine may be busy
 DISCARDED_MAX = 20  # batches of a link
 SITL_TIMEOUT_S = 180.0  # for simulator and companion in lockstep: either may compile, or be slow
+SETTINGS = SessionSettings(component_id=COMPONENT_ID, record_component_id=RECORD_COMPONENT_ID)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,10 +64,16 @@ class Connection:
 
     known_vehicle: ClassVar[None] = None  # which vehicle it is, nobody has said
 
-    @property
-    def sends_first(self) -> bool:
-        """The vehicle learns our address from what we send."""
-        return not self.address.startswith("udpin")
+    def settings(self, link: Link) -> SessionSettings:
+        """Of the session over `link`."""
+        return replace(
+            SETTINGS,
+            system_id=self.system_id,
+            stream=link.is_stream,
+            capacity_bytes_ps=link.capacity_bytes_ps,
+            # else the vehicle learns our address from what we send
+            sends_first=not self.address.startswith("udpin"),
+        )
 
     def signing(self, stack: ExitStack) -> Signing | None:
         """Signing with the kept time; closed with `stack`. Raises KeyFileError and
@@ -74,17 +81,6 @@ class Connection:
         if self.signing_key is None:
             return None
         return stack.enter_context(SigningTime(read_key(self.signing_key)))
-
-    def session(self, link: Link, signing: Signing | None) -> Session:
-        """The session over `link`."""
-        return session_of(
-            signing,
-            system_id=self.system_id,
-            stream=link.is_stream,
-            capacity_bytes_ps=link.capacity_bytes_ps,
-            lockstep=False,
-            sends_first=self.sends_first,
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,15 +112,9 @@ class Simulated:
         """Without a kept time: in lockstep no stamp depends on the clock."""
         return Signing(read_key(self.signing_key)) if self.signing_key else None
 
-    def session(self, link: Link, signing: Signing | None) -> Session:
-        """The session over `link`."""
-        return session_of(
-            signing,
-            stream=link.is_stream,
-            capacity_bytes_ps=None,
-            lockstep=True,
-            sends_first=False,
-        )
+    def settings(self, link: Link) -> SessionSettings:
+        """Of the session over `link`."""
+        return replace(SETTINGS, lockstep=True)
 
     def open_link(self, simulator: SimulatorProcess | InMemorySimulator, seed: int) -> Link:
         """Start the vehicle and return the link to it."""
@@ -156,30 +146,6 @@ class Simulated:
         """Parameters that a user must set once on this autopilot."""
         watched = DIALECTS[self.firmware].watched_parameters
         return {p.name: float(p.required_bits) for p in watched if p.required_bits}
-
-
-def session_of(
-    signing: Signing | None = None,
-    *,
-    system_id: int | None = None,
-    stream: bool,
-    capacity_bytes_ps: float | None,
-    lockstep: bool,
-    sends_first: bool,
-) -> Session:
-    """The session of a flight; see `SessionSettings`."""
-    return Session(
-        SessionSettings(
-            system_id=system_id,
-            component_id=COMPONENT_ID,
-            record_component_id=RECORD_COMPONENT_ID,
-            stream=stream,
-            capacity_bytes_ps=capacity_bytes_ps,
-            lockstep=lockstep,
-            sends_first=sends_first,
-        ),
-        signing,
-    )
 
 
 # --- a configuration made ready ---
@@ -345,7 +311,7 @@ def fly(
             supervisor.await_ready()
         stops.check()
         stack.enter_context(log)
-        session = vehicle.session(link, signing)
+        session = Session(vehicle.settings(link), signing)
         for piece in manifest.pieces(prepared.text):
             log.begin(clock.unix_us(), session.encode(piece))
         loop = Loop(

@@ -156,7 +156,7 @@ def test_late_link_blocks_and_its_delay_is_measured(firmware: str) -> None:
     patient = bench(faults=link(latency_s=0.3))
     rows = patient.consult("delay", "rates")
     assert rows["delay"].level is BLOCKS
-    delay = patient.listen().link.delay
+    delay = patient.listen().heard.clock.delay
     assert delay is not None
     assert delay.value == pytest.approx(0.6, abs=0.03)  # both directions
     assert rows["rates"].level is OK
@@ -276,5 +276,5 @@ def test_flood_of_addresses_and_ids_is_bounded() -> None:
 
     patient = bench(before=before)
     seen = patient.listen()
-    assert len(seen.senders) == 64
+    assert len(seen.heard.senders.found) == 64
     assert seen.vehicle.found is not None
