@@ -43,9 +43,13 @@ from offboard.run.configuration import (
     dump,
     read_part,
 )
-from offboard.run.in_memory import InMemorySimulator
 from offboard.run.loop import Loop
-from offboard.run.sitl import OWN_VEHICLES, SimulatorProcess, check_scenario_named
+from offboard.run.sitl import (
+    OWN_VEHICLES,
+    InMemorySimulator,
+    SimulatorProcess,
+    check_scenario_named,
+)
 from offboard.supervisor.supervisor import Supervisor
 
 REHEARSED_DECISIONS = 5  # the fastest counts: the machine may be busy
@@ -160,31 +164,25 @@ class Prepared:
     track: Track
     text: str
 
-    def observer(self) -> Observer:
-        """A new observer."""
-        return Observer(self.config.vehicle)
-
     def companion(
         self,
         session: Session,
         stopwatch: Callable[[], float],
-        *,
-        keeps_deadline: bool = True,
         **more: Any,
     ) -> Flight:
         """The companion of a flight over `session`. `stopwatch` reads host time; `more`: see
         `Flight`."""
         config = self.config
-        keeps_deadline &= not session.settings.lockstep
+        in_time = not session.settings.lockstep
         return Flight(
             vehicle=config.vehicle,
             session=session,
-            observer=self.observer(),
+            observer=Observer(config.vehicle),
             controller=self.controller,
             plan=FlightPlan(self.track),
             limits=config.limits,
             period_s=config.period_s,
-            deadline_s=config.deadline_s if keeps_deadline else None,
+            deadline_s=config.deadline_s if in_time else None,
             stopwatch=stopwatch,
             identify=config.identify,
             **more,
@@ -203,7 +201,8 @@ def rehearse(prepared: Prepared, *, keeps_deadline: bool) -> float:
     shortest possible decision, measured with `keeps_deadline`. Raises DocumentError if the control
     law fails or, with `keeps_deadline`, if a decision cannot meet the deadline.
     """
-    config, controller, observer = prepared.config, prepared.controller, prepared.observer()
+    config, controller = prepared.config, prepared.controller
+    observer = Observer(config.vehicle)
     reference = Hold((0.0, 0.0, -2.0), 0.1)
     previous = Command(config.vehicle.gravity_mps2, (0.0, 0.0, 1.0), 0.0)
     observer.freeze(True)

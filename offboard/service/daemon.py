@@ -91,7 +91,7 @@ def run(
 
         def display() -> None:
             manager.alive(clock.monotonic_s(), flights.phase.value)
-            preparation.allow(not (flights.in_flight or flights.state.vehicle.armed))
+            preparation.allowed = not (flights.in_flight or flights.state.vehicle.armed)
             show(flights)
             if monitor:
                 monitor.show(flights)

@@ -86,7 +86,6 @@ class Flights:
         memory: Memory,
         options: ServiceOptions,
         stopwatch: Callable[[], float],
-        keeps_deadline: bool = True,
     ) -> None:
         self._session = session
         self._source = source
@@ -94,7 +93,6 @@ class Flights:
         self._memory = memory
         self._options = options
         self._stopwatch = stopwatch
-        self._keeps_deadline = keeps_deadline
         self._stopping = False
         self._recording = False
         self._shown = 0  # of the present companion's announcements
@@ -189,7 +187,6 @@ class Flights:
         return self._prepared.companion(
             self._session,
             self._stopwatch,
-            keeps_deadline=self._keeps_deadline,
             known=self._known,
             service=self._options,
             before=before,
