@@ -164,16 +164,10 @@ class Prepared:
     track: Track
     text: str
 
-    def companion(
-        self,
-        session: Session,
-        stopwatch: Callable[[], float],
-        **more: Any,
-    ) -> Flight:
+    def companion(self, session: Session, stopwatch: Callable[[], float], **more: Any) -> Flight:
         """The companion of a flight over `session`. `stopwatch` reads host time; `more`: see
         `Flight`."""
         config = self.config
-        in_time = not session.settings.lockstep
         return Flight(
             vehicle=config.vehicle,
             session=session,
@@ -182,7 +176,7 @@ class Prepared:
             plan=FlightPlan(self.track),
             limits=config.limits,
             period_s=config.period_s,
-            deadline_s=config.deadline_s if in_time else None,
+            deadline_s=None if session.settings.lockstep else config.deadline_s,
             stopwatch=stopwatch,
             identify=config.identify,
             **more,
@@ -319,8 +313,8 @@ def fly(
             log,
             stops=stops,
             progress=progress,
-            simulator_ended=simulator.ended if simulated and simulator else lambda: None,
-            patience_s=SITL_TIMEOUT_S if simulated else math.inf,
+            simulator=simulator if simulated else None,
+            patience_s=SITL_TIMEOUT_S,
             supervisor=supervisor,
         )
         if supervisor:
