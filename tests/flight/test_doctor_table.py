@@ -12,7 +12,9 @@ import pytest
 from doctor_bench import bench
 
 from offboard.doctor import computer, link_checks, run
+from offboard.doctor.listening import Listening, Observation
 from offboard.flight.preflight import Level
+from offboard.mavlink.session import SessionSettings
 from offboard.run.configuration import load
 from offboard.run.flight import Connection
 
@@ -75,3 +77,20 @@ def test_silence_behind_a_bridge(
     assert finding.level is Level.BLOCKS
     assert hint in finding.hint
     assert "--connect udpin:0.0.0.0" in finding.hint
+
+
+def test_what_is_wrong_with_this_computer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A full disk, a clock that was set, a slow decision, and late waking up."""
+    monkeypatch.setattr(computer, "LEAST_FREE_BYTES", 10**18)
+    monkeypatch.setattr(computer, "_not_compiled", lambda: 0)
+    monkeypatch.setattr(computer, "rehearse", lambda prepared, keeps_deadline: 0.04)
+    monkeypatch.setattr(computer, "_sleep", lambda: 0.03)
+    heard = Listening(0.0, SessionSettings())
+    seen = Observation(load("flight"), heard, "udpin:127.0.0.1:1", Path(), clock_step_s=0.3)
+    rows = run.examine(["disk", "compiled", "computer"], seen)
+    levels = {row.check: [finding.level for finding in row.findings] for row in rows}
+    assert levels == {"disk": [Level.WARN], "compiled": [Level.OK], "computer": [Level.WARN] * 3}
+    found = " ".join(finding.found for finding in rows[-1].findings)
+    assert "set by 0.30 s" in found
+    assert "a decision takes 40.0 ms of 50 ms" in found
+    assert "wakes up at most 30.0 ms late" in found
