@@ -253,7 +253,7 @@ class Observation:
 
     @property
     def dialect(self) -> Dialect:
-        """Of the vehicle that was found."""
+        """Dialect of the vehicle that was found."""
         assert self.heard.session.dialect is not None
         return self.heard.session.dialect
 

@@ -69,7 +69,7 @@ class Connection:
     known_vehicle: ClassVar[None] = None  # which vehicle it is, nobody has said
 
     def settings(self, link: Link) -> SessionSettings:
-        """Of the session over `link`."""
+        """Settings of the session over `link`."""
         return replace(
             SETTINGS,
             system_id=self.system_id,
@@ -117,7 +117,7 @@ class Simulated:
         return Signing(read_key(self.signing_key)) if self.signing_key else None
 
     def settings(self, link: Link) -> SessionSettings:
-        """Of the session over `link`."""
+        """Settings of the session over `link`."""
         return replace(SETTINGS, lockstep=True)
 
     def open_link(self, simulator: SimulatorProcess | InMemorySimulator, seed: int) -> Link:
