@@ -43,7 +43,7 @@ from offboard.link.log import LogError
 from offboard.link.stop import StopRequests
 from offboard.run.configuration import FlightConfig
 from offboard.run.flight import fly
-from offboard.run.in_memory import InMemorySimulator
+from offboard.run.sitl import InMemorySimulator
 
 NOT_COMPLETED = -1.0
 NOT_FLOWN = -2.0  # no log, or a flight that never began

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from offboard.documents import shipped
 from offboard.documents.errors import UserError
-from offboard.run.in_memory import registered
+from offboard.run.sitl import registered
 
 # of plans, whose flights are hashed case by case
 PLANS = {shipped.FOLDERS["campaign"], shipped.FOLDERS["tuning"]}

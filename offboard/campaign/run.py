@@ -29,7 +29,7 @@ from offboard.documents.errors import DocumentError, UserError, naming
 from offboard.link import clock
 from offboard.link.stop import StopRequests
 from offboard.run.configuration import build_controller, build_track
-from offboard.run.in_memory import check_scenario_text
+from offboard.run.sitl import check_scenario_text
 
 KEPT = "flights"
 KEPT_FILES = {"report": "report.html", "log": "flight.tlog"}

@@ -19,7 +19,7 @@ from offboard.cli.shared import (
 )
 
 if TYPE_CHECKING:
-    from offboard.doctor.table import Row
+    from offboard.doctor.run import Row
 
 REFUSED = 3
 EXIT_CODES = (
@@ -49,34 +49,28 @@ def doctor(
 
     Levels: ok; warn; wait, which may clear by itself; blocks, which `offboard fly` refuses, too.
     """
-    from offboard.doctor.table import checks
-
-    chosen = checks(names or ())
-    if listing:
-        width = max(len(check.name) for check in chosen)
-        for check in chosen:
-            say(f"{check.name:<{width}}  {check.summary}", indent=width + 2)
-        return
-    from offboard.doctor.run import observe
-    from offboard.doctor.table import as_json as report
-    from offboard.doctor.table import examine, verdict, worst
+    from offboard.doctor import run
     from offboard.flight.preflight import Level
 
+    chosen = run.names(names or ())
+    if listing:
+        width = max(map(len, chosen))
+        for name in chosen:
+            say(f"{name:<{width}}  {run.summary(name)}", indent=width + 2)
+        return
     flight = options.load()
     with err.status("opening the link") as status:  # a line on a terminal, nothing elsewhere
-        seen = observe(
-            options.connection(),
-            flight,
-            out_directory or FLIGHTS,
-            tell=status.update,
+        seen = run.observe(
+            options.connection(), flight, out_directory or FLIGHTS, tell=status.update
         )
-    rows = examine(chosen, seen)
-    sentence = verdict(rows, complete=not names)
+        status.update("judging")
+        rows = run.examine(chosen, seen)
+    sentence = run.verdict(rows, complete=not names)
     if as_json:
-        sys.stdout.write(report(rows, seen, sentence))
+        sys.stdout.write(run.as_json(rows, seen, sentence))
     else:
         _show(rows, sentence)
-    if worst(rows) is Level.BLOCKS:
+    if run.worst(rows) is Level.BLOCKS:
         raise typer.Exit(REFUSED)
 
 

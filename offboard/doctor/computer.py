@@ -1,5 +1,5 @@
-"""This computer: which other processes have a port or a serial device, where this one runs; disk,
-compiled functions, time of a decision, late waking up.
+"""This computer: which other processes have a port or a serial device, where this one runs; and the
+checks of its disk, compiled functions, time of a decision and late waking up.
 
 Without /proc (macOS) nothing is known of ports, and nothing is said.
 """
@@ -13,9 +13,11 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from offboard import compiled
-from offboard.doctor.observation import Computer
+from offboard import compiled as compilation
+from offboard.doctor.link_checks import blocks, ok, warn
+from offboard.doctor.listening import Observation
 from offboard.documents.errors import DocumentError
+from offboard.flight.preflight import Finding
 from offboard.link import clock
 from offboard.run.configuration import FlightConfig
 from offboard.run.flight import build, rehearse
@@ -26,6 +28,9 @@ TABLES = {"udpin": ("udp", "udp6"), "tcpin": ("tcp", "tcp6")}
 STATES = {"udp": ("07", "01"), "tcp": ("0A",)}
 CONTAINER_MARKS = ("/.dockerenv", "/run/.containerenv")
 SLEEPS, SLEEP_S = 40, 0.01
+LEAST_FREE_BYTES = 500_000_000  # four hours of log
+OVERSHOOT_S, CLOCK_STEP_S = 0.02, 0.05
+MARGIN = 0.5  # of the deadline
 
 
 def holders(connection: str) -> tuple[str, ...]:
@@ -87,42 +92,67 @@ def _names(pids: Iterable[int]) -> Iterator[str]:
         yield f"{name} (pid {pid})"
 
 
-def measure(config: FlightConfig, directory: Path, *, clock_step_s: float) -> Computer:
-    """Measure this computer for a flight of `config` that is recorded in `directory`."""
-    decision_s, rehearsal = None, ""
-    missing = sum(not each.is_compiled for each in compiled.defined)
-    if not missing:  # compiling takes longer than the whole check
-        prepared = None
-        with suppress(DocumentError):  # a reference that cannot be flown is another check
-            prepared = build(config)
-        try:
-            decision_s = rehearse(prepared, keeps_deadline=True) if prepared else None
-        except DocumentError as error:
-            rehearsal = str(error)
-    return Computer(
-        directory=str(directory),
-        free_bytes=_free_bytes(directory),
-        overshoot_s=_overshoot_s(),
-        not_compiled=missing,
-        decision_s=decision_s,
-        deadline_s=config.deadline_s,
-        rehearsal=rehearsal,
-        clock_step_s=clock_step_s,
-    )
+def disk(seen: Observation) -> Iterable[Finding]:
+    """Free space for the log of a flight."""
+    place = seen.directory.absolute()
+    try:
+        free = shutil.disk_usage(next(p for p in (place, *place.parents) if p.exists())).free
+    except OSError:
+        return
+    figures = f"{free / 1e9:.1f} GB free in {seen.directory}"
+    if free < LEAST_FREE_BYTES:
+        yield warn(f"{figures}; a flight lands when its log cannot be written", "free some space")
+    else:
+        yield ok(figures)
 
 
-def _free_bytes(directory: Path) -> int | None:
-    with suppress(OSError):
-        places = (directory.absolute(), *directory.absolute().parents)
-        return shutil.disk_usage(next(each for each in places if each.exists())).free
-    return None
+def compiled(seen: Observation) -> Iterable[Finding]:
+    """Whether the compiled functions are ready."""
+    missing = _not_compiled()
+    if missing:
+        found = f"{missing} functions are not compiled yet: the first flight begins late"
+        yield warn(found, "run `offboard fly --sitl` once")
+    else:
+        yield ok("all functions are compiled")
 
 
-def _overshoot_s() -> float:
-    """By how much the longest of some short sleeps was too long."""
-    longest_s = 0.0
-    for _ in range(SLEEPS):
-        began_s = clock.monotonic_s()
-        threading.Event().wait(SLEEP_S)
-        longest_s = max(longest_s, clock.monotonic_s() - began_s - SLEEP_S)
-    return longest_s
+def computer(seen: Observation) -> Iterable[Finding]:
+    """Whether this computer decides and wakes up in time."""
+    if seen.clock_step_s > CLOCK_STEP_S:
+        yield warn(
+            f"this computer's clock was set by {seen.clock_step_s:.2f} s while it listened",
+            "let the clock settle (chrony, ntp); logs have wrong times",
+        )
+    if not _not_compiled():  # compiling takes longer than the whole check
+        yield from _decision(seen.config)
+    overshoot_s = max(_sleep() for _ in range(SLEEPS))
+    figures = f"this computer wakes up at most {1e3 * overshoot_s:.1f} ms late"
+    hint = "close other programs; use the performance governor of the processor"
+    yield warn(figures, hint) if overshoot_s > OVERSHOOT_S else ok(figures)
+
+
+def _not_compiled() -> int:
+    return sum(not each.is_compiled for each in compilation.defined)
+
+
+def _decision(config: FlightConfig) -> Iterable[Finding]:
+    """Whether the controller can be flown here, and decides in time."""
+    try:
+        prepared = build(config)
+    except DocumentError:  # a reference that cannot be flown is another check
+        return
+    try:
+        took_s = rehearse(prepared, keeps_deadline=True)
+    except DocumentError as error:
+        yield blocks(str(error), "choose another controller, or a longer deadline_s")
+        return
+    figures = f"a decision takes {1e3 * took_s:.1f} ms of {1e3 * config.deadline_s:.0f} ms"
+    hint = "close other programs, or allow more time (deadline_s)"
+    yield warn(figures, hint) if took_s > MARGIN * config.deadline_s else ok(figures)
+
+
+def _sleep() -> float:
+    """By how much a short sleep was too long."""
+    began_s = clock.monotonic_s()
+    threading.Event().wait(SLEEP_S)
+    return clock.monotonic_s() - began_s - SLEEP_S

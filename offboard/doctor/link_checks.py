@@ -1,18 +1,18 @@
-"""Checks of the link beyond the preflight list: the port, who sends on it, delay, loss, load and
-clocks. A check is a function of an `Observation`; it returns nothing where there is nothing to
-say."""
+"""What is said of the link beside the preflight list: the port, who sends on it, delay, loss, load
+and clocks. A check is a function of an `Observation`; it returns nothing where there is nothing to
+say. All but the first two need a vehicle that was found."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
-from offboard.doctor.observation import Observation
+from offboard.doctor.listening import Observation
 from offboard.flight.preflight import TELEMETRY, Finding, Level
 from offboard.link.connection import BITS_OF_A_BYTE
 from offboard.mavlink.telemetry_rates import SHARE
 
 BAUDS = (57600, 115200, 230400, 460800, 921600)
-LOST_SHARE, FULL_SHARE, ENOUGH = 0.02, 0.9, 0.7
+LOST_SHARE, FULL_SHARE = 0.02, 0.9
 LATE_S, REAL_TIME = 0.25, 0.05
 FOREIGN_TIMES = 3
 ALL_ADDRESSES = "listen on all addresses: --connect udpin:0.0.0.0:PORT"
@@ -68,41 +68,39 @@ def port(seen: Observation) -> Iterable[Finding]:
 
 def vehicle(seen: Observation) -> Iterable[Finding]:
     """Whether an autopilot that can be flown is heard, and what is heard if none is."""
-    found, kind = seen.vehicle.found, _kind(seen)
+    found, heard, kind = seen.vehicle.found, seen.heard, _kind(seen)
+    senders, received = heard.senders.found, heard.senders.counters.bytes_received
     if seen.link_error:
         return
     if found:
         yield ok(f"{found.autopilot}, system {found.system_id}")
-    elif any(sender.is_autopilot for sender in seen.senders):
-        yield blocks(seen.not_found or "the autopilot is neither PX4 nor ArduCopter")
-    elif seen.senders:
-        names = ", ".join(sender.name for sender in seen.senders[:4])
+    elif any(sender.is_autopilot for sender in senders):
+        why = heard.session.senders.why_none(heard.session.counters)
+        yield blocks(why or "the autopilot is neither PX4 nor ArduCopter")
+    elif senders:
+        names = ", ".join(sender.name for sender in senders[:4])
         hint = "let the autopilot, or the router before it, send to this port"
         yield blocks(f"MAVLink is heard, but no autopilot: {names}", hint)
-    elif seen.link.bytes_received:
+    elif received:
         hint = "check the baud rate, or which program sends to this port"
-        yield blocks(f"{seen.link.bytes_received} bytes are heard that are not MAVLink", hint)
+        yield blocks(f"{received} bytes are heard that are not MAVLink", hint)
     else:
         hint = SILENT.get(kind, STARTED)
         if "127.0.0.1" in seen.connection and kind == "udpin":
             hint += f"; {BRIDGES[seen.surroundings]}"
-        yield blocks(f"nothing is heard in {seen.listened_s:.0f} s", hint)
+        yield blocks(f"nothing is heard in {heard.listened_s:.0f} s", hint)
 
 
 def senders(seen: Observation) -> Iterable[Finding]:
     """Other vehicles, ground stations and controllers on the link."""
-    found = seen.vehicle.found
-    if found is None:
-        return
-    ours = found.system_id, found.component_id
     others = []
-    for sender in seen.senders:
+    for sender in seen.heard.senders.found:
         places = ", ".join(sorted(sender.places))
-        if (sender.system_id, sender.component_id) != ours:
+        if sender.ids != _ids(seen):
             others.append(f"{sender.name}, from {places}" if sender.is_autopilot else sender.name)
         elif len(sender.places) > 1:
             yield warn(
-                f"two programs send as vehicle {ours[0]}/{ours[1]}: {places}",
+                f"two programs send as vehicle {sender.system_id}/{sender.component_id}: {places}",
                 "give each vehicle its own system id (MAV_SYS_ID, SYSID_THISMAV) and port",
             )
     yield ok("besides the vehicle: " + ("; ".join(others) or "nobody"))
@@ -110,9 +108,9 @@ def senders(seen: Observation) -> Iterable[Finding]:
 
 def uplink(seen: Observation) -> Iterable[Finding]:
     """Whether what we send reaches the vehicle: it acknowledges commands without effect."""
-    if seen.vehicle.found is None or not seen.link.commands_sent:
+    if not seen.heard.has_asked:
         return
-    if seen.link.acknowledged:
+    if seen.heard.acknowledged:
         yield ok("the vehicle acknowledges our commands, so that heartbeat and texts reach it")
     elif seen.vehicle.parameters:
         yield warn("parameters are answered, but no command is acknowledged")
@@ -126,29 +124,25 @@ def uplink(seen: Observation) -> Iterable[Finding]:
 
 def delay(seen: Observation) -> Iterable[Finding]:
     """Delay and jitter of the link by TIMESYNC, and telemetry that comes late."""
-    link = seen.link
-    if seen.vehicle.found is None:
+    delay, late_s = seen.heard.clock.delay, seen.heard.late_s
+    if delay is None:
         return
-    if link.delay is None:
-        yield wait("TIMESYNC is not answered: the delay of the link is unknown")
-        return
-    trip = "" if link.round_trip_s is None else f", round trip {1e3 * link.round_trip_s:.0f} ms"
-    figures = f"delay {1e3 * link.delay.value:.0f} +- {1e3 * link.delay.sd:.0f} ms{trip}"
-    if link.late_s > LATE_S:
-        yield warn(f"{figures}, but telemetry came up to {1e3 * link.late_s:.0f} ms late")
+    figures = f"delay {1e3 * delay.value:.0f} +- {1e3 * delay.sd:.0f} ms"
+    if late_s > LATE_S:
+        yield warn(f"{figures}, but telemetry came up to {1e3 * late_s:.0f} ms late")
     else:
         yield ok(figures)
 
 
 def loss(seen: Observation) -> Iterable[Finding]:
     """Frames that are lost, and bytes that are damaged."""
-    found = seen.vehicle.found
-    ours = (found.system_id, found.component_id) if found else None
-    sender = next((s for s in seen.senders if (s.system_id, s.component_id) == ours), None)
+    senders = seen.heard.senders
+    sender = next((each for each in senders.found if each.ids == _ids(seen)), None)
     if sender is None:
         return
-    share = sender.lost / (sender.frames + sender.lost)
-    damaged = seen.link.bytes_skipped / max(seen.link.bytes_received, 1)
+    lost, counters = senders.lost(sender), senders.counters
+    share = lost / (sender.frames + lost)
+    damaged = counters.bytes_skipped / max(counters.bytes_received, 1)
     figures = f"{share:.1%} of the frames lost, {damaged:.1%} of the bytes damaged"
     if share > LOST_SHARE or damaged > LOST_SHARE:
         yield warn(figures, "move closer, or use another channel, a cable or a better radio")
@@ -158,72 +152,71 @@ def loss(seen: Observation) -> Iterable[Finding]:
 
 def bandwidth(seen: Observation) -> Iterable[Finding]:
     """Whether the link carries the telemetry that a flight requests."""
-    link = seen.link
-    if seen.vehicle.found is None:
-        return
-    figures = f"{link.bytes_ps / 1e3:.1f} kB/s received"
-    if link.capacity_bytes_ps is None:
+    heard, session = seen.heard, seen.heard.session
+    figures = f"{heard.bytes_ps / 1e3:.1f} kB/s received"
+    most, wanted = session.settings.capacity_bytes_ps, session.wanted_bytes_ps
+    if most is None:
         yield ok(figures)
         return
-    most = link.capacity_bytes_ps
     figures += f", the link carries {most / 1e3:.1f} kB/s"
-    if link.wanted_bytes_ps > FULL_SHARE * most:
-        needed = link.wanted_bytes_ps / SHARE
+    if wanted > FULL_SHARE * most:
+        needed = wanted / SHARE
         baud = next((each for each in BAUDS if each >= BITS_OF_A_BYTE * needed), BAUDS[-1])
         yield warn(
             f"{figures}; the telemetry of a flight needs {needed / 1e3:.1f} kB/s",
             f"use at least {baud} baud",
         )
-    elif link.bytes_ps > FULL_SHARE * most:
-        first = sorted(link.messages_bytes_ps, key=lambda name: -link.messages_bytes_ps[name])[:4]
+    elif heard.bytes_ps > FULL_SHARE * most:
+        first = ", ".join(name for name, _ in heard.senders.message_bytes.most_common(4))
         hint = "lower the rates of messages that nobody needs (PX4: MAV_x_RATE, ArduPilot: SRx_*)"
-        yield warn(f"{figures}; most of it is {', '.join(first)}", hint)
+        yield warn(f"{figures}; most of it is {first}", hint)
     else:
         yield ok(figures)
 
 
 def rates(seen: Observation) -> Iterable[Finding]:
     """Rates of the telemetry that a flight needs."""
-    link = seen.link
-    if seen.vehicle.found is None:
-        return
-    figures = ", ".join(f"{name} {link.rates_hz.get(name, 0.0):.0f} Hz" for name in TELEMETRY)
+    rates_hz = seen.heard.session.rates_hz
+    figures = ", ".join(f"{name} {rates_hz.get(name, 0.0):.0f} Hz" for name in TELEMETRY)
     slow = [
-        f"{each.name} {link.rates_hz.get(each.name, 0.0):.1f} of {each.rate_hz:g} Hz"
-        for each in link.wanted
-        if not each.optional and link.rates_hz.get(each.name, 0.0) < ENOUGH * each.rate_hz
+        f"{each.name} {rates_hz.get(each.name, 0.0):.1f} of {each.rate_hz:g} Hz"
+        for each in seen.heard.slow(lambda each: each.rate_hz)
     ]
-    if not link.requested:
+    if not seen.heard.requested:
         yield ok(f"{figures}; not requested, since the vehicle is armed")
     elif slow:
-        hint = seen.dialect.slow_hint if seen.dialect else ""
-        yield warn(f"slower than requested: {', '.join(slow)}", hint)
+        yield warn(f"slower than requested: {', '.join(slow)}", seen.dialect.slow_hint)
     else:
         yield ok(figures)
 
 
 def clock(seen: Observation) -> Iterable[Finding]:
     """The vehicle's clock, and whether somebody else sets it."""
-    measured, found = seen.clock, seen.vehicle.found
-    if found is None:
-        return
-    if measured.rebooted:
+    heard, (system_id, _) = seen.heard, _ids(seen)
+    if heard.rebooted:
         hint = "find out why, then check again"
         yield blocks("the vehicle restarted while it was observed", hint)
-    if measured.jumped_s:
-        yield blocks(f"the vehicle's clock jumped by {measured.jumped_s:.1f} s")
-    masters = [s.name for s in seen.senders if s.times and s.system_id != found.system_id]
-    if seen.link.foreign_timesync > FOREIGN_TIMES:
-        masters.append(
-            f"the sender of {seen.link.foreign_timesync} requests that are answered here"
-        )
+    if heard.clock.jumped_s:
+        yield blocks(f"the vehicle's clock jumped by {heard.clock.jumped_s:.1f} s")
+    masters = [s.name for s in heard.senders.found if s.times and s.system_id != system_id]
+    if heard.foreign_replies > FOREIGN_TIMES:
+        masters.append(f"the sender of {heard.foreign_replies} requests that are answered here")
     if masters:
         hint = "let one program alone exchange TIMESYNC with the vehicle"
         yield warn(f"another time master: {', '.join(masters)}", hint)
-    if measured.rate is not None:
-        figures = f"the vehicle's clock runs {measured.rate:.3f} times as fast as this computer's"
-        yield warn(figures) if abs(measured.rate - 1.0) > REAL_TIME else ok(figures)
+    if heard.clock_rate is not None:
+        figures = (
+            f"the vehicle's clock runs {heard.clock_rate:.3f} times as fast as this computer's"
+        )
+        yield warn(figures) if abs(heard.clock_rate - 1.0) > REAL_TIME else ok(figures)
 
 
 def _kind(seen: Observation) -> str:
     return seen.connection.partition(":")[0]
+
+
+def _ids(seen: Observation) -> tuple[int, int]:
+    """System and component of the vehicle."""
+    found = seen.vehicle.found
+    assert found is not None
+    return found.system_id, found.component_id

@@ -1,36 +1,157 @@
-"""A whole check: open the link, listen, and look at this computer."""
+"""A whole check: open the link, listen, judge, report.
+
+A finding is of the preflight list, by which `fly` and `daemon` refuse a flight, or of a check of
+this package, which says what else is worth knowing. The worst finding wins.
+"""
 
 from __future__ import annotations
 
+import inspect
+import json
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from offboard.doctor.computer import holders, measure, surroundings
-from offboard.doctor.listening import LONGEST_S, Listening
-from offboard.doctor.observation import Computer, Observation
-from offboard.documents.errors import DocumentError, shown
+from offboard.doctor import computer, link_checks, vehicle_checks
+from offboard.doctor.computer import holders, surroundings
+from offboard.doctor.link_checks import wait
+from offboard.doctor.listening import LONGEST_S, Listening, Observation
+from offboard.documents.errors import UserError, shown
+from offboard.flight import preflight
+from offboard.flight.preflight import Finding, Level
 from offboard.link import clock
 from offboard.link.connection import open_link
 from offboard.link.interface import Link, LinkUnavailable
+from offboard.mavlink.session import SessionSettings
 from offboard.mavlink.signing import Signing
-from offboard.reference.feasibility import check
-from offboard.run.configuration import FlightConfig, build_track
+from offboard.run.configuration import FlightConfig
 from offboard.run.flight import Connection
 
 Result = TypeVar("Result")
-Tell = Callable[[str], None]
+Check = Callable[[Observation], Iterable[Finding]]
 POLL_S = 0.02
 # The command ends within 15 s: what takes longer is left out, and a row says so
 OPEN_S = 2.0  # to open the link, before listening
-LOOK_S = 12.5  # from the beginning to the end of the look at this computer
+LOOK_S = 12.5  # from the beginning to the end of the checks
+LEAST_S = 0.1  # for a check, however late it is
+
+# In the order of a signal: link, vehicle, flight, computer
+OF_LINK: tuple[Check, ...] = (link_checks.port, link_checks.vehicle)
+OF_VEHICLE: tuple[Check, ...] = (
+    link_checks.senders,
+    link_checks.uplink,
+    link_checks.delay,
+    link_checks.loss,
+    link_checks.bandwidth,
+    link_checks.rates,
+    link_checks.clock,
+    vehicle_checks.firmware,
+    vehicle_checks.state,
+    vehicle_checks.estimator,
+    vehicle_checks.gps,
+    vehicle_checks.prearm,
+    vehicle_checks.battery,
+    vehicle_checks.parameters,
+)
+OF_COMPUTER: tuple[Check, ...] = (computer.disk, computer.compiled, computer.computer)
+CHECKS = {
+    check.__name__: check
+    for check in (*OF_LINK, *OF_VEHICLE, vehicle_checks.configuration, *OF_COMPUTER)
+}
 
 
-def within(seconds: float, call: Callable[[], Result]) -> Result:
+class CheckError(UserError):
+    """A check that does not exist."""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """The findings of one check, the worst first."""
+
+    check: str
+    findings: tuple[Finding, ...]
+
+    @property
+    def level(self) -> Level:
+        return self.findings[0].level
+
+
+def names(chosen: Sequence[str] = ()) -> list[str]:
+    """The chosen checks in the order of the table; all if none is. Raises CheckError."""
+    for name in chosen:
+        if name not in CHECKS:
+            listed = ", ".join(CHECKS)
+            raise CheckError(f"there is no check named {shown(name)}; known are {listed}")
+    return [name for name in CHECKS if not chosen or name in chosen]
+
+
+def summary(name: str) -> str:
+    """What a check is about."""
+    return " ".join((inspect.getdoc(CHECKS[name]) or "").split())
+
+
+# --- observing ---
+
+
+def observe(
+    vehicle: Connection,
+    config: FlightConfig,
+    directory: Path,
+    *,
+    tell: Callable[[str], None] = lambda sentence: None,
+) -> Observation:
+    """Observe the `vehicle` and the link to it, for a flight of `config` that is recorded in
+    `directory`. Sends nothing that changes the vehicle. `tell` is called with sentences about the
+    progress.
+
+    Raises LinkError for an address that is no address, KeyFileError and SigningTimeError.
+    """
+    began_s, unix_s = clock.monotonic_s(), clock.monotonic_less_unix_s()
+    connection, others, error = vehicle.address, holders(vehicle.address), ""
+    heard = Listening(began_s, SessionSettings())
+    with ExitStack() as stack:
+        signing = vehicle.signing(stack)
+        try:
+            link = _within(OPEN_S, lambda: open_link(connection))
+        except TimeoutError:
+            error = f"connection {shown(connection)} cannot be opened in {OPEN_S:g} s"
+        except LinkUnavailable as failure:
+            error = str(failure)
+        else:
+            stack.callback(link.close)
+            heard = _listen(link, vehicle.settings(link), signing, tell)
+    return Observation(
+        config,
+        heard,
+        connection,
+        directory,
+        link_error=error,
+        holders=others,
+        surroundings=surroundings(),
+        clock_step_s=abs(clock.monotonic_less_unix_s() - unix_s),
+        began_s=began_s,
+    )
+
+
+def _listen(
+    link: Link, settings: SessionSettings, signing: Signing | None, tell: Callable[[str], None]
+) -> Listening:
+    heard = Listening(clock.monotonic_s(), settings, signing)
+    while not heard.complete(clock.monotonic_s()):
+        for chunk in link.receive(POLL_S):
+            heard.take(chunk)
+        for frame in heard.due(clock.monotonic_s()):
+            link.send(frame, heard.peer)
+        found = heard.vehicle.found.autopilot if heard.vehicle.found else "no vehicle yet"
+        tell(f"listening, {heard.listened_s:.0f} s of at most {LONGEST_S:.0f} s: {found}")
+    return heard
+
+
+def _within(seconds: float, call: Callable[[], Result]) -> Result:
     """What `call` returns or raises, from a thread of its own. Raises TimeoutError after `seconds`:
     the thread is left alone, and the process does not wait for it at its end."""
     future: Future[Result] = Future()
@@ -42,85 +163,75 @@ def within(seconds: float, call: Callable[[], Result]) -> Result:
             future.set_exception(error)
 
     threading.Thread(target=run, daemon=True).start()
-    return future.result(max(0.0, seconds))
+    return future.result(seconds)
 
 
-def observe(
-    vehicle: Connection,
-    config: FlightConfig,
-    directory: Path,
-    *,
-    tell: Tell = lambda sentence: None,
-) -> Observation:
-    """Observe the `vehicle`, the link to it and this computer, for a flight of `config` that is
-    recorded in `directory`. Sends nothing that changes the vehicle. `tell` is called with sentences
-    about the progress.
+# --- judging ---
 
-    Raises LinkError for an address that is no address, KeyFileError and SigningTimeError.
-    """
-    until_s, connection = clock.monotonic_s() + LOOK_S, vehicle.address
-    others = holders(connection)
-    unix_s = clock.monotonic_less_unix_s()
-    seen, error = Observation(), ""
-    with ExitStack() as stack:
-        signing = vehicle.signing(stack)
-        try:
-            link = within(OPEN_S, lambda: open_link(connection))
-        except TimeoutError:
-            error = f"connection {shown(connection)} cannot be opened in {OPEN_S:g} s"
-        except LinkUnavailable as failure:
-            error = str(failure)
-        else:
-            stack.callback(link.close)
-            seen = _listen(link, vehicle, signing, tell)
-    step_s = abs(clock.monotonic_less_unix_s() - unix_s)
-    seen = replace(
-        seen,
-        connection=connection,
-        link_error=error,
-        holders=others,
-        surroundings=surroundings(),
-        computer=Computer(str(directory), clock_step_s=step_s),
-    )
-    left_s = until_s - clock.monotonic_s()
-    tell("looking at this computer")
+
+def examine(chosen: Iterable[str], seen: Observation) -> list[Row]:
+    """One row for each of the checks that has something to say."""
+    found = seen.vehicle.found is not None
+    blocking = list(preflight.findings(seen.ground)) if found else []
+    rows = []
+    for name in chosen:
+        findings = [each for condition, each in blocking if condition.check == name]
+        if found or CHECKS[name] not in OF_VEHICLE:
+            findings += _judged(CHECKS[name], seen, seen.began_s + LOOK_S - clock.monotonic_s())
+        if findings:
+            rows.append(Row(name, tuple(sorted(findings, key=lambda each: -each.level))))
+    return rows
+
+
+def _judged(check: Check, seen: Observation, most_s: float) -> list[Finding]:
     try:
-        return within(
-            left_s,
-            lambda: replace(
-                planned(seen, config), computer=measure(config, directory, clock_step_s=step_s)
-            ),
-        )
+        return _within(max(most_s, LEAST_S), lambda: list(check(seen)))
     except TimeoutError:
-        return replace(seen, computer=replace(seen.computer, not_measured_s=left_s))
+        hint = "close other programs and check again, or `offboard check` the configuration"
+        return [wait("this was not examined in time", hint)]
 
 
-def planned(seen: Observation, config: FlightConfig) -> Observation:
-    """The observation with a planned flight."""
-    problem, tilt_rad = "", None
-    try:
-        tilt_rad = check(build_track(config), config.vehicle).tilt_max_rad
-    except DocumentError as failure:
-        problem = str(failure)
-    return replace(seen, config=config, config_problem=problem, tilt_rad=tilt_rad)
+def worst(rows: Iterable[Row]) -> Level:
+    """The worst level of all."""
+    return max((row.level for row in rows), default=Level.OK)
 
 
-def _listen(link: Link, vehicle: Connection, signing: Signing | None, tell: Tell) -> Observation:
-    began_s = clock.monotonic_s()
-    listening = Listening(
-        began_s,
-        system_id=vehicle.system_id,
-        signing=signing,
-        stream=link.is_stream,
-        capacity_bytes_ps=link.capacity_bytes_ps,
-        sends_first=vehicle.sends_first,
-    )
-    while not listening.complete(clock.monotonic_s()):
-        for chunk in link.receive(POLL_S):
-            listening.take(chunk)
-        for frame in listening.due(clock.monotonic_s()):
-            link.send(frame, listening.peer)
-        heard = listening.vehicle.found.autopilot if listening.vehicle.found else "no vehicle yet"
-        passed_s = clock.monotonic_s() - began_s
-        tell(f"listening, {passed_s:.0f} s of at most {LONGEST_S:.0f} s: {heard}")
-    return listening.observation(clock.monotonic_s())
+def verdict(rows: Iterable[Row], *, complete: bool) -> str:
+    """One sentence: whether this vehicle can be flown now. `complete`: all checks were made."""
+    found = [(each.level, each.about or row.check) for row in rows for each in row.findings]
+
+    def named(level: Level) -> list[str]:
+        return list(dict.fromkeys(name for at, name in found if at is level))
+
+    blocking, waiting, warning = map(named, (Level.BLOCKS, Level.WAIT, Level.WARN))
+    if blocking:
+        return f"{len(blocking)} block{'s' * (len(blocking) == 1)}: {', '.join(blocking)}"
+    if waiting:
+        return f"not ready yet: {', '.join(waiting)}"
+    ready = "ready to fly" if complete else "nothing blocks in these checks"
+    return f"{ready}; warnings: {', '.join(warning)}" if warning else ready
+
+
+def as_json(rows: Sequence[Row], seen: Observation, sentence: str) -> str:
+    """One object with the worst level, the verdict, what was observed where, and a list of rows."""
+    found, version = seen.vehicle.found, seen.vehicle.version
+    document = {
+        "level": worst(rows).name.lower(),
+        "verdict": sentence,
+        "connection": seen.connection,
+        "listened_s": round(seen.heard.listened_s, 2),
+        "vehicle": found and {"autopilot": found.autopilot, "system_id": found.system_id},
+        "version": version and [version.major, version.minor, version.patch],
+        "rows": [
+            {
+                "check": row.check,
+                "level": row.level.name.lower(),
+                "findings": [
+                    {"level": each.level.name.lower(), "found": each.found, "hint": each.hint}
+                    for each in row.findings
+                ],
+            }
+            for row in rows
+        ],
+    }
+    return json.dumps(document, indent=2, ensure_ascii=False) + "\n"

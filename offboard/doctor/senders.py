@@ -7,17 +7,46 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Hashable
+from dataclasses import dataclass, field
 
 from pymavlink.dialects.v20.all import mavlink_map
 
-from offboard.doctor.observation import Sender
 from offboard.documents.arguments import join_address
 from offboard.mavlink.counters import Counters
-from offboard.mavlink.decode import decode_identity
+from offboard.mavlink.decode import Identity, decode_identity
+from offboard.mavlink.dialects.base import TYPE_GCS
 from offboard.mavlink.framing import HEARTBEAT, Frame, FrameSplitter
+from offboard.mavlink.senders import is_vehicle
 
 _TIMES = frozenset({2, 111})  # SYSTEM_TIME, TIMESYNC
 _PLACES_MAX, _SENDERS_MAX = 16, 64  # a flood of addresses or ids must not use up the memory
+
+
+@dataclass(slots=True)
+class Sender:
+    """One MAVLink sender. `identity` is that of its HEARTBEAT, None without one; `places` are the
+    addresses that it sends from."""
+
+    system_id: int
+    component_id: int
+    identity: Identity | None = None
+    places: set[str] = field(default_factory=set)
+    frames: int = 0
+    times: int = 0  # TIMESYNC and SYSTEM_TIME
+
+    @property
+    def ids(self) -> tuple[int, int]:
+        return self.system_id, self.component_id
+
+    @property
+    def is_autopilot(self) -> bool:
+        return self.identity is not None and is_vehicle(self.identity)
+
+    @property
+    def name(self) -> str:
+        is_gcs = self.identity is not None and self.identity.vehicle_type == TYPE_GCS
+        kind = "autopilot" if self.is_autopilot else "ground station" if is_gcs else "component"
+        return f"{kind} {self.system_id}/{self.component_id}"
 
 
 class Senders:
@@ -51,27 +80,21 @@ class Senders:
         message = mavlink_map.get(frame.message_id)
         self.message_bytes[message.msgname if message else str(frame.message_id)] += len(frame.raw)
         sender.frames += 1
-        sender.places.add(_name(place))
+        sender.places.add(join_address(*place[:2]) if isinstance(place, tuple) else str(place))
         sender.times += frame.message_id in _TIMES
         if frame.message_id == HEARTBEAT:
-            sender.vehicle_type, sender.autopilot = decode_identity(frame.payload)
-        self._follow(ids, frame.sequence)
-        self._follow(ids[:1], frame.sequence)
+            sender.identity = decode_identity(frame.payload)
+        for key in (ids, ids[:1]):
+            gap = (frame.sequence - self._sequences.get(key, frame.sequence - 1) - 1) % 256
+            self._lost[key] += gap if gap < 128 else 0  # more: out of order
+            self._sequences[key] = frame.sequence
 
-    def _follow(self, key: tuple[int, ...], sequence: int) -> None:
-        """The next frame of a sender, or of a system, has this sequence number."""
-        gap = (sequence - self._sequences.get(key, sequence - 1) - 1) % 256
-        self._lost[key] += gap if gap < 128 else 0  # more: out of order
-        self._sequences[key] = sequence
+    def lost(self, sender: Sender) -> int:
+        """Frames of a sender that are missing by the gaps of its sequence numbers. Components that
+        share a link of an autopilot may share its sequence numbers."""
+        return min(self._lost[sender.ids], self._lost[sender.ids[:1]])
 
     @property
-    def found(self) -> tuple[Sender, ...]:
+    def found(self) -> list[Sender]:
         """All senders, the most talkative first."""
-        for ids, sender in self._senders.items():
-            # components that share a link of an autopilot may share its sequence numbers
-            sender.lost = min(self._lost[ids], self._lost[ids[:1]])
-        return tuple(sorted(self._senders.values(), key=lambda sender: -sender.frames))
-
-
-def _name(place: Hashable) -> str:
-    return join_address(*place[:2]) if isinstance(place, tuple) else str(place)
+        return sorted(self._senders.values(), key=lambda sender: -sender.frames)

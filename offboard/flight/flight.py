@@ -41,7 +41,7 @@ from offboard.mavlink.events import Attitude, ClockBehind, Event, LocalPosition,
 from offboard.mavlink.outgoing import Outgoing
 from offboard.mavlink.session import ACTIVE, Session
 from offboard.model.vehicle import Vehicle
-from offboard.supervisor.supervisor import Supervised
+from offboard.supervisor.recovery import Supervised
 
 __all__ = ["STOPPED", "Flight", "Outcome", "Output"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from offboard.analysis.history import record_type
@@ -25,10 +25,11 @@ from offboard.flight.inputs import (
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.link.interface import Chunk
 from offboard.mavlink.framing import Frame
+from offboard.mavlink.session import Session
 from offboard.mavlink.signing import Signing
 from offboard.replay.recording import Recording
 from offboard.run.configuration import flown
-from offboard.run.flight import Prepared, build, session_of
+from offboard.run.flight import SETTINGS, Prepared, build
 
 CALLS = ("request_stop", "announce", "note_autopilot", "guard")  # methods of the companion
 _OUR_FIRST_SYSTEM = 1  # our system id before a vehicle was found
@@ -91,7 +92,7 @@ class Replay:
         settings: dict[str, Any] = recording.settings
         signing = Accepted(bytes(KEY_BYTES)) if recording.signed else None
         try:
-            session = session_of(signing, **settings)
+            session = Session(replace(SETTINGS, **settings), signing)
         except TypeError:
             raise UserError(
                 f"{recording.log.path}: the settings of its session are those of another version"

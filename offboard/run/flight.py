@@ -43,14 +43,19 @@ from offboard.run.configuration import (
     dump,
     read_part,
 )
-from offboard.run.in_memory import InMemorySimulator
 from offboard.run.loop import Loop
-from offboard.run.sitl import OWN_VEHICLES, SimulatorProcess, check_scenario_named
+from offboard.run.sitl import (
+    OWN_VEHICLES,
+    InMemorySimulator,
+    SimulatorProcess,
+    check_scenario_named,
+)
 from offboard.supervisor.supervisor import Supervisor
 
 REHEARSED_DECISIONS = 5  # the fastest counts: the machine may be busy
 DISCARDED_MAX = 20  # batches of a link
 SITL_TIMEOUT_S = 180.0  # for simulator and companion in lockstep: either may compile, or be slow
+SETTINGS = SessionSettings(component_id=COMPONENT_ID, record_component_id=RECORD_COMPONENT_ID)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,10 +68,16 @@ class Connection:
 
     known_vehicle: ClassVar[None] = None  # which vehicle it is, nobody has said
 
-    @property
-    def sends_first(self) -> bool:
-        """The vehicle learns our address from what we send."""
-        return not self.address.startswith("udpin")
+    def settings(self, link: Link) -> SessionSettings:
+        """Settings of the session over `link`."""
+        return replace(
+            SETTINGS,
+            system_id=self.system_id,
+            stream=link.is_stream,
+            capacity_bytes_ps=link.capacity_bytes_ps,
+            # else the vehicle learns our address from what we send
+            sends_first=not self.address.startswith("udpin"),
+        )
 
     def signing(self, stack: ExitStack) -> Signing | None:
         """Signing with the kept time; closed with `stack`. Raises KeyFileError and
@@ -74,17 +85,6 @@ class Connection:
         if self.signing_key is None:
             return None
         return stack.enter_context(SigningTime(read_key(self.signing_key)))
-
-    def session(self, link: Link, signing: Signing | None) -> Session:
-        """The session over `link`."""
-        return session_of(
-            signing,
-            system_id=self.system_id,
-            stream=link.is_stream,
-            capacity_bytes_ps=link.capacity_bytes_ps,
-            lockstep=False,
-            sends_first=self.sends_first,
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,15 +116,9 @@ class Simulated:
         """Without a kept time: in lockstep no stamp depends on the clock."""
         return Signing(read_key(self.signing_key)) if self.signing_key else None
 
-    def session(self, link: Link, signing: Signing | None) -> Session:
-        """The session over `link`."""
-        return session_of(
-            signing,
-            stream=link.is_stream,
-            capacity_bytes_ps=None,
-            lockstep=True,
-            sends_first=False,
-        )
+    def settings(self, link: Link) -> SessionSettings:
+        """Settings of the session over `link`."""
+        return replace(SETTINGS, lockstep=True)
 
     def open_link(self, simulator: SimulatorProcess | InMemorySimulator, seed: int) -> Link:
         """Start the vehicle and return the link to it."""
@@ -158,30 +152,6 @@ class Simulated:
         return {p.name: float(p.required_bits) for p in watched if p.required_bits}
 
 
-def session_of(
-    signing: Signing | None = None,
-    *,
-    system_id: int | None = None,
-    stream: bool,
-    capacity_bytes_ps: float | None,
-    lockstep: bool,
-    sends_first: bool,
-) -> Session:
-    """The session of a flight; see `SessionSettings`."""
-    return Session(
-        SessionSettings(
-            system_id=system_id,
-            component_id=COMPONENT_ID,
-            record_component_id=RECORD_COMPONENT_ID,
-            stream=stream,
-            capacity_bytes_ps=capacity_bytes_ps,
-            lockstep=lockstep,
-            sends_first=sends_first,
-        ),
-        signing,
-    )
-
-
 # --- a configuration made ready ---
 
 
@@ -194,31 +164,19 @@ class Prepared:
     track: Track
     text: str
 
-    def observer(self) -> Observer:
-        """A new observer."""
-        return Observer(self.config.vehicle)
-
-    def companion(
-        self,
-        session: Session,
-        stopwatch: Callable[[], float],
-        *,
-        keeps_deadline: bool = True,
-        **more: Any,
-    ) -> Flight:
+    def companion(self, session: Session, stopwatch: Callable[[], float], **more: Any) -> Flight:
         """The companion of a flight over `session`. `stopwatch` reads host time; `more`: see
         `Flight`."""
         config = self.config
-        keeps_deadline &= not session.settings.lockstep
         return Flight(
             vehicle=config.vehicle,
             session=session,
-            observer=self.observer(),
+            observer=Observer(config.vehicle),
             controller=self.controller,
             plan=FlightPlan(self.track),
             limits=config.limits,
             period_s=config.period_s,
-            deadline_s=config.deadline_s if keeps_deadline else None,
+            deadline_s=None if session.settings.lockstep else config.deadline_s,
             stopwatch=stopwatch,
             identify=config.identify,
             **more,
@@ -237,7 +195,8 @@ def rehearse(prepared: Prepared, *, keeps_deadline: bool) -> float:
     shortest possible decision, measured with `keeps_deadline`. Raises DocumentError if the control
     law fails or, with `keeps_deadline`, if a decision cannot meet the deadline.
     """
-    config, controller, observer = prepared.config, prepared.controller, prepared.observer()
+    config, controller = prepared.config, prepared.controller
+    observer = Observer(config.vehicle)
     reference = Hold((0.0, 0.0, -2.0), 0.1)
     previous = Command(config.vehicle.gravity_mps2, (0.0, 0.0, 1.0), 0.0)
     observer.freeze(True)
@@ -345,7 +304,7 @@ def fly(
             supervisor.await_ready()
         stops.check()
         stack.enter_context(log)
-        session = vehicle.session(link, signing)
+        session = Session(vehicle.settings(link), signing)
         for piece in manifest.pieces(prepared.text):
             log.begin(clock.unix_us(), session.encode(piece))
         loop = Loop(
@@ -354,8 +313,8 @@ def fly(
             log,
             stops=stops,
             progress=progress,
-            simulator_ended=simulator.ended if simulated and simulator else lambda: None,
-            patience_s=SITL_TIMEOUT_S if simulated else math.inf,
+            simulator=simulator if simulated else None,
+            patience_s=SITL_TIMEOUT_S,
             supervisor=supervisor,
         )
         if supervisor:

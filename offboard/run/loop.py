@@ -18,7 +18,7 @@ from offboard.flight.phases import BEFORE_FLIGHT, WAITING, ExitCode
 from offboard.link import clock
 from offboard.link.interface import Chunk, Link
 from offboard.link.stop import StopRequests
-from offboard.run.sitl import Ending
+from offboard.run.sitl import Ending, InMemorySimulator, SimulatorProcess
 from offboard.supervisor.supervisor import Supervisor, SupervisorError
 
 POLL_S = 0.02
@@ -62,9 +62,8 @@ class Loop:
     """Moves bytes between one link, one companion and one log until the flight ends.
 
     `progress` is called often, to show the companion's announcements to the user; it must not wait.
-    `simulator_ended` says how the bundled simulator ended, or None while it runs; `patience_s` is
-    the wall time without a datagram after which the flight ends. `supervisor` outlives us; None
-    with the bundled simulator.
+    With the bundled `simulator` `patience_s` is the wall time without a datagram after which the
+    flight ends; on any other vehicle there is a `supervisor`, which outlives us.
     """
 
     def __init__(
@@ -75,7 +74,7 @@ class Loop:
         *,
         stops: StopRequests,
         progress: Callable[[Any], None],
-        simulator_ended: Callable[[], Ending | None] = lambda: None,
+        simulator: SimulatorProcess | InMemorySimulator | None = None,
         patience_s: float = math.inf,
         supervisor: Supervisor | None = None,
     ) -> None:
@@ -84,7 +83,7 @@ class Loop:
         self._log = log
         self._stops = stops
         self._progress = progress
-        self._simulator_ended = simulator_ended
+        self._simulator = simulator
         self._patience_s = patience_s
         self._supervisor = supervisor
         self._warned: set[str] = set()
@@ -236,7 +235,9 @@ class Loop:
 
     def _check_simulator(self, silent_s: float) -> None:
         """End the flight if the bundled simulator has ended."""
-        ended = None if self._companion.has_ended() else self._simulator_ended()
+        if self._simulator is None or self._companion.has_ended():
+            return
+        ended = self._simulator.ended()
         if ended is None and silent_s > self._patience_s:
             ended = Ending(f"the bundled simulator has not answered for {silent_s:.1f} s", False)
         if ended is None:

@@ -1,6 +1,8 @@
-"""The bundled simulator as a process: started, watched and always stopped.
+"""The bundled simulator: as a process, started, watched and always stopped; or in this process, for
+campaigns, without socket. A flight is the same with either, byte for byte.
 
-`offboard` never imports `simulator`. They exchange MAVLink, and on a pipe the simulator's options.
+`offboard` never imports `simulator`. They exchange MAVLink, and on a pipe the simulator's options;
+in memory it is found by entry point.
 """
 
 from __future__ import annotations
@@ -12,20 +14,26 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import TracebackType
+from typing import Any, Protocol
 
 from offboard.documents import shipped
+from offboard.documents.errors import UserError
 from offboard.documents.reading import DocumentError
+from offboard.link import clock
+from offboard.link.interface import Chunk, LinkReport
 
 OWN_VEHICLES = {"px4": "px4_sih", "ardupilot": "arducopter"}  # the simulator's default vehicles
 STOP_S = 2.0
 ERRORS_BYTES = 65536
 USAGE = 2  # the simulator's exit code for options and files that it cannot use
+GROUP, NAME = "pso_offboard.simulators", "bundled"  # its entry point
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +59,12 @@ def check_scenario(path: Path) -> None:
     answer = subprocess.run(command, capture_output=True, text=True, check=False)
     if answer.returncode:
         raise DocumentError(*answer.stderr.strip().splitlines())
+
+
+def check_scenario_text(text: str, source: str) -> None:
+    """Let the simulator validate the YAML of a scenario, which errors call `source`. Raises
+    DocumentError."""
+    registered().load().check_scenario(text, source)
 
 
 class SimulatorProcess:
@@ -139,3 +153,89 @@ class SimulatorProcess:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+# --- in this process ---
+
+
+class InMemoryVehicle(Protocol):
+    """A vehicle in lockstep, made of a firmware, the names of a scenario and a vehicle file (None:
+    the firmware's), a seed and parameters. `exchange` takes frames of the companion and returns
+    sender and bytes of the datagrams up to the next barrier; nothing until it is answered."""
+
+    def exchange(self, frames: Sequence[bytes]) -> list[tuple[int, bytes]]: ...
+
+
+class InMemoryLink:
+    """The `Link` to a vehicle in this process. `problem`: the exception that ended the vehicle."""
+
+    is_stream = False
+    capacity_bytes_ps: float | None = None
+    opened = 0
+
+    def __init__(self, vehicle: InMemoryVehicle) -> None:
+        self.report = LinkReport()
+        self.problem: Exception | None = None
+        self._vehicle = vehicle
+        self._sent: list[bytes] = []
+
+    def wait(self, timeout_s: float) -> None: ...
+
+    def receive(self, timeout_s: float) -> list[Chunk]:
+        """All datagrams up to the next barrier. Never waits."""
+        frames, self._sent = self._sent, []
+        if self.problem is not None:
+            return []
+        try:
+            datagrams = self._vehicle.exchange(frames)
+        except Exception as error:
+            self.problem = error
+            return []
+        now_s = clock.monotonic_s()
+        return [Chunk(data, ("simulator", sender), now_s) for sender, data in datagrams]
+
+    def send(self, data: bytes, peer: Hashable | None) -> None:
+        self._sent.append(data)
+
+    def follow(self, peer: Hashable) -> None:
+        pass
+
+    def descriptors(self) -> tuple[int, ...]:
+        return ()
+
+    def close(self) -> None:
+        pass
+
+
+class InMemorySimulator:
+    """Takes the place of a `SimulatorProcess`: one vehicle after the other, each in memory."""
+
+    def __init__(self) -> None:
+        self._link: InMemoryLink | None = None
+
+    def open_link(self, **options: Any) -> InMemoryLink:
+        """Start a vehicle and return the link to it; `options`: see `InMemoryVehicle`. Raises
+        DocumentError."""
+        vehicle: InMemoryVehicle = registered().load()(**options)
+        self._link = InMemoryLink(vehicle)
+        return self._link
+
+    def ended(self, timeout_s: float = 0.0) -> Ending | None:
+        """How the vehicle ended, None while it runs."""
+        problem = self._link.problem if self._link else None
+        if problem is None:
+            return None
+        return Ending(f"the bundled simulator failed ({type(problem).__name__}: {problem})", False)
+
+    def recall(self) -> None:
+        """Drop the vehicle."""
+        self._link = None
+
+
+@cache
+def registered() -> EntryPoint:
+    """The entry point of the bundled simulator. Raises UserError where it is not installed."""
+    for point in entry_points(group=GROUP):
+        if point.name == NAME:
+            return point
+    raise UserError(f"the bundled simulator is not registered ({GROUP}); install the package again")

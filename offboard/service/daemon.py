@@ -20,6 +20,7 @@ from offboard.link.interface import Link, LinkError
 from offboard.link.lock import connection_lock, directory_lock
 from offboard.link.stop import StopRequests
 from offboard.live.process import SERVER, LiveProcess
+from offboard.mavlink.session import Session
 from offboard.run.configuration import FlightConfig
 from offboard.run.flight import Connection, discard
 from offboard.run.loop import Loop
@@ -80,7 +81,7 @@ def run(
         stack.callback(link.close)
         recorder.score_earlier()  # a supervisor that still has the link also has the log
         flights = Flights(
-            session=vehicle.session(link, signing),
+            session=Session(vehicle.settings(link), signing),
             source=preparation,
             record=recorder,
             memory=memory,
@@ -90,7 +91,7 @@ def run(
 
         def display() -> None:
             manager.alive(clock.monotonic_s(), flights.phase.value)
-            preparation.allow(not (flights.in_flight or flights.state.vehicle.armed))
+            preparation.allowed = not (flights.in_flight or flights.state.vehicle.armed)
             show(flights)
             if monitor:
                 monitor.show(flights)

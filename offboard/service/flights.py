@@ -86,7 +86,6 @@ class Flights:
         memory: Memory,
         options: ServiceOptions,
         stopwatch: Callable[[], float],
-        keeps_deadline: bool = True,
     ) -> None:
         self._session = session
         self._source = source
@@ -94,7 +93,6 @@ class Flights:
         self._memory = memory
         self._options = options
         self._stopwatch = stopwatch
-        self._keeps_deadline = keeps_deadline
         self._stopping = False
         self._recording = False
         self._shown = 0  # of the present companion's announcements
@@ -103,8 +101,7 @@ class Flights:
         self.announcements = 0
         self.engagements = 0
         self._prepared = source.newest()
-        self._known: IdentifiedVehicle | None = None  # of the vehicle, for the next flight
-        self._recalled: IdentifiedVehicle | None = None  # that the present companion began with
+        self._known: IdentifiedVehicle | None = None  # that the present flight began with
         self.current = self._companion(None)
 
     # ------------------------------------------------------------------ as a companion
@@ -178,18 +175,15 @@ class Flights:
     def _follow(self, prepared: Prepared) -> None:
         """Continue with a new companion where the present one has ended or waits."""
         self._collect()
-        known = self._remembered(prepared)
-        self._prepared, self._known = prepared, known
+        self._prepared, self._known = prepared, self._remembered(prepared)
         self.current = self._companion(self.current)
         self._shown = 0
 
     def _companion(self, before: Flight | None) -> Flight:
         self._prepared.controller.reset()
-        self._recalled = self._known
         return self._prepared.companion(
             self._session,
             self._stopwatch,
-            keeps_deadline=self._keeps_deadline,
             known=self._known,
             service=self._options,
             before=before,
@@ -202,8 +196,7 @@ class Flights:
         self._recording = True
         directory = self._record.begin(self._session, self._prepared.text, self._identity)
         self.current.announce(f"flight {self.engagements}, recorded in {directory}")
-        known = self._recalled
-        if known:
+        if known := self._known:
             self.current.announce(
                 f"this vehicle was identified before: tilt delay {1e3 * known.delay.value:.0f} ms, "
                 f"hover thrust {known.vehicle.hover_thrust:.3f}; no identification steps"
@@ -244,19 +237,15 @@ class Flights:
         identification = self.current.identification
         if identification is None or not self._key:
             return
-        if identification.contradicted:
-            if self._known is not None:
-                self._known = None
-                self._memory.discard(self._key)
-                self.current.announce(
-                    "what was identified of this vehicle is contradicted, and discarded: the next "
-                    "flight identifies it again"
-                )
-        elif self._known is None:
-            found = identification.result
-            if found is not None:
-                self._known = found
-                self._memory.keep(self._key, self._prepared, found)
+        known = self._remembered(self._prepared)
+        if identification.contradicted and known is not None:
+            self._memory.discard(self._key)
+            self.current.announce(
+                "what was identified of this vehicle is contradicted, and discarded: the next "
+                "flight identifies it again"
+            )
+        elif not identification.contradicted and known is None and identification.result:
+            self._memory.keep(self._key, self._prepared, identification.result)
 
     # ------------------------------------------------------------------ what the user reads
 

@@ -17,35 +17,23 @@ from offboard.run.flight import Prepared, build, rehearse
 EVERY_S = 2.0
 
 
-def prepare(config: FlightConfig) -> Prepared:
-    """Build and rehearse. Raises DocumentError."""
-    prepared = build(config)
-    rehearse(prepared, keeps_deadline=True)
-    return prepared
-
-
 class Preparation:
-    """A `flights.Source` of what `load` returns. Raises DocumentError if the first configuration
-    cannot be used."""
+    """A `flights.Source` of what `load` returns. The thread works only while it is `allowed`: not
+    while the vehicle is armed. Raises DocumentError if the first configuration cannot be used."""
 
     def __init__(self, load: Callable[[], FlightConfig], every_s: float = EVERY_S) -> None:
         self._load = load
         self._every_s = every_s
-        self._newest = prepare(load())
+        self._newest = self._ready(load())
         self._seen = self._newest.text  # the newest text or error
         self._news: deque[str] = deque()
-        self._ended, self._allowed = threading.Event(), threading.Event()
+        self.allowed = True
+        self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True, name="configuration")
 
     def start(self) -> None:
         """Begin to watch."""
-        self._allowed.set()
         self._thread.start()
-
-    def allow(self, allowed: bool) -> None:
-        """Whether the thread may work now: not while the vehicle is armed."""
-        if allowed != self._allowed.is_set():
-            (self._allowed.set if allowed else self._allowed.clear)()
 
     def close(self) -> None:
         self._ended.set()
@@ -59,7 +47,7 @@ class Preparation:
 
     def _run(self) -> None:
         while not self._ended.wait(self._every_s):
-            if self._allowed.is_set():
+            if self.allowed:
                 self.look()
 
     def look(self) -> None:
@@ -71,10 +59,15 @@ class Preparation:
                 self._seen = text
                 return
             self._seen = text
-            self._newest = prepare(config)
+            self._newest = self._ready(config)
             self._news.append("the configuration has changed: used from the next flight on")
         except Exception as error:  # whatever a controller raises, the old configuration is kept
             sentence = "; ".join(str(error).splitlines())
             if sentence != self._seen:
                 self._seen = sentence
                 self._news.append(f"the configuration is refused, the old one is kept: {sentence}")
+
+    def _ready(self, config: FlightConfig) -> Prepared:
+        prepared = build(config)
+        rehearse(prepared, keeps_deadline=True)
+        return prepared

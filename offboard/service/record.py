@@ -17,6 +17,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from itertools import chain, count
 from pathlib import Path
 
 from offboard.flight import manifest
@@ -30,7 +31,8 @@ ROLLING_BYTES = 16 * 2**20
 ROLLING_NAMES = ("standby.1.tlog", "standby.2.tlog")
 BEFORE_US = 5_000_000  # of the time before a flight that its log holds
 BEFORE_MAX = 20_000  # frames of it
-SENT_ONCE = frozenset({22, 49, 148, 242})  # PARAM_VALUE, GPS_GLOBAL_ORIGIN, AUTOPILOT_VERSION, HOME
+PARAM_VALUE = 22
+SENT_ONCE = {PARAM_VALUE, 49, 148, 242}  # GPS_GLOBAL_ORIGIN, AUTOPILOT_VERSION, HOME_POSITION
 PARAM_ID = slice(18, 34)  # in a frame of PARAM_VALUE: 10 bytes of header, 8 of payload before it
 KEPT_MAX = 100
 SCORE_S = 600.0
@@ -139,7 +141,7 @@ class Recorder:
         self._rolling = RollingLog(directory, rolling_bytes)
         self._flight: FlightRecord | None = None
         self._before: deque[tuple[int, bytes]] = deque(maxlen=BEFORE_MAX)
-        self._once: dict[bytes, bytes] = {}
+        self._once: dict[tuple[int, bytes], bytes] = {}
         self._clerk = ThreadPoolExecutor(max_workers=1, thread_name_prefix="record")
         self._scorer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="score")
         self._closing = threading.Event()
@@ -147,7 +149,6 @@ class Recorder:
         self._engaged = sorted(path.parent for path in directory.glob(f"*/{ENGAGED}"))
         self._left, self._left_until_s = _left(self._engaged)
         self._vehicle = ""
-        self._stamped, self._number = "", 0
         # read once: in flight the file system may keep its caller waiting
         self._taken = {path.name for path in directory.iterdir()}
 
@@ -178,15 +179,11 @@ class Recorder:
         self._before.append((unix_us, record))
         while not 0 <= unix_us - self._before[0][0] <= BEFORE_US:  # the wall clock may be set
             self._before.popleft()
-        if int.from_bytes(frame[7:10], "little") in SENT_ONCE:
-            self._keep(frame, record)
-
-    def _keep(self, frame: bytes, record: bytes) -> None:
-        name = frame[7:10]
-        if name == b"\x16\0\0":
-            name += frame[PARAM_ID]
-        if name in self._once or len(self._once) < KEPT_MAX:
-            self._once[name] = record
+        message = int.from_bytes(frame[7:10], "little")
+        if message in SENT_ONCE:
+            name = message, frame[PARAM_ID] if message == PARAM_VALUE else b""
+            if name in self._once or len(self._once) < KEPT_MAX:
+                self._once[name] = record
 
     # ------------------------------------------------------------------ flights
 
@@ -213,14 +210,10 @@ class Recorder:
     def _new_directory(self) -> Path:
         """Two flights of one second have different names; a directory that is there is left."""
         stamp = self._stamp()
-        if stamp != self._stamped:
-            self._stamped, self._number = stamp, 0
-        while True:
-            self._number += 1
-            name = stamp if self._number == 1 else f"{stamp}-{self._number}"
-            if name not in self._taken:
-                self._taken.add(name)
-                return self._directory / name
+        names = chain([stamp], (f"{stamp}-{number}" for number in count(2)))
+        name = next(each for each in names if each not in self._taken)
+        self._taken.add(name)
+        return self._directory / name
 
     def end(self, *, engaged: bool) -> None:
         """Close the flight's log and score it, in other threads. `engaged`: the vehicle may still

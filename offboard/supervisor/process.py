@@ -14,7 +14,7 @@ import socket
 import stat
 import subprocess
 import sys
-from collections.abc import Hashable
+from collections.abc import Hashable, Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -34,7 +34,7 @@ from offboard.mavlink.events import VehicleFound
 from offboard.mavlink.outgoing import Heartbeat, Outgoing
 from offboard.mavlink.session import ACTIVE, Session, SessionSettings
 from offboard.mavlink.signing import Signing
-from offboard.supervisor.recovery import Recovery
+from offboard.supervisor.recovery import Recovery, Supervised
 from offboard.supervisor.supervisor import READY
 
 POLL_S = 0.02
@@ -55,7 +55,8 @@ class Watch:
         self._channel.setblocking(False)
         self._received = b""
         self._silent_s = 0.0
-        self.newest: dict[str, Any] = {}
+        self.newest: dict[str, Any] = {}  # beat
+        self.known: Supervised | None = None  # as it says
         self.key: bytes | None = None  # of signing
         self.descriptors: list[int] = []  # of the link, then of the log
         self.ended = False
@@ -67,22 +68,19 @@ class Watch:
             while not self.ended:
                 self._read()
         if not self._silent_s:
-            self._answer()
-        if not (self.newest.get("ours") and self.newest.get("flying")):
+            with suppress(OSError):  # it is stopped, or has ended
+                self._channel.send(b'""\n')
+        if not (self.known and self.known.ours and self.known.flying):
             return ""
         if self.ended:
             return DIED
-        silent_s: float = self.newest["silent_s"]
+        silent_s = self.known.silent_s
         return HANGS.format(silent_s=silent_s) if self._silent_s >= silent_s else ""
 
     @property
     def beat_s(self) -> float:
         """When the newest beat was read, at the latest."""
         return clock.monotonic_s() - self._silent_s
-
-    def _answer(self) -> None:
-        with suppress(OSError):  # it is stopped, or has ended
-            self._channel.send(b'""\n')
 
     def _read(self) -> None:
         data, descriptors, _, _ = socket.recv_fds(self._channel, 65536, 8)
@@ -104,35 +102,29 @@ class Watch:
         if "key" in message:
             self.key = bytes.fromhex(message["key"])
         else:
-            self.newest = message
+            self.newest, self.known = message, _known(**message["known"])
 
 
 class TakeOver:
     """Takes the controller's place: sends on its link what `Recovery` asks for, and logs it."""
 
-    def __init__(self, watch: Watch, tell: BackgroundWriter[str]) -> None:
+    def __init__(self, watch: Watch, known: Supervised, tell: BackgroundWriter[str]) -> None:
         beat = watch.newest
         self._tell = tell
-        self._peer = _peer(beat["peer"])
+        # JSON has no tuples
+        self._peer: Hashable = (
+            tuple(beat["peer"]) if isinstance(beat["peer"], list) else beat["peer"]
+        )
         self._link = _link(watch.descriptors[:-1], str(self._peer) if beat["stream"] else "")
         self._log = BackgroundWriter[bytes](
             lambda entries: append(watch.descriptors[-1], entries), 100_000
         )
         signing = watch.key and Signing.resumed(watch.key, clock.monotonic_s, beat["signing"])
         self._session = Session(SessionSettings(stream=beat["stream"]), signing or None)
-        self._session.set_vehicle(VehicleFound(**beat["vehicle"]), self._peer)
+        self._session.set_vehicle(known.vehicle, self._peer)
         self._session.status = ACTIVE, LANDING
         assert self._session.dialect is not None
-        self._recovery = Recovery(
-            self._session.dialect,
-            clock.monotonic_s(),
-            holding=beat["holding"],
-            reported_s=beat["reported_s"],
-            beat_s=watch.beat_s,
-            loss=SetpointLoss(beat["loss"]["after_s"], tuple(beat["loss"]["modes"])),
-            sticks=beat["sticks"],
-            starved=beat["starved"],
-        )
+        self._recovery = Recovery(self._session.dialect, known, clock.monotonic_s(), watch.beat_s)
         self._text_id = 0
 
     def run(self, reason: str) -> None:
@@ -201,9 +193,10 @@ class TakeOver:
             self._log.put(entry(clock.unix_us(), frame))
 
 
-def _peer(place: Any) -> Hashable:
-    """An address as the link gives it: JSON has no tuples."""
-    return tuple(place) if isinstance(place, list) else str(place)
+def _known(vehicle: Mapping[str, Any], loss: Mapping[str, Any], **more: Any) -> Supervised:
+    """From JSON."""
+    modes = tuple(loss["modes"])
+    return Supervised(VehicleFound(**vehicle), loss=SetpointLoss(loss["after_s"], modes), **more)
 
 
 def _link(descriptors: list[int], stream: str) -> Link:
@@ -253,10 +246,10 @@ def main() -> None:
         select.select([], [], [], POLL_S)
         now_s = clock.monotonic_s()
         reason, before_s = watch.turn(now_s - before_s), now_s
-    if reason:
+    if reason and watch.known:
         tell = BackgroundWriter[str](lambda said: _tell(channel, said), 1000)
         _announce(channel, tell, f"taking over: {reason}")
-        TakeOver(watch, tell).run(reason)
+        TakeOver(watch, watch.known, tell).run(reason)
         tell.close(CLOSE_S)
         if watch.ended:
             _score(watch.descriptors[-1])

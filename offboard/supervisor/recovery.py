@@ -24,6 +24,7 @@ from offboard.mavlink.events import (
     LocalPosition,
     ModeReport,
     SystemHealth,
+    VehicleFound,
 )
 from offboard.mavlink.outgoing import CommandLong
 
@@ -37,6 +38,33 @@ EARLY_S = 0.3  # the newest setpoint left before the newest beat, and may have b
 CRITICAL = 5  # MAV_STATE: a failsafe
 SINK_MPS = 0.2  # downward speed of a vehicle that lands, within SINK_S
 SINK_S = 3.0  # COM_DISARM_LAND is 2 s
+# Without beats the supervisor acts after this time: before the autopilot's own failsafe, so that
+# only one of them does, if that gives a busy computer time enough
+EARLIER_S, SILENT_MIN_S, SILENT_MAX_S = 0.4, 0.4, 0.9
+
+
+@dataclass(frozen=True, slots=True)
+class Supervised:
+    """What the controller tells, and the supervisor must know before it may act: the vehicle,
+    whether it is `ours`, in the mode of our setpoints or in one that we asked for, by a report that
+    arrived at `reported_s` (`clock.monotonic_s`), of which the supervisor judges the age; whether
+    it may be `flying`, and whether it was asked to hold (`holding`): then this mode is ours, too.
+    `loss`: what its autopilot does without setpoints; `sticks`: it receives those of a pilot;
+    `starved`: setpoints were missing already, or its failsafe for that flies it."""
+
+    vehicle: VehicleFound
+    ours: bool
+    flying: bool
+    reported_s: float = -math.inf
+    holding: bool = False
+    loss: SetpointLoss = NEVER
+    sticks: bool = False
+    starved: bool = False
+
+    @property
+    def silent_s(self) -> float:
+        """Time without a beat after which the supervisor acts."""
+        return min(max(self.loss.after_s - EARLIER_S, SILENT_MIN_S), SILENT_MAX_S)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,35 +76,23 @@ class Request:
 
 
 class Recovery:
-    """Begins at `began_s`; the newest beat of the controller was at `beat_s`. As it knew them:
-    `holding`: the vehicle was asked to hold; `reported_s`: time of the newest report of a mode that
-    was ours; `loss`: what follows when setpoints stop; `sticks`: those of a pilot are received;
-    `starved`: setpoints were missing before, or its own failsafe for that flew it.
+    """Begins at `began_s`; the newest beat of the controller was at `beat_s`, and said `known`.
 
     `ended` says how it ended, empty until then; `refusal` and `notice` have news for the user."""
 
     def __init__(
-        self,
-        dialect: Dialect,
-        began_s: float,
-        *,
-        holding: bool = False,
-        reported_s: float = math.inf,
-        beat_s: float = math.inf,
-        loss: SetpointLoss = NEVER,
-        sticks: bool = False,
-        starved: bool = False,
+        self, dialect: Dialect, known: Supervised, began_s: float, beat_s: float = math.inf
     ) -> None:
         self._dialect = dialect
-        self._holding = holding
+        self._holding = known.holding
         self._began_s = began_s
-        self._loss = loss
-        missing_s = min(beat_s, began_s) + loss.after_s - EARLY_S
-        self._loses_s = -math.inf if starved else missing_s
-        self._sticks = sticks
+        self._loss = known.loss
+        missing_s = min(beat_s, began_s) + known.loss.after_s - EARLY_S
+        self._loses_s = -math.inf if known.starved else missing_s
+        self._sticks = known.sticks
         self._mode: str | None = None
         self._before: str | None = None  # the mode before it
-        self._reported_s = reported_s
+        self._reported_s = known.reported_s
         self._fallen_s = math.inf  # since when its own failsafe flies it
         self._fallen_shown = False  # by HEARTBEAT
         self._sank_s = -math.inf  # when it was last seen to sink

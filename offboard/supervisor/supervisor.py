@@ -19,22 +19,18 @@ import subprocess
 import sys
 from collections.abc import Hashable
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from types import TracebackType
 
 from offboard.documents.errors import UserError
 from offboard.link import clock
 from offboard.link.interface import Link
-from offboard.mavlink.dialects.base import NEVER, SetpointLoss
-from offboard.mavlink.events import VehicleFound
 from offboard.mavlink.signing import Signing
+from offboard.supervisor.recovery import Supervised
 
 START_S = 20.0  # on a busy machine
 END_S = 1.0
 ANSWER_S = 1.0  # a beat that was not answered for so long: it is stopped
-# Without beats it acts after this time: before the autopilot's own failsafe, so that only one of
-# them does, if that gives a busy computer time enough
-EARLIER_S, SILENT_MIN_S, SILENT_MAX_S = 0.4, 0.4, 0.9
 READY = "ready"
 NOT_STARTED = "the supervisor, which lands the vehicle if this process dies, does not start"
 
@@ -43,30 +39,6 @@ class SupervisorError(UserError):
     """The supervisor cannot be started: one sentence for the user."""
 
     is_usage = False
-
-
-@dataclass(frozen=True, slots=True)
-class Supervised:
-    """What the supervisor must know before it may act: the vehicle, whether it is `ours`, in the
-    mode of our setpoints or in one that we asked for, by a report that arrived at `reported_s`
-    (`clock.monotonic_s`), of which the supervisor judges the age; whether it may be `flying`, and
-    whether it was asked to hold (`holding`): then this mode is ours, too. `loss`: what its
-    autopilot does without setpoints; `sticks`: it receives those of a pilot; `starved`: setpoints
-    were missing already, or its failsafe for that flies it."""
-
-    vehicle: VehicleFound
-    ours: bool
-    flying: bool
-    reported_s: float = -math.inf
-    holding: bool = False
-    loss: SetpointLoss = NEVER
-    sticks: bool = False
-    starved: bool = False
-
-    @property
-    def silent_s(self) -> float:
-        """Time without a beat after which the supervisor acts."""
-        return min(max(self.loss.after_s - EARLIER_S, SILENT_MIN_S), SILENT_MAX_S)
 
 
 class Supervisor:
@@ -80,8 +52,6 @@ class Supervisor:
         self._signing = signing
         self._received = b""
         self._lines: list[str] = []  # first READY, then why it took over and what it did
-        self._beat: object = None  # what the newest line says
-        self._line = b""
         self._passed: object = None  # the descriptors that it has
         self._unanswered_s = math.inf  # time of the first beat since the newest answer
 
@@ -129,7 +99,7 @@ class Supervisor:
         self._channel.close()
         self._process.poll()
         self._received, self._lines = b"", []
-        self._beat = self._passed = None
+        self._passed = None
         self._unanswered_s = math.inf
         self.__enter__()
         self.lost = False
@@ -145,24 +115,18 @@ class Supervisor:
         """Show that the controller lives. The vehicle sends from `peer`. Never waits."""
         if not self._lines:  # it has not loaded yet
             return
-        signing = self._signing.state() if self._signing else None
-        if self._beat != (vehicle, peer, signing):
-            self._beat = (vehicle, peer, signing)
-            message = {
-                **asdict(vehicle),
-                "silent_s": vehicle.silent_s,
-                "peer": peer,
-                "stream": link.is_stream,
-                "signing": signing,
-            }
-            self._line = json.dumps(message).encode() + b"\n"
+        beat = {
+            "known": asdict(vehicle),
+            "peer": peer,
+            "stream": link.is_stream,
+            "signing": self._signing.state() if self._signing else None,
+        }
+        line = json.dumps(beat).encode() + b"\n"
         self._unanswered_s = min(self._unanswered_s, clock.monotonic_s())
         descriptors = [*link.descriptors(), log_descriptor]
         passed = (link.opened, descriptors)
         try:
-            socket.send_fds(
-                self._channel, [self._line], [] if passed == self._passed else descriptors
-            )
+            socket.send_fds(self._channel, [line], [] if passed == self._passed else descriptors)
             self._passed = passed
         except BlockingIOError:
             pass  # it is stopped or very late; the next beat says the same

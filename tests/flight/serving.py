@@ -112,7 +112,6 @@ def flights(source: Settings, logs: Record, memory: Remembered, then: Then, anch
         memory=memory,
         options=ServiceOptions(anchor, then, arms),
         stopwatch=lambda: 0.0,
-        keeps_deadline=False,
     )
 
 

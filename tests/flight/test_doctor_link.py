@@ -110,89 +110,30 @@ def test_second_vehicle_on_the_link() -> None:
     assert row.findings[0].found.startswith("besides the vehicle: autopilot 2/1")
 
 
-def test_two_vehicles_with_the_same_ids() -> None:
-    place = ("::1", 14999, 0, 0)
-    patient = bench(before=from_others(AUTOPILOT_HEARTBEAT, 1, 1, 1.0, place))
-    row = patient.consult("senders")["senders"]
-    assert row.level is WARN
-    assert "two programs send as vehicle 1/1: 127.0.0.1:14580, [::1]:14999" in (
-        row.findings[0].found
-    )
-    assert mended(patient, before=quiet)
+TIME = mavlink.MAVLink_timesync_message(0, 12345)
+SAME_PLACE = ("127.0.0.1", 14580)
 
 
 @pytest.mark.parametrize(
-    ("system", "component", "name"),
-    [(1, 194, "system 1 component 194"), (1, 191, "system 1 component 191")],
-    ids=["other ids", "our ids"],
-)
-def test_another_controller_blocks(system: int, component: int, name: str) -> None:
-    before = from_others(SETPOINT, system, component, place=("127.0.0.1", 14580))
+    ("before", "check", "level", "found"),
+    [
+        (from_others(AUTOPILOT_HEARTBEAT, 1, 1, 1.0, ("::1", 14999, 0, 0)), "senders", WARN,
+         "two programs send as vehicle 1/1: 127.0.0.1:14580, [::1]:14999"),
+        (from_others(SETPOINT, 1, 194, place=SAME_PLACE), "senders", BLOCKS, "component 194"),
+        (from_others(SETPOINT, 1, 191, place=SAME_PLACE), "senders", BLOCKS, "component 191"),
+        (from_others(GCS_HEARTBEAT, 255, 190, 1.0), "senders", OK,
+         "besides the vehicle: ground station 255/190"),
+        (from_others(TIME, 255, 190, 2.0), "clock", WARN,
+         "another time master: component 255/190"),
+    ],
+    ids=["same ids", "controller", "controller with our ids", "ground station", "time master"],
+)  # fmt: skip
+def test_others_beside_the_vehicle(before: Any, check: str, level: Level, found: str) -> None:
     patient = bench(before=before)
-    row = patient.consult("senders")["senders"]
-    assert row.level is BLOCKS
-    assert name in row.findings[0].found
+    row = patient.consult(check)[check]
+    assert row.level is level
+    assert found in row.findings[0].found
     assert mended(patient, before=quiet)
-
-
-def test_ground_station_beside_the_vehicle_is_no_finding() -> None:
-    patient = bench(before=from_others(GCS_HEARTBEAT, 255, 190, 1.0))
-    row = patient.consult("senders")["senders"]
-    assert row.level is OK
-    assert row.findings[0].found == "besides the vehicle: ground station 255/190"
-
-
-def test_second_time_master() -> None:
-    time = mavlink.MAVLink_timesync_message(0, 12345)
-    patient = bench(before=from_others(time, 255, 190, 2.0))
-    row = patient.consult("clock")["clock"]
-    assert row.level is WARN
-    assert "another time master: component 255/190" in row.findings[0].found
-    assert mended(patient, before=quiet)
-
-
-@pytest.mark.parametrize("firmware", ["px4"])
-def test_late_link_blocks_and_its_delay_is_measured(firmware: str) -> None:
-    patient = bench(faults=link(latency_s=0.3))
-    rows = patient.consult("delay", "rates")
-    assert rows["delay"].level is BLOCKS
-    delay = patient.listen().link.delay
-    assert delay is not None
-    assert delay.value == pytest.approx(0.6, abs=0.03)  # both directions
-    assert rows["rates"].level is OK
-
-
-def test_delay_that_lowers_the_bandwidth() -> None:
-    patient = bench(faults=link(latency_s=0.2))
-    row = patient.consult("configuration")["configuration"]
-    assert row.level is WARN
-    possible = row.findings[0].hint.rpartition("=")[2]
-    assert 1.0 <= float(possible) < 7.0
-    again = bench(
-        faults=link(latency_s=0.2), assignments=[f"controller.bandwidth_radps={possible}"]
-    )
-    assert again.consult("configuration")["configuration"].level is OK
-
-
-def test_jitter_blocks() -> None:
-    patient = bench(faults=link(jitter_s=0.8, direction="up"))
-    assert patient.consult("delay")["delay"].level is BLOCKS
-
-
-def test_loss_is_counted() -> None:
-    patient = bench(PX4, faults=link(loss=0.2, direction="down", for_s=9.0))
-    row = patient.consult("loss")["loss"]
-    assert row.level is WARN
-    share = float(row.findings[0].found.partition("%")[0])
-    assert share == pytest.approx(20.0, abs=3.0)
-    while patient.instance.time_s < 16.0:
-        patient.step()
-    assert patient.consult("loss")["loss"].level is OK
-
-
-def test_damaged_bytes_are_counted() -> None:
-    patient = bench(faults=link(corruption=0.2, direction="down"))
-    assert patient.consult("loss")["loss"].level is WARN
 
 
 def shared_counter(datagrams: Bytes) -> Bytes:
@@ -206,10 +147,54 @@ def shared_counter(datagrams: Bytes) -> Bytes:
     return sent
 
 
-def test_frames_of_other_components_are_no_loss() -> None:
-    """Half of the vehicle's sequence numbers are its camera's, and no frame is lost."""
-    row = bench(down=shared_counter).consult("loss")["loss"]
-    assert row.findings[0].found.startswith("0.0% of the frames lost")
+@pytest.mark.parametrize(
+    ("options", "check", "level", "found"),
+    [
+        ({"faults": link(latency_s=0.3)}, "delay", BLOCKS, "the link delays by"),
+        ({"faults": link(jitter_s=0.8, direction="up")}, "delay", BLOCKS, "the link delays by"),
+        ({"faults": link(corruption=0.2, direction="down")}, "loss", WARN, "of the bytes damaged"),
+        # half of the vehicle's sequence numbers are its camera's, and no frame is lost
+        ({"down": shared_counter}, "loss", OK, "0.0% of the frames lost"),
+        ({"faults": link(message_rate_hz=30.0, direction="down")}, "rates", WARN,
+         "LOCAL_POSITION_NED 30.0 of 100 Hz"),
+        ({"faults": [{"fault": "clock_jump", "at_s": 9.0, "jump_s": 30.0}]}, "clock", BLOCKS,
+         "the vehicle's clock jumped by 30.0 s"),
+        ({"faults": [{"fault": "reboot", "at_s": 7.0, "for_s": 0.5}]}, "clock", BLOCKS,
+         "the vehicle restarted while it was observed"),
+    ],
+    ids=["late", "jitter", "damaged", "camera", "slow", "jump", "restart"],
+)  # fmt: skip
+def test_fault_of_the_link(options: Any, check: str, level: Level, found: str) -> None:
+    patient = bench(**options)
+    row = patient.consult(check)[check]
+    assert row.level is level
+    assert found in row.findings[0].found
+
+
+def test_delay_is_measured_and_lowers_the_bandwidth() -> None:
+    patient = bench(faults=link(latency_s=0.2))
+    delay = patient.listen().heard.clock.delay
+    assert delay is not None
+    assert delay.value == pytest.approx(0.4, abs=0.03)  # both directions
+    row = patient.consult("configuration")["configuration"]
+    assert row.level is WARN
+    possible = row.findings[0].hint.rpartition("=")[2]
+    assert 1.0 <= float(possible) < 7.0
+    again = bench(
+        faults=link(latency_s=0.2), assignments=[f"controller.bandwidth_radps={possible}"]
+    )
+    assert again.consult("configuration")["configuration"].level is OK
+
+
+def test_loss_is_counted() -> None:
+    patient = bench(PX4, faults=link(loss=0.2, direction="down", for_s=9.0))
+    row = patient.consult("loss")["loss"]
+    assert row.level is WARN
+    share = float(row.findings[0].found.partition("%")[0])
+    assert share == pytest.approx(20.0, abs=3.0)
+    while patient.instance.time_s < 16.0:
+        patient.step()
+    assert patient.consult("loss")["loss"].level is OK
 
 
 def test_rates_that_are_too_low_block() -> None:
@@ -225,13 +210,6 @@ def test_rates_that_are_too_low_block() -> None:
     assert patient.consult("rates")["rates"].level is OK
 
 
-def test_slower_than_requested_is_a_warning() -> None:
-    patient = bench(faults=link(message_rate_hz=30.0, direction="down"))
-    row = patient.consult("rates")["rates"]
-    assert row.level is WARN
-    assert "LOCAL_POSITION_NED 30.0 of 100 Hz" in row.findings[0].found
-
-
 def test_line_that_is_too_slow_for_the_telemetry() -> None:
     """What it asks for is thinned to fit; 38400 baud do not carry the least of it."""
     patient = bench(capacity_bytes_ps=3840.0)
@@ -241,18 +219,6 @@ def test_line_that_is_too_slow_for_the_telemetry() -> None:
     assert baud == 115_200
     patient.capacity_bytes_ps = baud / 10.0
     assert patient.consult("bandwidth")["bandwidth"].level is OK
-
-
-def test_clock_that_jumps_and_vehicle_that_restarts() -> None:
-    jump = bench(faults=[{"fault": "clock_jump", "at_s": 9.0, "jump_s": 30.0}])
-    row = jump.consult("clock")["clock"]
-    assert row.level is BLOCKS
-    assert row.findings[0].found == "the vehicle's clock jumped by 30.0 s"
-    assert mended(jump)
-    restarted = bench(faults=[{"fault": "reboot", "at_s": 7.0, "for_s": 0.5}])
-    row = restarted.consult("clock")["clock"]
-    assert row.level is BLOCKS
-    assert "restarted" in row.findings[0].found
 
 
 def test_what_we_send_does_not_arrive() -> None:
@@ -276,5 +242,5 @@ def test_flood_of_addresses_and_ids_is_bounded() -> None:
 
     patient = bench(before=before)
     seen = patient.listen()
-    assert len(seen.senders) == 64
+    assert len(seen.heard.senders.found) == 64
     assert seen.vehicle.found is not None

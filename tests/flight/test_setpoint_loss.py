@@ -15,8 +15,7 @@ from offboard.mavlink.dialects.px4 import PX4
 from offboard.mavlink.events import VehicleFound
 from offboard.mavlink.outgoing import AttitudeTarget, CommandLong
 from offboard.mavlink.session import Session, SessionSettings
-from offboard.supervisor.recovery import Recovery
-from offboard.supervisor.supervisor import Supervised
+from offboard.supervisor.recovery import Recovery, Supervised
 from simulator import config
 from simulator.instance import Instance
 from simulator.steps import STEP_S
@@ -54,7 +53,7 @@ class Stopped:
         self.asked: list[tuple[float, int, float]] = []  # time, MAV_CMD, height
         self.modes: list[str] = []
         loss = PX4.setpoint_loss({"COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": fallback})
-        self.beat = Supervised(VEHICLE, ours=True, flying=True, loss=loss)
+        self.beat = Supervised(VEHICLE, ours=True, flying=True, reported_s=0.0, loss=loss)
         self.silent_s = self.beat.silent_s if silent_s is None else silent_s
 
     def run(self) -> str:
@@ -72,9 +71,7 @@ class Stopped:
 
     def _step(self) -> None:
         if self.recovery is None and self.now_s >= self.silent_s:
-            self.recovery = Recovery(
-                PX4, self.now_s, reported_s=0.0, beat_s=0.0, loss=self.beat.loss
-            )
+            self.recovery = Recovery(PX4, self.beat, self.now_s, beat_s=0.0)
         for datagram in self.instance.step():
             reception = self.session.receive(datagram, "vehicle", 100.0 + self.now_s)
             if self.recovery:

@@ -35,7 +35,8 @@ from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.signing import Signing
 from offboard.run.loop import ANSWERS, UNANSWERED, Loop
-from offboard.supervisor.supervisor import Supervised, Supervisor, SupervisorError
+from offboard.supervisor.recovery import Supervised
+from offboard.supervisor.supervisor import Supervisor, SupervisorError
 
 LONG_S = 20.0
 OFFBOARD, POSCTL, LANDING, HOLDING = 0x00060000, 0x00030000, 0x06040000, 0x03040000

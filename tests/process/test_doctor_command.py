@@ -91,16 +91,3 @@ def test_exit_codes(arguments: tuple[str, ...], code: int, says: str, called: Ca
     assert says in (output + errors).replace("\n", " ")
     assert "Traceback" not in errors
     assert code < 3 or "fix: start the vehicle, or the router, that " in output.replace("\n", " ")
-
-
-def test_silent_port_blocks(spawn: Spawn) -> None:
-    """Datagrams that are no MAVLink, from a real socket."""
-    port = free_port()
-    doctor = spawn("offboard", "doctor", "vehicle", "--connect", f"udpin:127.0.0.1:{port}")
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-        while doctor.poll() is None:
-            stranger.sendto(b"hello", ("127.0.0.1", port))
-            time.sleep(0.1)
-    output, _ = doctor.communicate(timeout=60)
-    assert doctor.returncode == 3
-    assert "bytes are heard that are not MAVLink" in output

@@ -10,11 +10,10 @@ import yaml
 
 from offboard.flight.flight import Outcome
 from offboard.link.stop import StopRequests
-from offboard.run import flight, in_memory
+from offboard.run import flight, sitl
 from offboard.run.configuration import load
 from offboard.run.flight import Simulated, fly
-from offboard.run.in_memory import InMemorySimulator
-from offboard.run.sitl import SimulatorProcess
+from offboard.run.sitl import InMemorySimulator, SimulatorProcess
 
 SETPOINT, TELEMETRY = 82, (30, 31, 32, 115)
 SHORT = ("reference.duration_s=1", "reference.height_m=1", "identify.excite=false")
@@ -77,7 +76,7 @@ def test_a_vehicle_that_fails_ends_the_flight_with_a_sentence(
         def load(self) -> type[Fails]:
             return Fails
 
-    monkeypatch.setattr(in_memory, "registered", Point)
+    monkeypatch.setattr(sitl, "registered", Point)
     outcome = flown(tmp_path / "flight", Simulated(scenario="calm"), InMemorySimulator())
     sentence = "the bundled simulator failed (ZeroDivisionError: division by zero)"
     assert (outcome.exit_code, outcome.sentence) == (3, sentence)
@@ -121,7 +120,7 @@ def test_a_vehicle_that_hangs_ends_the_flight_with_a_sentence(
         def load(self) -> type[Hangs]:
             return Hangs
 
-    monkeypatch.setattr(in_memory, "registered", Point)
+    monkeypatch.setattr(sitl, "registered", Point)
     monkeypatch.setattr(flight, "SITL_TIMEOUT_S", 0.1)
     outcome = flown(tmp_path / "flight", Simulated(scenario="calm"), InMemorySimulator())
     assert outcome.exit_code == 3

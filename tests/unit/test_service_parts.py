@@ -11,6 +11,7 @@ import threading
 import time
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -48,11 +49,15 @@ def session() -> Session:
     return made
 
 
-def test_a_flight_log_begins_with_what_came_before(tmp_path: Path) -> None:
+def recorded(directory: Path, **options: Any) -> tuple[Recorder, list[Path]]:
+    """A recorder, and the flights that it has scored."""
     scored: list[Path] = []
-    recorder = Recorder(
-        tmp_path, stamp=lambda: "now", score=lambda directory, closing: scored.append(directory)
-    )
+    options = {"score": lambda flight, closing: scored.append(flight)} | options
+    return Recorder(directory, **options), scored
+
+
+def test_a_flight_log_begins_with_what_came_before(tmp_path: Path) -> None:
+    recorder, scored = recorded(tmp_path, stamp=lambda: "now")
     talk = session()
     codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     home = mavlink.MAVLink_gps_global_origin_message(1, 2, 3).pack(codec)
@@ -81,7 +86,7 @@ def test_a_flight_log_begins_with_what_came_before(tmp_path: Path) -> None:
 
 
 def test_a_clock_that_is_set_back_ends_what_came_before(tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path, stamp=lambda: "now", score=lambda *_: None)
+    recorder, _ = recorded(tmp_path)
     talk = session()
     frames = [talk.encode(Heartbeat(6)) for _ in range(3)]
     for unix_s, frame in zip((2000, 1000, 1001), frames, strict=True):
@@ -95,20 +100,20 @@ def test_a_clock_that_is_set_back_ends_what_came_before(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("age_s", "left"), [(0, "px4-1-7"), (700, ""), (-4000, "px4-1-7")])
 def test_what_a_killed_service_has_not_done(tmp_path: Path, age_s: int, left: str) -> None:
     """The vehicle that it had engaged is known for ten minutes, its flight is scored. A log of the
-    future: this computer has booted, and its clock was not set since."""
-    killed = Recorder(tmp_path, stamp=lambda: "cut", score=lambda *_: None)
+    future: this computer has booted, and its clock was not set since. A flight whose log is gone is
+    not scored, nor looked at again."""
+    killed, _ = recorded(tmp_path)
     cut = Path(killed.begin(session(), "", "px4-1-7"))
     killed.close()  # its threads write no more; nothing is scored, the vehicle stays engaged
     deadline_s = time.monotonic() + 10.0
     changed_s = time.time() - age_s
     os.utime(cut / "flight.tlog", (changed_s, changed_s))
-    scored: list[Path] = []
-    recorder = Recorder(
-        tmp_path, settled_s=0.01, score=lambda directory, closing: scored.append(directory)
-    )
+    (tmp_path / "gone").mkdir()
+    (tmp_path / "gone" / "unscored").touch()
+    recorder, scored = recorded(tmp_path, settled_s=0.01)
     assert recorder.left == left
     recorder.score_earlier()
-    while (cut / "unscored").exists():
+    while any(tmp_path.glob("*/unscored")):
         assert time.monotonic() < deadline_s
         time.sleep(0.01)
     assert scored == [cut]
@@ -118,50 +123,35 @@ def test_what_a_killed_service_has_not_done(tmp_path: Path, age_s: int, left: st
     assert not (cut / "engaged").exists()
 
 
-def test_a_flight_whose_log_is_gone_is_not_scored_at_every_start(tmp_path: Path) -> None:
-    (tmp_path / "cut").mkdir()
-    (tmp_path / "cut" / "unscored").touch()
-    scored: list[Path] = []
-    recorder = Recorder(tmp_path, score=lambda directory, closing: scored.append(directory))
-    recorder.score_earlier()
-    recorder.close()
-    assert (scored, list((tmp_path / "cut").iterdir())) == ([], [])
-
-
-@pytest.mark.parametrize("engaged", [True, False])
-def test_a_vehicle_is_left_engaged_until_it_was_handed_back(tmp_path: Path, engaged: bool) -> None:
-    recorder = Recorder(tmp_path, score=lambda *_: None)
-    flight = Path(recorder.begin(session(), "", "px4-1-7"))
-    recorder.end(engaged=engaged)
-    recorder.close()
-    assert recorder.left == ("px4-1-7" if engaged else "")
-    again = Recorder(tmp_path, score=lambda *_: None)
-    assert again.left == recorder.left
-    assert (flight / "engaged").exists() is engaged
-    again.close()
-
-
-def test_the_end_does_not_wait_for_the_score(tmp_path: Path) -> None:
-    """The processes that score outlive the service; the next start sees what they have done."""
+def test_a_vehicle_is_left_engaged_until_it_was_handed_back(tmp_path: Path) -> None:
+    """And the end does not wait for the score: the processes that score outlive the service, and
+    the next start sees what they have done."""
 
     def score(directory: Path, closing: threading.Event) -> None:
         began.append(directory)
         assert closing.wait(60.0)
 
     began: list[Path] = []
-    recorder = Recorder(tmp_path, score=score)
-    (first, second) = [Path(recorder.begin(session(), "", "")) for _ in range(2)
-                       if recorder.end(engaged=False) is None]  # fmt: skip
+    recorder, _ = recorded(tmp_path, score=score)
+    flights = []
+    for engaged in (True, False, True):
+        flights.append(Path(recorder.begin(session(), "", "px4-1-7")))
+        recorder.end(engaged=engaged)
+        assert recorder.left == ("px4-1-7" if engaged else "")
     recorder.close()
-    assert began == [first, second]
-    assert {path.parent for path in tmp_path.glob("*/unscored")} == {first, second}
+    assert began == flights
+    assert sorted(path.parent for path in tmp_path.glob("*/unscored")) == flights
+    assert [(flight / "engaged").exists() for flight in flights] == [False, False, True]
+    again, _ = recorded(tmp_path)
+    assert again.left == "px4-1-7"
+    again.close()
 
 
 def test_the_rolling_log_is_bounded(tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path, score=lambda *_: None, rolling_bytes=20_000)
+    recorder, _ = recorded(tmp_path, rolling_bytes=20_000)
     talk = session()
     written = 0
-    for number in range(5000):
+    for number in range(4000):
         frame = talk.encode(Heartbeat(6))
         written += len(frame) + 8
         recorder.write(number * 1000, frame)
@@ -177,12 +167,7 @@ def test_the_rolling_log_is_bounded(tmp_path: Path) -> None:
 
 def test_a_flight_that_cannot_be_recorded_says_so_and_the_next_one_is(tmp_path: Path) -> None:
     names = iter([f"{ROLLING_NAMES[0]}/x", "later"])
-    scored: list[Path] = []
-    recorder = Recorder(
-        tmp_path,
-        stamp=lambda: next(names),
-        score=lambda directory, closing: scored.append(directory),
-    )
+    recorder, scored = recorded(tmp_path, stamp=lambda: next(names))
     talk = session()
     recorder.begin(talk, "", "")
     deadline_s = time.monotonic() + 10.0
@@ -365,6 +350,11 @@ def test_a_switch_counts_in_the_air_from_a_mode_without_failsafe() -> None:
     assert not shows(ours=False)
     assert not shows(ours=True, in_the_air=False)
     assert not shows(ours=True)  # took off in this mode
+    for flies in (True, False):  # by every sign
+        switch = PilotSwitch()
+        switch.on_heartbeat(ours=False, failsafe=False)
+        switch.on_mode(ours=True, in_the_air=True, flies=flies)
+        assert switch.engaged is flies
 
 
 def test_a_reference_that_is_placed_low_stays_clear_of_the_ground() -> None:
@@ -401,11 +391,3 @@ def test_a_moving_vehicle_is_stopped_where_the_reference_starts(speed_mps: float
     assert along_m[-1] == pytest.approx(35.0 / 32.0 * speed_mps**2 / 2.0)
     assert along_m.max() < along_m[-1] + 0.01
     assert np.linalg.norm(flown.acceleration_ned_mps2, axis=1).max() < 2.01
-
-
-@pytest.mark.parametrize("flies", [True, False])
-def test_only_a_vehicle_that_flies_by_every_sign_is_engaged(flies: bool) -> None:
-    switch = PilotSwitch()
-    switch.on_heartbeat(ours=False, failsafe=False)
-    switch.on_mode(ours=True, in_the_air=True, flies=flies)
-    assert switch.engaged is flies
