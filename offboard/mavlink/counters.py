@@ -1,7 +1,7 @@
 """Counters of received bytes and frames, and of what was dropped, by reason.
 
-Two sums always hold and are tested: each byte received is framed, skipped or pending; each frame is
-decoded, ignored (a message that no decoder exists for) or dropped for exactly one reason.
+Two sums always hold and are tested: each byte received is in a frame, skipped or pending; each
+frame is decoded, ignored (a message that no decoder exists for) or dropped for exactly one reason.
 """
 
 from __future__ import annotations
@@ -37,14 +37,6 @@ class DropReason(Enum):
     STALE = "older than the newest message of the same id"
 
 
-NOT_A_FRAME = frozenset(
-    {
-        DropReason.TRUNCATED,
-        DropReason.BAD_CRC,
-        DropReason.INCOMPATIBLE,
-        DropReason.FOREIGN_PEER,
-    }
-)
 FORGED = (
     DropReason.UNSIGNED,
     DropReason.BAD_SIGNATURE,
@@ -78,10 +70,6 @@ class Counters:
             self.decoded += 1
         else:
             self.ignored += 1
-
-    @property
-    def dropped_frames(self) -> int:
-        return sum(n for reason, n in self.dropped.items() if reason not in NOT_A_FRAME)
 
     def news(self) -> str:
         """What signing refused, on the 1st, 10th, 100th ... frame; else empty."""

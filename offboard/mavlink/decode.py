@@ -33,7 +33,7 @@ _FIX_3D = 3  # GPS_FIX_TYPE
 _REAL32 = 9  # MAV_PARAM_TYPE
 _UNSIGNED_TYPES, _SIGNED_TYPES = (1, 3, 5), (2, 4, 6)
 _LANDED = ("unknown", "on_ground", "in_air", "takeoff", "landing")  # MAV_LANDED_STATE
-_RESULTS = (  # MAV_RESULT
+_RESULTS = (  # MAV_RESULT, of which pymavlink's `all` lacks some
     "ACCEPTED",
     "TEMPORARILY_REJECTED",
     "DENIED",
@@ -62,47 +62,16 @@ class Identity(NamedTuple):
     autopilot: int
 
 
-class TextChunk(NamedTuple):
-    """One STATUSTEXT. `last`: its text is terminated. `text_id` 0: a text of one chunk."""
-
-    severity: int
-    data: bytes
-    text_id: int
-    chunk: int
-    last: bool
-
-
 def decode(frame: Frame, dialect: Dialect) -> events.Event | DropReason | None:
     """The event in a verified frame, IMPLAUSIBLE, or None for a message without decoder."""
     decoder = _DECODERS.get(frame.message_id)
     return None if decoder is None else decoder(frame.message, dialect)
 
 
-def decode_command(message: Any) -> tuple[int, tuple[float, ...], Address]:
-    """Command, parameters and receiver of a COMMAND_LONG or a COMMAND_INT, whose parameters 5 to 7,
-    a place, are left out."""
-    parameters = [message.param1, message.param2, message.param3, message.param4]
-    if message.id == mavlink.MAVLINK_MSG_ID_COMMAND_LONG:
-        parameters += [message.param5, message.param6, message.param7]
-    return (
-        message.command,
-        tuple(parameters),
-        Address(message.target_system, message.target_component),
-    )
-
-
 def decode_identity(payload: bytes) -> Identity:
     """MAV_TYPE and MAV_AUTOPILOT in the payload of a HEARTBEAT."""
     padded = payload.ljust(6, b"\0")  # MAVLink 2 omits trailing zeros
     return Identity(padded[4], padded[5])
-
-
-def decode_text_chunk(payload: bytes) -> TextChunk:
-    """The payload of a STATUSTEXT, whose text is UTF-8, which pymavlink does not decode."""
-    layout = mavlink.MAVLink_statustext_message.unpacker
-    severity, text, text_id, chunk = layout.unpack_from(payload.ljust(layout.size, b"\0"))
-    data, terminator, _ = text.partition(b"\0")
-    return TextChunk(severity, data, text_id, chunk, bool(terminator))
 
 
 def _heartbeat(message: Any, dialect: Dialect) -> events.Event:

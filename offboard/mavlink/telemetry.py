@@ -9,7 +9,7 @@ import math
 from dataclasses import replace
 
 from offboard.mavlink.counters import DropReason
-from offboard.mavlink.decode import decode, decode_text_chunk
+from offboard.mavlink.decode import decode
 from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.events import (
     Attitude,
@@ -52,7 +52,7 @@ class Telemetry:
         it is dropped. `now_s`: its arrival."""
         number = self._number(frame, now_s)
         if frame.message_id == STATUSTEXT:
-            return tuple(self.texts.add(decode_text_chunk(frame.payload), now_s))
+            return tuple(self.texts.add(frame.payload, now_s))
         event = decode(frame, dialect)
         if isinstance(event, DropReason):
             return event

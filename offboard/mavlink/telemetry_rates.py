@@ -66,11 +66,18 @@ class _Stream:
         measured_s = min(_WINDOW_S, now_s - self.began_s)
         return len(self.arrivals_s) / measured_s if measured_s > 0.0 else 0.0
 
-    def due(self, now_s: float) -> bool:
-        if self.requested_s is None:
-            return True
-        waited_s, rate_hz = now_s - self.requested_s, self.rate_hz(now_s)
-        enough_hz = _ENOUGH * self.wanted.arrives_hz
+    def request(self, now_s: float) -> bool:
+        """Whether to request it now; then it counts as requested."""
+        if self.requested_s is not None and not self._again(now_s - self.requested_s, now_s):
+            return False
+        if self.requests:
+            self.wait_s = min(2.0 * self.wait_s, _LONGEST_WAIT_S)
+        self.requested_s = now_s
+        self.requests += 1
+        return True
+
+    def _again(self, waited_s: float, now_s: float) -> bool:
+        rate_hz, enough_hz = self.rate_hz(now_s), _ENOUGH * self.wanted.arrives_hz
         lost_hz = min(_UNHEARD * self.wanted.rate_hz, enough_hz)
         if waited_s >= _FIRST_WAIT_S and 0.0 < rate_hz < lost_hz:
             return True  # the link has lost the requests
@@ -80,12 +87,6 @@ class _Stream:
             self.wait_s, self.requests = _FIRST_WAIT_S, 0
             return False
         return not (self.wanted.optional and self.requests >= _OPTIONAL_TRIES)
-
-    def request(self, now_s: float) -> None:
-        if self.requests:
-            self.wait_s = min(2.0 * self.wait_s, _LONGEST_WAIT_S)
-        self.requested_s = now_s
-        self.requests += 1
 
 
 class TelemetryRates:
@@ -103,17 +104,11 @@ class TelemetryRates:
         """A message has arrived."""
         stream = self._streams.get(message_id)
         if stream is not None:
-            arrivals = stream.arrivals_s
-            arrivals.append(now_s)
-            while arrivals[0] <= now_s - _WINDOW_S:
-                arrivals.popleft()
+            stream.arrivals_s.append(now_s)
 
     def due(self, now_s: float) -> list[WantedMessage]:
         """Messages to request now; they count as requested."""
-        due = [stream for stream in self._streams.values() if stream.due(now_s)]
-        for stream in due:
-            stream.request(now_s)
-        return [stream.wanted for stream in due]
+        return [each.wanted for each in self._streams.values() if each.request(now_s)]
 
     def measured_hz(self, now_s: float) -> dict[str, float]:
         """Rate of each wanted message over the last two seconds, by name."""

@@ -9,7 +9,6 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from vehicle_frames import PX4, Sender, pinned, understood
 
-from offboard.mavlink.decode import decode_text_chunk
 from offboard.mavlink.dialects.ardupilot import ARDUPILOT as ARDUPILOT_DIALECT
 from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.dialects.px4 import PX4 as PX4_DIALECT
@@ -200,9 +199,7 @@ def test_long_texts_are_joined_again(length: int) -> None:
     assert len(messages) == (1 if length <= 50 else length // 50 + 1)
     assert "".join(message.text for message in messages) == text
     assert [message.chunk_seq for message in messages] == list(range(len(messages)))
-    joined = [
-        whole for frame in frames for whole in assembler.add(decode_text_chunk(frame[10:-2]), 0.0)
-    ]
+    joined = [whole for frame in frames for whole in assembler.add(frame[10:-2], 0.0)]
     assert [(whole.severity, whole.text) for whole in joined] == [(4, text)]
 
 

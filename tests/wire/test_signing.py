@@ -215,7 +215,9 @@ def test_stamps_increase_whatever_the_clock_does_and_are_reserved_first() -> Non
     for elapsed_s in (0.0, 0.0, 10.0, -50.0, 0.0, 40.0, 40.0):
         time_s[0] += elapsed_s
         beat = mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)
-        frame = signing.pack(beat, mavlink.MAVLink(None))
+        link = mavlink.MAVLink(None)
+        signing.sign(link)
+        frame = bytes(beat.pack(link))
         stamps.append(int.from_bytes(frame[-12:-6], "little"))
         assert stamps[-1] < reserved[-1]
     assert stamps == sorted(set(stamps))
