@@ -31,8 +31,8 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def stamp_of(signing: Signing) -> int:
-    beat = mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)
-    return int.from_bytes(signing.pack(beat, mavlink.MAVLink(None))[-12:-6], "little")
+    session = Session(SessionSettings(), signing)
+    return int.from_bytes(session.encode(Heartbeat(18))[-12:-6], "little")
 
 
 def test_stamps_do_not_go_back_with_the_clock_or_after_a_crash(
