@@ -153,12 +153,12 @@ class Session:
         foreign = self.senders.judge(frame, arrival.place, self.link_time_s, arrival.events)
         if foreign is not None:
             return foreign
-        if was_found and frame.message_id in COMMANDS:
-            return True
-        if self.vehicle is not None and not was_found:
-            self._begin()
+        if frame.message_id in COMMANDS:
+            return True  # to us
         if self.vehicle is not None:
             self.senders.heard_s = arrival.now_s
+            if not was_found:
+                self._begin()
         if frame.message_id == framing.TIMESYNC:
             return self._synchronise(frame, arrival)
         return self._interpret(frame, arrival)

@@ -149,8 +149,8 @@ def test_why_no_vehicle_was_found() -> None:
 
 
 def test_a_vehicle_whose_clock_is_behind_hears_ours_and_is_found() -> None:
-    """PX4 begins with the stamp that came with its key, perhaps years ago. Where its clock is ahead,
-    ours follows it."""
+    """PX4 begins with the stamp that came with its key, perhaps years ago. Ours follows a clock
+    that is ahead."""
     ours, vehicle = session(), Signer(stamp=NOW - 10 * BEHIND_MAX)
     reception = ours.receive(vehicle.heartbeat(), PEER, 0.0)
     assert reception.events == (events.ClockBehind(1, armed=False),)
