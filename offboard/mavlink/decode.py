@@ -27,7 +27,7 @@ _SENSORS = {
     for bit, sensor in mavlink.enums["MAV_SYS_STATUS_SENSOR"].items()
 }
 # ESTIMATOR_STATUS_FLAGS and EKF_STATUS_FLAGS have the same bits
-_EKF_ATTITUDE, _EKF_VELOCITY, _EKF_POSITION, _EKF_HEIGHT = 1, 2, 8, 32
+_EKF_BITS = dict(zip(events.ESTIMATE, (1, 2, 8, 32), strict=True))
 _ARMED = 0x80  # MAV_MODE_FLAG_SAFETY_ARMED
 _FIX_3D = 3  # GPS_FIX_TYPE
 _REAL32 = 9  # MAV_PARAM_TYPE
@@ -164,10 +164,7 @@ def _estimator(
     flags: int, ratios: dict[str, float], accuracy_m: float | None = None
 ) -> events.EstimatorReport:
     return events.EstimatorReport(
-        attitude_ok=bool(flags & _EKF_ATTITUDE),
-        velocity_ok=bool(flags & _EKF_VELOCITY),
-        position_ok=bool(flags & _EKF_POSITION),
-        height_ok=bool(flags & _EKF_HEIGHT),
+        valid=frozenset(part for part, bit in _EKF_BITS.items() if flags & bit),
         ratios=tuple((name, ratio) for name, ratio in ratios.items() if math.isfinite(ratio)),
         accuracy_m=accuracy_m,
     )

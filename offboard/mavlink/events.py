@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 Triple = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]  # w, x, y, z; FRD -> NED
+ESTIMATE = ("attitude", "horizontal velocity", "horizontal position", "height")  # its parts
 
 
 class Event:
@@ -123,27 +124,10 @@ class EstimatorReport(Event):
     measurement. Measurements that are not in use are missing. PX4's are squared.
     """
 
-    attitude_ok: bool
-    velocity_ok: bool  # horizontal
-    position_ok: bool  # horizontal, relative to the origin
-    height_ok: bool
+    valid: frozenset[str]  # of ESTIMATE; positions relative to the origin
     ratios: tuple[tuple[str, float], ...]
     # horizontal, one standard deviation; None: not reported, or not finite
     accuracy_m: float | None = None
-
-    @property
-    def valid(self) -> frozenset[str]:
-        """The parts of the estimate that are valid."""
-        return frozenset(name for name, valid in self._parts.items() if valid)
-
-    @property
-    def _parts(self) -> dict[str, bool]:
-        return {
-            "attitude": self.attitude_ok,
-            "horizontal velocity": self.velocity_ok,
-            "horizontal position": self.position_ok,
-            "height": self.height_ok,
-        }
 
     @property
     def worst(self) -> tuple[str, float]:
@@ -153,7 +137,7 @@ class EstimatorReport(Event):
     @property
     def problem(self) -> str:
         """Why nobody can fly by this estimate; empty if somebody can."""
-        missing = [name for name, valid in self._parts.items() if not valid]
+        missing = [part for part in ESTIMATE if part not in self.valid]
         if missing:
             return f"its estimator has no valid {', '.join(missing)}"
         name, ratio = self.worst

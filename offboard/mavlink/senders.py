@@ -11,7 +11,7 @@ and no pause of ours: before, it hands over no datagram of another address.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Hashable, Iterable, Mapping
+from collections.abc import Collection, Hashable, Iterable, Mapping
 from types import MappingProxyType
 
 from pymavlink.dialects.v20.all import enums
@@ -80,9 +80,7 @@ class Senders:
         """Whether the vehicle sends from another address."""
         return self.vehicle is not None and place != self._place
 
-    def moves_to(
-        self, place: Hashable, now_s: float, genuine: Callable[[], Iterable[Frame]]
-    ) -> bool:
+    def moves_to(self, place: Hashable, now_s: float, genuine: Iterable[Frame]) -> bool:
         """Take `place` as the vehicle's address if one of the `genuine` frames from it shows that
         the vehicle sends from there now."""
         if now_s - self.heard_s <= PEER_SILENT_S or not same_host(place, self._place):
@@ -90,7 +88,7 @@ class Senders:
         vehicle = self.vehicle
         assert vehicle is not None
         ids = vehicle.system_id, vehicle.component_id
-        moves = any((frame.system_id, frame.component_id) == ids for frame in genuine())
+        moves = any((frame.system_id, frame.component_id) == ids for frame in genuine)
         if moves:
             self._place = place
         return moves

@@ -10,7 +10,7 @@ components.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterator
 from dataclasses import dataclass, field
 
 from pymavlink.dialects.v20 import all as mavlink
@@ -119,7 +119,7 @@ class Session:
         self._time.on_datagram()
         arrival = _Arrival(peer, self._time.now_s(now_s))
         if self.senders.is_foreign(peer):
-            if not self.senders.moves_to(peer, arrival.now_s, lambda: self._genuine(datagram)):
+            if not self.senders.moves_to(peer, arrival.now_s, self._genuine(datagram)):
                 self.counters.dropped[DropReason.FOREIGN_PEER] += 1
                 return Reception()
             self._heartbeat_sent = None  # a router learns our address from it
@@ -207,11 +207,11 @@ class Session:
         shows, each once a second."""
         return self.senders.overhear(self._genuine(datagram), self.link_time_s)
 
-    def _genuine(self, datagram: bytes) -> list[framing.Frame]:
+    def _genuine(self, datagram: bytes) -> Iterator[framing.Frame]:
         """The frames of a datagram that signing would accept. Counts nothing, uses up no stamp."""
-        found = framing.FrameSplitter(False, Counters()).split(datagram)
-        signing = self._signing
-        return [each for each in found if not (signing and signing.refusal(each, note=False))]
+        for frame in framing.FrameSplitter(False, Counters()).split(datagram):
+            if not (self._signing and self._signing.refusal(frame, note=False)):
+                yield frame
 
     def thin_telemetry(self) -> bool:
         """Request half of the telemetry from now on: the link is saturated. False if the rates are

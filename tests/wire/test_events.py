@@ -139,7 +139,7 @@ def test_estimator_of_px4() -> None:
         return received(mavlink.MAVLink_estimator_status_message(10**6, flags, *ratios, 0.3, 0.3))
 
     waiting = report(229, NAN, NAN, 0.02, NAN, 0.003, NAN)
-    assert (waiting.attitude_ok, waiting.height_ok) == (True, True)
+    assert waiting.valid == {"attitude", "height"}
     assert waiting.problem == "its estimator has no valid horizontal velocity, horizontal position"
     for flags in (1023, 895, 831):
         good = report(flags, 0.04, 0.031, 0.018, 0.072, 0.001, NAN)
@@ -160,7 +160,7 @@ def test_estimator_of_arducopter() -> None:
     ):
         ratios = (velocity, 0.01, 0.0, 0.03, 0.0, NAN)
         found = received(mavlink.MAVLink_ekf_status_report_message(flags, *ratios), ARDUPILOT)
-        assert found.position_ok is valid
+        assert ("horizontal position" in found.valid) is valid
         assert found.worst[1] == pytest.approx(worst)
 
 

@@ -11,7 +11,7 @@ from offboard.mavlink.dialects.base import WantedMessage
 from offboard.mavlink.dialects.px4 import PX4
 from offboard.mavlink.outgoing import CommandLong, Outgoing
 from offboard.mavlink.session import Session, SessionSettings
-from offboard.mavlink.telemetry_rates import TelemetryRates, fitted
+from offboard.mavlink.telemetry import TelemetryRates, fitted
 from offboard.mavlink.vehicle_time import VehicleTime
 
 POSITION = 32
