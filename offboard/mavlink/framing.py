@@ -96,8 +96,8 @@ class FrameSplitter:
     def _next_marker(self, data: bytes, at: int) -> int:
         """Index of the next first byte of a frame, or the length of `data`; what is before it is
         counted as skipped."""
-        if data[at : at + 1] == b"\xfd":
-            return at
+        if data[at : at + 1] in (b"\xfd", b""):
+            return at  # as nearly always
         candidates = [i for i in (data.find(V2, at), data.find(V1, at)) if i >= 0]
         found = min(candidates, default=len(data))
         self._counters.bytes_skipped += found - at
