@@ -284,7 +284,7 @@ def texts(session: Session, *frames: bytes, now_s: float = 0.0) -> list[str]:
 def test_chunks_are_joined_in_any_order(
     order: tuple[int, ...], session: Session, vehicle: Sender
 ) -> None:
-    """Of two texts whose chunks alternate."""
+    """Also where the chunks of two texts alternate."""
     frames = [vehicle.text(CHUNKS[i], text_id, i) for i in order for text_id in (8, 9)]
     assert texts(session, *frames[:-2]) == []
     assert texts(session, *frames[-2:]) == [LONG.decode()] * 2
