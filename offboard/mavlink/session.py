@@ -128,9 +128,9 @@ class Session:
         unlogged: list[tuple[int, bytes]] = []
         arrival.events.extend(self._telemetry.texts.expire(arrival.now_s))
         for frame in self._splitter.split(datagram):
-            outcome = self._accept(frame, arrival)
-            self.counters.count(outcome)
-            if outcome in _NOT_LOGGED or frame.message_id == framing.SETUP_SIGNING:
+            why = self._accept(frame, arrival)
+            self.counters.count(why)
+            if why in _NOT_LOGGED or frame.message_id == framing.SETUP_SIGNING:
                 continue  # the latter holds the key
             if self._has_our_ids(frame):
                 unlogged.append((len(frames), frame.raw))
@@ -140,8 +140,8 @@ class Session:
             tuple(frames), tuple(arrival.events), tuple(arrival.replies), tuple(unlogged)
         )
 
-    def _accept(self, frame: framing.Frame, arrival: _Arrival) -> DropReason | bool:
-        """Why the frame was dropped, or whether it was decoded."""
+    def _accept(self, frame: framing.Frame, arrival: _Arrival) -> DropReason | None:
+        """Add to `arrival` what a frame says; why it was dropped."""
         if frame.component_id == self.settings.component_id and frame.raw in self._sent:
             return DropReason.ECHO
         forged = self._signing.refusal(frame) if self._signing else None
@@ -151,19 +151,18 @@ class Session:
             return forged
         was_found = self.vehicle is not None
         foreign = self.senders.judge(frame, arrival.place, self.link_time_s, arrival.events)
-        if foreign is not None:
+        if foreign or frame.message_id in COMMANDS:
             return foreign
-        if frame.message_id in COMMANDS:
-            return True  # to us
         if self.vehicle is not None:
             self.senders.heard_s = arrival.now_s
             if not was_found:
                 self._begin()
         if frame.message_id == framing.TIMESYNC:
-            return self._synchronise(frame, arrival)
+            self._synchronise(frame, arrival)
+            return None
         return self._interpret(frame, arrival)
 
-    def _synchronise(self, frame: framing.Frame, arrival: _Arrival) -> bool:
+    def _synchronise(self, frame: framing.Frame, arrival: _Arrival) -> None:
         """TIMESYNC: tc1 is 0 in a request."""
         tc1_ns, ts1_ns = frame.message.tc1, frame.message.ts1
         if tc1_ns == 0:
@@ -172,9 +171,8 @@ class Session:
             arrival.replies.append(Timesync(max(1, int(arrival.now_s * 1e9)), ts1_ns))
         elif self.vehicle is not None:
             arrival.events.append(self._telemetry.timesync_reply(tc1_ns, ts1_ns))
-        return True
 
-    def _interpret(self, frame: framing.Frame, arrival: _Arrival) -> DropReason | bool:
+    def _interpret(self, frame: framing.Frame, arrival: _Arrival) -> DropReason | None:
         """Turn a frame of the vehicle into events."""
         assert self.dialect is not None
         if frame.message_id == framing.COMMAND_ACK and not self.senders.is_for_us(frame):
@@ -182,8 +180,8 @@ class Session:
         found = self._telemetry.interpret(frame, self.dialect, arrival.now_s)
         if isinstance(found, DropReason):
             return found
-        arrival.events.extend(found or ())
-        return found is not None
+        arrival.events.extend(found)
+        return None
 
     def _has_our_ids(self, frame: framing.Frame) -> bool:
         """Whether it has the ids of what we send, or of our records."""

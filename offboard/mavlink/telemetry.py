@@ -62,9 +62,8 @@ class Telemetry:
 
     def interpret(
         self, frame: Frame, dialect: Dialect, now_s: float
-    ) -> tuple[Event, ...] | DropReason | None:
-        """The events of a verified frame of the vehicle, None for a message without decoder; or why
-        it is dropped. `now_s`: its arrival."""
+    ) -> tuple[Event, ...] | DropReason:
+        """The events of a frame of the vehicle, or why it is dropped. `now_s`: its arrival."""
         number = self._number(frame, now_s)
         if frame.message_id == STATUSTEXT:
             return tuple(self.texts.add(frame.payload, now_s))
@@ -76,7 +75,7 @@ class Telemetry:
         if isinstance(event, (Heartbeat, ModeReport)) and self._overtaken(number, now_s):
             return DropReason.STALE
         self.rates.count(frame.message_id, self.time.seconds)
-        return None if event is None else (event,)
+        return () if event is None else (event,)
 
     def _stamped(
         self, event: LocalPosition | Attitude, message_id: int, dialect: Dialect, now_s: float

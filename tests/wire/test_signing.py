@@ -83,7 +83,6 @@ def test_none_of_many_forged_and_replayed_frames_is_accepted() -> None:
     stranger, unsigned = Signer(OTHER_KEY, stamp=NOW + 10**6), Signer(None)
     for frame in real:
         assert ours.receive(frame, PEER, 0.1).events
-    decoded = ours.counters.decoded
 
     def altered(byte: int, end: int) -> bytes:
         """A captured frame with another time stamp, link id or content, and a right checksum."""
@@ -108,7 +107,7 @@ def test_none_of_many_forged_and_replayed_frames_is_accepted() -> None:
         reception = ours.receive(chance.choice(forgeries)(), PEER, 0.2)
         assert (reception.events, reception.frames, reception.replies) == ((), (), ())
     # a part of the altered frames is the original, by chance: then it is a replay
-    assert (ours.counters.forged, ours.counters.decoded) == (COUNT, decoded)
+    assert ours.counters.forged == COUNT
     assert all(ours.counters.dropped[each] for each in FORGED if each is not DropReason.OLD_STAMP)
     assert ours.receive(vehicle.position(9000), PEER, 0.3).events  # and the vehicle still is
 
