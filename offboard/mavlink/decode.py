@@ -125,10 +125,8 @@ def _gps_fix(message: Any, _: Dialect) -> events.Event:
 def _system_health(message: Any, _: Dialect) -> events.Event:
     health, percent = message.onboard_control_sensors_health, message.battery_remaining
     failed = message.onboard_control_sensors_enabled & ~health & ~_PREARM_CHECK
-    millivolts = message.voltage_battery
     return events.SystemHealth(
         prearm_ok=bool(health & _PREARM_CHECK),
-        battery_voltage_v=millivolts * 1e-3 if millivolts != 0xFFFF else None,
         battery_remaining=percent * 1e-2 if 0 <= percent <= 100 else None,
         radio_ok=bool(message.onboard_control_sensors_present & health & _RADIO),
         unhealthy=tuple(name for bit, name in _SENSORS.items() if failed & bit),
@@ -177,10 +175,6 @@ def _version(message: Any, _: Dialect) -> events.Event:
     return events.VehicleIdentity(uid, version)
 
 
-def _system_time(message: Any, _: Dialect) -> events.Event:
-    return events.SystemTime(message.time_unix_usec * 1e-6)
-
-
 def _landed(message: Any, _: Dialect) -> events.Event:
     state = message.landed_state
     return events.Landed(_LANDED[state] if state < len(_LANDED) else _LANDED[0])
@@ -215,7 +209,6 @@ def printable(data: bytes) -> str:
 _DECODERS: Mapping[int, Callable[[Any, Dialect], events.Event | DropReason | None]] = {
     0: _heartbeat,
     1: _system_health,
-    2: _system_time,
     22: _parameter,
     31: _attitude,
     24: _gps_fix,

@@ -165,18 +165,10 @@ class VehicleIdentity(Event):
 
 
 @dataclass(frozen=True, slots=True)
-class SystemTime(Event):
-    """SYSTEM_TIME; `unix_s` is 0 while the vehicle does not know it."""
-
-    unix_s: float
-
-
-@dataclass(frozen=True, slots=True)
 class SystemHealth(Event):
     """SYS_STATUS: whether the vehicle's own pre-arm checks pass, and its battery."""
 
     prearm_ok: bool
-    battery_voltage_v: float | None
     battery_remaining: float | None  # 0 .. 1
     radio_ok: bool = False  # a remote control is present and received
     unhealthy: tuple[str, ...] = ()  # MAV_SYS_STATUS_SENSOR that are enabled and not healthy

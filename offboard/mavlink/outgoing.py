@@ -170,7 +170,6 @@ class CommandLong(Outgoing):
 
     command: int
     parameters: tuple[float, ...] = ()  # up to seven; the rest is 0
-    confirmation: int = 0
 
     @classmethod
     def arm(cls) -> CommandLong:
@@ -205,9 +204,7 @@ class CommandLong(Outgoing):
         if len(parameters) != 7:
             raise ValueError(f"COMMAND_LONG has seven parameters, not {len(parameters)}")
         _finite("a command parameter", *(p for p in parameters if not math.isnan(p)))
-        return mavlink.MAVLink_command_long_message(
-            *_ids(target), self.command, self.confirmation, *parameters
-        )
+        return mavlink.MAVLink_command_long_message(*_ids(target), self.command, 0, *parameters)
 
 
 @dataclass(frozen=True, slots=True)

@@ -225,7 +225,7 @@ MEASURED: list[tuple[str, Callable[[FlightState, Any], None], Any, Any]] = [
     ("volume", lambda flight, value: _fly_at(flight, value, -1.0), 1000.0, 1000.1),
     (
         "battery",
-        lambda flight, value: hear(flight, SystemHealth(True, None, value)),
+        lambda flight, value: hear(flight, SystemHealth(True, value)),
         0.1,
         0.09,
     ),

@@ -163,8 +163,8 @@ def test_px4_lands(px4: Replay) -> None:
     assert changes[0] == changes[-1] == "on_ground"
     assert "in_air" in changes
     assert any(health.prearm_ok for health in px4.of(events.SystemHealth))
-    voltages = [health.battery_voltage_v for health in px4.of(events.SystemHealth)]
-    assert all(voltage is not None and 14.0 < voltage < 17.0 for voltage in voltages[-50:])
+    charges = [health.battery_remaining for health in px4.of(events.SystemHealth)]
+    assert all(charge is not None and 0.0 < charge <= 1.0 for charge in charges[-50:])
 
 
 def test_arducopter_modes(arducopter: Replay) -> None:
