@@ -31,7 +31,7 @@ def test_only_the_clock_reads_the_time() -> None:
 
 def test_only_the_edges_open_sockets() -> None:
     links = {f"simulator/link/{name}.py" for name in ("links", "sockets")}
-    opening = ("connection", "lock", "stream", "stream_sources", "udp")
+    opening = ("connection", "lock", "stream", "udp")
     edges = {f"offboard/link/{name}.py" for name in opening}
     supervisor = {f"offboard/supervisor/{name}.py" for name in ("supervisor", "process")}
     pipes = {"offboard/run/sitl.py", "simulator/pool.py"}  # between two processes

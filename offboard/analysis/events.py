@@ -10,7 +10,6 @@ from offboard.analysis.samples import continuous_s
 from offboard.analysis.tlog import LoggedMessage
 from offboard.flight.phases import PHASE_CODES
 from offboard.mavlink import event_record
-from offboard.mavlink.decode import decode_text_chunk
 from offboard.mavlink.texts import TextAssembler
 
 _PHASES: dict[int | None, str] = {code: phase.value for phase, code in PHASE_CODES.items()}
@@ -48,7 +47,7 @@ class Texts:
 
     def add_chunk(self, entry: LoggedMessage, now_ms: float) -> None:
         """A STATUSTEXT; a text in chunks is whole with its last one."""
-        whole = self._assembler.add(decode_text_chunk(entry.frame.payload), entry.unix_us / 1e6)
+        whole = self._assembler.add(entry.frame.payload, entry.unix_us / 1e6)
         self._texts += [(now_ms, text.text) for text in whole]
 
     def events(self, anchor_ms: float) -> tuple[Event, ...]:

@@ -18,7 +18,7 @@ from offboard.identification.attitude_fit import ResponseFit
 from offboard.identification.trace import Trace, clean
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_fit import Identified, identify
-from offboard.mavlink.dialects.base import ThrustRule
+from offboard.mavlink.outgoing import ThrustRule
 from offboard.model.frames import heading_from_quaternion, thrust_direction_from_quaternion
 from offboard.model.vehicle import AxisResponse, Vehicle
 

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from pymavlink.dialects.v20 import all as dialect
 
 from offboard.documents.errors import UserError, abridged
-from offboard.mavlink.counters import DropReason
 from offboard.mavlink.framing import Frame, frame_size, parse
 
 _STAMP = struct.Struct(">Q")
@@ -144,13 +143,11 @@ def _entry(data: bytes, at: int, *, certain: bool) -> LoggedMessage | int | None
     if size is None or end > len(data):
         return None
     frame = parse(data, at + 8, end)
-    if isinstance(frame, Frame) and frame.verified:
+    if frame and frame.verified:
         return LoggedMessage(_STAMP.unpack_from(data, at)[0], frame)
     if certain or not _begins(data, end):
         return 0
-    if isinstance(frame, DropReason):
-        return end - at
-    return LoggedMessage(_STAMP.unpack_from(data, at)[0], frame)
+    return LoggedMessage(_STAMP.unpack_from(data, at)[0], frame) if frame else end - at
 
 
 def _begins(data: bytes, at: int) -> bool:

@@ -22,7 +22,7 @@ from rich.console import Console
 from offboard.documents.command_line import complain as complain
 from offboard.documents.command_line import wrapped
 from offboard.documents.errors import UserError, shown
-from offboard.link.new_file import new_file
+from offboard.link.log import new_file
 
 if TYPE_CHECKING:
     from offboard.run.configuration import FlightConfig

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from offboard.doctor.listening import Observation
 from offboard.flight.preflight import TELEMETRY, Finding, Level
 from offboard.link.connection import BITS_OF_A_BYTE
-from offboard.mavlink.telemetry_rates import SHARE
+from offboard.mavlink.telemetry import SHARE
 
 BAUDS = (57600, 115200, 230400, 460800, 921600)
 LOST_SHARE, FULL_SHARE = 0.02, 0.9

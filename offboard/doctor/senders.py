@@ -69,8 +69,7 @@ class Senders:
         if splitter is None:
             splitter = self._splitters[place] = FrameSplitter(self._stream, self.counters)
         for frame in splitter.split(data):
-            if frame.verified:
-                self._count(frame, place)
+            self._count(frame, place)
 
     def _count(self, frame: Frame, place: Hashable) -> None:
         ids = frame.system_id, frame.component_id

@@ -75,7 +75,7 @@ def gps(seen: Observation) -> Iterable[Finding]:
     names = {None: "GPS_RAW_INT is not sent", 0: "no GPS is connected", 1: "no fix", 2: "2D fix"}
     found = names.get(fix_type, f"fix type {fix_type}")
     report = seen.vehicle.estimator
-    if report and report.position_ok and not report.problem:
+    if report and not report.problem:
         hint = "check that it has another source"
         yield warn(f"{found}; the estimator still has a position", hint)
     elif fix_type == 0:

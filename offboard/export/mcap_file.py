@@ -18,7 +18,7 @@ import numpy as np
 from offboard.documents.errors import UserError
 from offboard.documents.extras import install
 from offboard.export.series import PHASE, Array, Flight, Series, phase_name
-from offboard.link.new_file import new_file
+from offboard.link.log import new_file
 from offboard.model.frames import enu, flu_in_enu
 
 MAP, BODY = "map", "base_link"  # frames: east, north, up; and forward, left, up

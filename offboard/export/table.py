@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from offboard.export.series import PHASE, Array, Flight, phase_name
-from offboard.link.new_file import new_file
+from offboard.link.log import new_file
 
 EVENT = "event"
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from offboard.export.series import Array, Flight, Series
 from offboard.flight.record import FIELDS
-from offboard.link.new_file import new_file
+from offboard.link.log import new_file
 from offboard.model.frames import heading_from_quaternion
 
 _MAGIC = b"ULog\x01\x12\x35\x01"

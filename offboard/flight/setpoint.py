@@ -13,8 +13,7 @@ from enum import IntFlag
 
 from offboard.flight import outbox
 from offboard.flight.state import LEVEL, FlightState
-from offboard.mavlink.encode import FLOAT32_MAX
-from offboard.mavlink.outgoing import AttitudeTarget, PositionTarget
+from offboard.mavlink.outgoing import FLOAT32_MAX, AttitudeTarget, PositionTarget
 from offboard.model.command import Command, PositionCommand
 from offboard.model.vehicle import Vehicle
 

@@ -14,7 +14,6 @@ from offboard.flight.positioning import PositionJumps
 from offboard.flight.preflight import ParameterReading
 from offboard.flight.rows import other_sender
 from offboard.flight.state import FlightState
-from offboard.mavlink.dialects.base import ThrustRule
 from offboard.mavlink.events import (
     Attitude,
     ClockBehind,
@@ -30,6 +29,7 @@ from offboard.mavlink.events import (
     TimesyncReply,
     VehicleFound,
 )
+from offboard.mavlink.outgoing import ThrustRule
 from offboard.model.frames import thrust_direction_from_quaternion
 
 SAME_THRUST = 1e-5  # of full throttle: rounding on the link

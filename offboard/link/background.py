@@ -27,7 +27,6 @@ class BackgroundWriter(Generic[Item]):
         self._waits = waits
         self._queue: deque[Item] = deque()
         self._writing = 0
-        self._room = threading.Event()
         self._closing = threading.Event()
         self.error: BaseException | None = None
         self.dropped = 0
@@ -37,8 +36,7 @@ class BackgroundWriter(Generic[Item]):
     def put(self, item: Item) -> None:
         """Queue `item`. Call it from one thread only."""
         while self._waits and len(self._queue) >= self._size and self.error is None:
-            self._room.clear()
-            self._room.wait(PERIOD_S)
+            self._closing.wait(PERIOD_S)
         if self.error is not None or len(self._queue) >= self._size:
             self.dropped += 1
         else:
@@ -58,7 +56,6 @@ class BackgroundWriter(Generic[Item]):
     def _run(self) -> None:
         while not self._closing.wait(PERIOD_S) or self._queue:
             batch = [self._queue.popleft() for _ in range(len(self._queue))]
-            self._room.set()
             if batch:
                 self._try(batch)
 

@@ -19,8 +19,7 @@ from typing import Any
 
 from offboard.documents.errors import shown
 from offboard.link.interface import Link, LinkError, LinkUnavailable
-from offboard.link.stream import StreamLink
-from offboard.link.stream_sources import Listener, Redial, connect, open_port
+from offboard.link.stream import Listener, Redial, StreamLink, connect, open_port
 from offboard.link.udp import LockstepLink, UdpLink, udp_socket
 
 FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or serial:DEVICE:BAUD"

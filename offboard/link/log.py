@@ -1,4 +1,5 @@
-"""The flight directory and its .tlog: every frame sent or received, and our own records.
+"""Files: the flight directory and its .tlog, which has every frame sent or received and our own
+records; and `new_file`, for all others.
 
 An entry of a .tlog is a big-endian uint64 of Unix microseconds, low two bits zero, and the frame
 unchanged. A thread writes them, so that a slow disk does not stop the flight: a crash loses the
@@ -9,9 +10,11 @@ from __future__ import annotations
 
 import os
 import struct
-from errno import EACCES, ENOTDIR
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from errno import EACCES, EEXIST, ENOTDIR
 from pathlib import Path
-from types import TracebackType
+from typing import BinaryIO
 
 from offboard.documents.errors import UserError
 from offboard.link.background import BackgroundWriter
@@ -87,12 +90,7 @@ class FlightLog:
             "choose a directory that can be written with --out"
         )
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -146,3 +144,24 @@ def append(descriptor: int, entries: list[bytes]) -> None:
     rest = b"".join(entries)
     while rest:
         rest = rest[os.write(descriptor, rest) :]
+
+
+@contextmanager
+def new_file(path: Path) -> Iterator[BinaryIO]:
+    """Write a file that must not exist. It appears at the end of the block, unless the block or the
+    disk fails. Raises UserError."""
+    incomplete = path.with_name(f".{os.getpid()}.part")
+    try:
+        with incomplete.open("xb") as file:
+            yield file
+        try:
+            os.link(incomplete, path)  # unlike a rename, refuses to replace a file
+        except PermissionError:  # a file system without links
+            if path.exists():
+                raise FileExistsError(EEXIST, os.strerror(EEXIST)) from None
+            incomplete.rename(path)
+    except OSError as error:
+        raise UserError(f"{path} cannot be written ({error.strerror or error})") from None
+    finally:
+        with suppress(OSError):
+            incomplete.unlink()

@@ -12,7 +12,6 @@ import os
 from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
-from types import TracebackType
 
 from offboard.documents.errors import UserError
 from offboard.link import clock
@@ -68,12 +67,7 @@ class SigningTime:
             reserved,
         )
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._writer.close(CLOSE_S)
 
     def _kept(self) -> int:

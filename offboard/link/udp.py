@@ -12,6 +12,7 @@ import select
 import socket
 import struct
 import sys
+from collections import Counter
 from collections.abc import Hashable
 from contextlib import suppress
 
@@ -147,7 +148,7 @@ class UdpLink:
         return ours
 
     def _count(self, others: list[Chunk], dropped: int) -> None:
-        for sender, number in _by_sender(others).items():
+        for sender, number in Counter(_name(chunk.peer) for chunk in others).items():
             self.report.count(sender, number)
         if dropped > self._dropped:  # most of the others by far: the vehicle has its own buffer
             self.report.count(_name(others[-1].peer), dropped - self._dropped)
@@ -218,14 +219,6 @@ def _second_socket(listening: socket.socket, peer: tuple[str | int, ...]) -> soc
             if one.fileno() >= 0:
                 one.setsockopt(socket.SOL_SOCKET, _SHARE_PORT, 0)
     return sock
-
-
-def _by_sender(chunks: list[Chunk]) -> dict[str, int]:
-    numbers: dict[str, int] = {}
-    for chunk in chunks:
-        name = _name(chunk.peer)
-        numbers[name] = numbers.get(name, 0) + 1
-    return numbers
 
 
 def _name(place: Hashable) -> str:

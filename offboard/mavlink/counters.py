@@ -1,7 +1,6 @@
 """Counters of received bytes and frames, and of what was dropped, by reason.
 
-Two sums always hold and are tested: each byte received is framed, skipped or pending; each frame is
-decoded, ignored (a message that no decoder exists for) or dropped for exactly one reason.
+Each byte received is in a frame, skipped or pending, and a frame is dropped for one reason.
 """
 
 from __future__ import annotations
@@ -37,14 +36,6 @@ class DropReason(Enum):
     STALE = "older than the newest message of the same id"
 
 
-NOT_A_FRAME = frozenset(
-    {
-        DropReason.TRUNCATED,
-        DropReason.BAD_CRC,
-        DropReason.INCOMPATIBLE,
-        DropReason.FOREIGN_PEER,
-    }
-)
 FORGED = (
     DropReason.UNSIGNED,
     DropReason.BAD_SIGNATURE,
@@ -62,26 +53,16 @@ class Counters:
     bytes_skipped: int = 0
     bytes_pending: int = 0
     frames: int = 0
-    decoded: int = 0
-    ignored: int = 0
     dropped: Counter[DropReason] = field(default_factory=Counter)
     forged: int = 0  # frames that signing refused
     _reported_next: int = 1  # number of them in the next of `news`
 
-    def count(self, outcome: DropReason | bool) -> None:
-        """A frame was dropped, decoded (True) or ignored (False)."""
+    def count(self, why: DropReason | None) -> None:
+        """A frame was received; `why` it was dropped."""
         self.frames += 1
-        if isinstance(outcome, DropReason):
-            self.dropped[outcome] += 1
-            self.forged += outcome in FORGED
-        elif outcome:
-            self.decoded += 1
-        else:
-            self.ignored += 1
-
-    @property
-    def dropped_frames(self) -> int:
-        return sum(n for reason, n in self.dropped.items() if reason not in NOT_A_FRAME)
+        if why is not None:
+            self.dropped[why] += 1
+            self.forged += why in FORGED
 
     def news(self) -> str:
         """What signing refused, on the 1st, 10th, 100th ... frame; else empty."""

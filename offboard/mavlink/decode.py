@@ -27,13 +27,13 @@ _SENSORS = {
     for bit, sensor in mavlink.enums["MAV_SYS_STATUS_SENSOR"].items()
 }
 # ESTIMATOR_STATUS_FLAGS and EKF_STATUS_FLAGS have the same bits
-_EKF_ATTITUDE, _EKF_VELOCITY, _EKF_POSITION, _EKF_HEIGHT = 1, 2, 8, 32
+_EKF_BITS = dict(zip(events.ESTIMATE, (1, 2, 8, 32), strict=True))
 _ARMED = 0x80  # MAV_MODE_FLAG_SAFETY_ARMED
 _FIX_3D = 3  # GPS_FIX_TYPE
 _REAL32 = 9  # MAV_PARAM_TYPE
 _UNSIGNED_TYPES, _SIGNED_TYPES = (1, 3, 5), (2, 4, 6)
 _LANDED = ("unknown", "on_ground", "in_air", "takeoff", "landing")  # MAV_LANDED_STATE
-_RESULTS = (  # MAV_RESULT
+_RESULTS = (  # MAV_RESULT, of which pymavlink's `all` lacks some
     "ACCEPTED",
     "TEMPORARILY_REJECTED",
     "DENIED",
@@ -62,47 +62,16 @@ class Identity(NamedTuple):
     autopilot: int
 
 
-class TextChunk(NamedTuple):
-    """One STATUSTEXT. `last`: its text is terminated. `text_id` 0: a text of one chunk."""
-
-    severity: int
-    data: bytes
-    text_id: int
-    chunk: int
-    last: bool
-
-
 def decode(frame: Frame, dialect: Dialect) -> events.Event | DropReason | None:
     """The event in a verified frame, IMPLAUSIBLE, or None for a message without decoder."""
     decoder = _DECODERS.get(frame.message_id)
     return None if decoder is None else decoder(frame.message, dialect)
 
 
-def decode_command(message: Any) -> tuple[int, tuple[float, ...], Address]:
-    """Command, parameters and receiver of a COMMAND_LONG or a COMMAND_INT, whose parameters 5 to 7,
-    a place, are left out."""
-    parameters = [message.param1, message.param2, message.param3, message.param4]
-    if message.id == mavlink.MAVLINK_MSG_ID_COMMAND_LONG:
-        parameters += [message.param5, message.param6, message.param7]
-    return (
-        message.command,
-        tuple(parameters),
-        Address(message.target_system, message.target_component),
-    )
-
-
 def decode_identity(payload: bytes) -> Identity:
     """MAV_TYPE and MAV_AUTOPILOT in the payload of a HEARTBEAT."""
     padded = payload.ljust(6, b"\0")  # MAVLink 2 omits trailing zeros
     return Identity(padded[4], padded[5])
-
-
-def decode_text_chunk(payload: bytes) -> TextChunk:
-    """The payload of a STATUSTEXT, whose text is UTF-8, which pymavlink does not decode."""
-    layout = mavlink.MAVLink_statustext_message.unpacker
-    severity, text, text_id, chunk = layout.unpack_from(payload.ljust(layout.size, b"\0"))
-    data, terminator, _ = text.partition(b"\0")
-    return TextChunk(severity, data, text_id, chunk, bool(terminator))
 
 
 def _heartbeat(message: Any, dialect: Dialect) -> events.Event:
@@ -156,10 +125,8 @@ def _gps_fix(message: Any, _: Dialect) -> events.Event:
 def _system_health(message: Any, _: Dialect) -> events.Event:
     health, percent = message.onboard_control_sensors_health, message.battery_remaining
     failed = message.onboard_control_sensors_enabled & ~health & ~_PREARM_CHECK
-    millivolts = message.voltage_battery
     return events.SystemHealth(
         prearm_ok=bool(health & _PREARM_CHECK),
-        battery_voltage_v=millivolts * 1e-3 if millivolts != 0xFFFF else None,
         battery_remaining=percent * 1e-2 if 0 <= percent <= 100 else None,
         radio_ok=bool(message.onboard_control_sensors_present & health & _RADIO),
         unhealthy=tuple(name for bit, name in _SENSORS.items() if failed & bit),
@@ -195,10 +162,7 @@ def _estimator(
     flags: int, ratios: dict[str, float], accuracy_m: float | None = None
 ) -> events.EstimatorReport:
     return events.EstimatorReport(
-        attitude_ok=bool(flags & _EKF_ATTITUDE),
-        velocity_ok=bool(flags & _EKF_VELOCITY),
-        position_ok=bool(flags & _EKF_POSITION),
-        height_ok=bool(flags & _EKF_HEIGHT),
+        valid=frozenset(part for part, bit in _EKF_BITS.items() if flags & bit),
         ratios=tuple((name, ratio) for name, ratio in ratios.items() if math.isfinite(ratio)),
         accuracy_m=accuracy_m,
     )
@@ -209,10 +173,6 @@ def _version(message: Any, _: Dialect) -> events.Event:
     uid = message.uid or int.from_bytes(bytes(message.uid2), "little")
     version = events.FirmwareVersion(*message.flight_sw_version.to_bytes(4, "big"))
     return events.VehicleIdentity(uid, version)
-
-
-def _system_time(message: Any, _: Dialect) -> events.Event:
-    return events.SystemTime(message.time_unix_usec * 1e-6)
 
 
 def _landed(message: Any, _: Dialect) -> events.Event:
@@ -249,7 +209,6 @@ def printable(data: bytes) -> str:
 _DECODERS: Mapping[int, Callable[[Any, Dialect], events.Event | DropReason | None]] = {
     0: _heartbeat,
     1: _system_health,
-    2: _system_time,
     22: _parameter,
     31: _attitude,
     24: _gps_fix,

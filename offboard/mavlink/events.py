@@ -11,10 +11,17 @@ from dataclasses import dataclass
 
 Triple = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]  # w, x, y, z; FRD -> NED
+ESTIMATE = ("attitude", "horizontal velocity", "horizontal position", "height")  # its parts
+
+
+class Event:
+    """One of the values below."""
+
+    __slots__ = ()
 
 
 @dataclass(frozen=True, slots=True)
-class VehicleFound:
+class VehicleFound(Event):
     """The first HEARTBEAT of an autopilot. From now on the session accepts only this vehicle."""
 
     system_id: int
@@ -23,7 +30,7 @@ class VehicleFound:
 
 
 @dataclass(frozen=True, slots=True)
-class Heartbeat:
+class Heartbeat(Event):
     """HEARTBEAT of our vehicle."""
 
     mode: str  # the dialect's name of custom_mode: "OFFBOARD", "AUTO.LOITER", ...
@@ -33,14 +40,14 @@ class Heartbeat:
 
 
 @dataclass(frozen=True, slots=True)
-class ModeReport:
+class ModeReport(Event):
     """CURRENT_MODE of our vehicle."""
 
     mode: str  # as in `Heartbeat`
 
 
 @dataclass(frozen=True, slots=True)
-class OtherSender:
+class OtherSender(Event):
     """A frame that shows a second controller of our vehicle on this link: a setpoint that is not
     ours, or a command for its mode from its own system, as ours are."""
 
@@ -50,7 +57,7 @@ class OtherSender:
 
 
 @dataclass(frozen=True, slots=True)
-class OtherCompanion:
+class OtherCompanion(Event):
     """HEARTBEAT of another companion computer of our vehicle, which may use our own ids."""
 
     system_id: int
@@ -59,7 +66,7 @@ class OtherCompanion:
 
 
 @dataclass(frozen=True, slots=True)
-class CommandRequest:
+class CommandRequest(Event):
     """COMMAND_LONG or COMMAND_INT to our own component, forwarded by the vehicle or a router.
     Parameters may be NaN; those of a COMMAND_INT are its first four."""
 
@@ -70,7 +77,7 @@ class CommandRequest:
 
 
 @dataclass(frozen=True, slots=True)
-class LocalPosition:
+class LocalPosition(Event):
     """LOCAL_POSITION_NED."""
 
     time_s: float
@@ -79,7 +86,7 @@ class LocalPosition:
 
 
 @dataclass(frozen=True, slots=True)
-class Attitude:
+class Attitude(Event):
     """ATTITUDE_QUATERNION."""
 
     time_s: float
@@ -88,7 +95,7 @@ class Attitude:
 
 
 @dataclass(frozen=True, slots=True)
-class ThrustReport:
+class ThrustReport(Event):
     """ATTITUDE_TARGET: the collective thrust that the autopilot demands of its motors, whatever
     flies it. On ArduCopter before it is raised for the tilt."""
 
@@ -96,49 +103,31 @@ class ThrustReport:
 
 
 @dataclass(frozen=True, slots=True)
-class GpsFix:
+class GpsFix(Event):
     """GPS_RAW_INT with a position fix in three dimensions."""
 
     accuracy_m: float | None  # horizontal, as the receiver reports it
 
 
 @dataclass(frozen=True, slots=True)
-class NoFix:
+class NoFix(Event):
     """GPS_RAW_INT without a 3D fix."""
 
     fix_type: int  # GPS_FIX_TYPE: 0 no GPS, 1 no fix, 2 2D fix
 
 
 @dataclass(frozen=True, slots=True)
-class EstimatorReport:
+class EstimatorReport(Event):
     """ESTIMATOR_STATUS (PX4) or EKF_STATUS_REPORT (ArduPilot).
 
     `ratios`: innovation over its test limit, by measurement; above 1 the estimator rejects the
     measurement. Measurements that are not in use are missing. PX4's are squared.
     """
 
-    attitude_ok: bool
-    velocity_ok: bool  # horizontal
-    position_ok: bool  # horizontal, relative to the origin
-    height_ok: bool
+    valid: frozenset[str]  # of ESTIMATE; positions relative to the origin
     ratios: tuple[tuple[str, float], ...]
-    accuracy_m: float | None = (
-        None  # horizontal, one standard deviation; None: not reported, or not finite
-    )
-
-    @property
-    def valid(self) -> frozenset[str]:
-        """The parts of the estimate that are valid."""
-        return frozenset(name for name, valid in self._parts.items() if valid)
-
-    @property
-    def _parts(self) -> dict[str, bool]:
-        return {
-            "attitude": self.attitude_ok,
-            "horizontal velocity": self.velocity_ok,
-            "horizontal position": self.position_ok,
-            "height": self.height_ok,
-        }
+    # horizontal, one standard deviation; None: not reported, or not finite
+    accuracy_m: float | None = None
 
     @property
     def worst(self) -> tuple[str, float]:
@@ -148,7 +137,7 @@ class EstimatorReport:
     @property
     def problem(self) -> str:
         """Why nobody can fly by this estimate; empty if somebody can."""
-        missing = [name for name, valid in self._parts.items() if not valid]
+        missing = [part for part in ESTIMATE if part not in self.valid]
         if missing:
             return f"its estimator has no valid {', '.join(missing)}"
         name, ratio = self.worst
@@ -168,7 +157,7 @@ class FirmwareVersion:
 
 
 @dataclass(frozen=True, slots=True)
-class VehicleIdentity:
+class VehicleIdentity(Event):
     """AUTOPILOT_VERSION: the hardware's unique number, 0 where there is none, and the firmware."""
 
     uid: int
@@ -176,32 +165,24 @@ class VehicleIdentity:
 
 
 @dataclass(frozen=True, slots=True)
-class SystemTime:
-    """SYSTEM_TIME; `unix_s` is 0 while the vehicle does not know it."""
-
-    unix_s: float
-
-
-@dataclass(frozen=True, slots=True)
-class SystemHealth:
+class SystemHealth(Event):
     """SYS_STATUS: whether the vehicle's own pre-arm checks pass, and its battery."""
 
     prearm_ok: bool
-    battery_voltage_v: float | None
     battery_remaining: float | None  # 0 .. 1
     radio_ok: bool = False  # a remote control is present and received
     unhealthy: tuple[str, ...] = ()  # MAV_SYS_STATUS_SENSOR that are enabled and not healthy
 
 
 @dataclass(frozen=True, slots=True)
-class Landed:
+class Landed(Event):
     """EXTENDED_SYS_STATE.landed_state: "unknown", "on_ground", "in_air", "takeoff", "landing"."""
 
     state: str
 
 
 @dataclass(frozen=True, slots=True)
-class CommandAck:
+class CommandAck(Event):
     """COMMAND_ACK addressed to us. `result` is the name without prefix: "ACCEPTED", "DENIED" ..."""
 
     command: int
@@ -209,7 +190,7 @@ class CommandAck:
 
 
 @dataclass(frozen=True, slots=True)
-class StatusText:
+class StatusText(Event):
     """STATUSTEXT, all chunks joined, trailing tab and NUL removed."""
 
     severity: int  # MAV_SEVERITY, 0 emergency .. 7 debug
@@ -217,7 +198,7 @@ class StatusText:
 
 
 @dataclass(frozen=True, slots=True)
-class Parameter:
+class Parameter(Event):
     """PARAM_VALUE, decoded as the dialect packs it."""
 
     name: str
@@ -225,7 +206,7 @@ class Parameter:
 
 
 @dataclass(frozen=True, slots=True)
-class PeerChanged:
+class PeerChanged(Event):
     """The vehicle now sends from another port of its host, for example after a restart of
     mavlink-router."""
 
@@ -233,7 +214,7 @@ class PeerChanged:
 
 
 @dataclass(frozen=True, slots=True)
-class ClockBehind:
+class ClockBehind(Event):
     """A correctly signed heartbeat whose time stamp is too old; no vehicle is found yet."""
 
     system_id: int
@@ -241,7 +222,7 @@ class ClockBehind:
 
 
 @dataclass(frozen=True, slots=True)
-class TimesyncReply:
+class TimesyncReply(Event):
     """TIMESYNC reply of the vehicle: the stamp of our request, and vehicle time on its arrival."""
 
     request_ns: int
@@ -249,34 +230,7 @@ class TimesyncReply:
 
 
 @dataclass(frozen=True, slots=True)
-class Rebooted:
+class Rebooted(Event):
     """Several stamps in a row are of a new epoch: the vehicle was rebooted."""
 
     time_s: float
-
-
-Event = (
-    VehicleFound
-    | Heartbeat
-    | ModeReport
-    | OtherSender
-    | OtherCompanion
-    | CommandRequest
-    | VehicleIdentity
-    | LocalPosition
-    | Attitude
-    | ThrustReport
-    | GpsFix
-    | NoFix
-    | EstimatorReport
-    | SystemTime
-    | SystemHealth
-    | Landed
-    | CommandAck
-    | StatusText
-    | Parameter
-    | PeerChanged
-    | ClockBehind
-    | TimesyncReply
-    | Rebooted
-)

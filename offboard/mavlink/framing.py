@@ -10,7 +10,6 @@ MAVLink 1 frames (0xFE) are accepted: their payloads lack the extension fields, 
 
 from __future__ import annotations
 
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from fastcrc import crc16
@@ -25,8 +24,8 @@ mavlink.MAVLINK_IGNORE_CRC = 0  # MAV_IGNORE_CRC of the environment must not swi
 V2, V1 = 0xFD, 0xFE  # first byte of a frame of MAVLink 2 and 1
 # Ids of messages that are needed before they are decoded
 HEARTBEAT, COMMAND_ACK, TIMESYNC, STATUSTEXT, SETUP_SIGNING = 0, 77, 111, 253, 256
-# SET_ATTITUDE_TARGET, SET_POSITION_TARGET_LOCAL_NED and _GLOBAL_INT: offset of target_system
-SETPOINTS = MappingProxyType({82: 36, 84: 50, 86: 50})
+# SET_ATTITUDE_TARGET, SET_POSITION_TARGET_LOCAL_NED and _GLOBAL_INT
+SETPOINTS = frozenset({82, 84, 86})
 _CRC_BYTES = 2
 _CRC_EXTRA = {i: bytes((each.crc_extra,)) for i, each in mavlink.mavlink_map.items()}
 _crc = crc16.mcrf4xx
@@ -35,7 +34,7 @@ _SIGNED = 0x01  # incompatibility flag
 
 
 class Frame(NamedTuple):
-    """`verified`: the checksum is correct. False only if pymavlink does not know the id. `message`:
+    """`verified`: the checksum is correct; False only if pymavlink does not know the id. `message`:
     decoded by pymavlink; None for an unknown id, and in a log."""
 
     raw: bytes
@@ -66,41 +65,47 @@ class FrameSplitter:
         self._counters = counters
         self._mavlink = mavlink.MAVLink(None)
         self._rest = b""
-        self._aligned = True  # nothing was skipped since the last frame
 
     def split(self, data: bytes) -> list[Frame]:
+        """The verified frames in `data`; what is not returned is counted."""
         counters = self._counters
         counters.bytes_received += len(data)
         data = self._rest + data
         frames: list[Frame] = []
-        at, end = 0, len(data)
+        at, end, behind = self._next_marker(data, 0), len(data), 0
         while at < end:
-            start = _next_marker(data, at)
-            self._skip(start - at)
-            at = start
-            outcome = self._frame_at(data, at) if at < end else None
-            if outcome is None:
+            found = self._frame_at(data, at, adjoins=at == behind)
+            if found is None:
                 break
-            if isinstance(outcome, DropReason):
-                counters.dropped[outcome] += 1
-                self._skip(1)
-                at += 1
+            if isinstance(found, DropReason):
+                counters.dropped[found] += 1
+                counters.bytes_skipped += 1
+                at = self._next_marker(data, at + 1)
+                continue
+            counters.bytes_framed += len(found.raw)
+            if found.verified:
+                frames.append(found)
             else:
-                counters.bytes_framed += len(outcome.raw)
-                self._aligned = True
-                frames.append(outcome)
-                at += len(outcome.raw)
+                counters.count(DropReason.UNKNOWN_ID)
+            behind = at + len(found.raw)
+            at = self._next_marker(data, behind)
         self._rest = data[at:]
         counters.bytes_pending = end - at
         return frames
 
-    def _skip(self, count: int) -> None:
-        if count:
-            self._counters.bytes_skipped += count
-            self._aligned = False
+    def _next_marker(self, data: bytes, at: int) -> int:
+        """Index of the next first byte of a frame, or the length of `data`; what is before it is
+        counted as skipped."""
+        if data[at : at + 1] in (b"\xfd", b""):
+            return at  # as nearly always
+        candidates = [i for i in (data.find(V2, at), data.find(V1, at)) if i >= 0]
+        found = min(candidates, default=len(data))
+        self._counters.bytes_skipped += found - at
+        return found
 
-    def _frame_at(self, data: bytes, at: int) -> Frame | DropReason | None:
-        """The frame at `at`, why there is none, or None if more bytes are needed."""
+    def _frame_at(self, data: bytes, at: int, *, adjoins: bool) -> Frame | DropReason | None:
+        """The frame at `at`, why there is none, or None if more bytes are needed. `adjoins`: the
+        frame before it ends there."""
         size = frame_size(data, at)
         if size is None or at + size > len(data):
             return None if self._stream else DropReason.TRUNCATED
@@ -115,12 +120,11 @@ class FrameSplitter:
         if header[0] in mavlink.mavlink_map:
             return Frame(raw, *header, True, message)
         # without a known checksum a frame must fill the space between two others
-        if not self._aligned:
-            return DropReason.BAD_CRC
-        frame = Frame(raw, *header, False)
-        if at + size == len(data):
-            return None if self._stream else frame
-        return frame if data[at + size] in (V2, V1) else DropReason.BAD_CRC
+        following = data[at + size : at + size + 1]
+        if adjoins and self._stream and not following:
+            return None
+        fills = adjoins and (not following or following[0] in (V2, V1))
+        return Frame(raw, *header, False) if fills else DropReason.BAD_CRC
 
 
 def frame_size(data: bytes, at: int) -> int | None:
@@ -132,18 +136,18 @@ def frame_size(data: bytes, at: int) -> int | None:
     return _header_bytes(data, at) + data[at + 1] + _CRC_BYTES + signature_bytes
 
 
-def parse(data: bytes, at: int, end: int) -> Frame | DropReason:
-    """The frame of a log in data[at:end], which `frame_size` has measured, or why it is refused.
+def parse(data: bytes, at: int, end: int) -> Frame | None:
+    """The frame of a log in data[at:end], which `frame_size` has measured; None if it is damaged.
     Its message is not decoded: a log of hours holds millions."""
     raw = data[at:end]
     header = _header(raw)
     if header is None:
-        return DropReason.INCOMPATIBLE
+        return None
     extra = _CRC_EXTRA.get(header[0])
     if extra is not None:
-        crc_at = (_HEADER_BYTES_V1 if raw[0] == V1 else _HEADER_BYTES_V2) + raw[1]
+        crc_at = _header_bytes(raw) + raw[1]
         if _crc(extra, _crc(raw[1:crc_at])) != raw[crc_at] | raw[crc_at + 1] << 8:
-            return DropReason.BAD_CRC
+            return None
     return Frame(raw, *header, extra is not None)
 
 
@@ -151,14 +155,6 @@ def payload_of(raw: bytes) -> bytes:
     """The payload of a frame, as in `Frame`."""
     at = _header_bytes(raw)
     return raw[at : at + raw[1]]
-
-
-def _next_marker(data: bytes, at: int) -> int:
-    """Index of the next start byte of a frame, or the length of `data`."""
-    if data[at] == V2:
-        return at
-    candidates = [i for i in (data.find(V2, at), data.find(V1, at)) if i >= 0]
-    return min(candidates, default=len(data))
 
 
 def _header_bytes(data: bytes, at: int = 0) -> int:

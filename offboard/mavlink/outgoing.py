@@ -1,18 +1,65 @@
-"""What the flight sends or records: one frozen value per message, the counterpart of events.py.
+"""What is sent or recorded: one frozen value per message, which makes the message of pymavlink.
 
-NED, FRD, SI and vehicle time; encode.py converts to the units and frames of MAVLink. The last three
-values, the records, are written to the flight log and never sent.
+Values are in NED, FRD, SI and vehicle time; `encode` converts to the units and frames of MAVLink.
+It is the last check before the vehicle: ValueError for what is not finite or out of range. Records
+are written to the flight log and never sent.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from enum import Enum
+from typing import Any, NamedTuple
 
-from offboard.mavlink.events import Triple
+import numpy as np
+from pymavlink.dialects.v20 import all as mavlink
+
+from offboard.mavlink.events import Quaternion, Triple
+from offboard.model import frames
+
+Message = Any  # of pymavlink, to be packed
+FLOAT32_MAX = 3.4028234663852886e38
+_LOCAL_NED = 1  # MAV_FRAME_LOCAL_NED
+# SET_ATTITUDE_TARGET.type_mask for attitude and thrust: the body rates are ignored. On ArduCopter
+# masks 1 to 6 hold the position, 71 and 199 make it ignore the message
+_ATTITUDE_AND_THRUST = 7
+
+
+class ThrustRule(Enum):
+    """What the autopilot does with the normalised thrust of a setpoint."""
+
+    COLLECTIVE = "applies it unchanged along the body axis"
+    TILT_COMPENSATED = "divides it by the cosine of the body's tilt"
+
+
+class Target(NamedTuple):
+    """The vehicle that a message is for."""
+
+    system_id: int
+    component_id: int
+    thrust_rule: ThrustRule
+
+
+class Outgoing:
+    """A value that is sent or recorded."""
+
+    __slots__ = ()
+
+    def encode(self, target: Target | None) -> Message:
+        """The message, for the vehicle `target`. Raises ValueError for a value that is not finite
+        or out of range, and for a message to the vehicle while there is none."""
+        raise NotImplementedError
+
+
+class Record(Outgoing):
+    """A value that only our log holds."""
+
+    __slots__ = ()
 
 
 @dataclass(frozen=True, slots=True)
-class AttitudeTarget:
+class AttitudeTarget(Outgoing):
     """SET_ATTITUDE_TARGET, attitude and thrust.
 
     `thrust_mps2` is thrust per unit of mass, `thrust_direction_ned` the commanded third body axis
@@ -29,10 +76,53 @@ class AttitudeTarget:
     gravity_mps2: float = 9.81
     body_z_down: float | None = None
 
+    def encode(self, target: Target | None) -> Message:
+        vehicle = _found(target)
+        return mavlink.MAVLink_set_attitude_target_message(
+            _boot_ms(self.time_s),
+            vehicle.system_id,
+            vehicle.component_id,
+            _ATTITUDE_AND_THRUST,
+            self.attitude(),
+            body_roll_rate=0.0,
+            body_pitch_rate=0.0,
+            body_yaw_rate=0.0,
+            thrust=self.normalised_thrust(vehicle.thrust_rule),
+        )
+
+    def attitude(self) -> Quaternion:
+        """The commanded attitude."""
+        direction = np.asarray(self.thrust_direction_ned, dtype=np.float64)
+        _finite("thrust direction and heading", *direction, self.heading_rad)
+        norm = float(np.linalg.norm(direction))
+        if not 0.9 < norm < 1.1:
+            raise ValueError(f"thrust direction must be a unit vector; its length is {norm:g}")
+        quaternion = frames.quaternion_from_thrust_direction(direction / norm, self.heading_rad)
+        # last of all: ArduCopter drops a quaternion whose length differs from 1 by 0.0005
+        quaternion = quaternion / np.linalg.norm(quaternion)
+        w, x, y, z = (float(c) for c in (quaternion if quaternion[0] >= 0.0 else -quaternion))
+        _finite("attitude", w, x, y, z)
+        return w, x, y, z
+
+    def normalised_thrust(self, rule: ThrustRule) -> float:
+        """Thrust 0 .. 1: u = u_h T / g, times the body's b_z if the autopilot divides by it."""
+        _finite("thrust", self.thrust_mps2, self.hover_thrust, self.gravity_mps2)
+        if not (0.0 < self.hover_thrust < 1.0 and self.gravity_mps2 > 0.0):
+            raise ValueError(
+                f"hover thrust must be within 0 and 1 and gravity positive, "
+                f"not {self.hover_thrust!r} and {self.gravity_mps2!r}"
+            )
+        thrust = self.hover_thrust * self.thrust_mps2 / self.gravity_mps2
+        if rule is ThrustRule.TILT_COMPENSATED:
+            down = self.thrust_direction_ned[2] if self.body_z_down is None else self.body_z_down
+            _finite("body_z_down", down)
+            thrust *= down
+        return min(max(thrust, 0.0), 1.0)
+
 
 @dataclass(frozen=True, slots=True)
-class PositionTarget:
-    """SET_POSITION_TARGET_LOCAL_NED with all fields in use."""
+class _Motion:
+    """A position, its derivatives and a heading."""
 
     time_s: float
     position_ned_m: Triple
@@ -41,14 +131,45 @@ class PositionTarget:
     heading_rad: float
     heading_rate_radps: float
 
+    def _fields(self) -> tuple[float, ...]:
+        """From coordinate_frame and type_mask, 0: all in use, to yaw_rate, in MAVLink's order."""
+        numbers = (
+            *self.position_ned_m,
+            *self.velocity_ned_mps,
+            *self.acceleration_ned_mps2,
+            self.heading_rad,
+            self.heading_rate_radps,
+        )
+        _finite("a position target", *numbers)
+        return _LOCAL_NED, 0, *numbers
+
 
 @dataclass(frozen=True, slots=True)
-class CommandLong:
+class PositionTarget(_Motion, Outgoing):
+    """SET_POSITION_TARGET_LOCAL_NED with all fields in use."""
+
+    def encode(self, target: Target | None) -> Message:
+        return mavlink.MAVLink_set_position_target_local_ned_message(
+            _boot_ms(self.time_s), *_ids(target), *self._fields()
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class ReferenceRecord(_Motion, Record):
+    """The reference at a tick, logged as POSITION_TARGET_LOCAL_NED."""
+
+    def encode(self, target: Target | None) -> Message:
+        return mavlink.MAVLink_position_target_local_ned_message(
+            _boot_ms(self.time_s), *self._fields()
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class CommandLong(Outgoing):
     """COMMAND_LONG. NaN in `parameters` means "not given", as in MAVLink."""
 
     command: int
     parameters: tuple[float, ...] = ()  # up to seven; the rest is 0
-    confirmation: int = 0
 
     @classmethod
     def arm(cls) -> CommandLong:
@@ -78,9 +199,16 @@ class CommandLong:
         """MAV_CMD_SET_MESSAGE_INTERVAL; the interval is in whole microseconds."""
         return cls(511, (float(message_id), float(round(1e6 / rate_hz))))
 
+    def encode(self, target: Target | None) -> Message:
+        parameters = self.parameters + (0.0,) * (7 - len(self.parameters))
+        if len(parameters) != 7:
+            raise ValueError(f"COMMAND_LONG has seven parameters, not {len(parameters)}")
+        _finite("a command parameter", *(p for p in parameters if not math.isnan(p)))
+        return mavlink.MAVLink_command_long_message(*_ids(target), self.command, 0, *parameters)
+
 
 @dataclass(frozen=True, slots=True)
-class CommandResult:
+class CommandResult(Outgoing):
     """COMMAND_ACK of a command that was sent to us; `result` is a MAV_RESULT."""
 
     command: int
@@ -88,33 +216,60 @@ class CommandResult:
     system_id: int  # of its sender, as is the component
     component_id: int
 
+    def encode(self, target: Target | None) -> Message:
+        return mavlink.MAVLink_command_ack_message(
+            self.command,
+            self.result,
+            target_system=self.system_id,
+            target_component=self.component_id,
+        )
+
 
 @dataclass(frozen=True, slots=True)
-class ParamRead:
+class ParamRead(Outgoing):
     """PARAM_REQUEST_READ by name, at most 16 characters."""
 
     name: str
 
+    def encode(self, target: Target | None) -> Message:
+        data = self.name.encode("ascii", errors="replace")
+        if not 1 <= len(data) <= 16:
+            raise ValueError(f"a parameter name has 1 to 16 characters: {self.name!r}")
+        return mavlink.MAVLink_param_request_read_message(*_ids(target), data, param_index=-1)
+
 
 @dataclass(frozen=True, slots=True)
-class Heartbeat:
+class Heartbeat(Outgoing):
     """Our HEARTBEAT; `vehicle_type` is a MAV_TYPE, `system_status` a MAV_STATE."""
 
     vehicle_type: int
     system_status: int = 4  # active
     custom_mode: int = 0
 
+    def encode(self, target: Target | None) -> Message:
+        return mavlink.MAVLink_heartbeat_message(
+            self.vehicle_type,
+            mavlink.MAV_AUTOPILOT_INVALID,
+            0,
+            self.custom_mode,
+            self.system_status,
+            mavlink_version=3,
+        )
+
 
 @dataclass(frozen=True, slots=True)
-class Timesync:
+class Timesync(Outgoing):
     """TIMESYNC. Request: tc1 = 0 and our stamp. Reply: our time and the stamp of the request."""
 
     tc1_ns: int
     ts1_ns: int
 
+    def encode(self, target: Target | None) -> Message:
+        return mavlink.MAVLink_timesync_message(self.tc1_ns, self.ts1_ns)
+
 
 @dataclass(frozen=True, slots=True)
-class StatusTextOut:
+class StatusTextOut(Outgoing):
     """STATUSTEXT, one chunk of at most 50 bytes (see `texts.chunks`); `text_id` 0: a text of one
     chunk."""
 
@@ -123,50 +278,76 @@ class StatusTextOut:
     text_id: int = 0
     chunk: int = 0
 
-
-@dataclass(frozen=True, slots=True)
-class ReferenceRecord:
-    """The reference at a tick, logged as POSITION_TARGET_LOCAL_NED."""
-
-    time_s: float
-    position_ned_m: Triple
-    velocity_ned_mps: Triple
-    acceleration_ned_mps2: Triple
-    heading_rad: float
-    heading_rate_radps: float
+    def encode(self, target: Target | None) -> Message:
+        return mavlink.MAVLink_statustext_message(
+            self.severity, self.data, self.text_id, self.chunk
+        )
 
 
 @dataclass(frozen=True, slots=True)
-class SolverRecord:
+class SolverRecord(Record):
     """Numbers of one decision or identification, logged as DEBUG_FLOAT_ARRAY: at most 58, NaN
-    where there is none."""
+    where there is none, infinity beyond the range of a float32."""
 
     time_s: float
     data: tuple[float, ...]
     array_id: int = 0
     name: str = "pso"
 
+    def encode(self, target: Target | None) -> Message:
+        kind = mavlink.MAVLink_debug_float_array_message
+        capacity = _capacity(kind, "data", len(self.data))
+        data = (v if not abs(v) > FLOAT32_MAX else math.copysign(math.inf, v) for v in self.data)
+        return kind(
+            _boot_ms(self.time_s) * 1000,
+            self.name.encode("ascii", errors="replace")[:10],
+            self.array_id,
+            (*data, *(0.0,) * (capacity - len(self.data))),
+        )
+
 
 @dataclass(frozen=True, slots=True)
-class ConfigurationRecord:
+class ConfigurationRecord(Record):
     """One piece of the flight's configuration or of its inputs, logged as TUNNEL: at most 128
     bytes."""
 
     data: bytes
     payload_type: int
 
+    def encode(self, target: Target | None) -> Message:
+        kind = mavlink.MAVLink_tunnel_message
+        capacity = _capacity(kind, "payload", len(self.data))
+        padded = tuple(self.data.ljust(capacity, b"\0"))
+        return kind(0, 0, self.payload_type, len(self.data), padded)
 
-Outgoing = (
-    AttitudeTarget
-    | PositionTarget
-    | CommandLong
-    | CommandResult
-    | ParamRead
-    | Heartbeat
-    | Timesync
-    | StatusTextOut
-    | ReferenceRecord
-    | SolverRecord
-    | ConfigurationRecord
-)
-Record = ReferenceRecord | SolverRecord | ConfigurationRecord
+
+def _found(target: Target | None) -> Target:
+    if target is None:
+        raise ValueError("no vehicle has been found yet: there is no receiver for this message")
+    return target
+
+
+def _ids(target: Target | None) -> tuple[int, int]:
+    """target_system and target_component."""
+    vehicle = _found(target)
+    return vehicle.system_id, vehicle.component_id
+
+
+def _boot_ms(time_s: float) -> int:
+    if not (math.isfinite(time_s) and time_s >= 0.0):
+        raise ValueError(f"vehicle time must be finite and not negative, not {time_s!r}")
+    return round(time_s * 1e3) & 0xFFFFFFFF
+
+
+def _finite(name: str, *values: float) -> None:
+    for value in values:
+        if not (math.isfinite(value) and abs(value) <= FLOAT32_MAX):
+            raise ValueError(f"{name} must be finite, not {value!r}")
+
+
+def _capacity(kind: Any, field: str, count: int) -> int:
+    """Length of an array field, into which `count` values must fit."""
+    capacity: int = kind.array_lengths[kind.ordered_fieldnames.index(field)]
+    if count > capacity:
+        raise ValueError(f"{kind.msgname} holds {capacity} values, not {count}")
+    return capacity

@@ -11,13 +11,13 @@ and no pause of ours: before, it hands over no datagram of another address.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Hashable, Iterable, Mapping
+from collections.abc import Collection, Hashable, Iterable, Mapping
 from types import MappingProxyType
 
 from pymavlink.dialects.v20.all import enums
 
 from offboard.mavlink.counters import Counters, DropReason
-from offboard.mavlink.decode import Address, Identity, decode, decode_command, decode_identity
+from offboard.mavlink.decode import Address, Identity, decode
 from offboard.mavlink.dialects.ardupilot import ARDUPILOT
 from offboard.mavlink.dialects.base import TYPE_GCS, TYPE_ONBOARD_CONTROLLER, Dialect
 from offboard.mavlink.dialects.px4 import PX4
@@ -34,7 +34,7 @@ from offboard.mavlink.framing import HEARTBEAT, SETPOINTS, TIMESYNC, Frame
 
 DIALECTS: Mapping[str, Dialect] = MappingProxyType({d.name: d for d in (PX4, ARDUPILOT)})
 AUTOPILOT_COMPONENT = 1
-COMMANDS = (75, 76)  # COMMAND_INT, COMMAND_LONG
+COMMANDS = COMMAND_INT, COMMAND_LONG = 75, 76
 # MAV_CMD: return, land, take off, set the mode, go to a place, begin a mission, arm or disarm
 _MODE_COMMANDS = frozenset({20, 21, 22, 176, 192, 300, 400})
 PEER_SILENT_S = 0.5  # half of `Limits.silence_s`, so that the flight can continue
@@ -80,9 +80,7 @@ class Senders:
         """Whether the vehicle sends from another address."""
         return self.vehicle is not None and place != self._place
 
-    def moves_to(
-        self, place: Hashable, now_s: float, genuine: Callable[[], Iterable[Frame]]
-    ) -> bool:
+    def moves_to(self, place: Hashable, now_s: float, genuine: Iterable[Frame]) -> bool:
         """Take `place` as the vehicle's address if one of the `genuine` frames from it shows that
         the vehicle sends from there now."""
         if now_s - self.heard_s <= PEER_SILENT_S or not same_host(place, self._place):
@@ -90,7 +88,7 @@ class Senders:
         vehicle = self.vehicle
         assert vehicle is not None
         ids = vehicle.system_id, vehicle.component_id
-        moves = any((frame.system_id, frame.component_id) == ids for frame in genuine())
+        moves = any((frame.system_id, frame.component_id) == ids for frame in genuine)
         if moves:
             self._place = place
         return moves
@@ -102,34 +100,43 @@ class Senders:
     ) -> DropReason | None:
         """Why this frame is not one of our vehicle, nor a command to us. Adds to `events` the
         vehicle when it is found, commands to us, and others that control the vehicle."""
-        sender = Address(frame.system_id, frame.component_id)
+        heard = self._whose(frame, now_s)
         if self.vehicle is None:
-            return self._find(frame, place, now_s, events)
+            return self._find(frame, heard, place, events)
+        sender = Address(frame.system_id, frame.component_id)
         if self._controls(frame):
             events.append(OtherSender(*sender, frame.message_id))
-        if sender != self.own and frame.message_id in COMMANDS and frame.verified:
-            command, parameters, receiver = decode_command(frame.message)
-            if receiver != self.own:
+        if frame.message_id in COMMANDS and sender != self.own:
+            if _receiver(frame) != self.own:
                 return DropReason.NOT_FOR_US
-            events.append(CommandRequest(command, parameters, *sender))
+            events.append(CommandRequest(frame.message.command, _parameters(frame), *sender))
             return None
-        foreign = DropReason.SAME_IDS if sender == self.own else self._foreign(frame, now_s)
-        if foreign is not None and self._is_companion(frame):
+        if isinstance(heard, Dialect):
+            return None if heard is self.dialect else DropReason.FOREIGN_COMPONENT
+        if heard and self._is_companion(frame):
             events.append(OtherCompanion(*sender, frame.message.custom_mode))
-        return foreign
+        return heard
 
-    def _find(
-        self, frame: Frame, place: Hashable, now_s: float, events: list[Event]
-    ) -> DropReason | None:
-        """The first heartbeat of an autopilot makes it the vehicle."""
+    def _whose(self, frame: Frame, now_s: float) -> Dialect | DropReason | None:
+        """Why a frame is not of a vehicle that may be ours; the autopilot that a HEARTBEAT of it
+        shows, None for another message."""
         heard = self.note(frame, now_s)
         if (frame.system_id, frame.component_id) == self.own:
             return DropReason.SAME_IDS
         if frame.component_id != AUTOPILOT_COMPONENT:
             return DropReason.FOREIGN_COMPONENT
-        if self._wanted not in (None, frame.system_id):
-            return DropReason.FOREIGN_SYSTEM
-        if frame.message_id == TIMESYNC and frame.verified:
+        system_id = self.vehicle.system_id if self.vehicle else self._wanted
+        return heard if system_id in (None, frame.system_id) else DropReason.FOREIGN_SYSTEM
+
+    def _find(
+        self,
+        frame: Frame,
+        heard: Dialect | DropReason | None,
+        place: Hashable,
+        events: list[Event],
+    ) -> DropReason | None:
+        """The first heartbeat of an autopilot makes it the vehicle."""
+        if heard is None and frame.message_id == TIMESYNC:
             return None  # a simulator in lockstep may need the reply before its first heartbeat
         if not isinstance(heard, Dialect):
             return heard or DropReason.NO_VEHICLE
@@ -140,53 +147,41 @@ class Senders:
         events.append(vehicle)
         return None
 
-    def _foreign(self, frame: Frame, now_s: float) -> DropReason | None:
-        heard = self.note(frame, now_s)
-        assert self.vehicle is not None
-        if frame.system_id != self.vehicle.system_id:
-            return DropReason.FOREIGN_SYSTEM
-        if frame.component_id != self.vehicle.component_id:
-            return DropReason.FOREIGN_COMPONENT
-        if isinstance(heard, DropReason):
-            return heard  # a HEARTBEAT with its ids that is no autopilot's
-        other = heard is not None and heard.name != self.vehicle.autopilot
-        return DropReason.FOREIGN_COMPONENT if other else None
-
     def _controls(self, frame: Frame) -> bool:
         """Whether it is a setpoint for our vehicle or for all (routers forward those of others), or
         commands the mode from the vehicle's own system, as we do: that of a ground station is the
         pilot's."""
-        offset = SETPOINTS.get(frame.message_id)
-        if offset is not None:
-            target = frame.payload[offset : offset + 1]  # MAVLink 2 omits trailing zeros
-            return not target or target[0] in (0, self.own.system_id)
-        if frame.message_id not in COMMANDS or not frame.verified:
-            return False
-        if frame.system_id != self.own.system_id or frame.component_id == AUTOPILOT_COMPONENT:
-            return False
-        command, _, receiver = decode_command(frame.message)
-        for_vehicle = receiver.system_id in (0, self.own.system_id) and receiver != self.own
-        return command in _MODE_COMMANDS and for_vehicle
+        if frame.message_id not in SETPOINTS:
+            commands = frame.message_id in COMMANDS and frame.message.command in _MODE_COMMANDS
+            companion = frame.component_id != AUTOPILOT_COMPONENT
+            if not (commands and companion and frame.system_id == self.own.system_id):
+                return False
+            if _receiver(frame) == self.own:
+                return False
+        return frame.message.target_system in (0, self.own.system_id)
 
     def _is_companion(self, frame: Frame) -> bool:
         """Whether it is the HEARTBEAT of a companion computer. On PX4 some of them call themselves
         a ground station, but with the system id of the vehicle."""
-        if frame.message_id != HEARTBEAT or not frame.verified:
+        if frame.message_id != HEARTBEAT or frame.message.autopilot != _NO_AUTOPILOT:
             return False
-        kind = frame.message.type
-        on_vehicle = kind == TYPE_GCS and frame.system_id == self.own.system_id
-        companion = kind == TYPE_ONBOARD_CONTROLLER or on_vehicle
-        return companion and frame.message.autopilot == _NO_AUTOPILOT
+        on_vehicle = frame.system_id == self.own.system_id
+        kinds = (TYPE_ONBOARD_CONTROLLER, *((TYPE_GCS,) if on_vehicle else ()))
+        return frame.message.type in kinds
 
     def note(self, frame: Frame, now_s: float) -> Dialect | DropReason | None:
         """The autopilot that a frame shows, why it is none, or None if it is no HEARTBEAT of an
         autopilot's component."""
         if frame.message_id != HEARTBEAT or frame.component_id != AUTOPILOT_COMPONENT:
             return None
-        found = _dialect(frame) if frame.verified else DropReason.NO_VEHICLE
-        if isinstance(found, Dialect):
-            self.hear(frame.system_id, now_s)
-        return found
+        identity = Identity(frame.message.type, frame.message.autopilot)
+        if not is_vehicle(identity):
+            return DropReason.NO_VEHICLE
+        for dialect in DIALECTS.values():
+            if dialect.mav_autopilot == identity.autopilot:
+                self.hear(frame.system_id, now_s)
+                return dialect
+        return DropReason.UNSUPPORTED_AUTOPILOT
 
     def overhear(self, frames: Iterable[Frame], now_s: float) -> list[int]:
         """Systems with an autopilot that these frames show, each once a second."""
@@ -217,7 +212,7 @@ class Senders:
 
     def is_for_us(self, ack: Frame) -> bool:
         """Whether a COMMAND_ACK is for us, or for all."""
-        system_id, component_id = ack.message.target_system, ack.message.target_component
+        system_id, component_id = _receiver(ack)
         return system_id in (0, self.own.system_id) and component_id in (0, self.own.component_id)
 
     # --- what to say ---
@@ -283,9 +278,11 @@ def unfit_type(vehicle_type: int, *, helicopter: bool) -> str:
     )
 
 
-def _dialect(heartbeat: Frame) -> Dialect | DropReason:
-    identity = decode_identity(heartbeat.payload)
-    if not is_vehicle(identity):
-        return DropReason.NO_VEHICLE
-    fitting = (d for d in DIALECTS.values() if d.mav_autopilot == identity.autopilot)
-    return next(fitting, DropReason.UNSUPPORTED_AUTOPILOT)
+def _receiver(frame: Frame) -> Address:
+    return Address(frame.message.target_system, frame.message.target_component)
+
+
+def _parameters(command: Frame) -> tuple[float, ...]:
+    """Those of a COMMAND_LONG; of a COMMAND_INT without 5 to 7, which are a place."""
+    given = 7 if command.message_id == COMMAND_LONG else 4
+    return tuple(getattr(command.message, f"param{number + 1}") for number in range(given))

@@ -9,24 +9,25 @@ components.
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections import deque
+from collections.abc import Hashable, Iterator
 from dataclasses import dataclass, field
-from functools import partial
+
+from pymavlink.dialects.v20 import all as mavlink
 
 from offboard.mavlink import framing
 from offboard.mavlink.counters import FORGED, Counters, DropReason
-from offboard.mavlink.decode import Address
 from offboard.mavlink.dialects.base import TYPE_ONBOARD_CONTROLLER, Dialect
-from offboard.mavlink.encode import Encoder
 from offboard.mavlink.events import Event, PeerChanged, VehicleFound
-from offboard.mavlink.outgoing import CommandLong, Heartbeat, Outgoing, Timesync
+from offboard.mavlink.outgoing import CommandLong, Heartbeat, Outgoing, Record, Target, Timesync
 from offboard.mavlink.senders import COMMANDS, Senders
-from offboard.mavlink.signing import Signing, genuine
+from offboard.mavlink.signing import Signing
 from offboard.mavlink.telemetry import Telemetry
 
 ACTIVE = 4  # MAV_STATE
 
 _NOT_LOGGED = (DropReason.ECHO, *FORGED)
+_ECHOES = 256  # newest frames of ours that are recognised when they come back
 _HEARTBEAT_PERIOD_S = 0.999  # 1 Hz; below 1 s, so that no rounding error delays it by a cycle
 
 
@@ -95,7 +96,9 @@ class Session:
         self.status = (ACTIVE, 0)
         self._signing = signing
         self._splitter = framing.FrameSplitter(settings.stream, self.counters)
-        self._encoder = Encoder(settings.component_id, settings.record_component_id, signing)
+        self._sending = mavlink.MAVLink(None, srcComponent=settings.component_id)
+        self._recording = mavlink.MAVLink(None, srcComponent=settings.record_component_id)
+        self._sent: deque[bytes] = deque(maxlen=_ECHOES)
         self._telemetry = Telemetry(settings.capacity_bytes_ps, lockstep=settings.lockstep)
         self._time = self._telemetry.time
         self._heartbeat_sent: tuple[float, float] | None = None  # host time, link time
@@ -116,8 +119,7 @@ class Session:
         self._time.on_datagram()
         arrival = _Arrival(peer, self._time.now_s(now_s))
         if self.senders.is_foreign(peer):
-            frames_of = partial(genuine, datagram, self._signing)
-            if not self.senders.moves_to(peer, arrival.now_s, frames_of):
+            if not self.senders.moves_to(peer, arrival.now_s, self._genuine(datagram)):
                 self.counters.dropped[DropReason.FOREIGN_PEER] += 1
                 return Reception()
             self._heartbeat_sent = None  # a router learns our address from it
@@ -126,21 +128,21 @@ class Session:
         unlogged: list[tuple[int, bytes]] = []
         arrival.events.extend(self._telemetry.texts.expire(arrival.now_s))
         for frame in self._splitter.split(datagram):
-            outcome = self._accept(frame, arrival)
-            self.counters.count(outcome)
-            if outcome in _NOT_LOGGED or frame.message_id == framing.SETUP_SIGNING:
+            why = self._accept(frame, arrival)
+            self.counters.count(why)
+            if why in _NOT_LOGGED or frame.message_id == framing.SETUP_SIGNING:
                 continue  # the latter holds the key
             if self._has_our_ids(frame):
                 unlogged.append((len(frames), frame.raw))
-            elif frame.verified:
+            else:
                 frames.append(frame.raw)
         return Reception(
             tuple(frames), tuple(arrival.events), tuple(arrival.replies), tuple(unlogged)
         )
 
-    def _accept(self, frame: framing.Frame, arrival: _Arrival) -> DropReason | bool:
-        """Why the frame was dropped, or whether it was decoded."""
-        if self._encoder.is_echo(frame):
+    def _accept(self, frame: framing.Frame, arrival: _Arrival) -> DropReason | None:
+        """Add to `arrival` what a frame says; why it was dropped."""
+        if frame.component_id == self.settings.component_id and frame.raw in self._sent:
             return DropReason.ECHO
         forged = self._signing.refusal(frame) if self._signing else None
         if forged:
@@ -149,21 +151,18 @@ class Session:
             return forged
         was_found = self.vehicle is not None
         foreign = self.senders.judge(frame, arrival.place, self.link_time_s, arrival.events)
-        if foreign is not None:
+        if foreign or frame.message_id in COMMANDS:
             return foreign
-        if not frame.verified:
-            return DropReason.UNKNOWN_ID
-        if was_found and frame.message_id in COMMANDS:
-            return True
-        if self.vehicle is not None and not was_found:
-            self._begin()
         if self.vehicle is not None:
             self.senders.heard_s = arrival.now_s
+            if not was_found:
+                self._begin()
         if frame.message_id == framing.TIMESYNC:
-            return self._synchronise(frame, arrival)
+            self._synchronise(frame, arrival)
+            return None
         return self._interpret(frame, arrival)
 
-    def _synchronise(self, frame: framing.Frame, arrival: _Arrival) -> bool:
+    def _synchronise(self, frame: framing.Frame, arrival: _Arrival) -> None:
         """TIMESYNC: tc1 is 0 in a request."""
         tc1_ns, ts1_ns = frame.message.tc1, frame.message.ts1
         if tc1_ns == 0:
@@ -172,9 +171,8 @@ class Session:
             arrival.replies.append(Timesync(max(1, int(arrival.now_s * 1e9)), ts1_ns))
         elif self.vehicle is not None:
             arrival.events.append(self._telemetry.timesync_reply(tc1_ns, ts1_ns))
-        return True
 
-    def _interpret(self, frame: framing.Frame, arrival: _Arrival) -> DropReason | bool:
+    def _interpret(self, frame: framing.Frame, arrival: _Arrival) -> DropReason | None:
         """Turn a frame of the vehicle into events."""
         assert self.dialect is not None
         if frame.message_id == framing.COMMAND_ACK and not self.senders.is_for_us(frame):
@@ -182,8 +180,8 @@ class Session:
         found = self._telemetry.interpret(frame, self.dialect, arrival.now_s)
         if isinstance(found, DropReason):
             return found
-        arrival.events.extend(found or ())
-        return found is not None
+        arrival.events.extend(found)
+        return None
 
     def _has_our_ids(self, frame: framing.Frame) -> bool:
         """Whether it has the ids of what we send, or of our records."""
@@ -205,7 +203,13 @@ class Session:
     def overhear(self, datagram: bytes) -> list[int]:
         """Systems with an autopilot that this datagram, from another address than the vehicle's,
         shows, each once a second."""
-        return self.senders.overhear(genuine(datagram, self._signing), self.link_time_s)
+        return self.senders.overhear(self._genuine(datagram), self.link_time_s)
+
+    def _genuine(self, datagram: bytes) -> Iterator[framing.Frame]:
+        """The frames of a datagram that signing would accept. Counts nothing, uses up no stamp."""
+        for frame in framing.FrameSplitter(False, Counters()).split(datagram):
+            if not (self._signing and self._signing.refusal(frame, note=False)):
+                yield frame
 
     def thin_telemetry(self) -> bool:
         """Request half of the telemetry from now on: the link is saturated. False if the rates are
@@ -245,9 +249,20 @@ class Session:
         Raises ValueError if a value is not finite or out of range, or if the message is for the
         vehicle and none was found.
         """
-        vehicle, system_id = self.vehicle, self.senders.own.system_id
-        target = Address(vehicle.system_id, vehicle.component_id) if vehicle else None
-        return self._encoder.frame(outgoing, system_id, target, self.dialect)
+        vehicle, dialect, target = self.vehicle, self.dialect, None
+        if vehicle and dialect:
+            target = Target(vehicle.system_id, vehicle.component_id, dialect.thrust_rule)
+        message = outgoing.encode(target)
+        sender = self._sending
+        if isinstance(outgoing, Record):
+            sender = self._recording
+        elif self._signing:
+            self._signing.sign(sender)
+        sender.srcSystem = self.senders.own.system_id
+        frame = bytes(message.pack(sender))
+        sender.seq = (sender.seq + 1) % 256
+        self._sent.append(frame)
+        return frame
 
     # --- time and rates ---
 

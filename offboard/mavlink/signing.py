@@ -15,12 +15,11 @@ import math
 from collections.abc import Callable
 from hashlib import sha256
 from hmac import compare_digest
-from typing import Any
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from offboard.mavlink.counters import Counters, DropReason
-from offboard.mavlink.framing import Frame, FrameSplitter
+from offboard.mavlink.counters import DropReason
+from offboard.mavlink.framing import Frame
 
 UNITS_PER_S = 100_000
 EPOCH_UNIX_S = 1_420_070_400  # 2015-01-01 UTC
@@ -66,14 +65,13 @@ class Signing:
         self._signing.sign_outgoing = True
         self._signing.link_id = LINK_ID
 
-    def pack(self, message: Any, sender: mavlink.MAVLink) -> bytes:
-        """The frame of pymavlink's `message`, signed."""
+    def sign(self, sender: mavlink.MAVLink) -> None:
+        """Have the next frame that `sender` packs signed."""
         sender.signing = self._signing
         self._signing.timestamp = stamp = min(self._now(), _STAMP_MAX)  # pymavlink then adds one
         if stamp > self._reserved - RESERVED // 2:
             self._reserved = stamp + RESERVED
             self._reserve(stamp + RESERVED)
-        return bytes(message.pack(sender))
 
     def refusal(self, frame: Frame, *, note: bool = True) -> DropReason | None:
         """Why a frame must not be used; notes the time stamp of one that may, if `note`."""
@@ -117,13 +115,3 @@ class Signing:
         signing._signing.timestamp = newest + UNITS_PER_S
         signing._signing.stream_timestamps = {(a, b, c): at for a, b, c, at in streams}
         return signing
-
-
-def genuine(datagram: bytes, signing: Signing | None) -> list[Frame]:
-    """The frames of a datagram that could be accepted. Counts nothing, uses up no time stamp."""
-    found = FrameSplitter(False, Counters()).split(datagram)
-    return [
-        frame
-        for frame in found
-        if frame.verified and not (signing and signing.refusal(frame, note=False))
-    ]

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from offboard.mavlink.decode import TextChunk, printable
+from pymavlink.dialects.v20 import all as mavlink
+
+from offboard.mavlink.decode import printable
 from offboard.mavlink.events import StatusText
 from offboard.mavlink.outgoing import StatusTextOut
 
@@ -35,9 +37,6 @@ class _Pending:
     chunks: dict[int, bytes] = field(default_factory=dict)
     count: int | None = None  # known once the last chunk has arrived
 
-    def complete(self) -> bool:
-        return self.count is not None and len(self.chunks) >= self.count
-
     def text(self) -> StatusText:
         count = max(self.chunks) + 1 if self.count is None else self.count
         data = b"".join(self.chunks.get(i, _GAP) for i in range(count))
@@ -50,22 +49,25 @@ class TextAssembler:
     def __init__(self) -> None:
         self._pending: dict[int, _Pending] = {}
 
-    def add(self, chunk: TextChunk, now_s: float) -> list[StatusText]:
-        """Texts that this chunk completes, and those whose time is over."""
+    def add(self, payload: bytes, now_s: float) -> list[StatusText]:
+        """Texts that the payload of a STATUSTEXT completes, and those whose time is over."""
+        # pymavlink's own decoding takes the text for ASCII
+        layout = mavlink.MAVLink_statustext_message.unpacker
+        severity, text, text_id, chunk = layout.unpack_from(payload.ljust(layout.size, b"\0"))
+        data, terminator, _ = text.partition(b"\0")
         done = self.expire(now_s)
-        if chunk.text_id == 0 or (chunk.chunk == 0 and chunk.last):
-            done.append(StatusText(chunk.severity, printable(chunk.data)))
+        if text_id == 0 or (chunk == 0 and terminator):
+            return [*done, StatusText(severity, printable(data))]
+        if chunk >= _CHUNKS_MAX:
             return done
-        if chunk.chunk >= _CHUNKS_MAX:
-            return done
-        if chunk.text_id not in self._pending and len(self._pending) >= _PENDING_MAX:
+        if text_id not in self._pending and len(self._pending) >= _PENDING_MAX:
             done.append(self._pending.pop(next(iter(self._pending))).text())
-        pending = self._pending.setdefault(chunk.text_id, _Pending(chunk.severity, now_s))
-        pending.chunks[chunk.chunk] = chunk.data
-        if chunk.last:
-            pending.count = chunk.chunk + 1
-        if pending.complete():
-            done.append(self._pending.pop(chunk.text_id).text())
+        pending = self._pending.setdefault(text_id, _Pending(severity, now_s))
+        pending.chunks[chunk] = data
+        if terminator:
+            pending.count = chunk + 1
+        if pending.count is not None and len(pending.chunks) >= pending.count:
+            done.append(self._pending.pop(text_id).text())
         return done
 
     def expire(self, now_s: float) -> list[StatusText]:

@@ -51,8 +51,7 @@ class VehicleTime:
         self._last_s: dict[int, float] = {}
         self._other: list[tuple[int, float]] = []  # of another epoch, in a row: id and stamp
         self._counted_s: float | None = None  # the newest stamp that `seconds` has followed
-        self._received_s: float | None = None
-        self._host_s: float | None = None
+        self._received_s: float | None = None  # host time of the newest telemetry, or the first
         self._bridged_s = 0.0  # counted since the newest telemetry
 
     # --- stamps ---
@@ -112,13 +111,11 @@ class VehicleTime:
         """Host time is `now_s`; once no telemetry has arrived for a second, all the time since the
         newest counts."""
         if self._received_s is None:
-            silent_s = self._bridged_s + (0.0 if self._host_s is None else now_s - self._host_s)
-        else:
-            silent_s = now_s - self._received_s
-        if self._received_s is None or silent_s > SILENCE_S:
+            self._received_s = now_s
+        silent_s = now_s - self._received_s
+        if self._counted_s is None or silent_s > SILENCE_S:
             self.seconds += max(silent_s - self._bridged_s, 0.0)
             self._bridged_s = max(silent_s, self._bridged_s)
-        self._host_s = now_s
 
     # --- in lockstep ---
 

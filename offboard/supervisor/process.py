@@ -24,8 +24,7 @@ from offboard.link import clock
 from offboard.link.background import BackgroundWriter
 from offboard.link.interface import Link
 from offboard.link.log import append, entry
-from offboard.link.stream import Source, Stream, StreamLink
-from offboard.link.stream_sources import Listener
+from offboard.link.stream import Listener, Source, Stream, StreamLink
 from offboard.link.udp import UdpLink
 from offboard.mavlink import event_record, texts
 from offboard.mavlink.dialects.base import SetpointLoss

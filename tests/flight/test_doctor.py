@@ -15,7 +15,7 @@ from offboard.flight.phases import ExitCode, Limits
 from offboard.flight.preflight import FIX_3D, Ground, Level, findings
 from offboard.flight.vehicle_state import VehicleState
 from offboard.mavlink.dialects.ardupilot import ARDUPILOT as ARDUPILOT_DIALECT
-from offboard.mavlink.events import Attitude, EstimatorReport
+from offboard.mavlink.events import ESTIMATE, Attitude, EstimatorReport
 from simulator.config import Scenario
 from simulator.faults import GpsLoss
 from simulator.firmware.ardupilot import ARDUPILOT
@@ -99,9 +99,7 @@ def test_gps_that_is_lost_waits_and_comes_back() -> None:
 def test_estimator_without_position_although_the_gps_has_a_fix(boot_s: float, level: Level) -> None:
     """ArduCopter 4.6.3 reports a 3D fix 10 s after its start, and a position 42 s after it."""
     starting = VehicleState(
-        estimator=EstimatorReport(
-            attitude_ok=True, velocity_ok=True, position_ok=False, height_ok=True, ratios=()
-        ),
+        estimator=EstimatorReport(frozenset(ESTIMATE) - {"horizontal position"}, ratios=()),
         attitude=Attitude(boot_s, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
     )
     ground = Ground(starting, Limits(), ARDUPILOT_DIALECT, fix_type=FIX_3D)

@@ -19,6 +19,7 @@ from offboard.flight.failsafe import ROWS, Row, judge
 from offboard.flight.phases import Action, Limits, Phase
 from offboard.flight.state import FlightState
 from offboard.mavlink.events import (
+    ESTIMATE,
     EstimatorReport,
     GpsFix,
     LocalPosition,
@@ -172,7 +173,7 @@ def _predicted(flight: FlightState, away_m: float) -> None:
 
 def _accuracy(flight: FlightState, accuracy_m: float) -> None:
     flight.positioning.begin(flight.vehicle, {}, "ESTIMATOR_STATUS")
-    good = EstimatorReport(True, True, True, True, (), 0.5)
+    good = EstimatorReport(frozenset(ESTIMATE), (), 0.5)
     hear(flight, good)
     flight.positioning.begin(flight.vehicle, {"ESTIMATOR_STATUS": 1.0}, "ESTIMATOR_STATUS")
     hear(flight, replace(good, accuracy_m=accuracy_m))
@@ -224,7 +225,7 @@ MEASURED: list[tuple[str, Callable[[FlightState, Any], None], Any, Any]] = [
     ("volume", lambda flight, value: _fly_at(flight, value, -1.0), 1000.0, 1000.1),
     (
         "battery",
-        lambda flight, value: hear(flight, SystemHealth(True, None, value)),
+        lambda flight, value: hear(flight, SystemHealth(True, value)),
         0.1,
         0.09,
     ),

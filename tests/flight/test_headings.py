@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from pair import Pair, make
 
-from offboard.mavlink import encode
 from offboard.mavlink.outgoing import AttitudeTarget
 
 Triple = tuple[int, int, int]
@@ -45,8 +44,8 @@ def test_facing_south(tmp_path: Path) -> None:
 
 def swapped(monkeypatch: pytest.MonkeyPatch, sign: Callable[[AttitudeTarget], Any]) -> Pair:
     """The climbing flight, with what `sign` makes of each target on the wire."""
-    unchanged = encode._attitude_quaternion
-    monkeypatch.setattr(encode, "_attitude_quaternion", lambda target: unchanged(sign(target)))
+    unchanged = AttitudeTarget.attitude
+    monkeypatch.setattr(AttitudeTarget, "attitude", lambda target: unchanged(sign(target)))
     return on_a_helix(0.4, 3.0)
 
 

@@ -89,7 +89,7 @@ def test_arducopter_is_not_flown_without_a_reply_for_guid_options() -> None:
     def ground(parameters: dict[str, float]) -> Ground:
         attitude = Attitude(1.0, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
         position = LocalPosition(1.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-        health = SystemHealth(True, None, 1.0)
+        health = SystemHealth(True, 1.0)
         vehicle = VehicleState(
             landed="on_ground",
             position=position,

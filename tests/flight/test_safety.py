@@ -45,7 +45,7 @@ from offboard.flight.positioning import Positioning
 from offboard.flight.state import Outcome
 from offboard.flight.vehicle_state import VehicleState
 from offboard.identification.learner import IdentifySettings
-from offboard.mavlink.events import EstimatorReport
+from offboard.mavlink.events import ESTIMATE, EstimatorReport
 from simulator import config as simulated
 from simulator.config import Scenario
 from simulator.firmware.px4 import PX4
@@ -511,7 +511,7 @@ ONLY_ESTIMATOR = partial(ON_PX4, "reference.laps=2", limits={"gps_s": 600.0})
 
 def test_an_accuracy_that_is_not_reported_any_more_is_lost() -> None:
     """PX4 reports NaN. One that was never reported is not missed."""
-    vehicle, valid = VehicleState(), EstimatorReport(True, True, True, True, (), 0.5)
+    vehicle, valid = VehicleState(), EstimatorReport(frozenset(ESTIMATE), (), 0.5)
     unknown = replace(valid, accuracy_m=None)
     for began, now, says in (
         (valid, valid, ""),

@@ -128,27 +128,19 @@ def test_other_senders_are_counted_and_neither_delay_nor_displace_the_vehicle(
 def test_frames_reach_the_vehicle_before_and_after_it_is_followed(
     link: UdpLink, vehicle: Sender
 ) -> None:
+    """And no other program gets the port: with pymavlink's SO_REUSEADDR it would take the vehicle's
+    datagrams."""
     link.send(b"nobody", None)
-    link.send(b"one", vehicle.place)
-    link.follow(vehicle.place)
-    link.send(b"two", vehicle.place)
-    heard = [vehicle.socket.recvfrom(100) for _ in range(2)]
-    assert heard == [(b"one", (LOCAL, link.port)), (b"two", (LOCAL, link.port))]
-
-
-@pytest.mark.parametrize("option", [socket.SO_REUSEADDR, socket.SO_REUSEPORT])
-@pytest.mark.parametrize("host", [LOCAL, "0.0.0.0"])
-@pytest.mark.parametrize("followed", [False, True])
-def test_no_other_program_gets_the_port(
-    option: int, host: str, followed: bool, link: UdpLink, vehicle: Sender
-) -> None:
-    """pymavlink's udpin sets SO_REUSEADDR: it would take the vehicle's datagrams."""
-    if followed:
+    for sent in (b"one", b"two"):
+        link.send(sent, vehicle.place)
+        assert vehicle.socket.recvfrom(100) == (sent, (LOCAL, link.port))
+        for option in (socket.SO_REUSEADDR, socket.SO_REUSEPORT):
+            for host in (LOCAL, "0.0.0.0"):
+                with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+                    other.setsockopt(socket.SOL_SOCKET, option, 1)
+                    with pytest.raises(OSError, match="in use"):
+                        other.bind((host, link.port))
         link.follow(vehicle.place)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-        other.setsockopt(socket.SOL_SOCKET, option, 1)
-        with pytest.raises(OSError, match="in use"):
-            other.bind((host, link.port))
 
 
 def test_another_port_is_heard_after_a_silence_that_was_observed(
@@ -187,33 +179,26 @@ def test_our_own_pause_is_no_silence_of_the_vehicle(
 
 
 def test_udpout_hears_only_its_peer() -> None:
-    with (
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other,
-    ):
-        peer.bind((LOCAL, 0))
-        link = open_link(f"udpout:{LOCAL}:{peer.getsockname()[1]}")
-        link.send(b"hello", None)
-        _, place = peer.recvfrom(100)
-        other.sendto(b"no", place)
-        peer.sendto(b"yes", place)
-        assert data(link.receive(1.0)) == [b"yes"]
-        assert link.receive(0.0) == []
-        link.close()
-
-
-def test_a_refused_datagram_does_not_cost_the_next_one() -> None:
-    """A connected socket reports the ICMP message of the one before instead of sending."""
+    """A refused datagram does not cost the next one: a connected socket reports the ICMP message
+    of the one before instead of sending."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind((LOCAL, 0))
         port = probe.getsockname()[1]
     link = open_link(f"udpout:{LOCAL}:{port}")
     link.send(b"too early", None)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other,
+    ):
         peer.bind((LOCAL, port))
         peer.settimeout(5.0)
         link.send(b"heard", None)
-        assert peer.recv(100) == b"heard"
+        data_sent, place = peer.recvfrom(100)
+        assert data_sent == b"heard"
+        other.sendto(b"no", place)
+        peer.sendto(b"yes", place)
+        assert data(link.receive(1.0)) == [b"yes"]
+        assert link.receive(0.0) == []
     link.close()
 
 

@@ -29,7 +29,6 @@ from offboard.flight.manifest import PAYLOAD_TYPE as MANIFEST
 from offboard.flight.record import RECORD_COMPONENT_ID
 from offboard.link.interface import Chunk
 from offboard.link.log import entry
-from offboard.mavlink.encode import encode
 from offboard.mavlink.framing import SETPOINTS
 from offboard.mavlink.outgoing import ConfigurationRecord
 from offboard.mavlink.session import Reception, SessionSettings
@@ -109,7 +108,7 @@ def thinned(recording: Recording, turns: dict[int, tuple[LoggedMessage, ...]]) -
             kept.append(entry(message.unix_us, message.frame.raw))
     records = inputs_of(recording, turns)
     sender = mavlink.MAVLink(None, srcSystem=1, srcComponent=RECORD_COMPONENT_ID)
-    frames = (bytes(encode(record, None, None).pack(sender)) for record in records)
+    frames = (bytes(record.encode(None).pack(sender)) for record in records)
     return b"".join([*kept, *(entry(message.unix_us, frame) for frame in frames)])
 
 

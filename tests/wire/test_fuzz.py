@@ -15,21 +15,18 @@ from vehicle_frames import ARDUPILOT, PEER, PX4, PX4_RECORDING, Sender, pinned, 
 
 from offboard.mavlink import events
 from offboard.mavlink.counters import DropReason
-from offboard.mavlink.framing import FrameSplitter
 from offboard.mavlink.session import Reception, Session
 
 LONGEST_FRAME = 10 + 255 + 2 + 13
 
 
 def check(session: Session) -> None:
-    """The two sums of counters.py."""
+    """The sum of counters.py."""
     counted = session.counters
     assert counted.bytes_received == (
         counted.bytes_framed + counted.bytes_skipped + counted.bytes_pending
     )
-    assert counted.frames == counted.decoded + counted.ignored + counted.dropped_frames
     assert counted.bytes_pending <= LONGEST_FRAME
-    assert min(counted.decoded, counted.ignored) >= 0
 
 
 def floats(value: object) -> Iterator[float]:
@@ -92,7 +89,7 @@ def test_any_payload_with_a_correct_checksum(payload: bytes, message_id: int, px
 
 
 @pytest.mark.parametrize("stream", [False, True])
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_damaged_frames(traffic: list[bytes], seed: int, stream: bool) -> None:
     generator = np.random.default_rng(seed)
     session = pinned(Sender(7), PX4, stream=stream)
@@ -110,7 +107,7 @@ def test_damaged_frames(traffic: list[bytes], seed: int, stream: bool) -> None:
     assert session.counters.frames > 200  # a fifth goes undamaged
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_good_frames_survive_garbage_between_them(traffic: list[bytes], seed: int) -> None:
     """Also behind garbage that begins like a long frame."""
     generator = np.random.default_rng(seed)
@@ -128,44 +125,24 @@ def test_good_frames_survive_garbage_between_them(traffic: list[bytes], seed: in
     check(session)
 
 
-@pytest.mark.parametrize(
-    ("flags", "reason"), [(0x02, DropReason.INCOMPATIBLE), (0xFE, DropReason.INCOMPATIBLE)]
-)
-def test_unknown_incompatibility_flags_are_refused(flags: int, reason: DropReason) -> None:
-    session = pinned(Sender())
-    frame = bytearray(Sender().position(1000))
-    frame[2] = flags
-    assert session.receive(bytes(frame), PEER, 0.0).frames == ()
-    assert session.counters.dropped[reason] == 1
-
-
-def test_signed_frames_include_their_signature() -> None:
+def test_frames_that_are_unusual() -> None:
+    """Unknown incompatibility flags are refused; a signed frame includes its signature; one with an
+    unknown id needs another frame behind it, and garbage like it hides none."""
+    session, good, outer = pinned(Sender()), Sender().position(1000), Sender().position(2000)
+    for flags in (0x02, 0xFE):
+        frame = bytearray(good)
+        frame[2] = flags
+        assert session.receive(bytes(frame), PEER, 0.0).frames == ()
+    assert session.counters.dropped[DropReason.INCOMPATIBLE] == 2
     link = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     link.signing.secret_key = bytes(32)
     link.signing.sign_outgoing = True
-    frame = mavlink.MAVLink_local_position_ned_message(1000, 1, 2, 3, 0, 0, 0).pack(link)
-    vehicle = Sender()
-    session = pinned(vehicle)
-    reception = session.receive(frame + vehicle.position(2000), PEER, 0.0)
-    assert reception.frames[0] == frame
-    assert len(reception.events) == 2
-
-
-def test_a_frame_with_an_unknown_id_needs_another_frame_behind_it() -> None:
-    good = Sender().position(1000)
-    unknown = b"\xfd\x03\x00\x00\x00\x01\x01\xff\xff\xff" + b"abc" + b"\x00\x00"
-    session = pinned(Sender())
-    assert len(session.receive(unknown + good, PEER, 0.0).frames) == 1
+    signed = mavlink.MAVLink_local_position_ned_message(1000, 1, 2, 3, 0, 0, 0).pack(link)
+    assert session.receive(signed + outer, PEER, 0.0).frames == (signed, outer)
+    unknown = bytes([0xFD, len(good), 0, 0, 0, 1, 1, 0xFF, 0xFF, 0xFF]) + good + b"\0\0"
+    assert session.receive(unknown + outer, PEER, 0.0).frames == (outer,)
     assert session.counters.dropped[DropReason.UNKNOWN_ID] == 1
-    check(session)
-
-
-def test_garbage_like_an_unknown_frame_hides_no_frame() -> None:
-    inner = Sender().position(1000)
-    unknown = bytes([0xFD, len(inner), 0, 0, 0, 1, 1, 0xFF, 0xFF, 0xFF]) + inner + b"\0\0"
-    outer = Sender().position(2000)
-    session = pinned(Sender())
-    assert session.receive(b"\0" + unknown + outer, PEER, 0.0).frames == (inner, outer)
+    assert session.receive(b"\0" + unknown + outer, PEER, 0.0).frames == (good, outer)
     check(session)
 
 
@@ -176,13 +153,3 @@ def test_many_start_bytes_use_bounded_time_and_memory() -> None:
         session.receive(b"\xfe" * 10_000, PEER, 0.0)
     check(session)
     assert session.counters.bytes_skipped > 390_000
-
-
-def test_the_splitter_keeps_partial_frames_between_calls() -> None:
-    counters = pinned(Sender()).counters
-    splitter = FrameSplitter(True, counters)
-    sender = Sender()
-    frames = [sender.position(i) for i in range(50)]
-    data = b"".join(frames)
-    found = [f.raw for i in range(len(data)) for f in splitter.split(data[i : i + 1])]
-    assert found == frames

@@ -9,6 +9,7 @@ from typing import Any
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from offboard.mavlink.counters import DropReason
 from offboard.mavlink.session import Session, SessionSettings
 
 RECORDINGS = Path(__file__).parent / "recordings"
@@ -62,6 +63,10 @@ def pinned(vehicle: Sender, autopilot: int = PX4, **settings: Any) -> Session:
     assert len(reception.events) == 2
     session.poll(0.0)
     return session
+
+
+def dropped(session: Session, reason: DropReason) -> int:
+    return session.counters.dropped[reason]
 
 
 def understood(frame: bytes) -> Any:

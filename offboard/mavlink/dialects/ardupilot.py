@@ -14,10 +14,10 @@ from offboard.mavlink.dialects.base import (
     Dialect,
     ParameterEncoding,
     Takeoff,
-    ThrustRule,
     WantedMessage,
     WatchedParameter,
 )
+from offboard.mavlink.outgoing import ThrustRule
 
 
 def _mode_parameters(custom_mode: int) -> tuple[float, float, float]:
@@ -43,8 +43,6 @@ ARDUPILOT = Dialect(
     takeoff=Takeoff.COMMAND,
     unused_parameter=0.0,  # NaN stops its SITL with a floating point exception
     thrust_rule=ThrustRule.TILT_COMPENSATED,  # ATC_ANGLE_BOOST 1
-    # masks 1 to 6 make it hold its position, 71 and 199 make it ignore the message
-    attitude_type_mask=7,
     parameter_encoding=ParameterEncoding.CAST,
     watched_parameters=(
         WatchedParameter(

@@ -11,18 +11,11 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
-from offboard.mavlink.outgoing import CommandLong
+from offboard.mavlink.outgoing import CommandLong, ThrustRule
 
 SET_MODE, TAKEOFF = 176, 22  # MAV_CMD
 CUSTOM_MODE_ENABLED = 1.0  # MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 TYPE_ONBOARD_CONTROLLER, TYPE_GCS = 18, 6  # MAV_TYPE
-
-
-class ThrustRule(Enum):
-    """What the autopilot does with the normalised thrust of a setpoint."""
-
-    COLLECTIVE = "applies it unchanged along the body axis"
-    TILT_COMPENSATED = "divides it by the cosine of the body's tilt"
 
 
 class ParameterEncoding(Enum):
@@ -173,7 +166,6 @@ class Dialect:
     takeoff: Takeoff
     unused_parameter: float  # of a COMMAND_LONG: "not given" to this autopilot
     thrust_rule: ThrustRule
-    attitude_type_mask: int  # the one legal SET_ATTITUDE_TARGET.type_mask for attitude + thrust
     parameter_encoding: ParameterEncoding
     watched_parameters: tuple[WatchedParameter, ...]
     wanted: tuple[WantedMessage, ...]

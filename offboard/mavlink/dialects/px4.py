@@ -14,10 +14,10 @@ from offboard.mavlink.dialects.base import (
     Dialect,
     ParameterEncoding,
     Takeoff,
-    ThrustRule,
     WantedMessage,
     WatchedParameter,
 )
+from offboard.mavlink.outgoing import ThrustRule
 
 
 def _custom_mode(main: int, sub: int = 0) -> int:
@@ -68,7 +68,6 @@ PX4 = Dialect(
     takeoff=Takeoff.SETPOINT,
     unused_parameter=float("nan"),  # 0 would be a latitude
     thrust_rule=ThrustRule.COLLECTIVE,
-    attitude_type_mask=7,
     parameter_encoding=ParameterEncoding.BYTEWISE,
     watched_parameters=(
         WatchedParameter("MPC_THR_HOVER", "normalised thrust that holds the weight"),
