@@ -31,8 +31,7 @@ from offboard.documents.arguments import LIVE_PAGE
 from offboard.documents.command_line import INTERRUPT, drop_output, explained
 
 if TYPE_CHECKING:
-    from offboard.analysis.requirement import Requirement
-    from offboard.analysis.score import Score
+    from offboard.analysis.score import Requirement, Score
     from offboard.flight.flight import Outcome
     from offboard.live.displays import Displays
 
@@ -170,14 +169,14 @@ def _conclude(
 ) -> None:
     """Print verdict and result. Exits with the code of the verdict. `lost`: sentences on what was
     not shown of the flight."""
-    from offboard.analysis.flight_score import judged
+    from offboard.analysis.score import judged
     from offboard.analysis.score_table import summary
 
     score, history = scored(directory)
     outcome = judged(outcome, score)
     checked = [] if outcome.exit_code else requirements
-    missed = [each for each in checked if not each.met(score.figures())]
-    results = "; ".join(each.sentence(score.figures()) for each in missed or checked)
+    missed = [each for each in checked if not each.met(score.metrics())]
+    results = "; ".join(each.sentence(score.metrics()) for each in missed or checked)
     code = outcome.exit_code or int(bool(missed))
     try:
         if json_lines:
@@ -223,6 +222,6 @@ def _result(
         "ended_by": score.ended_by,
         "directory": str(directory),
         "lost": lost,
-        "figures": plain(score.figures(), DIGITS),
+        "figures": plain(score.metrics(), DIGITS),
     }
     return line("result", **result) + "\n"

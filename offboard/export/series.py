@@ -13,9 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.analysis import history, tlog
-from offboard.analysis.events import Event
-from offboard.analysis.history import TELEMETRY, History
-from offboard.analysis.samples import Rows, continuous_s
+from offboard.analysis.history import TELEMETRY, Event, History, Rows, continuous_s
 from offboard.analysis.tlog import Tlog
 from offboard.documents.errors import UserError
 from offboard.flight.phases import PHASE_CODES

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import plotly.graph_objects as go
 
-from offboard.analysis.figure import (
+from offboard.analysis.history import Rows
+from offboard.analysis.page import (
     BLUE,
     BLUE_BAND,
     BROWN,
@@ -32,7 +33,6 @@ from offboard.analysis.figure import (
     panels,
     without_outliers,
 )
-from offboard.analysis.samples import Rows
 from offboard.analysis.verdict import begin_times
 from offboard.report import timeline
 from offboard.report.flight import Flight

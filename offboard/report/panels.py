@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.analysis.figure import BLUE, GREEN, INK, ORANGE, PINK, PURPLE
-from offboard.analysis.history import History
-from offboard.analysis.samples import Rows, each_once
-from offboard.analysis.tracking import Reference
+from offboard.analysis.history import History, Rows
+from offboard.analysis.page import BLUE, GREEN, INK, ORANGE, PINK, PURPLE
+from offboard.analysis.tracking import Reference, each_once
 from offboard.model.frames import euler_from_quaternion
 
 Array = NDArray[np.float64]

@@ -19,7 +19,7 @@ from pair import Pair, hover
 from typer.testing import CliRunner
 
 from offboard.analysis import tlog
-from offboard.analysis.figure import logarithmic
+from offboard.analysis.page import logarithmic
 from offboard.analysis.score import Score
 from offboard.cli.commands import app
 from offboard.flight.phases import Phase
@@ -254,7 +254,7 @@ def test_the_command_replaces_nothing_and_refuses_what_is_no_log(tmp_path: Path)
 def test_colours_of_flights_differ_for_colour_blind_people() -> None:
     """Distance in CIELAB of each pair of the first four, as seen with deuteranopia and protanopia
     (Viénot, Brettel and Mollon 1999), in the light and in the dark scheme."""
-    from offboard.analysis.figure import DARK
+    from offboard.analysis.page import DARK
     from offboard.report.figures import COLOURS
 
     for scheme in (COLOURS[:4], [DARK[colour] for colour in COLOURS[:4]]):
@@ -282,5 +282,5 @@ def lab(colour: str, blind: str) -> Any:
 def test_the_figures_on_the_page_are_those_of_the_score(flown: tuple[Pair, Path, Score]) -> None:
     _, directory, score = flown
     shown = {row.name: row.values[0] for row in report_page.rows([read(directory)])}
-    finite = {name: v for name, v in score.figures().items() if math.isfinite(v)}
+    finite = {name: v for name, v in score.metrics().items() if math.isfinite(v)}
     assert shown == {name: f"{value:.4g}" for name, value in finite.items()}

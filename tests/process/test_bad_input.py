@@ -23,7 +23,7 @@ from processes import SHORT, Called, Spawn, children, free_port
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from offboard.analysis import history, tlog
-from offboard.analysis.flight_score import keep_score, score_flight
+from offboard.analysis.score import keep_score, score_flight
 from offboard.documents.signing_key import create_key
 from offboard.flight import manifest
 from offboard.flight.record import RECORD_COMPONENT_ID

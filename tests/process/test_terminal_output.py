@@ -20,8 +20,7 @@ from processes import SHORT, Spawn
 from rich.console import Console
 from typer.testing import CliRunner
 
-from offboard.analysis.flight_score import score_flight
-from offboard.analysis.score import FIGURES
+from offboard.analysis.score import METRICS, score_flight
 from offboard.analysis.score_table import show
 from offboard.cli.commands import app as offboard
 from simulator.command import app as simulator
@@ -90,7 +89,7 @@ def test_a_score_fits(columns: int) -> None:
     lines = text.getvalue().splitlines()
     assert max(map(len, lines)) <= columns
     assert "…" not in text.getvalue()
-    assert max(len(figure["meaning"]) for figure in FIGURES.values()) <= 37  # that fit 80 columns
+    assert max(len(figure["meaning"]) for figure in METRICS.values()) <= 37  # that fit 80 columns
     assert columns < 80 or sum("setpoint_gap_wall_max_s" in line for line in lines) == 1
 
 

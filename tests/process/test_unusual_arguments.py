@@ -417,8 +417,8 @@ def test_an_interrupted_score_is_one_sentence(tmp_path: Path) -> None:
     begin = """
 import signal
 signal.signal(signal.SIGINT, signal.default_int_handler)
-from offboard.analysis import flight_score
-flight_score.score_flight = lambda flight: signal.raise_signal(signal.SIGINT)
+from offboard.analysis import score
+score.score_flight = lambda flight: signal.raise_signal(signal.SIGINT)
 """
     ended = process(SCORE, tmp_path, begin)
     assert (ended.returncode, ended.stderr) == (130, "interrupted\n")
