@@ -21,8 +21,7 @@ from offboard.analysis.history import Event, History, gather
 from offboard.analysis.link_metrics import decision_metrics, link_metrics
 from offboard.analysis.tracking import passed_s, tracking_metrics, window_of
 from offboard.analysis.verdict import verdict_metrics
-from offboard.documents.errors import UserError
-from offboard.documents.plain import plain
+from offboard.documents.errors import UserError, plain
 from offboard.flight.flight import Outcome
 from offboard.flight.phases import ExitCode
 from offboard.link.log import LogError

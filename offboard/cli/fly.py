@@ -33,7 +33,7 @@ from offboard.documents.command_line import INTERRUPT, drop_output, explained
 if TYPE_CHECKING:
     from offboard.analysis.score import Requirement, Score
     from offboard.flight.flight import Outcome
-    from offboard.live.displays import Displays
+    from offboard.live.process import Displays
 
 INTERRUPTED = "interrupted before anything was sent"
 LABEL_WIDTH = 15
@@ -150,9 +150,8 @@ def _exit_at_once() -> None:
 
 def _displays(live: str | None, *, json_lines: bool) -> Displays:
     """What shows the flight: lines, and a server of the page at the address `live`."""
-    from offboard.live.displays import Displays
     from offboard.live.lines import JsonLines, Terminal
-    from offboard.live.process import SERVER, LiveProcess
+    from offboard.live.process import SERVER, Displays, LiveProcess
 
     lines = JsonLines(write) if json_lines else Terminal(out, partial(say, indent=12))
     return Displays(lines, [LiveProcess(SERVER, "--live", live)] if live else [])
@@ -211,7 +210,7 @@ def _result(
     code: int, sentence: str, requirements: str, score: Score, directory: Path, lost: list[str]
 ) -> str:
     """The last line of --json-lines."""
-    from offboard.documents.plain import plain
+    from offboard.documents.errors import plain
     from offboard.live.display import DIGITS, line
 
     result = {

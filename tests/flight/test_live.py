@@ -23,9 +23,8 @@ from pair import Pair, hover
 from rich.console import Console
 
 from offboard.documents.errors import UserError
-from offboard.live.displays import Displays
 from offboard.live.lines import JsonLines, Terminal, status
-from offboard.live.process import LiveProcess
+from offboard.live.process import Displays, LiveProcess
 
 SERVER = "offboard.live.server"
 FLOOD = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n" * 200
