@@ -1,4 +1,4 @@
-"""`offboard score`: every figure of a flight, from its log."""
+"""`offboard score`: every metric of a flight, from its log."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def score(
 ) -> None:
     """Score a flight from its .tlog alone.
 
-    Prints whether the flight was completed, what happened in the order of time, then every figure.
+    Prints whether the flight was completed, what happened in the order of time, then every metric.
     Every requirement on a flight that was not completed is missed. Writes score.json if FLIGHT is a
     directory.
     """
