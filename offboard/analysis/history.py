@@ -196,9 +196,8 @@ class Samples:
     """
 
     def __init__(
-        self, message: str, columns: Columns, stamp: str = BOOT_MS,
-        *, unix: bool = False,
-    ) -> None:  # fmt: skip
+        self, message: str, columns: Columns, stamp: str = BOOT_MS, *, unix: bool = False
+    ) -> None:
         places = {column: _place(message, *fields) for column, fields in columns.items()}
         self._begin = min(at for at, _ in places.values())
         self._end = max(at + kind.itemsize for at, kind in places.values())
@@ -293,7 +292,7 @@ class _Collector:
         self._counts[entry.name] += 1
         self._unix_us = (self._unix_us[0] or entry.unix_us, entry.unix_us)
         ours = entry.component_id in OUR_COMPONENTS
-        if ours and self._vehicle and entry.system_id == self._vehicle.system_id:
+        if ours and (self._vehicle is None or entry.system_id == self._vehicle.system_id):
             self._add_ours(entry, entry.frame.payload)
         elif not ours and (entry.system_id, entry.component_id) == self._vehicle:
             self._add_theirs(entry, entry.frame.payload)

@@ -266,6 +266,7 @@ def test_no_vehicle(offboard: Call, tmp_path: Path) -> None:
     assert len(output.strip().splitlines()) == 1
     log = tlog.read(tmp_path / "x" / "flight.tlog")
     assert history.configuration(log) == (tmp_path / "x" / "flight.yaml").read_text()
+    assert history.gather(log).phases[-1].phase == "failed"
 
 
 def in_flight(spawn: Spawn, *arguments: str) -> subprocess.Popen[str]:
