@@ -36,7 +36,7 @@ from offboard.analysis.page import (
 from offboard.analysis.verdict import begin_times
 from offboard.report import timeline
 from offboard.report.flight import Flight
-from offboard.report.panels import GROUPS, Curve, Panel, Samples, thinned
+from offboard.report.panels import GROUPS, Curve, Panel, Points, thinned
 
 # of flights that share a figure, in an order that colour-blind people can tell apart
 COLOURS = (BLUE, ORANGE, GREEN, GREY, PINK, BROWN)
@@ -224,7 +224,7 @@ def _panels(title: str, group: Sequence[Panel], drawn: Sequence[Lane]) -> Figure
     return Figure(title, figure, " ".join(captions + [_CUT] * cut))
 
 
-def _known(panel: Panel, drawn: Sequence[Lane]) -> list[tuple[Lane, Curve, Samples]]:
+def _known(panel: Panel, drawn: Sequence[Lane]) -> list[tuple[Lane, Curve, Points]]:
     """The curves of a panel that have values; of several flights only the main ones."""
     curves = [
         (lane, each, each.source(lane.flight.history))
@@ -236,9 +236,9 @@ def _known(panel: Panel, drawn: Sequence[Lane]) -> list[tuple[Lane, Curve, Sampl
 
 
 def _draw(
-    figure: go.Figure, place: int, each: Curve, samples: Samples, lane: Lane, *, named: bool
+    figure: go.Figure, place: int, each: Curve, points: Points, lane: Lane, *, named: bool
 ) -> None:
-    times, values, *sd = samples
+    times, values, *sd = points
     chosen = thinned(values)
     name, colour, dash = each.name, each.colour, each.dash
     if lane.label:

@@ -14,8 +14,8 @@ from offboard.analysis.tracking import Reference, each_once
 from offboard.model.frames import euler_from_quaternion
 
 Array = NDArray[np.float64]
-Samples = tuple[Array, ...]  # times and values (N,), and their standard deviations where known
-Source = Callable[[History], Samples]
+Points = tuple[Array, ...]  # times and values (N,), and their standard deviations where known
+Source = Callable[[History], Points]
 
 BINS = 1500  # of a curve, see `thinned`
 REFERENCE_GAP_S = 0.5  # without a record of the reference for longer there is none
@@ -49,7 +49,7 @@ class Panel:
 
 
 def _column(array: str, column: str, axis: int | None = None, scale: float = 1.0) -> Source:
-    def samples(flown: History) -> Samples:
+    def samples(flown: History) -> Points:
         rows = getattr(flown, array)
         values = rows[column] if axis is None else rows[column][:, axis]
         return rows["time_s"], scale * values
@@ -62,7 +62,7 @@ def _recorded(field: str, scale: float = 1.0) -> Source:
 
 
 def _above_zero(field: str) -> Source:
-    def samples(flown: History) -> Samples:
+    def samples(flown: History) -> Points:
         return flown.records["time_s"], np.maximum(flown.records[field], LEAST_SHOWN)
 
     return samples
@@ -71,7 +71,7 @@ def _above_zero(field: str) -> Source:
 def _away(array: str, axis: int | None = None) -> Source:
     """Distance from the reference, or its component along an axis; NaN where there is none."""
 
-    def samples(flown: History) -> Samples:
+    def samples(flown: History) -> Points:
         rows = each_once(getattr(flown, array))
         if len(np.unique(flown.reference["time_s"])) < 2:
             return np.zeros(0), np.zeros(0)
@@ -85,7 +85,7 @@ def _away(array: str, axis: int | None = None) -> Source:
     return samples
 
 
-def _speed(flown: History) -> Samples:
+def _speed(flown: History) -> Points:
     speed = np.linalg.norm(flown.position["velocity_ned_mps"], axis=1)
     return flown.position["time_s"], np.asarray(speed)
 
@@ -93,7 +93,7 @@ def _speed(flown: History) -> Samples:
 def _euler_deg(array: str, axis: int) -> Source:
     """Roll, pitch or heading to 1e-4 deg, with a gap where it wraps."""
 
-    def samples(flown: History) -> Samples:
+    def samples(flown: History) -> Points:
         rows = getattr(flown, array)
         radians = np.asarray(euler_from_quaternion(rows["quaternion"])[..., axis], np.float64)
         angles = np.asarray(np.round(np.degrees(radians), 4), np.float64)
@@ -103,13 +103,13 @@ def _euler_deg(array: str, axis: int) -> Source:
     return samples
 
 
-def _intervals_ms(flown: History) -> Samples:
+def _intervals_ms(flown: History) -> Points:
     stamps = np.unique(flown.position["time_s"])
     return stamps[1:], 1e3 * np.diff(stamps)
 
 
 def _identified(constant: str, scale: float = 1.0) -> Source:
-    def samples(flown: History) -> Samples:
+    def samples(flown: History) -> Points:
         known = flown.identified[np.isfinite(flown.identified[constant][:, 0])]
         value, sd = scale * known[constant].T
         return known["time_s"], value, sd
