@@ -11,9 +11,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from offboard.analysis.history import History
+from offboard.documents.errors import plain
 from offboard.flight.phases import PHASE_CODES, TRACKING
 from offboard.identification.attitude_fit import ResponseFit
 from offboard.identification.trace import NORTH, POSITION, STAMP, VELOCITY, Trace, clean
@@ -21,12 +23,16 @@ from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_fit import Identified, identify
 from offboard.mavlink.dialects.base import ThrustRule
 from offboard.model.frames import heading_from_quaternion, thrust_direction_from_quaternion
-from offboard.model.vehicle import AxisResponse, Vehicle
+from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
 
 LIFTED_OFF_S = 0.5  # the ground's effect on the thrust ends
-NOT_IDENTIFIED = "not identified: {sentence}"
+_KEPT = (
+    "mass_kg", "inertia_kgm2", "arm_m", "drag_rotation_nmpradps",
+    "angular_acceleration_limit_radps2",
+)  # fmt: skip
+DIGITS = 6  # of the values in a vehicle file
 LINE_WIDTH = 80
 MEAN_OVER_S = 0.5  # time over which reported velocity and position are compared
 
@@ -100,39 +106,27 @@ def vehicle_file(found: Identified, prior: Vehicle, flight: str) -> str:
     Identified constants have their standard deviation as comment. The other constants are those of
     `prior`, with the reason why they were not identified. `flight` names the log.
     """
-    vehicle, whys = found.applied_to(prior), found.refusals
-    kept = "not identifiable from telemetry"
+    whys = found.refusals
     lag = _comment(found.thrust_lag_s, "s", whys.get("thrust_lag_s", ""))
-    hover = _comment(found.hover_thrust, "", whys.get("hover_thrust", ""))
-    drag = _comment(found.drag_ps, "1/s times the mass", whys.get("drag_ps", ""))
-    limits = _list(vehicle.angular_acceleration_limit_radps2)
-    entries = [
-        (f"name: {vehicle.name}", ""),
-        (f"mass_kg: {vehicle.mass_kg:g}", kept),
-        (f"gravity_mps2: {vehicle.gravity_mps2:g}", ""),
-        (f"inertia_kgm2: {_list(vehicle.inertia_kgm2)}", kept),
-        (f"arm_m: {vehicle.arm_m:g}", kept),
-        (f"drag_translation_npmps: {_list(vehicle.drag_translation_npmps)}", drag),
-        (f"drag_rotation_nmpradps: {_list(vehicle.drag_rotation_nmpradps)}", kept),
-        (f"hover_thrust: {vehicle.hover_thrust:.4f}", hover),
-        (f"thrust_delay_s: {vehicle.thrust_delay_s:.4f}", lag),
-        (f"thrust_lag_s: {vehicle.thrust_lag_s:.4f}", lag),
-        *_axis("tilt", vehicle.tilt, _fit_comment(found.tilt, whys.get("tilt", ""))),
-        *_axis("yaw", vehicle.yaw, _fit_comment(found.yaw, whys.get("yaw", ""))),
-        (f"angular_acceleration_limit_radps2: {limits}", kept),
-        (f"tilt_max_rad: {vehicle.tilt_max_rad:g}", ""),
-    ]
-    heading = f"# Identified from {found.seconds:.0f} s of {flight}; +- is one standard deviation."
-    return "\n".join([heading, *(_line(*entry) for entry in entries)]) + "\n"
-
-
-def _axis(name: str, axis: AxisResponse, comment: str) -> list[tuple[str, str]]:
-    return [
-        (f"{name}:", comment),
-        (f"  delay_s: {axis.delay_s:.4f}", ""),
-        (f"  natural_frequency_radps: {axis.natural_frequency_radps:.3f}", ""),
-        (f"  damping: {axis.damping:.3f}", ""),
-    ]
+    comments = {
+        **dict.fromkeys(_KEPT, "not identifiable from telemetry"),
+        "drag_translation_npmps": _comment(
+            found.drag_ps, "1/s times the mass", whys.get("drag_ps", "")
+        ),
+        "hover_thrust": _comment(found.hover_thrust, "", whys.get("hover_thrust", "")),
+        "thrust_delay_s": lag,
+        "thrust_lag_s": lag,
+        "tilt": _fit_comment(found.tilt, whys.get("tilt", "")),
+        "yaw": _fit_comment(found.yaw, whys.get("yaw", "")),
+    }
+    lines = [f"# Identified from {found.seconds:.0f} s of {flight}; +- is one standard deviation."]
+    for key, value in plain(found.applied_to(prior).model_dump(mode="json"), DIGITS).items():
+        flow = None if isinstance(value, dict | list) else False
+        text = yaml.safe_dump(
+            {key: value}, default_flow_style=flow, sort_keys=False, width=math.inf
+        )
+        lines.append(_line(text.rstrip(), comments.get(key, "")))
+    return "\n".join(lines) + "\n"
 
 
 def _line(entry: str, comment: str) -> str:
@@ -147,23 +141,17 @@ def _line(entry: str, comment: str) -> str:
 
 
 def _comment(estimate: Estimate | None, unit: str, why: str) -> str:
-    if estimate is None:
-        return NOT_IDENTIFIED.format(sentence=why)
-    return f"+- {estimate.sd:.2g} {unit}".rstrip()
+    return f"+- {estimate.sd:.2g} {unit}".rstrip() if estimate else f"not identified: {why}"
 
 
 def _fit_comment(fit: ResponseFit | None, why: str) -> str:
     if fit is None:
-        return NOT_IDENTIFIED.format(sentence=why)
+        return f"not identified: {why}"
     return (
         f"+- {fit.delay_s.sd:.2g} s, {fit.natural_frequency_radps.sd:.2g} rad/s, "
         f"{fit.damping.sd:.2g}; residual {1e3 * fit.residual_rms:.1f} of "
         f"{1e3 * fit.commanded_rms:.0f} mrad RMS"
     )
-
-
-def _list(values: tuple[float, ...]) -> str:
-    return "[" + ", ".join(f"{value:.4g}" for value in values) + "]"
 
 
 # ---------------------------------------------------------------------- estimator's noise
