@@ -93,7 +93,7 @@ def fly(
         settings: Sequence[str] = (),
         must_succeed: bool = True,
     ) -> Flight:
-        from offboard.analysis.flight_score import judged, score_flight
+        from offboard.analysis.score import judged, score_flight
         from offboard.documents.errors import UserError
         from offboard.run.configuration import load
         from offboard.run.flight import Simulated, fly

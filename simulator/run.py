@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from offboard.documents.repeated import Repeated
+from offboard.documents.errors import Repeated
 from offboard.link.clock import monotonic_s, unix_us
 from simulator.instance import Instance
 from simulator.link.framing import Recorder

@@ -1,7 +1,8 @@
 """One flight as columns and events, read once from its .tlog.
 
 Times are vehicle time in seconds, continued where `time_boot_ms` begins again at zero. Positions
-are NED in metres relative to the estimator's origin.
+are NED in metres relative to the estimator's origin. The columns of a message are the bytes of its
+payloads as they are in the log; only those that are used are kept.
 """
 
 from __future__ import annotations
@@ -10,23 +11,24 @@ import math
 import struct
 from array import array
 from collections import Counter
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.analysis.events import Event, Texts, ours
-from offboard.analysis.samples import BOOT_US, Rows, Samples, Wire, continuous_s
-from offboard.analysis.tlog import LoggedMessage, Tlog, TlogError, columns
+from offboard.analysis.tlog import LoggedMessage, Tlog, TlogError, layout
 from offboard.flight import manifest
+from offboard.flight.phases import PHASE_CODES
 from offboard.flight.record import (
     COMPONENT_ID,
     FIELDS,
-    IDENTIFIED_ID,
     IDENTIFIED_NAME,
+    NAN,
     RECORD_COMPONENT_ID,
     RECORD_NAME,
-    records_of,
+    TickRecord,
 )
 from offboard.identification.vehicle_fit import RECORDED
 from offboard.mavlink import event_record
@@ -34,64 +36,70 @@ from offboard.mavlink.decode import Address, decode_identity
 from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.framing import HEARTBEAT
 from offboard.mavlink.senders import DIALECTS, is_vehicle
+from offboard.mavlink.texts import TextAssembler
 from offboard.model.geodesy import Geodetic, origin_of, position_ned_m
 
 Array = NDArray[np.float64]
+Rows = NDArray[np.void]
 OUR_COMPONENTS = (COMPONENT_ID, RECORD_COMPONENT_ID)
 TELEMETRY = (31, 32)  # ATTITUDE_QUATERNION, LOCAL_POSITION_NED
 _SUBSTITUTES = (30, 33)  # ATTITUDE, GLOBAL_POSITION_INT: the clock of logs without these
 _TUNNEL = 385  # message id
 _ARMED = 0x80  # MAV_MODE_FLAG_SAFETY_ARMED
-
-_TIME = ("time_s", "f8")
-POSITION = [_TIME, ("position_ned_m", "3f4"), ("velocity_ned_mps", "3f4")]
-ATTITUDE = [_TIME, ("quaternion", "4f4"), ("rates_radps", "3f4")]
-SETPOINT = [_TIME, ("unix_s", "f8"), ("quaternion", "4f4"), ("thrust", "f4")]
-# array of History -> its columns
-_DTYPES = {
-    "position": POSITION,
-    "attitude": ATTITUDE,
-    "reference": [
-        *POSITION, ("acceleration_ned_mps2", "3f4"), ("heading_rad", "f4"),
-    ],
-    "setpoint": SETPOINT,
-    "heartbeat": [_TIME, ("armed", "f4"), ("system_status", "f4")],
-    "battery": [_TIME, ("voltage_mv", "f4"), ("remaining", "f4")],
-    "landed": [_TIME, ("state", "f4")],
-    "identified": [_TIME, ("values", f"{2 * len(RECORDED)}f4")],
+_NO_VOLTAGE, _NO_PERCENTAGE = 0xFFFF, -1  # of SYS_STATUS
+_WRAP_MS = 2**32
+_PHASES: dict[int | None, str] = {code: phase.value for phase, code in PHASE_CODES.items()}
+BOOT_MS, BOOT_US, BEFORE = "time_boot_ms", "time_usec", ""  # stamps of messages
+# columns of a message: name -> the first of its fields and how many values, in an array from where
+Columns = Mapping[str, tuple[str, int] | tuple[str, int, int]]
+_MOTION = {"position_ned_m": ("x", 3), "velocity_ned_mps": ("vx", 3)}
+_REFERENCE = {**_MOTION, "acceleration_ned_mps2": ("afx", 3), "heading_rad": ("yaw", 1)}
+SETPOINT = {"quaternion": ("q", 4), "thrust": ("thrust", 1)}
+_BATTERY = {"voltage": ("voltage_battery", 1), "remaining": ("battery_remaining", 1)}
+_THEIRS: dict[str, tuple[Columns, str]] = {
+    "LOCAL_POSITION_NED": (_MOTION, BOOT_MS),
+    "ATTITUDE_QUATERNION": (
+        {"quaternion": ("q1", 4), "rates_radps": ("rollspeed", 3)}, BOOT_MS
+    ),
+    "HEARTBEAT": (
+        {"armed": ("base_mode", 1), "system_status": ("system_status", 1)}, BEFORE
+    ),
+    "SYS_STATUS": (_BATTERY, BEFORE),
+    "EXTENDED_SYS_STATE": ({"state": ("landed_state", 1)}, BEFORE),
 }  # fmt: skip
-_MOTION = {"position_ned_m": "x y z", "velocity_ned_mps": "vx vy vz"}
-_ROTATION = {"quaternion": "q1 q2 q3 q4", "rates_radps": "rollspeed pitchspeed yawspeed"}
-_REFERENCE = {**_MOTION, "acceleration_ned_mps2": "afx afy afz", "heading_rad": "yaw"}
-_MODE = {"armed": "base_mode", "system_status": "system_status"}
-_BATTERY = {"voltage_mv": "voltage_battery", "remaining": "battery_remaining"}
-
-
-def _kept(*kinds: tuple[str, Wire]) -> dict[str, tuple[str, Wire]]:
-    return {wire.name: (kind, wire) for kind, wire in kinds}
-
-
-# array of History and fields of its columns, by message
-_THEIRS = _kept(
-    ("position", Wire("LOCAL_POSITION_NED", _MOTION)),
-    ("attitude", Wire("ATTITUDE_QUATERNION", _ROTATION)),
-    ("heartbeat", Wire("HEARTBEAT", _MODE, None)),
-    ("battery", Wire("SYS_STATUS", _BATTERY, None)),
-    ("landed", Wire("EXTENDED_SYS_STATE", {"state": "landed_state"}, None)),
+_PLACE = {"latitude": ("lat", 1), "longitude": ("lon", 1), "altitude": ("alt", 1)}
+_SIM_PLACE = {"latitude": ("lat_int", 1), "longitude": ("lon_int", 1), "altitude": ("alt", 1)}
+_TRUTH: dict[str, tuple[Columns, str]] = {
+    "HIL_STATE_QUATERNION": (_PLACE, BOOT_US),
+    "SIM_STATE": (_SIM_PLACE, BEFORE),
+}
+_ALTITUDE_UNITS = {"HIL_STATE_QUATERNION": 1e3, "SIM_STATE": 1.0}  # in a metre
+_ARRAY, _DATA = "DEBUG_FLOAT_ARRAY", 20  # and where its data begin
+_TICK = {name: ("data", 1, place) for place, name in enumerate(FIELDS)}
+_IDENTIFIED = {name: ("data", 2, 2 * place) for place, name in enumerate(RECORDED)}
+_DEFAULTS = struct.pack(  # of records of an older version, which lack the last fields
+    f"<{len(FIELDS)}f",
+    *(NAN if each.default is MISSING else each.default for each in fields(TickRecord)),
 )
-_OURS = _kept(
-    ("reference", Wire("POSITION_TARGET_LOCAL_NED", _REFERENCE)),
-    ("setpoint", Wire("SET_ATTITUDE_TARGET", {"quaternion": "q", "thrust": "thrust"})),
-    ("setpoint", Wire("SET_POSITION_TARGET_LOCAL_NED", {})),
-)
-_PLACE = {"place": "lat lon alt"}
-_HIL = Wire("HIL_STATE_QUATERNION", _PLACE, BOOT_US)
-_HIL_UNSTAMPED = Wire("HIL_STATE_QUATERNION", _PLACE, None)
-_SIM = Wire("SIM_STATE", {"place": "lat_int lon_int alt"}, None)
-_SCALES = {_HIL.name: (1e7, 1e7, 1e3), _SIM.name: (1e7, 1e7, 1.0)}
-_ARRAYS = {RECORD_NAME.encode(), IDENTIFIED_NAME.encode()}
-_TICK = Wire("DEBUG_FLOAT_ARRAY", {}, BOOT_US)
-_IDENTIFIED = Wire("DEBUG_FLOAT_ARRAY", {"values": "data"}, BOOT_US)
+_NO_ATTITUDE = struct.pack("<8f", *(NAN,) * 8)  # of a setpoint, after its stamp
+_TIMESYNC = struct.Struct("<qq")  # tc1, ts1
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """A phase, a mode or a text: vehicle time (NaN before telemetry), sender, and what. `phase`:
+    the one that begins, empty for another event; `cause`: a word for what caused it, or empty."""
+
+    time_s: float
+    who: str
+    what: str
+    phase: str = ""
+    cause: str = ""
+
+    @property
+    def reason(self) -> str:
+        """Why its phase begins."""
+        return self.what.removeprefix(f"{self.phase}: ")
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,10 +121,10 @@ class History:
 
     `phases` and `announcements` are our own, by their records; `modes` and `vehicle_messages`
     (STATUSTEXT, refused commands) the vehicle's. `vehicle` is the one that was flown, as the log's
-    manifest says; in an older log the first autopilot that was heard. Only its messages, and ours,
-    are used. It and `dialect` are None without one, `dialect` also for one that is not known.
-    `damage` says what could not be read, `damage_s` is the time of the telemetry before the first
-    damage, NaN without.
+    manifest says, else the first autopilot that was heard. Only its messages, and ours, are used.
+    It and `dialect` are None without one, `dialect` also for one that is not known. `damage` says
+    what could not be read, `damage_s` is the time of the telemetry before the first damage, NaN
+    without.
     """
 
     position: Rows
@@ -176,30 +184,85 @@ def record_type(entry: LoggedMessage) -> int | None:
     return int.from_bytes(entry.frame.payload[:2], "little")
 
 
-class _Ticks(Samples):
-    """Records of the ticks, of any version."""
+class Samples:
+    """Rows of the messages of one kind, in the order of arrival: their time, and the bytes of their
+    payloads that hold the columns.
 
-    def fill(self, rows: Rows, wire: Wire, payloads: bytearray) -> None:
-        ids = columns(wire.name, payloads, "array_id")[:, 0]
-        records = records_of(columns(wire.name, payloads, "data"), ids)
-        for name in FIELDS:
-            rows[name] = records[name]
+    Args:
+        message: name in pymavlink.
+        columns: name -> the first of its fields, or an array field, and how many values.
+        stamp: BOOT_MS or BOOT_US; BEFORE gives a message the time of the telemetry before it.
+        unix: whether to keep the time in the log, as `unix_s`.
+    """
+
+    def __init__(
+        self, message: str, columns: Columns, stamp: str = BOOT_MS, *, unix: bool = False
+    ) -> None:
+        places = {column: _place(message, *fields) for column, fields in columns.items()}
+        self._begin = min(at for at, _ in places.values())
+        self._end = max(at + kind.itemsize for at, kind in places.values())
+        names = ["time_s", "unix_s"][: 1 + unix]
+        self._head = struct.Struct(f"<{len(names)}d")
+        away = self._head.size - self._begin
+        self._dtype = np.dtype(
+            {
+                "names": [*names, *places],
+                "formats": ["f8"] * len(names) + [kind for _, kind in places.values()],
+                "offsets": [0, 8][: len(names)] + [away + at for at, _ in places.values()],
+                "itemsize": away + self._end,
+            }
+        )
+        self._stamp, self._unix = stamp, unix
+        self._data = bytearray()
+
+    def add(self, payload: bytes, now_ms: float, unix_s: float) -> None:
+        """A message. `now_ms`: stamp of the telemetry before it, NaN without. `unix_s`: of its
+        entry in the log."""
+        stamp_ms = now_ms
+        if self._stamp == BOOT_MS:
+            stamp_ms = int.from_bytes(payload[:4], "little")
+        elif self._stamp == BOOT_US and any(payload[:8]):
+            stamp_ms = 1e-3 * int.from_bytes(payload[:8], "little")
+        self._data += self._head.pack(stamp_ms, unix_s) if self._unix else self._head.pack(stamp_ms)
+        self._data += payload[self._begin : self._end].ljust(self._end - self._begin, b"\0")
+
+    def rows(self, anchor_ms: float) -> Rows:
+        """All rows, their times continued (see `continuous_s`). Nothing can be added after."""
+        rows: Rows = np.frombuffer(self._data, self._dtype)
+        rows["time_s"] = continuous_s(rows["time_s"], anchor_ms)
+        return rows
 
 
-class _Truth(Samples):
-    """True positions from the first known origin of the local frame on. HOME_POSITION gives one
-    point in both frames."""
+def _place(message: str, field: str, count: int, first: int = 0) -> tuple[int, np.dtype[Any]]:
+    """Where in the payload values begin, and their type."""
+    found = layout(message).fields
+    assert found is not None
+    kind, at = found[field][:2]
+    base = kind.base
+    return at + first * base.itemsize, np.dtype((base, (count,))) if count > 1 else base
 
-    origin: Geodetic | None = None
 
-    def move(self, origin: Geodetic) -> None:
-        self.convert()
-        self.origin = origin
+def table(time_s: Any, **columns: Any) -> Rows:
+    """Rows at the times (N,), with columns (N, ...)."""
+    values = {name: np.asarray(column) for name, column in columns.items()}
+    kinds = [(name, each.dtype, each.shape[1:]) for name, each in values.items()]
+    rows = np.empty(len(time_s), [("time_s", "f8"), *kinds])
+    rows["time_s"] = time_s
+    for name, each in values.items():
+        rows[name] = each
+    return rows
 
-    def fill(self, rows: Rows, wire: Wire, payloads: bytearray) -> None:
-        assert self.origin is not None
-        places = columns(wire.name, payloads, wire.fields["place"]) / _SCALES[wire.name]
-        rows["position_ned_m"] = position_ned_m(places, self.origin)
+
+def continuous_s(stamps_ms: Any, anchor_ms: float) -> Any:
+    """Vehicle time in s from `time_boot_ms`, which begins again at zero after 2^32 ms.
+
+    The result is within 24 days of `anchor_ms`, any stamp of the same log. Stamps that do not wrap
+    are put on the same clock.
+    """
+    if math.isnan(anchor_ms):
+        return stamps_ms / 1e3
+    away_ms = (stamps_ms - anchor_ms + _WRAP_MS / 2) % _WRAP_MS - _WRAP_MS / 2
+    return (anchor_ms + away_ms) / 1e3
 
 
 class _Collector:
@@ -207,13 +270,16 @@ class _Collector:
 
     def __init__(self, vehicle: Address | None, dialect: Dialect | None) -> None:
         self._vehicle, self._dialect = vehicle, dialect
-        self._samples = {name: Samples(dtype) for name, dtype in _DTYPES.items()}
-        self._ticks = _Ticks([_TIME, *((name, "f4") for name in FIELDS)])
-        self._truth = _Truth([_TIME, ("position_ned_m", "3f4")])
+        self._theirs = {name: Samples(name, *spec) for name, spec in _THEIRS.items()}
+        self._reference = Samples("POSITION_TARGET_LOCAL_NED", _REFERENCE)
+        self._setpoint = Samples("SET_ATTITUDE_TARGET", SETPOINT, unix=True)
+        self._records = Samples(_ARRAY, _TICK, BOOT_US)
+        self._identified = Samples(_ARRAY, _IDENTIFIED, BOOT_US)
+        self._truth: list[tuple[Geodetic, dict[str, Samples]]] = []  # by the local frame's origin
         self._asked_ns, self._answered_ns = array("q"), array("q")  # of TIMESYNC; ts1, and ts1, tc1
-        self._texts, self._our_texts = Texts("vehicle"), Texts("offboard")
-        self._modes = Texts("vehicle")
-        self._mode = ""
+        self._assembler = TextAssembler()
+        self._texts: list[tuple[float, str]] = []  # of the vehicle, each with `now_ms`
+        self._modes: list[tuple[float, str]] = []
         self._event_records: list[tuple[float, bytes]] = []
         self._counts: Counter[str] = Counter()
         self._unix_us = (0, 0)
@@ -226,85 +292,112 @@ class _Collector:
         self._counts[entry.name] += 1
         self._unix_us = (self._unix_us[0] or entry.unix_us, entry.unix_us)
         ours = entry.component_id in OUR_COMPONENTS
-        if ours and self._vehicle and entry.system_id != self._vehicle.system_id:
-            return
-        if not ours and (entry.system_id, entry.component_id) != self._vehicle:
-            return
-        name, payload = entry.name, entry.frame.payload
-        if name in (_OURS if ours else _THEIRS):
-            kind, wire = (_OURS if ours else _THEIRS)[name]
-            self._samples[kind].add(wire, payload, self.now_ms, entry.unix_us / 1e6)
+        if ours and (self._vehicle is None or entry.system_id == self._vehicle.system_id):
+            self._add_ours(entry, entry.frame.payload)
+        elif not ours and (entry.system_id, entry.component_id) == self._vehicle:
+            self._add_theirs(entry, entry.frame.payload)
+
+    def _add_ours(self, entry: LoggedMessage, payload: bytes) -> None:
+        name, now_ms, unix_s = entry.name, self.now_ms, entry.unix_us / 1e6
+        if name == "POSITION_TARGET_LOCAL_NED":
+            self._reference.add(payload, now_ms, unix_s)
+        elif name == "SET_ATTITUDE_TARGET":
+            self._setpoint.add(payload, now_ms, unix_s)
+        elif name == "SET_POSITION_TARGET_LOCAL_NED":
+            self._setpoint.add(payload[:4] + _NO_ATTITUDE, now_ms, unix_s)
+        elif name == _ARRAY and payload[10:20].rstrip(b"\0") == RECORD_NAME.encode():
+            end = _DATA + 4 * int.from_bytes(payload[8:10], "little")  # array_id: how many fields
+            known = payload[:end].ljust(end, b"\0")
+            self._records.add(known + _DEFAULTS[end - _DATA :], now_ms, unix_s)
+        elif name == _ARRAY and payload[10:20].rstrip(b"\0") == IDENTIFIED_NAME.encode():
+            self._identified.add(payload, now_ms, unix_s)
         elif name == "TIMESYNC":
-            answered_ns, asked_ns = struct.unpack("<qq", payload[:16].ljust(16, b"\0"))
-            if ours and not answered_ns:
+            answered_ns, asked_ns = _TIMESYNC.unpack(payload[:16].ljust(16, b"\0"))
+            if not answered_ns:
                 self._asked_ns.append(asked_ns)
-            elif not ours and answered_ns:
+        elif record_type(entry) == event_record.PAYLOAD_TYPE:
+            self._event_records.append((now_ms, entry.tunnelled))
+
+    def _add_theirs(self, entry: LoggedMessage, payload: bytes) -> None:
+        name, now_ms, unix_s = entry.name, self.now_ms, entry.unix_us / 1e6
+        if name in self._theirs:
+            self._theirs[name].add(payload, now_ms, unix_s)
+        elif name in _TRUTH:
+            if self._truth:
+                self._truth[-1][1][name].add(payload, now_ms, unix_s)
+        elif name == "TIMESYNC":
+            answered_ns, asked_ns = _TIMESYNC.unpack(payload[:16].ljust(16, b"\0"))
+            if answered_ns:
                 self._answered_ns.extend((asked_ns, answered_ns))
         elif name == "STATUSTEXT":
-            (self._our_texts if ours else self._texts).add_chunk(entry, self.now_ms)
-        elif ours:
-            self._add_ours(name, entry)
-        else:
-            self._add_theirs(name, entry)
-        if name == "HEARTBEAT" and self._dialect and not ours:
+            whole = self._assembler.add(payload, unix_s)
+            self._texts += [(now_ms, text.text) for text in whole]
+        elif name == "COMMAND_ACK":
+            command, result = entry.message.command, entry.message.result
+            if result not in (0, 5):  # MAV_RESULT_ACCEPTED, MAV_RESULT_IN_PROGRESS
+                self._texts.append((now_ms, f"command {command} refused, result {result}"))
+        elif name in ("GPS_GLOBAL_ORIGIN", "HOME_POSITION"):
+            self._add_origin(entry)
+        if name == "HEARTBEAT" and self._dialect:
             mode = self._dialect.mode_name(int.from_bytes(payload[:4], "little"))
-            if mode != self._mode:
-                self._modes.add(mode, self.now_ms)
-                self._mode = mode
-        if entry.frame.message_id in self._clocks and not ours:
+            if not self._modes or mode != self._modes[-1][1]:
+                self._modes.append((now_ms, mode))
+        if entry.frame.message_id in self._clocks:
             if entry.frame.message_id in TELEMETRY:
                 self._clocks = TELEMETRY
             self.now_ms = float(int.from_bytes(payload[:4], "little"))
             if math.isnan(self._anchor_ms):
                 self._anchor_ms = self.now_ms
 
-    def _add_ours(self, name: str, entry: LoggedMessage) -> None:
-        payload = entry.frame.payload
-        if name == _TICK.name and payload[10:20].rstrip(b"\0") in _ARRAYS:
-            identified = int.from_bytes(payload[8:10], "little") == IDENTIFIED_ID
-            samples = self._samples["identified"] if identified else self._ticks
-            wire = _IDENTIFIED if identified else _TICK
-            samples.add(wire, payload, self.now_ms, entry.unix_us / 1e6)
-        elif record_type(entry) == event_record.PAYLOAD_TYPE:
-            self._event_records.append((self.now_ms, entry.tunnelled))
-
-    def _add_theirs(self, name: str, entry: LoggedMessage) -> None:
-        if name in _SCALES and self._truth.origin:
-            payload = entry.frame.payload
-            wire = _SIM if name == _SIM.name else _HIL if any(payload[:8]) else _HIL_UNSTAMPED
-            self._truth.add(wire, payload, self.now_ms, entry.unix_us / 1e6)
-        elif name == "COMMAND_ACK":
-            command, result = entry.message.command, entry.message.result
-            if result not in (0, 5):  # MAV_RESULT_ACCEPTED, MAV_RESULT_IN_PROGRESS
-                self._texts.add(f"command {command} refused, result {result}", self.now_ms)
-        elif name in ("GPS_GLOBAL_ORIGIN", "HOME_POSITION"):
-            at = entry.message
-            place = Geodetic(at.latitude / 1e7, at.longitude / 1e7, at.altitude / 1e3)
-            if name == "HOME_POSITION":
-                place = origin_of(place, (at.x, at.y, at.z))
-            self._truth.move(place)
+    def _add_origin(self, entry: LoggedMessage) -> None:
+        """HOME_POSITION gives one point in both frames."""
+        at = entry.message
+        origin = Geodetic(at.latitude / 1e7, at.longitude / 1e7, at.altitude / 1e3)
+        if entry.name == "HOME_POSITION":
+            origin = origin_of(origin, (at.x, at.y, at.z))
+        if not self._truth or origin != self._truth[-1][0]:
+            samples = {name: Samples(name, *spec) for name, spec in _TRUTH.items()}
+            self._truth.append((origin, samples))
 
     def history(self, damage: str) -> History:
         """All that was added."""
         anchor_ms = self._anchor_ms
-        rows = {name: samples.rows(anchor_ms) for name, samples in self._samples.items()}
-        constants = [_TIME, *((name, "2f4") for name in RECORDED)]
-        rows["identified"] = rows["identified"].view(constants)
-        armed = rows["heartbeat"]["armed"].astype(np.int64) & _ARMED
-        rows["heartbeat"]["armed"] = armed > 0
-        for column, unknown in (("voltage_mv", 0xFFFF), ("remaining", -1)):
-            battery = rows["battery"][column]
-            battery[battery == unknown] = math.nan
-        events = ours(self._event_records, self._our_texts, anchor_ms)
+        rows = {name: samples.rows(anchor_ms) for name, samples in self._theirs.items()}
+        heartbeat, battery = rows["HEARTBEAT"], rows["SYS_STATUS"]
+        voltage, remaining = (battery[name].astype(np.float32) for name in _BATTERY)
+        voltage[voltage == _NO_VOLTAGE] = remaining[remaining == _NO_PERCENTAGE] = math.nan
+        payloads = [payload for _, payload in self._event_records]
+        events = [
+            Event(
+                float(continuous_s(self._event_records[last][0], anchor_ms)),
+                "offboard", event.text, _PHASES.get(event.phase, ""), event.cause,
+            )
+            for last, event in event_record.join(payloads)
+        ]  # fmt: skip
+        modes, texts = (
+            tuple(Event(float(continuous_s(at, anchor_ms)), "vehicle", text) for at, text in said)
+            for said in (self._modes, self._texts)
+        )
         return History(
-            **rows,
-            truth=self._truth.rows(anchor_ms),
-            records=self._ticks.rows(anchor_ms),
+            position=rows["LOCAL_POSITION_NED"],
+            attitude=rows["ATTITUDE_QUATERNION"],
+            truth=self._truth_rows(),
+            reference=self._reference.rows(anchor_ms),
+            setpoint=self._setpoint.rows(anchor_ms),
+            records=self._records.rows(anchor_ms),
+            identified=self._identified.rows(anchor_ms),
             link_delay=self._link_delay(),
+            heartbeat=table(
+                heartbeat["time_s"],
+                armed=(heartbeat["armed"] & _ARMED > 0).astype(np.float32),
+                system_status=heartbeat["system_status"].astype(np.float32),
+            ),
+            battery=table(battery["time_s"], voltage_mv=voltage, remaining=remaining),
+            landed=rows["EXTENDED_SYS_STATE"],
             phases=tuple(event for event in events if event.phase),
             announcements=tuple(event for event in events if not event.phase),
-            modes=self._modes.events(anchor_ms),
-            vehicle_messages=self._texts.events(anchor_ms),
+            modes=modes,
+            vehicle_messages=texts,
             vehicle=self._vehicle,
             dialect=self._dialect,
             messages=self._counts,
@@ -313,13 +406,22 @@ class _Collector:
             damage_s=float(continuous_s(self.damage_ms, anchor_ms)),
         )
 
+    def _truth_rows(self) -> Rows:
+        parts = [table(np.zeros(0), position_ned_m=np.zeros((0, 3), np.float32))]
+        for origin, samples in self._truth:
+            for name, each in samples.items():
+                rows = each.rows(self._anchor_ms)
+                places = np.column_stack([rows[column] for column in _PLACE])
+                places = places / (1e7, 1e7, _ALTITUDE_UNITS[name])
+                position = position_ned_m(places, origin).astype(np.float32)
+                parts.append(table(rows["time_s"], position_ned_m=position))
+        return np.concatenate(parts)
+
     def _link_delay(self) -> Rows:
         """From the vehicle's answers to our TIMESYNC requests."""
         answers = np.array(self._answered_ns, np.int64).reshape(-1, 2)
         asked, answered = answers[np.isin(answers[:, 0], np.array(self._asked_ns))].T
-        rows = np.empty(len(asked), [_TIME, ("delay_s", "f8")])
-        rows["time_s"], rows["delay_s"] = 1e-9 * asked, 1e-9 * (answered - asked)
-        return rows
+        return table(1e-9 * asked, delay_s=1e-9 * (answered - asked))
 
 
 def _vehicle(log: Tlog) -> tuple[Address | None, Dialect | None]:

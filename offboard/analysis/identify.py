@@ -1,4 +1,4 @@
-"""Identifies the vehicle of a log, and writes the vehicle file.
+"""Identifies the vehicle of a log and the noise of its estimator, and writes the vehicle file.
 
 The flight may be one of another program, if it sent SET_ATTITUDE_TARGET.
 """
@@ -8,25 +8,33 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from offboard.analysis.history import History
+from offboard.documents.errors import plain
 from offboard.flight.phases import PHASE_CODES, TRACKING
 from offboard.identification.attitude_fit import ResponseFit
-from offboard.identification.trace import Trace, clean
+from offboard.identification.trace import NORTH, POSITION, STAMP, VELOCITY, Trace, clean
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_fit import Identified, identify
 from offboard.mavlink.outgoing import ThrustRule
 from offboard.model.frames import heading_from_quaternion, thrust_direction_from_quaternion
-from offboard.model.vehicle import AxisResponse, Vehicle
+from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
 
 LIFTED_OFF_S = 0.5  # the ground's effect on the thrust ends
-NOT_IDENTIFIED = "not identified: {sentence}"
+_KEPT = (
+    "mass_kg", "inertia_kgm2", "arm_m", "drag_rotation_nmpradps",
+    "angular_acceleration_limit_radps2",
+)  # fmt: skip
+DIGITS = 6  # of the values in a vehicle file
 LINE_WIDTH = 80
+MEAN_OVER_S = 0.5  # time over which reported velocity and position are compared
 
 
 def identify_flight(history: History, vehicle: Vehicle) -> tuple[Identified, Trace]:
@@ -98,39 +106,27 @@ def vehicle_file(found: Identified, prior: Vehicle, flight: str) -> str:
     Identified constants have their standard deviation as comment. The other constants are those of
     `prior`, with the reason why they were not identified. `flight` names the log.
     """
-    vehicle, whys = found.applied_to(prior), found.refusals
-    kept = "not identifiable from telemetry"
+    whys = found.refusals
     lag = _comment(found.thrust_lag_s, "s", whys.get("thrust_lag_s", ""))
-    hover = _comment(found.hover_thrust, "", whys.get("hover_thrust", ""))
-    drag = _comment(found.drag_ps, "1/s times the mass", whys.get("drag_ps", ""))
-    limits = _list(vehicle.angular_acceleration_limit_radps2)
-    entries = [
-        (f"name: {vehicle.name}", ""),
-        (f"mass_kg: {vehicle.mass_kg:g}", kept),
-        (f"gravity_mps2: {vehicle.gravity_mps2:g}", ""),
-        (f"inertia_kgm2: {_list(vehicle.inertia_kgm2)}", kept),
-        (f"arm_m: {vehicle.arm_m:g}", kept),
-        (f"drag_translation_npmps: {_list(vehicle.drag_translation_npmps)}", drag),
-        (f"drag_rotation_nmpradps: {_list(vehicle.drag_rotation_nmpradps)}", kept),
-        (f"hover_thrust: {vehicle.hover_thrust:.4f}", hover),
-        (f"thrust_delay_s: {vehicle.thrust_delay_s:.4f}", lag),
-        (f"thrust_lag_s: {vehicle.thrust_lag_s:.4f}", lag),
-        *_axis("tilt", vehicle.tilt, _fit_comment(found.tilt, whys.get("tilt", ""))),
-        *_axis("yaw", vehicle.yaw, _fit_comment(found.yaw, whys.get("yaw", ""))),
-        (f"angular_acceleration_limit_radps2: {limits}", kept),
-        (f"tilt_max_rad: {vehicle.tilt_max_rad:g}", ""),
-    ]
-    heading = f"# Identified from {found.seconds:.0f} s of {flight}; +- is one standard deviation."
-    return "\n".join([heading, *(_line(*entry) for entry in entries)]) + "\n"
-
-
-def _axis(name: str, axis: AxisResponse, comment: str) -> list[tuple[str, str]]:
-    return [
-        (f"{name}:", comment),
-        (f"  delay_s: {axis.delay_s:.4f}", ""),
-        (f"  natural_frequency_radps: {axis.natural_frequency_radps:.3f}", ""),
-        (f"  damping: {axis.damping:.3f}", ""),
-    ]
+    comments = {
+        **dict.fromkeys(_KEPT, "not identifiable from telemetry"),
+        "drag_translation_npmps": _comment(
+            found.drag_ps, "1/s times the mass", whys.get("drag_ps", "")
+        ),
+        "hover_thrust": _comment(found.hover_thrust, "", whys.get("hover_thrust", "")),
+        "thrust_delay_s": lag,
+        "thrust_lag_s": lag,
+        "tilt": _fit_comment(found.tilt, whys.get("tilt", "")),
+        "yaw": _fit_comment(found.yaw, whys.get("yaw", "")),
+    }
+    lines = [f"# Identified from {found.seconds:.0f} s of {flight}; +- is one standard deviation."]
+    for key, value in plain(found.applied_to(prior).model_dump(mode="json"), DIGITS).items():
+        flow = None if isinstance(value, dict | list) else False
+        text = yaml.safe_dump(
+            {key: value}, default_flow_style=flow, sort_keys=False, width=math.inf
+        )
+        lines.append(_line(text.rstrip(), comments.get(key, "")))
+    return "\n".join(lines) + "\n"
 
 
 def _line(entry: str, comment: str) -> str:
@@ -145,14 +141,12 @@ def _line(entry: str, comment: str) -> str:
 
 
 def _comment(estimate: Estimate | None, unit: str, why: str) -> str:
-    if estimate is None:
-        return NOT_IDENTIFIED.format(sentence=why)
-    return f"+- {estimate.sd:.2g} {unit}".rstrip()
+    return f"+- {estimate.sd:.2g} {unit}".rstrip() if estimate else f"not identified: {why}"
 
 
 def _fit_comment(fit: ResponseFit | None, why: str) -> str:
     if fit is None:
-        return NOT_IDENTIFIED.format(sentence=why)
+        return f"not identified: {why}"
     return (
         f"+- {fit.delay_s.sd:.2g} s, {fit.natural_frequency_radps.sd:.2g} rad/s, "
         f"{fit.damping.sd:.2g}; residual {1e3 * fit.residual_rms:.1f} of "
@@ -160,5 +154,64 @@ def _fit_comment(fit: ResponseFit | None, why: str) -> str:
     )
 
 
-def _list(values: tuple[float, ...]) -> str:
-    return "[" + ", ".join(f"{value:.4g}" for value in values) + "]"
+# ---------------------------------------------------------------------- estimator's noise
+
+
+@dataclass(frozen=True, slots=True)
+class EstimatorNoise:
+    """Standard deviations; NaN where the trace is too short. The first three are white noise of
+    position (m), reported velocity (m/s) and thrust direction (rad); the last one is reported
+    velocity less the derivative of reported position (m/s), as means over MEAN_OVER_S."""
+
+    position_m: float
+    velocity_mps: float
+    attitude_rad: float
+    velocity_contradiction_mps: float
+
+
+def estimator_noise(trace: Trace) -> EstimatorNoise:
+    """Noise of the attitudes, positions and velocities in a stretch of flight."""
+    stamps, velocity = trace.position[:, STAMP], trace.position[:, VELOCITY]
+    direction = trace.attitude[:, NORTH : NORTH + 2]
+    return EstimatorNoise(
+        position_m=_white_sd(stamps, trace.position[:, POSITION]),
+        velocity_mps=_white_sd(stamps, velocity),
+        attitude_rad=_white_sd(trace.attitude[:, STAMP], direction),
+        velocity_contradiction_mps=_velocity_contradiction(trace),
+    )
+
+
+def _white_sd(stamps: Array, signals: Array) -> float:
+    """Sd of white noise in `signals` (N, axes): each sample less the cubic through its two
+    neighbours on either side, which follows any motion; by the median, so that jumps do not
+    count."""
+    if len(signals) < 10:
+        return math.nan
+    away = np.stack([stamps[i : len(stamps) - 4 + i] - stamps[2:-2] for i in (0, 1, 3, 4)])
+    weights = np.ones_like(away)
+    for i in range(4):
+        for j in range(4):
+            if i != j:
+                weights[i] *= away[j] / (away[j] - away[i])
+    around = np.stack([signals[i : len(signals) - 4 + i] for i in (0, 1, 3, 4)])
+    residual = signals[2:-2] - np.einsum("kn,kna->na", weights, around)
+    white = residual / np.sqrt(1.0 + np.sum(weights**2, axis=0))[:, None]
+    return float(np.median(np.abs(white))) / 0.6745  # of a normal distribution
+
+
+def _velocity_contradiction(trace: Trace) -> float:
+    stamps = trace.position[:, STAMP]
+    starts = np.arange(stamps[0], stamps[-1] - MEAN_OVER_S, MEAN_OVER_S)
+    if len(starts) < 2:
+        return math.nan
+    differences = []
+    for axis in range(3):
+        position, velocity = trace.position[:, 1 + axis], trace.position[:, 4 + axis]
+        travelled = np.concatenate(
+            ([0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * np.diff(stamps)))
+        )
+        gap = travelled - position
+        differences.append(
+            np.interp(starts + MEAN_OVER_S, stamps, gap) - np.interp(starts, stamps, gap)
+        )
+    return float(np.std(differences) / MEAN_OVER_S)

@@ -7,6 +7,7 @@ From the columns of a flight to values of a Score, all in vehicle time as in the
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from offboard.flight.setpoint import Refusal
 Array = NDArray[np.float64]
 
 
-def decision_figures(flown: History) -> dict[str, float]:
+def decision_metrics(flown: History) -> dict[str, float]:
     """Values of a Score; empty without records."""
     columns = flown.records
     if not len(columns):
@@ -39,6 +40,7 @@ def decision_figures(flown: History) -> dict[str, float]:
     changed = np.isnan(columns["at_bound"]) & np.isfinite(columns["thrust_mps2"])
     limited = changed & (columns["phase"] != PHASE_CODES[Phase.EXCITE])
     at_bound = np.where(limited, 1.0, columns["at_bound"])
+    skipped = columns["missed_ticks"][columns["pause_s"] > 0.0]
     return {
         "decisions": float(len(refused)),
         "answer_p50_ms": _percentile(answer_ms, 50),
@@ -47,9 +49,7 @@ def decision_figures(flown: History) -> dict[str, float]:
         "setpoint_age_p99_ms": _percentile(age_ms, 99),
         "setpoint_age_max_ms": _percentile(age_ms, 100),
         "missed_ticks": float(known("missed_ticks").sum()),
-        "skipped_ticks": float(
-            columns["missed_ticks"][columns["pause_s"] > 0.0].sum(dtype=np.float64)
-        ),
+        "skipped_ticks": float(skipped.sum(dtype=np.float64)),
         "pause_max_s": float(columns["pause_s"].max()),
         "refused_setpoints": float((refused != 0).sum()),
         "refused_late": refusals(Refusal.LATE),
@@ -69,61 +69,42 @@ def decision_figures(flown: History) -> dict[str, float]:
     }
 
 
+def link_metrics(flown: History, window: tuple[float, float] | None) -> dict[str, float]:
+    """Values of a Score. `window`: first and last vehicle time of TRACK; without it, the telemetry
+    has none."""
+    begun = begin_times(flown.phases)
+    last_s = float(flown.position["time_s"][-1]) if len(flown.position) else math.nan
+    sent = flown.setpoint[flown.setpoint["time_s"] < begun.get("land", math.inf)]
+    values = {"flight_s": last_s - begun.get("takeoff", math.nan)}
+    if len(sent) > 1:
+        span_s = float(sent["time_s"][-1] - sent["time_s"][0])
+        values["setpoint_hz"] = (len(sent) - 1) / span_s if span_s > 0.0 else math.nan
+        values["setpoint_gap_max_s"] = float(np.diff(sent["time_s"]).max(initial=0.0))
+        values["setpoint_gap_wall_max_s"] = float(np.diff(sent["unix_s"]).max(initial=0.0))
+    if len(flown.link_delay):
+        late_ms = 1e3 * flown.link_delay["delay_s"]
+        values["link_delay_p50_ms"] = _percentile(late_ms, 50)
+        values["link_delay_p99_ms"] = _percentile(late_ms, 99)
+    delay_s = flown.identified["tilt_delay_s"]
+    if len(delay_s := delay_s[np.isfinite(delay_s[:, 0])]):
+        values["delay_ms"], values["delay_sd_ms"] = (1e3 * delay_s[-1].astype(float)).tolist()
+    for name, rows in (("position", flown.position), ("attitude", flown.attitude)):
+        if window is not None:
+            stamps = rows["time_s"]
+            stamps = stamps[(stamps >= window[0]) & (stamps <= window[1])]
+            intervals = np.diff(np.maximum.accumulate(stamps))  # repeated and late ones: zero
+            span_s = float(np.ptp(stamps)) if len(stamps) else 0.0
+            count = len(np.unique(stamps))
+            values[f"{name}_hz"] = (count - 1) / span_s if span_s > 0.0 else math.nan
+            values[f"{name}_gap_max_s"] = float(intervals.max(initial=0.0))
+            if name == "position":
+                values["stale_share"] = _mean(intervals <= 0.0)
+    return values
+
+
 def _percentile(values: Array, share: float) -> float:
     return float(np.percentile(values, share)) if len(values) else math.nan
 
 
-def _mean(values: Array) -> float:
+def _mean(values: NDArray[Any]) -> float:
     return float(values.mean()) if len(values) else math.nan
-
-
-def link_figures(flown: History, window: tuple[float, float] | None) -> dict[str, float]:
-    """Values of a Score. `window`: first and last vehicle time of TRACK; without it, the telemetry
-    has none."""
-    armed_s = begin_times(flown.phases).get("takeoff", math.nan)
-    last_s = flown.position["time_s"][-1] if len(flown.position) else math.nan
-    values = {"flight_s": float(last_s - armed_s), **_delay(flown), **_setpoints(flown)}
-    if window is None:
-        return values
-    for name, rows in (("position", flown.position), ("attitude", flown.attitude)):
-        stamps = rows["time_s"]
-        stamps = stamps[(stamps >= window[0]) & (stamps <= window[1])]
-        intervals, count = np.diff(stamps), len(stamps)
-        if (intervals <= 0.0).any():
-            count = len(np.unique(stamps))
-            intervals = np.diff(np.maximum.accumulate(stamps))
-        late = int((intervals <= 0.0).sum())
-        span_s = float(np.ptp(stamps)) if len(stamps) else 0.0
-        values[f"{name}_hz"] = (count - 1) / span_s if span_s > 0.0 else math.nan
-        values[f"{name}_gap_max_s"] = float(intervals.max(initial=0.0))
-        if name == "position" and len(intervals):
-            values["stale_share"] = late / len(intervals)
-    return values
-
-
-def _setpoints(flown: History) -> dict[str, float]:
-    """Figures of the setpoints up to the landing."""
-    end_s = begin_times(flown.phases).get("land", math.inf)
-    rows = flown.setpoint[flown.setpoint["time_s"] < end_s]
-    if len(rows) < 2:
-        return {}
-    span_s = float(rows["time_s"][-1] - rows["time_s"][0])
-    gap_s, wall_gap_s = (float(np.diff(rows[at]).max(initial=0.0)) for at in ("time_s", "unix_s"))
-    return {
-        "setpoint_hz": (len(rows) - 1) / span_s if span_s > 0.0 else math.nan,
-        "setpoint_gap_max_s": gap_s,
-        "setpoint_gap_wall_max_s": wall_gap_s,
-    }
-
-
-def _delay(flown: History) -> dict[str, float]:
-    """Delay of the link (TIMESYNC), and the last one identified: from telemetry to effect."""
-    values = {}
-    if len(flown.link_delay):
-        late_ms = 1e3 * flown.link_delay["delay_s"]
-        values["link_delay_p50_ms"], values["link_delay_p99_ms"] = np.percentile(late_ms, (50, 99))
-    identified = flown.identified["tilt_delay_s"]
-    known = identified[np.isfinite(identified[:, 0])]
-    if len(known):
-        values["delay_ms"], values["delay_sd_ms"] = 1e3 * known[-1].astype(np.float64)
-    return {name: float(value) for name, value in values.items()}

@@ -1,25 +1,72 @@
-"""HTML pages from Jinja2 templates: one self-contained file each, plotly.js inside, no network.
+"""HTML pages from Jinja2 templates, and their plotly figures: one style for light and dark.
 
-A template is named by its path in this package: "campaign/templates/campaign.html". Templates
-extend "analysis/templates/page.html" and draw figures and notes with the macros of "parts.html".
-Values are escaped.
+A page is one self-contained file, plotly.js inside, no network. A template is named by its path in
+this package: "campaign/templates/campaign.html". Templates extend "analysis/templates/page.html"
+and draw figures and notes with the macros of "parts.html". Values are escaped.
 """
 
 from __future__ import annotations
 
+import json
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from numpy.typing import ArrayLike, NDArray
 from plotly.offline import get_plotlyjs
+from plotly.subplots import make_subplots
 
-from offboard.analysis import figure
+INK, MUTED, GRID, SURFACE, BACKGROUND = "#1f2933", "#52606d", "#e4e7eb", "#ffffff", "#f5f7fa"
+BLUE, RED, GREEN, ORANGE, PURPLE, GREY = (
+    "#2b6cb0", "#c53030", "#2f855a", "#c05621", "#6b46c1", "#617488",
+)  # fmt: skip
+# backgrounds of bands with text on them
+BLUE_BAND, ORANGE_BAND, GREY_BAND = "#cfe0f3", "#f6d9bd", "#dfe3e8"
+TEAL, PINK, BROWN, SLATE, YELLOW = "#0f766e", "#b83280", "#744210", "#4a5568", "#b7791f"
+PALETTE = (BLUE, RED, GREEN, ORANGE, PURPLE, TEAL, PINK, BROWN, SLATE, YELLOW)
+# Figures are written in light colours; the page replaces each in the dark scheme
+DARK = {
+    INK: "#e6e9ed", MUTED: "#a5b1bd", GRID: "#343c46", SURFACE: "#1b2027", BACKGROUND: "#12161b",
+    BLUE: "#6aaaf0", RED: "#f47c7c", GREEN: "#5cc48d", ORANGE: "#f2954f", PURPLE: "#b197fc",
+    GREY: "#8d9bab", TEAL: "#4fd1c5", PINK: "#f18dc0", BROWN: "#c89b5d", SLATE: "#b8c2d0",
+    YELLOW: "#e8c15c", BLUE_BAND: "#24405e", ORANGE_BAND: "#5e3c1c", GREY_BAND: "#2f3843",
+}  # fmt: skip
 
+_TOP_PX, _BOTTOM_PX, _PANEL_PX, _GAP_PX = 48, 90, 150, 36
+_FEW_DECADES = 2  # of a logarithmic axis with ticks at 2 and 5
+_MOST_DECADES = 3  # of one with a tick at each
+_FEW_VALUES, _FLATTENED = 50, 4.0  # of `without_outliers`
+_MARGIN = 0.02  # of its decades, beside its outermost ticks
+_AXIS = {
+    "gridcolor": GRID, "zerolinecolor": GRID, "linecolor": GREY, "showline": True,
+    "ticks": "outside", "tickcolor": GREY, "automargin": True, "exponentformat": "power",
+    "title": {"font": {"size": 13}},
+}  # fmt: skip
+_SCENE_AXIS = {"backgroundcolor": SURFACE, "gridcolor": GRID, "linecolor": GREY}
+STYLE = go.layout.Template(
+    layout={
+        "font": {"family": "system-ui, sans-serif", "size": 13, "color": INK},
+        "paper_bgcolor": SURFACE, "plot_bgcolor": SURFACE, "hovermode": "closest",
+        "margin": {"l": 50, "r": 15, "t": _TOP_PX, "b": _BOTTOM_PX}, "xaxis": _AXIS, "yaxis": _AXIS,
+        "scene": {"xaxis": _SCENE_AXIS, "yaxis": _SCENE_AXIS, "zaxis": _SCENE_AXIS},
+        "legend": {
+            "orientation": "h", "x": 0, "y": 0, "yref": "container", "yanchor": "bottom",
+            "groupclick": "togglegroup",
+        },
+    }
+)  # fmt: skip
 _TEMPLATES = Environment(
     loader=PackageLoader("offboard", ""), autoescape=True, undefined=StrictUndefined,
     trim_blocks=True, lstrip_blocks=True,
 )  # fmt: skip
 _COLOURS = {  # names of the CSS variables
-    "ink": figure.INK, "muted": figure.MUTED, "grid": figure.GRID, "surface": figure.SURFACE,
-    "background": figure.BACKGROUND, "link": figure.BLUE, "failed": figure.RED,
-    "warning": figure.YELLOW, "printed": figure.GREY,
+    "ink": INK, "muted": MUTED, "grid": GRID, "surface": SURFACE,
+    "background": BACKGROUND, "link": BLUE, "failed": RED,
+    "warning": YELLOW, "printed": GREY,
 }  # fmt: skip
 
 
@@ -28,7 +75,111 @@ def render(template: str, **values: object) -> str:
     return _TEMPLATES.get_template(template).render(
         plotly_js=get_plotlyjs(),
         colours=_COLOURS,
-        dark=figure.DARK,
-        style=figure.STYLE.to_plotly_json(),
+        dark=DARK,
+        style=STYLE.to_plotly_json(),
         **values,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A figure with its heading and the caption below it.
+
+    A window narrower than `width_px` scrolls the figure instead of squeezing it.
+    """
+
+    title: str
+    drawing: go.Figure
+    caption: str = ""
+    width_px: int = 0
+
+    def to_json(self, *, styled: bool = True) -> str:
+        """Title, caption, and the figure as plotly's own JSON (`plotly.io.read_json` reads it).
+
+        Without its style for a page, which contains `STYLE` once.
+        """
+        drawing = json.loads(self.drawing.to_json())
+        if not styled:
+            del drawing["layout"]["template"]
+        document = {"title": self.title, "caption": self.caption, **drawing}
+        return json.dumps(document, separators=(",", ":"), allow_nan=False)
+
+
+def panels(titles: Sequence[str], x_title: str, panel_px: int = _PANEL_PX) -> go.Figure:
+    """An empty figure with one panel per title, one above the other, that share their x axis."""
+    inner_px = panel_px * len(titles) + _GAP_PX * (len(titles) - 1)
+    figure = make_subplots(
+        rows=len(titles), shared_xaxes=True, subplot_titles=titles,
+        vertical_spacing=_GAP_PX / inner_px,
+    )  # fmt: skip
+    figure.update_layout(template=STYLE, height=_TOP_PX + inner_px + _BOTTOM_PX)
+    figure.update_annotations(x=0, xanchor="left", font_size=13)
+    figure.update_xaxes(title_text=x_title, row=len(titles))
+    return figure
+
+
+def listed(figure: go.Figure, lines: Sequence[tuple[str, bool]], row_px: int, top_px: int) -> None:
+    """Give a figure one row for each of `lines`, from above: its label, which may have HTML, and
+    whether it is the heading of those below."""
+    figure.update_yaxes(
+        tickvals=list(range(len(lines))), ticktext=[label for label, _ in lines],
+        range=[len(lines) - 0.3, -0.7], showgrid=False, zeroline=False, fixedrange=True,
+        showline=False, ticks="", ticklabelstandoff=8,
+    )  # fmt: skip
+    for at, (_, is_heading) in enumerate(lines):
+        if at and is_heading:
+            figure.add_hline(at - 0.5, line={"color": GRID, "width": 1}, col="all", row=1)
+    figure.update_layout(
+        template=STYLE, height=top_px + row_px * len(lines) + 10, showlegend=False,
+        margin={"t": top_px, "b": 10},
+    )  # fmt: skip
+
+
+def without_outliers(values: NDArray[np.float64]) -> list[float] | None:
+    """The range of an axis that shows 99 % of the values, where it would flatten them to show all;
+    None where it would not."""
+    known = values[np.isfinite(values)]
+    if len(known) < _FEW_VALUES:
+        return None
+    low, high = np.percentile(known, (0.5, 99.5)).tolist()
+    span = high - low
+    if np.ptp(known) <= _FLATTENED * span or not span:
+        return None
+    return [low - 0.1 * span, high + 0.1 * span]
+
+
+def logarithmic(values: Iterable[float]) -> dict[str, Any]:
+    """A logarithmic axis around the positive values. Up to two decades have ticks at 1, 2 and 5;
+    more decades have about three, at powers of ten."""
+    known = [value for value in values if 0.0 < value < math.inf]
+    least, greatest = min(known, default=1.0), max(known, default=1.0)
+    low, high = math.floor(math.log10(least)), math.ceil(math.log10(greatest))
+    steps = (1, 2, 5) if high - low <= _FEW_DECADES else (1,)
+    ticks = [float(f"{step}e{power}") for power in range(low, high + 1) for step in steps]
+    first = max((at for at in ticks if at <= least), default=ticks[0])
+    last = min((at for at in ticks if at >= greatest), default=ticks[-1])
+    margin = _MARGIN * (1 + high - low)
+    shown = ticks[:: math.ceil((high - low) / _MOST_DECADES) or 1]
+    return {
+        "type": "log", "tickvals": shown, "ticktext": [f"{at:g}" for at in shown],
+        "range": [math.log10(first) - margin, math.log10(last) + margin],
+    }  # fmt: skip
+
+
+def curve(
+    figure: go.Figure, panel: int, x: ArrayLike, y: ArrayLike, name: str, colour: str,
+    dash: str = "solid", **scatter: Any,
+) -> None:  # fmt: skip
+    """Add a curve to panel 1, 2, ...; curves of the same name share one entry of the legend."""
+    line = {"color": colour, "width": 1.4, "dash": dash, **scatter.pop("line", {})}
+    shown = {other.name for other in figure.data if other.showlegend}
+    trace = go.Scatter(
+        x=coordinates(x), y=coordinates(y), name=name, legendgroup=name, line=line,
+        **{"mode": "lines", "showlegend": name not in shown, **scatter},
+    )  # fmt: skip
+    figure.add_trace(trace, row=panel, col=1)
+
+
+def coordinates(values: ArrayLike) -> NDArray[np.float32]:
+    """Seven significant digits: more than a screen shows. Plotly writes arrays in base64."""
+    return np.asarray(values, np.float32)

@@ -1,31 +1,42 @@
-"""The figures of one flight.
+"""The metrics of one flight, its verdict, requirements on it, and score.json.
 
 Tracking, activity and telemetry are scored during the phase TRACK, setpoints from the first one to
-the landing, decisions over the whole flight. A figure that the log does not hold is NaN.
+the landing, decisions over the whole flight. A metric that the log does not hold is NaN.
 """
 
 from __future__ import annotations
 
+import json
 import math
+import operator
+import re
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, fields
+from pathlib import Path
 from typing import Any
 
-from offboard.analysis.history import History
-from offboard.analysis.link_metrics import decision_figures, link_figures
-from offboard.analysis.tracking import passed_s, tracking_figures, window_of
-from offboard.analysis.verdict import verdict_figures
+from offboard.analysis import tlog
+from offboard.analysis.history import Event, History, gather
+from offboard.analysis.link_metrics import decision_metrics, link_metrics
+from offboard.analysis.tracking import passed_s, tracking_metrics, window_of
+from offboard.analysis.verdict import verdict_metrics
+from offboard.documents.errors import UserError, plain
+from offboard.flight.flight import Outcome
+from offboard.flight.phases import ExitCode
+from offboard.link.log import LogError
 
 NAN = math.nan
 
 
-def _figure(meaning: str, unit: str = "") -> float:
+def _metric(meaning: str, unit: str = "") -> float:
     value: float = field(default=NAN, metadata={"meaning": meaning, "unit": unit})
     return value
 
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """All figures of a flight, by the names that --require takes, and what ended it.
+    """All metrics of a flight, by the names that --require takes, and what ended it.
 
     `completed` is 1 if the whole reference was tracked, the vehicle landed by its land detector,
     height and speed, and it was disarmed; else 0, and `ended_by` says why not in a word or a few,
@@ -36,100 +47,203 @@ class Score:
     SIM_STATE). RMSE, mean, sd and percentiles of errors and motion are weighted by the time of the
     reference: each sample stands for half of the interval before it and half of the one after it,
     so that telemetry which is thinned or lost counts with the mean of what surrounds it
-    (`analysis.samples`). `position_gap_max_s` is the longest gap. The figures of the certificate
+    (`analysis.tracking`). `position_gap_max_s` is the longest gap. The metrics of the certificate
     are of the decisions that were sent as they were certified, a share `certified_share` of all.
-    Times are vehicle time. A figure that the log does not hold is NaN.
+    Times are vehicle time. A metric that the log does not hold is NaN.
 
     Example, with the pytest fixture `fly`:
 
         assert fly(reference="hover").score.rmse_position_m < 0.05
     """
 
-    completed: float = _figure("1: all tracked, landed, disarmed")
+    completed: float = _metric("1: all tracked, landed, disarmed")
     ended_by: str = ""
     reason: str = ""
-    touchdown_mps: float = _figure("downward speed at touch-down", "m/s")
-    rmse_position_m: float = _figure("position error, RMSE", "m")
-    mean_position_m: float = _figure("position error, mean", "m")
-    p95_position_m: float = _figure("position error, 95th percentile", "m")
-    max_position_m: float = _figure("position error, maximum", "m")
-    rmse_truth_m: float = _figure("true position error, RMSE", "m")
-    max_truth_m: float = _figure("true position error, maximum", "m")
-    rmse_velocity_mps: float = _figure("velocity error, RMSE", "m/s")
-    p95_velocity_mps: float = _figure("velocity error, 95th percentile", "m/s")
-    max_velocity_mps: float = _figure("velocity error, maximum", "m/s")
-    rmse_heading_deg: float = _figure("heading error, RMSE", "deg")
-    max_heading_deg: float = _figure("heading error, maximum", "deg")
-    mu_e: float = _figure("fitness of the paper, Eq. 31")
-    e_u: float = _figure("Eq. 32, body velocity u", "m2/s2")
-    e_v: float = _figure("Eq. 32, body velocity v", "m2/s2")
-    e_w: float = _figure("Eq. 32, body velocity w", "m2/s2")
-    e_x: float = _figure("Eq. 32, north", "m2")
-    e_y: float = _figure("Eq. 32, east", "m2")
-    e_z: float = _figure("Eq. 32, down", "m2")
-    e_psi: float = _figure("Eq. 32, heading", "deg2")
-    tracked_s: float = _figure("time of the reference tracked", "s")
-    thrust_sd: float = _figure("commanded thrust (0 .. 1), sd")
-    tilt_command_step_deg: float = _figure("commanded tilt, RMS of its steps", "deg")
-    tilt_max_deg: float = _figure("tilt, maximum", "deg")
-    tilt_agitation_deg: float = _figure("tilt beside the reference's, RMS", "deg")
-    rate_agitation_radps: float = _figure("rates beside the reference's, RMS", "rad/s")
-    roll_rate_sd_radps: float = _figure("roll rate, sd", "rad/s")
-    pitch_rate_sd_radps: float = _figure("pitch rate, sd", "rad/s")
-    setpoint_hz: float = _figure("setpoints sent", "Hz")
-    setpoint_gap_max_s: float = _figure("longest gap of setpoints", "s")
-    setpoint_gap_wall_max_s: float = _figure("longest gap of setpoints, wall time", "s")
-    answer_p50_ms: float = _figure("telemetry in to setpoint out, median", "ms")
-    answer_p99_ms: float = _figure("telemetry in to setpoint out, 99th p.", "ms")
-    answer_max_ms: float = _figure("telemetry in to setpoint out, maximum", "ms")
-    setpoint_age_p99_ms: float = _figure("telemetry at its setpoint, 99th perc.", "ms")
-    setpoint_age_max_ms: float = _figure("telemetry at its setpoint, maximum", "ms")
-    missed_ticks: float = _figure("control periods without telemetry")
-    skipped_ticks: float = _figure("of these, in pauses of this process")
-    pause_max_s: float = _figure("longest pause of this process", "s")
-    refused_setpoints: float = _figure("setpoints not sent")
-    refused_late: float = _figure("setpoints decided too late")
-    refused_stale: float = _figure("setpoints of too old telemetry")
-    refused_not_ours: float = _figure("setpoints without authority")
-    refused_unusable: float = _figure("setpoints not finite or beyond limits")
-    decisions: float = _figure("decisions")
-    solve_time_p50_ms: float = _figure("time of a decision, median", "ms")
-    solve_time_p99_ms: float = _figure("time of a decision, 99th perc.", "ms")
-    certified_share: float = _figure("share of decisions sent as certified")
-    gap_median: float = _figure("cost above the exact optimum, median")
-    gap_max: float = _figure("cost above the optimum, maximum")
-    spread_median: float = _figure("epsilon of Eq. 29, median")
-    at_bound_share: float = _figure("share of decisions at a limit")
-    cut_short_share: float = _figure("share of decisions cut by deadline")
-    other_datagrams: float = _figure("datagrams of others, frames refused")
-    position_hz: float = _figure("LOCAL_POSITION_NED received", "Hz")
-    attitude_hz: float = _figure("ATTITUDE_QUATERNION received", "Hz")
-    position_gap_max_s: float = _figure("longest gap of positions", "s")
-    attitude_gap_max_s: float = _figure("longest gap of attitudes", "s")
-    stale_share: float = _figure("share of repeated or late positions")
-    link_delay_p50_ms: float = _figure("round trip of the link, median", "ms")
-    link_delay_p99_ms: float = _figure("round trip of the link, 99th perc.", "ms")
-    delay_ms: float = _figure("identified delay to the effect", "ms")
-    delay_sd_ms: float = _figure("identified delay, sd", "ms")
-    hover_thrust: float = _figure("hover thrust, estimated at the end")
-    flight_s: float = _figure("from arming to the end of the log", "s")
+    touchdown_mps: float = _metric("downward speed at touch-down", "m/s")
+    rmse_position_m: float = _metric("position error, RMSE", "m")
+    mean_position_m: float = _metric("position error, mean", "m")
+    p95_position_m: float = _metric("position error, 95th percentile", "m")
+    max_position_m: float = _metric("position error, maximum", "m")
+    rmse_truth_m: float = _metric("true position error, RMSE", "m")
+    max_truth_m: float = _metric("true position error, maximum", "m")
+    rmse_velocity_mps: float = _metric("velocity error, RMSE", "m/s")
+    p95_velocity_mps: float = _metric("velocity error, 95th percentile", "m/s")
+    max_velocity_mps: float = _metric("velocity error, maximum", "m/s")
+    rmse_heading_deg: float = _metric("heading error, RMSE", "deg")
+    max_heading_deg: float = _metric("heading error, maximum", "deg")
+    mu_e: float = _metric("fitness of the paper, Eq. 31")
+    e_u: float = _metric("Eq. 32, body velocity u", "m2/s2")
+    e_v: float = _metric("Eq. 32, body velocity v", "m2/s2")
+    e_w: float = _metric("Eq. 32, body velocity w", "m2/s2")
+    e_x: float = _metric("Eq. 32, north", "m2")
+    e_y: float = _metric("Eq. 32, east", "m2")
+    e_z: float = _metric("Eq. 32, down", "m2")
+    e_psi: float = _metric("Eq. 32, heading", "deg2")
+    tracked_s: float = _metric("time of the reference tracked", "s")
+    thrust_sd: float = _metric("commanded thrust (0 .. 1), sd")
+    tilt_command_step_deg: float = _metric("commanded tilt, RMS of its steps", "deg")
+    tilt_max_deg: float = _metric("tilt, maximum", "deg")
+    tilt_agitation_deg: float = _metric("tilt beside the reference's, RMS", "deg")
+    rate_agitation_radps: float = _metric("rates beside the reference's, RMS", "rad/s")
+    roll_rate_sd_radps: float = _metric("roll rate, sd", "rad/s")
+    pitch_rate_sd_radps: float = _metric("pitch rate, sd", "rad/s")
+    setpoint_hz: float = _metric("setpoints sent", "Hz")
+    setpoint_gap_max_s: float = _metric("longest gap of setpoints", "s")
+    setpoint_gap_wall_max_s: float = _metric("longest gap of setpoints, wall time", "s")
+    answer_p50_ms: float = _metric("telemetry in to setpoint out, median", "ms")
+    answer_p99_ms: float = _metric("telemetry in to setpoint out, 99th p.", "ms")
+    answer_max_ms: float = _metric("telemetry in to setpoint out, maximum", "ms")
+    setpoint_age_p99_ms: float = _metric("telemetry at its setpoint, 99th perc.", "ms")
+    setpoint_age_max_ms: float = _metric("telemetry at its setpoint, maximum", "ms")
+    missed_ticks: float = _metric("control periods without telemetry")
+    skipped_ticks: float = _metric("of these, in pauses of this process")
+    pause_max_s: float = _metric("longest pause of this process", "s")
+    refused_setpoints: float = _metric("setpoints not sent")
+    refused_late: float = _metric("setpoints decided too late")
+    refused_stale: float = _metric("setpoints of too old telemetry")
+    refused_not_ours: float = _metric("setpoints without authority")
+    refused_unusable: float = _metric("setpoints not finite or beyond limits")
+    decisions: float = _metric("decisions")
+    solve_time_p50_ms: float = _metric("time of a decision, median", "ms")
+    solve_time_p99_ms: float = _metric("time of a decision, 99th perc.", "ms")
+    certified_share: float = _metric("share of decisions sent as certified")
+    gap_median: float = _metric("cost above the exact optimum, median")
+    gap_max: float = _metric("cost above the optimum, maximum")
+    spread_median: float = _metric("epsilon of Eq. 29, median")
+    at_bound_share: float = _metric("share of decisions at a limit")
+    cut_short_share: float = _metric("share of decisions cut by deadline")
+    other_datagrams: float = _metric("datagrams of others, frames refused")
+    position_hz: float = _metric("LOCAL_POSITION_NED received", "Hz")
+    attitude_hz: float = _metric("ATTITUDE_QUATERNION received", "Hz")
+    position_gap_max_s: float = _metric("longest gap of positions", "s")
+    attitude_gap_max_s: float = _metric("longest gap of attitudes", "s")
+    stale_share: float = _metric("share of repeated or late positions")
+    link_delay_p50_ms: float = _metric("round trip of the link, median", "ms")
+    link_delay_p99_ms: float = _metric("round trip of the link, 99th perc.", "ms")
+    delay_ms: float = _metric("identified delay to the effect", "ms")
+    delay_sd_ms: float = _metric("identified delay, sd", "ms")
+    hover_thrust: float = _metric("hover thrust, estimated at the end")
+    flight_s: float = _metric("from arming to the end of the log", "s")
 
-    def figures(self) -> dict[str, float]:
-        """The figures by name, without the texts."""
-        return {name: getattr(self, name) for name in FIGURES}
+    def metrics(self) -> dict[str, float]:
+        """The metrics by name, without the texts."""
+        return {name: getattr(self, name) for name in METRICS}
 
 
-FIGURES = {figure.name: figure.metadata for figure in fields(Score) if figure.metadata}
+METRICS = {each.name: each.metadata for each in fields(Score) if each.metadata}
 
 
 def score(flown: History) -> Score:
     """Compute all values of a flight from its columns."""
     window = window_of(flown)
     skipped_s = passed_s(flown, window)[1] if window else 0.0
-    values: dict[str, Any] = verdict_figures(flown, skipped_s)
-    values |= link_figures(flown, window) | decision_figures(flown)
+    values: dict[str, Any] = verdict_metrics(flown, skipped_s)
+    values |= link_metrics(flown, window) | decision_metrics(flown)
     if window:
-        values |= tracking_figures(flown, window)
+        values |= tracking_metrics(flown, window)
     elif values["completed"] == 1.0:
         values |= {"completed": 0.0, "ended_by": "too short at full speed to be scored"}
     return Score(**values)
+
+
+def score_flight(flight: Path) -> tuple[Score, History]:
+    """Score a flight from its log alone.
+
+    `flight` is a flight directory or a .tlog file. Returns the values, and columns and events of
+    the log. Raises TlogError.
+
+    Example:
+
+        score, history = score_flight(Path("flights/20261121-093000"))
+        print(score.rmse_position_m, history.phases)
+    """
+    flown = gather(tlog.read(tlog.find(flight)))
+    return score(flown), flown
+
+
+def judged(outcome: Outcome, score: Score) -> Outcome:
+    """The outcome of a flight by what its log shows: one that is not completed was aborted."""
+    if outcome.exit_code != ExitCode.FLOWN or score.completed == 1.0:
+        return outcome
+    return Outcome(ExitCode.ABORTED, f"{outcome.sentence}, but not completed: {score.ended_by}")
+
+
+def keep_score(directory: Path, score: Score, flown: History) -> None:
+    """Write score.json into a flight directory; a score that is there stays until the new one is
+    complete. Raises LogError."""
+    path, incomplete = directory / "score.json", directory / "score.json.part"
+    try:
+        incomplete.write_text(as_text(score, flown), encoding="utf-8")
+        incomplete.replace(path)
+    except OSError as error:
+        with suppress(OSError):
+            incomplete.unlink()
+        raise LogError(f"{path} cannot be written ({error.strerror})") from None
+
+
+def as_text(score: Score, history: History) -> str:
+    """All metrics, the events and the number of messages as JSON text; a metric that the log does
+    not hold is null."""
+    document = {
+        "ended_by": score.ended_by,
+        "reason": score.reason,
+        **score.metrics(),
+        "phases": _events(history.phases),
+        "modes": _events(history.modes),
+        "vehicle_messages": _events(history.vehicle_messages),
+        "messages": dict(sorted(history.messages.items())),
+        "wall_s": history.wall_s,
+        "damage": history.damage,
+    }
+    return json.dumps(plain(document), indent=2, allow_nan=False) + "\n"
+
+
+def _events(events: tuple[Event, ...]) -> list[dict[str, Any]]:
+    return [{"time_s": event.time_s, "what": event.what} for event in events]
+
+
+_OPERATORS: dict[str, Callable[[float, float], bool]] = {
+    "<=": operator.le,
+    ">=": operator.ge,
+    "==": operator.eq,
+    "<": operator.lt,
+    ">": operator.gt,
+}
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_PATTERN = re.compile(rf"\s*(\w+)\s*(<=|>=|==|<|>)\s*({_NUMBER})\s*")
+
+
+@dataclass(frozen=True, slots=True)
+class Requirement:
+    """One metric of the score compared with a number.
+
+    Example: `Requirement.parse("rmse_position_m<0.05").met(score.metrics())`.
+    """
+
+    metric: str
+    comparison: str
+    limit: float
+
+    @classmethod
+    def parse(cls, text: str) -> Requirement:
+        """Read 'METRIC<NUMBER'. Raises UserError."""
+        match = _PATTERN.fullmatch(text)
+        if match is None:
+            raise UserError(
+                f"{text!r} is not understood; write METRIC<NUMBER, "
+                "for example 'rmse_position_m<0.05' (also <=, >, >=, ==)"
+            )
+        metric, comparison, number = match.groups()
+        if metric not in METRICS:
+            raise UserError(f"there is no metric {metric!r}; there are {', '.join(METRICS)}")
+        return cls(metric, comparison, float(number))
+
+    def met(self, metrics: Mapping[str, float]) -> bool:
+        """Whether the metric is as required. One that the log does not hold (NaN) is not."""
+        return _OPERATORS[self.comparison](metrics[self.metric], self.limit)
+
+    def sentence(self, metrics: Mapping[str, float]) -> str:
+        """The metric beside what is required: `rmse_position_m is 0.031 (required < 0.05)`."""
+        value = metrics[self.metric]
+        found = "not in this log" if math.isnan(value) else f"{value:.4g}"
+        return f"{self.metric} is {found} (required {self.comparison} {self.limit:g})"

@@ -10,10 +10,10 @@ from rich.table import Table
 from rich.text import Text
 
 from offboard.analysis.history import History
-from offboard.analysis.score import FIGURES, Score
+from offboard.analysis.score import METRICS, Score
 from offboard.flight.busyness import too_busy
 
-# the figure that begins a section -> its title
+# the metric that begins a section -> its title
 SECTIONS = {
     "completed": "verdict",
     "rmse_position_m": "tracking",
@@ -29,7 +29,7 @@ AT_LIMIT_SHARE = 0.2  # of the decisions, from which a summary says so
 
 
 def summary(score: Score, history: History) -> dict[str, str]:
-    """What a person wants to know after a flight: text by label. Figures that the log does not hold
+    """What a person wants to know after a flight: text by label. Metrics that the log does not hold
     are left out."""
     rows: dict[str, str] = {}
     if math.isfinite(score.rmse_position_m):
@@ -85,7 +85,7 @@ def _identified(history: History) -> str:
 
 
 def show(console: Console, score: Score, history: History) -> None:
-    """Print the verdict, what happened in the order of time, and every figure of the log."""
+    """Print the verdict, what happened in the order of time, and every metric of the log."""
     console.print(Text(verdict(score)))
     story = Table(box=None, pad_edge=False)
     story.add_column("t [s]", justify="right")
@@ -96,7 +96,7 @@ def show(console: Console, score: Score, history: History) -> None:
         story.add_row(stamp, event.who, Text(event.what))
     if story.rows:
         console.print(story)
-    known = {name: value for name, value in score.figures().items() if not math.isnan(value)}
+    known = {name: value for name, value in score.metrics().items() if not math.isnan(value)}
     if not known:
         console.print("nothing was flown that could be scored")
         return
@@ -105,9 +105,9 @@ def show(console: Console, score: Score, history: History) -> None:
     figures.add_column(justify="right")
     figures.add_column()
     figures.add_column(style="dim")
-    for name, value in score.figures().items():
+    for name, value in score.metrics().items():
         if name in SECTIONS:
             figures.add_row(Text(f"\n{SECTIONS[name]}", "bold"))
         if name in known:
-            figures.add_row(name, f"{value:.4g}", FIGURES[name]["unit"], FIGURES[name]["meaning"])
+            figures.add_row(name, f"{value:.4g}", METRICS[name]["unit"], METRICS[name]["meaning"])
     console.print(figures)

@@ -1,22 +1,20 @@
 """Reads a .tlog: frames with their times, one after the other, in bounded memory.
 
 An entry is a big-endian uint64 of Unix microseconds, then one unchanged MAVLink frame. A log that
-ends inside an entry (after a crash) is read up to it. Damaged entries are skipped and counted:
-reading goes on at the next time stamp that is followed by a frame with a correct checksum. A file
-without any entry is refused.
+ends inside an entry (after a crash) is read up to it. Damaged entries are skipped and counted: the
+next one is where a time stamp is followed by a frame with a correct checksum. A file without any
+entry is refused.
 """
 
 from __future__ import annotations
 
-import math
 import struct
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pymavlink.dialects.v20 import all as dialect
 
 from offboard.documents.errors import UserError, abridged
@@ -69,8 +67,8 @@ class LoggedMessage(NamedTuple):
 class Tlog:
     """A log to iterate over, as often as needed: its messages in order.
 
-    After each iteration `damaged` is the number of damaged entries, `first_damage` the place of the
-    first one in bytes, `truncated` the bytes of an incomplete entry at the end.
+    After each iteration `damaged` is the number of places where entries were skipped,
+    `first_damage` the first of them in bytes, `truncated` the bytes after the last entry.
     """
 
     def __init__(self, path: Path) -> None:
@@ -89,65 +87,49 @@ class Tlog:
         self.damaged = self.first_damage = self.truncated = 0
         try:
             with self.path.open("rb") as file:
-                yield from self._messages(iter(lambda: file.read(_BLOCK), b""))
+                yield from self._messages(file)
         except OSError as error:
             raise TlogError(f"{self.path} cannot be read: {error.strerror}") from None
 
-    def _messages(self, blocks: Iterator[bytes]) -> Iterator[LoggedMessage]:
-        data, before, at, found = b"", 0, 0, False
+    def _messages(self, file: BinaryIO) -> Iterator[LoggedMessage]:
+        data, at, before = b"", 0, 0  # `before`: bytes of the file before `data`
         lost: int | None = None  # where the search for the next entry began
-        cut = False  # it began because the file ends within the entry there, if its length is right
+        found = False
         while True:
-            if at + _LONGEST + 9 > len(data):  # an entry, and the head of the next one
-                block = next(blocks, b"")
+            if at + _LONGEST + 9 > len(data) and (block := file.read(_BLOCK)):
                 before, data, at = before + at, data[at:] + block, 0
-                if block:
-                    continue
-                if len(data) < 8 + 3:  # no entry can begin here
-                    break
+                continue  # an entry, and the head of the next one
+            if at >= len(data):
+                break
             entry = _entry(data, at, certain=lost is not None)
-            if isinstance(entry, LoggedMessage):
-                if lost is not None and cut:
-                    self._count(lost)
-                at += 8 + len(entry.frame.raw)
-                found, lost = True, None
-                yield entry
-            elif entry:
-                self._count(before + at)
-                at += entry
-            else:
-                if lost is None:
-                    lost, cut = before + at, entry is None
-                    if not cut:
-                        self._count(lost)
+            if entry is None:
+                lost = before + at if lost is None else lost
                 at = _next_magic(data, at + 9) - 8
-        if lost is None or cut:
-            self.truncated = before + len(data) - (before if lost is None else lost)
+                continue
+            if lost is not None:
+                self.damaged += 1
+                self.first_damage = self.first_damage if self.damaged > 1 else lost
+            at += 8 + len(entry.frame.raw)
+            found, lost = True, None
+            yield entry
+        self.truncated = 0 if lost is None else before + len(data) - lost
         if not found:
             raise TlogError(
                 f"{self.path} is not a .tlog, or empty: it holds no time stamp and MAVLink frame"
             )
 
-    def _count(self, place: int) -> None:
-        self.damaged += 1
-        self.first_damage = self.first_damage if self.damaged > 1 else place
 
-
-def _entry(data: bytes, at: int, *, certain: bool) -> LoggedMessage | int | None:
-    """The entry that begins at `at`; else the size of a damaged one that the next one follows, 0
-    where none begins, None where the data end within it. `certain`: its checksum must be known."""
-    if not _begins(data, at):
-        return 0
-    size = frame_size(data, at + 8)
+def _entry(data: bytes, at: int, *, certain: bool) -> LoggedMessage | None:
+    """The entry that begins at `at`, None without. `certain`: its checksum must be known; else a
+    message that pymavlink does not know is taken if an entry follows."""
+    size = frame_size(data, at + 8) if _begins(data, at) else None
     end = at + 8 + (size or 0)
     if size is None or end > len(data):
         return None
     frame = parse(data, at + 8, end)
-    if frame and frame.verified:
-        return LoggedMessage(_STAMP.unpack_from(data, at)[0], frame)
-    if certain or not _begins(data, end):
-        return 0
-    return LoggedMessage(_STAMP.unpack_from(data, at)[0], frame) if frame else end - at
+    if frame is None or (not frame.verified and (certain or not _begins(data, end))):
+        return None
+    return LoggedMessage(_STAMP.unpack_from(data, at)[0], frame)
 
 
 def _begins(data: bytes, at: int) -> bool:
@@ -159,9 +141,9 @@ def _begins(data: bytes, at: int) -> bool:
 
 
 def _next_magic(data: bytes, at: int) -> int:
-    """Where the next first byte of a frame is; the end of the data without one."""
+    """Where the next first byte of a frame is; 8 bytes after the end of the data without one."""
     places = [place for magic in _MAGIC if (place := data.find(magic, at)) >= 0]
-    return min(places, default=len(data))
+    return min(places, default=len(data) + 8)
 
 
 def find(flight: Path) -> Path:
@@ -185,22 +167,6 @@ def name_of(message_id: int) -> str:
     """The name of a message id in pymavlink, UNKNOWN_<id> without one."""
     kind = dialect.mavlink_map.get(message_id)
     return kind.msgname if kind else f"UNKNOWN_{message_id}"
-
-
-def columns(name: str, payloads: bytes | bytearray, fields: str) -> NDArray[np.float64]:
-    """Fields of messages named `name` as rows (N, columns).
-
-    `payloads` are the N payloads one after the other, each with all the zeros that MAVLink 2 omits
-    (see `layout`). `fields` are separated by spaces; an array field fills as many columns as it has
-    elements.
-    """
-    rows = np.frombuffer(payloads, layout(name))
-    names = fields.split()
-    widths = [math.prod(rows.dtype[field].shape) for field in names]
-    found = np.empty((len(rows), sum(widths)))
-    for field, width, end in zip(names, widths, np.cumsum(widths).tolist(), strict=True):
-        found[:, end - width : end] = rows[field].reshape(len(rows), width)
-    return found
 
 
 @cache

@@ -8,14 +8,14 @@ fitness are over the control ticks, as in its Eq. 32.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import PPoly
 
-from offboard.analysis.history import History
-from offboard.analysis.samples import Rows, Weighted, blocks, each_once, weighted
+from offboard.analysis.history import History, Rows
 from offboard.flight.phases import PHASE_CODES, Phase
 from offboard.model.frames import (
     heading_from_quaternion,
@@ -27,6 +27,7 @@ from offboard.model.frames import (
 Array = NDArray[np.float64]
 
 SKIPPED_S = 1.5  # without a decision for longer, the reference was not tracked meanwhile
+_BLOCK = 8192  # samples that are computed at once
 _EXPLAINED = 7  # regressors of the agitation: velocity, acceleration, jerk (north, east), and 1
 _FITNESS = ("e_u", "e_v", "e_w", "e_x", "e_y", "e_z", "e_psi")
 
@@ -34,7 +35,7 @@ _FITNESS = ("e_u", "e_v", "e_w", "e_x", "e_y", "e_z", "e_psi")
 def window_of(flown: History) -> tuple[float, float] | None:
     """First and last vehicle time of TRACK; None where a signal has less than two samples in it."""
     times = flown.records["time_s"][_in_track(flown)]
-    if len(times) < 2 or len(flown.reference) < 2:
+    if len(times) < 2 or len(np.unique(flown.reference["time_s"])) < 2:
         return None
     begin_s, end_s = float(times[0]), float(times[-1])
     stamps = (rows["time_s"] for rows in (flown.position, flown.attitude, flown.setpoint))
@@ -51,43 +52,41 @@ def passed_s(flown: History, window: tuple[float, float]) -> tuple[float, float]
     return float(intervals[flowing].sum()), float(intervals[~flowing].sum())
 
 
-def tracking_figures(flown: History, window: tuple[float, float]) -> dict[str, float]:
+def tracking_metrics(flown: History, window: tuple[float, float]) -> dict[str, float]:
     """Values of a Score, of the samples in the window."""
     reference, clock = Reference(flown.reference), _Clock(flown)
 
-    def away(rows: Rows, column: str, weights: Array, derivative: int = 0) -> Weighted:
-        def distance(part: Rows) -> Any:
-            expected = reference.position(part["time_s"], derivative)
-            return np.linalg.norm(part[column] - expected, axis=1)
+    def position_m(rows: Rows) -> Array:
+        return _length(rows["position_ned_m"] - reference.position(rows["time_s"]))
 
-        return weighted(_in_blocks(distance, rows), weights)
+    def velocity_mps(rows: Rows) -> Array:
+        return _length(rows["velocity_ned_mps"] - reference.position(rows["time_s"], 1))
 
-    def turned_deg(part: Rows) -> Any:
-        turn = heading_from_quaternion(part["quaternion"]) - reference.heading(part["time_s"])
-        return np.abs(np.degrees(wrap_pi(turn)))
+    def turned_deg(rows: Rows) -> Array:
+        turn = heading_from_quaternion(rows["quaternion"]) - reference.heading(rows["time_s"])
+        return np.asarray(np.abs(np.degrees(wrap_pi(turn))))
 
-    def tilt_deg(part: Rows) -> Any:
-        direction = thrust_direction_from_quaternion(part["quaternion"])
+    def tilt_deg(rows: Rows) -> Array:
+        direction = thrust_direction_from_quaternion(rows["quaternion"])
         return np.degrees(np.arccos(np.clip(direction[:, 2], -1.0, 1.0)))
 
     fitness = _fitness(flown, reference, window)
     # one array after the other: each may be a copy of hours of telemetry
     rows = _within(flown.position, window)
     weights = clock.shares(rows["time_s"])
-    position = away(rows, "position_ned_m", weights)
-    velocity = away(rows, "velocity_ned_mps", weights, 1)
+    position, velocity = (
+        weighted(_in_blocks(f, rows), weights) for f in (position_m, velocity_mps)
+    )
     rows = _within(flown.truth, window)
-    true = away(rows, "position_ned_m", clock.shares(rows["time_s"]))
+    true = weighted(_in_blocks(position_m, rows), clock.shares(rows["time_s"]))
     rows = _within(flown.setpoint, window)
-    commanded = thrust_direction_from_quaternion(rows["quaternion"])
-    steps = np.degrees(np.linalg.norm(np.diff(commanded, axis=0), axis=1))
+    steps = _length(np.diff(thrust_direction_from_quaternion(rows["quaternion"]), axis=0))
     thrust = weighted(rows["thrust"].astype(np.float64), clock.shares(rows["time_s"]))
     rows = _within(flown.attitude, window)
     weights = clock.shares(rows["time_s"])
     heading = weighted(_in_blocks(turned_deg, rows), weights)
-    roll_rate, pitch_rate = (
-        weighted(rows["rates_radps"][:, axis].astype(np.float64), weights).sd for axis in (0, 1)
-    )
+    tilt = weighted(_in_blocks(tilt_deg, rows), weights)
+    rates = rows["rates_radps"].astype(np.float64)
     return {
         "rmse_position_m": position.rms,
         "mean_position_m": position.mean,
@@ -104,10 +103,12 @@ def tracking_figures(flown: History, window: tuple[float, float]) -> dict[str, f
         "mu_e": sum(fitness.values()),
         "tracked_s": passed_s(flown, window)[0],
         "thrust_sd": thrust.sd,
-        "tilt_command_step_deg": math.sqrt((steps**2).mean()) if len(steps) else math.nan,
-        "tilt_max_deg": weighted(_in_blocks(tilt_deg, rows), weights).max,
-        "roll_rate_sd_radps": roll_rate,
-        "pitch_rate_sd_radps": pitch_rate,
+        "tilt_command_step_deg": math.degrees(math.sqrt((steps**2).mean()))
+        if len(steps)
+        else math.nan,
+        "tilt_max_deg": tilt.max,
+        "roll_rate_sd_radps": weighted(rates[:, 0], weights).sd,
+        "pitch_rate_sd_radps": weighted(rates[:, 1], weights).sd,
         **_agitation(reference, rows, weights),
     }
 
@@ -116,18 +117,16 @@ def _fitness(flown: History, reference: Reference, window: tuple[float, float]) 
     """Eqs. 31-32: velocities in the body frame, heading in degrees."""
     ticks = flown.records["time_s"][_ticks(flown, window)]
     quaternion = flown.attitude["quaternion"][_nearest(flown.attitude["time_s"], ticks)]
+    body = rotation_from_quaternion(quaternion).swapaxes(-1, -2)
+    stamps = flown.position["time_s"]
     position, velocity = (
-        _at(flown.position, column, ticks) for column in ("position_ned_m", "velocity_ned_mps")
+        np.stack([np.interp(ticks, stamps, axis) for axis in flown.position[column].T], axis=1)
+        for column in ("position_ned_m", "velocity_ned_mps")
     )
-    squares = np.zeros(len(_FITNESS))
-    for part in blocks(len(ticks)):
-        body = rotation_from_quaternion(quaternion[part]).swapaxes(-1, -2)
-        slip = np.einsum("nij,nj->ni", body, reference.position(ticks[part], 1) - velocity[part])
-        away = reference.position(ticks[part]) - position[part]
-        turn = reference.heading(ticks[part]) - heading_from_quaternion(quaternion[part])
-        errors = np.column_stack((slip, away, np.degrees(wrap_pi(turn))))
-        squares += (errors**2).sum(axis=0)
-    return {name: float(value) for name, value in zip(_FITNESS, squares, strict=True)}
+    slip = np.einsum("nij,nj->ni", body, reference.position(ticks, 1) - velocity)
+    turn = np.degrees(wrap_pi(reference.heading(ticks) - heading_from_quaternion(quaternion)))
+    errors = np.column_stack((slip, reference.position(ticks) - position, turn))
+    return dict(zip(_FITNESS, (errors**2).sum(axis=0).tolist(), strict=True))
 
 
 def _agitation(reference: Reference, attitude: Rows, weights: Array) -> dict[str, float]:
@@ -138,7 +137,7 @@ def _agitation(reference: Reference, attitude: Rows, weights: Array) -> dict[str
     little memory.
     """
     factor = np.zeros((0, _EXPLAINED + 4))
-    for part in blocks(len(attitude)):
+    for part in _blocks(len(attitude)):
         rows, share = attitude[part], weights[part]
         times, direction = rows["time_s"], thrust_direction_from_quaternion(rows["quaternion"])
         explained = [reference.position(times, order)[:, :2] for order in (1, 2, 3)]
@@ -182,12 +181,10 @@ class _Clock:
         interval before it and half of the one after it (the trapezoidal rule). So a metric does not
         depend on how often the signal was sampled, and a gap counts with its length.
         """
+        halves = 0.5 * np.diff(np.interp(times, self._times, self._passed_s))
         weights = np.zeros(len(times))
-        for part in blocks(len(times)):
-            passed_s = np.interp(times[part.start : part.stop + 1], self._times, self._passed_s)
-            halves = 0.5 * np.diff(passed_s)
-            weights[part.start : part.start + len(halves)] += halves
-            weights[part.start + 1 : part.start + 1 + len(halves)] += halves
+        weights[:-1] += halves
+        weights[1:] += halves
         return weights
 
 
@@ -197,41 +194,39 @@ class Reference:
 
     def __init__(self, rows: Rows) -> None:
         newest = np.maximum.accumulate(rows["time_s"])
-        self._rows = rows[np.concatenate(([True], rows["time_s"][1:] > newest[:-1]))]
-        self._heading = np.unwrap(self._rows["heading_rad"].astype(np.float64))
+        rows = rows[np.concatenate(([True], rows["time_s"][1:] > newest[:-1]))]
+        self._times = rows["time_s"]
+        self._heading = np.unwrap(rows["heading_rad"].astype(np.float64))
+        length_s = np.diff(self._times)[:, None]
+        position, velocity, half = (
+            rows["position_ned_m"].astype(np.float64),
+            rows["velocity_ned_mps"].astype(np.float64),
+            0.5 * rows["acceleration_ned_mps2"].astype(np.float64),
+        )
+        # of the end from the parabola that begins at the start, each in m
+        away = np.diff(position, axis=0) - length_s * (velocity[:-1] + length_s * half[:-1])
+        turn = length_s * (np.diff(velocity, axis=0) - 2.0 * length_s * half[:-1])
+        bend = length_s**2 * 2.0 * np.diff(half, axis=0)
+        self._position = PPoly(
+            np.stack(
+                (
+                    (6.0 * away - 3.0 * turn + 0.5 * bend) / length_s**5,
+                    (-15.0 * away + 7.0 * turn - bend) / length_s**4,
+                    (10.0 * away - 4.0 * turn + 0.5 * bend) / length_s**3,
+                    half[:-1],
+                    velocity[:-1],
+                    position[:-1],
+                )
+            ),
+            self._times,
+        )
 
     def position(self, times: Array, derivative: int = 0) -> Array:
         """(N, 3) position NED in m, or a derivative of it."""
-        stamps = self._rows["time_s"]
-        before = np.clip(np.searchsorted(stamps, times, "right") - 1, 0, len(stamps) - 2)
-        first, last = self._rows[before], self._rows[before + 1]
-        length_s = (last["time_s"] - first["time_s"])[:, None]
-        share = (times[:, None] - first["time_s"][:, None]) / length_s
-        begin, end = (
-            (
-                each["position_ned_m"].astype(np.float64),
-                length_s * each["velocity_ned_mps"],
-                length_s**2 * each["acceleration_ned_mps2"],
-            )
-            for each in (first, last)
-        )
-        away = end[0] - begin[0] - begin[1] - 0.5 * begin[2]  # of the end from the start's parabola
-        turn, bend = end[1] - begin[1] - begin[2], end[2] - begin[2]
-        coefficients: list[Array] = [
-            begin[0],
-            begin[1],
-            0.5 * begin[2],
-            10.0 * away - 4.0 * turn + 0.5 * bend,
-            -15.0 * away + 7.0 * turn - bend,
-            6.0 * away - 3.0 * turn + 0.5 * bend,
-        ]
-        for _ in range(derivative):
-            coefficients = [power * each for power, each in enumerate(coefficients)][1:]
-        values: Array = sum(each * share**power for power, each in enumerate(coefficients))
-        return np.asarray(values / length_s**derivative)
+        return np.asarray(self._position(times, derivative))
 
     def heading(self, times: Array) -> Array:
-        return np.interp(times, self._rows["time_s"], self._heading)
+        return np.interp(times, self._times, self._heading)
 
 
 def _within(rows: Rows, window: tuple[float, float]) -> Rows:
@@ -241,11 +236,11 @@ def _within(rows: Rows, window: tuple[float, float]) -> Rows:
     return once[begin:end]
 
 
-def _in_blocks(signal: Callable[[Rows], Any], rows: Rows) -> Array:
-    values = np.empty(len(rows))
-    for part in blocks(len(rows)):
-        values[part] = signal(rows[part])
-    return values
+def each_once(rows: Rows) -> Rows:
+    """Rows sorted by time, the first one of equal times."""
+    if (np.diff(rows["time_s"]) > 0.0).all():
+        return rows
+    return rows[np.unique(rows["time_s"], return_index=True)[1]]
 
 
 def _in_track(flown: History) -> NDArray[np.bool_]:
@@ -253,13 +248,56 @@ def _in_track(flown: History) -> NDArray[np.bool_]:
     return chosen
 
 
-def _at(rows: Rows, column: str, times: Array) -> Array:
-    """The column (N, 3), interpolated linearly at `times`."""
-    axes = rows[column].T
-    return np.stack([np.interp(times, rows["time_s"], axis) for axis in axes], axis=1)
+def _length(vectors: Array) -> Array:
+    return np.asarray(np.linalg.norm(vectors, axis=1))
 
 
 def _nearest(stamps: Array, times: Array) -> NDArray[np.intp]:
     right = np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1)
     nearest: NDArray[np.intp] = right - (times - stamps[right - 1] < stamps[right] - times)
     return nearest
+
+
+# ---------------------------------------------------------------------- metrics by time
+
+
+@dataclass(frozen=True, slots=True)
+class Weighted:
+    """Metrics of one signal; `p95` is not exceeded for 95 % of the time. NaN without samples."""
+
+    mean: float = math.nan
+    rms: float = math.nan
+    sd: float = math.nan
+    max: float = math.nan
+    p95: float = math.nan
+
+
+def weighted(values: Array, weights: Array) -> Weighted:
+    """Metrics of samples (N,) with the time (N,) for which each stands; those that stand for none
+    do not count."""
+    total = float(weights.sum())
+    if not total:
+        return Weighted()
+    mean = float(weights @ values / total)
+    square = float(np.einsum("i,i,i", weights, values, values) / total)
+    order = np.argsort(values)
+    upto = np.searchsorted(np.cumsum(weights[order]), 0.95 * total)
+    return Weighted(
+        mean=mean,
+        rms=math.sqrt(square),
+        sd=math.sqrt(max(square - mean**2, 0.0)),
+        max=float(np.max(values, where=weights > 0.0, initial=-math.inf)),
+        p95=float(values[order[upto]]),
+    )
+
+
+def _in_blocks(signal: Callable[[Rows], Array], rows: Rows) -> Array:
+    """The signal of the rows: what is computed of a few takes little memory."""
+    values = np.empty(len(rows))
+    for part in _blocks(len(rows)):
+        values[part] = signal(rows[part])
+    return values
+
+
+def _blocks(count: int) -> Iterator[slice]:
+    return (slice(first, first + _BLOCK) for first in range(0, count, _BLOCK))

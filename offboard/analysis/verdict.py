@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.analysis.events import Event
-from offboard.analysis.history import History
+from offboard.analysis.history import Event, History
 from offboard.flight.positioning import PositionJumps
 from offboard.flight.touchdown import Touchdown, moved
 from offboard.mavlink.event_record import SUPERVISOR
@@ -74,7 +73,7 @@ def begin_times(phases: tuple[Event, ...]) -> dict[str, float]:
     return {event.phase: event.time_s for event in phases}
 
 
-def verdict_figures(flown: History, skipped_s: float) -> dict[str, Any]:
+def verdict_metrics(flown: History, skipped_s: float) -> dict[str, Any]:
     """Values of a Score. `skipped_s`: time of the reference for which nothing was decided.
 
     completed: 1 or 0, NaN for a log without a flight of `offboard`

@@ -11,8 +11,7 @@ from typing import Any
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from offboard.analysis.figure import PALETTE, RED, Figure, coordinates, listed, logarithmic
-from offboard.analysis.page import render
+from offboard.analysis.page import PALETTE, RED, Figure, coordinates, listed, logarithmic, render
 from offboard.campaign.table import BEST, ERROR, Group, Row, digits
 
 WORST_SHOWN = 20

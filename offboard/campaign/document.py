@@ -17,7 +17,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from offboard.analysis.requirement import Requirement
+from offboard.analysis.score import Requirement
 from offboard.documents import shipped
 from offboard.documents.errors import UserError
 from offboard.documents.parameters import Parameters

@@ -29,8 +29,8 @@ from pathlib import Path
 
 import numpy as np
 
-from offboard.analysis.flight_score import judged, keep_score, score_flight
 from offboard.analysis.history import History
+from offboard.analysis.score import judged, keep_score, score_flight
 from offboard.campaign.cases import Case
 from offboard.campaign.document import Promises
 from offboard.campaign.results import Record, code_hash
@@ -112,7 +112,7 @@ def recorded(
         sentence = f"{type(error).__name__}: {error}"
         return Record(ExitCode.ABORTED, sentence, NOT_FLOWN, "crash")
     keep_score(directory, score, history)
-    outcome, figures = judged(outcome, score), score.figures()
+    outcome, figures = judged(outcome, score), score.metrics()
     margins = terms(promises, figures, history, config.controller)
     weakest = min(margins, key=lambda name: margins[name])
     return Record(

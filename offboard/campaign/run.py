@@ -16,7 +16,7 @@ from typing import Self
 
 from rich.console import Console
 
-from offboard.analysis.requirement import Requirement
+from offboard.analysis.score import Requirement
 from offboard.campaign.campaign_page import page
 from offboard.campaign.cases import Case, expand
 from offboard.campaign.document import CampaignFile, Promises

@@ -22,8 +22,7 @@ from offboard.campaign.document import Search
 from offboard.campaign.results import Record
 from offboard.campaign.run import Campaign, Runner, check
 from offboard.campaign.table import as_csv as csv_of
-from offboard.documents.errors import DocumentError, UserError, naming
-from offboard.documents.extras import install
+from offboard.documents.errors import DocumentError, UserError, install, naming
 
 Fly = Callable[[Sequence[Case]], list[Record]]  # `Runner.fly`
 BATCH = 20  # flights between two answers of the study

@@ -22,8 +22,7 @@ from rich.table import Table
 from rich.text import Text
 from scipy import stats
 
-from offboard.analysis.requirement import Requirement
-from offboard.analysis.score import FIGURES
+from offboard.analysis.score import METRICS, Requirement
 from offboard.campaign.cases import Case
 from offboard.campaign.results import Record
 
@@ -37,7 +36,7 @@ WALL_TIMES = (
     "solve_time_p99_ms",
 )
 CASE_COLUMNS = ("controller", "reference", "scenario", "vehicle", "sim_vehicle", "firmware")
-FIGURE_COLUMNS = tuple(name for name in FIGURES if name not in WALL_TIMES)
+FIGURE_COLUMNS = tuple(name for name in METRICS if name not in WALL_TIMES)
 CONFIDENCE = 0.95
 ERROR = "rmse_position_m"
 EQUAL_SHARE = 0.01  # medians that are closer than this share of the best are equal
@@ -81,7 +80,7 @@ def row_of(case: Case, record: Record, requirements: Sequence[Requirement]) -> R
     if not record.completed:
         failed = record.sentence
     else:
-        figures = {name: record.figures.get(name, float("nan")) for name in FIGURES}
+        figures = {name: record.figures.get(name, float("nan")) for name in METRICS}
         missed = [each.sentence(figures) for each in requirements if not each.met(figures)]
         failed = "; ".join(missed)
     return Row(case, record, failed)

@@ -31,8 +31,7 @@ from typing import Protocol
 
 from offboard.campaign.flight import NOT_FLOWN, Job, fly_job, recorded
 from offboard.campaign.results import Record
-from offboard.documents.errors import UserError, shown
-from offboard.documents.extras import install
+from offboard.documents.errors import UserError, install, shown
 from offboard.flight.flight import STOPPED
 from offboard.flight.phases import ExitCode
 from offboard.run.flight import Connection, fly

@@ -35,7 +35,6 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 PARTS = ("reference", "controller", "vehicle")
-NAMES = shipped.overview(*PARTS, "scenario")
 
 
 def _version(wanted: bool) -> None:
@@ -54,20 +53,22 @@ def offboard(
     """Fly a trajectory over MAVLink with a particle-swarm receding-horizon law, and score it."""
 
 
-app.command(cls=Command, epilog=f"{NAMES}\n\n{fly.EXIT_CODES}")(fly.fly)
-app.command(cls=Command, epilog=f"{shipped.overview(*PARTS)}\n\n{daemon.EXIT_CODES}")(daemon.daemon)
-app.command(cls=Command, epilog=doctor.EXIT_CODES)(doctor.doctor)
-app.command(cls=Command, epilog=score.EXIT_CODES)(score.score)
-app.command(cls=Command, epilog=EXIT_CODES)(report.report)
-app.command(cls=Command, epilog=check.EXIT_CODES)(check.check)
-app.command(cls=Command, epilog=identify.EXIT_CODES)(identify.identify)
-app.command(cls=Command, epilog=f"{NAMES}\n\n{compare.EXIT_CODES}")(compare.compare)
-app.command(cls=Command, epilog=f"{shipped.overview('campaign')}\n\n{campaign.EXIT_CODES}")(
-    campaign.campaign
-)
-app.command(cls=Command, epilog=f"{shipped.overview('tuning')}\n\n{tune.EXIT_CODES}")(tune.tune)
-app.command(cls=Command, epilog=paper.EXIT_CODES)(paper.paper)
-app.command(cls=Command, epilog=replay.EXIT_CODES)(replay.replay)
-app.command(cls=Command, epilog=EXIT_CODES)(export.export)
-app.command(cls=Command, epilog=EXIT_CODES)(key.key)
+# the commands in the order of --help, and what their --help says below the options
+for command, below in (
+    (fly.fly, (shipped.overview(*PARTS, "scenario"), fly.EXIT_CODES)),
+    (daemon.daemon, (shipped.overview(*PARTS), daemon.EXIT_CODES)),
+    (doctor.doctor, (doctor.EXIT_CODES,)),
+    (score.score, (score.EXIT_CODES,)),
+    (report.report, (EXIT_CODES,)),
+    (check.check, (check.EXIT_CODES,)),
+    (identify.identify, (identify.EXIT_CODES,)),
+    (compare.compare, (shipped.overview(*PARTS, "scenario"), compare.EXIT_CODES)),
+    (campaign.campaign, (shipped.overview("campaign"), campaign.EXIT_CODES)),
+    (tune.tune, (shipped.overview("tuning"), tune.EXIT_CODES)),
+    (paper.paper, (paper.EXIT_CODES,)),
+    (replay.replay, (replay.EXIT_CODES,)),
+    (export.export, (EXIT_CODES,)),
+    (key.key, (EXIT_CODES,)),
+):
+    app.command(cls=Command, epilog="\n\n".join(below))(command)
 app.command("list", cls=Command)(listing.list_files)

@@ -31,10 +31,9 @@ from offboard.documents.arguments import LIVE_PAGE
 from offboard.documents.command_line import INTERRUPT, drop_output, explained
 
 if TYPE_CHECKING:
-    from offboard.analysis.requirement import Requirement
-    from offboard.analysis.score import Score
+    from offboard.analysis.score import Requirement, Score
     from offboard.flight.flight import Outcome
-    from offboard.live.displays import Displays
+    from offboard.live.process import Displays
 
 INTERRUPTED = "interrupted before anything was sent"
 LABEL_WIDTH = 15
@@ -151,9 +150,8 @@ def _exit_at_once() -> None:
 
 def _displays(live: str | None, *, json_lines: bool) -> Displays:
     """What shows the flight: lines, and a server of the page at the address `live`."""
-    from offboard.live.displays import Displays
     from offboard.live.lines import JsonLines, Terminal
-    from offboard.live.process import SERVER, LiveProcess
+    from offboard.live.process import SERVER, Displays, LiveProcess
 
     lines = JsonLines(write) if json_lines else Terminal(out, partial(say, indent=12))
     return Displays(lines, [LiveProcess(SERVER, "--live", live)] if live else [])
@@ -170,14 +168,14 @@ def _conclude(
 ) -> None:
     """Print verdict and result. Exits with the code of the verdict. `lost`: sentences on what was
     not shown of the flight."""
-    from offboard.analysis.flight_score import judged
+    from offboard.analysis.score import judged
     from offboard.analysis.score_table import summary
 
     score, history = scored(directory)
     outcome = judged(outcome, score)
     checked = [] if outcome.exit_code else requirements
-    missed = [each for each in checked if not each.met(score.figures())]
-    results = "; ".join(each.sentence(score.figures()) for each in missed or checked)
+    missed = [each for each in checked if not each.met(score.metrics())]
+    results = "; ".join(each.sentence(score.metrics()) for each in missed or checked)
     code = outcome.exit_code or int(bool(missed))
     try:
         if json_lines:
@@ -212,7 +210,7 @@ def _result(
     code: int, sentence: str, requirements: str, score: Score, directory: Path, lost: list[str]
 ) -> str:
     """The last line of --json-lines."""
-    from offboard.documents.plain import plain
+    from offboard.documents.errors import plain
     from offboard.live.display import DIGITS, line
 
     result = {
@@ -223,6 +221,6 @@ def _result(
         "ended_by": score.ended_by,
         "directory": str(directory),
         "lost": lost,
-        "figures": plain(score.figures(), DIGITS),
+        "figures": plain(score.metrics(), DIGITS),
     }
     return line("result", **result) + "\n"

@@ -24,9 +24,9 @@ def replay(flight: Annotated[Path, FLIGHT]) -> None:
     from offboard.compiled import loading
 
     with loading():
+        from offboard.replay.difference import explained, verdict
         from offboard.replay.recording import read
         from offboard.replay.replaying import Replay
-        from offboard.replay.verdict import explained, verdict
     recording = read(flight)
     if recording.log.damage:
         complain(recording.log.damage)

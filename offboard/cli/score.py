@@ -1,4 +1,4 @@
-"""`offboard score`: every figure of a flight, from its log."""
+"""`offboard score`: every metric of a flight, from its log."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from offboard.cli.shared import FLIGHT, CommandError, Requirements, complain, ou
 
 if TYPE_CHECKING:
     from offboard.analysis.history import History
-    from offboard.analysis.requirement import Requirement
-    from offboard.analysis.score import Score
+    from offboard.analysis.score import Requirement, Score
 
 EXIT_CODES = (
     "Exit codes: 0 scored and all requirements met; 1 a requirement missed; 2 usage error, or the "
@@ -28,11 +27,11 @@ def score(
 ) -> None:
     """Score a flight from its .tlog alone.
 
-    Prints whether the flight was completed, what happened in the order of time, then every figure.
+    Prints whether the flight was completed, what happened in the order of time, then every metric.
     Every requirement on a flight that was not completed is missed. Writes score.json if FLIGHT is a
     directory.
     """
-    from offboard.analysis.flight_score import as_text
+    from offboard.analysis.score import as_text
     from offboard.analysis.score_table import show, verdict
 
     requirements = requirements_of(require)
@@ -43,7 +42,7 @@ def score(
         show(out, result, history)
     if history.damage:
         complain(history.damage)
-    figures = result.figures()
+    figures = result.metrics()
     missed = [each.sentence(figures) for each in requirements if not each.met(figures)]
     if requirements and result.completed != 1.0:
         missed.insert(0, verdict(result))
@@ -53,14 +52,14 @@ def score(
 
 def requirements_of(texts: list[str] | None) -> list[Requirement]:
     """The requirements of --require. Raises UserError."""
-    from offboard.analysis.requirement import Requirement
+    from offboard.analysis.score import Requirement
 
     return [Requirement.parse(text) for text in texts or ()]
 
 
 def scored(flight: Path) -> tuple[Score, History]:
     """Score a flight and keep the score in its directory. Raises TlogError."""
-    from offboard.analysis.flight_score import score_flight
+    from offboard.analysis.score import score_flight
 
     result, history = score_flight(flight)
     keep(flight, result, history)
@@ -69,7 +68,7 @@ def scored(flight: Path) -> tuple[Score, History]:
 
 def keep(flight: Path, result: Score, history: History) -> None:
     """Write score.json if `flight` is a directory. Where it cannot be written, say so."""
-    from offboard.analysis.flight_score import keep_score
+    from offboard.analysis.score import keep_score
     from offboard.link.log import LogError
 
     if flight.is_dir():

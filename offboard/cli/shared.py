@@ -90,7 +90,7 @@ Workers = Annotated[
 Requirements = Annotated[
     list[str] | None,
     option(
-        "FIGURE<NUMBER", "Exit with 1 if the score does not meet this; repeatable.", "--require"
+        "METRIC<NUMBER", "Exit with 1 if the score does not meet this; repeatable.", "--require"
     ),
 ]
 Assignments = Annotated[

@@ -94,5 +94,3 @@ def _check(label: str, value: str) -> None:
         value.encode()
     except UnicodeEncodeError:
         raise UserError(f"{label}: {shown(value)} is not UTF-8") from None
-    if "\0" in value:
-        raise UserError(f"{label}: {shown(value)} holds a null character")

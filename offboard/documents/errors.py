@@ -1,7 +1,10 @@
-"""Errors that the user can fix: the exceptions, and values and names as a sentence shows them."""
+"""What a user is told: errors that the user can fix, values and names as a sentence or JSON shows
+them, and sentences on what happens again and again.
+"""
 
 from __future__ import annotations
 
+import math
 import sysconfig
 import traceback
 from collections.abc import Iterator
@@ -9,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+EVERY_S = 1.0  # at most one sentence of a `Repeated`
 _PACKAGE, _STANDARD = str(Path(__file__).parents[1]), sysconfig.get_path("stdlib")
 
 
@@ -69,3 +73,52 @@ def abridged(name: object) -> str:
     """A name or path for a message: at most 100 characters, without what is no text."""
     text = str(name).encode(errors="backslashreplace").decode()
     return text if len(text) <= 100 else f"{text[:97]}..."
+
+
+def plain(value: Any, digits: int | None = None) -> Any:
+    """The value for JSON, which has no NaN and no infinity: None for each float that is not finite,
+    and lists for tuples; the other floats with `digits` significant digits."""
+    if isinstance(value, dict):
+        return {key: plain(each, digits) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(each, digits) for each in value]
+    if isinstance(value, float):
+        if not math.isfinite(value):
+            return None
+        return float(f"{value:.{digits}g}") if digits else value
+    return value
+
+
+def install(extra: str) -> str:
+    """The line that installs the libraries of an extra. It names them and not this package, which
+    was installed from a checkout or a wheel, and is on no index."""
+    from importlib.metadata import requires
+
+    marked = (each.partition(";") for each in requires("pso-offboard") or ())
+    libraries = [name.strip() for name, _, marker in marked if extra in marker.split("extra")[-1]]
+    return "pip install " + " ".join(f"'{each}'" for each in libraries)
+
+
+class Repeated:
+    """One sentence for the user. `add` what happened, with a figure, and ask `news` for it.
+
+    `text` is a format of `most` (the greatest figure since the last sentence), `total` (their sum)
+    and `times` (" (the longest of 4)", empty for a single one). Times are seconds of any clock.
+    """
+
+    def __init__(self, text: str) -> None:
+        self._text = text
+        self._said_s = -math.inf
+        self._figures: list[float] = []
+
+    def add(self, figure: float) -> None:
+        self._figures.append(figure)
+
+    def news(self, now_s: float) -> str:
+        """What to say now; empty if nothing happened, or within a second of the last time."""
+        figures = self._figures
+        if not figures or now_s - self._said_s < EVERY_S:
+            return ""
+        self._said_s, self._figures = now_s, []
+        times = f" (the longest of {len(figures)})" if len(figures) > 1 else ""
+        return self._text.format(most=max(figures), total=sum(figures), times=times)

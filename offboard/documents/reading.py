@@ -16,7 +16,7 @@ import math
 import re
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -220,7 +220,7 @@ def _sentence(detail: ErrorDetails, document: Any, model: type[BaseModel]) -> st
     path = abridged(_key_path(detail, document))
     kind, context = detail["type"], detail.get("ctx", {})
     if kind == "extra_forbidden":
-        return _unknown_key(path, _model_at(model, detail["loc"][:-1]))
+        return _unknown_key(path, model)
     if kind == "missing":
         return f"{path} is missing"
     if kind.startswith("union_tag"):
@@ -236,24 +236,14 @@ def _sentence(detail: ErrorDetails, document: Any, model: type[BaseModel]) -> st
     return f"{where}{detail['msg'].removeprefix('Value error, ')}"
 
 
-def _unknown_key(path: str, model: type[BaseModel] | None) -> str:
-    if model is None:
+def _unknown_key(path: str, model: type[BaseModel]) -> str:
+    """The sentence for an unknown key; of the whole document also what is known."""
+    if "." in path:
         return f"{path} is not a known key"
     known = sorted(model.model_fields)
-    near = difflib.get_close_matches(path.rpartition(".")[2], known, n=1)
+    near = difflib.get_close_matches(path, known, n=1)
     hint = f", did you mean {near[0]}?" if near else ""
     return f"{path} is not a known key{hint} (known keys: {', '.join(known)})"
-
-
-def _model_at(model: type[BaseModel], location: tuple[int | str, ...]) -> type[BaseModel] | None:
-    """The class of a section; None for a member of a union, or of a mapping."""
-    found: type[BaseModel] | None = model
-    for key in location:
-        field = found.model_fields.get(str(key)) if found else None
-        members = [field.annotation, *get_args(field.annotation)] if field else []
-        models = [m for m in members if isinstance(m, type) and issubclass(m, BaseModel)]
-        found = models[0] if len(models) == 1 else None
-    return found
 
 
 def _key_path(detail: ErrorDetails, document: Any) -> str:

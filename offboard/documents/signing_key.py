@@ -14,6 +14,7 @@ import hashlib
 import os
 import secrets
 import stat
+from functools import partial
 from pathlib import Path
 
 from offboard.documents.errors import UserError, abridged
@@ -36,14 +37,14 @@ def read_key(path: Path) -> bytes:
     """The 32 bytes of the key in the file at `path`. Raises KeyFileError."""
     shown = f"signing key {abridged(path)}"
     try:
-        # a FIFO must not make us wait
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-        try:
-            found = os.fstat(descriptor)
-            _check(found, shown)
-            content = os.read(descriptor, FILE_BYTES_MAX + 1)
-        finally:
-            os.close(descriptor)
+        found = path.stat()
+        if not stat.S_ISREG(found.st_mode):
+            raise KeyFileError(f"{shown} is not a file")
+        if found.st_mode & _OTHERS:
+            raise KeyFileError(f"{shown} can be read or changed by other users: chmod 600 it")
+        if found.st_size > FILE_BYTES_MAX:
+            raise KeyFileError(f"{shown} has {found.st_size:,} bytes: that is no key file")
+        content = path.read_bytes()
     except (OSError, ValueError) as error:  # ValueError: a NUL in the path
         reason = getattr(error, "strerror", None) or error
         raise KeyFileError(f"{shown} cannot be read: {reason}") from None
@@ -54,33 +55,16 @@ def create_key(path: Path) -> str:
     """Create a key file at `path` with a random passphrase, which is returned. Never replaces a
     file. Raises KeyFileError."""
     passphrase = secrets.token_hex(KEY_BYTES)
-    text = f"# MAVLink 2 signing key: keep it secret\npassphrase: {passphrase}\n"
     try:
-        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        with open(path, "x", encoding="ascii", opener=partial(os.open, mode=0o600)) as file:
+            os.fchmod(file.fileno(), 0o600)
+            file.write(f"# MAVLink 2 signing key: keep it secret\npassphrase: {passphrase}\n")
     except FileExistsError:
         raise KeyFileError(f"{abridged(path)} exists and is not replaced: name another") from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise KeyFileError(f"{abridged(path)} cannot be created: {reason}") from None
-    try:
-        with os.fdopen(descriptor, "w", encoding="ascii") as file:
-            os.fchmod(file.fileno(), 0o600)
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-    except OSError as error:
-        path.unlink(missing_ok=True)
-        raise KeyFileError(f"{abridged(path)} cannot be written: {error.strerror}") from None
     return passphrase
-
-
-def _check(found: os.stat_result, shown: str) -> None:
-    if not stat.S_ISREG(found.st_mode):
-        raise KeyFileError(f"{shown} is not a file")
-    if found.st_mode & _OTHERS:
-        raise KeyFileError(f"{shown} can be read or changed by other users: chmod 600 it")
-    if found.st_size > FILE_BYTES_MAX:
-        raise KeyFileError(f"{shown} has {found.st_size:,} bytes: that is no key file")
 
 
 def _key_in(content: bytes, shown: str) -> bytes:

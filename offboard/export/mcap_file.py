@@ -15,8 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from offboard.documents.errors import UserError
-from offboard.documents.extras import install
+from offboard.documents.errors import UserError, install
 from offboard.export.series import PHASE, Array, Flight, Series, phase_name
 from offboard.link.log import new_file
 from offboard.model.frames import enu, flu_in_enu
@@ -91,17 +90,15 @@ def _channel(writer: Any, register: Any, flight: Flight, topic: str, message: An
 
 def _rows(series: Series, stamps: Stamps) -> Iterator[Stamped]:
     """JSON has no NaN: what is not known is left out."""
-    times = series.time_s.tolist()
     for stamp_ns, time_s, row in zip(
-        stamps(series.time_s), times, series.values.tolist(), strict=True
+        stamps(series.time_s), series.time_s.tolist(), series.values.tolist(), strict=True
     ):
-        values = zip(series.columns, row, strict=True)
-        known: dict[str, float | str] = {
+        known = {
             column: phase_name(value) if column == PHASE else value
-            for column, value in values
+            for column, value in zip(series.columns, row, strict=True)
             if math.isfinite(value)
         }
-        yield stamp_ns, f"/table/{series.name}", {"vehicle_time_s": time_s} | known
+        yield stamp_ns, f"/table/{series.name}", {"vehicle_time_s": time_s, **known}
 
 
 def _poses(flight: Flight, stamps: Stamps) -> Iterator[Stamped]:
@@ -109,8 +106,7 @@ def _poses(flight: Flight, stamps: Stamps) -> Iterator[Stamped]:
     position, attitude = flight.series.get("position"), flight.series.get("attitude")
     if position is None or attitude is None:
         return
-    pose_in_frame = _message("PoseInFrame")
-    transform = _message("FrameTransform")
+    pose_in_frame, transform = _message("PoseInFrame"), _message("FrameTransform")
     newest = np.searchsorted(attitude.time_s, position.time_s, side="right") - 1
     quaternions = flu_in_enu(attitude.values[np.maximum(newest, 0), :4]).tolist()
     places = enu(position.values[:, :3]).tolist()
@@ -120,21 +116,16 @@ def _poses(flight: Flight, stamps: Stamps) -> Iterator[Stamped]:
         if index < 0:
             continue
         pose = pose_in_frame(frame_id=MAP)
-        _fill(
-            pose.timestamp, stamp_ns, pose.pose.position, place, pose.pose.orientation, quaternion
-        )
-        yield stamp_ns, "/pose", pose
         frame = transform(parent_frame_id=MAP, child_frame_id=BODY)
-        _fill(frame.timestamp, stamp_ns, frame.translation, place, frame.rotation, quaternion)
+        for timestamp, vector, rotation in (
+            (pose.timestamp, pose.pose.position, pose.pose.orientation),
+            (frame.timestamp, frame.translation, frame.rotation),
+        ):
+            timestamp.FromNanoseconds(stamp_ns)
+            vector.x, vector.y, vector.z = place
+            rotation.w, rotation.x, rotation.y, rotation.z = quaternion
+        yield stamp_ns, "/pose", pose
         yield stamp_ns, "/tf", frame
-
-
-def _fill(
-    timestamp: Any, stamp_ns: int, vector: Any, place: list[float], rotation: Any, q: list[float]
-) -> None:
-    timestamp.FromNanoseconds(stamp_ns)
-    vector.x, vector.y, vector.z = place
-    rotation.w, rotation.x, rotation.y, rotation.z = q
 
 
 def _velocities(position: Series, stamps: Stamps) -> Iterator[Stamped]:

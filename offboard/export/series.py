@@ -13,9 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.analysis import history, tlog
-from offboard.analysis.events import Event
-from offboard.analysis.history import TELEMETRY, History
-from offboard.analysis.samples import Rows, continuous_s
+from offboard.analysis.history import TELEMETRY, Event, Rows, continuous_s
 from offboard.analysis.tlog import Tlog
 from offboard.documents.errors import UserError
 from offboard.flight.phases import PHASE_CODES
@@ -50,6 +48,7 @@ _COLUMNS = {
     "decision": tuple(f"decision_{name}" for name in FIELDS),
     "heartbeat": ("armed", "system_status"),
 }
+_ARRAYS = {"decision": "records"}  # of History, where they have another name
 PHASE = "decision_phase"  # whose numbers tables show as names
 LOCKSTEP_SHARE = 0.05  # of the vehicle's time, by which a flight in real time differs at most
 _PHASES = {code: phase.value for phase, code in PHASE_CODES.items()}
@@ -108,29 +107,17 @@ def read(path: Path) -> Flight:
     if not len(unix):
         raise UserError(f"{log.path} holds no telemetry with a time stamp: nothing to export")
     events = tuple(event for event in flown.events() if np.isfinite(event.time_s))
-    found = {name: _series(name, rows) for name, rows in _rows(flown).items()}
-    series = {name: each for name, each in found.items() if len(each.time_s)}
+    arrays = {name: getattr(flown, _ARRAYS.get(name, name)) for name in _COLUMNS}
+    series = {name: each for name in arrays if len((each := _series(name, arrays[name])).time_s)}
     autopilot = _AUTOPILOTS[flown.dialect.name] if flown.dialect else "unknown"
     return Flight(series, events, unix, autopilot, flown.damage)
-
-
-def _rows(flown: History) -> dict[str, Rows]:
-    """The arrays that are exported, by the name of the series."""
-    return {
-        "position": flown.position,
-        "attitude": flown.attitude,
-        "truth": flown.truth,
-        "reference": flown.reference,
-        "setpoint": flown.setpoint[["time_s", "quaternion", "thrust"]],
-        "decision": flown.records,
-        "heartbeat": flown.heartbeat,
-    }
 
 
 def _series(name: str, rows: Rows) -> Series:
     """Without the samples from before any telemetry, whose time is NaN."""
     rows = rows[np.isfinite(rows["time_s"])]
-    columns = [rows[column] for column in rows.dtype.names or () if column != "time_s"]
+    times = ("time_s", "unix_s")
+    columns = [rows[column] for column in rows.dtype.names or () if column not in times]
     return Series(name, _COLUMNS[name], rows["time_s"], np.column_stack(columns))
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 import re
 
-from offboard.documents.repeated import Repeated
+from offboard.documents.errors import Repeated
 from offboard.flight import preflight
 from offboard.flight.phases import TRACKING, Phase
 from offboard.flight.starting import ground_of

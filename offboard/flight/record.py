@@ -27,7 +27,6 @@ RECORD_NAME = "pso"
 NAN = float("nan")
 CERTIFIED = len(fields(Certificate))
 Array = NDArray[np.float64]
-_COUNTS = {1: 28, 3: 31, 4: 32}  # number of fields by the array_id of logs before 0.1
 IDENTIFIED_NAME, IDENTIFIED_ID = "identified", 2  # of the other DEBUG_FLOAT_ARRAY in the log
 
 
@@ -80,19 +79,6 @@ class TickRecord:
 
 FIELDS = tuple(field.name for field in fields(TickRecord))
 RECORD_ID = len(FIELDS)
-
-
-def records_of(data: Array, array_ids: Array) -> NDArray[np.void]:
-    """Records (N,) as a structured array with the fields of `TickRecord`, from DEBUG_FLOAT_ARRAY:
-    `data` (N, 58) and `array_ids` (N,). What an older log lacks has its default."""
-    values = data[:, : len(FIELDS)].copy()
-    for array_id in np.unique(array_ids).astype(int).tolist():
-        count = min(_COUNTS.get(array_id, array_id), len(FIELDS))
-        values[array_ids == array_id, count:] = TickRecord(*(NAN,) * count).data()[count:]
-    records = np.empty(len(values), [(name, np.float64) for name in FIELDS])
-    for column, name in enumerate(FIELDS):
-        records[name] = values[:, column]
-    return records
 
 
 @dataclass(frozen=True, slots=True)

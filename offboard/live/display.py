@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol
 
-from offboard.documents.plain import plain
+from offboard.documents.errors import plain
 from offboard.link.background import BackgroundWriter
 
 if TYPE_CHECKING:  # the process that serves clients starts without the controller

@@ -6,8 +6,7 @@ from typing import Any
 
 import plotly.graph_objects as go
 
-from offboard.analysis.figure import BLUE, INK, STYLE, Figure, curve, panels
-from offboard.analysis.page import render
+from offboard.analysis.page import BLUE, INK, STYLE, Figure, curve, panels, render
 
 # label on the page and element that the script fills
 VALUES = {

@@ -9,7 +9,7 @@ import plotly.graph_objects as go
 from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
-from offboard.analysis.figure import (
+from offboard.analysis.page import (
     BLUE,
     GREEN,
     GREY,

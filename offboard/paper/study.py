@@ -17,8 +17,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from offboard.analysis.figure import Figure
-from offboard.analysis.page import render
+from offboard.analysis.page import Figure, render
 from offboard.documents.errors import UserError
 from offboard.paper import errata, figures, horizon, tables
 from offboard.paper.closed_loop import Flights

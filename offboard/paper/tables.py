@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.documents.plain import plain
+from offboard.documents.errors import plain
 from offboard.model.state import PHI, PSI, P, U, V, W
 from offboard.paper import printed
 from offboard.paper.closed_loop import Flight, Flights, FlightTask, PathName

@@ -1,23 +1,29 @@
-"""Difference: the setpoints and commands of two runs of the same flight, side by side."""
+"""Difference: the setpoints and commands of two runs of the same flight, side by side, and what
+preceded the first difference.
+"""
 
 from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
 from offboard.analysis.tlog import layout, name_of
+from offboard.documents.errors import UserError
 from offboard.mavlink.framing import SETPOINTS
-from offboard.replay.replaying import Sent
+from offboard.replay.recording import Recording
+from offboard.replay.replaying import Replay, Sent, Turn
 
 COMMANDS = (75, 76)  # COMMAND_INT, COMMAND_LONG
 # Of a field, relative to its value or to 1: another processor or library rounds differently, by up
 # to 1e-8 rad and 6e-8 of thrust between two x86-64 processors
 ROUNDING = 1e-6
 _UNSTAMPED = ("time_boot_ms", "target_system", "target_component")
+FIELDS_MAX = 8  # that are shown of a difference
+TOLD_EVERY = 500  # turns
 Key = tuple[float, int, bytes, int]
 
 
@@ -45,7 +51,7 @@ class Difference:
         return [
             (name, value, after[name], abs(after[name] - value))
             for name, value in before.items()
-            if not _same(value, after[name])
+            if value != after[name] and not (math.isnan(value) and math.isnan(after[name]))
         ]
 
     def is_rounding(self) -> bool:
@@ -128,7 +134,8 @@ def _by_key(sent: Iterable[Sent]) -> dict[Key, Sent]:
 
 
 def _fields(sent: Sent) -> dict[str, float]:
-    row = _row(sent)
+    kind = layout(name_of(sent.message_id))
+    (row,) = np.frombuffer(sent.payload[: kind.itemsize].ljust(kind.itemsize, b"\0"), kind)
     names = [name for name in row.dtype.names or () if name not in _UNSTAMPED]
     return {
         f"{name}[{at}]" if row[name].size > 1 else name: float(value)
@@ -137,11 +144,58 @@ def _fields(sent: Sent) -> dict[str, float]:
     }
 
 
-def _row(sent: Sent) -> np.void:
-    kind = layout(name_of(sent.message_id))
-    row: np.void = np.frombuffer(sent.payload[: kind.itemsize].ljust(kind.itemsize, b"\0"), kind)[0]
-    return row
+# ------------------------------------------------------------------ of a replay and its log
 
 
-def _same(first: float, second: float) -> bool:
-    return first == second or (math.isnan(first) and math.isnan(second))
+def verdict(replay: Replay, tell: Callable[[str], object] = str) -> Comparison:
+    """Replay a flight to its end and compare it with its log. `tell` is called with sentences about
+    the progress. Raises UserError if nothing can be compared."""
+    for turn in replay.turns():
+        if turn.number % TOLD_EVERY == 0:
+            tell(f"replayed up to {replay.ended_s:.0f} s of vehicle time")
+    comparison = compare(replay.recorded, replay.replayed)
+    if not comparison.compared.total():
+        why = replay.stopped or "the log holds no setpoint and no command"
+        raise UserError(f"{replay.recording.log.path}: nothing to compare: {why}")
+    return comparison
+
+
+def explained(recording: Recording, difference: Difference) -> list[str]:
+    """What differs, field by field, and the input that preceded it; one line each."""
+    name = f"{difference.name} at {difference.time_s:.3f} s"
+    if difference.expected is None:
+        lines = [f"{name} was not sent in the recorded flight"]
+    elif difference.actual is None:
+        lines = [f"{name} was not sent in the replay"]
+    else:
+        lines = [f"{name}:"]
+        lines += [
+            f"  {field}: {before:.9g} in the log, {after:.9g} in the replay, by {by:.3g}"
+            for field, before, after, by in difference.fields()[:FIELDS_MAX]
+        ]
+    return lines + _input(recording, difference)
+
+
+def _input(recording: Recording, difference: Difference) -> list[str]:
+    """The turn that decided it: replayed once more up to there."""
+    replay = Replay(recording)
+    number = difference.actual.turn if difference.actual else None
+    for turn in replay.turns():
+        due = replay.ended_s >= difference.time_s if number is None else turn.number == number
+        if due:
+            tick = int(replay.ended_s / replay.config.period_s + 1e-6)
+            lines = [f"decided in turn {turn.number}, tick {tick}, which was given:"]
+            rows = _received(turn) or [("nothing", "no message had arrived")]
+            return lines + [f"  {when}: {names}" for when, names in rows]
+    return []
+
+
+def _received(turn: Turn) -> list[tuple[str, str]]:
+    """The messages that a turn was given, and how long before it they arrived."""
+    frames = iter(turn.received)
+    rows: list[tuple[str, str]] = []
+    for chunk in turn.given.chunks:
+        names = [next(frames).name for _ in range(chunk.frames)]
+        age_ms = 1e3 * (turn.given.now_s - chunk.arrived_s)
+        rows.append((f"{age_ms:.3f} ms before", ", ".join(names) or "nothing that was used"))
+    return rows

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import plotly.graph_objects as go
 
-from offboard.analysis.figure import (
+from offboard.analysis.history import Rows
+from offboard.analysis.page import (
     BLUE,
     BLUE_BAND,
     BROWN,
@@ -32,11 +33,10 @@ from offboard.analysis.figure import (
     panels,
     without_outliers,
 )
-from offboard.analysis.samples import Rows
 from offboard.analysis.verdict import begin_times
 from offboard.report import timeline
 from offboard.report.flight import Flight
-from offboard.report.panels import GROUPS, Curve, Panel, thinned
+from offboard.report.panels import GROUPS, Curve, Panel, Points, thinned
 
 # of flights that share a figure, in an order that colour-blind people can tell apart
 COLOURS = (BLUE, ORANGE, GREEN, GREY, PINK, BROWN)
@@ -45,13 +45,6 @@ PATH_POINTS = 1500
 PANEL_PX = 120
 LEFT_PX = 75  # beside the panels, the same in all figures: their time axes stand below each other
 ROW_PX = 34  # of the timeline
-_CAPTIONS = {  # by the panel that they explain
-    "distance from the reference, m": "The reference is known from the climb to the landing.",
-    "gap: cost above the exact optimum": (
-        "Zero is drawn at 1e-16. Only decisions that were sent as certified have a gap."
-    ),
-    "identified delay, ms": "Bars: one standard deviation.",
-}
 _CUT = "Single values far from all others are outside; two clicks on the figure show them."
 
 
@@ -87,8 +80,8 @@ def figures(flights: Sequence[Flight]) -> dict[str, Figure]:
     """All figures that the logs have data for, by name: path, timeline, and those of GROUPS."""
     drawn = lanes(flights)
     found = {"path": _path(drawn), "timeline": _timeline(drawn)}
-    for name, (title, panels_of) in GROUPS.items():
-        found[name] = _panels(title, [(lane, panels_of(lane.flight.history)) for lane in drawn])
+    for name, (title, group) in GROUPS.items():
+        found[name] = _panels(title, group, drawn)
     return {name: figure for name, figure in found.items() if figure is not None}
 
 
@@ -205,44 +198,48 @@ def _add_marks(figure: go.Figure, row: str, marks: Sequence[timeline.Mark], zero
 # ---------------------------------------------------------------------- panels
 
 
-def _panels(title: str, flown: Sequence[tuple[Lane, Sequence[Panel]]]) -> Figure | None:
-    """One group of panels, for each flight the curves that it has."""
-    by_title: dict[str, list[tuple[Lane, Panel]]] = {}
-    for lane, group in flown:
-        for panel in group:
-            shown = panel.shown()
-            if shown is not None and (not lane.label or any(c.main for c in shown.curves)):
-                by_title.setdefault(shown.title, []).append((lane, shown))
-    if not by_title:
+def _panels(title: str, group: Sequence[Panel], drawn: Sequence[Lane]) -> Figure | None:
+    """A group of panels, in each the curves that the flights have."""
+    shown = [(panel, curves) for panel in group if (curves := _known(panel, drawn))]
+    if not shown:
         return None
-    figure = panels(list(by_title), _axis_title([lane for lane, _ in flown]), PANEL_PX)
-    cut = False
-    for place, shown_in in enumerate(by_title.values(), 1):
-        for lane, panel in shown_in:
-            for each in panel.curves:
-                if each.main or not lane.label:
-                    _draw(
-                        figure, place, each, lane, named=bool(lane.label) or len(panel.curves) > 1
-                    )
-        values = np.concatenate([each.values for _, panel in shown_in for each in panel.curves])
-        if shown_in[0][1].logarithmic:
+    figure = panels([panel.title for panel, _ in shown], _axis_title(drawn), PANEL_PX)
+    captions, cut = [], False
+    for place, (panel, curves) in enumerate(shown, 1):
+        alone = len(curves) == 1 and not curves[0][0].label
+        for lane, each, samples in curves:
+            _draw(figure, place, each, samples, lane, named=not alone)
+        values = np.concatenate([samples[1] for _, _, samples in curves])
+        captions += [panel.caption] if panel.caption else []
+        if panel.logarithmic:
             figure.update_yaxes(logarithmic(values), row=place)
         elif inner := without_outliers(values):
             figure.update_yaxes(range=inner, row=place)
             cut = True
-    for lane, _ in flown:
-        if not lane.label:
-            figure.update_layout(shapes=_phase_shapes(lane.flight))
-    figure.update_xaxes(range=_extent([lane for lane, _ in flown]))
+    if not drawn[0].label:
+        figure.update_layout(shapes=_phase_shapes(drawn[0].flight))
+    figure.update_xaxes(range=_extent(drawn))
     figure.update_yaxes(automargin=False, exponentformat="e")
     figure.update_layout(margin_l=LEFT_PX)
-    captions = [_CAPTIONS[each] for each in by_title if each in _CAPTIONS] + [_CUT] * cut
-    return Figure(title, figure, " ".join(captions))
+    return Figure(title, figure, " ".join(captions + [_CUT] * cut))
 
 
-def _draw(figure: go.Figure, place: int, each: Curve, lane: Lane, *, named: bool) -> None:
-    chosen = thinned(each.values)
-    times, values = each.times[chosen] - lane.zero_s, each.values[chosen]
+def _known(panel: Panel, drawn: Sequence[Lane]) -> list[tuple[Lane, Curve, Points]]:
+    """The curves of a panel that have values; of several flights only the main ones."""
+    curves = [
+        (lane, each, each.source(lane.flight.history))
+        for lane in drawn
+        for each in panel.curves
+        if each.main or not lane.label
+    ]
+    return [curve for curve in curves if np.isfinite(curve[2][1]).any()]
+
+
+def _draw(
+    figure: go.Figure, place: int, each: Curve, points: Points, lane: Lane, *, named: bool
+) -> None:
+    times, values, *sd = points
+    chosen = thinned(values)
     name, colour, dash = each.name, each.colour, each.dash
     if lane.label:
         name, colour, dash = lane.label, lane.colour, lane.dash
@@ -250,12 +247,12 @@ def _draw(figure: go.Figure, place: int, each: Curve, lane: Lane, *, named: bool
     if each.style == "steps":
         more["line"] = {"shape": "hv", "width": 1.1}
     elif each.style == "dots":
-        more["mode"] = "markers"
-        more["marker"] = {"color": colour, "size": 4 if each.sd is None else 7}
-    if each.sd is not None:
-        sd = coordinates(each.sd[chosen])
-        more["error_y"] = {"type": "data", "array": sd, "color": colour, "thickness": 1.5}
-    curve(figure, place, times, values, html.escape(name), colour, dash, **more)
+        more |= {"mode": "markers", "marker": {"color": colour, "size": 7 if sd else 4}}
+    if sd:
+        bars = coordinates(sd[0][chosen])
+        more["error_y"] = {"type": "data", "array": bars, "color": colour, "thickness": 1.5}
+    times = times[chosen] - lane.zero_s
+    curve(figure, place, times, values[chosen], html.escape(name), colour, dash, **more)
 
 
 def _phase_shapes(flight: Flight) -> list[dict[str, Any]]:

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.analysis.estimator_noise import estimator_noise
-from offboard.analysis.figure import BLUE, GREY, RED, Figure, curve, panels
-from offboard.analysis.identify import rows
+from offboard.analysis.identify import estimator_noise, rows
+from offboard.analysis.page import BLUE, GREY, RED, Figure, curve, panels
 from offboard.identification.attitude_fit import tilt_signals, yaw_signals
 from offboard.identification.motion_fit import Motion, predicted_velocity
 from offboard.identification.response import second_order

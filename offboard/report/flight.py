@@ -1,9 +1,15 @@
-"""What a report has of one log: arrays, events, score, configuration, and what is missing."""
+"""What a report has of one log: arrays, events, score, configuration, and what is missing.
+
+Ground stations often record ATTITUDE and GLOBAL_POSITION_INT without ATTITUDE_QUATERNION and
+LOCAL_POSITION_NED, and the setpoint in force only as the vehicle reports it (ATTITUDE_TARGET): they
+are the substitutes in a log that `offboard` has not written.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +17,12 @@ import numpy as np
 import yaml
 
 from offboard.analysis import history, tlog
-from offboard.analysis.history import History
-from offboard.analysis.samples import Rows
+from offboard.analysis.history import SETPOINT, Columns, History, Rows, Samples, table
 from offboard.analysis.score import Score, score
+from offboard.analysis.tlog import Tlog
 from offboard.analysis.verdict import begin_times
-from offboard.report.substitutes import completed
+from offboard.model.frames import quaternion_from_euler
+from offboard.model.geodesy import Geodetic, position_ned_m
 
 _PARTS = {"controller": "law", "reference": "shape", "vehicle": "name"}  # key that names each
 _NO_HEARTBEAT = "no HEARTBEAT of an autopilot: no telemetry used"
@@ -66,7 +73,7 @@ def read(path: Path) -> Flight:
     if not len(flown.records):
         missing.append(_NO_RECORDS)
     sent = flown
-    flown, notes = completed(flown, log)
+    flown, notes = _completed(flown, log)
     if flown.damage:
         at = "" if math.isnan(flown.damage_s) else f", at {flown.damage_s:.2f} s of vehicle time"
         notes.append(f"damaged log: {flown.damage}{at}")
@@ -94,3 +101,80 @@ def _configured(text: str | None) -> dict[str, str]:
         return {part: str(document[part][key]) for part, key in _PARTS.items()}
     except (yaml.YAMLError, KeyError, TypeError):
         return {}
+
+
+# ---------------------------------------------------------------------- substitutes
+
+
+def _completed(flown: History, log: Tlog) -> tuple[History, list[str]]:
+    """The history with substitutes for telemetry that it lacks, and a sentence for each thing that
+    was replaced or is missing."""
+    found = {
+        name: Samples(name, columns, unix=name == "ATTITUDE_TARGET")
+        for name, (part, columns, *_) in _SUBSTITUTES.items()
+        if not len(getattr(flown, part))
+    }
+    if not found:
+        return flown, []
+    for entry in log:
+        if entry.name in found and (entry.system_id, entry.component_id) == flown.vehicle:
+            found[entry.name].add(entry.frame.payload, math.nan, math.nan)
+    anchor_ms = 1e3 * next(
+        (rows["time_s"][0] for rows in (flown.attitude, flown.position) if len(rows)), math.nan
+    )
+    used: dict[str, Any] = {}
+    notes = []
+    for name, samples in found.items():
+        part, _, convert, missing, replaced = _SUBSTITUTES[name]
+        rows = samples.rows(anchor_ms)
+        notes.append(replaced if len(rows) else missing)
+        if len(rows):
+            used[part] = convert(rows)
+    return replace(flown, **used), notes
+
+
+def _attitude(rows: Rows) -> Rows:
+    quaternion = quaternion_from_euler(*rows["angles"].astype(np.float64).T)
+    return table(
+        rows["time_s"],
+        quaternion=np.asarray(quaternion, np.float32),
+        rates_radps=rows["rates_radps"],
+    )
+
+
+def _position(rows: Rows) -> Rows:
+    """Relative to the first position. Latitude and longitude in 1e-7 deg, mm, cm/s."""
+    places = rows["place"] / (1e7, 1e7, 1e3)
+    position = position_ned_m(places, Geodetic(*places[0].tolist()))
+    return table(
+        rows["time_s"],
+        position_ned_m=position.astype(np.float32),
+        velocity_ned_mps=(rows["velocity"] / 100.0).astype(np.float32),
+    )
+
+
+# message -> the array of History that it replaces, its columns, their conversion, and what to say
+# without the message and with it
+_SUBSTITUTES: dict[str, tuple[str, Columns, Callable[[Rows], Rows], str, str]] = {
+    "ATTITUDE": (
+        "attitude",
+        {"angles": ("roll", 3), "rates_radps": ("rollspeed", 3)},
+        _attitude,
+        "no attitude (ATTITUDE_QUATERNION, ATTITUDE)",
+        "no ATTITUDE_QUATERNION: the attitude is that of ATTITUDE",
+    ),
+    "GLOBAL_POSITION_INT": (
+        "position",
+        {"place": ("lat", 3), "velocity": ("vx", 3)},
+        _position,
+        "no position (LOCAL_POSITION_NED, GLOBAL_POSITION_INT)",
+        "no LOCAL_POSITION_NED: positions are of GLOBAL_POSITION_INT, relative to the first one",
+    ),
+    "ATTITUDE_TARGET": (
+        "setpoint",
+        SETPOINT,
+        lambda rows: rows,
+        "no setpoints (SET_ATTITUDE_TARGET of offboard, ATTITUDE_TARGET)",
+        "no setpoints of offboard: the commanded attitude is the vehicle's ATTITUDE_TARGET",
+    ),
+}

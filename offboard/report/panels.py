@@ -1,4 +1,4 @@
-"""What the panels of a report show: curves of one flight over vehicle time, in groups."""
+"""What the panels of a report show: a table of curves over vehicle time, in groups."""
 
 from __future__ import annotations
 
@@ -8,33 +8,33 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.analysis.figure import BLUE, GREEN, INK, ORANGE, PINK, PURPLE
 from offboard.analysis.history import History
-from offboard.analysis.samples import Rows, each_once
-from offboard.analysis.tracking import Reference
+from offboard.analysis.page import BLUE, GREEN, INK, ORANGE, PINK, PURPLE
+from offboard.analysis.tracking import Reference, each_once
 from offboard.model.frames import euler_from_quaternion
 
 Array = NDArray[np.float64]
+Points = tuple[Array, ...]  # times and values (N,), and their standard deviations where known
+Source = Callable[[History], Points]
 
 BINS = 1500  # of a curve, see `thinned`
 REFERENCE_GAP_S = 0.5  # without a record of the reference for longer there is none
 LEAST_SHOWN = 1e-16  # of a logarithmic axis: zero is drawn there
 ESTIMATED, TRUE, COMMANDED = "estimated", "true (simulator)", "commanded"
+AXES = (("north", GREEN, "solid"), ("east", PINK, "dash"), ("down", INK, "dot"))
 
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """Values (N,) at vehicle times (N,). `main` curves are also drawn where several flights share a
-    panel. `style`: "line", "steps" or "dots"; dots may have a standard deviation `sd` (N,)."""
+    """A curve of one flight. `main` ones are also drawn where several flights share a panel.
+    `style`: "line", "steps" or "dots"; dots may have a standard deviation."""
 
     name: str
-    times: Array
-    values: Array
+    source: Source
     colour: str
     style: str = "line"
     main: bool = True
     dash: str = "solid"
-    sd: Array | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,170 +42,164 @@ class Panel:
     title: str
     curves: tuple[Curve, ...]
     logarithmic: bool = False
-
-    def shown(self) -> Panel | None:
-        """The panel with the curves that have values; None without any."""
-        curves = tuple(curve for curve in self.curves if np.isfinite(curve.values).any())
-        return Panel(self.title, curves, self.logarithmic) if curves else None
+    caption: str = ""
 
 
-def tracking(flown: History) -> tuple[Panel, ...]:
-    """Distances from the reference, height and speed."""
-    flights = {ESTIMATED: flown.position, TRUE: flown.truth}
-    away = {name: _away(flown, each_once(rows)) for name, rows in flights.items() if len(rows)}
-    colours = {ESTIMATED: BLUE, TRUE: ORANGE}
-    errors = tuple(
-        Curve(name, times, np.linalg.norm(errors, axis=1), colours[name], main=name == ESTIMATED)
-        for name, (times, errors) in away.items()
-    )
-    times, by_axis = away.get(ESTIMATED, (np.zeros(0), np.zeros((0, 3))))
-    components = tuple(
-        Curve(axis, times, by_axis[:, column], colour, main=False, dash=dash)
-        for column, (axis, (colour, dash)) in enumerate(_AXES.items())
-    )
-    heights = tuple(
-        Curve(name, rows["time_s"], _height_m(rows), colours[name], main=name == ESTIMATED)
-        for name, rows in flights.items()
-        if len(rows)
-    )
-    reference = Curve(
-        "reference",
-        flown.reference["time_s"],
-        _height_m(flown.reference),
-        INK,
-        main=False,
-        dash="dash",
-    )
+# ---------------------------------------------------------------------- sources
+
+
+def _column(array: str, column: str, axis: int | None = None, scale: float = 1.0) -> Source:
+    def samples(flown: History) -> Points:
+        rows = getattr(flown, array)
+        values = rows[column] if axis is None else rows[column][:, axis]
+        return rows["time_s"], scale * values
+
+    return samples
+
+
+def _recorded(field: str, scale: float = 1.0) -> Source:
+    return _column("records", field, None, scale)
+
+
+def _above_zero(field: str) -> Source:
+    def samples(flown: History) -> Points:
+        return flown.records["time_s"], np.maximum(flown.records[field], LEAST_SHOWN)
+
+    return samples
+
+
+def _away(array: str, axis: int | None = None) -> Source:
+    """Distance from the reference, or its component along an axis; NaN where there is none."""
+
+    def samples(flown: History) -> Points:
+        rows = each_once(getattr(flown, array))
+        if len(np.unique(flown.reference["time_s"])) < 2:
+            return np.zeros(0), np.zeros(0)
+        near = near_reference(flown, rows["time_s"])
+        expected = Reference(flown.reference).position(rows["time_s"][near])
+        errors = np.full((len(rows), 3), np.nan)
+        errors[near] = rows["position_ned_m"][near] - expected
+        values = np.linalg.norm(errors, axis=1) if axis is None else errors[:, axis]
+        return rows["time_s"], np.asarray(values)
+
+    return samples
+
+
+def _speed(flown: History) -> Points:
     speed = np.linalg.norm(flown.position["velocity_ned_mps"], axis=1)
-    return (
-        Panel("distance from the reference, m", errors),
-        Panel("estimated error by axis, m", components),
-        Panel("height, m", (*heights, reference)),
-        Panel("speed, m/s", (Curve(ESTIMATED, flown.position["time_s"], speed, BLUE),)),
-    )
+    return flown.position["time_s"], np.asarray(speed)
 
 
-def attitude(flown: History) -> tuple[Panel, ...]:
-    """Roll, pitch and heading, commanded and flown."""
-    sent = _euler_deg(flown.setpoint["quaternion"])
-    estimated = _euler_deg(flown.attitude["quaternion"])
-    return tuple(
-        Panel(
-            f"{title}, deg",
-            (
-                Curve(COMMANDED, flown.setpoint["time_s"], sent[:, axis], ORANGE, "steps", False),
-                Curve(ESTIMATED, flown.attitude["time_s"], estimated[:, axis], BLUE),
-            ),
-        )
-        for axis, title in enumerate(("roll", "pitch", "heading"))
-    )
+def _euler_deg(array: str, axis: int) -> Source:
+    """Roll, pitch or heading to 1e-4 deg, with a gap where it wraps."""
+
+    def samples(flown: History) -> Points:
+        rows = getattr(flown, array)
+        radians = np.asarray(euler_from_quaternion(rows["quaternion"])[..., axis], np.float64)
+        angles = np.asarray(np.round(np.degrees(radians), 4), np.float64)
+        angles[1:][np.abs(np.diff(angles)) > 180.0] = np.nan
+        return rows["time_s"], angles
+
+    return samples
 
 
-def thrust(flown: History) -> tuple[Panel, ...]:
-    """Thrust commanded, the hover thrust that the observer estimates, and the battery."""
-    commanded = Curve(
-        COMMANDED, flown.setpoint["time_s"], flown.setpoint["thrust"], ORANGE, "steps"
-    )
-    hover = _recorded(
-        flown, "hover_thrust", "hover thrust, estimated", INK, main=False, dash="dash"
-    )
-    times, battery = flown.battery["time_s"], flown.battery
-    remaining = Curve("remaining", times, battery["remaining"], BLUE, "steps")
-    voltage = Curve("voltage", times, 1e-3 * battery["voltage_mv"], BLUE, "steps")
-    return (
-        Panel("thrust, 0 to 1", (commanded, hover)),
-        Panel("battery, %", (remaining,)),
-        Panel("battery, V", (voltage,)),
-    )
-
-
-def decisions(flown: History) -> tuple[Panel, ...]:
-    """Certificate and time of the decisions."""
-
-    def floored(name: str, label: str) -> Curve:
-        curve = _recorded(flown, name, label, BLUE, "dots")
-        return Curve(label, curve.times, np.maximum(curve.values, LEAST_SHOWN), BLUE, "dots")
-
-    return (
-        Panel("gap: cost above the exact optimum", (floored("gap", "gap"),), logarithmic=True),
-        Panel("spread of the swarm (ε, Eq. 29)", (floored("spread", "spread"),), logarithmic=True),
-        Panel(
-            "solve time, ms", (_recorded(flown, "solve_time_s", "solve time", BLUE, "dots", 1e3),)
-        ),
-    )
-
-
-def link(flown: History) -> tuple[Panel, ...]:
-    """Ages and delays of the link, and intervals of telemetry."""
-    delay = Curve(
-        "delay of the link (TIMESYNC)", flown.link_delay["time_s"],
-        1e3 * flown.link_delay["delay_s"], ORANGE, main=False,
-    )  # fmt: skip
-    age = _recorded(flown, "age_s", "telemetry at its setpoint", BLUE, "dots", 1e3)
-    late = _recorded(
-        flown,
-        "answer_s",
-        "telemetry in to setpoint out (host time)",
-        GREEN,
-        "dots",
-        1e3,
-        main=False,
-    )
+def _intervals_ms(flown: History) -> Points:
     stamps = np.unique(flown.position["time_s"])
-    gaps = Curve("positions", stamps[1:], 1e3 * np.diff(stamps), BLUE, "dots")
-    return (
-        Panel("age and delay, ms", (age, delay, late)),
-        Panel("interval between positions, ms", (gaps,)),
-    )
+    return stamps[1:], 1e3 * np.diff(stamps)
 
 
-def identification(flown: History) -> tuple[Panel, ...]:
-    """What was identified, with its standard deviation, and what the observer estimates."""
+def _identified(constant: str, scale: float = 1.0) -> Source:
+    def samples(flown: History) -> Points:
+        known = flown.identified[np.isfinite(flown.identified[constant][:, 0])]
+        value, sd = scale * known[constant].T
+        return known["time_s"], value, sd
 
-    def found(
-        constant: str, name: str, colour: str, scale: float = 1.0, main: bool = True
-    ) -> Curve:
-        values = flown.identified[constant]
-        known = np.isfinite(values[:, 0])
-        value, sd = scale * values[known].T
-        times = flown.identified["time_s"][known]
-        return Curve(name, times, value, colour, "dots", main, sd=sd)
-
-    hover = _recorded(flown, "hover_thrust", ESTIMATED, PURPLE, main=False)
-    disturbance = tuple(
-        _recorded(flown, f"disturbance_{axis}_mps2", axis, colour, main=False, dash=dash)
-        for axis, (colour, dash) in _AXES.items()
-    )
-    return (
-        Panel(
-            "identified delay, ms",
-            (
-                found("tilt_delay_s", "tilt", BLUE, 1e3),
-                found("yaw_delay_s", "yaw", ORANGE, 1e3, main=False),
-            ),
-        ),
-        Panel(
-            "identified natural frequency, rad/s",
-            (
-                found("tilt_natural_frequency_radps", "tilt", BLUE),
-                found("yaw_natural_frequency_radps", "yaw", ORANGE, main=False),
-            ),
-        ),
-        Panel("hover thrust, 0 to 1", (found("hover_thrust", "identified", INK), hover)),
-        Panel("identified drag, 1/s", (found("drag_ps", "drag", BLUE),)),
-        Panel("estimated disturbance, m/s²", disturbance),
-    )
+    return samples
 
 
-GROUPS: dict[str, tuple[str, Callable[[History], tuple[Panel, ...]]]] = {
-    "tracking": ("Tracking", tracking),
-    "attitude": ("Attitude commanded and flown", attitude),
-    "thrust": ("Thrust and battery", thrust),
-    "decisions": ("Decisions", decisions),
-    "link": ("Link", link),
-    "identification": ("Identified and estimated", identification),
-}
-_AXES = {"north": (GREEN, "solid"), "east": (PINK, "dash"), "down": (INK, "dot")}
+# ---------------------------------------------------------------------- the table
+
+_TILT, _YAW = "tilt_natural_frequency_radps", "yaw_natural_frequency_radps"
+GROUPS: dict[str, tuple[str, tuple[Panel, ...]]] = {
+    "tracking": ("Tracking", (
+        Panel("distance from the reference, m", (
+            Curve(ESTIMATED, _away("position"), BLUE),
+            Curve(TRUE, _away("truth"), ORANGE, main=False),
+        ), caption="The reference is known from the climb to the landing."),
+        Panel("estimated error by axis, m", tuple(
+            Curve(name, _away("position", axis), colour, main=False, dash=dash)
+            for axis, (name, colour, dash) in enumerate(AXES)
+        )),
+        Panel("height, m", (
+            Curve(ESTIMATED, _column("position", "position_ned_m", 2, -1.0), BLUE),
+            Curve(TRUE, _column("truth", "position_ned_m", 2, -1.0), ORANGE, main=False),
+            Curve("reference", _column("reference", "position_ned_m", 2, -1.0), INK, main=False,
+                  dash="dash"),
+        )),
+        Panel("speed, m/s", (Curve(ESTIMATED, _speed, BLUE),)),
+    )),
+    "attitude": ("Attitude commanded and flown", tuple(
+        Panel(f"{title}, deg", (
+            Curve(COMMANDED, _euler_deg("setpoint", axis), ORANGE, "steps", main=False),
+            Curve(ESTIMATED, _euler_deg("attitude", axis), BLUE),
+        ))
+        for axis, title in enumerate(("roll", "pitch", "heading"))
+    )),
+    "thrust": ("Thrust and battery", (
+        Panel("thrust, 0 to 1", (
+            Curve(COMMANDED, _column("setpoint", "thrust"), ORANGE, "steps"),
+            Curve("hover thrust, estimated", _recorded("hover_thrust"), INK, main=False,
+                  dash="dash"),
+        )),
+        Panel("battery, %", (Curve("remaining", _column("battery", "remaining"), BLUE, "steps"),)),
+        Panel("battery, V", (
+            Curve("voltage", _column("battery", "voltage_mv", None, 1e-3), BLUE, "steps"),
+        )),
+    )),
+    "decisions": ("Decisions", (
+        Panel("gap: cost above the exact optimum", (
+            Curve("gap", _above_zero("gap"), BLUE, "dots"),
+        ), logarithmic=True, caption="Zero is drawn at 1e-16. Only decisions that were sent as "
+              "certified have a gap."),
+        Panel("spread of the swarm (ε, Eq. 29)", (
+            Curve("spread", _above_zero("spread"), BLUE, "dots"),
+        ), logarithmic=True),
+        Panel("solve time, ms", (
+            Curve("solve time", _recorded("solve_time_s", 1e3), BLUE, "dots"),
+        )),
+    )),
+    "link": ("Link", (
+        Panel("age and delay, ms", (
+            Curve("telemetry at its setpoint", _recorded("age_s", 1e3), BLUE, "dots"),
+            Curve("delay of the link (TIMESYNC)", _column("link_delay", "delay_s", None, 1e3),
+                  ORANGE, main=False),
+            Curve("telemetry in to setpoint out (host time)", _recorded("answer_s", 1e3), GREEN,
+                  "dots", main=False),
+        )),
+        Panel("interval between positions, ms", (
+            Curve("positions", _intervals_ms, BLUE, "dots"),
+        )),
+    )),
+    "identification": ("Identified and estimated", (
+        Panel("identified delay, ms", (
+            Curve("tilt", _identified("tilt_delay_s", 1e3), BLUE, "dots"),
+            Curve("yaw", _identified("yaw_delay_s", 1e3), ORANGE, "dots", main=False),
+        ), caption="Bars: one standard deviation."),
+        Panel("identified natural frequency, rad/s", (
+            Curve("tilt", _identified(_TILT), BLUE, "dots"),
+            Curve("yaw", _identified(_YAW), ORANGE, "dots", main=False),
+        )),
+        Panel("hover thrust, 0 to 1", (
+            Curve("identified", _identified("hover_thrust"), INK, "dots"),
+            Curve(ESTIMATED, _recorded("hover_thrust"), PURPLE, main=False),
+        )),
+        Panel("identified drag, 1/s", (Curve("drag", _identified("drag_ps"), BLUE, "dots"),)),
+        Panel("estimated disturbance, m/s²", tuple(
+            Curve(name, _recorded(f"disturbance_{name}_mps2"), colour, main=False, dash=dash)
+            for name, colour, dash in AXES
+        )),
+    )),
+}  # fmt: skip
 
 
 def thinned(values: Array, bins: int = BINS) -> NDArray[np.intp]:
@@ -232,34 +226,3 @@ def near_reference(flown: History, times: Array) -> NDArray[np.bool_]:
     before, after = np.clip(place - 1, 0, None), np.clip(place, None, len(stamps) - 1)
     near: NDArray[np.bool_] = inside & (stamps[after] - stamps[before] <= REFERENCE_GAP_S)
     return near
-
-
-def _away(flown: History, rows: Rows) -> tuple[Array, Array]:
-    """Times (N,), and position minus reference (N, 3) in m where there is a reference."""
-    if len(np.unique(flown.reference["time_s"])) < 2:
-        return np.zeros(0), np.zeros((0, 3))
-    times = rows["time_s"]
-    near = near_reference(flown, times)
-    errors = np.full((len(rows), 3), np.nan)
-    errors[near] = rows["position_ned_m"][near] - Reference(flown.reference).position(times[near])
-    return times, errors
-
-
-def _height_m(rows: Rows) -> Array:
-    return np.asarray(-rows["position_ned_m"][:, 2])
-
-
-def _euler_deg(quaternions: Array) -> Array:
-    """Roll, pitch and heading to 1e-4 deg, with a gap where one of them wraps."""
-    angles: Array = np.degrees(euler_from_quaternion(quaternions))
-    angles = np.asarray(np.round(angles, 4), np.float64)
-    angles[1:][np.abs(np.diff(angles, axis=0)) > 180.0] = np.nan
-    return angles
-
-
-def _recorded(
-    flown: History, field: str, name: str, colour: str, style: str = "line", scale: float = 1.0,
-    *, main: bool = True, dash: str = "solid",
-) -> Curve:  # fmt: skip
-    values = scale * flown.records[field]
-    return Curve(name, flown.records["time_s"], values, colour, style, main, dash)

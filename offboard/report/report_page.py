@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from offboard.analysis.page import render
-from offboard.analysis.score import FIGURES
+from offboard.analysis.score import METRICS
 from offboard.analysis.score_table import summary, verdict
 from offboard.report.figures import figures, letter
 from offboard.report.fits import Fits
@@ -64,9 +64,9 @@ def _verdict(place: int, flight: Flight, alone: bool) -> dict[str, object]:
 
 def rows(flights: Sequence[Flight]) -> list[Row]:
     """Every figure that a log holds, for each flight."""
-    scores = [flight.score.figures() for flight in flights]
+    scores = [flight.score.metrics() for flight in flights]
     found = []
-    for name, meta in FIGURES.items():
+    for name, meta in METRICS.items():
         values = [score[name] for score in scores]
         if any(math.isfinite(value) for value in values):
             difference = _difference(values) if len(values) == 2 else ""

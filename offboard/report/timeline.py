@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from offboard.analysis.events import Event
-from offboard.analysis.figure import BLUE_BAND, GREY_BAND, ORANGE_BAND
+from offboard.analysis.history import Event
+from offboard.analysis.page import BLUE_BAND, GREY_BAND, ORANGE_BAND
 from offboard.flight.phases import Phase
 from offboard.flight.setpoint import Refusal
 from offboard.report.flight import Flight

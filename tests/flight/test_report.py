@@ -8,7 +8,6 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +18,7 @@ from pair import Pair, hover
 from typer.testing import CliRunner
 
 from offboard.analysis import tlog
-from offboard.analysis.figure import logarithmic
+from offboard.analysis.page import logarithmic
 from offboard.analysis.score import Score
 from offboard.cli.commands import app
 from offboard.flight.phases import Phase
@@ -251,36 +250,8 @@ def test_the_command_replaces_nothing_and_refuses_what_is_no_log(tmp_path: Path)
     ]  # fmt: skip
 
 
-def test_colours_of_flights_differ_for_colour_blind_people() -> None:
-    """Distance in CIELAB of each pair of the first four, as seen with deuteranopia and protanopia
-    (Viénot, Brettel and Mollon 1999), in the light and in the dark scheme."""
-    from offboard.analysis.figure import DARK
-    from offboard.report.figures import COLOURS
-
-    for scheme in (COLOURS[:4], [DARK[colour] for colour in COLOURS[:4]]):
-        for blind in ("deuteranopia", "protanopia"):
-            seen = [lab(colour, blind) for colour in scheme]
-            for i, one in enumerate(seen):
-                for other in seen[:i]:
-                    assert np.linalg.norm(one - other) > 10.0, (scheme, blind)
-
-
-def lab(colour: str, blind: str) -> Any:
-    """CIELAB of a colour as a dichromat sees it."""
-    values = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) / 255
-    linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
-    lost = {
-        "deuteranopia": [[0.29275, 0.70725, 0], [0.29275, 0.70725, 0], [-0.02234, 0.02234, 1]],
-        "protanopia": [[0.11238, 0.88762, 0], [0.11238, 0.88762, 0], [0.00401, -0.00401, 1]],
-    }[blind]
-    to_xyz = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
-    xyz = np.array(to_xyz) @ (np.array(lost) @ linear) / (0.9505, 1.0, 1.089)
-    f = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116)
-    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
-
-
 def test_the_figures_on_the_page_are_those_of_the_score(flown: tuple[Pair, Path, Score]) -> None:
     _, directory, score = flown
     shown = {row.name: row.values[0] for row in report_page.rows([read(directory)])}
-    finite = {name: v for name, v in score.figures().items() if math.isfinite(v)}
+    finite = {name: v for name, v in score.metrics().items() if math.isfinite(v)}
     assert shown == {name: f"{value:.4g}" for name, value in finite.items()}

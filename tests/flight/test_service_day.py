@@ -26,7 +26,7 @@ from hypothesis import strategies as st
 from service_wire import Wire
 from serving import ARM, PAUSE_CONTINUE, SET_MODE, START, prepared, serve
 
-from offboard.analysis.flight_score import keep_score, score_flight
+from offboard.analysis.score import keep_score, score_flight
 from offboard.flight.phases import TRACKING, WAITING
 from offboard.service.record import ENGAGED, ROLLING_NAMES, UNSCORED, Recorder
 

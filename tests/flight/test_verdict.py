@@ -18,9 +18,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from typer.testing import CliRunner
 
 from offboard.analysis import history, tlog
-from offboard.analysis.flight_score import judged
 from offboard.analysis.history import OUR_COMPONENTS, History
-from offboard.analysis.score import Score, score
+from offboard.analysis.score import Score, judged, score
 from offboard.analysis.score_table import summary, verdict
 from offboard.cli.commands import app
 from offboard.flight.flight import Outcome

@@ -236,7 +236,7 @@ def test_an_infeasible_case_is_a_row_with_its_reason(tmp_path: Path) -> None:
         (("[lqr]", "[lqg]"), "there is no controller named 'lqg'"),
         (("conditions.mass_scale", "conditions.mass"), "conditions.mass is not a known key"),
         (("[4, 5]", "[5, 4]"), "the range [5, 4] is empty"),
-        (("rmse_position_m<", "rmse<"), "there is no figure 'rmse'"),
+        (("rmse_position_m<", "rmse<"), "there is no metric 'rmse'"),
         (("[calm, px4_like]", "[calm, calm]"), "a combination is given twice"),
     ],
 )

@@ -22,7 +22,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.analysis import tlog
-from offboard.analysis.flight_score import as_text, score_flight
+from offboard.analysis.score import as_text, score_flight
 from offboard.documents.signing_key import create_key, read_key
 
 SET_MODE = 176  # MAV_CMD

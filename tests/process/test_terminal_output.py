@@ -20,8 +20,7 @@ from processes import SHORT, Spawn
 from rich.console import Console
 from typer.testing import CliRunner
 
-from offboard.analysis.flight_score import score_flight
-from offboard.analysis.score import FIGURES
+from offboard.analysis.score import METRICS, score_flight
 from offboard.analysis.score_table import show
 from offboard.cli.commands import app as offboard
 from simulator.command import app as simulator
@@ -34,6 +33,7 @@ CODES = {"fly": "0 1 2 3 4 130 141", "daemon": "0 2 3 4", "doctor": "0 2 3", "li
          **dict.fromkeys(("check", "report", "export", "key", "paper"), "0 2"),
          **dict.fromkeys(("score", "identify", "replay"), "0 1 2"),
          **dict.fromkeys(("campaign", "compare", "tune"), "0 1 2 4")}  # fmt: skip
+NAMED = {("fly",): FOLDERS[:4], ("compare",): FOLDERS[:4], "simulator": FOLDERS[2:4]}
 HELP = [(offboard, ()), *((offboard, (command,)) for command in COMMANDS), (simulator, ())]
 
 
@@ -41,37 +41,20 @@ def shipped(folder: str) -> list[Path]:
     return sorted((CONFIG / folder).glob("*.yaml"))
 
 
-@pytest.mark.parametrize("columns", [60, 80])
-def test_help_fits(columns: int) -> None:
+def test_help_fits_and_has_the_exit_codes_and_the_shipped_files() -> None:
     for app, arguments in HELP:
-        answer = CliRunner().invoke(app, [*arguments, "--help"], terminal_width=columns)
-        assert answer.exit_code == 0
-        assert max(map(len, answer.output.splitlines())) <= columns
+        for columns in (60, 80):
+            answer = CliRunner().invoke(app, [*arguments, "--help"], terminal_width=columns)
+            assert answer.exit_code == 0
+            assert max(map(len, answer.output.splitlines())) <= columns
         cut_off = [line for line in answer.output.splitlines()[1:] if line.endswith("...")]
-        assert columns < 80 or not cut_off
-
-
-def test_help_has_the_exit_codes_of_its_command() -> None:
-    for command in COMMANDS:
-        text = CliRunner().invoke(offboard, [command, "--help"], terminal_width=80).output
-        codes = re.findall(r"(?:codes:|;)\s+(\d+)\s", text.partition("Exit")[2])
-        assert " ".join(codes) == CODES[command], command
-
-
-@pytest.mark.parametrize(
-    ("app", "command", "folders"),
-    [
-        (offboard, "fly", FOLDERS[:4]),
-        (offboard, "compare", FOLDERS[:4]),
-        (simulator, "", FOLDERS[2:4]),
-    ],
-    ids=["fly", "compare", "simulator"],
-)
-def test_help_names_every_shipped_file(app: object, command: str, folders: tuple[str, ...]) -> None:
-    arguments = [*command.split(), "--help"]
-    words = CliRunner().invoke(app, arguments).output.replace(",", " ").replace(".", " ").split()  # type: ignore[arg-type]
-    for folder in folders:
-        assert {path.stem for path in shipped(folder)} <= set(words)
+        assert not cut_off
+        if arguments:
+            codes = re.findall(r"(?:codes:|;)\s+(\d+)\s", answer.output.partition("Exit")[2])
+            assert " ".join(codes) == CODES[arguments[0]], arguments
+        words = set(re.split(r"[\s,.]+", answer.output))
+        for folder in NAMED.get(arguments[:1] if app is offboard else "simulator", ()):
+            assert {path.stem for path in shipped(folder)} <= words
 
 
 def test_list_describes_every_shipped_file_in_one_line() -> None:
@@ -90,7 +73,7 @@ def test_a_score_fits(columns: int) -> None:
     lines = text.getvalue().splitlines()
     assert max(map(len, lines)) <= columns
     assert "…" not in text.getvalue()
-    assert max(len(figure["meaning"]) for figure in FIGURES.values()) <= 37  # that fit 80 columns
+    assert max(len(figure["meaning"]) for figure in METRICS.values()) <= 37  # that fit 80 columns
     assert columns < 80 or sum("setpoint_gap_wall_max_s" in line for line in lines) == 1
 
 
@@ -123,18 +106,6 @@ def test_a_piped_flight_prints_its_phases_once_as_they_happen(spawn: Spawn, tmp_
     assert Path(tmp_path / rows[-2].split()[-1]).is_file()
 
 
-def test_a_missed_requirement_is_the_verdict(spawn: Spawn) -> None:
-    process = spawn(
-        "offboard", "fly", "--sitl", "--scenario", "calm", "--out", "x",
-        *SHORT, "--require", "tilt_max_deg<0", COLUMNS="80",
-    )  # fmt: skip
-    told, errors = process.communicate(timeout=60)
-    assert process.returncode == 1
-    assert errors.startswith("flown and landed; requirement missed: tilt_max_deg is ")
-    assert errors.endswith(" (required < 0)\n")
-    assert "  all figures    offboard score x\n" in told
-
-
 def on_a_terminal(tmp_path: Path, *command: str) -> list[str]:
     """The lines that a command prints on a terminal of 80 columns."""
     terminal, theirs = pty.openpty()
@@ -159,7 +130,6 @@ def on_a_terminal(tmp_path: Path, *command: str) -> list[str]:
     ("command", "says"),
     [
         ("offboard fly --reference spiral", "there is no reference named 'spiral'; known are"),
-        ("simulator --scenario storm", "there is no scenario named 'storm'; known are"),
         (
             "simulator --duration 0.1 --connect udpout:127.0.0.1:59999 --gcs none",
             "px4_sih, system 1",

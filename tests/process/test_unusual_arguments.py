@@ -5,10 +5,8 @@ What ends before anything is sent is called in this process; the rest are real p
 
 from __future__ import annotations
 
-import ctypes
 import os
 import resource
-import struct
 import subprocess
 import sys
 from collections.abc import Callable
@@ -40,43 +38,29 @@ def refused(answer: tuple[int, str]) -> str:
     return said
 
 
-VALUES = {
-    "offboard fly": (
-        "--connect", "--config", "--controller", "--reference", "--vehicle", "--out", "--require",
-        "--set", "--scenario", "--sim-vehicle", "--firmware",
-    ),
-    "offboard compare": (
-        "--connect", "--controllers", "--reference", "--scenario", "--vehicle", "--out", "--set",
-    ),
-    "offboard identify": ("--connect", "-o", "--page", "--vehicle", "--out", "FLIGHT"),
-    "offboard score": ("FLIGHT", "--require"),
-    "offboard report": ("FLIGHT...", "-o"),
-    "offboard check": ("FILE...",),
-    "offboard paper": ("--out", "--figure", "--table", "--initial-q"),
-    "simulator": (
-        "--connect", "--gcs", "--firmware", "--scenario", "--vehicle", "--param", "--log",
-        "--check",
-    ),
-}  # fmt: skip
-
-
 @pytest.mark.parametrize(
-    ("value", "says"),
+    ("command", "options"),
     [
-        ("", "the value is empty; is a variable unset?"),
-        (" \t", "the value is empty; is a variable unset?"),
-        (SURROGATE, r"'caf\udce9' is not UTF-8"),
-        ("a\0b", r"'a\x00b' holds a null character"),
+        ("offboard fly", ("--connect", "--config", "--out", "--require", "--set", "--firmware")),
+        ("offboard compare", ("--controllers", "--scenario")),
+        ("offboard identify", ("--page", "FLIGHT")),
+        ("offboard report", ("FLIGHT...", "--output")),
+        ("offboard paper", ("--figure", "--initial-q")),
+        ("simulator", ("--connect", "--param", "--log", "--check")),
     ],
 )
-@pytest.mark.parametrize("command", VALUES)
 def test_a_value_that_is_no_text_is_refused(
-    value: str, says: str, command: str, call: Call, tmp_path: Path
+    command: str, options: tuple[str, ...], call: Call, tmp_path: Path
 ) -> None:
-    for option in VALUES[command]:
-        given = (option, value) if option.startswith("-") else (value,)
-        label = "--output" if option == "-o" else option
-        assert refused(call(command, *given)) == f"{label}: {says}\n"
+    refusals = {
+        "": "the value is empty; is a variable unset?",
+        " \t": "the value is empty; is a variable unset?",
+        SURROGATE: r"'caf\udce9' is not UTF-8",
+    }
+    for option in options:
+        for value, says in refusals.items():
+            given = (option, value) if option.startswith("-") else (value,)
+            assert refused(call(command, *given)) == f"{option}: {says}\n"
     assert not list(tmp_path.iterdir())
 
 
@@ -90,43 +74,24 @@ def test_an_option_is_no_value_of_the_one_before_it(call: Call, tmp_path: Path) 
     ("command", "arguments"),
     [
         ("offboard fly", (*LINK, "--config", LONG)),
-        ("offboard fly", (*LINK, "--vehicle", f"{LONG}.yaml")),
-        ("offboard fly", (*LINK, "--controller", LONG)),
         ("offboard fly", (*LINK, "--reference", f"{LONG}.csv")),
-        ("offboard fly", (*LINK, "--set", f"vehicle={LONG}/x")),
         ("offboard fly", (*LINK, "--out", LONG)),
         ("offboard fly", (*LINK, "--set", 'vehicle="a\\0/b"')),
-        ("offboard fly", (*LINK, "--set", 'reference={shape: table, file: "a\\0b"}')),
         ("offboard fly", (*LINK, "--set", 'vehicle.name="\\ud800"')),
         ("offboard fly", (*LINK, "--set", f"controller.{5000 * '9'}=1")),
-        ("offboard fly", (*LINK, "--set", "a..b=1")),
         ("offboard fly", (*LINK, "--seed", 5000 * "9")),
         ("offboard fly", ("--connect", f"udpin:127.0.0.1:{5000 * '9'}")),
         ("offboard fly", ("--connect", "udpin:127.0.0.1:²")),
         ("offboard fly", ("--connect", "udpin:a..b:14540")),
-        ("offboard fly", ("--connect", f"udpin:{LONG}:14540")),
         ("offboard fly", ("--connect", "serial:/dev/null:9999999999")),
-        ("offboard compare", ("--controllers", LONG)),
-        ("offboard compare", ("--controllers", "lqr", "--scenario", f"{LONG}.yaml")),
         ("offboard compare", ("--controllers", "lqr", "--scenario", "calm", "--out", LONG)),
         ("offboard score", (LONG,)),
-        ("offboard check", (f"{LONG}.yaml",)),
-        ("offboard check", (f"{LONG}.csv",)),
-        ("offboard identify", (LONG,)),
-        ("offboard identify", (RECORDING, "--page", LONG)),
         ("offboard identify", (RECORDING, "-o", f"nowhere/{LONG}")),
-        ("offboard report", (RECORDING, LONG, "-o", "x.html")),
         ("offboard report", (RECORDING, "-o", LONG)),
-        ("offboard fly", ("--sitl", "--live", "127.0.0.1:²")),
-        ("offboard paper", ("--quick", "--table", "2", "--out", LONG)),
         ("simulator", ("--scenario", f"{LONG}.yaml")),
-        ("simulator", ("--vehicle", f"{LONG}.yaml")),
-        ("simulator", ("--check", f"{LONG}.yaml")),
         ("simulator", ("--log", "/dev/full", "--duration", "0.1", "--gcs", "none")),
-        ("simulator", ("--connect", f"udpin:127.0.0.1:{5000 * '9'}")),
         ("simulator", ("--connect", "udpin:a..b:14540")),
         ("simulator", ("--duration", "nan")),
-        ("simulator", ("--patience", "nan", "--lockstep")),
     ],
 )
 def test_a_name_or_number_beyond_every_limit_is_refused(
@@ -139,13 +104,13 @@ def test_a_name_or_number_beyond_every_limit_is_refused(
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", ["flight.yaml", "flight.tlog", "score.json"])
-def test_a_directory_with_a_flight_is_left_as_it_is(name: str, call: Call, tmp_path: Path) -> None:
-    (tmp_path / "x").mkdir()
-    (tmp_path / "x" / name).write_text("precious")
-    said = refused(call("offboard fly", *LINK, "--out", "x"))
-    assert said.startswith(f"x/{name} exists: the directory already holds a flight; choose another")
-    assert [path.read_text() for path in (tmp_path / "x").iterdir()] == ["precious"]
+def test_a_directory_with_a_flight_is_left_as_it_is(call: Call, tmp_path: Path) -> None:
+    for name in ("flight.yaml", "flight.tlog", "score.json"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / name).write_text("precious")
+        said = refused(call("offboard fly", *LINK, "--out", name))
+        assert said.startswith(f"{name}/{name} exists: the directory already holds a flight;")
+        assert [path.read_text() for path in (tmp_path / name).iterdir()] == ["precious"]
 
 
 @pytest.mark.parametrize(
@@ -153,11 +118,9 @@ def test_a_directory_with_a_flight_is_left_as_it_is(name: str, call: Call, tmp_p
     [
         ("offboard paper --quick --table 2 --out x", "is not empty; choose another"),
         (f"offboard identify {RECORDING} --page x/old", "x/old exists already; choose another"),
-        (f"offboard identify {RECORDING} -o x/old", "x/old exists already; choose another file"),
         (f"offboard identify {RECORDING} -o new --page new", "-o and --page are both new"),
         (f"offboard identify {RECORDING} -o y/new", "-o y/new: there is no directory y"),
         (f"offboard identify {RECORDING} --out x", "a log needs no --system, --signing-key or"),
-        (f"offboard report {RECORDING} -o x/old", "x/old exists already; choose another file"),
         ("simulator --log x/old --duration 0.1 --gcs none", "--log x/old cannot be written: File"),
     ],
 )
@@ -191,37 +154,20 @@ FILES: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("kind", FILES)
-@pytest.mark.parametrize(
-    "command",
-    [
-        "offboard check x.yaml",
-        "offboard check x.csv",
-        "offboard fly --connect udpin:127.0.0.1:PORT --config x.yaml",
-        "offboard fly --connect udpin:127.0.0.1:PORT --reference x.csv",
-        "offboard fly --sitl --scenario x.yaml",
-        "offboard compare --controllers x.yaml",
-        "simulator --check x.yaml",
-        "simulator --vehicle x.yaml",
-    ],
-)
+@pytest.mark.parametrize("command", ["offboard check", "simulator --vehicle"])
 def test_only_regular_files_of_a_bounded_size_are_read(
     kind: str, command: str, call: Call, tmp_path: Path
 ) -> None:
-    name = "x.csv" if "x.csv" in command else "x.yaml"
-    FILES[kind](tmp_path / name)
-    said = refused(call(command.split()[0], *command.split()[1:]))
+    FILES[kind](tmp_path / "x.yaml")
+    said = refused(call(*command.split(), "x.yaml"))
     reason = kind if kind.startswith("larger") else "not a regular file"
-    assert f"{name} cannot be read: {reason}" in said
+    assert f"x.yaml cannot be read: {reason}" in said
 
 
-@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("/dev/zero")])
-@pytest.mark.parametrize("command", ["score", "identify"])
-def test_only_a_regular_file_is_a_log(
-    command: str, make: Callable[[Path], object], call: Call, tmp_path: Path
-) -> None:
-    make(tmp_path / "x.tlog")
+def test_only_a_regular_file_is_a_log(call: Call, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "x.tlog")
     assert "x.tlog is not a regular file; name a flight directory or a .tlog file" in refused(
-        call(f"offboard {command}", "x.tlog")
+        call("offboard score", "x.tlog")
     )
 
 
@@ -259,11 +205,6 @@ def test_of_many_errors_the_first_ten_are_printed(call: Call, tmp_path: Path) ->
             "limits.radius_m (1.5 m); fly nearer or raise the limit",
         ),
         (
-            ("--set", "reference.height_m=40", "--set", "limits.ceiling_m=30"),
-            "reference lemniscate: it goes 40 m above the take-off point, beyond limits.ceiling_m "
-            "(30 m); fly nearer or raise the limit",
-        ),
-        (
             ("--set", "vehicle.hover_thrust=0.92"),
             "vehicle neutral: hover_thrust 0.92 exceeds limits.hover_thrust (0.9), beyond "
             "which a flight is ended; carry less or raise the limit",
@@ -279,12 +220,6 @@ def test_what_cannot_be_flown_to_its_end_is_refused(
 ) -> None:
     assert says in refused(call("offboard fly", *LINK, *arguments))
     assert not list(tmp_path.iterdir())
-
-
-def test_a_height_with_the_time_to_land_is_flown(call: Call, tmp_path: Path) -> None:
-    high = ("--set", "reference.height_m=100", "--set", "limits.land_s=201")
-    code, said = call("offboard fly", *LINK, *high, "--out", "x")
-    assert (code, "no vehicle heard" in said) == (3, True)
 
 
 def test_a_comparison_on_a_full_disk_says_what_cannot_be_written(
@@ -323,9 +258,7 @@ CLOSED = "import os; r, w = os.pipe(); os.close(r); os.dup2(w, 1)"
 SCORE = f"offboard score {RECORDING}"
 
 
-@pytest.mark.parametrize(
-    "command", ["offboard list", "offboard --version", SCORE, f"{SCORE} --json"]
-)
+@pytest.mark.parametrize("command", ["offboard list", f"{SCORE} --json"])
 def test_a_full_disk_behind_the_output_is_one_sentence(
     command: str, call: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -336,9 +269,8 @@ def test_a_full_disk_behind_the_output_is_one_sentence(
     assert said == "the output cannot be written: No space left on device\n"
 
 
-@pytest.mark.parametrize("command", ["offboard list", SCORE])
-def test_a_pipe_that_nobody_reads_is_no_missed_requirement(command: str, tmp_path: Path) -> None:
-    ended = process(command, tmp_path, CLOSED)
+def test_a_pipe_that_nobody_reads_is_no_missed_requirement(tmp_path: Path) -> None:
+    ended = process(SCORE, tmp_path, CLOSED)
     assert (ended.returncode, ended.stderr) == (141, "")
 
 
@@ -353,63 +285,22 @@ def test_a_page_on_a_full_disk_leaves_no_file(call: Call, tmp_path: Path) -> Non
     assert not list(tmp_path.iterdir())
 
 
-def capabilities(effective: int) -> None:
-    """Set the effective capabilities of this thread; all stay permitted."""
-    header, words = struct.pack("Ii", 0x20080522, 0), (effective & 0xFFFFFFFF, effective >> 32)
-    permitted = struct.unpack("6I", capabilities_now())[1::3]
-    data = struct.pack("6I", words[0], permitted[0], 0, words[1], permitted[1], 0)
-    assert not ctypes.CDLL(None).capset(header, data)
-
-
-def capabilities_now() -> bytes:
-    data = ctypes.create_string_buffer(24)
-    assert not ctypes.CDLL(None).capget(struct.pack("Ii", 0x20080522, 0), data)
-    return data.raw
-
-
-@pytest.mark.skipif(os.getuid() != 0, reason="only root can become a user without rights")
-@pytest.mark.parametrize(
-    ("command", "place"),
-    [
-        ("offboard fly --connect udpin:127.0.0.1:PORT --out locked/x", "locked/x"),
-        ("offboard fly --connect udpin:127.0.0.1:PORT --vehicle locked/x.yaml", "locked/x.yaml"),
-        ("offboard score locked/x", "locked/x"),
-        ("offboard identify locked/x -o y", "locked/x"),
-        ("simulator --check locked/x.yaml", "locked/x.yaml"),
-    ],
-)
-def test_a_folder_that_cannot_be_searched(
-    command: str, place: str, call: Call, tmp_path: Path
-) -> None:
-    (tmp_path / "locked").mkdir(mode=0)
-    words = struct.unpack("6I", capabilities_now())
-    before = words[0] | words[3] << 32
-    capabilities(before & ~0b110)  # without CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH
-    try:
-        said = refused(call(command.split()[0], *command.split()[1:]))
-    finally:
-        capabilities(before)
-    assert place in said
-    assert "Permission denied" in said
-
-
-@pytest.mark.parametrize("module", ["offboard", "simulator"])
-def test_an_interrupt_during_the_imports_is_one_sentence(module: str, tmp_path: Path) -> None:
+def test_an_interrupt_during_the_imports_is_one_sentence(tmp_path: Path) -> None:
     """The signal is raised by an import, the first once `main` has been called."""
     begin = """
 import builtins, signal
 signal.signal(signal.SIGINT, signal.default_int_handler)
-import {module}.cli
+import offboard.cli
 count, real = 0, builtins.__import__
 def imported(*arguments, **named):
     global count
     count += 1
-    if count == {at}:
+    if count == 100:
         signal.raise_signal(signal.SIGINT)
     return real(*arguments, **named)
 builtins.__import__ = imported
 """
-    ended = process(f"{module} --help", tmp_path, begin.format(module=module, at=100))
+    ended = process("offboard --help", tmp_path, begin)
     assert (ended.returncode, ended.stderr) == (130, "interrupted\n")
 
 
@@ -417,8 +308,8 @@ def test_an_interrupted_score_is_one_sentence(tmp_path: Path) -> None:
     begin = """
 import signal
 signal.signal(signal.SIGINT, signal.default_int_handler)
-from offboard.analysis import flight_score
-flight_score.score_flight = lambda flight: signal.raise_signal(signal.SIGINT)
+from offboard.analysis import score
+score.score_flight = lambda flight: signal.raise_signal(signal.SIGINT)
 """
     ended = process(SCORE, tmp_path, begin)
     assert (ended.returncode, ended.stderr) == (130, "interrupted\n")

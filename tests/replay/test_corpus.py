@@ -9,8 +9,7 @@ from __future__ import annotations
 import pytest
 from corpus import expected, names, replayed, unpacked, write_expected
 
-from offboard.replay.difference import compare
-from offboard.replay.verdict import explained
+from offboard.replay.difference import compare, explained
 
 
 @pytest.mark.parametrize("name", names())

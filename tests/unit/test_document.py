@@ -73,27 +73,13 @@ def test_the_vehicles_we_ship_are_valid(path: Path) -> None:
     assert parse(path.read_text(), Vehicle, path.name).name == path.stem
 
 
-@pytest.mark.parametrize(
-    ("text", "number"),
-    [
-        ("1e-3", 1e-3),
-        ("1E3", 1000.0),
-        ("-2.5e+1", -25.0),
-        (".5", 0.5),
-        ("3.", 3.0),
-        ("7", 7.0),
-        ("+4", 4.0),
-        ("010", 10.0),
-        ("0x10", 16.0),
-    ],
-)
-def test_numbers_are_those_of_yaml_1_2(text: str, number: float) -> None:
-    assert parse(f"title: a\ntilt_rad: {text}", Drawing, "d.yaml").tilt_rad == number
-
-
-@pytest.mark.parametrize("text", ["no", "12:30", "off", "'1'", '"true"', "a:b"])
-def test_words_stay_text(text: str) -> None:
-    assert parse(f"title: {text}", Drawing, "d.yaml").title == text.strip("'\"")
+def test_scalars_are_those_of_yaml_1_2() -> None:
+    numbers = {"1e-3": 1e-3, "1E3": 1e3, "-2.5e+1": -25.0, ".5": 0.5, "3.": 3.0, "010": 10.0,
+               "0x10": 16.0}  # fmt: skip
+    for text, number in numbers.items():
+        assert parse(f"title: a\ntilt_rad: {text}", Drawing, "d.yaml").tilt_rad == number
+    for text in ("no", "12:30", "off", "'1'", '"true"', "a:b"):
+        assert parse(f"title: {text}", Drawing, "d.yaml").title == text.strip("'\"")
 
 
 def test_lists_become_tuples_text_an_enum_and_tags_choose_the_model() -> None:
@@ -114,31 +100,21 @@ def test_lists_become_tuples_text_an_enum_and_tags_choose_the_model() -> None:
     ("text", "sentences"),
     [
         ("scale: -1", ["scale: -1 should be greater than 0"]),
-        ("scale: 10.0", ["scale: 10.0 should be less than 10"]),
         ("scale: big", ["scale: 'big' should be a valid number"]),
-        ("scale: '2'", ["scale: '2' should be a valid number"]),
         ("scale: true", ["scale: true should be a valid number"]),
         ("scale:", ["scale: an empty value should be a valid number"]),
-        ("scale: .inf", ["scale: inf should be a finite number"]),
-        ("tilt_rad: .nan", ["tilt_rad: nan should be a finite number"]),
         ("tilt_rad: 1e999", ["tilt_rad: inf should be a finite number"]),
         ("visible: 1", ["visible: 1 should be a valid boolean"]),
         ("colour: green", ["colour: 'green' should be 'red' or 'blue'"]),
         ("corner: [1, x]", ["corner.1: 'x' should be a valid number"]),
-        ("corner: 3", ["corner: 3 should be a valid array"]),
         (
             "shape: {kind: line, points: 2.5}",
             ["shape.points: 2.5 should be a valid integer"],
         ),
         ("shape: {kind: square}", ["shape.kind: 'square' is not one of 'circle', 'line'"]),
-        ("shape: {points: 3}", ["shape.kind is missing"]),
         (
             "circles: [{kind: circle, radius_m: 1}, {kind: circle, radius_m: 0}]",
             ["circles.1.radius_m: 0 should be greater than 0"],
-        ),
-        (
-            "named: {sun: {kind: circle}}",
-            ["named.sun.radius_m is missing"],
         ),
         (
             "shape: {kind: line, point: 3}",
@@ -154,7 +130,6 @@ def test_lists_become_tuples_text_an_enum_and_tags_choose_the_model() -> None:
                 " shape, tilt_rad, title, visible)"
             ],
         ),
-        ("copies: 0", ["copies: 0 should be greater than or equal to 1"]),
         ("copies: [x]", ["copies.0: 'x' should be a valid integer"]),
         ("colour: blue\ntilt_rad: 1", ["a blue drawing is not tilted"]),
         (
@@ -177,7 +152,6 @@ def test_each_problem_is_one_sentence(text: str, sentences: list[str]) -> None:
     ("text", "place"),
     [
         ("title: x\nscale: -1", "d.yaml, line 2, column 1: scale: -1"),
-        ("title: x\nshape:\n  kind: line\n  points: 2.5", "d.yaml, line 4, column 3: shape.points"),
         ("title: x\ncorner: [1, x]", "d.yaml, line 2, column 1: corner.1"),
         (
             "title: x\ncircles: [{kind: circle, radius_m: 0}]",
@@ -190,10 +164,6 @@ def test_each_problem_is_one_sentence(text: str, sentences: list[str]) -> None:
 def test_a_problem_names_line_and_column_of_its_key(text: str, place: str) -> None:
     (problem,) = problems(text)
     assert problem.startswith(place)
-
-
-def test_a_missing_key_is_named() -> None:
-    assert problems("") == ("d.yaml: title is missing",)
 
 
 def test_a_description_is_read_and_is_no_part_of_the_value() -> None:
@@ -213,18 +183,9 @@ def test_a_description_is_read_and_is_no_part_of_the_value() -> None:
         ("title: [1", "d.yaml, line 1, column 10: expected ',' or ']', but got '<stream end>'"),
         ("title: x\n a: b: c", "d.yaml, line 2, column 3: mapping values are not allowed here"),
         ("title: x\ntitle: y", "d.yaml, line 2, column 1: the key 'title' is given twice"),
-        (
-            "named:\n  a: {kind: circle, kind: line}",
-            "d.yaml, line 2, column 21: the key 'kind' is given twice",
-        ),
         ("- a\n- b", "d.yaml: expected a mapping of keys to values, not ['a', 'b']"),
-        ("just text", "d.yaml: expected a mapping of keys to values, not 'just text'"),
         (
             "title: &t x\ncolour: *t",
-            "d.yaml, line 1, column 8: a value is used twice: aliases are not allowed",
-        ),
-        (
-            "title: &t [*t]",
             "d.yaml, line 1, column 8: a value is used twice: aliases are not allowed",
         ),
         ("title: !!python/name:os.system x", "d.yaml, line 1, column 8: tags are not allowed"),
@@ -260,11 +221,9 @@ def test_override_keeps_an_equals_sign_in_the_value() -> None:
             "--set: scal is not a known key, did you mean scale? (known keys: circles, colour,"
             " copies, corner, named, scale, shape, tilt_rad, title, visible)",
         ),
-        ("scale.x=2", "--set: scale: {'x': 2} should be a valid number"),
         ("corner.5=2", "--set: corner: {'5': 2} should be a valid array"),
         ("scale=12", "--set: scale: 12 should be less than 10"),
         ("scale", "--set scale: expected key.path=value"),
-        ("=3", "--set =3: expected key.path=value"),
         ("a..b=3", "--set a..b=3: expected key.path=value"),
         (
             "scale=[",

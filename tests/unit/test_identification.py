@@ -10,7 +10,7 @@ from scipy import signal
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from offboard.analysis.estimator_noise import estimator_noise
+from offboard.analysis.identify import estimator_noise
 from offboard.identification import attitude_fit
 from offboard.identification.attitude_fit import ResponseFit
 from offboard.identification.motion_fit import Motion, Noise, PositionFilter, predicted_velocity

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from scipy.linalg import solve_discrete_are
 
-from offboard.analysis.figure import Figure
+from offboard.analysis.page import Figure
 from offboard.control.swarm import certify
 from offboard.documents.errors import UserError
 from offboard.paper import closed_loop, errata, horizon, printed, study, tables

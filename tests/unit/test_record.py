@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
 
 from offboard.control.base import Certificate, Decision
 from offboard.flight.phases import Phase
-from offboard.flight.record import RECORD_ID, Decided, Tick, TickRecord, records_of
+from offboard.flight.record import Decided, Tick, TickRecord
 from offboard.flight.setpoint import Refusal
 from offboard.model.command import Command
 from offboard.model.predicted_state import PredictedState
@@ -51,15 +50,3 @@ def test_the_certificate_is_of_what_was_sent() -> None:
     withheld = record(None, refused=Refusal.STALE | Refusal.LATE)
     assert np.isnan([*certificate(withheld), withheld.thrust_mps2, withheld.heading_rad]).all()
     assert withheld.refused == 3.0
-
-
-def test_a_record_of_an_older_log_has_no_age() -> None:
-    """The wire fills what a record does not use with zeros."""
-    written = record(COMMAND, Tick(5.0, other_datagrams=4), age_s=0.03, refused=Refusal.LATE).data()
-    counts = {1: 28, RECORD_ID: RECORD_ID}  # of fields, by array_id: the oldest and the newest
-    rows = [(*written[:count], *(0.0,) * (58 - count)) for count in counts.values()]
-    old, new = records_of(np.array(rows), np.array(list(counts)))
-    assert (old["seed_cost"], new["seed_cost"], old["phase"]) == (3.0, 3.0, 8.0)
-    assert math.isnan(old["age_s"])
-    assert (old["refused"], old["other_datagrams"]) == (0.0, 0.0)
-    assert (new["age_s"], new["refused"], new["other_datagrams"]) == (0.03, 1.0, 4.0)

@@ -1,17 +1,18 @@
-"""A .tlog read by columns against pymavlink, message by message, and with damage in it."""
+"""A .tlog against pymavlink, message by message, its columns, and damage in it."""
 
 from __future__ import annotations
 
 import itertools
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from pymavlink import mavutil
+from pymavlink.dialects.v20 import all as mavlink
 
 from offboard.analysis import history, tlog
+from offboard.flight.record import FIELDS, RECORD_COMPONENT_ID
 
 RECORDINGS = Path(__file__).parents[1] / "wire" / "recordings"
 PX4, ARDUCOPTER = (
@@ -19,31 +20,47 @@ PX4, ARDUCOPTER = (
 )
 
 
-@pytest.mark.parametrize(
-    ("path", "names"),
-    [
-        (PX4, "LOCAL_POSITION_NED ATTITUDE_QUATERNION SET_ATTITUDE_TARGET HOME_POSITION"),
-        (ARDUCOPTER, "LOCAL_POSITION_NED GLOBAL_POSITION_INT SET_ATTITUDE_TARGET"),
-    ],
-)
-def test_columns_are_what_pymavlink_decodes(path: Path, names: str) -> None:
-    theirs = mavutil.mavlogfile(str(path))
-    decoded: dict[str, list[Any]] = {name: [] for name in names.split()}
-    while (message := theirs.recv_match(type=list(decoded))) is not None:
-        decoded[message.get_type()].append(message)
-    log = tlog.read(path)
-    for name, messages in decoded.items():
-        ours = [entry for entry in log if entry.name == name]
-        assert len(ours) == len(messages) > 1
-        size = tlog.layout(name).itemsize
-        payloads = b"".join(entry.frame.payload[:size].ljust(size, b"\0") for entry in ours)
-        for field in messages[0].get_fieldnames():
-            expected = np.array([np.ravel(getattr(message, field)) for message in messages])
-            assert np.array_equal(tlog.columns(name, payloads, field), expected, equal_nan=True)
+@pytest.mark.parametrize("path", [PX4, ARDUCOPTER])
+def test_the_layout_of_every_message_is_pymavlinks(path: Path) -> None:
+    for entry in tlog.read(path):
+        if entry.name.startswith("UNKNOWN"):
+            continue
+        message, kind = entry.message, tlog.layout(entry.name)
+        payload = entry.frame.payload[: kind.itemsize].ljust(kind.itemsize, b"\0")
+        (row,) = np.frombuffer(payload, kind)
+        for field in message.get_fieldnames():
+            if not isinstance(expected := getattr(message, field), str):
+                assert np.array_equal(row[field], expected, equal_nan=True), (entry.name, field)
 
 
-def test_no_message_gives_no_row_of_the_right_width() -> None:
-    assert tlog.columns("SET_ATTITUDE_TARGET", b"", "time_boot_ms q thrust").shape == (0, 6)
+def test_columns_are_what_pymavlink_decodes() -> None:
+    theirs = mavutil.mavlogfile(str(PX4))
+    messages = []
+    while message := theirs.recv_match(type="LOCAL_POSITION_NED"):
+        messages.append([message.time_boot_ms, message.x, message.y, message.z])
+    stamps_ms, *position = np.array(messages).T
+    rows = history.gather(tlog.read(PX4)).position
+    np.testing.assert_allclose(rows["time_s"], stamps_ms / 1e3, rtol=1e-12)
+    np.testing.assert_array_equal(rows["position_ned_m"], np.stack(position, axis=1))
+
+
+def test_what_a_record_of_an_older_version_lacks_has_its_default(tmp_path: Path) -> None:
+    """MAVLink fills what a record does not use with zeros."""
+    codec = mavlink.MAVLink(None, 1, RECORD_COMPONENT_ID)
+    frames = [
+        mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 4, 3).pack(mavlink.MAVLink(None, 1, 1))
+    ]
+    for count in (28, len(FIELDS)):
+        data = [float(place < count) for place in range(58)]
+        record = mavlink.MAVLink_debug_float_array_message(5_000_000, b"pso", count, data)
+        frames.append(record.pack(codec))
+    path = tmp_path / "old.tlog"
+    path.write_bytes(b"".join((10**15 + i).to_bytes(8, "big") + f for i, f in enumerate(frames)))
+    old, new = history.gather(tlog.read(path)).records
+    assert (old["time_s"], old["seed_cost"], new["seed_cost"]) == (5.0, 1.0, 1.0)
+    assert math.isnan(old["age_s"])
+    assert (old["refused"], old["pause_s"]) == (0.0, 0.0)
+    assert (new["age_s"], new["refused"]) == (1.0, 1.0)
 
 
 def damaged(path: Path, data: bytes) -> tlog.Tlog:
@@ -57,18 +74,16 @@ def places(log: tlog.Tlog) -> list[int]:
 
 
 @pytest.mark.parametrize(
-    ("offset", "byte", "lost"),
+    ("offset", "byte"),
     [
-        (8 + 12, 0x40, 1),  # payload
-        (0, 0x7F, 1),  # time stamp
-        (8, 0x55, 1),  # first byte of the frame
-        (9, 0xFF, 1),  # length: the frame seems to reach into the next entries
-        (9, 0x01, 1),
+        (8 + 12, 0x40),  # payload
+        (0, 0x7F),  # time stamp
+        (8, 0x55),  # first byte of the frame
+        (9, 0xFF),  # length: the frame seems to reach into the next entries
+        (9, 0x01),
     ],
 )
-def test_a_damaged_entry_is_skipped_and_counted(
-    offset: int, byte: int, lost: int, tmp_path: Path
-) -> None:
+def test_a_damaged_entry_is_skipped_and_counted(offset: int, byte: int, tmp_path: Path) -> None:
     """The first entry, one in the middle, and the last but one."""
     data, whole = PX4.read_bytes(), tlog.read(PX4)
     messages, at = tuple(whole), places(whole)
@@ -76,7 +91,7 @@ def test_a_damaged_entry_is_skipped_and_counted(
         changed = bytearray(data)
         changed[at[number] + offset] ^= byte
         log = damaged(tmp_path / "x.tlog", bytes(changed))
-        assert tuple(log) == (*messages[:number], *messages[number + lost :])
+        assert tuple(log) == (*messages[:number], *messages[number + 1 :])
         assert (log.damaged, log.first_damage, log.truncated) == (1, at[number], 0)
         assert log.damage.endswith(f"1 damaged entry was skipped, the first at byte {at[number]}")
 
