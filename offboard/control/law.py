@@ -52,9 +52,8 @@ from offboard.control.gains import (
 )
 from offboard.control.quadratic import BoxQuadratic
 from offboard.model.axes import lead
-from offboard.model.command import Command
+from offboard.model.command import Command, PredictedHeave, PredictedState
 from offboard.model.frames import wrap_pi
-from offboard.model.predicted_state import PredictedHeave, PredictedState
 from offboard.model.vehicle import DelayUncertainty, Vehicle
 from offboard.reference.base import Reference
 from offboard.reference.flatness import flat_state

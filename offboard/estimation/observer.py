@@ -65,13 +65,12 @@ from offboard.estimation.propagation import (
     wrapped,
 )
 from offboard.model.axes import acceleration, b_z_of, lateral_model
-from offboard.model.command import Command
+from offboard.model.command import Command, PredictedHeave, PredictedState
 from offboard.model.frames import (
     heading_from_quaternion,
     thrust_direction_from_quaternion,
     wrap_pi,
 )
-from offboard.model.predicted_state import PredictedHeave, PredictedState
 from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]

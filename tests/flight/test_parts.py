@@ -21,8 +21,7 @@ from offboard.mavlink.dialects.ardupilot import ARDUPILOT
 from offboard.mavlink.dialects.px4 import PX4
 from offboard.mavlink.events import Attitude, LocalPosition, SystemHealth
 from offboard.mavlink.outgoing import CommandLong
-from offboard.model.command import Command
-from offboard.model.predicted_state import PredictedState
+from offboard.model.command import Command, PredictedState
 from offboard.model.vehicle import Vehicle
 from offboard.reference.transfer import Hold
 from offboard.run import configuration as config

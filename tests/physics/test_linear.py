@@ -7,11 +7,10 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import expm
 
-from offboard.model.linear import hover_matrices, sampled_matrices
-from offboard.model.rigid_body import RK4_SCRATCH_ROWS, derivative, hover_input, pack
-from offboard.model.state import (
+from offboard.model.rigid_body import (
     PHI,
     PSI,
+    RK4_SCRATCH_ROWS,
     TAU_X,
     TAU_Y,
     TAU_Z,
@@ -25,6 +24,11 @@ from offboard.model.state import (
     W,
     X,
     Z,
+    derivative,
+    hover_input,
+    hover_matrices,
+    pack,
+    sampled_matrices,
 )
 from offboard.model.vehicle import Vehicle
 from offboard.paper.plant import follow

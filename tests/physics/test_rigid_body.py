@@ -13,14 +13,18 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from offboard.model.rigid_body import (
+    EULER,
+    QUATERNION,
     RK4_SCRATCH_ROWS,
+    Chart,
     derivative,
     derivative_into,
+    euler_state,
     hover_input,
     pack,
+    quaternion_state,
     rk4_into,
 )
-from offboard.model.state import EULER, QUATERNION, Chart, euler_state, quaternion_state
 from offboard.model.vehicle import Vehicle
 from offboard.paper.plant import follow
 

@@ -11,8 +11,7 @@ from offboard.control.base import Controller
 from offboard.control.catalogue import names, settings_of
 from offboard.control.lqr import LqrLaw, LqrSettings
 from offboard.control.pso import PsoLaw, PsoSettings
-from offboard.model.command import Command
-from offboard.model.predicted_state import PredictedState
+from offboard.model.command import Command, PredictedState
 from offboard.model.vehicle import AxisResponse, Vehicle
 
 G = 9.80665

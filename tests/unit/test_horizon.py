@@ -18,8 +18,7 @@ from offboard.control.horizon.plant import STATE_SIZE, B, P, T, V, W, Z
 from offboard.control.horizon.search import Evaluator, Plan, swarm
 from offboard.control.mpc import MpcLaw, MpcSettings
 from offboard.control.swarm import SwarmSettings
-from offboard.model.command import Command
-from offboard.model.predicted_state import PredictedState
+from offboard.model.command import Command, PredictedState
 from offboard.reference.transfer import Hold
 
 STEPS, PERIOD_S = 10, 0.1

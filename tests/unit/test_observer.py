@@ -22,9 +22,8 @@ from offboard.estimation.propagation import (
     plant_of,
     replay,
 )
-from offboard.model.command import Command
+from offboard.model.command import Command, PredictedState
 from offboard.model.frames import quaternion_from_thrust_direction
-from offboard.model.predicted_state import PredictedState
 from offboard.model.vehicle import AxisResponse, Vehicle
 
 G = 9.80665
