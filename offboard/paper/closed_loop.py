@@ -33,8 +33,8 @@ from offboard.paper.plant import (
 )
 from offboard.reference.base import FlatSample, Reference
 from offboard.reference.flatness import flat_state
+from offboard.reference.path import Smoothness
 from offboard.reference.shapes import HeadingMode, Hover, Waypoints
-from offboard.reference.waypoints import Smoothness
 
 Array = NDArray[np.float64]
 
