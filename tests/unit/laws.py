@@ -9,8 +9,7 @@ from attitude_plant import Lemniscate
 
 from offboard.control.base import Controller
 from offboard.control.catalogue import names, settings_of
-from offboard.control.lqr import LqrLaw, LqrSettings
-from offboard.control.pso import PsoLaw, PsoSettings
+from offboard.control.law import LqrLaw, LqrSettings, PsoLaw, PsoSettings
 from offboard.model.command import Command, PredictedState
 from offboard.model.vehicle import AxisResponse, Vehicle
 

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from attitude_plant import Lemniscate
 from laws import LEVEL, PX4, G, lqr, state_of
+from offboard.control.horizon.law import STEPS_AROUND, HorizonLaw, HorizonSettings
+from offboard.control.horizon.plant import STATE_SIZE, B, P, T, V, W, Z
+from offboard.control.horizon.search import Evaluator, Plan, swarm
 from scipy.integrate import solve_ivp
 
 from offboard.control.base import Situation
 from offboard.control.horizon import polish as polishing
-from offboard.control.horizon.law import STEPS_AROUND, HorizonLaw, HorizonSettings
-from offboard.control.horizon.plant import STATE_SIZE, B, P, T, V, W, Z
-from offboard.control.horizon.search import Evaluator, Plan, swarm
 from offboard.control.mpc import MpcLaw, MpcSettings
 from offboard.control.swarm import SwarmSettings
 from offboard.model.command import Command, PredictedState
-from offboard.reference.transfer import Hold
+from offboard.reference.track import hold
 
 STEPS, PERIOD_S = 10, 0.1
 IN_THE_WAY = {"shape": "sphere", "north_m": 0.6, "east_m": -0.7, "height_m": 3.0, "radius_m": 0.3}
@@ -36,7 +36,7 @@ def situations(count: int, size: float, seed: int = 1) -> list[Situation]:
 
 def about_hover(count: int, size: float) -> list[Situation]:
     """States near a level hover, where the nonlinear motion is linear to first order."""
-    rng, hold = np.random.default_rng(4), Hold((0.0, 0.0, -3.0), 0.0)
+    rng, hold = np.random.default_rng(4), hold((0.0, 0.0, -3.0), 0.0)
     found = []
     for _ in range(count):
         tilt = 0.1 * size * rng.normal(size=2)
@@ -120,7 +120,7 @@ def test_nonlinear_roll_outs_fly_as_scipy_does() -> None:
     """Tilts and thrusts 0.2 and 3 m/s^2 about a hover that leans by 15 degrees: 1 s later within
     4 mm and 10 mm/s."""
     rng = np.random.default_rng(3)
-    reference = Hold((0.0, 0.0, -3.0), 0.0)
+    reference = hold((0.0, 0.0, -3.0), 0.0)
     down = np.array([0.2, -0.1, 0.0])
     down[2] = math.sqrt(1.0 - down @ down)
     state = PredictedState(
@@ -255,7 +255,7 @@ def test_a_way_below_the_clearance_to_the_ground_costs() -> None:
         position_ned_m=np.array([5.0, 5.0, -0.8]), velocity_ned_mps=np.zeros(3),
         thrust_direction_ned=np.array([0.0, 0.0, 1.0]), thrust_mps2=G,
     )  # fmt: skip
-    hold = Hold((5.0, 5.0, -0.8), 0.0)
+    hold = hold((5.0, 5.0, -0.8), 0.0)
     _, _, evaluate = prepared(law, Situation(5.0, start, hold, LEVEL))
     down, up = np.zeros((STEPS_AROUND, 3)), np.zeros((STEPS_AROUND, 3))
     down[:5, 2], up[:5, 2] = -3.0, 3.0

@@ -12,8 +12,7 @@ from offboard.model.vehicle import Vehicle
 from offboard.reference.base import FlatSample
 from offboard.reference.feasibility import InfeasibleReference, check
 from offboard.reference.shapes import SHAPES
-from offboard.reference.track import Track
-from offboard.reference.transfer import Hold
+from offboard.reference.track import Track, hold
 
 
 def vehicle(**changes: object) -> Vehicle:
@@ -122,7 +121,7 @@ def test_the_time_is_that_of_the_rows_of_a_table() -> None:
 
 def test_what_is_not_a_number_is_refused() -> None:
     with pytest.raises(InfeasibleReference, match="a height of nan m"):
-        check(Hold((0.0, 0.0, math.nan), 0.0), vehicle())
+        check(hold((0.0, 0.0, math.nan), 0.0), vehicle())
 
 
 def test_long_references_are_checked_in_parts() -> None:

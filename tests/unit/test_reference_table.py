@@ -9,8 +9,9 @@ import pytest
 
 from offboard.model.vehicle import Vehicle
 from offboard.reference.feasibility import InfeasibleReference, check
+from offboard.reference.path import interpolate
 from offboard.reference.shapes import FromTable
-from offboard.reference.table import TableError, interpolate, parse
+from offboard.reference.table import TableError, parse
 from offboard.reference.track import Track
 
 GOOD = "time_s,north_m,east_m,down_m\n0,0,0,-2\n1,1,0,-2\n2,2,1,-2\n3,3,3,-2.5\n"

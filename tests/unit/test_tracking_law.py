@@ -17,8 +17,8 @@ from laws import ARDUCOPTER, LEVEL, PX4, G, lqr, pso, state_of
 from scipy.linalg import expm
 
 from offboard.control.base import Controller, DecisionError, Situation
-from offboard.control.lqr import closed_form
-from offboard.control.pso import PsoLaw
+from offboard.control.law import PsoLaw
+from offboard.control.quadratic import closed_form
 from offboard.control.swarm import SwarmSettings
 from offboard.model.axes import lateral_model, lead, vertical_model
 from offboard.model.command import Command
