@@ -2,10 +2,9 @@
 
 A plan is a base (inputs and the states they lead to) that the feedback of the closed form follows,
 plus a few knots interpolated over its steps. Bases are the better of the closed form's plan and the
-previous one, and, where they are cheaper than that, the exact plan of the linear problem (`mpc`)
-and the ways past each side of each volume. Where none of them comes near a limit, the cheapest is
-the answer; otherwise the swarm searches the knots about the best. The answer is never worse than
-any base.
+previous one, and, where they are cheaper than that, the exact plan of the linear problem (`mpc`),
+the ways past each side of each volume, and the reference flown no faster than a speed limit. The
+swarm searches the knots about the best of them; the answer is never worse than any base.
 """
 
 from __future__ import annotations
@@ -49,7 +48,6 @@ STEPS, STEPS_AROUND = 10, 20
 VERTICAL_REACH_MPS2 = 3.0  # of the knots of the vertical thrust
 PLANNED_MARGIN_M = 0.05  # beyond the clearance: for tracking errors, and because it is a soft limit
 RIVALS = 2  # plans of other origin that are searched about too
-NEAR = 0.3  # m, m/s: a plan that stays further than this within every limit needs no search
 DETOUR_M = 1.0  # volumes whose clearance is further from the reference need no detour
 COST = attrgetter("cost")  # the order of plans: infinite where a roll-out is not finite
 
@@ -94,13 +92,11 @@ class HorizonSettings(TrackingSettings):
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Inputs (N, 3), the states (N + 1, STATE_SIZE) they lead to, the cost, and by how much a limit
-    is exceeded (m, m/s; negative within all)."""
+    """Inputs (N, 3), the states (N + 1, STATE_SIZE) they lead to, and the cost."""
 
     inputs: Array
     states: Array
     cost: float
-    over: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,12 +106,10 @@ class RollOuts:
     inputs: Array
     states: Array
     costs: Array
-    over: Array
 
     def plan(self, index: int) -> Plan:
         """One of them."""
-        cost, over = float(self.costs[index]), float(self.over[index])
-        return Plan(self.inputs[index], self.states[index], cost, over)
+        return Plan(self.inputs[index], self.states[index], float(self.costs[index]))
 
 
 class HorizonLaw(TrackingLaw):
@@ -159,18 +153,16 @@ class HorizonLaw(TrackingLaw):
         own, others = self._own_plan(situation.time_s), self._other_plans(task)
         rivals = sorted((plan for plan in others if plan.cost < own.cost), key=COST)
         bases = [own, *rivals[:RIVALS]]
-        best = min(bases, key=COST)
-        if not math.isfinite(best.cost):
+        seed_cost = min(plan.cost for plan in bases)
+        if not math.isfinite(seed_cost):
             raise DecisionError("no plan over the horizon has a finite cost")
-        found = Certificate(cost=best.cost)
-        if any(plan.over > -NEAR for plan in (own, *rivals)):
-            best, found = self._searched(bases, situation.remaining_s)
+        best, found = self._searched(bases, situation.remaining_s)
         self.previous = (situation.time_s, best)
         chosen, lower, upper = best.inputs[0], self.outlook["lower"][0], self.outlook["upper"][0]
         certificate = replace(
             found,
             at_bound=bool(((chosen <= lower[0]) | (chosen >= upper[0])).any()),
-            seed_cost=min(bases, key=COST).cost,
+            seed_cost=seed_cost,
         )
         return decision(task.problem.clip(task.inputs(chosen)), certificate)
 
@@ -203,14 +195,13 @@ class HorizonLaw(TrackingLaw):
             np.empty((len(knots), steps, INPUTS)),
             np.empty((len(knots), steps + 1, STATE_SIZE)),
             np.empty(len(knots)),
-            np.empty(len(knots)),
         )
         feedback, towards = (0.0, self._nowhere) if states is None else (1.0, states)
         roll_out(
             self._plant, self.outlook, self._placed, self._floor_down_m, self._start,
             np.ascontiguousarray(inputs), np.ascontiguousarray(towards), feedback,
             self._weights, np.ascontiguousarray(knots),
-            flown.states, flown.inputs, flown.over, flown.costs,
+            flown.states, flown.inputs, flown.costs,
         )  # fmt: skip
         return flown
 
@@ -229,13 +220,13 @@ class HorizonLaw(TrackingLaw):
         return plan
 
     def _other_plans(self, task: Task) -> list[Plan]:
-        """The exact plan of the linear problem, and a way past each side of each volume nearby."""
+        """The exact plan of the linear problem, and those that follow other ways."""
         exact = self._exact.minimise(self.quadratic.problem(task, self.outlook))
         plans = []
         if np.isfinite(exact).all():
             plans.append(self.fly(self.quadratic.plan(exact)).plan(0))
         nothing = np.zeros((self._settings.planned, INPUTS))
-        plans.extend(self.fly(nothing, way).plan(0) for way in self._detours())
+        plans.extend(self.fly(nothing, way).plan(0) for way in (*self._detours(), *self._slower()))
         return plans
 
     def _detours(self) -> list[Array]:
@@ -260,6 +251,22 @@ class HorizonLaw(TrackingLaw):
                 way[past, velocity] = -speeds[past, axis]
                 ways.append(way)
         return ways
+
+    def _slower(self) -> list[Array]:
+        """The reference from the present state on, no faster than the limit of the speed, as states
+        (N + 1, STATE_SIZE)."""
+        way, limit_mps = self._nowhere.copy(), self._settings.speed_limit_mps
+        if limit_mps is None:
+            return []
+        velocities = self.outlook["velocities"][0, 0 : 2 * len(way) - 1 : 2]
+        speeds_mps = np.linalg.norm(velocities, axis=1, keepdims=True)
+        less_mps = np.minimum(limit_mps / np.maximum(speeds_mps, limit_mps) - 1.0, 0.0) * velocities
+        behind_m = np.cumsum(less_mps[:-1], axis=0) * self.period_s
+        for axis, (position, velocity) in enumerate(ROWS):
+            way[:, position] = self._start[position]
+            way[1:, position] += behind_m[:, axis]
+            way[:, velocity] = less_mps[:, axis]
+        return [way]
 
     def _searched(
         self, bases: list[Plan], remaining_s: Callable[[], float] | None

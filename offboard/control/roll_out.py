@@ -98,7 +98,7 @@ def plant_of(law: TrackingLaw, *, speed_limit_mps: float, clearance_m: float) ->
 
 @entry(
     PLANT, OUTLOOK, array(2), float, array(1), array(2), array(2), float, array(2), array(3),
-    array(3), array(3), array(1), array(1),
+    array(3), array(3), array(1),
 )  # fmt: skip
 def roll_out(
     plants: Any,
@@ -113,11 +113,9 @@ def roll_out(
     knots: Array,
     states: Array,
     inputs: Array,
-    worst: Array,
     costs: Array,
 ) -> None:
-    """Compute costs (n,), states (n, N + 1, STATE_SIZE) and inputs (n, N, 3) of n plans, and
-    `worst` (n,): by how much each exceeds any limit but that of the tilt, in m or m/s.
+    """Compute costs (n,), states (n, N + 1, STATE_SIZE) and inputs (n, N, 3) of n plans.
 
     The input of a step is base_inputs (N, 3) + weights (N, M) @ knots (n, M, 3) + `feedback` times
     the closed form's answer to the deviation of the state from base_states (N + 1, STATE_SIZE),
@@ -127,7 +125,7 @@ def roll_out(
     """
     plant, ahead = plants[0], outlooks[0]
     for n in range(costs.shape[0]):
-        costs[n], worst[n] = 0.0, -math.inf
+        costs[n] = 0.0
         states[n, 0] = start
         for k in range(inputs.shape[1]):
             before, after, chosen = states[n, k], states[n, k + 1], inputs[n, k]
@@ -145,9 +143,7 @@ def roll_out(
                 chosen[axis] = min(max(chosen[axis], ahead.lower[k, axis]), ahead.upper[k, axis])
             costs[n] += _hold(plant, before, chosen, after)
             _add_nonlinear_part(plant, ahead, k, before, chosen, after)
-            over, paid = _exceeded(plant, ahead, volumes, floor_down_m, k, before, after)
-            worst[n] = max(worst[n], over)
-            costs[n] += paid
+            costs[n] += _penalties(plant, ahead, volumes, floor_down_m, k, before, after)
         costs[n] += _cost_to_go(plant, states[n, inputs.shape[1]])
         if not math.isfinite(costs[n]):
             costs[n] = math.inf  # a NaN would win an argmin
@@ -231,7 +227,7 @@ def _cost_to_go(plant: Any, last: Array) -> float:
 
 
 @kernel
-def _exceeded(
+def _penalties(
     plant: Any,
     ahead: Any,
     volumes: Array,
@@ -239,17 +235,15 @@ def _exceeded(
     k: int,
     before: Array,
     after: Array,
-) -> tuple[float, float]:
-    """By how much hold k exceeds any limit but that of the tilt, negative within all, and the
-    penalty for that; each volume counts at the middle of the hold and at its end."""
+) -> float:
+    """For exceeding limits in hold k; each volume counts at the middle of the hold and its end."""
     hold, end = plant.hold_s, 2 * k + 2
     b, v = ahead.directions[end], ahead.velocities[end]
     paid = hold * _penalty(math.hypot(b[0] + after[B], b[1] + after[B + 1]) - plant.tilt_most)
-    worst = -math.inf
     if plant.speed_most_mps < math.inf:
         north, east, down = v[0] + after[V], v[1] + after[V + 1], v[2] + after[W]
-        worst = math.sqrt(north * north + east * east + down * down) - plant.speed_most_mps
-        paid += hold * _penalty(worst)
+        speed = math.sqrt(north * north + east * east + down * down)
+        paid += hold * _penalty(speed - plant.speed_most_mps)
     if volumes.shape[0] > 0:
         room = max(floor_down_m - ahead.positions[end, 2], 0.0)
         paid += hold * _penalty(after[Z] - room)
@@ -274,9 +268,8 @@ def _exceeded(
                 at[1] + e,
                 at[2] + d,
             )
-            worst = max(worst, plant.clearance_m - away)
             paid += 0.5 * hold * _penalty(plant.clearance_m - away)
-    return worst, paid
+    return paid
 
 
 @kernel

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from attitude_plant import Flight, Lemniscate, Truth, fly
-from laws import ARDUCOPTER, LEVEL, PX4, G, lqr, pso, state_of
+from laws import ARDUCOPTER, LEVEL, PX4, G, lqr, on_target, pso, state_of
 from scipy.linalg import expm
 
 from offboard.control.base import Controller, DecisionError, Situation
@@ -91,26 +91,21 @@ def test_unconstrained_minimiser_is_the_lqr_law() -> None:
         task = law.task(Situation(5.0, state, reference, LEVEL))
         target, problem = task.target, task.problem
         minimiser = np.linalg.solve(problem.hessian, -problem.gradient)
-        off = [
-            state.position_ned_m[:2] - target.position_ne_m,
-            state.velocity_ned_mps[:2] - target.velocity_ne_mps,
-            state.thrust_direction_ned[:2] - target.direction_ne,
-            state.thrust_direction_rate_ned_ps[:2] - target.direction_rate_ne_ps,
-        ]
-        b_z = state.thrust_direction_ned[2]
-        vertical = [
-            state.position_ned_m[2] - target.position_down_m,
-            state.velocity_ned_mps[2] - target.velocity_down_mps,
-            state.thrust_mps2 * b_z - target.thrust_down_mps2,
-        ]
-        expected_tilt = target.tilt_feedforward - law.lateral.gain @ np.array(off)
-        force = target.thrust_down_feedforward_mps2 - law.vertical.gain @ vertical
+        north_east = np.array(
+            (state.position_ned_m, state.velocity_ned_mps, state.thrust_direction_ned,
+             state.thrust_direction_rate_ned_ps)
+        )[:, :2]  # fmt: skip
+        off, b_z = north_east - target.lateral, state.thrust_direction_ned[2]
+        down = (state.position_ned_m[2], state.velocity_ned_mps[2], state.thrust_mps2 * b_z)
+        vertical = np.array(down) - target.vertical
+        expected_tilt = target.feedforward[:2] - law.lateral.gain @ off
+        force = target.feedforward[2] - law.vertical.gain @ vertical
         assert minimiser[1:3] == pytest.approx(expected_tilt, abs=1e-9)
         assert minimiser[0] == pytest.approx(force / b_z, abs=1e-9)
-        assert minimiser[3] == pytest.approx(target.heading_feedforward_rad)
+        assert minimiser[3] == pytest.approx(target.heading_rad)
         # what an optimal law has left to pay is x' P x
-        left = np.sum(np.array(off) * (law.lateral.terminal @ np.array(off)))
-        left += vertical @ law.vertical.terminal @ np.array(vertical)
+        left = np.sum(off * (law.lateral.terminal @ off))
+        left += vertical @ law.vertical.terminal @ vertical
         assert float(problem(minimiser)) == pytest.approx(left, rel=1e-9)
 
 
@@ -121,17 +116,9 @@ def test_cost_vanishes_on_the_reference_and_never_goes_below_zero() -> None:
         task = law.task(Situation(5.0, state, reference, LEVEL))
         target, problem = task.target, task.problem
         assert problem(np.linalg.solve(problem.hessian, -problem.gradient)) > -1e-9
-    b_z = math.sqrt(1 - target.direction_ne @ target.direction_ne)
-    on_it = replace(
-        state,
-        position_ned_m=np.array([*target.position_ne_m, target.position_down_m]),
-        velocity_ned_mps=np.array([*target.velocity_ne_mps, target.velocity_down_mps]),
-        thrust_direction_ned=np.array([*target.direction_ne, b_z]),
-        thrust_direction_rate_ned_ps=np.array([*target.direction_rate_ne_ps, 0.0]),
-        thrust_mps2=target.thrust_down_mps2 / b_z,
-    )
-    nominal = [target.thrust_down_feedforward_mps2 / b_z,
-               *target.tilt_feedforward, target.heading_feedforward_rad]  # fmt: skip
+    on_it = on_target(state, target)
+    b_z = on_it.thrust_direction_ned[2]
+    nominal = [target.feedforward[2] / b_z, *target.feedforward[:2], target.heading_rad]
     problem = law.task(Situation(5.0, on_it, reference, LEVEL)).problem
     cost = float(problem(np.array(nominal)))
     assert cost == pytest.approx(0.0, abs=1e-9)
@@ -146,7 +133,7 @@ def test_bounds_hold_and_the_feedback_is_limited(size: float, least: int, most: 
         target = law.target(reference, 5.0, state)
         decision = law.decide(Situation(5.0, state, reference, LEVEL))
         tilt = np.array(decision.command.thrust_direction_ned)
-        fed_forward = np.clip(target.tilt_feedforward, -limit, limit)
+        fed_forward = np.clip(target.feedforward[:2], -limit, limit)
         assert np.abs(tilt[:2] - fed_forward).max() <= 0.3 + 1e-12
         assert np.abs(tilt[:2]).max() <= limit + 1e-12
         assert np.linalg.norm(tilt) == pytest.approx(1.0)
