@@ -166,7 +166,7 @@ def _hold(plant: Any, before: Array, chosen: Array, after: Array) -> float:
     cost += plant.hold_s * before[Z] ** 2 + plant.vertical_effort * u * u
     for i in range(3):
         after[Z + i] = h[i, 0] * before[Z] + h[i, 1] * before[W] + h[i, 2] * before[F] + g[i] * u
-    return cost
+    return float(cost)
 
 
 @kernel
@@ -269,7 +269,7 @@ def _penalties(
                 at[2] + d,
             )
             paid += 0.5 * hold * _penalty(plant.clearance_m - away)
-    return paid
+    return float(paid)
 
 
 @kernel

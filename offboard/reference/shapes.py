@@ -232,16 +232,15 @@ class FromTable(Shape):
 
     def path(self) -> Path:
         rows = self._rows()
-        columns = [rows.points_ned_m]
-        if self._takes_column(rows):
-            columns.append(rows.heading_rad[:, np.newaxis])
-        return interpolate(rows.times_s, np.hstack(columns), self.knot_spacing_s)
+        values = rows.points_ned_m
+        if self.course is HeadingMode.TABLE and rows.heading_rad is not None:
+            values = np.column_stack((values, rows.heading_rad))
+        return interpolate(rows.times_s, values, self.knot_spacing_s)
 
     def _heading(self, path: Path) -> Heading:
-        return Column() if self._takes_column(self._rows()) else super()._heading(path)
-
-    def _takes_column(self, rows: table.Table) -> bool:
-        return self.course is HeadingMode.TABLE and rows.heading_rad is not None
+        if self.course is HeadingMode.TABLE and self._rows().heading_rad is not None:
+            return Column()
+        return super()._heading(path)
 
     def _rows(self) -> table.Table:
         if self.text is None:

@@ -181,13 +181,3 @@ def test_climbing_and_descending_flights_at_all_headings(name: str, heading_deg:
     reference = Lemniscate(8.0, heading_rad=math.radians(heading_deg), heave_m=0.4)
     flown = fly(Truth(PX4, noisy=False), law_named(name), PX4, reference, 1, laps=0.5)
     assert flown.rmse_m < 0.03
-
-
-@pytest.mark.parametrize("output", ["north", "east", "thrust"])
-@pytest.mark.parametrize("name", ["pso", pytest.param("horizon", marks=pytest.mark.slow)])
-def test_one_sign_swapped_is_seen(name: str, output: str) -> None:
-    """What the flights above would show."""
-    reference = Lemniscate(8.0, heading_rad=math.radians(90.0), heave_m=0.4)
-    law = Swapped(law_named(name), output)
-    flown = fly(Truth(PX4, noisy=False), law, PX4, reference, 1, laps=0.1)
-    assert flown.rmse_m > 0.3

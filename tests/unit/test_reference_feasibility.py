@@ -54,7 +54,6 @@ UP = {"shape": "line", "to_north_m": 0, "speed_mps": 10, "run_out_s": 6, "height
             "12 m/s",
         ),
         ({"shape": "helix", "climb_mps": -0.4}, "a height of", "0.3 m"),
-        ({"shape": "helix", "climb_mps": -4, "period_s": 2.0}, "a height of", "0.3 m"),
         (
             {"shape": "line", "to_north_m": 1000, "to_east_m": 0, "speed_mps": 11}
             | {"origin_north_m": 1000, "origin_east_m": 1000},

@@ -113,11 +113,6 @@ def test_no_start_is_planned_further_out_than_it_needs_to_brake() -> None:
             np.testing.assert_allclose(path[-1], target, atol=1e-6)
 
 
-def test_a_start_that_is_not_finite_is_refused() -> None:
-    with pytest.raises(ValueError, match="finite start"):
-        transfer((math.nan, 0, 0), (1, 0, 0), 0, 0)
-
-
 def test_moved_and_held() -> None:
     track = Circle(course=HeadingMode.ALONG_VELOCITY).track()
     moved = Moved(track, 100.0, (10.0, -5.0, 2.0))

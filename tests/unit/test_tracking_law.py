@@ -18,7 +18,6 @@ from scipy.linalg import expm
 
 from offboard.control.base import Controller, DecisionError, Situation
 from offboard.control.law import PsoLaw
-from offboard.control.quadratic import closed_form
 from offboard.control.swarm import SwarmSettings
 from offboard.model.axes import lateral_model, lead, vertical_model
 from offboard.model.command import Command
@@ -158,33 +157,6 @@ def test_swarm_finds_the_closed_form() -> None:
         assert ours.certificate.gap < 1e-6
         assert exact.certificate.gap == 0.0
         assert ours.certificate.optimal_cost == pytest.approx(exact.certificate.cost, rel=1e-6)
-
-
-def test_closed_form_is_no_worse_than_any_point_of_the_box() -> None:
-    rng, reference = np.random.default_rng(6), Lemniscate(8.0)
-    state = state_of(rng, reference, 2.0)
-    problem = lqr().task(Situation(5.0, state, reference, LEVEL)).problem
-    anywhere = rng.uniform(problem.lower, problem.upper, (10_000, 4))
-    assert problem(closed_form(problem)) <= problem(anywhere).min()
-
-
-def test_same_error_north_east_south_west_heading_same_tilt() -> None:
-    """The law lives in NED: the heading turns the quaternion, never the thrust direction. An error
-    to the north is answered by thrust to the south (b_n > 0), one to the east by b_e > 0."""
-    law = lqr()
-    tilts = []
-    for heading in np.radians([0.0, 90.0, 180.0, 270.0]):
-        reference = Lemniscate(15.0, run_in_s=1e9, heading_rad=float(heading))
-        home = reference.sample(5.057).position_ned_m
-        rest = state_of(np.random.default_rng(0), reference, 0.0)
-        state = replace(rest, position_ned_m=home + np.array([0.1, 0.05, 0.0]),
-                        velocity_ned_mps=np.zeros(3), heading_rad=float(heading))  # fmt: skip
-        command = law.decide(Situation(5.0, state, reference, LEVEL)).command
-        tilts.append(command.thrust_direction_ned)
-        assert math.cos(command.heading_rad - heading) == pytest.approx(1.0)
-    assert tilts[0][:2] == pytest.approx((0.187, 0.0937), abs=1e-3)
-    for tilt in tilts[1:]:
-        assert tilt == pytest.approx(tilts[0], abs=1e-12)
 
 
 def test_too_low_means_more_thrust_and_tilt_is_paid_for() -> None:
