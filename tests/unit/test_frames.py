@@ -72,7 +72,6 @@ def test_leading_axes_are_kept_and_single_values_agree() -> None:
     assert_allclose(heading_from_quaternion(QUATERNIONS), np.arctan2(nose[:, 1], nose[:, 0]))
     direction, heading = thrust_direction_from_quaternion(many), heading_from_quaternion(many)
     batch = quaternion_from_thrust_direction(direction, heading)
-    assert angle_between(batch.reshape(-1, 4), QUATERNIONS) < 1e-13
     for place in ((0, 0), (2, 57), (4, 99)):
         single = quaternion_from_thrust_direction(direction[place], heading[place])
         assert_allclose(batch[place], single, rtol=0, atol=1e-15)
