@@ -123,10 +123,8 @@ def simulate(
         signing_key=signing_key,
         log=log,
     )
-    from offboard.compiled import loading
+    from simulator.launch import launch  # late, so that a wrong option is answered at once
 
-    with loading():  # imported late, so that a wrong option is answered at once
-        from simulator.launch import launch
     raise typer.Exit(launch(options, stopping))
 
 

@@ -7,6 +7,7 @@ signal. A fork takes milliseconds where a start takes a second; the vehicle send
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import select
@@ -17,15 +18,15 @@ from functools import partial
 from io import FileIO
 from typing import NoReturn
 
-from offboard.compiled import loading, prepare
+from offboard.compiled import prepare
 from offboard.documents.command_line import run
 from simulator.command import app
 
 
 def serve(requests: FileIO) -> None:
     """Run a vehicle for each line of `requests`, which is unbuffered: `select` waits for it."""
-    with loading():  # what is not collected stays shared with the forks
-        _load()
+    _load()
+    gc.freeze()  # what is not collected stays shared with the forks
     for line in requests:
         if line.strip():
             print(_exit_code(json.loads(line), requests), flush=True)

@@ -14,8 +14,8 @@ import pytest
 from offboard.compiled import prepare
 
 COMPILED = (
-    "offboard.control.horizon.law",
-    "offboard.control.pso",
+    "offboard.control.horizon",
+    "offboard.control.law",
     "offboard.run.flight",
     "offboard.paper.plant",
     "simulator.vehicle.dynamics",

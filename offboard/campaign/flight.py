@@ -35,7 +35,7 @@ from offboard.campaign.cases import Case
 from offboard.campaign.document import Promises
 from offboard.campaign.results import Record, code_hash
 from offboard.control.base import ControllerSettings
-from offboard.control.horizon.keep_out import clearances
+from offboard.control.keep_out import clearances
 from offboard.documents.errors import UserError
 from offboard.flight.flight import Outcome
 from offboard.flight.phases import ExitCode

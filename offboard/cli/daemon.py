@@ -96,11 +96,9 @@ def daemon(
 
     lines = JsonLog(write) if log_json else Terminal(out, partial(say, indent=12))
     with StopRequests() as stops, closing(lines):
-        from offboard.compiled import loading
+        from offboard.flight.phases import ServiceOptions
+        from offboard.service.daemon import run
 
-        with loading():
-            from offboard.flight.phases import ServiceOptions
-            from offboard.service.daemon import run
         try:
             outcome = run(
                 partial(options.load, seed),

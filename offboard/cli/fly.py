@@ -98,12 +98,9 @@ def fly(
             SimulatorProcess() if sitl else nullcontext() as simulator,  # loads in the background
             closing(_displays(live, json_lines=json_lines)) as displays,
         ):
-            from offboard.compiled import loading
-
-            with loading():
-                from offboard.link import clock
-                from offboard.run.flight import Connection, Simulated
-                from offboard.run.flight import fly as fly_once
+            from offboard.link import clock
+            from offboard.run.flight import Connection, Simulated
+            from offboard.run.flight import fly as fly_once
 
             requirements = requirements_of(require)
             directory = out_directory or FLIGHTS / clock.local_stamp()

@@ -21,12 +21,10 @@ def replay(flight: Annotated[Path, FLIGHT]) -> None:
     Prints the first difference, and the messages before it. Flights of `offboard daemon` cannot be
     replayed: their logs do not hold what was received in standby.
     """
-    from offboard.compiled import loading
+    from offboard.replay.difference import explained, verdict
+    from offboard.replay.recording import read
+    from offboard.replay.replaying import Replay
 
-    with loading():
-        from offboard.replay.difference import explained, verdict
-        from offboard.replay.recording import read
-        from offboard.replay.replaying import Replay
     recording = read(flight)
     if recording.log.damage:
         complain(recording.log.damage)

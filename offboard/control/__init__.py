@@ -74,8 +74,7 @@ from offboard.control.base import (
     DecisionError,
     Situation,
 )
-from offboard.model.command import Command, PositionCommand
-from offboard.model.predicted_state import PredictedHeave, PredictedState
+from offboard.model.command import Command, PositionCommand, PredictedHeave, PredictedState
 from offboard.model.vehicle import Vehicle
 from offboard.reference.base import FlatSample, Reference
 

@@ -13,8 +13,7 @@ from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 from offboard.documents.parameters import Parameters
-from offboard.model.command import Command, PositionCommand
-from offboard.model.predicted_state import PredictedState
+from offboard.model.command import Command, PositionCommand, PredictedState
 from offboard.model.vehicle import DelayUncertainty, Vehicle
 from offboard.reference.base import Reference
 

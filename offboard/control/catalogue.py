@@ -18,10 +18,10 @@ GROUP = "pso_offboard.controllers"
 BUILT_IN = EntryPoints(
     EntryPoint(law, f"offboard.control.{settings}", GROUP)
     for law, settings in (
-        ("pso", "pso:PsoSettings"),
-        ("lqr", "lqr:LqrSettings"),
+        ("pso", "law:PsoSettings"),
+        ("lqr", "law:LqrSettings"),
         ("mpc", "mpc:MpcSettings"),
-        ("horizon", "horizon.law:HorizonSettings"),
+        ("horizon", "horizon:HorizonSettings"),
         ("pid", "pid:PidSettings"),
         ("autopilot", "autopilot:AutopilotSettings"),
     )

@@ -23,15 +23,15 @@ Array = NDArray[np.float64]
 class CostToGo:
     """One sampled axis, its gain, and the cost of one held input with all that follows it.
 
-    J(u; x) = x' Q x + R u^2 + x(k+1)' P x(k+1)
+    J(u; x) = T x_0^2 + effort u^2 + x(k+1)' P x(k+1)
             = 1/2 curvature u^2 + (coupling x) u + 1/2 x' state_cost x, minimal at u = -gain x,
-    in deviations from the reference. transition A (n, n), input_map B (n, 1); stage (n + 1, n + 1)
-    is diag(Q, R); terminal P (n, n); coupling and gain K (n,).
+    in deviations from the reference, for a period T. transition A (n, n), input_map B (n, 1);
+    terminal P (n, n); coupling and gain K (n,).
     """
 
     transition: Array
     input_map: Array
-    stage: Array
+    effort: float
     terminal: Array
     curvature: float
     coupling: Array
@@ -64,15 +64,15 @@ def _solved(dynamics: bytes, input_map: bytes, effort: float, period_s: float) -
     model = LinearModel(np.frombuffer(dynamics).reshape(states, states), inputs.reshape(states, 1))
     held = model.sampled(period_s)
     a, b = held.dynamics, held.input_map
-    stage = period_s * np.diag([1.0] + [0.0] * (len(a) - 1) + [effort])
-    q, r = stage[:-1, :-1], stage[-1:, -1:]
+    q, r = np.zeros_like(a), np.array([[period_s * effort]])
+    q[0, 0] = period_s
     import control  # takes a second: only where a gain is designed
 
     gain, terminal, _ = control.dlqr(a, b, q, r)
     return CostToGo(
         transition=a,
         input_map=b,
-        stage=stage,
+        effort=period_s * effort,
         terminal=terminal,
         curvature=2.0 * float((r + b.T @ terminal @ b)[0, 0]),
         coupling=2.0 * (b.T @ terminal @ a)[0],

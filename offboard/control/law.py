@@ -9,12 +9,12 @@ or, where the bounds or a horizon couple the inputs, the u that minimises the sa
     x_predicted  the state at the time when this command will begin to act: the observer's, carried
                  there by replaying the commands already sent (`offboard.estimation`)
     x_ref        what the reference asks for at that time, by differential flatness from its
-                 position and derivatives, drag and the estimated disturbance (`Tracking.target`)
+                 position and derivatives, drag and the estimated disturbance (`TrackingLaw.target`)
     u_ff         what follows the reference without an error: half a period later, because a command
                  is held for one period and acts on average in its middle, and led through the
                  response of attitude and thrust, so that these arrive in time
     K            gain of the linear-quadratic regulator of each axis for one bandwidth (`gains`)
-    clip         thrust, tilt, and the feedback about u_ff (`Tracking._box`)
+    clip         thrust, tilt, and the feedback about u_ff (`TrackingLaw._weighed`)
 
 In NED, acceleration = g e3 - T b - c v + d: written in b, the lateral axes [p, v, b, b'], the
 vertical [z, v_z, T b_z] and the heading decouple, and no heading frame is needed.
@@ -30,6 +30,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,11 +51,11 @@ from offboard.control.gains import (
     tilt_ripple,
     vertical_gain,
 )
-from offboard.control.quadratic import BoxQuadratic
+from offboard.control.quadratic import BoxQuadratic, ExactMinimum, at_bound, closed_form
+from offboard.control.swarm import SwarmSettings, certify, minimise
 from offboard.model.axes import lead
-from offboard.model.command import Command
+from offboard.model.command import Command, PredictedHeave, PredictedState
 from offboard.model.frames import wrap_pi
-from offboard.model.predicted_state import PredictedHeave, PredictedState
 from offboard.model.vehicle import DelayUncertainty, Vehicle
 from offboard.reference.base import Reference
 from offboard.reference.flatness import flat_state
@@ -86,36 +87,25 @@ class TrackingSettings(ControllerSettings):
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """State and input that the reference asks for when the command acts. NED, SI; the ripple of
-    held commands (`gains.hold_ripple`) is included.
+    """x_ref and u_ff: what the reference asks for when the command acts. NED, SI.
 
-    Lateral, each (2,), north and east, at the time of the predicted state: position_ne_m,
-    velocity_ne_mps, thrust direction direction_ne and its rate direction_rate_ne_ps. Vertical, at
-    the time when the thrust acts: position_down_m, velocity_down_mps and T b_z, thrust_down_mps2.
-    Feed-forward of tilt (2,), vertical thrust and heading, each taken half a period after its own
-    delay and led through its own response.
+    `lateral` (4, 2), [p, v, b, b'] x [north, east], at the time of the predicted state; `vertical`
+    (3,), [z, v_z, T b_z], when the thrust acts; both with the ripple of held commands
+    (`gains.hold_ripple`). `feedforward` (3,), b_c north, b_c east and T b_z, and `heading_rad` are
+    taken half a period after their own delays and led through their own responses.
     """
 
-    position_ne_m: Array
-    velocity_ne_mps: Array
-    direction_ne: Array
-    direction_rate_ne_ps: Array
-    position_down_m: float
-    velocity_down_mps: float
-    thrust_down_mps2: float
-    tilt_feedforward: Array
-    thrust_down_feedforward_mps2: float
-    heading_feedforward_rad: float
+    lateral: Array
+    vertical: Array
+    feedforward: Array
+    heading_rad: float
 
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """What one decision is about.
-
-    `lateral` (4, 2), [p, v, b, b'] x [north, east], and `vertical` (3,), [z, v_z, T b_z], are the
-    deviations of the predicted state from the target; `b_z` is that of its thrust direction.
-    `problem` is the cost of u (4,) and its bounds.
-    """
+    """What one decision is about: `lateral` (4, 2) and `vertical` (3,) are the deviations of the
+    predicted state from the target, `b_z` is that of its thrust direction, `problem` the cost of
+    u (4,) and its bounds."""
 
     target: Target
     lateral: Array
@@ -124,13 +114,9 @@ class Task:
     problem: BoxQuadratic
 
     def inputs(self, deviation: Array) -> Array:
-        """u (4,), not clipped, for a deviation (3,) from the feed-forward: b_c north, b_c east and
-        vertical thrust."""
-        inputs = np.empty(4)
-        inputs[0] = (self.target.thrust_down_feedforward_mps2 + deviation[2]) / self.b_z
-        inputs[1:3] = self.target.tilt_feedforward + deviation[:2]
-        inputs[3] = self.target.heading_feedforward_rad
-        return inputs
+        """u (4,), not clipped, for a deviation (3,) from the feed-forward."""
+        north, east, down_mps2 = self.target.feedforward + deviation
+        return np.array([down_mps2 / self.b_z, north, east, self.target.heading_rad])
 
 
 class TrackingLaw:
@@ -141,7 +127,7 @@ class TrackingLaw:
     models of its axes with the optimal cost that follows one held input.
     """
 
-    def __init__(self, vehicle: Vehicle, settings: TrackingSettings, period_s: float) -> None:
+    def __init__(self, vehicle: Vehicle, settings: TrackingSettings, period_s: float = 0.1) -> None:
         self.period_s = period_s
         self.configured_radps = self.bandwidth_radps = settings.bandwidth_radps
         self.limits, self._file = settings, vehicle
@@ -172,21 +158,27 @@ class TrackingLaw:
         self.lateral = lateral_gain(self.vehicle, bandwidth_radps, self.period_s)
         self.vertical = vertical_gain(self.vehicle, bandwidth_radps, self.period_s)
 
-    @property
-    def tilt_limit(self) -> float:
-        """Bound of each lateral component of b_c."""
-        return min(self.limits.tilt_limit, math.sin(self.vehicle.tilt_max_rad))
-
     def task(self, situation: Situation) -> Task:
         """The task of this tick. Raises DecisionError where its cost is not finite."""
         state = situation.state
         target = self.target(situation.reference, situation.time_s, state)
-        lateral, vertical = deviations(state, target)
-        b_z = float(state.thrust_direction_ned[2])
-        problem = self._problem(target, lateral, vertical, b_z)
-        if not _finite(problem):
+        heave = heave_of(state)
+        motion = (
+            state.position_ned_m,
+            state.velocity_ned_mps,
+            state.thrust_direction_ned,
+            state.thrust_direction_rate_ned_ps,
+        )
+        lateral = np.array(motion)[:, :2] - target.lateral
+        vertical = (heave.position_down_m, heave.velocity_down_mps, heave.thrust_down_mps2)
+        task = self._weighed(
+            target, lateral, vertical - target.vertical, float(state.thrust_direction_ned[2])
+        )
+        problem = task.problem
+        parts = (problem.hessian.ravel(), problem.gradient, problem.lower, [problem.constant])
+        if not np.isfinite(np.concatenate(parts)).all():
             raise DecisionError("the cost of this decision is not finite")
-        return Task(target, lateral, vertical, b_z, problem)
+        return task
 
     def target(self, reference: Reference, time_s: float, state: PredictedState) -> Target:
         """The target of a decision at `time_s`, for the state predicted to the time when its tilt
@@ -205,77 +197,65 @@ class TrackingLaw:
         )
         b, b1 = flat.thrust_direction_ned, flat.thrust_direction_rate_ned_ps
         b2 = flat.thrust_direction_acceleration_ned_ps2
-        tilt_slope = lead(b1[0, :2], b2[0, :2], np.zeros(2), vehicle.tilt)
-        thrust_slope = flat.thrust_rate_mps3[2] * b[2, 2] + flat.thrust_mps2[2] * b1[2, 2]
-        thrust_down = flat.thrust_mps2[2] * b[2, 2] + self._thrust_ripple * thrust_slope
-        led_thrust = flat.thrust_mps2[3] + vehicle.thrust_lag_s * flat.thrust_rate_mps3[3]
-        heading = lead(
+        lateral = np.array((sample.position_ned_m[0], sample.velocity_ned_mps[0], b[0], b1[0]))
+        tilt_slope = lead(b1[0], b2[0], np.zeros(3), vehicle.tilt)
+        lateral[2:] += np.outer(self._tilt_ripple, tilt_slope)
+        thrust, thrust_rate = flat.thrust_mps2, flat.thrust_rate_mps3
+        thrust_slope = thrust_rate[2] * b[2, 2] + thrust[2] * b1[2, 2]
+        vertical = (
+            sample.position_ned_m[2, 2],
+            sample.velocity_ned_mps[2, 2],
+            thrust[2] * b[2, 2] + self._thrust_ripple * thrust_slope,
+        )
+        led_tilt = held_lead(b[1], b1[1], b2[1], vehicle.tilt, period_s)
+        led_thrust = thrust[3] + vehicle.thrust_lag_s * thrust_rate[3]  # T lags, b_z does not
+        heading_rad = lead(
             sample.heading_rad[4],
             sample.heading_rate_radps[4],
             sample.heading_acceleration_radps2[4],
             vehicle.yaw,
         )
         return Target(
-            position_ne_m=sample.position_ned_m[0, :2],
-            velocity_ne_mps=sample.velocity_ned_mps[0, :2],
-            direction_ne=b[0, :2] + self._tilt_ripple[0] * tilt_slope,
-            direction_rate_ne_ps=b1[0, :2] + self._tilt_ripple[1] * tilt_slope,
-            position_down_m=float(sample.position_ned_m[2, 2]),
-            velocity_down_mps=float(sample.velocity_ned_mps[2, 2]),
-            thrust_down_mps2=float(thrust_down),
-            tilt_feedforward=held_lead(b[1, :2], b1[1, :2], b2[1, :2], vehicle.tilt, period_s),
-            thrust_down_feedforward_mps2=float(led_thrust * b[3, 2]),  # T lags, b_z does not
-            heading_feedforward_rad=float(heading),
+            lateral=lateral[:, :2],
+            vertical=np.array(vertical),
+            feedforward=np.array((led_tilt[0], led_tilt[1], led_thrust * b[3, 2])),
+            heading_rad=float(heading_rad),
         )
 
-    def _problem(self, target: Target, lateral: Array, vertical: Array, b_z: float) -> BoxQuadratic:
-        nominal = np.empty(4)
-        nominal[0] = target.thrust_down_feedforward_mps2 / b_z
-        nominal[1:3] = target.tilt_feedforward
-        nominal[3] = target.heading_feedforward_rad
-        curvature = np.empty(4)
-        curvature[0] = self.vertical.curvature * b_z**2
-        curvature[1:3] = self.lateral.curvature
-        curvature[3] = HEADING_CURVATURE
-        slope = np.zeros(4)  # of J at the nominal input
+    def _weighed(self, target: Target, lateral: Array, vertical: Array, b_z: float) -> Task:
+        """The task of these deviations, with J and its bounds: clip."""
+        settings, vehicle = self.limits, self.vehicle
+        curvature = np.array(
+            [
+                self.vertical.curvature * b_z**2,
+                self.lateral.curvature,
+                self.lateral.curvature,
+                HEADING_CURVATURE,
+            ]
+        )
+        slope = np.zeros(4)  # of J at the feed-forward
         slope[0] = b_z * (self.vertical.coupling @ vertical)
         slope[1:3] = self.lateral.coupling @ lateral
         rest = vertical @ self.vertical.state_cost @ vertical
         rest += np.sum(lateral * (self.lateral.state_cost @ lateral))
+        thrust = target.feedforward[2] / b_z
+        nominal = np.array([thrust, *target.feedforward[:2], target.heading_rad])
         gradient = slope - curvature * nominal
         constant = 0.5 * rest + nominal @ (0.5 * curvature * nominal - slope)
-        lower, upper = self._box(nominal)
-        return BoxQuadratic(np.diag(curvature), gradient, float(constant), lower, upper)
+        low, high = self.tilt_bounds(nominal[1:3])
+        heading = target.heading_rad
+        least_mps2 = settings.thrust_floor * vehicle.gravity_mps2
+        lower = np.array([least_mps2, *low, heading - HEADING_BOX_RAD])
+        upper = np.array([vehicle.thrust_max_mps2, *high, heading + HEADING_BOX_RAD])
+        problem = BoxQuadratic(np.diag(curvature), gradient, float(constant), lower, upper)
+        return Task(target, lateral, vertical, b_z, problem)
 
-    def _box(self, nominal: Array) -> tuple[Array, Array]:
-        """Lower and upper (4,): thrust, |b_c| and |b_c - b_ff| per axis, heading about its
-        feed-forward. A feed-forward beyond the tilt limit counts as being at the limit."""
-        settings, vehicle, limit = self.limits, self.vehicle, self.tilt_limit
-        centre = np.clip(nominal[1:3], -limit, limit)
-        lower, upper = np.empty(4), np.empty(4)
-        lower[0], upper[0] = settings.thrust_floor * vehicle.gravity_mps2, vehicle.thrust_max_mps2
-        lower[1:3] = np.maximum(centre - settings.feedback_limit, -limit)
-        upper[1:3] = np.minimum(centre + settings.feedback_limit, limit)
-        lower[3], upper[3] = nominal[3] - HEADING_BOX_RAD, nominal[3] + HEADING_BOX_RAD
-        return lower, upper
-
-
-def deviations(state: PredictedState, target: Target) -> tuple[Array, Array]:
-    """`Task.lateral` (4, 2) and `Task.vertical` (3,) of a predicted state."""
-    lateral = np.empty((4, 2))
-    lateral[0] = state.position_ned_m[:2] - target.position_ne_m
-    lateral[1] = state.velocity_ned_mps[:2] - target.velocity_ne_mps
-    lateral[2] = state.thrust_direction_ned[:2] - target.direction_ne
-    lateral[3] = state.thrust_direction_rate_ned_ps[:2] - target.direction_rate_ne_ps
-    heave = heave_of(state)
-    vertical = np.array(
-        [
-            heave.position_down_m - target.position_down_m,
-            heave.velocity_down_mps - target.velocity_down_mps,
-            heave.thrust_down_mps2 - target.thrust_down_mps2,
-        ]
-    )
-    return lateral, vertical
+    def tilt_bounds(self, nominal: Array) -> tuple[Array, Array]:
+        """Lower and upper b_c (..., 2): |b_c| and |b_c - b_ff| per axis for feed-forwards (..., 2);
+        one beyond the tilt limit counts as being at the limit."""
+        limit = min(self.limits.tilt_limit, math.sin(self.vehicle.tilt_max_rad))
+        centre, reach = np.clip(nominal, -limit, limit), self.limits.feedback_limit
+        return np.maximum(centre - reach, -limit), np.minimum(centre + reach, limit)
 
 
 def heave_of(state: PredictedState) -> PredictedHeave:
@@ -295,10 +275,52 @@ def decision(inputs: Array, certificate: Certificate) -> Decision:
     return Decision(Command(thrust, (north, east, down), wrap_pi(heading)), certificate)
 
 
-def _finite(problem: BoxQuadratic) -> bool:
-    return bool(
-        math.isfinite(problem.constant)
-        and np.isfinite(problem.gradient).all()
-        and np.isfinite(problem.lower).all()
-        and np.isfinite(np.diag(problem.hessian)).all()
-    )
+class LqrSettings(TrackingSettings):
+    """Settings of the law `lqr`."""
+
+    law: Literal["lqr"] = "lqr"
+
+    def build(self, vehicle: Vehicle, *, period_s: float, seed: int) -> LqrLaw:
+        return LqrLaw(vehicle, self, period_s)
+
+
+class LqrLaw(TrackingLaw):
+    """The exact minimum, clip(-f / H)."""
+
+    def decide(self, situation: Situation) -> Decision:
+        problem = self.task(situation).problem
+        inputs = closed_form(problem)
+        cost = float(problem(inputs))
+        on_bound = at_bound(problem, inputs)
+        return decision(inputs, Certificate(cost, optimal_cost=cost, gap=0.0, at_bound=on_bound))
+
+
+class PsoSettings(TrackingSettings):
+    """Settings of the law `pso`."""
+
+    law: Literal["pso"] = "pso"
+    swarm: SwarmSettings = SwarmSettings()
+
+    def build(self, vehicle: Vehicle, *, period_s: float, seed: int) -> PsoLaw:
+        return PsoLaw(vehicle, self, period_s, seed)
+
+
+class PsoLaw(TrackingLaw):
+    """The minimum that the swarm finds, certified against the exact one."""
+
+    def __init__(
+        self, vehicle: Vehicle, settings: PsoSettings, period_s: float = 0.1, seed: int = 0
+    ) -> None:
+        super().__init__(vehicle, settings, period_s)
+        self._swarm, self._seed = settings.swarm, seed
+        self._rng = np.random.default_rng(seed)
+        self._exact = ExactMinimum(4)
+
+    def decide(self, situation: Situation) -> Decision:
+        problem = self.task(situation).problem
+        result = minimise(self._swarm, problem, self._rng, situation.remaining_s)
+        return decision(result.best, certify(problem, result, self._exact))
+
+    def reset(self) -> None:
+        super().reset()
+        self._rng = np.random.default_rng(self._seed)

@@ -1,7 +1,8 @@
 """The law `mpc`: the cost of the tracking laws over N decisions within their bounds, by daqp.
 
 Where no later bound is active it equals `lqr`; where one is, it plans for it. It avoids no keep-out
-volume.
+volume. `horizon` shares what the reference asks for over N decisions (`look_ahead`) and the
+problem for the linear plant as one quadratic in all inputs (`HorizonQuadratic`).
 """
 
 from __future__ import annotations
@@ -9,20 +10,135 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
+from scipy.linalg import block_diag
 
 from offboard.control.base import Certificate, Decision, DecisionError, Situation
-from offboard.control.horizon.outlook import HorizonQuadratic, bounds, look_ahead
-from offboard.control.law import TrackingLaw, TrackingSettings, decision
-from offboard.control.quadratic import ExactMinimum, at_bound
+from offboard.control.gains import CostToGo, held_lead
+from offboard.control.law import Task, TrackingLaw, TrackingSettings, decision, heave_of
+from offboard.control.quadratic import BoxQuadratic, ExactMinimum, at_bound
 from offboard.model.vehicle import Vehicle
+from offboard.reference.flatness import flat_state
+
+Array = NDArray[np.float64]
+
+MOST_STEPS = 40
+_NODES = 2 * MOST_STEPS + 1
+OUTLOOK = np.dtype(
+    [
+        # at the nodes, NED: p, v and b, each axis at its own times; T when tilt and when thrust
+        # act; b_z when the thrust acts
+        ("positions", "f8", (_NODES, 3)),
+        ("velocities", "f8", (_NODES, 3)),
+        ("directions", "f8", (_NODES, 3)),
+        ("thrusts_tilt", "f8", _NODES),
+        ("thrusts_heave", "f8", _NODES),
+        ("b_z", "f8", _NODES),
+        # of each hold: b_c north and east and the vertical thrust in its middle, led; the bounds
+        # of the deviations from them
+        ("feedforward", "f8", (MOST_STEPS, 3)),
+        ("lower", "f8", (MOST_STEPS, 3)),
+        ("upper", "f8", (MOST_STEPS, 3)),
+        # A steady vertical disturbance is nearly always a wrong hover thrust or mass: the lateral
+        # force of the tilted thrust is taken as this share of the modelled one
+        ("thrust_share", "f8"),
+    ],
+    align=True,
+)
+"""The reference over up to `MOST_STEPS` holds: nodes are start, middle, ..., end of the holds. SI.
+
+Plans are deviations [b_c north, b_c east, T b_z] from the feed-forward, which compensates the
+response of the attitude loop: a plan of zeros flies the reference."""
+
+
+def look_ahead(law: TrackingLaw, situation: Situation, task: Task, steps: int) -> NDArray[np.void]:
+    """One `OUTLOOK` over `steps` holds, from the times at which a command sent now takes effect:
+    lateral axes when the tilt acts, the vertical one when the thrust acts."""
+    vehicle, state, period_s = law.vehicle, situation.state, law.period_s
+    nodes_s = 0.5 * period_s * np.arange(2 * steps + 1)
+    times = np.concatenate((state.time_s + nodes_s, heave_of(state).time_s + nodes_s))
+    sample = situation.reference.sample(times)
+    flat = flat_state(
+        sample, vehicle.gravity_mps2, vehicle.drag_per_mass_ps, state.disturbance_ned_mps2
+    )
+    tilt, heave = np.split(np.arange(len(times)), 2)
+    b, down = flat.thrust_direction_ned, flat.thrust_direction_ned[heave, 2]
+    middles = tilt[1::2]
+    outlook = np.zeros(1, OUTLOOK)
+    one = outlook[0]
+    for name, values in (
+        ("positions", sample.position_ned_m),
+        ("velocities", sample.velocity_ned_mps),
+    ):
+        one[name][: len(tilt)] = np.column_stack((values[tilt, :2], values[heave, 2]))
+    one["directions"][: len(tilt)] = b[tilt]
+    one["thrusts_tilt"][: len(tilt)] = flat.thrust_mps2[tilt]
+    one["thrusts_heave"][: len(tilt)] = flat.thrust_mps2[heave]
+    one["b_z"][: len(tilt)] = down
+    led_tilt = held_lead(
+        b[middles, :2],
+        flat.thrust_direction_rate_ned_ps[middles, :2],
+        flat.thrust_direction_acceleration_ned_ps2[middles, :2],
+        vehicle.tilt,
+        period_s,
+    )
+    led_thrust = flat.thrust_mps2 + vehicle.thrust_lag_s * flat.thrust_rate_mps3
+    nominal = np.column_stack((led_tilt, (led_thrust * b[:, 2])[heave][1::2]))
+    one["feedforward"][:steps] = nominal
+    low, high = law.tilt_bounds(led_tilt)
+    down = down[:-1:2].copy()
+    down[0] = task.b_z
+    thrusts = task.problem.lower[0] * down, task.problem.upper[0] * down
+    one["lower"][:steps] = np.column_stack((low, thrusts[0])) - nominal
+    one["upper"][:steps] = np.column_stack((high, thrusts[1])) - nominal
+    gravity = vehicle.gravity_mps2
+    one["thrust_share"] = gravity / (gravity + float(state.disturbance_ned_mps2[2]))
+    return outlook
+
+
+class HorizonQuadratic:
+    """J of N held inputs and the cost-to-go that follows them, for the gains of `law`; `problem`
+    fills in the state. Inputs are deviations from the `OUTLOOK`: N of b_c north, N of b_c east, N
+    of vertical thrust. The axes do not couple."""
+
+    def __init__(self, law: TrackingLaw, steps: int) -> None:
+        self.steps = steps
+        lateral = _condense(law.lateral, steps, law.period_s)
+        self._axes = (lateral, lateral, _condense(law.vertical, steps, law.period_s))
+        self._hessian: Array = block_diag(*(axis[0] for axis in self._axes))
+
+    def problem(self, task: Task, outlook: NDArray[np.void]) -> BoxQuadratic:
+        """The quadratic in (3 N,) from the deviations of `task`."""
+        starts = (task.lateral[:, 0], task.lateral[:, 1], task.vertical)
+        axes = list(zip(starts, self._axes, strict=True))
+        gradient = np.concatenate([start @ axis[1] for start, axis in axes])
+        rest = sum(float(start @ axis[2] @ start) for start, axis in axes)
+        bounds = (outlook[0][name][: self.steps].T.ravel() for name in ("lower", "upper"))
+        return BoxQuadratic(self._hessian, gradient, rest, *bounds)
+
+    def plan(self, stacked: Array) -> Array:
+        """Inputs (3 N,) of the problem as (N, 3), one row per step."""
+        return stacked.reshape(3, self.steps).T
+
+
+def _condense(to_go: CostToGo, steps: int, period_s: float) -> tuple[Array, Array, Array]:
+    """J = 1/2 u' H u + x' F u + x' G x of u (N,) from the state x (n,): H, F (n, N), G (n, n)."""
+    size = len(to_go.transition)
+    at = np.eye(size, size + steps)  # the state, as a function of the first one and the inputs
+    total = np.zeros((size + steps, size + steps))
+    for held in np.eye(size + steps)[size:, None]:
+        total += period_s * at[:1].T @ at[:1] + to_go.effort * held.T @ held
+        at = to_go.transition @ at + to_go.input_map @ held
+    total += at.T @ to_go.terminal @ at
+    return 2.0 * total[size:, size:], 2.0 * total[:size, size:], total[:size, :size]
 
 
 class MpcSettings(TrackingSettings):
     """Settings of the law `mpc`; `steps` is the number of decisions planned."""
 
     law: Literal["mpc"] = "mpc"
-    steps: int = Field(default=10, ge=2, le=40)
+    steps: int = Field(default=10, ge=2, le=MOST_STEPS)
 
     def build(self, vehicle: Vehicle, *, period_s: float, seed: int) -> MpcLaw:
         return MpcLaw(vehicle, self, period_s=period_s)
@@ -38,8 +154,7 @@ class MpcLaw(TrackingLaw):
 
     def decide(self, situation: Situation) -> Decision:
         task = self.task(situation)
-        ahead = look_ahead(self, situation, self._steps)
-        planned = self._quadratic.problem(task, bounds(ahead, task, self))
+        planned = self._quadratic.problem(task, look_ahead(self, situation, task, self._steps))
         best = self._exact.minimise(planned)
         if not np.isfinite(best).all():
             raise DecisionError("the quadratic over the horizon has no solution")

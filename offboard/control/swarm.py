@@ -85,6 +85,8 @@ SEARCH = np.dtype(
 )
 """Settings and progress of one search: iterations done, cost of the best, spread (Eqs. 28-29)."""
 
+_NO_HESSIAN, _NO_GRADIENT = np.empty((0, 0)), np.empty(0)
+
 # Compiled: the particles are (3, n, particles), their positions, velocities and personal bests;
 # `bounds` (2, n) lower and upper; `best` (n,) the best position of all; `costs` (2, particles) the
 # newest and the least of each particle.
@@ -137,21 +139,10 @@ def _remember(search: Any, particles: Array, best: Array, costs: Array) -> None:
     search.done += 1
 
 
-@entry(SEARCH, Generator, array(2), array(3), array(1), array(2))
-def iterate(
-    searches: Any, rng: Generator, bounds: Array, particles: Array, best: Array, costs: Array
-) -> None:
-    """End an iteration with the newest costs, and move the particles for the next one."""
-    search = searches[0]
-    _remember(search, particles, best, costs)
-    if search.done < search.iterations:
-        _move(search, rng, bounds, particles, best)
-
-
 @entry(
     SEARCH, Generator, array(2), array(3), array(1), array(2), array(2), array(1), float, int
 )  # fmt: skip
-def iterate_quadratic(
+def iterate(
     searches: Any,
     rng: Generator,
     bounds: Array,
@@ -163,10 +154,11 @@ def iterate_quadratic(
     constant: float,
     until: int,
 ) -> None:
-    """`iterate` with the costs J = 1/2 u'Hu + f'u + c, until `until` iterations are done."""
+    """Iterate until `until` iterations are done: with the costs J = 1/2 u'Hu + f'u + c, or, where
+    the gradient is empty, with the newest of `costs`. Then move the particles for the next one."""
     search = searches[0]
     while search.done < until:
-        for i in range(costs.shape[1]):
+        for i in range(costs.shape[1] if len(gradient) > 0 else 0):
             costs[0, i] = constant
             for j in range(len(gradient)):
                 slope = gradient[j] + 0.5 * hessian[j, j] * particles[0, j, i]
@@ -226,15 +218,18 @@ class Swarm:
         if values.shape != self._costs.shape[1:]:
             raise ValueError(f"{values.shape} costs for {self._costs.shape[1]} particles")
         self._costs[0] = values
-        iterate(self._search, self._rng, self._bounds, self._particles, self._best, self._costs)
+        self._iterate(_NO_HESSIAN, _NO_GRADIENT, 0.0, int(self._search["done"][0]) + 1)
 
     def tell_all(self, problem: BoxQuadratic, until: int) -> None:
         """`tell` the costs of `problem` until `until` iterations are done."""
-        iterate_quadratic(
+        hessian = np.ascontiguousarray(problem.hessian, np.float64)
+        gradient = np.ascontiguousarray(problem.gradient, np.float64)
+        self._iterate(hessian, gradient, float(problem.constant), until)
+
+    def _iterate(self, hessian: Array, gradient: Array, constant: float, until: int) -> None:
+        iterate(
             self._search, self._rng, self._bounds, self._particles, self._best, self._costs,
-            np.ascontiguousarray(problem.hessian, np.float64),
-            np.ascontiguousarray(problem.gradient, np.float64),
-            float(problem.constant), until,
+            hessian, gradient, constant, until,
         )  # fmt: skip
 
     def result(self, cut_short: bool = False) -> SwarmResult:
@@ -262,12 +257,9 @@ def minimise(
     finite and ordered.
     """
     swarm, limit = Swarm(settings, problem.lower, problem.upper, rng), settings.iterations
-    if remaining_s is None:
-        swarm.tell_all(problem, limit)
-        return swarm.result()
     for until in range(CHUNK_ITERATIONS, limit, CHUNK_ITERATIONS):
         swarm.tell_all(problem, until)
-        if remaining_s() <= 0:
+        if remaining_s is not None and remaining_s() <= 0:
             return swarm.result(cut_short=True)
     swarm.tell_all(problem, limit)
     return swarm.result()
@@ -300,7 +292,10 @@ def certify(
     off = result.best - best
     slope = problem.hessian @ best + problem.gradient
     excess = float(slope @ off + 0.5 * off @ problem.hessian @ off)
-    scale = max(abs(optimal), GAP_FLOOR * _variation(problem))
+    width, middle = problem.upper - problem.lower, 0.5 * (problem.lower + problem.upper)
+    steepness = np.abs(problem.hessian @ middle + problem.gradient)
+    variation = float(steepness @ width + width @ np.abs(problem.hessian) @ width / 8)
+    scale = max(abs(optimal), GAP_FLOOR * variation)
     gap = max(excess, 0.0) / scale if scale > 0 else (0.0 if scale == 0 else float("nan"))
     return Certificate(
         cost=result.cost,
@@ -311,11 +306,3 @@ def certify(
         cut_short=result.cut_short,
         at_bound=at_bound(problem, result.best),
     )
-
-
-def _variation(problem: BoxQuadratic) -> float:
-    """An upper estimate of the variation of J within the bounds."""
-    width = problem.upper - problem.lower
-    middle = 0.5 * (problem.lower + problem.upper)
-    slope = problem.hessian @ middle + problem.gradient
-    return float(np.abs(slope) @ width + width @ np.abs(problem.hessian) @ width / 8)

@@ -45,13 +45,12 @@ from offboard.estimation.motion import (
 )
 from offboard.estimation.noise import Noise, NoiseEstimate
 from offboard.model.axes import acceleration, b_z_of, lateral_model
-from offboard.model.command import Command
+from offboard.model.command import Command, PredictedHeave, PredictedState
 from offboard.model.frames import (
     heading_from_quaternion,
     thrust_direction_from_quaternion,
     wrap_pi,
 )
-from offboard.model.predicted_state import PredictedHeave, PredictedState
 from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]

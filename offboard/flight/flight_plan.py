@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.reference.base import FlatSample, Reference
-from offboard.reference.paused import Paused
-from offboard.reference.track import Track
-from offboard.reference.transfer import Limits, Moved, stopping_place, transfer
+from offboard.reference.track import Moved, Track
+from offboard.reference.transfer import Limits, stopping_place, transfer
 
 Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
@@ -60,7 +59,7 @@ class FlightPlan:
         self._track_began_s = math.nan
         self._arrival_s = math.nan
         self._planned: Reference | None = None
-        self._paused: Paused | None = None
+        self._paused: Moved | None = None
         self._offset: Reference | None = None  # since a jump of the estimate
 
     @property
@@ -109,8 +108,8 @@ class FlightPlan:
         """Come to rest on the track, which has begun."""
         assert self._planned is not None
         if self._paused and self._paused.at_full_speed(time_s):
-            self.start_track(self._track_began_s + time_s - self._paused.passed_s(time_s))
-        self._paused = self._planned = Paused(self._planned, time_s)
+            self.start_track(time_s - self._paused.own_s(time_s))
+        self._paused = self._planned = Moved(self._planned, paused_s=time_s)
 
     def resume(self, time_s: float) -> None:
         """Continue the track after `pause`."""
@@ -137,8 +136,7 @@ class FlightPlan:
 
     def track_time_s(self, time_s: float) -> float:
         """Time since the start of the track, without pauses; NaN before it."""
-        passed_s = self._paused.passed_s(time_s) if self._paused else time_s
-        return passed_s - self._track_began_s
+        return self._paused.own_s(time_s) if self._paused else time_s - self._track_began_s
 
     def late_s(self, time_s: float) -> float:
         """Time since the planned end of the climb; negative before it, NaN without a climb."""

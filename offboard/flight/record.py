@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from offboard.control.base import Certificate, Decision
 from offboard.flight.phases import PHASE_CODES, Phase
 from offboard.mavlink.outgoing import ReferenceRecord
-from offboard.model.command import Command, PositionCommand
-from offboard.model.predicted_state import PredictedState
+from offboard.model.command import Command, PositionCommand, PredictedState
 from offboard.reference.base import FlatSample
 
 COMPONENT_ID = 191  # MAV_COMP_ID_ONBOARD_COMPUTER: the sender of frames

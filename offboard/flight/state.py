@@ -34,8 +34,7 @@ from offboard.mavlink.dialects.base import Dialect, Takeoff
 from offboard.mavlink.events import Heartbeat, Landed, TimesyncReply
 from offboard.mavlink.outgoing import CommandLong, Outgoing, Record
 from offboard.mavlink.session import Session
-from offboard.model.command import Command
-from offboard.model.predicted_state import PredictedState
+from offboard.model.command import Command, PredictedState
 from offboard.model.vehicle import Vehicle
 
 Triple = tuple[float, float, float]

@@ -1,8 +1,59 @@
-"""Setpoints as values: attitude and thrust, or position."""
+"""The attitude interface as values: the state when a command takes effect, and the commands."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class PredictedHeave:
+    """The vertical motion at `time_s` (vehicle time), when the thrust of a command sent now takes
+    effect. Down is positive; `thrust_down_mps2` is the vertical part T b_z of the thrust."""
+
+    time_s: float
+    position_down_m: float
+    velocity_down_mps: float
+    thrust_down_mps2: float
+
+
+@dataclass(frozen=True, slots=True)
+class PredictedState:
+    """The state predicted by the observer for `time_s`, when a command sent now takes effect.
+
+    Acceleration = g e3 - T b - c v + d, with thrust T, direction b, drag c and disturbance d.
+
+    Attributes:
+        time_s: Vehicle time, s: the tick plus the delay of the tilt.
+        position_ned_m: (3,), in the autopilot's local NED frame.
+        velocity_ned_mps: (3,).
+        thrust_direction_ned: (3,), unit vector b: the body's down axis in NED, (0, 0, 1) if level.
+        thrust_direction_rate_ned_ps: (3,), derivative of b, 1/s.
+        heading_rad: Heading of the nose, 0 = north, clockwise, -pi .. pi.
+        heading_rate_radps: Its derivative.
+        thrust_mps2: Thrust per unit of mass T that acts, after its lag.
+        disturbance_ned_mps2: (3,), estimated d: wind, wrong mass or hover thrust.
+        rates_frd_radps: (3,), body rates p, q, r.
+        heave: The vertical motion at its own time. Thrust acts sooner than tilt; a vertical loop
+            closed on `time_s` would wait for the tilt and, from a difference of about 0.1 s on,
+            oscillate. None: not predicted separately.
+    """
+
+    time_s: float
+    position_ned_m: Array
+    velocity_ned_mps: Array
+    thrust_direction_ned: Array
+    thrust_direction_rate_ned_ps: Array
+    heading_rad: float
+    heading_rate_radps: float
+    thrust_mps2: float
+    disturbance_ned_mps2: Array
+    rates_frd_radps: Array
+    heave: PredictedHeave | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,29 +1,64 @@
-"""The nonlinear rigid body of Eqs. 1-8: forces and torques in, motion out.
+"""The nonlinear rigid body of Eqs. 1-8, forces and torques in, motion out, and its linear model at
+hover, Eqs. 8-18.
 
 One function, `body_accelerations`, holds the physics (Newton-Euler with linear drag); two charts
 around it hold only kinematics: the paper's 12 states (Eq. 5, Euler angles, body velocity) and 13
-states with a quaternion and NED velocity, without singularity. The length of the state tells
-which. The simulator, the paper's plant and the linearisation all run this code: compiled, where
-compiled code calls it, and on numpy's arrays, also complex ones for differentiation by complex
-step, where Python does. Inputs are total: hover is [m g, 0, 0, 0].
+states with a quaternion and NED velocity, without singularity, which the simulator integrates. The
+length of the state tells which. A state is an array (..., 12) or (..., 13), inputs (Eq. 6) are
+(..., 4) and total: hover is [m g, 0, 0, 0].
 
-Knows no rotors, ground, sensors or randomness.
+The simulator, the paper's plant and the linearisation all run this code: compiled, where compiled
+code calls it, and on numpy's arrays, also complex ones for differentiation by complex step, where
+Python does. For attitude setpoints instead of torques, see `axes`. Knows no rotors, ground, sensors
+or randomness.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from offboard.compiled import kernel
-from offboard.model.state import EULER, INPUT_SIZE, QUATERNION
+from offboard.model.axes import LinearModel
+from offboard.model.frames import (
+    euler_from_quaternion,
+    quaternion_from_euler,
+    rotation_from_quaternion,
+)
 from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
 
+# Eq. 5: Euler angles rad, body rates rad/s, body velocity m/s, position NED m
+PHI, THETA, PSI, P, Q, R, U, V, W, X, Y, Z = range(12)
+
+# Eq. 6: lift N, roll and pitch input (N if the vehicle has an arm, else N m), yaw torque N m
+THRUST, TAU_X, TAU_Y, TAU_Z = range(4)
+INPUT_SIZE: Final = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Chart:
+    """The parts of a state along its last axis."""
+
+    size: int
+    attitude: slice
+    rates: slice
+    velocity: slice
+    position: slice
+
+
+EULER: Final = Chart(12, slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12))
+"""[phi theta psi, p q r, u v w (body), x y z (NED)], Eq. 5."""
+
+QUATERNION: Final = Chart(13, slice(0, 4), slice(4, 7), slice(7, 10), slice(10, 13))
+"""[w x y z (FRD -> NED), p q r, velocity NED, position NED]."""
+
 RK4_SCRATCH_ROWS = 3
+_COMPLEX_STEP = 1e-30
 _STILL_AIR = np.zeros(3)
 
 
@@ -209,3 +244,55 @@ def rk4_into(
         length = np.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2] + out[3] * out[3])
         for i in range(4):
             out[i] /= length
+
+
+def hover_matrices(vehicle: Vehicle) -> tuple[Array, Array]:
+    """A (12, 12) and B (12, 4) of Eq. 9 at hover, level, nose north.
+
+    By complex step, f'(x) = Im f(x + ih) / h: exact to rounding, exact zeros where f is decoupled.
+    """
+    size = EULER.size
+    steps = 1j * _COMPLEX_STEP * np.eye(size + INPUT_SIZE)
+    slopes = derivative(
+        steps[:, :size], hover_input(vehicle) + steps[:, size:], pack(vehicle)
+    ).imag.T
+    jacobian = slopes / _COMPLEX_STEP
+    return jacobian[:, :size], jacobian[:, size:]
+
+
+def sampled_matrices(vehicle: Vehicle, step_s: float) -> tuple[Array, Array]:
+    """A_d (12, 12) and B_d (12, 4) of Eq. 14: zero-order hold over `step_s` seconds."""
+    sampled = LinearModel(*hover_matrices(vehicle)).sampled(step_s)
+    return sampled.dynamics, sampled.input_map
+
+
+def quaternion_state(euler_state: Array) -> Array:
+    """Eq. 5 state (..., 12) -> quaternion state (..., 13); velocity from body axes to NED."""
+    phi, theta, psi = np.moveaxis(euler_state[..., EULER.attitude], -1, 0)
+    quaternion = quaternion_from_euler(phi, theta, psi)
+    velocity_ned = np.einsum(
+        "...ij,...j->...i", rotation_from_quaternion(quaternion), euler_state[..., EULER.velocity]
+    )
+    return np.concatenate(
+        (quaternion, euler_state[..., EULER.rates], velocity_ned, euler_state[..., EULER.position]),
+        axis=-1,
+    )
+
+
+def euler_state(quaternion_state: Array) -> Array:
+    """Quaternion state (..., 13) -> Eq. 5 state (..., 12); velocity from NED to body axes."""
+    quaternion = quaternion_state[..., QUATERNION.attitude]
+    velocity_body = np.einsum(
+        "...ji,...j->...i",
+        rotation_from_quaternion(quaternion),
+        quaternion_state[..., QUATERNION.velocity],
+    )
+    return np.concatenate(
+        (
+            euler_from_quaternion(quaternion),
+            quaternion_state[..., QUATERNION.rates],
+            velocity_body,
+            quaternion_state[..., QUATERNION.position],
+        ),
+        axis=-1,
+    )

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from offboard.control.quadratic import ExactMinimum
 from offboard.control.swarm import certify
 from offboard.link.clock import monotonic_s
+from offboard.model.command import PredictedState
 from offboard.model.frames import quaternion_from_euler, rotation_from_quaternion
-from offboard.model.predicted_state import PredictedState
-from offboard.model.state import EULER, PHI, PSI, THETA, THRUST, P, R, U, V, W, X, Z
+from offboard.model.rigid_body import EULER, PHI, PSI, THETA, THRUST, P, R, U, V, W, X, Z
 from offboard.model.vehicle import Vehicle
 from offboard.paper.controller import flyable_box, heading_frame
 from offboard.paper.extensions import INTEGRATED
@@ -33,8 +33,8 @@ from offboard.paper.plant import (
 )
 from offboard.reference.base import FlatSample, Reference
 from offboard.reference.flatness import flat_state
+from offboard.reference.path import Smoothness
 from offboard.reference.shapes import HeadingMode, Hover, Waypoints
-from offboard.reference.waypoints import Smoothness
 
 Array = NDArray[np.float64]
 

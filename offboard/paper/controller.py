@@ -15,11 +15,9 @@ from numpy.typing import NDArray
 from offboard.control.base import ControllerSettings, Decision, DecisionError, Situation
 from offboard.control.quadratic import ExactMinimum
 from offboard.control.swarm import certify
-from offboard.model.command import Command
+from offboard.model.command import Command, PredictedState
 from offboard.model.frames import wrap_pi
-from offboard.model.linear import sampled_matrices
-from offboard.model.predicted_state import PredictedState
-from offboard.model.state import PHI, PSI, THETA, THRUST, P, R, U, W, X, Z
+from offboard.model.rigid_body import PHI, PSI, THETA, THRUST, P, R, U, W, X, Z, sampled_matrices
 from offboard.model.vehicle import Vehicle
 from offboard.paper.law import (
     PAPER_ARM_M,

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from offboard.model.linear import sampled_matrices
+from offboard.model.rigid_body import sampled_matrices
 from offboard.paper import printed
 from offboard.paper.closed_loop import Flight, Flights
 from offboard.paper.law import PaperSettings

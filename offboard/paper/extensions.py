@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from offboard.documents.parameters import Parameters
-from offboard.model.state import PHI, PSI, THETA, P, Q, R, U, V, W, X, Z
+from offboard.model.rigid_body import PHI, PSI, THETA, P, Q, R, U, V, W, X, Z
 
 Array = NDArray[np.float64]
 Weight = Annotated[float, Field(ge=0)]

@@ -25,7 +25,7 @@ from offboard.analysis.page import (
 )
 from offboard.control.quadratic import ExactMinimum
 from offboard.control.swarm import Swarm
-from offboard.model.state import PSI, U, X
+from offboard.model.rigid_body import PSI, U, X
 from offboard.paper.closed_loop import Flight, Flights, FlightTask, PathName, sampled_path
 from offboard.paper.law import PaperLaw, PaperSettings
 from offboard.paper.plant import PlantKind, paper_model

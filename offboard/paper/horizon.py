@@ -15,7 +15,7 @@ from scipy.linalg import block_diag
 from scipy.optimize import differential_evolution
 
 from offboard.analysis.page import BLUE, GREY, INK, RED, Figure, curve, panels
-from offboard.model.state import PHI, TAU_X, P, V, Y
+from offboard.model.rigid_body import PHI, TAU_X, P, V, Y
 from offboard.paper.closed_loop import Flights, FlightTask, LawName, PathName, cost_to_go
 from offboard.paper.figures import position_error
 from offboard.paper.law import PAPER_STEP_S, PaperSettings

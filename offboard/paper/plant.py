@@ -15,15 +15,19 @@ from offboard.compiled import array, entry
 from offboard.documents import shipped
 from offboard.documents.reading import parse
 from offboard.model.axes import LinearModel
-from offboard.model.linear import hover_matrices, sampled_matrices
 from offboard.model.rigid_body import (
+    EULER,
     RK4_SCRATCH_ROWS,
+    THRUST,
+    U,
+    W,
     derivative_into,
     hover_input,
+    hover_matrices,
     pack,
     rk4_into,
+    sampled_matrices,
 )
-from offboard.model.state import EULER, THRUST, U, W
 from offboard.model.vehicle import Vehicle
 from offboard.paper.law import PAPER_STEP_S
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.documents.errors import plain
-from offboard.model.state import PHI, PSI, P, U, V, W
+from offboard.model.rigid_body import PHI, PSI, P, U, V, W
 from offboard.paper import printed
 from offboard.paper.closed_loop import Flight, Flights, FlightTask, PathName
 from offboard.paper.extensions import IntegralSettings, StateLimits

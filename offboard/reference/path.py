@@ -1,25 +1,31 @@
-"""Geometric paths: what a shape has to provide, and the two kinds that there are.
+"""Geometric paths, and where the nose points along them.
 
 A path maps its own time s (seconds at full speed) to a position and its derivatives with respect
-to s. Starting and stopping is added by `track`, where the nose points by `heading`.
+to s: `Harmonic`, or a `Spline` of SciPy through points. Starting and stopping is added by `track`.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline
+from scipy.interpolate import BPoly, BSpline, PPoly, make_interp_spline, make_lsq_spline
 
 Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
 
 ORDERS = 5  # position, velocity, acceleration, jerk, snap
+HEADING = 3  # column of a jet, after north, east and down
+HOLD_SPEED_MPS = 0.1
 _ORDER = np.arange(ORDERS, dtype=np.float64)[:, np.newaxis, np.newaxis]
 _ZERO: Triple = (0.0, 0.0, 0.0)
+_DEGREE = 5  # of a curve through the rows of a table
+_REST_LEG_STRETCH = 1.5  # the first and the last leg start or end at rest and need more time
+_STEP_S, _NODES_MAX = 0.02, 200_000  # of the unwrapped direction of a path
 
 
 class Path(Protocol):
@@ -36,54 +42,9 @@ class Path(Protocol):
     def bounded(self) -> bool: ...
 
     def jet(self, path_time_s: Array) -> Array:
-        """Derivatives 0 to 4 with respect to s, (5, N, 3), NED and SI, for s of shape (N,)."""
+        """Derivatives 0 to 4 with respect to s, NED and SI, for s of shape (N,): (5, N, 3), or
+        (5, N, 4) with the heading, rad, as a fourth column."""
         ...
-
-
-@dataclass(frozen=True, slots=True)
-class Polynomial:
-    """A piecewise polynomial on [0, length_s] with any number of columns (3 for a path).
-
-    breaks_s (M + 1,) increasing; coefficients (ORDERS, M, K, C): for each derivative and piece
-    the factors of (s - break)^k, lowest power first. Outside, the end pieces continue.
-    """
-
-    breaks_s: Array
-    coefficients: Array
-    bounded: bool = True
-
-    @classmethod
-    def from_taylor(cls, breaks_s: Array, taylor: Array) -> Polynomial:
-        """From the factors of (s - break)^k, lowest power first, (M, K, C)."""
-        pieces, powers, columns = taylor.shape
-        coefficients = np.zeros((ORDERS, pieces, powers, columns))
-        coefficients[0] = taylor
-        factors = np.arange(1.0, powers)[:, np.newaxis]
-        for order in range(1, ORDERS):
-            coefficients[order, :, :-1] = coefficients[order - 1, :, 1:] * factors
-        return cls(breaks_s, coefficients)
-
-    @classmethod
-    def from_spline(cls, spline: BSpline) -> Polynomial:
-        """From a SciPy B-spline with C columns: one piece between any two different knots."""
-        breaks = np.unique(spline.t[spline.k : spline.t.size - spline.k])
-        derivatives = [
-            spline(breaks[:-1], nu=power) / math.factorial(power) for power in range(spline.k + 1)
-        ]
-        return cls.from_taylor(breaks, np.stack(derivatives, axis=1))
-
-    @property
-    def length_s(self) -> float:
-        return float(self.breaks_s[-1])
-
-    def jet(self, path_time_s: Array) -> Array:
-        """Derivatives 0 to 4, shape (5, N, C), for s of shape (N,)."""
-        inner = self.breaks_s[1:-1]
-        piece = np.searchsorted(inner, path_time_s, side="right")
-        offset = path_time_s - self.breaks_s[piece]
-        powers = offset[:, np.newaxis] ** np.arange(self.coefficients.shape[2])
-        result: Array = np.einsum("dnkc,nk->dnc", self.coefficients[:, piece], powers)
-        return result
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +64,7 @@ class Harmonic:
     phase_ned_rad: Triple = _ZERO
 
     def jet(self, path_time_s: Array) -> Array:
-        """Derivatives 0 to 4 with respect to s, shape (5, N, 3), for s of shape (N,)."""
+        """See `Path`."""
         time = path_time_s[:, np.newaxis]
         omega = np.array(self.omega_ned_radps)
         angle = omega * time + np.array(self.phase_ned_rad)
@@ -114,3 +75,183 @@ class Harmonic:
         result[0] += np.array(self.offset_ned_m) + slope * time
         result[1] += slope
         return result
+
+
+class Spline:
+    """A piecewise polynomial of SciPy from s = 0 on, with its derivatives."""
+
+    bounded = True
+
+    def __init__(self, curve: BSpline | PPoly) -> None:
+        if isinstance(curve, BSpline):
+            starts = np.unique(curve.t)
+            powers = range(curve.k, -1, -1)
+            factors = [curve(starts[:-1], nu=power) / math.factorial(power) for power in powers]
+            curve = PPoly(np.array(factors), starts)
+        self.breaks_s: Array = curve.x
+        self.length_s = float(curve.x[-1])
+        # all derivatives as columns of one polynomial: five calls would take 0.1 ms
+        together = np.zeros((*curve.c.shape[:2], ORDERS, curve.c.shape[2]))
+        for order in range(ORDERS):
+            factors = curve.derivative(order).c
+            together[len(together) - len(factors) :, :, order] = factors
+        self._curves = PPoly(together, curve.x)
+
+    def jet(self, path_time_s: Array) -> Array:
+        """Derivatives 0 to 4, (5, N, columns), for s of shape (N,)."""
+        jet: Array = self._curves(path_time_s).transpose(1, 0, 2)
+        return jet
+
+
+def joined(times_s: Array | list[float], jets: Array | list[Array]) -> Spline:
+    """Polynomials from each jet (derivatives, columns) to the next, with all its derivatives."""
+    return Spline(PPoly.from_bernstein_basis(BPoly.from_derivatives(times_s, jets)))
+
+
+class Smoothness(StrEnum):
+    """The derivative whose square is minimised. Inside, `jerk` gives a path continuous to snap,
+    `snap` one continuous to two derivatives more.
+
+    At the ends velocity and acceleration vanish, with `snap` jerk too; the run-in and run-out of
+    `Track` make the higher derivatives continuous there."""
+
+    JERK = "jerk"
+    SNAP = "snap"
+
+
+def times_from_speed(points_ned_m: Array, speed_mps: float) -> Array:
+    """Arrival times (N,), from 0: `speed_mps` is the mean speed of an inner leg; the first and
+    the last leg take 1.5 times as long. Raises ValueError when two neighbours coincide."""
+    legs_m = np.linalg.norm(np.diff(points_ned_m, axis=0), axis=1)
+    for index, leg_m in enumerate(legs_m):
+        if leg_m < 1e-3:
+            raise ValueError(f"points {index + 1} and {index + 2} are the same place")
+    legs_s = legs_m / speed_mps
+    legs_s[0] *= _REST_LEG_STRETCH
+    if len(legs_s) > 1:
+        legs_s[-1] *= _REST_LEG_STRETCH
+    return np.concatenate([[0.0], np.cumsum(legs_s)])
+
+
+def through(points_ned_m: Array, times_s: Array, smoothness: Smoothness) -> Spline:
+    """The minimum-jerk or minimum-snap path from rest to rest through points (N, 3) at times (N,),
+    N >= 2: with clamped ends the minimiser of the integral of the squared m-th derivative is the
+    interpolating spline of degree 2 m - 1.
+
+    Raises ValueError unless the times are finite, start at 0 and increase."""
+    if len(points_ned_m) < 2:
+        raise ValueError(f"a path needs at least 2 points, not {len(points_ned_m)}")
+    if len(times_s) != len(points_ned_m):
+        raise ValueError(f"{len(points_ned_m)} points need as many times, not {len(times_s)}")
+    if not np.all(np.isfinite(points_ned_m)) or not np.all(np.isfinite(times_s)):
+        raise ValueError("points and times must be finite")
+    if times_s[0] != 0.0 or np.any(np.diff(times_s) <= 0.0):
+        raise ValueError("the times of the points must start at 0 and increase")
+    order = 3 if smoothness is Smoothness.JERK else 4
+    rest = [(derivative, np.zeros(3)) for derivative in range(1, order)]
+    return Spline(make_interp_spline(times_s, points_ned_m, k=2 * order - 1, bc_type=(rest, rest)))
+
+
+def interpolate(times_s: Array, values: Array, knot_spacing_s: float = 0.0) -> Spline:
+    """A quintic spline, continuous to its fourth derivative, through values (N, C) at times (N,).
+
+    It has the least jerk of all curves through the values; third and fourth derivative vanish at
+    the ends. With a positive `knot_spacing_s` it is a least-squares fit with knots no closer than
+    that, for rounded or noisy values.
+    """
+    rows = times_s.size
+    intervals = int(times_s[-1] / knot_spacing_s) if knot_spacing_s > 0.0 else rows
+    if intervals + _DEGREE >= rows:  # a fit would have no fewer coefficients than rows
+        natural = [(order, np.zeros(values.shape[1:])) for order in (3, 4)]
+        return Spline(make_interp_spline(times_s, values, k=_DEGREE, bc_type=(natural, natural)))
+    # knots on rows, equally many rows apart: every span has data (Schoenberg-Whitney)
+    knots = times_s[np.rint(np.linspace(0, rows - 1, intervals + 1)).astype(np.int64)]
+    return Spline(make_lsq_spline(times_s, values, np.pad(knots, _DEGREE, "edge"), k=_DEGREE))
+
+
+class Heading(Protocol):
+    """Where the nose points along a path."""
+
+    def jet(self, path_time_s: Array, path_jet: Array) -> Array:
+        """Heading (unwrapped), its first and second derivative by s, shape (3, N), rad and s.
+
+        path_time_s (N,); path_jet (5, N, 3 or 4) is the path at the same times."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Fixed:
+    """A constant heading."""
+
+    heading_rad: float
+
+    def jet(self, path_time_s: Array, path_jet: Array) -> Array:
+        """See `Heading`."""
+        return np.multiply.outer((self.heading_rad, 0.0, 0.0), np.ones(path_time_s.size))
+
+
+class Column:
+    """The fourth column of the path."""
+
+    def jet(self, path_time_s: Array, path_jet: Array) -> Array:
+        """See `Heading`."""
+        return path_jet[:3, :, HEADING]
+
+
+class AlongVelocity:
+    """The direction of the horizontal velocity, unwrapped from the start of the path, for s in
+    [0, length_s]; a path that never moves horizontally has the heading `standstill_rad`.
+
+    The derivative of position by s has the direction of the velocity, so that a start from rest
+    needs no special case. Only where the path itself is slower than `HOLD_SPEED_MPS`, the direction
+    is replaced by a quintic which continues heading, rate and acceleration at both ends of that
+    interval, turns the short way, and comes to rest where the path begins or ends.
+    """
+
+    def __init__(self, path: Path, length_s: float, standstill_rad: float = 0.0) -> None:
+        count = int(np.clip(np.ceil(length_s / _STEP_S), 50, _NODES_MAX)) + 1
+        nodes_s = np.linspace(0.0, length_s, count)
+        path_jet = path.jet(nodes_s)
+        fast = np.hypot(path_jet[1, :, 0], path_jet[1, :, 1]) >= HOLD_SPEED_MPS
+        jet = direction_jet(path_jet)
+        places = np.flatnonzero(fast)
+        if places.size:
+            # a slow node takes the heading of the next fast one: unwrapping works across it
+            following = np.minimum(np.searchsorted(places, np.arange(count)), places.size - 1)
+            jet[0] = np.unwrap(jet[0, places[following]])
+        else:
+            jet[0] = standstill_rad
+        # to find which whole turn a direction belongs to
+        self._step_s, self._nodes_rad = float(nodes_s[1]), jet[0].copy()
+        jet[1:, ~fast] = 0.0  # where the path begins or ends slowly
+        change = np.flatnonzero(np.diff(fast))
+        edges = np.unique(np.concatenate(([0], change + ~fast[change], [count - 1])))
+        self._slow = ~(fast[edges[:-1]] & fast[edges[:-1] + 1])
+        self._edges_s = nodes_s[edges]
+        self._across = joined(self._edges_s, jet[:, edges].T[:, :, np.newaxis])
+
+    def jet(self, path_time_s: Array, path_jet: Array) -> Array:
+        """See `Heading`."""
+        jet = direction_jet(path_jet)
+        node = np.rint(path_time_s / self._step_s).astype(np.intp)
+        nearest_rad = self._nodes_rad[np.clip(node, 0, self._nodes_rad.size - 1)]
+        jet[0] += 2.0 * np.pi * np.rint((nearest_rad - jet[0]) / (2.0 * np.pi))
+        piece = np.searchsorted(self._edges_s[1:-1], path_time_s)
+        slow = self._slow[piece]
+        if slow.any():
+            jet[:, slow] = self._across.jet(path_time_s[slow])[:3, :, 0]
+        return jet
+
+
+def direction_jet(path_jet: Array) -> Array:
+    """Direction of the horizontal velocity in (-pi, pi], its rate and acceleration: (3, N).
+
+    path_jet (5, N, 3). Finite at any speed: the squared speed is floored at 1e-6 m^2/s^2.
+    """
+    (vn, ve), (an, ae), (jn, je) = path_jet[1:4, :, :2].transpose(0, 2, 1)
+    square = np.maximum(vn * vn + ve * ve, 1e-6)
+    rate = (vn * ae - ve * an) / square
+    # numpy's arctan2 differs in the last digit from one processor to another
+    direction = list(map(math.atan2, ve.tolist(), vn.tolist()))
+    acceleration = (vn * je - ve * jn - 2.0 * rate * (vn * an + ve * ae)) / square
+    return np.array((direction, rate, acceleration))

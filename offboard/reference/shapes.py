@@ -17,9 +17,19 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from offboard.documents.parameters import Parameters
-from offboard.reference import table, waypoints
-from offboard.reference.heading import Fixed, Heading, Tabulated, along_velocity
-from offboard.reference.path import Harmonic, Path
+from offboard.reference import table
+from offboard.reference.path import (
+    AlongVelocity,
+    Column,
+    Fixed,
+    Harmonic,
+    Heading,
+    Path,
+    Smoothness,
+    interpolate,
+    through,
+    times_from_speed,
+)
 from offboard.reference.track import Track, path_end_s
 
 Seconds = Annotated[float, Field(ge=0, le=60)]
@@ -68,7 +78,9 @@ class Shape(Parameters, ABC):
         where the runs do not fit (see `Track`)."""
         path = self.path()
         origin_ned_m = (self.origin_north_m, self.origin_east_m, -float(self.height_m))
-        return Track(path, self._heading(path), self.run_in_s, self.run_out_s, origin_ned_m)
+        track = Track(path, self._heading(path), self.run_in_s, self.run_out_s, origin_ned_m)
+        track.check_runs()
+        return track
 
     @property
     def title(self) -> str:
@@ -78,7 +90,7 @@ class Shape(Parameters, ABC):
     def _heading(self, path: Path) -> Heading:
         fixed_rad = math.radians(self.course_deg)
         if self.course is HeadingMode.ALONG_VELOCITY:
-            return along_velocity(path, path_end_s(path, self.run_in_s, self.run_out_s), fixed_rad)
+            return AlongVelocity(path, path_end_s(path, self.run_in_s, self.run_out_s), fixed_rad)
         return Fixed(fixed_rad)
 
 
@@ -177,7 +189,7 @@ class Waypoints(Shape):
     ]
     speed_mps: Speed | None = None
     times_s: tuple[Annotated[float, Field(ge=0, le=3600)], ...] | None = None
-    minimise: waypoints.Smoothness = waypoints.Smoothness.SNAP
+    minimise: Smoothness = Smoothness.SNAP
     run_in_s: Seconds = 1.0
     run_out_s: Seconds = 1.0
 
@@ -191,10 +203,10 @@ class Waypoints(Shape):
     def path(self) -> Path:
         points = np.array(self.points_m, dtype=np.float64) * (1.0, 1.0, -1.0)
         if self.speed_mps is not None:
-            times = waypoints.times_from_speed(points, self.speed_mps)
+            times = times_from_speed(points, self.speed_mps)
         else:
             times = np.array(self.times_s or (), dtype=np.float64)
-        return waypoints.through(points, times, self.minimise)
+        return through(points, times, self.minimise)
 
 
 class FromTable(Shape):
@@ -220,12 +232,14 @@ class FromTable(Shape):
 
     def path(self) -> Path:
         rows = self._rows()
-        return table.interpolate(rows.times_s, rows.points_ned_m, self.knot_spacing_s)
+        values = rows.points_ned_m
+        if self.course is HeadingMode.TABLE and rows.heading_rad is not None:
+            values = np.column_stack((values, rows.heading_rad))
+        return interpolate(rows.times_s, values, self.knot_spacing_s)
 
     def _heading(self, path: Path) -> Heading:
-        if self.course is HeadingMode.TABLE and (rows := self._rows()).heading_rad is not None:
-            column = rows.heading_rad[:, np.newaxis]
-            return Tabulated(table.interpolate(rows.times_s, column, self.knot_spacing_s))
+        if self.course is HeadingMode.TABLE and self._rows().heading_rad is not None:
+            return Column()
         return super()._heading(path)
 
     def _rows(self) -> table.Table:

@@ -1,6 +1,6 @@
-"""Paths from points: a CSV table, and the smooth curve through points at given times.
+"""A CSV table of positions over time.
 
-Columns of a table, named in the first row, in any order: `time_s`; `north_m` or `x`, `x_m`;
+Its columns, named in the first row, in any order: `time_s`; `north_m` or `x`, `x_m`;
 `east_m` or `y`, `y_m`; `down_m` or `z`, `z_m` (positive down), or `altitude_m` (positive up);
 optionally `course_deg` (heading, clockwise from north). Other columns are refused.
 """
@@ -14,9 +14,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import make_interp_spline, make_lsq_spline
-
-from offboard.reference.path import Polynomial
 
 Array = NDArray[np.float64]
 
@@ -30,8 +27,6 @@ _NAMES = {
     "altitude_m": "altitude_m",
     "course_deg": "course_deg",
 }  # fmt: skip
-_DEGREE = 5
-_NATURAL_END = [(3, 0.0), (4, 0.0)]
 
 
 class TableError(ValueError):
@@ -81,23 +76,6 @@ def parse(text: str, name: str) -> Table:
     return Table(times - times[0], points, heading)
 
 
-def interpolate(times_s: Array, values: Array, knot_spacing_s: float = 0.0) -> Polynomial:
-    """A quintic spline, continuous to its fourth derivative, through values (N, C) at times (N,).
-
-    It has the least jerk of all curves through the values; third and fourth derivative vanish at
-    the ends. With a positive `knot_spacing_s` it is a least-squares fit with knots no closer than
-    that, for rounded or noisy values.
-    """
-    knots = _knots(times_s, knot_spacing_s)
-    if knots is None:
-        spline = make_interp_spline(
-            times_s, values, k=_DEGREE, bc_type=(_ends(values), _ends(values))
-        )
-    else:
-        spline = make_lsq_spline(times_s, values, knots, k=_DEGREE)
-    return Polynomial.from_spline(spline)
-
-
 def _rows(text: str, name: str) -> list[list[str]]:
     try:
         return list(csv.reader(io.StringIO(text.removeprefix("\ufeff"))))
@@ -140,20 +118,3 @@ def _numbers(row: list[str], columns: list[str], name: str, number: int) -> list
             )
         values.append(value)
     return values
-
-
-def _ends(values: Array) -> list[tuple[int, Array]]:
-    return [(order, np.full(values.shape[1:], value)) for order, value in _NATURAL_END]
-
-
-def _knots(times_s: Array, spacing_s: float) -> Array | None:
-    """Knots of a least-squares fit, or None where interpolation has no more of them."""
-    intervals = int(times_s[-1] / spacing_s) if spacing_s > 0.0 else times_s.size
-    if intervals + _DEGREE >= times_s.size:
-        return None
-    # knots on rows, equally many rows apart: every span has data (Schoenberg-Whitney)
-    on_rows = np.rint(np.linspace(0, times_s.size - 1, intervals + 1)).astype(np.int64)
-    inner = times_s[on_rows[1:-1]]
-    return np.concatenate(
-        [np.full(_DEGREE + 1, times_s[0]), inner, np.full(_DEGREE + 1, times_s[-1])]
-    )

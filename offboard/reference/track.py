@@ -1,26 +1,88 @@
-"""A path flown from rest to rest: run-in, the scored part at full speed, run-out.
+"""References in time: a path flown from rest to rest, and references moved, delayed and paused.
 
-On an unbounded path (circle, lemniscate, helix) the run-in covers the first run_in_s / 2 of it,
-then come exactly the laps, and the run-out continues along it for run_out_s / 2. On a bounded path
-(line, waypoints, table) both runs lie within its ends: only the part between is flown at full speed
-and scored. A hover has no runs and is scored throughout.
+A `Track` has a run-in, a scored part at full speed and a run-out. On an unbounded path (circle,
+lemniscate, helix) the run-in covers the first run_in_s / 2 of it, then come exactly the laps, and
+the run-out continues along it for run_out_s / 2. On a bounded path (line, waypoints, table) both
+runs lie within its ends: only the part between is flown at full speed and scored. A hover has no
+runs and is scored throughout.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.reference.base import FlatSample
-from offboard.reference.heading import Heading
-from offboard.reference.path import Path
-from offboard.reference.warp import compose_heading, compose_position, warp
+from offboard.reference.base import FlatSample, Reference
+from offboard.reference.path import HEADING, Fixed, Harmonic, Heading, Path, Triple
 
 Array = NDArray[np.float64]
 
+STOP_S = 2.5  # of a pause, from full speed to rest, and back; about that of a run-out
+_BEFORE_S = 1e6  # of undisturbed time, more than a flight lasts
 _REST_SPEED_MPS = 1e-3
+
+
+def warp(time_s: Array, run_in_s: float, cruise_s: float, run_out_s: float) -> Array:
+    """A smooth start and stop on a path: its time s(t) and four derivatives, (5, N), for t (N,).
+
+    ds/dt rises from 0 to 1 within `run_in_s`, stays for `cruise_s`, falls to 0 within
+    `run_out_s`, along the smoothstep of degree 9: four derivatives of ds/dt vanish at every
+    joint. A run of duration R covers R / 2 of the path. Outside, s rests at its ends.
+    """
+    out = np.zeros((5, time_s.size))
+    cruise_end_s = run_in_s + cruise_s
+    end_s = cruise_end_s + run_out_s
+    length_s = 0.5 * run_in_s + cruise_s + 0.5 * run_out_s
+    starts = (time_s >= 0.0) & (time_s < run_in_s)
+    cruises = (time_s >= run_in_s) & (time_s <= cruise_end_s)
+    stops = (time_s > cruise_end_s) & (time_s < end_s)
+    out[:, starts] = _ramp(time_s[starts] / run_in_s, run_in_s, 1.0) if starts.any() else 0.0
+    out[0, cruises] = time_s[cruises] - 0.5 * run_in_s
+    out[1, cruises] = 1.0
+    if stops.any():
+        out[:, stops] = _ramp((end_s - time_s[stops]) / run_out_s, run_out_s, -1.0)
+    out[0, time_s > cruise_end_s] += length_s
+    return out
+
+
+def _ramp(x: Array, duration_s: float, direction: float) -> Array:
+    """The smoothstep of degree 9 at x (N,) in [0, 1]: s and four derivatives by time (5, N).
+
+    direction -1 runs backwards in time: s and its even derivatives change sign.
+    """
+    u = x * (1.0 - x)
+    shape = 21.0 + x * (-60.0 + x * (67.5 + x * (-35.0 + 7.0 * x)))
+    slope = 126.0 + x * (-420.0 + x * (540.0 + x * (-315.0 + 70.0 * x)))
+    return np.array(
+        [
+            direction * duration_s * x**6 * shape,
+            x**5 * slope,
+            direction * 630.0 * u**4 / duration_s,
+            2520.0 * u**3 * (1.0 - 2.0 * x) / duration_s**2,
+            direction * 2520.0 * u**2 * (3.0 - 14.0 * u) / duration_s**3,
+        ]
+    )
+
+
+def _composed(clock: Array, jet: Array, shape: tuple[int, ...]) -> FlatSample:
+    """The sample of leading shape `shape` of a jet (5, N, 4), by s, [north, east, down, heading],
+    at s(t) with its derivatives, `clock` (5, N): the chain rule to the fourth derivative (Faa di
+    Bruno)."""
+    s1, s2, s3, s4 = clock[1:, :, np.newaxis]
+    p0, p1, p2, p3, p4 = jet
+    by_time = np.array(
+        [
+            p0,
+            p1 * s1,
+            p2 * s1**2 + p1 * s2,
+            p3 * s1**3 + 3.0 * p2 * s1 * s2 + p1 * s3,
+            p4 * s1**4 + 6.0 * p3 * s1**2 * s2 + p2 * (3.0 * s2**2 + 4.0 * s1 * s3) + p1 * s4,
+        ]
+    ).reshape(5, *shape, 4)
+    return FlatSample(*by_time[..., :HEADING], *by_time[:3, ..., HEADING])
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,25 +90,25 @@ class Track:
     """A `Reference` from rest to rest, continuous to snap in position and to acceleration in
     heading (without a run, at that end, as continuous as the path is there).
 
-    Time 0 is the start of the run-in; positions are NED relative to the take-off point. Raises
-    ValueError where the runs do not fit in a bounded path, or a run is zero and the path moves at
-    that end.
+    Time 0 is the start of the run-in; positions are NED relative to the take-off point.
     """
 
     path: Path
     heading: Heading
-    run_in_s: float
-    run_out_s: float
-    origin_ned_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    run_in_s: float = 0.0
+    run_out_s: float = 0.0
+    origin_ned_m: Triple = (0.0, 0.0, 0.0)
 
-    def __post_init__(self) -> None:
+    def check_runs(self) -> None:
+        """Raise ValueError where the runs do not fit in a bounded path, or a run is zero and the
+        path moves at that end."""
         if self.cruise_s <= 0.0:
             raise ValueError(
                 f"run-in and run-out ({self.run_in_s:g} s and {self.run_out_s:g} s) take half "
                 f"their duration of the path, which is only {self.path.length_s:.3g} s long"
             )
         ends = self.path.jet(np.array([0.0, self.path_end_s]))
-        speeds_mps = np.linalg.norm(ends[1], axis=1)
+        speeds_mps = np.linalg.norm(ends[1, :, :HEADING], axis=1)
         for name, run_s, speed_mps in (
             ("run-in", self.run_in_s, float(speeds_mps[0])),
             ("run-out", self.run_out_s, float(speeds_mps[1])),
@@ -81,26 +143,26 @@ class Track:
 
     @property
     def duration_s(self) -> float:
+        """The time at which it comes to rest."""
         return self.run_in_s + self.cruise_s + self.run_out_s
 
     def path_time_s(self, time_s: float) -> float:
         """The path's own time at `time_s`: of a table, the time in its rows, from the first."""
-        runs = self.run_in_s, self.cruise_s, self.run_out_s
-        return float(warp(np.array([time_s]), *runs)[0, 0])
+        return float(self._clock(np.array([time_s]))[0, 0])
 
     def sample(self, time_s: float | Array) -> FlatSample:
         """Flat outputs at `time_s`, a scalar or an array of any shape; at rest outside [0, end]."""
         time = np.asarray(time_s, dtype=np.float64)
-        shape = time.shape
-        s = warp(time.reshape(-1), self.run_in_s, self.cruise_s, self.run_out_s)
-        path_jet = self.path.jet(s[0])
-        position = compose_position(s, path_jet)
-        position[0] += self.origin_ned_m
-        heading = compose_heading(s, self.heading.jet(s[0], path_jet))
-        return FlatSample(
-            *(derivative.reshape(*shape, 3) for derivative in position),
-            *(derivative.reshape(shape) for derivative in heading),
-        )
+        clock = self._clock(time.reshape(-1))
+        jet = np.zeros((5, time.size, 4))
+        path = self.path.jet(clock[0])
+        jet[..., :HEADING] = path[..., :HEADING]
+        jet[0, :, :HEADING] += self.origin_ned_m
+        jet[:3, :, HEADING] = self.heading.jet(clock[0], path)
+        return _composed(clock, jet, time.shape)
+
+    def _clock(self, time_s: Array) -> Array:
+        return warp(time_s, self.run_in_s, self.cruise_s, self.run_out_s)
 
 
 def path_end_s(path: Path, run_in_s: float, run_out_s: float) -> float:
@@ -108,3 +170,89 @@ def path_end_s(path: Path, run_in_s: float, run_out_s: float) -> float:
     if path.bounded:
         return path.length_s
     return path.length_s + 0.5 * (run_in_s + run_out_s)
+
+
+def hold(position_ned_m: Triple, heading_rad: float, duration_s: float = 0.0) -> Track:
+    """Rest at a point (NED, m) with a heading (rad)."""
+    at_rest = Harmonic(duration_s, bounded=True, offset_ned_m=position_ned_m)
+    return Track(at_rest, Fixed(heading_rad))
+
+
+@dataclass(frozen=True, slots=True)
+class Moved:
+    """A reference on another time axis and at another place, which may be paused: its own time
+    then slows down to a stop within `STOP_S`, and later runs again. The path stays the same, its
+    derivatives remain continuous to snap.
+
+    Args:
+        reference: on its own axes.
+        start_s: its time 0 on the new axis, such as vehicle time.
+        origin_ned_m: its origin, such as the take-off point, in the new frame.
+        paused_s: when it begins to stop, on the new axis.
+        resumed_s: when it begins to run again, not before it is at rest.
+    """
+
+    reference: Reference
+    start_s: float = 0.0
+    origin_ned_m: Triple = (0.0, 0.0, 0.0)
+    paused_s: float = math.inf
+    resumed_s: float = math.inf
+
+    @property
+    def duration_s(self) -> float:
+        """The end, on the new axis; infinite while it is paused."""
+        end_s = self.start_s + self.reference.duration_s
+        if self.paused_s == math.inf:
+            return end_s
+        return end_s + self.resumed_s - self.paused_s  # a stop and a start cover half their time
+
+    def resumed(self, time_s: float) -> Moved:
+        """Running again from `time_s`, or from the moment when it has come to rest."""
+        return replace(self, resumed_s=max(time_s, self.paused_s + STOP_S))
+
+    def at_full_speed(self, time_s: float) -> bool:
+        """Whether it runs as fast as before a pause, from `time_s` on."""
+        return time_s < self.paused_s or time_s >= self.resumed_s + STOP_S
+
+    def own_s(self, time_s: float) -> float:
+        """The time at `time_s` of the reference that is moved, however often it is."""
+        own_s = float(self._clock(np.array([time_s]))[0, 0])
+        return self.reference.own_s(own_s) if isinstance(self.reference, Moved) else own_s
+
+    def sample(self, time_s: float | Array) -> FlatSample:
+        """Flat outputs at `time_s`, a scalar or an array of any shape."""
+        time = np.asarray(time_s, dtype=np.float64)
+        if self.paused_s == math.inf:
+            sample = self.reference.sample(time - self.start_s)
+        else:
+            clock = self._clock(time.reshape(-1))
+            inner = self.reference.sample(clock[0])
+            jet = np.zeros((5, time.size, 4))
+            jet[..., :HEADING] = (
+                inner.position_ned_m,
+                inner.velocity_ned_mps,
+                inner.acceleration_ned_mps2,
+                inner.jerk_ned_mps3,
+                inner.snap_ned_mps4,
+            )
+            jet[:3, :, HEADING] = (
+                inner.heading_rad,
+                inner.heading_rate_radps,
+                inner.heading_acceleration_radps2,
+            )
+            sample = _composed(clock, jet, time.shape)
+        return replace(sample, position_ned_m=sample.position_ned_m + np.array(self.origin_ned_m))
+
+    def _clock(self, time_s: Array) -> Array:
+        """The reference's own time and its first four derivatives (5, N) at `time_s` (N,)."""
+        if self.paused_s == math.inf:
+            clock = np.zeros((5, time_s.size))
+            clock[0], clock[1] = time_s, 1.0
+        else:
+            clock = warp(time_s - self.paused_s + _BEFORE_S, 0.0, _BEFORE_S, STOP_S)
+            clock[0] += self.paused_s - _BEFORE_S
+            again = time_s >= self.resumed_s
+            clock[:, again] = warp(time_s[again] - self.resumed_s, STOP_S, _BEFORE_S, 0.0)
+            clock[0, again] += self.paused_s + 0.5 * STOP_S
+        clock[0] -= self.start_s
+        return clock

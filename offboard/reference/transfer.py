@@ -1,5 +1,5 @@
-"""Transfers from a start, at rest or moving, to rest at a target; and references moved in time
-and space. Used for the climb after take-off and for flying to the start of a track.
+"""Flights from a start, at rest or moving, to rest at a target: the climb after take-off, and the
+way back after a jump of the estimate.
 """
 
 from __future__ import annotations
@@ -7,14 +7,13 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import BPoly, PPoly
 
-from offboard.reference.base import FlatSample, Reference
-from offboard.reference.path import Polynomial
+from offboard.reference.path import Column, Spline, joined
+from offboard.reference.track import Track
 
 Array = NDArray[np.float64]
 Vector = Array | Iterable[float]
@@ -42,30 +41,6 @@ class Limits:
     cruise_vertical_mps: float = 1.5
 
 
-@dataclass(frozen=True, slots=True)
-class Transfer:
-    """Polynomials of degree 9 in position and heading; at rest, to snap, at their end.
-
-    `polynomial` has the columns north, east, down (m) and heading (rad). Before time 0 it rests
-    at its start, after `duration_s` at its target.
-    """
-
-    polynomial: Polynomial
-
-    @property
-    def duration_s(self) -> float:
-        return self.polynomial.length_s
-
-    def sample(self, time_s: float | Array) -> FlatSample:
-        """Flat outputs at `time_s`, a scalar or an array of any shape."""
-        time = np.asarray(time_s, dtype=np.float64)
-        flat = time.reshape(-1)
-        jet = self.polynomial.jet(np.clip(flat, 0.0, self.duration_s))
-        jet[1:, (flat < 0.0) | (flat > self.duration_s)] = 0.0
-        jet = jet.reshape(5, *time.shape, 4)
-        return FlatSample(*jet[:, ..., :3], *jet[:3, ..., 3])
-
-
 def stopping_place(
     position_ned_m: Vector, velocity_ned_mps: Vector, limits: Limits = Limits()
 ) -> Array:
@@ -88,7 +63,7 @@ def transfer(
     limits: Limits = Limits(),
     *,
     start_velocity_ned_mps: Vector = (0.0, 0.0, 0.0),
-) -> Transfer:
+) -> Track:
     """From a start (3,), NED, to rest at a target (3,), about as fast as the limits allow.
 
     The heading turns the short way: it ends at `target_heading_rad` plus the whole turns that are
@@ -111,7 +86,7 @@ def transfer(
     if _moves_well(begin, end, limits):
         hop = _shortest(begin, end, limits)
         if hop.length_s <= _CRUISE_FROM_S:
-            return Transfer(hop)
+            return Track(hop, Column())
     times_s, jets = [0.0], [begin]
     if velocity.any():
         brake_s = max(_brake_s(velocity, limits), _BRAKE_MIN_S)
@@ -125,7 +100,7 @@ def transfer(
     for leg_s, jet in legs:
         times_s.append(times_s[-1] + leg_s)
         jets.append(jet)
-    return Transfer(_through(times_s, jets))
+    return Track(joined(times_s, jets), Column())
 
 
 def _moves_well(begin: Array, end: Array, limits: Limits) -> bool:
@@ -142,7 +117,7 @@ def _at_rest(place: Array) -> Array:
     return jet
 
 
-def _shortest(begin: Array, end: Array, limits: Limits) -> Polynomial:
+def _shortest(begin: Array, end: Array, limits: Limits) -> Spline:
     """The shortest single polynomial within the limits; none is tried beyond _CRUISE_FROM_S."""
     distance_m = float(np.linalg.norm(end[0, :3] - begin[0, :3]))
     turn_rad = abs(float(end[0, 3] - begin[0, 3]))
@@ -151,7 +126,7 @@ def _shortest(begin: Array, end: Array, limits: Limits) -> Polynomial:
         _DURATION_MIN_S, distance_m / limits.speed_mps, turn_rad / limits.heading_rate_radps
     )
     while True:
-        candidate = _through([0.0, duration_s], [begin, end])
+        candidate = joined([0.0, duration_s], [begin, end])
         if duration_s > _CRUISE_FROM_S or _excess(candidate, limits) <= 1.0:
             return candidate
         duration_s *= _GROWTH
@@ -186,62 +161,12 @@ def _cruise_mps(way: Array, limits: Limits) -> float:
     )
 
 
-def _through(times_s: Array | list[float], jets: list[Array]) -> Polynomial:
-    """Polynomials of degree 9 from each (5, 4) jet, position to snap, to the next."""
-    bernstein = BPoly.from_derivatives(times_s, jets)
-    taylor = PPoly.from_bernstein_basis(bernstein).c[::-1].transpose(1, 0, 2)
-    return Polynomial.from_taylor(bernstein.x, taylor)
-
-
-def _excess(polynomial: Polynomial, limits: Limits) -> float:
+def _excess(curve: Spline, limits: Limits) -> float:
     """The largest ratio of a peak to its limit."""
-    times_s = [np.linspace(*piece, 101) for piece in itertools.pairwise(polynomial.breaks_s)]
-    jet = polynomial.jet(np.concatenate(times_s))
+    times_s = [np.linspace(*piece, 101) for piece in itertools.pairwise(curve.breaks_s)]
+    jet = curve.jet(np.concatenate(times_s))
     return max(
         float(np.linalg.norm(jet[1, :, :3], axis=-1).max()) / limits.speed_mps,
         float(np.linalg.norm(jet[2, :, :3], axis=-1).max()) / limits.acceleration_mps2,
         float(np.abs(jet[1, :, 3]).max()) / limits.heading_rate_radps,
     )
-
-
-@dataclass(frozen=True, slots=True)
-class Hold:
-    """Rest at a point (NED, m) with a heading (rad)."""
-
-    position_ned_m: tuple[float, float, float]
-    heading_rad: float
-    duration_s: float = 0.0
-
-    def sample(self, time_s: float | Array) -> FlatSample:
-        """Flat outputs at `time_s`, a scalar or an array of any shape."""
-        shape = np.shape(time_s)
-        vectors = np.zeros((5, *shape, 3))
-        vectors[0] = self.position_ned_m
-        heading = np.zeros((3, *shape))
-        heading[0] = self.heading_rad
-        return FlatSample(*vectors, *(derivative.reshape(shape) for derivative in heading))
-
-
-@dataclass(frozen=True, slots=True)
-class Moved:
-    """A reference on another time axis and at another place.
-
-    Args:
-        reference: on its own axes.
-        start_s: its time 0 on the new axis, such as vehicle time.
-        origin_ned_m: its origin, such as the take-off point, in the new frame.
-    """
-
-    reference: Reference
-    start_s: float = 0.0
-    origin_ned_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    @property
-    def duration_s(self) -> float:
-        """The end, on the new axis."""
-        return self.start_s + self.reference.duration_s
-
-    def sample(self, time_s: float | Array) -> FlatSample:
-        """Flat outputs at `time_s` of the new axis, a scalar or an array of any shape."""
-        sample = self.reference.sample(np.asarray(time_s, dtype=np.float64) - self.start_s)
-        return replace(sample, position_ned_m=sample.position_ned_m + np.array(self.origin_ned_m))

@@ -34,8 +34,7 @@ from offboard.mavlink.senders import DIALECTS
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.signing import Signing
 from offboard.model.command import Command, PositionCommand
-from offboard.reference.track import Track
-from offboard.reference.transfer import Hold
+from offboard.reference.track import Track, hold
 from offboard.run.configuration import (
     FlightConfig,
     build_controller,
@@ -197,7 +196,7 @@ def rehearse(prepared: Prepared, *, keeps_deadline: bool) -> float:
     """
     config, controller = prepared.config, prepared.controller
     observer = Observer(config.vehicle)
-    reference = Hold((0.0, 0.0, -2.0), 0.1)
+    reference = hold((0.0, 0.0, -2.0), 0.1)
     previous = Command(config.vehicle.gravity_mps2, (0.0, 0.0, 1.0), 0.0)
     observer.freeze(True)
     for step in range(60):

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from offboard.compiled import entry, kernel
-from offboard.model.rigid_body import RK4_SCRATCH_ROWS
-from offboard.model.state import QUATERNION
+from offboard.model.rigid_body import QUATERNION, RK4_SCRATCH_ROWS
 from simulator.steps import STEP_S
 from simulator.vehicle.airframe import ROTOR_SIZE, advance_airframe
 from simulator.vehicle.attitude import ROW_WIDTH, angular_acceleration, delayed_thrust

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.model.state import QUATERNION
+from offboard.model.rigid_body import QUATERNION
 from offboard.model.vehicle import Triple, Vehicle
 from simulator.steps import STEP_S
 from simulator.vehicle.airframe import (

@@ -11,8 +11,7 @@ import pytest
 
 from offboard.control.base import Situation
 from offboard.control.catalogue import settings_of
-from offboard.model.command import Command
-from offboard.model.predicted_state import PredictedState
+from offboard.model.command import Command, PredictedState
 from offboard.reference.transfer import transfer
 from offboard.run.configuration import load
 

@@ -12,7 +12,7 @@ from pair import Pair, decode, make
 from pydantic import TypeAdapter
 
 from offboard.control.catalogue import names
-from offboard.control.horizon.keep_out import KeepOut, clearances
+from offboard.control.keep_out import KeepOut, clearances
 from offboard.flight.phases import Phase
 
 # RMSE in m that is to be undercut in calm; the paper's law has a time constant of 39 s, the

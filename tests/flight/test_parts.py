@@ -21,10 +21,9 @@ from offboard.mavlink.dialects.ardupilot import ARDUPILOT
 from offboard.mavlink.dialects.px4 import PX4
 from offboard.mavlink.events import Attitude, LocalPosition, SystemHealth
 from offboard.mavlink.outgoing import CommandLong
-from offboard.model.command import Command
-from offboard.model.predicted_state import PredictedState
+from offboard.model.command import Command, PredictedState
 from offboard.model.vehicle import Vehicle
-from offboard.reference.transfer import Hold
+from offboard.reference.track import hold
 from offboard.run import configuration as config
 from offboard.run.flight import build, rehearse
 
@@ -127,7 +126,7 @@ def test_what_a_horizon_calls_near_a_volume_was_loaded_at_the_rehearsal(
         0.05, at_m, np.array([1.5, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]), np.zeros(3), 0.0, 0.0,
         9.8, np.zeros(3), np.zeros(3),
     )  # fmt: skip
-    met = Situation(0.0, state, Hold((7.0, 0.3, -3.0), 0.0), Command(9.8, (0.0, 0.0, 1.0), 0.0))
+    met = Situation(0.0, state, hold((7.0, 0.3, -3.0), 0.0), Command(9.8, (0.0, 0.0, 1.0), 0.0))
     assert parts.controller.decide(met).certificate.iterations > 0
     assert set(loaded) == rehearsed
 

@@ -7,11 +7,10 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import expm
 
-from offboard.model.linear import hover_matrices, sampled_matrices
-from offboard.model.rigid_body import RK4_SCRATCH_ROWS, derivative, hover_input, pack
-from offboard.model.state import (
+from offboard.model.rigid_body import (
     PHI,
     PSI,
+    RK4_SCRATCH_ROWS,
     TAU_X,
     TAU_Y,
     TAU_Z,
@@ -25,6 +24,10 @@ from offboard.model.state import (
     W,
     X,
     Z,
+    hover_input,
+    hover_matrices,
+    pack,
+    sampled_matrices,
 )
 from offboard.model.vehicle import Vehicle
 from offboard.paper.plant import follow
@@ -59,21 +62,6 @@ def test_hover_matrices_are_the_physics_written_by_hand(paper_vehicle: Vehicle) 
     model_a, model_b = hover_matrices(paper_vehicle)
     assert_allclose(model_a, a, rtol=1e-14)
     assert_allclose(model_b, b, rtol=1e-14)
-
-
-def test_hover_matrices_agree_with_finite_differences(paper_vehicle: Vehicle) -> None:
-    """Five-point differences of real numbers."""
-    parameters, trim = pack(paper_vehicle), hover_input(paper_vehicle)
-    h = 1e-3
-
-    def slope(offset: np.ndarray) -> np.ndarray:
-        return np.asarray(derivative(offset[:12], trim + offset[12:], parameters))
-
-    columns = [
-        (8 * (slope(h * e) - slope(-h * e)) - (slope(2 * h * e) - slope(-2 * h * e))) / (12 * h)
-        for e in np.eye(16)
-    ]
-    assert_allclose(np.hstack(hover_matrices(paper_vehicle)), np.transpose(columns), atol=1e-9)
 
 
 @pytest.mark.parametrize("step_s", [0.01, 0.1, 0.5])

@@ -34,7 +34,7 @@ LAW_THAT_HANGS = """
 import os
 from typing import Literal
 from offboard.control.base import ControllerSettings
-from offboard.control.lqr import LqrSettings
+from offboard.control.law import LqrSettings
 
 class Settings(ControllerSettings):
     law: Literal["hangs"] = "hangs"

@@ -16,7 +16,7 @@ from offboard.analysis import tlog
 from offboard.analysis.history import record_type
 from offboard.cli.commands import app
 from offboard.control.base import Controller, Decision, Situation
-from offboard.control.pso import PsoLaw
+from offboard.control.law import PsoLaw
 from offboard.flight import actions, inputs, manifest
 from offboard.flight.flight import Output
 from offboard.flight.phases import Phase

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from attitude_plant import Lemniscate
 
 from offboard.control.base import Controller
 from offboard.control.catalogue import names, settings_of
-from offboard.control.lqr import LqrLaw, LqrSettings
-from offboard.control.pso import PsoLaw, PsoSettings
-from offboard.model.command import Command
-from offboard.model.predicted_state import PredictedState
+from offboard.control.law import LqrLaw, LqrSettings, PsoLaw, PsoSettings, Target
+from offboard.model.command import Command, PredictedState
 from offboard.model.vehicle import AxisResponse, Vehicle
 
 G = 9.80665
@@ -65,6 +64,20 @@ def state_of(rng: np.random.Generator, reference: Lemniscate, size: float) -> Pr
         thrust_mps2=G + 0.3 * size * rng.normal(),
         disturbance_ned_mps2=0.3 * size * rng.normal(size=3),
         rates_frd_radps=np.zeros(3),
+    )
+
+
+def on_target(state: PredictedState, target: Target) -> PredictedState:
+    """`state` as the reference asks for it."""
+    down = math.sqrt(1.0 - target.lateral[2] @ target.lateral[2])
+    position, velocity, direction, rate = target.lateral
+    return replace(
+        state,
+        position_ned_m=np.array([*position, target.vertical[0]]),
+        velocity_ned_mps=np.array([*velocity, target.vertical[1]]),
+        thrust_direction_ned=np.array([*direction, down]),
+        thrust_direction_rate_ned_ps=np.array([*rate, 0.0]),
+        thrust_mps2=target.vertical[2] / down,
     )
 
 

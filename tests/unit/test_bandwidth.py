@@ -7,7 +7,7 @@ import pytest
 from attitude_plant import Flight, Lemniscate, Truth, fly
 
 from offboard.control.bandwidth import LEAST_MARGIN_S, SHARE_OF_DELAY, supported_bandwidth
-from offboard.control.lqr import LqrLaw, LqrSettings
+from offboard.control.law import LqrLaw, LqrSettings
 from offboard.estimation.noise import Noise
 from offboard.model.vehicle import AxisResponse, DelayUncertainty, Vehicle
 

@@ -45,7 +45,3 @@ def test_distance_and_bearing_are_the_sphere_s(
 def test_origin_is_where_the_place_lies_as_known(known: tuple[float, float, float]) -> None:
     origin = origin_of(ZURICH, known)
     assert position_ned_m(ZURICH, origin) == pytest.approx(known, abs=1e-6)
-
-
-def test_a_place_is_at_its_own_origin() -> None:
-    assert position_ned_m(ZURICH, ZURICH).tolist() == [0.0, 0.0, 0.0]

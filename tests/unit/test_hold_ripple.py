@@ -62,11 +62,11 @@ def test_the_target_ripples_as_the_staircase_does() -> None:
     off = _after(held=True) - _after(held=False)
     level = at((0.0, 0.0, 0.0), 0.0)
     target = law.target(Jerking((1.0, -1.0, 0.0)), 0.0, level)
-    assert target.direction_ne == pytest.approx(np.array([-1.0, 1.0]) / G * off[0], rel=1e-3)
+    assert target.lateral[2] == pytest.approx(np.array([-1.0, 1.0]) / G * off[0], rel=1e-3)
     leaning = np.array([-1.0, 1.0]) / G
-    assert target.direction_rate_ne_ps == pytest.approx(leaning * (1.0 + off[1]), rel=1e-3)
+    assert target.lateral[3] == pytest.approx(leaning * (1.0 + off[1]), rel=1e-3)
     climbing = law.target(Jerking((0.0, 0.0, 1.0)), 0.0, level)
-    assert climbing.thrust_down_mps2 - G == pytest.approx(-off[2], rel=1e-3)
+    assert climbing.vertical[2] - G == pytest.approx(-off[2], rel=1e-3)
 
 
 @pytest.mark.parametrize(("heave_m", "most_m"), [(0.0, 0.0002), (0.4, 0.0008)])

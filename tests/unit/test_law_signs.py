@@ -15,7 +15,7 @@ from offboard.control.base import Controller, Decision, Situation
 from offboard.model.command import Command, PositionCommand
 from offboard.model.frames import wrap_pi
 from offboard.reference.base import FlatSample
-from offboard.reference.transfer import Hold
+from offboard.reference.track import hold
 
 HEADINGS_DEG = (0.0, 90.0, 179.9, -179.9, -90.0)
 
@@ -75,7 +75,7 @@ def push_back(law: Controller, heading: float) -> None:
     """b points where the vehicle came from: north of the target, or moving north of it, it leans
     north. Above the target, or climbing, the thrust is less than hover's. The heading commanded is
     the target's, across the wrap."""
-    reference = Hold((1.0, 2.0, -3.0), heading)
+    reference = hold((1.0, 2.0, -3.0), heading)
     for axis, sign, moving in itertools.product(range(3), (1.0, -1.0), (False, True)):
         off = np.zeros(3)
         off[axis] = 0.1 * sign
@@ -137,7 +137,7 @@ def test_an_error_that_stays_is_answered_ever_more_by_the_integral(axis: int, si
     """5 cm for 3 s: 0.03 m/s^2 more along north and east, 0.15 along the vertical."""
     law, off = law_named("pid"), np.zeros(3)
     off[axis] = 0.05 * sign
-    situation = Situation(0.0, at((off[0], off[1], off[2]), 0.0), Hold((0, 0, 0), 0.0), LEVEL)
+    situation = Situation(0.0, at((off[0], off[1], off[2]), 0.0), hold((0, 0, 0), 0.0), LEVEL)
     pushed = []
     for _ in range(31):
         command = law.decide(situation).command
@@ -181,13 +181,3 @@ def test_climbing_and_descending_flights_at_all_headings(name: str, heading_deg:
     reference = Lemniscate(8.0, heading_rad=math.radians(heading_deg), heave_m=0.4)
     flown = fly(Truth(PX4, noisy=False), law_named(name), PX4, reference, 1, laps=0.5)
     assert flown.rmse_m < 0.03
-
-
-@pytest.mark.parametrize("output", ["north", "east", "thrust"])
-@pytest.mark.parametrize("name", ["pso", pytest.param("horizon", marks=pytest.mark.slow)])
-def test_one_sign_swapped_is_seen(name: str, output: str) -> None:
-    """What the flights above would show."""
-    reference = Lemniscate(8.0, heading_rad=math.radians(90.0), heave_m=0.4)
-    law = Swapped(law_named(name), output)
-    flown = fly(Truth(PX4, noisy=False), law, PX4, reference, 1, laps=0.1)
-    assert flown.rmse_m > 0.3

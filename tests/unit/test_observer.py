@@ -14,9 +14,8 @@ from scipy.integrate import solve_ivp
 from offboard.estimation.motion import COMMAND_SIZE, STATE_SIZE, THRUST, plant_of, propagate
 from offboard.estimation.noise import Noise
 from offboard.estimation.observer import Observer
-from offboard.model.command import Command
+from offboard.model.command import Command, PredictedState
 from offboard.model.frames import quaternion_from_thrust_direction
-from offboard.model.predicted_state import PredictedState
 from offboard.model.vehicle import AxisResponse, Vehicle
 
 G = 9.80665

@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation
 from offboard.control.base import DecisionError, Situation
 from offboard.control.swarm import SwarmSettings
 from offboard.documents.reading import parse
-from offboard.model.command import Command
-from offboard.model.linear import hover_matrices, sampled_matrices
-from offboard.model.predicted_state import PredictedState
+from offboard.model.command import Command, PredictedState
+from offboard.model.rigid_body import hover_matrices, sampled_matrices
 from offboard.model.vehicle import Vehicle
 from offboard.paper.controller import (
     PaperController,

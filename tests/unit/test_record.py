@@ -10,8 +10,7 @@ from offboard.control.base import Certificate, Decision
 from offboard.flight.phases import Phase
 from offboard.flight.record import Decided, Tick, TickRecord
 from offboard.flight.setpoint import Refusal
-from offboard.model.command import Command
-from offboard.model.predicted_state import PredictedState
+from offboard.model.command import Command, PredictedState
 
 TICK = Tick(5.0)
 COMMAND = Command(9.0, (0.6, 0.0, 0.8), 0.3)

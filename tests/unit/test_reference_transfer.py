@@ -10,10 +10,11 @@ import pytest
 
 from offboard.reference.base import FlatSample
 from offboard.reference.shapes import Circle, HeadingMode
-from offboard.reference.transfer import Hold, Limits, Moved, Transfer, transfer
+from offboard.reference.track import Moved, Track, hold
+from offboard.reference.transfer import Limits, transfer
 
 
-def peaks(flown: Transfer) -> tuple[float, float, float]:
+def peaks(flown: Track) -> tuple[float, float, float]:
     sample = flown.sample(np.linspace(0.0, flown.duration_s, 2001))
     return (
         float(np.linalg.norm(sample.velocity_ned_mps, axis=-1).max()),
@@ -82,7 +83,7 @@ def test_a_long_way_is_flown_at_constant_speed(
     assert float(end.heading_rad) == pytest.approx(2 * math.pi - 3.0)
     for name in ("velocity_ned_mps", "acceleration_ned_mps2", "jerk_ned_mps3", "snap_ned_mps4"):
         np.testing.assert_allclose(getattr(end, name), 0.0, atol=1e-6)
-        for knot_s in flown.polynomial.breaks_s[1:-1]:  # no kink between the pieces
+        for knot_s in flown.path.breaks_s[1:-1]:  # no kink between the pieces
             before, after = (getattr(flown.sample(knot_s + h), name) for h in (-1e-7, 1e-7))
             np.testing.assert_allclose(before, after, atol=1e-4)
 
@@ -112,25 +113,6 @@ def test_no_start_is_planned_further_out_than_it_needs_to_brake() -> None:
             np.testing.assert_allclose(path[-1], target, atol=1e-6)
 
 
-def test_a_start_that_is_not_finite_is_refused() -> None:
-    with pytest.raises(ValueError, match="finite start"):
-        transfer((math.nan, 0, 0), (1, 0, 0), 0, 0)
-
-
-def test_derivatives_are_those_of_the_position() -> None:
-    flown = transfer((0, 0, 0), (2, 1, -3), 0.1, 2.0, start_velocity_ned_mps=(0.5, 0, 0))
-    times = np.linspace(0.1, flown.duration_s - 0.1, 50)
-    h = 1e-4
-    names = FlatSample.__slots__
-    for lower, upper in itertools.pairwise(names):
-        if upper == "heading_rad":  # snap and heading: no derivative of one another
-            continue
-        slope = (
-            getattr(flown.sample(times + h), lower) - getattr(flown.sample(times - h), lower)
-        ) / (2 * h)
-        np.testing.assert_allclose(getattr(flown.sample(times), upper), slope, atol=1e-5)
-
-
 def test_moved_and_held() -> None:
     track = Circle(course=HeadingMode.ALONG_VELOCITY).track()
     moved = Moved(track, 100.0, (10.0, -5.0, 2.0))
@@ -142,10 +124,10 @@ def test_moved_and_held() -> None:
     )
     for name in FlatSample.__slots__[1:]:
         np.testing.assert_array_equal(getattr(there, name), getattr(here, name))
-    hold = Hold((1.0, 2.0, -3.0), 0.4)
-    assert hold.duration_s == 0.0
+    rest = hold((1.0, 2.0, -3.0), 0.4)
+    assert rest.duration_s == 0.0
     for time_s in (5.0, times):
-        sample = hold.sample(time_s)
+        sample = rest.sample(time_s)
         assert sample.position_ned_m.shape == (*np.shape(time_s), 3)
         np.testing.assert_array_equal(sample.position_ned_m[..., 2], -3.0)
         np.testing.assert_array_equal(sample.heading_rad, np.full(np.shape(time_s), 0.4))

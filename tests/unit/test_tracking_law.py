@@ -13,12 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from attitude_plant import Flight, Lemniscate, Truth, fly
-from laws import ARDUCOPTER, LEVEL, PX4, G, lqr, pso, state_of
+from laws import ARDUCOPTER, LEVEL, PX4, G, lqr, on_target, pso, state_of
 from scipy.linalg import expm
 
 from offboard.control.base import Controller, DecisionError, Situation
-from offboard.control.lqr import closed_form
-from offboard.control.pso import PsoLaw
+from offboard.control.law import PsoLaw
 from offboard.control.swarm import SwarmSettings
 from offboard.model.axes import lateral_model, lead, vertical_model
 from offboard.model.command import Command
@@ -91,26 +90,21 @@ def test_unconstrained_minimiser_is_the_lqr_law() -> None:
         task = law.task(Situation(5.0, state, reference, LEVEL))
         target, problem = task.target, task.problem
         minimiser = np.linalg.solve(problem.hessian, -problem.gradient)
-        off = [
-            state.position_ned_m[:2] - target.position_ne_m,
-            state.velocity_ned_mps[:2] - target.velocity_ne_mps,
-            state.thrust_direction_ned[:2] - target.direction_ne,
-            state.thrust_direction_rate_ned_ps[:2] - target.direction_rate_ne_ps,
-        ]
-        b_z = state.thrust_direction_ned[2]
-        vertical = [
-            state.position_ned_m[2] - target.position_down_m,
-            state.velocity_ned_mps[2] - target.velocity_down_mps,
-            state.thrust_mps2 * b_z - target.thrust_down_mps2,
-        ]
-        expected_tilt = target.tilt_feedforward - law.lateral.gain @ np.array(off)
-        force = target.thrust_down_feedforward_mps2 - law.vertical.gain @ vertical
+        north_east = np.array(
+            (state.position_ned_m, state.velocity_ned_mps, state.thrust_direction_ned,
+             state.thrust_direction_rate_ned_ps)
+        )[:, :2]  # fmt: skip
+        off, b_z = north_east - target.lateral, state.thrust_direction_ned[2]
+        down = (state.position_ned_m[2], state.velocity_ned_mps[2], state.thrust_mps2 * b_z)
+        vertical = np.array(down) - target.vertical
+        expected_tilt = target.feedforward[:2] - law.lateral.gain @ off
+        force = target.feedforward[2] - law.vertical.gain @ vertical
         assert minimiser[1:3] == pytest.approx(expected_tilt, abs=1e-9)
         assert minimiser[0] == pytest.approx(force / b_z, abs=1e-9)
-        assert minimiser[3] == pytest.approx(target.heading_feedforward_rad)
+        assert minimiser[3] == pytest.approx(target.heading_rad)
         # what an optimal law has left to pay is x' P x
-        left = np.sum(np.array(off) * (law.lateral.terminal @ np.array(off)))
-        left += vertical @ law.vertical.terminal @ np.array(vertical)
+        left = np.sum(off * (law.lateral.terminal @ off))
+        left += vertical @ law.vertical.terminal @ vertical
         assert float(problem(minimiser)) == pytest.approx(left, rel=1e-9)
 
 
@@ -121,17 +115,9 @@ def test_cost_vanishes_on_the_reference_and_never_goes_below_zero() -> None:
         task = law.task(Situation(5.0, state, reference, LEVEL))
         target, problem = task.target, task.problem
         assert problem(np.linalg.solve(problem.hessian, -problem.gradient)) > -1e-9
-    b_z = math.sqrt(1 - target.direction_ne @ target.direction_ne)
-    on_it = replace(
-        state,
-        position_ned_m=np.array([*target.position_ne_m, target.position_down_m]),
-        velocity_ned_mps=np.array([*target.velocity_ne_mps, target.velocity_down_mps]),
-        thrust_direction_ned=np.array([*target.direction_ne, b_z]),
-        thrust_direction_rate_ned_ps=np.array([*target.direction_rate_ne_ps, 0.0]),
-        thrust_mps2=target.thrust_down_mps2 / b_z,
-    )
-    nominal = [target.thrust_down_feedforward_mps2 / b_z,
-               *target.tilt_feedforward, target.heading_feedforward_rad]  # fmt: skip
+    on_it = on_target(state, target)
+    b_z = on_it.thrust_direction_ned[2]
+    nominal = [target.feedforward[2] / b_z, *target.feedforward[:2], target.heading_rad]
     problem = law.task(Situation(5.0, on_it, reference, LEVEL)).problem
     cost = float(problem(np.array(nominal)))
     assert cost == pytest.approx(0.0, abs=1e-9)
@@ -146,7 +132,7 @@ def test_bounds_hold_and_the_feedback_is_limited(size: float, least: int, most: 
         target = law.target(reference, 5.0, state)
         decision = law.decide(Situation(5.0, state, reference, LEVEL))
         tilt = np.array(decision.command.thrust_direction_ned)
-        fed_forward = np.clip(target.tilt_feedforward, -limit, limit)
+        fed_forward = np.clip(target.feedforward[:2], -limit, limit)
         assert np.abs(tilt[:2] - fed_forward).max() <= 0.3 + 1e-12
         assert np.abs(tilt[:2]).max() <= limit + 1e-12
         assert np.linalg.norm(tilt) == pytest.approx(1.0)
@@ -171,33 +157,6 @@ def test_swarm_finds_the_closed_form() -> None:
         assert ours.certificate.gap < 1e-6
         assert exact.certificate.gap == 0.0
         assert ours.certificate.optimal_cost == pytest.approx(exact.certificate.cost, rel=1e-6)
-
-
-def test_closed_form_is_no_worse_than_any_point_of_the_box() -> None:
-    rng, reference = np.random.default_rng(6), Lemniscate(8.0)
-    state = state_of(rng, reference, 2.0)
-    problem = lqr().task(Situation(5.0, state, reference, LEVEL)).problem
-    anywhere = rng.uniform(problem.lower, problem.upper, (10_000, 4))
-    assert problem(closed_form(problem)) <= problem(anywhere).min()
-
-
-def test_same_error_north_east_south_west_heading_same_tilt() -> None:
-    """The law lives in NED: the heading turns the quaternion, never the thrust direction. An error
-    to the north is answered by thrust to the south (b_n > 0), one to the east by b_e > 0."""
-    law = lqr()
-    tilts = []
-    for heading in np.radians([0.0, 90.0, 180.0, 270.0]):
-        reference = Lemniscate(15.0, run_in_s=1e9, heading_rad=float(heading))
-        home = reference.sample(5.057).position_ned_m
-        rest = state_of(np.random.default_rng(0), reference, 0.0)
-        state = replace(rest, position_ned_m=home + np.array([0.1, 0.05, 0.0]),
-                        velocity_ned_mps=np.zeros(3), heading_rad=float(heading))  # fmt: skip
-        command = law.decide(Situation(5.0, state, reference, LEVEL)).command
-        tilts.append(command.thrust_direction_ned)
-        assert math.cos(command.heading_rad - heading) == pytest.approx(1.0)
-    assert tilts[0][:2] == pytest.approx((0.187, 0.0937), abs=1e-3)
-    for tilt in tilts[1:]:
-        assert tilt == pytest.approx(tilts[0], abs=1e-12)
 
 
 def test_too_low_means_more_thrust_and_tilt_is_paid_for() -> None:

@@ -40,17 +40,6 @@ class _KeepOut(Parameters):
     velocity_east_mps: Speed = 0.0
     velocity_up_mps: Speed = 0.0
 
-    def packed(self) -> Array:
-        """The volume as (PACKED_SIZE,), NED, relative to the take-off point."""
-        row = np.zeros(PACKED_SIZE)
-        row[CENTRE : CENTRE + 3] = self.north_m, self.east_m, -self.height_m
-        row[VELOCITY : VELOCITY + 3] = (
-            self.velocity_north_mps,
-            self.velocity_east_mps,
-            -self.velocity_up_mps,
-        )
-        return row
-
 
 class Sphere(_KeepOut):
     """A sphere of `radius_m`."""
@@ -58,10 +47,10 @@ class Sphere(_KeepOut):
     shape: Literal["sphere"]
     radius_m: Size
 
-    def packed(self) -> Array:
-        row = super().packed()
-        row[ROUND] = self.radius_m
-        return row
+    @property
+    def sizes(self) -> tuple[float, ...]:
+        """Columns HALF to the last."""
+        return 0.0, 0.0, 0.0, self.radius_m, 0.0
 
 
 class Cylinder(_KeepOut):
@@ -71,11 +60,10 @@ class Cylinder(_KeepOut):
     radius_m: Size
     length_m: Size
 
-    def packed(self) -> Array:
-        row = super().packed()
-        row[RADIUS] = self.radius_m
-        row[HALF + 2] = 0.5 * self.length_m
-        return row
+    @property
+    def sizes(self) -> tuple[float, ...]:
+        """Columns HALF to the last."""
+        return 0.0, 0.0, 0.5 * self.length_m, 0.0, self.radius_m
 
 
 class Box(_KeepOut):
@@ -86,25 +74,27 @@ class Box(_KeepOut):
     size_east_m: Size
     size_up_m: Size
 
-    def packed(self) -> Array:
-        row = super().packed()
-        row[HALF : HALF + 3] = (
-            0.5 * self.size_north_m,
-            0.5 * self.size_east_m,
-            0.5 * self.size_up_m,
+    @property
+    def sizes(self) -> tuple[float, ...]:
+        """Columns HALF to the last."""
+        return 0.5 * self.size_north_m, 0.5 * self.size_east_m, 0.5 * self.size_up_m, 0.0, 0.0
+
+
+Volume = Sphere | Cylinder | Box
+KeepOut = Annotated[Volume, Field(discriminator="shape")]
+
+
+def pack(volumes: Sequence[Volume]) -> Array:
+    """The volumes as (V, PACKED_SIZE), NED, relative to the take-off point."""
+    rows = [
+        (
+            *(each.north_m, each.east_m, -each.height_m),
+            *(each.velocity_north_mps, each.velocity_east_mps, -each.velocity_up_mps),
+            *each.sizes,
         )
-        return row
-
-
-KeepOut = Annotated[Sphere | Cylinder | Box, Field(discriminator="shape")]
-
-
-def pack(volumes: Sequence[Sphere | Cylinder | Box]) -> Array:
-    """The volumes as (V, PACKED_SIZE)."""
-    rows = np.zeros((len(volumes), PACKED_SIZE))
-    for row, volume in zip(rows, volumes, strict=True):
-        row[:] = volume.packed()
-    return rows
+        for each in volumes
+    ]
+    return np.array(rows, np.float64).reshape(-1, PACKED_SIZE)
 
 
 @kernel
@@ -142,9 +132,7 @@ def placed_at(volumes: Array, origin_ned_m: Array, track_time_s: float) -> Array
     return there
 
 
-def clearances(
-    volumes: Sequence[Sphere | Cylinder | Box], times_s: Array, positions_ned_m: Array
-) -> Array:
+def clearances(volumes: Sequence[Volume], times_s: Array, positions_ned_m: Array) -> Array:
     """Distance to the nearest volume, (n,), at times (n,) since the start of the reference and
     positions (n, 3) relative to the take-off point. It is inf where no volumes are given."""
     packed, origin = pack(volumes), np.zeros(3)
@@ -155,25 +143,23 @@ def clearances(
     return nearest
 
 
-def refusal(
-    volumes: Sequence[Sphere | Cylinder | Box], clearance_m: float, reference: Reference
-) -> str | None:
+def refusal(volumes: Sequence[Volume], clearance_m: float, reference: Reference) -> str | None:
     """Why `reference`, relative to the take-off point, conflicts with the volumes; or None."""
+    times = np.arange(0.0, reference.duration_s + CHECK_STEP_S, CHECK_STEP_S)
+    path = reference.sample(times).position_ned_m
     for number, volume in enumerate(volumes):
-        times = np.arange(0.0, reference.duration_s + CHECK_STEP_S, CHECK_STEP_S)
-        path = reference.sample(times).position_ned_m
         gaps = clearances((volume,), times, path)
-        ground = float(clearances((volume,), np.zeros(1), np.zeros((1, 3)))[0])
-        named = f"keep_out[{number}] ({volume.shape})"
-        within = f"with its clearance of {clearance_m:g} m"
-        if ground < clearance_m:
-            return f"{named} contains the take-off point {within} ({ground:.2f} m from its surface)"
-        if bool((gaps < clearance_m).all()):
-            return f"{named} contains the whole path {within}"
-        for place, gap in (("start", gaps[0]), ("end", gaps[-1])):
-            if gap < clearance_m:
+        ground = clearances((volume,), np.zeros(1), np.zeros((1, 3)))[0]
+        for what, inside, gap in (
+            ("take-off point", ground < clearance_m, ground),
+            ("whole path", (gaps < clearance_m).all(), None),
+            ("start of the reference", gaps[0] < clearance_m, gaps[0]),
+            ("end of the reference", gaps[-1] < clearance_m, gaps[-1]),
+        ):
+            if inside:
+                near = "" if gap is None else f" ({gap:.2f} m from its surface)"
                 return (
-                    f"{named} contains the {place} of the reference {within} "
-                    f"({gap:.2f} m from its surface)"
+                    f"keep_out[{number}] ({volume.shape}) contains the {what} "
+                    f"with its clearance of {clearance_m:g} m{near}"
                 )
     return None

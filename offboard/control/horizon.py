@@ -1,0 +1,314 @@
+"""The law `horizon`: the swarm over N decisions of nonlinear roll-outs, around keep-out volumes.
+
+A plan is a base (inputs and the states they lead to) that the feedback of the closed form follows,
+plus a few knots interpolated over its steps. Bases are the better of the closed form's plan and the
+previous one, and, where they are cheaper than that, the exact plan of the linear problem (`mpc`),
+the ways past each side of each volume, and the reference flown no faster than a speed limit. The
+swarm searches the knots about the best of them; the answer is never worse than any base.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from operator import attrgetter
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from offboard.control.base import Certificate, Decision, DecisionError, Situation
+from offboard.control.keep_out import CENTRE, HALF, RADIUS, ROUND, KeepOut, pack, placed_at, refusal
+from offboard.control.law import Task, TrackingLaw, TrackingSettings, decision
+from offboard.control.mpc import MOST_STEPS, OUTLOOK, HorizonQuadratic, look_ahead
+from offboard.control.quadratic import ExactMinimum
+from offboard.control.roll_out import (
+    INPUTS,
+    STATE_SIZE,
+    B,
+    F,
+    P,
+    T,
+    V,
+    W,
+    Z,
+    plant_of,
+    roll_out,
+)
+from offboard.control.swarm import Swarm, SwarmSettings
+from offboard.model.axes import b_z_of
+from offboard.model.vehicle import Vehicle
+from offboard.reference.base import Reference
+
+Array = NDArray[np.float64]
+
+STEPS, STEPS_AROUND = 10, 20
+VERTICAL_REACH_MPS2 = 3.0  # of the knots of the vertical thrust
+PLANNED_MARGIN_M = 0.05  # beyond the clearance: for tracking errors, and because it is a soft limit
+RIVALS = 2  # plans of other origin that are searched about too
+DETOUR_M = 1.0  # volumes whose clearance is further from the reference need no detour
+COST = attrgetter("cost")  # the order of plans: infinite where a roll-out is not finite
+
+# Places of the knots as fractions of the plan: dense at its start, which is what is commanded
+KNOT_SHARES = (0.0, 0.15, 0.4, 0.8)
+# Axis NED and sign: a detour never passes below a volume
+SIDES = ((0, 1.0), (0, -1.0), (1, 1.0), (1, -1.0), (2, -1.0))
+ROWS = ((P, V), (P + 1, V + 1), (Z, W))  # position and velocity of each axis in a state
+
+
+class HorizonSettings(TrackingSettings):
+    """Settings of the law `horizon`.
+
+    `steps` is the number of decisions planned (default: 10, and 20 with keep-out volumes, so that
+    the way round one fits in), `keep_out` the volumes to avoid with `clearance_m` to spare,
+    `speed_limit_mps` the highest speed (default: unlimited).
+    """
+
+    law: Literal["horizon"] = "horizon"
+    steps: int | None = Field(default=None, ge=2, le=MOST_STEPS)
+    keep_out: tuple[KeepOut, ...] = ()
+    clearance_m: float = Field(default=0.3, ge=0, le=50)
+    speed_limit_mps: float | None = Field(default=None, gt=0, le=50)
+    swarm: SwarmSettings = SwarmSettings(particles=20, iterations=40, damping=0.8)
+
+    @property
+    def planned(self) -> int:
+        """The number of decisions planned, as chosen or by default."""
+        return self.steps or (STEPS_AROUND if self.keep_out else STEPS)
+
+    @property
+    def reach_m(self) -> float:
+        """Distance that plans keep from the surface of a volume."""
+        return self.clearance_m + PLANNED_MARGIN_M
+
+    def build(self, vehicle: Vehicle, *, period_s: float, seed: int) -> HorizonLaw:
+        return HorizonLaw(vehicle, self, period_s=period_s, seed=seed)
+
+    def refusal(self, reference: Reference) -> str | None:
+        return refusal(self.keep_out, self.clearance_m, reference)
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Inputs (N, 3), the states (N + 1, STATE_SIZE) they lead to, and the cost."""
+
+    inputs: Array
+    states: Array
+    cost: float
+
+
+@dataclass(frozen=True, slots=True)
+class RollOuts:
+    """The fields of `Plan` for n plans: (n, ...)."""
+
+    inputs: Array
+    states: Array
+    costs: Array
+
+    def plan(self, index: int) -> Plan:
+        """One of them."""
+        return Plan(self.inputs[index], self.states[index], float(self.costs[index]))
+
+
+class HorizonLaw(TrackingLaw):
+    """Particle swarm over the knots of a plan. `previous` is the last plan and the vehicle time of
+    its decision."""
+
+    def __init__(
+        self, vehicle: Vehicle, settings: HorizonSettings, *, period_s: float = 0.1, seed: int = 0
+    ) -> None:
+        self._settings, self._seed = settings, seed
+        super().__init__(vehicle, settings, period_s)
+        steps, particles = settings.planned, settings.swarm.particles
+        self._volumes = self._placed = pack(settings.keep_out)
+        self._exact = ExactMinimum(INPUTS * steps)
+        self.outlook = np.zeros(1, OUTLOOK)
+        self._start, self._floor_down_m = np.zeros(STATE_SIZE), 0.0
+        self._nowhere = np.zeros((steps + 1, STATE_SIZE))
+        self._weights = knot_weights(steps)
+        self.reach = np.full((self._weights.shape[1], INPUTS), settings.feedback_limit)
+        self.reach[:, 2] = VERTICAL_REACH_MPS2
+        self.previous: tuple[float, Plan] | None = None
+        self._rng = np.random.default_rng(seed)
+        drawn = np.random.default_rng(particles).uniform(-1.0, 1.0, (particles, self.reach.size))
+        # The first particle starts at the base, each further one scattered wider about it
+        self._starts = np.linspace(0.0, 1.0, particles)[:, None] * drawn * self.reach.ravel()
+
+    def reset(self) -> None:
+        super().reset()
+        self.previous = None
+        self._rng = np.random.default_rng(self._seed)
+
+    def _use_gains(self, bandwidth_radps: float) -> None:
+        super()._use_gains(bandwidth_radps)
+        settings = self._settings
+        self.quadratic = HorizonQuadratic(self, settings.planned)
+        speed_limit_mps = settings.speed_limit_mps or math.inf
+        self._plant = plant_of(self, speed_limit_mps=speed_limit_mps, clearance_m=settings.reach_m)
+
+    def decide(self, situation: Situation) -> Decision:
+        task = self.prepare(situation)
+        own, others = self._own_plan(situation.time_s), self._other_plans(task)
+        rivals = sorted((plan for plan in others if plan.cost < own.cost), key=COST)
+        bases = [own, *rivals[:RIVALS]]
+        seed_cost = min(plan.cost for plan in bases)
+        if not math.isfinite(seed_cost):
+            raise DecisionError("no plan over the horizon has a finite cost")
+        best, found = self._searched(bases, situation.remaining_s)
+        self.previous = (situation.time_s, best)
+        chosen, lower, upper = best.inputs[0], self.outlook["lower"][0], self.outlook["upper"][0]
+        certificate = replace(
+            found,
+            at_bound=bool(((chosen <= lower[0]) | (chosen >= upper[0])).any()),
+            seed_cost=seed_cost,
+        )
+        return decision(task.problem.clip(task.inputs(chosen)), certificate)
+
+    def prepare(self, situation: Situation) -> Task:
+        """Make the roll-outs ready for this situation. Returns its task."""
+        task, settings = self.task(situation), self._settings
+        self.outlook = look_ahead(self, situation, task, settings.planned)
+        delay_s = situation.state.time_s - situation.time_s
+        origin_ned_m = np.array(situation.origin_ned_m, np.float64)
+        self._placed = placed_at(self._volumes, origin_ned_m, situation.track_time_s + delay_s)
+        self._floor_down_m = situation.origin_ned_m[2] - settings.clearance_m
+        self._start[P:Z] = task.lateral.reshape(-1)
+        self._start[Z:T] = task.vertical
+        ahead = self.outlook[0]
+        b_n, b_e = ahead["directions"][0, :2]
+        leant = b_z_of(b_n + self._start[B], b_e + self._start[B + 1]) - b_z_of(b_n, b_e)
+        thrust, b_z = ahead["thrusts_heave"][0], ahead["b_z"][0]
+        self._start[T] = (thrust * b_z + self._start[F]) / (b_z + leant) - thrust
+        return task
+
+    def fly(
+        self, inputs: Array, states: Array | None = None, knots: Array | None = None
+    ) -> RollOuts:
+        """Roll out n plans: inputs (N, 3), plus the closed form's feedback towards `states`
+        (N + 1, STATE_SIZE) unless None, plus knots (n, M, 3); n is 1 without knots."""
+        steps = self._settings.planned
+        if knots is None:
+            knots = np.zeros((1, *self.reach.shape))
+        flown = RollOuts(
+            np.empty((len(knots), steps, INPUTS)),
+            np.empty((len(knots), steps + 1, STATE_SIZE)),
+            np.empty(len(knots)),
+        )
+        feedback, towards = (0.0, self._nowhere) if states is None else (1.0, states)
+        roll_out(
+            self._plant, self.outlook, self._placed, self._floor_down_m, self._start,
+            np.ascontiguousarray(inputs), np.ascontiguousarray(towards), feedback,
+            self._weights, np.ascontiguousarray(knots),
+            flown.states, flown.inputs, flown.costs,
+        )  # fmt: skip
+        return flown
+
+    def _own_plan(self, time_s: float) -> Plan:
+        """The cheaper of the plan of the closed form and what remains of the previous plan."""
+        steps = self._settings.planned
+        inputs, states = np.zeros((steps, INPUTS)), self._nowhere.copy()
+        plan = self.fly(inputs, states).plan(0)
+        if self.previous is not None:
+            decided_s, before = self.previous
+            gone = round((time_s - decided_s) / self.period_s)
+            if 0 <= gone < steps:
+                inputs[: steps - gone] = before.inputs[gone:]
+                states[: steps - gone + 1] = before.states[gone:]
+                plan = min(plan, self.fly(inputs, states).plan(0), key=COST)
+        return plan
+
+    def _other_plans(self, task: Task) -> list[Plan]:
+        """The exact plan of the linear problem, and those that follow other ways."""
+        exact = self._exact.minimise(self.quadratic.problem(task, self.outlook))
+        plans = []
+        if np.isfinite(exact).all():
+            plans.append(self.fly(self.quadratic.plan(exact)).plan(0))
+        nothing = np.zeros((self._settings.planned, INPUTS))
+        plans.extend(self.fly(nothing, way).plan(0) for way in (*self._detours(), *self._slower()))
+        return plans
+
+    def _detours(self) -> list[Array]:
+        """Ways round the volumes that are near the reference, one past each side of each, as states
+        (N + 1, STATE_SIZE) that the closed form follows. A way need not be good, the search
+        improves it; but the search alone would not find the other side of a wide volume."""
+        ways = []
+        nodes = slice(0, 2 * self._settings.planned + 1, 2)
+        places, speeds = self.outlook["positions"][0, nodes], self.outlook["velocities"][0, nodes]
+        for volume in self._placed:
+            half = volume[HALF : HALF + 3] + volume[ROUND] + self._settings.reach_m
+            half[:2] += volume[RADIUS]
+            centre = volume[CENTRE : CENTRE + 3]
+            if not (np.abs(places - centre) - half < DETOUR_M).all(axis=1).any():
+                continue
+            for axis, sign in SIDES:
+                way = self._nowhere.copy()
+                aside = centre[axis] + sign * half[axis] - places[:, axis]
+                past = sign * aside > 0.0
+                position, velocity = ROWS[axis]
+                way[past, position] = aside[past]
+                way[past, velocity] = -speeds[past, axis]
+                ways.append(way)
+        return ways
+
+    def _slower(self) -> list[Array]:
+        """The reference from the present state on, no faster than the limit of the speed, as states
+        (N + 1, STATE_SIZE)."""
+        way, limit_mps = self._nowhere.copy(), self._settings.speed_limit_mps
+        if limit_mps is None:
+            return []
+        velocities = self.outlook["velocities"][0, 0 : 2 * len(way) - 1 : 2]
+        speeds_mps = np.linalg.norm(velocities, axis=1, keepdims=True)
+        less_mps = np.minimum(limit_mps / np.maximum(speeds_mps, limit_mps) - 1.0, 0.0) * velocities
+        behind_m = np.cumsum(less_mps[:-1], axis=0) * self.period_s
+        for axis, (position, velocity) in enumerate(ROWS):
+            way[:, position] = self._start[position]
+            way[1:, position] += behind_m[:, axis]
+            way[:, velocity] = less_mps[:, axis]
+        return [way]
+
+    def _searched(
+        self, bases: list[Plan], remaining_s: Callable[[], float] | None
+    ) -> tuple[Plan, Certificate]:
+        """The best plan about any of the bases, which share the iterations. Searching only about
+        the cheapest of all ends in worse valleys than searching about our own too."""
+        settings = self._settings.swarm
+        share = max(1, settings.iterations // len(bases))
+        each = settings.model_copy(update={"iterations": share})
+        answers = [self.search(base, each, self._rng, remaining_s) for base in bases]
+        return min(answers, key=lambda answer: answer[0].cost)
+
+    def search(
+        self,
+        base: Plan,
+        settings: SwarmSettings,
+        rng: np.random.Generator,
+        remaining_s: Callable[[], float] | None = None,
+    ) -> tuple[Plan, Certificate]:
+        """The best plan whose knots are within +-`reach` (M, 3) about `base`. The first particle
+        starts at the base, so the answer is never worse."""
+        limit = self.reach.ravel()
+        swarm = Swarm(settings, -limit, limit, rng, self._starts)
+        best, late = base, False
+        for iteration in range(settings.iterations):
+            knots = swarm.ask().reshape(-1, *self.reach.shape)
+            flown = self.fly(base.inputs, base.states, knots)
+            first = int(np.argmin(flown.costs))
+            if flown.costs[first] < best.cost:
+                best = flown.plan(first)
+            swarm.tell(flown.costs)
+            if remaining_s is not None and remaining_s() <= 0:
+                late = iteration + 1 < settings.iterations
+                break
+        found = swarm.result()
+        return best, Certificate(
+            cost=best.cost, spread=found.spread, iterations=found.iterations, cut_short=late
+        )
+
+
+def knot_weights(steps: int) -> Array:
+    """Weights (N, M) of M knots in each step: linear between knots, constant after the last."""
+    places = sorted({round(share * (steps - 1)) for share in KNOT_SHARES})
+    every = np.arange(steps)
+    return np.column_stack([np.interp(every, places, unit) for unit in np.eye(len(places))])
