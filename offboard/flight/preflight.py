@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import partial
+from typing import Protocol
 
 from offboard.flight.phases import Limits
 from offboard.flight.vehicle_state import ARMED_KNOWN_S, VehicleState
@@ -54,9 +55,16 @@ class Finding:
         return f"{self.found}. Fix: {self.hint}" if self.hint else self.found
 
 
-@dataclass(frozen=True, slots=True)
+class Known(Protocol):
+    """What a flight and a `Ground` have in common."""
+
+    vehicle: VehicleState
+    limits: Limits
+
+
+@dataclass(slots=True)
 class Ground:
-    """What is known of a vehicle before its flight."""
+    """What is known of a vehicle before its flight, by a flight or by the listening of `doctor`."""
 
     vehicle: VehicleState
     limits: Limits
@@ -122,7 +130,6 @@ def not_ready(ground: Ground) -> str:
 # --- conditions ---
 
 # what may also come up later on the ground
-ARMED_ALREADY = "the vehicle is armed already, by another controller or a pilot"
 OTHER_SENDER = (
     "another program controls the vehicle on this link, too: {flight.vehicle.other_sender_name} "
     "(limits.begin_with_other_sender=true flies all the same)"
@@ -138,9 +145,10 @@ def unfit_type(ground: Ground) -> str:
     return senders.unfit_type(heartbeat.vehicle_type, helicopter=ground.helicopter)
 
 
-def _armed_already(ground: Ground) -> str:
-    armed = ground.vehicle.armed and not ground.limits.begin_armed
-    return ARMED_ALREADY if armed else ""
+def armed_already(known: Known) -> str:
+    """Another has armed it, and such a vehicle is not to be flown."""
+    armed = known.vehicle.armed and not known.limits.begin_armed
+    return "the vehicle is armed already, by another controller or a pilot" if armed else ""
 
 
 def _flown_by_another(ground: Ground) -> str:
@@ -294,60 +302,36 @@ def _late(ground: Ground) -> str:
 
 
 _ESTIMATOR = "wait for a GPS fix, keep the vehicle still and away from metal; then calibrate"
-_LINK = "use a faster link"
+_UNFIT = "fly it with its own autopilot; is MAV_TYPE or FRAME_CLASS right?"
+_FAILSAFE = "let the pilot take over first"
 
 
 def _slow_hint(ground: Ground) -> str:
     return ground.dialect.slow_hint if ground.dialect else ""
 
 
+WARN, WAIT, BLOCKS = Level.WARN, Level.WAIT, Level.BLOCKS
 PREFLIGHT = (
-    Row(
-        "vehicle",
-        Level.BLOCKS,
-        unfit_type,
-        "fly it with its own autopilot; is MAV_TYPE or FRAME_CLASS right?",
-        at_once=True,
-    ),
-    Row(
-        "state",
-        Level.BLOCKS,
-        _flown_by_another,
-        "stop that controller",
-        at_once=True,
-        fly_only=True,
-    ),
-    Row(
-        "state",
-        Level.BLOCKS,
-        _flown_by_failsafe,
-        "let the pilot take over first",
-        at_once=True,
-        fly_only=True,
-    ),
-    Row("state", Level.BLOCKS, _armed_already, "disarm it", at_once=True, fly_only=True),
-    Row("senders", Level.BLOCKS, _other_sender, "stop it", at_once=True, fly_only=True),
-    Row(
-        "senders",
-        Level.BLOCKS,
-        _several_vehicles,
-        "or give each vehicle its own port",
-        at_once=True,
-    ),
-    Row("rates", Level.WAIT, _no_telemetry),
-    Row("supervisor", Level.WAIT, _unguarded),
-    Row("rates", Level.BLOCKS, _slow, _slow_hint),
-    Row("state", Level.BLOCKS, _may_fly),
-    Row("parameters", Level.WAIT, _reading),
-    Row("origin", Level.WAIT, _origin),
-    Row("prearm", Level.WAIT, _prearm, fly_only=True),
-    Row("prearm", Level.WARN, _needs_setpoints, _other_mode, fly_only=True),
-    Row("estimator", Level.BLOCKS, _rejected, _ESTIMATOR),
-    Row("estimator", Level.WAIT, partial(_no_estimate, starting=True), _ESTIMATOR),
-    Row("estimator", Level.BLOCKS, partial(_no_estimate, starting=False), _ESTIMATOR),
-    Row("battery", Level.BLOCKS, _empty_battery, "charge the battery"),
-    Row("delay", Level.WAIT, _measuring),
-    Row("delay", Level.BLOCKS, _late, _LINK),
+    Row("vehicle", BLOCKS, unfit_type, _UNFIT, at_once=True),
+    Row("state", BLOCKS, _flown_by_another, "stop that controller", at_once=True, fly_only=True),
+    Row("state", BLOCKS, _flown_by_failsafe, _FAILSAFE, at_once=True, fly_only=True),
+    Row("state", BLOCKS, armed_already, "disarm it", at_once=True, fly_only=True),
+    Row("senders", BLOCKS, _other_sender, "stop it", at_once=True, fly_only=True),
+    Row("senders", BLOCKS, _several_vehicles, "or give each vehicle its own port", at_once=True),
+    Row("rates", WAIT, _no_telemetry),
+    Row("supervisor", WAIT, _unguarded),
+    Row("rates", BLOCKS, _slow, _slow_hint),
+    Row("state", BLOCKS, _may_fly),
+    Row("parameters", WAIT, _reading),
+    Row("origin", WAIT, _origin),
+    Row("prearm", WAIT, _prearm, fly_only=True),
+    Row("prearm", WARN, _needs_setpoints, _other_mode, fly_only=True),
+    Row("estimator", BLOCKS, _rejected, _ESTIMATOR),
+    Row("estimator", WAIT, partial(_no_estimate, starting=True), _ESTIMATOR),
+    Row("estimator", BLOCKS, partial(_no_estimate, starting=False), _ESTIMATOR),
+    Row("battery", BLOCKS, _empty_battery, "charge the battery"),
+    Row("delay", WAIT, _measuring),
+    Row("delay", BLOCKS, _late, "use a faster link"),
 )
 
 

@@ -7,7 +7,7 @@ not hold; a text says why it holds.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Set
 from dataclasses import dataclass
 
 from offboard.flight.authority import Standing
@@ -17,6 +17,7 @@ from offboard.mavlink.events import OtherSender
 
 Condition = Callable[[FlightState], str | bool]
 
+OPERATOR = "{flight.stop_cause}"  # the cause of a row for `stop_requested`
 REBOOTED = "the vehicle restarted"
 OTHER_SENDER_S = 5.0  # a second sender is there for so long after its newest frame
 
@@ -31,7 +32,7 @@ class Transition:
     braces.
     """
 
-    phases: tuple[Phase, ...]
+    phases: Set[Phase]
     condition: Condition
     target: Phase
     exit_code: int | None = None
@@ -47,6 +48,7 @@ class Transition:
 
 
 def silent(flight: FlightState) -> str:
+    """Host time without position and attitude."""
     return silent_for(flight, flight.limits.silence_s)
 
 
@@ -55,7 +57,7 @@ def silent_for(flight: FlightState, limit_s: float) -> str:
 
 
 def blind(flight: FlightState) -> str:
-    """Position or attitude is missing, by vehicle time."""
+    """Age of the older of position and attitude, by vehicle time."""
     vehicle = flight.vehicle
     age_s, name = max(
         (vehicle.position_age_s, "LOCAL_POSITION_NED"),
@@ -73,8 +75,8 @@ def mode_unknown(flight: FlightState) -> str:
 
 
 def other_sender(flight: FlightState) -> str:
-    """Another program controls the vehicle on this link, and that counts: it sends setpoints or
-    mode commands, or says so."""
+    """Another program sends setpoints or commands modes on this link, or says in its HEARTBEAT
+    that it flies the vehicle."""
     if flight.limits.begin_with_other_sender:
         return ""
     if not flight.vehicle.age_s(OtherSender) < OTHER_SENDER_S:

@@ -8,6 +8,7 @@ begins the next one where it has ended.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -36,26 +37,27 @@ SERVICE_ONLY = frozenset({Phase.STANDBY, Phase.PAUSE, Phase.HAND_BACK})
 @cache
 def table(service: ServiceOptions | None = None) -> tuple[Transition, ...]:
     """The phase table of the service with these options; without them that of `fly`."""
-    phases = tuple(phase for phase in Phase if phase in FLYING)
     if service is None:
-        phases = tuple(phase for phase in phases if phase not in SERVICE_ONLY)
-        return (
+        rows = (
             *starting.FLY_BEGINS,
-            *starting.starting((Phase.HEALTH, *starting.STREAMING)),
+            *starting.starting({Phase.HEALTH, *starting.STREAMING}),
             *starting.FLY_IS_READY,
-            *flying.ends_early(phases, serves=False),
+            *flying.ends_early(serves=False),
             *flying.TO_THE_END,
             *flying.AT_REST["land"],
         )
-    return (
-        *starting.SERVICE_WAITS,
-        *starting.starting(starting.STREAMING),
-        Transition((Phase.HAND_BACK,), flying.handed, Phase.YIELDED),
-        *flying.ends_early(phases, serves=True),
-        *flying.TO_THE_END,
-        *flying.SERVICE_ENDS,
-        *flying.AT_REST[service.then],
-    )
+        rows = tuple(replace(row, phases=row.phases - SERVICE_ONLY) for row in rows)
+    else:
+        rows = (
+            *starting.SERVICE_WAITS,
+            *starting.starting(starting.STREAMING),
+            Transition({Phase.HAND_BACK}, flying.handed, Phase.YIELDED),
+            *flying.ends_early(serves=True),
+            *flying.TO_THE_END,
+            *flying.SERVICE_ENDS,
+            *flying.AT_REST[service.then],
+        )
+    return tuple(row for row in rows if row.phases)
 
 
 def next_row(flight: FlightState) -> Transition | None:
