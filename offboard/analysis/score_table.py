@@ -11,7 +11,7 @@ from rich.text import Text
 
 from offboard.analysis.history import History
 from offboard.analysis.score import FIGURES, Score
-from offboard.flight.busyness import too_busy
+from offboard.flight.record import too_busy
 
 # the figure that begins a section -> its title
 SECTIONS = {

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from offboard.analysis.events import Event
 from offboard.analysis.history import History
+from offboard.flight.ground_contact import Touchdown, moved
 from offboard.flight.positioning import PositionJumps
-from offboard.flight.touchdown import Touchdown, moved
 from offboard.mavlink.event_record import SUPERVISOR
 from offboard.mavlink.events import LocalPosition
 

@@ -131,7 +131,7 @@ class Listening:
             case Rebooted():
                 self._rebooted = True
                 self._first = self._newest = None
-                self._clock.reset()
+                self._clock = VehicleClock()
 
     def _on_stamp(self, stamp_s: float, at_s: float) -> None:
         self._late_s = max(self._late_s, self._clock.age_s(stamp_s, at_s) if self._settled else 0.0)

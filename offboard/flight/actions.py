@@ -24,12 +24,16 @@ SPOOL_KNOWN_S = 0.2  # age of a position that shows the height
 # Of an autopilot's own take-off, which setpoints replace on the way: the height of the reference,
 # but above the height that shows lift-off, and no higher than needed
 TAKEOFF_HEIGHTS_M = 1.5, 3.0
+DISARMING = (
+    f"disarming: {STANDING_S:.0f} s without motion on the ground, and the vehicle does not disarm "
+    "by itself"
+)
 LAND_STREAM_S = 3.0  # if the landing is refused, setpoints stop and the autopilot's failsafe lands
 
 
 def act(flight: FlightState) -> None:
     """Send the requests of the phase, at most one setpoint, and a request of the vehicle's time."""
-    if flight.has_ended:
+    if flight.ended:
         return
     time_s = flight.time_s
     if flight.phase in BEFORE_FLIGHT:
@@ -66,7 +70,6 @@ def hold(flight: FlightState, time_s: float) -> None:
 def _end(flight: FlightState, time_s: float, *, steers: bool) -> None:
     """Ask the autopilot to hold or to land, with level setpoints until it does."""
     dialect, authority = _dialect(flight), flight.authority
-    assert authority is not None
     holds = flight.phase is not Phase.LAND
     if not holds:
         _await_link(flight)
@@ -98,7 +101,7 @@ def _await_link(flight: FlightState) -> None:
             "then landing is asked again",
         )
     elif waited and not flight.awaits_link:
-        outbox.renew(flight)
+        flight.requested_s.clear()  # every request may be sent once more
         outbox.announce(flight, f"heard again: the vehicle shows {flight.vehicle.mode}")
 
 
@@ -110,13 +113,9 @@ def _disarm_if_standing(flight: FlightState) -> None:
     if not contact.stands:
         return
     if contact.detects_flight:
-        outbox.announce_once(flight, STILL_ARMED)
+        outbox.announce(flight, STILL_ARMED, once=True)
     elif outbox.request(flight, CommandLong.disarm()):
-        outbox.announce_once(
-            flight,
-            f"disarming: {STANDING_S:.0f} s without motion on the ground, and the vehicle "
-            "does not disarm by itself",
-        )
+        outbox.announce(flight, DISARMING, once=True)
 
 
 def _prepare(flight: FlightState, time_s: float) -> None:

@@ -27,7 +27,6 @@ from offboard.flight.rows import (
     lost_armed,
     mode_unknown,
     rebooted,
-    stands,
     stop_requested,
 )
 from offboard.flight.state import FlightState
@@ -103,7 +102,8 @@ def _when(flight: FlightState) -> str:
 
 def handed(flight: FlightState) -> str:
     """It shows a mode that we asked for at the end."""
-    return f"the vehicle shows {flight.vehicle.mode}" if stands(flight, Standing.HANDED) else ""
+    handed = flight.authority.standing is Standing.HANDED
+    return f"the vehicle shows {flight.vehicle.mode}" if handed else ""
 
 
 def failsafe_land(flight: FlightState) -> bool:

@@ -6,7 +6,6 @@ not hold; a text says why it holds.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Set
 from dataclasses import dataclass
 
@@ -68,10 +67,9 @@ def blind(flight: FlightState) -> str:
 
 
 def mode_unknown(flight: FlightState) -> str:
-    if flight.authority is not None and flight.authority.heard(flight.now_s):
+    if flight.authority.heard(flight.now_s):
         return ""
-    heard_s = flight.authority.heard_s if flight.authority else -math.inf
-    return f"no report of the mode for {flight.now_s - heard_s:.1f} s"
+    return f"no report of the mode for {flight.now_s - flight.authority.heard_s:.1f} s"
 
 
 def other_sender(flight: FlightState) -> str:
@@ -100,7 +98,7 @@ def engaged_in_the_air(flight: FlightState) -> str:
 
 def lost(flight: FlightState) -> str:
     """The vehicle is not ours any more."""
-    if flight.authority is None or flight.authority.standing is not Standing.LOST:
+    if flight.authority.standing is not Standing.LOST:
         return ""
     return flight.authority.lost_reason or Standing.LOST.value
 
@@ -114,13 +112,9 @@ def lost_disarmed(flight: FlightState) -> str:
     return lost(flight) if flight.shown_since_lost and not flight.vehicle.armed else ""
 
 
-def stands(flight: FlightState, standing: Standing) -> bool:
-    return flight.authority is not None and flight.authority.standing is standing
-
-
 def in_own_failsafe(flight: FlightState) -> str:
     """Setpoints were missing, and the autopilot's failsafe flies the vehicle."""
-    if not stands(flight, Standing.FAILSAFE):
+    if flight.authority.standing is not Standing.FAILSAFE:
         return ""
     mode = flight.vehicle.mode
     return f"setpoints did not arrive, and the vehicle's own failsafe flies it, in {mode}"

@@ -176,10 +176,9 @@ def engaged(flight: FlightState) -> str:
 def not_engaged(flight: FlightState) -> str:
     if flight.in_phase_s <= flight.limits.engage_s:
         return ""
-    wanted = flight.authority.engage_mode if flight.authority else "offboard mode"
     unanswered = preflight.unanswered(flight.clock.unanswered_s(flight.host_s))
     return (
-        f"the vehicle did not enter {wanted} in {flight.in_phase_s:.0f} s "
+        f"the vehicle did not enter {flight.authority.engage_mode} in {flight.in_phase_s:.0f} s "
         f"(it shows {flight.vehicle.mode})" + (unanswered and f"; {unanswered}")
     )
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from offboard.flight import decision, failsafe, flying, outbox, starting
 from offboard.flight.authority import PilotSwitch
+from offboard.flight.ground_contact import Touchdown
 from offboard.flight.hover_estimate import DIFFERENT, SETTLED, differs
 from offboard.flight.phases import (
     BEFORE_FLIGHT,
@@ -27,7 +28,6 @@ from offboard.flight.phases import (
 )
 from offboard.flight.rows import REBOOTED, Transition, in_own_failsafe
 from offboard.flight.state import FlightState, Outcome
-from offboard.flight.touchdown import Touchdown
 from offboard.mavlink.events import LocalPosition
 
 TAKEN = "a failsafe of the vehicle has it, as its HEARTBEAT shows"
@@ -77,7 +77,7 @@ def _by_phase(service: ServiceOptions | None) -> dict[Phase, tuple[Transition, .
 
 def advance(flight: FlightState) -> None:
     """Make every transition whose guard holds."""
-    while not flight.has_ended:
+    while not flight.ended:
         if flight.phase in FLYING:
             failsafe.judge(flight)
         _note_failsafe(flight)
@@ -101,7 +101,7 @@ def name_failsafe(flight: FlightState) -> None:
     before = flight.outcome
     if flight.taken and flight.vehicle.in_failsafe and before is not None:
         sentence = TAKEN + _explanation(flight)
-        outbox.announce_once(flight, sentence)
+        outbox.announce(flight, sentence, once=True)
         flight.outcome = Outcome(before.exit_code, f"{before.sentence}; {sentence}")
 
 
@@ -124,7 +124,7 @@ def _enter(flight: FlightState, row: Transition) -> None:
     flight.request = Request.NONE
     flight.phase = row.target
     flight.began_s = flight.now_s
-    outbox.announce_phase(flight, row.target, reason, cause)
+    outbox.announce_phase(flight, reason, cause)
     if source in BEFORE_FLIGHT and row.target in FLYING:
         flight.clock.settle()
         dialect = flight.session.dialect
@@ -136,7 +136,7 @@ def _enter(flight: FlightState, row: Transition) -> None:
             decision.begin(flight)
     if flight.identification:
         flight.identification.on_phase(row.target, flight.time_s)
-    if source in WAITING and row.target in FLYING and flight.authority:
+    if source in WAITING and row.target in FLYING:
         flight.authority.ask()  # it shows the mode already
     if row.target is Phase.ENGAGE:
         _begin_engaging(flight)
@@ -175,7 +175,6 @@ def _explanation(flight: FlightState) -> str:
 
 def _begin_engaging(flight: FlightState) -> None:
     """Here, not with the request: a vehicle that shows the mode already passes without one."""
-    assert flight.authority is not None
     flight.authority.ask()
     _set_hover_thrust(flight)
 

@@ -184,7 +184,7 @@ def test_an_unsigned_vehicle_is_refused_with_a_key() -> None:
 
 def test_a_vehicle_that_reboots_with_its_old_stamps_is_heard_again() -> None:
     pair = signed_hover()
-    session: Any = pair.companion.state.session
+    session: Any = pair.companion.session
     session._signing.offset = 10**12  # our clock is right, the vehicle's is years behind
     pair.at.append((in_phase(Phase.HEALTH, 1.0), lambda p: p.instance.reboot(0.5)))
     pair.at.append((in_phase(Phase.STREAM), lambda p: pytest.fail("it was not rebooted")))
@@ -192,7 +192,7 @@ def test_a_vehicle_that_reboots_with_its_old_stamps_is_heard_again() -> None:
         pair.advance()
     pair.at.clear()
     until(pair, Phase.ARM)
-    assert pair.companion.state.session.counters.forged > 0
+    assert pair.companion.session.counters.forged > 0
 
 
 def test_two_vehicles_on_one_link_are_named() -> None:
@@ -209,5 +209,5 @@ def test_two_vehicles_on_one_link_are_named() -> None:
         outcome.sentence
     )
     chosen = hover(down=both)
-    chosen.companion.state.session.senders = Senders(1, 191, has_key=False)
+    chosen.companion.session.senders = Senders(1, 191, has_key=False)
     until(chosen, Phase.ARM)

@@ -24,9 +24,9 @@ from offboard.analysis.score import Score, score
 from offboard.analysis.score_table import summary, verdict
 from offboard.cli.commands import app
 from offboard.flight.flight import Outcome
+from offboard.flight.ground_contact import Touchdown
 from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import PHASE_CODES, Phase
-from offboard.flight.touchdown import Touchdown
 from offboard.link.log import FlightLog
 from offboard.model.frames import thrust_direction_from_quaternion
 
