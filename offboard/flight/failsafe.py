@@ -17,9 +17,8 @@ import numpy as np
 
 from offboard.flight.phases import TRACKING, Action
 from offboard.flight.rows import Condition, blind, mode_unknown, other_sender, silent
-from offboard.flight.state import FlightState
+from offboard.flight.state import COMMANDS_KEPT, FlightState
 from offboard.mavlink.events import ThrustReport
-from offboard.model.frames import thrust_direction_from_quaternion
 
 RECOVERY = 0.25  # speed at which a delay runs back
 STEP_MAX_S = 0.2  # what one sample counts for, also after a gap of telemetry
@@ -62,21 +61,19 @@ def decisions_missed(flight: FlightState) -> bool:
 
 def tilted(flight: FlightState) -> str:
     """Tilt of the vehicle: the angle between the thrust axis and the vertical."""
-    attitude = flight.vehicle.attitude
-    if attitude is None:
+    if flight.vehicle.attitude is None:
         return ""
-    down = thrust_direction_from_quaternion(np.array(attitude.attitude))[2]
-    tilt_rad = math.acos(min(1.0, max(-1.0, float(down))))
+    tilt_rad = math.acos(min(1.0, max(-1.0, float(flight.vehicle.thrust_direction_ned[2]))))
     exceeds = tilt_rad > flight.limits.tilt_rad
     return f"tilt {math.degrees(tilt_rad):.0f} deg" if exceeds else ""
 
 
 def away_from_commands(flight: FlightState) -> str:
     """Angle between the thrust direction and the nearest of the newest commands."""
-    attitude, commands = flight.vehicle.attitude, flight.commands
-    if attitude is None or len(commands) < (commands.maxlen or 0):
+    vehicle, commands = flight.vehicle, flight.commands
+    if vehicle.attitude is None or len(commands) < COMMANDS_KEPT:
         return ""
-    flown = thrust_direction_from_quaternion(np.array(attitude.attitude))
+    flown = vehicle.thrust_direction_ned
     nearest = max(float(flown @ np.array(each.thrust_direction_ned)) for each in commands)
     error_rad = math.acos(min(1.0, max(-1.0, nearest)))
     if not error_rad > flight.limits.tilt_error_rad:

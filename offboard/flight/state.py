@@ -58,21 +58,9 @@ class Outcome:
 
 # of the flight before, with the same vehicle
 KEPT = (
-    "vehicle",
-    "contact",
-    "clock",
-    "hover",
-    "reading",
-    "dialect",
-    "now_s",
-    "host_s",
-    "silence_s",
-    "heard_s",
-    "guarded",
-    "peer",
-    "other_datagrams",
-    "turned_s",
-)
+    "vehicle", "contact", "clock", "hover", "reading", "dialect", "peer", "other_datagrams",
+    "now_s", "host_s", "turned_s", "silence_s", "heard_s", "guarded",
+)  # fmt: skip
 
 
 @dataclass(slots=True)

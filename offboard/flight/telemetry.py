@@ -40,7 +40,6 @@ from offboard.mavlink.events import (
     VehicleFound,
 )
 from offboard.mavlink.outgoing import CommandResult
-from offboard.model.frames import thrust_direction_from_quaternion
 
 START, PAUSE_CONTINUE, SET_MODE = 300, 193, 176  # MAV_CMD
 BEGINNING = (Phase.STREAM, Phase.ENGAGE, Phase.ARM, Phase.TAKEOFF)
@@ -89,20 +88,22 @@ def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: flo
 
 
 def _is_of_others(flight: FlightState, thrust: float) -> bool:
-    """Whether the vehicle demands a thrust that no recent setpoint of ours had. False on
-    ArduCopter, which does not report the thrust of the setpoint."""
-    if flight.dialect is None or flight.dialect.thrust_rule is not ThrustRule.COLLECTIVE:
-        return False
-    return bool(flight.thrusts) and all(abs(thrust - t) > SAME_THRUST for t in flight.thrusts)
+    """Whether the vehicle demands a thrust that no recent setpoint of ours had."""
+    ours = flight.thrusts if _reports_thrust(flight) else ()
+    return bool(ours) and all(abs(thrust - each) > SAME_THRUST for each in ours)
+
+
+def _reports_thrust(flight: FlightState) -> bool:
+    """Whether the autopilot reports the thrust of the setpoint; ArduCopter does not."""
+    return flight.dialect is not None and flight.dialect.thrust_rule is ThrustRule.COLLECTIVE
 
 
 def _lifting_share(flight: FlightState) -> float:
     """Vertical part of the thrust that the autopilot reports: the cosine of the tilt, unless it
     reports it before it is raised for the tilt."""
-    attitude, dialect = flight.vehicle.attitude, flight.dialect
-    if attitude is None or dialect is None or dialect.thrust_rule is not ThrustRule.COLLECTIVE:
+    if flight.vehicle.attitude is None or not _reports_thrust(flight):
         return 1.0
-    return float(thrust_direction_from_quaternion(np.array(attitude.attitude))[2])
+    return float(flight.vehicle.thrust_direction_ned[2])
 
 
 def _on_telemetry(flight: FlightState, stamp_s: float, arrived_s: float, turned_s: float) -> None:
