@@ -31,7 +31,7 @@ def request(flight: FlightState, request: CommandLong) -> bool:
     requested_s = flight.requested_s.get(key, -math.inf)
     waits = flight.now_s - requested_s < REPEAT_S - 1e-6 or flight.authority.heard_s < requested_s
     done = math.isfinite(requested_s) and result in GOOD_RESULTS
-    if waits or done or not flight.may_command:
+    if waits or done or not flight.authority.permits_command(flight.now_s):
         return False
     flight.requested_s[key] = flight.now_s
     flight.vehicle.results.pop(request.command, None)

@@ -104,8 +104,8 @@ class FlightState:
     failsafe: Failsafe = field(default_factory=Failsafe)
     contact: GroundContact = field(init=False)
     pilot: PilotSwitch = field(default_factory=PilotSwitch)
-    takeoff_ned_m: Triple | None = None  # None for a vehicle that was found in the air
     home_ned_m: Triple = (0.0, 0.0, 0.0)  # the ground where the flight began
+    took_off: bool = False  # from there; a vehicle that was found in the air has not
     touchdown: Touchdown | None = None  # of the landing
     dialect: Dialect | None = None  # once the vehicle has reported its mode
     authority: Authority = field(default_factory=Authority)
@@ -287,10 +287,6 @@ class FlightState:
         """A setpoint may leave."""
         return self.authority.permits_setpoint(self.now_s)
 
-    @property
-    def may_command(self) -> bool:
-        return self.authority.permits_command(self.now_s)
-
     def not_landed(self) -> str:
         """Why the vehicle has not landed; empty if it has."""
         vehicle = self.vehicle
@@ -305,8 +301,6 @@ class FlightState:
         """The reported position has jumped by this (3,), not the vehicle: so has the ground."""
         jump = tuple(jump_ned_m)
         self.home_ned_m = moved(self.home_ned_m, jump)
-        if self.takeoff_ned_m is not None:
-            self.takeoff_ned_m = moved(self.takeoff_ned_m, jump)
         if self.phase is Phase.TAKEOFF:  # the reference is not in force yet
             self.plan.origin_ned_m = moved(self.plan.origin_ned_m, jump)
         if self.contact.rest_ned_m is not None:

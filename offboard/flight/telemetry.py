@@ -180,7 +180,7 @@ def _on_reboot(flight: FlightState) -> None:
     flight.contact, flight.clock = GroundContact(flight.vehicle), VehicleClock()
     flight.hover, flight.jumps = HoverEstimate(), PositionJumps()
     flight.reading = ParameterReading()
-    flight.takeoff_ned_m = None  # the local frame begins elsewhere
+    flight.took_off = False  # the local frame begins elsewhere
     if flight.phase not in BEFORE_FLIGHT:
         flight.authority.forget(flight.now_s)
     else:

@@ -153,7 +153,7 @@ def _enter(flight: FlightState, row: Transition) -> None:
     elif source is Phase.PAUSE and row.target is Phase.TRACK:
         flight.plan.resume(flight.time_s)
     elif row.target is Phase.LAND:
-        flight.touchdown = Touchdown(flight.takeoff_ned_m)
+        flight.touchdown = Touchdown(flight.home_ned_m if flight.took_off else None)
 
 
 def _conclude(flight: FlightState, row: Transition, reason: str) -> None:
@@ -182,8 +182,8 @@ def _begin_engaging(flight: FlightState) -> None:
 def _begin_takeoff(flight: FlightState) -> None:
     position = flight.vehicle.position
     assert position is not None
-    flight.takeoff_ned_m = flight.plan.origin_ned_m = position.position_ned_m
-    flight.home_ned_m = flight.takeoff_ned_m
+    flight.home_ned_m = flight.plan.origin_ned_m = position.position_ned_m
+    flight.took_off = True
 
 
 def _begin_climb(flight: FlightState, source: Phase) -> None:
