@@ -113,8 +113,8 @@ def examine(chosen: Sequence[Check], seen: Observation) -> list[Row]:
     """One row for each check that found something to say. A check that fails is a row, too."""
     judged: dict[str, list[Finding]] = {}
     if seen.dialect is not None:
-        for condition, finding in preflight.findings(seen.ground):
-            judged.setdefault(condition.check, []).append(finding)
+        for name, _, finding in preflight.findings(seen.ground):
+            judged.setdefault(name, []).append(finding)
     rows = []
     for check in chosen:
         found = judged.get(check.name, [])

@@ -89,7 +89,7 @@ class Row:
     """One condition: `problem` says what is wrong, empty if nothing is, `fix` what to do.
 
     `at_once`: `fly` does not wait `limits.health_s` for it to clear. `fly_only`: `daemon`, which
-    waits for its pilot, does not judge it. `about`: the parameter."""
+    waits for its pilot, does not judge it."""
 
     check: str
     level: Level
@@ -97,33 +97,34 @@ class Row:
     fix: str | Callable[[Ground], str] = ""
     at_once: bool = False
     fly_only: bool = False
-    about: str = ""
-
-    def finding(self, ground: Ground) -> Finding | None:
-        """What is wrong; None if nothing is."""
-        found = "" if self.fly_only and ground.serves else self.problem(ground)
-        if not found:
-            return None
-        fix = self.fix if isinstance(self.fix, str) else self.fix(ground)
-        return Finding(self.level, found, fix, self.about)
 
 
-def findings(ground: Ground) -> Iterator[tuple[Row, Finding]]:
-    """The rows whose condition is not met, in the order of the list."""
-    dialect = ground.dialect
-    parameters = dialect.watched_parameters if dialect else ()
-    rows = (*PREFLIGHT, *(row for each in parameters for row in _parameter_rows(each)))
-    return ((row, found) for row in rows if (found := row.finding(ground)))
+def findings(ground: Ground) -> Iterator[tuple[str, bool, Finding]]:
+    """What is wrong, in the order of the list, and last what the autopilot requires of its
+    parameters: the name of the check, whether `fly` refuses it at once, and the finding."""
+    for row in PREFLIGHT:
+        found = "" if row.fly_only and ground.serves else row.problem(ground)
+        if found:
+            fix = row.fix if isinstance(row.fix, str) else row.fix(ground)
+            yield row.check, row.at_once, Finding(row.level, found, fix)
+    for parameter in ground.dialect.watched_parameters if ground.dialect else ():
+        name, value = parameter.name, ground.vehicle.parameters.get(parameter.name)
+        fault = None if value is None else parameter.fault(value)
+        if fault:
+            yield "parameters", True, Finding(Level.BLOCKS, fault.found, fault.fix, name)
+        elif value is None and parameter.must_answer:
+            missing = f"no reply for parameter {name}"
+            yield "parameters", False, Finding(Level.BLOCKS, missing, about=name)
 
 
 def refusals(ground: Ground) -> list[str]:
     """Why this vehicle is not flown, whatever else changes: a sentence for each reason."""
-    return [found.sentence for row, found in findings(ground) if row.at_once]
+    return [found.sentence for _, at_once, found in findings(ground) if at_once]
 
 
 def not_ready(ground: Ground) -> str:
     """Why it cannot be flown yet, in one sentence; empty if nothing is to be waited for."""
-    waiting = (found.sentence for row, found in findings(ground) if not row.at_once)
+    waiting = (found.sentence for _, at_once, found in findings(ground) if not at_once)
     return next(waiting, "")
 
 
@@ -336,29 +337,6 @@ PREFLIGHT = (
 
 
 # --- parameters ---
-
-
-def _parameter_rows(parameter: WatchedParameter) -> tuple[Row, ...]:
-    """What the autopilot requires of a parameter, and of a reply."""
-    name = parameter.name
-
-    def wrong(ground: Ground) -> str:
-        value = ground.vehicle.parameters.get(name)
-        fault = None if value is None else parameter.fault(value)
-        return fault.found if fault else ""
-
-    def line(ground: Ground) -> str:
-        fault = parameter.fault(ground.vehicle.parameters[name])
-        return fault.fix if fault else ""
-
-    def unanswered(ground: Ground) -> str:
-        missing = parameter.must_answer and name not in ground.vehicle.parameters
-        return f"no reply for parameter {name}" if missing else ""
-
-    return (
-        Row("parameters", Level.BLOCKS, wrong, line, at_once=True, about=name),
-        Row("parameters", Level.BLOCKS, unanswered, about=name),
-    )
 
 
 class ParameterReading:
