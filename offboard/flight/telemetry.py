@@ -145,10 +145,11 @@ def _follow_jump(flight: FlightState, event: LocalPosition) -> None:
 def _on_mode(
     flight: FlightState, event: Heartbeat | ModeReport, mode: str, arrived_s: float
 ) -> None:
-    flight.dialect = flight.session.dialect
-    assert flight.dialect is not None
     if not flight.authority.engage_mode:
+        flight.dialect = flight.session.dialect
+        assert flight.dialect is not None
         flight.authority = Authority(flight.dialect.engage_mode)
+    assert flight.dialect is not None
     vehicle, authority = flight.vehicle, flight.authority
     authority.loss = flight.dialect.setpoint_loss(vehicle.parameters)
     authority.on_mode(

@@ -139,7 +139,9 @@ def _enter(flight: FlightState, row: Transition) -> None:
     if source in WAITING and row.target in FLYING:
         flight.authority.ask()  # it shows the mode already
     if row.target is Phase.ENGAGE:
-        _begin_engaging(flight)
+        # here, not with the request: a vehicle that shows the mode already passes without one
+        flight.authority.ask()
+        _set_hover_thrust(flight)
     elif row.target is Phase.STANDBY:
         flight.pilot.engaged = False  # the pilot switched to one that was not ready
     elif row.target is Phase.TAKEOFF:
@@ -171,12 +173,6 @@ def _conclude(flight: FlightState, row: Transition, reason: str) -> None:
 def _explanation(flight: FlightState) -> str:
     dialect = flight.dialect
     return flight.vehicle.explanation(dialect.unsaid if dialect else "")
-
-
-def _begin_engaging(flight: FlightState) -> None:
-    """Here, not with the request: a vehicle that shows the mode already passes without one."""
-    flight.authority.ask()
-    _set_hover_thrust(flight)
 
 
 def _begin_takeoff(flight: FlightState) -> None:
