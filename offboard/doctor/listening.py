@@ -118,7 +118,7 @@ class Listening:
             case Rebooted():
                 self.rebooted = True
                 self._first = self._newest = None
-                self.clock.reset()
+                self.clock = VehicleClock()
 
     def _on_stamp(self, stamp_s: float, at_s: float) -> None:
         self.late_s = max(self.late_s, self.clock.age_s(stamp_s, at_s) if self._settled else 0.0)

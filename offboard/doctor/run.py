@@ -1,7 +1,7 @@
 """A whole check: open the link, listen, judge, report.
 
 A finding is of the preflight list, by which `fly` and `daemon` refuse a flight, or of a check of
-this package, which says what else is worth knowing. The worst finding wins.
+this or another package, which says what else is worth knowing. The worst finding wins.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack
 from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import TypeVar
 
@@ -64,6 +65,10 @@ CHECKS = {
 }
 
 
+GROUP = "pso_offboard.checks"  # entry points of other packages: name and function of a check
+AUTHOR = "report this to whoever wrote the check"
+
+
 class CheckError(UserError):
     """A check that does not exist."""
 
@@ -80,18 +85,36 @@ class Row:
         return self.findings[0].level
 
 
+def checks() -> dict[str, Check]:
+    """All checks by name; those of other packages last, which cannot replace one of this."""
+    others = sorted(entry_points(group=GROUP), key=lambda point: point.name)
+    return CHECKS | {each.name: _installed(each) for each in others if each.name not in CHECKS}
+
+
+def _installed(point: EntryPoint) -> Check:
+    """A check of another package, imported when it is asked."""
+
+    def check(seen: Observation) -> Iterable[Finding]:
+        found: Iterable[Finding] = point.load()(seen)
+        return found
+
+    check.__doc__ = f"A check of another package, {point.value}."
+    return check
+
+
 def names(chosen: Sequence[str] = ()) -> list[str]:
     """The chosen checks in the order of the table; all if none is. Raises CheckError."""
+    known = checks()
     for name in chosen:
-        if name not in CHECKS:
-            listed = ", ".join(CHECKS)
+        if name not in known:
+            listed = ", ".join(known)
             raise CheckError(f"there is no check named {shown(name)}; known are {listed}")
-    return [name for name in CHECKS if not chosen or name in chosen]
+    return [name for name in known if not chosen or name in chosen]
 
 
 def summary(name: str) -> str:
     """What a check is about."""
-    return " ".join((inspect.getdoc(CHECKS[name]) or "").split())
+    return " ".join((inspect.getdoc(checks()[name]) or "").split())
 
 
 # --- observing ---
@@ -173,11 +196,11 @@ def examine(chosen: Iterable[str], seen: Observation) -> list[Row]:
     """One row for each of the checks that has something to say."""
     found = seen.vehicle.found is not None
     blocking = list(preflight.findings(seen.ground)) if found else []
-    rows = []
+    rows, known = [], checks()
     for name in chosen:
-        findings = [each for condition, each in blocking if condition.check == name]
-        if found or CHECKS[name] not in OF_VEHICLE:
-            findings += _judged(CHECKS[name], seen, seen.began_s + LOOK_S - clock.monotonic_s())
+        findings = [each for check, _, each in blocking if check == name]
+        if found or known[name] not in OF_VEHICLE:
+            findings += _judged(known[name], seen, seen.began_s + LOOK_S - clock.monotonic_s())
         if findings:
             rows.append(Row(name, tuple(sorted(findings, key=lambda each: -each.level))))
     return rows
@@ -189,6 +212,9 @@ def _judged(check: Check, seen: Observation, most_s: float) -> list[Finding]:
     except TimeoutError:
         hint = "close other programs and check again, or `offboard check` the configuration"
         return [wait("this was not examined in time", hint)]
+    except Exception as error:  # whatever a check of another package raises
+        sentence = f"the check itself failed: {type(error).__name__}: {error}"
+        return [Finding(Level.WARN, sentence, AUTHOR)]
 
 
 def worst(rows: Iterable[Row]) -> Level:

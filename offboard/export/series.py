@@ -51,7 +51,7 @@ _COLUMNS = {
 _ARRAYS = {"decision": "records"}  # of History, where they have another name
 PHASE = "decision_phase"  # whose numbers tables show as names
 LOCKSTEP_SHARE = 0.05  # of the vehicle's time, by which a flight in real time differs at most
-_PHASES = {code: phase.value for phase, code in PHASE_CODES.items()}
+_PHASES: dict[int, str] = {code: phase.value for phase, code in PHASE_CODES.items()}
 _AUTOPILOTS = {"px4": "PX4", "ardupilot": "ArduPilot"}  # as MAV_AUTOPILOT names them
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from offboard.flight import decision, outbox, setpoint
 from offboard.flight.authority import Standing
 from offboard.flight.ground_contact import STANDING_S, STILL_ARMED
@@ -13,7 +11,6 @@ from offboard.flight.state import LEVEL, FlightState
 from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.outgoing import CommandLong
 from offboard.model.command import Command
-from offboard.model.frames import thrust_direction_from_quaternion
 
 AUTOPILOT_VERSION = 148  # message id
 FIT_EVERY_S = 4.0  # between two reductions of the telemetry: a backlog must drain first
@@ -24,12 +21,16 @@ SPOOL_KNOWN_S = 0.2  # age of a position that shows the height
 # Of an autopilot's own take-off, which setpoints replace on the way: the height of the reference,
 # but above the height that shows lift-off, and no higher than needed
 TAKEOFF_HEIGHTS_M = 1.5, 3.0
+DISARMING = (
+    f"disarming: {STANDING_S:.0f} s without motion on the ground, and the vehicle does not disarm "
+    "by itself"
+)
 LAND_STREAM_S = 3.0  # if the landing is refused, setpoints stop and the autopilot's failsafe lands
 
 
 def act(flight: FlightState) -> None:
     """Send the requests of the phase, at most one setpoint, and a request of the vehicle's time."""
-    if flight.has_ended:
+    if flight.ended:
         return
     time_s = flight.time_s
     if flight.phase in BEFORE_FLIGHT:
@@ -46,7 +47,7 @@ def act(flight: FlightState) -> None:
 
 def hold(flight: FlightState, time_s: float) -> None:
     """Send what needs no telemetry: level setpoints, and the request that ends the flight."""
-    phase, time_s = flight.phase, time_s
+    phase = flight.phase
     # Until setpoints have replaced an autopilot's own take-off, none must be sent
     steers = not flight.takes_off_by_command or flight.plan.reference is not None
     if phase is Phase.TAKEOFF or phase in TRACKING:
@@ -59,14 +60,13 @@ def hold(flight: FlightState, time_s: float) -> None:
     elif phase is Phase.STAND_DOWN:
         outbox.request(flight, CommandLong.disarm())
         if steers:
-            heading_rad = flight.command.heading_rad
-            setpoint.send_level(flight, time_s, Command(0.0, LEVEL, heading_rad))
+            idle = Command(0.0, LEVEL, flight.command.heading_rad)
+            setpoint.send_level(flight, time_s, idle)
 
 
 def _end(flight: FlightState, time_s: float, *, steers: bool) -> None:
     """Ask the autopilot to hold or to land, with level setpoints until it does."""
     dialect, authority = _dialect(flight), flight.authority
-    assert authority is not None
     holds = flight.phase is not Phase.LAND
     if not holds:
         _await_link(flight)
@@ -98,7 +98,7 @@ def _await_link(flight: FlightState) -> None:
             "then landing is asked again",
         )
     elif waited and not flight.awaits_link:
-        outbox.renew(flight)
+        flight.requested_s.clear()  # every request may be sent once more
         outbox.announce(flight, f"heard again: the vehicle shows {flight.vehicle.mode}")
 
 
@@ -110,19 +110,15 @@ def _disarm_if_standing(flight: FlightState) -> None:
     if not contact.stands:
         return
     if contact.detects_flight:
-        outbox.announce_once(flight, STILL_ARMED)
+        outbox.announce(flight, STILL_ARMED, once=True)
     elif outbox.request(flight, CommandLong.disarm()):
-        outbox.announce_once(
-            flight,
-            f"disarming: {STANDING_S:.0f} s without motion on the ground, and the vehicle "
-            "does not disarm by itself",
-        )
+        outbox.announce(flight, DISARMING, once=True)
 
 
 def _prepare(flight: FlightState, time_s: float) -> None:
     if flight.phase is Phase.HEALTH:
         request_parameters(flight)
-        _fit_telemetry(flight, flight.in_phase_s)
+        _fit_telemetry(flight)
         return
     if flight.phase is Phase.STANDBY:
         _stand_by(flight, time_s)
@@ -159,11 +155,8 @@ def _stand_by(flight: FlightState, time_s: float) -> None:
 
 def _flown(flight: FlightState) -> Command:
     """The attitude that the vehicle has, with the thrust that its autopilot reports."""
-    attitude, share = flight.vehicle.attitude, flight.hover.thrust(flight.time_s)
-    assert attitude is not None
-    direction = thrust_direction_from_quaternion(np.array(attitude.attitude))
-    north, east, down = direction.tolist()
-    model = flight.model
+    model, share = flight.model, flight.hover.thrust(flight.time_s)
+    north, east, down = flight.vehicle.thrust_direction_ned.tolist()
     thrust_mps2 = (1.0 if share is None else share / model.hover_thrust) * model.gravity_mps2
     return Command(thrust_mps2, (north, east, down), flight.vehicle.heading_rad)
 
@@ -181,10 +174,10 @@ def request_parameters(flight: FlightState) -> None:
         outbox.request(flight, _dialect(flight).hold())
 
 
-def _fit_telemetry(flight: FlightState, in_phase_s: float) -> None:
+def _fit_telemetry(flight: FlightState) -> None:
     """Request less telemetry while the link delays by more than can be flown: it may be
     saturated."""
-    link, limits = flight.clock.delay, flight.limits
+    link, limits, in_phase_s = flight.clock.delay, flight.limits, flight.in_phase_s
     if in_phase_s - flight.thinned_s < FIT_EVERY_S or link is None:
         return
     if link.value > limits.link_delay_s or link.sd > limits.link_jitter_s:
@@ -199,14 +192,12 @@ def _take_off(flight: FlightState, time_s: float) -> None:
     if flight.takes_off_by_command:
         _request_takeoff(flight, time_s)
         return
-    age_s, most = flight.vehicle.position_age_s, SPOOL_MAX
-    rising_s = flight.in_phase_s
+    age_s, rising_s, most = flight.vehicle.position_age_s, flight.in_phase_s, SPOOL_MAX
     if age_s > SPOOL_KNOWN_S:
         rising_s, most = rising_s - age_s, SPOOL_UNSEEN
     spool = min(most, max(0.0, SPOOL_UP_PER_S * rising_s))
     thrust_mps2 = spool * flight.model.gravity_mps2
-    heading_rad = flight.command.heading_rad
-    setpoint.send_level(flight, time_s, Command(thrust_mps2, LEVEL, heading_rad))
+    setpoint.send_level(flight, time_s, Command(thrust_mps2, LEVEL, flight.command.heading_rad))
 
 
 def _request_takeoff(flight: FlightState, time_s: float) -> None:
@@ -217,20 +208,18 @@ def _request_takeoff(flight: FlightState, time_s: float) -> None:
     least_m, most_m = TAKEOFF_HEIGHTS_M
     height_m = -float(flight.plan.track.sample(0.0).position_ned_m[2])
     outbox.request(flight, _dialect(flight).take_off(min(max(height_m, least_m), most_m)))
-    gravity_mps2 = flight.model.gravity_mps2
-    heading_rad = flight.vehicle.heading_rad
-    setpoint.set_command(flight, time_s, Command(gravity_mps2, LEVEL, heading_rad))
+    hovering = Command(flight.model.gravity_mps2, LEVEL, flight.vehicle.heading_rad)
+    setpoint.set_command(flight, time_s, hovering)
 
 
 def _level(flight: FlightState) -> Command:
     """Level, with the thrust that hovers. Before lift-off is seen, with the thrust reached, but
     less than lifts."""
-    flying, command = flight.plan.reference is not None, flight.command
-    least_mps2 = SPOOL_UNSEEN * flight.model.gravity_mps2
-    thrust_mps2 = min(command.thrust_mps2, least_mps2)
-    if flying:
+    reached_mps2, gravity_mps2 = flight.command.thrust_mps2, flight.model.gravity_mps2
+    thrust_mps2 = min(reached_mps2, SPOOL_UNSEEN * gravity_mps2)
+    if flight.plan.reference is not None:
         thrust_mps2 = setpoint.hover_mps2(flight)
-    return Command(thrust_mps2, LEVEL, command.heading_rad)
+    return Command(thrust_mps2, LEVEL, flight.command.heading_rad)
 
 
 def _dialect(flight: FlightState) -> Dialect:

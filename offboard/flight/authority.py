@@ -35,7 +35,8 @@ class Standing(Enum):
 
 @dataclass(slots=True)
 class Authority:
-    """The standing of one vehicle. Times are `Session.link_time_s`; `arrived_s` is host time.
+    """The standing of one vehicle; `engage_mode` is empty until it has reported a mode. Times are
+    `Session.link_time_s`; `arrived_s` is host time.
 
     Example:
         >>> authority = Authority("OFFBOARD")
@@ -50,7 +51,7 @@ class Authority:
         (False, 'taken by another')
     """
 
-    engage_mode: str
+    engage_mode: str = ""
     standing: Standing = Standing.FREE
     mode: str = "unknown"
     heard_s: float = -math.inf  # time of the newest report

@@ -6,7 +6,7 @@ counted, never raised: the vehicle is in the air.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 
 from offboard.control.base import Adaptive, Situation
 from offboard.documents.errors import located
@@ -122,25 +122,22 @@ def _decided(flight: FlightState) -> Decided:
     assert plan.reference is not None
     sent_s = flight.sent_s(flight.tick.time_s)
     state = flight.observer.predict(sent_s)
-    began_s = flight.stopwatch()
+    began_s, deadline_s = flight.stopwatch(), flight.deadline_s or math.inf
+
+    def remaining_s() -> float:
+        return deadline_s - (flight.stopwatch() - began_s)
+
     situation = Situation(
         sent_s,
         state,
         plan.reference,
         previous=flight.command,
-        remaining_s=_remaining(flight, began_s),
+        remaining_s=remaining_s if flight.deadline_s is not None else None,
         origin_ned_m=plan.origin_ned_m,
         track_time_s=plan.track_time_s(sent_s),
     )
     decision = flight.controller.decide(situation)
     return Decided(flight.tick, flight.phase, state, decision, flight.stopwatch() - began_s)
-
-
-def _remaining(flight: FlightState, began_s: float) -> Callable[[], float] | None:
-    deadline_s = flight.deadline_s
-    if deadline_s is None:
-        return None
-    return lambda: deadline_s - (flight.stopwatch() - began_s)
 
 
 def _set_vehicle(flight: FlightState, time_s: float, update: VehicleUpdate) -> None:

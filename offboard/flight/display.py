@@ -25,43 +25,37 @@ CHANGED_S = 1.0  # between two reasons
 AGAIN_S = 10.0  # the same reason, in other figures too
 
 
-class Waiting:
-    """Says why the flight does not begin: a new reason at most once a second. One that a found
-    vehicle has is repeated every ten, with its figures; that none is heard is said once."""
-
-    def __init__(self) -> None:
-        self._kind = ""  # of the newest reason: without its figures
-        self._said_s = -math.inf
-
-    def news(self, state: FlightState, session: Session, now_s: float) -> str:
-        """A sentence to say at `now_s`, of any clock; empty without one."""
-        if state.phase not in FIRST_S:
-            self._kind = ""
-            return ""
-        if state.in_phase_s < FIRST_S[state.phase] or now_s - self._said_s < CHANGED_S:
-            return ""
-        reason = _unheard(session) if state.phase is Phase.CONNECT else _unready(state)
-        kind = re.sub(r"[0-9]+", "", reason)
-        again = state.phase is Phase.HEALTH and now_s - self._said_s >= AGAIN_S
-        if not reason or (kind == self._kind and not again):
-            return ""
-        self._kind, self._said_s = kind, now_s
-        return f"waiting: {reason}"
-
-
 class News:
-    """All that is told of one flight, each kind at most once a second."""
+    """All that is told of one flight beside its phases, each kind at most once a second: pauses of
+    this process and messages dropped (`add` them), and why the flight does not begin. A reason that
+    a found vehicle has is repeated every ten seconds, with its figures; that none is heard is said
+    once."""
 
     def __init__(self) -> None:
         self.paused, self.dropped = Repeated(PAUSED), Repeated(DROPPED)
-        self._waiting = Waiting()
+        self._kind = ""  # of the newest reason: without its figures
+        self._said_s = -math.inf
 
-    def due(self, state: FlightState, session: Session, now_s: float) -> list[str]:
+    def due(self, state: FlightState, now_s: float) -> list[str]:
         """The sentences to announce now, at host time `now_s`."""
-        late = [each.news(now_s) for each in (self.paused, self.dropped)]
-        ended = state.busyness.sentence if state.has_ended and state.service else ""
-        told = [*late, self._waiting.news(state, session, state.now_s)]
+        ended = state.busyness.sentence if state.ended and state.service else ""
+        told = [self.paused.news(now_s), self.dropped.news(now_s), self._waiting(state)]
         return list(filter(None, [*told, "" if ended in state.announced else ended]))
+
+    def _waiting(self, state: FlightState) -> str:
+        if state.phase not in FIRST_S:
+            self._kind = ""
+            return ""
+        passed_s = state.now_s - self._said_s
+        if state.in_phase_s < FIRST_S[state.phase] or passed_s < CHANGED_S:
+            return ""
+        reason = _unheard(state.session) if state.phase is Phase.CONNECT else _unready(state)
+        kind = re.sub(r"[0-9]+", "", reason)
+        again = state.phase is Phase.HEALTH and passed_s >= AGAIN_S
+        if not reason or (kind == self._kind and not again):
+            return ""
+        self._kind, self._said_s = kind, state.now_s
+        return f"waiting: {reason}"
 
 
 def _unready(state: FlightState) -> str:
@@ -89,10 +83,10 @@ class Snapshot:
     another thread. SI, NED, vehicle time; NaN or None for what is not known yet. The attributes are
     the fields of the JSON objects.
 
-    `other_datagrams`: of other senders, since the start. `flights`: that the service has begun.
+    `flights`: that the service has begun.
     """
 
-    def __init__(self, state: FlightState, other_datagrams: int, flights: int = 0) -> None:
+    def __init__(self, state: FlightState, flights: int = 0) -> None:
         vehicle, command, link = state.vehicle, state.command, state.clock.delay
         position, attitude = vehicle.position, vehicle.attitude
         sample = (
@@ -107,7 +101,9 @@ class Snapshot:
         self.mode = vehicle.mode  # that the vehicle shows
         self.armed = vehicle.armed
         # a name of `authority.Standing` in lower case; "unknown" before the first mode
-        self.authority = state.authority.standing.name.lower() if state.authority else "unknown"
+        self.authority = (
+            state.authority.standing.name.lower() if state.authority.engage_mode else "unknown"
+        )
         self.failsafe = state.failsafe.action.name.lower()
         self.failsafe_row = state.failsafe.row  # that the action follows from
         self.position_ned_m = position.position_ned_m if position else None
@@ -129,7 +125,7 @@ class Snapshot:
         self.skipped_ticks = state.busyness.skipped  # in pauses of this process, since take-off
         self.computer = state.busyness.sentence  # that it is too busy; empty if it keeps up
         self.battery = NAN if charge is None else charge  # remaining, of 1
-        self.other_datagrams = other_datagrams
+        self.other_datagrams = state.other_datagrams  # of other senders, since the start
         self.forged = state.session.counters.forged  # frames that signing refused since the start
         self.texts = tuple(state.announced[-TEXTS_KEPT:])  # the newest announcements, oldest first
         self.flights = flights

@@ -17,9 +17,8 @@ import numpy as np
 
 from offboard.flight.phases import TRACKING, Action
 from offboard.flight.rows import Condition, blind, mode_unknown, other_sender, silent
-from offboard.flight.state import FlightState
+from offboard.flight.state import COMMANDS_KEPT, FlightState
 from offboard.mavlink.events import ThrustReport
-from offboard.model.frames import thrust_direction_from_quaternion
 
 RECOVERY = 0.25  # speed at which a delay runs back
 STEP_MAX_S = 0.2  # what one sample counts for, also after a gap of telemetry
@@ -32,46 +31,49 @@ THRUST_REPORT_S = 1.0  # age of a ThrustReport that counts
 
 
 def another_may_control(flight: FlightState) -> str:
+    """Age of the newest report of the mode."""
     unknown = mode_unknown(flight)
     return f"{unknown}: another may control the vehicle" if unknown else ""
 
 
 def old(flight: FlightState) -> str:
+    """Age of the newest telemetry beyond the known delay of the link."""
     age_s = flight.age_s
     return f"telemetry is {age_s:.2f} s old" if age_s > flight.limits.setpoint_age_s else ""
 
 
 def late_link(flight: FlightState) -> str:
+    """Growth of the link's delay since take-off (TIMESYNC), or the age of telemetry."""
     limits, growth_s = flight.limits, flight.link_growth_s
     late = growth_s > limits.link_growth_s or flight.age_s > limits.setpoint_age_s
     return f"the delay of the link has grown by {growth_s:.2f} s" if late else ""
 
 
 def decision_missed(flight: FlightState) -> bool:
+    """A decision failed, came too late, or was not fit to be sent."""
     return flight.missed > 0
 
 
 def decisions_missed(flight: FlightState) -> bool:
+    """Decisions missed in a row."""
     return flight.missed >= flight.limits.missed_decisions
 
 
 def tilted(flight: FlightState) -> str:
-    """The angle between the thrust axis and the vertical."""
-    attitude = flight.vehicle.attitude
-    if attitude is None:
+    """Tilt of the vehicle: the angle between the thrust axis and the vertical."""
+    if flight.vehicle.attitude is None:
         return ""
-    down = thrust_direction_from_quaternion(np.array(attitude.attitude))[2]
-    tilt_rad = math.acos(min(1.0, max(-1.0, float(down))))
+    tilt_rad = math.acos(min(1.0, max(-1.0, float(flight.vehicle.thrust_direction_ned[2]))))
     exceeds = tilt_rad > flight.limits.tilt_rad
     return f"tilt {math.degrees(tilt_rad):.0f} deg" if exceeds else ""
 
 
 def away_from_commands(flight: FlightState) -> str:
-    """The angle between the thrust direction and the nearest of the newest commands."""
-    attitude, commands = flight.vehicle.attitude, flight.commands
-    if attitude is None or len(commands) < (commands.maxlen or 0):
+    """Angle between the thrust direction and the nearest of the newest commands."""
+    vehicle, commands = flight.vehicle, flight.commands
+    if vehicle.attitude is None or len(commands) < COMMANDS_KEPT:
         return ""
-    flown = thrust_direction_from_quaternion(np.array(attitude.attitude))
+    flown = vehicle.thrust_direction_ned
     nearest = max(float(flown @ np.array(each.thrust_direction_ned)) for each in commands)
     error_rad = math.acos(min(1.0, max(-1.0, nearest)))
     if not error_rad > flight.limits.tilt_error_rad:
@@ -83,6 +85,7 @@ def away_from_commands(flight: FlightState) -> str:
 
 
 def away_from_reference(flight: FlightState) -> str:
+    """Distance from the reference."""
     error_m, limit_m = flight.position_error_m, flight.limits.position_error_m
     if not error_m > limit_m:
         return ""
@@ -90,7 +93,7 @@ def away_from_reference(flight: FlightState) -> str:
 
 
 def away_from_prediction(flight: FlightState) -> str:
-    """The newest position, from the newest prediction for an earlier moment."""
+    """Distance from the position that the decision before predicted."""
     position = flight.vehicle.position
     if position is None:
         return ""
@@ -105,6 +108,7 @@ def away_from_prediction(flight: FlightState) -> str:
 
 
 def estimate_contradicts(flight: FlightState) -> str:
+    """Jumps of the position in the last 10 s, or its difference from the velocity in one second."""
     jumped_m, drift_m = flight.jumps.recent_m(flight.time_s), flight.jumps.drift_m
     if jumped_m > flight.limits.position_jump_m:
         return f"the estimated position jumped by {jumped_m:.1f} m"
@@ -114,10 +118,12 @@ def estimate_contradicts(flight: FlightState) -> str:
 
 
 def positioning_lost(flight: FlightState) -> str:
+    """GPS fix, validity and accuracy of the estimate, their messages: lost since take-off."""
     return flight.positioning.lost(flight.vehicle, flight.limits)
 
 
 def outside_volume(flight: FlightState) -> str:
+    """Height and distance from the take-off point."""
     north_m, east_m, height_m = flight.from_takeoff_m
     distance_m = math.hypot(north_m, east_m)
     if not (height_m > flight.limits.ceiling_m or distance_m > flight.limits.radius_m):
@@ -129,12 +135,13 @@ def outside_volume(flight: FlightState) -> str:
 
 
 def battery_empty(flight: FlightState) -> str:
+    """Remaining charge."""
     charge = flight.vehicle.battery
     return f"the battery holds {100.0 * charge:.0f} %" if charge < flight.limits.battery else ""
 
 
 def no_thrust_reserve(flight: FlightState) -> str:
-    """By the normalised thrust that hovers now, as setpoints that are followed show it."""
+    """Normalised thrust that hovers now, as setpoints that are followed show it."""
     thrust = flight.observer.hover_thrust_estimate
     if flight.phase not in TRACKING or not thrust > flight.limits.hover_thrust:
         return ""
@@ -142,7 +149,9 @@ def no_thrust_reserve(flight: FlightState) -> str:
 
 
 def sinks_with_full_thrust(flight: FlightState) -> str:
-    """While the newest setpoint demands the full thrust. Other rows act on an old position (blind)
+    """Downward speed while the newest setpoint demands the full thrust.
+
+    Other rows act on an old position (blind)
     and on missing setpoints (decisions)."""
     position, thrusts = flight.vehicle.position, flight.thrusts
     if flight.phase not in TRACKING or position is None or not thrusts:
@@ -153,7 +162,9 @@ def sinks_with_full_thrust(flight: FlightState) -> str:
 
 
 def follows_others(flight: FlightState) -> str:
-    """The vehicle follows setpoints of another program in the mode that we asked for."""
+    """Thrust of the setpoint that PX4 follows (ATTITUDE_TARGET): none of our newest 40.
+
+    The vehicle follows setpoints of another program in the mode that we asked for."""
     reported = flight.vehicle.age_s(ThrustReport) < THRUST_REPORT_S
     followed = flight.follows_others and reported and flight.phase in TRACKING
     if not followed or not flight.engaged or flight.limits.begin_with_other_sender:
@@ -173,11 +184,13 @@ def _other_companion(flight: FlightState) -> str:
 
 
 def clock_jumped(flight: FlightState) -> str:
+    """Jump of the vehicle's clock."""
     jumped_s = flight.clock.jumped_s
     return f"the clock of the vehicle jumped by {jumped_s:.1f} s" if jumped_s > 0.0 else ""
 
 
 def contradicted(flight: FlightState) -> str:
+    """Identified constants out of bounds."""
     return flight.identification.contradiction if flight.identification else ""
 
 
@@ -187,12 +200,12 @@ def contradicted(flight: FlightState) -> str:
 @dataclass(frozen=True, slots=True)
 class Row:
     """`action` is taken when `condition` has held for `held_s`. `cause` and `reason` are as in
-    `rows.Transition`. `measured` and `limit` are for the documentation."""
+    `rows.Transition`. `limit` is for the documentation, as is the first line of the condition's
+    docstring: what is measured."""
 
     name: str
-    measured: str
-    limit: str
     condition: Condition
+    limit: str
     action: Action
     held_s: float = 0.0
     cause: str = "limit"
@@ -201,159 +214,35 @@ class Row:
 
 LEVEL, HOLD, LAND = Action.LEVEL, Action.HOLD, Action.LAND
 MISSED = "{flight.failure_cause}", "{flight.failure}"
+LATE = "limits.link_growth_s, limits.setpoint_age_s"
+UNIDENTIFIED = "BOUNDS of identification"
+# a pilot's change of the mode is seen within this time, or `authority` acts
+FOLLOWED_S = 2.5
 ROWS = (
+    # of `authority` nothing is asked before the mode is known again
+    Row("authority", another_may_control, "2.5 s", LAND, cause="link"),
+    Row("silence", silent, "limits.silence_s", LAND, cause="link"),
+    Row("blind", blind, "limits.blind_s", LAND, cause="link"),
+    Row("age", old, "limits.setpoint_age_s", LEVEL, cause="link"),
+    Row("link", late_link, LATE, HOLD, 0.5, "link"),
+    Row("decision", decision_missed, "one", LEVEL, 0.0, *MISSED),
+    Row("decisions", decisions_missed, "limits.missed_decisions", LAND, 0.0, *MISSED),
+    Row("tilt", tilted, "limits.tilt_rad", LAND),
+    Row("tilt error", away_from_commands, "limits.tilt_error_rad", LAND, 0.5),
+    Row("position error", away_from_reference, "limits.position_error_m", LAND),
+    Row("prediction", away_from_prediction, "limits.prediction_error_m", HOLD, 0.3),
+    Row("estimator", estimate_contradicts, "limits.position_jump_m", HOLD, cause=""),
     Row(
-        "authority",
-        "age of the newest report of the mode",
-        "2.5 s",
-        another_may_control,
-        LAND,  # of which nothing is asked before the mode is known again
-        cause="link",
+        "positioning", positioning_lost, "limits.gps_s, limits.accuracy_m", LAND, 0.5, "positioning"
     ),
-    Row(
-        "silence",
-        "host time without position and attitude",
-        "limits.silence_s",
-        silent,
-        LAND,
-        cause="link",
-    ),
-    Row(
-        "blind",
-        "age of the older of position and attitude",
-        "limits.blind_s",
-        blind,
-        LAND,
-        cause="link",
-    ),
-    Row(
-        "age",
-        "age of the newest telemetry beyond the known delay of the link",
-        "limits.setpoint_age_s",
-        old,
-        LEVEL,
-        cause="link",
-    ),
-    Row(
-        "link",
-        "growth of the link's delay since take-off (TIMESYNC), or the age of telemetry",
-        "limits.link_growth_s, limits.setpoint_age_s",
-        late_link,
-        HOLD,
-        held_s=0.5,
-        cause="link",
-    ),
-    Row(
-        "decision",
-        "a decision failed, came too late, or was not fit to be sent",
-        "one",
-        decision_missed,
-        LEVEL,
-        0.0,
-        *MISSED,
-    ),
-    Row(
-        "decisions",
-        "decisions missed in a row",
-        "limits.missed_decisions",
-        decisions_missed,
-        LAND,
-        0.0,
-        *MISSED,
-    ),
-    Row("tilt", "tilt of the vehicle", "limits.tilt_rad", tilted, LAND),
-    Row(
-        "tilt error",
-        "angle between the thrust direction and the nearest of the newest commands",
-        "limits.tilt_error_rad",
-        away_from_commands,
-        LAND,
-        held_s=0.5,
-    ),
-    Row(
-        "position error",
-        "distance from the reference",
-        "limits.position_error_m",
-        away_from_reference,
-        LAND,
-    ),
-    Row(
-        "prediction",
-        "distance from the position that the decision before predicted",
-        "limits.prediction_error_m",
-        away_from_prediction,
-        HOLD,
-        held_s=0.3,
-    ),
-    Row(
-        "estimator",
-        "jumps of the reported position in the last 10 s, or what it differs by from the "
-        "reported velocity in one second",
-        "limits.position_jump_m",
-        estimate_contradicts,
-        HOLD,
-        cause="",
-    ),
-    Row(
-        "positioning",
-        "GPS fix, validity and accuracy of the estimate, their messages: lost since take-off",
-        "limits.gps_s, limits.accuracy_m",
-        positioning_lost,
-        LAND,
-        held_s=0.5,
-        cause="positioning",
-    ),
-    Row(
-        "volume",
-        "height and distance from the take-off point",
-        "limits.ceiling_m, limits.radius_m",
-        outside_volume,
-        LAND,
-    ),
-    Row("battery", "remaining charge", "limits.battery", battery_empty, LAND, held_s=2.0),
-    Row(
-        "thrust reserve",
-        "normalised thrust that hovers now",
-        "limits.hover_thrust",
-        no_thrust_reserve,
-        LAND,
-        held_s=2.0,
-    ),
-    Row(
-        "full thrust",
-        "downward speed while setpoints demand the full thrust",
-        f"{SINK_MPS:g} m/s",
-        sinks_with_full_thrust,
-        LAND,
-        held_s=1.0,
-    ),
-    Row(
-        "second sender",
-        "another program sends setpoints or commands modes on this link, or says in its HEARTBEAT "
-        "that it flies the vehicle",
-        "one message",
-        other_sender,
-        HOLD,
-        cause="second sender",
-    ),
-    Row(
-        "other setpoints",
-        "thrust of the setpoint that PX4 follows (ATTITUDE_TARGET): none of our newest 40",
-        "1e-5",
-        follows_others,
-        HOLD,
-        held_s=2.5,  # a pilot's change of the mode is seen within this time, or `authority` acts
-        cause="second sender",
-    ),
-    Row("clock", "jump of the vehicle's clock", "0.5 s", clock_jumped, LAND, cause=""),
-    Row(
-        "contradiction",
-        "identified constants out of bounds",
-        "BOUNDS of identification",
-        contradicted,
-        LAND,
-        cause="",
-    ),
+    Row("volume", outside_volume, "limits.ceiling_m, limits.radius_m", LAND),
+    Row("battery", battery_empty, "limits.battery", LAND, 2.0),
+    Row("thrust reserve", no_thrust_reserve, "limits.hover_thrust", LAND, 2.0),
+    Row("full thrust", sinks_with_full_thrust, f"{SINK_MPS:g} m/s", LAND, 1.0),
+    Row("second sender", other_sender, "one message", HOLD, cause="second sender"),
+    Row("other setpoints", follows_others, "1e-5", HOLD, FOLLOWED_S, "second sender"),
+    Row("clock", clock_jumped, "0.5 s", LAND, cause=""),
+    Row("contradiction", contradicted, UNIDENTIFIED, LAND, cause=""),
 )
 
 

@@ -6,8 +6,18 @@ import numpy as np
 
 from offboard.flight.authority import Standing
 from offboard.flight.ground_contact import STILL_ARMED
-from offboard.flight.phases import OUTAGE_MAX_S, TRACKING, Action, ExitCode, Phase, Request
+from offboard.flight.phases import (
+    FLYING,
+    MOVING,
+    OUTAGE_MAX_S,
+    TRACKING,
+    Action,
+    ExitCode,
+    Phase,
+    Request,
+)
 from offboard.flight.rows import (
+    OPERATOR,
     REBOOTED,
     Condition,
     Transition,
@@ -17,7 +27,6 @@ from offboard.flight.rows import (
     lost_armed,
     mode_unknown,
     rebooted,
-    stands,
     stop_requested,
 )
 from offboard.flight.state import FlightState
@@ -93,7 +102,8 @@ def _when(flight: FlightState) -> str:
 
 def handed(flight: FlightState) -> str:
     """It shows a mode that we asked for at the end."""
-    return f"the vehicle shows {flight.vehicle.mode}" if stands(flight, Standing.HANDED) else ""
+    handed = flight.authority.standing is Standing.HANDED
+    return f"the vehicle shows {flight.vehicle.mode}" if handed else ""
 
 
 def failsafe_land(flight: FlightState) -> bool:
@@ -158,129 +168,70 @@ def requested(request: Request) -> Condition:
 
 # ---------------------------------------------------------------------- rows
 
-REFUSED, ABORTED, FLOWN = ExitCode.REFUSED, ExitCode.ABORTED, ExitCode.FLOWN
-OPERATOR = "{flight.stop_cause}"
-FAILSAFE = ("{flight.failsafe.cause}", "{flight.failsafe.reason}")
-ON_REFERENCE = tuple(phase for phase in Phase if phase in TRACKING)
-CLIMB, EXCITE, LAND = (Phase.CLIMB,), (Phase.EXCITE,), (Phase.LAND,)
+(CONNECT, HEALTH, STANDBY, STREAM, ENGAGE, ARM, TAKEOFF, CLIMB, EXCITE, JOIN, TRACK, PAUSE, HOVER,
+ HAND_BACK, HOLD, STAND_DOWN, LAND, DISARMED, YIELDED, FAILED) = Phase  # fmt: skip
+FLOWN, REFUSED, ABORTED = ExitCode.FLOWN, ExitCode.REFUSED, ExitCode.ABORTED
+FAILSAFE = "{flight.failsafe.cause}", "{flight.failsafe.reason}"
 AT_START = "hovers at the start of the reference"
+NO_LIFT_OFF = "no lift-off in {flight.in_phase_s:.0f} s; is hover_thrust in the vehicle file right?"
+NOT_IDENTIFIED = "identification did not converge in {flight.in_phase_s:.0f} s"
+HELD = "the autopilot held for {flight.in_phase_s:.0f} s"
+DID_NOT_HOLD = "the vehicle did not hold in {flight.in_phase_s:.0f} s"
+UNHEARD = "it stands on the ground, and no HEARTBEAT shows whether it is disarmed"
+RESTARTED = f"{REBOOTED} and is disarmed"
 
 
-def ends_early(phases: tuple[Phase, ...], serves: bool) -> tuple[Transition, ...]:
-    """What ends `phases` in the air early. In the service a stop hands back where `fly` lands, and
+def ends_early(*, serves: bool) -> tuple[Transition, ...]:
+    """What ends a flight in the air early. In the service a stop hands back where `fly` lands, and
     a pilot who takes the vehicle is the usual end."""
-    followed = ON_REFERENCE if serves else ()
-    others = tuple(phase for phase in phases if phase not in followed)
-    stopped = tuple(phase for phase in others if phase is not Phase.HAND_BACK)
-    held = tuple(phase for phase in phases if phase not in (Phase.HAND_BACK, Phase.HOLD))
-    rows = (
-        Transition(phases, rebooted_in_flight, Phase.LAND, ABORTED, "restart"),
+    followed = TRACKING if serves else frozenset[Phase]()
+    others = FLYING - followed
+    return (
+        Transition(FLYING, rebooted_in_flight, LAND, ABORTED, "restart"),
         # HEARTBEAT may be wrong: what still flies is to land
-        Transition(phases, disarmed, Phase.LAND, ABORTED, "disarmed in flight"),
-        Transition(followed, lost, Phase.YIELDED, FLOWN, "pilot"),
-        Transition(others, lost, Phase.YIELDED, ABORTED, "pilot"),
-        Transition(phases, in_own_failsafe, Phase.LAND, ABORTED, "link"),
-        Transition(phases, failsafe_land, Phase.LAND, ABORTED, *FAILSAFE),
-        Transition(followed, stop_requested, Phase.HAND_BACK, FLOWN, OPERATOR),
-        Transition(stopped, stop_requested, Phase.LAND, ABORTED, OPERATOR),
-        Transition(held, failsafe_hold, Phase.HOLD, ABORTED, *FAILSAFE),
+        Transition(FLYING, disarmed, LAND, ABORTED, "disarmed in flight"),
+        Transition(followed, lost, YIELDED, FLOWN, "pilot"),
+        Transition(others, lost, YIELDED, ABORTED, "pilot"),
+        Transition(FLYING, in_own_failsafe, LAND, ABORTED, "link"),
+        Transition(FLYING, failsafe_land, LAND, ABORTED, *FAILSAFE),
+        Transition(followed, stop_requested, HAND_BACK, FLOWN, OPERATOR),
+        Transition(others - {HAND_BACK}, stop_requested, LAND, ABORTED, OPERATOR),
+        Transition(FLYING - {HAND_BACK, HOLD}, failsafe_hold, HOLD, ABORTED, *FAILSAFE),
     )
-    return tuple(row for row in rows if row.phases)
 
 
 TO_THE_END = (
-    Transition((Phase.TAKEOFF,), lifted_off, Phase.CLIMB, reason="lifted off"),
-    Transition(
-        (Phase.TAKEOFF,),
-        longer_than("lift_off_s"),
-        Phase.LAND,
-        ABORTED,
-        reason="no lift-off in {flight.in_phase_s:.0f} s; "
-        "is hover_thrust in the vehicle file right?",
-    ),
-    Transition(CLIMB, at_start_to_excite, Phase.EXCITE, reason="identification steps"),
-    Transition(CLIMB, at_start, Phase.JOIN, reason=AT_START),
-    Transition(CLIMB, too_late_at_start, Phase.LAND, ABORTED),
-    Transition(EXCITE, identified, Phase.JOIN, reason=AT_START),
-    Transition(
-        EXCITE,
-        longer_than("excite_s"),
-        Phase.LAND,
-        ABORTED,
-        reason="identification did not converge in {flight.in_phase_s:.0f} s",
-    ),
-    Transition((Phase.JOIN,), at_full_speed, Phase.TRACK, reason="on the reference at full speed"),
-    Transition((Phase.TRACK,), track_over, Phase.HOVER, reason="the reference was flown"),
-    Transition(
-        (Phase.HOLD,),
-        longer_than("hold_s"),
-        Phase.LAND,
-        ABORTED,
-        reason="the autopilot held for {flight.in_phase_s:.0f} s",
-    ),
-    Transition(LAND, landed, Phase.DISARMED, reason="disarmed on the ground"),
-    Transition(
-        LAND, rebooted_disarmed, Phase.FAILED, ABORTED, "restart", f"{REBOOTED} and is disarmed"
-    ),
-    Transition(LAND, disarmed_elsewhere, Phase.FAILED, ABORTED),
-    Transition(LAND, lost_armed, Phase.YIELDED, ABORTED, "pilot"),
-    Transition(
-        LAND,
-        unheard_on_ground,
-        Phase.FAILED,
-        ABORTED,
-        reason="it stands on the ground, and no HEARTBEAT shows whether it is disarmed",
-    ),
-    Transition(LAND, out_of_reach, Phase.FAILED, ABORTED),
-    Transition(LAND, not_disarmed, Phase.FAILED, ABORTED),
+    Transition({TAKEOFF}, lifted_off, CLIMB, reason="lifted off"),
+    Transition({TAKEOFF}, longer_than("lift_off_s"), LAND, ABORTED, reason=NO_LIFT_OFF),
+    Transition({CLIMB}, at_start_to_excite, EXCITE, reason="identification steps"),
+    Transition({CLIMB}, at_start, JOIN, reason=AT_START),
+    Transition({CLIMB}, too_late_at_start, LAND, ABORTED),
+    Transition({EXCITE}, identified, JOIN, reason=AT_START),
+    Transition({EXCITE}, longer_than("excite_s"), LAND, ABORTED, reason=NOT_IDENTIFIED),
+    Transition({JOIN}, at_full_speed, TRACK, reason="on the reference at full speed"),
+    Transition({TRACK}, track_over, HOVER, reason="the reference was flown"),
+    Transition({HOLD}, longer_than("hold_s"), LAND, ABORTED, reason=HELD),
+    Transition({LAND}, landed, DISARMED, reason="disarmed on the ground"),
+    Transition({LAND}, rebooted_disarmed, FAILED, ABORTED, "restart", RESTARTED),
+    Transition({LAND}, disarmed_elsewhere, FAILED, ABORTED),
+    Transition({LAND}, lost_armed, YIELDED, ABORTED, "pilot"),
+    Transition({LAND}, unheard_on_ground, FAILED, ABORTED, reason=UNHEARD),
+    Transition({LAND}, out_of_reach, FAILED, ABORTED),
+    Transition({LAND}, not_disarmed, FAILED, ABORTED),
 )
+HANDED, STOPPED = "handed back on request", "stopped on request"
+hand_back, start = requested(Request.HAND_BACK), requested(Request.START)
 SERVICE_ENDS = (
-    Transition(
-        (Phase.HAND_BACK,),
-        longer_than("hand_back_s"),
-        Phase.LAND,
-        ABORTED,
-        reason="the vehicle did not hold in {flight.in_phase_s:.0f} s",
-    ),
-    Transition(
-        (Phase.TAKEOFF, *ON_REFERENCE),
-        requested(Request.HAND_BACK),
-        Phase.HAND_BACK,
-        FLOWN,
-        reason="handed back on request",
-    ),
-    Transition(
-        (Phase.STREAM, Phase.ENGAGE),
-        requested(Request.HAND_BACK),
-        Phase.FAILED,
-        FLOWN,
-        reason="stopped on request",
-    ),
-    Transition(
-        (Phase.ARM,),
-        requested(Request.HAND_BACK),
-        Phase.STAND_DOWN,
-        FLOWN,
-        reason="stopped on request",
-    ),
-    Transition(
-        (Phase.EXCITE, Phase.JOIN, Phase.TRACK, Phase.PAUSE, Phase.HOVER),
-        requested(Request.START),
-        Phase.CLIMB,
-        reason="start requested",
-    ),
-    Transition(
-        (Phase.JOIN, Phase.TRACK),
-        requested(Request.PAUSE),
-        Phase.PAUSE,
-        reason="pause requested",
-    ),
-    Transition(
-        (Phase.PAUSE,), requested(Request.CONTINUE), Phase.TRACK, reason="continue requested"
-    ),
+    Transition({HAND_BACK}, longer_than("hand_back_s"), LAND, ABORTED, reason=DID_NOT_HOLD),
+    Transition({TAKEOFF} | TRACKING, hand_back, HAND_BACK, FLOWN, reason=HANDED),
+    Transition({STREAM, ENGAGE}, hand_back, FAILED, FLOWN, reason=STOPPED),
+    Transition({ARM}, hand_back, STAND_DOWN, FLOWN, reason=STOPPED),
+    Transition(TRACKING - {CLIMB}, start, CLIMB, reason="start requested"),
+    Transition(MOVING, requested(Request.PAUSE), PAUSE, reason="pause requested"),
+    Transition({PAUSE}, requested(Request.CONTINUE), TRACK, reason="continue requested"),
 )
 AT_REST = {
     "hold": (),
-    "land": (Transition((Phase.HOVER,), at_rest, Phase.LAND, reason="at rest"),),
-    "repeat": (Transition((Phase.HOVER,), at_rest, Phase.CLIMB, reason="once more"),),
+    "land": (Transition({HOVER}, at_rest, LAND, reason="at rest"),),
+    "repeat": (Transition({HOVER}, at_rest, CLIMB, reason="once more"),),
 }

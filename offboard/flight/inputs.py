@@ -1,4 +1,8 @@
-"""Inputs of a flight, recorded so that `offboard replay` can give it the same ones again.
+"""Inputs of a flight in its log: its configuration, which vehicle it flew, and what its turns were
+given, so that `offboard replay` can give it the same again. All are TUNNEL messages of our record
+component.
+
+The configuration is a text, compressed and in numbered pieces, the first entries of the log.
 
 The log holds every frame that was received. What else a turn depends on is recorded here: its host
 time, which frames arrived together, when and from whom, each reading of the stopwatch, and what the
@@ -6,7 +10,7 @@ loop requested. Host times are whole microseconds, rounded before the flight see
 the record is exact. In lockstep nothing depends on host time, and none is recorded.
 
 The record is a list of JSON texts, one in a line, compressed by zlib and cut into TUNNEL messages
-of our record component: an object, or for a turn `[time, chunks, readings]` with the time since the
+of that component: an object, or for a turn `[time, chunks, readings]` with the time since the
 turn before, and in its chunks and readings since its own time.
 """
 
@@ -16,19 +20,77 @@ import json
 import struct
 import zlib
 from collections.abc import Callable, Hashable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from offboard.link.interface import Chunk
+from offboard.mavlink.events import VehicleFound
 from offboard.mavlink.outgoing import ConfigurationRecord
 from offboard.mavlink.session import Reception, SessionSettings
 
-PAYLOAD_TYPE = 0xC0F5  # TUNNEL.payload_type; numbers above 32767 need no registration
+# TUNNEL.payload_type; numbers above 32767 need no registration
+CONFIGURATION_TYPE, VEHICLE_TYPE, PAYLOAD_TYPE = 0xC0F1, 0xC0F3, 0xC0F5
+_NUMBERED = struct.Struct("<HH")  # index of the piece, number of pieces of a configuration
+_PART_BYTES = 128 - _NUMBERED.size
+TEXT_MOST = 4_000_000  # bytes: eight of the longest configuration files; a log may be anybody's
 _HEAD = struct.Struct("<I")  # number of the piece
 _PIECE_BYTES = 128 - _HEAD.size
 _CALL, _OTHERS, _DROPPED, _CHECK = "call", "others", "dropped", "crc"  # what an object holds
-_LINE_MOST = 4_000_000  # bytes; a log may be anybody's
 SETTINGS = "settings"  # the first call: how the session was set
+
+
+# ---------------------------------------------------------------------- configuration and vehicle
+
+
+def vehicle_record(vehicle: VehicleFound) -> ConfigurationRecord:
+    """The record that says which vehicle is flown."""
+    return ConfigurationRecord(json.dumps(asdict(vehicle)).encode(), VEHICLE_TYPE)
+
+
+def vehicle_of(payload: bytes) -> VehicleFound | None:
+    """The vehicle in the payload of such a record; None if it is damaged."""
+    try:
+        return VehicleFound(**json.loads(payload))
+    except (ValueError, TypeError):
+        return None
+
+
+def pieces(text: str) -> list[ConfigurationRecord]:
+    """Records that hold `text`, in order."""
+    data = zlib.compress(text.encode("utf-8"), 9)
+    parts = [data[at : at + _PART_BYTES] for at in range(0, len(data), _PART_BYTES)]
+    return [
+        ConfigurationRecord(_NUMBERED.pack(index, len(parts)) + part, CONFIGURATION_TYPE)
+        for index, part in enumerate(parts)
+    ]
+
+
+def join(payloads: Iterable[bytes]) -> str | None:
+    """The text in the payloads of TUNNEL messages; None if a piece is missing or damaged. Raises
+    ValueError for a text of more than TEXT_MOST bytes."""
+    parts: dict[int, bytes] = {}
+    count = 0
+    for payload in payloads:
+        if len(payload) > _NUMBERED.size:
+            index, count = _NUMBERED.unpack_from(payload)
+            parts[index] = payload[_NUMBERED.size :]
+        if len(parts) == count > 0:  # they are the first entries of a log
+            break
+    if not count or sorted(parts) != list(range(count)):
+        return None
+    unpacked = zlib.decompressobj()
+    try:
+        data = unpacked.decompress(b"".join(parts[index] for index in range(count)), TEXT_MOST)
+        if unpacked.eof:
+            return data.decode("utf-8")
+    except (zlib.error, UnicodeDecodeError):
+        return None
+    if len(data) == TEXT_MOST:
+        raise ValueError(f"its configuration unpacks to more than {TEXT_MOST // 1000} kB")
+    return None
+
+
+# ---------------------------------------------------------------------- turns
 
 
 class InputRecorder:
@@ -217,7 +279,7 @@ def _lines(payloads: Iterable[bytes]) -> Iterator[bytes]:
             *lines, begun = (begun + unpacked.decompress(piece[_HEAD.size :])).split(b"\n")
         except zlib.error as error:
             raise InputsError(f"piece {count} is damaged: {error}") from None
-        if len(begun) > _LINE_MOST:
+        if len(begun) > TEXT_MOST:
             raise InputsError(f"piece {count} is damaged: it has no end of line")
         yield from lines
 

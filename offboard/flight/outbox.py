@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 
-from offboard.flight.phases import PHASE_CODES, Phase
 from offboard.flight.state import FlightState
 from offboard.flight.vehicle_state import GOOD_RESULTS
 from offboard.mavlink import event_record
@@ -30,10 +29,9 @@ def request(flight: FlightState, request: CommandLong) -> bool:
     key = flight.phase, request
     result = flight.vehicle.results.get(request.command)
     requested_s = flight.requested_s.get(key, -math.inf)
-    heard_s = flight.authority.heard_s if flight.authority else -math.inf
-    waits = flight.now_s - requested_s < REPEAT_S - 1e-6 or heard_s < requested_s
+    waits = flight.now_s - requested_s < REPEAT_S - 1e-6 or flight.authority.heard_s < requested_s
     done = math.isfinite(requested_s) and result in GOOD_RESULTS
-    if waits or done or not flight.may_command:
+    if waits or done or not flight.authority.permits_command(flight.now_s):
         return False
     flight.requested_s[key] = flight.now_s
     flight.vehicle.results.pop(request.command, None)
@@ -41,28 +39,18 @@ def request(flight: FlightState, request: CommandLong) -> bool:
     return True
 
 
-def renew(flight: FlightState) -> None:
-    """After an outage of the link every request may be sent once more."""
-    flight.requested_s.clear()
+def announce(flight: FlightState, sentence: str, *, once: bool = False) -> None:
+    """Report to the user, the ground station and the log; `once`: unless it has been."""
+    if not (once and sentence in flight.announced):
+        flight.announced.append(sentence)
+        _say(flight, INFO, EventRecord(sentence))
 
 
-def announce(flight: FlightState, sentence: str) -> None:
-    """Report to the user, the ground station and the log."""
+def announce_phase(flight: FlightState, reason: str, cause: str) -> None:
+    """Report that the phase begins; `cause` is a word for the log, empty without one."""
+    sentence = f"{flight.phase.value}: {reason}"
     flight.announced.append(sentence)
-    _say(flight, INFO, EventRecord(sentence))
-
-
-def announce_phase(flight: FlightState, phase: Phase, reason: str, cause: str) -> None:
-    """Report that a phase begins; `cause` is a word for the log, empty without one."""
-    sentence = f"{phase.value}: {reason}"
-    flight.announced.append(sentence)
-    _say(flight, INFO, EventRecord(sentence, PHASE_CODES[phase], cause), title="offboard: ")
-
-
-def announce_once(flight: FlightState, sentence: str) -> None:
-    """`announce`, unless it has been."""
-    if sentence not in flight.announced:
-        announce(flight, sentence)
+    _say(flight, INFO, EventRecord(sentence, flight.phase.code, cause), title="offboard: ")
 
 
 def warn(flight: FlightState, sentence: str) -> None:

@@ -14,28 +14,37 @@ from offboard.documents.parameters import Parameters
 
 class Phase(Enum):
     """In the order of a flight; the last three end it. STANDBY, PAUSE and HAND_BACK occur in
-    flights of the service alone."""
+    flights of the service alone. Beside its name a phase has its number in logs: never reuse one,
+    old logs must stay readable."""
 
-    CONNECT = "connect"
-    HEALTH = "health"
-    STANDBY = "standby"
-    STREAM = "stream"
-    ENGAGE = "engage"
-    ARM = "arm"
-    TAKEOFF = "takeoff"
-    CLIMB = "climb"
-    EXCITE = "excite"
-    JOIN = "join"
-    TRACK = "track"
-    PAUSE = "pause"
-    HOVER = "hover"
-    HAND_BACK = "hand back"
-    HOLD = "hold"
-    STAND_DOWN = "stand down"
-    LAND = "land"
-    DISARMED = "disarmed"
-    YIELDED = "yielded"
-    FAILED = "failed"
+    _value_: str
+    code: int
+
+    def __new__(cls, name: str, code: int) -> Phase:
+        phase = object.__new__(cls)
+        phase._value_, phase.code = name, code
+        return phase
+
+    CONNECT = "connect", 0
+    HEALTH = "health", 1
+    STANDBY = "standby", 17
+    STREAM = "stream", 2
+    ENGAGE = "engage", 3
+    ARM = "arm", 4
+    TAKEOFF = "takeoff", 5
+    CLIMB = "climb", 6
+    EXCITE = "excite", 14
+    JOIN = "join", 7
+    TRACK = "track", 8
+    PAUSE = "pause", 18
+    HOVER = "hover", 9
+    HAND_BACK = "hand back", 19
+    HOLD = "hold", 16
+    STAND_DOWN = "stand down", 15
+    LAND = "land", 10
+    DISARMED = "disarmed", 11
+    YIELDED = "yielded", 12
+    FAILED = "failed", 13
 
 
 class Action(IntEnum):
@@ -57,34 +66,12 @@ class Request(Enum):
     HAND_BACK = "hand back"
 
 
-# The number of a phase in logs. Never reuse a number: old logs must stay readable.
-PHASE_CODES: Mapping[Phase, int] = {
-    Phase.CONNECT: 0,
-    Phase.HEALTH: 1,
-    Phase.STREAM: 2,
-    Phase.ENGAGE: 3,
-    Phase.ARM: 4,
-    Phase.TAKEOFF: 5,
-    Phase.CLIMB: 6,
-    Phase.JOIN: 7,
-    Phase.TRACK: 8,
-    Phase.HOVER: 9,
-    Phase.LAND: 10,
-    Phase.DISARMED: 11,
-    Phase.YIELDED: 12,
-    Phase.FAILED: 13,
-    Phase.EXCITE: 14,
-    Phase.STAND_DOWN: 15,
-    Phase.HOLD: 16,
-    Phase.STANDBY: 17,
-    Phase.PAUSE: 18,
-    Phase.HAND_BACK: 19,
-}
+PHASE_CODES: Mapping[Phase, int] = {phase: phase.code for phase in Phase}
 ENDS = frozenset({Phase.DISARMED, Phase.YIELDED, Phase.FAILED})
 WAITING = frozenset({Phase.CONNECT, Phase.HEALTH, Phase.STANDBY})
 BEFORE_FLIGHT = WAITING | {Phase.STREAM, Phase.ENGAGE, Phase.ARM}
 # codes of the phases in which an `offboard` has or takes the vehicle, in its HEARTBEAT
-CONTROLLING = frozenset(code for each, code in PHASE_CODES.items() if each not in WAITING | ENDS)
+CONTROLLING = frozenset(each.code for each in Phase if each not in WAITING | ENDS)
 TRACKING = frozenset({Phase.CLIMB, Phase.EXCITE, Phase.JOIN, Phase.TRACK, Phase.PAUSE, Phase.HOVER})
 MOVING = frozenset({Phase.JOIN, Phase.TRACK})  # along the reference
 # phases in which the failsafe judges

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import partial
+from typing import Protocol
 
 from offboard.flight.phases import Limits
 from offboard.flight.vehicle_state import ARMED_KNOWN_S, VehicleState
@@ -54,9 +55,16 @@ class Finding:
         return f"{self.found}. Fix: {self.hint}" if self.hint else self.found
 
 
-@dataclass(frozen=True, slots=True)
+class Known(Protocol):
+    """What a flight and a `Ground` have in common."""
+
+    vehicle: VehicleState
+    limits: Limits
+
+
+@dataclass(slots=True)
 class Ground:
-    """What is known of a vehicle before its flight."""
+    """What is known of a vehicle before its flight, by a flight or by the listening of `doctor`."""
 
     vehicle: VehicleState
     limits: Limits
@@ -81,7 +89,7 @@ class Row:
     """One condition: `problem` says what is wrong, empty if nothing is, `fix` what to do.
 
     `at_once`: `fly` does not wait `limits.health_s` for it to clear. `fly_only`: `daemon`, which
-    waits for its pilot, does not judge it. `about`: the parameter."""
+    waits for its pilot, does not judge it."""
 
     check: str
     level: Level
@@ -89,40 +97,40 @@ class Row:
     fix: str | Callable[[Ground], str] = ""
     at_once: bool = False
     fly_only: bool = False
-    about: str = ""
-
-    def finding(self, ground: Ground) -> Finding | None:
-        """What is wrong; None if nothing is."""
-        found = "" if self.fly_only and ground.serves else self.problem(ground)
-        if not found:
-            return None
-        fix = self.fix if isinstance(self.fix, str) else self.fix(ground)
-        return Finding(self.level, found, fix, self.about)
 
 
-def findings(ground: Ground) -> Iterator[tuple[Row, Finding]]:
-    """The rows whose condition is not met, in the order of the list."""
-    dialect = ground.dialect
-    parameters = dialect.watched_parameters if dialect else ()
-    rows = (*PREFLIGHT, *(row for each in parameters for row in _parameter_rows(each)))
-    return ((row, found) for row in rows if (found := row.finding(ground)))
+def findings(ground: Ground) -> Iterator[tuple[str, bool, Finding]]:
+    """What is wrong, in the order of the list, and last what the autopilot requires of its
+    parameters: the name of the check, whether `fly` refuses it at once, and the finding."""
+    for row in PREFLIGHT:
+        found = "" if row.fly_only and ground.serves else row.problem(ground)
+        if found:
+            fix = row.fix if isinstance(row.fix, str) else row.fix(ground)
+            yield row.check, row.at_once, Finding(row.level, found, fix)
+    for parameter in ground.dialect.watched_parameters if ground.dialect else ():
+        name, value = parameter.name, ground.vehicle.parameters.get(parameter.name)
+        fault = None if value is None else parameter.fault(value)
+        if fault:
+            yield "parameters", True, Finding(Level.BLOCKS, fault.found, fault.fix, name)
+        elif value is None and parameter.must_answer:
+            missing = f"no reply for parameter {name}"
+            yield "parameters", False, Finding(Level.BLOCKS, missing, about=name)
 
 
 def refusals(ground: Ground) -> list[str]:
     """Why this vehicle is not flown, whatever else changes: a sentence for each reason."""
-    return [found.sentence for row, found in findings(ground) if row.at_once]
+    return [found.sentence for _, at_once, found in findings(ground) if at_once]
 
 
 def not_ready(ground: Ground) -> str:
     """Why it cannot be flown yet, in one sentence; empty if nothing is to be waited for."""
-    waiting = (found.sentence for row, found in findings(ground) if not row.at_once)
+    waiting = (found.sentence for _, at_once, found in findings(ground) if not at_once)
     return next(waiting, "")
 
 
 # --- conditions ---
 
 # what may also come up later on the ground
-ARMED_ALREADY = "the vehicle is armed already, by another controller or a pilot"
 OTHER_SENDER = (
     "another program controls the vehicle on this link, too: {flight.vehicle.other_sender_name} "
     "(limits.begin_with_other_sender=true flies all the same)"
@@ -138,9 +146,10 @@ def unfit_type(ground: Ground) -> str:
     return senders.unfit_type(heartbeat.vehicle_type, helicopter=ground.helicopter)
 
 
-def _armed_already(ground: Ground) -> str:
-    armed = ground.vehicle.armed and not ground.limits.begin_armed
-    return ARMED_ALREADY if armed else ""
+def armed_already(known: Known) -> str:
+    """Another has armed it, and such a vehicle is not to be flown."""
+    armed = known.vehicle.armed and not known.limits.begin_armed
+    return "the vehicle is armed already, by another controller or a pilot" if armed else ""
 
 
 def _flown_by_another(ground: Ground) -> str:
@@ -294,87 +303,40 @@ def _late(ground: Ground) -> str:
 
 
 _ESTIMATOR = "wait for a GPS fix, keep the vehicle still and away from metal; then calibrate"
-_LINK = "use a faster link"
+_UNFIT = "fly it with its own autopilot; is MAV_TYPE or FRAME_CLASS right?"
+_FAILSAFE = "let the pilot take over first"
 
 
 def _slow_hint(ground: Ground) -> str:
     return ground.dialect.slow_hint if ground.dialect else ""
 
 
+WARN, WAIT, BLOCKS = Level.WARN, Level.WAIT, Level.BLOCKS
 PREFLIGHT = (
-    Row(
-        "vehicle",
-        Level.BLOCKS,
-        unfit_type,
-        "fly it with its own autopilot; is MAV_TYPE or FRAME_CLASS right?",
-        at_once=True,
-    ),
-    Row(
-        "state",
-        Level.BLOCKS,
-        _flown_by_another,
-        "stop that controller",
-        at_once=True,
-        fly_only=True,
-    ),
-    Row(
-        "state",
-        Level.BLOCKS,
-        _flown_by_failsafe,
-        "let the pilot take over first",
-        at_once=True,
-        fly_only=True,
-    ),
-    Row("state", Level.BLOCKS, _armed_already, "disarm it", at_once=True, fly_only=True),
-    Row("senders", Level.BLOCKS, _other_sender, "stop it", at_once=True, fly_only=True),
-    Row(
-        "senders",
-        Level.BLOCKS,
-        _several_vehicles,
-        "or give each vehicle its own port",
-        at_once=True,
-    ),
-    Row("rates", Level.WAIT, _no_telemetry),
-    Row("supervisor", Level.WAIT, _unguarded),
-    Row("rates", Level.BLOCKS, _slow, _slow_hint),
-    Row("state", Level.BLOCKS, _may_fly),
-    Row("parameters", Level.WAIT, _reading),
-    Row("origin", Level.WAIT, _origin),
-    Row("prearm", Level.WAIT, _prearm, fly_only=True),
-    Row("prearm", Level.WARN, _needs_setpoints, _other_mode, fly_only=True),
-    Row("estimator", Level.BLOCKS, _rejected, _ESTIMATOR),
-    Row("estimator", Level.WAIT, partial(_no_estimate, starting=True), _ESTIMATOR),
-    Row("estimator", Level.BLOCKS, partial(_no_estimate, starting=False), _ESTIMATOR),
-    Row("battery", Level.BLOCKS, _empty_battery, "charge the battery"),
-    Row("delay", Level.WAIT, _measuring),
-    Row("delay", Level.BLOCKS, _late, _LINK),
+    Row("vehicle", BLOCKS, unfit_type, _UNFIT, at_once=True),
+    Row("state", BLOCKS, _flown_by_another, "stop that controller", at_once=True, fly_only=True),
+    Row("state", BLOCKS, _flown_by_failsafe, _FAILSAFE, at_once=True, fly_only=True),
+    Row("state", BLOCKS, armed_already, "disarm it", at_once=True, fly_only=True),
+    Row("senders", BLOCKS, _other_sender, "stop it", at_once=True, fly_only=True),
+    Row("senders", BLOCKS, _several_vehicles, "or give each vehicle its own port", at_once=True),
+    Row("rates", WAIT, _no_telemetry),
+    Row("supervisor", WAIT, _unguarded),
+    Row("rates", BLOCKS, _slow, _slow_hint),
+    Row("state", BLOCKS, _may_fly),
+    Row("parameters", WAIT, _reading),
+    Row("origin", WAIT, _origin),
+    Row("prearm", WAIT, _prearm, fly_only=True),
+    Row("prearm", WARN, _needs_setpoints, _other_mode, fly_only=True),
+    Row("estimator", BLOCKS, _rejected, _ESTIMATOR),
+    Row("estimator", WAIT, partial(_no_estimate, starting=True), _ESTIMATOR),
+    Row("estimator", BLOCKS, partial(_no_estimate, starting=False), _ESTIMATOR),
+    Row("battery", BLOCKS, _empty_battery, "charge the battery"),
+    Row("delay", WAIT, _measuring),
+    Row("delay", BLOCKS, _late, "use a faster link"),
 )
 
 
 # --- parameters ---
-
-
-def _parameter_rows(parameter: WatchedParameter) -> tuple[Row, ...]:
-    """What the autopilot requires of a parameter, and of a reply."""
-    name = parameter.name
-
-    def wrong(ground: Ground) -> str:
-        value = ground.vehicle.parameters.get(name)
-        fault = None if value is None else parameter.fault(value)
-        return fault.found if fault else ""
-
-    def line(ground: Ground) -> str:
-        fault = parameter.fault(ground.vehicle.parameters[name])
-        return fault.fix if fault else ""
-
-    def unanswered(ground: Ground) -> str:
-        missing = parameter.must_answer and name not in ground.vehicle.parameters
-        return f"no reply for parameter {name}" if missing else ""
-
-    return (
-        Row("parameters", Level.BLOCKS, wrong, line, at_once=True, about=name),
-        Row("parameters", Level.BLOCKS, unanswered, about=name),
-    )
 
 
 class ParameterReading:

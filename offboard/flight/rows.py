@@ -6,8 +6,7 @@ not hold; a text says why it holds.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
+from collections.abc import Callable, Set
 from dataclasses import dataclass
 
 from offboard.flight.authority import Standing
@@ -17,6 +16,7 @@ from offboard.mavlink.events import OtherSender
 
 Condition = Callable[[FlightState], str | bool]
 
+OPERATOR = "{flight.stop_cause}"  # the cause of a row for `stop_requested`
 REBOOTED = "the vehicle restarted"
 OTHER_SENDER_S = 5.0  # a second sender is there for so long after its newest frame
 
@@ -31,7 +31,7 @@ class Transition:
     braces.
     """
 
-    phases: tuple[Phase, ...]
+    phases: Set[Phase]
     condition: Condition
     target: Phase
     exit_code: int | None = None
@@ -47,6 +47,7 @@ class Transition:
 
 
 def silent(flight: FlightState) -> str:
+    """Host time without position and attitude."""
     return silent_for(flight, flight.limits.silence_s)
 
 
@@ -55,7 +56,7 @@ def silent_for(flight: FlightState, limit_s: float) -> str:
 
 
 def blind(flight: FlightState) -> str:
-    """Position or attitude is missing, by vehicle time."""
+    """Age of the older of position and attitude, by vehicle time."""
     vehicle = flight.vehicle
     age_s, name = max(
         (vehicle.position_age_s, "LOCAL_POSITION_NED"),
@@ -66,15 +67,14 @@ def blind(flight: FlightState) -> str:
 
 
 def mode_unknown(flight: FlightState) -> str:
-    if flight.authority is not None and flight.authority.heard(flight.now_s):
+    if flight.authority.heard(flight.now_s):
         return ""
-    heard_s = flight.authority.heard_s if flight.authority else -math.inf
-    return f"no report of the mode for {flight.now_s - heard_s:.1f} s"
+    return f"no report of the mode for {flight.now_s - flight.authority.heard_s:.1f} s"
 
 
 def other_sender(flight: FlightState) -> str:
-    """Another program controls the vehicle on this link, and that counts: it sends setpoints or
-    mode commands, or says so."""
+    """Another program sends setpoints or commands modes on this link, or says in its HEARTBEAT
+    that it flies the vehicle."""
     if flight.limits.begin_with_other_sender:
         return ""
     if not flight.vehicle.age_s(OtherSender) < OTHER_SENDER_S:
@@ -98,7 +98,7 @@ def engaged_in_the_air(flight: FlightState) -> str:
 
 def lost(flight: FlightState) -> str:
     """The vehicle is not ours any more."""
-    if flight.authority is None or flight.authority.standing is not Standing.LOST:
+    if flight.authority.standing is not Standing.LOST:
         return ""
     return flight.authority.lost_reason or Standing.LOST.value
 
@@ -112,13 +112,9 @@ def lost_disarmed(flight: FlightState) -> str:
     return lost(flight) if flight.shown_since_lost and not flight.vehicle.armed else ""
 
 
-def stands(flight: FlightState, standing: Standing) -> bool:
-    return flight.authority is not None and flight.authority.standing is standing
-
-
 def in_own_failsafe(flight: FlightState) -> str:
     """Setpoints were missing, and the autopilot's failsafe flies the vehicle."""
-    if not stands(flight, Standing.FAILSAFE):
+    if flight.authority.standing is not Standing.FAILSAFE:
         return ""
     mode = flight.vehicle.mode
     return f"setpoints did not arrive, and the vehicle's own failsafe flies it, in {mode}"

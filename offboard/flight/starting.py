@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Set
+
 from offboard.flight import preflight
 from offboard.flight.phases import ExitCode, Phase, Request
-from offboard.flight.preflight import ARMED_ALREADY, OTHER_SENDER, SEVERAL, Ground
+from offboard.flight.preflight import OTHER_SENDER, SEVERAL, Ground, armed_already
 from offboard.flight.rows import (
+    OPERATOR,
     Transition,
     blind,
     engaged_in_the_air,
@@ -48,10 +51,6 @@ def silent_on_ground(flight: FlightState) -> str:
 
 def silent_for_long(flight: FlightState) -> str:
     return silent_for(flight, 2.0 * flight.limits.silence_s)
-
-
-def armed_by_another(flight: FlightState) -> str:
-    return ARMED_ALREADY if flight.vehicle.armed and not flight.limits.begin_armed else ""
 
 
 def other_vehicle(flight: FlightState) -> str:
@@ -122,8 +121,9 @@ def can_take_over(flight: FlightState) -> bool:
     )
 
 
-def engaged_by_pilot(flight: FlightState) -> bool:
-    return flight.pilot.engaged and can_take_over(flight) and usable(flight)
+def engaged_by_pilot(flight: FlightState) -> str:
+    fit = flight.pilot.engaged and can_take_over(flight) and usable(flight)
+    return f"engaged: {flight.vehicle.mode} in the air" if fit else ""
 
 
 def engaged_but_unfit(flight: FlightState) -> str:
@@ -149,8 +149,9 @@ def abandoned(flight: FlightState) -> bool:
     return left and found_engaged(flight) and can_take_over(flight)
 
 
-def started_in_the_air(flight: FlightState) -> bool:
-    return flight.request is Request.START and can_take_over(flight) and usable(flight)
+def started_in_the_air(flight: FlightState) -> str:
+    fit = flight.request is Request.START and can_take_over(flight) and usable(flight)
+    return f"start requested, {flight.vehicle.mode}" if fit else ""
 
 
 def started_on_the_ground(flight: FlightState) -> bool:
@@ -175,10 +176,9 @@ def engaged(flight: FlightState) -> str:
 def not_engaged(flight: FlightState) -> str:
     if flight.in_phase_s <= flight.limits.engage_s:
         return ""
-    wanted = flight.authority.engage_mode if flight.authority else "offboard mode"
     unanswered = preflight.unanswered(flight.clock.unanswered_s(flight.host_s))
     return (
-        f"the vehicle did not enter {wanted} in {flight.in_phase_s:.0f} s "
+        f"the vehicle did not enter {flight.authority.engage_mode} in {flight.in_phase_s:.0f} s "
         f"(it shows {flight.vehicle.mode})" + (unanswered and f"; {unanswered}")
     )
 
@@ -197,10 +197,15 @@ def disarmed_again(flight: FlightState) -> bool:
     return accepted and shown and since_s > ARMING_SHOWN_S
 
 
-def stop_requested_on_ground(flight: FlightState) -> bool:
+def stopped_before_takeoff(flight: FlightState) -> str:
+    return f"{flight.stop_reason} before take-off" if flight.stop_reason else ""
+
+
+def stop_requested_on_ground(flight: FlightState) -> str:
     """Every sign says that the vehicle stands there."""
     stands = flight.vehicle.armed and not flight.contact.in_the_air
-    return bool(stop_requested(flight)) and stands and not lost(flight)
+    stopped = flight.stop_reason and stands and not lost(flight)
+    return f"{flight.stop_reason} before lift-off" if stopped else ""
 
 
 def rises(flight: FlightState) -> bool:
@@ -232,117 +237,75 @@ def still_armed(flight: FlightState) -> str:
 
 # ---------------------------------------------------------------------- rows
 
-REFUSED, ABORTED, FLOWN = ExitCode.REFUSED, ExitCode.ABORTED, ExitCode.FLOWN
-CONNECT, HEALTH, STANDBY = (Phase.CONNECT,), (Phase.HEALTH,), (Phase.STANDBY,)
-WAITS, STREAMING = HEALTH + STANDBY, (Phase.STREAM, Phase.ENGAGE)
-ENGAGE, ARM, STAND_DOWN = (Phase.ENGAGE,), (Phase.ARM,), (Phase.STAND_DOWN,)
-FAILED = Phase.FAILED
-OPERATOR = "{flight.stop_cause}"
-_ABANDONED = (
-    "{flight.vehicle.mode} in the air, and nobody flies the vehicle: a flight was cut short"
-)
-_TOO_SOON = (
+(CONNECT, HEALTH, STANDBY, STREAM, ENGAGE, ARM, TAKEOFF, CLIMB, EXCITE, JOIN, TRACK, PAUSE, HOVER,
+ HAND_BACK, HOLD, STAND_DOWN, LAND, DISARMED, YIELDED, FAILED) = Phase  # fmt: skip
+FLOWN, REFUSED, ABORTED = ExitCode.FLOWN, ExitCode.REFUSED, ExitCode.ABORTED
+STREAMING = {STREAM, ENGAGE}
+ABANDONED = "{flight.vehicle.mode} in the air, and nobody flies the vehicle: a flight was cut short"
+TOO_SOON = (
     "not engaged: {flight.vehicle.mode} again before a HEARTBEAT has shown another mode, or while "
     "a flight ended; switch again"
 )
+DISARMED_AGAIN = "the vehicle was disarmed just after it had armed"
+FLIGHT_DETECTED = "flight is detected as it was to disarm"
+LOST_AS_IT_ARMED = "{flight.authority.lost_reason} as it armed"
 
 FLY_BEGINS = (
-    Transition(CONNECT, stop_requested, FAILED, REFUSED, OPERATOR),
-    Transition(CONNECT, vehicle_found, Phase.HEALTH),
-    Transition(CONNECT, not_found, FAILED, REFUSED, "link"),
+    Transition({CONNECT}, stop_requested, FAILED, REFUSED, OPERATOR),
+    Transition({CONNECT}, vehicle_found, HEALTH),
+    Transition({CONNECT}, not_found, FAILED, REFUSED, "link"),
 )
 FLY_IS_READY = (
-    Transition(HEALTH, refused, FAILED, REFUSED),
-    Transition(HEALTH, ready, Phase.STREAM, reason="telemetry flows and the vehicle can arm"),
-    Transition(HEALTH, not_ready_in_time, FAILED, REFUSED),
+    Transition({HEALTH}, refused, FAILED, REFUSED),
+    Transition({HEALTH}, ready, STREAM, reason="telemetry flows and the vehicle can arm"),
+    Transition({HEALTH}, not_ready_in_time, FAILED, REFUSED),
 )
 SERVICE_WAITS = (
-    Transition(CONNECT, stop_requested, FAILED, FLOWN, OPERATOR),
-    Transition(CONNECT, vehicle_found, Phase.HEALTH),
-    Transition(STANDBY, rebooted, FAILED, FLOWN, "restart"),
-    Transition(WAITS, stop_requested, FAILED, FLOWN, OPERATOR),
-    Transition(WAITS, abandoned, Phase.HAND_BACK, FLOWN, reason=_ABANDONED),
-    Transition(
-        STANDBY,
-        engaged_by_pilot,
-        Phase.CLIMB,
-        FLOWN,
-        reason="engaged: {flight.vehicle.mode} in the air",
-    ),
-    Transition(WAITS, engaged_but_unfit, Phase.HAND_BACK, REFUSED),
-    Transition(HEALTH, usable, Phase.STANDBY, reason="telemetry flows"),
-    Transition(STANDBY, engaged_too_soon, Phase.HAND_BACK, REFUSED, reason=_TOO_SOON),
-    Transition(
-        STANDBY,
-        started_in_the_air,
-        Phase.CLIMB,
-        FLOWN,
-        reason="start requested, {flight.vehicle.mode}",
-    ),
-    Transition(STANDBY, started_on_the_ground, Phase.STREAM, reason="start requested"),
+    Transition({CONNECT}, stop_requested, FAILED, FLOWN, OPERATOR),
+    Transition({CONNECT}, vehicle_found, HEALTH),
+    Transition({STANDBY}, rebooted, FAILED, FLOWN, "restart"),
+    Transition({HEALTH, STANDBY}, stop_requested, FAILED, FLOWN, OPERATOR),
+    Transition({HEALTH, STANDBY}, abandoned, HAND_BACK, FLOWN, reason=ABANDONED),
+    Transition({STANDBY}, engaged_by_pilot, CLIMB, FLOWN),
+    Transition({HEALTH, STANDBY}, engaged_but_unfit, HAND_BACK, REFUSED),
+    Transition({HEALTH}, usable, STANDBY, reason="telemetry flows"),
+    Transition({STANDBY}, engaged_too_soon, HAND_BACK, REFUSED, reason=TOO_SOON),
+    Transition({STANDBY}, started_in_the_air, CLIMB, FLOWN),
+    Transition({STANDBY}, started_on_the_ground, STREAM, reason="start requested"),
 )
 
 
-def starting(before: tuple[Phase, ...]) -> tuple[Transition, ...]:
+def starting(before: Set[Phase]) -> tuple[Transition, ...]:
     """From the ground to lift-off. `before`: the phases in which a flight is refused."""
     return (
         # first: from then on it is ours, and whatever ends the flight must ask for hold or land
-        Transition(ENGAGE, engaged_in_the_air, Phase.CLIMB),
+        Transition({ENGAGE}, engaged_in_the_air, CLIMB),
         Transition(STREAMING, rebooted, FAILED, REFUSED, "restart"),
-        Transition(STREAMING, armed_by_another, FAILED, REFUSED),
+        Transition(STREAMING, armed_already, FAILED, REFUSED),
         Transition(before, silent_on_ground, FAILED, REFUSED, "link"),
-        Transition(
-            before,
-            stop_requested,
-            FAILED,
-            REFUSED,
-            OPERATOR,
-            "{flight.stop_reason} before take-off",
-        ),
+        Transition(before, stopped_before_takeoff, FAILED, REFUSED, OPERATOR),
         Transition(STREAMING, other_sender, FAILED, REFUSED, "second sender", OTHER_SENDER),
         Transition(STREAMING, other_vehicle, FAILED, REFUSED),
         Transition(STREAMING, blind, FAILED, REFUSED, "link"),
         Transition(STREAMING, mode_unknown, FAILED, REFUSED, "link"),
         Transition(STREAMING, lost, FAILED, REFUSED, "pilot"),
-        Transition((Phase.STREAM,), needs_no_stream, Phase.ENGAGE),
-        Transition((Phase.STREAM,), streamed, Phase.ENGAGE),
-        Transition(ENGAGE, engaged, Phase.ARM),
-        Transition(ENGAGE, not_engaged, FAILED, REFUSED),
-        Transition(ARM, rebooted, Phase.STAND_DOWN, REFUSED, "restart"),
-        Transition(
-            ARM,
-            lost_armed,
-            Phase.YIELDED,
-            ABORTED,
-            "pilot",
-            "{flight.authority.lost_reason} as it armed",
-        ),
-        Transition(ARM, lost_disarmed, FAILED, REFUSED, "pilot"),
-        Transition(ARM, in_own_failsafe, Phase.STAND_DOWN, REFUSED, "link"),
-        Transition(ARM, silent, Phase.STAND_DOWN, REFUSED, "link"),
-        Transition(ARM, blind, Phase.STAND_DOWN, REFUSED, "link"),
-        Transition(ARM, stop_requested, Phase.STAND_DOWN, REFUSED, OPERATOR),
-        Transition(ARM, armed, Phase.TAKEOFF),
-        Transition(
-            ARM,
-            disarmed_again,
-            Phase.STAND_DOWN,
-            REFUSED,
-            reason="the vehicle was disarmed just after it had armed",
-        ),
-        Transition(ARM, not_armed, Phase.STAND_DOWN, REFUSED),
-        Transition(
-            (Phase.TAKEOFF,),
-            stop_requested_on_ground,
-            Phase.STAND_DOWN,
-            REFUSED,
-            OPERATOR,
-            "{flight.stop_reason} before lift-off",
-        ),
-        Transition(
-            STAND_DOWN, rises, Phase.LAND, ABORTED, reason="flight is detected as it was to disarm"
-        ),
-        Transition(STAND_DOWN, silent_for_long, FAILED, REFUSED, "link"),
-        Transition(STAND_DOWN, disarmed_for_good, FAILED, reason="disarmed on the ground"),
-        Transition(STAND_DOWN, still_armed, FAILED, ABORTED),
+        Transition({STREAM}, needs_no_stream, ENGAGE),
+        Transition({STREAM}, streamed, ENGAGE),
+        Transition({ENGAGE}, engaged, ARM),
+        Transition({ENGAGE}, not_engaged, FAILED, REFUSED),
+        Transition({ARM}, rebooted, STAND_DOWN, REFUSED, "restart"),
+        Transition({ARM}, lost_armed, YIELDED, ABORTED, "pilot", LOST_AS_IT_ARMED),
+        Transition({ARM}, lost_disarmed, FAILED, REFUSED, "pilot"),
+        Transition({ARM}, in_own_failsafe, STAND_DOWN, REFUSED, "link"),
+        Transition({ARM}, silent, STAND_DOWN, REFUSED, "link"),
+        Transition({ARM}, blind, STAND_DOWN, REFUSED, "link"),
+        Transition({ARM}, stop_requested, STAND_DOWN, REFUSED, OPERATOR),
+        Transition({ARM}, armed, TAKEOFF),
+        Transition({ARM}, disarmed_again, STAND_DOWN, REFUSED, reason=DISARMED_AGAIN),
+        Transition({ARM}, not_armed, STAND_DOWN, REFUSED),
+        Transition({TAKEOFF}, stop_requested_on_ground, STAND_DOWN, REFUSED, OPERATOR),
+        Transition({STAND_DOWN}, rises, LAND, ABORTED, reason=FLIGHT_DETECTED),
+        Transition({STAND_DOWN}, silent_for_long, FAILED, REFUSED, "link"),
+        Transition({STAND_DOWN}, disarmed_for_good, FAILED, reason="disarmed on the ground"),
+        Transition({STAND_DOWN}, still_armed, FAILED, ABORTED),
     )

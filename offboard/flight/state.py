@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import operator
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,16 +18,14 @@ import numpy as np
 from offboard.control.base import Controller
 from offboard.estimation.observer import Observer
 from offboard.flight.authority import Authority, PilotSwitch, Standing
-from offboard.flight.busyness import Busyness
 from offboard.flight.flight_plan import FlightPlan
-from offboard.flight.ground_contact import DETECTOR_KNOWN_S, GroundContact
+from offboard.flight.ground_contact import DETECTOR_KNOWN_S, GroundContact, Touchdown, moved
 from offboard.flight.hover_estimate import HoverEstimate
 from offboard.flight.phases import ENDS, STOPPED, Action, Limits, Phase, Request, ServiceOptions
 from offboard.flight.positioning import Positioning, PositionJumps
 from offboard.flight.preflight import ParameterReading
-from offboard.flight.record import Decided, Tick
-from offboard.flight.touchdown import Touchdown, moved
-from offboard.flight.vehicle_clock import VehicleClock
+from offboard.flight.record import Busyness, Decided, Tick
+from offboard.flight.vehicle_clock import LinkGrowth, VehicleClock
 from offboard.flight.vehicle_state import VehicleState
 from offboard.identification.learner import Learner
 from offboard.mavlink.dialects.base import Dialect, Takeoff
@@ -59,18 +57,9 @@ class Outcome:
 
 # of the flight before, with the same vehicle
 KEPT = (
-    "vehicle",
-    "contact",
-    "clock",
-    "hover",
-    "reading",
-    "dialect",
-    "now_s",
-    "host_s",
-    "silence_s",
-    "heard_s",
-    "guarded",
-)
+    "vehicle", "contact", "clock", "hover", "reading", "dialect", "peer", "other_datagrams",
+    "now_s", "host_s", "turned_s", "silence_s", "heard_s", "guarded",
+)  # fmt: skip
 
 
 @dataclass(slots=True)
@@ -114,15 +103,18 @@ class FlightState:
     failsafe: Failsafe = field(default_factory=Failsafe)
     contact: GroundContact = field(init=False)
     pilot: PilotSwitch = field(default_factory=PilotSwitch)
-    takeoff_ned_m: Triple | None = None  # None for a vehicle that was found in the air
     home_ned_m: Triple = (0.0, 0.0, 0.0)  # the ground where the flight began
+    took_off: bool = False  # from there; a vehicle that was found in the air has not
     touchdown: Touchdown | None = None  # of the landing
-    dialect: Dialect | None = None  # with the authority, once the vehicle was found
-    authority: Authority | None = None
+    dialect: Dialect | None = None  # once the vehicle has reported its mode
+    authority: Authority = field(default_factory=Authority)
+    peer: Hashable | None = None  # address that the vehicle sends from; None before it is found
+    other_datagrams: int = 0  # of other senders, for the log
 
     phase: Phase = Phase.CONNECT
     began_s: float = 0.0  # of the phase, on `Session.link_time_s`
     now_s: float = 0.0  # `Session.link_time_s`
+    turned_s: float = math.nan  # host time of the newest turn
     host_s: float = 0.0  # monotonic time of this computer at the present turn
     silence_s: float = 0.0  # host time since the newest telemetry
     setpoint_s: float = math.inf  # when the newest setpoint left
@@ -170,14 +162,13 @@ class FlightState:
         reboot its parameters are read again."""
         for name in KEPT:
             setattr(self, name, getattr(before, name))
-        self.clock.growth.reset()
-        if before.authority:
-            self.authority = before.authority.renewed()
-        if not before.has_ended:  # nothing was flown: what the pilot did before counts
+        self.clock.growth = LinkGrowth()
+        self.authority = before.authority.renewed()
+        if not before.ended:  # nothing was flown: what the pilot did before counts
             self.pilot, self.phase, self.began_s = before.pilot, before.phase, before.began_s
             return
         prepared = before.phase not in (Phase.CONNECT, Phase.HEALTH) and not before.rebooted
-        self.phase = Phase.STANDBY if prepared and before.authority else Phase.CONNECT
+        self.phase = Phase.STANDBY if prepared and self.authority.engage_mode else Phase.CONNECT
         self.began_s = before.now_s
         self.pilot = PilotSwitch(
             elsewhere=before.pilot.elsewhere,
@@ -193,7 +184,7 @@ class FlightState:
         return self.now_s - self.began_s
 
     @property
-    def has_ended(self) -> bool:
+    def ended(self) -> bool:
         return self.phase in ENDS
 
     @property
@@ -204,7 +195,7 @@ class FlightState:
     @property
     def engaged(self) -> bool:
         """The vehicle shows the mode in which it follows setpoints."""
-        return self.authority is not None and self.authority.mode == self.authority.engage_mode
+        return self.authority.mode == self.authority.engage_mode
 
     @property
     def track_time_s(self) -> float:
@@ -233,16 +224,14 @@ class FlightState:
     @property
     def taken(self) -> bool:
         """Another has chosen the vehicle's mode, which ended the flight in the air."""
-        lost = self.authority is not None and self.authority.standing is Standing.LOST
-        return lost and self.phase is Phase.YIELDED
+        return self.authority.standing is Standing.LOST and self.phase is Phase.YIELDED
 
     @property
     def shown_since_lost(self) -> bool:
         """A HEARTBEAT has come since the vehicle was lost: only it shows whether a failsafe took
         it, and whether it is armed. PX4 shows the mode by CURRENT_MODE up to a second earlier, and
         leaves its landing mode when it disarms."""
-        heard_s = self.now_s - self.vehicle.age_s(Heartbeat)
-        return self.authority is not None and heard_s > self.authority.lost_s
+        return self.now_s - self.vehicle.age_s(Heartbeat) > self.authority.lost_s
 
     @property
     def awaits_heartbeat(self) -> bool:
@@ -256,7 +245,7 @@ class FlightState:
     def ends_engaged(self) -> bool:
         """Whether the flight ends with a vehicle that nobody has seen in another mode than that of
         setpoints: it was not heard any more, or has rebooted."""
-        unheard = self.authority is not None and self.authority.standing is Standing.OURS
+        unheard = self.authority.standing is Standing.OURS
         return unheard or (self.rebooted and self.pilot.unclaimed)
 
     @property
@@ -273,13 +262,11 @@ class FlightState:
     def unreached_s(self) -> float:
         """For how long no telemetry, or no report of the mode, has arrived; 0 while both do."""
         silent_s = self.silence_s if self.silence_s > self.limits.silence_s else 0.0
-        return max(silent_s, self.authority.unheard_s(self.now_s) if self.authority else 0.0)
+        return max(silent_s, self.authority.unheard_s(self.now_s))
 
     def note_starvation(self) -> None:
         """Note when the vehicle may have been without setpoints for so long that its failsafe acts:
         none was sent, nothing was heard, or no TIMESYNC was answered."""
-        if self.authority is None:
-            return
         unanswered_s = self.vehicle.age_s(TimesyncReply)
         gap_s = max(
             self.now_s - self.setpoint_s,
@@ -297,11 +284,7 @@ class FlightState:
     @property
     def ours(self) -> bool:
         """A setpoint may leave."""
-        return self.authority is not None and self.authority.permits_setpoint(self.now_s)
-
-    @property
-    def may_command(self) -> bool:
-        return self.authority is not None and self.authority.permits_command(self.now_s)
+        return self.authority.permits_setpoint(self.now_s)
 
     def not_landed(self) -> str:
         """Why the vehicle has not landed; empty if it has."""
@@ -317,8 +300,6 @@ class FlightState:
         """The reported position has jumped by this (3,), not the vehicle: so has the ground."""
         jump = tuple(jump_ned_m)
         self.home_ned_m = moved(self.home_ned_m, jump)
-        if self.takeoff_ned_m is not None:
-            self.takeoff_ned_m = moved(self.takeoff_ned_m, jump)
         if self.phase is Phase.TAKEOFF:  # the reference is not in force yet
             self.plan.origin_ned_m = moved(self.plan.origin_ned_m, jump)
         if self.contact.rest_ned_m is not None:

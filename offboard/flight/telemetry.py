@@ -1,19 +1,28 @@
-"""What each received message changes in a flight. Sends nothing but answers."""
+"""What each received message changes in a flight. Sends nothing but answers.
+
+A ground station may ask our component for these, in the service: MAV_CMD_MISSION_START starts the
+reference, MAV_CMD_DO_PAUSE_CONTINUE pauses and continues it, MAV_CMD_DO_SET_MODE, with any
+parameters, hands the vehicle back.
+"""
 
 from __future__ import annotations
 
+from enum import IntEnum
+
 import numpy as np
 
-from offboard.flight import outbox, requests
+from offboard.flight import outbox
 from offboard.flight.authority import Authority
 from offboard.flight.ground_contact import GroundContact
 from offboard.flight.hover_estimate import HoverEstimate
-from offboard.flight.manifest import vehicle_record
-from offboard.flight.phases import BEFORE_FLIGHT, FLYING, TRACKING, WAITING
+from offboard.flight.inputs import vehicle_record
+from offboard.flight.phases import BEFORE_FLIGHT, FLYING, MOVING, TRACKING, WAITING, Phase, Request
 from offboard.flight.positioning import PositionJumps
 from offboard.flight.preflight import ParameterReading
 from offboard.flight.rows import other_sender
+from offboard.flight.starting import can_take_over, usable
 from offboard.flight.state import FlightState
+from offboard.flight.vehicle_clock import VehicleClock
 from offboard.mavlink.events import (
     Attitude,
     ClockBehind,
@@ -29,10 +38,16 @@ from offboard.mavlink.events import (
     TimesyncReply,
     VehicleFound,
 )
-from offboard.mavlink.outgoing import ThrustRule
-from offboard.model.frames import thrust_direction_from_quaternion
+from offboard.mavlink.outgoing import CommandResult, ThrustRule
 
+START, PAUSE_CONTINUE, SET_MODE = 300, 193, 176  # MAV_CMD
+BEGINNING = (Phase.STREAM, Phase.ENGAGE, Phase.ARM, Phase.TAKEOFF)
+ENDING = (Phase.HAND_BACK, Phase.HOLD)
 SAME_THRUST = 1e-5  # of full throttle: rounding on the link
+OTHER_COMPANION = (
+    "another companion computer is on the link: system {system} component {component}; only one of "
+    "them may send setpoints"
+)
 
 
 def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: float) -> None:
@@ -56,40 +71,38 @@ def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: flo
         case TimesyncReply():
             flight.clock.on_reply(event)
         case CommandRequest():
-            requests.answer(flight, event)
+            _answer(flight, event)
         case VehicleFound():
             outbox.send(flight, vehicle_record(event))
         case PeerChanged(peer):
             outbox.announce(flight, f"the vehicle now sends from another port: {peer}")
         case OtherCompanion(system, component):
-            outbox.announce_once(
-                flight,
-                f"another companion computer is on the link: system {system} component "
-                f"{component}; only one of them may send setpoints",
-            )
+            sentence = OTHER_COMPANION.format(system=system, component=component)
+            outbox.announce(flight, sentence, once=True)
         case ClockBehind(system_id, _):  # its time stamps follow ours once it has heard us
-            outbox.announce_once(
-                flight, f"the signing time of system {system_id} is behind: sending ours"
-            )
+            sentence = f"the signing time of system {system_id} is behind: sending ours"
+            outbox.announce(flight, sentence, once=True)
         case Rebooted():
             _on_reboot(flight)
 
 
 def _is_of_others(flight: FlightState, thrust: float) -> bool:
-    """Whether the vehicle demands a thrust that no recent setpoint of ours had. False on
-    ArduCopter, which does not report the thrust of the setpoint."""
-    if flight.dialect is None or flight.dialect.thrust_rule is not ThrustRule.COLLECTIVE:
-        return False
-    return bool(flight.thrusts) and all(abs(thrust - t) > SAME_THRUST for t in flight.thrusts)
+    """Whether the vehicle demands a thrust that no recent setpoint of ours had."""
+    ours = flight.thrusts if _reports_thrust(flight) else ()
+    return bool(ours) and all(abs(thrust - each) > SAME_THRUST for each in ours)
+
+
+def _reports_thrust(flight: FlightState) -> bool:
+    """Whether the autopilot reports the thrust of the setpoint; ArduCopter does not."""
+    return flight.dialect is not None and flight.dialect.thrust_rule is ThrustRule.COLLECTIVE
 
 
 def _lifting_share(flight: FlightState) -> float:
     """Vertical part of the thrust that the autopilot reports: the cosine of the tilt, unless it
     reports it before it is raised for the tilt."""
-    attitude, dialect = flight.vehicle.attitude, flight.dialect
-    if attitude is None or dialect is None or dialect.thrust_rule is not ThrustRule.COLLECTIVE:
+    if flight.vehicle.attitude is None or not _reports_thrust(flight):
         return 1.0
-    return float(thrust_direction_from_quaternion(np.array(attitude.attitude))[2])
+    return float(flight.vehicle.thrust_direction_ned[2])
 
 
 def _on_telemetry(flight: FlightState, stamp_s: float, arrived_s: float, turned_s: float) -> None:
@@ -131,14 +144,14 @@ def _follow_jump(flight: FlightState, event: LocalPosition) -> None:
 def _on_mode(
     flight: FlightState, event: Heartbeat | ModeReport, mode: str, arrived_s: float
 ) -> None:
-    if flight.authority is None:
+    if not flight.authority.engage_mode:
         flight.dialect = flight.session.dialect
         assert flight.dialect is not None
         flight.authority = Authority(flight.dialect.engage_mode)
     assert flight.dialect is not None
-    vehicle = flight.vehicle
-    flight.authority.loss = flight.dialect.setpoint_loss(vehicle.parameters)
-    flight.authority.on_mode(
+    vehicle, authority = flight.vehicle, flight.authority
+    authority.loss = flight.dialect.setpoint_loss(vehicle.parameters)
+    authority.on_mode(
         mode,
         flight.now_s,
         arrived_s=arrived_s,
@@ -147,7 +160,7 @@ def _on_mode(
         starved=flight.starved,
         sticks=vehicle.sticks,
     )
-    ours = mode == flight.authority.engage_mode
+    ours = mode == authority.engage_mode
     contact = flight.contact
     in_the_air, switched = contact.in_the_air, ours and flight.pilot.elsewhere
     flight.pilot.on_mode(ours=ours, in_the_air=in_the_air, flies=contact.flies)
@@ -164,12 +177,79 @@ def _on_mode(
 def _on_reboot(flight: FlightState) -> None:
     """Nothing that was known of vehicle and link is known any more."""
     flight.observer.reset()
-    flight.clock.reset()
-    flight.contact = GroundContact(flight.vehicle)
+    flight.contact, flight.clock = GroundContact(flight.vehicle), VehicleClock()
     flight.hover, flight.jumps = HoverEstimate(), PositionJumps()
     flight.reading = ParameterReading()
-    flight.takeoff_ned_m = None  # the local frame begins elsewhere
-    if flight.authority and flight.phase not in BEFORE_FLIGHT:
+    flight.took_off = False  # the local frame begins elsewhere
+    if flight.phase not in BEFORE_FLIGHT:
         flight.authority.forget(flight.now_s)
     else:
-        flight.authority = None
+        flight.authority = Authority()
+
+
+# ---------------------------------------------------------------------- requests
+
+
+class Result(IntEnum):
+    """MAV_RESULT."""
+
+    ACCEPTED = 0
+    TEMPORARILY_REJECTED = 1
+    DENIED = 2
+    UNSUPPORTED = 3
+
+
+def _answer(flight: FlightState, asked: CommandRequest) -> None:
+    """Acknowledge a command to us; the next tick does what it asks for."""
+    result = Result.UNSUPPORTED
+    if flight.service:
+        result, request = _judged(flight, asked.command, asked.parameters)
+        if request is not Request.NONE:
+            flight.request = request
+            sender = f"system {asked.system_id} component {asked.component_id}"
+            outbox.announce(flight, f"{request.value} requested by {sender}")
+    outbox.send(flight, CommandResult(asked.command, result, asked.system_id, asked.component_id))
+
+
+Answer = tuple[Result, Request]
+NOTHING_TO_DO: Answer = (Result.ACCEPTED, Request.NONE)
+NOT_NOW: Answer = (Result.TEMPORARILY_REJECTED, Request.NONE)
+DENIED: Answer = (Result.DENIED, Request.NONE)
+
+
+def _judged(flight: FlightState, command: int, parameters: tuple[float, ...]) -> Answer:
+    """The result to acknowledge `command` with, and what is to be done."""
+    if command == START:
+        return _start(flight)
+    if command == PAUSE_CONTINUE:
+        return _pause_or_continue(flight.phase, parameters[0])
+    if command == SET_MODE:
+        if flight.phase in TRACKING or flight.phase in BEGINNING:
+            return Result.ACCEPTED, Request.HAND_BACK
+        return NOTHING_TO_DO if flight.phase in ENDING else DENIED
+    return Result.UNSUPPORTED, Request.NONE
+
+
+def _start(flight: FlightState) -> Answer:
+    if flight.phase in TRACKING:
+        return Result.ACCEPTED, Request.START
+    if flight.phase in BEGINNING:
+        return NOTHING_TO_DO
+    if flight.phase is not Phase.STANDBY:
+        return NOT_NOW
+    armed = flight.vehicle.armed
+    if not armed and not (flight.service and flight.service.arms):
+        return DENIED
+    fit = usable(flight) and (not armed or can_take_over(flight))
+    return (Result.ACCEPTED, Request.START) if fit else NOT_NOW
+
+
+def _pause_or_continue(phase: Phase, parameter: float) -> Answer:
+    wanted = {0.0: Request.PAUSE, 1.0: Request.CONTINUE}.get(parameter)
+    if wanted is None:
+        return DENIED
+    if phase in MOVING:
+        return (Result.ACCEPTED, wanted) if wanted is Request.PAUSE else NOTHING_TO_DO
+    if phase is Phase.PAUSE:
+        return (Result.ACCEPTED, wanted) if wanted is Request.CONTINUE else NOTHING_TO_DO
+    return NOTHING_TO_DO if phase is Phase.HOVER else NOT_NOW

@@ -8,12 +8,14 @@ begins the next one where it has ended.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 
 from offboard.flight import decision, failsafe, flying, outbox, starting
 from offboard.flight.authority import PilotSwitch
+from offboard.flight.ground_contact import Touchdown
 from offboard.flight.hover_estimate import DIFFERENT, SETTLED, differs
 from offboard.flight.phases import (
     BEFORE_FLIGHT,
@@ -26,7 +28,6 @@ from offboard.flight.phases import (
 )
 from offboard.flight.rows import REBOOTED, Transition, in_own_failsafe
 from offboard.flight.state import FlightState, Outcome
-from offboard.flight.touchdown import Touchdown
 from offboard.identification.learner import Stage
 from offboard.mavlink.events import LocalPosition
 
@@ -43,26 +44,27 @@ SERVICE_ONLY = frozenset({Phase.STANDBY, Phase.PAUSE, Phase.HAND_BACK})
 @cache
 def table(service: ServiceOptions | None = None) -> tuple[Transition, ...]:
     """The phase table of the service with these options; without them that of `fly`."""
-    phases = tuple(phase for phase in Phase if phase in FLYING)
     if service is None:
-        phases = tuple(phase for phase in phases if phase not in SERVICE_ONLY)
-        return (
+        rows = (
             *starting.FLY_BEGINS,
-            *starting.starting((Phase.HEALTH, *starting.STREAMING)),
+            *starting.starting({Phase.HEALTH, *starting.STREAMING}),
             *starting.FLY_IS_READY,
-            *flying.ends_early(phases, serves=False),
+            *flying.ends_early(serves=False),
             *flying.TO_THE_END,
             *flying.AT_REST["land"],
         )
-    return (
-        *starting.SERVICE_WAITS,
-        *starting.starting(starting.STREAMING),
-        Transition((Phase.HAND_BACK,), flying.handed, Phase.YIELDED),
-        *flying.ends_early(phases, serves=True),
-        *flying.TO_THE_END,
-        *flying.SERVICE_ENDS,
-        *flying.AT_REST[service.then],
-    )
+        rows = tuple(replace(row, phases=row.phases - SERVICE_ONLY) for row in rows)
+    else:
+        rows = (
+            *starting.SERVICE_WAITS,
+            *starting.starting(starting.STREAMING),
+            Transition({Phase.HAND_BACK}, flying.handed, Phase.YIELDED),
+            *flying.ends_early(serves=True),
+            *flying.TO_THE_END,
+            *flying.SERVICE_ENDS,
+            *flying.AT_REST[service.then],
+        )
+    return tuple(row for row in rows if row.phases)
 
 
 def next_row(flight: FlightState) -> Transition | None:
@@ -82,7 +84,7 @@ def _by_phase(service: ServiceOptions | None) -> dict[Phase, tuple[Transition, .
 
 def advance(flight: FlightState) -> None:
     """Make every transition whose guard holds."""
-    while not flight.has_ended:
+    while not flight.ended:
         if flight.phase in FLYING:
             failsafe.judge(flight)
         _note_failsafe(flight)
@@ -106,7 +108,7 @@ def name_failsafe(flight: FlightState) -> None:
     before = flight.outcome
     if flight.taken and flight.vehicle.in_failsafe and before is not None:
         sentence = TAKEN + _explanation(flight)
-        outbox.announce_once(flight, sentence)
+        outbox.announce(flight, sentence, once=True)
         flight.outcome = Outcome(before.exit_code, f"{before.sentence}; {sentence}")
 
 
@@ -129,7 +131,7 @@ def _enter(flight: FlightState, row: Transition) -> None:
     flight.request = Request.NONE
     flight.phase = row.target
     flight.began_s = flight.now_s
-    outbox.announce_phase(flight, row.target, reason, cause)
+    outbox.announce_phase(flight, reason, cause)
     if source in BEFORE_FLIGHT and row.target in FLYING:
         flight.clock.settle()
         dialect = flight.session.dialect
@@ -142,10 +144,12 @@ def _enter(flight: FlightState, row: Transition) -> None:
     if flight.identification:
         stage = STAGES.get(row.target, Stage.OTHER)
         flight.identification.on_stage(stage, flight.time_s)
-    if source in WAITING and row.target in FLYING and flight.authority:
+    if source in WAITING and row.target in FLYING:
         flight.authority.ask()  # it shows the mode already
     if row.target is Phase.ENGAGE:
-        _begin_engaging(flight)
+        # here, not with the request: a vehicle that shows the mode already passes without one
+        flight.authority.ask()
+        _set_hover_thrust(flight)
     elif row.target is Phase.STANDBY:
         flight.pilot.engaged = False  # the pilot switched to one that was not ready
     elif row.target is Phase.TAKEOFF:
@@ -159,7 +163,7 @@ def _enter(flight: FlightState, row: Transition) -> None:
     elif source is Phase.PAUSE and row.target is Phase.TRACK:
         flight.plan.resume(flight.time_s)
     elif row.target is Phase.LAND:
-        flight.touchdown = Touchdown(flight.takeoff_ned_m)
+        flight.touchdown = Touchdown(flight.home_ned_m if flight.took_off else None)
 
 
 def _conclude(flight: FlightState, row: Transition, reason: str) -> None:
@@ -179,18 +183,11 @@ def _explanation(flight: FlightState) -> str:
     return flight.vehicle.explanation(dialect.unsaid if dialect else "")
 
 
-def _begin_engaging(flight: FlightState) -> None:
-    """Here, not with the request: a vehicle that shows the mode already passes without one."""
-    assert flight.authority is not None
-    flight.authority.ask()
-    _set_hover_thrust(flight)
-
-
 def _begin_takeoff(flight: FlightState) -> None:
     position = flight.vehicle.position
     assert position is not None
-    flight.takeoff_ned_m = flight.plan.origin_ned_m = position.position_ned_m
-    flight.home_ned_m = flight.takeoff_ned_m
+    flight.home_ned_m = flight.plan.origin_ned_m = position.position_ned_m
+    flight.took_off = True
 
 
 def _begin_climb(flight: FlightState, source: Phase) -> None:

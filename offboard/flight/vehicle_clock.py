@@ -47,10 +47,6 @@ class VehicleClock:
     """
 
     def __init__(self) -> None:
-        self.reset()
-
-    def reset(self) -> None:
-        """The vehicle was rebooted."""
         self.growth = LinkGrowth()
         self._requests: deque[tuple[int, float]] = deque(maxlen=REQUESTS_MAX)  # ts1, host time
         self._reset_line()
@@ -180,10 +176,6 @@ class LinkGrowth:
     """
 
     def __init__(self) -> None:
-        self.reset()
-
-    def reset(self) -> None:
-        """Nothing was added."""
         self.added_s = self.changed_s = 0.0
         self._history: deque[tuple[float, float]] = deque(((-math.inf, 0.0),))  # from when, added_s
 

@@ -9,6 +9,9 @@ import math
 from collections import deque
 from dataclasses import dataclass, field
 
+import numpy as np
+from numpy.typing import NDArray
+
 from offboard.flight.phases import CONTROLLING
 from offboard.flight.record import COMPONENT_ID
 from offboard.mavlink.events import (
@@ -31,7 +34,7 @@ from offboard.mavlink.events import (
     VehicleIdentity,
 )
 from offboard.mavlink.framing import HEARTBEAT
-from offboard.model.frames import heading_from_quaternion
+from offboard.model.frames import heading_from_quaternion, thrust_direction_from_quaternion
 
 HEALTH_S = 1.5  # SYS_STATUS is requested at 2 Hz
 ARMED_KNOWN_S = 3.0  # PX4 reports it in HEARTBEAT alone, at 1 Hz
@@ -141,6 +144,12 @@ class VehicleState:
         """Heading of the nose in the newest attitude, which must have been received."""
         assert self.attitude is not None
         return float(heading_from_quaternion(self.attitude.attitude))
+
+    @property
+    def thrust_direction_ned(self) -> NDArray[np.float64]:
+        """Thrust direction (3,) in the newest attitude, which must have been received."""
+        assert self.attitude is not None
+        return thrust_direction_from_quaternion(np.array(self.attitude.attitude))
 
     @property
     def prearm_ok(self) -> bool:

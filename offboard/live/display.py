@@ -14,8 +14,8 @@ from offboard.link.background import BackgroundWriter
 
 if TYPE_CHECKING:  # the process that serves clients starts without the controller
     from offboard.flight.display import Snapshot
+    from offboard.flight.flight import Flight
     from offboard.flight.phases import Phase
-    from offboard.flight.state import FlightState
 
 DIGITS = 9  # of a float
 CLOSE_S = 2.0  # for what is queued, after the flight
@@ -32,7 +32,7 @@ class Shown(Protocol):
     @property
     def phase(self) -> Phase: ...
     @property
-    def state(self) -> FlightState: ...
+    def current(self) -> Flight: ...
     def snapshot(self) -> Snapshot: ...
     def has_ended(self) -> bool: ...
 
@@ -58,7 +58,7 @@ class Display:
 
     def announcement(self, shown: Shown, sentence: str) -> str:
         """What is written of an announcement."""
-        time_s = round(shown.state.time_s, 3)
+        time_s = round(shown.current.time_s, 3)
         return line("announcement", time_s=time_s, text=sentence)
 
     def is_due(self, shown: Shown) -> bool:

@@ -41,7 +41,7 @@ class Terminal(Display):
         self._writer.put(sentence)
 
     def announcement(self, shown: Shown, sentence: str) -> str:
-        return f"{_stamp(shown.state.time_s)}  {sentence}"
+        return f"{_stamp(shown.current.time_s)}  {sentence}"
 
     def is_due(self, shown: Shown) -> bool:
         now_s = clock.monotonic_s()
@@ -106,7 +106,7 @@ class JsonLines(Display):
         self._writer.put(line("preparation", text=sentence))
 
     def is_due(self, shown: Shown) -> bool:
-        time_s = shown.state.time_s
+        time_s = shown.current.time_s
         if self._due_s - SNAPSHOT_S <= time_s < self._due_s:  # else the clock may have jumped back
             return False
         self._due_s = math.floor(time_s / SNAPSHOT_S + 1.0) * SNAPSHOT_S
@@ -121,7 +121,7 @@ class JsonLog(JsonLines):
         self._writer.put(_logged("service", sentence))
 
     def announcement(self, shown: Shown, sentence: str) -> str:
-        return _logged(shown.phase.value, sentence, vehicle_time_s=shown.state.time_s)
+        return _logged(shown.phase.value, sentence, vehicle_time_s=shown.current.time_s)
 
     def is_due(self, shown: Shown) -> bool:
         return False

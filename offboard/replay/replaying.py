@@ -153,7 +153,7 @@ class Replay:
         self._readings, self._read_s = iter(given.readings_s), given.now_s
         self.count += 1
         output = self._output(chunks, given.now_s)
-        self.ended_s = self.companion.state.time_s
+        self.ended_s = self.companion.time_s
         if output:
             self._leaving = [self._sent(frame) for frame in output.send]
             self.companion.finish_turn(math.nan)  # it was not sent
@@ -172,7 +172,7 @@ class Replay:
 
     def _sent(self, frame: bytes) -> Sent:
         message_id = int.from_bytes(frame[7:10], "little")
-        return Sent(self.companion.state.time_s, message_id, frame[10 : 10 + frame[1]], self.count)
+        return Sent(self.companion.time_s, message_id, frame[10 : 10 + frame[1]], self.count)
 
     def _leave(self) -> None:
         self.replayed += self._leaving
@@ -193,7 +193,7 @@ class Replay:
 
     def _note(self, message: LoggedMessage) -> bool:
         """Note what we sent; returns whether it was ours."""
-        vehicle = self.companion.state.vehicle.found
+        vehicle = self.companion.vehicle.found
         system = vehicle.system_id if vehicle else _OUR_FIRST_SYSTEM
         if message.system_id != system:
             return False
@@ -209,7 +209,7 @@ class Replay:
 
     def _note_thrust(self, message: LoggedMessage) -> None:
         """The recorded vehicle reports the thrust of recorded setpoints, whatever is sent now."""
-        thrusts = self.companion.state.thrusts
+        thrusts = self.companion.thrusts
         if message.name == "SET_ATTITUDE_TARGET":
             thrusts.append(message.message.thrust)
         elif message.name.startswith("SET_POSITION_TARGET"):

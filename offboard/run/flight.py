@@ -19,7 +19,7 @@ from offboard.control.base import Controller, Situation
 from offboard.documents.errors import DocumentError, located
 from offboard.documents.signing_key import read_key
 from offboard.estimation.observer import Observer
-from offboard.flight import manifest
+from offboard.flight import inputs
 from offboard.flight.flight import Flight, Outcome
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
@@ -304,7 +304,7 @@ def fly(
         stops.check()
         stack.enter_context(log)
         session = Session(vehicle.settings(link), signing)
-        for piece in manifest.pieces(prepared.text):
+        for piece in inputs.pieces(prepared.text):
             log.begin(clock.unix_us(), session.encode(piece))
         loop = Loop(
             prepared.companion(session, clock.monotonic_s),

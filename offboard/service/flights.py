@@ -108,7 +108,7 @@ class Flights:
 
     @property
     def state(self) -> FlightState:
-        return self.current.state
+        return self.current
 
     @property
     def phase(self) -> Phase:

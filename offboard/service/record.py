@@ -20,7 +20,7 @@ from contextlib import suppress
 from itertools import chain, count
 from pathlib import Path
 
-from offboard.flight import manifest
+from offboard.flight import inputs
 from offboard.link import clock
 from offboard.link.background import BackgroundWriter
 from offboard.link.log import CLOSE_S, QUEUED_MAX, FlightLog, LogError, append, entry
@@ -195,8 +195,8 @@ class Recorder:
         self._flight = flight = FlightRecord(directory, configuration, vehicle)
         now_us = clock.unix_us()
         assert session.vehicle is not None
-        found = manifest.vehicle_record(session.vehicle)
-        for piece in (*manifest.pieces(configuration), found):
+        found = inputs.vehicle_record(session.vehicle)
+        for piece in (*inputs.pieces(configuration), found):
             flight.write(now_us, session.encode(piece))
         earlier = {record for _, record in self._before}
         for record in self._once.values():

@@ -69,7 +69,8 @@ def failsafe_markdown() -> str:
     lines = ["| row | what is measured | limit | held for | then |", "|---|---|---|---|---|"]
     for row in ROWS:
         then = row.action.name.lower()
-        lines.append(f"| {row.name} | {row.measured} | {row.limit} | {row.held_s:g} s | {then} |")
+        measured = " ".join((row.condition.__doc__ or "").partition(".")[0].split())
+        lines.append(f"| {row.name} | {measured} | {row.limit} | {row.held_s:g} s | {then} |")
     return "\n".join(lines)
 
 

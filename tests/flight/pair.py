@@ -147,7 +147,7 @@ class Pair:
     def _take(self, output: Any) -> None:
         self.sent.extend((self.time_s, self.companion.phase, frame) for frame in output.send)
         self.leaving += self.up(self.time_s, list(output.send))
-        failsafe = self.companion.state.failsafe
+        failsafe = self.companion.current.failsafe
         if failsafe.row:
             self.failsafes[failsafe.row] = failsafe.action
         if self.clock.now_s <= self.host_s:
@@ -192,7 +192,7 @@ class Pair:
     @property
     def heard_s(self) -> float:
         """Time of the newest telemetry."""
-        return self.time_s - self.companion.state.silence_s
+        return self.time_s - self.companion.current.silence_s
 
     # -- what a test may ask afterwards -----------------------------------------------------------
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import threading
 import time
 from dataclasses import replace
@@ -17,6 +18,27 @@ from offboard.flight.preflight import Level
 from offboard.mavlink.session import SessionSettings
 from offboard.run.configuration import load
 from offboard.run.flight import Connection
+
+README = Path(__file__).parents[2] / "offboard" / "doctor" / "README.md"
+
+
+def test_checks_of_other_packages_are_rows_and_broken_ones_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The one that the README shows; one that cannot be imported; one named as one of ours."""
+    (code,) = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+    (tmp_path / "site_checks.py").write_text(code)
+    metadata = tmp_path / "site_checks-1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: site_checks\nVersion: 1.0\n")
+    points = "ceiling = site_checks:ceiling\ngone = no_such_module:check\ngps = json:loads\n"
+    (metadata / "entry_points.txt").write_text(f"[{run.GROUP}]\n{points}")
+    monkeypatch.syspath_prepend(tmp_path)
+    seen = bench().listen()
+    rows = {row.check: row for row in run.examine(run.names(["ceiling", "gone", "gps"]), seen)}
+    assert rows["ceiling"].findings[0].hint == "--set limits.ceiling_m=6"
+    assert "ModuleNotFoundError" in rows["gone"].findings[0].found
+    assert rows["gps"].level is Level.OK
 
 
 def test_the_command_ends_in_time_although_nothing_of_it_does(

@@ -29,7 +29,7 @@ def like_arducopter(personality: str, *assignments: str) -> Pair:
     off = np.array([2.4, 0.0, 0.0])
 
     def step(flying: Pair) -> None:
-        state = flying.companion.state
+        state = flying.companion
         state.plan.follow_jump(state.time_s, off)
 
     pair.at.append((in_phase(Phase.TRACK, 2.0), step))

@@ -32,7 +32,7 @@ def on_a_link_that_becomes_late(direction: str, added_s: float) -> tuple[Pair, l
 
     def note(flying: Pair) -> bool:
         if begun:
-            limit = flying.companion.state.controller.bandwidth_radps
+            limit = flying.companion.controller.bandwidth_radps
             if not limits or limits[-1][1] != limit:
                 limits.append((flying.time_s - begun[0], limit))
         return False
@@ -85,8 +85,8 @@ def flown_at(
     rmse_m = pair.score(directory).rmse_position_m
     return (
         rmse_m,
-        pair.companion.state.model.tilt.delay_s,
-        pair.companion.state.clock.growth.added_s,
+        pair.companion.model.tilt.delay_s,
+        pair.companion.clock.growth.added_s,
     )
 
 

@@ -84,8 +84,8 @@ def flown(law: str, tmp_path: Path, *assignments: str) -> tuple[np.ndarray, np.n
         advance()
         companion = pair.companion
         if companion.phase in (Phase.CLIMB, Phase.JOIN, Phase.TRACK, Phase.HOVER):
-            plan = companion.state.plan
-            times.append(plan.track_time_s(companion.state.time_s))
+            plan = companion.plan
+            times.append(plan.track_time_s(companion.time_s))
             truth = np.array(pair.instance.autopilot.state.truth.position_ned_m)
             places.append(truth - plan.origin_ned_m)
 

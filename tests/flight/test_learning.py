@@ -125,7 +125,7 @@ def test_slow_thrust_is_identified(tmp_path: Path):
     )
     pair.track()
     assert pair.score(tmp_path).rmse_position_m < 0.06
-    model = pair.companion.state.model
+    model = pair.companion.model
     effect_s = model.thrust_delay_s + model.thrust_lag_s
     assert effect_s == pytest.approx(flies.thrust_delay_s + 0.5, abs=0.1)
 
@@ -136,7 +136,7 @@ def test_steps_stay_in_the_box_and_what_they_show_is_announced_and_recorded():
 
     def look(now: Pair) -> bool:
         if now.companion.phase is Phase.EXCITE:
-            position = now.companion.state.vehicle.position
+            position = now.companion.vehicle.position
             assert position is not None
             away.append(np.linalg.norm(np.array(position.position_ned_m) - [0.0, 0.0, -3.0]))
         return False

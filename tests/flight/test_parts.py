@@ -1,4 +1,4 @@
-"""The gate, the parameters before the flight, the manifest, and the records in the log."""
+"""The gate, the parameters before the flight, the configuration, and the records in the log."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pair import calm_hover, hover
 from offboard import compiled
 from offboard.compiled import Entry
 from offboard.control.base import Situation
-from offboard.flight import manifest, outbox
+from offboard.flight import inputs, outbox
 from offboard.flight.phases import Limits
 from offboard.flight.preflight import Ground, ParameterReading, not_ready, refusals
 from offboard.flight.setpoint import clamp, usable
@@ -135,23 +135,23 @@ def test_what_a_horizon_calls_near_a_volume_was_loaded_at_the_rehearsal(
 def test_manifest_round_trip(length: int) -> None:
     source = random.Random(length)
     text = "".join(chr(source.randrange(32, 500)) for _ in range(length))
-    records = manifest.pieces(text)
+    records = inputs.pieces(text)
     assert all(len(record.data) <= 128 for record in records)
-    assert manifest.join(record.data for record in records) == text
+    assert inputs.join(record.data for record in records) == text
 
 
 def test_a_damaged_manifest_is_none() -> None:
     source = random.Random(1)
     text = "".join(chr(source.randrange(32, 500)) for _ in range(1000))
-    payloads = [record.data for record in manifest.pieces(text)]
+    payloads = [record.data for record in inputs.pieces(text)]
     assert len(payloads) > 3
-    assert manifest.join(payloads) == text
-    assert manifest.join(payloads[1:]) is None
-    assert manifest.join(payloads[:-1]) is None
-    assert manifest.join([]) is None
-    assert manifest.join([b"", b"\1"]) is None
-    assert manifest.join([b"\0\0\1\0 not compressed"]) is None
-    assert manifest.join([*payloads[:2], payloads[2][:-3] + b"???", *payloads[3:]]) is None
+    assert inputs.join(payloads) == text
+    assert inputs.join(payloads[1:]) is None
+    assert inputs.join(payloads[:-1]) is None
+    assert inputs.join([]) is None
+    assert inputs.join([b"", b"\1"]) is None
+    assert inputs.join([b"\0\0\1\0 not compressed"]) is None
+    assert inputs.join([*payloads[:2], payloads[2][:-3] + b"???", *payloads[3:]]) is None
 
 
 def test_records_are_not_sent_and_no_sequence_has_a_gap() -> None:
@@ -169,7 +169,7 @@ def test_records_are_not_sent_and_no_sequence_has_a_gap() -> None:
 
 def test_a_message_that_cannot_be_encoded_does_not_stop_the_later_ones() -> None:
     """Here a command without a vehicle. The loop then asks for a landing."""
-    flight = hover().companion.state
+    flight = hover().companion
     outbox.send(flight, CommandLong.arm())
     with pytest.raises(ValueError, match="no vehicle"):
         outbox.flush(flight)

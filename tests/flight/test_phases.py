@@ -143,7 +143,7 @@ EVENTS: dict[str, Setup] = {
     "ready": _fit,
     "usable": _fit,
     "refused": lambda flight: vars(flight.session).update(refusals=["no multirotor"]),
-    "armed_by_another": _all(
+    "armed_already": _all(
         partial(heartbeat, armed=True, mode="POSCTL"), _set(limits=Limits(begin_armed=False))
     ),
     "rebooted": _set(rebooted=True),
@@ -187,6 +187,7 @@ EVENTS: dict[str, Setup] = {
     "not_disarmed": _set(began_s=NOW_S - Limits().land_s - 0.1),
     "blind": _age_attitude,
     "stop_requested": _stop,
+    "stopped_before_takeoff": _stop,
     "stop_requested_on_ground": _all(_rest, _set(stop_reason="stop requested")),
     "rises": _lift_off,
     "engaged_by_pilot": _all(partial(_engage, engaged=True), _fit),

@@ -262,7 +262,7 @@ def test_a_load_that_full_thrust_does_not_carry_is_landed(fly: Fly) -> None:
     flown into the ground so, with 45 degrees of tilt."""
     pair = fly(HIGH)
     plant = pair.instance.autopilot.plant
-    scale = 1.1 / pair.companion.state.model.hover_thrust
+    scale = 1.1 / pair.companion.model.hover_thrust
     pair.at.append((in_phase(Phase.TRACK, 1.0), lambda flying: plant.scale_mass(scale)))
     outcome = pair.fly()
     assert outcome.exit_code == ExitCode.ABORTED
@@ -283,7 +283,7 @@ def test_in_the_air_it_never_falls(scenario: str, fly: Fly) -> None:
     pair = fly(HIGH, scenario=low)
     watch = watched(pair)
     pair.fly()
-    hover = pair.companion.state.model.hover_thrust
+    hover = pair.companion.model.hover_thrust
     assert not pair.went_through(Phase.TAKEOFF)
     assert pair.went_through(Phase.TRACK)
     assert min(setpoint.thrust for _, _, setpoint in pair.setpoints) > hover / 3.0 - 1e-6
@@ -361,7 +361,7 @@ def test_an_empty_battery_ends_the_flight(on: str, then: str, tmp_path: Path) ->
 def test_a_vehicle_without_thrust_reserve_is_landed(share: float, fly: Fly) -> None:
     """Heavier than its file, it is identified; then a load in track, with which it hovers with this
     share of its thrust."""
-    scale = float(np.sqrt(share / fly().companion.state.model.hover_thrust))
+    scale = float(np.sqrt(share / fly().companion.model.hover_thrust))
     heavier = scenario_of(conditions={"mass_scale": scale})
     pair = fly(HIGH, scenario=heavier, learning=IdentifySettings())
     plant = pair.instance.autopilot.plant
@@ -379,7 +379,7 @@ def test_a_vehicle_without_thrust_reserve_is_landed(share: float, fly: Fly) -> N
 @FROM_THE_GROUND
 def test_a_load_that_is_only_believed_does_not_end_the_take_off(fly: Fly) -> None:
     """An earlier flight has identified the vehicle with a load that it does not carry any more."""
-    file = fly().companion.state.model
+    file = fly().companion.model
     pair = fly(believed=file.model_copy(update={"hover_thrust": 0.93}))
     assert pair.fly().exit_code == ExitCode.FLOWN
     assert "thrust reserve" not in pair.failsafes
@@ -498,7 +498,7 @@ def test_a_landing_is_judged_by_the_ground_where_a_reset_has_moved_it(
     reset = {"fault": "estimator_jump", "offset_ned_m": (0.0, 0.0, -climbs_m), **moment}
     pair = fly(scenario=scenario_of(reset))
     assert pair.fly() == Outcome(ExitCode.FLOWN, "flown and landed")
-    assert pair.companion.state.contact.height_m == pytest.approx(0.0, abs=0.1)
+    assert pair.companion.contact.height_m == pytest.approx(0.0, abs=0.1)
     assert pair.score(tmp_path).ended_by == "reference over"
 
 

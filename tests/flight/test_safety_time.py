@@ -75,7 +75,7 @@ def test_a_link_that_becomes_late_ends_in_hold_and_landing(scenario: str, fly: F
         Phase.TRACK, Phase.HOLD, Phase.LAND, Phase.DISARMED,
     ]  # fmt: skip
     assert pair.failsafes == {"age": Action.LEVEL, "link": Action.HOLD}
-    dialect = pair.companion.state.dialect
+    dialect = pair.companion.current.dialect
     assert dialect is not None
     hold = dialect.hold().parameters[1:3]
     assert hold in [(m.param2, m.param3) for m in pair.commands(SET_MODE)]

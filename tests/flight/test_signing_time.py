@@ -167,7 +167,7 @@ def test_the_wrong_key_is_named_when_no_vehicle_is_found() -> None:
 
 def test_a_vehicle_that_reboots_with_its_old_stamps_is_heard_again() -> None:
     pair = signed_hover()
-    session: Any = pair.companion.state.session
+    session: Any = pair.companion.session
     session._signing.offset = 10**12  # our clock is right, the vehicle's is years behind
     pair.at.append((in_phase(Phase.HEALTH, 1.0), lambda p: p.instance.reboot(0.5)))
     pair.at.append((in_phase(Phase.STREAM), lambda p: pytest.fail("it was not rebooted")))
@@ -175,7 +175,7 @@ def test_a_vehicle_that_reboots_with_its_old_stamps_is_heard_again() -> None:
         pair.advance()
     pair.at.clear()
     until(pair, Phase.ARM)
-    assert pair.companion.state.session.counters.forged > 0
+    assert pair.companion.session.counters.forged > 0
 
 
 def test_two_vehicles_on_one_link_are_named() -> None:
@@ -192,5 +192,5 @@ def test_two_vehicles_on_one_link_are_named() -> None:
         outcome.sentence
     )
     chosen = hover(down=both)
-    chosen.companion.state.session.senders = Senders(1, 191, has_key=False)
+    chosen.companion.session.senders = Senders(1, 191, has_key=False)
     until(chosen, Phase.ARM)

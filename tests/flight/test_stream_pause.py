@@ -20,7 +20,7 @@ class Paused:
     stream: what arrives meanwhile may have arrived at any time since the turn before."""
 
     def __init__(self, companion: Flight) -> None:
-        session = companion.state.session
+        session = companion.session
         session.settings = replace(session.settings, stream=True)
         self._companion = companion
         self._waiting: list[Chunk] = []

@@ -231,7 +231,7 @@ def test_nothing_leaves_after_a_take_over(take_over: TakeOver) -> None:
     assert watch.after == []
     assert watch.again == []
     if watch.gone_s is not None and acted:
-        standing = pair.companion.state.authority.standing
+        standing = pair.companion.authority.standing
         assert standing is Standing.LOST or take_over.mode is None
 
 

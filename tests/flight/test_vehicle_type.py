@@ -20,7 +20,7 @@ NOT_FLOWN = "the vehicle is a FIXED_WING; offboard flies multirotors"
 
 
 def heli() -> Vehicle:
-    return hover().companion.state.model.model_copy(update={"airframe": "helicopter"})
+    return hover().companion.model.model_copy(update={"airframe": "helicopter"})
 
 
 @pytest.mark.parametrize(

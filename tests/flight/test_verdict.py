@@ -23,8 +23,8 @@ from offboard.analysis.score import Score, judged, score
 from offboard.analysis.score_table import summary, verdict
 from offboard.cli.commands import app
 from offboard.flight.flight import Outcome
+from offboard.flight.ground_contact import Touchdown
 from offboard.flight.phases import PHASE_CODES, Phase
-from offboard.flight.touchdown import Touchdown
 from offboard.identification.learner import IdentifySettings
 from offboard.link.log import FlightLog
 from offboard.model.frames import thrust_direction_from_quaternion

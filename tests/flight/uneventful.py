@@ -9,9 +9,9 @@ import numpy as np
 
 from offboard.flight.authority import Authority
 from offboard.flight.flight_plan import FlightPlan
+from offboard.flight.ground_contact import Touchdown
 from offboard.flight.phases import Limits, Phase, ServiceOptions
 from offboard.flight.state import FlightState
-from offboard.flight.touchdown import Touchdown
 from offboard.mavlink.dialects.px4 import PX4
 from offboard.mavlink.events import Attitude, Event, Heartbeat, Landed, LocalPosition
 from offboard.run import configuration

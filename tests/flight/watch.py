@@ -80,7 +80,7 @@ class Watch:
         position = np.array(truth.position_ned_m)
         vehicle_s = autopilot.state.time_s + 1e-6 * self.pair.instance.view.clock_offset_us
         tracked = companion.phase in TRACKING
-        wanted = companion.state.plan.sample(vehicle_s) if tracked else None
+        wanted = companion.current.plan.sample(vehicle_s) if tracked else None
         error = np.nan if wanted is None else np.linalg.norm(position - wanted.position_ned_m)
         return Moment(
             time_s,
@@ -133,7 +133,7 @@ def watched(pair: Pair) -> Watch:
 
 
 def engage_mode(pair: Pair) -> str:
-    dialect = pair.companion.state.dialect
+    dialect = pair.companion.current.dialect
     assert dialect is not None
     return dialect.engage_mode
 

@@ -25,7 +25,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from offboard.analysis import history, tlog
 from offboard.analysis.score import keep_score, score_flight
 from offboard.documents.signing_key import create_key
-from offboard.flight import manifest
+from offboard.flight import inputs
 from offboard.flight.record import RECORD_COMPONENT_ID
 from offboard.link.log import LogError
 from offboard.run import flight as run
@@ -231,7 +231,7 @@ def test_a_configuration_that_unpacks_to_gigabytes_is_refused(
     offboard: Call, tmp_path: Path
 ) -> None:
     """Here to 40 MB, by a thousand times as many as its bytes."""
-    packed = manifest.pieces(40_000_000 * " ")
+    packed = inputs.pieces(40_000_000 * " ")
     codec = dialect.MAVLink(None, srcSystem=1, srcComponent=RECORD_COMPONENT_ID)
     log = io.BytesIO()
     for piece in packed:

@@ -18,6 +18,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from offboard.analysis.history import record_type
 from offboard.analysis.tlog import LoggedMessage
+from offboard.flight.inputs import CONFIGURATION_TYPE as MANIFEST
 from offboard.flight.inputs import (
     Call,
     FramesDropped,
@@ -25,7 +26,6 @@ from offboard.flight.inputs import (
     OtherDatagrams,
     TurnInput,
 )
-from offboard.flight.manifest import PAYLOAD_TYPE as MANIFEST
 from offboard.flight.record import RECORD_COMPONENT_ID
 from offboard.link.interface import Chunk
 from offboard.link.log import entry

@@ -17,7 +17,7 @@ from offboard.analysis.history import record_type
 from offboard.cli.commands import app
 from offboard.control.base import Controller, Decision, Situation
 from offboard.control.law import PsoLaw
-from offboard.flight import actions, inputs, manifest
+from offboard.flight import actions, inputs
 from offboard.flight.flight import Output
 from offboard.flight.phases import Phase
 from offboard.flight.state import FlightState
@@ -194,7 +194,7 @@ def logged(pair: Pair, path: Path) -> Path:
     resolved = configuration.load("flight", choices={"reference": "hover"}, assignments=SHORT,
                                   known_vehicle="px4_sih")  # fmt: skip
     session = Session(SessionSettings(record_component_id=192))
-    pieces = [session.encode(piece) for piece in manifest.pieces(configuration.dump(resolved))]
+    pieces = [session.encode(piece) for piece in inputs.pieces(configuration.dump(resolved))]
     frames = [*pieces, *pair.logged]
     path.write_bytes(b"".join(entry(UNIX_EPOCH_US + 100 * n, f) for n, f in enumerate(frames)))
     return path

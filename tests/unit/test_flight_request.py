@@ -15,8 +15,6 @@ from offboard.run.flight import Simulated
     [
         ({}, "neutral"),
         ({"firmware": "px4"}, "px4_sih"),
-        ({"firmware": "ardupilot"}, "arducopter"),
-        ({"firmware": "px4", "choices": {"vehicle": "neutral"}}, "neutral"),
         ({"firmware": "px4", "assignments": ("vehicle=neutral",)}, "neutral"),
         ({"firmware": "ardupilot", "name": "paper"}, "px4_sih"),
         ({"choices": {"vehicle": "arducopter"}}, "arducopter"),

@@ -40,12 +40,12 @@ def test_an_outage_of_the_whole_link_does_not_count_as_age() -> None:
     assert state.position_age_s == pytest.approx(0.0)
 
 
-@pytest.mark.parametrize("interval_s", [0.05, 0.2, 0.31, 0.4, 0.9])
-def test_a_stopped_stream_is_detected_at_any_rate_of_the_other(interval_s: float) -> None:
-    for stopped in ("position", "attitude"):
-        state = hovering()
-        going = attitude if stopped == "position" else position
-        for time_s in 10.0 + np.arange(1, 11) * interval_s:
-            state.update(going(time_s), time_s)
-        age_s = getattr(state, f"{stopped}_age_s")
-        assert age_s >= 10 * interval_s - interval_s - 1e-9
+@pytest.mark.parametrize("interval_s", [0.05, 0.31, 0.9])
+@pytest.mark.parametrize("stopped", ["position", "attitude"])
+def test_a_stopped_stream_is_detected_at_any_rate_of_the_other(
+    stopped: str, interval_s: float
+) -> None:
+    state, going = hovering(), attitude if stopped == "position" else position
+    for time_s in 10.0 + np.arange(1, 11) * interval_s:
+        state.update(going(time_s), time_s)
+    assert getattr(state, f"{stopped}_age_s") >= 9 * interval_s - 1e-9
