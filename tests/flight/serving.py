@@ -20,7 +20,7 @@ from pair import (
 )
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from offboard.flight.phases import Anchor, Phase, ServiceOptions, Then
+from offboard.flight.phases import TRACKING, Anchor, Phase, ServiceOptions, Then
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.identification.learner import IdentifiedVehicle
 from offboard.mavlink.session import Session, SessionSettings
@@ -153,10 +153,6 @@ class Serving(Pair):
         return self.service.phase
 
     @property
-    def mode(self) -> str:
-        return str(self.instance.autopilot.commander.mode.name)
-
-    @property
     def paused(self) -> bool:
         """The process of the service is stopped."""
         return self.clock.now_s > HOST_EPOCH_S + self.time_s
@@ -167,6 +163,11 @@ class Serving(Pair):
 
     def switch(self, to: str) -> None:
         self.ground(SET_MODE, *MODES[self.firmware][to])
+
+    def engage(self) -> None:
+        """The pilot switches to our mode, and we fly."""
+        self.switch("engage")
+        self.until(lambda: self.phase in TRACKING, 3.0)
 
     def fly_up(self, height_m: float = 3.0) -> None:
         """The pilot takes off and holds; the service waits."""

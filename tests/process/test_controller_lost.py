@@ -1,6 +1,7 @@
 """A controller that is killed, stopped or hangs in flight: the supervisor lands the vehicle.
 
-Real processes in real time, each over another kind of link. The log says what was asked of the
+Real processes in real time, each over another kind of link; one that is stopped also in
+`flight/test_supervisor.py`. The log says what was asked of the
 vehicle; the simulated autopilot, which is another program, that it obeyed and landed.
 """
 
@@ -16,9 +17,8 @@ import subprocess
 import threading
 import time
 import tty
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from processes import SHORT, Spawn, children, free_port, hovering
@@ -54,37 +54,25 @@ class Hangs:
 """
 
 
-@pytest.fixture
-def cable() -> Iterator[Callable[[int], str]]:
-    """A serial line to a TCP port: a pseudo-terminal and a thread."""
-    ends: list[Any] = []
+def cable(port: int) -> str:
+    """A serial line to a TCP port, until the process ends: a pseudo-terminal and a thread."""
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    other = socket.create_connection(("127.0.0.1", port))
 
-    def lay(port: int) -> str:
-        master, slave = pty.openpty()
-        tty.setraw(slave)
-        other = socket.create_connection(("127.0.0.1", port))
-        ends.extend((master, slave, other))
-        threading.Thread(target=carry, args=(master, other), daemon=True).start()
-        return f"serial:{os.ttyname(slave)}:921600"
-
-    yield lay
-    for end in ends[::-1]:
-        end.close() if isinstance(end, socket.socket) else os.close(end)
-
-
-def carry(master: int, other: socket.socket) -> None:
-    while True:
-        try:
+    def carry() -> None:
+        while True:
             ready = select.select([master, other], [], [])[0]
             if master in ready:
                 other.sendall(os.read(master, 65536))
             if other in ready:
                 os.write(master, other.recv(65536))
-        except (OSError, ValueError):  # closed at the end of the test
-            return
+
+    threading.Thread(target=carry, daemon=True).start()
+    return f"serial:{os.ttyname(slave)}:921600"
 
 
-def connections(spawn: Spawn, kind: str, directory: Path, cable: Any = None) -> str:
+def connections(spawn: Spawn, kind: str, directory: Path) -> str:
     """Start a simulator, whose vehicle hovers; the address at which it can be flown."""
     port = free_port()
     listens = kind != "udp"
@@ -111,26 +99,19 @@ def tracking(spawn: Spawn, connection: str, *arguments: str, **more: str) -> sub
     raise AssertionError(flight.communicate()[1])
 
 
+def eventually(holds: Callable[[], object]) -> None:
+    deadline_s = time.monotonic() + LONG_S
+    while not holds():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.02)
+
+
 def ended(pid: int) -> bool:
     """Whether a process has ended; one that nobody waits for has too."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
     except OSError:
         return True
-
-
-def await_end(pid: int) -> None:
-    deadline_s = time.monotonic() + LONG_S
-    while not ended(pid):
-        assert time.monotonic() < deadline_s, f"process {pid} has not ended"
-        time.sleep(0.02)
-
-
-def await_text(log: Path, text: bytes) -> None:
-    deadline_s = time.monotonic() + LONG_S
-    while text not in log.read_bytes():
-        assert time.monotonic() < deadline_s, f"the log does not hold {text!r}"
-        time.sleep(0.02)
 
 
 def story(log: tlog.Tlog) -> list[str]:
@@ -152,7 +133,7 @@ def test_a_killed_controller_is_survived(spawn: Spawn, tmp_path: Path) -> None:
     flight = tracking(spawn, connections(spawn, "udp", tmp_path))
     (supervisor,) = children(flight.pid)
     flight.kill()
-    await_end(supervisor)
+    eventually(lambda: ended(supervisor))
     _, said = flight.communicate()
     assert said.splitlines()[0] == (
         "offboard supervisor: taking over: the controller ended in flight"
@@ -161,20 +142,18 @@ def test_a_killed_controller_is_survived(spawn: Spawn, tmp_path: Path) -> None:
     log = tlog.read(tmp_path / "x" / "flight.tlog")
     assert story(log) == ["hold", "land", "disarmed"]
     kept = tmp_path / "x" / "score.json"  # by a process that the supervisor begins
-    deadline_s = time.monotonic() + LONG_S
-    while not kept.exists():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.05)
+    eventually(kept.exists)
     score = json.loads(kept.read_text())
     assert (score["completed"], score["ended_by"]) == (0.0, "supervisor")
     assert score["reason"] == "supervisor: taking over: the controller ended in flight"
 
 
+@pytest.mark.slow
 def test_a_stopped_controller_that_continues_sends_nothing(spawn: Spawn, tmp_path: Path) -> None:
     flight = tracking(spawn, connections(spawn, "tcp", tmp_path))
     flight.send_signal(signal.SIGSTOP)
     path = tmp_path / "x" / "flight.tlog"
-    await_text(path, b"hold requested")
+    eventually(lambda: b"hold requested" in path.read_bytes())
     flight.send_signal(signal.SIGCONT)
     _, said = flight.communicate(timeout=LONG_S)
     assert flight.returncode == 4
@@ -189,9 +168,8 @@ def test_a_stopped_controller_that_continues_sends_nothing(spawn: Spawn, tmp_pat
     assert max(setpoints_us) < taken_us
 
 
-def test_an_endless_loop_in_a_law(
-    spawn: Spawn, cable: Callable[[int], str], tmp_path: Path
-) -> None:
+@pytest.mark.slow
+def test_an_endless_loop_in_a_law(spawn: Spawn, tmp_path: Path) -> None:
     """It begins when the file `hang` exists."""
     site = tmp_path / "site"
     metadata = site / "hangs-1.0.dist-info"
@@ -202,13 +180,13 @@ def test_an_endless_loop_in_a_law(
     )
     (site / "law_that_hangs.py").write_text(LAW_THAT_HANGS)
     modules = os.pathsep.join(filter(None, (str(site), os.environ.get("PYTHONPATH"))))
-    connection = connections(spawn, "serial", tmp_path, cable)
+    connection = connections(spawn, "serial", tmp_path)
     flight = tracking(spawn, connection, "--controller", "hangs", PYTHONPATH=modules)
     (supervisor,) = children(flight.pid)
     (tmp_path / "hang").touch()
     path = tmp_path / "x" / "flight.tlog"
-    await_text(path, b"land requested")
+    eventually(lambda: b"land requested" in path.read_bytes())
     assert flight.poll() is None  # it hangs for ever
     flight.send_signal(signal.SIGSTOP)  # which needs no processor
-    await_end(supervisor)
+    eventually(lambda: ended(supervisor))
     assert story(tlog.read(path)) == ["hold", "land", "disarmed"]
