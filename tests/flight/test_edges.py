@@ -27,7 +27,7 @@ from offboard.link.log import FlightLog
 from offboard.link.stop import StopRequests
 from offboard.mavlink.counters import Counters
 from offboard.mavlink.framing import FrameSplitter
-from offboard.run.loop import UNGUARDED, Loop
+from offboard.run.loop import ANSWERS, UNANSWERED, UNGUARDED, Loop
 from offboard.supervisor.supervisor import SupervisorError
 
 FLOWN = Outcome(0, "flown and landed")
@@ -100,14 +100,14 @@ class Brief:
 
 
 class Watcher:
-    """A supervisor that takes over when it is told to."""
+    """A supervisor that takes over, or does not answer, when it is told to."""
 
-    loaded, taken, lost, restarts = True, False, False, 0
+    loaded, taken, lost, answers, restarts = True, False, False, True, 0
     said = ("taking over: the controller has not answered for 0.6 s", "it is disarmed")
 
     @property
     def guards(self) -> bool:
-        return not self.lost
+        return self.answers and not self.lost
 
     def restart(self) -> None:
         self.restarts += 1
@@ -226,6 +226,23 @@ def test_what_a_turn_decided_does_not_leave_after_a_take_over(tmp_path: Path) ->
     outcome = fly(flight, tmp_path, link=link, supervisor=watcher)
     assert link.sent == [setpoint(2)]
     assert outcome == Outcome(4, f"supervisor: {'; '.join(watcher.said)}")
+
+
+@pytest.mark.parametrize("phase", [Phase.HEALTH, Phase.TRACK])
+def test_a_supervisor_that_does_not_answer_is_announced_once_and_when_it_does(
+    phase: Phase, tmp_path: Path
+) -> None:
+    guarded: list[bool] = []
+
+    def stop_and_continue(left: int) -> None:
+        guarded.append(flight.guarded)
+        watcher.answers = left not in (6, 5, 4)
+
+    flight, watcher = Brief(9, stop_and_continue), Watcher()
+    flight.phase = phase
+    assert fly(flight, tmp_path, supervisor=watcher) == FLOWN
+    assert flight.announced == [UNANSWERED, ANSWERS]
+    assert guarded == [True] * 3 + [False] * 3 + [True] * 3
 
 
 @pytest.mark.parametrize(("phase", "restarts"), [(Phase.STANDBY, [4.0, 16.0]), (Phase.TRACK, [])])

@@ -34,7 +34,7 @@ from offboard.mavlink.events import VehicleFound
 from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.signing import Signing
-from offboard.run.loop import ANSWERS, UNANSWERED, Loop
+from offboard.run.loop import Loop
 from offboard.supervisor.supervisor import Supervised, Supervisor, SupervisorError
 
 LONG_S = 20.0
@@ -225,58 +225,25 @@ def test_a_stopped_controller_leaves_the_answers_to_the_supervisor(
     assert "COMMAND_LONG" not in [each.get_type() for each in rig.heard()]
 
 
-class Announcing(Beating):
-    """On the ground, then in flight: stops the supervisor for as long as the loop does not say that
-    it does not answer. `said_s`: how long that took, and how long its return."""
+def test_one_that_is_stopped_does_not_guard_until_it_continues(rig: Rig) -> None:
+    """Within two seconds, on the ground and in flight, where it does not take over. The loop
+    announces it: see test_edges.py."""
 
-    def __init__(self, rig: Rig) -> None:
-        super().__init__(rig.peer)
-        self._pid = rig.supervisor.pid
-        self._changed_s = clock.monotonic_s()
-        self.announced: list[str] = []
-        self.guarded: list[bool] = []
-        self.said_s: list[float] = []
+    def beat_until(guards: bool, guard: Supervised) -> float:
+        began_s = clock.monotonic_s()
+        while rig.supervisor.guards is not guards:
+            assert clock.monotonic_s() < began_s + LONG_S
+            rig.beat(guard)
+            time.sleep(0.02)
+            rig.supervisor.has_taken_over()  # reads its answer
+        return clock.monotonic_s() - began_s
 
-    @property
-    def in_flight(self) -> bool:
-        return len(self.said_s) >= 2
-
-    def turn(self, chunks: Sequence[Chunk], now_s: float) -> Output:
-        self.phase = Phase.TRACK if self.in_flight else Phase.HEALTH
-        return Output(supervised=now(OURS if self.in_flight else ON_GROUND))
-
-    def guard(self, guarded: bool) -> None:
-        if [guarded] != self.guarded[-1:]:
-            self.guarded.append(guarded)
-            self._signal(signal.SIGSTOP if guarded else 0)
-
-    def announce(self, sentence: str) -> None:
-        self.announced.append(sentence)
-        self.said_s.append(clock.monotonic_s() - self._changed_s)
-        self._signal(signal.SIGCONT if sentence == UNANSWERED else 0)
-
-    def _signal(self, number: int) -> None:
-        if number and not self.has_ended():
-            self._changed_s = clock.monotonic_s()
-            os.kill(self._pid, number)
-
-    def has_ended(self) -> bool:
-        return len(self.said_s) >= 4 or clock.monotonic_s() - self._changed_s > LONG_S
-
-
-def test_one_that_is_stopped_is_announced_within_a_second_and_when_it_answers_again(
-    rig: Rig,
-) -> None:
-    """Once each, on the ground and in flight, where it does not take over."""
-    flown: Any = Announcing(rig)
-    with StopRequests() as requested:
-        Loop(
-            flown, rig.link, rig.log, stops=requested, progress=id, supervisor=rig.supervisor
-        ).run()
-    assert flown.announced == [UNANSWERED, ANSWERS] * 2
-    assert flown.guarded == [True, False, True, False, True]
-    assert all(0.9 < said_s < 2.0 for said_s in flown.said_s[::2])
-    assert all(said_s < 1.0 for said_s in flown.said_s[1::2])
+    for guard in (ON_GROUND, OURS):
+        beat_until(True, guard)
+        os.kill(rig.supervisor.pid, signal.SIGSTOP)
+        assert 0.9 < beat_until(False, guard) < 2.0
+        os.kill(rig.supervisor.pid, signal.SIGCONT)
+        assert beat_until(True, guard) < 1.0
     assert not rig.supervisor.has_taken_over()
 
 

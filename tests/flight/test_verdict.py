@@ -203,39 +203,6 @@ def test_thinned_telemetry_does_not_lower_the_error(flown: History) -> None:
     assert gap.position_gap_max_s == pytest.approx(0.4, abs=0.02)
 
 
-def jumped(flown: History, by_s: float, *, reference_too: bool) -> History:
-    """The flight with the vehicle's clock jumping in the middle of the track."""
-    moment_s = track_begin_s(flown) + 1.5
-    tables = {}
-    for name in ("position", "attitude", "truth", "reference", "setpoint", "landed", "heartbeat"):
-        rows = getattr(flown, name).copy()
-        rows["time_s"][rows["time_s"] > moment_s] += by_s
-        tables[name] = rows
-    records = flown.records.copy()
-    late = records["time_s"] > moment_s
-    if reference_too:
-        records["track_time_s"][late] += by_s
-    records["time_s"][late] += by_s
-    phases = tuple(
-        replace(event, time_s=event.time_s + (by_s if event.time_s > moment_s else 0.0))
-        for event in flown.phases
-    )
-    return replace(flown, **tables, records=records, phases=phases)
-
-
-def test_a_jump_of_the_clock_is_not_tracked(flown: History) -> None:
-    """Where the reference jumps too, a part of it was not flown. Where it does not, nothing is
-    missing, and the error is that of the flight without the jump."""
-    whole, by_s = score(flown), 35.0
-    stepped = score(jumped(flown, by_s, reference_too=True))
-    assert stepped.completed == 0.0
-    assert stepped.ended_by == f"{by_s + 0.1:.1f} s of the reference were not tracked"
-    assert stepped.tracked_s == pytest.approx(whole.tracked_s - 0.1, abs=0.02)
-    steady = score(jumped(flown, by_s, reference_too=False))
-    assert (steady.completed, steady.tracked_s) == (1.0, whole.tracked_s)
-    assert steady.rmse_position_m == pytest.approx(whole.rmse_position_m, rel=0.01)
-
-
 def test_stretch_that_is_too_short_to_be_scored_is_not_flown(tmp_path: Path) -> None:
     """One tick at full speed has no figures of the tracking."""
     table = tmp_path / "short.csv"
