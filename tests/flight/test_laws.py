@@ -215,7 +215,7 @@ def swing(personality: str, *assignments: str) -> tuple[float, float]:
     return float(np.linalg.norm(away, axis=1).max()), float(np.abs(rates).max())
 
 
-@pytest.mark.parametrize("personality", ["px4", "ardupilot"])
+@pytest.mark.parametrize("personality", [pytest.param("px4", marks=pytest.mark.slow), "ardupilot"])
 def test_settles_after_a_step_of_the_reference(personality: str) -> None:
     away_m, rate_radps = swing(personality)
     assert away_m < 0.005

@@ -198,11 +198,13 @@ def test_a_second_flight_is_refused_and_the_first_flies_on(moment: Any, on: Vehi
 @BOTH
 def test_a_second_companion_of_other_ids_shows_by_what_it_does(on: Vehicle) -> None:
     """Its setpoints are not on our link: the vehicle no longer follows ours, and is landed."""
-    seen = "the vehicle follows setpoints of another program"
-    if on is copter:
-        seen = "the attitude is [0-9]+ deg away from every recent command"
+    seen = "the attitude is [0-9]+ deg away from every recent command"
+    if on is px4:
+        seen = "the vehicle follows setpoints of another program"
+        pair = on.lap(HIGH, "reference.laps=2", aloft=False, scenario="second_sender")
+    else:
+        pair = on.lap(HIGH, scenario=early("second_sender"))
     named = "another companion computer, system 1 component 194, may send setpoints, too"
-    pair = on.lap(HIGH, "reference.laps=2", aloft=False, scenario="second_sender")
     aborted(pair, f"{seen}; {named}", error_m=5.0)
 
 

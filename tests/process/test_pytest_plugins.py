@@ -82,7 +82,7 @@ def test_the_fixtures(workers: int, pytester: pytest.Pytester) -> None:
     """A test that fails keeps its log and ends its vehicle, one that passes keeps none. What is
     wrong is one sentence, without a flight."""
     pytester.makepyfile(MINE)
-    result = pytester.runpytest_subprocess("-q", "--strict-markers", "-n", workers, timeout=120)
+    result = pytester.runpytest_subprocess("-q", "--strict-markers", f"-n{workers}", timeout=120)
     result.assert_outcomes(passed=2, failed=3, errors=2)
     logs = [Path(line) for line in result.outlines if line.endswith(".tlog")]
     assert len(logs) == 2
