@@ -32,6 +32,7 @@ from simulator import config as simulated
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Firmware
 from simulator.instance import Instance
+from simulator.start import Start
 
 ARM, TAKEOFF, SET_MODE, LAND = 400, 22, 176, 21  # MAV_CMD
 START, PAUSE_CONTINUE = 300, 193
@@ -280,9 +281,11 @@ def serve(
     memory: Remembered | None = None,
     firmware: Firmware | None = None,
     record: Record | None = None,
+    aloft: bool = False,
     **options: Any,
 ) -> Serving:
-    """A service with a vehicle that stands on the ground, and boots."""
+    """A service with a vehicle that stands on the ground, and boots; with `aloft` one that its
+    pilot holds at 3 m."""
     vehicle = "px4_sih" if on == "px4" else "arducopter"
     clock = HostClock()
     short = SHORT if reference == "hover" else ()
@@ -301,7 +304,7 @@ def serve(
         seed,
         ground_link=False,
         faults=flown.faults,
-        start=flown.start,
+        start=Start(height_m=3.0) if aloft else flown.start,
     )
     if on == "ardupilot":
         instance.autopilot.parameters.set("GUID_OPTIONS", 8.0)

@@ -178,7 +178,7 @@ class Beside:
 def test_a_second_flight_is_refused_and_the_first_flies_on(moment: Any, on: Vehicle) -> None:
     """By mistake, on another port: it has our ids. It is refused before it sends a setpoint or a
     command that changes the vehicle."""
-    first, second = on.lap(), on.lap()
+    first, second = on.hover(), on.hover()
     while not moment(first):
         first.advance()
     second.instance = Beside(first)  # type: ignore[assignment]
@@ -368,7 +368,7 @@ def test_a_landing_is_judged_by_the_ground_where_a_reset_has_moved_it(
 def test_one_heartbeat_that_shows_it_disarmed_ends_no_flight(phase: Phase, on: Vehicle) -> None:
     """The vehicle was left in the air, and ArduCopter in its own take-off."""
     wrong = (in_phase(phase, 0.3), downlink(disarmed(most=1)))
-    pair = on.lap(aloft=phase is not Phase.TAKEOFF, at=[wrong])
+    pair = on.hop(aloft=phase is not Phase.TAKEOFF, at=[wrong])
     flown(pair)
     assert pair.at == []
 
@@ -378,7 +378,7 @@ def test_a_vehicle_that_flies_and_says_that_it_is_disarmed_is_landed(
     phase: Phase, on: Vehicle
 ) -> None:
     wrong = (in_phase(phase, 0.3), downlink(disarmed()))
-    pair = on.lap(aloft=phase is not Phase.TAKEOFF, at=[wrong])
+    pair = on.hop(aloft=phase is not Phase.TAKEOFF, at=[wrong])
     aborted(pair, "the vehicle disarmed ")
     for _ in range(3000):
         pair.instance.step()

@@ -315,7 +315,7 @@ def test_after_a_pause_one_setpoint_leaves(seconds: float, on: Vehicle, tmp_path
 
 def test_what_happens_often_is_told_once_a_second_and_summed_up() -> None:
     """Ten times within 1.3 s messages are dropped, and this process pauses three times."""
-    pair = px4.lap(deadline_s=DEADLINE_S)
+    pair = px4.hover("reference.duration_s=5", deadline_s=DEADLINE_S)
     for number in range(10):
         when = in_phase(Phase.TRACK, 2.0 + 0.13 * number)
         pair.at.append((when, lambda pair: pair.companion.on_dropped(2)))

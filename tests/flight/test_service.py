@@ -42,10 +42,16 @@ class Served:
         pair.restart = watched  # type: ignore[method-assign]
         return pair
 
+    def aloft(self, on: str = "px4", **options: Any) -> Serving:
+        """A service that waits, of a vehicle that its pilot holds in the air."""
+        pair = self(on=on, aloft=True, **options)
+        pair.until(lambda: pair.phase is Phase.STANDBY)
+        pair.run(2.0)
+        return pair
+
     def engaged(self, on: str = "px4", **options: Any) -> Serving:
-        """A service that the pilot has just engaged in the air."""
-        pair = self(on=on, **options)
-        pair.fly_up()
+        """The same, which the pilot has just engaged."""
+        pair = self.aloft(on, **options)
         pair.engage()
         return pair
 
@@ -141,12 +147,11 @@ def fly_north(pair: Serving, speed_mps: float) -> None:
         pair.run(0.2)
 
 
-@pytest.mark.parametrize(("on", "speed_mps"), [("px4", 3.8), ("ardupilot", 3.8)])
-def test_engaged_in_motion(served: Served, on: str, speed_mps: float) -> None:
+@BOTH
+def test_engaged_in_motion(served: Served, on: str) -> None:
     """What the thrust lifts, and the position, are continuous; the tilt is that of the motion."""
-    pair = served(on=on)
-    pair.fly_up()
-    fly_north(pair, speed_mps)
+    pair = served.aloft(on)
+    fly_north(pair, 3.8)
     began_s = pair.time_s
     pair.switch("engage")
     lifts, off_m = [], []
@@ -237,8 +242,7 @@ def test_a_vehicle_that_is_seen_on_the_ground_is_not_left_engaged_any_more(serve
 def test_engaging_a_service_that_is_not_ready_asks_for_hold_and_says_why(served: Served) -> None:
     """A restarted service has not reached standby, because a parameter must be changed first. PX4
     accepts OFFBOARD as the setpoints of before are not older than COM_OF_LOSS_T."""
-    pair = served()
-    pair.fly_up()
+    pair = served.aloft()
     pair.instance.autopilot.parameters.set("COM_OF_LOSS_T", 60.0)
     pair.restart()
     pair.run(5.0)
@@ -440,8 +444,7 @@ def test_with_arms_a_start_takes_off_and_flies(served: Served) -> None:
 
 def test_another_controller_is_left_alone(served: Served) -> None:
     """Its setpoints are on the link: nothing of ours leaves, and nothing is asked for."""
-    pair = served()
-    pair.fly_up()
+    pair = served.aloft()
     pair.other_setpoint()
     pair.run(0.3)
     heard_s = pair.time_s
@@ -495,7 +498,9 @@ def test_engaged_while_it_lands_it_is_held_and_the_pilot_is_told(served: Served)
 
 def test_a_take_off_point_that_was_not_seen_is_no_origin(served: Served) -> None:
     """A service that is started in the air with --anchor origin engages after the next landing."""
-    pair = served.engaged("ardupilot", anchor="origin")
+    pair = served(on="ardupilot", anchor="origin")
+    pair.fly_up()
+    pair.engage()
     assert pair.state.plan.origin_ned_m == pytest.approx((0.0, 0.0, 0.0), abs=0.1)
     pair.switch("pilot")
     pair.run(1.0)

@@ -56,8 +56,8 @@ def test_a_heartbeat_with_the_vehicles_ids_that_is_no_autopilots_counts_for_noth
 
 def test_the_service_leaves_another_vehicle_alone() -> None:
     """The modes of a plane have other numbers: what looks like OFFBOARD or GUIDED is none."""
-    pair, plane = serve(on="ardupilot"), heartbeats(type=FIXED_WING)
-    pair.fly_up()
+    pair, plane = serve(on="ardupilot", aloft=True), heartbeats(type=FIXED_WING)
+    pair.until(lambda: pair.phase is Phase.STANDBY)
     pair.down = lambda time_s, datagrams: plane(time_s, pair.deliver(time_s, datagrams))
     pair.restart()
     pair.run(5.0)
