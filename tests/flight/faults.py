@@ -226,11 +226,6 @@ def restart(pair: Pair) -> None:
     pair.instance = Instance(LEAN, config.vehicle("px4_sih"), conditions, 7)
 
 
-def jump(metres: float) -> Action:
-    """The vehicle's estimated position jumps by `metres`."""
-    return lambda pair: pair.instance.autopilot.plant.reset_estimate((metres, 0.0, 0.0))
-
-
 def downlink(fault: Filter) -> Action:
     """From now on telemetry comes through `fault`."""
 

@@ -230,15 +230,6 @@ def test_a_vehicle_that_the_service_has_not_engaged_is_left_alone(
     pair.engage()
 
 
-def test_a_vehicle_that_is_seen_on_the_ground_is_not_left_engaged_any_more(served: Served) -> None:
-    """Who engages it later is another."""
-    pair = served()
-    pair.until(lambda: pair.phase is Phase.STANDBY)
-    pair.restart()
-    pair.logs.left = "px4-1-1"
-    pair.until(lambda: pair.logs.left == "", 5.0)
-
-
 def test_engaging_a_service_that_is_not_ready_asks_for_hold_and_says_why(served: Served) -> None:
     """A restarted service has not reached standby, because a parameter must be changed first. PX4
     accepts OFFBOARD as the setpoints of before are not older than COM_OF_LOSS_T."""
@@ -385,7 +376,13 @@ def test_a_vehicle_in_the_failsafe_for_missing_setpoints_is_landed(served: Serve
 
 
 def test_armed_in_offboard_on_the_ground_it_stays_there(served: Served) -> None:
+    """And is not left engaged any more, as by a flight that was cut short: who engages it later is
+    another."""
     pair = served()
+    pair.until(lambda: pair.phase is Phase.STANDBY)
+    pair.restart()
+    pair.logs.left = "px4-1-1"
+    pair.until(lambda: pair.logs.left == "", 5.0)
     pair.until(lambda: pair.phase is Phase.STANDBY)
     pair.switch("engage")
     commander = pair.instance.autopilot.commander
