@@ -20,16 +20,8 @@ from offboard.documents.signing_key import create_key
 from simulator.link.sockets import free_ports
 
 MAVPROXY = Path(sys.executable).with_name("mavproxy.py")
-SHORT = (
-    "--controller",
-    "lqr",
-    "--reference",
-    "hover",
-    "--set",
-    "reference.height_m=1",
-    "--set",
-    "reference.duration_s=1",
-)
+SHORT = ("--controller", "lqr", "--reference", "hover", "--set", "reference.height_m=1",
+         "--set", "reference.duration_s=1")  # fmt: skip
 # three programs and a router share the processors with other tests
 PATIENT = ("--set", "limits.link_growth_s=2", "--set", "limits.setpoint_age_s=2")
 LATE = ("--set", "limits.silence_s=5", "--set", "limits.missed_decisions=50")

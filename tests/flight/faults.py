@@ -6,8 +6,9 @@ import math
 import random
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
-from pair import LEAN, Bytes, Filter, Pair, frames_of
+from pair import LEAN, Bytes, Filter, Pair, decode, frames_of
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.control.base import Controller, Decision, Situation
@@ -18,7 +19,7 @@ from simulator.firmware.values import Result, Severity, StatusText
 from simulator.instance import Instance
 
 HEARTBEAT, ATTITUDE, POSITION, PARAM_VALUE, TIMESYNC, TARGET = 0, 31, 32, 22, 111, 83
-EXTENDED_SYS_STATE = 245
+EXTENDED_SYS_STATE, CURRENT_MODE = 245, 436
 Action = Callable[[Pair], None]
 
 
@@ -149,56 +150,55 @@ def frame_id(frame: bytes) -> int:
     return int.from_bytes(frame[7:10], "little")
 
 
-def upside_down() -> Filter:
-    """A link on which every attitude is a roll by 180 degrees."""
-    codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+def rewritten(change: Callable[[Any], object], *kinds: int) -> Filter:
+    """A link on which `change` edits every message with one of these ids."""
+    codec = mavlink.MAVLink(None)
 
-    def turn(frame: bytes) -> bytes:
-        if frame_id(frame) != ATTITUDE:
+    def edit(frame: bytes) -> bytes:
+        if frame_id(frame) not in kinds:
             return frame
-        stamp_ms = mavlink.MAVLink(None).decode(bytearray(frame)).time_boot_ms
-        message = mavlink.MAVLink_attitude_quaternion_message(stamp_ms, 0, 1, 0, 0, 0, 0, 0)
-        codec.seq = frame[4]
+        message = decode(frame)
+        change(message)
+        codec.seq, codec.srcSystem, codec.srcComponent = frame[4:7]
         return bytes(message.pack(codec))
 
-    return lambda _, datagrams: [b"".join(map(turn, frames_of(d))) for d in datagrams]
+    return lambda _, datagrams: [b"".join(map(edit, frames_of(d))) for d in datagrams]
 
 
-def critical() -> Filter:
-    """A link on which every heartbeat shows MAV_STATE_CRITICAL, as with a low battery."""
-    return heartbeats(system_status=5)
+def setting(**fields: object) -> Callable[[Any], object]:
+    return lambda message: [setattr(message, name, value) for name, value in fields.items()]
+
+
+def upside_down() -> Filter:
+    """A link on which every attitude is a roll by 180 degrees."""
+    return rewritten(setting(q1=0.0, q2=1.0, q3=0.0, q4=0.0), ATTITUDE)
 
 
 def heartbeats(**changed: int) -> Filter:
     """A link on which these fields of every heartbeat have other values."""
-    codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    return rewritten(setting(**changed), HEARTBEAT)
 
-    def change(frame: bytes) -> bytes:
-        if frame_id(frame) != HEARTBEAT:
-            return frame
-        message = mavlink.MAVLink(None).decode(bytearray(frame))
-        for name, value in changed.items():
-            setattr(message, name, value)
-        codec.seq = frame[4]
-        return bytes(message.pack(codec))
 
-    return lambda _, datagrams: [b"".join(map(change, frames_of(d))) for d in datagrams]
+def disarmed(most: float = math.inf) -> Filter:
+    """A link on which so many heartbeats show the vehicle disarmed, wrongly."""
+    wrong: list[Any] = []
+
+    def change(message: Any) -> None:
+        if len(wrong) < most:
+            message.base_mode &= ~mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+            wrong.append(message)
+
+    return rewritten(change, HEARTBEAT)
 
 
 def restamped(less_s: float) -> Filter:
     """A link on which positions and attitudes are stamped as by a vehicle that booted so much
     later."""
-    codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
 
-    def change(frame: bytes) -> bytes:
-        if frame_id(frame) not in (ATTITUDE, POSITION):
-            return frame
-        message = mavlink.MAVLink(None).decode(bytearray(frame))
+    def change(message: Any) -> None:
         message.time_boot_ms -= round(1e3 * less_s)
-        codec.seq = frame[4]
-        return bytes(message.pack(codec))
 
-    return lambda _, datagrams: [b"".join(map(change, frames_of(d))) for d in datagrams]
+    return rewritten(change, ATTITUDE, POSITION)
 
 
 # --- events ---------------------------------------------------------------------------------------
@@ -224,11 +224,6 @@ def restart(pair: Pair) -> None:
     """The vehicle boots: on the ground, disarmed, its time from zero."""
     conditions = config.scenario("calm").conditions
     pair.instance = Instance(LEAN, config.vehicle("px4_sih"), conditions, 7)
-
-
-def jump(metres: float) -> Action:
-    """The vehicle's estimated position jumps by `metres`."""
-    return lambda pair: pair.instance.autopilot.plant.reset_estimate((metres, 0.0, 0.0))
 
 
 def downlink(fault: Filter) -> Action:

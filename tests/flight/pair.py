@@ -15,11 +15,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.analysis import history, tlog
+from offboard.analysis.history import History
 from offboard.analysis.score import Score, score
 from offboard.control.base import Controller
 from offboard.estimation.observer import Observer
@@ -212,6 +214,30 @@ class Pair:
         decoded = (decode(frame) for _, _, frame in self.sent)
         return [m for m in decoded if m.get_type() == "COMMAND_LONG" and m.command == number]
 
+    @property
+    def modes(self) -> list[Any]:
+        """Requests for a mode (MAV_CMD_DO_SET_MODE)."""
+        return self.commands(176)
+
+    @property
+    def landings(self) -> list[Any]:
+        """Requests to land (MAV_CMD_NAV_LAND)."""
+        return self.commands(21)
+
+    @property
+    def armings(self) -> list[float]:
+        """What was asked by MAV_CMD_COMPONENT_ARM_DISARM: 1 to arm, 0 to disarm."""
+        return [message.param1 for message in self.commands(400)]
+
+    @property
+    def armed(self) -> bool:
+        return bool(self.instance.autopilot.commander.armed)
+
+    @property
+    def mode(self) -> str:
+        """Of the vehicle."""
+        return str(self.instance.autopilot.commander.mode.name)
+
     def went_through(self, phase: Phase) -> bool:
         return any(flown is phase for _, flown in self.phases)
 
@@ -223,9 +249,16 @@ class Pair:
                 log.write(UNIX_EPOCH_US + 100 * index, frame)
         return tlog.read(log.path)
 
-    def score(self, directory: Path) -> Score:
-        """The score of `log`."""
-        return score(history.gather(self.log(directory)))
+    def history(self, directory: Path | None = None) -> History:
+        """What the log holds. Without a directory, in one that is gone afterwards."""
+        if directory is not None:
+            return history.gather(self.log(directory))
+        with TemporaryDirectory() as temporary:
+            return history.gather(self.log(Path(temporary)))
+
+    def score(self, directory: Path | None = None) -> Score:
+        """The score of `history`."""
+        return score(self.history(directory))
 
 
 def decode(frame: bytes) -> Any:

@@ -20,7 +20,7 @@ from pair import (
 )
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from offboard.flight.phases import Anchor, Phase, ServiceOptions, Then
+from offboard.flight.phases import TRACKING, Anchor, Phase, ServiceOptions, Then
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from offboard.mavlink.session import Session, SessionSettings
@@ -32,6 +32,7 @@ from simulator import config as simulated
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Firmware
 from simulator.instance import Instance
+from simulator.start import Start
 
 ARM, TAKEOFF, SET_MODE, LAND = 400, 22, 176, 21  # MAV_CMD
 START, PAUSE_CONTINUE = 300, 193
@@ -152,10 +153,6 @@ class Serving(Pair):
         return self.service.phase
 
     @property
-    def mode(self) -> str:
-        return str(self.instance.autopilot.commander.mode.name)
-
-    @property
     def paused(self) -> bool:
         """The process of the service is stopped."""
         return self.clock.now_s > HOST_EPOCH_S + self.time_s
@@ -166,6 +163,11 @@ class Serving(Pair):
 
     def switch(self, to: str) -> None:
         self.ground(SET_MODE, *MODES[self.firmware][to])
+
+    def engage(self) -> None:
+        """The pilot switches to our mode, and we fly."""
+        self.switch("engage")
+        self.until(lambda: self.phase in TRACKING, 3.0)
 
     def fly_up(self, height_m: float = 3.0) -> None:
         """The pilot takes off and holds; the service waits."""
@@ -278,9 +280,11 @@ def serve(
     memory: Remembered | None = None,
     firmware: Firmware | None = None,
     record: Record | None = None,
+    aloft: bool = False,
     **options: Any,
 ) -> Serving:
-    """A service with a vehicle that stands on the ground, and boots."""
+    """A service with a vehicle that stands on the ground, and boots; with `aloft` one that its
+    pilot holds at 3 m."""
     vehicle = "px4_sih" if on == "px4" else "arducopter"
     clock = HostClock()
     short = SHORT if reference == "hover" else ()
@@ -299,7 +303,7 @@ def serve(
         seed,
         ground_link=False,
         faults=flown.faults,
-        start=flown.start,
+        start=Start(height_m=3.0) if aloft else flown.start,
     )
     if on == "ardupilot":
         instance.autopilot.parameters.set("GUID_OPTIONS", 8.0)

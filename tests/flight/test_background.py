@@ -30,47 +30,38 @@ class Disk:
         self.items += items
 
 
-def test_a_slow_writer_stops_nobody_and_loses_nothing() -> None:
+@pytest.mark.parametrize(
+    ("room", "waits", "free", "put", "written"),
+    [
+        (1000, False, False, 500, 500),  # a slow disk stops nobody and loses nothing
+        (10, False, False, 50, 10),  # what does not fit is dropped and counted
+        (100, True, True, 2000, 2000),  # in lockstep it waits
+    ],
+)
+def test_what_is_written_and_what_is_dropped(
+    room: int, waits: bool, free: bool, put: int, written: int
+) -> None:
     disk = Disk()
-    writer = BackgroundWriter(disk.write, 1000)
-    for number in range(500):
-        writer.put(number)
-    assert disk.items == []
-    disk.free.set()
-    writer.close(LONG_S)
-    assert (disk.items, writer.dropped) == (list(range(500)), 0)
-
-
-def test_what_does_not_fit_is_dropped_and_counted() -> None:
-    disk = Disk()
-    writer = BackgroundWriter(disk.write, 10)
+    if free:
+        disk.free.set()
+    writer = BackgroundWriter(disk.write, room, waits=waits)
     writer.put(-1)
     assert disk.asked.wait(LONG_S)  # holds the first
-    for number in range(50):
+    for number in range(put):
         writer.put(number)
-    assert writer.dropped == 40
+    assert free or disk.items == []
+    assert writer.dropped == put - written
     disk.free.set()
     writer.close(LONG_S)
-    assert disk.items == [-1, *range(10)]
-
-
-def test_in_lockstep_nothing_is_dropped() -> None:
-    disk = Disk()
-    disk.free.set()
-    writer = BackgroundWriter(disk.write, 100, waits=True)
-    for number in range(2000):
-        writer.put(number)
-    writer.close(LONG_S)
-    assert (disk.items, writer.dropped) == (list(range(2000)), 0)
+    assert disk.items == [-1, *range(written)]
 
 
 def test_what_is_stuck_at_the_end_is_counted() -> None:
     disk = Disk()
     writer = BackgroundWriter(disk.write, 100)
-    writer.put(-1)
-    assert disk.asked.wait(LONG_S)
-    for number in range(7):
+    for number in range(8):
         writer.put(number)
+    assert disk.asked.wait(LONG_S)
     writer.close(0.05)
     assert writer.dropped == 8
     assert not writer.is_free()

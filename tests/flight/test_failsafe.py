@@ -12,7 +12,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import pytest
 from uneventful import NOW_S, hear, uneventful
 
 from offboard.flight.failsafe import ROWS, Row, judge
@@ -51,22 +50,16 @@ NOTHING, LINK, TILT, BATTERY = (), ("link",), ("tilt error",), ("battery",)
 FLY, HOLD, LAND = Action.FLY, Action.HOLD, Action.LAND
 
 
-def test_a_condition_counts_for_as_long_as_it_holds() -> None:
+def test_a_condition_counts_once_it_has_held_and_is_forgotten_slowly() -> None:
     assert set(actions(*[NOTHING] * 100)) == {FLY}
     assert actions(*[LINK] * 6) == [FLY] * 4 + [HOLD] * 2
     assert actions(NOTHING, *[BATTERY] * 17)[-3:] == [FLY, LAND, LAND]
     assert actions(*[LINK] * 5, NOTHING)[-2:] == [HOLD, FLY]
-
-
-@pytest.mark.parametrize(("pause", "again"), [(1, 1), (4, 1), (8, 2), (16, 4), (100, 4)])
-def test_it_is_forgotten_at_a_quarter_of_the_speed(pause: int, again: int) -> None:
-    """Four steps of condition, `pause` of none; then it takes `again` steps to be active."""
-    seen = actions(NOTHING, *[LINK] * 4, *[NOTHING] * pause, *[LINK] * 8)
-    assert seen[5 + pause :].index(HOLD) + 1 == again
-
-
-def test_a_condition_that_comes_and_goes() -> None:
-    """Half of the time it gains 3/32 s in two steps: active in the fifth; a fifth: never."""
+    # at a quarter of the speed: four steps of condition, a pause, and so many steps again
+    for pause, again in ((1, 1), (4, 1), (8, 2), (16, 4), (100, 4)):
+        seen = actions(NOTHING, *[LINK] * 4, *[NOTHING] * pause, *[LINK] * 8)
+        assert seen[5 + pause :].index(HOLD) + 1 == again
+    # one that comes and goes: half of the time it gains 3/32 s in two steps, a fifth nothing
     assert actions(NOTHING, *[LINK, NOTHING] * 40).index(HOLD) == 9
     assert HOLD not in actions(NOTHING, *[LINK, *[NOTHING] * 4] * 100)
 
@@ -89,30 +82,26 @@ def test_of_equally_bad_rows_the_report_of_the_mode_is_named() -> None:
     assert flight.failsafe.reason.startswith("no report of the mode")
 
 
-@pytest.mark.parametrize(("last", "action"), [(50.125, HOLD), (50.0625, FLY)])
-def test_time_that_steps_back_counts_for_nothing(last: float, action: Action) -> None:
+def test_neither_a_step_back_of_time_nor_a_gap_of_telemetry_counts() -> None:
+    for last, action in ((50.125, HOLD), (50.0625, FLY)):
+        flight = uneventful()
+        for flight.now_s in (100.0, 100.1875, 100.375, 50.0, last):
+            judge(flight, [replace(BY_NAME["link"], condition=lambda _: True)])
+        assert flight.failsafe.action is action
     flight = uneventful()
-    held = [replace(BY_NAME["link"], condition=lambda _: True)]
-    for flight.now_s in (100.0, 100.1875, 100.375, 50.0, last):
-        judge(flight, held)
-    assert flight.failsafe.action is action
-
-
-def test_one_sample_after_a_gap_of_telemetry_is_no_condition_that_has_held() -> None:
-    flight = uneventful()
-    flight.now_s = 100.0
-    judge(flight, [replace(BY_NAME["tilt error"], condition=lambda _: False)])
-    flight.now_s = 100.8
-    judge(flight, [replace(BY_NAME["tilt error"], condition=lambda _: True)])
+    for flight.now_s, holds in ((100.0, False), (100.8, True)):
+        judge(flight, [replace(BY_NAME["tilt error"], condition=lambda _, now=holds: now)])
     assert flight.failsafe.action is FLY
 
 
-def _set(**values: object) -> Callable[[FlightState], None]:
-    def apply(flight: FlightState) -> None:
-        for name, value in values.items():
-            setattr(flight, name, value)
+# --- each row at its limit ------------------------------------------------------------------------
 
-    return apply
+Measure = Callable[[FlightState, Any], object]
+
+
+def attribute(name: str, within: Callable[[Any], Any] = lambda value: value) -> Measure:
+    """Sets this of the flight to the value, or to what `within` makes of it."""
+    return lambda flight, value: setattr(flight, name, within(value))
 
 
 def _fly_at(flight: FlightState, north_m: float, down_m: float, down_mps: float = 0.0) -> None:
@@ -138,20 +127,17 @@ def _tilt_error(flight: FlightState, angle_rad: float) -> None:
     _tilt(flight, angle_rad)
 
 
-def _clock(flight: FlightState, **values: object) -> None:
-    clock: Any = SimpleNamespace(
-        age_s=lambda stamp_s, host_s: 0.0, delay_growth_s=0.0, jumped_s=0.0
-    )
-    vars(clock).update(values)
-    flight.clock = clock
+def _clock(**values: Callable[[Any], Any]) -> Measure:
+    def measure(flight: FlightState, value: Any) -> None:
+        given = {name: make(value) for name, make in values.items()}
+        clock = {"age_s": lambda *_: 0.0, "delay_growth_s": 0.0, "jumped_s": 0.0} | given
+        flight.clock = SimpleNamespace(**clock)  # type: ignore[assignment]
 
-
-def _jumps(jumped_m: float = 0.0, drift_m: float = 0.0) -> SimpleNamespace:
-    return SimpleNamespace(recent_m=lambda time_s: jumped_m, drift_m=drift_m)
+    return measure
 
 
 def _aged(flight: FlightState, age_s: float) -> None:
-    _clock(flight, age_s=lambda stamp_s, host_s: age_s)
+    _clock(age_s=lambda age_s: lambda *_: age_s)(flight, age_s)
 
 
 def _unheard(flight: FlightState, age_s: float) -> None:
@@ -171,12 +157,14 @@ def _predicted(flight: FlightState, away_m: float) -> None:
     flight.predictions.append(predicted)
 
 
-def _accuracy(flight: FlightState, accuracy_m: float) -> None:
-    flight.positioning.begin(flight.vehicle, {}, "ESTIMATOR_STATUS")
-    good = EstimatorReport(frozenset(ESTIMATE), (), 0.5)
-    hear(flight, good)
-    flight.positioning.begin(flight.vehicle, {"ESTIMATOR_STATUS": 1.0}, "ESTIMATOR_STATUS")
-    hear(flight, replace(good, accuracy_m=accuracy_m))
+def _accuracy(flight: FlightState, accuracies_m: tuple[float | None, float | None]) -> None:
+    """At the beginning and now. PX4 reports none as NaN; one that was never reported is not
+    missed."""
+    reported = EstimatorReport(frozenset(ESTIMATE), (), 0.5)
+    for accuracy_m in accuracies_m:
+        hear(flight, replace(reported, accuracy_m=accuracy_m))
+        if accuracy_m is accuracies_m[0]:
+            flight.positioning.begin(flight.vehicle, {}, "ESTIMATOR_STATUS")
 
 
 def _no_fix(flight: FlightState, for_s: float) -> None:
@@ -190,6 +178,18 @@ def _sinks(flight: FlightState, sink_mps: float) -> None:
     flight.thrusts.append(1.0)
 
 
+def _jumps(jumped_m: float = 0.0, drift_m: float = 0.0) -> SimpleNamespace:
+    return SimpleNamespace(recent_m=lambda time_s: jumped_m, drift_m=drift_m)
+
+
+def _other_sender(flight: FlightState, since_s: float) -> None:
+    flight.vehicle.heard_s[OtherSender] = NOW_S - since_s
+
+
+def _contradicted(why: str) -> SimpleNamespace:
+    return SimpleNamespace(contradiction=why)
+
+
 def _follows(flight: FlightState, mode: str) -> None:
     assert flight.authority is not None
     hear(flight, ThrustReport(0.3))
@@ -197,86 +197,58 @@ def _follows(flight: FlightState, mode: str) -> None:
     flight.follows_others = True
 
 
-LIMITS = Limits()
+AGE_S = Limits().setpoint_age_s
+_hover = attribute("observer", lambda share: SimpleNamespace(hover_thrust_estimate=share))
 # row: how to set what it measures, a value that it allows, and one that it does not
-MEASURED: list[tuple[str, Callable[[FlightState, Any], None], Any, Any]] = [
+MEASURED: list[tuple[str, Measure, Any, Any]] = [
     ("authority", _unheard, 2.5, 2.6),
-    ("silence", lambda flight, value: _set(silence_s=value)(flight), 1.0, 1.1),
+    ("silence", attribute("silence_s"), 1.0, 1.1),
     ("blind", _blind, 0.5, 0.51),
-    ("age", _aged, LIMITS.setpoint_age_s, 0.26),
-    ("link", lambda flight, value: _clock(flight, delay_growth_s=value), 0.3, 0.31),
-    ("link", _aged, LIMITS.setpoint_age_s, 0.26),
-    ("decision", lambda flight, value: _set(missed=value)(flight), 0, 1),
-    ("decisions", lambda flight, value: _set(missed=value)(flight), 2, 3),
+    ("age", _aged, AGE_S, 0.26),
+    ("link", _clock(delay_growth_s=float), 0.3, 0.31),
+    ("link", _aged, AGE_S, 0.26),
+    ("decision", attribute("missed"), 0, 1),
+    ("decisions", attribute("missed"), 2, 3),
     ("tilt", _tilt, 1.29, 1.31),
     ("tilt error", _tilt_error, 0.49, 0.51),
     ("position error", _near_reference, 4.99, 5.01),
     ("prediction", _predicted, 2.0, 2.01),
-    (
-        "estimator",
-        lambda flight, value: _set(jumps=_jumps(jumped_m=value))(flight),
-        2.0,
-        2.1,
-    ),
-    ("estimator", lambda flight, value: _set(jumps=_jumps(drift_m=value))(flight), 2.0, 2.1),
-    ("positioning", _accuracy, 3.0, 3.1),
+    ("estimator", attribute("jumps", lambda m: _jumps(jumped_m=m)), 2.0, 2.1),
+    ("estimator", attribute("jumps", lambda m: _jumps(drift_m=m)), 2.0, 2.1),
+    ("positioning", _accuracy, (0.5, 3.0), (0.5, 3.1)),
+    ("positioning", _accuracy, (None, None), (0.5, None)),
     ("positioning", _no_fix, 1.0, 2.1),
-    ("volume", lambda flight, value: _fly_at(flight, 0.0, -value), 120.0, 120.1),
-    ("volume", lambda flight, value: _fly_at(flight, value, -1.0), 1000.0, 1000.1),
-    (
-        "battery",
-        lambda flight, value: hear(flight, SystemHealth(True, value)),
-        0.1,
-        0.09,
-    ),
-    (
-        "thrust reserve",
-        lambda flight, value: _set(observer=SimpleNamespace(hover_thrust_estimate=value))(flight),
-        0.9,
-        0.91,
-    ),
+    ("volume", lambda flight, height_m: _fly_at(flight, 0.0, -height_m), 120.0, 120.1),
+    ("volume", lambda flight, away_m: _fly_at(flight, away_m, -1.0), 1000.0, 1000.1),
+    ("battery", lambda flight, left: hear(flight, SystemHealth(True, left)), 0.1, 0.09),
+    ("thrust reserve", _hover, 0.9, 0.91),
     ("full thrust", _sinks, 0.3, 0.31),
-    (
-        "second sender",
-        lambda flight, value: flight.vehicle.heard_s.update({OtherSender: NOW_S - value}),
-        5.0,
-        4.9,
-    ),
+    ("second sender", _other_sender, 5.0, 4.9),
     ("other setpoints", _follows, "POSCTL", "OFFBOARD"),
-    ("clock", lambda flight, value: _clock(flight, jumped_s=value), 0.0, 0.6),
-    (
-        "contradiction",
-        lambda flight, value: _set(identification=SimpleNamespace(contradiction=value))(flight),
-        "",
-        "out of bounds",
-    ),
+    ("clock", _clock(jumped_s=float), 0.0, 0.6),
+    ("contradiction", attribute("identification", _contradicted), "", "out of bounds"),
 ]
 
 
-@pytest.mark.parametrize(
-    ("name", "measure", "allowed", "exceeded"), MEASURED, ids=[each[0] for each in MEASURED]
-)
-def test_every_row_at_its_limit(
-    name: str, measure: Callable[[FlightState, Any], None], allowed: Any, exceeded: Any
-) -> None:
-    row = BY_NAME[name]
-    for value, expected in ((allowed, False), (exceeded, True)):
-        flight = uneventful()
-        measure(flight, value)
-        assert bool(row.condition(flight)) is expected
-        judge(flight, [replace(row, held_s=0.0)])
-        assert "{" not in flight.failsafe.reason + flight.failsafe.cause
+def test_every_row_at_its_limit() -> None:
     assert {each[0] for each in MEASURED} == set(BY_NAME)
+    for name, measure, *values in MEASURED:
+        for value, exceeds in zip(values, (False, True), strict=True):
+            flight = uneventful()
+            measure(flight, value)
+            assert bool(BY_NAME[name].condition(flight)) is exceeds, name
+            judge(flight, [replace(BY_NAME[name], held_s=0.0)])
+            assert "{" not in flight.failsafe.reason + flight.failsafe.cause
 
 
-@pytest.mark.parametrize("name", ["second sender", "other setpoints"])
-def test_another_program_may_be_allowed(name: str) -> None:
-    flight = uneventful()
-    hear(flight, OtherSender(1, 190, 82))
-    _follows(flight, "OFFBOARD")
-    assert BY_NAME[name].condition(flight)
-    flight.limits = Limits(begin_with_other_sender=True)
-    assert not BY_NAME[name].condition(flight)
+def test_another_program_may_be_allowed() -> None:
+    for name in ("second sender", "other setpoints"):
+        flight = uneventful()
+        hear(flight, OtherSender(1, 190, 82))
+        _follows(flight, "OFFBOARD")
+        assert BY_NAME[name].condition(flight)
+        flight.limits = Limits(begin_with_other_sender=True)
+        assert not BY_NAME[name].condition(flight)
 
 
 def test_what_only_our_setpoints_show_is_not_measured_in_other_phases() -> None:
@@ -284,7 +256,7 @@ def test_what_only_our_setpoints_show_is_not_measured_in_other_phases() -> None:
         flight = uneventful(Phase.HOLD)
         _sinks(flight, 5.0)
         _follows(flight, "OFFBOARD")
-        _set(observer=SimpleNamespace(hover_thrust_estimate=1.0))(flight)
+        _hover(flight, 1.0)
         assert not BY_NAME[name].condition(flight)
         flight.phase = Phase.TRACK
         assert BY_NAME[name].condition(flight)

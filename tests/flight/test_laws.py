@@ -1,19 +1,25 @@
-"""Every controller of the table flies, from its shipped file, through the whole flight."""
+"""Laws in whole flights: every one of the table, volumes that are kept clear of, every heading, a
+step of the reference, and the ranking that was measured on a real PX4."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
+from statistics import mean
 from typing import Any
 
 import numpy as np
 import pytest
-from pair import Pair, decode, make
+from faults import rewritten
+from pair import Pair, decode, in_phase, make, on_arducopter
 from pydantic import TypeAdapter
+from scipy.spatial.transform import Rotation
 
 from offboard.control.catalogue import names
 from offboard.control.keep_out import KeepOut, clearances
 from offboard.flight.phases import Phase
+from simulator import config as simulated
 
 # RMSE in m that is to be undercut in calm; the paper's law has a time constant of 39 s, the
 # autopilot's own loop lags
@@ -29,15 +35,18 @@ def flying(controller: str, tmp_path: Path, *assignments: str, **options: object
     return make(*assignments, name=str(chosen), **options)
 
 
-@pytest.mark.parametrize("law", [law for law in names() if law not in ("pso", "autopilot")])
+@pytest.mark.parametrize("law", sorted({*names(), "pso on ArduCopter"} - {"pso", "autopilot"}))
 def test_flies_a_short_lemniscate_and_lands(law: str, tmp_path: Path) -> None:
-    """`pso` is flown by most other tests, `autopilot` by the next one."""
-    pair = flying(law, tmp_path, *SHORT)
+    """`pso` on PX4 is flown by most other tests, `autopilot` by the next one. On ArduCopter 1 cm
+    needs that u_h T b_z / g with the predicted b_z is what its tilt boost undoes."""
+    copter = law not in names()
+    pair = on_arducopter(*SHORT) if copter else flying(law, tmp_path, *SHORT)
     outcome = pair.fly()
     assert (outcome.exit_code, outcome.sentence) == (0, "flown and landed")
-    score = pair.score(tmp_path)
-    assert score.rmse_position_m < MOST_M[law]
+    score = pair.score()
+    assert score.rmse_position_m < MOST_M.get(law, 0.01)
     assert score.tracked_s == pytest.approx(6.0, abs=0.3)
+    assert not copter or score.hover_thrust == pytest.approx(0.3655, abs=0.001)
     assert not pair.instance.autopilot.commander.armed
 
 
@@ -58,7 +67,7 @@ def test_autopilot_gets_positions_while_tracking_and_attitudes_before(tmp_path: 
     ]
     assert len(targets) == pytest.approx(60, abs=3)
     assert {target.type_mask for target in targets} == {0}
-    score = pair.score(tmp_path)
+    score = pair.score()
     assert score.rmse_position_m < MOST_M["autopilot"]
     assert score.tracked_s == pytest.approx(6.0, abs=0.3)
     assert score.setpoint_gap_max_s <= 0.12
@@ -91,7 +100,7 @@ def flown(law: str, tmp_path: Path, *assignments: str) -> tuple[np.ndarray, np.n
 
     pair.advance = watched  # type: ignore[method-assign]
     pair.track()
-    return np.array(times[::5]), np.array(places[::5]), pair.score(tmp_path).rmse_position_m
+    return np.array(times[::5]), np.array(places[::5]), pair.score().rmse_position_m
 
 
 def nearest_m(volumes: list[dict[str, Any]], times: np.ndarray, places: np.ndarray) -> float:
@@ -114,8 +123,128 @@ def test_volumes_are_kept_clear_of(volumes: list[dict[str, Any]], tmp_path: Path
     assert rmse_m < 0.4  # and back to the reference behind them
 
 
-@pytest.mark.parametrize("law", ["lqr", pytest.param("mpc", marks=pytest.mark.slow)])
-def test_others_fly_through(law: str, tmp_path: Path) -> None:
-    times, places, _ = flown(law, tmp_path)
+def test_others_fly_through(tmp_path: Path) -> None:
+    times, places, _ = flown("lqr", tmp_path)
     for volume in (AT_THE_TOP, CROSSING, TOWER, SHED):
         assert nearest_m([volume], times, places) < -0.2
+
+
+# -- every heading ---------------------------------------------------------------------------------
+
+SET_ATTITUDE_TARGET = 82
+TURNING = ("reference.course=along_velocity", "reference.laps=1", "reference.period_s=6",
+           "reference.radius_m=1")  # fmt: skip
+
+
+def on_a_helix(climb_mps: float, height_m: float) -> Pair:
+    """One lap with the nose ahead: from east through south, west and north to east again."""
+    climb = f"reference.climb_mps={climb_mps}"
+    return make(*TURNING, climb, f"reference.height_m={height_m}", reference="helix", aloft=True)
+
+
+def test_turning_through_all_headings() -> None:
+    """Descending; and facing south, where the reported heading jumps across the wrap."""
+    south = make("reference.course_deg=180", "reference.laps=1", scenario="px4_like", aloft=True)
+    for pair, rmse_m in ((on_a_helix(-0.4, 7.0), 0.01), (south, 0.05)):
+        pair.track()
+        score = pair.score()
+        assert score.rmse_position_m < rmse_m
+        assert score.rmse_heading_deg < 2.0
+
+
+def swapped(change: Callable[[Rotation], Rotation]) -> Pair:
+    """A climbing flight, with what `change` makes of each target on the wire."""
+
+    def edit(message: Any) -> None:
+        target = Rotation.from_quat(np.roll(message.q, -1))
+        message.q = np.roll(change(target).as_quat(), 1).tolist()
+
+    pair = on_a_helix(0.4, 3.0)
+    pair.up = rewritten(edit, SET_ATTITUDE_TARGET)
+    return pair
+
+
+@pytest.mark.parametrize("signs", [(1, -1, 1), (1, 1, -1)], ids=["pitch", "roll"])
+def test_a_swapped_lean_is_stopped(signs: tuple[int, int, int]) -> None:
+    pair = swapped(lambda target: Rotation.from_euler("ZYX", target.as_euler("ZYX") * signs))
+    outcome = pair.fly()
+    assert outcome.exit_code == 4
+    assert "deg away from every recent command" in outcome.sentence
+
+
+def test_a_swapped_heading_is_scored() -> None:
+    """About the thrust axis, whose direction does not depend on it."""
+    pair = swapped(lambda q: q * Rotation.from_euler("Z", -2.0 * q.as_euler("ZYX")[0]))
+    pair.track()
+    assert pair.score().rmse_heading_deg > 60.0
+
+
+# -- a step of the reference -----------------------------------------------------------------------
+
+SETTLED_S, END_S = 15.0, 19.0
+
+
+def swing(personality: str, *assignments: str) -> tuple[float, float]:
+    """ArduCopter's vehicle, whose attitude loop limits its angular acceleration (1100 deg/s2), with
+    either firmware, in hover at 7 rad/s; after two seconds the reference jumps by 2.4 m and returns
+    slowly. The largest distance from it (m) and rate (rad/s) after the settling time."""
+    hover = (f"reference.duration_s={END_S}", "controller.bandwidth_radps=7", *assignments)
+    if personality == "ardupilot":
+        pair = on_arducopter(*hover, reference="hover", seed=2)
+    else:
+        flies = simulated.vehicle("arducopter")
+        named = {"reference": "hover", "vehicle": "arducopter"}
+        pair = make(*hover, **named, seed=2, flies=flies)
+
+    def step(flying: Pair) -> None:
+        state = flying.companion
+        state.plan.follow_jump(state.time_s, np.array([2.4, 0.0, 0.0]))
+
+    pair.at.append((in_phase(Phase.TRACK, 2.0), step))
+    pair.track()
+    logged = pair.history()
+    begin_s = next(at_s for at_s, phase in pair.phases if phase is Phase.TRACK)
+
+    def settled(rows: np.ndarray) -> np.ndarray:
+        passed_s = rows["time_s"] - begin_s
+        return rows[(passed_s > SETTLED_S) & (passed_s < END_S)]
+
+    away = settled(logged.position)["position_ned_m"]
+    away = away - settled(logged.reference)["position_ned_m"][0]
+    rates = settled(logged.attitude)["rates_radps"][:, :2]
+    return float(np.linalg.norm(away, axis=1).max()), float(np.abs(rates).max())
+
+
+@pytest.mark.parametrize("personality", [pytest.param("px4", marks=pytest.mark.slow), "ardupilot"])
+def test_settles_after_a_step_of_the_reference(personality: str) -> None:
+    away_m, rate_radps = swing(personality)
+    assert away_m < 0.005
+    assert rate_radps < 0.02
+
+
+def test_limit_cycle_without_the_feedback_limit() -> None:
+    """Shows that `feedback_limit` prevents the limit cycle."""
+    away_m, rate_radps = swing("ardupilot", "controller.feedback_limit=1.0")
+    assert away_m > 0.005
+    assert rate_radps > 0.3
+
+
+# -- the ranking -----------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_ranking_of_bandwidths() -> None:
+    """As measured on a real PX4 (1.16 SITL, SIH), in `px4_like`: one lap in 8 s, mean of two seeds
+    by the vehicle's estimate. White noise on the estimate would rank them the other way round."""
+    lap = ("controller={law: lqr, feedback_limit: 0.6}", "reference.laps=1", "reference.height_m=1",
+           "reference.run_in_s=2", "reference.run_out_s=1")  # fmt: skip
+
+    def rmse_m(bandwidth_radps: int, seed: int) -> float:
+        bandwidth = f"controller.bandwidth_radps={bandwidth_radps}"
+        pair = make(*lap, bandwidth, scenario="px4_like", seed=seed)
+        pair.track()
+        return pair.score().rmse_position_m
+
+    slow, knee, fast = (mean(rmse_m(bandwidth, seed) for seed in (1, 2)) for bandwidth in (3, 5, 7))
+    assert fast < 0.95 * knee < 0.95**2 * slow
+    assert fast < 0.04

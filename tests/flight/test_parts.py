@@ -1,8 +1,7 @@
-"""The gate, the parameters before the flight, the configuration, and the records in the log."""
+"""The parameters before the flight, the rehearsal, the manifest, and the records in the log."""
 
 from __future__ import annotations
 
-import math
 import random
 
 import numpy as np
@@ -15,59 +14,15 @@ from offboard.control.base import Situation
 from offboard.flight import inputs, outbox
 from offboard.flight.phases import Limits
 from offboard.flight.preflight import Ground, ParameterReading, not_ready, refusals
-from offboard.flight.setpoint import clamp, usable
 from offboard.flight.vehicle_state import VehicleState
 from offboard.mavlink.dialects.ardupilot import ARDUPILOT
 from offboard.mavlink.dialects.px4 import PX4
 from offboard.mavlink.events import Attitude, LocalPosition, SystemHealth
 from offboard.mavlink.outgoing import CommandLong
 from offboard.model.command import Command, PredictedState
-from offboard.model.vehicle import Vehicle
 from offboard.reference.track import hold
 from offboard.run import configuration as config
 from offboard.run.flight import build, rehearse
-
-NAN, INF = math.nan, math.inf
-
-
-@pytest.fixture(scope="module")
-def vehicle() -> Vehicle:
-    return config.load("flight").vehicle
-
-
-@pytest.mark.parametrize(
-    ("command", "expected"),
-    [
-        (Command(9.8, (0.0, 0.0, 1.0), 0.0), True),
-        (Command(9.8, (0.6, 0.0, 0.8), 3.0), True),
-        (Command(NAN, (0.0, 0.0, 1.0), 0.0), False),
-        (Command(INF, (0.0, 0.0, 1.0), 0.0), False),
-        (Command(9.8, (0.0, NAN, 1.0), 0.0), False),
-        (Command(9.8, (0.0, 0.0, 1.0), NAN), False),
-        (Command(9.8, (0.0, 0.0, 0.0), 0.0), False),
-        (Command(9.8, (0.0, 0.0, 1.02), 0.0), False),
-    ],
-)
-def test_usable(command: Command, expected: bool) -> None:
-    assert usable(command) is expected
-
-
-def test_clamp_changes_only_what_exceeds_the_limits(vehicle: Vehicle) -> None:
-    generator = np.random.default_rng(4)
-    for drawn in generator.normal(size=(500, 3)):
-        direction = drawn / np.linalg.norm(drawn)
-        command = Command(generator.uniform(-50, 50), tuple(direction), 0.3)
-        clamped = clamp(command, vehicle)
-        given = np.array(clamped.thrust_direction_ned)
-        assert np.linalg.norm(given) == pytest.approx(1.0)
-        assert given[2] >= math.cos(vehicle.tilt_max_rad) - 1e-9
-        assert 0.0 <= clamped.thrust_mps2 <= vehicle.thrust_max_mps2
-        assert clamped.heading_rad == 0.3
-        across = direction[0] * given[1] - direction[1] * given[0]
-        assert across == pytest.approx(0.0, abs=1e-9)
-        assert direction[:2] @ given[:2] > 0.0
-        if direction[2] >= math.cos(vehicle.tilt_max_rad):
-            assert clamped.thrust_direction_ned == command.thrust_direction_ned
 
 
 def test_parameters_are_requested_until_they_are_answered() -> None:
@@ -86,14 +41,11 @@ def test_arducopter_is_not_flown_without_a_reply_for_guid_options() -> None:
     boosts = {"ATC_ANGLE_BOOST": 1.0}
 
     def ground(parameters: dict[str, float]) -> Ground:
-        attitude = Attitude(1.0, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-        position = LocalPosition(1.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-        health = SystemHealth(True, 1.0)
         vehicle = VehicleState(
             landed="on_ground",
-            position=position,
-            attitude=attitude,
-            health=health,
+            position=LocalPosition(1.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+            attitude=Attitude(1.0, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+            health=SystemHealth(True, 1.0),
             parameters=parameters,
         )
         return Ground(vehicle, Limits(), ARDUPILOT, rates_hz=None)
@@ -131,27 +83,21 @@ def test_what_a_horizon_calls_near_a_volume_was_loaded_at_the_rehearsal(
     assert set(loaded) == rehearsed
 
 
-@pytest.mark.parametrize("length", [0, 1, 123, 124, 125, 20_000])
-def test_manifest_round_trip(length: int) -> None:
-    source = random.Random(length)
-    text = "".join(chr(source.randrange(32, 500)) for _ in range(length))
-    records = inputs.pieces(text)
-    assert all(len(record.data) <= 128 for record in records)
-    assert inputs.join(record.data for record in records) == text
-
-
-def test_a_damaged_manifest_is_none() -> None:
+def test_the_manifest_is_read_back_or_is_none() -> None:
+    """As DEBUG_FLOAT_ARRAY, of any length; damaged, it is none."""
     source = random.Random(1)
-    text = "".join(chr(source.randrange(32, 500)) for _ in range(1000))
-    payloads = [record.data for record in inputs.pieces(text)]
-    assert len(payloads) > 3
-    assert inputs.join(payloads) == text
-    assert inputs.join(payloads[1:]) is None
-    assert inputs.join(payloads[:-1]) is None
-    assert inputs.join([]) is None
-    assert inputs.join([b"", b"\1"]) is None
-    assert inputs.join([b"\0\0\1\0 not compressed"]) is None
-    assert inputs.join([*payloads[:2], payloads[2][:-3] + b"???", *payloads[3:]]) is None
+    for length in (0, 1, 123, 124, 125, 1000, 20_000):
+        text = "".join(chr(source.randrange(32, 500)) for _ in range(length))
+        payloads = [record.data for record in inputs.pieces(text)]
+        assert max(map(len, payloads)) <= 128
+        assert inputs.join(payloads) == text
+        assert inputs.join(payloads[1:]) is None
+        if len(payloads) > 3:
+            assert inputs.join(payloads[:-1]) is None
+            changed = payloads[2][:-3] + b"???"
+            assert inputs.join([*payloads[:2], changed, *payloads[3:]]) is None
+    for payloads in ([b"", b"\1"], [b"\0\0\1\0 not compressed"]):
+        assert inputs.join(payloads) is None
 
 
 def test_records_are_not_sent_and_no_sequence_has_a_gap() -> None:

@@ -39,11 +39,7 @@ Setup = Callable[[FlightState], object]
 
 
 def _set(**values: object) -> Setup:
-    def apply(flight: FlightState) -> None:
-        for name, value in values.items():
-            setattr(flight, name, value)
-
-    return apply
+    return lambda flight: [setattr(flight, name, value) for name, value in values.items()]
 
 
 def _stand(standing: Standing, armed: bool | None = None) -> Setup:
@@ -87,18 +83,15 @@ def _age_attitude(flight: FlightState) -> None:
     flight.vehicle.attitude = Attitude(NOW_S - 0.51, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
 
-def _reach_start(flight: FlightState) -> None:
+def _climb(late_s: float, at_start: bool) -> Setup:
     plan: Any = SimpleNamespace(
-        late_s=lambda time_s: 1.0, at_start=lambda *_: True, sample=lambda time_s: None
-    )
-    plan.track, plan.reference, plan.track_time_s = TRACK, None, lambda time_s: math.nan
-    flight.plan = plan
+        late_s=lambda time_s: late_s, at_start=lambda *_: at_start, sample=lambda time_s: None,
+        track=TRACK, reference=None, track_time_s=lambda time_s: math.nan,
+    )  # fmt: skip
+    return _set(plan=plan)
 
 
-def _climb_late(flight: FlightState) -> None:
-    _reach_start(flight)
-    plan: Any = flight.plan
-    plan.late_s, plan.at_start = lambda time_s: 90.1, lambda *_: False
+_reach_start, _climb_late = _climb(1.0, True), _climb(90.1, False)
 
 
 def _refuse_arming(flight: FlightState) -> None:
@@ -247,13 +240,6 @@ def test_every_wait_is_limited() -> None:
         assert next_row(flight) is not None
 
 
-def test_every_phase_but_the_ends_has_rows() -> None:
-    unended = {phase for phase in Phase if phase not in ENDS}
-    assert {phase for row in table() for phase in row.phases} == unended - SERVICE_ONLY
-    for service in SERVICES.values():
-        assert {phase for row in table(service) for phase in row.phases} == unended
-
-
 def test_the_service_waits_for_ever() -> None:
     for service in SERVICES.values():
         for phase in (Phase.CONNECT, Phase.HEALTH, Phase.STANDBY, Phase.PAUSE):
@@ -269,17 +255,18 @@ def test_the_service_waits_for_ever() -> None:
     assert targets == {"hold": None, "land": Phase.LAND, "repeat": Phase.CLIMB}
 
 
-def test_the_service_arms_nothing_by_itself() -> None:
-    """The only way to the phases that arm is a request on the ground."""
-    for service in SERVICES.values():
-        ways = [row for row in table(service) if row.target is Phase.STREAM]
-        assert [row.condition.__name__ for row in ways] == ["started_on_the_ground"]
-
-
-def test_every_row_leads_to_a_later_phase() -> None:
+def test_every_phase_but_the_ends_has_rows_and_each_leads_to_a_later_one() -> None:
+    """Of the service, which flies again, only the first holds; the only way to the phases that arm
+    is a request on the ground."""
     order = {phase: index for index, phase in enumerate(Phase)}
+    unended = {phase for phase in Phase if phase not in ENDS}
+    assert {phase for row in table() for phase in row.phases} == unended - SERVICE_ONLY
     for row in table():
         assert all(order[row.target] > order[phase] for phase in row.phases)
+    for service in SERVICES.values():
+        assert {phase for row in table(service) for phase in row.phases} == unended
+        ways = [row for row in table(service) if row.target is Phase.STREAM]
+        assert [row.condition.__name__ for row in ways] == ["started_on_the_ground"]
 
 
 def test_every_abnormal_end_has_an_exit_code() -> None:

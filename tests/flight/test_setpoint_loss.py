@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import pytest
 from pair import LEAN, QUICK_LANDING, decode, hover, in_phase
-from watch import scenario_of
+from watch import LANDED, flown, scenario_of
 
 from offboard.flight.phases import Phase
 from offboard.mavlink.dialects.px4 import PX4
@@ -99,25 +99,26 @@ class Stopped:
 @pytest.mark.parametrize(("stop_s", "exit_code"), [(0.5, 0), (0.9, 4)])
 def test_a_stop_that_ends_before_the_supervisor_acts(stop_s: float, exit_code: int) -> None:
     """The controller flies on if no setpoint was missing for long, else it lands the vehicle."""
-    pair = hover("reference.duration_s=4.0")
+    pair = hover("reference.duration_s=4.0", aloft=True)
     if exit_code:
         pair.instance.autopilot.parameters.set("COM_OF_LOSS_T", 0.5)
     pair.at.append((in_phase(Phase.TRACK, 1.0), lambda flying: flying.pause(stop_s)))
-    assert pair.fly().exit_code == exit_code
-    assert not pair.instance.autopilot.commander.armed
+    flown(pair, exit_code, "" if exit_code else LANDED)
+    assert not pair.armed
 
 
-@pytest.mark.parametrize("fallback", [POSCTL, LOITER])
-def test_the_supervisor_lands_it_before_the_failsafe(fallback: int) -> None:
-    stopped = Stopped(fallback)
+def test_the_supervisor_lands_it_before_the_failsafe() -> None:
+    stopped = Stopped(POSCTL)
     assert stopped.silent_s == pytest.approx(0.6)
     assert stopped.run() == "the vehicle is disarmed"
     assert not stopped.armed
     assert stopped.modes[:3] == ["OFFBOARD", "AUTO.LOITER", "AUTO.LAND"]
 
 
-@pytest.mark.parametrize("fallback", [POSCTL, RETURN, LAND, LOITER])
-@pytest.mark.parametrize("after_s", [-0.004, 0.0, 0.004, 0.02, 0.4])
+@pytest.mark.parametrize(
+    ("after_s", "fallback"),
+    [(-0.004, POSCTL), (0.0, LOITER), (0.0, POSCTL), (0.004, RETURN), (0.02, LAND), (0.4, LOITER)],
+)
 def test_in_a_race_with_the_failsafe_it_is_landed(after_s: float, fallback: int) -> None:
     """The supervisor acts so long after the failsafe; it took that mode for a pilot's and gave
     up."""
@@ -146,8 +147,9 @@ def test_in_the_failsafe_it_is_watched_and_landed_if_it_does_not(
     assert all(5.0 < at_s < 7.5 for at_s in landings)
 
 
-@pytest.mark.parametrize("pilot_s", [0.5, 1.3, 3.0])
-@pytest.mark.parametrize("mode", ["POSCTL", "ALTCTL"])
+@pytest.mark.parametrize(
+    ("mode", "pilot_s"), [("POSCTL", 0.5), ("POSCTL", 1.3), ("POSCTL", 3.0), ("ALTCTL", 1.3)]
+)
 def test_a_pilots_choice_is_final_before_the_failsafe_and_in_it(mode: str, pilot_s: float) -> None:
     """POSCTL is also the mode of the failsafe: HEARTBEAT shows none once it was chosen. Nothing
     that is asked arrives."""

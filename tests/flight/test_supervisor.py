@@ -34,7 +34,7 @@ from offboard.mavlink.events import VehicleFound
 from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.signing import Signing
-from offboard.run.loop import ANSWERS, UNANSWERED, Loop
+from offboard.run.loop import Loop
 from offboard.supervisor.recovery import Supervised
 from offboard.supervisor.supervisor import Supervisor, SupervisorError
 
@@ -51,6 +51,16 @@ OURS, ON_GROUND, NOT_OURS = (
 def now(guard: Supervised) -> Supervised:
     """The vehicle has just reported its mode."""
     return replace(guard, reported_s=clock.monotonic_s())
+
+
+def abandon(supervisor: Supervisor, link: Any) -> None:
+    """End as a controller that is killed: the kernel closes its descriptors."""
+    supervisor._channel.close()
+    link.close()
+
+
+def await_end(supervisor: Supervisor) -> None:
+    supervisor._process.wait(LONG_S)
 
 
 class Rig:
@@ -71,14 +81,6 @@ class Rig:
 
     def beat(self, guard: Supervised) -> None:
         self.supervisor.beat(now(guard), self.peer, self.link, self.log.descriptor)
-
-    def abandon(self) -> None:
-        """End as a process that is killed: the kernel closes its descriptors."""
-        self.supervisor._channel.close()
-        self.link.close()
-
-    def await_end(self) -> None:
-        self.supervisor._process.wait(LONG_S)
 
     def heard(self) -> list[Any]:
         """What the vehicle has received until the supervisor ended."""
@@ -116,9 +118,12 @@ class Rig:
         self.report(self.sender, LANDING, armed=False)
 
 
-@pytest.fixture(params=["udpin", "udpout"])
+BOTH_WAYS = pytest.mark.parametrize("rig", ["udpin", "udpout"], indirect=True)
+
+
+@pytest.fixture
 def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Rig]:
-    rig = Rig(tmp_path, request.param)
+    rig = Rig(tmp_path, getattr(request, "param", "udpin"))
     with rig.log, rig.supervisor:
         rig.supervisor.await_ready()
         yield rig
@@ -126,15 +131,16 @@ def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Rig]:
     rig.vehicle.close()
 
 
+@BOTH_WAYS
 def test_it_takes_over_when_the_controller_ends(rig: Rig) -> None:
     rig.beat(ON_GROUND)
     rig.beat(OURS)
-    rig.abandon()
+    abandon(rig.supervisor, rig.link)
     command = rig.next_command()
     assert (command.command, command.param2, command.param3) == (176, 4.0, 3.0)  # AUTO.LOITER
     assert (command.target_system, command.get_srcSystem()) == (7, 7)
     rig.disarm()
-    rig.await_end()
+    await_end(rig.supervisor)
     texts = [entry.message.text for entry in tlog.read(rig.log.path)
              if entry.name == "STATUSTEXT"]  # fmt: skip
     said = "".join(texts)
@@ -143,6 +149,9 @@ def test_it_takes_over_when_the_controller_ends(rig: Rig) -> None:
 
 
 def test_it_takes_over_when_the_beats_stop_and_says_so_first(rig: Rig) -> None:
+    """Signals do not end it: a service manager signals all processes of a service."""
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        os.kill(rig.supervisor.pid, number)
     rig.beat(OURS)
     assert not rig.supervisor.has_taken_over()
     assert rig.next_command().command == 176
@@ -217,59 +226,25 @@ def test_a_stopped_controller_leaves_the_answers_to_the_supervisor(
     assert "COMMAND_LONG" not in [each.get_type() for each in rig.heard()]
 
 
-class Announcing(Beating):
-    """On the ground, then in flight: stops the supervisor for as long as the loop does not say that
-    it does not answer. `said_s`: how long that took, and how long its return."""
+def test_one_that_is_stopped_does_not_guard_until_it_continues(rig: Rig) -> None:
+    """Within two seconds, on the ground and in flight, where it does not take over. The loop
+    announces it: see test_edges.py."""
 
-    def __init__(self, rig: Rig) -> None:
-        super().__init__(rig.peer)
-        self._pid = rig.supervisor.pid
-        self._changed_s = clock.monotonic_s()
-        self.announced: list[str] = []
-        self.guarded: list[bool] = []
-        self.said_s: list[float] = []
+    def beat_until(guards: bool, guard: Supervised) -> float:
+        began_s = clock.monotonic_s()
+        while rig.supervisor.guards is not guards:
+            assert clock.monotonic_s() < began_s + LONG_S
+            rig.beat(guard)
+            time.sleep(0.02)
+            rig.supervisor.has_taken_over()  # reads its answer
+        return clock.monotonic_s() - began_s
 
-    @property
-    def in_flight(self) -> bool:
-        return len(self.said_s) >= 2
-
-    def turn(self, chunks: Sequence[Chunk], now_s: float) -> Output:
-        self.phase = Phase.TRACK if self.in_flight else Phase.HEALTH
-        return Output(supervised=now(OURS if self.in_flight else ON_GROUND))
-
-    def guard(self, guarded: bool) -> None:
-        if [guarded] != self.guarded[-1:]:
-            self.guarded.append(guarded)
-            self._signal(signal.SIGSTOP if guarded else 0)
-
-    def announce(self, sentence: str) -> None:
-        self.announced.append(sentence)
-        self.said_s.append(clock.monotonic_s() - self._changed_s)
-        self._signal(signal.SIGCONT if sentence == UNANSWERED else 0)
-
-    def _signal(self, number: int) -> None:
-        if number and not self.has_ended():
-            self._changed_s = clock.monotonic_s()
-            os.kill(self._pid, number)
-
-    def has_ended(self) -> bool:
-        return len(self.said_s) >= 4 or clock.monotonic_s() - self._changed_s > LONG_S
-
-
-@pytest.mark.parametrize("rig", ["udpin"], indirect=True)
-def test_one_that_is_stopped_is_announced_within_a_second_and_when_it_answers_again(
-    rig: Rig,
-) -> None:
-    """Once each, on the ground and in flight, where it does not take over."""
-    flown: Any = Announcing(rig)
-    with StopRequests() as requested:
-        Loop(
-            flown, rig.link, rig.log, stops=requested, progress=id, supervisor=rig.supervisor
-        ).run()
-    assert flown.announced == [UNANSWERED, ANSWERS] * 2
-    assert flown.guarded == [True, False, True, False, True]
-    assert all(0.9 < said_s < 2.0 for said_s in flown.said_s[::2])
-    assert all(said_s < 1.0 for said_s in flown.said_s[1::2])
+    for guard in (ON_GROUND, OURS):
+        beat_until(True, guard)
+        os.kill(rig.supervisor.pid, signal.SIGSTOP)
+        assert 0.9 < beat_until(False, guard) < 2.0
+        os.kill(rig.supervisor.pid, signal.SIGCONT)
+        assert beat_until(True, guard) < 1.0
     assert not rig.supervisor.has_taken_over()
 
 
@@ -298,7 +273,7 @@ def test_the_report_of_the_mode_may_be_old_and_is_awaited_then(rig: Rig) -> None
     no report is fresh, and hold as soon as it shows our mode."""
     old = replace(OURS, reported_s=clock.monotonic_s() - 3.0)
     rig.supervisor.beat(old, rig.peer, rig.link, rig.log.descriptor)
-    rig.abandon()
+    abandon(rig.supervisor, rig.link)
     rig.vehicle.settimeout(1.0)
     with pytest.raises(TimeoutError):
         rig.next_command()
@@ -314,8 +289,8 @@ def test_a_vehicle_that_is_not_ours_or_on_the_ground_is_left_alone(
 ) -> None:
     rig.beat(OURS)
     rig.beat(guard)
-    rig.abandon()
-    rig.await_end()
+    abandon(rig.supervisor, rig.link)
+    await_end(rig.supervisor)
     assert rig.heard() == []
 
 
@@ -326,18 +301,9 @@ def test_the_newest_of_what_has_waited_decides(rig: Rig) -> None:
     for _ in range(BATCH_MAX + 50):
         rig.report(place, OFFBOARD)
     rig.report(place, POSCTL)
-    rig.abandon()
-    rig.await_end()
+    abandon(rig.supervisor, rig.link)
+    await_end(rig.supervisor)
     assert [each for each in rig.heard() if each.get_type() == "COMMAND_LONG"] == []
-
-
-def test_signals_do_not_end_it(rig: Rig) -> None:
-    """A service manager signals all processes of a service."""
-    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        os.kill(rig.supervisor.pid, number)
-    rig.beat(OURS)
-    assert rig.next_command().command == 176
-    rig.disarm()
 
 
 # --- other links, and signing ---
@@ -360,34 +326,40 @@ class Caller:
                     return message
 
 
+def listening() -> tuple[Any, int]:
+    """A link to which a vehicle connects, and its port."""
+    link = open_link("tcpin:127.0.0.1:0")
+    with socket.socket(fileno=os.dup(link.descriptors()[0])) as listener:
+        return link, listener.getsockname()[1]
+
+
+def await_connections(link: Any, count: int) -> None:
+    while len(link.descriptors()) != 1 + count:
+        link.receive(0.02)
+
+
 @pytest.mark.parametrize("returns", ["before", "after"])
 def test_over_tcpin_it_asks_the_vehicle_that_connected_last(returns: str, tmp_path: Path) -> None:
     """A connection that ended, and one that begins before or after the controller ended."""
-    link = open_link("tcpin:127.0.0.1:0")
-    with socket.socket(fileno=os.dup(link.descriptors()[0])) as listener:
-        port = listener.getsockname()[1]
+    link, port = listening()
     with FlightLog(tmp_path / "x", "", real_time=True) as log, Supervisor() as supervisor:
         supervisor.await_ready()
         first = Caller(port)
-        while len(link.descriptors()) < 2:
-            link.receive(0.02)
+        await_connections(link, 1)
         supervisor.beat(now(OURS), "tcp", link, log.descriptor)
         first.socket.close()
-        while len(link.descriptors()) > 1:
-            link.receive(0.02)
+        await_connections(link, 0)
         supervisor.beat(now(OURS), "tcp", link, log.descriptor)
         if returns == "before":
             second = Caller(port)
-            while len(link.descriptors()) < 2:
-                link.receive(0.02)
+            await_connections(link, 1)
             supervisor.beat(now(OURS), "tcp", link, log.descriptor)
-        supervisor._channel.close()
-        link.close()
+        abandon(supervisor, link)
         if returns == "after":
             second = Caller(port)
         assert second.asked(mavlink.MAVLink(None)).command == 176
         second.socket.close()
-        supervisor._process.kill()
+        os.kill(supervisor.pid, signal.SIGKILL)
 
 
 def test_it_signs_with_stamps_that_follow_ours(tmp_path: Path) -> None:
@@ -395,23 +367,20 @@ def test_it_signs_with_stamps_that_follow_ours(tmp_path: Path) -> None:
     signing = Signing(key, 10**12, clock.monotonic_s)
     ours = Session(SessionSettings(), signing)
     ours.set_vehicle(VEHICLE, "tcp")
-    link = open_link("tcpin:127.0.0.1:0")
-    with socket.socket(fileno=os.dup(link.descriptors()[0])) as listener:
-        vehicle = Caller(listener.getsockname()[1])
+    link, port = listening()
+    vehicle = Caller(port)
     reader = mavlink.MAVLink(None, srcSystem=7, srcComponent=1)
     reader.signing.secret_key, reader.signing.sign_outgoing = key, True
     reader.signing.timestamp = 10**12
     with FlightLog(tmp_path / "x", "", real_time=True) as log, Supervisor(signing) as supervisor:
         supervisor.await_ready()
-        while len(link.descriptors()) < 2:
-            link.receive(0.02)
+        await_connections(link, 1)
         for _ in range(3):
             supervisor.beat(now(OURS), "tcp", link, log.descriptor)
             newest = ours.encode(Heartbeat(6))
         assert reader.decode(bytearray(newest)).get_type() == "HEARTBEAT"
         assert key.hex() not in str(supervisor._process.args)
-        supervisor._channel.close()
-        link.close()
+        abandon(supervisor, link)
         command = vehicle.asked(reader)
         assert command.command == 176
         assert command.get_signed()
@@ -420,7 +389,7 @@ def test_it_signs_with_stamps_that_follow_ours(tmp_path: Path) -> None:
         vehicle.socket.sendall(disarmed.pack(forged))
         assert vehicle.asked(reader).command == 176  # it does not believe that
         vehicle.socket.sendall(disarmed.pack(reader))
-        supervisor._process.wait(LONG_S)
+        await_end(supervisor)
     vehicle.socket.close()
     assert all(each.frame.signed for each in tlog.read(log.path) if each.name != "TUNNEL")
 
@@ -429,7 +398,7 @@ def test_a_supervisor_that_ends_is_noticed_and_another_one_takes_over(rig: Rig) 
     rig.beat(OURS)
     assert not rig.supervisor.lost
     os.kill(rig.supervisor.pid, signal.SIGKILL)
-    rig.await_end()
+    await_end(rig.supervisor)
     rig.beat(OURS)
     rig.beat(OURS)
     assert rig.supervisor.lost
@@ -449,9 +418,10 @@ def test_a_supervisor_that_cannot_be_started_is_said(monkeypatch: pytest.MonkeyP
     """As with too many processes; nothing is left open."""
     monkeypatch.setattr(sys, "executable", "/no/such/python")
     supervisor = Supervisor()
+    before = os.listdir("/proc/self/fd")
     with (
         pytest.raises(SupervisorError, match="does not start: No such file or directory"),
         supervisor,
     ):
         pass
-    assert supervisor._channel.fileno() == -1
+    assert os.listdir("/proc/self/fd") == before

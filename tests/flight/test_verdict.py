@@ -12,13 +12,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from faults import die, kill_motors, stop, take_over
-from pair import UNIX_EPOCH_US, Pair, calm_hover, decode, frames_of, hover, in_phase, make
+from pair import UNIX_EPOCH_US, calm_hover, hover, make
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from typer.testing import CliRunner
 
-from offboard.analysis import history, tlog
-from offboard.analysis.history import OUR_COMPONENTS, History
+from offboard.analysis.history import History
 from offboard.analysis.score import Score, judged, score
 from offboard.analysis.score_table import summary, verdict
 from offboard.cli.commands import app
@@ -29,21 +27,19 @@ from offboard.identification.learner import IdentifySettings
 from offboard.link.log import FlightLog
 from offboard.model.frames import thrust_direction_from_quaternion
 
-WRAP_MS = 2**32
 TRACKED_S = 3.0
-STAMPED = {"LOCAL_POSITION_NED", "ATTITUDE_QUATERNION"}
 
 
 @pytest.fixture(scope="module")
-def flown(tmp_path_factory: pytest.TempPathFactory) -> History:
-    return history.gather(calm_hover().log(tmp_path_factory.mktemp("flown")))
+def flown() -> History:
+    return calm_hover().history()
 
 
-def test_decisions_at_the_tilt_limit_are_counted_and_reported(tmp_path: Path) -> None:
+def test_decisions_at_the_tilt_limit_are_counted_and_reported() -> None:
     """The wind of `wind_light` needs more than 45 degrees of tilt, to which the gate turns back."""
     pair = make(reference="lemniscate", vehicle="neutral", scenario="wind_light", seed=2)
     pair.track()
-    flown = history.gather(pair.log(tmp_path))
+    flown = pair.history()
     down = thrust_direction_from_quaternion(flown.setpoint["quaternion"])[:, 2]
     limited = np.degrees(np.arccos(down)) > 44.9
     assert limited.sum() > 20
@@ -53,81 +49,16 @@ def test_decisions_at_the_tilt_limit_are_counted_and_reported(tmp_path: Path) ->
     assert texts["at a limit"].endswith("% of the decisions: fly slower, or in less wind")
 
 
-def test_a_calm_flight_is_not_at_a_limit(flown: History) -> None:
-    scored = score(flown)
-    assert scored.at_bound_share == 0.0
-    assert "at a limit" not in summary(scored, flown)
-
-
 def test_a_whole_flight_is_completed(flown: History) -> None:
     whole = score(flown)
     assert (whole.completed, whole.ended_by) == (1.0, "reference over")
     assert whole.tracked_s == pytest.approx(TRACKED_S, abs=0.2)
     assert 0.3 < whole.touchdown_mps < 1.2  # MPC_LAND_CRWL is 0.7
+    assert whole.at_bound_share == 0.0
+    assert "at a limit" not in summary(whole, flown)
 
 
-def judged_by(pair: Pair, directory: Path) -> tuple[object, ...]:
-    """Verdict, touch-down and events of the log."""
-    flown = history.gather(pair.log(directory))
-    judged = score(flown)
-    rows = [repr(event) for event in flown.events()]  # a NaN does not equal itself
-    return judged.completed, judged.ended_by, judged.reason, repr(judged.touchdown_mps), rows
-
-
-def judged_without_texts(pair: Pair, directory: Path) -> tuple[object, ...]:
-    """The same of the log without any STATUSTEXT of ours."""
-    ours = [
-        frame
-        for frame in pair.logged
-        if frame[7:10] == b"\xfd\0\0" and decode(frame).get_srcComponent() in OUR_COMPONENTS
-    ]
-    assert len(ours) > 5
-    return judged_by(replace(pair, logged=[f for f in pair.logged if f not in ours]), directory)
-
-
-def test_the_verdict_needs_no_texts(tmp_path: Path) -> None:
-    muted = judged_without_texts(calm_hover(), tmp_path / "mute")
-    assert muted == judged_by(calm_hover(), tmp_path / "log")
-    assert muted[:2] == (1.0, "reference over")
-    begun = [
-        event.phase for event in history.gather(tlog.read(tlog.find(tmp_path / "mute"))).phases
-    ]
-    assert (begun[0], begun[-1]) == ("health", "disarmed")
-    assert {"arm", "takeoff", "track", "hover", "land"} < set(begun)
-
-
-def our_ids(pair: Pair) -> None:
-    """Another program says that it tracks: the autopilot is asked to hold, then to land."""
-    frame = mavlink.MAVLink_heartbeat_message(18, 8, 0, 8, 4, 3).pack(mavlink.MAVLink(None, 1, 191))
-    pair.down = lambda _, datagrams: [*datagrams, frame]
-
-
-@pytest.mark.parametrize(
-    ("moment", "act", "ended_by"),
-    [
-        (in_phase(Phase.TRACK, 1.0), stop, "operator"),
-        (in_phase(Phase.TRACK, 1.0), take_over, "pilot"),
-        (in_phase(Phase.LAND, 0.5), take_over, "pilot"),
-        (in_phase(Phase.TRACK, 1.0), die, "link"),
-        (in_phase(Phase.TRACK, 1.0), our_ids, "second sender"),
-        (in_phase(Phase.TRACK, 1.0), kill_motors, "disarmed in flight"),
-        (in_phase(Phase.ARM), stop, "operator"),
-    ],
-)
-def test_a_flight_that_ended_early_says_what_ended_it(
-    moment: Callable[[Pair], bool], act: Callable[[Pair], None], ended_by: str, tmp_path: Path
-) -> None:
-    pair = hover(at=[(moment, act)])
-    assert pair.fly().exit_code != 0
-    ended = pair.score(tmp_path)
-    assert (ended.completed, ended.ended_by) == (0.0, ended_by)
-    assert judged_without_texts(pair, tmp_path / "mute") == judged_by(pair, tmp_path / "log")
-    assert ended.reason
-    assert any(line.endswith(f": {ended.reason}") for line in pair.companion.announced)
-    assert verdict(ended) == f"not completed ({ended_by}): {ended.reason}"
-
-
-def test_others_on_the_link_have_no_effect(flown: History, tmp_path: Path) -> None:
+def test_others_on_the_link_have_no_effect(flown: History) -> None:
     """Another autopilot, heard first, its companion with our component id, and a camera of the same
     system: none of them is what `--system 1` flies."""
     battery = mavlink.MAVLink_sys_status_message(0, 0, 0, 0, 9000, 0, 5, 0, 0, 0, 0, 0, 0)
@@ -148,33 +79,9 @@ def test_others_on_the_link_have_no_effect(flown: History, tmp_path: Path) -> No
     pair = hover(system_id=1, down=lambda _, heard: [*frames, *heard] if heard else [])
     assert pair.fly() == calm_hover().companion.outcome
     assert pair.failsafes == {}
-    among = score(history.gather(pair.log(tmp_path)))
-    alone = score(flown)
+    among, alone = pair.score(), score(flown)
     assert (among.completed, among.ended_by) == (1.0, "reference over")
     assert among.rmse_position_m == alone.rmse_position_m
-
-
-@pytest.mark.parametrize("height", [1.5, 0.6])
-def test_a_fall_is_no_landing(height: float, tmp_path: Path) -> None:
-    """The motors are cut above the ground while it lands: all phases are gone through."""
-
-    def low(pair: Pair) -> bool:
-        return pair.companion.phase is Phase.LAND and height_m(pair) < height
-
-    assignments = ("reference.height_m=3.0", "reference.duration_s=1.0")
-    pair = make(*assignments, reference="hover", at=[(low, kill_motors)])
-    pair.fly()
-    assert pair.companion.phase is Phase.FAILED
-    fallen = pair.score(tmp_path)
-    assert fallen.completed == 0.0
-    assert "fell at up to " in fallen.ended_by
-    fastest_mps = float(fallen.ended_by.split()[-2])
-    free_mps = math.sqrt(0.7**2 + 2 * 9.81 * height)
-    assert 0.75 * free_mps < fastest_mps < free_mps  # less by drag
-
-
-def height_m(pair: Pair) -> float:
-    return -float(pair.instance.autopilot.state.truth.position_ned_m[2])
 
 
 def test_a_requirement_on_a_cut_log_is_missed(tmp_path: Path) -> None:
@@ -237,13 +144,15 @@ def test_the_outcome_follows_the_log(flown: History) -> None:
     sentence = "flown and landed, but not completed: fell at up to 5.1 m/s"
     assert judged(landed, fallen) == Outcome(4, sentence)
     assert judged(refused, fallen) == refused
+    ended = replace(fallen, ended_by="pilot", reason="the vehicle left OFFBOARD")
+    assert verdict(ended) == "not completed (pilot): the vehicle left OFFBOARD"
 
 
-def test_a_record_says_what_was_sent(tmp_path: Path) -> None:
+def test_a_record_says_what_was_sent() -> None:
     """Identification steps change the command after the decision: no certificate then."""
     pair = hover(scenario="px4_like", learning=IdentifySettings())
     pair.track()
-    flown = history.gather(pair.log(tmp_path))
+    flown = pair.history()
     excited = flown.records["phase"] == PHASE_CODES[Phase.EXCITE]
     certified = np.isfinite(flown.records["gap"])
     assert excited.sum() > 20
@@ -291,75 +200,6 @@ def test_thinned_telemetry_does_not_lower_the_error(flown: History) -> None:
     gap = score(replace(off, position=off.position[~lost]))
     assert gap.rmse_position_m == pytest.approx(expected_m, rel=0.03)
     assert gap.position_gap_max_s == pytest.approx(0.4, abs=0.02)
-
-
-def jumped(flown: History, by_s: float, *, reference_too: bool) -> History:
-    """The flight with the vehicle's clock jumping in the middle of the track."""
-    moment_s = track_begin_s(flown) + 1.5
-    tables = {}
-    for name in ("position", "attitude", "truth", "reference", "setpoint", "landed", "heartbeat"):
-        rows = getattr(flown, name).copy()
-        rows["time_s"][rows["time_s"] > moment_s] += by_s
-        tables[name] = rows
-    records = flown.records.copy()
-    late = records["time_s"] > moment_s
-    if reference_too:
-        records["track_time_s"][late] += by_s
-    records["time_s"][late] += by_s
-    phases = tuple(
-        replace(event, time_s=event.time_s + (by_s if event.time_s > moment_s else 0.0))
-        for event in flown.phases
-    )
-    return replace(flown, **tables, records=records, phases=phases)
-
-
-@pytest.mark.parametrize("by_s", [3.0, 35.0])
-def test_a_jump_of_the_clock_is_not_tracked(flown: History, by_s: float) -> None:
-    """Where the reference jumps too, a part of it was not flown. Where it does not, nothing is
-    missing, and the error is that of the flight without the jump."""
-    whole = score(flown)
-    stepped = score(jumped(flown, by_s, reference_too=True))
-    assert stepped.completed == 0.0
-    assert stepped.ended_by == f"{by_s + 0.1:.1f} s of the reference were not tracked"
-    assert stepped.tracked_s == pytest.approx(whole.tracked_s - 0.1, abs=0.02)
-    steady = score(jumped(flown, by_s, reference_too=False))
-    assert (steady.completed, steady.tracked_s) == (1.0, whole.tracked_s)
-    assert steady.rmse_position_m == pytest.approx(whole.rmse_position_m, rel=0.01)
-
-
-def later(by_ms: int) -> Callable[[float, list[bytes]], list[bytes]]:
-    """A link on which the vehicle's clock is later, and its stamps wrap."""
-    codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
-
-    def restamped(frame: bytes) -> bytes:
-        message = decode(frame)
-        if message.get_type() in STAMPED:
-            message.time_boot_ms = (message.time_boot_ms + by_ms) % WRAP_MS
-        elif message.get_type() == "TIMESYNC":
-            message.tc1 += by_ms * 10**6
-        else:
-            return frame
-        codec.seq = frame[4]
-        return bytes(message.pack(codec))
-
-    return lambda _, datagrams: [b"".join(map(restamped, frames_of(d))) for d in datagrams]
-
-
-def test_a_flight_across_the_wrap_of_the_clock(flown: History, tmp_path: Path) -> None:
-    """`time_boot_ms` begins again at zero in the middle of the track."""
-    by_ms = WRAP_MS - round(1e3 * (track_begin_s(flown) + 1.5))
-    pair = hover(down=later(by_ms))
-    outcome = pair.fly()
-    assert (outcome.exit_code, outcome.sentence) == (0, "flown and landed")
-    wrapped, whole = pair.score(tmp_path), score(flown)
-    assert (wrapped.completed, wrapped.ended_by) == (1.0, "reference over")
-    assert wrapped.tracked_s == pytest.approx(whole.tracked_s, abs=0.1)  # ticks fall elsewhere
-    assert wrapped.rmse_position_m == pytest.approx(whole.rmse_position_m, abs=1e-3)
-    assert wrapped.link_delay_p50_ms == pytest.approx(whole.link_delay_p50_ms, abs=1.0)
-    again = history.gather(tlog.read(tmp_path / "flight.tlog"))
-    for rows in (again.position, again.reference, again.setpoint):
-        assert np.diff(rows["time_s"]).min() >= 0.0
-        assert np.diff(rows["time_s"]).max() < 1.0
 
 
 def test_stretch_that_is_too_short_to_be_scored_is_not_flown(tmp_path: Path) -> None:

@@ -1,10 +1,11 @@
-"""The true motion of a vehicle in flight, and what several tests of safety ask."""
+"""What the vehicle really did in a flight, and how the flight must have ended."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import partial
+import math
+import re
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
@@ -13,39 +14,54 @@ import pytest
 from numpy.typing import NDArray
 from pair import SHORT, Bytes, Filter, Pair, decode, make, on_arducopter, through
 
-from offboard.flight.phases import TRACKING, Phase
+from offboard.analysis.history import OUR_COMPONENTS
+from offboard.analysis.score import score
+from offboard.flight.phases import ENDS, TRACKING, Action, ExitCode, Phase
 from simulator import config as simulated
 from simulator.config import Scenario
 
-SET_MODE, LAND, ARM, SET_MESSAGE_INTERVAL = 176, 21, 400, 511  # MAV_CMD
-LOW, HIGH = "reference.height_m=1.0", "reference.height_m=3.0"  # low: a short climb and landing
-ONE_LAP = "reference.laps=1"
-FIRMWARES = (("px4", make), ("ardupilot", on_arducopter))
-# one lap, by a vehicle that hovers when its links open; or a hover after its own take-off
-BOTH, FROM_THE_GROUND = (
-    pytest.mark.parametrize(
-        "fly",
-        [partial(fly, *reference, aloft=aloft, **named) for _, fly in FIRMWARES],
-        ids=[name for name, _ in FIRMWARES],
-    )
-    for reference, named, aloft in (
-        ((LOW, ONE_LAP), {}, True),
-        (SHORT, {"reference": "hover"}, False),
-    )
-)
+SET_MESSAGE_INTERVAL = 511  # MAV_CMD
+HIGH = "reference.height_m=3.0"
+LANDED = "flown and landed$"
+REACTION_S = 0.13  # a report of the mode at 10 Hz, and a turn
+WATCHED_STEPS = 5  # 20 ms
+LAP = ("reference.height_m=1.0", "reference.laps=1")  # low: a short climb and landing
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """Makes flights of one firmware."""
+
+    name: str
+    make: Callable[..., Pair]
+
+    def lap(self, *assignments: str, **options: Any) -> Pair:
+        """One lap of a lemniscate, by a vehicle that hovers when its links open."""
+        return self.make(*LAP, *assignments, **{"aloft": True} | options)
+
+    def hover(self, *assignments: str, **options: Any) -> Pair:
+        """A hover of three seconds at 1 m, by a vehicle that hovers when its links open."""
+        return self.hop(*assignments, **{"aloft": True} | options)
+
+    def hop(self, *assignments: str, **options: Any) -> Pair:
+        """The same hover after a take-off of its own."""
+        return self.make(*SHORT, *assignments, reference="hover", **options)
+
+    def __str__(self) -> str:
+        return self.name
+
+
+px4, copter = Vehicle("px4", make), Vehicle("ardupilot", on_arducopter)
+BOTH = pytest.mark.parametrize("on", [px4, copter], ids=str)
 
 
 def alternately(*cases: Any) -> list[Any]:
-    """Arguments (case, fly), as for `BOTH`: each case is flown on one of the firmwares, in turn."""
-    each = ((case, *FIRMWARES[index % 2]) for index, case in enumerate(cases))
+    """Arguments (case, on): each case is flown on one of the firmwares, in turn."""
+    vehicles = ((px4, copter)[index % 2] for index in range(len(cases)))
     return [
-        pytest.param(case, partial(fly, LOW, ONE_LAP, aloft=True), id=f"{index}-{name}")
-        for index, (case, name, fly) in enumerate(each)
+        pytest.param(case, on, id=f"{index}-{on}")
+        for index, (case, on) in enumerate(zip(cases, vehicles, strict=True))
     ]
-
-
-REACTION_S = 0.13  # a report of the mode at 10 Hz, and a turn
-WATCHED_STEPS = 5  # 20 ms
 
 
 @dataclass(frozen=True)
@@ -82,14 +98,9 @@ class Watch:
         tracked = companion.phase in TRACKING
         wanted = companion.current.plan.sample(vehicle_s) if tracked else None
         error = np.nan if wanted is None else np.linalg.norm(position - wanted.position_ned_m)
+        mode, down_mps = commander.mode.name, float(truth.velocity_ned_mps[2])
         return Moment(
-            time_s,
-            companion.phase,
-            commander.mode.name,
-            commander.armed,
-            position,
-            float(truth.velocity_ned_mps[2]),
-            float(error),
+            time_s, companion.phase, mode, commander.armed, position, down_mps, float(error)
         )
 
     def during(self, *phases: Phase) -> list[Moment]:
@@ -98,11 +109,11 @@ class Watch:
     @property
     def error_m(self) -> float:
         """Largest true distance from the reference while it was tracked."""
-        return max(moment.error_m for moment in self.during(*TRACKING))
+        return max((moment.error_m for moment in self.during(*TRACKING)), default=0.0)
 
     @property
     def top_m(self) -> float:
-        return max(-moment.position_ned_m[2] for moment in self.moments)
+        return max((-moment.position_ned_m[2] for moment in self.moments), default=0.0)
 
     @property
     def height_m(self) -> float:
@@ -112,12 +123,7 @@ class Watch:
     @property
     def fall_mps(self) -> float:
         """Largest downward speed."""
-        return max(moment.down_mps for moment in self.moments)
-
-    @property
-    def armings(self) -> int:
-        armed = [moment.armed for moment in self.moments]
-        return sum(now and not before for before, now in pairwise(armed))
+        return max((moment.down_mps for moment in self.moments), default=0.0)
 
     def left_s(self, mode: str) -> float:
         """When the vehicle first left `mode`."""
@@ -130,6 +136,89 @@ def watched(pair: Pair) -> Watch:
     watch = Watch(pair, pair.down)
     pair.down = watch
     return watch
+
+
+def flown(
+    pair: Pair,
+    code: int | None = ExitCode.FLOWN,
+    says: str = LANDED,
+    *,
+    failsafes: Collection[str] | None = None,
+    ended_by: str = "",
+    error_m: float = math.inf,
+    top_m: float = math.inf,
+    fall_mps: float = math.inf,
+) -> Watch:
+    """Fly `pair` to its end. Its exit code must be `code` (None: any), its sentence must begin with
+    `says` (a regular expression), the rows of the failsafe be `failsafes`, the score's reason
+    `ended_by`, and the truth stay within the limits.
+
+    What holds in every flight: setpoints are finite and valid, and none leaves after the end. One
+    that was flown is on the ground, disarmed, and needed no failsafe worse than a level setpoint.
+    One that was refused has asked for no landing; the vehicle is where it was.
+    """
+    watch = watched(pair)
+    outcome = pair.fly()
+    assert code in (outcome.exit_code, None), outcome
+    assert re.match(says, outcome.sentence), outcome.sentence
+    if failsafes is not None:
+        assert set(pair.failsafes) == set(failsafes)
+    assert watch.error_m < error_m
+    assert watch.top_m < top_m
+    assert watch.fall_mps < fall_mps
+    for _, phase, setpoint in pair.setpoints:
+        assert phase not in ENDS
+        assert all(math.isfinite(value) for value in (*setpoint.q, setpoint.thrust))
+        assert 0.0 <= setpoint.thrust <= 1.0
+        assert setpoint.type_mask == 7
+    autopilot = pair.instance.autopilot
+    if code == ExitCode.FLOWN:
+        assert not autopilot.commander.armed
+        assert autopilot.position_controller.landed
+        assert max(pair.failsafes.values(), default=Action.FLY) <= Action.LEVEL
+    if code == ExitCode.REFUSED and watch.moments:
+        assert pair.landings == []
+        assert abs(watch.height_m + watch.moments[0].position_ned_m[2]) < 0.05
+    if ended_by:
+        completed, *rest = verdict(pair)
+        assert (completed, rest[0]) == (code == ExitCode.FLOWN, ended_by)
+        assert rest[1] or completed
+        assert completed or any(line.endswith(f": {rest[1]}") for line in announced(pair))
+        assert (completed, *rest) == verdict(without_texts(pair))
+    return watch
+
+
+def refused(pair: Pair, says: str = "", **more: Any) -> Watch:
+    """`flown`, and refused on the ground with this sentence."""
+    return flown(pair, ExitCode.REFUSED, says, **more)
+
+
+def aborted(pair: Pair, says: str = "", **more: Any) -> Watch:
+    """`flown`, and ended early with this sentence."""
+    return flown(pair, ExitCode.ABORTED, says, **more)
+
+
+def verdict(pair: Pair) -> tuple[Any, ...]:
+    """What the score of the log says of its end, and its events; a NaN does not equal itself."""
+    logged = pair.history()
+    judged = score(logged)
+    ended = (judged.completed, judged.ended_by, judged.reason)
+    return *ended, repr(judged.touchdown_mps), [repr(event) for event in logged.events()]
+
+
+def without_texts(pair: Pair) -> Pair:
+    """The same log without any STATUSTEXT of ours, which the verdict does not need."""
+    ours = [
+        frame
+        for frame in pair.logged
+        if frame[7:10] == b"\xfd\0\0" and decode(frame).get_srcComponent() in OUR_COMPONENTS
+    ]
+    assert len(ours) > 5
+    return replace(pair, logged=[frame for frame in pair.logged if frame not in ours])
+
+
+def announced(pair: Pair) -> tuple[str, ...]:
+    return tuple(pair.companion.announced)
 
 
 def engage_mode(pair: Pair) -> str:
@@ -149,8 +238,13 @@ def sent_after(pair: Pair, time_s: float) -> list[str]:
     ]
 
 
+def begun_s(pair: Pair, phase: Phase) -> float:
+    """When this phase began first."""
+    return next(at_s for at_s, flown in pair.phases if flown is phase)
+
+
 def said(pair: Pair, words: str) -> bool:
-    return any(words in sentence for sentence in pair.companion.announced)
+    return any(words in sentence for sentence in announced(pair))
 
 
 def scenario_of(*faults: dict[str, Any], **more: Any) -> Scenario:
@@ -166,6 +260,3 @@ def early(name: str, at_s: float = 7.0) -> Scenario:
         each.model_copy(update={"at_s": each.at_s - first_s + at_s}) for each in scenario.faults
     ]
     return scenario.model_copy(update={"faults": earlier})
-
-
-Fly = Callable[..., Pair]

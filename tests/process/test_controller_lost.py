@@ -1,24 +1,18 @@
-"""A controller that is killed, stopped or hangs in flight: the supervisor lands the vehicle.
+"""A controller that is killed or stopped in flight: the supervisor lands the vehicle.
 
-Real processes in real time, each over another kind of link. The log says what was asked of the
+Real processes in real time, each over another kind of link; one that is stopped also in
+`flight/test_supervisor.py`. The log says what was asked of the
 vehicle; the simulated autopilot, which is another program, that it obeyed and landed.
 """
 
 from __future__ import annotations
 
 import json
-import os
-import pty
-import select
 import signal
-import socket
 import subprocess
-import threading
 import time
-import tty
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from processes import SHORT, Spawn, children, free_port, hovering
@@ -30,85 +24,36 @@ ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
 LONG_S = 60.0
 QUICK_LANDING = ("--param", "MPC_LAND_CRWL=0.7", "--param", "COM_DISARM_LAND=0.5")
 HOVER = (*SHORT, "--set", "reference.duration_s=600")
-LAW_THAT_HANGS = """
-import os
-from typing import Literal
-from offboard.control.base import ControllerSettings
-from offboard.control.law import LqrSettings
-
-class Settings(ControllerSettings):
-    law: Literal["hangs"] = "hangs"
-
-    def build(self, vehicle, *, period_s, seed):
-        return Hangs(LqrSettings().build(vehicle, period_s=period_s, seed=seed))
-
-class Hangs:
-    def __init__(self, law):
-        self.law = law
-        self.reset = law.reset
-
-    def decide(self, situation):
-        while os.path.exists("hang"):
-            pass
-        return self.law.decide(situation)
-"""
 
 
-@pytest.fixture
-def cable() -> Iterator[Callable[[int], str]]:
-    """A serial line to a TCP port: a pseudo-terminal and a thread."""
-    ends: list[Any] = []
-
-    def lay(port: int) -> str:
-        master, slave = pty.openpty()
-        tty.setraw(slave)
-        other = socket.create_connection(("127.0.0.1", port))
-        ends.extend((master, slave, other))
-        threading.Thread(target=carry, args=(master, other), daemon=True).start()
-        return f"serial:{os.ttyname(slave)}:921600"
-
-    yield lay
-    for end in ends[::-1]:
-        end.close() if isinstance(end, socket.socket) else os.close(end)
-
-
-def carry(master: int, other: socket.socket) -> None:
-    while True:
-        try:
-            ready = select.select([master, other], [], [])[0]
-            if master in ready:
-                other.sendall(os.read(master, 65536))
-            if other in ready:
-                os.write(master, other.recv(65536))
-        except (OSError, ValueError):  # closed at the end of the test
-            return
-
-
-def connections(spawn: Spawn, kind: str, directory: Path, cable: Any = None) -> str:
+def connections(spawn: Spawn, kind: str, directory: Path) -> str:
     """Start a simulator, whose vehicle hovers; the address at which it can be flown."""
     port = free_port()
-    listens = kind != "udp"
-    link = f"tcpin:127.0.0.1:{port}" if listens else f"udpout:127.0.0.1:{port}"
+    link, ours = {"udp": ("udpout", "udpin"), "tcp": ("tcpin", "tcp")}[kind]
     # with the longest timeout of its own: on a busy machine its failsafe would come first
     own_failsafe = ("--param", "COM_OF_LOSS_T=5", *QUICK_LANDING)
-    hovers = hovering(directory, 1.0)
-    simulator = spawn("simulator", "--connect", link, "--gcs", "none", *own_failsafe, *hovers)
+    place = ("--connect", f"{link}:127.0.0.1:{port}", "--gcs", "none")
+    simulator = spawn("simulator", *place, *own_failsafe, *hovering(directory, 1.0))
     assert simulator.stdout is not None
     assert simulator.stdout.readline()
-    if kind == "serial":
-        return cable(port)
-    return f"tcp:127.0.0.1:{port}" if listens else f"udpin:127.0.0.1:{port}"
+    return f"{ours}:127.0.0.1:{port}"
 
 
-def tracking(spawn: Spawn, connection: str, *arguments: str, **more: str) -> subprocess.Popen[str]:
+def tracking(spawn: Spawn, connection: str) -> subprocess.Popen[str]:
     """A flight that has just begun to track."""
-    flight = spawn("offboard", "fly", "--connect", connection, "--out", "x", *HOVER, *arguments,
-                   **more)  # fmt: skip
+    flight = spawn("offboard", "fly", "--connect", connection, "--out", "x", *HOVER)
     assert flight.stdout is not None
     for line in flight.stdout:
         if "track: " in line:
             return flight
     raise AssertionError(flight.communicate()[1])
+
+
+def eventually(holds: Callable[[], object]) -> None:
+    deadline_s = time.monotonic() + LONG_S
+    while not holds():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.02)
 
 
 def ended(pid: int) -> bool:
@@ -117,20 +62,6 @@ def ended(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
     except OSError:
         return True
-
-
-def await_end(pid: int) -> None:
-    deadline_s = time.monotonic() + LONG_S
-    while not ended(pid):
-        assert time.monotonic() < deadline_s, f"process {pid} has not ended"
-        time.sleep(0.02)
-
-
-def await_text(log: Path, text: bytes) -> None:
-    deadline_s = time.monotonic() + LONG_S
-    while text not in log.read_bytes():
-        assert time.monotonic() < deadline_s, f"the log does not hold {text!r}"
-        time.sleep(0.02)
 
 
 def story(log: tlog.Tlog) -> list[str]:
@@ -152,7 +83,7 @@ def test_a_killed_controller_is_survived(spawn: Spawn, tmp_path: Path) -> None:
     flight = tracking(spawn, connections(spawn, "udp", tmp_path))
     (supervisor,) = children(flight.pid)
     flight.kill()
-    await_end(supervisor)
+    eventually(lambda: ended(supervisor))
     _, said = flight.communicate()
     assert said.splitlines()[0] == (
         "offboard supervisor: taking over: the controller ended in flight"
@@ -161,20 +92,18 @@ def test_a_killed_controller_is_survived(spawn: Spawn, tmp_path: Path) -> None:
     log = tlog.read(tmp_path / "x" / "flight.tlog")
     assert story(log) == ["hold", "land", "disarmed"]
     kept = tmp_path / "x" / "score.json"  # by a process that the supervisor begins
-    deadline_s = time.monotonic() + LONG_S
-    while not kept.exists():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.05)
+    eventually(kept.exists)
     score = json.loads(kept.read_text())
     assert (score["completed"], score["ended_by"]) == (0.0, "supervisor")
     assert score["reason"] == "supervisor: taking over: the controller ended in flight"
 
 
+@pytest.mark.slow
 def test_a_stopped_controller_that_continues_sends_nothing(spawn: Spawn, tmp_path: Path) -> None:
     flight = tracking(spawn, connections(spawn, "tcp", tmp_path))
     flight.send_signal(signal.SIGSTOP)
     path = tmp_path / "x" / "flight.tlog"
-    await_text(path, b"hold requested")
+    eventually(lambda: b"hold requested" in path.read_bytes())
     flight.send_signal(signal.SIGCONT)
     _, said = flight.communicate(timeout=LONG_S)
     assert flight.returncode == 4
@@ -187,28 +116,3 @@ def test_a_stopped_controller_that_continues_sends_nothing(spawn: Spawn, tmp_pat
     taken_us = next(e.unix_us for e in texts if "hold requested" in e.message.text)
     setpoints_us = [e.unix_us for e in log if e.name == "SET_ATTITUDE_TARGET"]
     assert max(setpoints_us) < taken_us
-
-
-def test_an_endless_loop_in_a_law(
-    spawn: Spawn, cable: Callable[[int], str], tmp_path: Path
-) -> None:
-    """It begins when the file `hang` exists."""
-    site = tmp_path / "site"
-    metadata = site / "hangs-1.0.dist-info"
-    metadata.mkdir(parents=True)
-    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: hangs\nVersion: 1.0\n")
-    (metadata / "entry_points.txt").write_text(
-        "[pso_offboard.controllers]\nhangs = law_that_hangs:Settings\n"
-    )
-    (site / "law_that_hangs.py").write_text(LAW_THAT_HANGS)
-    modules = os.pathsep.join(filter(None, (str(site), os.environ.get("PYTHONPATH"))))
-    connection = connections(spawn, "serial", tmp_path, cable)
-    flight = tracking(spawn, connection, "--controller", "hangs", PYTHONPATH=modules)
-    (supervisor,) = children(flight.pid)
-    (tmp_path / "hang").touch()
-    path = tmp_path / "x" / "flight.tlog"
-    await_text(path, b"land requested")
-    assert flight.poll() is None  # it hangs for ever
-    flight.send_signal(signal.SIGSTOP)  # which needs no processor
-    await_end(supervisor)
-    assert story(tlog.read(path)) == ["hold", "land", "disarmed"]

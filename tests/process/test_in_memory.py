@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import yaml
@@ -40,88 +41,65 @@ def flown(
     return fly(config, directory, simulated, simulator=simulator, stops=StopRequests())
 
 
-@pytest.fixture(scope="module")
-def simulator() -> Iterator[SimulatorProcess]:
-    with SimulatorProcess() as simulator:
-        yield simulator
-
-
-# with a late link, the first heartbeat comes after several barriers
-@pytest.mark.parametrize("scenario", ["delay_60ms"])
-def test_a_flight_in_memory_is_that_over_udp(
-    scenario: str, tmp_path: Path, simulator: SimulatorProcess
-) -> None:
+def test_a_flight_in_memory_is_that_over_udp(tmp_path: Path) -> None:
+    """With a late link, the first heartbeat comes after several barriers."""
     sent = {}
-    for name, vehicle in (("memory", InMemorySimulator()), ("udp", simulator)):
-        outcome = flown(tmp_path / name, Simulated(scenario=scenario), vehicle)
-        assert (outcome.exit_code, outcome.sentence) == (0, "flown and landed")
-        log = tmp_path / name / "flight.tlog"
-        sent[name] = frames(log, SETPOINT), frames(log, *TELEMETRY)
+    with SimulatorProcess() as process:
+        for name, vehicle in (("memory", InMemorySimulator()), ("udp", process)):
+            outcome = flown(tmp_path / name, Simulated(scenario="delay_60ms"), vehicle)
+            assert (outcome.exit_code, outcome.sentence) == (0, "flown and landed")
+            log = tmp_path / name / "flight.tlog"
+            sent[name] = frames(log, SETPOINT), frames(log, *TELEMETRY)
     assert len(sent["udp"][0]) > 60
     assert len(sent["udp"][1]) > 1000
     assert sent["memory"] == sent["udp"]
 
 
-def test_a_vehicle_that_fails_ends_the_flight_with_a_sentence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Fails:
-        def __init__(self, **options: object) -> None:
-            pass
-
-        def exchange(self, frames: object) -> list[tuple[int, bytes]]:
-            raise ZeroDivisionError("division by zero")
-
-    class Point:
-        def load(self) -> type[Fails]:
-            return Fails
-
-    monkeypatch.setattr(sitl, "registered", Point)
-    outcome = flown(tmp_path / "flight", Simulated(scenario="calm"), InMemorySimulator())
-    sentence = "the bundled simulator failed (ZeroDivisionError: division by zero)"
-    assert (outcome.exit_code, outcome.sentence) == (3, sentence)
+def divides(frames: object) -> list[tuple[int, bytes]]:
+    raise ZeroDivisionError("division by zero")
 
 
 @pytest.mark.parametrize(
-    ("scenario", "code", "sentence"),
+    ("exchange", "says"),
+    [
+        (divides, "the bundled simulator failed (ZeroDivisionError: division by zero)"),
+        (lambda frames: [], "the bundled simulator has not answered for 0."),
+    ],
+    ids=["fails", "hangs"],
+)
+def test_a_vehicle_that_fails_or_hangs_ends_the_flight_with_a_sentence(
+    exchange: Any, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def load() -> Any:
+        return lambda **options: SimpleNamespace(exchange=exchange)
+
+    monkeypatch.setattr(sitl, "registered", lambda: SimpleNamespace(load=load))
+    monkeypatch.setattr(flight, "SITL_TIMEOUT_S", 0.1)
+    outcome = flown(tmp_path / "flight", Simulated(scenario="calm"), InMemorySimulator())
+    assert outcome.exit_code == 3
+    assert outcome.sentence.startswith(says)
+
+
+LINK_LOST = {"fault": "link", "direction": "down", "loss": 1.0, "after": "engaged", "at_s": 8.0}
+
+
+@pytest.mark.parametrize(
+    ("fault", "code", "sentence"),
     [
         # the autopilot sends no telemetry after its restart until it is asked again
         ({"fault": "reboot", "at_s": 30.0}, 0, "flown and landed"),
         pytest.param(
-            {"fault": "link", "direction": "down", "loss": 1.0, "after": "engaged", "at_s": 8.0},
-            4,
-            "no telemetry for 1.0 s; not heard for 300 s while landing; last known: armed in ",
-            marks=pytest.mark.slow,  # 300 s
+            LINK_LOST, 4, "no telemetry for 1.0 s; not heard for 300 s while landing; last known: ",
+            marks=pytest.mark.slow,
         ),
     ],
     ids=["restart on the ground", "telemetry lost"],
-)
+)  # fmt: skip
 def test_time_goes_on_without_telemetry(
-    scenario: dict[str, object], code: int, sentence: str, tmp_path: Path
+    fault: dict[str, object], code: int, sentence: str, tmp_path: Path
 ) -> None:
     file = tmp_path / "faulty.yaml"
-    file.write_text(yaml.safe_dump({"name": "faulty", "faults": [scenario]}))
+    file.write_text(yaml.safe_dump({"name": "faulty", "faults": [fault]}))
     outcome = flown(tmp_path / "flight", Simulated("ardupilot", str(file)), InMemorySimulator())
     assert outcome.exit_code == code
     assert outcome.sentence.startswith(sentence)
-
-
-def test_a_vehicle_that_hangs_ends_the_flight_with_a_sentence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Hangs:
-        def __init__(self, **options: object) -> None:
-            pass
-
-        def exchange(self, frames: object) -> list[tuple[int, bytes]]:
-            return []
-
-    class Point:
-        def load(self) -> type[Hangs]:
-            return Hangs
-
-    monkeypatch.setattr(sitl, "registered", Point)
-    monkeypatch.setattr(flight, "SITL_TIMEOUT_S", 0.1)
-    outcome = flown(tmp_path / "flight", Simulated(scenario="calm"), InMemorySimulator())
-    assert outcome.exit_code == 3
-    assert outcome.sentence.startswith("the bundled simulator has not answered for 0.")

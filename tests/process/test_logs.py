@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -17,8 +18,21 @@ from offboard.cli.commands import app
 from offboard.run import configuration as config
 
 SCRIPTS = Path(sys.executable).parent
-
 ALL = ("--dialect", "all")  # the default one of these tools lacks CURRENT_MODE
+
+
+def offboard(*arguments: object) -> str:
+    """What a command prints, in this process."""
+    result = CliRunner().invoke(app, [*map(str, arguments)], terminal_width=300)
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def tool(name: str, *arguments: str) -> str:
+    command = [sys.executable, SCRIPTS / name, *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 @pytest.fixture(scope="module")
@@ -27,50 +41,33 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("logs")
     rows = "".join(f"{t},{0.5 * t},0,-1\n" for t in range(9))
     (directory / "line.csv").write_text("time_s,north_m,east_m,down_m\n" + rows)
-    subprocess.run(
-        [SCRIPTS / "offboard", "fly", "--sitl", "--out", "x", "--reference", "line.csv"],
-        cwd=directory, check=True, capture_output=True, timeout=60,
-    )  # fmt: skip
+    flown = directory / "x"
+    offboard("fly", "--sitl", "--out", flown, "--reference", directory / "line.csv")
     (directory / "line.csv").unlink()
-    return directory / "x"
-
-
-def tool(name: str, *arguments: str) -> str:
-    done = subprocess.run(
-        [sys.executable, SCRIPTS / name, *arguments], capture_output=True, text=True, timeout=60
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    return flown
 
 
 @pytest.fixture(scope="module")
-def scored(flight: Path) -> dict[str, object]:
-    done = subprocess.run(
-        [SCRIPTS / "offboard", "score", flight, "--json"], capture_output=True, timeout=60
-    )
-    assert done.returncode == 0
-    document: dict[str, object] = json.loads(done.stdout)
-    return document
+def scored(flight: Path) -> dict[str, Any]:
+    return dict(json.loads(offboard("score", flight, "--json")))
 
 
-def test_mavlogdump_counts_the_same_messages(flight: Path, scored: dict[str, object]) -> None:
+def test_mavlogdump_counts_the_same_messages(flight: Path, scored: dict[str, Any]) -> None:
     dumped = tool("mavlogdump.py", *ALL, "--format", "standard", str(flight / "flight.tlog"))
     counted = Counter(re.findall(r"^\d{4}-\d\d-\d\d [\d:.]+: (\w+) \{", dumped, re.MULTILINE))
     assert counted == scored["messages"]
 
 
 def test_the_replay_of_the_flight_is_identical(flight: Path) -> None:
-    result = CliRunner().invoke(app, ["replay", str(flight)], terminal_width=300)
-    assert result.exit_code == 0
-    output = result.stdout.replace("\n", " ")
+    output = offboard("replay", flight).replace("\n", " ")
     assert int(output.split()[0]) > 100
     assert "all identical" in output or "rounding of another computer" in output
 
 
-def test_mavflightmodes_shows_the_same_modes(flight: Path, scored: dict[str, object]) -> None:
+def test_mavflightmodes_shows_the_same_modes(flight: Path, scored: dict[str, Any]) -> None:
     shown = tool("mavflightmodes.py", str(flight / "flight.tlog"))
     modes = re.findall(r"MAV\.flightmode=(\w+)", shown)
-    ours = [str(mode["what"]).removeprefix("AUTO.") for mode in scored["modes"]]  # type: ignore
+    ours = [str(mode["what"]).removeprefix("AUTO.") for mode in scored["modes"]]
     assert modes == ours
     assert modes[:3] == ["LOITER", "OFFBOARD", "LAND"]
 

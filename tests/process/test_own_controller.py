@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import json
-import os
 import subprocess
 import sys
 import textwrap
@@ -12,11 +10,15 @@ from pathlib import Path
 
 import pytest
 import yaml
-from processes import Spawn
 
 import offboard.control
+from offboard.analysis import history, tlog
+from offboard.analysis.score import score
 from offboard.documents.reading import DocumentError
+from offboard.link.stop import StopRequests
 from offboard.run.configuration import load
+from offboard.run.flight import Simulated, fly
+from offboard.run.sitl import InMemorySimulator
 
 
 def documented_package(directory: Path) -> None:
@@ -40,36 +42,21 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return site
 
 
-@pytest.mark.parametrize(
-    ("controller", "reference", "shorter", "damping_ps", "most_m"),
-    [
-        ("pd", "hover", "reference.duration_s=8", 4.0, 0.03),
-        pytest.param("my.yaml", "lemniscate", "reference.laps=1", 5.0, 0.2, marks=pytest.mark.slow),
-    ],
-)
 def test_documented_controller_flies(
-    controller: str, reference: str, shorter: str, damping_ps: float, most_m: float,
-    site: Path, spawn: Spawn, tmp_path: Path,
-) -> None:  # fmt: skip
-    (tmp_path / "my.yaml").write_text("law: pd\ndamping_ps: 5\n")
-    path = os.pathsep.join(filter(None, (str(site), os.environ.get("PYTHONPATH"))))
-    flight = spawn(
-        "offboard", "fly", "--sitl", "--controller", controller, "--reference", reference,
-        "--set", shorter, "--set", "reference.height_m=1", "--scenario", "calm", "--seed", "7",
-        "--out", "x", PYTHONPATH=path,
-    )  # fmt: skip
-    output, errors = flight.communicate(timeout=170)
-    assert (flight.returncode, errors) == (0, ""), output
-    score = json.loads((tmp_path / "x" / "score.json").read_text())
-    assert score["rmse_position_m"] < most_m
-    flown = yaml.safe_load((tmp_path / "x" / "flight.yaml").read_text())["controller"]
-    assert flown == {"law": "pd", "stiffness_ps2": 6.0, "damping_ps": damping_ps}
-
-
-def test_documented_settings_are_strict(
     site: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.syspath_prepend(site)
+    short = ("reference.duration_s=8", "reference.height_m=1")
+    config = load("flight", choices={"controller": "pd", "reference": "hover"}, assignments=short,
+                  seed=7, known_vehicle="px4_sih")  # fmt: skip
+    simulator, vehicle = InMemorySimulator(), Simulated(scenario="calm")
+    outcome = fly(config, tmp_path / "x", vehicle, simulator=simulator, stops=StopRequests())
+    assert (outcome.exit_code, outcome.sentence) == (0, "flown and landed")
+    scored = score(history.gather(tlog.read(tmp_path / "x" / "flight.tlog")))
+    assert scored.rmse_position_m < 0.03
+    flown = yaml.safe_load((tmp_path / "x" / "flight.yaml").read_text())["controller"]
+    assert flown == {"law": "pd", "stiffness_ps2": 6.0, "damping_ps": 4.0}
+    # its settings are strict
     with pytest.raises(DocumentError, match=r"controller.damping_ps: 0 should be greater than 0"):
         load("flight", choices={"controller": "pd"}, assignments=["controller.damping_ps=0"])
     (tmp_path / "my.yaml").write_text("law: pd\ndamping: 4\n")

@@ -38,104 +38,63 @@ def climb(sitl):
     return height
 """
 
-FLIES = (
+MINE = (
     TAKES_OFF
     + """
-@pytest.mark.sitl(scenario="calm", speed=10)
-@pytest.mark.parametrize("run", [1, 2])
-def test_climbs(sitl, run):
+SHORT = ("reference.duration_s=1.0", "reference.height_m=1.0", "identify.online=false")
+fast = pytest.mark.sitl(scenario="calm", speed=10)
+
+@fast
+def test_climbs(sitl):
     assert repr(sitl) == f"<Sitl at {sitl.connection}, scenario calm>"
     assert climb(sitl) >= 2.0
+
+@fast
+def test_does_not_climb(sitl):
+    pathlib.Path("pid").write_text(str(sitl.process.pid))
+    assert climb(sitl) < 0.0
+
+def test_hovers(fly):
+    flight = fly(reference="hover", scenario="calm", seed=3, settings=SHORT)
+    assert flight.score.rmse_position_m < 0.05
+    assert flight.log.exists()
+
+def test_is_perfect(fly):
+    flight = fly(reference="hover", scenario="calm", seed=3, settings=SHORT)
+    assert flight.score.rmse_position_m < 0.0
+
+def test_unknown_reference(fly):
+    fly(reference="moon")
+
+@pytest.mark.sitl(scenario="storm")
+def test_unknown_scenario(sitl):
+    pass
+
+@pytest.mark.sitl(weather=3)
+def test_unknown_argument(sitl):
+    pass
 """
 )
 
-FAILS = """
-@pytest.mark.sitl(scenario="calm", speed=10)
-def test_fails(sitl):
-    pathlib.Path("pid").write_text(str(sitl.process.pid))
-    assert climb(sitl) < 0.0
-"""
 
-
-def is_running(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return True
-
-
-def named_logs(result: pytest.RunResult) -> list[Path]:
-    return [Path(line) for line in result.outlines if line.endswith(".tlog")]
-
-
-@pytest.mark.slow
-def test_vehicles_for_tests_of_two_workers(pytester: pytest.Pytester) -> None:
-    pytester.makepyfile(FLIES)
-    result = pytester.runpytest_subprocess("-q", "--strict-markers", "-n", "2", timeout=90)
-    result.assert_outcomes(passed=2)
-    assert named_logs(result) == []
-
-
-def test_a_failed_test_keeps_its_log_and_stops_its_vehicle(pytester: pytest.Pytester) -> None:
-    """One that passes keeps none."""
-    pytester.makepyfile(FLIES.replace("[1, 2]", "[1]") + FAILS)
-    result = pytester.runpytest_subprocess("-q", timeout=90)
-    result.assert_outcomes(passed=1, failed=1)
-    (log,) = named_logs(result)
-    assert log.stat().st_size > 10_000
-    assert not is_running(int((pytester.path / "pid").read_text()))
-
-
-def test_a_wrong_marker_is_one_sentence(pytester: pytest.Pytester) -> None:
-    pytester.makepyfile(
-        """
-        import pytest
-
-        @pytest.mark.sitl(scenario="storm")
-        def test_scenario(sitl):
-            pass
-
-        @pytest.mark.sitl(weather=3)
-        def test_argument(sitl):
-            pass
-        """
-    )
-    result = pytester.runpytest_subprocess("-q", timeout=60)
-    result.assert_outcomes(errors=2)
-    result.stdout.fnmatch_lines(
-        [
-            "*there is no scenario named 'storm'; known are*",
-            "*pytest.mark.sitl: weather is unknown; there is scenario, firmware*",
-        ]
-    )
-    assert "Traceback" not in result.stdout.str()
-
-
-def test_a_flight_in_one_call(pytester: pytest.Pytester) -> None:
-    """The log of a failed test is kept; an unknown reference is one sentence, without a flight."""
-    pytester.makepyfile(
-        """
-        SHORT = ("reference.duration_s=1.0", "reference.height_m=1.0", "identify.online=false")
-
-        def test_hovers(fly):
-            flight = fly(reference="hover", scenario="calm", seed=3, settings=SHORT)
-            assert flight.score.rmse_position_m < 0.05
-            assert flight.log.exists()
-
-        def test_fails(fly):
-            flight = fly(reference="hover", scenario="calm", seed=3, settings=SHORT)
-            assert flight.score.rmse_position_m < 0.0
-
-        def test_unknown(fly):
-            fly(reference="moon")
-        """
-    )
-    result = pytester.runpytest_subprocess("-q", timeout=120)
-    result.assert_outcomes(passed=1, failed=2)
-    (log,) = named_logs(result)
-    assert log.stat().st_size > 10_000
-    result.stdout.fnmatch_lines("nothing was flown: there is no reference named 'moon'*")
+@pytest.mark.parametrize("workers", [0, pytest.param(2, marks=pytest.mark.slow)])
+def test_the_fixtures(workers: int, pytester: pytest.Pytester) -> None:
+    """A test that fails keeps its log and ends its vehicle, one that passes keeps none. What is
+    wrong is one sentence, without a flight."""
+    pytester.makepyfile(MINE)
+    result = pytester.runpytest_subprocess("-q", "--strict-markers", f"-n{workers}", timeout=120)
+    result.assert_outcomes(passed=2, failed=3, errors=2)
+    logs = [Path(line) for line in result.outlines if line.endswith(".tlog")]
+    assert len(logs) == 2
+    assert all(log.stat().st_size > 10_000 for log in logs)
+    with pytest.raises(ProcessLookupError):
+        os.kill(int((pytester.path / "pid").read_text()), 0)
+    for line in (
+        "*nothing was flown: there is no reference named 'moon'*",
+        "*there is no scenario named 'storm'; known are*",
+        "*pytest.mark.sitl: weather is unknown; there is scenario, firmware*",
+    ):
+        result.stdout.fnmatch_lines(line)
 
 
 def test_other_test_suites_import_nothing(pytester: pytest.Pytester) -> None:

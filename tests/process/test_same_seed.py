@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from threading import Timer
@@ -46,19 +43,6 @@ def simulator() -> Iterator[LateSimulator]:
         yield simulator
 
 
-@contextmanager
-def busy(count: int) -> Iterator[None]:
-    """So many processes that use a processor each."""
-    loop = [sys.executable, "-c", "while True: pass"]
-    processes = [subprocess.Popen(loop) for _ in range(count)]
-    try:
-        yield
-    finally:
-        for process in processes:
-            process.kill()
-            process.wait()
-
-
 def fly(
     directory: Path,
     simulator: LateSimulator,
@@ -66,7 +50,6 @@ def fly(
     simulator_late_s: float = 0.0,
     controller_late_s: float = 0.0,
     stall_s: float = 0.0,
-    seed: int = 7,
 ) -> dict[int, list[bytes]]:
     """One short flight: its frames by component, without wall times."""
     stalls = [stall_s]
@@ -77,7 +60,7 @@ def fly(
 
     simulator.late_s = simulator_late_s
     config = load(
-        "flight", choices={"reference": "hover", "vehicle": "px4_sih"}, assignments=SHORT, seed=seed
+        "flight", choices={"reference": "hover", "vehicle": "px4_sih"}, assignments=SHORT, seed=7
     )
     outcome = flight.fly(
         config,
@@ -110,31 +93,22 @@ def undisturbed(
 
 
 @pytest.mark.parametrize(
-    ("disturbance", "load"),
+    "disturbance",
     [
         # the simulator repeats its first barrier, and one in flight
-        ({"simulator_late_s": 0.1, "controller_late_s": 1.0, "stall_s": 1.2}, 0),
-        pytest.param({"simulator_late_s": 2.0}, 0, marks=pytest.mark.slow),
-        pytest.param({"simulator_late_s": 0.1}, 2, marks=pytest.mark.slow),
+        {"simulator_late_s": 0.1, "controller_late_s": 1.0, "stall_s": 1.2},
+        pytest.param({"simulator_late_s": 2.0}, marks=pytest.mark.slow),
     ],
     ids=str,
 )
 def test_every_frame_is_the_same(
     disturbance: dict[str, float],
-    load: int,
     undisturbed: dict[int, list[bytes]],
     simulator: LateSimulator,
     tmp_path: Path,
 ) -> None:
-    with busy(load):
-        frames = fly(tmp_path / "flight", simulator, **disturbance)
+    frames = fly(tmp_path / "flight", simulator, **disturbance)
     assert set(frames) == {VEHICLE_COMPONENT_ID, COMPONENT_ID, RECORD_COMPONENT_ID}
     assert len(frames[COMPONENT_ID]) > 500
     for component, expected in undisturbed.items():
         assert frames[component] == expected
-
-
-def test_another_seed_sends_other_setpoints(
-    undisturbed: dict[int, list[bytes]], simulator: LateSimulator, tmp_path: Path
-) -> None:
-    assert fly(tmp_path / "flight", simulator, seed=8)[COMPONENT_ID] != undisturbed[COMPONENT_ID]
