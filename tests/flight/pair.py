@@ -235,7 +235,7 @@ class Pair:
 
     @property
     def mode(self) -> str:
-        """Of the vehicle."""
+        """The mode that the vehicle is in."""
         return str(self.instance.autopilot.commander.mode.name)
 
     def went_through(self, phase: Phase) -> bool:

@@ -103,7 +103,7 @@ def test_estimator_without_position_although_the_gps_has_a_fix(boot_s: float, le
         attitude=Attitude(boot_s, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
     )
     ground = Ground(starting, Limits(), ARDUPILOT_DIALECT, fix_type=FIX_3D)
-    assert {f.level for row, f in findings(ground) if row.check == "estimator"} == {level}
+    assert {found.level for check, _, found in findings(ground) if check == "estimator"} == {level}
 
 
 @pytest.mark.parametrize(

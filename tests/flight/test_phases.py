@@ -256,7 +256,7 @@ def test_the_service_waits_for_ever() -> None:
 
 
 def test_every_phase_but_the_ends_has_rows_and_each_leads_to_a_later_one() -> None:
-    """Of the service, which flies again, only the first holds; the only way to the phases that arm
+    """Only the first holds in the service, which flies again; the only way to the phases that arm
     is a request on the ground."""
     order = {phase: index for index, phase in enumerate(Phase)}
     unended = {phase for phase in Phase if phase not in ENDS}
