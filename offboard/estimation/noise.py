@@ -51,8 +51,8 @@ class NoiseEstimate:
     """
 
     def __init__(self, noise: Noise) -> None:
-        self._least = np.square((noise.position_sd_m, noise.velocity_sd_mps))
-        self._variances = np.zeros(2)
+        self._least = noise.position_sd_m**2, noise.velocity_sd_mps**2
+        self._variances = [0.0, 0.0]
         self.drift_mps2 = np.full(2, noise.disturbance_mps2)
         self._least_drift = noise.disturbance_mps2
         self._drift_limit = max(noise.disturbance_mps2, noise.disturbance_limit_mps2)
@@ -62,9 +62,10 @@ class NoiseEstimate:
         self.interrupt()
 
     @property
-    def variances(self) -> Array:
-        """R (2,) of position (m^2) and velocity (m^2/s^2)."""
-        return np.maximum(self._variances, self._least)
+    def variances(self) -> tuple[float, float]:
+        """R of position (m^2) and velocity (m^2/s^2)."""
+        (position, velocity), (least_position, least_velocity) = self._variances, self._least
+        return max(position, least_position), max(velocity, least_velocity)
 
     def permit_vertical_drift(self) -> None:
         self._drift_limits[1] = self._drift_limit
@@ -80,7 +81,7 @@ class NoiseEstimate:
 
     def update(self, time_s: float, innovation: Array, residual: Array) -> None:
         """Use one message of `time_s`: measured less predicted, and measured less updated position
-        (m) and velocity (m/s), each (2, 3), NED."""
+        (m) and velocity (m/s), each (6,), NED."""
         if self._residual is None:
             self._began_s = time_s
         else:
@@ -89,7 +90,7 @@ class NoiseEstimate:
                 self._estimate_noise(time_s - self._last_s, change, self._change)
             self._change = change
         self._residual, self._last_s = residual, time_s
-        self._total += innovation[0]
+        self._total += innovation[:3]
         self._messages += 1
         span_s = time_s - self._began_s
         if span_s < SPAN_S - 1e-6:
@@ -103,10 +104,13 @@ class NoiseEstimate:
         """The measured change since the last message less the predicted one is `change`. For white
         noise of variance s^2, successive changes have the covariance -s^2; for a measurement whose
         error drifts, they have none."""
-        limit = NOISE_OUTLIER * self.variances
-        product = (change * before).sum(axis=1) / -3.0
-        product = np.minimum(np.maximum(product, -limit), limit)
-        self._variances += min(interval_s / NOISE_TIME_S, 0.1) * (product - self._variances)
+        north, east, down, *velocity = (change * before).tolist()
+        products = (north + east + down) / -3.0, sum(velocity) / -3.0
+        share = min(interval_s / NOISE_TIME_S, 0.1)
+        for kind, (product, variance) in enumerate(zip(products, self.variances, strict=True)):
+            limit = NOISE_OUTLIER * variance
+            product = min(max(product, -limit), limit)
+            self._variances[kind] += share * (product - self._variances[kind])
 
     def _estimate_drift(self, span_s: float, now: Array, before: Array) -> None:
         """Update the drift densities from the mean innovations of two spans, (3,) each."""

@@ -116,15 +116,15 @@ def predict(
     if steps <= 0:
         return
     h, size = interval_s / steps, covariance.shape[0]
-    half, term, moved = np.eye(size), np.eye(size), np.empty((size, size))
+    half, moved = np.eye(size), np.empty((size, size))
     transition, noise = np.empty((size, size)), np.zeros((size, size))
-    # F = exp(A h / 2) to fourth order, squared
-    for order in range(1, 5):
-        _multiply(term, dynamics, moved)
+    # F = exp(A h / 2) to fourth order, by Horner's rule, squared
+    for order in (4, 3, 2, 1):
+        _multiply(dynamics, half, moved)
         for i in range(size):
             for j in range(size):
-                term[i, j] = 0.5 * h / order * moved[i, j]
-                half[i, j] += term[i, j]
+                half[i, j] = 0.5 * h / order * moved[i, j]
+            half[i, i] += 1.0
     _multiply(half, half, transition)
     # Q by Simpson's rule, exact for a chain of two integrators
     for k in range(size):
@@ -261,7 +261,7 @@ class Observer:
     @property
     def noise_sds(self) -> tuple[float, float]:
         """Noise of position (m) and reported velocity (m/s), as estimated."""
-        position, velocity = np.sqrt(self._estimated.variances).tolist()
+        position, velocity = map(math.sqrt, self._estimated.variances)
         return position, velocity
 
     @property
@@ -340,7 +340,7 @@ class Observer:
         """Update by position and velocity (6,) of now. What jumped is reset, and the rest left."""
         state, estimated = self._state, self._estimated
         innovation = measured - H_POSITION @ state
-        variances, jumped = estimated.variances.tolist(), False
+        variances, jumped = estimated.variances, False
         for first, end in TOGETHER:
             kind = first // 3  # position or velocity
             h, z = H_POSITION[first:end], measured[first:end]
@@ -352,7 +352,7 @@ class Observer:
             estimated.interrupt()
             return
         residual = measured - H_POSITION @ state
-        estimated.update(self._time_s, innovation.reshape(2, 3), residual.reshape(2, 3))
+        estimated.update(self._time_s, innovation, residual)
         self._densities[DISTURBANCE : DISTURBANCE + 2] = estimated.drift_mps2[0]
         self._densities[DISTURBANCE + 2] = estimated.drift_mps2[1]
 
