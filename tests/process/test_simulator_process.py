@@ -194,7 +194,7 @@ def test_a_vehicle_takes_little_memory() -> None:
         peer.listen(lambda: peer.time_s > 10.0)
         status = Path(f"/proc/{process.popen.pid}/status").read_text()
     (peak_kb,) = re.findall(r"VmHWM:\s+(\d+) kB", status)
-    assert int(peak_kb) < 190_000
+    assert int(peak_kb) < 240_000  # 150,000 after the import of numba 0.68
 
 
 # -- several vehicles, several clients ------------------------------------------------------------
