@@ -50,8 +50,8 @@ _CUT = "Single values far from all others are outside; two clicks on the figure 
 
 @dataclass(frozen=True, slots=True)
 class DrawnFlight:
-    """A flight as it is drawn in a report: its letter and name, colour and dash, and the vehicle time
-    that is zero on its axis."""
+    """A flight as a report draws it: letter and name, colour and dash, and the vehicle time that is
+    zero on its axis."""
 
     flight: Flight
     label: str

@@ -1,7 +1,7 @@
 """The loop: link -> companion -> link and log, paced by the vehicle's telemetry.
 
-Nothing in it waits, except for telemetry: log and terminal are written by other threads. Whatever
-fails in it hands the vehicle back.
+Nothing in it waits, except for telemetry: log and terminal are written by other threads. An
+exception in it requests the landing.
 """
 
 from __future__ import annotations
