@@ -43,7 +43,7 @@ class Record(Protocol):
 
     @property
     def left(self) -> str:
-        """Key of the vehicle that a flight left engaged when it was cut short; empty without one."""
+        """Key of the vehicle that a flight left engaged when it was cut short; may be empty."""
         ...
 
     def begin(self, session: Session, configuration: str, vehicle: str) -> str:
