@@ -120,8 +120,8 @@ class History:
     records: the fields of `flight.record.TickRecord`
 
     `phases` and `announcements` are our own, by their records; `modes` and `vehicle_messages`
-    (STATUSTEXT, refused commands) the vehicle's. `vehicle` is the one that was flown, as the log's
-    manifest says, else the first autopilot that was heard. Only its messages, and ours, are used.
+    (STATUSTEXT, refused commands) the vehicle's. `vehicle` is the one that our record of it
+    names, else the first autopilot that was heard. Only its messages, and ours, are used.
     It and `dialect` are None without one, `dialect` also for one that is not known. `damage` says
     what could not be read, `damage_s` is the time of the telemetry before the first damage, NaN
     without.
@@ -425,7 +425,7 @@ class _Collector:
 
 
 def _vehicle(log: Tlog) -> tuple[Address | None, Dialect | None]:
-    """The vehicle that the manifest names, else the first autopilot that was heard."""
+    """The vehicle that its record in the log names, else the first autopilot that was heard."""
     known = {dialect.mav_autopilot: dialect for dialect in DIALECTS.values()}
     first: tuple[Address | None, Dialect | None] = (None, None)
     for entry in log:

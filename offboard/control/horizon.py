@@ -271,8 +271,8 @@ class HorizonLaw(TrackingLaw):
     def _searched(
         self, bases: list[Plan], remaining_s: Callable[[], float] | None
     ) -> tuple[Plan, Certificate]:
-        """The best plan about any of the bases, which share the iterations. Searching only about
-        the cheapest of all ends in worse valleys than searching about our own too."""
+        """The best plan about any of the bases, which share the iterations. Searching about the
+        cheapest base alone ends in worse local minima than searching about our own plan as well."""
         settings = self._settings.swarm
         share = max(1, settings.iterations // len(bases))
         each = settings.model_copy(update={"iterations": share})

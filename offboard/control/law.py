@@ -223,7 +223,7 @@ class TrackingLaw:
         )
 
     def _weighed(self, target: Target, lateral: Array, vertical: Array, b_z: float) -> Task:
-        """The task of these deviations, with J and its bounds: clip."""
+        """The task of these deviations: J, and the bounds of u to which the law clips."""
         settings, vehicle = self.limits, self.vehicle
         curvature = np.array(
             [
@@ -259,7 +259,8 @@ class TrackingLaw:
 
 
 def heave_of(state: PredictedState) -> PredictedHeave:
-    """The vertical motion when the thrust acts; at `state.time_s` where it was not predicted."""
+    """The predicted vertical motion when the thrust acts, or at `state.time_s` if it was not
+    predicted separately."""
     return state.heave or PredictedHeave(
         time_s=state.time_s,
         position_down_m=float(state.position_ned_m[2]),

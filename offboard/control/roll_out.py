@@ -120,7 +120,7 @@ def roll_out(
     The input of a step is base_inputs (N, 3) + weights (N, M) @ knots (n, M, 3) + `feedback` times
     the closed form's answer to the deviation of the state from base_states (N + 1, STATE_SIZE),
     clipped to the bounds. `start` (STATE_SIZE,) is the first state, `volumes` (V, PACKED_SIZE) are
-    the keep-out volumes where they are then, `floor_down_m` (NED) is the height below which no way
+    the keep-out volumes where they are then, `floor_down_m` (NED) is the height below which no plan
     leads, where the reference does not.
     """
     plant, ahead = plants[0], outlooks[0]

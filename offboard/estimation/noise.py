@@ -71,8 +71,7 @@ class NoiseEstimate:
         self._drift_limits[1] = self._drift_limit
 
     def interrupt(self) -> None:
-        """Do not correlate the next innovation with the last one: after a jump, a gap or a
-        restart."""
+        """After a jump, a gap or a restart: do not correlate the next innovation with the last."""
         self._last_s = self._began_s = -np.inf
         self._residual: Array | None = None  # of the last message: measured less updated
         self._change: Array | None = None  # its innovation less the residual before

@@ -218,7 +218,7 @@ class Observer:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the previous flight."""
+        """Return to the state after construction, for another flight."""
         self._frozen = False
         self._sent = np.empty((0, COMMAND_SIZE))
         self._state: Array = np.zeros(STATE_SIZE)
@@ -271,9 +271,9 @@ class Observer:
         return lateral, vertical
 
     def freeze(self, grounded: bool) -> None:
-        """Stop estimating while the vehicle is on the ground or does not fly our commands: velocity
-        as reported, thrust direction as measured, no disturbance. After that the filter starts from
-        there."""
+        """Stop or resume estimating. Frozen, on the ground or while the vehicle does not follow our
+        commands, the state is the reported velocity and the measured thrust direction, without a
+        disturbance; the filter starts from there."""
         if grounded != self._frozen:
             self._reset_covariance()
         self._frozen = grounded
@@ -337,7 +337,7 @@ class Observer:
         return np.concatenate((velocity, accelerated))
 
     def _update_by_position(self, measured: Array) -> None:
-        """Update by position and velocity (6,) of now. What jumped is reset, and the rest left."""
+        """Update by the present position and velocity (6,); reset what jumped beyond its gate."""
         state, estimated = self._state, self._estimated
         innovation = measured - H_POSITION @ state
         variances, jumped = estimated.variances, False

@@ -85,8 +85,8 @@ def _end(flight: FlightState, time_s: float, *, steers: bool) -> None:
 
 
 def _await_link(flight: FlightState) -> None:
-    """Say once what is waited for; when the vehicle is heard again, what was asked of it counts
-    for nothing."""
+    """Say once that the link is awaited; when the vehicle is heard again, allow every request to be
+    sent once more."""
     unreached_s, limits = flight.unreached_s, flight.limits
     waited, flight.awaits_link = flight.awaits_link, unreached_s > 2.0 * limits.silence_s
     if flight.awaits_link and not waited:
@@ -103,9 +103,9 @@ def _await_link(flight: FlightState) -> None:
 
 
 def _disarm_if_standing(flight: FlightState) -> None:
-    """Ask a vehicle that stands, and does not disarm by itself, to disarm. It is never forced
-    to: by its own land detector the autopilot refuses in the air. While that detector says so,
-    only the user can disarm."""
+    """Ask a vehicle that stands on the ground and stays armed to disarm; never by force, so that
+    the autopilot refuses in the air. While its land detector reports flight, it must be disarmed
+    by the user, who is told so."""
     contact = flight.contact
     if not contact.stands:
         return
@@ -137,9 +137,9 @@ def _prepare(flight: FlightState, time_s: float) -> None:
 
 
 def _stand_by(flight: FlightState, time_s: float) -> None:
-    """PX4 accepts OFFBOARD only while setpoints arrive: stream what changes nothing. On the
-    ground no thrust; in the air what the vehicle flies, unless a failsafe flies it, after which
-    PX4 would return to OFFBOARD, or it flies setpoints of others."""
+    """PX4 accepts OFFBOARD only while setpoints arrive, so stream setpoints that change nothing: on
+    the ground no thrust, in the air the vehicle's own attitude and thrust. None in the air in a
+    failsafe, after which PX4 would return to OFFBOARD by itself, or while another program sends."""
     on_ground, vehicle = flight.contact.on_ground, flight.vehicle
     command = Command(0.0, LEVEL, vehicle.heading_rad) if on_ground else _flown(flight)
     quiet = flight.takes_off_by_command or flight.telemetry_is_old or bool(other_sender(flight))

@@ -4,8 +4,8 @@ It is ours from the moment when it shows the mode that we asked for until it sho
 we did not ask for; that is final. What a pilot, a ground station or a failsafe has chosen is never
 changed. A report has an age: without a recent one nothing is sent.
 
-One mode is nobody's choice: that of the autopilot's own failsafe for setpoints that did not arrive.
-The vehicle may be asked to land from it, unless sticks are received.
+The mode of the autopilot's own failsafe for missing setpoints is an exception, as nobody chose it:
+the vehicle may be asked to land from it, unless it receives a pilot's sticks.
 
 While it is not ours, `PilotSwitch` says whether the pilot of the service has engaged us.
 """
@@ -35,7 +35,7 @@ class Standing(Enum):
 
 @dataclass(slots=True)
 class Authority:
-    """The standing of one vehicle; `engage_mode` is empty until it has reported a mode. Times are
+    """Whether one vehicle is ours; `engage_mode` is empty until it has reported a mode. Times are
     `Session.link_time_s`; `arrived_s` is host time.
 
     Example:
@@ -130,7 +130,7 @@ class Authority:
             self._failsafe_shown = shown or (heartbeat and counts and sticks is not None)
 
     def _hand_over(self, mode: str) -> None:
-        """It shows a mode that we asked for: one that we asked for before would be a step back."""
+        """It shows a mode that we requested; those requested before it do not count any more."""
         self.standing = Standing.HANDED
         del self._requested[: self._requested.index(mode)]
 

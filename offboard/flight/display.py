@@ -26,10 +26,10 @@ AGAIN_S = 10.0  # the same reason, in other figures too
 
 
 class News:
-    """All that is told of one flight beside its phases, each kind at most once a second: pauses of
-    this process and messages dropped (`add` them), and why the flight does not begin. A reason that
-    a found vehicle has is repeated every ten seconds, with its figures; that none is heard is said
-    once."""
+    """Announcements of one flight beside its phases, each kind at most once a second: pauses of
+    this process and dropped messages (`add` them), and why the flight does not begin yet. A reason
+    of a found vehicle is repeated every ten seconds with new figures; that no vehicle is heard is
+    said once."""
 
     def __init__(self) -> None:
         self.paused, self.dropped = Repeated(PAUSED), Repeated(DROPPED)

@@ -89,7 +89,8 @@ def rebooted_in_flight(flight: FlightState) -> str:
 
 
 def disarmed(flight: FlightState) -> str:
-    """One HEARTBEAT may be wrong: the land detector shows it too, or a second HEARTBEAT."""
+    """Disarmed by HEARTBEAT. One may be wrong: in flight the land detector or a second HEARTBEAT
+    must confirm it."""
     flies = flight.contact.detects_flight or flight.phase is Phase.TAKEOFF
     if flight.vehicle.armed or (flies and flight.vehicle.disarmed_s < DISARMED_S):
         return ""
@@ -101,7 +102,7 @@ def _when(flight: FlightState) -> str:
 
 
 def handed(flight: FlightState) -> str:
-    """It shows a mode that we asked for at the end."""
+    """The vehicle shows the mode that we requested as the end of the flight."""
     handed = flight.authority.standing is Standing.HANDED
     return f"the vehicle shows {flight.vehicle.mode}" if handed else ""
 
@@ -157,7 +158,7 @@ def not_disarmed(flight: FlightState) -> str:
 
 
 def requested(request: Request) -> Condition:
-    """Holds when the ground station has asked for this."""
+    """A condition: the ground station has requested this."""
 
     def wanted(flight: FlightState) -> bool:
         return flight.request is request
@@ -182,8 +183,8 @@ RESTARTED = f"{REBOOTED} and is disarmed"
 
 
 def ends_early(*, serves: bool) -> tuple[Transition, ...]:
-    """What ends a flight in the air early. In the service a stop hands back where `fly` lands, and
-    a pilot who takes the vehicle is the usual end."""
+    """Rows that end a flight in the air early. A stop makes `fly` land and the service hold; in the
+    service a change of mode by the pilot is the usual end."""
     followed = TRACKING if serves else frozenset[Phase]()
     others = FLYING - followed
     return (

@@ -72,8 +72,7 @@ class HoverEstimate:
 
 
 def differs(hover_thrust: float, vehicle: Vehicle, least: float = DIFFERENT) -> bool:
-    """Whether `hover_thrust` is another than `vehicle`'s, by more than the observer should find
-    out by itself."""
+    """Whether `hover_thrust` differs from `vehicle`'s by more than the observer should correct."""
     return abs(hover_thrust / vehicle.hover_thrust - 1.0) > least
 
 

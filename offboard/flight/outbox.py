@@ -59,7 +59,7 @@ def warn(flight: FlightState, sentence: str) -> None:
 
 
 def _say(flight: FlightState, severity: int, event: EventRecord, title: str = "") -> None:
-    """To the ground station with `title` before the text; to the log as a record."""
+    """Send the text, after `title`, as STATUSTEXT to the ground station; log it as a record."""
     flight.text_id = flight.text_id % TEXT_ID_MAX + 1
     send(flight, *chunks(severity, title + event.text, flight.text_id))
     send(flight, *event_record.pieces(event))

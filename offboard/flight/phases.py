@@ -57,7 +57,7 @@ class Action(IntEnum):
 
 
 class Request(Enum):
-    """What a ground station has asked for, and is to be done at the next tick (see `requests`)."""
+    """What a ground station has asked for, and is to be done at the next tick (see `telemetry`)."""
 
     NONE = "nothing"
     START = "start"

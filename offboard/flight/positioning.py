@@ -2,12 +2,12 @@
 flight, and its jumps and drift.
 
 PX4 goes on under attitude setpoints when its GPS is lost, and reports a position that drifts away:
-0.5 m in the first second, 10 m in fifteen. What was not there at the beginning is not missed: a
-vehicle may fly by motion capture or optical flow.
+0.5 m in the first second, 10 m in fifteen. Only what was there at the beginning can be lost: a
+vehicle may fly by motion capture or optical flow, without GPS.
 
 Jumps are resets of the vehicle's estimator. No message is needed for them
-(ODOMETRY.reset_counter: PX4 only): two positions some milliseconds apart that no motion joins show
-one, on any autopilot.
+(ODOMETRY.reset_counter: PX4 only): on any autopilot, two positions some milliseconds apart that
+are too far from each other for any motion show one.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ WORSE = 2.0  # times the accuracy of the beginning, where that was no better tha
 
 @dataclass(slots=True)
 class Positioning:
-    """What was there when the flight began; nothing before it."""
+    """What the position estimate had when the flight began; nothing before that."""
 
     had_fix: bool = False
     had_valid: frozenset[str] = frozenset()  # parts of the estimate
@@ -141,5 +141,5 @@ class PositionJumps:
         return sum(size_m for _, size_m in self._jumps)
 
     def forget(self) -> None:
-        """What has been until now, on the ground, is no matter of the flight."""
+        """Drop the jumps so far: those on the ground do not count for the flight."""
         self._jumps.clear()

@@ -139,7 +139,7 @@ SEVERAL = "several vehicles are heard, systems {systems}: choose one with --syst
 
 
 def unfit_type(ground: Ground) -> str:
-    """Why a vehicle of its type is not flown, none of whose modes we know; empty if it is."""
+    """Why a vehicle of this MAV_TYPE, whose modes are not known here, is not flown; else empty."""
     heartbeat = ground.vehicle.heartbeat
     if heartbeat is None or ground.dialect is None:
         return ""
@@ -147,7 +147,7 @@ def unfit_type(ground: Ground) -> str:
 
 
 def armed_already(known: Known) -> str:
-    """Another has armed it, and such a vehicle is not to be flown."""
+    """It is armed already, and the limits refuse such a vehicle."""
     armed = known.vehicle.armed and not known.limits.begin_armed
     return "the vehicle is armed already, by another controller or a pilot" if armed else ""
 
@@ -242,7 +242,7 @@ def _prearm(ground: Ground) -> str:
 
 
 def _needs_setpoints(ground: Ground) -> str:
-    """In the mode of setpoints PX4 lets no vehicle arm that receives none, whatever its state."""
+    """PX4 in OFFBOARD refuses to arm while no setpoints arrive, whatever the vehicle's state."""
     vehicle, dialect = ground.vehicle, ground.dialect
     if dialect is None or dialect.takeoff is not Takeoff.SETPOINT or vehicle.health is None:
         return ""
@@ -279,7 +279,7 @@ def _empty_battery(ground: Ground) -> str:
 
 
 def unanswered(for_s: float) -> str:
-    """What it may mean that no TIMESYNC was answered for so long; empty if nothing."""
+    """The sentence for TIMESYNC that was not answered for `for_s`; empty for a short time."""
     if for_s < UNANSWERED_S:
         return ""
     return f"TIMESYNC is not answered for {for_s:.0f} s: does the vehicle receive what is sent?"

@@ -97,7 +97,7 @@ def engaged_in_the_air(flight: FlightState) -> str:
 
 
 def lost(flight: FlightState) -> str:
-    """The vehicle is not ours any more."""
+    """Another has taken control of the vehicle."""
     if flight.authority.standing is not Standing.LOST:
         return ""
     return flight.authority.lost_reason or Standing.LOST.value

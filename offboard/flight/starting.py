@@ -54,7 +54,7 @@ def silent_for_long(flight: FlightState) -> str:
 
 
 def other_vehicle(flight: FlightState) -> str:
-    """Several vehicles are heard: which one is meant?"""
+    """Several vehicles are heard, and none was chosen with --system."""
     senders, now_s = flight.session.senders, flight.now_s
     return SEVERAL.format(systems=senders.named(now_s)) if senders.ambiguous(now_s) else ""
 
@@ -85,12 +85,12 @@ def ground_of(flight: FlightState) -> Ground:
 
 
 def refused(flight: FlightState) -> str:
-    """By the preflight list, whatever is waited for."""
+    """What the preflight list refuses at once, without waiting."""
     return "; ".join(preflight.refusals(ground_of(flight)))
 
 
 def not_ready(flight: FlightState) -> str:
-    """What is to be waited for, by the preflight list."""
+    """What the preflight list still waits for."""
     return preflight.not_ready(ground_of(flight))
 
 
@@ -104,7 +104,7 @@ def not_ready_in_time(flight: FlightState) -> str:
 
 
 def usable(flight: FlightState) -> bool:
-    """Nothing speaks against flying it."""
+    """The preflight list neither refuses the vehicle nor waits for anything."""
     return ready(flight) and not refused(flight)
 
 
@@ -112,7 +112,7 @@ def usable(flight: FlightState) -> bool:
 
 
 def can_take_over(flight: FlightState) -> bool:
-    """It flies in the mode of setpoints, and nobody else has it."""
+    """It flies in the mode of setpoints, without a failsafe, and no other program controls it."""
     if flight.vehicle.in_failsafe or not engaged_in_the_air(flight):
         return False
     prevented = (other_sender, mode_unknown, silent, blind)
@@ -132,19 +132,19 @@ def engaged_but_unfit(flight: FlightState) -> str:
 
 
 def engaged_too_soon(flight: FlightState) -> bool:
-    """Switched away and back so fast that a failsafe may have done it."""
+    """It left the mode of setpoints and returned so soon that a failsafe may have done it."""
     hasty = flight.pilot.hasty and flight.in_phase_s > LISTENED_S
     return hasty and can_take_over(flight)
 
 
 def found_engaged(flight: FlightState) -> bool:
-    """Found in the air, in the mode of setpoints: another program may fly it."""
+    """It was found in the air in the mode of setpoints: another program may fly it."""
     unclaimed = flight.pilot.unclaimed and flight.vehicle.landed != "unknown"
     return unclaimed and flight.in_phase_s > LISTENED_S and bool(engaged_in_the_air(flight))
 
 
 def abandoned(flight: FlightState) -> bool:
-    """A flight of this service was cut short there, and nobody else flies it."""
+    """A flight of this service was cut short and left it engaged; no other program flies it."""
     left = flight.left_engaged and not other_vehicle(flight)
     return left and found_engaged(flight) and can_take_over(flight)
 
@@ -202,7 +202,7 @@ def stopped_before_takeoff(flight: FlightState) -> str:
 
 
 def stop_requested_on_ground(flight: FlightState) -> str:
-    """Every sign says that the vehicle stands there."""
+    """A stop is requested while the vehicle is armed and stands on the ground by every sign."""
     stands = flight.vehicle.armed and not flight.contact.in_the_air
     stopped = flight.stop_reason and stands and not lost(flight)
     return f"{flight.stop_reason} before lift-off" if stopped else ""
@@ -210,7 +210,7 @@ def stop_requested_on_ground(flight: FlightState) -> str:
 
 def rises(flight: FlightState) -> bool:
     """Positions or the land detector show flight: an autopilot refuses to disarm then. PX4's
-    detector leaves the ground while the thrust is still well below hover."""
+    detector reports flight while the thrust is still well below hover."""
     return flight.contact.lifted_off or flight.contact.detects_flight
 
 

@@ -189,7 +189,7 @@ class FlightState:
 
     @property
     def stop_cause(self) -> str:
-        """Who wants the flight to end, in a word; empty for another reason than the operator's."""
+        """A word for who requested the stop: "operator", or empty for any other reason."""
         return "operator" if self.stop_reason == STOPPED else ""
 
     @property
@@ -223,7 +223,7 @@ class FlightState:
 
     @property
     def taken(self) -> bool:
-        """Another has chosen the vehicle's mode, which ended the flight in the air."""
+        """Someone else changed the vehicle's mode, and that ended the flight in the air."""
         return self.authority.standing is Standing.LOST and self.phase is Phase.YIELDED
 
     @property
@@ -235,8 +235,8 @@ class FlightState:
 
     @property
     def awaits_heartbeat(self) -> bool:
-        """The vehicle was taken, and no HEARTBEAT has shown since by whom. Not while it shows the
-        mode of setpoints again: that may be a pilot who wants the next flight."""
+        """The vehicle was taken, and no HEARTBEAT since then shows whether by a failsafe. False
+        while it shows the mode of setpoints again: the pilot may want the next flight."""
         if not self.taken or self.engaged:
             return False
         return not self.shown_since_lost and self.in_phase_s < SHOWN_S
@@ -278,12 +278,12 @@ class FlightState:
 
     @property
     def starved(self) -> bool:
-        """Within the last seconds, as `note_starvation` has it."""
+        """Whether `note_starvation` found this within the last STARVED_KNOWN_S."""
         return self.now_s - self.starved_s < STARVED_KNOWN_S
 
     @property
     def ours(self) -> bool:
-        """A setpoint may leave."""
+        """Whether a setpoint may be sent, by the reported mode and its age."""
         return self.authority.permits_setpoint(self.now_s)
 
     def not_landed(self) -> str:
@@ -297,7 +297,8 @@ class FlightState:
         return self.touchdown.not_landed(on_ground=on_ground)
 
     def move_ground(self, jump_ned_m: Iterable[float]) -> None:
-        """The reported position has jumped by this (3,), not the vehicle: so has the ground."""
+        """The reported position has jumped by this (3,), but the vehicle has not moved: move all
+        places on the ground by as much."""
         jump = tuple(jump_ned_m)
         self.home_ned_m = moved(self.home_ned_m, jump)
         if self.phase is Phase.TAKEOFF:  # the reference is not in force yet
@@ -309,7 +310,7 @@ class FlightState:
 
     @property
     def link_growth_s(self) -> float:
-        """What the link's delay has grown by since take-off."""
+        """Growth of the link's delay since take-off."""
         return max(self.clock.delay_growth_s, self.age_s)
 
     def sent_s(self, time_s: float) -> float:
@@ -329,5 +330,5 @@ class FlightState:
 
     @property
     def telemetry_is_old(self) -> bool:
-        """No decision on the newest telemetry may leave any more."""
+        """The newest telemetry is too old for a setpoint that is computed from it."""
         return self.telemetry_age_s(self.host_s) > self.limits.setpoint_age_s

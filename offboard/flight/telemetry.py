@@ -126,7 +126,7 @@ def _on_position(flight: FlightState, event: LocalPosition) -> None:
 
 
 def _follow_jump(flight: FlightState, event: LocalPosition) -> None:
-    """The vehicle does not step when its estimate does."""
+    """The position estimate has jumped, not the vehicle: move the reference and the ground too."""
     jump_ned_m = flight.jumps.on_position(event)
     if jump_ned_m is not None:
         flight.move_ground(jump_ned_m.tolist())
@@ -175,7 +175,7 @@ def _on_mode(
 
 
 def _on_reboot(flight: FlightState) -> None:
-    """Nothing that was known of vehicle and link is known any more."""
+    """After a reboot of the vehicle: forget what was known of vehicle and link."""
     flight.observer.reset()
     flight.contact, flight.clock = GroundContact(flight.vehicle), VehicleClock()
     flight.hover, flight.jumps = HoverEstimate(), PositionJumps()

@@ -239,7 +239,7 @@ def _place_reference(flight: FlightState, position: LocalPosition) -> None:
 
 
 def _set_hover_thrust(flight: FlightState, least: float = DIFFERENT) -> None:
-    """Fly with the hover thrust that the autopilot's own flight shows, if it is another."""
+    """Fly with the hover thrust measured before the take-over, if it differs from the model's."""
     model = flight.model
     shown = flight.hover.hover_thrust(model, flight.time_s)
     if shown is None or not differs(shown, model, least):

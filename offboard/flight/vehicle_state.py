@@ -114,7 +114,7 @@ class VehicleState:
 
     @property
     def in_failsafe(self) -> bool:
-        """HEARTBEAT shows a failsafe or an emergency."""
+        """The newest HEARTBEAT shows MAV_STATE critical or emergency."""
         return self.heartbeat is not None and self.heartbeat.system_status >= FAILSAFE_STATUS
 
     @property
@@ -242,8 +242,7 @@ class VehicleState:
         return self.time_s - max(newest.time_s, self.resumed_s)
 
     def _reset(self) -> None:
-        """After a reboot nothing is known of the vehicle, but that it was armed, until HEARTBEAT
-        says otherwise."""
+        """After a reboot: forget all but that it was armed, until HEARTBEAT says otherwise."""
         self.health = self.estimator = self.position = self.attitude = None
         self.landed = self.mode = "unknown"
         self.heard_s.clear()

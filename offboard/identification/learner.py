@@ -6,7 +6,7 @@ each setpoint has left, `learn` does one piece of work of 10 to 20 ms at most:
 
 - the first identification: everything, from the climb and the steps that are flown for it, which
   are repeated while they do not show the tilt's response;
-- in motion: drag, tilt response and hover thrust, adopted where they are better known or another;
+- in motion: drag, tilt response and hover thrust, adopted if they are more certain or differ;
 - the tilt of the last seconds is compared with its prediction; see `vehicle_estimate`.
 
 What is new is returned as a `VehicleUpdate`. Times are vehicle time.
@@ -86,7 +86,7 @@ class IdentifySettings(Parameters):
 
 
 class Stage(Enum):
-    """What the vehicle does, as far as it matters here."""
+    """What the flight does, as far as the identification distinguishes it."""
 
     OTHER = auto()
     CLIMB = auto()  # it leaves the ground, or was taken over: what it does from now on counts
@@ -228,7 +228,7 @@ class Learner(VehicleEstimate):
         """What to fly with from the next tick on; where nothing is new, do one piece of work and
         return None. `hover_thrust`: the observer's estimate.
 
-        A link that changes with each tick has every other turn.
+        While the link's delay changes with each tick, every other call does a piece of work.
         """
         if self._gave_up:
             return None
@@ -322,8 +322,8 @@ class Learner(VehicleEstimate):
         yield
 
     def _review_hover(self) -> None:
-        """Adopt the observer's hover thrust if its mean is another than the one in use, twice: the
-        mass or the battery has changed. One beyond the bounds is ignored."""
+        """Adopt the mean of the observer's hover thrust if it differs from the one in use twice in
+        a row: mass or battery has changed. A value beyond the bounds is ignored."""
         while self._hover[0][0] < self._time_s - HOVER_OVER_S:
             self._hover.popleft()
         if self._hover[0][0] > self._time_s - HOVER_OVER_S + HOVER_EVERY_S:

@@ -1,10 +1,10 @@
 """What one vehicle is, and how sure of its delays: the estimate that fits and the link change.
 
-It begins with the vehicle file, or with what an earlier flight has identified. A fit is adopted
-where it is within bounds and better known than what is in use, or confirmed to be another.
+It begins with the vehicle file, or with what an earlier flight has identified. A fit is adopted if
+it is within bounds, and more certain than the value in use or confirmed to differ from it.
 Telemetry that contradicts the constants in use makes the delay uncertain at once, until a fit
-explains the flight. `vehicle` and `uncertainty` are the result. What they mean for a control law is
-not known here. Times are vehicle time.
+explains the flight. `vehicle` and `uncertainty` are the result. It knows no control law. Times are
+vehicle time.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ class VehicleEstimate:
         self._unknown_s += JUMP_SDS * link.sd
 
     def _on_other_link(self, recalled: IdentifiedVehicle, delay: Estimate, link: Estimate) -> None:
-        """Adapt what was recalled to the link's delay of now."""
+        """Adapt delays of an earlier flight to the present delay of the link."""
         changed_s = link.value - max(recalled.link_s, DIRECT_LINK_S)
         changed_s = max(changed_s, -self.vehicle.tilt.delay_s, -self.vehicle.yaw.delay_s)
         if abs(changed_s) < LINK_S:
@@ -238,7 +238,7 @@ class VehicleEstimate:
             self.explain()
 
     def explain(self, refusal: str = "") -> None:
-        """The delay is as well known as it can be now; `refusal`: why it was not identified."""
+        """Set `cause` for the delay as identified so far; `refusal`: why it was not identified."""
         if self.delay is None:
             self.cause = f"tilt response not identified, {refusal}"
             return
@@ -246,8 +246,8 @@ class VehicleEstimate:
         self.cause = f"identified delay, {_in_ms(self.delay)}{thrust}"
 
     def _confirmed(self, tilt: ResponseFit, now: Unexplained) -> bool:
-        """Whether something besides this fit shows that the delay is another: a fit before it, or
-        a contradiction that it explains."""
+        """Whether something besides this fit shows a changed delay: an earlier fit that agrees, or
+        a contradiction that this fit explains."""
         if self._other_delay is not None:
             return not _apart(tilt.delay_s, self._other_delay)
         once = 0 < self._contradictions < MOST_CONTRADICTIONS

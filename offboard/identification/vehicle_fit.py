@@ -217,7 +217,7 @@ def _drag(
 def _accepted_vertical(
     motion: Motion, fit: dict[str, Estimate], refusals: dict[str, str]
 ) -> dict[str, Any]:
-    """Those of hover thrust, thrust lag and thrust delay that are certain enough, by name."""
+    """Hover thrust, thrust lag and thrust delay, by name, as far as they are certain enough."""
     accepted: dict[str, Any] = {}
     hover, effect = fit["hover_thrust"], fit["thrust_effect_s"]
     if 0.02 < hover.value < 0.95 and hover.sd <= HOVER_SD * hover.value:

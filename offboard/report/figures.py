@@ -49,9 +49,9 @@ _CUT = "Single values far from all others are outside; two clicks on the figure 
 
 
 @dataclass(frozen=True, slots=True)
-class Lane:
-    """A flight among those of a report: its letter, its colour and dash, and the vehicle time that
-    is zero on its axis."""
+class DrawnFlight:
+    """A flight as a report draws it: letter and name, colour and dash, and the vehicle time that is
+    zero on its axis."""
 
     flight: Flight
     label: str
@@ -60,13 +60,13 @@ class Lane:
     zero_s: float
 
 
-def lanes(flights: Sequence[Flight]) -> list[Lane]:
+def drawn_flights(flights: Sequence[Flight]) -> list[DrawnFlight]:
     """One flight keeps its vehicle time; several begin their tracks at zero."""
     if len(flights) == 1:
-        return [Lane(flights[0], "", BLUE, "solid", 0.0)]
+        return [DrawnFlight(flights[0], "", BLUE, "solid", 0.0)]
     styles = itertools.cycle(zip(COLOURS, itertools.cycle(DASHES), strict=False))
     return [
-        Lane(flight, f"{letter(place)}: {flight.name}", *style, flight.track_s)
+        DrawnFlight(flight, f"{letter(place)}: {flight.name}", *style, flight.track_s)
         for place, (flight, style) in enumerate(zip(flights, styles, strict=False))
     ]
 
@@ -78,7 +78,7 @@ def letter(place: int) -> str:
 
 def figures(flights: Sequence[Flight]) -> dict[str, Figure]:
     """All figures that the logs have data for, by name: path, timeline, and those of GROUPS."""
-    drawn = lanes(flights)
+    drawn = drawn_flights(flights)
     found = {"path": _path(drawn), "timeline": _timeline(drawn)}
     for name, (title, group) in GROUPS.items():
         found[name] = _panels(title, group, drawn)
@@ -88,20 +88,20 @@ def figures(flights: Sequence[Flight]) -> dict[str, Figure]:
 # ---------------------------------------------------------------------- path
 
 
-def _path(drawn: Sequence[Lane]) -> Figure | None:
+def _path(drawn: Sequence[DrawnFlight]) -> Figure | None:
     figure = go.Figure()
-    for lane in drawn:
-        flown = lane.flight.history
-        alone = not lane.label
-        parts = [("estimated", flown.position, lane.colour, "solid")]
+    for one in drawn:
+        flown = one.flight.history
+        alone = not one.label
+        parts = [("estimated", flown.position, one.colour, "solid")]
         if alone:
             parts.append(("true (simulator)", flown.truth, ORANGE, "solid"))
-        if alone or lane is drawn[0]:
+        if alone or one is drawn[0]:
             parts.append(("reference", flown.reference, INK, "dash"))
         for name, rows, colour, dash in parts:
             if not len(rows):
                 continue
-            label = lane.label if lane.label and name == "estimated" else name
+            label = one.label if one.label and name == "estimated" else name
             figure.add_trace(_path_of(rows, label, colour, dash))
     if not figure.data:
         return None
@@ -130,13 +130,13 @@ def _path_of(rows: Rows, name: str, colour: str, dash: str) -> go.Scatter3d:
 # ---------------------------------------------------------------------- timeline
 
 
-def _timeline(drawn: Sequence[Lane]) -> Figure | None:
+def _timeline(drawn: Sequence[DrawnFlight]) -> Figure | None:
     figure = go.Figure()
     rows: list[str] = []
-    for lane in drawn:
-        prefix = f"{lane.label.partition(':')[0]} " if lane.label else ""
-        shown = timeline.bands(lane.flight), timeline.marks(lane.flight)
-        if lane.label:  # of several flights only what differs most
+    for one in drawn:
+        prefix = f"{one.label.partition(':')[0]} " if one.label else ""
+        shown = timeline.bands(one.flight), timeline.marks(one.flight)
+        if one.label:  # of several flights only what differs most
             shown = (
                 [b for b in shown[0] if b.row == "phase"],
                 [m for m in shown[1] if m.row == "failsafe"],
@@ -144,8 +144,8 @@ def _timeline(drawn: Sequence[Lane]) -> Figure | None:
         own = dict.fromkeys(each.row for part in shown for each in part)
         rows += [prefix + row for row in own]
         for row in own:
-            _add_bands(figure, prefix + row, [b for b in shown[0] if b.row == row], lane.zero_s)
-            _add_marks(figure, prefix + row, [m for m in shown[1] if m.row == row], lane.zero_s)
+            _add_bands(figure, prefix + row, [b for b in shown[0] if b.row == row], one.zero_s)
+            _add_marks(figure, prefix + row, [m for m in shown[1] if m.row == row], one.zero_s)
     if not rows:
         return None
     figure.update_layout(
@@ -198,7 +198,7 @@ def _add_marks(figure: go.Figure, row: str, marks: Sequence[timeline.Mark], zero
 # ---------------------------------------------------------------------- panels
 
 
-def _panels(title: str, group: Sequence[Panel], drawn: Sequence[Lane]) -> Figure | None:
+def _panels(title: str, group: Sequence[Panel], drawn: Sequence[DrawnFlight]) -> Figure | None:
     """A group of panels, in each the curves that the flights have."""
     shown = [(panel, curves) for panel in group if (curves := _known(panel, drawn))]
     if not shown:
@@ -207,8 +207,8 @@ def _panels(title: str, group: Sequence[Panel], drawn: Sequence[Lane]) -> Figure
     captions, cut = [], False
     for place, (panel, curves) in enumerate(shown, 1):
         alone = len(curves) == 1 and not curves[0][0].label
-        for lane, each, samples in curves:
-            _draw(figure, place, each, samples, lane, named=not alone)
+        for one, each, samples in curves:
+            _draw(figure, place, each, samples, one, named=not alone)
         values = np.concatenate([samples[1] for _, _, samples in curves])
         captions += [panel.caption] if panel.caption else []
         if panel.logarithmic:
@@ -224,25 +224,25 @@ def _panels(title: str, group: Sequence[Panel], drawn: Sequence[Lane]) -> Figure
     return Figure(title, figure, " ".join(captions + [_CUT] * cut))
 
 
-def _known(panel: Panel, drawn: Sequence[Lane]) -> list[tuple[Lane, Curve, Points]]:
+def _known(panel: Panel, drawn: Sequence[DrawnFlight]) -> list[tuple[DrawnFlight, Curve, Points]]:
     """The curves of a panel that have values; of several flights only the main ones."""
     curves = [
-        (lane, each, each.source(lane.flight.history))
-        for lane in drawn
+        (one, each, each.source(one.flight.history))
+        for one in drawn
         for each in panel.curves
-        if each.main or not lane.label
+        if each.main or not one.label
     ]
     return [curve for curve in curves if np.isfinite(curve[2][1]).any()]
 
 
 def _draw(
-    figure: go.Figure, place: int, each: Curve, points: Points, lane: Lane, *, named: bool
+    figure: go.Figure, place: int, each: Curve, points: Points, one: DrawnFlight, *, named: bool
 ) -> None:
     times, values, *sd = points
     chosen = thinned(values)
     name, colour, dash = each.name, each.colour, each.dash
-    if lane.label:
-        name, colour, dash = lane.label, lane.colour, lane.dash
+    if one.label:
+        name, colour, dash = one.label, one.colour, one.dash
     more: dict[str, Any] = {} if named else {"showlegend": False}
     if each.style == "steps":
         more["line"] = {"shape": "hv", "width": 1.1}
@@ -251,7 +251,7 @@ def _draw(
     if sd:
         bars = coordinates(sd[0][chosen])
         more["error_y"] = {"type": "data", "array": bars, "color": colour, "thickness": 1.5}
-    times = times[chosen] - lane.zero_s
+    times = times[chosen] - one.zero_s
     curve(figure, place, times, values[chosen], html.escape(name), colour, dash, **more)
 
 
@@ -278,12 +278,12 @@ def _phase_shapes(flight: Flight) -> list[dict[str, Any]]:
     return shapes
 
 
-def _axis_title(drawn: Sequence[Lane]) -> str:
+def _axis_title(drawn: Sequence[DrawnFlight]) -> str:
     return "time since the track began, s" if len(drawn) > 1 else "vehicle time, s"
 
 
-def _extent(drawn: Sequence[Lane]) -> list[float]:
+def _extent(drawn: Sequence[DrawnFlight]) -> list[float]:
     """From the first sample of all flights to the last one."""
-    begin = min(lane.flight.begin_s - lane.zero_s for lane in drawn)
-    end = max(lane.flight.end_s - lane.zero_s for lane in drawn)
+    begin = min(one.flight.begin_s - one.zero_s for one in drawn)
+    end = max(one.flight.end_s - one.zero_s for one in drawn)
     return [round(begin, 2), round(end, 2)]

@@ -1,7 +1,7 @@
 """The loop: link -> companion -> link and log, paced by the vehicle's telemetry.
 
-Nothing in it waits, except for telemetry: log and terminal are written by other threads. Whatever
-fails in it hands the vehicle back.
+Nothing in it waits, except for telemetry: log and terminal are written by other threads. An
+exception in it requests the landing.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ POLL_S = 0.02
 STOPPED_S = 0.2  # from the beginning of a turn: what it decided does not leave later
 FAILING_S = 0.3  # without a turn that succeeds: give up
 TWICE = "interrupted twice: setpoints stopped, "
-OWN_FAILSAFE, SUPERVISED = (
-    "the vehicle's own failsafe takes over",
+SIMULATED, SUPERVISED = (
+    "the simulation ends",
     "the supervisor lands the vehicle",
 )
 UNGUARDED = "the supervisor ended: nobody lands the vehicle if this process dies"
@@ -264,4 +264,4 @@ class Loop:
         return Outcome(code, sentence, self._log.problem)
 
     def _interrupted(self) -> Outcome:
-        return Outcome(ExitCode.ABORTED, TWICE + (SUPERVISED if self._supervisor else OWN_FAILSAFE))
+        return Outcome(ExitCode.ABORTED, TWICE + (SUPERVISED if self._supervisor else SIMULATED))

@@ -1,4 +1,4 @@
-"""The flights of the service on one link: one waits or flies, and when it has ended the next waits.
+"""The flights of the service on one link: one waits or flies; when it has ended, the next waits.
 
 `Flights` takes the place of one companion in the loop. Each flight has a new `Flight` on the
 same session, so that authority, failsafe, plan and identification are new, and what is known of
@@ -43,7 +43,7 @@ class Record(Protocol):
 
     @property
     def left(self) -> str:
-        """Key of the vehicle that a flight which was cut short has left engaged; may be empty."""
+        """Key of the vehicle that a flight left engaged when it was cut short; may be empty."""
         ...
 
     def begin(self, session: Session, configuration: str, vehicle: str) -> str:
@@ -164,7 +164,7 @@ class Flights:
         self._follow(self._source.newest())
 
     def _renew_if_changed(self) -> None:
-        """Wait with the newest configuration, and with what is known of the vehicle."""
+        """Continue to wait with a changed configuration or a remembered vehicle."""
         newest = self._source.newest()
         changed = newest is not self._prepared or self._remembered(newest) is not self._known
         if changed and not self._stopping:
@@ -209,8 +209,8 @@ class Flights:
             self._record.end(engaged=self.state.ends_engaged)
 
     def _look_for_left(self) -> None:
-        """Whether this vehicle was left engaged; not any more once it was seen in another mode, or
-        on the ground."""
+        """Note whether a flight that was cut short left this vehicle engaged; no longer once the
+        vehicle was seen in another mode or on the ground."""
         state, left = self.state, self._record.left
         state.left_engaged = bool(left) and left == self._identity
         if state.left_engaged and not state.pilot.unclaimed:
@@ -250,7 +250,7 @@ class Flights:
     # ------------------------------------------------------------------ what the user reads
 
     def _explain(self) -> None:
-        """Say what the service does not touch."""
+        """Announce a vehicle that was found engaged and is left alone."""
         state = self.state
         if not state.pilot.unclaimed:
             self._told_left_alone = False

@@ -127,7 +127,7 @@ class TakeOver:
         self._text_id = 0
 
     def run(self, reason: str) -> None:
-        """Take over for `reason`, until the vehicle is down or belongs to somebody else."""
+        """Take over for `reason`, until the vehicle is disarmed or another has changed its mode."""
         for _ in range(BACKLOG_MAX):  # the mode may have been left since the last beat
             if not self._receive(0.0):
                 break
@@ -144,7 +144,7 @@ class TakeOver:
         for chunk in chunks:
             reception = self._session.receive(chunk.data, chunk.peer, chunk.arrived_s)
             self._record(*reception.frames)
-            # Of a stream it is only known when it arrived at the earliest
+            # a stream may have buffered it: count it as arrived now
             at_s = clock.monotonic_s() if self._link.is_stream else chunk.arrived_s
             for event in reception.events:
                 self._recovery.see(event, at_s)
@@ -236,7 +236,7 @@ def _listens(descriptor: int) -> bool:
 def main() -> None:
     """Watch until the controller ends, and take its place if the vehicle flies for it."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)  # whoever stops the controller means it, not us
+        signal.signal(number, signal.SIG_IGN)  # they are meant for the controller
     channel = socket.socket(fileno=os.dup(sys.stdin.fileno()))
     watch = Watch(channel)
     channel.send(json.dumps(READY).encode() + b"\n")

@@ -1,14 +1,15 @@
 """Recovery: what the supervisor asks of a vehicle that has lost its controller. No I/O, no clock.
 
-Hold, and after some seconds land. Both are asked for only while the vehicle shows a mode that is
-ours or that we asked for, and at most once for each report of the mode. Any other mode is the
-decision of a pilot or of the vehicle's own failsafe, and final, whatever is reported after it. So
-is hold that was reported before our request, that the vehicle has not acknowledged though asked
-again, or that comes after the landing mode.
+Hold, and after some seconds land. Both are requested only while the vehicle shows the mode of our
+setpoints or one that we requested, and at most once for each report of the mode. Any other mode is
+the decision of a pilot or of the vehicle's own failsafe, and final, whatever is reported after it.
+So is hold if it was reported before our request, if the vehicle did not acknowledge the request
+though it was repeated, or if it comes after the landing mode.
 
-One failsafe decides nothing: that for missing setpoints, which stopped with the controller. It
-shows by its mode, by its time and by HEARTBEAT.system_status, which a pilot's choice clears. In it
-the vehicle is watched, and asked to land if it does not; not while it receives a pilot's sticks.
+The failsafe for missing setpoints is an exception: it acts because the controller has ended. It is
+recognised by its mode, by its time and by HEARTBEAT.system_status, which a pilot's choice clears.
+In it the vehicle is observed, and asked to land if it does not descend by itself; not while it
+receives a pilot's sticks.
 """
 
 from __future__ import annotations
@@ -97,12 +98,12 @@ class Recovery:
         self._fallen_shown = False  # by HEARTBEAT
         self._sank_s = -math.inf  # when it was last seen to sink
         self._armed = True
-        self._begun = False  # all that had waited was seen
+        self._begun = False  # all messages that had arrived before were processed
         self._first_s = math.inf  # time of the first request
         self._asked_s = -math.inf
         self._acknowledged = False
         self._landing = False  # the landing mode was shown
-        self._left_for = ""  # the mode that nobody of us has asked for
+        self._left_for = ""  # the mode that neither controller nor supervisor has requested
         self._left_s = -math.inf
         self._heartbeat_s = -math.inf
         self._requests = 0
@@ -180,7 +181,7 @@ class Recovery:
         return request
 
     def _conclude(self, now_s: float) -> None:
-        """Note when it holds, and when this is over."""
+        """Note since when it holds, and whether the recovery has ended."""
         holds = self._mode == self._dialect.hold_mode and self._fallen_s == math.inf
         self._held_s = min(self._held_s, now_s) if holds else math.inf
         ours = self._holding or self._acknowledged
