@@ -28,8 +28,11 @@ import functools
 import hashlib
 import os
 import re
+import sys
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Generic, ParamSpec, TypeVar, cast
 
@@ -94,9 +97,12 @@ class Entry(Generic[P, R]):
             return self._interpreted
         while _kernels:
             register_jitable(error_model="numpy")(_kernels.pop())
-        config.CACHE_DIR = str(directory())
         signature = tuple(map(_numba_type, self._parameters))
-        jitted = numba.njit(signature, cache=True, error_model="numpy")(self._function)
+        others, config.CACHE_DIR = config.CACHE_DIR, str(directory())
+        try:
+            jitted = numba.njit(signature, cache=True, error_model="numpy")(self._function)
+        finally:
+            config.CACHE_DIR = others
         (directory() / self.name).touch()
         self.machine_code = cast(Callable[P, R], jitted)
         return self.machine_code
@@ -132,12 +138,12 @@ def prepare(tell: Callable[[str], None] = lambda sentence: None) -> None:
 
 @functools.cache
 def directory() -> Path:
-    """Where machine code is kept: below NUMBA_CACHE_DIR, XDG_CACHE_HOME or ~/.cache, or in a
-    temporary directory where that cannot be written.
+    """Where machine code is kept: below the first of NUMBA_CACHE_DIR, XDG_CACHE_HOME and ~/.cache
+    that is absolute (as the XDG standard requires) and can be written, or in a temporary directory.
 
-    It is named after the sources with compiled functions and the modules that these import, because
-    numba compiles an entry again when its own file has changed, but not when that of a kernel or
-    a constant has.
+    It is named after this installation and version of numba, and after the sources with compiled
+    functions and the modules that these import, because numba compiles an entry again when its own
+    file has changed, but not when that of a kernel or a constant has.
     """
     root = Path(__file__).parents[1]
     packages = (root / package for package in ("offboard", "simulator"))
@@ -146,12 +152,13 @@ def directory() -> Path:
     for path in tuple(used):
         modules = (name.decode().replace(".", "/") for name in _IMPORT.findall(texts[path]))
         used.update({root / f"{module}.py" for module in modules} & texts.keys())
-    digest = hashlib.sha256(b"\0".join(texts[path] for path in sorted(used))).hexdigest()[:16]
-    cache = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    place = Path(cache).expanduser().absolute() / "pso-offboard" / digest
-    try:
-        place.mkdir(mode=0o700, parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=place).close()
-    except OSError:
-        return Path(tempfile.mkdtemp())
-    return place
+    compiler = f"{root} {sys.implementation.cache_tag} {version('numba')}".encode()
+    hashed = hashlib.sha256(b"\0".join((compiler, *(texts[path] for path in sorted(used)))))
+    given = (os.environ.get(name, "") for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"))
+    for cache in filter(os.path.isabs, (*given, os.path.expanduser("~/.cache"))):
+        place = Path(cache) / "pso-offboard" / hashed.hexdigest()[:16]
+        with suppress(OSError):
+            place.mkdir(mode=0o700, parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=place).close()
+            return place
+    return Path(tempfile.mkdtemp())

@@ -77,6 +77,7 @@ _ALTITUDE_UNITS = {"HIL_STATE_QUATERNION": 1e3, "SIM_STATE": 1.0}  # in a metre
 _ARRAY, _DATA = "DEBUG_FLOAT_ARRAY", 20  # and where its data begin
 _TICK = {name: ("data", 1, place) for place, name in enumerate(FIELDS)}
 _IDENTIFIED = {name: ("data", 2, 2 * place) for place, name in enumerate(RECORDED)}
+_FIRST_FIELDS = 28  # of a record; smaller numbers are versions of before 0.1
 _DEFAULTS = struct.pack(  # of records of an older version, which lack the last fields
     f"<{len(FIELDS)}f",
     *(NAN if each.default is MISSING else each.default for each in fields(TickRecord)),
@@ -306,9 +307,11 @@ class _Collector:
         elif name == "SET_POSITION_TARGET_LOCAL_NED":
             self._setpoint.add(payload[:4] + _NO_ATTITUDE, now_ms, unix_s)
         elif name == _ARRAY and payload[10:20].rstrip(b"\0") == RECORD_NAME.encode():
-            end = _DATA + 4 * int.from_bytes(payload[8:10], "little")  # array_id: how many fields
-            known = payload[:end].ljust(end, b"\0")
-            self._records.add(known + _DEFAULTS[end - _DATA :], now_ms, unix_s)
+            fields = int.from_bytes(payload[8:10], "little")  # array_id
+            if fields >= _FIRST_FIELDS:
+                end = _DATA + 4 * min(fields, len(FIELDS))
+                known = payload[:end].ljust(end, b"\0")
+                self._records.add(known + _DEFAULTS[end - _DATA :], now_ms, unix_s)
         elif name == _ARRAY and payload[10:20].rstrip(b"\0") == IDENTIFIED_NAME.encode():
             self._identified.add(payload, now_ms, unix_s)
         elif name == "TIMESYNC":

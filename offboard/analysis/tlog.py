@@ -94,29 +94,38 @@ class Tlog:
     def _messages(self, file: BinaryIO) -> Iterator[LoggedMessage]:
         data, at, before = b"", 0, 0  # `before`: bytes of the file before `data`
         lost: int | None = None  # where the search for the next entry began
-        found = False
+        found = cut = False  # `cut`: the file ends within the entry there, if its length is right
         while True:
             if at + _LONGEST + 9 > len(data) and (block := file.read(_BLOCK)):
                 before, data, at = before + at, data[at:] + block, 0
                 continue  # an entry, and the head of the next one
-            if at >= len(data):
+            if len(data) - at < 8 + 3:  # no entry can begin here
                 break
             entry = _entry(data, at, certain=lost is not None)
             if entry is None:
-                lost = before + at if lost is None else lost
+                if lost is None:
+                    size = frame_size(data, at + 8)
+                    cut = _begins(data, at) and (size is None or at + 8 + size > len(data))
+                    lost = before + at
                 at = _next_magic(data, at + 9) - 8
                 continue
             if lost is not None:
-                self.damaged += 1
-                self.first_damage = self.first_damage if self.damaged > 1 else lost
+                self._count(lost)
             at += 8 + len(entry.frame.raw)
             found, lost = True, None
             yield entry
-        self.truncated = 0 if lost is None else before + len(data) - lost
+        if lost is not None and not cut:
+            self._count(lost)
+        else:
+            self.truncated = before + len(data) - (before + at if lost is None else lost)
         if not found:
             raise TlogError(
                 f"{self.path} is not a .tlog, or empty: it holds no time stamp and MAVLink frame"
             )
+
+    def _count(self, place: int) -> None:
+        self.damaged += 1
+        self.first_damage = self.first_damage if self.damaged > 1 else place
 
 
 def _entry(data: bytes, at: int, *, certain: bool) -> LoggedMessage | None:
@@ -141,9 +150,9 @@ def _begins(data: bytes, at: int) -> bool:
 
 
 def _next_magic(data: bytes, at: int) -> int:
-    """Where the next first byte of a frame is; 8 bytes after the end of the data without one."""
+    """Where the next first byte of a frame is; the end of the data without one."""
     places = [place for magic in _MAGIC if (place := data.find(magic, at)) >= 0]
-    return min(places, default=len(data) + 8)
+    return min(places, default=len(data))
 
 
 def find(flight: Path) -> Path:

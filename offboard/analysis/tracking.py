@@ -35,7 +35,7 @@ _FITNESS = ("e_u", "e_v", "e_w", "e_x", "e_y", "e_z", "e_psi")
 def window_of(flown: History) -> tuple[float, float] | None:
     """First and last vehicle time of TRACK; None where a signal has less than two samples in it."""
     times = flown.records["time_s"][_in_track(flown)]
-    if len(times) < 2 or len(np.unique(flown.reference["time_s"])) < 2:
+    if len(times) < 2 or len(np.unique(np.maximum.accumulate(flown.reference["time_s"]))) < 2:
         return None
     begin_s, end_s = float(times[0]), float(times[-1])
     stamps = (rows["time_s"] for rows in (flown.position, flown.attitude, flown.setpoint))

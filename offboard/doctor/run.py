@@ -92,13 +92,16 @@ def checks() -> dict[str, Check]:
 
 
 def _installed(point: EntryPoint) -> Check:
-    """A check of another package, imported when it is asked."""
+    """A check of another package; one that cannot be imported fails when it is asked."""
 
     def check(seen: Observation) -> Iterable[Finding]:
         found: Iterable[Finding] = point.load()(seen)
         return found
 
-    check.__doc__ = f"A check of another package, {point.value}."
+    try:
+        check.__doc__ = inspect.getdoc(point.load())
+    except Exception:  # whatever another package raises while it is imported
+        check.__doc__ = f"cannot be imported from {point.value}"
     return check
 
 
@@ -114,7 +117,8 @@ def names(chosen: Sequence[str] = ()) -> list[str]:
 
 def summary(name: str) -> str:
     """What a check is about."""
-    return " ".join((inspect.getdoc(checks()[name]) or "").split())
+    text = (inspect.getdoc(checks()[name]) or "").partition("\n\n")[0]
+    return " ".join(text.split())
 
 
 # --- observing ---

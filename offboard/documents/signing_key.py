@@ -57,8 +57,14 @@ def create_key(path: Path) -> str:
     passphrase = secrets.token_hex(KEY_BYTES)
     try:
         with open(path, "x", encoding="ascii", opener=partial(os.open, mode=0o600)) as file:
-            os.fchmod(file.fileno(), 0o600)
-            file.write(f"# MAVLink 2 signing key: keep it secret\npassphrase: {passphrase}\n")
+            try:
+                os.fchmod(file.fileno(), 0o600)
+                file.write(f"# MAVLink 2 signing key: keep it secret\npassphrase: {passphrase}\n")
+                file.flush()
+                os.fsync(file.fileno())
+            except OSError:
+                path.unlink(missing_ok=True)  # half a key is none
+                raise
     except FileExistsError:
         raise KeyFileError(f"{abridged(path)} exists and is not replaced: name another") from None
     except (OSError, ValueError) as error:

@@ -181,10 +181,9 @@ def _on_reboot(flight: FlightState) -> None:
     flight.hover, flight.jumps = HoverEstimate(), PositionJumps()
     flight.reading = ParameterReading()
     flight.took_off = False  # the local frame begins elsewhere
-    if flight.phase not in BEFORE_FLIGHT:
-        flight.authority.forget(flight.now_s)
-    else:
+    if flight.phase in BEFORE_FLIGHT:
         flight.authority = Authority()
+    flight.authority.forget(flight.now_s)
 
 
 # ---------------------------------------------------------------------- requests

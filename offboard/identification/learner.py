@@ -146,7 +146,7 @@ class Learner(VehicleEstimate):
         self._positions = Rows(POSITION_WIDTH)
         self._stage = Stage.OTHER
         self._time_s = 0.0
-        self._climb_s = self._steps_s = self._motion_s = math.inf  # when each began
+        self._climb_s = self._steps_s = self.motion_s = math.inf  # when each began
         self._rounds = 1
         self._left_box = self._gave_up = False
         self._work: Work | None = None
@@ -190,11 +190,11 @@ class Learner(VehicleEstimate):
         """The flight has entered `stage`."""
         self._stage = stage
         if stage is Stage.CLIMB and self._settings.online:
-            self._climb_s = time_s
+            self._climb_s, self.motion_s = time_s, math.inf
         elif stage is Stage.STEPS:
             self._steps_s = time_s
         elif stage is Stage.MOTION:
-            self._motion_s = min(self._motion_s, time_s)
+            self.motion_s = min(self.motion_s, time_s)
 
     # ------------------------------------------------------------------ what the flight reads
 
@@ -264,7 +264,7 @@ class Learner(VehicleEstimate):
             return self._identify_tilt()
         if self.in_doubt:
             return None
-        if self._time_s >= self._motion_s + DRAG_FIRST_S and self._is_due("drag", DRAG_EVERY_S):
+        if self._time_s >= self.motion_s + DRAG_FIRST_S and self._is_due("drag", DRAG_EVERY_S):
             return self._identify_drag()
         if self._is_due("hover", HOVER_EVERY_S):
             self._review_hover()
@@ -277,8 +277,9 @@ class Learner(VehicleEstimate):
         return True
 
     def _flown_since(self, begin_s: float) -> Trace:
-        trace = clean(self._commands.kept, self._attitudes.kept, self._positions.kept)
-        return trace.between(begin_s, self._time_s)
+        stamped = self._attitudes.kept, self._positions.kept
+        known = (rows[(rows[:, 0] >= begin_s) & (rows[:, 0] <= self._time_s)] for rows in stamped)
+        return clean(self._commands.kept, *known).between(begin_s, self._time_s)
 
     def _identify_all(self) -> Work:
         """Identify everything from climb and steps, which are repeated if they do not show the
@@ -297,7 +298,7 @@ class Learner(VehicleEstimate):
         self.explain(refusal or "it is out of bounds")
 
     def _identify_drag(self) -> Work:
-        trace = self._flown_since(max(self._motion_s, self._time_s - DRAG_OVER_S))
+        trace = self._flown_since(max(self.motion_s, self._time_s - DRAG_OVER_S))
         self.review_drag(identify_drag(trace, self.vehicle), DRAG_NEWS_PS, self._time_s)
         yield
 

@@ -65,6 +65,7 @@ class FrameSplitter:
         self._counters = counters
         self._mavlink = mavlink.MAVLink(None)
         self._rest = b""
+        self._behind = 0  # where in the next data the frame before ends; -1: further back
 
     def split(self, data: bytes) -> list[Frame]:
         """The verified frames in `data`; what is not returned is counted."""
@@ -72,7 +73,7 @@ class FrameSplitter:
         counters.bytes_received += len(data)
         data = self._rest + data
         frames: list[Frame] = []
-        at, end, behind = self._next_marker(data, 0), len(data), 0
+        at, end, behind = self._next_marker(data, 0), len(data), self._behind
         while at < end:
             found = self._frame_at(data, at, adjoins=at == behind)
             if found is None:
@@ -89,7 +90,7 @@ class FrameSplitter:
                 counters.count(DropReason.UNKNOWN_ID)
             behind = at + len(found.raw)
             at = self._next_marker(data, behind)
-        self._rest = data[at:]
+        self._rest, self._behind = data[at:], 0 if at == behind else -1
         counters.bytes_pending = end - at
         return frames
 

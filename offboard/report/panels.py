@@ -73,7 +73,7 @@ def _away(array: str, axis: int | None = None) -> Source:
 
     def samples(flown: History) -> Points:
         rows = each_once(getattr(flown, array))
-        if len(np.unique(flown.reference["time_s"])) < 2:
+        if len(np.unique(np.maximum.accumulate(flown.reference["time_s"]))) < 2:
             return np.zeros(0), np.zeros(0)
         near = near_reference(flown, rows["time_s"])
         expected = Reference(flown.reference).position(rows["time_s"][near])

@@ -237,15 +237,16 @@ class Flights:
         identification = self.current.identification
         if identification is None or not self._key:
             return
-        known = self._remembered(self._prepared)
-        if identification.contradicted and known is not None:
+        if identification.contradicted and self._known is not None:
+            self._known = None
             self._memory.discard(self._key)
             self.current.announce(
                 "what was identified of this vehicle is contradicted, and discarded: the next "
                 "flight identifies it again"
             )
-        elif not identification.contradicted and known is None and identification.result:
+        elif not identification.contradicted and self._known is None and identification.result:
             self._memory.keep(self._key, self._prepared, identification.result)
+            self._known = self._remembered(self._prepared)
 
     # ------------------------------------------------------------------ what the user reads
 

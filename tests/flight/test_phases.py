@@ -12,7 +12,7 @@ import pytest
 from flight_tables import IN_THE_AIR, README, asked, exits, with_tables
 from uneventful import NOW_S, TRACK, hear, heartbeat, lift, position, uneventful
 
-from offboard.flight import preflight, starting
+from offboard.flight import preflight, starting, telemetry
 from offboard.flight.authority import Standing
 from offboard.flight.phases import (
     ENDS,
@@ -29,7 +29,14 @@ from offboard.flight.rows import Transition
 from offboard.flight.state import FlightState
 from offboard.flight.transitions import SERVICE_ONLY, next_row, table
 from offboard.mavlink.dialects.base import Takeoff
-from offboard.mavlink.events import Attitude, CommandAck, Landed, OtherSender, VehicleFound
+from offboard.mavlink.events import (
+    Attitude,
+    CommandAck,
+    Landed,
+    OtherSender,
+    Rebooted,
+    VehicleFound,
+)
 
 ON_TRACK = (Phase.JOIN, Phase.TRACK, Phase.HOVER)
 SERVICES = {then: ServiceOptions(then=then) for then in ("hold", "land", "repeat")}  # type: ignore[arg-type]
@@ -299,6 +306,15 @@ def test_no_way_out_of_the_air_leaves_the_vehicle_unasked(service: ServiceOption
             taken = next_row(flight)
             assert taken is not None
             assert taken.target in IN_THE_AIR
+
+
+def test_a_vehicle_that_reboots_as_it_arms_counts_as_unheard_from_then_on() -> None:
+    """Not for ever: a landing that follows at once waits for its HEARTBEAT."""
+    flight = uneventful(Phase.ARM)
+    flight.session.link_time_s, flight.observer.reset = NOW_S, lambda: None  # type: ignore[misc]
+    telemetry.update(flight, Rebooted(0.0), NOW_S, turned_s=NOW_S)
+    flight.now_s += 4.0
+    assert flight.unreached_s == pytest.approx(4.0)
 
 
 def test_the_tables_of_the_readme_are_those_of_the_code() -> None:

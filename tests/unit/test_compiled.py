@@ -117,9 +117,25 @@ def test_without_compilation_the_same_functions_run_as_python(
     assert not machine_code(tmp_path)
 
 
+def test_the_directory_is_below_the_first_usable_one(package: Path, tmp_path: Path) -> None:
+    """A relative one is not, as the XDG standard says."""
+    code = "from offboard import compiled; print(compiled.directory())"
+    first, second, home = (tmp_path / name for name in ("numba", "xdg", "home"))
+    given = {"NUMBA_CACHE_DIR": str(first), "XDG_CACHE_HOME": str(second), "HOME": str(home)}
+    for place in (first, second):
+        assert Path(answer(package, code, **given)).parent == place / "pso-offboard"
+        shutil.rmtree(place)
+        place.write_text("not a directory")
+    given["XDG_CACHE_HOME"] = "here"
+    assert Path(answer(package, code, **given)).parent == home / ".cache/pso-offboard"
+    assert not list(package.rglob("here"))
+
+
 def test_compiles_where_no_directory_can_be_written(package: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("not a directory")
-    assert answer(package, NUMBA_CACHE_DIR=str(tmp_path / "file")).startswith("68.0\n")
+    nowhere = str(tmp_path / "file")
+    given = {"NUMBA_CACHE_DIR": nowhere, "XDG_CACHE_HOME": nowhere, "HOME": nowhere}
+    assert answer(package, **given).startswith("68.0\n")
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 from pydantic import ValidationError
 
@@ -205,6 +207,17 @@ def test_learner_announces_what_is_new_in_motion(monkeypatch: pytest.MonkeyPatch
         learner, said = flown(AGREES, shown)
         assert learner.vehicle.hover_thrust == pytest.approx(used, abs=0.002)
         assert sum(line.startswith("identified hover thrust") for line in said) == (used != 0.42)
+
+
+def test_motion_begins_anew_with_each_lap() -> None:
+    """From the climb of a second lap on, what was flown before it is not used for the drag."""
+    learner = Learner(FILE, IdentifySettings())
+    for stage, time_s, begun_s in (
+        (Stage.CLIMB, 0.0, math.inf), (Stage.MOTION, 10.0, 10.0), (Stage.MOTION, 20.0, 10.0),
+        (Stage.CLIMB, 45.0, math.inf), (Stage.MOTION, 60.0, 60.0),
+    ):  # fmt: skip
+        learner.on_stage(stage, time_s)
+        assert learner.motion_s == begun_s
 
 
 def test_what_is_recalled_needs_no_steps_and_is_not_adopted_again() -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import os
+import resource
+import signal
 from pathlib import Path
 
 import pytest
@@ -29,6 +31,19 @@ def test_a_new_key_is_private_random_and_the_hash_of_its_passphrase(tmp_path: Pa
     assert passphrases[0] != passphrases[1]
     assert all(len(bytes.fromhex(each)) == 32 for each in passphrases)
     assert read_key(tmp_path / "a") == hashlib.sha256(passphrases[0].encode()).digest()
+
+
+def test_a_file_that_cannot_be_written_whole_is_not_left(tmp_path: Path) -> None:
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20, limits[1]))
+    try:
+        with pytest.raises(KeyFileError, match="cannot be created: File too large"):
+            create_key(tmp_path / "key")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, ignored)
+    assert not (tmp_path / "key").exists()
 
 
 def test_no_file_is_replaced(tmp_path: Path) -> None:

@@ -110,6 +110,31 @@ def test_entries_after_garbage_and_holes_are_read(tmp_path: Path) -> None:
     assert "2 damaged entries were skipped" in log.damage
 
 
+def test_damage_at_the_end_is_reported_and_a_cut_entry_is_none(tmp_path: Path) -> None:
+    """Garbage behind the last entry, a last entry with a wrong checksum, and one that is cut."""
+    data, whole = PX4.read_bytes(), tlog.read(PX4)
+    messages, at = tuple(whole), places(whole)
+    wrong = bytearray(data)
+    wrong[-1] ^= 1
+    for changed, kept, damage in ((data + bytes(5000), 0, at[-1]), (bytes(wrong), 1, at[-2])):
+        log = damaged(tmp_path / "x.tlog", changed)
+        assert tuple(log) == messages[: len(messages) - kept]
+        assert (log.damaged, log.first_damage, log.truncated) == (1, damage, 0)
+    log = damaged(tmp_path / "x.tlog", data[:-3])
+    assert tuple(log) == messages[:-1]
+    assert (log.damaged, log.truncated) == (0, at[-1] - at[-2] - 3)
+
+
+def test_an_entry_at_the_border_of_a_block_is_found_behind_garbage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data, messages = PX4.read_bytes(), tuple(tlog.read(PX4))
+    monkeypatch.setattr(tlog, "_BLOCK", 1000)
+    for short in range(12):
+        log = damaged(tmp_path / "x.tlog", bytes(1000 - short) + data)
+        assert tuple(log) == messages
+
+
 def test_a_whole_log_is_read_in_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = list(tlog.read(PX4))
     monkeypatch.setattr(tlog, "_BLOCK", 301)

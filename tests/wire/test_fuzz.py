@@ -125,6 +125,20 @@ def test_good_frames_survive_garbage_between_them(traffic: list[bytes], seed: in
     check(session)
 
 
+def test_a_length_in_garbage_hides_no_frame_of_the_next_read() -> None:
+    """A false start with an unknown id, whose length covers three good frames of two reads."""
+    sender = Sender(7)
+    frames = [sender.heartbeat(PX4) for _ in range(6)]
+    session = pinned(sender, PX4, stream=True)
+    reach = sum(map(len, frames[:3]))
+    false = bytes((0, 1, 0xFD, reach - 2)) + bytes((0, 0, 0, 7, 1, 0xAA, 0xBB, 0x77))
+    data = false + b"".join(frames)
+    split = len(false) + 5
+    found = [*session.receive(data[:split], PEER, 0.0).frames]
+    found += session.receive(data[split:], PEER, 0.1).frames
+    assert found == frames
+
+
 def test_frames_that_are_unusual() -> None:
     """Unknown incompatibility flags are refused; a signed frame includes its signature; one with an
     unknown id needs another frame behind it, and garbage like it hides none."""
