@@ -78,6 +78,7 @@ def test_every_setpoint_is_finite_and_within_the_vehicle() -> None:
         assert setpoint.type_mask == 7
 
 
+@pytest.mark.slow
 def test_a_wide_fast_circle_that_begins_far_away(tmp_path: Path) -> None:
     """7.5 m/s at 39 degrees of tilt, 60 m from the take-off point."""
     wide = {"radius_m": 30, "period_s": 25, "laps": 1, "run_in_s": 8, "origin_north_m": 50}

@@ -83,6 +83,7 @@ def test_arducopter_with_another_thrust_stays_at_its_height(factor: float, seed:
     assert taken_over_with(pair) == pytest.approx(true, rel=0.03)
 
 
+@pytest.mark.slow
 def test_nothing_changes_without_a_difference_or_a_report_or_a_take_over() -> None:
     """PX4 takes off with our setpoints: the observer finds the difference out."""
     right = with_thrust(1.0, "arducopter", ARDUPILOT)

@@ -117,6 +117,7 @@ def test_second_lap_is_as_good_as_with_the_true_constants(like, tmp_path: Path):
     assert rmse_m["file"] > 1.6 * rmse_m["true"]
 
 
+@pytest.mark.slow
 def test_slow_thrust_is_identified(tmp_path: Path):
     """From the steps, though they leave it uncertain. Otherwise it is 0.5 to 1.2 m off."""
     flies = simulated.vehicle("px4_sih").model_copy(update={"thrust_lag_s": 0.5})
@@ -268,6 +269,7 @@ def after_doubt(pair: Pair) -> list[str]:
     return text[known:].split()
 
 
+@pytest.mark.slow
 def test_delay_that_jumps_is_noticed_and_flown(tmp_path: Path):
     """Unnoticed, 0.2 s more take the vehicle 3.8 m off at this bandwidth; noticed by the motion
     alone 0.6 to 2.0 m, by the moment of the jump, and 0.06 m in the lap that follows; by TIMESYNC
@@ -296,6 +298,7 @@ def test_vehicle_is_identified_on_a_link_that_changes_with_each_tick(
     assert begun[Phase.TRACK] - begun[Phase.EXCITE] < 3.0 * LENGTH_S
 
 
+@pytest.mark.slow
 def test_delay_that_is_never_the_same_lowers_the_bandwidth(tmp_path: Path):
     """As on a machine that does much else: frames arrive 0 to 0.2 s late."""
     chance = random.Random(3)
@@ -308,6 +311,7 @@ def test_delay_that_is_never_the_same_lowers_the_bandwidth(tmp_path: Path):
     assert second_lap_rmse_m(pair, tmp_path) < 0.3
 
 
+@pytest.mark.slow
 def test_attitude_loop_that_slows_is_noticed_and_flown(tmp_path: Path):
     """From 11.4 to 5 rad/s with the same delay. Unnoticed, it is 0.98 m off."""
     pair = neutral(scenario="px4_like", learning=IDENTIFY, aloft=True)

@@ -65,6 +65,7 @@ def test_the_delay_of_the_link_is_measured_before_lift_off(monkeypatch: pytest.M
     assert unanswered.fly().exit_code == 4
 
 
+@pytest.mark.slow
 def test_sixty_ms_each_way_cause_a_limit_cycle_unless_identified() -> None:
     """On the real PX4, with its vehicle file, which does not contain this delay: 0.5 to 0.9 m
     without identification, 0.05 m with it."""

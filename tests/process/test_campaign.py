@@ -314,6 +314,7 @@ def dies(job: Job) -> Record:
     return Record(0, "flown and landed", 1.0, "error")
 
 
+@pytest.mark.slow
 def test_a_flight_whose_worker_dies_twice_is_a_row(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -330,6 +331,7 @@ def test_a_flight_whose_worker_dies_twice_is_a_row(
     assert (ended[2].exit_code, ended[2].sentence) == (4, "the process that flew it ended, twice")
 
 
+@pytest.mark.slow
 def test_a_kept_flight_appears_when_it_is_complete(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

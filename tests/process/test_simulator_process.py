@@ -46,6 +46,7 @@ def test_a_flight_in_real_time() -> None:
     assert OFFBOARD in {m.custom_mode for m in peer.of("HEARTBEAT")}
 
 
+@pytest.mark.slow
 def test_speed() -> None:
     with Peer() as peer, simulator(*to(peer), *QUIET, "--speed", "5") as process:
         peer.listen(lambda: peer.time_s > 1.0)

@@ -330,6 +330,7 @@ def flown_over_an_attitude_loop(
     return positions, velocities, directions
 
 
+@pytest.mark.slow
 def test_the_integral_holds_a_point_in_wind_over_an_attitude_loop() -> None:
     wind = np.array([1.0, -0.5, 0.0])
     ends = {
