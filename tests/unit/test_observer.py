@@ -171,8 +171,9 @@ def test_prediction_is_exact_on_a_matching_plant(about_rad: float) -> None:
     observer.on_attitude(plant.time_s, plant.attitude(), STILL)
     observer.on_position(plant.time_s, *plant.position())
     pairs.append((observer.predict(plant.time_s - PX4.tilt.delay_s), plant.x.copy()))
-    for state, truth in pairs:
-        assert state.position_ned_m == pytest.approx(truth[:3], abs=4e-4)
+    for number, (state, truth) in enumerate(pairs):
+        near_m = 2e-4 if number < len(pairs) - 2 else 4e-4  # after the gap
+        assert state.position_ned_m == pytest.approx(truth[:3], abs=near_m)
         assert state.velocity_ned_mps == pytest.approx(truth[3:6], abs=3e-3)
         assert state.thrust_direction_ned[:2] == pytest.approx(truth[6:8], abs=1e-3)
         assert state.thrust_direction_rate_ned_ps[:2] == pytest.approx(truth[8:10], abs=1e-2)
