@@ -183,7 +183,7 @@ def _on_reboot(flight: FlightState) -> None:
     flight.took_off = False  # the local frame begins elsewhere
     if flight.phase in BEFORE_FLIGHT:
         flight.authority = Authority()
-    flight.authority.forget(flight.now_s)
+    flight.authority.forget(flight.now_s)  # unheard from now on, not for ever
 
 
 # ---------------------------------------------------------------------- requests

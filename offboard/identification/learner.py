@@ -190,7 +190,7 @@ class Learner(VehicleEstimate):
         """The flight has entered `stage`."""
         self._stage = stage
         if stage is Stage.CLIMB and self._settings.online:
-            self._climb_s, self.motion_s = time_s, math.inf
+            self._climb_s, self.motion_s = time_s, math.inf  # each lap has its own motion
         elif stage is Stage.STEPS:
             self._steps_s = time_s
         elif stage is Stage.MOTION:
