@@ -115,9 +115,12 @@ class Flight(FlightState):
         """Process all that has arrived, then act once if a tick is due. Returns what to send.
 
         Call it at least every 50 ms, and `finish_turn` after the frames were sent. `now_s` is host
-        time.
+        time. In lockstep a turn without chunks does nothing: how many there are between two
+        barriers depends on the load of the machine.
         """
         self._ticked = self._heard = False
+        if self.session.settings.lockstep and not chunks:
+            return Output()
         now_s = self._inputs.begin(now_s, self.other_datagrams)
         try:
             before_s = self.now_s

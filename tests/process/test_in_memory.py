@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,9 +15,9 @@ from offboard.link.stop import StopRequests
 from offboard.run import flight, sitl
 from offboard.run.configuration import load
 from offboard.run.flight import Simulated, fly
-from offboard.run.sitl import InMemorySimulator, SimulatorProcess
+from offboard.run.sitl import InMemoryLink, InMemorySimulator, SimulatorProcess
 
-SETPOINT, TELEMETRY = 82, (30, 31, 32, 115)
+HEARTBEAT, SETPOINT, TELEMETRY = 0, 82, (30, 31, 32, 115)
 SHORT = ("reference.duration_s=1", "reference.height_m=1", "identify.excite=false")
 
 
@@ -53,6 +54,25 @@ def test_a_flight_in_memory_is_that_over_udp(tmp_path: Path) -> None:
     assert len(sent["udp"][0]) > 60
     assert len(sent["udp"][1]) > 1000
     assert sent["memory"] == sent["udp"]
+
+
+class Idle(InMemorySimulator):
+    """Every third turn finds nothing, as where the simulator is slower than the loop."""
+
+    def open_link(self, **options: Any) -> InMemoryLink:
+        link = super().open_link(**options)
+        receive, turns = link.receive, count()
+        link.receive = lambda timeout_s: receive(timeout_s) if next(turns) % 3 else []  # type: ignore[method-assign]
+        return link
+
+
+def test_turns_that_receive_nothing_change_no_byte_of_a_flight(tmp_path: Path) -> None:
+    sent = []
+    for name, vehicle in (("busy", InMemorySimulator()), ("idle", Idle())):
+        assert flown(tmp_path / name, Simulated(scenario="calm"), vehicle).exit_code == 0
+        sent.append(frames(tmp_path / name / "flight.tlog", HEARTBEAT, SETPOINT, *TELEMETRY))
+    assert len(sent[0]) > 1000
+    assert sent[0] == sent[1]
 
 
 def divides(frames: object) -> list[tuple[int, bytes]]:
