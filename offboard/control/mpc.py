@@ -110,7 +110,7 @@ class HorizonQuadratic:
 
     def problem(self, task: Task, outlook: NDArray[np.void]) -> BoxQuadratic:
         """The quadratic in (3 N,) from the deviations of `task`."""
-        starts = (task.lateral[:, 0], task.lateral[:, 1], task.vertical)
+        starts = (*task.at_hover.T, task.vertical)
         axes = list(zip(starts, self._axes, strict=True))
         gradient = np.concatenate([start @ axis[1] for start, axis in axes])
         rest = sum(float(start @ axis[2] @ start) for start, axis in axes)

@@ -53,7 +53,7 @@ class PidLaw(TrackingLaw):
 
     def decide(self, situation: Situation) -> Decision:
         task, gains, slower = self.task(situation), self._gains, self._slower
-        lateral, vertical = task.lateral, task.vertical
+        lateral, vertical = task.at_hover, task.vertical
         north_east_mps = lateral[1] + slower * gains.position_gain_ps * lateral[0]
         climb_mps = vertical[1] + slower * gains.height_gain_ps * vertical[0]
         asked = np.empty(3)  # acceleration against the error, m/s^2, NED
@@ -63,7 +63,7 @@ class PidLaw(TrackingLaw):
         asked[:2] /= self.vehicle.gravity_mps2  # as tilt
         inputs = task.inputs(asked)
         clipped = task.problem.clip(inputs)
-        self._integrate(np.append(lateral[0], vertical[0]), (clipped == inputs)[[1, 2, 0]])
+        self._integrate(np.append(task.lateral[0], vertical[0]), (clipped == inputs)[[1, 2, 0]])
         cost, on_bound = float(task.problem(clipped)), at_bound(task.problem, clipped)
         return decision(clipped, Certificate(cost, at_bound=on_bound))
 

@@ -20,7 +20,7 @@ from offboard.control.base import Controller, DecisionError, Situation
 from offboard.control.law import PsoLaw
 from offboard.control.swarm import SwarmSettings
 from offboard.model.axes import lateral_model, lead, vertical_model
-from offboard.model.command import Command
+from offboard.model.command import Command, PredictedState
 from offboard.model.vehicle import Vehicle
 from offboard.reference.base import FlatSample
 
@@ -82,8 +82,24 @@ def test_lead_inverts_the_second_order_response() -> None:
     assert commanded == pytest.approx((np.exp(s * t) / response).imag)
 
 
+def slope_of_force(reference: Lemniscate, vehicle: Vehicle, state: PredictedState) -> np.ndarray:
+    """d(T b) / db (2, 2), by differences, at the direction that the reference asks for and with the
+    vertical force that carries the weight; symmetric."""
+    sample = reference.sample(state.time_s)
+    force = np.array([0.0, 0.0, G]) - sample.acceleration_ned_mps2
+    force += state.disturbance_ned_mps2 - vehicle.drag_per_mass_ps * sample.velocity_ned_mps
+    b, step = force[:2] / np.linalg.norm(force), 1e-6
+    carried = force[2] * G / (G + state.disturbance_ned_mps2[2])
+
+    def push(b: np.ndarray) -> np.ndarray:
+        return carried * b / math.sqrt(1.0 - b @ b)
+
+    return np.array([(push(b + e) - push(b - e)) / (2.0 * step) for e in step * np.eye(2)])
+
+
 def test_unconstrained_minimiser_is_the_lqr_law() -> None:
-    """u* = -f / h: b_c = b_ff - K [p, v, b, b'], T b_z = f_ff - Kz [z, v_z, f_z]; heading led."""
+    """u* = -f / h: b_c = b_ff - K [p, v, b, b'], T b_z = f_ff - Kz [z, v_z, f_z]; heading led. p and
+    v are those for which b in hover does what b does here, by the slope of the lateral force."""
     law, rng, reference = lqr(), np.random.default_rng(1), Lemniscate(15.0)
     for _ in range(20):
         state = state_of(rng, reference, 0.3)
@@ -95,6 +111,7 @@ def test_unconstrained_minimiser_is_the_lqr_law() -> None:
              state.thrust_direction_rate_ned_ps)
         )[:, :2]  # fmt: skip
         off, b_z = north_east - target.lateral, state.thrust_direction_ned[2]
+        off[:2] = off[:2] @ np.linalg.inv(slope_of_force(reference, law.vehicle, state)) * G
         down = (state.position_ned_m[2], state.velocity_ned_mps[2], state.thrust_mps2 * b_z)
         vertical = np.array(down) - target.vertical
         expected_tilt = target.feedforward[:2] - law.lateral.gain @ off
@@ -313,6 +330,26 @@ def test_engaging_off_the_reference_ends_on_it(
         score_from_s=14.0, laps=0.3,
     )  # fmt: skip
     assert result.largest_m < 0.005
+
+
+@dataclass
+class Hover(Lemniscate):
+    """At 3 m above the start."""
+
+    def sample(self, time_s: float | np.ndarray) -> FlatSample:
+        still = np.zeros((*np.shape(time_s), 3))
+        place = still + np.array([0.0, 0.0, -3.0])
+        zero = still[..., 0]
+        return FlatSample(place, still, still, still, still, zero, zero, zero)
+
+
+def test_a_vehicle_that_leans_by_39_degrees_comes_to_rest() -> None:
+    """[circle of 8 m/s at 42 degrees: with the gain of hover a cycle of 0.05 m, without noise]"""
+    storm = Truth(PX4, wind_force_ned_mps2=(7.9, 0.0, 0.0), noisy=False)
+    result = flight(
+        7.0, truth=storm, reference=Hover(8.0), offset_ned_m=(0.5, 0.5, 0.0), score_from_s=14.0
+    )
+    assert result.largest_m < 0.003
 
 
 def test_limited_feedback_cures_the_limit_cycle() -> None:
