@@ -215,9 +215,6 @@ class TrackingLaw:
         )
         led_tilt = held_lead(b[1], b1[1], b2[1], vehicle.tilt, period_s)
         led_thrust = thrust[3] + vehicle.thrust_lag_s * thrust_rate[3]  # T lags, b_z does not
-        # a steady vertical disturbance is nearly always a wrong hover thrust or mass
-        hovering = vehicle.gravity_mps2 + state.disturbance_ned_mps2[2]
-        thrust_now = max(thrust[0], vehicle.thrust_min_mps2)
         heading_rad = lead(
             sample.heading_rad[4],
             sample.heading_rate_radps[4],
@@ -229,7 +226,7 @@ class TrackingLaw:
             vertical=np.array(vertical),
             feedforward=np.array((led_tilt[0], led_tilt[1], led_thrust * b[3, 2])),
             heading_rad=float(heading_rad),
-            to_hover=(np.eye(2) - np.outer(b[0, :2], b[0, :2])) * (hovering / thrust_now),
+            to_hover=to_hover(b[0], thrust[0], state, vehicle),
         )
 
     def _weighed(self, target: Target, lateral: Array, vertical: Array, b_z: float) -> Task:
@@ -278,6 +275,17 @@ def heave_of(state: PredictedState) -> PredictedHeave:
         velocity_down_mps=float(state.velocity_ned_mps[2]),
         thrust_down_mps2=float(state.thrust_mps2 * state.thrust_direction_ned[2]),
     )
+
+
+def to_hover(b: Array, thrust_mps2: Array, state: PredictedState, vehicle: Vehicle) -> Array:
+    """`Target.to_hover` (..., 2, 2) at directions b (..., 3) and thrusts (...). T_hover carries the
+    estimated vertical disturbance too, which is nearly always a wrong hover thrust or mass."""
+    hovering_mps2 = vehicle.gravity_mps2 + state.disturbance_ned_mps2[2]
+    share = hovering_mps2 / np.maximum(thrust_mps2, vehicle.thrust_min_mps2)
+    lateral = b[..., :2]
+    across = np.eye(2) - lateral[..., :, None] * lateral[..., None, :]
+    scaled: Array = share[..., None, None] * across
+    return scaled
 
 
 def decision(inputs: Array, certificate: Certificate) -> Decision:

@@ -16,7 +16,7 @@ from scipy.linalg import block_diag
 
 from offboard.control.base import Certificate, Decision, DecisionError, Situation
 from offboard.control.gains import CostToGo, held_lead
-from offboard.control.law import Task, TrackingLaw, TrackingSettings, decision, heave_of
+from offboard.control.law import Task, TrackingLaw, TrackingSettings, decision, heave_of, to_hover
 from offboard.control.quadratic import BoxQuadratic, ExactMinimum, at_bound
 from offboard.model.vehicle import Vehicle
 from offboard.reference.flatness import flat_state
@@ -40,6 +40,7 @@ OUTLOOK = np.dtype(
         ("feedforward", "f8", (MOST_STEPS, 3)),
         ("lower", "f8", (MOST_STEPS, 3)),
         ("upper", "f8", (MOST_STEPS, 3)),
+        ("to_hover", "f8", (MOST_STEPS, 2, 2)),  # `law.Target.to_hover` at the start of each hold
         # A steady vertical disturbance is nearly always a wrong hover thrust or mass: the lateral
         # force of the tilted thrust is taken as this share of the modelled one
         ("thrust_share", "f8"),
@@ -76,6 +77,8 @@ def look_ahead(law: TrackingLaw, situation: Situation, task: Task, steps: int) -
     one["thrusts_tilt"][: len(tilt)] = flat.thrust_mps2[tilt]
     one["thrusts_heave"][: len(tilt)] = flat.thrust_mps2[heave]
     one["b_z"][: len(tilt)] = down
+    starts = tilt[:-1:2]
+    one["to_hover"][:steps] = to_hover(b[starts], flat.thrust_mps2[starts], state, vehicle)
     led_tilt = held_lead(
         b[middles, :2],
         flat.thrust_direction_rate_ned_ps[middles, :2],

@@ -135,7 +135,12 @@ def roll_out(
                     chosen[axis] += weights[k, m] * knots[n, m, axis]
             for row in range(Z):
                 off = feedback * (before[row] - base_states[k, row])
-                chosen[row % 2] -= plant.lateral_gain[row // 2] * off
+                if row < B:  # position and velocity count as in hover
+                    north, east = ahead.to_hover[k, 0, row % 2], ahead.to_hover[k, 1, row % 2]
+                    chosen[0] -= plant.lateral_gain[row // 2] * north * off
+                    chosen[1] -= plant.lateral_gain[row // 2] * east * off
+                else:
+                    chosen[row % 2] -= plant.lateral_gain[row // 2] * off
             for row in range(Z, T):
                 off = feedback * (before[row] - base_states[k, row])
                 chosen[2] -= plant.vertical_gain[row - Z] * off

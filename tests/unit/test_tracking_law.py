@@ -98,8 +98,9 @@ def slope_of_force(reference: Lemniscate, vehicle: Vehicle, state: PredictedStat
 
 
 def test_unconstrained_minimiser_is_the_lqr_law() -> None:
-    """u* = -f / h: b_c = b_ff - K [p, v, b, b'], T b_z = f_ff - Kz [z, v_z, f_z]; heading led. p and
-    v are those for which b in hover does what b does here, by the slope of the lateral force."""
+    """u* = -f / h: b_c = b_ff - K [p, v, b, b'], T b_z = f_ff - Kz [z, v_z, f_z]; heading led.
+
+    p and v are those for which b in hover does what b does here, by the slope of the force."""
     law, rng, reference = lqr(), np.random.default_rng(1), Lemniscate(15.0)
     for _ in range(20):
         state = state_of(rng, reference, 0.3)
