@@ -16,8 +16,8 @@ from simulator.faults import Fault
 from simulator.faults.fault import prepare
 from simulator.firmware.base import Firmware
 from simulator.link.framing import frames
+from simulator.mavlink.codec import Keyring
 from simulator.mavlink.server import Server
-from simulator.mavlink.signing import Keyring
 from simulator.mavlink.telemetry import builders
 from simulator.mavlink.view import View
 from simulator.start import Start, take_off

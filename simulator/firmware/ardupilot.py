@@ -1,7 +1,7 @@
 """ArduCopter 4.6: how it reads commands and setpoints, checks, fails and flies.
 
 Measured on ArduCopter 4.6.3 SITL where MAVLink shows it. Modes and parameters are in
-`simulator.firmware.ardupilot_tables`, the state table in `simulator.firmware.ardupilot_rules`,
+`simulator.firmware.ardupilot_tables`, the state table in `simulator.firmware.ardupilot_tables`,
 telemetry in `simulator.firmware.ardupilot_messages`.
 """
 
@@ -12,15 +12,13 @@ from collections.abc import Mapping
 from typing import Any
 
 from simulator.firmware import ardupilot_messages as telemetry
-from simulator.firmware.ardupilot_rules import RULES
-from simulator.firmware.ardupilot_tables import MODES, PARAMETERS, ROLES
+from simulator.firmware.ardupilot_tables import MODES, PARAMETERS, ROLES, RULES
 from simulator.firmware.base import Firmware, Landing, PositionGains, StickFlight
 from simulator.firmware.values import (
     NAN3,
-    ArmRequest,
+    Asked,
     AttitudeSetpoint,
     MissionItem,
-    ModeRequest,
     MotionSetpoint,
     Quaternion,
     ReadParameter,
@@ -71,26 +69,25 @@ _RETURN_LEAST_M = 2.0  # RTL_ALT_MIN
 class ArduCopter(Firmware):
     """ArduCopter 4.6."""
 
-    def command_mode(self, params: tuple[float, ...]) -> ModeRequest:
+    def command_mode(self, params: tuple[float, ...]) -> Asked:
         """MAV_CMD_DO_SET_MODE (176): param1 base mode, param2 the mode's number."""
         base, number = (int(p) if math.isfinite(p) else 0 for p in params[:2])
         if not base & _CUSTOM_MODE_ENABLED:
-            return ModeRequest(None, Result.DENIED)
-        known = _BY_NUMBER.get(number)
+            return Asked(refusal=Result.DENIED)
         text = f"No such mode {number}"
         if number in _NOT_ENTERED:
             text = f"Mode change to {_NOT_ENTERED[number]}"
-        return ModeRequest(known, Result.FAILED, None if known else warning(text))
+        return Asked(_BY_NUMBER.get(number, ""), Result.FAILED, warning(text))
 
-    def set_mode(self, base_mode: int, custom_mode: int) -> ModeRequest:
+    def set_mode(self, base_mode: int, custom_mode: int) -> Asked:
         """SET_MODE: the mode's number is custom_mode."""
         return self.command_mode((base_mode, custom_mode))
 
-    def arm_request(self, param: float) -> ArmRequest:
+    def arm_request(self, param: float) -> Asked:
         """1 arms, 0 disarms, anything else is not supported."""
         if param in (0.0, 1.0):
-            return ArmRequest("arm" if param else "disarm")
-        return ArmRequest(refusal=Result.UNSUPPORTED)
+            return Asked("arm" if param else "disarm")
+        return Asked(refusal=Result.UNSUPPORTED)
 
     def attitude_setpoint(
         self, values: Mapping[str, Any], parameter: ReadParameter

@@ -14,11 +14,10 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from simulator.firmware.values import (
-    ArmRequest,
+    Asked,
     AttitudeSetpoint,
     MissionItem,
     Mode,
-    ModeRequest,
     MotionSetpoint,
     Quaternion,
     ReadParameter,
@@ -237,15 +236,15 @@ class Firmware(ABC):
         return self.modes.get(name) or self.modes.get(f"AUTO.{name}")
 
     @abstractmethod
-    def command_mode(self, params: tuple[float, ...]) -> ModeRequest:
+    def command_mode(self, params: tuple[float, ...]) -> Asked:
         """The request of MAV_CMD_DO_SET_MODE (176)."""
 
     @abstractmethod
-    def set_mode(self, base_mode: int, custom_mode: int) -> ModeRequest:
+    def set_mode(self, base_mode: int, custom_mode: int) -> Asked:
         """The request of SET_MODE, the deprecated message."""
 
     @abstractmethod
-    def arm_request(self, param: float) -> ArmRequest:
+    def arm_request(self, param: float) -> Asked:
         """The request of MAV_CMD_COMPONENT_ARM_DISARM with this param1."""
 
     @abstractmethod
