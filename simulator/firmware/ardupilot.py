@@ -62,7 +62,6 @@ _UNSUPPORTED_FRAME = 2  # MAV_MISSION_RESULT
 _PLACE_FRAMES = frozenset({0, 3, 5, 6, 10, 11})
 _PLACES = frozenset({16, 17, 18, 19, 21, 22, 31, 82, 201})  # MAV_CMD of missions that have a place
 
-_GATE_MPS = 5.0 * 0.3  # EK3_VEL_I_GATE standard deviations of EK3_VELNE_M_NSE
 _RETURN_LEAST_M = 2.0  # RTL_ALT_MIN
 
 
@@ -183,21 +182,9 @@ class ArduCopter(Firmware):
             return _UNSUPPORTED_FRAME, None
         return None
 
-    def is_ground_station(self, kind: int, system: int, parameter: ReadParameter) -> bool:
-        """By system id, whatever the MAV_TYPE."""
-        return system == parameter("SYSID_MYGCS")
-
     def obeys_system(self, sender: int, own: int, parameter: ReadParameter) -> bool:
         """All systems; with SYSID_ENFORCE the ground station and its own components only."""
         return not parameter("SYSID_ENFORCE") or sender in (own, parameter("SYSID_MYGCS"))
-
-    def velocity_ratio(self, error_mps: float) -> float:
-        """The ratio as EKF_STATUS_REPORT has it: the square root of the squared test ratio."""
-        return error_mps / _GATE_MPS
-
-    def velocity_ratio_most(self, parameter: ReadParameter) -> float:
-        """As the failsafe in flight."""
-        return parameter("FS_EKF_THRESH")
 
     def battery_level(self, battery: BatteryState, parameter: ReadParameter) -> int:
         """By voltage or by remaining charge; a threshold of 0 disables the check."""
@@ -284,6 +271,7 @@ ARDUPILOT = ArduCopter(
     companion_rates_hz=telemetry.COMPANION_RATES_HZ,
     ground_rates_hz=telemetry.GROUND_RATES_HZ,
     messages=builders_in(telemetry),
+    ground_station_parameter="SYSID_MYGCS",
     withheld_until={
         "LOCAL_POSITION_NED": "position",
         "GPS_GLOBAL_ORIGIN": "origin",

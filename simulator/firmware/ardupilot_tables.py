@@ -123,6 +123,7 @@ PARAMETERS = (
 _CENTI = 0.01
 ROLES: dict[str, Role] = {
     "stream_timeout_s": "GUID_TIMEOUT",
+    "velocity_ratio_most": "FS_EKF_THRESH",  # to arm, as the failsafe in flight; 0: not checked
     "disarm_landed_s": 0.45,
     "disarm_idle_s": "DISARM_DELAY",
     "takeoff_height_m": 0.0,  # the command always has a height

@@ -27,6 +27,7 @@ from simulator.firmware.values import (
 )
 from simulator.vehicle.battery import BatteryState
 
+_MAV_TYPE_GCS = 6
 Role = str | float | tuple[str, float]
 """Where a value comes from: a parameter, a constant, or a parameter and the factor to SI."""
 
@@ -205,6 +206,7 @@ class Firmware(ABC):
 
     # link
     ground_station_stays_s: float = 0.0  # after its last heartbeat
+    ground_station_parameter: str = ""  # its system id; "": known by its MAV_TYPE
     target_component_checked: bool = False
     text_suffix: str = ""
     text_to_ground_stations_only: bool = False
@@ -222,6 +224,7 @@ class Firmware(ABC):
     passes_without_position_after_s: float  # the same for modes that need none
     fails_where_unarmable: bool = False  # pre-arm checks fail in a mode that does not arm
     position_without_fix_s: float  # until the position estimate is lost
+    velocity_ratio_squared: bool = False  # as it reports the innovation ratio of the velocity
     battery_events: tuple[str, ...]  # of battery levels 1 on
 
     # flight
@@ -271,21 +274,14 @@ class Firmware(ABC):
     def mission_refusal(self, item: MissionItem) -> tuple[int, StatusText | None] | None:
         """MAV_MISSION_RESULT and text with which an item is refused; None: it is taken."""
 
-    @abstractmethod
     def is_ground_station(self, kind: int, system: int, parameter: ReadParameter) -> bool:
         """Whether a heartbeat with this MAV_TYPE and system id is a ground station's."""
+        name = self.ground_station_parameter
+        return system == parameter(name) if name else kind == _MAV_TYPE_GCS
 
     def obeys_system(self, sender: int, own: int, parameter: ReadParameter) -> bool:
         """Whether messages of this system id are handled."""
         return True
-
-    @abstractmethod
-    def velocity_ratio(self, error_mps: float) -> float:
-        """Innovation ratio of the velocity, as the firmware reports it."""
-
-    @abstractmethod
-    def velocity_ratio_most(self, parameter: ReadParameter) -> float:
-        """Its limit to arm; 0: not checked."""
 
     @abstractmethod
     def battery_level(self, battery: BatteryState, parameter: ReadParameter) -> int:

@@ -44,7 +44,6 @@ _AUTO_SUB = {
     9: "AUTO.PRECLAND",
 }
 _CUSTOM_MODE_ENABLED = 1
-_MAV_TYPE_GCS = 6
 _NO_AUTO_MODE = critical("Unsupported auto mode")
 
 # MAV_CMD accepted without an effect that the simulator shows, and not acknowledged at all
@@ -69,7 +68,6 @@ _ACTS = frozenset({
 })  # fmt: skip
 
 _BATTERY_THRESHOLDS = ("BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR")
-_GATE_MPS = 5.0 * 0.3  # EKF2_GPS_V_GATE standard deviations of EKF2_GPS_V_NOISE
 
 
 class Px4(Firmware):
@@ -200,18 +198,6 @@ class Px4(Firmware):
             return _UNSUPPORTED_FRAME, _INVALID
         return None
 
-    def is_ground_station(self, kind: int, system: int, parameter: ReadParameter) -> bool:
-        """By MAV_TYPE, whatever the system id."""
-        return kind == _MAV_TYPE_GCS
-
-    def velocity_ratio(self, error_mps: float) -> float:
-        """Squared, as PX4 reports it."""
-        return (error_mps / _GATE_MPS) ** 2
-
-    def velocity_ratio_most(self, parameter: ReadParameter) -> float:
-        """EKF2's limit before take-off."""
-        return 0.5
-
     def battery_level(self, battery: BatteryState, parameter: ReadParameter) -> int:
         """By the remaining share."""
         return sum(battery.remaining < parameter(name) for name in _BATTERY_THRESHOLDS)
@@ -314,6 +300,7 @@ PX4 = Px4(
     passes_without_position_after_s=4.0,
     fails_where_unarmable=True,
     position_without_fix_s=5.0,  # EKF2_NOAID_TOUT
+    velocity_ratio_squared=True,
     battery_events=("battery low", "battery critical", "battery emergency"),
     return_faces_way=True,
     integrates_on_ramp=True,

@@ -135,6 +135,7 @@ PARAMETERS = (
 
 ROLES: dict[str, Role] = {
     "stream_timeout_s": "COM_OF_LOSS_T",
+    "velocity_ratio_most": 0.5,  # EKF2's limit before take-off
     "disarm_landed_s": "COM_DISARM_LAND",
     "disarm_idle_s": "COM_DISARM_PRFLT",
     "takeoff_height_m": "MIS_TAKEOFF_ALT",
