@@ -35,20 +35,23 @@ class Trace:
 
     @property
     def begin_s(self) -> float:
-        """First time with both attitude and position; infinite if there is none."""
-        telemetry = self.attitude, self.position
-        return max(float(rows[0, STAMP]) if len(rows) else math.inf for rows in telemetry)
+        """First time with both attitude and position; NaN if there is none."""
+        if not len(self.attitude) or not len(self.position):
+            return math.nan
+        return float(max(self.attitude[0, STAMP], self.position[0, STAMP]))
 
     @property
     def end_s(self) -> float:
-        """Last time with both attitude and position; minus infinity if there is none."""
-        telemetry = self.attitude, self.position
-        return min(float(rows[-1, STAMP]) if len(rows) else -math.inf for rows in telemetry)
+        """Last time with both attitude and position; NaN if there is none."""
+        if not len(self.attitude) or not len(self.position):
+            return math.nan
+        return float(min(self.attitude[-1, STAMP], self.position[-1, STAMP]))
 
     @property
     def seconds(self) -> float:
         """Time with both attitude and position; 0 if there is none."""
-        return max(self.end_s - self.begin_s, 0.0)
+        seconds = self.end_s - self.begin_s
+        return max(seconds, 0.0) if math.isfinite(seconds) else 0.0
 
     def between(self, begin_s: float, end_s: float) -> Trace:
         """Telemetry from `begin_s` to `end_s`, and all commands sent until `end_s`."""
