@@ -1,4 +1,4 @@
-"""The `simulator` command: a simulated vehicle that runs until it is stopped."""
+"""The `simulator` command: simulated vehicles that run until they are stopped."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from offboard.documents.errors import UserError
 from simulator.options import COMPANION_PORT, NO_LINK, Options, Stop
 
 GROUND_PORT = 14550
+SYSTEM_MAX = 250
 FILE = "NAME|FILE"  # the name of a shipped file, or a path
 
 GROUND_LINK = f"udpout:127.0.0.1:{GROUND_PORT}"
@@ -65,6 +66,7 @@ def simulate(
         float | None, _option("SECONDS", "Stop after this vehicle time.", min=0.0)
     ] = None,
     instance: Annotated[int, _option("N", "Added to ports and system id.", min=0, max=249)] = 0,
+    instances: Annotated[int, _option("N", "Number of vehicles.", min=1, max=100)] = 1,
     patience: Annotated[float | None, _option("SECONDS", PATIENCE, min=0.1, max=600.0)] = None,
     signing_key: Annotated[
         Path | None, _option("FILE", "Sign and require signatures, see `offboard key`.")
@@ -80,7 +82,9 @@ def simulate(
         bool, typer.Option("--list-scenarios", help="List the shipped scenarios and exit.")
     ] = False,
 ) -> None:
-    """Simulate a vehicle that speaks MAVLink as PX4 or ArduCopter does.
+    """Simulate vehicles that speak MAVLink as PX4 or ArduCopter does.
+
+    Every option applies to each of --instances vehicles; seed, ports and system id count up.
 
     Forwards nothing between its two links, as PX4 without MAV_x_FORWARD; PX4's own SITL and
     ArduPilot forward. A ground station that commands component 191 (`offboard daemon`) needs a
@@ -97,6 +101,7 @@ def simulate(
         if seconds is not None and math.isnan(seconds):
             raise UserError(f"{option} nan: must be a number")
     _check_speed(speed, lockstep=lockstep)
+    _check_numbers(instance, instances, lockstep=lockstep)
     stopping = Stop()
     options = Options(
         connect=connect,
@@ -109,7 +114,7 @@ def simulate(
         vehicle=vehicle,
         parameters=tuple(param or ()),
         duration_s=duration,
-        instance=instance,
+        numbers=range(instance, instance + instances),
         patience_s=patience,
         signing_key=signing_key,
         log=log,
@@ -138,3 +143,14 @@ def _check_speed(speed: float | None, *, lockstep: bool) -> None:
         raise UserError("--speed and --lockstep exclude each other: lockstep has no speed")
     if speed is not None and not 0.1 <= speed <= 1000.0:
         raise UserError(f"--speed {speed:g}: must be 0.1 .. 1000")
+
+
+def _check_numbers(instance: int, instances: int, *, lockstep: bool) -> None:
+    if lockstep and instances > 1:
+        raise UserError(
+            "--lockstep and --instances exclude each other: time waits for one companion"
+        )
+    if instance + instances > SYSTEM_MAX:
+        raise UserError(
+            f"--instance {instance} --instances {instances}: system ids end at {SYSTEM_MAX}"
+        )

@@ -1,4 +1,4 @@
-"""A run of the `simulator` command: its vehicle, links and files, made from its options."""
+"""A run of the `simulator` command: its vehicles, links and files, made from its options."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from simulator.firmware.base import Firmware
 from simulator.firmware.catalogue import FIRMWARES
 from simulator.instance import VIRTUAL_EPOCH_US, Instance
 from simulator.link.framing import Recorder
-from simulator.link.sockets import Link, open_beside, open_link
+from simulator.link.sockets import Link, open_beside, open_link, shifted
 from simulator.options import COMPANION_PORT, NO_LINK, Options, Stop
 from simulator.run import Endpoint, Runner, warm_up
 
@@ -23,7 +23,7 @@ ANY_PORT = 0
 
 
 def launch(options: Options, stopping: Stop) -> int:
-    """Run the vehicle until it is stopped; the exit code.
+    """Run the vehicles until they are stopped; the exit code.
 
     Raises:
         UserError: an option, a link or a file cannot be used.
@@ -34,63 +34,63 @@ def launch(options: Options, stopping: Stop) -> int:
     flown = config.scenario(options.scenario or firmware.scenario)
     config.check_for(flown, firmware, lockstep=options.lockstep)
     vehicle = config.vehicle(options.vehicle or firmware.vehicle)
-    companion, ground = _links(options)
+    links = [_links(options, number) for number in options.numbers]
     parameters, recorder = _parameters(firmware, options.parameters), _recorder(options)
     key = read_key(options.signing_key) if options.signing_key else b""
     epoch_us = VIRTUAL_EPOCH_US if options.lockstep else unix_us()
     prepare(_warn)
     warm_up(Instance(firmware, vehicle, flown.conditions, options.seed, lockstep=True))
-    instance = Instance(
-        firmware,
-        vehicle,
-        flown.conditions,
-        options.seed,
-        system=options.instance + 1,
-        lockstep=options.lockstep,
-        ground_link=ground is not None,
-        epoch_us=epoch_us,
-        parameters=parameters,
-        faults=flown.faults,
-        start=flown.start,
-        signing_key=key,
-    )
-    strangers = tuple(open_beside(companion) for _ in instance.strangers)
-    endpoint = Endpoint(instance, companion, ground, recorder, strangers)
-    _warn_if_it_cannot_land(instance, vehicle.hover_thrust)
-    link = _companion_link(options)
-    purpose = "waiting at" if link.startswith("udpin:") else "sending to"
-    tell(
-        f"{options.firmware} vehicle {vehicle.name}, system {options.instance + 1}, scenario"
-        f" {flown.name}, seed {options.seed}: {purpose} {link.partition(':')[2]}",
-        sys.stdout,
-    )
+    endpoints = []
+    for number, (companion, ground) in zip(options.numbers, links, strict=True):
+        instance = Instance(
+            firmware,
+            vehicle,
+            flown.conditions,
+            options.seed + number - options.numbers[0],
+            system=number + 1,
+            lockstep=options.lockstep,
+            ground_link=ground is not None,
+            epoch_us=epoch_us,
+            parameters=parameters,
+            faults=flown.faults,
+            start=flown.start,
+            signing_key=key,
+        )
+        strangers = tuple(open_beside(companion) for _ in instance.strangers)
+        endpoints.append(Endpoint(instance, companion, ground, recorder, strangers))
+    _warn_if_it_cannot_land(endpoints[0].instance, vehicle.hover_thrust)
+    _announce(options, f"{options.firmware} vehicle {vehicle.name}", flown.name)
     stopping.running = True
-    runner = Runner(endpoint, stopping=stopping, report=_warn, duration_s=options.duration_s)
+    runner = Runner(endpoints, stopping=stopping, report=_warn, duration_s=options.duration_s)
     if options.lockstep:
         outcome = runner.lockstep(options.patience_s)
     else:
         outcome = runner.real_time(options.speed)
     if outcome.sentence:
         _warn(outcome.sentence)
-    for sentence, count in instance.complaints.items():
-        tell(f"{count} x {sentence}", sys.stdout)
+    if len(options.numbers) > 1:
+        tell(f"{len(options.numbers)} vehicles: {runner.punctuality}", sys.stdout)
+    for endpoint in endpoints:
+        for sentence, count in endpoint.instance.complaints.items():
+            tell(f"{count} x {sentence}", sys.stdout)
     return outcome.code
 
 
 def _companion_link(options: Options) -> str:
-    return options.connect or f"udpout:127.0.0.1:{COMPANION_PORT + options.instance}"
+    """Ports of the first instance."""
+    return options.connect or f"udpout:127.0.0.1:{COMPANION_PORT + options.numbers[0]}"
 
 
-def _links(options: Options) -> tuple[Link, Link | None]:
-    """Companion and ground station link.
+def _links(options: Options, number: int) -> tuple[Link, Link | None]:
+    """Companion and ground station link of an instance.
 
     The local ports of PX4 SITL only by default: a real PX4 beside us may use them.
     """
-    port = ANY_PORT if options.connect else LOCAL_COMPANION_PORT + options.instance
-    companion = open_link(_companion_link(options), port)
+    port = ANY_PORT if options.connect else LOCAL_COMPANION_PORT + number
+    companion = open_link(shifted(_companion_link(options), number - options.numbers[0]), port)
     if options.gcs == NO_LINK:
         return companion, None
-    return companion, open_link(options.gcs, LOCAL_GROUND_PORT + options.instance)
+    return companion, open_link(options.gcs, LOCAL_GROUND_PORT + number)
 
 
 def _recorder(options: Options) -> Recorder | None:
@@ -101,6 +101,19 @@ def _recorder(options: Options) -> Recorder | None:
     except OSError as error:
         sentence = f"--log {options.log} cannot be written: {error.strerror}"
         raise UserError(sentence) from None
+
+
+def _announce(options: Options, what: str, scenario: str) -> None:
+    """A line for each vehicle."""
+    link, first = _companion_link(options), options.numbers[0]
+    purpose = "waiting at" if link.startswith("udpin:") else "sending to"
+    for number in options.numbers:
+        place = shifted(link, number - first).partition(":")[2]
+        tell(
+            f"{what}, system {number + 1}, scenario {scenario},"
+            f" seed {options.seed + number - first}: {purpose} {place}",
+            sys.stdout,
+        )
 
 
 def _parameters(firmware: Firmware, assignments: tuple[str, ...]) -> dict[str, float]:

@@ -13,7 +13,7 @@ NO_LINK = "none"
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """The options of a run."""
+    """The options of a run; `numbers` are those of its instances."""
 
     connect: str | None
     gcs: str
@@ -25,7 +25,7 @@ class Options:
     vehicle: str | None
     parameters: tuple[str, ...]  # NAME=VALUE
     duration_s: float | None
-    instance: int
+    numbers: range
     patience_s: float | None
     signing_key: Path | None
     log: Path | None

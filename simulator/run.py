@@ -1,4 +1,4 @@
-"""An instance with sockets and a clock: real time, faster or slower, or lockstep with a companion.
+"""Instances with sockets and a clock: real time, faster or slower, or lockstep with a companion.
 
 Lockstep uses MAVLink only: at each barrier the simulator sends a TIMESYNC request after the
 telemetry and waits for the answer. The companion answers in the order in which it reads: when the
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import gc
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from offboard.documents.errors import Repeated
@@ -99,6 +99,26 @@ class Endpoint:
             self.instance.feed_ground(datagram)
 
 
+@dataclass(slots=True)
+class Punctuality:
+    """Deadlines of a run in real time. Missed: a step ended after the next one was due."""
+
+    steps: int = 0
+    missed: int = 0
+    worst_s: float = 0.0
+
+    def note(self, late_s: float, allowed_s: float) -> None:
+        self.steps += 1
+        self.missed += late_s > allowed_s
+        self.worst_s = max(self.worst_s, late_s)
+
+    def __str__(self) -> str:
+        return (
+            f"{self.missed} of {self.steps} deadlines missed,"
+            f" at worst {1e3 * self.worst_s:.1f} ms late"
+        )
+
+
 def warm_up(instance: Instance) -> None:
     """Run all compiled code once with an instance that is not used later."""
     while instance.time_s < WARM_UP_S:
@@ -106,10 +126,10 @@ def warm_up(instance: Instance) -> None:
 
 
 class Runner:
-    """Runs an instance with its sockets.
+    """Runs instances with their sockets.
 
     Args:
-        endpoint: the instance.
+        endpoints: the instances; lockstep takes one.
         stopping: called often; True ends the run.
         report: takes sentences for the user.
         duration_s: vehicle time at which the run ends.
@@ -117,18 +137,22 @@ class Runner:
 
     def __init__(
         self,
-        endpoint: Endpoint,
+        endpoints: Sequence[Endpoint],
         *,
         stopping: Callable[[], bool],
         report: Callable[[str], None],
         duration_s: float | None = None,
     ) -> None:
-        self._endpoint = endpoint
-        self._instance = endpoint.instance
-        self._companion = endpoint.companion
+        self._endpoints = endpoints
+        self._endpoint = endpoints[0]
+        self._instance = self._endpoint.instance
+        self._companion = self._endpoint.companion
+        self._owner = {link: endpoint for endpoint in endpoints for link in endpoint.links}
+        self._links = list(self._owner)
         self._stopping = stopping
         self._report = report
         self._end_s = math.inf if duration_s is None else duration_s
+        self.punctuality = Punctuality()
 
     def _over(self) -> bool:
         return self._instance.time_s >= self._end_s or self._stopping()
@@ -138,6 +162,7 @@ class Runner:
     def real_time(self, speed: float) -> Outcome:
         """Run at `speed` x real time by absolute deadlines; answers are sent at once."""
         instance = self._instance
+        self._stagger()
         gc.collect()
         gc.freeze()
         epoch_s = monotonic_s() - instance.time_s / speed
@@ -145,9 +170,11 @@ class Runner:
         while not self._over():
             deadline_s = epoch_s + (instance.time_s + STEP_S) / speed
             self._serve_until(deadline_s)
-            instance.advance()
-            self._endpoint.send()
+            for endpoint in self._endpoints:
+                endpoint.instance.advance()
+                endpoint.send()
             behind_s = monotonic_s() - deadline_s
+            self.punctuality.note(behind_s, STEP_S / speed)
             if behind_s > BEHIND_S:  # suspended or overloaded: do not catch up
                 behind.add(behind_s)
                 epoch_s += behind_s
@@ -155,15 +182,23 @@ class Runner:
                 self._report(news)
         return Outcome(0)
 
+    def _stagger(self) -> None:
+        """Start each vehicle one step later, so that they do not all send in the same step."""
+        for ahead, endpoint in enumerate(self._endpoints):
+            for _ in range(ahead):
+                endpoint.instance.advance()
+                endpoint.send()
+
     def _serve_until(self, deadline_s: float) -> None:
         """Handle what arrives before the deadline; at least once."""
         while True:
             remaining_s = deadline_s - monotonic_s()
-            if wait(self._endpoint.links, min(remaining_s, POLL_S)):
-                if self._endpoint.read():
-                    self._endpoint.send()
+            ready = wait(self._links, min(remaining_s, POLL_S))
+            for endpoint in dict.fromkeys(self._owner[link] for link in ready):
+                if endpoint.read():
+                    endpoint.send()
                 else:
-                    self._endpoint.send_ground()
+                    endpoint.send_ground()
             if remaining_s <= 0 or self._stopping():
                 return
 

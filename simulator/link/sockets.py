@@ -23,7 +23,8 @@ Address = tuple[str, int]
 CLIENTS_MAX = 16
 READ_BYTES = 65536
 UNSENT_MAX = 1 << 20  # bytes; a client that does not read more is disconnected
-KINDS = ("udpout", "udpin", "tcpin")
+# Distance between the ports of two instances, as PX4 and ArduPilot have it
+_PORTS_APART = {"udpout": 1, "udpin": 1, "tcpin": 10}
 
 
 class LinkError(UserError):
@@ -257,9 +258,15 @@ def open_beside(link: Link) -> Link:
     return UdpLink(sock, None, link.peers)
 
 
+def shifted(url: str, by: int) -> str:
+    """URL of the same link for the instance `by` numbers later. Raises LinkError."""
+    kind, host, port = _split(url)
+    return f"{kind}:{host}:{port + by * _PORTS_APART[kind]}"
+
+
 def _split(url: str) -> tuple[str, str, int]:
     parts = url.split(":")
-    usable = len(parts) == 3 and parts[0] in KINDS and parts[1] != ""
+    usable = len(parts) == 3 and parts[0] in _PORTS_APART and parts[1] != ""
     number = parts[-1].isascii() and parts[-1].isdigit() and len(parts[-1]) <= 5
     if not (usable and number and 0 < int(parts[2]) < 65536):
         raise LinkError(

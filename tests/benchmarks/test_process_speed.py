@@ -107,3 +107,18 @@ def test_boot(benchmark: Any) -> None:
                 pass
 
     benchmark(boot)
+
+
+@pytest.mark.benchmark(group="twenty vehicles in real time")
+def test_instances(benchmark: Any) -> None:
+    """The last line says how many steps ended later than the next one was due."""
+    options = ("--instances", "20", "--connect", "udpout:127.0.0.1:24540", "--gcs", "none")
+
+    def run() -> str:
+        command = [sys.executable, "-m", "simulator", *options, "--duration", "5"]
+        output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+        return output.splitlines()[-1]
+
+    output = benchmark.pedantic(run, rounds=1)
+    print(f"\n{output}")
+    assert "of 1250 deadlines missed" in output

@@ -158,6 +158,8 @@ def test_it_can_wait_to_be_spoken_to_and_shifts_its_system() -> None:
             "--log no/such/x.tlog cannot be written: No such file or directory",
         ),
         (("--no-such-option",), "--no-such-option"),
+        (("--instances", "2", "--lockstep"), "--lockstep and --instances exclude each other"),
+        (("--instances", "20", "--instance", "240"), "system ids end at 250"),
     ],
 )
 def test_wrong_options_are_refused(options: tuple[str, ...], says: str, called: Called) -> None:
@@ -211,6 +213,32 @@ def free_ports(count: int) -> int:
                 continue
             return first
     raise AssertionError("no free ports")
+
+
+def test_instances_have_ports_and_systems_of_their_own_and_keep_time() -> None:
+    first = free_ports(3)
+    heard: list[list[int]] = []
+    with ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket(type=socket.SOCK_DGRAM)) for _ in range(3)]
+        for port, sock in enumerate(sockets, first):
+            sock.bind(("127.0.0.1", port))
+            sock.settimeout(20.0)
+        options = ("--connect", f"udpout:127.0.0.1:{first}", "--gcs", "none", "--instances", "3")
+        process = stack.enter_context(simulator(*options, "--instance", "4", "--duration", "2"))
+        for sock in sockets:
+            heard.append([datagram[5] for datagram in (sock.recv(2000) for _ in range(20))])
+        output, errors = process.popen.communicate(timeout=20.0)
+    assert heard == [[5] * 20, [6] * 20, [7] * 20]
+    assert process.popen.returncode == 0
+    assert errors == ""
+    lines = output.splitlines()
+    seeds = [re.findall(r"seed (\d+)", line)[0] for line in lines[:3]]
+    assert seeds == ["7", "8", "9"]
+    steps = re.fullmatch(
+        r"3 vehicles: \d+ of (\d+) deadlines missed, at worst .* ms late", lines[3]
+    )
+    assert steps is not None
+    assert int(steps[1]) == 500
 
 
 def gaps(peer: Peer) -> int:

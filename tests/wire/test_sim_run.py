@@ -38,7 +38,7 @@ def link(companion: socket.socket) -> Iterator[UdpLink]:
 
 def runner(link: UdpLink, reports: list[str]) -> Runner:
     instance = Instance(PX4, px4_vehicle(), Conditions(), 1, lockstep=True)
-    return Runner(Endpoint(instance, link), stopping=lambda: False, report=reports.append)
+    return Runner([Endpoint(instance, link)], stopping=lambda: False, report=reports.append)
 
 
 def test_without_a_companion_the_run_ends_with_code_3(

@@ -13,6 +13,7 @@ from simulator.link.sockets import (
     LinkError,
     TcpLink,
     open_link,
+    shifted,
     wait,
     whole_frames,
 )
@@ -85,6 +86,8 @@ def test_a_client_that_never_reads_is_disconnected(link: TcpLink) -> None:
     other.close()
 
 
-def test_a_port_in_use_is_refused(link: TcpLink) -> None:
+def test_a_port_in_use_is_refused_and_instances_are_ten_apart(link: TcpLink) -> None:
     with pytest.raises(LinkError, match="cannot be opened"):
         open_link(f"tcpin:127.0.0.1:{link.port}", 0)
+    assert shifted("tcpin:127.0.0.1:5760", 2) == "tcpin:127.0.0.1:5780"
+    assert shifted("udpin:127.0.0.1:5760", 2) == "udpin:127.0.0.1:5762"
