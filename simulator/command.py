@@ -41,10 +41,6 @@ def _option(metavar: str, text: str, **limits: Any) -> Any:
     return typer.Option(metavar=metavar, help=text, **limits)
 
 
-def _refuse(sentence: str) -> NoReturn:
-    raise UserError(sentence)
-
-
 @app.command(cls=Command, epilog=f"{shipped.overview('vehicle', 'scenario')}\n\n{EXIT_CODES}")
 def simulate(
     connect: Annotated[str | None, _option("LINK", LINKS)] = None,
@@ -103,7 +99,7 @@ def simulate(
         _check(check)
     for seconds, option in ((duration, "--duration"), (patience, "--patience")):
         if seconds is not None and math.isnan(seconds):
-            _refuse(f"{option} nan: must be a number")
+            raise UserError(f"{option} nan: must be a number")
     _check_speed(speed, lockstep=lockstep)
     _check_numbers(instance, instances, lockstep=lockstep)
     stopping = Stop()
@@ -129,13 +125,9 @@ def simulate(
 
 
 def _check(path: Path) -> NoReturn:
-    from offboard.documents.reading import DocumentError
     from simulator import config
 
-    try:
-        config.scenario(str(path if path.suffix in (".yaml", ".yml") else path.absolute()))
-    except DocumentError as error:
-        _refuse(str(error))
+    config.scenario(str(path if path.suffix in (".yaml", ".yml") else path.absolute()))
     tell(f"{path}: scenario, valid", sys.stdout)
     raise typer.Exit(0)
 
@@ -148,13 +140,17 @@ def _list_scenarios() -> NoReturn:
 
 def _check_speed(speed: float | None, *, lockstep: bool) -> None:
     if lockstep and speed is not None:
-        _refuse("--speed and --lockstep exclude each other: lockstep has no speed")
+        raise UserError("--speed and --lockstep exclude each other: lockstep has no speed")
     if speed is not None and not 0.1 <= speed <= 1000.0:
-        _refuse(f"--speed {speed:g}: must be 0.1 .. 1000")
+        raise UserError(f"--speed {speed:g}: must be 0.1 .. 1000")
 
 
 def _check_numbers(instance: int, instances: int, *, lockstep: bool) -> None:
     if lockstep and instances > 1:
-        _refuse("--lockstep and --instances exclude each other: time waits for one companion")
+        raise UserError(
+            "--lockstep and --instances exclude each other: time waits for one companion"
+        )
     if instance + instances > SYSTEM_MAX:
-        _refuse(f"--instance {instance} --instances {instances}: system ids end at {SYSTEM_MAX}")
+        raise UserError(
+            f"--instance {instance} --instances {instances}: system ids end at {SYSTEM_MAX}"
+        )

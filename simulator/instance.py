@@ -16,8 +16,9 @@ from simulator.faults import Fault
 from simulator.faults.fault import prepare
 from simulator.firmware.base import Firmware
 from simulator.link.framing import frames
+from simulator.link.impairment import carry
+from simulator.mavlink.codec import Keyring
 from simulator.mavlink.server import Server
-from simulator.mavlink.signing import Keyring
 from simulator.mavlink.telemetry import builders
 from simulator.mavlink.view import View
 from simulator.start import Start, take_off
@@ -150,7 +151,9 @@ class Instance:
         self.companion.step()
         self.ground.step()
         if self._injection is not None:
-            self._arrived += self._injection.down.carry(self.companion.outbox.drain(), self._now_us)
+            self._arrived += carry(
+                self._injection.down, self.companion.outbox.drain(), self._now_us
+            )
 
     def advance_to_barrier(self, end_s: float = math.inf) -> bool:
         """`advance` until `barrier_due` (True) or `end_s` (False)."""
@@ -171,7 +174,7 @@ class Instance:
         """Datagrams that have arrived at the companion since the last call."""
         if self._injection is None:
             return self.companion.outbox.drain()
-        sent = self._injection.down.carry(self.companion.outbox.drain(), self._now_us)
+        sent = carry(self._injection.down, self.companion.outbox.drain(), self._now_us)
         arrived, self._arrived = self._arrived + sent, []
         return arrived
 
@@ -181,7 +184,7 @@ class Instance:
             self._handle(datagram)
             return
         for piece in self._without_clock(datagram):
-            for arrived in self._injection.up.carry([piece], self._now_us):
+            for arrived in carry(self._injection.up, [piece], self._now_us):
                 self._handle(arrived)
 
     def feed_ground(self, datagram: bytes) -> None:
@@ -240,7 +243,7 @@ class Instance:
         assert self._injection is not None
         self._injection.step(self.time_s, self)
         self.autopilot.state.invalidate()
-        for datagram in self._injection.up.carry([], self._now_us):
+        for datagram in carry(self._injection.up, [], self._now_us):
             self._handle(datagram)
 
     def _handle(self, datagram: bytes) -> None:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import sys
-from typing import NoReturn
 
 from offboard.compiled import prepare
 from offboard.documents.command_line import complain, tell
 from offboard.documents.errors import UserError
-from offboard.documents.reading import DocumentError
 from offboard.documents.signing_key import read_key
 from offboard.link.clock import unix_us
 from simulator import config
@@ -16,7 +14,7 @@ from simulator.firmware.base import Firmware
 from simulator.firmware.catalogue import FIRMWARES
 from simulator.instance import VIRTUAL_EPOCH_US, Instance
 from simulator.link.framing import Recorder
-from simulator.link.sockets import Link, LinkError, open_beside, open_link, shifted
+from simulator.link.sockets import Link, open_beside, open_link, shifted
 from simulator.options import COMPANION_PORT, NO_LINK, Options, Stop
 from simulator.run import Endpoint, Runner, warm_up
 
@@ -28,41 +26,38 @@ def launch(options: Options, stopping: Stop) -> int:
     """Run the vehicles until they are stopped; the exit code.
 
     Raises:
-        UserError: an option cannot be used.
+        UserError: an option, a link or a file cannot be used.
     """
     firmware = FIRMWARES.get(options.firmware)
     if firmware is None:
-        _refuse(f"--firmware {options.firmware}: unknown; there is {', '.join(FIRMWARES)}")
-    try:
-        flown = config.scenario(options.scenario or firmware.scenario)
-        config.check_for(flown, firmware, lockstep=options.lockstep)
-        vehicle = config.vehicle(options.vehicle or firmware.vehicle)
-        links = [_links(options, number) for number in options.numbers]
-        parameters, recorder = _parameters(firmware, options.parameters), _recorder(options)
-        key = read_key(options.signing_key) if options.signing_key else b""
-        epoch_us = VIRTUAL_EPOCH_US if options.lockstep else unix_us()
-        prepare(_warn)
-        warm_up(Instance(firmware, vehicle, flown.conditions, options.seed, lockstep=True))
-        endpoints = []
-        for number, (companion, ground) in zip(options.numbers, links, strict=True):
-            instance = Instance(
-                firmware,
-                vehicle,
-                flown.conditions,
-                options.seed + number - options.numbers[0],
-                system=number + 1,
-                lockstep=options.lockstep,
-                ground_link=ground is not None,
-                epoch_us=epoch_us,
-                parameters=parameters,
-                faults=flown.faults,
-                start=flown.start,
-                signing_key=key,
-            )
-            strangers = tuple(open_beside(companion) for _ in instance.strangers)
-            endpoints.append(Endpoint(instance, companion, ground, recorder, strangers))
-    except (DocumentError, LinkError) as error:
-        _refuse(str(error))
+        raise UserError(f"--firmware {options.firmware}: unknown; there is {', '.join(FIRMWARES)}")
+    flown = config.scenario(options.scenario or firmware.scenario)
+    config.check_for(flown, firmware, lockstep=options.lockstep)
+    vehicle = config.vehicle(options.vehicle or firmware.vehicle)
+    links = [_links(options, number) for number in options.numbers]
+    parameters, recorder = _parameters(firmware, options.parameters), _recorder(options)
+    key = read_key(options.signing_key) if options.signing_key else b""
+    epoch_us = VIRTUAL_EPOCH_US if options.lockstep else unix_us()
+    prepare(_warn)
+    warm_up(Instance(firmware, vehicle, flown.conditions, options.seed, lockstep=True))
+    endpoints = []
+    for number, (companion, ground) in zip(options.numbers, links, strict=True):
+        instance = Instance(
+            firmware,
+            vehicle,
+            flown.conditions,
+            options.seed + number - options.numbers[0],
+            system=number + 1,
+            lockstep=options.lockstep,
+            ground_link=ground is not None,
+            epoch_us=epoch_us,
+            parameters=parameters,
+            faults=flown.faults,
+            start=flown.start,
+            signing_key=key,
+        )
+        strangers = tuple(open_beside(companion) for _ in instance.strangers)
+        endpoints.append(Endpoint(instance, companion, ground, recorder, strangers))
     _warn_if_it_cannot_land(endpoints[0].instance, vehicle.hover_thrust)
     _announce(options, f"{options.firmware} vehicle {vehicle.name}", flown.name)
     stopping.running = True
@@ -74,10 +69,10 @@ def launch(options: Options, stopping: Stop) -> int:
     if outcome.sentence:
         _warn(outcome.sentence)
     if len(options.numbers) > 1:
-        _print(f"{len(options.numbers)} vehicles: {runner.punctuality}")
+        tell(f"{len(options.numbers)} vehicles: {runner.punctuality}", sys.stdout)
     for endpoint in endpoints:
         for sentence, count in endpoint.instance.complaints.items():
-            _print(f"{count} x {sentence}")
+            tell(f"{count} x {sentence}", sys.stdout)
     return outcome.code
 
 
@@ -104,7 +99,8 @@ def _recorder(options: Options) -> Recorder | None:
     try:
         return Recorder(options.log)
     except OSError as error:
-        _refuse(f"--log {options.log} cannot be written: {error.strerror}")
+        sentence = f"--log {options.log} cannot be written: {error.strerror}"
+        raise UserError(sentence) from None
 
 
 def _announce(options: Options, what: str, scenario: str) -> None:
@@ -113,9 +109,10 @@ def _announce(options: Options, what: str, scenario: str) -> None:
     purpose = "waiting at" if link.startswith("udpin:") else "sending to"
     for number in options.numbers:
         place = shifted(link, number - first).partition(":")[2]
-        _print(
+        tell(
             f"{what}, system {number + 1}, scenario {scenario},"
-            f" seed {options.seed + number - first}: {purpose} {place}"
+            f" seed {options.seed + number - first}: {purpose} {place}",
+            sys.stdout,
         )
 
 
@@ -126,14 +123,14 @@ def _parameters(firmware: Firmware, assignments: tuple[str, ...]) -> dict[str, f
     for text in assignments:
         name, _, number = text.partition("=")
         if name not in known:
-            _refuse(f"--param {text}: {firmware.name} has no parameter {name}")
+            raise UserError(f"--param {text}: {firmware.name} has no parameter {name}")
         spec = known[name]
         try:
             values[name] = float(number)
         except ValueError:
-            _refuse(f"--param {text}: give NAME=NUMBER")
+            raise UserError(f"--param {text}: give NAME=NUMBER") from None
         if not spec.minimum <= values[name] <= spec.maximum:
-            _refuse(f"--param {text}: must be {spec.minimum:g} .. {spec.maximum:g}")
+            raise UserError(f"--param {text}: must be {spec.minimum:g} .. {spec.maximum:g}")
     return values
 
 
@@ -148,13 +145,5 @@ def _warn_if_it_cannot_land(instance: Instance, hover_thrust: float) -> None:
         )
 
 
-def _refuse(sentence: str) -> NoReturn:
-    raise UserError(sentence)
-
-
 def _warn(sentence: str) -> None:
     complain(f"simulator: {sentence}")
-
-
-def _print(text: str) -> None:
-    tell(text, sys.stdout)

@@ -47,6 +47,32 @@ THRUST_EFFECT = ("thrust_lag_s", "thrust_delay_s", "thrust_effect_s")  # accepte
 # thrust, of the thrust's lag, and of the link's delay while the tilt is not identified.
 YAW_DELAY_SD_S, THRUST_DELAY_SD_S, THRUST_LAG_SD_S, LINK_SD_S = 0.1, 0.03, 0.05, 0.15
 
+DELAY_SLACK_S = 0.4  # allowed in addition to the factor: a link may be slow
+LINK_S = 0.03  # a smaller difference of delays is the vehicle's own, not the link's
+AXES = ("tilt", "yaw")
+AXIS_BOUNDS = {
+    "delay_s": (DELAY_LIMITS_S, DELAY_SLACK_S),
+    "natural_frequency_radps": (FREQUENCY_LIMITS_RADPS, 0.0),
+    "damping": (DAMPING_LIMITS, 0.0),
+}
+# Least and greatest value of each constant, whatever the vehicle file says; (limits, slack)
+BOUNDS = {f"{axis}_{name}": AXIS_BOUNDS[name] for axis in AXES for name in AXIS_BOUNDS} | {
+    "hover_thrust": (HOVER_THRUST_LIMITS, 0.0),
+    "thrust_lag_s": ((0.0, 0.4), DELAY_SLACK_S),
+    "thrust_delay_s": ((0.0, 0.5), DELAY_SLACK_S),
+    "drag_ps": ((0.02, 3.0), 0.0),
+}
+RECORDED = tuple(BOUNDS)  # in the log, in this order
+
+
+def _constant(of: Any, name: str) -> Any:
+    """The constant `name` of BOUNDS of a vehicle, or the estimate of it in what was identified."""
+    axis, _, rest = name.partition("_")
+    if axis not in AXES:
+        return getattr(of, name)
+    response = getattr(of, axis)
+    return None if response is None else getattr(response, rest)
+
 
 @dataclass(frozen=True, slots=True)
 class Identified:
@@ -70,12 +96,7 @@ class Identified:
     @property
     def estimates(self) -> dict[str, Estimate | None]:
         """By the names of `BOUNDS`, in the order of the log's records."""
-        of_axes: dict[str, Estimate | None] = {
-            f"{axis}_{name}": getattr(fit, name) if fit else None
-            for axis, fit in (("tilt", self.tilt), ("yaw", self.yaw))
-            for name in AXIS_BOUNDS
-        }
-        return of_axes | {name: getattr(self, name) for name in BODY_BOUNDS}
+        return {name: _constant(self, name) for name in BOUNDS}
 
     @property
     def supported(self) -> bool:
@@ -84,14 +105,11 @@ class Identified:
 
     def applied_to(self, vehicle: Vehicle) -> Vehicle:
         """`vehicle` with the identified constants; the others stay as they are."""
-        found: dict[str, object] = {}
-        for name, fit in (("tilt", self.tilt), ("yaw", self.yaw)):
-            if fit is not None:
-                found[name] = fit.response
+        found = {axis: fit.response for axis in AXES if (fit := getattr(self, axis))}
         for name in ("hover_thrust", "thrust_lag_s", "thrust_delay_s"):
-            if getattr(self, name) is not None:
-                found[name] = getattr(self, name).value
-        if self.drag_ps is not None:
+            if estimate := getattr(self, name):
+                found[name] = estimate.value
+        if self.drag_ps:
             found["drag_translation_npmps"] = (self.drag_ps.value * vehicle.mass_kg,) * 3
         return vehicle.model_validate(vehicle.model_dump() | found)
 
@@ -244,38 +262,6 @@ def _accepted_vertical(
 
 # ---------------------------------------------------------------------- bounds and texts
 
-DELAY_SLACK_S = 0.4  # allowed in addition to the factor: a link may be slow
-LINK_S = 0.03  # a smaller difference of delays is the vehicle's own, not the link's
-
-
-# Least and greatest value of each constant, whatever the vehicle file says; (limits, slack)
-AXIS_BOUNDS = {
-    "delay_s": (DELAY_LIMITS_S, DELAY_SLACK_S),
-    "natural_frequency_radps": (FREQUENCY_LIMITS_RADPS, 0.0),
-    "damping": (DAMPING_LIMITS, 0.0),
-}
-BODY_BOUNDS = {
-    "hover_thrust": (HOVER_THRUST_LIMITS, 0.0),
-    "thrust_lag_s": ((0.0, 0.4), DELAY_SLACK_S),
-    "thrust_delay_s": ((0.0, 0.5), DELAY_SLACK_S),
-    "drag_ps": ((0.02, 3.0), 0.0),
-}
-BOUNDS = {f"{axis}_{name}": AXIS_BOUNDS[name] for axis in ("tilt", "yaw") for name in AXIS_BOUNDS}
-BOUNDS |= BODY_BOUNDS
-RECORDED = tuple(BOUNDS)  # in the log, in this order
-
-
-def constants_of(vehicle: Vehicle) -> dict[str, float]:
-    """The constants of BOUNDS."""
-    axes = {"tilt": vehicle.tilt, "yaw": vehicle.yaw}
-    of_axes = {f"{axis}_{name}": getattr(axes[axis], name) for axis in axes for name in AXIS_BOUNDS}
-    return of_axes | {
-        "hover_thrust": vehicle.hover_thrust,
-        "thrust_lag_s": vehicle.thrust_lag_s,
-        "thrust_delay_s": vehicle.thrust_delay_s,
-        "drag_ps": vehicle.drag_per_mass_ps,
-    }
-
 
 def within_bounds(
     found: Identified, vehicle_file: Vehicle, factor: float
@@ -284,12 +270,14 @@ def within_bounds(
     than `factor`, and a sentence about each of those."""
     sentences: list[str] = []
     rejected: dict[str, Any] = {}
-    expected_of = constants_of(vehicle_file)
     for name, estimate in found.estimates.items():
-        field = name if name in BODY_BOUNDS else name.partition("_")[0]
+        axis = name.partition("_")[0]
+        field = axis if axis in AXES else name
         if estimate is None or field in rejected:
             continue
-        ((least, greatest), slack), expected = BOUNDS[name], expected_of[name]
+        (least, greatest), slack = BOUNDS[name]
+        of_drag = name == "drag_ps"
+        expected = vehicle_file.drag_per_mass_ps if of_drag else _constant(vehicle_file, name)
         low = max(least, expected / factor - slack)
         high = min(greatest, expected * factor + slack)
         if not low <= estimate.value <= high:

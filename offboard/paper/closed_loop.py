@@ -22,8 +22,7 @@ from offboard.model.frames import quaternion_from_euler, rotation_from_quaternio
 from offboard.model.rigid_body import EULER, PHI, PSI, THETA, THRUST, P, R, U, V, W, X, Z
 from offboard.model.vehicle import Vehicle
 from offboard.paper.controller import flyable_box, heading_frame
-from offboard.paper.extensions import INTEGRATED
-from offboard.paper.law import PAPER_STEP_S, PaperLaw, PaperSettings
+from offboard.paper.law import INTEGRATED, PAPER_STEP_S, PaperLaw, PaperSettings
 from offboard.paper.plant import (
     LinearPlant,
     NonlinearPlant,
@@ -31,19 +30,24 @@ from offboard.paper.plant import (
     paper_model,
     paper_vehicle,
 )
-from offboard.reference.base import FlatSample, Reference
+from offboard.reference.base import FlatSample
 from offboard.reference.flatness import flat_state
 from offboard.reference.path import Smoothness
 from offboard.reference.shapes import HeadingMode, Hover, Waypoints
 
 Array = NDArray[np.float64]
 
-POINTS_M = (
-    (0.0, 0.0, 2.0), (20.0, 5.0, 2.0), (30.0, 25.0, 4.0), (10.0, 40.0, 6.0), (-15.0, 30.0, 6.0),
-    (-25.0, 0.0, 4.0), (-10.0, -30.0, 4.0), (20.0, -40.0, 3.0), (45.0, -20.0, 2.0),
-    (50.0, 10.0, 2.0),
+HOVER = Hover(height_m=2.0, duration_s=60.0)
+TOUR = Waypoints(
+    points_m=(
+        (0.0, 0.0, 2.0), (20.0, 5.0, 2.0), (30.0, 25.0, 4.0), (10.0, 40.0, 6.0),
+        (-15.0, 30.0, 6.0), (-25.0, 0.0, 4.0), (-10.0, -30.0, 4.0), (20.0, -40.0, 3.0),
+        (45.0, -20.0, 2.0), (50.0, 10.0, 2.0),
+    ),
+    speed_mps=2.8,  # mean of an inner leg
+    minimise=Smoothness.SNAP,
+    course=HeadingMode.ALONG_VELOCITY,
 )  # fmt: skip
-SPEED_MPS = 2.8  # mean of an inner leg
 
 
 class PathName(StrEnum):
@@ -54,41 +58,16 @@ class PathName(StrEnum):
 
 
 @cache
-def reference(name: PathName) -> Reference:
-    """Position NED, velocity and heading over vehicle time from 0."""
-    if name is PathName.HOVER:
-        return Hover(height_m=2.0, duration_s=60.0).track()
-    return Waypoints(
-        points_m=POINTS_M,
-        speed_mps=SPEED_MPS,
-        minimise=Smoothness.SNAP,
-        course=HeadingMode.ALONG_VELOCITY,
-    ).track()
-
-
-@dataclass(frozen=True, slots=True)
-class SampledPath:
-    """A reference at the steps k = 0 ... K of 0.1 s.
-
-    `times_s` (K + 1,); `tracked` (K + 1, 12) is Eq. 27: zero except psi, u, v, w, x, y, z, with
-    velocities in NED as on the linear plant; `samples` are the flat outputs.
-    """
-
-    times_s: Array
-    tracked: Array
-    samples: FlatSample
-
-
-@cache
-def sampled_path(name: PathName, steps: int) -> SampledPath:
-    """The reference `name` at `steps` + 1 times."""
-    times_s: Array = PAPER_STEP_S * np.arange(steps + 1, dtype=np.float64)
-    samples = reference(name).sample(times_s)
+def sampled_path(name: PathName, steps: int) -> tuple[FlatSample, Array]:
+    """A reference at k = 0 ... `steps`: flat outputs, and the states (steps + 1, 12) of Eq. 27:
+    zero except psi, u, v, w, x, y, z, with velocities in NED as on the linear plant."""
+    reference = (HOVER if name is PathName.HOVER else TOUR).track()
+    samples = reference.sample(PAPER_STEP_S * np.arange(steps + 1, dtype=np.float64))
     tracked = np.zeros((steps + 1, 12))
     tracked[:, PSI] = samples.heading_rad
     tracked[:, U : W + 1] = samples.velocity_ned_mps
     tracked[:, X : Z + 1] = samples.position_ned_m
-    return SampledPath(times_s, tracked, samples)
+    return samples, tracked
 
 
 def linear_states(samples: FlatSample, vehicle: Vehicle) -> Array:
@@ -207,75 +186,73 @@ class Flight:
 
 def fly(task: FlightTask) -> Flight:
     """Fly `task`; the same task gives the same flight, except for the solve times."""
-    kind = NonlinearPlant if task.plant is PlantKind.NONLINEAR else LinearPlant
-    plant = kind(np.array(task.wind_ned_mps), task.thrust_loss)
-    path = sampled_path(task.path, task.steps)
-    controller = _Controller(task, path)
-    state = path.tracked[0].copy()
+    vehicle, settings, (dynamics, control_map) = paper_vehicle(), task.settings, paper_model()
+    nonlinear, to_go = task.plant is PlantKind.NONLINEAR, task.law is LawName.COST_TO_GO
+    plant = (NonlinearPlant if nonlinear else LinearPlant)(
+        np.array(task.wind_ned_mps), task.thrust_loss
+    )
+    lower, upper = flyable_box(vehicle, settings) if nonlinear else (None, None)
+    terminal = cost_to_go(settings) if to_go else None
+    law = PaperLaw(dynamics, control_map, settings, lower, upper, terminal, seed=task.seed)
+    exact = ExactMinimum(4)
+    samples, tracked = sampled_path(task.path, task.steps)
+    # What the model itself does as it follows the reference: the cost-to-go needs it
+    consistent = (heading_states if nonlinear else linear_states)(samples, vehicle)
+    nominal = nominal_inputs(consistent, samples, vehicle, nonlinear)
+    state = tracked[0].copy()
     state[X : Z + 1] += task.start_offset_m
-    if task.law is LawName.COST_TO_GO:
-        state[:PSI] = controller.consistent[0][:PSI]
-    states, inputs = [state], []
+    if to_go:
+        state[:PSI] = consistent[0][:PSI]
+    states, inputs, quality = [state], [], []
     for k in range(task.steps):
-        inputs.append(controller.inputs(k, state))
-        state = plant.next_state(state, inputs[-1])
-        states.append(state)
-    flown = np.array(states)
-    if task.plant is PlantKind.NONLINEAR:
-        flown[:, U : W + 1] = _velocity_ned(flown)
-    applied = np.array(inputs)
-    changes = np.diff(applied, axis=0, prepend=0.0)
-    signal_costs = applied**2 @ task.settings.energy + changes**2 @ task.settings.rate
-    costs, *quality = np.array(controller.quality).T
-    return Flight(flown, path.tracked, applied, costs, signal_costs, *quality)
-
-
-class _Controller:
-    """The law of a task. `consistent` (K + 1, 12) are the states that the plant's model has when
-    it follows the reference; `quality` cost, spread, gap and solve time of every step."""
-
-    def __init__(self, task: FlightTask, path: SampledPath) -> None:
-        vehicle, settings = paper_vehicle(), task.settings
-        self._dynamics, self._inputs = paper_model()
-        self._path = path
-        self._nonlinear = task.plant is PlantKind.NONLINEAR
-        lower, upper = flyable_box(vehicle, settings) if self._nonlinear else (None, None)
-        self._to_go = task.law is LawName.COST_TO_GO
-        terminal = cost_to_go(settings) if self._to_go else None
-        self._law = PaperLaw(
-            self._dynamics, self._inputs, settings, lower, upper, terminal, seed=task.seed
-        )
-        self._exact = ExactMinimum(4)
-        complete = heading_states if self._nonlinear else linear_states
-        self.consistent = complete(path.samples, vehicle)
-        self._nominal = nominal_inputs(self.consistent, path.samples, vehicle, self._nonlinear)
-        self.quality: list[tuple[float, float, float, float]] = []
-
-    def inputs(self, k: int, state: Array) -> Array:
-        """u(k) (4,) for the plant's state x(k) (12,)."""
-        nominal = None
-        seen, target = self._in_axes_of_the_law(state, k + 1)
-        if self._to_go:  # needs a reference that the model itself can follow
-            seen, _ = self._in_axes_of_the_law(state, k)
-            nominal = self._nominal[k]
-            target = self._dynamics @ self.consistent[k] + self._inputs @ nominal
-        error = (state - self._path.tracked[k])[list(INTEGRATED)]
-        heading_rad = state[PSI] if self._nonlinear else 0.0
+        seen, target = _in_axes_of_the_law(state, tracked, samples, k + 1, nonlinear)
+        if to_go:
+            seen, _ = _in_axes_of_the_law(state, tracked, samples, k, nonlinear)
+            target = dynamics @ consistent[k] + control_map @ nominal[k]
         started = monotonic_s()
-        move = self._law.move(seen, target, error=error, heading_rad=heading_rad, nominal=nominal)
-        elapsed_s = monotonic_s() - started
-        certificate = certify(move.problem, move.result, self._exact)
-        self.quality.append((certificate.cost, certificate.spread, certificate.gap, elapsed_s))
-        return move.inputs
+        move = law.move(
+            seen,
+            target,
+            error=(state - tracked[k])[list(INTEGRATED)],
+            heading_rad=state[PSI] if nonlinear else 0.0,
+            nominal=nominal[k] if to_go else None,
+        )
+        solve_s = monotonic_s() - started
+        certificate = certify(move.problem, move.result, exact)
+        quality.append((certificate.cost, certificate.spread, certificate.gap, solve_s))
+        inputs.append(move.inputs)
+        state = plant.next_state(state, move.inputs)
+        states.append(state)
+    flown, applied = np.array(states), np.array(inputs)
+    if nonlinear:
+        velocities = flown[:, EULER.velocity, None]
+        flown[:, U : W + 1] = (_rotations(flown) @ velocities)[..., 0]
+    changes = np.diff(applied, axis=0, prepend=0.0)
+    signal_costs = applied**2 @ settings.energy + changes**2 @ settings.rate
+    costs, *rest = np.array(quality).T
+    return Flight(flown, tracked, applied, costs, signal_costs, *rest)
 
-    def _in_axes_of_the_law(self, state: Array, k: int) -> tuple[Array, Array]:
-        """State and reference k (12,): unchanged on the linear plant; in the heading frame and
-        relative to sample k on the nonlinear one."""
-        if not self._nonlinear:
-            return state, self._path.tracked[k]
-        samples = self._path.samples
-        sample = FlatSample(*(getattr(samples, field.name)[k] for field in fields(samples)))
-        return heading_frame(_predicted(state), sample)
+
+def _in_axes_of_the_law(
+    state: Array, tracked: Array, samples: FlatSample, k: int, nonlinear: bool
+) -> tuple[Array, Array]:
+    """State and reference k (12,): unchanged on the linear plant; in the heading frame and
+    relative to sample k on the nonlinear one."""
+    if not nonlinear:
+        return state, tracked[k]
+    rotation, still = _rotations(state), np.zeros(3)
+    predicted = PredictedState(
+        0.0, state[X : Z + 1], rotation @ state[U : W + 1], rotation[:, 2], still,
+        float(state[PSI]), 0.0, 0.0, still, state[P : R + 1],
+    )  # fmt: skip
+    parts = (getattr(samples, field.name) for field in fields(samples))
+    return heading_frame(predicted, FlatSample(*(part[k] for part in parts)))
+
+
+def _rotations(states: Array) -> Array:
+    """Rotations (..., 3, 3) from the body to NED of states (..., 12)."""
+    angles = np.moveaxis(states[..., EULER.attitude], -1, 0)
+    return rotation_from_quaternion(quaternion_from_euler(*angles))
 
 
 def cost_to_go(settings: PaperSettings) -> Array:
@@ -285,24 +262,6 @@ def cost_to_go(settings: PaperSettings) -> Array:
     weights = np.diag(settings.fitness), np.diag(settings.energy)
     solution: Array = control.dlqr(*paper_model(), *weights)[1]
     return solution
-
-
-def _predicted(state: Array) -> PredictedState:
-    """The plant's state (12,) in the form that a controller gets."""
-    rotation = rotation_from_quaternion(quaternion_from_euler(*state[PHI : PSI + 1]))
-    still = np.zeros(3)
-    return PredictedState(
-        0.0, state[X : Z + 1], rotation @ state[U : W + 1], rotation[:, 2], still,
-        float(state[PSI]), 0.0, 0.0, still, state[P : R + 1],
-    )  # fmt: skip
-
-
-def _velocity_ned(states: Array) -> Array:
-    """NED velocity (..., 3) of states (..., 12) whose velocity is in body axes."""
-    angles = np.moveaxis(states[..., EULER.attitude], -1, 0)
-    rotation = rotation_from_quaternion(quaternion_from_euler(*angles))
-    velocity: Array = np.einsum("...ij,...j->...i", rotation, states[..., EULER.velocity])
-    return velocity
 
 
 class Flights:

@@ -61,15 +61,8 @@ class PaperController:
         self._vehicle = vehicle
         self._settings = settings
         self._step_s = step_s
-        self._law = PaperLaw(
-            dynamics,
-            inputs * input_scale(vehicle),
-            settings,
-            lower,
-            upper,
-            step_s=step_s,
-            seed=seed,
-        )
+        scaled = inputs * input_scale(vehicle)
+        self._law = PaperLaw(dynamics, scaled, settings, lower, upper, step_s=step_s, seed=seed)
         self._exact = ExactMinimum(len(lower))
 
     def decide(self, situation: Situation) -> Decision:
@@ -87,7 +80,7 @@ class PaperController:
         if not math.isfinite(move.result.cost):
             raise DecisionError("the cost of this decision is not finite")
         certificate = certify(move.problem, move.result, self._exact)
-        return Decision(self._command(move, state, float(target.heading_rad)), certificate)
+        return Decision(self._command(move, float(target.heading_rad)), certificate)
 
     def reset(self) -> None:
         self._law.reset()
@@ -98,29 +91,14 @@ class PaperController:
         heading = wrap_pi(state.heading_rad - float(now.heading_rad))
         return np.append(state.position_ned_m - now.position_ned_m, heading)
 
-    def _command(self, move: Move, state: Array, target_heading_rad: float) -> Command:
+    def _command(self, move: Move, target_heading_rad: float) -> Command:
         gravity, limit = self._vehicle.gravity_mps2, self._vehicle.thrust_max_mps2
         thrust = gravity + float(move.inputs[THRUST]) / PAPER_MASS_KG
-        phi, theta, psi = (float(angle) for angle in self._attitude(state, move.following))
+        phi, theta, psi = move.following[PHI : PSI + 1].tolist()
         heading = target_heading_rad + psi
         return Command(
             min(max(thrust, 0.0), limit), _thrust_direction(phi, theta, heading), wrap_pi(heading)
         )
-
-    def _attitude(self, state: Array, following: Array) -> Array:
-        """[phi, theta, psi] to send, from x(k) and x(k+1) (12,)."""
-        predicted = following[PHI : PSI + 1]
-        if not self._settings.attitude_lead:
-            return predicted
-        rates = following[P : R + 1]
-        accelerations = (rates - state[P : R + 1]) / self._step_s
-        loops = (self._vehicle.tilt, self._vehicle.tilt, self._vehicle.yaw)
-        frequency = np.array([loop.natural_frequency_radps for loop in loops])
-        damping = np.array([loop.damping for loop in loops])
-        # s_c from s'' = wn^2 (s_c - s) - 2 z wn s'; the state is already predicted over the delay
-        lead: Array = 2.0 * damping / frequency * rates + accelerations / frequency**2
-        asked: Array = predicted + lead
-        return asked
 
 
 def input_scale(vehicle: Vehicle) -> Array:
@@ -163,15 +141,9 @@ def heading_frame(state: PredictedState, target: FlatSample) -> tuple[Array, Arr
 
 
 def _usable(state: PredictedState) -> bool:
-    return math.isfinite(state.heading_rad) and all(
-        np.isfinite(part).all()
-        for part in (
-            state.position_ned_m,
-            state.velocity_ned_mps,
-            state.thrust_direction_ned,
-            state.rates_frd_radps,
-        )
-    )
+    vectors = state.position_ned_m, state.velocity_ned_mps, state.thrust_direction_ned
+    numbers = np.concatenate([*vectors, state.rates_frd_radps, [state.heading_rad]])
+    return bool(np.isfinite(numbers).all())
 
 
 def _turn(angle_rad: float) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -11,9 +11,11 @@ from offboard.paper import printed
 from offboard.paper.closed_loop import Flight, Flights
 from offboard.paper.law import PaperSettings
 from offboard.paper.plant import paper_vehicle
-from offboard.paper.tables import MISS, Row, Table, deviation, shown
+from offboard.paper.tables import MISS, Entries, Table, deviation, shown
 
 ROUNDING = 0.5e-4  # Eq. 16 prints four decimals
+REBOUND = 0.5  # share of the speed; the particles of the paper stop at the box
+FEW = 3  # flights where one number per row is enough
 _VARIANTS = {  # key: heading, name, sampling time, arm
     "ts_100ms_arm": ("0.1 s, arm 0.225 m", "0.1 s, arm", 0.1, True),
     "ts_50ms_arm": ("0.05 s, arm 0.225 m", "0.05 s, arm", 0.05, True),
@@ -21,7 +23,6 @@ _VARIANTS = {  # key: heading, name, sampling time, arm
     "ts_50ms_no_arm": ("0.05 s, no arm", "0.05 s, no arm", 0.05, False),
 }
 Erratum = tuple[str, str, str, str]  # where, printed, correct, evidence
-Flown = Mapping[str, Sequence[Flight]]
 
 
 def computed_inputs(step_s: float, with_arm: bool) -> np.ndarray:
@@ -35,64 +36,51 @@ def computed_inputs(step_s: float, with_arm: bool) -> np.ndarray:
 def bd_table(_: Flights) -> Table:
     """Every printed non-zero of Eq. 16: printed, computed at 0.1 s and 0.05 s, arm or none."""
     computed = {key: computed_inputs(*variant[2:]) for key, variant in _VARIANTS.items()}
-    rows: list[Row] = []
+    rows: list[Entries] = []
     for entry in (*printed.EQ_16, printed.LOST_ENTRY):
         values = {key: _value(entry, matrix) for key, matrix in computed.items()}
         rows.append(
             {
-                "row": entry.row if entry.value is not None else "lost",
-                "entry": f"B_d[{entry.state}, {entry.input}]",
-                "printed": entry.value,
-                **values,
-                "reproduced_by": _reproduced_by(entry.value, values),
+                "row": ("printed row", entry.row if entry.value is not None else "lost"),
+                "entry": ("entry", f"B_d[{entry.state}, {entry.input}]"),
+                "printed": ("printed", entry.value),
+                **{key: (_VARIANTS[key][0], value) for key, value in values.items()},
+                "reproduced_by": (
+                    "reproduced to four decimals by",
+                    _reproduced_by(entry.value, values),
+                ),
             }
         )
-    columns = {
-        "row": "printed row", "entry": "entry", "printed": "printed",
-        **{key: variant[0] for key, variant in _VARIANTS.items()},
-        "reproduced_by": "reproduced to four decimals by",
-    }  # fmt: skip
-    notes = ("The yaw and lift columns have no arm: both variants with 0.1 s reproduce them.",)
-    return Table("Eq. 16, entry by entry", columns, rows, notes)
+    note = "The yaw and lift columns have no arm: both variants with 0.1 s reproduce them."
+    return Table.of("Eq. 16, entry by entry", rows, note)
 
 
 def _reproduced_by(value: float | None, computed: dict[str, float]) -> str:
     if value is None:
         return "not printed"
     for sign, remark in ((1, ""), (-1, ", with the other sign")):
-        names = [
-            _VARIANTS[key][1]
-            for key, found in computed.items()
-            if abs(sign * found - value) <= ROUNDING
-        ]
-        if names:
-            return "; ".join(names) + remark
+        fitting = [key for key, found in computed.items() if abs(sign * found - value) <= ROUNDING]
+        if fitting:
+            return "; ".join(_VARIANTS[key][1] for key in fitting) + remark
     return "none"
-
-
-REBOUND = 0.5  # share of the speed; the particles of the paper stop at the box
-FEW = 3  # flights where one number per row is enough
 
 
 def errata_table(flights: Flights) -> Table:
     """The errata, with evidence from flights on the linear plant."""
-    best = flights.damped(printed.BEST_DAMPING)
-    no_constant = best.model_copy(update={"keep_constant": False})
-    rebounding = flights.damped(printed.UNDAMPED, rebound=REBOUND)
-    flown = {
-        "undamped": flights.by_seed(flights.damped(printed.UNDAMPED)),
-        "damped": flights.by_seed(best),
-        "least": flights.by_seed(flights.damped(printed.LEAST_DAMPING)),
-        "final": flights.by_seed(PaperSettings()),
-        "no constant": flights.by_seed(no_constant, most=FEW),
-        "rebounding": flights.by_seed(rebounding, most=FEW),
-    }
-    columns = {
-        "where": "where", "printed": "printed", "holds": "correct", "shown_by": "evidence",
-    }  # fmt: skip
-    errata = (*_model_errata(), *_swarm_errata(flown), *_error_errata(flown))
-    rows: list[Row] = [dict(zip(columns, erratum, strict=True)) for erratum in errata]
-    return Table("Errata", columns, rows)
+    rows: list[Entries] = [
+        {
+            "where": ("where", where),
+            "printed": ("printed", theirs),
+            "holds": ("correct", holds),
+            "shown_by": ("evidence", evidence),
+        }
+        for where, theirs, holds, evidence in (
+            *_model_errata(),
+            *_swarm_errata(flights),
+            *_error_errata(flights),
+        )
+    ]
+    return Table.of("Errata", rows)
 
 
 def _model_errata() -> Iterator[Erratum]:
@@ -138,16 +126,23 @@ def _model_errata() -> Iterator[Erratum]:
     )
 
 
-def _swarm_errata(flown: Flown) -> Iterator[Erratum]:
+def _swarm_errata(flights: Flights) -> Iterator[Erratum]:
+    best = flights.damped(printed.BEST_DAMPING)
+    flown = {
+        "undamped": flights.by_seed(flights.damped(printed.UNDAMPED)),
+        "damped": flights.by_seed(best),
+        "least": flights.by_seed(flights.damped(printed.LEAST_DAMPING)),
+        "no constant": flights.by_seed(best.model_copy(update={"keep_constant": False}), most=FEW),
+        "rebounding": flights.by_seed(flights.damped(printed.UNDAMPED, rebound=REBOUND), most=FEW),
+    }
     costs = [flight.costs.sum() for flight in flown["undamped"]]
-    epsilon = {
-        name: float(np.mean([flight.spreads.mean() for flight in flights]))
-        for name, flights in flown.items()
-    }
-    missed = {
-        name: 100.0 * float(np.mean([np.mean(flight.gaps > MISS) for flight in flights]))
-        for name, flights in flown.items()
-    }
+    epsilon, missed = (
+        {
+            name: scale * float(np.mean([of(flight) for flight in own]))
+            for name, own in flown.items()
+        }
+        for scale, of in ((1.0, _mean_spread), (100.0, _share_missed))
+    )
     kept, dropped = epsilon["damped"], epsilon["no constant"]
     yield (
         "ε at λ = 0.65",
@@ -180,9 +175,18 @@ def _swarm_errata(flown: Flown) -> Iterator[Erratum]:
     )
 
 
-def _error_errata(flown: Flown) -> Iterator[Erratum]:
+def _mean_spread(flight: Flight) -> float:
+    return float(flight.spreads.mean())
+
+
+def _share_missed(flight: Flight) -> float:
+    return float(np.mean(flight.gaps > MISS))
+
+
+def _error_errata(flights: Flights) -> Iterator[Erratum]:
     before, after = (
-        np.mean([flight.errors for flight in flown[name]], axis=0) for name in ("damped", "final")
+        np.mean([flight.errors for flight in flights.by_seed(settings)], axis=0)
+        for settings in (flights.damped(printed.BEST_DAMPING), PaperSettings())
     )
     entries = printed.ERRORS_REWEIGHTED[2] / printed.ERRORS_DAMPED[2]
     yield (

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
@@ -11,7 +12,6 @@ from plotly.subplots import make_subplots
 
 from offboard.analysis.page import (
     BLUE,
-    GREEN,
     GREY,
     INK,
     ORANGE,
@@ -27,7 +27,7 @@ from offboard.control.quadratic import ExactMinimum
 from offboard.control.swarm import Swarm
 from offboard.model.rigid_body import PSI, U, X
 from offboard.paper.closed_loop import Flight, Flights, FlightTask, PathName, sampled_path
-from offboard.paper.law import PaperLaw, PaperSettings
+from offboard.paper.law import PAPER_STEP_S, PaperLaw, PaperSettings
 from offboard.paper.plant import PlantKind, paper_model
 from offboard.paper.printed import BEST_DAMPING, LEAST_DAMPING, TABLE_2, UNDAMPED
 from offboard.paper.tables import (
@@ -81,77 +81,61 @@ FLOWN = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class Search:
-    """Positions (4 shown iterations, particles, 4), box lower, upper (4,), optimum u* (4,)."""
-
-    positions: Array
-    lower: Array
-    upper: Array
-    optimum: Array
-
-
-def search(settings: PaperSettings) -> Search:
-    """A search of the swarm of `settings` midway along the path of Figs. 5-6."""
-    path = sampled_path(PathName.TOUR, 1000)
-    law = PaperLaw(*paper_model(), settings)
-    state = path.tracked[0]
-    for following in path.tracked[1 : MIDWAY + 2]:
-        move = law.move(state, following)
-        state = move.following
-    problem = move.problem
-    rng = np.random.default_rng(0)
-    swarm, positions = Swarm(settings.swarm, problem.lower, problem.upper, rng), []
-    for iteration in SHOWN_ITERATIONS:
-        swarm.tell_all(problem, min(iteration, settings.swarm.iterations) - 1)
-        positions.append(swarm.ask())
-    optimum = ExactMinimum(4).minimise(problem)
-    return Search(np.array(positions), problem.lower, problem.upper, optimum)
-
-
 def search_motion(flights: Flights) -> Figure:
     """Fig. 4: the particles in [f_t, tau_x], one row per lambda, four iterations each."""
     dampings = (BEST_DAMPING, UNDAMPED, LEAST_DAMPING)
-    searches = {damping: search(flights.damped(damping)) for damping in dampings}
-    titles = [f"λ = {damping:g}, iteration {n}" for damping in searches for n in SHOWN_ITERATIONS]
+    titles = [f"λ = {damping:g}, iteration {n}" for damping in dampings for n in SHOWN_ITERATIONS]
     drawing = make_subplots(
-        rows=len(searches), cols=len(SHOWN_ITERATIONS), shared_xaxes="all", shared_yaxes="all",
+        rows=len(dampings), cols=len(SHOWN_ITERATIONS), shared_xaxes="all", shared_yaxes="all",
         subplot_titles=titles, horizontal_spacing=0.015, vertical_spacing=0.07,
     )  # fmt: skip
-    for row, found in enumerate(searches.values(), 1):
-        for column in range(1, len(SHOWN_ITERATIONS) + 1):
-            drawing.add_traces(_particles(found, column - 1), rows=row, cols=column)
+    for row, damping in enumerate(dampings, 1):
+        for column, traces in enumerate(_search(flights.damped(damping)), 1):
+            drawing.add_traces(traces, rows=row, cols=column)
     drawing.update_layout(
-        template=STYLE, height=110 + 240 * len(searches), showlegend=False,
+        template=STYLE, height=110 + 240 * len(dampings), showlegend=False,
         margin={"t": 60, "b": 50},
     )  # fmt: skip
     drawing.update_annotations(font_size=12)
-    drawing.update_xaxes(title_text="f_t, N", row=len(searches))
+    drawing.update_xaxes(title_text="f_t, N", row=len(dampings))
     drawing.update_yaxes(title_text="τ_x, N", col=1)
     caption = "Dots: particles; cross: the exact optimum; the box is Eq. 26. Two of four inputs."
     return Figure("Fig. 4: the search of the swarm", drawing, caption, width_px=760)
 
 
-def _particles(found: Search, shown: int) -> list[go.Scatter]:
-    (left, low), (right, high) = found.lower[:2], found.upper[:2]
+def _search(settings: PaperSettings) -> Iterator[list[go.Scatter]]:
+    """The search midway along the path of Figs. 5-6, drawn at each of SHOWN_ITERATIONS: the box,
+    the particles and the exact optimum."""
+    _, tracked = sampled_path(PathName.TOUR, 1000)
+    law = PaperLaw(*paper_model(), settings)
+    state = tracked[0]
+    for following in tracked[1 : MIDWAY + 2]:
+        move = law.move(state, following)
+        state = move.following
+    problem = move.problem
+    (left, low), (right, high) = problem.lower[:2], problem.upper[:2]
     corners = [left, right, right, left, left], [low, low, high, high, low]
+    optimum = ExactMinimum(4).minimise(problem)[:, None]
     cross = {"color": RED, "size": 10, "symbol": "cross-thin", "line": {"width": 2, "color": RED}}
     dot = {"color": BLUE, "size": 5, "opacity": 0.7}
-    drawn = (
-        (corners, {"mode": "lines", "line": {"color": GREY, "width": 1}, "hoverinfo": "skip"}),
-        (found.positions[shown].T, {"mode": "markers", "name": "particle", "marker": dot}),
-        (found.optimum[:, None], {"mode": "markers", "name": "optimum", "marker": cross}),
-    )
-    return [go.Scatter(x=coordinates(x[0]), y=coordinates(x[1]), **style) for x, style in drawn]
+    swarm = Swarm(settings.swarm, problem.lower, problem.upper, np.random.default_rng(0))
+    for iteration in SHOWN_ITERATIONS:
+        swarm.tell_all(problem, min(iteration, settings.swarm.iterations) - 1)
+        drawn: list[tuple[Any, dict[str, Any]]] = [
+            (corners, {"mode": "lines", "line": {"color": GREY, "width": 1}, "hoverinfo": "skip"}),
+            (swarm.ask().T, {"mode": "markers", "name": "particle", "marker": dot}),
+            (optimum, {"mode": "markers", "name": "optimum", "marker": cross}),
+        ]
+        yield [go.Scatter(x=coordinates(x[0]), y=coordinates(x[1]), **style) for x, style in drawn]
 
 
 def reference_states(_: Flights) -> Figure:
     """Fig. 5."""
-    path = sampled_path(PathName.TOUR, 1000)
+    tracked = sampled_path(PathName.TOUR, 1000)[1]
     drawing = panels(_PANELS[_POSITIONS] + _PANELS[_VELOCITIES], "t, s", panel_px=100)
-    columns = _columns(path.tracked)
+    columns, times_s = _columns(tracked), PAPER_STEP_S * np.arange(len(tracked))
     for panel, column in enumerate((*columns[_POSITIONS], *columns[_VELOCITIES]), 1):
-        curve(drawing, panel, path.times_s, column, "reference", INK)
+        curve(drawing, panel, times_s, column, "reference", INK)
     drawing.update_layout(showlegend=False, margin={"b": 50})
     caption = "The paper draws its path without numbers; this one is similar."
     return Figure("Fig. 5: reference of the states", drawing, caption)
@@ -159,19 +143,17 @@ def reference_states(_: Flights) -> Figure:
 
 def reference_path(flights: Flights) -> Figure:
     """Fig. 6: the path in space, with the flights by their names."""
-    settings = _settings(flights)
-    flown = {name: flights(FlightTask(settings[name])) for name in (DAMPED_FLIGHT, FINAL_FLIGHT)}
-    tracked = sampled_path(PathName.TOUR, 1000).tracked
-    drawing = go.Figure()
-    paths = {"reference": tracked} | {name: flight.states for name, flight in flown.items()}
-    for (name, states), colour in zip(paths.items(), (INK, BLUE, RED, GREEN), strict=False):
-        x, y, z = (coordinates(column) for column in (states[::4, X : X + 3] * (1, 1, -1)).T)
-        line = {"color": colour, "width": 4 if name == "reference" else 3}
-        drawing.add_scatter3d(x=x, y=y, z=z, mode="lines", name=name, line=line)
-    x, y, z = (coordinates(column) for column in (tracked[[0, -1], X : X + 3] * (1, 1, -1)).T)
+    _, tracked = sampled_path(PathName.TOUR, 1000)
+    settings, drawing = _settings(flights), go.Figure()
+    lines = [("reference", tracked, INK, 4)]
+    for name, colour in ((DAMPED_FLIGHT, BLUE), (FINAL_FLIGHT, RED)):
+        lines.append((name, flights(FlightTask(settings[name])).states, colour, 3))
+    for name, states, colour, width in lines:
+        line = {"color": colour, "width": width}
+        drawing.add_scatter3d(**_in_space(states[::4]), mode="lines", name=name, line=line)
     drawing.add_scatter3d(
-        x=x, y=y, z=z, mode="markers+text", text=["S", "D"], textposition="top center",
-        showlegend=False, marker={"size": 4, "color": INK},
+        **_in_space(tracked[[0, -1]]), mode="markers+text", text=["S", "D"],
+        textposition="top center", showlegend=False, marker={"size": 4, "color": INK},
     )  # fmt: skip
     scene = {
         "xaxis_title": "north, m", "yaxis_title": "east, m", "zaxis_title": "height, m",
@@ -181,6 +163,12 @@ def reference_path(flights: Flights) -> Figure:
     drawing.update_layout(template=STYLE, height=560, scene=scene, margin={"l": 0, "b": 40})
     caption = "S start, D destination. Flown on the linear plant."
     return Figure("Fig. 6: the path", drawing, caption, width_px=560)
+
+
+def _in_space(states: Array) -> dict[str, NDArray[np.float32]]:
+    """North, east and height of states (N, 12)."""
+    x, y, z = (coordinates(column) for column in (states[:, X : X + 3] * (1, 1, -1)).T)
+    return {"x": x, "y": y, "z": z}
 
 
 def _settings(flights: Flights) -> dict[str, PaperSettings]:

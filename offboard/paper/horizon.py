@@ -7,7 +7,7 @@ closed loop gives the time an error lasts.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from offboard.paper.closed_loop import Flights, FlightTask, LawName, PathName, c
 from offboard.paper.figures import position_error
 from offboard.paper.law import PAPER_STEP_S, PaperSettings
 from offboard.paper.plant import PlantKind, paper_model
-from offboard.paper.tables import Row, Table
+from offboard.paper.tables import Entries, Table
 
 Array = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -28,34 +28,7 @@ Complexes = NDArray[np.complex128]
 LONGEST = 20
 _LATERAL = [PHI, P, V, Y]  # y, v, phi, p depend on tau_x alone; x and the others mirror them
 _RATIOS = (1, 2, 5, 10, 20, 40, 80)
-_COLUMNS = {
-    "slowest": "slowest |eigenvalue|", "time_constant_s": "slowest time constant, s",
-}  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class Modes:
-    """Eigenvalues of a closed loop, largest magnitude first."""
-
-    name: str
-    eigenvalues: Complexes
-
-    @property
-    def slowest(self) -> float:
-        return float(abs(self.eigenvalues[0]))
-
-    @property
-    def time_constant_s(self) -> float:
-        """Time constant of the slowest mode; infinite where it does not decay."""
-        return -PAPER_STEP_S / math.log(self.slowest) if self.slowest < 1 else math.inf
-
-    def row(self) -> Row:
-        """The cells of `_COLUMNS`."""
-        finite = math.isfinite(self.time_constant_s)
-        return {
-            "slowest": self.slowest,
-            "time_constant_s": self.time_constant_s if finite else None,
-        }
+ONE_STEP, TO_GO, ENDLESS = "one step, Eqs. 33-35", "cost-to-go, Eqs. 33-35", "N = ∞"
 
 
 def receding(
@@ -94,52 +67,69 @@ def receding(
     return found[np.argsort(-np.abs(found), kind="stable")]
 
 
-def modes_by_law(first: PaperSettings) -> list[Modes]:
+def time_constant_s(modes: Complexes) -> float:
+    """Time constant of the slowest mode; infinite where it does not decay."""
+    slowest = float(abs(modes[0]))
+    return -PAPER_STEP_S / math.log(slowest) if slowest < 1 else math.inf
+
+
+def modes_by_law(first: PaperSettings) -> dict[str, Complexes]:
     """One step with both of the paper's weights, without R and R_du, cost-to-go, N = 1 ... 20."""
     final = PaperSettings()
     a, b = paper_model()
     q, r, s = (np.diag(part) for part in (final.fitness, final.energy, final.rate))
     q0, r0, s0 = (np.diag(part) for part in (first.fitness, first.energy, first.rate))
-    modes = [
-        Modes("one step, first weights", receding(a, b, q0, r0, s0, 1)),
-        Modes("one step, Eqs. 33-35", receding(a, b, q, r, s, 1)),
-        Modes("one step, Eq. 33, R = R_Δu = 0", receding(a, b, q, 0 * r, 0 * s, 1)),
-        Modes("cost-to-go, Eqs. 33-35", receding(a, b, q, r, s, 1, cost_to_go(final))),
-    ]
-    modes += [Modes(f"N = {n}", receding(a, b, q, r, s, n)) for n in range(1, LONGEST + 1)]
-    return [*modes, Modes("N = ∞", receding(a, b, q, r, s))]
+    return {
+        "one step, first weights": receding(a, b, q0, r0, s0, 1),
+        ONE_STEP: receding(a, b, q, r, s, 1),
+        "one step, Eq. 33, R = R_Δu = 0": receding(a, b, q, 0 * r, 0 * s, 1),
+        TO_GO: receding(a, b, q, r, s, 1, cost_to_go(final)),
+        **{f"N = {n}": receding(a, b, q, r, s, n) for n in range(1, LONGEST + 1)},
+        ENDLESS: receding(a, b, q, r, s),
+    }
+
+
+def _slowest(modes: Complexes) -> Entries:
+    """The cells that describe the slowest mode of a closed loop."""
+    constant_s = time_constant_s(modes)
+    return {
+        "slowest": ("slowest |eigenvalue|", float(abs(modes[0]))),
+        "time_constant_s": (
+            "slowest time constant, s",
+            constant_s if math.isfinite(constant_s) else None,
+        ),
+    }
 
 
 def horizon_table(flights: Flights) -> Table:
     """Slowest eigenvalues and time constants of the closed loops."""
-    rows = [
-        {
-            "law": mode.name,
-            **mode.row(),
-            "four_slowest": ", ".join(map(_text, mode.eigenvalues[:4])),
-        }
-        for mode in modes_by_law(flights.first)
-    ]
-    notes = (
+    return Table.of(
+        "Closed loop by objective and horizon",
+        [
+            {
+                "law": ("law", name),
+                **_slowest(modes),
+                "four_slowest": ("four slowest", ", ".join(map(_text, modes[:4]))),
+            }
+            for name, modes in modes_by_law(flights.first).items()
+        ],
         "Position is four integrations from torque: in one step of 0.1 s a newton moves it by "
         "0.4 mm, so the cost of one step hardly depends on it. The same search over four inputs, "
         "with the Riccati solution instead of Q, takes the same time and is as fast as any.",
     )
-    columns = {"law": "law", **_COLUMNS, "four_slowest": "four slowest"}
-    return Table("Closed loop by objective and horizon", columns, rows, notes)
 
 
 def horizon_figure(flights: Flights) -> Figure:
     """Slowest time constant over the horizon."""
-    by_name = {mode.name: mode.time_constant_s for mode in modes_by_law(flights.first)}
+    by_law = {name: time_constant_s(modes) for name, modes in modes_by_law(flights.first).items()}
     steps = list(range(1, LONGEST + 1))
     drawing = panels(("slowest time constant, s",), "horizon N, steps of 0.1 s", panel_px=300)
-    values = [by_name[f"N = {n}"] for n in steps]
+    values = [by_law[f"N = {n}"] for n in steps]
     curve(drawing, 1, steps, values, "N steps, Eqs. 33-35", BLUE, mode="lines+markers")
-    curve(drawing, 1, [1, LONGEST], [by_name["N = ∞"]] * 2, "N = ∞", INK, "dash")
+    curve(drawing, 1, [1, LONGEST], [by_law[ENDLESS]] * 2, ENDLESS, INK, "dash")
     diamond = {"size": 11, "color": RED, "symbol": "diamond"}
-    value = by_name["cost-to-go, Eqs. 33-35"]
-    curve(drawing, 1, [1], [value], "one step + cost-to-go", RED, mode="markers", marker=diamond)
+    name = "one step + cost-to-go"
+    curve(drawing, 1, [1], [by_law[TO_GO]], name, RED, mode="markers", marker=diamond)
     drawing.update_yaxes(type="log", tickvals=[1, 2, 5, 10, 20, 50])
     caption = "Computed from the model. One step with the cost-to-go is as fast as any horizon."
     return Figure("Slowest time constant of the closed loop", drawing, caption)
@@ -156,15 +146,9 @@ def laws_figure(flights: Flights) -> Figure:
                 if kind == "offset":
                     task = replace(task, path=PathName.HOVER, start_offset_m=(1.0, 0.0, 0.0))
                 position_error(drawing, panel, flights(task), law, plant, colour)
-    (slow_s,) = (
-        modes.time_constant_s
-        for modes in modes_by_law(flights.first)
-        if modes.name == "one step, Eqs. 33-35"
-    )
-    times = np.linspace(0.0, 100.0, 50)
-    curve(
-        drawing, 1, times, np.exp(-times / slow_s), f"model: e^(-t / {slow_s:.1f} s)", GREY, "dash"
-    )
+    slow_s, times = time_constant_s(modes_by_law(flights.first)[ONE_STEP]), np.linspace(0, 100, 50)
+    name = f"model: e^(-t / {slow_s:.1f} s)"
+    curve(drawing, 1, times, np.exp(-times / slow_s), name, GREY, "dash")
     drawing.update_yaxes(type="log", range=[-5, 0.7])
     caption = (
         "Same weights (Eqs. 33-35), swarm and box; the cost-to-go also gets a reference that the "
@@ -181,30 +165,32 @@ def weights_table(_: Flights) -> Table:
     fitness = np.array(settings.fitness)[_LATERAL]
     energy, rate = np.eye(1) * settings.energy[TAU_X], np.eye(1) * settings.rate[TAU_X]
 
-    def modes(name: str, diagonal: Array) -> Modes:
-        return Modes(name, receding(a, b, np.diag(diagonal), energy, rate, 1))
+    def modes(diagonal: Array) -> Complexes:
+        return receding(a, b, np.diag(diagonal), energy, rate, 1)
 
-    tried = [
-        modes(f"Q_y = {ratio} Q_v", np.array([*fitness[:3], ratio * fitness[2]]))
+    tried = {
+        f"Q_y = {ratio} Q_v": modes(np.array([*fitness[:3], ratio * fitness[2]]))
         for ratio in _RATIOS
-    ]
+    }
     found = differential_evolution(
-        lambda exponents: modes("", 10.0**exponents).slowest,
+        lambda exponents: float(abs(modes(10.0**exponents)[0])),
         [(-3.0, 7.0)] * len(_LATERAL), seed=0, maxiter=150, tol=1e-8,
     )  # fmt: skip
     best = 10.0**found.x
     weights = ", ".join(f"{weight:.3g}" for weight in best)
-    tried.append(modes(f"searched: Q_φ, Q_p, Q_v, Q_y = {weights}", best))
-    rows = [{"weights": mode.name, **mode.row()} for mode in tried]
-    notes = (
+    tried[f"searched: Q_φ, Q_p, Q_v, Q_y = {weights}"] = modes(best)
+    return Table.of(
+        "One step, other diagonal weights",
+        [
+            {"weights": ("diagonal weights", name), **_slowest(found_modes)}
+            for name, found_modes in tried.items()
+        ],
         "With the equal weights of Eq. 33 on y and v even R = R_Δu = 0 does not help. Unequal ones "
         "do: in one step four diagonal weights determine four feedback gains, and a search over "
         "them reaches any stable pole placement. Towards Q_y = 40 Q_v the loop gets slower again, "
         "then unstable. Such weights no longer express what matters, and the result holds inside "
         "the box only; the cost-to-go needs no search.",
     )
-    columns = {"weights": "diagonal weights", **_COLUMNS}
-    return Table("One step, other diagonal weights", columns, rows, notes)
 
 
 def _text(value: complex) -> str:

@@ -75,24 +75,19 @@ class PaperOptions:
     tables: tuple[str, ...] = ()
 
     @property
-    def seed_count(self) -> int:
-        return self.seeds if self.seeds is not None else QUICK_SEEDS if self.quick else SEEDS
-
-    @property
-    def first_settings(self) -> PaperSettings:
-        """The first configuration (section 4.1), at lambda = 1."""
-        first = PaperSettings.first_configuration()
-        if self.initial_q is None:
-            return first
-        diagonal = self.initial_q * 12 if len(self.initial_q) == 1 else self.initial_q
-        return first.model_copy(update={"fitness": diagonal})
-
-    @property
     def labels(self) -> tuple[str, ...]:
         """The tables and figures to make ("table 2", "figure gap"), tables first."""
         chosen = [f"table {name}" for name in self.tables]
         chosen += [f"figure {name}" for name in self.figures]
         return tuple(dict.fromkeys(chosen)) or (*known("table"), *known("figure"))
+
+    def flights(self, on_flight: Callable[[], None] = lambda: None) -> Flights:
+        """The flights of a run with these options."""
+        first, diagonal = PaperSettings.first_configuration(), self.initial_q or (1.0,)
+        diagonal = diagonal * 12 if len(diagonal) == 1 else diagonal
+        seeds = (QUICK_SEEDS if self.quick else SEEDS) if self.seeds is None else self.seeds
+        settings = first.model_copy(update={"fitness": diagonal})
+        return Flights(settings, seeds, self.quick, on_flight)
 
 
 def known(kind: str) -> list[str]:
@@ -107,20 +102,17 @@ def check(options: PaperOptions) -> None:
             if f"{kind} {name}" not in MAKERS:
                 all_names = ", ".join(label.split()[1] for label in known(kind))
                 raise UserError(f"there is no {kind} {name!r}; known are {all_names}")
-    if not 1 <= options.seed_count <= MOST_SEEDS:
-        raise UserError(f"seeds must be 1 .. {MOST_SEEDS}, not {options.seed_count}")
+    if options.seeds is not None and not 1 <= options.seeds <= MOST_SEEDS:
+        raise UserError(f"seeds must be 1 .. {MOST_SEEDS}, not {options.seeds}")
     diagonal = options.initial_q or (1.0,)
     if len(diagonal) not in (1, 12):
         raise UserError(f"the initial Q takes 1 or 12 weights, not {len(diagonal)}")
     for weight in diagonal:
         if not (math.isfinite(weight) and weight >= 0):
             raise UserError(f"the weights of the initial Q must be 0 or more, not {weight:g}")
-    try:
-        options.out.mkdir(parents=True, exist_ok=True)
-        if any(options.out.iterdir()):
-            raise UserError(f"{options.out} is not empty; choose another directory with --out")
-    except OSError as error:
-        raise _not_written(options.out, error) from None
+    options.out.mkdir(parents=True, exist_ok=True)
+    if any(options.out.iterdir()):
+        raise UserError(f"{options.out} is not empty; choose another directory with --out")
 
 
 def reproduce(options: PaperOptions, console: Console | None = None) -> dict[str, Table | Figure]:
@@ -130,10 +122,18 @@ def reproduce(options: PaperOptions, console: Console | None = None) -> dict[str
     Returns tables and figures by label. Raises UserError for invalid options or an output that
     cannot be written.
     """
-    check(options)
+    try:
+        check(options)
+        return _reproduce(options, console or Console(stderr=True))
+    except OSError as error:
+        sentence = f"{options.out} cannot be written: {error.strerror or error}"
+        raise UserError(sentence) from None
+
+
+def _reproduce(options: PaperOptions, console: Console) -> dict[str, Table | Figure]:
     made: dict[str, Table | Figure] = {}
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
-    progress = Progress(*columns, TimeElapsedColumn(), console=console or Console(stderr=True))
+    progress = Progress(*columns, TimeElapsedColumn(), console=console)
     bar = progress.add_task("paper", total=len(options.labels))
     count = 0
 
@@ -142,20 +142,25 @@ def reproduce(options: PaperOptions, console: Console | None = None) -> dict[str
         count += 1
         progress.update(bar, description=f"{label}: flight {count}")
 
-    flights = Flights(options.first_settings, options.seed_count, options.quick, on_flight)
-    try:
-        with progress:
-            for label in options.labels:
-                progress.update(bar, description=label)
-                made[label] = MAKERS[label](flights)
-                _write(options.out, label, made[label])
-                progress.advance(bar)
-        facts = _facts(options)
-        (options.out / PAGE).write_text(page(made, facts), encoding="utf-8")
-        document = json.dumps({"run": facts}, indent=1) + "\n"
-        (options.out / "run.json").write_text(document, encoding="utf-8")
-    except OSError as error:
-        raise _not_written(options.out, error) from None
+    flights = options.flights(on_flight)
+    with progress:
+        for label in options.labels:
+            progress.update(bar, description=label)
+            made[label] = piece = MAKERS[label](flights)
+            stem = options.out / label.replace(" ", "_")
+            stem.with_suffix(".json").write_text(piece.to_json(), encoding="utf-8")
+            if isinstance(piece, Table):
+                stem.with_suffix(".csv").write_text(piece.to_csv(), encoding="utf-8")
+            progress.advance(bar)
+    facts = {
+        "pso-offboard": metadata.version("pso-offboard"),
+        "seeds per row": str(flights.seeds),
+        "quick": "yes" if options.quick else "no",
+        "diag Q of the first configuration": ", ".join(f"{q:g}" for q in flights.first.fitness),
+    }
+    (options.out / PAGE).write_text(page(made, facts), encoding="utf-8")
+    document = json.dumps({"run": facts}, indent=1) + "\n"
+    (options.out / "run.json").write_text(document, encoding="utf-8")
     return made
 
 
@@ -173,24 +178,3 @@ def page(made: Mapping[str, Table | Figure], facts: Mapping[str, str]) -> str:
         sections={title: pieces for title, pieces in sections.items() if pieces},
         shown=shown,
     )
-
-
-def _write(out: Path, label: str, made: Table | Figure) -> None:
-    stem = out / label.replace(" ", "_")
-    stem.with_suffix(".json").write_text(made.to_json(), encoding="utf-8")
-    if isinstance(made, Table):
-        stem.with_suffix(".csv").write_text(made.to_csv(), encoding="utf-8")
-
-
-def _not_written(out: Path, error: OSError) -> UserError:
-    return UserError(f"{out} cannot be written: {error.strerror or error}")
-
-
-def _facts(options: PaperOptions) -> dict[str, str]:
-    diagonal = options.first_settings.fitness
-    return {
-        "pso-offboard": metadata.version("pso-offboard"),
-        "seeds per row": str(options.seed_count),
-        "quick": "yes" if options.quick else "no",
-        "diag Q of the first configuration": ", ".join(f"{weight:g}" for weight in diagonal),
-    }

@@ -21,13 +21,13 @@ from offboard.documents.errors import plain
 from offboard.model.rigid_body import PHI, PSI, P, U, V, W
 from offboard.paper import printed
 from offboard.paper.closed_loop import Flight, Flights, FlightTask, PathName
-from offboard.paper.extensions import IntegralSettings, StateLimits
-from offboard.paper.law import PaperSettings
+from offboard.paper.law import IntegralSettings, PaperSettings, StateLimits
 from offboard.paper.plant import PlantKind
 
 Array = NDArray[np.float64]
 Cell = float | int | str | None
 Row = dict[str, Cell]
+Entries = dict[str, tuple[str, Cell]]  # a row: key -> heading and cell
 
 MISS = 1e-6  # a relative gap above this is a missed optimum
 ORDER_ONLY = "~"
@@ -54,9 +54,6 @@ MARGIN = 0.05  # on the nonlinear plant, for what the linear model neglects
 _STEADY_STEPS, _LAST_STEPS = 1500, 100
 
 
-Flown = Mapping[tuple[PlantKind, float], Sequence[Flight]]
-
-
 @dataclass(frozen=True, slots=True)
 class Table:
     """A table of the study.
@@ -72,6 +69,13 @@ class Table:
     columns: Mapping[str, str]
     rows: Sequence[Row]
     notes: Sequence[str] = ()
+
+    @classmethod
+    def of(cls, title: str, rows: Sequence[Entries], *notes: str) -> Table:
+        """A table of rows that say heading and cell under each key."""
+        columns = {key: heading for key, (heading, _) in rows[0].items()}
+        cells = [{key: cell for key, (_, cell) in row.items()} for row in rows]
+        return cls(title, columns, cells, notes)
 
     def to_csv(self) -> str:
         text = io.StringIO()
@@ -102,84 +106,66 @@ def shown(cell: Cell) -> str:
 
 def table_2(flights: Flights) -> Table:
     """Table 2 on both plants; `quick`: the nonlinear one at three lambdas only."""
-    flown = _by_damping(flights)
-    rows = [
-        _damping_row(plant, damping, each, flown[plant, printed.UNDAMPED])
-        for (plant, damping), each in flown.items()
-    ]
-    columns = {
-        "plant": "plant", "lambda": "λ", "mark": "ε / J",
-        "epsilon_mean_printed": "ε mean, printed", "epsilon_mean": "ε mean",
-        "epsilon_mean_sd": "± over seeds", "gap_median": "gap to J*, median",
-        "gap_p99": "gap, p99", "missed": "share missed > 1e-6",
-        "gain_printed": "J_c1 − J_cλ, printed", "gain": "J_c1 − J_cλ",
-        "gain_sd": "± over seeds", "signal_cost": "J of R and R_Δu",
-        "solve_ms_median": "solve ms, median", "solve_ms_p99": "solve ms, p99",
-        "epsilon_min_printed": "ε min, printed", "epsilon_min": "ε min",
-        "epsilon_max_printed": "ε max, printed", "epsilon_max": "ε max",
-    }  # fmt: skip
-    return Table("Table 2: the damping λ", columns, rows, (*_MARKS, *_gain_notes(flown)))
+    few = (printed.UNDAMPED, printed.LEAST_DAMPING, printed.BEST_DAMPING)
+    rows: list[Entries] = []
+    costs: dict[float, list[float]] = {}  # on the linear plant
+    for plant in PlantKind:
+        linear = plant is PlantKind.LINEAR
+        undamped = flights.by_seed(flights.damped(printed.UNDAMPED), plant)
+        for damping in printed.TABLE_2 if linear or not flights.quick else few:
+            flown = flights.by_seed(flights.damped(damping), plant)
+            rows.append(_damping_row(plant, damping, flown, undamped))
+            if linear:
+                costs[damping] = [float(flight.costs.sum()) for flight in flown]
+    return Table.of("Table 2: the damping λ", rows, *_MARKS, *_gain_notes(costs))
+
+
+def _over_seeds(key: str, heading: str, values: Sequence[float] | Array) -> Entries:
+    """Mean and standard deviation of one value per seed."""
+    spread = deviation(values)
+    return {key: (heading, float(np.mean(values))), f"{key}_sd": ("± over seeds", spread)}
 
 
 def _damping_row(
     plant: PlantKind, damping: float, flights: Sequence[Flight], undamped: Sequence[Flight]
-) -> Row:
-    print_row = printed.TABLE_2[damping] if plant is PlantKind.LINEAR else None
-    means = [float(flight.spreads.mean()) for flight in flights]
-    spreads = np.concatenate([flight.spreads for flight in flights])
-    gaps = np.concatenate([flight.gaps for flight in flights])
-    solve_ms = 1e3 * np.concatenate([flight.solve_s for flight in flights])
-    gains = [one.costs.sum() - own.costs.sum() for one, own in zip(undamped, flights, strict=True)]
-    return {
-        "plant": str(plant),
-        "lambda": damping,
-        "epsilon_mean_printed": print_row and print_row.mean,
-        "epsilon_mean": float(np.mean(means)),
-        "epsilon_mean_sd": deviation(means),
-        "epsilon_min_printed": print_row and print_row.least,
-        "epsilon_min": float(spreads.min()),
-        "epsilon_max_printed": print_row and print_row.greatest,
-        "epsilon_max": float(spreads.max()),
-        "gain_printed": print_row and print_row.gain,
-        "gain": float(np.mean(gains)),
-        "gain_sd": deviation(gains),
-        "signal_cost": float(np.mean([flight.signal_costs.sum() for flight in flights])),
-        "gap_median": float(np.median(gaps)),
-        "gap_p99": float(np.quantile(gaps, 0.99)),
-        "missed": float(np.mean(gaps > MISS)),
-        "solve_ms_median": float(np.median(solve_ms)),
-        "solve_ms_p99": float(np.quantile(solve_ms, 0.99)),
-        "mark": f"= / {ORDER_ONLY}" if print_row else "+",
-    }
-
-
-def _by_damping(flights: Flights) -> Flown:
-    """Flights, one per seed, by plant and lambda."""
-    few = (printed.UNDAMPED, printed.LEAST_DAMPING, printed.BEST_DAMPING)
-    return {
-        (plant, damping): flights.by_seed(flights.damped(damping), plant)
-        for plant in PlantKind
-        for damping in printed.TABLE_2
-        if plant is PlantKind.LINEAR or not flights.quick or damping in few
-    }
-
-
-def _gain_notes(flown: Flown) -> list[str]:
-    linear = {
-        damping: [flight.costs.sum() for flight in flights]
-        for (plant, damping), flights in flown.items()
-        if plant is PlantKind.LINEAR
-    }
-    if not {printed.UNDAMPED, printed.BEST_DAMPING} <= linear.keys():
-        return []
-    undamped, best = linear[printed.UNDAMPED], np.mean(linear[printed.BEST_DAMPING])
-    share = printed.TABLE_2[printed.BEST_DAMPING].gain / printed.UNDAMPED_COST
-    damped = [damping for damping in linear if damping != printed.UNDAMPED]
-    worst = max(damped, key=lambda damping: float(np.mean(linear[damping])))
-    worst_printed = min(
-        (damping for damping in printed.TABLE_2 if damping != printed.UNDAMPED),
-        key=lambda damping: printed.TABLE_2[damping].gain,
+) -> Entries:
+    linear = plant is PlantKind.LINEAR
+    theirs = printed.TABLE_2[damping]._asdict() if linear else {}
+    spreads, gaps, solve_s = (
+        np.concatenate([getattr(flight, name) for flight in flights])
+        for name in ("spreads", "gaps", "solve_s")
     )
+    gains = [one.costs.sum() - own.costs.sum() for one, own in zip(undamped, flights, strict=True)]
+    signal_cost = np.mean([flight.signal_costs.sum() for flight in flights])
+    means = [float(flight.spreads.mean()) for flight in flights]
+    return {
+        "plant": ("plant", str(plant)),
+        "lambda": ("λ", damping),
+        "mark": ("ε / J", f"= / {ORDER_ONLY}" if linear else "+"),
+        "epsilon_mean_printed": ("ε mean, printed", theirs.get("mean")),
+        **_over_seeds("epsilon_mean", "ε mean", means),
+        "gap_median": ("gap to J*, median", float(np.median(gaps))),
+        "gap_p99": ("gap, p99", float(np.quantile(gaps, 0.99))),
+        "missed": ("share missed > 1e-6", float(np.mean(gaps > MISS))),
+        "gain_printed": ("J_c1 − J_cλ, printed", theirs.get("gain")),
+        **_over_seeds("gain", "J_c1 − J_cλ", gains),
+        "signal_cost": ("J of R and R_Δu", float(signal_cost)),
+        "solve_ms_median": ("solve ms, median", 1e3 * float(np.median(solve_s))),
+        "solve_ms_p99": ("solve ms, p99", 1e3 * float(np.quantile(solve_s, 0.99))),
+        "epsilon_min_printed": ("ε min, printed", theirs.get("least")),
+        "epsilon_min": ("ε min", float(spreads.min())),
+        "epsilon_max_printed": ("ε max, printed", theirs.get("greatest")),
+        "epsilon_max": ("ε max", float(spreads.max())),
+    }
+
+
+def _gain_notes(costs: dict[float, list[float]]) -> list[str]:
+    """What may be said of the gain, by the cost of each flight for each lambda."""
+    undamped, best = costs[printed.UNDAMPED], np.mean(costs[printed.BEST_DAMPING])
+    share = printed.TABLE_2[printed.BEST_DAMPING].gain / printed.UNDAMPED_COST
+    damped = [damping for damping in costs if damping != printed.UNDAMPED]
+    worst = max(damped, key=lambda damping: float(np.mean(costs[damping])))
+    worst_printed = min(damped, key=lambda damping: printed.TABLE_2[damping].gain)
     return [
         f"Least gain: computed, λ = {worst:g}; printed (one run), λ = {worst_printed:g}, just "
         "below 0.3. From 0.5 on the gain no longer changes, in the paper and here.",
@@ -221,35 +207,26 @@ Side = tuple[str, printed.Eight, Sequence[Flight]]
 def _errors_table(
     title: str, before: Side, after: Side, ratio: printed.Eight, remark: str
 ) -> Table:
-    errors = [np.array([flight.errors for flight in side[2]]) for side in (before, after)]
-    rows: list[Row] = [
+    left, right = (np.array([flight.errors for flight in side[2]]) for side in (before, after))
+    rows: list[Entries] = [
         {
-            "error": name,
-            "before_printed": before[1][i],
-            "before": float(errors[0][:, i].mean()),
-            "before_sd": deviation(errors[0][:, i]),
-            "after_printed": after[1][i],
-            "after": float(errors[1][:, i].mean()),
-            "after_sd": deviation(errors[1][:, i]),
-            "ratio_printed": ratio[i],
-            "ratio": float(errors[1][:, i].mean() / errors[0][:, i].mean()),
-            "ratio_sd": deviation(errors[1][:, i] / errors[0][:, i]),
-            "mark": ORDER_ONLY,
+            "error": ("error", name),
+            "before_printed": (f"{before[0]}, printed", before[1][i]),
+            **_over_seeds("before", before[0], left[:, i]),
+            "after_printed": (f"{after[0]}, printed", after[1][i]),
+            **_over_seeds("after", after[0], right[:, i]),
+            "ratio_printed": ("ratio, printed", ratio[i]),
+            "ratio": ("ratio", float(right[:, i].mean() / left[:, i].mean())),
+            "ratio_sd": ("± over seeds", deviation(right[:, i] / left[:, i])),
+            "mark": ("comparable?", ORDER_ONLY),
         }
         for i, name in enumerate(printed.ERRORS)
     ]
-    columns = {
-        "error": "error", "before_printed": f"{before[0]}, printed", "before": before[0],
-        "before_sd": "± over seeds", "after_printed": f"{after[0]}, printed",
-        "after": after[0], "after_sd": "± over seeds", "ratio_printed": "ratio, printed",
-        "ratio": "ratio", "ratio_sd": "± over seeds", "mark": "comparable?",
-    }  # fmt: skip
-    notes = (
+    units = (
         "Sums over 1000 steps; velocities in m²/s², positions in m², heading in degrees squared "
-        "(radians could not give the printed magnitude). All on the linear plant. " + _MARKS[1],
-        remark,
+        "(radians could not give the printed magnitude). All on the linear plant. " + _MARKS[1]
     )
-    return Table(title, columns, rows, notes)
+    return Table.of(title, rows, units, remark)
 
 
 def deviation(values: Sequence[float] | np.ndarray) -> float | None:
@@ -276,27 +253,23 @@ def steady_error_m(flight: Flight) -> float:
 
 def integral_table(flights: Flights) -> Table:
     """Steady and greatest position errors."""
-    flown = steady_flights(flights)
-    rows: list[Row] = [
-        {
-            "case": case,
-            "plant": str(plant),
-            "law": law,
-            "steady_m": steady_error_m(flight),
-            "greatest_m": float(flight.position_errors_m.max()),
-        }
-        for (law, case, plant), flight in sorted(flown.items(), key=lambda item: item[0][1:])
-    ]
-    columns = {
-        "case": "hover, 150 s", "plant": "plant", "law": "law",
-        "steady_m": "steady position error, m", "greatest_m": "greatest, m",
-    }  # fmt: skip
-    notes = (
+    flown = sorted(steady_flights(flights).items(), key=lambda item: item[0][1:])
+    return Table.of(
+        "Integral term",
+        [
+            {
+                "case": ("hover, 150 s", case),
+                "plant": ("plant", str(plant)),
+                "law": ("law", law),
+                "steady_m": ("steady position error, m", steady_error_m(flight)),
+                "greatest_m": ("greatest, m", float(flight.position_errors_m.max())),
+            }
+            for (law, case, plant), flight in flown
+        ],
         "Flown by the controller paper_integral. With the position weights of Eq. 33 the integral "
         "would have a time constant of 79 s at best; hence the raised weights, which alone leave "
         "a steady error.",
     )
-    return Table("Integral term", columns, rows, notes)
 
 
 def limited_flights(flights: Flights) -> dict[tuple[str, PlantKind], Flight]:
@@ -330,28 +303,28 @@ def limited_states(flight: Flight, plant: PlantKind) -> dict[str, Array]:
 
 def limits_table(flights: Flights) -> Table:
     """The greatest value of each limited state, and the number of samples above its limit."""
-    rows: list[Row] = []
+    rows: list[Entries] = []
     for (name, plant), flight in limited_flights(flights).items():
         for key, values in limited_states(flight, plant).items():
             limit = float(getattr(LIMITS, key))
             rows.append(
                 {
-                    "plant": str(plant),
-                    "law": name,
-                    "state": key,
-                    "limit": limit,
-                    "greatest": float(values.max()),
-                    "samples_over": int(np.sum(values > limit * (1 + 1e-9))),
-                    "samples": len(values),
+                    "plant": ("plant", str(plant)),
+                    "law": ("law", name),
+                    "state": ("state", key),
+                    "limit": ("limit", limit),
+                    "greatest": ("greatest", float(values.max())),
+                    "samples_over": (
+                        "samples over the limit",
+                        int(np.sum(values > limit * (1 + 1e-9))),
+                    ),
+                    "samples": ("of", len(values)),
                 }
             )
-    columns = {
-        "plant": "plant", "law": "law", "state": "state", "limit": "limit",
-        "greatest": "greatest", "samples_over": "samples over the limit", "samples": "of",
-    }  # fmt: skip
-    notes = (
+    return Table.of(
+        "State limits",
+        rows,
         "Flown by the controller paper_limited. On the linear plant the limits hold exactly, by "
         "construction; on the nonlinear one a margin of 5 % covers what the model neglects. The "
         "reference requires more than the limits allow, so the tracking error grows.",
     )
-    return Table("State limits", columns, rows, notes)

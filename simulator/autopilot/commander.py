@@ -27,6 +27,9 @@ from simulator.firmware.values import (
     Triple,
 )
 
+# EKF2_GPS_V_GATE standard deviations of EKF2_GPS_V_NOISE; EK3_VEL_I_GATE of EK3_VELNE_M_NSE
+_GATE_MPS = 5.0 * 0.3
+
 
 @dataclass(frozen=True, slots=True)
 class Request:
@@ -84,14 +87,14 @@ class Commander:
 
     @property
     def velocity_ratio(self) -> float:
-        """Innovation ratio of the velocity in the estimator."""
-        error_mps = math.hypot(*self._state.velocity_error_ned_mps)
-        return self._firmware.velocity_ratio(error_mps)
+        """Innovation ratio of the velocity in the estimator, as the firmware reports it."""
+        ratio = math.hypot(*self._state.velocity_error_ned_mps) / _GATE_MPS
+        return ratio**2 if self._firmware.velocity_ratio_squared else ratio
 
     @property
     def rejects_velocity(self) -> bool:
         """The innovation ratio of the velocity is too large to arm."""
-        most = self._firmware.velocity_ratio_most(self._parameters.__getitem__)
+        most = self._parameters.role("velocity_ratio_most")
         return most > 0.0 and self.velocity_ratio >= most
 
     @property

@@ -1,7 +1,7 @@
 """A mission: its items, its progress, and the place to fly to.
 
 What it reaches (an item, its end, an item that returns home) is an event. Knows positions and time;
-knows no modes, no links and no protocol (`simulator.mavlink.mission_transfer`).
+knows no modes, no links and no protocol (`simulator.mavlink.transfers`).
 """
 
 from __future__ import annotations

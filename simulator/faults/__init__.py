@@ -10,9 +10,15 @@ from typing import Annotated
 from pydantic import Field
 
 from simulator.faults.fault import Direction
-from simulator.faults.messages import ClockJump, LinkFault, SilentMessage, StuckMessage
-from simulator.faults.pilot import PilotDisarms, PilotTakesOver, Reboot, Refusal
-from simulator.faults.senders import SecondSender, SecondVehicle, Stranger
+from simulator.faults.link import (
+    ClockJump,
+    LinkFault,
+    SecondSender,
+    SecondVehicle,
+    SilentMessage,
+    Stranger,
+    StuckMessage,
+)
 from simulator.faults.vehicle import (
     BatteryDrop,
     BlindLandDetector,
@@ -20,6 +26,10 @@ from simulator.faults.vehicle import (
     GpsLoss,
     MassChange,
     MotorsCut,
+    PilotDisarms,
+    PilotTakesOver,
+    Reboot,
+    Refusal,
     ThrustChange,
     VelocityError,
     WeakMotor,

@@ -20,7 +20,7 @@ from offboard.documents.parameters import Parameters
 from simulator.autopilot.autopilot import Autopilot
 from simulator.firmware.catalogue import FIRMWARES
 from simulator.firmware.values import Behaviour
-from simulator.link.impairment import Channel, Impairment, LinkDirection
+from simulator.link.impairment import Channel, Impairment
 from simulator.mavlink.codec import id_of
 from simulator.mavlink.server import Server
 from simulator.mavlink.view import View
@@ -112,11 +112,12 @@ def until_the_end() -> Effect:
 
 @dataclass(slots=True)
 class Injection:
-    """All faults of one flight. `down` and `up`: directions of the companion link; `strangers`:
-    datagrams that wait to be sent to the companion, each list from a port of its own."""
+    """All faults of one flight. `down` and `up`: channels of the companion link's directions;
+    `strangers`: datagrams that wait to be sent to the companion, each list from a port of its own.
+    """
 
-    down: LinkDirection
-    up: LinkDirection
+    down: list[Channel]
+    up: list[Channel]
     strangers: list[list[bytes]]
     _waiting: list[Running]
     _moments: dict[Moment, float] = field(default_factory=dict)
@@ -178,6 +179,5 @@ def prepare(scenario: Sequence[Timed], seed: int) -> Injection | None:
                 channels[-1].on = False
                 path.append(channels[-1])
         waiting.append(Running(fault, channels, Random(f"{seed} {number}")))
-    down, up = (LinkDirection(tuple(path)) for path in paths.values())
     strangers = [one.datagrams for one in waiting if one.fault.from_another_port]
-    return Injection(down, up, strangers, waiting)
+    return Injection(paths[Direction.DOWN], paths[Direction.UP], strangers, waiting)

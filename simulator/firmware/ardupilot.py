@@ -1,7 +1,7 @@
 """ArduCopter 4.6: how it reads commands and setpoints, checks, fails and flies.
 
 Measured on ArduCopter 4.6.3 SITL where MAVLink shows it. Modes and parameters are in
-`simulator.firmware.ardupilot_tables`, the state table in `simulator.firmware.ardupilot_rules`,
+`simulator.firmware.ardupilot_tables`, the state table in `simulator.firmware.ardupilot_tables`,
 telemetry in `simulator.firmware.ardupilot_messages`.
 """
 
@@ -12,15 +12,13 @@ from collections.abc import Mapping
 from typing import Any
 
 from simulator.firmware import ardupilot_messages as telemetry
-from simulator.firmware.ardupilot_rules import RULES
-from simulator.firmware.ardupilot_tables import MODES, PARAMETERS, ROLES
+from simulator.firmware.ardupilot_tables import MODES, PARAMETERS, ROLES, RULES
 from simulator.firmware.base import Firmware, Landing, PositionGains, StickFlight
 from simulator.firmware.values import (
     NAN3,
-    ArmRequest,
+    Asked,
     AttitudeSetpoint,
     MissionItem,
-    ModeRequest,
     MotionSetpoint,
     Quaternion,
     ReadParameter,
@@ -64,33 +62,31 @@ _UNSUPPORTED_FRAME = 2  # MAV_MISSION_RESULT
 _PLACE_FRAMES = frozenset({0, 3, 5, 6, 10, 11})
 _PLACES = frozenset({16, 17, 18, 19, 21, 22, 31, 82, 201})  # MAV_CMD of missions that have a place
 
-_GATE_MPS = 5.0 * 0.3  # EK3_VEL_I_GATE standard deviations of EK3_VELNE_M_NSE
 _RETURN_LEAST_M = 2.0  # RTL_ALT_MIN
 
 
 class ArduCopter(Firmware):
     """ArduCopter 4.6."""
 
-    def command_mode(self, params: tuple[float, ...]) -> ModeRequest:
+    def command_mode(self, params: tuple[float, ...]) -> Asked:
         """MAV_CMD_DO_SET_MODE (176): param1 base mode, param2 the mode's number."""
         base, number = (int(p) if math.isfinite(p) else 0 for p in params[:2])
         if not base & _CUSTOM_MODE_ENABLED:
-            return ModeRequest(None, Result.DENIED)
-        known = _BY_NUMBER.get(number)
+            return Asked(refusal=Result.DENIED)
         text = f"No such mode {number}"
         if number in _NOT_ENTERED:
             text = f"Mode change to {_NOT_ENTERED[number]}"
-        return ModeRequest(known, Result.FAILED, None if known else warning(text))
+        return Asked(_BY_NUMBER.get(number, ""), Result.FAILED, warning(text))
 
-    def set_mode(self, base_mode: int, custom_mode: int) -> ModeRequest:
+    def set_mode(self, base_mode: int, custom_mode: int) -> Asked:
         """SET_MODE: the mode's number is custom_mode."""
         return self.command_mode((base_mode, custom_mode))
 
-    def arm_request(self, param: float) -> ArmRequest:
+    def arm_request(self, param: float) -> Asked:
         """1 arms, 0 disarms, anything else is not supported."""
         if param in (0.0, 1.0):
-            return ArmRequest("arm" if param else "disarm")
-        return ArmRequest(refusal=Result.UNSUPPORTED)
+            return Asked("arm" if param else "disarm")
+        return Asked(refusal=Result.UNSUPPORTED)
 
     def attitude_setpoint(
         self, values: Mapping[str, Any], parameter: ReadParameter
@@ -186,21 +182,9 @@ class ArduCopter(Firmware):
             return _UNSUPPORTED_FRAME, None
         return None
 
-    def is_ground_station(self, kind: int, system: int, parameter: ReadParameter) -> bool:
-        """By system id, whatever the MAV_TYPE."""
-        return system == parameter("SYSID_MYGCS")
-
     def obeys_system(self, sender: int, own: int, parameter: ReadParameter) -> bool:
         """All systems; with SYSID_ENFORCE the ground station and its own components only."""
         return not parameter("SYSID_ENFORCE") or sender in (own, parameter("SYSID_MYGCS"))
-
-    def velocity_ratio(self, error_mps: float) -> float:
-        """The ratio as EKF_STATUS_REPORT has it: the square root of the squared test ratio."""
-        return error_mps / _GATE_MPS
-
-    def velocity_ratio_most(self, parameter: ReadParameter) -> float:
-        """As the failsafe in flight."""
-        return parameter("FS_EKF_THRESH")
 
     def battery_level(self, battery: BatteryState, parameter: ReadParameter) -> int:
         """By voltage or by remaining charge; a threshold of 0 disables the check."""
@@ -287,6 +271,7 @@ ARDUPILOT = ArduCopter(
     companion_rates_hz=telemetry.COMPANION_RATES_HZ,
     ground_rates_hz=telemetry.GROUND_RATES_HZ,
     messages=builders_in(telemetry),
+    ground_station_parameter="SYSID_MYGCS",
     withheld_until={
         "LOCAL_POSITION_NED": "position",
         "GPS_GLOBAL_ORIGIN": "origin",

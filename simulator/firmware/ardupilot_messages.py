@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from offboard.model.frames import euler_from_quaternion, rotation_from_quaternion
-from simulator.autopilot.position_loop import GRAVITY_MPS2
+from offboard.model.frames import euler_from_quaternion
 from simulator.firmware.ardupilot_tables import BY_HAND, BY_POSITION
 from simulator.firmware.values import AttitudeSetpoint
 from simulator.mavlink.view import View
@@ -34,15 +33,6 @@ _EKF_FLAGS = (("position", 831), ("attitude", 167), ("aligning", 0))
 _EKF_UNINITIALISED = 1024
 
 
-def _specific_force(view: View) -> tuple[float, float, float]:
-    """True specific force, FRD, m/s^2."""
-    truth = view.autopilot.state.truth
-    force_ned = truth.acceleration_ned_mps2.copy()
-    force_ned[2] -= GRAVITY_MPS2
-    x, y, z = (rotation_from_quaternion(truth.attitude).T @ force_ned).tolist()
-    return x, y, z
-
-
 def heartbeat(view: View) -> Sequence[Any]:
     """MAV_STATE: 1 booting, 3 on the ground, 4 in the air, 5 in trouble."""
     autopilot, commander = view.autopilot, view.autopilot.commander
@@ -64,7 +54,7 @@ def sim_state(view: View) -> Sequence[Any]:
     return (
         *truth.attitude.tolist(),
         *euler_from_quaternion(truth.attitude).tolist(),
-        *_specific_force(view),
+        *view.specific_force,
         *truth.rates_frd_radps.tolist(),
         latitude * 1e-7,
         longitude * 1e-7,

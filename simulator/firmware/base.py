@@ -14,11 +14,10 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from simulator.firmware.values import (
-    ArmRequest,
+    Asked,
     AttitudeSetpoint,
     MissionItem,
     Mode,
-    ModeRequest,
     MotionSetpoint,
     Quaternion,
     ReadParameter,
@@ -28,6 +27,7 @@ from simulator.firmware.values import (
 )
 from simulator.vehicle.battery import BatteryState
 
+_MAV_TYPE_GCS = 6
 Role = str | float | tuple[str, float]
 """Where a value comes from: a parameter, a constant, or a parameter and the factor to SI."""
 
@@ -206,6 +206,7 @@ class Firmware(ABC):
 
     # link
     ground_station_stays_s: float = 0.0  # after its last heartbeat
+    ground_station_parameter: str = ""  # its system id; "": known by its MAV_TYPE
     target_component_checked: bool = False
     text_suffix: str = ""
     text_to_ground_stations_only: bool = False
@@ -223,6 +224,7 @@ class Firmware(ABC):
     passes_without_position_after_s: float  # the same for modes that need none
     fails_where_unarmable: bool = False  # pre-arm checks fail in a mode that does not arm
     position_without_fix_s: float  # until the position estimate is lost
+    velocity_ratio_squared: bool = False  # as it reports the innovation ratio of the velocity
     battery_events: tuple[str, ...]  # of battery levels 1 on
 
     # flight
@@ -237,15 +239,15 @@ class Firmware(ABC):
         return self.modes.get(name) or self.modes.get(f"AUTO.{name}")
 
     @abstractmethod
-    def command_mode(self, params: tuple[float, ...]) -> ModeRequest:
+    def command_mode(self, params: tuple[float, ...]) -> Asked:
         """The request of MAV_CMD_DO_SET_MODE (176)."""
 
     @abstractmethod
-    def set_mode(self, base_mode: int, custom_mode: int) -> ModeRequest:
+    def set_mode(self, base_mode: int, custom_mode: int) -> Asked:
         """The request of SET_MODE, the deprecated message."""
 
     @abstractmethod
-    def arm_request(self, param: float) -> ArmRequest:
+    def arm_request(self, param: float) -> Asked:
         """The request of MAV_CMD_COMPONENT_ARM_DISARM with this param1."""
 
     @abstractmethod
@@ -272,21 +274,14 @@ class Firmware(ABC):
     def mission_refusal(self, item: MissionItem) -> tuple[int, StatusText | None] | None:
         """MAV_MISSION_RESULT and text with which an item is refused; None: it is taken."""
 
-    @abstractmethod
     def is_ground_station(self, kind: int, system: int, parameter: ReadParameter) -> bool:
         """Whether a heartbeat with this MAV_TYPE and system id is a ground station's."""
+        name = self.ground_station_parameter
+        return system == parameter(name) if name else kind == _MAV_TYPE_GCS
 
     def obeys_system(self, sender: int, own: int, parameter: ReadParameter) -> bool:
         """Whether messages of this system id are handled."""
         return True
-
-    @abstractmethod
-    def velocity_ratio(self, error_mps: float) -> float:
-        """Innovation ratio of the velocity, as the firmware reports it."""
-
-    @abstractmethod
-    def velocity_ratio_most(self, parameter: ReadParameter) -> float:
-        """Its limit to arm; 0: not checked."""
 
     @abstractmethod
     def battery_level(self, battery: BatteryState, parameter: ReadParameter) -> int:

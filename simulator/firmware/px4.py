@@ -2,7 +2,7 @@
 
 Measured on PX4 1.16.1 SITL where MAVLink shows it, including messages that it should refuse.
 Modes and parameters are in `simulator.firmware.px4_tables`, the state table in
-`simulator.firmware.px4_rules`, telemetry in `simulator.firmware.px4_messages`.
+`simulator.firmware.px4_tables`, telemetry in `simulator.firmware.px4_messages`.
 """
 
 from __future__ import annotations
@@ -16,13 +16,11 @@ import numpy as np
 from offboard.model.frames import rotation_from_quaternion
 from simulator.firmware import px4_messages as telemetry
 from simulator.firmware.base import Firmware, Landing, PositionGains
-from simulator.firmware.px4_rules import RULES
-from simulator.firmware.px4_tables import MODES, PARAMETERS, ROLES
+from simulator.firmware.px4_tables import MODES, PARAMETERS, ROLES, RULES
 from simulator.firmware.values import (
-    ArmRequest,
+    Asked,
     AttitudeSetpoint,
     MissionItem,
-    ModeRequest,
     MotionSetpoint,
     Quaternion,
     ReadParameter,
@@ -46,7 +44,6 @@ _AUTO_SUB = {
     9: "AUTO.PRECLAND",
 }
 _CUSTOM_MODE_ENABLED = 1
-_MAV_TYPE_GCS = 6
 _NO_AUTO_MODE = critical("Unsupported auto mode")
 
 # MAV_CMD accepted without an effect that the simulator shows, and not acknowledged at all
@@ -71,37 +68,35 @@ _ACTS = frozenset({
 })  # fmt: skip
 
 _BATTERY_THRESHOLDS = ("BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR")
-_GATE_MPS = 5.0 * 0.3  # EKF2_GPS_V_GATE standard deviations of EKF2_GPS_V_NOISE
 
 
 class Px4(Firmware):
     """PX4 1.16."""
 
-    def command_mode(self, params: tuple[float, ...]) -> ModeRequest:
+    def command_mode(self, params: tuple[float, ...]) -> Asked:
         """MAV_CMD_DO_SET_MODE (176): param1 base mode, param2 main mode, param3 sub mode of AUTO.
 
         An unknown main mode, or a base mode alone, is accepted and changes nothing.
         """
         base, main, sub = (int(p) if math.isfinite(p) else 0 for p in params[:3])
         if not base & _CUSTOM_MODE_ENABLED:
-            return ModeRequest(None, Result.ACCEPTED)
+            return Asked(refusal=Result.ACCEPTED)
         if main == 4:
-            known = _AUTO_SUB.get(sub)
-            text = None if known else _NO_AUTO_MODE
-            return ModeRequest(known, Result.TEMPORARILY_REJECTED, text)
-        return ModeRequest(_MAIN.get(main), Result.ACCEPTED)
+            known = _AUTO_SUB.get(sub, "")
+            return Asked(known, Result.TEMPORARILY_REJECTED, _NO_AUTO_MODE)
+        return Asked(_MAIN.get(main, ""), Result.ACCEPTED)
 
-    def set_mode(self, base_mode: int, custom_mode: int) -> ModeRequest:
+    def set_mode(self, base_mode: int, custom_mode: int) -> Asked:
         """SET_MODE: main mode in the third byte of custom_mode, sub mode in the fourth."""
         return self.command_mode((base_mode, custom_mode >> 16 & 0xFF, custom_mode >> 24))
 
-    def arm_request(self, param: float) -> ArmRequest:
+    def arm_request(self, param: float) -> Asked:
         """param1 rounded; one that is not finite disarms."""
         number = math.floor(param + 0.5) if math.isfinite(param) else 0
         if number in (0, 1):
-            return ArmRequest("arm" if number else "disarm")
+            return Asked("arm" if number else "disarm")
         text = f"Unsupported ARM_DISARM param: {param:.3f}"
-        return ArmRequest(text=critical(text))
+        return Asked(text=critical(text))
 
     def attitude_setpoint(
         self, values: Mapping[str, Any], parameter: ReadParameter
@@ -202,18 +197,6 @@ class Px4(Firmware):
         if by_place and not math.isfinite(item.z):
             return _UNSUPPORTED_FRAME, _INVALID
         return None
-
-    def is_ground_station(self, kind: int, system: int, parameter: ReadParameter) -> bool:
-        """By MAV_TYPE, whatever the system id."""
-        return kind == _MAV_TYPE_GCS
-
-    def velocity_ratio(self, error_mps: float) -> float:
-        """Squared, as PX4 reports it."""
-        return (error_mps / _GATE_MPS) ** 2
-
-    def velocity_ratio_most(self, parameter: ReadParameter) -> float:
-        """EKF2's limit before take-off."""
-        return 0.5
 
     def battery_level(self, battery: BatteryState, parameter: ReadParameter) -> int:
         """By the remaining share."""
@@ -317,6 +300,7 @@ PX4 = Px4(
     passes_without_position_after_s=4.0,
     fails_where_unarmable=True,
     position_without_fix_s=5.0,  # EKF2_NOAID_TOUT
+    velocity_ratio_squared=True,
     battery_events=("battery low", "battery critical", "battery emergency"),
     return_faces_way=True,
     integrates_on_ramp=True,

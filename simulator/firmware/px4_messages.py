@@ -13,7 +13,6 @@ from simulator.mavlink.view import (
     View,
     centi,
     fit,
-    in_body,
     pressure_hpa,
 )
 
@@ -134,12 +133,10 @@ def altitude(view: View) -> Sequence[Any]:
 def highres_imu(view: View) -> Sequence[Any]:
     """True specific force in body axes, estimated rates."""
     nav = view.autopilot.state.estimate
-    w, x, y, z, *_, down, a_north, a_east, a_down = view.autopilot.plant.motion()
-    force = in_body((w, x, y, z), (a_north, a_east, a_down - GRAVITY_MPS2))
-    height = view.autopilot.firmware.origin[2] - down
+    height = view.autopilot.firmware.origin[2] + view.autopilot.plant.height_m
     return (
         view.time_us,
-        *force,
+        *view.specific_force,
         *nav.rates_frd_radps,
         *(0.21, 0.0, 0.43),
         pressure_hpa(height),

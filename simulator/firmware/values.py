@@ -110,20 +110,12 @@ class Mode:
 
 
 @dataclass(frozen=True, slots=True)
-class ModeRequest:
-    """Mode that a command asks for by name, or the result to refuse it with."""
+class Asked:
+    """What a command asks for: a mode by name, "arm" or "disarm"; empty: refused with the result
+    (None: no acknowledgement) and the text."""
 
-    mode: str | None
-    refusal: Result = Result.DENIED
-    text: StatusText | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class ArmRequest:
-    """Event that an arm or disarm command asks for, or the result to refuse it with."""
-
-    event: str = ""
-    refusal: Result | None = None  # None: no acknowledgement
+    name: str = ""
+    refusal: Result | None = None
     text: StatusText | None = None
 
 

@@ -7,6 +7,7 @@ generator is passed in, so that the same seed gives the same faults.
 from __future__ import annotations
 
 import heapq
+from collections.abc import Sequence
 from random import Random
 
 from pydantic import Field
@@ -141,16 +142,10 @@ class Channel:
         return b"".join(kept)
 
 
-class LinkDirection:
-    """One direction of a link: any number of channels in series."""
-
-    def __init__(self, channels: tuple[Channel, ...] = ()) -> None:
-        self.channels = channels
-
-    def carry(self, datagrams: list[bytes], now_us: int) -> list[bytes]:
-        """Send these datagrams and return those that arrive now."""
-        for channel in self.channels:
-            for datagram in datagrams:
-                channel.put(datagram, now_us)
-            datagrams = channel.take(now_us)
-        return datagrams
+def carry(channels: Sequence[Channel], datagrams: list[bytes], now_us: int) -> list[bytes]:
+    """Send these datagrams through channels in series and return those that arrive now."""
+    for channel in channels:
+        for datagram in datagrams:
+            channel.put(datagram, now_us)
+        datagrams = channel.take(now_us)
+    return datagrams

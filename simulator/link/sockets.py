@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
-from offboard.documents.errors import abridged
+from offboard.documents.errors import UserError, abridged
 from simulator.link.framing import whole_frames
 
 PEERS_MAX = 16
@@ -27,7 +27,7 @@ UNSENT_MAX = 1 << 20  # bytes; a client that does not read more is disconnected
 _PORTS_APART = {"udpout": 1, "udpin": 1, "tcpin": 10}
 
 
-class LinkError(Exception):
+class LinkError(UserError):
     """An address that cannot be used; the message is one sentence."""
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from simulator.autopilot.autopilot import Autopilot
 from simulator.autopilot.commander import Request
-from simulator.firmware.values import Behaviour, ModeRequest, Result, Triple, info
+from simulator.firmware.values import Asked, Behaviour, Result, Triple, info
 from simulator.geodesy import down_m, to_metres
 from simulator.mavlink.codec import id_of, name_of
 from simulator.mavlink.outbox import Outbox
@@ -63,9 +63,9 @@ class Commands:
     def set_mode(self, base_mode: int, custom_mode: int, sender: tuple[int, int]) -> None:
         """SET_MODE, the deprecated message."""
         firmware = self._autopilot.firmware
-        request = firmware.set_mode(base_mode, custom_mode)
-        result = self._request(request, sender[1] == _MISSION_PLANNER)
-        if firmware.set_mode_acked_as is not None:
+        asked = firmware.set_mode(base_mode, custom_mode)
+        result = self._enter(asked, sender[1] == _MISSION_PLANNER)
+        if firmware.set_mode_acked_as is not None and result is not None:
             self._acknowledge(Command(firmware.set_mode_acked_as, (), *sender), result)
 
     def _acknowledge(self, command: Command, result: Result) -> None:
@@ -73,27 +73,28 @@ class Commands:
             "COMMAND_ACK", command.number, int(result), 0, 0, command.system, command.component
         )
 
-    def _set_mode(self, autopilot: Autopilot, command: Command) -> Result:
+    def _set_mode(self, autopilot: Autopilot, command: Command) -> Result | None:
         if autopilot.firmware.mode_acked_twice:
             self._acknowledge(command, Result.ACCEPTED)
         by_ground_station = command.component == _MISSION_PLANNER
-        return self._request(autopilot.firmware.command_mode(command.params), by_ground_station)
+        return self._enter(autopilot.firmware.command_mode(command.params), by_ground_station)
 
-    def _request(self, request: ModeRequest, by_ground_station: bool) -> Result:
-        autopilot = self._autopilot
-        if request.mode is None:
-            if request.text is not None:
-                autopilot.commander.texts.append(request.text)
-            return request.refusal
-        return autopilot.handle("mode", Request(request.mode, by_ground_station=by_ground_station))
+    def _refused(self, asked: Asked) -> Result | None:
+        self._autopilot.commander.texts += () if asked.text is None else (asked.text,)
+        return asked.refusal
+
+    def _enter(self, asked: Asked, by_ground_station: bool) -> Result | None:
+        if not asked.name:
+            return self._refused(asked)
+        request = Request(asked.name, by_ground_station=by_ground_station)
+        return self._autopilot.handle("mode", request)
 
     def _arm_disarm(self, autopilot: Autopilot, command: Command) -> Result | None:
-        request = autopilot.firmware.arm_request(command.params[0])
-        if not request.event:
-            autopilot.commander.texts += () if request.text is None else (request.text,)
-            return request.refusal
-        forced = command.params[1] == autopilot.firmware.force_codes[request.event]
-        return autopilot.handle(f"force {request.event}" if forced else request.event)
+        asked = autopilot.firmware.arm_request(command.params[0])
+        if not asked.name:
+            return self._refused(asked)
+        forced = command.params[1] == autopilot.firmware.force_codes[asked.name]
+        return autopilot.handle(f"force {asked.name}" if forced else asked.name)
 
     def _takeoff(self, autopilot: Autopilot, command: Command) -> Result:
         height_m = command.params[6]

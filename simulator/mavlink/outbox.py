@@ -11,8 +11,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from simulator.firmware.values import StatusText
-from simulator.mavlink.codec import Encoder, message_of
-from simulator.mavlink.signing import Keyring
+from simulator.mavlink.codec import Encoder, Keyring, message_of
 from simulator.mavlink.view import View
 
 MAV_COMP_ID_AUTOPILOT = 1

@@ -6,22 +6,18 @@ the `outbox`. Knows no socket and no clock: time is the autopilot's.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from simulator.autopilot.setpoints import ATTITUDE, GLOBAL, LOCAL
-from simulator.mavlink.codec import Decoder, Message, sender_of
+from simulator.mavlink.codec import Decoder, Keyring, Message, sender_of
 from simulator.mavlink.commands import Command, Commands
-from simulator.mavlink.mission_transfer import HANDLERS as MISSION_HANDLERS
-from simulator.mavlink.mission_transfer import MissionTransfer
 from simulator.mavlink.outbox import MAV_COMP_ID_AUTOPILOT, Outbox, Texts
-from simulator.mavlink.parameter_transfer import HANDLERS as PARAMETER_HANDLERS
-from simulator.mavlink.parameter_transfer import ParameterTransfer
-from simulator.mavlink.signing import Keyring
 from simulator.mavlink.telemetry import Schedule
+from simulator.mavlink.transfers import Handlers, MissionTransfer, ParameterTransfer
 from simulator.mavlink.view import View
 
-_ITEMS, _GUIDED = ("MISSION_ITEM", "MISSION_ITEM_INT"), 2  # `current` of an item
+_GUIDED = 2  # `current` of a mission item that is a place to fly to now
 _FTP_NAK, _FTP_ERROR_NOT_FOUND = 128 + 1, 10
 
 
@@ -50,6 +46,7 @@ class Server:
     _commands: Commands = field(init=False)
     _parameters: ParameterTransfer = field(init=False)
     _missions: MissionTransfer = field(init=False)
+    _handlers: Handlers = field(init=False)  # by message
 
     def __post_init__(self) -> None:
         self.decoder = Decoder(self.keyring)
@@ -64,6 +61,23 @@ class Server:
     def _begin_transfers(self) -> None:
         self._parameters = ParameterTransfer(self.outbox)
         self._missions = MissionTransfer(self.outbox, self.texts)
+        self._handlers = {
+            "HEARTBEAT": self._heartbeat,
+            "COMMAND_LONG": self._command_long,
+            "COMMAND_INT": self._command_int,
+            "SET_MODE": self._set_mode,
+            **dict.fromkeys((ATTITUDE, LOCAL, GLOBAL), self._setpoint),
+            **self._missions.handlers,
+            **dict.fromkeys(("MISSION_ITEM", "MISSION_ITEM_INT"), self._mission_item),
+            "TIMESYNC": self._timesync,
+            **self._parameters.handlers,
+            "RC_CHANNELS_OVERRIDE": self._rc_channels_override,
+            "MANUAL_CONTROL": self._manual_control,
+            "SETUP_SIGNING": self._setup_signing,
+            "LOG_REQUEST_LIST": self._log_request_list,
+            "REQUEST_DATA_STREAM": self._request_data_stream,
+            "FILE_TRANSFER_PROTOCOL": self._file_transfer,
+        }
 
     def restart(self) -> None:
         """Reset as after boot: default rates, no known client."""
@@ -74,7 +88,7 @@ class Server:
 
     def step(self) -> None:
         """Queue what is due at this step: missions, lists of parameters, telemetry."""
-        self._missions.step(self.view.autopilot.state.time_us * 1e-6)
+        self._missions.step()
         self._parameters.step()
         for name in self.schedule.take_due():
             self.outbox.send_now(name)
@@ -89,9 +103,9 @@ class Server:
         """Handle all messages of one datagram; no bytes make this raise."""
         for message in self.decoder.read(datagram):
             self.texts.connected = True
-            handler = HANDLERS.get(message.get_type())
+            handler = self._handlers.get(message.get_type())
             if handler is not None and self._is_for_us(message):
-                handler(self, message)
+                handler(message)
 
     def _is_for_us(self, message: Message) -> bool:
         """Whether its target is this system and its autopilot, or all."""
@@ -127,18 +141,10 @@ class Server:
     def _set_mode(self, message: Message) -> None:
         self._commands.set_mode(message.base_mode, message.custom_mode, sender_of(message))
 
-    def _parameter(self, message: Message) -> None:
-        self._parameters.handle(message)
-
-    def _mission(self, message: Message) -> None:
-        guided = self.view.autopilot.firmware.guided_items
-        if guided and message.get_type() in _ITEMS and message.current == _GUIDED:
-            self._guided_item(message)
+    def _mission_item(self, message: Message) -> None:
+        if not (self.view.autopilot.firmware.guided_items and message.current == _GUIDED):
+            self._missions.item(message)
             return
-        self._missions.handle(message, self.view.autopilot.state.time_us * 1e-6)
-
-    def _guided_item(self, message: Message) -> None:
-        """A mission item that is a place to fly to now (ArduPilot, `current` = 2)."""
         scale = 1e-7 if message.get_type().endswith("INT") else 1.0
         place = (message.x * scale, message.y * scale, message.z)
         accepted = self._commands.go_to(place, message.frame)
@@ -189,21 +195,3 @@ class Server:
         answer = head + (0,) * 6 + (_FTP_ERROR_NOT_FOUND,)
         padded = answer + (0,) * (len(request) - len(answer))
         self.outbox.send("FILE_TRANSFER_PROTOCOL", 0, *sender_of(message), padded)
-
-
-HANDLERS: dict[str, Callable[[Server, Message], None]] = {
-    "HEARTBEAT": Server._heartbeat,
-    "COMMAND_LONG": Server._command_long,
-    "COMMAND_INT": Server._command_int,
-    "SET_MODE": Server._set_mode,
-    **dict.fromkeys((ATTITUDE, LOCAL, GLOBAL), Server._setpoint),
-    **dict.fromkeys(MISSION_HANDLERS, Server._mission),
-    "TIMESYNC": Server._timesync,
-    **dict.fromkeys(PARAMETER_HANDLERS, Server._parameter),
-    "RC_CHANNELS_OVERRIDE": Server._rc_channels_override,
-    "MANUAL_CONTROL": Server._manual_control,
-    "SETUP_SIGNING": Server._setup_signing,
-    "LOG_REQUEST_LIST": Server._log_request_list,
-    "REQUEST_DATA_STREAM": Server._request_data_stream,
-    "FILE_TRANSFER_PROTOCOL": Server._file_transfer,
-}

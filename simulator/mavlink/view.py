@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from simulator.autopilot.autopilot import Autopilot
-from simulator.firmware.values import Quaternion, Triple
+from simulator.autopilot.position_loop import GRAVITY_MPS2
+from simulator.firmware.values import Triple
 from simulator.geodesy import DEGREES_PER_M, east_degrees_per_m, wrapped_deg
 from simulator.mavlink.codec import message_of
 
@@ -105,6 +106,21 @@ class View:
         return present, enabled, health
 
     @property
+    def specific_force(self) -> Triple:
+        """True specific force, FRD, m/s^2: v + 2 r x (r x v - w v) with the quaternion (w, r)."""
+        truth = self.autopilot.state.truth
+        w, x, y, z = truth.attitude.tolist()
+        north, east, down = truth.acceleration_ned_mps2.tolist()
+        down -= GRAVITY_MPS2
+        a, b, c = y * down - z * east, z * north - x * down, x * east - y * north
+        a, b, c = a - w * north, b - w * east, c - w * down
+        return (
+            north + 2.0 * (y * c - z * b),
+            east + 2.0 * (z * a - x * c),
+            down + 2.0 * (x * b - y * a),
+        )
+
+    @property
     def landed_state(self) -> int:
         """MAV_LANDED_STATE: 1 on ground, 2 in air, 3 taking off, 4 landing."""
         if self.wrong_landed_state is not None:
@@ -168,16 +184,3 @@ def heading_cdeg(yaw_rad: float) -> int:
 def pressure_hpa(height_m: float) -> float:
     """Pressure of the standard atmosphere at this height above the sea; 0 above 44 km."""
     return 1013.25 * math.pow(max(0.0, 1.0 - 2.25577e-5 * height_m), 5.25588)
-
-
-def in_body(attitude: Quaternion, vector_ned: Triple) -> Triple:
-    """An NED vector in body axes: v + 2 r x (r x v - w v) with the quaternion (w, r)."""
-    w, x, y, z = attitude
-    north, east, down = vector_ned
-    a, b, c = y * down - z * east, z * north - x * down, x * east - y * north
-    a, b, c = a - w * north, b - w * east, c - w * down
-    return (
-        north + 2.0 * (y * c - z * b),
-        east + 2.0 * (z * a - x * c),
-        down + 2.0 * (x * b - y * a),
-    )

@@ -8,7 +8,6 @@ effect, charge consumed. Compiled. Knows no autopilot, no estimate and no random
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,6 @@ from numpy.typing import NDArray
 from offboard.compiled import kernel
 from offboard.model.rigid_body import pack, quaternion_into, rk4_into
 from offboard.model.vehicle import Vehicle
-from simulator.vehicle.battery import Pack
 from simulator.vehicle.conditions import Conditions
 
 Array = NDArray[np.float64]
@@ -37,20 +35,16 @@ _ROTOR_HEIGHT_M = 0.10
 _STIFFNESS_LIMIT = 0.5
 
 
-@dataclass(frozen=True, slots=True)
-class Airframe:
-    """Packed constants of the compiled step."""
-
-    body: Array  # offboard.model.rigid_body.pack of the simulated vehicle
-    rotor: Array  # thrust at full throttle N, factor of the lag in a step, thrust above which
-    #               torques are full, ground effect 0/1, hover thrust, hover current A
-    substeps: int
-    pack: Pack
-
-
-def build_airframe(vehicle: Vehicle, conditions: Conditions, step_s: float) -> Airframe:
+def build_airframe(
+    vehicle: Vehicle, conditions: Conditions, step_s: float
+) -> tuple[Array, Array, int]:
     """Constants of the simulated vehicle: the model that the controller has, too, with the factors
-    of the conditions on thrust and mass. `step_s`: length of a step."""
+    of the conditions on thrust and mass.
+
+    Returns those of the body, as `offboard.model.rigid_body.pack` has them; of the rotors: thrust
+    at full throttle N, factor of the lag in a step, thrust above which torques are full, ground
+    effect 0/1, hover thrust, hover current A; and the substeps of a step of `step_s`.
+    """
     body = pack(vehicle)
     lag_s = vehicle.thrust_lag_s
     rotor = np.array(
@@ -66,7 +60,7 @@ def build_airframe(vehicle: Vehicle, conditions: Conditions, step_s: float) -> A
     body[0] *= conditions.mass_scale
     stiffness = max(body[6:9].max() / body[0], (body[9:12] / body[2:5]).max())
     substeps = max(1, math.ceil(step_s * stiffness / _STIFFNESS_LIMIT))
-    return Airframe(body, rotor, substeps, Pack(conditions.battery, vehicle.hover_thrust))
+    return body, rotor, substeps
 
 
 @kernel

@@ -22,7 +22,7 @@ from simulator.vehicle.airframe import (
     build_airframe,
 )
 from simulator.vehicle.attitude import Demand, build_loop, encode
-from simulator.vehicle.battery import BatteryState
+from simulator.vehicle.battery import BatteryState, Pack
 from simulator.vehicle.conditions import Conditions
 from simulator.vehicle.dynamics import RECORD, advance_steps, draw_gusts, receive_fix, report_state
 from simulator.vehicle.noise import seed_word
@@ -63,15 +63,15 @@ class Plant:
 
     def __init__(self, vehicle: Vehicle, conditions: Conditions, seed: int) -> None:
         self.record = np.zeros(1, RECORD)
-        airframe = build_airframe(vehicle, conditions, STEP_S)
+        body, rotor, substeps = build_airframe(vehicle, conditions, STEP_S)
         loop, gusts = build_loop(vehicle, STEP_S), dryden(conditions.gusts, STEP_S)
         model = error_model(conditions.estimator, conditions.white_noise)
         errors, wind_ned_mps = error_process(model, STEP_S), conditions.wind_ned_mps
         constants = {
             "seed": seed_word(seed),
-            "substeps": airframe.substeps,
-            "body_constants": airframe.body,
-            "rotor_constants": airframe.rotor,
+            "substeps": substeps,
+            "body_constants": body,
+            "rotor_constants": rotor,
             "delays": loop.delays,
             "gains": loop.gains,
             "noisy": np.any(errors.scale != 0.0),
@@ -87,7 +87,7 @@ class Plant:
         record = self.record
         for name, value in constants.items():
             record[name] = value
-        self.pack = airframe.pack
+        self.pack = Pack(conditions.battery, vehicle.hover_thrust)
         self._demand: Demand | None = None
         self._body, self._rotor, self._wind = (
             record[name][0] for name in ("body", "rotor", "wind")
@@ -153,11 +153,6 @@ class Plant:
         receive_fix(self.record)
         fix: list[float] = self.record["fix"][0].tolist()
         return fix
-
-    def motion(self) -> list[float]:
-        """The true motion as floats: attitude wxyz, rates FRD, then NED velocity, position and
-        acceleration."""
-        return [*self._body.tolist(), *self._rotor[ACCELERATION].tolist()]
 
     @property
     def height_m(self) -> float:

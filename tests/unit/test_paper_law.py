@@ -24,7 +24,7 @@ from offboard.paper.controller import (
     heading_frame,
     input_scale,
 )
-from offboard.paper.extensions import ErrorIntegral, IntegralSettings
+from offboard.paper.law import ErrorIntegral, IntegralSettings
 from offboard.reference.base import FlatSample
 from offboard.run.configuration import load
 
@@ -117,11 +117,7 @@ def test_the_heading_frame_is_eq_5_at_heading_north() -> None:
 SUMMED = IntegralSettings(weights=(80.0, 80.0, 15.0, 50.0))
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [PaperSettings(attitude_lead=False), PaperSettings(attitude_lead=True),
-     PaperSettings(integral=SUMMED)],
-)  # fmt: skip
+@pytest.mark.parametrize("settings", [PaperSettings(), PaperSettings(integral=SUMMED)])
 @pytest.mark.parametrize("heading", [-2.9, 3.1])
 def test_the_law_is_the_same_at_every_heading(heading: float, settings: PaperSettings) -> None:
     """With the sum of three decisions, where there is one."""
@@ -155,25 +151,6 @@ def test_what_is_sent_is_the_attitude_of_the_next_state() -> None:
     assert command.thrust_direction_ned == pytest.approx(attitude[:, 2], abs=1e-9)
     assert command.heading_rad == pytest.approx(psi, abs=1e-9)
     assert command.thrust_mps2 == pytest.approx(9.81 + move.inputs[0] / 0.4, abs=1e-9)
-
-
-def test_the_lead_makes_the_attitude_loop_follow_the_prediction() -> None:
-    """s'' = wn^2 (s_c - s) - 2 z wn s' with the command sent gives the predicted acceleration."""
-    state, reference = tilted(0.0)
-    plain, ahead = (
-        PaperController(PAPER, PaperSettings(attitude_lead=lead)) for lead in (False, True)
-    )
-    situation = Situation(0.0, state, reference, HOVER)
-    heading, asked = (c.decide(situation).command.heading_rad for c in (plain, ahead))
-    dynamics, inputs = sampled_matrices(PAPER, 0.1)
-    settings = PaperSettings()
-    move = PaperLaw(dynamics, inputs, settings, *flyable_box(PAPER, settings)).move(
-        *heading_frame(state, reference.sample(0.1))
-    )
-    rate = move.following[5]
-    wn, z = PAPER.yaw.natural_frequency_radps, PAPER.yaw.damping
-    acceleration = wn**2 * (asked - heading) - 2 * z * wn * rate
-    assert acceleration == pytest.approx((rate - 0.05) / 0.1, abs=1e-6)
 
 
 @pytest.mark.parametrize("vehicle", VEHICLES.values(), ids=VEHICLES.keys())

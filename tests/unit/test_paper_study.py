@@ -23,9 +23,8 @@ from offboard.control.swarm import certify
 from offboard.documents.errors import UserError
 from offboard.paper import closed_loop, errata, horizon, printed, study, tables
 from offboard.paper.closed_loop import Flight, Flights, FlightTask, LawName, PathName, fly
-from offboard.paper.extensions import LimitedBox, StateLimits
 from offboard.paper.horizon import receding
-from offboard.paper.law import PaperLaw, PaperSettings
+from offboard.paper.law import LimitedBox, PaperLaw, PaperSettings, StateLimits
 from offboard.paper.plant import (
     LinearPlant,
     NonlinearPlant,

@@ -1,8 +1,8 @@
-"""Mission protocol of one link: upload, download, clear and current item.
+"""Parameter and mission protocol of one link.
 
-Knows messages and items; the flight of a mission is in `simulator.autopilot.mission`, and which
-items a firmware takes in its `mission_refusal`. Fences and rally points are refused; there are none
-to download.
+Knows messages; values and their ranges are in `simulator.autopilot.parameters`, the flight of a
+mission in `simulator.autopilot.mission`, and which items a firmware takes in its
+`mission_refusal`. Fences and rally points are refused; there are none to download.
 """
 
 from __future__ import annotations
@@ -12,10 +12,76 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 
 from simulator.autopilot.mission import ITEMS_MAX, Kind, Mission
+from simulator.autopilot.parameters import HASH, MAV_PARAM_TYPE_UINT32
 from simulator.firmware.base import Firmware
 from simulator.firmware.values import MissionItem
 from simulator.mavlink.codec import Message, Peer, sender_of
 from simulator.mavlink.outbox import Outbox, Texts
+
+PER_STEP = 4  # parameters of a list
+NO_INDEX = 65535  # PARAM_VALUE.param_index of an answer without one
+Handlers = dict[str, Callable[[Message], None]]
+
+
+@dataclass(slots=True)
+class ParameterTransfer:
+    """Parameter transfers of one link."""
+
+    outbox: Outbox
+    _due: list[str] = field(default_factory=list)
+
+    @property
+    def handlers(self) -> Handlers:
+        """By message: what handles it, if it is addressed to this vehicle."""
+        return {
+            "PARAM_REQUEST_READ": self._read,
+            "PARAM_REQUEST_LIST": self._list,
+            "PARAM_SET": self._set,
+        }
+
+    def step(self) -> None:
+        """Queue the next parameters of a requested list."""
+        if not self._due:
+            return
+        for name in self._due[:PER_STEP]:
+            self._answer(name, listed=True)
+        del self._due[:PER_STEP]
+
+    def _answer(self, name: str, *, listed: bool = False) -> None:
+        """Queue PARAM_VALUE; `listed`: as part of a list or requested by index."""
+        autopilot = self.outbox.view.autopilot
+        if name == HASH:
+            head = (HASH.encode(), autopilot.parameters.hash_on_wire, MAV_PARAM_TYPE_UINT32)
+            self.outbox.send("PARAM_VALUE", *head, len(autopilot.parameters.names), NO_INDEX)
+            return
+        value, kind = autopilot.parameters.to_wire(name)
+        names = autopilot.parameters.names
+        numbered = listed or autopilot.firmware.parameters_numbered
+        index = names.index(name) if numbered else NO_INDEX
+        self.outbox.send("PARAM_VALUE", name.encode(), value, kind, len(names), index)
+
+    def _read(self, message: Message) -> None:
+        names = self.outbox.view.autopilot.parameters.names
+        if message.param_index >= 0:
+            if message.param_index < len(names):
+                self._answer(names[message.param_index], listed=True)
+        elif message.param_id in names or self._is_hash(message.param_id):
+            self._answer(message.param_id)
+
+    def _is_hash(self, name: str) -> bool:
+        return name == HASH and self.outbox.view.autopilot.firmware.parameters_hashed
+
+    def _list(self, _: Message) -> None:
+        hashed = (HASH,) if self._is_hash(HASH) and not self._due else ()
+        self._due = [*hashed, *self.outbox.view.autopilot.parameters.names]
+
+    def _set(self, message: Message) -> None:
+        table = self.outbox.view.autopilot.parameters
+        if self._is_hash(message.param_id):  # the client has the whole list already
+            self._due = []
+        if table.set_from_wire(message.param_id, message.param_value, message.param_type):
+            self._answer(message.param_id)
+
 
 REPEAT_S, GIVE_UP_S = 0.25, 5.0
 
@@ -58,24 +124,40 @@ class MissionTransfer:
         autopilot = self.outbox.view.autopilot
         self.mission, self._firmware = autopilot.mission, autopilot.firmware
 
-    def handle(self, message: Message, now_s: float) -> None:
-        """Handle one message of the mission protocol addressed to this vehicle."""
-        HANDLERS[message.get_type()](self, message, now_s)
+    @property
+    def handlers(self) -> Handlers:
+        """By message: what handles it, if it is addressed to this vehicle."""
+        return {
+            "MISSION_ACK": self._ack,
+            "MISSION_COUNT": self._count,
+            "MISSION_ITEM": self.item,
+            "MISSION_ITEM_INT": self.item,
+            "MISSION_REQUEST_LIST": self._list,
+            "MISSION_REQUEST": self._request,
+            "MISSION_REQUEST_INT": self._request,
+            "MISSION_CLEAR_ALL": self._clear,
+            "MISSION_SET_CURRENT": self._set_current,
+        }
 
-    def step(self, now_s: float) -> None:
+    @property
+    def _now_s(self) -> float:
+        return self.outbox.view.autopilot.state.time_us * 1e-6
+
+    def step(self) -> None:
         """Request a missing item again, and give up after a while."""
         upload = self._upload
         if upload is None:
             return
+        now_s = self._now_s
         if now_s - upload.begun_s > GIVE_UP_S:
             self._acknowledge(upload.peer, Ack.CANCELLED)
             self._upload = None
         elif now_s - upload.requested_s > REPEAT_S:
-            self._request_item(upload, now_s)
+            self._request_item(upload)
 
     # -- up ----------------------------------------------------------------------------------
 
-    def _count(self, message: Message, now_s: float) -> None:
+    def _count(self, message: Message) -> None:
         peer = sender_of(message)
         if message.mission_type:
             self._acknowledge(peer, Ack.UNSUPPORTED, message.mission_type)
@@ -85,16 +167,17 @@ class MissionTransfer:
             self.mission.store(())
             self._acknowledge(peer, Ack.ACCEPTED)
         else:
-            self._upload = Upload(peer, message.count, [], now_s, now_s)
-            self._request_item(self._upload, now_s)
+            self._upload = Upload(peer, message.count, [], self._now_s, self._now_s)
+            self._request_item(self._upload)
 
-    def _request_item(self, upload: Upload, now_s: float) -> None:
-        upload.requested_s = now_s
+    def _request_item(self, upload: Upload) -> None:
+        upload.requested_s = self._now_s
         whole = self._whole and self._firmware.requests_kind_of_peer
         name = "MISSION_REQUEST_INT" if whole else "MISSION_REQUEST"
         self.outbox.send(name, *upload.peer, len(upload.items), 0)
 
-    def _item(self, message: Message, now_s: float) -> None:
+    def item(self, message: Message) -> None:
+        """MISSION_ITEM or MISSION_ITEM_INT of an upload."""
         self._whole = message.get_type() == "MISSION_ITEM_INT"
         upload, peer = self._upload, sender_of(message)
         if upload is None:  # the last one again, whose answer was lost, or one without an upload
@@ -113,9 +196,9 @@ class MissionTransfer:
             self._upload = None
             return
         upload.items.append(item)
-        upload.begun_s = now_s
+        upload.begun_s = self._now_s
         if len(upload.items) < upload.count:
-            self._request_item(upload, now_s)
+            self._request_item(upload)
             return
         self.mission.store(tuple(upload.items))
         self._upload, self._taken = None, upload.count
@@ -123,14 +206,14 @@ class MissionTransfer:
         if self._firmware.mission_text is not None:
             self.texts.send(self._firmware.mission_text)
 
-    def _ack(self, message: Message, now_s: float) -> None:
+    def _ack(self, message: Message) -> None:
         """MISSION_ACK of the peer: it wants the other kind of request, or cancels."""
         upload = self._upload
         if upload is None or upload.peer != sender_of(message):
             return
         if message.type == Ack.UNSUPPORTED:
             self._whole = not self._whole
-            self._request_item(upload, now_s)
+            self._request_item(upload)
         elif message.type == Ack.CANCELLED:
             self._upload = None
 
@@ -139,11 +222,11 @@ class MissionTransfer:
 
     # -- down, and the rest ------------------------------------------------------------------
 
-    def _list(self, message: Message, _: float) -> None:
+    def _list(self, message: Message) -> None:
         count = 0 if message.mission_type else len(self.mission.items)
         self.outbox.send("MISSION_COUNT", *sender_of(message), count, message.mission_type)
 
-    def _request(self, message: Message, _: float) -> None:
+    def _request(self, message: Message) -> None:
         peer, items = sender_of(message), self.mission.items
         self._whole = whole = message.get_type() == "MISSION_REQUEST_INT"
         is_home = self._firmware.home_item_first and message.seq == 0
@@ -164,12 +247,12 @@ class MissionTransfer:
         place = view.geodetic(north_m, east_m)
         return MissionItem(0, Kind.WAYPOINT, (0.0,) * 4, *place, view.altitude_mm(down_m) * 1e-3)
 
-    def _clear(self, message: Message, _: float) -> None:
+    def _clear(self, message: Message) -> None:
         if message.mission_type in (0, 255):  # the mission, or all
             self.mission.store(())
         self._acknowledge(sender_of(message), Ack.ACCEPTED, message.mission_type)
 
-    def _set_current(self, message: Message, _: float) -> None:
+    def _set_current(self, message: Message) -> None:
         if self.mission.go_to(message.seq):
             self.outbox.send_now("MISSION_CURRENT")
 
@@ -185,16 +268,3 @@ def _read(message: Message) -> MissionItem:
 
 def _integer(value: float) -> int:
     return int(min(2e9, max(-2e9, value))) if value == value else 0
-
-
-HANDLERS: dict[str, Callable[[MissionTransfer, Message, float], None]] = {
-    "MISSION_ACK": MissionTransfer._ack,
-    "MISSION_COUNT": MissionTransfer._count,
-    "MISSION_ITEM": MissionTransfer._item,
-    "MISSION_ITEM_INT": MissionTransfer._item,
-    "MISSION_REQUEST_LIST": MissionTransfer._list,
-    "MISSION_REQUEST": MissionTransfer._request,
-    "MISSION_REQUEST_INT": MissionTransfer._request,
-    "MISSION_CLEAR_ALL": MissionTransfer._clear,
-    "MISSION_SET_CURRENT": MissionTransfer._set_current,
-}

@@ -1,4 +1,4 @@
-"""Other MAVLink senders beside the vehicle."""
+"""Faults of the companion link and of what the vehicle sends on it; other MAVLink senders."""
 
 from __future__ import annotations
 
@@ -7,13 +7,104 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from simulator.faults.fault import Effect, Running, Timed, Vehicle
+from simulator.faults.fault import (
+    Direction,
+    Effect,
+    MessageName,
+    Running,
+    Timed,
+    Vehicle,
+    until_the_end,
+)
 from simulator.firmware.base import Firmware
-from simulator.mavlink.codec import Encoder, message_of
+from simulator.link.impairment import Impairment
+from simulator.mavlink.codec import Encoder, fields_of, message_of
 from simulator.mavlink.outbox import MAV_COMP_ID_AUTOPILOT
+from simulator.mavlink.view import Stuck
 from simulator.steps import STEP_S
+
+
+class LinkFault(Timed, Impairment):
+    """A bad companion link; each direction by itself, so `both` doubles the round trip.
+
+    It does not apply to the TIMESYNC exchange of lockstep, which is the simulation's clock.
+    """
+
+    fault: Literal["link"]
+    direction: Direction = Direction.BOTH
+
+    @model_validator(mode="after")
+    def _ends(self) -> LinkFault:
+        if self.stalled and self.for_s is None:
+            raise ValueError("a stalled link needs for_s: what waits arrives when the fault ends")
+        return self
+
+    @property
+    def impaired(self) -> tuple[Direction, ...]:
+        """Directions of the link that it impairs."""
+        both = (Direction.DOWN, Direction.UP)
+        return both if self.direction is Direction.BOTH else (self.direction,)
+
+    def effect(self, vehicle: Vehicle, running: Running) -> Effect:
+        for channel in running.channels:
+            channel.on = True
+        yield from until_the_end()
+        for channel in running.channels:
+            channel.on = False
+
+
+class SilentMessage(Timed):
+    """A message that is no longer sent, on any link; with `every`, every so many are still sent."""
+
+    fault: Literal["silent_message"]
+    message: MessageName
+    every: int | None = Field(default=None, ge=2, le=1000)
+
+    def effect(self, vehicle: Vehicle, running: Running) -> Effect:
+        vehicle.view.silent[self.message] = self.every or 0
+        yield from until_the_end()
+        vehicle.view.silent.pop(self.message, None)
+
+
+class StuckMessage(Timed):
+    """A message that repeats its content, or only some of its `fields`; with `stamp_runs` its time
+    stamp increases."""
+
+    fault: Literal["stuck_message"]
+    message: MessageName
+    fields: tuple[str, ...] = ()
+    stamp_runs: bool = True
+
+    @model_validator(mode="after")
+    def _has_fields(self) -> StuckMessage:
+        known = fields_of(self.message)
+        if unknown := [each for each in self.fields if each not in known]:
+            raise ValueError(f"{self.message} has no field {unknown[0]}; it has {', '.join(known)}")
+        return self
+
+    def effect(self, vehicle: Vehicle, running: Running) -> Effect:
+        known = fields_of(self.message)
+        # the first field of telemetry is its time stamp
+        stuck = self.fields or known[1 if self.stamp_runs else 0 :]
+        vehicle.view.stuck[self.message] = Stuck([known.index(each) for each in stuck])
+        yield from until_the_end()
+        vehicle.view.stuck.pop(self.message, None)
+
+
+class ClockJump(Timed):
+    """All time stamps of the vehicle jump by `jump_s`."""
+
+    fault: Literal["clock_jump"]
+    jump_s: float = Field(ge=-1e7, le=1e7)
+
+    def effect(self, vehicle: Vehicle, running: Running) -> Effect:
+        jump_us = round(self.jump_s * 1e6)
+        vehicle.view.clock_offset_us += jump_us
+        yield from until_the_end()
+        vehicle.view.clock_offset_us -= jump_us
+
 
 _QUADROTOR, _ONBOARD_CONTROLLER, _NO_AUTOPILOT = 2, 18, 8  # MAV_TYPE, MAV_AUTOPILOT
 _STANDBY, _ACTIVE, _MAVLINK = 3, 4, 3  # MAV_STATE; protocol version
