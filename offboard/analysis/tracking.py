@@ -8,7 +8,6 @@ fitness are over the control ticks, as in its Eq. 32.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,8 +26,15 @@ from offboard.model.frames import (
 Array = NDArray[np.float64]
 
 SKIPPED_S = 1.5  # without a decision for longer, the reference was not tracked meanwhile
-_BLOCK = 8192  # samples that are computed at once
-_EXPLAINED = 7  # regressors of the agitation: velocity, acceleration, jerk (north, east), and 1
+_ORDERS, _POWERS = np.arange(3)[:, None], np.arange(5, -1, -1)[:, None]
+# coefficients of s^5 .. s^0 from position, velocity and acceleration at s = 0, then at s = 1
+_QUINTIC = np.linalg.inv(
+    [
+        [math.perm(power, order) * float(s) ** max(power - order, 0) for power in range(5, -1, -1)]
+        for s in (0, 1)
+        for order in range(3)
+    ]
+)
 _FITNESS = ("e_u", "e_v", "e_w", "e_x", "e_y", "e_z", "e_psi")
 
 
@@ -55,37 +61,25 @@ def passed_s(flown: History, window: tuple[float, float]) -> tuple[float, float]
 def tracking_metrics(flown: History, window: tuple[float, float]) -> dict[str, float]:
     """Values of a Score, of the samples in the window."""
     reference, clock = Reference(flown.reference), _Clock(flown)
-
-    def position_m(rows: Rows) -> Array:
-        return _length(rows["position_ned_m"] - reference.position(rows["time_s"]))
-
-    def velocity_mps(rows: Rows) -> Array:
-        return _length(rows["velocity_ned_mps"] - reference.position(rows["time_s"], 1))
-
-    def turned_deg(rows: Rows) -> Array:
-        turn = heading_from_quaternion(rows["quaternion"]) - reference.heading(rows["time_s"])
-        return np.asarray(np.abs(np.degrees(wrap_pi(turn))))
-
-    def tilt_deg(rows: Rows) -> Array:
-        direction = thrust_direction_from_quaternion(rows["quaternion"])
-        return np.degrees(np.arccos(np.clip(direction[:, 2], -1.0, 1.0)))
-
     fitness = _fitness(flown, reference, window)
-    # one array after the other: each may be a copy of hours of telemetry
+
+    def position_error(rows: Rows) -> Weighted:
+        away = rows["position_ned_m"] - reference.position(rows["time_s"])
+        return weighted(_length(away), clock.shares(rows["time_s"]))
+
     rows = _within(flown.position, window)
-    weights = clock.shares(rows["time_s"])
-    position, velocity = (
-        weighted(_in_blocks(f, rows), weights) for f in (position_m, velocity_mps)
-    )
-    rows = _within(flown.truth, window)
-    true = weighted(_in_blocks(position_m, rows), clock.shares(rows["time_s"]))
+    position, true = position_error(rows), position_error(_within(flown.truth, window))
+    slip = rows["velocity_ned_mps"] - reference.position(rows["time_s"], 1)
+    velocity = weighted(_length(slip), clock.shares(rows["time_s"]))
     rows = _within(flown.setpoint, window)
     steps = _length(np.diff(thrust_direction_from_quaternion(rows["quaternion"]), axis=0))
     thrust = weighted(rows["thrust"].astype(np.float64), clock.shares(rows["time_s"]))
     rows = _within(flown.attitude, window)
     weights = clock.shares(rows["time_s"])
-    heading = weighted(_in_blocks(turned_deg, rows), weights)
-    tilt = weighted(_in_blocks(tilt_deg, rows), weights)
+    turn = heading_from_quaternion(rows["quaternion"]) - reference.heading(rows["time_s"])
+    heading = weighted(np.abs(np.degrees(wrap_pi(turn))), weights)
+    upright = np.clip(thrust_direction_from_quaternion(rows["quaternion"])[:, 2], -1.0, 1.0)
+    tilt = weighted(np.degrees(np.arccos(upright)), weights)
     rates = rows["rates_radps"].astype(np.float64)
     return {
         "rmse_position_m": position.rms,
@@ -131,29 +125,18 @@ def _fitness(flown: History, reference: Reference, window: tuple[float, float]) 
 
 def _agitation(reference: Reference, attitude: Rows, weights: Array) -> dict[str, float]:
     """Motion beside that of the reference: thrust direction and rates minus their linear fit by
-    the reference's velocity, acceleration and jerk. The fit needs no model of drag and lag.
-
-    The factor R of the samples has the same residuals as the samples; made of blocks, it takes
-    little memory.
-    """
-    factor = np.zeros((0, _EXPLAINED + 4))
-    for part in _blocks(len(attitude)):
-        rows, share = attitude[part], weights[part]
-        times, direction = rows["time_s"], thrust_direction_from_quaternion(rows["quaternion"])
-        explained = [reference.position(times, order)[:, :2] for order in (1, 2, 3)]
-        block = np.hstack(
-            (*explained, np.ones((len(times), 1)), direction[:, :2], rows["rates_radps"][:, :2])
-        )
-        stacked = np.vstack((factor, np.sqrt(share)[:, None] * block))
-        factor = np.linalg.qr(stacked, mode="r")  # type: ignore[assignment]
-    regressors, motion = factor[:, :_EXPLAINED], factor[:, _EXPLAINED:]
-    fit, *_ = np.linalg.lstsq(regressors, motion, rcond=None)
-    squares = ((motion - regressors @ fit) ** 2).sum(axis=0)
-    total = (factor[:, _EXPLAINED - 1] ** 2).sum()  # of the weights, from the column of 1
-    tilt, rate = np.sqrt(np.array([squares[:2].sum(), squares[2:].sum()]) / total)
+    the reference's velocity, acceleration and jerk. The fit needs no model of drag and lag."""
+    direction = thrust_direction_from_quaternion(attitude["quaternion"])
+    motion = np.hstack((direction[:, :2], attitude["rates_radps"][:, :2]))
+    explained = [reference.position(attitude["time_s"], order)[:, :2] for order in (1, 2, 3)]
+    regressors = np.hstack((*explained, np.ones((len(motion), 1))))
+    products = regressors.T * weights
+    fit, *_ = np.linalg.lstsq(products @ regressors, products @ motion, rcond=None)
+    motion -= regressors @ fit
+    squares = weights @ motion**2 / weights.sum()
     return {
-        "tilt_agitation_deg": float(np.degrees(tilt)),
-        "rate_agitation_radps": float(rate),
+        "tilt_agitation_deg": math.degrees(math.sqrt(squares[:2].sum())),
+        "rate_agitation_radps": math.sqrt(squares[2:].sum()),
     }
 
 
@@ -197,29 +180,12 @@ class Reference:
         rows = rows[np.concatenate(([True], rows["time_s"][1:] > newest[:-1]))]
         self._times = rows["time_s"]
         self._heading = np.unwrap(rows["heading_rad"].astype(np.float64))
-        length_s = np.diff(self._times)[:, None]
-        position, velocity, half = (
-            rows["position_ned_m"].astype(np.float64),
-            rows["velocity_ned_mps"].astype(np.float64),
-            0.5 * rows["acceleration_ned_mps2"].astype(np.float64),
-        )
-        # of the end from the parabola that begins at the start, each in m
-        away = np.diff(position, axis=0) - length_s * (velocity[:-1] + length_s * half[:-1])
-        turn = length_s * (np.diff(velocity, axis=0) - 2.0 * length_s * half[:-1])
-        bend = length_s**2 * 2.0 * np.diff(half, axis=0)
-        self._position = PPoly(
-            np.stack(
-                (
-                    (6.0 * away - 3.0 * turn + 0.5 * bend) / length_s**5,
-                    (-15.0 * away + 7.0 * turn - bend) / length_s**4,
-                    (10.0 * away - 4.0 * turn + 0.5 * bend) / length_s**3,
-                    half[:-1],
-                    velocity[:-1],
-                    position[:-1],
-                )
-            ),
-            self._times,
-        )
+        derivatives = ("position_ned_m", "velocity_ned_mps", "acceleration_ned_mps2")
+        known = np.stack([rows[name].astype(np.float64) for name in derivatives], axis=1)
+        length_s = np.diff(self._times)[:, None, None]
+        scaled = known[:-1] * length_s**_ORDERS, known[1:] * length_s**_ORDERS
+        coefficients = _QUINTIC @ np.concatenate(scaled, axis=1) / length_s**_POWERS
+        self._position = PPoly(coefficients.swapaxes(0, 1), self._times)
 
     def position(self, times: Array, derivative: int = 0) -> Array:
         """(N, 3) position NED in m, or a derivative of it."""
@@ -289,15 +255,3 @@ def weighted(values: Array, weights: Array) -> Weighted:
         max=float(np.max(values, where=weights > 0.0, initial=-math.inf)),
         p95=float(values[order[upto]]),
     )
-
-
-def _in_blocks(signal: Callable[[Rows], Array], rows: Rows) -> Array:
-    """The signal of the rows: what is computed of a few takes little memory."""
-    values = np.empty(len(rows))
-    for part in _blocks(len(rows)):
-        values[part] = signal(rows[part])
-    return values
-
-
-def _blocks(count: int) -> Iterator[slice]:
-    return (slice(first, first + _BLOCK) for first in range(0, count, _BLOCK))

@@ -126,10 +126,10 @@ def recorded(
 
 def _fly(case: Case, scratch: Path, config: FlightConfig, directory: Path) -> Outcome:
     scenario = case.scenario
-    if case.text:
+    if text := case.scenario_text:
         path = scratch / case.scenario_file
         path.parent.mkdir()
-        path.write_text(case.text, encoding="utf-8")
+        path.write_text(text, encoding="utf-8")
         scenario = str(path)
     outcome = fly(
         config,

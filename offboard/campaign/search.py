@@ -220,7 +220,7 @@ class FailureSearch:
     def _case(self, values: Mapping[str, float]) -> Case:
         seed = round(values.get(SEED, self._base.seed))
         own = tuple((key, value) for key, value in values.items() if key != SEED)
-        return replace(self._base.with_values((*self._base.values, *own)), seed=seed)
+        return replace(self._base, values=(*self._base.values, *own), seed=seed)
 
 
 def _changed(values: Mapping[str, float], defaults: Mapping[str, float]) -> Values:

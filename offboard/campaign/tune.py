@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,7 +23,7 @@ from pydantic import AfterValidator, Field
 from scipy import stats
 
 from offboard.campaign.cases import SCENARIO, Case, Values, expand
-from offboard.campaign.document import CampaignFile, Name, Names, Ranges, Seed
+from offboard.campaign.document import CampaignFile, Firmware, Name, Names, Ranges, Seed
 from offboard.campaign.results import Record
 from offboard.campaign.run import check
 from offboard.campaign.search import Fly, Study
@@ -47,7 +47,7 @@ class Flights(Parameters):
     """A set of flights: every reference in every scenario with every seed."""
 
     references: Names | None = None
-    scenarios: Annotated[tuple[Name | dict[str, Any], ...], Field(min_length=1)]
+    scenarios: Names
     seeds: (
         Annotated[int, Field(ge=1, le=1000)] | Annotated[tuple[Seed, ...], Field(min_length=1)]
     ) = 3
@@ -59,7 +59,7 @@ class TuneFile(Parameters):
 
     config: Name = "flight"
     controller: Name | None = None
-    firmware: Name = "px4"
+    firmware: Firmware = "px4"
     ranges: Ranges
     training: Flights
     validation: Flights
@@ -135,7 +135,7 @@ class Tuning:
                     "references or seeds"
                 )
             self._defaults = _defaults(self._training[0], file)
-            check([self._training[0].with_values(tuple(self._defaults.items()))])
+            check([replace(self._training[0], values=tuple(self._defaults.items()))])
 
     @property
     def flights(self) -> int:
@@ -158,7 +158,7 @@ class Tuning:
         return Tuned(best, judge(before, self._costs(fly, self._validation, best)))
 
     def _costs(self, fly: Fly, cases: Sequence[Case], values: Values) -> list[float]:
-        records = fly([case.with_values(values) if values else case for case in cases])
+        records = fly([replace(case, values=values) for case in cases])
         return [self._cost(record) for record in records]
 
     def _cost(self, record: Record) -> float:

@@ -8,7 +8,8 @@ from typing import Annotated
 
 import typer
 
-from offboard.cli.shared import FLIGHT, CommandError, check_new, complain, option, say
+from offboard.cli.shared import FLIGHT, check_new, complain, option, say
+from offboard.documents.errors import UserError
 
 
 class Format(str, Enum):  # noqa: UP042 - typer shows the values of a `str`
@@ -38,7 +39,7 @@ def export(
     Log Viewer and MAVExplorer read the .tlog itself. mcap needs the extra `export`.
     """
     if vehicle_time and to is not Format.MCAP:
-        raise CommandError(f"--vehicle-time is an option of --to mcap: {to.value} always has it")
+        raise UserError(f"--vehicle-time is an option of --to mcap: {to.value} always has it")
     from offboard.export.mcap_file import write_mcap
     from offboard.export.series import read
     from offboard.export.table import write_csv

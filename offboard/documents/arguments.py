@@ -34,12 +34,6 @@ def join_address(host: str, port: int) -> str:
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
-class Interrupted(UserError):
-    """The command was interrupted."""
-
-    code = INTERRUPT
-
-
 class Command(TyperCommand):
     """A command whose values are neither empty nor options nor bytes that are no text.
 
@@ -67,7 +61,7 @@ class Command(TyperCommand):
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
-            raise Interrupted(INTERRUPTED) from None
+            raise UserError(INTERRUPTED, INTERRUPT) from None
 
 
 def _completed(args: list[str]) -> list[str]:

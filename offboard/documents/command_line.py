@@ -27,9 +27,9 @@ def run(load: Callable[[], Callable[[], object]]) -> NoReturn:
 
     An interrupt exits at once until the command calls `interrupts_raise`, its arguments parsed.
 
-    A UserError is printed without a traceback and exits with its `code`, 2 without one. So do a
-    lack of memory, and an error of a file or of the output; an interrupt exits with 130. Where
-    nobody reads the output any more (`| head -1`), the exit code is 141 without a sentence.
+    A UserError is printed without a traceback and exits with its `code`; a lack of memory, and an
+    error of a file or of the output, with 2; an interrupt with 130. Where nobody reads the output
+    any more (`| head -1`), the exit code is 141 without a sentence.
     """
     interrupts_exit()
     if sys.stdout is not None:  # text that the encoding of the output does not have is escaped
@@ -56,7 +56,7 @@ def run(load: Callable[[], Callable[[], object]]) -> NoReturn:
 
         if not isinstance(error, UserError):
             raise
-        sentence, code = str(error), getattr(error, "code", USAGE)
+        sentence, code = str(error), error.code
     interrupts_raise()
     unwritten = _flushed()
     if isinstance(unwritten, BrokenPipeError):

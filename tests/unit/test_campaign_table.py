@@ -87,7 +87,7 @@ def test_a_value_names_a_group_where_it_differs() -> None:
     def name(drawn: frozenset[str]) -> list[str]:
         case = Case("flight", "lqr", "hover", None, None, "px4", "calm", 1)
         rows = [
-            row_of(case.with_values((("a.b", 1), ("a.c", value))), record(0.1), ())
+            row_of(replace(case, values=(("a.b", 1), ("a.c", value))), record(0.1), ())
             for value in (2, 3)
         ]
         return [group.name for group in groups(rows, drawn)]
@@ -181,7 +181,7 @@ def test_on_one_vehicle_nothing_is_flown_after_a_refused_or_aborted_flight(
 
     monkeypatch.setattr(workers, "recorded", fly)
     laws = ("pso", "lqr", "pid", "mpc")
-    file = CampaignFile(controllers=laws, references=("hover",), keep="all")
+    file = CampaignFile(controllers=laws, references=("hover",), keep=True)
 
     def again() -> str:
         campaign = Campaign(file, "x", tmp_path, link="udpin:127.0.0.1:0")
@@ -261,7 +261,7 @@ def test_what_a_command_cannot_fly_is_refused(
 def test_a_connected_flight_begins_disarmed_unless_told_otherwise() -> None:
     case = Case("flight", "lqr", "hover", None, None, "px4", "connected", 1, link="udpin::0")
     assert not case.load().limits.begin_armed
-    armed = case.with_values((("limits.begin_armed", True),))
+    armed = replace(case, values=(("limits.begin_armed", True),))
     assert armed.load().limits.begin_armed
     assert replace(case, link=None).load().limits.begin_armed
 

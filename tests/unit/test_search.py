@@ -27,7 +27,7 @@ from offboard.run.configuration import load
 SEARCH = """
 controllers: [lqr]
 references: [hover]
-scenarios: [{name: still, conditions: {wind_ned_mps: [0, 0, 0], gusts: {intensity_mps: 0}}}]
+scenarios: [promises]
 search:
   flights: 200
   seeds: 4
@@ -88,7 +88,7 @@ def test_failures_that_differ_are_found_and_reduced_to_their_causes(tmp_path: Pa
     hot, rough = found["error", (NORTH, BANDWIDTH)], found["tilt", (EAST, GUSTS)]
     assert (hot.failing, hot.seeds) == (2, 4)  # seeds 2 .. 5, of which 4 and 5 do not fail
     assert (rough.failing, rough.seeds) == (4, 4)
-    assert "wind_ned_mps:\n  - 0.0\n" in rough.case.text  # north is back at its default
+    assert "wind_ned_mps:\n  - 0.0\n" in rough.case.scenario_text  # north is back at its default
     assert "--set controller.bandwidth_radps=7." in as_csv(failures)
     shown = (tmp_path / "out" / "campaign.html").read_text()
     assert shown.count(f"{BANDWIDTH}=") < 100  # of the worst flights alone, not of 200 groups
