@@ -57,7 +57,7 @@ def _positions(flown: History) -> Iterator[LocalPosition]:
     """In the order of time."""
     rows = flown.position[np.argsort(flown.position["time_s"], kind="stable")]
     for row in rows:
-        time_s, place, velocity = row.item()
+        time_s, _, place, velocity = row.item()
         yield LocalPosition(time_s, tuple(place.tolist()), tuple(velocity.tolist()))
 
 

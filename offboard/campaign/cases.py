@@ -205,7 +205,7 @@ def _digests(case: Case) -> tuple[tuple[str, str], ...]:
             kind = {"config": "configuration", "sim_vehicle": "vehicle"}.get(part, part)
             laws = catalogue.names() if part == "controller" else ()
             if name not in laws:
-                shipped.locate(name, shipped.FOLDERS[kind], kind, laws)
+                shipped.locate(name, kind, laws)
     if found:
         with suppress(DocumentError):  # of a flight that cannot be flown: it becomes a row
             found.append(("flight", _hash(case.load().model_dump_json())))
@@ -224,7 +224,7 @@ def _hash(text: str) -> str:
 @cache
 def _changed(scenario: str, changes: str) -> str:
     """The YAML of a scenario with values by key, which are given as JSON."""
-    text = shipped.read_text(shipped.locate(scenario, "scenarios", "scenario"))
+    text = shipped.read_text(shipped.locate(scenario, "scenario"))
     raw = read(text, f"scenario {scenario}")
     for key, value in json.loads(changes):
         raw = override(raw, f"{key.removeprefix(SCENARIO)}={json.dumps(value)}")

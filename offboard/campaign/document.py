@@ -133,6 +133,5 @@ class CampaignFile(Parameters):
 
 def read_campaign(name: str) -> tuple[CampaignFile, str]:
     """A shipped campaign or a file, and its path for errors. Raises DocumentError."""
-    folder = shipped.FOLDERS["campaign"]
-    path = shipped.locate(name, folder, "campaign") if "." not in name else Path(name)
+    path = shipped.locate(name, "campaign") if "." not in name else Path(name)
     return parse(shipped.read_text(path), CampaignFile, str(path), "campaign"), str(path)

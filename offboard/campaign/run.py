@@ -31,8 +31,7 @@ from offboard.link.stop import StopRequests
 from offboard.run.configuration import build_controller, build_track
 from offboard.run.sitl import check_scenario_text
 
-KEPT = "flights"
-KEPT_FILES = {"report": "report.html", "log": "flight.tlog"}
+KEPT = "flights"  # directory of the logs that are kept
 TABLE_S = 5.0  # at least, from one table to the next
 TABLE_SHARE = 0.02  # of the time is for tables while it flies
 
@@ -210,7 +209,7 @@ class Campaign:
         absent = len(self.cases) - len(rows)
         missing = [f"{absent} of {len(self.cases)} flights are not flown yet"] if absent else []
         missing += [stopped] if stopped else []
-        text = page(groups(rows, self.drawn), missing, self._kept(rows))
+        text = page(groups(rows, self.drawn), missing, KEPT if self.file.keep else "")
         write(self.directory / "campaign.html", text.encode())
 
     def _written(self) -> None:
@@ -220,19 +219,6 @@ class Campaign:
             self.write(self.rows())
             took_s = clock.monotonic_s() - now_s
             self._next_table_s = now_s + max(TABLE_S, took_s / TABLE_SHARE)
-
-    def _kept(self, rows: Sequence[Row]) -> dict[str, dict[str, str]]:
-        """Files of kept flights by case, relative to the page."""
-        if not self.file.keep:
-            return {}
-        return {
-            row.case.key: {
-                name: f"{KEPT}/{row.case.folder}/{file}"
-                for name, file in KEPT_FILES.items()
-                if (self.directory / KEPT / row.case.folder / file).exists()
-            }
-            for row in rows
-        }
 
 
 def check(cases: Sequence[Case]) -> None:

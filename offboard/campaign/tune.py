@@ -28,12 +28,11 @@ from offboard.campaign.results import Record
 from offboard.campaign.run import check
 from offboard.campaign.search import Fly, Study
 from offboard.campaign.table import CONFIDENCE, FIGURE_COLUMNS
-from offboard.documents import shipped
 from offboard.documents.errors import DocumentError, naming
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import override, parse, read
 from offboard.documents.shipped import locate, read_text
-from offboard.run.configuration import FOLDERS, read_part
+from offboard.run.configuration import PARTS, read_part
 
 
 def _figure(name: str) -> str:
@@ -110,7 +109,7 @@ class Tuned:
 
 def read_tune(name: str) -> tuple[TuneFile, str]:
     """A shipped tuning or a file, and its path for errors. Raises DocumentError."""
-    path = locate(name, shipped.FOLDERS["tuning"], "tuning") if "." not in name else Path(name)
+    path = locate(name, "tuning") if "." not in name else Path(name)
     file = parse(read_text(path), TuneFile, str(path), "tuning")
     for key in file.ranges:
         if key.startswith((SCENARIO, "vehicle.")):
@@ -195,10 +194,10 @@ def _defaults(case: Case, file: TuneFile) -> dict[str, float]:
 
 def profile(file: TuneFile, tuned: Tuned) -> str:
     """The configuration with the tuned values, as `fly --config` takes it."""
-    raw = read(read_text(locate(file.config, "", "configuration")), file.config)
+    raw = read(read_text(locate(file.config, "configuration")), file.config)
     if file.controller:
         raw["controller"] = file.controller
-    for part, (key, _) in itertools.product(FOLDERS, tuned.values):
+    for part, (key, _) in itertools.product(PARTS, tuned.values):
         if key.startswith(f"{part}.") and isinstance(raw.get(part), str):
             raw[part] = read_part(part, raw[part])
     for key, value in tuned.values:

@@ -62,7 +62,7 @@ def compare(
         raise UserError("--scenario and --workers are options of the simulator: omit them")
     if not 1 <= seeds <= 1000:
         raise UserError(f"--seeds {seeds}: give 1 .. 1000")
-    laws = _names("--controllers", controllers, shipped.names("controllers"))
+    laws = _names("--controllers", controllers, shipped.names("controller"))
     references = _names("--reference", reference)
     scenarios = ["connected"] if connect else _names("--scenario", scenario or SCENARIOS)
     say(

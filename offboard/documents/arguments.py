@@ -8,7 +8,7 @@ from typing import Any
 from typer import BadParameter
 from typer.core import TyperCommand
 
-from offboard.documents.command_line import INTERRUPT, INTERRUPTED, interrupts_raise
+from offboard.documents.command_line import INTERRUPT, INTERRUPTED
 from offboard.documents.errors import UserError, shown
 
 LIVE_PAGE = "127.0.0.1:8014"
@@ -57,7 +57,6 @@ class Command(TyperCommand):
         return super().parse_args(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
-        interrupts_raise()
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:

@@ -6,7 +6,6 @@ import csv
 import io
 import itertools
 import math
-from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +20,7 @@ from offboard.campaign import workers
 from offboard.campaign.campaign_page import FIGURES, page
 from offboard.campaign.cases import Case
 from offboard.campaign.document import CampaignFile, Promises
-from offboard.campaign.flight import LOWEST, terms
+from offboard.campaign.flight import LOWEST, Job, terms
 from offboard.campaign.progress import Counter
 from offboard.campaign.results import Record
 from offboard.campaign.run import Campaign
@@ -29,7 +28,6 @@ from offboard.campaign.table import Group, groups, row_of, show
 from offboard.campaign.workers import ConnectedVehicle
 from offboard.cli.commands import app
 from offboard.link import clock
-from offboard.run.configuration import FlightConfig
 
 LAWS = ("pso", "lqr", "an/uncommonly/long/name.yaml", "lost")
 SCENARIOS = ("calm", "all_together")
@@ -172,8 +170,8 @@ def test_on_one_vehicle_nothing_is_flown_after_a_refused_or_aborted_flight(
 ) -> None:
     flown: list[str] = []
 
-    def fly(load: Callable[[], FlightConfig], directory: Path, *_: object) -> Record:
-        flown.append(load().controller.law)
+    def fly(job: Job, directory: Path, *_: object) -> Record:
+        flown.append(job.case.load().controller.law)
         directory.mkdir(parents=True)
         if flown[-1] == "lqr":
             return Record(exit_code, "left OFFBOARD for AUTO.LOITER", -1.0, "completed")
