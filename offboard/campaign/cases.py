@@ -58,9 +58,9 @@ class Case:
 
     @property
     def key(self) -> str:
-        """Hash of the case, 16 hexadecimal digits."""
-        text = json.dumps(asdict(self), sort_keys=True, separators=(",", ":"))
-        return _hash(text)
+        """Hash of the case, 16 hexadecimal digits. Raises DocumentError."""
+        flown = {**asdict(self), "text": self.scenario_text}
+        return _hash(json.dumps(flown, sort_keys=True, separators=(",", ":")))
 
     @property
     def assignments(self) -> tuple[str, ...]:

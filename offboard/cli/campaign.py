@@ -119,12 +119,12 @@ def conclude(summary: Summary, flown: Campaign) -> None:
 def _search(flown: Campaign, source: str, count: int, open_workers: OpenFlyer) -> None:
     """Search for failures and print them; exits with 1 if there is one."""
     from offboard.campaign.progress import Counter
-    from offboard.campaign.search import find, search_of
+    from offboard.campaign.search import FailureSearch
 
-    search = search_of(flown, source)
+    search = FailureSearch(flown, source)
     counter = Counter(out, search.flights_most(count))
     with resumable(), flown.runner(open_workers, counter) as runner:
-        failures = find(flown, search, count, runner)
+        failures = search.find(count, runner)
     say(f"{len(flown.cases)} flights, {len(failures)} failures that differ")
     if failures:
         say(f"fly one again in {flown.directory}:")

@@ -19,7 +19,7 @@ from offboard.campaign.flight import Job
 from offboard.campaign.progress import Counter
 from offboard.campaign.results import Record, Results
 from offboard.campaign.run import Campaign, Incomplete, Runner
-from offboard.campaign.search import Failure, as_csv, find, search_of
+from offboard.campaign.search import Failure, FailureSearch, as_csv
 from offboard.campaign.tune import Tuned, Tuning, judge, profile, read_tune
 from offboard.documents.errors import DocumentError, UserError
 from offboard.run.configuration import load
@@ -78,7 +78,7 @@ def searched(directory: Path, most: float = math.inf) -> tuple[Campaign, list[Fa
     file.write_text(SEARCH)
     campaign = Campaign(*read_campaign(str(file)), directory / "out")
     with runner(campaign.results, Known(two_regions, most)) as flown:
-        return campaign, find(campaign, search_of(campaign, "c.yaml"), 2, flown)
+        return campaign, FailureSearch(campaign, "c.yaml").find(2, flown)
 
 
 def test_failures_that_differ_are_found_and_reduced_to_their_causes(tmp_path: Path) -> None:
