@@ -121,6 +121,8 @@ def vehicle_file(found: Identified, prior: Vehicle, flight: str) -> str:
     """
     comments = dict.fromkeys(_KEPT, "not identifiable from telemetry")
     comments |= {key: _comment(constants) for key, constants in _constants(found).items()}
+    if found.drag_ps:
+        comments["drag_translation_npmps"] += " times the mass"
     lines = [f"# Identified from {found.seconds:.0f} s of {flight}; +- is one standard deviation."]
     for key, value in plain(found.applied_to(prior).model_dump(mode="json"), DIGITS).items():
         flow = None if isinstance(value, dict | list) else False
