@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 
 REFERENCE_OVER = "reference over"
 NO_FLIGHT = "no flight of offboard in this log"
+_BLOCK = 10_000  # positions
 _ON_GROUND = 1  # MAV_LANDED_STATE
 _CRITICAL = 5  # MAV_STATE
 _LANDING_ENDS = {"disarmed", "failed", "yielded"}
@@ -55,10 +56,16 @@ def landing(flown: History) -> tuple[str, float]:
 
 def _positions(flown: History) -> Iterator[LocalPosition]:
     """In the order of time."""
-    rows = flown.position[np.argsort(flown.position["time_s"], kind="stable")]
-    for row in rows:
-        time_s, _, place, velocity = row.item()
-        yield LocalPosition(time_s, tuple(place.tolist()), tuple(velocity.tolist()))
+    order = np.argsort(flown.position["time_s"], kind="stable")
+    for first in range(0, len(order), _BLOCK):
+        rows = flown.position[order[first : first + _BLOCK]]
+        for place, velocity, time_s in zip(
+            rows["position_ned_m"].tolist(),
+            rows["velocity_ned_mps"].tolist(),
+            rows["time_s"].tolist(),
+            strict=True,
+        ):
+            yield LocalPosition(time_s, tuple(place), tuple(velocity))
 
 
 def begin_times(phases: tuple[Event, ...]) -> dict[str, float]:
