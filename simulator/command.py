@@ -133,7 +133,7 @@ def _check(path: Path) -> NoReturn:
 
 
 def _list_scenarios() -> NoReturn:
-    for name, text in shipped.descriptions("scenarios").items():
+    for name, text in shipped.descriptions("scenario").items():
         tell(f"{name:16}  {text}", sys.stdout)
     raise typer.Exit(0)
 

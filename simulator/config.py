@@ -29,7 +29,7 @@ class Scenario(Parameters):
 
 def scenario(name: str) -> Scenario:
     """A shipped scenario or a file. Raises DocumentError."""
-    return _load(name, "scenarios", "scenario", Scenario)
+    return _load(name, "scenario", Scenario)
 
 
 def check_for(flown: Scenario, firmware: Firmware, *, lockstep: bool) -> None:
@@ -49,9 +49,9 @@ def check_for(flown: Scenario, firmware: Firmware, *, lockstep: bool) -> None:
 
 def vehicle(name: str) -> Vehicle:
     """A shipped vehicle or a file. Raises DocumentError."""
-    return _load(name, "vehicles", "vehicle", Vehicle)
+    return _load(name, "vehicle", Vehicle)
 
 
-def _load(name: str, folder: str, kind: str, model: type[M]) -> M:
-    path = locate(name, folder, kind)
+def _load(name: str, kind: str, model: type[M]) -> M:
+    path = locate(name, kind)
     return parse(read_text(path), model, str(path), kind)

@@ -67,6 +67,10 @@ _THEIRS: dict[str, tuple[Columns, str]] = {
     "SYS_STATUS": (_BATTERY, BEFORE),
     "EXTENDED_SYS_STATE": ({"state": ("landed_state", 1)}, BEFORE),
 }  # fmt: skip
+_OURS: dict[str, tuple[Columns, str]] = {
+    "POSITION_TARGET_LOCAL_NED": (_REFERENCE, BOOT_MS),
+    "SET_ATTITUDE_TARGET": (SETPOINT, BOOT_MS),
+}
 _PLACE = {"latitude": ("lat", 1), "longitude": ("lon", 1), "altitude": ("alt", 1)}
 _SIM_PLACE = {"latitude": ("lat_int", 1), "longitude": ("lon_int", 1), "altitude": ("alt", 1)}
 _TRUTH: dict[str, tuple[Columns, str]] = {
@@ -84,18 +88,22 @@ _DEFAULTS = struct.pack(  # of records of an older version, which lack the last 
 )
 _NO_ATTITUDE = struct.pack("<8f", *(NAN,) * 8)  # of a setpoint, after its stamp
 _TIMESYNC = struct.Struct("<qq")  # tc1, ts1
+_TIMES = struct.Struct("<2d")  # time_s, unix_s
+Said = list[tuple[float, float, str]]  # texts, each with `now_ms` and the time in the log
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
     """A phase, a mode or a text: vehicle time (NaN before telemetry), sender, and what. `phase`:
-    the one that begins, empty for another event; `cause`: a word for what caused it, or empty."""
+    the one that begins, empty for another event; `cause`: a word for what caused it, or empty;
+    `unix_s`: its time in the log."""
 
     time_s: float
     who: str
     what: str
     phase: str = ""
     cause: str = ""
+    unix_s: float = math.nan
 
     @property
     def reason(self) -> str:
@@ -105,16 +113,17 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """Structured arrays (N,) in the order of arrival, and events. Each has `time_s`, and:
+    """Structured arrays (N,) in the order of arrival, and events. Each has `time_s`, `unix_s` (the
+    time in the log), and:
 
     position: position_ned_m, velocity_ned_mps (LOCAL_POSITION_NED)
     attitude: quaternion (w, x, y, z), rates_radps (ATTITUDE_QUATERNION)
     truth: position_ned_m (HIL_STATE_QUATERNION or SIM_STATE; empty without)
     reference: position, velocity and acceleration, heading_rad (POSITION_TARGET_LOCAL_NED)
-    setpoint: unix_s, quaternion, thrust (SET_ATTITUDE_TARGET); the last two NaN for a setpoint of
+    setpoint: quaternion, thrust (SET_ATTITUDE_TARGET); the last two NaN for a setpoint of
         the autopilot's own position loop (SET_POSITION_TARGET_LOCAL_NED)
     identified: value and sd of each constant of `identification.vehicle_fit.RECORDED`
-    link_delay: delay_s, at the telemetry that a TIMESYNC request followed
+    link_delay: delay_s, at the telemetry that a TIMESYNC request followed; without `unix_s`
     heartbeat: armed (1 or 0), system_status (MAV_STATE)
     battery: voltage_mv, remaining in percent; NaN where it is not known (SYS_STATUS)
     landed: state (MAV_LANDED_STATE of EXTENDED_SYS_STATE)
@@ -193,27 +202,22 @@ class Samples:
         message: name in pymavlink.
         columns: name -> the first of its fields, or an array field, and how many values.
         stamp: BOOT_MS or BOOT_US; BEFORE gives a message the time of the telemetry before it.
-        unix: whether to keep the time in the log, as `unix_s`.
     """
 
-    def __init__(
-        self, message: str, columns: Columns, stamp: str = BOOT_MS, *, unix: bool = False
-    ) -> None:
+    def __init__(self, message: str, columns: Columns, stamp: str = BOOT_MS) -> None:
         places = {column: _place(message, *fields) for column, fields in columns.items()}
         self._begin = min(at for at, _ in places.values())
         self._end = max(at + kind.itemsize for at, kind in places.values())
-        names = ["time_s", "unix_s"][: 1 + unix]
-        self._head = struct.Struct(f"<{len(names)}d")
-        away = self._head.size - self._begin
+        away = _TIMES.size - self._begin
         self._dtype = np.dtype(
             {
-                "names": [*names, *places],
-                "formats": ["f8"] * len(names) + [kind for _, kind in places.values()],
-                "offsets": [0, 8][: len(names)] + [away + at for at, _ in places.values()],
+                "names": ["time_s", "unix_s", *places],
+                "formats": ["f8", "f8", *(kind for _, kind in places.values())],
+                "offsets": [0, 8, *(away + at for at, _ in places.values())],
                 "itemsize": away + self._end,
             }
         )
-        self._stamp, self._unix = stamp, unix
+        self._stamp = stamp
         self._data = bytearray()
 
     def add(self, payload: bytes, now_ms: float, unix_s: float) -> None:
@@ -224,7 +228,7 @@ class Samples:
             stamp_ms = int.from_bytes(payload[:4], "little")
         elif self._stamp == BOOT_US and any(payload[:8]):
             stamp_ms = 1e-3 * int.from_bytes(payload[:8], "little")
-        self._data += self._head.pack(stamp_ms, unix_s) if self._unix else self._head.pack(stamp_ms)
+        self._data += _TIMES.pack(stamp_ms, unix_s)
         self._data += payload[self._begin : self._end].ljust(self._end - self._begin, b"\0")
 
     def rows(self, anchor_ms: float) -> Rows:
@@ -243,12 +247,12 @@ def _place(message: str, field: str, count: int, first: int = 0) -> tuple[int, n
     return at + first * base.itemsize, np.dtype((base, (count,))) if count > 1 else base
 
 
-def table(time_s: Any, **columns: Any) -> Rows:
-    """Rows at the times (N,), with columns (N, ...)."""
+def table(times: Any, **columns: Any) -> Rows:
+    """Rows with both times (N,) of other rows, or of a mapping, and columns (N, ...)."""
     values = {name: np.asarray(column) for name, column in columns.items()}
+    values = {name: np.asarray(times[name]) for name in ("time_s", "unix_s")} | values
     kinds = [(name, each.dtype, each.shape[1:]) for name, each in values.items()]
-    rows = np.empty(len(time_s), [("time_s", "f8"), *kinds])
-    rows["time_s"] = time_s
+    rows = np.empty(len(values["time_s"]), kinds)
     for name, each in values.items():
         rows[name] = each
     return rows
@@ -271,17 +275,16 @@ class _Collector:
 
     def __init__(self, vehicle: Address | None, dialect: Dialect | None) -> None:
         self._vehicle, self._dialect = vehicle, dialect
-        self._theirs = {name: Samples(name, *spec) for name, spec in _THEIRS.items()}
-        self._reference = Samples("POSITION_TARGET_LOCAL_NED", _REFERENCE)
-        self._setpoint = Samples("SET_ATTITUDE_TARGET", SETPOINT, unix=True)
+        specs = _THEIRS | _OURS
+        self._samples = {name: Samples(name, *spec) for name, spec in specs.items()}
         self._records = Samples(_ARRAY, _TICK, BOOT_US)
         self._identified = Samples(_ARRAY, _IDENTIFIED, BOOT_US)
         self._truth: list[tuple[Geodetic, dict[str, Samples]]] = []  # by the local frame's origin
         self._asked_ns, self._answered_ns = array("q"), array("q")  # of TIMESYNC; ts1, and ts1, tc1
         self._assembler = TextAssembler()
-        self._texts: list[tuple[float, str]] = []  # of the vehicle, each with `now_ms`
-        self._modes: list[tuple[float, str]] = []
-        self._event_records: list[tuple[float, bytes]] = []
+        self._texts: Said = []  # of the vehicle
+        self._modes: Said = []
+        self._event_records: list[tuple[float, float, bytes]] = []
         self._counts: Counter[str] = Counter()
         self._unix_us = (0, 0)
         self._anchor_ms = math.nan
@@ -300,12 +303,11 @@ class _Collector:
 
     def _add_ours(self, entry: LoggedMessage, payload: bytes) -> None:
         name, now_ms, unix_s = entry.name, self.now_ms, entry.unix_us / 1e6
-        if name == "POSITION_TARGET_LOCAL_NED":
-            self._reference.add(payload, now_ms, unix_s)
-        elif name == "SET_ATTITUDE_TARGET":
-            self._setpoint.add(payload, now_ms, unix_s)
+        if name in _OURS:
+            self._samples[name].add(payload, now_ms, unix_s)
         elif name == "SET_POSITION_TARGET_LOCAL_NED":
-            self._setpoint.add(payload[:4] + _NO_ATTITUDE, now_ms, unix_s)
+            setpoint = payload[:4] + _NO_ATTITUDE
+            self._samples["SET_ATTITUDE_TARGET"].add(setpoint, now_ms, unix_s)
         elif name == _ARRAY and payload[10:20].rstrip(b"\0") == RECORD_NAME.encode():
             fields = int.from_bytes(payload[8:10], "little")  # array_id
             if fields >= _FIRST_FIELDS:
@@ -319,12 +321,12 @@ class _Collector:
             if not answered_ns:
                 self._asked_ns.append(asked_ns)
         elif record_type(entry) == event_record.PAYLOAD_TYPE:
-            self._event_records.append((now_ms, entry.tunnelled))
+            self._event_records.append((now_ms, unix_s, entry.tunnelled))
 
     def _add_theirs(self, entry: LoggedMessage, payload: bytes) -> None:
         name, now_ms, unix_s = entry.name, self.now_ms, entry.unix_us / 1e6
-        if name in self._theirs:
-            self._theirs[name].add(payload, now_ms, unix_s)
+        if name in _THEIRS:
+            self._samples[name].add(payload, now_ms, unix_s)
         elif name in _TRUTH:
             if self._truth:
                 self._truth[-1][1][name].add(payload, now_ms, unix_s)
@@ -334,17 +336,18 @@ class _Collector:
                 self._answered_ns.extend((asked_ns, answered_ns))
         elif name == "STATUSTEXT":
             whole = self._assembler.add(payload, unix_s)
-            self._texts += [(now_ms, text.text) for text in whole]
+            self._texts += [(now_ms, unix_s, text.text) for text in whole]
         elif name == "COMMAND_ACK":
             command, result = entry.message.command, entry.message.result
             if result not in (0, 5):  # MAV_RESULT_ACCEPTED, MAV_RESULT_IN_PROGRESS
-                self._texts.append((now_ms, f"command {command} refused, result {result}"))
+                refused = f"command {command} refused, result {result}"
+                self._texts.append((now_ms, unix_s, refused))
         elif name in ("GPS_GLOBAL_ORIGIN", "HOME_POSITION"):
             self._add_origin(entry)
         if name == "HEARTBEAT" and self._dialect:
             mode = self._dialect.mode_name(int.from_bytes(payload[:4], "little"))
-            if not self._modes or mode != self._modes[-1][1]:
-                self._modes.append((now_ms, mode))
+            if not self._modes or mode != self._modes[-1][-1]:
+                self._modes.append((now_ms, unix_s, mode))
         if entry.frame.message_id in self._clocks:
             if entry.frame.message_id in TELEMETRY:
                 self._clocks = TELEMETRY
@@ -365,37 +368,38 @@ class _Collector:
     def history(self, damage: str) -> History:
         """All that was added."""
         anchor_ms = self._anchor_ms
-        rows = {name: samples.rows(anchor_ms) for name, samples in self._theirs.items()}
+        rows = {name: samples.rows(anchor_ms) for name, samples in self._samples.items()}
         heartbeat, battery = rows["HEARTBEAT"], rows["SYS_STATUS"]
         voltage, remaining = (battery[name].astype(np.float32) for name in _BATTERY)
         voltage[voltage == _NO_VOLTAGE] = remaining[remaining == _NO_PERCENTAGE] = math.nan
-        payloads = [payload for _, payload in self._event_records]
-        events = [
-            Event(
-                float(continuous_s(self._event_records[last][0], anchor_ms)),
-                "offboard", event.text, _PHASES.get(event.phase, ""), event.cause,
-            )
-            for last, event in event_record.join(payloads)
-        ]  # fmt: skip
+        payloads = [payload for *_, payload in self._event_records]
+        events = []
+        for last, event in event_record.join(payloads):
+            now_ms, unix_s, _ = self._event_records[last]
+            time_s, phase = float(continuous_s(now_ms, anchor_ms)), _PHASES.get(event.phase, "")
+            events.append(Event(time_s, "offboard", event.text, phase, event.cause, unix_s))
         modes, texts = (
-            tuple(Event(float(continuous_s(at, anchor_ms)), "vehicle", text) for at, text in said)
+            tuple(
+                Event(float(continuous_s(at, anchor_ms)), "vehicle", text, unix_s=unix_s)
+                for at, unix_s, text in said
+            )
             for said in (self._modes, self._texts)
         )
         return History(
             position=rows["LOCAL_POSITION_NED"],
             attitude=rows["ATTITUDE_QUATERNION"],
             truth=self._truth_rows(),
-            reference=self._reference.rows(anchor_ms),
-            setpoint=self._setpoint.rows(anchor_ms),
+            reference=rows["POSITION_TARGET_LOCAL_NED"],
+            setpoint=rows["SET_ATTITUDE_TARGET"],
             records=self._records.rows(anchor_ms),
             identified=self._identified.rows(anchor_ms),
             link_delay=self._link_delay(),
             heartbeat=table(
-                heartbeat["time_s"],
+                heartbeat,
                 armed=(heartbeat["armed"] & _ARMED > 0).astype(np.float32),
                 system_status=heartbeat["system_status"].astype(np.float32),
             ),
-            battery=table(battery["time_s"], voltage_mv=voltage, remaining=remaining),
+            battery=table(battery, voltage_mv=voltage, remaining=remaining),
             landed=rows["EXTENDED_SYS_STATE"],
             phases=tuple(event for event in events if event.phase),
             announcements=tuple(event for event in events if not event.phase),
@@ -410,21 +414,23 @@ class _Collector:
         )
 
     def _truth_rows(self) -> Rows:
-        parts = [table(np.zeros(0), position_ned_m=np.zeros((0, 3), np.float32))]
+        none = {"time_s": np.zeros(0), "unix_s": np.zeros(0)}
+        parts = [table(none, position_ned_m=np.zeros((0, 3), np.float32))]
         for origin, samples in self._truth:
             for name, each in samples.items():
                 rows = each.rows(self._anchor_ms)
                 places = np.column_stack([rows[column] for column in _PLACE])
                 places = places / (1e7, 1e7, _ALTITUDE_UNITS[name])
                 position = position_ned_m(places, origin).astype(np.float32)
-                parts.append(table(rows["time_s"], position_ned_m=position))
+                parts.append(table(rows, position_ned_m=position))
         return np.concatenate(parts)
 
     def _link_delay(self) -> Rows:
         """From the vehicle's answers to our TIMESYNC requests."""
         answers = np.array(self._answered_ns, np.int64).reshape(-1, 2)
         asked, answered = answers[np.isin(answers[:, 0], np.array(self._asked_ns))].T
-        return table(1e-9 * asked, delay_s=1e-9 * (answered - asked))
+        times = {"time_s": 1e-9 * asked, "unix_s": np.full(len(asked), np.nan)}
+        return table(times, delay_s=1e-9 * (answered - asked))
 
 
 def _vehicle(log: Tlog) -> tuple[Address | None, Dialect | None]:

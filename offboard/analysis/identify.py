@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
+from scipy.integrate import cumulative_trapezoid
 
 from offboard.analysis.history import History
 from offboard.documents.errors import plain
@@ -26,6 +27,7 @@ from offboard.model.frames import heading_from_quaternion, thrust_direction_from
 from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
+Row = tuple[str, Estimate | None, str, str]  # name, estimate, unit, reason without one
 
 LIFTED_OFF_S = 0.5  # the ground's effect on the thrust ends
 _KEPT = (
@@ -81,23 +83,34 @@ def _flown(history: History) -> tuple[float, float]:
     return (times[0] + LIFTED_OFF_S, times[-1]) if len(times) else (-math.inf, math.inf)
 
 
-def rows(found: Identified) -> Iterator[tuple[str, Estimate | None, str, str]]:
-    """(name, estimate, unit, reason without one) of every constant that can be identified."""
-    for name, fit in (("tilt", found.tilt), ("yaw", found.yaw)):
-        why = found.refusals.get(name, "")
-        yield f"{name} delay", fit.delay_s if fit else None, "s", why
-        yield (
-            f"{name} natural frequency",
-            fit.natural_frequency_radps if fit else None,
-            "rad/s",
-            why,
-        )
-        yield f"{name} damping", fit.damping if fit else None, "", why
-    yield "hover thrust", found.hover_thrust, "", found.refusals.get("hover_thrust", "")
-    lag = found.refusals.get("thrust_lag_s", "")
-    yield "thrust lag", found.thrust_lag_s, "s", lag
-    yield "thrust delay", found.thrust_delay_s, "s", lag
-    yield "drag", found.drag_ps, "1/s", found.refusals.get("drag_ps", "")
+def rows(found: Identified) -> Iterator[Row]:
+    """Name, estimate, unit, and reason without one of every constant that can be identified."""
+    for constants in _constants(found).values():
+        yield from constants
+
+
+def _constants(found: Identified) -> dict[str, list[Row]]:
+    """The rows by their key in a vehicle file."""
+
+    def row(name: str, estimate: Estimate | None, unit: str, refused: str) -> Row:
+        return name, estimate, unit, found.refusals.get(refused, "")
+
+    def response(axis: str, fit: ResponseFit | None) -> list[Row]:
+        frequency = fit.natural_frequency_radps if fit else None
+        return [
+            row(f"{axis} delay", fit.delay_s if fit else None, "s", axis),
+            row(f"{axis} natural frequency", frequency, "rad/s", axis),
+            row(f"{axis} damping", fit.damping if fit else None, "", axis),
+        ]
+
+    return {
+        "tilt": response("tilt", found.tilt),
+        "yaw": response("yaw", found.yaw),
+        "hover_thrust": [row("hover thrust", found.hover_thrust, "", "hover_thrust")],
+        "thrust_lag_s": [row("thrust lag", found.thrust_lag_s, "s", "thrust_lag_s")],
+        "thrust_delay_s": [row("thrust delay", found.thrust_delay_s, "s", "thrust_lag_s")],
+        "drag_translation_npmps": [row("drag", found.drag_ps, "1/s", "drag_ps")],
+    }
 
 
 def vehicle_file(found: Identified, prior: Vehicle, flight: str) -> str:
@@ -106,19 +119,10 @@ def vehicle_file(found: Identified, prior: Vehicle, flight: str) -> str:
     Identified constants have their standard deviation as comment. The other constants are those of
     `prior`, with the reason why they were not identified. `flight` names the log.
     """
-    whys = found.refusals
-    lag = _comment(found.thrust_lag_s, "s", whys.get("thrust_lag_s", ""))
-    comments = {
-        **dict.fromkeys(_KEPT, "not identifiable from telemetry"),
-        "drag_translation_npmps": _comment(
-            found.drag_ps, "1/s times the mass", whys.get("drag_ps", "")
-        ),
-        "hover_thrust": _comment(found.hover_thrust, "", whys.get("hover_thrust", "")),
-        "thrust_delay_s": lag,
-        "thrust_lag_s": lag,
-        "tilt": _fit_comment(found.tilt, whys.get("tilt", "")),
-        "yaw": _fit_comment(found.yaw, whys.get("yaw", "")),
-    }
+    comments = dict.fromkeys(_KEPT, "not identifiable from telemetry")
+    comments |= {key: _comment(constants) for key, constants in _constants(found).items()}
+    if found.drag_ps:
+        comments["drag_translation_npmps"] += " times the mass"
     lines = [f"# Identified from {found.seconds:.0f} s of {flight}; +- is one standard deviation."]
     for key, value in plain(found.applied_to(prior).model_dump(mode="json"), DIGITS).items():
         flow = None if isinstance(value, dict | list) else False
@@ -127,6 +131,14 @@ def vehicle_file(found: Identified, prior: Vehicle, flight: str) -> str:
         )
         lines.append(_line(text.rstrip(), comments.get(key, "")))
     return "\n".join(lines) + "\n"
+
+
+def _comment(constants: Sequence[Row]) -> str:
+    """Standard deviations of the constants of one key, or why there are none."""
+    known = [(estimate.sd, unit) for _, estimate, unit, _ in constants if estimate]
+    if not known:
+        return f"not identified: {constants[0][-1]}"
+    return "+- " + ", ".join(f"{sd:.2g} {unit}".rstrip() for sd, unit in known)
 
 
 def _line(entry: str, comment: str) -> str:
@@ -138,20 +150,6 @@ def _line(entry: str, comment: str) -> str:
         comment, LINE_WIDTH, initial_indent="# ", subsequent_indent="# ", break_long_words=False
     )
     return "\n".join([*above, entry])
-
-
-def _comment(estimate: Estimate | None, unit: str, why: str) -> str:
-    return f"+- {estimate.sd:.2g} {unit}".rstrip() if estimate else f"not identified: {why}"
-
-
-def _fit_comment(fit: ResponseFit | None, why: str) -> str:
-    if fit is None:
-        return f"not identified: {why}"
-    return (
-        f"+- {fit.delay_s.sd:.2g} s, {fit.natural_frequency_radps.sd:.2g} rad/s, "
-        f"{fit.damping.sd:.2g}; residual {1e3 * fit.residual_rms:.1f} of "
-        f"{1e3 * fit.commanded_rms:.0f} mrad RMS"
-    )
 
 
 # ---------------------------------------------------------------------- estimator's noise
@@ -201,17 +199,10 @@ def _white_sd(stamps: Array, signals: Array) -> float:
 
 def _velocity_contradiction(trace: Trace) -> float:
     stamps = trace.position[:, STAMP]
-    starts = np.arange(stamps[0], stamps[-1] - MEAN_OVER_S, MEAN_OVER_S)
-    if len(starts) < 2:
+    travelled = cumulative_trapezoid(trace.position[:, VELOCITY], stamps, axis=0, initial=0.0)
+    apart = travelled - trace.position[:, POSITION]
+    ends = np.arange(stamps[0], stamps[-1], MEAN_OVER_S)
+    if len(ends) < 3:
         return math.nan
-    differences = []
-    for axis in range(3):
-        position, velocity = trace.position[:, 1 + axis], trace.position[:, 4 + axis]
-        travelled = np.concatenate(
-            ([0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * np.diff(stamps)))
-        )
-        gap = travelled - position
-        differences.append(
-            np.interp(starts + MEAN_OVER_S, stamps, gap) - np.interp(starts, stamps, gap)
-        )
-    return float(np.std(differences) / MEAN_OVER_S)
+    changes = np.diff([np.interp(ends, stamps, axis) for axis in apart.T])
+    return float(np.std(changes) / MEAN_OVER_S)

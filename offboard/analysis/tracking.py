@@ -29,6 +29,15 @@ Array = NDArray[np.float64]
 SKIPPED_S = 1.5  # without a decision for longer, the reference was not tracked meanwhile
 _BLOCK = 8192  # samples that are computed at once
 _EXPLAINED = 7  # regressors of the agitation: velocity, acceleration, jerk (north, east), and 1
+_ORDERS, _POWERS = np.arange(3)[:, None], np.arange(5, -1, -1)[:, None]
+# coefficients of s^5 .. s^0 from position, velocity and acceleration at s = 0, then at s = 1
+_QUINTIC = np.linalg.inv(
+    [
+        [math.perm(power, order) * float(s) ** max(power - order, 0) for power in range(5, -1, -1)]
+        for s in (0, 1)
+        for order in range(3)
+    ]
+)
 _FITNESS = ("e_u", "e_v", "e_w", "e_x", "e_y", "e_z", "e_psi")
 
 
@@ -197,29 +206,12 @@ class Reference:
         rows = rows[np.concatenate(([True], rows["time_s"][1:] > newest[:-1]))]
         self._times = rows["time_s"]
         self._heading = np.unwrap(rows["heading_rad"].astype(np.float64))
-        length_s = np.diff(self._times)[:, None]
-        position, velocity, half = (
-            rows["position_ned_m"].astype(np.float64),
-            rows["velocity_ned_mps"].astype(np.float64),
-            0.5 * rows["acceleration_ned_mps2"].astype(np.float64),
-        )
-        # of the end from the parabola that begins at the start, each in m
-        away = np.diff(position, axis=0) - length_s * (velocity[:-1] + length_s * half[:-1])
-        turn = length_s * (np.diff(velocity, axis=0) - 2.0 * length_s * half[:-1])
-        bend = length_s**2 * 2.0 * np.diff(half, axis=0)
-        self._position = PPoly(
-            np.stack(
-                (
-                    (6.0 * away - 3.0 * turn + 0.5 * bend) / length_s**5,
-                    (-15.0 * away + 7.0 * turn - bend) / length_s**4,
-                    (10.0 * away - 4.0 * turn + 0.5 * bend) / length_s**3,
-                    half[:-1],
-                    velocity[:-1],
-                    position[:-1],
-                )
-            ),
-            self._times,
-        )
+        derivatives = ("position_ned_m", "velocity_ned_mps", "acceleration_ned_mps2")
+        known = np.stack([rows[name].astype(np.float64) for name in derivatives], axis=1)
+        length_s = np.diff(self._times)[:, None, None]
+        scaled = known[:-1] * length_s**_ORDERS, known[1:] * length_s**_ORDERS
+        coefficients = _QUINTIC @ np.concatenate(scaled, axis=1) / length_s**_POWERS
+        self._position = PPoly(coefficients.swapaxes(0, 1), self._times)
 
     def position(self, times: Array, derivative: int = 0) -> Array:
         """(N, 3) position NED in m, or a derivative of it."""

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import html
 import itertools
-from collections.abc import Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Sequence
 from typing import Any
 
 import plotly.graph_objects as go
@@ -41,13 +40,9 @@ CAPTION = (
 )
 
 
-def page(
-    groups: Sequence[Group],
-    missing: Sequence[str] = (),
-    kept: Mapping[str, Mapping[str, str]] = MappingProxyType({}),
-) -> str:
-    """The page as text. `missing`: what is not flown; `kept`: files of kept flights, title to path,
-    by case."""
+def page(groups: Sequence[Group], missing: Sequence[str] = (), kept: str = "") -> str:
+    """The page as text. `missing`: what is not flown; `kept`: the directory of the logs, beside the
+    page, empty without."""
     rows = [row for group in groups for row in group.rows]
     return render(
         "campaign/templates/campaign.html",

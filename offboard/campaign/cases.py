@@ -8,9 +8,8 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-import math
 import shlex
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cache
@@ -31,7 +30,6 @@ from offboard.run.flight import Simulated
 
 SEED = "seed"  # a range of this name is that of the flight's seed: noise, and the phase of gusts
 SCENARIO = "scenario."  # of a key of the scenario
-UNNAMED = "unnamed"
 CONNECTED = "connected"  # the scenario of the vehicle at a link
 OWN_SCENARIOS = {"px4": "px4_like", "ardupilot": "ardupilot_like"}  # where a file names none
 FILES = ("config", "controller", "reference", "vehicle", "sim_vehicle", "scenario")
@@ -42,9 +40,8 @@ Values = tuple[tuple[str, Any], ...]
 class Case:
     """One flight of a campaign. None: the default of `config`, or of the firmware.
 
-    `values` are what parameters and draws set, by key; `text` is the YAML of a scenario that is not
-    a file; `files` holds a hash of every file that is not shipped. With `link` (an address), the
-    vehicle at it is flown instead of the simulator.
+    `values` are what parameters and draws set, by key; `files` holds a hash of every file that is
+    not shipped. With `link` (an address), the vehicle at it is flown instead of the simulator.
     """
 
     config: str
@@ -56,15 +53,14 @@ class Case:
     scenario: str
     seed: int
     values: Values = ()
-    text: str = ""
     files: tuple[tuple[str, str], ...] = ()
     link: str | None = None
 
     @property
     def key(self) -> str:
-        """Hash of the case, 16 hexadecimal digits."""
-        text = json.dumps(asdict(self), sort_keys=True, separators=(",", ":"))
-        return _hash(text)
+        """Hash of the case, 16 hexadecimal digits. Raises DocumentError."""
+        flown = {**asdict(self), "text": self.scenario_text}
+        return _hash(json.dumps(flown, sort_keys=True, separators=(",", ":")))
 
     @property
     def assignments(self) -> tuple[str, ...]:
@@ -83,12 +79,17 @@ class Case:
         return "-".join((*stems, str(self.seed), self.key[:8]))
 
     @property
+    def scenario_text(self) -> str:
+        """YAML of the scenario with what `values` set in it; empty where they set nothing. Raises
+        DocumentError."""
+        changes = [(key, value) for key, value in self.values if key.startswith(SCENARIO)]
+        return _changed(self.scenario, json.dumps(changes)) if changes else ""
+
+    @property
     def scenario_file(self) -> str:
-        """Name of the file that holds `text`, by its content; empty without one."""
-        if not self.text:
-            return ""
-        digest = hashlib.sha256(self.text.encode()).hexdigest()[:10]
-        return f"scenarios/{Path(self.scenario).stem}-{digest}.yaml"
+        """Name of the file that holds `scenario_text`, by its content; empty without one."""
+        text = self.scenario_text
+        return f"scenarios/{Path(self.scenario).stem}-{_hash(text)[:10]}.yaml" if text else ""
 
     @property
     def line(self) -> str:
@@ -126,88 +127,44 @@ class Case:
         """The simulated vehicle of the case, in `scenario`. Raises DocumentError."""
         return Simulated(self.firmware, scenario, self.sim_vehicle)
 
-    def with_values(self, values: Values) -> Case:
-        """The case with these values instead."""
-        text = self.text
-        changes = [(key, value) for key, value in values if key.startswith(SCENARIO)]
-        if changes:
-            source = f"scenario {self.scenario}"
-            raw = read(text or _scenario_text(self.scenario), source)
-            for key, value in changes:
-                raw = override(raw, f"{key.removeprefix(SCENARIO)}={json.dumps(value)}")
-            text = yaml.safe_dump(raw, sort_keys=False)
-        return replace(self, values=values, text=text)
-
 
 def expand(file: CampaignFile, link: str | None = None) -> list[Case]:
     """All cases of a campaign, in the order of its table; with `link`, at that address. Raises
     DocumentError."""
     if SEED in file.parameters:
         raise DocumentError("parameters.seed: give the seeds with seeds")
-    size = _size(file)
-    if size > CASES_MOST:
-        raise DocumentError(f"{size:,} flights; at most {CASES_MOST:,}")
+    columns = [[(key, value) for value in values] for key, values in file.parameters.items()]
     draws = drawn(file.sample) if file.sample else [()]
-    cases: list[Case] = []
-    for case, grid in itertools.product(base_cases(file), _grid(file.parameters)):
-        if link:
-            case = replace(case, scenario=CONNECTED, link=link)
-        for draw in draws:
-            flown = case.with_values((*grid, *draw)) if grid or draw else case
-            cases += [replace(flown, seed=seed) for seed in file.seed_values]
+    flown = (
+        replace(case, values=(*grid, *draw), seed=seed)
+        for case in base_cases(file, link)
+        for grid in itertools.product(*columns)
+        for draw in draws
+        for seed in file.seed_values
+    )
+    cases = list(itertools.islice(flown, CASES_MOST + 1))
+    if len(cases) > CASES_MOST:
+        raise DocumentError(f"more than {CASES_MOST:,} flights")
     if len({case.key for case in cases}) < len(cases):
         raise DocumentError("a combination is given twice; give each value once")
     return cases
 
 
-def base_cases(file: CampaignFile) -> Iterator[Case]:
+def base_cases(file: CampaignFile, link: str | None = None) -> Iterator[Case]:
     """Every combination of names, without parameters, with the first seed. Raises DocumentError."""
-    names = [each.get("name", UNNAMED) for each in file.scenarios or () if isinstance(each, dict)]
-    for name in names:
-        if names.count(name) > 1:
-            raise DocumentError(f"scenarios: two are called {name!r}; give each its own name")
     for firmware in file.firmwares:
-        scenarios = file.scenarios or (_own_scenario(firmware),)
         for reference, scenario, controller, vehicle, sim_vehicle in itertools.product(
             file.references or (None,),
-            scenarios,
+            (CONNECTED,) if link else file.scenarios or (OWN_SCENARIOS[firmware],),
             file.controllers or (None,),
             file.vehicles or (None,),
             file.sim_vehicles or (None,),
         ):
-            inline = isinstance(scenario, dict)
             case = Case(
-                config=file.config,
-                controller=controller,
-                reference=reference,
-                vehicle=vehicle,
-                sim_vehicle=sim_vehicle,
-                firmware=firmware,
-                scenario=str(scenario.get("name", UNNAMED)) if inline else scenario,
-                seed=file.seed_values[0],
-                text=yaml.safe_dump(scenario, sort_keys=False) if inline else "",
-            )
+                file.config, controller, reference, vehicle, sim_vehicle, firmware, scenario,
+                file.seed_values[0], link=link,
+            )  # fmt: skip
             yield replace(case, files=_digests(case))
-
-
-def _own_scenario(firmware: str) -> str:
-    if firmware not in OWN_SCENARIOS:
-        known = ", ".join(OWN_SCENARIOS)
-        raise DocumentError(f"firmwares: {firmware!r} is not one of {known}")
-    return OWN_SCENARIOS[firmware]
-
-
-def _size(file: CampaignFile) -> int:
-    lists = (file.controllers, file.references, file.vehicles, file.sim_vehicles, file.scenarios)
-    combinations = math.prod(len(names or (None,)) for names in lists) * len(file.firmwares)
-    grid = math.prod(map(len, file.parameters.values()))
-    draws = file.sample.draws if file.sample else 1
-    return combinations * grid * draws * len(file.seed_values)
-
-
-def _grid(parameters: Mapping[str, Sequence[Any]]) -> Iterable[Values]:
-    columns = [[(key, value) for value in values] for key, values in parameters.items()]
-    return list(itertools.product(*columns))
 
 
 def drawn(sample: Sample) -> list[Values]:
@@ -240,7 +197,7 @@ def _digests(case: Case) -> tuple[tuple[str, str], ...]:
     found = []
     for part in FILES:
         name = getattr(case, part)
-        if name is None or (part == "scenario" and case.text):
+        if name is None or (part == "scenario" and case.link):
             continue
         if _is_file(name):
             found.append((part, _digest(name)))
@@ -248,7 +205,7 @@ def _digests(case: Case) -> tuple[tuple[str, str], ...]:
             kind = {"config": "configuration", "sim_vehicle": "vehicle"}.get(part, part)
             laws = catalogue.names() if part == "controller" else ()
             if name not in laws:
-                shipped.locate(name, shipped.FOLDERS[kind], kind, laws)
+                shipped.locate(name, kind, laws)
     if found:
         with suppress(DocumentError):  # of a flight that cannot be flown: it becomes a row
             found.append(("flight", _hash(case.load().model_dump_json())))
@@ -265,5 +222,10 @@ def _hash(text: str) -> str:
 
 
 @cache
-def _scenario_text(name: str) -> str:
-    return shipped.read_text(shipped.locate(name, "scenarios", "scenario"))
+def _changed(scenario: str, changes: str) -> str:
+    """The YAML of a scenario with values by key, which are given as JSON."""
+    text = shipped.read_text(shipped.locate(scenario, "scenario"))
+    raw = read(text, f"scenario {scenario}")
+    for key, value in json.loads(changes):
+        raw = override(raw, f"{key.removeprefix(SCENARIO)}={json.dumps(value)}")
+    return yaml.safe_dump(raw, sort_keys=False)

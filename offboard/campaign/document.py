@@ -5,15 +5,14 @@
     scenarios: [calm, px4_like]
     seeds: 5
 
-A scenario is a name, a file, or the values of a scenario file. A key of `parameters` and of ranges
-is that of `--set`; after `scenario.` it is a key of the scenario.
+A key of `parameters` and of ranges is that of `--set`; after `scenario.` it is a key of the
+scenario.
 """
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -46,13 +45,8 @@ def _requirement(text: str) -> str:
     return text
 
 
-def _kept(text: str) -> str:
-    if not re.fullmatch("all|worst [1-9][0-9]{0,3}", text):
-        raise ValueError(f"{text!r} is not understood; write for example 'worst 5', or 'all'")
-    return text
-
-
 Name = Annotated[str, Field(min_length=1)]
+Firmware = Literal["px4", "ardupilot"]
 Names = Annotated[tuple[Name, ...], Field(min_length=1)]
 Key = Annotated[str, AfterValidator(_key)]
 Ends = Annotated[tuple[float, float], AfterValidator(_ordered)]
@@ -109,7 +103,7 @@ class CampaignFile(Parameters):
 
     Without controllers, references or vehicles, those of `config` are flown; without scenarios, the
     firmware's own. `require` is what a flight must meet beside being completed, `promises` what the
-    margin is measured against, `keep` ("worst 5", or "all") the flights whose logs are kept.
+    margin is measured against; `keep` keeps the log of each flight.
     """
 
     config: Name = "flight"
@@ -117,8 +111,8 @@ class CampaignFile(Parameters):
     references: Names | None = None
     vehicles: Names | None = None
     sim_vehicles: Names | None = None
-    firmwares: Names = ("px4",)
-    scenarios: Annotated[tuple[Name | dict[str, Any], ...], Field(min_length=1)] | None = None
+    firmwares: Annotated[tuple[Firmware, ...], Field(min_length=1)] = ("px4",)
+    scenarios: Names | None = None
     parameters: dict[Key, Annotated[tuple[Any, ...], Field(min_length=1)]] = Field(
         default_factory=dict
     )
@@ -129,12 +123,7 @@ class CampaignFile(Parameters):
     ) = 1
     require: tuple[Annotated[str, AfterValidator(_requirement)], ...] = ()
     promises: Promises = Promises()
-    keep: Annotated[str, AfterValidator(_kept)] | None = None
-
-    @property
-    def kept(self) -> int:
-        """The number of worst flights whose logs are kept."""
-        return CASES_MOST if self.keep == "all" else int((self.keep or "worst 0").split()[1])
+    keep: bool = False
 
     @property
     def seed_values(self) -> tuple[int, ...]:
@@ -144,6 +133,5 @@ class CampaignFile(Parameters):
 
 def read_campaign(name: str) -> tuple[CampaignFile, str]:
     """A shipped campaign or a file, and its path for errors. Raises DocumentError."""
-    folder = shipped.FOLDERS["campaign"]
-    path = shipped.locate(name, folder, "campaign") if "." not in name else Path(name)
+    path = shipped.locate(name, "campaign") if "." not in name else Path(name)
     return parse(shipped.read_text(path), CampaignFile, str(path), "campaign"), str(path)

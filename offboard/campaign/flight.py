@@ -75,9 +75,7 @@ def fly_job(job: Job) -> Record:
         place = job.kept.parent if job.kept else None
         with tempfile.TemporaryDirectory(prefix=".offboard-", dir=place) as scratch:
             directory = Path(scratch) / "flight"
-            record = recorded(
-                job.case.load, directory, job.promises, partial(_fly, job.case, Path(scratch))
-            )
+            record = recorded(job, directory, partial(_fly, job.case, Path(scratch)))
             if job.kept and directory.exists() and not job.kept.exists():
                 directory.rename(job.kept)
             return replace(record, sentence=record.sentence.replace(f"{scratch}/", ""))
@@ -85,20 +83,15 @@ def fly_job(job: Job) -> Record:
         raise UserError(f"a worker cannot go on: {error}") from None
 
 
-def recorded(
-    load: Callable[[], FlightConfig],
-    directory: Path,
-    promises: Promises,
-    fly: Callable[[FlightConfig, Path], Outcome],
-) -> Record:
+def recorded(job: Job, directory: Path, fly: Callable[[FlightConfig, Path], Outcome]) -> Record:
     """The record of a flight from its log, with score.json beside the log.
 
-    `fly` flies the configuration that `load` returns, and logs it in `directory`. A flight that
-    fails is a record too. Raises UserError where none can be flown or recorded, for lack of memory
-    or disk space.
+    `fly` flies the configuration of the case, and logs it in `directory`. A flight that fails is a
+    record too. Raises UserError where none can be flown or recorded, for lack of memory or disk
+    space.
     """
     try:
-        config = load()
+        config = job.case.load()
         outcome = fly(config, directory)
         score, history = score_flight(directory)
     except LogError:
@@ -113,7 +106,7 @@ def recorded(
         return Record(ExitCode.ABORTED, sentence, NOT_FLOWN, "crash")
     keep_score(directory, score, history)
     outcome, figures = judged(outcome, score), score.metrics()
-    margins = terms(promises, figures, history, config.controller)
+    margins = terms(job.promises, figures, history, config.controller)
     weakest = min(margins, key=lambda name: margins[name])
     return Record(
         outcome.exit_code,
@@ -126,10 +119,10 @@ def recorded(
 
 def _fly(case: Case, scratch: Path, config: FlightConfig, directory: Path) -> Outcome:
     scenario = case.scenario
-    if case.text:
+    if text := case.scenario_text:
         path = scratch / case.scenario_file
         path.parent.mkdir()
-        path.write_text(case.text, encoding="utf-8")
+        path.write_text(text, encoding="utf-8")
         scenario = str(path)
     outcome = fly(
         config,

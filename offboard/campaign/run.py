@@ -31,8 +31,7 @@ from offboard.link.stop import StopRequests
 from offboard.run.configuration import build_controller, build_track
 from offboard.run.sitl import check_scenario_text
 
-KEPT = "flights"
-KEPT_FILES = {"report": "report.html", "log": "flight.tlog"}
+KEPT = "flights"  # directory of the logs that are kept
 TABLE_S = 5.0  # at least, from one table to the next
 TABLE_SHARE = 0.02  # of the time is for tables while it flies
 
@@ -80,7 +79,7 @@ class Runner(ExitStack):
         missing = [case for case in cases if known[case.key] is None]
         new = {case.key: case for case in cases if case.key not in self.flown}
         self._counter.begin(sum(known[key] is not None for key in new))
-        for job, record in self._fly(missing, self._keep):
+        for job, record in self._fly(missing):
             known[job.case.key] = record
             try:
                 self._results.put(job.case.key, record)
@@ -95,18 +94,12 @@ class Runner(ExitStack):
         self.flown |= new
         return records
 
-    def keep(self, cases: Sequence[Case], directory: Path) -> None:
-        """Fly cases again, with their logs: the same seed gives the same flight."""
-        missing = [case for case in cases if not (directory / case.folder).exists()]
-        for _ in self._fly(missing, directory):
-            pass
-
-    def _fly(self, cases: Sequence[Case], keep: Path | None) -> Iterator[tuple[Job, Record]]:
+    def _fly(self, cases: Sequence[Case]) -> Iterator[tuple[Job, Record]]:
         if not cases:
             return
         if self._flyer is None:
             self._flyer = self.enter_context(self._open_flyer())
-        folder = keep.absolute() if keep else None
+        folder = self._keep.absolute() if self._keep else None
         jobs = [
             Job(case, self._promises, code_hash(), folder / case.folder if folder else None)
             for case in cases
@@ -163,7 +156,7 @@ class Campaign:
 
     def runner(self, open_flyer: OpenFlyer, counter: Counter) -> Runner:
         """What flies the cases of this campaign, and writes table and page while it does."""
-        keep = self.directory / KEPT if self.file.kept >= len(self.cases) else None
+        keep = self.directory / KEPT if self.file.keep else None
         return Runner(
             self.results, self.file.promises, open_flyer, counter, keep=keep, written=self._written
         )
@@ -176,8 +169,6 @@ class Campaign:
         try:
             with self.runner(open_flyer, Counter(console, len(mine))) as runner:
                 runner.fly(mine)
-                if len(rows := self.rows()) == len(self.cases):
-                    runner.keep(self._worst(rows), self.directory / KEPT)
         except Incomplete as reason:
             stopped = str(reason)
         except KeyboardInterrupt:
@@ -196,10 +187,6 @@ class Campaign:
         kept = [path for path in folders if path.exists()]
         return Summary(len(self.cases), rows, missing, stopped, kept)
 
-    def _worst(self, rows: Sequence[Row]) -> list[Case]:
-        flown = (row for row in rows if row.record.figures)
-        return [row.case for row in sorted(flown, key=lambda row: row.severity)[: self.file.kept]]
-
     def rows(self) -> list[Row]:
         """The finished flights of all shards, in the order of the plan."""
         found = ((case, self.results.get(case.key)) for case in self.cases)
@@ -216,13 +203,13 @@ class Campaign:
         """Write table and page."""
         write = self.results.write
         for case in self.cases:
-            if case.text and not (path := self.directory / case.scenario_file).exists():
-                write(path, case.text.encode())
+            if (name := case.scenario_file) and not (path := self.directory / name).exists():
+                write(path, case.scenario_text.encode())
         write(self.directory / "campaign.csv", as_csv(columns(rows)).encode())
         absent = len(self.cases) - len(rows)
         missing = [f"{absent} of {len(self.cases)} flights are not flown yet"] if absent else []
         missing += [stopped] if stopped else []
-        text = page(groups(rows, self.drawn), missing, self._kept(rows))
+        text = page(groups(rows, self.drawn), missing, KEPT if self.file.keep else "")
         write(self.directory / "campaign.html", text.encode())
 
     def _written(self) -> None:
@@ -232,19 +219,6 @@ class Campaign:
             self.write(self.rows())
             took_s = clock.monotonic_s() - now_s
             self._next_table_s = now_s + max(TABLE_S, took_s / TABLE_SHARE)
-
-    def _kept(self, rows: Sequence[Row]) -> dict[str, dict[str, str]]:
-        """Files of kept flights by case, relative to the page."""
-        if not self.file.keep:
-            return {}
-        return {
-            row.case.key: {
-                name: f"{KEPT}/{row.case.folder}/{file}"
-                for name, file in KEPT_FILES.items()
-                if (self.directory / KEPT / row.case.folder / file).exists()
-            }
-            for row in rows
-        }
 
 
 def check(cases: Sequence[Case]) -> None:
@@ -267,9 +241,9 @@ def check(cases: Sequence[Case]) -> None:
 
 
 def _check_one(case: Case) -> None:
-    if case.text:
-        check_scenario_text(case.text, f"scenario {case.scenario}")
-    case.simulated(None if case.text or case.link else case.scenario).check()
+    if text := case.scenario_text:
+        check_scenario_text(text, f"scenario {case.scenario}")
+    case.simulated(None if text or case.link else case.scenario).check()
     config = case.load()
     build_track(config)
     build_controller(config)

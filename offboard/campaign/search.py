@@ -18,7 +18,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from offboard.campaign.cases import SEED, Case, Values, rounded
-from offboard.campaign.document import Search
 from offboard.campaign.results import Record
 from offboard.campaign.run import Campaign, Runner, check
 from offboard.campaign.table import as_csv as csv_of
@@ -104,33 +103,47 @@ class Failure:
 
 
 class FailureSearch:
-    """Searches around the case `base`."""
+    """The search of a campaign, whose file is `source`, around its one combination.
 
-    def __init__(self, base: Case, search: Search) -> None:
-        self._base = base
-        self._search = search
+    Raises DocumentError where the file declares no search, or more than one combination, and
+    UserError without optuna.
+    """
+
+    def __init__(self, campaign: Campaign, source: str) -> None:
+        if campaign.file.search is None:
+            raise DocumentError(f"{source}: search is missing; --worst needs search.ranges")
+        if len({replace(case, seed=0).key for case in campaign.cases}) > 1 or campaign.file.sample:
+            raise DocumentError(
+                f"{source}: --worst searches around one combination; give one controller, "
+                "reference, scenario, vehicle and firmware, one value of each parameter, and no "
+                "sample"
+            )
+        self._campaign = campaign
+        self._base, self._search = campaign.cases[0], campaign.file.search
+        ranges, seed = self._search.ranges, self._search.seed
         # all before the first flight: a study needs a package
-        self._studies = [Study(search.ranges, search.seed + 1000 * n) for n in range(ROUNDS)]
+        self._studies = [Study(ranges, seed + 1000 * n) for n in range(ROUNDS)]
+        middle = {key: rounded((low + high) / 2) for key, (low, high) in ranges.items()}
+        with naming(source):
+            check([self._case(middle)])
 
-    def find(self, count: int, fly: Fly) -> list[Failure]:
-        """The `count` worst failures that differ. Raises what `fly` raises."""
-        flown = self._flown(fly)
-        worst = self._worst(flown, CANDIDATES * count)
+    def find(self, count: int, runner: Runner) -> list[Failure]:
+        """The `count` worst failures that differ; writes worst.csv, and table and page of all
+        flights. Raises Incomplete, or UserError."""
+        fly, campaign = runner.fly, self._campaign
         failures: dict[tuple[str, tuple[str, ...]], Failure] = {}
-        for failure in self._reduced(worst, fly):
+        for failure in self._reduced(self._worst(self._flown(fly), CANDIDATES * count), fly):
             failures.setdefault(failure.kind, failure)
-        return self._at_seeds(list(failures.values())[:count], fly)
+        found = self._at_seeds(list(failures.values())[:count], fly)
+        campaign.cases = list(runner.flown.values())
+        campaign.write(campaign.rows())
+        campaign.results.write(campaign.directory / "worst.csv", as_csv(found).encode())
+        return found
 
     def flights_most(self, count: int) -> int:
         """The flights that `find` takes at most."""
         ranges, seeds = len(self._search.ranges), self._search.seeds
         return self._search.flights + count * (CANDIDATES * (1 + ranges) + seeds)
-
-    def middle(self) -> Case:
-        """The case in the middle of all ranges."""
-        return self._case(
-            {key: rounded((low + high) / 2) for key, (low, high) in self._search.ranges.items()}
-        )
 
     def _flown(self, fly: Fly) -> list[tuple[Values, Record]]:
         """All values that are flown, with their records. Each round has a study of its own and is
@@ -220,38 +233,11 @@ class FailureSearch:
     def _case(self, values: Mapping[str, float]) -> Case:
         seed = round(values.get(SEED, self._base.seed))
         own = tuple((key, value) for key, value in values.items() if key != SEED)
-        return replace(self._base.with_values((*self._base.values, *own)), seed=seed)
+        return replace(self._base, values=(*self._base.values, *own), seed=seed)
 
 
 def _changed(values: Mapping[str, float], defaults: Mapping[str, float]) -> Values:
     return tuple((key, value) for key, value in values.items() if value != defaults[key])
-
-
-def search_of(campaign: Campaign, source: str) -> FailureSearch:
-    """The search of a campaign. Raises DocumentError where the file declares none, or more than
-    one combination to search."""
-    search = campaign.file.search
-    if search is None:
-        raise DocumentError(f"{source}: search is missing; --worst needs search.ranges")
-    if len({replace(case, seed=0).key for case in campaign.cases}) > 1 or campaign.file.sample:
-        raise DocumentError(
-            f"{source}: --worst searches around one combination; give one controller, reference, "
-            "scenario, vehicle and firmware, one value of each parameter, and no sample"
-        )
-    found = FailureSearch(campaign.cases[0], search)
-    with naming(source):
-        check([found.middle()])
-    return found
-
-
-def find(campaign: Campaign, search: FailureSearch, count: int, runner: Runner) -> list[Failure]:
-    """The `count` worst failures that differ; writes worst.csv, and table and page of all flights.
-    Raises Incomplete, or UserError."""
-    failures = search.find(count, runner.fly)
-    campaign.cases = list(runner.flown.values())
-    campaign.write(campaign.rows())
-    campaign.results.write(campaign.directory / "worst.csv", as_csv(failures).encode())
-    return failures
 
 
 def as_csv(failures: Sequence[Failure]) -> str:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,17 +23,16 @@ from pydantic import AfterValidator, Field
 from scipy import stats
 
 from offboard.campaign.cases import SCENARIO, Case, Values, expand
-from offboard.campaign.document import CampaignFile, Name, Names, Ranges, Seed
+from offboard.campaign.document import CampaignFile, Firmware, Name, Names, Ranges, Seed
 from offboard.campaign.results import Record
 from offboard.campaign.run import check
 from offboard.campaign.search import Fly, Study
 from offboard.campaign.table import CONFIDENCE, FIGURE_COLUMNS
-from offboard.documents import shipped
 from offboard.documents.errors import DocumentError, naming
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import override, parse, read
 from offboard.documents.shipped import locate, read_text
-from offboard.run.configuration import FOLDERS, read_part
+from offboard.run.configuration import PARTS, read_part
 
 
 def _figure(name: str) -> str:
@@ -47,7 +46,7 @@ class Flights(Parameters):
     """A set of flights: every reference in every scenario with every seed."""
 
     references: Names | None = None
-    scenarios: Annotated[tuple[Name | dict[str, Any], ...], Field(min_length=1)]
+    scenarios: Names
     seeds: (
         Annotated[int, Field(ge=1, le=1000)] | Annotated[tuple[Seed, ...], Field(min_length=1)]
     ) = 3
@@ -59,7 +58,7 @@ class TuneFile(Parameters):
 
     config: Name = "flight"
     controller: Name | None = None
-    firmware: Name = "px4"
+    firmware: Firmware = "px4"
     ranges: Ranges
     training: Flights
     validation: Flights
@@ -110,7 +109,7 @@ class Tuned:
 
 def read_tune(name: str) -> tuple[TuneFile, str]:
     """A shipped tuning or a file, and its path for errors. Raises DocumentError."""
-    path = locate(name, shipped.FOLDERS["tuning"], "tuning") if "." not in name else Path(name)
+    path = locate(name, "tuning") if "." not in name else Path(name)
     file = parse(read_text(path), TuneFile, str(path), "tuning")
     for key in file.ranges:
         if key.startswith((SCENARIO, "vehicle.")):
@@ -135,7 +134,7 @@ class Tuning:
                     "references or seeds"
                 )
             self._defaults = _defaults(self._training[0], file)
-            check([self._training[0].with_values(tuple(self._defaults.items()))])
+            check([replace(self._training[0], values=tuple(self._defaults.items()))])
 
     @property
     def flights(self) -> int:
@@ -158,7 +157,7 @@ class Tuning:
         return Tuned(best, judge(before, self._costs(fly, self._validation, best)))
 
     def _costs(self, fly: Fly, cases: Sequence[Case], values: Values) -> list[float]:
-        records = fly([case.with_values(values) if values else case for case in cases])
+        records = fly([replace(case, values=values) for case in cases])
         return [self._cost(record) for record in records]
 
     def _cost(self, record: Record) -> float:
@@ -195,10 +194,10 @@ def _defaults(case: Case, file: TuneFile) -> dict[str, float]:
 
 def profile(file: TuneFile, tuned: Tuned) -> str:
     """The configuration with the tuned values, as `fly --config` takes it."""
-    raw = read(read_text(locate(file.config, "", "configuration")), file.config)
+    raw = read(read_text(locate(file.config, "configuration")), file.config)
     if file.controller:
         raw["controller"] = file.controller
-    for part, (key, _) in itertools.product(FOLDERS, tuned.values):
+    for part, (key, _) in itertools.product(PARTS, tuned.values):
         if key.startswith(f"{part}.") and isinstance(raw.get(part), str):
             raw[part] = read_part(part, raw[part])
     for key, value in tuned.values:

@@ -166,9 +166,7 @@ class ConnectedVehicle:
         _move_aside(job.kept)
         assert job.case.link is not None
         vehicle = Connection(job.case.link, self.system_id, self.signing_key)
-        return recorded(
-            job.case.load, job.kept, job.promises, lambda config, place: fly(config, place, vehicle)
-        )
+        return recorded(job, job.kept, lambda config, place: fly(config, place, vehicle))
 
 
 def _move_aside(directory: Path) -> None:

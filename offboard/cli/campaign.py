@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from offboard.cli.shared import CommandError, Workers, option, out, say
+from offboard.cli.shared import Workers, option, out, say
+from offboard.documents.errors import UserError
 
 if TYPE_CHECKING:
     from offboard.campaign.run import Campaign, Summary
@@ -51,9 +52,9 @@ def campaign(
     fewest changed values, and lists them in worst.csv with the command that flies each again.
     """
     if worst is not None and (shard or not 1 <= worst <= 100):
-        raise CommandError("--worst takes 1 .. 100, and no --shard: a search is one whole")
+        raise UserError("--worst takes 1 .. 100, and no --shard: a search is one whole")
     if scheduler and workers:
-        raise CommandError("--scheduler has its own workers: use it or --workers, not both")
+        raise UserError("--scheduler has its own workers: use it or --workers, not both")
     with out.status("planning"):
         from offboard.campaign.document import read_campaign
         from offboard.campaign.run import Campaign
@@ -77,7 +78,7 @@ def _shard(text: str | None) -> slice:
         return slice(None)
     matched = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
     if not matched or not 1 <= int(matched[1]) <= int(matched[2]):
-        raise CommandError(f"--shard {text}: give I/N with I from 1 to N, for example 2/4")
+        raise UserError(f"--shard {text}: give I/N with I from 1 to N, for example 2/4")
     return slice(int(matched[1]) - 1, None, int(matched[2]))
 
 
@@ -90,7 +91,7 @@ def resumable() -> Iterator[None]:
         yield
     except (Incomplete, KeyboardInterrupt) as reason:
         ended = str(reason) or "interrupted; finished flights are kept"
-        raise CommandError(f"{ended}: run the same command again to go on", 4) from None
+        raise UserError(f"{ended}: run the same command again to go on", 4) from None
 
 
 def conclude(summary: Summary, flown: Campaign) -> None:
@@ -110,22 +111,20 @@ def conclude(summary: Summary, flown: Campaign) -> None:
     if summary.stopped or summary.mine_missing:
         why = summary.stopped or "interrupted"
         missing = f"{summary.mine_missing} of {summary.planned} flights are missing"
-        raise CommandError(
-            f"{why}: {missing}; go on with the same command and --out {directory}", 4
-        )
+        raise UserError(f"{why}: {missing}; go on with the same command and --out {directory}", 4)
     if summary.failed:
-        raise CommandError(f"{summary.failed} flights failed; the table says why", 1)
+        raise UserError(f"{summary.failed} flights failed; the table says why", 1)
 
 
 def _search(flown: Campaign, source: str, count: int, open_workers: OpenFlyer) -> None:
     """Search for failures and print them; exits with 1 if there is one."""
     from offboard.campaign.progress import Counter
-    from offboard.campaign.search import find, search_of
+    from offboard.campaign.search import FailureSearch
 
-    search = search_of(flown, source)
+    search = FailureSearch(flown, source)
     counter = Counter(out, search.flights_most(count))
     with resumable(), flown.runner(open_workers, counter) as runner:
-        failures = find(flown, search, count, runner)
+        failures = search.find(count, runner)
     say(f"{len(flown.cases)} flights, {len(failures)} failures that differ")
     if failures:
         say(f"fly one again in {flown.directory}:")
@@ -136,4 +135,4 @@ def _search(flown: Campaign, source: str, count: int, open_workers: OpenFlyer) -
         say(f"    {failure.failing} of {failure.seeds} other seeds fail: {failure.case.line}", 4)
     say(f"written: {flown.directory / 'worst.csv'} and campaign.html")
     if failures:
-        raise CommandError(f"{len(failures)} kinds of flights break a promise", 1)
+        raise UserError(f"{len(failures)} kinds of flights break a promise", 1)

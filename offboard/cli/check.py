@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from offboard.cli.shared import CommandError, say
+from offboard.cli.shared import say
+from offboard.documents.errors import UserError
 
 EXIT_CODES = "Exit codes: 0 all files are valid; 2 one is not, or usage error."
 
@@ -29,7 +30,7 @@ def check(
         except DocumentError as error:
             problems.append(str(error))
     if problems:
-        raise CommandError("\n".join(problems))
+        raise UserError("\n".join(problems))
 
 
 def _checked(path: Path) -> str:

@@ -11,7 +11,6 @@ from offboard.cli.campaign import conclude
 from offboard.cli.shared import (
     FLIGHTS,
     Assignments,
-    CommandError,
     Directory,
     SigningKey,
     System,
@@ -22,6 +21,7 @@ from offboard.cli.shared import (
     say,
 )
 from offboard.documents import shipped
+from offboard.documents.errors import UserError
 
 if TYPE_CHECKING:
     from offboard.campaign.workers import OpenFlyer
@@ -57,12 +57,12 @@ def compare(
     campaign.html. The same command with --out DIR continues what was interrupted.
     """
     if connect is None and (system or signing_key):
-        raise CommandError("--system and --signing-key are options of --connect: add it")
+        raise UserError("--system and --signing-key are options of --connect: add it")
     if connect and (scenario or workers):
-        raise CommandError("--scenario and --workers are options of the simulator: omit them")
+        raise UserError("--scenario and --workers are options of the simulator: omit them")
     if not 1 <= seeds <= 1000:
-        raise CommandError(f"--seeds {seeds}: give 1 .. 1000")
-    laws = _names("--controllers", controllers, shipped.names("controllers"))
+        raise UserError(f"--seeds {seeds}: give 1 .. 1000")
+    laws = _names("--controllers", controllers, shipped.names("controller"))
     references = _names("--reference", reference)
     scenarios = ["connected"] if connect else _names("--scenario", scenario or SCENARIOS)
     say(
@@ -82,7 +82,7 @@ def compare(
             vehicles=(vehicle,) if vehicle else None,
             parameters=dict(map(_parameter, assignments or ())),
             seeds=seeds,
-            keep="all",
+            keep=True,
         )
         directory = out_directory or FLIGHTS / f"compare-{clock.local_stamp()}"
         flown = Campaign(file, "compare", directory, link=connect)
@@ -108,5 +108,5 @@ def _names(name: str, text: str, known: Sequence[str] = ()) -> list[str]:
     """Comma-separated names, each once; 'all' stands for every known one."""
     parts = [part.strip() for part in text.split(",") if part.strip()]
     if not parts:
-        raise CommandError(f"{name} is an empty list of names; give at least one")
+        raise UserError(f"{name} is an empty list of names; give at least one")
     return list(known) if parts == ["all"] and known else list(dict.fromkeys(parts))

@@ -13,14 +13,13 @@ import typer
 
 from offboard.cli.shared import (
     FLIGHTS,
-    CommandError,
     FlightOptions,
     Report,
     complain,
+    grouped,
     option,
     out,
     say,
-    with_flight_options,
     write,
 )
 from offboard.documents.command_line import DISK_ERRORS, explained
@@ -51,7 +50,7 @@ class ThenDo(StrEnum):
     REPEAT = "repeat"
 
 
-@with_flight_options
+@grouped
 def daemon(
     options: FlightOptions,
     anchor: Annotated[
@@ -115,9 +114,9 @@ def daemon(
             if not may_pass(error):
                 raise
             sentence = explained(error) if isinstance(error, OSError) else str(error)
-            raise CommandError(sentence, REFUSED) from None
+            raise UserError(sentence, REFUSED) from None
     if outcome.exit_code:
-        raise CommandError(outcome.sentence, outcome.exit_code)
+        raise UserError(outcome.sentence, outcome.exit_code)
 
 
 def may_pass(error: UserError | OSError) -> bool:
@@ -129,14 +128,14 @@ def may_pass(error: UserError | OSError) -> bool:
 
 
 def _print_unit(options: FlightOptions, out_directory: Path | None) -> None:
-    """Print the unit, and on stderr what its user cannot read. Raises CommandError and
+    """Print the unit, and on stderr what its user cannot read. Raises UserError and
     KeyFileError."""
     import offboard
     from offboard.documents.signing_key import read_key
     from offboard.service.unit import unit, unreadable
 
     if out_directory and STATE not in (out_directory, *out_directory.parents):
-        raise CommandError(
+        raise UserError(
             f"--out {out_directory}: the unit can write below {STATE} alone: omit --out, or name a "
             "directory there"
         )

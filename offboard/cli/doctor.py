@@ -12,10 +12,10 @@ from offboard.cli.shared import (
     FLIGHTS,
     FlightOptions,
     err,
+    grouped,
     option,
     out,
     say,
-    with_flight_options,
 )
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ EXIT_CODES = (
 )
 
 
-@with_flight_options
+@grouped
 def doctor(
     options: FlightOptions,
     names: Annotated[

@@ -13,22 +13,22 @@ import typer
 
 from offboard.cli.score import requirements_of, scored
 from offboard.cli.shared import (
-    FILE,
     FLIGHTS,
-    CommandError,
     Directory,
     FlightOptions,
     Report,
     Requirements,
+    SimulatorOptions,
     complain,
+    grouped,
     option,
     out,
     say,
-    with_flight_options,
     write,
 )
 from offboard.documents.arguments import LIVE_PAGE
 from offboard.documents.command_line import INTERRUPT, drop_output, explained
+from offboard.documents.errors import UserError
 
 if TYPE_CHECKING:
     from offboard.analysis.score import Requirement, Score
@@ -46,19 +46,10 @@ EXIT_CODES = (
 )
 
 
-@with_flight_options
+@grouped
 def fly(
     options: FlightOptions,
-    sitl: Annotated[bool, typer.Option("--sitl", help="Fly the bundled simulator.")] = False,
-    firmware: Annotated[
-        str | None, option("NAME", "With --sitl: px4 or ardupilot.  [default: px4]")
-    ] = None,
-    scenario: Annotated[
-        str | None, option(FILE, "With --sitl: scenario.  [default: errors of the firmware]")
-    ] = None,
-    sim_vehicle: Annotated[
-        str | None, option(FILE, "With --sitl: simulated vehicle; may differ from --vehicle.")
-    ] = None,
+    simulated: SimulatorOptions,
     seed: Annotated[int | None, option("N", "Random seed, also of the simulator.")] = None,
     out_directory: Directory = None,
     require: Requirements = None,
@@ -83,33 +74,22 @@ def fly(
     phase or another text), snapshot (once a second of vehicle time; SI, NED, null for what is not
     known) or, as the last one, result.
     """
-    if sitl and options.connect:
-        raise CommandError("--sitl starts its own simulator: use --sitl or --connect, not both")
-    if sitl and options.system:
-        raise CommandError("--system is an option of --connect: --sitl has one vehicle")
-    if not sitl and (scenario or sim_vehicle or firmware):
-        raise CommandError("--scenario, --sim-vehicle and --firmware are options of --sitl: add it")
+    simulated.check(options)
     try:
         from offboard.link.stop import StopRequests
         from offboard.run.sitl import SimulatorProcess
 
         with (
             StopRequests(_exit_at_once) as stops,
-            SimulatorProcess() if sitl else nullcontext() as simulator,  # loads in the background
+            SimulatorProcess() if simulated.sitl else nullcontext() as simulator,
             closing(_displays(live, json_lines=json_lines)) as displays,
         ):
             from offboard.link import clock
-            from offboard.run.flight import Connection, Simulated
             from offboard.run.flight import fly as fly_once
 
             requirements = requirements_of(require)
             directory = out_directory or FLIGHTS / clock.local_stamp()
-            flown: Connection | Simulated
-            if sitl:
-                flown = Simulated(firmware or "px4", scenario, sim_vehicle, options.signing_key)
-                flown.check()
-            else:
-                flown = options.connection()
+            flown = simulated.vehicle(options)
             flight = options.load(seed, flown.known_vehicle)
             for url in displays.await_ready():
                 displays.tell(f"live: {url}")
@@ -125,9 +105,9 @@ def fly(
             )
             displays.conclude(outcome.sentence, str(directory / "report.html") if report else "")
     except KeyboardInterrupt:  # before the flight; in flight an interrupt lands the vehicle
-        raise CommandError(INTERRUPTED, INTERRUPT) from None
+        raise UserError(INTERRUPTED, INTERRUPT) from None
     if outcome.exit_code == 2:
-        raise CommandError(outcome.sentence)
+        raise UserError(outcome.sentence)
     try:
         _conclude(
             outcome, directory, requirements, displays.lost, report=report, json_lines=json_lines

@@ -10,8 +10,8 @@ def list_files() -> None:
     """List the shipped files by name, with one line each."""
     from offboard.control import catalogue
 
-    for number, (kind, folder) in enumerate(shipped.FOLDERS.items()):
-        described = shipped.descriptions(folder)
+    for number, kind in enumerate(shipped.FOLDERS):
+        described = shipped.descriptions(kind)
         if kind == "controller":
             for law in catalogue.names():
                 described.setdefault(law, "law of an installed package")

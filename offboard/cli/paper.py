@@ -6,7 +6,8 @@ from typing import Annotated
 
 import typer
 
-from offboard.cli.shared import FLIGHTS, CommandError, Directory, err, option, say
+from offboard.cli.shared import FLIGHTS, Directory, err, option, say
+from offboard.documents.errors import UserError
 
 EXIT_CODES = "Exit codes: 0 all written; 2 usage error."
 
@@ -30,9 +31,7 @@ def paper(
     try:
         weights = None if initial_q is None else tuple(float(w) for w in initial_q.split(","))
     except ValueError:
-        raise CommandError(
-            f"--initial-q {initial_q}: 1 or 12 numbers with commas between"
-        ) from None
+        raise UserError(f"--initial-q {initial_q}: 1 or 12 numbers with commas between") from None
     options = PaperOptions(
         out=out_directory or FLIGHTS / f"paper-{clock.local_stamp()}",
         quick=quick,

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from offboard.cli.shared import FLIGHT, CommandError, complain, err, say
+from offboard.cli.shared import FLIGHT, complain, err, say
+from offboard.documents.errors import UserError
 
 EXIT_CODES = (
     "Exit codes: 0 all identical, or rounded differently by another computer; 1 a setpoint or a "
@@ -40,4 +41,4 @@ def replay(flight: Annotated[Path, FLIGHT]) -> None:
     say("the first difference:")
     for line in explained(recording, comparison.significant[0]):
         say(f"  {line}", indent=6)
-    raise CommandError(sentence, 1)
+    raise UserError(sentence, 1)

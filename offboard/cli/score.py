@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from offboard.cli.shared import FLIGHT, CommandError, Requirements, complain, out
+from offboard.cli.shared import FLIGHT, Requirements, complain, out
+from offboard.documents.errors import UserError
 
 if TYPE_CHECKING:
     from offboard.analysis.history import History
@@ -47,7 +48,7 @@ def score(
     if requirements and result.completed != 1.0:
         missed.insert(0, verdict(result))
     if missed:
-        raise CommandError("; ".join(missed), 1)
+        raise UserError("; ".join(missed), 1)
 
 
 def requirements_of(texts: list[str] | None) -> list[Requirement]:

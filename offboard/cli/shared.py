@@ -1,4 +1,4 @@
-"""What the commands share: output that fits the terminal, option types, and CommandError.
+"""What the commands share: output that fits the terminal, and options.
 
 The module of a command imports the rest of the package when the command runs, so that `--help` and
 wrong options are answered at once.
@@ -12,9 +12,9 @@ import itertools
 import re
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 from rich.console import Console
@@ -26,7 +26,7 @@ from offboard.link.log import new_file
 
 if TYPE_CHECKING:
     from offboard.run.configuration import FlightConfig
-    from offboard.run.flight import Connection
+    from offboard.run.flight import Connection, Simulated
 
 
 class Output(Console):
@@ -52,7 +52,7 @@ def option(metavar: str, text: str, *names: str, **more: Any) -> Any:
 def _known_port(address: str | None) -> str | None:
     """Refuse to listen on any free port, to which nobody sends."""
     if address and re.fullmatch(r"(udp|tcp)in:.*:0+", address):
-        raise CommandError(f"--connect {shown(address)}: give the port that the vehicle sends to")
+        raise UserError(f"--connect {shown(address)}: give the port that the vehicle sends to")
     return address
 
 
@@ -131,29 +131,66 @@ class FlightOptions:
         return Connection(self.connect or DEFAULT_CONNECTION, self.system, self.signing_key)
 
 
-def with_flight_options(command: Callable[..., None]) -> Callable[..., None]:
-    """A command whose first parameter is a `FlightOptions`, with each of its fields as an option
-    before its own."""
-    shared = inspect.signature(FlightOptions, eval_str=True).parameters
-    _, *own = inspect.signature(command, eval_str=True).parameters.values()
+@dataclass(frozen=True, slots=True)
+class SimulatorOptions:
+    """The options of the simulator that `fly` and `identify` start."""
+
+    sitl: Annotated[bool, typer.Option("--sitl", help="Fly the bundled simulator.")] = False
+    firmware: Annotated[
+        str | None, option("NAME", "With --sitl: px4 or ardupilot.  [default: px4]")
+    ] = None
+    scenario: Annotated[
+        str | None, option(FILE, "With --sitl: scenario.  [default: errors of the firmware]")
+    ] = None
+    sim_vehicle: Annotated[
+        str | None, option(FILE, "With --sitl: simulated vehicle; may differ from --vehicle.")
+    ] = None
+
+    def check(self, options: FlightOptions) -> None:
+        """Raise UserError where both name a vehicle to fly, or the simulator is not flown."""
+        if self.sitl and options.connect:
+            raise UserError("--sitl starts its own simulator: use --sitl or --connect, not both")
+        if self.sitl and options.system:
+            raise UserError("--system is an option of --connect: --sitl has one vehicle")
+        if not self.sitl and self != SimulatorOptions():
+            raise UserError(
+                "--scenario, --sim-vehicle and --firmware are options of --sitl: add it"
+            )
+
+    def vehicle(self, options: FlightOptions) -> Connection | Simulated:
+        """What is flown: the simulator, or the vehicle at a link. Raises DocumentError."""
+        if not self.sitl:
+            return options.connection()
+        from offboard.run.flight import Simulated
+
+        firmware = self.firmware or "px4"
+        simulated = Simulated(firmware, self.scenario, self.sim_vehicle, options.signing_key)
+        simulated.check()
+        return simulated
+
+
+def grouped(command: Callable[..., None]) -> Callable[..., None]:
+    """A command in whose signature the options of a group replace each parameter that is one, a
+    dataclass such as `FlightOptions`."""
+    groups: dict[str, type] = {}
+    options: list[inspect.Parameter] = []
+    for each in inspect.signature(command, eval_str=True).parameters.values():
+        if is_dataclass(each.annotation):
+            groups[each.name] = group = cast(type, each.annotation)
+            options += inspect.signature(group, eval_str=True).parameters.values()
+        else:
+            options.append(each)
 
     @functools.wraps(command)
     def run(**given: Any) -> None:
-        options = FlightOptions(**{name: given.pop(name) for name in shared if name in given})
-        command(options, **given)
+        for name, group in groups.items():
+            own = [each for each in inspect.signature(group).parameters if each in given]
+            given[name] = group(**{each: given.pop(each) for each in own})
+        command(**given)
 
-    signature = inspect.Signature([*shared.values(), *own])
-    run.__signature__ = signature  # type: ignore[attr-defined]
-    run.__annotations__ = {each.name: each.annotation for each in signature.parameters.values()}
+    run.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
+    run.__annotations__ = {each.name: each.annotation for each in options}
     return run
-
-
-class CommandError(UserError):
-    """Ends the command with one sentence on stderr and an exit code."""
-
-    def __init__(self, sentence: str, code: int = 2) -> None:
-        super().__init__(sentence)
-        self.code = code
 
 
 def say(text: str, indent: int = 0) -> None:
@@ -168,11 +205,11 @@ def write(text: str) -> None:
 
 
 def check_new(path: Path, option_name: str) -> None:
-    """Raise CommandError if the file chosen by an option exists, or has no directory."""
+    """Raise UserError if the file chosen by an option exists, or has no directory."""
     if path.exists() or path.is_symlink():
-        raise CommandError(f"{path} exists already; choose another file with {option_name}")
+        raise UserError(f"{path} exists already; choose another file with {option_name}")
     if not path.parent.is_dir():
-        raise CommandError(f"{option_name} {path}: there is no directory {path.parent}")
+        raise UserError(f"{option_name} {path}: there is no directory {path.parent}")
 
 
 def free_name(path: Path) -> Path:

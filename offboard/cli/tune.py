@@ -9,7 +9,8 @@ from typing import Annotated
 import typer
 
 from offboard.cli.campaign import resumable
-from offboard.cli.shared import CommandError, Workers, check_new, option, out, say, write_new
+from offboard.cli.shared import Workers, check_new, option, out, say, write_new
+from offboard.documents.errors import UserError
 
 EXIT_CODES = (
     "Exit codes: 0 a better configuration is written; 1 none is better; 2 usage or configuration "
@@ -56,6 +57,6 @@ def tune(
         say(f"  {key}: {value:g}")
     say(f"validation: {tuned.verdict}")
     if not tuned.verdict.better:
-        raise CommandError("not better with 95 % confidence: nothing is written", 1)
+        raise UserError("not better with 95 % confidence: nothing is written", 1)
     write_new(profile, text_of(tuning.file, tuned))
     say(f"written: {profile}")

@@ -8,7 +8,7 @@ from typing import Any
 from typer import BadParameter
 from typer.core import TyperCommand
 
-from offboard.documents.command_line import INTERRUPT, INTERRUPTED, interrupts_raise
+from offboard.documents.command_line import INTERRUPT, INTERRUPTED
 from offboard.documents.errors import UserError, shown
 
 LIVE_PAGE = "127.0.0.1:8014"
@@ -34,12 +34,6 @@ def join_address(host: str, port: int) -> str:
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
-class Interrupted(UserError):
-    """The command was interrupted."""
-
-    code = INTERRUPT
-
-
 class Command(TyperCommand):
     """A command whose values are neither empty nor options nor bytes that are no text.
 
@@ -63,11 +57,10 @@ class Command(TyperCommand):
         return super().parse_args(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
-        interrupts_raise()
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
-            raise Interrupted(INTERRUPTED) from None
+            raise UserError(INTERRUPTED, INTERRUPT) from None
 
 
 def _completed(args: list[str]) -> list[str]:

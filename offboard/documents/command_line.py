@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import errno
 import os
-import signal
 import sys
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from types import FrameType
     from typing import NoReturn, TextIO
 
 USAGE, INTERRUPT, CLOSED_PIPE = 2, 130, 141  # exit codes; the last two as of SIGINT and SIGPIPE
@@ -25,13 +23,10 @@ DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 def run(load: Callable[[], Callable[[], object]]) -> NoReturn:
     """Import a command with `load`, call it, and exit.
 
-    An interrupt exits at once until the command calls `interrupts_raise`, its arguments parsed.
-
-    A UserError is printed without a traceback and exits with its `code`, 2 without one. So do a
-    lack of memory, and an error of a file or of the output; an interrupt exits with 130. Where
-    nobody reads the output any more (`| head -1`), the exit code is 141 without a sentence.
+    A UserError is printed without a traceback and exits with its `code`; a lack of memory, and an
+    error of a file or of the output, with 2; an interrupt with 130. Where nobody reads the output
+    any more (`| head -1`), the exit code is 141 without a sentence.
     """
-    interrupts_exit()
     if sys.stdout is not None:  # text that the encoding of the output does not have is escaped
         sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     try:
@@ -56,8 +51,7 @@ def run(load: Callable[[], Callable[[], object]]) -> NoReturn:
 
         if not isinstance(error, UserError):
             raise
-        sentence, code = str(error), getattr(error, "code", USAGE)
-    interrupts_raise()
+        sentence, code = str(error), error.code
     unwritten = _flushed()
     if isinstance(unwritten, BrokenPipeError):
         code = code or CLOSED_PIPE
@@ -107,24 +101,6 @@ def explained(error: OSError) -> str:
     if error.errno in DISK_ERRORS:
         return f"the output cannot be written: {reason}"
     return f"refused by the operating system: {reason}"
-
-
-def interrupts_exit() -> None:
-    """From now on an interrupt exits at once: an import may catch KeyboardInterrupt. If interrupts
-    are ignored, as in a background job, they stay so."""
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, _exit_at_once)
-
-
-def interrupts_raise() -> None:
-    """From now on an interrupt raises KeyboardInterrupt again."""
-    if signal.getsignal(signal.SIGINT) is _exit_at_once:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-def _exit_at_once(number: int, frame: FrameType | None) -> None:
-    os.write(2, f"{INTERRUPTED}\n".encode())
-    os._exit(INTERRUPT)
 
 
 def _flushed() -> OSError | None:

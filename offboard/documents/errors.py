@@ -18,10 +18,14 @@ _PACKAGE, _STANDARD = str(Path(__file__).parents[1]), sysconfig.get_path("stdlib
 
 class UserError(Exception):
     """An error that the user can fix. `str()` says what is wrong and what to do, without a
-    traceback; the commands print it and exit with code 2. `is_usage`: what was asked for is wrong;
-    otherwise it may work another time."""
+    traceback; a command that it ends prints it and exits with `code`. `is_usage`: what was asked
+    for is wrong; otherwise it may work another time."""
 
     is_usage = True
+
+    def __init__(self, sentence: str, code: int = 2) -> None:
+        super().__init__(sentence)
+        self.code = code
 
 
 class DocumentError(UserError):

@@ -15,7 +15,6 @@ import json
 import math
 import re
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import yaml
@@ -58,11 +57,12 @@ _WORDS: dict[str, Any] = {
 
 
 class Section(dict[str, Any]):
-    """A mapping of a file. `places`: where each of its keys stands, for errors."""
+    """A mapping of a file. `places`: where each of its keys stands, or the option that set it, for
+    errors."""
 
-    def __init__(self, values: Mapping[str, Any], places: Mapping[str, str] | None = None) -> None:
+    def __init__(self, values: Mapping[str, Any]) -> None:
         super().__init__(values)
-        self.places = dict(places or getattr(values, "places", {}))
+        self.places: dict[str, str] = dict(getattr(values, "places", {}))
 
 
 yaml.add_representer(Section, SafeRepresenter.represent_dict, Dumper=yaml.SafeDumper)
@@ -122,32 +122,27 @@ def _document(text: str, source: str) -> tuple[Json, str]:
     return value, line
 
 
-def override(mapping: Mapping[str, Any], assignment: str) -> Json:
+def override(mapping: Mapping[str, Any], assignment: str, option: str = "") -> Json:
     """A copy of the raw `mapping` with one `key.path=value` of the command line applied.
 
     The value is YAML; a number in the path indexes a list. Keys are not checked here but in
-    `validate`. Raises DocumentError where `key.path=` is missing or the value is no YAML.
+    `validate`, whose errors name `option`, by default --set. Raises DocumentError where
+    `key.path=` is missing or the value is no YAML.
     """
     path, separator, text = assignment.partition("=")
-    source = f"--set {abridged(assignment)}"
+    option = option or f"--set {abridged(assignment)}"
     keys = [key.strip() for key in path.split(".")]
     if not separator or not all(keys):
-        raise DocumentError(f"{source}: expected key.path=value")
-    changed: Json = _with(mapping, keys, _loaded(text, source))
+        raise DocumentError(f"{option}: expected key.path=value")
+    changed: Json = _with(mapping, keys, _loaded(text, option), option)
     return changed
 
 
-def validate(
-    mapping: Mapping[str, Any],
-    model: type[M],
-    source: str,
-    options: Mapping[str, str] = MappingProxyType({}),
-) -> M:
+def validate(mapping: Mapping[str, Any], model: type[M], source: str) -> M:
     """Raw mapping -> an instance of `model`. Raises DocumentError with the problems
     found, at most PROBLEMS_MOST of them.
 
-    `source` names the file in errors. `options` maps a key path to the command-line option that
-    set it; an error there names the option instead.
+    `source` names the file in errors about what has no place in it.
     """
     try:
         # as JSON: strict about scalars, yet a list may become a tuple and text an enum
@@ -155,7 +150,7 @@ def validate(
     except ValidationError as error:
         details = _own_problems(error.errors(include_url=False), mapping)
         problems = [
-            f"{_origin(detail, mapping, options, source)}: {_sentence(detail, mapping, model)}"
+            f"{_origin(detail, mapping, source)}: {_sentence(detail, mapping, model)}"
             for detail in details[:PROBLEMS_MOST]
         ]
         if len(details) > PROBLEMS_MOST:
@@ -196,17 +191,10 @@ def _own_problems(details: list[ErrorDetails], mapping: Mapping[str, Any]) -> li
     ]
 
 
-def _origin(
-    detail: ErrorDetails, mapping: Mapping[str, Any], options: Mapping[str, str], source: str
-) -> str:
-    """What set the value: the last option that did, else the place of its key in a file."""
-    problem = _key_path(detail, mapping).split(".")
-    for assigned, option in reversed(list(options.items())):
-        keys = [key.strip() for key in assigned.split(".")]
-        if all(mine == theirs for mine, theirs in zip(keys, problem, strict=False)):
-            return option
+def _origin(detail: ErrorDetails, mapping: Mapping[str, Any], source: str) -> str:
+    """What set the value: the place of its key in a file, or an option."""
     value: Any = mapping
-    for key in problem:
+    for key in _key_path(detail, mapping).split("."):
         source = getattr(value, "places", {}).get(key, source)
         if isinstance(value, Mapping):
             value = value.get(key)
@@ -321,17 +309,17 @@ def _refusal(problem: str, node: yaml.Node) -> yaml.YAMLError:
     return yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
 
 
-def _with(value: Any, keys: list[str], new: Any) -> Any:
-    """A copy of `value` in which the entry at `keys` is `new`; missing sections are created."""
+def _with(value: Any, keys: list[str], new: Any, option: str) -> Any:
+    """A copy of `value` in which the entry at `keys` is `new`, set by `option`; missing sections
+    are created."""
     if not keys:
         return new
     key, rest = keys[0], keys[1:]
     if isinstance(value, list) and key in map(str, range(len(value))):
         index = int(key)
-        return [*value[:index], _with(value[index], rest, new), *value[index + 1 :]]
+        changed = _with(value[index], rest, new, option)
+        return [*value[:index], changed, *value[index + 1 :]]
     section = Section(value if isinstance(value, Mapping) else {})
-    before = section.get(key)
-    section[key] = _with(before, rest, new)
-    if not rest or type(before) is not type(section[key]):
-        section.places.pop(key, None)  # not of the file any more
+    section[key] = _with(section.get(key), rest, new, option)
+    section.places[key] = option
     return section

@@ -32,32 +32,32 @@ def directory() -> Path:
     return inside if inside.is_dir() else package.parent / "config"
 
 
-def names(folder: str) -> list[str]:
-    """The names of the files in one folder, for example `scenarios`, sorted."""
-    return sorted(path.stem for path in (directory() / folder).glob("*.yaml"))
+def names(kind: str) -> list[str]:
+    """The names of the files of one kind, for example `scenario`, sorted."""
+    return sorted(path.stem for path in (directory() / FOLDERS[kind]).glob("*.yaml"))
 
 
-def descriptions(folder: str) -> dict[str, str]:
-    """Name -> description of the files in one folder."""
+def descriptions(kind: str) -> dict[str, str]:
+    """Name -> description of the files of one kind."""
     from offboard.documents.reading import description  # late: --help needs no YAML
 
-    paths = {name: directory() / folder / f"{name}.yaml" for name in names(folder)}
+    paths = {name: directory() / FOLDERS[kind] / f"{name}.yaml" for name in names(kind)}
     return {name: description(read_text(path), str(path)) for name, path in paths.items()}
 
 
 def overview(*kinds: str) -> str:
     """The names of the shipped files, a paragraph for each kind: for the end of `--help`."""
-    return "\n\n".join(f"Shipped {kind}s: {', '.join(names(FOLDERS[kind]))}." for kind in kinds)
+    return "\n\n".join(f"Shipped {kind}s: {', '.join(names(kind))}." for kind in kinds)
 
 
-def locate(name: str, folder: str, kind: str, others: Sequence[str] = ()) -> Path:
+def locate(name: str, kind: str, others: Sequence[str] = ()) -> Path:
     """The file with a shipped name, or the file itself where `name` contains a `/` or ends in .yaml
     or .yml. Raises DocumentError with the known names, `others` among them."""
     if name.endswith((".yaml", ".yml")) or "/" in name:
         return Path(name)
-    if name in names(folder):
-        return directory() / folder / f"{name}.yaml"
-    known = sorted({*names(folder), *others})
+    if name in names(kind):
+        return directory() / FOLDERS[kind] / f"{name}.yaml"
+    known = sorted({*names(kind), *others})
     raise DocumentError(f"there is no {kind} named {shown(name)}; known are {', '.join(known)}")
 
 

@@ -2,6 +2,7 @@
 
 Poses, paths and velocity are in the frame `map` (ENU, metres) and the body `base_link` (FLU). Every
 series is also a channel of JSON messages with the columns of the tables, in NED, as `/table/NAME`.
+Time is the vehicle's, counted from the Unix time of the first telemetry, also of a lockstep flight.
 """
 
 from __future__ import annotations
@@ -27,14 +28,15 @@ Stamped = tuple[int, str, Any]  # time in ns, topic, protobuf message or dict
 Stamps = Callable[[Array], list[int]]  # vehicle times in s to stamps of the file in ns
 
 
-def write_mcap(flight: Flight, path: Path, *, vehicle_time: bool = False) -> None:
-    """Write an MCAP file, with Unix time or vehicle time. Raises UserError."""
+def write_mcap(flight: Flight, path: Path) -> None:
+    """Write an MCAP file. Raises UserError."""
     writers = _library("mcap.writer")
     register = _library("mcap_protobuf.schema").register_schema
+    begun_s, begun_unix_s = flight.begun
 
     def stamps(time_s: Array) -> list[int]:
-        times = time_s if vehicle_time else flight.unix_s(time_s)
-        return [max(0, round(stamp * 1e6)) * 1000 for stamp in times.tolist()]
+        unix_s = time_s - begun_s + begun_unix_s
+        return [max(0, round(stamp * 1e6)) * 1000 for stamp in unix_s.tolist()]
 
     messages = sorted(_messages(flight, stamps), key=lambda each: each[0])
     with new_file(path) as file:

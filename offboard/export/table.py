@@ -26,11 +26,10 @@ def write_csv(flight: Flight, path: Path) -> None:
     """Write a CSV file, UTF-8, with a line of column names. Raises UserError."""
     parts = list(flight.series.values())
     columns = [column for part in parts for column in part.columns]
-    rows = [_rows(flight, part, columns) for part in parts]
-    told = [(e.time_s, float(flight.unix_s(e.time_s)), e.who, e.what) for e in flight.events]
+    rows = [_rows(part, columns) for part in parts]
     blank = [""] * len(columns)
     events: Iterator[list[Any]] = (
-        [at, unix_s, EVENT, *blank, f"{who}: {what}"] for at, unix_s, who, what in told
+        [e.time_s, e.unix_s, EVENT, *blank, f"{e.who}: {e.what}"] for e in flight.events
     )
     with new_file(path) as file, io.TextIOWrapper(file, "utf-8", newline="") as text:
         writer = csv.writer(text)
@@ -38,16 +37,17 @@ def write_csv(flight: Flight, path: Path) -> None:
         writer.writerows(heapq.merge(*rows, events, key=_time_s))
 
 
-def _rows(flight: Flight, series: Series, columns: list[str]) -> Iterator[list[Any]]:
+def _rows(series: Series, columns: list[str]) -> Iterator[list[Any]]:
     """One for each sample, with the columns of all series, in the order of time."""
-    samples = series.values[np.argsort(series.time_s, kind="stable")].tolist()
-    time_s = np.sort(series.time_s)
-    unix_s = flight.unix_s(time_s)
+    order = np.argsort(series.time_s, kind="stable")
     before = columns.index(series.columns[0])
     after = len(columns) - before - len(series.columns) + 1  # and no event
-    for at, unix, values in zip(time_s.tolist(), unix_s.tolist(), samples, strict=True):
+    for at, unix_s, values in zip(
+        *(each[order].tolist() for each in (series.time_s, series.unix_s, series.values)),
+        strict=True,
+    ):
         cells = [_cell(*each) for each in zip(series.columns, values, strict=True)]
-        yield [at, unix, series.name, *[""] * before, *cells, *[""] * after]
+        yield [at, unix_s, series.name, *[""] * before, *cells, *[""] * after]
 
 
 def _time_s(row: Any) -> float:

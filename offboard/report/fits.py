@@ -8,13 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.analysis.identify import estimator_noise, rows
+from offboard.analysis.identify import Row, estimator_noise, rows
 from offboard.analysis.page import BLUE, GREY, RED, Figure, curve, panels
 from offboard.identification.attitude_fit import tilt_signals, yaw_signals
 from offboard.identification.motion_fit import Motion, predicted_velocity
 from offboard.identification.response import second_order
 from offboard.identification.trace import Trace
-from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_fit import Identified
 from offboard.model.vehicle import AxisResponse, Vehicle
 
@@ -28,7 +27,7 @@ class Fits:
     """`rows` are those of `identify.rows`; `noise` is a sentence, empty where nothing was flown."""
 
     title: str
-    rows: list[tuple[str, Estimate | None, str, str]]
+    rows: list[Row]
     noise: str
     figures: list[Figure]
 

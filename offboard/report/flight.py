@@ -110,7 +110,7 @@ def _completed(flown: History, log: Tlog) -> tuple[History, list[str]]:
     """The history with substitutes for telemetry that it lacks, and a sentence for each thing that
     was replaced or is missing."""
     found = {
-        name: Samples(name, columns, unix=name == "ATTITUDE_TARGET")
+        name: Samples(name, columns)
         for name, (part, columns, *_) in _SUBSTITUTES.items()
         if not len(getattr(flown, part))
     }
@@ -118,7 +118,7 @@ def _completed(flown: History, log: Tlog) -> tuple[History, list[str]]:
         return flown, []
     for entry in log:
         if entry.name in found and (entry.system_id, entry.component_id) == flown.vehicle:
-            found[entry.name].add(entry.frame.payload, math.nan, math.nan)
+            found[entry.name].add(entry.frame.payload, math.nan, entry.unix_us / 1e6)
     anchor_ms = 1e3 * next(
         (rows["time_s"][0] for rows in (flown.attitude, flown.position) if len(rows)), math.nan
     )
@@ -136,7 +136,7 @@ def _completed(flown: History, log: Tlog) -> tuple[History, list[str]]:
 def _attitude(rows: Rows) -> Rows:
     quaternion = quaternion_from_euler(*rows["angles"].astype(np.float64).T)
     return table(
-        rows["time_s"],
+        rows,
         quaternion=np.asarray(quaternion, np.float32),
         rates_radps=rows["rates_radps"],
     )
@@ -147,7 +147,7 @@ def _position(rows: Rows) -> Rows:
     places = rows["place"] / (1e7, 1e7, 1e3)
     position = position_ned_m(places, Geodetic(*places[0].tolist()))
     return table(
-        rows["time_s"],
+        rows,
         position_ned_m=position.astype(np.float32),
         velocity_ned_mps=(rows["velocity"] / 100.0).astype(np.float32),
     )

@@ -1,4 +1,4 @@
-"""Bands and marks of a flight: phases, modes, authority, steps of the failsafe, texts."""
+"""Bands and marks of a flight: phases, modes, steps of the failsafe, texts."""
 
 from __future__ import annotations
 
@@ -36,17 +36,15 @@ class Mark:
 
 
 def bands(flight: Flight) -> list[Band]:
-    """Phases of offboard, modes of the vehicle, and who has authority."""
-    phases = flight.history.phases
-    spans = _spans(phases, flight)
+    """Phases of offboard, and modes of the vehicle; the mode of its setpoints is blue."""
     found = [
         Band("phase", begin_s, end_s, event.phase, event.what, _colour(event.phase))
-        for event, begin_s, end_s in spans
+        for event, begin_s, end_s in _spans(flight.history.phases, flight)
     ]
     for event, begin_s, end_s in _spans(flight.history.modes, flight):
         colour = BLUE_BAND if event.what == flight.engage_mode else GREY_BAND
         found.append(Band("mode", begin_s, end_s, event.what, f"mode {event.what}", colour))
-    return found + (_authority(flight) if phases else [])
+    return found
 
 
 def marks(flight: Flight) -> list[Mark]:
@@ -82,36 +80,3 @@ def _colour(phase: str) -> str:
     if phase == Phase.TRACK.value:
         return BLUE_BAND
     return ORANGE_BAND if phase in {each.value for each in _ENDED_EARLY} else GREY_BAND
-
-
-def _authority(flight: Flight) -> list[Band]:
-    """Whose the vehicle was, by the phases and the modes that it showed."""
-    times = sorted({begin_s for part in (flight.history.phases, flight.history.modes)
-                    for _, begin_s, _ in _spans(part, flight)})  # fmt: skip
-    found: list[Band] = []
-    for begin_s, end_s in pairwise((*times, flight.end_s)):
-        label, text, colour = _standing(flight, begin_s)
-        if found and found[-1].label == label:
-            begin_s = found.pop().begin_s
-        found.append(Band("authority", begin_s, end_s, label, text, colour))
-    return found
-
-
-def _standing(flight: Flight, time_s: float) -> tuple[str, str, str]:
-    """Label, text and colour at a moment."""
-
-    def newest(events: Sequence[Event]) -> Event | None:
-        begun = [event for event, begin_s, _ in _spans(events, flight) if begin_s <= time_s]
-        return begun[-1] if begun else None
-
-    begun = {event.phase for event in flight.history.phases if event.time_s <= time_s}
-    mode = newest(flight.history.modes)
-    if begun & {Phase.STAND_DOWN.value, Phase.YIELDED.value, Phase.FAILED.value}:
-        return "given up", "offboard sends nothing any more", ORANGE_BAND
-    if begun & {Phase.HOLD.value, Phase.LAND.value, Phase.DISARMED.value}:
-        return "handed over", "the vehicle is in a mode that offboard asked for", GREY_BAND
-    if Phase.ENGAGE.value not in begun:
-        return "not asked", "offboard has not asked for the vehicle", GREY_BAND
-    if mode is not None and mode.what == flight.engage_mode:
-        return "offboard", "the vehicle follows the setpoints of offboard", BLUE_BAND
-    return "asked", "offboard has asked for the vehicle", GREY_BAND

@@ -22,7 +22,7 @@ from pydantic import BaseModel, Field, SerializeAsAny, create_model, model_valid
 from offboard.control import catalogue
 from offboard.control.base import Controller, ControllerSettings
 from offboard.documents import shipped
-from offboard.documents.errors import abridged, located
+from offboard.documents.errors import located
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import (
     DocumentError,
@@ -45,7 +45,7 @@ Raw = dict[str, Any]
 RECORDED_VERSIONS = ("pso-offboard", "pymavlink", "numpy", "scipy", "numba")
 UNKNOWN_VEHICLE = "neutral"
 DESCENT_MPS = 0.5  # slowest default near the ground: ArduCopter LAND_SPEED; MPC_LAND_SPEED is 0.7
-FOLDERS = {part: shipped.FOLDERS[part] for part in ("vehicle", "controller", "reference")}
+PARTS = ("vehicle", "controller", "reference")  # of a flight, each a file of its own
 
 
 class FlightConfig(Parameters):
@@ -75,28 +75,26 @@ def load(
     reference by another name or file (None: does not); `assignments` are `key.path=value` of --set.
     `known_vehicle` stands in for the file's `neutral`, of which nothing is known.
     """
-    path = locate(name, "", "configuration")
+    path = locate(name, "configuration")
     raw = read(read_text(path), str(path))
     check_kind(raw, "configuration", str(path))
     if known_vehicle and raw.get("vehicle") == UNKNOWN_VEHICLE:
         raw["vehicle"] = known_vehicle
-    for part in FOLDERS:
+    for part in PARTS:
         chosen = (choices or {}).get(part) or raw.get(part)
         if isinstance(chosen, str):
             raw[part] = read_part(part, chosen)
-    options: dict[str, str] = {}
     for assignment in assignments:
         raw = override(raw, assignment)
         key = assignment.partition("=")[0].strip()
-        options[key] = f"--set {abridged(assignment)}"
-        if key in FOLDERS and isinstance(raw[key], str):
+        if key in PARTS and isinstance(raw[key], str):
             raw[key] = read_part(key, raw[key])
-    missing = [_missing(part, raw) for part in FOLDERS if part not in raw]
+    missing = [_missing(part, raw) for part in PARTS if part not in raw]
     if missing:
         raise DocumentError(*(f"{path}: {sentence}" for sentence in missing))
     if seed is not None:
-        raw["seed"], options["seed"] = seed, f"--seed {seed}"
-    return _with_table(_validated(raw, str(path), options))
+        raw = override(raw, f"seed={seed}", f"--seed {seed}")
+    return _with_table(_validated(raw, str(path)))
 
 
 def build_track(config: FlightConfig) -> Track:
@@ -175,7 +173,7 @@ def check_file(path: Path, check_scenario: Callable[[Path], None]) -> str:
         check_scenario(path)
         return kind
     try:
-        if kind in FOLDERS:
+        if kind in PARTS:
             validate(raw, _model(kind, raw), str(path))
         if kind == "reference":
             build_track(load("flight", choices={kind: name}))
@@ -220,18 +218,16 @@ def flown(text: str) -> FlightConfig:
     """The configuration in a log (`dump`ed then), without settings that no longer exist. Raises
     DocumentError."""
     source = "the log's configuration"
-    return _validated(read(text, source), source, {}, ignores_unknown=True)
+    return _validated(read(text, source), source, ignores_unknown=True)
 
 
-def _validated(
-    raw: Raw, source: str, options: Mapping[str, str], *, ignores_unknown: bool = False
-) -> FlightConfig:
+def _validated(raw: Raw, source: str, *, ignores_unknown: bool = False) -> FlightConfig:
     """`raw` as a FlightConfig whose parts have the classes that they name."""
-    parts: dict[str, Any] = {part: (_model(part, raw.get(part)), ...) for part in FOLDERS}
+    parts: dict[str, Any] = {part: (_model(part, raw.get(part)), ...) for part in PARTS}
     model = create_model("FlightConfig", __base__=FlightConfig, **parts)
     if ignores_unknown:
         raw = known(raw, model)
-    return FlightConfig(**dict(validate(raw, model, source, options)))
+    return FlightConfig(**dict(validate(raw, model, source)))
 
 
 def _with_table(config: FlightConfig) -> FlightConfig:
@@ -255,10 +251,10 @@ def read_part(part: str, name: str) -> Raw:
         return {"shape": "table", "file": name}
     laws = []
     if part == "controller":
-        laws = sorted(set(catalogue.names()) - set(shipped.names(FOLDERS[part])))
+        laws = sorted(set(catalogue.names()) - set(shipped.names(part)))
     if name in laws:
         return {"law": name}
-    path = locate(name, FOLDERS[part], part, laws)
+    path = locate(name, part, laws)
     raw = read(read_text(path), str(path))
     check_kind(raw, part, str(path))
     validate(raw, _model(part, raw), str(path))

@@ -48,7 +48,7 @@ class Ending:
 def check_scenario_named(name: str) -> None:
     """Check the scenario of flights, by name or path; shipped ones are valid. Raises
     DocumentError."""
-    path = shipped.locate(name, "scenarios", "scenario")
+    path = shipped.locate(name, "scenario")
     if shipped.directory() not in path.parents:
         check_scenario(path)
 

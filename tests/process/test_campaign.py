@@ -232,7 +232,6 @@ def test_an_infeasible_case_is_a_row_with_its_reason(tmp_path: Path) -> None:
     ("change", "sentence"),
     [
         (("reference.height_m", "seed"), "parameters.seed: give the seeds with seeds"),
-        (("[calm, px4_like]", "[{}, {conditions: {}}]"), "two are called 'unnamed'"),
         (("[lqr]", "[lqg]"), "there is no controller named 'lqg'"),
         (("conditions.mass_scale", "conditions.mass"), "conditions.mass is not a known key"),
         (("[4, 5]", "[5, 4]"), "the range [5, 4] is empty"),

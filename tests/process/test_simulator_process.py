@@ -284,4 +284,4 @@ def test_scenarios_are_listed_with_what_they_are(called: Called) -> None:
     code, output, errors = called("simulator", "--list-scenarios")
     assert (code, errors) == (0, "")
     listed = dict(re.split(r"\s+", line, maxsplit=1) for line in output.splitlines())
-    assert listed == shipped.descriptions("scenarios")
+    assert listed == shipped.descriptions("scenario")

@@ -6,7 +6,6 @@ import csv
 import io
 import itertools
 import math
-from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +20,7 @@ from offboard.campaign import workers
 from offboard.campaign.campaign_page import FIGURES, page
 from offboard.campaign.cases import Case
 from offboard.campaign.document import CampaignFile, Promises
-from offboard.campaign.flight import LOWEST, terms
+from offboard.campaign.flight import LOWEST, Job, terms
 from offboard.campaign.progress import Counter
 from offboard.campaign.results import Record
 from offboard.campaign.run import Campaign
@@ -29,7 +28,6 @@ from offboard.campaign.table import Group, groups, row_of, show
 from offboard.campaign.workers import ConnectedVehicle
 from offboard.cli.commands import app
 from offboard.link import clock
-from offboard.run.configuration import FlightConfig
 
 LAWS = ("pso", "lqr", "an/uncommonly/long/name.yaml", "lost")
 SCENARIOS = ("calm", "all_together")
@@ -87,7 +85,7 @@ def test_a_value_names_a_group_where_it_differs() -> None:
     def name(drawn: frozenset[str]) -> list[str]:
         case = Case("flight", "lqr", "hover", None, None, "px4", "calm", 1)
         rows = [
-            row_of(case.with_values((("a.b", 1), ("a.c", value))), record(0.1), ())
+            row_of(replace(case, values=(("a.b", 1), ("a.c", value))), record(0.1), ())
             for value in (2, 3)
         ]
         return [group.name for group in groups(rows, drawn)]
@@ -172,8 +170,8 @@ def test_on_one_vehicle_nothing_is_flown_after_a_refused_or_aborted_flight(
 ) -> None:
     flown: list[str] = []
 
-    def fly(load: Callable[[], FlightConfig], directory: Path, *_: object) -> Record:
-        flown.append(load().controller.law)
+    def fly(job: Job, directory: Path, *_: object) -> Record:
+        flown.append(job.case.load().controller.law)
         directory.mkdir(parents=True)
         if flown[-1] == "lqr":
             return Record(exit_code, "left OFFBOARD for AUTO.LOITER", -1.0, "completed")
@@ -181,7 +179,7 @@ def test_on_one_vehicle_nothing_is_flown_after_a_refused_or_aborted_flight(
 
     monkeypatch.setattr(workers, "recorded", fly)
     laws = ("pso", "lqr", "pid", "mpc")
-    file = CampaignFile(controllers=laws, references=("hover",), keep="all")
+    file = CampaignFile(controllers=laws, references=("hover",), keep=True)
 
     def again() -> str:
         campaign = Campaign(file, "x", tmp_path, link="udpin:127.0.0.1:0")
@@ -261,7 +259,7 @@ def test_what_a_command_cannot_fly_is_refused(
 def test_a_connected_flight_begins_disarmed_unless_told_otherwise() -> None:
     case = Case("flight", "lqr", "hover", None, None, "px4", "connected", 1, link="udpin::0")
     assert not case.load().limits.begin_armed
-    armed = case.with_values((("limits.begin_armed", True),))
+    armed = replace(case, values=(("limits.begin_armed", True),))
     assert armed.load().limits.begin_armed
     assert replace(case, link=None).load().limits.begin_armed
 

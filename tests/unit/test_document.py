@@ -218,11 +218,11 @@ def test_override_keeps_an_equals_sign_in_the_value() -> None:
     [
         (
             "scal=2",
-            "--set: scal is not a known key, did you mean scale? (known keys: circles, colour,"
-            " copies, corner, named, scale, shape, tilt_rad, title, visible)",
+            "--set scal=2: scal is not a known key, did you mean scale? (known keys: circles,"
+            " colour, copies, corner, named, scale, shape, tilt_rad, title, visible)",
         ),
-        ("corner.5=2", "--set: corner: {'5': 2} should be a valid array"),
-        ("scale=12", "--set: scale: 12 should be less than 10"),
+        ("corner.5=2", "--set corner.5=2: corner: {'5': 2} should be a valid array"),
+        ("scale=12", "--set scale=12: scale: 12 should be less than 10"),
         ("scale", "--set scale: expected key.path=value"),
         ("a..b=3", "--set a..b=3: expected key.path=value"),
         (
@@ -234,7 +234,7 @@ def test_override_keeps_an_equals_sign_in_the_value() -> None:
 def test_a_bad_override_is_refused_with_the_same_sentences(assignment: str, sentence: str) -> None:
     raw = read("title: x\ncorner: [1, 2]", "d.yaml")
     with pytest.raises(DocumentError) as caught:
-        validate(override(raw, assignment), Drawing, "--set")
+        validate(override(raw, assignment), Drawing, "d.yaml")
     assert caught.value.problems == (sentence,)
 
 

@@ -19,7 +19,7 @@ from offboard.campaign.flight import Job
 from offboard.campaign.progress import Counter
 from offboard.campaign.results import Record, Results
 from offboard.campaign.run import Campaign, Incomplete, Runner
-from offboard.campaign.search import Failure, as_csv, find, search_of
+from offboard.campaign.search import Failure, FailureSearch, as_csv
 from offboard.campaign.tune import Tuned, Tuning, judge, profile, read_tune
 from offboard.documents.errors import DocumentError, UserError
 from offboard.run.configuration import load
@@ -27,7 +27,7 @@ from offboard.run.configuration import load
 SEARCH = """
 controllers: [lqr]
 references: [hover]
-scenarios: [{name: still, conditions: {wind_ned_mps: [0, 0, 0], gusts: {intensity_mps: 0}}}]
+scenarios: [promises]
 search:
   flights: 200
   seeds: 4
@@ -78,7 +78,7 @@ def searched(directory: Path, most: float = math.inf) -> tuple[Campaign, list[Fa
     file.write_text(SEARCH)
     campaign = Campaign(*read_campaign(str(file)), directory / "out")
     with runner(campaign.results, Known(two_regions, most)) as flown:
-        return campaign, find(campaign, search_of(campaign, "c.yaml"), 2, flown)
+        return campaign, FailureSearch(campaign, "c.yaml").find(2, flown)
 
 
 def test_failures_that_differ_are_found_and_reduced_to_their_causes(tmp_path: Path) -> None:
@@ -88,7 +88,7 @@ def test_failures_that_differ_are_found_and_reduced_to_their_causes(tmp_path: Pa
     hot, rough = found["error", (NORTH, BANDWIDTH)], found["tilt", (EAST, GUSTS)]
     assert (hot.failing, hot.seeds) == (2, 4)  # seeds 2 .. 5, of which 4 and 5 do not fail
     assert (rough.failing, rough.seeds) == (4, 4)
-    assert "wind_ned_mps:\n  - 0.0\n" in rough.case.text  # north is back at its default
+    assert "wind_ned_mps:\n  - 0.0\n" in rough.case.scenario_text  # north is back at its default
     assert "--set controller.bandwidth_radps=7." in as_csv(failures)
     shown = (tmp_path / "out" / "campaign.html").read_text()
     assert shown.count(f"{BANDWIDTH}=") < 100  # of the worst flights alone, not of 200 groups

@@ -425,6 +425,6 @@ def test_an_invalid_fault_is_refused_with_one_sentence(text: str, tmp_path: Path
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("name", shipped.names("scenarios"))
+@pytest.mark.parametrize("name", shipped.names("scenario"))
 def test_every_shipped_scenario_is_valid(name: str) -> None:
     assert config.scenario(name).name == name
