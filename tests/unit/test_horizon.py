@@ -54,7 +54,7 @@ def about_hover(count: int, size: float) -> list[Situation]:
 def left_to_pay(law: HorizonLaw, situation: Situation) -> float:
     """x'Px: the cost of the closed form without bounds."""
     task = law.task(situation)
-    left = np.sum(task.lateral * (law.lateral.terminal @ task.lateral))
+    left = np.sum(task.at_hover * (law.lateral.terminal @ task.at_hover))
     return float(left + task.vertical @ law.vertical.terminal @ task.vertical)
 
 
@@ -92,7 +92,7 @@ def test_the_quadratic_leaves_the_cost_to_go_and_has_the_bounds_of_one_decision(
         problem, box, b_z = law.quadratic.problem(task, law.outlook), task.problem, task.b_z
         best = np.linalg.solve(problem.hessian, -problem.gradient)
         assert float(problem(best)) == pytest.approx(left_to_pay(law, situation), rel=1e-8)
-        assert best[0] == pytest.approx(-law.lateral.gain @ task.lateral[:, 0], abs=1e-8)
+        assert best[0] == pytest.approx(-law.lateral.gain @ task.at_hover[:, 0], abs=1e-8)
         assert best[2 * STEPS] == pytest.approx(-law.vertical.gain @ task.vertical, abs=1e-8)
         for ours, theirs in ((problem.lower, box.lower), (problem.upper, box.upper)):
             first = task.inputs(law.quadratic.plan(ours)[0])
