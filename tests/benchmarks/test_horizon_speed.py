@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import cycle
 from typing import Any
 
 import numpy as np
 import pytest
+from laws import LEVEL, at
 
 from offboard.control.base import Situation
 from offboard.control.catalogue import settings_of
-from offboard.model.command import Command, PredictedState
 from offboard.reference.transfer import transfer
 from offboard.run.configuration import load
 
@@ -25,22 +26,18 @@ VEHICLE = load("flight").vehicle
 
 def situations() -> list[Situation]:
     """Fifty states about a brisk transfer, a decision apart."""
-    rng = np.random.default_rng(3)
+    rng, found = np.random.default_rng(3), []
     reference = transfer((0, 0, -3), (6, 2, -4), 0.0, 0.5)
-    found = []
-    for k in range(50):
-        at_s = 0.1 * k
+    for at_s in 0.1 * np.arange(50):
         sample = reference.sample(at_s + 0.057)
         tilt = 0.03 * rng.normal(size=2)
-        state = PredictedState(
-            at_s + 0.057,
-            sample.position_ned_m + 0.1 * rng.normal(size=3),
-            sample.velocity_ned_mps + 0.1 * rng.normal(size=3),
-            np.array([*tilt, math.sqrt(1.0 - tilt @ tilt)]),
-            np.zeros(3), 0.0, 0.0, 9.8, np.zeros(3), np.zeros(3),
-        )  # fmt: skip
-        level = Command(9.8, (0.0, 0.0, 1.0), 0.0)
-        found.append(Situation(at_s, state, reference, level))
+        state = replace(
+            at(sample.position_ned_m + 0.1 * rng.normal(size=3), 0.0),
+            time_s=at_s + 0.057,
+            velocity_ned_mps=sample.velocity_ned_mps + 0.1 * rng.normal(size=3),
+            thrust_direction_ned=np.array([*tilt, math.sqrt(1.0 - tilt @ tilt)]),
+        )
+        found.append(Situation(float(at_s), state, reference, LEVEL))
     return found
 
 
@@ -48,8 +45,7 @@ def situations() -> list[Situation]:
 @pytest.mark.parametrize(
     ("law", "steps", "volumes"),
     [("paper", None, 0), ("pid", None, 0), ("lqr", None, 0), ("pso", None, 0), ("mpc", 10, 0),
-     ("horizon", 10, 0),
-     ("horizon", 10, 1), ("horizon", 20, 1), ("horizon", 20, 3)],
+     ("horizon", 10, 0), ("horizon", 20, 1), ("horizon", 20, 3)],
 )  # fmt: skip
 def test_decision(law: str, steps: int | None, volumes: int, benchmark: Any) -> None:
     """The 99th percentile of 1000 is printed with `-s` and kept by `--benchmark-json`; on a busy

@@ -6,6 +6,8 @@ In memory, default rates of PX4's companion link, PX4's estimator. Nothing here 
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -51,3 +53,18 @@ def test_a_second_in_memory(benchmark: Any, begin: Callable[[], Instance]) -> No
     instance = begin()
     sent = benchmark(_fly, instance, 1.0)
     assert 20_000 < sent < 60_000
+
+
+@pytest.mark.benchmark(group="twenty vehicles in real time")
+def test_instances(benchmark: Any) -> None:
+    """The last line says how many steps ended later than the next one was due."""
+    command = [sys.executable, "-m", "simulator", "--instances", "20", "--gcs", "none",
+               "--connect", "udpout:127.0.0.1:24540", "--duration", "5"]  # fmt: skip
+
+    def run() -> str:
+        output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+        return output.splitlines()[-1]
+
+    output = benchmark.pedantic(run, rounds=1)
+    print(f"\n{output}")
+    assert "of 1250 deadlines missed" in output

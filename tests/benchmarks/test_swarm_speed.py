@@ -19,15 +19,9 @@ PROBLEM = BoxQuadratic(HESSIAN, -HESSIAN @ MINIMISER, 20.0, LOWER, UPPER)
 
 
 @pytest.mark.benchmark(group="one step, 4 inputs")
-def test_compiled_swarm_40_by_150(benchmark: Any) -> None:
-    result = benchmark(minimise, SwarmSettings(), PROBLEM, np.random.default_rng(1))
-    assert result.best == pytest.approx(MINIMISER, abs=1e-4)
-
-
-@pytest.mark.benchmark(group="one step, 4 inputs")
-def test_compiled_swarm_with_a_deadline(benchmark: Any) -> None:
-    rng = np.random.default_rng(1)
-    result = benchmark(minimise, SwarmSettings(), PROBLEM, rng, lambda: 1.0)
+@pytest.mark.parametrize("remaining_s", [None, lambda: 1.0], ids=["", "with a deadline"])
+def test_compiled_swarm_40_by_150(benchmark: Any, remaining_s: Any) -> None:
+    result = benchmark(minimise, SwarmSettings(), PROBLEM, np.random.default_rng(1), remaining_s)
     assert result.best == pytest.approx(MINIMISER, abs=1e-4)
 
 

@@ -30,7 +30,7 @@ def _climbing(thrust: float, duration_s: float, **more) -> Plant:
 
 
 # Measured on PX4: up .70, 1.72, 2.82 and down .82, 1.04, 2.89 m/s^2 for the same three steps
-@pytest.mark.parametrize(("step", "measured"), [(0.05, 0.76), (0.10, 1.38), (0.20, 2.855)])
+@pytest.mark.parametrize(("step", "measured"), [(0.05, 0.76), (0.20, 2.855)])
 def test_thrust_step_on_px4_gives_the_measured_vertical_acceleration(step, measured):
     means = []
     for sign in (1.0, -1.0):
@@ -41,10 +41,7 @@ def test_thrust_step_on_px4_gives_the_measured_vertical_acceleration(step, measu
 
 
 # Measured on ArduCopter: mean vertical acceleration .3-.9 s after the step, with its drag
-@pytest.mark.parametrize(
-    ("step", "measured"),
-    [(-0.15, -3.45), (-0.10, -2.20), (-0.05, -1.08), (0.05, 1.18), (0.10, 2.16), (0.15, 3.12)],
-)
+@pytest.mark.parametrize(("step", "measured"), [(-0.15, -3.45), (-0.05, -1.08), (0.15, 3.12)])
 def test_thrust_step_on_arducopter_gives_the_measured_vertical_acceleration(step, measured):
     vehicle = load("arducopter")
     demand = Demand(True, vehicle.hover_thrust + step, LEVEL)
@@ -75,7 +72,7 @@ def test_motors_off_in_the_air_is_free_fall_with_drag():
     assert down[-1] > 3.4  # PX4, zero thrust: 3.4 m/s after 0.6 s from the command
 
 
-@pytest.mark.parametrize("share", [0.0, 0.5, 0.98])
+@pytest.mark.parametrize("share", [0.5, 0.98])
 def test_vehicle_stays_on_the_ground_below_its_weight(share):
     tilted = attitude(roll_deg=15.0)
     plant = Plant(PX4, Conditions(wind_ned_mps=(4.0, -3.0, 0.0)), 1)
@@ -105,15 +102,11 @@ def test_crash_upside_down_at_speed_is_survived_and_ends_level():
     assert np.abs(truth.velocity_ned_mps).max() < 1e-12
 
 
-@pytest.mark.parametrize(("thrust_scale", "mass_scale"), [(0.85, 1.0), (1.0, 1.2), (0.85, 1.2)])
-def test_wrong_thrust_and_mass_act_as_they_should(thrust_scale, mass_scale):
-    plant = _climbing(
-        0.8, 0.5, thrust_scale=thrust_scale, mass_scale=mass_scale
-    )  # still slow: read the acceleration with its drag taken off
-    truth = plant.truth
-    drag = PX4.drag_translation_npmps[2] / (PX4.mass_kg * mass_scale)
+def test_wrong_thrust_and_mass_act_as_they_should():
+    truth = _climbing(0.8, 0.5, thrust_scale=0.85, mass_scale=1.2).truth
+    drag = PX4.drag_translation_npmps[2] / (PX4.mass_kg * 1.2)
     felt = truth.acceleration_ned_mps2[2] + drag * truth.velocity_ned_mps[2]
-    expected = G * (1.0 - 0.8 / PX4.hover_thrust * thrust_scale / mass_scale)
+    expected = G * (1.0 - 0.8 / PX4.hover_thrust * 0.85 / 1.2)
     assert felt == pytest.approx(expected, rel=5e-3)
 
 
@@ -159,14 +152,8 @@ def test_battery_empties_by_the_current_and_sags_under_load():
 
 def test_a_vehicle_of_almost_pure_drag_stays_finite():
     """Explicit integration of a drag of 1000 1/s at 4 ms would explode."""
-    feather = PX4.model_copy(
-        update={
-            "mass_kg": 0.02,
-            "drag_translation_npmps": (20.0, 20.0, 20.0),
-            "drag_rotation_nmpradps": (5.0, 5.0, 5.0),
-            "inertia_kgm2": (0.01, 0.01, 0.01),
-        }
-    )
+    drag = {"drag_translation_npmps": (20.0,) * 3, "drag_rotation_nmpradps": (5.0,) * 3}
+    feather = PX4.model_copy(update={"mass_kg": 0.02, "inertia_kgm2": (0.01,) * 3, **drag})
     plant = Plant(feather, Conditions(wind_ned_mps=(5.0, 0.0, 0.0)), 1)
     plant.advance(4.0, Demand(True, 0.9, attitude(roll_deg=20.0)))
     assert plant.truth.velocity_ned_mps[0] == pytest.approx(5.0, abs=0.1)

@@ -6,13 +6,10 @@ import math
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 from sim_hover import attitude, crossing, estimate_of, euler_deg, hovering, load, response
 
-from offboard.model.frames import (
-    euler_from_quaternion,
-)
+from offboard.model.frames import euler_from_quaternion
 from simulator.steps import STEP_S
 from simulator.vehicle.attitude import Demand
 from simulator.vehicle.conditions import Conditions
@@ -21,23 +18,19 @@ AXES = {"roll": 0, "pitch": 1, "yaw": 2}
 
 
 # Measured figures; the slack covers their own spread and that telemetry at 100 Hz shows a
-# crossing half a sample late.
+# crossing half a sample late. Times of 10, 63 and 90 % in s, peak in degrees
 @pytest.mark.parametrize(
     ("vehicle", "axis", "step_deg", "t10", "t63", "t90", "peak"),
     [
-        ("px4_sih", "roll", 10.0, (0.085, 0.105), (0.185, 0.21), (0.24, 0.265), (10.7, 11.3)),
         ("px4_sih", "roll", -10.0, (0.085, 0.105), (0.185, 0.21), (0.24, 0.265), (10.7, 11.3)),
         ("px4_sih", "pitch", 10.0, (0.085, 0.105), (0.185, 0.21), (0.24, 0.265), (10.7, 11.3)),
         ("px4_sih", "yaw", 30.0, (0.26, 0.31), (0.59, 0.64), (0.74, 0.80), (37.3, 38.7)),
-        ("px4_sih", "yaw", -30.0, (0.26, 0.31), (0.59, 0.64), (0.74, 0.80), (37.3, 38.7)),
         ("arducopter", "roll", 10.0, (0.05, 0.07), (0.185, 0.21), (0.35, 0.38), (9.95, 10.2)),
-        ("arducopter", "pitch", -10.0, (0.05, 0.07), (0.185, 0.21), (0.35, 0.38), (9.95, 10.2)),
         ("arducopter", "yaw", 30.0, (0.19, 0.34), (0.57, 0.61), (0.70, 0.80), (33.2, 34.0)),
     ],
 )
 def test_attitude_step_has_the_measured_shape(vehicle, axis, step_deg, t10, t63, t90, peak):
-    truth = load(vehicle)
-    angles = [0.0, 0.0, 0.0]
+    truth, angles = load(vehicle), [0.0, 0.0, 0.0]
     angles[AXES[axis]] = step_deg
     demand = Demand(True, truth.hover_thrust, attitude(*angles))
     times, euler = response(hovering(truth), demand, 5.0, euler_deg)
@@ -52,16 +45,13 @@ def test_attitude_step_has_the_measured_shape(vehicle, axis, step_deg, t10, t63,
 @pytest.mark.parametrize(
     ("vehicle", "axis", "rate", "t63"),
     [
-        ("px4_sih", "roll", 0.6, (0.09, 0.125)),
         ("px4_sih", "pitch", -0.6, (0.09, 0.125)),
         ("px4_sih", "yaw", 0.6, (0.43, 0.50)),
         ("arducopter", "pitch", 0.6, (0.035, 0.07)),
-        ("arducopter", "yaw", 0.6, (0.25, 0.33)),
     ],
 )
 def test_rate_step_has_the_measured_rise(vehicle, axis, rate, t63):
-    truth = load(vehicle)
-    rates = [0.0, 0.0, 0.0]
+    truth, rates = load(vehicle), [0.0, 0.0, 0.0]
     rates[AXES[axis]] = rate
     demand = Demand(True, truth.hover_thrust, rates_frd_radps=tuple(rates))
     times, values = response(hovering(truth), demand, 2.5, lambda t: t.rates_frd_radps)
@@ -71,36 +61,20 @@ def test_rate_step_has_the_measured_rise(vehicle, axis, rate, t63):
 
 
 def _second_order(times, commands_s, commands, delay_s, wn, z):
-    """s'' = wn^2 (s_c(t - D) - s) - 2 z wn s', integrated piece by piece by SciPy."""
-    edges = [0.0, *[t + delay_s for t in commands_s], times[-1] + 1.0]
-    levels = [0.0, *commands]
-    state, out = np.zeros(2), []
-    for start, end, level in zip(edges[:-1], edges[1:], levels, strict=True):
-        inside = times[(times >= start) & (times < end)]
-
-        def slope(_, s, level=level):
-            return [s[1], wn * wn * (level - s[0]) - 2.0 * z * wn * s[1]]
-
-        solution = solve_ivp(
-            slope, (start, end), state, t_eval=[*inside, end], rtol=1e-8, atol=1e-10
-        )
-        out.extend(solution.y[0, :-1])
-        state = solution.y[:, -1]
-    return np.array(out)
+    """s'' = wn^2 (s_c(t - D) - s) - 2 z wn s': the sum of the responses to each change of s_c."""
+    since = np.maximum(times - commands_s[:, None] - delay_s, 0.0)
+    wd = wn * math.sqrt(1.0 - z * z)
+    settling = np.exp(-z * wn * since) * (np.cos(wd * since) + z * wn / wd * np.sin(wd * since))
+    return np.diff(commands, prepend=0.0) @ (1.0 - settling)
 
 
-@pytest.mark.parametrize("axis", [0])
-def test_identification_gives_back_delay_frequency_and_damping(axis):
-    vehicle = load("px4_sih")
+def test_identification_gives_back_delay_frequency_and_damping():
+    vehicle, seen = load("px4_sih"), []
     plant = hovering(vehicle)
-    generator = np.random.default_rng(7)
-    commands_deg = generator.choice([-3.0, -1.5, 0.0, 1.5, 3.0], 12)
-    seen = []
+    commands_deg = np.random.default_rng(7).choice([-3.0, -1.5, 0.0, 1.5, 3.0], 12)
     for command in commands_deg:
-        angles = [0.0, 0.0, 0.0]
-        angles[axis] = command
-        demand = Demand(True, vehicle.hover_thrust, attitude(*angles))
-        seen.append(response(plant, demand, 0.4, euler_deg)[1][:, axis])
+        demand = Demand(True, vehicle.hover_thrust, attitude(roll_deg=command))
+        seen.append(response(plant, demand, 0.4, euler_deg)[1][:, 0])
     angle = np.radians(np.concatenate(seen))
     times = np.arange(1, len(angle) + 1) * STEP_S
     commands_s = np.arange(12) * 0.4

@@ -23,21 +23,10 @@ ROUGH = Conditions(
 
 
 def _bytes(plant: Plant) -> bytes:
-    truth, estimate = plant.truth, estimate_of(plant)
-    return b"".join(
-        part.tobytes()
-        for part in (
-            truth.position_ned_m,
-            truth.velocity_ned_mps,
-            truth.attitude,
-            truth.rates_frd_radps,
-            truth.wind_ned_mps,
-            estimate.position_ned_m,
-            estimate.velocity_ned_mps,
-            estimate.attitude,
-            estimate.rates_frd_radps,
-        )
-    )
+    """Truth and estimate."""
+    names = ("position_ned_m", "velocity_ned_mps", "attitude", "rates_frd_radps")
+    parts = [getattr(each, name) for each in (plant.truth, estimate_of(plant)) for name in names]
+    return b"".join(part.tobytes() for part in (*parts, plant.truth.wind_ned_mps))
 
 
 def _fly(seed: int, cut: int) -> bytes:
@@ -61,9 +50,8 @@ def test_gusts_reach_the_vehicle_on_all_axes_whatever_way_the_wind_blows():
     assert np.abs(correlation).max() < 0.1
 
 
-@pytest.mark.parametrize("cut", [1, 3, 40, 240])
-def test_same_seed_gives_the_same_bytes_however_time_is_cut(cut):
-    assert _fly(17, cut) == _fly(17, 24)
+def test_same_seed_gives_the_same_bytes_however_time_is_cut():
+    assert _fly(17, 1) == _fly(17, 24) == _fly(17, 240) != _fly(18, 240)
 
 
 def test_asking_changes_nothing():
@@ -83,7 +71,7 @@ HOSTILE = [math.nan, math.inf, -math.inf, 0.0, -1.0, 1e300, -1e300, 1e-300, 1.5,
 def test_hostile_demands_never_make_anything_infinite():
     generator = np.random.default_rng(42)
     plant = Plant(PX4, ROUGH, 1)
-    for _ in range(100_000):
+    for _ in range(30_000):
         hostile = generator.random() < 0.5
         values = generator.choice(HOSTILE, 8) if hostile else generator.normal(0.0, 2.0, 8)
         kind = generator.integers(3)

@@ -28,6 +28,7 @@ from offboard.replay.difference import compare, verdict
 from offboard.replay.recording import read
 from offboard.replay.replaying import Replay
 from offboard.run import configuration
+from offboard.run.configuration import FlightConfig
 
 sys.path.append(str(Path(__file__).parents[1] / "flight"))
 
@@ -55,19 +56,23 @@ def reason(result: Result) -> str:
     return str(result.exception)
 
 
-def test_reports_of_the_recorded_setpoints_are_no_second_sender(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """A law that decides another thrust is replayed to the end, beside the recorded ATTITUDE_TARGET
-    of a real PX4."""
+def change_the_law(monkeypatch: pytest.MonkeyPatch, more_mps2: float) -> None:
+    """A law that decides another thrust."""
     decide = PsoLaw.decide
 
     def changed(law: PsoLaw, situation: Situation) -> Decision:
         decision = decide(law, situation)
-        command = replace(decision.command, thrust_mps2=1.01 * decision.command.thrust_mps2)
-        return replace(decision, command=command)
+        thrust_mps2 = decision.command.thrust_mps2 + more_mps2
+        return replace(decision, command=replace(decision.command, thrust_mps2=thrust_mps2))
 
     monkeypatch.setattr(PsoLaw, "decide", changed)
+
+
+def test_reports_of_the_recorded_setpoints_are_no_second_sender(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Replayed to the end, beside the recorded ATTITUDE_TARGET of a real PX4."""
+    change_the_law(monkeypatch, 0.1)
     with unpacked("real-px4") as recording:
         replay = replayed(recording)
     assert not any("another program" in said for said in replay.companion.announced)
@@ -81,17 +86,7 @@ def test_a_changed_law_is_found_at_its_first_decision(
     flight: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A thrust of 0.01 m/s2 more is 0.00043 of the whole, by the vehicle file's hover thrust."""
-    decide = PsoLaw.decide
-
-    def changed(self, situation):
-        decision = decide(self, situation)
-        command = decision.command
-        more = type(command)(
-            command.thrust_mps2 + 0.01, command.thrust_direction_ned, command.heading_rad
-        )
-        return type(decision)(more, decision.certificate)
-
-    monkeypatch.setattr(PsoLaw, "decide", changed)
+    change_the_law(monkeypatch, 0.01)
     result = run(flight)
     assert " of 215 setpoints and 25 commands differ; largest difference" in reason(result)
     assert getattr(result.exception, "code", None) == 1
@@ -122,16 +117,17 @@ def test_the_rounding_of_another_computer_is_no_difference(by: float, significan
 
 
 def test_logs_that_cannot_be_replayed(flight: Path, tmp_path: Path) -> None:
-    foreign = WIRE / "px4-1.16.1-offboard.tlog"
-    assert "does not hold the configuration" in reason(run(foreign))
-    old = tmp_path / "old.tlog"
+    old, silent = tmp_path / "old.tlog", tmp_path / "silent.tlog"
     old.write_bytes(without(flight, lambda message: record_type(message) == inputs.PAYLOAD_TYPE))
-    assert "has no inputs of each turn" in reason(run(old))
-    silent = tmp_path / "silent.tlog"
     silent.write_bytes(without(flight, lambda message: record_type(message) is None))
-    assert "nothing to compare" in reason(run(silent))
-    for path in (foreign, old, silent):
-        assert getattr(run(path).exception, "code", 2) == 2
+    for log, why in (
+        (WIRE / "px4-1.16.1-offboard.tlog", "does not hold the configuration"),
+        (old, "has no inputs of each turn"),
+        (silent, "nothing to compare"),
+    ):
+        result = run(log)
+        assert why in reason(result)
+        assert getattr(result.exception, "code", 2) == 2
 
 
 def without(flight: Path, drops) -> bytes:
@@ -139,19 +135,16 @@ def without(flight: Path, drops) -> bytes:
     return b"".join(kept)
 
 
-def test_a_lost_message_ends_the_comparison_before_it(tmp_path: Path) -> None:
+def test_a_lost_message_ends_the_comparison_before_it(failed: Pair, tmp_path: Path) -> None:
     """One LOCAL_POSITION_NED is damaged: what was sent before is still compared, in each mode of
     the command, and it says up to where."""
-    pair = short_flight()
-    whole = logged(pair, tmp_path / "whole.tlog")
-    lost_ms = 10_000
+    damaged, lost_ms = logged(failed, tmp_path / "damaged.tlog"), 10_000
     lost = next(
         m
-        for m in tlog.read(whole)
+        for m in tlog.read(damaged)
         if m.name == "LOCAL_POSITION_NED" and m.message.time_boot_ms >= lost_ms
     )
-    damaged = tmp_path / "damaged.tlog"
-    data = bytearray(whole.read_bytes())
+    data = bytearray(damaged.read_bytes())
     data[data.index(lost.frame.raw) + 12] ^= 0x40
     damaged.write_bytes(data)
     replay = Replay(read(damaged))
@@ -163,17 +156,21 @@ def test_a_lost_message_ends_the_comparison_before_it(tmp_path: Path) -> None:
     assert "1 damaged entry was skipped" in answer.stderr
     assert ended in answer.stderr
     assert not comparison.differences
-    assert 30 < comparison.setpoints < verdict(Replay(read(whole))).setpoints
+    assert 30 < comparison.setpoints < len(failed.payloads)
     assert replay.ended_s == pytest.approx(lost_ms / 1e3, abs=0.3)
 
 
 # ------------------------------------------------------------------ unusual inputs
 
 
+def resolved() -> FlightConfig:
+    return configuration.load(
+        "flight", choices={"reference": "hover"}, assignments=SHORT, known_vehicle="px4_sih"
+    )
+
+
 def short_flight(key: bytes = b"", **options) -> Pair:
-    resolved = configuration.load("flight", choices={"reference": "hover"}, assignments=SHORT,
-                                  known_vehicle="px4_sih")  # fmt: skip
-    pair = hover(learning=resolved.identify, deadline_s=resolved.deadline_s, key=key, **options)
+    pair = hover(learning=resolved().identify, deadline_s=resolved().deadline_s, key=key, **options)
     companion, turn = pair.companion, pair.companion.turn
     if key:
         pair.instance.keyring.set_up(key, 1)
@@ -191,10 +188,8 @@ def short_flight(key: bytes = b"", **options) -> Pair:
 
 
 def logged(pair: Pair, path: Path) -> Path:
-    resolved = configuration.load("flight", choices={"reference": "hover"}, assignments=SHORT,
-                                  known_vehicle="px4_sih")  # fmt: skip
     session = Session(SessionSettings(record_component_id=192))
-    pieces = [session.encode(piece) for piece in inputs.pieces(configuration.dump(resolved))]
+    pieces = [session.encode(piece) for piece in inputs.pieces(configuration.dump(resolved()))]
     frames = [*pieces, *pair.logged]
     path.write_bytes(b"".join(entry(UNIX_EPOCH_US + 100 * n, f) for n, f in enumerate(frames)))
     return path
@@ -264,17 +259,27 @@ def test_slow_decisions_a_stop_request_strangers_and_a_signed_link(tmp_path: Pat
     assert KEY not in (tmp_path / "flight.tlog").read_bytes()
 
 
-def test_an_error_in_a_turn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The frames of the turn stay in the log, and the replay fails and lands in the same turn."""
+def fail_in_a_turn(patch: pytest.MonkeyPatch) -> None:
     act = actions.act
 
     def failing(flight: FlightState) -> None:
-        if 10.0 <= flight.time_s < 10.1:
+        if 10.5 <= flight.time_s < 10.6:
             raise RuntimeError("as it happens")
         act(flight)
 
-    monkeypatch.setattr(actions, "act", failing)
-    pair = short_flight()
-    assert pair.companion.outcome is not None
-    assert "as it happens" in pair.companion.outcome.sentence
-    check(pair, tmp_path, least=40)
+    patch.setattr(actions, "act", failing)
+
+
+@pytest.fixture(scope="module")
+def failed() -> Pair:
+    with pytest.MonkeyPatch.context() as patch:
+        fail_in_a_turn(patch)
+        return short_flight()
+
+
+def test_an_error_in_a_turn(failed: Pair, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The frames of the turn stay in the log, and the replay fails and lands in the same turn."""
+    fail_in_a_turn(monkeypatch)
+    assert failed.companion.outcome is not None
+    assert "as it happens" in failed.companion.outcome.sentence
+    check(failed, tmp_path, least=40)

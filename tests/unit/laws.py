@@ -6,13 +6,14 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from attitude_plant import Lemniscate
+from numpy.typing import ArrayLike
 
 from offboard.control.base import Controller
 from offboard.control.catalogue import names, settings_of
 from offboard.control.law import LqrLaw, LqrSettings, PsoLaw, PsoSettings, Target
 from offboard.model.command import Command, PredictedState
 from offboard.model.vehicle import AxisResponse, Vehicle
+from offboard.reference.base import Reference
 
 G = 9.80665
 PX4 = Vehicle(
@@ -26,14 +27,6 @@ PX4 = Vehicle(
     thrust_lag_s=0.05,
     tilt=AxisResponse(delay_s=0.057, natural_frequency_radps=11.4, damping=0.56),
     yaw=AxisResponse(delay_s=0.148, natural_frequency_radps=3.1, damping=0.4),
-)
-ARDUCOPTER = PX4.model_copy(
-    update={
-        "drag_translation_npmps": (0.29, 0.29, 0.29),
-        "thrust_lag_s": 0.0,
-        "tilt": AxisResponse(delay_s=0.01, natural_frequency_radps=12.6, damping=1.115),
-        "angular_acceleration_limit_radps2": (19.2, 19.2, 4.7),
-    }
 )
 LEVEL = Command(G, (0.0, 0.0, 1.0), 0.0)
 # Those that track by themselves; the paper's law is slow, and the autopilot's own loop not ours
@@ -49,7 +42,7 @@ def pso(bandwidth: float = 5.0, vehicle: Vehicle = PX4, seed: int = 0, **more: o
     return PsoLaw(vehicle, settings, seed=seed)
 
 
-def state_of(rng: np.random.Generator, reference: Lemniscate, size: float) -> PredictedState:
+def state_of(rng: np.random.Generator, reference: Reference, size: float) -> PredictedState:
     """Somewhere near the reference at 5.057 s, off by about `size` in every unit."""
     sample = reference.sample(5.057)
     tilt = np.clip(0.05 * size * rng.normal(size=2), -0.6, 0.6)
@@ -86,7 +79,7 @@ def law_named(name: str) -> Controller:
     return settings_of(name)(law=name, **chosen).build(PX4, period_s=0.1, seed=7)
 
 
-def at(position: tuple[float, float, float], heading_rad: float) -> PredictedState:
+def at(position: ArrayLike, heading_rad: float) -> PredictedState:
     """At rest and level."""
     return PredictedState(
         0.057, np.array(position), np.zeros(3), np.array([0.0, 0.0, 1.0]), np.zeros(3),

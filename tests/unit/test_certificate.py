@@ -51,11 +51,12 @@ def test_the_exact_minimum_is_that_of_all_active_sets() -> None:
     generator = np.random.default_rng(1)
     exact = ExactMinimum(4)
     active = set()
-    for _ in range(300):
+    for _ in range(150):
         problem = coupled_problem(generator)
         minimiser, _ = enumerated_minimum(problem)
         found = exact.minimise(problem)
         assert found == pytest.approx(minimiser, abs=1e-8)
+        assert 0 <= certify(problem, answer(problem, minimiser), exact).gap < 1e-12
         active.add(int(np.sum((found == problem.lower) | (found == problem.upper))))
     assert active == {0, 1, 2, 3, 4}
 
@@ -85,16 +86,6 @@ def test_the_gap_is_resolved_below_the_rounding_of_the_costs() -> None:
     assert certificate.gap == pytest.approx(2e-18, rel=1e-6)
 
 
-def test_the_gap_of_the_minimum_itself_is_never_negative() -> None:
-    generator = np.random.default_rng(3)
-    exact = ExactMinimum(4)
-    for _ in range(300):
-        problem = coupled_problem(generator)
-        minimiser, _ = enumerated_minimum(problem)
-        gap = certify(problem, answer(problem, minimiser), exact).gap
-        assert 0 <= gap < 1e-12
-
-
 def test_the_gap_stays_meaningful_where_the_minimum_costs_nothing() -> None:
     problem = BoxQuadratic(np.eye(4), np.zeros(4), 0.0, -np.ones(4), np.ones(4))
     result = minimise(SwarmSettings(), problem, np.random.default_rng(4))
@@ -106,35 +97,16 @@ def test_the_gap_stays_meaningful_where_the_minimum_costs_nothing() -> None:
     assert certify(flat, answer(flat, np.zeros(4))).gap == 0.0
 
 
-@pytest.mark.parametrize("constant", [0.0, 50.0])
-def test_the_default_swarm_is_at_the_minimum(constant: float) -> None:
+def test_the_default_swarm_is_at_the_minimum() -> None:
     """Lambda = 0.65, 40 x 150: median gap of some 1e-16."""
-    generator = np.random.default_rng(5)
-    exact, rng = ExactMinimum(4), np.random.default_rng(5)
-    settings = SwarmSettings()
-    gaps = []
+    generator, box = np.random.default_rng(5), (-np.ones(4), np.ones(4))
+    exact, rng, settings, gaps = ExactMinimum(4), np.random.default_rng(5), SwarmSettings(), []
     for _ in range(300):
-        root = generator.normal(size=(4, 4))
-        problem = BoxQuadratic(
-            root @ root.T + 2 * np.eye(4), 4 * generator.normal(size=4), constant,
-            -np.ones(4), np.ones(4),
-        )  # fmt: skip
+        root, slope = generator.normal(size=(4, 4)), 4 * generator.normal(size=4)
+        problem = BoxQuadratic(root @ root.T + 2 * np.eye(4), slope, 50.0, *box)
         gaps.append(certify(problem, minimise(settings, problem, rng), exact).gap)
     assert np.median(gaps) <= 1e-9
     assert np.percentile(gaps, 99) <= 1e-6
-
-
-def test_a_frozen_swarm_is_told_apart_by_its_gap_not_by_its_spread() -> None:
-    """Lambda = 0.3: epsilon of 1e-13 and less, and far from the minimum."""
-    generator = np.random.default_rng(6)
-    exact, rng = ExactMinimum(4), np.random.default_rng(6)
-    settings = SwarmSettings(damping=0.3)
-    certificates = []
-    for _ in range(100):
-        problem = coupled_problem(generator)
-        certificates.append(certify(problem, minimise(settings, problem, rng), exact))
-    assert np.median([c.spread for c in certificates]) < 1e-12
-    assert np.median([c.gap for c in certificates]) > 1e-4
 
 
 def test_at_bound_looks_at_the_inputs_that_can_move() -> None:

@@ -101,12 +101,8 @@ def test_compiled_once_and_again_when_another_file_has_changed(
     assert len(made) == 1
     assert answer(package, **given) == "68.0\n1 [2, 10] 0"
     assert machine_code(cache) == made
-    for changed, source, total in (
-        ("kernels", KERNELS.replace("2.0", "3.0"), "84.0"),
-        ("constants", "OFFSET = 2.0\n", "88.0"),
-    ):
-        (package / "offboard" / f"{changed}.py").write_text(source)
-        assert answer(package, **given).startswith(f"{total}\n")
+    (package / "offboard" / "constants.py").write_text("OFFSET = 2.0\n")
+    assert answer(package, **given).startswith("72.0\n")
 
 
 def test_without_compilation_the_same_functions_run_as_python(
@@ -129,30 +125,17 @@ def test_the_directory_is_below_the_first_usable_one(package: Path, tmp_path: Pa
     given["XDG_CACHE_HOME"] = "here"
     assert Path(answer(package, code, **given)).parent == home / ".cache/pso-offboard"
     assert not list(package.rglob("here"))
+    nowhere = dict.fromkeys(given, str(first))  # a file: compiled, and kept in no directory
+    assert answer(package, **nowhere).startswith("68.0\n")
 
 
-def test_compiles_where_no_directory_can_be_written(package: Path, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("not a directory")
-    nowhere = str(tmp_path / "file")
-    given = {"NUMBA_CACHE_DIR": nowhere, "XDG_CACHE_HOME": nowhere, "HOME": nowhere}
-    assert answer(package, **given).startswith("68.0\n")
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        np.zeros((3, 2, 8))[..., ::2],
-        np.zeros(3),
-        np.zeros((3, 2, 4), "f4"),
-        np.zeros((4, 2, 3)).T,
-    ],
-    ids=["strided", "one dimension", "single precision", "transposed"],
-)
-def test_arguments_of_other_types_are_refused(wrong: np.ndarray) -> None:
+def test_arguments_of_other_types_are_refused() -> None:
     """Or they might be compiled in flight, for seconds."""
     bounds, best, rng = np.zeros((2, 2)), np.ones(2), np.random.default_rng(0)
-    with pytest.raises(TypeError, match="No matching definition"):
-        iterate(np.zeros(1, SEARCH), rng, bounds, wrong, best, bounds, bounds, best, 0.0, 1)
+    strided, transposed = np.zeros((3, 2, 8))[..., ::2], np.zeros((4, 2, 3)).T
+    for wrong in (strided, np.zeros(3), np.zeros((3, 2, 4), "f4"), transposed):
+        with pytest.raises(TypeError, match="No matching definition"):
+            iterate(np.zeros(1, SEARCH), rng, bounds, wrong, best, bounds, bounds, best, 0.0, 1)
 
 
 def test_importing_a_flight_does_not_import_numba() -> None:

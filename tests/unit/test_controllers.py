@@ -7,7 +7,7 @@ import re
 
 import numpy as np
 import pytest
-from attitude_plant import Lemniscate
+from attitude_plant import lemniscate
 from laws import LEVEL, law_named, state_of
 
 from offboard.control.base import Controller, Situation
@@ -47,7 +47,7 @@ def test_flight_yaml_states_every_setting_with_its_default_and_range() -> None:
 
 @pytest.mark.parametrize("law", names())
 def test_reset_gives_the_decisions_of_a_new_controller(law: str) -> None:
-    reference = Lemniscate(8.0)
+    reference = lemniscate(8.0)
     states = [state_of(np.random.default_rng(seed), reference, 0.3) for seed in range(3)]
 
     def decisions(controller: Controller) -> list[object]:

@@ -68,9 +68,10 @@ def problems(text: str, model: type[Parameters] = Drawing) -> tuple[str, ...]:
     return caught.value.problems
 
 
-@pytest.mark.parametrize("path", VEHICLES, ids=lambda path: path.stem)
-def test_the_vehicles_we_ship_are_valid(path: Path) -> None:
-    assert parse(path.read_text(), Vehicle, path.name).name == path.stem
+def test_the_vehicles_we_ship_are_valid() -> None:
+    assert len(VEHICLES) > 3
+    for path in VEHICLES:
+        assert parse(path.read_text(), Vehicle, path.name).name == path.stem
 
 
 def test_scalars_are_those_of_yaml_1_2() -> None:
@@ -96,21 +97,18 @@ def test_lists_become_tuples_text_an_enum_and_tags_choose_the_model() -> None:
     assert drawing.visible is False
 
 
+KEYS = "circles, colour, copies, corner, named, scale, shape, tilt_rad, title, visible"
+
+
 @pytest.mark.parametrize(
     ("text", "sentences"),
     [
         ("scale: -1", ["scale: -1 should be greater than 0"]),
-        ("scale: big", ["scale: 'big' should be a valid number"]),
         ("scale: true", ["scale: true should be a valid number"]),
         ("scale:", ["scale: an empty value should be a valid number"]),
         ("tilt_rad: 1e999", ["tilt_rad: inf should be a finite number"]),
-        ("visible: 1", ["visible: 1 should be a valid boolean"]),
         ("colour: green", ["colour: 'green' should be 'red' or 'blue'"]),
         ("corner: [1, x]", ["corner.1: 'x' should be a valid number"]),
-        (
-            "shape: {kind: line, points: 2.5}",
-            ["shape.points: 2.5 should be a valid integer"],
-        ),
         ("shape: {kind: square}", ["shape.kind: 'square' is not one of 'circle', 'line'"]),
         (
             "circles: [{kind: circle, radius_m: 1}, {kind: circle, radius_m: 0}]",
@@ -118,40 +116,20 @@ def test_lists_become_tuples_text_an_enum_and_tags_choose_the_model() -> None:
         ),
         (
             "shape: {kind: line, point: 3}",
-            [
-                "shape.points is missing",
-                "shape.point is not a known key",
-            ],
+            ["shape.points is missing", "shape.point is not a known key"],
         ),
-        (
-            "zzz: 3",
-            [
-                "zzz is not a known key (known keys: circles, colour, copies, corner, named, scale,"
-                " shape, tilt_rad, title, visible)"
-            ],
-        ),
+        ("zzz: 3", [f"zzz is not a known key (known keys: {KEYS})"]),
         ("copies: [x]", ["copies.0: 'x' should be a valid integer"]),
         ("colour: blue\ntilt_rad: 1", ["a blue drawing is not tilted"]),
-        (
-            "scale: 0\nvisible: maybe",
-            [
-                "scale: 0 should be greater than 0",
-                "visible: 'maybe' should be a valid boolean",
-            ],
-        ),
     ],
 )
 def test_each_problem_is_one_sentence(text: str, sentences: list[str]) -> None:
-    found = tuple(
-        re.sub(", line [0-9]+, column [0-9]+", "", each) for each in problems(f"title: x\n{text}")
-    )
-    assert found == tuple(f"d.yaml: {each}" for each in sentences)
+    found = [re.sub(", line [0-9]+, column [0-9]+", "", e) for e in problems(f"title: x\n{text}")]
+    assert found == [f"d.yaml: {each}" for each in sentences]
 
 
-@pytest.mark.parametrize(
-    ("text", "place"),
-    [
-        ("title: x\nscale: -1", "d.yaml, line 2, column 1: scale: -1"),
+def test_a_problem_names_line_and_column_of_its_key() -> None:
+    for text, place in (
         ("title: x\ncorner: [1, x]", "d.yaml, line 2, column 1: corner.1"),
         (
             "title: x\ncircles: [{kind: circle, radius_m: 0}]",
@@ -159,11 +137,9 @@ def test_each_problem_is_one_sentence(text: str, sentences: list[str]) -> None:
         ),
         ("title: x\nnamed:\n  sun: {kind: circle}", "d.yaml, line 3, column 3: named.sun.radius_m"),
         ("scale: 2", "d.yaml: title is missing"),
-    ],
-)
-def test_a_problem_names_line_and_column_of_its_key(text: str, place: str) -> None:
-    (problem,) = problems(text)
-    assert problem.startswith(place)
+    ):
+        (problem,) = problems(text)
+        assert problem.startswith(place)
 
 
 def test_a_description_is_read_and_is_no_part_of_the_value() -> None:
@@ -181,7 +157,6 @@ def test_a_description_is_read_and_is_no_part_of_the_value() -> None:
     ("text", "sentence"),
     [
         ("title: [1", "d.yaml, line 1, column 10: expected ',' or ']', but got '<stream end>'"),
-        ("title: x\n a: b: c", "d.yaml, line 2, column 3: mapping values are not allowed here"),
         ("title: x\ntitle: y", "d.yaml, line 2, column 1: the key 'title' is given twice"),
         ("- a\n- b", "d.yaml: expected a mapping of keys to values, not ['a', 'b']"),
         (
@@ -209,33 +184,22 @@ def test_override_sets_a_copy() -> None:
     assert raw == {"title": "x", "shape": {"kind": "line", "points": 3}, "corner": [1, 2]}
 
 
-def test_override_keeps_an_equals_sign_in_the_value() -> None:
-    assert override({}, "title=a=b") == {"title": "a=b"}
-
-
-@pytest.mark.parametrize(
-    ("assignment", "sentence"),
-    [
+def test_a_bad_override_is_refused_with_the_same_sentences() -> None:
+    raw = read("title: x\ncorner: [1, 2]", "d.yaml")
+    assert override(raw, "title=a=b")["title"] == "a=b"
+    for assignment, sentence in (
         (
             "scal=2",
-            "--set scal=2: scal is not a known key, did you mean scale? (known keys: circles,"
-            " colour, copies, corner, named, scale, shape, tilt_rad, title, visible)",
+            f"--set scal=2: scal is not a known key, did you mean scale? (known keys: {KEYS})",
         ),
         ("corner.5=2", "--set corner.5=2: corner: {'5': 2} should be a valid array"),
         ("scale=12", "--set scale=12: scale: 12 should be less than 10"),
         ("scale", "--set scale: expected key.path=value"),
         ("a..b=3", "--set a..b=3: expected key.path=value"),
-        (
-            "scale=[",
-            "--set scale=[, line 1, column 2: expected the node content, but found '<stream end>'",
-        ),
-    ],
-)
-def test_a_bad_override_is_refused_with_the_same_sentences(assignment: str, sentence: str) -> None:
-    raw = read("title: x\ncorner: [1, 2]", "d.yaml")
-    with pytest.raises(DocumentError) as caught:
-        validate(override(raw, assignment), Drawing, "d.yaml")
-    assert caught.value.problems == (sentence,)
+    ):
+        with pytest.raises(DocumentError) as caught:
+            validate(override(raw, assignment), Drawing, "d.yaml")
+        assert caught.value.problems == (sentence,)
 
 
 @given(st.text(st.sampled_from("ab:-[]{}&*!?|>'\"%@#,.0123 \n\t\\\x00\ud800é~"), max_size=40))

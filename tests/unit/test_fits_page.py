@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
 from browser import opening
 
 from offboard.analysis.identify import identify_flight, rows
@@ -17,6 +18,7 @@ RECORDING = Path(__file__).parents[1] / "wire" / "recordings" / "px4-1.16.1-offb
 REFUSAL = "it <b>does not</b> follow its command"
 
 
+@pytest.mark.slow
 def test_the_page_shows_every_constant_and_reads_in_both_colour_schemes(
     tmp_path: Path,
 ) -> None:

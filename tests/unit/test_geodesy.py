@@ -12,19 +12,12 @@ ZURICH = Geodetic(47.3977435, 8.5455941, 489.277)
 
 def unit(place: Geodetic) -> np.ndarray:
     latitude, longitude = np.radians(place[:2])
-    return np.array(
-        [
-            np.cos(latitude) * np.cos(longitude),
-            np.cos(latitude) * np.sin(longitude),
-            np.sin(latitude),
-        ]
-    )
+    level = np.cos(latitude)
+    return np.array([level * np.cos(longitude), level * np.sin(longitude), np.sin(latitude)])
 
 
-@pytest.mark.parametrize("origin", [ZURICH, Geodetic(-35.36, 149.17, 584.0), Geodetic(78, -179.99)])
-@pytest.mark.parametrize(
-    ("north_deg", "east_deg"), [(1e-5, 0), (0, -2e-5), (3e-3, 4e-3), (-0.1, 0.05)]
-)
+@pytest.mark.parametrize("origin", [Geodetic(-35.36, 149.17, 584.0), Geodetic(78, -179.99)])
+@pytest.mark.parametrize(("north_deg", "east_deg"), [(0, -2e-5), (-0.1, 0.05)])
 def test_distance_and_bearing_are_the_sphere_s(
     origin: Geodetic, north_deg: float, east_deg: float
 ) -> None:

@@ -23,16 +23,10 @@ class Standing:
     def heartbeat(self, now_s: float, *, armed: bool) -> None:
         self.vehicle.update(Heartbeat("POSCTL", armed, 4, 2), now_s)
 
-    def detector(self, now_s: float, state: str) -> None:
-        self.vehicle.update(Landed(state), now_s)
-
     def position(self, now_s: float, height_m: float = 0.0, climb_mps: float = 0.0) -> None:
         noise = 1e-6 * now_s  # no estimator repeats itself
-        event = LocalPosition(
-            now_s,
-            (5.0 + noise, noise - 3.0, 2.0 - height_m + noise),
-            (noise, noise, -climb_mps + noise),
-        )
+        place = (5.0 + noise, noise - 3.0, 2.0 - height_m + noise)
+        event = LocalPosition(now_s, place, (noise, noise, -climb_mps + noise))
         self.vehicle.update(event, now_s)
         self.contact.on_position(event)
 
@@ -45,7 +39,7 @@ def armed(height_m: float = 0.0, climb_mps: float = 0.0, detector: str = "on_gro
     standing = Standing()
     standing.heartbeat(1.0, armed=True)
     standing.position(1.0, height_m, climb_mps)
-    standing.detector(1.0, detector)
+    standing.vehicle.update(Landed(detector), 1.0)
     return standing
 
 

@@ -7,22 +7,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from attitude_plant import Lemniscate
-from laws import LEVEL, PX4, G, lqr, on_target, state_of
+from attitude_plant import lemniscate
+from laws import LEVEL, PX4, G, at, lqr, on_target, state_of
 from scipy.integrate import solve_ivp
 
 from offboard.control.base import Situation
 from offboard.control.horizon import STEPS_AROUND, HorizonLaw, HorizonSettings, Plan
 from offboard.control.mpc import MpcLaw, MpcSettings
 from offboard.control.roll_out import STATE_SIZE, B, P, T, V, W, Z
-from offboard.control.swarm import SwarmSettings
-from offboard.model.command import Command, PredictedState
+from offboard.model.command import PredictedState
 from offboard.reference.track import hold
 
 STEPS, PERIOD_S = 10, 0.1
 IN_THE_WAY = {"shape": "sphere", "north_m": 0.6, "east_m": -0.7, "height_m": 3.0, "radius_m": 0.3}
-WALL = {"shape": "box", "north_m": 0.6, "east_m": -0.5, "height_m": 3.0, "size_north_m": 0.4,
-        "size_east_m": 0.8, "size_up_m": 8.0}  # fmt: skip
 PASSING = IN_THE_WAY | {"east_m": -1.4, "velocity_east_mps": 1.4}
 
 
@@ -31,7 +28,7 @@ def horizon(**settings: object) -> HorizonLaw:
 
 
 def situations(count: int, size: float, seed: int = 1) -> list[Situation]:
-    rng, reference = np.random.default_rng(seed), Lemniscate(8.0)
+    rng, reference = np.random.default_rng(seed), lemniscate(8.0)
     return [Situation(5.0, state_of(rng, reference, size), reference, LEVEL) for _ in range(count)]
 
 
@@ -41,12 +38,14 @@ def about_hover(count: int, size: float) -> list[Situation]:
     found = []
     for _ in range(count):
         tilt = 0.1 * size * rng.normal(size=2)
-        state = PredictedState(
-            5.057, np.array([0.0, 0.0, -3.0]) + size * rng.normal(size=3),
-            size * rng.normal(size=3), np.array([*tilt, math.sqrt(1.0 - tilt @ tilt)]),
-            np.array([*(0.2 * size * rng.normal(size=2)), 0.0]), 0.0, 0.0,
-            G + 0.3 * size * rng.normal(), np.zeros(3), np.zeros(3),
-        )  # fmt: skip
+        state = replace(
+            at(np.array([0.0, 0.0, -3.0]) + size * rng.normal(size=3), 0.0),
+            time_s=5.057,
+            velocity_ned_mps=size * rng.normal(size=3),
+            thrust_direction_ned=np.array([*tilt, math.sqrt(1.0 - tilt @ tilt)]),
+            thrust_direction_rate_ned_ps=np.array([*(0.2 * size * rng.normal(size=2)), 0.0]),
+            thrust_mps2=G + 0.3 * size * rng.normal(),
+        )
         found.append(Situation(5.0, state, reference, LEVEL))
     return found
 
@@ -130,32 +129,29 @@ def _flown(state: PredictedState, plan: np.ndarray) -> np.ndarray:
 def test_nonlinear_roll_outs_fly_as_scipy_does() -> None:
     """Tilts and thrusts 0.2 and 3 m/s^2 about a hover that leans by 15 degrees: 1 s later within
     4 mm and 10 mm/s."""
-    rng = np.random.default_rng(3)
-    reference = hold((0.0, 0.0, -3.0), 0.0)
-    down = np.array([0.2, -0.1, 0.0])
-    down[2] = math.sqrt(1.0 - down @ down)
-    state = PredictedState(
-        5.057, np.array([0.2, -0.1, -3.3]), np.array([0.3, 0.2, -0.1]), down,
-        np.array([0.1, -0.2, 0.0]), 0.0, 0.0, G + 0.5, PUSHED_MPS2, np.zeros(3),
-    )  # fmt: skip
-    situation = Situation(5.0, state, reference, LEVEL)
-    plan = rng.uniform([-0.1, -0.2, -3.0], [0.2, 0.1, 3.0], (STEPS, 3))
-    true = _flown(state, plan)
-    pull = np.array([0.0, 0.0, G]) + PUSHED_MPS2
-    law = horizon()
-    law.prepare(situation)
+    state = replace(
+        at((0.2, -0.1, -3.3), 0.0),
+        time_s=5.057,
+        velocity_ned_mps=np.array([0.3, 0.2, -0.1]),
+        thrust_direction_ned=np.array([0.2, -0.1, math.sqrt(0.95)]),
+        thrust_direction_rate_ned_ps=np.array([0.1, -0.2, 0.0]),
+        thrust_mps2=G + 0.5,
+        disturbance_ned_mps2=PUSHED_MPS2,
+    )
+    plan = np.random.default_rng(3).uniform([-0.1, -0.2, -3.0], [0.2, 0.1, 3.0], (STEPS, 3))
+    true, law = _flown(state, plan), horizon()
+    law.prepare(Situation(5.0, state, hold((0.0, 0.0, -3.0), 0.0), LEVEL))
     rolled = law.fly(plan).plan(0).states[-1]
-    place = np.array([rolled[P], rolled[P + 1], rolled[Z] - 3.0])
-    speed = np.array([rolled[V], rolled[V + 1], rolled[W]])
-    assert np.abs(place - true[:3]).max() < 0.004
-    assert np.abs(speed - true[3:6]).max() < 0.01
+    assert np.abs(rolled[[P, P + 1, Z]] - [0.0, 0.0, 3.0] - true[:3]).max() < 0.004
+    assert np.abs(rolled[[V, V + 1, W]] - true[3:6]).max() < 0.01
+    pull = np.array([0.0, 0.0, G]) + PUSHED_MPS2
     leaning = pull[:2] / np.linalg.norm(pull)
     assert rolled[B : B + 2] + leaning == pytest.approx(true[6:8], abs=1e-6)
     assert rolled[T] + np.linalg.norm(pull) == pytest.approx(true[10], abs=1e-3)
 
 
 def test_a_plan_of_zeros_flies_the_reference() -> None:
-    reference, law = Lemniscate(8.0, heave_m=0.4), horizon()
+    reference, law = lemniscate(8.0, heave_m=0.4), horizon()
     start = state_of(np.random.default_rng(0), reference, 0.0)
     state = on_target(start, law.target(reference, 5.0, start))
     law.prepare(Situation(5.0, state, reference, LEVEL))
@@ -191,70 +187,31 @@ def test_swarm_is_lqr_where_that_is_optimal() -> None:
 
 def test_never_worse_than_the_seeds() -> None:
     law = horizon(keep_out=[IN_THE_WAY])
-    gained = []
-    for situation in situations(25, 0.3):
-        certificate = law.decide(situation).certificate
-        assert certificate.cost <= certificate.seed_cost
-        gained.append(1.0 - certificate.cost / certificate.seed_cost)
+    found = [law.decide(situation).certificate for situation in situations(12, 0.3)]
+    gained = [1.0 - each.cost / each.seed_cost for each in found]
+    assert min(gained) >= 0.0
     assert np.median(gained) > 0.02
 
 
-def random_search(law: HorizonLaw, rng: np.random.Generator, plans: int = 2800) -> float:
-    """The least cost of knots drawn uniformly about the closed form."""
-    base = closed_form(law)
-    knots = law.reach * rng.uniform(-1.0, 1.0, (plans, *law.reach.shape))
-    return float(law.fly(base.inputs, base.states, knots).costs.min())
-
-
-@pytest.mark.parametrize(
-    ("volume", "share"),
-    [
-        (PASSING, 0.5),
-        pytest.param(IN_THE_WAY, 0.5, marks=pytest.mark.slow),
-        pytest.param(WALL, 0.7, marks=pytest.mark.slow),
-    ],
-)
-def test_law_finds_cheaper_plans_than_a_random_search(
-    volume: dict[str, object], share: float
-) -> None:
-    """Each decision from the closed form, for about 900 roll-outs, against 2800 plans drawn about
-    it: every one cheaper, and most by a half. Past a wall it is a third: what four knots can do."""
-    law, rng, paid = horizon(keep_out=[volume]), np.random.default_rng(7), []
+def test_law_finds_cheaper_plans_than_a_random_search() -> None:
+    """Past a moving sphere, each decision from the closed form, for about 900 roll-outs, against
+    2800 plans drawn about it: every one cheaper, and most by a half."""
+    law, rng, paid = horizon(keep_out=[PASSING]), np.random.default_rng(7), []
     for situation in situations(10, 0.3, seed=7):
         law.previous = None
-        ours = law.decide(situation).certificate.cost
-        paid.append((ours, random_search(law, rng)))
+        ours, base = law.decide(situation).certificate.cost, closed_form(law)
+        knots = law.reach * rng.uniform(-1.0, 1.0, (2800, *law.reach.shape))
+        paid.append((ours, law.fly(base.inputs, base.states, knots).costs.min()))
     ours, drawn = np.array(paid).T
     assert (ours < drawn).all()
-    assert np.median(ours / drawn) < share
-
-
-@pytest.mark.parametrize("volume", [IN_THE_WAY, pytest.param(WALL, marks=pytest.mark.slow)])
-def test_the_search_alone_beats_a_random_search(volume: dict[str, object]) -> None:
-    """2800 roll-outs each about the same base, no other seed: cheaper in sum and in the median."""
-    law = horizon(keep_out=[volume])
-    drawn, rng = np.random.default_rng(7), np.random.default_rng(7)
-    settings = SwarmSettings(particles=20, iterations=140, damping=0.8)
-    paid = []
-    for situation in situations(30, 0.3, seed=7):
-        law.prepare(situation)
-        found, _ = law.search(closed_form(law), settings, rng)
-        paid.append((found.cost, random_search(law, drawn)))
-    ours, theirs = np.array(paid).T
-    assert ours.sum() < theirs.sum()
-    assert np.median(ours / theirs) < 1.0
+    assert np.median(ours / drawn) < 0.5
 
 
 def test_a_way_below_the_clearance_to_the_ground_costs() -> None:
     """A plan down and its mirror image up, from 0.8 m: alike but for 20 a metre and 200 a square
     metre and second, below 0.3 m."""
     law = horizon(keep_out=[IN_THE_WAY])
-    start = replace(
-        state_of(np.random.default_rng(0), Lemniscate(8.0), 0.0),
-        position_ned_m=np.array([5.0, 5.0, -0.8]), velocity_ned_mps=np.zeros(3),
-        thrust_direction_ned=np.array([0.0, 0.0, 1.0]), thrust_mps2=G,
-    )  # fmt: skip
-    law.prepare(Situation(5.0, start, hold((5.0, 5.0, -0.8), 0.0), LEVEL))
+    law.prepare(Situation(5.0, at((5.0, 5.0, -0.8), 0.0), hold((5.0, 5.0, -0.8), 0.0), LEVEL))
     down = np.zeros((STEPS_AROUND, 3))
     down[:5, 2] = -3.0
     low, high = law.fly(down).plan(0), law.fly(-down).plan(0)
@@ -263,18 +220,6 @@ def test_a_way_below_the_clearance_to_the_ground_costs() -> None:
     assert over.max() > 0.1
     paid = PERIOD_S * np.sum(20.0 * over + 200.0 * over**2)
     assert low.cost - high.cost == pytest.approx(paid, rel=1e-9)
-
-
-def test_away_from_volumes_little_is_left_to_find() -> None:
-    """By 240 iterations of 120 particles about the closed form, no more than 5 % of the cost."""
-    law = horizon()
-    settings = SwarmSettings(particles=120, iterations=240, damping=0.9)
-    rng = np.random.default_rng(0)
-    for situation in situations(6, 0.1):
-        law.previous = None
-        cost = law.decide(situation).certificate.cost
-        found, _ = law.search(closed_form(law), settings, rng)
-        assert cost < 1.05 * found.cost
 
 
 def test_the_deadline_ends_with_a_plan_no_worse_than_the_base() -> None:
@@ -286,15 +231,6 @@ def test_the_deadline_ends_with_a_plan_no_worse_than_the_base() -> None:
     assert 1 <= decision.certificate.iterations <= 5
     assert decision.certificate.cost <= decision.certificate.seed_cost
     assert np.linalg.norm(decision.command.thrust_direction_ned) == pytest.approx(1.0)
-
-
-def test_the_same_after_a_reset() -> None:
-    law = horizon(keep_out=[IN_THE_WAY])
-    flown: list[list[Command]] = []
-    for _ in range(2):
-        flown.append([law.decide(situation).command for situation in situations(4, 0.3)])
-        law.reset()
-    assert flown[0] == flown[1]
 
 
 def test_speed_limit_slows_the_plan() -> None:

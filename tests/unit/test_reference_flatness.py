@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -13,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from offboard.model.frames import quaternion_from_thrust_direction
 from offboard.reference.base import FlatSample
 from offboard.reference.flatness import FlatState, flat_state
-from offboard.reference.shapes import SHAPES, Circle, HeadingMode, Hover
+from offboard.reference.shapes import SHAPES
 from offboard.reference.track import Track
 
 Array = NDArray[np.float64]
@@ -90,61 +88,18 @@ def test_rates_turn_the_attitude(shape: str, heading: str) -> None:
 
 @every_shape
 def test_derivatives_of_thrust_and_direction(shape: str) -> None:
-    track = track_of(shape, "fixed")
+    """By central differences, each from the one below it."""
+    track, h = track_of(shape, "fixed"), 1e-4
     times = np.linspace(0.1, track.duration_s - 0.1, 400)
-    h = 1e-3
-    states = [state_of(track, times + k * h) for k in (-2, -1, 0, 1, 2)]
-    b = [state.thrust_direction_ned for state in states]
-    first = (b[0] - 8 * b[1] + 8 * b[3] - b[4]) / (12 * h)
-    second = (-b[0] + 16 * b[1] - 30 * b[2] + 16 * b[3] - b[4]) / (12 * h * h)
-    thrust = [state.thrust_mps2 for state in states]
-    thrust_rate = (thrust[0] - 8 * thrust[1] + 8 * thrust[3] - thrust[4]) / (12 * h)
-    np.testing.assert_allclose(states[2].thrust_direction_rate_ned_ps, first, atol=1e-6)
-    np.testing.assert_allclose(states[2].thrust_direction_acceleration_ned_ps2, second, atol=1e-4)
-    np.testing.assert_allclose(states[2].thrust_rate_mps3, thrust_rate, atol=1e-6)
-    assert np.abs(second).max() > 0.05  # it does move
-
-
-def test_a_level_circle_by_hand() -> None:
-    """Steady circle without drag: T = hypot(g, v^2/r), tilt atan(v^2 / (r g)) inwards, and with
-    the nose along the velocity p = 0, q and r the parts of the turn about the vertical."""
-    radius, period = 2.0, 8.0
-    track = Circle(course=HeadingMode.ALONG_VELOCITY).track()
-    omega = 2 * math.pi / period
-    inward = omega**2 * radius
-    flat = flat_state(track.sample(9.3), GRAVITY, 0.0)
-    tilt = math.atan2(inward, GRAVITY)
-    assert float(flat.thrust_mps2) == pytest.approx(math.hypot(GRAVITY, inward), rel=1e-12)
-    assert float(flat.thrust_rate_mps3) == pytest.approx(0.0, abs=1e-12)
-    assert float(flat.thrust_direction_ned[2]) == pytest.approx(math.cos(tilt), rel=1e-12)
-    # clockwise: banked to the right
-    np.testing.assert_allclose(
-        flat.rates_frd_radps, [0.0, omega * math.sin(tilt), omega * math.cos(tilt)], atol=1e-12
-    )
-
-
-def test_hover_in_a_disturbance_leans_against_it() -> None:
-    track = Hover().track()
-    flat = flat_state(track.sample(1.0), GRAVITY, DRAG, WIND)
-    force = np.array([0, 0, GRAVITY]) + WIND
-    assert float(flat.thrust_mps2) == pytest.approx(np.linalg.norm(force))
-    np.testing.assert_allclose(flat.thrust_direction_ned, force / np.linalg.norm(force))
-    assert np.all(flat.rates_frd_radps == 0.0)
-
-
-def test_array_equals_loop_and_shapes() -> None:
-    track = track_of("helix", "along_velocity")
-    times = np.linspace(0.0, track.duration_s, 12).reshape(3, 4)
-    batch = state_of(track, times)
-    assert batch.thrust_direction_ned.shape == (3, 4, 3)
-    for index in np.ndindex(3, 4):
-        single = state_of(track, float(times[index]))
-        assert single.thrust_mps2.shape == ()
-        assert single.rates_frd_radps.shape == (3,)
-        for name in (*FlatState.__slots__, "rates_frd_radps"):
-            np.testing.assert_allclose(
-                getattr(batch, name)[index], getattr(single, name), rtol=1e-12, atol=1e-13
-            )
+    before, here, after = (state_of(track, times + k * h) for k in (-1, 0, 1))
+    for name, derivative, near in (
+        ("thrust_direction_ned", "thrust_direction_rate_ned_ps", 1e-6),
+        ("thrust_direction_rate_ned_ps", "thrust_direction_acceleration_ned_ps2", 1e-4),
+        ("thrust_mps2", "thrust_rate_mps3", 1e-6),
+    ):
+        slope = (getattr(after, name) - getattr(before, name)) / (2 * h)
+        np.testing.assert_allclose(getattr(here, derivative), slope, atol=near)
+    assert np.abs(here.thrust_direction_acceleration_ned_ps2).max() > 0.05  # it does move
 
 
 def test_free_fall_and_knife_edge_stay_finite() -> None:

@@ -42,25 +42,10 @@ def test_as_fast_as_the_limits_allow(distance_m: float) -> None:
     assert 0.85 < ratio <= 1.001
 
 
-def test_moving_start_is_taken_over_and_ends_at_rest() -> None:
-    flown = transfer(
-        (1, 2, -3), (4, 0, -5), 3.0, -3.0, Limits(speed_mps=3.0),
-        start_velocity_ned_mps=(1.0, -0.5, -0.2),
-    )  # fmt: skip
-    start, end = flown.sample(0.0), flown.sample(flown.duration_s)
-    np.testing.assert_allclose(start.position_ned_m, [1, 2, -3], atol=1e-12)
-    np.testing.assert_allclose(start.velocity_ned_mps, [1.0, -0.5, -0.2], atol=1e-12)
-    np.testing.assert_allclose(end.position_ned_m, [4, 0, -5], atol=1e-9)
-    for name in ("velocity_ned_mps", "acceleration_ned_mps2", "jerk_ned_mps3", "snap_ned_mps4"):
-        np.testing.assert_allclose(getattr(end, name), 0.0, atol=1e-8)
-    # the short way through pi
-    assert float(start.heading_rad) == pytest.approx(3.0)
-    assert float(end.heading_rad) == pytest.approx(2 * math.pi - 3.0)
-    assert peaks(flown)[0] <= 3.001
-
-
-@pytest.mark.parametrize("target", [(60.0, -40.0, -20.0), (900.0, 0.0, -3.0), (0.0, 5.0, -60.0)])
-@pytest.mark.parametrize("velocity", [(0.0, 0.0, 0.0), (-1.0, 0.5, -0.8)])
+@pytest.mark.parametrize(
+    ("target", "velocity"),
+    [((60.0, -40.0, -20.0), (-1.0, 0.5, -0.8)), ((0.0, 5.0, -60.0), (0.0, 0.0, 0.0))],
+)
 def test_a_long_way_is_flown_at_constant_speed(
     target: tuple[float, float, float], velocity: tuple[float, float, float]
 ) -> None:
@@ -88,18 +73,11 @@ def test_a_long_way_is_flown_at_constant_speed(
             np.testing.assert_allclose(before, after, atol=1e-4)
 
 
-def test_a_start_faster_than_the_limit_still_stops() -> None:
-    flown = transfer((0, 0, -10), (1, 0, -10), 0, 0, start_velocity_ned_mps=(6.0, 0, 0))
-    assert flown.duration_s < 20  # it may brake at its own speed, not creep below the limit
-    assert np.all(flown.sample(flown.duration_s + 5).velocity_ned_mps == 0)
-    np.testing.assert_allclose(flown.sample(1e6).position_ned_m, [1, 0, -10], atol=1e-8)
-
-
 def test_no_start_is_planned_further_out_than_it_needs_to_brake() -> None:
     """Climbing away, falling, sideways: the plan stays between start, target and braking point."""
     rng, acceleration = np.random.default_rng(5), Limits().acceleration_mps2
-    for size_m, speed_mps in itertools.product((2.0, 30.0, 500.0), (0.5, 1.4, 3.0, 8.0)):
-        for _ in range(10):
+    for size_m, speed_mps in itertools.product((2.0, 30.0, 500.0), (0.5, 3.0, 8.0)):
+        for _ in range(5):
             start, target = rng.uniform(-size_m, size_m, (2, 3))
             velocity = rng.normal(size=3)
             velocity *= speed_mps / np.linalg.norm(velocity)
@@ -110,6 +88,7 @@ def test_no_start_is_planned_further_out_than_it_needs_to_brake() -> None:
             highest = np.maximum(start, target) + braking_m + 0.5
             assert np.all((path >= lowest) & (path <= highest))
             assert flown.duration_s < 20.0 + 2.0 * braking_m + size_m * math.sqrt(12.0)
+            np.testing.assert_allclose(flown.sample(0.0).velocity_ned_mps, velocity, atol=1e-9)
             np.testing.assert_allclose(path[-1], target, atol=1e-6)
 
 

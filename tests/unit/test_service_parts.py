@@ -57,28 +57,25 @@ def recorded(directory: Path, **options: Any) -> tuple[Recorder, list[Path]]:
 
 
 def test_a_flight_log_begins_with_what_came_before(tmp_path: Path) -> None:
+    """With the home position from long ago, the last five seconds and the configuration."""
     recorder, scored = recorded(tmp_path, stamp=lambda: "now")
-    talk = session()
+    talk, began_us = session(), clock.unix_us() - 20_000_000
     codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     home = mavlink.MAVLink_gps_global_origin_message(1, 2, 3).pack(codec)
-    began_us = clock.unix_us() - 20_000_000
-    recorder.write(began_us, home)  # long ago
+    recorder.write(began_us, home)
     for second in range(2, 20):
         recorder.write(began_us + second * 1_000_000, talk.encode(Heartbeat(6)))
     first = Path(recorder.begin(talk, "vehicle: neutral\n", "px4-1-7"))
     recorder.write(began_us + 20_000_000, talk.encode(Heartbeat(18)))
     recorder.end(engaged=False)
     second_flight = Path(recorder.begin(talk, "vehicle: neutral\n", "px4-1-7"))
-    recorder.write(began_us + 21_000_000, talk.encode(Heartbeat(18)))
     recorder.close()
     assert (first.name, second_flight.name) == ("now", "now-2")
     assert scored == [first, second_flight]
-    raw = (first / "flight.tlog").read_bytes()
-    assert home in raw
+    assert home in (first / "flight.tlog").read_bytes()
     log = tlog.read(first / "flight.tlog")
-    beats = [entry for entry in log if entry.name == "HEARTBEAT"]
-    assert len(beats) == 7  # of the last five seconds, and of the flight
-    assert beats[-1].message.type == 18
+    beats = [entry.message.type for entry in log if entry.name == "HEARTBEAT"]
+    assert beats == [*[6] * 6, 18]
     pieces = [entry.message for entry in log if entry.name == "TUNNEL"]
     payloads = [bytes(piece.payload[: piece.payload_length]) for piece in pieces]
     assert inputs.join(payloads) == "vehicle: neutral\n"
@@ -149,19 +146,15 @@ def test_a_vehicle_is_left_engaged_until_it_was_handed_back(tmp_path: Path) -> N
 
 def test_the_rolling_log_is_bounded(tmp_path: Path) -> None:
     recorder, _ = recorded(tmp_path, rolling_bytes=20_000)
-    talk = session()
-    written = 0
+    frame = session().encode(Heartbeat(6))
     for number in range(4000):
-        frame = talk.encode(Heartbeat(6))
-        written += len(frame) + 8
         recorder.write(number * 1000, frame)
         if number % 100 == 0:  # the writing thread takes them in several batches
             while recorder._rolling._writer._queue:
                 pass
     recorder.close()
     sizes = [(tmp_path / name).stat().st_size for name in ROLLING_NAMES]
-    assert written > 100_000
-    assert max(sizes) <= 20_000
+    assert 4000 * (len(frame) + 8) > 100_000 > 20_000 >= max(sizes)
     assert sum(sizes) > 10_000
 
 
@@ -230,15 +223,9 @@ def test_the_lock_names_its_holder_and_dies_with_it(tmp_path: Path) -> None:
     holder.wait()
     with connection_lock("udpin:127.0.0.1:1"):
         pass
-    with directory_lock(tmp_path / "new"):
-        again = directory_lock(tmp_path / "new")
-        with (
-            pytest.raises(
-                Locked, match=f"has the directory {tmp_path}/new.*: process {os.getpid()}$"
-            ),
-            again,
-        ):
-            pass
+    ours = f"has the directory {tmp_path}/new.*: process {os.getpid()}$"
+    with directory_lock(tmp_path / "new"), pytest.raises(Locked, match=ours):
+        directory_lock(tmp_path / "new").__enter__()
 
 
 def test_a_full_disk_is_no_wrong_option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -314,23 +301,23 @@ def test_a_changed_configuration_is_used_and_a_bad_one_refused(
 ) -> None:
     monkeypatch.setattr(preparation, "rehearse", lambda parts, keeps_deadline: None)
     file = tmp_path / "my.yaml"
-    good = "vehicle: px4_sih\ncontroller: lqr\nreference: {shape: hover, height_m: %s}\n"
-    file.write_text(good % 2)
+    text = "vehicle: px4_sih\ncontroller: lqr\nreference: {shape: hover, height_m: %s}\n"
+    file.write_text(text % 2)
     watched = Preparation(partial(load, str(file)))
     first = watched.newest()
-    watched.look()
+
+    def news(height: object) -> list[str]:
+        file.write_text(text % height)
+        watched.look()
+        watched.look()
+        return watched.news()
+
+    assert news(2) == []
+    (refused,) = news("high")
+    assert refused.startswith("the configuration is refused, the old one is kept: ")
+    assert "height_m" in refused
     assert watched.newest() is first
-    assert watched.news() == []
-    file.write_text(good % "high")
-    watched.look()
-    watched.look()
-    (news,) = watched.news()
-    assert news.startswith("the configuration is refused, the old one is kept: ")
-    assert "height_m" in news
-    assert watched.newest() is first
-    file.write_text(good % 3)
-    watched.look()
-    assert watched.news() == ["the configuration has changed: used from the next flight on"]
+    assert news(3) == ["the configuration has changed: used from the next flight on"]
     assert "height_m: 3" in watched.newest().text
 
 
@@ -376,7 +363,7 @@ def test_a_reference_that_is_placed_low_stays_clear_of_the_ground() -> None:
     assert plan.place_start((3.0, 4.0, -20.0), REST, None) == pytest.approx(falls_m, abs=0.02)
 
 
-@pytest.mark.parametrize("speed_mps", [0.3, 1.0, 1.5, 4.0])
+@pytest.mark.parametrize("speed_mps", [0.3, 4.0])
 def test_a_moving_vehicle_is_stopped_where_the_reference_starts(speed_mps: float) -> None:
     """Without a way back. A smooth stop with at most 2 m/s2 needs 35/32 of a stop with a constant
     1 m/s2."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections import Counter
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +22,22 @@ PX4, ARDUCOPTER = (
 )
 
 
+@cache
+def recorded() -> tuple[bytes, tuple[tlog.LoggedMessage, ...], list[int]]:
+    """The first 500 entries of PX4's log: bytes, messages, and where each begins and the last one
+    ends."""
+    messages = tuple(itertools.islice(tlog.read(PX4), 500))
+    at = [0, *itertools.accumulate(8 + len(entry.frame.raw) for entry in messages)]
+    return PX4.read_bytes()[: at[-1]], messages, at
+
+
 @pytest.mark.parametrize("path", [PX4, ARDUCOPTER])
 def test_the_layout_of_every_message_is_pymavlinks(path: Path) -> None:
+    """Of the first five messages of each name."""
+    seen: Counter[str] = Counter()
     for entry in tlog.read(path):
-        if entry.name.startswith("UNKNOWN"):
+        seen[entry.name] += 1
+        if entry.name.startswith("UNKNOWN") or seen[entry.name] > 5:
             continue
         message, kind = entry.message, tlog.layout(entry.name)
         payload = entry.frame.payload[: kind.itemsize].ljust(kind.itemsize, b"\0")
@@ -31,17 +45,7 @@ def test_the_layout_of_every_message_is_pymavlinks(path: Path) -> None:
         for field in message.get_fieldnames():
             if not isinstance(expected := getattr(message, field), str):
                 assert np.array_equal(row[field], expected, equal_nan=True), (entry.name, field)
-
-
-def test_columns_are_what_pymavlink_decodes() -> None:
-    theirs = mavutil.mavlogfile(str(PX4))
-    messages = []
-    while message := theirs.recv_match(type="LOCAL_POSITION_NED"):
-        messages.append([message.time_boot_ms, message.x, message.y, message.z])
-    stamps_ms, *position = np.array(messages).T
-    rows = history.gather(tlog.read(PX4)).position
-    np.testing.assert_allclose(rows["time_s"], stamps_ms / 1e3, rtol=1e-12)
-    np.testing.assert_array_equal(rows["position_ned_m"], np.stack(position, axis=1))
+    assert len(seen) > 20
 
 
 def test_what_a_record_of_an_older_version_lacks_has_its_default(tmp_path: Path) -> None:
@@ -68,11 +72,6 @@ def damaged(path: Path, data: bytes) -> tlog.Tlog:
     return tlog.read(path)
 
 
-def places(log: tlog.Tlog) -> list[int]:
-    """Where each entry begins; the log ends where the last one does."""
-    return [0, *itertools.accumulate(8 + len(entry.frame.raw) for entry in log)]
-
-
 @pytest.mark.parametrize(
     ("offset", "byte"),
     [
@@ -85,8 +84,7 @@ def places(log: tlog.Tlog) -> list[int]:
 )
 def test_a_damaged_entry_is_skipped_and_counted(offset: int, byte: int, tmp_path: Path) -> None:
     """The first entry, one in the middle, and the last but one."""
-    data, whole = PX4.read_bytes(), tlog.read(PX4)
-    messages, at = tuple(whole), places(whole)
+    data, messages, at = recorded()
     for number in (0, len(messages) // 2, len(messages) - 2):
         changed = bytearray(data)
         changed[at[number] + offset] ^= byte
@@ -99,8 +97,7 @@ def test_a_damaged_entry_is_skipped_and_counted(offset: int, byte: int, tmp_path
 def test_entries_after_garbage_and_holes_are_read(tmp_path: Path) -> None:
     """Garbage between entries, a hole that cuts two, and one that cuts the last: 4000 random bytes
     hold about 30 that could begin a frame."""
-    data, whole = PX4.read_bytes(), tlog.read(PX4)
-    messages, at = tuple(whole), places(whole)
+    data, messages, at = recorded()
     garbage = np.random.default_rng(3).bytes(4000)
     parts = data[: at[100]], garbage, data[at[100] : at[200] + 7], data[at[203] + 5 : -7]
     log = damaged(tmp_path / "x.tlog", b"".join(parts))
@@ -112,8 +109,7 @@ def test_entries_after_garbage_and_holes_are_read(tmp_path: Path) -> None:
 
 def test_damage_at_the_end_is_reported_and_a_cut_entry_is_none(tmp_path: Path) -> None:
     """Garbage behind the last entry, a last entry with a wrong checksum, and one that is cut."""
-    data, whole = PX4.read_bytes(), tlog.read(PX4)
-    messages, at = tuple(whole), places(whole)
+    data, messages, at = recorded()
     wrong = bytearray(data)
     wrong[-1] ^= 1
     for changed, kept, damage in ((data + bytes(5000), 0, at[-1]), (bytes(wrong), 1, at[-2])):
@@ -125,20 +121,13 @@ def test_damage_at_the_end_is_reported_and_a_cut_entry_is_none(tmp_path: Path) -
     assert (log.damaged, log.truncated) == (0, at[-1] - at[-2] - 3)
 
 
-def test_an_entry_at_the_border_of_a_block_is_found_behind_garbage(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    data, messages = PX4.read_bytes(), tuple(tlog.read(PX4))
+def test_a_log_is_read_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An entry at the border of one is found, also behind garbage."""
+    data, messages, _ = recorded()
     monkeypatch.setattr(tlog, "_BLOCK", 1000)
     for short in range(12):
         log = damaged(tmp_path / "x.tlog", bytes(1000 - short) + data)
         assert tuple(log) == messages
-
-
-def test_a_whole_log_is_read_in_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = list(tlog.read(PX4))
-    monkeypatch.setattr(tlog, "_BLOCK", 301)
-    assert list(tlog.read(PX4)) == whole
 
 
 def test_a_story_is_told_in_vehicle_time() -> None:

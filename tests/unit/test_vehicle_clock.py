@@ -80,63 +80,55 @@ def settled(until_s: float = 10.0, **more: Any) -> VehicleClock:
     return clock
 
 
-@pytest.mark.parametrize("rate", [0.25, 0.9, 1.0, 4.0, 20.0])
-@pytest.mark.parametrize("way_s", [0.002, 0.06])
-@pytest.mark.parametrize(("until_s", "answers"), [(0.8, False), (3.0, False), (10.0, True)])
-def test_a_clock_of_any_rate_is_no_late_link(
-    rate: float, way_s: float, until_s: float, answers: bool
-) -> None:
+@pytest.mark.parametrize("rate", [0.25, 0.9, 20.0])
+@pytest.mark.parametrize(("until_s", "answers"), [(0.8, False), (10.0, True)])
+def test_a_clock_of_any_rate_is_no_late_link(rate: float, until_s: float, answers: bool) -> None:
     """A simulation on a busy computer, or one that is told to be faster; also where the vehicle is
     engaged before its rate can be measured. Before any telemetry nothing is old."""
     assert VehicleClock().now_s(EPOCH_S) == -math.inf
     assert VehicleClock().age_s(3.0, EPOCH_S) == 0.0
-    link: Any = {"stamp": lambda at_s: rate * at_s, "down": lambda at_s: way_s, "answers": answers}
+    link: Any = {"stamp": lambda at_s: rate * at_s, "answers": answers}
     clock = settled(until_s, **link)
     fly(clock, every(0.02, until_s, 12.0), **link)
     oldest_s, newest = fly(clock, every(0.02, 12.0, 30.0), **link)
     assert oldest_s < 0.002 * rate
     assert clock.age_s(newest[0], newest[1] + 0.2) == pytest.approx(0.2 * rate, abs=0.002 * rate)
-    assert clock.now_s(EPOCH_S + 30.5) == pytest.approx(rate * (30.5 - way_s), abs=0.01 * rate)
+    assert clock.now_s(EPOCH_S + 30.5) == pytest.approx(rate * (30.5 - WAY_S), abs=0.01 * rate)
     assert clock.jumped_s == 0.0
 
 
-BOOTS: dict[str, tuple[Callable[[float], float], float]] = {  # stamps, and when it is engaged
-    "set before its rate is known": (lambda at_s: at_s + 30.0 * (at_s > 0.5), 9.0),
-    "set later": (lambda at_s: at_s + 30.0 * (at_s > 3.0), 4.0),
-    "stands still": (lambda at_s: min(at_s, 1.0) + max(at_s - 3.0, 0.0), 9.0),
-    "fast": (lambda at_s: 5.0 * min(at_s, 3.0) + max(at_s - 3.0, 0.0), 9.0),
-    "becomes slow": (lambda at_s: min(at_s, 3.0) + 0.5 * max(at_s - 3.0, 0.0), 9.0),
-    "slow, then set": (lambda at_s: 0.3 * at_s if at_s < 3.0 else at_s + 30.0, 3.5),
-}
+BOOTS: tuple[tuple[Callable[[float], float], float], ...] = (  # stamps, and when it is engaged
+    (lambda at_s: at_s + 30.0 * (at_s > 0.5), 9.0),  # set before its rate is known
+    (lambda at_s: at_s + 30.0 * (at_s > 3.0), 4.0),  # set later
+    (lambda at_s: min(at_s, 1.0) + max(at_s - 3.0, 0.0), 9.0),  # stands still
+    (lambda at_s: 5.0 * min(at_s, 3.0) + max(at_s - 3.0, 0.0), 9.0),  # fast
+    (lambda at_s: 0.3 * at_s if at_s < 3.0 else at_s + 30.0, 3.5),  # slow, then set
+)
 
 
-@pytest.mark.parametrize("boot", BOOTS)
 @pytest.mark.parametrize("answers", [True, False])
-def test_what_the_clock_did_at_boot_is_over(boot: str, answers: bool) -> None:
+def test_what_the_clock_did_at_boot_is_over(answers: bool) -> None:
     """When the flight begins its rate is the present one, and no jump counts."""
-    stamp, engaged_s = BOOTS[boot]
-    clock = settled(engaged_s, stamp=stamp, answers=answers)
-    now_s = clock.now_s(EPOCH_S + engaged_s + WAY_S + 1.0)
-    assert now_s == pytest.approx(stamp(engaged_s + 1.0), abs=1e-6)
-    times_s = every(0.02, engaged_s, engaged_s + 10.0)
-    assert fly(clock, times_s, stamp=stamp, answers=answers)[0] < 1e-6
-    assert clock.jumped_s == 0.0
+    for stamp, engaged_s in BOOTS:
+        clock = settled(engaged_s, stamp=stamp, answers=answers)
+        now_s = clock.now_s(EPOCH_S + engaged_s + WAY_S + 1.0)
+        assert now_s == pytest.approx(stamp(engaged_s + 1.0), abs=1e-6)
+        times_s = every(0.02, engaged_s, engaged_s + 10.0)
+        assert fly(clock, times_s, stamp=stamp, answers=answers)[0] < 1e-6
+        assert clock.jumped_s == 0.0
 
 
-@pytest.mark.parametrize("answers", [True, False])
-@pytest.mark.parametrize(("added_s", "ramp_s"), [(0.1, 3.0), (0.3, 0.02), (0.4, 4.0)])
+@pytest.mark.parametrize(("added_s", "ramp_s", "answers"), [(0.3, 0.02, True), (0.4, 4.0, False)])
 def test_telemetry_that_becomes_later_is_as_old_as_it_is(
-    answers: bool, added_s: float, ramp_s: float
+    added_s: float, ramp_s: float, answers: bool
 ) -> None:
     """The clock goes on while the replies come later, too, and the age shows within a tenth."""
+
+    def down(at_s: float) -> float:
+        return WAY_S + added_s * min((at_s - 12.0) / ramp_s, 1.0)
+
     clock = settled(12.0, answers=answers)
-    times_s = every(0.02, 12.0, 12.1 + ramp_s)
-    oldest_s, _ = fly(
-        clock,
-        times_s,
-        answers=answers,
-        down=lambda at_s: WAY_S + added_s * min((at_s - 12.0) / ramp_s, 1.0),
-    )
+    oldest_s, _ = fly(clock, every(0.02, 12.0, 12.1 + ramp_s), answers=answers, down=down)
     assert oldest_s == pytest.approx(added_s, rel=0.1)
 
 
@@ -152,7 +144,7 @@ def test_after_a_pause_the_backlog_is_as_old_as_it_is() -> None:
     assert clock.jumped_s == 0.0
 
 
-@pytest.mark.parametrize(("jump_s", "shown_s"), [(3.0, 3.0), (0.6, 0.6), (0.4, 0.0), (-1.0, 0.0)])
+@pytest.mark.parametrize(("jump_s", "shown_s"), [(0.6, 0.6), (0.4, 0.0), (-1.0, 0.0)])
 def test_a_jump_forward_is_measured(jump_s: float, shown_s: float) -> None:
     """Replies from before it do not count."""
     clock = VehicleClock()
@@ -183,34 +175,15 @@ def test_lost_and_scattered_telemetry() -> None:
     assert clock.age_s(1.01, 7001.10) == pytest.approx(0.04)
 
 
-def test_an_hour_of_drift() -> None:
-    """100 ppm: 0.36 s in an hour, 0.5 ms within the window of five seconds."""
-    clock = settled(5.0)
-    times_s = every(0.25, 5.0, 3600.0)
-    _, newest = fly(clock, times_s, stamp=lambda at_s: at_s * 1.0001)
-    assert clock.age_s(*newest) < 0.0006
-    assert clock.age_s(newest[0], newest[1] + 0.3) == pytest.approx(0.3, abs=0.0006)
-    assert clock.jumped_s == 0.0
-
-
-@pytest.mark.parametrize(("before", "after"), [(1.0, 0.93), (0.93, 1.0)])
-def test_a_clock_that_changes_its_rate_is_no_late_link(before: float, after: float) -> None:
+def test_a_clock_that_becomes_slower_is_no_late_link() -> None:
     """The load of the computer changes in flight. What remains is the change within one reply."""
 
     def stamp(at_s: float) -> float:
-        return before * min(at_s, 20.0) + after * max(at_s - 20.0, 0.0)
+        return min(at_s, 20.0) + 0.93 * max(at_s - 20.0, 0.0)
 
     clock = settled(stamp=stamp, answers=True)
     assert fly(clock, every(0.02, 10.0, 40.0), stamp=stamp, answers=True)[0] < 0.02
     assert clock.jumped_s == 0.0
-
-
-@pytest.mark.parametrize(("rate", "age_s"), [(0.96, 0.2), (0.9, 0.0)])
-def test_without_replies_a_clock_a_little_slow_looks_late(rate: float, age_s: float) -> None:
-    """Nothing tells it from a link that becomes later; a clock that is further off must be one."""
-    clock = settled(stamp=lambda at_s: rate * at_s)
-    _, newest = fly(clock, every(0.02, 10.0, 20.0), stamp=lambda at_s: rate * at_s)
-    assert clock.age_s(*newest) == pytest.approx(age_s, abs=0.006)
 
 
 # --- the delay of both directions ---
@@ -261,31 +234,23 @@ def test_link_delay_is_measured_by_twenty_replies(delay_s: float, measured_s: fl
     assert now_s == pytest.approx(measured_s, abs=0.15)
 
 
-# --- what the link has added since take-off -------------------------------------------------------
-
-
-def replies(link: VehicleClock, delay_s: float, count: int) -> None:
-    for _ in range(count):
-        sent_s = next(TIMES_S)
-        link.request(sent_s, EPOCH_S)
-        answer(link, sent_s, delay_s)
-
-
-TIMES_S = iter(0.1 * n for n in range(1, 10_000))
-
-
 def test_growth_is_that_of_the_median_of_five_replies() -> None:
-    link = VehicleClock()
-    replies(link, 0.05, 4)
+    link, times_s = VehicleClock(), iter(0.1 * n for n in range(1, 1000))
+
+    def replies(delay_s: float, count: int) -> None:
+        for _ in range(count):
+            link.on_reply(reply(link, next(times_s), delay_s))
+
+    replies(0.05, 4)
     link.settle()
-    replies(link, 0.95, 40)
+    replies(0.95, 40)
     assert link.delay_growth_s == 0.0  # nothing to compare with
     link.settle()
-    replies(link, 1.25, 2)
+    replies(1.25, 2)
     assert link.delay_growth_s == pytest.approx(0.0)  # two late ones may be chance
-    replies(link, 1.25, 1)
+    replies(1.25, 1)
     assert link.delay_growth_s == pytest.approx(0.30)
-    replies(link, 0.91, 5)
+    replies(0.91, 5)
     assert link.delay_growth_s == pytest.approx(-0.04)
 
 
