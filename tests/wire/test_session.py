@@ -42,7 +42,10 @@ def test_the_first_autopilot_heard_is_the_vehicle() -> None:
         events.VehicleFound(42, 1, "px4"),
         events.Heartbeat("OFFBOARD", False, 3, 2),
     )
-    assert session.encode(Heartbeat(18))[5:7] == bytes([42, 191])
+    ours = session.encode(Heartbeat(18))
+    assert ours[5:7] == bytes([42, 191])
+    echo = session.receive(ours, PEER, 0.0)  # neither heard nor logged
+    assert (echo.frames, echo.events, dropped(session, DropReason.ECHO)) == ((), (), 1)
 
 
 def test_others_are_dropped_once_the_vehicle_is_found() -> None:
@@ -100,13 +103,6 @@ def test_no_other_sender_replaces_the_vehicle(
 # --- other controllers ---
 
 
-def test_our_own_frames_are_ignored_and_not_logged() -> None:
-    session = pinned(Sender())
-    reception = session.receive(session.encode(Heartbeat(18)), PEER, 0.0)
-    assert (reception.frames, reception.events) == ((), ())
-    assert dropped(session, DropReason.ECHO) == 1
-
-
 def level_setpoint(target: int) -> Any:
     return mavlink.MAVLink_set_attitude_target_message(0, target, 1, 7, [1, 0, 0, 0], 0, 0, 0, 0.5)
 
@@ -135,8 +131,7 @@ def test_another_program_with_our_ids_and_a_strange_setpoint_are_seen() -> None:
 
 @pytest.mark.parametrize(("target", "seen"), [(0, True), (1, True), (2, False)])
 def test_a_setpoint_for_another_vehicle_on_the_link_is_not_ours(target: int, seen: bool) -> None:
-    session = pinned(Sender())
-    zeros = (0,) * 12
+    session, zeros = pinned(Sender()), (0,) * 12
     for setpoint in (
         level_setpoint(target),
         mavlink.MAVLink_set_position_target_local_ned_message(0, target, 1, 1, *zeros),
@@ -269,18 +264,6 @@ def test_heartbeats_at_1_hz_of_host_or_vehicle_time_whichever_is_faster() -> Non
         session.receive(vehicle.position(10 * tick), PEER, 10.5 + 0.0002 * tick)
         beats += Heartbeat(18) in session.poll(10.5 + 0.0002 * tick)
     assert beats == 10
-
-
-def test_in_lockstep_host_time_changes_nothing() -> None:
-    """Two sessions with the same datagrams at other host times, polled in between or not."""
-    vehicle = Sender()
-    datagrams = [vehicle.heartbeat(), *(vehicle.position(20 * tick) for tick in range(1, 300))]
-    plain, polled = (Session(SessionSettings(lockstep=True)) for _ in range(2))
-    for tick, datagram in enumerate(datagrams):
-        expected = plain.receive(datagram, PEER, 0.001 * tick)
-        assert polled.receive(datagram, PEER, 7.0 * tick) == expected
-        assert polled.poll(7.0 * tick + 6.0) == plain.poll(0.001 * tick)
-    assert polled.link_time_s == plain.link_time_s
 
 
 def test_intervals_are_requested_at_once() -> None:
