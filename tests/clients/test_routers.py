@@ -11,15 +11,13 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from programs import Terminal, vehicle
 from pymavlink import mavutil
-from terminal import Terminal
-from vehicle_process import vehicle
 
 from offboard.analysis import tlog
 from offboard.documents.signing_key import create_key
 from simulator.link.sockets import free_ports
 
-MAVPROXY = Path(sys.executable).with_name("mavproxy.py")
 SHORT = ("--controller", "lqr", "--reference", "hover", "--set", "reference.height_m=1",
          "--set", "reference.duration_s=1")  # fmt: skip
 # three programs and a router share the processors with other tests
@@ -32,13 +30,10 @@ def routed(directory: Path, system: int) -> Iterator[tuple[Terminal, int, int]]:
     """A vehicle behind MAVProxy; its terminal, and the ports to which it sends for us and for a
     ground station."""
     ours, station = free_ports(2)
-    failsafe = ("--param", "COM_OF_LOSS_T=5")
-    with vehicle("--instance", str(system - 1), *failsafe) as port:
-        outs = (f"--out=udpout:127.0.0.1:{ours}", f"--out=udpout:127.0.0.1:{station}")
-        master = f"--master=udpin:127.0.0.1:{port}"
-        command = (sys.executable, str(MAVPROXY), master, *outs, "--no-state")
-        with Terminal(command, str(directory)) as terminal:
-            yield terminal, ours, station
+    outs = (f"--out=udpout:127.0.0.1:{ours}", f"--out=udpout:127.0.0.1:{station}")
+    simulated = ("--instance", str(system - 1), "--param", "COM_OF_LOSS_T=5")
+    with vehicle(*simulated) as port, Terminal(directory, port, *outs) as terminal:
+        yield terminal, ours, station
 
 
 def fly(port: int, directory: Path, key: Path, meanwhile: Callable[[], object]) -> str:
@@ -79,7 +74,7 @@ def test_a_signed_flight_behind_a_router_beside_a_ground_station(tmp_path: Path)
 
         def listen() -> None:
             """The terminal must be read, or MAVProxy would stop."""
-            terminal._read(0.05)
+            terminal.read(0.05)
             while (message := ground.recv_match()) is not None:
                 if message.get_type() != "BAD_DATA" and message.get_signed():
                     heard.add((message.get_srcSystem(), message.get_srcComponent()))

@@ -19,14 +19,10 @@ from simulator.vehicle.conditions import Conditions
 from simulator.vehicle.sensors import EstimatorName
 
 OFFBOARD, LOITER, POSCTL = 0x00060000, 0x03040000, 0x00030000
-TAKEOFF, LAND, RTL = 0x02040000, 0x06040000, 0x05040000
-HOVER = 0.4895
+LAND, RTL = 0x06040000, 0x05040000
+HOVER = 0.4895  # of PX4's vehicle
 NAN = math.nan
 STEPS_PER_HEARTBEAT = 250
-
-
-def px4_vehicle() -> Vehicle:
-    return config.vehicle("px4_sih")
 
 
 class Bench:
@@ -42,23 +38,20 @@ class Bench:
         ground_link: bool = False,
         firmware: Firmware = PX4,
         boot_scale: float = 1.0,
-        strict: bool = False,
         vehicle: Vehicle | None = None,
         scenario: Scenario | None = None,
     ) -> None:
         conditions = Conditions(estimator=estimator, boot_scale=boot_scale)
-        if scenario is not None:
-            conditions = scenario.conditions
-        vehicle = vehicle or config.vehicle(firmware.vehicle)
+        scenario = scenario or Scenario(name="none", conditions=conditions)
         self.instance = Instance(
             firmware,
-            vehicle,
-            conditions,
+            vehicle or config.vehicle(firmware.vehicle),
+            scenario.conditions,
             seed,
             system=system,
             ground_link=ground_link,
-            faults=() if scenario is None else scenario.faults,
-            start=None if scenario is None else scenario.start,
+            faults=scenario.faults,
+            start=scenario.start,
         )
         self.system = system
         self.codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
@@ -75,7 +68,23 @@ class Bench:
 
     @property
     def height_m(self) -> float:
-        return -float(self.instance.autopilot.state.truth.position_ned_m[2])
+        return -self.place[2]
+
+    @property
+    def place(self) -> tuple[float, ...]:
+        """Where it is: north, east, down, m."""
+        return tuple(self.instance.autopilot.state.truth.position_ned_m.tolist())
+
+    @property
+    def velocity(self) -> tuple[float, ...]:
+        return tuple(self.instance.autopilot.state.truth.velocity_ned_mps.tolist())
+
+    @property
+    def heading_deg(self) -> float:
+        return math.degrees(self.instance.autopilot.state.estimate.yaw_rad)
+
+    def set(self, name: str, value: float) -> None:
+        assert self.instance.autopilot.parameters.set(name, value)
 
     # -- sending -----------------------------------------------------------------------------
 
@@ -86,18 +95,14 @@ class Bench:
         if self.heartbeat_type is not None:
             self.send(mavlink.MAVLink_heartbeat_message(self.heartbeat_type, 8, 0, 0, 4, 3))
 
-    def command(self, number: int, *params: float, to: tuple[int, int] | None = None) -> list[int]:
+    def command(self, number: int, *params: float) -> list[int]:
         """Send COMMAND_LONG, let a moment pass and return the results of its acks."""
-        system, component = (self.system, 1) if to is None else to
         filled = (*params, *(0.0,) * (7 - len(params)))
-        self.send(mavlink.MAVLink_command_long_message(system, component, number, 0, *filled))
+        self.send(mavlink.MAVLink_command_long_message(self.system, 1, number, 0, *filled))
         since_s = self.time_s
         self.run(0.02)
-        return [
-            message.result
-            for at_s, message in self.of("COMMAND_ACK")
-            if at_s > since_s and message.command == number
-        ]
+        acks = [ack for at_s, ack in self.of("COMMAND_ACK") if at_s > since_s]
+        return [ack.result for ack in acks if ack.command == number]
 
     def ask_mode(self, custom_mode: int) -> list[int]:
         return self.command(176, 1, custom_mode >> 16 & 0xFF, custom_mode >> 24)
@@ -107,22 +112,13 @@ class Bench:
         quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
         thrust: float = HOVER,
         mask: int = 7,
-        rates: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        to: tuple[int, int] | None = None,
     ) -> None:
-        system, component = (self.system, 1) if to is None else to
-        self.send(
-            mavlink.MAVLink_set_attitude_target_message(
-                0, system, component, mask, quaternion, *rates, thrust
-            )
-        )
+        fields = (0, self.system, 1, mask, quaternion, 0.0, 0.0, 0.0, thrust)
+        self.send(mavlink.MAVLink_set_attitude_target_message(*fields))
 
-    def position(self, x: float, y: float, z: float, mask: int = 2552, frame: int = 1) -> None:
-        self.send(
-            mavlink.MAVLink_set_position_target_local_ned_message(
-                0, self.system, 1, frame, mask, x, y, z, *(0.0,) * 8
-            )
-        )
+    def position(self, x: float, y: float, z: float, mask: int = 2552) -> None:
+        fields = (0, self.system, 1, 1, mask, x, y, z, *(0.0,) * 8)
+        self.send(mavlink.MAVLink_set_position_target_local_ned_message(*fields))
 
     # -- time --------------------------------------------------------------------------------
 
@@ -185,10 +181,6 @@ class Bench:
             joined[message.id] = joined.get(message.id, "") + message.text
         return [text.rstrip("\t") for text in joined.values()]
 
-    def text_at(self, text: str) -> float:
-        """Vehicle time of the newest STATUSTEXT with this beginning."""
-        return [at_s for at_s, m in self.of("STATUSTEXT") if m.text.startswith(text)][-1]
-
     @property
     def mode(self) -> int:
         """custom_mode as the next heartbeat will show it."""
@@ -206,22 +198,42 @@ class Bench:
 
     # -- scripts -----------------------------------------------------------------------------
 
-    def boot(self) -> None:
-        self.run(5.0)
-
-    def take_off(self) -> None:
-        """By command from the ground, until AUTO.LOITER, 2.5 m up."""
-        assert self.command(22, *(NAN,) * 7) == [0]
-        assert self.command(400, 1) == [0]
-        self.run_until(lambda: self.mode == LOITER, 15.0)
-
     def fly_offboard(self, height_m: float = 3.0) -> None:
         """Boot, stream, engage, arm and climb by position setpoints; the stream then ends."""
-        self.boot()
-        self.run(0.6, lambda: self.position(0, 0, -height_m))
+        self.run(5.6, lambda: self.position(0, 0, -height_m))
         assert self.ask_mode(OFFBOARD) == [0, 0]
         assert self.command(400, 1) == [0]
         limit_s = self.time_s + 20.0
         while abs(self.height_m - height_m) > 0.1:
             assert self.time_s < limit_s
             self.run(0.2, lambda: self.position(0, 0, -height_m))
+
+
+def aloft(
+    *faults: dict[str, Any],
+    firmware: Firmware = PX4,
+    height_m: float = 8.0,
+    mode: str | None = None,
+    **more: Any,
+) -> Bench:
+    """A vehicle that hovers; faults count from there. `more` are further parts of the scenario."""
+    content = {"start": {"height_m": height_m, "mode": mode}, "faults": faults, **more}
+    bench = Bench(firmware=firmware, scenario=Scenario.model_validate({"name": "test", **content}))
+    bench._parser.robust_parsing = True  # damage is part of the deal
+    return bench
+
+
+def engaged(*faults: dict[str, Any], firmware: Firmware = PX4) -> Bench:
+    """The same, obeying setpoints; faults count from there."""
+    counted = ({"after": "engaged", **fault} for fault in faults)
+    if firmware is not PX4:
+        return aloft(*counted, firmware=firmware, mode="GUIDED")
+    bench = aloft(*counted)
+    hold(bench, 0.6)
+    assert bench.ask_mode(OFFBOARD)[-1] == 0
+    return bench
+
+
+def hold(bench: Bench, duration_s: float, height_m: float = 8.0) -> None:
+    """By position setpoints."""
+    bench.run(duration_s, lambda: bench.position(0, 0, -height_m), 0.1)

@@ -17,12 +17,12 @@ KINDS = ("ack", "text", "state", "landed", "filter", "param", "mission")
 @dataclass
 class Rows:
     """One side: rows of each kind in order, as (time, what), repetitions of a state left out,
-    and where it was, as (time, north, east, down)."""
+    and where it was, as (time, position, velocity), both north, east, down."""
 
     by_kind: dict[str, list[tuple[float, str]]] = field(
         default_factory=lambda: {kind: [] for kind in KINDS}
     )
-    positions_ned_m: list[tuple[float, float, float, float]] = field(default_factory=list)
+    path: list[tuple[float, ...]] = field(default_factory=list)
     _open_text: str = ""
 
     def hear(self, time_s: float, message: Any) -> None:
@@ -45,7 +45,8 @@ class Rows:
         elif name == "EKF_STATUS_REPORT":
             self._change("filter", time_s, str(message.flags))
         elif name == "LOCAL_POSITION_NED":
-            self.positions_ned_m.append((time_s, message.x, message.y, message.z))
+            m = message
+            self.path.append((time_s, m.x, m.y, m.z, m.vx, m.vy, m.vz))
         elif name == "PARAM_VALUE":
             bits = struct.pack("<f", message.param_value).hex()
             self._change("param", time_s, f"{message.param_id} {bits} {message.param_type}")

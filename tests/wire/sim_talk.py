@@ -6,7 +6,7 @@ import lzma
 import struct
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_bench import Bench
@@ -33,21 +33,15 @@ def recorded_frames(recording: Path) -> list[tuple[float, bytes, Any]]:
     return frames
 
 
-class Listener(Protocol):
-    """Receives the messages of an autopilot."""
-
-    def hear(self, time_s: float, message: Any) -> None: ...
-
-
 def ask_again(
     recording: Path,
     bench: Bench,
-    real: Listener,
-    ours: Listener,
+    real: Any,
+    ours: Any,
     run_on_s: float,
     each: Callable[[Any], None] = lambda message: None,
 ) -> None:
-    """Send what the companion sent, at the same vehicle times; both talks are filled.
+    """Send what the companion sent, at the same vehicle times; both sides `hear` the answers.
 
     `run_on_s`: how long the simulator runs after the last request. `each` receives the messages
     of the real autopilot, in order of time.

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from scipy.spatial.transform import Rotation
 from vehicle_frames import ARDUPILOT, PX4, Sender, pinned, understood
 
@@ -23,7 +22,6 @@ from offboard.mavlink.outgoing import (
     PositionTarget,
     ReferenceRecord,
     SolverRecord,
-    StatusTextOut,
 )
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.texts import TextAssembler, chunks
@@ -37,54 +35,38 @@ def sent(value: Outgoing, autopilot: int = PX4, system_id: int = 7) -> Any:
     return understood(pinned(Sender(system_id), autopilot).encode(value))
 
 
-def rotation(message: Any) -> Rotation:
-    w, x, y, z = message.q
-    return Rotation.from_quat([x, y, z, w])
-
-
 # --- attitude and thrust ---
 
 
-@pytest.mark.parametrize("seed", range(20))
-def test_body_axes_have_the_commanded_direction(seed: int) -> None:
+def test_body_axes_have_the_commanded_direction() -> None:
     """For any tilt below 90 degrees and any heading. ArduCopter drops a quaternion whose length is
     off by 5e-4."""
-    generator = np.random.default_rng(seed)
-    direction = generator.normal(size=3) + np.array([0.0, 0.0, 3.0])
-    direction /= np.linalg.norm(direction)
-    heading_rad = generator.uniform(-20.0, 20.0)
-    given = tuple((direction * generator.uniform(0.95, 1.05)).tolist())
-    message = sent(replace(LEVEL, thrust_direction_ned=given, heading_rad=heading_rad))
-    assert abs(np.linalg.norm(message.q) - 1.0) < 1e-6
-    assert message.q[0] >= 0.0
-    attitude = rotation(message)
-    np.testing.assert_allclose(attitude.apply([0.0, 0.0, 1.0]), direction, atol=1e-6)
-    nose = attitude.apply([1.0, 0.0, 0.0])
-    heading_error = math.atan2(nose[1], nose[0]) - heading_rad
-    assert math.remainder(heading_error, 2.0 * math.pi) == pytest.approx(0.0, abs=1e-6)
+    generator = np.random.default_rng(0)
+    session = pinned(Sender())
+    for _ in range(50):
+        direction = generator.normal(size=3) + np.array([0.0, 0.0, 3.0])
+        direction /= np.linalg.norm(direction)
+        heading_rad = generator.uniform(-20.0, 20.0)
+        given = tuple((direction * generator.uniform(0.95, 1.05)).tolist())
+        value = replace(LEVEL, thrust_direction_ned=given, heading_rad=heading_rad)
+        w, x, y, z = quaternion = understood(session.encode(value)).q
+        assert abs(np.linalg.norm(quaternion) - 1.0) < 1e-6
+        assert w >= 0.0
+        attitude = Rotation.from_quat([x, y, z, w])
+        np.testing.assert_allclose(attitude.apply([0.0, 0.0, 1.0]), direction, atol=1e-6)
+        nose = attitude.apply([1.0, 0.0, 0.0])
+        heading_error = math.atan2(nose[1], nose[0]) - heading_rad
+        assert math.remainder(heading_error, 2.0 * math.pi) == pytest.approx(0.0, abs=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("heading_deg", "roll_rad", "pitch_rad"),
-    [(0, 0.0, -0.2), (90, -0.2, 0.0), (180, 0.0, 0.2), (-90, 0.2, 0.0)],
-)
-def test_tilt_that_accelerates_north(heading_deg: int, roll_rad: float, pitch_rad: float) -> None:
-    """Acceleration is -T b. Nose down, roll left, nose up and roll right do it."""
+def test_fields_of_a_tilt_that_accelerates_north() -> None:
+    """Acceleration is -T b: nose down."""
     direction = (-math.sin(0.2), 0.0, math.cos(0.2))
-    heading_rad = math.radians(heading_deg)
-    message = sent(replace(LEVEL, thrust_direction_ned=direction, heading_rad=heading_rad))
-    yaw, pitch, roll = rotation(message).as_euler("ZYX")
-    assert (roll, pitch) == pytest.approx((roll_rad, pitch_rad), abs=1e-6)
-    assert math.remainder(yaw - heading_rad, 2.0 * math.pi) == pytest.approx(0.0, abs=1e-6)
-
-
-def test_fields_of_an_attitude_target() -> None:
-    fields = sent(LEVEL).to_dict()
-    assert fields["mavpackettype"] == "SET_ATTITUDE_TARGET"
-    assert (fields["target_system"], fields["target_component"]) == (7, 1)
-    assert (fields["time_boot_ms"], fields["type_mask"]) == (12345, 7)
-    assert fields["body_roll_rate"] == fields["body_pitch_rate"] == fields["body_yaw_rate"] == 0.0
-    assert fields["q"] == [1.0, 0.0, 0.0, 0.0]
+    message = sent(replace(LEVEL, thrust_direction_ned=direction))
+    assert message.q == pytest.approx([math.cos(0.1), 0.0, -math.sin(0.1), 0.0])
+    assert message.get_type() == "SET_ATTITUDE_TARGET"
+    assert (message.target_system, message.target_component) == (7, 1)
+    assert (message.time_boot_ms, message.type_mask) == (12345, 7)
 
 
 TILTED = (0.5, 0.0, math.cos(math.pi / 6))  # 30 degrees
@@ -93,8 +75,7 @@ TILTED = (0.5, 0.0, math.cos(math.pi / 6))  # 30 degrees
 @pytest.mark.parametrize(
     ("autopilot", "thrust_mps2", "direction", "body_z_down", "expected"),
     [
-        (PX4, 12.0, TILTED, None, 0.489 * 12.0 / 9.81),  # the tilt is not compensated
-        (PX4, 12.0, TILTED, 0.9, 0.489 * 12.0 / 9.81),
+        (PX4, 12.0, TILTED, 0.9, 0.489 * 12.0 / 9.81),  # the tilt is not compensated
         # thrust that holds the height: hover thrust, since the boost divides by the cosine
         (ARDUPILOT, 9.81 / TILTED[2], TILTED, None, 0.489),
         (ARDUPILOT, 12.0, TILTED, 0.9, 0.489 * 12.0 * 0.9 / 9.81),
@@ -104,11 +85,7 @@ TILTED = (0.5, 0.0, math.cos(math.pi / 6))  # 30 degrees
     ],
 )
 def test_thrust_rules(
-    autopilot: int,
-    thrust_mps2: float,
-    direction: tuple[float, float, float],
-    body_z_down: float | None,
-    expected: float,
+    autopilot: int, thrust_mps2: float, direction: Any, body_z_down: Any, expected: float
 ) -> None:
     value = AttitudeTarget(1.0, thrust_mps2, direction, 0.0, 0.489, body_z_down=body_z_down)
     assert sent(value, autopilot).thrust == pytest.approx(expected, abs=1e-6)
@@ -147,17 +124,13 @@ def test_what_is_not_finite_or_out_of_range_is_refused() -> None:
 @pytest.mark.parametrize(
     ("command", "number", "leading"),
     [
-        (CommandLong.arm(), 400, [1.0, 0.0]),
-        (CommandLong.disarm(), 400, [0.0, 0.0]),
-        (CommandLong.land(), 21, [0.0]),
+        (CommandLong.arm(), 400, [1.0]),
         (CommandLong.message_interval(31, 100.0), 511, [31.0, 10000.0]),
-        (PX4_DIALECT.engage(), 176, [1.0, 6.0, 0.0]),
-        (PX4_DIALECT.hold(), 176, [1.0, 4.0, 3.0]),
+        (PX4_DIALECT.engage(), 176, [1.0, 6.0]),
         (PX4_DIALECT.set_mode("AUTO.LAND"), 176, [1.0, 4.0, 6.0]),
         (PX4_DIALECT.take_off(500.0), 22, [0.0, 0.0, 0.0, *(math.nan,) * 3, 500.0]),
-        (ARDUPILOT_DIALECT.engage(), 176, [1.0, 4.0, 0.0]),
-        (ARDUPILOT_DIALECT.hold(), 176, [1.0, 17.0, 0.0]),
-        (ARDUPILOT_DIALECT.take_off(5.0), 22, [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 5.0]),
+        (ARDUPILOT_DIALECT.hold(), 176, [1.0, 17.0]),
+        (ARDUPILOT_DIALECT.take_off(5.0), 22, [*(0.0,) * 6, 5.0]),
     ],
 )
 def test_commands(command: CommandLong, number: int, leading: list[float]) -> None:
@@ -168,17 +141,13 @@ def test_commands(command: CommandLong, number: int, leading: list[float]) -> No
 
 
 def test_modes_have_the_numbers_of_the_specification() -> None:
-    modes = {name: number for number, name in PX4_DIALECT.modes.items()}
-    assert modes["OFFBOARD"] == 0x00060000
-    assert modes["AUTO.LOITER"] == 0x03040000
-    assert modes["AUTO.TAKEOFF"] == 0x02040000
-    assert modes["AUTO.LAND"] == 0x06040000
-    assert modes["POSCTL"] == 0x00030000
-    assert ARDUPILOT_DIALECT.mode_name(20) == mavlink.enums["COPTER_MODE"][20].name[12:]
+    for number, name in (
+        (0x00060000, "OFFBOARD"), (0x03040000, "AUTO.LOITER"), (0x02040000, "AUTO.TAKEOFF"),
+        (0x06040000, "AUTO.LAND"), (0x00030000, "POSCTL"), (0xFF00FFFF, "UNKNOWN(0xff00ffff)"),
+    ):  # fmt: skip
+        assert PX4_DIALECT.mode_name(number) == name
+    assert [ARDUPILOT_DIALECT.mode_name(n) for n in (4, 9, 17)] == ["GUIDED", "LAND", "BRAKE"]
     for dialect in (PX4_DIALECT, ARDUPILOT_DIALECT):
-        named = (dialect.engage_mode, dialect.hold_mode, dialect.land_mode, dialect.return_mode)
-        assert set(named) <= set(dialect.modes.values())
-        assert dialect.mode_name(0xFF00FFFF) == "UNKNOWN(0xff00ffff)"
         with pytest.raises(ValueError, match=f"no mode 'NONSENSE'; it has .*{dialect.engage_mode}"):
             dialect.set_mode("NONSENSE")
 
@@ -188,21 +157,19 @@ def test_problem_of_a_parameter_names_the_command_that_fixes_it() -> None:
     options, loss = watched["GUID_OPTIONS"], watched["COM_OF_LOSS_T"]
     assert options.fault(8.0) is options.fault(10.0) is loss.fault(1.0) is None
     faults = (options.fault(2.0), loss.fault(0.0), watched["ATC_ANGLE_BOOST"].fault(0.0))
-    assert [each.fix for each in faults if each] == [
-        "param set GUID_OPTIONS 10",
-        "param set COM_OF_LOSS_T 1",
-        "param set ATC_ANGLE_BOOST 1",
-    ]
+    fixes = ["GUID_OPTIONS 10", "COM_OF_LOSS_T 1", "ATC_ANGLE_BOOST 1"]
+    assert [each.fix for each in faults if each] == [f"param set {fix}" for fix in fixes]
 
 
 # --- the others ---
 
 
 def test_positions_and_references() -> None:
+    """Their stamp has 32 bits."""
     session = pinned(Sender(7), record_component_id=192)
     for value, kind, component in (
         (POSITION, "SET_POSITION_TARGET_LOCAL_NED", 191),
-        (ReferenceRecord(1.0, *MOTION), "POSITION_TARGET_LOCAL_NED", 192),
+        (ReferenceRecord(2**32 / 1e3 + 1.0, *MOTION), "POSITION_TARGET_LOCAL_NED", 192),
     ):
         fields = understood(session.encode(value))
         assert (fields.get_type(), fields.get_srcComponent()) == (kind, component)
@@ -212,44 +179,26 @@ def test_positions_and_references() -> None:
         assert [getattr(fields, name) for name in names] == pytest.approx(given)
 
 
-def test_numbers_for_the_log() -> None:
-    data = (1.0, math.nan, 1e300, -1e300, -2.5)
-    message = sent(SolverRecord(2.5, data, array_id=3))
-    assert (message.time_usec, message.name, message.array_id) == (2_500_000, "pso", 3)
-    assert message.data[:5] == pytest.approx(
-        [1.0, math.nan, math.inf, -math.inf, -2.5], nan_ok=True
-    )
-    assert message.data[5:] == [0.0] * 53
-
-
-def test_sequence_numbers_count_per_component() -> None:
+def test_numbers_for_the_log_have_sequence_numbers_of_their_own() -> None:
     session = pinned(Sender(), record_component_id=192)
     sequence = [session.encode(Heartbeat(18))[4] for _ in range(257)]
     assert sequence == [*range(256), 0]
-    assert session.encode(SolverRecord(0.0, ()))[4] == 0
+    data = (1.0, math.nan, 1e300, -1e300, -2.5)
+    message = understood(session.encode(SolverRecord(2.5, data, array_id=3)))
+    assert (message.time_usec, message.name, message.array_id) == (2_500_000, "pso", 3)
+    kept = [1.0, math.nan, math.inf, -math.inf, -2.5, *(0.0,) * 53]
+    assert message.data == pytest.approx(kept, nan_ok=True)
+    assert message.get_seq() == 0
     assert session.encode(Heartbeat(18))[4] == 1
 
 
-def test_frames_are_byte_for_byte_those_of_pymavlink() -> None:
-    """Zeros at the end, at the beginning, nothing but zeros."""
-    name = b"COM_OF_LOSS_T"
-    for value, message in (
-        (CommandLong.arm(), mavlink.MAVLink_command_long_message(7, 1, 400, 0, 1, *[0] * 6)),
-        (Heartbeat(18), mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)),
-        (StatusTextOut(0, b""), mavlink.MAVLink_statustext_message(0, b"", 0, 0)),
-        (ParamRead(name.decode()), mavlink.MAVLink_param_request_read_message(7, 1, name, -1)),
-    ):
-        assert pinned(Sender(7)).encode(value) == Sender(7, 191).frame(message)
-
-
-@pytest.mark.parametrize("length", [0, 1, 50, 51, 99, 100, 101, 999])
+@pytest.mark.parametrize("length", [0, 50, 51, 100, 101, 999])
 def test_long_texts_are_joined_again(length: int) -> None:
     text = "".join(str(place % 10) for place in range(length))
     session, assembler = pinned(Sender(7)), TextAssembler()
     frames = [session.encode(chunk) for chunk in chunks(4, text, 7)]
     messages = [understood(frame) for frame in frames]
-    assert len(messages) == (1 if length <= 50 else length // 50 + 1)
     assert "".join(message.text for message in messages) == text
-    assert [message.chunk_seq for message in messages] == list(range(len(messages)))
+    assert [m.chunk_seq for m in messages] == list(range(length // 50 + 1 if length > 50 else 1))
     joined = [whole for frame in frames for whole in assembler.add(frame[10:-2], 0.0)]
     assert [(whole.severity, whole.text) for whole in joined] == [(4, text)]

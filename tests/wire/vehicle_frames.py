@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,15 +22,22 @@ OFFBOARD = 0x00060000
 
 
 class Sender:
-    """One component on the network, with its own sequence numbers."""
+    """One component on the network, with its own sequence numbers. With a `key` pymavlink signs
+    for it, from this time stamp on."""
 
-    def __init__(self, system_id: int = 1, component_id: int = 1) -> None:
+    def __init__(
+        self, system_id: int = 1, component_id: int = 1, key: bytes = b"", stamp: int = 0
+    ) -> None:
         self.ids = system_id, component_id
-        self._link = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
+        self.codec = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
+        self.codec.robust_parsing = True
+        self.codec.signing.secret_key = key or None
+        self.codec.signing.sign_outgoing = bool(key)
+        self.codec.signing.timestamp = stamp
 
     def frame(self, message: Any, mavlink1: bool = False) -> bytes:
-        packed: bytes = message.pack(self._link, force_mavlink1=mavlink1)
-        self._link.seq = (self._link.seq + 1) % 256
+        packed: bytes = message.pack(self.codec, force_mavlink1=mavlink1)
+        self.codec.seq = (self.codec.seq + 1) % 256
         return packed
 
     def heartbeat(
@@ -54,6 +62,17 @@ class Sender:
 
     def text(self, data: bytes, text_id: int = 0, chunk: int = 0) -> bytes:
         return self.frame(mavlink.MAVLink_statustext_message(2, data, text_id, chunk))
+
+
+def framed(message_id: int, payload: bytes, *, version_1: bool = False) -> bytes:
+    """A frame with any payload under a right checksum, from (1, 1)."""
+    ids = struct.pack("<BBBH", 7, 1, 1, message_id & 0xFFFF)
+    body = bytes((len(payload), 0, 0)) + ids + bytes((message_id >> 16,)) + payload
+    if version_1:
+        body = bytes((len(payload),)) + ids[:4] + payload
+    crc = mavlink.x25crc(body)
+    crc.accumulate(bytes((mavlink.mavlink_map[message_id].crc_extra,)))
+    return (b"\xfe" if version_1 else b"\xfd") + body + struct.pack("<H", crc.crc)
 
 
 def pinned(vehicle: Sender, autopilot: int = PX4, **settings: Any) -> Session:

@@ -1,0 +1,219 @@
+"""The simulated vehicle's link: rates, requests, texts, parameters, values that are not finite."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import struct
+from collections import Counter
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import all as mavlink
+from sim_bench import NAN, Bench
+
+from simulator import config
+from simulator.firmware.base import Firmware
+from simulator.firmware.catalogue import FIRMWARES
+from simulator.firmware.px4 import PX4
+from simulator.firmware.px4_messages import COMPANION_RATES_HZ, GROUND_RATES_HZ
+from simulator.instance import Instance
+from simulator.mavlink.codec import Decoder
+from simulator.mavlink.outbox import DATAGRAM_MAX
+from simulator.mavlink.telemetry import builders
+from simulator.vehicle.conditions import Conditions
+from simulator.vehicle.sensors import EstimatorName
+
+LOCAL_POSITION, GPS_RAW, ATTITUDE_QUATERNION = 32, 24, 31
+
+
+def packed_command(number: int) -> bytes:
+    message = mavlink.MAVLink_command_long_message(1, 1, number, 0, *(math.nan,) * 7)
+    return bytes(message.pack(mavlink.MAVLink(None)))
+
+
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(st.binary(max_size=60).filter(lambda b: not set(b) & {0xFD, 0xFE}))
+def test_garbage_in_a_datagram_hides_no_frame(garbage: bytes) -> None:
+    decoder = Decoder()
+    messages = decoder.read(garbage + packed_command(400) + garbage + packed_command(176))
+    assert [m.command for m in messages] == [400, 176]
+    assert decoder.dropped["not a frame"] == 2 * len(garbage)
+
+
+# -- rates -----------------------------------------------------------------------------------
+
+
+def test_each_link_has_the_rates_of_px4_and_its_own_sequence() -> None:
+    """In datagrams of whole frames."""
+    bench = Bench(ground_link=True)
+    bench.send(mavlink.MAVLink_param_request_list_message(1, 1))
+    companion, ground = bench.instance.companion.outbox, bench.instance.ground.outbox
+    heard: dict[str, list[bytes]] = {"companion": [], "ground": []}
+    for _ in range(5000):
+        bench.instance.advance()
+        heard["companion"] += companion.drain()
+        heard["ground"] += ground.drain()
+    for link, rates_hz in (("companion", COMPANION_RATES_HZ), ("ground", GROUND_RATES_HZ)):
+        messages = []
+        for datagram in heard[link]:
+            whole = mavlink.MAVLink(None).parse_buffer(datagram)
+            assert sum(len(m.get_msgbuf()) for m in whole) == len(datagram) <= DATAGRAM_MAX
+            messages += whole
+        counts = Counter(m.get_type() for m in messages)
+        assert {name: counts[name] / 20.0 for name in rates_hz} == {
+            name: pytest.approx(rate, abs=0.1) for name, rate in rates_hz.items()
+        }
+        sequence = [m.get_seq() for m in messages]
+        assert sequence == [i % 256 for i in range(len(sequence))]
+
+
+def test_a_hundred_hertz_come_in_gaps_of_8_and_16_ms() -> None:
+    bench = Bench()
+    assert bench.command(511, LOCAL_POSITION, 10_000) == [0]
+    begun_s = bench.time_s
+    bench.run(4.0)
+    stamps = [m.time_boot_ms for _, m in bench.of("LOCAL_POSITION_NED", begun_s)]
+    gaps = Counter(b - a for a, b in itertools.pairwise(stamps))
+    assert set(gaps) == {8, 16}
+    assert gaps[8] / gaps[16] == pytest.approx(3.0, rel=0.05)
+    assert len(stamps) == pytest.approx(400, abs=2)
+
+
+def test_an_interval_can_be_stopped_restored_and_read() -> None:
+    """Another rate of one message does not shift the others."""
+    bench = Bench()
+    bench.run(1.1)
+    for interval_us, shown_us, expected in (
+        (20_000, 20_000, 50),
+        (-1, -1, 0),
+        (0, 33_333, 30),
+        (3e38, 2**31 - 1, 0),
+    ):
+        bench.command(511, LOCAL_POSITION, interval_us)
+        begun_s = bench.time_s
+        bench.run(2.0)
+        assert len(bench.of("LOCAL_POSITION_NED", begun_s)) == pytest.approx(2 * expected, abs=2)
+        assert len(bench.of("ATTITUDE", begun_s)) == pytest.approx(200, abs=1)
+        assert bench.command(510, LOCAL_POSITION) == [0]
+        assert bench.of("MESSAGE_INTERVAL")[-1][1].interval_us == shown_us
+
+
+# -- time, files -----------------------------------------------------------------------------
+
+
+def test_timesync_is_answered_with_vehicle_time_and_file_transfer_is_refused() -> None:
+    bench = Bench()
+    bench.run(2.0)
+    bench.send(mavlink.MAVLink_timesync_message(0, 123456789))
+    request = struct.pack("<HBBBBBBI", 41, 3, 4, 2, 0, 0, 0, 0) + b"@PARAM/param.pck"
+    payload = list(request.ljust(251, b"\0"))
+    bench.send(mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, payload))
+    bench.run(0.02)
+    answers = [m for _, m in bench.of("TIMESYNC") if m.tc1 != 0]
+    assert [(m.tc1, m.ts1) for m in answers] == [(2_000_000_000, 123456789)]
+    ((_, answer),) = bench.of("FILE_TRANSFER_PROTOCOL")
+    assert struct.unpack_from("<HBBBB", bytes(answer.payload)) == (42, 3, 129, 1, 4)
+    assert answer.payload[12] == 10
+
+
+# -- parameters ------------------------------------------------------------------------------
+
+
+def asked(bench: Bench, name: bytes) -> tuple[float, int]:
+    """Value and type of a parameter, as answered on the wire."""
+    bench.send(mavlink.MAVLink_param_request_read_message(1, 1, name, -1))
+    bench.run(0.02)
+    _, message = bench.of("PARAM_VALUE")[-1]
+    assert message.param_id == name.decode()
+    return message.param_value, message.param_type
+
+
+def test_the_parameter_hash_changes_with_the_values() -> None:
+    """As QGroundControl reads it; a client that knows the hash stops the list."""
+    bench = Bench()
+    first = asked(bench, b"_HASH_CHECK")
+    assert first[1] == 5
+    for value, same in ((2.0, False), (1.0, True)):
+        bench.send(mavlink.MAVLink_param_set_message(1, 1, b"COM_OF_LOSS_T", value, 9))
+        assert (asked(bench, b"_HASH_CHECK") == first) is same
+    bench.send(mavlink.MAVLink_param_request_list_message(1, 1))
+    bench.run(0.008)
+    bench.send(mavlink.MAVLink_param_set_message(1, 1, b"_HASH_CHECK", 0.0, 5))
+    before = len(bench.of("PARAM_VALUE"))
+    bench.run(0.5)
+    assert len(bench.of("PARAM_VALUE")) == before
+
+
+def test_parameters_take_any_value_and_are_obeyed_within_their_range() -> None:
+    """A value of the wrong type is not taken and not answered."""
+    bench = Bench()
+    table = bench.instance.autopilot.parameters
+    for value, obeyed in ((2.5, 2.5), (-1.0, 0.0), (100.0, 60.0), (NAN, 1.0)):
+        bench.send(mavlink.MAVLink_param_set_message(1, 1, b"COM_OF_LOSS_T", value, 9))
+        bench.run(0.02)
+        kept = bench.of("PARAM_VALUE")[-1][1].param_value
+        assert kept == pytest.approx(value, nan_ok=True)
+        assert table.role("stream_timeout_s") == obeyed
+    bench.send(mavlink.MAVLink_param_set_message(1, 1, b"COM_OBL_RC_ACT", 1.0, 9))
+    bench.run(0.02)
+    assert table["COM_OBL_RC_ACT"] == 0
+    assert len(bench.of("PARAM_VALUE")) == 4
+
+
+# -- contents --------------------------------------------------------------------------------
+
+
+def test_gps_errors_are_as_large_as_those_of_sih() -> None:
+    """Standing still: eight fixes a second however fast they are asked for, white about the truth
+    with the deviations measured on PX4's SIH (N .19, E .13, D .52 m; .062 and .072 m/s)."""
+    bench = Bench(EstimatorName.PX4_LIKE, seed=4)
+    bench.run(5.0)
+    assert bench.command(511, GPS_RAW, 10_000) == [0]
+    bench.run(60.0)
+    fixes = [message for _, message in bench.received_of(frozenset({GPS_RAW}))]
+    assert len(fixes) == pytest.approx(480, abs=2)
+    latitude, longitude, amsl = PX4.origin
+    degree_m = math.radians(1.0) * 6_371_000
+    shrink = math.cos(math.radians(latitude))
+    velocities = [f.vel / 100 * np.exp(1j * math.radians(f.cog / 100)) for f in fixes]
+    errors = {
+        0.19: [(f.lat * 1e-7 - latitude) * degree_m for f in fixes],
+        0.13: [(f.lon * 1e-7 - longitude) * degree_m * shrink for f in fixes],
+        0.52: [f.alt / 1e3 - amsl for f in fixes],
+        0.062: np.real(velocities),
+        0.072: np.imag(velocities),
+    }
+    for deviation, found in errors.items():
+        assert np.std(found) == pytest.approx(deviation, rel=0.12)
+        assert abs(np.mean(found)) < 0.08
+        assert abs(np.corrcoef(found[1:], found[:-1])[0, 1]) < 0.15
+
+
+@pytest.mark.parametrize(
+    "body",
+    [(np.nan,) * 13, (1.0, *(0.0,) * 9, np.nan, np.inf, -np.inf), (1.0, *(0.0,) * 11, -1e5)],
+    ids=["all NaN", "no position", "above the atmosphere"],
+)
+def test_states_that_are_not_finite_or_out_of_range_are_sent(body: tuple[float, ...]) -> None:
+    conditions = Conditions(estimator=EstimatorName.PX4_LIKE)
+    instance = Instance(PX4, config.vehicle(PX4.vehicle), conditions, 7)
+    instance.autopilot.plant.record["body"][0] = body
+    for stream in instance.companion.schedule.streams.values():
+        stream.due_us = 0
+    sent = {m.get_type() for each in instance.step() for m in Decoder().read(each)}
+    assert sent >= {"LOCAL_POSITION_NED", "ODOMETRY", "ATTITUDE", "HIGHRES_IMU", "GPS_RAW_INT"}
+
+
+@pytest.mark.parametrize("firmware", FIRMWARES.values(), ids=FIRMWARES)
+def test_every_message_is_read_by_pymavlink(firmware: Firmware) -> None:
+    """Right number, order and types of fields: each message is framed here and decoded there."""
+    bench = Bench(firmware=firmware, boot_scale=0.02)
+    bench.run(1.0)
+    names = builders(firmware)
+    for name in names:
+        bench.instance.companion.outbox.send_now(name)
+    bench.run(0.1)
+    assert {message.get_type() for _, message in bench.received} >= set(names)

@@ -1,0 +1,190 @@
+"""The simulator's UDP and TCP links on loopback; lockstep without and after a companion."""
+
+from __future__ import annotations
+
+import select
+import socket
+from collections.abc import Iterator
+from contextlib import closing
+
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from simulator import config, run
+from simulator.faults import Stranger
+from simulator.firmware.px4 import PX4
+from simulator.instance import Instance
+from simulator.link.sockets import (
+    UNSENT_MAX,
+    LinkError,
+    TcpLink,
+    UdpLink,
+    free_ports,
+    open_beside,
+    open_link,
+    shifted,
+    wait,
+    whole_frames,
+)
+from simulator.run import Endpoint, Outcome, Runner
+from simulator.vehicle.conditions import Conditions
+
+CODEC = mavlink.MAVLink(None, srcSystem=255)
+HEARTBEAT = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3).pack(CODEC)
+OLD = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3).pack(CODEC, force_mavlink1=True)
+
+
+def bound() -> socket.socket:
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sock.bind(("127.0.0.1", 0))
+    sock.setblocking(False)
+    return sock
+
+
+@pytest.fixture
+def companion() -> Iterator[socket.socket]:
+    with bound() as sock:
+        yield sock
+
+
+@pytest.fixture
+def link(companion: socket.socket) -> Iterator[UdpLink]:
+    with closing(open_link(f"udpout:127.0.0.1:{companion.getsockname()[1]}", 0)) as opened:
+        assert isinstance(opened, UdpLink)
+        yield opened
+
+
+@pytest.fixture
+def server() -> Iterator[TcpLink]:
+    with closing(open_link(f"tcpin:127.0.0.1:{free_ports(1)[0]}", 0)) as opened:
+        assert isinstance(opened, TcpLink)
+        yield opened
+
+
+def instance(*faults: Stranger) -> Instance:
+    vehicle = config.vehicle(PX4.vehicle)
+    return Instance(PX4, vehicle, Conditions(), 1, lockstep=True, faults=faults)
+
+
+# -- lockstep --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("answers", "says"),
+    [
+        (0, "no companion answered TIMESYNC within 0.1 s: start one, or run without --lockstep"),
+        (1, "the companion stopped answering at 0.02 s"),
+    ],
+)
+def test_a_companion_that_does_not_answer_ends_the_run_with_code_3(
+    answers: int,
+    says: str,
+    link: UdpLink,
+    companion: socket.socket,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(run, "FIRST_ANSWER_TIMEOUT_S", 0.1)
+    for _ in range(answers):
+        answer = mavlink.MAVLink_timesync_message(1, 8_000_000).pack(mavlink.MAVLink(None))
+        companion.sendto(answer, ("127.0.0.1", link.port))
+    reports: list[str] = []
+    runner = Runner([Endpoint(instance(), link)], stopping=lambda: False, report=reports.append)
+    assert runner.lockstep(0.1) == Outcome(3, says)
+    assert reports == []
+
+
+def test_a_stranger_sends_from_another_port_of_the_same_host(
+    link: UdpLink, companion: socket.socket
+) -> None:
+    """In lockstep before each barrier: the telemetry of these 20 ms follows. Only by UDP."""
+    fault = Stranger.model_validate({"fault": "stranger", "rate_hz": 250.0, "size_bytes": 33})
+    flown = instance(fault)
+    endpoint = Endpoint(flown, link, strangers=(open_beside(link),))
+    flown.advance_to_barrier()
+    endpoint.send_barrier()
+    received = []
+    while select.select([companion], [], [], 0.0)[0]:
+        received.append(companion.recvfrom(2048))
+    ports = [sender[1] for _, sender in received]
+    ours = ports.index(link.port)
+    assert ours == flown.steps
+    assert {sender[0] for _, sender in received} == {"127.0.0.1"}
+    assert len(set(ports[:ours])) == 1
+    assert set(ports[ours:]) == {link.port}
+    assert {len(datagram) for datagram, _ in received[:ours]} == {33}
+
+
+def test_senders_become_peers_up_to_a_limit(link: UdpLink, companion: socket.socket) -> None:
+    others = [bound() for _ in range(20)]
+    for other in others:
+        other.sendto(b"x", ("127.0.0.1", link.port))
+        wait([link], 1.0)
+        assert link.receive() == b"x"
+    link.send([b"telemetry"])
+    heard = [bool(select.select([other], [], [], 0.0)[0]) for other in others]
+    for other in others:
+        other.close()
+    assert heard == [False] * 5 + [True] * 15
+    assert companion.recv(100) == b"telemetry"
+
+
+# -- TCP, like ArduPilot's SITL --------------------------------------------------------------
+
+
+def client(server: TcpLink) -> socket.socket:
+    connected = socket.create_connection(("127.0.0.1", server.port))
+    connected.settimeout(2.0)
+    assert heard(server) is None  # it is let in
+    return connected
+
+
+def heard(server: TcpLink) -> bytes | None:
+    assert wait([server], 2.0) == [server]
+    return server.receive()
+
+
+def test_split_frames_are_joined_and_garbage_is_passed_on() -> None:
+    stream = b"x" + HEARTBEAT + OLD + HEARTBEAT
+    wholes = [0, 1, 1 + len(HEARTBEAT), 1 + len(HEARTBEAT + OLD), len(stream)]
+    for length in range(len(stream) + 1):
+        assert whole_frames(stream[:length]) == max(w for w in wholes if w <= length)
+
+
+def test_clients_connect_and_disconnect(server: TcpLink) -> None:
+    one, other = client(server), client(server)
+    one.sendall(HEARTBEAT[:5])
+    assert heard(server) is None
+    one.sendall(HEARTBEAT[5:] + OLD)
+    assert heard(server) == HEARTBEAT + OLD
+    server.send([b"telemetry"])
+    assert one.recv(100) == other.recv(100) == b"telemetry"
+    one.close()
+    assert heard(server) is None
+    with client(server) as again:
+        server.send([b"again"])
+        assert again.recv(100) == other.recv(100) == b"again"
+    other.close()
+
+
+def test_a_client_that_never_reads_is_disconnected(server: TcpLink) -> None:
+    idle, other = client(server), client(server)
+    piece, count = bytes(65536), 0
+    for _ in range(20 * UNSENT_MAX // len(piece)):
+        server.send([piece])
+        count += len(other.recv(1 << 20))
+    assert count > 15 * UNSENT_MAX
+    left = 0
+    while data := idle.recv(1 << 20):
+        left += len(data)
+    assert left < 15 * UNSENT_MAX  # and then the end
+    idle.close()
+    other.close()
+
+
+def test_links_that_are_refused_and_instances_ten_ports_apart(server: TcpLink) -> None:
+    with pytest.raises(LinkError, match="cannot be opened"):
+        open_link(f"tcpin:127.0.0.1:{server.port}", 0)
+    with pytest.raises(LinkError, match="fault stranger: it needs a UDP link"):
+        open_beside(server)
+    assert shifted("tcpin:127.0.0.1:5760", 2) == "tcpin:127.0.0.1:5780"
+    assert shifted("udpin:127.0.0.1:5760", 2) == "udpin:127.0.0.1:5762"
