@@ -158,7 +158,13 @@ def swapped(change: Callable[[Rotation], Rotation]) -> Pair:
     return pair
 
 
-@pytest.mark.parametrize("signs", [(1, -1, 1), (1, 1, -1)], ids=["pitch", "roll"])
+@pytest.mark.parametrize(
+    "signs",
+    [
+        pytest.param((1, -1, 1), id="pitch"),
+        pytest.param((1, 1, -1), id="roll", marks=pytest.mark.slow),
+    ],
+)
 def test_a_swapped_lean_is_stopped(signs: tuple[int, int, int]) -> None:
     pair = swapped(lambda target: Rotation.from_euler("ZYX", target.as_euler("ZYX") * signs))
     outcome = pair.fly()

@@ -140,6 +140,7 @@ def flown_at(rate: float, in_flight: float = 1.0) -> tuple[float, float, float]:
     return pair.score().rmse_position_m, state.model.tilt.delay_s, state.clock.growth.added_s
 
 
+@pytest.mark.slow
 def test_simulator_slower_than_real_time_is_flown_as_any_other() -> None:
     """PX4's simulation on a busy computer. Taken for a link that becomes later, its identified
     delay was 70 to 130 ms too short, and the error 1.4 times as large."""
