@@ -73,6 +73,11 @@ class Bench:
         heard = [Chunk(datagram, ("127.0.0.1", 14580), self.now_s) for datagram in datagrams]
         return (heard if self.has_vehicle else []) + self.before(self.instance.time_s)
 
+    def run_to(self, time_s: float) -> None:
+        """Nobody listens meanwhile."""
+        while self.instance.time_s < time_s:
+            self.step()
+
     def listen(self) -> Observation:
         settings = SessionSettings(self.system_id, capacity_bytes_ps=self.capacity_bytes_ps)
         listening = Listening(self.now_s, settings, self.signing)
@@ -93,14 +98,14 @@ class Bench:
         return {row.check: row for row in examine(chosen, seen)}
 
     def follow(self, row: Row) -> None:
-        """Do what the hints of a row say: set the parameters that they name."""
+        """Do what the hints of a row say: set the parameters that they name, as a ground station
+        does."""
         lines = [line for finding in row.findings for line in PARAMETER.findall(finding.hint)]
         assert lines, row
         for name, value in lines:
-            self.set_parameter(name, float(value))
+            self._set(name, float(value))
 
-    def set_parameter(self, name: str, value: float) -> None:
-        """PARAM_SET, as a ground station sends it."""
+    def _set(self, name: str, value: float) -> None:
         table = self.instance.autopilot.parameters
         _, kind = table.to_wire(name)
         bytewise = self.instance.autopilot.firmware.parameters_bytewise and kind != 9
@@ -145,8 +150,7 @@ def bench(
     )
     config = configuration.load("flight", choices=choices or {}, assignments=assignments)
     made = Bench(instance, config, **options)
-    while instance.time_s < BOOT_S[firmware.name]:
-        made.step()
+    made.run_to(BOOT_S[firmware.name])
     return made
 
 

@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 from pair import decode, frames_of
-from serving import ARM, LAND, MODES, SET_MODE, START, TAKEOFF, Serving
+from serving import ARM, HOVER, LAND, MODES, SET_MODE, START, TAKEOFF, Serving
 
 from offboard.flight.flight import Output
 from offboard.link.interface import Chunk
@@ -31,7 +30,6 @@ ENGAGE = {"px4": "OFFBOARD", "ardupilot": "GUIDED"}
 HOLD = {"px4": "AUTO.LOITER", "ardupilot": "BRAKE"}
 LANDS = {"px4": "AUTO.LAND", "ardupilot": "LAND"}
 HOLD_PARAMETERS = {"px4": (4, 3), "ardupilot": (17, 0)}
-HOVER = {"px4": 0.489, "ardupilot": 0.366}
 ALOFT_M = 0.3
 REPORTED_S = 0.5  # EXTENDED_SYS_STATE at 5 Hz, and what decides on it
 ANSWERED_S = 0.3  # a command of the pilot, by the vehicle
@@ -42,6 +40,11 @@ LIKE_NOW_RAD = 0.2  # attitude of the stream in the air against the vehicle's
 TILT_RAD = math.radians(46.0)
 LEAST_SHARE, FALLING_MPS = 0.32, 3.5
 UNFLOWN_S = 2.5
+
+
+def number_of(frame: bytes) -> int:
+    """Of its message."""
+    return int.from_bytes(frame[7:10], "little")
 
 
 class Report(NamedTuple):
@@ -60,10 +63,7 @@ class Wire:
     pair: Serving
     arms: bool = False
     unsafe: list[str] = field(default_factory=list)
-    setpoints: int = 0
-    engaged_setpoints: int = 0
     switches: int = 0  # by the pilot, in the air
-    least_share: float = math.inf  # of hover thrust, in the air and in the mode of setpoints
     mode: str = ""  # of the vehicle
     changed_s: float = -math.inf  # when the vehicle took it
     engaged: bool = False  # by the pilot, and the mode was not left since
@@ -78,8 +78,9 @@ class Wire:
         self._served_s = self._apart_s = self._flying_s = self.pair.time_s
         self._deliver = self.pair.down
         self.pair.down = self._delivered
-        instance, on_command = self.pair.instance, self.pair.instance.feed_ground
-        instance.feed_ground = self._before(on_command)  # type: ignore[method-assign]
+        self._feed = self.pair.instance.feed_ground
+        self.pair.instance.feed_ground = self._asked  # type: ignore[method-assign]
+        self.pair.restarted = self.wrap
         self.wrap()
 
     def wrap(self) -> None:
@@ -104,25 +105,21 @@ class Wire:
 
     # ------------------------------------------------------------------ to the vehicle and from it
 
-    def _before(self, feed: Callable[[bytes], None]) -> Callable[[bytes], None]:
+    def _asked(self, frame: bytes) -> None:
         """What the pilot asks of the vehicle."""
-
-        def watched(frame: bytes) -> None:
-            if int.from_bytes(frame[7:10], "little") == COMMAND_LONG:
-                message = decode(frame)
-                asked = (message.command, message.param1, message.param2, message.param3)
-                if asked == (SET_MODE, *MODES[self.pair.firmware]["engage"]):
-                    self._wish_s = self.pair.time_s
-            feed(frame)
-
-        return watched
+        if number_of(frame) == COMMAND_LONG:
+            message = decode(frame)
+            asked = (message.command, message.param1, message.param2, message.param3)
+            if asked == (SET_MODE, *MODES[self.pair.firmware]["engage"]):
+                self._wish_s = self.pair.time_s
+        self._feed(frame)
 
     def _delivered(self, time_s: float, datagrams: list[bytes]) -> list[bytes]:
         """The vehicle at this step, and which reports of its mode are on their way."""
         self._look(time_s)
         arriving = self._deliver(time_s, datagrams)
         for frame in (frame for datagram in arriving for frame in frames_of(datagram)):
-            number = int.from_bytes(frame[7:10], "little")
+            number = number_of(frame)
             if number in (HEARTBEAT, CURRENT_MODE) and (frame[5], frame[6]) == VEHICLE:
                 failsafe = self.known is not None and self.known.failsafe
                 if self._sent:
@@ -158,17 +155,9 @@ class Wire:
         elif time_s - max(self._apart_s, self._served_s, self.changed_s) > UNFLOWN_S:
             self._note(f"nobody flies it in {mode}")
             self._apart_s = time_s
-        if self.engaged and self.pair.steps % 25 == 0:
-            self._look_at_flight()
-
-    def _look_at_flight(self) -> None:
-        truth = self.pair.instance.autopilot.state.truth
-        if self._aloft and truth.velocity_ned_mps[2] > FALLING_MPS:
-            self._note(f"falls at {truth.velocity_ned_mps[2]:.1f} m/s")
-
-    @property
-    def _height_m(self) -> float:
-        return float(-self.pair.place[2])
+        down_mps = self.pair.instance.autopilot.state.truth.velocity_ned_mps[2]
+        if self.engaged and self._aloft and down_mps > FALLING_MPS:
+            self._note(f"falls at {down_mps:.1f} m/s")
 
     @property
     def _off_ground(self) -> bool:
@@ -176,12 +165,12 @@ class Wire:
 
     @property
     def _aloft(self) -> bool:
-        return self._height_m > ALOFT_M and bool(self.pair.instance.autopilot.commander.armed)
+        return bool(-self.pair.place[2] > ALOFT_M) and self.pair.armed
 
     def _take(self, datagram: bytes) -> None:
         """What the service gets."""
         for frame in frames_of(datagram):
-            number, sender = int.from_bytes(frame[7:10], "little"), (frame[5], frame[6])
+            number, sender = number_of(frame), (frame[5], frame[6])
             if sender == VEHICLE and number in (HEARTBEAT, CURRENT_MODE):
                 if self._sent:
                     self.known = self._sent.popleft()
@@ -196,7 +185,7 @@ class Wire:
     # ------------------------------------------------------------------ from the service
 
     def _judge(self, frame: bytes) -> None:
-        number = int.from_bytes(frame[7:10], "little")
+        number = number_of(frame)
         if number in SETPOINTS | COMMANDS:
             if (frame[5], frame[6]) != US:
                 self._note(f"message {number} of {frame[5]}/{frame[6]}")
@@ -209,7 +198,6 @@ class Wire:
 
     def _judge_setpoint(self, message: Any) -> None:
         on, known = self.pair.firmware, self.known
-        self.setpoints += 1
         self._served_s = self.pair.time_s
         self._judge_numbers(message)
         if self._is_unknown(known):
@@ -225,9 +213,8 @@ class Wire:
 
     def _judge_numbers(self, message: Any) -> None:
         values = (*message.q, message.thrust)
-        if not all(map(math.isfinite, values)) or abs(math.hypot(*message.q) - 1.0) > 4e-4:
-            self._note(f"setpoint {message}")
-        if not 0.0 <= message.thrust <= 1.0 or message.type_mask != 7:
+        valid = all(map(math.isfinite, values)) and 0.0 <= message.thrust <= 1.0
+        if not valid or abs(math.hypot(*message.q) - 1.0) > 4e-4 or message.type_mask != 7:
             self._note(f"setpoint {message}")
         _, x, y, _ = message.q
         if 2.0 * math.asin(min(1.0, math.hypot(x, y))) > TILT_RAD:
@@ -237,10 +224,6 @@ class Wire:
 
     def _judge_engaged(self, message: Any, known: Report) -> None:
         self._followed = True
-        if self._aloft:
-            self.engaged_setpoints += 1
-            share = message.thrust / HOVER[self.pair.firmware]
-            self.least_share = min(self.least_share, share)
         if not known.engaged and (self._aloft or message.thrust > 0.0) and not self.arms:
             self._note(f"setpoint in {known.mode}, to which no pilot has switched in the air")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,11 +12,9 @@ from pair import (
     LEAN,
     LOITER,
     SHORT,
-    UNIX_EPOCH_US,
     HostClock,
     Pair,
     decode,
-    frames_of,
 )
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -27,7 +25,6 @@ from offboard.mavlink.session import Session, SessionSettings
 from offboard.run import configuration as config
 from offboard.run.flight import Prepared, build
 from offboard.service.flights import Flights, Record
-from offboard.service.record import Recorder
 from simulator import config as simulated
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Firmware
@@ -37,10 +34,18 @@ from simulator.start import Start
 ARM, TAKEOFF, SET_MODE, LAND = 400, 22, 176, 21  # MAV_CMD
 START, PAUSE_CONTINUE = 300, 193
 NAN = float("nan")
+HOVER = {"px4": 0.489, "ardupilot": 0.366}  # thrust
 MODES = {  # parameters of MAV_CMD_DO_SET_MODE
     "px4": {"engage": (1, 6, 0), "pilot": (1, 4, LOITER), "land": (1, 4, 6)},
     "ardupilot": {"engage": (1, 4, 0), "pilot": (1, 17, 0), "land": (1, 9, 0)},
 }
+
+
+def level_setpoint(thrust: float, system: int, component: int) -> bytes:
+    codec = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
+    level = (1.0, 0.0, 0.0, 0.0)
+    message = mavlink.MAVLink_set_attitude_target_message(0, 1, 1, 7, level, 0, 0, 0, thrust)
+    return bytes(message.pack(codec))
 
 
 @dataclass
@@ -103,19 +108,6 @@ def prepared(*assignments: str, **choices: str) -> Prepared:
     return build(resolved)
 
 
-def flights(source: Settings, logs: Record, memory: Remembered, then: Then, anchor: Anchor,
-            arms: bool) -> Flights:  # fmt: skip
-    settings = SessionSettings(component_id=COMPONENT_ID, record_component_id=RECORD_COMPONENT_ID)
-    return Flights(
-        session=Session(settings),
-        source=source,
-        record=logs,
-        memory=memory,
-        options=ServiceOptions(anchor, then, arms),
-        stopwatch=lambda: 0.0,
-    )
-
-
 @dataclass
 class Serving(Pair):
     """A pair whose companion is a service. The pilot commands on a link of his own."""
@@ -125,6 +117,7 @@ class Serving(Pair):
     logs: Any = None
     memory: Any = None
     again: Callable[[Record], Flights] | None = None
+    restarted: Callable[[], object] = lambda: None  # of an observer
 
     @property
     def state(self) -> Any:
@@ -191,9 +184,9 @@ class Serving(Pair):
             self.ground(ARM, 1)
         return bool(commander.armed)
 
-    def command(self, number: int, *params: float, system: int = 255) -> None:
+    def command(self, number: int, *params: float) -> None:
         """A command to our component, which the vehicle forwards on our link."""
-        codec = mavlink.MAVLink(None, srcSystem=system, srcComponent=190)
+        codec = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
         filled = (*params, *(0.0,) * (7 - len(params)))
         message = mavlink.MAVLink_command_long_message(1, 191, number, 0, *filled)
         self.forwarded.append(message.pack(codec))
@@ -201,53 +194,30 @@ class Serving(Pair):
     forwarded: list[bytes] = field(default_factory=list)
     lost_down: bool = False
     lost_up: bool = False
-    heard_mode_s: float = 0.0  # when a report of the mode arrived last
 
-    def deliver(self, time_s: float, datagrams: list[bytes]) -> list[bytes]:
+    def deliver(self, _: float, datagrams: list[bytes]) -> list[bytes]:
         """The way down: with what others send to us, unless it is lost."""
         extra, self.forwarded = self.forwarded, []
-        if self.lost_down:
-            return []
-        for frame in (frame for datagram in datagrams for frame in frames_of(datagram)):
-            if int.from_bytes(frame[7:10], "little") in (0, 436):
-                self.heard_mode_s = time_s
-        return datagrams + extra
-
-    def _keep(self, frames: Iterable[bytes]) -> None:
-        """What the loop does with a log; only tests without one look at what was sent."""
-        if not isinstance(self.logs, Recorder):
-            super()._keep(frames)
-            return
-        for frame in frames:
-            self.logs.write(UNIX_EPOCH_US + round(1e6 * self.time_s), frame)
-        self.sent.clear()
+        return [] if self.lost_down else datagrams + extra
 
     def send_up(self, _: float, frames: list[bytes]) -> list[bytes]:
         return [] if self.lost_up else frames
 
     def other_setpoint(self) -> None:
         """A setpoint that another program sends, as a router shows it to us."""
-        codec = mavlink.MAVLink(None, srcSystem=42, srcComponent=190)
-        message = mavlink.MAVLink_set_attitude_target_message(
-            0, 1, 1, 7, (1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0, 0.5
-        )
-        self.forwarded.append(message.pack(codec))
+        self.forwarded.append(level_setpoint(0.5, 42, 190))
 
     def flown_by_other(self, seconds: float) -> None:
         """Another computer sends setpoints, on a link that we do not hear."""
-        codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=194)
-        thrust = {"px4": 0.489, "ardupilot": 0.366}[self.firmware]
-        message = mavlink.MAVLink_set_attitude_target_message(
-            0, 1, 1, 7, (1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0, thrust
-        )
         end_s = self.time_s + seconds
         while self.time_s < end_s:
-            self.instance.feed_ground(message.pack(codec))
+            self.instance.feed_ground(level_setpoint(HOVER[self.firmware], 1, 194))
             self.run(0.1)
 
     def restart(self) -> None:
         """Restart the process of the service."""
         self.companion = self.again(self.logs)  # type: ignore[misc,assignment]
+        self.restarted()
 
     @property
     def acks(self) -> list[tuple[int, int]]:
@@ -292,7 +262,17 @@ def serve(
     logs, memory = record or Logs(clock), memory or Remembered()
 
     def again(logs: Record) -> Flights:
-        return flights(source, logs, memory, then, anchor, arms)
+        settings = SessionSettings(
+            component_id=COMPONENT_ID, record_component_id=RECORD_COMPONENT_ID
+        )
+        return Flights(
+            session=Session(settings),
+            source=source,
+            record=logs,
+            memory=memory,
+            options=ServiceOptions(anchor, then, arms),
+            stopwatch=lambda: 0.0,
+        )
 
     flown = simulated.scenario(scenario)
     firmware = firmware or (LEAN if on == "px4" else ARDUPILOT)

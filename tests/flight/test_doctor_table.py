@@ -78,21 +78,18 @@ def test_report_as_json() -> None:
 @pytest.mark.parametrize(
     ("version", "marks", "found", "hint"),
     [
-        ("Linux version 5.15.90.1-microsoft-standard-WSL2", False, "WSL", "hostname -I"),
-        ("Linux version 6.1.0", True, "container", "-p PORT:PORT/udp"),
-        ("Linux version 6.1.0", False, "", ""),
+        ("Linux version 5.15.90.1-microsoft-standard-WSL2", "none", "WSL", "hostname -I"),
+        ("Linux version 6.1.0", "version", "container", "-p PORT:PORT/udp"),
+        ("Linux version 6.1.0", "none", "", ""),
     ],
 )
 def test_silence_behind_a_bridge(
-    version: str, marks: bool, found: str, hint: str, tmp_path: Path,
+    version: str, marks: str, found: str, hint: str, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     (tmp_path / "version").write_text(version)
-    mark = tmp_path / "containerenv"
-    if marks:
-        mark.touch()
     monkeypatch.setattr(computer, "PROC", tmp_path)
-    monkeypatch.setattr(computer, "CONTAINER_MARKS", (str(mark),))
+    monkeypatch.setattr(computer, "CONTAINER_MARKS", (str(tmp_path / marks),))
     seen = replace(bench(has_vehicle=False).listen(), surroundings=computer.surroundings())
     assert seen.surroundings == found
     (finding,) = link_checks.vehicle(seen)

@@ -17,18 +17,18 @@ SENT_HZ = 100.0
 TIMESYNC = 111
 
 
-def over(down: Filter, aloft: bool = True) -> Pair:
-    return make(
-        *LAP, scenario="px4_like", vehicle="px4_sih", down=down, learning=IdentifySettings(),
-        aloft=aloft,
-    )  # fmt: skip
+def over(down: Filter, *assignments: str, aloft: bool = True, **options: object) -> Pair:
+    lap = assignments or LAP
+    learning = options.pop("learning", IdentifySettings())
+    return make(*lap, scenario="px4_like", vehicle="px4_sih", down=down, learning=learning,
+                aloft=aloft, **options)  # fmt: skip
 
 
 @pytest.mark.parametrize(
     ("down", "stale_share", "later_ms", "rmse_m"),
     [
         (both(late(0.08), repeating(0.1)), 2.0 / 3.0, 80.0, 0.06),
-        (stuttering(0.08, 0.4), 0.0, 0.0, 0.10),
+        pytest.param(stuttering(0.08, 0.4), 0.0, 0.0, 0.10, marks=pytest.mark.slow),
     ],
     ids=["80 ms late, all messages three times", "stops for 80 ms in 400"],
 )
@@ -48,7 +48,7 @@ def test_delay_and_duplicates_are_measured(
 
 
 def test_gaps_of_a_lossy_link_are_measured() -> None:
-    pair = over(losing(0.3))
+    pair = over(losing(0.3), learning=None)
     pair.track()
     score = pair.score()
     assert 0.04 <= score.position_gap_max_s < 0.3
@@ -72,10 +72,8 @@ def test_sixty_ms_each_way_cause_a_limit_cycle_unless_identified() -> None:
     scores = []
     for bandwidth_radps, learning in ((5, None), (10, IdentifySettings())):
         law = f"controller={{law: lqr, feedback_limit: 0.6, bandwidth_radps: {bandwidth_radps}}}"
-        pair = make(
-            law, *LAP[1:], scenario="px4_like", vehicle="px4_sih", seed=1,
-            down=late(0.06), up=late(0.06), learning=learning,
-        )  # fmt: skip
+        pair = over(late(0.06), law, *LAP[1:], aloft=False, seed=1, up=late(0.06),
+                    learning=learning)  # fmt: skip
         pair.track()
         scores.append(pair.score())
     unknown, known = scores
@@ -95,39 +93,31 @@ CHANGED_S, BACK_S = 2.0, 8.0  # in track
 CONFIGURED_RADPS = 7.0
 
 
-def on_a_link_that_becomes_late(direction: str, added_s: float) -> tuple[Pair, list]:
-    """A lemniscate on PX4 during which the link becomes late and prompt again; returns also times
-    since the change, and the bandwidth limits that began then."""
-    pair = make(vehicle="px4_sih", scenario="px4_like", learning=IdentifySettings(), boot_scale=1.0)
-    begun: list[float] = []
-    limits: list[tuple[float, float]] = []
-
-    def change(flying: Pair) -> None:
-        begun.append(flying.time_s)
-        setattr(flying, direction, late(added_s))
+@pytest.mark.parametrize(
+    ("direction", "most_m"), [("down", 0.15), pytest.param("up", 0.2, marks=pytest.mark.slow)]
+)
+def test_late_link_is_noticed_and_flown(direction: str, most_m: float) -> None:
+    """It becomes late in flight, and prompt again. With its delay taken for that at take-off, 0.2 s
+    more take the vehicle 2.1 m off."""
+    pair = over(through, "reference.height_m=3.0", aloft=False, boot_scale=1.0)
+    limits: list[tuple[float, float]] = []  # of the bandwidth, and since when
 
     def note(flying: Pair) -> bool:
-        if begun:
-            limit = flying.companion.controller.bandwidth_radps
-            if not limits or limits[-1][1] != limit:
-                limits.append((flying.time_s - begun[0], limit))
+        limit = flying.companion.controller.bandwidth_radps
+        if in_phase(Phase.TRACK, CHANGED_S)(flying) and limit not in [x for _, x in limits[-1:]]:
+            limits.append((flying.time_s, limit))
         return False
 
-    back = (in_phase(Phase.TRACK, BACK_S), lambda flying: setattr(flying, direction, through))
-    pair.at += [(in_phase(Phase.TRACK, CHANGED_S), change), back, (note, lambda _: None)]
-    return pair, limits
-
-
-@pytest.mark.parametrize(("direction", "most_m"), [("down", 0.15), ("up", 0.2)])
-def test_late_link_is_noticed_and_flown(direction: str, most_m: float) -> None:
-    """With its delay taken for that at take-off, 0.2 s more take the vehicle 2.1 m off."""
-    pair, limits = on_a_link_that_becomes_late(direction, 0.2)
+    for at_s, link in ((CHANGED_S, late(0.2)), (BACK_S, through)):
+        change = lambda flying, link=link: setattr(flying, direction, link)  # noqa: E731
+        pair.at.append((in_phase(Phase.TRACK, at_s), change))
+    pair.at.append((note, lambda _: None))
     pair.track()
-    assert limits[0][1] == CONFIGURED_RADPS
-    lowered_s, lowered = limits[1]
-    assert lowered_s <= 0.9
+    (changed_s, configured), (lowered_s, lowered), *_ = limits
+    assert configured == CONFIGURED_RADPS
+    assert lowered_s - changed_s <= 0.9
     assert 3.5 <= lowered < CONFIGURED_RADPS - 0.5
-    stayed = [limit for since_s, limit in limits if since_s < BACK_S - CHANGED_S]
+    stayed = [limit for at_s, limit in limits if at_s - changed_s < BACK_S - CHANGED_S]
     assert stayed[-1] == CONFIGURED_RADPS  # a delay that stays is compensated
     assert limits[-1][1] == CONFIGURED_RADPS  # also when the link is prompt again
     assert pair.score().max_position_m < most_m
@@ -138,25 +128,22 @@ def test_late_link_is_noticed_and_flown(direction: str, most_m: float) -> None:
     assert any("delay is that of take-off" in line for line in lines)
 
 
+def flown_at(rate: float, in_flight: float = 1.0) -> tuple[float, float, float]:
+    """RMSE, identified delay, and by how much the link's delay is thought to have grown, where
+    the vehicle's clock runs at `rate` of host time; 60 ms each way."""
+    pair = over(late(0.06), "reference.laps=1", up=late(0.06), rate=rate)
+    if in_flight != 1.0:
+        pair.at.append((in_phase(Phase.EXCITE), lambda flying: flying.slow_down(in_flight)))
+    pair.track()
+    assert not pair.failsafes
+    state = pair.companion
+    return pair.score().rmse_position_m, state.model.tilt.delay_s, state.clock.growth.added_s
+
+
+@pytest.mark.slow
 def test_simulator_slower_than_real_time_is_flown_as_any_other() -> None:
-    """PX4's simulation on a busy computer, with 60 ms each way. Taken for a link that becomes
-    later, its identified delay was 70 to 130 ms too short, and the error 1.4 times as large; with a
-    clock that slows in flight, as a second simulation starts, 0.26 m."""
-
-    def flown_at(rate: float, in_flight: float = 1.0) -> tuple[float, float, float]:
-        """RMSE, identified delay, and by how much the link's delay is thought to have grown, where
-        the vehicle's clock runs at `rate` of host time."""
-        pair = make(
-            "reference.laps=1", vehicle="px4_sih", scenario="px4_like", rate=rate, aloft=True,
-            learning=IdentifySettings(), down=late(0.06), up=late(0.06),
-        )  # fmt: skip
-        slow_down = (in_phase(Phase.EXCITE), lambda flying: flying.slow_down(in_flight))
-        pair.at += [slow_down] if in_flight != 1.0 else []
-        pair.track()
-        assert not pair.failsafes
-        state = pair.companion
-        return pair.score().rmse_position_m, state.model.tilt.delay_s, state.clock.growth.added_s
-
+    """PX4's simulation on a busy computer. Taken for a link that becomes later, its identified
+    delay was 70 to 130 ms too short, and the error 1.4 times as large."""
     real_time_rmse_m, real_time_delay_s, real_time_grown_s = flown_at(1.0)
     assert real_time_delay_s == pytest.approx(0.178, abs=0.01)
     assert real_time_grown_s == 0.0
@@ -164,6 +151,11 @@ def test_simulator_slower_than_real_time_is_flown_as_any_other() -> None:
     assert rmse_m <= real_time_rmse_m + 0.002
     assert delay_s == pytest.approx(real_time_delay_s, abs=0.002)
     assert grown_s <= LEAST_GROWTH_S
+
+
+@pytest.mark.slow
+def test_simulator_that_slows_in_flight_is_flown() -> None:
+    """As a second simulation starts; it was 0.26 m."""
     rmse_m, delay_s, _ = flown_at(1.0, in_flight=0.93)
     assert rmse_m < 0.06  # 0.049
     assert delay_s == pytest.approx(0.178, abs=0.01)

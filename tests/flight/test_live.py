@@ -1,9 +1,11 @@
-"""What shows a flight while it happens: clients of the live page, JSON lines, the terminal."""
+"""What shows a flight while it happens: clients of the live page, JSON lines, the terminal, and the
+snapshots that all of them show."""
 
 from __future__ import annotations
 
 import io
 import json
+import math
 import os
 import re
 import signal
@@ -11,18 +13,22 @@ import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
 from functools import partial
-from itertools import count
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import urlsplit
 from urllib.request import urlopen
 
 import pytest
-from browser import opening
-from pair import Pair, hover
+from browser import Opened, opening
+from pair import Pair, calm_hover, hover
 from rich.console import Console
+from uneventful import heartbeat, uneventful
 
 from offboard.documents.errors import UserError
+from offboard.flight.display import Snapshot
+from offboard.flight.phases import Phase
 from offboard.live.lines import JsonLines, Terminal, status
 from offboard.live.process import Displays, LiveProcess
 
@@ -37,27 +43,23 @@ def serving() -> Iterator[tuple[LiveProcess, str]]:
         yield process, process.await_ready()
 
 
-def flown(*shows: Callable[[Any], None]) -> Pair:
-    """A flight whose companion is shown at every step, as the loop does at every turn."""
+def shown_by(show: Callable[[Pair], object], every: int = 1) -> Pair:
+    """A flight that is shown at every step, as the loop does at every turn, or at fewer."""
     pair = hover()
 
     def look(flying: Pair) -> bool:
-        for show in shows:
-            show(flying.companion)
+        if flying.steps % every == 0:
+            show(flying)
         return False
 
     pair.at.append((look, lambda _: None))
-    pair.fly()
     return pair
 
 
-@pytest.fixture(scope="module")
-def undisturbed() -> list[bytes]:
-    """The setpoints of a flight that nothing shows."""
-    return flown().payloads
+# --- what must not disturb a flight ---------------------------------------------------------------
 
 
-def test_no_client_of_the_live_page_changes_a_setpoint(undisturbed: list[bytes]) -> None:
+def test_no_client_of_the_live_page_changes_a_setpoint() -> None:
     """Nor does it take anything from another client, which sees the flight to its end."""
     with serving() as (process, url):
         address = (urlsplit(url).hostname, urlsplit(url).port)
@@ -66,23 +68,22 @@ def test_no_client_of_the_live_page_changes_a_setpoint(undisturbed: list[bytes])
         deaf.sendall(EVENTS)  # and reads nothing
         flooding = socket.create_connection(address)
         flooding.setblocking(False)
-        steps = count()
 
-        def disturb(_: object) -> None:
-            step = next(steps)
-            if step % 50 == 0:
+        def show(flying: Pair) -> None:
+            process.show(flying.companion)
+            if flying.steps % 50 == 0:
                 with suppress(BlockingIOError, ConnectionError):  # it may be closed
                     flooding.send(FLOOD)
-            if step % 500 == 0:
+            if flying.steps % 500 == 0:
                 with socket.create_connection(address) as leaving:
-                    leaving.sendall(EVENTS[: step % 37])
+                    leaving.sendall(EVENTS[: flying.steps % 37])
 
-        pair = flown(process.show, disturb)
+        pair = shown_by(show)
+        pair.fly()
         late = urlopen(f"{url}/events", timeout=20)
         deaf.close()
         flooding.close()
-    assert len(undisturbed) > 80
-    assert pair.payloads == undisturbed
+    assert pair.payloads == calm_hover().payloads
     for client in (reading, late):
         lines = client.read().decode().splitlines()
         messages = [json.loads(each[6:]) for each in lines if each.startswith('data: {"type')]
@@ -95,9 +96,7 @@ def test_no_client_of_the_live_page_changes_a_setpoint(undisturbed: list[bytes])
     assert max(heights) == pytest.approx(1.0, abs=0.1)
 
 
-def test_what_nobody_reads_delays_nothing_and_is_told(
-    undisturbed: list[bytes], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_nobody_reads_delays_nothing_and_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     """A server that stands still, and a pipe that is full."""
     monkeypatch.setattr("offboard.live.process.PERIOD_S", 0.0)  # a thousand snapshots
     monkeypatch.setattr("offboard.live.display.CLOSE_S", 0.2)
@@ -107,19 +106,20 @@ def test_what_nobody_reads_delays_nothing_and_is_told(
     with serving() as (process, _):
         os.kill(process._process.pid, signal.SIGSTOP)
 
-        def timed(companion: Any) -> None:
+        def timed(flying: Pair) -> None:
             nonlocal slowest_s
             began_s = time.thread_time()
-            process.show(companion)
-            lines.show(companion)
+            process.show(flying.companion)
+            lines.show(flying.companion)
             slowest_s = max(slowest_s, time.thread_time() - began_s)
 
-        steps = count()
-        pair = flown(lambda companion: timed(companion) if next(steps) % 5 == 0 else None)
+        pair = shown_by(timed, every=3)
+        pair.track()
         began_s = time.monotonic()
     assert time.monotonic() - began_s < 10.0
     lines.close()
-    assert pair.payloads == undisturbed
+    assert len(pair.payloads) > 60
+    assert pair.payloads == calm_hover().payloads[: len(pair.payloads)]
     assert slowest_s < 0.02
     found = re.fullmatch(r"--live: (\d+) snapshots dropped, they were not read", process.lost)
     assert found
@@ -132,46 +132,21 @@ def test_what_nobody_reads_delays_nothing_and_is_told(
 def test_an_address_that_cannot_be_served_is_refused() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         address = f"127.0.0.1:{taken.getsockname()[1]}"
-        refused = f"--live: {address} cannot be listened on"
-        with (
-            closing(LiveProcess(SERVER, "--live", address)) as process,
-            pytest.raises(UserError, match=refused),
+        for unusable, says in (
+            (address, f"--live: {address} cannot be listened on"),
+            ("no.such.invalid:8014", r"listened on \((?!Unknown error)"),
         ):
-            process.await_ready()
-    with (
-        closing(LiveProcess(SERVER, "--live", "no.such.invalid:8014")) as process,
-        pytest.raises(UserError, match=r"listened on \((?!Unknown error)"),
-    ):
-        process.await_ready()
+            with (
+                closing(LiveProcess(SERVER, "--live", unusable)) as process,
+                pytest.raises(UserError, match=says),
+            ):
+                process.await_ready()
     for wrong in ("", "8014x", "localhost:", "127.0.0.1:99999", "127.0.0.1:²", "[::1:1"):
         with pytest.raises(UserError, match="give HOST:PORT"):
             LiveProcess(SERVER, "--live", wrong)
 
 
-def test_the_live_page_follows_the_flight_in_both_schemes_and_widths() -> None:
-    pair = hover()
-    with serving() as (process, url), opening(url, width=400) as opened:
-        pair.at.append((lambda p: p.steps % 25 == 0 and process.show(p.companion), lambda _: None))
-        pair.fly()
-        process.tell(title="a flight: lemniscate by pso")
-        process.show(pair.companion)
-        process.tell(verdict="flown and landed", report="flights/a/report.html")
-        ended = "document.getElementById('phase').innerText.startsWith('disarmed')"
-        opened.page.wait_for_function(ended)
-        for width in (400, 1280):
-            opened.resize(width)
-            for scheme in ("dark", "light"):
-                opened.switch(scheme)
-                assert opened.width_px() == width
-                assert opened.unreadable() == opened.colliding() == []
-        drawn = "document.getElementById('plan').data[1].x.length"
-        opened.page.wait_for_function(f"{drawn} > 3")
-        last = opened.page.inner_text("#texts li >> nth=0")
-        assert re.fullmatch(rf"\d+\.\d\d s +{re.escape(pair.companion.announced[-1])}", last)
-        assert opened.page.inner_text("h1") == "a flight: lemniscate by pso"
-        assert opened.page.inner_text("#report").endswith("flights/a/report.html")
-        assert opened.page.inner_text("#skipped") == "0"
-        assert opened.problems == opened.fetched == []
+# --- one flight, shown in every way ---------------------------------------------------------------
 
 
 class Broken:
@@ -184,51 +159,114 @@ class Broken:
         raise OSError
 
 
+@dataclass
+class Shown:
+    pair: Pair
+    lines: list[dict[str, Any]]
+    terminal: str
+    pipe: str
+    seen: list[tuple[float, Snapshot]]  # with the true height, every 0.1 s
+    page: Opened
+
+
 @pytest.fixture(scope="module")
-def lines() -> tuple[Pair, list[str], str, str]:
-    """A flight, its JSON lines, and the text of a terminal and of a pipe."""
+def shown() -> Iterator[Shown]:
     written: list[str] = []
     displays = [Displays(JsonLines(written.append), [Broken()])]  # type: ignore[list-item]
     files = io.StringIO(), io.StringIO()
-    with pytest.MonkeyPatch.context() as patch:
+    seen: list[tuple[float, Snapshot]] = []
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        serving() as (process, url),
+        opening(url, width=400) as page,
+    ):
         patch.setattr("offboard.live.lines.STATUS_S", 0.0)
         patch.setenv("TERM", "xterm")
         for file in files:
             console = Console(file=file, force_terminal=file is files[0], width=80)
             displays.append(Displays(Terminal(console, partial(console.print, soft_wrap=True))))
+
+        def show(flying: Pair) -> None:
+            for display in displays:
+                display.show(flying.companion)
+            if flying.steps % 25 == 0:
+                process.show(flying.companion)
+                height_m = float(flying.instance.autopilot.plant.height_m)
+                seen.append((height_m, flying.companion.snapshot()))
+
         for display in displays:
             display.tell("preparing")
-        pair = flown(*(display.show for display in displays))
+        pair = shown_by(show)
+        pair.fly()
         for display in displays:
             display.close()
-    assert [display.lost for display in displays] == [["broken"], [], []]
-    objects = "".join(written).splitlines()
-    return pair, objects, files[0].getvalue(), files[1].getvalue()
+        assert [display.lost for display in displays] == [["broken"], [], []]
+        process.tell(title="a flight: lemniscate by pso")
+        process.show(pair.companion)
+        process.tell(verdict="flown and landed", report="flights/a/report.html")
+        objects = [json.loads(each) for each in "".join(written).splitlines()]
+        yield Shown(pair, objects, files[0].getvalue(), files[1].getvalue(), seen, page)
 
 
-def test_json_lines_are_one_object_each(lines: tuple[Pair, list[str], str, str]) -> None:
-    pair, written, *_ = lines
-    objects = [json.loads(each) for each in written]
-    assert objects[0] == {"type": "preparation", "text": "preparing"}
-    told = [each["text"] for each in objects if each["type"] == "announcement"]
-    assert told == pair.companion.announced
-    times = [each["time_s"] for each in objects if each["type"] == "snapshot"]
+def test_the_live_page_follows_the_flight_in_both_schemes_and_widths(shown: Shown) -> None:
+    opened = shown.page
+    ended = "document.getElementById('phase').innerText.startsWith('disarmed')"
+    opened.page.wait_for_function(ended)
+    for width, scheme in ((400, "dark"), (1280, "light")):
+        opened.resize(width)
+        opened.switch(scheme)
+        assert opened.width_px() == width
+        assert opened.unreadable() == opened.colliding() == []
+    opened.page.wait_for_function("document.getElementById('plan').data[1].x.length > 3")
+    last = opened.page.inner_text("#texts li >> nth=0")
+    assert re.fullmatch(rf"\d+\.\d\d s +{re.escape(shown.pair.companion.announced[-1])}", last)
+    assert opened.page.inner_text("h1") == "a flight: lemniscate by pso"
+    assert opened.page.inner_text("#report").endswith("flights/a/report.html")
+    assert opened.page.inner_text("#skipped") == "0"
+    assert opened.problems == opened.fetched == []
+
+
+def test_json_lines_are_one_object_each(shown: Shown) -> None:
+    assert shown.lines[0] == {"type": "preparation", "text": "preparing"}
+    told = [each["text"] for each in shown.lines if each["type"] == "announcement"]
+    assert told == shown.pair.companion.announced
+    times = [each["time_s"] for each in shown.lines if each["type"] == "snapshot"]
     assert times[1:] == pytest.approx(range(1, len(times)), abs=0.05)
-    assert times[-1] == pytest.approx(pair.time_s, abs=1.0)
+    assert times[-1] == pytest.approx(shown.pair.time_s, abs=1.0)
 
 
-def test_the_terminal_has_its_lines_and_one_status_in_place(
-    lines: tuple[Pair, list[str], str, str],
-) -> None:
-    pair, _, terminal, pipe = lines
-    plain = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", terminal).replace("\r", "\n")
-    assert plain.splitlines()[0] == pipe.splitlines()[0] == "preparing"
-    for sentence in pair.companion.announced:
-        assert plain.count(f" s  {sentence}") == pipe.count(f" s  {sentence}") == 1
-    assert "\x1b" not in pipe
-    assert "\x1b[2K" in terminal  # a line erased to be written again
+def test_the_terminal_has_its_lines_and_one_status_in_place(shown: Shown) -> None:
+    plain = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", shown.terminal).replace("\r", "\n")
+    assert plain.splitlines()[0] == shown.pipe.splitlines()[0] == "preparing"
+    for sentence in shown.pair.companion.announced:
+        assert plain.count(f" s  {sentence}") == shown.pipe.count(f" s  {sentence}") == 1
+    assert "\x1b" not in shown.pipe
+    assert "\x1b[2K" in shown.terminal  # a line erased to be written again
     assert re.search(r"s  track  error 0\.0\d\d m  link age \d+ ms  OFFBOARD", plain)
-    assert terminal.rindex("\x1b[?25h") > terminal.rindex("\x1b[?25l")  # cursor shown again
+    shows_cursor, hides_cursor = "\x1b[?25h", "\x1b[?25l"
+    assert shown.terminal.rindex(shows_cursor) > shown.terminal.rindex(hides_cursor)
+
+
+def test_snapshots_agree_with_the_wire(shown: Shown) -> None:
+    first, last = shown.seen[0][1], shown.pair.companion.snapshot()
+    assert (first.authority, first.reference_ned_m) == ("free", None)
+    assert math.isnan(first.position_error_m)
+    tracked = [each for each in shown.seen if each[1].phase == "track"]
+    assert len(tracked) == pytest.approx(30, abs=2)
+    for true_height_m, now in tracked:
+        assert now.position_ned_m is not None
+        assert now.reference_ned_m is not None
+        assert -now.position_ned_m[2] == pytest.approx(true_height_m, abs=0.3)
+        error_m = math.dist(now.position_ned_m, now.reference_ned_m)
+        assert now.position_error_m == pytest.approx(error_m, abs=1e-9)
+        assert (now.mode, now.armed, now.authority) == ("OFFBOARD", True, "ours")
+        assert now.failsafe == "fly"
+    ends_s = [tracked[0][1].track_time_s, tracked[-1][1].track_time_s]
+    assert ends_s == pytest.approx([0.0, 3.0], abs=0.2)
+    assert (last.phase, last.armed) == ("disarmed", False)
+    followed = {now.phase for _, now in shown.seen if now.reference_ned_m is not None}
+    assert followed == {"climb", "track", "hover"}
+    assert last.texts[-1] == shown.pair.companion.announced[-1]
 
 
 def test_a_status_leaves_out_what_is_not_known() -> None:
@@ -237,3 +275,10 @@ def test_a_status_leaves_out_what_is_not_known() -> None:
     shown = {"phase": "track", "position_error_m": 12.3456}
     vars(now).update(shown, failsafe="hold", failsafe_row="link")
     assert status(now).strip() == "-- s  track  error 12.346 m  unknown  hold: link"
+
+
+def test_the_mode_of_a_pilot_is_shown_with_who_has_authority() -> None:
+    state: Any = uneventful(Phase.TRACK)
+    state.session.counters = SimpleNamespace(forged=0)
+    heartbeat(state, armed=True, mode="AUTO.LOITER")
+    assert (Snapshot(state).authority, Snapshot(state).mode) == ("lost", "AUTO.LOITER")

@@ -6,7 +6,7 @@ import lzma
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ import pytest
 from browser import Opened, opening
 from hypothesis import given
 from hypothesis import strategies as st
-from pair import Pair, hover
+from pair import Pair, hover, in_phase
 from typer.testing import CliRunner
 
 from offboard.analysis import tlog
@@ -24,7 +24,7 @@ from offboard.cli.commands import app
 from offboard.flight.phases import Phase
 from offboard.report import report_page
 from offboard.report.figures import figures
-from offboard.report.flight import read
+from offboard.report.flight import Flight, read
 from offboard.report.panels import thinned
 from offboard.report.report_page import page
 from offboard.report.timeline import bands, marks
@@ -41,75 +41,61 @@ CURVE = """([figure, name]) => {
 }"""
 
 
+@dataclass
+class Flown:
+    pair: Pair
+    directory: Path
+    score: Score
+    flight: Flight
+
+
 @pytest.fixture(scope="module")
-def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Pair, Path, Score]:
-    """A flight that a pilot ends, its directory and score."""
-    pair = hover()
-    pair.at.append((lambda p: p.companion.phase is Phase.HOVER, Pair.pilot_takes_over))
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
+    """A flight that a pilot ends."""
+    pair = hover(at=[(in_phase(Phase.HOVER), Pair.pilot_takes_over)])
     pair.fly()
     directory = tmp_path_factory.mktemp("flights") / "a <b>"
-    return pair, directory, pair.score(directory)
+    return Flown(pair, directory, pair.score(directory), read(directory))
 
 
 @pytest.fixture(scope="module")
-def opened(flown: tuple[Pair, Path, Score]) -> Iterator[Opened]:
-    _, directory, _ = flown
-    file = directory / "report.html"
-    file.write_text(page([read(directory)]), encoding="utf-8")
+def recorded() -> Flight:
+    """Of a real PX4."""
+    return read(PX4)
+
+
+@pytest.fixture(scope="module")
+def opened(flown: Flown) -> Iterator[Opened]:
+    file = flown.directory / "report.html"
+    file.write_text(page([flown.flight]), encoding="utf-8")
     with opening(file) as opened:
         yield opened
 
 
 def test_the_page_is_readable_in_both_schemes_and_widths(opened: Opened) -> None:
-    for width in (400, 1280):
+    """And begins with the verdict."""
+    for width, scheme in ((400, "dark"), (1280, "light")):
         opened.resize(width)
-        for scheme in ("dark", "light"):
-            opened.switch(scheme)
-            assert opened.width_px() == width
-            assert opened.unreadable() == opened.colliding() == []
+        opened.switch(scheme)
+        assert opened.width_px() == width
+        assert opened.unreadable() == opened.colliding() == []
     assert opened.problems == opened.fetched == []
     drawn = opened.page.evaluate("[...document.querySelectorAll('.figure')].map(f => f.id)")
     assert drawn == [*FIGURES, "identification"]
     assert len(opened.page.content().encode()) < MOST_BYTES
-
-
-def test_the_verdict_comes_first(opened: Opened) -> None:
     shown = opened.page.inner_text("main").splitlines()
     assert shown[0] == "Flight a <b>"
     assert "✗ not completed (pilot): the vehicle left OFFBOARD for AUTO.LOITER" in shown[1:4]
 
 
-def test_the_curves_are_those_of_the_score(opened: Opened, flown: tuple[Pair, Path, Score]) -> None:
-    pair, _, score = flown
-    begun = {phase: time_s for time_s, phase in pair.phases}
+def test_the_curves_are_those_of_the_score(opened: Opened, flown: Flown) -> None:
+    begun = {phase: time_s for time_s, phase in flown.pair.phases}
     times, errors = map(np.array, opened.page.evaluate(CURVE, ["tracking", "estimated"]))
     tracked = (times >= begun[Phase.TRACK]) & (times <= begun[Phase.HOVER])
-    assert errors[tracked].astype(float).max() == pytest.approx(score.max_position_m, rel=1e-4)
+    largest_m = errors[tracked].astype(float).max()
+    assert largest_m == pytest.approx(flown.score.max_position_m, rel=1e-4)
     _, thrust = opened.page.evaluate(CURVE, ["thrust", "commanded"])
-    assert len(thrust) == len(pair.setpoints)
-    np.testing.assert_allclose(thrust, [m.thrust for _, _, m in pair.setpoints], atol=1e-6)
-
-
-def test_the_path_is_no_mirror_image() -> None:
-    """The axes of a scene are right-handed: east, north, up."""
-    flight = read(PX4)
-    (curve,) = figures([flight])["path"].drawing.data
-    north, east, down = flight.history.position["position_ned_m"][[0, -1]].T
-    ends = [[axis[0], axis[-1]] for axis in (curve.x, curve.y, curve.z)]
-    assert np.array(ends) == pytest.approx(np.array([east, north, -down]))
-    assert figures([flight])["tracking"].caption == ""  # which has no reference
-
-
-def test_bands_are_the_phases_that_were_flown(flown: tuple[Pair, Path, Score]) -> None:
-    pair, directory, _ = flown
-    phases = [band for band in bands(read(directory)) if band.row == "phase"]
-    shown = [band for band in phases if band.end_s > band.begin_s or band is phases[-1]]
-    begun = {phase.value: time_s for time_s, phase in pair.phases}
-    assert [band.label for band in shown] == list(begun)
-    for band in shown:
-        assert band.begin_s == pytest.approx(begun[band.label], abs=0.02)
-    steps = [mark.text for mark in marks(read(directory)) if mark.row == "failsafe"]
-    assert [text.partition(":")[0] for text in steps] == ["yielded"]
+    np.testing.assert_allclose(thrust, [m.thrust for _, _, m in flown.pair.setpoints], atol=1e-6)
 
 
 def test_linked_figures_zoom_together(opened: Opened) -> None:
@@ -118,26 +104,38 @@ def test_linked_figures_zoom_together(opened: Opened) -> None:
     assert len({tuple(each) for each in before}) == 1
     opened.page.evaluate("Plotly.relayout('attitude', {'xaxis.range': [3, 7]})")
     opened.page.wait_for_function(f"{ranges}.every(([low, high]) => low === 3 && high === 7)")
-    opened.page.evaluate("Plotly.relayout('link', {'xaxis.range': [0, 30]})")
-    opened.page.wait_for_function(f"{ranges}.every(([low, high]) => low === 0 && high === 30)")
 
 
-def test_several_flights_have_their_differences_in_a_table(
-    opened: Opened, flown: tuple[Pair, Path, Score], tmp_path: Path
-) -> None:
-    _, directory, score = flown
-    file = tmp_path / "report.html"
-    file.write_text(page([read(directory), read(PX4), read(directory)]), encoding="utf-8")
-    several = Opened(opened.page.context.new_page(), file)
-    several.resize(400)
-    assert several.problems == several.fetched == several.colliding() == several.unreadable() == []
-    assert several.page.locator(".verdict").count() == 3
-    rows = several.page.locator("#scores tr").all_inner_texts()
-    (row,) = (each for each in rows if each.startswith("rmse_position_m"))
-    value = f"{score.rmse_position_m:.4g}"
-    assert row.split()[:4] == ["rmse_position_m", value, "–", value]
-    two = page([read(directory), read(directory)])
-    assert "<th>B − A</th>" in two
+def test_the_path_is_no_mirror_image(recorded: Flight) -> None:
+    """The axes of a scene are right-handed: east, north, up."""
+    (curve,) = figures([recorded])["path"].drawing.data
+    north, east, down = recorded.history.position["position_ned_m"][[0, -1]].T
+    ends = [[axis[0], axis[-1]] for axis in (curve.x, curve.y, curve.z)]
+    assert np.array(ends) == pytest.approx(np.array([east, north, -down]))
+    assert figures([recorded])["tracking"].caption == ""  # which has no reference
+
+
+def test_bands_are_the_phases_that_were_flown(flown: Flown) -> None:
+    phases = [band for band in bands(flown.flight) if band.row == "phase"]
+    shown = [band for band in phases if band.end_s > band.begin_s or band is phases[-1]]
+    begun = {phase.value: time_s for time_s, phase in flown.pair.phases}
+    assert [band.label for band in shown] == list(begun)
+    for band in shown:
+        assert band.begin_s == pytest.approx(begun[band.label], abs=0.02)
+    steps = [mark.text for mark in marks(flown.flight) if mark.row == "failsafe"]
+    assert [text.partition(":")[0] for text in steps] == ["yielded"]
+
+
+def test_the_metrics_on_the_page_are_those_of_the_score(flown: Flown, recorded: Flight) -> None:
+    """Of several flights beside each other, of two with the difference."""
+    shown = {row.name: row.values[0] for row in report_page.rows([flown.flight])}
+    finite = {name: v for name, v in flown.score.metrics().items() if math.isfinite(v)}
+    assert shown == {name: f"{value:.4g}" for name, value in finite.items()}
+    rows = report_page.rows([flown.flight, recorded, flown.flight])
+    (row,) = (each for each in rows if each.name == "rmse_position_m")
+    value = f"{flown.score.rmse_position_m:.4g}"
+    assert row.values == (value, "–", value)
+    assert "<th>B − A</th>" in page([flown.flight, flown.flight])
 
 
 def of_kinds(log: Path, without: set[int]) -> bytes:
@@ -149,10 +147,10 @@ def of_kinds(log: Path, without: set[int]) -> bytes:
     )
 
 
-def test_a_log_of_another_program_gives_what_it_holds(tmp_path: Path) -> None:
+def test_a_log_of_another_program_gives_what_it_holds(tmp_path: Path, recorded: Flight) -> None:
     bare = tmp_path / "bare.tlog"
     bare.write_bytes(of_kinds(PX4, {31, 32, 82, 83, 84}))  # ATTITUDE, GLOBAL_POSITION_INT
-    whole, flight = read(PX4), read(bare)
+    whole, flight = recorded, read(bare)
     assert "no setpoints (SET_ATTITUDE_TARGET of offboard, ATTITUDE_TARGET)" in flight.missing
     assert any("positions are of GLOBAL_POSITION_INT" in each for each in flight.missing)
     assert math.isnan(flight.score.completed)
@@ -172,7 +170,9 @@ def test_a_log_of_another_program_gives_what_it_holds(tmp_path: Path) -> None:
     assert "31 datagrams of others" in shown
 
 
-def test_a_damaged_log_is_shown_with_the_place_of_the_damage(tmp_path: Path) -> None:
+def test_a_damaged_log_is_shown_with_the_place_of_the_damage(
+    tmp_path: Path, recorded: Flight
+) -> None:
     data = bytearray(PX4.read_bytes())
     at = len(data) // 2
     data[at : at + 500] = bytes(500)
@@ -183,21 +183,17 @@ def test_a_damaged_log_is_shown_with_the_place_of_the_damage(tmp_path: Path) -> 
     found = re.search(r"the first at byte (\d+), at ([0-9.]+) s", said)
     assert found
     assert at - 300 < int(found[1]) <= at
-    whole = read(PX4).history.position
+    before = tmp_path / "before.tlog"
+    before.write_bytes(data[: int(found[1])])
     expected_s = next(
-        e.message.time_boot_ms / 1e3
-        for e in reversed(list(tlog.read(cut(tmp_path, data[: int(found[1])]))))
-        if e.name in ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED")
+        entry.message.time_boot_ms / 1e3
+        for entry in reversed(list(tlog.read(before)))
+        if entry.name in ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED")
     )
     assert float(found[2]) == pytest.approx(expected_s, abs=0.01)
-    assert flight.history.position["time_s"][-1] == pytest.approx(whole["time_s"][-1], abs=0.1)
+    last_s, whole_s = (each.history.position["time_s"][-1] for each in (flight, recorded))
+    assert last_s == pytest.approx(whole_s, abs=0.1)
     assert any(each.startswith("the log ends within an entry, at byte") for each in flight.missing)
-
-
-def cut(directory: Path, data: bytes) -> Path:
-    path = directory / "cut.tlog"
-    path.write_bytes(data)
-    return path
 
 
 @given(
@@ -246,10 +242,3 @@ def test_the_command_replaces_nothing_and_refuses_what_is_no_log(tmp_path: Path)
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "report-2.html", "report.html", "x.tlog", "y.tlog",
     ]  # fmt: skip
-
-
-def test_the_figures_on_the_page_are_those_of_the_score(flown: tuple[Pair, Path, Score]) -> None:
-    _, directory, score = flown
-    shown = {row.name: row.values[0] for row in report_page.rows([read(directory)])}
-    finite = {name: v for name, v in score.metrics().items() if math.isfinite(v)}
-    assert shown == {name: f"{value:.4g}" for name, value in finite.items()}

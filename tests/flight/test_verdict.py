@@ -1,7 +1,5 @@
-"""The verdict of the score: completed only if all was tracked, landed and disarmed; else why not.
-
-Also what the score must not depend on: the rate of the telemetry, jumps and the wrap of its clock.
-"""
+"""The score of a flight: what the default flight must achieve, the verdict (completed only if all
+was tracked, landed and disarmed; else why not), and what neither may depend on."""
 
 from __future__ import annotations
 
@@ -12,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pair import UNIX_EPOCH_US, calm_hover, hover, make
+from pair import UNIX_EPOCH_US, Pair, calm_hover, hover, make
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from typer.testing import CliRunner
 
@@ -22,12 +20,11 @@ from offboard.analysis.score_table import summary, verdict
 from offboard.cli.commands import app
 from offboard.flight.flight import Outcome
 from offboard.flight.ground_contact import Touchdown
-from offboard.flight.phases import PHASE_CODES, Phase
+from offboard.flight.phases import PHASE_CODES, Action, Phase
 from offboard.identification.learner import IdentifySettings
 from offboard.link.log import FlightLog
 from offboard.model.frames import thrust_direction_from_quaternion
-
-TRACKED_S = 3.0
+from simulator import config as simulated
 
 
 @pytest.fixture(scope="module")
@@ -35,13 +32,75 @@ def flown() -> History:
     return calm_hover().history()
 
 
+def default_flight(scenario: str, *assignments: str) -> Pair:
+    """Of a vehicle of which nothing is known: it is identified in flight."""
+    neutral = simulated.vehicle("neutral")
+    pair = make(*assignments, scenario=scenario, believed=neutral, learning=IdentifySettings(),
+                deadline_s=0.05)  # fmt: skip
+    assert pair.fly() == Outcome(0, "flown and landed")
+    return pair
+
+
+@pytest.fixture(scope="module")
+def px4_like() -> Pair:
+    return default_flight("px4_like")
+
+
+def achieves(pair: Pair, most_m: float, tracked_s: float = 16.0) -> None:
+    """What a flight must achieve, in numbers."""
+    scored = pair.score()
+    assert scored.rmse_position_m <= most_m
+    assert scored.tracked_s == pytest.approx(tracked_s, abs=0.3)
+    assert scored.setpoint_gap_max_s <= 0.12
+    assert scored.missed_ticks == 0
+    assert scored.gap_median <= 1e-9
+    assert max(pair.failsafes.values(), default=Action.FLY) <= Action.LEVEL
+    assert abs(pair.instance.autopilot.state.truth.position_ned_m[2]) < 0.05
+    assert not pair.armed
+
+
+def test_default_flight(px4_like: Pair) -> None:
+    achieves(px4_like, 0.04)
+    achieves(default_flight("calm", "reference.laps=1"), 0.01, tracked_s=8.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scenario", "most_m"),
+    [
+        ("noise", 0.04),
+        ("thrust_minus_15", 0.02),
+        ("mass_plus_20", 0.03),
+        ("wind_2mps", 0.03),
+        ("gusts", 0.06),
+    ],
+)
+def test_default_flight_in_other_scenarios(scenario: str, most_m: float) -> None:
+    """One profile for all rows."""
+    achieves(default_flight(scenario), most_m)
+
+
+@pytest.mark.slow
+def test_a_wide_fast_circle_that_begins_far_away() -> None:
+    """7.5 m/s at 39 degrees of tilt, 60 m from the take-off point."""
+    wide = {"radius_m": 30, "period_s": 25, "laps": 1, "run_in_s": 8, "origin_north_m": 50}
+    assignments = (f"reference.{key}={value}" for key, value in wide.items())
+    pair = make(*assignments, scenario="px4_like", reference="circle_course", aloft=True)
+    pair.track()
+    assert pair.score().rmse_position_m < 0.08
+
+
 def test_decisions_at_the_tilt_limit_are_counted_and_reported() -> None:
     """The wind of `wind_light` needs more than 45 degrees of tilt, to which the gate turns back."""
-    pair = make(reference="lemniscate", vehicle="neutral", scenario="wind_light", seed=2)
+    pair = make("reference.laps=1", reference="lemniscate", vehicle="neutral",
+                scenario="wind_light", seed=2, aloft=True)  # fmt: skip
     pair.track()
     flown = pair.history()
+    assert np.abs(np.linalg.norm(flown.setpoint["quaternion"], axis=1) - 1.0).max() < 1e-6
     down = thrust_direction_from_quaternion(flown.setpoint["quaternion"])[:, 2]
-    limited = np.degrees(np.arccos(down)) > 44.9
+    tilt_deg = np.degrees(np.arccos(down))
+    assert tilt_deg.max() < 45.0 + 1e-3
+    limited = tilt_deg > 44.9
     assert limited.sum() > 20
     scored = score(flown)
     assert scored.at_bound_share >= limited.sum() / scored.decisions > 0.1
@@ -52,28 +111,39 @@ def test_decisions_at_the_tilt_limit_are_counted_and_reported() -> None:
 def test_a_whole_flight_is_completed(flown: History) -> None:
     whole = score(flown)
     assert (whole.completed, whole.ended_by) == (1.0, "reference over")
-    assert whole.tracked_s == pytest.approx(TRACKED_S, abs=0.2)
+    assert whole.tracked_s == pytest.approx(3.0, abs=0.2)
     assert 0.3 < whole.touchdown_mps < 1.2  # MPC_LAND_CRWL is 0.7
     assert whole.at_bound_share == 0.0
     assert "at a limit" not in summary(whole, flown)
 
 
+def test_a_log_with_parts_missing_is_scored_as_far_as_it_goes(flown: History) -> None:
+    whole = score(flown)
+    assert whole.rmse_position_m < 0.05
+    for part in ("position", "attitude", "setpoint", "reference"):
+        rows = getattr(flown, part)
+        for kept in (rows[:0], rows[:1]):
+            assert math.isnan(score(replace(flown, **{part: kept})).rmse_position_m)
+    twice = np.concatenate((flown.reference, flown.reference))
+    assert score(replace(flown, reference=twice)).rmse_position_m == whole.rmse_position_m
+
+
 def test_others_on_the_link_have_no_effect(flown: History) -> None:
     """Another autopilot, heard first, its companion with our component id, and a camera of the same
     system: none of them is what `--system 1` flies."""
-    battery = mavlink.MAVLink_sys_status_message(0, 0, 0, 0, 9000, 0, 5, 0, 0, 0, 0, 0, 0)
-    text = b"offboard: land: the battery holds 9 %"
+    text = mavlink.MAVLink_statustext_message(4, b"offboard: land: the battery holds 9 %")
+    place = mavlink.MAVLink_local_position_ned_message(10, 9, 9, -9, 9, 9, 9)
     others = [
         (2, 1, mavlink.MAVLink_heartbeat_message(2, 3, 0, 4, 4, 3)),
-        (2, 1, mavlink.MAVLink_local_position_ned_message(10, 9, 9, -9, 9, 9, 9)),
-        (2, 191, mavlink.MAVLink_statustext_message(4, text)),
-        (1, 100, mavlink.MAVLink_statustext_message(4, text)),
+        (2, 1, place),
+        (2, 191, text),
+        (1, 100, text),
         (1, 100, mavlink.MAVLink_heartbeat_message(30, 8, 128, 0, 5, 3)),
-        (1, 100, mavlink.MAVLink_local_position_ned_message(10, 9, 9, -9, 9, 9, 9)),
+        (1, 100, place),
         (1, 100, mavlink.MAVLink_extended_sys_state_message(0, 2)),
-        (1, 100, battery),
+        (1, 100, mavlink.MAVLink_sys_status_message(0, 0, 0, 0, 9000, 0, 5, 0, 0, 0, 0, 0, 0)),
         (1, 192, mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)),
-        (1, 192, mavlink.MAVLink_statustext_message(4, text)),
+        (1, 192, text),
     ]
     frames = [each.pack(mavlink.MAVLink(None, *ids)) for *ids, each in others]
     pair = hover(system_id=1, down=lambda _, heard: [*frames, *heard] if heard else [])
@@ -100,12 +170,12 @@ def test_a_requirement_on_a_cut_log_is_missed(tmp_path: Path) -> None:
     assert "not completed: the log ends in the phase track" in str(required.exception)
 
 
-def touchdown(fall_m: float, *, rests_s: float, noise_mps: float = 0.0) -> Touchdown:
+def touchdown(fall_m: float = 0.0, rests_s: float = 2.0, noise_mps: float = 1e-4) -> Touchdown:
     """A descent at 0.7 m/s from 3 m, a fall from `fall_m`, then the ground; 50 Hz."""
     landing, rng = Touchdown((0.0, 0.0, 0.0)), np.random.default_rng(5)
     time_s, height, down_mps, end_s = 0.0, 3.0, 0.7, math.inf
     while time_s < end_s:
-        noise = rng.normal(0.0, max(noise_mps, 1e-4))  # no estimator repeats itself
+        noise = rng.normal(0.0, noise_mps)  # no estimator repeats itself
         landing.on_position(time_s, (0.0, 0.0, -height), down_mps + noise)
         time_s += 0.02
         if height > 0.0:
@@ -116,24 +186,30 @@ def touchdown(fall_m: float, *, rests_s: float, noise_mps: float = 0.0) -> Touch
     return landing
 
 
+def reporting(height_m: float, down_mps: float, changing_mps: float) -> Touchdown:
+    """Two seconds of reports of the same place."""
+    landing = Touchdown((0.0, 0.0, 0.0))
+    for tick in range(100):
+        landing.on_position(
+            0.02 * tick, (3.0, 4.0, -height_m), down_mps + changing_mps * (tick % 2)
+        )
+    return landing
+
+
 def test_landings_and_falls() -> None:
     """Speeds by sqrt(v^2 + 2 g h)."""
-    soft = touchdown(0.0, rests_s=2.0, noise_mps=0.15)
-    assert soft.not_landed(on_ground=True) == ""
+    soft, hard = touchdown(noise_mps=0.15), touchdown(2.8)
     assert soft.speed_mps == pytest.approx(0.7, abs=0.5)
-    assert soft.not_landed(on_ground=False) == "the land detector does not report the ground"
-    assert touchdown(0.0, rests_s=0.1).not_landed(on_ground=True) == "it has not come to rest"
-    hard = touchdown(2.8, rests_s=2.0)
     assert hard.speed_mps == pytest.approx(math.sqrt(0.7**2 + 2 * 9.81 * 2.8), rel=0.05)
-    assert hard.not_landed(on_ground=True) == f"fell at up to {hard.speed_mps:.1f} m/s"
-    hovering = Touchdown((0.0, 0.0, 0.0))
-    for tick in range(100):
-        hovering.on_position(0.02 * tick, (3.0, 4.0, -2.8), 1e-4 * (tick % 2))
-    assert hovering.not_landed(on_ground=True) == "2.8 m above the take-off point"
-    frozen = Touchdown((0.0, 0.0, 0.0))
-    for tick in range(100):
-        frozen.on_position(0.02 * tick, (3.0, 4.0, -0.8), 0.7)
-    assert frozen.not_landed(on_ground=True) == "it has not come to rest"
+    assert soft.not_landed(on_ground=False) == "the land detector does not report the ground"
+    for landing, says in (
+        (soft, ""),
+        (touchdown(rests_s=0.1), "it has not come to rest"),
+        (hard, f"fell at up to {hard.speed_mps:.1f} m/s"),
+        (reporting(2.8, 0.0, 1e-4), "2.8 m above the take-off point"),
+        (reporting(0.8, 0.7, 0.0), "it has not come to rest"),
+    ):
+        assert landing.not_landed(on_ground=True) == says
 
 
 def test_the_outcome_follows_the_log(flown: History) -> None:
@@ -148,11 +224,9 @@ def test_the_outcome_follows_the_log(flown: History) -> None:
     assert verdict(ended) == "not completed (pilot): the vehicle left OFFBOARD"
 
 
-def test_a_record_says_what_was_sent() -> None:
+def test_a_record_says_what_was_sent(px4_like: Pair) -> None:
     """Identification steps change the command after the decision: no certificate then."""
-    pair = hover(scenario="px4_like", learning=IdentifySettings())
-    pair.track()
-    flown = pair.history()
+    flown = px4_like.history()
     excited = flown.records["phase"] == PHASE_CODES[Phase.EXCITE]
     certified = np.isfinite(flown.records["gap"])
     assert excited.sum() > 20
@@ -164,9 +238,6 @@ def test_a_record_says_what_was_sent() -> None:
     recorded = [flown.records[f"thrust_direction_{axis}"] for axis in ("north", "east", "down")]
     assert np.array_equal(flown.setpoint["time_s"][rows], flown.records["time_s"])
     assert np.abs(sent - np.stack(recorded, axis=1)).max() < 1e-6
-
-
-# --- what the figures must not depend on ----------------------------------------------------------
 
 
 def beside(flown: History, offset_m: Callable[[np.ndarray], np.ndarray]) -> History:
