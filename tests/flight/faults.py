@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import count
 from typing import Any
 
 from pair import LEAN, Bytes, Filter, Pair, decode, frames_of
@@ -53,6 +54,20 @@ def slow(rate_hz: float) -> Firmware:
 # --- links ----------------------------------------------------------------------------------------
 
 
+def delivering(delays_s: Callable[[float, bytes], Sequence[float]]) -> Filter:
+    """A link that delivers each datagram after each of these delays, in the order of arrival."""
+    under_way: list[tuple[float, bytes]] = []
+
+    def arriving(time_s: float, datagrams: Bytes) -> Bytes:
+        for datagram in datagrams:
+            under_way.extend((time_s + delay_s, datagram) for delay_s in delays_s(time_s, datagram))
+        now = [datagram for due_s, datagram in under_way if due_s <= time_s]
+        under_way[:] = [each for each in under_way if each[0] > time_s]
+        return now
+
+    return arriving
+
+
 def losing(share: float, seed: int = 3) -> Filter:
     """A link that loses datagrams."""
     chance = random.Random(seed)
@@ -61,16 +76,7 @@ def losing(share: float, seed: int = 3) -> Filter:
 
 def stuttering(hold_s: float, every_s: float) -> Filter:
     """A link that stops for `hold_s` in every `every_s`, then delivers all datagrams at once."""
-    held: Bytes = []
-
-    def arriving(time_s: float, datagrams: Bytes) -> Bytes:
-        held.extend(datagrams)
-        if time_s % every_s < hold_s:
-            return []
-        now, held[:] = list(held), []
-        return now
-
-    return arriving
+    return delivering(lambda time_s, _: [max(hold_s - time_s % every_s, 0.0)])
 
 
 def interrupted(for_s: float) -> Filter:
@@ -90,42 +96,26 @@ def interrupted(for_s: float) -> Filter:
 
 def late(delay_s: float) -> Filter:
     """A link with a constant delay."""
-    under_way: list[tuple[float, bytes]] = []
-
-    def arriving(time_s: float, datagrams: Bytes) -> Bytes:
-        under_way.extend((time_s + delay_s, datagram) for datagram in datagrams)
-        now = [datagram for due_s, datagram in under_way if due_s <= time_s]
-        under_way[:] = [entry for entry in under_way if entry[0] > time_s]
-        return now
-
-    return arriving
+    return delivering(lambda *_: [delay_s])
 
 
 def repeating(again_s: float) -> Filter:
     """A link that delivers each datagram twice at once, and once more later."""
-    again = late(again_s)
-    return lambda time_s, datagrams: [*datagrams, *datagrams, *again(time_s, datagrams)]
+    return delivering(lambda *_: [0.0, 0.0, again_s])
 
 
 def shuffling(seed: int = 5) -> Filter:
     """A link that delays one datagram in five by 20 ms, some that have a time stamp by 2.5 s, and
     duplicates another one in five."""
     chance = random.Random(seed)
-    late: list[tuple[float, bytes]] = []
 
-    def shuffle(time_s: float, datagrams: Bytes) -> Bytes:
-        arriving = [datagram for due_s, datagram in late if due_s <= time_s]
-        late[:] = [entry for entry in late if entry[0] > time_s]
-        for datagram in datagrams:
-            draw = chance.random()
-            if draw < 0.2:
-                straggles = draw < 0.01 and frame_id(datagram) in (ATTITUDE, POSITION)
-                late.append((time_s + (2.5 if straggles else 0.02), datagram))
-            else:
-                arriving.extend([datagram] * (2 if draw < 0.4 else 1))
-        return arriving
+    def delays_s(_: float, datagram: bytes) -> Sequence[float]:
+        draw = chance.random()
+        if draw < 0.01 and frame_id(datagram) in (ATTITUDE, POSITION):
+            return [2.5]
+        return [0.02] if draw < 0.2 else [0.0] * (2 if draw < 0.4 else 1)
 
-    return shuffle
+    return delivering(delays_s)
 
 
 def noisy(_: float, datagrams: Bytes) -> Bytes:
@@ -238,29 +228,22 @@ def downlink(fault: Filter) -> Action:
 # --- laws -----------------------------------------------------------------------------------------
 
 
-class Failing:
-    """A controller that fails from its `after`-th decision on, for `times` decisions."""
-
-    def __init__(
-        self, law: Controller, fail: Callable[[Situation], Decision], after: int, times: float
-    ) -> None:
-        self._law, self._fail, self._after, self._times = law, fail, after, times
-        self._count = 0
-
-    def decide(self, situation: Situation) -> Decision:
-        self._count += 1
-        if self._after < self._count <= self._after + self._times:
-            return self._fail(situation)
-        return self._law.decide(situation)
-
-    def reset(self) -> None:
-        self._law.reset()
-
-
 def failing(
     fail: Callable[[Situation], Decision], times: float = math.inf, after: int = 30
 ) -> Callable[[Controller], Controller]:
-    return lambda law: Failing(law, fail, after, times)
+    """A controller that fails after so many decisions, for `times` decisions."""
+
+    def wrap(law: Controller) -> Controller:
+        decide, numbers = law.decide, count(1)
+
+        def sometimes(situation: Situation) -> Decision:
+            fails = after < next(numbers) <= after + times
+            return fail(situation) if fails else decide(situation)
+
+        law.decide = sometimes  # type: ignore[method-assign]
+        return law
+
+    return wrap
 
 
 def raises(_: Situation) -> Decision:

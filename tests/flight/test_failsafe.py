@@ -96,138 +96,133 @@ def test_neither_a_step_back_of_time_nor_a_gap_of_telemetry_counts() -> None:
 
 # --- each row at its limit ------------------------------------------------------------------------
 
-Measure = Callable[[FlightState, Any], object]
+Measure = Callable[[Any, Any], object]
 
 
-def attribute(name: str, within: Callable[[Any], Any] = lambda value: value) -> Measure:
-    """Sets this of the flight to the value, or to what `within` makes of it."""
-    return lambda flight, value: setattr(flight, name, within(value))
+def holding(**values: Callable[[Any], Any]) -> Measure:
+    """Gives the flight these attributes, made of the value."""
 
-
-def _fly_at(flight: FlightState, north_m: float, down_m: float, down_mps: float = 0.0) -> None:
-    place, velocity = (north_m, 0.0, down_m), (0.0, 0.0, down_mps)
-    flight.vehicle.position = LocalPosition(NOW_S, place, velocity)
-
-
-def _near_reference(flight: FlightState, away_m: float) -> None:
-    sample = flight.plan.sample(NOW_S)
-    assert sample is not None
-    north, east, down = sample.position_ned_m.tolist()
-    flight.vehicle.position = LocalPosition(NOW_S, (north + away_m, east, down), (0.0, 0.0, 0.0))
-
-
-def _tilt(flight: FlightState, angle_rad: float) -> None:
-    assert flight.vehicle.attitude is not None
-    half = (np.cos(angle_rad / 2), np.sin(angle_rad / 2), 0.0, 0.0)
-    flight.vehicle.attitude = replace(flight.vehicle.attitude, attitude=half)
-
-
-def _tilt_error(flight: FlightState, angle_rad: float) -> None:
-    flight.commands.extend([Command(9.8, (0.0, 0.0, 1.0), 0.0)] * 7)
-    _tilt(flight, angle_rad)
-
-
-def _clock(**values: Callable[[Any], Any]) -> Measure:
     def measure(flight: FlightState, value: Any) -> None:
-        given = {name: make(value) for name, make in values.items()}
-        clock = {"age_s": lambda *_: 0.0, "delay_growth_s": 0.0, "jumped_s": 0.0} | given
-        flight.clock = SimpleNamespace(**clock)  # type: ignore[assignment]
+        for name, make in values.items():
+            setattr(flight, name, make(value))
 
     return measure
 
 
-def _aged(flight: FlightState, age_s: float) -> None:
-    _clock(age_s=lambda age_s: lambda *_: age_s)(flight, age_s)
+def clock(**shown: Callable[[Any], Any]) -> Measure:
+    calm = {"age_s": lambda *_: 0.0, "delay_growth_s": 0.0, "jumped_s": 0.0}
+
+    def measure(flight: Any, value: Any) -> None:
+        now = {name: make(value) for name, make in shown.items()}
+        flight.clock = SimpleNamespace(**calm | now)
+
+    return measure
 
 
-def _unheard(flight: FlightState, age_s: float) -> None:
-    assert flight.authority is not None
-    flight.authority.heard_s = NOW_S - age_s
+def at(flight: FlightState, north_m: float, down_m: float, down_mps: float = 0.0) -> None:
+    place, velocity = (north_m, 0.0, down_m), (0.0, 0.0, down_mps)
+    flight.vehicle.position = LocalPosition(NOW_S, place, velocity)
 
 
-def _blind(flight: FlightState, age_s: float) -> None:
-    assert flight.vehicle.attitude is not None
+def near_reference(flight: Any, away_m: float) -> None:
+    north, east, down = flight.plan.sample(NOW_S).position_ned_m.tolist()
+    flight.vehicle.position = LocalPosition(NOW_S, (north + away_m, east, down), (0.0, 0.0, 0.0))
+
+
+def tilt(flight: Any, angle_rad: float) -> None:
+    rolled = (np.cos(angle_rad / 2), np.sin(angle_rad / 2), 0.0, 0.0)
+    flight.vehicle.attitude = replace(flight.vehicle.attitude, attitude=rolled)
+
+
+def tilt_from_commands(flight: FlightState, angle_rad: float) -> None:
+    flight.commands.extend([Command(9.8, (0.0, 0.0, 1.0), 0.0)] * 7)
+    tilt(flight, angle_rad)
+
+
+def blind(flight: Any, age_s: float) -> None:
     flight.vehicle.attitude = replace(flight.vehicle.attitude, time_s=NOW_S - age_s)
 
 
-def _predicted(flight: FlightState, away_m: float) -> None:
-    predicted: Any = SimpleNamespace(
-        time_s=NOW_S, position_ned_m=np.array([0.0, 0.0, away_m]), velocity_ned_mps=np.zeros(3)
+def predicted(flight: Any, away_m: float) -> None:
+    place = np.array([0.0, 0.0, away_m])
+    flight.predictions.append(
+        SimpleNamespace(time_s=NOW_S, position_ned_m=place, velocity_ned_mps=np.zeros(3))
     )
-    flight.predictions.append(predicted)
 
 
-def _accuracy(flight: FlightState, accuracies_m: tuple[float | None, float | None]) -> None:
-    """At the beginning and now. PX4 reports none as NaN; one that was never reported is not
-    missed."""
-    reported = EstimatorReport(frozenset(ESTIMATE), (), 0.5)
-    for accuracy_m in accuracies_m:
-        hear(flight, replace(reported, accuracy_m=accuracy_m))
-        if accuracy_m is accuracies_m[0]:
+def valid(flight: FlightState, estimates: frozenset[str]) -> None:
+    for each in (frozenset(ESTIMATE), estimates):
+        hear(flight, EstimatorReport(each, (), 0.5))
+        if not flight.positioning.had_valid:
             flight.positioning.begin(flight.vehicle, {}, "ESTIMATOR_STATUS")
 
 
-def _no_fix(flight: FlightState, for_s: float) -> None:
+def accuracy(flight: FlightState, accuracies_m: tuple[float | None, float | None]) -> None:
+    """At the beginning and now. PX4 reports none as NaN; one that was never reported is not
+    missed."""
+    reported = EstimatorReport(frozenset(ESTIMATE), (), 0.5)
+    hear(flight, replace(reported, accuracy_m=accuracies_m[0]))
+    flight.positioning.begin(flight.vehicle, {}, "ESTIMATOR_STATUS")
+    hear(flight, replace(reported, accuracy_m=accuracies_m[1]))
+
+
+def no_fix(flight: FlightState, for_s: float) -> None:
     hear(flight, GpsFix(1.0))
     flight.positioning.begin(flight.vehicle, {"GPS_RAW_INT": 5.0}, "")
     flight.vehicle.heard_s[GpsFix] = NOW_S - for_s
 
 
-def _sinks(flight: FlightState, sink_mps: float) -> None:
-    _fly_at(flight, 0.0, -1.0, sink_mps)
+def sinks(flight: FlightState, sink_mps: float) -> None:
+    at(flight, 0.0, -1.0, sink_mps)
     flight.thrusts.append(1.0)
 
 
-def _jumps(jumped_m: float = 0.0, drift_m: float = 0.0) -> SimpleNamespace:
-    return SimpleNamespace(recent_m=lambda time_s: jumped_m, drift_m=drift_m)
-
-
-def _other_sender(flight: FlightState, since_s: float) -> None:
-    flight.vehicle.heard_s[OtherSender] = NOW_S - since_s
-
-
-def _contradicted(why: str) -> SimpleNamespace:
-    return SimpleNamespace(contradiction=why)
-
-
-def _follows(flight: FlightState, mode: str) -> None:
-    assert flight.authority is not None
+def follows(flight: Any, mode: str) -> None:
     hear(flight, ThrustReport(0.3))
-    flight.authority.mode = mode
-    flight.follows_others = True
+    flight.authority.mode, flight.follows_others = mode, True
+
+
+def jumps(recent_m: float, drift_m: float) -> SimpleNamespace:
+    return SimpleNamespace(recent_m=lambda time_s: recent_m, drift_m=drift_m)
 
 
 AGE_S = Limits().setpoint_age_s
-_hover = attribute("observer", lambda share: SimpleNamespace(hover_thrust_estimate=share))
+aged = clock(age_s=lambda age_s: lambda *_: age_s)
+hovers = holding(observer=lambda share: SimpleNamespace(hover_thrust_estimate=share))
 # row: how to set what it measures, a value that it allows, and one that it does not
 MEASURED: list[tuple[str, Measure, Any, Any]] = [
-    ("authority", _unheard, 2.5, 2.6),
-    ("silence", attribute("silence_s"), 1.0, 1.1),
-    ("blind", _blind, 0.5, 0.51),
-    ("age", _aged, AGE_S, 0.26),
-    ("link", _clock(delay_growth_s=float), 0.3, 0.31),
-    ("link", _aged, AGE_S, 0.26),
-    ("decision", attribute("missed"), 0, 1),
-    ("decisions", attribute("missed"), 2, 3),
-    ("tilt", _tilt, 1.29, 1.31),
-    ("tilt error", _tilt_error, 0.49, 0.51),
-    ("position error", _near_reference, 4.99, 5.01),
-    ("prediction", _predicted, 2.0, 2.01),
-    ("estimator", attribute("jumps", lambda m: _jumps(jumped_m=m)), 2.0, 2.1),
-    ("estimator", attribute("jumps", lambda m: _jumps(drift_m=m)), 2.0, 2.1),
-    ("positioning", _accuracy, (0.5, 3.0), (0.5, 3.1)),
-    ("positioning", _accuracy, (None, None), (0.5, None)),
-    ("positioning", _no_fix, 1.0, 2.1),
-    ("volume", lambda flight, height_m: _fly_at(flight, 0.0, -height_m), 120.0, 120.1),
-    ("volume", lambda flight, away_m: _fly_at(flight, away_m, -1.0), 1000.0, 1000.1),
+    ("authority", lambda flight, age_s: setattr(flight.authority, "heard_s", NOW_S - age_s),
+     2.5, 2.6),
+    ("silence", holding(silence_s=float), 1.0, 1.1),
+    ("blind", blind, 0.5, 0.51),
+    ("age", aged, AGE_S, 0.26),
+    ("link", clock(delay_growth_s=float), 0.3, 0.31),
+    ("link", aged, AGE_S, 0.26),
+    ("decision", holding(missed=int), 0, 1),
+    ("decisions", holding(missed=int), 2, 3),
+    ("tilt", tilt, 1.29, 1.31),
+    ("tilt error", tilt_from_commands, 0.49, 0.51),
+    ("position error", near_reference, 4.99, 5.01),
+    ("prediction", predicted, 2.0, 2.01),
+    ("estimator", holding(jumps=lambda jumped_m: jumps(jumped_m, 0.0)), 2.0, 2.1),
+    ("estimator", holding(jumps=lambda drift_m: jumps(0.0, drift_m)), 2.0, 2.1),
+    ("positioning", accuracy, (0.5, 3.0), (0.5, 3.1)),
+    ("positioning", accuracy, (None, None), (0.5, None)),
+    ("positioning", valid, frozenset(ESTIMATE), frozenset(ESTIMATE[:1])),
+    ("positioning", no_fix, 1.0, 2.1),
+    ("volume", lambda flight, height_m: at(flight, 0.0, -height_m), 120.0, 120.1),
+    ("volume", lambda flight, away_m: at(flight, away_m, -1.0), 1000.0, 1000.1),
     ("battery", lambda flight, left: hear(flight, SystemHealth(True, left)), 0.1, 0.09),
-    ("thrust reserve", _hover, 0.9, 0.91),
-    ("full thrust", _sinks, 0.3, 0.31),
-    ("second sender", _other_sender, 5.0, 4.9),
-    ("other setpoints", _follows, "POSCTL", "OFFBOARD"),
-    ("clock", _clock(jumped_s=float), 0.0, 0.6),
-    ("contradiction", attribute("identification", _contradicted), "", "out of bounds"),
-]
+    ("thrust reserve", hovers, 0.9, 0.91),
+    ("full thrust", sinks, 0.3, 0.31),
+    ("second sender",
+     lambda flight, since_s: flight.vehicle.heard_s.update({OtherSender: NOW_S - since_s}),
+     5.0, 4.9),
+    ("other setpoints", follows, "POSCTL", "OFFBOARD"),
+    ("clock", clock(jumped_s=float), 0.0, 0.6),
+    ("contradiction", holding(identification=lambda why: SimpleNamespace(contradiction=why)),
+     "", "out of bounds"),
+]  # fmt: skip
 
 
 def test_every_row_at_its_limit() -> None:
@@ -245,7 +240,7 @@ def test_another_program_may_be_allowed() -> None:
     for name in ("second sender", "other setpoints"):
         flight = uneventful()
         hear(flight, OtherSender(1, 190, 82))
-        _follows(flight, "OFFBOARD")
+        follows(flight, "OFFBOARD")
         assert BY_NAME[name].condition(flight)
         flight.limits = Limits(begin_with_other_sender=True)
         assert not BY_NAME[name].condition(flight)
@@ -254,9 +249,9 @@ def test_another_program_may_be_allowed() -> None:
 def test_what_only_our_setpoints_show_is_not_measured_in_other_phases() -> None:
     for name in ("thrust reserve", "full thrust", "other setpoints"):
         flight = uneventful(Phase.HOLD)
-        _sinks(flight, 5.0)
-        _follows(flight, "OFFBOARD")
-        _hover(flight, 1.0)
+        sinks(flight, 5.0)
+        follows(flight, "OFFBOARD")
+        hovers(flight, 1.0)
         assert not BY_NAME[name].condition(flight)
         flight.phase = Phase.TRACK
         assert BY_NAME[name].condition(flight)

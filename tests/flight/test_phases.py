@@ -49,13 +49,19 @@ def _set(**values: object) -> Setup:
     return lambda flight: [setattr(flight, name, value) for name, value in values.items()]
 
 
+def _all(*setups: Setup) -> Setup:
+    return lambda flight: [setup(flight) for setup in setups]
+
+
+def _since(seconds: float) -> Setup:
+    return _set(began_s=NOW_S - seconds)
+
+
 def _stand(standing: Standing, armed: bool | None = None) -> Setup:
-    def apply(flight: FlightState) -> None:
+    def apply(flight: Any) -> None:
         if armed is not None:
             heartbeat(flight, armed=armed)
-        assert flight.authority is not None
-        flight.authority.standing = standing
-        flight.authority.lost_s = NOW_S - 1.0
+        flight.authority.standing, flight.authority.lost_s = standing, NOW_S - 1.0
 
     return apply
 
@@ -66,23 +72,21 @@ def _disarm(flight: FlightState, for_s: float = 1.6, landed: str = "on_ground") 
     flight.began_s = flight.vehicle.armed_changed_s = NOW_S - for_s
 
 
-def _engage(flight: FlightState, **pilot: bool) -> None:
-    lift(flight)
-    flight.began_s = NOW_S - 0.6
-    for name, value in pilot.items():
-        setattr(flight.pilot, name, value)
+def _engage(**pilot: bool) -> Setup:
+    def apply(flight: FlightState) -> None:
+        lift(flight)
+        flight.began_s = NOW_S - 0.6
+        for name, value in pilot.items():
+            setattr(flight.pilot, name, value)
+
+    return apply
 
 
 def _fit(flight: FlightState) -> None:
     vars(flight.session)["ready"] = True
 
 
-def _all(*setups: Setup) -> Setup:
-    return lambda flight: [setup(flight) for setup in setups]
-
-
-def _unhear_mode(flight: FlightState) -> None:
-    assert flight.authority is not None
+def _unhear_mode(flight: Any) -> None:
     flight.authority.heard_s = -math.inf
 
 
@@ -105,10 +109,6 @@ def _refuse_arming(flight: FlightState) -> None:
     hear(flight, CommandAck(400, "ACCEPTED"))
     flight.vehicle.answered_s[400] = NOW_S - 2.6
     heartbeat(flight, armed=False)
-
-
-def _be_several(flight: FlightState) -> None:
-    flight.session.senders.ambiguous = lambda now_s: True  # type: ignore[method-assign]
 
 
 def _lift_off(flight: FlightState) -> None:
@@ -150,7 +150,7 @@ EVENTS: dict[str, Setup] = {
     "rebooted_in_flight": _set(rebooted=True),
     "rebooted_disarmed": _all(_set(rebooted=True), partial(_disarm, for_s=0.0, landed="in_air")),
     "needs_no_stream": _set(dialect=SimpleNamespace(takeoff=Takeoff.COMMAND)),
-    "streamed": _set(began_s=NOW_S - 1.0),
+    "streamed": _since(1.0),
     "engaged": partial(heartbeat, armed=False),
     "engaged_in_the_air": lift,
     "armed": partial(heartbeat, armed=True),
@@ -163,7 +163,9 @@ EVENTS: dict[str, Setup] = {
     "track_over": _track_for(TRACK.track_end_s),
     "at_rest": _track_for(TRACK.duration_s + 0.5),
     "other_sender": lambda flight: hear(flight, OtherSender(1, 190, 82)),
-    "other_vehicle": _be_several,
+    "other_vehicle": lambda flight: vars(flight.session.senders).update(
+        ambiguous=lambda now_s: True
+    ),
     "disarmed": _disarm,
     "disarmed_again": _refuse_arming,
     "disarmed_for_good": _disarm,
@@ -180,22 +182,22 @@ EVENTS: dict[str, Setup] = {
     "out_of_reach": _set(silence_s=OUTAGE_MAX_S + 0.1),
     "silent_on_ground": _set(silence_s=20.1),
     "not_found": _set(silence_s=20.1),
-    "not_ready_in_time": _set(began_s=NOW_S - Limits().health_s - 0.1),
-    "not_engaged": _set(began_s=NOW_S - Limits.engage_s - 0.1),
-    "not_armed": _set(began_s=NOW_S - Limits.arm_s - 0.1),
-    "still_armed": _set(began_s=NOW_S - Limits.disarm_s - 0.1),
-    "not_disarmed": _set(began_s=NOW_S - Limits().land_s - 0.1),
+    "not_ready_in_time": _since(Limits().health_s + 0.1),
+    "not_engaged": _since(Limits.engage_s + 0.1),
+    "not_armed": _since(Limits.arm_s + 0.1),
+    "still_armed": _since(Limits.disarm_s + 0.1),
+    "not_disarmed": _since(Limits().land_s + 0.1),
     "blind": _age_attitude,
     "stop_requested": _stop,
     "stopped_before_takeoff": _stop,
     "stop_requested_on_ground": _all(_rest, _set(stop_reason="stop requested")),
     "rises": _lift_off,
-    "engaged_by_pilot": _all(partial(_engage, engaged=True), _fit),
-    "engaged_but_unfit": partial(_engage, engaged=True),
+    "engaged_by_pilot": _all(_engage(engaged=True), _fit),
+    "engaged_but_unfit": _engage(engaged=True),
     "started_in_the_air": _all(lift, _fit, _set(request=Request.START)),
     "started_on_the_ground": _all(_fit, _set(request=Request.START)),
-    "engaged_too_soon": partial(_engage, hasty=True),
-    "abandoned": _all(partial(_engage, unclaimed=True), _set(left_engaged=True)),
+    "engaged_too_soon": _engage(hasty=True),
+    "abandoned": _all(_engage(unclaimed=True), _set(left_engaged=True)),
     "handed": _stand(Standing.HANDED),
     "failsafe_hold": lambda flight: setattr(flight.failsafe, "action", Action.HOLD),
     "failsafe_land": lambda flight: setattr(flight.failsafe, "action", Action.LAND),
@@ -217,8 +219,7 @@ def preflight_list(monkeypatch: pytest.MonkeyPatch) -> None:
 def event_of(row: Transition) -> Setup:
     name = row.condition.__name__
     if name.startswith("longer_than_"):
-        limit_s = getattr(Limits(), name.removeprefix("longer_than_"))
-        return _set(began_s=NOW_S - limit_s - 0.1)
+        return _since(getattr(Limits(), name.removeprefix("longer_than_")) + 0.1)
     return EVENTS[name]
 
 
@@ -238,7 +239,7 @@ def test_every_row_is_taken_when_its_condition_holds(service: ServiceOptions | N
 def test_every_wait_is_limited() -> None:
     for phase in {phase for row in table() for phase in row.phases}:
         flight = uneventful(phase)
-        later = _track_for(1e4) if phase in ON_TRACK else _set(began_s=NOW_S - 1e4)
+        later = _track_for(1e4) if phase in ON_TRACK else _since(1e4)
         if phase is Phase.CLIMB:
             later = _climb_late  # after the way that was planned
         if phase is Phase.CONNECT:
@@ -315,6 +316,19 @@ def test_a_vehicle_that_reboots_as_it_arms_counts_as_unheard_from_then_on() -> N
     telemetry.update(flight, Rebooted(0.0), NOW_S, turned_s=NOW_S)
     flight.now_s += 4.0
     assert flight.unreached_s == pytest.approx(4.0)
+
+
+def test_only_a_heartbeat_newer_than_the_acceptance_shows_a_disarming() -> None:
+    """On a lossy link arming may be accepted late, and the next HEARTBEAT be lost."""
+    flight = uneventful(Phase.ARM)
+    flight.now_s = flight.vehicle.now_s = NOW_S + 0.1
+    hear(flight, CommandAck(400, "ACCEPTED"))
+    flight.now_s = flight.vehicle.now_s = NOW_S + 2.7
+    assert next_row(flight) is None
+    heartbeat(flight, armed=False)
+    row = next_row(flight)
+    assert row is not None
+    assert row.target is Phase.STAND_DOWN
 
 
 def test_the_tables_of_the_readme_are_those_of_the_code() -> None:

@@ -1,182 +1,168 @@
-"""Recovery: what is asked of a vehicle without controller, against a table of what it shows."""
+"""Recovery: what the supervisor asks of a vehicle without controller.
+
+First against scripts of what the vehicle shows, then of a simulated PX4, whose own failsafe for
+missing setpoints acts, too. The process and its sockets are in `test_supervisor.py`.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 
 import pytest
+from pair import LEAN, QUICK_LANDING, hover, in_phase
+from watch import aborted, scenario_of
 
+from offboard.flight.phases import Phase
 from offboard.mavlink.dialects.ardupilot import ARDUPILOT
 from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.dialects.px4 import PX4
-from offboard.mavlink.events import CommandAck, Heartbeat, ModeReport, VehicleFound
+from offboard.mavlink.events import CommandAck, Event, Heartbeat, ModeReport, VehicleFound
+from offboard.mavlink.outgoing import AttitudeTarget, CommandLong
+from offboard.mavlink.session import Session, SessionSettings
 from offboard.supervisor.recovery import LONGEST_S, Recovery, Supervised
+from simulator import config
+from simulator.instance import Instance
+from simulator.steps import STEP_S
 
-STEP_S = 0.02
-FIRMWARES = pytest.mark.parametrize("dialect", [PX4, ARDUPILOT], ids=["px4", "ardupilot"])
 HOLD, LAND = 176, 21  # MAV_CMD_DO_SET_MODE, MAV_CMD_NAV_LAND
-OURS = Supervised(VehicleFound(7, 1, "px4"), ours=True, flying=True, reported_s=math.inf)
-
-
-class Vehicle:
-    """Shows its mode once a second, follows what is asked, and lands in `land_s`."""
-
-    def __init__(self, dialect: Dialect, *, obeys: bool = True, land_s: float = 8.0) -> None:
-        self.dialect = dialect
-        self.mode = dialect.engage_mode
-        self.obeys = obeys
-        self.acknowledges = obeys
-        self.loses = 0  # acknowledgements, on the link
-        self.armed = True
-        self.heard = True
-        self.land_s = land_s
-        self.asked: list[tuple[float, int]] = []
-        self.pilot: tuple[float, str] | None = None
-
-    def survives(self, before: str | None = None, *, holding: bool = False) -> str:
-        """Run to the end of the recovery, which has heard the mode `before` it began."""
-        recovery = Recovery(self.dialect, replace(OURS, holding=holding), 100.0)
-        if before:
-            recovery.see(Heartbeat(before, True, 4, 2), 99.6)
-        landing_s = 0.0
-        for step in range(round((LONGEST_S + 1.0) / STEP_S)):
-            time_s = step * STEP_S
-            if self.pilot and time_s >= self.pilot[0]:
-                self.mode = self.pilot[1]
-            elif self.mode == self.dialect.land_mode:
-                landing_s += STEP_S
-            self.armed = landing_s < self.land_s
-            if self.heard and step % 50 == 25:
-                recovery.see(Heartbeat(self.mode, self.armed, 4, 2), 100.0 + time_s)
-            request = recovery.due(100.0 + time_s)
-            if request:
-                self.asked.append((round(time_s, 2), request.command.command))
-                self.loses -= 1
-                if self.acknowledges and self.loses < 0:
-                    ack = CommandAck(request.command.command, "ACCEPTED")
-                    recovery.see(ack, 100.0 + time_s + STEP_S)
-                if self.obeys:
-                    landing = request.command.command == LAND
-                    self.mode = self.dialect.land_mode if landing else self.dialect.hold_mode
-            if recovery.ended:
-                return recovery.ended
-        return "never"
-
-
+FIRMWARES = pytest.mark.parametrize("dialect", [PX4, ARDUPILOT], ids=["px4", "ardupilot"])
+VEHICLE = VehicleFound(1, 1, "px4")
+OURS = Supervised(VEHICLE, ours=True, flying=True, reported_s=math.inf)
 DISARMED, TOO_LONG = "the vehicle is disarmed", f"not landed after {LONGEST_S:.0f} s"
-NOT_ASKED = "the vehicle shows {hold}, and has not acknowledged the request"
+Timed = tuple[float, Event]
+ACCEPTED = (0.05, CommandAck(HOLD, "ACCEPTED"))
 
 
-@FIRMWARES
-@pytest.mark.parametrize(
-    ("vehicle", "before", "ended", "commands"),
-    [
-        ({}, "engage", DISARMED, [HOLD, LAND]),
-        ({"heard": False}, None, TOO_LONG, [HOLD, HOLD, HOLD]),
-        # every request was lost, and its pilot or its failsafe has chosen hold
-        ({"acknowledges": False}, "engage", NOT_ASKED, [HOLD] * 5),
-        # as on a real PX4: the controller continued, and read the acknowledgement
-        ({"loses": 1}, "engage", DISARMED, [HOLD, HOLD, LAND]),
-        # also hold that we did not ask for: somebody decided it
-        ({}, "hold", "the vehicle shows {hold}", []),
-        ({}, "ALTCTL", "the vehicle shows ALTCTL", []),
-    ],
-    ids=["obeys", "not heard", "not acknowledged", "acknowledgement lost", "holds", "left"],
-)
-def test_what_is_asked(
-    dialect: Dialect, vehicle: dict[str, int], before: str | None, ended: str, commands: list[int]
-) -> None:
-    flown, modes = Vehicle(dialect), {"engage": dialect.engage_mode, "hold": dialect.hold_mode}
-    vars(flown).update(vehicle)
-    shown = modes.get(before or "", before)
-    assert flown.survives(before=shown).startswith(ended.format(**modes))
-    assert [command for _, command in flown.asked] == commands
-
-
-@FIRMWARES
-def test_hold_at_once_then_land_until_disarmed(dialect: Dialect) -> None:
-    vehicle = Vehicle(dialect)
-    assert vehicle.survives() == DISARMED
-    commands = [command for _, command in vehicle.asked]
-    assert vehicle.asked[0] == (0.0, HOLD)
-    assert commands == [HOLD] * (len(commands) - 1) + [LAND]
-    assert len(commands) <= 4  # hold is repeated until the first report
-    assert 5.0 <= vehicle.asked[-1][0] <= 6.6
-    holding = Vehicle(dialect)  # as the controller has asked
-    holding.mode = dialect.hold_mode
-    assert holding.survives(before=dialect.hold_mode, holding=True) == DISARMED
-    assert [command for _, command in holding.asked] == [LAND]
-
-
-@FIRMWARES
-def test_a_pilot_is_never_overridden(dialect: Dialect) -> None:
-    """His mode ends it with the first report; nothing is asked after that."""
-    mode = {"px4": "POSCTL", "ardupilot": "LOITER"}[dialect.name]
-    for pilot_s in (0.0, 0.2, 0.9, 3.0, 7.0, 12.0):
-        vehicle = Vehicle(dialect, obeys=pilot_s > 1.0, land_s=60.0)
-        vehicle.pilot = (pilot_s, mode)
-        assert vehicle.survives() == f"the vehicle shows {mode}: its pilot or its failsafe has it"
-        assert all(at_s < pilot_s + 1.02 for at_s, _ in vehicle.asked)
-        late = [at_s for at_s, _ in vehicle.asked if at_s > pilot_s]
-        assert len(late) <= 2  # asked before the first report
-
-
-@FIRMWARES
-def test_a_vehicle_that_refuses_to_hold_is_asked_to_land(dialect: Dialect) -> None:
-    vehicle = Vehicle(dialect, obeys=False)
-    assert vehicle.survives() == TOO_LONG
-    assert {command for at_s, command in vehicle.asked if at_s < 5.0} == {HOLD}
-    assert {command for at_s, command in vehicle.asked if at_s > 5.0} == {LAND}
-    assert len(vehicle.asked) <= 3 + LONGEST_S  # once for each report
-
-
-def asked(*reports: tuple[float, str], armed: bool = True) -> tuple[list[int], str]:
-    """What is asked of a PX4 that acknowledges hold 0.05 s after the request at 100 s, and shows
-    these modes at these times, and in its next HEARTBEAT whether it is `armed`; and how it
-    ended."""
-    recovery = Recovery(PX4, OURS, 100.0)
-    recovery.see(Heartbeat(PX4.engage_mode, True, 4, 2), 99.6)
-    commands = []
-    events = [(100.05, CommandAck(HOLD, "ACCEPTED")), *((t, ModeReport(m)) for t, m in reports)]
-    for step in range(601):
-        now_s = 100.0 + STEP_S * step
+def asked(
+    dialect: Dialect, *events: Timed, shown: str = "", known: Supervised = OURS
+) -> tuple[list[tuple[float, int]], str]:
+    """What is asked, and when, of a vehicle that has shown the mode `shown` 0.4 s before the
+    recovery begins at 0 s, and reports these `events` at these times; and how it ended."""
+    recovery, waiting = Recovery(dialect, known, 0.0), sorted(events, key=lambda each: each[0])
+    if shown:
+        recovery.see(Heartbeat(shown, True, 4, 2), -0.4)
+    commands: list[tuple[float, int]] = []
+    now_s, end_s = 0.0, 1.0 + (waiting[-1][0] if waiting else LONGEST_S)
+    while not recovery.ended and now_s < end_s:
         request = recovery.due(now_s)
-        commands += [request.command.command] if request else []
-        for at_s, event in events:
-            if now_s - STEP_S < at_s <= now_s + 1e-9 or (not step and at_s <= now_s):
-                recovery.see(event, at_s)
-    if not recovery.ended:
-        recovery.see(Heartbeat(reports[-1][1], armed, 4, 2), 112.1)
-        request = recovery.due(112.1)
-        commands += [request.command.command] if request else []
+        commands += [(now_s, request.command.command)] if request else []
+        while waiting and waiting[0][0] <= now_s:
+            at_s, event = waiting.pop(0)
+            recovery.see(event, at_s)
+        now_s = round(now_s + 0.02, 2)
     return commands, recovery.ended
 
 
-HOLDS = [(100.5 + 0.5 * n, PX4.hold_mode) for n in range(22)]
-LANDS = [(105.9 + 0.5 * n, PX4.land_mode) for n in range(12)]
+def beats(mode: str, first_s: float, last_s: float, *, armed: bool = True) -> list[Timed]:
+    """HEARTBEAT shows this mode once a second."""
+    count = math.floor(last_s - first_s) + 1
+    return [(first_s + number, Heartbeat(mode, armed, 4, 2)) for number in range(count)]
 
 
-@pytest.mark.parametrize("left_s", [100.01, 100.2, 100.31, 103.0])
-def test_a_pilot_who_switches_and_then_holds_is_left_alone(left_s: float) -> None:
-    """Also within 0.3 s of our request, and although the vehicle has acknowledged it."""
-    later = [(t, m) for t, m in HOLDS if t > left_s]
-    commands, ended = asked((left_s, "POSCTL"), (left_s + 0.001, PX4.hold_mode), *later)
-    assert commands == [HOLD]
-    assert ended.startswith("the vehicle shows POSCTL")
+def words(commands: list[tuple[float, int]]) -> list[int]:
+    return [command for _, command in commands]
 
 
-def test_hold_of_before_the_request_or_after_the_landing_mode_is_the_pilots() -> None:
-    """The first arrived before the request left, and was read after it."""
-    assert set(asked(*HOLDS)[0]) == {HOLD, LAND}
-    commands, ended = asked((99.99, PX4.hold_mode), *HOLDS)
-    assert (commands, ended[:30]) == ([HOLD], "the vehicle shows AUTO.LOITER:")
-    landing = [*((t, m) for t, m in HOLDS if t < 105.8), *LANDS[:3]]
-    assert asked(*landing) == ([HOLD, LAND], "")
-    commands, ended = asked(*landing, *((106.92 + 0.1 * n, PX4.hold_mode) for n in range(51)))
-    assert (commands, ended[:30]) == ([HOLD, LAND], "the vehicle shows AUTO.LOITER:")
-    left_as_it_disarms = asked(*landing, (107.5, PX4.hold_mode), armed=False)
-    assert left_as_it_disarms == ([HOLD, LAND], DISARMED)
+@FIRMWARES
+@pytest.mark.parametrize("answered_s", [0.05, 0.55], ids=["at once", "the second request"])
+def test_hold_at_once_then_land_until_disarmed(dialect: Dialect, answered_s: float) -> None:
+    """Also if the first acknowledgement is lost: on a real PX4 the controller had read it."""
+    commands, ended = asked(
+        dialect,
+        (answered_s, CommandAck(HOLD, "ACCEPTED")),
+        *beats(dialect.hold_mode, 0.5, 5.5),
+        *beats(dialect.land_mode, 6.5, 13.5),
+        *beats(dialect.land_mode, 14.5, 14.5, armed=False),
+        shown=dialect.engage_mode,
+    )
+    assert ended == DISARMED
+    assert commands[0] == (0.0, HOLD)
+    assert set(words(commands[:-1])) == {HOLD}
+    assert commands[-1][1] == LAND
+    assert 5.0 <= commands[-1][0] <= 6.6
+    assert len(commands) <= 3
+
+
+@FIRMWARES
+def test_only_what_is_ours_is_asked_for_more(dialect: Dialect) -> None:
+    """Hold that the vehicle has not acknowledged, or that it showed before, is somebody's choice;
+    one that the controller had asked for is ours."""
+    holds = beats(dialect.hold_mode, 0.5, 20.5)
+    commands, ended = asked(dialect, *holds, shown=dialect.engage_mode)
+    assert set(words(commands)) == {HOLD}
+    assert ended.startswith(f"the vehicle shows {dialect.hold_mode}, and has not acknowledged")
+    for shown in (dialect.hold_mode, "ALTCTL"):
+        commands, ended = asked(dialect, shown=shown)
+        assert (commands, ended.startswith(f"the vehicle shows {shown}")) == ([], True)
+    holding = replace(OURS, holding=True)
+    lands = [*holds[:5], *beats(dialect.land_mode, 5.5, 9.5, armed=False)]
+    commands, ended = asked(dialect, *lands, shown=dialect.hold_mode, known=holding)
+    assert (words(commands), ended) == ([LAND], DISARMED)
+
+
+@FIRMWARES
+def test_a_vehicle_that_is_not_heard_or_does_not_obey(dialect: Dialect) -> None:
+    """Three requests if nothing at all is heard; else one for each report, at last to land."""
+    commands, ended = asked(dialect)
+    assert (words(commands), ended) == ([HOLD] * 3, TOO_LONG)
+    commands, ended = asked(dialect, *beats(dialect.engage_mode, 0.5, LONGEST_S + 1.0))
+    assert ended == TOO_LONG
+    assert {command for at_s, command in commands if at_s < 5.0} == {HOLD}
+    assert {command for at_s, command in commands if at_s > 5.0} == {LAND}
+    assert len(commands) <= 3 + LONGEST_S
+
+
+@FIRMWARES
+@pytest.mark.parametrize("pilot_s", [0.2, 3.5, 12.5])
+def test_a_pilot_is_never_overridden(dialect: Dialect, pilot_s: float) -> None:
+    """Nothing is asked after the first report of his mode, before, in hold and in the landing."""
+    mode = {"px4": "POSCTL", "ardupilot": "LOITER"}[dialect.name]
+    obeyed = [*beats(dialect.hold_mode, 0.5, 5.5), *beats(dialect.land_mode, 6.5, 13.5)]
+    before = [(at_s, event) for at_s, event in obeyed if at_s < pilot_s]
+    commands, ended = asked(dialect, ACCEPTED, *before, *beats(mode, pilot_s, 20.5))
+    assert ended == f"the vehicle shows {mode}: its pilot or its failsafe has it"
+    assert all(at_s <= pilot_s for at_s, _ in commands)
+
+
+HOLDS = [(0.5 + 0.5 * n, ModeReport(PX4.hold_mode)) for n in range(22)]
+IN_LANDING = [*HOLDS[:10], *((5.9 + 0.5 * n, ModeReport(PX4.land_mode)) for n in range(3))]
+
+
+@pytest.mark.parametrize(
+    ("commands", "reports"),
+    [
+        # between our request and its effect, although the vehicle has acknowledged it
+        *(([HOLD], [(s, ModeReport("POSCTL")), *HOLDS]) for s in (0.01, 0.31, 3.1)),
+        # hold that arrived before the request left, and was read after it
+        ([HOLD], [(-0.01, ModeReport(PX4.hold_mode)), *HOLDS]),
+        # hold after the landing mode
+        ([HOLD, LAND], [*IN_LANDING, *((6.92 + 0.1 * n, HOLDS[0][1]) for n in range(51))]),
+    ],
+)
+def test_a_mode_that_was_not_asked_for_is_final(commands: list[int], reports: list[Timed]) -> None:
+    """Whatever is reported after it."""
+    beat = [(12.1, Heartbeat(reports[-1][1].mode, True, 4, 2))]  # type: ignore[attr-defined]
+    done, ended = asked(PX4, ACCEPTED, *reports, *beat, shown=PX4.engage_mode)
+    assert words(done) == commands
+    assert ended.startswith("the vehicle shows ")
+
+
+def test_the_failsafe_for_missing_setpoints_may_act_a_little_early() -> None:
+    """The newest setpoint left before the newest beat, and may have been lost."""
+    loss = PX4.setpoint_loss({"COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": POSCTL})
+    for at_s, end in ((0.6, "the vehicle shows POSCTL"), (0.8, DISARMED)):
+        falls = [(at_s, Heartbeat("POSCTL", True, 5, 2)), *beats("POSCTL", 2.0, 2.0, armed=False)]
+        known = replace(OURS, loss=loss)
+        _, ended = asked(PX4, *falls, shown=PX4.engage_mode, known=known)
+        assert ended.startswith(end)
+
+
+def test_leaving_the_landing_mode_as_it_disarms_is_no_choice() -> None:
+    left = [(7.5, ModeReport(PX4.hold_mode)), *beats(PX4.hold_mode, 12.1, 12.1, armed=False)]
+    commands, ended = asked(PX4, ACCEPTED, *IN_LANDING, *left, shown=PX4.engage_mode)
+    assert (words(commands), ended) == ([HOLD, LAND], DISARMED)
 
 
 def test_a_refusal_is_kept_to_be_said() -> None:
@@ -184,3 +170,116 @@ def test_a_refusal_is_kept_to_be_said() -> None:
     for result, refusal in (("ACCEPTED", ""), ("DENIED", "DENIED")):
         recovery.see(CommandAck(HOLD, result), 0.1)
         assert recovery.refusal == refusal
+
+
+# -- against the failsafe for missing setpoints ----------------------------------------------------
+
+POSCTL, RETURN, LANDS, LOITER = 0, 3, 4, 5  # COM_OBL_RC_ACT
+STREAM_S = 1.5
+
+
+@dataclass
+class Recovered:
+    """How a recovery ended, and what was asked until then: time, command, height."""
+
+    ended: str = ""
+    armed: bool = True
+    modes: list[str] = field(default_factory=list)
+    asked: list[tuple[float, int, float]] = field(default_factory=list)
+
+
+def recovered(
+    fallback: int,
+    silent_s: float,
+    arrives: Callable[[int], bool] = lambda command: True,
+    pilot: tuple[float, str] = (math.inf, ""),
+) -> Recovered:
+    """A PX4 that hovers at 4 m in OFFBOARD; its newest setpoint leaves at 0 s, and the supervisor
+    acts at `silent_s`. Its commands arrive if `arrives` says so; a `pilot` switches the mode."""
+    start = scenario_of(start={"height_m": 4.0, "mode": "OFFBOARD"})
+    vehicle, conditions = config.vehicle("px4_sih"), start.conditions
+    instance = Instance(LEAN, vehicle, conditions, 3, ground_link=False, start=start.start)
+    autopilot, commander = instance.autopilot, instance.autopilot.commander
+    for name, value in {"COM_OBL_RC_ACT": fallback, **QUICK_LANDING}.items():
+        autopilot.parameters.set(name, value)
+    session, result = Session(SessionSettings()), Recovered()
+    session.set_vehicle(VEHICLE, "vehicle")
+    instance.feed(session.encode(CommandLong.message_interval(436, 50.0)))  # CURRENT_MODE
+    level = session.encode(AttitudeTarget(0.0, 9.81, (0.0, 0.0, 1.0), 0.0, 0.489))
+    loss = PX4.setpoint_loss({"COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": fallback})
+    known = Supervised(VEHICLE, ours=True, flying=True, reported_s=0.0, loss=loss)
+    recovery: Recovery | None = None
+    for step in range(round(90.0 / STEP_S)):
+        now_s = step * STEP_S - STREAM_S
+        if now_s < 1e-9 and step % 25 == 0:
+            instance.feed(level)
+        if recovery is None and now_s >= silent_s:
+            recovery = Recovery(PX4, known, now_s, beat_s=0.0)
+        if now_s >= pilot[0]:
+            commander.switch(pilot[1])
+            pilot = (math.inf, "")
+        for datagram in instance.step():
+            for event in session.receive(datagram, "vehicle", 100.0 + now_s).events:
+                if recovery:
+                    recovery.see(event, now_s)
+        result.modes += [commander.mode.name] if commander.mode.name not in result.modes else []
+        request = recovery.due(now_s) if recovery else None
+        if request:
+            command, height_m = request.command.command, -autopilot.state.truth.position_ned_m[2]
+            result.asked.append((now_s, command, height_m))
+            if arrives(command):
+                instance.feed(session.encode(request.command))
+        if recovery and recovery.ended:
+            result.ended, result.armed = recovery.ended, commander.armed
+            return result
+    raise AssertionError(result)
+
+
+def test_the_supervisor_lands_it_before_the_failsafe() -> None:
+    loss = PX4.setpoint_loss({"COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": POSCTL})
+    assert replace(OURS, loss=loss).silent_s == pytest.approx(0.6)
+    result = recovered(POSCTL, 0.6)
+    assert (result.ended, result.armed) == (DISARMED, False)
+    assert result.modes[:3] == ["OFFBOARD", "AUTO.LOITER", "AUTO.LAND"]
+
+
+@pytest.mark.parametrize(
+    ("after_s", "fallback"), [(-0.004, POSCTL), (0.0, LOITER), (0.004, RETURN), (0.02, LANDS)]
+)
+def test_in_a_race_with_the_failsafe_it_is_landed(after_s: float, fallback: int) -> None:
+    """The supervisor acts so long after the failsafe; it took that mode for a pilot's and gave
+    up."""
+    result = recovered(fallback, 1.0 + after_s)
+    assert (result.ended, result.armed) == (DISARMED, False)
+
+
+@pytest.mark.parametrize(("fallback", "silent_s"), [(POSCTL, 1.2), (LOITER, 0.6)])
+def test_in_the_failsafe_it_is_watched_and_landed_if_it_does_not(
+    fallback: int, silent_s: float
+) -> None:
+    """Every request to hold is lost. POSCTL without sticks sinks by itself."""
+    result = recovered(fallback, silent_s, arrives=lambda command: command != HOLD)
+    assert (result.ended, result.armed) == (DISARMED, False)
+    landings_s = [at_s for at_s, command, height_m in result.asked
+                  if command == LAND and height_m > 0.1]  # fmt: skip
+    assert bool(landings_s) is (fallback == LOITER)
+    assert all(5.0 < at_s < 7.5 for at_s in landings_s)
+
+
+@pytest.mark.parametrize(("mode", "pilot_s"), [("POSCTL", 0.5), ("POSCTL", 3.0), ("ALTCTL", 1.3)])
+def test_a_pilots_choice_is_final_before_the_failsafe_and_in_it(mode: str, pilot_s: float) -> None:
+    """POSCTL is also the mode of the failsafe: HEARTBEAT shows none once it was chosen. Nothing
+    that is asked arrives."""
+    result = recovered(POSCTL, 1.2, arrives=lambda command: False, pilot=(pilot_s, mode))
+    assert result.ended == f"the vehicle shows {mode}: its pilot or its failsafe has it"
+    assert all(at_s < max(pilot_s, 1.2) + 1.1 for at_s, _, _ in result.asked)
+
+
+def test_a_controller_that_continues_before_the_supervisor_acts_lands_it() -> None:
+    """Setpoints were missing for longer than the vehicle allows. Shorter pauses are flown: see
+    `test_safety_time.py`."""
+    pair = hover("reference.duration_s=4.0", aloft=True)
+    pair.instance.autopilot.parameters.set("COM_OF_LOSS_T", 0.5)
+    pair.at.append((in_phase(Phase.TRACK, 1.0), lambda flying: flying.pause(0.9)))
+    aborted(pair)
+    assert not pair.armed
