@@ -22,10 +22,11 @@ class UserError(Exception):
     for is wrong; otherwise it may work another time."""
 
     is_usage = True
+    code = 2
 
-    def __init__(self, sentence: str, code: int = 2) -> None:
+    def __init__(self, sentence: str, code: int | None = None) -> None:
         super().__init__(sentence)
-        self.code = code
+        self.code = self.code if code is None else code
 
 
 class DocumentError(UserError):
