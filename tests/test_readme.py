@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import runpy
 import subprocess
 import sys
+import time
 from pathlib import Path
 from textwrap import dedent
+from typing import Any
 
 import numpy as np
 import pytest
 
 from offboard import cli
+from offboard.cli.commands import app
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 SCRIPTS = Path(sys.executable).parent
 LINES_MAX = 180
+REPORT_S = 60.0  # for the report on a busy machine
 
 
 def _examples() -> dict[str, list[str]]:
@@ -56,34 +62,58 @@ def test_the_workflow_leaves_out_only_tests_that_exist() -> None:
         assert wanted in (ROOT / file).read_text(), f"{file}::{test}"
 
 
-def test_first_command_flies_and_scores(tmp_path: Path) -> None:
+def test_the_first_command_flies_prints_and_scores_and_the_report_follows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     install, _, fly = _commands()[0].rpartition(" && ")
     assert "pip install ." in install
     program, *arguments = fly.split()
-    done = subprocess.run(
-        (str(SCRIPTS / Path(program).name), *arguments),
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert done.returncode == 0, done.stderr
-    assert "tracked error" in done.stdout
+    process = subprocess.Popen(
+        (SCRIPTS / Path(program).name, *arguments),
+        cwd=tmp_path, env={**os.environ, "COLUMNS": "80", "OFFBOARD_REPORT": "1"},
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stdout is not None
+    lines = []
+    for line in process.stdout:
+        lines.append(line)
+        if " track: " in line:  # each phase is printed when it begins
+            assert process.poll() is None
+            assert not list(tmp_path.rglob("score.json"))
+    assert (process.wait(), process.communicate()[1]) == (0, "")
     (flight,) = (tmp_path / "flights").iterdir()
-    assert {path.name for path in flight.iterdir()} >= {"flight.tlog", "flight.yaml", "score.json"}
-    assert json.loads((flight / "score.json").read_text())["rmse_position_m"] < 0.05
-    _compare_with_picture(flight)
+    score = json.loads((flight / "score.json").read_text())
+    assert score["rmse_position_m"] < 0.05
+    _check_phases(lines, score["phases"])
+    verdict, *rows = lines[lines.index("\n") + 1 :]
+    assert verdict == "flown and landed\n"
+    labels = [row[2:17].strip() for row in rows if row[2] != " "]
+    assert labels == ["tracked error", "true error", "timing", "identified", "log", "all figures",
+                      "report"]  # fmt: skip
 
-
-def _compare_with_picture(flight: Path) -> None:
-    """The README's picture shows the path of this flight, to within a pixel (1 cm)."""
-    script = ROOT / ".github" / "flight_picture.py"
-    drawn = subprocess.run(
-        (sys.executable, script, flight), capture_output=True, text=True, check=True, timeout=60
-    ).stdout
-    shown = (ROOT / ".github" / "flight.svg").read_text()
+    monkeypatch.setattr(sys, "argv", ["", str(flight)])
+    capsys.readouterr()
+    runpy.run_path(str(ROOT / ".github" / "flight_picture.py"), run_name="__main__")
+    drawn, shown = capsys.readouterr().out, (ROOT / ".github" / "flight.svg").read_text()
     assert _path(drawn).shape[0] > 200
-    np.testing.assert_allclose(_path(drawn), _path(shown), atol=1.0)
+    np.testing.assert_allclose(_path(drawn), _path(shown), atol=1.0)  # a pixel is 1 cm
+
+    report, until_s = flight / "report.html", time.monotonic() + REPORT_S
+    while not report.exists() and time.monotonic() < until_s:
+        time.sleep(0.1)
+    assert report.read_text(encoding="utf-8").endswith("</html>")
+    names = {path.name for path in flight.iterdir() if not path.name.startswith(".")}
+    assert names == {"flight.tlog", "flight.yaml", "score.json", "report.html"}
+
+
+def _check_phases(lines: list[str], logged: list[dict[str, Any]]) -> None:
+    """Each phase of the log is printed once, with its time, in lines of 80 columns."""
+    assert max(map(len, lines)) <= 81  # with the line break
+    words = [line.split() for line in lines[1 : lines.index("\n")]]
+    words = [each for each in words if each[1:2] == ["s"] and each[2] != "waiting:"]
+    phases = {what: float(time_s) for time_s, _, what, *_ in words if what.endswith(":")}
+    assert len(phases) == sum(what.endswith(":") for _, _, what, *_ in words) >= 10
+    assert phases == pytest.approx({e["what"].split()[0]: e["time_s"] for e in logged}, abs=0.01)
 
 
 def _path(picture: str) -> np.ndarray:
@@ -92,13 +122,8 @@ def _path(picture: str) -> np.ndarray:
     return np.array([pair.split(",") for pair in points.split()], dtype=float)
 
 
-@pytest.mark.parametrize(
-    "readme",
-    [
-        pytest.param(name, marks=[] if name == "README.md" else pytest.mark.slow)
-        for name in _examples()
-    ],
-)
+@pytest.mark.slow  # those of README.md itself: tests/process/test_pytest_plugins.py
+@pytest.mark.parametrize("readme", _examples().keys() - {"README.md"})
 def test_python_examples_run(readme: str, tmp_path: Path) -> None:
     blocks = _examples()[readme]
     for number, block in enumerate(blocks):
@@ -115,15 +140,9 @@ def test_python_examples_run(readme: str, tmp_path: Path) -> None:
     assert expected in done.stdout, f"{readme}: {done.stdout}{done.stderr}"
 
 
-def _subcommands() -> list[str]:
-    from offboard.cli.commands import app
-
-    return sorted(info.name or info.callback.__name__ for info in app.registered_commands)
-
-
-@pytest.mark.parametrize("command", _subcommands())
-def test_every_command_is_described(command: str) -> None:
-    assert f"offboard {command}" in README
+def test_every_command_is_described() -> None:
+    named = {info.name or info.callback.__name__ for info in app.registered_commands}
+    assert {name for name in named if f"offboard {name}" not in README} == set()
 
 
 def test_links_lead_to_files() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import resource
 import signal
 import socket
 import subprocess
@@ -18,7 +19,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 SHORT = ("--reference", "hover", "--set", "reference.duration_s=1", "--set", "reference.height_m=1",
          "--set", "identify.excite=false")  # fmt: skip
+RECORDING = Path(__file__).parents[1] / "wire" / "recordings" / "px4-1.16.1-offboard.tlog"
+CONFIG = Path(__file__).parents[2] / "config"
 SIGNING_EPOCH_S = 1_420_070_400  # 2015-01-01
+LONG_S = 60.0  # for what takes a moment on an idle machine
 HOVERS = """name: hovers
 description: A vehicle that hovers when its links open, and is healthy a second later.
 conditions: {boot_scale: 0.1}
@@ -54,14 +58,16 @@ def spawning(directory: Path) -> Iterator[Spawn]:
     for module in ("json", "pickle"):
         (directory / f"{module}.py").write_text("import os\nos._exit(99)\n")
 
-    def spawn(program: str, *arguments: object, **more: str) -> subprocess.Popen[str]:
+    def spawn(
+        program: str, *arguments: object, terminal: int | None = None, **more: str
+    ) -> subprocess.Popen[str]:
         process = subprocess.Popen(
             [sys.executable, "-P", "-m", program, *map(str, arguments)],
             cwd=directory,
             env={**os.environ, "PYTHONUNBUFFERED": "1", "COLUMNS": "200", **more},
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
+            stdin=subprocess.DEVNULL if terminal is None else terminal,
+            stdout=subprocess.PIPE if terminal is None else terminal,
+            stderr=subprocess.PIPE if terminal is None else terminal,
             text=True,
             start_new_session=True,
         )
@@ -93,6 +99,32 @@ def children(pid: int) -> list[int]:
     except OSError:
         return []
     return [int(child) for child in listing.split()]
+
+
+def ended(pid: int) -> bool:
+    """Whether a process has ended; one that nobody waits for has too."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except OSError:
+        return True
+
+
+def eventually(holds: Callable[[], object]) -> None:
+    deadline_s = time.monotonic() + LONG_S
+    while not holds():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.02)
+
+
+@contextmanager
+def full_disk(holds_bytes: int) -> Iterator[None]:
+    """A limit of the size of files stands for it."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (holds_bytes, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 def signing(system: int, component: int, key: bytes) -> Any:

@@ -1,4 +1,4 @@
-"""A companion over UDP for tests of the simulator's process: pymavlink and a socket, no more."""
+"""A companion or ground station over UDP for tests of processes: pymavlink and a socket."""
 
 from __future__ import annotations
 
@@ -14,49 +14,23 @@ from typing import Any
 from pymavlink.dialects.v20 import all as mavlink
 
 HOVER = 0.4895
-OFFBOARD = 0x00060000
-STOP_S = 5.0
-
-
-class Process:
-    """`python -m simulator` with its output, stopped at the end of the block."""
-
-    def __init__(self, *options: str) -> None:
-        self.popen = subprocess.Popen(
-            [sys.executable, "-m", "simulator", *options],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-
-    def ready_line(self) -> str:
-        """Its first line, printed when it is about to send."""
-        assert self.popen.stdout is not None
-        return self.popen.stdout.readline().strip()
-
-    def finish(self, timeout_s: float) -> tuple[int, str]:
-        """Wait for its own end; exit code and stderr."""
-        _, errors = self.popen.communicate(timeout=timeout_s)
-        return self.popen.returncode, errors
-
-    def stop(self) -> float:
-        """SIGTERM; seconds until it was gone."""
-        begun_s = time.monotonic()
-        self.popen.terminate()
-        self.popen.wait(STOP_S)
-        return time.monotonic() - begun_s
 
 
 @contextmanager
-def simulator(*options: str) -> Iterator[Process]:
-    process = Process(*options)
+def simulator(*options: str) -> Iterator[subprocess.Popen[str]]:
+    """`python -m simulator` with its output, gone at the end of the block."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "simulator", *options],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     try:
         yield process
     finally:
-        if process.popen.poll() is None:
-            process.popen.kill()
-        process.popen.communicate()
+        process.kill()
+        process.communicate()
 
 
 class Peer:
@@ -71,7 +45,7 @@ class Peer:
         self.vehicle: tuple[str, int] | None = None
         self.time_s = 0.0  # vehicle time of the newest position
         self.received: list[tuple[float, Any]] = []
-        self.raw = bytearray()
+        self.newest: dict[str, Any] = {}
         self.answers_timesync = True
         self._heartbeat_s = math.inf  # when the next is due
         self._parser = mavlink.MAVLink(None)
@@ -102,7 +76,6 @@ class Peer:
             assert remaining_s > 0, f"not reached within {wall_s} s of wall time"
             self._socket.settimeout(remaining_s)
             datagram, self.vehicle = self._socket.recvfrom(65535)
-            self.raw += datagram
             for message in self._parser.parse_buffer(datagram) or []:
                 if message.get_type() == "LOCAL_POSITION_NED":
                     self.time_s = message.time_boot_ms / 1000.0
@@ -112,6 +85,7 @@ class Peer:
                         each()
                         next_s += period_s
                 self.received.append((self.time_s, message))
+                self.newest[message.get_type()] = message
                 if message.get_type() == "TIMESYNC" and message.tc1 == 0 and self.answers_timesync:
                     self.send(mavlink.MAVLink_timesync_message(1, message.ts1))
 
@@ -138,8 +112,8 @@ class Peer:
             )
         )
 
-    def fly(self) -> None:
-        """Boot, engage, arm, climb and hover by attitude setpoints, then land and disarm."""
+    def climb(self) -> None:
+        """Boot, engage, arm, climb and hover by attitude setpoints."""
         self.listen(lambda: self.vehicle is not None)
         self.heartbeat()
         self.listen(lambda: self.time_s > 4.2)
@@ -149,5 +123,3 @@ class Peer:
         self.command(400, 1)
         self.listen(lambda: self.time_s > start_s + 2.0, each=lambda: self.attitude(1.15 * HOVER))
         self.listen(lambda: self.time_s > start_s + 3.0, each=lambda: self.attitude(HOVER))
-        self.command(21)
-        self.listen(lambda: "Disarmed by landing" in self.texts)

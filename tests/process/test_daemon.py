@@ -8,75 +8,66 @@ import shutil
 import signal
 import socket
 import subprocess
-import sys
 import time
 import urllib.error
 import urllib.request
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from threading import Event
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from processes import Called, Spawn, children, free_port, hovering, signing
+from processes import (
+    LONG_S,
+    Called,
+    Spawn,
+    children,
+    eventually,
+    free_port,
+    hovering,
+    signing,
+)
 from prometheus_client.parser import text_string_to_metric_families
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from sim_peer import Peer
 
 from offboard.analysis import tlog
 from offboard.analysis.score import as_text, score_flight
 from offboard.documents.signing_key import create_key, read_key
+from offboard.service import record
 
 SET_MODE = 176  # MAV_CMD
-LONG_S = 60.0
+OFFBOARD, HOLDING, RETURNING = 0x00060000, 0x03040000, 0x05040000
+ACTIVE = 4  # MAV_STATE
 ENGAGED = ("excite", "join", "track")
 
 
-class Pilot:
+@pytest.fixture
+def pilot() -> Iterator[Peer]:
     """A ground station on the simulator's second link, which switches modes."""
-
-    def __init__(self, key: bytes) -> None:
-        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.socket.bind(("127.0.0.1", 0))
-        self.socket.settimeout(2.0)
-        self.port = self.socket.getsockname()[1]
-        self._codec = signing(255, 190, key)
-
-    def command(self, number: int, *params: float) -> None:
-        filled = (*params, *(0.0,) * (7 - len(params)))
-        message = mavlink.MAVLink_command_long_message(1, 1, number, 0, *filled)
-        self.socket.sendto(message.pack(self._codec), self._peer)
-
-    def until(self, done: Any, repeat: Any = None) -> None:
-        """Read until `done(message)`; calls `repeat` about once a second."""
-        deadline_s, repeated_s = time.monotonic() + LONG_S, 0.0
-        parser = mavlink.MAVLink(None)
-        parser.robust_parsing = True
-        while time.monotonic() < deadline_s:
-            data, self._peer = self.socket.recvfrom(65535)
-            if repeat and time.monotonic() > repeated_s + 1.0:
-                repeated_s = time.monotonic()
-                repeat()
-            if any(done(message) for message in parser.parse_buffer(data) or ()):
-                return
-        raise AssertionError("the vehicle did not do it")
+    with Peer() as peer:
+        yield peer
 
 
-def shows(mode: int) -> Any:
-    return lambda m: m.get_type() == "HEARTBEAT" and m.custom_mode == mode
+def mode(pilot: Peer, number: int) -> Callable[[], bool]:
+    """Whether the vehicle's newest heartbeat shows this mode."""
+    return lambda: getattr(pilot.newest.get("HEARTBEAT"), "custom_mode", None) == number
 
 
-def scraped(port: int) -> dict[str, float]:
+def engage(pilot: Peer) -> None:
+    """Switch to OFFBOARD, again every second until the vehicle shows it."""
+    pilot.listen(mode(pilot, OFFBOARD), each=lambda: pilot.command(SET_MODE, 1, 6), period_s=1.0)
+
+
+def scraped(port: int) -> dict[str, Any]:
+    """The metrics by name, and the `phase`."""
     with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=5.0) as answer:
-        text = answer.read().decode()
-    return {
-        sample.name: sample.value
-        for family in text_string_to_metric_families(text)
-        for sample in family.samples
-    } | {"phase": _phase(text)}  # type: ignore[dict-item]
-
-
-def _phase(text: str) -> str:
-    (line,) = [each for each in text.splitlines() if each.startswith("offboard_state_info")]
-    return line.partition('phase="')[2].partition('"')[0]
+        families = text_string_to_metric_families(answer.read().decode())
+    samples = [sample for family in families for sample in family.samples]
+    (phase,) = (each.labels["phase"] for each in samples if each.name == "offboard_state_info")
+    return {sample.name: sample.value for sample in samples} | {"phase": phase}
 
 
 def health(port: int) -> tuple[int, dict[str, Any]]:
@@ -112,36 +103,37 @@ def many_strangers(port: int, service: int) -> list[socket.socket]:
     return strangers
 
 
-def test_a_pilot_engages_and_a_stop_hands_back(spawn: Spawn, tmp_path: Path) -> None:
+def test_a_pilot_engages_and_a_stop_hands_back(
+    spawn: Spawn, called: Called, pilot: Peer, tmp_path: Path
+) -> None:
     """In real time over UDP, signed, with monitoring and strangers that use up connections, a
     second service, another vehicle, SIGTERM in flight, and SIGKILL in the next one."""
     create_key(tmp_path / "key")
     key = read_key(tmp_path / "key")
-    port, web, pilot = free_port(), free_port(), Pilot(key)
-    link = f"udpin:127.0.0.1:{port}"
+    port, web = free_port(), free_port()
+    pilot.codec = signing(255, 190, key)
+    link, page = f"udpin:127.0.0.1:{port}", f"127.0.0.1:{web}"
     command = ("offboard", "daemon", "--connect", link, "--out", "out", "--log-json",
-               "--metrics", f"127.0.0.1:{web}", "--reference", "hover", "--system", "1",
+               "--metrics", page, "--reference", "hover", "--system", "1",
                "--signing-key", "key", "--set", "reference.duration_s=600")  # fmt: skip
-    variables = {"OFFBOARD_REPORT": "1", "XDG_STATE_HOME": str(tmp_path)}
+    variables = {"XDG_STATE_HOME": str(tmp_path)}
     service = spawn(*command, **variables)
     await_phase(service, web, "connect")
     assert health(web)[0] == 503
-    second = spawn("offboard", "daemon", "--connect", link, "--out", "other")
-    assert second.wait(LONG_S) == 3
-    assert second.stderr is not None
-    assert f"process {service.pid}" in second.stderr.read()
-    busy = spawn("offboard", "daemon", "--connect", f"udpin:127.0.0.1:{free_port()}",
-                 "--out", "third", "--metrics", f"127.0.0.1:{web}")  # fmt: skip
-    assert busy.wait(LONG_S) == 3
+    code, _, said = called("offboard daemon --out other --connect", link)
+    assert (code, f"process {service.pid}" in said) == (3, True)
+    code, _, said = called("offboard daemon --out third --connect udpin::PORT --metrics", page)
+    assert (code, f"{page} cannot be listened on" in said) == (3, True)
     other = mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 3, 3).pack(signing(9, 1, key))
-    pilot.socket.sendto(other, ("127.0.0.1", port))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as beside:
+        beside.sendto(other, ("127.0.0.1", port))
     spawn("simulator", "--signing-key", "key", "--connect", f"udpout:127.0.0.1:{port}",
           "--gcs", f"udpout:127.0.0.1:{pilot.port}", *hovering(tmp_path, 3.0),
           "--param", "COM_OF_LOSS_T=4")  # fmt: skip
     await_phase(service, web, "standby")
     strangers = many_strangers(web, service.pid)
-    pilot.until(shows(0x03040000))
-    pilot.until(shows(0x00060000), lambda: pilot.command(SET_MODE, 1, 6, 0))
+    pilot.listen(mode(pilot, HOLDING))
+    engage(pilot)
     await_phase(service, web, *ENGAGED)
     for stranger in strangers:  # all were left or refused before a client was served
         stranger.close()
@@ -153,7 +145,7 @@ def test_a_pilot_engages_and_a_stop_hands_back(spawn: Spawn, tmp_path: Path) -> 
     status, state = health(web)
     assert (status, state["mode"]) == (200, "OFFBOARD")
     service.send_signal(signal.SIGTERM)
-    pilot.until(shows(0x03040000))
+    pilot.listen(mode(pilot, HOLDING))
     out, error = service.communicate(timeout=LONG_S)
     assert (service.returncode, error) == (0, "")
     lines = [json.loads(line) for line in out.splitlines()]
@@ -161,10 +153,7 @@ def test_a_pilot_engages_and_a_stop_hands_back(spawn: Spawn, tmp_path: Path) -> 
     assert any("engaged: OFFBOARD in the air" in line["event"] for line in lines)
     assert sum("stop requested" in line["event"] for line in lines) == 1
     (flight,) = [path for path in (tmp_path / "out").iterdir() if (path / "flight.tlog").exists()]
-    deadline_s = time.monotonic() + LONG_S
-    while not (flight / "report.html").exists() and time.monotonic() < deadline_s:
-        time.sleep(0.1)
-    assert (flight / "report.html").read_text(encoding="utf-8").endswith("</html>")
+    eventually((flight / "score.json").exists)
     kept = (flight / "score.json").read_text()
     assert json.loads(kept)["phases"]
     assert kept == as_text(*score_flight(flight / "flight.tlog"))
@@ -176,43 +165,40 @@ def test_a_pilot_engages_and_a_stop_hands_back(spawn: Spawn, tmp_path: Path) -> 
     assert {"TUNNEL", "HEARTBEAT", "PARAM_VALUE", "SET_ATTITUDE_TARGET", "STATUSTEXT"} <= names
     killed = spawn(*command, **variables)
     await_phase(killed, web, "standby")
-    pilot.until(shows(0x00060000), lambda: pilot.command(SET_MODE, 1, 6, 0))
+    engage(pilot)
     await_phase(killed, web, *ENGAGED)
     killed.kill()
-    held = shows(0x03040000)
-    pilot.until(lambda m: held(m) and m.system_status == 4)  # asked by the supervisor: no failsafe
+    pilot.listen(mode(pilot, HOLDING))
+    assert pilot.newest["HEARTBEAT"].system_status == ACTIVE  # asked by the supervisor: no failsafe
     pilot.command(SET_MODE, 1, 4, 5)  # RTL, which ends the supervisor, too
-    pilot.until(shows(0x05040000))
+    pilot.listen(mode(pilot, RETURNING))
 
 
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        (("--config", "missing.yaml"), "missing.yaml cannot be read: No such file or directory"),
-        (("--signing-key", "missing.key"), "signing key missing.key"),
-        (("--out", "here"), "--out here: the unit can write below /var/lib/offboard alone"),
-    ],
-)
-def test_a_unit_that_could_not_start_is_not_printed(
-    arguments: tuple[str, ...], sentence: str, called: Called
+@pytest.mark.parametrize("report", [False, True])
+def test_a_flight_is_scored_or_reported_by_a_process_of_its_own(
+    report: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    code, unit, errors = called("offboard daemon", "--print-unit", *arguments)
-    assert (code, unit) == (2, "")
-    assert sentence in " ".join(errors.split())
+    begun: list[tuple[str, Path]] = []
+
+    def begin(command: str, directory: Path) -> Any:
+        begun.append((command, directory))
+        return SimpleNamespace(poll=lambda: 0)
+
+    monkeypatch.setattr(record, "begin", begin)
+    record.score(tmp_path, Event(), report=report)
+    assert begun == [("report" if report else "score", tmp_path)]
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")
-def test_the_unit_is_valid(tmp_path: Path) -> None:
+def test_the_unit_is_valid(called: Called, tmp_path: Path) -> None:
     (tmp_path / "my $ %.yaml").write_text("vehicle: neutral\ncontroller: lqr\nreference: hover\n")
     create_key(tmp_path / "my %.key")
-    told = subprocess.run(
-        [sys.executable, "-P", "-m", "offboard", "daemon", "--connect", "serial:/dev/ttyACM0:57600",
-         "--config", "./my $ %.yaml", "--signing-key", "my %.key", "--print-unit"],
-        capture_output=True, text=True, check=True, cwd=tmp_path,
-    )  # fmt: skip
-    printed = told.stdout
+    link = ("--connect", "serial:/dev/ttyACM0:57600")
+    files = ("--config", "./my $ %.yaml", "--signing-key", "my %.key")
+    code, printed, said = called("offboard daemon --print-unit", *link, *files)
+    assert code == 0
     assert f"the unit cannot see {tmp_path / 'my $ %.yaml'}: it has a tmp of its own" in (
-        " ".join(told.stderr.split())
+        " ".join(said.split())
     )
     unit = tmp_path / "offboard.service"
     unit.write_text(printed)

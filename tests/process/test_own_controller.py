@@ -15,7 +15,6 @@ import offboard.control
 from offboard.analysis import history, tlog
 from offboard.analysis.score import score
 from offboard.documents.reading import DocumentError
-from offboard.link.stop import StopRequests
 from offboard.run.configuration import load
 from offboard.run.flight import Simulated, fly
 from offboard.run.sitl import InMemorySimulator
@@ -46,11 +45,11 @@ def test_documented_controller_flies(
     site: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.syspath_prepend(site)
-    short = ("reference.duration_s=8", "reference.height_m=1")
+    short = ("reference.duration_s=4", "reference.height_m=1", "identify.online=false")
     config = load("flight", choices={"controller": "pd", "reference": "hover"}, assignments=short,
                   seed=7, known_vehicle="px4_sih")  # fmt: skip
-    simulator, vehicle = InMemorySimulator(), Simulated(scenario="calm")
-    outcome = fly(config, tmp_path / "x", vehicle, simulator=simulator, stops=StopRequests())
+    vehicle = Simulated(scenario="calm")
+    outcome = fly(config, tmp_path / "x", vehicle, simulator=InMemorySimulator())
     assert (outcome.exit_code, outcome.sentence) == (0, "flown and landed")
     scored = score(history.gather(tlog.read(tmp_path / "x" / "flight.tlog")))
     assert scored.rmse_position_m < 0.03

@@ -5,107 +5,74 @@ from __future__ import annotations
 import os
 import signal
 import socket
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import pytest
-from processes import children
+from processes import children, ended, eventually
 
-from offboard.run.sitl import SimulatorProcess
+from offboard.analysis import tlog
+from offboard.flight.flight import Flight
+from offboard.flight.phases import Phase
+from offboard.run.configuration import load
+from offboard.run.flight import Simulated, fly
+from offboard.run.sitl import Ending, SimulatorProcess
 
-HELLO = 65535
-
-
-@pytest.fixture(scope="module")
-def simulator() -> Iterator[SimulatorProcess]:
-    with SimulatorProcess() as simulator:
-        yield simulator
+KILLED = Ending("the bundled simulator ended (signal 9)", unusable=False)
+SHORT = ("reference.height_m=1", "identify.excite=false")
 
 
 @contextmanager
-def flying(simulator: SimulatorProcess, *options: str) -> Iterator[bytes]:
-    """A vehicle in lockstep, and the first datagram that it sent."""
+def flying(simulator: SimulatorProcess) -> Iterator[int]:
+    """A vehicle in lockstep that has sent something: its process id."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ours:
         ours.bind(("127.0.0.1", 0))
         ours.settimeout(30.0)
         port = ours.getsockname()[1]
-        simulator.launch(
-            ["--connect", f"udpout:127.0.0.1:{port}", "--gcs", "none", "--lockstep", *options]
-        )
-        yield ours.recv(HELLO)
+        simulator.launch(["--connect", f"udpout:127.0.0.1:{port}", "--gcs", "none", "--lockstep"])
+        assert ours.recv(65535)
+        (vehicle,) = children(simulator.pid)
+        yield vehicle
 
 
-def vehicles(simulator: SimulatorProcess) -> list[int]:
-    return children(simulator.pid)
-
-
-def gone(pid: int) -> bool:
-    """Whether a process that is no child of ours ends within ten seconds."""
-    for _ in range(1000):
-        if not Path(f"/proc/{pid}/exe").exists():
-            return True
-        time.sleep(0.01)
-    return False
-
-
-def test_vehicles_with_the_same_seed_send_the_same_datagram(simulator: SimulatorProcess) -> None:
-    hellos, pid = [], simulator.pid
-    for seed in ("1", "1", "2"):
-        with flying(simulator, "--scenario", "px4_like", "--seed", seed) as hello:
-            hellos.append(hello)
-            assert len(vehicles(simulator)) == 1
-            assert simulator.ended() is None
-        simulator.recall()
-        assert (vehicles(simulator), simulator.pid) == ([], pid)
-    assert hellos[0] == hellos[1] != hellos[2]
-
-
-def test_the_end_of_a_vehicle_is_reported_and_the_next_one_flies(
-    simulator: SimulatorProcess,
-) -> None:
-    with flying(simulator):
-        os.kill(vehicles(simulator)[0], signal.SIGKILL)
-        ending = simulator.ended(10.0)
-        assert ending is not None
-        assert (ending.sentence, ending.unusable) == (
-            "the bundled simulator ended (signal 9)",
-            False,
-        )
-    simulator.recall()
-    with flying(simulator):
-        assert simulator.ended() is None
-    simulator.recall()
-
-
-def test_wrong_options_are_reported_as_the_simulator_does(simulator: SimulatorProcess) -> None:
-    simulator.launch(["--scenario", "storm"])
-    ending = simulator.ended(10.0)
-    assert ending is not None
-    assert ending.unusable
-    assert ending.sentence.startswith("there is no scenario named 'storm'; known are")
-    simulator.launch(["--firmware", "betaflight"])
-    again = simulator.ended(10.0)
-    assert again is not None
-    assert again.sentence.startswith("--firmware betaflight: unknown")
-    with flying(simulator):
-        os.kill(vehicles(simulator)[0], signal.SIGKILL)
-        last = simulator.ended(10.0)
-        assert last is not None
-        assert last.sentence == "the bundled simulator ended (signal 9)"  # not the words before
-
-
-def test_a_pool_that_was_lost_is_replaced() -> None:
+def test_how_each_vehicle_ends_is_reported_and_the_next_one_flies() -> None:
     with SimulatorProcess() as simulator:
-        with flying(simulator):
-            lost, (orphan,) = simulator.pid, vehicles(simulator)
-            os.kill(lost, signal.SIGKILL)
+        pid = simulator.pid
+        for options, says in (
+            (["--scenario", "storm"], "there is no scenario named 'storm'; known are"),
+            (["--firmware", "betaflight"], "--firmware betaflight: unknown"),
+        ):
+            simulator.launch(options)
             ending = simulator.ended(10.0)
             assert ending is not None
-            assert ending.sentence == "the bundled simulator ended (signal 9)"
-        simulator.recall()
-        assert gone(orphan)
+            assert (ending.unusable, ending.sentence.startswith(says)) == (True, True)
+            with flying(simulator) as vehicle:
+                os.kill(vehicle, signal.SIGKILL)
+                assert simulator.ended(10.0) == KILLED  # not the words before
         with flying(simulator):
-            assert simulator.pid != lost
-    assert not Path(f"/proc/{simulator.pid}").exists()
+            assert simulator.ended() is None
+        simulator.recall()
+        assert (children(simulator.pid), simulator.pid) == ([], pid)
+
+
+def test_one_that_dies_in_flight_ends_it_and_is_replaced(tmp_path: Path) -> None:
+    lost: list[int] = []
+
+    def kill(companion: Flight) -> None:
+        if companion.phase is Phase.TRACK and not lost:
+            lost.extend((*children(simulator.pid), simulator.pid))
+            os.kill(simulator.pid, signal.SIGKILL)
+
+    config = load("flight", choices={"reference": "hover"}, assignments=SHORT)
+    with SimulatorProcess() as simulator:
+        outcome = fly(
+            config, tmp_path / "x", Simulated(scenario="calm"), simulator=simulator, progress=kill
+        )
+        assert (outcome.exit_code, outcome.sentence) == (4, KILLED.sentence)
+        log = tlog.read(tmp_path / "x" / "flight.tlog")
+        assert sum(entry.name == "SET_ATTITUDE_TARGET" for entry in log) > 50
+        orphan, pool = lost
+        eventually(lambda: ended(orphan))
+        with flying(simulator):
+            assert simulator.pid != pool
+    assert ended(simulator.pid)

@@ -9,7 +9,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from processes import Spawn
+from processes import Spawn, free_port
 
 ROOT = Path(__file__).parents[2]
 BUILD = (sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory")
@@ -19,9 +19,7 @@ COMPILING = "first flight with this code: compiling"
 
 
 @pytest.mark.slow
-def test_a_pure_wheel_flies_in_two_terminals_and_in_one(
-    spawn: Spawn, port: int, tmp_path: Path
-) -> None:
+def test_a_pure_wheel_flies_in_two_terminals_and_in_one(spawn: Spawn, tmp_path: Path) -> None:
     """In real time while both processes compile everything first, then with what they compiled."""
     built = tmp_path / "dist"
     subprocess.run((*BUILD, built), cwd=ROOT, check=True, capture_output=True, timeout=60)
@@ -33,6 +31,7 @@ def test_a_pure_wheel_flies_in_two_terminals_and_in_one(
         assert {Path(name).suffix for name in archive.namelist()} <= TEXT
     places = {"PYTHONPATH": str(site), "XDG_CACHE_HOME": str(cache)}
 
+    port = free_port()
     vehicle = ("--connect", f"udpout:127.0.0.1:{port}", "--gcs", "none")
     simulator = spawn("simulator", *vehicle, **places)
     connection = ("--connect", f"udpin:127.0.0.1:{port}", "--set", "limits.connect_s=120")

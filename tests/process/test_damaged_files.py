@@ -1,0 +1,183 @@
+"""Foreign and damaged logs, full disks, outputs that nobody reads: one sentence, the right exit
+code, and no file that is incomplete. Called in this process."""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from processes import RECORDING, Called, full_disk
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from offboard.analysis.score import keep_score, score_flight
+from offboard.campaign.results import Record
+from offboard.cli import fly
+from offboard.flight import inputs
+from offboard.flight.record import RECORD_COMPONENT_ID
+from offboard.link.log import LogError
+
+NOW_US = 1_790_000_000_000_000  # of an entry of a log
+NO_VEHICLE = "offboard fly --connect udpin:127.0.0.1:PORT --set limits.connect_s=0.3 --out x"
+
+
+def gigabytes() -> bytes:
+    """A log whose configuration unpacks to a thousand times its bytes, here to 40 MB."""
+    codec = dialect.MAVLink(None, srcSystem=1, srcComponent=RECORD_COMPONENT_ID)
+    log = io.BytesIO()
+    for piece in inputs.pieces(40_000_000 * " "):
+        data = list(piece.data.ljust(128, b"\0"))
+        message = codec.tunnel_encode(0, 0, piece.payload_type, len(piece.data), data)
+        log.write(NOW_US.to_bytes(8, "big") + message.pack(codec))
+    return log.getvalue() + RECORDING.read_bytes()
+
+
+def damaged() -> bytes:
+    data = bytearray(RECORDING.read_bytes())
+    data[8 + 12] ^= 0x40  # payload of the first frame
+    return bytes(data)
+
+
+DAMAGE = "x.tlog: 1 damaged entry was skipped, the first at byte 0\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "command", "code", "says"),
+    [
+        (b"", "score", 2, "is not a .tlog, or empty"),
+        (b"PK\3\4" + bytes(500), "score", 2, "is not a .tlog"),
+        (None, "score", 2, "x.tlog is not a regular file; name a flight directory or a .tlog file"),
+        (gigabytes(), "report", 2, "x.tlog: its configuration unpacks to more than 4000 kB\n"),
+        (RECORDING.read_bytes()[:-7], "score", 0, ""),
+        (damaged(), "score", 0, DAMAGE),
+        (damaged(), "identify", 0, DAMAGE),
+    ],
+    ids=["empty", "foreign", "a FIFO", "gigabytes", "cut off", "damaged", "damaged, identified"],
+)
+def test_a_log_is_read_as_far_as_it_is_one(
+    content: bytes | None, command: str, code: int, says: str, called: Called, tmp_path: Path
+) -> None:
+    if content is None:
+        os.mkfifo(tmp_path / "x.tlog")
+    else:
+        (tmp_path / "x.tlog").write_bytes(content)
+    ended, _, said = called(f"offboard {command} x.tlog")
+    assert (ended, said.count("\n")) == (code, 1 if says else 0)
+    assert says in said
+
+
+def test_nothing_identified_is_no_vehicle_file(called: Called, tmp_path: Path) -> None:
+    still = RECORDING.with_name("arducopter-4.6.3-guided.tlog")
+    code, _, said = called("offboard identify -o mine.yaml --page page.html", still)
+    assert code == 1
+    assert said == "nothing could be identified from this flight; page.html says why\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
+
+
+def test_the_page_of_a_second_identification_has_a_name_of_its_own(
+    called: Called, tmp_path: Path
+) -> None:
+    """Its title is the name of the flight directory, also of the working directory."""
+    (tmp_path / "flight.tlog").write_bytes(RECORDING.read_bytes())
+    (tmp_path / "identify.html").write_text("precious")
+    assert called("offboard identify .")[::2] == (0, "")
+    assert (tmp_path / "identify.html").read_text() == "precious"
+    assert f"<title>Flight {tmp_path.name}</title>" in (tmp_path / "identify-2.html").read_text()
+
+
+def test_a_score_that_cannot_be_written_is_reported(called: Called, tmp_path: Path) -> None:
+    (tmp_path / "x" / "score.json").mkdir(parents=True)
+    (tmp_path / "x" / "flight.tlog").write_bytes(RECORDING.read_bytes())
+    said = "x/score.json cannot be written (Is a directory)\n"
+    assert called("offboard score x")[::2] == (0, said)
+
+
+# --- a full disk ---
+
+
+def test_an_incomplete_score_is_not_kept(tmp_path: Path) -> None:
+    score, flown = score_flight(RECORDING)
+    with full_disk(100), pytest.raises(LogError, match=r"score\.json cannot be written"):
+        keep_score(tmp_path, score, flown)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_page_on_a_full_disk_leaves_no_file(called: Called, tmp_path: Path) -> None:
+    with full_disk(100):
+        code, _, said = called("offboard identify --page x.html -o x.yaml", RECORDING)
+    assert (code, said.count("\n")) == (2, 1)
+    assert said.startswith("x.html cannot be written (File")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_comparison_on_a_full_disk_says_what_cannot_be_written(
+    called: Called, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with ExitStack() as ended:
+
+        def flown(*_: object) -> Record:
+            ended.enter_context(full_disk(10))
+            return Record(4, "no vehicle", -1.0, "completed")
+
+        monkeypatch.setattr("offboard.campaign.workers.recorded", flown)
+        command = "offboard compare --connect udpin:127.0.0.1:PORT --controllers lqr --seeds 1"
+        code, _, said = called(command, "--out", "x")
+    assert (code, said.count("\n")) == (4, 1)
+    assert said.startswith("x cannot be written (File too large); ")
+
+
+@pytest.mark.parametrize(
+    ("command", "holds_bytes", "code"),
+    [("fly", 0, 2), ("daemon", 10, 3)],
+    ids=["fly", "daemon's signing time"],
+)
+def test_nothing_is_sent_where_a_disk_is_full(
+    command: str, holds_bytes: int, code: int, called: Called
+) -> None:
+    """The service manager starts a daemon again, which waits for room."""
+    called("offboard key key")
+    with full_disk(holds_bytes):
+        link = "--connect udpin:127.0.0.1:PORT --signing-key key --out x"
+        ended, _, said = called(f"offboard {command} {link}")
+    assert (ended, said.count("\n")) == (code, 1)
+    assert "File too large" in said
+
+
+# --- an output that takes nothing ---
+
+
+@pytest.mark.parametrize("command", ["offboard list", f"offboard score {RECORDING} --json"])
+def test_a_full_disk_behind_the_output_is_one_sentence(
+    command: str, called: Called, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "stdout", Path("/dev/full").open("w"))  # noqa: SIM115
+    said = "the output cannot be written: No space left on device\n"
+    assert called(command)[::2] == (2, said)
+
+
+def test_a_flight_whose_result_cannot_be_printed_keeps_its_exit_code(
+    called: Called, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full = Path("/dev/full").open("w", encoding="utf-8")  # noqa: SIM115
+
+    def printed(text: str, indent: int = 0) -> None:
+        monkeypatch.setattr(sys, "stdout", full)
+        print(text, flush="preparing" not in text)
+
+    monkeypatch.setattr(fly, "say", printed)
+    code, _, said = called(NO_VEHICLE)
+    assert code == 3
+    assert said.endswith("; the output cannot be written: No space left on device\n")
+
+
+def test_a_pipe_that_nobody_reads_is_no_missed_requirement(
+    called: Called, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Exit code 141 without a sentence, as of SIGPIPE."""
+    reads, writes = os.pipe()
+    os.close(reads)
+    monkeypatch.setattr(sys, "stdout", os.fdopen(writes, "w"))
+    assert called(f"offboard score {RECORDING}") == (141, "", "")

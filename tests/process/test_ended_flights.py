@@ -1,0 +1,174 @@
+"""Flights that end otherwise than planned: signals, terminals, pipes, disks. The log, not only the
+sentence, says that the vehicle landed."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+from processes import RECORDING, SHORT, Called, Spawn, children, ended, eventually, full_disk
+
+from offboard.analysis import history, tlog
+from offboard.run import flight as run
+
+NO_VEHICLE = "offboard fly --connect udpin:127.0.0.1:PORT --set limits.connect_s=0.3 --out x"
+
+
+def flown(directory: Path) -> history.History:
+    return history.gather(tlog.read(directory / "x" / "flight.tlog"))
+
+
+def test_ctrl_c_lands_though_ctrl_s_has_stopped_the_terminal(spawn: Spawn, tmp_path: Path) -> None:
+    terminal, theirs = pty.openpty()
+    process = spawn(
+        "offboard", "fly", "--sitl", "--scenario", "calm", "--out", "x", *SHORT,
+        "--set", "reference.duration_s=3600", terminal=theirs, COLUMNS="80", TERM="dumb",
+    )  # fmt: skip
+    os.close(theirs)
+    printed = b""
+    while b"track: " not in printed:
+        printed += os.read(terminal, 65536)
+    os.write(terminal, b"\x13")  # Ctrl-S
+    os.killpg(process.pid, signal.SIGINT)  # Ctrl-C reaches all processes of a terminal
+    eventually(lambda: b"disarmed: " in (tmp_path / "x" / "flight.tlog").read_bytes())
+    assert process.poll() is None
+    os.write(terminal, b"\x11")  # Ctrl-Q
+    with suppress(OSError):  # nobody is left to print
+        while True:
+            printed += os.read(terminal, 65536)
+    os.close(terminal)
+    assert process.wait(timeout=30) == 4
+    lines = printed.decode().replace("\r", "\n").splitlines()
+    assert max(map(len, lines)) <= 80
+    sentence = "stop requested by the operator (log: x/flight.tlog)"
+    assert " ".join(line.strip() for line in lines).count(sentence) == 1
+    assert "AUTO.LAND" in [mode.what for mode in flown(tmp_path).modes]
+    assert flown(tmp_path).phases[-1].what.startswith("disarmed")
+
+
+def test_ended_before_the_flight_it_leaves_no_simulator(spawn: Spawn, tmp_path: Path) -> None:
+    process = spawn("offboard", "fly", "--sitl", "--out", "x")
+    while process.poll() is None and not children(process.pid):
+        time.sleep(0.01)
+    (simulator,) = children(process.pid)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        process.send_signal(number)
+        time.sleep(1.05)  # a second one within a second is the same request
+    _, said = process.communicate(timeout=60)
+    assert (process.returncode, said) == (130, "interrupted before anything was sent\n")
+    eventually(lambda: ended(simulator))  # hit while it started: it ends by itself, alone
+    assert not (tmp_path / "x").exists()
+
+
+def interrupted_while_compiling(*_: object, **__: object) -> float:
+    """A rehearsal: what is raised in a callback of the compiler goes no further than that."""
+    ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGINT))()
+    return 0.0
+
+
+def test_interrupted_while_it_compiles_it_does_not_fly(
+    called: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run, "rehearse", interrupted_while_compiling)
+    assert called(NO_VEHICLE)[::2] == (130, "interrupted before anything was sent\n")
+    assert not list(tmp_path.iterdir())
+
+
+def test_no_vehicle(called: Called, tmp_path: Path) -> None:
+    code, _, said = called(NO_VEHICLE)
+    assert (code, said.count("\n")) == (3, 1)
+    assert said.startswith("no vehicle heard in 0 s; is it running, and sending to this port?")
+    log = tlog.read(tmp_path / "x" / "flight.tlog")
+    assert history.configuration(log) == (tmp_path / "x" / "flight.yaml").read_text()
+    assert flown(tmp_path).phases[-1].phase == "failed"
+
+
+@pytest.mark.usefixtures("in_memory")
+def test_a_full_disk_lands(called: Called, tmp_path: Path) -> None:
+    with full_disk(380_000):
+        code, shown, said = called("offboard fly --sitl --out x", *SHORT)
+    assert (code, said.count("\n")) == (4, 1), said
+    assert "flight.tlog cannot be written (File too large)" in said
+    assert "land: the log x/flight.tlog cannot be written (File too large)" in shown
+    assert "by the operator" not in shown
+    assert sum(1 for _ in tlog.read(tmp_path / "x" / "flight.tlog")) > 1000
+
+
+@pytest.mark.usefixtures("in_memory")
+def test_a_pipe_that_closes_ends_no_flight(
+    called: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reads, writes = os.pipe()
+    os.close(reads)
+    monkeypatch.setattr(sys, "stdout", os.fdopen(writes, "w"))
+    assert called("offboard fly --sitl --out x", *SHORT)[0] == 0
+    assert flown(tmp_path).phases[-1].what.startswith("disarmed")
+
+
+@pytest.mark.usefixtures("in_memory")
+def test_json_lines_end_with_the_result_and_the_live_page_is_announced(
+    called: Called, tmp_path: Path
+) -> None:
+    shows = ("--json-lines", "--live", "127.0.0.1:0", "--require", "rmse_position_m<0")
+    code, shown, said = called("offboard fly --sitl --scenario calm --out x", *SHORT, *shows)
+    assert (code, said) == (1, "")
+    *others, result = (json.loads(line) for line in shown.splitlines())
+    assert others[0]["text"].startswith("live: http://127.0.0.1:")
+    assert {each["type"] for each in others} == {"preparation", "announcement", "snapshot"}
+    assert (result["type"], result["exit_code"], result["completed"]) == ("result", 1, True)
+    assert result["requirements"].startswith("rmse_position_m is ")
+    score = json.loads((tmp_path / "x" / "score.json").read_text())
+    assert result["figures"]["rmse_position_m"] == float(f"{score['rmse_position_m']:.9g}")
+    times = [each["time_s"] for each in others if each["type"] == "snapshot"]
+    assert times[1:] == [float(second) for second in range(1, len(times))]
+
+
+# --- a process that ends as its console script does ---
+
+IMPORTS = """
+import builtins, signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+import offboard.cli
+count, real = 0, builtins.__import__
+def imported(*arguments, **named):
+    global count
+    count += 1
+    if count == 100:
+        signal.raise_signal(signal.SIGINT)
+    return real(*arguments, **named)
+builtins.__import__ = imported
+"""
+CLOSED = "import os; r, w = os.pipe(); os.close(r); os.dup2(w, 1)"
+
+
+@pytest.mark.parametrize(
+    ("begin", "command", "code", "said"),
+    [
+        (IMPORTS, ["--help"], 130, "interrupted\n"),  # by the 100th import of `main`
+        (CLOSED, ["score", str(RECORDING)], 141, ""),  # nobody reads it: as SIGPIPE
+    ],
+    ids=["interrupted import", "closed pipe"],
+)
+def test_a_process_ends_in_order(begin: str, command: list[str], code: int, said: str) -> None:
+    script = f"import sys; sys.argv = {['offboard', *command]!r}\n{begin}\n"
+    script += "from offboard.cli import main\nsys.exit(main())"
+    answer = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert (answer.returncode, answer.stderr) == (code, said)
+
+
+def test_an_interrupted_score_is_one_sentence(
+    called: Called, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stop: Callable[[object], None] = lambda _: signal.raise_signal(signal.SIGINT)  # noqa: E731
+    monkeypatch.setattr("offboard.analysis.score.score_flight", stop)
+    assert called("offboard score", RECORDING) == (130, "", "interrupted\n")

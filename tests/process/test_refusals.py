@@ -1,0 +1,332 @@
+"""Bad options, files and values, called in this process: one sentence (what, where, what to do) and
+exit code 2, before anything is sent or written."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import socket
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import typer
+from processes import CONFIG, RECORDING, Called
+
+from offboard.cli.commands import app as offboard
+from offboard.documents.errors import UserError
+from offboard.run import flight as run
+from simulator.command import app as simulator
+
+Refused = Callable[..., str]
+FLY = "offboard fly --connect udpin:127.0.0.1:PORT --set limits.connect_s=0.1"
+SIMULATOR = "simulator --gcs none"
+COMPARE = "offboard compare --controllers lqr --scenario calm"
+LONG, DIGITS = 300 * "n", 5000 * "9"
+SWARM = "controller.swarm={particles: 10000, iterations: 100000}"
+SLOW = "--set controller.steps=40 --set controller.swarm.particles=2000 --set deadline_s=0.0006"
+EMPTY, NO_TEXT = "the value is empty; is a variable unset?", r"'caf\udce9' is not UTF-8"
+SPHERE = {"shape": "sphere", "north_m": 0, "east_m": 0, "height_m": 3, "radius_m": 0.5}
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ("--firmware frog", "--firmware frog: unknown; there is px4, ardupilot"),
+        ("--sim-vehicle tank", "there is no vehicle named 'tank'; known are arducopter"),
+        ("--scenario no.yaml", "no.yaml cannot be read: No such file"),
+        ("--connect tcp:127.0.0.1:1", "--sitl starts its own simulator: use --sitl or --connect"),
+    ],
+)
+def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
+    options: str, says: str, refused: Refused, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run, "build", pytest.fail)
+    assert says in refused(f"offboard fly --sitl {options}")
+
+
+@pytest.mark.parametrize(
+    ("options", "value", "says"),
+    [
+        ("--config", "nonsense", "no configuration named 'nonsense'; known are flight, paper"),
+        ("--reference", "spiral", "no reference named 'spiral'; known are circle"),
+        ("--reference", "missing.csv", "missing.csv cannot be read: No such file"),
+        ("--set", "period_s=7", "period_s: 7 should be less than or equal to 0.5"),
+        ("--set", "controller.seed=3", "controller.seed is not a known key"),
+        ("--set", "controller.law=frog", "controller: law: 'frog' is not one of pso, lqr,"),
+        ("--set", "controller=pid2", "no controller named 'pid2'; known are"),
+        ("--set", "controller.bandwidth_radps=fast", "'fast' should be a valid number"),
+        ("--seed", "-1", "--seed -1: seed: -1 should be greater than or equal to 0"),
+        ("--set", "vehicle.drag_translation_npmps=[0, 0, 1e9]", "must be at most 100 per kg"),
+        ("--set", "reference.height_m=100", "from 100 m takes 200 s at 0.5 m/s, longer than"),
+        ("--set", "limits.radius_m=1.5", "it goes 2 m away from the take-off point, beyond limits"),
+        ("--set", "vehicle.hover_thrust=0.92", "0.92 exceeds limits.hover_thrust (0.9)"),
+        ("--set", SWARM, "particles x iterations must be at most 500000, not 1000000000"),
+        ("--require", "rmse<1", "there is no metric 'rmse'; there are completed, touchdown_mps,"),
+        ("--connect", "udpin:127.0.0.1:0", "give the port that the vehicle sends to"),
+        ("--connect", "udpin:127.0.0.1", "is not understood; use udpin:HOST:PORT"),
+        ("--connect", "udpin:::1:14540", "an IPv6 address stands in brackets, as in udpin:[::1]"),
+        ("--signing-key", "/dev/null", "signing key /dev/null is not a file"),
+        ("--signing-key", "none", "signing key none cannot be read: No such file or directory"),
+        ("--out", "/proc/nowhere", "choose a directory that can be written with --out"),
+        ("--firmware", "px4", "--firmware are options of --sitl: add it"),
+        ("--vehicle", CONFIG / "campaigns" / "quick.yaml", "is a campaign file; a vehicle file is"),
+        ("--reference", "", "--reference: the value is empty; is a variable unset?"),
+        ("--out", "--sitl", "--out: '--sitl' is an option, not a value; is a variable unset?"),
+        ("--controller horizon --set", f"controller.keep_out={json.dumps([SPHERE])}",
+         "keep_out[0] (sphere) contains the start of the reference"),
+        ("--controller horizon --set", "controller.keep_out=[{shape: cone}]", "keep_out"),
+        (f"{SLOW} --controller", "horizon", "longer than deadline_s (0.6 ms); plan fewer steps"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_flown_is_refused(
+    options: str, value: object, says: str, refused: Refused
+) -> None:
+    assert says in refused(f"{FLY} {options}", value)
+
+
+@pytest.mark.parametrize(
+    ("command", "says"),
+    [
+        ("offboard doctor gsp", "there is no check named 'gsp'; known are port, vehicle,"),
+        ("offboard doctor --connect nowhere", "connection 'nowhere' is not understood; use udpin:"),
+        ("offboard daemon --print-unit --config no.yaml", "no.yaml cannot be read: No such file"),
+        ("offboard daemon --print-unit --signing-key no", "signing key no"),
+        ("offboard daemon --print-unit --out here", "can write below /var/lib/offboard alone"),
+        ("--scenario storm", "there is no scenario named 'storm'; known are all_together, "),
+        ("--vehicle no/such.yaml", "no/such.yaml cannot be read: No such file"),
+        ("--firmware betaflight", "--firmware betaflight: unknown; there is px4"),
+        ("--connect tcp:127.0.0.1:1", "tcp:127.0.0.1:1 is not a link"),
+        ("--connect udpout:127.0.0.1:99999", "is not a link"),
+        ("--speed 0", "--speed 0: must be 0.1 .. 1000"),
+        ("--speed nan", "--speed nan: must be 0.1 .. 1000"),
+        ("--speed 2 --lockstep", "exclude each other"),
+        ("--seed -1", "--seed"),
+        ("--log no/x.tlog", "--log no/x.tlog cannot be written: No such file or directory"),
+        ("--instances 2 --lockstep", "--lockstep and --instances exclude each other"),
+        ("--instances 20 --instance 240", "system ids end at 250"),
+    ],
+)
+def test_other_commands_refuse_alike(command: str, says: str, refused: Refused) -> None:
+    assert says in refused(command if command.startswith("offboard") else f"{SIMULATOR} {command}")
+
+
+def test_an_unknown_option_is_named(called: Called) -> None:
+    for command in (FLY, SIMULATOR):
+        code, _, said = called(command, "--no-such-option")
+        assert (code, "No such option" in said) == (2, True)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        *(f"{FLY} --config {LONG}", f"{FLY} --reference {LONG}.csv", f"{FLY} --out {LONG}"),
+        *(f'{FLY} --set vehicle="a\\0/b"', f'{FLY} --set vehicle.name="\\ud800"'),
+        *(f"{FLY} --set controller.{DIGITS}=1", f"{FLY} --connect udpin:127.0.0.1:{DIGITS}"),
+        *(f"{FLY} --connect udpin:127.0.0.1:²", f"{FLY} --connect udpin:a..b:14540"),
+        f"{FLY} --connect serial:/dev/null:9999999999",
+        *(f"{COMPARE} --out {LONG}", f"offboard score {LONG}"),
+        *(f"offboard identify {RECORDING} -o no/{LONG}", f"offboard report {RECORDING} -o {LONG}"),
+        *(f"{SIMULATOR} --scenario {LONG}.yaml", f"{SIMULATOR} --log /dev/full --duration 0.1"),
+        *(f"{SIMULATOR} --connect udpin:a..b:14540", f"{SIMULATOR} --duration nan"),
+    ],
+)
+def test_a_name_or_number_beyond_every_limit_is_refused(command: str, refused: Refused) -> None:
+    assert len(refused(command)) < 600
+
+
+def test_a_seed_of_many_digits_is_refused(refused: Refused) -> None:
+    assert "--seed" in refused(f"{FLY} --seed {DIGITS}")
+
+
+@pytest.mark.parametrize("app", [offboard, simulator], ids=["offboard", "simulator"])
+def test_no_value_is_empty_or_no_text(app: typer.Typer) -> None:
+    """Of no option and argument of any command, as `--connect "$LINK"` of an unset variable."""
+    command = typer.main.get_command(app)
+    commands = getattr(command, "commands", {"": command}).values()
+    values = [(each, value) for each in commands for value in each.params if value.nargs]
+    values = [(each, value) for each, value in values if not getattr(value, "is_flag", False)]
+    assert len(values) >= 15
+    for each, value in values:
+        option, label = value.opts[-1:], value.opts[-1]
+        if value.param_type_name == "argument":
+            option, label = [], value.metavar
+        for text, says in (("", EMPTY), (" \t", EMPTY), (os.fsdecode(b"caf\xe9"), NO_TEXT)):
+            with pytest.raises(UserError) as refused:
+                each.make_context("command", [*option, text])
+            assert str(refused.value) == f"{label}: {says}"
+
+
+# --- files ---
+
+CSV = "time_s,north_m,east_m,altitude_m\n0,0,0,3\n3,2,0,3\n6,2,{east},4\n9,0,0,3\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("flight.yaml", "vehicle: px4_sih", "flight.yaml: controller is missing"),
+        ("flight.yaml", "seed: 3", "flight.yaml: reference is missing; give a name, a file or a"),
+        ("flight.yaml", "controler: pso", "controller is missing (is it meant by controler?)"),
+        ("flight.yaml", "# nothing yet", "flight.yaml is empty"),
+        ("path.csv", "", "path.csv is empty: it needs a header and at least 4 rows"),
+        ("mine.yaml", "mas_kg: 1", "mas_kg is not a known key, did you mean mass_kg?"),
+        ("mine.yaml", "hover_thrust: 0.5", "mine.yaml: mass_kg is missing"),
+        ("law.yaml", "bandwidth_radps: 5", "law.yaml: law is missing; known are pso, lqr,"),
+        ("path.csv", CSV.format(east="two"), "path.csv, row 4, column east_m: 'two' is not a"),
+        ("path.csv", CSV.format(east=90), "reference path.csv: the reference asks for"),
+        ("path.csv", CSV.format(east=1e300), "a distance of inf m at"),
+        ("circle.yaml", "shape: circle\nperiod_s: 0", "circle.yaml, line 2, column 1: period_s: 0"),
+        ("storm.yaml", "name: s\nconditions: {thrust_scale: 9}",
+         "storm.yaml, line 2, column 14: conditions.thrust_scale: 9 should be less"),
+        ("storm.yaml", "name: s\nfaults: [{kind: frogs}]", "storm.yaml, line 2, column 1: faults."),
+        ("c.yaml", "parameters: {seed: [1]}\nrequire: [x<1]", "require.0: there is no metric 'x'"),
+    ],
+)  # fmt: skip
+def test_every_kind_of_file_is_checked(
+    name: str, content: str, says: str, called: Called, tmp_path: Path
+) -> None:
+    (tmp_path / name).write_text(content)
+    code, _, said = called("offboard check", name)
+    assert (code, "Traceback" in said) == (2, False)
+    assert says in said
+
+
+def test_all_shipped_files_are_valid(called: Called) -> None:
+    files = [path for path in CONFIG.rglob("*.yaml") if "scenarios" not in path.parts]
+    assert len(files) > 25
+    scenario = CONFIG / "scenarios" / "all_together.yaml"
+    assert called("offboard check", scenario, *files)[::2] == (0, "")
+
+
+def test_of_many_errors_the_first_ten_are_printed(called: Called, tmp_path: Path) -> None:
+    (tmp_path / "x.yaml").write_text("law: pid\n" + "".join(f"key_{n}: 1\n" for n in range(5000)))
+    code, _, said = called("offboard check", "x.yaml")
+    lines = said.splitlines()
+    assert (code, len(lines), lines[-1]) == (2, 11, "x.yaml: and 4990 more problems")
+    assert lines[0].startswith("x.yaml, line 2, column 1: key_0 is not a known key")
+
+
+FILES: dict[str, Callable[[Path], object]] = {
+    "a FIFO": os.mkfifo,
+    "/dev/zero": lambda path: path.symlink_to("/dev/zero"),
+    "a directory": Path.mkdir,
+    "larger than 500 kB": lambda path: path.write_text("# comment\n" * 60_000),
+}
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_only_regular_files_of_a_bounded_size_are_read(
+    kind: str, refused: Refused, tmp_path: Path
+) -> None:
+    FILES[kind](tmp_path / "x.yaml")
+    reason = kind if kind.startswith("larger") else "not a regular file"
+    for command in ("offboard check", "simulator --vehicle"):
+        assert f"x.yaml cannot be read: {reason}" in refused(command, "x.yaml")
+
+
+def test_a_directory_with_a_flight_is_left_as_it_is(refused: Refused, tmp_path: Path) -> None:
+    for name in ("flight.yaml", "flight.tlog", "score.json"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / name).write_text("precious")
+        said = refused(f"{FLY} --out {name}")
+        assert said.startswith(f"{name}/{name} exists: the directory already holds a flight;")
+
+
+@pytest.mark.parametrize(
+    ("command", "says"),
+    [
+        ("offboard paper --quick --table 2 --out x", "is not empty; choose another"),
+        (f"offboard identify {RECORDING} --page x/old", "x/old exists already; choose another"),
+        (f"offboard identify {RECORDING} -o new --page new", "-o and --page are both new"),
+        (f"offboard identify {RECORDING} -o y/new", "-o y/new: there is no directory y"),
+        (f"offboard identify {RECORDING} --out x", "a log needs no --system, --out or other"),
+        (f"{SIMULATOR} --log x/old --duration 0.1", "--log x/old cannot be written: File"),
+    ],
+)
+def test_no_command_overwrites_a_file(
+    command: str, says: str, refused: Refused, tmp_path: Path
+) -> None:
+    (tmp_path / "x").mkdir()
+    (tmp_path / "x" / "old").write_text("precious")
+    assert says in refused(command)
+
+
+# --- keys ---
+
+
+@pytest.mark.parametrize(
+    ("command", "content", "mode", "says"),
+    [
+        ("offboard fly --sitl", "key: 12", 0o600, "signing key k is too short or no key file"),
+        ("simulator", "key: " + "ab" * 32, 0o644, "k can be read or changed by other users"),
+    ],
+)
+def test_a_bad_key_is_refused_and_not_shown(
+    command: str, content: str, mode: int, says: str, refused: Refused, tmp_path: Path
+) -> None:
+    (tmp_path / "k").write_text(content)
+    (tmp_path / "k").chmod(mode)
+    said = refused(command, "--signing-key", "k")
+    assert says in said
+    assert "ab" * 32 not in said
+
+
+def test_a_key_is_made_once_and_explained_without_showing_it(
+    called: Called, refused: Refused, tmp_path: Path
+) -> None:
+    code, said, _ = called("offboard key my.key")
+    assert code == 0
+    assert "signing setup PASSPHRASE" in said
+    assert "offboard fly --signing-key my.key" in said
+    assert (tmp_path / "my.key").read_text().split()[-1] not in said
+    assert "my.key exists and is not replaced" in refused("offboard key my.key")
+    (tmp_path / "state").write_text("a file")
+    said = refused(f"{FLY} --signing-key my.key")
+    assert "the time stamp of the signing key cannot be kept" in said
+
+
+# --- links that cannot be opened ---
+
+
+@pytest.mark.parametrize(
+    ("address", "says"),
+    [
+        ("tcpin:192.0.2.1:14540", "cannot be opened: Cannot assign requested"),
+        ("tcp:127.0.0.1:1", "cannot be opened: Connection refused"),
+        ("serial:/dev/nonexistent:57600", "cannot be opened"),
+    ],
+)
+def test_a_vehicle_that_cannot_be_reached_is_the_same_to_every_command(
+    address: str, says: str, called: Called
+) -> None:
+    code, _, said = called("offboard fly --connect", address)
+    assert (code, said.count("\n")) == (3, 1)
+    assert says in said
+    code, told, _ = called("offboard doctor port --connect", address)
+    assert (code, told.endswith("\n1 blocks: port\n")) == (3, True)
+    assert says in " ".join(told.split())
+    assert "refused" not in says or "fix: start the vehicle, or the router" in told
+
+
+def test_a_port_in_use_is_refused(called: Called, refused: Refused) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        link = f"udpin:127.0.0.1:{taken.getsockname()[1]}"
+        said = refused(f"{SIMULATOR} --connect", link)
+        assert said == f"{link} cannot be opened: Address already in use\n"
+        code, _, said = called("offboard fly --connect", link)
+    assert (code, said.count("\n")) == (3, 1)
+    assert f"'{link}' cannot be opened" in said
+    assert "another program uses the port" in said
+
+
+def test_a_vehicle_that_cannot_come_down_is_told(called: Called, tmp_path: Path) -> None:
+    light = (CONFIG / "vehicles" / "px4_sih.yaml").read_text()
+    (tmp_path / "light.yaml").write_text(re.sub(r"(hover_thrust:) \S+", r"\1 0.1", light))
+    flown = f"{SIMULATOR} --vehicle light.yaml --connect udpout:127.0.0.1:9 --duration 0.1"
+    code, _, said = called(flown)
+    assert code == 0
+    assert "MPC_THR_MIN is 0.12, which lifts a vehicle that hovers at 0.1" in said
+    assert called(f"{flown} --param MPC_THR_MIN=0.09")[::2] == (0, "")

@@ -1,0 +1,168 @@
+"""A flight on the bundled simulator is the same to the byte: in this process and over UDP, on a
+machine that is busy or idle."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from itertools import count
+from pathlib import Path
+from threading import Timer
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import yaml
+
+from offboard.analysis import tlog
+from offboard.flight.flight import Flight, Outcome
+from offboard.flight.phases import Phase
+from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID, RECORD_ID, TickRecord
+from offboard.link.stop import StopRequests
+from offboard.run import flight, sitl
+from offboard.run.configuration import load
+from offboard.run.flight import Simulated, fly
+from offboard.run.sitl import InMemoryLink, InMemorySimulator, SimulatorProcess
+
+VEHICLE_COMPONENT_ID = 1
+WALL_TIMES = ("solve_time_s", "answer_s")  # fields of TickRecord that the machine decides
+COLUMNS = [at for at, field in enumerate(fields(TickRecord)) if field.name in WALL_TIMES]
+SHORT = ("reference.duration_s=1", "reference.height_m=1", "identify.excite=false")
+LATE = Simulated(scenario="delay_60ms")  # the first heartbeat comes after several barriers
+
+
+def flown(
+    directory: Path, simulated: Simulated, simulator: Any, **watched: Callable[[Any], None]
+) -> Outcome:
+    config = load(
+        "flight", choices={"reference": "hover"}, assignments=SHORT, seed=3,
+        known_vehicle=simulated.known_vehicle,
+    )  # fmt: skip
+    return fly(
+        config, directory, simulated, simulator=simulator, stops=StopRequests(), **watched
+    )  # fmt: skip
+
+
+def frames(directory: Path) -> dict[int, list[bytes]]:
+    """Those of a log by component, but for the requests for time, which a late side repeats."""
+    found: dict[int, list[bytes]] = {}
+    for entry in tlog.read(directory / "flight.tlog"):
+        if entry.name != "TIMESYNC":
+            found.setdefault(entry.component_id, []).append(without_wall_times(entry))
+    return found
+
+
+def without_wall_times(entry: tlog.LoggedMessage) -> bytes:
+    """The frame; of a tick's record, which is never sent, the fields that no clock decides."""
+    if entry.name != "DEBUG_FLOAT_ARRAY" or entry.message.array_id != RECORD_ID:
+        return entry.frame.raw
+    kept = [value for at, value in enumerate(entry.message.data) if at not in COLUMNS]
+    return repr((entry.frame.sequence, entry.message.time_usec, kept)).encode()
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[int, list[bytes]]:
+    directory = tmp_path_factory.mktemp("undisturbed") / "flight"
+    outcome = flown(directory, LATE, InMemorySimulator())
+    assert (outcome.exit_code, outcome.sentence) == (0, "flown and landed")
+    return frames(directory)
+
+
+class LateSimulator(SimulatorProcess):
+    """Starts each vehicle a tenth of a second after the launch."""
+
+    def launch(self, options: Sequence[str]) -> None:
+        os.killpg(self.pid, signal.SIGSTOP)
+        super().launch(options)
+        Timer(0.1, os.killpg, (self.pid, signal.SIGCONT)).start()
+
+
+def test_over_udp_and_disturbed_every_frame_is_the_same(
+    undisturbed: dict[int, list[bytes]], tmp_path: Path
+) -> None:
+    """The simulator begins late and repeats its first barrier, for which the controller is late,
+    and one in flight, where it stalls."""
+    stalls = [1.2]
+
+    def progress(companion: Flight) -> None:
+        if companion.phase is Phase.TRACK and stalls:
+            time.sleep(stalls.pop())
+
+    with LateSimulator() as simulator:
+        outcome = flown(tmp_path / "flight", LATE, simulator, progress=progress,
+                        tell=lambda _: time.sleep(1.0))  # fmt: skip
+    assert (outcome.exit_code, stalls) == (0, [])
+    sent = frames(tmp_path / "flight")
+    assert set(sent) == {VEHICLE_COMPONENT_ID, COMPONENT_ID, RECORD_COMPONENT_ID}
+    assert len(sent[COMPONENT_ID]) > 100
+    assert len(sent[VEHICLE_COMPONENT_ID]) > 1000
+    for component, expected in undisturbed.items():
+        assert sent[component] == expected
+
+
+class Idle(InMemorySimulator):
+    """Every third turn finds nothing, as where the simulator is slower than the loop."""
+
+    def open_link(self, **options: Any) -> InMemoryLink:
+        link = super().open_link(**options)
+        receive, turns = link.receive, count()
+        link.receive = lambda timeout_s: receive(timeout_s) if next(turns) % 3 else []  # type: ignore[method-assign]
+        return link
+
+
+def test_turns_that_receive_nothing_change_no_byte_of_a_flight(
+    undisturbed: dict[int, list[bytes]], tmp_path: Path
+) -> None:
+    assert flown(tmp_path / "idle", LATE, Idle()).exit_code == 0
+    assert frames(tmp_path / "idle") == undisturbed
+
+
+def divides(frames: object) -> list[tuple[int, bytes]]:
+    raise ZeroDivisionError("division by zero")
+
+
+@pytest.mark.parametrize(
+    ("exchange", "says"),
+    [
+        (divides, "the bundled simulator failed (ZeroDivisionError: division by zero)"),
+        (lambda frames: [], "the bundled simulator has not answered for 0."),
+    ],
+    ids=["fails", "hangs"],
+)
+def test_a_vehicle_that_fails_or_hangs_ends_the_flight_with_a_sentence(
+    exchange: Any, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def load() -> Any:
+        return lambda **options: SimpleNamespace(exchange=exchange)
+
+    monkeypatch.setattr(sitl, "registered", lambda: SimpleNamespace(load=load))
+    monkeypatch.setattr(flight, "SITL_TIMEOUT_S", 0.1)
+    outcome = flown(tmp_path / "flight", Simulated(scenario="calm"), InMemorySimulator())
+    assert outcome.exit_code == 3
+    assert outcome.sentence.startswith(says)
+
+
+LINK_LOST = {"fault": "link", "direction": "down", "loss": 1.0, "after": "engaged", "at_s": 8.0}
+SILENT = "no telemetry for 1.0 s; not heard for 300 s while landing; last known: "
+
+
+@pytest.mark.parametrize(
+    ("fault", "code", "sentence"),
+    [
+        # the autopilot sends no telemetry after its restart until it is asked again
+        ({"fault": "reboot", "at_s": 30.0}, 0, "flown and landed"),
+        pytest.param(LINK_LOST, 4, SILENT, marks=pytest.mark.slow),
+    ],
+    ids=["restart on the ground", "telemetry lost"],
+)
+def test_time_goes_on_without_telemetry(
+    fault: dict[str, object], code: int, sentence: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "faulty.yaml"
+    file.write_text(yaml.safe_dump({"name": "faulty", "faults": [fault]}))
+    outcome = flown(tmp_path / "flight", Simulated("ardupilot", str(file)), InMemorySimulator())
+    assert outcome.exit_code == code
+    assert outcome.sentence.startswith(sentence)
