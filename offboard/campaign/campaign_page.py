@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import plotly.graph_objects as go
@@ -40,9 +40,13 @@ CAPTION = (
 )
 
 
-def page(groups: Sequence[Group], missing: Sequence[str] = (), kept: str = "") -> str:
-    """The page as text. `missing`: what is not flown; `kept`: the directory of the logs, beside the
-    page, empty without."""
+def page(
+    groups: Sequence[Group],
+    missing: Sequence[str] = (),
+    links: Callable[[Row], Mapping[str, str]] = lambda row: {},
+) -> str:
+    """The page as text. `missing`: what is not flown; `links`: the files of a kept flight by name,
+    relative to the page."""
     rows = [row for group in groups for row in group.rows]
     return render(
         "campaign/templates/campaign.html",
@@ -55,7 +59,7 @@ def page(groups: Sequence[Group], missing: Sequence[str] = (), kept: str = "") -
         groups=groups,
         best=BEST if any(group.best for group in groups) else "",
         worst=sorted(rows, key=lambda row: row.severity)[:WORST_SHOWN],
-        kept=kept,
+        links=links,
         described=described,
         number=digits,
         percent=lambda share: f"{100 * share:.1f} %",

@@ -32,6 +32,7 @@ from offboard.run.configuration import build_controller, build_track
 from offboard.run.sitl import check_scenario_text
 
 KEPT = "flights"  # directory of the logs that are kept
+KEPT_FILES = {"report": "report.html", "log": "flight.tlog"}
 TABLE_S = 5.0  # at least, from one table to the next
 TABLE_SHARE = 0.02  # of the time is for tables while it flies
 
@@ -76,9 +77,9 @@ class Runner(ExitStack):
         """The records of these cases, in their order. Raises Incomplete when one is missing, and
         UserError where no flight can begin."""
         known = {case.key: self._results.get(case.key) for case in cases}
-        missing = [case for case in cases if known[case.key] is None]
+        missing = [case for case in cases if not self._is_done(case, known[case.key])]
         new = {case.key: case for case in cases if case.key not in self.flown}
-        self._counter.begin(sum(known[key] is not None for key in new))
+        self._counter.begin(len(new.keys() - {case.key for case in missing}))
         for job, record in self._fly(missing):
             known[job.case.key] = record
             try:
@@ -93,6 +94,12 @@ class Runner(ExitStack):
             raise Incomplete
         self.flown |= new
         return records
+
+    def _is_done(self, case: Case, record: Record | None) -> bool:
+        """Flown, with its log where logs are kept; the same seed gives the same flight again."""
+        if record is None or self._keep is None or not record.figures:
+            return record is not None
+        return (self._keep / case.folder).exists()
 
     def _fly(self, cases: Sequence[Case]) -> Iterator[tuple[Job, Record]]:
         if not cases:
@@ -209,8 +216,14 @@ class Campaign:
         absent = len(self.cases) - len(rows)
         missing = [f"{absent} of {len(self.cases)} flights are not flown yet"] if absent else []
         missing += [stopped] if stopped else []
-        text = page(groups(rows, self.drawn), missing, KEPT if self.file.keep else "")
+        text = page(groups(rows, self.drawn), missing, self._links)
         write(self.directory / "campaign.html", text.encode())
+
+    def _links(self, row: Row) -> dict[str, str]:
+        """Files of a kept flight by name, relative to the page."""
+        folder = Path(KEPT, row.case.folder)
+        paths = {name: folder / file for name, file in KEPT_FILES.items()}
+        return {name: str(path) for name, path in paths.items() if (self.directory / path).exists()}
 
     def _written(self) -> None:
         """Write what is known, rarely enough that it does not delay the flights."""

@@ -61,7 +61,7 @@ for command, below in (
     (score.score, (score.EXIT_CODES,)),
     (report.report, (EXIT_CODES,)),
     (check.check, (check.EXIT_CODES,)),
-    (identify.identify, (identify.EXIT_CODES,)),
+    (identify.identify, (shipped.overview(*PARTS, "scenario"), identify.EXIT_CODES)),
     (compare.compare, (shipped.overview(*PARTS, "scenario"), compare.EXIT_CODES)),
     (campaign.campaign, (shipped.overview("campaign"), campaign.EXIT_CODES)),
     (tune.tune, (shipped.overview("tuning"), tune.EXIT_CODES)),

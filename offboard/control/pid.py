@@ -56,10 +56,11 @@ class PidLaw(TrackingLaw):
         lateral, vertical = task.at_hover, task.vertical
         north_east_mps = lateral[1] + slower * gains.position_gain_ps * lateral[0]
         climb_mps = vertical[1] + slower * gains.height_gain_ps * vertical[0]
-        asked = np.empty(3)  # acceleration against the error, m/s^2, NED
+        asked = np.empty(3)  # acceleration against the error, m/s^2, NED; lateral as in hover
         asked[:2] = slower * gains.velocity_gain_ps * north_east_mps
         asked[2] = slower * gains.climb_gain_ps * climb_mps
-        asked += self._integral
+        asked[:2] += self._integral[:2] @ task.target.to_hover
+        asked[2] += self._integral[2]
         asked[:2] /= self.vehicle.gravity_mps2  # as tilt
         inputs = task.inputs(asked)
         clipped = task.problem.clip(inputs)

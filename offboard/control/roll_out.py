@@ -3,8 +3,8 @@
 States and inputs are deviations from the reference (`mpc.OUTLOOK`). The motion is that of the
 tracking laws' linear model, sampled exactly, plus the nonlinear part of thrust times direction,
 integrated over start, middle and end of each hold (Simpson). A plan of zeros flies the reference
-exactly, and for small deviations cost and motion are those of the closed form. Exceeding a soft
-limit (speed, tilt, the ground, keep-out volumes) is penalised.
+exactly, and for small deviations from hover cost and motion are those of the closed form. Exceeding
+a soft limit (speed, tilt, the ground, keep-out volumes) is penalised.
 """
 
 from __future__ import annotations

@@ -320,6 +320,8 @@ def _with(value: Any, keys: list[str], new: Any, option: str) -> Any:
         changed = _with(value[index], rest, new, option)
         return [*value[:index], changed, *value[index + 1 :]]
     section = Section(value if isinstance(value, Mapping) else {})
-    section[key] = _with(section.get(key), rest, new, option)
-    section.places[key] = option
+    before = section.get(key)
+    section[key] = _with(before, rest, new, option)
+    if not rest or type(before) is not type(section[key]):  # not of the file any more
+        section.places[key] = option
     return section

@@ -2,7 +2,8 @@
 
 Serves the live page at /, server-sent events at /events (first what was kept of the flight so far,
 then each snapshot), /metrics and /health. A client that does not read misses snapshots; it delays
-nobody.
+nobody. The number of connections is limited, and so is the life of each but those of /events: slow
+or idle ones use up neither descriptors nor memory.
 """
 
 from __future__ import annotations
@@ -36,6 +37,8 @@ TEXTS_KEPT = 100
 CLIENTS_MAX = 20
 CLIENT_QUEUE = 50  # snapshots that a client may be late
 CLIENT_S = 10.0  # in which a client must take one
+CONNECTIONS_MAX = 60  # those of clients that watch included
+CONNECTION_S = 5.0  # from its beginning to its end, unless the client watches
 LINE_MAX = 1 << 20
 _NICENESS = 5
 _TRACE = ("time_s", "position_ned_m", "reference_ned_m", "position_error_m", "telemetry_age_s")
@@ -88,6 +91,7 @@ class Broadcast:
     def __init__(self) -> None:
         self.metrics = Metrics()
         self._clients: set[asyncio.Queue[str | None]] = set()
+        self._watching: set[web.RequestHandler] = set()
         self._kept: deque[dict[str, Any]] = deque(maxlen=KEPT)
         self._texts: deque[dict[str, Any]] = deque(maxlen=TEXTS_KEPT)
         self._newest: dict[str, Any] | None = None
@@ -127,13 +131,35 @@ class Broadcast:
         known = {"newest": self._newest, "texts": list(self._texts), "flight": self._flight}
         queue.put_nowait(line("history", rows=list(self._kept), **known))
         self._clients.add(queue)
+        self._watching.add(request.protocol)
         with suppress(ConnectionError, TimeoutError, asyncio.TimeoutError):
             await response.prepare(request)
             while (text := await queue.get()) is not None:
                 await asyncio.wait_for(response.write(f"data: {text}\n\n".encode()), CLIENT_S)
             await asyncio.wait_for(response.write(b"event: end\ndata: {}\n\n"), CLIENT_S)
         self._clients.discard(queue)
+        self._watching.discard(request.protocol)
         return response
+
+    def connection(self, server: web.Server) -> asyncio.Protocol:
+        """What handles a new connection to `server`: nothing, if there are too many."""
+        if len(server.connections) >= CONNECTIONS_MAX:
+            return _Refused()
+        handler = server()
+        asyncio.get_running_loop().call_later(CONNECTION_S, self._end, handler)
+        return handler
+
+    def _end(self, handler: web.RequestHandler) -> None:
+        if handler in self._watching:
+            return
+        if handler.transport is not None:
+            handler.transport.abort()
+
+
+class _Refused(asyncio.Protocol):
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        transport.abort()
 
 
 def application(broadcast: Broadcast) -> web.Application:
@@ -170,12 +196,16 @@ async def serve(host: str, port: int) -> None:
     broadcast = Broadcast()
     runner = web.AppRunner(application(broadcast), access_log=None, shutdown_timeout=0.5)
     await runner.setup()
+    serves = runner.server
+    assert serves is not None
     try:
-        site = web.TCPSite(runner, host, port)
-        await site.start()
-        bound = runner.addresses[0][1]
+        server = await asyncio.get_running_loop().create_server(
+            lambda: broadcast.connection(serves), host, port, backlog=CONNECTIONS_MAX
+        )
+        bound = server.sockets[0].getsockname()[1]
         print(json.dumps({"url": f"http://{join_address(host, bound)}"}), flush=True)
         await _read(broadcast)
+        server.close()
         broadcast.end()
         await asyncio.sleep(0.1)  # the clients take their last event
     except OSError as error:

@@ -1,8 +1,8 @@
 """ArduCopter 4.6: how it reads commands and setpoints, checks, fails and flies.
 
-Measured on ArduCopter 4.6.3 SITL where MAVLink shows it. Modes and parameters are in
-`simulator.firmware.ardupilot_tables`, the state table in `simulator.firmware.ardupilot_tables`,
-telemetry in `simulator.firmware.ardupilot_messages`.
+Measured on ArduCopter 4.6.3 SITL where MAVLink shows it. Modes, parameters and the
+state table are in `simulator.firmware.ardupilot_tables`, telemetry in
+`simulator.firmware.ardupilot_messages`.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """PX4 1.16 multicopter: how it reads commands and setpoints, checks, fails and flies.
 
 Measured on PX4 1.16.1 SITL where MAVLink shows it, including messages that it should refuse.
-Modes and parameters are in `simulator.firmware.px4_tables`, the state table in
-`simulator.firmware.px4_tables`, telemetry in `simulator.firmware.px4_messages`.
+Modes, parameters and the state table are in `simulator.firmware.px4_tables`, telemetry in
+`simulator.firmware.px4_messages`.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from pymavlink.dialects.v20 import all as dialect
+from pymavlink.dialects.v20 import all as dialect  # with CURRENT_MODE, which common lacks
 
 from simulator.link.framing import MAGIC_V1, MAGIC_V2, SIGNED, frame_length
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import os
+import subprocess
 import sys
 from contextlib import ExitStack
 from pathlib import Path
@@ -149,13 +150,13 @@ def test_nothing_is_sent_where_a_disk_is_full(
 # --- an output that takes nothing ---
 
 
-@pytest.mark.parametrize("command", ["offboard list", f"offboard score {RECORDING} --json"])
-def test_a_full_disk_behind_the_output_is_one_sentence(
-    command: str, called: Called, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sys, "stdout", Path("/dev/full").open("w"))  # noqa: SIM115
+@pytest.mark.parametrize("command", [("list",), ("score", str(RECORDING), "--json")])
+def test_a_full_disk_behind_the_output_is_one_sentence(command: tuple[str, ...]) -> None:
+    with Path("/dev/full").open("w") as full:
+        process = [sys.executable, "-P", "-m", "offboard", *command]
+        ended = subprocess.run(process, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     said = "the output cannot be written: No space left on device\n"
-    assert called(command)[::2] == (2, said)
+    assert (ended.returncode, ended.stderr) == (2, said)
 
 
 def test_a_flight_whose_result_cannot_be_printed_keeps_its_exit_code(
