@@ -117,6 +117,19 @@ def test_a_whole_flight_is_completed(flown: History) -> None:
     assert "at a limit" not in summary(whole, flown)
 
 
+def test_a_flight_is_not_completed_that_is_not_tracked_landed_and_disarmed(flown: History) -> None:
+    records, heartbeat = flown.records, flown.heartbeat.copy()
+    since_s = records["time_s"] - track_begin_s(flown)
+    heartbeat["armed"][-1] = 1
+    for changed, why in (
+        ({"records": records[(since_s < 0.45) | (since_s > 2.45)]}, "2.1 s of the reference were"),
+        ({"landed": flown.landed[:0]}, "the land detector does not report the ground"),
+        ({"heartbeat": heartbeat}, "not disarmed"),
+    ):
+        scored = score(replace(flown, **changed))
+        assert (scored.completed, scored.ended_by.startswith(why)) == (0.0, True), scored.ended_by
+
+
 def test_a_log_with_parts_missing_is_scored_as_far_as_it_goes(flown: History) -> None:
     whole = score(flown)
     assert whole.rmse_position_m < 0.05
