@@ -25,7 +25,7 @@ from offboard.link.stream import BROKEN, RENEWED
 from offboard.link.udp import UdpLink
 
 LONG_S = 10.0
-TURN_S = 0.3  # for one turn of the loop, whatever the link does
+TURN_S = 1.0  # for one turn of the loop, whatever the link does, on a busy machine
 IPV6 = socket.has_ipv6 and Path("/proc/net/if_inet6").exists()
 
 

@@ -203,7 +203,8 @@ def verdict(pair: Pair) -> tuple[Any, ...]:
     logged = pair.history()
     judged = score(logged)
     ended = (judged.completed, judged.ended_by, judged.reason)
-    return *ended, repr(judged.touchdown_mps), [repr(event) for event in logged.events()]
+    events = [repr(replace(event, unix_s=0.0)) for event in logged.events()]
+    return *ended, repr(judged.touchdown_mps), events
 
 
 def without_texts(pair: Pair) -> Pair:
