@@ -123,7 +123,7 @@ def _path(picture: str) -> np.ndarray:
 
 
 @pytest.mark.slow  # those of README.md itself: tests/process/test_pytest_plugins.py
-@pytest.mark.parametrize("readme", _examples().keys() - {"README.md"})
+@pytest.mark.parametrize("readme", sorted(_examples().keys() - {"README.md"}))
 def test_python_examples_run(readme: str, tmp_path: Path) -> None:
     blocks = _examples()[readme]
     for number, block in enumerate(blocks):

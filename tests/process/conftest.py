@@ -12,6 +12,7 @@ import pytest
 from processes import Called, Spawn, free_port, spawning
 
 from offboard import cli
+from offboard.cli.shared import out
 from offboard.run import sitl
 from simulator import cli as simulator_cli
 
@@ -38,6 +39,8 @@ def called(
         words = [*command.split(), *map(str, arguments)]
         words = [word.replace(":PORT", f":{free_port()}") for word in words]
         monkeypatch.setattr(sys, "argv", words)
+        with out.capture():  # drops what an earlier call could not write
+            pass
         handlers = {number: signal.getsignal(number) for number in SIGNALS}
         try:
             with pytest.raises(SystemExit) as ended:
