@@ -208,11 +208,11 @@ def after_doubt(pair: Pair) -> list[str]:
 @pytest.mark.slow
 def test_delay_that_jumps_is_noticed_and_flown(tmp_path: Path):
     """Unnoticed, 0.2 s more take the vehicle 3.8 m off at this bandwidth; noticed by the motion
-    alone 0.6 to 2.0 m, by the moment of the jump; by TIMESYNC 0.2 m."""
+    alone 0.6 to 1.9 m, by the moment of the jump; by TIMESYNC 0.2 m."""
     pair = on_a_link_that_changes(lambda: 0.2)
     pair.track()
     assert 1e-3 * float(after_doubt(pair)[3]) == pytest.approx(0.257, abs=0.015)
-    assert pair.score(tmp_path).max_position_m < 1.5
+    assert pair.score(tmp_path).max_position_m < 2.0
 
 
 @pytest.mark.slow
