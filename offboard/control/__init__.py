@@ -74,7 +74,7 @@ from offboard.control.base import (
     DecisionError,
     Situation,
 )
-from offboard.model.command import Command, PositionCommand, PredictedHeave, PredictedState
+from offboard.model.command import Command, PositionCommand, PredictedState, PredictedVertical
 from offboard.model.vehicle import Vehicle
 from offboard.reference.base import FlatSample, Reference
 
@@ -88,8 +88,8 @@ __all__ = [
     "DecisionError",
     "FlatSample",
     "PositionCommand",
-    "PredictedHeave",
     "PredictedState",
+    "PredictedVertical",
     "Reference",
     "Situation",
     "Vehicle",

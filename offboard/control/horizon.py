@@ -21,7 +21,7 @@ from pydantic import Field
 
 from offboard.control.base import Certificate, Decision, DecisionError, Situation
 from offboard.control.keep_out import CENTRE, HALF, RADIUS, ROUND, KeepOut, pack, placed_at, refusal
-from offboard.control.law import Task, TrackingLaw, TrackingSettings, decision
+from offboard.control.law import TrackingLaw, TrackingProblem, TrackingSettings, decision
 from offboard.control.mpc import MOST_STEPS, OUTLOOK, HorizonQuadratic, look_ahead
 from offboard.control.quadratic import ExactMinimum
 from offboard.control.roll_out import (
@@ -149,8 +149,8 @@ class HorizonLaw(TrackingLaw):
         self._plant = plant_of(self, speed_limit_mps=speed_limit_mps, clearance_m=settings.reach_m)
 
     def decide(self, situation: Situation) -> Decision:
-        task = self.prepare(situation)
-        own, others = self._own_plan(situation.time_s), self._other_plans(task)
+        problem = self.prepare(situation)
+        own, others = self._own_plan(situation.time_s), self._other_plans(problem)
         rivals = sorted((plan for plan in others if plan.cost < own.cost), key=COST)
         bases = [own, *rivals[:RIVALS]]
         seed_cost = min(plan.cost for plan in bases)
@@ -164,24 +164,24 @@ class HorizonLaw(TrackingLaw):
             at_bound=bool(((chosen <= lower[0]) | (chosen >= upper[0])).any()),
             seed_cost=seed_cost,
         )
-        return decision(task.problem.clip(task.inputs(chosen)), certificate)
+        return decision(problem.quadratic.clip(problem.inputs(chosen)), certificate)
 
-    def prepare(self, situation: Situation) -> Task:
-        """Make the roll-outs ready for this situation. Returns its task."""
-        task, settings = self.task(situation), self._settings
-        self.outlook = look_ahead(self, situation, task, settings.planned)
+    def prepare(self, situation: Situation) -> TrackingProblem:
+        """Make the roll-outs ready for this situation. Returns its problem."""
+        problem, settings = self.problem(situation), self._settings
+        self.outlook = look_ahead(self, situation, problem, settings.planned)
         delay_s = situation.state.time_s - situation.time_s
         origin_ned_m = np.array(situation.origin_ned_m, np.float64)
         self._placed = placed_at(self._volumes, origin_ned_m, situation.track_time_s + delay_s)
         self._floor_down_m = situation.origin_ned_m[2] - settings.clearance_m
-        self._start[P:Z] = task.lateral.reshape(-1)
-        self._start[Z:T] = task.vertical
+        self._start[P:Z] = problem.lateral.reshape(-1)
+        self._start[Z:T] = problem.vertical
         ahead = self.outlook[0]
         b_n, b_e = ahead["directions"][0, :2]
         leant = b_z_of(b_n + self._start[B], b_e + self._start[B + 1]) - b_z_of(b_n, b_e)
-        thrust, b_z = ahead["thrusts_heave"][0], ahead["b_z"][0]
+        thrust, b_z = ahead["thrusts_vertical"][0], ahead["b_z"][0]
         self._start[T] = (thrust * b_z + self._start[F]) / (b_z + leant) - thrust
-        return task
+        return problem
 
     def fly(
         self, inputs: Array, states: Array | None = None, knots: Array | None = None
@@ -219,9 +219,9 @@ class HorizonLaw(TrackingLaw):
                 plan = min(plan, self.fly(inputs, states).plan(0), key=COST)
         return plan
 
-    def _other_plans(self, task: Task) -> list[Plan]:
+    def _other_plans(self, problem: TrackingProblem) -> list[Plan]:
         """The exact plan of the linear problem, and those that follow other ways."""
-        exact = self._exact.minimise(self.quadratic.problem(task, self.outlook))
+        exact = self._exact.minimise(self.quadratic.over(problem, self.outlook))
         plans = []
         if np.isfinite(exact).all():
             plans.append(self.fly(self.quadratic.plan(exact)).plan(0))

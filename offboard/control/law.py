@@ -58,7 +58,7 @@ from offboard.control.gains import (
 from offboard.control.quadratic import BoxQuadratic, ExactMinimum, at_bound, closed_form
 from offboard.control.swarm import SwarmSettings, certify, minimise
 from offboard.model.axes import lead
-from offboard.model.command import Command, PredictedHeave, PredictedState
+from offboard.model.command import Command, PredictedState, PredictedVertical
 from offboard.model.frames import wrap_pi
 from offboard.model.vehicle import DelayUncertainty, Vehicle
 from offboard.reference.base import Reference
@@ -107,17 +107,17 @@ class Target:
 
 
 @dataclass(frozen=True, slots=True)
-class Task:
-    """What one decision is about: `lateral` (4, 2) and `vertical` (3,) are the deviations of the
+class TrackingProblem:
+    """What one decision minimises: `lateral` (4, 2) and `vertical` (3,) are the deviations of the
     predicted state from the target, `at_hover` (4, 2) is `lateral` with `Target.to_hover`, `b_z` is
-    that of its thrust direction, `problem` the cost of u (4,) and its bounds."""
+    that of its thrust direction, `quadratic` the cost of u (4,) and its bounds."""
 
     target: Target
     lateral: Array
     at_hover: Array
     vertical: Array
     b_z: float
-    problem: BoxQuadratic
+    quadratic: BoxQuadratic
 
     def inputs(self, deviation: Array) -> Array:
         """u (4,), not clipped, for a deviation (3,) from the feed-forward."""
@@ -126,8 +126,8 @@ class Task:
 
 
 class TrackingLaw:
-    """Base class of the laws: makes the `Task` of each decision, for the vehicle and the bandwidth
-    in use, which `set_vehicle` sets.
+    """Base class of the laws: makes the `TrackingProblem` of each decision, for the vehicle and the
+    bandwidth in use, which `set_vehicle` sets.
 
     `limits` are the settings, `vehicle` is the vehicle in use; `lateral` and `vertical` are the
     models of its axes with the optimal cost that follows one held input.
@@ -164,11 +164,10 @@ class TrackingLaw:
         self.lateral = lateral_gain(self.vehicle, bandwidth_radps, self.period_s)
         self.vertical = vertical_gain(self.vehicle, bandwidth_radps, self.period_s)
 
-    def task(self, situation: Situation) -> Task:
-        """The task of this tick. Raises DecisionError where its cost is not finite."""
+    def problem(self, situation: Situation) -> TrackingProblem:
+        """The problem of this tick. Raises DecisionError where its cost is not finite."""
         state = situation.state
         target = self.target(situation.reference, situation.time_s, state)
-        heave = heave_of(state)
         motion = (
             state.position_ned_m,
             state.velocity_ned_mps,
@@ -176,24 +175,25 @@ class TrackingLaw:
             state.thrust_direction_rate_ned_ps,
         )
         lateral = np.array(motion)[:, :2] - target.lateral
-        vertical = (heave.position_down_m, heave.velocity_down_mps, heave.thrust_down_mps2)
-        task = self._weighed(
+        down = vertical_of(state)
+        vertical = (down.position_down_m, down.velocity_down_mps, down.thrust_down_mps2)
+        problem = self._weighed(
             target, lateral, vertical - target.vertical, float(state.thrust_direction_ned[2])
         )
-        problem = task.problem
-        parts = (problem.hessian.ravel(), problem.gradient, problem.lower, [problem.constant])
+        cost = problem.quadratic
+        parts = (cost.hessian.ravel(), cost.gradient, cost.lower, [cost.constant])
         if not np.isfinite(np.concatenate(parts)).all():
             raise DecisionError("the cost of this decision is not finite")
-        return task
+        return problem
 
     def target(self, reference: Reference, time_s: float, state: PredictedState) -> Target:
         """The target of a decision at `time_s`, for the state predicted to the time when its tilt
         begins to act. The estimated disturbance is compensated in it."""
         vehicle, period_s = self.vehicle, self.period_s
         half_s = 0.5 * period_s
-        heave_s = heave_of(state).time_s
+        vertical_s = vertical_of(state).time_s
         heading_s = time_s + vehicle.yaw.delay_s + half_s
-        times = [state.time_s, state.time_s + half_s, heave_s, heave_s + half_s, heading_s]
+        times = [state.time_s, state.time_s + half_s, vertical_s, vertical_s + half_s, heading_s]
         sample = reference.sample(np.array(times))
         flat = flat_state(
             sample,
@@ -229,8 +229,10 @@ class TrackingLaw:
             to_hover=to_hover(b[0], thrust[0], state, vehicle),
         )
 
-    def _weighed(self, target: Target, lateral: Array, vertical: Array, b_z: float) -> Task:
-        """The task of these deviations: J, and the bounds of u to which the law clips."""
+    def _weighed(
+        self, target: Target, lateral: Array, vertical: Array, b_z: float
+    ) -> TrackingProblem:
+        """The problem of these deviations: J, and the bounds of u to which the law clips."""
         settings, vehicle = self.limits, self.vehicle
         curvature = np.array(
             [
@@ -255,8 +257,8 @@ class TrackingLaw:
         least_mps2 = settings.thrust_floor * vehicle.gravity_mps2
         lower = np.array([least_mps2, *low, heading - HEADING_BOX_RAD])
         upper = np.array([vehicle.thrust_max_mps2, *high, heading + HEADING_BOX_RAD])
-        problem = BoxQuadratic(np.diag(curvature), gradient, float(constant), lower, upper)
-        return Task(target, lateral, at_hover, vertical, b_z, problem)
+        quadratic = BoxQuadratic(np.diag(curvature), gradient, float(constant), lower, upper)
+        return TrackingProblem(target, lateral, at_hover, vertical, b_z, quadratic)
 
     def tilt_bounds(self, nominal: Array) -> tuple[Array, Array]:
         """Lower and upper b_c (..., 2): |b_c| and |b_c - b_ff| per axis for feed-forwards (..., 2);
@@ -266,10 +268,10 @@ class TrackingLaw:
         return np.maximum(centre - reach, -limit), np.minimum(centre + reach, limit)
 
 
-def heave_of(state: PredictedState) -> PredictedHeave:
+def vertical_of(state: PredictedState) -> PredictedVertical:
     """The predicted vertical motion when the thrust acts, or at `state.time_s` if it was not
     predicted separately."""
-    return state.heave or PredictedHeave(
+    return state.vertical or PredictedVertical(
         time_s=state.time_s,
         position_down_m=float(state.position_ned_m[2]),
         velocity_down_mps=float(state.velocity_ned_mps[2]),
@@ -311,7 +313,7 @@ class LqrLaw(TrackingLaw):
     """The exact minimum, clip(-f / H)."""
 
     def decide(self, situation: Situation) -> Decision:
-        problem = self.task(situation).problem
+        problem = self.problem(situation).quadratic
         inputs = closed_form(problem)
         cost = float(problem(inputs))
         on_bound = at_bound(problem, inputs)
@@ -340,7 +342,7 @@ class PsoLaw(TrackingLaw):
         self._exact = ExactMinimum(4)
 
     def decide(self, situation: Situation) -> Decision:
-        problem = self.task(situation).problem
+        problem = self.problem(situation).quadratic
         result = minimise(self._swarm, problem, self._rng, situation.remaining_s)
         return decision(result.best, certify(problem, result, self._exact))
 

@@ -16,7 +16,14 @@ from scipy.linalg import block_diag
 
 from offboard.control.base import Certificate, Decision, DecisionError, Situation
 from offboard.control.gains import CostToGo, held_lead
-from offboard.control.law import Task, TrackingLaw, TrackingSettings, decision, heave_of, to_hover
+from offboard.control.law import (
+    TrackingLaw,
+    TrackingProblem,
+    TrackingSettings,
+    decision,
+    to_hover,
+    vertical_of,
+)
 from offboard.control.quadratic import BoxQuadratic, ExactMinimum, at_bound
 from offboard.model.vehicle import Vehicle
 from offboard.reference.flatness import flat_state
@@ -33,7 +40,7 @@ OUTLOOK = np.dtype(
         ("velocities", "f8", (_NODES, 3)),
         ("directions", "f8", (_NODES, 3)),
         ("thrusts_tilt", "f8", _NODES),
-        ("thrusts_heave", "f8", _NODES),
+        ("thrusts_vertical", "f8", _NODES),
         ("b_z", "f8", _NODES),
         # of each hold: b_c north and east and the vertical thrust in its middle, led; the bounds
         # of the deviations from them
@@ -53,18 +60,20 @@ Plans are deviations [b_c north, b_c east, T b_z] from the feed-forward, which c
 response of the attitude loop: a plan of zeros flies the reference."""
 
 
-def look_ahead(law: TrackingLaw, situation: Situation, task: Task, steps: int) -> NDArray[np.void]:
+def look_ahead(
+    law: TrackingLaw, situation: Situation, problem: TrackingProblem, steps: int
+) -> NDArray[np.void]:
     """One `OUTLOOK` over `steps` holds, from the times at which a command sent now takes effect:
     lateral axes when the tilt acts, the vertical one when the thrust acts."""
     vehicle, state, period_s = law.vehicle, situation.state, law.period_s
     nodes_s = 0.5 * period_s * np.arange(2 * steps + 1)
-    times = np.concatenate((state.time_s + nodes_s, heave_of(state).time_s + nodes_s))
+    times = np.concatenate((state.time_s + nodes_s, vertical_of(state).time_s + nodes_s))
     sample = situation.reference.sample(times)
     flat = flat_state(
         sample, vehicle.gravity_mps2, vehicle.drag_per_mass_ps, state.disturbance_ned_mps2
     )
-    tilt, heave = np.split(np.arange(len(times)), 2)
-    b, down = flat.thrust_direction_ned, flat.thrust_direction_ned[heave, 2]
+    tilt, vertical = np.split(np.arange(len(times)), 2)
+    b, down = flat.thrust_direction_ned, flat.thrust_direction_ned[vertical, 2]
     middles = tilt[1::2]
     outlook = np.zeros(1, OUTLOOK)
     one = outlook[0]
@@ -72,10 +81,10 @@ def look_ahead(law: TrackingLaw, situation: Situation, task: Task, steps: int) -
         ("positions", sample.position_ned_m),
         ("velocities", sample.velocity_ned_mps),
     ):
-        one[name][: len(tilt)] = np.column_stack((values[tilt, :2], values[heave, 2]))
+        one[name][: len(tilt)] = np.column_stack((values[tilt, :2], values[vertical, 2]))
     one["directions"][: len(tilt)] = b[tilt]
     one["thrusts_tilt"][: len(tilt)] = flat.thrust_mps2[tilt]
-    one["thrusts_heave"][: len(tilt)] = flat.thrust_mps2[heave]
+    one["thrusts_vertical"][: len(tilt)] = flat.thrust_mps2[vertical]
     one["b_z"][: len(tilt)] = down
     starts = tilt[:-1:2]
     one["to_hover"][:steps] = to_hover(b[starts], flat.thrust_mps2[starts], state, vehicle)
@@ -87,12 +96,12 @@ def look_ahead(law: TrackingLaw, situation: Situation, task: Task, steps: int) -
         period_s,
     )
     led_thrust = flat.thrust_mps2 + vehicle.thrust_lag_s * flat.thrust_rate_mps3
-    nominal = np.column_stack((led_tilt, (led_thrust * b[:, 2])[heave][1::2]))
+    nominal = np.column_stack((led_tilt, (led_thrust * b[:, 2])[vertical][1::2]))
     one["feedforward"][:steps] = nominal
     low, high = law.tilt_bounds(led_tilt)
     down = down[:-1:2].copy()
-    down[0] = task.b_z
-    thrusts = task.problem.lower[0] * down, task.problem.upper[0] * down
+    down[0] = problem.b_z
+    thrusts = problem.quadratic.lower[0] * down, problem.quadratic.upper[0] * down
     one["lower"][:steps] = np.column_stack((low, thrusts[0])) - nominal
     one["upper"][:steps] = np.column_stack((high, thrusts[1])) - nominal
     gravity = vehicle.gravity_mps2
@@ -111,9 +120,9 @@ class HorizonQuadratic:
         self._axes = (lateral, lateral, _condense(law.vertical, steps, law.period_s))
         self._hessian: Array = block_diag(*(axis[0] for axis in self._axes))
 
-    def problem(self, task: Task, outlook: NDArray[np.void]) -> BoxQuadratic:
-        """The quadratic in (3 N,) from the deviations of `task`."""
-        starts = (*task.at_hover.T, task.vertical)
+    def over(self, problem: TrackingProblem, outlook: NDArray[np.void]) -> BoxQuadratic:
+        """The quadratic in (3 N,) from the deviations of `problem`."""
+        starts = (*problem.at_hover.T, problem.vertical)
         axes = list(zip(starts, self._axes, strict=True))
         gradient = np.concatenate([start @ axis[1] for start, axis in axes])
         rest = sum(float(start @ axis[2] @ start) for start, axis in axes)
@@ -156,8 +165,8 @@ class MpcLaw(TrackingLaw):
         self._exact = ExactMinimum(3 * self._steps)
 
     def decide(self, situation: Situation) -> Decision:
-        task = self.task(situation)
-        planned = self._quadratic.problem(task, look_ahead(self, situation, task, self._steps))
+        problem = self.problem(situation)
+        planned = self._quadratic.over(problem, look_ahead(self, situation, problem, self._steps))
         best = self._exact.minimise(planned)
         if not np.isfinite(best).all():
             raise DecisionError("the quadratic over the horizon has no solution")
@@ -165,8 +174,8 @@ class MpcLaw(TrackingLaw):
         certificate = Certificate(
             cost, optimal_cost=cost, gap=0.0, at_bound=at_bound(planned, best)
         )
-        inputs = task.inputs(self._quadratic.plan(best)[0])
-        return decision(task.problem.clip(inputs), certificate)
+        inputs = problem.inputs(self._quadratic.plan(best)[0])
+        return decision(problem.quadratic.clip(inputs), certificate)
 
     def _use_gains(self, bandwidth_radps: float) -> None:
         super()._use_gains(bandwidth_radps)

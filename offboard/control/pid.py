@@ -52,20 +52,20 @@ class PidLaw(TrackingLaw):
         self._integral = np.zeros(3)  # m/s^2, NED
 
     def decide(self, situation: Situation) -> Decision:
-        task, gains, slower = self.task(situation), self._gains, self._slower
-        lateral, vertical = task.at_hover, task.vertical
+        problem, gains, slower = self.problem(situation), self._gains, self._slower
+        lateral, vertical = problem.at_hover, problem.vertical
         north_east_mps = lateral[1] + slower * gains.position_gain_ps * lateral[0]
         climb_mps = vertical[1] + slower * gains.height_gain_ps * vertical[0]
         asked = np.empty(3)  # acceleration against the error, m/s^2, NED; lateral as in hover
         asked[:2] = slower * gains.velocity_gain_ps * north_east_mps
         asked[2] = slower * gains.climb_gain_ps * climb_mps
-        asked[:2] += self._integral[:2] @ task.target.to_hover
+        asked[:2] += self._integral[:2] @ problem.target.to_hover
         asked[2] += self._integral[2]
         asked[:2] /= self.vehicle.gravity_mps2  # as tilt
-        inputs = task.inputs(asked)
-        clipped = task.problem.clip(inputs)
-        self._integrate(np.append(task.lateral[0], vertical[0]), (clipped == inputs)[[1, 2, 0]])
-        cost, on_bound = float(task.problem(clipped)), at_bound(task.problem, clipped)
+        inputs = problem.inputs(asked)
+        clipped = problem.quadratic.clip(inputs)
+        self._integrate(np.append(problem.lateral[0], vertical[0]), (clipped == inputs)[[1, 2, 0]])
+        cost, on_bound = float(problem.quadratic(clipped)), at_bound(problem.quadratic, clipped)
         return decision(clipped, Certificate(cost, at_bound=on_bound))
 
     def reset(self) -> None:

@@ -206,7 +206,9 @@ def _add_nonlinear_part(
         thrust = ahead.thrusts_tilt[i] + thrust_error
         north = plant.gravity_mps2 * off_n - share * (thrust * off_n + thrust_error * ref_n)
         east = plant.gravity_mps2 * off_e - share * (thrust * off_e + thrust_error * ref_e)
-        vertical_error = (ahead.thrusts_heave[i] + thrust_error) * down_error + thrust_error * down
+        vertical_error = (
+            ahead.thrusts_vertical[i] + thrust_error
+        ) * down_error + thrust_error * down
         after[P] += plant.push_position[node] * north
         after[P + 1] += plant.push_position[node] * east
         after[V] += plant.push_velocity[node] * north

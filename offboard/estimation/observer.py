@@ -45,7 +45,7 @@ from offboard.estimation.motion import (
 )
 from offboard.estimation.noise import Noise, NoiseEstimate
 from offboard.model.axes import acceleration, b_z_of, lateral_model
-from offboard.model.command import Command, PredictedHeave, PredictedState
+from offboard.model.command import Command, PredictedState, PredictedVertical
 from offboard.model.frames import (
     heading_from_quaternion,
     thrust_direction_from_quaternion,
@@ -373,12 +373,13 @@ class Observer:
 
     def predict(self, time_s: float) -> PredictedState:
         """The state when the tilt of a command sent at `time_s` begins to act, after the tilt's
-        delay, with the commands sent replayed; `heave` is the vertical after the thrust's delay.
+        delay, with the commands sent replayed; `vertical` is the vertical motion after the
+        delay of the thrust.
         Valid once `ready`."""
         tilt_s = time_s + self._vehicle.tilt.delay_s
         thrust_s = time_s + self._vehicle.thrust_delay_s
         numbers = self._propagated(thrust_s).tolist()
-        heave = PredictedHeave(
+        vertical = PredictedVertical(
             time_s=thrust_s,
             position_down_m=numbers[POSITION + 2],
             velocity_down_mps=numbers[VELOCITY + 2],
@@ -399,7 +400,7 @@ class Observer:
             thrust_mps2=float(state[THRUST]),
             disturbance_ned_mps2=state[DISTURBANCE : DISTURBANCE + 3],
             rates_frd_radps=self._rates.copy(),
-            heave=heave,
+            vertical=vertical,
         )
 
     def _propagated(self, time_s: float) -> Array:

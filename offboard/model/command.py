@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class PredictedHeave:
+class PredictedVertical:
     """The vertical motion at `time_s` (vehicle time), when the thrust of a command sent now takes
     effect. Down is positive; `thrust_down_mps2` is the vertical part T b_z of the thrust."""
 
@@ -38,7 +38,7 @@ class PredictedState:
         thrust_mps2: Thrust per unit of mass T that acts, after its lag.
         disturbance_ned_mps2: (3,), estimated d: wind, wrong mass or hover thrust.
         rates_frd_radps: (3,), body rates p, q, r.
-        heave: The vertical motion at its own time. Thrust acts sooner than tilt; a vertical loop
+        vertical: The vertical motion at its own time. Thrust acts sooner than tilt; a vertical loop
             closed on `time_s` would wait for the tilt and, from a difference of about 0.1 s on,
             oscillate. None: not predicted separately.
     """
@@ -53,7 +53,7 @@ class PredictedState:
     thrust_mps2: float
     disturbance_ned_mps2: Array
     rates_frd_radps: Array
-    heave: PredictedHeave | None = None
+    vertical: PredictedVertical | None = None
 
 
 @dataclass(frozen=True, slots=True)

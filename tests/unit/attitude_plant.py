@@ -112,13 +112,13 @@ class Plant:
         return quaternion_from_thrust_direction(np.array([*self.x[6:8], down]), self.x[11])
 
 
-def lemniscate(period_s: float, *, heading_rad: float = 0.0, heave_m: float = 0.0) -> Track:
+def lemniscate(period_s: float, *, heading_rad: float = 0.0, vertical_m: float = 0.0) -> Track:
     """2 sin wt north, 1 sin 2wt east, 3 m high, heaving with sin 3wt; from rest over the first
     4 s."""
     omega = math.tau / period_s
     path = Harmonic(
         3600.0,
-        amplitude_ned_m=(2.0, 1.0, heave_m),
+        amplitude_ned_m=(2.0, 1.0, vertical_m),
         omega_ned_radps=(omega, 2.0 * omega, 3.0 * omega),
     )
     return Track(path, Fixed(heading_rad), run_in_s=4.0, origin_ned_m=(0.0, 0.0, -3.0))

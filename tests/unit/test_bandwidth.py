@@ -34,7 +34,7 @@ def delay_margin(vehicle: Vehicle, bandwidth: float, period_s: float) -> float:
 def rmse_m(truth: Vehicle, believed: Vehicle, bandwidth: float, **offset: object) -> float:
     law, reference = (
         LqrLaw(believed, LqrSettings(bandwidth_radps=bandwidth)),
-        lemniscate(15.0, heave_m=0.3),
+        lemniscate(15.0, vertical_m=0.3),
     )
     noise = Noise(velocity_sd_mps=1.0)
     return fly(

@@ -69,8 +69,8 @@ def test_the_target_ripples_as_the_staircase_does() -> None:
     assert climbing.vertical[2] - G == pytest.approx(-off[2], rel=1e-3)
 
 
-@pytest.mark.parametrize(("heave_m", "most_m"), [(0.0, 0.0002), (0.4, 0.0008)])
-def test_what_is_left_on_a_known_vehicle(heave_m: float, most_m: float) -> None:
+@pytest.mark.parametrize(("vertical_m", "most_m"), [(0.0, 0.0002), (0.4, 0.0008)])
+def test_what_is_left_on_a_known_vehicle(vertical_m: float, most_m: float) -> None:
     """Without noise, everything known: 0.8 and 1.5 mm by a law that fights its own ripple."""
-    reference = lemniscate(8.0, heave_m=heave_m)
+    reference = lemniscate(8.0, vertical_m=vertical_m)
     assert fly(Truth(PX4), lqr(), PX4, reference, 16.0) < most_m

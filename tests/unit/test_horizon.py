@@ -52,9 +52,9 @@ def about_hover(count: int, size: float) -> list[Situation]:
 
 def left_to_pay(law: HorizonLaw, situation: Situation) -> float:
     """x'Px: the cost of the closed form without bounds."""
-    task = law.task(situation)
-    left = np.sum(task.at_hover * (law.lateral.terminal @ task.at_hover))
-    return float(left + task.vertical @ law.vertical.terminal @ task.vertical)
+    now = law.problem(situation)
+    left = np.sum(now.at_hover * (law.lateral.terminal @ now.at_hover))
+    return float(left + now.vertical @ law.vertical.terminal @ now.vertical)
 
 
 def closed_form(law: HorizonLaw) -> Plan:
@@ -65,8 +65,7 @@ def closed_form(law: HorizonLaw) -> Plan:
 def test_near_a_hover_quadratic_roll_outs_and_closed_form_cost_the_same() -> None:
     law, rng = horizon(), np.random.default_rng(2)
     for situation in about_hover(5, 1e-4):
-        task = law.prepare(situation)
-        problem = law.quadratic.problem(task, law.outlook)
+        problem = law.quadratic.over(law.prepare(situation), law.outlook)
         for _ in range(4):
             tried = 1e-4 * rng.uniform(problem.lower, problem.upper)
             flown = law.fly(law.quadratic.plan(tried)).plan(0)
@@ -87,16 +86,16 @@ def test_the_quadratic_leaves_the_cost_to_go_and_has_the_bounds_of_one_decision(
     """N optimal inputs and P behind them cost x'Px, whatever N; the first is -K x."""
     law = horizon()
     for situation in situations(5, 0.3):
-        task = law.prepare(situation)
-        problem, box, b_z = law.quadratic.problem(task, law.outlook), task.problem, task.b_z
+        first = law.prepare(situation)
+        problem, box, b_z = law.quadratic.over(first, law.outlook), first.quadratic, first.b_z
         best = np.linalg.solve(problem.hessian, -problem.gradient)
         assert float(problem(best)) == pytest.approx(left_to_pay(law, situation), rel=1e-8)
-        assert best[0] == pytest.approx(-law.lateral.gain @ task.at_hover[:, 0], abs=1e-8)
-        assert best[2 * STEPS] == pytest.approx(-law.vertical.gain @ task.vertical, abs=1e-8)
+        assert best[0] == pytest.approx(-law.lateral.gain @ first.at_hover[:, 0], abs=1e-8)
+        assert best[2 * STEPS] == pytest.approx(-law.vertical.gain @ first.vertical, abs=1e-8)
         for ours, theirs in ((problem.lower, box.lower), (problem.upper, box.upper)):
-            first = task.inputs(law.quadratic.plan(ours)[0])
-            assert first[:3] == pytest.approx(theirs[:3], abs=1e-9)
-            assert first[0] * b_z == pytest.approx(theirs[0] * b_z, rel=1e-9)
+            inputs = first.inputs(law.quadratic.plan(ours)[0])
+            assert inputs[:3] == pytest.approx(theirs[:3], abs=1e-9)
+            assert inputs[0] * b_z == pytest.approx(theirs[0] * b_z, rel=1e-9)
 
 
 PUSHED_MPS2 = np.array([2.0, -1.5, 0.0])  # a disturbance, which the reference leans into
@@ -151,7 +150,7 @@ def test_nonlinear_roll_outs_fly_as_scipy_does() -> None:
 
 
 def test_a_plan_of_zeros_flies_the_reference() -> None:
-    reference, law = lemniscate(8.0, heave_m=0.4), horizon()
+    reference, law = lemniscate(8.0, vertical_m=0.4), horizon()
     start = state_of(np.random.default_rng(0), reference, 0.0)
     state = on_target(start, law.target(reference, 5.0, start))
     law.prepare(Situation(5.0, state, reference, LEVEL))

@@ -178,7 +178,15 @@ def test_first_order_response_equals_scipys_integration():
 
 @cache
 def flown(
-    *, tilt=0.25, heading=0.1, heave=0.06, hover=0.5, drag=0.8, noise=0.0, seconds=12.0, seed=1
+    *,
+    tilt=0.25,
+    heading=0.1,
+    thrust_step=0.06,
+    hover=0.5,
+    drag=0.8,
+    noise=0.0,
+    seconds=12.0,
+    seed=1,
 ) -> Trace:
     """A vehicle that swings under open-loop commands, integrated by SciPy. Delay, natural frequency
     and damping: tilt .06, 12, .7, heading .1, 4, .6; thrust: delay .02, lag .05."""
@@ -186,7 +194,7 @@ def flown(
     generator = np.random.default_rng(seed)
     swing = tilt * np.sin(1.6 * sent_at), tilt * np.cos(2.3 * sent_at)
     tilts = [each + 0.1 * tilt * generator.choice([-1, 0, 1], len(sent_at)) for each in swing]
-    thrust = hover * (1.0 + heave * np.sign(np.sin(2.0 * sent_at)))
+    thrust = hover * (1.0 + thrust_step * np.sign(np.sin(2.0 * sent_at)))
     headings = heading * np.sign(np.sin(1.1 * sent_at))
     grid = np.arange(0.0, seconds, 0.01)
     b = [simulated(each, sent_at, 0.06, 12.0, 0.7, grid) for each in tilts]
@@ -264,7 +272,7 @@ def test_white_noise_of_the_estimator_is_measured():
 
 def test_constant_that_the_flight_does_not_determine_is_refused():
     """Hovering without steps determines the hover thrust alone."""
-    found = identify(flown(tilt=0.0, heading=0.0, heave=0.0), VEHICLE_FILE)
+    found = identify(flown(tilt=0.0, heading=0.0, thrust_step=0.0), VEHICLE_FILE)
     for name, words in (
         ("tilt", "moved by 0.0 mrad rms"),
         ("yaw", "moved by 0.0 mrad rms"),

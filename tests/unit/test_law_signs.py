@@ -108,7 +108,7 @@ def test_an_error_that_stays_is_answered_ever_more_by_the_integral() -> None:
 
 def test_the_autopilots_loop_is_given_the_reference() -> None:
     heading = HEADINGS_RAD[-1]
-    reference = lemniscate(8.0, heading_rad=heading, heave_m=0.3)
+    reference = lemniscate(8.0, heading_rad=heading, vertical_m=0.3)
     situation = Situation(6.0, at((0, 0, -3), heading), reference, LEVEL)
     command = law_named("autopilot").decide(situation).command
     assert isinstance(command, PositionCommand)

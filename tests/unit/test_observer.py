@@ -163,11 +163,11 @@ def test_vertical_is_predicted_to_the_time_when_the_thrust_acts() -> None:
     state = observer.predict(3.0)
     assert state.time_s == pytest.approx(3.057)
     assert state.position_ned_m[2] == pytest.approx(6.114, abs=1e-3)
-    assert state.heave is not None
-    assert state.heave.time_s == pytest.approx(3.015)
-    assert state.heave.position_down_m == pytest.approx(6.03, abs=1e-3)
-    assert state.heave.velocity_down_mps == pytest.approx(2.0, abs=5e-3)
-    assert state.heave.thrust_down_mps2 == pytest.approx(thrust, abs=1e-6)
+    assert state.vertical is not None
+    assert state.vertical.time_s == pytest.approx(3.015)
+    assert state.vertical.position_down_m == pytest.approx(6.03, abs=1e-3)
+    assert state.vertical.velocity_down_mps == pytest.approx(2.0, abs=5e-3)
+    assert state.vertical.thrust_down_mps2 == pytest.approx(thrust, abs=1e-6)
 
 
 # ---------------------------------------------------------------- disturbance and bias

@@ -86,8 +86,8 @@ def test_unconstrained_minimiser_is_the_lqr_law() -> None:
     law, rng, reference = lqr(), np.random.default_rng(1), lemniscate(15.0)
     for _ in range(20):
         state = state_of(rng, reference, 0.3)
-        task = law.task(Situation(5.0, state, reference, LEVEL))
-        target, problem = task.target, task.problem
+        posed = law.problem(Situation(5.0, state, reference, LEVEL))
+        target, problem = posed.target, posed.quadratic
         minimiser = np.linalg.solve(problem.hessian, -problem.gradient)
         north_east = np.array(
             (state.position_ned_m, state.velocity_ned_mps, state.thrust_direction_ned,
@@ -115,7 +115,7 @@ def test_cost_vanishes_on_the_reference() -> None:
     state = on_target(start, target)
     b_z = state.thrust_direction_ned[2]
     nominal = [target.feedforward[2] / b_z, *target.feedforward[:2], target.heading_rad]
-    problem = law.task(Situation(5.0, state, reference, LEVEL)).problem
+    problem = law.problem(Situation(5.0, state, reference, LEVEL)).quadratic
     assert float(problem(np.array(nominal))) == pytest.approx(0.0, abs=1e-9)
 
 
