@@ -48,32 +48,38 @@ class Path(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Harmonic:
-    """p_i(s) = offset_i + slope_i s + amplitude_i sin(omega_i s + phase_i), i = north, east, down.
+class Sine:
+    """amplitude_i sin(omega_i s + phase_i), i = north, east, down. SI."""
 
-    One sine per axis on top of a straight motion: enough for lines, circles, helices and figures
-    of eight, with all derivatives in closed form. SI.
-    """
+    amplitude_ned_m: Triple
+    omega_ned_radps: Triple
+    phase_ned_rad: Triple = _ZERO
+
+
+@dataclass(frozen=True, slots=True)
+class Harmonic:
+    """p(s) = offset + slope s + the sum of `sines`, with all derivatives in closed form: lines,
+    circles, helices, Lissajous figures. SI."""
 
     length_s: float
     bounded: bool = False
     offset_ned_m: Triple = _ZERO
     slope_ned_mps: Triple = _ZERO
-    amplitude_ned_m: Triple = _ZERO
-    omega_ned_radps: Triple = _ZERO
-    phase_ned_rad: Triple = _ZERO
+    sines: tuple[Sine, ...] = ()
 
     def jet(self, path_time_s: Array) -> Array:
         """See `Path`."""
         time = path_time_s[:, np.newaxis]
-        omega = np.array(self.omega_ned_radps)
-        angle = omega * time + np.array(self.phase_ned_rad)
-        # d/ds of sin(omega s + phase) adds a quarter turn and a factor omega
-        scale = np.array(self.amplitude_ned_m) * omega**_ORDER
-        result: Array = scale * np.sin(angle + 0.5 * math.pi * _ORDER)
         slope = np.array(self.slope_ned_mps)
-        result[0] += np.array(self.offset_ned_m) + slope * time
-        result[1] += slope
+        result: Array = np.zeros((ORDERS, path_time_s.size, 3))
+        result[0] = np.array(self.offset_ned_m) + slope * time
+        result[1] = slope
+        for sine in self.sines:
+            omega = np.array(sine.omega_ned_radps)
+            angle = omega * time + np.array(sine.phase_ned_rad)
+            # d/ds of sin(omega s + phase) adds a quarter turn and a factor omega
+            scale = np.array(sine.amplitude_ned_m) * omega**_ORDER
+            result += scale * np.sin(angle + 0.5 * math.pi * _ORDER)
         return result
 
 

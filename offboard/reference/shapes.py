@@ -18,6 +18,7 @@ from pydantic import Field, model_validator
 
 from offboard.documents.parameters import Parameters
 from offboard.reference import table
+from offboard.reference.fastest import PathLimits, fastest_times
 from offboard.reference.path import (
     AlongVelocity,
     Column,
@@ -25,6 +26,7 @@ from offboard.reference.path import (
     Harmonic,
     Heading,
     Path,
+    Sine,
     Smoothness,
     interpolate,
     through,
@@ -40,6 +42,11 @@ Coordinate = Annotated[float, Field(ge=-1000, le=1000)]
 Size = Annotated[float, Field(gt=0.05, le=500)]
 Speed = Annotated[float, Field(gt=0.05, le=30)]
 Climb = Annotated[float, Field(ge=-5, le=5)]
+Term = tuple[
+    Annotated[float, Field(ge=-500, le=500)],
+    Annotated[int, Field(ge=1, le=20)],
+    Annotated[float, Field(ge=-360, le=360)],
+]
 
 
 class HeadingMode(StrEnum):
@@ -140,9 +147,13 @@ class Helix(Shape):
         return Harmonic(
             self.laps * self.period_s,
             slope_ned_mps=(0.0, 0.0, -self.climb_mps),
-            amplitude_ned_m=(self.radius_m, self.radius_m, 0.0),
-            omega_ned_radps=(omega, omega, 0.0),
-            phase_ned_rad=(0.5 * math.pi, 0.0, 0.0),
+            sines=(
+                Sine(
+                    (self.radius_m, self.radius_m, 0.0),
+                    (omega, omega, 0.0),
+                    (0.5 * math.pi, 0.0, 0.0),
+                ),
+            ),
         )
 
 
@@ -174,14 +185,37 @@ class Lemniscate(Shape):
         omega = 2.0 * math.pi / self.period_s
         return Harmonic(
             self.laps * self.period_s,
-            amplitude_ned_m=(self.half_length_m, self.half_width_m, 0.0),
-            omega_ned_radps=(omega, 2.0 * omega, 0.0),
+            sines=(
+                Sine((self.half_length_m, self.half_width_m, 0.0), (omega, 2.0 * omega, 0.0)),
+            ),
         )
+
+
+class Sines(Shape):
+    """A closed curve about the origin, each of whose axes is a sum of sines: an entry [amplitude in
+    m, cycles per period, phase in deg] adds amplitude sin(2 pi cycles s / period + phase)."""
+
+    shape: Literal["sines"] = "sines"
+    north: Annotated[tuple[Term, ...], Field(max_length=10)] = ((1.0, 1, 90.0),)
+    east: Annotated[tuple[Term, ...], Field(max_length=10)] = ((1.0, 1, 0.0),)
+    up: Annotated[tuple[Term, ...], Field(max_length=10)] = ()
+    period_s: Period = 8.0
+    laps: Laps = 2
+
+    def path(self) -> Path:
+        omega = 2.0 * math.pi / self.period_s
+        terms = zip(np.diag((1.0, 1.0, -1.0)), (self.north, self.east, self.up), strict=True)
+        sines = tuple(
+            Sine(tuple(amplitude_m * axis), (cycles * omega,) * 3, (math.radians(phase),) * 3)
+            for axis, entries in terms
+            for amplitude_m, cycles, phase in entries
+        )
+        return Harmonic(self.laps * self.period_s, sines=sines)
 
 
 class Waypoints(Shape):
     """A smooth path from rest to rest through points [north, east, up] m, relative to the origin;
-    at `times_s`, or at a mean speed."""
+    at `times_s`, at a mean speed, or as fast as the limits of `fastest` allow."""
 
     shape: Literal["waypoints"] = "waypoints"
     points_m: Annotated[
@@ -189,20 +223,23 @@ class Waypoints(Shape):
     ]
     speed_mps: Speed | None = None
     times_s: tuple[Annotated[float, Field(ge=0, le=3600)], ...] | None = None
+    fastest: PathLimits | None = None
     minimise: Smoothness = Smoothness.SNAP
     run_in_s: Seconds = 1.0
     run_out_s: Seconds = 1.0
 
     @model_validator(mode="after")
     def _makes_a_path(self) -> Self:
-        if (self.speed_mps is None) == (self.times_s is None):
-            raise ValueError("waypoints need one of speed_mps and times_s")
+        if [self.speed_mps, self.times_s, self.fastest].count(None) != 2:
+            raise ValueError("waypoints need one of speed_mps, times_s and fastest")
         self.path()
         return self
 
     def path(self) -> Path:
         points = np.array(self.points_m, dtype=np.float64) * (1.0, 1.0, -1.0)
-        if self.speed_mps is not None:
+        if self.fastest is not None:
+            times = fastest_times(self.points_m, self.minimise, self.fastest)
+        elif self.speed_mps is not None:
             times = times_from_speed(points, self.speed_mps)
         else:
             times = np.array(self.times_s or (), dtype=np.float64)
@@ -254,6 +291,7 @@ SHAPES: Mapping[str, type[Shape]] = {
     "circle": Circle,
     "lemniscate": Lemniscate,
     "helix": Helix,
+    "sines": Sines,
     "waypoints": Waypoints,
     "table": FromTable,
 }

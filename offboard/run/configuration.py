@@ -246,7 +246,8 @@ def _missing(part: str, raw: Raw) -> str:
 
 
 def read_part(part: str, name: str) -> Raw:
-    """A vehicle, controller or reference by shipped name or file, valid. Raises DocumentError."""
+    """A vehicle, controller or reference by shipped name or file, valid; the table that a reference
+    names is beside it. Raises DocumentError."""
     if part == "reference" and name.lower().endswith(".csv"):
         return {"shape": "table", "file": name}
     laws = []
@@ -258,6 +259,8 @@ def read_part(part: str, name: str) -> Raw:
     raw = read(read_text(path), str(path))
     check_kind(raw, part, str(path))
     validate(raw, _model(part, raw), str(path))
+    if raw.get("shape") == "table":
+        raw["file"] = str(path.parent / raw["file"])
     return raw
 
 

@@ -19,7 +19,7 @@ from offboard.model.command import Command
 from offboard.model.frames import quaternion_from_thrust_direction
 from offboard.model.vehicle import Vehicle
 from offboard.reference.base import Reference
-from offboard.reference.path import Fixed, Harmonic
+from offboard.reference.path import Fixed, Harmonic, Sine
 from offboard.reference.track import Track
 
 STEP_S = 1e-3
@@ -113,14 +113,11 @@ class Plant:
 
 
 def lemniscate(period_s: float, *, heading_rad: float = 0.0, vertical_m: float = 0.0) -> Track:
-    """2 sin wt north, 1 sin 2wt east, 3 m high, heaving with sin 3wt; from rest over the first
+    """2 sin wt north, 1 sin 2wt east, `vertical_m` sin 3wt about 3 m high; from rest over the first
     4 s."""
     omega = math.tau / period_s
-    path = Harmonic(
-        3600.0,
-        amplitude_ned_m=(2.0, 1.0, vertical_m),
-        omega_ned_radps=(omega, 2.0 * omega, 3.0 * omega),
-    )
+    sine = Sine((2.0, 1.0, vertical_m), (omega, 2.0 * omega, 3.0 * omega))
+    path = Harmonic(3600.0, sines=(sine,))
     return Track(path, Fixed(heading_rad), run_in_s=4.0, origin_ned_m=(0.0, 0.0, -3.0))
 
 

@@ -14,7 +14,7 @@ from offboard.documents.reading import parse, read
 from offboard.model.vehicle import Vehicle
 from offboard.reference.base import FlatSample
 from offboard.reference.feasibility import check
-from offboard.reference.path import AlongVelocity, Harmonic
+from offboard.reference.path import AlongVelocity, Harmonic, Sine
 from offboard.reference.shapes import SHAPES, Line
 from offboard.reference.track import STOP_S, Moved, Track
 
@@ -39,8 +39,9 @@ def track_of(shape: str, heading: str, **settings: object) -> Track:
 
 
 def shipped(name: str) -> Track:
-    text = (CONFIG / "references" / f"{name}.yaml").read_text()
-    settings = read(text, name)
+    settings = read((CONFIG / "references" / f"{name}.yaml").read_text(), name)
+    if settings["shape"] == "table":
+        settings["text"] = (CONFIG / "references" / settings["file"]).read_text()
     return SHAPES[settings["shape"]](**settings).track()
 
 
@@ -144,14 +145,36 @@ def test_shipped_references_are_feasible_and_have_their_peak_speeds() -> None:
         parse(path.read_text(), Vehicle, path.stem) for path in (CONFIG / "vehicles").glob("*.yaml")
     ]
     peaks_mps = {"lemniscate_4mps": 4.0, "lemniscate_15s": 1.18, "circle": 1.57, "helix": 1.024}
-    assert peaks_mps.keys() < set(SHIPPED)
+    lowest_m = {"lemniscate_4mps": 5.0, "circle_vertical": 2.65, "trefoil": 1.5, "spiral": 1.5}
+    lowest_m["racing"] = 3.736
+    assert peaks_mps.keys() | lowest_m.keys() < set(SHIPPED)
     for name in SHIPPED:
         for vehicle in fleet:
             envelope = check(shipped(name), vehicle)
             assert envelope.tilt_max_rad < 0.62
-            assert envelope.height_min_m == pytest.approx(5.0 if name == "lemniscate_4mps" else 3.0)
+            assert envelope.height_min_m == pytest.approx(lowest_m.get(name, 3.0), abs=0.005)
         peak_mps = peaks_mps.get(name, envelope.speed_max_mps)
         assert envelope.speed_max_mps == pytest.approx(peak_mps, rel=0.005)
+
+
+def test_published_curves_are_as_their_definitions() -> None:
+    """Those of quad_trajectories: (north, east, height) by the time at full speed."""
+    s = np.linspace(3.0, 50.0, 400)
+    trefoil, w = shipped("trefoil"), math.tau * s / 25.0
+    height_m, progress = 2.25 + 0.75 * np.sin(3 * w), 0.5 - 0.5 * np.cos(math.tau * s / 55.0)
+    spiral, turned = shipped("spiral"), 6.0 * math.pi * progress
+    circle, v = shipped("circle_vertical"), math.tau * s / 13.0
+    published = (
+        (trefoil, 0.6 * (np.sin(w) + 2 * np.sin(2 * w)), 0.6 * (np.cos(w) - 2 * np.cos(2 * w)),
+         height_m),
+        (spiral, 1.5 * np.cos(turned), 1.5 * np.sin(turned), 1.5 + 1.5 * progress),
+        (circle, 0.35 * np.cos(v), 0.0 * v, 3.0 + 0.35 * np.sin(v)),
+    )  # fmt: skip
+    for track, north_m, east_m, up_m in published:
+        flown_m = track.sample(s + 0.5 * track.run_in_s).position_ned_m
+        inside = s < track.path.length_s - 0.5 * track.run_out_s
+        expected_m = np.column_stack((north_m, east_m, -up_m))
+        np.testing.assert_allclose(flown_m[inside], expected_m[inside], atol=0.001)
 
 
 def test_heading_along_velocity_points_along_it_and_unwraps() -> None:
@@ -172,9 +195,8 @@ def test_heading_along_velocity_points_along_it_and_unwraps() -> None:
 
 def test_heading_turns_smoothly_through_an_inner_stop() -> None:
     # out and back: the direction of motion jumps by pi where the path turns round
-    back_and_forth = Harmonic(
-        length_s=10.0, bounded=True, amplitude_ned_m=(2.0, 0, 0), omega_ned_radps=(0.5, 0, 0)
-    )
+    sine = Sine((2.0, 0.0, 0.0), (0.5, 0.0, 0.0))
+    back_and_forth = Harmonic(length_s=10.0, bounded=True, sines=(sine,))
     heading = AlongVelocity(back_and_forth, 10.0)
     s = np.linspace(0.0, 10.0, 100_001)
     jet = heading.jet(s, back_and_forth.jet(s))
@@ -230,7 +252,7 @@ def test_waypoints_minimise_what_they_say(minimise: str, order: int) -> None:
         ({"shape": "circle", "radius_m": -1}, "greater than 0.05"),
         ({"shape": "circle", "course": "table"}, "fixed"),
         ({"shape": "hover", "run_in_s": 2}, "Input should be 0"),
-        ({"shape": "waypoints", "points_m": POINTS}, "one of speed_mps and times_s"),
+        ({"shape": "waypoints", "points_m": POINTS}, "one of speed_mps, times_s and fastest"),
         (
             {"shape": "waypoints", "points_m": [[0, 0, 0], [0, 0, 0]], "speed_mps": 1},
             "points 1 and 2 are the same place",
