@@ -81,7 +81,7 @@ def test_a_score_fits(columns: int) -> None:
 @pytest.mark.parametrize(
     ("command", "stream", "says"),
     [
-        ("offboard fly --reference spiral", "stderr", "no reference named 'spiral'; known are"),
+        ("offboard fly --reference snail", "stderr", "no reference named 'snail'; known are"),
         (
             "simulator --duration 0.1 --gcs none --connect udpout:127.0.0.1:59999",
             "stdout",

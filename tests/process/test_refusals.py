@@ -50,7 +50,7 @@ def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
     ("options", "value", "says"),
     [
         ("--config", "nonsense", "no configuration named 'nonsense'; known are flight, paper"),
-        ("--reference", "spiral", "no reference named 'spiral'; known are circle"),
+        ("--reference", "snail", "no reference named 'snail'; known are circle"),
         ("--reference", "missing.csv", "missing.csv cannot be read: No such file"),
         ("--set", "period_s=7", "period_s: 7 should be less than or equal to 0.5"),
         ("--set", "controller.seed=3", "controller.seed is not a known key"),
