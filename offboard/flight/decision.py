@@ -28,7 +28,13 @@ from offboard.model.command import Command
 
 NOTICEABLE_RADPS = 0.5  # a smaller change of the bandwidth is not announced
 # in a word -> what a missed decision is ascribed to
-_BY = {"controller": "the controller failed", "link": "telemetry was too old for a setpoint"}
+_BY = {
+    "controller": "the controller failed",
+    "link": "telemetry was too old for a setpoint",
+    "computer": "this computer was too busy",
+}
+# of a law that answered within a period
+_NOT_OF_THE_LAW: dict[int, str] = {Refusal.STALE: "link", Refusal.LATE: "computer"}
 
 
 def begin(flight: FlightState) -> None:
@@ -57,8 +63,8 @@ def decide(flight: FlightState) -> bool:
         return False
     if decided.failure:
         in_time = decided.solve_time_s <= flight.period_s
-        aged = decided.refused == Refusal.STALE and in_time
-        _miss(flight, decided.failure, "link" if aged else "controller")
+        late = _NOT_OF_THE_LAW.get(decided.refused, "controller")
+        _miss(flight, decided.failure, late if in_time else "controller")
         return False
     flight.predictions.append(decided.state)
     return True

@@ -136,7 +136,7 @@ class FlightState:
     announced_radps: float = math.nan  # bandwidth in use, as the user knows it
     missed: int = 0  # decisions in a row that were not sent
     failure: str = ""  # what prevented the newest of them
-    failure_cause: str = ""  # in a word: controller or link
+    failure_cause: str = ""  # in a word: controller, link or computer
     commands: deque[Command] = field(default_factory=lambda: deque(maxlen=COMMANDS_KEPT))
     thrusts: deque[float] = field(default_factory=lambda: deque(maxlen=THRUSTS_KEPT))
     announced: list[str] = field(default_factory=list)  # sentences for the user, oldest first

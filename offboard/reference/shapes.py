@@ -185,9 +185,7 @@ class Lemniscate(Shape):
         omega = 2.0 * math.pi / self.period_s
         return Harmonic(
             self.laps * self.period_s,
-            sines=(
-                Sine((self.half_length_m, self.half_width_m, 0.0), (omega, 2.0 * omega, 0.0)),
-            ),
+            sines=(Sine((self.half_length_m, self.half_width_m, 0.0), (omega, 2.0 * omega, 0.0)),),
         )
 
 
