@@ -149,6 +149,7 @@ class Recorder:
         self._engaged = sorted(path.parent for path in directory.glob(f"*/{ENGAGED}"))
         self._left, self._left_until_s = _left(self._engaged)
         self._vehicle = ""
+        self._newest = directory  # flight
         # read once: in flight the file system may keep its caller waiting
         self._taken = {path.name for path in directory.iterdir()}
 
@@ -191,7 +192,7 @@ class Recorder:
         """A log of its own for a flight of `vehicle` that begins. Returns its directory."""
         self.settle()
         directory = self._new_directory()
-        self._engaged, self._vehicle = [directory], vehicle
+        self._engaged, self._vehicle, self._newest = [directory], vehicle, directory
         self._flight = flight = FlightRecord(directory, configuration, vehicle)
         now_us = clock.unix_us()
         assert session.vehicle is not None
@@ -270,13 +271,16 @@ class Recorder:
         self._score_one(directory)
 
     def _score_one(self, directory: Path) -> None:
+        # several at once would load a small computer: of those that wait, the newest at the end
+        if self._closing.is_set() and directory != self._newest:
+            return
         self._score(directory, self._closing)
         if not self._closing.is_set():
             _remove([directory / UNSCORED])
 
     def close(self) -> None:
-        """Close all logs. What is not scored yet is left to processes that outlive this one, or to
-        the next start."""
+        """Close all logs. The flight that is being scored and the newest are left to processes that
+        outlive this one, the others to the next start."""
         if self._closing.is_set():
             return
         self._close_flight()
