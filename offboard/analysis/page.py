@@ -55,7 +55,7 @@ STYLE = go.layout.Template(
         "scene": {"xaxis": _SCENE_AXIS, "yaxis": _SCENE_AXIS, "zaxis": _SCENE_AXIS},
         "legend": {
             "orientation": "h", "x": 0, "y": 0, "yref": "container", "yanchor": "bottom",
-            "groupclick": "togglegroup",
+            "groupclick": "togglegroup", "itemsizing": "constant",
         },
     }
 )  # fmt: skip

@@ -45,7 +45,9 @@ class Command(TyperCommand):
         try:
             return self._parsed(ctx, _completed(args))
         except BadParameter as error:
-            raise UserError(f"{error.format_message()}; see `{ctx.command_path} --help`") from None
+            words = error.format_message().replace("Value error, ", "").split()
+            sentence = " ".join(words).rstrip(".")
+            raise UserError(f"{sentence}; see `{ctx.command_path} --help`") from None
 
     def _parsed(self, ctx: Any, args: list[str]) -> list[str]:
         given, _, parameters = self.make_parser(ctx).parse_args(list(args))

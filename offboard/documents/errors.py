@@ -40,12 +40,15 @@ class DocumentError(UserError):
 
 def located(error: BaseException) -> str:
     """An exception of code from outside, such as a controller, in one sentence with file and line
-    of the mistake: of the innermost call in the folder that was called from here. Reads no file."""
+    of the mistake: of the innermost call in the package that was called from here, a folder or a
+    single module. Reads no file."""
     walked = traceback.walk_tb(error.__traceback__)
     calls = [(frame.f_code.co_filename, line) for frame, line in walked]
     calls = [(file, line) for file, line in calls if _is_file(file)]
     outside = [(file, line) for file, line in calls if not file.startswith(_PACKAGE)]
-    folder = str(Path(outside[0][0]).parent) if outside else ""
+    own = Path(outside[0][0]) if outside else Path()
+    is_module = own.parent.name.endswith("-packages")  # site-packages has those of others, too
+    folder = str(own if is_module else own.parent) if outside else ""
     theirs = [(file, line) for file, line in outside if file.startswith(folder)] or calls
     place = " ({}:{})".format(*theirs[-1]) if theirs else ""
     return " ".join(f"{type(error).__name__}: {error}{place}".split())

@@ -225,13 +225,17 @@ def _sentence(detail: ErrorDetails, document: Any, model: type[BaseModel]) -> st
 
 
 def _unknown_key(path: str, model: type[BaseModel]) -> str:
-    """The sentence for an unknown key; of the whole document also what is known."""
-    if "." in path:
-        return f"{path} is not a known key"
-    known = sorted(model.model_fields)
-    near = difflib.get_close_matches(path, known, n=1)
+    """The sentence for an unknown key, with those that its section knows if it is of one class."""
+    *sections, key = path.split(".")
+    section: Any = model
+    for name in sections:
+        field = getattr(section, "model_fields", {}).get(name)
+        section = field and field.annotation
+    known = sorted(getattr(section, "model_fields", ()))
+    near = difflib.get_close_matches(key, known, n=1)
     hint = f", did you mean {near[0]}?" if near else ""
-    return f"{path} is not a known key{hint} (known keys: {', '.join(known)})"
+    all_known = f" (known keys: {', '.join(known)})" if known else ""
+    return f"{path} is not a known key{hint}{all_known}"
 
 
 def _key_path(detail: ErrorDetails, document: Any) -> str:

@@ -95,11 +95,12 @@ def _header(cells: list[str], name: str, number: int) -> list[str]:
         if column in columns:
             raise TableError(f"{name}, row {number}: column {column} is given twice")
         columns.append(column)
-    for column in ("time_s", "north_m", "east_m"):
+    height = "down_m" if "down_m" in columns else "altitude_m"
+    for column in ("time_s", "north_m", "east_m", height):
         if column not in columns:
             raise TableError(f"{name}, row {number}: column {column} is missing")
-    if ("down_m" in columns) == ("altitude_m" in columns):
-        raise TableError(f"{name}, row {number}: one of down_m and altitude_m is needed, not both")
+    if "down_m" in columns and "altitude_m" in columns:
+        raise TableError(f"{name}, row {number}: down_m and altitude_m exclude each other")
     return columns
 
 

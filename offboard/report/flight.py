@@ -95,11 +95,12 @@ def read(path: Path) -> Flight:
 
 
 def _configured(text: str | None) -> dict[str, str]:
-    """Names of the parts, from the configuration in the log."""
+    """Names of the parts, from the configuration in the log; of a table that of its file."""
     try:
         document: Any = yaml.safe_load(text or "")
-        return {part: str(document[part][key]) for part, key in _PARTS.items()}
-    except (yaml.YAMLError, KeyError, TypeError):
+        parts = ((part, document[part], key) for part, key in _PARTS.items())
+        return {name: str(part.get("file", part[key])) for name, part, key in parts}
+    except (yaml.YAMLError, AttributeError, KeyError, TypeError):
         return {}
 
 

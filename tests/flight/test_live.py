@@ -223,6 +223,7 @@ def test_the_live_page_follows_the_flight_in_both_schemes_and_widths(shown: Show
     assert opened.page.inner_text("h1") == "a flight: lemniscate by pso"
     assert opened.page.inner_text("#report").endswith("flights/a/report.html")
     assert opened.page.inner_text("#skipped") == "0"
+    assert opened.page.inner_text("#failsafe") == "none"
     assert opened.problems == opened.fetched == []
 
 

@@ -53,7 +53,8 @@ def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
         ("--reference", "snail", "no reference named 'snail'; known are circle"),
         ("--reference", "missing.csv", "missing.csv cannot be read: No such file"),
         ("--set", "period_s=7", "period_s: 7 should be less than or equal to 0.5"),
-        ("--set", "controller.seed=3", "controller.seed is not a known key"),
+        ("--set", "controller.seed=3", "controller.seed is not a known key (known keys: bandwidth"),
+        ("--set", "vehicle.mass=3", "vehicle.mass is not a known key, did you mean mass_kg? ("),
         ("--set", "controller.law=frog", "controller: law: 'frog' is not one of pso, lqr,"),
         ("--set", "controller=pid2", "no controller named 'pid2'; known are"),
         ("--set", "controller.bandwidth_radps=fast", "'fast' should be a valid number"),
@@ -110,6 +111,23 @@ def test_what_cannot_be_flown_is_refused(
 )
 def test_other_commands_refuse_alike(command: str, says: str, refused: Refused) -> None:
     assert says in refused(command if command.startswith("offboard") else f"{SIMULATOR} {command}")
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (
+            "--to xls -o x",
+            "Invalid value for '--to': 'xls' is not one of 'mcap', 'csv', 'ulog'; see",
+        ),
+        (
+            "-o x",
+            "Missing option '--to'. Choose from: mcap, csv, ulog; see `offboard export --help`",
+        ),
+    ],
+)
+def test_a_wrong_option_is_one_sentence(options: str, says: str, refused: Refused) -> None:
+    assert refused(f"offboard export {RECORDING} {options}").startswith(says)
 
 
 def test_an_unknown_option_is_named(called: Called) -> None:

@@ -12,8 +12,8 @@ function tell() {
   $("time").textContent = number(newest.time_s, 1, "s");
   $("mode").textContent = `${newest.mode || "unknown"}, ${newest.armed ? "armed" : "disarmed"}`;
   $("authority").textContent = AUTHORITY[newest.authority] ?? newest.authority;
-  $("failsafe").textContent =
-    newest.failsafe + (newest.failsafe_row ? `: ${newest.failsafe_row}` : "");
+  $("failsafe").textContent = newest.failsafe === "fly"
+    ? "none" : `${newest.failsafe}: ${newest.failsafe_row}`;
   $("error").textContent = number(newest.position_error_m, 3, "m");
   $("age").textContent = number(newest.telemetry_age_s, 0, "ms", 1e3);
   $("delay").textContent = number(newest.link_delay_s, 0, "ms", 1e3);
