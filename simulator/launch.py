@@ -106,7 +106,7 @@ def _recorder(options: Options) -> Recorder | None:
 def _announce(options: Options, what: str, scenario: str) -> None:
     """A line for each vehicle."""
     link, first = _companion_link(options), options.numbers[0]
-    purpose = "waiting at" if link.startswith("udpin:") else "sending to"
+    purpose = "waiting at" if link.startswith(("udpin:", "tcpin:")) else "sending to"
     for number in options.numbers:
         place = shifted(link, number - first).partition(":")[2]
         tell(

@@ -105,10 +105,12 @@ def sitl(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Sitl]:
     and its path printed.
     """
     marker = request.node.get_closest_marker("sitl")
-    named = marker.kwargs if marker else {}
-    if unknown := sorted(set(named) - set(OPTIONS)):
+    named, nameless = (marker.kwargs, marker.args) if marker else ({}, ())
+    wrong = [f"name the option {value!r}" for value in nameless]
+    wrong += [f"{name} is unknown" for name in sorted(set(named) - set(OPTIONS))]
+    if wrong:
         known = ", ".join(OPTIONS)
-        pytest.fail(f"pytest.mark.sitl: {unknown[0]} is unknown; there is {known}", pytrace=False)
+        pytest.fail(f"pytest.mark.sitl: {wrong[0]}; there is {known}", pytrace=False)
     options = {name: value for name, value in named.items() if value is not None}
     vehicle = Sitl(tmp_path, options)
     request.node.stash.setdefault(LOGS, []).append(vehicle.log)

@@ -102,21 +102,18 @@ class Commander:
         """The mode that was chosen; in a failsafe the vehicle flies another one."""
         return self._firmware.modes[self._intended]
 
-    def knows(self, event: str) -> bool:
-        """The firmware has rules for an event."""
-        return event in self._rows
-
     # -- events ------------------------------------------------------------------------------
 
     def handle(self, event: str, request: Request = NO_REQUEST) -> Result:
-        """Apply the row of the state table that decides about an event."""
+        """Apply the row of the state table that decides about an event; a firmware without rows
+        for it does not support it."""
         self._event, self._request = event, request
         if self.refused and (text := self.refused.get(self._refusal_name)) is not None:
             self.texts.append(text)
             return Result.TEMPORARILY_REJECTED
         rule = self._row(event)
         if rule is None:
-            return Result.ACCEPTED
+            return Result.ACCEPTED if event in self._rows else Result.UNSUPPORTED
         self._apply(rule)
         return rule.result
 

@@ -73,10 +73,12 @@ class Mission:
         self.speed_mps, self._since_s = math.inf, math.nan
 
     def go_to(self, number: int) -> bool:
-        """Continue with this item; False where there is none."""
+        """Continue with this item, for home (ArduCopter) with the first one; False where there is
+        none."""
         if not 0 <= number < len(self.items):
             return False
-        self.current, self.finished, self._since_s = number, False, math.nan
+        self.current, self.finished = max(number, self.first), False
+        self._since_s = math.nan
         return True
 
     def pause(self) -> None:
@@ -117,7 +119,7 @@ class Mission:
         """Start, or continue where it was paused; a finished one starts again."""
         self.under_way = True
         if self.finished:
-            self.go_to(self.first)
+            self.go_to(0)
             self.speed_mps = math.inf
         self._target_ned_m = here_ned_m
         self._since_s = self._climb_down_m = math.nan
@@ -194,6 +196,7 @@ class Mission:
         north, east, down = self._position(item, home_ned_m)
         if item.command == Kind.TAKEOFF:
             north, east = self._target_ned_m[:2]
+            down = min(down, here_ned_m[2]) if self.firmware.takeoff_items_climb else down
         if item.command == Kind.LAND:
             down = here_ned_m[2] if self.landing else self._target_ned_m[2]
         return north, east, down

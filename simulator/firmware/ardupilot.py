@@ -266,6 +266,7 @@ ARDUPILOT = ArduCopter(
     setpoints_imply_flight=True,
     setpoint_spool_s=2.8,
     home_item_first=True,
+    takeoff_items_climb=True,
     guided_items=True,
     mission_text=info("Flight plan received"),
     companion_rates_hz=telemetry.COMPANION_RATES_HZ,

@@ -49,7 +49,7 @@ AFTER_DELAY = " after delay"
 
 EVENTS = frozenset({
     # requests: commands, messages, faults that act for a pilot
-    "mode", "takeoff", "land", "return", "loiter", "turn", "mission", "reboot",
+    "mode", "takeoff", "land", "return", "loiter", "turn", "mission", "reboot", "terminate",
     "arm", "disarm", "force arm", "force disarm", "checks", "thrust not a number",
     # monitoring
     "stream lost", "stream found", "position lost", "position found",
@@ -180,6 +180,7 @@ class Firmware(ABC):
     # missions
     requests_kind_of_peer: bool = False  # items of a mission in the kind that came last
     home_item_first: bool = False  # item 0 of a mission is home
+    takeoff_items_climb: bool = False  # and never descend
     guided_items: bool = False  # an item with current = 2 is a place to fly to now
     mission_text: StatusText | None = None  # after an upload
     reached_above_landing: bool = False  # a landing is "item reached" above its place, too

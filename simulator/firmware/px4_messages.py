@@ -94,7 +94,8 @@ def heartbeat(view: View) -> Sequence[Any]:
         base_mode = RATES if setpoint is None or rates else OFFBOARD
     if commander.armed:
         return view.heartbeat(base_mode, 5 if commander.failsafe else 4)
-    return view.heartbeat(base_mode, 3 if commander.healthy else 0)
+    terminated = 8 if commander.latched else 0
+    return view.heartbeat(base_mode, 3 if commander.healthy else terminated)
 
 
 def current_mode(view: View) -> Sequence[Any]:

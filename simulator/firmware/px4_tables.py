@@ -41,6 +41,7 @@ MODES = {
         Mode("AUTO.MISSION", "Mission", 0x04040000, AUTO, Behaviour.MISSION),
         Mode("AUTO.FOLLOW", "Follow Target", 0x08040000, AUTO, Behaviour.HOLD),
         _ends("AUTO.PRECLAND", "Precision Land", 0x09040000, Behaviour.LAND),
+        Mode("TERMINATION", "Termination", 0x000A0000, RATES, Behaviour.HOLD, arms=False),
         Mode("OFFBOARD", "Offboard", 0x00060000, OFFBOARD, Behaviour.SETPOINT),
         _by_sticks("POSCTL", "Position", 0x00030000, Behaviour.DESCEND),
         _by_sticks("ALTCTL", "Altitude", 0x00020000, Behaviour.DESCEND),
@@ -235,6 +236,7 @@ def _disarms(event: str, *texts: str, when: tuple[str, ...] = ()) -> Rule:
 
 
 RULES = (
+    _says("mode", _NOT_AVAILABLE, "latched terminate", result=_LATER),
     Rule("mode", when=("not armed",), to="requested"),
     Rule("mode", when=("mode can run",), to="requested"),
     Rule("mode", when=("requested by ground station",), result=_LATER, texts=(_NOT_AVAILABLE,)),
@@ -255,6 +257,7 @@ RULES = (
     Rule("disarm", result=_LATER, texts=(critical("Disarming denied: not landed"),)),
     Rule("force disarm", when=("not armed",)),
     _disarms("force disarm", "Disarmed by external command"),
+    Rule("terminate", to="TERMINATION", do=("disarm", "latch"), texts=(_LOST,)),
     *(
         Rule(
             "stream lost",

@@ -108,10 +108,6 @@ class Commands:
         north, east, down = finite
         return autopilot.handle("takeoff", Request(takeoff_ned_m=(north, east, down)))
 
-    def _loiter(self, autopilot: Autopilot, _: Command) -> Result:
-        known = autopilot.commander.knows("loiter")
-        return autopilot.handle("loiter") if known else Result.UNSUPPORTED
-
     def _set_home(self, autopilot: Autopilot, command: Command) -> Result:
         """MAV_CMD_DO_SET_HOME. param1 = 1: here; else a place in degrees and AMSL metres."""
         latitude, longitude, height_m = command.params[4:7]
@@ -182,15 +178,18 @@ class Commands:
     def _turn(self, autopilot: Autopilot, command: Command) -> Result:
         """MAV_CMD_CONDITION_YAW: to a yaw, or relative to the present one; degrees."""
         yaw_deg, speed_dps, sense, relative = command.params[:4]
-        if not autopilot.commander.knows("turn"):
-            return Result.UNSUPPORTED
-        if math.isfinite(yaw_deg):
+        result = autopilot.handle("turn")
+        if result is Result.ACCEPTED and math.isfinite(yaw_deg):
             from_rad = autopilot.state.estimate.yaw_rad if relative else 0.0
             turn_rad = math.radians(yaw_deg) * (-1.0 if relative and sense < 0 else 1.0)
             turn_radps = math.radians(speed_dps) if speed_dps > 0.0 else math.inf
             yaw_rad = math.remainder(from_rad + turn_rad, 2.0 * math.pi)
             autopilot.guidance.turn_to(yaw_rad, turn_radps)
-        return autopilot.handle("turn")
+        return result
+
+    def _terminate(self, autopilot: Autopilot, command: Command) -> Result:
+        """MAV_CMD_DO_FLIGHTTERMINATION: the motors stop; it cannot be withdrawn."""
+        return autopilot.handle("terminate") if command.params[0] > 0.5 else Result.FAILED
 
     def _reboot(self, autopilot: Autopilot, command: Command) -> Result:
         restart = command.params[0] >= 1.0
@@ -198,8 +197,6 @@ class Commands:
 
     def _start_mission(self, autopilot: Autopilot, command: Command) -> Result:
         first = command.params[0] if math.isfinite(command.params[0]) else 0.0
-        if not autopilot.commander.knows("mission"):
-            return Result.UNSUPPORTED
         if not -1 <= first < max(1, len(autopilot.mission.items)):
             return Result.DENIED
         return autopilot.handle("mission")
@@ -248,7 +245,7 @@ class Commands:
 
 # By MAV_CMD
 HANDLERS: dict[int, Callable[[Commands, Autopilot, Command], Result | None]] = {
-    17: Commands._loiter,  # NAV_LOITER_UNLIM
+    17: lambda _, autopilot, __: autopilot.handle("loiter"),  # NAV_LOITER_UNLIM
     20: lambda _, autopilot, __: autopilot.handle("return"),  # NAV_RETURN_TO_LAUNCH
     21: lambda _, autopilot, __: autopilot.handle("land"),  # NAV_LAND
     22: Commands._takeoff,  # NAV_TAKEOFF
@@ -256,6 +253,7 @@ HANDLERS: dict[int, Callable[[Commands, Autopilot, Command], Result | None]] = {
     176: Commands._set_mode,  # DO_SET_MODE
     178: Commands._change_speed,  # DO_CHANGE_SPEED
     179: Commands._set_home,  # DO_SET_HOME
+    185: Commands._terminate,  # DO_FLIGHTTERMINATION
     192: Commands._reposition,  # DO_REPOSITION
     224: Commands._set_current_item,  # DO_SET_MISSION_CURRENT
     246: Commands._reboot,  # PREFLIGHT_REBOOT_SHUTDOWN

@@ -51,6 +51,10 @@ def test_unknown_scenario(sitl):
 @pytest.mark.sitl(weather=3)
 def test_unknown_argument(sitl):
     pass
+
+@pytest.mark.sitl("wind_2mps")
+def test_argument_without_name(sitl):
+    pass
 """
 
 
@@ -62,7 +66,7 @@ def test_the_fixtures_as_the_readme_shows_them(workers: int, pytester: pytest.Py
     assert example.count("\ndef test_") == 2
     pytester.makepyfile(test_readme=example, test_mine=MINE)
     result = pytester.runpytest_subprocess("-q", "--strict-markers", f"-n{workers}", timeout=120)
-    result.assert_outcomes(passed=2, failed=3, errors=2)
+    result.assert_outcomes(passed=2, failed=3, errors=3)
     logs = [Path(line) for line in result.outlines if line.endswith(".tlog")]
     assert len(logs) == 2
     assert all(log.stat().st_size > 10_000 for log in logs)
@@ -74,6 +78,7 @@ def test_the_fixtures_as_the_readme_shows_them(workers: int, pytester: pytest.Py
         "*nothing was flown: there is no reference named 'moon'*",
         "*there is no scenario named 'storm'; known are*",
         "*pytest.mark.sitl: weather is unknown; there is scenario, firmware*",
+        "*pytest.mark.sitl: name the option 'wind_2mps'; there is scenario, firmware*",
     ):
         result.stdout.fnmatch_lines(line)
 

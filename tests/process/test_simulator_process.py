@@ -66,8 +66,12 @@ def test_it_waits_to_be_spoken_to_shifts_its_system_and_ends_at_an_interrupt() -
 
 
 def test_the_duration_ends_it_though_nobody_listens(called: Called) -> None:
-    options = ("--connect", "udpout:127.0.0.1:9", "--duration", "2", "--speed", "20")
-    assert called("simulator", *QUIET, *options)[::2] == (0, "")
+    for link, does in (("udpout:127.0.0.1:9", "sending to"), ("tcpin:127.0.0.1:{}", "waiting at")):
+        link = link.format(free_port())
+        options = ("--connect", link, "--duration", "2", "--speed", "20")
+        code, said, errors = called("simulator", *QUIET, *options)
+        assert (code, errors) == (0, "")
+        assert f"{does} {link.partition(':')[2]}" in said
 
 
 def test_instances_have_ports_and_systems_of_their_own_and_keep_time() -> None:

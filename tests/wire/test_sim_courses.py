@@ -12,6 +12,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_bench import NAN, Bench, aloft
 
 from simulator.firmware.ardupilot import ARDUPILOT
+from simulator.firmware.base import Firmware
+from simulator.firmware.px4 import PX4
 from simulator.geodesy import EARTH_RADIUS_M
 
 ACCEPTED, UNSUPPORTED = 0, 3
@@ -130,3 +132,30 @@ def test_px4_faces_its_goal_and_then_takes_the_requested_yaw() -> None:
     assert reposition(bench, 1.0, 30.0, amsl_m, ABSOLUTE) == ACCEPTED  # nearer than NAV_ACC_RAD
     bench.run(4.0)
     assert off_deg(bench, -45.0) < 3.0
+
+
+@pytest.mark.parametrize(
+    ("firmware", "beats", "later", "said"),
+    [
+        # base_mode, custom_mode, system_status after the fall, answer to arming
+        (PX4, (1, 0xA0000, 8), 1, ["Failsafe activated"]),
+        (ARDUPILOT, (89, 4, 3), 0, ["Disarming motors"]),
+    ],
+    ids=["px4", "ardupilot"],
+)
+def test_a_terminated_flight_falls_and_only_px4_does_not_arm_again(
+    firmware: Firmware, beats: tuple[int, ...], later: int, said: list[str]
+) -> None:
+    """MAV_CMD_DO_FLIGHTTERMINATION. PX4 stays in its mode until it is started again."""
+    bench = aloft(firmware=firmware, height_m=5.0, mode="GUIDED" if firmware is ARDUPILOT else None)
+    assert bench.command(185, 0) == [4]
+    assert bench.armed
+    begun_s = bench.time_s
+    assert bench.command(185, 1) == [ACCEPTED]
+    bench.run(3.0)
+    assert (bench.armed, bench.height_m) == (False, pytest.approx(0.0, abs=0.1))
+    assert bench.texts(begun_s) == said
+    beat = bench.of("HEARTBEAT")[-1][1]
+    assert (beat.base_mode, beat.custom_mode, beat.system_status) == beats
+    assert bench.command(176, 1, 4, 3)[-1] == later
+    assert bench.command(400, 1) == [later]

@@ -179,3 +179,18 @@ def test_arducopter_faces_its_direction_of_flight_and_returns_within_its_mission
     bench.run_until(lambda: not bench.armed, 70.0)
     assert bench.mode == 3
     assert math.hypot(*bench.place[:2]) < 0.5
+
+
+def test_arducopter_asked_for_home_begins_with_the_takeoff_and_does_not_descend_to_it() -> None:
+    """Scripts reset a mission with MISSION_SET_CURRENT 0. ArduCopter 4.6.3 SITL at 6 m: item 1 is
+    reached at once, and it flies level to item 2."""
+    bench = aloft(firmware=ARDUPILOT, height_m=6.0, mode="GUIDED")
+    home = place(WAYPOINT, 0, 0, 0, 0, 0, 0, 0)
+    upload(bench, [home, place(TAKEOFF, 0, 0, 3), place(WAYPOINT, 12, 0, 6)])
+    send(bench, mavlink.MAVLink_mission_set_current_message(1, 1, 0))
+    assert bench.command(176, 1, 3) == [0]
+    heights_m: list[float] = []
+    bench.run(10.0, lambda: heights_m.append(bench.height_m))
+    assert [m.seq for _, m in bench.of("MISSION_ITEM_REACHED")] == [1, 2]
+    assert 5.7 < min(heights_m) < max(heights_m) < 6.3
+    assert bench.place[0] == pytest.approx(12.0, abs=1.0)
