@@ -40,7 +40,8 @@ class DocumentError(UserError):
 
 def located(error: BaseException) -> str:
     """An exception of code from outside, such as a controller, in one sentence with file and line
-    of the mistake: of the innermost call in the folder that was called from here. Reads no file."""
+    of the mistake: of the innermost call in the folder that was called from here. Reads no file.
+    Never raises, whatever the exception does."""
     walked = traceback.walk_tb(error.__traceback__)
     calls = [(frame.f_code.co_filename, line) for frame, line in walked]
     calls = [(file, line) for file, line in calls if _is_file(file)]
@@ -48,7 +49,11 @@ def located(error: BaseException) -> str:
     folder = str(Path(outside[0][0]).parent) if outside else ""
     theirs = [(file, line) for file, line in outside if file.startswith(folder)] or calls
     place = " ({}:{})".format(*theirs[-1]) if theirs else ""
-    return " ".join(f"{type(error).__name__}: {error}{place}".split())
+    try:
+        said = str(error)
+    except Exception:
+        said = "it cannot be printed"
+    return " ".join(f"{type(error).__name__}: {said}{place}".split())
 
 
 def _is_file(name: str) -> bool:

@@ -163,6 +163,8 @@ class FlightState:
         for name in KEPT:
             setattr(self, name, getattr(before, name))
         self.clock.growth = LinkGrowth()
+        # for a vehicle that was taken nothing was asked: not unanswered, see `note_starvation`
+        self.vehicle.heard_s.pop(TimesyncReply, None)
         self.authority = before.authority.renewed()
         if not before.ended:  # nothing was flown: what the pilot did before counts
             self.pilot, self.phase, self.began_s = before.pilot, before.phase, before.began_s
