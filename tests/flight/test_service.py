@@ -498,6 +498,23 @@ def test_a_pilot_who_engages_and_takes_it_again_at_once_has_it(served: Served) -
     assert pair.commands(21) == []  # to land
 
 
+def test_a_pilot_takes_a_vehicle_whose_own_failsafe_acts_soon(served: Served) -> None:
+    """With the least COM_OF_LOSS_T setpoints seemed to be missing always, and this its failsafe."""
+    pair = served.aloft()
+    pair.instance.autopilot.parameters.set("COM_OF_LOSS_T", 0.3)
+    pair.state.vehicle.parameters["COM_OF_LOSS_T"] = 0.3  # as it reports a change
+    pair.engage()
+    heard = pair.state.vehicle.heartbeat
+    pair.until(lambda: pair.state.vehicle.heartbeat is not heard, 1.5)
+    pair.run(0.3)  # CURRENT_MODE shows it first, which does not tell a pilot from a failsafe
+    pair.switch("pilot")
+    pair.until(lambda: pair.phase is Phase.STANDBY, 2.0)
+    assert pair.service.announced[-1].startswith(
+        "yielded: the vehicle left OFFBOARD for AUTO.LOITER"
+    )
+    assert not pair.said("own failsafe")
+
+
 def test_a_request_in_the_tick_of_a_transition_is_obeyed(served: Served) -> None:
     """It was acknowledged, and forgotten: it arrives in the last step before the phase changes."""
     pair = served.engaged(reference="hover")
