@@ -32,11 +32,19 @@ from offboard.flight.record import (
 )
 from offboard.identification.vehicle_fit import RECORDED
 from offboard.mavlink import event_record
-from offboard.mavlink.decode import Address, decode_identity
+from offboard.mavlink.decode import (
+    POSITION_LIMIT_M,
+    RATE_LIMIT_RADPS,
+    UNIT_LENGTHS,
+    VELOCITY_LIMIT_MPS,
+    Address,
+    decode_identity,
+)
 from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.framing import HEARTBEAT
 from offboard.mavlink.senders import DIALECTS, is_vehicle
 from offboard.mavlink.texts import TextAssembler
+from offboard.mavlink.vehicle_time import Age, VehicleTime
 from offboard.model.geodesy import Geodetic, origin_of, position_ned_m
 
 Array = NDArray[np.float64]
@@ -289,6 +297,7 @@ class _Collector:
         self._unix_us = (0, 0)
         self._anchor_ms = math.nan
         self._clocks: tuple[int, ...] = TELEMETRY + _SUBSTITUTES
+        self._time = VehicleTime()
         self.now_ms = math.nan  # stamp of the newest telemetry
         self.damage_ms = math.nan  # of the newest one before the first damage
 
@@ -325,6 +334,8 @@ class _Collector:
 
     def _add_theirs(self, entry: LoggedMessage, payload: bytes) -> None:
         name, now_ms, unix_s = entry.name, self.now_ms, entry.unix_us / 1e6
+        if entry.frame.message_id in TELEMETRY and self._is_ahead(entry.frame.message_id, payload):
+            return
         if name in _THEIRS:
             self._samples[name].add(payload, now_ms, unix_s)
         elif name in _TRUTH:
@@ -355,6 +366,13 @@ class _Collector:
             if math.isnan(self._anchor_ms):
                 self._anchor_ms = self.now_ms
 
+    def _is_ahead(self, message_id: int, payload: bytes) -> bool:
+        """Whether its stamp is so far ahead that the flight has refused it, too."""
+        time_s = int.from_bytes(payload[:4], "little") / 1e3
+        time_s += self._time.wrapped_s(time_s)
+        stale = self._time.check(message_id, time_s) is Age.STALE
+        return stale and time_s > self._time.newest_s
+
     def _add_origin(self, entry: LoggedMessage) -> None:
         """HOME_POSITION gives one point in both frames."""
         at = entry.message
@@ -372,6 +390,8 @@ class _Collector:
         heartbeat, battery = rows["HEARTBEAT"], rows["SYS_STATUS"]
         voltage, remaining = (battery[name].astype(np.float32) for name in _BATTERY)
         voltage[voltage == _NO_VOLTAGE] = remaining[remaining == _NO_PERCENTAGE] = math.nan
+        attitude = _plausible(rows["ATTITUDE_QUATERNION"], rates_radps=RATE_LIMIT_RADPS)
+        lengths = np.linalg.norm(attitude["quaternion"].astype(np.float64), axis=1)
         payloads = [payload for *_, payload in self._event_records]
         events = []
         for last, event in event_record.join(payloads):
@@ -386,8 +406,12 @@ class _Collector:
             for said in (self._modes, self._texts)
         )
         return History(
-            position=rows["LOCAL_POSITION_NED"],
-            attitude=rows["ATTITUDE_QUATERNION"],
+            position=_plausible(
+                rows["LOCAL_POSITION_NED"],
+                position_ned_m=POSITION_LIMIT_M,
+                velocity_ned_mps=VELOCITY_LIMIT_MPS,
+            ),
+            attitude=attitude[(lengths > UNIT_LENGTHS[0]) & (lengths < UNIT_LENGTHS[1])],
             truth=self._truth_rows(),
             reference=rows["POSITION_TARGET_LOCAL_NED"],
             setpoint=rows["SET_ATTITUDE_TARGET"],
@@ -431,6 +455,12 @@ class _Collector:
         asked, answered = answers[np.isin(answers[:, 0], np.array(self._asked_ns))].T
         times = {"time_s": 1e-9 * asked, "unix_s": np.full(len(asked), np.nan)}
         return table(times, delay_s=1e-9 * (answered - asked))
+
+
+def _plausible(rows: Rows, **limits: float) -> Rows:
+    """The rows whose columns are within these limits, as the flight refuses the others."""
+    within = [(np.abs(rows[name]) < limit).all(axis=1) for name, limit in limits.items()]
+    return rows[np.all(within, axis=0)]
 
 
 def _vehicle(log: Tlog) -> tuple[Address | None, Dialect | None]:

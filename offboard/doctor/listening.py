@@ -273,6 +273,7 @@ class Observation:
             measures_delay=not heard.clock.delay_is_measured(heard.now_s),
             unanswered_s=heard.clock.unanswered_s(heard.now_s),
             systems=senders.named(session.link_time_s) if several else "",
+            twin=session.has_twin,
             other_sender=vehicle.other_sender is not None,
             in_the_air=vehicle.armed,
             fix_type=heard.fix_type,

@@ -41,7 +41,7 @@ class DocumentError(UserError):
 def located(error: BaseException) -> str:
     """An exception of code from outside, such as a controller, in one sentence with file and line
     of the mistake: of the innermost call in the package that was called from here, a folder or a
-    single module. Reads no file."""
+    single module. Reads no file. Never raises, whatever the exception does."""
     walked = traceback.walk_tb(error.__traceback__)
     calls = [(frame.f_code.co_filename, line) for frame, line in walked]
     calls = [(file, line) for file, line in calls if _is_file(file)]
@@ -51,7 +51,11 @@ def located(error: BaseException) -> str:
     folder = str(own if is_module else own.parent) if outside else ""
     theirs = [(file, line) for file, line in outside if file.startswith(folder)] or calls
     place = " ({}:{})".format(*theirs[-1]) if theirs else ""
-    return " ".join(f"{type(error).__name__}: {error}{place}".split())
+    try:
+        said = str(error)
+    except Exception:
+        said = "it cannot be printed"
+    return " ".join(f"{type(error).__name__}: {said}{place}".split())
 
 
 def _is_file(name: str) -> bool:

@@ -49,6 +49,14 @@ def late_link(flight: FlightState) -> str:
     return f"the delay of the link has grown by {growth_s:.2f} s" if late else ""
 
 
+def unanswered(flight: FlightState) -> str:
+    """Host time since the newest TIMESYNC request that was answered, of a vehicle that answers."""
+    for_s = flight.clock.unanswered_s(flight.host_s)
+    if flight.clock.delay is None or for_s <= flight.limits.silence_s:
+        return ""
+    return f"TIMESYNC is not answered for {for_s:.1f} s: the vehicle may not receive setpoints"
+
+
 def decision_missed(flight: FlightState) -> bool:
     """A decision failed, came too late, or was not fit to be sent."""
     return flight.missed > 0
@@ -225,6 +233,7 @@ ROWS = (
     Row("blind", blind, "limits.blind_s", LAND, cause="link"),
     Row("age", old, "limits.setpoint_age_s", LEVEL, cause="link"),
     Row("link", late_link, LATE, HOLD, 0.5, "link"),
+    Row("uplink", unanswered, "limits.silence_s", HOLD, 0.5, "link"),
     Row("decision", decision_missed, "one", LEVEL, 0.0, *MISSED),
     Row("decisions", decisions_missed, "limits.missed_decisions", LAND, 0.0, *MISSED),
     Row("tilt", tilted, "limits.tilt_rad", LAND),

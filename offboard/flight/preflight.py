@@ -76,6 +76,7 @@ class Ground:
     unanswered_s: float = 0.0  # since the newest request of TIMESYNC that was answered
     reads_parameters: bool = False  # replies are still awaited
     systems: str = ""  # of several vehicles, none of which was chosen
+    twin: bool = False  # two vehicles have the same ids
     other_sender: bool = False  # another program controls it
     in_the_air: bool = False
     fix_type: int | None = None  # GPS_FIX_TYPE
@@ -135,6 +136,7 @@ OTHER_SENDER = (
     "another program controls the vehicle on this link, too: {flight.vehicle.other_sender_name} "
     "(limits.begin_with_other_sender=true flies all the same)"
 )
+TWIN = "two vehicles with the same system id send on this link, and both obey"
 SEVERAL = "several vehicles are heard, systems {systems}: choose one with --system"
 
 
@@ -180,6 +182,10 @@ def _other_sender(ground: Ground) -> str:
 
 def _several_vehicles(ground: Ground) -> str:
     return SEVERAL.format(systems=ground.systems) if ground.systems else ""
+
+
+def _twin(ground: Ground) -> str:
+    return TWIN if ground.twin else ""
 
 
 def _no_telemetry(ground: Ground) -> str:
@@ -319,6 +325,7 @@ PREFLIGHT = (
     Row("state", BLOCKS, armed_already, "disarm it", at_once=True, fly_only=True),
     Row("senders", BLOCKS, _other_sender, "stop it", at_once=True, fly_only=True),
     Row("senders", BLOCKS, _several_vehicles, "or give each vehicle its own port", at_once=True),
+    Row("senders", BLOCKS, _twin, "switch one off, or change its system id", at_once=True),
     Row("rates", WAIT, _no_telemetry),
     Row("supervisor", WAIT, _unguarded),
     Row("rates", BLOCKS, _slow, _slow_hint),
@@ -358,9 +365,11 @@ class ParameterReading:
         self._requested_s = now_s
         return [ParamRead(p.name) for p in self._wanted(dialect) if p.name not in known]
 
-    def complete(self, dialect: Dialect, known: Mapping[str, float], now_s: float) -> bool:
-        """Every parameter has a reply, or had time enough for one."""
-        answered = all(each.name in known for each in self._wanted(dialect))
+    def complete(
+        self, dialect: Dialect, known: Mapping[str, float], now_s: float, *, named: bool = True
+    ) -> bool:
+        """Every parameter has a reply, and the vehicle is `named`, or had time enough for it."""
+        answered = named and all(each.name in known for each in self._wanted(dialect))
         return answered or now_s - self._began_s >= REPLY_TIMEOUT_S
 
     def _wanted(self, dialect: Dialect) -> list[WatchedParameter]:

@@ -74,7 +74,8 @@ def admit(
 
 
 def usable(command: Command | PositionCommand) -> bool:
-    """Whether all values can be sent, as float32, and the thrust direction is a unit vector."""
+    """Whether all values can be sent, as float32, and the thrust direction is a unit vector, as a
+    tuple: an array is not compared with what was sent."""
     if isinstance(command, PositionCommand):
         vectors = (
             command.position_ned_m,
@@ -83,6 +84,9 @@ def usable(command: Command | PositionCommand) -> bool:
             (command.heading_rad, command.heading_rate_radps),
         )
         return all(abs(value) <= FLOAT32_MAX for vector in vectors for value in vector)
+    direction: object = command.thrust_direction_ned
+    if not isinstance(direction, tuple):
+        return False
     values = (command.thrust_mps2, *command.thrust_direction_ned, command.heading_rad)
     if not all(abs(value) <= FLOAT32_MAX for value in values):
         return False

@@ -6,7 +6,7 @@ from collections.abc import Set
 
 from offboard.flight import preflight
 from offboard.flight.phases import ExitCode, Phase, Request
-from offboard.flight.preflight import OTHER_SENDER, SEVERAL, Ground, armed_already
+from offboard.flight.preflight import OTHER_SENDER, SEVERAL, TWIN, Ground, armed_already
 from offboard.flight.rows import (
     OPERATOR,
     Transition,
@@ -30,6 +30,7 @@ from offboard.mavlink.events import Heartbeat
 ARM_DISARM = 400  # MAV_CMD_COMPONENT_ARM_DISARM
 ARMING_SHOWN_S = 2.5  # HEARTBEAT, at 1 Hz, shows an accepted arming within this time
 DISARMED_SHOWN_S = 1.5  # longer than a period of HEARTBEAT: arming may have been in progress
+UNHEARD_S = 5.0  # what is heard after that may be another vehicle
 LISTENED_S = 0.5  # to hear another sender: PX4 leaves OFFBOARD below 2 Hz
 
 
@@ -53,9 +54,15 @@ def silent_for_long(flight: FlightState) -> str:
     return silent_for(flight, 2.0 * flight.limits.silence_s)
 
 
+def gone(flight: FlightState) -> str:
+    return silent_for(flight, UNHEARD_S)
+
+
 def other_vehicle(flight: FlightState) -> str:
-    """Several vehicles are heard, and none was chosen with --system."""
+    """Several vehicles are heard, and none was chosen with --system, or none can be."""
     senders, now_s = flight.session.senders, flight.now_s
+    if flight.session.has_twin:
+        return TWIN
     return SEVERAL.format(systems=senders.named(now_s)) if senders.ambiguous(now_s) else ""
 
 
@@ -63,7 +70,10 @@ def ground_of(flight: FlightState) -> Ground:
     """What the preflight list judges."""
     vehicle, contact, dialect = flight.vehicle, flight.contact, flight.dialect
     senders, service = flight.session.senders, flight.service
-    read = dialect and flight.reading.complete(dialect, vehicle.parameters, flight.now_s)
+    named = service is None or vehicle.uid is not None
+    read = dialect and flight.reading.complete(
+        dialect, vehicle.parameters, flight.now_s, named=named
+    )
     from_origin = service is not None and service.anchor == "origin"
     return Ground(
         vehicle,
@@ -76,6 +86,7 @@ def ground_of(flight: FlightState) -> Ground:
         unanswered_s=flight.clock.unanswered_s(flight.host_s),
         reads_parameters=not read,
         systems=senders.named(flight.now_s) if senders.ambiguous(flight.now_s) else "",
+        twin=flight.session.has_twin,
         other_sender=bool(other_sender(flight)),
         in_the_air=contact.in_the_air,
         guarded=flight.guarded,
@@ -264,10 +275,12 @@ SERVICE_WAITS = (
     Transition({CONNECT}, stop_requested, FAILED, FLOWN, OPERATOR),
     Transition({CONNECT}, vehicle_found, HEALTH),
     Transition({STANDBY}, rebooted, FAILED, FLOWN, "restart"),
-    Transition({HEALTH, STANDBY}, stop_requested, FAILED, FLOWN, OPERATOR),
+    Transition({STANDBY}, gone, HEALTH),
+    # before a stop: what has just been engaged is handed back
     Transition({HEALTH, STANDBY}, abandoned, HAND_BACK, FLOWN, reason=ABANDONED),
     Transition({STANDBY}, engaged_by_pilot, CLIMB, FLOWN),
     Transition({HEALTH, STANDBY}, engaged_but_unfit, HAND_BACK, REFUSED),
+    Transition({HEALTH, STANDBY}, stop_requested, FAILED, FLOWN, OPERATOR),
     Transition({HEALTH}, usable, STANDBY, reason="telemetry flows"),
     Transition({STANDBY}, engaged_too_soon, HAND_BACK, REFUSED, reason=TOO_SOON),
     Transition({STANDBY}, started_in_the_air, CLIMB, FLOWN),

@@ -40,7 +40,8 @@ LEVEL = (0.0, 0.0, 1.0)  # thrust direction
 COMMANDS_KEPT = 7  # as long as an attitude may take to follow
 THRUSTS_KEPT = 40  # as long as a setpoint may be on its way, or the next ones be lost
 PREDICTIONS_KEPT = 8
-STARVED_EARLY_S = 0.3  # before the time of its failsafe: a setpoint is on its way, or was lost
+# Before the time of its failsafe: a setpoint is on its way, or was lost. A third of it at most
+STARVED_EARLY_S = 0.3
 SHOWN_S = 1.2  # HEARTBEAT comes at 1 Hz
 STARVED_KNOWN_S = 3.0  # HEARTBEAT, at 1 Hz, shows the failsafe
 
@@ -163,6 +164,8 @@ class FlightState:
         for name in KEPT:
             setattr(self, name, getattr(before, name))
         self.clock.growth = LinkGrowth()
+        # for a vehicle that was taken nothing was asked: not unanswered, see `note_starvation`
+        self.vehicle.heard_s.pop(TimesyncReply, None)
         self.authority = before.authority.renewed()
         if not before.ended:  # nothing was flown: what the pilot did before counts
             self.pilot, self.phase, self.began_s = before.pilot, before.phase, before.began_s
@@ -273,7 +276,8 @@ class FlightState:
             self.silence_s,
             unanswered_s if math.isfinite(unanswered_s) else 0.0,
         )
-        if gap_s > self.authority.loss.after_s - STARVED_EARLY_S:
+        after_s = self.authority.loss.after_s
+        if gap_s > max(after_s - STARVED_EARLY_S, after_s * 2.0 / 3.0):
             self.starved_s = self.now_s
 
     @property

@@ -218,12 +218,14 @@ DENIED: Answer = (Result.DENIED, Request.NONE)
 
 def _judged(flight: FlightState, command: int, parameters: tuple[float, ...]) -> Answer:
     """The result to acknowledge `command` with, and what is to be done."""
+    if flight.request is Request.HAND_BACK and command in (START, PAUSE_CONTINUE):
+        return NOT_NOW
     if command == START:
         return _start(flight)
     if command == PAUSE_CONTINUE:
         return _pause_or_continue(flight.phase, parameters[0])
     if command == SET_MODE:
-        if flight.phase in TRACKING or flight.phase in BEGINNING:
+        if flight.phase in TRACKING or flight.phase in BEGINNING or flight.request is Request.START:
             return Result.ACCEPTED, Request.HAND_BACK
         return NOTHING_TO_DO if flight.phase in ENDING else DENIED
     return Result.UNSUPPORTED, Request.NONE

@@ -26,6 +26,7 @@ from offboard.flight.phases import (
     Request,
     ServiceOptions,
 )
+from offboard.flight.preflight import ParameterReading
 from offboard.flight.rows import REBOOTED, Transition, in_own_failsafe
 from offboard.flight.state import FlightState, Outcome
 from offboard.identification.learner import Stage
@@ -60,8 +61,8 @@ def table(service: ServiceOptions | None = None) -> tuple[Transition, ...]:
             *starting.starting(starting.STREAMING),
             Transition({Phase.HAND_BACK}, flying.handed, Phase.YIELDED),
             *flying.ends_early(serves=True),
+            *flying.SERVICE_ENDS,  # before the regular ones: a request is for one tick only
             *flying.TO_THE_END,
-            *flying.SERVICE_ENDS,
             *flying.AT_REST[service.then],
         )
     return tuple(row for row in rows if row.phases)
@@ -150,6 +151,9 @@ def _enter(flight: FlightState, row: Transition) -> None:
         # here, not with the request: a vehicle that shows the mode already passes without one
         flight.authority.ask()
         _set_hover_thrust(flight)
+    elif row.target is Phase.HEALTH:  # it may be another vehicle, or have other parameters
+        flight.vehicle.forget_identity()
+        flight.reading = ParameterReading()
     elif row.target is Phase.STANDBY:
         flight.pilot.engaged = False  # the pilot switched to one that was not ready
     elif row.target is Phase.TAKEOFF:

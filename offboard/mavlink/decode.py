@@ -20,6 +20,7 @@ from offboard.mavlink.framing import Frame, payload_of
 POSITION_LIMIT_M = 1e5
 VELOCITY_LIMIT_MPS = 200.0
 RATE_LIMIT_RADPS = 100.0
+UNIT_LENGTHS = 0.9, 1.1  # of a quaternion
 _PREARM_CHECK = 0x10000000  # MAV_SYS_STATUS_PREARM_CHECK
 _RADIO = 0x10000  # MAV_SYS_STATUS_SENSOR_RC_RECEIVER
 _SENSORS = {
@@ -100,7 +101,7 @@ def _attitude(message: Any, _: Dialect) -> events.Event | DropReason:
     w, x, y, z = message.q1, message.q2, message.q3, message.q4
     p, q, r = rates = message.rollspeed, message.pitchspeed, message.yawspeed
     norm = math.sqrt(w * w + x * x + y * y + z * z)
-    if not 0.9 < norm < 1.1:
+    if not UNIT_LENGTHS[0] < norm < UNIT_LENGTHS[1]:
         return DropReason.IMPLAUSIBLE
     limit = RATE_LIMIT_RADPS
     if not (-limit < p < limit and -limit < q < limit and -limit < r < limit):

@@ -280,6 +280,11 @@ class Session:
         return self._time.seconds
 
     @property
+    def has_twin(self) -> bool:
+        """Whether two vehicles with the same ids send, by the clocks of their telemetry."""
+        return self._time.mixed
+
+    @property
     def rates_hz(self) -> dict[str, float]:
         """Measured rate of each wanted message over the last two seconds of `link_time_s`."""
         return self._telemetry.rates.measured_hz(self.link_time_s)

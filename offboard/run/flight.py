@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import ExitStack
+from copy import deepcopy
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -224,6 +225,7 @@ def rehearse(prepared: Prepared, *, keeps_deadline: bool) -> float:
 def _decided(controller: Controller, situation: Situation) -> Command | PositionCommand:
     """The command of a decision. Raises DocumentError if the law fails: better here than in
     flight."""
+    given = deepcopy(situation.state)
     try:
         decision = controller.decide(situation)
         command = decision.command
@@ -231,7 +233,13 @@ def _decided(controller: Controller, situation: Situation) -> Command | Position
     except Exception as error:
         raise DocumentError(f"controller: {located(error)}") from error
     if not usable(command):
-        raise DocumentError(f"controller: it decides {command}, which cannot be sent")
+        raise DocumentError(
+            f"controller: it decides {command}, which cannot be sent: all values must be finite, "
+            "the thrust direction a tuple of length 1"
+        )
+    # the flight compares it with what the vehicle does then
+    if not all(map(np.array_equal, astuple(situation.state), astuple(given))):
+        raise DocumentError("controller: it changes the state that it is given; let it use a copy")
     return command
 
 

@@ -17,6 +17,7 @@ from uneventful import NOW_S, hear, uneventful
 from offboard.flight.failsafe import ROWS, Row, judge
 from offboard.flight.phases import Action, Limits, Phase
 from offboard.flight.state import FlightState
+from offboard.flight.vehicle_clock import REPLIES_MIN
 from offboard.mavlink.events import (
     ESTIMATE,
     EstimatorReport,
@@ -25,6 +26,7 @@ from offboard.mavlink.events import (
     OtherSender,
     SystemHealth,
     ThrustReport,
+    TimesyncReply,
 )
 from offboard.model.command import Command
 
@@ -110,7 +112,10 @@ def holding(**values: Callable[[Any], Any]) -> Measure:
 
 
 def clock(**shown: Callable[[Any], Any]) -> Measure:
-    calm = {"age_s": lambda *_: 0.0, "delay_growth_s": 0.0, "jumped_s": 0.0}
+    calm = {
+        "age_s": lambda *_: 0.0, "delay_growth_s": 0.0, "jumped_s": 0.0, "delay": None,
+        "unanswered_s": lambda *_: 0.0,
+    }  # fmt: skip
 
     def measure(flight: Any, value: Any) -> None:
         now = {name: make(value) for name, make in shown.items()}
@@ -189,7 +194,16 @@ def jumps(recent_m: float, drift_m: float) -> SimpleNamespace:
 AGE_S = Limits().setpoint_age_s
 aged = clock(age_s=lambda age_s: lambda *_: age_s)
 hovers = holding(observer=lambda share: SimpleNamespace(hover_thrust_estimate=share))
+
+
 # row: how to set what it measures, a value that it allows, and one that it does not
+def unheard(flight: FlightState, for_s: float) -> None:
+    """Its newest answer to TIMESYNC is so old."""
+    for number in range(REPLIES_MIN):
+        request = flight.clock.request(float(number), flight.host_s - for_s)
+        flight.clock.on_reply(TimesyncReply(request.ts1_ns, request.ts1_ns + 10_000_000))
+
+
 MEASURED: list[tuple[str, Measure, Any, Any]] = [
     ("authority", lambda flight, age_s: setattr(flight.authority, "heard_s", NOW_S - age_s),
      2.5, 2.6),
@@ -198,6 +212,7 @@ MEASURED: list[tuple[str, Measure, Any, Any]] = [
     ("age", aged, AGE_S, 0.26),
     ("link", clock(delay_growth_s=float), 0.3, 0.31),
     ("link", aged, AGE_S, 0.26),
+    ("uplink", unheard, 1.0, 1.1),
     ("decision", holding(missed=int), 0, 1),
     ("decisions", holding(missed=int), 2, 3),
     ("tilt", tilt, 1.29, 1.31),

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import pytest
 from faults import CURRENT_MODE, HEARTBEAT, without
 from pair import Bytes, Filter, Pair, hover, in_phase, on_arducopter
-from watch import aborted, flown, said, sent_after
+from watch import aborted, begun_s, flown, said, sent_after
 
 from offboard.flight.phases import Phase
 
@@ -112,3 +112,21 @@ def test_without_reports_of_the_mode_it_listens_and_lands_it_later(
     assert commander.armed is bool(pilot)
     assert bool(pair.landings) is not bool(pilot)
     assert pair.companion.phase is (Phase.YIELDED if pilot else Phase.DISARMED)
+
+
+def test_a_vehicle_that_does_not_receive_setpoints_is_held() -> None:
+    """ArduCopter, which shows nothing: what was commanded meanwhile would have dropped it as it
+    received it again."""
+    lost_up: list[float] = []
+
+    def loses(pair: Pair) -> None:
+        pair.up = lost(pair, 3.0)
+        lost_up.append(pair.time_s)
+
+    pair = make("arducopter", loses)
+    watch = aborted(
+        pair, "TIMESYNC is not answered for 1.5 s: the vehicle may not receive setpoints",
+        failsafes=["uplink"], fall_mps=1.6,
+    )  # fmt: skip
+    assert begun_s(pair, Phase.HOLD) - lost_up[0] < 1.8
+    assert watch.top_m < 3.5

@@ -34,9 +34,31 @@ def without_cost(_: Situation) -> Decision:
     return Decision(LEVEL, Certificate(cost=None))  # type: ignore[arg-type]
 
 
+def with_an_array(_: Situation) -> Decision:
+    return Decision(replace(LEVEL, thrust_direction_ned=np.array(LEVEL.thrust_direction_ned)))
+
+
+def changing_its_input(situation: Situation) -> Decision:
+    """The error from the reference, computed in place."""
+    position_ned_m = situation.state.position_ned_m
+    position_ned_m -= situation.reference.sample(situation.time_s).position_ned_m
+    return Decision(LEVEL)
+
+
+def without_a_text(_: Situation) -> Decision:
+    class Unprintable(Exception):
+        def __str__(self) -> str:
+            raise RuntimeError
+
+    raise Unprintable
+
+
 @pytest.mark.parametrize(
     ("fail", "says"),
     [
+        (with_an_array, r"controller: it decides Command.*array.*, which cannot be sent"),
+        (changing_its_input, "controller: it changes the state that it is given; let it use a"),
+        (without_a_text, r"controller: Unprintable: it cannot be printed \(.*test_parts\.py:\d+\)"),
         (raises, r"controller: ZeroDivisionError: nothing to divide by \(.*faults\.py:\d+\)"),
         (no_direction, "controller: it decides Command.*, which cannot be sent"),
         (without_cost, r"controller: TypeError: .*float\(\)"),

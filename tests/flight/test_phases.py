@@ -181,6 +181,7 @@ EVENTS: dict[str, Setup] = {
     "unheard_on_ground": _unhear_mode,
     "out_of_reach": _set(silence_s=OUTAGE_MAX_S + 0.1),
     "silent_on_ground": _set(silence_s=20.1),
+    "gone": _set(silence_s=5.1),
     "not_found": _set(silence_s=20.1),
     "not_ready_in_time": _since(Limits().health_s + 0.1),
     "not_engaged": _since(Limits.engage_s + 0.1),
@@ -251,8 +252,9 @@ def test_every_wait_is_limited() -> None:
 def test_the_service_waits_for_ever() -> None:
     for service in SERVICES.values():
         for phase in (Phase.CONNECT, Phase.HEALTH, Phase.STANDBY, Phase.PAUSE):
+            silent = phase in (Phase.CONNECT, Phase.HEALTH)
             flight = uneventful(phase, service)
-            flight.began_s, flight.silence_s = -1e6, 0.0 if phase is Phase.PAUSE else 1e6
+            flight.began_s, flight.silence_s = -1e6, 1e6 if silent else 0.0
             assert next_row(flight) is None
     targets: dict[str, Phase | None] = {}
     for then, service in SERVICES.items():

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from faults import restamped
-from pair import decode
+from pair import STEP_S, decode
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from service_wire import Wire
 from serving import (
@@ -476,6 +476,104 @@ def test_requests_over_mavlink(served: Served) -> None:
         (SET_MODE, DENIED),
         (START, TEMPORARILY_REJECTED),
     ]
+
+
+def test_a_pilot_who_engages_and_takes_it_again_at_once_has_it(served: Served) -> None:
+    """On a real PX4 it was asked to land: no TIMESYNC was asked for while the HEARTBEAT after the
+    first switch was awaited, so that setpoints seemed lost, and the second switch a failsafe."""
+    pair = served.engaged()
+    pair.run(1.0)
+    heard = pair.state.vehicle.heartbeat
+    pair.until(lambda: pair.state.vehicle.heartbeat is not heard, 1.5)
+    pair.switch("pilot")
+    pair.until(lambda: pair.phase is Phase.STANDBY, 1.5)
+    pair.run(0.1)
+    pair.engage()
+    pair.run(0.1)
+    pair.switch("pilot")
+    pair.run(0.15)
+    pair.switch("engage")
+    pair.run(2.0)
+    assert not pair.said("own failsafe")
+    assert pair.commands(21) == []  # to land
+
+
+def test_a_pilot_takes_a_vehicle_whose_own_failsafe_acts_soon(served: Served) -> None:
+    """With the least COM_OF_LOSS_T setpoints seemed to be missing always, and this its failsafe."""
+    pair = served.aloft()
+    pair.instance.autopilot.parameters.set("COM_OF_LOSS_T", 0.3)
+    pair.state.vehicle.parameters["COM_OF_LOSS_T"] = 0.3  # as it reports a change
+    pair.engage()
+    heard = pair.state.vehicle.heartbeat
+    pair.until(lambda: pair.state.vehicle.heartbeat is not heard, 1.5)
+    pair.run(0.3)  # CURRENT_MODE shows it first, which does not tell a pilot from a failsafe
+    pair.switch("pilot")
+    pair.until(lambda: pair.phase is Phase.STANDBY, 2.0)
+    assert pair.service.announced[-1].startswith(
+        "yielded: the vehicle left OFFBOARD for AUTO.LOITER"
+    )
+    assert not pair.said("own failsafe")
+
+
+def test_a_request_in_the_tick_of_a_transition_is_obeyed(served: Served) -> None:
+    """It was acknowledged, and forgotten: it arrives in the last step before the phase changes."""
+    pair = served.engaged(reference="hover")
+    pair.until(lambda: pair.phase is Phase.HOVER, 90.0)
+    changed_s = pair.time_s
+    again = served.engaged(reference="hover")
+    again.until(lambda: again.time_s > changed_s - 1.5 * STEP_S, 90.0)
+    assert again.phase is Phase.TRACK
+    again.command(SET_MODE, 1.0)
+    again.until(lambda: again.phase is Phase.STANDBY, 3.0)
+    assert (again.acks, again.mode) == ([(SET_MODE, ACCEPTED)], "AUTO.LOITER")
+
+
+def test_requests_within_one_tick(served: Served) -> None:
+    """A start is cancelled, and nothing cancels that the vehicle is to be given back."""
+    pair = served("ardupilot", arms=True)
+    pair.until(lambda: pair.phase is Phase.STANDBY)
+    pair.command(START)
+    pair.command(SET_MODE, 1.0)
+    pair.run(2.0)
+    assert (pair.phase, pair.armed) == (Phase.STANDBY, False)
+    flies = served.engaged("ardupilot")
+    flies.command(SET_MODE, 1.0)
+    flies.command(START)
+    flies.until(lambda: flies.phase is Phase.STANDBY, 3.0)
+    assert pair.acks == [(START, ACCEPTED), (SET_MODE, ACCEPTED)]
+    assert flies.acks == [(SET_MODE, ACCEPTED), (START, TEMPORARILY_REJECTED)]
+
+
+def test_a_vehicle_that_is_engaged_as_the_service_stops_is_held(served: Served) -> None:
+    pair = served.aloft()
+    pair.run(0.04)  # the report of the mode comes between two ticks
+    pair.switch("engage")
+    pair.until(lambda: pair.state.pilot.engaged, 1.0)
+    assert pair.phase is Phase.STANDBY
+    pair.service.request_stop()
+    pair.until(pair.service.has_ended, 5.0)
+    assert pair.mode == "AUTO.LOITER"
+
+
+def test_what_is_heard_after_a_silence_may_be_another_vehicle(served: Served) -> None:
+    """With the same system id, on the same radio, switched on earlier: its parameters are read. It
+    was flown with those of the one before, its thrust taken for a climb rate."""
+    pair = served.engaged("ardupilot")
+    pair.switch("pilot")
+    pair.run(2.0)
+    pair.lost_down = pair.lost_up = True
+    pair.run(6.0)
+    assert pair.phase is Phase.HEALTH
+    pair.instance.autopilot.parameters.set("GUID_OPTIONS", 0.0)
+    pair.lost_down = pair.lost_up = False
+    pair.run(4.0)
+    pair.switch("engage")
+    pair.until(lambda: pair.mode == "BRAKE", 3.0)
+    assert pair.said("not engaged: GUID_OPTIONS is 0: without bit 3")
+    pair.instance.autopilot.parameters.set("GUID_OPTIONS", 8.0)
+    pair.state.vehicle.parameters["GUID_OPTIONS"] = 8.0  # as a ground station sets it
+    pair.until(lambda: pair.phase is Phase.STANDBY, 5.0)
+    assert pair.state.vehicle.uid == 1
 
 
 def test_the_reference_is_repeated_with_the_newest_configuration(served: Served) -> None:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 from faults import heartbeats, stop
-from pair import Pair, in_phase
+from pair import STEP_S, Bytes, Pair, in_phase
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from serving import serve
-from watch import flown, px4, refused
+from watch import Vehicle, copter, flown, px4, refused
 
 from offboard.flight.phases import Phase
 from offboard.mavlink.session import Session, SessionSettings
@@ -71,3 +71,21 @@ def test_what_is_no_vehicle_is_never_taken_for_one() -> None:
         frame = mavlink.MAVLink_heartbeat_message(kind, 3, 0, 0, 4, 3).pack(codec)
         assert session.receive(frame, "link", 0.0).events == ()
         assert session.senders.systems == {}
+
+
+@pytest.mark.parametrize("on", [px4, copter], ids=str)
+def test_of_two_vehicles_with_the_same_ids_on_one_radio_none_is_armed(on: Vehicle) -> None:
+    """Both obey: the other one was flown too, by setpoints that were not made for it."""
+    pair, twin = on.hop(), on.hop(seed=8).instance
+    for _ in range(int(5.0 / STEP_S)):  # it was switched on earlier
+        twin.step()
+
+    def obeyed_by_both(_: float, frames: Bytes) -> Bytes:
+        for frame in frames:
+            twin.feed(frame)
+        return frames
+
+    pair.down, pair.up = lambda _, datagrams: [*datagrams, *twin.step()], obeyed_by_both
+    refused(pair, "two vehicles with the same system id send on this link")
+    assert not pair.armed
+    assert not twin.autopilot.commander.armed

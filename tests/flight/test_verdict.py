@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pair import UNIX_EPOCH_US, Pair, calm_hover, hover, make
+from faults import ATTITUDE, POSITION, frame_id, rewritten, setting
+from pair import UNIX_EPOCH_US, Pair, calm_hover, frames_of, hover, in_phase, make, through
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from typer.testing import CliRunner
 
@@ -296,3 +297,31 @@ def test_stretch_that_is_too_short_to_be_scored_is_not_flown(tmp_path: Path) -> 
     scored = pair.score(tmp_path)
     assert math.isnan(scored.rmse_position_m)
     assert (scored.completed, scored.ended_by) == (0.0, "too short at full speed to be scored")
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"y": math.nan}, {"y": -3.4e38}, {"vz": math.inf}, {"time_boot_ms": 2**31}, {"q2": math.nan}],
+    ids=str,
+)
+def test_what_the_flight_has_refused_is_not_scored(wrong: dict[str, float]) -> None:
+    """A frame with a right checksum and impossible values, before the true one."""
+    kind, pair = ATTITUDE if "q2" in wrong else POSITION, hover(aloft=True)
+    edit = rewritten(setting(**wrong), kind)
+
+    def insert(_: float, datagrams: list[bytes]) -> list[bytes]:
+        for place, datagram in enumerate(datagrams):
+            frame = next((each for each in frames_of(datagram) if frame_id(each) == kind), b"")
+            if frame and in_phase(Phase.TRACK, 1.0)(pair):
+                pair.down = through
+                return [*datagrams[:place], *edit(0.0, [frame]), *datagrams[place:]]
+        return datagrams
+
+    pair.down = insert
+    assert pair.fly().exit_code == 0
+    assert pair.down is through
+    scored = pair.score()
+    assert (scored.completed, scored.ended_by) == (1.0, "reference over")
+    assert scored.max_position_m < 0.01
+    assert scored.max_velocity_mps < 0.1
+    assert scored.tilt_max_deg < 1.0
