@@ -11,6 +11,7 @@ from offboard.identification.attitude_fit import ResponseFit, Unexplained
 from offboard.identification.learner import IdentifySettings, Learner, Stage
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_estimate import (
+    FILE_DELAY_S,
     UNKNOWN_DELAY_S,
     IdentifiedVehicle,
     VehicleEstimate,
@@ -208,3 +209,17 @@ def test_what_is_recalled_needs_no_steps_and_is_not_adopted_again() -> None:
     learner.on_stage(Stage.CLIMB, 10.0)
     assert learner.learn(10.0, 0.42) is None
     assert learner.result == recalled
+
+
+def test_without_identification_the_file_is_flown_and_nothing_is_recalled() -> None:
+    recalled = IdentifiedVehicle(PX4, Estimate(0.04, 0.002), 0.0)
+    learner = Learner(FILE, IdentifySettings(online=False), known=recalled)
+    assert not learner.wants_excitation
+    told = []
+    for stage, since_s in ((Stage.CLIMB, 0.0), (Stage.STEPS, 5.0), (Stage.MOTION, 10.0)):
+        learner.on_stage(stage, since_s)
+        told += [learner.learn(since_s + 0.1 * tick, 0.53) for tick in range(50)]
+    (update,) = filter(None, told)
+    assert (update.vehicle, update.uncertainty.tilt_s) == (FILE, FILE_DELAY_S)
+    assert update.cause.endswith("the vehicle file's delay may be wrong by 130 ms")
+    assert (update.sentences, learner.result) == ((), None)
