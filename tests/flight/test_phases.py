@@ -290,6 +290,19 @@ def test_every_abnormal_end_has_an_exit_code() -> None:
     assert {row.exit_code for row in rows} == {None, ExitCode.REFUSED, ExitCode.ABORTED}
 
 
+def test_what_prevents_a_take_over_prevents_each_kind_of_it() -> None:
+    in_failsafe = partial(heartbeat, armed=True, status=5)
+    prevented = (EVENTS[each] for each in ("other_sender", "mode_unknown", "silent", "blind"))
+    for prevents in (in_failsafe, *prevented):
+        for name in ("engaged_by_pilot", "engaged_but_unfit", "engaged_too_soon", "abandoned",
+                     "started_in_the_air"):  # fmt: skip
+            flight, condition = uneventful(Phase.STANDBY, SERVICES["hold"]), getattr(starting, name)
+            EVENTS[name](flight)
+            assert condition(flight)
+            prevents(flight)
+            assert not condition(flight), name
+
+
 @BOTH
 def test_no_way_out_of_the_air_leaves_the_vehicle_unasked(service: ServiceOptions | None) -> None:
     """Each row that ends a flight in the air is in a phase that asks for hold or land, or leads to
