@@ -353,6 +353,9 @@ def test_a_failsafe_that_was_shown_within_a_pause_permits_nothing() -> None:
     authority.doubt(250.0, 1.3)
     reports = ((True, 249.8), (False, 250.3), (True, 250.8), (False, 251.3))
     assert [permits(*report) for report in reports] == [False, False, True, True]
+    authority.forget(207.5)  # it has restarted, and flies in this mode without a failsafe of ours
+    authority.on_mode("POSCTL", 208.0, failsafe=True, heartbeat=False)
+    assert authority.standing is Standing.LOST
 
 
 def test_the_first_loss_is_the_one_that_is_told() -> None:

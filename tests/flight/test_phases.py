@@ -133,6 +133,13 @@ def _track_for(seconds: float) -> Setup:
     return lambda flight: flight.plan.start_track(NOW_S - seconds)
 
 
+def _act(action: Action) -> Setup:
+    def apply(flight: FlightState) -> None:
+        flight.failsafe.action, flight.failsafe.reason = action, "tilt 80 deg"
+
+    return apply
+
+
 def _identify(**values: Any) -> Setup:
     return lambda flight: vars(flight.identification).update(values)
 
@@ -199,8 +206,8 @@ EVENTS: dict[str, Setup] = {
     "engaged_too_soon": _engage(hasty=True),
     "abandoned": _all(_engage(unclaimed=True), _set(left_engaged=True)),
     "handed": _stand(Standing.HANDED),
-    "failsafe_hold": lambda flight: setattr(flight.failsafe, "action", Action.HOLD),
-    "failsafe_land": lambda flight: setattr(flight.failsafe, "action", Action.LAND),
+    "failsafe_hold": _act(Action.HOLD),
+    "failsafe_land": _act(Action.LAND),
     **{f"requested_{each.name.lower()}": _set(request=each) for each in Request},
 }
 
