@@ -183,9 +183,12 @@ def test_a_requirement_on_a_cut_log_is_missed(tmp_path: Path) -> None:
     assert "not completed: the log ends in the phase track" in str(required.exception)
 
 
-def touchdown(fall_m: float = 0.0, rests_s: float = 2.0, noise_mps: float = 1e-4) -> Touchdown:
-    """A descent at 0.7 m/s from 3 m, a fall from `fall_m`, then the ground; 50 Hz."""
+def touchdown(
+    fall_m: float = 0.0, rests_s: float = 2.0, noise_mps: float = 1e-4, before_mps: float = 0.7
+) -> Touchdown:
+    """From 3 m at 0.7 m/s, faster above, a fall from `fall_m`, then the ground; 50 Hz."""
     landing, rng = Touchdown((0.0, 0.0, 0.0)), np.random.default_rng(5)
+    landing.on_position(-0.02, (0.0, 0.0, -3.1), before_mps)
     time_s, height, down_mps, end_s = 0.0, 3.0, 0.7, math.inf
     while time_s < end_s:
         noise = rng.normal(0.0, noise_mps)  # no estimator repeats itself
@@ -217,6 +220,7 @@ def test_landings_and_falls() -> None:
     assert soft.not_landed(on_ground=False) == "the land detector does not report the ground"
     for landing, says in (
         (soft, ""),
+        (touchdown(before_mps=3.0), ""),
         (touchdown(rests_s=0.1), "it has not come to rest"),
         (hard, f"fell at up to {hard.speed_mps:.1f} m/s"),
         (reporting(2.8, 0.0, 1e-4), "2.8 m above the take-off point"),
