@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from laws import PX4
 from pydantic import ValidationError
@@ -17,6 +18,7 @@ from offboard.identification.vehicle_estimate import (
     VehicleEstimate,
 )
 from offboard.identification.vehicle_fit import Identified, within_bounds
+from offboard.model.command import Command
 from offboard.model.vehicle import AxisResponse, Vehicle
 
 FILE = PX4.model_copy(
@@ -209,6 +211,24 @@ def test_what_is_recalled_needs_no_steps_and_is_not_adopted_again() -> None:
     learner.on_stage(Stage.CLIMB, 10.0)
     assert learner.learn(10.0, 0.42) is None
     assert learner.result == recalled
+
+
+def test_steps_end_where_they_began_and_outside_the_box() -> None:
+    """Integrated twice, tilts by 2 degrees to either side leave the vehicle where it was."""
+    learner = Learner(FILE, IdentifySettings(box_m=0.5))
+    learner.on_stage(Stage.STEPS, 10.0)
+    level = Command(9.8, (0.0, 0.0, 1.0), 0.0)
+    times_s = 10.0 + 0.01 * np.arange(400)
+    flown = [learner.excited(level, time_s, 0.4) for time_s in times_s]
+    tilts = np.array([each.thrust_direction_ned[:2] for each in flown])
+    speeds = np.cumsum(tilts, axis=0)
+    for ends in (speeds, np.cumsum(speeds, axis=0)):
+        assert ends[-1] == pytest.approx([0.0, 0.0], abs=1e-9)
+    assert set(np.round(tilts.ravel(), 4)) == {-0.0349, 0.0, 0.0349}
+    assert {round(each.thrust_mps2, 2) for each in flown} == {9.31, 9.8, 10.29}
+    assert {round(each.heading_rad, 3) for each in flown} == {-0.07, 0.07}
+    assert learner.excited(level, 10.1, 0.51) == level
+    assert learner.excited(level, 10.1, 0.0) == level  # for good
 
 
 def test_without_identification_the_file_is_flown_and_nothing_is_recalled() -> None:
