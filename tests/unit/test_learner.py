@@ -79,6 +79,7 @@ def test_doubt_ends_with_a_fit_that_explains_the_flight() -> None:
     assert estimate.vehicle.tilt.natural_frequency_radps == 5.0
     assert estimate.uncertainty.tilt_s == pytest.approx(KNOWN_S)
     assert estimate.cause == "identified delay, 50 +- 2 ms"
+    assert estimate.result is None  # the next flight begins without what was contradicted once
 
 
 def test_doubt_ends_when_the_constants_explain_the_flight_again() -> None:
@@ -146,13 +147,16 @@ def test_doubt_about_the_tilt_leaves_the_other_constants() -> None:
     }
     assert estimate.vehicle == FILE.model_copy(update=identified)
     assert estimate_with(fit(0.06)).vehicle.thrust_delay_s == 0.01  # the vehicle's own difference
-    own = estimate_with(Identified(10.0, tilt=tilt, thrust_delay_s=Estimate(0.05, 0.01)))
+    thrust = {"thrust_delay_s": Estimate(0.05, 0.01), "thrust_effect_s": Estimate(0.06, 0.01)}
+    own = estimate_with(Identified(10.0, tilt=tilt, **thrust))
+    assert own.uncertainty.thrust_s == pytest.approx(0.03)
     own.on_contradiction(CONTRADICTS, AGREES, 20.0)
     assert own.vehicle == FILE.model_copy(update={"thrust_delay_s": 0.05})
 
 
 def test_a_link_is_in_every_delay_and_its_changes_make_them_uncertain() -> None:
     estimate = VehicleEstimate(FILE, delay_error_s=UNKNOWN_DELAY_S)
+    assert estimate.result is None
     estimate.on_link_delay(Estimate(0.124, 0.01))
     delays = [estimate.vehicle.tilt.delay_s, estimate.vehicle.yaw.delay_s]
     assert [*delays, estimate.vehicle.thrust_delay_s] == pytest.approx([0.16, 0.32, 0.13])
