@@ -224,7 +224,7 @@ class PilotSwitch:
 
     elsewhere: bool = False
     engaged: bool = False
-    unclaimed: bool = False
+    unclaimed: bool = True
     hasty: bool = False
     showed_ours: bool | None = None
 

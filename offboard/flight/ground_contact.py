@@ -21,7 +21,7 @@ RESTING_HEIGHT_M = 0.75  # errors of an estimate on the ground
 LIFTED_HEIGHT_M, LIFTED_CLIMB_MPS, LIFTED_SAMPLES = 0.15, 0.4, 3
 GROUND_SPEED_MPS = 0.5  # as an estimate on the ground may show
 STOOD_WITHIN_M, STOOD_HEIGHT_M, STOOD_S = 0.1, 0.3, 1.0
-KEPT_S, KEPT_EVERY_S = 20.0, 0.05
+KEPT_S = 20.0
 STANDING_S = 15.0  # at one height: it stands, and does not hover
 POSITION_KNOWN_S = 1.0  # age of a position that shows where it is
 STILL_ARMED = (
@@ -56,8 +56,7 @@ class GroundContact:
         climbs = speed_mps < -LIFTED_CLIMB_MPS and self.height_m > 0.3 * LIFTED_HEIGHT_M
         lifted = self.height_m > LIFTED_HEIGHT_M or climbs
         self._lifted = self._lifted + 1 if lifted else 0
-        if not self._heights or position.time_s - self._heights[-1][0] >= KEPT_EVERY_S:
-            self._heights.append((position.time_s, self.height_m))
+        self._heights.append((position.time_s, self.height_m))
         while self._heights[0][0] < position.time_s - KEPT_S:
             self._heights.popleft()
 

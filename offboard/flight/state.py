@@ -155,7 +155,6 @@ class FlightState:
     def __post_init__(self) -> None:
         self.busyness = Busyness(self.period_s)
         self.contact = GroundContact(self.vehicle)
-        self.pilot.unclaimed = self.service is not None
 
     def follow(self, before: FlightState) -> None:
         """Continue after another flight with the same vehicle: what is known of vehicle and link

@@ -117,7 +117,7 @@ def on_reboot(flight: FlightState) -> None:
     """The vehicle was rebooted: this ends the flight, except while telemetry is awaited. A
     landing goes on, but the flight is none that was flown to its end."""
     flight.rebooted = flight.phase not in (Phase.CONNECT, Phase.HEALTH)
-    flight.pilot = PilotSwitch(unclaimed=flight.service is not None)
+    flight.pilot = PilotSwitch()
     if flight.phase is Phase.LAND:
         flight.touchdown = Touchdown(None)
         if flight.outcome is None:
@@ -154,8 +154,6 @@ def _enter(flight: FlightState, row: Transition) -> None:
     elif row.target is Phase.HEALTH:  # it may be another vehicle, or have other parameters
         flight.vehicle.forget_identity()
         flight.reading = ParameterReading()
-    elif row.target is Phase.STANDBY:
-        flight.pilot.engaged = False  # the pilot switched to one that was not ready
     elif row.target is Phase.TAKEOFF:
         _begin_takeoff(flight)
     elif row.target is Phase.CLIMB:

@@ -189,7 +189,7 @@ class Learner(VehicleEstimate):
     def on_stage(self, stage: Stage, time_s: float) -> None:
         """The flight has entered `stage`."""
         self._stage = stage
-        if stage is Stage.CLIMB and self._settings.online:
+        if stage is Stage.CLIMB:
             self._climb_s, self.motion_s = time_s, math.inf  # each lap has its own motion
         elif stage is Stage.STEPS:
             self._steps_s = time_s
@@ -277,9 +277,8 @@ class Learner(VehicleEstimate):
         return True
 
     def _flown_since(self, begin_s: float) -> Trace:
-        stamped = self._attitudes.kept, self._positions.kept
-        known = (rows[(rows[:, 0] >= begin_s) & (rows[:, 0] <= self._time_s)] for rows in stamped)
-        return clean(self._commands.kept, *known).between(begin_s, self._time_s)
+        known = clean(self._commands.kept, self._attitudes.kept, self._positions.kept)
+        return known.between(begin_s, self._time_s)
 
     def _identify_all(self) -> Work:
         """Identify everything from climb and steps, which are repeated if they do not show the

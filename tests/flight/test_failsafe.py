@@ -213,7 +213,7 @@ MEASURED: list[tuple[str, Measure, Any, Any]] = [
     ("link", clock(delay_growth_s=float), 0.3, 0.31),
     ("link", aged, AGE_S, 0.26),
     ("uplink", unheard, 1.0, 1.1),
-    ("decision", holding(missed=int), 0, 1),
+    ("decision", holding(missed=int, failure=lambda _: "it was late"), 0, 1),
     ("decisions", holding(missed=int), 2, 3),
     ("tilt", tilt, 1.29, 1.31),
     ("tilt error", tilt_from_commands, 0.49, 0.51),
@@ -249,6 +249,7 @@ def test_every_row_at_its_limit() -> None:
             assert bool(BY_NAME[name].condition(flight)) is exceeds, name
             judge(flight, [replace(BY_NAME[name], held_s=0.0)])
             assert "{" not in flight.failsafe.reason + flight.failsafe.cause
+            assert name != "decision" or flight.failsafe.reason == exceeds * "it was late"
 
 
 def test_another_program_may_be_allowed() -> None:

@@ -263,7 +263,12 @@ TIME = st.one_of(st.floats(-0.1, 0.1), st.just(0.0), st.floats(-0.1, 3.0), ANY)
 LATE = st.one_of(st.just(0.0), TIME)
 
 
+PAUSED = [*FLIGHT[:4], Occurrence("pause", after_s=0.7)]
+WAITED = [*PAUSED, Occurrence("report", mode="E", waited_s=0.8)]
+
+
 @MANY
+@example((WAITED, HOVER, 0.0, False, 0.0, 1.0, 0.0))  # it arrived before or within the pause
 @given(st.tuples(HISTORY, SETPOINT, LATER, st.booleans(), TIME, st.floats(0.1, 2.0), LATE))
 def test_flights_of_one_tick(tick: Any) -> None:
     judge(*tick)
@@ -336,14 +341,21 @@ def test_a_failsafe_that_was_shown_within_a_pause_permits_nothing() -> None:
     """A pilot may have taken it since, in the same mode."""
     authority, _ = replayed(HELD[:2])
     authority.loss = SetpointLoss(1.0, ("POSCTL",))
-    authority.doubt(250.0, 1.3)
-    for heartbeat, arrived_s, permitted in ((True, 249.8, False), (False, 250.3, False),
-                                            (True, 250.8, True)):  # fmt: skip
+
+    def permits(heartbeat: bool, arrived_s: float) -> bool:
         authority.on_mode(
             "POSCTL", 207.0, arrived_s=arrived_s, failsafe=True, heartbeat=heartbeat, starved=True
         )
         assert authority.standing is Standing.FAILSAFE
-        assert authority.permits_command(207.0) is permitted
+        return authority.permits_command(207.0)
+
+    assert permits(True, 248.0)
+    authority.doubt(250.0, 1.3)
+    reports = ((True, 249.8), (False, 250.3), (True, 250.8), (False, 251.3))
+    assert [permits(*report) for report in reports] == [False, False, True, True]
+    authority.forget(207.5)  # it has restarted, and flies in this mode without a failsafe of ours
+    authority.on_mode("POSCTL", 208.0, failsafe=True, heartbeat=False)
+    assert authority.standing is Standing.LOST
 
 
 def test_the_first_loss_is_the_one_that_is_told() -> None:

@@ -133,6 +133,13 @@ def _track_for(seconds: float) -> Setup:
     return lambda flight: flight.plan.start_track(NOW_S - seconds)
 
 
+def _act(action: Action) -> Setup:
+    def apply(flight: FlightState) -> None:
+        flight.failsafe.action, flight.failsafe.reason = action, "tilt 80 deg"
+
+    return apply
+
+
 def _identify(**values: Any) -> Setup:
     return lambda flight: vars(flight.identification).update(values)
 
@@ -200,8 +207,8 @@ EVENTS: dict[str, Setup] = {
     "engaged_too_soon": _engage(hasty=True),
     "abandoned": _all(_engage(unclaimed=True), _set(left_engaged=True)),
     "handed": _stand(Standing.HANDED),
-    "failsafe_hold": lambda flight: setattr(flight.failsafe, "action", Action.HOLD),
-    "failsafe_land": lambda flight: setattr(flight.failsafe, "action", Action.LAND),
+    "failsafe_hold": _act(Action.HOLD),
+    "failsafe_land": _act(Action.LAND),
     **{f"requested_{each.name.lower()}": _set(request=each) for each in Request},
 }
 
@@ -233,7 +240,7 @@ def test_every_row_is_taken_when_its_condition_holds(service: ServiceOptions | N
             assert next_row(flight) is None, phase
             event_of(row)(flight)
             assert next_row(flight) is row, (phase, row.condition.__name__)
-            assert row.why(flight)
+            assert row.why(flight) not in ("", "True")
             assert "{" not in row.why(flight) + row.cause.format(flight=flight)
 
 
@@ -290,6 +297,19 @@ def test_every_abnormal_end_has_an_exit_code() -> None:
         if row.exit_code == ExitCode.REFUSED:
             assert row.target is Phase.STAND_DOWN or not IN_THE_AIR & set(row.phases)
     assert {row.exit_code for row in rows} == {None, ExitCode.REFUSED, ExitCode.ABORTED}
+
+
+def test_what_prevents_a_take_over_prevents_each_kind_of_it() -> None:
+    in_failsafe = partial(heartbeat, armed=True, status=5)
+    prevented = (EVENTS[each] for each in ("other_sender", "mode_unknown", "silent", "blind"))
+    for prevents in (in_failsafe, *prevented):
+        for name in ("engaged_by_pilot", "engaged_but_unfit", "engaged_too_soon", "abandoned",
+                     "started_in_the_air"):  # fmt: skip
+            flight, condition = uneventful(Phase.STANDBY, SERVICES["hold"]), getattr(starting, name)
+            EVENTS[name](flight)
+            assert condition(flight)
+            prevents(flight)
+            assert not condition(flight), name
 
 
 @BOTH

@@ -159,6 +159,16 @@ def test_the_failsafe_for_missing_setpoints_may_act_a_little_early() -> None:
         assert ended.startswith(end)
 
 
+def test_from_hold_even_the_mode_of_that_failsafe_is_a_pilots_choice() -> None:
+    """The controller has asked for hold; HEARTBEAT shows another failsafe, as an empty battery."""
+    loss = PX4.setpoint_loss({"COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": POSCTL})
+    switched = [(2.0 + n, Heartbeat("POSCTL", True, 5, 2)) for n in range(10)]
+    known = replace(OURS, loss=loss, holding=True)
+    commands, ended = asked(PX4, *switched, shown=PX4.hold_mode, known=known)
+    assert ended.startswith("the vehicle shows POSCTL")
+    assert commands == []
+
+
 def test_leaving_the_landing_mode_as_it_disarms_is_no_choice() -> None:
     left = [(7.5, ModeReport(PX4.hold_mode)), *beats(PX4.hold_mode, 12.1, 12.1, armed=False)]
     commands, ended = asked(PX4, ACCEPTED, *IN_LANDING, *left, shown=PX4.engage_mode)

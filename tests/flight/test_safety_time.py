@@ -356,7 +356,7 @@ def test_a_clock_that_wraps_is_flown() -> None:
 
 def test_a_normal_flight_needs_no_failsafe() -> None:
     """As `offboard fly` does it: nothing known of the vehicle, identified in flight. Milder
-    scenarios are in test_figures.py."""
+    scenarios are in test_verdict.py."""
     pair = px4.lap(
         aloft=False,
         scenario="all_together",

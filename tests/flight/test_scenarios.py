@@ -102,9 +102,11 @@ def level(setpoints: list[Any]) -> bool:
 
 
 def unheard(pair: Pair) -> list[float]:
-    """Times since the newest telemetry of the setpoints after it, which are level."""
+    """Times since the newest telemetry of the setpoints after it, which are level and hover."""
     late = [(at_s - pair.heard_s, s) for at_s, _, s in pair.setpoints if at_s > pair.heard_s + 0.2]
     assert level([setpoint for _, setpoint in late])
+    hover_thrust = pair.companion.model.hover_thrust
+    assert all(abs(setpoint.thrust - hover_thrust) < 0.02 for _, setpoint in late)
     return [since_s for since_s, _ in late]
 
 

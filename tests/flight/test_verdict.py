@@ -33,11 +33,10 @@ def flown() -> History:
     return calm_hover().history()
 
 
-def default_flight(scenario: str, *assignments: str) -> Pair:
+def default_flight(scenario: str) -> Pair:
     """Of a vehicle of which nothing is known: it is identified in flight."""
     neutral = simulated.vehicle("neutral")
-    pair = make(*assignments, scenario=scenario, believed=neutral, learning=IdentifySettings(),
-                deadline_s=0.05)  # fmt: skip
+    pair = make(scenario=scenario, believed=neutral, learning=IdentifySettings(), deadline_s=0.05)
     assert pair.fly() == Outcome(0, "flown and landed")
     return pair
 
@@ -47,11 +46,11 @@ def px4_like() -> Pair:
     return default_flight("px4_like")
 
 
-def achieves(pair: Pair, most_m: float, tracked_s: float = 16.0) -> None:
+def achieves(pair: Pair, most_m: float) -> None:
     """What a flight must achieve, in numbers."""
     scored = pair.score()
     assert scored.rmse_position_m <= most_m
-    assert scored.tracked_s == pytest.approx(tracked_s, abs=0.3)
+    assert scored.tracked_s == pytest.approx(16.0, abs=0.3)
     assert scored.setpoint_gap_max_s <= 0.12
     assert scored.missed_ticks == 0
     assert scored.gap_median <= 1e-9
@@ -62,13 +61,13 @@ def achieves(pair: Pair, most_m: float, tracked_s: float = 16.0) -> None:
 
 def test_default_flight(px4_like: Pair) -> None:
     achieves(px4_like, 0.04)
-    achieves(default_flight("calm", "reference.laps=1"), 0.01, tracked_s=8.0)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("scenario", "most_m"),
     [
+        ("calm", 0.01),
         ("noise", 0.04),
         ("thrust_minus_15", 0.02),
         ("mass_plus_20", 0.03),
@@ -184,9 +183,12 @@ def test_a_requirement_on_a_cut_log_is_missed(tmp_path: Path) -> None:
     assert "not completed: the log ends in the phase track" in str(required.exception)
 
 
-def touchdown(fall_m: float = 0.0, rests_s: float = 2.0, noise_mps: float = 1e-4) -> Touchdown:
-    """A descent at 0.7 m/s from 3 m, a fall from `fall_m`, then the ground; 50 Hz."""
+def touchdown(
+    fall_m: float = 0.0, rests_s: float = 2.0, noise_mps: float = 1e-4, before_mps: float = 0.7
+) -> Touchdown:
+    """From 3 m at 0.7 m/s, faster above, a fall from `fall_m`, then the ground; 50 Hz."""
     landing, rng = Touchdown((0.0, 0.0, 0.0)), np.random.default_rng(5)
+    landing.on_position(-0.02, (0.0, 0.0, -3.1), before_mps)
     time_s, height, down_mps, end_s = 0.0, 3.0, 0.7, math.inf
     while time_s < end_s:
         noise = rng.normal(0.0, noise_mps)  # no estimator repeats itself
@@ -218,6 +220,7 @@ def test_landings_and_falls() -> None:
     assert soft.not_landed(on_ground=False) == "the land detector does not report the ground"
     for landing, says in (
         (soft, ""),
+        (touchdown(before_mps=3.0), ""),
         (touchdown(rests_s=0.1), "it has not come to rest"),
         (hard, f"fell at up to {hard.speed_mps:.1f} m/s"),
         (reporting(2.8, 0.0, 1e-4), "2.8 m above the take-off point"),
@@ -247,6 +250,7 @@ def test_a_record_says_what_was_sent(px4_like: Pair) -> None:
     assert certified[~excited].all()
     assert 0.0 < certified[excited].mean() < 0.9
     assert score(flown).certified_share == pytest.approx(certified.mean())
+    assert score(flown).at_bound_share < 0.01  # steps are none of the law's
     rows = np.searchsorted(flown.setpoint["time_s"], flown.records["time_s"])
     sent = thrust_direction_from_quaternion(flown.setpoint["quaternion"][rows])
     recorded = [flown.records[f"thrust_direction_{axis}"] for axis in ("north", "east", "down")]

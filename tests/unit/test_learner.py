@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from laws import PX4
 from pydantic import ValidationError
@@ -11,11 +12,13 @@ from offboard.identification.attitude_fit import ResponseFit, Unexplained
 from offboard.identification.learner import IdentifySettings, Learner, Stage
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_estimate import (
+    FILE_DELAY_S,
     UNKNOWN_DELAY_S,
     IdentifiedVehicle,
     VehicleEstimate,
 )
 from offboard.identification.vehicle_fit import Identified, within_bounds
+from offboard.model.command import Command
 from offboard.model.vehicle import AxisResponse, Vehicle
 
 FILE = PX4.model_copy(
@@ -76,6 +79,7 @@ def test_doubt_ends_with_a_fit_that_explains_the_flight() -> None:
     assert estimate.vehicle.tilt.natural_frequency_radps == 5.0
     assert estimate.uncertainty.tilt_s == pytest.approx(KNOWN_S)
     assert estimate.cause == "identified delay, 50 +- 2 ms"
+    assert estimate.result is None  # the next flight begins without what was contradicted once
 
 
 def test_doubt_ends_when_the_constants_explain_the_flight_again() -> None:
@@ -143,13 +147,16 @@ def test_doubt_about_the_tilt_leaves_the_other_constants() -> None:
     }
     assert estimate.vehicle == FILE.model_copy(update=identified)
     assert estimate_with(fit(0.06)).vehicle.thrust_delay_s == 0.01  # the vehicle's own difference
-    own = estimate_with(Identified(10.0, tilt=tilt, thrust_delay_s=Estimate(0.05, 0.01)))
+    thrust = {"thrust_delay_s": Estimate(0.05, 0.01), "thrust_effect_s": Estimate(0.06, 0.01)}
+    own = estimate_with(Identified(10.0, tilt=tilt, **thrust))
+    assert own.uncertainty.thrust_s == pytest.approx(0.03)
     own.on_contradiction(CONTRADICTS, AGREES, 20.0)
     assert own.vehicle == FILE.model_copy(update={"thrust_delay_s": 0.05})
 
 
 def test_a_link_is_in_every_delay_and_its_changes_make_them_uncertain() -> None:
     estimate = VehicleEstimate(FILE, delay_error_s=UNKNOWN_DELAY_S)
+    assert estimate.result is None
     estimate.on_link_delay(Estimate(0.124, 0.01))
     delays = [estimate.vehicle.tilt.delay_s, estimate.vehicle.yaw.delay_s]
     assert [*delays, estimate.vehicle.thrust_delay_s] == pytest.approx([0.16, 0.32, 0.13])
@@ -208,3 +215,35 @@ def test_what_is_recalled_needs_no_steps_and_is_not_adopted_again() -> None:
     learner.on_stage(Stage.CLIMB, 10.0)
     assert learner.learn(10.0, 0.42) is None
     assert learner.result == recalled
+
+
+def test_steps_end_where_they_began_and_outside_the_box() -> None:
+    """Integrated twice, tilts by 2 degrees to either side leave the vehicle where it was."""
+    learner = Learner(FILE, IdentifySettings(box_m=0.5))
+    learner.on_stage(Stage.STEPS, 10.0)
+    level = Command(9.8, (0.0, 0.0, 1.0), 0.0)
+    times_s = 10.0 + 0.01 * np.arange(400)
+    flown = [learner.excited(level, time_s, 0.4) for time_s in times_s]
+    tilts = np.array([each.thrust_direction_ned[:2] for each in flown])
+    speeds = np.cumsum(tilts, axis=0)
+    for ends in (speeds, np.cumsum(speeds, axis=0)):
+        assert ends[-1] == pytest.approx([0.0, 0.0], abs=1e-9)
+    assert set(np.round(tilts.ravel(), 4)) == {-0.0349, 0.0, 0.0349}
+    assert {round(each.thrust_mps2, 2) for each in flown} == {9.31, 9.8, 10.29}
+    assert {round(each.heading_rad, 3) for each in flown} == {-0.07, 0.07}
+    assert learner.excited(level, 10.1, 0.51) == level
+    assert learner.excited(level, 10.1, 0.0) == level  # for good
+
+
+def test_without_identification_the_file_is_flown_and_nothing_is_recalled() -> None:
+    recalled = IdentifiedVehicle(PX4, Estimate(0.04, 0.002), 0.0)
+    learner = Learner(FILE, IdentifySettings(online=False), known=recalled)
+    assert not learner.wants_excitation
+    told = []
+    for stage, since_s in ((Stage.CLIMB, 0.0), (Stage.STEPS, 5.0), (Stage.MOTION, 10.0)):
+        learner.on_stage(stage, since_s)
+        told += [learner.learn(since_s + 0.1 * tick, 0.53) for tick in range(50)]
+    (update,) = filter(None, told)
+    assert (update.vehicle, update.uncertainty.tilt_s) == (FILE, FILE_DELAY_S)
+    assert update.cause.endswith("the vehicle file's delay may be wrong by 130 ms")
+    assert (update.sentences, learner.result) == ((), None)

@@ -333,6 +333,7 @@ def test_a_switch_counts_in_the_air_from_a_mode_without_failsafe() -> None:
     assert not shows(ours=True)  # found so
     assert not shows(ours=False, failsafe=True)
     assert not shows(ours=True)  # PX4 returns by itself
+    assert not switch.hasty
     assert not shows(ours=False)
     assert shows(ours=True)
     assert not shows(ours=False)

@@ -124,19 +124,21 @@ def test_estimator_reports() -> None:
     """Flags of recordings of PX4 1.16.1 and ArduCopter 4.6.3, before GPS and in flight."""
     waiting, flying, wrong = (0.0, NAN, 0.02, NAN, 0.003), (0.04, 0.03, 0.02, 0.07), (1.3, 0.1)
     unfixed = "no valid horizontal velocity, horizontal position"
-    for flags, ratios, problem in (
-        (229, waiting, unfixed),
-        (831, flying, ""),
-        (831, wrong, "rejects GPS velocity (innovation ratio 1.30, limit 1)"),
+    for flags, ratios, accuracy_m, problem in (
+        (229, waiting, NAN, unfixed),
+        (831, flying, 0.3, ""),
+        (831, wrong, 0.3, "rejects GPS velocity (innovation ratio 1.30, limit 1)"),
     ):
         filled = (*ratios, *(NAN,) * (6 - len(ratios)))
-        px4 = mavlink.MAVLink_estimator_status_message(10**6, flags, *filled, 0.3, 0.3)
+        px4 = mavlink.MAVLink_estimator_status_message(10**6, flags, *filled, accuracy_m, 0.3)
         copter = mavlink.MAVLink_ekf_status_report_message(flags, *filled[:5], NAN)
         for message, autopilot in ((px4, PX4), (copter, ARDUPILOT)):
             report = received(message, autopilot)
             assert report.problem.endswith(problem)
             assert bool(report.problem) is bool(problem)
             assert report.worst[1] == pytest.approx(max(r for r in ratios if r == r))
+        known_m = None if math.isnan(accuracy_m) else pytest.approx(accuracy_m)
+        assert received(px4).accuracy_m == known_m
 
 
 # --- time ---
