@@ -160,8 +160,13 @@ def abandoned(flight: FlightState) -> bool:
     return left and found_engaged(flight) and can_take_over(flight)
 
 
+def can_start_in_the_air(flight: FlightState) -> bool:
+    """On request, as by a pilot's switch, only where every sign says that it flies."""
+    return flight.contact.flies and can_take_over(flight) and usable(flight)
+
+
 def started_in_the_air(flight: FlightState) -> str:
-    fit = flight.request is Request.START and can_take_over(flight) and usable(flight)
+    fit = flight.request is Request.START and can_start_in_the_air(flight)
     return f"start requested, {flight.vehicle.mode}" if fit else ""
 
 

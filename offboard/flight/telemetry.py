@@ -20,7 +20,7 @@ from offboard.flight.phases import BEFORE_FLIGHT, FLYING, MOVING, TRACKING, WAIT
 from offboard.flight.positioning import PositionJumps
 from offboard.flight.preflight import ParameterReading
 from offboard.flight.rows import other_sender
-from offboard.flight.starting import can_take_over, usable
+from offboard.flight.starting import can_start_in_the_air, usable
 from offboard.flight.state import FlightState
 from offboard.flight.vehicle_clock import VehicleClock
 from offboard.mavlink.events import (
@@ -241,7 +241,7 @@ def _start(flight: FlightState) -> Answer:
     armed = flight.vehicle.armed
     if not armed and not (flight.service and flight.service.arms):
         return DENIED
-    fit = usable(flight) and (not armed or can_take_over(flight))
+    fit = can_start_in_the_air(flight) if armed else usable(flight)
     return (Result.ACCEPTED, Request.START) if fit else NOT_NOW
 
 

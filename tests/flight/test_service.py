@@ -329,7 +329,7 @@ def test_engaged_while_it_lands_it_is_held_and_the_pilot_is_told(served: Served)
 
 
 def test_switched_where_it_has_touched_down_it_stays_there(served: Served) -> None:
-    """ArduCopter's land detector does not see that it stands in BRAKE."""
+    """ArduCopter's land detector does not see that it stands in BRAKE. Nor is it started there."""
     pair = served.engaged("ardupilot")
     pair.switch("land")
     pair.until(lambda: -pair.place[2] < 0.01)
@@ -342,6 +342,10 @@ def test_switched_where_it_has_touched_down_it_stays_there(served: Served) -> No
     assert (pair.phase, pair.mode) == (Phase.STANDBY, "GUIDED")
     assert pair.after(switched_s, SETPOINT, COMMAND) == []
     assert pair.said("not engaged: GUIDED, but the vehicle may stand on the ground")
+    pair.command(START)
+    pair.run(1.0)
+    assert (pair.phase, pair.acks) == (Phase.STANDBY, [(START, TEMPORARILY_REJECTED)])
+    assert pair.after(switched_s, SETPOINT, COMMAND) == []
 
 
 def test_armed_in_offboard_on_the_ground_it_stays_there(served: Served) -> None:
