@@ -334,7 +334,7 @@ class _Collector:
 
     def _add_theirs(self, entry: LoggedMessage, payload: bytes) -> None:
         name, now_ms, unix_s = entry.name, self.now_ms, entry.unix_us / 1e6
-        if entry.frame.message_id in TELEMETRY and self._is_ahead(entry.frame.message_id, payload):
+        if self._refused_as_ahead(entry.frame.message_id, payload):
             return
         if name in _THEIRS:
             self._samples[name].add(payload, now_ms, unix_s)
@@ -366,8 +366,10 @@ class _Collector:
             if math.isnan(self._anchor_ms):
                 self._anchor_ms = self.now_ms
 
-    def _is_ahead(self, message_id: int, payload: bytes) -> bool:
-        """Whether its stamp is so far ahead that the flight has refused it, too."""
+    def _refused_as_ahead(self, message_id: int, payload: bytes) -> bool:
+        """Whether telemetry has a stamp so far ahead that the flight has refused it, too."""
+        if message_id not in TELEMETRY:
+            return False
         time_s = int.from_bytes(payload[:4], "little") / 1e3
         time_s += self._time.wrapped_s(time_s)
         stale = self._time.check(message_id, time_s) is Age.STALE

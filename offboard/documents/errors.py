@@ -41,7 +41,7 @@ class DocumentError(UserError):
 def located(error: BaseException) -> str:
     """An exception of code from outside, such as a controller, in one sentence with file and line
     of the mistake: of the innermost call in the package that was called from here, a folder or a
-    single module. Reads no file. Never raises, whatever the exception does."""
+    single module. Reads no file. Never raises an exception of its own."""
     walked = traceback.walk_tb(error.__traceback__)
     calls = [(frame.f_code.co_filename, line) for frame, line in walked]
     calls = [(file, line) for file, line in calls if _is_file(file)]

@@ -9,6 +9,7 @@ from offboard.flight.phases import BEFORE_FLIGHT, TRACKING, Phase
 from offboard.flight.rows import other_sender
 from offboard.flight.state import LEVEL, FlightState
 from offboard.mavlink.dialects.base import Dialect
+from offboard.mavlink.events import VehicleIdentity
 from offboard.mavlink.outgoing import CommandLong
 from offboard.model.command import Command
 
@@ -166,7 +167,7 @@ def request_parameters(flight: FlightState) -> None:
     due = flight.reading.due(_dialect(flight), flight.vehicle.parameters, flight.now_s)
     outbox.send(flight, *due)
     if flight.service:
-        if flight.vehicle.uid is None:
+        if flight.vehicle.age_s(VehicleIdentity) > flight.in_phase_s:
             outbox.request(flight, CommandLong.message(AUTOPILOT_VERSION))
         return
     stale = flight.vehicle.mode == _dialect(flight).engage_mode and flight.vehicle.disarmed

@@ -50,11 +50,11 @@ def late_link(flight: FlightState) -> str:
 
 
 def unanswered(flight: FlightState) -> str:
-    """Host time since the newest TIMESYNC request that was answered, of a vehicle that answers."""
-    for_s = flight.clock.unanswered_s(flight.host_s)
-    if flight.clock.delay is None or for_s <= flight.limits.silence_s:
+    """Requests of TIMESYNC in a row without the answer that was due, times their period."""
+    requests = flight.clock.overdue(flight.host_s)
+    if requests * flight.period_s <= flight.limits.silence_s:
         return ""
-    return f"TIMESYNC is not answered for {for_s:.1f} s: the vehicle may not receive setpoints"
+    return f"{requests} requests of TIMESYNC are not answered: does it receive setpoints?"
 
 
 def decision_missed(flight: FlightState) -> bool:

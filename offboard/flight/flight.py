@@ -177,12 +177,18 @@ class Flight(FlightState):
         if reception.events:
             self.peer = chunk.peer
         for event in reception.events:
-            telemetry.update(self, event, arrived_s, turned_s=now_s)
-            self._heard |= self._ends_silence(event)
-            if isinstance(event, Rebooted):
-                self._tick = -1
-                transitions.on_reboot(self)
+            if telemetry.is_of_another(self, event):
+                outbox.announce(self, "another vehicle answers, with the same system id")
+                self._take(Rebooted(self.time_s), arrived_s, now_s)
+            self._take(event, arrived_s, now_s)
         return reception.replies
+
+    def _take(self, event: Event, arrived_s: float, now_s: float) -> None:
+        telemetry.update(self, event, arrived_s, turned_s=now_s)
+        self._heard |= self._ends_silence(event)
+        if isinstance(event, Rebooted):
+            self._tick = -1
+            transitions.on_reboot(self)
 
     def _ends_silence(self, event: Event) -> bool:
         """Whether the event is telemetry. Once position and attitude are received only they are:

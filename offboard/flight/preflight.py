@@ -136,7 +136,10 @@ OTHER_SENDER = (
     "another program controls the vehicle on this link, too: {flight.vehicle.other_sender_name} "
     "(limits.begin_with_other_sender=true flies all the same)"
 )
-TWIN = "two vehicles with the same system id send on this link, and both obey"
+TWIN = (
+    "two vehicles with the same system id send on this link, or its telemetry comes twice, seconds "
+    "apart"
+)
 SEVERAL = "several vehicles are heard, systems {systems}: choose one with --system"
 
 
@@ -365,11 +368,9 @@ class ParameterReading:
         self._requested_s = now_s
         return [ParamRead(p.name) for p in self._wanted(dialect) if p.name not in known]
 
-    def complete(
-        self, dialect: Dialect, known: Mapping[str, float], now_s: float, *, named: bool = True
-    ) -> bool:
-        """Every parameter has a reply, and the vehicle is `named`, or had time enough for it."""
-        answered = named and all(each.name in known for each in self._wanted(dialect))
+    def complete(self, dialect: Dialect, known: Mapping[str, float], now_s: float) -> bool:
+        """Every parameter has a reply, or had time enough for one."""
+        answered = all(each.name in known for each in self._wanted(dialect))
         return answered or now_s - self._began_s >= REPLY_TIMEOUT_S
 
     def _wanted(self, dialect: Dialect) -> list[WatchedParameter]:

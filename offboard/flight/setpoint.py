@@ -75,7 +75,7 @@ def admit(
 
 def usable(command: Command | PositionCommand) -> bool:
     """Whether all values can be sent, as float32, and the thrust direction is a unit vector, as a
-    tuple: an array is not compared with what was sent."""
+    tuple: commands are compared with ==."""
     if isinstance(command, PositionCommand):
         vectors = (
             command.position_ned_m,

@@ -30,7 +30,7 @@ from offboard.mavlink.events import Heartbeat
 ARM_DISARM = 400  # MAV_CMD_COMPONENT_ARM_DISARM
 ARMING_SHOWN_S = 2.5  # HEARTBEAT, at 1 Hz, shows an accepted arming within this time
 DISARMED_SHOWN_S = 1.5  # longer than a period of HEARTBEAT: arming may have been in progress
-UNHEARD_S = 5.0  # what is heard after that may be another vehicle
+OTHER_VEHICLE_S = 5.0  # what is heard after that may be another vehicle
 LISTENED_S = 0.5  # to hear another sender: PX4 leaves OFFBOARD below 2 Hz
 
 
@@ -54,8 +54,8 @@ def silent_for_long(flight: FlightState) -> str:
     return silent_for(flight, 2.0 * flight.limits.silence_s)
 
 
-def gone(flight: FlightState) -> str:
-    return silent_for(flight, UNHEARD_S)
+def silent_for_another(flight: FlightState) -> str:
+    return silent_for(flight, OTHER_VEHICLE_S)
 
 
 def other_vehicle(flight: FlightState) -> str:
@@ -70,10 +70,7 @@ def ground_of(flight: FlightState) -> Ground:
     """What the preflight list judges."""
     vehicle, contact, dialect = flight.vehicle, flight.contact, flight.dialect
     senders, service = flight.session.senders, flight.service
-    named = service is None or vehicle.uid is not None
-    read = dialect and flight.reading.complete(
-        dialect, vehicle.parameters, flight.now_s, named=named
-    )
+    read = dialect and flight.reading.complete(dialect, vehicle.parameters, flight.now_s)
     from_origin = service is not None and service.anchor == "origin"
     return Ground(
         vehicle,
@@ -280,7 +277,7 @@ SERVICE_WAITS = (
     Transition({CONNECT}, stop_requested, FAILED, FLOWN, OPERATOR),
     Transition({CONNECT}, vehicle_found, HEALTH),
     Transition({STANDBY}, rebooted, FAILED, FLOWN, "restart"),
-    Transition({STANDBY}, gone, HEALTH),
+    Transition({STANDBY}, silent_for_another, HEALTH),
     # before a stop: what has just been engaged is handed back
     Transition({HEALTH, STANDBY}, abandoned, HAND_BACK, FLOWN, reason=ABANDONED),
     Transition({STANDBY}, engaged_by_pilot, CLIMB, FLOWN),

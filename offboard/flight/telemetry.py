@@ -37,6 +37,7 @@ from offboard.mavlink.events import (
     ThrustReport,
     TimesyncReply,
     VehicleFound,
+    VehicleIdentity,
 )
 from offboard.mavlink.outgoing import CommandResult, ThrustRule
 
@@ -84,6 +85,14 @@ def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: flo
             outbox.announce(flight, sentence, once=True)
         case Rebooted():
             _on_reboot(flight)
+
+
+def is_of_another(flight: FlightState, event: Event) -> bool:
+    """Whether a vehicle that waits is another one than before, by its hardware number. Nothing that
+    was known is of it, as after a reboot."""
+    known = flight.vehicle.uid
+    differs = isinstance(event, VehicleIdentity) and known is not None and event.uid != known
+    return differs and flight.phase in WAITING
 
 
 def _is_of_others(flight: FlightState, thrust: float) -> bool:
@@ -218,7 +227,7 @@ DENIED: Answer = (Result.DENIED, Request.NONE)
 
 def _judged(flight: FlightState, command: int, parameters: tuple[float, ...]) -> Answer:
     """The result to acknowledge `command` with, and what is to be done."""
-    if flight.request is Request.HAND_BACK and command in (START, PAUSE_CONTINUE):
+    if flight.request is not Request.NONE and command in (START, PAUSE_CONTINUE):
         return NOT_NOW
     if command == START:
         return _start(flight)

@@ -129,7 +129,6 @@ def _enter(flight: FlightState, row: Transition) -> None:
     source, reason, cause = flight.phase, row.why(flight), row.cause.format(flight=flight)
     _conclude(flight, row, reason)
     flight.vehicle.clear_messages()
-    flight.request = Request.NONE
     flight.phase = row.target
     flight.began_s = flight.now_s
     outbox.announce_phase(flight, reason, cause)
@@ -152,8 +151,9 @@ def _enter(flight: FlightState, row: Transition) -> None:
         flight.authority.ask()
         _set_hover_thrust(flight)
     elif row.target is Phase.HEALTH:  # it may be another vehicle, or have other parameters
-        flight.vehicle.forget_identity()
-        flight.reading = ParameterReading()
+        flight.vehicle.parameters.clear()
+        flight.reading, flight.thinned_s = ParameterReading(), 0.0
+        flight.requested_s.clear()
     elif row.target is Phase.TAKEOFF:
         _begin_takeoff(flight)
     elif row.target is Phase.CLIMB:

@@ -159,6 +159,15 @@ class VehicleClock:
         """For how long at host time `host_s` no request has been answered; 0 before the first."""
         return max(host_s - max(self._began_s, self._answered_s), 0.0)
 
+    def overdue(self, host_s: float) -> int:
+        """Number of requests since the newest one with a reply that should have one at host time
+        `host_s`: a reply takes at most one way more than `delay`. 0 while no delay is known."""
+        delay = self.delay
+        if delay is None:
+            return 0
+        due_s = host_s - 2.0 * delay.value
+        return sum(self._answered_s < sent_s <= due_s for _, sent_s in self._requests)
+
     @property
     def delay_growth_s(self) -> float:
         """Median of the newest replies less the delay at `settle`; 0 while either is unknown."""

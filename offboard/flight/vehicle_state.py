@@ -248,11 +248,6 @@ class VehicleState:
         self.heard_s.clear()
         self.results.clear()
         self.resumed_s = -math.inf
-        self.forget_identity()
-
-    def forget_identity(self) -> None:
-        """Forget which vehicle it is, and its parameters."""
-        self.uid = self.version = None
         self.parameters.clear()
 
     def explanation(self, unsaid: str) -> str:

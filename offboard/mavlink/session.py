@@ -281,7 +281,7 @@ class Session:
 
     @property
     def has_twin(self) -> bool:
-        """Whether two vehicles with the same ids send, by the clocks of their telemetry."""
+        """Whether two vehicles with the same ids send, whose clocks are more than 2 s apart."""
         return self._time.mixed
 
     @property

@@ -15,7 +15,8 @@ from enum import Enum, auto
 # the one before, are a new epoch
 _REBOOT_S = 2.0
 _EPOCH_STAMPS, _EPOCH_S, _GAP_S = 3, 0.1, 10.0
-_MIXED_STAMPS, _MIXED_S = 10, 2.0  # of another epoch between those of this one: a second vehicle
+# So often within this time a stamp of this epoch follows one of another: two clocks send by turns
+_TURNS, _TURNS_S = 10, 2.0
 SILENCE_S = 1.0
 _WRAP_S = 2**32 / 1e3
 _NEAR_S = 600.0  # a stamp this close to the newest, also but for the wrap, continues it
@@ -52,7 +53,7 @@ class VehicleTime:
         self.seconds = 0.0
         self._last_s: dict[int, float] = {}
         self._other: list[tuple[int, float]] = []  # of another epoch, in a row: id and stamp
-        self._refused_s: deque[float] = deque(maxlen=_MIXED_STAMPS)  # when stamps of another epoch
+        self._turns_s: deque[float] = deque(maxlen=_TURNS)  # when this epoch followed another
         self._counted_s: float | None = None  # the newest stamp that `seconds` has followed
         self._received_s: float | None = None  # host time of the newest telemetry, or the first
         self._bridged_s = 0.0  # counted since the newest telemetry
@@ -78,6 +79,8 @@ class VehicleTime:
         if self._last_s and not -_REBOOT_S <= ahead_s <= _NEAR_S:
             stuck = time_s == last_s
             return Age.STALE if stuck else self._check_epoch(message_id, time_s)
+        if self._other:
+            self._turns_s.append(self.seconds)
         self._other.clear()
         if last_s is not None and time_s <= last_s:
             return Age.STALE
@@ -91,9 +94,7 @@ class VehicleTime:
             self._other.clear()
         self._other.append((message_id, time_s))
         if len(self._other) < _EPOCH_STAMPS or time_s - self._other[0][1] < _EPOCH_S:
-            self._refused_s.append(self.seconds)
             return Age.STALE
-        self._refused_s.clear()
         rebooted = time_s < self.newest_s
         self._last_s = dict(self._other)
         self.newest_s = max(self._last_s.values())
@@ -102,9 +103,8 @@ class VehicleTime:
 
     @property
     def mixed(self) -> bool:
-        """Whether stamps of two clocks arrive by turns."""
-        full = len(self._refused_s) == _MIXED_STAMPS
-        return full and self.seconds - self._refused_s[0] < _MIXED_S
+        """Whether stamps of two clocks, more than _REBOOT_S apart, arrive by turns."""
+        return len(self._turns_s) == _TURNS and self.seconds - self._turns_s[0] < _TURNS_S
 
     # --- seconds ---
 

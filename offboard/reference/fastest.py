@@ -24,7 +24,8 @@ Array = NDArray[np.float64]
 
 GRAVITY_MPS2 = 9.80665
 SAMPLES = 16  # a leg; of the optimiser, and four times as many of the result
-SLOWEST, QUICKEST = 0.01, 100.0  # speeds (m/s) between which the first guess is searched
+QUICKEST, SLOWEST = 1e-3, 1e4  # times the durations at 1 m/s, between which the first guess is
+POINTS_MOST = 40  # two seconds; the time grows with their square
 
 
 class PathLimits(Parameters):
@@ -42,17 +43,18 @@ class PathLimits(Parameters):
 @lru_cache(maxsize=32)
 def fastest_times(
     points_m: tuple[Triple, ...], smoothness: Smoothness, limits: PathLimits
-) -> Array:
-    """Times (N,), from 0, at which the fastest path passes `points_m` [north, east, up], in whole
-    milliseconds. Raises ValueError like `path.through`, and where two neighbours coincide."""
+) -> tuple[float, ...]:
+    """Times (N,), from 0, at which the fastest path passes `points_m` [north, east, up], legs of
+    whole milliseconds. The last digits depend on the computer. Raises ValueError like
+    `path.through`, where two neighbours coincide, for more than POINTS_MOST points, and where no
+    durations keep the limits."""
+    if len(points_m) > POINTS_MOST:
+        raise ValueError(f"fastest takes at most {POINTS_MOST} points, not {len(points_m)}")
     points = np.array(points_m) * (1.0, 1.0, -1.0)
     legs_s = np.diff(times_from_speed(points, 1.0))
 
-    def times(durations_s: Array) -> Array:
-        return np.concatenate(([0.0], np.cumsum(durations_s)))
-
     def room(durations_s: Array, samples: int = SAMPLES) -> Array:
-        path = through(points, times(durations_s), smoothness)
+        path = through(points, np.append(0.0, np.cumsum(durations_s)), smoothness)
         return 1.0 - demands(path, limits, samples)
 
     def slowed(durations_s: Array) -> Array:
@@ -61,9 +63,12 @@ def fastest_times(
         def least(factor: float) -> float:
             return float(room(factor * durations_s, 4 * SAMPLES).min())
 
-        return float(brentq(least, 1.0 / QUICKEST, 1.0 / SLOWEST, rtol=1e-6)) * durations_s
+        return float(brentq(least, QUICKEST, SLOWEST, rtol=1e-6)) * durations_s
 
-    start_s = slowed(legs_s)
+    try:
+        start_s = slowed(legs_s)
+    except ValueError:
+        raise ValueError("no times of these points keep the limits of fastest") from None
     found = minimize(
         lambda scale: scale @ start_s / start_s.sum(),
         np.ones(len(start_s)),
@@ -73,8 +78,11 @@ def fastest_times(
         method="SLSQP",
         options={"maxiter": 200, "ftol": 1e-5},
     )
-    best_s = min((start_s, slowed(found.x * start_s)), key=np.sum)
-    return np.ceil(1e3 * times(best_s)) / 1e3
+    best_s = start_s
+    if np.isfinite(found.x).all():  # without success it may still be better
+        best_s = min((start_s, slowed(found.x * start_s)), key=np.sum)
+    times_s = np.append(0.0, np.cumsum(np.ceil(1e3 * best_s))) / 1e3
+    return tuple(times_s.tolist())
 
 
 def demands(path: Spline, limits: PathLimits, samples: int) -> Array:

@@ -14,6 +14,7 @@ from enum import StrEnum
 from typing import Annotated, Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from offboard.documents.parameters import Parameters
@@ -233,15 +234,17 @@ class Waypoints(Shape):
         self.path()
         return self
 
+    def times(self) -> NDArray[np.float64]:
+        """When the path passes the points (N,), s from its start. Raises ValueError like `path`."""
+        if self.fastest is not None:
+            return np.array(fastest_times(self.points_m, self.minimise, self.fastest))
+        if self.speed_mps is not None:
+            return times_from_speed(np.array(self.points_m), self.speed_mps)
+        return np.array(self.times_s or (), dtype=np.float64)
+
     def path(self) -> Path:
         points = np.array(self.points_m, dtype=np.float64) * (1.0, 1.0, -1.0)
-        if self.fastest is not None:
-            times = fastest_times(self.points_m, self.minimise, self.fastest)
-        elif self.speed_mps is not None:
-            times = times_from_speed(points, self.speed_mps)
-        else:
-            times = np.array(self.times_s or (), dtype=np.float64)
-        return through(points, times, self.minimise)
+        return through(points, self.times(), self.minimise)
 
 
 class FromTable(Shape):

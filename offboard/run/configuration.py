@@ -38,7 +38,7 @@ from offboard.flight.phases import Limits
 from offboard.identification.learner import IdentifySettings
 from offboard.model.vehicle import Vehicle
 from offboard.reference.feasibility import Envelope, check
-from offboard.reference.shapes import SHAPES, FromTable, Shape
+from offboard.reference.shapes import SHAPES, FromTable, Shape, Waypoints
 from offboard.reference.track import Track
 
 Raw = dict[str, Any]
@@ -94,7 +94,7 @@ def load(
         raise DocumentError(*(f"{path}: {sentence}" for sentence in missing))
     if seed is not None:
         raw = override(raw, f"seed={seed}", f"--seed {seed}")
-    return _with_table(_validated(raw, str(path)))
+    return _complete(_validated(raw, str(path)))
 
 
 def build_track(config: FlightConfig) -> Track:
@@ -230,13 +230,17 @@ def _validated(raw: Raw, source: str, *, ignores_unknown: bool = False) -> Fligh
     return FlightConfig(**dict(validate(raw, model, source)))
 
 
-def _with_table(config: FlightConfig) -> FlightConfig:
-    """With the content of the table that it names, so that it stands alone."""
+def _complete(config: FlightConfig) -> FlightConfig:
+    """With what its reference is computed from, so that it is the same everywhere: the content of
+    the table that it names, the times that were found."""
     reference = config.reference
-    if not isinstance(reference, FromTable) or reference.text is not None:
+    if isinstance(reference, FromTable) and reference.text is None:
+        found: dict[str, Any] = {"text": read_text(Path(reference.file))}
+    elif isinstance(reference, Waypoints) and reference.fastest is not None:
+        found = {"times_s": tuple(reference.times().tolist()), "fastest": None}
+    else:
         return config
-    content = {"text": read_text(Path(reference.file))}
-    return config.model_copy(update={"reference": reference.model_copy(update=content)})
+    return config.model_copy(update={"reference": reference.model_copy(update=found)})
 
 
 def _missing(part: str, raw: Raw) -> str:

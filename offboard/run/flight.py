@@ -230,9 +230,10 @@ def _decided(controller: Controller, situation: Situation) -> Command | Position
         decision = controller.decide(situation)
         command = decision.command
         [float(figure) for figure in astuple(decision.certificate)]  # as the log will have them
+        may_be_sent = usable(command)
     except Exception as error:
         raise DocumentError(f"controller: {located(error)}") from error
-    if not usable(command):
+    if not may_be_sent:
         raise DocumentError(
             f"controller: it decides {command}, which cannot be sent: all values must be finite, "
             "the thrust direction a tuple of length 1"

@@ -75,9 +75,10 @@ class Mission:
     def go_to(self, number: int) -> bool:
         """Continue with this item, for home (ArduCopter) with the first one; False where there is
         none."""
-        if not 0 <= number < len(self.items):
+        item = max(number, self.first)
+        if number < 0 or item >= len(self.items):
             return False
-        self.current, self.finished = max(number, self.first), False
+        self.current, self.finished = item, False
         self._since_s = math.nan
         return True
 

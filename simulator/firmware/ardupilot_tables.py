@@ -277,6 +277,7 @@ RULES = (
     Rule("disarm", result=_FAILED),
     Rule("force disarm", when=("not armed",)),
     Rule("force disarm", do=("disarm",), texts=(_DISARMING,)),
+    Rule("terminate", when=("not armed",)),
     Rule("terminate", do=("disarm",), texts=(_DISARMING,)),
     # No failsafe and no text: level with constant height, or standing still; the mode stays GUIDED
     Rule("stream lost", when=("attitude setpoint",), do=("level",)),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -196,14 +197,19 @@ aged = clock(age_s=lambda age_s: lambda *_: age_s)
 hovers = holding(observer=lambda share: SimpleNamespace(hover_thrust_estimate=share))
 
 
-# row: how to set what it measures, a value that it allows, and one that it does not
-def unheard(flight: FlightState, for_s: float) -> None:
-    """Its newest answer to TIMESYNC is so old."""
+def unanswered(flight: FlightState, requests: int, delay_s: float = 0.01) -> None:
+    """So many requests, of one tick each, were sent since one that was answered; the newest of them
+    so long ago that a reply was due."""
+    sent_s = flight.host_s - 2.0 * delay_s - 0.1 * requests
     for number in range(REPLIES_MIN):
-        request = flight.clock.request(float(number), flight.host_s - for_s)
-        flight.clock.on_reply(TimesyncReply(request.ts1_ns, request.ts1_ns + 10_000_000))
+        request = flight.clock.request(float(number), sent_s)
+        vehicle_ns = request.ts1_ns + round(1e9 * delay_s)
+        flight.clock.on_reply(TimesyncReply(request.ts1_ns, vehicle_ns))
+    for number in range(1, requests + 1 + round(20.0 * delay_s)):  # and some that are on their way
+        flight.clock.request(100.0 + number, sent_s + 0.1 * number - 1e-3)
 
 
+# row: how to set what it measures, a value that it allows, and one that it does not
 MEASURED: list[tuple[str, Measure, Any, Any]] = [
     ("authority", lambda flight, age_s: setattr(flight.authority, "heard_s", NOW_S - age_s),
      2.5, 2.6),
@@ -212,7 +218,8 @@ MEASURED: list[tuple[str, Measure, Any, Any]] = [
     ("age", aged, AGE_S, 0.26),
     ("link", clock(delay_growth_s=float), 0.3, 0.31),
     ("link", aged, AGE_S, 0.26),
-    ("uplink", unheard, 1.0, 1.1),
+    ("uplink", unanswered, 10, 11),
+    ("uplink", partial(unanswered, delay_s=0.6), 10, 11),
     ("decision", holding(missed=int, failure=lambda _: "it was late"), 0, 1),
     ("decisions", holding(missed=int), 2, 3),
     ("tilt", tilt, 1.29, 1.31),

@@ -521,15 +521,22 @@ def test_a_pilot_takes_a_vehicle_whose_own_failsafe_acts_soon(served: Served) ->
 
 def test_a_request_in_the_tick_of_a_transition_is_obeyed(served: Served) -> None:
     """It was acknowledged, and forgotten: it arrives in the last step before the phase changes."""
-    pair = served.engaged(reference="hover")
-    pair.until(lambda: pair.phase is Phase.HOVER, 90.0)
-    changed_s = pair.time_s
-    again = served.engaged(reference="hover")
-    again.until(lambda: again.time_s > changed_s - 1.5 * STEP_S, 90.0)
-    assert again.phase is Phase.TRACK
-    again.command(SET_MODE, 1.0)
-    again.until(lambda: again.phase is Phase.STANDBY, 3.0)
-    assert (again.acks, again.mode) == ([(SET_MODE, ACCEPTED)], "AUTO.LOITER")
+
+    def begun(phase: Phase, **options: Any) -> Any:
+        pair = served(reference="hover", arms=True, **options)
+        pair.until(lambda: pair.phase is Phase.STANDBY)
+        pair.command(START)
+        pair.until(lambda: pair.phase is phase, 120.0)
+        return pair
+
+    for before, after in ((Phase.ARM, Phase.TAKEOFF), (Phase.TRACK, Phase.HOVER)):
+        changed_s = begun(after).time_s
+        pair = begun(before)
+        pair.until(lambda at_s=changed_s, on=pair: on.time_s > at_s - 1.5 * STEP_S, 90.0)
+        assert pair.phase is before
+        pair.command(SET_MODE, 1.0)
+        pair.until(lambda on=pair: on.phase in (Phase.STANDBY, Phase.LAND), 6.0)
+        assert (pair.acks[-1], pair.mode) == ((SET_MODE, ACCEPTED), "AUTO.LOITER")
 
 
 def test_requests_within_one_tick(served: Served) -> None:
@@ -578,6 +585,23 @@ def test_what_is_heard_after_a_silence_may_be_another_vehicle(served: Served) ->
     pair.state.vehicle.parameters["GUID_OPTIONS"] = 8.0  # as a ground station sets it
     pair.until(lambda: pair.phase is Phase.STANDBY, 5.0)
     assert pair.state.vehicle.uid == 1
+
+
+def test_another_hardware_number_is_another_vehicle(served: Served) -> None:
+    """Asked after each silence, also before the first flight. Nothing known is of it."""
+    pair = served("ardupilot")
+    for number_before in (1, 7):
+        pair.until(lambda: pair.phase is Phase.STANDBY)
+        assert pair.state.vehicle.uid == 1
+        pair.state.vehicle.uid = number_before  # of the one that was heard until now
+        pair.lost_down = pair.lost_up = True
+        pair.run(6.0)
+        assert pair.phase is Phase.HEALTH
+        asked = len(pair.commands(512))
+        pair.lost_down = pair.lost_up = False
+        pair.run(4.0)
+        assert len(pair.commands(512)) > asked
+        assert pair.said("another vehicle answers") is (number_before == 7)
 
 
 def test_the_reference_is_repeated_with_the_newest_configuration(served: Served) -> None:

@@ -10,7 +10,7 @@ from offboard.mavlink.dialects.px4 import PX4
 from offboard.mavlink.outgoing import CommandLong, Outgoing
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.telemetry import TelemetryRates, fitted
-from offboard.mavlink.vehicle_time import VehicleTime
+from offboard.mavlink.vehicle_time import Age, VehicleTime
 
 POSITION = 32
 
@@ -110,6 +110,28 @@ def test_link_time_follows_the_vehicle_or_host_time() -> None:
     assert link.seconds - before_s == pytest.approx(0.2 + 59.8)
     link.on_telemetry(60.7, 65.2)  # host time has counted the minute without telemetry
     assert link.seconds - before_s == pytest.approx(60.0)
+
+
+def test_two_clocks_by_turns_are_two_vehicles_and_a_reboot_is_one() -> None:
+    """At 100 Hz each, of two messages. The twin is 5 s older."""
+
+    def feed(began_s: float, stamps: int, *others_s: float) -> bool:
+        mixed = False
+        for number in range(stamps):
+            for clock_s in (began_s, *(began_s + other for other in others_s)):
+                for message_id in (31, 32):
+                    time_s = clock_s + 0.01 * number
+                    if link.check(message_id, time_s) is Age.FRESH:
+                        link.on_telemetry(time_s, 0.0)
+                    mixed |= link.mixed
+        return mixed
+
+    link = VehicleTime()
+    assert not feed(50.0, 100)
+    assert not feed(0.0, 100)  # rebooted
+    assert feed(1.0, 100, 5.0)
+    feed(2.0, 300)  # the twin was switched off
+    assert not link.mixed
 
 
 @pytest.mark.parametrize(
