@@ -188,7 +188,7 @@ EVENTS: dict[str, Setup] = {
     "unheard_on_ground": _unhear_mode,
     "out_of_reach": _set(silence_s=OUTAGE_MAX_S + 0.1),
     "silent_on_ground": _set(silence_s=20.1),
-    "gone": _set(silence_s=5.1),
+    "silent_for_another": _set(silence_s=5.1),
     "not_found": _set(silence_s=20.1),
     "not_ready_in_time": _since(Limits().health_s + 0.1),
     "not_engaged": _since(Limits.engage_s + 0.1),
