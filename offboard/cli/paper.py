@@ -15,7 +15,7 @@ EXIT_CODES = "Exit codes: 0 all written; 2 usage error."
 def paper(
     out_directory: Directory = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="One seed; about 20 s instead of 4 minutes.")
+        bool, typer.Option("--quick", help="One seed; less than a minute instead of several.")
     ] = False,
     seeds: Annotated[int | None, option("N", "Flights per row.  [default: 20]")] = None,
     initial_q: Annotated[
