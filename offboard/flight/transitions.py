@@ -127,6 +127,9 @@ def on_reboot(flight: FlightState) -> None:
 
 def _enter(flight: FlightState, row: Transition) -> None:
     source, reason, cause = flight.phase, row.why(flight), row.cause.format(flight=flight)
+    asked, flight.request = flight.request, Request.NONE
+    if row.condition(flight):  # also without the request, which is still to be obeyed
+        flight.request = asked
     _conclude(flight, row, reason)
     flight.vehicle.clear_messages()
     flight.phase = row.target
