@@ -24,8 +24,8 @@ Array = NDArray[np.float64]
 
 GRAVITY_MPS2 = 9.80665
 SAMPLES = 16  # a leg; of the optimiser, and four times as many of the result
-QUICKEST, SLOWEST = 1e-3, 1e4  # times the durations at 1 m/s, between which the first guess is
-POINTS_MOST = 40  # two seconds; the time grows with their square
+QUICKEST, SLOWEST = 1e-3, 1e4  # times the durations at 1 m/s: bounds of the first guess
+POINTS_MOST = 40  # two seconds of search, which grow with the square of this number
 
 
 class PathLimits(Parameters):
@@ -44,10 +44,11 @@ class PathLimits(Parameters):
 def fastest_times(
     points_m: tuple[Triple, ...], smoothness: Smoothness, limits: PathLimits
 ) -> tuple[float, ...]:
-    """Times (N,), from 0, at which the fastest path passes `points_m` [north, east, up], legs of
-    whole milliseconds. The last digits depend on the computer. Raises ValueError like
-    `path.through`, where two neighbours coincide, for more than POINTS_MOST points, and where no
-    durations keep the limits."""
+    """Times (N,), s from 0, at which the fastest path passes `points_m`, N of [north, east, up] in
+    m. Each leg takes whole milliseconds; the last ones depend on the computer.
+
+    Raises ValueError like `path.through`, where two neighbours coincide, for more than POINTS_MOST
+    points, and where no durations keep the limits."""
     if len(points_m) > POINTS_MOST:
         raise ValueError(f"fastest takes at most {POINTS_MOST} points, not {len(points_m)}")
     points = np.array(points_m) * (1.0, 1.0, -1.0)
