@@ -17,7 +17,7 @@ COMPILED = (
     "offboard.control.horizon",
     "offboard.control.law",
     "offboard.run.flight",
-    "offboard.paper.plant",
+    "offboard.paper.closed_loop",
     "simulator.vehicle.dynamics",
 )
 

@@ -7,7 +7,6 @@ from typing import Annotated
 import typer
 
 from offboard.cli.shared import FLIGHTS, Directory, err, option, say
-from offboard.documents.errors import UserError
 
 EXIT_CODES = "Exit codes: 0 all written; 2 usage error."
 
@@ -18,27 +17,16 @@ def paper(
         bool, typer.Option("--quick", help="One seed; less than a minute instead of several.")
     ] = False,
     seeds: Annotated[int | None, option("N", "Flights per row.  [default: 20]")] = None,
-    initial_q: Annotated[
-        str | None, option("LIST", "diag(Q) of Eq. 23: 1 or 12 weights, separated by commas.")
-    ] = None,
     figure: Annotated[list[str] | None, option("NAME", "Only this figure; repeatable.")] = None,
     table: Annotated[list[str] | None, option("NAME", "Only this table; repeatable.")] = None,
 ) -> None:
     """Reproduce tables 2-4 and figures 4-17 of the paper on one page."""
     from offboard.link import clock
-    from offboard.paper.study import PAGE, PaperOptions, reproduce
+    from offboard.paper.study import PAGE, SEEDS, reproduce
 
-    try:
-        weights = None if initial_q is None else tuple(float(w) for w in initial_q.split(","))
-    except ValueError:
-        raise UserError(f"--initial-q {initial_q}: 1 or 12 numbers with commas between") from None
-    options = PaperOptions(
-        out=out_directory or FLIGHTS / f"paper-{clock.local_stamp()}",
-        quick=quick,
-        seeds=seeds,
-        initial_q=weights,
-        figures=tuple(figure or ()),
-        tables=tuple(table or ()),
-    )
-    reproduce(options, err)
-    say(f"written: {options.out / PAGE}", indent=2)
+    directory = out_directory or FLIGHTS / f"paper-{clock.local_stamp()}"
+    labels = [f"table {name}" for name in table or ()]
+    labels += [f"figure {name}" for name in figure or ()]
+    flights = (1 if quick else SEEDS) if seeds is None else seeds
+    reproduce(directory, labels, flights, err)
+    say(f"written: {directory / PAGE}", indent=2)

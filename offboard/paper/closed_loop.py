@@ -1,37 +1,54 @@
 """One flight of the paper's loop: reference, law and plant, with a certificate for every step.
 
-The paper draws its path (Figs. 5 and 6) without numbers; this one is similar: about 100 s at some
-3 m/s through turns and changes of height, minimum snap from rest to rest, the nose along the path.
+The plants are the paper's linear model (Eq. 14) and its nonlinear one (Eq. 7); inputs are
+deviations from hover, held for one step of 0.1 s. The paper draws its path (Figs. 5 and 6) without
+numbers; this one is similar: about 100 s at some 3 m/s through turns and changes of height, minimum
+snap from rest to rest, the nose along the path.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from offboard.compiled import array, entry
 from offboard.control.quadratic import ExactMinimum
 from offboard.control.swarm import certify
+from offboard.documents import shipped
+from offboard.documents.reading import parse
 from offboard.link.clock import monotonic_s
+from offboard.model.axes import LinearModel
 from offboard.model.command import PredictedState
 from offboard.model.frames import quaternion_from_euler, rotation_from_quaternion
-from offboard.model.rigid_body import EULER, PHI, PSI, THETA, THRUST, P, R, U, V, W, X, Z
+from offboard.model.rigid_body import (
+    EULER,
+    PSI,
+    QUATERNION,
+    RK4_SCRATCH_ROWS,
+    THRUST,
+    P,
+    R,
+    U,
+    W,
+    X,
+    Z,
+    derivative_into,
+    hover_input,
+    hover_matrices,
+    pack,
+    quaternion_state,
+    rk4_into,
+    sampled_matrices,
+)
 from offboard.model.vehicle import Vehicle
 from offboard.paper.controller import flyable_box, heading_frame
 from offboard.paper.law import INTEGRATED, PAPER_STEP_S, PaperLaw, PaperSettings
-from offboard.paper.plant import (
-    LinearPlant,
-    NonlinearPlant,
-    PlantKind,
-    paper_model,
-    paper_vehicle,
-)
 from offboard.reference.base import FlatSample
-from offboard.reference.flatness import flat_state
 from offboard.reference.path import Smoothness
 from offboard.reference.shapes import HeadingMode, Hover, Waypoints
 
@@ -48,98 +65,131 @@ TOUR = Waypoints(
     minimise=Smoothness.SNAP,
     course=HeadingMode.ALONG_VELOCITY,
 )  # fmt: skip
-
-
-class PathName(StrEnum):
-    """The references of the study."""
-
-    TOUR = "tour"  # Figs. 5 and 6
-    HOVER = "hover"
+FIRST = PaperSettings.first_configuration()
+TRACKED = (*range(U, Z + 1), PSI)  # Eq. 31, in the order of Tables 3 and 4: u v w x y z psi
+_SUBSTEPS = 10
 
 
 @cache
-def sampled_path(name: PathName, steps: int) -> tuple[FlatSample, Array]:
-    """A reference at k = 0 ... `steps`: flat outputs, and the states (steps + 1, 12) of Eq. 27:
-    zero except psi, u, v, w, x, y, z, with velocities in NED as on the linear plant."""
-    reference = (HOVER if name is PathName.HOVER else TOUR).track()
-    samples = reference.sample(PAPER_STEP_S * np.arange(steps + 1, dtype=np.float64))
+def reference_states(hover: bool, steps: int) -> Array:
+    """States (steps + 1, 12) of Eq. 27, of a hover or of Figs. 5-6: zero except psi, u, v, w, x, y,
+    z, with velocities in NED as on the linear plant."""
+    samples = (HOVER if hover else TOUR).track().sample(PAPER_STEP_S * np.arange(steps + 1.0))
     tracked = np.zeros((steps + 1, 12))
     tracked[:, PSI] = samples.heading_rad
     tracked[:, U : W + 1] = samples.velocity_ned_mps
     tracked[:, X : Z + 1] = samples.position_ned_m
-    return samples, tracked
+    return tracked
 
 
-def linear_states(samples: FlatSample, vehicle: Vehicle) -> Array:
-    """All states (..., 12) of the linear model when it follows the reference exactly."""
-    gravity, drag = vehicle.gravity_mps2, vehicle.drag_per_mass_ps
-    v, a, j = samples.velocity_ned_mps, samples.acceleration_ned_mps2, samples.jerk_ned_mps3
-    states = np.zeros((*samples.heading_rad.shape, 12))
-    lean = (a + drag * v) / gravity  # u' = -g theta - c u, v' = g phi - c v
-    lean_rate = (j + drag * a) / gravity
-    states[..., PHI], states[..., THETA] = lean[..., 1], -lean[..., 0]
-    states[..., P], states[..., P + 1] = lean_rate[..., 1], -lean_rate[..., 0]
-    states[..., PSI], states[..., R] = samples.heading_rad, samples.heading_rate_radps
-    states[..., U : W + 1] = v
-    states[..., X : Z + 1] = samples.position_ned_m
-    return states
+# ---------------------------------------------------------------------- plants
 
 
-def heading_states(samples: FlatSample, vehicle: Vehicle) -> Array:
-    """The same (..., 12) for the nonlinear plant (flatness), in the heading frame of each sample;
-    heading and position are relative to the sample, hence 0."""
-    flat = flat_state(samples, vehicle.gravity_mps2, vehicle.drag_per_mass_ps)
-    cosine, sine = np.cos(samples.heading_rad), np.sin(samples.heading_rad)
-    b, v = flat.thrust_direction_ned, samples.velocity_ned_mps
-    along = cosine * b[..., 0] + sine * b[..., 1]
-    across = cosine * b[..., 1] - sine * b[..., 0]
-    states = np.zeros((*samples.heading_rad.shape, 12))
-    states[..., PHI], states[..., THETA] = np.arcsin(-across), np.arctan2(along, b[..., 2])
-    states[..., P : R + 1] = flat.rates_frd_radps
-    states[..., U] = cosine * v[..., 0] + sine * v[..., 1]
-    states[..., V] = cosine * v[..., 1] - sine * v[..., 0]
-    states[..., W] = v[..., 2]
-    return states
+@cache
+def paper_vehicle() -> Vehicle:
+    """Table 1 and the arm that Eq. 16 requires: the shipped vehicle file `paper`."""
+    file = shipped.directory() / "vehicles" / "paper.yaml"
+    return parse(file.read_text(encoding="utf-8"), Vehicle, str(file))
 
 
-def nominal_inputs(states: Array, samples: FlatSample, vehicle: Vehicle, tilted: bool) -> Array:
-    """Inputs (K, 4) held between states (K + 1, 12); torques follow from the rates at both ends.
+@cache
+def paper_model() -> tuple[Array, Array]:
+    """A_d (12, 12) and B_d (12, 4) of Eq. 14, sampled with the 0.1 s that Eq. 16 is sampled with.
 
-    `tilted`: increase the thrust by the part that tilt turns sideways, which the linear model
-    neglects.
+    All callers share the arrays, which are read-only.
     """
-    inertia, drag = np.array(vehicle.inertia_kgm2), np.array(vehicle.drag_rotation_nmpradps)
-    rates = states[:, P : R + 1]
-    inputs = np.empty((len(states) - 1, 4))
-    inputs[:, 1:] = inertia * np.diff(rates, axis=0) / PAPER_STEP_S
-    inputs[:, 1:] += 0.5 * drag * (rates[1:] + rates[:-1])
-    inputs[:, 1:3] /= vehicle.arm_m
-    upward = -(samples.acceleration_ned_mps2 + vehicle.drag_per_mass_ps * samples.velocity_ned_mps)
-    b_z = np.cos(states[:, PHI]) * np.cos(states[:, THETA]) if tilted else 1.0
-    lift = vehicle.mass_kg * (vehicle.gravity_mps2 + upward[:, 2]) / b_z
-    inputs[:, THRUST] = 0.5 * (lift[1:] + lift[:-1]) - vehicle.mass_kg * vehicle.gravity_mps2
-    return inputs
+    dynamics, inputs = sampled_matrices(paper_vehicle(), PAPER_STEP_S)
+    dynamics.flags.writeable = inputs.flags.writeable = False
+    return dynamics, inputs
 
 
-TRACKED = (*range(U, Z + 1), PSI)  # Eq. 31, in the order of Tables 3 and 4: u v w x y z psi
+class PlantKind(StrEnum):
+    """Eqs. 14-18, or the rigid body of Eqs. 1-8."""
+
+    LINEAR = "linear"
+    NONLINEAR = "nonlinear"
 
 
-class LawName(StrEnum):
-    """The laws compared."""
+class LinearPlant:
+    """Eq. 14 with C = I. A constant wind acts as a force through the drag, sampled exactly.
 
-    ONE_STEP = "one step"  # Eq. 21
-    COST_TO_GO = "cost-to-go"  # the Riccati solution replaces Q; the reference is consistent
+    Args:
+        wind_ned_mps: wind velocity (3,).
+        thrust_loss: missing fraction of the total thrust, 0 to 1.
+    """
+
+    def __init__(self, wind_ned_mps: Array, thrust_loss: float = 0.0) -> None:
+        vehicle, self._thrust_loss = paper_vehicle(), thrust_loss
+        dynamics, _ = hover_matrices(vehicle)
+        force = np.zeros((len(dynamics), 1))
+        drag = np.array(vehicle.drag_translation_npmps) / vehicle.mass_kg
+        force[U : W + 1, 0] = drag * wind_ned_mps
+        self._wind_effect = LinearModel(dynamics, force).sampled(PAPER_STEP_S).input_map[:, 0]
+
+    def next_state(self, state: Array, inputs: Array) -> Array:
+        """x(k+1) (12,) from x(k) (12,) and u(k) (4,)."""
+        (dynamics, control_map), delivered = paper_model(), _delivered(inputs, self._thrust_loss)
+        following: Array = dynamics @ state + control_map @ delivered + self._wind_effect
+        return following
+
+
+class NonlinearPlant:
+    """Eq. 7, integrated by RK4 in ten substeps; the total thrust is never negative.
+
+    Arguments and `next_state` as for `LinearPlant`; velocities u, v, w are in body axes.
+    """
+
+    def __init__(self, wind_ned_mps: Array, thrust_loss: float = 0.0) -> None:
+        vehicle, self._thrust_loss = paper_vehicle(), thrust_loss
+        self._hover = hover_input(vehicle)
+        self._constants = np.array(wind_ned_mps, np.float64), pack(vehicle)
+        self._scratch = np.empty((RK4_SCRATCH_ROWS, EULER.size))
+
+    def next_state(self, state: Array, inputs: Array) -> Array:
+        """x(k+1) (12,) from x(k) (12,) and u(k) (4,)."""
+        total = self._hover + _delivered(inputs, self._thrust_loss)
+        total[THRUST] = max(total[THRUST], 0.0)
+        following, step_s = state.copy(), PAPER_STEP_S / _SUBSTEPS
+        follow(following, total, *self._constants, step_s, _SUBSTEPS, self._scratch)
+        return following
+
+
+@entry(array(1), array(1), array(1), array(1), float, int, array(2))
+def follow(
+    state: Array,
+    inputs: Array,
+    wind_ned: Array,
+    parameters: Array,
+    step_s: float,
+    steps: int,
+    scratch: Array,
+) -> None:
+    """`steps` RK4 steps of held inputs and wind, in place; shapes as in `rk4_into`."""
+    for _ in range(steps):
+        rk4_into(derivative_into, state, inputs, wind_ned, parameters, step_s, scratch, state)
+
+
+def _delivered(inputs: Array, thrust_loss: float) -> Array:
+    """Inputs (4,) that the rotors deliver: a fraction of the total thrust is missing."""
+    delivered = inputs.copy()
+    delivered[THRUST] -= thrust_loss * (hover_input(paper_vehicle())[THRUST] + inputs[THRUST])
+    return delivered
+
+
+# ---------------------------------------------------------------------- flights
 
 
 @dataclass(frozen=True, slots=True)
 class FlightTask:
-    """`start_offset_m` is the start relative to the reference's start, NED; `thrust_loss` the
-    missing fraction of the total thrust."""
+    """`hover`: instead of the path of Figs. 5-6. `cost_to_go`: the Riccati solution replaces Q of
+    Eq. 21; for a hover, as no moving reference is what the model itself would do. `start_offset_m`
+    is the start relative to the reference's start, NED; `thrust_loss` the missing fraction of the
+    total thrust."""
 
     settings: PaperSettings
     plant: PlantKind = PlantKind.LINEAR
-    path: PathName = PathName.TOUR
-    law: LawName = LawName.ONE_STEP
+    hover: bool = False
+    cost_to_go: bool = False
     steps: int = 1000
     wind_ned_mps: tuple[float, float, float] = (0.0, 0.0, 0.0)
     thrust_loss: float = 0.0
@@ -166,8 +216,7 @@ class Flight:
     @property
     def times_s(self) -> Array:
         """(K + 1,) from 0."""
-        times: Array = PAPER_STEP_S * np.arange(len(self.states), dtype=np.float64)
-        return times
+        return PAPER_STEP_S * np.arange(float(len(self.states)))
 
     @property
     def errors(self) -> Array:
@@ -186,36 +235,26 @@ class Flight:
 
 def fly(task: FlightTask) -> Flight:
     """Fly `task`; the same task gives the same flight, except for the solve times."""
-    vehicle, settings, (dynamics, control_map) = paper_vehicle(), task.settings, paper_model()
-    nonlinear, to_go = task.plant is PlantKind.NONLINEAR, task.law is LawName.COST_TO_GO
+    settings, nonlinear = task.settings, task.plant is PlantKind.NONLINEAR
     plant = (NonlinearPlant if nonlinear else LinearPlant)(
         np.array(task.wind_ned_mps), task.thrust_loss
     )
-    lower, upper = flyable_box(vehicle, settings) if nonlinear else (None, None)
-    terminal = cost_to_go(settings) if to_go else None
-    law = PaperLaw(dynamics, control_map, settings, lower, upper, terminal, seed=task.seed)
-    exact = ExactMinimum(4)
-    samples, tracked = sampled_path(task.path, task.steps)
-    # What the model itself does as it follows the reference: the cost-to-go needs it
-    consistent = (heading_states if nonlinear else linear_states)(samples, vehicle)
-    nominal = nominal_inputs(consistent, samples, vehicle, nonlinear)
+    lower, upper = flyable_box(paper_vehicle(), settings) if nonlinear else (None, None)
+    terminal = cost_to_go(settings) if task.cost_to_go else None
+    law = PaperLaw(*paper_model(), settings, lower, upper, terminal, seed=task.seed)
+    exact, tracked = ExactMinimum(4), reference_states(task.hover, task.steps)
     state = tracked[0].copy()
     state[X : Z + 1] += task.start_offset_m
-    if to_go:
-        state[:PSI] = consistent[0][:PSI]
     states, inputs, quality = [state], [], []
     for k in range(task.steps):
-        seen, target = _in_axes_of_the_law(state, tracked, samples, k + 1, nonlinear)
-        if to_go:
-            seen, _ = _in_axes_of_the_law(state, tracked, samples, k, nonlinear)
-            target = dynamics @ consistent[k] + control_map @ nominal[k]
+        target = tracked[k + 1]
+        seen, wanted = _in_heading_frame(state, target) if nonlinear else (state, target)
         started = monotonic_s()
         move = law.move(
             seen,
-            target,
+            wanted,
             error=(state - tracked[k])[list(INTEGRATED)],
             heading_rad=state[PSI] if nonlinear else 0.0,
-            nominal=nominal[k] if to_go else None,
         )
         solve_s = monotonic_s() - started
         certificate = certify(move.problem, move.result, exact)
@@ -225,34 +264,27 @@ def fly(task: FlightTask) -> Flight:
         states.append(state)
     flown, applied = np.array(states), np.array(inputs)
     if nonlinear:
-        velocities = flown[:, EULER.velocity, None]
-        flown[:, U : W + 1] = (_rotations(flown) @ velocities)[..., 0]
+        flown[:, U : W + 1] = quaternion_state(flown)[:, QUATERNION.velocity]
     changes = np.diff(applied, axis=0, prepend=0.0)
     signal_costs = applied**2 @ settings.energy + changes**2 @ settings.rate
     costs, *rest = np.array(quality).T
     return Flight(flown, tracked, applied, costs, signal_costs, *rest)
 
 
-def _in_axes_of_the_law(
-    state: Array, tracked: Array, samples: FlatSample, k: int, nonlinear: bool
-) -> tuple[Array, Array]:
-    """State and reference k (12,): unchanged on the linear plant; in the heading frame and
-    relative to sample k on the nonlinear one."""
-    if not nonlinear:
-        return state, tracked[k]
-    rotation, still = _rotations(state), np.zeros(3)
+def _in_heading_frame(state: Array, target: Array) -> tuple[Array, Array]:
+    """State of the nonlinear plant and reference (12,) as `heading_frame` gives them."""
+    rotation = rotation_from_quaternion(quaternion_from_euler(*state[EULER.attitude]))
+    still = np.zeros(3)
     predicted = PredictedState(
         0.0, state[X : Z + 1], rotation @ state[U : W + 1], rotation[:, 2], still,
         float(state[PSI]), 0.0, 0.0, still, state[P : R + 1],
     )  # fmt: skip
-    parts = (getattr(samples, field.name) for field in fields(samples))
-    return heading_frame(predicted, FlatSample(*(part[k] for part in parts)))
-
-
-def _rotations(states: Array) -> Array:
-    """Rotations (..., 3, 3) from the body to NED of states (..., 12)."""
-    angles = np.moveaxis(states[..., EULER.attitude], -1, 0)
-    return rotation_from_quaternion(quaternion_from_euler(*angles))
+    velocity, heading = target[U : W + 1], target[PSI]
+    nothing = np.zeros(())
+    return heading_frame(
+        predicted,
+        FlatSample(target[X : Z + 1], velocity, still, still, still, heading, nothing, nothing),
+    )
 
 
 def cost_to_go(settings: PaperSettings) -> Array:
@@ -264,21 +296,18 @@ def cost_to_go(settings: PaperSettings) -> Array:
     return solution
 
 
+def damped(damping: float, **swarm: float) -> PaperSettings:
+    """The first configuration (section 4.1) with this lambda, and other settings of the swarm."""
+    changes = {"swarm": FIRST.swarm.model_copy(update={"damping": damping, **swarm})}
+    return FIRST.model_copy(update=changes)
+
+
 class Flights:
     """The flights of one run of the study, each flown once; `on_flight` is called before each.
+    `seeds`: flights per row of a table."""
 
-    first: the first configuration (section 4.1) at lambda = 1. seeds: flights per row of a table.
-    """
-
-    def __init__(
-        self,
-        first: PaperSettings | None = None,
-        seeds: int = 1,
-        quick: bool = False,
-        on_flight: Callable[[], None] = lambda: None,
-    ) -> None:
-        self.first = first or PaperSettings.first_configuration()
-        self.seeds, self.quick = seeds, quick
+    def __init__(self, seeds: int = 1, on_flight: Callable[[], None] = lambda: None) -> None:
+        self.seeds = seeds
         self._on_flight = on_flight
         self._flown: dict[FlightTask, Flight] = {}
 
@@ -295,8 +324,3 @@ class Flights:
         """One flight on the path per seed, at most `most`."""
         count = min(self.seeds, most)
         return [self(FlightTask(settings, plant, seed=seed)) for seed in range(count)]
-
-    def damped(self, damping: float, **swarm: float) -> PaperSettings:
-        """The first configuration with this lambda, and other settings of the swarm."""
-        changes = {"swarm": self.first.swarm.model_copy(update={"damping": damping, **swarm})}
-        return self.first.model_copy(update=changes)

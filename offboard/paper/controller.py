@@ -16,7 +16,11 @@ from offboard.control.base import ControllerSettings, Decision, DecisionError, S
 from offboard.control.quadratic import ExactMinimum
 from offboard.control.swarm import certify
 from offboard.model.command import Command, PredictedState
-from offboard.model.frames import wrap_pi
+from offboard.model.frames import (
+    quaternion_from_euler,
+    thrust_direction_from_quaternion,
+    wrap_pi,
+)
 from offboard.model.rigid_body import PHI, PSI, THETA, THRUST, P, R, U, W, X, Z, sampled_matrices
 from offboard.model.vehicle import Vehicle
 from offboard.paper.law import (
@@ -96,9 +100,9 @@ class PaperController:
         thrust = gravity + float(move.inputs[THRUST]) / PAPER_MASS_KG
         phi, theta, psi = move.following[PHI : PSI + 1].tolist()
         heading = target_heading_rad + psi
-        return Command(
-            min(max(thrust, 0.0), limit), _thrust_direction(phi, theta, heading), wrap_pi(heading)
-        )
+        attitude = quaternion_from_euler(phi, theta, heading)
+        north, east, down = thrust_direction_from_quaternion(attitude).tolist()
+        return Command(min(max(thrust, 0.0), limit), (north, east, down), wrap_pi(heading))
 
 
 def input_scale(vehicle: Vehicle) -> Array:
@@ -126,7 +130,8 @@ def heading_frame(state: PredictedState, target: FlatSample) -> tuple[Array, Arr
     valid for every heading. Positions and heading are relative to the target; velocities stay
     absolute because drag acts on them.
     """
-    to_heading = _turn(-state.heading_rad)
+    cosine, sine = math.cos(state.heading_rad), math.sin(state.heading_rad)
+    to_heading = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
     direction = to_heading @ state.thrust_direction_ned
     vector = np.zeros(12)
     vector[PHI] = math.asin(min(max(-direction[1], -1.0), 1.0))
@@ -144,20 +149,3 @@ def _usable(state: PredictedState) -> bool:
     vectors = state.position_ned_m, state.velocity_ned_mps, state.thrust_direction_ned
     numbers = np.concatenate([*vectors, state.rates_frd_radps, [state.heading_rad]])
     return bool(np.isfinite(numbers).all())
-
-
-def _turn(angle_rad: float) -> Array:
-    """Rotation (3, 3) about the vertical."""
-    cosine, sine = math.cos(angle_rad), math.sin(angle_rad)
-    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _thrust_direction(phi: float, theta: float, psi: float) -> tuple[float, float, float]:
-    """Third body axis in NED of the Z-Y-X angles in rad."""
-    along, across = math.sin(theta) * math.cos(phi), -math.sin(phi)
-    cosine, sine = math.cos(psi), math.sin(psi)
-    return (
-        cosine * along - sine * across,
-        sine * along + cosine * across,
-        math.cos(theta) * math.cos(phi),
-    )

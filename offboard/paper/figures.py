@@ -14,8 +14,6 @@ from offboard.analysis.page import (
     BLUE,
     GREY,
     INK,
-    ORANGE,
-    PALETTE,
     RED,
     STYLE,
     Figure,
@@ -26,30 +24,24 @@ from offboard.analysis.page import (
 from offboard.control.quadratic import ExactMinimum
 from offboard.control.swarm import Swarm
 from offboard.model.rigid_body import PSI, U, X
-from offboard.paper.closed_loop import Flight, Flights, FlightTask, PathName, sampled_path
+from offboard.paper import closed_loop
+from offboard.paper.closed_loop import Flights, FlightTask, PlantKind, damped, paper_model
 from offboard.paper.law import PAPER_STEP_S, PaperLaw, PaperSettings
-from offboard.paper.plant import PlantKind, paper_model
 from offboard.paper.printed import BEST_DAMPING, LEAST_DAMPING, TABLE_2, UNDAMPED
-from offboard.paper.tables import (
-    CASES,
-    LAWS,
-    LIMITS,
-    MISS,
-    limited_flights,
-    limited_states,
-    steady_flights,
-)
 
 Array = NDArray[np.float64]
 
-LEAST_GAP = 1e-17  # shown for smaller gaps: they are rounding, and a logarithmic axis has no zero
 MIDWAY = 509  # of 1000 steps
 SHOWN_ITERATIONS = (1, 5, 20, 150)  # Fig. 4 a-d
 UNDAMPED_FLIGHT = "λ = 1, first weights"
 DAMPED_FLIGHT = "λ = 0.65, first weights"
 FINAL_FLIGHT = "λ = 0.65, Eqs. 33-35"
+SETTINGS = {
+    UNDAMPED_FLIGHT: damped(UNDAMPED),
+    DAMPED_FLIGHT: damped(BEST_DAMPING),
+    FINAL_FLIGHT: PaperSettings(),
+}
 
-DASHES = {PlantKind.LINEAR: "solid", PlantKind.NONLINEAR: "dot"}
 _COLOURS = {PlantKind.LINEAR: BLUE, PlantKind.NONLINEAR: RED}
 _CONTROLS, _VELOCITIES, _POSITIONS, _SPREADS = "controls", "u, v, w", "x, y, z, ψ", "ε"
 _PANELS = {
@@ -81,7 +73,7 @@ FLOWN = {
 }  # fmt: skip
 
 
-def search_motion(flights: Flights) -> Figure:
+def search_motion(_: Flights) -> Figure:
     """Fig. 4: the particles in [f_t, tau_x], one row per lambda, four iterations each."""
     dampings = (BEST_DAMPING, UNDAMPED, LEAST_DAMPING)
     titles = [f"λ = {damping:g}, iteration {n}" for damping in dampings for n in SHOWN_ITERATIONS]
@@ -90,7 +82,7 @@ def search_motion(flights: Flights) -> Figure:
         subplot_titles=titles, horizontal_spacing=0.015, vertical_spacing=0.07,
     )  # fmt: skip
     for row, damping in enumerate(dampings, 1):
-        for column, traces in enumerate(_search(flights.damped(damping)), 1):
+        for column, traces in enumerate(_search(damped(damping)), 1):
             drawing.add_traces(traces, rows=row, cols=column)
     drawing.update_layout(
         template=STYLE, height=110 + 240 * len(dampings), showlegend=False,
@@ -106,7 +98,7 @@ def search_motion(flights: Flights) -> Figure:
 def _search(settings: PaperSettings) -> Iterator[list[go.Scatter]]:
     """The search midway along the path of Figs. 5-6, drawn at each of SHOWN_ITERATIONS: the box,
     the particles and the exact optimum."""
-    _, tracked = sampled_path(PathName.TOUR, 1000)
+    tracked = closed_loop.reference_states(hover=False, steps=1000)
     law = PaperLaw(*paper_model(), settings)
     state = tracked[0]
     for following in tracked[1 : MIDWAY + 2]:
@@ -131,7 +123,7 @@ def _search(settings: PaperSettings) -> Iterator[list[go.Scatter]]:
 
 def reference_states(_: Flights) -> Figure:
     """Fig. 5."""
-    tracked = sampled_path(PathName.TOUR, 1000)[1]
+    tracked = closed_loop.reference_states(hover=False, steps=1000)
     drawing = panels(_PANELS[_POSITIONS] + _PANELS[_VELOCITIES], "t, s", panel_px=100)
     columns, times_s = _columns(tracked), PAPER_STEP_S * np.arange(len(tracked))
     for panel, column in enumerate((*columns[_POSITIONS], *columns[_VELOCITIES]), 1):
@@ -143,11 +135,11 @@ def reference_states(_: Flights) -> Figure:
 
 def reference_path(flights: Flights) -> Figure:
     """Fig. 6: the path in space, with the flights by their names."""
-    _, tracked = sampled_path(PathName.TOUR, 1000)
-    settings, drawing = _settings(flights), go.Figure()
+    tracked = closed_loop.reference_states(hover=False, steps=1000)
+    drawing = go.Figure()
     lines = [("reference", tracked, INK, 4)]
     for name, colour in ((DAMPED_FLIGHT, BLUE), (FINAL_FLIGHT, RED)):
-        lines.append((name, flights(FlightTask(settings[name])).states, colour, 3))
+        lines.append((name, flights(FlightTask(SETTINGS[name])).states, colour, 3))
     for name, states, colour, width in lines:
         line = {"color": colour, "width": width}
         drawing.add_scatter3d(**_in_space(states[::4]), mode="lines", name=name, line=line)
@@ -171,19 +163,10 @@ def _in_space(states: Array) -> dict[str, NDArray[np.float32]]:
     return {"x": x, "y": y, "z": z}
 
 
-def _settings(flights: Flights) -> dict[str, PaperSettings]:
-    return {
-        UNDAMPED_FLIGHT: flights.damped(UNDAMPED),
-        DAMPED_FLIGHT: flights.damped(BEST_DAMPING),
-        FINAL_FLIGHT: PaperSettings(),
-    }
-
-
 def flown_figure(number: int, flights: Flights) -> Figure:
     """Figs. 7 to 17, `FLOWN`: the flight on both plants, beside its reference if it has one."""
     name, shown, caption = FLOWN[number]
-    settings = _settings(flights)[name]
-    flown = {plant: flights(FlightTask(settings, plant)) for plant in PlantKind}
+    flown = {plant: flights(FlightTask(SETTINGS[name], plant)) for plant in PlantKind}
     drawing = panels(_PANELS[shown], "t, s", 300 if shown == _SPREADS else 150)
     first = next(iter(flown.values()))
     lines = [(f"{p} plant", f, f.states, _COLOURS[p], "solid") for p, f in flown.items()]
@@ -201,64 +184,3 @@ def flown_figure(number: int, flights: Flights) -> Figure:
 def _columns(states: Array) -> dict[str, list[Array]]:
     positions = [*states[:, X : X + 3].T, np.degrees(states[:, PSI])]
     return {_POSITIONS: positions, _VELOCITIES: [*states[:, U : U + 3].T]}
-
-
-def position_error(
-    drawing: go.Figure, panel: int, flight: Flight, law: str, plant: PlantKind, colour: str,
-    every: int = 1,
-) -> None:  # fmt: skip
-    """Add the position error of every n-th step; not below 1e-9 m, for a logarithmic axis."""
-    errors = np.maximum(flight.position_errors_m[::every], 1e-9)
-    name = f"{law}, {plant}"
-    curve(drawing, panel, flight.times_s[::every], errors, name, colour, DASHES[plant])
-
-
-def gap_by_damping(flights: Flights) -> Figure:
-    """The distance from the exact optimum by lambda, beside epsilon, on the linear plant."""
-    dampings = sorted(TABLE_2)
-    flown = [flights.by_seed(flights.damped(damping)) for damping in dampings]
-    gaps = [np.concatenate([flight.gaps for flight in own]) for own in flown]
-    drawing = panels(("gap to J*", "ε", "missed > 1e-6, %"), "λ")
-    names = {"gap, median": (0.5, BLUE), "gap, 90 %": (0.9, ORANGE), "gap, 99 %": (0.99, RED)}
-    for name, (quantile, colour) in names.items():
-        values = [max(float(np.quantile(gap, quantile)), LEAST_GAP) for gap in gaps]
-        curve(drawing, 1, dampings, values, name, colour, mode="lines+markers")
-    spreads = [np.mean([flight.spreads.mean() for flight in own]) for own in flown]
-    curve(drawing, 2, dampings, spreads, "ε, mean", GREY, "dash", mode="lines+markers")
-    missed = [100 * float(np.mean(gap > MISS)) for gap in gaps]
-    curve(drawing, 3, dampings, missed, "missed, %", INK, mode="lines+markers")
-    for row in (1, 2):
-        drawing.update_yaxes(type="log", row=row)
-    caption = (
-        "ε keeps falling with λ; the gap has its minimum between 0.5 and 0.8. Gaps below 1e-17 are "
-        "drawn as 1e-17."
-    )
-    return Figure("Gap to the exact optimum, by λ", drawing, caption)
-
-
-def integral_figure(flights: Flights) -> Figure:
-    """Position error over time in wind and with weak thrust."""
-    drawing = panels([f"{case}: position error, m" for case in CASES], "t, s", panel_px=240)
-    for (law, case, plant), flight in steady_flights(flights).items():
-        panel, colour = list(CASES).index(case) + 1, PALETTE[list(LAWS).index(law)]
-        position_error(drawing, panel, flight, law, plant, colour, every=5)
-    drawing.update_yaxes(type="log", range=[-6, 1.5])
-    return Figure("Integral term", drawing, "Hover; every flight starts on the reference.")
-
-
-def limits_figure(flights: Flights) -> Figure:
-    """Limited states, with and without limits, and the limits."""
-    shown = {
-        "tilt_rad": "tilt, rad", "tilt_rate_radps": "tilt rate, rad/s",
-        "speed_mps": "speed per axis, m/s",
-    }  # fmt: skip
-    drawing = panels(list(shown.values()), "t, s")
-    for (name, plant), flight in limited_flights(flights).items():
-        reached, colour = limited_states(flight, plant), RED if name == "free" else BLUE
-        for panel, key in enumerate(shown, 1):
-            law = f"{name}, {plant}"
-            curve(drawing, panel, flight.times_s, reached[key], law, colour, DASHES[plant])
-    for panel, key in enumerate(shown, 1):
-        curve(drawing, panel, [0, 100], [getattr(LIMITS, key)] * 2, "limit", INK, "dash")
-    caption = "The limits narrow the box of every search; no cost is added, no limit is exceeded."
-    return Figure("State limits", drawing, caption)

@@ -1,6 +1,6 @@
 """The paper's law on any plant of Eq. 14: settings, and one input u(k) per state and reference.
 
-J(u) = e'Qe + (u_nom - u)'R(u_nom - u) + (u - u(k-1))'R_du(u - u(k-1)),  e = x_ref(k+1) - A x - B u
+J(u) = e'Qe + u'Ru + (u - u(k-1))'R_du(u - u(k-1)),  e = x_ref(k+1) - A x - B u
 
 is Eq. 21, a quadratic in u; the swarm searches its minimum within the bounds of Eq. 22. Two
 extensions that the conclusions propose leave a quadratic in four bounded inputs. Integral term: the
@@ -146,23 +146,20 @@ class PaperLaw:
             if settings.limits
             else None
         )
-        self._extend_reference: Array | None = None
         if settings.integral:
             dynamics, inputs, self._extend_reference = with_error_sum(dynamics, inputs, step_s)
             weight = block_diag(weight, np.diag(settings.integral.weights))
         self._dynamics, self._inputs, self._weight = dynamics, inputs, weight
-        self._energy, self._rate = np.diag(settings.energy), np.diag(settings.rate)
-        curvature = inputs.T @ weight @ inputs + self._energy + self._rate
+        self._rate = np.diag(settings.rate)
+        curvature = inputs.T @ weight @ inputs + np.diag(settings.energy) + self._rate
         self._hessian = curvature + curvature.T
-        self._hover = np.zeros(len(self._lower))
         self.reset()
 
     def reset(self) -> None:
         """Forget the last input and the summed error, and start the random stream anew."""
-        self._previous = self._hover
-        integral = self._settings.integral
-        self._integral = ErrorIntegral(integral, self._step_s) if integral else None
-        self._held = False  # whether the last input was at its bound: the integral waits
+        self._previous = np.zeros(len(self._lower))
+        self._summed = np.zeros(len(INTEGRATED))
+        self._held = False  # whether the last input was at its bound
         self._rng = np.random.default_rng(self._seed)
 
     def move(
@@ -173,56 +170,42 @@ class PaperLaw:
         *,
         error: Array | None = None,
         heading_rad: float = 0.0,
-        nominal: Array | None = None,
     ) -> Move:
         """u(k) for the state x(k) (12,) towards x_ref(k+1) (12,), Eq. 27.
 
         `error` (4,) is the present one of `INTEGRATED`, NED, which is summed where the settings
-        weigh its sum; `heading_rad` is that of the axes of `state`. `nominal` (4,) is u_nom, by
-        default hover; `remaining_s` as in `swarm.minimise`.
+        weigh its sum; `heading_rad` is that of the axes of `state`. `remaining_s` as in
+        `swarm.minimise`.
         """
         bounds = self._limits.narrow(state) if self._limits else (self._lower, self._upper)
         whole = state
-        if self._integral and self._extend_reference is not None:
-            now = np.zeros(len(INTEGRATED)) if error is None else error
-            summed = self._integral.add(now, self._held)
-            whole = np.concatenate([state, along_heading(summed, heading_rad)])
+        if self._settings.integral:
+            self._sum(error, self._settings.integral)
+            whole = np.concatenate([state, along_heading(self._summed, heading_rad)])
             reference_next = self._extend_reference @ reference_next
-        nominal = self._hover if nominal is None else nominal
-        problem = BoxQuadratic(self._hessian, *self._slope(whole, reference_next, nominal), *bounds)
+        problem = BoxQuadratic(self._hessian, *self._slope(whole, reference_next), *bounds)
         result = minimise(self._settings.swarm, problem, self._rng, remaining_s=remaining_s)
         self._previous = result.best
         self._held = at_bound(problem, result.best)
         following = whole @ self._dynamics.T + result.best @ self._inputs.T
         return Move(result.best, following[: len(state)], problem, result)
 
-    def _slope(self, state: Array, reference_next: Array, nominal: Array) -> tuple[Array, float]:
+    def _sum(self, error: Array | None, settings: IntegralSettings) -> None:
+        """Add the error (4,) of this step. While the input is at its bound the sum stops: it could
+        not be acted upon and would have to be unwound later."""
+        if error is not None and not self._held and np.isfinite(error).all():
+            limits = np.array(settings.limits)
+            self._summed = np.clip(self._summed + self._step_s * error, -limits, limits)
+
+    def _slope(self, state: Array, reference_next: Array) -> tuple[Array, float]:
         """Gradient (4,) and constant of Eq. 21 at u = 0. The constant does not move the minimum,
         but its rounding limits epsilon of Eq. 29: only with it is epsilon the paper's."""
-        previous = self._previous
         error = self._dynamics @ state - reference_next
-        weighed = self._weight @ error
-        gradient = self._inputs.T @ weighed - self._energy @ nominal - self._rate @ previous
+        weighed, pull = self._weight @ error, self._rate @ self._previous
+        gradient = 2.0 * (self._inputs.T @ weighed - pull)
         if not self._settings.keep_constant:
-            return 2.0 * gradient, 0.0
-        constant = error @ weighed + nominal @ self._energy @ nominal
-        return 2.0 * gradient, float(constant + previous @ self._rate @ previous)
-
-
-class ErrorIntegral:
-    """xi (4,), summed at each step. While the input is at its bound (`held`) the sum stops: it
-    could not be acted upon and would have to be unwound later."""
-
-    def __init__(self, settings: IntegralSettings, step_s: float) -> None:
-        self._limits, self._step_s = np.array(settings.limits), step_s
-        self.value = np.zeros(len(INTEGRATED))
-
-    def add(self, error: Array, held: bool = False) -> Array:
-        """Add the error (4,) of this step, state minus reference, and return the sum (4,)."""
-        if not held and np.isfinite(error).all():
-            total = self.value + self._step_s * error
-            self.value = np.clip(total, -self._limits, self._limits)
-        return self.value
+            return gradient, 0.0
+        return gradient, float(error @ weighed + self._previous @ pull)
 
 
 def along_heading(summed: Array, heading_rad: float) -> Array:

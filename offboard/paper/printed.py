@@ -1,6 +1,6 @@
 """What the paper prints (doi 10.1117/12.2565129): its tables and Eq. 16, as data.
 
-Numbers as printed, errors included; `errata` lists the errors.
+Numbers as printed, errors included; `tables.errata_table` lists the errors.
 """
 
 from __future__ import annotations
@@ -55,29 +55,11 @@ RATIO_DAMPED: Final[Eight] = (1.0060, 1.0441, 0.6615, 0.8798, 0.8990, 0.7796, 0.
 RATIO_REWEIGHTED: Final[Eight] = (0.0450, 0.0538, 0.6615, 0.0442, 0.0486, 0.0911, 0.0142, 0.0163)
 
 
-class PrintedEntry(NamedTuple):
-    """A non-zero of Eq. 16: printed row (from 1), the state it must be, input, printed value."""
-
-    row: int
-    state: str
-    input: str
-    value: float | None
-
-
-INPUT_NAMES: Final = ("f_t", "tau_x", "tau_y", "tau_z")
 STATE_NAMES: Final = ("phi", "theta", "psi", "p", "q", "r", "u", "v", "w", "x", "y", "z")
-EQ_16: Final = (
-    PrintedEntry(1, "phi", "tau_x", 0.0488),
-    PrintedEntry(2, "p", "tau_x", 0.8992),
-    PrintedEntry(3, "psi", "tau_z", 0.1676),
-    PrintedEntry(4, "r", "tau_z", 3.1531),
-    PrintedEntry(5, "theta", "tau_y", 0.0488),
-    PrintedEntry(6, "q", "tau_y", 0.8992),
-    PrintedEntry(7, "x", "tau_y", -0.0004),
-    PrintedEntry(8, "u", "tau_y", -0.0161),
-    PrintedEntry(9, "v", "tau_x", -0.0161),
-    PrintedEntry(10, "z", "f_t", -0.0120),
-    PrintedEntry(11, "w", "f_t", -0.2350),
-)
-LOST_ENTRY: Final = PrintedEntry(12, "y", "tau_x", None)  # the twelfth row is not printed
-EQ_26_LOWER_THRUST: Final = -4.0
+# The non-zeros of Eq. 16 by the state that each must be of, and the input (f_t, tau_x, tau_y,
+# tau_z: 0 to 3). The rows are printed in this order, not in that of Eq. 5; the twelfth, y, is not
+EQ_16: Final[dict[tuple[str, int], float]] = {
+    ("phi", 1): 0.0488, ("p", 1): 0.8992, ("psi", 3): 0.1676, ("r", 3): 3.1531,
+    ("theta", 2): 0.0488, ("q", 2): 0.8992, ("x", 2): -0.0004, ("u", 2): -0.0161,
+    ("v", 1): -0.0161, ("z", 0): -0.0120, ("w", 0): -0.2350,
+}  # fmt: skip

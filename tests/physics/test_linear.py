@@ -30,7 +30,7 @@ from offboard.model.rigid_body import (
     sampled_matrices,
 )
 from offboard.model.vehicle import Vehicle
-from offboard.paper.plant import follow
+from offboard.paper.closed_loop import follow
 
 # Every non-zero Eq. 16 prints. Its rows are interleaved [phi p psi r theta q x u (y lost) v z w];
 # its v row reads -0.0161, a slip: a roll to the right accelerates to the right.

@@ -25,7 +25,7 @@ from offboard.model.rigid_body import (
     rk4_into,
 )
 from offboard.model.vehicle import Vehicle
-from offboard.paper.plant import follow
+from offboard.paper.closed_loop import follow
 
 Array = NDArray[np.float64]
 

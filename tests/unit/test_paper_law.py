@@ -25,7 +25,7 @@ from offboard.paper.controller import (
     heading_frame,
     input_scale,
 )
-from offboard.paper.law import ErrorIntegral, IntegralSettings, Move
+from offboard.paper.law import IntegralSettings, Move
 from offboard.reference.base import FlatSample
 from offboard.run.configuration import load
 
@@ -222,12 +222,19 @@ def test_a_deadline_is_kept_and_every_decision_has_its_certificate() -> None:
     assert not certificate.at_bound
 
 
-def test_integral_sums_holds_and_stays_within_its_limits() -> None:
-    integral = ErrorIntegral(IntegralSettings(limits=(1.0, 1.0, 1.0, 1.0)), 0.1)
-    np.testing.assert_allclose(integral.add(np.array([1.0, -2.0, 0.0, 0.5])), [0.1, -0.2, 0, 0.05])
-    np.testing.assert_allclose(integral.add(np.ones(4), held=True), [0.1, -0.2, 0, 0.05])
-    np.testing.assert_allclose(integral.add(np.full(4, np.nan)), [0.1, -0.2, 0, 0.05])
-    np.testing.assert_allclose(integral.add(np.array([1e3, -1e3, 0, 0])), [1, -1, 0, 0.05])
+def test_the_summed_error_stays_within_its_limits() -> None:
+    """The sum acts on the slope of the cost; at its limits a further error changes nothing."""
+    narrow = SUMMED.model_copy(update={"limits": (0.1, 0.1, 0.1, 0.1)})
+    settings = PaperSettings(rate=(0, 0, 0, 0), integral=narrow)
+    law = PaperLaw(*sampled_matrices(PAPER, 0.1), settings)
+    slopes = [
+        law.move(np.zeros(12), np.zeros(12), error=np.full(4, error)).problem.gradient
+        for error in (0.05, 0.96, 5.0, np.nan, -0.5)
+    ]
+    assert np.allclose(20 * slopes[0], slopes[1], rtol=1e-9)  # 0.005, then 0.1
+    assert np.array_equal(slopes[1], slopes[2])
+    assert np.array_equal(slopes[2], slopes[3])
+    assert np.allclose(0.5 * slopes[3], slopes[4], rtol=1e-9)  # down to 0.05
 
 
 def test_the_error_is_not_summed_while_an_input_is_at_its_bound() -> None:
