@@ -1,29 +1,41 @@
-"""`offboard campaign`: many flights on the bundled simulator, one table."""
+"""The commands that fly many flights: `offboard campaign`, `compare` and `tune`."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from offboard.cli.shared import Workers, option, out, say
+from offboard.cli.shared import (
+    FLIGHTS,
+    Assignments,
+    Directory,
+    SigningKey,
+    System,
+    Vehicle,
+    Workers,
+    check_new,
+    option,
+    out,
+    say,
+    write_new,
+)
+from offboard.documents import shipped
 from offboard.documents.errors import UserError
 
 if TYPE_CHECKING:
     from offboard.campaign.run import Campaign, Summary
     from offboard.campaign.workers import OpenFlyer
 
-EXIT_CODES = (
-    "Exit codes: 0 all flights are flown and meet `require`, or --worst has found no failure; 1 a "
-    "flight failed; 2 usage or configuration error; 4 flights are missing: the same command goes "
-    "on."
-)
 NAME = typer.Argument(metavar="NAME|FILE", help="Campaign: a shipped name or a file.")
+TUNING = typer.Argument(metavar="NAME|FILE", help="Tuning: a shipped name or a file.")
+NAMES = "Names or files, separated by commas"
+SCENARIOS = "calm,px4_like"
 GROUPS_SHOWN = 30  # of a table in the terminal
 
 
@@ -44,12 +56,15 @@ def campaign(
 ) -> None:
     """Fly many flights and put them into one table.
 
-    DIR gets campaign.csv and campaign.html. A finished flight is
-    on disk at once: the same command continues what was interrupted, and a table does not depend
-    on how it was flown.
+    DIR gets campaign.csv and campaign.html. A finished flight is on disk at once: the same command
+    continues what was interrupted, and a table does not depend on how it was flown.
 
     --worst searches the ranges of `search` for flights with a negative margin, reduces each to the
     fewest changed values, and lists them in worst.csv with the command that flies each again.
+
+    Exit codes: 0 all flights are flown and meet `require`, or --worst has found no failure; 1 a
+    flight failed; 2 usage or configuration error; 4 flights are missing: the same command goes
+    on.
     """
     if worst is not None and (shard or not 1 <= worst <= 100):
         raise UserError("--worst takes 1 .. 100, and no --shard: a search is one whole")
@@ -136,3 +151,129 @@ def _search(flown: Campaign, source: str, count: int, open_workers: OpenFlyer) -
     say(f"written: {flown.directory / 'worst.csv'} and campaign.html")
     if failures:
         raise UserError(f"{len(failures)} kinds of flights break a promise", 1)
+
+
+def compare(
+    controllers: Annotated[str, option("LIST", f"{NAMES}, or 'all'.")] = "pso,lqr,paper",
+    reference: Annotated[str, option("LIST", f"{NAMES}.")] = "lemniscate",
+    scenario: Annotated[str | None, option("LIST", f"{NAMES}.  [default: {SCENARIOS}]")] = None,
+    seeds: Annotated[int, option("N", "Flights of each combination, with seeds 1 .. N.")] = 3,
+    vehicle: Vehicle = None,
+    connect: Annotated[
+        str | None, option("LINK", "Fly the vehicle at this link instead of the simulator.")
+    ] = None,
+    system: System = None,
+    signing_key: SigningKey = None,
+    workers: Workers = None,
+    out_directory: Directory = None,
+    assignments: Assignments = None,
+) -> None:
+    """Fly several controllers and compare them in one table.
+
+    Every controller flies every reference in every scenario with every seed: a campaign whose
+    flights keep their logs. The table has medians and ranges; the directory gets campaign.csv and
+    campaign.html. The same command with --out DIR continues what was interrupted.
+
+    Exit codes: 0 all flights are completed; 1 a flight failed; 2 usage or configuration error;
+    4 flights are missing: the same command with --out DIR goes on.
+    """
+    if connect is None and (system or signing_key):
+        raise UserError("--system and --signing-key are options of --connect: add it")
+    if connect and (scenario or workers):
+        raise UserError("--scenario and --workers are options of the simulator: omit them")
+    if not 1 <= seeds <= 1000:
+        raise UserError(f"--seeds {seeds}: give 1 .. 1000")
+    laws = _names("--controllers", controllers, shipped.names("controller"))
+    references = _names("--reference", reference)
+    scenarios = ["connected"] if connect else _names("--scenario", scenario or SCENARIOS)
+    say(
+        f"controllers: {len(laws)}, references: {len(references)}, scenarios: {len(scenarios)}, "
+        f"seeds: {seeds}"
+    )
+    with out.status("checking that all of them can be flown"):
+        from offboard.campaign.document import CampaignFile
+        from offboard.campaign.run import Campaign
+        from offboard.campaign.workers import ConnectedVehicle, local_workers
+        from offboard.link import clock
+
+        file = CampaignFile(
+            controllers=tuple(laws),
+            references=tuple(references),
+            scenarios=None if connect else tuple(scenarios),
+            vehicles=(vehicle,) if vehicle else None,
+            parameters=dict(map(_parameter, assignments or ())),
+            seeds=seeds,
+            keep=True,
+        )
+        directory = out_directory or FLIGHTS / f"compare-{clock.local_stamp()}"
+        flown = Campaign(file, "compare", directory, link=connect)
+    vehicle_at_link = ConnectedVehicle(system, signing_key)
+    open_flyer: OpenFlyer = (
+        (lambda: nullcontext(vehicle_at_link)) if connect else partial(local_workers, workers)
+    )
+    conclude(flown.fly(open_flyer, out), flown)
+
+
+def _parameter(assignment: str) -> tuple[str, tuple[Any]]:
+    """Key and value of `key.path=value`, as a campaign's parameter. Raises DocumentError."""
+    from offboard.documents.reading import override
+
+    value: Any = override({}, assignment)
+    key = assignment.partition("=")[0]
+    for part in key.split("."):
+        value = value[part.strip()]
+    return key, (value,)
+
+
+def _names(name: str, text: str, known: Sequence[str] = ()) -> list[str]:
+    """Comma-separated names, each once; 'all' stands for every known one."""
+    parts = [part.strip() for part in text.split(",") if part.strip()]
+    if not parts:
+        raise UserError(f"{name} is an empty list of names; give at least one")
+    return list(known) if parts == ["all"] and known else list(dict.fromkeys(parts))
+
+
+def tune(
+    file: Annotated[str, TUNING],
+    profile: Annotated[
+        Path, option("FILE", "Flight configuration to write; a new file.", "-o", "--out")
+    ] = Path("profile.yaml"),
+    workers: Workers = None,
+) -> None:
+    """Tune parameters, and write a configuration that flies better.
+
+    Minimises a figure over training flights, then flies the validation flights with and without
+    the result. It is written only if it is better with 95 % confidence. The flights are in a
+    folder beside it: the same command goes on. The shipped tuning shows all keys of the file.
+
+    Exit codes: 0 a better configuration is written; 1 none is better; 2 usage or configuration
+    error; 4 interrupted: the same command goes on.
+    """
+    check_new(profile, "--out")
+    with out.status("planning"):
+        from offboard.campaign.document import Promises
+        from offboard.campaign.progress import Counter
+        from offboard.campaign.results import Results, code_hash
+        from offboard.campaign.run import Runner
+        from offboard.campaign.tune import Tuning, read_tune
+        from offboard.campaign.tune import profile as text_of
+        from offboard.campaign.workers import local_workers
+
+        tuning = Tuning(*read_tune(file))
+        results = Results(profile.with_suffix(".tune"), code_hash())
+    counter = Counter(out, tuning.flights)
+    with (
+        resumable(),
+        Runner(results, Promises(), partial(local_workers, workers), counter) as runner,
+    ):
+        tuned = tuning.run(
+            runner.fly,
+            lambda number, cost: say(f"{number} of {tuning.file.trials} trials, best {cost:.4g}"),
+        )
+    for key, value in tuned.values:
+        say(f"  {key}: {value:g}")
+    say(f"validation: {tuned.verdict}")
+    if not tuned.verdict.better:
+        raise UserError("not better with 95 % confidence: nothing is written", 1)
+    write_new(profile, text_of(tuning.file, tuned))
+    say(f"written: {profile}")

@@ -7,24 +7,8 @@ from typing import Annotated
 
 import typer
 
-from offboard.cli import (
-    campaign,
-    check,
-    compare,
-    daemon,
-    doctor,
-    export,
-    fly,
-    identify,
-    key,
-    listing,
-    paper,
-    replay,
-    report,
-    score,
-    tune,
-)
-from offboard.cli.shared import EXIT_CODES, out
+from offboard.cli import campaign, daemon, doctor, files, fly, logs, paper
+from offboard.cli.shared import out
 from offboard.documents import shipped
 from offboard.documents.arguments import Command
 
@@ -53,22 +37,22 @@ def offboard(
     """Fly a trajectory over MAVLink with a particle-swarm receding-horizon law, and score it."""
 
 
-# the commands in the order of --help, and what their --help says below the options
-for command, below in (
-    (fly.fly, (shipped.overview(*PARTS, "scenario"), fly.EXIT_CODES)),
-    (daemon.daemon, (shipped.overview(*PARTS), daemon.EXIT_CODES)),
-    (doctor.doctor, (doctor.EXIT_CODES,)),
-    (score.score, (score.EXIT_CODES,)),
-    (report.report, (EXIT_CODES,)),
-    (check.check, (check.EXIT_CODES,)),
-    (identify.identify, (shipped.overview(*PARTS, "scenario"), identify.EXIT_CODES)),
-    (compare.compare, (shipped.overview(*PARTS, "scenario"), compare.EXIT_CODES)),
-    (campaign.campaign, (shipped.overview("campaign"), campaign.EXIT_CODES)),
-    (tune.tune, (shipped.overview("tuning"), tune.EXIT_CODES)),
-    (paper.paper, (paper.EXIT_CODES,)),
-    (replay.replay, (replay.EXIT_CODES,)),
-    (export.export, (EXIT_CODES,)),
-    (key.key, (EXIT_CODES,)),
+# the commands in the order of --help, and the kinds of shipped files that theirs names
+for command, kinds in (
+    (fly.fly, (*PARTS, "scenario")),
+    (daemon.daemon, PARTS),
+    (doctor.doctor, ()),
+    (logs.score, ()),
+    (logs.report, ()),
+    (files.check, ()),
+    (logs.identify, (*PARTS, "scenario")),
+    (campaign.compare, (*PARTS, "scenario")),
+    (campaign.campaign, ("campaign",)),
+    (campaign.tune, ("tuning",)),
+    (paper.paper, ()),
+    (logs.replay, ()),
+    (logs.export, ()),
+    (files.key, ()),
 ):
-    app.command(cls=Command, epilog="\n\n".join(below))(command)
-app.command("list", cls=Command)(listing.list_files)
+    app.command(cls=Command, epilog=shipped.overview(*kinds))(command)
+app.command("list", cls=Command)(files.list_files)

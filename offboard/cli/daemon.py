@@ -27,11 +27,6 @@ from offboard.documents.errors import UserError
 
 STATE = Path("/var/lib/offboard")  # of the unit
 REFUSED = 3
-EXIT_CODES = (
-    "Exit codes: 0 stopped while no vehicle follows it; 2 usage or configuration error, nothing "
-    "sent; 3 cannot begin now (another daemon has the connection, the disk is full), or stopped "
-    "before a take-off; 4 ended before the vehicle was handed back, or left armed."
-)
 OUT = f"Directory of the flights' directories.  [default: {FLIGHTS}]"
 
 
@@ -85,6 +80,10 @@ def daemon(
     (ArduCopter) in the air, and takes the vehicle back by any other mode. Each engagement has a
     directory of its own, as that of `fly`. A ground station may send MAV_CMD_MISSION_START,
     MAV_CMD_DO_PAUSE_CONTINUE and MAV_CMD_DO_SET_MODE (hands back) to component 191.
+
+    Exit codes: 0 stopped while no vehicle follows it; 2 usage or configuration error, nothing
+    sent; 3 cannot begin now (another daemon has the connection, the disk is full), or stopped
+    before a take-off; 4 ended before the vehicle was handed back, or left armed.
     """
     if print_unit:
         options.load()

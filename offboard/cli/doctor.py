@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     from offboard.doctor.run import Row
 
 REFUSED = 3
-EXIT_CODES = (
-    "Exit codes: 0 nothing blocks a flight; 2 usage or configuration error; 3 something blocks."
-)
 
 
 @grouped
@@ -48,6 +45,8 @@ def doctor(
     or sets a parameter. Of an armed vehicle it requests no rates.
 
     Levels: ok; warn; wait, which may clear by itself; blocks, which `offboard fly` refuses, too.
+
+    Exit codes: 0 nothing blocks a flight; 2 usage or configuration error; 3 something blocks.
     """
     from offboard.doctor import run
     from offboard.flight.preflight import Level

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from offboard.cli.score import requirements_of, scored
 from offboard.cli.shared import (
     FLIGHTS,
     Directory,
@@ -23,7 +22,9 @@ from offboard.cli.shared import (
     grouped,
     option,
     out,
+    requirements_of,
     say,
+    scored,
     write,
 )
 from offboard.documents.arguments import LIVE_PAGE
@@ -37,13 +38,6 @@ if TYPE_CHECKING:
 
 INTERRUPTED = "interrupted before anything was sent"
 LABEL_WIDTH = 15
-
-EXIT_CODES = (
-    "Exit codes: 0 flown and all requirements met; 1 a requirement missed; 2 usage or "
-    "configuration error, nothing sent; 3 not flown: no vehicle or connection, refused, or stopped "
-    "on the ground; 4 aborted in flight, or left armed; 130 interrupted before anything was sent; "
-    "141 nobody reads the output."
-)
 
 
 @grouped
@@ -73,6 +67,11 @@ def fly(
     With --json-lines stdout has nothing else. `type` of each object is preparation, announcement (a
     phase or another text), snapshot (once a second of vehicle time; SI, NED, null for what is not
     known) or, as the last one, result.
+
+    Exit codes: 0 flown and all requirements met; 1 a requirement missed; 2 usage or
+    configuration error, nothing sent; 3 not flown: no vehicle or connection, refused, or
+    stopped on the ground; 4 aborted in flight, or left armed; 130 interrupted before anything
+    was sent; 141 nobody reads the output.
     """
     simulated.check(options)
     try:

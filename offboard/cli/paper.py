@@ -8,8 +8,6 @@ import typer
 
 from offboard.cli.shared import FLIGHTS, Directory, err, option, say
 
-EXIT_CODES = "Exit codes: 0 all written; 2 usage error."
-
 
 def paper(
     out_directory: Directory = None,
@@ -20,7 +18,10 @@ def paper(
     figure: Annotated[list[str] | None, option("NAME", "Only this figure; repeatable.")] = None,
     table: Annotated[list[str] | None, option("NAME", "Only this table; repeatable.")] = None,
 ) -> None:
-    """Reproduce tables 2-4 and figures 4-17 of the paper on one page."""
+    """Reproduce tables 2-4 and figures 4-17 of the paper on one page.
+
+    Exit codes: 0 all written; 2 usage error.
+    """
     from offboard.link import clock
     from offboard.paper.study import PAGE, SEEDS, reproduce
 

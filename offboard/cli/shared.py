@@ -25,6 +25,8 @@ from offboard.documents.errors import UserError, shown
 from offboard.link.log import new_file
 
 if TYPE_CHECKING:
+    from offboard.analysis.history import History
+    from offboard.analysis.score import Requirement, Score
     from offboard.run.configuration import FlightConfig
     from offboard.run.flight import Connection, Simulated
 
@@ -41,7 +43,6 @@ err = Console(stderr=True, highlight=False)
 
 DEFAULT_CONNECTION = "udpin:127.0.0.1:14540"
 FLIGHTS = Path("flights")  # parent of the flight directories that have no --out
-EXIT_CODES = "Exit codes: 0 done; 2 usage error, or a file that cannot be read or written."
 
 
 def option(metavar: str, text: str, *names: str, **more: Any) -> Any:
@@ -222,3 +223,31 @@ def write_new(path: Path, text: str) -> None:
     """Write a file that must not exist. It appears when it is complete. Raises UserError."""
     with new_file(path) as file:
         file.write(text.encode())
+
+
+def requirements_of(texts: list[str] | None) -> list[Requirement]:
+    """The requirements of --require. Raises UserError."""
+    from offboard.analysis.score import Requirement
+
+    return [Requirement.parse(text) for text in texts or ()]
+
+
+def scored(flight: Path) -> tuple[Score, History]:
+    """Score a flight and keep the score in its directory. Raises TlogError."""
+    from offboard.analysis.score import score_flight
+
+    result, history = score_flight(flight)
+    keep(flight, result, history)
+    return result, history
+
+
+def keep(flight: Path, result: Score, history: History) -> None:
+    """Write score.json if `flight` is a directory. Where it cannot be written, say so."""
+    from offboard.analysis.score import keep_score
+    from offboard.link.log import LogError
+
+    if flight.is_dir():
+        try:
+            keep_score(flight, result, history)
+        except LogError as error:
+            complain(str(error))

@@ -1,0 +1,95 @@
+"""The commands that read or make files: `offboard check`, `list` and `key`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from offboard.cli.shared import out, say
+from offboard.documents import shipped
+from offboard.documents.errors import DocumentError, UserError
+
+
+def check(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Configuration files.")],
+) -> None:
+    """Check configuration files without flying.
+
+    Accepts flight configurations, vehicles, controllers, scenarios, references (.yaml or .csv),
+    campaigns and tunings. A reference must also be within the limits of the vehicle.
+
+    Exit codes: 0 all files are valid; 2 one is not, or usage error.
+    """
+    problems = []
+    for path in files:
+        try:
+            say(f"{path}: {_checked(path)}, valid", indent=2)
+        except DocumentError as error:
+            problems.append(str(error))
+    if problems:
+        raise UserError("\n".join(problems))
+
+
+def _checked(path: Path) -> str:
+    """Validate a file; what it is. Raises DocumentError."""
+    from offboard.campaign.document import read_campaign
+    from offboard.campaign.tune import read_tune
+    from offboard.documents.reading import kind_of, read
+    from offboard.documents.shipped import read_text
+    from offboard.run.configuration import check_file
+    from offboard.run.sitl import check_scenario
+
+    table = path.suffix.lower() == ".csv"
+    kind = "" if table else kind_of(read(read_text(path), str(path)))
+    if kind == "tuning":
+        read_tune(str(path))
+    elif kind == "campaign":
+        read_campaign(str(path))
+    else:
+        return check_file(path, check_scenario)
+    return kind
+
+
+def list_files() -> None:
+    """List the shipped files by name, with one line each."""
+    from offboard.control import catalogue
+
+    for number, kind in enumerate(shipped.FOLDERS):
+        described = shipped.descriptions(kind)
+        if kind == "controller":
+            for law in catalogue.names():
+                described.setdefault(law, "law of an installed package")
+        width = max(map(len, described))
+        out.print("\n" * (number > 0) + f"{kind}s", style="bold")
+        for name, text in described.items():
+            say(f"  {name:<{width}}  {text}", indent=width + 4)
+
+
+DEFAULT = Path("offboard.key")
+
+
+def key(
+    file: Annotated[Path, typer.Argument(metavar="[FILE]", show_default=False)] = DEFAULT,
+) -> None:
+    """Make a key file for MAVLink signing.
+
+    FILE is offboard.key unless it is named; what is printed says how a vehicle gets the key. The
+    file holds a random passphrase of 64 characters; the key is its SHA-256, as in MAVProxy,
+    QGroundControl and Mission Planner. Only you can read it, and no file is replaced.
+
+    Exit codes: 0 done; 2 usage error, or a file that cannot be read or written.
+    """
+    from offboard.documents.signing_key import create_key
+
+    create_key(file)
+    say(f"{file}: a new signing key, which only you can read. Keep it secret.")
+    say("")
+    say("Set it once on the vehicle, over a cable and disarmed (the passphrase is in the file):")
+    say("  MAVProxy: signing setup PASSPHRASE", indent=4)
+    say("  QGroundControl, Mission Planner: their page on MAVLink signing", indent=4)
+    say("  It needs ArduPilot, or PX4 1.17 or later.", indent=4)
+    say("")
+    say(f"Then: offboard fly --signing-key {file}")
+    say(f"or, without a vehicle: simulator --signing-key {file}")
