@@ -118,23 +118,6 @@ def panels(titles: Sequence[str], x_title: str, panel_px: int = _PANEL_PX) -> go
     return figure
 
 
-def listed(figure: go.Figure, lines: Sequence[tuple[str, bool]], row_px: int, top_px: int) -> None:
-    """Give a figure one row for each of `lines`, from above: its label, which may have HTML, and
-    whether it is the heading of those below."""
-    figure.update_yaxes(
-        tickvals=list(range(len(lines))), ticktext=[label for label, _ in lines],
-        range=[len(lines) - 0.3, -0.7], showgrid=False, zeroline=False, fixedrange=True,
-        showline=False, ticks="", ticklabelstandoff=8,
-    )  # fmt: skip
-    for at, (_, is_heading) in enumerate(lines):
-        if at and is_heading:
-            figure.add_hline(at - 0.5, line={"color": GRID, "width": 1}, col="all", row=1)
-    figure.update_layout(
-        template=STYLE, height=top_px + row_px * len(lines) + 10, showlegend=False,
-        margin={"t": top_px, "b": 10},
-    )  # fmt: skip
-
-
 def without_outliers(values: NDArray[np.float64]) -> list[float] | None:
     """The range of an axis that shows 99 % of the values, where it would flatten them to show all;
     None where it would not."""

@@ -1,16 +1,15 @@
-"""The page of a campaign: success, figures by block, a table, worst flights."""
+"""The page of a campaign: figures by block, a table, worst flights."""
 
 from __future__ import annotations
 
 import html
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from offboard.analysis.page import PALETTE, RED, Figure, coordinates, listed, logarithmic, render
+from offboard.analysis.page import PALETTE, RED, STYLE, Figure, coordinates, logarithmic, render
 from offboard.campaign.table import BEST, ERROR, Group, Row, digits
 
 WORST_SHOWN = 20
@@ -20,23 +19,21 @@ _ROW_PX, _TOP_PX = 22, 120  # _TOP_PX: tool bar, titles and numbers of the axes
 
 # figure of the score, the title of its panel
 PANELS = {
-    "success": "success rate",
     ERROR: "position error<br>RMSE [m]",
     "margin": "margin",
     "tilt_agitation_deg": "excess tilt<br>RMS [deg]",
     "rate_agitation_radps": "excess rates<br>RMS [rad/s]",
 }
-LINEAR = ("success", "margin")
 # of the table
 FIGURES = (
     ERROR, "max_position_m", "margin", "rmse_truth_m", "tilt_agitation_deg",
     "rate_agitation_radps", "rmse_heading_deg",
 )  # fmt: skip
 CAPTION = (
-    "Success: completed, with every requirement met; line: 95 % interval (Wilson). Boxes: "
-    "quartiles over seeds and draws; dots: single flights outside. Margin: the least distance to a "
-    "limit (promises), as a share of it; 0 at a limit, -1 not completed, -2 not flown. Excess: "
-    "motion that the reference does not require of an ideal vehicle. Bold: the best of its block."
+    "Boxes: quartiles over seeds and draws; dots: single flights outside. Margin: the least "
+    "distance to a limit (promises), as a share of it; 0 at a limit, -1 not completed, -2 not "
+    "flown. Excess: motion that the reference does not require of an ideal vehicle. Bold: the best "
+    "of its block."
 )
 
 
@@ -82,22 +79,25 @@ def _figure(groups: Sequence[Group]) -> Figure:
     lines: list[Group | str] = []
     for block, members in itertools.groupby(groups, lambda group: group.block):
         lines += [block, *members]
-    figure = make_subplots(
-        cols=len(PANELS), shared_yaxes=True, horizontal_spacing=0.05,
-        column_widths=[1.0 if name in LINEAR else 1.4 for name in PANELS],
-    )  # fmt: skip
-    placed = [(at, line) for at, line in enumerate(lines) if isinstance(line, Group)]
+    figure = make_subplots(cols=len(PANELS), shared_yaxes=True, horizontal_spacing=0.05)
     names = list(dict.fromkeys(group.name for group in groups))
     for column, (name, title) in enumerate(PANELS.items(), 1):
-        draw = _rate if name == "success" else _box
-        for at, group in placed:
-            colour = PALETTE[names.index(group.name) % len(PALETTE)]
-            figure.add_trace(draw(at, group, name, colour), row=1, col=column)
-        figure.update_xaxes(
-            _axis(groups, name), title_text=title, tickangle=0, side="top", row=1, col=column
-        )
-    headed = [(_label(line), isinstance(line, str)) for line in lines]
-    listed(figure, headed, _ROW_PX, _TOP_PX)
+        for at, group in enumerate(lines):
+            if isinstance(group, Group):
+                colour = PALETTE[names.index(group.name) % len(PALETTE)]
+                figure.add_trace(_box(at, group, name, colour), row=1, col=column)
+        values = [value for group in groups for value in group.values(name)]
+        axis = {"nticks": 4} if name == "margin" else logarithmic(values)
+        figure.update_xaxes(axis, title_text=title, tickangle=0, side="top", row=1, col=column)
+    figure.update_yaxes(
+        tickvals=list(range(len(lines))), ticktext=[_label(line) for line in lines],
+        range=[len(lines) - 0.3, -0.7], showgrid=False, zeroline=False, fixedrange=True,
+        showline=False, ticks="", ticklabelstandoff=8,
+    )  # fmt: skip
+    figure.update_layout(
+        template=STYLE, height=_TOP_PX + _ROW_PX * len(lines) + 10, showlegend=False,
+        margin={"t": _TOP_PX, "b": 10},
+    )  # fmt: skip
     return Figure("Side by side", figure, CAPTION, NARROWEST_PX)
 
 
@@ -108,29 +108,6 @@ def _label(line: Group | str) -> str:
     if line.failed:
         name += f'  <span style="color: {RED}">{line.failed} of {line.flights} failed</span>'
     return f"<b>{name}</b>" if line.best else name
-
-
-def _axis(groups: Sequence[Group], name: str) -> dict[str, Any]:
-    """The axis of a panel; logarithmic for a figure of the score."""
-    if name == "success":
-        return {"range": [-0.03, 1.03], "tickformat": ".0%"}
-    if name == "margin":
-        return {"nticks": 4}
-    return logarithmic([value for group in groups for value in group.values(name)])
-
-
-def _rate(at: int, group: Group, name: str, colour: str) -> go.Scatter:
-    """Success rate with its interval."""
-    low, rate, high = group.spread(name)
-    text = f"{group.name}, {group.block}: {group.successes} of {group.flights}"
-    return go.Scatter(
-        mode="markers", x=coordinates([rate]), y=[at], hoverinfo="text", text=html.escape(text),
-        marker={"color": colour, "size": 9},
-        error_x={
-            "type": "data", "symmetric": False, "thickness": 1.5, "width": 3, "color": colour,
-            "array": coordinates([high - rate]), "arrayminus": coordinates([rate - low]),
-        },
-    )  # fmt: skip
 
 
 def _box(at: int, group: Group, name: str, colour: str) -> go.Box:

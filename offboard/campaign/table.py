@@ -163,10 +163,7 @@ class Group:
         return [r.figures[figure] for r in completed if figure in r.figures]
 
     def spread(self, figure: str) -> tuple[float, float, float]:
-        """Lowest, median and highest value; NaN without values. Of `success`: the rate with its
-        interval."""
-        if figure == "success":
-            return self.low, self.successes / self.flights, self.high
+        """Lowest, median and highest value; NaN without values."""
         values = self.values(figure)
         if not values:
             return math.nan, math.nan, math.nan

@@ -133,7 +133,7 @@ def conclude(summary: Summary, flown: Campaign) -> None:
 
 def _search(flown: Campaign, source: str, count: int, open_workers: OpenFlyer) -> None:
     """Search for failures and print them; exits with 1 if there is one."""
-    from offboard.campaign.progress import Counter
+    from offboard.campaign.run import Counter
     from offboard.campaign.search import FailureSearch
 
     search = FailureSearch(flown, source)
@@ -252,9 +252,8 @@ def tune(
     check_new(profile, "--out")
     with out.status("planning"):
         from offboard.campaign.document import Promises
-        from offboard.campaign.progress import Counter
         from offboard.campaign.results import Results, code_hash
-        from offboard.campaign.run import Runner
+        from offboard.campaign.run import Counter, Runner
         from offboard.campaign.tune import Tuning, read_tune
         from offboard.campaign.tune import profile as text_of
         from offboard.campaign.workers import local_workers

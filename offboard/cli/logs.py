@@ -113,8 +113,7 @@ def replay(flight: Annotated[Path, FLIGHT]) -> None:
     command differs; 2 the log cannot be replayed, or there is nothing to compare.
     """
     from offboard.replay.difference import explained, verdict
-    from offboard.replay.recording import read
-    from offboard.replay.replaying import Replay
+    from offboard.replay.replaying import Replay, read
 
     recording = read(flight)
     if recording.log.damage:
@@ -156,8 +155,7 @@ def export(
     Exit codes: 0 done; 2 usage error, or a file that cannot be read or written.
     """
     from offboard.export.mcap_file import write_mcap
-    from offboard.export.series import read
-    from offboard.export.table import write_csv
+    from offboard.export.series import read, write_csv
     from offboard.export.ulog import write_ulog
 
     check_new(output, "-o")

@@ -1,4 +1,4 @@
-"""Series: a flight as named columns over vehicle time, with the unit in each name.
+"""Series: a flight as named columns over vehicle time, with the unit in each name; and CSV.
 
 The frame is NED, the body's is FRD, quaternions are w, x, y, z from NED to FRD, thrust without a
 unit is normalised.
@@ -6,8 +6,14 @@ unit is normalised.
 
 from __future__ import annotations
 
+import csv
+import heapq
+import io
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +23,7 @@ from offboard.analysis.history import Event, Rows
 from offboard.documents.errors import UserError
 from offboard.flight.phases import PHASE_CODES
 from offboard.flight.record import FIELDS
+from offboard.link.log import new_file
 
 Array = NDArray[np.float64]
 
@@ -47,6 +54,7 @@ _COLUMNS = {
     "heartbeat": ("armed", "system_status"),
 }
 _ARRAYS = {"decision": "records"}  # of History, where they have another name
+EVENT = "event"  # source and column of texts
 PHASE = "decision_phase"  # whose numbers tables show as names
 _PHASES: dict[int, str] = {code: phase.value for phase, code in PHASE_CODES.items()}
 _AUTOPILOTS = {"px4": "PX4", "ardupilot": "ArduPilot"}  # as MAV_AUTOPILOT names them
@@ -103,3 +111,46 @@ def _series(name: str, rows: Rows) -> Series:
     times = ("time_s", "unix_s")
     columns = [rows[column] for column in rows.dtype.names or () if column not in times]
     return Series(name, _COLUMNS[name], rows["time_s"], rows["unix_s"], np.column_stack(columns))
+
+
+def write_csv(flight: Flight, path: Path) -> None:
+    """Write a CSV file, UTF-8, with a line of column names. Raises UserError.
+
+    One row for each sample, in the order of vehicle time. `source` is the name of its series;
+    columns of the other series are empty. Rows with the source `event` have a text in the column
+    `event`.
+    """
+    parts = list(flight.series.values())
+    columns = [column for part in parts for column in part.columns]
+    rows = [_csv_rows(part, columns) for part in parts]
+    blank = [""] * len(columns)
+    events: Iterator[list[Any]] = (
+        [e.time_s, e.unix_s, EVENT, *blank, f"{e.who}: {e.what}"] for e in flight.events
+    )
+    with new_file(path) as file, io.TextIOWrapper(file, "utf-8", newline="") as text:
+        writer = csv.writer(text)
+        writer.writerow(["vehicle_time_s", "unix_time_s", "source", *columns, EVENT])
+        writer.writerows(heapq.merge(*rows, events, key=_time_s))
+
+
+def _csv_rows(series: Series, columns: list[str]) -> Iterator[list[Any]]:
+    """One for each sample, with the columns of all series, in the order of time."""
+    order = np.argsort(series.time_s, kind="stable")
+    before = columns.index(series.columns[0])
+    after = len(columns) - before - len(series.columns) + 1  # and no event
+    for at, unix_s, values in zip(
+        *(each[order].tolist() for each in (series.time_s, series.unix_s, series.values)),
+        strict=True,
+    ):
+        cells = [_cell(*each) for each in zip(series.columns, values, strict=True)]
+        yield [at, unix_s, series.name, *[""] * before, *cells, *[""] * after]
+
+
+def _time_s(row: Any) -> float:
+    return float(row[0])
+
+
+def _cell(column: str, value: float) -> float | str:
+    if math.isnan(value):
+        return ""
+    return phase_name(value) if column == PHASE else value

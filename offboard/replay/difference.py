@@ -14,8 +14,7 @@ import numpy as np
 from offboard.analysis.tlog import layout, name_of
 from offboard.documents.errors import UserError
 from offboard.mavlink.framing import SETPOINTS
-from offboard.replay.recording import Recording
-from offboard.replay.replaying import Replay, Sent, Turn
+from offboard.replay.replaying import Recording, Replay, Sent, Turn
 
 COMMANDS = (75, 76)  # COMMAND_INT, COMMAND_LONG
 # Of a field, relative to its value or to 1: another processor or library rounds differently, by up

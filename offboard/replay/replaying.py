@@ -1,4 +1,6 @@
-"""Replaying: a companion as in the recorded flight, and its turns with the recorded inputs."""
+"""Replaying: what a replay needs of a .tlog (configuration, the inputs of each turn, frames), a
+companion as in the recorded flight, and its turns with the recorded inputs.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +8,12 @@ import math
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
+from offboard.analysis import history, tlog
 from offboard.analysis.history import record_type
-from offboard.analysis.tlog import LoggedMessage
+from offboard.analysis.tlog import LoggedMessage, Tlog
 from offboard.documents.errors import UserError
 from offboard.documents.signing_key import KEY_BYTES
 from offboard.flight import inputs
@@ -17,6 +21,7 @@ from offboard.flight.flight import Flight, Output
 from offboard.flight.inputs import (
     Call,
     Check,
+    Entry,
     FramesDropped,
     InputsError,
     OtherDatagrams,
@@ -27,12 +32,59 @@ from offboard.link.interface import Chunk
 from offboard.mavlink.framing import Frame
 from offboard.mavlink.session import Session
 from offboard.mavlink.signing import Signing
-from offboard.replay.recording import Recording
 from offboard.run.configuration import flown
 from offboard.run.flight import SETTINGS, Prepared, build
 
 CALLS = ("request_stop", "announce", "note_autopilot", "guard")  # methods of the companion
 _OUR_FIRST_SYSTEM = 1  # our system id before a vehicle was found
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """`settings` are those of the session: lockstep, stream, sends_first, capacity_bytes_ps."""
+
+    log: Tlog
+    configuration: str
+    settings: dict[str, object]
+    inputs: tuple[bytes, ...]  # the pieces of `flight.inputs`
+
+    @property
+    def signed(self) -> bool:
+        """Whether the link was signed: then what we sent is, too."""
+        return any(m.frame.signed for m in self.log if m.component_id == COMPONENT_ID)
+
+    def entries(self) -> Iterator[Entry]:
+        """The inputs in order. Raises inputs.InputsError where they are damaged."""
+        return inputs.entries(self.inputs)
+
+
+def read(flight: Path) -> Recording:
+    """The recording in a flight directory or .tlog. Raises UserError or TlogError."""
+    path = tlog.find(flight)
+    log = tlog.read(path)
+    configuration = history.configuration(log)
+    if configuration is None:
+        raise UserError(
+            f"{path} does not hold the configuration of a flight: only logs of offboard can be "
+            "replayed"
+        )
+    recorded = tuple(m.tunnelled for m in log if record_type(m) == inputs.PAYLOAD_TYPE)
+    if not recorded:
+        raise UserError(
+            f"{path} cannot be replayed, only scored and reported: it has no inputs of each turn; "
+            "a flight of `offboard daemon` goes on with what was received before its log begins"
+        )
+    return Recording(log, configuration, _settings(path, recorded), recorded)
+
+
+def _settings(path: Path, recorded: tuple[bytes, ...]) -> dict[str, object]:
+    try:
+        first = next(inputs.entries(recorded), None)
+    except inputs.InputsError as error:
+        raise UserError(f"{path}: the record of the inputs is damaged: {error}") from None
+    if not isinstance(first, Call) or first.name != inputs.SETTINGS:
+        raise UserError(f"{path}: the record of the inputs does not begin with the settings")
+    return dict(first.arguments[0])
 
 
 @dataclass(frozen=True, slots=True)

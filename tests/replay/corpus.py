@@ -33,8 +33,7 @@ from offboard.mavlink.framing import SETPOINTS
 from offboard.mavlink.outgoing import ConfigurationRecord
 from offboard.mavlink.session import Reception, SessionSettings
 from offboard.replay.difference import COMMANDS
-from offboard.replay.recording import Recording, read
-from offboard.replay.replaying import CALLS, Replay, Sent
+from offboard.replay.replaying import CALLS, Recording, Replay, Sent, read
 
 FLIGHTS = Path(__file__).parent / "recordings"
 # Messages that the session decodes or whose rate it counts; the others only fill the log

@@ -25,8 +25,7 @@ from offboard.link.log import entry
 from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.replay.difference import compare, verdict
-from offboard.replay.recording import read
-from offboard.replay.replaying import Replay
+from offboard.replay.replaying import Replay, read
 from offboard.run import configuration
 from offboard.run.configuration import FlightConfig
 

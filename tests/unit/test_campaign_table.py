@@ -21,9 +21,8 @@ from offboard.campaign.campaign_page import FIGURES, page
 from offboard.campaign.cases import Case
 from offboard.campaign.document import CampaignFile, Promises
 from offboard.campaign.flight import LOWEST, Job, terms
-from offboard.campaign.progress import Counter
 from offboard.campaign.results import Record
-from offboard.campaign.run import Campaign
+from offboard.campaign.run import Campaign, Counter
 from offboard.campaign.table import Group, groups, row_of, show
 from offboard.campaign.workers import ConnectedVehicle
 from offboard.cli.commands import app

@@ -16,9 +16,8 @@ from rich.console import Console
 from offboard.campaign.cases import Case
 from offboard.campaign.document import Promises, read_campaign
 from offboard.campaign.flight import Job
-from offboard.campaign.progress import Counter
 from offboard.campaign.results import Record, Results
-from offboard.campaign.run import Campaign, Incomplete, Runner
+from offboard.campaign.run import Campaign, Counter, Incomplete, Runner
 from offboard.campaign.search import Failure, FailureSearch, as_csv
 from offboard.campaign.tune import Tuned, Tuning, judge, profile, read_tune
 from offboard.documents.errors import DocumentError, UserError
