@@ -47,10 +47,7 @@ class PaperControllerSettings(PaperSettings, ControllerSettings):
 
 
 class PaperController:
-    """`PaperLaw` between a predicted state and a command.
-
-    Raises ValueError where the settings' state limits cannot be kept by this vehicle.
-    """
+    """`PaperLaw` between a predicted state and a command."""
 
     def __init__(
         self,

@@ -2,10 +2,10 @@
 
 J(u) = e'Qe + u'Ru + (u - u(k-1))'R_du(u - u(k-1)),  e = x_ref(k+1) - A x - B u
 
-is Eq. 21, a quadratic in u; the swarm searches its minimum within the bounds of Eq. 22. Two
-extensions that the conclusions propose leave a quadratic in four bounded inputs. Integral term: the
-state of Eq. 5 is extended by xi, the tracking error of [x y z psi] summed over time, and xi(k+1) is
-weighted like any other state. State limits: see `LimitedBox`. Knows no vehicle and no autopilot.
+is Eq. 21, a quadratic in u; the swarm searches its minimum within the bounds of Eq. 22. The
+integral term that the conclusions propose leaves a quadratic in four bounded inputs: the state of
+Eq. 5 is extended by xi, the tracking error of [x y z psi] summed over time, and xi(k+1) is weighted
+like any other state. Knows no vehicle and no autopilot.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from scipy.linalg import block_diag
 from offboard.control.quadratic import BoxQuadratic, at_bound
 from offboard.control.swarm import SwarmResult, SwarmSettings, minimise
 from offboard.documents.parameters import Parameters
-from offboard.model.rigid_body import PHI, PSI, THETA, P, Q, R, U, V, W, X, Z
+from offboard.model.rigid_body import PSI, X, Z
 
 Array = NDArray[np.float64]
 Weight = Annotated[float, Field(ge=0)]
@@ -39,10 +39,6 @@ PAPER_INERTIA_KGM2 = (0.0196, 0.0196, 0.0264)  # Table 1
 PAPER_ARM_M = 0.225  # not in Table 1; Eq. 16 is reproduced only with it
 
 INTEGRATED = (X, X + 1, Z, PSI)  # indices in Eq. 5
-_MOVING = [PHI, THETA, P, Q, R, U, V, W]  # in the hover model independent of position and heading
-_LOOK_AHEAD = 80  # steps of the regulator, after which all motion has ended
-_SLIGHT = 1e-9  # of an input's greatest influence on any condition: counts as none
-_REACH = 3.0  # the regulator uses a third of the input bounds at the limit of a state
 
 
 class IntegralSettings(Parameters):
@@ -53,27 +49,6 @@ class IntegralSettings(Parameters):
     limits: tuple[Limit, Limit, Limit, Limit] = (200.0, 200.0, 200.0, 5.0)
 
 
-class StateLimits(Parameters):
-    """Largest magnitudes; None: not limited. Speeds are per axis of the heading frame.
-
-    `margin` is the fraction of every limit that is reserved for errors of the linear model.
-    """
-
-    tilt_rad: Limit | None = None  # phi and theta
-    tilt_rate_radps: Limit | None = None  # p and q
-    yaw_rate_radps: Limit | None = None  # r
-    speed_mps: Limit | None = None  # u and v
-    climb_mps: Limit | None = None  # w
-    margin: float = Field(default=0.0, ge=0, lt=1)
-
-    def per_state(self) -> dict[int, float]:
-        """{index in Eq. 5: largest magnitude}, reduced by the margin."""
-        tilt, rate, speed = self.tilt_rad, self.tilt_rate_radps, self.speed_mps
-        each = (tilt, tilt, rate, rate, self.yaw_rate_radps, speed, speed, self.climb_mps)
-        given = zip(_MOVING, each, strict=True)
-        return {index: (1.0 - self.margin) * limit for index, limit in given if limit is not None}
-
-
 class PaperSettings(Parameters):
     """Weights, bounds and swarm of the paper, by default the final ones (section 4.3).
 
@@ -82,8 +57,8 @@ class PaperSettings(Parameters):
     accelerations, and bounds and weights keep their meaning; f_t is limited further where the total
     thrust would be negative or above the vehicle's maximum.
 
-    `integral` adds the summed position and heading error to the cost, `limits` keeps tilt, rates
-    and speeds within bounds; without them the law is the paper's.
+    `integral` adds the summed position and heading error to the cost; without it the law is the
+    paper's.
     """
 
     fitness: TwelveWeights = (1, 1, 25, 1, 1, 1, 20, 20, 5, 20, 20, 5)  # diag Q, Eq. 33
@@ -93,7 +68,6 @@ class PaperSettings(Parameters):
     upper: Four = (3.942, 0.2, 0.2, 0.1)  # Eq. 26
     keep_constant: bool = True  # the constant of J: its rounding makes epsilon of Eq. 29
     integral: IntegralSettings | None = None
-    limits: StateLimits | None = None
     swarm: SwarmSettings = SwarmSettings()
 
     @classmethod
@@ -122,8 +96,7 @@ class PaperLaw:
 
     Remembers the last input (for R_du), the summed error and the random stream; `reset` forgets
     them. `terminal` (12, 12) replaces diag(Q): with the Riccati solution of the same weights the
-    minimum is optimal over an infinite horizon. Raises ValueError where this plant cannot keep the
-    limits of the settings.
+    minimum is optimal over an infinite horizon.
     """
 
     def __init__(
@@ -141,11 +114,6 @@ class PaperLaw:
         self._lower = np.array(settings.lower if lower is None else lower, np.float64)
         self._upper = np.array(settings.upper if upper is None else upper, np.float64)
         weight = np.diag(settings.fitness) if terminal is None else terminal
-        self._limits = (
-            LimitedBox(dynamics, inputs, settings.limits, self._lower, self._upper)
-            if settings.limits
-            else None
-        )
         if settings.integral:
             dynamics, inputs, self._extend_reference = with_error_sum(dynamics, inputs, step_s)
             weight = block_diag(weight, np.diag(settings.integral.weights))
@@ -177,13 +145,13 @@ class PaperLaw:
         weigh its sum; `heading_rad` is that of the axes of `state`. `remaining_s` as in
         `swarm.minimise`.
         """
-        bounds = self._limits.narrow(state) if self._limits else (self._lower, self._upper)
         whole = state
         if self._settings.integral:
             self._sum(error, self._settings.integral)
             whole = np.concatenate([state, along_heading(self._summed, heading_rad)])
             reference_next = self._extend_reference @ reference_next
-        problem = BoxQuadratic(self._hessian, *self._slope(whole, reference_next), *bounds)
+        slope = self._slope(whole, reference_next)
+        problem = BoxQuadratic(self._hessian, *slope, self._lower, self._upper)
         result = minimise(self._settings.swarm, problem, self._rng, remaining_s=remaining_s)
         self._previous = result.best
         self._held = at_bound(problem, result.best)
@@ -228,61 +196,3 @@ def with_error_sum(dynamics: Array, inputs: Array, step_s: float) -> tuple[Array
     lower = np.hstack([summing @ dynamics, np.eye(count)])
     whole = np.vstack([inputs, summing @ inputs])
     return np.vstack([upper, lower]), whole, np.vstack([np.eye(size), summing])
-
-
-class LimitedBox:
-    """The bounds of Eq. 22, narrowed at each state to inputs after which all limits can be kept.
-
-    An input is allowed only if a linear regulator could stop the vehicle from x(k+1) on within all
-    limits and its own bounds (a maximal output admissible set, Gilbert and Tan 1991), so on the
-    linear model limits once kept are always kept. In the hover model each of these conditions
-    depends on one input only and narrows a bound of Eq. 22.
-
-    dynamics (12, 12), inputs (12, 4): Eq. 14; lower < 0 < upper (4,). Raises ValueError where a
-    condition depends on several inputs.
-    """
-
-    def __init__(
-        self, dynamics: Array, inputs: Array, limits: StateLimits, lower: Array, upper: Array
-    ) -> None:
-        import control  # takes a second: only where something is designed
-
-        a, b = dynamics[np.ix_(_MOVING, _MOVING)], inputs[_MOVING]
-        self._lower, self._upper = lower, upper
-        most = limits.per_state()
-        scale = [most.get(index, 1.0) for index in _MOVING]
-        energy = np.diag(np.square(_REACH / np.minimum(-lower, upper)))
-        self._gain, _, _ = control.dlqr(a, b, np.diag(1.0 / np.square(scale)), energy)
-        limited = np.eye(len(_MOVING))[[_MOVING.index(index) for index in most]]
-        once = np.vstack([limited, -limited, -self._gain, self._gain])
-        ceiling = np.concatenate([[*most.values()] * 2, upper, -lower])
-        # x(k+1) is safe if rows @ x(k+1) <= ceiling, `_LOOK_AHEAD` times
-        closed, rows = a - b @ self._gain, [once]
-        power = np.eye(len(a))
-        for _ in range(_LOOK_AHEAD - 1):
-            power = closed @ power
-            rows.append(once @ power)
-        influence = np.vstack(rows) @ b
-        # Exactly zero where axes do not couple, and nearly zero in late steps of the look-ahead
-        depends = np.abs(influence) > _SLIGHT * np.abs(influence).max(axis=0)
-        if (depends.sum(axis=1) > 1).any():
-            raise ValueError("state limits need axes that do not couple")
-        kept = depends.any(axis=1)
-        self._channel = np.argmax(depends[kept], axis=1)
-        self._slope = influence[kept, self._channel]
-        self._free = np.vstack(rows)[kept] @ a
-        self._ceiling = np.tile(ceiling, _LOOK_AHEAD)[kept]
-
-    def narrow(self, state: Array) -> tuple[Array, Array]:
-        """Lower and upper (4,) at the state x(k) (12,). Where no input keeps the limits (after a
-        gust, or a start outside of them), both are the input of the regulator."""
-        inside = state[_MOVING]
-        edges = (self._ceiling - self._free @ inside) / self._slope
-        lower, upper = self._lower.copy(), self._upper.copy()
-        above = self._slope > 0
-        np.minimum.at(upper, self._channel[above], edges[above])
-        np.maximum.at(lower, self._channel[~above], edges[~above])
-        braking = np.clip(-self._gain @ inside, self._lower, self._upper)
-        empty = lower > upper
-        lower[empty] = upper[empty] = braking[empty]
-        return lower, upper

@@ -37,9 +37,7 @@ SECTIONS: dict[str, dict[str, Callable[[Flights], Table | Figure]]] = {
     "One step compared with longer horizons": {
         "table horizon": extensions.horizon_table, "figure laws": extensions.laws_figure,
     },
-    "Extensions that the conclusions propose": {
-        "table integral": extensions.integral_table, "table limits": extensions.limits_table,
-    },
+    "Integral term, which the conclusions propose": {"table integral": extensions.integral_table},
 }  # fmt: skip
 MAKERS = {label: make for pieces in SECTIONS.values() for label, make in pieces.items()}
 SEEDS, SEEDS_MOST = 20, 10_000
