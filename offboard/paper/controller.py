@@ -60,10 +60,9 @@ class PaperController:
         dynamics, inputs = sampled_matrices(vehicle, step_s)
         lower, upper = flyable_box(vehicle, settings)
         self._vehicle = vehicle
-        self._settings = settings
         self._step_s = step_s
         scaled = inputs * input_scale(vehicle)
-        self._law = PaperLaw(dynamics, scaled, settings, lower, upper, step_s=step_s, seed=seed)
+        self._law = PaperLaw(dynamics, scaled, settings, lower, upper, seed=seed)
         self._exact = ExactMinimum(len(lower))
 
     def decide(self, situation: Situation) -> Decision:
@@ -71,13 +70,7 @@ class PaperController:
         if not _usable(situation.state):
             raise DecisionError("the predicted state is not finite")
         state, reference = heading_frame(situation.state, target)
-        move = self._law.move(
-            state,
-            reference,
-            situation.remaining_s,
-            error=self._error(situation) if self._settings.integral else None,
-            heading_rad=situation.state.heading_rad,
-        )
+        move = self._law.move(state, reference, situation.remaining_s)
         if not math.isfinite(move.result.cost):
             raise DecisionError("the cost of this decision is not finite")
         certificate = certify(move.problem, move.result, self._exact)
@@ -85,12 +78,6 @@ class PaperController:
 
     def reset(self) -> None:
         self._law.reset()
-
-    def _error(self, situation: Situation) -> Array:
-        """The present error (4,) of position (NED) and heading."""
-        state, now = situation.state, situation.reference.sample(situation.state.time_s)
-        heading = wrap_pi(state.heading_rad - float(now.heading_rad))
-        return np.append(state.position_ned_m - now.position_ned_m, heading)
 
     def _command(self, move: Move, target_heading_rad: float) -> Command:
         gravity, limit = self._vehicle.gravity_mps2, self._vehicle.thrust_max_mps2

@@ -2,10 +2,8 @@
 
 J(u) = e'Qe + u'Ru + (u - u(k-1))'R_du(u - u(k-1)),  e = x_ref(k+1) - A x - B u
 
-is Eq. 21, a quadratic in u; the swarm searches its minimum within the bounds of Eq. 22. The
-integral term that the conclusions propose leaves a quadratic in four bounded inputs: the state of
-Eq. 5 is extended by xi, the tracking error of [x y z psi] summed over time, and xi(k+1) is weighted
-like any other state. Knows no vehicle and no autopilot.
+is Eq. 21, a quadratic in u; the swarm searches its minimum within the bounds of Eq. 22. Knows no
+vehicle and no autopilot.
 """
 
 from __future__ import annotations
@@ -17,12 +15,10 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.linalg import block_diag
 
-from offboard.control.quadratic import BoxQuadratic, at_bound
+from offboard.control.quadratic import BoxQuadratic
 from offboard.control.swarm import SwarmResult, SwarmSettings, minimise
 from offboard.documents.parameters import Parameters
-from offboard.model.rigid_body import PSI, X, Z
 
 Array = NDArray[np.float64]
 Weight = Annotated[float, Field(ge=0)]
@@ -38,16 +34,6 @@ PAPER_MASS_KG = 0.4  # Table 1
 PAPER_INERTIA_KGM2 = (0.0196, 0.0196, 0.0264)  # Table 1
 PAPER_ARM_M = 0.225  # not in Table 1; Eq. 16 is reproduced only with it
 
-INTEGRATED = (X, X + 1, Z, PSI)  # indices in Eq. 5
-
-
-class IntegralSettings(Parameters):
-    """`weights` of the squared summed errors of x, y, z (m s) and psi (rad s); each sum is kept
-    within +-`limits`."""
-
-    weights: FourWeights = (80.0, 80.0, 15.0, 0.0)
-    limits: tuple[Limit, Limit, Limit, Limit] = (200.0, 200.0, 200.0, 5.0)
-
 
 class PaperSettings(Parameters):
     """Weights, bounds and swarm of the paper, by default the final ones (section 4.3).
@@ -56,9 +42,6 @@ class PaperSettings(Parameters):
     relative to hover. For another vehicle they are scaled so that the same numbers cause the same
     accelerations, and bounds and weights keep their meaning; f_t is limited further where the total
     thrust would be negative or above the vehicle's maximum.
-
-    `integral` adds the summed position and heading error to the cost; without it the law is the
-    paper's.
     """
 
     fitness: TwelveWeights = (1, 1, 25, 1, 1, 1, 20, 20, 5, 20, 20, 5)  # diag Q, Eq. 33
@@ -67,7 +50,6 @@ class PaperSettings(Parameters):
     lower: Four = (-4.0, -0.2, -0.2, -0.1)  # N, N, N, N m, Eq. 26
     upper: Four = (3.942, 0.2, 0.2, 0.1)  # Eq. 26
     keep_constant: bool = True  # the constant of J: its rounding makes epsilon of Eq. 29
-    integral: IntegralSettings | None = None
     swarm: SwarmSettings = SwarmSettings()
 
     @classmethod
@@ -94,9 +76,9 @@ class Move:
 class PaperLaw:
     """The law on any plant of Eq. 14: dynamics (12, 12), inputs (12, 4), lower and upper (4,).
 
-    Remembers the last input (for R_du), the summed error and the random stream; `reset` forgets
-    them. `terminal` (12, 12) replaces diag(Q): with the Riccati solution of the same weights the
-    minimum is optimal over an infinite horizon.
+    Remembers the last input (for R_du) and the random stream; `reset` forgets them. `terminal`
+    (12, 12) replaces diag(Q): with the Riccati solution of the same weights the minimum is optimal
+    over an infinite horizon.
     """
 
     def __init__(
@@ -107,16 +89,12 @@ class PaperLaw:
         lower: Array | None = None,
         upper: Array | None = None,
         terminal: Array | None = None,
-        step_s: float = PAPER_STEP_S,
         seed: int = 0,
     ) -> None:
-        self._settings, self._seed, self._step_s = settings, seed, step_s
+        self._settings, self._seed = settings, seed
         self._lower = np.array(settings.lower if lower is None else lower, np.float64)
         self._upper = np.array(settings.upper if upper is None else upper, np.float64)
         weight = np.diag(settings.fitness) if terminal is None else terminal
-        if settings.integral:
-            dynamics, inputs, self._extend_reference = with_error_sum(dynamics, inputs, step_s)
-            weight = block_diag(weight, np.diag(settings.integral.weights))
         self._dynamics, self._inputs, self._weight = dynamics, inputs, weight
         self._rate = np.diag(settings.rate)
         curvature = inputs.T @ weight @ inputs + np.diag(settings.energy) + self._rate
@@ -124,10 +102,8 @@ class PaperLaw:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the last input and the summed error, and start the random stream anew."""
+        """Forget the last input, and start the random stream anew."""
         self._previous = np.zeros(len(self._lower))
-        self._summed = np.zeros(len(INTEGRATED))
-        self._held = False  # whether the last input was at its bound
         self._rng = np.random.default_rng(self._seed)
 
     def move(
@@ -135,35 +111,15 @@ class PaperLaw:
         state: Array,
         reference_next: Array,
         remaining_s: Callable[[], float] | None = None,
-        *,
-        error: Array | None = None,
-        heading_rad: float = 0.0,
     ) -> Move:
-        """u(k) for the state x(k) (12,) towards x_ref(k+1) (12,), Eq. 27.
-
-        `error` (4,) is the present one of `INTEGRATED`, NED, which is summed where the settings
-        weigh its sum; `heading_rad` is that of the axes of `state`. `remaining_s` as in
-        `swarm.minimise`.
-        """
-        whole = state
-        if self._settings.integral:
-            self._sum(error, self._settings.integral)
-            whole = np.concatenate([state, along_heading(self._summed, heading_rad)])
-            reference_next = self._extend_reference @ reference_next
-        slope = self._slope(whole, reference_next)
+        """u(k) for the state x(k) (12,) towards x_ref(k+1) (12,), Eq. 27; `remaining_s` as in
+        `swarm.minimise`."""
+        slope = self._slope(state, reference_next)
         problem = BoxQuadratic(self._hessian, *slope, self._lower, self._upper)
         result = minimise(self._settings.swarm, problem, self._rng, remaining_s=remaining_s)
         self._previous = result.best
-        self._held = at_bound(problem, result.best)
-        following = whole @ self._dynamics.T + result.best @ self._inputs.T
-        return Move(result.best, following[: len(state)], problem, result)
-
-    def _sum(self, error: Array | None, settings: IntegralSettings) -> None:
-        """Add the error (4,) of this step. While the input is at its bound the sum stops: it could
-        not be acted upon and would have to be unwound later."""
-        if error is not None and not self._held and np.isfinite(error).all():
-            limits = np.array(settings.limits)
-            self._summed = np.clip(self._summed + self._step_s * error, -limits, limits)
+        following = state @ self._dynamics.T + result.best @ self._inputs.T
+        return Move(result.best, following, problem, result)
 
     def _slope(self, state: Array, reference_next: Array) -> tuple[Array, float]:
         """Gradient (4,) and constant of Eq. 21 at u = 0. The constant does not move the minimum,
@@ -174,25 +130,3 @@ class PaperLaw:
         if not self._settings.keep_constant:
             return gradient, 0.0
         return gradient, float(error @ weighed + self._previous @ pull)
-
-
-def along_heading(summed: Array, heading_rad: float) -> Array:
-    """A sum (4,) in axes along and across the nose; errors are summed in NED, in which a wind is
-    constant."""
-    cosine, sine = np.cos(heading_rad), np.sin(heading_rad)
-    north, east, down, heading = summed
-    return np.array([cosine * north + sine * east, cosine * east - sine * north, down, heading])
-
-
-def with_error_sum(dynamics: Array, inputs: Array, step_s: float) -> tuple[Array, Array, Array]:
-    """A (16, 16) and B (16, 4) of [x, xi] from those of Eq. 14, and E (16, 12) of its reference.
-
-    xi(k+1) = xi(k) + step_s S (x(k+1) - x_ref(k+1)), where S selects `INTEGRATED`; the reference of
-    [x, xi] is E x_ref(k+1).
-    """
-    size, count = len(dynamics), len(INTEGRATED)
-    summing = step_s * np.eye(size)[list(INTEGRATED)]
-    upper = np.hstack([dynamics, np.zeros((size, count))])
-    lower = np.hstack([summing @ dynamics, np.eye(count)])
-    whole = np.vstack([inputs, summing @ inputs])
-    return np.vstack([upper, lower]), whole, np.vstack([np.eye(size), summing])

@@ -16,7 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from offboard.analysis.page import Figure, render
 from offboard.documents.errors import UserError
-from offboard.paper import extensions, figures, tables
+from offboard.paper import figures, horizon, tables
 from offboard.paper.closed_loop import Flights
 from offboard.paper.printed import DOI
 from offboard.paper.tables import Table, shown
@@ -35,9 +35,8 @@ SECTIONS: dict[str, dict[str, Callable[[Flights], Table | Figure]]] = {
     },
     "Errata, with computed evidence": {"table errata": tables.errata_table},
     "One step compared with longer horizons": {
-        "table horizon": extensions.horizon_table, "figure laws": extensions.laws_figure,
+        "table horizon": horizon.horizon_table, "figure laws": horizon.laws_figure,
     },
-    "Integral term, which the conclusions propose": {"table integral": extensions.integral_table},
 }  # fmt: skip
 MAKERS = {label: make for pieces in SECTIONS.values() for label, make in pieces.items()}
 SEEDS, SEEDS_MOST = 20, 10_000

@@ -25,7 +25,7 @@ from offboard.paper.controller import (
     heading_frame,
     input_scale,
 )
-from offboard.paper.law import IntegralSettings, Move
+from offboard.paper.law import Move
 from offboard.reference.base import FlatSample
 
 Array = NDArray[np.float64]
@@ -107,13 +107,9 @@ def test_the_heading_frame_is_eq_5_at_heading_north() -> None:
     assert target == pytest.approx([0] * 6 + [1.0, 0.5, -0.1] + [0] * 3, abs=1e-12)
 
 
-SUMMED = IntegralSettings(weights=(80.0, 80.0, 15.0, 50.0))
-
-
-@pytest.mark.parametrize("settings", [PaperSettings(), PaperSettings(integral=SUMMED)])
-def test_the_law_is_the_same_at_every_heading(settings: PaperSettings) -> None:
-    """Beside the wrap of the heading; with the sum of three decisions, where there is one."""
-    controller, heading = PaperController(PAPER, settings), 3.1
+def test_the_law_is_the_same_at_every_heading() -> None:
+    """Beside the wrap of the heading."""
+    controller, heading = PaperController(PAPER), 3.1
     commands = []
     for seen_from in (0.0, heading):
         controller.reset()
@@ -219,30 +215,3 @@ def test_a_deadline_is_kept_and_every_decision_has_its_certificate() -> None:
     assert certificate.cost == pytest.approx(certificate.optimal_cost, rel=1e-9)
     assert 0 < certificate.spread < 1e-6
     assert not certificate.at_bound
-
-
-def test_the_summed_error_stays_within_its_limits() -> None:
-    """The sum acts on the slope of the cost; at its limits a further error changes nothing."""
-    narrow = SUMMED.model_copy(update={"limits": (0.1, 0.1, 0.1, 0.1)})
-    settings = PaperSettings(rate=(0, 0, 0, 0), integral=narrow)
-    law = PaperLaw(*sampled_matrices(PAPER, 0.1), settings)
-    slopes = [
-        law.move(np.zeros(12), np.zeros(12), error=np.full(4, error)).problem.gradient
-        for error in (0.05, 0.96, 5.0, np.nan, -0.5)
-    ]
-    assert np.allclose(20 * slopes[0], slopes[1], rtol=1e-9)  # 0.005, then 0.1
-    assert np.array_equal(slopes[1], slopes[2])
-    assert np.array_equal(slopes[2], slopes[3])
-    assert np.allclose(0.5 * slopes[3], slopes[4], rtol=1e-9)  # down to 0.05
-
-
-def test_the_error_is_not_summed_while_an_input_is_at_its_bound() -> None:
-    settings = PaperSettings(rate=(0, 0, 0, 0), integral=SUMMED)
-    law = PaperLaw(*sampled_matrices(PAPER, 0.1), settings)
-    for down_m, held in ((1000.0, True), (0.01, False)):
-        law.reset()
-        target = np.zeros(12)
-        target[11] = down_m
-        moves = [law.move(np.zeros(12), target, error=np.full(4, 1e-3)) for _ in range(2)]
-        first, second = (move.problem.gradient for move in moves)
-        assert np.array_equal(first, second) == held

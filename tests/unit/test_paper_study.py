@@ -19,23 +19,19 @@ from scipy.linalg import solve_discrete_are
 
 from offboard.analysis.page import Figure
 from offboard.documents.errors import UserError
-from offboard.paper import closed_loop, extensions, tables
+from offboard.paper import closed_loop, tables
 from offboard.paper.closed_loop import (
     Flight,
     Flights,
     FlightTask,
-    LinearPlant,
-    NonlinearPlant,
     PlantKind,
     damped,
     fly,
     paper_model,
-    paper_vehicle,
 )
-from offboard.paper.extensions import receding
+from offboard.paper.horizon import receding
 from offboard.paper.law import PaperLaw, PaperSettings
 from offboard.paper.study import MAKERS, PAGE, check, reproduce
-from offboard.run.configuration import load
 
 Array = NDArray[np.float64]
 
@@ -119,20 +115,6 @@ def test_cost_to_go_settles_a_hundred_times_closer(plant: PlantKind) -> None:
     assert best < 0.01 * one
 
 
-def test_both_plants_settle_alike_in_wind_and_with_weak_thrust() -> None:
-    """A level vehicle reaches the wind's velocity, and sinks at the rate that its drag allows."""
-    vehicle = paper_vehicle()
-    sink = 0.1 * vehicle.mass_kg * vehicle.gravity_mps2 / vehicle.drag_translation_npmps[2]
-    wind = np.array([1.5, -0.5, 0.2])
-    for kind in (LinearPlant, NonlinearPlant):
-        blown, weak = np.zeros(12), np.zeros(12)
-        for _ in range(200):
-            blown = kind(wind).next_state(blown, np.zeros(4))
-            weak = kind(np.zeros(3), 0.1).next_state(weak, np.zeros(4))
-        np.testing.assert_allclose(blown[6:9], wind, atol=1e-6)
-        assert weak[8] == pytest.approx(sink, rel=1e-6)
-
-
 # ---------------------------------------------------------------- the printed tables
 
 
@@ -173,26 +155,6 @@ def test_reweighting_takes_nearly_all_of_the_error() -> None:
     after = np.mean([flight.errors[-1] for flight in FLIGHTS.by_seed(FINAL)])
     assert after < 0.05 * before  # printed ratio 0.0163
     assert 1e6 < before < 3e7  # printed 5.3519e6
-
-
-# ---------------------------------------------------------------- integral term
-
-
-@pytest.mark.slow
-def test_integral_removes_the_steady_error() -> None:
-    for row in extensions.integral_table(FLIGHTS).rows:
-        if row["law"] == "integral":
-            assert row["steady position error, m"] < 1e-3, row
-        else:  # with the weights alone it stays
-            assert row["steady position error, m"] > 0.1, row
-
-
-def test_flight_and_study_fly_the_same_integral_term() -> None:
-    law = load("paper", choices={"controller": "paper_integral"}).controller
-    assert (law.fitness, law.integral) == (
-        extensions.INTEGRAL.fitness,
-        extensions.INTEGRAL.integral,
-    )
 
 
 # ---------------------------------------------------------------- the run and its page

@@ -1,5 +1,4 @@
-"""Beyond the paper: longer horizons than one step, and the integral term that its conclusions
-propose.
+"""One step compared with longer horizons: closed-loop eigenvalues from the model, and flights.
 
 The law of each objective is linear while no input is at its bound; the slowest eigenvalue of its
 closed loop gives the time an error lasts.
@@ -8,7 +7,6 @@ closed loop gives the time an error lasts.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,23 +21,14 @@ from offboard.paper.closed_loop import (
     cost_to_go,
     paper_model,
 )
-from offboard.paper.law import PAPER_STEP_S, IntegralSettings, PaperSettings
-from offboard.paper.tables import Row, Table
+from offboard.paper.law import PAPER_STEP_S, PaperSettings
+from offboard.paper.tables import Table
 
 Array = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
 LONGEST = 20
 ONE_STEP = "one step, Eqs. 33-35"
-# The time constant of Eq. 33's position weights, 39 s, leaves no bandwidth for an integral
-RAISED = PaperSettings(fitness=(1, 1, 25, 1, 1, 1, 20, 20, 5, 150, 150, 20))
-INTEGRAL = RAISED.model_copy(update={"integral": IntegralSettings()})
-LAWS = {"Eqs. 33-35": PaperSettings(), "position weights raised": RAISED, "integral": INTEGRAL}
-CASES: dict[str, dict[str, Any]] = {
-    "wind 2 m/s N, -1 m/s E": {"wind_ned_mps": (2.0, -1.0, 0.0)},
-    "thrust 10 % weak": {"thrust_loss": 0.1},
-}
-_STEADY_STEPS, _LAST_STEPS = 1500, 100
 
 
 def receding(
@@ -140,32 +129,3 @@ def laws_figure(flights: Flights) -> Figure:
     curve(drawing, 1, times, np.exp(-times / slow_s), name, GREY, "dash")
     drawing.update_yaxes(type="log", range=[-5, 0.7])
     return Figure("One step and cost-to-go, flown", drawing, "Same weights (Eqs. 33-35) and swarm.")
-
-
-# ---------------------------------------------------------------------- integral term
-
-
-def integral_table(flights: Flights) -> Table:
-    """Steady and greatest position errors of a hover of 150 s in wind or with weak thrust."""
-    rows: list[Row] = []
-    for case, disturbance in CASES.items():
-        for plant in PlantKind:
-            for law, settings in LAWS.items():
-                task = FlightTask(settings, plant, hover=True, steps=_STEADY_STEPS, **disturbance)
-                errors_m = flights(task).position_errors_m
-                rows.append(
-                    {
-                        "hover, 150 s": case,
-                        "plant": str(plant),
-                        "law": law,
-                        "steady position error, m": float(errors_m[-_LAST_STEPS:].mean()),
-                        "greatest, m": float(errors_m.max()),
-                    }
-                )
-    return Table(
-        "Integral term",
-        rows,
-        "Flown by the controller paper_integral. With the position weights of Eq. 33 the integral "
-        "would have a time constant of 79 s at best; hence the raised weights, which alone leave "
-        "a steady error.",
-    )
