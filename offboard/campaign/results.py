@@ -96,12 +96,9 @@ class Results:
         except OSError as error:
             with suppress(OSError):
                 incomplete.unlink()
-            raise self._unwritable(error) from None
-
-    def _unwritable(self, error: OSError) -> UserError:
-        return UserError(
-            f"{self.directory} cannot be written ({error.strerror}); finished flights are kept"
-        )
+            raise UserError(
+                f"{self.directory} cannot be written ({error.strerror}); finished flights are kept"
+            ) from None
 
 
 @cache

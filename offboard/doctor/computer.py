@@ -1,5 +1,5 @@
-"""This computer: which other processes have a port or a serial device, where this one runs; and the
-checks of its disk, compiled functions, time of a decision and late waking up.
+"""This computer: which other processes have a port or a serial device; and the checks of its disk,
+compiled functions, time of a decision and late waking up.
 
 Without /proc (macOS) nothing is known of ports, and nothing is said.
 """
@@ -26,10 +26,9 @@ PROC = Path("/proc")
 TABLES = {"udpin": ("udp", "udp6"), "tcpin": ("tcp", "tcp6")}
 # States of a socket that has a port: UDP bound or connected, TCP listening
 STATES = {"udp": ("07", "01"), "tcp": ("0A",)}
-CONTAINER_MARKS = ("/.dockerenv", "/run/.containerenv")
 SLEEPS, SLEEP_S = 40, 0.01
 LEAST_FREE_BYTES = 500_000_000  # four hours of log
-OVERSHOOT_S, CLOCK_STEP_S = 0.02, 0.05
+OVERSHOOT_S = 0.02
 MARGIN = 0.5  # of the deadline
 
 
@@ -44,14 +43,6 @@ def holders(connection: str) -> tuple[str, ...]:
         if kind in TABLES:
             return tuple(_of_port(kind, int(rest.rpartition(":")[2])))
     return ()
-
-
-def surroundings() -> str:
-    """ "WSL", "container", or empty on a machine of its own."""
-    with suppress(OSError):
-        if "microsoft" in (PROC / "version").read_text().lower():
-            return "WSL"
-    return "container" if any(os.path.exists(mark) for mark in CONTAINER_MARKS) else ""
 
 
 def _of_port(kind: str, port: int) -> Iterator[str]:
@@ -118,11 +109,6 @@ def compiled(seen: Observation) -> Iterable[Finding]:
 
 def computer(seen: Observation) -> Iterable[Finding]:
     """Whether this computer decides and wakes up in time."""
-    if seen.clock_step_s > CLOCK_STEP_S:
-        yield warn(
-            f"this computer's clock was set by {seen.clock_step_s:.2f} s while it listened",
-            "let the clock settle (chrony, ntp); logs have wrong times",
-        )
     if not _not_compiled():  # compiling takes longer than the whole check
         yield from _decision(seen.config)
     overshoot_s = max(_sleep() for _ in range(SLEEPS))

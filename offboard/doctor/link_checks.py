@@ -15,14 +15,11 @@ BAUDS = (57600, 115200, 230400, 460800, 921600)
 LOST_SHARE, FULL_SHARE = 0.02, 0.9
 LATE_S, REAL_TIME = 0.25, 0.05
 FOREIGN_TIMES = 3
-ALL_ADDRESSES = "listen on all addresses: --connect udpin:0.0.0.0:PORT"
-BRIDGES = {
-    "": "if it runs elsewhere, " + ALL_ADDRESSES,
-    "WSL": "if it runs on Windows, send to the address that `hostname -I` prints here, and "
-    + ALL_ADDRESSES,
-    "container": "if it runs outside of this container, start it with --network host, or with "
-    "-p PORT:PORT/udp and " + ALL_ADDRESSES,
-}
+ELSEWHERE = (
+    "if it runs elsewhere, listen on all addresses (--connect udpin:0.0.0.0:PORT); into a "
+    "container publish the port (-p PORT:PORT/udp), from Windows send to the address that "
+    "`hostname -I` prints in WSL"
+)
 STARTED = "start the vehicle, or the router before it, and let it send to this port"
 SILENT = {  # by kind of connection: what to do when nothing is heard
     "udpout": "start the vehicle, and check the address",
@@ -87,7 +84,7 @@ def vehicle(seen: Observation) -> Iterable[Finding]:
     else:
         hint = SILENT.get(kind, STARTED)
         if "127.0.0.1" in seen.connection and kind == "udpin":
-            hint += f"; {BRIDGES[seen.surroundings]}"
+            hint += f"; {ELSEWHERE}"
         yield blocks(f"nothing is heard in {heard.listened_s:.0f} s", hint)
 
 

@@ -234,8 +234,7 @@ class Observation:
     """What checks judge: a flight of `config` that is recorded in `directory`, on `connection`.
 
     `link_error`: why this cannot be opened; `holders`: other processes that have its port;
-    `surroundings`: "WSL", "container" or empty; `clock_step_s`: of the wall clock since host time
-    `began_s`, when the check began."""
+    `began_s`: host time when the check began."""
 
     config: FlightConfig
     heard: Listening
@@ -243,8 +242,6 @@ class Observation:
     directory: Path
     link_error: str = ""
     holders: tuple[str, ...] = ()
-    surroundings: str = ""
-    clock_step_s: float = 0.0
     began_s: float = field(default_factory=clock.monotonic_s)
 
     @property

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from offboard.doctor import computer, link_checks, vehicle_checks
-from offboard.doctor.computer import holders, surroundings
+from offboard.doctor.computer import holders
 from offboard.doctor.link_checks import wait
 from offboard.doctor.listening import LONGEST_S, Listening, Observation
 from offboard.documents.errors import UserError, shown
@@ -64,13 +64,8 @@ CHECKS = {
     for check in (*OF_LINK, *OF_VEHICLE, vehicle_checks.configuration, *OF_COMPUTER)
 }
 
-
 GROUP = "pso_offboard.checks"  # entry points of other packages: name and function of a check
 AUTHOR = "report this to whoever wrote the check"
-
-
-class CheckError(UserError):
-    """A check that does not exist."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,12 +101,12 @@ def _installed(point: EntryPoint) -> Check:
 
 
 def names(chosen: Sequence[str] = ()) -> list[str]:
-    """The chosen checks in the order of the table; all if none is. Raises CheckError."""
+    """The chosen checks in the order of the table; all if none is. Raises UserError."""
     known = checks()
     for name in chosen:
         if name not in known:
             listed = ", ".join(known)
-            raise CheckError(f"there is no check named {shown(name)}; known are {listed}")
+            raise UserError(f"there is no check named {shown(name)}; known are {listed}")
     return [name for name in known if not chosen or name in chosen]
 
 
@@ -137,7 +132,7 @@ def observe(
 
     Raises LinkError for an address that is no address, KeyFileError and SigningTimeError.
     """
-    began_s, unix_s = clock.monotonic_s(), clock.monotonic_less_unix_s()
+    began_s = clock.monotonic_s()
     connection, others, error = vehicle.address, holders(vehicle.address), ""
     heard = Listening(began_s, SessionSettings())
     with ExitStack() as stack:
@@ -158,8 +153,6 @@ def observe(
         directory,
         link_error=error,
         holders=others,
-        surroundings=surroundings(),
-        clock_step_s=abs(clock.monotonic_less_unix_s() - unix_s),
         began_s=began_s,
     )
 

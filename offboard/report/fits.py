@@ -51,17 +51,7 @@ def fits(found: Identified, trace: Trace, prior: Vehicle) -> Fits:
     if len(trace.commands) and len(last.position) > 2:
         figures.append(_motion(last, vehicle))
     title = f"Identified from {found.seconds:.1f} s"
-    return Fits(title, list(rows(found)), _noise(trace) if found.seconds else "", figures)
-
-
-def _noise(trace: Trace) -> str:
-    noise = estimator_noise(trace)
-    return (
-        f"Noise of the autopilot's estimate from sample to sample: position "
-        f"{1e3 * noise.position_m:.2g} mm, velocity {1e3 * noise.velocity_mps:.2g} mm/s, attitude "
-        f"{1e3 * noise.attitude_rad:.2g} mrad. Over half a second its velocity and the change of "
-        f"its position differ by {noise.velocity_contradiction_mps:.2g} m/s."
-    )
+    return Fits(title, list(rows(found)), estimator_noise(trace) if found.seconds else "", figures)
 
 
 def _response(

@@ -18,14 +18,12 @@ _SIGNS = {1.0: ("good", "✓"), 0.0: ("bad", "✗")}
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A figure of the score, for each flight as text; `difference` of the last to the first, where
-    there are two."""
+    """A figure of the score, for each flight as text."""
 
     name: str
     meaning: str
     unit: str
     values: tuple[str, ...]
-    difference: str = ""
 
 
 def page(flights: Sequence[Flight], fits: Fits | None = None) -> str:
@@ -69,23 +67,6 @@ def rows(flights: Sequence[Flight]) -> list[Row]:
     for name, meta in METRICS.items():
         values = [score[name] for score in scores]
         if any(math.isfinite(value) for value in values):
-            difference = _difference(values) if len(values) == 2 else ""
-            shown = tuple(_text(value) for value in values)
-            found.append(Row(name, meta["meaning"], meta["unit"], shown, difference))
+            shown = tuple(f"{each:.4g}" if math.isfinite(each) else "–" for each in values)
+            found.append(Row(name, meta["meaning"], meta["unit"], shown))
     return found
-
-
-def _text(value: float) -> str:
-    return f"{value:.4g}" if math.isfinite(value) else "–"
-
-
-def _difference(values: Sequence[float]) -> str:
-    """The second value minus the first, also in percent of it."""
-    first, second = values
-    change = second - first
-    if not math.isfinite(change):
-        return "–"
-    if abs(change) < 1e-9 * abs(first):  # rounding
-        return "0"
-    share = f" ({100 * change / abs(first):+.0f} %)" if first and abs(change / first) < 10 else ""
-    return f"{change:+.3g}{share}" if change else "0"

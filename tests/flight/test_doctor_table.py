@@ -6,7 +6,6 @@ import json
 import re
 import threading
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -75,41 +74,24 @@ def test_report_as_json() -> None:
     assert (finding["level"], good["level"]) == ("warn", "ok")
 
 
-@pytest.mark.parametrize(
-    ("version", "marks", "found", "hint"),
-    [
-        ("Linux version 5.15.90.1-microsoft-standard-WSL2", "none", "WSL", "hostname -I"),
-        ("Linux version 6.1.0", "version", "container", "-p PORT:PORT/udp"),
-        ("Linux version 6.1.0", "none", "", ""),
-    ],
-)
-def test_silence_behind_a_bridge(
-    version: str, marks: str, found: str, hint: str, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    (tmp_path / "version").write_text(version)
-    monkeypatch.setattr(computer, "PROC", tmp_path)
-    monkeypatch.setattr(computer, "CONTAINER_MARKS", (str(tmp_path / marks),))
-    seen = replace(bench(has_vehicle=False).listen(), surroundings=computer.surroundings())
-    assert seen.surroundings == found
-    (finding,) = link_checks.vehicle(seen)
+def test_silence_at_an_address_of_this_computer_alone() -> None:
+    (finding,) = link_checks.vehicle(bench(has_vehicle=False).listen())
     assert finding.level is Level.BLOCKS
-    assert hint in finding.hint
-    assert "--connect udpin:0.0.0.0" in finding.hint
+    for hint in ("--connect udpin:0.0.0.0", "-p PORT:PORT/udp", "hostname -I"):
+        assert hint in finding.hint
 
 
 def test_what_is_wrong_with_this_computer(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A full disk, a clock that was set, a slow decision, and late waking up."""
+    """A full disk, a slow decision, and late waking up."""
     monkeypatch.setattr(computer, "LEAST_FREE_BYTES", 10**18)
     monkeypatch.setattr(computer, "_not_compiled", lambda: 0)
     monkeypatch.setattr(computer, "rehearse", lambda prepared, keeps_deadline: 0.04)
     monkeypatch.setattr(computer, "_sleep", lambda: 0.03)
     heard = Listening(0.0, SessionSettings())
-    seen = Observation(load("flight"), heard, "udpin:127.0.0.1:1", Path(), clock_step_s=0.3)
+    seen = Observation(load("flight"), heard, "udpin:127.0.0.1:1", Path())
     rows = run.examine(["disk", "compiled", "computer"], seen)
     levels = {row.check: [finding.level for finding in row.findings] for row in rows}
-    assert levels == {"disk": [Level.WARN], "compiled": [Level.OK], "computer": [Level.WARN] * 3}
+    assert levels == {"disk": [Level.WARN], "compiled": [Level.OK], "computer": [Level.WARN] * 2}
     found = " ".join(finding.found for finding in rows[-1].findings)
-    assert "set by 0.30 s" in found
     assert "a decision takes 40.0 ms of 50 ms" in found
     assert "wakes up at most 30.0 ms late" in found
