@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import sys
 from contextlib import closing
-from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -30,29 +29,16 @@ REFUSED = 3
 OUT = f"Directory of the flights' directories.  [default: {FLIGHTS}]"
 
 
-class AnchorAt(StrEnum):
-    """Where the reference of an engagement is placed."""
-
-    HERE = "here"
-    ORIGIN = "origin"
-
-
-class ThenDo(StrEnum):
-    """What follows when the reference was flown."""
-
-    HOLD = "hold"
-    LAND = "land"
-    REPEAT = "repeat"
-
-
 @grouped
 def daemon(
     options: FlightOptions,
     anchor: Annotated[
-        AnchorAt,
+        Literal["here", "origin"],
         typer.Option(help="Reference: start where the vehicle stops, or relative to the take-off."),
-    ] = AnchorAt.HERE,
-    then: Annotated[ThenDo, typer.Option(help="After the reference.")] = ThenDo.HOLD,
+    ] = "here",
+    then: Annotated[
+        Literal["hold", "land", "repeat"], typer.Option(help="After the reference.")
+    ] = "hold",
     arms: Annotated[
         bool, typer.Option("--arms", help="May arm and take off when it is asked to start.")
     ] = False,
@@ -102,7 +88,7 @@ def daemon(
                 partial(options.load, seed),
                 options.connection(),
                 out_directory or FLIGHTS,
-                options=ServiceOptions(anchor.value, then.value, arms),
+                options=ServiceOptions(anchor, then, arms),
                 metrics=metrics,
                 report=report,
                 stops=stops,

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import sys
 from dataclasses import asdict
-from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -133,15 +132,9 @@ def replay(flight: Annotated[Path, FLIGHT]) -> None:
     raise UserError(sentence, 1)
 
 
-class Format(str, Enum):  # noqa: UP042 - typer shows the values of a `str`
-    MCAP = "mcap"
-    CSV = "csv"
-    ULOG = "ulog"
-
-
 def export(
     flight: Annotated[Path, FLIGHT],
-    to: Annotated[Format, option("FORMAT", "mcap, csv or ulog.", "--to")],
+    to: Annotated[Literal["mcap", "csv", "ulog"], option("FORMAT", "mcap, csv or ulog.", "--to")],
     output: Annotated[Path, option("FILE", "File to write, a new one.", "-o", "--output")],
 ) -> None:
     """Write a flight in the format of another tool.
@@ -160,7 +153,7 @@ def export(
 
     check_new(output, "-o")
     found = read(flight)
-    write = {Format.MCAP: write_mcap, Format.CSV: write_csv, Format.ULOG: write_ulog}[to]
+    write = {"mcap": write_mcap, "csv": write_csv, "ulog": write_ulog}[to]
     write(found, output)
     if found.damage:
         complain(found.damage)

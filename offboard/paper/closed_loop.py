@@ -44,8 +44,13 @@ from offboard.model.rigid_body import (
     sampled_matrices,
 )
 from offboard.model.vehicle import Vehicle
-from offboard.paper.controller import flyable_box, heading_frame
-from offboard.paper.law import PAPER_STEP_S, PaperLaw, PaperSettings
+from offboard.paper.controller import (
+    PAPER_STEP_S,
+    PaperLaw,
+    PaperSettings,
+    flyable_box,
+    heading_frame,
+)
 from offboard.reference.base import FlatSample
 from offboard.reference.path import Smoothness
 from offboard.reference.shapes import HeadingMode, Hover, Waypoints

@@ -21,7 +21,7 @@ from offboard.paper.closed_loop import (
     cost_to_go,
     paper_model,
 )
-from offboard.paper.law import PAPER_STEP_S, PaperSettings
+from offboard.paper.controller import PAPER_STEP_S, PaperSettings
 from offboard.paper.tables import Table
 
 Array = NDArray[np.float64]

@@ -18,6 +18,7 @@ from offboard.model.command import Command, PredictedState
 from offboard.model.rigid_body import hover_matrices, sampled_matrices
 from offboard.model.vehicle import Vehicle
 from offboard.paper.controller import (
+    Move,
     PaperController,
     PaperLaw,
     PaperSettings,
@@ -25,7 +26,6 @@ from offboard.paper.controller import (
     heading_frame,
     input_scale,
 )
-from offboard.paper.law import Move
 from offboard.reference.base import FlatSample
 
 Array = NDArray[np.float64]

@@ -29,8 +29,8 @@ from offboard.paper.closed_loop import (
     fly,
     paper_model,
 )
+from offboard.paper.controller import PaperLaw, PaperSettings
 from offboard.paper.horizon import receding
-from offboard.paper.law import PaperLaw, PaperSettings
 from offboard.paper.study import MAKERS, PAGE, check, reproduce
 
 Array = NDArray[np.float64]
