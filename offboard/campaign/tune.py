@@ -69,10 +69,11 @@ class TuneFile(Parameters):
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
-    """Mean costs of the same flights with both. `p_value` is that of Wilcoxon's signed-rank test,
-    one-sided."""
+class Tuned:
+    """The best parameters found, and mean costs of the validation flights without and with them.
+    `p_value` is that of Wilcoxon's signed-rank test, one-sided."""
 
+    values: Values
     flights: int
     base: float
     candidate: float
@@ -90,21 +91,13 @@ class Verdict:
         )
 
 
-def judge(base: Sequence[float], candidate: Sequence[float]) -> Verdict:
+def judge(base: Sequence[float], candidate: Sequence[float], values: Values = ()) -> Tuned:
     """Compare costs of paired flights (same scenario, same seed)."""
     before, after = np.asarray(base, float), np.asarray(candidate, float)
     p_value = 1.0
     if np.any(after != before):
         p_value = float(stats.wilcoxon(after, before, alternative="less").pvalue)
-    return Verdict(len(before), float(before.mean()), float(after.mean()), p_value)
-
-
-@dataclass(frozen=True, slots=True)
-class Tuned:
-    """The best parameters found, and the verdict on the validation flights."""
-
-    values: Values
-    verdict: Verdict
+    return Tuned(values, len(before), float(before.mean()), float(after.mean()), p_value)
 
 
 def read_tune(name: str) -> tuple[TuneFile, str]:
@@ -154,7 +147,7 @@ class Tuning:
             best, cost = self._study.best
             progress(number, cost)
         before = self._costs(fly, self._validation, ())
-        return Tuned(best, judge(before, self._costs(fly, self._validation, best)))
+        return judge(before, self._costs(fly, self._validation, best), best)
 
     def _costs(self, fly: Fly, cases: Sequence[Case], values: Values) -> list[float]:
         records = fly([replace(case, values=values) for case in cases])
@@ -202,5 +195,5 @@ def profile(file: TuneFile, tuned: Tuned) -> str:
             raw[part] = read_part(part, raw[part])
     for key, value in tuned.values:
         raw = override(raw, f"{key}={value}")
-    heading = f"# Tuned for {file.objective}: {tuned.verdict}\n"
+    heading = f"# Tuned for {file.objective}: {tuned}\n"
     return heading + yaml.safe_dump(raw, sort_keys=False)

@@ -271,8 +271,8 @@ def tune(
         )
     for key, value in tuned.values:
         say(f"  {key}: {value:g}")
-    say(f"validation: {tuned.verdict}")
-    if not tuned.verdict.better:
+    say(f"validation: {tuned}")
+    if not tuned.better:
         raise UserError("not better with 95 % confidence: nothing is written", 1)
     write_new(profile, text_of(tuning.file, tuned))
     say(f"written: {profile}")

@@ -1,5 +1,5 @@
-"""The listening pass: what is received and what is asked, until enough is known; and `Observation`,
-all that is known then.
+"""The listening pass: who sends, what is received and what is asked, until enough is known; and
+`Observation`, all that is known then.
 
 Sans-I/O: received chunks and host times in, frames out. It only asks: it never sends a setpoint, a
 mode, an arming or a parameter, and no heartbeat: the vehicle may count on one, and says without it
@@ -8,17 +8,22 @@ what it says when no program of ours runs. Its component id is not that of a fli
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from offboard.doctor.senders import Senders
+from pymavlink.dialects.v20.all import mavlink_map
+
+from offboard.documents.arguments import join_address
 from offboard.flight.preflight import FIX_3D, Ground, ParameterReading
 from offboard.flight.vehicle_clock import VehicleClock
 from offboard.flight.vehicle_state import VehicleState
 from offboard.link import clock
 from offboard.link.interface import Chunk
-from offboard.mavlink.dialects.base import Dialect, WantedMessage
+from offboard.mavlink.counters import Counters
+from offboard.mavlink.decode import Identity, decode_identity
+from offboard.mavlink.dialects.base import TYPE_GCS, Dialect, WantedMessage
 from offboard.mavlink.events import (
     Attitude,
     ClockBehind,
@@ -31,7 +36,9 @@ from offboard.mavlink.events import (
     Rebooted,
     TimesyncReply,
 )
+from offboard.mavlink.framing import HEARTBEAT, Frame, FrameSplitter
 from offboard.mavlink.outgoing import CommandLong, Outgoing, Timesync
+from offboard.mavlink.senders import is_vehicle
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.signing import Signing
 from offboard.run.configuration import FlightConfig
@@ -48,6 +55,86 @@ ENOUGH = 0.7  # of a rate, measured over two seconds
 SETTLE_S = 1.0  # until jumps of the vehicle's clock count
 RUN_PREARM_CHECKS = 401  # MAV_CMD
 VERSION, GPS, TIMESYNC = 148, 24, 111  # message ids
+_TIMES = frozenset({2, 111})  # SYSTEM_TIME, TIMESYNC
+_PLACES_MAX, _SENDERS_MAX = 16, 64  # a flood of addresses or ids must not use up the memory
+
+
+@dataclass(slots=True)
+class Sender:
+    """One MAVLink sender. `identity` is that of its HEARTBEAT, None without one; `places` are the
+    addresses that it sends from."""
+
+    system_id: int
+    component_id: int
+    identity: Identity | None = None
+    places: set[str] = field(default_factory=set)
+    frames: int = 0
+    times: int = 0  # TIMESYNC and SYSTEM_TIME
+
+    @property
+    def ids(self) -> tuple[int, int]:
+        return self.system_id, self.component_id
+
+    @property
+    def is_autopilot(self) -> bool:
+        return self.identity is not None and is_vehicle(self.identity)
+
+    @property
+    def name(self) -> str:
+        is_gcs = self.identity is not None and self.identity.vehicle_type == TYPE_GCS
+        kind = "autopilot" if self.is_autopilot else "ground station" if is_gcs else "component"
+        return f"{kind} {self.system_id}/{self.component_id}"
+
+
+class Senders:
+    """Counts the frames of all senders, also of those that the session drops. `stream`: bytes
+    arrive in any portions."""
+
+    def __init__(self, stream: bool) -> None:
+        self._stream = stream
+        self._splitters: dict[Hashable, FrameSplitter] = {}
+        self._senders: dict[tuple[int, int], Sender] = {}
+        self._sequences: dict[tuple[int, ...], int] = {}
+        self._lost: Counter[tuple[int, ...]] = Counter()  # by sender, and by system
+        self.counters = Counters()
+        self.message_bytes: Counter[str] = Counter()
+
+    def receive(self, data: bytes, place: Hashable) -> None:
+        """Count the frames in `data`, which came from `place`."""
+        if place not in self._splitters and len(self._splitters) >= _PLACES_MAX:
+            place = None
+        splitter = self._splitters.get(place)
+        if splitter is None:
+            splitter = self._splitters[place] = FrameSplitter(self._stream, self.counters)
+        for frame in splitter.split(data):
+            self._count(frame, place)
+
+    def _count(self, frame: Frame, place: Hashable) -> None:
+        ids = frame.system_id, frame.component_id
+        if ids not in self._senders and len(self._senders) >= _SENDERS_MAX:
+            return
+        sender = self._senders.setdefault(ids, Sender(*ids))
+        message = mavlink_map.get(frame.message_id)
+        self.message_bytes[message.msgname if message else str(frame.message_id)] += len(frame.raw)
+        sender.frames += 1
+        sender.places.add(join_address(*place[:2]) if isinstance(place, tuple) else str(place))
+        sender.times += frame.message_id in _TIMES
+        if frame.message_id == HEARTBEAT:
+            sender.identity = decode_identity(frame.payload)
+        for key in (ids, ids[:1]):
+            gap = (frame.sequence - self._sequences.get(key, frame.sequence - 1) - 1) % 256
+            self._lost[key] += gap if gap < 128 else 0  # more: out of order
+            self._sequences[key] = frame.sequence
+
+    def lost(self, sender: Sender) -> int:
+        """Frames of a sender that are missing by the gaps of its sequence numbers. Components that
+        share a link of an autopilot may share its sequence numbers."""
+        return min(self._lost[sender.ids], self._lost[sender.ids[:1]])
+
+    @property
+    def found(self) -> list[Sender]:
+        """All senders, the most talkative first."""
+        return sorted(self._senders.values(), key=lambda sender: -sender.frames)
 
 
 class Listening:

@@ -89,15 +89,16 @@ def checks() -> dict[str, Check]:
 def _installed(point: EntryPoint) -> Check:
     """A check of another package; one that cannot be imported fails when it is asked."""
 
-    def check(seen: Observation) -> Iterable[Finding]:
-        found: Iterable[Finding] = point.load()(seen)
-        return found
-
     try:
-        check.__doc__ = inspect.getdoc(point.load())
-    except Exception:  # whatever another package raises while it is imported
-        check.__doc__ = f"cannot be imported from {point.value}"
-    return check
+        loaded: Check = point.load()
+    except Exception as error:  # whatever another package raises while it is imported
+        failure = error
+
+        def loaded(_: Observation) -> Iterable[Finding]:
+            raise failure
+
+        loaded.__doc__ = f"cannot be imported from {point.value}"
+    return loaded
 
 
 def names(chosen: Sequence[str] = ()) -> list[str]:

@@ -29,7 +29,6 @@ from offboard.analysis.page import (
     Figure,
     coordinates,
     curve,
-    logarithmic,
     panels,
     without_outliers,
 )
@@ -161,7 +160,7 @@ def _timeline(drawn: Sequence[DrawnFlight]) -> Figure | None:
     return Figure("Timeline", figure, "Point at a band or a mark to read its text.")
 
 
-def _add_bands(figure: go.Figure, row: str, bands: Sequence[timeline.Band], zero_s: float) -> None:
+def _add_bands(figure: go.Figure, row: str, bands: Sequence[timeline.Entry], zero_s: float) -> None:
     if not bands:
         return
     figure.add_trace(
@@ -178,15 +177,15 @@ def _add_bands(figure: go.Figure, row: str, bands: Sequence[timeline.Band], zero
     )  # fmt: skip
 
 
-def _add_marks(figure: go.Figure, row: str, marks: Sequence[timeline.Mark], zero_s: float) -> None:
+def _add_marks(figure: go.Figure, row: str, marks: Sequence[timeline.Entry], zero_s: float) -> None:
     if not marks:
         return
     failsafe = row.endswith("failsafe")
     figure.add_trace(
         go.Scatter(
-            cliponaxis=False, mode="markers", x=[round(mark.time_s - zero_s, 3) for mark in marks],
+            cliponaxis=False, mode="markers", x=[round(mark.begin_s - zero_s, 3) for mark in marks],
             y=[row] * len(marks), hoverinfo="text",
-            hovertext=[html.escape(f"{mark.time_s:.2f} s: {mark.text}") for mark in marks],
+            hovertext=[html.escape(f"{mark.begin_s:.2f} s: {mark.text}") for mark in marks],
             marker={
                 "size": 11 if failsafe else 8, "color": RED if failsafe else PURPLE,
                 "symbol": "triangle-down" if failsafe else "circle-open", "line": {"width": 2},
@@ -212,7 +211,7 @@ def _panels(title: str, group: Sequence[Panel], drawn: Sequence[DrawnFlight]) ->
         values = np.concatenate([samples[1] for _, _, samples in curves])
         captions += [panel.caption] if panel.caption else []
         if panel.logarithmic:
-            figure.update_yaxes(logarithmic(values), row=place)
+            figure.update_yaxes(type="log", nticks=4, row=place)
         elif inner := without_outliers(values):
             figure.update_yaxes(range=inner, row=place)
             cut = True

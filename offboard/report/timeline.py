@@ -19,39 +19,35 @@ _STEPS = {phase.value for phase in (*_ENDED_EARLY, Phase.LAND)}
 
 
 @dataclass(frozen=True, slots=True)
-class Band:
+class Entry:
+    """A band from `begin_s` to `end_s` with a label, or a mark at `begin_s`; `text` in full."""
+
     row: str
     begin_s: float
-    end_s: float
-    label: str
-    text: str  # in full
-    colour: str
-
-
-@dataclass(frozen=True, slots=True)
-class Mark:
-    row: str
-    time_s: float
     text: str
+    end_s: float = math.nan
+    label: str = ""
+    colour: str = ""
 
 
-def bands(flight: Flight) -> list[Band]:
+def bands(flight: Flight) -> list[Entry]:
     """Phases of offboard, and modes of the vehicle; the mode of its setpoints is blue."""
     found = [
-        Band("phase", begin_s, end_s, event.phase, event.what, _colour(event.phase))
+        Entry("phase", begin_s, event.what, end_s, event.phase, _colour(event.phase))
         for event, begin_s, end_s in _spans(flight.history.phases, flight)
     ]
     for event, begin_s, end_s in _spans(flight.history.modes, flight):
         colour = BLUE_BAND if event.what == flight.engage_mode else GREY_BAND
-        found.append(Band("mode", begin_s, end_s, event.what, f"mode {event.what}", colour))
+        text = f"mode {event.what}"
+        found.append(Entry("mode", begin_s, text, end_s, event.what, colour))
     return found
 
 
-def marks(flight: Flight) -> list[Mark]:
+def marks(flight: Flight) -> list[Entry]:
     """Steps of the failsafe, and texts of both sides."""
     flown = flight.history
     found = [
-        Mark("failsafe", event.time_s, event.what)
+        Entry("failsafe", event.time_s, event.what)
         for before, event in pairwise(flown.phases)
         if event.phase in _STEPS and (before.phase, event.phase) not in _REGULAR
     ]
@@ -61,11 +57,11 @@ def marks(flight: Flight) -> list[Mark]:
             flag.name.lower().replace("_", " ") for flag in Refusal(int(refused[row])) if flag.name
         )
         found.append(
-            Mark("failsafe", float(flown.records["time_s"][row]), f"setpoint not sent: {why}")
+            Entry("failsafe", float(flown.records["time_s"][row]), f"setpoint not sent: {why}")
         )
     texts = (*flown.announcements, *flown.vehicle_messages)
-    found += [Mark("texts", event.time_s, f"{event.who}: {event.what}") for event in texts]
-    return [mark for mark in found if math.isfinite(mark.time_s)]
+    found += [Entry("texts", event.time_s, f"{event.who}: {event.what}") for event in texts]
+    return [mark for mark in found if math.isfinite(mark.begin_s)]
 
 
 def _spans(events: Sequence[Event], flight: Flight) -> list[tuple[Event, float, float]]:

@@ -168,8 +168,8 @@ def test_the_minimum_is_found_and_confirmed_and_its_profile_is_a_configuration(
 ) -> None:
     found, tuning = whole
     assert dict(found.values)[BANDWIDTH] == pytest.approx(4.0, abs=1.0)
-    assert found.verdict.flights == 12
-    assert found.verdict.better, str(found.verdict)
+    assert found.flights == 12
+    assert found.better, str(found)
     file = tmp_path / "profile.yaml"
     file.write_text(profile(read_tune(str(tuning))[0], found))
     config = load(str(file), known_vehicle="px4_sih").model_dump()
@@ -180,7 +180,7 @@ def test_the_minimum_is_found_and_confirmed_and_its_profile_is_a_configuration(
 
 
 def test_what_is_better_only_in_training_is_refused(tmp_path: Path) -> None:
-    assert not tuned(tmp_path / "t", record=lambda case: bowl(case, 0.5)).verdict.better
+    assert not tuned(tmp_path / "t", record=lambda case: bowl(case, 0.5)).better
 
 
 def test_an_interrupted_tuning_goes_on_and_finds_the_same(
