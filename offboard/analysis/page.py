@@ -8,7 +8,8 @@ and draw figures and notes with the macros of "parts.html". Values are escaped.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,7 +37,10 @@ DARK = {
 }  # fmt: skip
 
 _TOP_PX, _BOTTOM_PX, _PANEL_PX, _GAP_PX = 48, 90, 150, 36
+_FEW_DECADES = 2  # of a logarithmic axis with ticks at 2 and 5
+_MOST_DECADES = 3  # of one with a tick at each
 _FEW_VALUES, _FLATTENED = 50, 4.0  # of `without_outliers`
+_MARGIN = 0.02  # of its decades, beside its outermost ticks
 _AXIS = {
     "gridcolor": GRID, "zerolinecolor": GRID, "linecolor": GREY, "showline": True,
     "ticks": "outside", "tickcolor": GREY, "automargin": True, "exponentformat": "power",
@@ -125,6 +129,24 @@ def without_outliers(values: NDArray[np.float64]) -> list[float] | None:
     if np.ptp(known) <= _FLATTENED * span or not span:
         return None
     return [low - 0.1 * span, high + 0.1 * span]
+
+
+def logarithmic(values: Iterable[float]) -> dict[str, Any]:
+    """A logarithmic axis around the positive values. Up to two decades have ticks at 1, 2 and 5;
+    more decades have about three, at powers of ten."""
+    known = [value for value in values if 0.0 < value < math.inf]
+    least, greatest = min(known, default=1.0), max(known, default=1.0)
+    low, high = math.floor(math.log10(least)), math.ceil(math.log10(greatest))
+    steps = (1, 2, 5) if high - low <= _FEW_DECADES else (1,)
+    ticks = [float(f"{step}e{power}") for power in range(low, high + 1) for step in steps]
+    first = max((at for at in ticks if at <= least), default=ticks[0])
+    last = min((at for at in ticks if at >= greatest), default=ticks[-1])
+    margin = _MARGIN * (1 + high - low)
+    shown = ticks[:: math.ceil((high - low) / _MOST_DECADES) or 1]
+    return {
+        "type": "log", "tickvals": shown, "ticktext": [f"{at:g}" for at in shown],
+        "range": [math.log10(first) - margin, math.log10(last) + margin],
+    }  # fmt: skip
 
 
 def curve(

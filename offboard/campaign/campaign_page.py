@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from offboard.analysis.page import PALETTE, RED, STYLE, Figure, coordinates, render
+from offboard.analysis.page import PALETTE, RED, STYLE, Figure, coordinates, logarithmic, render
 from offboard.campaign.table import BEST, ERROR, Group, Row, digits
 
 WORST_SHOWN = 20
@@ -86,10 +86,9 @@ def _figure(groups: Sequence[Group]) -> Figure:
             if isinstance(group, Group):
                 colour = PALETTE[names.index(group.name) % len(PALETTE)]
                 figure.add_trace(_box(at, group, name, colour), row=1, col=column)
-        kind = "linear" if name == "margin" else "log"
-        figure.update_xaxes(
-            type=kind, nticks=4, title_text=title, tickangle=0, side="top", row=1, col=column
-        )
+        values = [value for group in groups for value in group.values(name)]
+        axis = {"nticks": 4} if name == "margin" else logarithmic(values)
+        figure.update_xaxes(axis, title_text=title, tickangle=0, side="top", row=1, col=column)
     figure.update_yaxes(
         tickvals=list(range(len(lines))), ticktext=[_label(line) for line in lines],
         range=[len(lines) - 0.3, -0.7], showgrid=False, zeroline=False, fixedrange=True,

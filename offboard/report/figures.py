@@ -29,6 +29,7 @@ from offboard.analysis.page import (
     Figure,
     coordinates,
     curve,
+    logarithmic,
     panels,
     without_outliers,
 )
@@ -211,7 +212,7 @@ def _panels(title: str, group: Sequence[Panel], drawn: Sequence[DrawnFlight]) ->
         values = np.concatenate([samples[1] for _, _, samples in curves])
         captions += [panel.caption] if panel.caption else []
         if panel.logarithmic:
-            figure.update_yaxes(type="log", nticks=4, row=place)
+            figure.update_yaxes(logarithmic(values), row=place)
         elif inner := without_outliers(values):
             figure.update_yaxes(range=inner, row=place)
             cut = True

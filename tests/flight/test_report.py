@@ -18,6 +18,7 @@ from pair import Pair, hover, in_phase
 from typer.testing import CliRunner
 
 from offboard.analysis import tlog
+from offboard.analysis.page import logarithmic
 from offboard.analysis.score import Score
 from offboard.cli.commands import app
 from offboard.flight.phases import Phase
@@ -225,6 +226,15 @@ def test_thinning_keeps_peaks_and_gaps(values: list[float], bins: int) -> None:
         assert np.nanmax(array[kept]) == known.max()
         assert np.nanmin(array[kept]) == known.min()
     assert np.isnan(array[kept]).any() == (len(known) < len(array))
+
+
+@given(st.lists(st.floats(1e-16, 1e6) | st.just(math.nan) | st.just(0.0), max_size=20))
+def test_a_logarithmic_axis_holds_all_values_and_has_few_ticks(values: list[float]) -> None:
+    axis = logarithmic(values)
+    low, high = axis["range"]
+    assert all(low < math.log10(value) < high for value in values if value > 0.0)
+    assert 1 <= sum(low < math.log10(at) < high for at in axis["tickvals"]) <= 9
+    assert len(axis["tickvals"]) <= (9 if high - low < 2.2 else 5)
 
 
 def invoke(*arguments: object) -> tuple[int, str]:
