@@ -10,7 +10,7 @@ import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
 from offboard.analysis.page import PALETTE, RED, STYLE, Figure, coordinates, logarithmic, render
-from offboard.campaign.table import BEST, ERROR, Group, Row, digits
+from offboard.campaign.table import BEST, CASE_COLUMNS, ERROR, Group, Row, digits
 
 WORST_SHOWN = 20
 NARROWEST_PX = 960
@@ -65,13 +65,9 @@ def page(
 
 def described(row: Row) -> str:
     """What a flight was: names, values, seed."""
-    case = row.case
-    names = (
-        case.controller, case.reference, case.scenario, case.vehicle, case.sim_vehicle,
-        case.firmware,
-    )  # fmt: skip
-    words = [name for name in names if name] + [f"{key}={value}" for key, value in case.values]
-    return ", ".join([*words, f"seed {case.seed}"])
+    names = [name for column in CASE_COLUMNS if (name := getattr(row.case, column))]
+    values = [f"{key}={value}" for key, value in row.case.values]
+    return ", ".join([*names, *values, f"seed {row.case.seed}"])
 
 
 def _figure(groups: Sequence[Group]) -> Figure:

@@ -32,8 +32,6 @@ from offboard.identification.uncertainty import (
     long_run_covariance,
     sandwich,
 )
-from offboard.model.axes import acceleration
-from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
 
@@ -101,25 +99,6 @@ class Motion:
     @property
     def counts(self) -> str:
         return f"{len(self.times)} positions and {len(self._sent_at)} commands"
-
-
-def predicted_velocity(motion: Motion, vehicle: Vehicle) -> Array:
-    """Velocity (3, N) from thrust, attitude and drag alone; its mean is that of the positions."""
-    thrust = vehicle.thrust_max_mps2 * motion.thrust(vehicle.thrust_delay_s, vehicle.thrust_lag_s)
-    gravity = np.array([[0.0], [0.0], [vehicle.gravity_mps2]])
-    push = acceleration(
-        gravity, thrust * np.vstack((motion.direction_ne, motion.b_z)), 0.0, 0.0, 0.0
-    )
-    push -= push.mean(axis=1, keepdims=True)  # a constant disturbance
-    drag_ps, steps_s = vehicle.drag_per_mass_ps, np.diff(motion.times)
-    travelled = motion.positions[:, -1] - motion.positions[:, 0]
-    mean = travelled / max(motion.times[-1] - motion.times[0], 1e-3)
-    push += drag_ps * mean[:, None]
-    gained = np.zeros((len(motion.times), 1, 3))
-    gained[1:, 0] = (0.5 * (push[:, 1:] + push[:, :-1]) * steps_s).T
-    velocity = linear_recursion(np.exp(-drag_ps * steps_s)[:, None, None], gained)[:, 0].T
-    shifted: Array = velocity + (mean - velocity.mean(axis=1))[:, None]
-    return shifted
 
 
 # ---------------------------------------------------------------------- Kalman filter

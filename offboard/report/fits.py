@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from offboard.analysis.identify import Row, estimator_noise, rows
 from offboard.analysis.page import BLUE, GREY, RED, Figure, curve, panels
 from offboard.identification.attitude_fit import tilt_signals, yaw_signals
-from offboard.identification.motion_fit import Motion, predicted_velocity
 from offboard.identification.response import second_order
 from offboard.identification.trace import Trace
 from offboard.identification.vehicle_fit import Identified
@@ -48,8 +47,6 @@ def fits(found: Identified, trace: Trace, prior: Vehicle) -> Fits:
             _response("Tilt", axes, tilt_signals(last), vehicle.tilt),
             _response("Heading", ("heading, deg",), yaw_signals(last), vehicle.yaw, 180 / math.pi),
         ]
-    if len(trace.commands) and len(last.position) > 2:
-        figures.append(_motion(last, vehicle))
     title = f"Identified from {found.seconds:.1f} s"
     return Fits(title, list(rows(found)), estimator_noise(trace) if found.seconds else "", figures)
 
@@ -74,19 +71,3 @@ def _response(
         curve(figure, axis + 1, times, scale * modelled[:, axis], "identified response", RED)
     caption = "The identified response should coincide with the autopilot's estimate."
     return Figure(title, figure, caption)
-
-
-def _motion(trace: Trace, vehicle: Vehicle) -> Figure:
-    motion = Motion(trace)
-    modelled = predicted_velocity(motion, vehicle)
-    measured = np.gradient(motion.positions, motion.times, axis=1)
-    figure = panels(("north, m/s", "east, m/s", "down, m/s"), "vehicle time, s")
-    for axis in range(3):
-        curve(figure, axis + 1, motion.times, measured[axis], "position, differentiated", BLUE)
-        curve(figure, axis + 1, motion.times, modelled[axis], "thrust, attitude and drag", RED)
-    return Figure(
-        "Motion",
-        figure,
-        "Velocity computed from thrust, attitude and drag alone drifts slowly because of errors in "
-        "the estimated attitude; a difference that oscillates with the velocity means wrong drag.",
-    )

@@ -33,7 +33,7 @@ def test_the_page_shows_every_constant_and_reads_in_both_colour_schemes(
         assert opened.page.inner_text("h1") == "Flight <1>"
         assert opened.page.locator("#fits tr").count() == 1 + len(list(rows(found)))
         assert opened.page.inner_text("#fits").count(f"not identified: {REFUSAL}") == 3
-        assert opened.page.locator("[id^=fit_].figure").count() == 3
+        assert opened.page.locator("[id^=fit_].figure").count() == 2
         assert opened.width_px() == 400
         assert opened.colliding() == opened.unreadable() == []
         opened.switch("dark")
