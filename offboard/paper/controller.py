@@ -35,7 +35,6 @@ from offboard.reference.base import FlatSample
 
 Array = NDArray[np.float64]
 Weight = Annotated[float, Field(ge=0)]
-Limit = Annotated[float, Field(gt=0)]
 Four = tuple[float, float, float, float]
 FourWeights = tuple[Weight, Weight, Weight, Weight]
 TwelveWeights = tuple[

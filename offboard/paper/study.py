@@ -73,7 +73,9 @@ def reproduce(
     label. Raises UserError for invalid arguments or an output that cannot be written.
     """
     check(out, labels, seeds)
-    labels = list(dict.fromkeys(labels)) or sorted(MAKERS, key=lambda label: label[0] == "f")
+    labels = list(dict.fromkeys(labels)) or sorted(
+        MAKERS, key=lambda label: label.startswith("figure")
+    )
     made: dict[str, Table | Figure] = {}
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
     progress = Progress(*columns, TimeElapsedColumn(), console=console or Console(stderr=True))
