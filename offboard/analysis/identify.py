@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import yaml
@@ -154,21 +155,27 @@ def _line(entry: str, comment: str) -> str:
 # ---------------------------------------------------------------------- estimator's noise
 
 
-def estimator_noise(trace: Trace) -> str:
-    """A sentence on the noise of attitudes, positions and velocities in a stretch of flight: white
-    noise, and reported velocity less the derivative of reported position, as means over
-    MEAN_OVER_S; NaN where the trace is too short."""
-    stamps = trace.position[:, STAMP]
-    position_m, velocity_mps = (
-        _white_sd(stamps, trace.position[:, columns]) for columns in (POSITION, VELOCITY)
-    )
+@dataclass(frozen=True, slots=True)
+class EstimatorNoise:
+    """Standard deviations; NaN where the trace is too short. The first three are white noise of
+    position (m), reported velocity (m/s) and thrust direction (rad); the last one is reported
+    velocity less the derivative of reported position (m/s), as means over MEAN_OVER_S."""
+
+    position_m: float
+    velocity_mps: float
+    attitude_rad: float
+    velocity_contradiction_mps: float
+
+
+def estimator_noise(trace: Trace) -> EstimatorNoise:
+    """Noise of the attitudes, positions and velocities in a stretch of flight."""
+    stamps, velocity = trace.position[:, STAMP], trace.position[:, VELOCITY]
     direction = trace.attitude[:, NORTH : NORTH + 2]
-    attitude_rad = _white_sd(trace.attitude[:, STAMP], direction)
-    return (
-        f"Noise of the autopilot's estimate from sample to sample: position "
-        f"{1e3 * position_m:.2g} mm, velocity {1e3 * velocity_mps:.2g} mm/s, attitude "
-        f"{1e3 * attitude_rad:.2g} mrad. Over half a second its velocity and the change of "
-        f"its position differ by {_velocity_contradiction(trace):.2g} m/s."
+    return EstimatorNoise(
+        position_m=_white_sd(stamps, trace.position[:, POSITION]),
+        velocity_mps=_white_sd(stamps, velocity),
+        attitude_rad=_white_sd(trace.attitude[:, STAMP], direction),
+        velocity_contradiction_mps=_velocity_contradiction(trace),
     )
 
 

@@ -10,6 +10,7 @@ is not the derivative of the reported position. SI, NED.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,12 +105,24 @@ class Motion:
 # ---------------------------------------------------------------------- Kalman filter
 
 
-# What the filter allows for. Per root second: wander of the position (PX4: 0.013 to 0.030 m) and
-# acceleration that is not modelled (m/s). Noise of positions (m), sd of velocity at the start.
-WANDER_M, UNMODELLED_MPS, NOISE_M, START_MPS = 0.05, 0.1, 0.001, 3.0
-# Drift of the disturbance per root second (PX4: tilt error times g, 0.1), and its sd at the start,
-# m/s^2. The vertical one is a part of the hover thrust that is sought.
-LATERAL, VERTICAL = (0.08, 0.5), (0.03, 0.001)
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """What the filter allows for along an axis. Per root second: wander of the position (PX4:
+    0.013 to 0.030 m), acceleration that is not modelled (m/s) and drift of the disturbance (m/s^2;
+    PX4: tilt error times g, 0.1). Noise of positions (m), and sd of velocity (m/s) and disturbance
+    (m/s^2) at the start."""
+
+    position: float
+    velocity: float
+    disturbance: float
+    measured: float
+    start_velocity: float
+    start_disturbance: float
+
+
+LATERAL = Noise(0.05, 0.1, 0.08, 0.001, 3.0, 0.5)
+# The vertical disturbance is a part of the hover thrust that is sought.
+VERTICAL = Noise(0.05, 0.1, 0.03, 0.001, 3.0, 0.001)
 
 
 class PositionFilter:
@@ -119,12 +132,12 @@ class PositionFilter:
     gains the variance of the innovations is fixed too, so their sum of squares is a likelihood.
     """
 
-    def __init__(self, times: Array, drag_ps: float, disturbance: tuple[float, float]) -> None:
+    def __init__(self, times: Array, drag_ps: float, noise: Noise) -> None:
         self._steps_s = np.diff(times)
-        drift, start = disturbance
-        growth = np.diag(np.array((WANDER_M, UNMODELLED_MPS, drift)) ** 2)
-        variance = NOISE_M**2
-        covariance = np.diag((variance, START_MPS**2, start**2))
+        densities = np.array((noise.position, noise.velocity, noise.disturbance))
+        growth = np.diag(densities**2)
+        variance = noise.measured**2
+        covariance = np.diag((variance, noise.start_velocity**2, noise.start_disturbance**2))
         self._gains = np.empty((len(self._steps_s), 3))
         self._sds = np.empty(len(self._steps_s))
         steps = zip(self._steps_s, motion_transitions(self._steps_s, drag_ps), strict=True)

@@ -48,7 +48,17 @@ def fits(found: Identified, trace: Trace, prior: Vehicle) -> Fits:
             _response("Heading", ("heading, deg",), yaw_signals(last), vehicle.yaw, 180 / math.pi),
         ]
     title = f"Identified from {found.seconds:.1f} s"
-    return Fits(title, list(rows(found)), estimator_noise(trace) if found.seconds else "", figures)
+    return Fits(title, list(rows(found)), _noise(trace) if found.seconds else "", figures)
+
+
+def _noise(trace: Trace) -> str:
+    noise = estimator_noise(trace)
+    return (
+        f"Noise of the autopilot's estimate from sample to sample: position "
+        f"{1e3 * noise.position_m:.2g} mm, velocity {1e3 * noise.velocity_mps:.2g} mm/s, attitude "
+        f"{1e3 * noise.attitude_rad:.2g} mrad. Over half a second its velocity and the change of "
+        f"its position differ by {noise.velocity_contradiction_mps:.2g} m/s."
+    )
 
 
 def _response(
