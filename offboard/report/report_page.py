@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from offboard.analysis.page import render
 from offboard.analysis.score import METRICS
@@ -14,16 +13,6 @@ from offboard.report.fits import Fits
 from offboard.report.flight import Flight
 
 _SIGNS = {1.0: ("good", "✓"), 0.0: ("bad", "✗")}
-
-
-@dataclass(frozen=True, slots=True)
-class Row:
-    """A figure of the score, for each flight as text."""
-
-    name: str
-    meaning: str
-    unit: str
-    values: tuple[str, ...]
 
 
 def page(flights: Sequence[Flight], fits: Fits | None = None) -> str:
@@ -38,6 +27,7 @@ def page(flights: Sequence[Flight], fits: Fits | None = None) -> str:
         figures=figures(flights),
         fits=fits,
         rows=rows(flights),
+        metrics=METRICS,
         letters=[] if alone else [letter(place) for place in range(len(flights))],
         events=[
             (f"{e.time_s:.2f}" if math.isfinite(e.time_s) else "", e.who, e.what)
@@ -60,13 +50,11 @@ def _verdict(place: int, flight: Flight, alone: bool) -> dict[str, object]:
     }
 
 
-def rows(flights: Sequence[Flight]) -> list[Row]:
-    """Every figure that a log holds, for each flight."""
+def rows(flights: Sequence[Flight]) -> dict[str, tuple[str, ...]]:
+    """Every figure that a log holds, by name, for each flight as text."""
     scores = [flight.score.metrics() for flight in flights]
-    found = []
-    for name, meta in METRICS.items():
-        values = [score[name] for score in scores]
-        if any(math.isfinite(value) for value in values):
-            shown = tuple(f"{each:.4g}" if math.isfinite(each) else "–" for each in values)
-            found.append(Row(name, meta["meaning"], meta["unit"], shown))
-    return found
+    return {
+        name: tuple(f"{each:.4g}" if math.isfinite(each) else "–" for each in values)
+        for name in METRICS
+        if any(map(math.isfinite, values := [score[name] for score in scores]))
+    }

@@ -146,13 +146,12 @@ def test_bands_are_the_phases_that_were_flown(flown: Flown) -> None:
 
 def test_the_metrics_on_the_page_are_those_of_the_score(flown: Flown, recorded: Flight) -> None:
     """Of several flights beside each other."""
-    shown = {row.name: row.values[0] for row in report_page.rows([flown.flight])}
+    shown = {name: values[0] for name, values in report_page.rows([flown.flight]).items()}
     finite = {name: v for name, v in flown.score.metrics().items() if math.isfinite(v)}
     assert shown == {name: f"{value:.4g}" for name, value in finite.items()}
     rows = report_page.rows([flown.flight, recorded, flown.flight])
-    (row,) = (each for each in rows if each.name == "rmse_position_m")
     value = f"{flown.score.rmse_position_m:.4g}"
-    assert row.values == (value, "–", value)
+    assert rows["rmse_position_m"] == (value, "–", value)
 
 
 def of_kinds(log: Path, without: set[int]) -> bytes:
