@@ -204,10 +204,11 @@ class FailureSearch:
             for at, record in enumerate(fly([self._case(values) for values in trials])):
                 if record.margin < 0.0:
                     reduced[at], records[at] = trials[at], record
-        return [
-            Failure(self._case(values), record, _changed(values, defaults), 0, 0)
-            for values, record in zip(reduced, records, strict=True)
-        ]
+        found = []
+        for values, record in zip(reduced, records, strict=True):
+            changed = tuple((k, value) for k, value in values.items() if value != defaults[k])
+            found.append(Failure(self._case(values), record, changed, 0, 0))
+        return found
 
     def _at_seeds(self, failures: Sequence[Failure], fly: Fly) -> list[Failure]:
         """The failures, each flown at `seeds` more seeds."""
@@ -234,10 +235,6 @@ class FailureSearch:
         seed = round(values.get(SEED, self._base.seed))
         own = tuple((key, value) for key, value in values.items() if key != SEED)
         return replace(self._base, values=(*self._base.values, *own), seed=seed)
-
-
-def _changed(values: Mapping[str, float], defaults: Mapping[str, float]) -> Values:
-    return tuple((key, value) for key, value in values.items() if value != defaults[key])
 
 
 def as_csv(failures: Sequence[Failure]) -> str:

@@ -5,6 +5,7 @@ say. All but the first two need a vehicle that was found."""
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import partial
 
 from offboard.doctor.listening import Observation
 from offboard.flight.preflight import TELEMETRY, Finding, Level
@@ -32,22 +33,8 @@ CLOSED = {  # why it cannot be opened
     "tcp": "start the vehicle, or the router, that listens there; ArduPilot's SITL listens on 5760",
     "serial": "plug it in, and see `ls /dev/serial/by-id`; may this user read it (group dialout)?",
 }
-
-
-def ok(found: str) -> Finding:
-    return Finding(Level.OK, found)
-
-
-def warn(found: str, hint: str = "", about: str = "") -> Finding:
-    return Finding(Level.WARN, found, hint, about)
-
-
-def wait(found: str, hint: str = "") -> Finding:
-    return Finding(Level.WAIT, found, hint)
-
-
-def blocks(found: str, hint: str = "") -> Finding:
-    return Finding(Level.BLOCKS, found, hint)
+ok, warn = partial(Finding, Level.OK), partial(Finding, Level.WARN)
+wait, blocks = partial(Finding, Level.WAIT), partial(Finding, Level.BLOCKS)
 
 
 def port(seen: Observation) -> Iterable[Finding]:
