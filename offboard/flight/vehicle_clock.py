@@ -228,11 +228,9 @@ class Edge:
     def at(self, host_s: float, rate: float, over_s: float = math.inf) -> float | None:
         """Vehicle time at `host_s` by the point that is most ahead, or behind, of those that are at
         most `over_s` old; None without any."""
-        sign = self._sign
-        ahead_s = [
-            sign * (v + rate * (host_s - h)) for h, v in self._points if host_s - h <= over_s
-        ]
-        return sign * max(ahead_s) if ahead_s else None
+        since_s, sign = host_s - over_s, self._sign
+        ahead_s = [sign * (v - rate * h) for h, v in self._points if h >= since_s]
+        return rate * host_s + sign * max(ahead_s) if ahead_s else None
 
     @property
     def rate(self) -> float | None:
