@@ -162,7 +162,7 @@ def _spread(positions: Array, best: Array) -> float:
 
 
 @entry(
-    SEARCH, array(4), array(2), array(3), array(1), array(2), array(2), array(1), float
+    SEARCH, array(4), array(2), array(3), array(1), array(2), array(2), array(1), float, int
 )  # fmt: skip
 def iterate(
     searches: Any,
@@ -174,18 +174,19 @@ def iterate(
     hessian: Array,
     gradient: Array,
     constant: float,
+    iterations: int,
 ) -> None:
-    """Iterate once for each of `random` (iterations, n, particles, 2): with the costs of a
-    quadratic, or, where the gradient is empty, with the newest of `costs`. Then move the particles
-    for the next one; after the last iteration of the search they stay."""
+    """Iterate with the costs of a quadratic, or, where the gradient is empty, with the newest of
+    `costs`. After each iteration `random` (moves, n, particles, 2) moves the particles for the next
+    one; after the last one of a search they stay."""
     search = searches[0]
-    for k in range(random.shape[0]):
+    for k in range(iterations):
         if len(gradient) > 0:
             _evaluate(particles[0], hessian, gradient, constant, costs[0])
         _remember(search, particles, best, costs)
-        if search.done == search.iterations or k == random.shape[0] - 1:
+        if k == iterations - 1:
             search.spread = _spread(particles[0], best)
-        if search.done < search.iterations:
+        if k < random.shape[0]:
             _move(search, random[k], bounds, particles, best)
 
 
@@ -246,10 +247,12 @@ class Swarm:
         self._iterate(hessian, gradient, float(problem.constant), iterations)
 
     def _iterate(self, hessian: Array, gradient: Array, constant: float, iterations: int) -> None:
-        random = self._rng.random((iterations, *self._particles.shape[1:], 2))
+        left = int(self._search["iterations"][0] - self._search["done"][0])
+        moves = min(iterations, left - 1)
+        random = self._rng.random((moves, *self._particles.shape[1:], 2))
         iterate(
             self._search, random, self._bounds, self._particles, self._best, self._costs,
-            hessian, gradient, constant,
+            hessian, gradient, constant, iterations,
         )  # fmt: skip
 
     def result(self, cut_short: bool = False) -> SwarmResult:

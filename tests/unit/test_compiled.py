@@ -135,7 +135,7 @@ def test_arguments_of_other_types_are_refused() -> None:
     strided, transposed = np.zeros((3, 2, 8))[..., ::2], np.zeros((4, 2, 3)).T
     for wrong in (strided, np.zeros(3), np.zeros((3, 2, 4), "f4"), transposed):
         with pytest.raises(TypeError, match="No matching definition"):
-            iterate(np.zeros(1, SEARCH), random, bounds, wrong, best, bounds, bounds, best, 0.0)
+            iterate(np.zeros(1, SEARCH), random, bounds, wrong, best, bounds, bounds, best, 0.0, 1)
 
 
 def test_importing_a_flight_does_not_import_numba() -> None:
