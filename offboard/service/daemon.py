@@ -1,13 +1,20 @@
-"""The service as a process: lock, monitor, configuration, link, supervisor, and the loop."""
+"""The service as a process: lock, monitor, configuration, link, supervisor, and the loop; and as a
+unit of systemd, from the template beside this module.
+
+The unit runs as a user of its own, which can read what everybody can, and write only below its
+state directory.
+"""
 
 from __future__ import annotations
 
+import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
 
+from jinja2 import Environment, StrictUndefined
 from sdnotify import SystemdNotifier
 
 from offboard import compiled
@@ -21,18 +28,22 @@ from offboard.link.lock import connection_lock, directory_lock
 from offboard.link.stop import StopRequests
 from offboard.live.process import SERVER, LiveProcess
 from offboard.mavlink.session import Session
+from offboard.report.background import begin
 from offboard.run.configuration import FlightConfig
 from offboard.run.flight import Connection, discard
 from offboard.run.loop import Loop
 from offboard.service.flights import Flights
-from offboard.service.memory import VehicleFiles
-from offboard.service.preparation import Preparation
-from offboard.service.record import Recorder, score
+from offboard.service.preparation import Preparation, VehicleFiles
+from offboard.service.record import Recorder
 from offboard.supervisor.supervisor import Supervisor
 
 LINK_FIRST_S, LINK_MOST_S = 1.0, 5.0  # between two attempts to open the link
 WATCHDOG_EVERY_S = 1.0
 NOTICES_MAX, NOTICES_S = 100, 1.0  # that wait for the service manager; for them, at the end
+WATCHDOG_S = 10
+TEMPLATE = Path(__file__).with_name("offboard.service.j2")
+PRIVATE = (Path("/tmp"), Path("/var/tmp"))  # the unit has its own
+OTHERS_READ, OTHERS_ENTER = 0o4, 0o1
 STOPPED_EARLY = "stopped before the link was open"
 
 
@@ -69,7 +80,7 @@ def run(
         compiled.prepare(tell)
         preparation = stack.enter_context(closing(Preparation(load)))
         supervisor.await_ready()
-        recorder = Recorder(directory, score=partial(score, report=report))
+        recorder = Recorder(directory, score=partial(begin, "report" if report else "score"))
         stack.callback(recorder.close)
         memory = stack.enter_context(closing(VehicleFiles(directory / "vehicles", tell)))
         manager = stack.enter_context(closing(Manager()))
@@ -79,7 +90,6 @@ def run(
             tell(STOPPED_EARLY)
             return Outcome(ExitCode.FLOWN, STOPPED_EARLY)
         stack.callback(link.close)
-        recorder.score_earlier()  # a supervisor that still has the link also has the log
         flights = Flights(
             session=Session(vehicle.settings(link), signing),
             source=preparation,
@@ -164,3 +174,47 @@ class Manager:
         if status != self._status:
             self._status = status
             self._writer.put(f"STATUS={status}")
+
+
+# --- the unit of systemd ---
+
+
+def unit(arguments: Sequence[str], connection: str, signing_key: Path | None = None) -> str:
+    """The text of a unit that runs `offboard daemon` with these arguments, which name neither
+    the key nor, for the state directory, `--out`."""
+    template = Environment(undefined=StrictUndefined, keep_trailing_newline=True).from_string(
+        TEMPLATE.read_text(encoding="utf-8")
+    )
+    command = [sys.executable, "-P", "-m", "offboard", "daemon", *arguments]
+    words = [quoted(word) for word in command]
+    if not any(word.startswith("--out") for word in arguments):
+        words += ["--out", "%S/offboard"]
+    if signing_key:
+        words += ["--signing-key", "%d/signing-key"]
+    return template.render(
+        command=" ".join(words),
+        connection=connection.replace("%", "%%"),
+        serial=connection.startswith("serial:"),
+        signing_key=str(signing_key.absolute()).replace("%", "%%") if signing_key else "",
+        watchdog_s=WATCHDOG_S,
+    )
+
+
+def unreadable(path: Path) -> str:
+    """Why the user of the unit cannot read this file or directory; empty if it can."""
+    for place in (path.absolute(), path.resolve()):
+        if any(private in place.parents for private in PRIVATE):
+            return f"the unit cannot see {place}: it has a {place.parts[1]} of its own"
+        closed = [each for each in place.parents if not each.stat().st_mode & OTHERS_ENTER]
+        if not place.stat().st_mode & OTHERS_READ:
+            closed.append(place)
+        if closed:
+            return f"the user of the unit cannot read {place}: {closed[-1]} is closed to others"
+    return ""
+
+
+def quoted(word: str) -> str:
+    """A word of ExecStart=, in which systemd replaces nothing."""
+    escaped = word.replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%").replace("$", "$$")
+    plain = escaped and not any(c.isspace() or c in "\"'\\;" for c in escaped)
+    return escaped if plain else f'"{escaped}"'

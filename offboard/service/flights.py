@@ -2,14 +2,12 @@
 
 `Flights` takes the place of one companion in the loop. Each flight has a new `Flight` on the
 same session, so that authority, failsafe, plan and identification are new, and what is known of
-vehicle and link stays. No I/O: a log is begun and ended at `Record`, configurations come from
-`Source`.
+vehicle and link stays. Nothing in it waits: `Recorder` and `VehicleFiles` write in threads.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Protocol
 
 from offboard.flight.display import Snapshot
 from offboard.flight.flight import STOPPED, Flight, Outcome, Output
@@ -20,6 +18,8 @@ from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from offboard.link.interface import Chunk
 from offboard.mavlink.session import Session
 from offboard.run.flight import Prepared
+from offboard.service.preparation import Preparation, VehicleFiles
+from offboard.service.record import Recorder
 
 NAMED_S = 1.0  # until a vehicle has said which one it is
 TEXTS_KEPT = 200
@@ -27,46 +27,6 @@ LEFT_ALONE = (
     "the vehicle was found in {mode} in the air, and this service has not engaged it: it is left "
     "alone; switch to another mode and back"
 )
-
-
-class Source(Protocol):
-    """Where the newest usable configuration comes from. Neither method waits."""
-
-    def newest(self) -> Prepared: ...
-    def news(self) -> list[str]:
-        """Sentences about configurations since the last call."""
-        ...
-
-
-class Record(Protocol):
-    """Where flights are recorded. No method waits."""
-
-    @property
-    def left(self) -> str:
-        """Key of the vehicle that a flight left engaged when it was cut short; may be empty."""
-        ...
-
-    def begin(self, session: Session, configuration: str, vehicle: str) -> str:
-        """A flight of `vehicle` begins: its frames go to a log of its own. Returns its
-        directory."""
-        ...
-
-    def end(self, *, engaged: bool) -> None:
-        """It has ended: the log is closed and scored, and frames go to the rolling log. `engaged`:
-        the vehicle may still be in the mode of setpoints."""
-        ...
-
-    def settle(self) -> None:
-        """No vehicle is left engaged any more."""
-        ...
-
-
-class Memory(Protocol):
-    """The vehicles that were identified, by key. No method waits."""
-
-    def get(self, key: str, prepared: Prepared) -> IdentifiedVehicle | None: ...
-    def keep(self, key: str, prepared: Prepared, identified: IdentifiedVehicle) -> None: ...
-    def discard(self, key: str) -> None: ...
 
 
 class Flights:
@@ -81,9 +41,9 @@ class Flights:
         self,
         *,
         session: Session,
-        source: Source,
-        record: Record,
-        memory: Memory,
+        source: Preparation,
+        record: Recorder,
+        memory: VehicleFiles,
         options: ServiceOptions,
         stopwatch: Callable[[], float],
     ) -> None:

@@ -255,10 +255,10 @@ def main() -> None:
 
 
 def _score(log: int) -> None:
-    """In place of the controller. Its service does that when it starts again."""
+    """In place of the controller."""
     with suppress(OSError):
         path = Path(f"/proc/self/fd/{log}").readlink()
-        if path.name == "flight.tlog" and not (path.parent / "unscored").exists():
+        if path.name == "flight.tlog":
             subprocess.Popen(
                 [sys.executable, "-P", "-m", "offboard", "score", str(path.parent)],
                 stdin=subprocess.DEVNULL,
