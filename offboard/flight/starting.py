@@ -157,18 +157,16 @@ def abandoned(flight: FlightState) -> bool:
     return left and found_engaged(flight) and can_take_over(flight)
 
 
-def can_start_in_the_air(flight: FlightState) -> bool:
-    """On request, as by a pilot's switch, only where every sign says that it flies."""
-    return flight.contact.flies and can_take_over(flight) and usable(flight)
-
-
 def started_in_the_air(flight: FlightState) -> str:
-    fit = flight.request is Request.START and can_start_in_the_air(flight)
+    """On request, as by a pilot's switch, only where every sign says that it flies."""
+    flies = flight.request is Request.START and flight.contact.flies
+    fit = flies and can_take_over(flight) and usable(flight)
     return f"start requested, {flight.vehicle.mode}" if fit else ""
 
 
 def started_on_the_ground(flight: FlightState) -> bool:
-    return flight.request is Request.START and not flight.vehicle.armed and usable(flight)
+    may_arm = flight.service is not None and flight.service.arms and not flight.vehicle.armed
+    return flight.request is Request.START and may_arm and usable(flight)
 
 
 # ---------------------------------------------------------------------- to the air

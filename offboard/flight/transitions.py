@@ -70,8 +70,19 @@ def table(service: ServiceOptions | None = None) -> tuple[Transition, ...]:
 
 def next_row(flight: FlightState) -> Transition | None:
     """The first row of the flight's phase whose condition holds, or None to stay."""
-    rows = _by_phase(flight.service).get(flight.phase, ())
+    rows = _by_phase(flight.service)[flight.phase]
     return next((row for row in rows if row.condition(flight)), None)
+
+
+def leads_on(flight: FlightState, request: Request) -> bool:
+    """Whether a row of the flight's phase holds with the request, and does not without it."""
+    rows, pending = _by_phase(flight.service)[flight.phase], flight.request
+    flight.request = Request.NONE
+    without = [row for row in rows if row.condition(flight)]
+    flight.request = request
+    accepted = [row for row in rows if row.condition(flight)] != without
+    flight.request = pending
+    return accepted
 
 
 @cache

@@ -39,7 +39,10 @@ from offboard.mavlink.events import (
 )
 
 ON_TRACK = (Phase.JOIN, Phase.TRACK, Phase.HOVER)
-SERVICES = {then: ServiceOptions(then=then) for then in ("hold", "land", "repeat")}  # type: ignore[arg-type]
+SERVICES = {
+    then: ServiceOptions(then=then, arms=True)  # type: ignore[arg-type]
+    for then in ("hold", "land", "repeat")
+}
 TABLES: dict[str, ServiceOptions | None] = {"fly": None, **SERVICES}
 BOTH = pytest.mark.parametrize("service", TABLES.values(), ids=TABLES)
 Setup = Callable[[FlightState], object]

@@ -367,7 +367,7 @@ def test_armed_in_offboard_on_the_ground_it_stays_there(served: Served) -> None:
     assert -pair.place[2] < 0.05
 
 
-def test_without_arms_a_start_on_the_ground_is_denied(served: Served) -> None:
+def test_without_arms_a_start_on_the_ground_is_rejected(served: Served) -> None:
     """Another vehicle passed by, which prevents standby for 10 s."""
     pair = served()
     codec = mavlink.MAVLink(None, srcSystem=9, srcComponent=1)
@@ -379,7 +379,7 @@ def test_without_arms_a_start_on_the_ground_is_denied(served: Served) -> None:
     pair.until(lambda: pair.phase is Phase.STANDBY, 1.0)
     pair.command(START)
     pair.run(3.0)
-    assert pair.acks == [(START, DENIED)]
+    assert pair.acks == [(START, TEMPORARILY_REJECTED)]
     assert pair.after(0.0, COMMAND) == []
 
 
@@ -477,7 +477,7 @@ def test_requests_over_mavlink(served: Served) -> None:
         (PAUSE_CONTINUE, DENIED),
         (ARM, UNSUPPORTED),
         (SET_MODE, ACCEPTED),
-        (SET_MODE, DENIED),
+        (SET_MODE, TEMPORARILY_REJECTED),
         (START, TEMPORARILY_REJECTED),
     ]
 
