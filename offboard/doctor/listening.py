@@ -14,7 +14,7 @@ from pathlib import Path
 
 from offboard.doctor.senders import Senders
 from offboard.flight.preflight import FIX_3D, Ground, ParameterReading
-from offboard.flight.vehicle_clock import VehicleClock
+from offboard.flight.timing import VehicleClock
 from offboard.flight.vehicle_state import VehicleState
 from offboard.link import clock
 from offboard.link.interface import Chunk

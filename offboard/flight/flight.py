@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 from offboard.control.base import Adaptive, Controller
 from offboard.estimation.observer import Observer
@@ -17,7 +16,6 @@ from offboard.flight import actions, decision, outbox, telemetry, transitions
 from offboard.flight.authority import Standing
 from offboard.flight.display import News, Snapshot
 from offboard.flight.flight_plan import FlightPlan
-from offboard.flight.inputs import InputRecorder
 from offboard.flight.phases import (
     BEFORE_FLIGHT,
     ENDS,
@@ -29,8 +27,9 @@ from offboard.flight.phases import (
     Phase,
     ServiceOptions,
 )
-from offboard.flight.record import PAUSE_S, Tick
+from offboard.flight.record import DROPPED, InputRecorder
 from offboard.flight.state import FlightState, Outcome
+from offboard.flight.timing import PAUSE_S
 from offboard.identification.learner import IdentifySettings, Learner
 from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from offboard.link.interface import Chunk
@@ -40,18 +39,10 @@ from offboard.mavlink.session import ACTIVE, Session
 from offboard.model.vehicle import Vehicle
 from offboard.supervisor.recovery import Supervised
 
-__all__ = ["STOPPED", "Flight", "Outcome", "Output"]
+__all__ = ["STOPPED", "Flight", "Outcome"]
 
 MAV_STATE_STANDBY, MAV_STATE_CRITICAL = 3, 5
 BRIDGED_SHARE = 0.3  # of `Limits.silence_s`; after it, level setpoints replace the control law
-
-
-@dataclass(frozen=True, slots=True)
-class Output:
-    """What one turn sends."""
-
-    send: tuple[bytes, ...] = ()
-    supervised: Supervised | None = None  # for the supervisor; None before the vehicle is found
 
 
 class Flight(FlightState):
@@ -111,8 +102,9 @@ class Flight(FlightState):
 
     # ------------------------------------------------------------------ the turn
 
-    def turn(self, chunks: Sequence[Chunk], now_s: float) -> Output:
-        """Process all that has arrived, then act once if a tick is due. Returns what to send.
+    def turn(self, chunks: Sequence[Chunk], now_s: float) -> tuple[bytes, ...]:
+        """Process all that has arrived, then act once if a tick is due. Returns the frames to
+        send.
 
         Call it at least every 50 ms, and `finish_turn` after the frames were sent. `now_s` is host
         time. In lockstep a turn without chunks does nothing: how many there are between two
@@ -120,7 +112,7 @@ class Flight(FlightState):
         """
         self._ticked = self._heard = False
         if self.session.settings.lockstep and not chunks:
-            return Output()
+            return ()
         now_s = self._inputs.begin(now_s, self.other_datagrams)
         try:
             before_s = self.now_s
@@ -137,9 +129,9 @@ class Flight(FlightState):
             outbox.send(self, *due, *replies)
         finally:
             self._inputs.end()
-        output = Output(outbox.flush(self), self._supervised())
-        self._logged += output.send
-        return output
+        frames = outbox.flush(self)
+        self._logged += frames
+        return frames
 
     def finish_turn(self, sent_s: float) -> list[bytes]:
         """Do what no setpoint waits for: identify the vehicle, and encode the log's records.
@@ -227,14 +219,8 @@ class Flight(FlightState):
         self._tick, self._ticked = number, True
         pause_s = self.busyness.on_tick(missed, flying=self.phase in FLYING)
         ignored = self.other_datagrams + self.session.counters.forged
-        self.tick = Tick(
-            self.time_s,
-            self.telemetry_arrived_s,
-            missed,
-            ignored - self._recorded_others,
-            pause_s,
-        )
-        self._recorded_others = ignored
+        self.missed_ticks, self.pause_s = missed, pause_s
+        self.ignored, self._recorded_others = ignored - self._recorded_others, ignored
         return True
 
     def _follow_link(self) -> None:
@@ -260,8 +246,10 @@ class Flight(FlightState):
         if self.has_ended():
             transitions.name_failsafe(self)
 
-    def _supervised(self) -> Supervised | None:
-        """For the supervisor: whether it has to act, should this process fail."""
+    @property
+    def supervised(self) -> Supervised | None:
+        """For the supervisor: whether it has to act, should this process fail. None before the
+        vehicle is found."""
         found, health, authority = self.session.vehicle, self.vehicle.health, self.authority
         if found is None:
             return None
@@ -327,8 +315,8 @@ class Flight(FlightState):
             self.guarded = guarded
 
     def on_dropped(self, frames: int) -> None:
-        """The last frames of the newest `Output` were not sent: they became too old."""
-        self._inputs.dropped(frames)
+        """The last frames of the newest turn were not sent: they became too old."""
+        self._inputs.note(DROPPED, frames)
         self._news.dropped.add(frames)
 
     def overhear(self, datagrams: Sequence[bytes]) -> None:

@@ -24,8 +24,8 @@ from offboard.flight.hover_estimate import HoverEstimate
 from offboard.flight.phases import ENDS, STOPPED, Action, Limits, Phase, Request, ServiceOptions
 from offboard.flight.positioning import Positioning, PositionJumps
 from offboard.flight.preflight import ParameterReading
-from offboard.flight.record import Busyness, Decided, Tick
-from offboard.flight.vehicle_clock import LinkGrowth, VehicleClock
+from offboard.flight.record import Decided
+from offboard.flight.timing import Busyness, LinkGrowth, VehicleClock
 from offboard.flight.vehicle_state import VehicleState
 from offboard.identification.learner import Learner
 from offboard.mavlink.dialects.base import Dialect, Takeoff
@@ -131,7 +131,9 @@ class FlightState:
     heard_s: float = math.nan  # host time of the newest telemetry, as `Session.elapsed_s`
     telemetry_arrived_s: float = 0.0  # host time at which it arrived
     bridged_s: float = 0.0  # silence at the newest setpoint that needs no telemetry
-    tick: Tick = field(default_factory=Tick)  # the newest
+    missed_ticks: int = 0  # skipped between the newest tick and the one before
+    ignored: int = 0  # datagrams of others and forged frames between the two
+    pause_s: float = 0.0  # of this process, between the two
     command: Command = field(default_factory=lambda: Command(0.0, LEVEL, 0.0))  # in force
     decided: Decided | None = None  # in this turn
     announced_radps: float = math.nan  # bandwidth in use, as the user knows it

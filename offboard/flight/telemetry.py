@@ -15,13 +15,13 @@ from offboard.flight import outbox, transitions
 from offboard.flight.authority import Authority
 from offboard.flight.ground_contact import GroundContact
 from offboard.flight.hover_estimate import HoverEstimate
-from offboard.flight.inputs import vehicle_record
 from offboard.flight.phases import BEFORE_FLIGHT, FLYING, TRACKING, WAITING, Request
 from offboard.flight.positioning import PositionJumps
 from offboard.flight.preflight import ParameterReading
+from offboard.flight.record import vehicle_record
 from offboard.flight.rows import other_sender
 from offboard.flight.state import FlightState
-from offboard.flight.vehicle_clock import VehicleClock
+from offboard.flight.timing import VehicleClock
 from offboard.mavlink.events import (
     Attitude,
     ClockBehind,

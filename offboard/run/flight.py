@@ -20,10 +20,9 @@ from offboard.control.base import Controller, Situation
 from offboard.documents.errors import DocumentError, located
 from offboard.documents.signing_key import read_key
 from offboard.estimation.observer import Observer
-from offboard.flight import inputs
 from offboard.flight.flight import Flight, Outcome
 from offboard.flight.flight_plan import FlightPlan
-from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
+from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID, configuration_pieces
 from offboard.flight.setpoint import usable
 from offboard.link import clock
 from offboard.link.connection import open_link, open_lockstep_link
@@ -313,7 +312,7 @@ def fly(
         stops.check()
         stack.enter_context(log)
         session = Session(vehicle.settings(link), signing)
-        for piece in inputs.pieces(prepared.text):
+        for piece in configuration_pieces(prepared.text):
             log.begin(clock.unix_us(), session.encode(piece))
         loop = Loop(
             prepared.companion(session, clock.monotonic_s),

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import gc
 import math
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any, Protocol
 
 from offboard.documents.errors import located
-from offboard.flight.flight import Flight, Outcome, Output
+from offboard.flight.flight import Flight, Outcome
 from offboard.flight.phases import BEFORE_FLIGHT, WAITING, ExitCode
 from offboard.link import clock
 from offboard.link.interface import Chunk, Link
@@ -40,7 +40,7 @@ class Flown(Protocol):
 
     @property
     def current(self) -> Flight: ...
-    def turn(self, chunks: Sequence[Chunk], now_s: float) -> Output: ...
+    def turn(self, chunks: Sequence[Chunk], now_s: float) -> tuple[bytes, ...]: ...
     def has_ended(self) -> bool: ...
     def request_stop(self, why: str = ...) -> None: ...
 
@@ -122,10 +122,10 @@ class Loop:
         began_s = clock.monotonic_s()
         if chunks:
             self._heard_s = began_s
-        output = self._companion.turn(chunks, began_s)
+        frames = self._companion.turn(chunks, began_s)
         if self._taken_over():
             return
-        dropped = self._send(output, began_s)
+        dropped = self._send(frames, began_s)
         stamp = clock.unix_us()
         for frame in self._companion.current.finish_turn(clock.monotonic_s()):
             if frame not in dropped:
@@ -140,12 +140,12 @@ class Loop:
         self._show()
         self._check_simulator(began_s - self._heard_s)
 
-    def _send(self, output: Output, began_s: float) -> list[bytes]:
+    def _send(self, frames: Sequence[bytes], began_s: float) -> list[bytes]:
         """Send what a turn has decided. This process may have been stopped since the turn began:
         then it is dropped, and returned."""
         peer = self._companion.current.peer
         dropped: list[bytes] = []
-        for frame in output.send:
+        for frame in frames:
             if self._supervisor and clock.monotonic_s() - began_s > STOPPED_S:
                 dropped.append(frame)
             else:
@@ -154,15 +154,12 @@ class Loop:
             self._companion.current.on_dropped(len(dropped))
         if peer is not None:
             self._link.follow(peer)
-            self._beat(output, peer)
+            supervised = self._companion.current.supervised
+            if self._supervisor and supervised:
+                self._supervisor.beat(supervised, peer, self._link, self._log.descriptor)
         return dropped
 
     # --- the supervisor ---
-
-    def _beat(self, output: Output, peer: Hashable) -> None:
-        if self._supervisor is None or output.supervised is None:
-            return
-        self._supervisor.beat(output.supervised, peer, self._link, self._log.descriptor)
 
     def _check_supervisor(self) -> None:
         """Start another one in place of one that has ended, while no flight needs this loop: it

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from offboard.flight.display import Snapshot
-from offboard.flight.flight import STOPPED, Flight, Outcome, Output
+from offboard.flight.flight import STOPPED, Flight, Outcome
 from offboard.flight.phases import ENDS, FLYING, WAITING, Phase, ServiceOptions
 from offboard.flight.starting import found_engaged
 from offboard.flight.state import FlightState
@@ -95,7 +95,7 @@ class Flights:
         elif self.current.announced[-1:] != [why]:
             self.current.announce(why)
 
-    def turn(self, chunks: Sequence[Chunk], now_s: float) -> Output:
+    def turn(self, chunks: Sequence[Chunk], now_s: float) -> tuple[bytes, ...]:
         """Process all that has arrived; begin the next flight where the last one has ended."""
         if self.current.has_ended() and not self._stopping:
             self._begin_next()
@@ -103,7 +103,7 @@ class Flights:
             self._renew_if_changed()
             self._look_for_left()
         before = self.phase
-        output = self.current.turn(chunks, now_s)
+        frames = self.current.turn(chunks, now_s)
         if before in WAITING and self.phase not in WAITING and self.phase not in ENDS:
             self._begin_record()
         if self._recording and before is not self.phase:
@@ -111,7 +111,7 @@ class Flights:
         if self.phase in WAITING:
             self._explain()
         self._collect()
-        return output
+        return frames
 
     def close(self) -> None:
         """The service ends."""

@@ -19,7 +19,7 @@ from contextlib import suppress
 from itertools import chain, count
 from pathlib import Path
 
-from offboard.flight import inputs
+from offboard.flight.record import configuration_pieces, vehicle_record
 from offboard.link import clock
 from offboard.link.background import BackgroundWriter
 from offboard.link.log import CLOSE_S, QUEUED_MAX, FlightLog, LogError, append, entry
@@ -178,8 +178,8 @@ class Recorder:
         self._flight = flight = FlightRecord(directory, configuration, vehicle)
         now_us = clock.unix_us()
         assert session.vehicle is not None
-        found = inputs.vehicle_record(session.vehicle)
-        for piece in (*inputs.pieces(configuration), found):
+        found = vehicle_record(session.vehicle)
+        for piece in (*configuration_pieces(configuration), found):
             flight.write(now_us, session.encode(piece))
         earlier = {record for _, record in self._before}
         for record in self._once.values():

@@ -146,9 +146,9 @@ class Pair:
         if not self.phases or self.phases[-1][1] is not self.companion.phase:
             self.phases.append((self.time_s, self.companion.phase))
 
-    def _take(self, output: Any) -> None:
-        self.sent.extend((self.time_s, self.companion.phase, frame) for frame in output.send)
-        self.leaving += self.up(self.time_s, list(output.send))
+    def _take(self, frames: tuple[bytes, ...]) -> None:
+        self.sent.extend((self.time_s, self.companion.phase, frame) for frame in frames)
+        self.leaving += self.up(self.time_s, list(frames))
         failsafe = self.companion.current.failsafe
         if failsafe.row:
             self.failsafes[failsafe.row] = failsafe.action

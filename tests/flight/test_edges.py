@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from offboard.flight.flight import Outcome, Output
+from offboard.flight.flight import Outcome
 from offboard.flight.phases import Phase
 from offboard.link import clock
 from offboard.link import log as log_module
@@ -81,15 +81,16 @@ class Brief(Silent):
     ) -> None:
         self.turns, self.during, self.phase, self.log = turns, during, phase, log
         self.current = self
+        self.supervised = None
         self.announced: list[str] = []
         self.announce = self.announced.append
 
-    def turn(self, chunks: Sequence[Any], now_s: float) -> Output:
+    def turn(self, chunks: Sequence[Any], now_s: float) -> tuple[bytes, ...]:
         self.turns -= 1
         self.during(self.turns)
         if self.turns == 0:
             self.outcome = FLOWN
-        return Output(send=tuple(self.sends))
+        return tuple(self.sends)
 
     def finish_turn(self, sent_s: float) -> Sequence[bytes]:
         return self.log

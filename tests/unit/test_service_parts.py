@@ -18,9 +18,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.analysis import tlog
 from offboard.cli.daemon import may_pass
-from offboard.flight import inputs
 from offboard.flight.authority import PilotSwitch
 from offboard.flight.flight_plan import CLEAR_M, FlightPlan
+from offboard.flight.record import joined_configuration
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from offboard.link import clock
@@ -75,7 +75,7 @@ def test_a_flight_log_begins_with_what_came_before(tmp_path: Path) -> None:
     assert beats == [*[6] * 6, 18]
     pieces = [entry.message for entry in log if entry.name == "TUNNEL"]
     payloads = [bytes(piece.payload[: piece.payload_length]) for piece in pieces]
-    assert inputs.join(payloads) == "vehicle: neutral\n"
+    assert joined_configuration(payloads) == "vehicle: neutral\n"
     assert (first / "flight.yaml").read_text() == "vehicle: neutral\n"
 
 
