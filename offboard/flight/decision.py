@@ -11,7 +11,8 @@ from dataclasses import astuple
 
 from offboard.control.base import Adaptive, Situation
 from offboard.documents.errors import located
-from offboard.flight import outbox, setpoint
+from offboard.flight import outbox
+from offboard.flight.outbox import Refusal, Refused
 from offboard.flight.phases import Phase
 from offboard.flight.record import (
     CERTIFIED,
@@ -24,7 +25,6 @@ from offboard.flight.record import (
     TickRecord,
     reference_record,
 )
-from offboard.flight.setpoint import Refusal, Refused
 from offboard.flight.state import FlightState
 from offboard.identification.learner import Learner, VehicleUpdate
 from offboard.mavlink.outgoing import SolverRecord
@@ -107,7 +107,7 @@ def _send(flight: FlightState, decided: Decided) -> None:
         command = flight.identification.excited(command, flight.time_s, flight.position_error_m)
     body_z_down = float(decided.state.thrust_direction_ned[2])
     try:
-        decided.sent = setpoint.send(
+        decided.sent = outbox.send_setpoint(
             flight, flight.time_s, command, body_z_down, age_s=decided.age_s, late_s=late_s
         )
     except Refused as refused:

@@ -139,7 +139,7 @@ def moved(point_ned_m: Triple, jump_ned_m: Iterable[float]) -> Triple:
 
 class Touchdown:
     """One landing. Give it each position from the beginning of the landing on, and each jump of the
-    reported position (`positioning.PositionJumps`) before it: they move the ground as well.
+    reported position (`estimates.PositionJumps`) before it: they move the ground as well.
 
     `takeoff_ned_m` is the take-off point; None if unknown, then the height is not judged.
     `speed_mps` is the largest downward speed within a second before the vehicle came to rest where

@@ -87,7 +87,7 @@ class TickRecord:
     track_time_s: float  # time since the start of the track; NaN before it
     seed_cost: float = NAN  # cost of the best plan that the search started from
     age_s: float = NAN  # of the telemetry when the setpoint was sent, vehicle time
-    refused: float = 0.0  # flags of `setpoint.Refusal`; 0 for a setpoint that was sent
+    refused: float = 0.0  # flags of `outbox.Refusal`; 0 for a setpoint that was sent
     other_datagrams: float = 0.0  # datagrams of other senders since the previous record
     pause_s: float = 0.0  # longest pause of this process since the previous tick; 0 below a period
 
@@ -110,7 +110,7 @@ class Decided:
     solve_time_s: float
     sent: Command | PositionCommand | None = None
     age_s: float = 0.0  # of its telemetry, when it was checked
-    refused: int = 0  # flags of `setpoint.Refusal`
+    refused: int = 0  # flags of `outbox.Refusal`
     failure: str = ""  # why it was refused
 
 

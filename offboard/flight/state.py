@@ -18,11 +18,10 @@ import numpy as np
 from offboard.control.base import Controller
 from offboard.estimation.observer import Observer
 from offboard.flight.authority import Authority, PilotSwitch, Standing
+from offboard.flight.estimates import HoverEstimate, Positioning, PositionJumps
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.ground_contact import DETECTOR_KNOWN_S, GroundContact, Touchdown, moved
-from offboard.flight.hover_estimate import HoverEstimate
 from offboard.flight.phases import ENDS, STOPPED, Action, Limits, Phase, Request, ServiceOptions
-from offboard.flight.positioning import Positioning, PositionJumps
 from offboard.flight.preflight import ParameterReading
 from offboard.flight.record import Decided
 from offboard.flight.timing import Busyness, LinkGrowth, VehicleClock

@@ -13,10 +13,9 @@ import numpy as np
 
 from offboard.flight import outbox, transitions
 from offboard.flight.authority import Authority
+from offboard.flight.estimates import HoverEstimate, PositionJumps
 from offboard.flight.ground_contact import GroundContact
-from offboard.flight.hover_estimate import HoverEstimate
 from offboard.flight.phases import BEFORE_FLIGHT, FLYING, TRACKING, WAITING, Request
-from offboard.flight.positioning import PositionJumps
 from offboard.flight.preflight import ParameterReading
 from offboard.flight.record import vehicle_record
 from offboard.flight.rows import other_sender

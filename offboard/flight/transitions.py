@@ -15,8 +15,8 @@ import numpy as np
 
 from offboard.flight import decision, failsafe, flying, outbox, starting
 from offboard.flight.authority import PilotSwitch
+from offboard.flight.estimates import DIFFERENT, SETTLED, differs
 from offboard.flight.ground_contact import Touchdown
-from offboard.flight.hover_estimate import DIFFERENT, SETTLED, differs
 from offboard.flight.phases import (
     BEFORE_FLIGHT,
     FLYING,

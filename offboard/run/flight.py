@@ -22,8 +22,8 @@ from offboard.documents.signing_key import read_key
 from offboard.estimation.observer import Observer
 from offboard.flight.flight import Flight, Outcome
 from offboard.flight.flight_plan import FlightPlan
+from offboard.flight.outbox import usable
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID, configuration_pieces
-from offboard.flight.setpoint import usable
 from offboard.link import clock
 from offboard.link.connection import open_link, open_lockstep_link
 from offboard.link.interface import Link

@@ -10,9 +10,9 @@ from uneventful import uneventful
 
 from offboard.control.base import Certificate, Decision
 from offboard.flight.decision import tick_record
+from offboard.flight.outbox import Refusal
 from offboard.flight.phases import Phase
 from offboard.flight.record import Decided, TickRecord
-from offboard.flight.setpoint import Refusal
 from offboard.model.command import Command
 
 COMMAND = Command(9.0, (0.6, 0.0, 0.8), 0.3)
