@@ -292,11 +292,6 @@ class Flight(FlightState):
         """The flight at this moment, for displays; `flights` that the service has begun."""
         return Snapshot(self, flights)
 
-    @property
-    def lands_without_log(self) -> bool:
-        """Whether a log that cannot be written ends the flight."""
-        return self.limits.log_lost == "land"
-
     def request_stop(self, why: str = STOPPED) -> None:
         """Land, or do not take off; takes effect at the next turn."""
         if not self.stop_reason:

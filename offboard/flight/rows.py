@@ -77,10 +77,8 @@ def other_sender(flight: FlightState) -> str:
     that it flies the vehicle."""
     if flight.limits.begin_with_other_sender:
         return ""
-    if not flight.vehicle.age_s(OtherSender) < OTHER_SENDER_S:
-        return ""
-    name = flight.vehicle.other_sender_name
-    return f"another program controls the vehicle on this link, too: {name}"
+    recent = flight.vehicle.age_s(OtherSender) < OTHER_SENDER_S
+    return flight.vehicle.other_sender_named if recent else ""
 
 
 # ---------------------------------------------------------------------- who has the vehicle

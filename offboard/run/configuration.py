@@ -9,7 +9,7 @@ it.
 from __future__ import annotations
 
 import platform
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from importlib.metadata import version
 from pathlib import Path
@@ -40,6 +40,7 @@ from offboard.model.vehicle import Vehicle
 from offboard.reference.feasibility import Envelope, check
 from offboard.reference.shapes import SHAPES, FromTable, Shape, Waypoints
 from offboard.reference.track import Track
+from offboard.run.sitl import check_scenario
 
 Raw = dict[str, Any]
 RECORDED_VERSIONS = ("pso-offboard", "pymavlink", "numpy", "scipy", "numba")
@@ -155,55 +156,36 @@ def build_controller(config: FlightConfig) -> Controller:
         raise DocumentError(f"controller {settings.law}: {why}") from error
 
 
-def check_file(path: Path, check_scenario: Callable[[Path], None]) -> str:
+def check_file(path: Path) -> str:
     """Validate one file of any kind that a flight may be given; return what it is.
 
     A reference is built and must be flyable by the default flight's vehicle, a flight's by its
-    own. Scenarios are the simulator's: `check_scenario` asks it. Raises DocumentError.
+    own. Scenarios are the simulator's. Raises DocumentError.
     """
     if path.suffix.lower() == ".csv":
         build_track(load("flight", choices={"reference": str(path)}))
         return "reference"
-    raw = read(read_text(path), str(path))
+    text = read_text(path)
+    raw = read(text, str(path))
     if not raw:
         raise DocumentError(f"{path} is empty")
     name = str(path if path.suffix in (".yaml", ".yml") else path.absolute())
-    kind = kind_of(raw) or _likely_kind(raw)
+    kind = kind_of(raw)
+    if not kind:
+        raise DocumentError(
+            f"{path}: no key says what it is: a vehicle has mass_kg, a controller law, a reference "
+            "shape, a scenario conditions or faults, a configuration these three: "
+            f"{', '.join(PARTS)}"
+        )
     if kind == "scenario":
-        check_scenario(path)
-        return kind
-    try:
-        if kind in PARTS:
-            validate(raw, _model(kind, raw), str(path))
-        if kind == "reference":
-            build_track(load("flight", choices={kind: name}))
-        elif kind == "configuration":
-            build_track(load(name))
-    except DocumentError as error:
-        if kind_of(raw):
-            raise
-        raise DocumentError(f"{error}\n{path} was taken for a {kind} file") from None
+        check_scenario(text, str(path))
+    elif kind in PARTS:
+        validate(raw, _model(kind, raw), str(path))
+    if kind == "reference":
+        build_track(load("flight", choices={kind: name}))
+    elif kind == "configuration":
+        build_track(load(name))
     return kind
-
-
-def _likely_kind(raw: Raw) -> str:
-    """What a file without the key of its kind is meant to be: by most of its keys."""
-    keys = {
-        "configuration": set(FlightConfig.model_fields),
-        "vehicle": set(Vehicle.model_fields),
-        "controller": {
-            key
-            for law in catalogue.BUILT_IN.names
-            for key in catalogue.settings_of(law).model_fields
-        },
-        "reference": {key for shape in SHAPES.values() for key in shape.model_fields},
-    }
-
-    def likeness(kind: str) -> tuple[int, int]:
-        close = sum(bool(get_close_matches(key, keys[kind], n=1)) for key in list(raw)[:100])
-        return len(raw.keys() & keys[kind]), close
-
-    return max(keys, key=likeness)
 
 
 def dump(config: FlightConfig) -> str:

@@ -214,7 +214,7 @@ class Loop:
         problem = self._log.problem
         if problem:
             self._warn(problem)
-            if self._companion.current.lands_without_log:
+            if self._companion.current.limits.log_lost == "land":
                 self._companion.request_stop(problem)
 
     def _warn(self, sentence: str) -> None:
@@ -255,7 +255,7 @@ class Loop:
             code = ExitCode.ABORTED
             sentence = sentence if self._error in sentence else f"{self._error}; {sentence}"
         if self._log.problem:
-            lands = self._companion.current.lands_without_log
+            lands = self._companion.current.limits.log_lost == "land"
             code = code or (ExitCode.ABORTED if lands else ExitCode.FLOWN)
             sentence = f"{self._log.problem}: {self._log.lost} entries lost; {sentence}"
         return Outcome(code, sentence, self._log.problem)

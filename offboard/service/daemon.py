@@ -37,7 +37,7 @@ from offboard.service.preparation import Preparation, VehicleFiles
 from offboard.service.record import Recorder
 from offboard.supervisor.supervisor import Supervisor
 
-LINK_FIRST_S, LINK_MOST_S = 1.0, 5.0  # between two attempts to open the link
+LINK_EVERY_S = 2.0  # between two attempts to open the link
 WATCHDOG_EVERY_S = 1.0
 NOTICES_MAX, NOTICES_S = 100, 1.0  # that wait for the service manager; for them, at the end
 WATCHDOG_S = 10
@@ -84,7 +84,7 @@ def run(
         stack.callback(recorder.close)
         memory = stack.enter_context(closing(VehicleFiles(directory / "vehicles", tell)))
         manager = stack.enter_context(closing(Manager()))
-        manager.ready()
+        manager.tell("READY=1")
         link = opened(vehicle.address, stops, tell, manager)
         if link is None:
             tell(STOPPED_EARLY)
@@ -101,7 +101,7 @@ def run(
 
         def display() -> None:
             manager.alive(clock.monotonic_s(), flights.phase.value)
-            preparation.allowed = not (flights.in_flight or flights.state.vehicle.armed)
+            preparation.allowed = not (flights.in_flight or flights.current.vehicle.armed)
             show(flights)
             if monitor:
                 monitor.show(flights)
@@ -117,7 +117,7 @@ def run(
             progress=lambda _: display(),
             supervisor=supervisor,
         ).run()
-        manager.stopping()
+        manager.tell("STOPPING=1")
         flights.close()
         return outcome
 
@@ -127,7 +127,7 @@ def opened(
 ) -> Link | None:
     """The link, when it can be opened: a port may be in use, a device not plugged in yet. None if a
     stop was requested before. Raises LinkError for an address that nothing can be."""
-    wait_s, told = LINK_FIRST_S, ""
+    told = ""
     pause = threading.Event()
     while not stops.requested:
         try:
@@ -138,8 +138,7 @@ def opened(
             if str(error) != told:
                 told = str(error)
                 tell(f"{error}; trying again")
-        until_s = clock.monotonic_s() + wait_s
-        wait_s = min(2.0 * wait_s, LINK_MOST_S)
+        until_s = clock.monotonic_s() + LINK_EVERY_S
         while clock.monotonic_s() < until_s and not stops.requested:
             manager.alive(clock.monotonic_s())
             pause.wait(0.1)
@@ -157,11 +156,9 @@ class Manager:
         self._told_s = 0.0
         self._status = ""
 
-    def ready(self) -> None:
-        self._writer.put("READY=1")
-
-    def stopping(self) -> None:
-        self._writer.put("STOPPING=1")
+    def tell(self, notice: str) -> None:
+        """Of sd_notify(3)."""
+        self._writer.put(notice)
 
     def close(self) -> None:
         self._writer.close(NOTICES_S)

@@ -13,7 +13,6 @@ from offboard.flight.display import Snapshot
 from offboard.flight.flight import STOPPED, Flight, Outcome
 from offboard.flight.phases import ENDS, FLYING, WAITING, Phase, ServiceOptions
 from offboard.flight.starting import found_engaged
-from offboard.flight.state import FlightState
 from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from offboard.link.interface import Chunk
 from offboard.mavlink.session import Session
@@ -65,10 +64,6 @@ class Flights:
         self.current = self._companion(None)
 
     # ------------------------------------------------------------------ as a companion
-
-    @property
-    def state(self) -> FlightState:
-        return self.current
 
     @property
     def phase(self) -> Phase:
@@ -166,12 +161,12 @@ class Flights:
         if self._recording:
             self._recording = False
             self._keep_identified()
-            self._record.end(engaged=self.state.ends_engaged)
+            self._record.end(engaged=self.current.ends_engaged)
 
     def _look_for_left(self) -> None:
         """Note whether a flight that was cut short left this vehicle engaged; no longer once the
         vehicle was seen in another mode or on the ground."""
-        state, left = self.state, self._record.left
+        state, left = self.current, self._record.left
         state.left_engaged = bool(left) and left == self._identity
         if state.left_engaged and not state.pilot.unclaimed:
             self._record.settle()
@@ -182,13 +177,13 @@ class Flights:
     def _identity(self) -> str:
         """Autopilot, system id and the hardware's number, 0 where it has none; empty until they
         are known."""
-        found, uid = self.state.vehicle.found, self.state.vehicle.uid
+        found, uid = self.current.vehicle.found, self.current.vehicle.uid
         return f"{found.autopilot}-{found.system_id}-{uid:x}" if found and uid is not None else ""
 
     @property
     def _key(self) -> str:
         """The vehicle; empty for one without a number, which cannot be told from others."""
-        return self._identity if self.state.vehicle.uid else ""
+        return self._identity if self.current.vehicle.uid else ""
 
     def _remembered(self, prepared: Prepared) -> IdentifiedVehicle | None:
         return self._memory.get(self._key, prepared) if self._key else None
@@ -212,7 +207,7 @@ class Flights:
 
     def _explain(self) -> None:
         """Announce a vehicle that was found engaged and is left alone."""
-        state = self.state
+        state = self.current
         if not state.pilot.unclaimed:
             self._told_left_alone = False
         elif not (self._told_left_alone or state.left_engaged) and state.in_phase_s > NAMED_S:

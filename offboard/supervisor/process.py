@@ -123,7 +123,8 @@ class TakeOver:
         self._session.set_vehicle(known.vehicle, self._peer)
         self._session.status = ACTIVE, LANDING
         assert self._session.dialect is not None
-        self._recovery = Recovery(self._session.dialect, known, clock.monotonic_s(), watch.beat_s)
+        self._dialect = self._session.dialect
+        self._recovery = Recovery(self._dialect, known, clock.monotonic_s(), watch.beat_s)
         self._text_id = 0
 
     def run(self, reason: str) -> None:
@@ -156,11 +157,12 @@ class TakeOver:
     def _ask(self, text: str = "") -> None:
         request = self._recovery.due(clock.monotonic_s())
         if request:
-            self._send(request.command)  # before all texts
+            self._send(request)  # before all texts
         if text:
             self._text(text)
         if request:
-            self._say(f"{request.word} requested")
+            holds = request == self._dialect.hold()
+            self._say(f"{'hold' if holds else 'land'} requested")
         if self._recovery.refusal:
             self._say(f"the vehicle answers {self._recovery.refusal}")
             self._recovery.refusal = ""

@@ -121,7 +121,7 @@ class Serving(Pair):
 
     @property
     def state(self) -> Any:
-        return self.service.state
+        return self.service.current
 
     @property
     def service(self) -> Flights:

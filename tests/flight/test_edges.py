@@ -18,7 +18,7 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from offboard.flight.flight import Outcome
-from offboard.flight.phases import Phase
+from offboard.flight.phases import Limits, Phase
 from offboard.link import clock
 from offboard.link import log as log_module
 from offboard.link.connection import open_link
@@ -67,7 +67,8 @@ class Brief(Silent):
     stop requests. `sends` are the frames of the turn in progress, `log` what it logs."""
 
     peer, outcome = None, None
-    lands_without_log = guarded = True
+    guarded = True
+    limits = Limits()
     stops = dropped = 0
     sends: Sequence[bytes] = ()
 
@@ -308,7 +309,7 @@ def test_a_log_that_cannot_be_written_is_said_at_once(
     log = tmp_path / "flight" / "flight.tlog"
     says = f"the log {log} cannot be written (No space left on device)"
     flight = Brief(100_000, end_soon, log=(b"frame",))
-    flight.lands_without_log = lands
+    flight.limits = Limits(log_lost="land" if lands else "go_on")
     outcome = fly(flight, tmp_path, real_time=True)
     assert flight.announced == [says]
     assert bool(flight.stops) is lands

@@ -28,7 +28,6 @@ from offboard.flight.phases import (
 from offboard.flight.rows import Transition
 from offboard.flight.state import FlightState
 from offboard.flight.transitions import SERVICE_ONLY, next_row, table
-from offboard.mavlink.dialects.base import Takeoff
 from offboard.mavlink.events import (
     Attitude,
     CommandAck,
@@ -159,7 +158,6 @@ EVENTS: dict[str, Setup] = {
     "rebooted": _set(rebooted=True),
     "rebooted_in_flight": _set(rebooted=True),
     "rebooted_disarmed": _all(_set(rebooted=True), partial(_disarm, for_s=0.0, landed="in_air")),
-    "needs_no_stream": _set(dialect=SimpleNamespace(takeoff=Takeoff.COMMAND)),
     "streamed": _since(1.0),
     "engaged": partial(heartbeat, armed=False),
     "engaged_in_the_air": lift,

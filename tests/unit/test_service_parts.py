@@ -234,7 +234,7 @@ def test_what_the_user_of_the_unit_cannot_read(
 
 def test_the_link_is_opened_when_it_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
     """Port in use: said once, tried again until it is free. A wrong address is an error at once."""
-    monkeypatch.setattr(daemon, "LINK_FIRST_S", 0.01)
+    monkeypatch.setattr(daemon, "LINK_EVERY_S", 0.01)
     holder = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     holder.bind(("127.0.0.1", 0))
     alive, told = [], []
@@ -266,7 +266,7 @@ def test_the_service_manager_is_told_and_not_waited_for(monkeypatch: pytest.Monk
         systemd.bind(f"\0{name}")
         monkeypatch.setenv("NOTIFY_SOCKET", f"@{name}")
         manager = Manager()
-        manager.ready()
+        manager.tell("READY=1")
         for second in range(1, 1000):  # net.unix.max_dgram_qlen is 512 at most
             manager.alive(float(second), f"{second}")
         systemd.settimeout(10.0)
