@@ -263,6 +263,7 @@ class Observation:
         """What the preflight list judges."""
         heard, vehicle = self.heard, self.vehicle
         limits = self.config.limits
+        shared = vehicle.other_sender is not None and not limits.begin_with_other_sender
         return Ground(
             vehicle,
             limits,
@@ -272,6 +273,6 @@ class Observation:
             self.dialect,
             helicopter=self.config.vehicle.airframe == "helicopter",
             rates_requested=heard.requested,
-            other_sender="" if limits.begin_with_other_sender else vehicle.other_sender_named,
+            other_sender=vehicle.other_sender_named if shared else "",
             in_the_air=vehicle.armed,
         )

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from offboard.flight import decision, outbox
 from offboard.flight.authority import Standing
+from offboard.flight.failsafe import other_sender
 from offboard.flight.ground_contact import STANDING_S, STILL_ARMED
 from offboard.flight.phases import BEFORE_FLIGHT, TRACKING, Phase
-from offboard.flight.rows import other_sender
 from offboard.flight.state import LEVEL, FlightState
 from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.events import VehicleIdentity

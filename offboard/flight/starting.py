@@ -5,17 +5,12 @@ from __future__ import annotations
 from collections.abc import Set
 
 from offboard.flight import preflight
-from offboard.flight.phases import ExitCode, Phase, Request
-from offboard.flight.preflight import Ground
-from offboard.flight.rows import (
+from offboard.flight.failsafe import (
     OPERATOR,
-    Transition,
     blind,
-    engaged_in_the_air,
     in_own_failsafe,
     lost,
     lost_armed,
-    lost_disarmed,
     mode_unknown,
     other_sender,
     rebooted,
@@ -23,6 +18,8 @@ from offboard.flight.rows import (
     silent_for,
     stop_requested,
 )
+from offboard.flight.phases import ExitCode, Phase, Request, Transition
+from offboard.flight.preflight import Ground
 from offboard.flight.state import FlightState
 from offboard.flight.vehicle_state import ARMED_KNOWN_S
 from offboard.mavlink.events import Heartbeat
@@ -168,6 +165,16 @@ def started_on_the_ground(flight: FlightState) -> bool:
 
 
 # ---------------------------------------------------------------------- to the air
+
+
+def engaged_in_the_air(flight: FlightState) -> str:
+    """The vehicle flies in the mode in which it follows setpoints."""
+    flies = flight.engaged and flight.contact.in_the_air
+    return f"{flight.vehicle.mode} in the air" if flies else ""
+
+
+def lost_disarmed(flight: FlightState) -> str:
+    return lost(flight) if flight.shown_since_lost and not flight.vehicle.armed else ""
 
 
 def streamed(flight: FlightState) -> str:

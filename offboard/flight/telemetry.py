@@ -14,11 +14,11 @@ import numpy as np
 from offboard.flight import outbox, transitions
 from offboard.flight.authority import Authority
 from offboard.flight.estimates import HoverEstimate, PositionJumps
+from offboard.flight.failsafe import other_sender
 from offboard.flight.ground_contact import GroundContact
 from offboard.flight.phases import BEFORE_FLIGHT, FLYING, TRACKING, WAITING, Request
 from offboard.flight.preflight import ParameterReading
 from offboard.flight.record import vehicle_record
-from offboard.flight.rows import other_sender
 from offboard.flight.state import FlightState
 from offboard.flight.timing import VehicleClock
 from offboard.mavlink.events import (

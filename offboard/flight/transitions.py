@@ -16,6 +16,7 @@ import numpy as np
 from offboard.flight import decision, failsafe, flying, outbox, starting
 from offboard.flight.authority import PilotSwitch
 from offboard.flight.estimates import DIFFERENT, SETTLED, differs
+from offboard.flight.failsafe import REBOOTED, in_own_failsafe
 from offboard.flight.ground_contact import Touchdown
 from offboard.flight.phases import (
     BEFORE_FLIGHT,
@@ -25,9 +26,9 @@ from offboard.flight.phases import (
     Phase,
     Request,
     ServiceOptions,
+    Transition,
 )
 from offboard.flight.preflight import ParameterReading
-from offboard.flight.rows import REBOOTED, Transition, in_own_failsafe
 from offboard.flight.state import FlightState, Outcome
 from offboard.identification.learner import Stage
 from offboard.mavlink.events import LocalPosition

@@ -124,14 +124,10 @@ class VehicleState:
 
     @property
     def other_sender_named(self) -> str:
-        """That another program controls the vehicle, and which; empty without one."""
+        """That another program controls the vehicle, and which was heard last."""
         other = self.other_sender
-        if other is None:
-            return ""
-        return (
-            "another program controls the vehicle on this link, too: "
-            f"system {other.system_id} component {other.component_id}"
-        )
+        name = f": system {other.system_id} component {other.component_id}" if other else ""
+        return f"another program controls the vehicle on this link, too{name}"
 
     @property
     def battery(self) -> float:

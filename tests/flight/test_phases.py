@@ -24,8 +24,8 @@ from offboard.flight.phases import (
     Phase,
     Request,
     ServiceOptions,
+    Transition,
 )
-from offboard.flight.rows import Transition
 from offboard.flight.state import FlightState
 from offboard.flight.transitions import SERVICE_ONLY, next_row, table
 from offboard.mavlink.events import (
