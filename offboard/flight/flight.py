@@ -8,14 +8,11 @@ the control period, it decides once, on the newest state. What no setpoint waits
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
-from offboard.control.base import Adaptive, Controller
-from offboard.estimation.observer import Observer
 from offboard.flight import actions, decision, outbox, telemetry, transitions
 from offboard.flight.authority import Standing
 from offboard.flight.display import News, Snapshot
-from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.phases import (
     BEFORE_FLIGHT,
     ENDS,
@@ -23,20 +20,15 @@ from offboard.flight.phases import (
     STOPPED,
     WAITING,
     Action,
-    Limits,
     Phase,
-    ServiceOptions,
 )
 from offboard.flight.record import DROPPED, InputRecorder
 from offboard.flight.state import FlightState, Outcome
 from offboard.flight.timing import PAUSE_S
-from offboard.identification.learner import IdentifySettings, Learner
-from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from offboard.link.interface import Chunk
 from offboard.mavlink.events import Attitude, ClockBehind, Event, LocalPosition, Rebooted
 from offboard.mavlink.outgoing import Outgoing
-from offboard.mavlink.session import ACTIVE, Session
-from offboard.model.vehicle import Vehicle
+from offboard.mavlink.session import ACTIVE
 from offboard.supervisor.recovery import Supervised
 
 __all__ = ["STOPPED", "Flight", "Outcome"]
@@ -46,55 +38,16 @@ BRIDGED_SHARE = 0.3  # of `Limits.silence_s`; after it, level setpoints replace 
 
 
 class Flight(FlightState):
-    """Flies `plan` with `controller`: the state of the flight, and its turn. `stopwatch` reads host
-    time.
+    """The state of the flight, and its turn. After `before`, which has ended or waits, with the
+    same session, what it knows of vehicle and link stays known."""
 
-    `deadline_s` is the wall time that one decision may take; None in lockstep, where the vehicle
-    waits for each decision. `known` is what an earlier flight has identified of the vehicle.
-    `before` has ended or waits, with the same session: what it knows of vehicle and link stays
-    known.
-    """
-
-    def __init__(
-        self,
-        *,
-        vehicle: Vehicle,
-        session: Session,
-        observer: Observer,
-        controller: Controller,
-        plan: FlightPlan,
-        limits: Limits,
-        period_s: float,
-        deadline_s: float | None,
-        stopwatch: Callable[[], float],
-        identify: IdentifySettings | None = None,
-        known: IdentifiedVehicle | None = None,
-        service: ServiceOptions | None = None,
-        before: Flight | None = None,
-    ) -> None:
-        if known:
-            observer.set_vehicle(known.vehicle)
-        identification = None  # for a controller that cannot use another vehicle model
-        if identify and isinstance(controller, Adaptive):
-            identification = Learner(vehicle, identify, known=known)
-        self._inputs = InputRecorder(session.settings, kept=service is None)
-        super().__init__(
-            limits,
-            plan,
-            known.vehicle if known else vehicle,
-            session,
-            observer,
-            controller,
-            period_s,
-            self._inputs.watch(stopwatch),
-            deadline_s,
-            identification,
-            service,
-        )
+    def __post_init__(self, before: FlightState | None) -> None:
+        super().__post_init__(before)
+        self._inputs = InputRecorder(self.session.settings, kept=self.service is None)
+        self.stopwatch = self._inputs.watch(self.stopwatch)
         self._tick = -1  # number of the newest
-        if before is not None:
-            self.follow(before)
-            self._tick = before._tick if before.period_s == period_s else -1
+        if isinstance(before, Flight) and before.period_s == self.period_s:
+            self._tick = before._tick
         self._recorded_others = self.other_datagrams
         self._news = News()
         self._logged: list[bytes] = []  # frames since the newest `finish_turn`

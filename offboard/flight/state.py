@@ -11,7 +11,7 @@ import math
 import operator
 from collections import deque
 from collections.abc import Callable, Hashable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field
 
 import numpy as np
 
@@ -94,6 +94,7 @@ class FlightState:
     deadline_s: float | None = None
     identification: Learner | None = None
     service: ServiceOptions | None = None
+    before: InitVar[FlightState | None] = None
     vehicle: VehicleState = field(default_factory=VehicleState)
     clock: VehicleClock = field(default_factory=VehicleClock)
     hover: HoverEstimate = field(default_factory=HoverEstimate)
@@ -153,11 +154,13 @@ class FlightState:
         default_factory=lambda: deque(maxlen=PREDICTIONS_KEPT)
     )
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, before: FlightState | None) -> None:
         self.busyness = Busyness(self.period_s)
         self.contact = GroundContact(self.vehicle)
+        if before is not None:
+            self._follow(before)
 
-    def follow(self, before: FlightState) -> None:
+    def _follow(self, before: FlightState) -> None:
         """Continue after another flight with the same vehicle: what is known of vehicle and link
         stays. It begins in STANDBY, or anew while the vehicle is not known well enough: after a
         reboot its parameters are read again."""
