@@ -11,7 +11,7 @@ from dataclasses import astuple
 
 from offboard.control.base import Adaptive, Situation
 from offboard.documents.errors import located
-from offboard.flight import outbox
+from offboard.flight import failsafe, outbox
 from offboard.flight.outbox import Refusal, Refused
 from offboard.flight.phases import Phase
 from offboard.flight.record import (
@@ -55,7 +55,7 @@ def decide(flight: FlightState) -> bool:
     nothing is sent. Telemetry that was too old before the decision began does not count: the
     failsafe has a row for it.
     """
-    was_old = flight.telemetry_is_old
+    was_old = failsafe.old(flight)
     try:
         decided = _decided(flight)
         _send(flight, decided)

@@ -334,8 +334,3 @@ class FlightState:
     def telemetry_age_s(self, host_s: float) -> float:
         """Age of the newest telemetry at `host_s`, beyond the least delay of the link."""
         return self.clock.age_s(self.time_s, host_s)
-
-    @property
-    def telemetry_is_old(self) -> bool:
-        """The newest telemetry is too old for a setpoint that is computed from it."""
-        return self.telemetry_age_s(self.host_s) > self.limits.setpoint_age_s

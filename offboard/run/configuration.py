@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, Field, SerializeAsAny, create_model, model_validator
+from pydantic import BaseModel, Field, SerializeAsAny, create_model
 
 from offboard.control import catalogue
 from offboard.control.base import Controller, ControllerSettings
@@ -180,7 +180,7 @@ def check_file(path: Path) -> str:
     if kind == "scenario":
         check_scenario(text, str(path))
     elif kind in PARTS:
-        validate(raw, _model(kind, raw), str(path))
+        validate(raw, _model(kind, raw, str(path)), str(path))
     if kind == "reference":
         build_track(load("flight", choices={kind: name}))
     elif kind == "configuration":
@@ -205,7 +205,8 @@ def flown(text: str) -> FlightConfig:
 
 def _validated(raw: Raw, source: str, *, ignores_unknown: bool = False) -> FlightConfig:
     """`raw` as a FlightConfig whose parts have the classes that they name."""
-    parts: dict[str, Any] = {part: (_model(part, raw.get(part)), ...) for part in PARTS}
+    models = {part: _model(part, raw.get(part), f"{source}: {part}") for part in PARTS}
+    parts: dict[str, Any] = {part: (model, ...) for part, model in models.items()}
     model = create_model("FlightConfig", __base__=FlightConfig, **parts)
     if ignores_unknown:
         raw = known(raw, model)
@@ -244,31 +245,20 @@ def read_part(part: str, name: str) -> Raw:
     path = locate(name, part, laws)
     raw = read(read_text(path), str(path))
     check_kind(raw, part, str(path))
-    validate(raw, _model(part, raw), str(path))
+    validate(raw, _model(part, raw, str(path)), str(path))
     if raw.get("shape") == "table":
         raw["file"] = str(path.parent / raw["file"])
     return raw
 
 
-def _model(part: str, raw: object) -> type[BaseModel]:
-    """The class of a vehicle, or of the controller or reference that `raw` names."""
+def _model(part: str, raw: object, source: str) -> type[BaseModel]:
+    """The class of a vehicle, or of the controller or reference that `raw` names. Raises
+    DocumentError."""
     if part == "vehicle":
         return Vehicle
     key, known = ("law", catalogue.names()) if part == "controller" else ("shape", list(SHAPES))
     named = raw.get(key) if isinstance(raw, dict) else None
     if named not in known:
         problem = f"{key}: {named!r} is not one of" if named else f"{key} is missing; known are"
-        return _refusing(f"{problem} {', '.join(known)}")
+        raise DocumentError(f"{source}: {problem} {', '.join(known)}")
     return catalogue.settings_of(named) if part == "controller" else SHAPES[named]
-
-
-def _refusing(problem: str) -> type[BaseModel]:
-    """A class that refuses every value."""
-
-    class Unknown(BaseModel):
-        @model_validator(mode="before")
-        @classmethod
-        def _refuse(cls, given: object) -> object:
-            raise ValueError(problem)
-
-    return Unknown

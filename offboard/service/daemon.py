@@ -19,7 +19,7 @@ from sdnotify import SystemdNotifier
 
 from offboard import compiled
 from offboard.flight.flight import Outcome
-from offboard.flight.phases import ExitCode, ServiceOptions
+from offboard.flight.phases import WAITING, ExitCode, ServiceOptions
 from offboard.link import clock
 from offboard.link.background import BackgroundWriter
 from offboard.link.connection import open_link
@@ -101,7 +101,7 @@ def run(
 
         def display() -> None:
             manager.alive(clock.monotonic_s(), flights.phase.value)
-            preparation.allowed = not (flights.in_flight or flights.current.vehicle.armed)
+            preparation.allowed = flights.phase in WAITING and not flights.current.vehicle.armed
             show(flights)
             if monitor:
                 monitor.show(flights)

@@ -11,8 +11,7 @@ from collections.abc import Callable, Sequence
 
 from offboard.flight.display import Snapshot
 from offboard.flight.flight import STOPPED, Flight, Outcome
-from offboard.flight.phases import ENDS, FLYING, WAITING, Phase, ServiceOptions
-from offboard.flight.starting import found_engaged
+from offboard.flight.phases import ENDS, WAITING, Phase, ServiceOptions
 from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from offboard.link.interface import Chunk
 from offboard.mavlink.session import Session
@@ -20,12 +19,7 @@ from offboard.run.flight import Prepared
 from offboard.service.preparation import Preparation, VehicleFiles
 from offboard.service.record import Recorder
 
-NAMED_S = 1.0  # until a vehicle has said which one it is
 TEXTS_KEPT = 200
-LEFT_ALONE = (
-    "the vehicle was found in {mode} in the air, and this service has not engaged it: it is left "
-    "alone; switch to another mode and back"
-)
 
 
 class Flights:
@@ -55,7 +49,6 @@ class Flights:
         self._stopping = False
         self._recording = False
         self._shown = 0  # of the present companion's announcements
-        self._told_left_alone = False
         self.announced: list[str] = []
         self.announcements = 0
         self.engagements = 0
@@ -103,8 +96,6 @@ class Flights:
             self._begin_record()
         if self._recording and before is not self.phase:
             self._keep_identified()
-        if self.phase in WAITING:
-            self._explain()
         self._collect()
         return frames
 
@@ -205,16 +196,6 @@ class Flights:
 
     # ------------------------------------------------------------------ what the user reads
 
-    def _explain(self) -> None:
-        """Announce a vehicle that was found engaged and is left alone."""
-        state = self.current
-        if not state.pilot.unclaimed:
-            self._told_left_alone = False
-        elif not (self._told_left_alone or state.left_engaged) and state.in_phase_s > NAMED_S:
-            self._told_left_alone = found_engaged(state)
-            if self._told_left_alone:
-                self.current.announce(LEFT_ALONE.format(mode=state.vehicle.mode))
-
     def _collect(self) -> None:
         said = self.current.announced
         new = said[self._shown :]
@@ -222,8 +203,3 @@ class Flights:
         self._shown = len(said)
         self.announcements += len(new)
         self.announced = [*self.announced, *new][-TEXTS_KEPT:]
-
-    @property
-    def in_flight(self) -> bool:
-        """Whether the vehicle follows us, or was asked to end the flight."""
-        return self.phase in FLYING or self.phase is Phase.LAND
