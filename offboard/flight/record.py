@@ -143,6 +143,7 @@ _PIECE_BYTES = 128 - _HEAD.size
 # datagrams, a number of frames that were not sent, a checksum
 CALL, OTHERS, DROPPED, CHECK = "call", "others", "dropped", "crc"
 SETTINGS = "settings"  # the first call: how the session was set
+RECORDED_SETTINGS = ("system_id", "lockstep", "stream", "sends_first", "capacity_bytes_ps")
 
 
 def vehicle_record(vehicle: VehicleFound) -> ConfigurationRecord:
@@ -212,16 +213,7 @@ class InputRecorder:
         self._chunks: list[list[Any]] = []  # of the turn in progress
         self._readings_us: list[int] = []
         self._crc = 0  # of the frames since the last check
-        self.call(
-            SETTINGS,
-            {
-                "system_id": settings.system_id,
-                "lockstep": settings.lockstep,
-                "stream": settings.stream,
-                "sends_first": settings.sends_first,
-                "capacity_bytes_ps": settings.capacity_bytes_ps,
-            },
-        )
+        self.call(SETTINGS, {name: getattr(settings, name) for name in RECORDED_SETTINGS})
 
     def begin(self, now_s: float, other_datagrams: int) -> float:
         """A turn begins. Returns its time as it is recorded."""

@@ -19,7 +19,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
-from types import TracebackType
 from typing import Any, Protocol
 
 from offboard.documents import shipped
@@ -136,12 +135,7 @@ class SimulatorProcess:
             assert pipe is not None
             pipe.close()
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
