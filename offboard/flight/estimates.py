@@ -159,8 +159,6 @@ WINDOW_S, KEPT_S = 0.5, 1.5
 GROUND_M = 0.2  # lower, the ground may carry it
 LEAST_THRUSTS, LEAST_SPEEDS, LEAST_S = 3, 8, 0.25  # in the window
 LEAST_LIFT = 0.3  # of the weight: less shows too little of the thrust
-SETTLED = 0.02  # of a vehicle that has flown by itself for long
-DIFFERENT = 0.1  # of the hover thrust: a smaller difference is left to the observer
 
 
 class HoverEstimate:
@@ -207,11 +205,6 @@ class HoverEstimate:
             return None
         share = float(np.mean(thrusts[:, 2])) * gravity_mps2 / lift_mps2
         return share if HOVER_THRUST_LIMITS[0] <= share <= HOVER_THRUST_LIMITS[1] else None
-
-
-def differs(hover_thrust: float, vehicle: Vehicle, least: float = DIFFERENT) -> bool:
-    """Whether `hover_thrust` differs from `vehicle`'s by more than the observer should correct."""
-    return abs(hover_thrust / vehicle.hover_thrust - 1.0) > least
 
 
 def _append(samples: deque[tuple[float, ...]], sample: tuple[float, ...]) -> None:

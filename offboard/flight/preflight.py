@@ -296,7 +296,6 @@ def _late(ground: Ground) -> str:
 _ESTIMATOR = "wait for a GPS fix, keep the vehicle still and away from metal; then calibrate"
 _UNFIT = "fly it with its own autopilot; is MAV_TYPE or FRAME_CLASS right?"
 _FAILSAFE = "let the pilot take over first"
-_OTHER = "stop it; limits.begin_with_other_sender=true flies all the same"
 _PORTS = "or give each vehicle its own port"
 _TWIN = "switch one off, or change its system id"
 
@@ -311,7 +310,14 @@ PREFLIGHT = (
     Row("state", BLOCKS, _flown_by_another, "stop that controller", at_once=True, fly_only=True),
     Row("state", BLOCKS, _flown_by_failsafe, _FAILSAFE, at_once=True, fly_only=True),
     Row("state", BLOCKS, _armed, "disarm it", at_once=True, fly_only=True),
-    Row("senders", BLOCKS, lambda ground: ground.other_sender, _OTHER, at_once=True, fly_only=True),
+    Row(
+        "senders",
+        BLOCKS,
+        lambda ground: ground.other_sender,
+        "stop it",
+        at_once=True,
+        fly_only=True,
+    ),
     Row("senders", BLOCKS, lambda ground: several_vehicles(ground.session), _PORTS, at_once=True),
     Row("senders", BLOCKS, lambda ground: twin(ground.session), _TWIN, at_once=True),
     Row("rates", WAIT, _no_telemetry),

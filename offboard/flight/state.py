@@ -28,13 +28,12 @@ from offboard.flight.timing import Busyness, LinkGrowth, VehicleClock
 from offboard.flight.vehicle_state import VehicleState
 from offboard.identification.learner import Learner
 from offboard.mavlink.dialects.base import Dialect, Takeoff
-from offboard.mavlink.events import Heartbeat, Landed, TimesyncReply
+from offboard.mavlink.events import Heartbeat, Landed, TimesyncReply, Triple
 from offboard.mavlink.outgoing import CommandLong, Outgoing, Record
 from offboard.mavlink.session import Session
 from offboard.model.command import Command, PredictedState
 from offboard.model.vehicle import Vehicle
 
-Triple = tuple[float, float, float]
 LEVEL = (0.0, 0.0, 1.0)  # thrust direction
 COMMANDS_KEPT = 7  # as long as an attitude may take to follow
 THRUSTS_KEPT = 40  # as long as a setpoint may be on its way, or the next ones be lost

@@ -15,7 +15,6 @@ import numpy as np
 
 from offboard.flight import decision, failsafe, flying, outbox, starting
 from offboard.flight.authority import PilotSwitch
-from offboard.flight.estimates import DIFFERENT, SETTLED, differs
 from offboard.flight.failsafe import REBOOTED, in_own_failsafe
 from offboard.flight.ground_contact import Touchdown
 from offboard.flight.phases import (
@@ -33,6 +32,8 @@ from offboard.flight.state import FlightState, Outcome
 from offboard.identification.learner import Stage
 from offboard.mavlink.events import LocalPosition
 
+DIFFERENT = 0.1  # of the hover thrust: a smaller difference is left to the observer
+SETTLED = 0.02  # the same, of a vehicle that has flown by itself for long
 TAKEN = "a failsafe of the vehicle has it, as its HEARTBEAT shows"
 STAGES = {
     Phase.CLIMB: Stage.CLIMB,
@@ -259,7 +260,7 @@ def _set_hover_thrust(flight: FlightState, least: float = DIFFERENT) -> None:
     """Fly with the hover thrust measured before the take-over, if it differs from the model's."""
     model = flight.model
     shown = flight.hover.hover_thrust(model, flight.time_s)
-    if shown is None or not differs(shown, model, least):
+    if shown is None or abs(shown / model.hover_thrust - 1.0) <= least:
         return
     flight.model = model.model_copy(update={"hover_thrust": shown})
     flight.observer.set_vehicle(flight.model)

@@ -127,7 +127,10 @@ class VehicleState:
         """That another program controls the vehicle, and which was heard last."""
         other = self.other_sender
         name = f": system {other.system_id} component {other.component_id}" if other else ""
-        return f"another program controls the vehicle on this link, too{name}"
+        return (
+            f"another program controls the vehicle on this link, too{name} "
+            "(limits.begin_with_other_sender=true flies all the same)"
+        )
 
     @property
     def battery(self) -> float:
