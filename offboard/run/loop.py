@@ -24,11 +24,6 @@ from offboard.supervisor.supervisor import Supervisor, SupervisorError
 POLL_S = 0.02
 STOPPED_S = 0.2  # from the beginning of a turn: what it decided does not leave later
 FAILING_S = 0.3  # without a turn that succeeds: give up
-TWICE = "interrupted twice: setpoints stopped, "
-SIMULATED, SUPERVISED = (
-    "the simulation ends",
-    "the supervisor lands the vehicle",
-)
 UNGUARDED = "the supervisor ended: nobody lands the vehicle if this process dies"
 UNANSWERED = "the supervisor does not answer: nobody lands the vehicle if this process dies"
 ANSWERS = "the supervisor answers again"
@@ -261,4 +256,5 @@ class Loop:
         return Outcome(code, sentence, self._log.problem)
 
     def _interrupted(self) -> Outcome:
-        return Outcome(ExitCode.ABORTED, TWICE + (SUPERVISED if self._supervisor else SIMULATED))
+        follows = "the supervisor lands the vehicle" if self._supervisor else "the simulation ends"
+        return Outcome(ExitCode.ABORTED, f"interrupted twice: setpoints stopped, {follows}")

@@ -86,7 +86,8 @@ class Flights:
     def turn(self, chunks: Sequence[Chunk], now_s: float) -> tuple[bytes, ...]:
         """Process all that has arrived; begin the next flight where the last one has ended."""
         if self.current.has_ended() and not self._stopping:
-            self._begin_next()
+            self.close()
+            self._follow(self._source.newest())
         if self.phase in WAITING:
             self._renew_if_changed()
             self._look_for_left()
@@ -99,15 +100,7 @@ class Flights:
         self._collect()
         return frames
 
-    def close(self) -> None:
-        """The service ends."""
-        self._end_record()
-
     # ------------------------------------------------------------------ one flight after another
-
-    def _begin_next(self) -> None:
-        self._end_record()
-        self._follow(self._source.newest())
 
     def _renew_if_changed(self) -> None:
         """Continue to wait with a changed configuration or a remembered vehicle."""
@@ -148,7 +141,8 @@ class Flights:
                 f"hover thrust {known.vehicle.hover_thrust:.3f}; no identification steps"
             )
 
-    def _end_record(self) -> None:
+    def close(self) -> None:
+        """The present flight has ended, or the service does."""
         if self._recording:
             self._recording = False
             self._keep_identified()

@@ -241,7 +241,7 @@ def main() -> None:
         signal.signal(number, signal.SIG_IGN)  # they are meant for the controller
     channel = socket.socket(fileno=os.dup(sys.stdin.fileno()))
     watch = Watch(channel)
-    channel.send(json.dumps(READY).encode() + b"\n")
+    _say_to(channel, READY)
     reason, before_s = "", clock.monotonic_s()
     while not (reason or watch.ended):
         select.select([], [], [], POLL_S)
@@ -249,7 +249,10 @@ def main() -> None:
         reason, before_s = watch.turn(now_s - before_s), now_s
     if reason and watch.known:
         tell = BackgroundWriter[str](lambda said: _tell(channel, said), 1000)
-        _announce(channel, tell, f"taking over: {reason}")
+        try:  # the controller, if it is alive, must know it before the vehicle does
+            _say_to(channel, f"taking over: {reason}")
+        except OSError:
+            tell.put(f"taking over: {reason}")
         TakeOver(watch, watch.known, tell).run(reason)
         tell.close(CLOSE_S)
         if watch.ended:
@@ -270,19 +273,15 @@ def _score(log: int) -> None:
             )
 
 
-def _announce(channel: socket.socket, tell: BackgroundWriter[str], sentence: str) -> None:
-    """The controller, if it is alive, must know it before the vehicle does."""
-    try:
-        channel.send(json.dumps(sentence).encode() + b"\n")
-    except OSError:
-        tell.put(sentence)
+def _say_to(channel: socket.socket, sentence: str) -> None:
+    channel.send(json.dumps(sentence).encode() + b"\n")
 
 
 def _tell(channel: socket.socket, sentences: list[str]) -> None:
     """To the controller; if it is gone, to the terminal, which may wait."""
     for sentence in sentences:
         try:
-            channel.send(json.dumps(sentence).encode() + b"\n")
+            _say_to(channel, sentence)
         except OSError:
             os.write(2, f"offboard supervisor: {sentence}\n".encode())
 
