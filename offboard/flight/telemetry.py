@@ -221,11 +221,14 @@ def _answer(flight: FlightState, asked: CommandRequest) -> None:
 
 def _take_request(flight: FlightState, request: Request) -> Result:
     """Accept it if it leads to another phase now. Of several in one tick the first counts, but to
-    hand the vehicle back replaces any other."""
-    pending = flight.request
-    if pending is not Request.NONE and request is not Request.HAND_BACK:
-        return Result.TEMPORARILY_REJECTED
-    if pending is Request.NONE and not transitions.leads_on(flight, request):
-        return Result.TEMPORARILY_REJECTED
-    flight.request = request
+    hand the vehicle back replaces any other. One that is being obeyed is accepted again: a ground
+    station that missed the answer repeats it."""
+    if flight.request is Request.NONE:
+        possible = transitions.leads_on(flight, request)
+    else:
+        possible = request is Request.HAND_BACK
+    if not possible:
+        obeyed = request is flight.obeyed
+        return Result.ACCEPTED if obeyed else Result.TEMPORARILY_REJECTED
+    flight.request = flight.obeyed = request
     return Result.ACCEPTED

@@ -147,6 +147,8 @@ def _enter(flight: FlightState, row: Transition) -> None:
     flight.vehicle.clear_messages()
     flight.phase = row.target
     flight.began_s = flight.now_s
+    if row.target in WAITING and flight.obeyed is not Request.HAND_BACK:
+        flight.obeyed = Request.NONE
     outbox.announce_phase(flight, reason, cause)
     if source in BEFORE_FLIGHT and row.target in FLYING:
         flight.clock.settle()

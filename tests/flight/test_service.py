@@ -477,9 +477,26 @@ def test_requests_over_mavlink(served: Served) -> None:
         (PAUSE_CONTINUE, DENIED),
         (ARM, UNSUPPORTED),
         (SET_MODE, ACCEPTED),
-        (SET_MODE, TEMPORARILY_REJECTED),
+        (SET_MODE, ACCEPTED),
         (START, TEMPORARILY_REJECTED),
     ]
+
+
+def test_a_request_that_is_being_obeyed_is_accepted_again(served: Served) -> None:
+    """A ground station that missed the answer repeats its command."""
+    pair = served.engaged("ardupilot", reference="lemniscate")
+    pair.until(lambda: pair.phase is Phase.TRACK, 30.0)
+    for command, *parameters in ((PAUSE_CONTINUE, 0.0), (PAUSE_CONTINUE, 1.0), (SET_MODE, 1.0)):
+        pair.command(command, *parameters)
+        pair.command(command, *parameters)
+        pair.run(0.2)
+        pair.command(command, *parameters)
+        pair.run(0.2)
+    assert pair.acks == [(PAUSE_CONTINUE, ACCEPTED)] * 6 + [(SET_MODE, ACCEPTED)] * 3
+    assert pair.phase is Phase.STANDBY
+    pair.command(PAUSE_CONTINUE, 1.0)
+    pair.run(0.2)
+    assert pair.acks[-1] == (PAUSE_CONTINUE, TEMPORARILY_REJECTED)
 
 
 def test_a_pilot_who_engages_and_takes_it_again_at_once_has_it(served: Served) -> None:
