@@ -123,7 +123,7 @@ class FlightState:
     rebooted: bool = False
     left_engaged: bool = False  # a flight that was cut short has left the vehicle engaged
     request: Request = Request.NONE  # of the ground station, until the next tick
-    obeyed: Request = Request.NONE  # the newest that was accepted, while its flight lasts
+    obeyed: Request = Request.NONE  # the newest one that changed the phase, or will
     stop_reason: str = ""  # why the flight shall end; empty while it shall not
     outcome: Outcome | None = None
 

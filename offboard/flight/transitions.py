@@ -106,7 +106,8 @@ def advance(flight: FlightState) -> None:
         if row is None:
             break
         _enter(flight, row)
-    flight.request = Request.NONE
+    if flight.request is not Request.NONE:  # its row holds no more
+        flight.request = flight.obeyed = Request.NONE
 
 
 def _note_failsafe(flight: FlightState) -> None:
@@ -147,8 +148,6 @@ def _enter(flight: FlightState, row: Transition) -> None:
     flight.vehicle.clear_messages()
     flight.phase = row.target
     flight.began_s = flight.now_s
-    if row.target in WAITING and flight.obeyed is not Request.HAND_BACK:
-        flight.obeyed = Request.NONE
     outbox.announce_phase(flight, reason, cause)
     if source in BEFORE_FLIGHT and row.target in FLYING:
         flight.clock.settle()
