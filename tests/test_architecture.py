@@ -75,7 +75,7 @@ def test_one_place_makes_a_setpoint() -> None:
         and isinstance(node.func, ast.Name)
         and node.func.id in ("AttitudeTarget", "PositionTarget")
     }
-    assert makers == {"offboard/flight/setpoint.py"}
+    assert makers == {"offboard/flight/outbox.py"}
 
 
 def test_top_level_holds_only_what_the_layout_names() -> None:

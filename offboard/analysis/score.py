@@ -25,8 +25,8 @@ from offboard.analysis.tracking import passed_s, tracking_metrics, window_of
 from offboard.analysis.verdict import begin_times, verdict_metrics
 from offboard.documents.errors import UserError, plain
 from offboard.flight.flight import Outcome
+from offboard.flight.outbox import Refusal
 from offboard.flight.phases import PHASE_CODES, ExitCode, Phase
-from offboard.flight.setpoint import Refusal
 from offboard.link.log import LogError
 
 Array = NDArray[np.float64]

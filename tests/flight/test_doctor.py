@@ -11,11 +11,8 @@ from pair import LEAN
 from pair import make as flight
 
 from offboard.doctor.run import verdict
-from offboard.flight.phases import ExitCode, Limits
-from offboard.flight.preflight import FIX_3D, Ground, Level, findings
-from offboard.flight.vehicle_state import VehicleState
-from offboard.mavlink.dialects.ardupilot import ARDUPILOT as ARDUPILOT_DIALECT
-from offboard.mavlink.events import ESTIMATE, Attitude, EstimatorReport
+from offboard.flight.phases import ExitCode
+from offboard.flight.preflight import Level
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
@@ -78,17 +75,6 @@ def test_gps_that_is_lost_waits_and_comes_back() -> None:
     assert "no valid horizontal velocity, horizontal position" in found.found
     patient.run_to(15.0)
     assert said(patient.consult()) == {}
-
-
-@pytest.mark.parametrize(("boot_s", "level"), [(33.0, WAIT), (300.0, BLOCKS)])
-def test_estimator_without_position_although_the_gps_has_a_fix(boot_s: float, level: Level) -> None:
-    """ArduCopter 4.6.3 reports a 3D fix 10 s after its start, and a position 42 s after it."""
-    starting = VehicleState(
-        estimator=EstimatorReport(frozenset(ESTIMATE) - {"horizontal position"}, ratios=()),
-        attitude=Attitude(boot_s, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
-    )
-    ground = Ground(starting, Limits(), ARDUPILOT_DIALECT, fix_type=FIX_3D)
-    assert {found.level for check, _, found in findings(ground) if check == "estimator"} == {level}
 
 
 @pytest.mark.parametrize(

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from service_wire import Wire
 from serving import ARM, HOVER, SET_MODE, TAKEOFF, Serving, serve
 
-from offboard.flight.flight import Output
 from offboard.flight.phases import Phase
 
 CODEC = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
@@ -38,8 +36,8 @@ class Watched:
         turn = pair.companion.turn
 
         def added(*arguments: Any) -> Any:
-            output = turn(*arguments)
-            return Output() if self.silent else replace(output, send=(*output.send, *self.extra))
+            frames = turn(*arguments)
+            return () if self.silent else (*frames, *self.extra)
 
         pair.companion.turn = added  # type: ignore[method-assign]
         self.wire = Wire(pair)

@@ -8,14 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from offboard.flight.inputs import (
-    Call,
-    Check,
+from offboard.flight.record import (
+    CHECK,
+    OTHERS,
     ChunkInput,
     Entry,
     InputRecorder,
     InputsError,
-    OtherDatagrams,
+    Note,
     TurnInput,
     entries,
 )
@@ -51,7 +51,7 @@ def test_what_is_read_is_what_was_recorded(turns) -> None:
     read = recorder.watch(lambda: now_us / 1e6)
     for at_us, counted, chunks, readings, is_tick in turns:
         if counted != other_datagrams:
-            expected.append(OtherDatagrams(counted))
+            expected.append(Note(OTHERS, (counted,)))
         other_datagrams, now_us = counted, at_us
         assert recorder.begin(at_us / 1e6 + 2e-7, counted) == at_us / 1e6
         for peer, before_us, frames, unlogged in chunks:
@@ -76,7 +76,7 @@ def test_what_is_read_is_what_was_recorded(turns) -> None:
     pieces += recorder.pieces(all_of_it=True)
     assert all(len(piece.data) <= 128 for piece in pieces)
     found = list(entries(piece.data for piece in pieces))
-    assert [each for each in found[1:] if not isinstance(each, Check)] == expected
+    assert [each for each in found[1:] if getattr(each, "kind", "") != CHECK] == expected
 
 
 def recorded(turns: int) -> list[bytes]:
@@ -126,5 +126,5 @@ def test_in_lockstep_no_host_time_is_recorded() -> None:
 
     assert pieces(0.01, 14580) == pieces(0.37, 20000)
     first = next(entries(pieces(0.01, 14580)))
-    assert isinstance(first, Call)
-    assert first.arguments[0]["lockstep"] is True
+    assert isinstance(first, Note)
+    assert first.values[1]["lockstep"] is True

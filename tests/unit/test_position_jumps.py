@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from offboard.flight.positioning import PositionJumps
+from offboard.flight.estimates import PositionJumps
 from offboard.mavlink.events import LocalPosition
 
 SPEED = (1.0, -0.5, 0.2)

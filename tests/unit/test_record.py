@@ -6,11 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 from laws import at
+from uneventful import uneventful
 
 from offboard.control.base import Certificate, Decision
+from offboard.flight.decision import tick_record
+from offboard.flight.outbox import Refusal
 from offboard.flight.phases import Phase
-from offboard.flight.record import Decided, Tick, TickRecord
-from offboard.flight.setpoint import Refusal
+from offboard.flight.record import Decided, TickRecord
 from offboard.model.command import Command
 
 COMMAND = Command(9.0, (0.6, 0.0, 0.8), 0.3)
@@ -21,8 +23,8 @@ CERTIFIED = ("cost", "optimal_cost", "gap", "spread", "iterations", "cut_short",
 
 def record(sent: Command | None, **more: Refusal) -> TickRecord:
     state = at((0.0, 0.0, 0.0), 0.0)
-    decided = Decided(Tick(5.0), Phase.TRACK, state, DECISION, 0.001, sent, **more)
-    return decided.record(answer_s=0.002, hover_thrust=0.5, track_time_s=1.0)
+    decided = Decided(Phase.TRACK, state, DECISION, 0.001, sent, **more)
+    return tick_record(uneventful(), decided, 0.002)
 
 
 def certificate(of: TickRecord) -> list[float]:
