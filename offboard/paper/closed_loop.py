@@ -22,6 +22,7 @@ from offboard.control.swarm import certify
 from offboard.documents import shipped
 from offboard.documents.reading import parse
 from offboard.link.clock import monotonic_s
+from offboard.model.axes import LinearModel
 from offboard.model.command import PredictedState
 from offboard.model.frames import quaternion_from_euler, rotation_from_quaternion
 from offboard.model.rigid_body import (
@@ -38,19 +39,15 @@ from offboard.model.rigid_body import (
     Z,
     derivative_into,
     hover_input,
+    hover_matrices,
     pack,
     quaternion_state,
     rk4_into,
     sampled_matrices,
 )
 from offboard.model.vehicle import Vehicle
-from offboard.paper.controller import (
-    PAPER_STEP_S,
-    PaperLaw,
-    PaperSettings,
-    flyable_box,
-    heading_frame,
-)
+from offboard.paper.controller import flyable_box, heading_frame
+from offboard.paper.law import INTEGRATED, PAPER_STEP_S, PaperLaw, PaperSettings
 from offboard.reference.base import FlatSample
 from offboard.reference.path import Smoothness
 from offboard.reference.shapes import HeadingMode, Hover, Waypoints
@@ -114,31 +111,46 @@ class PlantKind(StrEnum):
 
 
 class LinearPlant:
-    """Eq. 14 with C = I."""
+    """Eq. 14 with C = I. A constant wind acts as a force through the drag, sampled exactly.
+
+    Args:
+        wind_ned_mps: wind velocity (3,).
+        thrust_loss: missing fraction of the total thrust, 0 to 1.
+    """
+
+    def __init__(self, wind_ned_mps: Array, thrust_loss: float = 0.0) -> None:
+        vehicle, self._thrust_loss = paper_vehicle(), thrust_loss
+        dynamics, _ = hover_matrices(vehicle)
+        force = np.zeros((len(dynamics), 1))
+        drag = np.array(vehicle.drag_translation_npmps) / vehicle.mass_kg
+        force[U : W + 1, 0] = drag * wind_ned_mps
+        self._wind_effect = LinearModel(dynamics, force).sampled(PAPER_STEP_S).input_map[:, 0]
 
     def next_state(self, state: Array, inputs: Array) -> Array:
         """x(k+1) (12,) from x(k) (12,) and u(k) (4,)."""
-        dynamics, control_map = paper_model()
-        following: Array = dynamics @ state + control_map @ inputs
+        (dynamics, control_map), delivered = paper_model(), _delivered(inputs, self._thrust_loss)
+        following: Array = dynamics @ state + control_map @ delivered + self._wind_effect
         return following
 
 
 class NonlinearPlant:
-    """Eq. 7, integrated by RK4 in ten substeps; the total thrust is never negative. Velocities u,
-    v, w are in body axes."""
+    """Eq. 7, integrated by RK4 in ten substeps; the total thrust is never negative.
 
-    def __init__(self) -> None:
-        vehicle = paper_vehicle()
-        self._hover, self._parameters = hover_input(vehicle), pack(vehicle)
+    Arguments and `next_state` as for `LinearPlant`; velocities u, v, w are in body axes.
+    """
+
+    def __init__(self, wind_ned_mps: Array, thrust_loss: float = 0.0) -> None:
+        vehicle, self._thrust_loss = paper_vehicle(), thrust_loss
+        self._hover = hover_input(vehicle)
+        self._constants = np.array(wind_ned_mps, np.float64), pack(vehicle)
         self._scratch = np.empty((RK4_SCRATCH_ROWS, EULER.size))
 
     def next_state(self, state: Array, inputs: Array) -> Array:
         """x(k+1) (12,) from x(k) (12,) and u(k) (4,)."""
-        total = self._hover + inputs
+        total = self._hover + _delivered(inputs, self._thrust_loss)
         total[THRUST] = max(total[THRUST], 0.0)
         following, step_s = state.copy(), PAPER_STEP_S / _SUBSTEPS
-        calm = np.zeros(3)
-        follow(following, total, calm, self._parameters, step_s, _SUBSTEPS, self._scratch)
+        follow(following, total, *self._constants, step_s, _SUBSTEPS, self._scratch)
         return following
 
 
@@ -157,6 +169,13 @@ def follow(
         rk4_into(derivative_into, state, inputs, wind_ned, parameters, step_s, scratch, state)
 
 
+def _delivered(inputs: Array, thrust_loss: float) -> Array:
+    """Inputs (4,) that the rotors deliver: a fraction of the total thrust is missing."""
+    delivered = inputs.copy()
+    delivered[THRUST] -= thrust_loss * (hover_input(paper_vehicle())[THRUST] + inputs[THRUST])
+    return delivered
+
+
 # ---------------------------------------------------------------------- flights
 
 
@@ -164,13 +183,16 @@ def follow(
 class FlightTask:
     """`hover`: instead of the path of Figs. 5-6. `cost_to_go`: the Riccati solution replaces Q of
     Eq. 21; for a hover, as no moving reference is what the model itself would do. `start_offset_m`
-    is the start relative to the reference's start, NED."""
+    is the start relative to the reference's start, NED; `thrust_loss` the missing fraction of the
+    total thrust."""
 
     settings: PaperSettings
     plant: PlantKind = PlantKind.LINEAR
     hover: bool = False
     cost_to_go: bool = False
     steps: int = 1000
+    wind_ned_mps: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    thrust_loss: float = 0.0
     start_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     seed: int = 0
 
@@ -214,7 +236,9 @@ class Flight:
 def fly(task: FlightTask) -> Flight:
     """Fly `task`; the same task gives the same flight, except for the solve times."""
     settings, nonlinear = task.settings, task.plant is PlantKind.NONLINEAR
-    plant = NonlinearPlant() if nonlinear else LinearPlant()
+    plant = (NonlinearPlant if nonlinear else LinearPlant)(
+        np.array(task.wind_ned_mps), task.thrust_loss
+    )
     lower, upper = flyable_box(paper_vehicle(), settings) if nonlinear else (None, None)
     terminal = cost_to_go(settings) if task.cost_to_go else None
     law = PaperLaw(*paper_model(), settings, lower, upper, terminal, seed=task.seed)
@@ -226,7 +250,12 @@ def fly(task: FlightTask) -> Flight:
         target = tracked[k + 1]
         seen, wanted = _in_heading_frame(state, target) if nonlinear else (state, target)
         started = monotonic_s()
-        move = law.move(seen, wanted)
+        move = law.move(
+            seen,
+            wanted,
+            error=(state - tracked[k])[list(INTEGRATED)],
+            heading_rad=state[PSI] if nonlinear else 0.0,
+        )
         solve_s = monotonic_s() - started
         certificate = certify(move.problem, move.result, exact)
         quality.append((certificate.cost, certificate.spread, certificate.gap, solve_s))

@@ -26,7 +26,7 @@ from offboard.control.swarm import Swarm
 from offboard.model.rigid_body import PSI, U, X
 from offboard.paper import closed_loop
 from offboard.paper.closed_loop import Flights, FlightTask, PlantKind, damped, paper_model
-from offboard.paper.controller import PAPER_STEP_S, PaperLaw, PaperSettings
+from offboard.paper.law import PAPER_STEP_S, PaperLaw, PaperSettings
 from offboard.paper.printed import BEST_DAMPING, LEAST_DAMPING, TABLE_2, UNDAMPED
 
 Array = NDArray[np.float64]

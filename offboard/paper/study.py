@@ -16,7 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from offboard.analysis.page import Figure, render
 from offboard.documents.errors import UserError
-from offboard.paper import figures, horizon, tables
+from offboard.paper import extensions, figures, tables
 from offboard.paper.closed_loop import Flights
 from offboard.paper.printed import DOI
 from offboard.paper.tables import Table, shown
@@ -35,7 +35,10 @@ SECTIONS: dict[str, dict[str, Callable[[Flights], Table | Figure]]] = {
     },
     "Errata, with computed evidence": {"table errata": tables.errata_table},
     "One step compared with longer horizons": {
-        "table horizon": horizon.horizon_table, "figure laws": horizon.laws_figure,
+        "table horizon": extensions.horizon_table, "figure laws": extensions.laws_figure,
+    },
+    "Extensions that the conclusions propose": {
+        "table integral": extensions.integral_table, "table limits": extensions.limits_table,
     },
 }  # fmt: skip
 MAKERS = {label: make for pieces in SECTIONS.values() for label, make in pieces.items()}
@@ -73,9 +76,7 @@ def reproduce(
     label. Raises UserError for invalid arguments or an output that cannot be written.
     """
     check(out, labels, seeds)
-    labels = list(dict.fromkeys(labels)) or sorted(
-        MAKERS, key=lambda label: label.startswith("figure")
-    )
+    labels = list(dict.fromkeys(labels)) or sorted(MAKERS, key=lambda label: label[0] == "f")
     made: dict[str, Table | Figure] = {}
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
     progress = Progress(*columns, TimeElapsedColumn(), console=console or Console(stderr=True))

@@ -22,7 +22,7 @@ from offboard.paper.closed_loop import (
     damped,
     paper_vehicle,
 )
-from offboard.paper.controller import PaperSettings
+from offboard.paper.law import PaperSettings
 
 Array = NDArray[np.float64]
 Cell = float | int | str | None

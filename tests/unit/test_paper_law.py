@@ -11,14 +11,13 @@ from laws import at
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from offboard.control.base import DecisionError, Situation
+from offboard.control.base import ControllerSettings, DecisionError, Situation
 from offboard.control.swarm import SwarmSettings
 from offboard.documents.reading import parse
 from offboard.model.command import Command, PredictedState
 from offboard.model.rigid_body import hover_matrices, sampled_matrices
 from offboard.model.vehicle import Vehicle
 from offboard.paper.controller import (
-    Move,
     PaperController,
     PaperLaw,
     PaperSettings,
@@ -26,7 +25,9 @@ from offboard.paper.controller import (
     heading_frame,
     input_scale,
 )
+from offboard.paper.law import IntegralSettings, Move
 from offboard.reference.base import FlatSample
+from offboard.run.configuration import load
 
 Array = NDArray[np.float64]
 
@@ -107,9 +108,13 @@ def test_the_heading_frame_is_eq_5_at_heading_north() -> None:
     assert target == pytest.approx([0] * 6 + [1.0, 0.5, -0.1] + [0] * 3, abs=1e-12)
 
 
-def test_the_law_is_the_same_at_every_heading() -> None:
-    """Beside the wrap of the heading."""
-    controller, heading = PaperController(PAPER), 3.1
+SUMMED = IntegralSettings(weights=(80.0, 80.0, 15.0, 50.0))
+
+
+@pytest.mark.parametrize("settings", [PaperSettings(), PaperSettings(integral=SUMMED)])
+def test_the_law_is_the_same_at_every_heading(settings: PaperSettings) -> None:
+    """Beside the wrap of the heading; with the sum of three decisions, where there is one."""
+    controller, heading = PaperController(PAPER, settings), 3.1
     commands = []
     for seen_from in (0.0, heading):
         controller.reset()
@@ -215,3 +220,75 @@ def test_a_deadline_is_kept_and_every_decision_has_its_certificate() -> None:
     assert certificate.cost == pytest.approx(certificate.optimal_cost, rel=1e-9)
     assert 0 < certificate.spread < 1e-6
     assert not certificate.at_bound
+
+
+def test_the_summed_error_stays_within_its_limits() -> None:
+    """The sum acts on the slope of the cost; at its limits a further error changes nothing."""
+    narrow = SUMMED.model_copy(update={"limits": (0.1, 0.1, 0.1, 0.1)})
+    settings = PaperSettings(rate=(0, 0, 0, 0), integral=narrow)
+    law = PaperLaw(*sampled_matrices(PAPER, 0.1), settings)
+    slopes = [
+        law.move(np.zeros(12), np.zeros(12), error=np.full(4, error)).problem.gradient
+        for error in (0.05, 0.96, 5.0, np.nan, -0.5)
+    ]
+    assert np.allclose(20 * slopes[0], slopes[1], rtol=1e-9)  # 0.005, then 0.1
+    assert np.array_equal(slopes[1], slopes[2])
+    assert np.array_equal(slopes[2], slopes[3])
+    assert np.allclose(0.5 * slopes[3], slopes[4], rtol=1e-9)  # down to 0.05
+
+
+def test_the_error_is_not_summed_while_an_input_is_at_its_bound() -> None:
+    settings = PaperSettings(rate=(0, 0, 0, 0), integral=SUMMED)
+    law = PaperLaw(*sampled_matrices(PAPER, 0.1), settings)
+    for down_m, held in ((1000.0, True), (0.01, False)):
+        law.reset()
+        target = np.zeros(12)
+        target[11] = down_m
+        moves = [law.move(np.zeros(12), target, error=np.full(4, 1e-3)) for _ in range(2)]
+        first, second = (move.problem.gradient for move in moves)
+        assert np.array_equal(first, second) == held
+
+
+def body_z(roll: float, pitch: float, _: float) -> Array:
+    """The axis in NED, at heading 0."""
+    level = np.cos(roll)
+    return np.array([np.sin(pitch) * level, -np.sin(roll), np.cos(pitch) * level])
+
+
+def flown_over_an_attitude_loop(name: str) -> tuple[ControllerSettings, Array, Array]:
+    """20 s of a shipped controller towards a far point: a point mass with drag behind a
+    second-order attitude loop. Its settings; velocities and commanded roll and pitch, per decision.
+    """
+    config = load("paper", choices={"controller": name})
+    vehicle, far = config.vehicle, Straight(np.array([150.0, 80.0, -10.0]), np.zeros(3), 0.0)
+    controller = config.controller.build(vehicle, period_s=0.1, seed=1)
+    position, velocity, angles, turning = np.zeros((4, 3))
+    wn, z, command, flown = vehicle.tilt.natural_frequency_radps, vehicle.tilt.damping, HOVER, []
+    for tick in range(200):
+        state = replace(
+            state_at(position, velocity, rates=turning),
+            time_s=0.1 * tick,
+            thrust_direction_ned=body_z(*angles),
+            thrust_mps2=command.thrust_mps2,
+        )
+        command = controller.decide(Situation(0.1 * tick, state, far, command)).command
+        north, east, down = command.thrust_direction_ned
+        asked = np.array([-np.arcsin(east), np.arctan2(north, down), 0.0])
+        flown.append((velocity, asked))
+        for _ in range(20):
+            turning = turning + 0.005 * (wn**2 * (asked - angles) - 2 * z * wn * turning)
+            angles = angles + 0.005 * turning
+            pull = np.array([0, 0, vehicle.gravity_mps2]) - vehicle.drag_per_mass_ps * velocity
+            velocity = velocity + 0.005 * (pull - command.thrust_mps2 * body_z(*angles))
+            position = position + 0.005 * velocity
+    velocities, tilts = np.array(flown).transpose(1, 0, 2)
+    return config.controller, velocities, tilts
+
+
+def test_the_limited_law_keeps_speed_and_tilt_over_an_attitude_loop() -> None:
+    settings, slow, level = flown_over_an_attitude_loop("paper_limited")
+    _, fast, steep = flown_over_an_attitude_loop("paper")
+    limits = settings.limits
+    assert np.abs(fast[:, :2]).max() > limits.speed_mps >= np.abs(slow[:, :2]).max()
+    assert np.abs(slow[:, 2]).max() <= limits.climb_mps
+    assert np.abs(steep[:, 1]).max() > limits.tilt_rad >= np.abs(level).max()

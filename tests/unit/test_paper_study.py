@@ -18,26 +18,34 @@ from rich.console import Console
 from scipy.linalg import solve_discrete_are
 
 from offboard.analysis.page import Figure
+from offboard.control.swarm import certify
 from offboard.documents.errors import UserError
-from offboard.paper import closed_loop, tables
+from offboard.paper import closed_loop, extensions, tables
 from offboard.paper.closed_loop import (
     Flight,
     Flights,
     FlightTask,
+    LinearPlant,
+    NonlinearPlant,
     PlantKind,
     damped,
     fly,
     paper_model,
+    paper_vehicle,
 )
-from offboard.paper.controller import PaperLaw, PaperSettings
-from offboard.paper.horizon import receding
+from offboard.paper.extensions import receding
+from offboard.paper.law import LimitedBox, PaperLaw, PaperSettings, StateLimits
 from offboard.paper.study import MAKERS, PAGE, check, reproduce
+from offboard.run.configuration import load
 
 Array = NDArray[np.float64]
 
 FINAL = PaperSettings()
 Q, R, RATE = (np.diag(part) for part in (FINAL.fitness, FINAL.energy, FINAL.rate))
 BOX = np.array(FINAL.lower), np.array(FINAL.upper)
+TIGHT = StateLimits(
+    tilt_rad=0.2, tilt_rate_radps=0.3, yaw_rate_radps=0.5, speed_mps=1.2, climb_mps=0.4
+)
 FLIGHTS = Flights(seeds=2)
 
 
@@ -115,6 +123,20 @@ def test_cost_to_go_settles_a_hundred_times_closer(plant: PlantKind) -> None:
     assert best < 0.01 * one
 
 
+def test_both_plants_settle_alike_in_wind_and_with_weak_thrust() -> None:
+    """A level vehicle reaches the wind's velocity, and sinks at the rate that its drag allows."""
+    vehicle = paper_vehicle()
+    sink = 0.1 * vehicle.mass_kg * vehicle.gravity_mps2 / vehicle.drag_translation_npmps[2]
+    wind = np.array([1.5, -0.5, 0.2])
+    for kind in (LinearPlant, NonlinearPlant):
+        blown, weak = np.zeros(12), np.zeros(12)
+        for _ in range(200):
+            blown = kind(wind).next_state(blown, np.zeros(4))
+            weak = kind(np.zeros(3), 0.1).next_state(weak, np.zeros(4))
+        np.testing.assert_allclose(blown[6:9], wind, atol=1e-6)
+        assert weak[8] == pytest.approx(sink, rel=1e-6)
+
+
 # ---------------------------------------------------------------- the printed tables
 
 
@@ -155,6 +177,89 @@ def test_reweighting_takes_nearly_all_of_the_error() -> None:
     after = np.mean([flight.errors[-1] for flight in FLIGHTS.by_seed(FINAL)])
     assert after < 0.05 * before  # printed ratio 0.0163
     assert 1e6 < before < 3e7  # printed 5.3519e6
+
+
+# ---------------------------------------------------------------- integral term, state limits
+
+
+@pytest.mark.slow
+def test_integral_removes_the_steady_error() -> None:
+    for row in extensions.integral_table(FLIGHTS).rows:
+        if row["law"] == "integral":
+            assert row["steady position error, m"] < 1e-3, row
+        else:  # with the weights alone it stays
+            assert row["steady position error, m"] > 0.1, row
+
+
+@pytest.mark.slow
+def test_limits_hold_in_every_sample_of_the_path() -> None:
+    for row in extensions.limits_table(FLIGHTS).rows:
+        if row["law"] == "limited":
+            assert row["greatest"] <= row["limit"] * (1 + 1e-9), row
+        if row["state"] in ("tilt_rad", "speed_mps"):
+            free = row["law"] == "free"
+            assert row["greatest"] > (1.2 if free else 0.8) * row["limit"], row
+
+
+def test_flight_and_study_fly_the_same_extensions() -> None:
+    law = load("paper", choices={"controller": "paper_integral"}).controller
+    assert (law.fitness, law.integral) == (
+        extensions.INTEGRAL.fitness,
+        extensions.INTEGRAL.integral,
+    )
+    limits = load("paper", choices={"controller": "paper_limited"}).controller.limits
+    assert limits.margin >= extensions.MARGIN
+    assert limits.model_copy(update={"margin": 0.0}) == extensions.LIMITS
+
+
+def test_limits_hold_whatever_is_done_within_the_narrowed_box() -> None:
+    """Bang-bang by chance: the corner of the box, drawn anew now and then, for 3000 steps."""
+    dynamics, inputs = paper_model()
+    box = LimitedBox(dynamics, inputs, TIGHT, *BOX)
+    rng = np.random.default_rng(1)
+    state, corner, greatest = np.zeros(12), np.zeros(4), np.zeros(12)
+    for k in range(3000):
+        if k % 7 == 0:
+            corner = rng.choice([0.0, 1.0], 4)
+        lower, upper = box.narrow(state)
+        assert (lower <= upper).all()
+        state = dynamics @ state + inputs @ (lower + corner * (upper - lower))
+        greatest = np.maximum(greatest, np.abs(state))
+    for index, limit in TIGHT.per_state().items():
+        assert greatest[index] <= limit * (1 + 1e-9)
+        assert greatest[index] > 0.9 * limit
+
+
+def test_outside_the_limits_the_vehicle_brakes_and_comes_back() -> None:
+    dynamics, inputs = paper_model()
+    box, state = LimitedBox(dynamics, inputs, TIGHT, *BOX), np.zeros(12)
+    state[6] = 2.0 * TIGHT.speed_mps  # a gust
+    for _ in range(60):
+        lower, _ = box.narrow(state)
+        state = dynamics @ state + inputs @ lower
+    assert abs(state[6]) <= TIGHT.speed_mps
+
+
+def test_the_certificate_is_of_the_narrowed_box() -> None:
+    settings = PaperSettings(limits=TIGHT)
+    law = PaperLaw(*paper_model(), settings)
+    target = np.zeros(12)
+    target[9:] = 50.0
+    state = np.zeros(12)
+    for _ in range(40):
+        move = law.move(state, target)
+        certificate = certify(move.problem, move.result)
+        assert certificate.gap <= 1e-9
+        state = move.following
+    assert certificate.at_bound
+    assert abs(state[6]) <= TIGHT.speed_mps * (1 + 1e-9)
+
+
+def test_coupled_axes_are_refused() -> None:
+    dynamics, inputs = (matrix.copy() for matrix in paper_model())
+    inputs[3, 2] = 0.1
+    with pytest.raises(ValueError, match="axes that do not couple"):
+        LimitedBox(dynamics, inputs, TIGHT, *BOX)
 
 
 # ---------------------------------------------------------------- the run and its page
