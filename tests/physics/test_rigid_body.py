@@ -235,8 +235,3 @@ def test_other_lengths_are_refused(lopsided: Vehicle) -> None:
         state, inputs, wind = map(np.zeros, shapes)
         with pytest.raises(ValueError, match="12 or 13, 4 and 3"):
             derivative(state, inputs, pack(lopsided), wind)
-
-
-def test_the_way_between_the_charts_is_a_round_trip() -> None:
-    states = random_states(50, 21).reshape(5, 10, 12)
-    assert_allclose(euler_state(quaternion_state(states)), states, atol=1e-13)
