@@ -85,8 +85,3 @@ def test_top_level_holds_only_what_the_layout_names() -> None:
     top = {name.split("/")[0] for name in listed if not name.startswith(".")}
     pages = {"README.md", "LICENSE", "CHANGELOG.md", "CONTRIBUTING.md"}
     assert top <= {"pyproject.toml", "offboard", "simulator", "config", "tests"} | pages
-
-
-def test_test_modules_import_no_test_modules() -> None:
-    tests = (ROOT / "tests").rglob("*.py")
-    assert not {str(path) for path in tests if any(n.startswith("test_") for n in _names(path))}

@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from offboard.model.geodesy import EARTH_RADIUS_M, Geodetic, origin_of, position_ned_m
-
-ZURICH = Geodetic(47.3977435, 8.5455941, 489.277)
+from offboard.model.geodesy import EARTH_RADIUS_M, Geodetic, position_ned_m
 
 
 def unit(place: Geodetic) -> np.ndarray:
@@ -32,9 +30,3 @@ def test_distance_and_bearing_are_the_sphere_s(
     north, east, down = position_ned_m(place, origin)
     assert (north, east) == pytest.approx(expected, abs=1e-6)
     assert down == origin[2] - 3.0
-
-
-@pytest.mark.parametrize("known", [(0.47, 0.015, -0.03), (-300.0, 4000.0, -120.0)])
-def test_origin_is_where_the_place_lies_as_known(known: tuple[float, float, float]) -> None:
-    origin = origin_of(ZURICH, known)
-    assert position_ned_m(ZURICH, origin) == pytest.approx(known, abs=1e-6)

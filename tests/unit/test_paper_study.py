@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import io
-import json
 import math
 from dataclasses import replace
 from functools import cache
@@ -315,15 +313,6 @@ def test_the_page_opens_without_a_network_and_shows_everything(run: Run) -> None
         table = made[name]
         assert isinstance(table, tables.Table)
         assert count == len(table.rows)
-
-
-@pytest.mark.slow
-def test_csv_and_json_say_the_same(run: Run) -> None:
-    out = run[0].out
-    lines = list(csv.DictReader((out / "table_horizon.csv").open(encoding="utf-8")))
-    document = json.loads((out / "table_horizon.json").read_text(encoding="utf-8"))
-    assert [row["law"] for row in lines] == [row["law"] for row in document["rows"]]
-    assert float(lines[1]["time_constant_s"]) == document["rows"][1]["time_constant_s"]
 
 
 def test_bad_options_are_one_sentence(tmp_path: Path) -> None:
