@@ -19,6 +19,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from offboard.analysis import tlog
 from offboard.cli.daemon import may_pass
 from offboard.flight import inputs
+from offboard.flight.authority import PilotSwitch
 from offboard.flight.flight_plan import CLEAR_M, FlightPlan
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_estimate import IdentifiedVehicle
@@ -318,6 +319,30 @@ def test_a_changed_configuration_is_used_and_a_bad_one_refused(
     assert watched.newest() is first
     assert news(3) == ["the configuration has changed: used from the next flight on"]
     assert "height_m: 3" in watched.newest().text
+
+
+def test_a_switch_counts_in_the_air_from_a_mode_without_failsafe() -> None:
+    switch = PilotSwitch()
+
+    def shows(ours: bool, failsafe: bool = False, in_the_air: bool = True) -> bool:
+        switch.on_mode(ours=ours, in_the_air=in_the_air, flies=in_the_air)
+        switch.on_heartbeat(ours=ours, failsafe=failsafe)
+        return switch.engaged
+
+    assert not shows(ours=True)  # found so
+    assert not shows(ours=False, failsafe=True)
+    assert not shows(ours=True)  # PX4 returns by itself
+    assert not switch.hasty
+    assert not shows(ours=False)
+    assert shows(ours=True)
+    assert not shows(ours=False)
+    assert not shows(ours=True, in_the_air=False)
+    assert not shows(ours=True)  # took off in this mode
+    for flies in (True, False):  # by every sign
+        switch = PilotSwitch()
+        switch.on_heartbeat(ours=False, failsafe=False)
+        switch.on_mode(ours=True, in_the_air=True, flies=flies)
+        assert switch.engaged is flies
 
 
 def test_a_reference_that_is_placed_low_stays_clear_of_the_ground() -> None:
