@@ -18,7 +18,7 @@ from simulator.vehicle.noise import (
     fill_normals,
     seed_word,
 )
-from simulator.vehicle.wind import Gusts, dryden, wind_axes
+from simulator.vehicle.wind import Gusts, dryden
 
 
 def _normals(seed: int, lane: int, steps: int, width: int) -> np.ndarray:
@@ -108,8 +108,3 @@ def test_dryden_spectrum_and_variance_of_a_long_run(component, state, sd, time_s
     assert np.mean(ratio) == pytest.approx(1.0, abs=0.06)
     for part in np.array_split(ratio, 5):
         assert np.mean(part) == pytest.approx(1.0, abs=0.15)
-
-
-def test_gusts_lie_along_the_steady_wind():
-    assert wind_axes((0.0, -3.0, 1.0)) == pytest.approx((0.0, -1.0))
-    assert wind_axes((0.0, 0.0, 2.0)) == (1.0, 0.0)

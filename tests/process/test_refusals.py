@@ -113,23 +113,6 @@ def test_other_commands_refuse_alike(command: str, says: str, refused: Refused) 
     assert says in refused(command if command.startswith("offboard") else f"{SIMULATOR} {command}")
 
 
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        (
-            "--to xls -o x",
-            "Invalid value for '--to': 'xls' is not one of 'mcap', 'csv', 'ulog'; see",
-        ),
-        (
-            "-o x",
-            "Missing option '--to'. Choose from: mcap, csv, ulog; see `offboard export --help`",
-        ),
-    ],
-)
-def test_a_wrong_option_is_one_sentence(options: str, says: str, refused: Refused) -> None:
-    assert refused(f"offboard export {RECORDING} {options}").startswith(says)
-
-
 def test_an_unknown_option_is_named(called: Called) -> None:
     for command in (FLY, SIMULATOR):
         code, _, said = called(command, "--no-such-option")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,8 @@ from offboard.flight.phases import Limits
 from offboard.identification.learner import IdentifySettings
 from offboard.model.command import PositionCommand
 from offboard.reference.track import hold
-from offboard.run.configuration import FlightConfig, read_part
+from offboard.run.configuration import FlightConfig, load, read_part
+from offboard.run.flight import Simulated
 
 ENDS = ("minimum", "exclusiveMinimum", "maximum")  # of a JSON schema
 
@@ -84,3 +86,24 @@ def test_the_autopilots_loop_is_given_the_reference() -> None:
     assert command.velocity_ned_mps == pytest.approx(tuple(sample.velocity_ned_mps))
     assert command.acceleration_ned_mps2 == pytest.approx(tuple(sample.acceleration_ned_mps2))
     assert command.heading_rad == pytest.approx(heading)
+
+
+# --- the vehicle of a flight ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("asked", "expected"),
+    [
+        ({}, "neutral"),
+        ({"firmware": "px4"}, "px4_sih"),
+        ({"firmware": "px4", "assignments": ("vehicle=neutral",)}, "neutral"),
+        ({"firmware": "ardupilot", "name": "paper"}, "px4_sih"),
+        ({"choices": {"vehicle": "arducopter"}}, "arducopter"),
+    ],
+)
+def test_vehicle_is_neutral_unless_one_is_named_or_the_simulator_flies_its_own(
+    asked: dict[str, Any], expected: str
+) -> None:
+    firmware, name = asked.pop("firmware", None), asked.pop("name", "flight")
+    known = Simulated(firmware).known_vehicle if firmware else None
+    assert load(name, known_vehicle=known, **asked).vehicle.name == expected

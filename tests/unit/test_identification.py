@@ -16,7 +16,7 @@ from offboard.analysis.identify import estimator_noise
 from offboard.identification import attitude_fit
 from offboard.identification.attitude_fit import ResponseFit
 from offboard.identification.motion_fit import Noise, PositionFilter
-from offboard.identification.response import first_order, second_order
+from offboard.identification.response import second_order
 from offboard.identification.trace import Rows, Trace, clean
 from offboard.identification.uncertainty import Estimate, long_run_covariance
 from offboard.identification.vehicle_fit import Identified, completed, identify
@@ -160,20 +160,6 @@ def test_delay_known_beforehand_counts_by_its_uncertainty():
     assert certain.delay_s.sd < 1e-4
     wrong = [abs(each.natural_frequency_radps.value - 7.0) for each in (alone, certain)]
     assert wrong[1] < 0.7 * wrong[0]
-
-
-def test_first_order_response_equals_scipys_integration():
-    sent_at = np.array([0.0, 0.5, 0.9, 1.4])
-    thrust = np.array([0.4, 0.5, 0.35, 0.45])
-    times = np.arange(0.4, 2.0, 0.013)
-
-    def rate(t, u):
-        row = max(int(np.searchsorted(sent_at + 0.02, t, side="right")) - 1, 0)
-        return (thrust[row] - u) / 0.08
-
-    solved = solve_ivp(rate, (0.0, 2.0), [0.4], t_eval=times, max_step=1e-3, rtol=1e-8)
-    ours = first_order(times, sent_at, thrust[:, None], 0.02, 0.08)[:, 0]
-    assert np.abs(ours - solved.y[0]).max() < 5e-4
 
 
 @cache
