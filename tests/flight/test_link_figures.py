@@ -4,7 +4,7 @@ says of them, and how they are flown. The oracle is the parameter of the fault."
 from __future__ import annotations
 
 import pytest
-from faults import both, late, losing, repeating, stuttering
+from faults import both, late, repeating, stuttering
 from pair import Filter, Pair, in_phase, make, through
 
 from offboard.flight.phases import Phase
@@ -44,14 +44,6 @@ def test_delay_and_duplicates_are_measured(
     assert score.rmse_position_m < rmse_m
     assert score.position_hz == pytest.approx(SENT_HZ, rel=0.02)
     assert score.position_gap_max_s == pytest.approx(1.0 / SENT_HZ, abs=0.007)
-
-
-def test_gaps_of_a_lossy_link_are_measured() -> None:
-    pair = over(losing(0.3), learning=None)
-    pair.track()
-    score = pair.score()
-    assert 0.04 <= score.position_gap_max_s < 0.3
-    assert score.position_hz == pytest.approx(0.7 * SENT_HZ, rel=0.1)
 
 
 def test_the_delay_of_the_link_is_measured_before_lift_off() -> None:

@@ -18,8 +18,8 @@ from offboard.identification.attitude_fit import ResponseFit
 from offboard.identification.motion_fit import Noise, PositionFilter
 from offboard.identification.response import second_order
 from offboard.identification.trace import Rows, Trace, clean
-from offboard.identification.uncertainty import Estimate, long_run_covariance
-from offboard.identification.vehicle_fit import Identified, completed, identify
+from offboard.identification.uncertainty import Estimate
+from offboard.identification.vehicle_fit import completed, identify
 
 VEHICLE_FILE = PX4.model_copy(
     update={"hover_thrust": 0.42, "drag_translation_npmps": (0.6, 0.6, 0.6), "thrust_lag_s": 0.0}
@@ -78,14 +78,6 @@ def test_innovations_of_a_matching_motion_are_white_and_of_unit_variance():
     white = position_filter.innovations(positions[None], np.zeros((1, count)), drag)[0, 200:]
     assert np.mean(white**2) == pytest.approx(1.0, abs=0.03)
     assert abs(np.mean(white[1:] * white[:-1])) < 0.02
-
-
-def test_long_run_covariance_of_residuals_is_that_of_the_errors():
-    """Errors about their mean, as a fit leaves them; without the correction 22 % less."""
-    errors = np.random.default_rng(6).normal(size=(4000, 120, 1))
-    left = errors - errors.mean(axis=1, keepdims=True)
-    found = np.mean([long_run_covariance(each, 15)[0, 0] for each in left])
-    assert found == pytest.approx(120.0, rel=0.03)
 
 
 def rms_in_sds(fits: list[ResponseFit], true) -> np.ndarray:
@@ -248,14 +240,6 @@ def test_reported_velocity_is_not_used():
     assert 0.2 < contradictions[1] < 0.4
 
 
-def test_white_noise_of_the_estimator_is_measured():
-    trace = flown(noise=0.004)
-    noise = estimator_noise(trace)
-    assert noise.position_m == pytest.approx(0.004, rel=0.1)
-    assert noise.attitude_rad == pytest.approx(0.0008, rel=0.15)
-    assert noise.velocity_mps < 1e-4
-
-
 def test_constant_that_the_flight_does_not_determine_is_refused():
     """Hovering without steps determines the hover thrust alone."""
     found = identify(flown(tilt=0.0, heading=0.0, thrust_step=0.0), VEHICLE_FILE)
@@ -283,16 +267,6 @@ def test_attitude_that_does_not_follow_its_commands_is_refused():
     found = identify(Trace(swapped, ours.attitude, ours.position), VEHICLE_FILE)
     assert found.tilt is None
     assert "does not follow" in found.refusals["tilt"] or "limit" in found.refusals["tilt"]
-
-
-def test_almost_empty_trace_is_refused():
-    trace = flown(seconds=3.0)
-    for rows in (0, 1, 5):
-        cut = Trace(trace.commands[:rows], trace.attitude[:rows], trace.position[:rows])
-        found = identify(cut, VEHICLE_FILE)
-        assert found == Identified(0.0, refusals=found.refusals)
-        assert set(found.refusals) >= {"tilt", "yaw", "hover_thrust", "drag_ps"}
-        assert not found.supported
 
 
 def test_last_rows_are_kept_and_cleaned():

@@ -128,11 +128,3 @@ def test_a_stalled_link_delivers_what_its_queue_holds_when_it_ends() -> None:
     channel.on = False
     channel.put(b"next", 12 * STEP_US)
     assert channel.take(12 * STEP_US) == [*sent[:10], b"next"]
-
-
-def test_the_seed_decides() -> None:
-    def run(seed: int) -> list[tuple[int, bytes]]:
-        return carried(500, seed, loss=0.3, jitter_s=0.02, duplication=0.1, corruption=0.1)
-
-    assert run(1) == run(1)
-    assert run(1) != run(2)

@@ -178,15 +178,6 @@ def test_wind_and_a_wrong_hover_thrust_are_absorbed_with_position_at_thirty_hert
     assert rmse_m(5.0, truth, gaps_s=(0.033,)) < 0.006
 
 
-@pytest.mark.parametrize(("tilt_s", "thrust_s"), [(0.177, 0.015), (0.01, 0.13)])
-def test_a_known_delay_costs_little(tilt_s: float, thrust_s: float) -> None:
-    """60 ms more each way, told to the controller; tilt and thrust may act at quite
-    different times, because each loop is closed where its own command acts."""
-    tilt = PX4.tilt.model_copy(update={"delay_s": tilt_s})
-    slow = PX4.model_copy(update={"tilt": tilt, "thrust_delay_s": thrust_s})
-    assert rmse_m(7.0, Truth(slow), slow) < 0.0005
-
-
 def test_a_vehicle_that_leans_by_39_degrees_comes_to_rest() -> None:
     """[circle of 8 m/s at 42 degrees: with the gain of hover a cycle of 0.05 m, without noise]"""
     storm, still = Truth(PX4, wind_force_ned_mps2=(7.9, 0.0, 0.0)), lemniscate(1e6)

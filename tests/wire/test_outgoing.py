@@ -59,16 +59,6 @@ def test_body_axes_have_the_commanded_direction() -> None:
         assert math.remainder(heading_error, 2.0 * math.pi) == pytest.approx(0.0, abs=1e-6)
 
 
-def test_fields_of_a_tilt_that_accelerates_north() -> None:
-    """Acceleration is -T b: nose down."""
-    direction = (-math.sin(0.2), 0.0, math.cos(0.2))
-    message = sent(replace(LEVEL, thrust_direction_ned=direction))
-    assert message.q == pytest.approx([math.cos(0.1), 0.0, -math.sin(0.1), 0.0])
-    assert message.get_type() == "SET_ATTITUDE_TARGET"
-    assert (message.target_system, message.target_component) == (7, 1)
-    assert (message.time_boot_ms, message.type_mask) == (12345, 7)
-
-
 TILTED = (0.5, 0.0, math.cos(math.pi / 6))  # 30 degrees
 
 

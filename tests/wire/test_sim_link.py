@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import struct
 from collections import Counter
@@ -26,7 +25,7 @@ from simulator.mavlink.telemetry import builders
 from simulator.vehicle.conditions import Conditions
 from simulator.vehicle.sensors import EstimatorName
 
-LOCAL_POSITION, GPS_RAW, ATTITUDE_QUATERNION = 32, 24, 31
+LOCAL_POSITION, GPS_RAW = 32, 24
 
 
 def packed_command(number: int) -> bytes:
@@ -68,18 +67,6 @@ def test_each_link_has_the_rates_of_px4_and_its_own_sequence() -> None:
         }
         sequence = [m.get_seq() for m in messages]
         assert sequence == [i % 256 for i in range(len(sequence))]
-
-
-def test_a_hundred_hertz_come_in_gaps_of_8_and_16_ms() -> None:
-    bench = Bench()
-    assert bench.command(511, LOCAL_POSITION, 10_000) == [0]
-    begun_s = bench.time_s
-    bench.run(4.0)
-    stamps = [m.time_boot_ms for _, m in bench.of("LOCAL_POSITION_NED", begun_s)]
-    gaps = Counter(b - a for a, b in itertools.pairwise(stamps))
-    assert set(gaps) == {8, 16}
-    assert gaps[8] / gaps[16] == pytest.approx(3.0, rel=0.05)
-    assert len(stamps) == pytest.approx(400, abs=2)
 
 
 def test_an_interval_can_be_stopped_restored_and_read() -> None:
