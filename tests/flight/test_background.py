@@ -10,7 +10,6 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from offboard.analysis import tlog
 from offboard.link import log as log_module
-from offboard.link.background import BackgroundWriter
 from offboard.link.log import FlightLog
 
 UNIX_US = 1_767_225_600_000_000
@@ -28,25 +27,6 @@ class Disk:
         self.asked.set()
         assert self.free.wait(LONG_S)
         self.items += items
-
-
-@pytest.mark.parametrize("failure", [OSError(28, "No space left"), SystemExit(1)])
-def test_a_failure_is_kept_and_ends_the_writing(failure: BaseException) -> None:
-    written: list[int] = []
-
-    def write(items: list[int]) -> None:
-        if written:
-            raise failure
-        written.extend(items)
-
-    writer = BackgroundWriter(write, 100)
-    writer.put(0)
-    while not written:
-        pass
-    for number in range(1, 6):
-        writer.put(number)
-    writer.close(LONG_S)
-    assert (writer.error, writer.dropped, written) == (failure, 5, [0])
 
 
 def test_a_log_on_a_slow_disk_is_complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

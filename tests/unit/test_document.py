@@ -93,22 +93,15 @@ KEYS = "circles, colour, copies, corner, named, scale, shape, tilt_rad, title, v
     ("text", "sentences"),
     [
         ("scale: -1", ["scale: -1 should be greater than 0"]),
-        ("scale: true", ["scale: true should be a valid number"]),
         ("scale:", ["scale: an empty value should be a valid number"]),
         ("tilt_rad: 1e999", ["tilt_rad: inf should be a finite number"]),
         ("colour: green", ["colour: 'green' should be 'red' or 'blue'"]),
-        ("corner: [1, x]", ["corner.1: 'x' should be a valid number"]),
         ("shape: {kind: square}", ["shape.kind: 'square' is not one of 'circle', 'line'"]),
-        (
-            "circles: [{kind: circle, radius_m: 1}, {kind: circle, radius_m: 0}]",
-            ["circles.1.radius_m: 0 should be greater than 0"],
-        ),
         (
             "shape: {kind: line, point: 3}",
             ["shape.points is missing", "shape.point is not a known key"],
         ),
         ("zzz: 3", [f"zzz is not a known key (known keys: {KEYS})"]),
-        ("copies: [x]", ["copies.0: 'x' should be a valid integer"]),
         ("colour: blue\ntilt_rad: 1", ["a blue drawing is not tilted"]),
     ],
 )

@@ -67,6 +67,8 @@ def test_a_flight_log_begins_with_what_came_before(tmp_path: Path) -> None:
     first = Path(recorder.begin(talk, "vehicle: neutral\n", "px4-1-7"))
     recorder.write(began_us + 20_000_000, talk.encode(Heartbeat(18)))
     recorder.end(engaged=False)
+    while not scored:  # which `close` would leave to the next start
+        time.sleep(0.01)
     second_flight = Path(recorder.begin(talk, "vehicle: neutral\n", "px4-1-7"))
     recorder.close()
     assert (first.name, second_flight.name) == ("now", "now-2")
