@@ -10,6 +10,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from offboard.analysis import tlog
 from offboard.link import log as log_module
+from offboard.link.background import BackgroundWriter
 from offboard.link.log import FlightLog
 
 UNIX_US = 1_767_225_600_000_000
@@ -27,6 +28,16 @@ class Disk:
         self.asked.set()
         assert self.free.wait(LONG_S)
         self.items += items
+
+
+def test_in_lockstep_it_waits_and_loses_nothing() -> None:
+    disk = Disk()
+    disk.free.set()
+    writer = BackgroundWriter(disk.write, 100, waits=True)
+    for number in range(2000):
+        writer.put(number)
+    writer.close(LONG_S)
+    assert (disk.items, writer.dropped) == ([*range(2000)], 0)
 
 
 def test_a_log_on_a_slow_disk_is_complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from offboard.link import clock
 from offboard.link.connection import open_link
-from offboard.link.interface import Chunk
+from offboard.link.interface import Chunk, LinkReport
 from offboard.link.udp import LOOK_EVERY_S, UdpLink
 from offboard.mavlink.senders import PEER_SILENT_S
 
@@ -171,3 +171,17 @@ def test_udpout_hears_only_its_peer() -> None:
         assert data(link.receive(1.0)) == [b"yes"]
         assert link.receive(0.0) == []
     link.close()
+
+
+def test_senders_are_named_at_powers_of_ten_and_bounded_in_number() -> None:
+    report = LinkReport()
+    for _ in range(100):
+        report.count("a:1", 1)
+    named = [sentence.partition(" from")[0] for sentence in report.news()]
+    assert named == ["1 datagram", "10 datagrams", "100 datagrams"]
+    report.count("b:2", 78_000)
+    assert report.news() == ["78,000 datagrams from b:2, which is not the vehicle, were ignored"]
+    for port in range(1000):
+        report.count(f"c:{port}", 1)
+    assert len(report.news()) == 6 + 3  # six more names, then 1, 10 and 100 others
+    assert report.ignored == 100 + 78_000 + 1000

@@ -22,11 +22,7 @@ from offboard.control.base import Controller, Decision, Situation
 from offboard.control.law import PsoLaw
 from offboard.flight import actions, inputs
 from offboard.flight.flight import Output
-from offboard.flight.inputs import (
-    InputRecorder,
-    InputsError,
-    entries,
-)
+from offboard.flight.inputs import Call, InputRecorder, InputsError, entries
 from offboard.flight.phases import Phase
 from offboard.flight.state import FlightState
 from offboard.link.interface import Chunk
@@ -327,3 +323,22 @@ def test_damaged_pieces_raise_nothing_else(data) -> None:
         piece[data.draw(st.integers(0, len(piece) - 1))] = data.draw(st.integers(0, 255))
     with suppress(InputsError):
         list(entries(map(bytes, pieces)))
+
+
+def test_in_lockstep_no_host_time_is_recorded() -> None:
+    def pieces(offset_s: float, port: int) -> list[bytes]:
+        recorder = InputRecorder(SessionSettings(lockstep=True))
+        read = recorder.watch(lambda: offset_s)
+        for number in range(50):
+            now_s = offset_s * number
+            recorder.begin(now_s, 0)
+            if number % 3:  # the machine was busy: a turn in which nothing had arrived
+                recorder.chunk(Chunk(b"", ("127.0.0.1", port), now_s), Reception((b"frame",)))
+            read()
+            recorder.end()
+        return [piece.data for piece in recorder.pieces(all_of_it=True)]
+
+    assert pieces(0.01, 14580) == pieces(0.37, 20000)
+    first = next(entries(pieces(0.01, 14580)))
+    assert isinstance(first, Call)
+    assert first.arguments[0]["lockstep"] is True
