@@ -81,23 +81,6 @@ def test_estimator_without_position_although_the_gps_has_a_fix(boot_s: float, le
     assert {found.level for check, _, found in findings(ground) if check == "estimator"} == {level}
 
 
-@pytest.mark.parametrize(
-    ("firmware", "text", "ratio"),
-    [(PX4, "unhealthy by SYS_STATUS: RC_RECEIVER", 4), (ARDUPILOT, "EKF velocity variance", 2)],
-    ids=["px4", "ardupilot"],
-)
-def test_velocity_that_the_estimator_rejects(firmware: Firmware, text: str, ratio: int) -> None:
-    """3 m/s are two of the gates of 1.5 m/s; PX4's ratios are squared."""
-    fault = {"fault": "velocity_error", "offset_ned_mps": (3.0, 0.0, 0.0), "for_s": 12.0}
-    rows = bench(firmware, faults=[fault]).consult()
-    found = {name: (row.level, row.findings[0].found) for name, row in rows.items() if row.level}
-    assert found.keys() == {"estimator", "prearm"}
-    assert [level for level, _ in found.values()] == [BLOCKS, WAIT]
-    rejected = f"rejects GPS velocity (innovation ratio {ratio}.00, limit 1)"
-    assert rejected in found["estimator"][1]
-    assert text in found["prearm"][1]
-
-
 def test_arducopter_says_itself_why_it_cannot_arm() -> None:
     """Before it has a position; the texts are those of 4.6.3."""
     patient = bench(ARDUPILOT, faults=[{"fault": "gps_loss", "at_s": 0.1, "for_s": 30.0}])

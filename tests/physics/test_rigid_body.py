@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from sim_hover import load
 
 from offboard.model.rigid_body import (
-    EULER,
     PHI,
     PSI,
     QUATERNION,
@@ -126,15 +125,6 @@ def test_free_spin_keeps_energy_and_angular_momentum(dragless: Vehicle) -> None:
     assert energy_after == pytest.approx(energy, abs=1e-8)  # of up to 6 kJ falling
     assert_allclose(momentum_after, momentum, atol=1e-11)
     assert np.linalg.norm(state[ATTITUDE]) == pytest.approx(1.0, abs=1e-15)
-
-
-def test_only_roll_and_pitch_inputs_have_the_arm(lopsided: Vehicle) -> None:
-    for axis, lever in enumerate((0.3, 0.3, 1.0)):
-        inputs, expected = hover_input(lopsided), np.zeros(3)
-        inputs[1 + axis] = 0.07
-        expected[axis] = lever * 0.07 / lopsided.inertia_kgm2[axis]
-        slope = derivative(np.zeros(12), inputs, pack(lopsided))
-        assert_allclose(slope[EULER.rates], expected, rtol=1e-14)
 
 
 def test_acceleration_is_newtons_in_the_inertial_frame(lopsided: Vehicle) -> None:

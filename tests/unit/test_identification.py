@@ -259,16 +259,6 @@ def test_constant_that_the_flight_does_not_determine_is_refused():
     assert "1.5 s of flight, 2 s are needed" in short.refusals["tilt"]
 
 
-def test_attitude_that_does_not_follow_its_commands_is_refused():
-    """The attitude of one flight with the commands of another."""
-    ours, other = flown(seed=1), flown(seed=2)
-    swapped = other.commands.copy()
-    swapped[:, 1:3] = np.roll(swapped[:, 1:3], 17, axis=0)
-    found = identify(Trace(swapped, ours.attitude, ours.position), VEHICLE_FILE)
-    assert found.tilt is None
-    assert "does not follow" in found.refusals["tilt"] or "limit" in found.refusals["tilt"]
-
-
 def test_last_rows_are_kept_and_cleaned():
     stamps = [0.0, 0.1, 0.1, 0.05, 0.2, 0.3]
     north = [1.0, 2.0, 3.0, 9.0, math.nan, 4.0]

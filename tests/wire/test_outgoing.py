@@ -142,15 +142,6 @@ def test_modes_have_the_numbers_of_the_specification() -> None:
             dialect.set_mode("NONSENSE")
 
 
-def test_problem_of_a_parameter_names_the_command_that_fixes_it() -> None:
-    watched = {p.name: p for d in (PX4_DIALECT, ARDUPILOT_DIALECT) for p in d.watched_parameters}
-    options, loss = watched["GUID_OPTIONS"], watched["COM_OF_LOSS_T"]
-    assert options.fault(8.0) is options.fault(10.0) is loss.fault(1.0) is None
-    faults = (options.fault(2.0), loss.fault(0.0), watched["ATC_ANGLE_BOOST"].fault(0.0))
-    fixes = ["GUID_OPTIONS 10", "COM_OF_LOSS_T 1", "ATC_ANGLE_BOOST 1"]
-    assert [each.fix for each in faults if each] == [f"param set {fix}" for fix in fixes]
-
-
 # --- the others ---
 
 
