@@ -196,6 +196,40 @@ def test_disturbance_and_velocity_converge_at_any_rate(
     assert state.velocity_ned_mps == pytest.approx(moving, abs=0.02)
 
 
+def test_hover_thrust_is_estimated_from_the_disturbance() -> None:
+    """The vehicle file has a hover thrust of u_h, the plant u_h / 0.85: u_h (1 + d_z / g)."""
+    plant = Plant(Truth(PX4, thrust_scale=0.85))
+    observer, sent = Observer(PX4), command(0.0, 0.0, G / 0.85)
+    plant.x[10] = G
+    plant.command(sent)
+    observer.on_command(0.0, sent)
+    for _ in range(500):
+        watch(observer, plant)
+        plant.advance(0.01)
+    true = PX4.hover_thrust / 0.85
+    assert observer.hover_thrust_estimate == pytest.approx(true, rel=0.01)
+    corrected = PX4.model_copy(update={"hover_thrust": observer.hover_thrust_estimate})
+    observer.set_vehicle(corrected)
+    state = observer.predict(plant.time_s)
+    assert observer.hover_thrust_estimate == pytest.approx(true, rel=0.01)
+    assert state.disturbance_ned_mps2[2] == pytest.approx(0.0, abs=1e-9)
+    assert state.thrust_mps2 == pytest.approx(G, rel=0.01)
+    assert abs(state.velocity_ned_mps[2]) < 0.01
+
+
+def test_observer_goes_on_smoothly_with_another_drag() -> None:
+    """The predicted acceleration stays the same: the disturbance changes with the drag."""
+    observer = Observer(PX4)
+    for i in range(300):
+        feed(observer, 0.01 * i, (0.02 * i, -0.01 * i, -3.0), (2.0, -1.0, 0.0))
+    old = observer.predict(3.0)
+    observer.set_vehicle(PX4.model_copy(update={"drag_translation_npmps": (1.82, 1.82, 1.82)}))
+    new = observer.predict(3.0)
+    change = new.disturbance_ned_mps2 - old.disturbance_ned_mps2
+    assert change == pytest.approx(0.8 * old.velocity_ned_mps, abs=0.02)
+    assert new.velocity_ned_mps == pytest.approx(old.velocity_ned_mps, abs=2e-3)
+
+
 # ---------------------------------------------------------------- ground, gaps, jumps
 
 
@@ -216,6 +250,15 @@ def test_frozen_observer_integrates_nothing() -> None:
     for time_s in (7.06, 7.07, 7.08):
         feed(observer, time_s, (1.0, 2.0, -0.1), (0.2, 0.0, -0.1), tilted)
     assert observer.predict(7.08).thrust_direction_ned[0] > 0.13  # now it responds to the command
+
+
+def test_old_and_repeated_messages_are_dropped() -> None:
+    observer = hovering()
+    before = observer.predict(5.0)
+    for time_s in (5.0, 4.5):  # the same stamp again, and older than the stream
+        feed(observer, time_s, (0.2, 0.0, 0.0))
+    after = observer.predict(5.0)
+    assert np.array_equal(before.position_ned_m, after.position_ned_m)
 
 
 def test_position_older_than_the_attitude_is_used_at_its_own_time() -> None:

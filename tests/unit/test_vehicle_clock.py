@@ -7,6 +7,7 @@ import random
 from collections.abc import Callable, Iterable
 from typing import Any
 
+import numpy as np
 import pytest
 
 from offboard.flight.vehicle_clock import (
@@ -189,6 +190,15 @@ def test_a_clock_that_becomes_slower_is_no_late_link() -> None:
 def reply(link: VehicleClock, telemetry_s: float, delay_s: float) -> TimesyncReply:
     request_ns = link.request(telemetry_s, 0.0).ts1_ns
     return TimesyncReply(request_ns, request_ns + round(delay_s * 1e9))
+
+
+def test_median_and_spread_of_the_replies() -> None:
+    link, rng = VehicleClock(), np.random.default_rng(3)
+    for number, delay_s in enumerate(rng.normal(0.12, 0.01, 40)):
+        link.on_reply(reply(link, 5.0 + 0.1 * number, delay_s))
+    assert link.delay is not None
+    assert link.delay.value == pytest.approx(0.12, abs=0.005)
+    assert link.delay.sd == pytest.approx(0.01, rel=0.4)
 
 
 def test_replies_to_others_late_and_duplicate_ones_are_ignored() -> None:
