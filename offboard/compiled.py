@@ -42,9 +42,8 @@ P = ParamSpec("P")
 R = TypeVar("R")
 F = TypeVar("F", bound=Callable[..., Any])
 
-Parameter = type[int | float | np.random.Generator] | np.dtype[Any] | tuple[int, np.dtype[Any]]
-"""A number, a random generator, the dtype of an array of one record, or the dimensions and dtype of
-an array."""
+Parameter = type[int | float] | np.dtype[Any] | tuple[int, np.dtype[Any]]
+"""A number, the dtype of an array of one record, or the dimensions and dtype of an array."""
 
 defined: list[Entry[Any, Any]] = []  # the entries of the modules imported so far
 _kernels: list[Callable[..., Any]] = []  # not yet registered with numba
@@ -117,11 +116,10 @@ class Entry(Generic[P, R]):
 
 
 def _numba_type(parameter: Parameter) -> Any:
-    from numba import float64, from_dtype, int64, typeof, types
+    from numba import float64, from_dtype, int64, types
 
     if isinstance(parameter, type):
-        generator = typeof(np.random.default_rng())
-        return {int: int64, float: float64, np.random.Generator: generator}[parameter]
+        return {int: int64, float: float64}[parameter]
     dimensions, dtype = parameter if isinstance(parameter, tuple) else (1, parameter)
     return types.Array(from_dtype(dtype), dimensions, "C")
 

@@ -74,4 +74,4 @@ def test_one_place_makes_a_setpoint() -> None:
         and isinstance(node.func, ast.Name)
         and node.func.id in ("AttitudeTarget", "PositionTarget")
     }
-    assert makers == {"offboard/flight/setpoint.py"}
+    assert makers == {"offboard/flight/outbox.py"}

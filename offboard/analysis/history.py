@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.analysis.tlog import LoggedMessage, Tlog, TlogError, layout
-from offboard.flight import inputs
+from offboard.flight import record
 from offboard.flight.phases import PHASE_CODES
 from offboard.flight.record import (
     COMPONENT_ID,
@@ -188,9 +188,9 @@ def gather(log: Tlog) -> History:
 def configuration(log: Tlog) -> str | None:
     """The configuration of the flight as YAML (see `run.configuration.flown`), None without.
     Raises TlogError."""
-    pieces = (entry.tunnelled for entry in log if record_type(entry) == inputs.CONFIGURATION_TYPE)
+    pieces = (entry.tunnelled for entry in log if record_type(entry) == record.CONFIGURATION_TYPE)
     try:
-        return inputs.join(pieces)
+        return record.joined_configuration(pieces)
     except ValueError as error:
         raise TlogError(f"{log.path}: {error}") from None
 
@@ -476,8 +476,8 @@ def _vehicle(log: Tlog) -> tuple[Address | None, Dialect | None]:
             if is_vehicle(identity):
                 heard = Address(entry.system_id, entry.component_id)
                 first = heard, known.get(identity.autopilot)
-        elif record_type(entry) == inputs.VEHICLE_TYPE:
-            flown = inputs.vehicle_of(entry.tunnelled)
+        elif record_type(entry) == record.VEHICLE_TYPE:
+            flown = record.vehicle_of(entry.tunnelled)
             if flown and flown.system_id == entry.system_id:
                 found = Address(flown.system_id, flown.component_id)
                 return found, DIALECTS.get(flown.autopilot)

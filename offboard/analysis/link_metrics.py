@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from offboard.analysis.history import History
 from offboard.analysis.verdict import begin_times
+from offboard.flight.outbox import Refusal
 from offboard.flight.phases import PHASE_CODES, Phase
-from offboard.flight.setpoint import Refusal
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from rich.text import Text
 
 from offboard.analysis.history import History
 from offboard.analysis.score import METRICS, Score
-from offboard.flight.record import too_busy
+from offboard.flight.timing import too_busy
 
 # the metric that begins a section -> its title
 SECTIONS = {

@@ -18,6 +18,7 @@ import numpy as np
 from pymavlink.dialects.v20 import all as dialect
 
 from offboard.documents.errors import UserError, abridged
+from offboard.mavlink.counters import DropReason
 from offboard.mavlink.framing import Frame, frame_size, parse
 
 _STAMP = struct.Struct(">Q")
@@ -26,7 +27,6 @@ _MAGIC = (0xFD, 0xFE)
 _LONGEST = 8 + 280  # bytes of an entry: a signed MAVLink 2 frame
 _BLOCK = 1 << 20
 _TUNNEL_BYTES = 133  # payload_type, target system and component, payload_length, 128 of data
-_codec = dialect.MAVLink(None)
 
 
 class TlogError(UserError):
@@ -54,8 +54,8 @@ class LoggedMessage(NamedTuple):
 
     @property
     def message(self) -> Any:
-        """The message decoded by pymavlink, at each access."""
-        return _codec.decode(bytearray(self.frame.raw))
+        """The message decoded by pymavlink."""
+        return self.frame.message
 
     @property
     def tunnelled(self) -> bytes:
@@ -136,7 +136,9 @@ def _entry(data: bytes, at: int, *, certain: bool) -> LoggedMessage | None:
     if size is None or end > len(data):
         return None
     frame = parse(data, at + 8, end)
-    if frame is None or (not frame.verified and (certain or not _begins(data, end))):
+    if isinstance(frame, DropReason):
+        return None
+    if not frame.verified and (certain or not _begins(data, end)):
         return None
     return LoggedMessage(_STAMP.unpack_from(data, at)[0], frame)
 

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.analysis.history import Event, History
+from offboard.flight.estimates import PositionJumps
 from offboard.flight.ground_contact import Touchdown, moved
-from offboard.flight.positioning import PositionJumps
 from offboard.mavlink.event_record import SUPERVISOR
 from offboard.mavlink.events import LocalPosition
 

@@ -29,7 +29,7 @@ from offboard.documents.errors import DocumentError, UserError, naming
 from offboard.link import clock
 from offboard.link.stop import StopRequests
 from offboard.run.configuration import build_controller, build_track
-from offboard.run.sitl import check_scenario_text
+from offboard.run.sitl import check_scenario
 
 KEPT = "flights"  # directory of the logs that are kept
 KEPT_FILES = {"report": "report.html", "log": "flight.tlog"}
@@ -255,7 +255,7 @@ def check(cases: Sequence[Case]) -> None:
 
 def _check_one(case: Case) -> None:
     if text := case.scenario_text:
-        check_scenario_text(text, f"scenario {case.scenario}")
+        check_scenario(text, f"scenario {case.scenario}")
     case.simulated(None if text or case.link else case.scenario).check()
     config = case.load()
     build_track(config)

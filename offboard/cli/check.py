@@ -40,7 +40,6 @@ def _checked(path: Path) -> str:
     from offboard.documents.reading import kind_of, read
     from offboard.documents.shipped import read_text
     from offboard.run.configuration import check_file
-    from offboard.run.sitl import check_scenario
 
     table = path.suffix.lower() == ".csv"
     kind = "" if table else kind_of(read(read_text(path), str(path)))
@@ -49,5 +48,5 @@ def _checked(path: Path) -> str:
     elif kind == "campaign":
         read_campaign(str(path))
     else:
-        return check_file(path, check_scenario)
+        return check_file(path)
     return kind

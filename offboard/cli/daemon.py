@@ -132,7 +132,7 @@ def _print_unit(options: FlightOptions, out_directory: Path | None) -> None:
     KeyFileError."""
     import offboard
     from offboard.documents.signing_key import read_key
-    from offboard.service.unit import unit, unreadable
+    from offboard.service.daemon import unit, unreadable
 
     if out_directory and STATE not in (out_directory, *out_directory.parents):
         raise UserError(

@@ -292,7 +292,7 @@ def to_hover(b: Array, thrust_mps2: Array, state: PredictedState, vehicle: Vehic
 
 def decision(inputs: Array, certificate: Certificate) -> Decision:
     """The decision for u (4,). Both lateral components of b_c may be at their bounds at once: then
-    the setpoint check turns it back to the tilt limit (`flight.setpoint.clamp`)."""
+    the setpoint check turns it back to the tilt limit (`flight.outbox.clamp`)."""
     thrust, north, east, heading = (float(value) for value in inputs)
     lateral = max(1.0, math.hypot(north, east))
     north, east = north / lateral, east / lateral

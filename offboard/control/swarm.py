@@ -89,62 +89,84 @@ _NO_HESSIAN, _NO_GRADIENT = np.empty((0, 0)), np.empty(0)
 
 # Compiled: the particles are (3, n, particles), their positions, velocities and personal bests;
 # `bounds` (2, n) lower and upper; `best` (n,) the best position of all; `costs` (2, particles) the
-# newest and the least of each particle.
+# newest and the least of each particle. Inner loops run over the particles, which are adjacent in
+# memory: the compiler makes vector instructions of them.
 
 
 @kernel
-def _move(search: Any, rng: Generator, bounds: Array, particles: Array, best: Array) -> None:
+def _evaluate(
+    positions: Array, hessian: Array, gradient: Array, constant: float, costs: Array
+) -> None:
+    """J = 1/2 u'Hu + f'u + c of each particle."""
+    costs[:] = constant
+    for j in range(len(gradient)):
+        here = positions[j]
+        for i in range(len(costs)):
+            costs[i] += here[i] * (gradient[j] + 0.5 * hessian[j, j] * here[i])
+        for k in range(j):
+            for i in range(len(costs)):
+                costs[i] += here[i] * hessian[j, k] * positions[k, i]
+
+
+@kernel
+def _remember(search: Any, particles: Array, best: Array, costs: Array) -> None:
+    """Update the bests from the newest costs. Of equal costs the first one found stays the best; a
+    cost that is not finite never becomes a best."""
+    for i in range(costs.shape[1]):
+        cost = costs[0, i]
+        if -np.inf < cost < costs[1, i]:
+            costs[1, i] = cost
+            particles[2, :, i] = particles[0, :, i]
+            if cost < search.cost:
+                search.cost = cost
+                best[:] = particles[0, :, i]
+    search.done += 1
+
+
+@kernel
+def _move(search: Any, random: Array, bounds: Array, particles: Array, best: Array) -> None:
     """Eqs. 30 and 20 with a random number per dimension; Eq. 22 by clamping.
 
     Where a particle is clamped its velocity is reversed and multiplied by `rebound`. If it were
     kept, the particle would stay at the bound; if it were set to zero, all particles could come to
     rest beside the best one in this dimension.
     """
+    inertia, damping, rebound = search.inertia, search.damping, search.rebound
+    personal, social = search.personal, search.social
     for j in range(particles.shape[1]):
-        low, high = bounds[0, j], bounds[1, j]
-        for i in range(particles.shape[2]):
-            here = particles[0, j, i]
-            velocity = search.damping * (
-                search.inertia * particles[1, j, i]
-                + search.personal * rng.random() * (particles[2, j, i] - here)
-                + search.social * rng.random() * (best[j] - here)
+        low, high, target = bounds[0, j], bounds[1, j], best[j]
+        positions, velocities, bests = particles[0, j], particles[1, j], particles[2, j]
+        for i in range(len(positions)):
+            here = positions[i]
+            velocity = damping * (
+                inertia * velocities[i]
+                + personal * random[j, i, 0] * (bests[i] - here)
+                + social * random[j, i, 1] * (target - here)
             )  # Eq. 30
             there = here + velocity  # Eq. 20
-            particles[1, j, i] = velocity if low <= there <= high else -search.rebound * velocity
-            particles[0, j, i] = min(max(there, low), high)  # Eq. 22
+            velocities[i] = velocity if low <= there <= high else -rebound * velocity
+            positions[i] = min(max(there, low), high)  # Eq. 22
 
 
 @kernel
-def _remember(search: Any, particles: Array, best: Array, costs: Array) -> None:
-    """Update the bests from the newest costs, then the spread. Of equal costs the first one found
-    stays the best; a cost that is not finite never becomes a best."""
-    for i in range(costs.shape[1]):
-        cost = costs[0, i]
-        if np.isfinite(cost) and cost < costs[1, i]:
-            costs[1, i] = cost
-            is_best = cost < search.cost
-            if is_best:
-                search.cost = cost
-            for j in range(len(best)):
-                particles[2, j, i] = particles[0, j, i]
-                if is_best:
-                    best[j] = particles[0, j, i]
+def _spread(positions: Array, best: Array) -> float:
+    """Mean distance of the particles from the best position (Eqs. 28-29)."""
     total = 0.0
-    for i in range(costs.shape[1]):
+    for i in range(positions.shape[1]):
         squared = 0.0
         for j in range(len(best)):
-            squared += (best[j] - particles[0, j, i]) ** 2
+            squared += (best[j] - positions[j, i]) ** 2
         total += np.sqrt(squared)
-    search.spread = total / costs.shape[1]
-    search.done += 1
+    mean: float = total / positions.shape[1]
+    return mean
 
 
 @entry(
-    SEARCH, Generator, array(2), array(3), array(1), array(2), array(2), array(1), float, int
+    SEARCH, array(4), array(2), array(3), array(1), array(2), array(2), array(1), float, int
 )  # fmt: skip
 def iterate(
     searches: Any,
-    rng: Generator,
+    random: Array,
     bounds: Array,
     particles: Array,
     best: Array,
@@ -152,22 +174,20 @@ def iterate(
     hessian: Array,
     gradient: Array,
     constant: float,
-    until: int,
+    iterations: int,
 ) -> None:
-    """Iterate until `until` iterations are done: with the costs J = 1/2 u'Hu + f'u + c, or, where
-    the gradient is empty, with the newest of `costs`. Then move the particles for the next one."""
+    """Iterate with the costs of a quadratic, or, where the gradient is empty, with the newest of
+    `costs`. After each iteration `random` (moves, n, particles, 2) moves the particles for the next
+    one; after the last one of a search they stay."""
     search = searches[0]
-    while search.done < until:
-        for i in range(costs.shape[1] if len(gradient) > 0 else 0):
-            costs[0, i] = constant
-            for j in range(len(gradient)):
-                slope = gradient[j] + 0.5 * hessian[j, j] * particles[0, j, i]
-                for k in range(j):
-                    slope += hessian[j, k] * particles[0, k, i]
-                costs[0, i] += particles[0, j, i] * slope
+    for k in range(iterations):
+        if len(gradient) > 0:
+            _evaluate(particles[0], hessian, gradient, constant, costs[0])
         _remember(search, particles, best, costs)
-        if search.done < search.iterations:
-            _move(search, rng, bounds, particles, best)
+        if k == iterations - 1:
+            search.spread = _spread(particles[0], best)
+        if k < random.shape[0]:
+            _move(search, random[k], bounds, particles, best)
 
 
 class Swarm:
@@ -218,18 +238,21 @@ class Swarm:
         if values.shape != self._costs.shape[1:]:
             raise ValueError(f"{values.shape} costs for {self._costs.shape[1]} particles")
         self._costs[0] = values
-        self._iterate(_NO_HESSIAN, _NO_GRADIENT, 0.0, int(self._search["done"][0]) + 1)
+        self._iterate(_NO_HESSIAN, _NO_GRADIENT, 0.0, 1)
 
-    def tell_all(self, problem: BoxQuadratic, until: int) -> None:
-        """`tell` the costs of `problem` until `until` iterations are done."""
+    def tell_all(self, problem: BoxQuadratic, iterations: int) -> None:
+        """`tell` the costs of `problem` so many times."""
         hessian = np.ascontiguousarray(problem.hessian, np.float64)
         gradient = np.ascontiguousarray(problem.gradient, np.float64)
-        self._iterate(hessian, gradient, float(problem.constant), until)
+        self._iterate(hessian, gradient, float(problem.constant), iterations)
 
-    def _iterate(self, hessian: Array, gradient: Array, constant: float, until: int) -> None:
+    def _iterate(self, hessian: Array, gradient: Array, constant: float, iterations: int) -> None:
+        left = int(self._search["iterations"][0] - self._search["done"][0])
+        moves = min(iterations, left - 1)
+        random = self._rng.random((moves, *self._particles.shape[1:], 2))
         iterate(
-            self._search, self._rng, self._bounds, self._particles, self._best, self._costs,
-            hessian, gradient, constant, until,
+            self._search, random, self._bounds, self._particles, self._best, self._costs,
+            hessian, gradient, constant, iterations,
         )  # fmt: skip
 
     def result(self, cut_short: bool = False) -> SwarmResult:
@@ -256,13 +279,13 @@ def minimise(
     far, after one chunk of iterations at the earliest. Raises ValueError for bounds that are not
     finite and ordered.
     """
-    swarm, limit = Swarm(settings, problem.lower, problem.upper, rng), settings.iterations
-    for until in range(CHUNK_ITERATIONS, limit, CHUNK_ITERATIONS):
-        swarm.tell_all(problem, until)
-        if remaining_s is not None and remaining_s() <= 0:
-            return swarm.result(cut_short=True)
-    swarm.tell_all(problem, limit)
-    return swarm.result()
+    swarm, left = Swarm(settings, problem.lower, problem.upper, rng), settings.iterations
+    while True:
+        swarm.tell_all(problem, min(left, CHUNK_ITERATIONS))
+        left -= CHUNK_ITERATIONS
+        late = left > 0 and remaining_s is not None and remaining_s() <= 0
+        if late or left <= 0:
+            return swarm.result(cut_short=late)
 
 
 def _bounds(lower: ArrayLike, upper: ArrayLike) -> Array:

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from offboard.doctor.senders import Senders
-from offboard.flight.preflight import FIX_3D, Ground, ParameterReading
-from offboard.flight.vehicle_clock import VehicleClock
+from offboard.flight.preflight import Ground, ParameterReading
+from offboard.flight.timing import VehicleClock
 from offboard.flight.vehicle_state import VehicleState
 from offboard.link import clock
 from offboard.link.interface import Chunk
@@ -47,6 +47,7 @@ TEXTS_S = 1.0  # for the texts after the acknowledgement
 ENOUGH = 0.7  # of a rate, measured over two seconds
 SETTLE_S = 1.0  # until jumps of the vehicle's clock count
 RUN_PREARM_CHECKS = 401  # MAV_CMD
+FIX_3D = 3  # GPS_FIX_TYPE; also stands for better ones
 VERSION, GPS, TIMESYNC = 148, 24, 111  # message ids
 
 
@@ -261,20 +262,17 @@ class Observation:
     def ground(self) -> Ground:
         """What the preflight list judges."""
         heard, vehicle = self.heard, self.vehicle
-        session, senders = heard.session, heard.session.senders
-        several = senders.ambiguous(session.link_time_s)
+        limits = self.config.limits
+        shared = vehicle.other_sender is not None and not limits.begin_with_other_sender
         return Ground(
             vehicle,
-            self.config.limits,
+            limits,
+            heard.session,
+            heard.clock,
+            heard.now_s,
             self.dialect,
             helicopter=self.config.vehicle.airframe == "helicopter",
-            rates_hz=session.rates_hz if heard.requested else None,
-            delay=heard.clock.delay,
-            measures_delay=not heard.clock.delay_is_measured(heard.now_s),
-            unanswered_s=heard.clock.unanswered_s(heard.now_s),
-            systems=senders.named(session.link_time_s) if several else "",
-            twin=session.has_twin,
-            other_sender=vehicle.other_sender is not None,
+            rates_requested=heard.requested,
+            other_sender=vehicle.other_sender_named if shared else "",
             in_the_air=vehicle.armed,
-            fix_type=heard.fix_type,
         )

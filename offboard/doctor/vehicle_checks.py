@@ -8,9 +8,9 @@ from collections.abc import Iterable
 
 from offboard.control.bandwidth import SDS, supported_bandwidth
 from offboard.doctor.link_checks import blocks, ok, wait, warn
-from offboard.doctor.listening import Observation
+from offboard.doctor.listening import FIX_3D, Observation
 from offboard.documents.errors import DocumentError
-from offboard.flight.preflight import FIX_3D, Finding
+from offboard.flight.preflight import Finding
 from offboard.model.vehicle import DelayUncertainty
 from offboard.reference.feasibility import check
 from offboard.run.configuration import UNKNOWN_VEHICLE, build_track

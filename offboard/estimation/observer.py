@@ -137,13 +137,13 @@ def predict(
                     noise[i, j] += middle * half[j, k] + end * transition[j, k]
     for _ in range(steps):
         _multiply(transition, covariance, moved)
-        for j in range(size):
-            for i in range(size):
-                covariance[i, j] = noise[i, j]
-            for k in range(size):
-                if transition[j, k] != 0.0:
-                    for i in range(size):
-                        covariance[i, j] += moved[i, k] * transition[j, k]
+        for i in range(size):
+            for j in range(size):
+                half[i, j] = moved[j, i]
+        _multiply(transition, half, covariance)  # F (F P)' = F P F'
+        for i in range(size):
+            for j in range(size):
+                covariance[i, j] += noise[i, j]
 
 
 @kernel
@@ -189,12 +189,15 @@ def _innovation(
 ) -> tuple[float, float]:
     """z - H x and H P H' of one `row` of H; `projected` becomes P H'."""
     innovation, total = measured, 0.0
-    for i in range(state.shape[0]):
-        innovation -= row[i] * state[i]
+    for i in range(len(state)):
         projected[i] = 0.0
-        for j in range(state.shape[0]):
-            projected[i] += covariance[i, j] * row[j]
-        total += row[i] * projected[i]
+    for j in range(len(state)):
+        if row[j] != 0.0:
+            innovation -= row[j] * state[j]
+            for i in range(len(state)):
+                projected[i] += row[j] * covariance[j, i]
+    for j in range(len(state)):
+        total += row[j] * projected[j]
     return innovation, total
 
 

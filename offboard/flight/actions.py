@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from offboard.flight import decision, outbox, setpoint
+from offboard.flight import decision, outbox
 from offboard.flight.authority import Standing
+from offboard.flight.failsafe import old, other_sender
 from offboard.flight.ground_contact import STANDING_S, STILL_ARMED
 from offboard.flight.phases import BEFORE_FLIGHT, TRACKING, Phase
-from offboard.flight.rows import other_sender
 from offboard.flight.state import LEVEL, FlightState
 from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.events import VehicleIdentity
@@ -42,7 +42,7 @@ def act(flight: FlightState) -> None:
     elif flight.phase not in TRACKING:
         hold(flight, time_s)
     elif flight.ours and not decision.decide(flight):
-        setpoint.send_level(flight, time_s, _level(flight))
+        outbox.send_level(flight, time_s, _level(flight))
     outbox.send(flight, flight.clock.request(time_s, flight.host_s))
 
 
@@ -53,7 +53,7 @@ def hold(flight: FlightState, time_s: float) -> None:
     steers = not flight.takes_off_by_command or flight.plan.reference is not None
     if phase is Phase.TAKEOFF or phase in TRACKING:
         if steers:
-            setpoint.send_level(flight, time_s, _level(flight))
+            outbox.send_level(flight, time_s, _level(flight))
     elif phase in (Phase.HOLD, Phase.LAND):
         _end(flight, time_s, steers=steers)
     elif phase is Phase.HAND_BACK:
@@ -62,7 +62,7 @@ def hold(flight: FlightState, time_s: float) -> None:
         outbox.request(flight, CommandLong.disarm())
         if steers:
             idle = Command(0.0, LEVEL, flight.command.heading_rad)
-            setpoint.send_level(flight, time_s, idle)
+            outbox.send_level(flight, time_s, idle)
 
 
 def _end(flight: FlightState, time_s: float, *, steers: bool) -> None:
@@ -82,7 +82,7 @@ def _end(flight: FlightState, time_s: float, *, steers: bool) -> None:
         _disarm_if_standing(flight)
     streams = steers and not flight.awaits_link and flight.in_phase_s < LAND_STREAM_S
     if streams and authority.mode == authority.engage_mode:
-        setpoint.send_level(flight, time_s, _level(flight))
+        outbox.send_level(flight, time_s, _level(flight))
 
 
 def _await_link(flight: FlightState) -> None:
@@ -132,9 +132,9 @@ def _prepare(flight: FlightState, time_s: float) -> None:
     flying = flight.contact.in_the_air
     if flight.takes_off_by_command and not flying:
         return
-    thrust_mps2 = setpoint.hover_mps2(flight) if flying else 0.0
+    thrust_mps2 = outbox.hover_mps2(flight) if flying else 0.0
     command = Command(thrust_mps2, LEVEL, flight.vehicle.heading_rad)
-    setpoint.send_level(flight, time_s, command)
+    outbox.send_level(flight, time_s, command)
 
 
 def _stand_by(flight: FlightState, time_s: float) -> None:
@@ -143,15 +143,15 @@ def _stand_by(flight: FlightState, time_s: float) -> None:
     failsafe, after which PX4 would return to OFFBOARD by itself, or while another program sends."""
     on_ground, vehicle = flight.contact.on_ground, flight.vehicle
     command = Command(0.0, LEVEL, vehicle.heading_rad) if on_ground else _flown(flight)
-    quiet = flight.takes_off_by_command or flight.telemetry_is_old or bool(other_sender(flight))
+    quiet = bool(flight.takes_off_by_command or old(flight) or other_sender(flight))
     if on_ground:
         quiet |= vehicle.armed and vehicle.in_failsafe
     else:
         quiet |= vehicle.in_failsafe or not flight.pilot.elsewhere
     if quiet:
-        setpoint.set_command(flight, time_s, command)
+        outbox.set_command(flight, time_s, command)
     else:
-        setpoint.send_level(flight, time_s, command)
+        outbox.send_level(flight, time_s, command)
 
 
 def _flown(flight: FlightState) -> Command:
@@ -198,7 +198,7 @@ def _take_off(flight: FlightState, time_s: float) -> None:
         rising_s, most = rising_s - age_s, SPOOL_UNSEEN
     spool = min(most, max(0.0, SPOOL_UP_PER_S * rising_s))
     thrust_mps2 = spool * flight.model.gravity_mps2
-    setpoint.send_level(flight, time_s, Command(thrust_mps2, LEVEL, flight.command.heading_rad))
+    outbox.send_level(flight, time_s, Command(thrust_mps2, LEVEL, flight.command.heading_rad))
 
 
 def _request_takeoff(flight: FlightState, time_s: float) -> None:
@@ -210,7 +210,7 @@ def _request_takeoff(flight: FlightState, time_s: float) -> None:
     height_m = -float(flight.plan.track.sample(0.0).position_ned_m[2])
     outbox.request(flight, _dialect(flight).take_off(min(max(height_m, least_m), most_m)))
     hovering = Command(flight.model.gravity_mps2, LEVEL, flight.vehicle.heading_rad)
-    setpoint.set_command(flight, time_s, hovering)
+    outbox.set_command(flight, time_s, hovering)
 
 
 def _level(flight: FlightState) -> Command:
@@ -219,7 +219,7 @@ def _level(flight: FlightState) -> Command:
     reached_mps2, gravity_mps2 = flight.command.thrust_mps2, flight.model.gravity_mps2
     thrust_mps2 = min(reached_mps2, SPOOL_UNSEEN * gravity_mps2)
     if flight.plan.reference is not None:
-        thrust_mps2 = setpoint.hover_mps2(flight)
+        thrust_mps2 = outbox.hover_mps2(flight)
     return Command(thrust_mps2, LEVEL, flight.command.heading_rad)
 
 

@@ -7,20 +7,24 @@ counted, never raised: the vehicle is in the air.
 from __future__ import annotations
 
 import math
+from dataclasses import astuple
 
 from offboard.control.base import Adaptive, Situation
 from offboard.documents.errors import located
-from offboard.flight import outbox, setpoint
+from offboard.flight import failsafe, outbox
+from offboard.flight.outbox import Refusal, Refused
 from offboard.flight.phases import Phase
 from offboard.flight.record import (
+    CERTIFIED,
     IDENTIFIED_ID,
     IDENTIFIED_NAME,
+    NAN,
     RECORD_ID,
     RECORD_NAME,
     Decided,
+    TickRecord,
     reference_record,
 )
-from offboard.flight.setpoint import Refusal, Refused
 from offboard.flight.state import FlightState
 from offboard.identification.learner import Learner, VehicleUpdate
 from offboard.mavlink.outgoing import SolverRecord
@@ -51,7 +55,7 @@ def decide(flight: FlightState) -> bool:
     nothing is sent. Telemetry that was too old before the decision began does not count: the
     failsafe has a row for it.
     """
-    was_old = flight.telemetry_is_old
+    was_old = failsafe.old(flight)
     try:
         decided = _decided(flight)
         _send(flight, decided)
@@ -76,7 +80,7 @@ def finish(flight: FlightState, sent_s: float) -> None:
     if decided is None:
         return
     try:
-        _record(flight, decided, sent_s - decided.tick.arrived_s)
+        _record(flight, decided, sent_s - flight.telemetry_arrived_s)
     except Exception as error:  # the certificate is the law's
         _miss(flight, located(error), "controller")
         return
@@ -98,15 +102,13 @@ def _send(flight: FlightState, decided: Decided) -> None:
     if flight.deadline_s is not None:
         host_s = flight.stopwatch()
         decided.age_s = flight.telemetry_age_s(host_s)
-        late_s = host_s - flight.tick.arrived_s - flight.period_s
+        late_s = host_s - flight.telemetry_arrived_s - flight.period_s
     if flight.identification and flight.phase is Phase.EXCITE and isinstance(command, Command):
-        command = flight.identification.excited(
-            command, flight.tick.time_s, flight.position_error_m
-        )
+        command = flight.identification.excited(command, flight.time_s, flight.position_error_m)
     body_z_down = float(decided.state.thrust_direction_ned[2])
     try:
-        decided.sent = setpoint.send(
-            flight, flight.tick.time_s, command, body_z_down, age_s=decided.age_s, late_s=late_s
+        decided.sent = outbox.send_setpoint(
+            flight, flight.time_s, command, body_z_down, age_s=decided.age_s, late_s=late_s
         )
     except Refused as refused:
         decided.refused, decided.failure = refused.why, str(refused)
@@ -115,9 +117,9 @@ def _send(flight: FlightState, decided: Decided) -> None:
 def _identify(flight: FlightState, decided: Decided, identification: Learner) -> None:
     try:
         hover_thrust = flight.observer.hover_thrust_estimate
-        update = identification.learn(decided.tick.time_s, hover_thrust)
+        update = identification.learn(flight.time_s, hover_thrust)
         if update is not None:
-            _set_vehicle(flight, decided.tick.time_s, update)
+            _set_vehicle(flight, flight.time_s, update)
     except Exception as error:  # the flight continues with the present vehicle model
         identification.give_up()
         outbox.warn(flight, f"identification stopped: {located(error)}")
@@ -126,7 +128,7 @@ def _identify(flight: FlightState, decided: Decided, identification: Learner) ->
 def _decided(flight: FlightState) -> Decided:
     plan = flight.plan
     assert plan.reference is not None
-    sent_s = flight.sent_s(flight.tick.time_s)
+    sent_s = flight.sent_s(flight.time_s)
     state = flight.observer.predict(sent_s)
     began_s, deadline_s = flight.stopwatch(), flight.deadline_s or math.inf
 
@@ -143,7 +145,7 @@ def _decided(flight: FlightState) -> Decided:
         track_time_s=plan.track_time_s(sent_s),
     )
     decision = flight.controller.decide(situation)
-    return Decided(flight.tick, flight.phase, state, decision, flight.stopwatch() - began_s)
+    return Decided(flight.phase, state, decision, flight.stopwatch() - began_s)
 
 
 def _set_vehicle(flight: FlightState, time_s: float, update: VehicleUpdate) -> None:
@@ -178,13 +180,42 @@ def _with_bandwidth(
 
 
 def _record(flight: FlightState, decided: Decided, answer_s: float) -> None:
-    time_s = decided.tick.time_s
-    sample = flight.plan.sample(time_s)
+    sample = flight.plan.sample(flight.time_s)
     assert sample is not None
-    outbox.send(flight, reference_record(time_s, sample))
-    record = decided.record(
-        answer_s=answer_s,
-        hover_thrust=flight.observer.hover_thrust_estimate,
-        track_time_s=flight.plan.track_time_s(time_s),
+    record = tick_record(flight, decided, answer_s)
+    outbox.send(
+        flight,
+        reference_record(flight.time_s, sample),
+        SolverRecord(flight.time_s, record.data(), RECORD_ID, RECORD_NAME),
     )
-    outbox.send(flight, SolverRecord(time_s, record.data(), RECORD_ID, RECORD_NAME))
+
+
+def tick_record(flight: FlightState, decided: Decided, answer_s: float) -> TickRecord:
+    """The record of a tick. The certificate counts if the setpoint was sent as decided."""
+    sent, state = decided.sent, decided.state
+    # with a position setpoint, the autopilot chooses thrust and direction
+    attitude = sent if isinstance(sent, Command) else None
+    certified = sent == decided.decision.command
+    figures = astuple(decided.decision.certificate) if certified else (NAN,) * CERTIFIED
+    *certificate, seed_cost = map(float, figures)
+    values = (
+        float(decided.phase.code),
+        attitude.thrust_mps2 if attitude else NAN,
+        *(attitude.thrust_direction_ned if attitude else (NAN, NAN, NAN)),
+        sent.heading_rad if sent else NAN,
+        *certificate,
+        decided.solve_time_s,
+        answer_s,
+        float(flight.missed_ticks),
+        *state.position_ned_m.tolist(),
+        *state.velocity_ned_mps.tolist(),
+        *state.disturbance_ned_mps2.tolist(),
+        flight.observer.hover_thrust_estimate,
+        flight.track_time_s,
+        seed_cost,
+        decided.age_s,
+        float(decided.refused),
+        float(flight.ignored),
+        flight.pause_s,
+    )
+    return TickRecord(*values)

@@ -10,17 +10,17 @@ import re
 from offboard.documents.errors import Repeated
 from offboard.flight import preflight
 from offboard.flight.phases import TRACKING, Phase
-from offboard.flight.starting import ground_of
+from offboard.flight.starting import found_engaged, ground_of
 from offboard.flight.state import FlightState
-from offboard.mavlink.session import Session
 
 PAUSED = "this computer paused for {most:.2f} s{times}: no setpoint before the mode is reported"
 DROPPED = (
     "{total:.0f} of our messages to the vehicle dropped: this computer was too busy, and they "
     "became too old"
 )
-# In a phase, before the first reason: telemetry has only just been requested, checks are running
-FIRST_S = {Phase.CONNECT: 2.5, Phase.HEALTH: 5.0}
+# In a phase, before the first reason: telemetry has only just been requested, checks are running,
+# the vehicle has not said yet which one it is
+FIRST_S = {Phase.CONNECT: 2.5, Phase.HEALTH: 5.0, Phase.STANDBY: 1.0}
 CHANGED_S = 1.0  # between two reasons
 AGAIN_S = 10.0  # the same reason, in other figures too
 
@@ -49,7 +49,8 @@ class News:
         passed_s = state.now_s - self._said_s
         if state.in_phase_s < FIRST_S[state.phase] or passed_s < CHANGED_S:
             return ""
-        reason = _unheard(state.session) if state.phase is Phase.CONNECT else _unready(state)
+        why = {Phase.CONNECT: _unheard, Phase.HEALTH: _unready, Phase.STANDBY: _left_alone}
+        reason = why[state.phase](state)
         kind = re.sub(r"[0-9]+", "", reason)
         again = state.phase is Phase.HEALTH and passed_s >= AGAIN_S
         if not reason or (kind == self._kind and not again):
@@ -63,9 +64,19 @@ def _unready(state: FlightState) -> str:
     return "; ".join(filter(None, [*preflight.refusals(ground), preflight.not_ready(ground)]))
 
 
-def _unheard(session: Session) -> str:
+def _left_alone(state: FlightState) -> str:
+    """Of the service: a vehicle that is in the mode of setpoints, and was not engaged by it."""
+    if state.left_engaged or not found_engaged(state):
+        return ""
+    return (
+        f"the vehicle was found in {state.vehicle.mode} in the air, and this service has not "
+        "engaged it: it is left alone; switch to another mode and back"
+    )
+
+
+def _unheard(state: FlightState) -> str:
     """What is heard instead of a vehicle."""
-    counters = session.counters
+    session, counters = state.session, state.session.counters
     if not counters.bytes_received:
         return "nothing is heard on this link"
     if not counters.frames:

@@ -4,7 +4,7 @@ The action of the worst row that is active counts. A row is active once its cond
 its delay. The time that it has held runs down at a quarter of the speed while the condition does
 not hold, so that a condition that comes and goes does not start from zero each time.
 
-Conditions are functions of the flight, as those of the phase table (`rows`).
+Its conditions come after those that the phase table has as well.
 """
 
 from __future__ import annotations
@@ -15,11 +15,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from offboard.flight.phases import TRACKING, Action
-from offboard.flight.rows import Condition, blind, mode_unknown, other_sender, silent
+from offboard.flight.authority import Standing
+from offboard.flight.phases import TRACKING, Action, Condition
 from offboard.flight.state import COMMANDS_KEPT, FlightState
-from offboard.mavlink.events import ThrustReport
+from offboard.mavlink.events import OtherSender, ThrustReport
 
+OPERATOR = "{flight.stop_cause}"  # the cause of a row for `stop_requested`
+REBOOTED = "the vehicle restarted"
+OTHER_SENDER_S = 5.0  # a second sender is there for so long after its newest frame
 RECOVERY = 0.25  # speed at which a delay runs back
 STEP_MAX_S = 0.2  # what one sample counts for, also after a gap of telemetry
 SINK_MPS = 0.3  # that full thrust stops within the delay, on a vehicle that can be flown
@@ -27,7 +30,76 @@ FULL_THRUST = 0.99
 THRUST_REPORT_S = 1.0  # age of a ThrustReport that counts
 
 
-# ---------------------------------------------------------------------- conditions
+# ---------------------------------------------------------------------- what is heard
+
+
+def silent(flight: FlightState) -> str:
+    """Host time without position and attitude."""
+    return silent_for(flight, flight.limits.silence_s)
+
+
+def silent_for(flight: FlightState, limit_s: float) -> str:
+    return f"no telemetry for {flight.silence_s:.1f} s" if flight.silence_s > limit_s else ""
+
+
+def blind(flight: FlightState) -> str:
+    """Age of the older of position and attitude, by vehicle time."""
+    vehicle = flight.vehicle
+    age_s, name = max(
+        (vehicle.position_age_s, "LOCAL_POSITION_NED"),
+        (vehicle.attitude_age_s, "ATTITUDE_QUATERNION"),
+        key=lambda each: each[0],
+    )
+    return f"no new {name} for {age_s:.1f} s" if age_s > flight.limits.blind_s else ""
+
+
+def mode_unknown(flight: FlightState) -> str:
+    if flight.authority.heard(flight.now_s):
+        return ""
+    return f"no report of the mode for {flight.now_s - flight.authority.heard_s:.1f} s"
+
+
+def other_sender(flight: FlightState) -> str:
+    """Another program sends setpoints or commands modes on this link, or says in its HEARTBEAT
+    that it flies the vehicle."""
+    if flight.limits.begin_with_other_sender:
+        return ""
+    recent = flight.vehicle.age_s(OtherSender) < OTHER_SENDER_S
+    return flight.vehicle.other_sender_named if recent else ""
+
+
+# ---------------------------------------------------------------------- who has the vehicle
+
+
+def rebooted(flight: FlightState) -> str:
+    return REBOOTED if flight.rebooted else ""
+
+
+def lost(flight: FlightState) -> str:
+    """Another has taken control of the vehicle."""
+    if flight.authority.standing is not Standing.LOST:
+        return ""
+    return flight.authority.lost_reason or Standing.LOST.value
+
+
+def lost_armed(flight: FlightState) -> str:
+    """A pilot has changed the mode of a vehicle that stays armed."""
+    return lost(flight) if flight.shown_since_lost and flight.vehicle.armed else ""
+
+
+def in_own_failsafe(flight: FlightState) -> str:
+    """Setpoints were missing, and the autopilot's failsafe flies the vehicle."""
+    if flight.authority.standing is not Standing.FAILSAFE:
+        return ""
+    mode = flight.vehicle.mode
+    return f"setpoints did not arrive, and the vehicle's own failsafe flies it, in {mode}"
+
+
+def stop_requested(flight: FlightState) -> str:
+    return flight.stop_reason
+
+
+# ---------------------------------------------------------------------- conditions of the failsafe
 
 
 def another_may_control(flight: FlightState) -> str:
@@ -208,7 +280,7 @@ def contradicted(flight: FlightState) -> str:
 @dataclass(frozen=True, slots=True)
 class Row:
     """`action` is taken when `condition` has held for `held_s`. `cause` and `reason` are as in
-    `rows.Transition`. `limit` is for the documentation, as is the first line of the condition's
+    `phases.Transition`. `limit` is for the documentation, as is the first line of the condition's
     docstring: what is measured."""
 
     name: str

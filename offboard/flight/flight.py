@@ -8,16 +8,11 @@ the control period, it decides once, on the newest state. What no setpoint waits
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
-from offboard.control.base import Adaptive, Controller
-from offboard.estimation.observer import Observer
 from offboard.flight import actions, decision, outbox, telemetry, transitions
 from offboard.flight.authority import Standing
 from offboard.flight.display import News, Snapshot
-from offboard.flight.flight_plan import FlightPlan
-from offboard.flight.inputs import InputRecorder
 from offboard.flight.phases import (
     BEFORE_FLIGHT,
     ENDS,
@@ -25,85 +20,34 @@ from offboard.flight.phases import (
     STOPPED,
     WAITING,
     Action,
-    Limits,
     Phase,
-    ServiceOptions,
 )
-from offboard.flight.record import PAUSE_S, Tick
+from offboard.flight.record import DROPPED, InputRecorder
 from offboard.flight.state import FlightState, Outcome
-from offboard.identification.learner import IdentifySettings, Learner
-from offboard.identification.vehicle_estimate import IdentifiedVehicle
+from offboard.flight.timing import PAUSE_S
 from offboard.link.interface import Chunk
 from offboard.mavlink.events import Attitude, ClockBehind, Event, LocalPosition, Rebooted
 from offboard.mavlink.outgoing import Outgoing
-from offboard.mavlink.session import ACTIVE, Session
-from offboard.model.vehicle import Vehicle
+from offboard.mavlink.session import ACTIVE
 from offboard.supervisor.recovery import Supervised
 
-__all__ = ["STOPPED", "Flight", "Outcome", "Output"]
+__all__ = ["STOPPED", "Flight", "Outcome"]
 
 MAV_STATE_STANDBY, MAV_STATE_CRITICAL = 3, 5
 BRIDGED_SHARE = 0.3  # of `Limits.silence_s`; after it, level setpoints replace the control law
 
 
-@dataclass(frozen=True, slots=True)
-class Output:
-    """What one turn sends."""
-
-    send: tuple[bytes, ...] = ()
-    supervised: Supervised | None = None  # for the supervisor; None before the vehicle is found
-
-
 class Flight(FlightState):
-    """Flies `plan` with `controller`: the state of the flight, and its turn. `stopwatch` reads host
-    time.
+    """The state of the flight, and its turn. After `before`, which has ended or waits, with the
+    same session, what it knows of vehicle and link stays known."""
 
-    `deadline_s` is the wall time that one decision may take; None in lockstep, where the vehicle
-    waits for each decision. `known` is what an earlier flight has identified of the vehicle.
-    `before` has ended or waits, with the same session: what it knows of vehicle and link stays
-    known.
-    """
-
-    def __init__(
-        self,
-        *,
-        vehicle: Vehicle,
-        session: Session,
-        observer: Observer,
-        controller: Controller,
-        plan: FlightPlan,
-        limits: Limits,
-        period_s: float,
-        deadline_s: float | None,
-        stopwatch: Callable[[], float],
-        identify: IdentifySettings | None = None,
-        known: IdentifiedVehicle | None = None,
-        service: ServiceOptions | None = None,
-        before: Flight | None = None,
-    ) -> None:
-        if known:
-            observer.set_vehicle(known.vehicle)
-        identification = None  # for a controller that cannot use another vehicle model
-        if identify and isinstance(controller, Adaptive):
-            identification = Learner(vehicle, identify, known=known)
-        self._inputs = InputRecorder(session.settings, kept=service is None)
-        super().__init__(
-            limits,
-            plan,
-            known.vehicle if known else vehicle,
-            session,
-            observer,
-            controller,
-            period_s,
-            self._inputs.watch(stopwatch),
-            deadline_s,
-            identification,
-            service,
-        )
+    def __post_init__(self, before: FlightState | None) -> None:
+        super().__post_init__(before)
+        self._inputs = InputRecorder(self.session.settings, kept=self.service is None)
+        self.stopwatch = self._inputs.watch(self.stopwatch)
         self._tick = -1  # number of the newest
-        if before is not None:
-            self.follow(before)
-            self._tick = before._tick if before.period_s == period_s else -1
+        if isinstance(before, Flight) and before.period_s == self.period_s:
+            self._tick = before._tick
         self._recorded_others = self.other_datagrams
         self._news = News()
         self._logged: list[bytes] = []  # frames since the newest `finish_turn`
@@ -111,8 +55,9 @@ class Flight(FlightState):
 
     # ------------------------------------------------------------------ the turn
 
-    def turn(self, chunks: Sequence[Chunk], now_s: float) -> Output:
-        """Process all that has arrived, then act once if a tick is due. Returns what to send.
+    def turn(self, chunks: Sequence[Chunk], now_s: float) -> tuple[bytes, ...]:
+        """Process all that has arrived, then act once if a tick is due. Returns the frames to
+        send.
 
         Call it at least every 50 ms, and `finish_turn` after the frames were sent. `now_s` is host
         time. In lockstep a turn without chunks does nothing: how many there are between two
@@ -120,7 +65,7 @@ class Flight(FlightState):
         """
         self._ticked = self._heard = False
         if self.session.settings.lockstep and not chunks:
-            return Output()
+            return ()
         now_s = self._inputs.begin(now_s, self.other_datagrams)
         try:
             before_s = self.now_s
@@ -137,9 +82,9 @@ class Flight(FlightState):
             outbox.send(self, *due, *replies)
         finally:
             self._inputs.end()
-        output = Output(outbox.flush(self), self._supervised())
-        self._logged += output.send
-        return output
+        frames = outbox.flush(self)
+        self._logged += frames
+        return frames
 
     def finish_turn(self, sent_s: float) -> list[bytes]:
         """Do what no setpoint waits for: identify the vehicle, and encode the log's records.
@@ -227,14 +172,8 @@ class Flight(FlightState):
         self._tick, self._ticked = number, True
         pause_s = self.busyness.on_tick(missed, flying=self.phase in FLYING)
         ignored = self.other_datagrams + self.session.counters.forged
-        self.tick = Tick(
-            self.time_s,
-            self.telemetry_arrived_s,
-            missed,
-            ignored - self._recorded_others,
-            pause_s,
-        )
-        self._recorded_others = ignored
+        self.missed_ticks, self.pause_s = missed, pause_s
+        self.ignored, self._recorded_others = ignored - self._recorded_others, ignored
         return True
 
     def _follow_link(self) -> None:
@@ -260,8 +199,10 @@ class Flight(FlightState):
         if self.has_ended():
             transitions.name_failsafe(self)
 
-    def _supervised(self) -> Supervised | None:
-        """For the supervisor: whether it has to act, should this process fail."""
+    @property
+    def supervised(self) -> Supervised | None:
+        """For the supervisor: whether it has to act, should this process fail. None before the
+        vehicle is found."""
         found, health, authority = self.session.vehicle, self.vehicle.health, self.authority
         if found is None:
             return None
@@ -304,11 +245,6 @@ class Flight(FlightState):
         """The flight at this moment, for displays; `flights` that the service has begun."""
         return Snapshot(self, flights)
 
-    @property
-    def lands_without_log(self) -> bool:
-        """Whether a log that cannot be written ends the flight."""
-        return self.limits.log_lost == "land"
-
     def request_stop(self, why: str = STOPPED) -> None:
         """Land, or do not take off; takes effect at the next turn."""
         if not self.stop_reason:
@@ -327,8 +263,8 @@ class Flight(FlightState):
             self.guarded = guarded
 
     def on_dropped(self, frames: int) -> None:
-        """The last frames of the newest `Output` were not sent: they became too old."""
-        self._inputs.dropped(frames)
+        """The last frames of the newest turn were not sent: they became too old."""
+        self._inputs.note(DROPPED, frames)
         self._news.dropped.add(frames)
 
     def overhear(self, datagrams: Sequence[bytes]) -> None:

@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from offboard.mavlink.events import Triple
 from offboard.reference.base import FlatSample, Reference
 from offboard.reference.track import Moved, Track
 from offboard.reference.transfer import Limits, stopping_place, transfer
 
 Array = NDArray[np.float64]
-Triple = tuple[float, float, float]
 SETTLED_DISTANCE_M = 0.3
 SETTLED_SPEED_MPS = 0.3
 RETURN = Limits(

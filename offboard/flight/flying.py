@@ -5,6 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from offboard.flight.authority import Standing
+from offboard.flight.failsafe import (
+    OPERATOR,
+    REBOOTED,
+    in_own_failsafe,
+    lost,
+    lost_armed,
+    mode_unknown,
+    rebooted,
+    stop_requested,
+)
 from offboard.flight.ground_contact import STILL_ARMED
 from offboard.flight.phases import (
     FLYING,
@@ -12,22 +22,11 @@ from offboard.flight.phases import (
     OUTAGE_MAX_S,
     TRACKING,
     Action,
+    Condition,
     ExitCode,
     Phase,
     Request,
-)
-from offboard.flight.rows import (
-    OPERATOR,
-    REBOOTED,
-    Condition,
     Transition,
-    in_own_failsafe,
-    longer_than,
-    lost,
-    lost_armed,
-    mode_unknown,
-    rebooted,
-    stop_requested,
 )
 from offboard.flight.state import FlightState
 
@@ -155,6 +154,16 @@ def not_disarmed(flight: FlightState) -> str:
     return f"not landed and disarmed after {flight.in_phase_s:.0f} s" + (
         f"; {STILL_ARMED}" if shows else ""
     )
+
+
+def longer_than(limit: str) -> Condition:
+    """Holds once the phase has lasted longer than the limit of this name."""
+
+    def too_long(flight: FlightState) -> bool:
+        return flight.in_phase_s > float(getattr(flight.limits, limit))
+
+    too_long.__name__ = f"longer_than_{limit}"
+    return too_long
 
 
 def requested(request: Request) -> Condition:

@@ -1,23 +1,226 @@
-"""Outbox: the queue of all messages of a flight, requests of modes, and texts.
+"""All that leaves: setpoints with their last check, requests, texts, and the queue of all messages.
 
-`flush` encodes what is to be sent, `log` what is only logged, after that. Decides nothing; owns no
-socket or file.
+PX4 flies any setpoint it receives. Every setpoint passes `admit`, which is independent of the
+control laws and of their limits, and is then given to the observer and the identification, which
+predict with the commands that were sent. `flush` encodes what is to be sent, `log` what is only
+logged, after that. Decides nothing; owns no socket or file.
 """
 
 from __future__ import annotations
 
 import math
+from contextlib import suppress
+from enum import IntFlag
 
-from offboard.flight.state import FlightState
+from offboard.flight.state import LEVEL, FlightState
 from offboard.flight.vehicle_state import GOOD_RESULTS
 from offboard.mavlink import event_record
 from offboard.mavlink.event_record import EventRecord
-from offboard.mavlink.outgoing import CommandLong, Outgoing, Record
+from offboard.mavlink.outgoing import (
+    FLOAT32_MAX,
+    AttitudeTarget,
+    CommandLong,
+    Outgoing,
+    PositionTarget,
+    Record,
+)
 from offboard.mavlink.texts import chunks
+from offboard.model.command import Command, PositionCommand
+from offboard.model.vehicle import Vehicle
 
 WARNING, INFO = 4, 6  # MAV_SEVERITY
 TEXT_ID_MAX = 65535  # STATUSTEXT.id; 0 is for texts of one chunk
 REPEAT_S = 1.0  # after this a request that was refused, or not answered, is sent again
+_LENGTH_TOLERANCE = 0.01
+
+
+class Refusal(IntFlag):
+    """Why a setpoint was not sent, as the log has it."""
+
+    LATE = 1  # decided after its deadline
+    STALE = 2  # the telemetry that it was made for is too old
+    NOT_OURS = 4  # the vehicle does not, or may not, follow us
+    UNUSABLE = 8  # not finite, or beyond the numbers of the wire
+
+
+class Refused(Exception):
+    """A setpoint that must not leave; the message is the reason, `why` its number."""
+
+    def __init__(self, why: Refusal, reason: str) -> None:
+        super().__init__(reason)
+        self.why = why
+
+
+def admit(
+    command: Command | PositionCommand,
+    vehicle: Vehicle,
+    *,
+    ours: bool,
+    on_ground: bool,
+    age_s: float = 0.0,
+    age_limit_s: float = math.inf,
+    late_s: float = 0.0,
+) -> Command | PositionCommand:
+    """The setpoint that may leave: `command` within the limits of `vehicle`.
+
+    Args:
+        ours: the vehicle is ours to command (`Authority.permits_setpoint`).
+        on_ground: it stands on the ground by every sign (`GroundContact.on_ground`).
+        age_s: age of the telemetry that the setpoint was computed from, beyond the known delay of
+            the link; 0 for a setpoint that needs none.
+        age_limit_s: the greatest age that may leave.
+        late_s: time by which the decision missed its deadline; 0 if it did not.
+
+    Raises Refused if the vehicle is not ours, the telemetry was too old, the decision too late, or
+    a value cannot be sent.
+    """
+    if not ours:
+        raise Refused(Refusal.NOT_OURS, "the vehicle is not ours")
+    if not age_s <= age_limit_s:
+        raise Refused(Refusal.STALE, f"decided on telemetry that is {age_s:.2f} s old")
+    if not late_s <= 0.0:
+        raise Refused(Refusal.LATE, f"decided {late_s:.2f} s too late")
+    if not usable(command):
+        raise Refused(Refusal.UNUSABLE, f"unusable {command}")
+    if isinstance(command, PositionCommand):
+        return command
+    return clamp(command, vehicle, on_ground=on_ground)
+
+
+def usable(command: Command | PositionCommand) -> bool:
+    """Whether all values can be sent, as float32, and the thrust direction is a unit vector, as a
+    tuple: commands are compared with ==."""
+    if isinstance(command, PositionCommand):
+        vectors = (
+            command.position_ned_m,
+            command.velocity_ned_mps,
+            command.acceleration_ned_mps2,
+            (command.heading_rad, command.heading_rate_radps),
+        )
+        return all(abs(value) <= FLOAT32_MAX for vector in vectors for value in vector)
+    direction: object = command.thrust_direction_ned
+    if not isinstance(direction, tuple):
+        return False
+    values = (command.thrust_mps2, *command.thrust_direction_ned, command.heading_rad)
+    if not all(abs(value) <= FLOAT32_MAX for value in values):
+        return False
+    return abs(math.hypot(*command.thrust_direction_ned) - 1.0) <= _LENGTH_TOLERANCE
+
+
+def clamp(command: Command, vehicle: Vehicle, *, on_ground: bool = False) -> Command:
+    """`command` limited to the vehicle's thrust and tilt.
+
+    A direction tilted by more than `tilt_max_rad` is turned back to that tilt in its own vertical
+    plane. In the air, thrust is at least a third of hover.
+    """
+    least_mps2 = 0.0 if on_ground else vehicle.thrust_min_mps2
+    thrust = min(max(command.thrust_mps2, least_mps2), vehicle.thrust_max_mps2)
+    north, east, down = command.thrust_direction_ned
+    lateral = math.hypot(north, east)
+    if math.atan2(lateral, down) > vehicle.tilt_max_rad:
+        # a direction that is exactly vertical is tilted to the north (atan2 of zeros)
+        towards_rad, scale = math.atan2(east, north), math.sin(vehicle.tilt_max_rad)
+        north, east = scale * math.cos(towards_rad), scale * math.sin(towards_rad)
+        down = math.cos(vehicle.tilt_max_rad)
+    return Command(thrust, (north, east, down), command.heading_rad)
+
+
+# ---------------------------------------------------------------------- setpoints
+
+
+def send_setpoint(
+    flight: FlightState,
+    time_s: float,
+    command: Command | PositionCommand,
+    body_z_down: float | None = None,
+    *,
+    age_s: float = 0.0,
+    late_s: float = 0.0,
+) -> Command | PositionCommand:
+    """Send a setpoint and return it as it was sent.
+
+    `age_s` and `late_s` are those of the decision (see `admit`), `body_z_down` is
+    described in `AttitudeTarget`. Raises Refused; then nothing is sent.
+    """
+    admitted = admit(
+        command,
+        flight.model,
+        ours=flight.ours,
+        on_ground=flight.contact.on_ground,
+        age_s=age_s,
+        age_limit_s=flight.limits.setpoint_age_s,
+        late_s=late_s,
+    )
+    if isinstance(admitted, Command):
+        _send_attitude(flight, time_s, admitted, body_z_down)
+    else:
+        _send_position(flight, time_s, admitted)
+    flight.setpoint_s = flight.now_s
+    return admitted
+
+
+def send_level(flight: FlightState, time_s: float, command: Command) -> None:
+    """Send a setpoint that no decision was needed for, if the vehicle is ours."""
+    with suppress(Refused):
+        send_setpoint(flight, time_s, command)
+
+
+def set_command(flight: FlightState, time_s: float, command: Command) -> None:
+    """Note the command in force without sending it, for example the autopilot's own."""
+    flight.command = command
+    flight.observer.on_command(flight.sent_s(time_s), command)
+
+
+def _send_attitude(
+    flight: FlightState, time_s: float, command: Command, body_z_down: float | None
+) -> None:
+    model = flight.model
+    set_command(flight, time_s, command)
+    flight.commands.append(command)
+    flight.thrusts.append(min(command.thrust_mps2 / model.thrust_max_mps2, 1.0))
+    if flight.identification:
+        flight.identification.on_command(flight.sent_s(time_s), command)
+    send(
+        flight,
+        AttitudeTarget(
+            time_s=time_s,
+            thrust_mps2=command.thrust_mps2,
+            thrust_direction_ned=command.thrust_direction_ned,
+            heading_rad=command.heading_rad,
+            hover_thrust=model.hover_thrust,
+            gravity_mps2=model.gravity_mps2,
+            body_z_down=body_z_down,
+        ),
+    )
+
+
+def _send_position(flight: FlightState, time_s: float, command: PositionCommand) -> None:
+    """The attitude that the autopilot's position loop commands is unknown, therefore the observer
+    stops predicting with commands."""
+    flight.observer.freeze(True)
+    flight.thrusts.clear()  # the autopilot chooses the thrust
+    flight.command = Command(flight.model.gravity_mps2, LEVEL, command.heading_rad)
+    send(
+        flight,
+        PositionTarget(
+            time_s,
+            command.position_ned_m,
+            command.velocity_ned_mps,
+            command.acceleration_ned_mps2,
+            command.heading_rad,
+            command.heading_rate_radps,
+        ),
+    )
+
+
+def hover_mps2(flight: FlightState) -> float:
+    """Thrust that holds the weight, by the observer's estimate of the hover thrust."""
+    model = flight.model
+    share = flight.observer.hover_thrust_estimate / model.hover_thrust
+    return (share if math.isfinite(share) else 1.0) * model.gravity_mps2
+
+
+# ---------------------------------------------------------------------- requests, texts, queue
 
 
 def request(flight: FlightState, request: CommandLong) -> bool:

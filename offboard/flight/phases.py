@@ -1,15 +1,19 @@
-"""Phases of a flight, actions of the failsafe, exit codes, limits, and options of the service."""
+"""Phases of a flight and what a row of the phase table is, actions of the failsafe, exit codes,
+limits, and options of the service."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass
 from enum import Enum, IntEnum
-from typing import ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from pydantic import Field
 
 from offboard.documents.parameters import Parameters
+
+if TYPE_CHECKING:
+    from offboard.flight.state import FlightState
 
 
 class Phase(Enum):
@@ -88,6 +92,33 @@ class ExitCode:
     USAGE = 2
     REFUSED = 3
     ABORTED = 4
+
+
+# A function of the flight that changes nothing: false (or an empty text) while it does not hold; a
+# text says why it holds
+Condition = Callable[["FlightState"], str | bool]
+
+
+@dataclass(frozen=True, slots=True)
+class Transition:
+    """A row of the phase table: from each of `phases`, when `condition` holds, to `target`.
+
+    `exit_code` is set if this row decides the result; a later row can only make it more severe.
+    `cause` is a word for what ended a flight that the row ends (see `analysis.verdict`). `reason`
+    is the sentence, where the condition does not say it. Both may have values of the flight in
+    braces.
+    """
+
+    phases: Set[Phase]
+    condition: Condition
+    target: Phase
+    exit_code: int | None = None
+    cause: str = ""
+    reason: str = ""
+
+    def why(self, flight: FlightState) -> str:
+        """The sentence that says why the row is taken, while its condition holds."""
+        return self.reason.format(flight=flight) or str(self.condition(flight))
 
 
 Anchor = Literal["here", "origin"]

@@ -8,23 +8,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import IntEnum
-from functools import partial
-from typing import Protocol
 
 from offboard.flight.phases import Limits
+from offboard.flight.timing import VehicleClock
 from offboard.flight.vehicle_state import ARMED_KNOWN_S, VehicleState
-from offboard.identification.uncertainty import Estimate
 from offboard.mavlink import senders
 from offboard.mavlink.dialects.base import Dialect, Takeoff, WatchedParameter
 from offboard.mavlink.events import Heartbeat
 from offboard.mavlink.outgoing import ParamRead
+from offboard.mavlink.session import Session
 
 TELEMETRY = ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED")
 MINIMUM_TELEMETRY_HZ = 10.0
-FIX_3D = 3  # GPS_FIX_TYPE; also stands for better ones
-STARTING_S = 90.0  # of vehicle time: ArduCopter uses a GPS 30 s after its first 3D fix
 REPEAT_S = 0.5  # between two requests for a parameter
 REPLY_TIMEOUT_S = 2.0  # for parameters
 UNANSWERED_S = 3.0  # requests of TIMESYNC, ten a second
@@ -55,31 +52,22 @@ class Finding:
         return f"{self.found}. Fix: {self.hint}" if self.hint else self.found
 
 
-class Known(Protocol):
-    """What a flight and a `Ground` have in common."""
-
-    vehicle: VehicleState
-    limits: Limits
-
-
 @dataclass(slots=True)
 class Ground:
-    """What is known of a vehicle before its flight, by a flight or by the listening of `doctor`."""
+    """What is known of a vehicle before its flight, by a flight or by the listening of `doctor`, at
+    host time `host_s`."""
 
     vehicle: VehicleState
     limits: Limits
+    session: Session
+    clock: VehicleClock
+    host_s: float
     dialect: Dialect | None = None
     helicopter: bool = False  # by its vehicle file
-    rates_hz: Mapping[str, float] | None = field(default_factory=dict)  # None: were not requested
-    delay: Estimate | None = None  # of telemetry and setpoint together, s
-    measures_delay: bool = False  # replies are still awaited
-    unanswered_s: float = 0.0  # since the newest request of TIMESYNC that was answered
+    rates_requested: bool = True
     reads_parameters: bool = False  # replies are still awaited
-    systems: str = ""  # of several vehicles, none of which was chosen
-    twin: bool = False  # two vehicles have the same ids
-    other_sender: bool = False  # another program controls it
+    other_sender: str = ""  # that another program controls it
     in_the_air: bool = False
-    fix_type: int | None = None  # GPS_FIX_TYPE
     guarded: bool = True  # a supervisor lands it if this process ends
     origin_missing: bool = False  # the reference is relative to a take-off point that is not known
     serves: bool = False  # for `daemon`, whose pilot arms it and engages
@@ -131,17 +119,6 @@ def not_ready(ground: Ground) -> str:
 
 # --- conditions ---
 
-# what may also come up later on the ground
-OTHER_SENDER = (
-    "another program controls the vehicle on this link, too: {flight.vehicle.other_sender_name} "
-    "(limits.begin_with_other_sender=true flies all the same)"
-)
-TWIN = (
-    "two vehicles with the same system id send on this link, or its telemetry comes twice, seconds "
-    "apart"
-)
-SEVERAL = "several vehicles are heard, systems {systems}: choose one with --system"
-
 
 def unfit_type(ground: Ground) -> str:
     """Why a vehicle of this MAV_TYPE, whose modes are not known here, is not flown; else empty."""
@@ -151,10 +128,14 @@ def unfit_type(ground: Ground) -> str:
     return senders.unfit_type(heartbeat.vehicle_type, helicopter=ground.helicopter)
 
 
-def armed_already(known: Known) -> str:
+def armed_already(vehicle: VehicleState, limits: Limits) -> str:
     """It is armed already, and the limits refuse such a vehicle."""
-    armed = known.vehicle.armed and not known.limits.begin_armed
+    armed = vehicle.armed and not limits.begin_armed
     return "the vehicle is armed already, by another controller or a pilot" if armed else ""
+
+
+def _armed(ground: Ground) -> str:
+    return armed_already(ground.vehicle, ground.limits)
 
 
 def _flown_by_another(ground: Ground) -> str:
@@ -178,17 +159,21 @@ def _flown_by_failsafe(ground: Ground) -> str:
     )
 
 
-def _other_sender(ground: Ground) -> str:
-    counts = ground.other_sender and not ground.limits.begin_with_other_sender
-    return OTHER_SENDER.format(flight=ground) if counts else ""
+def several_vehicles(session: Session) -> str:
+    """Several vehicles are heard, and none was chosen."""
+    senders, now_s = session.senders, session.link_time_s
+    if not senders.ambiguous(now_s):
+        return ""
+    return f"several vehicles are heard, systems {senders.named(now_s)}: choose one with --system"
 
 
-def _several_vehicles(ground: Ground) -> str:
-    return SEVERAL.format(systems=ground.systems) if ground.systems else ""
-
-
-def _twin(ground: Ground) -> str:
-    return TWIN if ground.twin else ""
+def twin(session: Session) -> str:
+    if not session.has_twin:
+        return ""
+    return (
+        "two vehicles with the same system id send on this link, or its telemetry comes twice, "
+        "seconds apart"
+    )
 
 
 def _no_telemetry(ground: Ground) -> str:
@@ -211,8 +196,8 @@ def _unguarded(ground: Ground) -> str:
 
 
 def _slow(ground: Ground) -> str:
-    rates_hz = ground.rates_hz
-    if rates_hz is None or not ground.vehicle.has_state:
+    rates_hz = ground.session.rates_hz
+    if not (ground.rates_requested and ground.vehicle.has_state):
         return ""
     for name in TELEMETRY:
         if rates_hz.get(name, 0.0) < MINIMUM_TELEMETRY_HZ:
@@ -270,13 +255,9 @@ def _rejected(ground: Ground) -> str:
     return report.problem if report and report.worst[1] > 1.0 else ""
 
 
-def _no_estimate(ground: Ground, *, starting: bool) -> str:
-    vehicle = ground.vehicle
-    report = vehicle.estimator
-    if report is None or report.worst[1] > 1.0:
-        return ""
-    starts = ground.fix_type != FIX_3D or vehicle.time_s < STARTING_S
-    return report.problem if starts == starting else ""
+def _no_estimate(ground: Ground) -> str:
+    report = ground.vehicle.estimator
+    return report.problem if report and report.worst[1] <= 1.0 else ""
 
 
 def _empty_battery(ground: Ground) -> str:
@@ -295,13 +276,14 @@ def unanswered(for_s: float) -> str:
 
 
 def _measuring(ground: Ground) -> str:
-    if not ground.measures_delay:
+    clock, host_s = ground.clock, ground.host_s
+    if clock.delay_is_measured(host_s):
         return ""
-    return unanswered(ground.unanswered_s) or "the delay of the link is being measured"
+    return unanswered(clock.unanswered_s(host_s)) or "the delay of the link is being measured"
 
 
 def _late(ground: Ground) -> str:
-    delay, limits = ground.delay, ground.limits
+    delay, limits = ground.clock.delay, ground.limits
     if delay is None or (delay.value <= limits.link_delay_s and delay.sd <= limits.link_jitter_s):
         return ""
     return (
@@ -314,6 +296,8 @@ def _late(ground: Ground) -> str:
 _ESTIMATOR = "wait for a GPS fix, keep the vehicle still and away from metal; then calibrate"
 _UNFIT = "fly it with its own autopilot; is MAV_TYPE or FRAME_CLASS right?"
 _FAILSAFE = "let the pilot take over first"
+_PORTS = "or give each vehicle its own port"
+_TWIN = "switch one off, or change its system id"
 
 
 def _slow_hint(ground: Ground) -> str:
@@ -325,10 +309,17 @@ PREFLIGHT = (
     Row("vehicle", BLOCKS, unfit_type, _UNFIT, at_once=True),
     Row("state", BLOCKS, _flown_by_another, "stop that controller", at_once=True, fly_only=True),
     Row("state", BLOCKS, _flown_by_failsafe, _FAILSAFE, at_once=True, fly_only=True),
-    Row("state", BLOCKS, armed_already, "disarm it", at_once=True, fly_only=True),
-    Row("senders", BLOCKS, _other_sender, "stop it", at_once=True, fly_only=True),
-    Row("senders", BLOCKS, _several_vehicles, "or give each vehicle its own port", at_once=True),
-    Row("senders", BLOCKS, _twin, "switch one off, or change its system id", at_once=True),
+    Row("state", BLOCKS, _armed, "disarm it", at_once=True, fly_only=True),
+    Row(
+        "senders",
+        BLOCKS,
+        lambda ground: ground.other_sender,
+        "stop it",
+        at_once=True,
+        fly_only=True,
+    ),
+    Row("senders", BLOCKS, lambda ground: several_vehicles(ground.session), _PORTS, at_once=True),
+    Row("senders", BLOCKS, lambda ground: twin(ground.session), _TWIN, at_once=True),
     Row("rates", WAIT, _no_telemetry),
     Row("supervisor", WAIT, _unguarded),
     Row("rates", BLOCKS, _slow, _slow_hint),
@@ -338,8 +329,7 @@ PREFLIGHT = (
     Row("prearm", WAIT, _prearm, fly_only=True),
     Row("prearm", WARN, _needs_setpoints, _other_mode, fly_only=True),
     Row("estimator", BLOCKS, _rejected, _ESTIMATOR),
-    Row("estimator", WAIT, partial(_no_estimate, starting=True), _ESTIMATOR),
-    Row("estimator", BLOCKS, partial(_no_estimate, starting=False), _ESTIMATOR),
+    Row("estimator", WAIT, _no_estimate, _ESTIMATOR),
     Row("battery", BLOCKS, _empty_battery, "charge the battery"),
     Row("delay", WAIT, _measuring),
     Row("delay", BLOCKS, _late, "use a faster link"),

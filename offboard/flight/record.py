@@ -1,21 +1,40 @@
-"""Control ticks: the log's record of one (state, command, cost and times, as floats), and whether
-this computer keeps up with them.
+"""Records of a flight in its log, beside the frames that were received and sent: of each control
+tick, of the configuration and the vehicle, and what the turns were given, so that `offboard replay`
+can give it the same again.
 
 The fields of `TickRecord` are the layout of DEBUG_FLOAT_ARRAY.data (name "pso") in the .tlog; the
 analysis reads the log with the same class. The array_id is the number of fields, so that the log
 of an older version, which lacks the last ones, stays readable.
+
+All others are TUNNEL messages of our record component. The configuration is a text, compressed and
+in numbered pieces, the first entries of the log. Of the inputs of a turn the log holds every frame
+that was received. What else a turn depends on is recorded here: its host time, which frames arrived
+together, when and from whom, each reading of the stopwatch, and what the loop requested. Host times
+are whole microseconds, rounded before the flight sees them, so that the record is exact. In
+lockstep nothing depends on host time, and none is recorded. This record is a list of JSON texts,
+one in a line, compressed by zlib and cut into pieces: an object, or for a turn
+`[time, chunks, readings]` with the time since the turn before, and in its chunks and readings since
+its own time.
 """
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass, fields
+import json
+import struct
+import zlib
+from collections.abc import Callable, Hashable, Iterable, Iterator
+from dataclasses import asdict, dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from offboard.control.base import Certificate, Decision
 from offboard.flight.phases import Phase
-from offboard.mavlink.outgoing import ReferenceRecord
+from offboard.link.interface import Chunk
+from offboard.mavlink.events import VehicleFound
+from offboard.mavlink.outgoing import ConfigurationRecord, ReferenceRecord
+from offboard.mavlink.session import Reception, SessionSettings
 from offboard.model.command import Command, PositionCommand, PredictedState
 from offboard.reference.base import FlatSample
 
@@ -68,7 +87,7 @@ class TickRecord:
     track_time_s: float  # time since the start of the track; NaN before it
     seed_cost: float = NAN  # cost of the best plan that the search started from
     age_s: float = NAN  # of the telemetry when the setpoint was sent, vehicle time
-    refused: float = 0.0  # flags of `setpoint.Refusal`; 0 for a setpoint that was sent
+    refused: float = 0.0  # flags of `outbox.Refusal`; 0 for a setpoint that was sent
     other_datagrams: float = 0.0  # datagrams of other senders since the previous record
     pause_s: float = 0.0  # longest pause of this process since the previous tick; 0 below a period
 
@@ -81,60 +100,18 @@ FIELDS = tuple(field.name for field in fields(TickRecord))
 RECORD_ID = len(FIELDS)
 
 
-@dataclass(frozen=True, slots=True)
-class Tick:
-    """One control tick."""
-
-    time_s: float = 0.0  # vehicle time
-    arrived_s: float = 0.0  # host time of the arrival of the telemetry that caused it
-    missed: int = 0  # ticks skipped since the previous one
-    other_datagrams: int = 0  # datagrams of other senders since the previous one
-    pause_s: float = 0.0  # of this process, since the previous one
-
-
 @dataclass(slots=True)
 class Decided:
     """A decision, the predicted state it was made for, and what became of it."""
 
-    tick: Tick
     phase: Phase
     state: PredictedState
     decision: Decision
     solve_time_s: float
     sent: Command | PositionCommand | None = None
     age_s: float = 0.0  # of its telemetry, when it was checked
-    refused: int = 0  # flags of `setpoint.Refusal`
+    refused: int = 0  # flags of `outbox.Refusal`
     failure: str = ""  # why it was refused
-
-    def record(self, *, answer_s: float, hover_thrust: float, track_time_s: float) -> TickRecord:
-        """The record of the tick. The certificate counts if the setpoint was sent as decided."""
-        sent, state, tick = self.sent, self.state, self.tick
-        # with a position setpoint, the autopilot chooses thrust and direction
-        attitude = sent if isinstance(sent, Command) else None
-        certified = sent == self.decision.command
-        figures = astuple(self.decision.certificate) if certified else (NAN,) * CERTIFIED
-        *certificate, seed_cost = map(float, figures)
-        values = (
-            float(self.phase.code),
-            attitude.thrust_mps2 if attitude else NAN,
-            *(attitude.thrust_direction_ned if attitude else (NAN, NAN, NAN)),
-            sent.heading_rad if sent else NAN,
-            *certificate,
-            self.solve_time_s,
-            answer_s,
-            float(tick.missed),
-            *_triple(state.position_ned_m),
-            *_triple(state.velocity_ned_mps),
-            *_triple(state.disturbance_ned_mps2),
-            hover_thrust,
-            track_time_s,
-            seed_cost,
-            self.age_s,
-            float(self.refused),
-            float(tick.other_datagrams),
-            tick.pause_s,
-        )
-        return TickRecord(*values)
 
 
 def reference_record(time_s: float, sample: FlatSample) -> ReferenceRecord:
@@ -153,50 +130,251 @@ def _triple(values: Array) -> tuple[float, float, float]:
     return float(values[0]), float(values[1]), float(values[2])
 
 
-# ---------------------------------------------------------------------- ticks that were skipped
+# ---------------------------------------------------------------------- configuration and vehicle
 
-SHARE = 0.05  # of the ticks skipped, from which a computer is too busy
-PAUSE_S = 0.3  # or one pause; after it, what was known before is not known any more
+# TUNNEL.payload_type; numbers above 32767 need no registration
+CONFIGURATION_TYPE, VEHICLE_TYPE, PAYLOAD_TYPE = 0xC0F1, 0xC0F3, 0xC0F5
+_NUMBERED = struct.Struct("<HH")  # index of the piece, number of pieces of a configuration
+_PART_BYTES = 128 - _NUMBERED.size
+TEXT_MOST = 4_000_000  # bytes: eight of the longest configuration files; a log may be anybody's
+_HEAD = struct.Struct("<I")  # number of the piece
+_PIECE_BYTES = 128 - _HEAD.size
+# what an object holds: the name and the arguments of a call of the flight, or the total of others'
+# datagrams, a number of frames that were not sent, a checksum
+CALL, OTHERS, DROPPED, CHECK = "call", "others", "dropped", "crc"
+SETTINGS = "settings"  # the first call: how the session was set
+RECORDED_SETTINGS = ("system_id", "lockstep", "stream", "sends_first", "capacity_bytes_ps")
 
 
-def too_busy(skipped: float, ticks: float, pause_s: float) -> str:
-    """A sentence if this computer was too busy to fly; else empty.
+def vehicle_record(vehicle: VehicleFound) -> ConfigurationRecord:
+    """The record that says which vehicle is flown."""
+    return ConfigurationRecord(json.dumps(asdict(vehicle)).encode(), VEHICLE_TYPE)
 
-    `skipped` of `ticks` control ticks fell into pauses of this process; `pause_s` is the longest.
-    """
-    if not (pause_s > PAUSE_S or skipped > SHARE * ticks):
-        return ""
-    return (
-        f"this computer was too busy: {skipped:.0f} of {ticks:.0f} ticks were skipped, pauses up "
-        f"to {pause_s:.2f} s"
+
+def vehicle_of(payload: bytes) -> VehicleFound | None:
+    """The vehicle in the payload of such a record; None if it is damaged."""
+    try:
+        return VehicleFound(**json.loads(payload))
+    except (ValueError, TypeError):
+        return None
+
+
+def configuration_pieces(text: str) -> list[ConfigurationRecord]:
+    """Records that hold `text`, in order."""
+    data = zlib.compress(text.encode("utf-8"), 9)
+    parts = [data[at : at + _PART_BYTES] for at in range(0, len(data), _PART_BYTES)]
+    return [
+        ConfigurationRecord(_NUMBERED.pack(index, len(parts)) + part, CONFIGURATION_TYPE)
+        for index, part in enumerate(parts)
+    ]
+
+
+def joined_configuration(payloads: Iterable[bytes]) -> str | None:
+    """The text in the payloads of TUNNEL messages; None if a piece is missing or damaged. Raises
+    ValueError for a text of more than TEXT_MOST bytes."""
+    parts: dict[int, bytes] = {}
+    count = 0
+    for payload in payloads:
+        if len(payload) > _NUMBERED.size:
+            index, count = _NUMBERED.unpack_from(payload)
+            parts[index] = payload[_NUMBERED.size :]
+        if len(parts) == count > 0:  # they are the first entries of a log
+            break
+    if not count or sorted(parts) != list(range(count)):
+        return None
+    unpacked = zlib.decompressobj()
+    try:
+        data = unpacked.decompress(b"".join(parts[index] for index in range(count)), TEXT_MOST)
+        if unpacked.eof:
+            return data.decode("utf-8")
+    except (zlib.error, UnicodeDecodeError):
+        return None
+    if len(data) == TEXT_MOST:
+        raise ValueError(f"its configuration unpacks to more than {TEXT_MOST // 1000} kB")
+    return None
+
+
+# ---------------------------------------------------------------------- turns
+
+
+class InputRecorder:
+    """Records the inputs of one `Flight`; see the module. With `kept` False nothing: a flight of
+    a service goes on with what was known before, which its log does not hold."""
+
+    def __init__(self, settings: SessionSettings, *, kept: bool = True) -> None:
+        self._kept = kept
+        self._timed = not settings.lockstep
+        self._compressor = zlib.compressobj()
+        self._data = bytearray()  # compressed, and not in a piece yet
+        self._pieces = 0
+        self._now_us = self._before_us = 0
+        self._peers: list[Hashable] = []
+        self._other_datagrams = 0
+        self._chunks: list[list[Any]] = []  # of the turn in progress
+        self._readings_us: list[int] = []
+        self._crc = 0  # of the frames since the last check
+        self.call(SETTINGS, {name: getattr(settings, name) for name in RECORDED_SETTINGS})
+
+    def begin(self, now_s: float, other_datagrams: int) -> float:
+        """A turn begins. Returns its time as it is recorded."""
+        if other_datagrams != self._other_datagrams:
+            self.note(OTHERS, other_datagrams)
+            self._other_datagrams = other_datagrams
+        self._before_us, self._now_us = self._now_us, round(now_s * 1e6)
+        self._chunks, self._readings_us = [], []
+        return self._now_us / 1e6
+
+    def arrived_s(self, chunk: Chunk) -> float:
+        """The time of arrival of a chunk as it is recorded."""
+        return round(chunk.arrived_s * 1e6) / 1e6
+
+    def chunk(self, chunk: Chunk, reception: Reception) -> None:
+        """A chunk of this turn, and what was found in it."""
+        for frame in reception.frames:
+            self._crc = zlib.crc32(frame, self._crc)
+        unlogged = [(place, frame.hex()) for place, frame in reception.unlogged]
+        arrived_us = round(chunk.arrived_s * 1e6) - self._now_us if self._timed else 0
+        self._chunks.append([self._peer(chunk.peer), arrived_us, len(reception.frames), *unlogged])
+
+    def watch(self, stopwatch: Callable[[], float]) -> Callable[[], float]:
+        """The same stopwatch, whose readings are recorded."""
+
+        def read() -> float:
+            read_us = round(stopwatch() * 1e6)
+            if self._timed:
+                self._readings_us.append(read_us - self._now_us)
+            return read_us / 1e6
+
+        return read
+
+    def end(self) -> None:
+        """The turn ends. In lockstep one in which nothing arrived changes nothing."""
+        if self._timed or self._chunks:
+            step_us = self._now_us - self._before_us if self._timed else 0
+            self._write([step_us, self._chunks, self._readings_us])
+
+    def call(self, name: str, *arguments: object) -> None:
+        """A method of the flight was called between two turns."""
+        self.note(CALL, [name, *arguments])
+
+    def note(self, kind: str, value: object) -> None:
+        """Something beside the turns: one of CALL, OTHERS, DROPPED, CHECK."""
+        self._write({kind: value})
+
+    def pieces(self, *, all_of_it: bool) -> list[ConfigurationRecord]:
+        """Records for the log: the full ones, or all that there is."""
+        if not self._kept:
+            return []
+        if all_of_it:
+            self.note(CHECK, self._crc)
+            self._crc = 0
+            self._data += self._compressor.flush(zlib.Z_SYNC_FLUSH)
+        records: list[ConfigurationRecord] = []
+        while len(self._data) >= _PIECE_BYTES or (all_of_it and self._data):
+            data = _HEAD.pack(self._pieces) + bytes(self._data[:_PIECE_BYTES])
+            records.append(ConfigurationRecord(data, PAYLOAD_TYPE))
+            self._pieces += 1
+            del self._data[:_PIECE_BYTES]
+        return records
+
+    def _write(self, entry: object) -> None:
+        if self._kept:
+            line = json.dumps(entry, separators=(",", ":")) + "\n"
+            self._data += self._compressor.compress(line.encode())
+
+    def _peer(self, peer: Hashable) -> Hashable:
+        """In lockstep its number: the simulator's port differs from run to run, and does not
+        matter."""
+        if self._timed:
+            return peer
+        if peer not in self._peers:
+            self._peers.append(peer)
+        return self._peers.index(peer)
+
+
+class InputsError(ValueError):
+    """The record is damaged or not complete; the text says how."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkInput:
+    """A chunk: how many of the logged frames it held, and which others, each with the number of
+    logged frames before it."""
+
+    peer: Hashable
+    arrived_s: float
+    frames: int
+    unlogged: tuple[tuple[int, bytes], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class TurnInput:
+    """A turn: host time, chunks, and readings of the stopwatch."""
+
+    now_s: float
+    chunks: tuple[ChunkInput, ...]
+    readings_s: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """What came between two turns, see `InputRecorder.note`: of a CALL the name of the method and
+    its arguments, of the others one number."""
+
+    kind: str
+    values: tuple[Any, ...]
+
+
+Entry = TurnInput | Note
+
+
+def entries(payloads: Iterable[bytes]) -> Iterator[Entry]:
+    """The entries in the payloads of TUNNEL messages, in order. Ends within the last one if the log
+    does. Raises InputsError where a piece is missing or damaged."""
+    now_us = 0
+    for line in _lines(payloads):
+        try:
+            found = json.loads(line)
+            if isinstance(found, list):
+                now_us += int(found[0])
+                yield _turn(now_us, *found[1:])
+            else:
+                ((kind, value),) = found.items()
+                yield Note(kind, (str(value[0]), *value[1:]) if kind == CALL else (int(value),))
+        except (ValueError, LookupError, TypeError, OverflowError, RecursionError) as error:
+            raise InputsError(f"damaged: {error}") from None
+
+
+def _lines(payloads: Iterable[bytes]) -> Iterator[bytes]:
+    unpacked, begun = zlib.decompressobj(), b""
+    for count, piece in enumerate(payloads):
+        if len(piece) < _HEAD.size or _HEAD.unpack_from(piece)[0] != count:
+            raise InputsError(f"piece {count} is missing")
+        try:
+            *lines, begun = (begun + unpacked.decompress(piece[_HEAD.size :])).split(b"\n")
+        except zlib.error as error:
+            raise InputsError(f"piece {count} is damaged: {error}") from None
+        if len(begun) > TEXT_MOST:
+            raise InputsError(f"piece {count} is damaged: it has no end of line")
+        yield from lines
+
+
+def _turn(now_us: int, chunks: list[list[Any]], readings_us: list[int]) -> TurnInput:
+    return TurnInput(
+        now_us / 1e6,
+        tuple(_chunk(now_us, *each) for each in chunks),
+        tuple((now_us + each_us) / 1e6 for each_us in readings_us),
     )
 
 
-class Busyness:
-    """Counts in the air. `period_s`: of control; a shorter gap between two turns skips no tick."""
-
-    def __init__(self, period_s: float) -> None:
-        self._period_s = period_s
-        self._gap_s = 0.0  # longest between two turns, since the previous tick
-        self.skipped = self.ticks = 0
-        self.pause_s = 0.0
-
-    def on_turn(self, gap_s: float) -> None:
-        """A turn begins `gap_s` after the one before it, host time."""
-        self._gap_s = max(self._gap_s, gap_s)
-
-    def on_tick(self, missed: int, *, flying: bool) -> float:
-        """A tick, `missed` ticks after the previous one. Returns the pause that it came after, 0
-        without one."""
-        pause_s, self._gap_s = self._gap_s, 0.0
-        if pause_s <= self._period_s:
-            pause_s = 0.0
-        if flying:
-            self.ticks += 1 + missed
-            self.skipped += missed if pause_s else 0
-            self.pause_s = max(self.pause_s, pause_s)
-        return pause_s
-
-    @property
-    def sentence(self) -> str:
-        return too_busy(self.skipped, self.ticks, self.pause_s)
+def _chunk(
+    now_us: int, peer: Any, arrived_us: int, frames: int, *unlogged: tuple[int, str]
+) -> ChunkInput:
+    sender: Hashable = tuple(peer) if isinstance(peer, list) else peer
+    hash(sender)  # TypeError for what is no address
+    return ChunkInput(
+        sender,
+        (now_us + arrived_us) / 1e6,
+        int(frames),
+        tuple((int(place), bytes.fromhex(frame)) for place, frame in unlogged),
+    )

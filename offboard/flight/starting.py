@@ -5,17 +5,12 @@ from __future__ import annotations
 from collections.abc import Set
 
 from offboard.flight import preflight
-from offboard.flight.phases import ExitCode, Phase, Request
-from offboard.flight.preflight import OTHER_SENDER, SEVERAL, TWIN, Ground, armed_already
-from offboard.flight.rows import (
+from offboard.flight.failsafe import (
     OPERATOR,
-    Transition,
     blind,
-    engaged_in_the_air,
     in_own_failsafe,
     lost,
     lost_armed,
-    lost_disarmed,
     mode_unknown,
     other_sender,
     rebooted,
@@ -23,6 +18,8 @@ from offboard.flight.rows import (
     silent_for,
     stop_requested,
 )
+from offboard.flight.phases import ExitCode, Phase, Request, Transition
+from offboard.flight.preflight import Ground
 from offboard.flight.state import FlightState
 from offboard.flight.vehicle_state import ARMED_KNOWN_S
 from offboard.mavlink.events import Heartbeat
@@ -60,36 +57,34 @@ def silent_for_another(flight: FlightState) -> str:
 
 def other_vehicle(flight: FlightState) -> str:
     """Several vehicles are heard, and none was chosen with --system, or none can be."""
-    senders, now_s = flight.session.senders, flight.now_s
-    if flight.session.has_twin:
-        return TWIN
-    return SEVERAL.format(systems=senders.named(now_s)) if senders.ambiguous(now_s) else ""
+    return preflight.twin(flight.session) or preflight.several_vehicles(flight.session)
 
 
 def ground_of(flight: FlightState) -> Ground:
     """What the preflight list judges."""
     vehicle, contact, dialect = flight.vehicle, flight.contact, flight.dialect
-    senders, service = flight.session.senders, flight.service
+    service = flight.service
     read = dialect and flight.reading.complete(dialect, vehicle.parameters, flight.now_s)
     from_origin = service is not None and service.anchor == "origin"
     return Ground(
         vehicle,
         flight.limits,
+        flight.session,
+        flight.clock,
+        flight.host_s,
         dialect,
         helicopter=flight.model.airframe == "helicopter",
-        rates_hz=flight.session.rates_hz,
-        delay=flight.clock.delay,
-        measures_delay=not flight.clock.delay_is_measured(flight.host_s),
-        unanswered_s=flight.clock.unanswered_s(flight.host_s),
         reads_parameters=not read,
-        systems=senders.named(flight.now_s) if senders.ambiguous(flight.now_s) else "",
-        twin=flight.session.has_twin,
-        other_sender=bool(other_sender(flight)),
+        other_sender=other_sender(flight),
         in_the_air=contact.in_the_air,
         guarded=flight.guarded,
         origin_missing=from_origin and contact.in_the_air and contact.rest_ned_m is None,
         serves=service is not None,
     )
+
+
+def armed_already(flight: FlightState) -> str:
+    return preflight.armed_already(flight.vehicle, flight.limits)
 
 
 def refused(flight: FlightState) -> str:
@@ -157,29 +152,35 @@ def abandoned(flight: FlightState) -> bool:
     return left and found_engaged(flight) and can_take_over(flight)
 
 
-def can_start_in_the_air(flight: FlightState) -> bool:
-    """On request, as by a pilot's switch, only where every sign says that it flies."""
-    return flight.contact.flies and can_take_over(flight) and usable(flight)
-
-
 def started_in_the_air(flight: FlightState) -> str:
-    fit = flight.request is Request.START and can_start_in_the_air(flight)
+    """On request, as by a pilot's switch, only where every sign says that it flies."""
+    flies = flight.request is Request.START and flight.contact.flies
+    fit = flies and can_take_over(flight) and usable(flight)
     return f"start requested, {flight.vehicle.mode}" if fit else ""
 
 
 def started_on_the_ground(flight: FlightState) -> bool:
-    return flight.request is Request.START and not flight.vehicle.armed and usable(flight)
+    may_arm = flight.service is not None and flight.service.arms and not flight.vehicle.armed
+    return flight.request is Request.START and may_arm and usable(flight)
 
 
 # ---------------------------------------------------------------------- to the air
 
 
+def engaged_in_the_air(flight: FlightState) -> str:
+    """The vehicle flies in the mode in which it follows setpoints."""
+    flies = flight.engaged and flight.contact.in_the_air
+    return f"{flight.vehicle.mode} in the air" if flies else ""
+
+
+def lost_disarmed(flight: FlightState) -> str:
+    return lost(flight) if flight.shown_since_lost and not flight.vehicle.armed else ""
+
+
 def streamed(flight: FlightState) -> str:
+    if flight.takes_off_by_command:
+        return "the autopilot takes off by itself"
     return "setpoints stream" if flight.in_phase_s >= flight.limits.stream_s else ""
-
-
-def needs_no_stream(flight: FlightState) -> str:
-    return "the autopilot takes off by itself" if flight.takes_off_by_command else ""
 
 
 def engaged(flight: FlightState) -> str:
@@ -299,12 +300,11 @@ def starting(before: Set[Phase]) -> tuple[Transition, ...]:
         Transition(STREAMING, armed_already, FAILED, REFUSED),
         Transition(before, silent_on_ground, FAILED, REFUSED, "link"),
         Transition(before, stopped_before_takeoff, FAILED, REFUSED, OPERATOR),
-        Transition(STREAMING, other_sender, FAILED, REFUSED, "second sender", OTHER_SENDER),
+        Transition(STREAMING, other_sender, FAILED, REFUSED, "second sender"),
         Transition(STREAMING, other_vehicle, FAILED, REFUSED),
         Transition(STREAMING, blind, FAILED, REFUSED, "link"),
         Transition(STREAMING, mode_unknown, FAILED, REFUSED, "link"),
         Transition(STREAMING, lost, FAILED, REFUSED, "pilot"),
-        Transition({STREAM}, needs_no_stream, ENGAGE),
         Transition({STREAM}, streamed, ENGAGE),
         Transition({ENGAGE}, engaged, ARM),
         Transition({ENGAGE}, not_engaged, FAILED, REFUSED),

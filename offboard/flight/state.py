@@ -11,31 +11,29 @@ import math
 import operator
 from collections import deque
 from collections.abc import Callable, Hashable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field
 
 import numpy as np
 
 from offboard.control.base import Controller
 from offboard.estimation.observer import Observer
 from offboard.flight.authority import Authority, PilotSwitch, Standing
+from offboard.flight.estimates import HoverEstimate, Positioning, PositionJumps
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.ground_contact import DETECTOR_KNOWN_S, GroundContact, Touchdown, moved
-from offboard.flight.hover_estimate import HoverEstimate
 from offboard.flight.phases import ENDS, STOPPED, Action, Limits, Phase, Request, ServiceOptions
-from offboard.flight.positioning import Positioning, PositionJumps
 from offboard.flight.preflight import ParameterReading
-from offboard.flight.record import Busyness, Decided, Tick
-from offboard.flight.vehicle_clock import LinkGrowth, VehicleClock
+from offboard.flight.record import Decided
+from offboard.flight.timing import Busyness, LinkGrowth, VehicleClock
 from offboard.flight.vehicle_state import VehicleState
 from offboard.identification.learner import Learner
 from offboard.mavlink.dialects.base import Dialect, Takeoff
-from offboard.mavlink.events import Heartbeat, Landed, TimesyncReply
+from offboard.mavlink.events import Heartbeat, Landed, TimesyncReply, Triple
 from offboard.mavlink.outgoing import CommandLong, Outgoing, Record
 from offboard.mavlink.session import Session
 from offboard.model.command import Command, PredictedState
 from offboard.model.vehicle import Vehicle
 
-Triple = tuple[float, float, float]
 LEVEL = (0.0, 0.0, 1.0)  # thrust direction
 COMMANDS_KEPT = 7  # as long as an attitude may take to follow
 THRUSTS_KEPT = 40  # as long as a setpoint may be on its way, or the next ones be lost
@@ -95,6 +93,7 @@ class FlightState:
     deadline_s: float | None = None
     identification: Learner | None = None
     service: ServiceOptions | None = None
+    before: InitVar[FlightState | None] = None
     vehicle: VehicleState = field(default_factory=VehicleState)
     clock: VehicleClock = field(default_factory=VehicleClock)
     hover: HoverEstimate = field(default_factory=HoverEstimate)
@@ -124,6 +123,7 @@ class FlightState:
     rebooted: bool = False
     left_engaged: bool = False  # a flight that was cut short has left the vehicle engaged
     request: Request = Request.NONE  # of the ground station, until the next tick
+    obeyed: Request = Request.NONE  # the newest that was accepted, while its flight lasts
     stop_reason: str = ""  # why the flight shall end; empty while it shall not
     outcome: Outcome | None = None
 
@@ -131,7 +131,9 @@ class FlightState:
     heard_s: float = math.nan  # host time of the newest telemetry, as `Session.elapsed_s`
     telemetry_arrived_s: float = 0.0  # host time at which it arrived
     bridged_s: float = 0.0  # silence at the newest setpoint that needs no telemetry
-    tick: Tick = field(default_factory=Tick)  # the newest
+    missed_ticks: int = 0  # skipped between the newest tick and the one before
+    ignored: int = 0  # datagrams of others and forged frames between the two
+    pause_s: float = 0.0  # of this process, between the two
     command: Command = field(default_factory=lambda: Command(0.0, LEVEL, 0.0))  # in force
     decided: Decided | None = None  # in this turn
     announced_radps: float = math.nan  # bandwidth in use, as the user knows it
@@ -152,11 +154,13 @@ class FlightState:
         default_factory=lambda: deque(maxlen=PREDICTIONS_KEPT)
     )
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, before: FlightState | None) -> None:
         self.busyness = Busyness(self.period_s)
         self.contact = GroundContact(self.vehicle)
+        if before is not None:
+            self._follow(before)
 
-    def follow(self, before: FlightState) -> None:
+    def _follow(self, before: FlightState) -> None:
         """Continue after another flight with the same vehicle: what is known of vehicle and link
         stays. It begins in STANDBY, or anew while the vehicle is not known well enough: after a
         reboot its parameters are read again."""
@@ -330,8 +334,3 @@ class FlightState:
     def telemetry_age_s(self, host_s: float) -> float:
         """Age of the newest telemetry at `host_s`, beyond the least delay of the link."""
         return self.clock.age_s(self.time_s, host_s)
-
-    @property
-    def telemetry_is_old(self) -> bool:
-        """The newest telemetry is too old for a setpoint that is computed from it."""
-        return self.telemetry_age_s(self.host_s) > self.limits.setpoint_age_s

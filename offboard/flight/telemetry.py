@@ -11,18 +11,16 @@ from enum import IntEnum
 
 import numpy as np
 
-from offboard.flight import outbox
+from offboard.flight import outbox, transitions
 from offboard.flight.authority import Authority
+from offboard.flight.estimates import HoverEstimate, PositionJumps
+from offboard.flight.failsafe import other_sender
 from offboard.flight.ground_contact import GroundContact
-from offboard.flight.hover_estimate import HoverEstimate
-from offboard.flight.inputs import vehicle_record
-from offboard.flight.phases import BEFORE_FLIGHT, FLYING, MOVING, TRACKING, WAITING, Phase, Request
-from offboard.flight.positioning import PositionJumps
+from offboard.flight.phases import BEFORE_FLIGHT, FLYING, TRACKING, WAITING, Request
 from offboard.flight.preflight import ParameterReading
-from offboard.flight.rows import other_sender
-from offboard.flight.starting import can_start_in_the_air, usable
+from offboard.flight.record import vehicle_record
 from offboard.flight.state import FlightState
-from offboard.flight.vehicle_clock import VehicleClock
+from offboard.flight.timing import VehicleClock
 from offboard.mavlink.events import (
     Attitude,
     ClockBehind,
@@ -42,8 +40,6 @@ from offboard.mavlink.events import (
 from offboard.mavlink.outgoing import CommandResult, ThrustRule
 
 START, PAUSE_CONTINUE, SET_MODE = 300, 193, 176  # MAV_CMD
-BEGINNING = (Phase.STREAM, Phase.ENGAGE, Phase.ARM, Phase.TAKEOFF)
-ENDING = (Phase.HAND_BACK, Phase.HOLD)
 SAME_THRUST = 1e-5  # of full throttle: rounding on the link
 OTHER_COMPANION = (
     "another companion computer is on the link: system {system} component {component}; only one of "
@@ -209,57 +205,30 @@ class Result(IntEnum):
 
 def _answer(flight: FlightState, asked: CommandRequest) -> None:
     """Acknowledge a command to us; the next tick does what it asks for."""
-    result = Result.UNSUPPORTED
+    request, result = Request.NONE, Result.UNSUPPORTED
     if flight.service:
-        result, request = _judged(flight, asked.command, asked.parameters)
-        if request is not Request.NONE:
-            flight.request = request
-            sender = f"system {asked.system_id} component {asked.component_id}"
-            outbox.announce(flight, f"{request.value} requested by {sender}")
+        request = {START: Request.START, SET_MODE: Request.HAND_BACK}.get(asked.command, request)
+        if asked.command == PAUSE_CONTINUE:
+            wanted = {0.0: Request.PAUSE, 1.0: Request.CONTINUE}
+            request, result = wanted.get(asked.parameters[0], request), Result.DENIED
+    if request is not Request.NONE:
+        result = _take_request(flight, request)
+    if result is Result.ACCEPTED:
+        sender = f"system {asked.system_id} component {asked.component_id}"
+        outbox.announce(flight, f"{request.value} requested by {sender}")
     outbox.send(flight, CommandResult(asked.command, result, asked.system_id, asked.component_id))
 
 
-Answer = tuple[Result, Request]
-NOTHING_TO_DO: Answer = (Result.ACCEPTED, Request.NONE)
-NOT_NOW: Answer = (Result.TEMPORARILY_REJECTED, Request.NONE)
-DENIED: Answer = (Result.DENIED, Request.NONE)
-
-
-def _judged(flight: FlightState, command: int, parameters: tuple[float, ...]) -> Answer:
-    """The result to acknowledge `command` with, and what is to be done."""
-    if flight.request is not Request.NONE and command in (START, PAUSE_CONTINUE):
-        return NOT_NOW
-    if command == START:
-        return _start(flight)
-    if command == PAUSE_CONTINUE:
-        return _pause_or_continue(flight.phase, parameters[0])
-    if command == SET_MODE:
-        if flight.phase in TRACKING or flight.phase in BEGINNING or flight.request is Request.START:
-            return Result.ACCEPTED, Request.HAND_BACK
-        return NOTHING_TO_DO if flight.phase in ENDING else DENIED
-    return Result.UNSUPPORTED, Request.NONE
-
-
-def _start(flight: FlightState) -> Answer:
-    if flight.phase in TRACKING:
-        return Result.ACCEPTED, Request.START
-    if flight.phase in BEGINNING:
-        return NOTHING_TO_DO
-    if flight.phase is not Phase.STANDBY:
-        return NOT_NOW
-    armed = flight.vehicle.armed
-    if not armed and not (flight.service and flight.service.arms):
-        return DENIED
-    fit = can_start_in_the_air(flight) if armed else usable(flight)
-    return (Result.ACCEPTED, Request.START) if fit else NOT_NOW
-
-
-def _pause_or_continue(phase: Phase, parameter: float) -> Answer:
-    wanted = {0.0: Request.PAUSE, 1.0: Request.CONTINUE}.get(parameter)
-    if wanted is None:
-        return DENIED
-    if phase in MOVING:
-        return (Result.ACCEPTED, wanted) if wanted is Request.PAUSE else NOTHING_TO_DO
-    if phase is Phase.PAUSE:
-        return (Result.ACCEPTED, wanted) if wanted is Request.CONTINUE else NOTHING_TO_DO
-    return NOTHING_TO_DO if phase is Phase.HOVER else NOT_NOW
+def _take_request(flight: FlightState, request: Request) -> Result:
+    """Accept it if it leads to another phase now. Of several in one tick the first counts, but to
+    hand the vehicle back replaces any other. One that is being obeyed is accepted again: a ground
+    station that missed the answer repeats it."""
+    if flight.request is Request.NONE:
+        possible = transitions.leads_on(flight, request)
+    else:
+        possible = request is Request.HAND_BACK
+    if not possible:
+        obeyed = request is flight.obeyed
+        return Result.ACCEPTED if obeyed else Result.TEMPORARILY_REJECTED
+    flight.request = flight.obeyed = request
+    return Result.ACCEPTED

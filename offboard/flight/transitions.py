@@ -15,8 +15,8 @@ import numpy as np
 
 from offboard.flight import decision, failsafe, flying, outbox, starting
 from offboard.flight.authority import PilotSwitch
+from offboard.flight.failsafe import REBOOTED, in_own_failsafe
 from offboard.flight.ground_contact import Touchdown
-from offboard.flight.hover_estimate import DIFFERENT, SETTLED, differs
 from offboard.flight.phases import (
     BEFORE_FLIGHT,
     FLYING,
@@ -25,13 +25,15 @@ from offboard.flight.phases import (
     Phase,
     Request,
     ServiceOptions,
+    Transition,
 )
 from offboard.flight.preflight import ParameterReading
-from offboard.flight.rows import REBOOTED, Transition, in_own_failsafe
 from offboard.flight.state import FlightState, Outcome
 from offboard.identification.learner import Stage
 from offboard.mavlink.events import LocalPosition
 
+DIFFERENT = 0.1  # of the hover thrust: a smaller difference is left to the observer
+SETTLED = 0.02  # the same, of a vehicle that has flown by itself for long
 TAKEN = "a failsafe of the vehicle has it, as its HEARTBEAT shows"
 STAGES = {
     Phase.CLIMB: Stage.CLIMB,
@@ -70,8 +72,19 @@ def table(service: ServiceOptions | None = None) -> tuple[Transition, ...]:
 
 def next_row(flight: FlightState) -> Transition | None:
     """The first row of the flight's phase whose condition holds, or None to stay."""
-    rows = _by_phase(flight.service).get(flight.phase, ())
+    rows = _by_phase(flight.service)[flight.phase]
     return next((row for row in rows if row.condition(flight)), None)
+
+
+def leads_on(flight: FlightState, request: Request) -> bool:
+    """Whether a row of the flight's phase holds with the request, and does not without it."""
+    rows, pending = _by_phase(flight.service)[flight.phase], flight.request
+    flight.request = Request.NONE
+    without = [row for row in rows if row.condition(flight)]
+    flight.request = request
+    accepted = [row for row in rows if row.condition(flight)] != without
+    flight.request = pending
+    return accepted
 
 
 @cache
@@ -134,6 +147,8 @@ def _enter(flight: FlightState, row: Transition) -> None:
     flight.vehicle.clear_messages()
     flight.phase = row.target
     flight.began_s = flight.now_s
+    if row.target in WAITING and flight.obeyed is not Request.HAND_BACK:
+        flight.obeyed = Request.NONE
     outbox.announce_phase(flight, reason, cause)
     if source in BEFORE_FLIGHT and row.target in FLYING:
         flight.clock.settle()
@@ -247,7 +262,7 @@ def _set_hover_thrust(flight: FlightState, least: float = DIFFERENT) -> None:
     """Fly with the hover thrust measured before the take-over, if it differs from the model's."""
     model = flight.model
     shown = flight.hover.hover_thrust(model, flight.time_s)
-    if shown is None or not differs(shown, model, least):
+    if shown is None or abs(shown / model.hover_thrust - 1.0) <= least:
         return
     flight.model = model.model_copy(update={"hover_thrust": shown})
     flight.observer.set_vehicle(flight.model)

@@ -123,10 +123,14 @@ class VehicleState:
         return self.health.radio_ok if self.health and self.age_s(SystemHealth) < HEALTH_S else None
 
     @property
-    def other_sender_name(self) -> str:
-        """The program that controls the vehicle, too; empty without one."""
+    def other_sender_named(self) -> str:
+        """That another program controls the vehicle, and which was heard last."""
         other = self.other_sender
-        return f"system {other.system_id} component {other.component_id}" if other else ""
+        name = f": system {other.system_id} component {other.component_id}" if other else ""
+        return (
+            f"another program controls the vehicle on this link, too{name} "
+            "(limits.begin_with_other_sender=true flies all the same)"
+        )
 
     @property
     def battery(self) -> float:

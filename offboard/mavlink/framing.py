@@ -1,4 +1,5 @@
-"""Framing: where frames are in received bytes. What is in them is decoded by pymavlink.
+"""Framing: where frames are in received bytes. pymavlink decodes those whose message is read: half
+of an autopilot's telemetry never is.
 
 pymavlink's own `parse_buffer` drops as many bytes after a damaged frame as its length says, and
 good frames with them: where a serial line loses one byte in a thousand it loses a tenth of the
@@ -10,7 +11,9 @@ MAVLink 1 frames (0xFE) are accepted: their payloads lack the extension fields, 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 from fastcrc import crc16
 
@@ -31,11 +34,12 @@ _CRC_EXTRA = {i: bytes((each.crc_extra,)) for i, each in mavlink.mavlink_map.ite
 _crc = crc16.mcrf4xx
 _HEADER_BYTES_V2, _HEADER_BYTES_V1, _SIGNATURE_BYTES = 10, 6, 13
 _SIGNED = 0x01  # incompatibility flag
+_pymavlink = mavlink.MAVLink(None)
 
 
-class Frame(NamedTuple):
-    """`verified`: the checksum is correct; False only if pymavlink does not know the id. `message`:
-    decoded by pymavlink; None for an unknown id, and in a log."""
+@dataclass
+class Frame:
+    """`verified`: the checksum is correct; False only if pymavlink does not know the id."""
 
     raw: bytes
     message_id: int
@@ -43,12 +47,16 @@ class Frame(NamedTuple):
     component_id: int
     sequence: int
     verified: bool
-    message: Any = None
 
     @property
     def payload(self) -> bytes:
         """The payload as it is on the wire: MAVLink 2 omits trailing zeros."""
         return payload_of(self.raw)
+
+    @cached_property
+    def message(self) -> Any:
+        """The message, decoded by pymavlink. Cannot fail where the checksum is correct."""
+        return _pymavlink.decode(bytearray(self.raw))
 
     @property
     def signed(self) -> bool:
@@ -63,7 +71,6 @@ class FrameSplitter:
     def __init__(self, stream: bool, counters: Counters) -> None:
         self._stream = stream
         self._counters = counters
-        self._mavlink = mavlink.MAVLink(None)
         self._rest = b""
         self._behind = 0  # where in the next data the frame before ends; -1: further back
 
@@ -110,22 +117,15 @@ class FrameSplitter:
         size = frame_size(data, at)
         if size is None or at + size > len(data):
             return None if self._stream else DropReason.TRUNCATED
-        raw = data[at : at + size]
-        header = _header(raw)
-        if header is None:
-            return DropReason.INCOMPATIBLE
-        try:
-            message = self._mavlink.decode(bytearray(raw))
-        except mavlink.MAVError:
-            return DropReason.BAD_CRC
-        if header[0] in mavlink.mavlink_map:
-            return Frame(raw, *header, True, message)
+        frame = parse(data, at, at + size)
+        if isinstance(frame, DropReason) or frame.verified:
+            return frame
         # without a known checksum a frame must fill the space between two others
         following = data[at + size : at + size + 1]
         if adjoins and self._stream and not following:
             return None
         fills = adjoins and (not following or following[0] in (V2, V1))
-        return Frame(raw, *header, False) if fills else DropReason.BAD_CRC
+        return frame if fills else DropReason.BAD_CRC
 
 
 def frame_size(data: bytes, at: int) -> int | None:
@@ -137,18 +137,20 @@ def frame_size(data: bytes, at: int) -> int | None:
     return _header_bytes(data, at) + data[at + 1] + _CRC_BYTES + signature_bytes
 
 
-def parse(data: bytes, at: int, end: int) -> Frame | None:
-    """The frame of a log in data[at:end], which `frame_size` has measured; None if it is damaged.
-    Its message is not decoded: a log of hours holds millions."""
+def parse(data: bytes, at: int, end: int) -> Frame | DropReason:
+    """The frame in data[at:end], which `frame_size` has measured, or why there is none."""
     raw = data[at:end]
-    header = _header(raw)
-    if header is None:
-        return None
+    if raw[0] == V1:
+        header = raw[5], raw[3], raw[4], raw[2]
+        crc_at = _HEADER_BYTES_V1 + raw[1]
+    elif raw[2] & ~_SIGNED:
+        return DropReason.INCOMPATIBLE  # cannot be understood without a later version of MAVLink
+    else:
+        header = raw[7] | raw[8] << 8 | raw[9] << 16, raw[5], raw[6], raw[4]
+        crc_at = _HEADER_BYTES_V2 + raw[1]
     extra = _CRC_EXTRA.get(header[0])
-    if extra is not None:
-        crc_at = _header_bytes(raw) + raw[1]
-        if _crc(extra, _crc(raw[1:crc_at])) != raw[crc_at] | raw[crc_at + 1] << 8:
-            return None
+    if extra is not None and _crc(extra, _crc(raw[1:crc_at])) != raw[crc_at] | raw[crc_at + 1] << 8:
+        return DropReason.BAD_CRC
     return Frame(raw, *header, extra is not None)
 
 
@@ -160,13 +162,3 @@ def payload_of(raw: bytes) -> bytes:
 
 def _header_bytes(data: bytes, at: int = 0) -> int:
     return _HEADER_BYTES_V1 if data[at] == V1 else _HEADER_BYTES_V2
-
-
-def _header(raw: bytes) -> tuple[int, int, int, int] | None:
-    """Message id, system, component and sequence number; None where incompatibility flags say that
-    the frame cannot be understood without a later version of MAVLink."""
-    if raw[0] == V1:
-        return raw[5], raw[3], raw[4], raw[2]
-    if raw[2] & ~_SIGNED:
-        return None
-    return raw[7] | raw[8] << 8 | raw[9] << 16, raw[5], raw[6], raw[4]

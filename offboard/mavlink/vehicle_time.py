@@ -2,7 +2,7 @@
 
 Vehicle time is `time_boot_ms` in seconds, continued where its 32 bits begin again at zero, after
 49.7 days. Host time is any monotonic clock, given as an argument. How old telemetry is, and how
-late the link, is in `flight.vehicle_clock`.
+late the link, is in `flight.timing`.
 """
 
 from __future__ import annotations

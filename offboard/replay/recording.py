@@ -10,9 +10,8 @@ from offboard.analysis import history, tlog
 from offboard.analysis.history import record_type
 from offboard.analysis.tlog import Tlog
 from offboard.documents.errors import UserError
-from offboard.flight import inputs
-from offboard.flight.inputs import SETTINGS, Call, Entry
-from offboard.flight.record import COMPONENT_ID
+from offboard.flight import record
+from offboard.flight.record import COMPONENT_ID, SETTINGS, Entry, Note
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +21,7 @@ class Recording:
     log: Tlog
     configuration: str
     settings: dict[str, object]
-    inputs: tuple[bytes, ...]  # the pieces of `flight.inputs`
+    inputs: tuple[bytes, ...]  # the pieces of `flight.record`
 
     @property
     def signed(self) -> bool:
@@ -30,8 +29,8 @@ class Recording:
         return any(m.frame.signed for m in self.log if m.component_id == COMPONENT_ID)
 
     def entries(self) -> Iterator[Entry]:
-        """The inputs in order. Raises inputs.InputsError where they are damaged."""
-        return inputs.entries(self.inputs)
+        """The inputs in order. Raises record.InputsError where they are damaged."""
+        return record.entries(self.inputs)
 
 
 def read(flight: Path) -> Recording:
@@ -44,7 +43,7 @@ def read(flight: Path) -> Recording:
             f"{path} does not hold the configuration of a flight: only logs of offboard can be "
             "replayed"
         )
-    recorded = tuple(m.tunnelled for m in log if record_type(m) == inputs.PAYLOAD_TYPE)
+    recorded = tuple(m.tunnelled for m in log if record_type(m) == record.PAYLOAD_TYPE)
     if not recorded:
         raise UserError(
             f"{path} cannot be replayed, only scored and reported: it has no inputs of each turn; "
@@ -55,9 +54,9 @@ def read(flight: Path) -> Recording:
 
 def _settings(path: Path, recorded: tuple[bytes, ...]) -> dict[str, object]:
     try:
-        first = next(inputs.entries(recorded), None)
-    except inputs.InputsError as error:
+        first = next(record.entries(recorded), None)
+    except record.InputsError as error:
         raise UserError(f"{path}: the record of the inputs is damaged: {error}") from None
-    if not isinstance(first, Call) or first.name != SETTINGS:
+    if not isinstance(first, Note) or first.values[0] != SETTINGS:
         raise UserError(f"{path}: the record of the inputs does not begin with the settings")
-    return dict(first.arguments[0])
+    return dict(first.values[1])

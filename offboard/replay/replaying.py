@@ -12,17 +12,19 @@ from offboard.analysis.history import record_type
 from offboard.analysis.tlog import LoggedMessage
 from offboard.documents.errors import UserError
 from offboard.documents.signing_key import KEY_BYTES
-from offboard.flight import inputs
-from offboard.flight.flight import Flight, Output
-from offboard.flight.inputs import (
-    Call,
-    Check,
-    FramesDropped,
+from offboard.flight.flight import Flight
+from offboard.flight.record import (
+    CALL,
+    CHECK,
+    COMPONENT_ID,
+    DROPPED,
+    OTHERS,
+    PAYLOAD_TYPE,
+    RECORD_COMPONENT_ID,
     InputsError,
-    OtherDatagrams,
+    Note,
     TurnInput,
 )
-from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.link.interface import Chunk
 from offboard.mavlink.framing import Frame
 from offboard.mavlink.session import Session
@@ -117,22 +119,27 @@ class Replay:
                         if turn is None:
                             break
                         yield turn
-                    case FramesDropped(count):
-                        del self._leaving[len(self._leaving) - count :]
-                    case OtherDatagrams(total):
-                        self.companion.other_datagrams = total
-                    case Call(name, arguments) if name in CALLS:
-                        getattr(self.companion, name)(*arguments)
-                    case Check(crc) if crc != self._crc:
-                        raise InputsError("received frames are missing or damaged")
-                    case Check():
-                        self._crc, self._checked_s = 0, self.ended_s
+                    case Note(kind, values):
+                        self._obey(kind, *values)
         except InputsError as error:
             self.stopped = str(error)
         self._leave()
         self._drain()
         if self.stopped or not self.companion.has_ended():
             self._cut()
+
+    def _obey(self, kind: str, value: Any, *arguments: Any) -> None:
+        """What came between two turns."""
+        if kind == DROPPED:
+            del self._leaving[len(self._leaving) - value :]
+        elif kind == OTHERS:
+            self.companion.other_datagrams = value
+        elif kind == CALL and value in CALLS:
+            getattr(self.companion, value)(*arguments)
+        elif kind == CHECK:
+            if value != self._crc:
+                raise InputsError("received frames are missing or damaged")
+            self._crc, self._checked_s = 0, self.ended_s
 
     # ------------------------------------------------------------------ one turn
 
@@ -143,23 +150,23 @@ class Replay:
             messages = self._take(chunk.frames)
             if messages is None:
                 return None
-            frames = [message.frame.raw for message in messages]
-            for frame in frames:
+            parts = [message.frame.raw for message in messages]
+            for frame in parts:
                 self._crc = zlib.crc32(frame, self._crc)
             for place, frame in reversed(chunk.unlogged):
-                frames.insert(place, frame)
-            chunks.append(Chunk(b"".join(frames), chunk.peer, chunk.arrived_s))
+                parts.insert(place, frame)
+            chunks.append(Chunk(b"".join(parts), chunk.peer, chunk.arrived_s))
             received += messages
         self._readings, self._read_s = iter(given.readings_s), given.now_s
         self.count += 1
-        output = self._output(chunks, given.now_s)
+        frames = self._frames(chunks, given.now_s)
         self.ended_s = self.companion.time_s
-        if output:
-            self._leaving = [self._sent(frame) for frame in output.send]
+        if frames is not None:
+            self._leaving = [self._sent(frame) for frame in frames]
             self.companion.finish_turn(math.nan)  # it was not sent
         return Turn(self.count, given, tuple(received))
 
-    def _output(self, chunks: list[Chunk], now_s: float) -> Output | None:
+    def _frames(self, chunks: list[Chunk], now_s: float) -> tuple[bytes, ...] | None:
         try:
             return self.companion.turn(chunks, now_s)
         except (Exception, SystemExit):  # as the loop, which then requests the landing
@@ -198,7 +205,7 @@ class Replay:
         if message.system_id != system:
             return False
         if message.component_id == RECORD_COMPONENT_ID:
-            self._pieces += record_type(message) == inputs.PAYLOAD_TYPE
+            self._pieces += record_type(message) == PAYLOAD_TYPE
             return True
         if message.component_id != COMPONENT_ID:
             return False

@@ -9,8 +9,8 @@ from itertools import pairwise
 
 from offboard.analysis.history import Event
 from offboard.analysis.page import BLUE_BAND, GREY_BAND, ORANGE_BAND
+from offboard.flight.outbox import Refusal
 from offboard.flight.phases import Phase
-from offboard.flight.setpoint import Refusal
 from offboard.report.flight import Flight
 
 _ENDED_EARLY = {Phase.HOLD, Phase.STAND_DOWN, Phase.YIELDED, Phase.FAILED}

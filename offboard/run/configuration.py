@@ -9,7 +9,7 @@ it.
 from __future__ import annotations
 
 import platform
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from importlib.metadata import version
 from pathlib import Path
@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, Field, SerializeAsAny, create_model, model_validator
+from pydantic import BaseModel, Field, SerializeAsAny, create_model
 
 from offboard.control import catalogue
 from offboard.control.base import Controller, ControllerSettings
@@ -40,6 +40,7 @@ from offboard.model.vehicle import Vehicle
 from offboard.reference.feasibility import Envelope, check
 from offboard.reference.shapes import SHAPES, FromTable, Shape, Waypoints
 from offboard.reference.track import Track
+from offboard.run.sitl import check_scenario
 
 Raw = dict[str, Any]
 RECORDED_VERSIONS = ("pso-offboard", "pymavlink", "numpy", "scipy", "numba")
@@ -155,55 +156,36 @@ def build_controller(config: FlightConfig) -> Controller:
         raise DocumentError(f"controller {settings.law}: {why}") from error
 
 
-def check_file(path: Path, check_scenario: Callable[[Path], None]) -> str:
+def check_file(path: Path) -> str:
     """Validate one file of any kind that a flight may be given; return what it is.
 
     A reference is built and must be flyable by the default flight's vehicle, a flight's by its
-    own. Scenarios are the simulator's: `check_scenario` asks it. Raises DocumentError.
+    own. Scenarios are the simulator's. Raises DocumentError.
     """
     if path.suffix.lower() == ".csv":
         build_track(load("flight", choices={"reference": str(path)}))
         return "reference"
-    raw = read(read_text(path), str(path))
+    text = read_text(path)
+    raw = read(text, str(path))
     if not raw:
         raise DocumentError(f"{path} is empty")
     name = str(path if path.suffix in (".yaml", ".yml") else path.absolute())
-    kind = kind_of(raw) or _likely_kind(raw)
+    kind = kind_of(raw)
+    if not kind:
+        raise DocumentError(
+            f"{path}: no key says what it is: a vehicle has mass_kg, a controller law, a reference "
+            "shape, a scenario conditions or faults, a configuration these three: "
+            f"{', '.join(PARTS)}"
+        )
     if kind == "scenario":
-        check_scenario(path)
-        return kind
-    try:
-        if kind in PARTS:
-            validate(raw, _model(kind, raw), str(path))
-        if kind == "reference":
-            build_track(load("flight", choices={kind: name}))
-        elif kind == "configuration":
-            build_track(load(name))
-    except DocumentError as error:
-        if kind_of(raw):
-            raise
-        raise DocumentError(f"{error}\n{path} was taken for a {kind} file") from None
+        check_scenario(text, str(path))
+    elif kind in PARTS:
+        validate(raw, _model(kind, raw, str(path)), str(path))
+    if kind == "reference":
+        build_track(load("flight", choices={kind: name}))
+    elif kind == "configuration":
+        build_track(load(name))
     return kind
-
-
-def _likely_kind(raw: Raw) -> str:
-    """What a file without the key of its kind is meant to be: by most of its keys."""
-    keys = {
-        "configuration": set(FlightConfig.model_fields),
-        "vehicle": set(Vehicle.model_fields),
-        "controller": {
-            key
-            for law in catalogue.BUILT_IN.names
-            for key in catalogue.settings_of(law).model_fields
-        },
-        "reference": {key for shape in SHAPES.values() for key in shape.model_fields},
-    }
-
-    def likeness(kind: str) -> tuple[int, int]:
-        close = sum(bool(get_close_matches(key, keys[kind], n=1)) for key in list(raw)[:100])
-        return len(raw.keys() & keys[kind]), close
-
-    return max(keys, key=likeness)
 
 
 def dump(config: FlightConfig) -> str:
@@ -223,7 +205,8 @@ def flown(text: str) -> FlightConfig:
 
 def _validated(raw: Raw, source: str, *, ignores_unknown: bool = False) -> FlightConfig:
     """`raw` as a FlightConfig whose parts have the classes that they name."""
-    parts: dict[str, Any] = {part: (_model(part, raw.get(part)), ...) for part in PARTS}
+    models = {part: _model(part, raw.get(part), f"{source}: {part}") for part in PARTS}
+    parts: dict[str, Any] = {part: (model, ...) for part, model in models.items()}
     model = create_model("FlightConfig", __base__=FlightConfig, **parts)
     if ignores_unknown:
         raw = known(raw, model)
@@ -262,31 +245,20 @@ def read_part(part: str, name: str) -> Raw:
     path = locate(name, part, laws)
     raw = read(read_text(path), str(path))
     check_kind(raw, part, str(path))
-    validate(raw, _model(part, raw), str(path))
+    validate(raw, _model(part, raw, str(path)), str(path))
     if raw.get("shape") == "table":
         raw["file"] = str(path.parent / raw["file"])
     return raw
 
 
-def _model(part: str, raw: object) -> type[BaseModel]:
-    """The class of a vehicle, or of the controller or reference that `raw` names."""
+def _model(part: str, raw: object, source: str) -> type[BaseModel]:
+    """The class of a vehicle, or of the controller or reference that `raw` names. Raises
+    DocumentError."""
     if part == "vehicle":
         return Vehicle
     key, known = ("law", catalogue.names()) if part == "controller" else ("shape", list(SHAPES))
     named = raw.get(key) if isinstance(raw, dict) else None
     if named not in known:
         problem = f"{key}: {named!r} is not one of" if named else f"{key} is missing; known are"
-        return _refusing(f"{problem} {', '.join(known)}")
+        raise DocumentError(f"{source}: {problem} {', '.join(known)}")
     return catalogue.settings_of(named) if part == "controller" else SHAPES[named]
-
-
-def _refusing(problem: str) -> type[BaseModel]:
-    """A class that refuses every value."""
-
-    class Unknown(BaseModel):
-        @model_validator(mode="before")
-        @classmethod
-        def _refuse(cls, given: object) -> object:
-            raise ValueError(problem)
-
-    return Unknown

@@ -11,20 +11,22 @@ from contextlib import ExitStack
 from copy import deepcopy
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from offboard.compiled import prepare
-from offboard.control.base import Controller, Situation
+from offboard.control.base import Adaptive, Controller, Situation
 from offboard.documents.errors import DocumentError, located
 from offboard.documents.signing_key import read_key
 from offboard.estimation.observer import Observer
-from offboard.flight import inputs
 from offboard.flight.flight import Flight, Outcome
 from offboard.flight.flight_plan import FlightPlan
-from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
-from offboard.flight.setpoint import usable
+from offboard.flight.outbox import usable
+from offboard.flight.phases import ServiceOptions
+from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID, configuration_pieces
+from offboard.identification.learner import Learner
+from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from offboard.link import clock
 from offboard.link.connection import open_link, open_lockstep_link
 from offboard.link.interface import Link
@@ -164,22 +166,36 @@ class Prepared:
     track: Track
     text: str
 
-    def companion(self, session: Session, stopwatch: Callable[[], float], **more: Any) -> Flight:
-        """The companion of a flight over `session`. `stopwatch` reads host time; `more`: see
-        `Flight`."""
-        config = self.config
+    def companion(
+        self,
+        session: Session,
+        stopwatch: Callable[[], float],
+        *,
+        known: IdentifiedVehicle | None = None,
+        service: ServiceOptions | None = None,
+        before: Flight | None = None,
+    ) -> Flight:
+        """The companion of a flight over `session`. `stopwatch` reads host time; `known` is what an
+        earlier flight has identified of the vehicle; `before`: see `Flight`."""
+        config, controller = self.config, self.controller
+        observer, identification = Observer(config.vehicle), None
+        if known:
+            observer.set_vehicle(known.vehicle)
+        if isinstance(controller, Adaptive):  # else it cannot use another vehicle model
+            identification = Learner(config.vehicle, config.identify, known=known)
         return Flight(
-            vehicle=config.vehicle,
-            session=session,
-            observer=Observer(config.vehicle),
-            controller=self.controller,
-            plan=FlightPlan(self.track),
             limits=config.limits,
+            plan=FlightPlan(self.track),
+            model=known.vehicle if known else config.vehicle,
+            session=session,
+            observer=observer,
+            controller=controller,
             period_s=config.period_s,
-            deadline_s=None if session.settings.lockstep else config.deadline_s,
             stopwatch=stopwatch,
-            identify=config.identify,
-            **more,
+            deadline_s=None if session.settings.lockstep else config.deadline_s,
+            identification=identification,
+            service=service,
+            before=before,
         )
 
 
@@ -313,7 +329,7 @@ def fly(
         stops.check()
         stack.enter_context(log)
         session = Session(vehicle.settings(link), signing)
-        for piece in inputs.pieces(prepared.text):
+        for piece in configuration_pieces(prepared.text):
             log.begin(clock.unix_us(), session.encode(piece))
         loop = Loop(
             prepared.companion(session, clock.monotonic_s),

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import gc
 import math
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any, Protocol
 
 from offboard.documents.errors import located
-from offboard.flight.flight import Flight, Outcome, Output
+from offboard.flight.flight import Flight, Outcome
 from offboard.flight.phases import BEFORE_FLIGHT, WAITING, ExitCode
 from offboard.link import clock
 from offboard.link.interface import Chunk, Link
@@ -24,11 +24,6 @@ from offboard.supervisor.supervisor import Supervisor, SupervisorError
 POLL_S = 0.02
 STOPPED_S = 0.2  # from the beginning of a turn: what it decided does not leave later
 FAILING_S = 0.3  # without a turn that succeeds: give up
-TWICE = "interrupted twice: setpoints stopped, "
-SIMULATED, SUPERVISED = (
-    "the simulation ends",
-    "the supervisor lands the vehicle",
-)
 UNGUARDED = "the supervisor ended: nobody lands the vehicle if this process dies"
 UNANSWERED = "the supervisor does not answer: nobody lands the vehicle if this process dies"
 ANSWERS = "the supervisor answers again"
@@ -40,7 +35,7 @@ class Flown(Protocol):
 
     @property
     def current(self) -> Flight: ...
-    def turn(self, chunks: Sequence[Chunk], now_s: float) -> Output: ...
+    def turn(self, chunks: Sequence[Chunk], now_s: float) -> tuple[bytes, ...]: ...
     def has_ended(self) -> bool: ...
     def request_stop(self, why: str = ...) -> None: ...
 
@@ -122,10 +117,10 @@ class Loop:
         began_s = clock.monotonic_s()
         if chunks:
             self._heard_s = began_s
-        output = self._companion.turn(chunks, began_s)
+        frames = self._companion.turn(chunks, began_s)
         if self._taken_over():
             return
-        dropped = self._send(output, began_s)
+        dropped = self._send(frames, began_s)
         stamp = clock.unix_us()
         for frame in self._companion.current.finish_turn(clock.monotonic_s()):
             if frame not in dropped:
@@ -140,12 +135,12 @@ class Loop:
         self._show()
         self._check_simulator(began_s - self._heard_s)
 
-    def _send(self, output: Output, began_s: float) -> list[bytes]:
+    def _send(self, frames: Sequence[bytes], began_s: float) -> list[bytes]:
         """Send what a turn has decided. This process may have been stopped since the turn began:
         then it is dropped, and returned."""
         peer = self._companion.current.peer
         dropped: list[bytes] = []
-        for frame in output.send:
+        for frame in frames:
             if self._supervisor and clock.monotonic_s() - began_s > STOPPED_S:
                 dropped.append(frame)
             else:
@@ -154,15 +149,12 @@ class Loop:
             self._companion.current.on_dropped(len(dropped))
         if peer is not None:
             self._link.follow(peer)
-            self._beat(output, peer)
+            supervised = self._companion.current.supervised
+            if self._supervisor and supervised:
+                self._supervisor.beat(supervised, peer, self._link, self._log.descriptor)
         return dropped
 
     # --- the supervisor ---
-
-    def _beat(self, output: Output, peer: Hashable) -> None:
-        if self._supervisor is None or output.supervised is None:
-            return
-        self._supervisor.beat(output.supervised, peer, self._link, self._log.descriptor)
 
     def _check_supervisor(self) -> None:
         """Start another one in place of one that has ended, while no flight needs this loop: it
@@ -217,7 +209,7 @@ class Loop:
         problem = self._log.problem
         if problem:
             self._warn(problem)
-            if self._companion.current.lands_without_log:
+            if self._companion.current.limits.log_lost == "land":
                 self._companion.request_stop(problem)
 
     def _warn(self, sentence: str) -> None:
@@ -258,10 +250,11 @@ class Loop:
             code = ExitCode.ABORTED
             sentence = sentence if self._error in sentence else f"{self._error}; {sentence}"
         if self._log.problem:
-            lands = self._companion.current.lands_without_log
+            lands = self._companion.current.limits.log_lost == "land"
             code = code or (ExitCode.ABORTED if lands else ExitCode.FLOWN)
             sentence = f"{self._log.problem}: {self._log.lost} entries lost; {sentence}"
         return Outcome(code, sentence, self._log.problem)
 
     def _interrupted(self) -> Outcome:
-        return Outcome(ExitCode.ABORTED, TWICE + (SUPERVISED if self._supervisor else SIMULATED))
+        follows = "the supervisor lands the vehicle" if self._supervisor else "the simulation ends"
+        return Outcome(ExitCode.ABORTED, f"interrupted twice: setpoints stopped, {follows}")

@@ -19,13 +19,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
-from pathlib import Path
-from types import TracebackType
 from typing import Any, Protocol
 
 from offboard.documents import shipped
 from offboard.documents.errors import UserError
-from offboard.documents.reading import DocumentError
 from offboard.link import clock
 from offboard.link.interface import Chunk, LinkReport
 
@@ -50,18 +47,10 @@ def check_scenario_named(name: str) -> None:
     DocumentError."""
     path = shipped.locate(name, "scenario")
     if shipped.directory() not in path.parents:
-        check_scenario(path)
+        check_scenario(shipped.read_text(path), str(path))
 
 
-def check_scenario(path: Path) -> None:
-    """Let the simulator validate a scenario file. Raises DocumentError with its errors."""
-    command = [sys.executable, "-P", "-m", "simulator", "--check", str(path)]
-    answer = subprocess.run(command, capture_output=True, text=True, check=False)
-    if answer.returncode:
-        raise DocumentError(*answer.stderr.strip().splitlines())
-
-
-def check_scenario_text(text: str, source: str) -> None:
+def check_scenario(text: str, source: str) -> None:
     """Let the simulator validate the YAML of a scenario, which errors call `source`. Raises
     DocumentError."""
     registered().load().check_scenario(text, source)
@@ -146,12 +135,7 @@ class SimulatorProcess:
             assert pipe is not None
             pipe.close()
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 

@@ -1,18 +1,25 @@
-"""The service as a process: lock, monitor, configuration, link, supervisor, and the loop."""
+"""The service as a process: lock, monitor, configuration, link, supervisor, and the loop; and as a
+unit of systemd, from the template beside this module.
+
+The unit runs as a user of its own, which can read what everybody can, and write only below its
+state directory.
+"""
 
 from __future__ import annotations
 
+import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
 
+from jinja2 import Environment, StrictUndefined
 from sdnotify import SystemdNotifier
 
 from offboard import compiled
 from offboard.flight.flight import Outcome
-from offboard.flight.phases import ExitCode, ServiceOptions
+from offboard.flight.phases import WAITING, ExitCode, ServiceOptions
 from offboard.link import clock
 from offboard.link.background import BackgroundWriter
 from offboard.link.connection import open_link
@@ -21,18 +28,22 @@ from offboard.link.lock import connection_lock, directory_lock
 from offboard.link.stop import StopRequests
 from offboard.live.process import SERVER, LiveProcess
 from offboard.mavlink.session import Session
+from offboard.report.background import begin
 from offboard.run.configuration import FlightConfig
 from offboard.run.flight import Connection, discard
 from offboard.run.loop import Loop
 from offboard.service.flights import Flights
-from offboard.service.memory import VehicleFiles
-from offboard.service.preparation import Preparation
-from offboard.service.record import Recorder, score
+from offboard.service.preparation import Preparation, VehicleFiles
+from offboard.service.record import Recorder
 from offboard.supervisor.supervisor import Supervisor
 
-LINK_FIRST_S, LINK_MOST_S = 1.0, 5.0  # between two attempts to open the link
+LINK_EVERY_S = 2.0  # between two attempts to open the link
 WATCHDOG_EVERY_S = 1.0
 NOTICES_MAX, NOTICES_S = 100, 1.0  # that wait for the service manager; for them, at the end
+WATCHDOG_S = 10
+TEMPLATE = Path(__file__).with_name("offboard.service.j2")
+PRIVATE = (Path("/tmp"), Path("/var/tmp"))  # the unit has its own
+OTHERS_READ, OTHERS_ENTER = 0o4, 0o1
 STOPPED_EARLY = "stopped before the link was open"
 
 
@@ -69,17 +80,16 @@ def run(
         compiled.prepare(tell)
         preparation = stack.enter_context(closing(Preparation(load)))
         supervisor.await_ready()
-        recorder = Recorder(directory, score=partial(score, report=report))
+        recorder = Recorder(directory, score=partial(begin, "report" if report else "score"))
         stack.callback(recorder.close)
         memory = stack.enter_context(closing(VehicleFiles(directory / "vehicles", tell)))
         manager = stack.enter_context(closing(Manager()))
-        manager.ready()
+        manager.tell("READY=1")
         link = opened(vehicle.address, stops, tell, manager)
         if link is None:
             tell(STOPPED_EARLY)
             return Outcome(ExitCode.FLOWN, STOPPED_EARLY)
         stack.callback(link.close)
-        recorder.score_earlier()  # a supervisor that still has the link also has the log
         flights = Flights(
             session=Session(vehicle.settings(link), signing),
             source=preparation,
@@ -91,7 +101,7 @@ def run(
 
         def display() -> None:
             manager.alive(clock.monotonic_s(), flights.phase.value)
-            preparation.allowed = not (flights.in_flight or flights.state.vehicle.armed)
+            preparation.allowed = flights.phase in WAITING and not flights.current.vehicle.armed
             show(flights)
             if monitor:
                 monitor.show(flights)
@@ -107,7 +117,7 @@ def run(
             progress=lambda _: display(),
             supervisor=supervisor,
         ).run()
-        manager.stopping()
+        manager.tell("STOPPING=1")
         flights.close()
         return outcome
 
@@ -117,7 +127,7 @@ def opened(
 ) -> Link | None:
     """The link, when it can be opened: a port may be in use, a device not plugged in yet. None if a
     stop was requested before. Raises LinkError for an address that nothing can be."""
-    wait_s, told = LINK_FIRST_S, ""
+    told = ""
     pause = threading.Event()
     while not stops.requested:
         try:
@@ -128,8 +138,7 @@ def opened(
             if str(error) != told:
                 told = str(error)
                 tell(f"{error}; trying again")
-        until_s = clock.monotonic_s() + wait_s
-        wait_s = min(2.0 * wait_s, LINK_MOST_S)
+        until_s = clock.monotonic_s() + LINK_EVERY_S
         while clock.monotonic_s() < until_s and not stops.requested:
             manager.alive(clock.monotonic_s())
             pause.wait(0.1)
@@ -147,11 +156,9 @@ class Manager:
         self._told_s = 0.0
         self._status = ""
 
-    def ready(self) -> None:
-        self._writer.put("READY=1")
-
-    def stopping(self) -> None:
-        self._writer.put("STOPPING=1")
+    def tell(self, notice: str) -> None:
+        """Of sd_notify(3)."""
+        self._writer.put(notice)
 
     def close(self) -> None:
         self._writer.close(NOTICES_S)
@@ -164,3 +171,47 @@ class Manager:
         if status != self._status:
             self._status = status
             self._writer.put(f"STATUS={status}")
+
+
+# --- the unit of systemd ---
+
+
+def unit(arguments: Sequence[str], connection: str, signing_key: Path | None = None) -> str:
+    """The text of a unit that runs `offboard daemon` with these arguments, which name neither
+    the key nor, for the state directory, `--out`."""
+    template = Environment(undefined=StrictUndefined, keep_trailing_newline=True).from_string(
+        TEMPLATE.read_text(encoding="utf-8")
+    )
+    command = [sys.executable, "-P", "-m", "offboard", "daemon", *arguments]
+    words = [quoted(word) for word in command]
+    if not any(word.startswith("--out") for word in arguments):
+        words += ["--out", "%S/offboard"]
+    if signing_key:
+        words += ["--signing-key", "%d/signing-key"]
+    return template.render(
+        command=" ".join(words),
+        connection=connection.replace("%", "%%"),
+        serial=connection.startswith("serial:"),
+        signing_key=str(signing_key.absolute()).replace("%", "%%") if signing_key else "",
+        watchdog_s=WATCHDOG_S,
+    )
+
+
+def unreadable(path: Path) -> str:
+    """Why the user of the unit cannot read this file or directory; empty if it can."""
+    for place in (path.absolute(), path.resolve()):
+        if any(private in place.parents for private in PRIVATE):
+            return f"the unit cannot see {place}: it has a {place.parts[1]} of its own"
+        closed = [each for each in place.parents if not each.stat().st_mode & OTHERS_ENTER]
+        if not place.stat().st_mode & OTHERS_READ:
+            closed.append(place)
+        if closed:
+            return f"the user of the unit cannot read {place}: {closed[-1]} is closed to others"
+    return ""
+
+
+def quoted(word: str) -> str:
+    """A word of ExecStart=, in which systemd replaces nothing."""
+    escaped = word.replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%").replace("$", "$$")
+    plain = escaped and not any(c.isspace() or c in "\"'\\;" for c in escaped)
+    return escaped if plain else f'"{escaped}"'

@@ -2,71 +2,24 @@
 
 `Flights` takes the place of one companion in the loop. Each flight has a new `Flight` on the
 same session, so that authority, failsafe, plan and identification are new, and what is known of
-vehicle and link stays. No I/O: a log is begun and ended at `Record`, configurations come from
-`Source`.
+vehicle and link stays. Nothing in it waits: `Recorder` and `VehicleFiles` write in threads.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Protocol
 
 from offboard.flight.display import Snapshot
-from offboard.flight.flight import STOPPED, Flight, Outcome, Output
-from offboard.flight.phases import ENDS, FLYING, WAITING, Phase, ServiceOptions
-from offboard.flight.starting import found_engaged
-from offboard.flight.state import FlightState
+from offboard.flight.flight import STOPPED, Flight, Outcome
+from offboard.flight.phases import ENDS, WAITING, Phase, ServiceOptions
 from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from offboard.link.interface import Chunk
 from offboard.mavlink.session import Session
 from offboard.run.flight import Prepared
+from offboard.service.preparation import Preparation, VehicleFiles
+from offboard.service.record import Recorder
 
-NAMED_S = 1.0  # until a vehicle has said which one it is
 TEXTS_KEPT = 200
-LEFT_ALONE = (
-    "the vehicle was found in {mode} in the air, and this service has not engaged it: it is left "
-    "alone; switch to another mode and back"
-)
-
-
-class Source(Protocol):
-    """Where the newest usable configuration comes from. Neither method waits."""
-
-    def newest(self) -> Prepared: ...
-    def news(self) -> list[str]:
-        """Sentences about configurations since the last call."""
-        ...
-
-
-class Record(Protocol):
-    """Where flights are recorded. No method waits."""
-
-    @property
-    def left(self) -> str:
-        """Key of the vehicle that a flight left engaged when it was cut short; may be empty."""
-        ...
-
-    def begin(self, session: Session, configuration: str, vehicle: str) -> str:
-        """A flight of `vehicle` begins: its frames go to a log of its own. Returns its
-        directory."""
-        ...
-
-    def end(self, *, engaged: bool) -> None:
-        """It has ended: the log is closed and scored, and frames go to the rolling log. `engaged`:
-        the vehicle may still be in the mode of setpoints."""
-        ...
-
-    def settle(self) -> None:
-        """No vehicle is left engaged any more."""
-        ...
-
-
-class Memory(Protocol):
-    """The vehicles that were identified, by key. No method waits."""
-
-    def get(self, key: str, prepared: Prepared) -> IdentifiedVehicle | None: ...
-    def keep(self, key: str, prepared: Prepared, identified: IdentifiedVehicle) -> None: ...
-    def discard(self, key: str) -> None: ...
 
 
 class Flights:
@@ -81,9 +34,9 @@ class Flights:
         self,
         *,
         session: Session,
-        source: Source,
-        record: Record,
-        memory: Memory,
+        source: Preparation,
+        record: Recorder,
+        memory: VehicleFiles,
         options: ServiceOptions,
         stopwatch: Callable[[], float],
     ) -> None:
@@ -96,7 +49,6 @@ class Flights:
         self._stopping = False
         self._recording = False
         self._shown = 0  # of the present companion's announcements
-        self._told_left_alone = False
         self.announced: list[str] = []
         self.announcements = 0
         self.engagements = 0
@@ -105,10 +57,6 @@ class Flights:
         self.current = self._companion(None)
 
     # ------------------------------------------------------------------ as a companion
-
-    @property
-    def state(self) -> FlightState:
-        return self.current
 
     @property
     def phase(self) -> Phase:
@@ -135,33 +83,24 @@ class Flights:
         elif self.current.announced[-1:] != [why]:
             self.current.announce(why)
 
-    def turn(self, chunks: Sequence[Chunk], now_s: float) -> Output:
+    def turn(self, chunks: Sequence[Chunk], now_s: float) -> tuple[bytes, ...]:
         """Process all that has arrived; begin the next flight where the last one has ended."""
         if self.current.has_ended() and not self._stopping:
-            self._begin_next()
+            self.close()
+            self._follow(self._source.newest())
         if self.phase in WAITING:
             self._renew_if_changed()
             self._look_for_left()
         before = self.phase
-        output = self.current.turn(chunks, now_s)
+        frames = self.current.turn(chunks, now_s)
         if before in WAITING and self.phase not in WAITING and self.phase not in ENDS:
             self._begin_record()
         if self._recording and before is not self.phase:
             self._keep_identified()
-        if self.phase in WAITING:
-            self._explain()
         self._collect()
-        return output
-
-    def close(self) -> None:
-        """The service ends."""
-        self._end_record()
+        return frames
 
     # ------------------------------------------------------------------ one flight after another
-
-    def _begin_next(self) -> None:
-        self._end_record()
-        self._follow(self._source.newest())
 
     def _renew_if_changed(self) -> None:
         """Continue to wait with a changed configuration or a remembered vehicle."""
@@ -202,16 +141,17 @@ class Flights:
                 f"hover thrust {known.vehicle.hover_thrust:.3f}; no identification steps"
             )
 
-    def _end_record(self) -> None:
+    def close(self) -> None:
+        """The present flight has ended, or the service does."""
         if self._recording:
             self._recording = False
             self._keep_identified()
-            self._record.end(engaged=self.state.ends_engaged)
+            self._record.end(engaged=self.current.ends_engaged)
 
     def _look_for_left(self) -> None:
         """Note whether a flight that was cut short left this vehicle engaged; no longer once the
         vehicle was seen in another mode or on the ground."""
-        state, left = self.state, self._record.left
+        state, left = self.current, self._record.left
         state.left_engaged = bool(left) and left == self._identity
         if state.left_engaged and not state.pilot.unclaimed:
             self._record.settle()
@@ -222,13 +162,13 @@ class Flights:
     def _identity(self) -> str:
         """Autopilot, system id and the hardware's number, 0 where it has none; empty until they
         are known."""
-        found, uid = self.state.vehicle.found, self.state.vehicle.uid
+        found, uid = self.current.vehicle.found, self.current.vehicle.uid
         return f"{found.autopilot}-{found.system_id}-{uid:x}" if found and uid is not None else ""
 
     @property
     def _key(self) -> str:
         """The vehicle; empty for one without a number, which cannot be told from others."""
-        return self._identity if self.state.vehicle.uid else ""
+        return self._identity if self.current.vehicle.uid else ""
 
     def _remembered(self, prepared: Prepared) -> IdentifiedVehicle | None:
         return self._memory.get(self._key, prepared) if self._key else None
@@ -250,16 +190,6 @@ class Flights:
 
     # ------------------------------------------------------------------ what the user reads
 
-    def _explain(self) -> None:
-        """Announce a vehicle that was found engaged and is left alone."""
-        state = self.state
-        if not state.pilot.unclaimed:
-            self._told_left_alone = False
-        elif not (self._told_left_alone or state.left_engaged) and state.in_phase_s > NAMED_S:
-            self._told_left_alone = found_engaged(state)
-            if self._told_left_alone:
-                self.current.announce(LEFT_ALONE.format(mode=state.vehicle.mode))
-
     def _collect(self) -> None:
         said = self.current.announced
         new = said[self._shown :]
@@ -267,8 +197,3 @@ class Flights:
         self._shown = len(said)
         self.announcements += len(new)
         self.announced = [*self.announced, *new][-TEXTS_KEPT:]
-
-    @property
-    def in_flight(self) -> bool:
-        """Whether the vehicle follows us, or was asked to end the flight."""
-        return self.phase in FLYING or self.phase is Phase.LAND

@@ -1,16 +1,32 @@
-"""The configuration of the service's next flight: read again while it waits, and made ready.
+"""What the service's next flight begins with: the configuration, read again while the service
+waits, and what earlier flights have identified of the vehicle.
 
 A thread resolves the configuration every `EVERY_S` while no vehicle follows us. One that has
 changed is built and called once, so that nothing is compiled in flight; one that cannot be used is
 refused with a sentence, and the one before stays in use.
+
+`DIR/vehicles/KEY.yaml` holds an identified vehicle, the delay of its tilt, and the vehicle file
+that it was identified from: for another vehicle file it is not used.
 """
 
 from __future__ import annotations
 
+import hashlib
 import threading
 from collections import deque
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
 
+import yaml
+from pydantic import BaseModel, ConfigDict, Field
+
+from offboard.documents.reading import DocumentError, read, validate
+from offboard.documents.shipped import read_text
+from offboard.identification.uncertainty import Estimate
+from offboard.identification.vehicle_estimate import IdentifiedVehicle
+from offboard.model.vehicle import Vehicle
 from offboard.run.configuration import FlightConfig, dump
 from offboard.run.flight import Prepared, build, rehearse
 
@@ -18,8 +34,9 @@ EVERY_S = 2.0
 
 
 class Preparation:
-    """A `flights.Source` of what `load` returns. The thread works only while it is `allowed`: not
-    while the vehicle is armed. Raises DocumentError if the first configuration cannot be used."""
+    """The newest usable configuration of those that `load` returns. The thread works only while it
+    is `allowed`: not while the vehicle is armed. Raises DocumentError if the first configuration
+    cannot be used."""
 
     def __init__(self, load: Callable[[], FlightConfig], every_s: float = EVERY_S) -> None:
         self._load = load
@@ -71,3 +88,81 @@ class Preparation:
         prepared = build(config)
         rehearse(prepared, keeps_deadline=True)
         return prepared
+
+
+# --- identified vehicles ---
+
+
+class Document(BaseModel):
+    """The content of a file."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    identified_from: str  # digest of the vehicle file
+    tilt_delay_s: float = Field(ge=0, le=1)
+    tilt_delay_sd_s: float = Field(gt=0, le=1)
+    link_delay_s: float = Field(ge=0, le=10)
+    vehicle: Vehicle
+
+
+class VehicleFiles:
+    """The files in `directory`, read at the start; written by a thread. `tell` is called with
+    sentences about files that cannot be used."""
+
+    def __init__(self, directory: Path, tell: Callable[[str], None]) -> None:
+        self._directory = directory
+        self._known: dict[str, tuple[str, IdentifiedVehicle]] = {}
+        self._clerk = ThreadPoolExecutor(max_workers=1, thread_name_prefix="vehicles")
+        for path in sorted(directory.glob("*.yaml")) if directory.is_dir() else ():
+            try:
+                self._known[path.stem] = _load(path)
+            except (DocumentError, OSError) as error:
+                tell(f"{path} is not used: {error}")
+
+    def get(self, key: str, prepared: Prepared) -> IdentifiedVehicle | None:
+        """What is known of this vehicle, if it was identified from the same vehicle file."""
+        source, identified = self._known.get(key, ("", None))
+        return identified if source == _digest(prepared.config.vehicle) else None
+
+    def keep(self, key: str, prepared: Prepared, identified: IdentifiedVehicle) -> None:
+        source = _digest(prepared.config.vehicle)
+        self._known[key] = source, identified
+        self._clerk.submit(self._write, key, source, identified)
+
+    def discard(self, key: str) -> None:
+        self._known.pop(key, None)
+        self._clerk.submit(self._remove, key)
+
+    def close(self) -> None:
+        self._clerk.shutdown(wait=True)
+
+    def _write(self, key: str, source: str, identified: IdentifiedVehicle) -> None:
+        document = {
+            "identified_from": source,
+            "tilt_delay_s": identified.delay.value,
+            "tilt_delay_sd_s": identified.delay.sd,
+            "link_delay_s": identified.link_s,
+            "vehicle": identified.vehicle.model_dump(mode="json"),
+        }
+        path = self._directory / f"{key}.yaml"
+        with suppress(OSError):  # then the next start identifies it again
+            self._directory.mkdir(parents=True, exist_ok=True)
+            part = path.with_suffix(".part")
+            part.write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
+            part.replace(path)
+
+    def _remove(self, key: str) -> None:
+        with suppress(OSError):
+            (self._directory / f"{key}.yaml").unlink()
+
+
+def _load(path: Path) -> tuple[str, IdentifiedVehicle]:
+    document = validate(read(read_text(path), str(path)), Document, str(path))
+    delay = Estimate(document.tilt_delay_s, document.tilt_delay_sd_s)
+    return document.identified_from, IdentifiedVehicle(
+        document.vehicle, delay, document.link_delay_s
+    )
+
+
+def _digest(vehicle: Vehicle) -> str:
+    return hashlib.sha256(vehicle.model_dump_json().encode()).hexdigest()[:16]

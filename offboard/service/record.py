@@ -5,14 +5,13 @@ A flight's log begins with its configuration, with what the vehicle sends only o
 last seconds before the flight, so that it is complete by itself. Files are opened, written and
 closed by threads: the loop waits for none of them.
 
-Two files in the directory of a flight tell the next start what a service that was killed has not
-done: `unscored`, and until the vehicle was handed back `engaged`, which holds its key.
+Until the vehicle was handed back, a file `engaged` in the directory of a flight holds its key: it
+tells the next start of a service that was killed.
 """
 
 from __future__ import annotations
 
 import os
-import threading
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -20,12 +19,11 @@ from contextlib import suppress
 from itertools import chain, count
 from pathlib import Path
 
-from offboard.flight import inputs
+from offboard.flight.record import configuration_pieces, vehicle_record
 from offboard.link import clock
 from offboard.link.background import BackgroundWriter
 from offboard.link.log import CLOSE_S, QUEUED_MAX, FlightLog, LogError, append, entry
 from offboard.mavlink.session import Session
-from offboard.report.background import begin
 
 ROLLING_BYTES = 16 * 2**20
 ROLLING_NAMES = ("standby.1.tlog", "standby.2.tlog")
@@ -35,10 +33,8 @@ PARAM_VALUE = 22
 SENT_ONCE = {PARAM_VALUE, 49, 148, 242}  # GPS_GLOBAL_ORIGIN, AUTOPILOT_VERSION, HOME_POSITION
 PARAM_ID = slice(18, 34)  # in a frame of PARAM_VALUE: 10 bytes of header, 8 of payload before it
 KEPT_MAX = 100
-SCORE_S = 600.0
-ENGAGED, UNSCORED = "engaged", "unscored"  # files of a flight, see the module
+ENGAGED = "engaged"  # file of a flight, see the module
 ENGAGED_MAX_S = 600.0  # after the end of its log: a vehicle that was left longer ago has landed
-SETTLED_S = 5.0  # of a log that no supervisor writes any more
 
 
 class RollingLog:
@@ -102,7 +98,6 @@ class FlightRecord(FlightLog):
         if not self.opened:
             self.directory.mkdir(parents=True)
             (self.directory / ENGAGED).write_text(self.vehicle, encoding="utf-8")
-            (self.directory / UNSCORED).touch()
             self._open()
             self.opened = True
         super()._append(entries)
@@ -112,29 +107,19 @@ class FlightRecord(FlightLog):
             super()._close_file()
 
 
-def score(directory: Path, closing: threading.Event, *, report: bool = False) -> None:
-    """Score a flight, and write its `report`, in a process of its own. Wait for its end, or until
-    the service closes: the process outlives it. Raises OSError if it cannot be started."""
-    process = begin("report" if report else "score", directory)
-    until_s = clock.monotonic_s() + SCORE_S
-    while process.poll() is None and not closing.wait(0.1):
-        if clock.monotonic_s() > until_s:
-            process.kill()
-
-
 class Recorder:
-    """The log of the loop and the `flights.Record` of the service, below `directory`."""
+    """The log of the loop, and the directories of the flights, below `directory`. No method but
+    `close` waits. `score` starts the process that scores a flight, and outlives this one; a failure
+    is ignored."""
 
     def __init__(
         self,
         directory: Path,
         *,
+        score: Callable[[Path], object],
         stamp: Callable[[], str] = clock.local_stamp,
-        score: Callable[[Path, threading.Event], object] = score,
         rolling_bytes: int = ROLLING_BYTES,
-        settled_s: float = SETTLED_S,
     ) -> None:
-        self._settled_s = settled_s
         self._directory = directory
         self._stamp = stamp
         self._score = score
@@ -143,13 +128,10 @@ class Recorder:
         self._before: deque[tuple[int, bytes]] = deque(maxlen=BEFORE_MAX)
         self._once: dict[tuple[int, bytes], bytes] = {}
         self._clerk = ThreadPoolExecutor(max_workers=1, thread_name_prefix="record")
-        self._scorer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="score")
-        self._closing = threading.Event()
-        self._unscored = sorted(path.parent for path in directory.glob(f"*/{UNSCORED}"))
+        self._closed = False
         self._engaged = sorted(path.parent for path in directory.glob(f"*/{ENGAGED}"))
         self._left, self._left_until_s = _left(self._engaged)
         self._vehicle = ""
-        self._newest = directory  # flight
         # read once: in flight the file system may keep its caller waiting
         self._taken = {path.name for path in directory.iterdir()}
 
@@ -192,12 +174,12 @@ class Recorder:
         """A log of its own for a flight of `vehicle` that begins. Returns its directory."""
         self.settle()
         directory = self._new_directory()
-        self._engaged, self._vehicle, self._newest = [directory], vehicle, directory
+        self._engaged, self._vehicle = [directory], vehicle
         self._flight = flight = FlightRecord(directory, configuration, vehicle)
         now_us = clock.unix_us()
         assert session.vehicle is not None
-        found = inputs.vehicle_record(session.vehicle)
-        for piece in (*inputs.pieces(configuration), found):
+        found = vehicle_record(session.vehicle)
+        for piece in (*configuration_pieces(configuration), found):
             flight.write(now_us, session.encode(piece))
         earlier = {record for _, record in self._before}
         for record in self._once.values():
@@ -217,7 +199,7 @@ class Recorder:
         return self._directory / name
 
     def end(self, *, engaged: bool) -> None:
-        """Close the flight's log and score it, in other threads. `engaged`: the vehicle may still
+        """Close the flight's log and score it, in another thread. `engaged`: the vehicle may still
         be in the mode of setpoints."""
         self._close_flight()
         if engaged:
@@ -233,7 +215,7 @@ class Recorder:
     def _finish(self, flight: FlightRecord) -> None:
         flight.close()
         if flight.opened:
-            self._scorer.submit(self._score_one, flight.directory)
+            self._score(flight.directory)
 
     @property
     def left(self) -> str:
@@ -245,48 +227,18 @@ class Recorder:
         """No vehicle is left engaged any more."""
         files = [directory / ENGAGED for directory in self._engaged]
         self._left, self._engaged = "", []
-        if self._closing.is_set():
+        if self._closed:
             _remove(files)
         elif files:
             self._clerk.submit(_remove, files)
 
-    def score_earlier(self) -> None:
-        """Score the flights that an earlier service has left unscored."""
-        for directory in self._unscored:
-            self._scorer.submit(self._score_settled, directory)
-
-    def _score_settled(self, directory: Path) -> None:
-        """Score a flight whose log a supervisor may still write."""
-        if (directory / "score.json").exists():  # by a process that outlived the service
-            _remove([directory / UNSCORED])
-            return
-        size = -1
-        try:
-            while size != (size := (directory / "flight.tlog").stat().st_size):
-                if self._closing.wait(self._settled_s):
-                    return
-        except OSError:  # killed before it was begun, or removed: there is nothing to score
-            _remove([directory / UNSCORED])
-            return
-        self._score_one(directory)
-
-    def _score_one(self, directory: Path) -> None:
-        # several at once would load a small computer: of those that wait, the newest at the end
-        if self._closing.is_set() and directory != self._newest:
-            return
-        self._score(directory, self._closing)
-        if not self._closing.is_set():
-            _remove([directory / UNSCORED])
-
     def close(self) -> None:
-        """Close all logs. The flight that is being scored and the newest are left to processes that
-        outlive this one, the others to the next start."""
-        if self._closing.is_set():
+        """Close all logs."""
+        if self._closed:
             return
         self._close_flight()
-        self._closing.set()
+        self._closed = True
         self._clerk.shutdown(wait=True)
-        self._scorer.shutdown(wait=True)
         self._rolling.close()
 
 

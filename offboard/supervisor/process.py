@@ -123,7 +123,8 @@ class TakeOver:
         self._session.set_vehicle(known.vehicle, self._peer)
         self._session.status = ACTIVE, LANDING
         assert self._session.dialect is not None
-        self._recovery = Recovery(self._session.dialect, known, clock.monotonic_s(), watch.beat_s)
+        self._dialect = self._session.dialect
+        self._recovery = Recovery(self._dialect, known, clock.monotonic_s(), watch.beat_s)
         self._text_id = 0
 
     def run(self, reason: str) -> None:
@@ -156,11 +157,12 @@ class TakeOver:
     def _ask(self, text: str = "") -> None:
         request = self._recovery.due(clock.monotonic_s())
         if request:
-            self._send(request.command)  # before all texts
+            self._send(request)  # before all texts
         if text:
             self._text(text)
         if request:
-            self._say(f"{request.word} requested")
+            holds = request == self._dialect.hold()
+            self._say(f"{'hold' if holds else 'land'} requested")
         if self._recovery.refusal:
             self._say(f"the vehicle answers {self._recovery.refusal}")
             self._recovery.refusal = ""
@@ -239,7 +241,7 @@ def main() -> None:
         signal.signal(number, signal.SIG_IGN)  # they are meant for the controller
     channel = socket.socket(fileno=os.dup(sys.stdin.fileno()))
     watch = Watch(channel)
-    channel.send(json.dumps(READY).encode() + b"\n")
+    _say_to(channel, READY)
     reason, before_s = "", clock.monotonic_s()
     while not (reason or watch.ended):
         select.select([], [], [], POLL_S)
@@ -247,7 +249,10 @@ def main() -> None:
         reason, before_s = watch.turn(now_s - before_s), now_s
     if reason and watch.known:
         tell = BackgroundWriter[str](lambda said: _tell(channel, said), 1000)
-        _announce(channel, tell, f"taking over: {reason}")
+        try:  # the controller, if it is alive, must know it before the vehicle does
+            _say_to(channel, f"taking over: {reason}")
+        except OSError:
+            tell.put(f"taking over: {reason}")
         TakeOver(watch, watch.known, tell).run(reason)
         tell.close(CLOSE_S)
         if watch.ended:
@@ -255,10 +260,10 @@ def main() -> None:
 
 
 def _score(log: int) -> None:
-    """In place of the controller. Its service does that when it starts again."""
+    """In place of the controller."""
     with suppress(OSError):
         path = Path(f"/proc/self/fd/{log}").readlink()
-        if path.name == "flight.tlog" and not (path.parent / "unscored").exists():
+        if path.name == "flight.tlog":
             subprocess.Popen(
                 [sys.executable, "-P", "-m", "offboard", "score", str(path.parent)],
                 stdin=subprocess.DEVNULL,
@@ -268,19 +273,15 @@ def _score(log: int) -> None:
             )
 
 
-def _announce(channel: socket.socket, tell: BackgroundWriter[str], sentence: str) -> None:
-    """The controller, if it is alive, must know it before the vehicle does."""
-    try:
-        channel.send(json.dumps(sentence).encode() + b"\n")
-    except OSError:
-        tell.put(sentence)
+def _say_to(channel: socket.socket, sentence: str) -> None:
+    channel.send(json.dumps(sentence).encode() + b"\n")
 
 
 def _tell(channel: socket.socket, sentences: list[str]) -> None:
     """To the controller; if it is gone, to the terminal, which may wait."""
     for sentence in sentences:
         try:
-            channel.send(json.dumps(sentence).encode() + b"\n")
+            _say_to(channel, sentence)
         except OSError:
             os.write(2, f"offboard supervisor: {sentence}\n".encode())
 

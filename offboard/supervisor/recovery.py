@@ -68,14 +68,6 @@ class Supervised:
         return min(max(self.loss.after_s - EARLIER_S, SILENT_MIN_S), SILENT_MAX_S)
 
 
-@dataclass(frozen=True, slots=True)
-class Request:
-    """A command, and what it asks for in a word."""
-
-    command: CommandLong
-    word: str
-
-
 class Recovery:
     """Begins at `began_s`; the newest beat of the controller was at `beat_s`, and said `known`.
 
@@ -168,7 +160,7 @@ class Recovery:
             self._fallen_shown = True
             self.notice = f"its own failsafe flies it, in {mode}: watching that it lands"
 
-    def due(self, now_s: float) -> Request | None:
+    def due(self, now_s: float) -> CommandLong | None:
         """What to ask for now."""
         self._begun = True
         self._conclude(now_s)
@@ -199,25 +191,20 @@ class Recovery:
         elif now_s - self._began_s > LONGEST_S:
             self.ended = f"not landed after {LONGEST_S:.0f} s"
 
-    def _wanted(self, now_s: float) -> Request | None:
+    def _wanted(self, now_s: float) -> CommandLong | None:
+        hold, land = self._dialect.hold(), self._dialect.land()
         fresh = now_s - self._reported_s < FRESH_S
         if self._mode is None:
-            return self._hold() if fresh and self._requests < UNHEARD_MAX else None
+            return hold if fresh and self._requests < UNHEARD_MAX else None
         answered = self._reported_s > self._asked_s and fresh
         if self._fallen_s < math.inf:
             lands = self._mode == self._dialect.return_mode or now_s - self._sank_s < SINK_S
             due = self._fallen_shown and now_s - self._fallen_s >= HOLD_S
-            return self._land() if answered and due and not lands else None
+            return land if answered and due and not lands else None
         if not answered or self._mode == self._dialect.land_mode:
             return None
         if self._mode == self._dialect.engage_mode:
-            return self._hold() if now_s - self._began_s < HOLD_S else self._land()
+            return hold if now_s - self._began_s < HOLD_S else land
         if not (self._holding or self._acknowledged):
-            return self._hold()  # it holds, but the acknowledgement may have been lost
-        return self._land() if now_s - self._held_s >= HOLD_S else None
-
-    def _hold(self) -> Request:
-        return Request(self._dialect.hold(), "hold")
-
-    def _land(self) -> Request:
-        return Request(self._dialect.land(), "land")
+            return hold  # it holds, but the acknowledgement may have been lost
+        return land if now_s - self._held_s >= HOLD_S else None

@@ -20,7 +20,6 @@ import sys
 from collections.abc import Hashable
 from contextlib import suppress
 from dataclasses import asdict
-from types import TracebackType
 
 from offboard.documents.errors import UserError
 from offboard.link import clock
@@ -158,12 +157,7 @@ class Supervisor:
         self._receive()
         return self._process.poll() is not None
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close the channel: the process ends, or takes over if the last beat says so."""
         self._channel.close()
         with suppress(subprocess.TimeoutExpired):  # it holds the link's port

@@ -9,8 +9,7 @@ from pathlib import Path
 
 from offboard.flight import flying
 from offboard.flight.failsafe import ROWS
-from offboard.flight.phases import ENDS, FLYING, Phase, ServiceOptions
-from offboard.flight.rows import Transition
+from offboard.flight.phases import ENDS, FLYING, Phase, ServiceOptions, Transition
 from offboard.flight.transitions import table
 
 README = Path(__file__).parents[2] / "offboard" / "flight" / "README.md"

@@ -23,13 +23,13 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from offboard.analysis import history, tlog
 from offboard.analysis.history import History
 from offboard.analysis.score import Score, score
-from offboard.control.base import Controller
+from offboard.control.base import Adaptive, Controller
 from offboard.estimation.observer import Observer
 from offboard.flight.flight import Flight, Outcome
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.phases import Action, Phase
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
-from offboard.identification.learner import IdentifySettings
+from offboard.identification.learner import IdentifySettings, Learner
 from offboard.link.interface import Chunk
 from offboard.link.log import FlightLog
 from offboard.mavlink.session import Session, SessionSettings
@@ -145,9 +145,9 @@ class Pair:
         if not self.phases or self.phases[-1][1] is not self.companion.phase:
             self.phases.append((self.time_s, self.companion.phase))
 
-    def _take(self, output: Any) -> None:
-        self.sent.extend((self.time_s, self.companion.phase, frame) for frame in output.send)
-        self.leaving += self.up(self.time_s, list(output.send))
+    def _take(self, frames: tuple[bytes, ...]) -> None:
+        self.sent.extend((self.time_s, self.companion.phase, frame) for frame in frames)
+        self.leaving += self.up(self.time_s, list(frames))
         failsafe = self.companion.current.failsafe
         if failsafe.row:
             self.failsafes[failsafe.row] = failsafe.action
@@ -318,8 +318,9 @@ def make(
     controller = resolved.controller.build(believed, period_s=resolved.period_s, seed=resolved.seed)
     observer = Observer(believed)
     track = config.build_track(resolved)
+    flies_with = wrap(controller)
     companion = Flight(
-        vehicle=believed,
+        model=believed,
         session=Session(
             SessionSettings(
                 system_id=system_id,
@@ -329,13 +330,15 @@ def make(
             Signing(key) if key else None,
         ),
         observer=observer,
-        controller=wrap(controller),
+        controller=flies_with,
         plan=FlightPlan(track),
         limits=resolved.limits.model_copy(update=limits or {}),
         period_s=resolved.period_s,
         deadline_s=deadline_s,
         stopwatch=lambda: 0.0 if deadline_s is None else clock.now_s,
-        identify=learning,
+        identification=(
+            Learner(believed, learning) if learning and isinstance(flies_with, Adaptive) else None
+        ),
     )
     flown = simulated.scenario(scenario) if isinstance(scenario, str) else scenario
     hovers = Start(height_m=-float(track.sample(0.0).position_ned_m[2])) if aloft else None

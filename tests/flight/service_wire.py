@@ -16,7 +16,6 @@ import numpy as np
 from pair import decode, frames_of
 from serving import ARM, HOVER, LAND, MODES, SET_MODE, START, TAKEOFF, Serving
 
-from offboard.flight.flight import Output
 from offboard.link.interface import Chunk
 
 HEARTBEAT, COMMAND_LONG, ATTITUDE_TARGET, CURRENT_MODE = 0, 76, 82, 436
@@ -93,13 +92,13 @@ class Wire:
         self._sent.clear()
         self.asked.clear()
 
-        def watched(chunks: list[Chunk], now_s: float) -> Output:
+        def watched(chunks: list[Chunk], now_s: float) -> tuple[bytes, ...]:
             for chunk in chunks:
                 self._take(chunk.data)
-            output = turn(chunks, now_s)
-            for frame in output.send:
+            frames = turn(chunks, now_s)
+            for frame in frames:
                 self._judge(frame)
-            return output
+            return frames
 
         service.turn = watched  # type: ignore[method-assign]
 

@@ -24,7 +24,7 @@ from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.run import configuration as config
 from offboard.run.flight import Prepared, build
-from offboard.service.flights import Flights, Record
+from offboard.service.flights import Flights
 from simulator import config as simulated
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Firmware
@@ -50,7 +50,7 @@ def level_setpoint(thrust: float, system: int, component: int) -> bytes:
 
 @dataclass
 class Settings:
-    """A `Source` whose configuration a test may replace."""
+    """A `Preparation` whose configuration a test may replace."""
 
     prepared: Prepared
     sentences: list[str] = field(default_factory=list)
@@ -65,7 +65,7 @@ class Settings:
 
 @dataclass
 class Logs:
-    """A `Record` that notes when each flight began and ended. It survives a restart, as files."""
+    """A `Recorder` that notes when each flight began and ended. It survives a restart, as files."""
 
     clock: HostClock
     begun: list[float] = field(default_factory=list)
@@ -87,7 +87,7 @@ class Logs:
 
 @dataclass
 class Remembered:
-    """A `Memory` without files."""
+    """`VehicleFiles` without files."""
 
     known: dict[str, IdentifiedVehicle] = field(default_factory=dict)
     discarded: list[str] = field(default_factory=list)
@@ -116,12 +116,12 @@ class Serving(Pair):
     source: Any = None
     logs: Any = None
     memory: Any = None
-    again: Callable[[Record], Flights] | None = None
+    again: Callable[[Any], Flights] | None = None
     restarted: Callable[[], object] = lambda: None  # of an observer
 
     @property
     def state(self) -> Any:
-        return self.service.state
+        return self.service.current
 
     @property
     def service(self) -> Flights:
@@ -249,7 +249,7 @@ def serve(
     seed: int = 7,
     memory: Remembered | None = None,
     firmware: Firmware | None = None,
-    record: Record | None = None,
+    record: Any = None,
     aloft: bool = False,
     **options: Any,
 ) -> Serving:
@@ -261,7 +261,7 @@ def serve(
     source = Settings(prepared(*short, *assignments, reference=reference, vehicle=vehicle))
     logs, memory = record or Logs(clock), memory or Remembered()
 
-    def again(logs: Record) -> Flights:
+    def again(logs: Any) -> Flights:
         settings = SessionSettings(
             component_id=COMPONENT_ID, record_component_id=RECORD_COMPONENT_ID
         )

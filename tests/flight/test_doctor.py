@@ -11,11 +11,8 @@ from pair import LEAN
 from pair import make as flight
 
 from offboard.doctor.run import verdict
-from offboard.flight.phases import ExitCode, Limits
-from offboard.flight.preflight import FIX_3D, Ground, Level, findings
-from offboard.flight.vehicle_state import VehicleState
-from offboard.mavlink.dialects.ardupilot import ARDUPILOT as ARDUPILOT_DIALECT
-from offboard.mavlink.events import ESTIMATE, Attitude, EstimatorReport
+from offboard.flight.phases import ExitCode
+from offboard.flight.preflight import Level
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
@@ -70,15 +67,21 @@ def test_gps_that_is_lost_waits_and_comes_back() -> None:
     assert said(patient.consult()) == {}
 
 
-@pytest.mark.parametrize(("boot_s", "level"), [(33.0, WAIT), (300.0, BLOCKS)])
-def test_estimator_without_position_although_the_gps_has_a_fix(boot_s: float, level: Level) -> None:
-    """ArduCopter 4.6.3 reports a 3D fix 10 s after its start, and a position 42 s after it."""
-    starting = VehicleState(
-        estimator=EstimatorReport(frozenset(ESTIMATE) - {"horizontal position"}, ratios=()),
-        attitude=Attitude(boot_s, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
-    )
-    ground = Ground(starting, Limits(), ARDUPILOT_DIALECT, fix_type=FIX_3D)
-    assert {found.level for check, _, found in findings(ground) if check == "estimator"} == {level}
+@pytest.mark.parametrize(
+    ("firmware", "text", "ratio"),
+    [(PX4, "unhealthy by SYS_STATUS: RC_RECEIVER", 4), (ARDUPILOT, "EKF velocity variance", 2)],
+    ids=["px4", "ardupilot"],
+)
+def test_velocity_that_the_estimator_rejects(firmware: Firmware, text: str, ratio: int) -> None:
+    """3 m/s are two of the gates of 1.5 m/s; PX4's ratios are squared."""
+    fault = {"fault": "velocity_error", "offset_ned_mps": (3.0, 0.0, 0.0), "for_s": 12.0}
+    rows = bench(firmware, faults=[fault]).consult()
+    found = {name: (row.level, row.findings[0].found) for name, row in rows.items() if row.level}
+    assert found.keys() == {"estimator", "prearm"}
+    assert [level for level, _ in found.values()] == [BLOCKS, WAIT]
+    rejected = f"rejects GPS velocity (innovation ratio {ratio}.00, limit 1)"
+    assert rejected in found["estimator"][1]
+    assert text in found["prearm"][1]
 
 
 def test_arducopter_says_itself_why_it_cannot_arm() -> None:

@@ -17,8 +17,8 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from offboard.flight.flight import Outcome, Output
-from offboard.flight.phases import Phase
+from offboard.flight.flight import Outcome
+from offboard.flight.phases import Limits, Phase
 from offboard.link import clock
 from offboard.link import log as log_module
 from offboard.link.connection import open_link
@@ -67,7 +67,8 @@ class Brief(Silent):
     stop requests. `sends` are the frames of the turn in progress, `log` what it logs."""
 
     peer, outcome = None, None
-    lands_without_log = guarded = True
+    guarded = True
+    limits = Limits()
     stops = dropped = 0
     sends: Sequence[bytes] = ()
 
@@ -81,15 +82,16 @@ class Brief(Silent):
     ) -> None:
         self.turns, self.during, self.phase, self.log = turns, during, phase, log
         self.current = self
+        self.supervised = None
         self.announced: list[str] = []
         self.announce = self.announced.append
 
-    def turn(self, chunks: Sequence[Any], now_s: float) -> Output:
+    def turn(self, chunks: Sequence[Any], now_s: float) -> tuple[bytes, ...]:
         self.turns -= 1
         self.during(self.turns)
         if self.turns == 0:
             self.outcome = FLOWN
-        return Output(send=tuple(self.sends))
+        return tuple(self.sends)
 
     def finish_turn(self, sent_s: float) -> Sequence[bytes]:
         return self.log
@@ -307,7 +309,7 @@ def test_a_log_that_cannot_be_written_is_said_at_once(
     log = tmp_path / "flight" / "flight.tlog"
     says = f"the log {log} cannot be written (No space left on device)"
     flight = Brief(100_000, end_soon, log=(b"frame",))
-    flight.lands_without_log = lands
+    flight.limits = Limits(log_lost="land" if lands else "go_on")
     outcome = fly(flight, tmp_path, real_time=True)
     assert flight.announced == [says]
     assert bool(flight.stops) is lands

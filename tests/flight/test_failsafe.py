@@ -18,7 +18,7 @@ from uneventful import NOW_S, hear, uneventful
 from offboard.flight.failsafe import ROWS, Row, judge
 from offboard.flight.phases import Action, Limits, Phase
 from offboard.flight.state import FlightState
-from offboard.flight.vehicle_clock import REPLIES_MIN
+from offboard.flight.timing import REPLIES_MIN
 from offboard.mavlink.events import (
     ESTIMATE,
     EstimatorReport,

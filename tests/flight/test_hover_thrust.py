@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from pair import Pair, make, on_arducopter
 from watch import scenario_of, watched
 
-from offboard.flight.hover_estimate import HoverEstimate
+from offboard.flight.estimates import HoverEstimate
 from offboard.flight.phases import FLYING
 from offboard.identification.learner import IdentifySettings
 from offboard.model.vehicle import Vehicle

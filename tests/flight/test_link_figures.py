@@ -8,7 +8,7 @@ from faults import both, late, repeating, stuttering
 from pair import Filter, Pair, in_phase, make, through
 
 from offboard.flight.phases import Phase
-from offboard.flight.vehicle_clock import LEAST_GROWTH_S
+from offboard.flight.timing import LEAST_GROWTH_S
 from offboard.identification.learner import IdentifySettings
 
 LAP = ("controller={law: lqr}", "reference.laps=1", "reference.height_m=1.0")

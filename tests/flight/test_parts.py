@@ -16,7 +16,8 @@ from offboard import compiled
 from offboard.compiled import Entry
 from offboard.control.base import Certificate, Decision, Situation
 from offboard.documents.reading import DocumentError
-from offboard.flight import inputs, outbox
+from offboard.flight import outbox
+from offboard.flight.record import configuration_pieces, joined_configuration
 from offboard.mavlink.outgoing import CommandLong
 from offboard.model.command import Command, PredictedState
 from offboard.reference.track import hold
@@ -104,16 +105,16 @@ def test_the_manifest_is_read_back_or_is_none() -> None:
     source = random.Random(1)
     for length in (0, 1, 124, 20_000):
         text = "".join(chr(source.randrange(32, 500)) for _ in range(length))
-        payloads = [record.data for record in inputs.pieces(text)]
+        payloads = [record.data for record in configuration_pieces(text)]
         assert max(map(len, payloads)) <= 128
-        assert inputs.join(payloads) == text
-        assert inputs.join(payloads[1:]) is None
+        assert joined_configuration(payloads) == text
+        assert joined_configuration(payloads[1:]) is None
         if len(payloads) > 3:
-            assert inputs.join(payloads[:-1]) is None
+            assert joined_configuration(payloads[:-1]) is None
             changed = payloads[2][:-3] + b"???"
-            assert inputs.join([*payloads[:2], changed, *payloads[3:]]) is None
+            assert joined_configuration([*payloads[:2], changed, *payloads[3:]]) is None
     for payloads in ([b"", b"\1"], [b"\0\0\1\0 not compressed"]):
-        assert inputs.join(payloads) is None
+        assert joined_configuration(payloads) is None
 
 
 def test_records_are_not_sent_and_no_sequence_has_a_gap() -> None:

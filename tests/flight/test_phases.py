@@ -24,11 +24,10 @@ from offboard.flight.phases import (
     Phase,
     Request,
     ServiceOptions,
+    Transition,
 )
-from offboard.flight.rows import Transition
 from offboard.flight.state import FlightState
 from offboard.flight.transitions import SERVICE_ONLY, next_row, table
-from offboard.mavlink.dialects.base import Takeoff
 from offboard.mavlink.events import (
     Attitude,
     CommandAck,
@@ -39,7 +38,10 @@ from offboard.mavlink.events import (
 )
 
 ON_TRACK = (Phase.JOIN, Phase.TRACK, Phase.HOVER)
-SERVICES = {then: ServiceOptions(then=then) for then in ("hold", "land", "repeat")}  # type: ignore[arg-type]
+SERVICES = {
+    then: ServiceOptions(then=then, arms=True)  # type: ignore[arg-type]
+    for then in ("hold", "land", "repeat")
+}
 TABLES: dict[str, ServiceOptions | None] = {"fly": None, **SERVICES}
 BOTH = pytest.mark.parametrize("service", TABLES.values(), ids=TABLES)
 Setup = Callable[[FlightState], object]
@@ -156,7 +158,6 @@ EVENTS: dict[str, Setup] = {
     "rebooted": _set(rebooted=True),
     "rebooted_in_flight": _set(rebooted=True),
     "rebooted_disarmed": _all(_set(rebooted=True), partial(_disarm, for_s=0.0, landed="in_air")),
-    "needs_no_stream": _set(dialect=SimpleNamespace(takeoff=Takeoff.COMMAND)),
     "streamed": _since(1.0),
     "engaged": partial(heartbeat, armed=False),
     "engaged_in_the_air": lift,

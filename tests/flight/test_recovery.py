@@ -47,7 +47,7 @@ def asked(
     now_s, end_s = 0.0, 1.0 + (waiting[-1][0] if waiting else LONGEST_S)
     while not recovery.ended and now_s < end_s:
         request = recovery.due(now_s)
-        commands += [(now_s, request.command.command)] if request else []
+        commands += [(now_s, request.command)] if request else []
         while waiting and waiting[0][0] <= now_s:
             at_s, event = waiting.pop(0)
             recovery.see(event, at_s)
@@ -235,10 +235,10 @@ def recovered(
         result.modes += [commander.mode.name] if commander.mode.name not in result.modes else []
         request = recovery.due(now_s) if recovery else None
         if request:
-            command, height_m = request.command.command, -autopilot.state.truth.position_ned_m[2]
+            command, height_m = request.command, -autopilot.state.truth.position_ned_m[2]
             result.asked.append((now_s, command, height_m))
             if arrives(command):
-                instance.feed(session.encode(request.command))
+                instance.feed(session.encode(request))
         if recovery and recovery.ended:
             result.ended, result.armed = recovery.ended, commander.armed
             return result

@@ -36,7 +36,6 @@ from watch import (
 from offboard.analysis.score import score
 from offboard.analysis.score_table import summary
 from offboard.estimation.observer import Observer
-from offboard.flight.flight import Output
 from offboard.flight.phases import BEFORE_FLIGHT, Action, ExitCode, Phase
 from offboard.identification.learner import IdentifySettings, Learner
 from offboard.link.interface import Chunk
@@ -307,7 +306,7 @@ def test_after_a_pause_telemetry_of_a_stream_is_not_late() -> None:
     session, turn, before_s = pair.companion.session, pair.companion.turn, 0.0
     session.settings = replace(session.settings, stream=True)
 
-    def as_read_from_a_stream(chunks: Sequence[Chunk], now_s: float) -> Output:
+    def as_read_from_a_stream(chunks: Sequence[Chunk], now_s: float) -> tuple[bytes, ...]:
         nonlocal before_s
         read, before_s = [replace(chunk, arrived_s=before_s) for chunk in chunks], now_s
         return turn(read, now_s)

@@ -367,7 +367,7 @@ def test_armed_in_offboard_on_the_ground_it_stays_there(served: Served) -> None:
     assert -pair.place[2] < 0.05
 
 
-def test_without_arms_a_start_on_the_ground_is_denied(served: Served) -> None:
+def test_without_arms_a_start_on_the_ground_is_rejected(served: Served) -> None:
     """Another vehicle passed by, which prevents standby for 10 s."""
     pair = served()
     codec = mavlink.MAVLink(None, srcSystem=9, srcComponent=1)
@@ -379,7 +379,7 @@ def test_without_arms_a_start_on_the_ground_is_denied(served: Served) -> None:
     pair.until(lambda: pair.phase is Phase.STANDBY, 1.0)
     pair.command(START)
     pair.run(3.0)
-    assert pair.acks == [(START, DENIED)]
+    assert pair.acks == [(START, TEMPORARILY_REJECTED)]
     assert pair.after(0.0, COMMAND) == []
 
 
@@ -477,9 +477,26 @@ def test_requests_over_mavlink(served: Served) -> None:
         (PAUSE_CONTINUE, DENIED),
         (ARM, UNSUPPORTED),
         (SET_MODE, ACCEPTED),
-        (SET_MODE, DENIED),
+        (SET_MODE, ACCEPTED),
         (START, TEMPORARILY_REJECTED),
     ]
+
+
+def test_a_request_that_is_being_obeyed_is_accepted_again(served: Served) -> None:
+    """A ground station that missed the answer repeats its command."""
+    pair = served.engaged("ardupilot", reference="lemniscate")
+    pair.until(lambda: pair.phase is Phase.TRACK, 30.0)
+    for command, *parameters in ((PAUSE_CONTINUE, 0.0), (PAUSE_CONTINUE, 1.0), (SET_MODE, 1.0)):
+        pair.command(command, *parameters)
+        pair.command(command, *parameters)
+        pair.run(0.2)
+        pair.command(command, *parameters)
+        pair.run(0.2)
+    assert pair.acks == [(PAUSE_CONTINUE, ACCEPTED)] * 6 + [(SET_MODE, ACCEPTED)] * 3
+    assert pair.phase is Phase.STANDBY
+    pair.command(PAUSE_CONTINUE, 1.0)
+    pair.run(0.2)
+    assert pair.acks[-1] == (PAUSE_CONTINUE, TEMPORARILY_REJECTED)
 
 
 def test_a_pilot_who_engages_and_takes_it_again_at_once_has_it(served: Served) -> None:
@@ -608,7 +625,7 @@ def test_the_reference_is_repeated_with_the_newest_configuration(served: Served)
     """Which is used by the next flight. What is announced is bounded: it may wait for weeks."""
     pair = served.engaged(then="repeat")
     model = pair.service.current
-    assert model.lands_without_log
+    assert model.limits.log_lost == "land"
     pair.source.prepared = prepared(
         "reference.height_m=1.5", "limits.log_lost=go_on", "period_s=0.2",
         reference="hover", vehicle="px4_sih",
@@ -632,6 +649,6 @@ def test_the_reference_is_repeated_with_the_newest_configuration(served: Served)
     pair.run(2.5)
     assert pair.service.current is not model
     assert float(pair.state.plan.track.sample(0.0).position_ned_m[2]) == -1.5
-    assert not pair.service.current.lands_without_log
+    assert pair.service.current.limits.log_lost == "go_on"
     ticks = thrusts(pair, pair.time_s - 1.0)
     assert len(ticks) == 5  # by the new period, which counts from another tick

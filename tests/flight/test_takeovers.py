@@ -21,7 +21,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from watch import SET_MESSAGE_INTERVAL, Vehicle, aborted, begun_s, copter, flown, px4
 
 from offboard.flight.authority import Standing
-from offboard.flight.flight import Output
 from offboard.flight.phases import ENDS, ExitCode, Phase
 from offboard.link.interface import Chunk
 
@@ -58,17 +57,17 @@ class Judge:
         self._done: set[str] = set()  # by the vehicle itself
         pair.companion.turn = self.turn  # type: ignore[method-assign]
 
-    def turn(self, chunks: list[Chunk], now_s: float) -> Output:
+    def turn(self, chunks: list[Chunk], now_s: float) -> tuple[bytes, ...]:
         for frame in (frame for chunk in chunks for frame in frames_of(chunk.data)):
             if frame_id(frame) in (HEARTBEAT, CURRENT_MODE):
                 self._shows(int.from_bytes(frame[10:-2][:4].ljust(4, b"\0"), "little"))
         self._look()
-        output = self._turn(chunks, now_s)
-        for message in map(decode, output.send):
+        frames = self._turn(chunks, now_s)
+        for message in map(decode, frames):
             command = getattr(message, "command", None)
             if message.get_msgId() in MOVING and command != SET_MESSAGE_INTERVAL:
                 self._leaves(message, command)
-        return output
+        return frames
 
     def _shows(self, mode: int) -> None:
         self._shown = mode

@@ -60,6 +60,7 @@ def uneventful(phase: Phase = Phase.TRACK, service: ServiceOptions | None = None
             ambiguous=lambda now_s: False, named=lambda now_s: "1, 2", why_none=lambda counted: ""
         ),
         counters=None,
+        link_time_s=NOW_S,
         has_twin=False,
         rates_hz={"ATTITUDE_QUATERNION": 50.0, "LOCAL_POSITION_NED": 30.0},
     )

@@ -14,8 +14,6 @@ import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from threading import Event
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -36,7 +34,6 @@ from sim_peer import Peer
 from offboard.analysis import tlog
 from offboard.analysis.score import as_text, score_flight
 from offboard.documents.signing_key import create_key, read_key
-from offboard.service import record
 
 SET_MODE = 176  # MAV_CMD
 OFFBOARD, HOLDING, RETURNING = 0x00060000, 0x03040000, 0x05040000
@@ -172,21 +169,7 @@ def test_a_pilot_engages_and_a_stop_hands_back(
     assert pilot.newest["HEARTBEAT"].system_status == ACTIVE  # asked by the supervisor: no failsafe
     pilot.command(SET_MODE, 1, 4, 5)  # RTL, which ends the supervisor, too
     pilot.listen(mode(pilot, RETURNING))
-
-
-@pytest.mark.parametrize("report", [False, True])
-def test_a_flight_is_scored_or_reported_by_a_process_of_its_own(
-    report: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    begun: list[tuple[str, Path]] = []
-
-    def begin(command: str, directory: Path) -> Any:
-        begun.append((command, directory))
-        return SimpleNamespace(poll=lambda: 0)
-
-    monkeypatch.setattr(record, "begin", begin)
-    record.score(tmp_path, Event(), report=report)
-    assert begun == [("report" if report else "score", tmp_path)]
+    eventually(lambda: len(list((tmp_path / "out").glob("*/score.json"))) == 2)  # scored by it
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")

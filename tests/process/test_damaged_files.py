@@ -17,8 +17,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from offboard.analysis.score import keep_score, score_flight
 from offboard.campaign.results import Record
 from offboard.cli import fly
-from offboard.flight import inputs
-from offboard.flight.record import RECORD_COMPONENT_ID
+from offboard.flight.record import RECORD_COMPONENT_ID, configuration_pieces
 from offboard.link.log import LogError
 
 NOW_US = 1_790_000_000_000_000  # of an entry of a log
@@ -29,7 +28,7 @@ def gigabytes() -> bytes:
     """A log whose configuration unpacks to a thousand times its bytes, here to 40 MB."""
     codec = dialect.MAVLink(None, srcSystem=1, srcComponent=RECORD_COMPONENT_ID)
     log = io.BytesIO()
-    for piece in inputs.pieces(40_000_000 * " "):
+    for piece in configuration_pieces(40_000_000 * " "):
         data = list(piece.data.ljust(128, b"\0"))
         message = codec.tunnel_encode(0, 0, piece.payload_type, len(piece.data), data)
         log.write(NOW_US.to_bytes(8, "big") + message.pack(codec))

@@ -18,15 +18,16 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from offboard.analysis.history import record_type
 from offboard.analysis.tlog import LoggedMessage
-from offboard.flight.inputs import CONFIGURATION_TYPE as MANIFEST
-from offboard.flight.inputs import (
-    Call,
-    FramesDropped,
+from offboard.flight.record import (
+    CALL,
+    CHECK,
+    OTHERS,
+    RECORD_COMPONENT_ID,
     InputRecorder,
-    OtherDatagrams,
+    Note,
     TurnInput,
 )
-from offboard.flight.record import RECORD_COMPONENT_ID
+from offboard.flight.record import CONFIGURATION_TYPE as MANIFEST
 from offboard.link.interface import Chunk
 from offboard.link.log import entry
 from offboard.mavlink.framing import SETPOINTS
@@ -136,12 +137,13 @@ def inputs_of(
                 for reading in readings_s:  # noqa: B007 - `read_again` reads it
                     read_again()
                 recorder.end()
-            case Call(name, arguments) if name in CALLS:
-                recorder.call(name, *arguments)
-            case OtherDatagrams(total):
-                other_datagrams = total
-            case FramesDropped(count):
-                recorder.dropped(count)
+            case Note(kind, values) if kind == OTHERS:
+                (other_datagrams,) = values
+            case Note(kind, values) if kind == CALL:
+                if values[0] in CALLS:
+                    recorder.call(*values)
+            case Note(kind, (value,)) if kind != CHECK:
+                recorder.note(kind, value)
     return recorder.pieces(all_of_it=True)
 
 

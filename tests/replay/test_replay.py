@@ -20,10 +20,16 @@ from offboard.analysis.history import record_type
 from offboard.cli.commands import app
 from offboard.control.base import Controller, Decision, Situation
 from offboard.control.law import PsoLaw
-from offboard.flight import actions, inputs
-from offboard.flight.flight import Output
-from offboard.flight.inputs import Call, InputRecorder, InputsError, entries
+from offboard.flight import actions
 from offboard.flight.phases import Phase
+from offboard.flight.record import (
+    PAYLOAD_TYPE,
+    InputRecorder,
+    InputsError,
+    Note,
+    configuration_pieces,
+    entries,
+)
 from offboard.flight.state import FlightState
 from offboard.link.interface import Chunk
 from offboard.link.log import entry
@@ -123,7 +129,7 @@ def test_the_rounding_of_another_computer_is_no_difference(by: float, significan
 
 def test_logs_that_cannot_be_replayed(flight: Path, tmp_path: Path) -> None:
     old, silent = tmp_path / "old.tlog", tmp_path / "silent.tlog"
-    old.write_bytes(without(flight, lambda message: record_type(message) == inputs.PAYLOAD_TYPE))
+    old.write_bytes(without(flight, lambda message: record_type(message) == PAYLOAD_TYPE))
     silent.write_bytes(without(flight, lambda message: record_type(message) is None))
     for log, why in (
         (WIRE / "px4-1.16.1-offboard.tlog", "does not hold the configuration"),
@@ -180,12 +186,12 @@ def short_flight(key: bytes = b"", **options) -> Pair:
     if key:
         pair.instance.keyring.set_up(key, 1)
 
-    def guarded(chunks, now_s) -> Output:  # as the loop
+    def guarded(chunks, now_s) -> tuple[bytes, ...]:  # as the loop
         try:
             return turn(chunks, now_s)
         except Exception as error:
             companion.request_stop(str(error))
-            return Output()
+            return ()
 
     companion.turn = guarded  # type: ignore[method-assign]
     pair.fly()
@@ -194,7 +200,9 @@ def short_flight(key: bytes = b"", **options) -> Pair:
 
 def logged(pair: Pair, path: Path) -> Path:
     session = Session(SessionSettings(record_component_id=192))
-    pieces = [session.encode(piece) for piece in inputs.pieces(configuration.dump(resolved()))]
+    pieces = [
+        session.encode(piece) for piece in configuration_pieces(configuration.dump(resolved()))
+    ]
     frames = [*pieces, *pair.logged]
     path.write_bytes(b"".join(entry(UNIX_EPOCH_US + 100 * n, f) for n, f in enumerate(frames)))
     return path
@@ -340,5 +348,5 @@ def test_in_lockstep_no_host_time_is_recorded() -> None:
 
     assert pieces(0.01, 14580) == pieces(0.37, 20000)
     first = next(entries(pieces(0.01, 14580)))
-    assert isinstance(first, Call)
-    assert first.arguments[0]["lockstep"] is True
+    assert isinstance(first, Note)
+    assert first.values[1]["lockstep"] is True

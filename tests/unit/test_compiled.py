@@ -131,11 +131,11 @@ def test_the_directory_is_below_the_first_usable_one(package: Path, tmp_path: Pa
 
 def test_arguments_of_other_types_are_refused() -> None:
     """Or they might be compiled in flight, for seconds."""
-    bounds, best, rng = np.zeros((2, 2)), np.ones(2), np.random.default_rng(0)
+    bounds, best, random = np.zeros((2, 2)), np.ones(2), np.zeros((1, 2, 4, 2))
     strided, transposed = np.zeros((3, 2, 8))[..., ::2], np.zeros((4, 2, 3)).T
     for wrong in (strided, np.zeros(3), np.zeros((3, 2, 4), "f4"), transposed):
         with pytest.raises(TypeError, match="No matching definition"):
-            iterate(np.zeros(1, SEARCH), rng, bounds, wrong, best, bounds, bounds, best, 0.0, 1)
+            iterate(np.zeros(1, SEARCH), random, bounds, wrong, best, bounds, bounds, best, 0.0, 1)
 
 
 def test_importing_a_flight_does_not_import_numba() -> None:

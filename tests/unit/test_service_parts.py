@@ -7,7 +7,6 @@ import os
 import socket
 import subprocess
 import sys
-import threading
 import time
 from functools import partial
 from pathlib import Path
@@ -18,9 +17,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.analysis import tlog
 from offboard.cli.daemon import may_pass
-from offboard.flight import inputs
 from offboard.flight.authority import PilotSwitch
 from offboard.flight.flight_plan import CLEAR_M, FlightPlan
+from offboard.flight.record import joined_configuration
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from offboard.link import clock
@@ -33,10 +32,9 @@ from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.run.configuration import load
 from offboard.run.flight import build
-from offboard.service import daemon, preparation, unit
+from offboard.service import daemon, preparation
 from offboard.service.daemon import Manager
-from offboard.service.memory import VehicleFiles
-from offboard.service.preparation import Preparation
+from offboard.service.preparation import Preparation, VehicleFiles
 from offboard.service.record import ROLLING_NAMES, Recorder
 
 REST = (0.0, 0.0, 0.0)  # velocity
@@ -51,8 +49,7 @@ def session() -> Session:
 def recorded(directory: Path, **options: Any) -> tuple[Recorder, list[Path]]:
     """A recorder, and the flights that it has scored."""
     scored: list[Path] = []
-    options = {"score": lambda flight, closing: scored.append(flight)} | options
-    return Recorder(directory, **options), scored
+    return Recorder(directory, score=scored.append, **options), scored
 
 
 def test_a_flight_log_begins_with_what_came_before(tmp_path: Path) -> None:
@@ -79,7 +76,7 @@ def test_a_flight_log_begins_with_what_came_before(tmp_path: Path) -> None:
     assert beats == [*[6] * 6, 18]
     pieces = [entry.message for entry in log if entry.name == "TUNNEL"]
     payloads = [bytes(piece.payload[: piece.payload_length]) for piece in pieces]
-    assert inputs.join(payloads) == "vehicle: neutral\n"
+    assert joined_configuration(payloads) == "vehicle: neutral\n"
     assert (first / "flight.yaml").read_text() == "vehicle: neutral\n"
 
 
@@ -97,24 +94,15 @@ def test_a_clock_that_is_set_back_ends_what_came_before(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("age_s", "left"), [(0, "px4-1-7"), (700, ""), (-4000, "px4-1-7")])
 def test_what_a_killed_service_has_not_done(tmp_path: Path, age_s: int, left: str) -> None:
-    """The vehicle that it had engaged is known for ten minutes, its flight is scored. A log of the
-    future: this computer has booted, and its clock was not set since. A flight whose log is gone is
-    not scored, nor looked at again."""
+    """The vehicle that it had engaged is known for ten minutes. A log of the future: this computer
+    has booted, and its clock was not set since."""
     killed, _ = recorded(tmp_path)
     cut = Path(killed.begin(session(), "", "px4-1-7"))
-    killed.close()  # its threads write no more; nothing is scored, the vehicle stays engaged
-    deadline_s = time.monotonic() + 10.0
+    killed.close()  # its threads write no more, the vehicle stays engaged
     changed_s = time.time() - age_s
     os.utime(cut / "flight.tlog", (changed_s, changed_s))
-    (tmp_path / "gone").mkdir()
-    (tmp_path / "gone" / "unscored").touch()
-    recorder, scored = recorded(tmp_path, settled_s=0.01)
+    recorder, _ = recorded(tmp_path)
     assert recorder.left == left
-    recorder.score_earlier()
-    while any(tmp_path.glob("*/unscored")):
-        assert time.monotonic() < deadline_s
-        time.sleep(0.01)
-    assert scored == [cut]
     recorder.settle()
     assert recorder.left == ""
     recorder.close()
@@ -122,24 +110,14 @@ def test_what_a_killed_service_has_not_done(tmp_path: Path, age_s: int, left: st
 
 
 def test_a_vehicle_is_left_engaged_until_it_was_handed_back(tmp_path: Path) -> None:
-    """And the end does not wait for the score: the processes that score outlive the service, one
-    for the flight that was being scored and one for the newest; the next start sees what they have
-    done, and does the rest."""
-
-    def score(directory: Path, closing: threading.Event) -> None:
-        began.append(directory)
-        assert closing.wait(60.0)
-
-    began: list[Path] = []
-    recorder, _ = recorded(tmp_path, score=score)
+    recorder, scored = recorded(tmp_path)
     flights = []
     for engaged in (True, False, False, True):
         flights.append(Path(recorder.begin(session(), "", "px4-1-7")))
         recorder.end(engaged=engaged)
         assert recorder.left == ("px4-1-7" if engaged else "")
     recorder.close()
-    assert began == [flights[0], flights[-1]]
-    assert sorted(path.parent for path in tmp_path.glob("*/unscored")) == flights
+    assert scored == flights
     assert [(flight / "engaged").exists() for flight in flights] == [False, False, False, True]
     again, _ = recorded(tmp_path)
     assert again.left == "px4-1-7"
@@ -235,10 +213,10 @@ def test_a_full_disk_is_no_wrong_option(tmp_path: Path, monkeypatch: pytest.Monk
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with pytest.raises(LogError) as wrong:
-        Recorder(Path("/dev/null/flights"))
+        recorded(Path("/dev/null/flights"))
     monkeypatch.setattr(os, "open", full)
     with pytest.raises(LogError) as passing:
-        Recorder(tmp_path)
+        recorded(tmp_path)
     assert [may_pass(each.value) for each in (wrong, passing)] == [False, True]
 
 
@@ -248,16 +226,16 @@ def test_what_the_user_of_the_unit_cannot_read(
     file = tmp_path / "home" / "my.yaml"
     file.parent.mkdir()
     file.touch(0o644)
-    assert unit.unreadable(file).startswith(f"the unit cannot see {file}: it has a ")
-    monkeypatch.setattr(unit, "PRIVATE", ())
+    assert daemon.unreadable(file).startswith(f"the unit cannot see {file}: it has a ")
+    monkeypatch.setattr(daemon, "PRIVATE", ())
     tmp_path.chmod(0o750)
-    assert unit.unreadable(file).endswith("is closed to others")
-    assert unit.unreadable(Path("/etc/passwd")) == ""
+    assert daemon.unreadable(file).endswith("is closed to others")
+    assert daemon.unreadable(Path("/etc/passwd")) == ""
 
 
 def test_the_link_is_opened_when_it_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
     """Port in use: said once, tried again until it is free. A wrong address is an error at once."""
-    monkeypatch.setattr(daemon, "LINK_FIRST_S", 0.01)
+    monkeypatch.setattr(daemon, "LINK_EVERY_S", 0.01)
     holder = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     holder.bind(("127.0.0.1", 0))
     alive, told = [], []
@@ -289,7 +267,7 @@ def test_the_service_manager_is_told_and_not_waited_for(monkeypatch: pytest.Monk
         systemd.bind(f"\0{name}")
         monkeypatch.setenv("NOTIFY_SOCKET", f"@{name}")
         manager = Manager()
-        manager.ready()
+        manager.tell("READY=1")
         for second in range(1, 1000):  # net.unix.max_dgram_qlen is 512 at most
             manager.alive(float(second), f"{second}")
         systemd.settimeout(10.0)

@@ -146,7 +146,7 @@ def test_the_spread_is_the_mean_distance_of_the_last_positions_from_the_best() -
     swarm = Swarm(SwarmSettings(iterations=20), problem.lower, problem.upper, rng(13))
     for until in range(1, 21):
         asked = swarm.ask()
-        swarm.tell_all(problem, until)
+        swarm.tell_all(problem, 1)
         result = swarm.result()
         distance = np.linalg.norm(asked - result.best, axis=1)  # Eqs. 28-29
         assert result.spread == pytest.approx(distance.mean(), rel=1e-12)
@@ -193,11 +193,11 @@ def test_compiled_and_ask_tell_move_the_same_particles() -> None:
     problem = BoxQuadratic(np.asfortranarray(hessian), gradient, 2.0, -half, half)
     compiled = Swarm(SwarmSettings(), -half, half, rng(3))
     swarm = Swarm(SwarmSettings(), -half, half, rng(3))
-    for until in range(1, SwarmSettings().iterations + 1):
+    for _ in range(SwarmSettings().iterations):
         asked = swarm.ask()
         assert asked == pytest.approx(compiled.ask(), abs=1e-5)  # equal costs but for rounding
         swarm.tell(problem(asked))
-        compiled.tell_all(problem, until)
+        compiled.tell_all(problem, 1)
     ours, theirs = swarm.result(), compiled.result()
     assert ours.best == pytest.approx(theirs.best, abs=1e-6)
     assert ours.cost == pytest.approx(theirs.cost, rel=1e-12)

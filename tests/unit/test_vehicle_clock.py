@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from offboard.flight.vehicle_clock import (
+from offboard.flight.timing import (
     DELAY_MAX_S,
     LinkGrowth,
     VehicleClock,

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from offboard.flight.estimates import PositionJumps
 from offboard.flight.ground_contact import GroundContact
-from offboard.flight.positioning import PositionJumps
 from offboard.flight.vehicle_state import VehicleState
 from offboard.mavlink.events import Attitude, Heartbeat, Landed, LocalPosition
 

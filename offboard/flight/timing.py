@@ -1,7 +1,8 @@
-"""The vehicle's clock: the time on it now, the age of telemetry, and the delay of the link.
+"""Times: the vehicle's clock, the age of telemetry and the delay of the link; and whether this
+computer keeps up with the control ticks.
 
-It is a line over host time, whose offset and rate are estimated together (one without the other
-would take a slow clock for a link that becomes later). Two measures enclose it:
+The vehicle's clock is a line over host time, whose offset and rate are estimated together (one
+without the other would take a slow clock for a link that becomes later). Two measures enclose it:
 
 - Telemetry arrives after the time of its stamp: the least delayed of the last seconds shows what
   the vehicle's clock has at least reached. Newest telemetry that is older has been delayed more
@@ -228,11 +229,9 @@ class Edge:
     def at(self, host_s: float, rate: float, over_s: float = math.inf) -> float | None:
         """Vehicle time at `host_s` by the point that is most ahead, or behind, of those that are at
         most `over_s` old; None without any."""
-        sign = self._sign
-        ahead_s = [
-            sign * (v + rate * (host_s - h)) for h, v in self._points if host_s - h <= over_s
-        ]
-        return sign * max(ahead_s) if ahead_s else None
+        since_s, sign = host_s - over_s, self._sign
+        ahead_s = [sign * (v - rate * h) for h, v in self._points if h >= since_s]
+        return rate * host_s + sign * max(ahead_s) if ahead_s else None
 
     @property
     def rate(self) -> float | None:
@@ -241,3 +240,52 @@ class Edge:
         if not points or points[-1][0] - points[0][0] < RATE_OVER_S:
             return None
         return statistics.linear_regression(*zip(*points, strict=True)).slope
+
+
+# ---------------------------------------------------------------------- this computer
+
+SHARE = 0.05  # of the ticks skipped, from which a computer is too busy
+PAUSE_S = 0.3  # or one pause; after it, what was known before is not known any more
+
+
+def too_busy(skipped: float, ticks: float, pause_s: float) -> str:
+    """A sentence if this computer was too busy to fly; else empty.
+
+    `skipped` of `ticks` control ticks fell into pauses of this process; `pause_s` is the longest.
+    """
+    if not (pause_s > PAUSE_S or skipped > SHARE * ticks):
+        return ""
+    return (
+        f"this computer was too busy: {skipped:.0f} of {ticks:.0f} ticks were skipped, pauses up "
+        f"to {pause_s:.2f} s"
+    )
+
+
+class Busyness:
+    """Counts in the air. `period_s`: of control; a shorter gap between two turns skips no tick."""
+
+    def __init__(self, period_s: float) -> None:
+        self._period_s = period_s
+        self._gap_s = 0.0  # longest between two turns, since the previous tick
+        self.skipped = self.ticks = 0
+        self.pause_s = 0.0
+
+    def on_turn(self, gap_s: float) -> None:
+        """A turn begins `gap_s` after the one before it, host time."""
+        self._gap_s = max(self._gap_s, gap_s)
+
+    def on_tick(self, missed: int, *, flying: bool) -> float:
+        """A tick, `missed` ticks after the previous one. Returns the pause that it came after, 0
+        without one."""
+        pause_s, self._gap_s = self._gap_s, 0.0
+        if pause_s <= self._period_s:
+            pause_s = 0.0
+        if flying:
+            self.ticks += 1 + missed
+            self.skipped += missed if pause_s else 0
+            self.pause_s = max(self.pause_s, pause_s)
+        return pause_s
+
+    @property
+    def sentence(self) -> str:
+        return too_busy(self.skipped, self.ticks, self.pause_s)
