@@ -1,4 +1,4 @@
-"""The state tables in simulator/README.md are those of the code, and its paths exist.
+"""The state tables in simulator/README.md are those of the code, and name only what exists.
 
 `python tests/test_simulator_readme.py` writes the tables.
 """
@@ -6,13 +6,16 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
+from string import Formatter
 from typing import get_args
 
 import pytest
 
+from simulator.autopilot.commander import ACTIONS, CONDITIONS, TEXT_VALUES
 from simulator.faults import Fault
-from simulator.firmware.base import Firmware
+from simulator.firmware.base import AFTER_DELAY, EVENTS, Firmware, Rule
 from simulator.firmware.catalogue import FIRMWARES
 from simulator.firmware.values import Result
 
@@ -59,6 +62,37 @@ def test_every_fault_is_in_the_table() -> None:
     rows = "\n".join(line for line in README.read_text().splitlines() if line.startswith("| `"))
     assert {name for name in named if f"`{name}`" not in rows} == set()
     assert len(named) == 21
+
+
+def unknown(firmware: Firmware, rule: Rule) -> Iterator[str]:
+    """What a row names that does not exist."""
+    known = EVENTS.union((event + AFTER_DELAY for event in EVENTS), firmware.boot_events_s)
+    yield from {rule.event} - known
+    yield from {rule.mode} - {*firmware.modes, "*"}
+    yield from {rule.to} - {*firmware.modes, "*", "requested", "remembered"}
+    yield from set(rule.do) - ACTIONS.keys()
+    yield from (name for name in rule.when if not exists(firmware, name.removeprefix("not ")))
+    fields = (name for text in rule.texts for _, name, _, _ in Formatter().parse(text.text))
+    yield from {name for name in fields if name is not None} - TEXT_VALUES.keys()
+
+
+def exists(firmware: Firmware, condition: str) -> bool:
+    name, compares, value = condition.partition("=")
+    if compares:
+        known = any(name == spec.name for spec in firmware.parameters)
+        return known and value.lstrip("-").isdecimal()
+    kind, _, event = condition.partition(" ")
+    if kind in ("since", "latched"):
+        return event in EVENTS
+    return event in firmware.boot_events_s if kind == "reached" else condition in CONDITIONS
+
+
+@pytest.mark.parametrize("firmware", FIRMWARES.values(), ids=FIRMWARES)
+def test_rows_name_only_what_exists(firmware: Firmware) -> None:
+    assert [(rule, name) for rule in firmware.rules for name in unknown(firmware, rule)] == []
+    assert len(firmware.rules) > 50
+    wrong = Rule("arm", when=("not amred", "COM_X=1"), to="LND")
+    assert list(unknown(firmware, wrong)) == ["LND", "not amred", "COM_X=1"]
 
 
 if __name__ == "__main__":

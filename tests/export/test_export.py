@@ -10,7 +10,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
@@ -26,7 +25,6 @@ from offboard.flight.phases import Phase
 from offboard.flight.record import RECORD_ID
 from offboard.link.log import entry
 from offboard.mavlink import event_record
-from offboard.model.frames import enu, flu_in_enu
 
 sys.path.append(str(Path(__file__).parents[1] / "flight"))
 
@@ -65,18 +63,6 @@ def exported(flight: Path, kind: str, output: Path, *options: str) -> Path:
     result = run(flight, kind, output, *options)
     assert result.exit_code == 0, result.exception
     return output
-
-
-def test_frames_against_rotation_matrices() -> None:
-    """ENU = A NED and FRD = B FLU, so that R_enu = A R_ned B."""
-    a = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
-    b = np.diag([1, -1, -1])
-    rotations = Rotation.random(50, random_state=3)
-    converted = flu_in_enu(np.roll(rotations.as_quat(), 1, axis=1))
-    expected = a @ rotations.as_matrix() @ b
-    assert Rotation.from_quat(np.roll(converted, -1, axis=1)).as_matrix() == pytest.approx(expected)
-    vectors = np.random.default_rng(3).normal(size=(50, 3))
-    assert enu(vectors) == pytest.approx(vectors @ a.T)
 
 
 def test_mcap(flight: Path, messages: dict[tuple[str, bool], list[Any]], tmp_path: Path) -> None:

@@ -250,10 +250,6 @@ def raises(_: Situation) -> Decision:
     raise ZeroDivisionError("nothing to divide by")
 
 
-def not_a_number(_: Situation) -> Decision:
-    return Decision(Command(math.nan, (0.0, 0.0, 1.0), 0.0))
-
-
 def no_direction(_: Situation) -> Decision:
     return Decision(Command(9.8, (0.0, 0.0, 0.0), 0.0))
 

@@ -98,8 +98,7 @@ class Pair:
     up: Filter = through
     at: list[tuple[Callable[[Pair], bool], Callable[[Pair], object]]] = field(default_factory=list)
     dead: bool = False
-    rate: float = 1.0  # of the vehicle's clock, against that of the host; see `slow_down`
-    epoch_s: float = HOST_EPOCH_S  # host time at vehicle time 0
+    rate: float = 1.0  # of the vehicle's clock, against that of the host
     time_s: float = 0.0
     steps: int = 0
     turned: int = 0  # steps at the newest turn
@@ -180,12 +179,7 @@ class Pair:
     @property
     def host_s(self) -> float:
         """Host time."""
-        return self.epoch_s + self.time_s / self.rate
-
-    def slow_down(self, rate: float) -> None:
-        """From now on the vehicle's clock runs at this rate."""
-        self.epoch_s = self.host_s - self.time_s / rate
-        self.rate = rate
+        return HOST_EPOCH_S + self.time_s / self.rate
 
     def pause(self, seconds: float) -> None:
         """The process of the companion is stopped, as by SIGSTOP."""

@@ -30,20 +30,6 @@ class Disk:
         self.items += items
 
 
-@pytest.mark.parametrize(("room", "written"), [(1000, 500), (10, 10)])
-def test_a_slow_disk_stops_nobody_and_what_does_not_fit_is_counted(room: int, written: int) -> None:
-    disk = Disk()
-    writer = BackgroundWriter(disk.write, room)
-    writer.put(-1)
-    assert disk.asked.wait(LONG_S)  # holds the first
-    for number in range(500):
-        writer.put(number)
-    assert (disk.items, writer.dropped) == ([], 500 - written)
-    disk.free.set()
-    writer.close(LONG_S)
-    assert disk.items == [-1, *range(written)]
-
-
 def test_in_lockstep_it_waits_and_loses_nothing() -> None:
     disk = Disk()
     disk.free.set()
@@ -52,25 +38,6 @@ def test_in_lockstep_it_waits_and_loses_nothing() -> None:
         writer.put(number)
     writer.close(LONG_S)
     assert (disk.items, writer.dropped) == ([*range(2000)], 0)
-
-
-@pytest.mark.parametrize("failure", [OSError(28, "No space left"), SystemExit(1)])
-def test_a_failure_is_kept_and_ends_the_writing(failure: BaseException) -> None:
-    written: list[int] = []
-
-    def write(items: list[int]) -> None:
-        if written:
-            raise failure
-        written.extend(items)
-
-    writer = BackgroundWriter(write, 100)
-    writer.put(0)
-    while not written:
-        pass
-    for number in range(1, 6):
-        writer.put(number)
-    writer.close(LONG_S)
-    assert (writer.error, writer.dropped, written) == (failure, 5, [0])
 
 
 def test_a_log_on_a_slow_disk_is_complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

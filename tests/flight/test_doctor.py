@@ -6,7 +6,7 @@ import dataclasses
 from typing import Any
 
 import pytest
-from doctor_bench import GOOD, bench, said
+from doctor_bench import bench, said
 from pair import LEAN
 from pair import make as flight
 
@@ -54,16 +54,6 @@ def test_line_for_a_parameter_mends_it(
     assert verdict([row], complete=True).startswith(named)
     patient.follow(row)
     assert patient.consult("parameters")["parameters"].level is OK
-
-
-def test_parameters_as_arducopter_ships_them() -> None:
-    patient = bench(ARDUPILOT, parameters={"GUID_OPTIONS": 0.0, "GUID_TIMEOUT": 3.0})
-    rows = patient.consult()
-    assert set(said(rows)) == {"parameters"}
-    assert rows["parameters"].level is BLOCKS
-    patient.follow(rows["parameters"])
-    table = patient.instance.autopilot.parameters
-    assert {name: table[name] for name in GOOD["ardupilot"]} == GOOD["ardupilot"]
 
 
 def test_gps_that_is_lost_waits_and_comes_back() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import threading
 import time
@@ -56,22 +55,6 @@ def test_the_command_ends_in_time_although_nothing_of_it_does(
     assert time.monotonic() - began_s < 2.0
     assert "cannot be opened in 0.1 s" in rows["port"].findings[0].found
     assert rows["computer"].level is Level.WAIT
-
-
-def test_report_as_json() -> None:
-    seen = bench(parameters={"COM_OBL_RC_ACT": 0.0}).listen()
-    rows = run.examine(["gps", "parameters"], seen)
-    assert run.worst(rows) is Level.WARN
-    report = json.loads(run.as_json(rows, seen, run.verdict(rows, complete=True)))
-    assert (report["level"], report["verdict"]) == (
-        "warn", "ready to fly; warnings: COM_OBL_RC_ACT"
-    )  # fmt: skip
-    assert report["vehicle"] == {"autopilot": "px4", "system_id": 1}
-    assert report["version"] == [1, 16, 1]
-    assert [row["check"] for row in report["rows"]] == ["gps", "parameters"]
-    (finding, good) = report["rows"][1]["findings"]
-    assert finding["hint"] == "param set COM_OBL_RC_ACT 4"
-    assert (finding["level"], good["level"]) == ("warn", "ok")
 
 
 def test_silence_at_an_address_of_this_computer_alone() -> None:

@@ -23,7 +23,8 @@ from offboard.flight.phases import Phase
 # RMSE in m that is to be undercut in calm; the paper's law has a time constant of 39 s, the
 # autopilot's own loop lags
 MOST_M = dict.fromkeys(names(), 0.01) | {"paper": 2.5, "autopilot": 1.0}
-SHORT = ("reference.laps=1", "reference.period_s=6", "reference.half_length_m=1")
+SHORT = ("reference.laps=1", "reference.period_s=6", "reference.half_length_m=1",
+         "reference.height_m=1")  # fmt: skip
 
 
 def flying(controller: str, tmp_path: Path, *assignments: str, **options: object) -> Pair:

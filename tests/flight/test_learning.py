@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import random
 from collections.abc import Callable
 from pathlib import Path
@@ -11,15 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 from faults import TIMESYNC, without
-from pair import Filter, Pair, hover, in_phase, make
+from pair import Filter, Pair, in_phase, make
 
 from offboard.analysis import history
 from offboard.analysis.identify import identify_flight, vehicle_file
 from offboard.documents.reading import parse
 from offboard.flight.phases import Phase
 from offboard.flight.record import IDENTIFIED_ID
-from offboard.identification.learner import LENGTH_S, TILT_RAD, IdentifySettings, excited
-from offboard.model.command import Command
+from offboard.identification.learner import LENGTH_S, IdentifySettings
 from offboard.model.vehicle import AxisResponse, Vehicle
 from simulator import config as simulated
 from simulator.steps import STEP_S
@@ -112,18 +110,6 @@ def test_slow_thrust_is_identified(tmp_path: Path) -> None:
     assert effect_s == pytest.approx(flies.thrust_delay_s + 0.5, abs=0.1)
 
 
-def test_switched_off_nothing_is_excited_or_adopted() -> None:
-    """The bandwidth is one that supports a delay 0.13 s longer than the vehicle file's."""
-    pair = hover(vehicle="neutral", learning=IdentifySettings(online=False), aloft=True)
-    pair.track()
-    assert not pair.went_through(Phase.EXCITE)
-    announced = [line for line in pair.companion.announced if "identif" in line]
-    assert announced == [
-        f"{LIMITED}5.0 rad/s (configured 7.0): without identification the vehicle "
-        "file's delay may be wrong by 130 ms"
-    ]
-
-
 def test_vehicle_file_that_telemetry_contradicts_ends_the_flight() -> None:
     """The reason has both figures, and the vehicle lands."""
     wrong = TRUE.tilt.model_copy(update={"natural_frequency_radps": 2.5})
@@ -149,22 +135,6 @@ def test_bandwidth_that_the_delay_does_not_support_is_limited() -> None:
     (line,) = (line for line in pair.companion.announced if line.startswith(LIMITED))
     assert "rad/s (configured 10.0): identified delay, 2" in line
     assert 4.0 < float(line.removeprefix(LIMITED).split()[0]) < 9.0
-
-
-def test_steps_end_where_they_began():
-    """Twice integrated, the added tilt leaves neither speed nor displacement."""
-    level = Command(9.8, (0.0, 0.0, 1.0), 0.3)
-    times = np.arange(0.0, LENGTH_S + 0.5, 0.01)
-    flown = [excited(level, float(time_s)) for time_s in times]
-    for axis in (0, 1):
-        added = np.array([command.thrust_direction_ned[axis] for command in flown])
-        speed = np.cumsum(added) * 0.01
-        assert np.abs(added).max() == pytest.approx(math.sin(TILT_RAD))
-        assert abs(speed[-1]) < 1e-4
-        assert abs(np.sum(speed) * 0.01) < 1e-3
-    for command in flown:
-        assert math.hypot(*command.thrust_direction_ned) == pytest.approx(1.0, abs=1e-12)
-    assert flown[-1] == level
 
 
 def test_slow_link_is_identified_and_flown() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import random
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,14 +17,12 @@ from offboard.compiled import Entry
 from offboard.control.base import Certificate, Decision, Situation
 from offboard.documents.reading import DocumentError
 from offboard.flight import outbox
-from offboard.flight.preflight import ParameterReading
 from offboard.flight.record import configuration_pieces, joined_configuration
-from offboard.mavlink.dialects.px4 import PX4
 from offboard.mavlink.outgoing import CommandLong
 from offboard.model.command import Command, PredictedState
 from offboard.reference.track import hold
 from offboard.run import configuration as config
-from offboard.run.flight import Simulated, build, rehearse
+from offboard.run.flight import build, rehearse
 
 LEVEL = Command(9.8, (0.0, 0.0, 1.0), 0.0)
 
@@ -70,25 +67,6 @@ def test_a_law_that_fails_is_found_before_the_flight(fail: Any, says: str) -> No
     law = failing(fail, after=0)(prepared.controller)
     with pytest.raises(DocumentError, match=says):
         rehearse(replace(prepared, controller=law), keeps_deadline=False)
-
-
-def test_a_wrong_scenario_is_found_before_the_flight(tmp_path: Path) -> None:
-    scenario = tmp_path / "bad.yaml"
-    scenario.write_text("conditions: {wind_ned_mps: [1, 2]}\n")
-    with pytest.raises(DocumentError, match="wind_ned_mps"):
-        Simulated(scenario=str(scenario)).check()
-
-
-def test_parameters_are_requested_until_they_are_answered() -> None:
-    readiness, known = ParameterReading(), {"MPC_THR_HOVER": 0.5}
-    first = [request.name for request in readiness.due(PX4, known, 10.0)]
-    assert first == [p.name for p in PX4.watched_parameters if p.name not in known]
-    assert readiness.due(PX4, known, 10.4) == []
-    assert len(readiness.due(PX4, known, 10.5)) == len(first)
-    assert not readiness.complete(PX4, known, 11.9)
-    assert readiness.complete(PX4, known, 12.0)
-    everything = {parameter.name: 1.0 for parameter in PX4.watched_parameters}
-    assert readiness.complete(PX4, everything, 10.6)
 
 
 def test_arducopter_is_not_flown_without_a_reply_for_guid_options() -> None:

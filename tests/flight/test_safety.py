@@ -185,9 +185,6 @@ NEEDED: dict[str, tuple[Callable[[], Pair], dict[str, Any]]] = {
     "no GPS from the beginning, by motion capture": (
         lambda: px4.hover(firmware=PX4, scenario=NO_GPS), {"failsafes": ()}
     ),
-    "twice the thrust of its file": (
-        lambda: copter.hop(HIGH, scenario="thrust_doubled"), {"top_m": 4.0, "error_m": 1.0}
-    ),
 }  # fmt: skip
 
 

@@ -1,5 +1,5 @@
 """The rigid body against closed forms, conservation laws and Newton in the inertial frame: in the
-chart of quaternions; that of Euler angles flies the same."""
+chart of quaternions; that of Euler angles flies the same. The linear model, and Eq. 16."""
 
 from __future__ import annotations
 
@@ -10,19 +10,37 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import solve_ivp
+from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
+from sim_hover import load
 
 from offboard.model.rigid_body import (
-    EULER,
+    PHI,
+    PSI,
     QUATERNION,
     RK4_SCRATCH_ROWS,
+    TAU_X,
+    TAU_Y,
+    TAU_Z,
+    THETA,
+    THRUST,
+    P,
+    Q,
+    R,
+    U,
+    V,
+    W,
+    X,
+    Z,
     derivative,
     derivative_into,
     euler_state,
     hover_input,
+    hover_matrices,
     pack,
     quaternion_state,
     rk4_into,
+    sampled_matrices,
 )
 from offboard.model.vehicle import Vehicle
 from offboard.paper.closed_loop import follow
@@ -90,19 +108,6 @@ def dragless(lopsided: Vehicle) -> Vehicle:
     )
 
 
-def test_free_fall_is_half_g_t_squared(dragless: Vehicle) -> None:
-    start = state_of([0.3, -0.2, 1.0, 0, 0, 0, 0, 0, 0, 1.0, 2.0, -50.0])
-    end, g = fly(start, NO_INPUT, pack(dragless), 2.0, 0.1), dragless.gravity_mps2
-    assert_allclose(end[POSITION], [1.0, 2.0, -50.0 + 0.5 * g * 2.0**2], atol=1e-12)
-    assert_allclose(end[VELOCITY], [0, 0, g * 2.0], atol=1e-12)
-
-
-def test_hover_is_an_equilibrium_at_every_heading(lopsided: Vehicle) -> None:
-    for heading in np.linspace(-3.0, 3.0, 7):
-        state = state_of([0, 0, heading, 0, 0, 0, 0, 0, 0, 5.0, -7.0, -3.0])
-        assert_allclose(derivative(state, hover_input(lopsided), pack(lopsided)), 0, atol=1e-15)
-
-
 def test_free_spin_keeps_energy_and_angular_momentum(dragless: Vehicle) -> None:
     """A torque-free asymmetric body near its unstable middle axis; momentum in NED."""
     inertia = np.array(dragless.inertia_kgm2)
@@ -120,33 +125,6 @@ def test_free_spin_keeps_energy_and_angular_momentum(dragless: Vehicle) -> None:
     assert energy_after == pytest.approx(energy, abs=1e-8)  # of up to 6 kJ falling
     assert_allclose(momentum_after, momentum, atol=1e-11)
     assert np.linalg.norm(state[ATTITUDE]) == pytest.approx(1.0, abs=1e-15)
-
-
-def test_the_middle_axis_flips(dragless: Vehicle) -> None:
-    """Without the gyroscopic term the conservation test above would hold trivially."""
-    state, rates_y = state_of([0, 0, 0, 0.01, 5.0, 0, 0, 0, 0, 0, 0, 0]), []
-    for _ in range(400):
-        state = step(state, NO_INPUT, pack(dragless), 0.01)
-        rates_y.append(state[RATES][1])
-    assert min(rates_y) < -4.9
-    assert max(rates_y) > 4.9
-
-
-def test_falling_with_drag_approaches_terminal_speed(lopsided: Vehicle) -> None:
-    """v(t) = (m g / k) (1 - exp(-k t / m)) for a level body."""
-    drag, mass = lopsided.drag_translation_npmps[2], lopsided.mass_kg
-    end = fly(state_of(np.zeros(12)), NO_INPUT, pack(lopsided), 3.0, 0.01)
-    terminal = mass * lopsided.gravity_mps2 / drag
-    assert end[VELOCITY][2] == pytest.approx(terminal * (1 - np.exp(-drag * 3.0 / mass)), 1e-9)
-
-
-def test_only_roll_and_pitch_inputs_have_the_arm(lopsided: Vehicle) -> None:
-    for axis, lever in enumerate((0.3, 0.3, 1.0)):
-        inputs, expected = hover_input(lopsided), np.zeros(3)
-        inputs[1 + axis] = 0.07
-        expected[axis] = lever * 0.07 / lopsided.inertia_kgm2[axis]
-        slope = derivative(np.zeros(12), inputs, pack(lopsided))
-        assert_allclose(slope[EULER.rates], expected, rtol=1e-14)
 
 
 def test_acceleration_is_newtons_in_the_inertial_frame(lopsided: Vehicle) -> None:
@@ -237,6 +215,55 @@ def test_other_lengths_are_refused(lopsided: Vehicle) -> None:
             derivative(state, inputs, pack(lopsided), wind)
 
 
-def test_the_way_between_the_charts_is_a_round_trip() -> None:
-    states = random_states(50, 21).reshape(5, 10, 12)
-    assert_allclose(euler_state(quaternion_state(states)), states, atol=1e-13)
+# --- the linear model -----------------------------------------------------------------------------
+
+
+PAPER = load("paper")
+# Every non-zero Eq. 16 prints. Its rows are interleaved [phi p psi r theta q x u (y lost) v z w];
+# its v row reads -0.0161, a slip: a roll to the right accelerates to the right.
+EQ_16 = {
+    (PHI, TAU_X): 0.0488,
+    (P, TAU_X): 0.8992,
+    (PSI, TAU_Z): 0.1676,
+    (R, TAU_Z): 3.1531,
+    (THETA, TAU_Y): 0.0488,
+    (Q, TAU_Y): 0.8992,
+    (X, TAU_Y): -0.0004,
+    (U, TAU_Y): -0.0161,
+    (V, TAU_X): 0.0161,
+    (Z, THRUST): -0.0120,
+    (W, THRUST): -0.2350,
+}
+
+
+def test_hover_matrices_are_the_physics_written_by_hand() -> None:
+    """Kinematics, gravity tilting into the lateral axes, drag over mass, inputs over inertia."""
+    a, b = np.zeros((12, 12)), np.zeros((12, 4))
+    a[0:3, 3:6] = a[9:12, 6:9] = np.eye(3)
+    a[U, THETA], a[V, PHI] = -9.81, 9.81
+    a[3:6, 3:6] = np.diag([-0.1 / 0.0196, -0.1 / 0.0196, -0.1 / 0.0264])
+    a[6:9, 6:9] = np.diag([-0.5 / 0.4] * 3)
+    b[W, THRUST] = -1 / 0.4
+    b[P, TAU_X] = b[Q, TAU_Y] = 0.225 / 0.0196
+    b[R, TAU_Z] = 1 / 0.0264
+    model_a, model_b = hover_matrices(PAPER)
+    assert_allclose(model_a, a, rtol=1e-14)
+    assert_allclose(model_b, b, rtol=1e-14)
+
+
+def test_zero_order_hold_is_the_exponential_of_the_augmented_matrix() -> None:
+    a, b = hover_matrices(PAPER)
+    augmented = expm(0.1 * np.block([[a, b], [np.zeros((4, 16))]]))
+    sampled_a, sampled_b = sampled_matrices(PAPER, 0.1)
+    assert_allclose(sampled_a, augmented[:12, :12], atol=1e-13)
+    assert_allclose(sampled_b, augmented[:12, 12:], atol=1e-13)
+
+
+def test_eq_16_is_reproduced_to_four_digits_at_a_tenth_of_a_second() -> None:
+    _, sampled_b = sampled_matrices(PAPER, 0.1)
+    for place, printed in EQ_16.items():
+        assert sampled_b[place] == pytest.approx(printed, abs=0.5e-4), place
+    others = np.ones_like(sampled_b, dtype=bool)
+    others[tuple(np.transpose(list(EQ_16)))] = False
+    others[10, TAU_X] = False  # the lost y row
+    assert_array_equal(sampled_b[others], 0.0)

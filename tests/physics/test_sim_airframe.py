@@ -102,14 +102,6 @@ def test_crash_upside_down_at_speed_is_survived_and_ends_level():
     assert np.abs(truth.velocity_ned_mps).max() < 1e-12
 
 
-def test_wrong_thrust_and_mass_act_as_they_should():
-    truth = _climbing(0.8, 0.5, thrust_scale=0.85, mass_scale=1.2).truth
-    drag = PX4.drag_translation_npmps[2] / (PX4.mass_kg * 1.2)
-    felt = truth.acceleration_ned_mps2[2] + drag * truth.velocity_ned_mps[2]
-    expected = G * (1.0 - 0.8 / PX4.hover_thrust * 0.85 / 1.2)
-    assert felt == pytest.approx(expected, rel=5e-3)
-
-
 def test_ground_effect_lifts_near_the_ground_only():
     share = 0.96  # of hover thrust: flies in ground effect and not without it
     assert not _climbing(share * PX4.hover_thrust, 2.0, ground_effect=True).truth.on_ground
@@ -126,14 +118,6 @@ def test_torque_needs_thrust():
     assert abs(euler_from_quaternion(plant.truth.attitude)[0]) < math.radians(0.5)
     plant.advance(0.4, Demand(True, 0.5, attitude(roll_deg=30.0)))
     assert abs(euler_from_quaternion(plant.truth.attitude)[0]) > math.radians(15.0)
-
-
-def test_level_flight_drifts_with_the_wind():
-    wind = (3.0, -1.5, 0.0)
-    plant = hovering(PX4, Conditions(wind_ned_mps=wind))
-    plant.advance(10.0, Demand(True, PX4.hover_thrust, LEVEL))
-    assert plant.truth.velocity_ned_mps == pytest.approx(wind, abs=0.01)
-    assert plant.truth.wind_ned_mps == pytest.approx(wind, abs=1e-12)
 
 
 def test_battery_empties_by_the_current_and_sags_under_load():

@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
 from sim_hover import attitude, crossing, estimate_of, euler_deg, hovering, load, response
 
 from offboard.model.frames import euler_from_quaternion
@@ -58,35 +57,6 @@ def test_rate_step_has_the_measured_rise(vehicle, axis, rate, t63):
     share = values[:, AXES[axis]] / rate
     assert t63[0] <= crossing(times, share, 1.0 - math.exp(-1.0)) <= t63[1]
     assert share[-1] == pytest.approx(1.0, abs=0.01)
-
-
-def _second_order(times, commands_s, commands, delay_s, wn, z):
-    """s'' = wn^2 (s_c(t - D) - s) - 2 z wn s': the sum of the responses to each change of s_c."""
-    since = np.maximum(times - commands_s[:, None] - delay_s, 0.0)
-    wd = wn * math.sqrt(1.0 - z * z)
-    settling = np.exp(-z * wn * since) * (np.cos(wd * since) + z * wn / wd * np.sin(wd * since))
-    return np.diff(commands, prepend=0.0) @ (1.0 - settling)
-
-
-def test_identification_gives_back_delay_frequency_and_damping():
-    vehicle, seen = load("px4_sih"), []
-    plant = hovering(vehicle)
-    commands_deg = np.random.default_rng(7).choice([-3.0, -1.5, 0.0, 1.5, 3.0], 12)
-    for command in commands_deg:
-        demand = Demand(True, vehicle.hover_thrust, attitude(roll_deg=command))
-        seen.append(response(plant, demand, 0.4, euler_deg)[1][:, 0])
-    angle = np.radians(np.concatenate(seen))
-    times = np.arange(1, len(angle) + 1) * STEP_S
-    commands_s = np.arange(12) * 0.4
-
-    def misfit(guess):
-        return _second_order(times, commands_s, np.radians(commands_deg), *guess) - angle
-
-    found = least_squares(misfit, [0.03, 9.0, 0.8], x_scale=[0.01, 1.0, 0.1], diff_step=1e-3).x
-    assert found[0] == pytest.approx(0.057, abs=0.003)
-    assert found[1] == pytest.approx(11.4, rel=0.02)
-    assert found[2] == pytest.approx(0.56, abs=0.02)
-    assert np.sqrt(np.mean(misfit(found) ** 2)) < 2e-4
 
 
 def test_angular_acceleration_is_limited_on_a_large_step():

@@ -74,7 +74,8 @@ def test_nothing_identified_is_no_vehicle_file(called: Called, tmp_path: Path) -
     code, _, said = called("offboard identify -o mine.yaml --page page.html", still)
     assert code == 1
     assert said == "nothing could be identified from this flight; page.html says why\n"
-    assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
+    (page,) = tmp_path.iterdir()
+    assert page.read_text().count("not identified: ") > 3
 
 
 def test_the_page_of_a_second_identification_has_a_name_of_its_own(
@@ -85,7 +86,9 @@ def test_the_page_of_a_second_identification_has_a_name_of_its_own(
     (tmp_path / "identify.html").write_text("precious")
     assert called("offboard identify .")[::2] == (0, "")
     assert (tmp_path / "identify.html").read_text() == "precious"
-    assert f"<title>Flight {tmp_path.name}</title>" in (tmp_path / "identify-2.html").read_text()
+    page = (tmp_path / "identify-2.html").read_text()
+    assert f"<title>Flight {tmp_path.name}</title>" in page
+    assert page.count(' id="fit_') == 2 * 3  # tilt, heading and motion, with their data
 
 
 def test_a_score_that_cannot_be_written_is_reported(called: Called, tmp_path: Path) -> None:
@@ -171,13 +174,3 @@ def test_a_flight_whose_result_cannot_be_printed_keeps_its_exit_code(
     code, _, said = called(NO_VEHICLE)
     assert code == 3
     assert said.endswith("; the output cannot be written: No space left on device\n")
-
-
-def test_a_pipe_that_nobody_reads_is_no_missed_requirement() -> None:
-    """Exit code 141 without a sentence, as of SIGPIPE."""
-    reads, writes = os.pipe()
-    os.close(reads)
-    process = [sys.executable, "-P", "-m", "offboard", "score", str(RECORDING)]
-    ended = subprocess.run(process, stdout=writes, stderr=subprocess.PIPE, text=True, check=False)
-    os.close(writes)
-    assert (ended.returncode, ended.stderr) == (141, "")

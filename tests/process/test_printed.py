@@ -2,22 +2,14 @@
 
 from __future__ import annotations
 
-import io
-import os
-import pty
 import re
-import sys
 from pathlib import Path
 
-import pytest
 import typer
 import yaml
-from processes import CONFIG, RECORDING, Called
-from rich.console import Console
+from processes import CONFIG, Called
 from typer.testing import CliRunner
 
-from offboard.analysis.score import METRICS, score_flight
-from offboard.analysis.score_table import show
 from offboard.cli.commands import app as offboard
 from offboard.documents import shipped as documents
 from simulator.command import app as simulator
@@ -65,40 +57,3 @@ def test_every_shipped_file_is_listed_with_what_it_is(called: Called) -> None:
     assert scenarios == documents.descriptions("scenario")
     code, output, _ = called("offboard doctor --list gps")
     assert (code, output.startswith("gps  GPS fix.")) == (0, True)
-
-
-@pytest.mark.parametrize("columns", [60, 80])
-def test_a_score_fits(columns: int) -> None:
-    text = io.StringIO()
-    show(Console(file=text, width=columns), *score_flight(RECORDING))
-    lines = text.getvalue().splitlines()
-    assert max(map(len, lines)) <= columns
-    assert "…" not in text.getvalue()
-    assert max(len(figure["meaning"]) for figure in METRICS.values()) <= 37  # that fit 80 columns
-    assert columns < 80 or sum("setpoint_gap_wall_max_s" in line for line in lines) == 1
-
-
-@pytest.mark.parametrize(
-    ("command", "stream", "says"),
-    [
-        ("offboard fly --reference snail", "stderr", "no reference named 'snail'; known are"),
-        (
-            "simulator --duration 0.1 --gcs none --connect udpout:127.0.0.1:59999",
-            "stdout",
-            "system 1",
-        ),
-    ],
-)
-def test_on_a_terminal_long_lines_are_wrapped_at_words(
-    command: str, stream: str, says: str, called: Called, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    terminal, theirs = pty.openpty()
-    monkeypatch.setenv("COLUMNS", "80")
-    with os.fdopen(theirs, "w") as file:
-        monkeypatch.setattr(sys, stream, file)
-        called(command)
-    lines = os.read(terminal, 65536).decode().splitlines()
-    os.close(terminal)
-    assert len(lines) > 1
-    assert max(map(len, lines)) <= 80
-    assert says in " ".join(line.strip() for line in lines)

@@ -53,12 +53,9 @@ def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
         ("--reference", "snail", "no reference named 'snail'; known are circle"),
         ("--reference", "missing.csv", "missing.csv cannot be read: No such file"),
         ("--set", "period_s=7", "period_s: 7 should be less than or equal to 0.5"),
-        ("--set", "controller.seed=3", "controller.seed is not a known key (known keys: bandwidth"),
         ("--set", "vehicle.mass=3", "vehicle.mass is not a known key, did you mean mass_kg? ("),
         ("--set", "controller.law=frog", "controller: law: 'frog' is not one of pso, lqr,"),
         ("--set", "controller=pid2", "no controller named 'pid2'; known are"),
-        ("--set", "controller.bandwidth_radps=fast", "'fast' should be a valid number"),
-        ("--seed", "-1", "--seed -1: seed: -1 should be greater than or equal to 0"),
         ("--set", "vehicle.drag_translation_npmps=[0, 0, 1e9]", "must be at most 100 per kg"),
         ("--set", "reference.height_m=100", "from 100 m takes 200 s at 0.5 m/s, longer than"),
         ("--set", "limits.radius_m=1.5", "it goes 2 m away from the take-off point, beyond limits"),
@@ -69,7 +66,6 @@ def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
         ("--connect", "udpin:127.0.0.1", "is not understood; use udpin:HOST:PORT"),
         ("--connect", "udpin:::1:14540", "an IPv6 address stands in brackets, as in udpin:[::1]"),
         ("--signing-key", "/dev/null", "signing key /dev/null is not a file"),
-        ("--signing-key", "none", "signing key none cannot be read: No such file or directory"),
         ("--out", "/proc/nowhere", "choose a directory that can be written with --out"),
         ("--firmware", "px4", "--firmware are options of --sitl: add it"),
         ("--vehicle", CONFIG / "campaigns" / "quick.yaml", "is a campaign file; a vehicle file is"),
@@ -77,7 +73,6 @@ def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
         ("--out", "--sitl", "--out: '--sitl' is an option, not a value; is a variable unset?"),
         ("--controller horizon --set", f"controller.keep_out={json.dumps([SPHERE])}",
          "keep_out[0] (sphere) contains the start of the reference"),
-        ("--controller horizon --set", "controller.keep_out=[{shape: cone}]", "keep_out"),
         (f"{SLOW} --controller", "horizon", "longer than deadline_s (0.6 ms); plan fewer steps"),
     ],
 )  # fmt: skip
@@ -111,23 +106,6 @@ def test_what_cannot_be_flown_is_refused(
 )
 def test_other_commands_refuse_alike(command: str, says: str, refused: Refused) -> None:
     assert says in refused(command if command.startswith("offboard") else f"{SIMULATOR} {command}")
-
-
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        (
-            "--to xls -o x",
-            "Invalid value for '--to': 'xls' is not one of 'mcap', 'csv', 'ulog'; see",
-        ),
-        (
-            "-o x",
-            "Missing option '--to'. Choose from: mcap, csv, ulog; see `offboard export --help`",
-        ),
-    ],
-)
-def test_a_wrong_option_is_one_sentence(options: str, says: str, refused: Refused) -> None:
-    assert refused(f"offboard export {RECORDING} {options}").startswith(says)
 
 
 def test_an_unknown_option_is_named(called: Called) -> None:
@@ -188,10 +166,8 @@ CSV = "time_s,north_m,east_m,altitude_m\n0,0,0,3\n3,2,0,3\n6,2,{east},4\n9,0,0,3
         ("flight.yaml", "vehicle: px4_sih\ncontroler: pso",
          "controller is missing (is it meant by controler?); give a name, a file or a"),
         ("flight.yaml", "# nothing yet", "flight.yaml is empty"),
-        ("path.csv", "", "path.csv is empty: it needs a header and at least 4 rows"),
         ("mine.yaml", "mass_kg: 1\nhover_trust: 1", "did you mean hover_thrust?"),
         ("mine.yaml", "hover_thrust: 0.5", "no key says what it is: a vehicle has mass_kg, a"),
-        ("path.csv", CSV.format(east="two"), "path.csv, row 4, column east_m: 'two' is not a"),
         ("path.csv", CSV.format(east=90), "reference path.csv: the reference asks for"),
         ("path.csv", CSV.format(east=1e300), "a distance of inf m at"),
         ("circle.yaml", "shape: circle\nperiod_s: 0", "circle.yaml, line 2, column 1: period_s: 0"),

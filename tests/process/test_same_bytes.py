@@ -8,7 +8,6 @@ import signal
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import fields
-from itertools import count
 from pathlib import Path
 from threading import Timer
 from types import SimpleNamespace
@@ -25,7 +24,7 @@ from offboard.link.stop import StopRequests
 from offboard.run import flight, sitl
 from offboard.run.configuration import load
 from offboard.run.flight import Simulated, fly
-from offboard.run.sitl import InMemoryLink, InMemorySimulator, SimulatorProcess
+from offboard.run.sitl import InMemorySimulator, SimulatorProcess
 
 VEHICLE_COMPONENT_ID = 1
 WALL_TIMES = ("solve_time_s", "answer_s")  # fields of TickRecord that the machine decides
@@ -101,23 +100,6 @@ def test_over_udp_and_disturbed_every_frame_is_the_same(
     assert len(sent[VEHICLE_COMPONENT_ID]) > 1000
     for component, expected in undisturbed.items():
         assert sent[component] == expected
-
-
-class Idle(InMemorySimulator):
-    """Every third turn finds nothing, as where the simulator is slower than the loop."""
-
-    def open_link(self, **options: Any) -> InMemoryLink:
-        link = super().open_link(**options)
-        receive, turns = link.receive, count()
-        link.receive = lambda timeout_s: receive(timeout_s) if next(turns) % 3 else []  # type: ignore[method-assign]
-        return link
-
-
-def test_turns_that_receive_nothing_change_no_byte_of_a_flight(
-    undisturbed: dict[int, list[bytes]], tmp_path: Path
-) -> None:
-    assert flown(tmp_path / "idle", LATE, Idle()).exit_code == 0
-    assert frames(tmp_path / "idle") == undisturbed
 
 
 def divides(frames: object) -> list[tuple[int, bytes]]:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import struct
 import sys
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from corpus import expected, replayed, unpacked
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from typer.testing import CliRunner, Result
 
@@ -19,11 +22,19 @@ from offboard.control.base import Controller, Decision, Situation
 from offboard.control.law import PsoLaw
 from offboard.flight import actions
 from offboard.flight.phases import Phase
-from offboard.flight.record import PAYLOAD_TYPE, configuration_pieces
+from offboard.flight.record import (
+    PAYLOAD_TYPE,
+    InputRecorder,
+    InputsError,
+    Note,
+    configuration_pieces,
+    entries,
+)
 from offboard.flight.state import FlightState
+from offboard.link.interface import Chunk
 from offboard.link.log import entry
 from offboard.mavlink.outgoing import Heartbeat
-from offboard.mavlink.session import Session, SessionSettings
+from offboard.mavlink.session import Reception, Session, SessionSettings
 from offboard.replay.difference import compare, verdict
 from offboard.replay.replaying import Replay, read
 from offboard.run import configuration
@@ -284,3 +295,57 @@ def test_an_error_in_a_turn(failed: Pair, tmp_path: Path, monkeypatch: pytest.Mo
     assert failed.companion.outcome is not None
     assert "as it happens" in failed.companion.outcome.sentence
     check(failed, tmp_path, least=40)
+
+
+# --- the record of a turn's inputs ----------------------------------------------------------------
+
+
+def recorded(turns: int) -> list[bytes]:
+    recorder = InputRecorder(SessionSettings())
+    for number in range(turns):
+        now_s = 100.0 + 0.01 * number + 1e-6 * (number * 7919 % 1000)
+        recorder.begin(now_s, 0)
+        frame = (number * 104729 % 2**24).to_bytes(3, "big")
+        recorder.chunk(Chunk(b"", "tcp", now_s), Reception((), unlogged=((0, frame),)))
+        recorder.end()
+    return [piece.data for piece in recorder.pieces(all_of_it=True)]
+
+
+def test_a_missing_piece_ends_the_reading_with_a_reason() -> None:
+    pieces = recorded(200)
+    assert len(pieces) > 8
+    with pytest.raises(InputsError, match="piece 3 is missing"):
+        list(entries(pieces[:3] + pieces[4:]))
+    whole, cut = list(entries(pieces)), list(entries(pieces[:3]))
+    assert 20 < len(cut) < len(whole)
+    assert whole[: len(cut)] == cut
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.data())
+def test_damaged_pieces_raise_nothing_else(data) -> None:
+    pieces = [bytearray(piece) for piece in recorded(60)]
+    for _ in range(data.draw(st.integers(1, 5))):
+        piece = data.draw(st.sampled_from(pieces))
+        piece[data.draw(st.integers(0, len(piece) - 1))] = data.draw(st.integers(0, 255))
+    with suppress(InputsError):
+        list(entries(map(bytes, pieces)))
+
+
+def test_in_lockstep_no_host_time_is_recorded() -> None:
+    def pieces(offset_s: float, port: int) -> list[bytes]:
+        recorder = InputRecorder(SessionSettings(lockstep=True))
+        read = recorder.watch(lambda: offset_s)
+        for number in range(50):
+            now_s = offset_s * number
+            recorder.begin(now_s, 0)
+            if number % 3:  # the machine was busy: a turn in which nothing had arrived
+                recorder.chunk(Chunk(b"", ("127.0.0.1", port), now_s), Reception((b"frame",)))
+            read()
+            recorder.end()
+        return [piece.data for piece in recorder.pieces(all_of_it=True)]
+
+    assert pieces(0.01, 14580) == pieces(0.37, 20000)
+    first = next(entries(pieces(0.01, 14580)))
+    assert isinstance(first, Note)
+    assert first.values[1]["lockstep"] is True

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import re
+from typing import Any
 
 import numpy as np
 import pytest
 from attitude_plant import lemniscate
-from laws import LEVEL, law_named, state_of
+from laws import LEVEL, G, at, law_named, state_of
 
 from offboard.control.base import Controller, Situation
 from offboard.control.catalogue import names, settings_of
@@ -16,7 +17,10 @@ from offboard.documents import shipped
 from offboard.documents.reading import read
 from offboard.flight.phases import Limits
 from offboard.identification.learner import IdentifySettings
-from offboard.run.configuration import FlightConfig, read_part
+from offboard.model.command import PositionCommand
+from offboard.reference.track import hold
+from offboard.run.configuration import FlightConfig, load, read_part
+from offboard.run.flight import Simulated
 
 ENDS = ("minimum", "exclusiveMinimum", "maximum")  # of a JSON schema
 
@@ -59,3 +63,47 @@ def test_reset_gives_the_decisions_of_a_new_controller(law: str) -> None:
     first = decisions(controller)
     controller.reset()
     assert decisions(controller) == first == decisions(law_named(law))
+
+
+def test_an_error_that_stays_is_answered_ever_more_by_the_integral() -> None:
+    """5 cm for 3 s: 0.03 m/s^2 more along north and east, 0.15 along the vertical."""
+    for axis, off in enumerate(0.05 * np.eye(3)):
+        law, situation = law_named("pid"), Situation(0.0, at(off, 0.0), hold((0, 0, 0), 0.0), LEVEL)
+        first, *_, last = (law.decide(situation).command for _ in range(31))
+        more = np.subtract(last.thrust_direction_ned[:2], first.thrust_direction_ned[:2]) * G
+        more = [*more, last.thrust_mps2 - first.thrust_mps2]
+        assert more == pytest.approx(np.diag((0.03, 0.03, 0.15))[axis], abs=1e-9)
+
+
+def test_the_autopilots_loop_is_given_the_reference() -> None:
+    heading = np.radians(-179.9)
+    reference = lemniscate(8.0, heading_rad=heading, vertical_m=0.3)
+    situation = Situation(6.0, at((0, 0, -3), heading), reference, LEVEL)
+    command = law_named("autopilot").decide(situation).command
+    assert isinstance(command, PositionCommand)
+    sample = reference.sample(6.05)  # the middle of the time it is held for
+    assert command.position_ned_m == pytest.approx(tuple(sample.position_ned_m))
+    assert command.velocity_ned_mps == pytest.approx(tuple(sample.velocity_ned_mps))
+    assert command.acceleration_ned_mps2 == pytest.approx(tuple(sample.acceleration_ned_mps2))
+    assert command.heading_rad == pytest.approx(heading)
+
+
+# --- the vehicle of a flight ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("asked", "expected"),
+    [
+        ({}, "neutral"),
+        ({"firmware": "px4"}, "px4_sih"),
+        ({"firmware": "px4", "assignments": ("vehicle=neutral",)}, "neutral"),
+        ({"firmware": "ardupilot", "name": "paper"}, "px4_sih"),
+        ({"choices": {"vehicle": "arducopter"}}, "arducopter"),
+    ],
+)
+def test_vehicle_is_neutral_unless_one_is_named_or_the_simulator_flies_its_own(
+    asked: dict[str, Any], expected: str
+) -> None:
+    firmware, name = asked.pop("firmware", None), asked.pop("name", "flight")
+    known = Simulated(firmware).known_vehicle if firmware else None
+    assert load(name, known_vehicle=known, **asked).vehicle.name == expected

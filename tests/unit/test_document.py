@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import re
 from enum import Enum
-from pathlib import Path
 from typing import Annotated, Literal
 
 import pytest
@@ -22,9 +20,6 @@ from offboard.documents.reading import (
     read,
     validate,
 )
-from offboard.model.vehicle import Vehicle
-
-VEHICLES = sorted((Path(__file__).parents[2] / "config" / "vehicles").glob("*.yaml"))
 
 
 class Colour(Enum):
@@ -68,12 +63,6 @@ def problems(text: str, model: type[Parameters] = Drawing) -> tuple[str, ...]:
     return caught.value.problems
 
 
-def test_the_vehicles_we_ship_are_valid() -> None:
-    assert len(VEHICLES) > 3
-    for path in VEHICLES:
-        assert parse(path.read_text(), Vehicle, path.name).name == path.stem
-
-
 def test_scalars_are_those_of_yaml_1_2() -> None:
     numbers = {"1e-3": 1e-3, "1E3": 1e3, "-2.5e+1": -25.0, ".5": 0.5, "3.": 3.0, "010": 10.0,
                "0x10": 16.0}  # fmt: skip
@@ -104,22 +93,15 @@ KEYS = "circles, colour, copies, corner, named, scale, shape, tilt_rad, title, v
     ("text", "sentences"),
     [
         ("scale: -1", ["scale: -1 should be greater than 0"]),
-        ("scale: true", ["scale: true should be a valid number"]),
         ("scale:", ["scale: an empty value should be a valid number"]),
         ("tilt_rad: 1e999", ["tilt_rad: inf should be a finite number"]),
         ("colour: green", ["colour: 'green' should be 'red' or 'blue'"]),
-        ("corner: [1, x]", ["corner.1: 'x' should be a valid number"]),
         ("shape: {kind: square}", ["shape.kind: 'square' is not one of 'circle', 'line'"]),
-        (
-            "circles: [{kind: circle, radius_m: 1}, {kind: circle, radius_m: 0}]",
-            ["circles.1.radius_m: 0 should be greater than 0"],
-        ),
         (
             "shape: {kind: line, point: 3}",
             ["shape.points is missing", "shape.point is not a known key"],
         ),
         ("zzz: 3", [f"zzz is not a known key (known keys: {KEYS})"]),
-        ("copies: [x]", ["copies.0: 'x' should be a valid integer"]),
         ("colour: blue\ntilt_rad: 1", ["a blue drawing is not tilted"]),
     ],
 )
@@ -212,10 +194,3 @@ def test_every_text_is_read_or_raises_document_error(text: str) -> None:
         refused = error.problems
     assert bool(refused) != bool(title)
     assert all(problem.startswith("fuzz") for problem in refused)
-
-
-@given(st.floats(allow_nan=False, allow_infinity=False))
-def test_numbers_survive_to_the_last_bit(number: float) -> None:
-    value = parse(f"title: x\ntilt_rad: {number!r}", Drawing, "d.yaml").tilt_rad
-    assert value == number
-    assert math.copysign(1.0, value) == math.copysign(1.0, number)

@@ -16,10 +16,10 @@ from offboard.analysis.identify import estimator_noise
 from offboard.identification import attitude_fit
 from offboard.identification.attitude_fit import ResponseFit
 from offboard.identification.motion_fit import Noise, PositionFilter
-from offboard.identification.response import first_order, second_order
+from offboard.identification.response import second_order
 from offboard.identification.trace import Rows, Trace, clean
-from offboard.identification.uncertainty import Estimate, long_run_covariance
-from offboard.identification.vehicle_fit import Identified, completed, identify
+from offboard.identification.uncertainty import Estimate
+from offboard.identification.vehicle_fit import completed, identify
 
 VEHICLE_FILE = PX4.model_copy(
     update={"hover_thrust": 0.42, "drag_translation_npmps": (0.6, 0.6, 0.6), "thrust_lag_s": 0.0}
@@ -78,14 +78,6 @@ def test_innovations_of_a_matching_motion_are_white_and_of_unit_variance():
     white = position_filter.innovations(positions[None], np.zeros((1, count)), drag)[0, 200:]
     assert np.mean(white**2) == pytest.approx(1.0, abs=0.03)
     assert abs(np.mean(white[1:] * white[:-1])) < 0.02
-
-
-def test_long_run_covariance_of_residuals_is_that_of_the_errors():
-    """Errors about their mean, as a fit leaves them; without the correction 22 % less."""
-    errors = np.random.default_rng(6).normal(size=(4000, 120, 1))
-    left = errors - errors.mean(axis=1, keepdims=True)
-    found = np.mean([long_run_covariance(each, 15)[0, 0] for each in left])
-    assert found == pytest.approx(120.0, rel=0.03)
 
 
 def rms_in_sds(fits: list[ResponseFit], true) -> np.ndarray:
@@ -160,20 +152,6 @@ def test_delay_known_beforehand_counts_by_its_uncertainty():
     assert certain.delay_s.sd < 1e-4
     wrong = [abs(each.natural_frequency_radps.value - 7.0) for each in (alone, certain)]
     assert wrong[1] < 0.7 * wrong[0]
-
-
-def test_first_order_response_equals_scipys_integration():
-    sent_at = np.array([0.0, 0.5, 0.9, 1.4])
-    thrust = np.array([0.4, 0.5, 0.35, 0.45])
-    times = np.arange(0.4, 2.0, 0.013)
-
-    def rate(t, u):
-        row = max(int(np.searchsorted(sent_at + 0.02, t, side="right")) - 1, 0)
-        return (thrust[row] - u) / 0.08
-
-    solved = solve_ivp(rate, (0.0, 2.0), [0.4], t_eval=times, max_step=1e-3, rtol=1e-8)
-    ours = first_order(times, sent_at, thrust[:, None], 0.02, 0.08)[:, 0]
-    assert np.abs(ours - solved.y[0]).max() < 5e-4
 
 
 @cache
@@ -262,14 +240,6 @@ def test_reported_velocity_is_not_used():
     assert 0.2 < contradictions[1] < 0.4
 
 
-def test_white_noise_of_the_estimator_is_measured():
-    trace = flown(noise=0.004)
-    noise = estimator_noise(trace)
-    assert noise.position_m == pytest.approx(0.004, rel=0.1)
-    assert noise.attitude_rad == pytest.approx(0.0008, rel=0.15)
-    assert noise.velocity_mps < 1e-4
-
-
 def test_constant_that_the_flight_does_not_determine_is_refused():
     """Hovering without steps determines the hover thrust alone."""
     found = identify(flown(tilt=0.0, heading=0.0, thrust_step=0.0), VEHICLE_FILE)
@@ -287,26 +257,6 @@ def test_constant_that_the_flight_does_not_determine_is_refused():
     assert found.applied_to(VEHICLE_FILE) == VEHICLE_FILE.model_copy(update=hover)
     short = identify(flown(seconds=2.0), VEHICLE_FILE)
     assert "1.5 s of flight, 2 s are needed" in short.refusals["tilt"]
-
-
-def test_attitude_that_does_not_follow_its_commands_is_refused():
-    """The attitude of one flight with the commands of another."""
-    ours, other = flown(seed=1), flown(seed=2)
-    swapped = other.commands.copy()
-    swapped[:, 1:3] = np.roll(swapped[:, 1:3], 17, axis=0)
-    found = identify(Trace(swapped, ours.attitude, ours.position), VEHICLE_FILE)
-    assert found.tilt is None
-    assert "does not follow" in found.refusals["tilt"] or "limit" in found.refusals["tilt"]
-
-
-def test_almost_empty_trace_is_refused():
-    trace = flown(seconds=3.0)
-    for rows in (0, 1, 5):
-        cut = Trace(trace.commands[:rows], trace.attitude[:rows], trace.position[:rows])
-        found = identify(cut, VEHICLE_FILE)
-        assert found == Identified(0.0, refusals=found.refusals)
-        assert set(found.refusals) >= {"tilt", "yaw", "hover_thrust", "drag_ps"}
-        assert not found.supported
 
 
 def test_last_rows_are_kept_and_cleaned():

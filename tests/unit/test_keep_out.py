@@ -12,7 +12,7 @@ from pydantic import TypeAdapter
 
 from offboard.control.keep_out import KeepOut, clearances, refusal
 from offboard.reference.path import Fixed
-from offboard.reference.track import Track, hold
+from offboard.reference.track import Track
 
 SPHERE = {"shape": "sphere", "north_m": 1, "east_m": 2, "height_m": 3, "radius_m": 0.5}
 TOWER = {
@@ -81,10 +81,3 @@ def test_what_cannot_be_flown_is_refused(values: dict[str, object], says: str | 
         assert found is not None
         assert says in found
         assert "clearance of 0.3 m" in found
-
-
-def test_a_hover_inside_is_refused_as_the_whole_path() -> None:
-    inside = volume({**SPHERE, "north_m": 0, "east_m": 0})
-    found = refusal((volume(SPHERE), inside), 0.0, hold((0.0, 0.0, -3.0), 0.0, 5.0))
-    assert found is not None
-    assert found.startswith("keep_out[1] (sphere) contains the whole path")

@@ -11,8 +11,7 @@ from laws import at
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from offboard.control.base import ControllerSettings, DecisionError, Situation
-from offboard.control.swarm import SwarmSettings
+from offboard.control.base import DecisionError, Situation
 from offboard.documents.reading import parse
 from offboard.model.command import Command, PredictedState
 from offboard.model.rigid_body import hover_matrices, sampled_matrices
@@ -27,7 +26,6 @@ from offboard.paper.controller import (
 )
 from offboard.paper.law import IntegralSettings, Move
 from offboard.reference.base import FlatSample
-from offboard.run.configuration import load
 
 Array = NDArray[np.float64]
 
@@ -195,16 +193,6 @@ def test_a_state_without_a_finite_cost_gives_no_decision(
         PaperController(PAPER).decide(Situation(0.0, spoilt, reference, HOVER))
 
 
-def test_the_seed_decides() -> None:
-    state, reference = tilted(1.0)
-    few = PaperSettings(swarm=SwarmSettings(iterations=10))
-    first, same, other = (
-        PaperController(PAPER, few, seed=seed).decide(Situation(0.0, state, reference, HOVER))
-        for seed in (1, 1, 2)
-    )
-    assert first.command == same.command != other.command
-
-
 def test_a_deadline_is_kept_and_every_decision_has_its_certificate() -> None:
     """The time left is asked for after every 25 iterations."""
     remaining_s = iter((0.002, 0.001, 0.0))
@@ -247,48 +235,3 @@ def test_the_error_is_not_summed_while_an_input_is_at_its_bound() -> None:
         moves = [law.move(np.zeros(12), target, error=np.full(4, 1e-3)) for _ in range(2)]
         first, second = (move.problem.gradient for move in moves)
         assert np.array_equal(first, second) == held
-
-
-def body_z(roll: float, pitch: float, _: float) -> Array:
-    """The axis in NED, at heading 0."""
-    level = np.cos(roll)
-    return np.array([np.sin(pitch) * level, -np.sin(roll), np.cos(pitch) * level])
-
-
-def flown_over_an_attitude_loop(name: str) -> tuple[ControllerSettings, Array, Array]:
-    """20 s of a shipped controller towards a far point: a point mass with drag behind a
-    second-order attitude loop. Its settings; velocities and commanded roll and pitch, per decision.
-    """
-    config = load("paper", choices={"controller": name})
-    vehicle, far = config.vehicle, Straight(np.array([150.0, 80.0, -10.0]), np.zeros(3), 0.0)
-    controller = config.controller.build(vehicle, period_s=0.1, seed=1)
-    position, velocity, angles, turning = np.zeros((4, 3))
-    wn, z, command, flown = vehicle.tilt.natural_frequency_radps, vehicle.tilt.damping, HOVER, []
-    for tick in range(200):
-        state = replace(
-            state_at(position, velocity, rates=turning),
-            time_s=0.1 * tick,
-            thrust_direction_ned=body_z(*angles),
-            thrust_mps2=command.thrust_mps2,
-        )
-        command = controller.decide(Situation(0.1 * tick, state, far, command)).command
-        north, east, down = command.thrust_direction_ned
-        asked = np.array([-np.arcsin(east), np.arctan2(north, down), 0.0])
-        flown.append((velocity, asked))
-        for _ in range(20):
-            turning = turning + 0.005 * (wn**2 * (asked - angles) - 2 * z * wn * turning)
-            angles = angles + 0.005 * turning
-            pull = np.array([0, 0, vehicle.gravity_mps2]) - vehicle.drag_per_mass_ps * velocity
-            velocity = velocity + 0.005 * (pull - command.thrust_mps2 * body_z(*angles))
-            position = position + 0.005 * velocity
-    velocities, tilts = np.array(flown).transpose(1, 0, 2)
-    return config.controller, velocities, tilts
-
-
-def test_the_limited_law_keeps_speed_and_tilt_over_an_attitude_loop() -> None:
-    settings, slow, level = flown_over_an_attitude_loop("paper_limited")
-    _, fast, steep = flown_over_an_attitude_loop("paper")
-    limits = settings.limits
-    assert np.abs(fast[:, :2]).max() > limits.speed_mps >= np.abs(slow[:, :2]).max()
-    assert np.abs(slow[:, 2]).max() <= limits.climb_mps
-    assert np.abs(steep[:, 1]).max() > limits.tilt_rad >= np.abs(level).max()

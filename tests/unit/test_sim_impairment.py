@@ -99,18 +99,6 @@ def test_a_rate_per_message_thins_telemetry_but_no_answers() -> None:
     assert heard == {30: 200, 32: 200, 77: 10}
 
 
-def test_frames_are_found_and_garbage_is_one_piece() -> None:
-    codec = mavlink.MAVLink(None)
-    ack = mavlink.MAVLink_command_ack_message(176, 0).pack(codec)
-    beat = mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 3, 3).pack(codec)
-    assert frames(ack + beat) == [(77, ack), (0, beat)]
-    assert frames(ack + b"garbage that is no frame") == [
-        (77, ack),
-        (-1, b"garbage that is no frame"),
-    ]
-    assert frames(b"") == []
-
-
 def test_after_the_end_of_a_fault_nothing_overtakes_what_is_under_way() -> None:
     channel = Channel(Impairment(latency_s=0.02), Random(1))
     channel.put(b"late", 0)
@@ -140,11 +128,3 @@ def test_a_stalled_link_delivers_what_its_queue_holds_when_it_ends() -> None:
     channel.on = False
     channel.put(b"next", 12 * STEP_US)
     assert channel.take(12 * STEP_US) == [*sent[:10], b"next"]
-
-
-def test_the_seed_decides() -> None:
-    def run(seed: int) -> list[tuple[int, bytes]]:
-        return carried(500, seed, loss=0.3, jitter_s=0.02, duplication=0.1, corruption=0.1)
-
-    assert run(1) == run(1)
-    assert run(1) != run(2)

@@ -12,8 +12,6 @@ import pytest
 
 from offboard.flight.timing import (
     DELAY_MAX_S,
-    LEAST_GROWTH_S,
-    STEADY_S,
     LinkGrowth,
     VehicleClock,
 )
@@ -252,21 +250,6 @@ def test_growth_is_that_of_the_median_of_five_replies() -> None:
     assert link.delay_growth_s == pytest.approx(0.30)
     replies(0.91, 5)
     assert link.delay_growth_s == pytest.approx(-0.04)
-
-
-def test_growth_is_followed_and_unsteady_until_it_has_lasted() -> None:
-    growth = LinkGrowth()
-    assert not growth.step(1.0, 0.9 * LEAST_GROWTH_S)
-    assert growth.step(2.0, 0.2)
-    assert (growth.added_s, growth.changed_s) == (0.2, 0.2)
-    assert not growth.step(2.1, 0.2 + 0.9 * LEAST_GROWTH_S)
-    assert not growth.step(1.9 + STEADY_S, 0.2)
-    assert growth.step(2.0 + STEADY_S, 0.2)
-    assert (growth.added_s, growth.changed_s) == (0.2, 0.0)
-    assert growth.step(10.0, 0.0)
-    assert (growth.added_s, growth.changed_s) == (0.0, 0.2)
-    assert growth.step(10.0 + STEADY_S, 0.0)
-    assert (growth.added_s, growth.changed_s) == (0.0, 0.0)
 
 
 def test_growth_that_comes_and_goes_stays_unsteady() -> None:

@@ -1,12 +1,174 @@
-"""Age of position and attitude, with outages of one stream and of the whole link."""
+"""What a flight knows of its vehicle: ground contact, jumps of the position, ages of telemetry."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
 
+from offboard.flight.estimates import PositionJumps
+from offboard.flight.ground_contact import GroundContact
 from offboard.flight.vehicle_state import VehicleState
-from offboard.mavlink.events import Attitude, LocalPosition
+from offboard.mavlink.events import Attitude, Heartbeat, Landed, LocalPosition
+
+
+class Standing:
+    """A vehicle that rests 2 m below its local origin, disarmed; time goes on with `at`."""
+
+    def __init__(self) -> None:
+        self.vehicle = VehicleState()
+        self.contact = GroundContact(self.vehicle)
+        self.heartbeat(0.0, armed=False)
+        self.position(0.0)
+
+    def heartbeat(self, now_s: float, *, armed: bool) -> None:
+        self.vehicle.update(Heartbeat("POSCTL", armed, 4, 2), now_s)
+
+    def position(self, now_s: float, height_m: float = 0.0, climb_mps: float = 0.0) -> None:
+        noise = 1e-6 * now_s  # no estimator repeats itself
+        place = (5.0 + noise, noise - 3.0, 2.0 - height_m + noise)
+        event = LocalPosition(now_s, place, (noise, noise, -climb_mps + noise))
+        self.vehicle.update(event, now_s)
+        self.contact.on_position(event)
+
+    def at(self, now_s: float) -> GroundContact:
+        self.vehicle.now_s = now_s
+        return self.contact
+
+
+def armed(height_m: float = 0.0, climb_mps: float = 0.0, detector: str = "on_ground") -> Standing:
+    standing = Standing()
+    standing.heartbeat(1.0, armed=True)
+    standing.position(1.0, height_m, climb_mps)
+    standing.vehicle.update(Landed(detector), 1.0)
+    return standing
+
+
+def test_disarmed_it_stands_for_as_long_as_a_heartbeat_counts() -> None:
+    standing = Standing()
+    assert standing.at(2.9).on_ground
+    assert not standing.at(3.1).on_ground
+    assert not standing.at(3.1).in_the_air  # nobody has said that it is armed
+
+
+@pytest.mark.parametrize(
+    ("signs", "certain"),
+    [
+        ({"height_m": 0.7}, True),
+        ({"height_m": 0.8}, False),
+        ({"height_m": -0.8}, False),
+        ({"climb_mps": 0.45}, True),
+        ({"climb_mps": 0.55}, False),
+        ({"climb_mps": -0.55}, False),
+        ({"detector": "unknown"}, False),
+        ({"detector": "in_air"}, False),
+    ],
+)
+def test_armed_every_sign_must_say_ground(signs: dict[str, Any], certain: bool) -> None:
+    vehicle = armed(**signs)
+    assert vehicle.at(1.0).on_ground is certain
+    assert vehicle.at(1.0).in_the_air is not certain
+    assert vehicle.at(2.4).on_ground is certain
+    assert vehicle.at(2.6).in_the_air  # the land detector is not heard any more
+    vehicle.vehicle.position = None
+    assert vehicle.at(1.0).in_the_air
+
+
+def test_height_counts_from_where_it_last_rested() -> None:
+    standing = armed()
+    standing.position(2.0, 10.7, 0.0)
+    assert standing.contact.height_m == pytest.approx(10.7)
+    standing.heartbeat(3.0, armed=False)
+    standing.position(3.0, 4.0, -2.0)  # falling, motors off
+    assert standing.contact.rest_down_m == 2.0
+    standing.position(3.1, 1.0, -0.4)  # on a roof
+    assert standing.contact.height_m == 0.0
+
+
+@pytest.mark.parametrize(
+    ("heights_m", "climb_mps", "lifted"),
+    [
+        ((0.16, 0.16), 0.0, False),
+        ((0.16, 0.16, 0.16), 0.0, True),
+        ((0.14, 0.14, 0.14), 0.0, False),
+        ((0.16, 0.16, 0.14, 0.16, 0.16), 0.0, False),
+        ((0.05, 0.05, 0.05), 0.41, True),
+        ((0.05, 0.05, 0.05), 0.39, False),
+        ((0.04, 0.04, 0.04), 3.0, False),  # an estimate that is in motion on the ground
+    ],
+)
+def test_lifted_off_after_three_positions_in_a_row(
+    heights_m: tuple[float, ...], climb_mps: float, lifted: bool
+) -> None:
+    standing = armed()
+    for number, height_m in enumerate(heights_m):
+        standing.position(2.0 + 0.1 * number, height_m, climb_mps)
+    assert standing.contact.lifted_off is lifted
+
+
+@pytest.mark.parametrize(
+    ("height_m", "wander_m", "for_s", "stood"),
+    [
+        (0.0, 0.0, 16.0, True),
+        (0.0, 0.08, 16.0, True),
+        (0.0, 0.12, 16.0, False),
+        (0.4, 0.0, 16.0, False),  # hovers low
+        (0.0, 0.0, 13.0, False),
+    ],
+)
+def test_stood_for_fifteen_seconds(
+    height_m: float, wander_m: float, for_s: float, stood: bool
+) -> None:
+    standing = armed(height_m=height_m)
+    for number in range(1, round(10 * for_s) + 1):
+        standing.position(1.0 + 0.1 * number, height_m + wander_m * (number % 2))
+    assert standing.contact.stood_for(15.0) is stood
+
+
+# --- jumps ----------------------------------------------------------------------------------------
+
+
+SPEED = (1.0, -0.5, 0.2)
+
+
+def found(sd_m: float, jump_m: float) -> list[float]:
+    """Sizes of the jumps found in 20 s at 100 Hz of steady motion with white noise and, at 10 s,
+    a jump to the east."""
+    random, jumps = np.random.default_rng(4), PositionJumps()
+    sizes = []
+    for time_s in np.arange(2000) / 100.0:
+        place = time_s * np.array(SPEED) + random.normal(0.0, sd_m, 3)
+        place[1] += jump_m * (time_s >= 10.0)
+        jump = jumps.on_position(LocalPosition(float(time_s), tuple(place.tolist()), SPEED))
+        if jump is not None and time_s > 1.0:
+            sizes.append(float(np.linalg.norm(jump)))
+    return sizes
+
+
+@pytest.mark.parametrize("sd_m", [0.0, 0.05, 0.07, 0.1, 0.2])
+def test_noise_is_no_jump(sd_m: float) -> None:
+    assert found(sd_m, 0.0) == []
+
+
+@pytest.mark.parametrize(("sd_m", "jump_m"), [(0.0, 0.35), (0.02, 0.5), (0.1, 2.0)])
+def test_a_jump_is_found_in_noise(sd_m: float, jump_m: float) -> None:
+    assert found(sd_m, jump_m) == [pytest.approx(jump_m, abs=6.0 * sd_m + 1e-9)]
+
+
+@pytest.mark.parametrize(("rises_mps", "drift_m"), [(0.0, 1.0), (-0.2, 1.2)])
+def test_a_position_that_leaves_its_velocity_drifts(rises_mps: float, drift_m: float) -> None:
+    """In the steady state by the difference of the two velocities in one second; a jump is none."""
+    jumps = PositionJumps()
+    for time_s in np.arange(1000) / 100.0:
+        height_m = rises_mps * time_s + 5.0 * (time_s >= 5.0)
+        position = LocalPosition(float(time_s), (3.0, 4.0, float(height_m)), (0.0, 0.0, 1.0))
+        jumps.on_position(position)
+    assert jumps.drift_m == pytest.approx(drift_m, rel=0.01)
+
+
+# --- age of position and attitude -----------------------------------------------------------------
+
 
 STILL = (0.0, 0.0, 0.0)
 LEVEL = (1.0, 0.0, 0.0, 0.0)

@@ -59,16 +59,6 @@ def test_body_axes_have_the_commanded_direction() -> None:
         assert math.remainder(heading_error, 2.0 * math.pi) == pytest.approx(0.0, abs=1e-6)
 
 
-def test_fields_of_a_tilt_that_accelerates_north() -> None:
-    """Acceleration is -T b: nose down."""
-    direction = (-math.sin(0.2), 0.0, math.cos(0.2))
-    message = sent(replace(LEVEL, thrust_direction_ned=direction))
-    assert message.q == pytest.approx([math.cos(0.1), 0.0, -math.sin(0.1), 0.0])
-    assert message.get_type() == "SET_ATTITUDE_TARGET"
-    assert (message.target_system, message.target_component) == (7, 1)
-    assert (message.time_boot_ms, message.type_mask) == (12345, 7)
-
-
 TILTED = (0.5, 0.0, math.cos(math.pi / 6))  # 30 degrees
 
 
@@ -150,15 +140,6 @@ def test_modes_have_the_numbers_of_the_specification() -> None:
     for dialect in (PX4_DIALECT, ARDUPILOT_DIALECT):
         with pytest.raises(ValueError, match=f"no mode 'NONSENSE'; it has .*{dialect.engage_mode}"):
             dialect.set_mode("NONSENSE")
-
-
-def test_problem_of_a_parameter_names_the_command_that_fixes_it() -> None:
-    watched = {p.name: p for d in (PX4_DIALECT, ARDUPILOT_DIALECT) for p in d.watched_parameters}
-    options, loss = watched["GUID_OPTIONS"], watched["COM_OF_LOSS_T"]
-    assert options.fault(8.0) is options.fault(10.0) is loss.fault(1.0) is None
-    faults = (options.fault(2.0), loss.fault(0.0), watched["ATC_ANGLE_BOOST"].fault(0.0))
-    fixes = ["GUID_OPTIONS 10", "COM_OF_LOSS_T 1", "ATC_ANGLE_BOOST 1"]
-    assert [each.fix for each in faults if each] == [f"param set {fix}" for fix in fixes]
 
 
 # --- the others ---

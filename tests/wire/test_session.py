@@ -250,15 +250,6 @@ def test_timesync_is_answered_also_before_the_first_heartbeat() -> None:
     assert reception.events == (events.TimesyncReply(request_ns=2, vehicle_ns=1),)
 
 
-def test_in_lockstep_requests_count_the_time_and_host_time_has_no_effect() -> None:
-    vehicle, session = Sender(7), Session(SessionSettings(lockstep=True))
-    for host_s, stamp_s in ((5000.0, 3), (7000.0, 4), (100.0, 13)):
-        request = mavlink.MAVLink_timesync_message(0, stamp_s * 10**9)
-        session.receive(vehicle.frame(request), PEER, host_s)
-        assert session.elapsed_s(host_s) == stamp_s - 3
-        assert session.clock_s(host_s) == session.link_time_s
-
-
 def test_heartbeats_at_1_hz_of_host_or_vehicle_time_whichever_is_faster() -> None:
     """And at once, with the system id of the vehicle, when it is found."""
     vehicle, session = Sender(7), Session(SessionSettings(sends_first=True))

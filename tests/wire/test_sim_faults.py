@@ -82,7 +82,6 @@ def observed() -> Bench:
         {"fault": "silent_message", "message": "LOCAL_POSITION_NED", "at_s": 1.0, "every": 10},
         {**attitude, "at_s": 2.0},
         {**attitude, "at_s": 3.0, "stamp_runs": False},
-        {"fault": "battery_drop", "remaining": 0.5, "at_s": 4.0},
     )
     bench.run(5.0)
     return bench
@@ -100,12 +99,6 @@ def test_a_stuck_message_repeats_its_content(observed: Bench, begin_s: float, ru
     assert len(stuck) > 50
     assert len({(m.roll, m.pitch, m.rollspeed) for m in stuck}) == 1
     assert (len({m.time_boot_ms for m in stuck}) == len(stuck)) is runs
-
-
-def test_the_charge_of_the_battery_drops(observed: Bench) -> None:
-    left = [(at_s, m.battery_remaining) for at_s, m in observed.of("SYS_STATUS")]
-    assert min(share for at_s, share in left if at_s < 3.99) > 95
-    assert {share for at_s, share in left if at_s > 4.01} == {50}
 
 
 def test_gps_loss_drifts_and_jumps_back_and_px4_loses_the_position_after_five_seconds() -> None:

@@ -251,9 +251,6 @@ SESSIONS = [
 ]
 
 
-ALL = pytest.mark.parametrize("session", SESSIONS, ids=lambda s: f"{s.firmware}-{s.name}")
-
-
 def _system(recording: Path) -> int:
     messages = (message for _, _, message in recorded_frames(recording) if message is not None)
     return next(m.get_srcSystem() for m in messages if m.get_srcComponent() == 1)

@@ -6,10 +6,9 @@ import pytest
 from vehicle_frames import PEER, Sender
 
 from offboard.mavlink.dialects.base import WantedMessage
-from offboard.mavlink.dialects.px4 import PX4
 from offboard.mavlink.outgoing import CommandLong, Outgoing
 from offboard.mavlink.session import Session, SessionSettings
-from offboard.mavlink.telemetry import TelemetryRates, fitted
+from offboard.mavlink.telemetry import fitted
 from offboard.mavlink.vehicle_time import Age, VehicleTime
 
 POSITION = 32
@@ -74,22 +73,6 @@ def test_a_message_at_its_rate_is_requested_once_until_another_program_changes_i
     vehicle.requested_s.clear()
     assert vehicle.run(40.0, 0) == 0.0  # host time counts
     assert len(vehicle.requested_s) >= 2
-
-
-@pytest.mark.parametrize(("default_hz", "requests"), [(0.0, 2), (0.5, 10), (2.0, 1)])
-def test_an_optional_message_at_its_default_rate_is_requested_until_it_is_heard(
-    default_hz: float, requests: int
-) -> None:
-    """The link loses every request; what never comes is requested twice. PX4 sends 2 Hz on request
-    while the mode does not change."""
-    (wanted,) = (each for each in PX4.wanted if each.message_id == 436)
-    rates = TelemetryRates([wanted], 0.0)
-    requested = 0
-    for tick in range(300):
-        if default_hz and tick % round(10.0 / default_hz) == 0:
-            rates.count(436, 0.1 * tick)
-        requested += len(rates.due(0.1 * tick))
-    assert requested == pytest.approx(requests, abs=1 if default_hz else 0)
 
 
 def test_link_time_follows_the_vehicle_or_host_time() -> None:
