@@ -11,7 +11,7 @@ import math
 import operator
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from offboard.flight.vehicle_state import VehicleState
 from offboard.mavlink.events import Landed, LocalPosition, Triple
@@ -21,6 +21,7 @@ RESTING_HEIGHT_M = 0.75  # errors of an estimate on the ground
 LIFTED_HEIGHT_M, LIFTED_CLIMB_MPS, LIFTED_SAMPLES = 0.15, 0.4, 3
 GROUND_SPEED_MPS = 0.5  # as an estimate on the ground may show
 STOOD_WITHIN_M, STOOD_HEIGHT_M, STOOD_S = 0.1, 0.3, 1.0
+KEPT_S = 20.0
 STANDING_S = 15.0  # at one height: it stands, and does not hover
 POSITION_KNOWN_S = 1.0  # age of a position that shows where it is
 STILL_ARMED = (
@@ -45,7 +46,7 @@ class GroundContact:
     vehicle: VehicleState
     rest_ned_m: Triple | None = None  # where it last rested; None if it has not been seen at rest
     _lifted: int = 0  # samples in a row
-    _stood_at: tuple[float, float] = (math.nan, math.nan)  # since when at one height, and where
+    _heights: deque[tuple[float, float]] = field(default_factory=deque)  # when, and how high
 
     def on_position(self, position: LocalPosition) -> None:
         """The newest position."""
@@ -55,8 +56,9 @@ class GroundContact:
         climbs = speed_mps < -LIFTED_CLIMB_MPS and self.height_m > 0.3 * LIFTED_HEIGHT_M
         lifted = self.height_m > LIFTED_HEIGHT_M or climbs
         self._lifted = self._lifted + 1 if lifted else 0
-        if not abs(self.height_m - self._stood_at[1]) < STOOD_WITHIN_M:
-            self._stood_at = position.time_s, self.height_m
+        self._heights.append((position.time_s, self.height_m))
+        while self._heights[0][0] < position.time_s - KEPT_S:
+            self._heights.popleft()
 
     @property
     def rest_down_m(self) -> float:
@@ -119,9 +121,11 @@ class GroundContact:
 
     def stood_for(self, for_s: float) -> bool:
         """At the height of the last rest, and no higher or lower during `for_s`."""
-        position = self.vehicle.position
-        stood = position is not None and position.time_s - self._stood_at[0] >= for_s
-        return stood and abs(self.height_m) < STOOD_HEIGHT_M
+        newest_s = self._heights[-1][0] if self._heights else 0.0
+        heights = [height for at_s, height in self._heights if at_s > newest_s - for_s]
+        still = bool(heights) and max(heights) - min(heights) < STOOD_WITHIN_M
+        known = still and newest_s - self._heights[0][0] >= for_s
+        return known and abs(self.height_m) < STOOD_HEIGHT_M
 
 
 # ---------------------------------------------------------------------- a landing

@@ -126,6 +126,19 @@ def test_stood_for_fifteen_seconds(
     assert standing.contact.stood_for(15.0) is stood
 
 
+def test_stood_is_a_matter_of_range() -> None:
+    """A hover 0.08 m above and below where it began is none. An estimate that drifts by 0.02 m/s on
+    the ground stands at all times: a pilot's switch does not engage there."""
+    hovers, drifts = armed(height_m=0.0), armed(height_m=-0.2)
+    stood = []
+    for number in range(1, 161):
+        hovers.position(1.0 + 0.1 * number, 0.08 * (-1.0) ** number)
+        drifts.position(1.0 + 0.1 * number, -0.2 + 0.002 * number)
+        stood.append(drifts.contact.stood_for(1.0))
+    assert not hovers.contact.stood_for(15.0)
+    assert all(stood[10:])
+
+
 # --- jumps ----------------------------------------------------------------------------------------
 
 
