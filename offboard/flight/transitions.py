@@ -20,6 +20,7 @@ from offboard.flight.ground_contact import Touchdown
 from offboard.flight.phases import (
     BEFORE_FLIGHT,
     FLYING,
+    TRACKING,
     WAITING,
     ExitCode,
     Phase,
@@ -41,6 +42,7 @@ STAGES = {
     Phase.JOIN: Stage.MOTION,
     Phase.TRACK: Stage.MOTION,
 }  # of the identification
+PROCEEDS = BEFORE_FLIGHT | TRACKING | {Phase.TAKEOFF}  # phases of a flight that goes on
 SERVICE_ONLY = frozenset({Phase.STANDBY, Phase.PAUSE, Phase.HAND_BACK})
 
 
@@ -146,6 +148,8 @@ def _enter(flight: FlightState, row: Transition) -> None:
         flight.request = asked
     _conclude(flight, row, reason)
     flight.vehicle.clear_messages()
+    if asked is Request.NONE and row.target not in PROCEEDS:
+        flight.obeyed = Request.NONE  # the flight ends for another reason
     flight.phase = row.target
     flight.began_s = flight.now_s
     outbox.announce_phase(flight, reason, cause)

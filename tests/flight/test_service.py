@@ -501,6 +501,21 @@ def test_a_request_that_is_being_obeyed_is_accepted_again(served: Served) -> Non
     assert pair.acks == [*repeated, (PAUSE_CONTINUE, TEMPORARILY_REJECTED)]
 
 
+def test_a_request_is_obeyed_no_more_once_the_flight_ends_for_another_reason(
+    served: Served,
+) -> None:
+    """A ground station was told that a vehicle that is handed back, or lands, will pause."""
+    pair = served.engaged("ardupilot", reference="lemniscate")
+    pair.until(lambda: pair.phase is Phase.TRACK, 30.0)
+    pair.command(PAUSE_CONTINUE, 0.0)
+    pair.until(lambda: pair.phase is Phase.PAUSE, 0.5)
+    pair.service.request_stop("the disk is full")
+    pair.until(lambda: pair.phase is Phase.HAND_BACK, 0.5)
+    pair.command(PAUSE_CONTINUE, 0.0)
+    pair.run(0.2)
+    assert pair.acks == [(PAUSE_CONTINUE, ACCEPTED), (PAUSE_CONTINUE, TEMPORARILY_REJECTED)]
+
+
 def test_a_pilot_who_engages_and_takes_it_again_at_once_has_it(served: Served) -> None:
     """On a real PX4 it was asked to land: no TIMESYNC was asked for while the HEARTBEAT after the
     first switch was awaited, so that setpoints seemed lost, and the second switch a failsafe."""
