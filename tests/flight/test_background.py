@@ -40,6 +40,20 @@ def test_in_lockstep_it_waits_and_loses_nothing() -> None:
     assert (disk.items, writer.dropped) == ([*range(2000)], 0)
 
 
+def test_a_failure_is_kept_and_ends_the_writing() -> None:
+    """Of a display: rich ends the program where nobody reads its pipe."""
+    failure = SystemExit(1)
+
+    def write(_: list[int]) -> None:
+        raise failure
+
+    writer = BackgroundWriter(write, 100)
+    writer.put(0)
+    writer.close(LONG_S)
+    writer.put(1)
+    assert (writer.error, writer.dropped) == (failure, 2)
+
+
 def test_a_log_on_a_slow_disk_is_complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     free, right = threading.Event(), log_module.append
 

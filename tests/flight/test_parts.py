@@ -17,7 +17,9 @@ from offboard.compiled import Entry
 from offboard.control.base import Certificate, Decision, Situation
 from offboard.documents.reading import DocumentError
 from offboard.flight import outbox
+from offboard.flight.preflight import ParameterReading
 from offboard.flight.record import configuration_pieces, joined_configuration
+from offboard.mavlink.dialects.px4 import PX4
 from offboard.mavlink.outgoing import CommandLong
 from offboard.model.command import Command, PredictedState
 from offboard.reference.track import hold
@@ -67,6 +69,15 @@ def test_a_law_that_fails_is_found_before_the_flight(fail: Any, says: str) -> No
     law = failing(fail, after=0)(prepared.controller)
     with pytest.raises(DocumentError, match=says):
         rehearse(replace(prepared, controller=law), keeps_deadline=False)
+
+
+def test_parameters_are_requested_until_they_are_answered() -> None:
+    """Request or reply may be lost on the link."""
+    reading, known = ParameterReading(), {"MPC_THR_HOVER": 0.5}
+    unknown = [each.name for each in PX4.watched_parameters if each.name not in known]
+    for at_s, names in ((10.0, unknown), (10.4, []), (10.5, unknown)):
+        assert [request.name for request in reading.due(PX4, known, at_s)] == names
+    assert [reading.complete(PX4, known, at_s) for at_s in (11.9, 12.0)] == [False, True]
 
 
 def test_arducopter_is_not_flown_without_a_reply_for_guid_options() -> None:
