@@ -23,10 +23,14 @@ from offboard.control.law import PsoLaw
 from offboard.flight import actions
 from offboard.flight.phases import Phase
 from offboard.flight.record import (
+    DROPPED,
+    OTHERS,
     PAYLOAD_TYPE,
+    ChunkInput,
     InputRecorder,
     InputsError,
     Note,
+    TurnInput,
     configuration_pieces,
     entries,
 )
@@ -330,6 +334,31 @@ def test_damaged_pieces_raise_nothing_else(data) -> None:
         piece[data.draw(st.integers(0, len(piece) - 1))] = data.draw(st.integers(0, 255))
     with suppress(InputsError):
         list(entries(map(bytes, pieces)))
+
+
+def test_in_real_time_each_input_is_recorded() -> None:
+    """Host times to the microsecond, who sent, what the log does not hold, datagrams of others."""
+    recorder, clock_s = InputRecorder(SessionSettings()), [100.000_250]
+    read = recorder.watch(lambda: clock_s[0])
+    pieces = []
+    for turn_s, others in ((100.000_1, 0), (100.020_3, 7)):
+        assert recorder.begin(turn_s + 2e-7, others) == turn_s
+        for peer in (("::1", 14580, 0, 0), "serial"):
+            chunk = Chunk(b"", peer, turn_s - 0.004_7)
+            recorder.chunk(chunk, Reception((b"a", b"b"), unlogged=((1, b"ours"),)))
+        assert read() == clock_s[0]
+        recorder.end()
+        pieces += recorder.pieces(all_of_it=False)
+    recorder.note(DROPPED, 2)
+    pieces += recorder.pieces(all_of_it=True)
+    _, first, counted, second, dropped, _ = entries(piece.data for piece in pieces)
+    assert (counted, dropped) == (Note(OTHERS, (7,)), Note(DROPPED, (2,)))
+    for found, turn_s in ((first, 100.000_1), (second, 100.020_3)):
+        chunks = tuple(
+            ChunkInput(peer, round(turn_s - 0.004_7, 6), 2, ((1, b"ours"),))
+            for peer in (("::1", 14580, 0, 0), "serial")
+        )
+        assert found == TurnInput(turn_s, chunks, (clock_s[0],))
 
 
 def test_in_lockstep_no_host_time_is_recorded() -> None:
