@@ -88,7 +88,7 @@ def test_the_page_of_a_second_identification_has_a_name_of_its_own(
     assert (tmp_path / "identify.html").read_text() == "precious"
     page = (tmp_path / "identify-2.html").read_text()
     assert f"<title>Flight {tmp_path.name}</title>" in page
-    assert page.count(' id="fit_') == 2 * 3  # tilt, heading and motion, with their data
+    assert page.count(' id="fit_') == 2 * 2  # tilt and heading, with their data
 
 
 def test_a_score_that_cannot_be_written_is_reported(called: Called, tmp_path: Path) -> None:
