@@ -248,7 +248,7 @@ class Swarm:
 
     def _iterate(self, hessian: Array, gradient: Array, constant: float, iterations: int) -> None:
         left = int(self._search["iterations"][0] - self._search["done"][0])
-        moves = min(iterations, left - 1)
+        moves = max(min(iterations, left - 1), 0)
         random = self._rng.random((moves, *self._particles.shape[1:], 2))
         iterate(
             self._search, random, self._bounds, self._particles, self._best, self._costs,

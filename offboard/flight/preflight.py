@@ -10,13 +10,14 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import partial
 
 from offboard.flight.phases import Limits
 from offboard.flight.timing import VehicleClock
 from offboard.flight.vehicle_state import ARMED_KNOWN_S, VehicleState
 from offboard.mavlink import senders
 from offboard.mavlink.dialects.base import Dialect, Takeoff, WatchedParameter
-from offboard.mavlink.events import Heartbeat
+from offboard.mavlink.events import GpsFix, Heartbeat, NoFix
 from offboard.mavlink.outgoing import ParamRead
 from offboard.mavlink.session import Session
 
@@ -24,6 +25,7 @@ TELEMETRY = ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED")
 MINIMUM_TELEMETRY_HZ = 10.0
 REPEAT_S = 0.5  # between two requests for a parameter
 REPLY_TIMEOUT_S = 2.0  # for parameters
+STARTING_S = 90.0  # of vehicle time: ArduCopter uses a GPS 30 s after its first 3D fix
 UNANSWERED_S = 3.0  # requests of TIMESYNC, ten a second
 
 
@@ -255,9 +257,14 @@ def _rejected(ground: Ground) -> str:
     return report.problem if report and report.worst[1] > 1.0 else ""
 
 
-def _no_estimate(ground: Ground) -> str:
-    report = ground.vehicle.estimator
-    return report.problem if report and report.worst[1] <= 1.0 else ""
+def _no_estimate(ground: Ground, *, starting: bool) -> str:
+    vehicle = ground.vehicle
+    report = vehicle.estimator
+    if report is None or report.worst[1] > 1.0:
+        return ""
+    fixed = vehicle.age_s(GpsFix) < vehicle.age_s(NoFix)
+    starts = not fixed or vehicle.time_s < STARTING_S
+    return report.problem if starts == starting else ""
 
 
 def _empty_battery(ground: Ground) -> str:
@@ -329,7 +336,8 @@ PREFLIGHT = (
     Row("prearm", WAIT, _prearm, fly_only=True),
     Row("prearm", WARN, _needs_setpoints, _other_mode, fly_only=True),
     Row("estimator", BLOCKS, _rejected, _ESTIMATOR),
-    Row("estimator", WAIT, _no_estimate, _ESTIMATOR),
+    Row("estimator", WAIT, partial(_no_estimate, starting=True), _ESTIMATOR),
+    Row("estimator", BLOCKS, partial(_no_estimate, starting=False), _ESTIMATOR),
     Row("battery", BLOCKS, _empty_battery, "charge the battery"),
     Row("delay", WAIT, _measuring),
     Row("delay", BLOCKS, _late, "use a faster link"),

@@ -11,8 +11,12 @@ from pair import LEAN
 from pair import make as flight
 
 from offboard.doctor.run import verdict
-from offboard.flight.phases import ExitCode
-from offboard.flight.preflight import Level
+from offboard.flight.phases import ExitCode, Limits
+from offboard.flight.preflight import Ground, Level, findings
+from offboard.flight.timing import VehicleClock
+from offboard.flight.vehicle_state import VehicleState
+from offboard.mavlink.events import ESTIMATE, Attitude, EstimatorReport, GpsFix
+from offboard.mavlink.session import Session, SessionSettings
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
@@ -156,3 +160,15 @@ def test_flight_is_refused_as_the_doctor_says() -> None:
     assert outcome.exit_code == ExitCode.REFUSED
     assert "its battery has 50% left, limits.battery is 100%" in outcome.sentence
     assert pair.setpoints == []
+
+
+@pytest.mark.parametrize(("boot_s", "level"), [(33.0, WAIT), (300.0, BLOCKS)])
+def test_estimator_without_position_although_the_gps_has_a_fix(boot_s: float, level: Level) -> None:
+    """ArduCopter 4.6.3 reports a 3D fix 10 s after its start, and a position 42 s after it."""
+    starting = VehicleState(
+        estimator=EstimatorReport(frozenset(ESTIMATE) - {"horizontal position"}, ratios=()),
+        attitude=Attitude(boot_s, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+    )
+    starting.heard_s[GpsFix] = starting.now_s
+    ground = Ground(starting, Limits(), Session(SessionSettings()), VehicleClock(), 0.0)
+    assert {found.level for check, _, found in findings(ground) if check == "estimator"} == {level}

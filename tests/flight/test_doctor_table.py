@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import threading
 import time
@@ -78,3 +79,19 @@ def test_what_is_wrong_with_this_computer(monkeypatch: pytest.MonkeyPatch) -> No
     found = " ".join(finding.found for finding in rows[-1].findings)
     assert "a decision takes 40.0 ms of 50 ms" in found
     assert "wakes up at most 30.0 ms late" in found
+
+
+def test_report_as_json() -> None:
+    seen = bench(parameters={"COM_OBL_RC_ACT": 0.0}).listen()
+    rows = run.examine(["gps", "parameters"], seen)
+    assert run.worst(rows) is Level.WARN
+    report = json.loads(run.as_json(rows, seen, run.verdict(rows, complete=True)))
+    assert (report["level"], report["verdict"]) == (
+        "warn", "ready to fly; warnings: COM_OBL_RC_ACT"
+    )  # fmt: skip
+    assert report["vehicle"] == {"autopilot": "px4", "system_id": 1}
+    assert report["version"] == [1, 16, 1]
+    assert [row["check"] for row in report["rows"]] == ["gps", "parameters"]
+    (finding, good) = report["rows"][1]["findings"]
+    assert finding["hint"] == "param set COM_OBL_RC_ACT 4"
+    assert (finding["level"], good["level"]) == ("warn", "ok")

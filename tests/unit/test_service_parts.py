@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -342,3 +343,20 @@ def test_a_reference_that_is_placed_low_stays_clear_of_the_ground() -> None:
     raised_m = plan.place_start((3.0, 4.0, -1.0), REST, 0.0)
     assert raised_m == pytest.approx(max(falls_m - 1.0 + CLEAR_M, 0.0), abs=0.02)
     assert plan.place_start((3.0, 4.0, -20.0), REST, None) == pytest.approx(falls_m, abs=0.02)
+
+
+@pytest.mark.parametrize("speed_mps", [0.3, 4.0])
+def test_a_moving_vehicle_is_stopped_where_the_reference_starts(speed_mps: float) -> None:
+    """Without a way back. A smooth stop with at most 2 m/s2 needs 35/32 of a stop with a constant
+    1 m/s2."""
+    config = load("flight", choices={"reference": "hover", "vehicle": "px4_sih"})
+    plan = FlightPlan(build(config).track)
+    velocity = (0.6 * speed_mps, -0.8 * speed_mps, 0.0)
+    assert plan.place_start((3.0, 4.0, -20.0), velocity, 0.0) == 0.0
+    plan.start_climb(5.0, np.array((3.0, 4.0, -20.0)), np.array(velocity), 0.0)
+    assert plan.reference is not None
+    flown = plan.reference.sample(np.linspace(5.0, 25.0, 2001))
+    along_m = (flown.position_ned_m - (3.0, 4.0, -20.0)) @ np.array((0.6, -0.8, 0.0))
+    assert along_m[-1] == pytest.approx(35.0 / 32.0 * speed_mps**2 / 2.0)
+    assert along_m.max() < along_m[-1] + 0.01
+    assert np.linalg.norm(flown.acceleration_ned_mps2, axis=1).max() < 2.01

@@ -249,3 +249,8 @@ def test_what_is_left_on_a_known_vehicle(vertical_m: float, most_m: float) -> No
     """Without noise, everything known: 0.8 and 1.5 mm by a law that fights its own ripple."""
     reference = lemniscate(8.0, vertical_m=vertical_m)
     assert fly(Truth(PX4), lqr(), PX4, reference, 16.0) < most_m
+
+
+def test_sixty_milliseconds_of_unknown_delay_are_survived() -> None:
+    """On real PX4, whose estimate wanders, .047."""
+    assert rmse_m(5.0, Truth(PX4, extra_delay_s=0.06)) < 0.005

@@ -74,3 +74,25 @@ def test_thrust_outside_its_range_is_clipped_or_zero_and_quaternions_are_not_che
         before_mps = climb_mps(bench)
         bench.run(0.6, lambda given=setpoint: bench.attitude(**given))
         assert low < climb_mps(bench) - before_mps < high
+
+
+def test_the_least_rate_until_which_the_last_attitude_continues() -> None:
+    bench, half = engaged(), math.radians(1.0)
+    quaternion = math.cos(half), math.sin(half), 0.0, 0.0
+    for period_s in (0.8, 1 / 1.5):
+        bench.run(4.0, lambda: bench.attitude(quaternion), period_s)
+        assert bench.of("ATTITUDE")[-1][1].roll == pytest.approx(math.radians(2.0), abs=0.01)
+        assert bench.mode == OFFBOARD
+    assert "Failsafe activated" not in bench.texts()
+    bench.run(4.0, bench.attitude, 1 / 0.9)
+    assert "Failsafe activated" in bench.texts()
+
+
+def test_the_pilot_takes_over_before_the_failsafe_acts() -> None:
+    bench = aloft()
+    bench.set("COM_LOW_BAT_ACT", 2)
+    bench.instance.autopilot.plant.set_battery(0.06)
+    bench.run(2.6, bench.attitude)
+    assert bench.ask_mode(OFFBOARD) == [0, 0]
+    bench.run(5.0, bench.attitude)
+    assert (bench.mode, bench.system_status) == (OFFBOARD, 4)
