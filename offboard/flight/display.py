@@ -65,7 +65,7 @@ def _unready(state: FlightState) -> str:
 
 
 def _left_alone(state: FlightState) -> str:
-    """Of the service: a vehicle that is in the mode of setpoints, and was not engaged by it."""
+    """That a vehicle is in the mode of setpoints, which this service did not ask for."""
     if state.left_engaged or not found_engaged(state):
         return ""
     return (

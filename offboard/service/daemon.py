@@ -157,7 +157,7 @@ class Manager:
         self._status = ""
 
     def tell(self, notice: str) -> None:
-        """Of sd_notify(3)."""
+        """Tell systemd, by the protocol of sd_notify(3)."""
         self._writer.put(notice)
 
     def close(self) -> None:

@@ -25,7 +25,7 @@ from serving import (
     serve,
 )
 
-from offboard.flight.phases import TRACKING, Phase
+from offboard.flight.phases import TRACKING, Phase, Request
 
 BOTH = pytest.mark.parametrize("on", ["px4", "ardupilot"])
 HOLD = {"px4": "AUTO.LOITER", "ardupilot": "BRAKE"}
@@ -486,6 +486,12 @@ def test_a_request_that_is_being_obeyed_is_accepted_again(served: Served) -> Non
     """A ground station that missed the answer repeats its command."""
     pair = served.engaged("ardupilot", reference="lemniscate")
     pair.until(lambda: pair.phase is Phase.TRACK, 30.0)
+    pair.state.request = pair.state.obeyed = Request.CONTINUE  # accepted in PAUSE, which has ended
+    pair.run(0.2)
+    pair.command(PAUSE_CONTINUE, 1.0)
+    pair.run(0.2)
+    rejected = (PAUSE_CONTINUE, TEMPORARILY_REJECTED)
+    assert pair.acks == [rejected]
     for parameter in (0.0, 1.0):
         pair.command(PAUSE_CONTINUE, parameter)
         pair.command(PAUSE_CONTINUE, parameter)
@@ -498,7 +504,7 @@ def test_a_request_that_is_being_obeyed_is_accepted_again(served: Served) -> Non
     pair.command(PAUSE_CONTINUE, 1.0)
     pair.run(0.2)
     repeated = [(PAUSE_CONTINUE, ACCEPTED)] * 6 + [(SET_MODE, ACCEPTED)] * 2
-    assert pair.acks == [*repeated, (PAUSE_CONTINUE, TEMPORARILY_REJECTED)]
+    assert pair.acks == [rejected, *repeated, rejected]
 
 
 def test_a_request_is_obeyed_no_more_once_the_flight_ends_for_another_reason(
