@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import math
 import struct
-from array import array
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,11 +23,9 @@ from offboard.flight.phases import PHASE_CODES
 from offboard.flight.record import (
     COMPONENT_ID,
     FIELDS,
-    IDENTIFIED_NAME,
-    NAN,
+    IDENTIFIED_ID,
     RECORD_COMPONENT_ID,
-    RECORD_NAME,
-    TickRecord,
+    RECORD_ID,
 )
 from offboard.identification.vehicle_fit import RECORDED
 from offboard.mavlink import event_record
@@ -64,7 +61,9 @@ _MOTION = {"position_ned_m": ("x", 3), "velocity_ned_mps": ("vx", 3)}
 _REFERENCE = {**_MOTION, "acceleration_ned_mps2": ("afx", 3), "heading_rad": ("yaw", 1)}
 SETPOINT = {"quaternion": ("q", 4), "thrust": ("thrust", 1)}
 _BATTERY = {"voltage": ("voltage_battery", 1), "remaining": ("battery_remaining", 1)}
+_TIMESYNC: tuple[Columns, str] = ({"answered_ns": ("tc1", 1), "asked_ns": ("ts1", 1)}, BEFORE)
 _THEIRS: dict[str, tuple[Columns, str]] = {
+    "TIMESYNC": _TIMESYNC,
     "LOCAL_POSITION_NED": (_MOTION, BOOT_MS),
     "ATTITUDE_QUATERNION": (
         {"quaternion": ("q1", 4), "rates_radps": ("rollspeed", 3)}, BOOT_MS
@@ -78,6 +77,7 @@ _THEIRS: dict[str, tuple[Columns, str]] = {
 _OURS: dict[str, tuple[Columns, str]] = {
     "POSITION_TARGET_LOCAL_NED": (_REFERENCE, BOOT_MS),
     "SET_ATTITUDE_TARGET": (SETPOINT, BOOT_MS),
+    "TIMESYNC": _TIMESYNC,
 }
 _PLACE = {"latitude": ("lat", 1), "longitude": ("lon", 1), "altitude": ("alt", 1)}
 _SIM_PLACE = {"latitude": ("lat_int", 1), "longitude": ("lon_int", 1), "altitude": ("alt", 1)}
@@ -86,16 +86,12 @@ _TRUTH: dict[str, tuple[Columns, str]] = {
     "SIM_STATE": (_SIM_PLACE, BEFORE),
 }
 _ALTITUDE_UNITS = {"HIL_STATE_QUATERNION": 1e3, "SIM_STATE": 1.0}  # in a metre
-_ARRAY, _DATA = "DEBUG_FLOAT_ARRAY", 20  # and where its data begin
-_TICK = {name: ("data", 1, place) for place, name in enumerate(FIELDS)}
-_IDENTIFIED = {name: ("data", 2, 2 * place) for place, name in enumerate(RECORDED)}
-_FIRST_FIELDS = 28  # of a record; smaller numbers are versions of before 0.1
-_DEFAULTS = struct.pack(  # of records of an older version, which lack the last fields
-    f"<{len(FIELDS)}f",
-    *(NAN if each.default is MISSING else each.default for each in fields(TickRecord)),
-)
-_NO_ATTITUDE = struct.pack("<8f", *(NAN,) * 8)  # of a setpoint, after its stamp
-_TIMESYNC = struct.Struct("<qq")  # tc1, ts1
+_ARRAY = "DEBUG_FLOAT_ARRAY"
+_ARRAYS: dict[int, Columns] = {  # by their array_id
+    RECORD_ID: {name: ("data", 1, place) for place, name in enumerate(FIELDS)},
+    IDENTIFIED_ID: {name: ("data", 2, 2 * place) for place, name in enumerate(RECORDED)},
+}
+_NO_ATTITUDE = struct.pack("<8f", *(math.nan,) * 8)  # of a setpoint, after its stamp
 _TIMES = struct.Struct("<2d")  # time_s, unix_s
 Said = list[tuple[float, float, str]]  # texts, each with `now_ms` and the time in the log
 
@@ -283,12 +279,10 @@ class _Collector:
 
     def __init__(self, vehicle: Address | None, dialect: Dialect | None) -> None:
         self._vehicle, self._dialect = vehicle, dialect
-        specs = _THEIRS | _OURS
-        self._samples = {name: Samples(name, *spec) for name, spec in specs.items()}
-        self._records = Samples(_ARRAY, _TICK, BOOT_US)
-        self._identified = Samples(_ARRAY, _IDENTIFIED, BOOT_US)
+        self._theirs = {name: Samples(name, *spec) for name, spec in _THEIRS.items()}
+        self._ours = {name: Samples(name, *spec) for name, spec in _OURS.items()}
+        self._arrays = {i: Samples(_ARRAY, columns, BOOT_US) for i, columns in _ARRAYS.items()}
         self._truth: list[tuple[Geodetic, dict[str, Samples]]] = []  # by the local frame's origin
-        self._asked_ns, self._answered_ns = array("q"), array("q")  # of TIMESYNC; ts1, and ts1, tc1
         self._assembler = TextAssembler()
         self._texts: Said = []  # of the vehicle
         self._modes: Said = []
@@ -313,22 +307,12 @@ class _Collector:
     def _add_ours(self, entry: LoggedMessage, payload: bytes) -> None:
         name, now_ms, unix_s = entry.name, self.now_ms, entry.unix_us / 1e6
         if name in _OURS:
-            self._samples[name].add(payload, now_ms, unix_s)
+            self._ours[name].add(payload, now_ms, unix_s)
         elif name == "SET_POSITION_TARGET_LOCAL_NED":
             setpoint = payload[:4] + _NO_ATTITUDE
-            self._samples["SET_ATTITUDE_TARGET"].add(setpoint, now_ms, unix_s)
-        elif name == _ARRAY and payload[10:20].rstrip(b"\0") == RECORD_NAME.encode():
-            fields = int.from_bytes(payload[8:10], "little")  # array_id
-            if fields >= _FIRST_FIELDS:
-                end = _DATA + 4 * min(fields, len(FIELDS))
-                known = payload[:end].ljust(end, b"\0")
-                self._records.add(known + _DEFAULTS[end - _DATA :], now_ms, unix_s)
-        elif name == _ARRAY and payload[10:20].rstrip(b"\0") == IDENTIFIED_NAME.encode():
-            self._identified.add(payload, now_ms, unix_s)
-        elif name == "TIMESYNC":
-            answered_ns, asked_ns = _TIMESYNC.unpack(payload[:16].ljust(16, b"\0"))
-            if not answered_ns:
-                self._asked_ns.append(asked_ns)
+            self._ours["SET_ATTITUDE_TARGET"].add(setpoint, now_ms, unix_s)
+        elif name == _ARRAY and entry.message.array_id in _ARRAYS:
+            self._arrays[entry.message.array_id].add(payload, now_ms, unix_s)
         elif record_type(entry) == event_record.PAYLOAD_TYPE:
             self._event_records.append((now_ms, unix_s, entry.tunnelled))
 
@@ -337,14 +321,10 @@ class _Collector:
         if self._refused_as_ahead(entry.frame.message_id, payload):
             return
         if name in _THEIRS:
-            self._samples[name].add(payload, now_ms, unix_s)
+            self._theirs[name].add(payload, now_ms, unix_s)
         elif name in _TRUTH:
             if self._truth:
                 self._truth[-1][1][name].add(payload, now_ms, unix_s)
-        elif name == "TIMESYNC":
-            answered_ns, asked_ns = _TIMESYNC.unpack(payload[:16].ljust(16, b"\0"))
-            if answered_ns:
-                self._answered_ns.extend((asked_ns, answered_ns))
         elif name == "STATUSTEXT":
             whole = self._assembler.add(payload, unix_s)
             self._texts += [(now_ms, unix_s, text.text) for text in whole]
@@ -388,7 +368,10 @@ class _Collector:
     def history(self, damage: str) -> History:
         """All that was added."""
         anchor_ms = self._anchor_ms
-        rows = {name: samples.rows(anchor_ms) for name, samples in self._samples.items()}
+        rows, ours, arrays = (
+            {name: samples.rows(anchor_ms) for name, samples in part.items()}
+            for part in (self._theirs, self._ours, self._arrays)
+        )
         heartbeat, battery = rows["HEARTBEAT"], rows["SYS_STATUS"]
         voltage, remaining = (battery[name].astype(np.float32) for name in _BATTERY)
         voltage[voltage == _NO_VOLTAGE] = remaining[remaining == _NO_PERCENTAGE] = math.nan
@@ -415,11 +398,11 @@ class _Collector:
             ),
             attitude=attitude[(lengths > UNIT_LENGTHS[0]) & (lengths < UNIT_LENGTHS[1])],
             truth=self._truth_rows(),
-            reference=rows["POSITION_TARGET_LOCAL_NED"],
-            setpoint=rows["SET_ATTITUDE_TARGET"],
-            records=self._records.rows(anchor_ms),
-            identified=self._identified.rows(anchor_ms),
-            link_delay=self._link_delay(),
+            reference=ours["POSITION_TARGET_LOCAL_NED"],
+            setpoint=ours["SET_ATTITUDE_TARGET"],
+            records=arrays[RECORD_ID],
+            identified=arrays[IDENTIFIED_ID],
+            link_delay=_link_delay(ours["TIMESYNC"], rows["TIMESYNC"]),
             heartbeat=table(
                 heartbeat,
                 armed=(heartbeat["armed"] & _ARMED > 0).astype(np.float32),
@@ -451,12 +434,13 @@ class _Collector:
                 parts.append(table(rows, position_ned_m=position))
         return np.concatenate(parts)
 
-    def _link_delay(self) -> Rows:
-        """From the vehicle's answers to our TIMESYNC requests."""
-        answers = np.array(self._answered_ns, np.int64).reshape(-1, 2)
-        asked, answered = answers[np.isin(answers[:, 0], np.array(self._asked_ns))].T
-        times = {"time_s": 1e-9 * asked, "unix_s": np.full(len(asked), np.nan)}
-        return table(times, delay_s=1e-9 * (answered - asked))
+
+def _link_delay(requests: Rows, replies: Rows) -> Rows:
+    """From the vehicle's replies to our TIMESYNC requests, which have tc1 = 0."""
+    asked = requests["asked_ns"][requests["answered_ns"] == 0]
+    replies = replies[(replies["answered_ns"] != 0) & np.isin(replies["asked_ns"], asked)]
+    times = {"time_s": 1e-9 * replies["asked_ns"], "unix_s": np.full(len(replies), np.nan)}
+    return table(times, delay_s=1e-9 * (replies["answered_ns"] - replies["asked_ns"]))
 
 
 def _plausible(rows: Rows, **limits: float) -> Rows:
