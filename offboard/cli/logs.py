@@ -148,7 +148,7 @@ def export(
     Exit codes: 0 done; 2 usage error, or a file that cannot be read or written.
     """
     from offboard.export.mcap_file import write_mcap
-    from offboard.export.series import read, write_csv
+    from offboard.export.series import events_of, read, series_of, write_csv
     from offboard.export.ulog import write_ulog
 
     check_new(output, "-o")
@@ -157,8 +157,8 @@ def export(
     write(found, output)
     if found.damage:
         complain(found.damage)
-    held = ", ".join(f"{len(each.time_s)} of {name}" for name, each in found.series.items())
-    say(f"{output}: samples: {held}; {len(found.events)} events")
+    held = ", ".join(f"{len(rows)} of {name}" for name, rows in series_of(found).items())
+    say(f"{output}: samples: {held}; {len(events_of(found))} events")
 
 
 @grouped
