@@ -35,7 +35,6 @@ from offboard.mavlink.decode import (
     UNIT_LENGTHS,
     VELOCITY_LIMIT_MPS,
     Address,
-    decode_identity,
 )
 from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.framing import HEARTBEAT
@@ -456,10 +455,9 @@ def _vehicle(log: Tlog) -> tuple[Address | None, Dialect | None]:
     for entry in log:
         kind = entry.frame.message_id
         if kind == HEARTBEAT and first[0] is None:
-            identity = decode_identity(entry.frame.payload)
-            if is_vehicle(identity):
+            if is_vehicle(entry.message):
                 heard = Address(entry.system_id, entry.component_id)
-                first = heard, known.get(identity.autopilot)
+                first = heard, known.get(entry.message.autopilot)
         elif record_type(entry) == record.VEHICLE_TYPE:
             flown = record.vehicle_of(entry.tunnelled)
             if flown and flown.system_id == entry.system_id:
