@@ -23,7 +23,7 @@ from pydantic import AfterValidator, Field
 from scipy import stats
 
 from offboard.campaign.cases import SCENARIO, Case, Values, expand
-from offboard.campaign.document import CampaignFile, Firmware, Name, Names, Ranges, Seed
+from offboard.campaign.document import CampaignFile, Firmware, Name, Names, Ranges, Seed, Seeds
 from offboard.campaign.results import Record
 from offboard.campaign.run import check
 from offboard.campaign.search import Fly, Study
@@ -47,9 +47,7 @@ class Flights(Parameters):
 
     references: Names | None = None
     scenarios: Names
-    seeds: (
-        Annotated[int, Field(ge=1, le=1000)] | Annotated[tuple[Seed, ...], Field(min_length=1)]
-    ) = 3
+    seeds: Seeds = (1, 2, 3)
 
 
 class TuneFile(Parameters):
