@@ -93,7 +93,7 @@ def test_other_senders_are_counted_and_neither_delay_nor_displace_the_vehicle(en
         time.sleep(LOOK_EVERY_S)
         assert set(data(link.receive(1.0))) == {b"v"}
         looks += 1
-    assert 64 * 20 > link.report.ignored > 1000  # of those that fit into the buffer
+    assert 64 * 22 > link.report.ignored > 500  # of those that fit into the buffer
     name = f" from {LOCAL}:{stranger.getsockname()[1]}, which is not the vehicle, "
     assert all(name in sentence for sentence in link.report.news())
     assert link.report.news() == []
