@@ -41,6 +41,7 @@ from offboard.mavlink.framing import HEARTBEAT
 from offboard.mavlink.senders import DIALECTS, is_vehicle
 from offboard.mavlink.texts import TextAssembler
 from offboard.mavlink.vehicle_time import Age, VehicleTime
+from offboard.model.frames import quaternion_from_euler
 from offboard.model.geodesy import Geodetic, origin_of, position_ned_m
 
 Array = NDArray[np.float64]
@@ -72,19 +73,20 @@ _THEIRS: dict[str, tuple[Columns, str]] = {
     ),
     "SYS_STATUS": (_BATTERY, BEFORE),
     "EXTENDED_SYS_STATE": ({"state": ("landed_state", 1)}, BEFORE),
+    # true positions of a simulated vehicle
+    "HIL_STATE_QUATERNION": ({"place": ("lat", 2), "altitude": ("alt", 1)}, BOOT_US),
+    "SIM_STATE": ({"place": ("lat_int", 2), "altitude": ("alt", 1)}, BEFORE),
+    # what ground stations record instead
+    "ATTITUDE": ({"angles": ("roll", 3), "rates_radps": ("rollspeed", 3)}, BOOT_MS),
+    "GLOBAL_POSITION_INT": ({"place": ("lat", 3), "velocity": ("vx", 3)}, BOOT_MS),
+    "ATTITUDE_TARGET": (SETPOINT, BOOT_MS),
 }  # fmt: skip
 _OURS: dict[str, tuple[Columns, str]] = {
     "POSITION_TARGET_LOCAL_NED": (_REFERENCE, BOOT_MS),
     "SET_ATTITUDE_TARGET": (SETPOINT, BOOT_MS),
     "TIMESYNC": _TIMESYNC,
 }
-_PLACE = {"latitude": ("lat", 1), "longitude": ("lon", 1), "altitude": ("alt", 1)}
-_SIM_PLACE = {"latitude": ("lat_int", 1), "longitude": ("lon_int", 1), "altitude": ("alt", 1)}
-_TRUTH: dict[str, tuple[Columns, str]] = {
-    "HIL_STATE_QUATERNION": (_PLACE, BOOT_US),
-    "SIM_STATE": (_SIM_PLACE, BEFORE),
-}
-_ALTITUDE_UNITS = {"HIL_STATE_QUATERNION": 1e3, "SIM_STATE": 1.0}  # in a metre
+_TRUTH = {"HIL_STATE_QUATERNION": 1e3, "SIM_STATE": 1.0}  # units of the altitude in a metre
 _ARRAY = "DEBUG_FLOAT_ARRAY"
 _ARRAYS: dict[int, Columns] = {  # by their array_id
     RECORD_ID: {name: ("data", 1, place) for place, name in enumerate(FIELDS)},
@@ -119,12 +121,14 @@ class History:
     """Structured arrays (N,) in the order of arrival, and events. Each has `time_s`, `unix_s` (the
     time in the log), and:
 
-    position: position_ned_m, velocity_ned_mps (LOCAL_POSITION_NED)
-    attitude: quaternion (w, x, y, z), rates_radps (ATTITUDE_QUATERNION)
+    position: position_ned_m, velocity_ned_mps (LOCAL_POSITION_NED, or GLOBAL_POSITION_INT, then
+        relative to the first one)
+    attitude: quaternion (w, x, y, z), rates_radps (ATTITUDE_QUATERNION, or ATTITUDE)
     truth: position_ned_m (HIL_STATE_QUATERNION or SIM_STATE; empty without)
     reference: position, velocity and acceleration, heading_rad (POSITION_TARGET_LOCAL_NED)
     setpoint: quaternion, thrust (SET_ATTITUDE_TARGET); the last two NaN for a setpoint of
         the autopilot's own position loop (SET_POSITION_TARGET_LOCAL_NED)
+    commanded: the same, or in a log without ours what the vehicle reports (ATTITUDE_TARGET)
     identified: value and sd of each constant of `identification.vehicle_fit.RECORDED`
     link_delay: delay_s, at the telemetry that a TIMESYNC request followed; without `unix_s`
     heartbeat: armed (1 or 0), system_status (MAV_STATE)
@@ -135,6 +139,7 @@ class History:
     `phases` and `announcements` are our own, by their records; `modes` and `vehicle_messages`
     (STATUSTEXT, refused commands) the vehicle's. `vehicle` is the one that our record of it
     names, else the first autopilot that was heard. Only its messages, and ours, are used.
+    `substitutes` are the messages that take the place of others in the log of a ground station.
     It and `dialect` are None without one, `dialect` also for one that is not known. `damage` says
     what could not be read, `damage_s` is the time of the telemetry before the first damage, NaN
     without.
@@ -145,6 +150,7 @@ class History:
     truth: Rows
     reference: Rows
     setpoint: Rows
+    commanded: Rows
     records: Rows
     identified: Rows
     link_delay: Rows
@@ -159,6 +165,7 @@ class History:
     dialect: Dialect | None
     messages: Counter[str]
     wall_s: float
+    substitutes: tuple[str, ...] = ()
     damage: str = ""
     damage_s: float = math.nan
 
@@ -281,7 +288,7 @@ class _Collector:
         self._theirs = {name: Samples(name, *spec) for name, spec in _THEIRS.items()}
         self._ours = {name: Samples(name, *spec) for name, spec in _OURS.items()}
         self._arrays = {i: Samples(_ARRAY, columns, BOOT_US) for i, columns in _ARRAYS.items()}
-        self._truth: list[tuple[Geodetic, dict[str, Samples]]] = []  # by the local frame's origin
+        self._origin: Geodetic | None = None  # of the local frame
         self._assembler = TextAssembler()
         self._texts: Said = []  # of the vehicle
         self._modes: Said = []
@@ -321,9 +328,6 @@ class _Collector:
             return
         if name in _THEIRS:
             self._theirs[name].add(payload, now_ms, unix_s)
-        elif name in _TRUTH:
-            if self._truth:
-                self._truth[-1][1][name].add(payload, now_ms, unix_s)
         elif name == "STATUSTEXT":
             whole = self._assembler.add(payload, unix_s)
             self._texts += [(now_ms, unix_s, text.text) for text in whole]
@@ -357,25 +361,37 @@ class _Collector:
     def _add_origin(self, entry: LoggedMessage) -> None:
         """HOME_POSITION gives one point in both frames."""
         at = entry.message
-        origin = Geodetic(at.latitude / 1e7, at.longitude / 1e7, at.altitude / 1e3)
-        if entry.name == "HOME_POSITION":
-            origin = origin_of(origin, (at.x, at.y, at.z))
-        if not self._truth or origin != self._truth[-1][0]:
-            samples = {name: Samples(name, *spec) for name, spec in _TRUTH.items()}
-            self._truth.append((origin, samples))
+        place = Geodetic(at.latitude / 1e7, at.longitude / 1e7, at.altitude / 1e3)
+        home = entry.name == "HOME_POSITION"
+        self._origin = origin_of(place, (at.x, at.y, at.z)) if home else place
 
     def history(self, damage: str) -> History:
         """All that was added."""
         anchor_ms = self._anchor_ms
-        rows, ours, arrays = (
-            {name: samples.rows(anchor_ms) for name, samples in part.items()}
-            for part in (self._theirs, self._ours, self._arrays)
-        )
+        rows = {name: samples.rows(anchor_ms) for name, samples in self._theirs.items()}
+        ours = {name: samples.rows(anchor_ms) for name, samples in self._ours.items()}
+        arrays = {i: samples.rows(anchor_ms) for i, samples in self._arrays.items()}
         heartbeat, battery = rows["HEARTBEAT"], rows["SYS_STATUS"]
         voltage, remaining = (battery[name].astype(np.float32) for name in _BATTERY)
         voltage[voltage == _NO_VOLTAGE] = remaining[remaining == _NO_PERCENTAGE] = math.nan
+        position = _plausible(
+            rows["LOCAL_POSITION_NED"],
+            position_ned_m=POSITION_LIMIT_M,
+            velocity_ned_mps=VELOCITY_LIMIT_MPS,
+        )
         attitude = _plausible(rows["ATTITUDE_QUATERNION"], rates_radps=RATE_LIMIT_RADPS)
         lengths = np.linalg.norm(attitude["quaternion"].astype(np.float64), axis=1)
+        attitude = attitude[(lengths > UNIT_LENGTHS[0]) & (lengths < UNIT_LENGTHS[1])]
+        setpoint = ours["SET_ATTITUDE_TARGET"]
+        substitutes = []
+        if not len(position):
+            position = _local(rows["GLOBAL_POSITION_INT"])
+            substitutes.append("GLOBAL_POSITION_INT")
+        if not len(attitude):
+            attitude = _turned(rows["ATTITUDE"])
+            substitutes.append("ATTITUDE")
+        if not len(setpoint):
+            substitutes.append("ATTITUDE_TARGET")
         payloads = [payload for *_, payload in self._event_records]
         events = []
         for last, event in event_record.join(payloads):
@@ -390,15 +406,12 @@ class _Collector:
             for said in (self._modes, self._texts)
         )
         return History(
-            position=_plausible(
-                rows["LOCAL_POSITION_NED"],
-                position_ned_m=POSITION_LIMIT_M,
-                velocity_ned_mps=VELOCITY_LIMIT_MPS,
-            ),
-            attitude=attitude[(lengths > UNIT_LENGTHS[0]) & (lengths < UNIT_LENGTHS[1])],
-            truth=self._truth_rows(),
+            position=position,
+            attitude=attitude,
+            truth=_truth(rows, self._origin),
             reference=ours["POSITION_TARGET_LOCAL_NED"],
-            setpoint=ours["SET_ATTITUDE_TARGET"],
+            setpoint=setpoint,
+            commanded=setpoint if len(setpoint) else rows["ATTITUDE_TARGET"],
             records=arrays[RECORD_ID],
             identified=arrays[IDENTIFIED_ID],
             link_delay=_link_delay(ours["TIMESYNC"], rows["TIMESYNC"]),
@@ -417,21 +430,39 @@ class _Collector:
             dialect=self._dialect,
             messages=self._counts,
             wall_s=(self._unix_us[1] - self._unix_us[0]) / 1e6,
+            substitutes=tuple(substitutes),
             damage=damage,
             damage_s=float(continuous_s(self.damage_ms, anchor_ms)),
         )
 
-    def _truth_rows(self) -> Rows:
-        none = {"time_s": np.zeros(0), "unix_s": np.zeros(0)}
-        parts = [table(none, position_ned_m=np.zeros((0, 3), np.float32))]
-        for origin, samples in self._truth:
-            for name, each in samples.items():
-                rows = each.rows(self._anchor_ms)
-                places = np.column_stack([rows[column] for column in _PLACE])
-                places = places / (1e7, 1e7, _ALTITUDE_UNITS[name])
-                position = position_ned_m(places, origin).astype(np.float32)
-                parts.append(table(rows, position_ned_m=position))
-        return np.concatenate(parts)
+
+def _truth(rows: Mapping[str, Rows], origin: Geodetic | None) -> Rows:
+    none = {"time_s": np.zeros(0), "unix_s": np.zeros(0)}
+    parts = [table(none, position_ned_m=np.zeros((0, 3), np.float32))]
+    for name, unit in _TRUTH.items():
+        if origin is not None and len(rows[name]):
+            places = np.column_stack((rows[name]["place"] / 1e7, rows[name]["altitude"] / unit))
+            position = position_ned_m(places, origin).astype(np.float32)
+            parts.append(table(rows[name], position_ned_m=position))
+    return np.concatenate(parts)
+
+
+def _local(rows: Rows) -> Rows:
+    """Positions of GLOBAL_POSITION_INT relative to the first. 1e-7 deg, mm, cm/s."""
+    places = rows["place"] / (1e7, 1e7, 1e3)
+    position = position_ned_m(places, Geodetic(*places[0].tolist())) if len(rows) else places
+    return table(
+        rows,
+        position_ned_m=position.astype(np.float32),
+        velocity_ned_mps=(rows["velocity"] / 100.0).astype(np.float32),
+    )
+
+
+def _turned(rows: Rows) -> Rows:
+    """Attitudes of ATTITUDE."""
+    quaternion = quaternion_from_euler(*rows["angles"].astype(np.float64).T)
+    rates = rows["rates_radps"]
+    return table(rows, quaternion=np.asarray(quaternion, np.float32), rates_radps=rates)
 
 
 def _link_delay(requests: Rows, replies: Rows) -> Rows:

@@ -226,7 +226,7 @@ def identify(
     recorded = read(flight)
     if recorded.history.damage:
         complain(recorded.history.damage)
-    found, trace = identify_flight(recorded.sent, prior)
+    found, trace = identify_flight(recorded.history, prior)
     name = flight.name or flight.resolve().name
     text = vehicle_file(found, prior, name)
     shown = page or free_name(path.with_name("identify.html"))
