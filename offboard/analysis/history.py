@@ -94,7 +94,6 @@ _ARRAYS: dict[int, Columns] = {  # by their array_id
 }
 _NO_ATTITUDE = struct.pack("<8f", *(math.nan,) * 8)  # of a setpoint, after its stamp
 _TIMES = struct.Struct("<2d")  # time_s, unix_s
-Said = list[tuple[float, float, str]]  # texts, each with `now_ms` and the time in the log
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,8 +180,8 @@ def gather(log: Tlog) -> History:
     """Sort a log's messages into a History. A log without a vehicle gives empty arrays."""
     collector = _Collector(*_vehicle(log))
     for entry in log:
-        if log.damaged and math.isnan(collector.damage_ms):
-            collector.damage_ms = collector.now_ms
+        if log.damaged and math.isnan(collector.damage_s):
+            collector.damage_s = collector.now_s
         collector.add(entry)
     return collector.history(log.damage)
 
@@ -290,16 +289,24 @@ class _Collector:
         self._arrays = {i: Samples(_ARRAY, columns, BOOT_US) for i, columns in _ARRAYS.items()}
         self._origin: Geodetic | None = None  # of the local frame
         self._assembler = TextAssembler()
-        self._texts: Said = []  # of the vehicle
-        self._modes: Said = []
+        self._texts: list[Event] = []  # of the vehicle
+        self._modes: list[Event] = []
         self._event_records: list[tuple[float, float, bytes]] = []
         self._counts: Counter[str] = Counter()
         self._unix_us = (0, 0)
         self._anchor_ms = math.nan
         self._clocks: tuple[int, ...] = TELEMETRY + _SUBSTITUTES
         self._time = VehicleTime()
-        self.now_ms = math.nan  # stamp of the newest telemetry
-        self.damage_ms = math.nan  # of the newest one before the first damage
+        self._now_ms = math.nan  # stamp of the newest telemetry
+        self.damage_s = math.nan  # time of the newest one before the first damage
+
+    @property
+    def now_s(self) -> float:
+        """Vehicle time of the newest telemetry, NaN before it."""
+        return float(continuous_s(self._now_ms, self._anchor_ms))
+
+    def _said(self, what: str, unix_s: float) -> Event:
+        return Event(self.now_s, "vehicle", what, unix_s=unix_s)
 
     def add(self, entry: LoggedMessage) -> None:
         self._counts[entry.name] += 1
@@ -311,7 +318,7 @@ class _Collector:
             self._add_theirs(entry, entry.frame.payload)
 
     def _add_ours(self, entry: LoggedMessage, payload: bytes) -> None:
-        name, now_ms, unix_s = entry.name, self.now_ms, entry.unix_us / 1e6
+        name, now_ms, unix_s = entry.name, self._now_ms, entry.unix_us / 1e6
         if name in _OURS:
             self._ours[name].add(payload, now_ms, unix_s)
         elif name == "SET_POSITION_TARGET_LOCAL_NED":
@@ -320,34 +327,34 @@ class _Collector:
         elif name == _ARRAY and entry.message.array_id in _ARRAYS:
             self._arrays[entry.message.array_id].add(payload, now_ms, unix_s)
         elif record_type(entry) == event_record.PAYLOAD_TYPE:
-            self._event_records.append((now_ms, unix_s, entry.tunnelled))
+            self._event_records.append((self.now_s, unix_s, entry.tunnelled))
 
     def _add_theirs(self, entry: LoggedMessage, payload: bytes) -> None:
-        name, now_ms, unix_s = entry.name, self.now_ms, entry.unix_us / 1e6
+        name, now_ms, unix_s = entry.name, self._now_ms, entry.unix_us / 1e6
         if self._refused_as_ahead(entry.frame.message_id, payload):
             return
         if name in _THEIRS:
             self._theirs[name].add(payload, now_ms, unix_s)
         elif name == "STATUSTEXT":
             whole = self._assembler.add(payload, unix_s)
-            self._texts += [(now_ms, unix_s, text.text) for text in whole]
+            self._texts += [self._said(text.text, unix_s) for text in whole]
         elif name == "COMMAND_ACK":
             command, result = entry.message.command, entry.message.result
             if result not in (0, 5):  # MAV_RESULT_ACCEPTED, MAV_RESULT_IN_PROGRESS
                 refused = f"command {command} refused, result {result}"
-                self._texts.append((now_ms, unix_s, refused))
+                self._texts.append(self._said(refused, unix_s))
         elif name in ("GPS_GLOBAL_ORIGIN", "HOME_POSITION"):
             self._add_origin(entry)
         if name == "HEARTBEAT" and self._dialect:
             mode = self._dialect.mode_name(int.from_bytes(payload[:4], "little"))
-            if not self._modes or mode != self._modes[-1][-1]:
-                self._modes.append((now_ms, unix_s, mode))
+            if not self._modes or mode != self._modes[-1].what:
+                self._modes.append(self._said(mode, unix_s))
         if entry.frame.message_id in self._clocks:
             if entry.frame.message_id in TELEMETRY:
                 self._clocks = TELEMETRY
-            self.now_ms = float(int.from_bytes(payload[:4], "little"))
+            self._now_ms = float(int.from_bytes(payload[:4], "little"))
             if math.isnan(self._anchor_ms):
-                self._anchor_ms = self.now_ms
+                self._anchor_ms = self._now_ms
 
     def _refused_as_ahead(self, message_id: int, payload: bytes) -> bool:
         """Whether telemetry has a stamp so far ahead that the flight has refused it, too."""
@@ -392,19 +399,11 @@ class _Collector:
             substitutes.append("ATTITUDE")
         if not len(setpoint):
             substitutes.append("ATTITUDE_TARGET")
-        payloads = [payload for *_, payload in self._event_records]
         events = []
-        for last, event in event_record.join(payloads):
-            now_ms, unix_s, _ = self._event_records[last]
-            time_s, phase = float(continuous_s(now_ms, anchor_ms)), _PHASES.get(event.phase, "")
+        for last, event in event_record.join(payload for *_, payload in self._event_records):
+            time_s, unix_s, _ = self._event_records[last]
+            phase = _PHASES.get(event.phase, "")
             events.append(Event(time_s, "offboard", event.text, phase, event.cause, unix_s))
-        modes, texts = (
-            tuple(
-                Event(float(continuous_s(at, anchor_ms)), "vehicle", text, unix_s=unix_s)
-                for at, unix_s, text in said
-            )
-            for said in (self._modes, self._texts)
-        )
         return History(
             position=position,
             attitude=attitude,
@@ -424,15 +423,15 @@ class _Collector:
             landed=rows["EXTENDED_SYS_STATE"],
             phases=tuple(event for event in events if event.phase),
             announcements=tuple(event for event in events if not event.phase),
-            modes=modes,
-            vehicle_messages=texts,
+            modes=tuple(self._modes),
+            vehicle_messages=tuple(self._texts),
             vehicle=self._vehicle,
             dialect=self._dialect,
             messages=self._counts,
             wall_s=(self._unix_us[1] - self._unix_us[0]) / 1e6,
             substitutes=tuple(substitutes),
             damage=damage,
-            damage_s=float(continuous_s(self.damage_ms, anchor_ms)),
+            damage_s=self.damage_s,
         )
 
 
