@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,14 +125,22 @@ def _fitness(flown: History, reference: Reference, window: tuple[float, float]) 
 
 def _agitation(reference: Reference, attitude: Rows, weights: Array) -> dict[str, float]:
     """Motion beside that of the reference: thrust direction and rates minus their linear fit by
-    the reference's velocity, acceleration and jerk. The fit needs no model of drag and lag."""
-    times, share = attitude["time_s"], np.sqrt(weights / weights.sum())[:, None]
-    explained = [reference.position(times, order)[:, :2] for order in (1, 2, 3)]
-    regressors = share * np.hstack((*explained, np.ones((len(times), 1))))
-    direction = thrust_direction_from_quaternion(attitude["quaternion"])
-    motion = share * np.hstack((direction[:, :2], attitude["rates_radps"][:, :2]))
-    fit, *_ = np.linalg.lstsq(regressors, motion, rcond=None)
-    squares = ((motion - regressors @ fit) ** 2).sum(axis=0)
+    the reference's velocity, acceleration and jerk. The fit needs no model of drag and lag.
+
+    The factor R of the samples has their residuals; made of parts, it takes little memory.
+    """
+    factor: Any = np.zeros((0, 11))
+    parts = 1 + len(weights) // 8192
+    shares = np.array_split(np.sqrt(weights / weights.sum())[:, None], parts)
+    for rows, share in zip(np.array_split(attitude, parts), shares, strict=True):
+        explained = [reference.position(rows["time_s"], order)[:, :2] for order in (1, 2, 3)]
+        direction = thrust_direction_from_quaternion(rows["quaternion"])[:, :2]
+        motion = direction, rows["rates_radps"][:, :2]
+        samples = share * np.hstack((*explained, np.ones((len(rows), 1)), *motion))
+        factor = np.linalg.qr(np.vstack((factor, samples)), mode="r")
+    explained, motion = factor[:, :7], factor[:, 7:]
+    fit, *_ = np.linalg.lstsq(explained, motion, rcond=None)
+    squares = ((motion - explained @ fit) ** 2).sum(axis=0)
     tilt, rate = np.sqrt([squares[:2].sum(), squares[2:].sum()])
     return {
         "tilt_agitation_deg": float(np.degrees(tilt)),
