@@ -1,4 +1,4 @@
-"""Reads a .tlog: frames with their times, one after the other.
+"""Reads a .tlog: frames with their times, one after the other, in bounded memory.
 
 An entry is a big-endian uint64 of Unix microseconds, then one unchanged MAVLink frame. A log that
 ends inside an entry (after a crash) is read up to it. Damaged entries are skipped and counted: the
@@ -12,9 +12,8 @@ import re
 import struct
 from collections.abc import Iterator
 from functools import cache
-from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from pymavlink.dialects.v20 import all as dialect
@@ -26,6 +25,8 @@ from offboard.mavlink.framing import V1, V2, Frame, frame_size, parse
 _STAMP = struct.Struct(">Q")
 _YEAR_2000_US, _YEAR_2100_US = 946_684_800_000_000, 4_102_444_800_000_000
 _MARKER = re.compile(rb"[\xfd\xfe]")  # the first byte of a frame
+_LONGEST = 8 + 280  # bytes of an entry: a signed MAVLink 2 frame
+_BLOCK = 1 << 20
 _TUNNEL_BYTES = 133  # payload_type, target system and component, payload_length, 128 of data
 
 
@@ -86,26 +87,29 @@ class Tlog:
     def __iter__(self) -> Iterator[LoggedMessage]:
         self.damaged = self.first_damage = self.truncated = 0
         try:
-            with self.path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
-                yield from self._messages(data)
+            with self.path.open("rb") as file:
+                yield from self._messages(file)
         except OSError as error:
             raise TlogError(f"{self.path} cannot be read: {error.strerror}") from None
-        except ValueError:  # an empty file has no map
-            raise self._no_log() from None
 
-    def _messages(self, data: Any) -> Iterator[LoggedMessage]:
-        at = 0
+    def _messages(self, file: BinaryIO) -> Iterator[LoggedMessage]:
+        data, at, before = b"", 0, 0  # `before`: bytes of the file before `data`
         lost: int | None = None  # where the search for the next entry began
         found = cut = False  # `cut`: the file ends within the entry there, if its length is right
-        while len(data) - at >= 8 + 3:  # an entry can begin here
+        while True:
+            if at + _LONGEST + 9 > len(data) and (block := file.read(_BLOCK)):
+                before, data, at = before + at, data[at:] + block, 0
+                continue  # an entry, and the head of the next one
+            if len(data) - at < 8 + 3:  # no entry can begin here
+                break
             entry = _entry(data, at, certain=lost is not None)
             if entry is None:
                 if lost is None:
                     size = frame_size(data, at + 8)
                     cut = _begins(data, at) and (size is None or at + 8 + size > len(data))
-                    lost = at
+                    lost = before + at
                 marker = _MARKER.search(data, at + 9)
-                at = marker.start() - 8 if marker else len(data)
+                at = marker.start() - 8 if marker else len(data) - 8
                 continue
             if lost is not None:
                 self._count(lost)
@@ -115,21 +119,18 @@ class Tlog:
         if lost is not None and not cut:
             self._count(lost)
         else:
-            self.truncated = len(data) - (at if lost is None else lost)
+            self.truncated = before + len(data) - (before + at if lost is None else lost)
         if not found:
-            raise self._no_log()
-
-    def _no_log(self) -> TlogError:
-        return TlogError(
-            f"{self.path} is not a .tlog, or empty: it holds no time stamp and MAVLink frame"
-        )
+            raise TlogError(
+                f"{self.path} is not a .tlog, or empty: it holds no time stamp and MAVLink frame"
+            )
 
     def _count(self, place: int) -> None:
         self.damaged += 1
         self.first_damage = self.first_damage if self.damaged > 1 else place
 
 
-def _entry(data: Any, at: int, *, certain: bool) -> LoggedMessage | None:
+def _entry(data: bytes, at: int, *, certain: bool) -> LoggedMessage | None:
     """The entry that begins at `at`, None without. `certain`: its checksum must be known; else a
     message that pymavlink does not know is taken if an entry follows."""
     size = frame_size(data, at + 8) if _begins(data, at) else None
@@ -144,7 +145,7 @@ def _entry(data: Any, at: int, *, certain: bool) -> LoggedMessage | None:
     return LoggedMessage(_STAMP.unpack_from(data, at)[0], frame)
 
 
-def _begins(data: Any, at: int) -> bool:
+def _begins(data: bytes, at: int) -> bool:
     """Whether a time stamp and the first byte of a frame are at `at`, as far as the data go."""
     if at + 9 > len(data):
         return True

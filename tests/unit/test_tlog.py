@@ -100,6 +100,15 @@ def test_damage_at_the_end_is_reported_and_a_cut_entry_is_none(tmp_path: Path) -
     assert (log.damaged, log.truncated) == (0, at[-1] - at[-2] - 3)
 
 
+def test_a_log_is_read_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An entry at the border of one is found, also behind garbage."""
+    data, messages, _ = recorded()
+    monkeypatch.setattr(tlog, "_BLOCK", 1000)
+    for short in range(12):
+        log = damaged(tmp_path / "x.tlog", bytes(1000 - short) + data)
+        assert tuple(log) == messages
+
+
 def test_a_story_is_told_in_vehicle_time() -> None:
     """Every text and refusal beside the newest telemetry that lies before it in the file; a text
     in chunks (STATUSTEXT.id) is whole once a chunk ends short of its 50 bytes."""
