@@ -46,14 +46,13 @@ _TELEMETRY = (
 @dataclass(frozen=True, slots=True)
 class Flight:
     """One log. `facts` are name and value; `missing` has a sentence for each thing that the log
-    lacks; `engage_mode` is the mode of setpoints, empty for an unknown autopilot."""
+    lacks."""
 
     name: str
     history: History
     score: Score
     facts: dict[str, str]
     missing: tuple[str, ...]
-    engage_mode: str = ""
 
     @property
     def track_s(self) -> float:
@@ -101,10 +100,8 @@ def read(path: Path) -> Flight:
         **_configured(history.configuration(log)),
         "messages": f"{flown.messages.total()} in {flown.wall_s:.1f} s of computer time",
     }
-    return Flight(
-        path.name or path.resolve().name, flown, score(flown), facts, tuple(missing),
-        flown.dialect.engage_mode if flown.dialect else "",
-    )  # fmt: skip
+    name = path.name or path.resolve().name
+    return Flight(name, flown, score(flown), facts, tuple(missing))
 
 
 def _configured(text: str | None) -> dict[str, str]:
