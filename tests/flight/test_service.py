@@ -505,6 +505,8 @@ def test_a_request_that_is_being_obeyed_is_accepted_again(served: Served) -> Non
     pair.run(0.2)
     repeated = [(PAUSE_CONTINUE, ACCEPTED)] * 6 + [(SET_MODE, ACCEPTED)] * 2
     assert pair.acks == [rejected, *repeated, rejected]
+    said = [text.split(" requested by ")[0] for text in pair.service.announced if "ted by" in text]
+    assert said == ["pause", "continue", "hand back"]
 
 
 def test_a_request_is_obeyed_no_more_once_the_flight_ends_for_another_reason(
