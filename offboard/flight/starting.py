@@ -202,13 +202,14 @@ def armed(flight: FlightState) -> str:
 
 
 def disarmed_again(flight: FlightState) -> bool:
-    """A HEARTBEAT that is newer than the acceptance shows it disarmed when it should be armed. On a
-    lossy link the acceptance may come long after the first request, and a HEARTBEAT be missing."""
+    """A HEARTBEAT that is newer than the acceptance, in this phase, shows it disarmed when it should
+    be armed. On a lossy link the acceptance may come long after the first request, and a HEARTBEAT
+    be missing."""
     vehicle = flight.vehicle
     accepted = vehicle.results.get(ARM_DISARM) == "ACCEPTED"
     since_s = flight.now_s - vehicle.answered_s.get(ARM_DISARM, flight.now_s)
     shown = vehicle.disarmed and vehicle.age_s(Heartbeat) < since_s
-    return accepted and shown and since_s > ARMING_SHOWN_S
+    return accepted and shown and ARMING_SHOWN_S < since_s < flight.in_phase_s
 
 
 def stopped_before_takeoff(flight: FlightState) -> str:

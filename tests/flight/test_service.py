@@ -384,13 +384,22 @@ def test_without_arms_a_start_on_the_ground_is_rejected(served: Served) -> None:
 
 
 def test_with_arms_a_start_takes_off_and_flies(served: Served) -> None:
+    """Also after one that was stopped as it armed: each later one was stood down at once, as the
+    answer to the first arming was taken for its own."""
     pair = served(arms=True, then="land")
     pair.until(lambda: pair.phase is Phase.STANDBY)
     pair.run(10.0)
     pair.command(START)
+    pair.until(lambda: pair.armings == [1.0], 5.0)
+    pair.run(0.1)
+    pair.command(SET_MODE, 1.0)
+    pair.until(lambda: len(pair.logs.ended) == 1, 10.0)
+    assert not pair.armed
+    pair.run(3.0)
+    pair.command(START)
     pair.until(lambda: pair.phase is Phase.TRACK, 60.0)
-    pair.until(lambda: len(pair.logs.ended) == 1, 60.0)
-    assert pair.acks == [(START, ACCEPTED)]
+    pair.until(lambda: len(pair.logs.ended) == 2, 60.0)
+    assert pair.acks == [(START, ACCEPTED), (SET_MODE, ACCEPTED), (START, ACCEPTED)]
     assert pair.phase is Phase.STANDBY
     assert not pair.armed
 
