@@ -638,6 +638,25 @@ def test_what_is_heard_after_a_silence_may_be_another_vehicle(served: Served) ->
     assert pair.state.vehicle.uid == 1
 
 
+def test_what_is_heard_after_a_silence_in_health_may_be_another_vehicle_too(served: Served) -> None:
+    """A third one passes by, which prevents standby for 10 s. It was ready with the parameters of
+    the one before."""
+    pair = served("ardupilot")
+    codec = mavlink.MAVLink(None, srcSystem=9, srcComponent=1)
+    pair.run(0.5)
+    pair.forwarded.append(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3).pack(codec))
+    pair.run(3.0)
+    assert pair.state.vehicle.parameters["GUID_OPTIONS"] == 8.0
+    pair.lost_down = pair.lost_up = True
+    pair.run(6.0)
+    pair.instance.autopilot.parameters.set("GUID_OPTIONS", 0.0)
+    pair.lost_down = pair.lost_up = False
+    pair.run(6.0)
+    assert pair.phase is Phase.HEALTH
+    assert pair.said("waiting: GUID_OPTIONS is 0: without bit 3")
+    assert sum("health: no telemetry for 5" in said for said in pair.service.announced) == 1
+
+
 def test_another_hardware_number_is_another_vehicle(served: Served) -> None:
     """Asked after each silence, also before the first flight. Nothing known is of it."""
     pair = served("ardupilot")
