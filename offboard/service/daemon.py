@@ -45,6 +45,7 @@ TEMPLATE = Path(__file__).with_name("offboard.service.j2")
 PRIVATE = (Path("/tmp"), Path("/var/tmp"))  # the unit has its own
 OTHERS_READ, OTHERS_ENTER = 0o4, 0o1
 STOPPED_EARLY = "stopped before the link was open"
+UNSCORED = "{number} of the earlier flights without a score: `offboard score {newest}` makes it"
 
 
 def run(
@@ -82,6 +83,8 @@ def run(
         supervisor.await_ready()
         recorder = Recorder(directory, score=partial(begin, "report" if report else "score"))
         stack.callback(recorder.close)
+        if recorder.unscored:
+            tell(UNSCORED.format(number=len(recorder.unscored), newest=recorder.unscored[-1]))
         memory = stack.enter_context(closing(VehicleFiles(directory / "vehicles", tell)))
         manager = stack.enter_context(closing(Manager()))
         manager.tell("READY=1")
