@@ -4,7 +4,6 @@ sentence, says that the vehicle landed."""
 from __future__ import annotations
 
 import ctypes
-import fcntl
 import json
 import os
 import pty
@@ -20,7 +19,6 @@ import pytest
 from processes import RECORDING, SHORT, Called, Spawn, children, ended, eventually, full_disk
 
 from offboard.analysis import history, tlog
-from offboard.report.background import begin
 from offboard.run import flight as run
 
 NO_VEHICLE = "offboard fly --connect udpin:127.0.0.1:PORT --set limits.connect_s=0.3 --out x"
@@ -174,19 +172,3 @@ def test_an_interrupted_score_is_one_sentence(
     stop: Callable[[object], None] = lambda _: signal.raise_signal(signal.SIGINT)  # noqa: E731
     monkeypatch.setattr("offboard.analysis.score.score_flight", stop)
     assert called("offboard score", RECORDING) == (130, "", "interrupted\n")
-
-
-def test_flights_are_scored_one_after_the_other(tmp_path: Path) -> None:
-    """Of short flights a dozen processes ran beside the next one."""
-    held = os.open(tmp_path, os.O_RDONLY)
-    fcntl.flock(held, fcntl.LOCK_EX)
-    for name in ("1", "2"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "flight.tlog").write_bytes(RECORDING.read_bytes())
-    scoring = [begin("score", tmp_path / name) for name in ("1", "2")]
-    for process in scoring:
-        waits = f"-> FLOCK  ADVISORY  WRITE {process.pid} "
-        eventually(lambda waits=waits: waits in Path("/proc/locks").read_text())
-    os.close(held)
-    assert [process.wait() for process in scoring] == [0, 0]
-    assert all((tmp_path / name / "score.json").exists() for name in ("1", "2"))
