@@ -81,6 +81,7 @@ _THEIRS: dict[str, tuple[Columns, str]] = {
     "GLOBAL_POSITION_INT": ({"place": ("lat", 3), "velocity": ("vx", 3)}, BOOT_MS),
     "ATTITUDE_TARGET": (SETPOINT, BOOT_MS),
 }  # fmt: skip
+_INSTEAD_OF = {"ATTITUDE": "ATTITUDE_QUATERNION", "GLOBAL_POSITION_INT": "LOCAL_POSITION_NED"}
 _OURS: dict[str, tuple[Columns, str]] = {
     "POSITION_TARGET_LOCAL_NED": (_REFERENCE, BOOT_MS),
     "SET_ATTITUDE_TARGET": (SETPOINT, BOOT_MS),
@@ -229,6 +230,10 @@ class Samples:
         self._stamp = stamp
         self._data = bytearray()
 
+    @property
+    def empty(self) -> bool:
+        return not self._data
+
     def add(self, payload: bytes, now_ms: float, unix_s: float) -> None:
         """A message. `now_ms`: stamp of the telemetry before it, NaN without. `unix_s`: of its
         entry in the log."""
@@ -334,7 +339,9 @@ class _Collector:
         if self._refused_as_ahead(entry.frame.message_id, payload):
             return
         if name in _THEIRS:
-            self._theirs[name].add(payload, now_ms, unix_s)
+            usual = self._theirs.get(_INSTEAD_OF.get(name, ""))
+            if usual is None or usual.empty:  # else it would only take memory
+                self._theirs[name].add(payload, now_ms, unix_s)
         elif name == "STATUSTEXT":
             whole = self._assembler.add(payload, unix_s)
             self._texts += [self._said(text.text, unix_s) for text in whole]
