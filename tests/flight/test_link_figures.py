@@ -13,7 +13,7 @@ from offboard.identification.learner import IdentifySettings
 
 LAP = ("controller={law: lqr}", "reference.laps=1", "reference.height_m=1.0")
 PLAIN_DELAY_MS = 57.0  # of the vehicle itself
-SENT_HZ = 100.0
+SENT_HZ = 50.0
 
 
 def over(down: Filter, *assignments: str, aloft: bool = True, **options: object) -> Pair:

@@ -223,8 +223,9 @@ def paused(
     when: Callable[[Pair], bool] = IN_TRACK,
     **options: Any,
 ) -> tuple[Pair, Watch, float]:
-    """The process is stopped, two seconds into the track; the end of the stop."""
-    pair = on.lap(deadline_s=DEADLINE_S, **options)
+    """The process is stopped, two seconds into the track, where it accelerates little; the end of
+    the stop."""
+    pair = on.lap("reference.run_in_s=4.0", deadline_s=DEADLINE_S, **options)
     ends_s: list[float] = []
 
     def stop(pair: Pair) -> None:
