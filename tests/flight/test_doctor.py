@@ -6,8 +6,7 @@ import dataclasses
 from typing import Any
 
 import pytest
-from doctor_bench import bench, said
-from pair import LEAN
+from doctor_bench import LEAN, bench, said
 from pair import make as flight
 
 from offboard.doctor.run import verdict
