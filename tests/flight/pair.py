@@ -58,14 +58,15 @@ Filter = Callable[[float, Bytes], Bytes]
 NEEDED = ("HEARTBEAT", "SYS_STATUS", "EXTENDED_SYS_STATE", "HOME_POSITION")
 
 
-def with_rate(firmware: Firmware, rate_hz: float) -> Firmware:
+def with_rate(firmware: Firmware, rate_hz: float, *more: str) -> Firmware:
     """A vehicle that sends position and attitude at `rate_hz`, whatever rate is requested, and else
-    what a flight needs; the simulated truth is not on the wire."""
+    what a flight needs and `more`; the simulated truth is not on the wire."""
     fixed = dict.fromkeys(("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED"), rate_hz)
     known_hz = firmware.companion_rates_hz
     return replace(
         firmware,
-        companion_rates_hz={name: known_hz[name] for name in NEEDED if name in known_hz} | fixed,
+        companion_rates_hz={name: known_hz[name] for name in (*NEEDED, *more) if name in known_hz}
+        | fixed,
         fixed_streams=firmware.fixed_streams.union(fixed, ("HIL_STATE_QUATERNION", "SIM_STATE")),
     )
 
