@@ -5,11 +5,11 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pair import HOST_EPOCH_S, Bytes, decode, with_rate
+from pair import HOST_EPOCH_S, OBEDIENT, Bytes, decode
 from pydantic import TypeAdapter
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -32,7 +32,6 @@ from simulator.steps import STEP_S
 from simulator.vehicle.battery import Battery
 from simulator.vehicle.conditions import Conditions
 
-LEAN = replace(with_rate(PX4, 100.0), fixed_streams=PX4.fixed_streams)  # sends what is requested
 BOOT_S = {PX4.name: 6.0, ARDUPILOT.name: 5.0}
 BOOT_SCALE = {PX4.name: 1.0, ARDUPILOT.name: 0.1}
 # What a vehicle has that was set up as the doctor advises
@@ -127,7 +126,7 @@ def assert_read_only(sent: Sequence[Any]) -> None:
 
 
 def bench(
-    firmware: Firmware = LEAN,
+    firmware: Firmware = OBEDIENT,
     faults: Sequence[dict[str, Any]] = (),
     start: Start | None = None,
     charge: float = 1.0,

@@ -73,6 +73,8 @@ def with_rate(firmware: Firmware, rate_hz: float, *more: str) -> Firmware:
 
 # As many telemetry links: a fifth of the traffic that is requested, and half of the time of a test
 LEAN, LEAN_COPTER = with_rate(PX4, 50.0), with_rate(ARDUPILOT, 50.0)
+# One that obeys requests for rates, which are 100 Hz
+OBEDIENT = replace(with_rate(PX4, 100.0), fixed_streams=PX4.fixed_streams)
 
 
 def through(_: float, datagrams: Bytes) -> Bytes:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from faults import rewritten
-from pair import ARDUPILOT, Pair, decode, in_phase, make, on_arducopter
+from pair import ARDUPILOT, OBEDIENT, Pair, decode, in_phase, make, on_arducopter
 from pydantic import TypeAdapter
 from scipy.spatial.transform import Rotation
 
@@ -223,7 +223,7 @@ def test_ranking_of_bandwidths() -> None:
 
     def rmse_m(bandwidth_radps: int, seed: int) -> float:
         bandwidth = f"controller.bandwidth_radps={bandwidth_radps}"
-        pair = make(*lap, bandwidth, scenario="px4_like", seed=seed)
+        pair = make(*lap, bandwidth, scenario="px4_like", seed=seed, firmware=OBEDIENT)
         pair.track()
         return pair.score().rmse_position_m
 

@@ -106,7 +106,8 @@ LANDED_EARLY: dict[str, Any] = {
         lambda: copter.lap(HIGH, scenario=early("second_sender")), AWAY + NAMED, {"error_m": 5.0}
     ),
     "another companion that is not heard, on PX4": (
-        lambda: px4.lap(HIGH, "reference.laps=2", aloft=False, scenario="second_sender"),
+        lambda: px4.lap(HIGH, "reference.laps=2", "reference.run_in_s=4.0", aloft=False,
+                        scenario="second_sender"),
         "the vehicle follows setpoints of another program" + NAMED,
         {"error_m": 5.0},
     ),
