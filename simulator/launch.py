@@ -122,13 +122,13 @@ def _parameters(firmware: Firmware, assignments: tuple[str, ...]) -> dict[str, f
     values: dict[str, float] = {}
     for text in assignments:
         name, _, number = text.partition("=")
-        if name not in known:
-            raise UserError(f"--param {text}: {firmware.name} has no parameter {name}")
-        spec = known[name]
         try:
             values[name] = float(number)
         except ValueError:
             raise UserError(f"--param {text}: give NAME=NUMBER") from None
+        if name not in known:
+            raise UserError(f"--param {text}: {firmware.name} has no parameter {name}")
+        spec = known[name]
         if not spec.minimum <= values[name] <= spec.maximum:
             raise UserError(f"--param {text}: must be {spec.minimum:g} .. {spec.maximum:g}")
     return values

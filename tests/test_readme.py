@@ -152,8 +152,10 @@ def test_links_lead_to_files() -> None:
         *ROOT.glob("*/README.md"),
         *ROOT.glob("offboard/*/README.md"),
     ):
-        for target in re.findall(r"\]\(([^)#:]+)\)", readme.read_text()):
-            assert (readme.parent / target).exists(), f"{readme.relative_to(ROOT)}: {target}"
+        text = readme.read_text()
+        targets = [readme.parent / each for each in re.findall(r"\]\(([^)#:]+)\)", text)]
+        targets += [ROOT / each for each in re.findall(r"`(tests/[\w/]+\.py)`", text)]
+        assert [each for each in targets if not each.exists()] == []
 
 
 def test_scenario_example_is_valid(

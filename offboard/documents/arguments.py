@@ -11,6 +11,7 @@ from typer.core import TyperCommand
 from offboard.documents.command_line import INTERRUPT, INTERRUPTED
 from offboard.documents.errors import UserError, shown
 
+UsageError: Any = BadParameter.__base__  # an unknown option, too; typer does not export it
 LIVE_PAGE = "127.0.0.1:8014"
 # options whose value may be omitted, and what they then have
 OPTIONAL_VALUES = {"--live": LIVE_PAGE}
@@ -44,7 +45,7 @@ class Command(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         try:
             return self._parsed(ctx, _completed(args))
-        except BadParameter as error:
+        except UsageError as error:
             words = error.format_message().replace("Value error, ", "").split()
             sentence = " ".join(words).rstrip(".")
             raise UserError(f"{sentence}; see `{ctx.command_path} --help`") from None

@@ -264,7 +264,9 @@ def _loaded(text: str, source: str) -> Any:
         mark = getattr(error, "problem_mark", None)
         place = _at(mark, source) if mark else source
         problem = getattr(error, "problem", None) or " ".join(str(error).split())
-        raise DocumentError(f"{place}: {problem}") from None
+        wrong = isinstance(error, yaml.scanner.ScannerError | yaml.parser.ParserError)
+        hint = "; check indentation, colons and quotes" if wrong else ""
+        raise DocumentError(f"{place}: {problem}{hint}") from None
     except RecursionError:
         raise DocumentError(f"{source}: nested too deeply") from None
 

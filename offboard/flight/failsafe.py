@@ -231,8 +231,7 @@ def no_thrust_reserve(flight: FlightState) -> str:
 def sinks_with_full_thrust(flight: FlightState) -> str:
     """Downward speed while the newest setpoint demands the full thrust.
 
-    Other rows act on an old position (blind)
-    and on missing setpoints (decisions)."""
+    Other rows act on an old position (blind) and on missing setpoints (decisions)."""
     position, thrusts = flight.vehicle.position, flight.thrusts
     if flight.phase not in TRACKING or position is None or not thrusts:
         return ""

@@ -212,6 +212,7 @@ class Flight(FlightState):
             flying=self.vehicle.armed,
             reported_s=authority.arrived_s,
             holding=self.phase is Phase.HOLD,
+            landing=self.phase is Phase.LAND,
             loss=authority.loss,
             sticks=health is not None and health.radio_ok,
             starved=self.starved or authority.standing is Standing.FAILSAFE,

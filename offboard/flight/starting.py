@@ -52,7 +52,9 @@ def silent_for_long(flight: FlightState) -> str:
 
 
 def silent_for_another(flight: FlightState) -> str:
-    return silent_for(flight, OTHER_VEHICLE_S)
+    """HEALTH begins anew, but only if something was heard in it."""
+    heard = flight.phase is not HEALTH or flight.in_phase_s > flight.silence_s
+    return silent_for(flight, OTHER_VEHICLE_S) if heard else ""
 
 
 def other_vehicle(flight: FlightState) -> str:
@@ -202,13 +204,14 @@ def armed(flight: FlightState) -> str:
 
 
 def disarmed_again(flight: FlightState) -> bool:
-    """A HEARTBEAT that is newer than the acceptance shows it disarmed when it should be armed. On a
-    lossy link the acceptance may come long after the first request, and a HEARTBEAT be missing."""
+    """A HEARTBEAT that is newer than the acceptance, in this phase, shows it disarmed when it
+    should be armed. On a lossy link the acceptance may come long after the first request, and a
+    HEARTBEAT be missing."""
     vehicle = flight.vehicle
     accepted = vehicle.results.get(ARM_DISARM) == "ACCEPTED"
     since_s = flight.now_s - vehicle.answered_s.get(ARM_DISARM, flight.now_s)
     shown = vehicle.disarmed and vehicle.age_s(Heartbeat) < since_s
-    return accepted and shown and since_s > ARMING_SHOWN_S
+    return accepted and shown and ARMING_SHOWN_S < since_s < flight.in_phase_s
 
 
 def stopped_before_takeoff(flight: FlightState) -> str:
@@ -278,7 +281,7 @@ SERVICE_WAITS = (
     Transition({CONNECT}, stop_requested, FAILED, FLOWN, OPERATOR),
     Transition({CONNECT}, vehicle_found, HEALTH),
     Transition({STANDBY}, rebooted, FAILED, FLOWN, "restart"),
-    Transition({STANDBY}, silent_for_another, HEALTH),
+    Transition({HEALTH, STANDBY}, silent_for_another, HEALTH),
     # before a stop: what has just been engaged is handed back
     Transition({HEALTH, STANDBY}, abandoned, HAND_BACK, FLOWN, reason=ABANDONED),
     Transition({STANDBY}, engaged_by_pilot, CLIMB, FLOWN),

@@ -212,10 +212,10 @@ def _answer(flight: FlightState, asked: CommandRequest) -> None:
             wanted = {0.0: Request.PAUSE, 1.0: Request.CONTINUE}
             request, result = wanted.get(asked.parameters[0], request), Result.DENIED
     if request is not Request.NONE:
-        result = _take_request(flight, request)
-    if result is Result.ACCEPTED:
-        sender = f"system {asked.system_id} component {asked.component_id}"
-        outbox.announce(flight, f"{request.value} requested by {sender}")
+        before, result = flight.request, _take_request(flight, request)
+        if flight.request is not before:  # else it repeats one
+            sender = f"system {asked.system_id} component {asked.component_id}"
+            outbox.announce(flight, f"{request.value} requested by {sender}")
     outbox.send(flight, CommandResult(asked.command, result, asked.system_id, asked.component_id))
 
 

@@ -30,7 +30,7 @@ from offboard.mavlink.outgoing import Timesync
 REPLIES_MIN, REPLIES_MAX, REPLIES_NEWEST = 5, 40, 5
 REPLIES_MEASURED = 20  # two seconds: a link that saturates has shown it
 DELAY_MAX_S = 10.0  # a larger difference belongs to another clock
-REQUESTS_MAX = 100  # of DELAY_MAX_S
+REQUESTS_MAX = 6100  # of the longest `Limits.silence_s`, at the shortest period
 NORMAL = 1.4826  # standard deviation of a normal distribution / median absolute deviation
 WINDOW_S, BIN_S = 5.0, 0.1
 RATE_OVER_S, RATE_EVERY_S = 1.0, 1.0  # the rate: from how much at least, and how often
@@ -108,6 +108,8 @@ class VehicleClock:
             return False
         self._requests.remove(asked)  # a duplicate must not count again
         self._answered_s = max(self._answered_s, asked[1])
+        while self._requests and self._requests[0][1] < self._answered_s - DELAY_MAX_S:
+            self._requests.popleft()  # lost
         delay_s = (reply.vehicle_ns - reply.request_ns) * 1e-9
         if 0.0 <= delay_s <= DELAY_MAX_S:
             self._delays_s.append(delay_s)

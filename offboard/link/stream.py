@@ -65,8 +65,10 @@ def open_port(device: str, baud: int) -> Stream:
     try:
         port = serial.Serial(device, baud, timeout=0, exclusive=True)
     except (serial.SerialException, ValueError, OverflowError) as error:
+        number = getattr(error, "errno", None)  # pyserial's text has it and the device twice
+        reason = os.strerror(number) if number else error
         raise LinkUnavailable(
-            f"serial port {device} at {baud} baud cannot be opened: {error}"
+            f"serial port {device} at {baud} baud cannot be opened: {reason}"
         ) from None
     return Stream(port.fileno(), port.close)
 

@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections import deque
 from enum import Enum, auto
 
-# Stamps older than the newest by more than _REBOOT_S are late, and those ahead of it by more than
-# _NEAR_S are wrong, unless they go on so: so many in a row, over so long, each within _GAP_S of
-# the one before, are a new epoch
+# Stamps older than the newest by more than _REBOOT_S are late, and those ahead of it by more are
+# wrong, unless they go on so: so many in a row, over so long, each within _GAP_S of the one before,
+# are a new epoch
 _REBOOT_S = 2.0
 _EPOCH_STAMPS, _EPOCH_S, _GAP_S = 3, 0.1, 10.0
 # So often within this time a stamp of this epoch follows one of another: two clocks send by turns
@@ -75,8 +75,7 @@ class VehicleTime:
     def check(self, message_id: int, time_s: float) -> Age:
         """`time_s`: the stamp, continued by `wrapped_s`."""
         last_s = self._last_s.get(message_id)
-        ahead_s = time_s - self.newest_s
-        if self._last_s and not -_REBOOT_S <= ahead_s <= _NEAR_S:
+        if self._last_s and abs(time_s - self.newest_s) > _REBOOT_S:
             stuck = time_s == last_s
             return Age.STALE if stuck else self._check_epoch(message_id, time_s)
         if self._other:

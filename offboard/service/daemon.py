@@ -45,6 +45,7 @@ TEMPLATE = Path(__file__).with_name("offboard.service.j2")
 PRIVATE = (Path("/tmp"), Path("/var/tmp"))  # the unit has its own
 OTHERS_READ, OTHERS_ENTER = 0o4, 0o1
 STOPPED_EARLY = "stopped before the link was open"
+UNSCORED = "{number} of the earlier flights without a score: `offboard score {newest}` makes it"
 
 
 def run(
@@ -82,6 +83,8 @@ def run(
         supervisor.await_ready()
         recorder = Recorder(directory, score=partial(begin, "report" if report else "score"))
         stack.callback(recorder.close)
+        if recorder.unscored:
+            tell(UNSCORED.format(number=len(recorder.unscored), newest=recorder.unscored[-1]))
         memory = stack.enter_context(closing(VehicleFiles(directory / "vehicles", tell)))
         manager = stack.enter_context(closing(Manager()))
         manager.tell("READY=1")
@@ -201,7 +204,7 @@ def unreadable(path: Path) -> str:
     """Why the user of the unit cannot read this file or directory; empty if it can."""
     for place in (path.absolute(), path.resolve()):
         if any(private in place.parents for private in PRIVATE):
-            return f"the unit cannot see {place}: it has a {place.parts[1]} of its own"
+            return f"the unit cannot see {place}: it has a /tmp of its own; put it elsewhere"
         closed = [each for each in place.parents if not each.stat().st_mode & OTHERS_ENTER]
         if not place.stat().st_mode & OTHERS_READ:
             closed.append(place)

@@ -137,8 +137,8 @@ class Flights:
         self.current.announce(f"flight {self.engagements}, recorded in {directory}")
         if known := self._known:
             self.current.announce(
-                f"this vehicle was identified before: tilt delay {1e3 * known.delay.value:.0f} ms, "
-                f"hover thrust {known.vehicle.hover_thrust:.3f}; no identification steps"
+                f"this vehicle was identified before: tilt delay {1e3 * known.delay.value:.0f} ms; "
+                "no identification steps"
             )
 
     def close(self) -> None:

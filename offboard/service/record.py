@@ -110,7 +110,7 @@ class FlightRecord(FlightLog):
 class Recorder:
     """The log of the loop, and the directories of the flights, below `directory`. No method but
     `close` waits. `score` starts the process that scores a flight, and outlives this one; a failure
-    is ignored."""
+    is ignored. `unscored`: the flights of earlier services that have no score."""
 
     def __init__(
         self,
@@ -132,6 +132,8 @@ class Recorder:
         self._engaged = sorted(path.parent for path in directory.glob(f"*/{ENGAGED}"))
         self._left, self._left_until_s = _left(self._engaged)
         self._vehicle = ""
+        logs = sorted(directory.glob("*/flight.tlog"))
+        self.unscored = [log.parent for log in logs if not (log.parent / "score.json").exists()]
         # read once: in flight the file system may keep its caller waiting
         self._taken = {path.name for path in directory.iterdir()}
 

@@ -1,8 +1,9 @@
 """Recovery: what the supervisor asks of a vehicle that has lost its controller. No I/O, no clock.
 
-Hold, and after some seconds land. Both are requested only while the vehicle shows the mode of our
-setpoints or one that we requested, and at most once for each report of the mode. Any other mode is
-the decision of a pilot or of the vehicle's own failsafe, and final, whatever is reported after it.
+Hold, and after some seconds land; at once land, if the controller was landing it. Both are
+requested only while the vehicle shows the mode of our setpoints or one that we requested, and at
+most once for each report of the mode. Any other mode is the decision of a pilot or of the vehicle's
+own failsafe, and final, whatever is reported after it.
 So is hold if it was reported before our request, if the vehicle did not acknowledge the request
 though it was repeated, or if it comes after the landing mode.
 
@@ -49,7 +50,8 @@ class Supervised:
     """What the controller tells, and the supervisor must know before it may act: the vehicle,
     whether it is `ours`, in the mode of our setpoints or in one that we asked for, by a report that
     arrived at `reported_s` (`clock.monotonic_s`), of which the supervisor judges the age; whether
-    it may be `flying`, and whether it was asked to hold (`holding`): then this mode is ours, too.
+    it may be `flying`, and whether it was asked to hold (`holding`): then this mode is ours, too;
+    or to land (`landing`).
     `loss`: what its autopilot does without setpoints; `sticks`: it receives those of a pilot;
     `starved`: setpoints were missing already, or its failsafe for that flies it."""
 
@@ -58,6 +60,7 @@ class Supervised:
     flying: bool
     reported_s: float = -math.inf
     holding: bool = False
+    landing: bool = False
     loss: SetpointLoss = NEVER
     sticks: bool = False
     starved: bool = False
@@ -78,6 +81,7 @@ class Recovery:
     ) -> None:
         self._dialect = dialect
         self._holding = known.holding
+        self._hold_s = 0.0 if known.landing else HOLD_S
         self._began_s = began_s
         self._loss = known.loss
         missing_s = min(beat_s, began_s) + known.loss.after_s - EARLY_S
@@ -94,7 +98,7 @@ class Recovery:
         self._first_s = math.inf  # time of the first request
         self._asked_s = -math.inf
         self._acknowledged = False
-        self._landing = False  # the landing mode was shown
+        self._landing = known.landing  # or the landing mode was shown
         self._left_for = ""  # the mode that neither controller nor supervisor has requested
         self._left_s = -math.inf
         self._heartbeat_s = -math.inf
@@ -193,9 +197,10 @@ class Recovery:
 
     def _wanted(self, now_s: float) -> CommandLong | None:
         hold, land = self._dialect.hold(), self._dialect.land()
+        first = hold if now_s - self._began_s < self._hold_s else land
         fresh = now_s - self._reported_s < FRESH_S
         if self._mode is None:
-            return hold if fresh and self._requests < UNHEARD_MAX else None
+            return first if fresh and self._requests < UNHEARD_MAX else None
         answered = self._reported_s > self._asked_s and fresh
         if self._fallen_s < math.inf:
             lands = self._mode == self._dialect.return_mode or now_s - self._sank_s < SINK_S
@@ -204,7 +209,7 @@ class Recovery:
         if not answered or self._mode == self._dialect.land_mode:
             return None
         if self._mode == self._dialect.engage_mode:
-            return hold if now_s - self._began_s < HOLD_S else land
+            return first
         if not (self._holding or self._acknowledged):
             return hold  # it holds, but the acknowledgement may have been lost
         return land if now_s - self._held_s >= HOLD_S else None

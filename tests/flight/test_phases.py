@@ -110,6 +110,7 @@ _reach_start, _climb_late = _climb(1.0, True), _climb(90.1, False)
 def _refuse_arming(flight: FlightState) -> None:
     hear(flight, CommandAck(400, "ACCEPTED"))
     flight.vehicle.answered_s[400] = NOW_S - 2.6
+    flight.began_s = NOW_S - 2.7
     heartbeat(flight, armed=False)
 
 
@@ -189,7 +190,7 @@ EVENTS: dict[str, Setup] = {
     "unheard_on_ground": _unhear_mode,
     "out_of_reach": _set(silence_s=OUTAGE_MAX_S + 0.1),
     "silent_on_ground": _set(silence_s=20.1),
-    "silent_for_another": _set(silence_s=5.1),
+    "silent_for_another": _all(_since(5.2), _set(silence_s=5.1)),
     "not_found": _set(silence_s=20.1),
     "not_ready_in_time": _since(Limits().health_s + 0.1),
     "not_engaged": _since(Limits.engage_s + 0.1),
@@ -262,7 +263,7 @@ def test_the_service_waits_for_ever() -> None:
         for phase in (Phase.CONNECT, Phase.HEALTH, Phase.STANDBY, Phase.PAUSE):
             silent = phase in (Phase.CONNECT, Phase.HEALTH)
             flight = uneventful(phase, service)
-            flight.began_s, flight.silence_s = -1e6, 1e6 if silent else 0.0
+            flight.began_s, flight.silence_s = -1e6, 2e6 if silent else 0.0
             assert next_row(flight) is None
     targets: dict[str, Phase | None] = {}
     for then, service in SERVICES.items():

@@ -103,6 +103,19 @@ def test_only_what_is_ours_is_asked_for_more(dialect: Dialect) -> None:
 
 
 @FIRMWARES
+def test_a_landing_goes_on(dialect: Dialect) -> None:
+    """It was interrupted for 5 s of hold, and a hold that a pilot chose was taken for an answer."""
+    landing = replace(OURS, landing=True)
+    down = beats(dialect.land_mode, 8.5, 8.5, armed=False)
+    for mode in (dialect.land_mode, dialect.engage_mode):
+        commands, ended = asked(dialect, *beats(mode, 0.5, 7.5), *down, known=landing)
+        assert (set(words(commands)), ended) == ({LAND}, DISARMED)
+    commands, ended = asked(dialect, *beats(dialect.hold_mode, 0.5, 9.5), known=landing)
+    assert (set(words(commands)), ended[:17]) == ({LAND}, "the vehicle shows")
+    assert commands[-1][0] < 0.5
+
+
+@FIRMWARES
 def test_a_vehicle_that_is_not_heard_or_does_not_obey(dialect: Dialect) -> None:
     """Three requests if nothing at all is heard; else one for each report, at last to land."""
     commands, ended = asked(dialect)

@@ -114,7 +114,8 @@ def test_engaged_handed_back_and_engaged_again(served: Served, on: str) -> None:
     counted = rf"this computer was too busy: [45] of ({ticks}|{ticks + 1}) ticks were "
     assert re.fullmatch(rf"{counted}skipped, pauses up to 0\.5[0-9] s", busy)
     assert len(pair.logs.begun) == len(pair.logs.ended) == 2
-    assert pair.said("this vehicle was identified before")
+    known = r"this vehicle was identified before: tilt delay \d+ ms; no identification steps"
+    assert any(re.fullmatch(known, said) for said in pair.service.announced)  # no hover thrust
     pair.engage()
     pair.run(1.0)
     pair.service.request_stop()
@@ -383,13 +384,22 @@ def test_without_arms_a_start_on_the_ground_is_rejected(served: Served) -> None:
 
 
 def test_with_arms_a_start_takes_off_and_flies(served: Served) -> None:
+    """Also after one that was stopped as it armed: each later one was stood down at once, as the
+    answer to the first arming was taken for its own."""
     pair = served(arms=True, then="land")
     pair.until(lambda: pair.phase is Phase.STANDBY)
     pair.run(10.0)
     pair.command(START)
+    pair.until(lambda: pair.armings == [1.0], 5.0)
+    pair.run(0.1)
+    pair.command(SET_MODE, 1.0)
+    pair.until(lambda: len(pair.logs.ended) == 1, 10.0)
+    assert not pair.armed
+    pair.run(3.0)
+    pair.command(START)
     pair.until(lambda: pair.phase is Phase.TRACK, 60.0)
-    pair.until(lambda: len(pair.logs.ended) == 1, 60.0)
-    assert pair.acks == [(START, ACCEPTED)]
+    pair.until(lambda: len(pair.logs.ended) == 2, 60.0)
+    assert pair.acks == [(START, ACCEPTED), (SET_MODE, ACCEPTED), (START, ACCEPTED)]
     assert pair.phase is Phase.STANDBY
     assert not pair.armed
 
@@ -504,6 +514,8 @@ def test_a_request_that_is_being_obeyed_is_accepted_again(served: Served) -> Non
     pair.run(0.2)
     repeated = [(PAUSE_CONTINUE, ACCEPTED)] * 6 + [(SET_MODE, ACCEPTED)] * 2
     assert pair.acks == [rejected, *repeated, rejected]
+    said = [text.split(" requested by ")[0] for text in pair.service.announced if "ted by" in text]
+    assert said == ["pause", "continue", "hand back"]
 
 
 def test_a_request_is_obeyed_no_more_once_the_flight_ends_for_another_reason(
@@ -624,6 +636,25 @@ def test_what_is_heard_after_a_silence_may_be_another_vehicle(served: Served) ->
     pair.state.vehicle.parameters["GUID_OPTIONS"] = 8.0  # as a ground station sets it
     pair.until(lambda: pair.phase is Phase.STANDBY, 5.0)
     assert pair.state.vehicle.uid == 1
+
+
+def test_what_is_heard_after_a_silence_in_health_may_be_another_vehicle_too(served: Served) -> None:
+    """A third one passes by, which prevents standby for 10 s. It was ready with the parameters of
+    the one before."""
+    pair = served("ardupilot")
+    codec = mavlink.MAVLink(None, srcSystem=9, srcComponent=1)
+    pair.run(0.5)
+    pair.forwarded.append(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3).pack(codec))
+    pair.run(3.0)
+    assert pair.state.vehicle.parameters["GUID_OPTIONS"] == 8.0
+    pair.lost_down = pair.lost_up = True
+    pair.run(6.0)
+    pair.instance.autopilot.parameters.set("GUID_OPTIONS", 0.0)
+    pair.lost_down = pair.lost_up = False
+    pair.run(6.0)
+    assert pair.phase is Phase.HEALTH
+    assert pair.said("waiting: GUID_OPTIONS is 0: without bit 3")
+    assert sum("health: no telemetry for 5" in said for said in pair.service.announced) == 1
 
 
 def test_another_hardware_number_is_another_vehicle(served: Served) -> None:

@@ -107,6 +107,8 @@ def test_a_pilot_engages_and_a_stop_hands_back(
     second service, another vehicle, SIGTERM in flight, and SIGKILL in the next one."""
     create_key(tmp_path / "key")
     key = read_key(tmp_path / "key")
+    (early := tmp_path / "out" / "early").mkdir(parents=True)
+    (early / "flight.tlog").touch()  # its service was killed
     port, web = free_port(), free_port()
     pilot.codec = signing(255, 190, key)
     link, page = f"udpin:127.0.0.1:{port}", f"127.0.0.1:{web}"
@@ -149,7 +151,9 @@ def test_a_pilot_engages_and_a_stop_hands_back(
     assert all({"time", "level", "event", "phase"} <= line.keys() for line in lines)
     assert any("engaged: OFFBOARD in the air" in line["event"] for line in lines)
     assert sum("stop requested" in line["event"] for line in lines) == 1
-    (flight,) = [path for path in (tmp_path / "out").iterdir() if (path / "flight.tlog").exists()]
+    (flight,) = {path.parent for path in (tmp_path / "out").glob("*/flight.tlog")} - {early}
+    unscored = "1 of the earlier flights without a score: `offboard score out/early` makes it"
+    assert [line["event"] for line in lines].count(unscored) == 1
     eventually((flight / "score.json").exists)
     kept = (flight / "score.json").read_text()
     assert json.loads(kept)["phases"]
@@ -180,7 +184,7 @@ def test_the_unit_is_valid(called: Called, tmp_path: Path) -> None:
     files = ("--config", "./my $ %.yaml", "--signing-key", "my %.key")
     code, printed, said = called("offboard daemon --print-unit", *link, *files)
     assert code == 0
-    assert f"the unit cannot see {tmp_path / 'my $ %.yaml'}: it has a tmp of its own" in (
+    assert f"the unit cannot see {tmp_path / 'my $ %.yaml'}: it has a /tmp of its own; put" in (
         " ".join(said.split())
     )
     unit = tmp_path / "offboard.service"

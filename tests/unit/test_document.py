@@ -138,7 +138,11 @@ def test_a_description_is_read_and_is_no_part_of_the_value() -> None:
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("title: [1", "d.yaml, line 1, column 10: expected ',' or ']', but got '<stream end>'"),
+        (
+            "title: [1",
+            "d.yaml, line 1, column 10: expected ',' or ']', but got '<stream end>'"
+            "; check indentation, colons and quotes",
+        ),
         ("title: x\ntitle: y", "d.yaml, line 2, column 1: the key 'title' is given twice"),
         ("- a\n- b", "d.yaml: expected a mapping of keys to values, not ['a', 'b']"),
         (

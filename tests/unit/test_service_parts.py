@@ -103,7 +103,7 @@ def test_what_a_killed_service_has_not_done(tmp_path: Path, age_s: int, left: st
     changed_s = time.time() - age_s
     os.utime(cut / "flight.tlog", (changed_s, changed_s))
     recorder, _ = recorded(tmp_path)
-    assert recorder.left == left
+    assert (recorder.left, recorder.unscored) == (left, [cut])
     recorder.settle()
     assert recorder.left == ""
     recorder.close()

@@ -215,6 +215,16 @@ def test_replies_to_others_late_and_duplicate_ones_are_ignored() -> None:
     assert link.delay == Estimate(pytest.approx(0.05), 0.0)
 
 
+def test_all_requests_without_a_reply_count_in_the_longest_silence_s() -> None:
+    """At the shortest period. Before, 100 did: no uplink was lost with `silence_s` of 10 s."""
+    link = VehicleClock()
+    for number in range(5):
+        link.on_reply(reply(link, float(number), 0.05))
+    for at_s in every(0.01, 0.01, 60.005):
+        link.request(10.0 + at_s, at_s)
+    assert link.overdue(60.2) == 6000
+
+
 @pytest.mark.parametrize(("delay_s", "measured_s"), [(0.05, 2.0), (4.4, 6.3), (math.inf, 10.1)])
 def test_link_delay_is_measured_by_twenty_replies(delay_s: float, measured_s: float) -> None:
     """Behind a full buffer of 50 kB, at 11.5 kB/s, the first one takes 4.4 s. Without any, the
