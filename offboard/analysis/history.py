@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import math
 import struct
-from array import array
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,11 +23,9 @@ from offboard.flight.phases import PHASE_CODES
 from offboard.flight.record import (
     COMPONENT_ID,
     FIELDS,
-    IDENTIFIED_NAME,
-    NAN,
+    IDENTIFIED_ID,
     RECORD_COMPONENT_ID,
-    RECORD_NAME,
-    TickRecord,
+    RECORD_ID,
 )
 from offboard.identification.vehicle_fit import RECORDED
 from offboard.mavlink import event_record
@@ -38,13 +35,13 @@ from offboard.mavlink.decode import (
     UNIT_LENGTHS,
     VELOCITY_LIMIT_MPS,
     Address,
-    decode_identity,
 )
 from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.framing import HEARTBEAT
 from offboard.mavlink.senders import DIALECTS, is_vehicle
 from offboard.mavlink.texts import TextAssembler
 from offboard.mavlink.vehicle_time import Age, VehicleTime
+from offboard.model.frames import quaternion_from_euler
 from offboard.model.geodesy import Geodetic, origin_of, position_ned_m
 
 Array = NDArray[np.float64]
@@ -64,7 +61,9 @@ _MOTION = {"position_ned_m": ("x", 3), "velocity_ned_mps": ("vx", 3)}
 _REFERENCE = {**_MOTION, "acceleration_ned_mps2": ("afx", 3), "heading_rad": ("yaw", 1)}
 SETPOINT = {"quaternion": ("q", 4), "thrust": ("thrust", 1)}
 _BATTERY = {"voltage": ("voltage_battery", 1), "remaining": ("battery_remaining", 1)}
+_TIMESYNC: tuple[Columns, str] = ({"answered_ns": ("tc1", 1), "asked_ns": ("ts1", 1)}, BEFORE)
 _THEIRS: dict[str, tuple[Columns, str]] = {
+    "TIMESYNC": _TIMESYNC,
     "LOCAL_POSITION_NED": (_MOTION, BOOT_MS),
     "ATTITUDE_QUATERNION": (
         {"quaternion": ("q1", 4), "rates_radps": ("rollspeed", 3)}, BOOT_MS
@@ -74,30 +73,27 @@ _THEIRS: dict[str, tuple[Columns, str]] = {
     ),
     "SYS_STATUS": (_BATTERY, BEFORE),
     "EXTENDED_SYS_STATE": ({"state": ("landed_state", 1)}, BEFORE),
+    # true positions of a simulated vehicle
+    "HIL_STATE_QUATERNION": ({"place": ("lat", 2), "altitude": ("alt", 1)}, BOOT_US),
+    "SIM_STATE": ({"place": ("lat_int", 2), "altitude": ("alt", 1)}, BEFORE),
+    # what ground stations record instead
+    "ATTITUDE": ({"angles": ("roll", 3), "rates_radps": ("rollspeed", 3)}, BOOT_MS),
+    "GLOBAL_POSITION_INT": ({"place": ("lat", 3), "velocity": ("vx", 3)}, BOOT_MS),
+    "ATTITUDE_TARGET": (SETPOINT, BOOT_MS),
 }  # fmt: skip
 _OURS: dict[str, tuple[Columns, str]] = {
     "POSITION_TARGET_LOCAL_NED": (_REFERENCE, BOOT_MS),
     "SET_ATTITUDE_TARGET": (SETPOINT, BOOT_MS),
+    "TIMESYNC": _TIMESYNC,
 }
-_PLACE = {"latitude": ("lat", 1), "longitude": ("lon", 1), "altitude": ("alt", 1)}
-_SIM_PLACE = {"latitude": ("lat_int", 1), "longitude": ("lon_int", 1), "altitude": ("alt", 1)}
-_TRUTH: dict[str, tuple[Columns, str]] = {
-    "HIL_STATE_QUATERNION": (_PLACE, BOOT_US),
-    "SIM_STATE": (_SIM_PLACE, BEFORE),
+_TRUTH = {"HIL_STATE_QUATERNION": 1e3, "SIM_STATE": 1.0}  # units of the altitude in a metre
+_ARRAY = "DEBUG_FLOAT_ARRAY"
+_ARRAYS: dict[int, Columns] = {  # by their array_id
+    RECORD_ID: {name: ("data", 1, place) for place, name in enumerate(FIELDS)},
+    IDENTIFIED_ID: {name: ("data", 2, 2 * place) for place, name in enumerate(RECORDED)},
 }
-_ALTITUDE_UNITS = {"HIL_STATE_QUATERNION": 1e3, "SIM_STATE": 1.0}  # in a metre
-_ARRAY, _DATA = "DEBUG_FLOAT_ARRAY", 20  # and where its data begin
-_TICK = {name: ("data", 1, place) for place, name in enumerate(FIELDS)}
-_IDENTIFIED = {name: ("data", 2, 2 * place) for place, name in enumerate(RECORDED)}
-_FIRST_FIELDS = 28  # of a record; smaller numbers are versions of before 0.1
-_DEFAULTS = struct.pack(  # of records of an older version, which lack the last fields
-    f"<{len(FIELDS)}f",
-    *(NAN if each.default is MISSING else each.default for each in fields(TickRecord)),
-)
-_NO_ATTITUDE = struct.pack("<8f", *(NAN,) * 8)  # of a setpoint, after its stamp
-_TIMESYNC = struct.Struct("<qq")  # tc1, ts1
+_NO_ATTITUDE = struct.pack("<8f", *(math.nan,) * 8)  # of a setpoint, after its stamp
 _TIMES = struct.Struct("<2d")  # time_s, unix_s
-Said = list[tuple[float, float, str]]  # texts, each with `now_ms` and the time in the log
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,12 +120,14 @@ class History:
     """Structured arrays (N,) in the order of arrival, and events. Each has `time_s`, `unix_s` (the
     time in the log), and:
 
-    position: position_ned_m, velocity_ned_mps (LOCAL_POSITION_NED)
-    attitude: quaternion (w, x, y, z), rates_radps (ATTITUDE_QUATERNION)
+    position: position_ned_m, velocity_ned_mps (LOCAL_POSITION_NED, or GLOBAL_POSITION_INT, then
+        relative to the first one)
+    attitude: quaternion (w, x, y, z), rates_radps (ATTITUDE_QUATERNION, or ATTITUDE)
     truth: position_ned_m (HIL_STATE_QUATERNION or SIM_STATE; empty without)
     reference: position, velocity and acceleration, heading_rad (POSITION_TARGET_LOCAL_NED)
     setpoint: quaternion, thrust (SET_ATTITUDE_TARGET); the last two NaN for a setpoint of
         the autopilot's own position loop (SET_POSITION_TARGET_LOCAL_NED)
+    commanded: the same, or in a log without ours what the vehicle reports (ATTITUDE_TARGET)
     identified: value and sd of each constant of `identification.vehicle_fit.RECORDED`
     link_delay: delay_s, at the telemetry that a TIMESYNC request followed; without `unix_s`
     heartbeat: armed (1 or 0), system_status (MAV_STATE)
@@ -140,6 +138,7 @@ class History:
     `phases` and `announcements` are our own, by their records; `modes` and `vehicle_messages`
     (STATUSTEXT, refused commands) the vehicle's. `vehicle` is the one that our record of it
     names, else the first autopilot that was heard. Only its messages, and ours, are used.
+    `substitutes` are the messages that take the place of others in the log of a ground station.
     It and `dialect` are None without one, `dialect` also for one that is not known. `damage` says
     what could not be read, `damage_s` is the time of the telemetry before the first damage, NaN
     without.
@@ -150,6 +149,7 @@ class History:
     truth: Rows
     reference: Rows
     setpoint: Rows
+    commanded: Rows
     records: Rows
     identified: Rows
     link_delay: Rows
@@ -164,6 +164,7 @@ class History:
     dialect: Dialect | None
     messages: Counter[str]
     wall_s: float
+    substitutes: tuple[str, ...] = ()
     damage: str = ""
     damage_s: float = math.nan
 
@@ -179,8 +180,8 @@ def gather(log: Tlog) -> History:
     """Sort a log's messages into a History. A log without a vehicle gives empty arrays."""
     collector = _Collector(*_vehicle(log))
     for entry in log:
-        if log.damaged and math.isnan(collector.damage_ms):
-            collector.damage_ms = collector.now_ms
+        if log.damaged and math.isnan(collector.damage_s):
+            collector.damage_s = collector.now_s
         collector.add(entry)
     return collector.history(log.damage)
 
@@ -283,23 +284,29 @@ class _Collector:
 
     def __init__(self, vehicle: Address | None, dialect: Dialect | None) -> None:
         self._vehicle, self._dialect = vehicle, dialect
-        specs = _THEIRS | _OURS
-        self._samples = {name: Samples(name, *spec) for name, spec in specs.items()}
-        self._records = Samples(_ARRAY, _TICK, BOOT_US)
-        self._identified = Samples(_ARRAY, _IDENTIFIED, BOOT_US)
-        self._truth: list[tuple[Geodetic, dict[str, Samples]]] = []  # by the local frame's origin
-        self._asked_ns, self._answered_ns = array("q"), array("q")  # of TIMESYNC; ts1, and ts1, tc1
+        self._theirs = {name: Samples(name, *spec) for name, spec in _THEIRS.items()}
+        self._ours = {name: Samples(name, *spec) for name, spec in _OURS.items()}
+        self._arrays = {i: Samples(_ARRAY, columns, BOOT_US) for i, columns in _ARRAYS.items()}
+        self._origin: Geodetic | None = None  # of the local frame
         self._assembler = TextAssembler()
-        self._texts: Said = []  # of the vehicle
-        self._modes: Said = []
+        self._texts: list[Event] = []  # of the vehicle
+        self._modes: list[Event] = []
         self._event_records: list[tuple[float, float, bytes]] = []
         self._counts: Counter[str] = Counter()
         self._unix_us = (0, 0)
         self._anchor_ms = math.nan
         self._clocks: tuple[int, ...] = TELEMETRY + _SUBSTITUTES
         self._time = VehicleTime()
-        self.now_ms = math.nan  # stamp of the newest telemetry
-        self.damage_ms = math.nan  # of the newest one before the first damage
+        self._now_ms = math.nan  # stamp of the newest telemetry
+        self.damage_s = math.nan  # time of the newest one before the first damage
+
+    @property
+    def now_s(self) -> float:
+        """Vehicle time of the newest telemetry, NaN before it."""
+        return float(continuous_s(self._now_ms, self._anchor_ms))
+
+    def _said(self, what: str, unix_s: float) -> Event:
+        return Event(self.now_s, "vehicle", what, unix_s=unix_s)
 
     def add(self, entry: LoggedMessage) -> None:
         self._counts[entry.name] += 1
@@ -311,60 +318,43 @@ class _Collector:
             self._add_theirs(entry, entry.frame.payload)
 
     def _add_ours(self, entry: LoggedMessage, payload: bytes) -> None:
-        name, now_ms, unix_s = entry.name, self.now_ms, entry.unix_us / 1e6
+        name, now_ms, unix_s = entry.name, self._now_ms, entry.unix_us / 1e6
         if name in _OURS:
-            self._samples[name].add(payload, now_ms, unix_s)
+            self._ours[name].add(payload, now_ms, unix_s)
         elif name == "SET_POSITION_TARGET_LOCAL_NED":
             setpoint = payload[:4] + _NO_ATTITUDE
-            self._samples["SET_ATTITUDE_TARGET"].add(setpoint, now_ms, unix_s)
-        elif name == _ARRAY and payload[10:20].rstrip(b"\0") == RECORD_NAME.encode():
-            fields = int.from_bytes(payload[8:10], "little")  # array_id
-            if fields >= _FIRST_FIELDS:
-                end = _DATA + 4 * min(fields, len(FIELDS))
-                known = payload[:end].ljust(end, b"\0")
-                self._records.add(known + _DEFAULTS[end - _DATA :], now_ms, unix_s)
-        elif name == _ARRAY and payload[10:20].rstrip(b"\0") == IDENTIFIED_NAME.encode():
-            self._identified.add(payload, now_ms, unix_s)
-        elif name == "TIMESYNC":
-            answered_ns, asked_ns = _TIMESYNC.unpack(payload[:16].ljust(16, b"\0"))
-            if not answered_ns:
-                self._asked_ns.append(asked_ns)
+            self._ours["SET_ATTITUDE_TARGET"].add(setpoint, now_ms, unix_s)
+        elif name == _ARRAY and entry.message.array_id in _ARRAYS:
+            self._arrays[entry.message.array_id].add(payload, now_ms, unix_s)
         elif record_type(entry) == event_record.PAYLOAD_TYPE:
-            self._event_records.append((now_ms, unix_s, entry.tunnelled))
+            self._event_records.append((self.now_s, unix_s, entry.tunnelled))
 
     def _add_theirs(self, entry: LoggedMessage, payload: bytes) -> None:
-        name, now_ms, unix_s = entry.name, self.now_ms, entry.unix_us / 1e6
+        name, now_ms, unix_s = entry.name, self._now_ms, entry.unix_us / 1e6
         if self._refused_as_ahead(entry.frame.message_id, payload):
             return
         if name in _THEIRS:
-            self._samples[name].add(payload, now_ms, unix_s)
-        elif name in _TRUTH:
-            if self._truth:
-                self._truth[-1][1][name].add(payload, now_ms, unix_s)
-        elif name == "TIMESYNC":
-            answered_ns, asked_ns = _TIMESYNC.unpack(payload[:16].ljust(16, b"\0"))
-            if answered_ns:
-                self._answered_ns.extend((asked_ns, answered_ns))
+            self._theirs[name].add(payload, now_ms, unix_s)
         elif name == "STATUSTEXT":
             whole = self._assembler.add(payload, unix_s)
-            self._texts += [(now_ms, unix_s, text.text) for text in whole]
+            self._texts += [self._said(text.text, unix_s) for text in whole]
         elif name == "COMMAND_ACK":
             command, result = entry.message.command, entry.message.result
             if result not in (0, 5):  # MAV_RESULT_ACCEPTED, MAV_RESULT_IN_PROGRESS
                 refused = f"command {command} refused, result {result}"
-                self._texts.append((now_ms, unix_s, refused))
+                self._texts.append(self._said(refused, unix_s))
         elif name in ("GPS_GLOBAL_ORIGIN", "HOME_POSITION"):
             self._add_origin(entry)
         if name == "HEARTBEAT" and self._dialect:
             mode = self._dialect.mode_name(int.from_bytes(payload[:4], "little"))
-            if not self._modes or mode != self._modes[-1][-1]:
-                self._modes.append((now_ms, unix_s, mode))
+            if not self._modes or mode != self._modes[-1].what:
+                self._modes.append(self._said(mode, unix_s))
         if entry.frame.message_id in self._clocks:
             if entry.frame.message_id in TELEMETRY:
                 self._clocks = TELEMETRY
-            self.now_ms = float(int.from_bytes(payload[:4], "little"))
+            self._now_ms = float(int.from_bytes(payload[:4], "little"))
             if math.isnan(self._anchor_ms):
-                self._anchor_ms = self.now_ms
+                self._anchor_ms = self._now_ms
 
     def _refused_as_ahead(self, message_id: int, payload: bytes) -> bool:
         """Whether telemetry has a stamp so far ahead that the flight has refused it, too."""
@@ -378,48 +368,52 @@ class _Collector:
     def _add_origin(self, entry: LoggedMessage) -> None:
         """HOME_POSITION gives one point in both frames."""
         at = entry.message
-        origin = Geodetic(at.latitude / 1e7, at.longitude / 1e7, at.altitude / 1e3)
-        if entry.name == "HOME_POSITION":
-            origin = origin_of(origin, (at.x, at.y, at.z))
-        if not self._truth or origin != self._truth[-1][0]:
-            samples = {name: Samples(name, *spec) for name, spec in _TRUTH.items()}
-            self._truth.append((origin, samples))
+        place = Geodetic(at.latitude / 1e7, at.longitude / 1e7, at.altitude / 1e3)
+        home = entry.name == "HOME_POSITION"
+        self._origin = origin_of(place, (at.x, at.y, at.z)) if home else place
 
     def history(self, damage: str) -> History:
         """All that was added."""
         anchor_ms = self._anchor_ms
-        rows = {name: samples.rows(anchor_ms) for name, samples in self._samples.items()}
+        rows = {name: samples.rows(anchor_ms) for name, samples in self._theirs.items()}
+        ours = {name: samples.rows(anchor_ms) for name, samples in self._ours.items()}
+        arrays = {i: samples.rows(anchor_ms) for i, samples in self._arrays.items()}
         heartbeat, battery = rows["HEARTBEAT"], rows["SYS_STATUS"]
         voltage, remaining = (battery[name].astype(np.float32) for name in _BATTERY)
         voltage[voltage == _NO_VOLTAGE] = remaining[remaining == _NO_PERCENTAGE] = math.nan
+        position = _plausible(
+            rows["LOCAL_POSITION_NED"],
+            position_ned_m=POSITION_LIMIT_M,
+            velocity_ned_mps=VELOCITY_LIMIT_MPS,
+        )
         attitude = _plausible(rows["ATTITUDE_QUATERNION"], rates_radps=RATE_LIMIT_RADPS)
         lengths = np.linalg.norm(attitude["quaternion"].astype(np.float64), axis=1)
-        payloads = [payload for *_, payload in self._event_records]
+        attitude = attitude[(lengths > UNIT_LENGTHS[0]) & (lengths < UNIT_LENGTHS[1])]
+        setpoint = ours["SET_ATTITUDE_TARGET"]
+        substitutes = []
+        if not len(position):
+            position = _local(rows["GLOBAL_POSITION_INT"])
+            substitutes.append("GLOBAL_POSITION_INT")
+        if not len(attitude):
+            attitude = _turned(rows["ATTITUDE"])
+            substitutes.append("ATTITUDE")
+        if not len(setpoint):
+            substitutes.append("ATTITUDE_TARGET")
         events = []
-        for last, event in event_record.join(payloads):
-            now_ms, unix_s, _ = self._event_records[last]
-            time_s, phase = float(continuous_s(now_ms, anchor_ms)), _PHASES.get(event.phase, "")
+        for last, event in event_record.join(payload for *_, payload in self._event_records):
+            time_s, unix_s, _ = self._event_records[last]
+            phase = _PHASES.get(event.phase, "")
             events.append(Event(time_s, "offboard", event.text, phase, event.cause, unix_s))
-        modes, texts = (
-            tuple(
-                Event(float(continuous_s(at, anchor_ms)), "vehicle", text, unix_s=unix_s)
-                for at, unix_s, text in said
-            )
-            for said in (self._modes, self._texts)
-        )
         return History(
-            position=_plausible(
-                rows["LOCAL_POSITION_NED"],
-                position_ned_m=POSITION_LIMIT_M,
-                velocity_ned_mps=VELOCITY_LIMIT_MPS,
-            ),
-            attitude=attitude[(lengths > UNIT_LENGTHS[0]) & (lengths < UNIT_LENGTHS[1])],
-            truth=self._truth_rows(),
-            reference=rows["POSITION_TARGET_LOCAL_NED"],
-            setpoint=rows["SET_ATTITUDE_TARGET"],
-            records=self._records.rows(anchor_ms),
-            identified=self._identified.rows(anchor_ms),
-            link_delay=self._link_delay(),
+            position=position,
+            attitude=attitude,
+            truth=_truth(rows, self._origin),
+            reference=ours["POSITION_TARGET_LOCAL_NED"],
+            setpoint=setpoint,
+            commanded=setpoint if len(setpoint) else rows["ATTITUDE_TARGET"],
+            records=arrays[RECORD_ID],
+            identified=arrays[IDENTIFIED_ID],
+            link_delay=_link_delay(ours["TIMESYNC"], rows["TIMESYNC"]),
             heartbeat=table(
                 heartbeat,
                 armed=(heartbeat["armed"] & _ARMED > 0).astype(np.float32),
@@ -429,34 +423,53 @@ class _Collector:
             landed=rows["EXTENDED_SYS_STATE"],
             phases=tuple(event for event in events if event.phase),
             announcements=tuple(event for event in events if not event.phase),
-            modes=modes,
-            vehicle_messages=texts,
+            modes=tuple(self._modes),
+            vehicle_messages=tuple(self._texts),
             vehicle=self._vehicle,
             dialect=self._dialect,
             messages=self._counts,
             wall_s=(self._unix_us[1] - self._unix_us[0]) / 1e6,
+            substitutes=tuple(substitutes),
             damage=damage,
-            damage_s=float(continuous_s(self.damage_ms, anchor_ms)),
+            damage_s=self.damage_s,
         )
 
-    def _truth_rows(self) -> Rows:
-        none = {"time_s": np.zeros(0), "unix_s": np.zeros(0)}
-        parts = [table(none, position_ned_m=np.zeros((0, 3), np.float32))]
-        for origin, samples in self._truth:
-            for name, each in samples.items():
-                rows = each.rows(self._anchor_ms)
-                places = np.column_stack([rows[column] for column in _PLACE])
-                places = places / (1e7, 1e7, _ALTITUDE_UNITS[name])
-                position = position_ned_m(places, origin).astype(np.float32)
-                parts.append(table(rows, position_ned_m=position))
-        return np.concatenate(parts)
 
-    def _link_delay(self) -> Rows:
-        """From the vehicle's answers to our TIMESYNC requests."""
-        answers = np.array(self._answered_ns, np.int64).reshape(-1, 2)
-        asked, answered = answers[np.isin(answers[:, 0], np.array(self._asked_ns))].T
-        times = {"time_s": 1e-9 * asked, "unix_s": np.full(len(asked), np.nan)}
-        return table(times, delay_s=1e-9 * (answered - asked))
+def _truth(rows: Mapping[str, Rows], origin: Geodetic | None) -> Rows:
+    none = {"time_s": np.zeros(0), "unix_s": np.zeros(0)}
+    parts = [table(none, position_ned_m=np.zeros((0, 3), np.float32))]
+    for name, unit in _TRUTH.items():
+        if origin is not None and len(rows[name]):
+            places = np.column_stack((rows[name]["place"] / 1e7, rows[name]["altitude"] / unit))
+            position = position_ned_m(places, origin).astype(np.float32)
+            parts.append(table(rows[name], position_ned_m=position))
+    return np.concatenate(parts)
+
+
+def _local(rows: Rows) -> Rows:
+    """Positions of GLOBAL_POSITION_INT relative to the first. 1e-7 deg, mm, cm/s."""
+    places = rows["place"] / (1e7, 1e7, 1e3)
+    position = position_ned_m(places, Geodetic(*places[0].tolist())) if len(rows) else places
+    return table(
+        rows,
+        position_ned_m=position.astype(np.float32),
+        velocity_ned_mps=(rows["velocity"] / 100.0).astype(np.float32),
+    )
+
+
+def _turned(rows: Rows) -> Rows:
+    """Attitudes of ATTITUDE."""
+    quaternion = quaternion_from_euler(*rows["angles"].astype(np.float64).T)
+    rates = rows["rates_radps"]
+    return table(rows, quaternion=np.asarray(quaternion, np.float32), rates_radps=rates)
+
+
+def _link_delay(requests: Rows, replies: Rows) -> Rows:
+    """From the vehicle's replies to our TIMESYNC requests, which have tc1 = 0."""
+    asked = requests["asked_ns"][requests["answered_ns"] == 0]
+    replies = replies[(replies["answered_ns"] != 0) & np.isin(replies["asked_ns"], asked)]
+    times = {"time_s": 1e-9 * replies["asked_ns"], "unix_s": np.full(len(replies), np.nan)}
+    return table(times, delay_s=1e-9 * (replies["answered_ns"] - replies["asked_ns"]))
 
 
 def _plausible(rows: Rows, **limits: float) -> Rows:
@@ -472,10 +485,9 @@ def _vehicle(log: Tlog) -> tuple[Address | None, Dialect | None]:
     for entry in log:
         kind = entry.frame.message_id
         if kind == HEARTBEAT and first[0] is None:
-            identity = decode_identity(entry.frame.payload)
-            if is_vehicle(identity):
+            if is_vehicle(entry.message):
                 heard = Address(entry.system_id, entry.component_id)
-                first = heard, known.get(identity.autopilot)
+                first = heard, known.get(entry.message.autopilot)
         elif record_type(entry) == record.VEHICLE_TYPE:
             flown = record.vehicle_of(entry.tunnelled)
             if flown and flown.system_id == entry.system_id:

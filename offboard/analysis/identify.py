@@ -18,10 +18,9 @@ from scipy.integrate import cumulative_trapezoid
 from offboard.analysis.history import History
 from offboard.documents.errors import plain
 from offboard.flight.phases import PHASE_CODES, TRACKING
-from offboard.identification.attitude_fit import ResponseFit
 from offboard.identification.trace import NORTH, POSITION, STAMP, VELOCITY, Trace, clean
 from offboard.identification.uncertainty import Estimate
-from offboard.identification.vehicle_fit import Identified, identify
+from offboard.identification.vehicle_fit import AXES, Identified, identify
 from offboard.mavlink.outgoing import ThrustRule
 from offboard.model.frames import heading_from_quaternion, thrust_direction_from_quaternion
 from offboard.model.vehicle import Vehicle
@@ -34,6 +33,9 @@ _KEPT = (
     "mass_kg", "inertia_kgm2", "arm_m", "drag_rotation_nmpradps",
     "angular_acceleration_limit_radps2",
 )  # fmt: skip
+_UNITS = {"s": "s", "radps": "rad/s", "ps": "1/s"}  # by the end of a constant's name
+_KEYS = {"drag_ps": "drag_translation_npmps"}  # in a vehicle file, where they differ
+_REASONS = {"thrust_delay_s": "thrust_lag_s"}  # identified, or not, with this constant
 DIGITS = 6  # of the values in a vehicle file
 LINE_WIDTH = 80
 MEAN_OVER_S = 0.5  # time over which reported velocity and position are compared
@@ -91,26 +93,15 @@ def rows(found: Identified) -> Iterator[Row]:
 
 def _constants(found: Identified) -> dict[str, list[Row]]:
     """The rows by their key in a vehicle file."""
-
-    def row(name: str, estimate: Estimate | None, unit: str, refused: str) -> Row:
-        return name, estimate, unit, found.refusals.get(refused, "")
-
-    def response(axis: str, fit: ResponseFit | None) -> list[Row]:
-        frequency = fit.natural_frequency_radps if fit else None
-        return [
-            row(f"{axis} delay", fit.delay_s if fit else None, "s", axis),
-            row(f"{axis} natural frequency", frequency, "rad/s", axis),
-            row(f"{axis} damping", fit.damping if fit else None, "", axis),
-        ]
-
-    return {
-        "tilt": response("tilt", found.tilt),
-        "yaw": response("yaw", found.yaw),
-        "hover_thrust": [row("hover thrust", found.hover_thrust, "", "hover_thrust")],
-        "thrust_lag_s": [row("thrust lag", found.thrust_lag_s, "s", "thrust_lag_s")],
-        "thrust_delay_s": [row("thrust delay", found.thrust_delay_s, "s", "thrust_lag_s")],
-        "drag_translation_npmps": [row("drag", found.drag_ps, "1/s", "drag_ps")],
-    }
+    by_key: dict[str, list[Row]] = {}
+    for constant, estimate in found.estimates.items():
+        *words, last = constant.split("_")
+        name = " ".join(words if last in _UNITS else (*words, last))
+        key = words[0] if words[0] in AXES else constant
+        reason = found.refusals.get(_REASONS.get(key, key), "")
+        row = name, estimate, _UNITS.get(last, ""), reason
+        by_key.setdefault(_KEYS.get(key, key), []).append(row)
+    return by_key
 
 
 def vehicle_file(found: Identified, prior: Vehicle, flight: str) -> str:

@@ -8,6 +8,7 @@ entry is refused.
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Iterator
 from functools import cache
@@ -19,11 +20,11 @@ from pymavlink.dialects.v20 import all as dialect
 
 from offboard.documents.errors import UserError, abridged
 from offboard.mavlink.counters import DropReason
-from offboard.mavlink.framing import Frame, frame_size, parse
+from offboard.mavlink.framing import V1, V2, Frame, frame_size, parse
 
 _STAMP = struct.Struct(">Q")
 _YEAR_2000_US, _YEAR_2100_US = 946_684_800_000_000, 4_102_444_800_000_000
-_MAGIC = (0xFD, 0xFE)
+_MARKER = re.compile(rb"[\xfd\xfe]")  # the first byte of a frame
 _LONGEST = 8 + 280  # bytes of an entry: a signed MAVLink 2 frame
 _BLOCK = 1 << 20
 _TUNNEL_BYTES = 133  # payload_type, target system and component, payload_length, 128 of data
@@ -107,7 +108,8 @@ class Tlog:
                     size = frame_size(data, at + 8)
                     cut = _begins(data, at) and (size is None or at + 8 + size > len(data))
                     lost = before + at
-                at = _next_magic(data, at + 9) - 8
+                marker = _MARKER.search(data, at + 9)
+                at = marker.start() - 8 if marker else len(data) - 8
                 continue
             if lost is not None:
                 self._count(lost)
@@ -148,13 +150,7 @@ def _begins(data: bytes, at: int) -> bool:
     if at + 9 > len(data):
         return True
     (stamp,) = _STAMP.unpack_from(data, at)
-    return data[at + 8] in _MAGIC and _YEAR_2000_US < stamp < _YEAR_2100_US
-
-
-def _next_magic(data: bytes, at: int) -> int:
-    """Where the next first byte of a frame is; the end of the data without one."""
-    places = [place for magic in _MAGIC if (place := data.find(magic, at)) >= 0]
-    return min(places, default=len(data))
+    return data[at + 8] in (V1, V2) and _YEAR_2000_US < stamp < _YEAR_2100_US
 
 
 def find(flight: Path) -> Path:

@@ -8,8 +8,8 @@ fitness are over the control ticks, as in its Eq. 32.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +27,6 @@ from offboard.model.frames import (
 Array = NDArray[np.float64]
 
 SKIPPED_S = 1.5  # without a decision for longer, the reference was not tracked meanwhile
-_BLOCK = 8192  # samples that are computed at once
-_EXPLAINED = 7  # regressors of the agitation: velocity, acceleration, jerk (north, east), and 1
 _ORDERS, _POWERS = np.arange(3)[:, None], np.arange(5, -1, -1)[:, None]
 # coefficients of s^5 .. s^0 from position, velocity and acceleration at s = 0, then at s = 1
 _QUINTIC = np.linalg.inv(
@@ -65,36 +63,23 @@ def tracking_metrics(flown: History, window: tuple[float, float]) -> dict[str, f
     """Values of a Score, of the samples in the window."""
     reference, clock = Reference(flown.reference), _Clock(flown)
 
-    def position_m(rows: Rows) -> Array:
-        return _length(rows["position_ned_m"] - reference.position(rows["time_s"]))
-
-    def velocity_mps(rows: Rows) -> Array:
-        return _length(rows["velocity_ned_mps"] - reference.position(rows["time_s"], 1))
-
-    def turned_deg(rows: Rows) -> Array:
-        turn = heading_from_quaternion(rows["quaternion"]) - reference.heading(rows["time_s"])
-        return np.asarray(np.abs(np.degrees(wrap_pi(turn))))
-
-    def tilt_deg(rows: Rows) -> Array:
-        direction = thrust_direction_from_quaternion(rows["quaternion"])
-        return np.degrees(np.arccos(np.clip(direction[:, 2], -1.0, 1.0)))
+    def away(rows: Rows, column: str, derivative: int = 0) -> Weighted:
+        distances = _length(rows[column] - reference.position(rows["time_s"], derivative))
+        return weighted(distances, clock.shares(rows["time_s"]))
 
     fitness = _fitness(flown, reference, window)
-    # one array after the other: each may be a copy of hours of telemetry
     rows = _within(flown.position, window)
-    weights = clock.shares(rows["time_s"])
-    position, velocity = (
-        weighted(_in_blocks(f, rows), weights) for f in (position_m, velocity_mps)
-    )
-    rows = _within(flown.truth, window)
-    true = weighted(_in_blocks(position_m, rows), clock.shares(rows["time_s"]))
+    position, velocity = away(rows, "position_ned_m"), away(rows, "velocity_ned_mps", 1)
+    true = away(_within(flown.truth, window), "position_ned_m")
     rows = _within(flown.setpoint, window)
     steps = _length(np.diff(thrust_direction_from_quaternion(rows["quaternion"]), axis=0))
     thrust = weighted(rows["thrust"].astype(np.float64), clock.shares(rows["time_s"]))
     rows = _within(flown.attitude, window)
     weights = clock.shares(rows["time_s"])
-    heading = weighted(_in_blocks(turned_deg, rows), weights)
-    tilt = weighted(_in_blocks(tilt_deg, rows), weights)
+    direction = thrust_direction_from_quaternion(rows["quaternion"])
+    turn = heading_from_quaternion(rows["quaternion"]) - reference.heading(rows["time_s"])
+    heading = weighted(np.abs(np.degrees(wrap_pi(turn))), weights)
+    tilt = weighted(np.degrees(np.arccos(np.clip(direction[:, 2], -1.0, 1.0))), weights)
     rates = rows["rates_radps"].astype(np.float64)
     return {
         "rmse_position_m": position.rms,
@@ -142,24 +127,21 @@ def _agitation(reference: Reference, attitude: Rows, weights: Array) -> dict[str
     """Motion beside that of the reference: thrust direction and rates minus their linear fit by
     the reference's velocity, acceleration and jerk. The fit needs no model of drag and lag.
 
-    The factor R of the samples has the same residuals as the samples; made of blocks, it takes
-    little memory.
+    The factor R of the samples has their residuals; made of parts, it takes little memory.
     """
-    factor = np.zeros((0, _EXPLAINED + 4))
-    for part in _blocks(len(attitude)):
-        rows, share = attitude[part], weights[part]
-        times, direction = rows["time_s"], thrust_direction_from_quaternion(rows["quaternion"])
-        explained = [reference.position(times, order)[:, :2] for order in (1, 2, 3)]
-        block = np.hstack(
-            (*explained, np.ones((len(times), 1)), direction[:, :2], rows["rates_radps"][:, :2])
-        )
-        stacked = np.vstack((factor, np.sqrt(share)[:, None] * block))
-        factor = np.linalg.qr(stacked, mode="r")  # type: ignore[assignment]
-    regressors, motion = factor[:, :_EXPLAINED], factor[:, _EXPLAINED:]
-    fit, *_ = np.linalg.lstsq(regressors, motion, rcond=None)
-    squares = ((motion - regressors @ fit) ** 2).sum(axis=0)
-    total = (factor[:, _EXPLAINED - 1] ** 2).sum()  # of the weights, from the column of 1
-    tilt, rate = np.sqrt(np.array([squares[:2].sum(), squares[2:].sum()]) / total)
+    factor: Any = np.zeros((0, 11))
+    parts = 1 + len(weights) // 8192
+    shares = np.array_split(np.sqrt(weights / weights.sum())[:, None], parts)
+    for rows, share in zip(np.array_split(attitude, parts), shares, strict=True):
+        explained = [reference.position(rows["time_s"], order)[:, :2] for order in (1, 2, 3)]
+        direction = thrust_direction_from_quaternion(rows["quaternion"])[:, :2]
+        motion = direction, rows["rates_radps"][:, :2]
+        samples = share * np.hstack((*explained, np.ones((len(rows), 1)), *motion))
+        factor = np.linalg.qr(np.vstack((factor, samples)), mode="r")
+    explained, motion = factor[:, :7], factor[:, 7:]
+    fit, *_ = np.linalg.lstsq(explained, motion, rcond=None)
+    squares = ((motion - explained @ fit) ** 2).sum(axis=0)
+    tilt, rate = np.sqrt([squares[:2].sum(), squares[2:].sum()])
     return {
         "tilt_agitation_deg": float(np.degrees(tilt)),
         "rate_agitation_radps": float(rate),
@@ -281,15 +263,3 @@ def weighted(values: Array, weights: Array) -> Weighted:
         max=float(np.max(values, where=weights > 0.0, initial=-math.inf)),
         p95=float(values[order[upto]]),
     )
-
-
-def _in_blocks(signal: Callable[[Rows], Array], rows: Rows) -> Array:
-    """The signal of the rows: what is computed of a few takes little memory."""
-    values = np.empty(len(rows))
-    for part in _blocks(len(rows)):
-        values[part] = signal(rows[part])
-    return values
-
-
-def _blocks(count: int) -> Iterator[slice]:
-    return (slice(first, first + _BLOCK) for first in range(0, count, _BLOCK))

@@ -140,7 +140,7 @@ def expand(file: CampaignFile, link: str | None = None) -> list[Case]:
         for case in base_cases(file, link)
         for grid in itertools.product(*columns)
         for draw in draws
-        for seed in file.seed_values
+        for seed in file.seeds
     )
     cases = list(itertools.islice(flown, CASES_MOST + 1))
     if len(cases) > CASES_MOST:
@@ -162,7 +162,7 @@ def base_cases(file: CampaignFile, link: str | None = None) -> Iterator[Case]:
         ):
             case = Case(
                 file.config, controller, reference, vehicle, sim_vehicle, firmware, scenario,
-                file.seed_values[0], link=link,
+                file.seeds[0], link=link,
             )  # fmt: skip
             yield replace(case, files=_digests(case))
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from offboard.analysis.score import Requirement
 from offboard.documents import shipped
@@ -22,7 +22,7 @@ from offboard.documents.errors import UserError
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import parse
 
-CASES_MOST = 1_000_000
+CASES_MOST, SEEDS_MOST = 1_000_000, 100_000
 
 
 def _key(text: str) -> str:
@@ -45,12 +45,22 @@ def _requirement(text: str) -> str:
     return text
 
 
+def _counted(seeds: Any) -> Any:
+    """1 .. N of a number N."""
+    if type(seeds) is not int:
+        return tuple(seeds) if isinstance(seeds, list) else seeds
+    if not 1 <= seeds <= SEEDS_MOST:
+        raise ValueError(f"{seeds} is no number of seeds from 1 to {SEEDS_MOST}")
+    return tuple(range(1, seeds + 1))
+
+
 Name = Annotated[str, Field(min_length=1)]
 Firmware = Literal["px4", "ardupilot"]
 Names = Annotated[tuple[Name, ...], Field(min_length=1)]
 Key = Annotated[str, AfterValidator(_key)]
 Ends = Annotated[tuple[float, float], AfterValidator(_ordered)]
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
+Seeds = Annotated[tuple[Seed, ...], Field(min_length=1), BeforeValidator(_counted)]  # or a number
 Ranges = Annotated[dict[Key, Ends], Field(min_length=1)]
 
 
@@ -118,17 +128,10 @@ class CampaignFile(Parameters):
     )
     sample: Sample | None = None
     search: Search | None = None
-    seeds: (
-        Annotated[int, Field(ge=1, le=100_000)] | Annotated[tuple[Seed, ...], Field(min_length=1)]
-    ) = 1
+    seeds: Seeds = (1,)
     require: tuple[Annotated[str, AfterValidator(_requirement)], ...] = ()
     promises: Promises = Promises()
     keep: bool = False
-
-    @property
-    def seed_values(self) -> tuple[int, ...]:
-        """The seeds of each combination."""
-        return tuple(range(1, self.seeds + 1)) if isinstance(self.seeds, int) else self.seeds
 
 
 def read_campaign(name: str) -> tuple[CampaignFile, str]:

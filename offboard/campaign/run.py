@@ -36,7 +36,6 @@ KEPT_FILES = {"report": "report.html", "log": "flight.tlog"}
 TABLE_S = 5.0  # at least, from one table to the next
 TABLE_SHARE = 0.02  # of the time is for tables while it flies
 INTERRUPTED = "interrupted: flights in the air are finished; interrupt again to exit at once"
-FIRST = 5  # flights after which the time is estimated first
 LINES = 20
 
 
@@ -46,8 +45,8 @@ class Incomplete(Exception):
 
 class Counter(Status):
     """Context manager that shows how many of at most `planned` flights have ended, how fast, and
-    how long the rest takes: one line in place on a terminal, else lines, at the beginning, after
-    the first `FIRST` flights, and for every twentieth of them."""
+    how long the rest takes: one line in place on a terminal, else a line at the beginning and for
+    every twentieth of them."""
 
     def __init__(self, console: Console, planned: int = 0) -> None:
         super().__init__("", console=console)
@@ -61,7 +60,7 @@ class Counter(Status):
         self._known += known
         if not self._flown:
             already = f", {self._known} already flown" if self._known else ""
-            self._show(f"{self.planned} flights{already}", in_lines=True)
+            self._show(f"{self.planned} flights{already}")
 
     def ended(self) -> None:
         """A flight has ended."""
@@ -70,11 +69,8 @@ class Counter(Status):
         self.planned = max(self.planned, done)
         rate = 60.0 * self._flown / max(1e-9, clock.monotonic_s() - self._begun_s)
         left = remaining(60.0 * (self.planned - done) / rate)
-        every = max(1, self.planned // LINES)
-        self._show(
-            f"{done} of {self.planned} flights, {rate:.0f} a minute, {left} left",
-            in_lines=done % every == 0 or done == self.planned or self._flown == FIRST,
-        )
+        if self.console.is_terminal or done % max(1, self.planned // LINES) == 0:
+            self._show(f"{done} of {self.planned} flights, {rate:.0f} a minute, {left} left")
 
     def ending(self, stops: StopRequests) -> bool:
         """Whether a stop was requested, which is then said, once."""
@@ -83,10 +79,10 @@ class Counter(Status):
             self.console.print(INTERRUPTED)
         return stops.requested
 
-    def _show(self, line: str, *, in_lines: bool) -> None:
+    def _show(self, line: str) -> None:
         if self.console.is_terminal:
             self.update(line)
-        elif in_lines:
+        else:
             self.console.print(line, markup=False, soft_wrap=True)
 
 

@@ -16,12 +16,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 from offboard.campaign.cases import SEED, Case, Values, rounded
+from offboard.campaign.document import Ends
 from offboard.campaign.results import Record
 from offboard.campaign.run import Campaign, Runner, check
 from offboard.campaign.table import as_csv as csv_of
 from offboard.documents.errors import DocumentError, UserError, install, naming
+
+if TYPE_CHECKING:
+    import optuna
 
 Fly = Callable[[Sequence[Case]], list[Record]]  # `Runner.fly`
 BATCH = 20  # flights between two answers of the study
@@ -32,58 +37,23 @@ PENALTY = 2.0
 CANDIDATES = 3  # failures that are reduced, per failure that is wanted
 
 
-class Study:
-    """Minimises a cost over `ranges` (key -> lowest, highest). Raises UserError without optuna.
+def study_of(seed: int) -> optuna.Study:
+    """A study of optuna, which minimises. Raises UserError without optuna."""
+    try:
+        import optuna
+    except ImportError:
+        raise UserError(f"a search needs optuna: {install('tune')}") from None
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    sampler = optuna.samplers.TPESampler(seed=seed, multivariate=True, constant_liar=True)
+    return optuna.create_study(sampler=sampler)
 
-    Example:
 
-        study = Study({"controller.bandwidth_radps": (3.0, 9.0)}, seed=1)
-        study.tell([cost(dict(values)) for values in study.ask(20)])
-        print(study.best)
-    """
-
-    def __init__(self, ranges: Mapping[str, tuple[float, float]], seed: int) -> None:
-        try:
-            import optuna
-        except ImportError:
-            raise UserError(f"a search needs optuna: {install('tune')}") from None
-        optuna.logging.set_verbosity(optuna.logging.ERROR)
-        sampler = optuna.samplers.TPESampler(seed=seed, multivariate=True, constant_liar=True)
-        self._study = optuna.create_study(sampler=sampler)
-        self._ranges = ranges
-        self._asked: list[optuna.Trial] = []
-
-    def first(self, values: Mapping[str, float]) -> None:
-        """Ask these values first, as far as they are within the ranges."""
-        within = {
-            key: value
-            for key, value in values.items()
-            if self._ranges[key][0] <= value <= self._ranges[key][1]
-        }
-        self._study.enqueue_trial(within)
-
-    def ask(self, count: int = 1) -> list[Values]:
-        """The next values to try."""
-        self._asked = [self._study.ask() for _ in range(count)]
-        return [
-            tuple(
-                (key, rounded(trial.suggest_float(key, *ends)))
-                for key, ends in self._ranges.items()
-            )
-            for trial in self._asked
-        ]
-
-    def tell(self, costs: Sequence[float]) -> None:
-        """What those that were asked last cost, in their order."""
-        for trial, cost in zip(self._asked, costs, strict=True):
-            self._study.tell(trial, cost)
-
-    @property
-    def best(self) -> tuple[Values, float]:
-        """The values with the lowest cost, and this cost."""
-        found = self._study.best_trial
-        assert found.value is not None
-        return tuple((key, rounded(found.params[key])) for key in self._ranges), found.value
+def ask(study: optuna.Study, ranges: Mapping[str, Ends]) -> tuple[optuna.Trial, Values]:
+    """The next values to try within `ranges` (key -> lowest, highest), and the trial that is to be
+    told what they cost."""
+    trial = study.ask()
+    asked = ((key, trial.suggest_float(key, *ends)) for key, ends in ranges.items())
+    return trial, tuple((key, rounded(value)) for key, value in asked)
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +92,7 @@ class FailureSearch:
         self._base, self._search = campaign.cases[0], campaign.file.search
         ranges, seed = self._search.ranges, self._search.seed
         # all before the first flight: a study needs a package
-        self._studies = [Study(ranges, seed + 1000 * n) for n in range(ROUNDS)]
+        self._studies = [study_of(seed + 1000 * n) for n in range(ROUNDS)]
         middle = {key: rounded((low + high) / 2) for key, (low, high) in ranges.items()}
         with naming(source):
             check([self._case(middle)])
@@ -152,11 +122,11 @@ class FailureSearch:
         for study in self._studies:
             failures = self._worst(flown, AVOIDED)
             for _ in range(self._search.flights // (ROUNDS * BATCH)):
-                asked = study.ask(BATCH)
-                records = fly([self._case(dict(values)) for values in asked])
-                ended = list(zip(asked, records, strict=True))
-                study.tell([r.margin + self._penalty(values, failures) for values, r in ended])
-                flown += ended
+                asked = [ask(study, self._search.ranges) for _ in range(BATCH)]
+                records = fly([self._case(dict(values)) for _, values in asked])
+                for (trial, values), record in zip(asked, records, strict=True):
+                    study.tell(trial, record.margin + self._penalty(values, failures))
+                    flown.append((values, record))
         return flown
 
     def _worst(self, flown: Sequence[tuple[Values, Record]], count: int) -> list[Values]:

@@ -22,11 +22,11 @@ import yaml
 from pydantic import AfterValidator, Field
 from scipy import stats
 
-from offboard.campaign.cases import SCENARIO, Case, Values, expand
-from offboard.campaign.document import CampaignFile, Firmware, Name, Names, Ranges, Seed
+from offboard.campaign.cases import SCENARIO, Case, Values, expand, rounded
+from offboard.campaign.document import CampaignFile, Firmware, Name, Names, Ranges, Seed, Seeds
 from offboard.campaign.results import Record
 from offboard.campaign.run import check
-from offboard.campaign.search import Fly, Study
+from offboard.campaign.search import Fly, ask, study_of
 from offboard.campaign.table import CONFIDENCE, FIGURE_COLUMNS
 from offboard.documents.errors import DocumentError, naming
 from offboard.documents.parameters import Parameters
@@ -47,9 +47,7 @@ class Flights(Parameters):
 
     references: Names | None = None
     scenarios: Names
-    seeds: (
-        Annotated[int, Field(ge=1, le=1000)] | Annotated[tuple[Seed, ...], Field(min_length=1)]
-    ) = 3
+    seeds: Seeds = (1, 2, 3)
 
 
 class TuneFile(Parameters):
@@ -116,7 +114,7 @@ class Tuning:
 
     def __init__(self, file: TuneFile, source: str) -> None:
         self.file = file
-        self._study = Study(file.ranges, file.seed)
+        self._study = study_of(file.seed)
         with naming(source):
             self._training = _cases(file, file.training)
             self._validation = _cases(file, file.validation)
@@ -139,13 +137,15 @@ class Tuning:
 
         `progress` gets the number of trials and the lowest cost so far. Raises what `fly` raises.
         """
-        self._study.first(self._defaults)
+        study, ranges = self._study, self.file.ranges
+        within = {k: v for k, v in self._defaults.items() if ranges[k][0] <= v <= ranges[k][1]}
+        study.enqueue_trial(within)  # the present values first
         for number in range(1, self.file.trials + 1):
-            (values,) = self._study.ask()
+            trial, values = ask(study, ranges)
             costs = self._costs(fly, self._training, values)
-            self._study.tell([sum(costs) / len(costs)])
-            best, cost = self._study.best
-            progress(number, cost)
+            study.tell(trial, sum(costs) / len(costs))
+            progress(number, study.best_value)
+        best = tuple((key, rounded(study.best_params[key])) for key in ranges)
         before = self._costs(fly, self._validation, ())
         return judge(before, self._costs(fly, self._validation, best), best)
 

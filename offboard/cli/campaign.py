@@ -202,7 +202,7 @@ def compare(
             scenarios=None if connect else tuple(scenarios),
             vehicles=(vehicle,) if vehicle else None,
             parameters=dict(map(_parameter, assignments or ())),
-            seeds=seeds,
+            seeds=tuple(range(1, seeds + 1)),
             keep=True,
         )
         directory = out_directory or FLIGHTS / f"compare-{clock.local_stamp()}"

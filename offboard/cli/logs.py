@@ -148,7 +148,7 @@ def export(
     Exit codes: 0 done; 2 usage error, or a file that cannot be read or written.
     """
     from offboard.export.mcap_file import write_mcap
-    from offboard.export.series import read, write_csv
+    from offboard.export.series import events_of, read, series_of, write_csv
     from offboard.export.ulog import write_ulog
 
     check_new(output, "-o")
@@ -157,8 +157,8 @@ def export(
     write(found, output)
     if found.damage:
         complain(found.damage)
-    held = ", ".join(f"{len(each.time_s)} of {name}" for name, each in found.series.items())
-    say(f"{output}: samples: {held}; {len(found.events)} events")
+    held = ", ".join(f"{len(rows)} of {name}" for name, rows in series_of(found).items())
+    say(f"{output}: samples: {held}; {len(events_of(found))} events")
 
 
 @grouped
@@ -169,19 +169,13 @@ def identify(
     output: Annotated[
         Path | None, option("FILE", "Vehicle file to write.", "-o", "--output")
     ] = None,
-    page: Annotated[
-        Path | None,
-        option(
-            "FILE", "Report of the flight with the fits.  [default: identify.html beside the log]"
-        ),
-    ] = None,
     out_directory: Directory = None,
 ) -> None:
     """Identify a vehicle from a flight: vehicle file and report.
 
     Identifies delay, attitude response, hover thrust, thrust lag and drag, each with its standard
-    deviation. Prints the vehicle file; -o writes it. The report shows the fits. What is not
-    identified is taken from --vehicle, or from the flight.
+    deviation. Prints the vehicle file; -o writes it. The report, identify.html beside it or beside
+    the log, shows the fits. What is not identified is taken from --vehicle, or from the flight.
 
     With --connect or --sitl the reference `identify`, or another one, is flown first, as by
     `offboard fly`.
@@ -195,16 +189,13 @@ def identify(
     from offboard.link import clock
     from offboard.report.fits import fits
     from offboard.report.flight import read
-    from offboard.report.report_page import page as report_page
+    from offboard.report.report_page import page
     from offboard.run.configuration import flown
 
     if (flight is None) == (options.connect is None and not simulated.sitl):
         raise UserError("name a FLIGHT, or fly one first with --connect or --sitl; not both")
-    for chosen, name in ((output, "-o"), (page, "--page")):
-        if chosen is not None:
-            check_new(chosen, name)
-    if output is not None and page is not None and output.resolve() == page.resolve():
-        raise UserError(f"-o and --page are both {output}; choose two files")
+    if output is not None:
+        check_new(output, "-o")
     if flight is None:
         flight = out_directory or FLIGHTS / f"identify-{clock.local_stamp()}"
         reference = options.reference or "identify"
@@ -226,11 +217,11 @@ def identify(
     recorded = read(flight)
     if recorded.history.damage:
         complain(recorded.history.damage)
-    found, trace = identify_flight(recorded.sent, prior)
+    found, trace = identify_flight(recorded.history, prior)
     name = flight.name or flight.resolve().name
     text = vehicle_file(found, prior, name)
-    shown = page or free_name(path.with_name("identify.html"))
-    write_new(shown, report_page([recorded], fits(found, trace, prior)))
+    shown = free_name((output or path).with_name("identify.html"))
+    write_new(shown, page([recorded], fits(found, trace, prior)))
     if not found.supported:
         raise UserError(f"nothing could be identified from this flight; {shown} says why", 1)
     if output is not None:

@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from pymavlink.dialects.v20.all import mavlink_map
 
@@ -22,7 +23,6 @@ from offboard.flight.vehicle_state import VehicleState
 from offboard.link import clock
 from offboard.link.interface import Chunk
 from offboard.mavlink.counters import Counters
-from offboard.mavlink.decode import Identity, decode_identity
 from offboard.mavlink.dialects.base import TYPE_GCS, Dialect, WantedMessage
 from offboard.mavlink.events import (
     Attitude,
@@ -62,12 +62,12 @@ _PLACES_MAX, _SENDERS_MAX = 16, 64  # a flood of addresses or ids must not use u
 
 @dataclass(slots=True)
 class Sender:
-    """One MAVLink sender. `identity` is that of its HEARTBEAT, None without one; `places` are the
+    """One MAVLink sender. `heartbeat` is its newest HEARTBEAT, None without one; `places` are the
     addresses that it sends from."""
 
     system_id: int
     component_id: int
-    identity: Identity | None = None
+    heartbeat: Any = None  # message of pymavlink
     places: set[str] = field(default_factory=set)
     frames: int = 0
     times: int = 0  # TIMESYNC and SYSTEM_TIME
@@ -78,11 +78,11 @@ class Sender:
 
     @property
     def is_autopilot(self) -> bool:
-        return self.identity is not None and is_vehicle(self.identity)
+        return self.heartbeat is not None and is_vehicle(self.heartbeat)
 
     @property
     def name(self) -> str:
-        is_gcs = self.identity is not None and self.identity.vehicle_type == TYPE_GCS
+        is_gcs = self.heartbeat is not None and self.heartbeat.type == TYPE_GCS
         kind = "autopilot" if self.is_autopilot else "ground station" if is_gcs else "component"
         return f"{kind} {self.system_id}/{self.component_id}"
 
@@ -121,7 +121,7 @@ class Senders:
         sender.places.add(join_address(*place[:2]) if isinstance(place, tuple) else str(place))
         sender.times += frame.message_id in _TIMES
         if frame.message_id == HEARTBEAT:
-            sender.identity = decode_identity(frame.payload)
+            sender.heartbeat = frame.message
         for key in (ids, ids[:1]):
             gap = (frame.sequence - self._sequences.get(key, frame.sequence - 1) - 1) % 256
             self._lost[key] += gap if gap < 128 else 0  # more: out of order

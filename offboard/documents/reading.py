@@ -148,7 +148,7 @@ def validate(mapping: Mapping[str, Any], model: type[M], source: str) -> M:
         # as JSON: strict about scalars, yet a list may become a tuple and text an enum
         return model.model_validate_json(json.dumps(mapping), strict=True)
     except ValidationError as error:
-        details = _own_problems(error.errors(include_url=False), mapping)
+        details = error.errors(include_url=False)
         problems = [
             f"{_origin(detail, mapping, source)}: {_sentence(detail, mapping, model)}"
             for detail in details[:PROBLEMS_MOST]
@@ -172,23 +172,6 @@ def known(mapping: Mapping[str, Any], model: type[M]) -> Json:
                     section = section[int(part)] if isinstance(section, list) else section[part]
                 del section[key]
     return kept
-
-
-def _own_problems(details: list[ErrorDetails], mapping: Mapping[str, Any]) -> list[ErrorDetails]:
-    """The errors without those that another one explains: a value of the right type is also refused
-    as every other type of a union, and a list is counted without its wrong items."""
-    paths = [_key_path(detail, mapping) for detail in details]
-    typed = {
-        path
-        for path, detail in zip(paths, details, strict=True)
-        if not detail["type"].endswith("_type")
-    }
-    return [
-        detail
-        for path, detail in zip(paths, details, strict=True)
-        if not (detail["type"].endswith("_type") and path in typed)
-        and not (detail["type"] == "too_short" and any(p.startswith(f"{path}.") for p in paths))
-    ]
 
 
 def _origin(detail: ErrorDetails, mapping: Mapping[str, Any], source: str) -> str:

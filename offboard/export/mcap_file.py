@@ -16,8 +16,17 @@ from typing import Any
 
 import numpy as np
 
+from offboard.analysis.history import History, Rows
 from offboard.documents.errors import UserError, install
-from offboard.export.series import PHASE, Array, Flight, Series, phase_name
+from offboard.export.series import (
+    COLUMNS,
+    PHASE,
+    Array,
+    events_of,
+    phase_name,
+    series_of,
+    values_of,
+)
 from offboard.link.log import new_file
 from offboard.model.frames import enu, flu_in_enu
 
@@ -28,24 +37,25 @@ Stamped = tuple[int, str, Any]  # time in ns, topic, protobuf message or dict
 Stamps = Callable[[Array], list[int]]  # vehicle times in s to stamps of the file in ns
 
 
-def write_mcap(flight: Flight, path: Path) -> None:
+def write_mcap(flown: History, path: Path) -> None:
     """Write an MCAP file. Raises UserError."""
     writers = _library("mcap.writer")
     register = _library("mcap_protobuf.schema").register_schema
-    begun_s, begun_unix_s = flight.begun
+    telemetry = [rows[0] for rows in (flown.position, flown.attitude) if len(rows)]
+    begun_s, begun_unix_s = min((float(row["time_s"]), float(row["unix_s"])) for row in telemetry)
 
     def stamps(time_s: Array) -> list[int]:
         unix_s = time_s - begun_s + begun_unix_s
         return [max(0, round(stamp * 1e6)) * 1000 for stamp in unix_s.tolist()]
 
-    messages = sorted(_messages(flight, stamps), key=lambda each: each[0])
+    messages = sorted(_messages(flown, stamps), key=lambda each: each[0])
     with new_file(path) as file:
         writer = writers.Writer(file)
         writer.start()
         channels: dict[str, int] = {}
         for stamp_ns, topic, message in messages:
             if topic not in channels:
-                channels[topic] = _channel(writer, register, flight, topic, message)
+                channels[topic] = _channel(writer, register, topic, message)
             data = (
                 json.dumps(message).encode()
                 if isinstance(message, dict)
@@ -55,26 +65,32 @@ def write_mcap(flight: Flight, path: Path) -> None:
         writer.finish()
 
 
-def _messages(flight: Flight, stamps: Stamps) -> Iterator[Stamped]:
-    for series in flight.series.values():
-        yield from _rows(series, stamps)
-    yield from _poses(flight, stamps)
-    if "position" in flight.series:
-        yield from _velocities(flight.series["position"], stamps)
+def _messages(flown: History, stamps: Stamps) -> Iterator[Stamped]:
+    found = series_of(flown)
+    for name, rows in found.items():
+        yield from _rows(name, rows, stamps)
+    if "position" in found and "attitude" in found:
+        yield from _poses(found["position"], found["attitude"], stamps)
+    if "position" in found:
+        yield from _velocities(found["position"], stamps)
     for name, topic in (("position", "flown"), ("reference", "reference")):
-        if name in flight.series:
-            yield from _path(flight.series[name], topic, stamps)
-    yield from _texts(flight, stamps)
+        if name in found:
+            yield from _path(found[name], topic, stamps)
+    log = _message("Log")
+    for event in events_of(flown):
+        (stamp_ns,) = stamps(np.array([event.time_s]))
+        entry = log(level=log.INFO, message=event.what, name=event.who)
+        entry.timestamp.FromNanoseconds(stamp_ns)
+        yield stamp_ns, "/log", entry
 
 
-def _channel(writer: Any, register: Any, flight: Flight, topic: str, message: Any) -> int:
+def _channel(writer: Any, register: Any, topic: str, message: Any) -> int:
     if not isinstance(message, dict):
         schema, encoding = register(writer, type(message)), "protobuf"
     else:
         name = topic.rpartition("/")[2]
         numbers = {
-            column: {"type": "string" if column == PHASE else "number"}
-            for column in flight.series[name].columns
+            column: {"type": "string" if column == PHASE else "number"} for column in COLUMNS[name]
         }
         described = {
             "type": "object",
@@ -90,30 +106,28 @@ def _channel(writer: Any, register: Any, flight: Flight, topic: str, message: An
 # ------------------------------------------------------------------ messages
 
 
-def _rows(series: Series, stamps: Stamps) -> Iterator[Stamped]:
+def _rows(name: str, rows: Rows, stamps: Stamps) -> Iterator[Stamped]:
     """JSON has no NaN: what is not known is left out."""
+    times = rows["time_s"]
     for stamp_ns, time_s, row in zip(
-        stamps(series.time_s), series.time_s.tolist(), series.values.tolist(), strict=True
+        stamps(times), times.tolist(), values_of(rows).tolist(), strict=True
     ):
         known = {
             column: phase_name(value) if column == PHASE else value
-            for column, value in zip(series.columns, row, strict=True)
+            for column, value in zip(COLUMNS[name], row, strict=True)
             if math.isfinite(value)
         }
-        yield stamp_ns, f"/table/{series.name}", {"vehicle_time_s": time_s, **known}
+        yield stamp_ns, f"/table/{name}", {"vehicle_time_s": time_s, **known}
 
 
-def _poses(flight: Flight, stamps: Stamps) -> Iterator[Stamped]:
+def _poses(position: Rows, attitude: Rows, stamps: Stamps) -> Iterator[Stamped]:
     """At each position, with the newest attitude."""
-    position, attitude = flight.series.get("position"), flight.series.get("attitude")
-    if position is None or attitude is None:
-        return
     pose_in_frame, transform = _message("PoseInFrame"), _message("FrameTransform")
-    newest = np.searchsorted(attitude.time_s, position.time_s, side="right") - 1
-    quaternions = flu_in_enu(attitude.values[np.maximum(newest, 0), :4]).tolist()
-    places = enu(position.values[:, :3]).tolist()
+    newest = np.searchsorted(attitude["time_s"], position["time_s"], side="right") - 1
+    quaternions = flu_in_enu(attitude["quaternion"][np.maximum(newest, 0)]).tolist()
+    places = enu(position["position_ned_m"]).tolist()
     for stamp_ns, place, quaternion, index in zip(
-        stamps(position.time_s), places, quaternions, newest.tolist(), strict=True
+        stamps(position["time_s"]), places, quaternions, newest.tolist(), strict=True
     ):
         if index < 0:
             continue
@@ -130,17 +144,17 @@ def _poses(flight: Flight, stamps: Stamps) -> Iterator[Stamped]:
         yield stamp_ns, "/tf", frame
 
 
-def _velocities(position: Series, stamps: Stamps) -> Iterator[Stamped]:
+def _velocities(position: Rows, stamps: Stamps) -> Iterator[Stamped]:
     vector = _message("Vector3")
     for stamp_ns, (x, y, z) in zip(
-        stamps(position.time_s), enu(position.values[:, 3:6]).tolist(), strict=True
+        stamps(position["time_s"]), enu(position["velocity_ned_mps"]).tolist(), strict=True
     ):
         yield stamp_ns, "/velocity", vector(x=x, y=y, z=z)
 
 
-def _path(series: Series, topic: str, stamps: Stamps) -> Iterator[Stamped]:
+def _path(rows: Rows, topic: str, stamps: Stamps) -> Iterator[Stamped]:
     """The whole path as a line, at its beginning."""
-    (first_ns,) = stamps(series.time_s[:1])
+    (first_ns,) = stamps(rows["time_s"][:1])
     update = _message("SceneUpdate")()
     entity = update.entities.add(id=topic, frame_id=MAP)
     entity.timestamp.FromNanoseconds(first_ns)
@@ -148,19 +162,10 @@ def _path(series: Series, topic: str, stamps: Stamps) -> Iterator[Stamped]:
     line.type = line.LINE_STRIP
     line.pose.orientation.w = 1.0
     line.color.r, line.color.g, line.color.b, line.color.a = COLOURS[topic]
-    for x, y, z in enu(series.values[:, :3]).tolist():
+    for x, y, z in enu(rows["position_ned_m"]).tolist():
         if math.isfinite(x + y + z):
             line.points.add(x=x, y=y, z=z)
     yield first_ns, f"/path/{topic}", update
-
-
-def _texts(flight: Flight, stamps: Stamps) -> Iterator[Stamped]:
-    log = _message("Log")
-    times = np.array([event.time_s for event in flight.events], dtype=np.float64)
-    for stamp_ns, event in zip(stamps(times), flight.events, strict=True):
-        entry = log(level=log.INFO, message=event.what, name=event.who)
-        entry.timestamp.FromNanoseconds(stamp_ns)
-        yield stamp_ns, "/log", entry
 
 
 def _message(name: str) -> Any:

@@ -11,15 +11,14 @@ import heapq
 import io
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.analysis import history, tlog
-from offboard.analysis.history import Event, Rows
+from offboard.analysis import tlog
+from offboard.analysis.history import Event, History, Rows, gather
 from offboard.documents.errors import UserError
 from offboard.flight.phases import PHASE_CODES
 from offboard.flight.record import FIELDS
@@ -36,7 +35,7 @@ def _quaternion(what: str) -> tuple[str, ...]:
     return tuple(f"{what}_{part}" for part in "wxyz")
 
 
-_COLUMNS = {
+COLUMNS = {
     "position": (*_vectors("position", "m"), *_vectors("velocity", "mps")),
     "attitude": (
         *_quaternion("attitude"),
@@ -57,7 +56,6 @@ _ARRAYS = {"decision": "records"}  # of History, where they have another name
 EVENT = "event"  # source and column of texts
 PHASE = "decision_phase"  # whose numbers tables show as names
 _PHASES: dict[int, str] = {code: phase.value for phase, code in PHASE_CODES.items()}
-_AUTOPILOTS = {"px4": "PX4", "ardupilot": "ArduPilot"}  # as MAV_AUTOPILOT names them
 
 
 def phase_name(number: float) -> str:
@@ -65,67 +63,47 @@ def phase_name(number: float) -> str:
     return _PHASES[int(number)]
 
 
-@dataclass(frozen=True, slots=True)
-class Series:
-    """Samples of one kind: `time_s` (N,) of vehicle time, `unix_s` (N,) of the log, and `values`
-    (N, len(columns))."""
-
-    name: str
-    columns: tuple[str, ...]
-    time_s: Array
-    unix_s: Array
-    values: Array
-
-
-@dataclass(frozen=True, slots=True)
-class Flight:
-    """`series` in which something was recorded, by name; `events` in the order of time. `begun`:
-    vehicle time and Unix time of the first telemetry. `damage` says what of the log could not be
-    read."""
-
-    series: dict[str, Series]
-    events: tuple[Event, ...]
-    begun: tuple[float, float]
-    autopilot: str
-    damage: str
-
-
-def read(path: Path) -> Flight:
+def read(path: Path) -> History:
     """The flight in a directory or .tlog. Raises TlogError, or UserError without telemetry."""
     log = tlog.read(tlog.find(path))
-    flown = history.gather(log)
-    telemetry = [rows[0] for rows in (flown.position, flown.attitude) if len(rows)]
-    if not telemetry:
+    flown = gather(log)
+    if not any(map(len, (flown.position, flown.attitude))):
         raise UserError(f"{log.path} holds no telemetry with a time stamp: nothing to export")
-    begun = min((float(row["time_s"]), float(row["unix_s"])) for row in telemetry)
-    events = tuple(event for event in flown.events() if np.isfinite(event.time_s))
-    arrays = {name: getattr(flown, _ARRAYS.get(name, name)) for name in _COLUMNS}
-    series = {name: each for name in arrays if len((each := _series(name, arrays[name])).time_s)}
-    autopilot = _AUTOPILOTS[flown.dialect.name] if flown.dialect else "unknown"
-    return Flight(series, events, begun, autopilot, flown.damage)
+    return flown
 
 
-def _series(name: str, rows: Rows) -> Series:
-    """Without the samples from before any telemetry, whose time is NaN."""
-    rows = rows[np.isfinite(rows["time_s"])]
-    times = ("time_s", "unix_s")
-    columns = [rows[column] for column in rows.dtype.names or () if column not in times]
-    return Series(name, _COLUMNS[name], rows["time_s"], rows["unix_s"], np.column_stack(columns))
+def series_of(flown: History) -> dict[str, Rows]:
+    """Its samples of each kind, by the names of COLUMNS, where there are any; without those from
+    before any telemetry, whose time is NaN."""
+    arrays = {name: getattr(flown, _ARRAYS.get(name, name)) for name in COLUMNS}
+    known = {name: rows[np.isfinite(rows["time_s"])] for name, rows in arrays.items()}
+    return {name: rows for name, rows in known.items() if len(rows)}
 
 
-def write_csv(flight: Flight, path: Path) -> None:
+def events_of(flown: History) -> list[Event]:
+    """Its events that have a time."""
+    return [event for event in flown.events() if math.isfinite(event.time_s)]
+
+
+def values_of(rows: Rows) -> Array:
+    """Values (N, columns), in the order of COLUMNS."""
+    names = [name for name in rows.dtype.names or () if name not in ("time_s", "unix_s")]
+    return np.column_stack([rows[name] for name in names])
+
+
+def write_csv(flown: History, path: Path) -> None:
     """Write a CSV file, UTF-8, with a line of column names. Raises UserError.
 
     One row for each sample, in the order of vehicle time. `source` is the name of its series;
     columns of the other series are empty. Rows with the source `event` have a text in the column
     `event`.
     """
-    parts = list(flight.series.values())
-    columns = [column for part in parts for column in part.columns]
-    rows = [_csv_rows(part, columns) for part in parts]
+    found = series_of(flown)
+    columns = [column for name in found for column in COLUMNS[name]]
+    rows = [_csv_rows(name, each, columns) for name, each in found.items()]
     blank = [""] * len(columns)
     events: Iterator[list[Any]] = (
-        [e.time_s, e.unix_s, EVENT, *blank, f"{e.who}: {e.what}"] for e in flight.events
+        [e.time_s, e.unix_s, EVENT, *blank, f"{e.who}: {e.what}"] for e in events_of(flown)
     )
     with new_file(path) as file, io.TextIOWrapper(file, "utf-8", newline="") as text:
         writer = csv.writer(text)
@@ -133,17 +111,16 @@ def write_csv(flight: Flight, path: Path) -> None:
         writer.writerows(heapq.merge(*rows, events, key=_time_s))
 
 
-def _csv_rows(series: Series, columns: list[str]) -> Iterator[list[Any]]:
+def _csv_rows(name: str, rows: Rows, columns: list[str]) -> Iterator[list[Any]]:
     """One for each sample, with the columns of all series, in the order of time."""
-    order = np.argsort(series.time_s, kind="stable")
-    before = columns.index(series.columns[0])
-    after = len(columns) - before - len(series.columns) + 1  # and no event
-    for at, unix_s, values in zip(
-        *(each[order].tolist() for each in (series.time_s, series.unix_s, series.values)),
-        strict=True,
+    rows = rows[np.argsort(rows["time_s"], kind="stable")]
+    before = columns.index(COLUMNS[name][0])
+    after = len(columns) - before - len(COLUMNS[name]) + 1  # and no event
+    for time_s, unix_s, values in zip(
+        rows["time_s"].tolist(), rows["unix_s"].tolist(), values_of(rows).tolist(), strict=True
     ):
-        cells = [_cell(*each) for each in zip(series.columns, values, strict=True)]
-        yield [at, unix_s, series.name, *[""] * before, *cells, *[""] * after]
+        cells = [_cell(*each) for each in zip(COLUMNS[name], values, strict=True)]
+        yield [time_s, unix_s, name, *[""] * before, *cells, *[""] * after]
 
 
 def _time_s(row: Any) -> float:

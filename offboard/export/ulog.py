@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from offboard.export.series import Array, Flight, Series
+from offboard.analysis.history import History, Rows
+from offboard.export.series import Array, events_of, series_of, values_of
 from offboard.flight.record import FIELDS
 from offboard.link.log import new_file
 from offboard.model.frames import heading_from_quaternion
@@ -23,13 +24,13 @@ _INFO_LEVEL = ord("6")
 DECISION = "offboard_decision"
 
 
-def _first(count: int) -> Callable[[Series], Array]:
-    return lambda series: series.values[:, :count]
+def _column(name: str) -> Callable[[Rows], Array]:
+    return lambda rows: rows[name]
 
 
-def _attitude_setpoint(setpoint: Series) -> Array:
+def _attitude_setpoint(setpoint: Rows) -> Array:
     """Thrust is along the body's -z axis, as PX4 has it."""
-    attitude, thrust = setpoint.values[:, :4], setpoint.values[:, 4]
+    attitude, thrust = setpoint["quaternion"], setpoint["thrust"]
     yaw = heading_from_quaternion(attitude)
     nothing = np.zeros_like(thrust)
     return np.column_stack((yaw, attitude, nothing, nothing, -thrust))
@@ -37,41 +38,43 @@ def _attitude_setpoint(setpoint: Series) -> Array:
 
 # series of the flight, its topic, names of its fields and how many values each, and the values
 _NED = (("x", 1), ("y", 1), ("z", 1))
-_TOPICS: tuple[tuple[str, str, tuple[tuple[str, int], ...], Callable[[Series], Array]], ...] = (
-    ("position", "vehicle_local_position", (*_NED, ("vx", 1), ("vy", 1), ("vz", 1)), _first(6)),
-    ("truth", "vehicle_local_position_groundtruth", _NED, _first(3)),
-    ("attitude", "vehicle_attitude", (("q", 4),), _first(4)),
-    ("attitude", "vehicle_angular_velocity", (("xyz", 3),), lambda each: each.values[:, 4:7]),
+_TOPICS: tuple[tuple[str, str, tuple[tuple[str, int], ...], Callable[[Rows], Array]], ...] = (
+    ("position", "vehicle_local_position", (*_NED, ("vx", 1), ("vy", 1), ("vz", 1)), values_of),
+    ("truth", "vehicle_local_position_groundtruth", _NED, values_of),
+    ("attitude", "vehicle_attitude", (("q", 4),), _column("quaternion")),
+    ("attitude", "vehicle_angular_velocity", (("xyz", 3),), _column("rates_radps")),
     ("reference", "trajectory_setpoint",
-     (("position", 3), ("velocity", 3), ("acceleration", 3), ("yaw", 1)), _first(10)),
+     (("position", 3), ("velocity", 3), ("acceleration", 3), ("yaw", 1)), values_of),
     ("setpoint", "vehicle_attitude_setpoint",
      (("yaw_body", 1), ("q_d", 4), ("thrust_body", 3)), _attitude_setpoint),
-    ("decision", DECISION, tuple((name, 1) for name in FIELDS), _first(len(FIELDS))),
-    ("heartbeat", "actuator_armed", (("armed", 1),), _first(1)),
+    ("decision", DECISION, tuple((name, 1) for name in FIELDS), values_of),
+    ("heartbeat", "actuator_armed", (("armed", 1),), _column("armed")),
 )  # fmt: skip
 _BYTES = {"actuator_armed"}  # topics of bytes; the others are of float32
+_AUTOPILOTS = {"px4": "PX4", "ardupilot": "ArduPilot"}  # as PX4's tools name them
 
 
-def write_ulog(flight: Flight, path: Path) -> None:
+def write_ulog(flown: History, path: Path) -> None:
     """Write a ULog file. Raises UserError."""
-    topics = [topic for topic in _TOPICS if topic[0] in flight.series]
+    found = series_of(flown)
+    topics = [topic for topic in _TOPICS if topic[0] in found]
     entries: list[tuple[int, bytes]] = []
     for number, (name, topic, _, values) in enumerate(topics):
-        series = flight.series[name]
-        rows = values(series).astype(np.uint8 if topic in _BYTES else np.float32)
-        stamps = np.maximum(np.round(series.time_s * 1e6), 0.0).astype(np.int64).tolist()
+        rows = values(found[name]).astype(np.uint8 if topic in _BYTES else np.float32)
+        stamps = np.maximum(np.round(found[name]["time_s"] * 1e6), 0.0).astype(np.int64).tolist()
         for stamp, row in zip(stamps, rows, strict=True):
             data = struct.pack("<HQ", number, stamp) + row.tobytes()
             entries.append((stamp, _message(_DATA, data)))
-    for event in flight.events:
+    for event in events_of(flown):
         stamp = max(0, round(event.time_s * 1e6))
         text = f"{event.who}: {event.what}".encode()
         entries.append((stamp, _message(_TEXT, struct.pack("<BQ", _INFO_LEVEL, stamp) + text)))
     entries.sort(key=lambda entry: entry[0])
     start = entries[0][0] if entries else 0
+    autopilot = _AUTOPILOTS[flown.dialect.name] if flown.dialect else "unknown"
     with new_file(path) as file:
         file.write(_MAGIC + struct.pack("<Q", start) + _message(_FLAG_BITS, bytes(40)))
-        for key, value in (("sys_name", flight.autopilot), ("ver_sw", "offboard export")):
+        for key, value in (("sys_name", autopilot), ("ver_sw", "offboard export")):
             info = f"char[{len(value)}] {key}".encode()
             file.write(_message(_INFO, bytes([len(info)]) + info + value.encode()))
         for _, topic, fields, _ in topics:

@@ -32,8 +32,7 @@ _STAMP_OPTION = 35 if _LINUX else 0x0400
 _STAMP_KIND = 35 if _LINUX else 0x02
 _STAMP = struct.Struct("@ll" if _LINUX else "@li")
 _STAMP_UNIT_S = 1e-9 if _LINUX else 1e-6
-_DROPPED = 40 if _LINUX else None  # SO_RXQ_OVFL: how many datagrams did not fit into the buffer
-_ANCILLARY_BYTES = socket.CMSG_SPACE(_STAMP.size) + socket.CMSG_SPACE(4)
+_ANCILLARY_BYTES = socket.CMSG_SPACE(_STAMP.size)
 
 
 def udp_socket(family: int = socket.AF_INET) -> socket.socket:
@@ -42,18 +41,15 @@ def udp_socket(family: int = socket.AF_INET) -> socket.socket:
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
     with suppress(OSError):  # without stamps the arrival is taken as early as it can have been
         sock.setsockopt(socket.SOL_SOCKET, _STAMP_OPTION, 1)
-        if _DROPPED is not None:
-            sock.setsockopt(socket.SOL_SOCKET, _DROPPED, 1)
     sock.setblocking(False)
     return sock
 
 
 class _Inbox:
-    """Reads one socket. `dropped`: datagrams that did not fit into its buffer."""
+    """Reads one socket."""
 
     def __init__(self, sock: socket.socket) -> None:
         self.socket = sock
-        self.dropped = 0
         self._buffer = bytearray(DATAGRAM_SIZE)
         self._empty_s = clock.monotonic_s()  # all that is waiting arrived later
 
@@ -72,22 +68,20 @@ class _Inbox:
             except OSError:  # nothing left, or the network interface is down
                 self._empty_s = now_s
                 break
-            stamp_s = self._read(ancillary)
             # a clock that was set meanwhile must not move the arrival
-            arrived_s = max(self._empty_s, min(stamp_s + offset_s, clock.monotonic_s()))
+            stamp_s = min(_stamp_s(ancillary) + offset_s, clock.monotonic_s())
+            arrived_s = max(self._empty_s, stamp_s)
             chunks.append(Chunk(bytes(self._buffer[:size]), peer, arrived_s))
         return chunks
 
-    def _read(self, ancillary: list[tuple[int, int, bytes]]) -> float:
-        """Unix time of the arrival, 0 if there is no stamp; notes `dropped`."""
-        stamp_s = 0.0
-        for _, kind, data in ancillary:
-            if kind == _STAMP_KIND and len(data) >= _STAMP.size:
-                seconds, fraction = _STAMP.unpack_from(data)
-                stamp_s = seconds + fraction * _STAMP_UNIT_S
-            elif kind == _DROPPED:
-                self.dropped = int.from_bytes(data, sys.byteorder)
-        return stamp_s
+
+def _stamp_s(ancillary: list[tuple[int, int, bytes]]) -> float:
+    """Unix time of the arrival, 0 if there is no stamp."""
+    for _, kind, data in ancillary:
+        if kind == _STAMP_KIND and len(data) >= _STAMP.size:
+            seconds, fraction = _STAMP.unpack_from(data)
+            return float(seconds + fraction * _STAMP_UNIT_S)
+    return 0.0
 
 
 class UdpLink:
@@ -104,7 +98,6 @@ class UdpLink:
         self._place: Hashable = vehicle.getpeername() if vehicle else None
         self._heard_s = clock.monotonic_s()  # when we last found a datagram of the vehicle
         self._look_s = 0.0  # when other senders are read next
-        self._dropped = 0
 
     # --- in ---
 
@@ -142,17 +135,11 @@ class UdpLink:
         elif silent:
             ours = [chunk for chunk in others if same_host(chunk.peer, self._place)]
             others = [chunk for chunk in others if not same_host(chunk.peer, self._place)]
-        if others:
-            self._count(others, listening.dropped)
-            self.report.keep(chunk.data for chunk in others)
-        return ours
-
-    def _count(self, others: list[Chunk], dropped: int) -> None:
         for sender, number in Counter(_name(chunk.peer) for chunk in others).items():
             self.report.count(sender, number)
-        if dropped > self._dropped:  # most of the others by far: the vehicle has its own buffer
-            self.report.count(_name(others[-1].peer), dropped - self._dropped)
-            self._dropped = dropped
+        if others:
+            self.report.keep(chunk.data for chunk in others)
+        return ours
 
     # --- out ---
 
@@ -184,7 +171,7 @@ class UdpLink:
             self._listening, sock = None, listening.socket
         self._vehicle, self._place = _Inbox(sock), peer
         self.opened += 1
-        self._heard_s, self._dropped = clock.monotonic_s(), listening.dropped
+        self._heard_s = clock.monotonic_s()
 
     def descriptors(self) -> tuple[int, ...]:
         return tuple(i.socket.fileno() for i in (self._listening, self._vehicle) if i)

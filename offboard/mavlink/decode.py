@@ -56,23 +56,10 @@ class Address(NamedTuple):
     component_id: int
 
 
-class Identity(NamedTuple):
-    """MAV_TYPE and MAV_AUTOPILOT in a HEARTBEAT."""
-
-    vehicle_type: int
-    autopilot: int
-
-
 def decode(frame: Frame, dialect: Dialect) -> events.Event | DropReason | None:
     """The event in a verified frame, IMPLAUSIBLE, or None for a message without decoder."""
     decoder = _DECODERS.get(frame.message_id)
     return None if decoder is None else decoder(frame.message, dialect)
-
-
-def decode_identity(payload: bytes) -> Identity:
-    """MAV_TYPE and MAV_AUTOPILOT in the payload of a HEARTBEAT."""
-    padded = payload.ljust(6, b"\0")  # MAVLink 2 omits trailing zeros
-    return Identity(padded[4], padded[5])
 
 
 def _heartbeat(message: Any, dialect: Dialect) -> events.Event:

@@ -13,11 +13,12 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Hashable, Iterable, Mapping
 from types import MappingProxyType
+from typing import Any
 
 from pymavlink.dialects.v20.all import enums
 
 from offboard.mavlink.counters import Counters, DropReason
-from offboard.mavlink.decode import Address, Identity, decode
+from offboard.mavlink.decode import Address, decode
 from offboard.mavlink.dialects.ardupilot import ARDUPILOT
 from offboard.mavlink.dialects.base import TYPE_GCS, TYPE_ONBOARD_CONTROLLER, Dialect
 from offboard.mavlink.dialects.px4 import PX4
@@ -174,11 +175,10 @@ class Senders:
         autopilot's component."""
         if frame.message_id != HEARTBEAT or frame.component_id != AUTOPILOT_COMPONENT:
             return None
-        identity = Identity(frame.message.type, frame.message.autopilot)
-        if not is_vehicle(identity):
+        if not is_vehicle(frame.message):
             return DropReason.NO_VEHICLE
         for dialect in DIALECTS.values():
-            if dialect.mav_autopilot == identity.autopilot:
+            if dialect.mav_autopilot == frame.message.autopilot:
                 self.hear(frame.system_id, now_s)
                 return dialect
         return DropReason.UNSUPPORTED_AUTOPILOT
@@ -257,9 +257,9 @@ def same_host(place: Hashable, other: Hashable) -> bool:
     return isinstance(place, tuple) and isinstance(other, tuple) and place[0] == other[0]
 
 
-def is_vehicle(identity: Identity) -> bool:
+def is_vehicle(heartbeat: Any) -> bool:
     """Whether this HEARTBEAT is of a vehicle with an autopilot, of any kind."""
-    return identity.vehicle_type not in _NO_VEHICLES and identity.autopilot != _NO_AUTOPILOT
+    return heartbeat.type not in _NO_VEHICLES and heartbeat.autopilot != _NO_AUTOPILOT
 
 
 def unfit_type(vehicle_type: int, *, helicopter: bool) -> str:

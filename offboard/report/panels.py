@@ -140,14 +140,14 @@ GROUPS: dict[str, tuple[str, tuple[Panel, ...]]] = {
     )),
     "attitude": ("Attitude commanded and flown", tuple(
         Panel(f"{title}, deg", (
-            Curve(COMMANDED, _euler_deg("setpoint", axis), ORANGE, "steps", main=False),
+            Curve(COMMANDED, _euler_deg("commanded", axis), ORANGE, "steps", main=False),
             Curve(ESTIMATED, _euler_deg("attitude", axis), BLUE),
         ))
         for axis, title in enumerate(("roll", "pitch", "heading"))
     )),
     "thrust": ("Thrust and battery", (
         Panel("thrust, 0 to 1", (
-            Curve(COMMANDED, _column("setpoint", "thrust"), ORANGE, "steps"),
+            Curve(COMMANDED, _column("commanded", "thrust"), ORANGE, "steps"),
             Curve("hover thrust, estimated", _recorded("hover_thrust"), INK, main=False,
                   dash="dash"),
         )),

@@ -36,8 +36,9 @@ def bands(flight: Flight) -> list[Entry]:
         Entry("phase", begin_s, event.what, end_s, event.phase, _colour(event.phase))
         for event, begin_s, end_s in _spans(flight.history.phases, flight)
     ]
+    dialect = flight.history.dialect
     for event, begin_s, end_s in _spans(flight.history.modes, flight):
-        colour = BLUE_BAND if event.what == flight.engage_mode else GREY_BAND
+        colour = BLUE_BAND if dialect and event.what == dialect.engage_mode else GREY_BAND
         text = f"mode {event.what}"
         found.append(Entry("mode", begin_s, text, end_s, event.what, colour))
     return found

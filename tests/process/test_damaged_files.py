@@ -11,14 +11,16 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+import yaml
 from processes import RECORDING, Called, full_disk
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from offboard.analysis import tlog
 from offboard.analysis.score import keep_score, score_flight
 from offboard.campaign.results import Record
 from offboard.cli import fly
 from offboard.flight.record import RECORD_COMPONENT_ID, configuration_pieces
-from offboard.link.log import LogError
+from offboard.link.log import LogError, entry
 
 NOW_US = 1_790_000_000_000_000  # of an entry of a log
 NO_VEHICLE = "offboard fly --connect udpin:127.0.0.1:PORT --set limits.connect_s=0.3 --out x"
@@ -70,12 +72,21 @@ def test_a_log_is_read_as_far_as_it_is_one(
 
 
 def test_nothing_identified_is_no_vehicle_file(called: Called, tmp_path: Path) -> None:
-    still = RECORDING.with_name("arducopter-4.6.3-guided.tlog")
-    code, _, said = called("offboard identify -o mine.yaml --page page.html", still)
+    kept = [each for each in tlog.read(RECORDING) if each.name != "SET_ATTITUDE_TARGET"]
+    (tmp_path / "x.tlog").write_bytes(b"".join(entry(e.unix_us, e.frame.raw) for e in kept))
+    code, _, said = called("offboard identify -o mine.yaml x.tlog")
     assert code == 1
-    assert said == "nothing could be identified from this flight; page.html says why\n"
-    (page,) = tmp_path.iterdir()
-    assert page.read_text().count("not identified: ") > 3
+    assert said == "nothing could be identified from this flight; identify.html says why\n"
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["identify.html", "x.tlog"]
+    assert (tmp_path / "identify.html").read_text().count("not identified: ") > 3
+
+
+def test_a_log_with_attitude_as_angles_is_identified(called: Called, tmp_path: Path) -> None:
+    log = RECORDING.with_name("arducopter-4.6.3-guided.tlog")  # has no ATTITUDE_QUATERNION
+    assert called("offboard identify -o mine.yaml", log)[0] == 0
+    found = yaml.safe_load((tmp_path / "mine.yaml").read_text())
+    assert found["hover_thrust"] == pytest.approx(0.365, abs=0.01)
+    assert found["tilt"]["natural_frequency_radps"] == pytest.approx(11.4, abs=1.0)
 
 
 def test_the_page_of_a_second_identification_has_a_name_of_its_own(
@@ -110,9 +121,9 @@ def test_an_incomplete_score_is_not_kept(tmp_path: Path) -> None:
 
 def test_a_page_on_a_full_disk_leaves_no_file(called: Called, tmp_path: Path) -> None:
     with full_disk(100):
-        code, _, said = called("offboard identify --page x.html -o x.yaml", RECORDING)
+        code, _, said = called("offboard identify -o x.yaml", RECORDING)
     assert (code, said.count("\n")) == (2, 1)
-    assert said.startswith("x.html cannot be written (File")
+    assert said.startswith("identify.html cannot be written (File")
     assert not list(tmp_path.iterdir())
 
 

@@ -47,7 +47,6 @@ class Drawing(Parameters):
     shape: Annotated[Circle | Line, Field(discriminator="kind")] | None = None
     circles: list[Circle] = Field(default=[])
     named: dict[str, Circle] = Field(default={})
-    copies: Annotated[int, Field(ge=1)] | Annotated[tuple[int, ...], Field(min_length=1)] = 1
 
     @model_validator(mode="after")
     def _blue_is_flat(self) -> Drawing:
@@ -86,7 +85,7 @@ def test_lists_become_tuples_text_an_enum_and_tags_choose_the_model() -> None:
     assert drawing.visible is False
 
 
-KEYS = "circles, colour, copies, corner, named, scale, shape, tilt_rad, title, visible"
+KEYS = "circles, colour, corner, named, scale, shape, tilt_rad, title, visible"
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pymavlink import mavutil
-from pymavlink.dialects.v20 import all as mavlink
 
 from offboard.analysis import history, tlog
-from offboard.flight.record import FIELDS, RECORD_COMPONENT_ID
 
 RECORDINGS = Path(__file__).parents[1] / "wire" / "recordings"
 PX4, ARDUCOPTER = (
@@ -46,25 +44,6 @@ def test_the_layout_of_every_message_is_pymavlinks(path: Path) -> None:
             if not isinstance(expected := getattr(message, field), str):
                 assert np.array_equal(row[field], expected, equal_nan=True), (entry.name, field)
     assert len(seen) > 20
-
-
-def test_what_a_record_of_an_older_version_lacks_has_its_default(tmp_path: Path) -> None:
-    """MAVLink fills what a record does not use with zeros."""
-    codec = mavlink.MAVLink(None, 1, RECORD_COMPONENT_ID)
-    frames = [
-        mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 4, 3).pack(mavlink.MAVLink(None, 1, 1))
-    ]
-    for count in (28, len(FIELDS)):
-        data = [float(place < count) for place in range(58)]
-        record = mavlink.MAVLink_debug_float_array_message(5_000_000, b"pso", count, data)
-        frames.append(record.pack(codec))
-    path = tmp_path / "old.tlog"
-    path.write_bytes(b"".join((10**15 + i).to_bytes(8, "big") + f for i, f in enumerate(frames)))
-    old, new = history.gather(tlog.read(path)).records
-    assert (old["time_s"], old["seed_cost"], new["seed_cost"]) == (5.0, 1.0, 1.0)
-    assert math.isnan(old["age_s"])
-    assert (old["refused"], old["pause_s"]) == (0.0, 0.0)
-    assert (new["age_s"], new["refused"]) == (1.0, 1.0)
 
 
 def damaged(path: Path, data: bytes) -> tlog.Tlog:
