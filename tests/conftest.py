@@ -31,6 +31,9 @@ for _number, _handler in (
     if signal.getsignal(_number) is signal.SIG_IGN:
         signal.signal(_number, _handler)
 
+# Waits of processes first; the many small modules at the end keep all workers busy to the last
+ORDER = ("tests", "process", "clients", "wire", "flight", "replay", "export", "physics", "unit")
+
 PACKAGES = (Path(__file__).parent.parent / name for name in ("offboard", "simulator"))
 
 # Tests that limit the size of files would leave truncated bytecode, on which later imports fail:
@@ -52,6 +55,11 @@ def pytest_sessionstart(session: pytest.Session) -> None:
         for name in COMPILED:
             importlib.import_module(name)
         prepare()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    folders = {name: place for place, name in enumerate(ORDER)}
+    items.sort(key=lambda item: folders.get(item.path.parent.name, len(ORDER)))
 
 
 def pytest_collection_finish() -> None:

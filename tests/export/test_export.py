@@ -28,7 +28,7 @@ from offboard.mavlink import event_record
 
 sys.path.append(str(Path(__file__).parents[1] / "flight"))
 
-from pair import hover
+from pair import PX4, hover
 
 RECORDINGS = Path(__file__).parents[1] / "wire" / "recordings"
 REAL = RECORDINGS / "px4-1.16.1-offboard.tlog"
@@ -37,7 +37,7 @@ OURS = (191, 192)
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    pair = hover(scenario="px4_like")
+    pair = hover(scenario="px4_like", firmware=PX4)
     assert pair.fly().exit_code == 0
     return pair.log(tmp_path_factory.mktemp("hover") / "flight").path
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pair import HOST_EPOCH_S, LEAN, Bytes, decode
+from pair import HOST_EPOCH_S, OBEDIENT, Bytes, decode
 from pydantic import TypeAdapter
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -126,7 +126,7 @@ def assert_read_only(sent: Sequence[Any]) -> None:
 
 
 def bench(
-    firmware: Firmware = LEAN,
+    firmware: Firmware = OBEDIENT,
     faults: Sequence[dict[str, Any]] = (),
     start: Start | None = None,
     charge: float = 1.0,

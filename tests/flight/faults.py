@@ -42,15 +42,6 @@ def with_default(name: str, value: float) -> Firmware:
     return replace(LEAN, parameters=tuple(parameters))
 
 
-def slow(rate_hz: float) -> Firmware:
-    """A vehicle that sends position and attitude at `rate_hz`, whatever rate is requested."""
-    state = ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED")
-    asked = LEAN.companion_rates_hz
-    rates = {name: rate_hz if name in state else hz for name, hz in asked.items()}
-    fixed = LEAN.fixed_streams | frozenset(state)
-    return replace(LEAN, companion_rates_hz=rates, fixed_streams=fixed)
-
-
 # --- links ----------------------------------------------------------------------------------------
 
 

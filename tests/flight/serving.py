@@ -10,6 +10,7 @@ import numpy as np
 from pair import (
     HOST_EPOCH_S,
     LEAN,
+    LEAN_COPTER,
     LOITER,
     SHORT,
     HostClock,
@@ -26,7 +27,6 @@ from offboard.run import configuration as config
 from offboard.run.flight import Prepared, build
 from offboard.service.flights import Flights
 from simulator import config as simulated
-from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Firmware
 from simulator.instance import Instance
 from simulator.start import Start
@@ -275,7 +275,7 @@ def serve(
         )
 
     flown = simulated.scenario(scenario)
-    firmware = firmware or (LEAN if on == "px4" else ARDUPILOT)
+    firmware = firmware or (LEAN if on == "px4" else LEAN_COPTER)
     instance = Instance(
         firmware,
         simulated.vehicle(firmware.vehicle),

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from doctor_bench import bench, said
-from pair import LEAN
+from pair import OBEDIENT
 from pair import make as flight
 
 from offboard.doctor.run import verdict
@@ -38,10 +38,10 @@ def test_nothing_is_said_of_a_good_vehicle(firmware: Firmware) -> None:
 @pytest.mark.parametrize(
     ("firmware", "name", "value", "level", "line"),
     [
-        (LEAN, "COM_OF_LOSS_T", 0.0, BLOCKS, "param set COM_OF_LOSS_T 1"),
-        (LEAN, "COM_OF_LOSS_T", 0.5, WARN, "param set COM_OF_LOSS_T 1"),
-        (LEAN, "COM_OBL_RC_ACT", 0.0, WARN, "param set COM_OBL_RC_ACT 4"),
-        (LEAN, "COM_RCL_EXCEPT", 0.0, WARN, "param set COM_RCL_EXCEPT 4"),
+        (OBEDIENT, "COM_OF_LOSS_T", 0.0, BLOCKS, "param set COM_OF_LOSS_T 1"),
+        (OBEDIENT, "COM_OF_LOSS_T", 0.5, WARN, "param set COM_OF_LOSS_T 1"),
+        (OBEDIENT, "COM_OBL_RC_ACT", 0.0, WARN, "param set COM_OBL_RC_ACT 4"),
+        (OBEDIENT, "COM_RCL_EXCEPT", 0.0, WARN, "param set COM_RCL_EXCEPT 4"),
         (ARDUPILOT, "GUID_OPTIONS", 2.0, BLOCKS, "param set GUID_OPTIONS 10"),
         (ARDUPILOT, "ATC_ANGLE_BOOST", 0.0, BLOCKS, "param set ATC_ANGLE_BOOST 1"),
     ],
@@ -115,9 +115,9 @@ def test_px4_in_offboard_without_setpoints() -> None:
     [
         ({"charge": 0.05}, "battery", BLOCKS, "its battery has 5% left"),
         ({"charge": 0.2}, "battery", WARN, "20% left"),
-        ({"firmware": dataclasses.replace(LEAN, version=0x010D03FF)}, "firmware", WARN,
+        ({"firmware": dataclasses.replace(OBEDIENT, version=0x010D03FF)}, "firmware", WARN,
          "px4 1.13.3 (release) is older than 1.14"),
-        ({"firmware": dataclasses.replace(LEAN, version=0x01110000)}, "firmware", WARN,
+        ({"firmware": dataclasses.replace(OBEDIENT, version=0x01110000)}, "firmware", WARN,
          "px4 1.17.0 (development) is no release"),
         ({"start": Start(height_m=5.0, mode="AUTO.LOITER", by_failsafe=True)}, "state", BLOCKS,
          "a failsafe flies the vehicle, in AUTO.LOITER"),

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from faults import rewritten
-from pair import Pair, decode, in_phase, make, on_arducopter
+from pair import ARDUPILOT, OBEDIENT, Pair, decode, in_phase, make, on_arducopter
 from pydantic import TypeAdapter
 from scipy.spatial.transform import Rotation
 
@@ -46,13 +46,14 @@ def test_flies_a_short_lemniscate(law: str, tmp_path: Path) -> None:
 
 def test_arducopter_flies_a_short_lemniscate_and_lands() -> None:
     """1 cm needs that u_h T b_z / g with the predicted b_z is what its tilt boost undoes."""
-    pair = on_arducopter(*SHORT)
+    pair = on_arducopter(*SHORT, firmware=ARDUPILOT)  # which sends the simulated truth, too
     outcome = pair.fly()
     assert (outcome.exit_code, outcome.sentence) == (0, "flown and landed")
     assert not pair.armed
     score = pair.score()
     assert score.rmse_position_m < 0.01
     assert score.hover_thrust == pytest.approx(0.3655, abs=0.001)
+    assert score.max_truth_m < 0.01
 
 
 def test_autopilot_gets_positions_while_tracking_and_attitudes_before(tmp_path: Path) -> None:
@@ -222,7 +223,7 @@ def test_ranking_of_bandwidths() -> None:
 
     def rmse_m(bandwidth_radps: int, seed: int) -> float:
         bandwidth = f"controller.bandwidth_radps={bandwidth_radps}"
-        pair = make(*lap, bandwidth, scenario="px4_like", seed=seed)
+        pair = make(*lap, bandwidth, scenario="px4_like", seed=seed, firmware=OBEDIENT)
         pair.track()
         return pair.score().rmse_position_m
 

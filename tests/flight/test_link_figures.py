@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import pytest
 from faults import both, late, repeating, stuttering, without
-from pair import Filter, Pair, in_phase, make, through
+from pair import OBEDIENT, Filter, Pair, in_phase, make, through
 
 from offboard.flight.phases import Limits, Phase
 from offboard.flight.timing import LEAST_GROWTH_S
@@ -20,7 +20,7 @@ def over(down: Filter, *assignments: str, aloft: bool = True, **options: object)
     lap = assignments or LAP
     learning = options.pop("learning", IdentifySettings())
     return make(*lap, scenario="px4_like", vehicle="px4_sih", down=down, learning=learning,
-                aloft=aloft, **options)  # fmt: skip
+                aloft=aloft, firmware=OBEDIENT, **options)  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from faults import disarmed, downlink, kill_motors, stop
-from pair import Pair, in_phase
+from pair import Pair, in_phase, with_rate
 from watch import (
     HIGH,
     REACTION_S,
@@ -39,6 +39,7 @@ from simulator.firmware.px4 import PX4
 from simulator.start import Start
 
 SLOW = pytest.mark.slow
+WITH_GPS = with_rate(PX4, 50.0, "GPS_RAW_INT", "ESTIMATOR_STATUS")
 TRACKING = in_phase(Phase.TRACK, 1.0)
 
 
@@ -105,7 +106,8 @@ LANDED_EARLY: dict[str, Any] = {
         lambda: copter.lap(HIGH, scenario=early("second_sender")), AWAY + NAMED, {"error_m": 5.0}
     ),
     "another companion that is not heard, on PX4": (
-        lambda: px4.lap(HIGH, "reference.laps=2", aloft=False, scenario="second_sender"),
+        lambda: px4.lap(HIGH, "reference.laps=2", "reference.run_in_s=4.0", aloft=False,
+                        scenario="second_sender"),
         "the vehicle follows setpoints of another program" + NAMED,
         {"error_m": 5.0},
     ),
@@ -120,7 +122,7 @@ LANDED_EARLY: dict[str, Any] = {
         {"error_m": 1.2, "ended_by": "positioning", "soon": (no_fix, 2.0)},
     ),
     "GPS is silent": (
-        lambda: px4.lap(firmware=PX4, scenario=scenario_of(GPS_LOST, SILENT_GPS)),
+        lambda: px4.lap(firmware=WITH_GPS, scenario=scenario_of(GPS_LOST, SILENT_GPS)),
         "no GPS_RAW_INT for 2.5 s",
         {"error_m": 1.6, "ended_by": "positioning", "soon": (no_fix, 3.0)},
     ),
@@ -183,7 +185,7 @@ NEEDED: dict[str, tuple[Callable[[], Pair], dict[str, Any]]] = {
     "one wrong heartbeat in the take-off": (partial(wrongly_disarmed, copter, Phase.TAKEOFF), {}),
     "one wrong heartbeat in the landing": (partial(wrongly_disarmed, px4, Phase.LAND), {}),
     "no GPS from the beginning, by motion capture": (
-        lambda: px4.hover(firmware=PX4, scenario=NO_GPS), {"failsafes": ()}
+        lambda: px4.hover(firmware=WITH_GPS, scenario=NO_GPS), {"failsafes": ()}
     ),
 }  # fmt: skip
 

@@ -15,7 +15,7 @@ from typing import Any
 import control
 import pytest
 from faults import CURRENT_MODE, HEARTBEAT, frame_id, late, without
-from pair import Bytes, HostClock, Pair, frames_of, hover, in_phase
+from pair import OBEDIENT, Bytes, HostClock, Pair, frames_of, hover, in_phase
 from watch import (
     HIGH,
     LANDED,
@@ -59,7 +59,10 @@ def oldest_s(pair: Pair) -> float:
     [("later_and_later", copter), pytest.param("link_saturates", px4, marks=pytest.mark.slow)],
 )
 def test_a_link_that_becomes_late_ends_in_hold_and_landing(scenario: str, on: Vehicle) -> None:
-    pair = on.lap(HIGH, "reference.laps=2", scenario=early(scenario), deadline_s=DEADLINE_S)
+    traffic = {"firmware": OBEDIENT} if on is px4 else {}
+    pair = on.lap(
+        HIGH, "reference.laps=2", scenario=early(scenario), deadline_s=DEADLINE_S, **traffic
+    )
     says = r"the delay of the link has grown by 0\."
     watch = aborted(pair, says, error_m=0.6, top_m=4.0)
     ends = [Phase.TRACK, Phase.HOLD, Phase.LAND, Phase.DISARMED]
@@ -223,8 +226,9 @@ def paused(
     when: Callable[[Pair], bool] = IN_TRACK,
     **options: Any,
 ) -> tuple[Pair, Watch, float]:
-    """The process is stopped, two seconds into the track; the end of the stop."""
-    pair = on.lap(deadline_s=DEADLINE_S, **options)
+    """The process is stopped, two seconds into the track, where it accelerates little; the end of
+    the stop."""
+    pair = on.lap("reference.run_in_s=4.0", deadline_s=DEADLINE_S, **options)
     ends_s: list[float] = []
 
     def stop(pair: Pair) -> None:

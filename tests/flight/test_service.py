@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -26,6 +25,9 @@ from serving import (
 )
 
 from offboard.flight.phases import TRACKING, Phase, Request
+from offboard.identification.uncertainty import Estimate
+from offboard.identification.vehicle_estimate import IdentifiedVehicle
+from simulator import config as simulated
 
 BOTH = pytest.mark.parametrize("on", ["px4", "ardupilot"])
 HOLD = {"px4": "AUTO.LOITER", "ardupilot": "BRAKE"}
@@ -171,19 +173,16 @@ def test_engaged_in_motion(served: Served, on: str) -> None:
 
 def test_a_contradicted_vehicle_is_identified_again(served: Served) -> None:
     """What was remembered is of another vehicle: its tilt responds three times as late."""
-    pair = served.engaged()
-    pair.until(lambda: bool(pair.memory.known), 30.0)
-    ((key, found),) = pair.memory.known.items()
+    true = simulated.vehicle("px4_sih")
     late = {"delay_s": 0.2, "natural_frequency_radps": 6.0}
-    tilt = found.vehicle.tilt.model_copy(update=late)
-    wrong = replace(found, vehicle=found.vehicle.model_copy(update={"tilt": tilt}))
-    memory = Remembered({key: wrong})
-    again = served.engaged(reference="lemniscate", memory=memory)
-    again.run(14.0)
-    again.switch("pilot")
-    again.run(1.0)
-    assert memory.discarded == [key]
-    assert again.said("contradicted, and discarded")
+    wrong = true.model_copy(update={"tilt": true.tilt.model_copy(update=late)})
+    memory = Remembered({"px4-1-1": IdentifiedVehicle(wrong, Estimate(0.2, 0.002), 0.008)})
+    pair = served.engaged(reference="lemniscate", memory=memory)
+    pair.run(14.0)
+    pair.switch("pilot")
+    pair.run(1.0)
+    assert memory.discarded == ["px4-1-1"]
+    assert pair.said("contradicted, and discarded")
 
 
 # --- who may engage, and when ---------------------------------------------------------------------
@@ -460,12 +459,12 @@ def test_a_vehicle_in_the_failsafe_for_missing_setpoints_is_landed(served: Serve
 def test_requests_over_mavlink(served: Served) -> None:
     pair = served.engaged("ardupilot", reference="lemniscate")
     pair.until(lambda: pair.phase is Phase.TRACK, 30.0)
-    pair.run(3.0)
+    pair.run(1.0)
     pair.command(PAUSE_CONTINUE, 0.0)
     pair.run(4.0)
     assert pair.phase is Phase.PAUSE
     at_m = pair.place
-    pair.run(3.0)
+    pair.run(1.0)
     assert float(np.linalg.norm(pair.place - at_m)) < 0.05
     pair.command(PAUSE_CONTINUE, 1.0)
     pair.until(lambda: float(np.linalg.norm(pair.place - at_m)) > 0.5, 6.0)
@@ -574,8 +573,8 @@ def test_a_pilot_takes_a_vehicle_whose_own_failsafe_acts_soon(served: Served) ->
 def test_a_request_in_the_tick_of_a_transition_is_obeyed(served: Served) -> None:
     """It was acknowledged, and forgotten: it arrives in the last step before the phase changes."""
 
-    def begun(phase: Phase, **options: Any) -> Any:
-        pair = served(reference="hover", arms=True, **options)
+    def begun(phase: Phase) -> Any:
+        pair = served(reference="hover", arms=True)
         pair.until(lambda: pair.phase is Phase.STANDBY)
         pair.command(START)
         pair.until(lambda: pair.phase is phase, 120.0)

@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from faults import ATTITUDE, POSITION, frame_id, rewritten, setting
-from pair import UNIX_EPOCH_US, Pair, calm_hover, frames_of, hover, in_phase, make
+from pair import PX4, UNIX_EPOCH_US, Pair, calm_hover, frames_of, hover, in_phase, make
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from typer.testing import CliRunner
+from watch import watched
 
 from offboard.analysis.history import History
 from offboard.analysis.score import Score, judged, score
@@ -36,7 +37,9 @@ def flown() -> History:
 def default_flight(scenario: str) -> Pair:
     """Of a vehicle of which nothing is known: it is identified in flight."""
     neutral = simulated.vehicle("neutral")
-    pair = make(scenario=scenario, believed=neutral, learning=IdentifySettings(), deadline_s=0.05)
+    pair = make(scenario=scenario, believed=neutral, learning=IdentifySettings(), deadline_s=0.05,
+                firmware=PX4)  # fmt: skip
+    watched(pair)
     assert pair.fly() == Outcome(0, "flown and landed")
     return pair
 
@@ -57,6 +60,8 @@ def achieves(pair: Pair, most_m: float) -> None:
     assert max(pair.failsafes.values(), default=Action.FLY) <= Action.LEVEL
     assert abs(pair.instance.autopilot.state.truth.position_ned_m[2]) < 0.05
     assert not pair.armed
+    true_m = max(moment.error_m for moment in pair.down.during(Phase.TRACK))  # type: ignore[attr-defined]
+    assert scored.max_truth_m == pytest.approx(true_m, abs=0.01)  # a step at 2 m/s
 
 
 def test_default_flight(px4_like: Pair) -> None:

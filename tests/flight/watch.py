@@ -25,7 +25,8 @@ HIGH = "reference.height_m=3.0"
 LANDED = "flown and landed$"
 REACTION_S = 0.13  # a report of the mode at 10 Hz, and a turn
 WATCHED_STEPS = 5  # 20 ms
-LAP = ("reference.height_m=1.0", "reference.laps=1")  # low: a short climb and landing
+LAP = ("reference.height_m=1.0", "reference.laps=1", "reference.run_in_s=2.0",
+       "reference.run_out_s=1.0")  # fmt: skip  # low: a short climb and landing
 
 
 @dataclass(frozen=True)

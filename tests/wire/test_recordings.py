@@ -140,16 +140,6 @@ def test_px4_tells_its_modes_answers_and_texts(px4: Replay) -> None:
     ]
 
 
-def test_px4_lands(px4: Replay) -> None:
-    states = [event.state for event in px4.of(events.Landed)]
-    changes = [s for i, s in enumerate(states) if i == 0 or states[i - 1] != s]
-    assert changes[0] == changes[-1] == "on_ground"
-    assert "in_air" in changes
-    assert any(health.prearm_ok for health in px4.of(events.SystemHealth))
-    charges = [health.battery_remaining for health in px4.of(events.SystemHealth)]
-    assert all(charge is not None and 0.0 < charge <= 1.0 for charge in charges[-50:])
-
-
 def test_arducopter_tells_its_modes_answers_and_texts(arducopter: Replay) -> None:
     assert arducopter.session.vehicle == events.VehicleFound(1, 1, "ardupilot")
     assert arducopter.transitions() == [

@@ -7,7 +7,7 @@ Each recording is trimmed: setpoints to 5 Hz, telemetry to what tells the time a
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,7 @@ NOT_OURS = (
     "Climb to", "Barometer", "AHRS: DCM active", "AHRS: EKF3 active", "EKF3 IMU0 initialised",
     "EKF3 IMU1 initialised", "alignment complete", "GPS 1:", "origin set", "Field Elevation",
 )  # fmt: skip
+COMPARED = {"HEARTBEAT", "EXTENDED_SYS_STATE", "LOCAL_POSITION_NED"}  # of what comes unasked
 PROMPT_S = 0.15
 NORTH, EAST = 0, 1
 # What hangs on how estimates wander near the ground, and on the jerk of PX4's climbs and descents,
@@ -259,13 +260,14 @@ def _system(recording: Path) -> int:
 @functools.cache
 def heard(session: Session) -> tuple[Rows, Rows]:
     """The real one's rows and the simulator's."""
-    real, ours = Rows(), Rows()
+    real, ours, firmware = Rows(), Rows(), FIRMWARES[session.firmware]
+    rates_hz = {name: hz for name, hz in firmware.companion_rates_hz.items() if name in COMPARED}
     bench = Bench(
         ESTIMATORS[session.firmware],
         seed=session.seed,
         heartbeat_type=None,
         system=_system(session.recording),
-        firmware=FIRMWARES[session.firmware],
+        firmware=replace(firmware, companion_rates_hz=rates_hz),
     )
 
     def drain(message: Any) -> None:
