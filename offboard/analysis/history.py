@@ -394,8 +394,8 @@ class _Collector:
             velocity_ned_mps=VELOCITY_LIMIT_MPS,
         )
         attitude = _plausible(rows["ATTITUDE_QUATERNION"], rates_radps=RATE_LIMIT_RADPS)
-        lengths = np.linalg.norm(attitude["quaternion"].astype(np.float64), axis=1)
-        attitude = attitude[(lengths > UNIT_LENGTHS[0]) & (lengths < UNIT_LENGTHS[1])]
+        lengths = np.linalg.norm(attitude["quaternion"], axis=1)
+        attitude = _where(attitude, lengths > UNIT_LENGTHS[0], lengths < UNIT_LENGTHS[1])
         setpoint = ours["SET_ATTITUDE_TARGET"]
         substitutes = []
         if not len(position):
@@ -481,8 +481,15 @@ def _link_delay(requests: Rows, replies: Rows) -> Rows:
 
 def _plausible(rows: Rows, **limits: float) -> Rows:
     """The rows whose columns are within these limits, as the flight refuses the others."""
-    within = [(np.abs(rows[name]) < limit).all(axis=1) for name, limit in limits.items()]
-    return rows[np.all(within, axis=0)]
+    return _where(
+        rows, *((np.abs(rows[name]) < limit).all(axis=1) for name, limit in limits.items())
+    )
+
+
+def _where(rows: Rows, *conditions: NDArray[np.bool_]) -> Rows:
+    """The rows where all conditions (N,) hold; without a copy if that is everywhere."""
+    kept = np.all(conditions, axis=0)
+    return rows if kept.all() else rows[kept]
 
 
 def _vehicle(log: Tlog) -> tuple[Address | None, Dialect | None]:
