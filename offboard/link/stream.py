@@ -6,6 +6,7 @@ again in a thread, `Listener` accepts the next client. Nothing here waits for ei
 
 from __future__ import annotations
 
+import errno
 import os
 import select
 import socket
@@ -67,6 +68,7 @@ def open_port(device: str, baud: int) -> Stream:
     except (serial.SerialException, ValueError, OverflowError) as error:
         number = getattr(error, "errno", None)  # pyserial's text has it and the device twice
         reason = os.strerror(number) if number else error
+        reason = "another program has it open" if number == errno.EAGAIN else reason
         raise LinkUnavailable(
             f"serial port {device} at {baud} baud cannot be opened: {reason}"
         ) from None

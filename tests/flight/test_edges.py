@@ -410,7 +410,7 @@ def test_a_serial_port_is_opened_once() -> None:
     address = f"serial:{os.ttyname(theirs)}:57600"
     open_link(address).close()
     link = open_link(address)
-    with pytest.raises(LinkUnavailable, match="exclusively lock"):
+    with pytest.raises(LinkUnavailable, match="another program has it open"):
         open_link(address)
     link.close()
     os.close(ours)
