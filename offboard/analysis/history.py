@@ -376,8 +376,10 @@ class _Collector:
         """HOME_POSITION gives one point in both frames."""
         at = entry.message
         place = Geodetic(at.latitude / 1e7, at.longitude / 1e7, at.altitude / 1e3)
-        home = entry.name == "HOME_POSITION"
-        self._origin = origin_of(place, (at.x, at.y, at.z)) if home else place
+        if entry.name == "GPS_GLOBAL_ORIGIN":
+            self._origin = place
+        elif self._origin is None:  # else of no use: ArduCopter's x, y and z are zero
+            self._origin = origin_of(place, (at.x, at.y, at.z))
 
     def history(self, damage: str) -> History:
         """All that was added."""
@@ -398,7 +400,7 @@ class _Collector:
         attitude = _where(attitude, lengths > UNIT_LENGTHS[0], lengths < UNIT_LENGTHS[1])
         setpoint = ours["SET_ATTITUDE_TARGET"]
         substitutes = []
-        if not len(position):
+        if not len(position) and not len(ours["POSITION_TARGET_LOCAL_NED"]):  # of another origin
             position = _local(rows["GLOBAL_POSITION_INT"])
             substitutes.append("GLOBAL_POSITION_INT")
         if not len(attitude):

@@ -204,7 +204,9 @@ def unreadable(path: Path) -> str:
     """Why the user of the unit cannot read this file or directory; empty if it can."""
     for place in (path.absolute(), path.resolve()):
         if any(private in place.parents for private in PRIVATE):
-            return f"the unit cannot see {place}: it has a /tmp of its own; put it elsewhere"
+            return (
+                f"the unit cannot see {place}: it has its own /tmp and /var/tmp; put it elsewhere"
+            )
         closed = [each for each in place.parents if not each.stat().st_mode & OTHERS_ENTER]
         if not place.stat().st_mode & OTHERS_READ:
             closed.append(place)

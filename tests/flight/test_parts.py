@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 from faults import PARAM_VALUE, failing, no_direction, raises, without
-from pair import calm_hover, hover
-from watch import copter, refused
+from pair import calm_hover, decode, hover
+from watch import begun_s, copter, refused
 
 from offboard import compiled
 from offboard.compiled import Entry
@@ -139,6 +139,15 @@ def test_records_are_not_sent_and_no_sequence_has_a_gap() -> None:
         assert numbers == [index % 256 for index in range(len(numbers))]
     sent = [frame for _, _, frame in pair.sent]
     assert [frame for frame in pair.logged if frame[6] == 191] == sent
+
+
+def test_the_heartbeat_says_in_which_phase_we_are() -> None:
+    """By which another `offboard` knows that the vehicle is flown."""
+    pair = calm_hover()
+    shown = [(decode(frame).custom_mode, phase) for at_s, phase, frame in pair.sent
+             if frame[7:10] == b"\0\0\0" and at_s > begun_s(pair, phase) + 0.1]  # fmt: skip
+    assert len(shown) > 5
+    assert all(code == phase.code for code, phase in shown)
 
 
 def test_a_message_that_cannot_be_encoded_does_not_stop_the_later_ones() -> None:

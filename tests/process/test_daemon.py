@@ -184,8 +184,9 @@ def test_the_unit_is_valid(called: Called, tmp_path: Path) -> None:
     files = ("--config", "./my $ %.yaml", "--signing-key", "my %.key")
     code, printed, said = called("offboard daemon --print-unit", *link, *files)
     assert code == 0
-    assert f"the unit cannot see {tmp_path / 'my $ %.yaml'}: it has a /tmp of its own; put" in (
-        " ".join(said.split())
+    assert (
+        f"the unit cannot see {tmp_path / 'my $ %.yaml'}: it has its own /tmp and /var/tmp; put"
+        in (" ".join(said.split()))
     )
     unit = tmp_path / "offboard.service"
     unit.write_text(printed)
