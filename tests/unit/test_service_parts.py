@@ -227,7 +227,7 @@ def test_what_the_user_of_the_unit_cannot_read(
     file = tmp_path / "home" / "my.yaml"
     file.parent.mkdir()
     file.touch(0o644)
-    assert daemon.unreadable(file).startswith(f"the unit cannot see {file}: it has a ")
+    assert daemon.unreadable(file).startswith(f"the unit cannot see {file}: it has its own /tmp")
     monkeypatch.setattr(daemon, "PRIVATE", ())
     tmp_path.chmod(0o750)
     assert daemon.unreadable(file).endswith("is closed to others")
