@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from simulator.link.sockets import free_ports
+from processes import free_port
 
 LIMIT_S = 160.0
 MAVPROXY = Path(sys.executable).with_name("mavproxy.py")
@@ -22,7 +22,7 @@ MAVPROXY = Path(sys.executable).with_name("mavproxy.py")
 @contextmanager
 def vehicle(*options: str) -> Iterator[int]:
     """Yield the port that it sends to; the process is gone when the block ends."""
-    (port,) = free_ports(1)
+    port = free_port()
     command = (sys.executable, "-m", "simulator", "--connect", f"udpout:127.0.0.1:{port}")
     process = subprocess.Popen(
         (*command, "--gcs", "none", *options),

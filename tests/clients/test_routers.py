@@ -11,12 +11,12 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from processes import free_port
 from programs import Terminal, vehicle
 from pymavlink import mavutil
 
 from offboard.analysis import tlog
 from offboard.documents.signing_key import create_key
-from simulator.link.sockets import free_ports
 
 SHORT = ("--controller", "lqr", "--reference", "hover", "--set", "reference.height_m=1",
          "--set", "reference.duration_s=1")  # fmt: skip
@@ -29,7 +29,7 @@ LATE = ("--set", "limits.silence_s=5", "--set", "limits.missed_decisions=50")
 def routed(directory: Path, system: int) -> Iterator[tuple[Terminal, int, int]]:
     """A vehicle behind MAVProxy; its terminal, and the ports to which it sends for us and for a
     ground station."""
-    ours, station = free_ports(2)
+    ours, station = free_port(), free_port()
     outs = (f"--out=udpout:127.0.0.1:{ours}", f"--out=udpout:127.0.0.1:{station}")
     simulated = ("--instance", str(system - 1), "--param", "COM_OF_LOSS_T=5")
     with vehicle(*simulated) as port, Terminal(directory, port, *outs) as terminal:

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import closing
 
 import pytest
+from processes import free_port
 from pymavlink.dialects.v20 import common as mavlink
 
 from simulator import config, run
@@ -19,7 +20,6 @@ from simulator.link.sockets import (
     LinkError,
     TcpLink,
     UdpLink,
-    free_ports,
     open_beside,
     open_link,
     shifted,
@@ -56,7 +56,7 @@ def link(companion: socket.socket) -> Iterator[UdpLink]:
 
 @pytest.fixture
 def server() -> Iterator[TcpLink]:
-    with closing(open_link(f"tcpin:127.0.0.1:{free_ports(1)[0]}", 0)) as opened:
+    with closing(open_link(f"tcpin:127.0.0.1:{free_port()}", 0)) as opened:
         assert isinstance(opened, TcpLink)
         yield opened
 
