@@ -121,11 +121,12 @@ class GroundContact:
 
     def stood_for(self, for_s: float) -> bool:
         """At the height of the last rest, and no higher or lower during `for_s`."""
-        newest_s = self._heights[-1][0] if self._heights else 0.0
+        if not self._heights or abs(self.height_m) >= STOOD_HEIGHT_M:
+            return False
+        newest_s = self._heights[-1][0]
         heights = [height for at_s, height in self._heights if at_s > newest_s - for_s]
-        still = bool(heights) and max(heights) - min(heights) < STOOD_WITHIN_M
-        known = still and newest_s - self._heights[0][0] >= for_s
-        return known and abs(self.height_m) < STOOD_HEIGHT_M
+        known = newest_s - self._heights[0][0] >= for_s
+        return known and max(heights) - min(heights) < STOOD_WITHIN_M
 
 
 # ---------------------------------------------------------------------- a landing

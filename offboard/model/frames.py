@@ -126,11 +126,13 @@ def _half_sine_cosine(angle_rad: Any) -> tuple[Any, Any]:
 
 def _components(vectors: ArrayLike) -> Any:
     """The elements of the last axis: Python floats for a single vector, views (...) for many."""
+    if isinstance(vectors, tuple) and isinstance(vectors[0], float):
+        return vectors
     array = np.asarray(vectors, dtype=np.float64)
     return array.tolist() if array.ndim == 1 else np.moveaxis(array, -1, 0)
 
 
 def _stack(*parts: Any) -> Array:
-    if all(isinstance(part, float) for part in parts):
+    if isinstance(parts[0], float):
         return np.array(parts, dtype=np.float64)
     return np.stack(np.broadcast_arrays(*parts), axis=-1)

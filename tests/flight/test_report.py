@@ -15,6 +15,7 @@ from browser import Opened, opening
 from hypothesis import given
 from hypothesis import strategies as st
 from pair import Pair, hover, in_phase
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from typer.testing import CliRunner
 
 from offboard.analysis import tlog
@@ -37,6 +38,7 @@ ARDUCOPTER = RECORDINGS / "arducopter-4.6.3-guided.tlog"
 PX4 = RECORDINGS / "px4-1.16.1-offboard.tlog"
 FIGURES = ["path", "timeline", "tracking", "attitude", "thrust", "decisions", "link"]
 MOST_BYTES = 8_000_000
+STAMP = (1_700_000_000_000_000).to_bytes(8, "big")  # of an entry of a log
 # [x, y] of a curve as the page draws it
 CURVE = """([figure, name]) => {
   const trace = document.getElementById(figure)._fullData.find((each) => each.name === name);
@@ -184,6 +186,41 @@ def test_a_log_of_another_program_gives_what_it_holds(tmp_path: Path, recorded: 
     shown = page([flooded])
     assert "no records of offboard" in shown
     assert "31 datagrams of others" in shown
+
+
+def test_a_flight_of_ours_is_not_shown_in_the_frame_of_another_message(
+    tmp_path: Path, flown: Flown
+) -> None:
+    """Its reference is in the frame of LOCAL_POSITION_NED; GLOBAL_POSITION_INT has another."""
+    bare = tmp_path / "bare.tlog"
+    codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    place = codec.global_position_int_encode(60_000, 470_000_000, 80_000_000, 0, 0, 0, 0, 0, 0)
+    ours = of_kinds(flown.directory / "flight.tlog", {32})
+    bare.write_bytes(ours + STAMP + place.pack(codec))
+    history = read(bare).history
+    assert len(history.reference) > 10
+    assert (len(history.position), history.substitutes) == (0, ())
+
+
+@pytest.mark.parametrize(("origin", "north_m"), [(True, 111.195), (False, 0.0)])
+def test_a_home_position_is_the_origin_only_without_another(
+    tmp_path: Path, origin: bool, north_m: float
+) -> None:
+    """ArduCopter's HOME_POSITION has zeros for the local frame wherever home is. A thousandth of a
+    degree of latitude is 111.195 m on a sphere of 6371 km."""
+    codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    home = 470_010_000, 80_000_000
+    messages = [
+        mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3),
+        *([codec.gps_global_origin_encode(470_000_000, 80_000_000, 500_000)] if origin else []),
+        codec.home_position_encode(*home, 500_000, 0.0, 0.0, 0.0, [1.0, 0.0, 0.0, 0.0], 0, 0, 0),
+        codec.local_position_ned_encode(1000, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+        codec.sim_state_encode(1.0, *[0.0] * 14, 500.0, *[0.0] * 5, *home),
+    ]
+    log = tmp_path / "x.tlog"
+    log.write_bytes(b"".join(STAMP + each.pack(codec) for each in messages))
+    (row,) = read(log).history.truth
+    assert row["position_ned_m"] == pytest.approx([north_m, 0.0, 0.0], abs=0.01)
 
 
 def test_a_damaged_log_is_shown_with_the_place_of_the_damage(
