@@ -36,7 +36,7 @@ from offboard.campaign.document import Promises
 from offboard.campaign.results import Record, code_hash
 from offboard.control.base import ControllerSettings
 from offboard.control.keep_out import clearances
-from offboard.documents.errors import UserError
+from offboard.documents.errors import DocumentError, UserError
 from offboard.flight.flight import Outcome
 from offboard.flight.phases import ExitCode
 from offboard.link.log import LogError
@@ -87,18 +87,18 @@ def recorded(job: Job, directory: Path, fly: Callable[[FlightConfig, Path], Outc
     """The record of a flight from its log, with score.json beside the log.
 
     `fly` flies the configuration of the case, and logs it in `directory`. A flight that fails is a
-    record too. Raises UserError where none can be flown or recorded, for lack of memory or disk
-    space.
+    record too. Raises UserError where none can be flown or recorded now, for example for lack of
+    memory, or of the link.
     """
     try:
         config = job.case.load()
         outcome = fly(config, directory)
         score, history = score_flight(directory)
-    except LogError:
-        raise
     except (OSError, MemoryError) as error:
         raise UserError(f"no flight can be flown here: {str(error) or 'out of memory'}") from None
     except UserError as error:
+        if not (isinstance(error, DocumentError) and error.is_usage):
+            raise  # it is not the case that is wrong
         sentence = " ".join(str(error).split())
         return Record(ExitCode.USAGE, sentence, NOT_FLOWN, "infeasible")
     except Exception as error:

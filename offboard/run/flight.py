@@ -157,6 +157,13 @@ class Simulated:
 # --- a configuration made ready ---
 
 
+class BusyComputer(DocumentError):
+    """A decision is late because other programs have the processor."""
+
+    is_usage = False
+    code = 3
+
+
 @dataclass(frozen=True, slots=True)
 class Prepared:
     """A configuration with what it builds; `text` is that of flight.yaml."""
@@ -269,7 +276,7 @@ def _check_deadline(controller: Controller, cut_short: Situation, deadline_s: fl
         least_s = min(least_s, clock.monotonic_s() - began_s)
         needed_s = min(needed_s, clock.thread_s() - computed_s)
     if least_s > deadline_s >= needed_s:
-        raise DocumentError(
+        raise BusyComputer(
             f"this computer is too busy: a decision needs {1e3 * needed_s:.1f} ms of its processor "
             f"and takes {1e3 * least_s:.1f} ms; close other programs"
         )

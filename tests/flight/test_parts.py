@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import random
 from dataclasses import replace
 from typing import Any
@@ -19,6 +20,7 @@ from offboard.documents.reading import DocumentError
 from offboard.flight import outbox
 from offboard.flight.preflight import ParameterReading
 from offboard.flight.record import configuration_pieces, joined_configuration
+from offboard.link import clock
 from offboard.mavlink.dialects.px4 import PX4
 from offboard.mavlink.outgoing import CommandLong
 from offboard.model.command import Command, PredictedState
@@ -69,6 +71,17 @@ def test_a_law_that_fails_is_found_before_the_flight(fail: Any, says: str) -> No
     law = failing(fail, after=0)(prepared.controller)
     with pytest.raises(DocumentError, match=says):
         rehearse(replace(prepared, controller=law), keeps_deadline=False)
+
+
+def test_a_law_that_other_programs_make_late_may_be_flown_later(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Wall time passes between two readings, and none of the processor's."""
+    prepared = build(config.load("flight", known_vehicle="px4_sih"))
+    monkeypatch.setattr(clock, "monotonic_s", map(float, itertools.count()).__next__)
+    with pytest.raises(DocumentError, match="this computer is too busy: a decision") as late:
+        rehearse(prepared, keeps_deadline=True)
+    assert (late.value.is_usage, late.value.code) == (False, 3)
 
 
 def test_parameters_are_requested_until_they_are_answered() -> None:
