@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -69,7 +70,7 @@ def _positions(flown: History) -> Iterator[LocalPosition]:
 
 
 def begin_times(phases: tuple[Event, ...]) -> dict[str, float]:
-    """Vehicle time at which each phase began."""
+    """Vehicle time at which each phase began, the last time of several."""
     return {event.phase: event.time_s for event in phases}
 
 
@@ -107,18 +108,27 @@ def _ended_early(flown: History) -> tuple[str, str]:
     """What ended the flight, by its phases, and the sentence that announced it; REFERENCE_OVER if
     they were all gone through."""
     names = [event.phase for event in flown.phases]
-    served = _given_back(names)
-    for event, name, before in zip(flown.phases[1:], names[1:], names, strict=False):
-        regular = (before, name) in (("hover", "land"), ("land", "disarmed")) or served
-        if name in {"hold", "land", "stand down", *_LANDING_ENDS} and not regular:
-            taken = event.cause == "pilot" and _critical(flown)
-            return "failsafe" if taken else event.cause or event.reason, event.reason
+    for event in irregular(flown.phases):
+        taken = event.cause == "pilot" and _critical(flown)
+        return "failsafe" if taken else event.cause or event.reason, event.reason
     took_over = [event.what for event in flown.announcements if event.cause == SUPERVISOR]
     if took_over:
         return SUPERVISOR, took_over[0]
     if names[-1] not in _LANDING_ENDS:
         return f"the log ends in the phase {names[-1]}", ""
     return REFERENCE_OVER if "track" in names else names[-1], ""
+
+
+def irregular(phases: tuple[Event, ...]) -> list[Event]:
+    """The phases in which a flight was ended early, or that followed from it."""
+    if _given_back([event.phase for event in phases]):
+        return []
+    return [
+        event
+        for before, event in pairwise(phases)
+        if event.phase in {"hold", "land", "stand down", *_LANDING_ENDS}
+        and (before.phase, event.phase) not in (("hover", "land"), ("land", "disarmed"))
+    ]
 
 
 def _given_back(names: list[str]) -> bool:

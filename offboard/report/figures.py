@@ -33,7 +33,6 @@ from offboard.analysis.page import (
     panels,
     without_outliers,
 )
-from offboard.analysis.verdict import begin_times
 from offboard.report import timeline
 from offboard.report.flight import Flight
 from offboard.report.panels import GROUPS, Curve, Panel, Points, thinned
@@ -257,24 +256,15 @@ def _draw(
 
 def _phase_shapes(flight: Flight) -> list[dict[str, Any]]:
     """A band where the track was flown, and a line where each phase begins."""
-    begun = begin_times(flight.history.phases)
-    known = [at for at in begun.values() if math.isfinite(at)]
-    shapes: list[dict[str, Any]] = [
-        {
-            "type": "line", "xref": "x", "yref": "paper", "x0": at, "x1": at, "y0": 0, "y1": 1,
-            "layer": "below", "opacity": 0.4, "line": {"color": GREY, "width": 1},
-        }
-        for at in known
-    ]  # fmt: skip
-    if math.isfinite(begun.get("track", math.nan)):
-        end_s = min((at for at in known if at > begun["track"]), default=flight.end_s)
-        shapes.append(
-            {
-                "type": "rect", "xref": "x", "yref": "paper", "x0": begun["track"], "x1": end_s,
-                "y0": 0, "y1": 1, "layer": "below", "fillcolor": BLUE_BAND, "opacity": 0.35,
-                "line": {"width": 0},
-            }
-        )  # fmt: skip
+    shapes: list[dict[str, Any]] = []
+    for event, begin_s, end_s in timeline.spans(flight.history.phases, flight):
+        place = {"xref": "x", "yref": "paper", "x0": begin_s, "y0": 0, "y1": 1, "layer": "below"}
+        line = {"color": GREY, "width": 1}
+        if math.isfinite(event.time_s):
+            shapes.append({"type": "line", "x1": begin_s, "opacity": 0.4, "line": line} | place)
+        if event.phase == "track":
+            band = {"fillcolor": BLUE_BAND, "opacity": 0.35, "line": {"width": 0}}
+            shapes.append({"type": "rect", "x1": end_s} | place | band)
     return shapes
 
 

@@ -56,9 +56,9 @@ class Flight:
 
     @property
     def track_s(self) -> float:
-        """Vehicle time at which the track began; otherwise of the take-off, or of the first
+        """Vehicle time at which the track first began; otherwise of the take-off, or of the first
         sample."""
-        begun = begin_times(self.history.phases)
+        begun = begin_times(self.history.phases[::-1])
         return begun.get("track", begun.get("takeoff", self.begin_s))
 
     @property

@@ -5,17 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 from offboard.analysis.history import Event
 from offboard.analysis.page import BLUE_BAND, GREY_BAND, ORANGE_BAND
+from offboard.analysis.verdict import irregular
 from offboard.flight.outbox import Refusal
 from offboard.flight.phases import Phase
 from offboard.report.flight import Flight
 
 _ENDED_EARLY = {Phase.HOLD, Phase.STAND_DOWN, Phase.YIELDED, Phase.FAILED}
-_REGULAR = {("hover", "land"), ("land", "disarmed")}
-_STEPS = {phase.value for phase in (*_ENDED_EARLY, Phase.LAND)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,10 +32,10 @@ def bands(flight: Flight) -> list[Entry]:
     """Phases of offboard, and modes of the vehicle; the mode of its setpoints is blue."""
     found = [
         Entry("phase", begin_s, event.what, end_s, event.phase, _colour(event.phase))
-        for event, begin_s, end_s in _spans(flight.history.phases, flight)
+        for event, begin_s, end_s in spans(flight.history.phases, flight)
     ]
     dialect = flight.history.dialect
-    for event, begin_s, end_s in _spans(flight.history.modes, flight):
+    for event, begin_s, end_s in spans(flight.history.modes, flight):
         colour = BLUE_BAND if dialect and event.what == dialect.engage_mode else GREY_BAND
         text = f"mode {event.what}"
         found.append(Entry("mode", begin_s, text, end_s, event.what, colour))
@@ -47,11 +45,7 @@ def bands(flight: Flight) -> list[Entry]:
 def marks(flight: Flight) -> list[Entry]:
     """Steps of the failsafe, and texts of both sides."""
     flown = flight.history
-    found = [
-        Entry("failsafe", event.time_s, event.what)
-        for before, event in pairwise(flown.phases)
-        if event.phase in _STEPS and (before.phase, event.phase) not in _REGULAR
-    ]
+    found = [Entry("failsafe", event.time_s, event.what) for event in irregular(flown.phases)]
     refused = flown.records["refused"].astype(int)
     for row in refused.nonzero()[0].tolist():
         why = ", ".join(
@@ -65,7 +59,7 @@ def marks(flight: Flight) -> list[Entry]:
     return [mark for mark in found if math.isfinite(mark.begin_s)]
 
 
-def _spans(events: Sequence[Event], flight: Flight) -> list[tuple[Event, float, float]]:
+def spans(events: Sequence[Event], flight: Flight) -> list[tuple[Event, float, float]]:
     """Each event until the next one; the first may be older than telemetry."""
     begins = [flight.begin_s if math.isnan(e.time_s) else e.time_s for e in events]
     ends = [*begins[1:], flight.end_s]

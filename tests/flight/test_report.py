@@ -19,6 +19,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from typer.testing import CliRunner
 
 from offboard.analysis import tlog
+from offboard.analysis.history import Event
 from offboard.analysis.page import logarithmic
 from offboard.analysis.score import Score
 from offboard.cli.commands import app
@@ -144,6 +145,32 @@ def test_bands_are_the_phases_that_were_flown(flown: Flown) -> None:
         assert band.begin_s == pytest.approx(begun[band.label], abs=0.02)
     steps = [mark.text for mark in marks(flown.flight) if mark.row == "failsafe"]
     assert [text.partition(":")[0] for text in steps] == ["yielded"]
+
+
+def of_phases(flight: Flight, *names: str) -> Flight:
+    """The flight as if these phases had begun, each 2 s after the one before."""
+    phases = tuple(
+        Event(flight.begin_s + 2.0 * number, "offboard", name, name)
+        for number, name in enumerate(names)
+    )
+    return replace(flight, history=replace(flight.history, phases=phases))
+
+
+@pytest.mark.parametrize("last", [("yielded",), ("hand back", "yielded")])
+def test_a_vehicle_that_is_given_back_at_the_end_is_no_failsafe(
+    flown: Flown, last: tuple[str, ...]
+) -> None:
+    given_back = of_phases(flown.flight, "ready", "track", "hover", *last)
+    assert not [mark for mark in marks(given_back) if mark.row == "failsafe"]
+
+
+def test_a_paused_track_has_two_bands_and_begins_with_the_first(flown: Flown) -> None:
+    paused = of_phases(flown.flight, "ready", "track", "pause", "track", "hover")
+    begun_s = flown.flight.begin_s
+    assert paused.track_s == begun_s + 2.0
+    shapes = figures([paused])["tracking"].drawing.layout.shapes
+    spans = [(shape.x0, shape.x1) for shape in shapes if shape.type == "rect"]
+    assert spans == [(begun_s + 2.0, begun_s + 4.0), (begun_s + 6.0, begun_s + 8.0)]
 
 
 def test_the_metrics_on_the_page_are_those_of_the_score(flown: Flown, recorded: Flight) -> None:
