@@ -127,10 +127,10 @@ def _exit_at_once() -> None:
 def _displays(live: str | None, *, json_lines: bool) -> Displays:
     """What shows the flight: lines, and a server of the page at the address `live`."""
     from offboard.live.lines import JsonLines, Terminal
-    from offboard.live.process import SERVER, Displays, LiveProcess
+    from offboard.live.process import Displays, LiveProcess
 
     lines = JsonLines(write) if json_lines else Terminal(out, partial(say, indent=12))
-    return Displays(lines, [LiveProcess(SERVER, "--live", live)] if live else [])
+    return Displays(lines, [LiveProcess("--live", live)] if live else [])
 
 
 def _conclude(

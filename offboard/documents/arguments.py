@@ -24,10 +24,18 @@ def split_address(option: str, address: str) -> tuple[str, int]:
     """Host and port of HOST:PORT, the value of `option`; an IPv6 address stands in brackets, no
     host means this computer. Raises UserError."""
     matched = _ADDRESS.fullmatch(address)
-    if matched is None or int(matched[3]) > PORT_MAX:
+    if matched is None or int(matched[3]) > PORT_MAX or not _is_host(matched[2] or LOCAL):
         example = f"give HOST:PORT, for example {LIVE_PAGE}"
         raise UserError(f"{option} {shown(address)}: {example}")
     return matched[1] or matched[2] or LOCAL, int(matched[3])
+
+
+def _is_host(name: str) -> bool:
+    """Whether the name service takes it: no part of it is empty or too long."""
+    try:
+        return bool(name.encode("idna"))
+    except UnicodeError:
+        return False
 
 
 def join_address(host: str, port: int) -> str:

@@ -36,16 +36,16 @@ class NotServed(UserError):
 
 
 class LiveProcess(Display):
-    """A display in the process `python -m MODULE HOST PORT`, started at once.
+    """The page, served by a process of its own that is started at once.
 
     The process prints one JSON line when it listens, {"url": ...}, or says why not, {"error": ...}.
     """
 
-    def __init__(self, module: str, option: str, address: str) -> None:
+    def __init__(self, option: str, address: str) -> None:
         host, port = split_address(option, address)
         self._option = option
         self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", module, host, str(port)],
+            [sys.executable, "-P", "-m", SERVER, host, str(port)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             bufsize=0,

@@ -26,7 +26,7 @@ from offboard.link.connection import open_link
 from offboard.link.interface import Link, LinkError
 from offboard.link.lock import connection_lock, directory_lock
 from offboard.link.stop import StopRequests
-from offboard.live.process import SERVER, LiveProcess
+from offboard.live.process import LiveProcess
 from offboard.mavlink.session import Session
 from offboard.report.background import begin
 from offboard.run.configuration import FlightConfig
@@ -72,7 +72,7 @@ def run(
         stack.enter_context(connection_lock(vehicle.address))
         load()  # a wrong configuration is refused before anything starts
         stack.enter_context(directory_lock(directory))
-        monitor = LiveProcess(SERVER, "--metrics", metrics) if metrics else None
+        monitor = LiveProcess("--metrics", metrics) if metrics else None
         if monitor:
             stack.enter_context(closing(monitor)).await_ready()
         signing = vehicle.signing(stack)

@@ -32,14 +32,13 @@ from offboard.flight.phases import Phase
 from offboard.live.lines import JsonLines, Terminal, status
 from offboard.live.process import Displays, LiveProcess
 
-SERVER = "offboard.live.server"
 FLOOD = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n" * 200
 EVENTS = b"GET /events HTTP/1.1\r\nHost: x\r\n\r\n"
 
 
 @contextmanager
 def serving() -> Iterator[tuple[LiveProcess, str]]:
-    with closing(LiveProcess(SERVER, "--live", "127.0.0.1:0")) as process:
+    with closing(LiveProcess("--live", "127.0.0.1:0")) as process:
         yield process, process.await_ready()
 
 
@@ -137,13 +136,21 @@ def test_an_address_that_cannot_be_served_is_refused() -> None:
             ("no.such.invalid:8014", r"listened on \((?!Unknown error)"),
         ):
             with (
-                closing(LiveProcess(SERVER, "--live", unusable)) as process,
+                closing(LiveProcess("--live", unusable)) as process,
                 pytest.raises(UserError, match=says),
             ):
                 process.await_ready()
-    for wrong in ("", "8014x", "localhost:", "127.0.0.1:99999", "127.0.0.1:²", "[::1:1"):
+    for wrong in (
+        "",
+        "8014x",
+        "localhost:",
+        "127.0.0.1:99999",
+        "127.0.0.1:²",
+        "[::1:1",
+        "127..0.1:1",
+    ):
         with pytest.raises(UserError, match="give HOST:PORT"):
-            LiveProcess(SERVER, "--live", wrong)
+            LiveProcess("--live", wrong)
 
 
 # --- one flight, shown in every way ---------------------------------------------------------------
