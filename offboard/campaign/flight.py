@@ -33,7 +33,7 @@ from offboard.analysis.history import History
 from offboard.analysis.score import judged, keep_score, score_flight
 from offboard.campaign.cases import Case
 from offboard.campaign.document import Promises
-from offboard.campaign.results import Record, code_hash
+from offboard.campaign.results import INFEASIBLE, Record, code_hash
 from offboard.control.base import ControllerSettings
 from offboard.control.keep_out import clearances
 from offboard.documents.errors import DocumentError, UserError
@@ -100,7 +100,7 @@ def recorded(job: Job, directory: Path, fly: Callable[[FlightConfig, Path], Outc
         if not (isinstance(error, DocumentError) and error.is_usage):
             raise  # it is not the case that is wrong
         sentence = " ".join(str(error).split())
-        return Record(ExitCode.USAGE, sentence, NOT_FLOWN, "infeasible")
+        return Record(ExitCode.USAGE, sentence, NOT_FLOWN, INFEASIBLE)
     except Exception as error:
         sentence = f"{type(error).__name__}: {error}"
         return Record(ExitCode.ABORTED, sentence, NOT_FLOWN, "crash")

@@ -25,6 +25,7 @@ from offboard.run.sitl import registered
 # of plans, whose flights are hashed case by case
 PLANS = {shipped.FOLDERS["campaign"], shipped.FOLDERS["tuning"]}
 PACKAGES = ("numpy", "scipy", "numba", "pymavlink", "daqp", "control")
+INFEASIBLE = "infeasible"
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +42,15 @@ class Record:
     @property
     def completed(self) -> bool:
         return self.exit_code == 0
+
+    @property
+    def infeasible(self) -> bool:
+        """Nothing was flown: the configuration cannot be."""
+        return self.weakest == INFEASIBLE
+
+    @property
+    def breaks_a_promise(self) -> bool:
+        return self.margin < 0.0 and not self.infeasible
 
 
 class Results:

@@ -34,6 +34,7 @@ ROUNDS = 4
 AVOIDED = 6  # failures that a round is kept away from
 NEAR = 0.25  # of a range (root mean square): values that are nearer to a failure are penalised
 PENALTY = 2.0
+NO_FAILURE = 1.0  # greatest margin: of values that cannot be flown, which are no failure
 CANDIDATES = 3  # failures that are reduced, per failure that is wanted
 
 
@@ -125,7 +126,8 @@ class FailureSearch:
                 asked = [ask(study, self._search.ranges) for _ in range(BATCH)]
                 records = fly([self._case(dict(values)) for _, values in asked])
                 for (trial, values), record in zip(asked, records, strict=True):
-                    study.tell(trial, record.margin + self._penalty(values, failures))
+                    cost = NO_FAILURE if record.infeasible else record.margin
+                    study.tell(trial, cost + self._penalty(values, failures))
                     flown.append((values, record))
         return flown
 
@@ -137,7 +139,7 @@ class FailureSearch:
                 self._distance(values, other) < NEAR and record.weakest == known.weakest
                 for other, known in chosen
             )
-            if record.margin < 0.0 and not near and len(chosen) < count:
+            if record.breaks_a_promise and not near and len(chosen) < count:
                 chosen.append((values, record))
         return [values for values, _ in chosen]
 
@@ -172,7 +174,7 @@ class FailureSearch:
                 {**values, key: defaults[key]} for values, key in zip(reduced, keys, strict=True)
             ]
             for at, record in enumerate(fly([self._case(values) for values in trials])):
-                if record.margin < 0.0:
+                if record.breaks_a_promise:
                     reduced[at], records[at] = trials[at], record
         found = []
         for values, record in zip(reduced, records, strict=True):
@@ -187,7 +189,7 @@ class FailureSearch:
             case = failure.case
             seeds = range(case.seed + 1, case.seed + 1 + self._search.seeds)
             records = fly([replace(case, seed=seed) for seed in seeds])
-            failing = sum(record.margin < 0.0 for record in records)
+            failing = sum(record.breaks_a_promise for record in records)
             found.append(replace(failure, failing=failing, seeds=len(records)))
         return found
 

@@ -140,7 +140,9 @@ def _search(flown: Campaign, source: str, count: int, open_workers: OpenFlyer) -
     counter = Counter(out, search.flights_most(count))
     with resumable(), flown.runner(open_workers, counter) as runner:
         failures = search.find(count, runner)
-    say(f"{len(flown.cases)} flights, {len(failures)} failures that differ")
+    unflown = sum(row.record.infeasible for row in flown.rows())
+    cannot = f", {unflown} cannot be flown (the table says why)" if unflown else ""
+    say(f"{len(flown.cases)} flights{cannot}, {len(failures)} failures that differ")
     if failures:
         say(f"fly one again in {flown.directory}:")
     for failure in failures:

@@ -72,12 +72,14 @@ def two_regions(case: Case) -> Record:
     return Record(0, "flown and landed", margins[weakest], weakest)
 
 
-def searched(directory: Path, most: float = math.inf) -> tuple[Campaign, list[Failure]]:
+def searched(
+    directory: Path, most: float = math.inf, record: Callable[[Case], Record] = two_regions
+) -> tuple[Campaign, list[Failure]]:
     directory.mkdir(exist_ok=True)
     file = directory / "c.yaml"
     file.write_text(SEARCH)
     campaign = Campaign(*read_campaign(str(file)), directory / "out")
-    with runner(campaign.results, Known(two_regions, most)) as flown:
+    with runner(campaign.results, Known(record, most)) as flown:
         return campaign, FailureSearch(campaign, "c.yaml").find(2, flown)
 
 
@@ -99,6 +101,20 @@ def test_failures_that_differ_are_found_and_reduced_to_their_causes(
     assert "--set controller.bandwidth_radps=7." in as_csv(failures)
     shown = (campaign.directory / "campaign.html").read_text()
     assert shown.count(f"{BANDWIDTH}=") < 100  # of the worst flights alone, not of 200 groups
+
+
+def test_values_that_cannot_be_flown_are_no_failures(
+    whole_search: tuple[Campaign, list[Failure]], tmp_path: Path
+) -> None:
+    """A third of the range of the bandwidth; the failures beside it are found as without it."""
+
+    def flown(case: Case) -> Record:
+        if dict(case.values)[BANDWIDTH] < 4.0:
+            return Record(2, "controller: it cannot be built", -2.0, "infeasible")
+        return two_regions(case)
+
+    _, failures = searched(tmp_path / "search", record=flown)
+    assert {one.kind for one in failures} == {one.kind for one in whole_search[1]}
 
 
 def test_an_interrupted_search_goes_on_and_finds_the_same(
