@@ -64,7 +64,7 @@ class Results:
         self.directory = directory
         self._folder = directory / "results" / code
         try:
-            others = [p.name for p in (directory / "results").glob("*") if p.name != code]
+            others = [p.name for p in (directory / "results").glob("*/") if p.name != code]
         except OSError:
             others = []
         if others:
