@@ -184,11 +184,7 @@ def rounded(value: float) -> float:
 
 def _place(name: str) -> str:
     """A name, or the absolute path of a file."""
-    return str(Path(name).absolute()) if _is_file(name) else name
-
-
-def _is_file(name: str) -> bool:
-    return "/" in name or name.endswith((".yaml", ".yml", ".csv"))
+    return str(Path(name).absolute()) if shipped.is_file(name) else name
 
 
 def _digests(case: Case) -> tuple[tuple[str, str], ...]:
@@ -199,7 +195,7 @@ def _digests(case: Case) -> tuple[tuple[str, str], ...]:
         name = getattr(case, part)
         if name is None or (part == "scenario" and case.link):
             continue
-        if _is_file(name):
+        if shipped.is_file(name):
             found.append((part, _digest(name)))
         else:
             kind = {"config": "configuration", "sim_vehicle": "vehicle"}.get(part, part)

@@ -134,7 +134,7 @@ class CampaignFile(Parameters):
     keep: bool = False
 
 
-def read_campaign(name: str) -> tuple[CampaignFile, str]:
+def read_campaign(name: str | Path) -> tuple[CampaignFile, str]:
     """A shipped campaign or a file, and its path for errors. Raises DocumentError."""
-    path = shipped.locate(name, "campaign") if "." not in name else Path(name)
+    path = name if isinstance(name, Path) else shipped.locate(name, "campaign")
     return parse(shipped.read_text(path), CampaignFile, str(path), "campaign"), str(path)

@@ -98,9 +98,9 @@ def judge(base: Sequence[float], candidate: Sequence[float], values: Values = ()
     return Tuned(values, len(before), float(before.mean()), float(after.mean()), p_value)
 
 
-def read_tune(name: str) -> tuple[TuneFile, str]:
+def read_tune(name: str | Path) -> tuple[TuneFile, str]:
     """A shipped tuning or a file, and its path for errors. Raises DocumentError."""
-    path = locate(name, "tuning") if "." not in name else Path(name)
+    path = name if isinstance(name, Path) else locate(name, "tuning")
     file = parse(read_text(path), TuneFile, str(path), "tuning")
     for key in file.ranges:
         if key.startswith((SCENARIO, "vehicle.")):
@@ -116,15 +116,7 @@ class Tuning:
         self.file = file
         self._study = study_of(file.seed)
         with naming(source):
-            self._training = _cases(file, file.training)
-            self._validation = _cases(file, file.validation)
-            shared = len(set(self._training) & set(self._validation))
-            if shared:
-                raise DocumentError(
-                    f"{shared} flights are in training and in validation; give other scenarios, "
-                    "references or seeds"
-                )
-            self._defaults = _defaults(self._training[0], file)
+            self._training, self._validation, self._defaults = planned(file)
             check([replace(self._training[0], values=tuple(self._defaults.items()))])
 
     @property
@@ -157,6 +149,18 @@ class Tuning:
         if not record.completed:
             return self.file.failure
         return record.figures.get(self.file.objective, self.file.failure)
+
+
+def planned(file: TuneFile) -> tuple[list[Case], list[Case], dict[str, float]]:
+    """The flights of training and of validation, and the present values of the parameters. Raises
+    DocumentError."""
+    training, validation = _cases(file, file.training), _cases(file, file.validation)
+    if shared := len(set(training) & set(validation)):
+        raise DocumentError(
+            f"{shared} flights are in training and in validation; give other scenarios, "
+            "references or seeds"
+        )
+    return training, validation, _defaults(training[0], file)
 
 
 def _cases(file: TuneFile, flights: Flights) -> list[Case]:

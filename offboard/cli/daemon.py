@@ -23,6 +23,7 @@ from offboard.cli.shared import (
 )
 from offboard.documents.command_line import DISK_ERRORS, explained
 from offboard.documents.errors import UserError
+from offboard.documents.shipped import is_file
 
 STATE = Path("/var/lib/offboard")  # of the unit
 REFUSED = 3
@@ -150,7 +151,6 @@ def _without(option: str, words: list[str]) -> list[str]:
 def _absolute(word: str) -> str:
     """A file is named by its whole path: the unit runs in another directory."""
     option, equals, value = word.partition("=") if word.startswith("--") else ("", "", word)
-    is_path = "/" in value or value.endswith((".yaml", ".yml", ".csv", ".key"))
-    if not (is_path and Path(value).exists()):
+    if not (is_file(value) and Path(value).exists()):
         return word
     return f"{option}{equals}{Path(value).absolute()}"

@@ -9,7 +9,7 @@ import typer
 
 from offboard.cli.shared import out, say
 from offboard.documents import shipped
-from offboard.documents.errors import DocumentError, UserError
+from offboard.documents.errors import DocumentError, UserError, naming
 
 
 def check(
@@ -34,8 +34,9 @@ def check(
 
 def _checked(path: Path) -> str:
     """Validate a file; what it is. Raises DocumentError."""
+    from offboard.campaign.cases import base_cases
     from offboard.campaign.document import read_campaign
-    from offboard.campaign.tune import read_tune
+    from offboard.campaign.tune import planned, read_tune
     from offboard.documents.reading import kind_of, read
     from offboard.documents.shipped import read_text
     from offboard.run.configuration import check_file
@@ -43,9 +44,13 @@ def _checked(path: Path) -> str:
     table = path.suffix.lower() == ".csv"
     kind = "" if table else kind_of(read(read_text(path), str(path)))
     if kind == "tuning":
-        read_tune(str(path))
+        tuning, source = read_tune(path)
+        with naming(source):
+            planned(tuning)
     elif kind == "campaign":
-        read_campaign(str(path))
+        campaign, source = read_campaign(path)
+        with naming(source):
+            list(base_cases(campaign))
     else:
         return check_file(path)
     return kind

@@ -50,10 +50,15 @@ def overview(*kinds: str) -> str:
     return "\n\n".join(f"Shipped {kind}s: {', '.join(names(kind))}." for kind in kinds)
 
 
+def is_file(name: str) -> bool:
+    """Whether a name is a file's, and not that of a shipped file."""
+    return "/" in name or name.lower().endswith((".yaml", ".yml", ".csv"))
+
+
 def locate(name: str, kind: str, others: Sequence[str] = ()) -> Path:
-    """The file with a shipped name, or the file itself where `name` contains a `/` or ends in .yaml
-    or .yml. Raises DocumentError with the known names, `others` among them."""
-    if name.endswith((".yaml", ".yml")) or "/" in name:
+    """The file with a shipped name, or the file itself where `name` is one. Raises DocumentError
+    with the known names, `others` among them."""
+    if is_file(name):
         return Path(name)
     if name in names(kind):
         return directory() / FOLDERS[kind] / f"{name}.yaml"

@@ -169,7 +169,7 @@ def check_file(path: Path) -> str:
     raw = read(text, str(path))
     if not raw:
         raise DocumentError(f"{path} is empty")
-    name = str(path if path.suffix in (".yaml", ".yml") else path.absolute())
+    name = str(path if shipped.is_file(str(path)) else path.absolute())
     kind = kind_of(raw)
     if not kind:
         raise DocumentError(

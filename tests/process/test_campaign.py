@@ -267,6 +267,17 @@ def test_a_file_that_a_file_names_decides_the_case(
     assert len(keys) == 2
 
 
+def test_a_table_whose_name_is_in_capitals_is_a_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As for `fly --reference PATH.CSV`."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "PATH.CSV").write_text("time_s,north_m,east_m,down_m\n")
+    (case,) = base_cases(CampaignFile(references=("PATH.CSV",)))
+    assert "reference" in dict(case.files)
+    assert shlex.split(case.line)[4] == str(tmp_path / "PATH.CSV")
+
+
 def test_a_lack_of_memory_is_no_record_of_the_case(monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*parts: object, **options: object) -> None:
         raise MemoryError
@@ -283,6 +294,7 @@ def test_results_of_other_code_are_refused_and_kept(
     Results(tmp_path, "0123456789ab").put("case", Record(0, "flown and landed", 1.0, "error"))
     with pytest.raises(UserError, match=f"other code .0123456789ab, this is {code_hash()}"):
         campaign(FILE, tmp_path)
+    (tmp_path / "results" / ".DS_Store").touch()  # macOS makes one
     assert Results(tmp_path, "0123456789ab").finished() == 1
 
 

@@ -27,6 +27,9 @@ LONG, DIGITS = 300 * "n", 5000 * "9"
 SWARM = "controller.swarm={particles: 10000, iterations: 100000}"
 SLOW = "--set controller.steps=40 --set controller.swarm.particles=2000 --set deadline_s=0.0006"
 EMPTY, NO_TEXT = "the value is empty; is a variable unset?", r"'caf\udce9' is not UTF-8"
+TUNING = """ranges: {controller.%s: [0.1, 0.5]}
+training: {scenarios: [%s]}
+validation: {scenarios: [gusts]}"""
 SPHERE = {"shape": "sphere", "north_m": 0, "east_m": 0, "height_m": 3, "radius_m": 0.5}
 
 
@@ -177,6 +180,10 @@ CSV = "time_s,north_m,east_m,altitude_m\n0,0,0,3\n3,2,0,3\n6,2,{east},4\n9,0,0,3
          "storm.yaml, line 2, column 14: conditions.thrust_scale: 9 should be less"),
         ("storm.yaml", "name: s\nfaults: [{kind: frogs}]", "storm.yaml, line 2, column 1: faults."),
         ("c.yaml", "parameters: {seed: [1]}\nrequire: [x<1]", "require.0: there is no metric 'x'"),
+        ("c.yaml", "controllers: [nope]", "c.yaml: there is no controller named 'nope'; known are"),
+        ("quick", "controllers: [nope]", "quick: there is no controller named 'nope'; known are"),
+        ("t.yaml", TUNING % ("feedback", "calm"), "ranges.controller.feedback is no number of"),
+        ("t.yaml", TUNING % ("feedback_limit", "snow"), "there is no scenario named 'snow'"),
     ],
 )  # fmt: skip
 def test_every_kind_of_file_is_checked(
