@@ -138,11 +138,10 @@ class History:
 
     `phases` and `announcements` are our own, by their records; `modes` and `vehicle_messages`
     (STATUSTEXT, refused commands) the vehicle's. `vehicle` is the one that our record of it
-    names, else the first autopilot that was heard. Only its messages, and ours, are used.
-    `substitutes` are the messages that take the place of others in the log of a ground station.
-    It and `dialect` are None without one, `dialect` also for one that is not known. `damage` says
-    what could not be read, `damage_s` is the time of the telemetry before the first damage, NaN
-    without.
+    names, else the first autopilot that was heard; only its messages, and ours, are used. `vehicle`
+    is None without one, `dialect` also for an autopilot that is not known. `substitutes` are the
+    messages that take the place of others in the log of a ground station. `damage` says what could
+    not be read, `damage_s` is the time of the telemetry before the first damage, NaN without.
     """
 
     position: Rows

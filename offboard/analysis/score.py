@@ -306,8 +306,8 @@ def decision_metrics(flown: History) -> dict[str, float]:
 
 
 def link_metrics(flown: History, window: tuple[float, float] | None) -> dict[str, float]:
-    """Values of a Score. `window`: first and last vehicle time of TRACK; without it, the telemetry
-    has none."""
+    """Values of a Score. `window`: first and last vehicle time of TRACK; None:
+    rates and gaps of the telemetry stay NaN."""
     begun = begin_times(flown.phases)
     last_s = float(flown.position["time_s"][-1]) if len(flown.position) else math.nan
     sent = flown.setpoint[flown.setpoint["time_s"] < begun.get("land", math.inf)]

@@ -1,7 +1,8 @@
 """The verdict on a flight, from its log alone: was all of it flown, and what ended it.
 
 A flight is completed if the whole reference was tracked, the vehicle landed, and it was disarmed;
-one of the service also if the vehicle was given back at the end of the reference.
+one that the pilot engaged in the air also if the vehicle was given back while it hovered at the end
+of the reference.
 """
 
 from __future__ import annotations
@@ -132,8 +133,8 @@ def irregular(phases: tuple[Event, ...]) -> list[Event]:
 
 
 def _given_back(names: list[str]) -> bool:
-    """A flight of the service that the pilot engaged in the air, and took or was given back as it
-    hovered at the end of the reference."""
+    """Whether the pilot engaged it in the air, and had the vehicle again, by a mode change or
+    handed back, while it hovered at the end of the reference."""
     ends = (["hover", "yielded"], ["hover", "hand back", "yielded"])
     return "engage" not in names and any(names[-len(end) :] == end for end in ends)
 

@@ -66,7 +66,8 @@ def fly(
 
     With --json-lines stdout has nothing else. `type` of each object is preparation, announcement (a
     phase or another text), snapshot (once a second of vehicle time; SI, NED, null for what is not
-    known) or, as the last one, result.
+    known) or, as the last one, result. What is refused before the log is created (wrong options or
+    files, a link that does not open) has no result: it is a sentence on stderr, exit code 2 or 3.
 
     Exit codes: 0 flown and all requirements met; 1 a requirement missed; 2 usage or
     configuration error, nothing sent; 3 not flown: no vehicle or connection, refused, or

@@ -4,8 +4,9 @@ The first autopilot heard is the vehicle, known by system id, component id and n
 then on every other sender is dropped and counted; setpoints and modes that another one sends to our
 vehicle are reported, as are other companion computers. mavlink-router and MAVProxy send from
 another port after a restart: the address changes to another port of its host that sends the
-vehicle's frames, after the known one was silent. The link checks that the silence is no overflow
-and no pause of ours: before, it hands over no datagram of another address.
+vehicle's frames, after the known one was silent. The link hands over datagrams of another address
+only after it has checked that the silence was neither an overflow of the socket's buffer nor a
+pause of this process.
 """
 
 from __future__ import annotations

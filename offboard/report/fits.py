@@ -32,10 +32,12 @@ class Fits:
 
 
 def fits(found: Identified, trace: Trace, prior: Vehicle) -> Fits:
-    """Args:
-    found: what was identified.
-    trace: the part of the log that it was identified from.
-    prior: the vehicle before the identification; supplies what was not identified.
+    """The constants of an identification, and how well they reproduce the end of the flight.
+
+    Args:
+        found: what was identified.
+        trace: the part of the log that it was identified from.
+        prior: the vehicle before the identification; supplies what was not identified.
     """
     vehicle = found.applied_to(prior)
     last = trace.between(max(trace.begin_s, trace.end_s - SHOWN_S), trace.end_s)

@@ -2,7 +2,7 @@
 const KEPT = 3000;
 let rows = [], texts = [], newest = null, flight = {}, changed = false;
 const AUTHORITY = {free: "not asked", asked: "asked", ours: "offboard", handed: "handed over",
-  lost: "given up"}; // as on the timeline of a report
+  lost: "given up"};
 const $ = (name) => document.getElementById(name);
 const number = (value, digits, unit, scale = 1) =>
   value === null ? "–" : `${(scale * value).toFixed(digits)} ${unit}`;
