@@ -93,7 +93,8 @@ class Case:
 
     @property
     def line(self) -> str:
-        """The command that flies the case again, from the directory of the campaign."""
+        """The command that flies the case again, from the directory of the campaign; at a link with
+        the same --system and --signing-key, which are no part of the case."""
         named = {
             "config": self.config if self.config != "flight" else None,
             "controller": self.controller,

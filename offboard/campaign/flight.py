@@ -164,7 +164,7 @@ def terms(
 def _clearance(flown: History, controller: ControllerSettings) -> float:
     """Least true distance to a keep-out volume in metres, NaN without volumes or positions."""
     volumes = getattr(controller, "keep_out", ())
-    begun = [event.time_s for event in flown.phases if event.what.startswith("track")]
+    begun = [event.time_s for event in flown.phases if event.phase == "track"]
     path = flown.truth if len(flown.truth) else flown.position
     if not volumes or not begun or not len(path):
         return math.nan

@@ -20,6 +20,7 @@ from offboard.cli.shared import (
     Vehicle,
     Workers,
     check_new,
+    known_port,
     option,
     out,
     say,
@@ -162,7 +163,10 @@ def compare(
     seeds: Annotated[int, option("N", "Flights of each combination, with seeds 1 .. N.")] = 3,
     vehicle: Vehicle = None,
     connect: Annotated[
-        str | None, option("LINK", "Fly the vehicle at this link instead of the simulator.")
+        str | None,
+        option(
+            "LINK", "Fly the vehicle at this link instead of the simulator.", callback=known_port
+        ),
     ] = None,
     system: System = None,
     signing_key: SigningKey = None,

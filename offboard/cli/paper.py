@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from offboard.cli.shared import FLIGHTS, Directory, err, option, say
+from offboard.documents.errors import UserError
 
 
 def paper(
@@ -22,6 +23,8 @@ def paper(
 
     Exit codes: 0 all written; 2 usage error.
     """
+    if quick and seeds is not None:
+        raise UserError("--quick is --seeds 1: use one of them")
     from offboard.link import clock
     from offboard.paper.study import PAGE, SEEDS, reproduce
 

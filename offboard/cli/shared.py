@@ -50,7 +50,7 @@ def option(metavar: str, text: str, *names: str, **more: Any) -> Any:
     return typer.Option(*names, metavar=metavar, help=text, **more)
 
 
-def _known_port(address: str | None) -> str | None:
+def known_port(address: str | None) -> str | None:
     """Refuse to listen on any free port, to which nobody sends."""
     if address and re.fullmatch(r"(udp|tcp)in:.*:0+", address):
         raise UserError(f"--connect {shown(address)}: give the port that the vehicle sends to")
@@ -67,7 +67,7 @@ Connect = Annotated[
         "LINK",
         "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or serial:DEVICE:BAUD; "
         f"IPv6 in brackets.  [default: {DEFAULT_CONNECTION}]",
-        callback=_known_port,
+        callback=known_port,
     ),
 ]
 Vehicle = Annotated[str | None, option(FILE, "Vehicle.")]

@@ -93,6 +93,8 @@ def test_what_cannot_be_flown_is_refused(
         ("offboard daemon --print-unit --config no.yaml", "no.yaml cannot be read: No such file"),
         ("offboard daemon --print-unit --signing-key no", "signing key no"),
         ("offboard daemon --print-unit --out here", "can write below /var/lib/offboard alone"),
+        ("offboard paper --quick --seeds 20 --table none", "--quick is --seeds 1: use one of them"),
+        ("offboard compare --connect udpin:127.0.0.1:0", "give the port that the vehicle sends to"),
         ("--scenario storm", "there is no scenario named 'storm'; known are all_together, "),
         ("--vehicle no/such.yaml", "no/such.yaml cannot be read: No such file"),
         ("--firmware betaflight", "--firmware betaflight: unknown; there is px4"),
