@@ -298,6 +298,11 @@ def test_a_changed_configuration_is_used_and_a_bad_one_refused(
     assert refused.startswith("the configuration is refused, the old one is kept: ")
     assert "height_m" in refused
     assert watched.newest() is first
+    for _ in range(2):
+        (refused,) = news(200)  # is read, but cannot be flown
+        assert "landing from 200 m" in refused
+        assert watched.newest() is first
+        assert news(2) == []
     assert news(3) == ["the configuration has changed: used from the next flight on"]
     assert "height_m: 3" in watched.newest().text
 
