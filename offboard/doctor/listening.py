@@ -228,6 +228,7 @@ class Listening:
 
     def _questions(self, now_s: float) -> Iterable[Outgoing]:
         yield from filter(self._permitted, self.session.poll(now_s))
+        self.vehicle.now_s = self.session.link_time_s  # also while nothing is heard
         dialect, state = self.session.dialect, self.vehicle
         if dialect is None:
             greets = self.session.settings.sends_first or self._may_greet
