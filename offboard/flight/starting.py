@@ -47,10 +47,6 @@ def silent_on_ground(flight: FlightState) -> str:
     return silent_for(flight, flight.limits.connect_s)
 
 
-def silent_for_long(flight: FlightState) -> str:
-    return silent_for(flight, 2.0 * flight.limits.silence_s)
-
-
 def silent_for_another(flight: FlightState) -> str:
     """HEALTH begins anew, but only if something was heard in it."""
     heard = flight.phase is not HEALTH or flight.in_phase_s > flight.silence_s
@@ -323,7 +319,6 @@ def starting(before: Set[Phase]) -> tuple[Transition, ...]:
         Transition({ARM}, not_armed, STAND_DOWN, REFUSED),
         Transition({TAKEOFF}, stop_requested_on_ground, STAND_DOWN, REFUSED, OPERATOR),
         Transition({STAND_DOWN}, rises, LAND, ABORTED, reason=FLIGHT_DETECTED),
-        Transition({STAND_DOWN}, silent_for_long, FAILED, REFUSED, "link"),
         Transition({STAND_DOWN}, disarmed_for_good, FAILED, reason="disarmed on the ground"),
         Transition({STAND_DOWN}, still_armed, FAILED, ABORTED),
     )

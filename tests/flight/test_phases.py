@@ -185,7 +185,6 @@ EVENTS: dict[str, Setup] = {
     "lost_disarmed": _stand(Standing.LOST, armed=False),
     "mode_unknown": _unhear_mode,
     "silent": _set(silence_s=1.01),
-    "silent_for_long": _set(silence_s=2.01),
     "in_own_failsafe": _stand(Standing.FAILSAFE),
     "unheard_on_ground": _unhear_mode,
     "out_of_reach": _set(silence_s=OUTAGE_MAX_S + 0.1),
