@@ -104,9 +104,14 @@ def not_ready_in_time(flight: FlightState) -> str:
     return f"not ready: {not_ready(flight)}" if waited else ""
 
 
+def unfit(flight: FlightState) -> str:
+    """What the preflight list refuses, and the first that it waits for; empty for neither."""
+    ground = ground_of(flight)
+    return "; ".join(filter(None, [*preflight.refusals(ground), preflight.not_ready(ground)]))
+
+
 def usable(flight: FlightState) -> bool:
-    """The preflight list neither refuses the vehicle nor waits for anything."""
-    return ready(flight) and not refused(flight)
+    return not unfit(flight)
 
 
 # ---------------------------------------------------------------------- the service waits
@@ -128,8 +133,9 @@ def engaged_by_pilot(flight: FlightState) -> str:
 
 
 def engaged_but_unfit(flight: FlightState) -> str:
-    unfit = flight.pilot.engaged and can_take_over(flight) and not usable(flight)
-    return f"not engaged: {refused(flight)}{not_ready(flight)}" if unfit else ""
+    may_fly = flight.pilot.engaged and can_take_over(flight)
+    why = unfit(flight) if may_fly else ""
+    return f"not engaged: {why}" if why else ""
 
 
 def engaged_too_soon(flight: FlightState) -> bool:

@@ -231,7 +231,8 @@ def deafen(pair: Pair) -> None:
     pair.up = lambda *_: []
 
 
-def cut(pair: Pair) -> None:
+def stop_unheard(pair: Pair) -> None:
+    faults.stop(pair)
     pair.up = pair.down = lambda *_: []
 
 
@@ -259,8 +260,9 @@ ROWS = {
     ),
     "stop before lift-off": refusal(STOPPED, stayed_down, at=then(Phase.TAKEOFF, 0.3, faults.stop)),
     "stop before lift-off, and nothing is heard any more": aborts(
-        Phase.FAILED, f"{STOPPED} before lift-off; no HEARTBEAT shows whether it is armed after 5 s",
-        asked_to_disarm, at=[*then(Phase.TAKEOFF, 0.3, faults.stop), *then(Phase.TAKEOFF, 0.3, cut)],
+        Phase.FAILED,
+        f"{STOPPED} before lift-off; no HEARTBEAT shows whether it is armed after 5 s",
+        asked_to_disarm, at=then(Phase.TAKEOFF, 0.3, stop_unheard),
     ),
     # its land detector reports flight before it lifts off
     "stop as it lifts off": ends(STOPPED, landed, at=then(Phase.TAKEOFF, 0.5, faults.stop)),
