@@ -69,7 +69,8 @@ def admit(
         age_s: age of the telemetry that the setpoint was computed from, beyond the known delay of
             the link; 0 for a setpoint that needs none.
         age_limit_s: the greatest age that may leave.
-        late_s: time by which the decision missed its deadline; 0 if it did not.
+        late_s: time by which the setpoint is ready later than one control period after the arrival
+            of its telemetry; 0 if it is not later.
 
     Raises Refused if the vehicle is not ours, the telemetry was too old, the decision too late, or
     a value cannot be sent.
