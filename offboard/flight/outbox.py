@@ -13,9 +13,9 @@ from contextlib import suppress
 from enum import IntFlag
 
 from offboard.flight.state import LEVEL, FlightState
-from offboard.flight.vehicle_state import GOOD_RESULTS
 from offboard.mavlink import event_record
 from offboard.mavlink.event_record import EventRecord
+from offboard.mavlink.events import GOOD_RESULTS, WARNING
 from offboard.mavlink.outgoing import (
     FLOAT32_MAX,
     AttitudeTarget,
@@ -28,7 +28,7 @@ from offboard.mavlink.texts import chunks
 from offboard.model.command import Command, PositionCommand
 from offboard.model.vehicle import Vehicle
 
-WARNING, INFO = 4, 6  # MAV_SEVERITY
+INFO = 6  # MAV_SEVERITY
 TEXT_ID_MAX = 65535  # STATUSTEXT.id; 0 is for texts of one chunk
 REPEAT_S = 1.0  # after this a request that was refused, or not answered, is sent again
 _LENGTH_TOLERANCE = 0.01

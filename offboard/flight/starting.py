@@ -21,12 +21,11 @@ from offboard.flight.failsafe import (
 from offboard.flight.phases import ExitCode, Phase, Request, Transition
 from offboard.flight.preflight import Ground
 from offboard.flight.state import FlightState
-from offboard.flight.vehicle_state import ARMED_KNOWN_S
+from offboard.flight.vehicle_state import ARMED_KNOWN_S, DISARMED_S
 from offboard.mavlink.events import Heartbeat
 
 ARM_DISARM = 400  # MAV_CMD_COMPONENT_ARM_DISARM
 ARMING_SHOWN_S = 2.5  # HEARTBEAT, at 1 Hz, shows an accepted arming within this time
-DISARMED_SHOWN_S = 1.5  # longer than a period of HEARTBEAT: arming may have been in progress
 OTHER_VEHICLE_S = 5.0  # what is heard after that may be another vehicle
 LISTENED_S = 0.5  # to hear another sender: PX4 leaves OFFBOARD below 2 Hz
 
@@ -234,7 +233,7 @@ def rises(flight: FlightState) -> bool:
 
 
 def disarmed_for_good(flight: FlightState) -> bool:
-    return flight.vehicle.disarmed and flight.in_phase_s > DISARMED_SHOWN_S
+    return flight.vehicle.disarmed and flight.in_phase_s > DISARMED_S
 
 
 def not_armed(flight: FlightState) -> str:
