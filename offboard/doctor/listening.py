@@ -20,7 +20,6 @@ from offboard.documents.arguments import join_address
 from offboard.flight.preflight import Ground, ParameterReading
 from offboard.flight.timing import VehicleClock
 from offboard.flight.vehicle_state import VehicleState
-from offboard.link import clock
 from offboard.link.interface import Chunk
 from offboard.mavlink.counters import Counters
 from offboard.mavlink.dialects.base import TYPE_GCS, Dialect, WantedMessage
@@ -329,9 +328,9 @@ class Observation:
     heard: Listening
     connection: str
     directory: Path
+    began_s: float
     link_error: str = ""
     holders: tuple[str, ...] = ()
-    began_s: float = field(default_factory=clock.monotonic_s)
 
     @property
     def vehicle(self) -> VehicleState:

@@ -57,9 +57,9 @@ def admit(
     *,
     ours: bool,
     on_ground: bool,
-    age_s: float = 0.0,
-    age_limit_s: float = math.inf,
-    late_s: float = 0.0,
+    age_s: float,
+    age_limit_s: float,
+    late_s: float,
 ) -> Command | PositionCommand:
     """The setpoint that may leave: `command` within the limits of `vehicle`.
 
@@ -108,7 +108,7 @@ def usable(command: Command | PositionCommand) -> bool:
     return abs(math.hypot(*command.thrust_direction_ned) - 1.0) <= _LENGTH_TOLERANCE
 
 
-def clamp(command: Command, vehicle: Vehicle, *, on_ground: bool = False) -> Command:
+def clamp(command: Command, vehicle: Vehicle, *, on_ground: bool) -> Command:
     """`command` limited to the vehicle's thrust and tilt.
 
     A direction tilted by more than `tilt_max_rad` is turned back to that tilt in its own vertical
