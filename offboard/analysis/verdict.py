@@ -19,7 +19,7 @@ from offboard.analysis.history import Event, History
 from offboard.flight.estimates import PositionJumps
 from offboard.flight.ground_contact import Touchdown, moved
 from offboard.mavlink.event_record import SUPERVISOR
-from offboard.mavlink.events import LocalPosition
+from offboard.mavlink.events import CRITICAL, LocalPosition
 
 Array = NDArray[np.float64]
 
@@ -27,7 +27,6 @@ REFERENCE_OVER = "reference over"
 NO_FLIGHT = "no flight of offboard in this log"
 _BLOCK = 10_000  # positions
 _ON_GROUND = 1  # MAV_LANDED_STATE
-_CRITICAL = 5  # MAV_STATE
 _LANDING_ENDS = {"disarmed", "failed", "yielded"}
 
 
@@ -142,4 +141,4 @@ def _given_back(names: list[str]) -> bool:
 def _critical(flown: History) -> bool:
     """Whether the newest HEARTBEAT shows a failsafe or an emergency. A flight whose vehicle was
     taken ends with the first HEARTBEAT since."""
-    return bool(len(flown.heartbeat)) and bool(flown.heartbeat["system_status"][-1] >= _CRITICAL)
+    return bool(len(flown.heartbeat)) and bool(flown.heartbeat["system_status"][-1] >= CRITICAL)

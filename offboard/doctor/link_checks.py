@@ -10,6 +10,7 @@ from functools import partial
 from offboard.doctor.listening import Observation
 from offboard.flight.preflight import TELEMETRY, Finding, Level
 from offboard.link.connection import BITS_OF_A_BYTE
+from offboard.mavlink.senders import DIALECTS
 from offboard.mavlink.telemetry import SHARE
 
 BAUDS = (57600, 115200, 230400, 460800, 921600)
@@ -52,15 +53,19 @@ def port(seen: Observation) -> Iterable[Finding]:
 
 def vehicle(seen: Observation) -> Iterable[Finding]:
     """Whether an autopilot that can be flown is heard, and what is heard if none is."""
-    found, heard, kind = seen.vehicle.found, seen.heard, _kind(seen)
+    found, heard, kind, known = seen.vehicle.found, seen.heard, _kind(seen), DIALECTS.values()
     senders, received = heard.senders.found, heard.senders.counters.bytes_received
     if seen.link_error:
         return
     if found:
         yield ok(f"{found.autopilot}, system {found.system_id}")
-    elif any(sender.is_autopilot for sender in senders):
-        why = heard.session.senders.why_none(heard.session.counters)
-        yield blocks(why or "the autopilot is neither PX4 nor ArduCopter")
+    elif autopilots := [sender for sender in senders if sender.is_autopilot]:
+        why, first = heard.session.senders.why_none(heard.session.counters), autopilots[0]
+        if not why and first.heartbeat.autopilot in {each.mav_autopilot for each in known}:
+            hint = "set its component id to 1 (PX4: MAV_COMP_ID)"
+            yield blocks(f"{first.name} is heard, but only component 1 is flown", hint)
+        else:
+            yield blocks(why or f"{first.name} is neither PX4 nor ArduCopter")
     elif senders:
         names = ", ".join(sender.name for sender in senders[:4])
         hint = "let the autopilot, or the router before it, send to this port"

@@ -20,7 +20,6 @@ from offboard.documents.arguments import join_address
 from offboard.flight.preflight import Ground, ParameterReading
 from offboard.flight.timing import VehicleClock
 from offboard.flight.vehicle_state import VehicleState
-from offboard.link import clock
 from offboard.link.interface import Chunk
 from offboard.mavlink.counters import Counters
 from offboard.mavlink.dialects.base import TYPE_GCS, Dialect, WantedMessage
@@ -228,6 +227,7 @@ class Listening:
 
     def _questions(self, now_s: float) -> Iterable[Outgoing]:
         yield from filter(self._permitted, self.session.poll(now_s))
+        self.vehicle.now_s = self.session.link_time_s  # also while nothing is heard
         dialect, state = self.session.dialect, self.vehicle
         if dialect is None:
             greets = self.session.settings.sends_first or self._may_greet
@@ -328,9 +328,9 @@ class Observation:
     heard: Listening
     connection: str
     directory: Path
+    began_s: float
     link_error: str = ""
     holders: tuple[str, ...] = ()
-    began_s: float = field(default_factory=clock.monotonic_s)
 
     @property
     def vehicle(self) -> VehicleState:

@@ -152,9 +152,9 @@ def observe(
         heard,
         connection,
         directory,
+        began_s,
         link_error=error,
         holders=others,
-        began_s=began_s,
     )
 
 

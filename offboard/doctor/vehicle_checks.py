@@ -122,8 +122,8 @@ def parameters(seen: Observation) -> Iterable[Finding]:
             yield warn(*advised, about=name)
         elif advised is None:
             good.append(f"{name} {parameter.shown(value)}")
-    note = f"; no reply for {', '.join(unanswered)}" if unanswered else ""
-    yield ok(", ".join(good) + note)
+    parts = [", ".join(good), f"no reply for {', '.join(unanswered)}" if unanswered else ""]
+    yield (ok if known else warn)("; ".join(filter(None, parts)))
 
 
 def configuration(seen: Observation) -> Iterable[Finding]:

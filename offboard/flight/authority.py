@@ -61,7 +61,9 @@ class Authority:
     loss: SetpointLoss = NEVER  # what the autopilot does without setpoints
     arrived_s: float = -math.inf  # host time of the arrival of the newest report
     _asked_in: str = ""  # the mode reported when we asked for `engage_mode`
-    _requested: list[str] = field(default_factory=list)  # hold, land: from the one that it shows on
+    # modes that we asked for to end the flight, oldest first; those before the one that it shows
+    # are dropped
+    _requested: list[str] = field(default_factory=list)
     _forgot_s: float = -math.inf  # time of a reboot
     _failsafe_shown: bool = False  # a HEARTBEAT shows what `Standing.FAILSAFE` supposes
     _counts_from_s: float = -math.inf  # host time: reports that arrived earlier do not count

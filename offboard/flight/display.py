@@ -8,9 +8,8 @@ import math
 import re
 
 from offboard.documents.errors import Repeated
-from offboard.flight import preflight
 from offboard.flight.phases import TRACKING, Phase
-from offboard.flight.starting import found_engaged, ground_of
+from offboard.flight.starting import found_engaged, unfit
 from offboard.flight.state import FlightState
 
 PAUSED = "this computer paused for {most:.2f} s{times}: no setpoint before the mode is reported"
@@ -49,7 +48,7 @@ class News:
         passed_s = state.now_s - self._said_s
         if state.in_phase_s < FIRST_S[state.phase] or passed_s < CHANGED_S:
             return ""
-        why = {Phase.CONNECT: _unheard, Phase.HEALTH: _unready, Phase.STANDBY: _left_alone}
+        why = {Phase.CONNECT: _unheard, Phase.HEALTH: unfit, Phase.STANDBY: _left_alone}
         reason = why[state.phase](state)
         kind = re.sub(r"[0-9]+", "", reason)
         again = state.phase is Phase.HEALTH and passed_s >= AGAIN_S
@@ -57,11 +56,6 @@ class News:
             return ""
         self._kind, self._said_s = kind, state.now_s
         return f"waiting: {reason}"
-
-
-def _unready(state: FlightState) -> str:
-    ground = ground_of(state)
-    return "; ".join(filter(None, [*preflight.refusals(ground), preflight.not_ready(ground)]))
 
 
 def _left_alone(state: FlightState) -> str:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from offboard.flight.authority import Standing
-from offboard.flight.phases import TRACKING, Action, Condition
+from offboard.flight.phases import TRACKING, Action, Condition, Limits
 from offboard.flight.state import COMMANDS_KEPT, FlightState
 from offboard.mavlink.events import OtherSender, ThrustReport
 
@@ -302,7 +302,7 @@ ROWS = (
     # of `authority` nothing is asked before the mode is known again
     Row("authority", another_may_control, "2.5 s", LAND, cause="link"),
     Row("silence", silent, "limits.silence_s", LAND, cause="link"),
-    Row("blind", blind, "limits.blind_s", LAND, cause="link"),
+    Row("blind", blind, f"{Limits.blind_s:g} s", LAND, cause="link"),
     Row("age", old, "limits.setpoint_age_s", LEVEL, cause="link"),
     Row("link", late_link, LATE, HOLD, 0.5, "link"),
     Row("uplink", unanswered, "limits.silence_s", HOLD, 0.5, "link"),
@@ -311,7 +311,7 @@ ROWS = (
     Row("tilt", tilted, "limits.tilt_rad", LAND),
     Row("tilt error", away_from_commands, "limits.tilt_error_rad", LAND, 0.5),
     Row("position error", away_from_reference, "limits.position_error_m", LAND),
-    Row("prediction", away_from_prediction, "limits.prediction_error_m", HOLD, 0.3),
+    Row("prediction", away_from_prediction, f"{Limits.prediction_error_m:g} m", HOLD, 0.3),
     Row("estimator", estimate_contradicts, "limits.position_jump_m", HOLD, cause=""),
     Row(
         "positioning", positioning_lost, "limits.gps_s, limits.accuracy_m", LAND, 0.5, "positioning"

@@ -26,14 +26,14 @@ from offboard.flight.record import DROPPED, InputRecorder
 from offboard.flight.state import FlightState, Outcome
 from offboard.flight.timing import PAUSE_S
 from offboard.link.interface import Chunk
-from offboard.mavlink.events import Attitude, ClockBehind, Event, LocalPosition, Rebooted
+from offboard.mavlink.events import CRITICAL, Attitude, ClockBehind, Event, LocalPosition, Rebooted
 from offboard.mavlink.outgoing import Outgoing
 from offboard.mavlink.session import ACTIVE
 from offboard.supervisor.recovery import Supervised
 
 __all__ = ["STOPPED", "Flight", "Outcome"]
 
-MAV_STATE_STANDBY, MAV_STATE_CRITICAL = 3, 5
+STANDBY = 3  # MAV_STATE
 BRIDGED_SHARE = 0.3  # of `Limits.silence_s`; after it, level setpoints replace the control law
 
 
@@ -222,7 +222,7 @@ class Flight(FlightState):
         """MAV_STATE and custom_mode of our heartbeat."""
         calm = self.phase in WAITING | ENDS
         critical = self.phase in FLYING and self.failsafe.action >= Action.HOLD
-        status = MAV_STATE_CRITICAL if critical else MAV_STATE_STANDBY if calm else ACTIVE
+        status = CRITICAL if critical else STANDBY if calm else ACTIVE
         return status, self.phase.code
 
     # ------------------------------------------------------------------ what others ask and say

@@ -29,9 +29,9 @@ from offboard.flight.phases import (
     Transition,
 )
 from offboard.flight.state import FlightState
+from offboard.flight.vehicle_state import DISARMED_S
 
 TAKE_OVER_HEIGHT_M = 1.0  # where setpoints replace the autopilot's own take-off
-DISARMED_S = 1.5  # longer than a period of HEARTBEAT
 DETECTOR_S = 1.0  # EXTENDED_SYS_STATE is requested at 5 Hz
 REST_S = 0.5  # after the end of the reference
 

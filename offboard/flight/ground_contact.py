@@ -90,8 +90,9 @@ class GroundContact:
 
     @property
     def flies(self) -> bool:
-        """Armed, and height and land detector both say that the vehicle flies. Otherwise a pilot's
-        switch does not engage: it may stand on the ground."""
+        """Armed, the land detector reports flight, and the height has not stayed near that of the
+        last rest for a second. Otherwise a pilot's switch does not engage: it may stand on the
+        ground."""
         return self.in_the_air and self.detects_flight and not self.stood_for(STOOD_S)
 
     @property

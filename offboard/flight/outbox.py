@@ -13,9 +13,9 @@ from contextlib import suppress
 from enum import IntFlag
 
 from offboard.flight.state import LEVEL, FlightState
-from offboard.flight.vehicle_state import GOOD_RESULTS
 from offboard.mavlink import event_record
 from offboard.mavlink.event_record import EventRecord
+from offboard.mavlink.events import GOOD_RESULTS, WARNING
 from offboard.mavlink.outgoing import (
     FLOAT32_MAX,
     AttitudeTarget,
@@ -28,7 +28,7 @@ from offboard.mavlink.texts import chunks
 from offboard.model.command import Command, PositionCommand
 from offboard.model.vehicle import Vehicle
 
-WARNING, INFO = 4, 6  # MAV_SEVERITY
+INFO = 6  # MAV_SEVERITY
 TEXT_ID_MAX = 65535  # STATUSTEXT.id; 0 is for texts of one chunk
 REPEAT_S = 1.0  # after this a request that was refused, or not answered, is sent again
 _LENGTH_TOLERANCE = 0.01
@@ -57,9 +57,9 @@ def admit(
     *,
     ours: bool,
     on_ground: bool,
-    age_s: float = 0.0,
-    age_limit_s: float = math.inf,
-    late_s: float = 0.0,
+    age_s: float,
+    age_limit_s: float,
+    late_s: float,
 ) -> Command | PositionCommand:
     """The setpoint that may leave: `command` within the limits of `vehicle`.
 
@@ -69,7 +69,8 @@ def admit(
         age_s: age of the telemetry that the setpoint was computed from, beyond the known delay of
             the link; 0 for a setpoint that needs none.
         age_limit_s: the greatest age that may leave.
-        late_s: time by which the decision missed its deadline; 0 if it did not.
+        late_s: time by which the setpoint is ready later than one control period after the arrival
+            of its telemetry; 0 if it is not later.
 
     Raises Refused if the vehicle is not ours, the telemetry was too old, the decision too late, or
     a value cannot be sent.
@@ -107,7 +108,7 @@ def usable(command: Command | PositionCommand) -> bool:
     return abs(math.hypot(*command.thrust_direction_ned) - 1.0) <= _LENGTH_TOLERANCE
 
 
-def clamp(command: Command, vehicle: Vehicle, *, on_ground: bool = False) -> Command:
+def clamp(command: Command, vehicle: Vehicle, *, on_ground: bool) -> Command:
     """`command` limited to the vehicle's thrust and tilt.
 
     A direction tilted by more than `tilt_max_rad` is turned back to that tilt in its own vertical

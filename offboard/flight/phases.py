@@ -150,7 +150,10 @@ class Limits(Parameters):
     disarm_s: ClassVar[float] = 5.0  # asked for again each second
     late_s: ClassVar[float] = 90.0  # after the planned end of the climb: a strong head wind
     excite_s: ClassVar[float] = 30.0  # three rounds of identification steps end within it
+    hold_s: ClassVar[float] = 2.0  # from hold to land
     hand_back_s: ClassVar[float] = 3.0  # from the request to hold, to land
+    blind_s: ClassVar[float] = 0.5  # no position, or no attitude
+    prediction_error_m: ClassVar[float] = 2.0  # of the decision before
 
     # on the ground
     connect_s: float = Field(default=20.0, gt=0, le=600)
@@ -162,10 +165,8 @@ class Limits(Parameters):
     link_delay_s: float = Field(default=0.4, gt=0, le=2)  # telemetry and setpoint together
     link_jitter_s: float = Field(default=0.15, gt=0, le=2)  # standard deviation of the delay
     # in flight
-    hold_s: float = Field(default=2.0, ge=0.5, le=60)  # from hold to land
     land_s: float = Field(default=90.0, gt=0, le=600)
     silence_s: float = Field(default=1.0, ge=0.2, le=60)  # no telemetry
-    blind_s: float = Field(default=0.5, ge=0.15, le=10)  # no position, or no attitude
     setpoint_age_s: float = Field(default=0.25, ge=0.1, le=2)  # of telemetry beyond link delay
     link_growth_s: float = Field(default=0.3, gt=0, le=2)  # of the link's delay since take-off
     missed_decisions: int = Field(default=3, ge=1, le=100)  # in a row
@@ -173,7 +174,6 @@ class Limits(Parameters):
     gps_s: float = Field(default=1.0, ge=0.5, le=600)  # without the fix of the take-off
     accuracy_m: float = Field(default=3.0, gt=0.5, le=100)  # of the position, as the vehicle says
     position_jump_m: float = Field(default=2.0, gt=0.3, le=100)  # of the estimate, in 10 s
-    prediction_error_m: float = Field(default=2.0, gt=0.1, le=100)  # of the decision before
     hover_thrust: float = Field(default=0.9, gt=0.05, le=1)  # normalised thrust that hovers
     tilt_rad: float = Field(default=1.3, gt=0.2, le=1.5)
     tilt_error_rad: float = Field(default=0.5, gt=0.1, le=3.2)  # from every recent command

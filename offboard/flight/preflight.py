@@ -136,10 +136,6 @@ def armed_already(vehicle: VehicleState, limits: Limits) -> str:
     return "the vehicle is armed already, by another controller or a pilot" if armed else ""
 
 
-def _armed(ground: Ground) -> str:
-    return armed_already(ground.vehicle, ground.limits)
-
-
 def _flown_by_another(ground: Ground) -> str:
     vehicle, dialect = ground.vehicle, ground.dialect
     engaged = vehicle.armed and dialect is not None and vehicle.mode == dialect.engage_mode
@@ -316,7 +312,14 @@ PREFLIGHT = (
     Row("vehicle", BLOCKS, unfit_type, _UNFIT, at_once=True),
     Row("state", BLOCKS, _flown_by_another, "stop that controller", at_once=True, fly_only=True),
     Row("state", BLOCKS, _flown_by_failsafe, _FAILSAFE, at_once=True, fly_only=True),
-    Row("state", BLOCKS, _armed, "disarm it", at_once=True, fly_only=True),
+    Row(
+        "state",
+        BLOCKS,
+        lambda ground: armed_already(ground.vehicle, ground.limits),
+        "disarm it",
+        at_once=True,
+        fly_only=True,
+    ),
     Row(
         "senders",
         BLOCKS,

@@ -21,12 +21,11 @@ from offboard.flight.failsafe import (
 from offboard.flight.phases import ExitCode, Phase, Request, Transition
 from offboard.flight.preflight import Ground
 from offboard.flight.state import FlightState
-from offboard.flight.vehicle_state import ARMED_KNOWN_S
+from offboard.flight.vehicle_state import ARMED_KNOWN_S, DISARMED_S
 from offboard.mavlink.events import Heartbeat
 
 ARM_DISARM = 400  # MAV_CMD_COMPONENT_ARM_DISARM
 ARMING_SHOWN_S = 2.5  # HEARTBEAT, at 1 Hz, shows an accepted arming within this time
-DISARMED_SHOWN_S = 1.5  # longer than a period of HEARTBEAT: arming may have been in progress
 OTHER_VEHICLE_S = 5.0  # what is heard after that may be another vehicle
 LISTENED_S = 0.5  # to hear another sender: PX4 leaves OFFBOARD below 2 Hz
 
@@ -45,10 +44,6 @@ def not_found(flight: FlightState) -> str:
 
 def silent_on_ground(flight: FlightState) -> str:
     return silent_for(flight, flight.limits.connect_s)
-
-
-def silent_for_long(flight: FlightState) -> str:
-    return silent_for(flight, 2.0 * flight.limits.silence_s)
 
 
 def silent_for_another(flight: FlightState) -> str:
@@ -108,9 +103,14 @@ def not_ready_in_time(flight: FlightState) -> str:
     return f"not ready: {not_ready(flight)}" if waited else ""
 
 
+def unfit(flight: FlightState) -> str:
+    """What the preflight list refuses, and the first that it waits for; empty for neither."""
+    ground = ground_of(flight)
+    return "; ".join(filter(None, [*preflight.refusals(ground), preflight.not_ready(ground)]))
+
+
 def usable(flight: FlightState) -> bool:
-    """The preflight list neither refuses the vehicle nor waits for anything."""
-    return ready(flight) and not refused(flight)
+    return not unfit(flight)
 
 
 # ---------------------------------------------------------------------- the service waits
@@ -132,8 +132,9 @@ def engaged_by_pilot(flight: FlightState) -> str:
 
 
 def engaged_but_unfit(flight: FlightState) -> str:
-    unfit = flight.pilot.engaged and can_take_over(flight) and not usable(flight)
-    return f"not engaged: {refused(flight)}{not_ready(flight)}" if unfit else ""
+    may_fly = flight.pilot.engaged and can_take_over(flight)
+    why = unfit(flight) if may_fly else ""
+    return f"not engaged: {why}" if why else ""
 
 
 def engaged_too_soon(flight: FlightState) -> bool:
@@ -232,7 +233,7 @@ def rises(flight: FlightState) -> bool:
 
 
 def disarmed_for_good(flight: FlightState) -> bool:
-    return flight.vehicle.disarmed and flight.in_phase_s > DISARMED_SHOWN_S
+    return flight.vehicle.disarmed and flight.in_phase_s > DISARMED_S
 
 
 def not_armed(flight: FlightState) -> str:
@@ -323,7 +324,6 @@ def starting(before: Set[Phase]) -> tuple[Transition, ...]:
         Transition({ARM}, not_armed, STAND_DOWN, REFUSED),
         Transition({TAKEOFF}, stop_requested_on_ground, STAND_DOWN, REFUSED, OPERATOR),
         Transition({STAND_DOWN}, rises, LAND, ABORTED, reason=FLIGHT_DETECTED),
-        Transition({STAND_DOWN}, silent_for_long, FAILED, REFUSED, "link"),
         Transition({STAND_DOWN}, disarmed_for_good, FAILED, reason="disarmed on the ground"),
         Transition({STAND_DOWN}, still_armed, FAILED, ABORTED),
     )

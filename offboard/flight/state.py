@@ -38,7 +38,8 @@ LEVEL = (0.0, 0.0, 1.0)  # thrust direction
 COMMANDS_KEPT = 7  # as long as an attitude may take to follow
 THRUSTS_KEPT = 40  # as long as a setpoint may be on its way, or the next ones be lost
 PREDICTIONS_KEPT = 8
-# Before the time of its failsafe, at most a third of it: a setpoint is on its way, or was lost
+# Setpoints count as missing so long before the autopilot's timeout, at most a third of it: the
+# newest may be on its way or lost
 STARVED_EARLY_S = 0.3
 SHOWN_S = 1.2  # HEARTBEAT comes at 1 Hz
 STARVED_KNOWN_S = 3.0  # HEARTBEAT, at 1 Hz, shows the failsafe

@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 from offboard.flight.phases import CONTROLLING
 from offboard.flight.record import COMPONENT_ID
 from offboard.mavlink.events import (
+    CRITICAL,
+    GOOD_RESULTS,
+    WARNING,
     Attitude,
     CommandAck,
     EstimatorReport,
@@ -37,13 +40,11 @@ from offboard.mavlink.framing import HEARTBEAT
 from offboard.model.frames import heading_from_quaternion, thrust_direction_from_quaternion
 
 HEALTH_S = 1.5  # SYS_STATUS is requested at 2 Hz
+DISARMED_S = 1.5  # longer than a period of HEARTBEAT: arming may have been in progress
 ARMED_KNOWN_S = 3.0  # PX4 reports it in HEARTBEAT alone, at 1 Hz
 STILL_S = 0.05  # PX4 and ArduCopter repeat a component of the position for 0.03 s at most
 OUTAGE_S = 0.3  # a longer gap of all telemetry is an outage of the link
 MESSAGES_MAX = 12  # texts and refusals kept for the sentence that explains a failure
-WARNING = 4  # MAV_SEVERITY; more severe is a lower number
-GOOD_RESULTS = ("ACCEPTED", "IN_PROGRESS")  # MAV_RESULT
-FAILSAFE_STATUS = 5  # MAV_STATE_CRITICAL; 6 is an emergency
 SET_MESSAGE_INTERVAL = 511  # MAV_CMD: a refused rate explains no failure
 
 
@@ -115,7 +116,7 @@ class VehicleState:
     @property
     def in_failsafe(self) -> bool:
         """The newest HEARTBEAT shows MAV_STATE critical or emergency."""
-        return self.heartbeat is not None and self.heartbeat.system_status >= FAILSAFE_STATUS
+        return self.heartbeat is not None and self.heartbeat.system_status >= CRITICAL
 
     @property
     def sticks(self) -> bool | None:

@@ -174,8 +174,10 @@ def _command_ack(message: Any, _: Dialect) -> events.Event:
     return events.CommandAck(message.command, name)
 
 
-def _parameter(message: Any, dialect: Dialect) -> events.Event | DropReason:
-    value, kind = message.param_value, message.param_type
+def _parameter(message: Any, dialect: Dialect) -> events.Event | DropReason | None:
+    name, value, kind = message.param_id, message.param_value, message.param_type
+    if all(name != watched.name for watched in dialect.watched_parameters):
+        return None  # a ground station reads them all
     if dialect.parameter_encoding is ParameterEncoding.BYTEWISE and kind != _REAL32:
         if kind not in _UNSIGNED_TYPES + _SIGNED_TYPES:
             return DropReason.IMPLAUSIBLE
@@ -184,8 +186,7 @@ def _parameter(message: Any, dialect: Dialect) -> events.Event | DropReason:
         value = int.from_bytes(first, "little", signed=kind in _SIGNED_TYPES)
     if not math.isfinite(value):
         return DropReason.IMPLAUSIBLE
-    name = printable(message.param_id.encode())
-    return events.Parameter(name, float(value)) if name else DropReason.IMPLAUSIBLE
+    return events.Parameter(name, float(value))
 
 
 def printable(data: bytes) -> str:

@@ -11,6 +11,9 @@ from dataclasses import dataclass
 
 Triple = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]  # w, x, y, z; FRD -> NED
+CRITICAL = 5  # MAV_STATE: a failsafe; 6 is an emergency
+WARNING = 4  # MAV_SEVERITY; more severe is a lower number
+GOOD_RESULTS = ("ACCEPTED", "IN_PROGRESS")  # MAV_RESULT
 ESTIMATE = ("attitude", "horizontal velocity", "horizontal position", "height")  # its parts
 
 

@@ -38,11 +38,10 @@ class Preparation:
     is `allowed`: not while the vehicle is armed. Raises DocumentError if the first configuration
     cannot be used."""
 
-    def __init__(self, load: Callable[[], FlightConfig], every_s: float = EVERY_S) -> None:
+    def __init__(self, load: Callable[[], FlightConfig]) -> None:
         self._load = load
-        self._every_s = every_s
         self._newest = self._ready(load())
-        self._seen = self._newest.text  # the newest text or error
+        self._refused = ""  # the text of the newest that was refused, or why it has none
         self._news: deque[str] = deque()
         self.allowed = True
         self._ended = threading.Event()
@@ -63,26 +62,27 @@ class Preparation:
         return [self._news.popleft() for _ in range(len(self._news))]
 
     def _run(self) -> None:
-        while not self._ended.wait(self._every_s):
+        while not self._ended.wait(EVERY_S):
             if self.allowed:
                 self.look()
 
     def look(self) -> None:
-        """Read the configuration again, and use it if it has changed."""
+        """Read the configuration again, and use it if it has changed. One that is refused is tried
+        again, since the computer may have been too busy for it, but named only once."""
+        text = ""
         try:
             config = self._load()
             text = dump(config)
-            if text in (self._seen, self._newest.text):
-                self._seen = text
-                return
-            self._seen = text
-            self._newest = self._ready(config)
-            self._news.append("the configuration has changed: used from the next flight on")
+            if text != self._newest.text:
+                self._newest = self._ready(config)
+                self._news.append("the configuration has changed: used from the next flight on")
+            self._refused = ""
         except Exception as error:  # whatever a controller raises, the old configuration is kept
             sentence = "; ".join(str(error).splitlines())
-            if sentence != self._seen:
-                self._seen = sentence
+            refused = text or sentence  # the sentence may have figures that vary
+            if refused != self._refused:
                 self._news.append(f"the configuration is refused, the old one is kept: {sentence}")
+            self._refused = refused
 
     def _ready(self, config: FlightConfig) -> Prepared:
         prepared = build(config)

@@ -167,7 +167,7 @@ class Recorder:
         message = int.from_bytes(frame[7:10], "little")
         if message in SENT_ONCE:
             name = message, frame[PARAM_ID] if message == PARAM_VALUE else b""
-            if name in self._once or len(self._once) < KEPT_MAX:
+            if message != PARAM_VALUE or name in self._once or len(self._once) < KEPT_MAX:
                 self._once[name] = record
 
     # ------------------------------------------------------------------ flights

@@ -29,7 +29,7 @@ from offboard.link.udp import UdpLink
 from offboard.mavlink import event_record, texts
 from offboard.mavlink.dialects.base import SetpointLoss
 from offboard.mavlink.event_record import SUPERVISOR, EventRecord
-from offboard.mavlink.events import VehicleFound
+from offboard.mavlink.events import WARNING, VehicleFound
 from offboard.mavlink.outgoing import Heartbeat, Outgoing
 from offboard.mavlink.session import ACTIVE, Session, SessionSettings
 from offboard.mavlink.signing import Signing
@@ -40,7 +40,6 @@ POLL_S = 0.02
 PAUSE_MAX_S = 0.1  # of a turn that counts as the controller's silence: the rest was a pause of ours
 BACKLOG_MAX = 20  # batches of the link that are read before the first request
 CLOSE_S = 2.0
-WARNING = 4  # MAV_SEVERITY
 LANDING = 10  # custom_mode, `flight.phases.PHASE_CODES`: no other `offboard` begins a flight now
 DIED = "the controller ended in flight"
 HANGS = "the controller has not answered for {silent_s:g} s"

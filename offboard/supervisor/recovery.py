@@ -20,6 +20,8 @@ from dataclasses import dataclass
 
 from offboard.mavlink.dialects.base import NEVER, Dialect, SetpointLoss
 from offboard.mavlink.events import (
+    CRITICAL,
+    GOOD_RESULTS,
     CommandAck,
     Event,
     Heartbeat,
@@ -37,7 +39,6 @@ ACKNOWLEDGED_S = 3.0  # after hold is reported; it is asked for again until then
 FRESH_S = 2.5  # an older report of the mode is no reason for a command
 LONGEST_S = 300.0
 EARLY_S = 0.3  # the newest setpoint left before the newest beat, and may have been lost
-CRITICAL = 5  # MAV_STATE: a failsafe
 SINK_MPS = 0.2  # downward speed of a vehicle that lands, within SINK_S
 SINK_S = 3.0  # COM_DISARM_LAND is 2 s
 # Without beats the supervisor acts after this time: before the autopilot's own failsafe, so that
@@ -121,7 +122,7 @@ class Recovery:
                 self._sticks = received
             case LocalPosition(velocity_ned_mps=(_, _, down_mps)) if down_mps > SINK_MPS:
                 self._sank_s = at_s
-            case CommandAck(_, result) if result not in ("ACCEPTED", "IN_PROGRESS"):
+            case CommandAck(_, result) if result not in GOOD_RESULTS:
                 self.refusal = result
             case CommandAck(command) if command == self._dialect.hold().command:
                 self._acknowledged |= at_s > self._first_s

@@ -17,6 +17,7 @@ from offboard.doctor import run
 from offboard.doctor.listening import Listening, Observation
 from offboard.doctor.run import OF_COMPUTER, Row, examine
 from offboard.flight.preflight import Finding, Level
+from offboard.link import clock
 from offboard.link.interface import Chunk
 from offboard.mavlink.session import SessionSettings
 from offboard.mavlink.signing import Signing
@@ -88,7 +89,8 @@ class Bench:
                 for frame in self.up(listening.due(self.now_s)):
                     self.sent.append(decode(frame))
                     self.instance.feed(frame)
-        return Observation(self.config, listening, "udpin:127.0.0.1:14540", Path("."))
+        address, began_s = "udpin:127.0.0.1:14540", clock.monotonic_s()
+        return Observation(self.config, listening, address, Path("."), began_s)
 
     def consult(self, *names: str) -> dict[str, Row]:
         """The rows of a check now, by name."""

@@ -60,6 +60,16 @@ def test_line_for_a_parameter_mends_it(
     assert patient.consult("parameters")["parameters"].level is OK
 
 
+@pytest.mark.parametrize("start", [None, Start(height_m=3.0)], ids=["on_the_ground", "armed"])
+def test_a_vehicle_that_falls_silent_is_not_ready_to_fly(start: Start | None) -> None:
+    patient = bench(start=start)
+    heard_until_s = patient.instance.time_s + 2.5
+    patient.down = lambda datagrams: datagrams if patient.instance.time_s < heard_until_s else []
+    rates = patient.consult()["rates"]
+    assert "no HEARTBEAT arrives" in [finding.found for finding in rates.findings]
+    assert not verdict([rates], complete=True).startswith("ready to fly")
+
+
 def test_gps_that_is_lost_waits_and_comes_back() -> None:
     patient = bench(faults=[{"fault": "gps_loss", "at_s": 0.5, "for_s": 12.0, "drift_mps": 0.1}])
     rows = patient.consult()

@@ -98,9 +98,10 @@ def test_nothing_is_heard() -> None:
     [
         (from_others(random.Random(1).randbytes(300), 0, 0, 20.0), "bytes are heard that are not"),
         (from_others(GCS_HEARTBEAT, 255, 190, 1.0), "but no autopilot: ground station 255/190"),
-        (from_others(UNKNOWN_HEARTBEAT, 1, 1, 1.0), "the autopilot is neither PX4 nor ArduCopter"),
+        (from_others(UNKNOWN_HEARTBEAT, 1, 1, 1.0), "autopilot 1/1 is neither PX4 nor ArduCopter"),
+        (from_others(AUTOPILOT_HEARTBEAT, 1, 50, 1.0), "autopilot 1/50 is heard, but only"),
     ],
-    ids=["noise", "ground station only", "unknown autopilot"],
+    ids=["noise", "ground station only", "unknown autopilot", "other component"],
 )
 def test_what_is_heard_is_no_vehicle(before: Any, found: str) -> None:
     row = bench(has_vehicle=False, before=before).consult()["vehicle"]
@@ -183,7 +184,8 @@ def test_what_we_send_does_not_arrive() -> None:
     rows = bench(up=lambda _: []).consult()
     assert rows["uplink"].level is BLOCKS
     assert rows["delay"].level is WAIT
-    assert rows["parameters"].level is OK  # PX4 has none that must be answered
+    assert rows["parameters"].level is WARN  # PX4 has none that must be answered
+    assert rows["parameters"].findings[0].found.startswith("no reply for MPC_THR_HOVER, ")
 
 
 def test_flood_of_addresses_and_ids_is_bounded() -> None:

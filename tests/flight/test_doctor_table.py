@@ -65,7 +65,7 @@ def test_what_is_wrong_with_this_computer(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(computer, "rehearse", lambda prepared, keeps_deadline: 0.04)
     monkeypatch.setattr(computer, "_sleep", lambda: 0.03)
     heard = Listening(0.0, SessionSettings())
-    seen = Observation(load("flight"), heard, "udpin:127.0.0.1:1", Path())
+    seen = Observation(load("flight"), heard, "udpin:127.0.0.1:1", Path(), time.monotonic())
     rows = run.examine(["disk", "compiled", "computer"], seen)
     levels = {row.check: [finding.level for finding in row.findings] for row in rows}
     assert levels == {"disk": [Level.WARN], "compiled": [Level.OK], "computer": [Level.WARN] * 2}

@@ -185,7 +185,6 @@ EVENTS: dict[str, Setup] = {
     "lost_disarmed": _stand(Standing.LOST, armed=False),
     "mode_unknown": _unhear_mode,
     "silent": _set(silence_s=1.01),
-    "silent_for_long": _set(silence_s=2.01),
     "in_own_failsafe": _stand(Standing.FAILSAFE),
     "unheard_on_ground": _unhear_mode,
     "out_of_reach": _set(silence_s=OUTAGE_MAX_S + 0.1),
@@ -312,6 +311,13 @@ def test_what_prevents_a_take_over_prevents_each_kind_of_it() -> None:
             assert condition(flight)
             prevents(flight)
             assert not condition(flight), name
+
+
+def test_reasons_against_an_engagement_are_apart() -> None:
+    flight = uneventful(Phase.STANDBY, SERVICES["hold"])
+    for name in ("engaged_but_unfit", "refused"):
+        EVENTS[name](flight)
+    assert starting.engaged_but_unfit(flight) == "not engaged: no multirotor; not yet"
 
 
 @BOTH

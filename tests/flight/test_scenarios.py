@@ -60,6 +60,10 @@ def still_armed(pair: Pair) -> None:
     assert pair.armed
 
 
+def asked_to_disarm(pair: Pair) -> None:
+    assert set(pair.armings) == {1.0, 0.0}
+
+
 def stayed_down(pair: Pair) -> None:
     """Stopped before lift-off: disarmed at once, and no setpoint asks for more thrust."""
     assert not pair.armed
@@ -232,6 +236,11 @@ def deafen(pair: Pair) -> None:
     pair.up = lambda *_: []
 
 
+def stop_unheard(pair: Pair) -> None:
+    faults.stop(pair)
+    pair.up = pair.down = lambda *_: []
+
+
 STOPPED = "stop requested by the operator"
 SECOND_VEHICLE = bytes(
     mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 3, 3).pack(mavlink.MAVLink(None, 9, 1))
@@ -255,6 +264,11 @@ ROWS = {
         at=then(Phase.ARM, 0.3, faults.stop),
     ),
     "stop before lift-off": refusal(STOPPED, stayed_down, at=then(Phase.TAKEOFF, 0.3, faults.stop)),
+    "stop before lift-off, and nothing is heard any more": aborts(
+        Phase.FAILED,
+        f"{STOPPED} before lift-off; no HEARTBEAT shows whether it is armed after 5 s",
+        asked_to_disarm, at=then(Phase.TAKEOFF, 0.3, stop_unheard),
+    ),
     # its land detector reports flight before it lifts off
     "stop as it lifts off": ends(STOPPED, landed, at=then(Phase.TAKEOFF, 0.5, faults.stop)),
     "stop in track": ends(

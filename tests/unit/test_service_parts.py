@@ -59,6 +59,10 @@ def test_a_flight_log_begins_with_what_came_before(tmp_path: Path) -> None:
     talk, began_us = session(), clock.unix_us() - 20_000_000
     codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     home = mavlink.MAVLink_gps_global_origin_message(1, 2, 3).pack(codec)
+    for number in range(150):  # a ground station reads all parameters
+        name = f"P{number}".encode()
+        parameter = mavlink.MAVLink_param_value_message(name, number, 9, 150, number)
+        recorder.write(began_us, parameter.pack(codec))
     recorder.write(began_us, home)
     for second in range(2, 20):
         recorder.write(began_us + second * 1_000_000, talk.encode(Heartbeat(6)))
@@ -73,6 +77,7 @@ def test_a_flight_log_begins_with_what_came_before(tmp_path: Path) -> None:
     assert scored == [first, second_flight]
     assert home in (first / "flight.tlog").read_bytes()
     log = tlog.read(first / "flight.tlog")
+    assert 90 < [entry.name for entry in log].count("PARAM_VALUE") <= 100
     beats = [entry.message.type for entry in log if entry.name == "HEARTBEAT"]
     assert beats == [*[6] * 6, 18]
     pieces = [entry.message for entry in log if entry.name == "TUNNEL"]
@@ -298,6 +303,11 @@ def test_a_changed_configuration_is_used_and_a_bad_one_refused(
     assert refused.startswith("the configuration is refused, the old one is kept: ")
     assert "height_m" in refused
     assert watched.newest() is first
+    for _ in range(2):
+        (refused,) = news(200)  # is read, but cannot be flown
+        assert "landing from 200 m" in refused
+        assert watched.newest() is first
+        assert news(2) == []
     assert news(3) == ["the configuration has changed: used from the next flight on"]
     assert "height_m: 3" in watched.newest().text
 

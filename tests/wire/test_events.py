@@ -41,8 +41,9 @@ def test_implausible_contents_are_dropped_but_logged() -> None:
         for place, limit in enumerate(limits):
             for bad in (NAN, INF, limit, -limit):
                 frames.append(state(1000, *good[:place], bad, *good[place + 1 :]))
-    for parameter in ((b"X", NAN, 9), (b"", 1.0, 9), (b"X", 1.0, 77)):
-        frames.append(vehicle.frame(mavlink.MAVLink_param_value_message(*parameter, 1, 0)))
+    for value, kind in ((NAN, 9), (1.0, 77)):
+        parameter = mavlink.MAVLink_param_value_message(b"COM_OF_LOSS_T", value, kind, 1, 0)
+        frames.append(vehicle.frame(parameter))
     for frame in frames:
         reception = session.receive(frame, PEER, 0.0)
         assert (reception.events, reception.frames) == ((), (frame,))
@@ -118,6 +119,16 @@ def test_px4_sends_integer_parameters_as_bytes(value: int) -> None:
     payload = struct.pack("<iHH16sB", value, 1, 0, b"COM_RC_IN_MODE", 6)
     (event,) = session.receive(framed(22, payload), PEER, 1.0).events
     assert event.value == value  # type: ignore[union-attr]
+
+
+def test_parameters_that_nothing_of_ours_reads_are_no_events() -> None:
+    """A ground station reads all on the same link, and names may be any."""
+    vehicle = Sender()
+    session = pinned(vehicle)
+    for name, events_of_it in ((b"", 0), (b"CAL_ACC0_ID", 0), (b"COM_OF_LOSS_T", 1)):
+        frame = vehicle.frame(mavlink.MAVLink_param_value_message(name, 1.0, 9, 1, 0))
+        reception = session.receive(frame, PEER, 1.0)
+        assert (len(reception.events), reception.frames) == (events_of_it, (frame,))
 
 
 def test_estimator_reports() -> None:

@@ -181,7 +181,6 @@ def test_parameters_are_bytewise_on_px4_and_cast_on_arducopter(
         "COM_RC_IN_MODE": 1.0,  # INT32: 1.4e-45 if it were read as a float
         "NAV_DLL_ACT": 0.0,
         "COM_RCL_EXCEPT": 0.0,
-        "MIS_TAKEOFF_ALT": 2.5,
     }
     last = {p.name: p.value for p in arducopter.of(events.Parameter)}
     assert (last["GUID_OPTIONS"], last["ATC_ANGLE_BOOST"], last["SYSID_MYGCS"]) == (8.0, 1.0, 255.0)
