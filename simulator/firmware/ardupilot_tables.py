@@ -1,7 +1,8 @@
 """Tables of ArduCopter: its flight modes, its parameters (those that clients read or the vehicle
 obeys), and its state table: events, and what follows from them.
 
-ArduCopter takes values outside the documented range, so the limits are those of the type.
+ArduCopter takes values outside the documented range, so the limits are those of the type, but for
+values that it raises itself or refuses to arm with.
 """
 
 from __future__ import annotations
@@ -46,8 +47,8 @@ MODES = {
 }
 
 
-def _real(name: str, default: float, meaning: str) -> ParameterSpec:
-    return ParameterSpec(name, "real32", default, -3.4e38, 3.4e38, meaning)
+def _real(name: str, default: float, meaning: str, least: float = -3.4e38) -> ParameterSpec:
+    return ParameterSpec(name, "real32", default, least, 3.4e38, meaning)
 
 
 def _int8(name: str, default: int, meaning: str) -> ParameterSpec:
@@ -63,7 +64,7 @@ def _int32(name: str, default: int, meaning: str) -> ParameterSpec:
 
 
 PARAMETERS = (
-    _int16("ANGLE_MAX", 3000, "cdeg, greatest tilt of its own position control"),
+    ParameterSpec("ANGLE_MAX", "int16", 3000, 1000, 8000, "cdeg, greatest tilt it flies by itself"),
     _int32("ARMING_CHECK", 1, "pre-arm checks, 1 all"),
     _real("ATC_ACCEL_P_MAX", 110000.0, "cdeg/s^2 of pitch"),
     _real("ATC_ACCEL_R_MAX", 110000.0, "cdeg/s^2 of roll"),
@@ -113,8 +114,8 @@ PARAMETERS = (
     _int8("SYSID_ENFORCE", 0, "1: obey SYSID_MYGCS only"),
     _int16("SYSID_MYGCS", 255, "system id of the ground station"),
     _int16("SYSID_THISMAV", 1, "system id"),
-    _real("WPNAV_ACCEL", 250.0, "cm/s^2 across the ground"),
-    _real("WPNAV_SPEED", 1000.0, "cm/s of automatic flight"),
+    _real("WPNAV_ACCEL", 250.0, "cm/s^2 across the ground", 1.0),
+    _real("WPNAV_SPEED", 1000.0, "cm/s of automatic flight", 10.0),
     _real("WPNAV_SPEED_DN", 150.0, "cm/s of descent"),
     _real("WPNAV_SPEED_UP", 250.0, "cm/s of climb"),
     _int8("WP_YAW_BEHAVIOR", 2, "yaw: 0 unchanged, 1 to the waypoint, 2 the same except in RTL"),

@@ -91,6 +91,16 @@ def test_without_guid_options_thrust_is_a_climb_rate() -> None:
         assert climb_mps(vehicle) == pytest.approx(climb, abs=0.1)
 
 
+@pytest.mark.parametrize("name", ["WPNAV_SPEED", "WPNAV_ACCEL", "ANGLE_MAX"])
+def test_a_negative_limit_is_raised_to_the_least_one(name: str) -> None:
+    vehicle = guided(GUID_OPTIONS=0)
+    kind = 4 if name == "ANGLE_MAX" else 9
+    vehicle.send(mavlink.MAVLink_param_set_message(1, 1, name.encode(), -500.0, kind))
+    vehicle.run(0.5, lambda: vehicle.attitude(LEVEL, 0.5))
+    vehicle.run(1.0, lambda: vehicle.position(0, 0, 0, mask=0b110111000111))
+    assert vehicle.height_m > 6.0
+
+
 def test_a_nan_thrust_is_zero_and_prevents_arming_until_reboot() -> None:
     vehicle = guided()
     vehicle.run(0.5, lambda: vehicle.attitude(LEVEL, NAN))
