@@ -131,7 +131,8 @@ class Commands:
         if strict:
             if command.frame is None:
                 return Result.UNSUPPORTED
-            if not (latitude or longitude):
+            on_earth = abs(latitude) <= 90.0 and abs(longitude) <= 180.0
+            if not on_earth or not (latitude or longitude):
                 return Result.DENIED
             yaw_rad = math.nan
         result = autopilot.handle("mode", Request(autopilot.firmware.reposition_mode))

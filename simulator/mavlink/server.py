@@ -6,6 +6,7 @@ the `outbox`. Knows no socket and no clock: time is the autopilot's.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -18,6 +19,7 @@ from simulator.mavlink.transfers import Handlers, MissionTransfer, ParameterTran
 from simulator.mavlink.view import View
 
 _GUIDED = 2  # `current` of a mission item that is a place to fly to now
+_NO_PLACE = 2**31 - 1  # in x and y of COMMAND_INT
 _FTP_NAK, _FTP_ERROR_NOT_FOUND = 128 + 1, 10
 
 
@@ -132,7 +134,10 @@ class Server:
 
     def _command_int(self, message: Message) -> None:
         params = tuple(getattr(message, f"param{i}") for i in range(1, 5))
-        params += (message.x * 1e-7, message.y * 1e-7, message.z)
+        place = (message.x * 1e-7, message.y * 1e-7)
+        if message.x == message.y == _NO_PLACE:
+            place = (math.nan, math.nan)
+        params += (*place, message.z)
         self._commands.run(Command(message.command, params, *sender_of(message), message.frame))
 
     def _setpoint(self, message: Message) -> None:

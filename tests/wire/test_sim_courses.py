@@ -16,7 +16,7 @@ from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
 from simulator.geodesy import EARTH_RADIUS_M
 
-ACCEPTED, UNSUPPORTED = 0, 3
+ACCEPTED, DENIED, UNSUPPORTED = 0, 2, 3
 POSITION_ALONE, VELOCITY_ALONE = 0xDF8, 0xDC7
 RELATIVE, ABSOLUTE = 6, 5  # MAV_FRAME
 
@@ -39,8 +39,12 @@ def reposition(
     bench: Bench, north: float, east: float, up: float, frame: int, yaw: float = NAN
 ) -> int:
     x, y = (round(value * 1e7) for value in degrees(bench, north, east))
-    asked = (frame, 192, 0, 0, -1.0, 1, 0, yaw, x, y, up)
-    bench.send(mavlink.MAVLink_command_int_message(1, 1, *asked))
+    return command_int(bench, frame, 192, -1.0, 1, 0, yaw, x, y, up)
+
+
+def command_int(bench: Bench, frame: int, number: int, *params: float) -> int:
+    """The result of a COMMAND_INT."""
+    bench.send(mavlink.MAVLink_command_int_message(1, 1, frame, number, 0, 0, *params))
     bench.run(0.02)
     return int(bench.of("COMMAND_ACK")[-1][1].result)
 
@@ -97,6 +101,25 @@ def test_reposition_of_arducopter_accelerates_and_brakes_as_the_real_one() -> No
     assert max(speeds) == pytest.approx(7.7, abs=1.0)
     bench.run(6.0)
     assert bench.place == pytest.approx((40.0, 0.0, -5.0), abs=0.9)
+
+
+@pytest.mark.parametrize(
+    ("firmware", "x", "frame", "result"),
+    [
+        (PX4, 2**31 - 1, ABSOLUTE, ACCEPTED),  # "no place": the present one
+        (ARDUPILOT, 2**31 - 1, RELATIVE, DENIED),
+        (ARDUPILOT, 950_000_000, RELATIVE, DENIED),
+    ],
+)
+def test_a_reposition_without_a_place_flies_nowhere(
+    firmware: Firmware, x: int, frame: int, result: int
+) -> None:
+    bench = aloft(firmware=firmware, height_m=5.0, mode="GUIDED" if firmware is ARDUPILOT else None)
+    bench.run(1.0)
+    up_m = 5.0 + (bench.instance.autopilot.firmware.origin[2] if frame == ABSOLUTE else 0.0)
+    assert command_int(bench, frame, 192, -1.0, 1, 0, NAN, x, x, up_m) == result
+    bench.run(3.0)
+    assert bench.place == pytest.approx((0.0, 0.0, -5.0), abs=0.5)
 
 
 @pytest.mark.parametrize("kind", ["", "_int"])
