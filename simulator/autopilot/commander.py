@@ -151,6 +151,8 @@ class Commander:
             return not self._holds(condition[4:])
         if condition.startswith("since "):
             return self.failsafe and self._cause == condition[6:]
+        if condition.startswith("requests "):
+            return self._requested.name == condition[9:]
         if condition.startswith("reached "):
             return condition[8:] in self._health.reached
         if condition.startswith("latched "):
@@ -240,6 +242,7 @@ CONDITIONS: dict[str, Callable[[Commander], bool]] = {
     "fix missing": lambda c: not c._health.has_fix(c._state.time_s) or not c._state.gps_healthy,
     "velocity rejected": lambda c: c.rejects_velocity,
     "mission missing": lambda c: not c._guidance.mission.flyable,
+    "takeoff item missing": lambda c: not c._guidance.mission.takes_off,
     "climb requested": lambda c: c._request.takeoff_ned_m[2] <= c._guidance.home_ned_m[2],
     "climbing": lambda c: c._guidance.behaviour is Behaviour.TAKEOFF,
     "attitude setpoint": lambda c: c._guidance.follows_attitude,

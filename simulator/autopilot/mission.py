@@ -66,6 +66,12 @@ class Mission:
         flown = _PLACES | {Kind.RETURN}
         return any(item.command in flown for item in self.items[self.first :])
 
+    @property
+    def takes_off(self) -> bool:
+        """Its first place is a takeoff."""
+        places = (item.command for item in self.items[self.first :] if item.command in _PLACES)
+        return next(places, None) == Kind.TAKEOFF
+
     def store(self, items: tuple[MissionItem, ...]) -> None:
         """Replace the items; the mission starts from its beginning."""
         self.items = items

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from simulator.firmware.base import ParameterSpec, Role, Rule
-from simulator.firmware.values import Behaviour, Mode, Result, critical, info, warning
+from simulator.firmware.values import Behaviour, Mode, Result, StatusText, critical, info, warning
 
 # MAV_MODE_FLAG: 1 custom mode, 8 guided, 16 stabilise, 64 manual input. "Guided" shows whether
 # the position controller runs, not the mode.
@@ -160,6 +160,7 @@ ROLES: dict[str, Role] = {
 
 _FAILED = Result.FAILED
 _NO_POSITION = warning("Mode change to {mode} failed: requires position")
+_NOT_STARTED = warning("Mode change to {mode} failed: init failed")
 _HEARTBEAT = ("HEARTBEAT",)
 _ORIGIN_AND_HOME = ("GPS_GLOBAL_ORIGIN", "HOME_POSITION")
 _ARMING = Rule("arm", do=("arm",), texts=(info("Arming motors"),), send=_ORIGIN_AND_HOME)
@@ -234,6 +235,25 @@ def _refusals(event: str, prefix: str, result: Result) -> list[Rule]:
     return [row for row in rows if event == "arm" or "not mode arms" not in row.when]
 
 
+def _entries(event: str) -> list[Rule]:
+    """Rows that enter the requested mode, while armed only if it can start."""
+
+    def refuses(*when: str, texts: tuple[StatusText, ...]) -> Rule:
+        return Rule(event, when=when, result=_FAILED, texts=texts)
+
+    no_takeoff = critical("Auto: Missing Takeoff Cmd")
+    return [
+        Rule(event, when=("not armed",), to="requested", send=_HEARTBEAT),
+        refuses("position missing", texts=(_NO_POSITION,)),
+        refuses("requests AUTO", "mission missing", texts=(_NOT_STARTED,)),
+        refuses(
+            "requests AUTO", "landed", "takeoff item missing", texts=(no_takeoff, _NOT_STARTED)
+        ),
+        refuses("requests THROW", texts=(_NOT_STARTED,)),
+        Rule(event, to="requested", send=_HEARTBEAT),
+    ]
+
+
 RULES = (
     # A mode requested before was acknowledged and is lost
     Rule("initialised", to="STABILIZE", texts=(info("ArduPilot Ready"),)),
@@ -245,14 +265,11 @@ RULES = (
     ),
     Rule("position", texts=(info("EKF3 IMU0 is using GPS"), info("EKF3 IMU1 is using GPS"))),
     # A heartbeat follows a mode change at once
-    Rule("mode", when=("not armed",), to="requested", send=_HEARTBEAT),
-    Rule("mode", when=("not position missing",), to="requested", send=_HEARTBEAT),
-    Rule("mode", result=_FAILED, texts=(_NO_POSITION,)),
+    *_entries("mode"),
     Rule("turn"),
     Rule("loiter", when=("not position missing",), to="LOITER", send=_HEARTBEAT),
     Rule("loiter", result=_FAILED),
-    Rule("mission", when=("not position missing",), to="AUTO", send=_HEARTBEAT),
-    Rule("mission", result=_FAILED),
+    *_entries("mission"),
     Rule("mission progress", send=("MISSION_CURRENT",)),
     Rule("item reached", send=("MISSION_ITEM_REACHED",)),
     Rule("mission return", "AUTO", do=("return",)),  # within the mode

@@ -71,7 +71,8 @@ class Rule:
         mode: name of the mode in which it happened, or "*".
         when: conditions that must all hold (`simulator.autopilot.commander.CONDITIONS`). "not X"
             negates, "NAME=2" compares a parameter, "since X" is a failsafe because of event X,
-            "reached X" a boot event that has come, "latched X" an event that only a reboot clears.
+            "reached X" a boot event that has come, "latched X" an event that only a reboot clears,
+            "requests X" a request of mode X.
         to: next mode by name, "*" none, "requested" by the command, "remembered" the last chosen.
         do: actions (`simulator.autopilot.commander.ACTIONS`).
         result: acknowledgement of a command.

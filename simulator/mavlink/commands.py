@@ -200,7 +200,9 @@ class Commands:
         first = command.params[0] if math.isfinite(command.params[0]) else 0.0
         if not -1 <= first < max(1, len(autopilot.mission.items)):
             return Result.DENIED
-        return autopilot.handle("mission")
+        modes = autopilot.firmware.modes.values()
+        mode = next(mode.name for mode in modes if mode.behaviour is Behaviour.MISSION)
+        return autopilot.handle("mission", Request(mode))
 
     def _set_current_item(self, autopilot: Autopilot, command: Command) -> Result:
         number = command.params[0]

@@ -13,8 +13,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_bench import NAN, Bench, aloft
 
 from simulator.firmware.ardupilot import ARDUPILOT
+from simulator.firmware.values import MissionItem
 
-GUIDED, LAND = 4, 9
+AUTO, GUIDED, LAND, THROW = 3, 4, 9, 18
 ACCEPTED, FAILED = 0, 4
 HOVER = 0.3655
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -99,6 +100,28 @@ def test_a_negative_limit_is_raised_to_the_least_one(name: str) -> None:
     vehicle.run(0.5, lambda: vehicle.attitude(LEVEL, 0.5))
     vehicle.run(1.0, lambda: vehicle.position(0, 0, 0, mask=0b110111000111))
     assert vehicle.height_m > 6.0
+
+
+def test_modes_that_do_not_start_while_armed() -> None:
+    """Disarmed any mode is entered."""
+    vehicle = guided()
+    mission = vehicle.instance.autopilot.mission
+    for number, title in ((AUTO, "AUTO"), (THROW, "THROW")):
+        assert vehicle.command(176, 1, number) == [FAILED]
+        assert vehicle.texts()[-1] == f"Mode change to {title} failed: init failed"
+        assert vehicle.mode == GUIDED
+    assert vehicle.command(300) == [FAILED]
+    mission.store(tuple(MissionItem(3, 16, (0.0,) * 4, 0, 0, up_m) for up_m in (0.0, 5.0)))
+    assert vehicle.command(300) == [ACCEPTED]
+    ground = Bench(firmware=ARDUPILOT, boot_scale=0.1)
+    ground.run(4.5)
+    ground.instance.autopilot.mission.store(mission.items)
+    for number in (THROW, AUTO, GUIDED):
+        assert ground.command(176, 1, number) == [ACCEPTED]
+    assert ground.command(400, 1) == [ACCEPTED]
+    assert ground.command(176, 1, AUTO) == [FAILED]
+    failed = "Mode change to AUTO failed: init failed"
+    assert ground.texts()[-2:] == ["Auto: Missing Takeoff Cmd", failed]
 
 
 def test_a_nan_thrust_is_zero_and_prevents_arming_until_reboot() -> None:
