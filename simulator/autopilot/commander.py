@@ -86,6 +86,11 @@ class Commander:
         return self._health.passes(self.intended, self._state.time_s, latched=bool(self.latched))
 
     @property
+    def has_fix(self) -> bool:
+        """GPS has a fix: its first one, and no fault takes it away."""
+        return self._health.first_fix(self._state.time_s) and self._state.gps_healthy
+
+    @property
     def velocity_ratio(self) -> float:
         """Innovation ratio of the velocity in the estimator, as the firmware reports it."""
         ratio = math.hypot(*self._state.velocity_error_ned_mps) / _GATE_MPS
@@ -239,7 +244,7 @@ CONDITIONS: dict[str, Callable[[Commander], bool]] = {
         c._requested.needs_position
         and ("position" not in c._health.reached or c._health.position_lost)
     ),
-    "fix missing": lambda c: not c._health.has_fix(c._state.time_s) or not c._state.gps_healthy,
+    "fix missing": lambda c: not c.has_fix,
     "velocity rejected": lambda c: c.rejects_velocity,
     "mission missing": lambda c: not c._guidance.mission.flyable,
     "takeoff item missing": lambda c: not c._guidance.mission.takes_off,

@@ -134,8 +134,8 @@ class Health:
         """Time since the last GPS fix."""
         return now_s - self._fix_s
 
-    def has_fix(self, now_s: float) -> bool:
-        """GPS has its first fix; a fault may take it away."""
+    def first_fix(self, now_s: float) -> bool:
+        """GPS has found its first fix; a fault may take it away."""
         return now_s >= self._firmware.first_fix_s * self.boot_scale
 
     def passes(self, mode: Mode, now_s: float, *, latched: bool) -> bool:

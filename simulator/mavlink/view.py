@@ -88,18 +88,13 @@ class View:
         self._at_step = -1
 
     @property
-    def has_fix(self) -> bool:
-        """No fault suppresses the GPS fix."""
-        return self.autopilot.state.gps_healthy
-
-    @property
     def sensor_bits(self) -> tuple[int, int, int]:
         """MAV_SYS_STATUS_SENSOR: present, enabled, healthy."""
         autopilot = self.autopilot
         present, enabled, health = autopilot.firmware.sensor_bits
-        if not autopilot.health.has_fix(autopilot.state.time_s):
+        if not autopilot.health.first_fix(autopilot.state.time_s):
             present, enabled, health = present & ~_GPS, enabled & ~_GPS, health & ~_GPS
-        elif not self.has_fix:
+        elif not autopilot.commander.has_fix:
             health &= ~_GPS
         if autopilot.commander.healthy:
             health |= _PREARM

@@ -57,6 +57,16 @@ def test_without_requests_it_sends_heartbeat_timesync_and_home() -> None:
     }
 
 
+def test_gps_raw_int_shows_no_fix_before_the_first_one() -> None:
+    """At 10.2 s."""
+    vehicle = Bench(firmware=ARDUPILOT)
+    vehicle.command(511, 24, 200_000)
+    vehicle.run(11.0)
+    fixes = vehicle.of("GPS_RAW_INT")
+    assert {m.fix_type for at_s, m in fixes if at_s < 10.1} == {1}
+    assert {m.fix_type for at_s, m in fixes if at_s > 10.3} == {3}
+
+
 @pytest.mark.parametrize(("thrust", "lifts"), [(0.45, True), (0.05, False)])
 def test_takeoff_by_setpoints_alone(thrust: float, lifts: bool) -> None:
     """.3 m after 3.3-3.9 s; any thrust is flight, even if it cannot lift."""
@@ -233,3 +243,25 @@ def test_roll_flies_sideways_also_by_manual_control_of_the_ground_station_alone(
     bench.codec.srcSystem = 255
     push(bench, 0.02, 0, KEEP, 0, KEEP)  # zero releases
     assert seen(bench) == (1500, 1500, 1000, 1500, *FEIGNED[4:])
+
+
+def test_manual_control_releases_axes_and_keeps_the_ground_station_present() -> None:
+    """32767 is an axis that is not used; a negative throttle or another target changes nothing."""
+    bench = loitering()
+    for target, throttle, roll_axis, widths in (
+        (1, 700, 0, (1500, 1500, 1700, 1500)),
+        (1, -1, 500, (1500, 1500, 1700, 1500)),
+        (2, 300, 500, (1500, 1500, 1700, 1500)),
+        (1, 700, 32767, (1500, 1500, 1700, 1500)),
+        (1, 32767, 500, (1750, 1500, 1000, 1500)),
+    ):
+        bench.send(mavlink.MAVLink_manual_control_message(target, 0, roll_axis, throttle, 0, 0))
+        bench.run(0.02)
+        assert seen(bench)[:4] == widths
+    bench.set("FS_GCS_ENABLE", 1)
+    bench.heartbeat_type = None
+    joystick = mavlink.MAVLink_manual_control_message(1, 0, 0, 500, 0, 0)
+    bench.run(7.0, lambda: bench.send(joystick), 0.5)
+    assert "GCS Failsafe" not in bench.texts()
+    bench.run(6.0)
+    assert "GCS Failsafe" in bench.texts()
