@@ -27,6 +27,7 @@ from simulator.firmware.values import (
     Triple,
 )
 
+_CRITICAL = 2  # battery level
 # EKF2_GPS_V_GATE standard deviations of EKF2_GPS_V_NOISE; EK3_VEL_I_GATE of EK3_VELNE_M_NSE
 _GATE_MPS = 5.0 * 0.3
 
@@ -81,7 +82,8 @@ class Commander:
     @property
     def healthy(self) -> bool:
         """The pre-arm checks pass in the intended mode."""
-        if self.rejects_velocity:
+        battery, read = self._state.truth.battery, self._parameters.__getitem__
+        if self.rejects_velocity or self._firmware.battery_level(battery, read) >= _CRITICAL:
             return False
         return self._health.passes(self.intended, self._state.time_s, latched=bool(self.latched))
 

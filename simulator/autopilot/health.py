@@ -150,7 +150,8 @@ class Health:
             return False
         if firmware.fails_where_unarmable and not mode.arms:
             return False
-        if self._parameters.role("ground_station_needed") > 0 and self.ground_station_lost:
+        heard = not (self.ground_station_lost or math.isnan(self._heartbeat_s))
+        if self._parameters.role("ground_station_needed") > 0 and not heard:
             return False
         if mode.behaviour is Behaviour.MISSION:
             return self._mission.flyable
