@@ -257,6 +257,7 @@ RULES = (
     Rule("disarm", result=_LATER, texts=(critical("Disarming denied: not landed"),)),
     Rule("force disarm", when=("not armed",)),
     _disarms("force disarm", "Disarmed by external command"),
+    Rule("terminate", when=("not armed",), result=Result.DENIED),
     Rule("terminate", to="TERMINATION", do=("disarm", "latch"), texts=(_LOST,)),
     *(
         Rule(

@@ -122,6 +122,26 @@ def test_a_reposition_without_a_place_flies_nowhere(
     assert bench.place == pytest.approx((0.0, 0.0, -5.0), abs=0.5)
 
 
+@pytest.mark.parametrize(
+    ("mode", "number", "frame", "params", "result"),
+    [
+        ("GUIDED", 115, RELATIVE, (400.0, 10.0, 1.0, 0.0), 4),
+        ("GUIDED", 115, RELATIVE, (90.0, 10.0, 1.0, 0.5), 4),
+        ("GUIDED", 300, RELATIVE, (0.0, 1.0, 0.0, 0.0), DENIED),
+        ("GUIDED", 22, ABSOLUTE, (0.0, 0.0, 0.0, 0.0), DENIED),
+        ("GUIDED", 192, RELATIVE, (-1.0, 0.0, 0.0, NAN), ACCEPTED),
+        ("LOITER", 192, RELATIVE, (-1.0, 0.0, 0.0, NAN), DENIED),
+        ("GUIDED", 510, RELATIVE, (60_000.0, 0.0, 0.0, 0.0), 4),
+    ],
+)
+def test_what_arducopter_refuses(
+    mode: str, number: int, frame: int, params: tuple[float, ...], result: int
+) -> None:
+    bench = aloft(firmware=ARDUPILOT, height_m=5.0, mode=mode)
+    x, y = (round(value * 1e7) for value in degrees(bench, 5.0, 0.0))
+    assert command_int(bench, frame, number, *params, x, y, 5.0) == result
+
+
 @pytest.mark.parametrize("kind", ["", "_int"])
 def test_arducopter_flies_to_a_guided_mission_item_at_once(kind: str) -> None:
     """As DroneKit's simple_goto asks."""
@@ -171,7 +191,7 @@ def test_a_terminated_flight_falls_and_only_px4_does_not_arm_again(
 ) -> None:
     """MAV_CMD_DO_FLIGHTTERMINATION. PX4 stays in its mode until it is started again."""
     bench = aloft(firmware=firmware, height_m=5.0, mode="GUIDED" if firmware is ARDUPILOT else None)
-    assert bench.command(185, 0) == [4]
+    assert bench.command(185, 0) == [2 if firmware is PX4 else 4]
     assert bench.armed
     begun_s = bench.time_s
     assert bench.command(185, 1) == [ACCEPTED]
