@@ -206,6 +206,8 @@ def _failsafe(
     ]
 
 
+# Modes that FS_OPTIONS bit 4 leaves to the pilot
+_PILOTED = ("STABILIZE", "ACRO", "ALT_HOLD", "LOITER", "DRIFT", "POSHOLD", "BRAKE", "THROW")
 _BATTERY_MODES = {1: "LAND", 2: "RTL", 3: "SMART_RTL", 4: "SMART_RTL", 7: "BRAKE"}
 _GROUND_MODES = {**_BATTERY_MODES, 1: "RTL", 5: "LAND", 6: "RTL"}
 
@@ -300,6 +302,21 @@ RULES = (
     # No failsafe and no text: level with constant height, or standing still; the mode stays GUIDED
     Rule("stream lost", when=("attitude setpoint",), do=("level",)),
     Rule("stream lost", when=("velocity setpoint",), do=("hold",)),
+    Rule(
+        "ground station lost",
+        when=("armed", "landed", "not FS_GCS_ENABLE=0"),
+        do=("disarm",),
+        texts=(_DISARMING, warning("GCS Failsafe - Disarming")),
+    ),
+    *(
+        Rule(
+            "ground station lost",
+            mode,
+            when=("armed", "not FS_GCS_ENABLE=0", "FS_OPTIONS=16"),
+            texts=(warning("GCS Failsafe - Continuing Pilot Control"),),
+        )
+        for mode in _PILOTED
+    ),
     *_failsafe("ground station lost", "FS_GCS_ENABLE", _GROUND_MODES),
     Rule(
         "ground station found",

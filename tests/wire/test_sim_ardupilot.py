@@ -134,6 +134,25 @@ def test_modes_that_do_not_start_while_armed() -> None:
     assert ground.texts()[-2:] == ["Auto: Missing Takeoff Cmd", failed]
 
 
+def test_a_lost_ground_station_disarms_on_the_ground_and_leaves_the_pilot_his_mode() -> None:
+    vehicle = loitering()
+    vehicle.set("FS_GCS_ENABLE", 1)
+    vehicle.heartbeat_type = None
+    vehicle.run(6.0)
+    assert (vehicle.mode, vehicle.system_status) == (5, 4)
+    assert "GCS Failsafe - Continuing Pilot Control" in vehicle.texts()
+    ground = Bench(firmware=ARDUPILOT, boot_scale=0.1)
+    ground.codec.srcSystem = 255
+    ground.set("FS_GCS_ENABLE", 1)
+    ground.run(4.5)
+    assert ground.command(176, 1, GUIDED) == [ACCEPTED]
+    ground.heartbeat_type = None
+    assert ground.command(400, 1) == [ACCEPTED]
+    ground.run(6.0)
+    assert (ground.armed, ground.mode) == (False, GUIDED)
+    assert ground.texts()[-2:] == ["Disarming motors", "GCS Failsafe - Disarming"]
+
+
 def test_a_nan_thrust_is_zero_and_prevents_arming_until_reboot() -> None:
     vehicle = guided()
     vehicle.run(0.5, lambda: vehicle.attitude(LEVEL, NAN))
@@ -262,6 +281,6 @@ def test_manual_control_releases_axes_and_keeps_the_ground_station_present() -> 
     bench.heartbeat_type = None
     joystick = mavlink.MAVLink_manual_control_message(1, 0, 0, 500, 0, 0)
     bench.run(7.0, lambda: bench.send(joystick), 0.5)
-    assert "GCS Failsafe" not in bench.texts()
+    assert not [text for text in bench.texts() if text.startswith("GCS Failsafe")]
     bench.run(6.0)
-    assert "GCS Failsafe" in bench.texts()
+    assert [text for text in bench.texts() if text.startswith("GCS Failsafe")]

@@ -100,6 +100,16 @@ def test_arming_needs_a_battery_and_with_nav_dll_act_a_ground_station() -> None:
         assert bench.command(400, 1) == [result]
 
 
+def test_a_landing_goes_on_without_a_ground_station() -> None:
+    bench = aloft(height_m=30.0)
+    bench.set("NAV_DLL_ACT", 2)
+    bench.command(21)
+    bench.heartbeat_type = None
+    bench.run(14.0)
+    assert (bench.mode, bench.system_status) == (LAND, 4)
+    assert "Failsafe activated" not in "".join(bench.texts())
+
+
 def test_the_pilot_takes_over_before_the_failsafe_acts() -> None:
     bench = aloft()
     bench.set("COM_LOW_BAT_ACT", 2)
