@@ -255,6 +255,7 @@ ARDUPILOT = ArduCopter(
     takeoff_above_home=True,
     reposition_mode="GUIDED",
     strict_places=True,
+    vertical_speeds=True,
     empty_refusal=Result.FAILED,
     command_answers={
         **dict.fromkeys(_TAKEN, Result.ACCEPTED),

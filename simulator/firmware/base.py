@@ -167,6 +167,7 @@ class Firmware(ABC):
     # needs a height above home; MAV_CMD_MISSION_START names no item
     strict_places: bool = False
     empty_refusal: Result  # of a MAV_CMD_DO_CHANGE_SPEED without a speed, an interval of no message
+    vertical_speeds: bool = False  # SPEED_TYPE 2 and 3 are climb and descent, else across as any
     no_interval_us: int = -1  # MESSAGE_INTERVAL of a message that is not streamed
     # MAV_CMD acknowledged and not carried out: result, None: no acknowledgement. Any other command
     # without a handler is UNSUPPORTED

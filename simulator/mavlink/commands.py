@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 from simulator.autopilot.autopilot import Autopilot
 from simulator.autopilot.commander import Request
+from simulator.autopilot.mission import VERTICAL_SPEEDS
 from simulator.firmware.values import Asked, Behaviour, Result, Triple, info
 from simulator.geodesy import down_m, to_metres
 from simulator.mavlink.codec import id_of, name_of
@@ -23,7 +24,6 @@ _HEIGHT_MAX_M = 83_000.0  # of home: ArduPilot's LOCATION_ALT_MAX_M
 _RELATIVE = 3  # MAV_FRAME
 _CHANGE_MODE = 1.0  # MAV_DO_REPOSITION_FLAGS
 _MISSION_PLANNER = 190  # MAV_COMPONENT, as ground stations call themselves
-_VERTICAL_SPEEDS = (2.0, 3.0)  # SPEED_TYPE: climb, descent
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,7 +174,8 @@ class Commands:
         A speed that is not positive restores the default.
         """
         kind, speed_mps = command.params[:2]
-        if speed_mps > 0.0 and kind in _VERTICAL_SPEEDS:
+        vertical = autopilot.firmware.vertical_speeds and kind in VERTICAL_SPEEDS
+        if speed_mps > 0.0 and vertical:
             return Result.ACCEPTED
         known = 0.0 < speed_mps < math.inf
         autopilot.guidance.cruise_mps = speed_mps if known else math.inf

@@ -14,6 +14,7 @@ from sim_bench import NAN, Bench, aloft
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
+from simulator.firmware.values import MissionItem
 from simulator.geodesy import EARTH_RADIUS_M
 
 ACCEPTED, DENIED, UNSUPPORTED = 0, 2, 3
@@ -120,6 +121,26 @@ def test_a_reposition_without_a_place_flies_nowhere(
     assert command_int(bench, frame, 192, -1.0, 1, 0, NAN, x, x, up_m) == result
     bench.run(3.0)
     assert bench.place == pytest.approx((0.0, 0.0, -5.0), abs=0.5)
+
+
+@pytest.mark.parametrize("item", [False, True], ids=["command", "item"])
+@pytest.mark.parametrize(("firmware", "obeys"), [(PX4, True), (ARDUPILOT, False)])
+def test_a_climb_speed_is_one_across_for_px4_alone(
+    firmware: Firmware, obeys: bool, item: bool
+) -> None:
+    bench = aloft(firmware=firmware, height_m=5.0, mode="GUIDED" if firmware is ARDUPILOT else None)
+    autopilot = bench.instance.autopilot
+    x, y = (round(value * 1e7) for value in degrees(bench, 30.0, 0.0))
+    up_m = autopilot.firmware.origin[2] + 5.0
+    if item:
+        home = MissionItem(5, 16, (0.0,) * 4, x, y, up_m)
+        speed = MissionItem(2, 178, (2.0, 1.5, -1.0, 0.0), 0, 0, 0.0)
+        autopilot.mission.store((home, speed, home)[firmware is PX4 :])
+        assert bench.command(300) == [ACCEPTED]
+    else:
+        assert command_int(bench, ABSOLUTE, 192, -1.0, 1, 0, NAN, x, y, up_m) == ACCEPTED
+        assert bench.command(178, 2, 1.5, -1) == [ACCEPTED]
+    assert (fastest_mps(bench, 6.0) < 2.0) is obeys
 
 
 @pytest.mark.parametrize(
