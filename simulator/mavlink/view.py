@@ -81,8 +81,10 @@ class View:
         return (2, firmware.mav_autopilot, base_mode, commander.mode.custom_mode, state, 3)
 
     def restart(self, autopilot: Autopilot) -> None:
-        """Show another autopilot, after a reboot."""
+        """Show another autopilot, after a reboot; faults that run go on."""
         autopilot.state.gps_healthy = self.autopilot.state.gps_healthy
+        autopilot.state.velocity_error_ned_mps = self.autopilot.state.velocity_error_ned_mps
+        autopilot.commander.refused = self.autopilot.commander.refused
         self.autopilot = autopilot
         self.clock_offset_us = 0
         self._at_step = -1
