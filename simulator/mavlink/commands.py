@@ -1,8 +1,8 @@
 """MAVLink commands (MAV_CMD): what each does, and how it is acknowledged.
 
-Unused parameters of a command may be NaN or 0. Every command addressed to the vehicle is
-acknowledged, unknown ones with UNSUPPORTED. Knows one link's outbox and schedule, and the
-autopilot.
+Unused parameters of a command may be NaN or 0. Every command is acknowledged, unknown ones with
+UNSUPPORTED, except those that the real autopilot leaves unanswered (`Firmware.command_answers`).
+Knows one link's outbox and schedule, and the autopilot.
 """
 
 from __future__ import annotations
