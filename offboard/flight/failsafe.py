@@ -149,9 +149,10 @@ def tilted(flight: FlightState) -> str:
 
 
 def away_from_commands(flight: FlightState) -> str:
-    """Angle between the thrust direction and the nearest of the newest commands."""
+    """Angle between the thrust direction and the nearest of the newest commands, all of which were
+    attitudes."""
     vehicle, commands = flight.vehicle, flight.commands
-    if vehicle.attitude is None or len(commands) < COMMANDS_KEPT:
+    if vehicle.attitude is None or len(flight.thrusts) < COMMANDS_KEPT:
         return ""
     flown = vehicle.thrust_direction_ned
     nearest = max(float(flown @ np.array(each.thrust_direction_ned)) for each in commands)

@@ -298,7 +298,7 @@ def starting(before: Set[Phase]) -> tuple[Transition, ...]:
     """From the ground to lift-off. `before`: the phases in which a flight is refused."""
     return (
         # first: from then on it is ours, and whatever ends the flight must ask for hold or land
-        Transition({ENGAGE}, engaged_in_the_air, CLIMB),
+        Transition(STREAMING, engaged_in_the_air, CLIMB),
         Transition(STREAMING, rebooted, FAILED, REFUSED, "restart"),
         Transition(STREAMING, armed_already, FAILED, REFUSED),
         Transition(before, silent_on_ground, FAILED, REFUSED, "link"),

@@ -21,7 +21,6 @@ from offboard.flight.phases import (
     BEFORE_FLIGHT,
     FLYING,
     TRACKING,
-    WAITING,
     ExitCode,
     Phase,
     Request,
@@ -165,8 +164,8 @@ def _enter(flight: FlightState, row: Transition) -> None:
     if flight.identification:
         stage = STAGES.get(row.target, Stage.OTHER)
         flight.identification.on_stage(stage, flight.time_s)
-    if source in WAITING and row.target in FLYING:
-        flight.authority.ask()  # it shows the mode already
+    if source in BEFORE_FLIGHT and row.target in FLYING:
+        flight.authority.ask()  # it may show the mode already
     if row.target is Phase.ENGAGE:
         # here, not with the request: a vehicle that shows the mode already passes without one
         flight.authority.ask()

@@ -13,11 +13,11 @@ from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, Field, SerializeAsAny, create_model
+from pydantic import BaseModel, Field, SerializeAsAny, create_model, model_validator
 
 from offboard.control import catalogue
 from offboard.control.base import Controller, ControllerSettings
@@ -60,6 +60,12 @@ class FlightConfig(Parameters):
     period_s: float = Field(default=0.1, ge=0.01, le=0.5)  # control period, vehicle time
     deadline_s: float = Field(default=0.05, gt=0.0005, le=0.5)  # for one decision, wall time
     seed: int = Field(default=7, ge=0, lt=2**32)
+
+    @model_validator(mode="after")
+    def _in_time(self) -> Self:
+        if self.deadline_s > self.period_s:  # a setpoint that is later than that is not sent
+            raise ValueError("deadline_s must be at most period_s")
+        return self
 
 
 def load(

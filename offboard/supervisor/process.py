@@ -63,7 +63,7 @@ class Watch:
     def turn(self, elapsed_s: float) -> str:
         """Read what has arrived, and answer it. Why to take over; empty if there is no reason."""
         self._silent_s += min(elapsed_s, PAUSE_MAX_S)
-        with suppress(BlockingIOError, ConnectionResetError):
+        with suppress(BlockingIOError):
             while not self.ended:
                 self._read()
         if not self._silent_s:
@@ -82,7 +82,10 @@ class Watch:
         return clock.monotonic_s() - self._silent_s
 
     def _read(self) -> None:
-        data, descriptors, _, _ = socket.recv_fds(self._channel, 65536, 8)
+        data = b""
+        descriptors: list[int] = []
+        with suppress(ConnectionResetError):  # it has ended, and left answers unread
+            data, descriptors, _, _ = socket.recv_fds(self._channel, 65536, 8)
         self.ended = not data
         if descriptors:
             for descriptor in self.descriptors:
@@ -255,6 +258,7 @@ def main() -> None:
             tell.put(f"taking over: {reason}")
         TakeOver(watch, watch.known, tell).run(reason)
         tell.close(CLOSE_S)
+        watch.turn(0.0)  # it may have been killed in the meantime
         if watch.ended:
             _score(watch.descriptors[-1])
 

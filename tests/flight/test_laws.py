@@ -56,6 +56,15 @@ def test_arducopter_flies_a_short_lemniscate_and_lands() -> None:
     assert score.max_truth_m < 0.01
 
 
+def test_autopilot_may_tilt_as_its_position_loop_needs(tmp_path: Path) -> None:
+    """34 deg for a lap: none of the attitudes that were commanded before the reference is near."""
+    fast = ("reference.half_length_m=6", "reference.period_s=7", "reference.laps=1")
+    pair = flying("autopilot", tmp_path, *fast, aloft=True)
+    outcome = pair.fly()
+    assert outcome.exit_code == 0, outcome.sentence
+    assert pair.score().tilt_max_deg > 32.0
+
+
 def test_autopilot_gets_positions_while_tracking_and_attitudes_before(tmp_path: Path) -> None:
     pair = flying("autopilot", tmp_path, *SHORT)
     assert pair.fly().exit_code == 0

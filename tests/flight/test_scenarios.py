@@ -219,6 +219,11 @@ def arm(pair: Pair) -> None:
     pair.ground(400, 1)
 
 
+def engage(pair: Pair) -> None:
+    """The pilot selects OFFBOARD."""
+    pair.ground(176, 1, 6)
+
+
 def lost(*message_ids: int) -> Callable[[Pair], object]:
     return faults.downlink(faults.without(*message_ids))
 
@@ -254,6 +259,10 @@ ROWS = {
     "stop as it lifts off": ends(STOPPED, landed, at=then(Phase.TAKEOFF, 0.5, faults.stop)),
     "stop in track": ends(
         STOPPED, landed, fly=px4.hover, ended_by="operator", at=tracking(faults.stop)
+    ),
+    "stop after the pilot has engaged it in the air, before we ask": ends(
+        STOPPED, landed, fly=px4.hover, ended_by="operator",
+        at=[*then(Phase.STREAM, 0.2, engage), (lambda pair: pair.companion.engaged, faults.stop)],
     ),
     # the vehicle refuses or is not there
     "no vehicle": refusal(

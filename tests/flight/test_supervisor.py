@@ -32,6 +32,7 @@ from offboard.supervisor.recovery import Supervised
 from offboard.supervisor.supervisor import Supervisor, SupervisorError
 
 LONG_S = 20.0
+RECORDING = Path(__file__).parents[1] / "wire" / "recordings" / "px4-1.16.1-offboard.tlog"
 OFFBOARD, POSCTL, LANDING = 0x00060000, 0x00030000, 0x06040000  # custom_mode of PX4
 KEY, SIGNED_FROM = bytes(range(32)), 10**12
 VEHICLE = VehicleFound(7, 1, "px4")
@@ -178,6 +179,21 @@ def test_it_takes_over_when_the_beats_stop_and_says_so_first(rig: Rig) -> None:
         pass
     assert rig.supervisor.said[-1] == "the vehicle is disarmed"
     assert not rig.supervisor.lost
+
+
+def test_a_controller_that_hangs_and_is_then_killed_is_scored(rig: Rig) -> None:
+    """As by the watchdog of a service manager."""
+    for entry in tlog.read(RECORDING):
+        rig.log.write(entry.unix_us, entry.frame.raw)
+    rig.beat(OURS)
+    assert rig.next_command().command == 176
+    rig.abandon()
+    rig.disarm()
+    rig.await_end()
+    kept, began_s = rig.log.path.with_name("score.json"), clock.monotonic_s()
+    while not kept.exists():
+        assert clock.monotonic_s() < began_s + LONG_S
+        time.sleep(0.05)
 
 
 def beat_until(rig: Rig, guards: bool, guard: Supervised) -> float:
