@@ -84,6 +84,8 @@ def exists(firmware: Firmware, condition: str) -> bool:
     kind, _, event = condition.partition(" ")
     if kind in ("since", "latched"):
         return event in EVENTS
+    if kind == "requests":
+        return event in firmware.modes
     return event in firmware.boot_events_s if kind == "reached" else condition in CONDITIONS
 
 

@@ -1,7 +1,7 @@
 """Latitude, longitude and altitude <-> metres in the local NED frame of an origin.
 
 The azimuthal equidistant projection on a sphere (J. P. Snyder, Map Projections, 1987, section 25):
-distances from the origin are true, as in the local frames of PX4 and ArduPilot.
+distances from the origin are true, as in PX4's local frame; ArduPilot's are 0.11 % longer.
 """
 
 from __future__ import annotations

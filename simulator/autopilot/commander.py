@@ -27,6 +27,7 @@ from simulator.firmware.values import (
     Triple,
 )
 
+_CRITICAL = 2  # battery level
 # EKF2_GPS_V_GATE standard deviations of EKF2_GPS_V_NOISE; EK3_VEL_I_GATE of EK3_VELNE_M_NSE
 _GATE_MPS = 5.0 * 0.3
 
@@ -81,9 +82,15 @@ class Commander:
     @property
     def healthy(self) -> bool:
         """The pre-arm checks pass in the intended mode."""
-        if self.rejects_velocity:
+        battery, read = self._state.truth.battery, self._parameters.__getitem__
+        if self.rejects_velocity or self._firmware.battery_level(battery, read) >= _CRITICAL:
             return False
         return self._health.passes(self.intended, self._state.time_s, latched=bool(self.latched))
+
+    @property
+    def has_fix(self) -> bool:
+        """GPS has a fix: its first one, and no fault takes it away."""
+        return self._health.first_fix(self._state.time_s) and self._state.gps_healthy
 
     @property
     def velocity_ratio(self) -> float:
@@ -151,6 +158,8 @@ class Commander:
             return not self._holds(condition[4:])
         if condition.startswith("since "):
             return self.failsafe and self._cause == condition[6:]
+        if condition.startswith("requests "):
+            return self._requested.name == condition[9:]
         if condition.startswith("reached "):
             return condition[8:] in self._health.reached
         if condition.startswith("latched "):
@@ -237,9 +246,10 @@ CONDITIONS: dict[str, Callable[[Commander], bool]] = {
         c._requested.needs_position
         and ("position" not in c._health.reached or c._health.position_lost)
     ),
-    "fix missing": lambda c: not c._health.has_fix(c._state.time_s) or not c._state.gps_healthy,
+    "fix missing": lambda c: not c.has_fix,
     "velocity rejected": lambda c: c.rejects_velocity,
     "mission missing": lambda c: not c._guidance.mission.flyable,
+    "takeoff item missing": lambda c: not c._guidance.mission.takes_off,
     "climb requested": lambda c: c._request.takeoff_ned_m[2] <= c._guidance.home_ned_m[2],
     "climbing": lambda c: c._guidance.behaviour is Behaviour.TAKEOFF,
     "attitude setpoint": lambda c: c._guidance.follows_attitude,

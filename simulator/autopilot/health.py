@@ -134,8 +134,8 @@ class Health:
         """Time since the last GPS fix."""
         return now_s - self._fix_s
 
-    def has_fix(self, now_s: float) -> bool:
-        """GPS has its first fix; a fault may take it away."""
+    def first_fix(self, now_s: float) -> bool:
+        """GPS has found its first fix; a fault may take it away."""
         return now_s >= self._firmware.first_fix_s * self.boot_scale
 
     def passes(self, mode: Mode, now_s: float, *, latched: bool) -> bool:
@@ -150,7 +150,8 @@ class Health:
             return False
         if firmware.fails_where_unarmable and not mode.arms:
             return False
-        if self._parameters.role("ground_station_needed") > 0 and self.ground_station_lost:
+        heard = not (self.ground_station_lost or math.isnan(self._heartbeat_s))
+        if self._parameters.role("ground_station_needed") > 0 and not heard:
             return False
         if mode.behaviour is Behaviour.MISSION:
             return self._mission.flyable

@@ -16,6 +16,7 @@ from simulator.firmware.values import NAN3, MissionItem, MotionSetpoint, Triple
 from simulator.geodesy import down_m, to_metres
 
 ITEMS_MAX = 500
+VERTICAL_SPEEDS = (2.0, 3.0)  # SPEED_TYPE: climb, descent
 _ACCEPTANCE_M, _ACCEPTANCE_HEIGHT_M = 2.0, 0.8  # NAV_ACC_RAD of multicopters, NAV_MC_ALT_RAD
 
 
@@ -65,6 +66,12 @@ class Mission:
         """There is a place or a return."""
         flown = _PLACES | {Kind.RETURN}
         return any(item.command in flown for item in self.items[self.first :])
+
+    @property
+    def takes_off(self) -> bool:
+        """Its first place is a takeoff."""
+        places = (item.command for item in self.items[self.first :] if item.command in _PLACES)
+        return next(places, None) == Kind.TAKEOFF
 
     def store(self, items: tuple[MissionItem, ...]) -> None:
         """Replace the items; the mission starts from its beginning."""
@@ -155,7 +162,8 @@ class Mission:
             item = self.items[self.current]
             if item.command in _PLACES or item.command == Kind.DELAY:
                 return
-            if item.command == Kind.CHANGE_SPEED and item.params[1] > 0:
+            vertical = self.firmware.vertical_speeds and item.params[0] in VERTICAL_SPEEDS
+            if item.command == Kind.CHANGE_SPEED and item.params[1] > 0 and not vertical:
                 self.speed_mps = item.params[1]
             if item.command == Kind.RETURN:
                 self._finish("mission return")

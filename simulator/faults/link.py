@@ -100,10 +100,11 @@ class ClockJump(Timed):
     jump_s: float = Field(ge=-1e7, le=1e7)
 
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
-        jump_us = round(self.jump_s * 1e6)
+        jump_us, jumped = round(self.jump_s * 1e6), vehicle.autopilot
         vehicle.view.clock_offset_us += jump_us
         yield from until_the_end()
-        vehicle.view.clock_offset_us -= jump_us
+        if vehicle.autopilot is jumped:  # a reboot sets the clock
+            vehicle.view.clock_offset_us -= jump_us
 
 
 _QUADROTOR, _ONBOARD_CONTROLLER, _NO_AUTOPILOT = 2, 18, 8  # MAV_TYPE, MAV_AUTOPILOT

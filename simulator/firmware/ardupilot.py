@@ -254,8 +254,9 @@ ARDUPILOT = ArduCopter(
     force_codes={"arm": 2989.0, "disarm": 21196.0},
     takeoff_above_home=True,
     reposition_mode="GUIDED",
-    repositions_strictly=True,
-    speed_refusal=Result.FAILED,
+    strict_places=True,
+    vertical_speeds=True,
+    empty_refusal=Result.FAILED,
     command_answers={
         **dict.fromkeys(_TAKEN, Result.ACCEPTED),
         **dict.fromkeys(_FAILED, Result.FAILED),

@@ -1,7 +1,8 @@
 """Tables of ArduCopter: its flight modes, its parameters (those that clients read or the vehicle
 obeys), and its state table: events, and what follows from them.
 
-ArduCopter takes values outside the documented range, so the limits are those of the type.
+ArduCopter takes values outside the documented range, so the limits are those of the type, but for
+values that it raises itself or refuses to arm with.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from simulator.firmware.base import ParameterSpec, Role, Rule
-from simulator.firmware.values import Behaviour, Mode, Result, critical, info, warning
+from simulator.firmware.values import Behaviour, Mode, Result, StatusText, critical, info, warning
 
 # MAV_MODE_FLAG: 1 custom mode, 8 guided, 16 stabilise, 64 manual input. "Guided" shows whether
 # the position controller runs, not the mode.
@@ -46,8 +47,8 @@ MODES = {
 }
 
 
-def _real(name: str, default: float, meaning: str) -> ParameterSpec:
-    return ParameterSpec(name, "real32", default, -3.4e38, 3.4e38, meaning)
+def _real(name: str, default: float, meaning: str, least: float = -3.4e38) -> ParameterSpec:
+    return ParameterSpec(name, "real32", default, least, 3.4e38, meaning)
 
 
 def _int8(name: str, default: int, meaning: str) -> ParameterSpec:
@@ -63,7 +64,7 @@ def _int32(name: str, default: int, meaning: str) -> ParameterSpec:
 
 
 PARAMETERS = (
-    _int16("ANGLE_MAX", 3000, "cdeg, greatest tilt of its own position control"),
+    ParameterSpec("ANGLE_MAX", "int16", 3000, 1000, 8000, "cdeg, greatest tilt it flies by itself"),
     _int32("ARMING_CHECK", 1, "pre-arm checks, 1 all"),
     _real("ATC_ACCEL_P_MAX", 110000.0, "cdeg/s^2 of pitch"),
     _real("ATC_ACCEL_R_MAX", 110000.0, "cdeg/s^2 of roll"),
@@ -113,8 +114,8 @@ PARAMETERS = (
     _int8("SYSID_ENFORCE", 0, "1: obey SYSID_MYGCS only"),
     _int16("SYSID_MYGCS", 255, "system id of the ground station"),
     _int16("SYSID_THISMAV", 1, "system id"),
-    _real("WPNAV_ACCEL", 250.0, "cm/s^2 across the ground"),
-    _real("WPNAV_SPEED", 1000.0, "cm/s of automatic flight"),
+    _real("WPNAV_ACCEL", 250.0, "cm/s^2 across the ground", 1.0),
+    _real("WPNAV_SPEED", 1000.0, "cm/s of automatic flight", 10.0),
     _real("WPNAV_SPEED_DN", 150.0, "cm/s of descent"),
     _real("WPNAV_SPEED_UP", 250.0, "cm/s of climb"),
     _int8("WP_YAW_BEHAVIOR", 2, "yaw: 0 unchanged, 1 to the waypoint, 2 the same except in RTL"),
@@ -159,6 +160,7 @@ ROLES: dict[str, Role] = {
 
 _FAILED = Result.FAILED
 _NO_POSITION = warning("Mode change to {mode} failed: requires position")
+_NOT_STARTED = warning("Mode change to {mode} failed: init failed")
 _HEARTBEAT = ("HEARTBEAT",)
 _ORIGIN_AND_HOME = ("GPS_GLOBAL_ORIGIN", "HOME_POSITION")
 _ARMING = Rule("arm", do=("arm",), texts=(info("Arming motors"),), send=_ORIGIN_AND_HOME)
@@ -204,6 +206,8 @@ def _failsafe(
     ]
 
 
+# Modes that FS_OPTIONS bit 4 leaves to the pilot
+_PILOTED = ("STABILIZE", "ACRO", "ALT_HOLD", "LOITER", "DRIFT", "POSHOLD", "BRAKE", "THROW")
 _BATTERY_MODES = {1: "LAND", 2: "RTL", 3: "SMART_RTL", 4: "SMART_RTL", 7: "BRAKE"}
 _GROUND_MODES = {**_BATTERY_MODES, 1: "RTL", 5: "LAND", 6: "RTL"}
 
@@ -233,6 +237,25 @@ def _refusals(event: str, prefix: str, result: Result) -> list[Rule]:
     return [row for row in rows if event == "arm" or "not mode arms" not in row.when]
 
 
+def _entries(event: str) -> list[Rule]:
+    """Rows that enter the requested mode, while armed only if it can start."""
+
+    def refuses(*when: str, texts: tuple[StatusText, ...]) -> Rule:
+        return Rule(event, when=when, result=_FAILED, texts=texts)
+
+    no_takeoff = critical("Auto: Missing Takeoff Cmd")
+    return [
+        Rule(event, when=("not armed",), to="requested", send=_HEARTBEAT),
+        refuses("position missing", texts=(_NO_POSITION,)),
+        refuses("requests AUTO", "mission missing", texts=(_NOT_STARTED,)),
+        refuses(
+            "requests AUTO", "landed", "takeoff item missing", texts=(no_takeoff, _NOT_STARTED)
+        ),
+        refuses("requests THROW", texts=(_NOT_STARTED,)),
+        Rule(event, to="requested", send=_HEARTBEAT),
+    ]
+
+
 RULES = (
     # A mode requested before was acknowledged and is lost
     Rule("initialised", to="STABILIZE", texts=(info("ArduPilot Ready"),)),
@@ -244,14 +267,11 @@ RULES = (
     ),
     Rule("position", texts=(info("EKF3 IMU0 is using GPS"), info("EKF3 IMU1 is using GPS"))),
     # A heartbeat follows a mode change at once
-    Rule("mode", when=("not armed",), to="requested", send=_HEARTBEAT),
-    Rule("mode", when=("not position missing",), to="requested", send=_HEARTBEAT),
-    Rule("mode", result=_FAILED, texts=(_NO_POSITION,)),
+    *_entries("mode"),
     Rule("turn"),
     Rule("loiter", when=("not position missing",), to="LOITER", send=_HEARTBEAT),
     Rule("loiter", result=_FAILED),
-    Rule("mission", when=("not position missing",), to="AUTO", send=_HEARTBEAT),
-    Rule("mission", result=_FAILED),
+    *_entries("mission"),
     Rule("mission progress", send=("MISSION_CURRENT",)),
     Rule("item reached", send=("MISSION_ITEM_REACHED",)),
     Rule("mission return", "AUTO", do=("return",)),  # within the mode
@@ -282,6 +302,21 @@ RULES = (
     # No failsafe and no text: level with constant height, or standing still; the mode stays GUIDED
     Rule("stream lost", when=("attitude setpoint",), do=("level",)),
     Rule("stream lost", when=("velocity setpoint",), do=("hold",)),
+    Rule(
+        "ground station lost",
+        when=("armed", "landed", "not FS_GCS_ENABLE=0"),
+        do=("disarm",),
+        texts=(_DISARMING, warning("GCS Failsafe - Disarming")),
+    ),
+    *(
+        Rule(
+            "ground station lost",
+            mode,
+            when=("armed", "not FS_GCS_ENABLE=0", "FS_OPTIONS=16"),
+            texts=(warning("GCS Failsafe - Continuing Pilot Control"),),
+        )
+        for mode in _PILOTED
+    ),
     *_failsafe("ground station lost", "FS_GCS_ENABLE", _GROUND_MODES),
     Rule(
         "ground station found",

@@ -71,7 +71,8 @@ class Rule:
         mode: name of the mode in which it happened, or "*".
         when: conditions that must all hold (`simulator.autopilot.commander.CONDITIONS`). "not X"
             negates, "NAME=2" compares a parameter, "since X" is a failsafe because of event X,
-            "reached X" a boot event that has come, "latched X" an event that only a reboot clears.
+            "reached X" a boot event that has come, "latched X" an event that only a reboot clears,
+            "requests X" a request of mode X.
         to: next mode by name, "*" none, "requested" by the command, "remembered" the last chosen.
         do: actions (`simulator.autopilot.commander.ACTIONS`).
         result: acknowledgement of a command.
@@ -162,8 +163,12 @@ class Firmware(ABC):
     force_codes: Mapping[str, float]  # param2 of MAV_CMD_COMPONENT_ARM_DISARM: arm, disarm
     takeoff_above_home: bool = False  # height of MAV_CMD_NAV_TAKEOFF; else above mean sea level
     reposition_mode: str  # mode for MAV_CMD_DO_REPOSITION
-    repositions_strictly: bool = False  # it needs a frame and a place; yaw and speed are ignored
-    speed_refusal: Result  # of MAV_CMD_DO_CHANGE_SPEED without a speed
+    # MAV_CMD_DO_REPOSITION needs a frame and a place, and its yaw and speed are ignored; a takeoff
+    # needs a height above home; MAV_CMD_MISSION_START names no item
+    strict_places: bool = False
+    empty_refusal: Result  # of a MAV_CMD_DO_CHANGE_SPEED without a speed, an interval of no message
+    vertical_speeds: bool = False  # SPEED_TYPE 2 and 3 are climb and descent, else across as any
+    no_interval_us: int = -1  # MESSAGE_INTERVAL of a message that is not streamed
     # MAV_CMD acknowledged and not carried out: result, None: no acknowledgement. Any other command
     # without a handler is UNSUPPORTED
     command_answers: Mapping[int, Result | None]
@@ -203,7 +208,7 @@ class Firmware(ABC):
     interval_refusal: Result
     interval_refusal_text: str = ""  # may name {id}; "": none
     too_fast_text: str = ""
-    request_refusal: Result  # of MAV_CMD_REQUEST_MESSAGE
+    request_refusal: Result  # of MAV_CMD_REQUEST_MESSAGE, and a termination that terminates nothing
 
     # link
     ground_station_stays_s: float = 0.0  # after its last heartbeat

@@ -258,7 +258,8 @@ PX4 = Px4(
     set_mode_acked_as=176,
     force_codes={"arm": 21196.0, "disarm": 21196.0},
     reposition_mode="AUTO.LOITER",
-    speed_refusal=Result.ACCEPTED,
+    empty_refusal=Result.ACCEPTED,
+    no_interval_us=0,
     command_answers={
         **dict.fromkeys(_TAKEN, Result.ACCEPTED),
         **dict.fromkeys(_UNANSWERED),

@@ -257,6 +257,7 @@ RULES = (
     Rule("disarm", result=_LATER, texts=(critical("Disarming denied: not landed"),)),
     Rule("force disarm", when=("not armed",)),
     _disarms("force disarm", "Disarmed by external command"),
+    Rule("terminate", when=("not armed",), result=Result.DENIED),
     Rule("terminate", to="TERMINATION", do=("disarm", "latch"), texts=(_LOST,)),
     *(
         Rule(
@@ -274,6 +275,10 @@ RULES = (
     Rule("stream found", when=("since stream lost",), to="remembered", do=("recover",)),
     *_delayed("battery critical", "COM_LOW_BAT_ACT", {1: _RTL, 2: _LAND, 3: _RTL}),
     *_delayed("battery emergency", "COM_LOW_BAT_ACT", {1: _RTL, 2: _LAND, 3: _LAND}),
+    *(
+        Rule("ground station lost", mode, texts=(_WARNINGS["ground station lost"],))
+        for mode in (_LAND, "AUTO.PRECLAND")  # a landing goes on
+    ),
     *_delayed("ground station lost", "NAV_DLL_ACT", {2: _RTL, 3: _LAND}),
     Rule(
         "ground station lost",

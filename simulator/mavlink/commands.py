@@ -1,8 +1,8 @@
 """MAVLink commands (MAV_CMD): what each does, and how it is acknowledged.
 
-Unused parameters of a command may be NaN or 0. Every command addressed to the vehicle is
-acknowledged, unknown ones with UNSUPPORTED. Knows one link's outbox and schedule, and the
-autopilot.
+Unused parameters of a command may be NaN or 0. Every command is acknowledged, unknown ones with
+UNSUPPORTED, except those that the real autopilot leaves unanswered (`Firmware.command_answers`).
+Knows one link's outbox and schedule, and the autopilot.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 from simulator.autopilot.autopilot import Autopilot
 from simulator.autopilot.commander import Request
+from simulator.autopilot.mission import VERTICAL_SPEEDS
 from simulator.firmware.values import Asked, Behaviour, Result, Triple, info
 from simulator.geodesy import down_m, to_metres
 from simulator.mavlink.codec import id_of, name_of
@@ -20,9 +21,9 @@ from simulator.mavlink.outbox import Outbox
 from simulator.mavlink.telemetry import Schedule
 
 _HEIGHT_MAX_M = 83_000.0  # of home: ArduPilot's LOCATION_ALT_MAX_M
+_RELATIVE = 3  # MAV_FRAME
 _CHANGE_MODE = 1.0  # MAV_DO_REPOSITION_FLAGS
 _MISSION_PLANNER = 190  # MAV_COMPONENT, as ground stations call themselves
-_VERTICAL_SPEEDS = (2.0, 3.0)  # SPEED_TYPE: climb, descent
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +98,8 @@ class Commands:
         return autopilot.handle(f"force {asked.name}" if forced else asked.name)
 
     def _takeoff(self, autopilot: Autopilot, command: Command) -> Result:
+        if autopilot.firmware.strict_places and command.frame not in (None, _RELATIVE):
+            return Result.DENIED
         height_m = command.params[6]
         home_down_m = autopilot.guidance.home_ned_m[2]
         if autopilot.firmware.takeoff_above_home:
@@ -123,18 +126,20 @@ class Commands:
     def _reposition(self, autopilot: Autopilot, command: Command) -> Result:
         """MAV_CMD_DO_REPOSITION: fly to a place and hold there. Coordinates that are not finite
         keep their present value."""
-        if command.params[1] != _CHANGE_MODE:
-            return Result.UNSUPPORTED
+        strict, mode = autopilot.firmware.strict_places, autopilot.firmware.reposition_mode
+        there = strict and autopilot.commander.mode.name == mode
+        if command.params[1] != _CHANGE_MODE and not there:
+            return Result.DENIED if strict and command.frame is not None else Result.UNSUPPORTED
         yaw_rad, latitude, longitude, height_m = command.params[3:7]
-        strict = autopilot.firmware.repositions_strictly
         speed_mps = math.inf if strict or not command.params[0] > 0.0 else command.params[0]
         if strict:
             if command.frame is None:
                 return Result.UNSUPPORTED
-            if not (latitude or longitude):
+            on_earth = abs(latitude) <= 90.0 and abs(longitude) <= 180.0
+            if not on_earth or not (latitude or longitude):
                 return Result.DENIED
             yaw_rad = math.nan
-        result = autopilot.handle("mode", Request(autopilot.firmware.reposition_mode))
+        result = autopilot.handle("mode", Request(mode))
         if result is Result.ACCEPTED and autopilot.commander.armed:
             yaw_rad = yaw_rad if math.isfinite(yaw_rad) else math.nan
             place = self._place(latitude, longitude, height_m, command.frame or 0)
@@ -169,17 +174,20 @@ class Commands:
         A speed that is not positive restores the default.
         """
         kind, speed_mps = command.params[:2]
-        if speed_mps > 0.0 and kind in _VERTICAL_SPEEDS:
+        vertical = autopilot.firmware.vertical_speeds and kind in VERTICAL_SPEEDS
+        if speed_mps > 0.0 and vertical:
             return Result.ACCEPTED
         known = 0.0 < speed_mps < math.inf
         autopilot.guidance.cruise_mps = speed_mps if known else math.inf
-        return Result.ACCEPTED if known else autopilot.firmware.speed_refusal
+        return Result.ACCEPTED if known else autopilot.firmware.empty_refusal
 
     def _turn(self, autopilot: Autopilot, command: Command) -> Result:
         """MAV_CMD_CONDITION_YAW: to a yaw, or relative to the present one; degrees."""
         yaw_deg, speed_dps, sense, relative = command.params[:4]
         result = autopilot.handle("turn")
-        if result is Result.ACCEPTED and math.isfinite(yaw_deg):
+        if result is Result.ACCEPTED:
+            if not (0.0 <= yaw_deg <= 360.0 and relative in (0.0, 1.0)):
+                return Result.FAILED
             from_rad = autopilot.state.estimate.yaw_rad if relative else 0.0
             turn_rad = math.radians(yaw_deg) * (-1.0 if relative and sense < 0 else 1.0)
             turn_radps = math.radians(speed_dps) if speed_dps > 0.0 else math.inf
@@ -189,17 +197,22 @@ class Commands:
 
     def _terminate(self, autopilot: Autopilot, command: Command) -> Result:
         """MAV_CMD_DO_FLIGHTTERMINATION: the motors stop; it cannot be withdrawn."""
-        return autopilot.handle("terminate") if command.params[0] > 0.5 else Result.FAILED
+        asked = command.params[0] > 0.5
+        return autopilot.handle("terminate") if asked else autopilot.firmware.request_refusal
 
     def _reboot(self, autopilot: Autopilot, command: Command) -> Result:
         restart = command.params[0] >= 1.0
         return autopilot.handle("reboot") if restart else Result.UNSUPPORTED
 
     def _start_mission(self, autopilot: Autopilot, command: Command) -> Result:
+        if autopilot.firmware.strict_places and any(command.params[:2]):
+            return Result.DENIED
         first = command.params[0] if math.isfinite(command.params[0]) else 0.0
         if not -1 <= first < max(1, len(autopilot.mission.items)):
             return Result.DENIED
-        return autopilot.handle("mission")
+        modes = autopilot.firmware.modes.values()
+        mode = next(mode.name for mode in modes if mode.behaviour is Behaviour.MISSION)
+        return autopilot.handle("mission", Request(mode))
 
     def _set_current_item(self, autopilot: Autopilot, command: Command) -> Result:
         number = command.params[0]
@@ -226,9 +239,14 @@ class Commands:
 
     def _get_interval(self, autopilot: Autopilot, command: Command) -> Result:
         name = message_name(command.params[0])
+        firmware, number = autopilot.firmware, command.params[0]
         if name is None or name not in self.outbox.view.builders:
-            return Result.DENIED
-        self.outbox.send("MESSAGE_INTERVAL", id_of(name), self.schedule.interval_us(name))
+            unknown = int(number) & 0xFFFF if math.isfinite(number) else 0
+            self.outbox.send("MESSAGE_INTERVAL", unknown, 0)
+            return firmware.empty_refusal
+        streamed = name in self.schedule.streams
+        interval_us = self.schedule.interval_us(name) if streamed else firmware.no_interval_us
+        self.outbox.send("MESSAGE_INTERVAL", id_of(name), interval_us)
         return Result.ACCEPTED
 
     def _request_message(self, autopilot: Autopilot, command: Command) -> Result:

@@ -82,7 +82,7 @@ def vfr_hud(view: View) -> Sequence[Any]:
 
 def gps_raw_int(view: View) -> Sequence[Any]:
     """Accuracies as PX4's SIH reports them: larger than the errors."""
-    if not view.has_fix:
+    if not view.autopilot.commander.has_fix:
         return (view.time_us, 1, 0, 0, 0, 65535, 65535, 65535, 65535, 0, *(0,) * 6)
     north, east, down, v_north, v_east = view.autopilot.plant.fix()
     course = heading_cdeg(math.atan2(v_east, v_north))

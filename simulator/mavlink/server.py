@@ -6,10 +6,12 @@ the `outbox`. Knows no socket and no clock: time is the autopilot's.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from simulator.autopilot.setpoints import ATTITUDE, GLOBAL, LOCAL
+from simulator.autopilot.sticks import RELEASE
 from simulator.mavlink.codec import Decoder, Keyring, Message, sender_of
 from simulator.mavlink.commands import Command, Commands
 from simulator.mavlink.outbox import MAV_COMP_ID_AUTOPILOT, Outbox, Texts
@@ -18,6 +20,8 @@ from simulator.mavlink.transfers import Handlers, MissionTransfer, ParameterTran
 from simulator.mavlink.view import View
 
 _GUIDED = 2  # `current` of a mission item that is a place to fly to now
+_AXIS_NOT_USED = 2**15 - 1  # of MANUAL_CONTROL
+_NO_PLACE = 2**31 - 1  # in x and y of COMMAND_INT
 _FTP_NAK, _FTP_ERROR_NOT_FOUND = 128 + 1, 10
 
 
@@ -132,7 +136,10 @@ class Server:
 
     def _command_int(self, message: Message) -> None:
         params = tuple(getattr(message, f"param{i}") for i in range(1, 5))
-        params += (message.x * 1e-7, message.y * 1e-7, message.z)
+        place = (message.x * 1e-7, message.y * 1e-7)
+        if message.x == message.y == _NO_PLACE:
+            place = (math.nan, math.nan)
+        params += (*place, message.z)
         self._commands.run(Command(message.command, params, *sender_of(message), message.frame))
 
     def _setpoint(self, message: Message) -> None:
@@ -161,19 +168,32 @@ class Server:
         self._sticks(message, [getattr(message, f"chan{i}_raw") for i in range(1, 9)])
 
     def _manual_control(self, message: Message) -> None:
-        """Joystick axes -1000 .. 1000, throttle 0 .. 1000, as pulse widths."""
+        """Joystick axes -1000 .. 1000, throttle 0 .. 1000, as pulse widths; an axis that is not
+        used is released."""
+        if message.target != self.view.system:
+            return
         pitch, roll, throttle, yaw = message.x, message.y, message.z, message.r
-        widths = (1500 + roll // 2, 1500 - pitch // 2, 1000 + throttle, 1500 + yaw // 2)
-        self._sticks(message, [min(2000, max(1000, width)) for width in widths])
+        widths = (
+            (roll, 1500 + roll // 2),
+            (pitch, 1500 - pitch // 2),
+            (throttle, 1000 + throttle),
+            (yaw, 1500 + yaw // 2),
+        )
+        pulses = [
+            RELEASE if axis == _AXIS_NOT_USED else min(2000, max(1000, width))
+            for axis, width in widths
+        ]
+        self._sticks(message, pulses if throttle >= 0 else ())
 
     def _sticks(self, message: Message, widths_us: Sequence[int]) -> None:
-        """Stick positions; only the ground station may send them."""
+        """Stick positions; only the ground station may send them, and is heard by them."""
         autopilot = self.view.autopilot
         read = autopilot.parameters.__getitem__
         if autopilot.guidance.sticks is None:
             return
         if autopilot.firmware.is_ground_station(0, message.get_srcSystem(), read):
             autopilot.guidance.sticks.override(widths_us, autopilot.state.time_s)
+            autopilot.health.ground_station_heard(autopilot.state.time_s)
 
     def _setup_signing(self, message: Message) -> None:
         """A new signing key; not while armed."""

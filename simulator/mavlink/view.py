@@ -81,25 +81,22 @@ class View:
         return (2, firmware.mav_autopilot, base_mode, commander.mode.custom_mode, state, 3)
 
     def restart(self, autopilot: Autopilot) -> None:
-        """Show another autopilot, after a reboot."""
+        """Show another autopilot, after a reboot; faults that run go on."""
         autopilot.state.gps_healthy = self.autopilot.state.gps_healthy
+        autopilot.state.velocity_error_ned_mps = self.autopilot.state.velocity_error_ned_mps
+        autopilot.commander.refused = self.autopilot.commander.refused
         self.autopilot = autopilot
         self.clock_offset_us = 0
         self._at_step = -1
-
-    @property
-    def has_fix(self) -> bool:
-        """No fault suppresses the GPS fix."""
-        return self.autopilot.state.gps_healthy
 
     @property
     def sensor_bits(self) -> tuple[int, int, int]:
         """MAV_SYS_STATUS_SENSOR: present, enabled, healthy."""
         autopilot = self.autopilot
         present, enabled, health = autopilot.firmware.sensor_bits
-        if not autopilot.health.has_fix(autopilot.state.time_s):
+        if not autopilot.health.first_fix(autopilot.state.time_s):
             present, enabled, health = present & ~_GPS, enabled & ~_GPS, health & ~_GPS
-        elif not self.has_fix:
+        elif not autopilot.commander.has_fix:
             health &= ~_GPS
         if autopilot.commander.healthy:
             health |= _PREARM

@@ -13,8 +13,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_bench import NAN, Bench, aloft
 
 from simulator.firmware.ardupilot import ARDUPILOT
+from simulator.firmware.values import MissionItem
 
-GUIDED, LAND = 4, 9
+AUTO, GUIDED, LAND, THROW = 3, 4, 9, 18
 ACCEPTED, FAILED = 0, 4
 HOVER = 0.3655
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -56,6 +57,16 @@ def test_without_requests_it_sends_heartbeat_timesync_and_home() -> None:
     }
 
 
+def test_gps_raw_int_shows_no_fix_before_the_first_one() -> None:
+    """At 10.2 s."""
+    vehicle = Bench(firmware=ARDUPILOT)
+    vehicle.command(511, 24, 200_000)
+    vehicle.run(11.0)
+    fixes = vehicle.of("GPS_RAW_INT")
+    assert {m.fix_type for at_s, m in fixes if at_s < 10.1} == {1}
+    assert {m.fix_type for at_s, m in fixes if at_s > 10.3} == {3}
+
+
 @pytest.mark.parametrize(("thrust", "lifts"), [(0.45, True), (0.05, False)])
 def test_takeoff_by_setpoints_alone(thrust: float, lifts: bool) -> None:
     """.3 m after 3.3-3.9 s; any thrust is flight, even if it cannot lift."""
@@ -89,6 +100,57 @@ def test_without_guid_options_thrust_is_a_climb_rate() -> None:
     for thrust, climb in ((0.5, 0.0), (1.0, 2.5), (0.75, 1.25), (0.0, -1.5), (2.0, 2.5)):
         vehicle.run(3.0, lambda u=thrust: vehicle.attitude(LEVEL, u))
         assert climb_mps(vehicle) == pytest.approx(climb, abs=0.1)
+
+
+@pytest.mark.parametrize("name", ["WPNAV_SPEED", "WPNAV_ACCEL", "ANGLE_MAX"])
+def test_a_negative_limit_is_raised_to_the_least_one(name: str) -> None:
+    vehicle = guided(GUID_OPTIONS=0)
+    kind = 4 if name == "ANGLE_MAX" else 9
+    vehicle.send(mavlink.MAVLink_param_set_message(1, 1, name.encode(), -500.0, kind))
+    vehicle.run(0.5, lambda: vehicle.attitude(LEVEL, 0.5))
+    vehicle.run(1.0, lambda: vehicle.position(0, 0, 0, mask=0b110111000111))
+    assert vehicle.height_m > 6.0
+
+
+def test_modes_that_do_not_start_while_armed() -> None:
+    """Disarmed any mode is entered."""
+    vehicle = guided()
+    mission = vehicle.instance.autopilot.mission
+    for number, title in ((AUTO, "AUTO"), (THROW, "THROW")):
+        assert vehicle.command(176, 1, number) == [FAILED]
+        assert vehicle.texts()[-1] == f"Mode change to {title} failed: init failed"
+        assert vehicle.mode == GUIDED
+    assert vehicle.command(300) == [FAILED]
+    mission.store(tuple(MissionItem(3, 16, (0.0,) * 4, 0, 0, up_m) for up_m in (0.0, 5.0)))
+    assert vehicle.command(300) == [ACCEPTED]
+    ground = Bench(firmware=ARDUPILOT, boot_scale=0.1)
+    ground.run(4.5)
+    ground.instance.autopilot.mission.store(mission.items)
+    for number in (THROW, AUTO, GUIDED):
+        assert ground.command(176, 1, number) == [ACCEPTED]
+    assert ground.command(400, 1) == [ACCEPTED]
+    assert ground.command(176, 1, AUTO) == [FAILED]
+    failed = "Mode change to AUTO failed: init failed"
+    assert ground.texts()[-2:] == ["Auto: Missing Takeoff Cmd", failed]
+
+
+def test_a_lost_ground_station_disarms_on_the_ground_and_leaves_the_pilot_his_mode() -> None:
+    vehicle = loitering()
+    vehicle.set("FS_GCS_ENABLE", 1)
+    vehicle.heartbeat_type = None
+    vehicle.run(6.0)
+    assert (vehicle.mode, vehicle.system_status) == (5, 4)
+    assert "GCS Failsafe - Continuing Pilot Control" in vehicle.texts()
+    ground = Bench(firmware=ARDUPILOT, boot_scale=0.1)
+    ground.codec.srcSystem = 255
+    ground.set("FS_GCS_ENABLE", 1)
+    ground.run(4.5)
+    assert ground.command(176, 1, GUIDED) == [ACCEPTED]
+    ground.heartbeat_type = None
+    assert ground.command(400, 1) == [ACCEPTED]
+    ground.run(6.0)
+    assert (ground.armed, ground.mode) == (False, GUIDED)
+    assert ground.texts()[-2:] == ["Disarming motors", "GCS Failsafe - Disarming"]
 
 
 def test_a_nan_thrust_is_zero_and_prevents_arming_until_reboot() -> None:
@@ -200,3 +262,25 @@ def test_roll_flies_sideways_also_by_manual_control_of_the_ground_station_alone(
     bench.codec.srcSystem = 255
     push(bench, 0.02, 0, KEEP, 0, KEEP)  # zero releases
     assert seen(bench) == (1500, 1500, 1000, 1500, *FEIGNED[4:])
+
+
+def test_manual_control_releases_axes_and_keeps_the_ground_station_present() -> None:
+    """32767 is an axis that is not used; a negative throttle or another target changes nothing."""
+    bench = loitering()
+    for target, throttle, roll_axis, widths in (
+        (1, 700, 0, (1500, 1500, 1700, 1500)),
+        (1, -1, 500, (1500, 1500, 1700, 1500)),
+        (2, 300, 500, (1500, 1500, 1700, 1500)),
+        (1, 700, 32767, (1500, 1500, 1700, 1500)),
+        (1, 32767, 500, (1750, 1500, 1000, 1500)),
+    ):
+        bench.send(mavlink.MAVLink_manual_control_message(target, 0, roll_axis, throttle, 0, 0))
+        bench.run(0.02)
+        assert seen(bench)[:4] == widths
+    bench.set("FS_GCS_ENABLE", 1)
+    bench.heartbeat_type = None
+    joystick = mavlink.MAVLink_manual_control_message(1, 0, 0, 500, 0, 0)
+    bench.run(7.0, lambda: bench.send(joystick), 0.5)
+    assert not [text for text in bench.texts() if text.startswith("GCS Failsafe")]
+    bench.run(6.0)
+    assert [text for text in bench.texts() if text.startswith("GCS Failsafe")]

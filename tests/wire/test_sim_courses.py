@@ -14,9 +14,10 @@ from sim_bench import NAN, Bench, aloft
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
+from simulator.firmware.values import MissionItem
 from simulator.geodesy import EARTH_RADIUS_M
 
-ACCEPTED, UNSUPPORTED = 0, 3
+ACCEPTED, DENIED, UNSUPPORTED = 0, 2, 3
 POSITION_ALONE, VELOCITY_ALONE = 0xDF8, 0xDC7
 RELATIVE, ABSOLUTE = 6, 5  # MAV_FRAME
 
@@ -39,8 +40,12 @@ def reposition(
     bench: Bench, north: float, east: float, up: float, frame: int, yaw: float = NAN
 ) -> int:
     x, y = (round(value * 1e7) for value in degrees(bench, north, east))
-    asked = (frame, 192, 0, 0, -1.0, 1, 0, yaw, x, y, up)
-    bench.send(mavlink.MAVLink_command_int_message(1, 1, *asked))
+    return command_int(bench, frame, 192, -1.0, 1, 0, yaw, x, y, up)
+
+
+def command_int(bench: Bench, frame: int, number: int, *params: float) -> int:
+    """The result of a COMMAND_INT."""
+    bench.send(mavlink.MAVLink_command_int_message(1, 1, frame, number, 0, 0, *params))
     bench.run(0.02)
     return int(bench.of("COMMAND_ACK")[-1][1].result)
 
@@ -99,6 +104,65 @@ def test_reposition_of_arducopter_accelerates_and_brakes_as_the_real_one() -> No
     assert bench.place == pytest.approx((40.0, 0.0, -5.0), abs=0.9)
 
 
+@pytest.mark.parametrize(
+    ("firmware", "x", "frame", "result"),
+    [
+        (PX4, 2**31 - 1, ABSOLUTE, ACCEPTED),  # "no place": the present one
+        (ARDUPILOT, 2**31 - 1, RELATIVE, DENIED),
+        (ARDUPILOT, 950_000_000, RELATIVE, DENIED),
+    ],
+)
+def test_a_reposition_without_a_place_flies_nowhere(
+    firmware: Firmware, x: int, frame: int, result: int
+) -> None:
+    bench = aloft(firmware=firmware, height_m=5.0, mode="GUIDED" if firmware is ARDUPILOT else None)
+    bench.run(1.0)
+    up_m = 5.0 + (bench.instance.autopilot.firmware.origin[2] if frame == ABSOLUTE else 0.0)
+    assert command_int(bench, frame, 192, -1.0, 1, 0, NAN, x, x, up_m) == result
+    bench.run(3.0)
+    assert bench.place == pytest.approx((0.0, 0.0, -5.0), abs=0.5)
+
+
+@pytest.mark.parametrize("item", [False, True], ids=["command", "item"])
+@pytest.mark.parametrize(("firmware", "obeys"), [(PX4, True), (ARDUPILOT, False)])
+def test_a_climb_speed_is_one_across_for_px4_alone(
+    firmware: Firmware, obeys: bool, item: bool
+) -> None:
+    bench = aloft(firmware=firmware, height_m=5.0, mode="GUIDED" if firmware is ARDUPILOT else None)
+    autopilot = bench.instance.autopilot
+    x, y = (round(value * 1e7) for value in degrees(bench, 30.0, 0.0))
+    up_m = autopilot.firmware.origin[2] + 5.0
+    if item:
+        home = MissionItem(5, 16, (0.0,) * 4, x, y, up_m)
+        speed = MissionItem(2, 178, (2.0, 1.5, -1.0, 0.0), 0, 0, 0.0)
+        autopilot.mission.store((home, speed, home)[firmware is PX4 :])
+        assert bench.command(300) == [ACCEPTED]
+    else:
+        assert command_int(bench, ABSOLUTE, 192, -1.0, 1, 0, NAN, x, y, up_m) == ACCEPTED
+        assert bench.command(178, 2, 1.5, -1) == [ACCEPTED]
+    assert (fastest_mps(bench, 6.0) < 2.0) is obeys
+
+
+@pytest.mark.parametrize(
+    ("mode", "number", "frame", "params", "result"),
+    [
+        ("GUIDED", 115, RELATIVE, (400.0, 10.0, 1.0, 0.0), 4),
+        ("GUIDED", 115, RELATIVE, (90.0, 10.0, 1.0, 0.5), 4),
+        ("GUIDED", 300, RELATIVE, (0.0, 1.0, 0.0, 0.0), DENIED),
+        ("GUIDED", 22, ABSOLUTE, (0.0, 0.0, 0.0, 0.0), DENIED),
+        ("GUIDED", 192, RELATIVE, (-1.0, 0.0, 0.0, NAN), ACCEPTED),
+        ("LOITER", 192, RELATIVE, (-1.0, 0.0, 0.0, NAN), DENIED),
+        ("GUIDED", 510, RELATIVE, (60_000.0, 0.0, 0.0, 0.0), 4),
+    ],
+)
+def test_what_arducopter_refuses(
+    mode: str, number: int, frame: int, params: tuple[float, ...], result: int
+) -> None:
+    bench = aloft(firmware=ARDUPILOT, height_m=5.0, mode=mode)
+    x, y = (round(value * 1e7) for value in degrees(bench, 5.0, 0.0))
+    assert command_int(bench, frame, number, *params, x, y, 5.0) == result
+
+
 @pytest.mark.parametrize("kind", ["", "_int"])
 def test_arducopter_flies_to_a_guided_mission_item_at_once(kind: str) -> None:
     """As DroneKit's simple_goto asks."""
@@ -148,7 +212,7 @@ def test_a_terminated_flight_falls_and_only_px4_does_not_arm_again(
 ) -> None:
     """MAV_CMD_DO_FLIGHTTERMINATION. PX4 stays in its mode until it is started again."""
     bench = aloft(firmware=firmware, height_m=5.0, mode="GUIDED" if firmware is ARDUPILOT else None)
-    assert bench.command(185, 0) == [4]
+    assert bench.command(185, 0) == [2 if firmware is PX4 else 4]
     assert bench.armed
     begun_s = bench.time_s
     assert bench.command(185, 1) == [ACCEPTED]

@@ -231,6 +231,27 @@ def test_disarmed_by_the_pilot_or_by_a_reboot_it_falls() -> None:
     assert bench.of("ATTITUDE", 1.01)[0][1].time_boot_ms < 50
 
 
+def test_faults_that_run_go_on_after_a_reboot_and_end_as_they_should() -> None:
+    """The clock is set by the reboot."""
+    bench = Bench(
+        scenario=scenario(
+            {"fault": "clock_jump", "jump_s": -30.0, "for_s": 8.0},
+            {"fault": "velocity_error", "offset_ned_mps": (0.0, 2.0, 0.0), "for_s": 8.0},
+            {"fault": "refusal", "of": "arm", "text": "no", "for_s": 8.0},
+            {"fault": "reboot", "at_s": 1.0, "for_s": 0.5},
+        )
+    )
+    bench.run(7.0)
+    autopilot = bench.instance.autopilot
+    assert autopilot.state.estimate.velocity_ned_mps[1] == pytest.approx(2.0, abs=0.1)
+    assert bench.command(400, 1) == [1]
+    assert bench.texts()[-1] == "Arming denied: no"
+    bench.run(2.0)
+    assert autopilot.state.estimate.velocity_ned_mps[1] == pytest.approx(0.0, abs=0.1)
+    assert bench.command(400, 1) == [0]
+    assert bench.of("ATTITUDE")[-1][1].time_boot_ms == pytest.approx(7540, abs=60)
+
+
 # -- documents -------------------------------------------------------------------------------------
 
 

@@ -88,6 +88,28 @@ def test_the_least_rate_until_which_the_last_attitude_continues() -> None:
     assert "Failsafe activated" in bench.texts()
 
 
+def test_arming_needs_a_battery_and_with_nav_dll_act_a_ground_station() -> None:
+    bench = Bench(heartbeat_type=None)
+    bench.set("NAV_DLL_ACT", 1)
+    bench.run(5.0)
+    assert bench.command(400, 1) == [1]  # none was ever heard
+    bench.heartbeat_type = 6
+    for remaining, result in ((0.06, 1), (0.1, 0)):
+        bench.instance.autopilot.plant.set_battery(remaining)
+        bench.run(1.1)
+        assert bench.command(400, 1) == [result]
+
+
+def test_a_landing_goes_on_without_a_ground_station() -> None:
+    bench = aloft(height_m=30.0)
+    bench.set("NAV_DLL_ACT", 2)
+    bench.command(21)
+    bench.heartbeat_type = None
+    bench.run(14.0)
+    assert (bench.mode, bench.system_status) == (LAND, 4)
+    assert "Failsafe activated" not in "".join(bench.texts())
+
+
 def test_the_pilot_takes_over_before_the_failsafe_acts() -> None:
     bench = aloft()
     bench.set("COM_LOW_BAT_ACT", 2)
