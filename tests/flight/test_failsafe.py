@@ -142,6 +142,7 @@ def tilt(flight: Any, angle_rad: float) -> None:
 
 def tilt_from_commands(flight: FlightState, angle_rad: float) -> None:
     flight.commands.extend([Command(9.8, (0.0, 0.0, 1.0), 0.0)] * 7)
+    flight.thrusts.extend([0.5] * 7)
     tilt(flight, angle_rad)
 
 
