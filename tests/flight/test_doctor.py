@@ -123,7 +123,7 @@ def test_px4_in_offboard_without_setpoints() -> None:
 @pytest.mark.parametrize(
     ("options", "check", "level", "found"),
     [
-        ({"charge": 0.05}, "battery", BLOCKS, "its battery has 5% left"),
+        ({"charge": 0.08}, "battery", BLOCKS, "its battery has 8% left"),
         ({"charge": 0.2}, "battery", WARN, "20% left"),
         ({"firmware": dataclasses.replace(OBEDIENT, version=0x010D03FF)}, "firmware", WARN,
          "px4 1.13.3 (release) is older than 1.14"),
