@@ -130,11 +130,11 @@ def _decision(config: FlightConfig) -> Iterable[Finding]:
     try:
         took_s = rehearse(prepared, keeps_deadline=True)
     except DocumentError as error:
-        yield blocks(str(error), "choose another controller, or a longer deadline_s")
+        yield blocks(str(error), "choose another controller, or a longer deadline_s or period_s")
         return
-    figures = f"a decision takes {1e3 * took_s:.1f} ms of {1e3 * config.deadline_s:.0f} ms"
-    hint = "close other programs, or allow more time (deadline_s)"
-    yield warn(figures, hint) if took_s > MARGIN * config.deadline_s else ok(figures)
+    figures = f"a decision takes {1e3 * took_s:.1f} ms of {1e3 * config.budget_s:.0f} ms"
+    hint = "close other programs, or allow more time (deadline_s, period_s)"
+    yield warn(figures, hint) if took_s > MARGIN * config.budget_s else ok(figures)
 
 
 def _sleep() -> float:

@@ -199,7 +199,7 @@ class Prepared:
             controller=controller,
             period_s=config.period_s,
             stopwatch=stopwatch,
-            deadline_s=None if session.settings.lockstep else config.deadline_s,
+            deadline_s=None if session.settings.lockstep else config.budget_s,
             identification=identification,
             service=service,
             before=before,
@@ -231,7 +231,7 @@ def rehearse(prepared: Prepared, *, keeps_deadline: bool) -> float:
         observer.on_position(time_s, (0.0, 0.0, -2.0), (0.0, 0.0, 0.0))
         if step >= 20 and step % 10 == 0:
             state = observer.predict(time_s)
-            situation = Situation(time_s, state, reference, previous, lambda: config.deadline_s)
+            situation = Situation(time_s, state, reference, previous, lambda: config.budget_s)
             command = _decided(controller, situation)
             if isinstance(command, Command):
                 previous = command
@@ -239,7 +239,7 @@ def rehearse(prepared: Prepared, *, keeps_deadline: bool) -> float:
     least_s = math.nan
     if keeps_deadline:
         cut_short = replace(situation, remaining_s=lambda: 0.0)
-        least_s = _check_deadline(controller, cut_short, config.deadline_s)
+        least_s = _check_deadline(controller, cut_short, config.budget_s)
     prepared.track.sample(np.array([0.0, 1.0]))
     controller.reset()
     return least_s
@@ -267,7 +267,7 @@ def _decided(controller: Controller, situation: Situation) -> Command | Position
     return command
 
 
-def _check_deadline(controller: Controller, cut_short: Situation, deadline_s: float) -> float:
+def _check_deadline(controller: Controller, cut_short: Situation, budget_s: float) -> float:
     """The shortest possible decision must meet the deadline; returns its time."""
     least_s = needed_s = math.inf
     for _ in range(REHEARSED_DECISIONS):
@@ -275,15 +275,15 @@ def _check_deadline(controller: Controller, cut_short: Situation, deadline_s: fl
         controller.decide(cut_short)
         least_s = min(least_s, clock.monotonic_s() - began_s)
         needed_s = min(needed_s, clock.thread_s() - computed_s)
-    if least_s > deadline_s >= needed_s:
+    if least_s > budget_s >= needed_s:
         raise BusyComputer(
             f"this computer is too busy: a decision needs {1e3 * needed_s:.1f} ms of its processor "
             f"and takes {1e3 * least_s:.1f} ms; close other programs"
         )
-    if least_s > deadline_s:
+    if least_s > budget_s:
         raise DocumentError(
             f"controller: a decision takes at least {1e3 * least_s:.1f} ms here, longer than "
-            f"deadline_s ({1e3 * deadline_s:.1f} ms); plan fewer steps or allow more time"
+            f"deadline_s or period_s ({1e3 * budget_s:.1f} ms); plan fewer steps or allow more time"
         )
     return least_s
 

@@ -84,6 +84,15 @@ def test_a_law_that_other_programs_make_late_may_be_flown_later(
     assert (late.value.is_usage, late.value.code) == (False, 3)
 
 
+def test_a_decision_must_be_ready_within_a_period(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the deadline: a setpoint that is later is not sent."""
+    prepared = build(config.load("flight", assignments=["deadline_s=0.2"], known_vehicle="px4_sih"))
+    for name in ("monotonic_s", "thread_s"):
+        monkeypatch.setattr(clock, name, itertools.count(step=0.15).__next__)
+    with pytest.raises(DocumentError, match=r"at least 150.0 ms here, .* \(100.0 ms\)"):
+        rehearse(prepared, keeps_deadline=True)
+
+
 def test_parameters_are_requested_until_they_are_answered() -> None:
     """Request or reply may be lost on the link."""
     reading, known = ParameterReading(), {"MPC_THR_HOVER": 0.5}
