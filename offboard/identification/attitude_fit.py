@@ -135,7 +135,7 @@ class Axis:
     wanders: bool  # see `ResponseProblem`
 
 
-TILT = Axis("tilt", tilt_signals, 0.004, (0.01, 0.15, 0.15), wanders=False)
+TILT = Axis("tilt", tilt_signals, 0.004, (0.03, 0.15, 0.15), wanders=False)
 YAW = Axis("yaw", yaw_signals, 0.008, (0.04, 0.15, 0.2), wanders=True)
 
 

@@ -39,6 +39,7 @@ from offboard.identification.vehicle_estimate import (
     UNKNOWN_DELAY_S,
     IdentifiedVehicle,
     VehicleEstimate,
+    in_ms,
 )
 from offboard.identification.vehicle_fit import Identified, identify_drag, identify_in_pieces
 from offboard.model.command import Command
@@ -58,7 +59,8 @@ HEADING_S = ((0.0, 1.0),)
 LENGTH_S = 4.0
 TILT_RAD = math.radians(2.0)
 THRUST_SHARE = 0.05
-MOST_ROUNDS = 3  # of steps
+MOST_ROUNDS = 3  # of steps, while the delay that they show has a greater sd than this
+CERTAIN_S = 0.01
 
 LIFTED_OFF_S = 0.5  # after this the ground has no effect on the thrust
 SETTLE_S = 1.0  # after an adoption the observer settles
@@ -286,6 +288,8 @@ class Learner(VehicleEstimate):
         trace = self._flown_since(self._climb_s + LIFTED_OFF_S)
         found = yield from identify_in_pieces(trace, self.file)
         refusal = found.refusals.get("tilt")
+        if found.tilt and found.tilt.delay_s.sd > CERTAIN_S:
+            refusal = f"its delay is uncertain: {in_ms(found.tilt.delay_s)}"
         may_repeat = self._stage is Stage.STEPS and self._rounds < MOST_ROUNDS
         if refusal is not None and may_repeat and not self._left_box:
             self._rounds += 1

@@ -138,7 +138,7 @@ class VehicleEstimate:
         added_s = link.value - DIRECT_LINK_S
         if added_s >= LINK_S:
             self.vehicle = self.vehicle.later_by(added_s)
-            self.sentences.append(f"link delay {_in_ms(link)}, telemetry and setpoint together")
+            self.sentences.append(f"link delay {in_ms(link)}, telemetry and setpoint together")
         self._unknown_s += JUMP_SDS * link.sd
 
     def _on_other_link(self, recalled: IdentifiedVehicle, delay: Estimate, link: Estimate) -> None:
@@ -162,7 +162,7 @@ class VehicleEstimate:
         self._link = link
         change_ms = round(1e3 * link[0])
         of_link = f"has grown by {change_ms} ms" if change_ms > 0 else "is that of take-off"
-        of_tilt = f"is {_in_ms(self.delay)}" if self.delay else "is not identified yet"
+        of_tilt = f"is {in_ms(self.delay)}" if self.delay else "is not identified yet"
         self.cause = f"the link's delay {of_link}, the tilt's {of_tilt}"
 
     def on_hover_thrust(self, hover_thrust: float) -> None:
@@ -242,8 +242,8 @@ class VehicleEstimate:
         if self.delay is None:
             self.cause = f"tilt response not identified, {refusal}"
             return
-        thrust = f", of the thrust with its lag {_in_ms(self._thrust)}" if self._thrust else ""
-        self.cause = f"identified delay, {_in_ms(self.delay)}{thrust}"
+        thrust = f", of the thrust with its lag {in_ms(self._thrust)}" if self._thrust else ""
+        self.cause = f"identified delay, {in_ms(self.delay)}{thrust}"
 
     def _confirmed(self, tilt: ResponseFit, now: Unexplained) -> bool:
         """Whether something besides this fit shows a changed delay: an earlier fit that agrees, or
@@ -258,9 +258,7 @@ class VehicleEstimate:
     def _doubt(self, seen: Estimate, known: Estimate) -> None:
         self._other_delay, self.cause = seen, ""
         self._doubt_s = max(self._doubt_s, abs(seen.value - known.value) + seen.sd)
-        self.sentences.append(
-            f"tilt delay {_in_ms(seen)} contradicts the identified {_in_ms(known)}"
-        )
+        self.sentences.append(f"tilt delay {in_ms(seen)} contradicts the identified {in_ms(known)}")
 
     def on_contradiction(self, now: Unexplained, before: Unexplained, time_s: float) -> None:
         """The tilt does not respond as predicted: its delay may be anything. `now` and `before` are
@@ -289,5 +287,5 @@ def _apart(one: Estimate, other: Estimate) -> bool:
     return abs(one.value - other.value) > allowed_s
 
 
-def _in_ms(delay: Estimate) -> str:
+def in_ms(delay: Estimate) -> str:
     return f"{1e3 * delay.value:.0f} +- {1e3 * delay.sd:.0f} ms"
