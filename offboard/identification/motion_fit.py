@@ -39,9 +39,9 @@ Array = NDArray[np.float64]
 DRAG_SPACING_S = 0.036  # in place of SPACING_S where only the drag is sought
 SPEED_OVER_S = 0.5  # time over which a speed is measured
 RELATED_S = 2.0  # time over which innovations of a wandering estimator are autocorrelated
-# Steps of six seconds hold few such times: rms of the error of delay plus lag / sd, in 40 flights
-# with the errors of PX4's estimator
-FEW_RELATED = 1.5
+# Time constant of the rate at which the estimated position wanders: estimators smooth it. Taken for
+# white, it added 30 ms to the delay of the thrust, as feedback answers it
+WANDER_S = 0.4
 
 DRAG_UPPER_PS = 5.0
 # Least start values of inverse hover thrust, delay (s), lag (s) and drag (1/s): without a lag the
@@ -107,10 +107,10 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """What the filter allows for along an axis. Per root second: wander of the position (PX4:
-    0.013 to 0.030 m), acceleration that is not modelled (m/s) and drift of the disturbance (m/s^2;
-    PX4: tilt error times g, 0.1). Noise of positions (m), and sd of velocity (m/s) and disturbance
-    (m/s^2) at the start."""
+    """What the filter allows for along an axis. Per root second: wander of the position over times
+    longer than WANDER_S (m), acceleration that is not modelled (m/s) and drift of the disturbance
+    (m/s^2; PX4: tilt error times g, 0.1). Noise of positions (m), and sd of velocity (m/s) and
+    disturbance (m/s^2) at the start."""
 
     position: float
     velocity: float
@@ -120,13 +120,14 @@ class Noise:
     start_disturbance: float
 
 
-LATERAL = Noise(0.05, 0.1, 0.08, 0.001, 3.0, 0.5)
+LATERAL = Noise(0.12, 0.1, 0.08, 0.001, 3.0, 0.5)
 # The vertical disturbance is a part of the hover thrust that is sought.
-VERTICAL = Noise(0.05, 0.1, 0.03, 0.001, 3.0, 0.001)
+VERTICAL = Noise(0.12, 0.1, 0.03, 0.001, 3.0, 0.001)
 
 
 class PositionFilter:
-    """Kalman filter of position, velocity and disturbance [p, v, d], with v' = a - drag v + d.
+    """Kalman filter of position, velocity, disturbance and rate of the wander [p, v, d, w], with
+    p' = v + w, v' = a - drag v + d, w' = -w / WANDER_S.
 
     Its gains are those for `drag_ps`, where a search begins; they hardly depend on it. With fixed
     gains the variance of the innovations is fixed too, so their sum of squares is a likelihood.
@@ -134,11 +135,15 @@ class PositionFilter:
 
     def __init__(self, times: Array, drag_ps: float, noise: Noise) -> None:
         self._steps_s = np.diff(times)
-        densities = np.array((noise.position, noise.velocity, noise.disturbance))
+        wander = noise.position / WANDER_S
+        densities = np.array((0.0, noise.velocity, noise.disturbance, wander))
         growth = np.diag(densities**2)
         variance = noise.measured**2
-        covariance = np.diag((variance, noise.start_velocity**2, noise.start_disturbance**2))
-        self._gains = np.empty((len(self._steps_s), 3))
+        start_wander = wander**2 * WANDER_S / 2.0  # as it is in the long run
+        covariance = np.diag(
+            (variance, noise.start_velocity**2, noise.start_disturbance**2, start_wander)
+        )
+        self._gains = np.empty((len(self._steps_s), 4))
         self._sds = np.empty(len(self._steps_s))
         steps = zip(self._steps_s, motion_transitions(self._steps_s, drag_ps), strict=True)
         for i, (step_s, transition) in enumerate(steps):
@@ -154,10 +159,10 @@ class PositionFilter:
         transitions = motion_transitions(self._steps_s, drag_ps)
         mean = 0.5 * (accelerations[:, 1:] + accelerations[:, :-1]).T[:, None]
         # A mean acceleration over a step acts as a disturbance, but does not stay
-        driven = transitions[:, :, 2:] * mean
+        driven = transitions[:, :, 2:3] * mean
         driven[:, 2] = 0.0
-        kept = np.eye(3) - self._gains[:, :, None] * np.array((1.0, 0.0, 0.0))
-        states = np.zeros((len(positions.T), 3, len(positions)))
+        kept = np.eye(4) - self._gains[:, :, None] * np.array((1.0, 0.0, 0.0, 0.0))
+        states = np.zeros((len(positions.T), 4, len(positions)))
         states[0, 0] = positions[:, 0]
         states[1:] = kept @ driven + self._gains[:, :, None] * positions.T[1:, None]
         states = linear_recursion(kept @ transitions, states)
@@ -167,13 +172,16 @@ class PositionFilter:
 
 
 def motion_transitions(steps_s: Array, drag_ps: float) -> Array:
-    """Transitions (N, 3, 3) of [p, v, d] with p' = v, v' = d - drag v, d' = 0 over `steps_s`."""
+    """Transitions (N, 4, 4) of [p, v, d, w] with p' = v + w, v' = d - drag v, d' = 0,
+    w' = -w / WANDER_S over `steps_s`."""
     drag_ps = max(drag_ps, 1e-6)
-    transitions = np.zeros((len(steps_s), 3, 3))
+    transitions = np.zeros((len(steps_s), 4, 4))
     transitions[:, 0, 0] = transitions[:, 2, 2] = 1.0
     transitions[:, 1, 1] = np.exp(-drag_ps * steps_s)
     transitions[:, 0, 1] = transitions[:, 1, 2] = -np.expm1(-drag_ps * steps_s) / drag_ps
     transitions[:, 0, 2] = (steps_s - transitions[:, 0, 1]) / drag_ps
+    transitions[:, 3, 3] = np.exp(-steps_s / WANDER_S)
+    transitions[:, 0, 3] = WANDER_S * (1.0 - transitions[:, 3, 3])
     return transitions
 
 
@@ -249,7 +257,7 @@ def fit_vertical(
     scores_covariance += found.jac[rows:].T @ found.jac[rows:]
     covariance = sandwich(found.jac.T @ found.jac, scores_covariance)
     sd = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
-    effect_sd_s = FEW_RELATED * math.sqrt(max(float(np.sum(covariance[1:3, 1:3])), 0.0))
+    effect_sd_s = math.sqrt(max(float(np.sum(covariance[1:3, 1:3])), 0.0))
     return {
         "hover_thrust": Estimate(1.0 / inverse, sd[0] / inverse**2),
         "thrust_delay_s": Estimate(delay, sd[1]),

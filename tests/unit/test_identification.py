@@ -63,18 +63,21 @@ def test_second_order_response_equals_scipys_simulation(damping):
 
 
 def test_innovations_of_a_matching_motion_are_white_and_of_unit_variance():
-    """Position, speed and disturbance are driven by the densities that the filter assumes."""
+    """Speed, disturbance and the rate of the wander are driven by the densities that the filter
+    assumes."""
     generator = np.random.default_rng(11)
     step_s, count, drag = 0.02, 20000, 0.7
-    densities = np.array([0.02, 0.3, 0.5])
-    drift = expm(np.array([[0.0, 1.0, 0.0], [0.0, -drag, 1.0], [0.0, 0.0, 0.0]]) * step_s)
-    kicks = generator.normal(size=(count, 3)) * densities * math.sqrt(step_s)
-    state, positions = np.zeros(3), np.empty(count)
+    wander, *densities = 0.02, 0.3, 0.5
+    rates = [[0.0, 1.0, 0.0, 1.0], [0.0, -drag, 1.0, 0.0], [0.0] * 4, [0.0, 0.0, 0.0, -2.5]]
+    drift = expm(np.array(rates) * step_s)
+    driven = np.array([0.0, *densities, 2.5 * wander]) * math.sqrt(step_s)
+    kicks = generator.normal(size=(count, 4)) * driven
+    state, positions = np.zeros(4), np.empty(count)
     for i in range(count):
         positions[i] = state[0] + 0.01 * generator.normal()
         state = drift @ state + kicks[i]
     times = step_s * np.arange(count)
-    position_filter = PositionFilter(times, drag, Noise(*densities, 0.01, 1.0, 1.0))
+    position_filter = PositionFilter(times, drag, Noise(wander, *densities, 0.01, 1.0, 1.0))
     white = position_filter.innovations(positions[None], np.zeros((1, count)), drag)[0, 200:]
     assert np.mean(white**2) == pytest.approx(1.0, abs=0.03)
     assert abs(np.mean(white[1:] * white[:-1])) < 0.02
