@@ -1,10 +1,10 @@
-"""Noise of telemetry (R) and drift of the disturbance (Q), estimated from innovations.
+"""Noise of telemetry (R) and drift of the disturbance (Q), estimated in flight.
 
-With the right R and Q innovations are white (R. Mehra, 1970). Innovations that change sign from one
-message to the next show that the measurement is noisier than configured. Innovations correlated
-over a fifth of a second show a disturbance that drifts faster than configured (gusts); the
-estimators of PX4 and ArduCopter drift too, but their innovations are correlated for less. Both
-estimates are slow, bounded, and never below the configured values.
+White noise shows in differences of successive measurements in which motion cancels, whatever the
+filter makes of them. Innovations that are correlated over a fifth of a second (R. Mehra, 1970) show
+a disturbance that drifts faster than configured (gusts); the estimators of PX4 and ArduCopter drift
+too, but their innovations are correlated for less. Both estimates are slow, bounded, and never
+below the configured values.
 """
 
 from __future__ import annotations
@@ -18,19 +18,20 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 NOISE_TIME_S = 3.0
-NOISE_OUTLIER = 25.0  # limit of a single product, in variances
+NOISE_OUTLIER = 25.0  # limit of a single square, in variances
+START_SDS = 0.002, 0.005  # of position (m) and velocity (m/s)
 # Innovations are averaged over SPAN_S and correlated with those two spans earlier.
 SPAN_S, LONGEST_SPAN_S, DRIFT_TIME_S = 0.1, 0.3, 3.0
 CORRELATED = 0.25  # correlation above which the density grows, by e per second for each 1 above
-VISIBLE_M = 5e-5  # smaller innovations do not count
+VISIBLE_M = 1e-5  # smaller innovations do not count
 
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """Q by densities per root second, R by standard deviations. These were flown on PX4 and
-    ArduCopter; half or twice the values made no visible difference. Noise of position and velocity
-    and drift of the disturbance are estimated in flight too, and never less than these; the drift
-    at most `disturbance_limit_mps2`."""
+    """Q by densities per root second, R by standard deviations. Half or twice the values made no
+    visible difference on PX4 and ArduCopter, whose positions have 2e-5 m of white noise. Noise of
+    position and velocity and drift of the disturbance are estimated in flight too, and never less
+    than these; the drift at most `disturbance_limit_mps2`."""
 
     acceleration_mps: float = 0.2
     disturbance_mps2: float = 0.15
@@ -38,7 +39,7 @@ class Noise:
     tilt_radps: float = 0.6
     heading_radps: float = 0.6
     bias_mps: float = 0.08
-    position_sd_m: float = 0.002
+    position_sd_m: float = 0.0001
     velocity_sd_mps: float = 0.005
     attitude_sd_rad: float = 0.001
 
@@ -52,7 +53,7 @@ class NoiseEstimate:
 
     def __init__(self, noise: Noise) -> None:
         self._least = noise.position_sd_m**2, noise.velocity_sd_mps**2
-        self._variances = [0.0, 0.0]
+        self._variances = np.square(START_SDS)
         self.drift_mps2 = np.full(2, noise.disturbance_mps2)
         self._least_drift = noise.disturbance_mps2
         self._drift_limit = max(noise.disturbance_mps2, noise.disturbance_limit_mps2)
@@ -64,31 +65,28 @@ class NoiseEstimate:
     @property
     def variances(self) -> tuple[float, float]:
         """R of position (m^2) and velocity (m^2/s^2)."""
-        (position, velocity), (least_position, least_velocity) = self._variances, self._least
-        return max(position, least_position), max(velocity, least_velocity)
+        position, velocity = self._variances.tolist()
+        return max(position, self._least[0]), max(velocity, self._least[1])
 
     def permit_vertical_drift(self) -> None:
         self._drift_limits[1] = self._drift_limit
 
     def interrupt(self) -> None:
-        """After a jump, a gap or a restart: do not correlate the next innovation with the last."""
+        """After a jump, a gap or a restart: do not compare the next message with the last."""
         self._last_s = self._began_s = -np.inf
-        self._residual: Array | None = None  # of the last message: measured less updated
-        self._change: Array | None = None  # its innovation less the residual before
+        self._measured: Array | None = None  # of the last message
+        self._rates: tuple[Array, float] | None = None  # see `_estimate_noise`
         self._total, self._messages = np.zeros(3), 0  # innovations of position since `_began_s`
         self._means: deque[Array] = deque(maxlen=3)  # of the last spans
 
-    def update(self, time_s: float, innovation: Array, residual: Array) -> None:
-        """Use one message of `time_s`: measured less predicted, and measured less updated position
-        (m) and velocity (m/s), each (6,), NED."""
-        if self._residual is None:
+    def update(self, time_s: float, innovation: Array, measured: Array) -> None:
+        """Use one message of `time_s`: measured less predicted, and measured position (m) and
+        velocity (m/s), each (6,), NED."""
+        if self._measured is None:
             self._began_s = time_s
         else:
-            change = innovation - self._residual
-            if self._change is not None:
-                self._estimate_noise(time_s - self._last_s, change, self._change)
-            self._change = change
-        self._residual, self._last_s = residual, time_s
+            self._estimate_noise(time_s - self._last_s, measured, self._measured)
+        self._measured, self._last_s = measured, time_s
         self._total += innovation[:3]
         self._messages += 1
         span_s = time_s - self._began_s
@@ -99,17 +97,19 @@ class NoiseEstimate:
         if len(self._means) == 3:
             self._estimate_drift(min(span_s, LONGEST_SPAN_S), self._means[2], self._means[0])
 
-    def _estimate_noise(self, interval_s: float, change: Array, before: Array) -> None:
-        """The measured change since the last message less the predicted one is `change`. For white
-        noise of variance s^2, successive changes have the covariance -s^2; for a measurement whose
-        error drifts, they have none."""
-        north, east, down, *velocity = (change * before).tolist()
-        products = (north + east + down) / -3.0, sum(velocity) / -3.0
-        share = min(interval_s / NOISE_TIME_S, 0.1)
-        for kind, (product, variance) in enumerate(zip(products, self.variances, strict=True)):
-            limit = NOISE_OUTLIER * variance
-            product = min(max(product, -limit), limit)
-            self._variances[kind] += share * (product - self._variances[kind])
+    def _estimate_noise(self, interval_s: float, now: Array, before: Array) -> None:
+        """The rates of change from one message to the next, of the position less the mean reported
+        velocity, differ from the rates before by white noise alone, of three messages."""
+        rates = (now - before) / interval_s
+        rates[:3] -= 0.5 * (now[3:] + before[3:])
+        last, self._rates = self._rates, (rates, 1.0 / interval_s)
+        if last is None:
+            return
+        old, new = last[1], 1.0 / interval_s
+        squares = (rates - last[0]) ** 2 / (old**2 + (old + new) ** 2 + new**2)
+        limit = NOISE_OUTLIER * np.array(self.variances)
+        found = np.minimum(squares.reshape(2, 3).mean(axis=1), limit)
+        self._variances += min(interval_s / NOISE_TIME_S, 0.1) * (found - self._variances)
 
     def _estimate_drift(self, span_s: float, now: Array, before: Array) -> None:
         """Update the drift densities from the mean innovations of two spans, (3,) each."""

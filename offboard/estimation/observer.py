@@ -354,8 +354,7 @@ class Observer:
         if jumped:
             estimated.interrupt()
             return
-        residual = measured - H_POSITION @ state
-        estimated.update(self._time_s, innovation, residual)
+        estimated.update(self._time_s, innovation, measured)
         self._densities[DISTURBANCE : DISTURBANCE + 2] = estimated.drift_mps2[0]
         self._densities[DISTURBANCE + 2] = estimated.drift_mps2[1]
 
