@@ -34,9 +34,10 @@ def flying(controller: str, tmp_path: Path, *assignments: str, **options: object
     return make(*assignments, name=str(chosen), **options)
 
 
-@pytest.mark.parametrize("law", sorted({*names()} - {"pso", "autopilot"}))
+@pytest.mark.parametrize("law", sorted({*names()} - {"pso", "lqr", "autopilot"}))
 def test_flies_a_short_lemniscate(law: str, tmp_path: Path) -> None:
-    """`pso` on PX4 is flown by most other tests, `autopilot` by the next one but one."""
+    """`pso` on PX4 is flown by most other tests, `lqr` by test_link_figures, and `autopilot` by the
+    next one but one."""
     pair = flying(law, tmp_path, *SHORT, aloft=True)
     pair.track()
     score = pair.score()

@@ -14,7 +14,6 @@ from typing import Any
 import faults
 import pytest
 from pair import Pair, in_phase
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from watch import HIGH, LANDED, announced, begun_s, copter, flown, px4, sent_after
 
 from offboard.flight.phases import TRACKING, ExitCode, Phase
@@ -242,15 +241,11 @@ def stop_unheard(pair: Pair) -> None:
 
 
 STOPPED = "stop requested by the operator"
-SECOND_VEHICLE = bytes(
-    mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 3, 3).pack(mavlink.MAVLink(None, 9, 1))
-)
 SOON, LATER = {"health_s": 5.0}, {"health_s": 8.0}
 NO_TAKEOFF = Rule("takeoff", result=Result.FAILED)
 REJECTED = r"; the vehicle said: command {} TEMPORARILY_REJECTED; unhealthy by SYS_STATUS: RC_"
 ROWS = {
     "armed by another": flies(whole, at=then(Phase.STREAM, 0.5, arm)),
-    "found in the air": flies(continued_in_the_air, fly=px4.hover),
     # the operator
     "stop before it is heard": refusal(
         STOPPED, nothing_sent, dead=True, at=then(Phase.CONNECT, 0.5, faults.stop)
@@ -271,9 +266,6 @@ ROWS = {
     ),
     # its land detector reports flight before it lifts off
     "stop as it lifts off": ends(STOPPED, landed, at=then(Phase.TAKEOFF, 0.5, faults.stop)),
-    "stop in track": ends(
-        STOPPED, landed, fly=px4.hover, ended_by="operator", at=tracking(faults.stop)
-    ),
     "stop after the pilot has engaged it in the air, before we ask": ends(
         STOPPED, landed, fly=px4.hover, ended_by="operator",
         at=[*then(Phase.STREAM, 0.2, engage), (lambda pair: pair.companion.engaged, faults.stop)],
@@ -316,14 +308,6 @@ ROWS = {
         nothing_sent, firmware=faults.with_default("COM_OF_LOSS_T", 30.0),
         down=faults.without(faults.POSITION),
     ),
-    "parameters not answered": refusal(
-        STOPPED, never_armed, down=faults.without(faults.PARAM_VALUE),
-        at=then(Phase.ENGAGE, 0.0, faults.stop)
-    ),
-    "a second vehicle on the link": refusal(
-        "several vehicles are heard, systems 1 and 9: choose one with --system",
-        nothing_sent, down=lambda _, heard: [*heard, SECOND_VEHICLE] if heard else [], limits=SOON,
-    ),
     "no position": refusal(
         "not ready: no LOCAL_POSITION_NED arrives", says_what_it_waits_for,
         down=faults.without(faults.POSITION), limits=LATER,
@@ -339,9 +323,6 @@ ROWS = {
     "take-off refused": ends(
         ".*no lift-off", stayed_down_without_a_setpoint, fly=copter.hop,
         firmware=replace(ARDUPILOT, rules=(NO_TAKEOFF, *ARDUPILOT.rules)),
-    ),
-    "thrust as climb rate": refusal(
-        ".*param set GUID_OPTIONS 8", nothing_sent, fly=copter.hop, guid_options=0.0
     ),
     # the pilot
     "pilot takes over the landing while a failsafe shows": aborts(
@@ -386,15 +367,9 @@ ROWS = {
         Phase.FAILED, "no telemetry for 1.0 s; disarmed, landing not confirmed: ",
         landing_requested, fly=px4.lap, at=tracking(lost(faults.POSITION, faults.ATTITUDE)),
     ),
-    "attitude stops": in_track(
-        r"no new ATTITUDE_QUATERNION for 0\.", soft_landing,
-        at=tracking(lost(faults.ATTITUDE)),
-    ),
-    "everything stops for 0.8 s": flies(
-        whole, fly=px4.hover, at=tracking(faults.downlink(faults.interrupted(0.8)))
-    ),
-    "upside down": in_track(
-        "tilt 180 deg", soft_landing, at=tracking(faults.downlink(faults.upside_down()))
+    "found in the air, and everything stops for 0.8 s": flies(
+        continued_in_the_air, fly=px4.hover,
+        at=tracking(faults.downlink(faults.interrupted(0.8))),
     ),
     # the law
     "a law that raises": in_track(

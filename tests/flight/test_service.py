@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from faults import restamped
 from pair import STEP_S, decode
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from service_wire import Wire
@@ -419,16 +418,6 @@ def test_a_reboot_between_two_flights(served: Served) -> None:
     assert pair.state.hover.thrust(pair.state.time_s) == pytest.approx(HOVER["px4"], rel=0.05)
     pair.switch("engage")
     pair.until(lambda: pair.phase is Phase.HOVER, 40.0)
-
-
-def test_a_vehicle_that_reboots_in_flight_is_asked_to_land(served: Served) -> None:
-    """ArduCopter's watchdog restarts it in the air, armed and in GUIDED."""
-    pair = served.engaged("ardupilot")
-    pair.run(1.0)
-    booted = restamped(pair.state.time_s - 1.0)
-    pair.down = lambda time_s, datagrams: booted(time_s, pair.deliver(time_s, datagrams))
-    pair.until(lambda: pair.said("the vehicle restarted in flight"), 1.0)
-    pair.until(lambda: pair.mode == "LAND", 1.0)
 
 
 def test_a_vehicle_that_is_not_heard_for_long_is_landed(served: Served) -> None:
