@@ -158,6 +158,19 @@ def now_s(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 # -- the terminal, and signals ---------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("failure", [SystemExit(1), BrokenPipeError()])
+def test_a_closed_terminal_does_not_end_the_flight(tmp_path: Path, failure: BaseException) -> None:
+    shown: list[Any] = []
+
+    def progress(companion: Any) -> None:
+        shown.append(companion)
+        raise failure
+
+    flight = Brief(5)
+    assert fly(flight, tmp_path, progress) == FLOWN
+    assert (flight.turns, len(shown), flight.stops) == (0, 1, 0)
+
+
 @pytest.mark.parametrize(
     ("number", "apart_s", "turns_left"),
     [
