@@ -55,6 +55,8 @@ def test_good_vehicle_over_udp(called: Called, tmp_path: Path) -> None:
     assert wrong.keys() <= OF_THIS_MACHINE, wrong
     assert "autopilot 9/1" in str(rows["senders"])
     assert report["vehicle"] == {"autopilot": "px4", "system_id": 1}
+    assert report["version"] == [1, 16, 1]
+    assert {"level", "found", "hint"} <= rows["gps"]["findings"][0].keys()
     assert report["verdict"].startswith(("ready to fly", "not ready yet: delay"))
     assert report["listened_s"] < 10.5
 
