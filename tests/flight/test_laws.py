@@ -177,7 +177,7 @@ def swapped(change: Callable[[Rotation], Rotation]) -> Pair:
         pytest.param((1, 1, -1), id="roll", marks=pytest.mark.slow),
     ],
 )
-def test_a_swapped_lean_is_stopped(signs: tuple[int, int, int]) -> None:
+def test_a_swapped_tilt_is_stopped(signs: tuple[int, int, int]) -> None:
     pair = swapped(lambda target: Rotation.from_euler("ZYX", target.as_euler("ZYX") * signs))
     outcome = pair.fly()
     assert outcome.exit_code == 4
