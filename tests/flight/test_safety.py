@@ -211,12 +211,16 @@ def test_the_vehicle_does_not_step_with_its_estimate() -> None:
     assert np.linalg.norm(hovered[-1] - hovered[0]) == pytest.approx(1.5, abs=0.1)
 
 
-@pytest.mark.parametrize(("after", "at_s"), [("took_off", 6.0), ("landing", 0.5)])
-def test_resets_of_the_estimate_move_its_place_and_the_ground(after: str, at_s: float) -> None:
-    """By 1.5 m before lift-off: it flew to the old place, 1.5 m away, at once. Then the estimated
+IN_TAKEOFF = jump(1.5, 0.0, 0.4, after="armed", at_s=0.9)
+IN_TRACK = jump(0.0, 0.0, -1.9, after="took_off", at_s=6.0)
+IN_LANDING = jump(0.0, 0.0, -1.9, after="landing", at_s=0.5)
+
+
+@pytest.mark.parametrize("resets", [[IN_TRACK], [IN_TAKEOFF, IN_LANDING]])
+def test_resets_of_the_estimate_move_its_place_and_the_ground(resets: list[dict[str, Any]]) -> None:
+    """By 1.5 m before lift-off: it flew to the old place, 1.5 m away, at once. Later the estimated
     height jumps up, and with it the ground: for the flight and for the score."""
-    first = jump(1.5, 0.0, 0.4, after="armed", at_s=0.3)
-    pair = px4.hop(scenario=scenario_of(first, jump(0.0, 0.0, -1.9, after=after, at_s=at_s)))
+    pair = px4.hop(scenario=scenario_of(*resets))
     watch = flown(pair, ended_by="reference over", top_m=2.2)
     assert max(math.hypot(*m.position_ned_m[:2]) for m in watch.moments) < 0.3
     assert pair.companion.contact.height_m == pytest.approx(0.0, abs=0.1)
