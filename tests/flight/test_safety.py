@@ -171,6 +171,7 @@ def wrongly_disarmed(on: Vehicle, phase: Phase) -> Pair:
 NO_GPS = scenario_of({"fault": "silent_message", "message": "GPS_RAW_INT"})
 NEEDED: dict[str, tuple[Callable[[], Pair], dict[str, Any]]] = {
     "a load that is only believed": (heavy, {"failsafes": ()}),
+    "one wrong heartbeat in track": (partial(wrongly_disarmed, px4, Phase.TRACK), {}),
     "one wrong heartbeat in the take-off": (partial(wrongly_disarmed, copter, Phase.TAKEOFF), {}),
     "one wrong heartbeat in the landing": (partial(wrongly_disarmed, px4, Phase.LAND), {}),
     "no GPS from the beginning, by motion capture": (
