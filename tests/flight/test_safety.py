@@ -63,6 +63,7 @@ def overload(pair: Pair) -> None:
 
 
 GPS_LOST = {"fault": "gps_loss", "after": "engaged", "at_s": 7.0, "drift_mps": 0.45}
+SILENT_GPS = {"fault": "silent_message", "message": "GPS_RAW_INT", "after": "engaged", "at_s": 7.0}
 OTHER = another_companion(after="engaged", at_s=7.0, setpoint_rate_hz=10, thrust=0.5)
 AWAY = "the attitude is [0-9]+ deg away from every recent command"
 NAMED = "; another companion computer, system 1 component 194, may send setpoints, too"
@@ -114,6 +115,11 @@ LANDED_EARLY: dict[str, Any] = {
         lambda: copter.lap(scenario=scenario_of(GPS_LOST)),
         "GPS has no fix for 1.5 s",
         {"error_m": 1.2, "ended_by": "positioning", "soon": (no_fix, 2.0)},
+    ),
+    "GPS is silent": (
+        lambda: px4.lap(firmware=WITH_GPS, scenario=scenario_of(GPS_LOST, SILENT_GPS)),
+        "no GPS_RAW_INT for 2.5 s",
+        {"error_m": 1.6, "ended_by": "positioning", "soon": (no_fix, 3.0)},
     ),
 }  # fmt: skip
 RARE = "another companion that is not heard, on PX4"

@@ -116,6 +116,18 @@ def test_forged_frames_in_flight_change_nothing_and_are_counted(tmp_path: Path) 
     assert KEY not in (tmp_path / "flight.tlog").read_bytes()
 
 
+def test_the_wrong_key_is_named_when_no_vehicle_is_found() -> None:
+    """Within three seconds, and as the result."""
+    pair, says = signed_hover(bytes(32)), "their signature does not match: it is another key's"
+    while pair.time_s < 3.0:
+        pair.advance()
+    assert any(says in sentence for sentence in pair.companion.announced)
+    outcome = pair.fly()
+    assert outcome.exit_code == ExitCode.REFUSED
+    assert says in outcome.sentence
+    assert pair.setpoints == pair.commands(400) == pair.commands(176) == []
+
+
 def test_a_vehicle_that_reboots_with_its_old_stamps_is_heard_again() -> None:
     pair = signed_hover()
     session: Any = pair.companion.session
