@@ -92,7 +92,7 @@ class Bench:
         address, began_s = "udpin:127.0.0.1:14540", clock.monotonic_s()
         return Observation(self.config, listening, address, Path("."), began_s)
 
-    def consult(self, *names: str) -> dict[str, Row]:
+    def check(self, *names: str) -> dict[str, Row]:
         """The rows of a check now, by name."""
         seen = self.listen()
         assert_read_only(self.sent)

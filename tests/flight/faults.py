@@ -150,11 +150,6 @@ def setting(**fields: object) -> Callable[[Any], object]:
     return lambda message: [setattr(message, name, value) for name, value in fields.items()]
 
 
-def upside_down() -> Filter:
-    """A link on which every attitude is a roll by 180 degrees."""
-    return rewritten(setting(q1=0.0, q2=1.0, q3=0.0, q4=0.0), ATTITUDE)
-
-
 def heartbeats(**changed: int) -> Filter:
     """A link on which these fields of every heartbeat have other values."""
     return rewritten(setting(**changed), HEARTBEAT)

@@ -370,12 +370,10 @@ def make(
     return Pair(companion, instance, clock, **options)
 
 
-def on_arducopter(
-    *assignments: str, guid_options: float = 8.0, firmware: Firmware = LEAN_COPTER, **options: Any
-) -> Pair:
+def on_arducopter(*assignments: str, firmware: Firmware = LEAN_COPTER, **options: Any) -> Pair:
     """A flight on ArduCopter, whose start is ten times as fast as the real one's 42 s."""
     pair = make(*assignments, vehicle="arducopter", firmware=firmware, boot_scale=0.1, **options)
-    pair.instance.autopilot.parameters.set("GUID_OPTIONS", guid_options)
+    pair.instance.autopilot.parameters.set("GUID_OPTIONS", 8.0)
     return pair
 
 

@@ -27,12 +27,12 @@ OK, WARN, WAIT, BLOCKS = Level.OK, Level.WARN, Level.WAIT, Level.BLOCKS
 
 @pytest.mark.parametrize("firmware", [PX4, ARDUPILOT], ids=["px4", "ardupilot"])
 def test_nothing_is_said_of_a_good_vehicle(firmware: Firmware) -> None:
-    patient = bench(firmware)
-    began_s = patient.instance.time_s
-    rows = patient.consult()
+    tested = bench(firmware)
+    began_s = tested.instance.time_s
+    rows = tested.check()
     assert said(rows) == {}
     assert len(rows) == 17
-    assert patient.instance.time_s - began_s < 6.0  # 8 s with what comes before and after
+    assert tested.instance.time_s - began_s < 6.0  # 8 s with what comes before and after
 
 
 @pytest.mark.parametrize(
@@ -49,36 +49,36 @@ def test_nothing_is_said_of_a_good_vehicle(firmware: Firmware) -> None:
 def test_line_for_a_parameter_mends_it(
     firmware: Firmware, name: str, value: float, level: Level, line: str
 ) -> None:
-    patient = bench(firmware, parameters={name: value})
-    row = patient.consult("parameters")["parameters"]
+    tested = bench(firmware, parameters={name: value})
+    row = tested.check("parameters")["parameters"]
     assert row.level is level
     assert row.findings[0].hint == line
     assert f"{name} is {value:g}" in row.findings[0].found
     named = f"1 blocks: {name}" if level is BLOCKS else "ready to fly; warnings: "
     assert verdict([row], complete=True).startswith(named)
-    patient.follow(row)
-    assert patient.consult("parameters")["parameters"].level is OK
+    tested.follow(row)
+    assert tested.check("parameters")["parameters"].level is OK
 
 
 @pytest.mark.parametrize("start", [None, Start(height_m=3.0)], ids=["on_the_ground", "armed"])
 def test_a_vehicle_that_falls_silent_is_not_ready_to_fly(start: Start | None) -> None:
-    patient = bench(start=start)
-    heard_until_s = patient.instance.time_s + 2.5
-    patient.down = lambda datagrams: datagrams if patient.instance.time_s < heard_until_s else []
-    rates = patient.consult()["rates"]
+    tested = bench(start=start)
+    heard_until_s = tested.instance.time_s + 2.5
+    tested.down = lambda datagrams: datagrams if tested.instance.time_s < heard_until_s else []
+    rates = tested.check()["rates"]
     assert "no HEARTBEAT arrives" in [finding.found for finding in rates.findings]
     assert not verdict([rates], complete=True).startswith("ready to fly")
 
 
 def test_gps_that_is_lost_waits_and_comes_back() -> None:
-    patient = bench(faults=[{"fault": "gps_loss", "at_s": 0.5, "for_s": 12.0, "drift_mps": 0.1}])
-    rows = patient.consult()
+    tested = bench(faults=[{"fault": "gps_loss", "at_s": 0.5, "for_s": 12.0, "drift_mps": 0.1}])
+    rows = tested.check()
     levels = {name: row.level for name, row in rows.items() if row.level}
     assert levels == {"estimator": WAIT, "gps": WAIT}
     (found, *_) = rows["estimator"].findings
     assert "no valid horizontal velocity, horizontal position" in found.found
-    patient.run_to(15.0)
-    assert said(patient.consult()) == {}
+    tested.run_to(15.0)
+    assert said(tested.check()) == {}
 
 
 @pytest.mark.parametrize(
@@ -89,7 +89,7 @@ def test_gps_that_is_lost_waits_and_comes_back() -> None:
 def test_velocity_that_the_estimator_rejects(firmware: Firmware, text: str, ratio: int) -> None:
     """3 m/s are two of the gates of 1.5 m/s; PX4's ratios are squared."""
     fault = {"fault": "velocity_error", "offset_ned_mps": (3.0, 0.0, 0.0), "for_s": 12.0}
-    rows = bench(firmware, faults=[fault]).consult()
+    rows = bench(firmware, faults=[fault]).check()
     found = {name: (row.level, row.findings[0].found) for name, row in rows.items() if row.level}
     assert found.keys() == {"estimator", "prearm"}
     assert [level for level, _ in found.values()] == [BLOCKS, WAIT]
@@ -100,24 +100,24 @@ def test_velocity_that_the_estimator_rejects(firmware: Firmware, text: str, rati
 
 def test_arducopter_says_itself_why_it_cannot_arm() -> None:
     """Before it has a position; the texts are those of 4.6.3."""
-    patient = bench(ARDUPILOT, faults=[{"fault": "gps_loss", "at_s": 0.1, "for_s": 30.0}])
-    patient.instance.autopilot.commander.switch("GUIDED")
-    patient.run_to(9.0)
-    (finding,) = patient.consult()["prearm"].findings
+    tested = bench(ARDUPILOT, faults=[{"fault": "gps_loss", "at_s": 0.1, "for_s": 30.0}])
+    tested.instance.autopilot.commander.switch("GUIDED")
+    tested.run_to(9.0)
+    (finding,) = tested.check()["prearm"].findings
     assert "do not pass in GUIDED; the vehicle said: PreArm: Need Position" in finding.found
     assert finding.level is WAIT
 
 
 def test_px4_in_offboard_without_setpoints() -> None:
     """It is not blamed on the radio, which nobody needs; `fly` selects the mode that is named."""
-    patient = bench()
-    patient.instance.autopilot.commander.switch("OFFBOARD")
-    (finding,) = patient.consult("prearm")["prearm"].findings
+    tested = bench()
+    tested.instance.autopilot.commander.switch("OFFBOARD")
+    (finding,) = tested.check("prearm")["prearm"].findings
     assert finding.found == "its pre-arm checks pass in OFFBOARD only while setpoints arrive"
     assert finding.hint == "select AUTO.LOITER, as `offboard fly` does first"
     assert finding.level is WARN
-    patient.instance.autopilot.commander.switch("AUTO.LOITER")
-    assert said(patient.consult("prearm")) == {}
+    tested.instance.autopilot.commander.switch("AUTO.LOITER")
+    assert said(tested.check("prearm")) == {}
 
 
 @pytest.mark.parametrize(
@@ -137,24 +137,24 @@ def test_px4_in_offboard_without_setpoints() -> None:
     ],
 )  # fmt: skip
 def test_condition_of_the_vehicle(options: Any, check: str, level: Level, found: str) -> None:
-    rows = bench(**options).consult()
+    rows = bench(**options).check()
     assert said(rows).keys() == {check}
     assert rows[check].level is level
     assert found in rows[check].findings[0].found
 
 
 def test_tilt_limit_of_the_vehicle_that_the_reference_exceeds() -> None:
-    patient = bench(parameters={"MPC_TILTMAX_AIR": 20.0}, choices={"reference": "lemniscate_4mps"})
-    row = patient.consult("configuration")["configuration"]
+    tested = bench(parameters={"MPC_TILTMAX_AIR": 20.0}, choices={"reference": "lemniscate_4mps"})
+    row = tested.check("configuration")["configuration"]
     assert row.level is WARN
-    patient.follow(row)
-    assert patient.consult("configuration")["configuration"].level is OK
+    tested.follow(row)
+    assert tested.check("configuration")["configuration"].level is OK
 
 
 def test_armed_vehicle_is_left_alone() -> None:
     """No rates or pre-arm checks."""
     flying = bench(start=Start(height_m=5.0, mode="AUTO.LOITER"))
-    rows = flying.consult()
+    rows = flying.check()
     kinds = {message.get_type() for message in flying.sent}
     commands = {m.command for m in flying.sent if m.get_type() == "COMMAND_LONG"}
     assert kinds == {"TIMESYNC", "PARAM_REQUEST_READ", "COMMAND_LONG"}

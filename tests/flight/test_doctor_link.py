@@ -72,25 +72,25 @@ def shared_counter(datagrams: Bytes) -> Bytes:
 )  # fmt: skip
 def test_what_is_said_of_a_link(options: Any, check: str, level: Level, found: str) -> None:
     """Others beside the vehicle, and faults."""
-    patient = bench(**options if isinstance(options, dict) else {"before": options})
-    row = patient.consult(check)[check]
+    tested = bench(**options if isinstance(options, dict) else {"before": options})
+    row = tested.check(check)[check]
     assert row.level is level
     assert found in row.findings[0].found
 
 
 def test_nothing_is_heard() -> None:
-    patient = bench(has_vehicle=False)
-    began_s = patient.instance.time_s
-    rows = patient.consult()
-    assert patient.instance.time_s - began_s == pytest.approx(NOTHING_S, abs=0.1)
+    tested = bench(has_vehicle=False)
+    began_s = tested.instance.time_s
+    rows = tested.check()
+    assert tested.instance.time_s - began_s == pytest.approx(NOTHING_S, abs=0.1)
     assert said(rows).keys() == {"vehicle"}
     assert rows["vehicle"].findings[0].found == "nothing is heard in 6 s"
     assert rows["vehicle"].level is BLOCKS
     for hint in ("--connect udpin:0.0.0.0", "-p PORT:PORT/udp", "hostname -I"):
         assert hint in rows["vehicle"].findings[0].hint
-    assert patient.sent == []
-    patient.has_vehicle = True
-    assert said(patient.consult()) == {}
+    assert tested.sent == []
+    tested.has_vehicle = True
+    assert said(tested.check()) == {}
 
 
 @pytest.mark.parametrize(
@@ -104,7 +104,7 @@ def test_nothing_is_heard() -> None:
     ids=["noise", "ground station only", "unknown autopilot", "other component"],
 )
 def test_what_is_heard_is_no_vehicle(before: Any, found: str) -> None:
-    row = bench(has_vehicle=False, before=before).consult()["vehicle"]
+    row = bench(has_vehicle=False, before=before).check()["vehicle"]
     assert row.level is BLOCKS
     assert found in row.findings[0].found
 
@@ -114,74 +114,74 @@ def test_vehicle_whose_signing_time_is_behind_hears_ours_unless_it_is_armed(
     start: Start | None,
 ) -> None:
     """By ten minutes."""
-    patient = bench(signing=Signing(KEY, 100 * 60 * UNITS_PER_S), start=start)
-    patient.instance.keyring.set_up(KEY, 90 * 60 * UNITS_PER_S)
-    rows = patient.consult()
+    tested = bench(signing=Signing(KEY, 100 * 60 * UNITS_PER_S), start=start)
+    tested.instance.keyring.set_up(KEY, 90 * 60 * UNITS_PER_S)
+    rows = tested.check()
     if start is None:
         assert said(rows) == {}
-        assert patient.sent[0].get_type() == "TIMESYNC"
+        assert tested.sent[0].get_type() == "TIMESYNC"
     else:
         assert rows["vehicle"].level is BLOCKS
         assert "their time stamps are too old" in rows["vehicle"].findings[0].found
-        assert patient.sent == []
+        assert tested.sent == []
 
 
 def test_second_vehicle_on_the_link() -> None:
-    patient = bench(before=from_others(AUTOPILOT_HEARTBEAT, 2, 1, 1.0))
-    rows = patient.consult()
+    tested = bench(before=from_others(AUTOPILOT_HEARTBEAT, 2, 1, 1.0))
+    rows = tested.check()
     assert said(rows).keys() == {"senders"}
     several, heard = rows["senders"].findings
     assert several.level is BLOCKS
     assert several.found == "several vehicles are heard, systems 1 and 2: choose one with --system"
     assert heard.found == "besides the vehicle: autopilot 2/1, from 127.0.0.1:14999"
-    patient.system_id = 1
-    assert patient.consult("senders")["senders"].level is OK
+    tested.system_id = 1
+    assert tested.check("senders")["senders"].level is OK
 
 
 def test_delay_is_measured_and_lowers_the_bandwidth() -> None:
-    patient = bench(**link(latency_s=0.2))
-    row = patient.consult("configuration")["configuration"]
+    tested = bench(**link(latency_s=0.2))
+    row = tested.check("configuration")["configuration"]
     assert row.level is WARN
     measured_ms = float(row.findings[0].found.removeprefix("with a delay of ").split()[0])
     assert measured_ms == pytest.approx(400.0, abs=30.0)  # both directions
     possible = row.findings[0].hint.rpartition("=")[2]
     assert 1.0 <= float(possible) < 7.0
     again = bench(**link(latency_s=0.2), assignments=[f"controller.bandwidth_radps={possible}"])
-    assert again.consult("configuration")["configuration"].level is OK
+    assert again.check("configuration")["configuration"].level is OK
 
 
 def test_loss_is_counted() -> None:
-    patient = bench(PX4, **link(loss=0.2, direction="down", for_s=9.0))
-    row = patient.consult("loss")["loss"]
+    tested = bench(PX4, **link(loss=0.2, direction="down", for_s=9.0))
+    row = tested.check("loss")["loss"]
     assert row.level is WARN
     share = float(row.findings[0].found.partition("%")[0])
     assert share == pytest.approx(20.0, abs=3.0)
-    patient.run_to(16.0)
-    assert patient.consult("loss")["loss"].level is OK
+    tested.run_to(16.0)
+    assert tested.check("loss")["loss"].level is OK
 
 
 def test_rates_that_are_too_low_block() -> None:
-    patient = bench(**link(message_rate_hz=5.0, direction="down", for_s=20.0))
-    began_s = patient.instance.time_s
-    row = patient.consult("rates")["rates"]
+    tested = bench(**link(message_rate_hz=5.0, direction="down", for_s=20.0))
+    began_s = tested.instance.time_s
+    row = tested.check("rates")["rates"]
     assert row.level is BLOCKS
     assert "at least 10 Hz are needed" in row.findings[0].found
     assert "MAV_x_RATE" in row.findings[0].hint
-    assert patient.instance.time_s - began_s < LONGEST_S + 1.1  # 15 s with the rest
+    assert tested.instance.time_s - began_s < LONGEST_S + 1.1  # 15 s with the rest
 
 
 def test_line_that_is_too_slow_for_the_telemetry() -> None:
     """What it asks for is thinned to fit; 38400 baud do not carry the least of it."""
-    patient = bench(capacity_bytes_ps=3840.0)
-    row = patient.consult("bandwidth")["bandwidth"]
+    tested = bench(capacity_bytes_ps=3840.0)
+    row = tested.check("bandwidth")["bandwidth"]
     assert row.level is WARN
     assert row.findings[0].hint.split()[-2:] == ["115200", "baud"]
-    patient.capacity_bytes_ps = 11520.0
-    assert patient.consult("bandwidth")["bandwidth"].level is OK
+    tested.capacity_bytes_ps = 11520.0
+    assert tested.check("bandwidth")["bandwidth"].level is OK
 
 
 def test_what_we_send_does_not_arrive() -> None:
-    rows = bench(up=lambda _: []).consult()
+    rows = bench(up=lambda _: []).check()
     assert rows["uplink"].level is BLOCKS
     assert rows["delay"].level is WAIT
     assert rows["parameters"].level is WARN  # PX4 has none that must be answered

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import threading
 import time
@@ -10,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from doctor_bench import bench
+from processes import register
 
 from offboard.doctor import computer, run
 from offboard.doctor.listening import Listening, Observation
@@ -27,11 +27,8 @@ def test_checks_of_other_packages_are_rows_and_broken_ones_too(
     """The one that the README shows; one that cannot be imported; one named as one of ours."""
     (code,) = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
     (tmp_path / "site_checks.py").write_text(code)
-    metadata = tmp_path / "site_checks-1.0.dist-info"
-    metadata.mkdir()
-    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: site_checks\nVersion: 1.0\n")
-    points = "ceiling = site_checks:ceiling\ngone = no_such_module:check\ngps = json:loads\n"
-    (metadata / "entry_points.txt").write_text(f"[{run.GROUP}]\n{points}")
+    checks = {"ceiling": "site_checks:ceiling", "gone": "no_such_module:check", "gps": "json:loads"}
+    register(tmp_path, "site_checks", run.GROUP, **checks)
     monkeypatch.syspath_prepend(tmp_path)
     seen = bench().listen()
     rows = {row.check: row for row in run.examine(run.names(["ceiling", "gone", "gps"]), seen)}
@@ -72,19 +69,3 @@ def test_what_is_wrong_with_this_computer(monkeypatch: pytest.MonkeyPatch) -> No
     found = " ".join(finding.found for finding in rows[-1].findings)
     assert "a decision takes 40.0 ms of 50 ms" in found
     assert "wakes up at most 30.0 ms late" in found
-
-
-def test_report_as_json() -> None:
-    seen = bench(parameters={"COM_OBL_RC_ACT": 0.0}).listen()
-    rows = run.examine(["gps", "parameters"], seen)
-    assert run.worst(rows) is Level.WARN
-    report = json.loads(run.as_json(rows, seen, run.verdict(rows, complete=True)))
-    assert (report["level"], report["verdict"]) == (
-        "warn", "ready to fly; warnings: COM_OBL_RC_ACT"
-    )  # fmt: skip
-    assert report["vehicle"] == {"autopilot": "px4", "system_id": 1}
-    assert report["version"] == [1, 16, 1]
-    assert [row["check"] for row in report["rows"]] == ["gps", "parameters"]
-    (finding, good) = report["rows"][1]["findings"]
-    assert finding["hint"] == "param set COM_OBL_RC_ACT 4"
-    assert (finding["level"], good["level"]) == ("warn", "ok")

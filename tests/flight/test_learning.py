@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from faults import TIMESYNC, without
-from pair import Filter, Pair, in_phase, make
+from faults import TIMESYNC, delivering, without
+from pair import Pair, in_phase, make
 
 from offboard.analysis import history
 from offboard.analysis.identify import identify_flight, vehicle_file
@@ -134,46 +134,12 @@ def test_vehicle_file_that_telemetry_contradicts_ends_the_flight() -> None:
     assert not pair.went_through(Phase.TRACK)
 
 
-def test_bandwidth_that_the_delay_does_not_support_is_limited() -> None:
-    slow = NEUTRAL.model_copy(
-        update={"tilt": NEUTRAL.tilt.model_copy(update={"delay_s": 0.26, "damping": 0.6})}
-    )
-    pair = learning(
-        "controller.bandwidth_radps=10", FIVE_S, reference="hover", flies=slow,
-        settings=IdentifySettings(box_m=5.0),
-    )  # fmt: skip
-    pair.track()
-    (line,) = (line for line in pair.companion.announced if line.startswith(LIMITED))
-    assert "rad/s (configured 10.0): identified delay, 2" in line
-    assert 4.0 < float(line.removeprefix(LIMITED).split()[0]) < 9.0
-
-
-def test_slow_link_is_identified_and_flown() -> None:
-    """100 ms more each way than the vehicle file says; flown with the file it would diverge."""
-    pair = learning(ONE_LAP, flies=TRUE.later_by(0.2), scenario="calm")
-    pair.track()
-    assert pair.score().rmse_position_m < 0.03
-
-
-def delayed(extra_s: Callable[[], float]) -> Filter:
-    """An uplink on which a frame arrives so much later."""
-    waiting: list[tuple[float, bytes]] = []
-
-    def carry(time_s: float, frames: list[bytes]) -> list[bytes]:
-        waiting.extend((time_s + extra_s(), frame) for frame in frames)
-        arrived = [frame for due_s, frame in waiting if due_s <= time_s]
-        waiting[:] = [entry for entry in waiting if entry[0] > time_s]
-        return arrived
-
-    return carry
-
-
 def on_a_link_that_changes(extra_s: Callable[[], float]) -> Pair:
     """Identified at its best, flown at bandwidth 7; two seconds on the path the uplink changes.
     The vehicle does not answer TIMESYNC, so only its motion shows the change."""
     pair = learning(vehicle="px4_sih", seed=1, aloft=False, down=without(TIMESYNC))
-    change = (in_phase(Phase.TRACK, 2.0), lambda flying: setattr(flying, "up", delayed(extra_s)))
-    pair.at.append(change)
+    later = delivering(lambda *_: [extra_s()])
+    pair.at.append((in_phase(Phase.TRACK, 2.0), lambda flying: setattr(flying, "up", later)))
     return pair
 
 
@@ -242,7 +208,7 @@ def test_steps_are_repeated_while_the_delay_is_uncertain() -> None:
     chance = random.Random(3)
     pair = learning("reference.duration_s=1", vehicle="px4_sih", reference="hover",
                     down=without(TIMESYNC))  # fmt: skip
-    late = delayed(lambda: chance.uniform(0.0, 0.3))
+    late = delivering(lambda *_: [chance.uniform(0.0, 0.3)])
     pair.at.append((in_phase(Phase.EXCITE), lambda flying: setattr(flying, "up", late)))
     pair.track()
     sentence = "repeating the steps, tilt not identified: its delay is uncertain: "

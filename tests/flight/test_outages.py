@@ -14,7 +14,7 @@ from watch import aborted, begun_s, flown, said, sent_after
 
 from offboard.flight.phases import Phase
 
-LONG = ("reference.height_m=3.0", "reference.duration_s=15.0")
+LONG = ("reference.height_m=3.0", "reference.duration_s=6.0")
 FALLBACKS = {"px4": 0.0, "px4, which holds": 5.0}  # COM_OBL_RC_ACT: POSCTL, LOITER
 
 

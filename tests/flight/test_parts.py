@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 from faults import PARAM_VALUE, failing, no_direction, raises, without
-from pair import calm_hover, decode, hover
-from watch import begun_s, copter, refused
+from pair import hover
+from watch import copter, refused
 
 from offboard import compiled
 from offboard.compiled import Entry
@@ -148,28 +148,6 @@ def test_the_manifest_is_read_back_or_is_none() -> None:
             assert joined_configuration([*payloads[:2], changed, *payloads[3:]]) is None
     for payloads in ([b"", b"\1"], [b"\0\0\1\0 not compressed"]):
         assert joined_configuration(payloads) is None
-
-
-def test_records_are_not_sent_and_no_sequence_has_a_gap() -> None:
-    """Records have a component id of their own, with its own sequence numbers."""
-    pair = calm_hover()
-    assert {frame[6] for _, _, frame in pair.sent} == {191}
-    assert {frame[6] for frame in pair.logged} == {1, 191, 192}
-    for component in (191, 192):
-        numbers = [frame[4] for frame in pair.logged if frame[6] == component]
-        assert len(numbers) > 50
-        assert numbers == [index % 256 for index in range(len(numbers))]
-    sent = [frame for _, _, frame in pair.sent]
-    assert [frame for frame in pair.logged if frame[6] == 191] == sent
-
-
-def test_the_heartbeat_says_in_which_phase_we_are() -> None:
-    """By which another `offboard` knows that the vehicle is flown."""
-    pair = calm_hover()
-    shown = [(decode(frame).custom_mode, phase) for at_s, phase, frame in pair.sent
-             if frame[7:10] == b"\0\0\0" and at_s > begun_s(pair, phase) + 0.1]  # fmt: skip
-    assert len(shown) > 5
-    assert all(code == phase.code for code, phase in shown)
 
 
 def test_a_message_that_cannot_be_encoded_does_not_stop_the_later_ones() -> None:

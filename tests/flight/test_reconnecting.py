@@ -205,8 +205,8 @@ def test_ipv6_addresses(ends: ExitStack) -> None:
     link.follow(peer)
     link.send(b"answer", peer)
     assert other.recv(100) == b"answer"
-    with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as stranger:
-        stranger.sendto(b"x", ("::1", link.port))
+    with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as third:
+        third.sendto(b"x", ("::1", link.port))
         turns(link, lambda _: link.report.ignored)
     assert "1 datagram from [::1]:" in link.report.news()[0]
     server = ends.enter_context(socket.create_server(("::1", 0), family=socket.AF_INET6))

@@ -30,9 +30,6 @@ from offboard.report.flight import Flight, read
 from offboard.report.panels import thinned
 from offboard.report.report_page import page
 from offboard.report.timeline import bands, marks
-from offboard.run.configuration import load
-from offboard.run.flight import Simulated, fly
-from offboard.run.sitl import InMemorySimulator
 
 RECORDINGS = Path(__file__).parents[1] / "wire" / "recordings"
 ARDUCOPTER = RECORDINGS / "arducopter-4.6.3-guided.tlog"
@@ -76,21 +73,6 @@ def opened(flown: Flown) -> Iterator[Opened]:
     file.write_text(page([flown.flight]), encoding="utf-8")
     with opening(file) as opened:
         yield opened
-
-
-def test_a_table_is_named_by_its_file(tmp_path: Path) -> None:
-    table = tmp_path / "square.csv"
-    rows = ("0,0,0,3", "4,2,0,3", "8,2,2,3", "12,0,2,3")
-    table.write_text("\n".join(("time_s,north_m,east_m,altitude_m", *rows)))
-    config = load("flight", choices={"reference": str(table)}, seed=7)
-    fly(
-        config,
-        tmp_path / "flight",
-        Simulated(scenario="pilot_disarms"),
-        simulator=InMemorySimulator(),
-    )
-    facts = read(tmp_path / "flight").facts
-    assert (facts["reference"], facts["controller"]) == (str(table), "pso")
 
 
 def test_the_page_is_readable_in_both_schemes_and_widths(opened: Opened) -> None:

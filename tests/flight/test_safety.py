@@ -38,7 +38,6 @@ from simulator import config as simulated
 from simulator.firmware.px4 import PX4
 from simulator.start import Start
 
-SLOW = pytest.mark.slow
 WITH_GPS = with_rate(PX4, 50.0, "GPS_RAW_INT", "ESTIMATOR_STATUS")
 TRACKING = in_phase(Phase.TRACK, 1.0)
 
@@ -49,10 +48,9 @@ def another_companion(**fault: Any) -> Any:
     return scenario_of({"fault": "second_sender", **tracks, **fault})
 
 
-def jumping(*offset_ned_m: float, **moment: Any) -> Any:
+def jump(*offset_ned_m: float, after: str = "engaged", at_s: float = 1.5) -> dict[str, Any]:
     """The estimate is reset by so much."""
-    when = {"after": "engaged", "at_s": 1.5} | moment
-    return scenario_of({"fault": "estimator_jump", "offset_ned_m": offset_ned_m, **when})
+    return {"fault": "estimator_jump", "offset_ned_m": offset_ned_m, "after": after, "at_s": at_s}
 
 
 # -- flights that end early ------------------------------------------------------------------------
@@ -90,9 +88,6 @@ LANDED_EARLY: dict[str, Any] = {
         "2 m above and 0 m from the take-off point",
         {"failsafes": ["volume"], "top_m": 3.25},
     ),
-    "an empty battery": (
-        lambda: copter.hover(scenario=early("empty_battery", 0.5)), "the battery holds 5 %", {}
-    ),
     "disarmed, it says, and flies": (
         lambda: px4.hover(at=[(TRACKING, downlink(disarmed()))]), "the vehicle disarmed ", {}
     ),
@@ -112,7 +107,7 @@ LANDED_EARLY: dict[str, Any] = {
         {"error_m": 5.0},
     ),
     "a large jump of the estimate": (
-        lambda: px4.hover(scenario=jumping(0.0, 3.0, 0.0)),
+        lambda: px4.hover(scenario=scenario_of(jump(0.0, 3.0, 0.0))),
         "the estimated position jumped by 3.0 m", {"held_for": "estimator"},
     ),
     # PX4 does not intervene, and ArduCopter late: its estimate drifts away meanwhile
@@ -131,7 +126,8 @@ RARE = "another companion that is not heard, on PX4"
 
 
 @pytest.mark.parametrize(
-    "title", [pytest.param(each, marks=[SLOW] if each == RARE else []) for each in LANDED_EARLY]
+    "title",
+    [pytest.param(each, marks=pytest.mark.slow if each == RARE else []) for each in LANDED_EARLY],
 )
 def test_it_is_landed(title: str) -> None:
     fly, says, more = LANDED_EARLY[title]
@@ -213,7 +209,7 @@ def test_in_the_air_it_never_falls(scenario: str, on: Vehicle) -> None:
 
 def test_the_vehicle_does_not_step_with_its_estimate() -> None:
     """A reset by 1.5 m in a hover: it moves to its place in the new frame at up to 0.5 m/s."""
-    pair = copter.hover("reference.duration_s=8.0", scenario=jumping(0.0, 1.5, 0.0))
+    pair = copter.hover("reference.duration_s=8.0", scenario=scenario_of(jump(0.0, 1.5, 0.0)))
     watch = flown(pair, failsafes=())
     assert said(pair, "the estimated position jumped by 1.50 m: the reference jumps with it")
     hovered = np.array([m.position_ned_m[:2] for m in watch.during(Phase.TRACK, Phase.HOVER)])
@@ -222,20 +218,18 @@ def test_the_vehicle_does_not_step_with_its_estimate() -> None:
     assert np.linalg.norm(hovered[-1] - hovered[0]) == pytest.approx(1.5, abs=0.1)
 
 
-def test_a_reset_of_the_estimate_in_the_take_off_moves_its_place() -> None:
-    """By 1.5 m before lift-off: it flew to the old place, 1.5 m away, at once."""
-    pair = px4.hop(scenario=jumping(1.5, 0.0, 0.4, after="armed", at_s=0.3))
-    watch = flown(pair, top_m=2.2)
+IN_TAKEOFF = jump(1.5, 0.0, 0.4, after="armed", at_s=0.9)
+IN_TRACK = jump(0.0, 0.0, -1.9, after="took_off", at_s=6.0)
+IN_LANDING = jump(0.0, 0.0, -1.9, after="landing", at_s=0.5)
+
+
+@pytest.mark.parametrize("resets", [[IN_TRACK], [IN_TAKEOFF, IN_LANDING]])
+def test_resets_of_the_estimate_move_its_place_and_the_ground(resets: list[dict[str, Any]]) -> None:
+    """By 1.5 m before lift-off: it flew to the old place, 1.5 m away, at once. Later the estimated
+    height jumps up, and with it the ground: for the flight and for the score."""
+    pair = px4.hop(scenario=scenario_of(*resets))
+    watch = flown(pair, ended_by="reference over", top_m=2.2)
     assert max(math.hypot(*m.position_ned_m[:2]) for m in watch.moments) < 0.3
-
-
-@pytest.mark.parametrize(("after", "at_s"), [("took_off", 6.0), ("landing", 0.5)])
-def test_a_landing_is_judged_by_the_ground_where_a_reset_has_moved_it(
-    after: str, at_s: float
-) -> None:
-    """The estimated height jumps up, and with it the ground: for the flight and for the score."""
-    pair = px4.hop(scenario=jumping(0.0, 0.0, -1.9, after=after, at_s=at_s))
-    flown(pair, ended_by="reference over")
     assert pair.companion.contact.height_m == pytest.approx(0.0, abs=0.1)
 
 

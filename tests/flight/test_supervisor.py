@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from processes import RECORDING
 from pymavlink.dialects.v20 import common as mavlink
 
 from offboard.analysis import tlog
@@ -32,7 +33,6 @@ from offboard.supervisor.recovery import Supervised
 from offboard.supervisor.supervisor import Supervisor, SupervisorError
 
 LONG_S = 20.0
-RECORDING = Path(__file__).parents[1] / "wire" / "recordings" / "px4-1.16.1-offboard.tlog"
 OFFBOARD, POSCTL, LANDING = 0x00060000, 0x00030000, 0x06040000  # custom_mode of PX4
 KEY, SIGNED_FROM = bytes(range(32)), 10**12
 VEHICLE = VehicleFound(7, 1, "px4")

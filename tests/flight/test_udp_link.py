@@ -20,17 +20,17 @@ Ends = tuple[UdpLink, socket.socket, socket.socket]
 
 @pytest.fixture
 def ends() -> Iterator[Ends]:
-    """A link that listens, the socket of a vehicle, and that of a stranger."""
+    """A link that listens, the socket of a vehicle, and that of another program."""
     link = open_link(f"udpin:{LOCAL}:0")
     assert isinstance(link, UdpLink)
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other,
     ):
-        for one in (vehicle, stranger):
+        for one in (vehicle, other):
             one.settimeout(5.0)
             one.connect((LOCAL, link.port))
-        yield link, vehicle, stranger
+        yield link, vehicle, other
     link.close()
 
 
@@ -75,13 +75,13 @@ def test_a_clock_that_is_set_does_not_move_arrivals(
 
 
 def test_other_senders_are_counted_and_neither_delay_nor_displace_the_vehicle(ends: Ends) -> None:
-    link, vehicle, stranger = ends
-    stranger.send(b"waits already")
+    link, vehicle, other = ends
+    other.send(b"waits already")
     vehicle.send(b"v1")
     link.follow(vehicle.getsockname())
     vehicle.send(b"v2")
     for _ in range(20_000):  # ten times the buffer
-        stranger.send(bytes(1000))
+        other.send(bytes(1000))
     vehicle.send(b"v3")
     time.sleep(LOOK_EVERY_S)
     heard = [*link.receive(1.0), *link.receive(0.1)]
@@ -94,7 +94,7 @@ def test_other_senders_are_counted_and_neither_delay_nor_displace_the_vehicle(en
         assert set(data(link.receive(1.0))) == {b"v"}
         looks += 1
     assert 64 * 22 > link.report.ignored > 500  # of those that fit into the buffer
-    name = f" from {LOCAL}:{stranger.getsockname()[1]}, which is not the vehicle, "
+    name = f" from {LOCAL}:{other.getsockname()[1]}, which is not the vehicle, "
     assert all(name in sentence for sentence in link.report.news())
     assert link.report.news() == []
 
@@ -118,33 +118,33 @@ def test_frames_reach_the_vehicle_before_and_after_it_is_followed(ends: Ends) ->
 def test_another_port_is_heard_after_a_silence_that_was_observed(
     ends: Ends, now_s: list[float]
 ) -> None:
-    link, vehicle, stranger = ends
+    link, vehicle, other = ends
     link.follow(vehicle.getsockname())
     for _ in range(4):
         now_s[0] += 0.4 * PEER_SILENT_S
         vehicle.send(b"v")
-        stranger.send(b"no")
+        other.send(b"no")
         assert data(link.receive(1.0)) == [b"v"]
     for silent_s, heard in ((0.9, []), (0.2, [b"moved"])):
         now_s[0] += silent_s * PEER_SILENT_S
-        stranger.send(b"moved")
+        other.send(b"moved")
         assert data(link.receive(0.0)) == heard
-    link.follow(stranger.getsockname())
-    vehicle.send(b"a stranger now")
-    stranger.send(b"v")
+    link.follow(other.getsockname())
+    vehicle.send(b"of another now")
+    other.send(b"v")
     assert data(link.receive(1.0)) == [b"v"]
 
 
 def test_our_own_pause_is_no_silence_of_the_vehicle(ends: Ends, now_s: list[float]) -> None:
     """Stopped for 3 s: the vehicle's datagrams wait, but a flood may have dropped the newest."""
-    link, vehicle, stranger = ends
+    link, vehicle, other = ends
     link.follow(vehicle.getsockname())
     vehicle.send(b"v")
     now_s[0] += 3.0
-    stranger.send(b"spoofed")
+    other.send(b"spoofed")
     assert data(link.receive(1.0)) == [b"v"]
     now_s[0] += 0.9 * PEER_SILENT_S
-    stranger.send(b"spoofed")
+    other.send(b"spoofed")
     assert link.receive(0.0) == []
 
 

@@ -85,6 +85,15 @@ def spawning(directory: Path) -> Iterator[Spawn]:
             process.communicate()
 
 
+def register(site: Path, package: str, group: str, **points: str) -> None:
+    """Metadata of an installed package with these entry points."""
+    metadata = site / f"{package}-1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+    lines = "".join(f"{name} = {where}\n" for name, where in points.items())
+    (metadata / "entry_points.txt").write_text(f"[{group}]\n{lines}")
+
+
 def hovering(directory: Path, height_m: float) -> tuple[str, ...]:
     """Options of a simulator whose vehicle hovers at `height_m` when its links open."""
     path = directory / "hovers.yaml"

@@ -37,7 +37,7 @@ def tracking(spawn: Spawn, directory: Path) -> subprocess.Popen[str]:
     raise AssertionError(flight.communicate()[1])
 
 
-def story(log: tlog.Tlog) -> list[str]:
+def take_over(log: tlog.Tlog) -> list[str]:
     """What was asked about the take-over, and that the vehicle disarmed, in order, each once."""
     told: list[str] = []
     for entry in log:
@@ -63,7 +63,7 @@ def test_a_killed_controller_is_survived(spawn: Spawn, tmp_path: Path) -> None:
     )
     assert said.splitlines()[-1] == "offboard supervisor: the vehicle is disarmed"
     log = tlog.read(tmp_path / "x" / "flight.tlog")
-    assert story(log) == ["hold", "land", "disarmed"]
+    assert take_over(log) == ["hold", "land", "disarmed"]
     kept = tmp_path / "x" / "score.json"  # by a process that the supervisor begins
     eventually(kept.exists)
     score = json.loads(kept.read_text())

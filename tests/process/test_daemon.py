@@ -88,22 +88,22 @@ def await_phase(service: subprocess.Popen[str], port: int, *phases: str) -> None
         time.sleep(0.1)
 
 
-def many_strangers(port: int, service: int) -> list[socket.socket]:
+def many_clients(port: int, service: int) -> list[socket.socket]:
     """More connections than a process may have descriptors, which send half a request and wait.
     They stay until the server ends them."""
     for pid in (service, *children(service)):
         resource.prlimit(pid, resource.RLIMIT_NOFILE, (100, 100))
-    strangers = [socket.create_connection(("127.0.0.1", port), timeout=20.0) for _ in range(250)]
-    for stranger in strangers:
+    clients = [socket.create_connection(("127.0.0.1", port), timeout=20.0) for _ in range(250)]
+    for client in clients:
         with suppress(ConnectionError):
-            stranger.send(b"GET /metrics HTTP/1.1\r\nHost:")
-    return strangers
+            client.send(b"GET /metrics HTTP/1.1\r\nHost:")
+    return clients
 
 
 def test_a_pilot_engages_and_a_stop_hands_back(
     spawn: Spawn, called: Called, pilot: Peer, tmp_path: Path
 ) -> None:
-    """In real time over UDP, signed, with monitoring and strangers that use up connections, a
+    """In real time over UDP, signed, with monitoring and clients that use up connections, a
     second service, another vehicle, SIGTERM in flight, and SIGKILL in the next one."""
     create_key(tmp_path / "key")
     key = read_key(tmp_path / "key")
@@ -130,12 +130,12 @@ def test_a_pilot_engages_and_a_stop_hands_back(
           "--gcs", f"udpout:127.0.0.1:{pilot.port}", *hovering(tmp_path, 3.0),
           "--param", "COM_OF_LOSS_T=4")  # fmt: skip
     await_phase(service, web, "standby")
-    strangers = many_strangers(web, service.pid)
+    clients = many_clients(web, service.pid)
     pilot.listen(mode(pilot, HOLDING))
     engage(pilot)
     await_phase(service, web, *ENGAGED)
-    for stranger in strangers:  # all were left or refused before a client was served
-        stranger.close()
+    for client in clients:  # all were left or refused before a later one was served
+        client.close()
     assert scraped(web)["offboard_flights_total"] == 1.0
     scraped_s = time.time()
     while time.time() < scraped_s + 2.0:  # a client that scrapes more than any real one

@@ -9,10 +9,12 @@ import sys
 import threading
 from pathlib import Path
 
+import pytest
 from processes import Called, free_port, signing
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_peer import simulator
 
+from offboard.doctor import listening
 from offboard.documents.signing_key import create_key, read_key
 
 GOOD_PX4 = ("--param", "COM_OBL_RC_ACT=4", "--param", "COM_RCL_EXCEPT=4")
@@ -53,6 +55,8 @@ def test_good_vehicle_over_udp(called: Called, tmp_path: Path) -> None:
     assert wrong.keys() <= OF_THIS_MACHINE, wrong
     assert "autopilot 9/1" in str(rows["senders"])
     assert report["vehicle"] == {"autopilot": "px4", "system_id": 1}
+    assert report["version"] == [1, 16, 1]
+    assert {"level", "found", "hint"} <= rows["gps"]["findings"][0].keys()
     assert report["verdict"].startswith(("ready to fly", "not ready yet: delay"))
     assert report["listened_s"] < 10.5
 
@@ -64,7 +68,8 @@ print(held.getsockname()[1], flush=True)
 sys.stdin.read()"""
 
 
-def test_a_taken_port_names_its_holder(called: Called) -> None:
+def test_a_taken_port_names_its_holder(called: Called, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(listening, "NOTHING_S", 0.1)  # where no vehicle is awaited
     with subprocess.Popen(
         [sys.executable, "-S", "-c", HOLDS],
         stdin=subprocess.PIPE,

@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 from offboard.analysis import history, tlog
 from offboard.cli.commands import app
+from offboard.report.flight import read
 from offboard.run import configuration as config
 from offboard.run.flight import Simulated, fly
 from offboard.run.sitl import InMemorySimulator
@@ -72,3 +73,5 @@ def test_the_log_alone_holds_what_was_flown(flight: Path) -> None:
     assert flown.seed == 7
     track = config.build_track(flown)
     assert track.sample(track.track_start_s).position_ned_m[0] > 0.2
+    facts = read(flight).facts  # the report names the table by its file
+    assert (facts["reference"], facts["controller"]) == (str(flight.parent / "line.csv"), "lqr")

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from processes import register
 
 import offboard.control
 from offboard.analysis import history, tlog
@@ -63,15 +64,6 @@ def test_documented_controller_flies(
         load("flight", choices={"controller": str(tmp_path / "my.yaml")})
 
 
-def registered(site: Path, package: str, **laws: str) -> None:
-    """Metadata of an installed package whose entry points are `laws`."""
-    metadata = site / f"{package}-1.0.dist-info"
-    metadata.mkdir()
-    (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
-    points = "".join(f"{law} = {where}\n" for law, where in laws.items())
-    (metadata / "entry_points.txt").write_text(f"[pso_offboard.controllers]\n{points}")
-
-
 @pytest.mark.parametrize(
     ("law", "says"),
     [
@@ -94,11 +86,12 @@ def test_broken_controller_is_refused_only_when_it_is_asked_for(
     (site / "raising.py").write_text("1 / 0\n")
     (site / "library.py").write_text("def of(value): return 1 / value\n")
     (site / "misusing.py").write_text("import library\n\nlibrary.of(0)\n")
-    registered(
-        site, "first", gone="no_such_module:Law", raises="raising:Law", function="json:loads",
+    laws = "pso_offboard.controllers"
+    register(
+        site, "first", laws, gone="no_such_module:Law", raises="raising:Law", function="json:loads",
         twice="json:loads", pso="no_such_module:Law", misused="misusing:Law",
     )  # fmt: skip
-    registered(site, "second", twice="json:dumps")
+    register(site, "second", laws, twice="json:dumps")
     monkeypatch.syspath_prepend(site)
     with pytest.raises(DocumentError) as refused:
         load("flight", choices={"controller": law})

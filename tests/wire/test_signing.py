@@ -65,7 +65,7 @@ def test_none_of_many_forged_and_replayed_frames_is_accepted() -> None:
     ours, vehicle = paired()
     chance = random.Random(13)
     real = [vehicle.position(1000 + 20 * number) for number in range(50)]
-    stranger, unsigned = signer(OTHER_KEY, stamp=(1 << 48) - 10**6), signer(b"")
+    other, unsigned = signer(OTHER_KEY, stamp=(1 << 48) - 10**6), signer(b"")
     for frame in real:
         assert ours.receive(frame, PEER, 0.1).events
 
@@ -80,7 +80,7 @@ def test_none_of_many_forged_and_replayed_frames_is_accepted() -> None:
 
     forgeries: tuple[Callable[[], bytes], ...] = (
         lambda: chance.choice(real),  # a replay
-        lambda: stranger.position(chance.randrange(2**31)),
+        lambda: other.position(chance.randrange(2**31)),
         lambda: unsigned.position(chance.randrange(2**31)),
         lambda: altered(-12, -6),  # time stamp
         lambda: altered(-13, -12),  # link id: a stream that was never heard
