@@ -11,12 +11,7 @@ import math
 from collections.abc import Mapping
 from enum import Enum
 
-from simulator.autopilot.guidance import (
-    ActiveBehaviour,
-    Control,
-    Guidance,
-    stopping_place_ned_m,
-)
+from simulator.autopilot.guidance import ActiveBehaviour, Guidance, stopping_place_ned_m
 from simulator.autopilot.state import StateEstimate
 from simulator.firmware.values import Behaviour, MotionSetpoint, Triple
 
@@ -212,18 +207,6 @@ class FlyBySticks(ActiveBehaviour):
         )
 
 
-class LevelAtLeastThrottle(ActiveBehaviour):
-    """ArduCopter STABILIZE: level, with the throttle stick down."""
-
-    control = Control.LEVEL
-
-
-class LastDemand(ActiveBehaviour):
-    """PX4 STABILIZED without sticks: the last demand stays in force."""
-
-    control = Control.UNCHANGED
-
-
 class FollowSetpoint(ActiveBehaviour):
     """PX4 OFFBOARD, ArduCopter GUIDED: follow a motion setpoint; hold where there is none. The
     position controller flies an attitude setpoint without asking for a motion."""
@@ -251,7 +234,8 @@ BEHAVIOURS: Mapping[Behaviour, type[ActiveBehaviour]] = {
     Behaviour.RETURN: Return,
     Behaviour.MISSION: FlyMission,
     Behaviour.DESCEND: FlyBySticks,
-    Behaviour.LEVEL: LevelAtLeastThrottle,
-    Behaviour.COAST: LastDemand,
+    # no motion: the position controller flies them
+    Behaviour.LEVEL: ActiveBehaviour,
+    Behaviour.COAST: ActiveBehaviour,
     Behaviour.SETPOINT: FollowSetpoint,
 }

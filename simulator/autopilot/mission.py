@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass, field
 from enum import IntEnum
 
+from offboard.model.frames import wrap_pi
 from simulator.autopilot.state import StateEstimate
 from simulator.firmware.base import Firmware
 from simulator.firmware.values import NAN3, MissionItem, MotionSetpoint, Triple
@@ -229,5 +230,5 @@ class Mission:
         """NaN: face the direction of flight."""
         yaw_deg = item.params[3]
         if item.command in self.firmware.turning_items and math.isfinite(yaw_deg):
-            return math.remainder(math.radians(yaw_deg), 2.0 * math.pi)
+            return wrap_pi(math.radians(yaw_deg))
         return math.nan

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from offboard.model.frames import quaternion_from_euler, wrap_pi
 from simulator.autopilot.state import StateEstimate
 from simulator.firmware.base import PositionGains
 from simulator.firmware.values import NAN3, MotionSetpoint, Quaternion, Triple
@@ -19,7 +20,6 @@ GRAVITY_MPS2 = 9.80665
 # The vertical integral may carry any vehicle; m/s^2 of north, east and down
 _INTEGRAL_MAX_MPS2 = (4.0, 4.0, GRAVITY_MPS2)
 _TILT_COSINE_MIN = 0.1  # least divisor of the thrust
-_TURN_RAD = 2.0 * math.pi
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,14 +183,12 @@ class PositionLoop:
         yaw_rad = self._yaw_demanded(motion, demanded)
         if math.isfinite(yaw_rad):
             most_rad = limits.turn_radps * LOOP_S
-            error_rad = math.remainder(yaw_rad - self.yaw_rad, _TURN_RAD)
+            error_rad = wrap_pi(yaw_rad - self.yaw_rad)
             if abs(error_rad) > most_rad:
-                yaw_rad = self.yaw_rad + math.copysign(most_rad, error_rad)
-                yaw_rad = math.remainder(yaw_rad, _TURN_RAD)
+                yaw_rad = wrap_pi(self.yaw_rad + math.copysign(most_rad, error_rad))
             self.yaw_rad = yaw_rad
         elif math.isfinite(motion.yaw_rate_radps):
-            yaw_rad = self.yaw_rad + motion.yaw_rate_radps * LOOP_S
-            self.yaw_rad = math.remainder(yaw_rad, _TURN_RAD)
+            self.yaw_rad = wrap_pi(self.yaw_rad + motion.yaw_rate_radps * LOOP_S)
 
     def _yaw_demanded(self, motion: MotionSetpoint, demanded: Triple) -> float:
         """The demanded yaw or that of the demanded velocity; not finite: keep the present one."""
@@ -232,14 +230,7 @@ def attitude(direction: Triple, yaw_rad: float) -> Quaternion:
     cos_yaw, sin_yaw = math.cos(yaw_rad), math.sin(yaw_rad)
     forward = cos_yaw * direction[0] + sin_yaw * direction[1]
     right = cos_yaw * direction[1] - sin_yaw * direction[0]
-    half_roll = 0.5 * math.asin(min(1.0, max(-1.0, -right)))
-    half_pitch = 0.5 * math.atan2(forward, direction[2])
-    sr, cr = math.sin(half_roll), math.cos(half_roll)
-    sp, cp = math.sin(half_pitch), math.cos(half_pitch)
-    sy, cy = math.sin(0.5 * yaw_rad), math.cos(0.5 * yaw_rad)
-    return (
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    )
+    roll_rad = math.asin(min(1.0, max(-1.0, -right)))
+    pitch_rad = math.atan2(forward, direction[2])
+    w, x, y, z = quaternion_from_euler(roll_rad, pitch_rad, yaw_rad).tolist()
+    return w, x, y, z

@@ -1,8 +1,8 @@
 """What a firmware consists of: data as fields, and how it reads and answers as methods.
 
 The autopilot and the MAVLink server never ask which firmware they run; they read one `Firmware`.
-`simulator.firmware.px4` and `simulator.firmware.ardupilot` are its two subclasses. Knows no
-autopilot, no message builder and no socket.
+`simulator.firmware.px4` and `simulator.firmware.ardupilot` are its two subclasses. Knows
+the state estimate, but no autopilot, no message builder and no socket.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from simulator.autopilot.state import StateEstimate
 from simulator.firmware.values import (
     Asked,
     AttitudeSetpoint,
     MissionItem,
     Mode,
     MotionSetpoint,
-    Quaternion,
     ReadParameter,
     Result,
     StatusText,
@@ -268,7 +268,7 @@ class Firmware(ABC):
 
     @abstractmethod
     def in_local_frame(
-        self, values: Mapping[str, Any], position_ned_m: Triple, attitude: Quaternion
+        self, values: Mapping[str, Any], estimate: StateEstimate
     ) -> Mapping[str, Any]:
         """Fields of SET_POSITION_TARGET_LOCAL_NED in another frame, as those in MAV_FRAME 1."""
 

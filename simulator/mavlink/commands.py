@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from offboard.model.frames import wrap_pi
 from simulator.autopilot.autopilot import Autopilot
 from simulator.autopilot.commander import Request
 from simulator.autopilot.mission import VERTICAL_SPEEDS
@@ -191,7 +192,7 @@ class Commands:
             from_rad = autopilot.state.estimate.yaw_rad if relative else 0.0
             turn_rad = math.radians(yaw_deg) * (-1.0 if relative and sense < 0 else 1.0)
             turn_radps = math.radians(speed_dps) if speed_dps > 0.0 else math.inf
-            yaw_rad = math.remainder(from_rad + turn_rad, 2.0 * math.pi)
+            yaw_rad = wrap_pi(from_rad + turn_rad)
             autopilot.guidance.turn_to(yaw_rad, turn_radps)
         return result
 
