@@ -277,7 +277,7 @@ def heard(session: Session) -> tuple[Rows, Rows]:
         if session.name == "battery" and kind == "SYS_STATUS":
             plant.set_battery(max(0, message.battery_remaining) / 100)
         elif kind == "PARAM_VALUE" and message.param_id == "SIM_BATT_VOLTAGE":
-            plant.set_battery((message.param_value / plant.pack.battery.cells - 3.5) / 0.7)
+            plant.set_battery((message.param_value / plant.battery.cells - 3.5) / 0.7)
 
     ask_again(session.recording, bench, real, ours, run_on_s=2.0, each=drain)
     return real, ours
