@@ -126,11 +126,11 @@ class Return(ActiveBehaviour):
         guidance, z = self.guidance, estimate.position_ned_m[2]
         home_x, home_y, home_z = guidance.home_ned_m
         role, target_z = guidance.parameters.role, guidance.hold_ned_m[2]
-        height_within_m, wait_s = role("return_height_within_m"), role("return_waits_s")
+        height_within_m, wait_s = role("reached_height_m"), role("return_waits_s")
         if self._stage is Stage.CLIMB and z < target_z + height_within_m:
             guidance.hold = MotionSetpoint((home_x, home_y, target_z))
             self._stage = Stage.FLY
-        if self._stage is Stage.FLY and self._distance_home_m(estimate) < role("return_within_m"):
+        if self._stage is Stage.FLY and self._distance_home_m(estimate) < role("reached_m"):
             target_z = max(target_z, home_z - role("return_descends_to_m"))
             guidance.hold = MotionSetpoint((home_x, home_y, target_z))
             self._stage = Stage.LAND if wait_s == 0.0 else Stage.DESCEND

@@ -306,7 +306,6 @@ ARDUPILOT = ArduCopter(
     first_fix_s=10.2,
     passes_after_s=42.5,
     passes_without_position_after_s=24.0,
-    position_without_fix_s=8.0,
     battery_events=("battery low", "battery critical"),
     landing=Landing(
         low_thrust_share=1.0,

@@ -115,6 +115,7 @@ PARAMETERS = (
     _int16("SYSID_MYGCS", 255, "system id of the ground station"),
     _int16("SYSID_THISMAV", 1, "system id"),
     _real("WPNAV_ACCEL", 250.0, "cm/s^2 across the ground", 1.0),
+    _real("WPNAV_RADIUS", 200.0, "cm, a waypoint is reached", 5.0),
     _real("WPNAV_SPEED", 1000.0, "cm/s of automatic flight", 10.0),
     _real("WPNAV_SPEED_DN", 150.0, "cm/s of descent"),
     _real("WPNAV_SPEED_UP", 250.0, "cm/s of climb"),
@@ -151,8 +152,9 @@ ROLES: dict[str, Role] = {
     "crawl_below_m": -1.0,  # never
     "crawl_speed_mps": 0.0,
     "return_descends_to_m": math.inf,
-    "return_within_m": 1.0,
-    "return_height_within_m": 1.0,
+    "reached_m": ("WPNAV_RADIUS", _CENTI),
+    "reached_height_m": 1.0,
+    "position_without_fix_s": 8.0,
     "return_waits_s": ("RTL_LOIT_TIME", 1e-3),
     "return_settles_s": 1.8,  # brakes and turns before
 }

@@ -229,7 +229,6 @@ class Firmware(ABC):
     passes_after_s: float  # boot until the pre-arm checks pass
     passes_without_position_after_s: float  # the same for modes that need none
     fails_where_unarmable: bool = False  # pre-arm checks fail in a mode that does not arm
-    position_without_fix_s: float  # until the position estimate is lost
     velocity_ratio_squared: bool = False  # as it reports the innovation ratio of the velocity
     battery_events: tuple[str, ...]  # of battery levels 1 on
 

@@ -297,7 +297,6 @@ PX4 = Px4(
     passes_after_s=4.0,
     passes_without_position_after_s=4.0,
     fails_where_unarmable=True,
-    position_without_fix_s=5.0,  # EKF2_NOAID_TOUT
     velocity_ratio_squared=True,
     battery_events=("battery low", "battery critical", "battery emergency"),
     return_faces_way=True,

@@ -302,7 +302,7 @@ def named(name: str, firmware: str) -> Session:
 
 @pytest.mark.parametrize(
     ("name", "firmware", "equal"),
-    [("talk", "ardupilot", 38), ("failsafes", "ardupilot", 33), ("failsafes", "px4", 11)],
+    [("talk", "ardupilot", 39), ("failsafes", "ardupilot", 33), ("failsafes", "px4", 11)],
 )
 def test_parameters_are_told_as_the_real_autopilot_tells_them(
     name: str, firmware: str, equal: int
