@@ -22,10 +22,6 @@ _STILL_MPS = 0.05  # sticks: a slower demand holds the place
 class Hold(ActiveBehaviour):
     """PX4 AUTO.LOITER; ArduCopter BRAKE and CIRCLE: stay, or fly to the place a client named."""
 
-    def keeps_place(self, following: Behaviour) -> bool:
-        """A repeated request does not stop a vehicle that flies to a named place."""
-        return following is Behaviour.HOLD and self.guidance.hold.faces_way
-
 
 class Takeoff(ActiveBehaviour):
     """PX4 AUTO.TAKEOFF; ArduCopter GUIDED after MAV_CMD_NAV_TAKEOFF. Reports "climbed"."""
@@ -149,7 +145,6 @@ class FlyMission(ActiveBehaviour):
     """PX4 AUTO.MISSION; ArduCopter AUTO: the items of `simulator.autopilot.mission`, in order."""
 
     lifts_off = True
-    continues = True
 
     def leave(self) -> None:
         self.guidance.mission.pause()
@@ -212,7 +207,6 @@ class FollowSetpoint(ActiveBehaviour):
     position controller flies an attitude setpoint without asking for a motion."""
 
     lifts_off = True
-    continues = True
 
     def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
         setpoint = self.guidance.newest

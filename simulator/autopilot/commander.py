@@ -11,7 +11,6 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from simulator.autopilot.behaviours import BEHAVIOURS
 from simulator.autopilot.guidance import Guidance
 from simulator.autopilot.health import FlightTime, Health
 from simulator.autopilot.position_controller import PositionController
@@ -189,7 +188,7 @@ class Commander:
                 self._remembered = name
         if mode is not self.mode and not self._firmware.setpoints_outlive_modes:
             self._guidance.newest = None
-        if mode is not self.mode or not BEHAVIOURS[mode.behaviour].continues:
+        if mode is not self.mode or self._event == "takeoff":  # the present mode goes on
             self._controller.enter(mode.behaviour, self._request.takeoff_ned_m)
         self.mode = mode
 
@@ -202,6 +201,7 @@ class Commander:
 
     def _disarm(self) -> None:
         self.armed, self._delayed = False, None
+        self._controller.enter(self.mode.behaviour)  # anew, if it is armed again
 
     def _fail(self) -> None:
         self.failsafe = True

@@ -31,7 +31,6 @@ class ActiveBehaviour:
     """
 
     lifts_off: ClassVar[bool] = False  # may leave the ground
-    continues: ClassVar[bool] = False  # a request for its mode does not start it again
     cannot_climb = False  # a takeoff whose target is not above the vehicle
 
     def __init__(self, guidance: Guidance) -> None:
