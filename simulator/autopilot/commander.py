@@ -251,7 +251,6 @@ CONDITIONS: dict[str, Callable[[Commander], bool]] = {
     "mission missing": lambda c: not c._guidance.mission.flyable,
     "takeoff item missing": lambda c: not c._guidance.mission.takes_off,
     "climb requested": lambda c: c._request.takeoff_ned_m[2] <= c._guidance.home_ned_m[2],
-    "climbing": lambda c: c._guidance.behaviour is Behaviour.TAKEOFF,
     "attitude setpoint": lambda c: c._guidance.follows_attitude,
     "motion setpoint": lambda c: isinstance(c._guidance.setpoint, MotionSetpoint),
     "velocity setpoint": lambda c: c._guidance.follows_velocity,

@@ -279,7 +279,6 @@ RULES = (
     Rule("mission return", "AUTO", do=("return",)),  # within the mode
     Rule("mission finished", when=("landed",), do=("disarm",), texts=(_DISARMING,)),
     Rule("takeoff", "GUIDED", when=("armed", "landed", "climb requested"), do=("take off",)),
-    Rule("takeoff", "GUIDED", when=("armed", "climbing", "climb requested"), do=("take off",)),
     Rule("takeoff", result=_FAILED),
     Rule("climbed", "GUIDED", do=("hold",)),
     Rule("land", to="LAND", send=_HEARTBEAT),

@@ -251,13 +251,12 @@ class Commands:
         return Result.ACCEPTED
 
     def _request_message(self, autopilot: Autopilot, command: Command) -> Result:
-        name = message_name(command.params[0])
-        view, firmware = self.outbox.view, autopilot.firmware
+        return self._send(message_name(command.params[0]))
+
+    def _send(self, name: str | None) -> Result:
+        view, firmware = self.outbox.view, self._autopilot.firmware
         if name not in view.builders or view.withheld(name) or name in firmware.not_on_request:
             return firmware.request_refusal
-        return self._send(name)
-
-    def _send(self, name: str) -> Result:
         self.outbox.send_now(name)
         return Result.ACCEPTED
 

@@ -125,6 +125,7 @@ def test_a_request_of_the_present_mode_changes_nothing_and_disarming_ends_a_take
 
     take_off(2.0)
     assert vehicle.command(176, 1, GUIDED) == [ACCEPTED]
+    assert vehicle.command(22, 0, 0, 0, 0, 0, 0, 9.0) == [FAILED]  # in the air
     vehicle.run(4.0)
     assert vehicle.height_m == pytest.approx(5.0, abs=0.2)
     vehicle.command(176, 1, LAND)
