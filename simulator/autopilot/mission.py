@@ -18,7 +18,6 @@ from simulator.firmware.values import NAN3, MissionItem, MotionSetpoint, Triple
 from simulator.geodesy import down_m, to_metres
 
 ITEMS_MAX = 500
-VERTICAL_SPEEDS = (2.0, 3.0)  # SPEED_TYPE: climb, descent
 
 
 class Kind(IntEnum):
@@ -166,7 +165,7 @@ class Mission:
             item = self.items[self.current]
             if item.command in _PLACES or item.command == Kind.DELAY:
                 return
-            vertical = self.firmware.vertical_speeds and item.params[0] in VERTICAL_SPEEDS
+            vertical = item.params[0] in self.firmware.vertical_speeds
             if item.command == Kind.CHANGE_SPEED and item.params[1] > 0 and not vertical:
                 self.speed_mps = item.params[1]
             if item.command == Kind.RETURN:

@@ -253,7 +253,7 @@ ARDUPILOT = ArduCopter(
     takeoff_above_home=True,
     reposition_mode="GUIDED",
     strict_places=True,
-    vertical_speeds=True,
+    vertical_speeds=(2.0, 3.0),
     empty_refusal=Result.FAILED,
     command_answers={
         **dict.fromkeys(_TAKEN, Result.ACCEPTED),

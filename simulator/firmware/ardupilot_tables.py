@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 
-from simulator.firmware.base import ParameterSpec, Role, Rule
+from simulator.firmware.base import RANGES, ParameterSpec, Role, Rule
 from simulator.firmware.values import Behaviour, Mode, Result, StatusText, critical, info, warning
 
 # MAV_MODE_FLAG: 1 custom mode, 8 guided, 16 stabilise, 64 manual input. "Guided" shows whether
@@ -52,15 +52,15 @@ def _real(name: str, default: float, meaning: str, least: float = -3.4e38) -> Pa
 
 
 def _int8(name: str, default: int, meaning: str) -> ParameterSpec:
-    return ParameterSpec(name, "int8", default, -128, 127, meaning)
+    return ParameterSpec(name, "int8", default, *RANGES["int8"], meaning)
 
 
 def _int16(name: str, default: int, meaning: str) -> ParameterSpec:
-    return ParameterSpec(name, "int16", default, -32768, 32767, meaning)
+    return ParameterSpec(name, "int16", default, *RANGES["int16"], meaning)
 
 
 def _int32(name: str, default: int, meaning: str) -> ParameterSpec:
-    return ParameterSpec(name, "int32", default, -(2**31), 2**31 - 1, meaning)
+    return ParameterSpec(name, "int32", default, *RANGES["int32"], meaning)
 
 
 PARAMETERS = (

@@ -32,6 +32,10 @@ Role = str | float | tuple[str, float]
 """Where a value comes from: a parameter, a constant, or a parameter and the factor to SI."""
 
 
+RANGES = {"int8": (-128, 127), "int16": (-32768, 32767), "int32": (-(2**31), 2**31 - 1)}
+"""Of each kind of whole parameter."""
+
+
 @dataclass(frozen=True, slots=True)
 class ParameterSpec:
     """One parameter. PARAM_SET may set any value; the vehicle obeys [minimum, maximum]."""
@@ -167,7 +171,7 @@ class Firmware(ABC):
     # needs a height above home; MAV_CMD_MISSION_START names no item
     strict_places: bool = False
     empty_refusal: Result  # of a MAV_CMD_DO_CHANGE_SPEED without a speed, an interval of no message
-    vertical_speeds: bool = False  # SPEED_TYPE 2 and 3 are climb and descent, else across as any
+    vertical_speeds: tuple[float, ...] = ()  # SPEED_TYPE of climb and descent; others are across
     no_interval_us: int = -1  # MESSAGE_INTERVAL of a message that is not streamed
     # MAV_CMD acknowledged and not carried out: result, None: no acknowledgement. Any other command
     # without a handler is UNSUPPORTED

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from offboard.model.frames import wrap_pi
 from simulator.autopilot.autopilot import Autopilot
 from simulator.autopilot.commander import Request
-from simulator.autopilot.mission import VERTICAL_SPEEDS
 from simulator.firmware.values import Asked, Behaviour, Result, Triple, info
 from simulator.geodesy import down_m, to_metres
 from simulator.mavlink.codec import id_of, name_of
@@ -175,8 +174,7 @@ class Commands:
         A speed that is not positive restores the default.
         """
         kind, speed_mps = command.params[:2]
-        vertical = autopilot.firmware.vertical_speeds and kind in VERTICAL_SPEEDS
-        if speed_mps > 0.0 and vertical:
+        if speed_mps > 0.0 and kind in autopilot.firmware.vertical_speeds:
             return Result.ACCEPTED
         known = 0.0 < speed_mps < math.inf
         autopilot.guidance.cruise_mps = speed_mps if known else math.inf
