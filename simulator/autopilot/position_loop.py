@@ -117,7 +117,7 @@ class PositionLoop:
     ) -> Triple:
         gains = self.gains
         north, east, down = demanded
-        speed = horizontal(_or_zero(north), _or_zero(east))
+        speed = math.hypot(_or_zero(north), _or_zero(east))
         most = min(limits.across_mps, gains.speed_xy_mps)
         if limits.smooth:
             most = min(most, self._smooth_mps(speed, motion, velocity))
@@ -137,7 +137,7 @@ class PositionLoop:
         way to a place, the speed from which it can brake: v^2 = 2 a d, d = speed / gain."""
         before_mps = self._across_mps
         if math.isnan(before_mps):
-            before_mps = horizontal(velocity[0], velocity[1])
+            before_mps = math.hypot(velocity[0], velocity[1])
         most = before_mps + self.gains.speeding_mps2 * LOOP_S
         gain_ps = self.gains.position_xy_ps
         if math.isnan(motion.velocity_ned_mps[0]) and gain_ps > 0.0:
@@ -194,7 +194,7 @@ class PositionLoop:
         """The demanded yaw or that of the demanded velocity; not finite: keep the present one."""
         if math.isfinite(motion.yaw_rad) or not motion.faces_way:
             return motion.yaw_rad
-        if not horizontal(demanded[0], demanded[1]) > self.gains.facing_mps:
+        if not math.hypot(demanded[0], demanded[1]) > self.gains.facing_mps:
             return math.nan
         return math.atan2(demanded[1], demanded[0])
 
@@ -203,16 +203,11 @@ def _or_zero(value: float) -> float:
     return 0.0 if math.isnan(value) else value
 
 
-def horizontal(north: float, east: float) -> float:
-    """Length of a horizontal vector."""
-    return abs(complex(north, east))
-
-
 def thrust_direction(acceleration_ned_mps2: Triple, tilt_max_rad: float) -> Triple:
     """Third body axis (unit, NED) for this horizontal acceleration in hover, within the tilt
     limit; the thrust makes the vertical acceleration."""
     north, east, _ = acceleration_ned_mps2
-    lateral = horizontal(north, east)
+    lateral = math.hypot(north, east)
     lateral_max = GRAVITY_MPS2 * math.tan(tilt_max_rad)
     scale = lateral_max / lateral if lateral > lateral_max else 1.0
     north, east = -north * scale, -east * scale
