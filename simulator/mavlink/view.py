@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from offboard.model.frames import rotation_from_quaternion
 from simulator.autopilot.autopilot import Autopilot
 from simulator.autopilot.position_loop import GRAVITY_MPS2
 from simulator.firmware.values import Triple
@@ -100,18 +101,12 @@ class View:
 
     @property
     def specific_force(self) -> Triple:
-        """True specific force, FRD, m/s^2: v + 2 r x (r x v - w v) with the quaternion (w, r)."""
+        """True specific force, FRD, m/s^2."""
         truth = self.autopilot.state.truth
-        w, x, y, z = truth.attitude.tolist()
         north, east, down = truth.acceleration_ned_mps2.tolist()
-        down -= GRAVITY_MPS2
-        a, b, c = y * down - z * east, z * north - x * down, x * east - y * north
-        a, b, c = a - w * north, b - w * east, c - w * down
-        return (
-            north + 2.0 * (y * c - z * b),
-            east + 2.0 * (z * a - x * c),
-            down + 2.0 * (x * b - y * a),
-        )
+        force_ned = (north, east, down - GRAVITY_MPS2)
+        forward, right, down = (force_ned @ rotation_from_quaternion(truth.attitude)).tolist()
+        return forward, right, down
 
     @property
     def landed_state(self) -> int:
