@@ -124,7 +124,8 @@ class Commander:
         return rule.result
 
     def switch(self, mode: str, *, by_failsafe: bool = False) -> None:
-        """Enter a mode that no command may request: by a pilot's switch, or by a failsafe."""
+        """Enter a mode anew, also one that no command may request: by a pilot's switch, or by a
+        failsafe."""
         self._event, self._request = "", NO_REQUEST
         self._enter(mode, by_failsafe=by_failsafe)
         self.failsafe = by_failsafe
@@ -188,7 +189,7 @@ class Commander:
                 self._remembered = name
         if mode is not self.mode and not self._firmware.setpoints_outlive_modes:
             self._guidance.newest = None
-        if mode is not self.mode or self._event == "takeoff":  # the present mode goes on
+        if mode is not self.mode or self._event in ("takeoff", ""):  # else the present one goes on
             self._controller.enter(mode.behaviour, self._request.takeoff_ned_m)
         self.mode = mode
 

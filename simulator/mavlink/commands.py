@@ -243,8 +243,8 @@ class Commands:
             unknown = int(number) & 0xFFFF if math.isfinite(number) else 0
             self.outbox.send("MESSAGE_INTERVAL", unknown, 0)
             return firmware.empty_refusal
-        streamed = name in self.schedule.streams
-        interval_us = self.schedule.interval_us(name) if streamed else firmware.no_interval_us
+        stream = self.schedule.streams.get(name)
+        interval_us = firmware.no_interval_us if stream is None else stream.interval_us
         self.outbox.send("MESSAGE_INTERVAL", id_of(name), interval_us)
         return Result.ACCEPTED
 

@@ -14,11 +14,10 @@ from offboard.compiled import entry, kernel
 from offboard.model.rigid_body import QUATERNION, RK4_SCRATCH_ROWS
 from simulator.vehicle.airframe import ROTOR_SIZE, advance_airframe
 from simulator.vehicle.attitude import ROW_WIDTH, angular_acceleration, delayed_thrust
-from simulator.vehicle.noise import advance_block, fill_normals
+from simulator.vehicle.noise import advance_process, fill_normals
 from simulator.vehicle.sensors import (
     AXIS_STRIDE,
     EAST,
-    ERROR_BLOCKS,
     ERROR_COUNT,
     NORTH,
     REPORT_WIDTH,
@@ -156,11 +155,9 @@ def _move_air(plant: Any, step: int) -> None:
     gust, air, wind = plant.gust, plant.air, plant.wind
     if plant.gusty:
         fill_normals(plant.seed, _GUST_LANE, step, plant.gust_normals[:])
-        advance_block(
+        advance_process(
             plant.gust_transition[:],
             plant.gust_scale[:],
-            0,
-            GUST_COUNT,
             1.0,
             plant.gust_normals[:],
             gust[:],
@@ -185,15 +182,11 @@ def _control_attitude(plant: Any, step: int) -> None:
 def _move_errors(plant: Any, step: int) -> None:
     """Next errors of the estimator."""
     fill_normals(plant.seed, _ERROR_LANE, step, plant.normals[:])
-    gain = 1.0 if plant.motors_on else STANDING_NOISE
-    for start, end in ERROR_BLOCKS:
-        advance_block(
-            plant.error_transition[:],
-            plant.error_scale[:],
-            start,
-            end,
-            gain,
-            plant.normals[:],
-            plant.error[:],
-            plant.work[:],
-        )
+    advance_process(
+        plant.error_transition[:],
+        plant.error_scale[:],
+        1.0 if plant.motors_on else STANDING_NOISE,
+        plant.normals[:],
+        plant.error[:],
+        plant.work[:],
+    )

@@ -27,7 +27,6 @@ Rows = tuple[tuple[float, ...], ...]
 
 # Order of the error state: north p v b r, east p v b r, down p v r, yaw.
 NORTH, EAST, DOWN, YAW, ERROR_COUNT = 0, 4, 8, 11, 12
-ERROR_BLOCKS = ((NORTH, EAST), (EAST, DOWN), (DOWN, YAW), (YAW, ERROR_COUNT))
 AXIS_STRIDE = 4
 
 WHITE_COUNT = 12  # position, velocity, attitude, rates
@@ -193,12 +192,8 @@ def error_model(name: EstimatorName, white: WhiteNoise) -> ErrorModel:
 
 def error_process(model: ErrorModel, step_s: float) -> LinearProcess:
     """Process of the error state (NORTH, EAST, DOWN, YAW) with steps of `step_s`."""
-    parts = [
-        discretise(*_padded(axis, end - first), step_s)
-        for axis, (first, end) in zip(
-            (model.north, model.east, model.down), ERROR_BLOCKS, strict=False
-        )
-    ]
+    sizes = ((model.north, EAST - NORTH), (model.east, DOWN - EAST), (model.down, YAW - DOWN))
+    parts = [discretise(*_padded(axis, size), step_s) for axis, size in sizes]
     yaw_density = model.yaw_sd_rad * math.sqrt(2.0 / model.yaw_time_s)
     parts.append(discretise([[-1.0 / model.yaw_time_s]], [yaw_density], step_s))
     return block_diagonal(*parts)
