@@ -25,9 +25,11 @@ def wrapped_deg(angle_deg: float) -> float:
     return math.remainder(angle_deg, 360.0) if math.isfinite(angle_deg) else math.nan
 
 
-def east_degrees_per_m(origin: Origin) -> float:
-    """Degrees of longitude per metre to the east, near the origin."""
-    return DEGREES_PER_M / math.cos(math.radians(origin[0]))
+def to_degrees(origin: Origin, north_m: float, east_m: float) -> tuple[float, float]:
+    """Latitude and longitude of a point near the origin."""
+    latitude, longitude, _ = origin
+    east_deg = east_m * (DEGREES_PER_M / math.cos(math.radians(latitude)))
+    return latitude + north_m * DEGREES_PER_M, wrapped_deg(longitude + east_deg)
 
 
 def down_m(height_m: float, frame: int, origin: Origin, home_down_m: float) -> float:

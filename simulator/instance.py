@@ -129,11 +129,6 @@ class Instance:
         sends and clears them."""
         return [] if self._injection is None else self._injection.strangers
 
-    @property
-    def idle(self) -> bool:
-        """Disarmed and on the ground."""
-        return not self.autopilot.commander.armed and self.autopilot.position_controller.landed
-
     def advance(self) -> None:
         """Simulate one step of STEP_S; telemetry waits in the links until `drain`."""
         self.steps += 1

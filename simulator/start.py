@@ -37,7 +37,10 @@ def take_off(autopilot: Autopilot, start: Start) -> None:
     ready_s = autopilot.firmware.passes_after_s * autopilot.health.boot_scale + SETTLE_S
     while autopilot.state.time_s < ready_s:
         autopilot.step()
-    _climb(autopilot, start.height_m)
+    # as a pilot with a ground station does, in a mode in which the firmware takes off
+    autopilot.handle("mode", Request(autopilot.firmware.reposition_mode))
+    autopilot.handle("arm")
+    autopilot.handle("takeoff", Request(takeoff_ned_m=(math.nan, math.nan, -start.height_m)))
     end_s = ready_s + CLIMB_S
     while not (hovers := _hovers(autopilot, start.height_m)) and autopilot.state.time_s < end_s:
         autopilot.step()
@@ -48,17 +51,6 @@ def take_off(autopilot: Autopilot, start: Start) -> None:
     autopilot.commander.switch(named.name, by_failsafe=start.by_failsafe)
     autopilot.commander.texts.clear()
     autopilot.commander.announcements.clear()
-
-
-def _climb(autopilot: Autopilot, height_m: float) -> None:
-    """Arm and begin to climb to a height above the origin, as a pilot with a ground station does.
-
-    A firmware that does not take off in its mode is given the one in which it does.
-    """
-    request = Request(takeoff_ned_m=(math.nan, math.nan, -height_m))
-    autopilot.handle("mode", Request(autopilot.firmware.reposition_mode))
-    autopilot.handle("arm")
-    autopilot.handle("takeoff", request)
 
 
 def _hovers(autopilot: Autopilot, height_m: float) -> bool:

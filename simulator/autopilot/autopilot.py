@@ -46,7 +46,7 @@ class Autopilot:
     ) -> None:
         self.firmware, self.plant = firmware, plant
         self.parameters = parameters or ParameterTable(firmware)
-        self.mission = mission or Mission(firmware)
+        self.mission = mission or Mission(firmware, self.parameters)
         self.state = VehicleState(plant)
         self.stream = SetpointStream(firmware, self.parameters)
         self.guidance = Guidance(firmware, self.parameters, self.mission, BEHAVIOURS)

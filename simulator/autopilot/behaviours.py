@@ -11,12 +11,7 @@ import math
 from collections.abc import Mapping
 from enum import Enum
 
-from simulator.autopilot.guidance import (
-    ActiveBehaviour,
-    Control,
-    Guidance,
-    stopping_place_ned_m,
-)
+from simulator.autopilot.guidance import ActiveBehaviour, Guidance, stopping_place_ned_m
 from simulator.autopilot.state import StateEstimate
 from simulator.firmware.values import Behaviour, MotionSetpoint, Triple
 
@@ -26,10 +21,6 @@ _STILL_MPS = 0.05  # sticks: a slower demand holds the place
 
 class Hold(ActiveBehaviour):
     """PX4 AUTO.LOITER; ArduCopter BRAKE and CIRCLE: stay, or fly to the place a client named."""
-
-    def keeps_place(self, following: Behaviour) -> bool:
-        """A repeated request does not stop a vehicle that flies to a named place."""
-        return following is Behaviour.HOLD and self.guidance.hold.faces_way
 
 
 class Takeoff(ActiveBehaviour):
@@ -131,11 +122,11 @@ class Return(ActiveBehaviour):
         guidance, z = self.guidance, estimate.position_ned_m[2]
         home_x, home_y, home_z = guidance.home_ned_m
         role, target_z = guidance.parameters.role, guidance.hold_ned_m[2]
-        height_within_m, wait_s = role("return_height_within_m"), role("return_waits_s")
+        height_within_m, wait_s = role("reached_height_m"), role("return_waits_s")
         if self._stage is Stage.CLIMB and z < target_z + height_within_m:
             guidance.hold = MotionSetpoint((home_x, home_y, target_z))
             self._stage = Stage.FLY
-        if self._stage is Stage.FLY and self._distance_home_m(estimate) < role("return_within_m"):
+        if self._stage is Stage.FLY and self._distance_home_m(estimate) < role("reached_m"):
             target_z = max(target_z, home_z - role("return_descends_to_m"))
             guidance.hold = MotionSetpoint((home_x, home_y, target_z))
             self._stage = Stage.LAND if wait_s == 0.0 else Stage.DESCEND
@@ -154,7 +145,6 @@ class FlyMission(ActiveBehaviour):
     """PX4 AUTO.MISSION; ArduCopter AUTO: the items of `simulator.autopilot.mission`, in order."""
 
     lifts_off = True
-    continues = True
 
     def leave(self) -> None:
         self.guidance.mission.pause()
@@ -212,24 +202,11 @@ class FlyBySticks(ActiveBehaviour):
         )
 
 
-class LevelAtLeastThrottle(ActiveBehaviour):
-    """ArduCopter STABILIZE: level, with the throttle stick down."""
-
-    control = Control.LEVEL
-
-
-class LastDemand(ActiveBehaviour):
-    """PX4 STABILIZED without sticks: the last demand stays in force."""
-
-    control = Control.UNCHANGED
-
-
 class FollowSetpoint(ActiveBehaviour):
     """PX4 OFFBOARD, ArduCopter GUIDED: follow a motion setpoint; hold where there is none. The
     position controller flies an attitude setpoint without asking for a motion."""
 
     lifts_off = True
-    continues = True
 
     def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
         setpoint = self.guidance.newest
@@ -251,7 +228,8 @@ BEHAVIOURS: Mapping[Behaviour, type[ActiveBehaviour]] = {
     Behaviour.RETURN: Return,
     Behaviour.MISSION: FlyMission,
     Behaviour.DESCEND: FlyBySticks,
-    Behaviour.LEVEL: LevelAtLeastThrottle,
-    Behaviour.COAST: LastDemand,
+    # no motion: the position controller flies them
+    Behaviour.LEVEL: ActiveBehaviour,
+    Behaviour.COAST: ActiveBehaviour,
     Behaviour.SETPOINT: FollowSetpoint,
 }

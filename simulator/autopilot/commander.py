@@ -11,7 +11,6 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from simulator.autopilot.behaviours import BEHAVIOURS
 from simulator.autopilot.guidance import Guidance
 from simulator.autopilot.health import FlightTime, Health
 from simulator.autopilot.position_controller import PositionController
@@ -125,7 +124,8 @@ class Commander:
         return rule.result
 
     def switch(self, mode: str, *, by_failsafe: bool = False) -> None:
-        """Enter a mode that no command may request: by a pilot's switch, or by a failsafe."""
+        """Enter a mode anew, also one that no command may request: by a pilot's switch, or by a
+        failsafe."""
         self._event, self._request = "", NO_REQUEST
         self._enter(mode, by_failsafe=by_failsafe)
         self.failsafe = by_failsafe
@@ -189,7 +189,7 @@ class Commander:
                 self._remembered = name
         if mode is not self.mode and not self._firmware.setpoints_outlive_modes:
             self._guidance.newest = None
-        if mode is not self.mode or not BEHAVIOURS[mode.behaviour].continues:
+        if mode is not self.mode or self._event in ("takeoff", ""):  # else the present one goes on
             self._controller.enter(mode.behaviour, self._request.takeoff_ned_m)
         self.mode = mode
 
@@ -202,6 +202,7 @@ class Commander:
 
     def _disarm(self) -> None:
         self.armed, self._delayed = False, None
+        self._controller.enter(self.mode.behaviour)  # anew, if it is armed again
 
     def _fail(self) -> None:
         self.failsafe = True
@@ -251,7 +252,6 @@ CONDITIONS: dict[str, Callable[[Commander], bool]] = {
     "mission missing": lambda c: not c._guidance.mission.flyable,
     "takeoff item missing": lambda c: not c._guidance.mission.takes_off,
     "climb requested": lambda c: c._request.takeoff_ned_m[2] <= c._guidance.home_ned_m[2],
-    "climbing": lambda c: c._guidance.behaviour is Behaviour.TAKEOFF,
     "attitude setpoint": lambda c: c._guidance.follows_attitude,
     "motion setpoint": lambda c: isinstance(c._guidance.setpoint, MotionSetpoint),
     "velocity setpoint": lambda c: c._guidance.follows_velocity,

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from enum import Enum
 from typing import ClassVar
 
 from simulator.autopilot.mission import Mission
@@ -25,23 +24,13 @@ ORIGIN: Triple = (0.0, 0.0, 0.0)
 Setpoint = AttitudeSetpoint | MotionSetpoint
 
 
-class Control(Enum):
-    """What the position controller does in a behaviour."""
-
-    MOTION = "flies the motion that the behaviour demands"
-    LEVEL = "level attitude at the least throttle of the sticks"
-    UNCHANGED = "the last demand stays in force"
-
-
 class ActiveBehaviour:
     """One behaviour; a new object each time that its mode is entered.
 
     The defaults are those of automatic flight that starts in the air and does not end by itself.
     """
 
-    control: ClassVar[Control] = Control.MOTION
     lifts_off: ClassVar[bool] = False  # may leave the ground
-    continues: ClassVar[bool] = False  # a request for its mode does not start it again
     cannot_climb = False  # a takeoff whose target is not above the vehicle
 
     def __init__(self, guidance: Guidance) -> None:

@@ -95,7 +95,7 @@ class Health:
             self._fix_s = now_s
         yield from self._ground_station(now_s)
         yield from self._battery(now_s, armed, battery)
-        lost = self.without_fix_s(now_s) > self._firmware.position_without_fix_s
+        lost = self.without_fix_s(now_s) > self._parameters.role("position_without_fix_s")
         if lost != self.position_lost:
             self.position_lost = lost
             yield "position lost" if lost else "position found"

@@ -10,14 +10,14 @@ import math
 from dataclasses import dataclass, field
 from enum import IntEnum
 
+from offboard.model.frames import wrap_pi
+from simulator.autopilot.parameters import ParameterTable
 from simulator.autopilot.state import StateEstimate
 from simulator.firmware.base import Firmware
 from simulator.firmware.values import NAN3, MissionItem, MotionSetpoint, Triple
 from simulator.geodesy import down_m, to_metres
 
 ITEMS_MAX = 500
-VERTICAL_SPEEDS = (2.0, 3.0)  # SPEED_TYPE: climb, descent
-_ACCEPTANCE_M, _ACCEPTANCE_HEIGHT_M = 2.0, 0.8  # NAV_ACC_RAD of multicopters, NAV_MC_ALT_RAD
 
 
 class Kind(IntEnum):
@@ -44,6 +44,7 @@ class Mission:
     """Items and progress of one vehicle's mission. The commander takes its `events`."""
 
     firmware: Firmware
+    parameters: ParameterTable
     items: tuple[MissionItem, ...] = ()
     current: int = 0
     reached: int = -1
@@ -76,6 +77,7 @@ class Mission:
     def store(self, items: tuple[MissionItem, ...]) -> None:
         """Replace the items; the mission starts from its beginning."""
         self.items = items
+        self.parameters.set("MIS_TOTAL", len(items))  # which PX4 has not
         self.current, self.reached, self.finished = self.first, -1, False
         self.speed_mps, self._since_s = math.inf, math.nan
 
@@ -110,7 +112,8 @@ class Mission:
             self._begin(estimate.position_ned_m, home_ned_m, landed)
         if not math.isnan(self._climb_down_m):
             self._target_ned_m = (*self._target_ned_m[:2], self._climb_down_m)
-            if estimate.position_ned_m[2] < self._climb_down_m + _ACCEPTANCE_HEIGHT_M:
+            within_m = self.parameters.role("reached_height_m")
+            if estimate.position_ned_m[2] < self._climb_down_m + within_m:
                 self._climb_down_m = math.nan
             return MotionSetpoint(self._target_ned_m)
         self._run_settings()
@@ -162,7 +165,7 @@ class Mission:
             item = self.items[self.current]
             if item.command in _PLACES or item.command == Kind.DELAY:
                 return
-            vertical = self.firmware.vertical_speeds and item.params[0] in VERTICAL_SPEEDS
+            vertical = item.params[0] in self.firmware.vertical_speeds
             if item.command == Kind.CHANGE_SPEED and item.params[1] > 0 and not vertical:
                 self.speed_mps = item.params[1]
             if item.command == Kind.RETURN:
@@ -214,10 +217,11 @@ class Mission:
         if item.command not in _PLACES:
             return True
         has_radius = item.command == Kind.WAYPOINT and item.params[1] > 0
-        radius_m = item.params[1] if has_radius else _ACCEPTANCE_M
+        radius_m = item.params[1] if has_radius else self.parameters.role("reached_m")
         north, east, down = self._target_ned_m
         x, y, z = here_ned_m
-        return math.hypot(x - north, y - east) < radius_m and abs(z - down) < _ACCEPTANCE_HEIGHT_M
+        height_m = self.parameters.role("reached_height_m")
+        return math.hypot(x - north, y - east) < radius_m and abs(z - down) < height_m
 
     def _stay_s(self, item: MissionItem) -> float:
         if item.command in (Kind.LOITER_UNLIMITED, Kind.LAND):
@@ -229,5 +233,5 @@ class Mission:
         """NaN: face the direction of flight."""
         yaw_deg = item.params[3]
         if item.command in self.firmware.turning_items and math.isfinite(yaw_deg):
-            return math.remainder(math.radians(yaw_deg), 2.0 * math.pi)
+            return wrap_pi(math.radians(yaw_deg))
         return math.nan

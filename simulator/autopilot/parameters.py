@@ -10,12 +10,11 @@ import struct
 import zlib
 from collections.abc import Mapping
 
-from simulator.firmware.base import Firmware, ParameterSpec, Role
+from simulator.firmware.base import RANGES, Firmware, ParameterSpec, Role
 
 HASH = "_HASH_CHECK"  # name under which the checksum of all values is read
 MAV_PARAM_TYPE_UINT32 = 5
 MAV_PARAM_TYPE = {"int8": 2, "int16": 4, "int32": 6, "real32": 9}
-RANGES = {"int8": (-128, 127), "int16": (-32768, 32767), "int32": (-(2**31), 2**31 - 1)}
 _FLOAT, _INT, _UNSIGNED = struct.Struct("<f"), struct.Struct("<i"), struct.Struct("<I")
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 from simulator.autopilot.ground import LandDetector, TakeoffRamp
-from simulator.autopilot.guidance import Control, Guidance
+from simulator.autopilot.guidance import Guidance
 from simulator.autopilot.position_loop import Limits, PositionLoop, level
 from simulator.autopilot.state import StateEstimate, VehicleState
 from simulator.firmware.values import NAN3, AttitudeSetpoint, Behaviour, MotionSetpoint, Triple
@@ -93,8 +93,8 @@ class PositionController:
         if self._tuned != self._parameters.changes:
             self._tuned = self._parameters.changes
             self.loop.tune(self._firmware.gains(self._parameters.__getitem__))
-        control = self._guidance.active.control
-        if control is Control.LEVEL:
+        behaviour = self._guidance.behaviour
+        if behaviour is Behaviour.LEVEL:
             thrust = self._parameters.role("stick_thrust_least")
             self._demand(Demand(True, thrust, level(self.loop.yaw_rad)))
         elif setpoint is not None:
@@ -102,7 +102,7 @@ class PositionController:
                 self._control_climb(setpoint.climb_mps, estimate)
             if setpoint.climb_mps is not None or self._boosts_thrust:
                 self._fly_attitude(setpoint)
-        elif control is Control.MOTION:
+        elif behaviour is not Behaviour.COAST:
             self._fly_motion(estimate)
         self._detect_landing(setpoint, estimate)
 

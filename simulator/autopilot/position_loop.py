@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from offboard.model.frames import quaternion_from_euler, wrap_pi
 from simulator.autopilot.state import StateEstimate
 from simulator.firmware.base import PositionGains
 from simulator.firmware.values import NAN3, MotionSetpoint, Quaternion, Triple
@@ -19,7 +20,6 @@ GRAVITY_MPS2 = 9.80665
 # The vertical integral may carry any vehicle; m/s^2 of north, east and down
 _INTEGRAL_MAX_MPS2 = (4.0, 4.0, GRAVITY_MPS2)
 _TILT_COSINE_MIN = 0.1  # least divisor of the thrust
-_TURN_RAD = 2.0 * math.pi
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +117,7 @@ class PositionLoop:
     ) -> Triple:
         gains = self.gains
         north, east, down = demanded
-        speed = horizontal(_or_zero(north), _or_zero(east))
+        speed = math.hypot(_or_zero(north), _or_zero(east))
         most = min(limits.across_mps, gains.speed_xy_mps)
         if limits.smooth:
             most = min(most, self._smooth_mps(speed, motion, velocity))
@@ -137,7 +137,7 @@ class PositionLoop:
         way to a place, the speed from which it can brake: v^2 = 2 a d, d = speed / gain."""
         before_mps = self._across_mps
         if math.isnan(before_mps):
-            before_mps = horizontal(velocity[0], velocity[1])
+            before_mps = math.hypot(velocity[0], velocity[1])
         most = before_mps + self.gains.speeding_mps2 * LOOP_S
         gain_ps = self.gains.position_xy_ps
         if math.isnan(motion.velocity_ned_mps[0]) and gain_ps > 0.0:
@@ -183,20 +183,18 @@ class PositionLoop:
         yaw_rad = self._yaw_demanded(motion, demanded)
         if math.isfinite(yaw_rad):
             most_rad = limits.turn_radps * LOOP_S
-            error_rad = math.remainder(yaw_rad - self.yaw_rad, _TURN_RAD)
+            error_rad = wrap_pi(yaw_rad - self.yaw_rad)
             if abs(error_rad) > most_rad:
-                yaw_rad = self.yaw_rad + math.copysign(most_rad, error_rad)
-                yaw_rad = math.remainder(yaw_rad, _TURN_RAD)
+                yaw_rad = wrap_pi(self.yaw_rad + math.copysign(most_rad, error_rad))
             self.yaw_rad = yaw_rad
         elif math.isfinite(motion.yaw_rate_radps):
-            yaw_rad = self.yaw_rad + motion.yaw_rate_radps * LOOP_S
-            self.yaw_rad = math.remainder(yaw_rad, _TURN_RAD)
+            self.yaw_rad = wrap_pi(self.yaw_rad + motion.yaw_rate_radps * LOOP_S)
 
     def _yaw_demanded(self, motion: MotionSetpoint, demanded: Triple) -> float:
         """The demanded yaw or that of the demanded velocity; not finite: keep the present one."""
         if math.isfinite(motion.yaw_rad) or not motion.faces_way:
             return motion.yaw_rad
-        if not horizontal(demanded[0], demanded[1]) > self.gains.facing_mps:
+        if not math.hypot(demanded[0], demanded[1]) > self.gains.facing_mps:
             return math.nan
         return math.atan2(demanded[1], demanded[0])
 
@@ -205,16 +203,11 @@ def _or_zero(value: float) -> float:
     return 0.0 if math.isnan(value) else value
 
 
-def horizontal(north: float, east: float) -> float:
-    """Length of a horizontal vector."""
-    return abs(complex(north, east))
-
-
 def thrust_direction(acceleration_ned_mps2: Triple, tilt_max_rad: float) -> Triple:
     """Third body axis (unit, NED) for this horizontal acceleration in hover, within the tilt
     limit; the thrust makes the vertical acceleration."""
     north, east, _ = acceleration_ned_mps2
-    lateral = horizontal(north, east)
+    lateral = math.hypot(north, east)
     lateral_max = GRAVITY_MPS2 * math.tan(tilt_max_rad)
     scale = lateral_max / lateral if lateral > lateral_max else 1.0
     north, east = -north * scale, -east * scale
@@ -232,14 +225,7 @@ def attitude(direction: Triple, yaw_rad: float) -> Quaternion:
     cos_yaw, sin_yaw = math.cos(yaw_rad), math.sin(yaw_rad)
     forward = cos_yaw * direction[0] + sin_yaw * direction[1]
     right = cos_yaw * direction[1] - sin_yaw * direction[0]
-    half_roll = 0.5 * math.asin(min(1.0, max(-1.0, -right)))
-    half_pitch = 0.5 * math.atan2(forward, direction[2])
-    sr, cr = math.sin(half_roll), math.cos(half_roll)
-    sp, cp = math.sin(half_pitch), math.cos(half_pitch)
-    sy, cy = math.sin(0.5 * yaw_rad), math.cos(0.5 * yaw_rad)
-    return (
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    )
+    roll_rad = math.asin(min(1.0, max(-1.0, -right)))
+    pitch_rad = math.atan2(forward, direction[2])
+    w, x, y, z = quaternion_from_euler(roll_rad, pitch_rad, yaw_rad).tolist()
+    return w, x, y, z

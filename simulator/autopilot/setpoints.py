@@ -50,7 +50,7 @@ class SetpointStream:
             return firmware.attitude_setpoint(values, self.parameters.__getitem__), None
         frame = values["coordinate_frame"]
         if message == LOCAL:
-            local = firmware.in_local_frame(values, estimate.position_ned_m, estimate.attitude)
+            local = firmware.in_local_frame(values, estimate)
         elif _has_position(values) and frame not in firmware.global_frames:
             return None, firmware.setpoint_rejection(message, frame)
         else:

@@ -14,7 +14,7 @@ KEEP, RELEASE = 65535, 0  # RC_CHANNELS_OVERRIDE: leave this channel, end its ov
 OVERRIDE_S = 3.0  # RC_OVERRIDE_TIME
 _CENTRE_US, _RANGE_US = 1500, 500
 _PERIOD_MIN_S, _PERIOD_MAX_S = 1e-3, 0.1  # between two calls of `demand`
-_DEAD_ZONE_US, _DEAD_ZONE_THROTTLE = 20, 0.2  # RCx_DZ; THR_DZ
+_THROTTLE_DEAD_ZONE_US = 100  # THR_DZ
 Pair = tuple[float, float]
 
 
@@ -65,7 +65,7 @@ class Sticks:
         self._accelerate((cos * forward - sin * right, sin * forward + cos * right), duration_s)
         changes = zip(self._velocity_mps, before, strict=True)
         north, east = ((after - first) / max(duration_s, _PERIOD_MIN_S) for after, first in changes)
-        climb_mps = flight.climb_mps * _throttle_deflection(throttle)
+        climb_mps = flight.climb_mps * _deflection(throttle, _THROTTLE_DEAD_ZONE_US)
         return self._velocity_mps, (north, east), climb_mps, flight.turn_radps * _deflection(yaw)
 
     def _accelerate(self, deflection: Pair, duration_s: float) -> None:
@@ -82,15 +82,8 @@ class Sticks:
         self._velocity_mps = (north, east)
 
 
-def _deflection(pulse_us: int) -> float:
-    """-1 .. 1, with a dead zone."""
+def _deflection(pulse_us: int, dead_zone_us: int = 20) -> float:
+    """-1 .. 1, with a dead zone (RCx_DZ)."""
     offset_us = min(_RANGE_US, max(-_RANGE_US, pulse_us - _CENTRE_US))
-    share = max(0, abs(offset_us) - _DEAD_ZONE_US) / (_RANGE_US - _DEAD_ZONE_US)
+    share = max(0, abs(offset_us) - dead_zone_us) / (_RANGE_US - dead_zone_us)
     return math.copysign(share, offset_us)
-
-
-def _throttle_deflection(pulse_us: int) -> float:
-    """-1 .. 1, with the dead zone of the throttle."""
-    share = min(1.0, max(-1.0, (pulse_us - _CENTRE_US) / _RANGE_US))
-    beyond = max(0.0, abs(share) - _DEAD_ZONE_THROTTLE) / (1.0 - _DEAD_ZONE_THROTTLE)
-    return math.copysign(beyond, share)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Literal
 
@@ -114,17 +113,12 @@ _HEARTBEAT_HZ = 1.0
 _DATAGRAMS_MAX = 2000  # of a stranger, that wait
 
 
-@dataclass(slots=True)
 class Sender:
     """Another sender with its MAVLink ids. `step` counts the steps in which it sends, from 0."""
 
-    system: int
-    component: int
-    step: int = -1
-    _encoder: Encoder = field(init=False)
-
-    def __post_init__(self) -> None:
-        self._encoder = Encoder(self.system, self.component)
+    def __init__(self, system: int, component: int) -> None:
+        self.step = -1
+        self._encoder = Encoder(system, component)
 
     def due(self, rate_hz: float) -> range:
         """As many numbers as messages of this rate are due in this step; the first is at once."""

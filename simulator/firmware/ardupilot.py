@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from simulator.autopilot.state import StateEstimate
 from simulator.firmware import ardupilot_messages as telemetry
 from simulator.firmware.ardupilot_tables import MODES, PARAMETERS, ROLES, RULES
 from simulator.firmware.base import Firmware, Landing, PositionGains, StickFlight
@@ -20,7 +21,6 @@ from simulator.firmware.values import (
     AttitudeSetpoint,
     MissionItem,
     MotionSetpoint,
-    Quaternion,
     ReadParameter,
     Result,
     StatusText,
@@ -159,21 +159,19 @@ class ArduCopter(Firmware):
         return MotionSetpoint(position, velocity, acceleration, yaw, yaw_rate, along)
 
     def in_local_frame(
-        self, values: Mapping[str, Any], position_ned_m: Triple, attitude: Quaternion
+        self, values: Mapping[str, Any], estimate: StateEstimate
     ) -> Mapping[str, Any]:
         """Offset frames are relative to the position; body frames also to the yaw."""
         frame = values["coordinate_frame"]
         if frame not in _OFFSET:
             return values
-        w, x, y, z = attitude
-        yaw_rad = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-        turn_rad = yaw_rad if frame in _BODY else 0.0
+        turn_rad = estimate.yaw_rad if frame in _BODY else 0.0
         cos_yaw, sin_yaw = math.cos(turn_rad), math.sin(turn_rad)
         local = {**values, "coordinate_frame": _LOCAL_NED, "yaw": turn_rad + values["yaw"]}
         for north, east in (("x", "y"), ("vx", "vy"), ("afx", "afy")):
             local[north] = cos_yaw * values[north] - sin_yaw * values[east]
             local[east] = sin_yaw * values[north] + cos_yaw * values[east]
-        for name, here_m in zip("xyz", position_ned_m, strict=True):
+        for name, here_m in zip("xyz", estimate.position_ned_m, strict=True):
             local[name] += here_m
         return local
 
@@ -255,7 +253,7 @@ ARDUPILOT = ArduCopter(
     takeoff_above_home=True,
     reposition_mode="GUIDED",
     strict_places=True,
-    vertical_speeds=True,
+    vertical_speeds=(2.0, 3.0),
     empty_refusal=Result.FAILED,
     command_answers={
         **dict.fromkeys(_TAKEN, Result.ACCEPTED),
@@ -308,7 +306,6 @@ ARDUPILOT = ArduCopter(
     first_fix_s=10.2,
     passes_after_s=42.5,
     passes_without_position_after_s=24.0,
-    position_without_fix_s=8.0,
     battery_events=("battery low", "battery critical"),
     landing=Landing(
         low_thrust_share=1.0,

@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 
-from simulator.firmware.base import ParameterSpec, Role, Rule
+from simulator.firmware.base import RANGES, ParameterSpec, Role, Rule
 from simulator.firmware.values import Behaviour, Mode, Result, StatusText, critical, info, warning
 
 # MAV_MODE_FLAG: 1 custom mode, 8 guided, 16 stabilise, 64 manual input. "Guided" shows whether
@@ -52,15 +52,15 @@ def _real(name: str, default: float, meaning: str, least: float = -3.4e38) -> Pa
 
 
 def _int8(name: str, default: int, meaning: str) -> ParameterSpec:
-    return ParameterSpec(name, "int8", default, -128, 127, meaning)
+    return ParameterSpec(name, "int8", default, *RANGES["int8"], meaning)
 
 
 def _int16(name: str, default: int, meaning: str) -> ParameterSpec:
-    return ParameterSpec(name, "int16", default, -32768, 32767, meaning)
+    return ParameterSpec(name, "int16", default, *RANGES["int16"], meaning)
 
 
 def _int32(name: str, default: int, meaning: str) -> ParameterSpec:
-    return ParameterSpec(name, "int32", default, -(2**31), 2**31 - 1, meaning)
+    return ParameterSpec(name, "int32", default, *RANGES["int32"], meaning)
 
 
 PARAMETERS = (
@@ -115,6 +115,7 @@ PARAMETERS = (
     _int16("SYSID_MYGCS", 255, "system id of the ground station"),
     _int16("SYSID_THISMAV", 1, "system id"),
     _real("WPNAV_ACCEL", 250.0, "cm/s^2 across the ground", 1.0),
+    _real("WPNAV_RADIUS", 200.0, "cm, a waypoint is reached", 5.0),
     _real("WPNAV_SPEED", 1000.0, "cm/s of automatic flight", 10.0),
     _real("WPNAV_SPEED_DN", 150.0, "cm/s of descent"),
     _real("WPNAV_SPEED_UP", 250.0, "cm/s of climb"),
@@ -151,8 +152,9 @@ ROLES: dict[str, Role] = {
     "crawl_below_m": -1.0,  # never
     "crawl_speed_mps": 0.0,
     "return_descends_to_m": math.inf,
-    "return_within_m": 1.0,
-    "return_height_within_m": 1.0,
+    "reached_m": ("WPNAV_RADIUS", _CENTI),
+    "reached_height_m": 1.0,
+    "position_without_fix_s": 8.0,
     "return_waits_s": ("RTL_LOIT_TIME", 1e-3),
     "return_settles_s": 1.8,  # brakes and turns before
 }
@@ -277,7 +279,6 @@ RULES = (
     Rule("mission return", "AUTO", do=("return",)),  # within the mode
     Rule("mission finished", when=("landed",), do=("disarm",), texts=(_DISARMING,)),
     Rule("takeoff", "GUIDED", when=("armed", "landed", "climb requested"), do=("take off",)),
-    Rule("takeoff", "GUIDED", when=("armed", "climbing", "climb requested"), do=("take off",)),
     Rule("takeoff", result=_FAILED),
     Rule("climbed", "GUIDED", do=("hold",)),
     Rule("land", to="LAND", send=_HEARTBEAT),

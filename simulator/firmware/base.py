@@ -1,8 +1,8 @@
 """What a firmware consists of: data as fields, and how it reads and answers as methods.
 
 The autopilot and the MAVLink server never ask which firmware they run; they read one `Firmware`.
-`simulator.firmware.px4` and `simulator.firmware.ardupilot` are its two subclasses. Knows no
-autopilot, no message builder and no socket.
+`simulator.firmware.px4` and `simulator.firmware.ardupilot` are its two subclasses. Knows
+the state estimate, but no autopilot, no message builder and no socket.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from simulator.autopilot.state import StateEstimate
 from simulator.firmware.values import (
     Asked,
     AttitudeSetpoint,
     MissionItem,
     Mode,
     MotionSetpoint,
-    Quaternion,
     ReadParameter,
     Result,
     StatusText,
@@ -30,6 +30,10 @@ from simulator.vehicle.battery import BatteryState
 _MAV_TYPE_GCS = 6
 Role = str | float | tuple[str, float]
 """Where a value comes from: a parameter, a constant, or a parameter and the factor to SI."""
+
+
+RANGES = {"int8": (-128, 127), "int16": (-32768, 32767), "int32": (-(2**31), 2**31 - 1)}
+"""Of each kind of whole parameter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,7 +171,7 @@ class Firmware(ABC):
     # needs a height above home; MAV_CMD_MISSION_START names no item
     strict_places: bool = False
     empty_refusal: Result  # of a MAV_CMD_DO_CHANGE_SPEED without a speed, an interval of no message
-    vertical_speeds: bool = False  # SPEED_TYPE 2 and 3 are climb and descent, else across as any
+    vertical_speeds: tuple[float, ...] = ()  # SPEED_TYPE of climb and descent; others are across
     no_interval_us: int = -1  # MESSAGE_INTERVAL of a message that is not streamed
     # MAV_CMD acknowledged and not carried out: result, None: no acknowledgement. Any other command
     # without a handler is UNSUPPORTED
@@ -229,7 +233,6 @@ class Firmware(ABC):
     passes_after_s: float  # boot until the pre-arm checks pass
     passes_without_position_after_s: float  # the same for modes that need none
     fails_where_unarmable: bool = False  # pre-arm checks fail in a mode that does not arm
-    position_without_fix_s: float  # until the position estimate is lost
     velocity_ratio_squared: bool = False  # as it reports the innovation ratio of the velocity
     battery_events: tuple[str, ...]  # of battery levels 1 on
 
@@ -268,7 +271,7 @@ class Firmware(ABC):
 
     @abstractmethod
     def in_local_frame(
-        self, values: Mapping[str, Any], position_ned_m: Triple, attitude: Quaternion
+        self, values: Mapping[str, Any], estimate: StateEstimate
     ) -> Mapping[str, Any]:
         """Fields of SET_POSITION_TARGET_LOCAL_NED in another frame, as those in MAV_FRAME 1."""
 

@@ -11,9 +11,8 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from offboard.model.frames import rotation_from_quaternion
+from simulator.autopilot.state import StateEstimate
 from simulator.firmware import px4_messages as telemetry
 from simulator.firmware.base import Firmware, Landing, PositionGains
 from simulator.firmware.px4_tables import MODES, PARAMETERS, ROLES, RULES
@@ -22,7 +21,6 @@ from simulator.firmware.values import (
     AttitudeSetpoint,
     MissionItem,
     MotionSetpoint,
-    Quaternion,
     ReadParameter,
     Result,
     StatusText,
@@ -152,7 +150,7 @@ class Px4(Firmware):
         )
 
     def in_local_frame(
-        self, values: Mapping[str, Any], position_ned_m: Triple, attitude: Quaternion
+        self, values: Mapping[str, Any], estimate: StateEstimate
     ) -> Mapping[str, Any]:
         """BODY_NED: velocity rotated by yaw, acceleration by attitude, no position.
 
@@ -160,12 +158,11 @@ class Px4(Firmware):
         """
         if values["coordinate_frame"] != _BODY_NED:
             return values
-        w, x, y, z = attitude
-        yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        yaw = estimate.yaw_rad
         forward, right = values["vx"], values["vy"]
         given = (values["afx"], values["afy"], values["afz"])
         finite = all(map(math.isfinite, given))
-        turned = rotation_from_quaternion(np.array(attitude)) @ given if finite else given
+        turned = rotation_from_quaternion(estimate.attitude) @ given if finite else given
         mask = values["type_mask"] | 0b111
         mask |= 0b111_000 if mask & 0b111_000 else 0
         mask |= 0b111_000_000 if mask & 0b111_000_000 else 0
@@ -300,7 +297,6 @@ PX4 = Px4(
     passes_after_s=4.0,
     passes_without_position_after_s=4.0,
     fails_where_unarmable=True,
-    position_without_fix_s=5.0,  # EKF2_NOAID_TOUT
     velocity_ratio_squared=True,
     battery_events=("battery low", "battery critical", "battery emergency"),
     return_faces_way=True,

@@ -9,12 +9,7 @@ from typing import Any
 from simulator.autopilot.position_loop import GRAVITY_MPS2
 from simulator.firmware.px4_tables import OFFBOARD, RATES
 from simulator.firmware.values import AttitudeSetpoint, Behaviour
-from simulator.mavlink.view import (
-    View,
-    centi,
-    fit,
-    pressure_hpa,
-)
+from simulator.mavlink.view import View, centi, fit, pressure_hpa
 
 COMPANION_RATES_HZ = {
     "HEARTBEAT": 1.0,

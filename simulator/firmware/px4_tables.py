@@ -163,8 +163,9 @@ ROLES: dict[str, Role] = {
     "crawl_below_m": "MPC_LAND_ALT3",
     "crawl_speed_mps": "MPC_LAND_CRWL",
     "return_descends_to_m": "RTL_DESCEND_ALT",
-    "return_within_m": "NAV_ACC_RAD",
-    "return_height_within_m": "NAV_MC_ALT_RAD",
+    "reached_m": "NAV_ACC_RAD",
+    "reached_height_m": "NAV_MC_ALT_RAD",
+    "position_without_fix_s": ("EKF2_NOAID_TOUT", 1e-6),
     "return_waits_s": "RTL_LAND_DELAY",
     "return_settles_s": 0.0,
 }

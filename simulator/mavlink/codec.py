@@ -129,20 +129,15 @@ def message_of(name: str, values: Sequence[object]) -> Any:
     return dialect.mavlink_map[getattr(dialect, f"MAVLINK_MSG_ID_{name}")](*values)
 
 
-@dataclass(slots=True)
 class Encoder:
     """Frames of one sender. With a key of `keyring` they are signed; `link` is the number of the
     link in the signature."""
 
-    system: int
-    component: int
-    keyring: Keyring | None = None
-    link: int = 0
-    _mavlink: Any = field(init=False)
-
-    def __post_init__(self) -> None:
-        self._mavlink = dialect.MAVLink(None, self.system, self.component)
-        self._mavlink.signing.link_id = self.link
+    def __init__(
+        self, system: int, component: int, keyring: Keyring | None = None, link: int = 0
+    ) -> None:
+        self._keyring, self._mavlink = keyring, dialect.MAVLink(None, system, component)
+        self._mavlink.signing.link_id = link
 
     def restart(self) -> None:
         """The next frame has sequence number 0."""
@@ -151,11 +146,11 @@ class Encoder:
     def frame(self, message: Any) -> bytes:
         """The message as one MAVLink 2 frame with the next sequence number."""
         mavlink = self._mavlink
-        if self.keyring is not None:
-            mavlink.signing.sign_outgoing = self.keyring.on
-            if self.keyring.on:
-                mavlink.signing.secret_key = self.keyring.key
-                mavlink.signing.timestamp = self.keyring.next_stamp()
+        if self._keyring is not None:
+            mavlink.signing.sign_outgoing = self._keyring.on
+            if self._keyring.on:
+                mavlink.signing.secret_key = self._keyring.key
+                mavlink.signing.timestamp = self._keyring.next_stamp()
         packed: bytes = message.pack(mavlink)
         mavlink.seq = (mavlink.seq + 1) & 0xFF
         return packed

@@ -11,9 +11,9 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from offboard.model.frames import wrap_pi
 from simulator.autopilot.autopilot import Autopilot
 from simulator.autopilot.commander import Request
-from simulator.autopilot.mission import VERTICAL_SPEEDS
 from simulator.firmware.values import Asked, Behaviour, Result, Triple, info
 from simulator.geodesy import down_m, to_metres
 from simulator.mavlink.codec import id_of, name_of
@@ -174,8 +174,7 @@ class Commands:
         A speed that is not positive restores the default.
         """
         kind, speed_mps = command.params[:2]
-        vertical = autopilot.firmware.vertical_speeds and kind in VERTICAL_SPEEDS
-        if speed_mps > 0.0 and vertical:
+        if speed_mps > 0.0 and kind in autopilot.firmware.vertical_speeds:
             return Result.ACCEPTED
         known = 0.0 < speed_mps < math.inf
         autopilot.guidance.cruise_mps = speed_mps if known else math.inf
@@ -191,7 +190,7 @@ class Commands:
             from_rad = autopilot.state.estimate.yaw_rad if relative else 0.0
             turn_rad = math.radians(yaw_deg) * (-1.0 if relative and sense < 0 else 1.0)
             turn_radps = math.radians(speed_dps) if speed_dps > 0.0 else math.inf
-            yaw_rad = math.remainder(from_rad + turn_rad, 2.0 * math.pi)
+            yaw_rad = wrap_pi(from_rad + turn_rad)
             autopilot.guidance.turn_to(yaw_rad, turn_radps)
         return result
 
@@ -244,19 +243,18 @@ class Commands:
             unknown = int(number) & 0xFFFF if math.isfinite(number) else 0
             self.outbox.send("MESSAGE_INTERVAL", unknown, 0)
             return firmware.empty_refusal
-        streamed = name in self.schedule.streams
-        interval_us = self.schedule.interval_us(name) if streamed else firmware.no_interval_us
+        stream = self.schedule.streams.get(name)
+        interval_us = firmware.no_interval_us if stream is None else stream.interval_us
         self.outbox.send("MESSAGE_INTERVAL", id_of(name), interval_us)
         return Result.ACCEPTED
 
     def _request_message(self, autopilot: Autopilot, command: Command) -> Result:
-        name = message_name(command.params[0])
-        view, firmware = self.outbox.view, autopilot.firmware
+        return self._send(message_name(command.params[0]))
+
+    def _send(self, name: str | None) -> Result:
+        view, firmware = self.outbox.view, self._autopilot.firmware
         if name not in view.builders or view.withheld(name) or name in firmware.not_on_request:
             return firmware.request_refusal
-        return self._send(name)
-
-    def _send(self, name: str) -> Result:
         self.outbox.send_now(name)
         return Result.ACCEPTED
 

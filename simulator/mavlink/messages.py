@@ -11,13 +11,8 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from simulator.mavlink.view import (
-    View,
-    centi,
-    fit,
-    heading_cdeg,
-    pressure_hpa,
-)
+from simulator.autopilot.position_loop import level
+from simulator.mavlink.view import View, centi, fit, heading_cdeg, pressure_hpa
 
 # -- motion ------------------------------------------------------------------------------------
 
@@ -155,14 +150,13 @@ def timesync(view: View) -> Sequence[Any]:
 
 def home_position(view: View) -> Sequence[Any]:
     north, east, down = view.autopilot.guidance.home_ned_m
-    yaw_rad = view.autopilot.guidance.home_yaw_rad
     return (
         *view.geodetic(north, east),
         view.altitude_mm(down),
         north,
         east,
         down,
-        (math.cos(0.5 * yaw_rad), 0.0, 0.0, math.sin(0.5 * yaw_rad)),
+        level(view.autopilot.guidance.home_yaw_rad),
         0.0,
         0.0,
         0.0,

@@ -20,19 +20,14 @@ HELD_US = 5_000_000
 TEXT_LENGTH = 50  # STATUSTEXT.text
 
 
-@dataclass(slots=True)
 class Outbox:
     """Send queue. `keyring`: of the vehicle; `link`: number of the link in signatures."""
 
-    view: View
-    keyring: Keyring
-    link: int
-    _frames: list[bytes] = field(default_factory=list)
-    _suppressed: Counter[str] = field(default_factory=Counter)
-    _encoder: Encoder = field(init=False)
-
-    def __post_init__(self) -> None:
-        self._encoder = Encoder(self.view.system, MAV_COMP_ID_AUTOPILOT, self.keyring, self.link)
+    def __init__(self, view: View, keyring: Keyring, link: int) -> None:
+        self.view = view
+        self._frames: list[bytes] = []
+        self._suppressed: Counter[str] = Counter()
+        self._encoder = Encoder(view.system, MAV_COMP_ID_AUTOPILOT, keyring, link)
 
     def restart(self) -> None:
         """As after boot: frames are numbered from 0."""

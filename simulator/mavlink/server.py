@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 
 from simulator.autopilot.setpoints import ATTITUDE, GLOBAL, LOCAL
 from simulator.autopilot.sticks import RELEASE
@@ -25,7 +24,6 @@ _NO_PLACE = 2**31 - 1  # in x and y of COMMAND_INT
 _FTP_NAK, _FTP_ERROR_NOT_FOUND = 128 + 1, 10
 
 
-@dataclass(slots=True)
 class Server:
     """One link of one vehicle.
 
@@ -37,27 +35,22 @@ class Server:
         barrier: leave TIMESYNC requests to `send_barrier`: in lockstep they are the clock.
     """
 
-    view: View
-    rates_hz: Mapping[str, float]
-    keyring: Keyring
-    number: int
-    barrier: bool = False
-    decoder: Decoder = field(init=False)
-    answered_ns: int = -1  # ts1 of the newest TIMESYNC answer
-    outbox: Outbox = field(init=False)
-    schedule: Schedule = field(init=False)
-    texts: Texts = field(init=False)
-    _commands: Commands = field(init=False)
-    _parameters: ParameterTransfer = field(init=False)
-    _missions: MissionTransfer = field(init=False)
-    _handlers: Handlers = field(init=False)  # by message
-
-    def __post_init__(self) -> None:
-        self.decoder = Decoder(self.keyring)
-        self.outbox = Outbox(self.view, self.keyring, self.number)
-        clock = ("TIMESYNC",) if self.barrier else ()
-        rates_hz = {name: hz for name, hz in self.rates_hz.items() if name not in clock}
-        self.schedule = Schedule(self.view, rates_hz)
+    def __init__(
+        self,
+        view: View,
+        rates_hz: Mapping[str, float],
+        keyring: Keyring,
+        number: int,
+        *,
+        barrier: bool = False,
+    ) -> None:
+        self.view, self.keyring, self.barrier = view, keyring, barrier
+        self.decoder = Decoder(keyring)
+        self.answered_ns = -1  # ts1 of the newest TIMESYNC answer
+        self.outbox = Outbox(view, keyring, number)
+        clock = ("TIMESYNC",) if barrier else ()
+        rates_hz = {name: hz for name, hz in rates_hz.items() if name not in clock}
+        self.schedule = Schedule(view, rates_hz)
         self.texts = Texts(self.outbox)
         self._commands = Commands(self.outbox, self.schedule)
         self._begin_transfers()
@@ -65,7 +58,7 @@ class Server:
     def _begin_transfers(self) -> None:
         self._parameters = ParameterTransfer(self.outbox)
         self._missions = MissionTransfer(self.outbox, self.texts)
-        self._handlers = {
+        self._handlers: Handlers = {  # by message
             "HEARTBEAT": self._heartbeat,
             "COMMAND_LONG": self._command_long,
             "COMMAND_INT": self._command_int,

@@ -131,11 +131,6 @@ class Schedule:
         self._start(name, interval_us).next_after(self.view.autopilot.state.time_us)
         return True
 
-    def interval_us(self, name: str) -> int:
-        """Interval of a message; -1 when it is not sent periodically."""
-        stream = self.streams.get(name)
-        return -1 if stream is None else stream.interval_us
-
     def set_group(self, group: int, rate_hz: float) -> None:
         """REQUEST_DATA_STREAM of a MAV_DATA_STREAM, which is not acknowledged; 0 stops it."""
         for name in self.view.autopilot.firmware.stream_groups.get(group, ()):

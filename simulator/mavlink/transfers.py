@@ -11,9 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import IntEnum
 
-from simulator.autopilot.mission import ITEMS_MAX, Kind, Mission
+from simulator.autopilot.mission import ITEMS_MAX, Kind
 from simulator.autopilot.parameters import HASH, MAV_PARAM_TYPE_UINT32
-from simulator.firmware.base import Firmware
 from simulator.firmware.values import MissionItem
 from simulator.mavlink.codec import Message, Peer, sender_of
 from simulator.mavlink.outbox import Outbox, Texts
@@ -108,21 +107,16 @@ class Upload:
     requested_s: float
 
 
-@dataclass(slots=True)
 class MissionTransfer:
     """Mission transfers of one link; `texts`: of this link. A download needs no state."""
 
-    outbox: Outbox
-    texts: Texts
-    mission: Mission = field(init=False)
-    _firmware: Firmware = field(init=False)
-    _upload: Upload | None = None
-    _taken: int = 0  # count of the last upload
-    _whole: bool = False  # the peer uses the _INT messages, in 1e-7 degrees
-
-    def __post_init__(self) -> None:
-        autopilot = self.outbox.view.autopilot
+    def __init__(self, outbox: Outbox, texts: Texts) -> None:
+        self.outbox, self.texts = outbox, texts
+        autopilot = outbox.view.autopilot
         self.mission, self._firmware = autopilot.mission, autopilot.firmware
+        self._upload: Upload | None = None
+        self._taken = 0  # count of the last upload
+        self._whole = False  # the peer uses the _INT messages, in 1e-7 degrees
 
     @property
     def handlers(self) -> Handlers:

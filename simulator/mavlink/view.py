@@ -11,10 +11,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from offboard.model.frames import rotation_from_quaternion
 from simulator.autopilot.autopilot import Autopilot
 from simulator.autopilot.position_loop import GRAVITY_MPS2
 from simulator.firmware.values import Triple
-from simulator.geodesy import DEGREES_PER_M, east_degrees_per_m, wrapped_deg
+from simulator.geodesy import to_degrees
 from simulator.mavlink.codec import message_of
 
 _GPS, _PREARM = 0x20, 0x10000000  # MAV_SYS_STATUS_SENSOR
@@ -48,12 +49,8 @@ class View:
     silent: dict[str, int] = field(default_factory=dict)
     wrong_landed_state: int | None = None  # reported in place of the true one
     stuck: dict[str, Stuck] = field(default_factory=dict)
-    east_degrees_per_m: float = field(init=False)
     _messages: dict[str, Any] = field(default_factory=dict)
     _at_step: int = -1
-
-    def __post_init__(self) -> None:
-        self.east_degrees_per_m = east_degrees_per_m(self.autopilot.firmware.origin)
 
     def withheld(self, name: str) -> bool:
         """Whether the vehicle cannot send this message yet, whatever its rate."""
@@ -104,18 +101,12 @@ class View:
 
     @property
     def specific_force(self) -> Triple:
-        """True specific force, FRD, m/s^2: v + 2 r x (r x v - w v) with the quaternion (w, r)."""
+        """True specific force, FRD, m/s^2."""
         truth = self.autopilot.state.truth
-        w, x, y, z = truth.attitude.tolist()
         north, east, down = truth.acceleration_ned_mps2.tolist()
-        down -= GRAVITY_MPS2
-        a, b, c = y * down - z * east, z * north - x * down, x * east - y * north
-        a, b, c = a - w * north, b - w * east, c - w * down
-        return (
-            north + 2.0 * (y * c - z * b),
-            east + 2.0 * (z * a - x * c),
-            down + 2.0 * (x * b - y * a),
-        )
+        force_ned = (north, east, down - GRAVITY_MPS2)
+        forward, right, down = (force_ned @ rotation_from_quaternion(truth.attitude)).tolist()
+        return forward, right, down
 
     @property
     def landed_state(self) -> int:
@@ -140,11 +131,8 @@ class View:
 
     def geodetic(self, north_m: float, east_m: float) -> tuple[int, int]:
         """Latitude and longitude in 1e-7 deg of a point near the origin (spherical Earth)."""
-        latitude, longitude, _ = self.autopilot.firmware.origin
-        north_deg = north_m * DEGREES_PER_M
-        east_deg = east_m * self.east_degrees_per_m
-        east_deg = wrapped_deg(longitude + east_deg)
-        return fit((latitude + north_deg) * 1e7, 32), fit(east_deg * 1e7, 32)
+        latitude, longitude = to_degrees(self.autopilot.firmware.origin, north_m, east_m)
+        return fit(latitude * 1e7, 32), fit(longitude * 1e7, 32)
 
     def altitude_mm(self, down_m: float) -> int:
         """AMSL, mm."""

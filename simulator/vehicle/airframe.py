@@ -8,6 +8,7 @@ effect, charge consumed. Compiled. Knows no autopilot, no estimate and no random
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from offboard.compiled import kernel
 from offboard.model.rigid_body import pack, quaternion_into, rk4_into
 from offboard.model.vehicle import Vehicle
+from simulator.steps import STEP_S
 from simulator.vehicle.conditions import Conditions
 
 Array = NDArray[np.float64]
@@ -35,22 +37,20 @@ _ROTOR_HEIGHT_M = 0.10
 _STIFFNESS_LIMIT = 0.5
 
 
-def build_airframe(
-    vehicle: Vehicle, conditions: Conditions, step_s: float
-) -> tuple[Array, Array, int]:
+def build_airframe(vehicle: Vehicle, conditions: Conditions) -> tuple[Array, Array, int]:
     """Constants of the simulated vehicle: the model that the controller has, too, with the factors
     of the conditions on thrust and mass.
 
     Returns those of the body, as `offboard.model.rigid_body.pack` has them; of the rotors: thrust
     at full throttle N, factor of the lag in a step, thrust above which torques are full, ground
-    effect 0/1, hover thrust, hover current A; and the substeps of a step of `step_s`.
+    effect 0/1, hover thrust, hover current A; and the substeps of a step.
     """
     body = pack(vehicle)
     lag_s = vehicle.thrust_lag_s
     rotor = np.array(
         [
             conditions.thrust_scale * vehicle.mass_kg * vehicle.thrust_max_mps2,
-            math.exp(-step_s / lag_s) if lag_s > 0.0 else 0.0,
+            math.exp(-STEP_S / lag_s) if lag_s > 0.0 else 0.0,
             _AUTHORITY_SHARE * vehicle.hover_thrust,
             float(conditions.ground_effect),
             vehicle.hover_thrust,
@@ -59,29 +59,16 @@ def build_airframe(
     )
     body[0] *= conditions.mass_scale
     stiffness = max(body[6:9].max() / body[0], (body[9:12] / body[2:5]).max())
-    substeps = max(1, math.ceil(step_s * stiffness / _STIFFNESS_LIMIT))
+    substeps = max(1, math.ceil(STEP_S * stiffness / _STIFFNESS_LIMIT))
     return body, rotor, substeps
 
 
 @kernel
-def advance_airframe(
-    body: Array,
-    rotor: Array,
-    thrust_demand: float,
-    turn_demand: Array,
-    wind_ned: Array,
-    body_constants: Array,
-    rotor_constants: Array,
-    step_s: float,
-    substeps: int,
-    inputs: Array,
-    scratch: Array,
-) -> None:
-    """One step in place: `body` (13,) and `rotor` (ROTOR_SIZE,).
-
-    thrust_demand 0..1; turn_demand (3,) angular acceleration FRD rad/s^2. `inputs` (4,) and
-    `scratch` (3, 13) are work space.
-    """
+def advance_airframe(plant: Any, thrust_demand: float) -> None:
+    """One step in place of body and rotor of a `simulator.vehicle.dynamics.RECORD`, by its angular
+    acceleration `turn` and a thrust 0 .. 1."""
+    body, rotor, inputs = plant.body, plant.rotor, plant.inputs
+    body_constants, rotor_constants = plant.body_constants, plant.rotor_constants
     before = rotor[THRUST]
     rotor[THRUST] = thrust_demand + (before - thrust_demand) * rotor_constants[1]
     mean = 0.5 * (before + rotor[THRUST])
@@ -89,20 +76,27 @@ def advance_airframe(
     inputs[0] = rotor_constants[0] * mean * _ground_gain(body[12], rotor_constants[3])
     # On the ground it does not rotate
     authority = 0.0 if rotor[CONTACT] > 0.5 else min(mean / rotor_constants[2], 1.0)
-    _torques(body, turn_demand, authority, body_constants, inputs)
-    part_s = step_s / substeps
-    for _ in range(substeps):
+    _torques(body, plant.turn, authority, body_constants, inputs)
+    part_s = STEP_S / plant.substeps
+    for _ in range(plant.substeps):
         stands, stand_north, stand_east = rotor[CONTACT] > 0.5, body[10], body[11]
         rk4_into(
-            quaternion_into, body[:], inputs, wind_ned, body_constants, part_s, scratch, body[:]
+            quaternion_into,
+            body[:],
+            inputs,
+            plant.wind,
+            body_constants,
+            part_s,
+            plant.slopes,
+            body[:],
         )
         rotor[CONTACT] = _touch_ground(body, part_s)
         if stands and rotor[CONTACT] > 0.5 and body[7] == 0.0 and body[8] == 0.0:
             body[10], body[11] = stand_north, stand_east  # held by friction
-    rotor[3] = (body[7] - north) / step_s
-    rotor[4] = (body[8] - east) / step_s
-    rotor[5] = (body[9] - down) / step_s
-    rotor[CHARGE] += rotor_constants[5] * (mean / rotor_constants[4]) ** 1.5 * step_s
+    rotor[3] = (body[7] - north) / STEP_S
+    rotor[4] = (body[8] - east) / STEP_S
+    rotor[5] = (body[9] - down) / STEP_S
+    rotor[CHARGE] += rotor_constants[5] * (mean / rotor_constants[4]) ** 1.5 * STEP_S
 
 
 @kernel

@@ -10,15 +10,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from offboard.compiled import kernel
 from offboard.model.vehicle import Vehicle
+from simulator.steps import STEP_S
 
 Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
 Triple = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
@@ -49,17 +50,13 @@ class Demand:
     rates_frd_radps: Triple | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Loop:
-    """Constants of the compiled loop: gains (3,), limits (3,), delays in steps."""
+def build_loop(vehicle: Vehicle) -> tuple[Array, NDArray[np.int64]]:
+    """Constants of the compiled loop.
 
-    gains: Array  # (3, 3): rows attitude gain 1/s, rate gain 1/s, acceleration limit rad/s^2
-    delays: Integers  # tilt, yaw, thrust, tilt rate, yaw rate
-
-
-def build_loop(vehicle: Vehicle, step_s: float) -> Loop:
-    """Gains 2 z wn and wn / 2z per axis, and the delays, shortened by half a step, by which
-    holding a demand for a step delays it."""
+    Gains (3, 3): rows attitude gain wn / 2z 1/s, rate gain 2 z wn 1/s, acceleration limit rad/s^2.
+    Delays (5,) of tilt, yaw, thrust, tilt rate and yaw rate, in steps, shortened by half a step, by
+    which holding a demand for a step delays it.
+    """
     axes = (vehicle.tilt, vehicle.tilt, vehicle.yaw)
     gains = np.array(
         [
@@ -77,8 +74,7 @@ def build_loop(vehicle: Vehicle, step_s: float) -> Loop:
             _RATE_DELAY_SHARE * vehicle.yaw.delay_s,
         ]
     )
-    steps = np.maximum(np.rint(delays_s / step_s - 0.5), 0.0).astype(np.int64)
-    return Loop(gains, steps)
+    return gains, np.maximum(np.rint(delays_s / STEP_S - 0.5), 0.0).astype(np.int64)
 
 
 def encode(demand: Demand, row: Array) -> None:
@@ -109,16 +105,16 @@ def _within(rate: float, limit: float) -> float:
 
 
 @kernel
-def delayed_row(history: Array, step: int, delay: int) -> Array:
+def _delayed_row(plant: Any, step: int, delay: int) -> Array:
     """Demand of `delay` steps ago."""
-    row: Array = history[(step - delay) % history.shape[0]]
+    row: Array = plant.history[(step - delay) % plant.history.shape[0]]
     return row
 
 
 @kernel
-def delayed_thrust(history: Array, step: int, delays: Integers) -> float:
+def delayed_thrust(plant: Any, step: int) -> float:
     """Normalised collective thrust, delayed."""
-    thrust: float = delayed_row(history, step, delays[2])[_THRUST]
+    thrust: float = _delayed_row(plant, step, plant.delays[2])[_THRUST]
     return thrust
 
 
@@ -148,34 +144,26 @@ def _attitude_error(quaternion: Array, row: Array, error: Array) -> None:
 
 
 @kernel
-def angular_acceleration(
-    quaternion: Array,
-    body: Array,
-    history: Array,
-    step: int,
-    delays: Integers,
-    gains: Array,
-    error: Array,
-    out: Array,
-) -> None:
-    """Demanded angular acceleration (3,) FRD rad/s^2, into `out`.
+def angular_acceleration(plant: Any, step: int) -> None:
+    """Demanded angular acceleration FRD rad/s^2, into `turn` of a
+    `simulator.vehicle.dynamics.RECORD`.
 
-    `quaternion` is the *estimated* attitude; the rates are those of `body`. Tilt and yaw have their
-    own delays in the history. `error` (3,) is scratch.
+    By its *estimated* attitude and true rates. Tilt and yaw have their own delays.
     """
+    delays, gains, error, out = plant.delays, plant.gains, plant.turn_error, plant.turn
     for first, last, attitude_delay, rate_delay in (
         (0, 2, delays[0], delays[3]),
         (2, 3, delays[1], delays[4]),
     ):
-        row = delayed_row(history, step, rate_delay)
+        row = _delayed_row(plant, step, rate_delay)
         if row[_IS_ATTITUDE] > 0.5:
-            row = delayed_row(history, step, attitude_delay)
+            row = _delayed_row(plant, step, attitude_delay)
         by_attitude = row[_IS_ATTITUDE] > 0.5
         if by_attitude:
-            _attitude_error(quaternion, row, error)
+            _attitude_error(plant.estimated, row, error)
         for i in range(first, last):
             rate = gains[0, i] * error[i] if by_attitude else row[_RATES + i]
             limit = RATE_LIMIT_RADPS[i]
             rate = min(max(rate, -limit), limit)
-            demand = gains[1, i] * (rate - body[4 + i])
+            demand = gains[1, i] * (rate - plant.body[4 + i])
             out[i] = min(max(demand, -gains[2, i]), gains[2, i])

@@ -22,6 +22,17 @@ class Battery(Parameters):
     resistance_ohm: float = Field(default=0.02, ge=0, le=1)
     remaining: float = Field(default=1.0, ge=0, le=1)  # at boot
 
+    def state(self, drawn_as: float, hover_share: float) -> BatteryState:
+        """State after consuming `drawn_as` (A s), at this multiple of the hover thrust."""
+        left = self.remaining - drawn_as / (3600.0 * self.capacity_ah)
+        current = self.hover_current_a * hover_share**1.5
+        voltage = self.cells * (3.5 + 0.7 * left) - self.resistance_ohm * current
+        return BatteryState(max(voltage, 0.0), current, max(left, 0.0), drawn_as / 3.6)
+
+    def drawn_as(self, remaining: float) -> float:
+        """Charge consumed (A s) when this share remains."""
+        return 3600.0 * self.capacity_ah * (self.remaining - remaining)
+
 
 @dataclass(frozen=True, slots=True)
 class BatteryState:
@@ -31,23 +42,3 @@ class BatteryState:
     current_a: float
     remaining: float
     used_mah: float  # since boot
-
-
-@dataclass(frozen=True, slots=True)
-class Pack:
-    """Battery of a vehicle that hovers at this normalised thrust."""
-
-    battery: Battery
-    hover_thrust: float
-
-    def state(self, drawn_as: float, thrust: float) -> BatteryState:
-        """State after consuming `drawn_as` (A s), at this normalised thrust."""
-        battery = self.battery
-        left = battery.remaining - drawn_as / (3600.0 * battery.capacity_ah)
-        current = battery.hover_current_a * (thrust / self.hover_thrust) ** 1.5
-        voltage = battery.cells * (3.5 + 0.7 * left) - battery.resistance_ohm * current
-        return BatteryState(max(voltage, 0.0), current, max(left, 0.0), drawn_as / 3.6)
-
-    def drawn_as(self, remaining: float) -> float:
-        """Charge consumed (A s) when this share remains."""
-        return 3600.0 * self.battery.capacity_ah * (self.battery.remaining - remaining)

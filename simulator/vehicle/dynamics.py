@@ -1,8 +1,7 @@
 """The equations of the vehicle below the autopilot, compiled: one step of everything, in place.
 
 Rows of a record in, the same rows a step later; what the estimator and the satellite receiver say
-of them. Knows constants and scratch only as `RECORD` lays them out (`simulator.vehicle.plant` fills
-it).
+of them. All works on a `RECORD`, which `simulator.vehicle.plant` fills.
 """
 
 from __future__ import annotations
@@ -13,27 +12,24 @@ import numpy as np
 
 from offboard.compiled import entry, kernel
 from offboard.model.rigid_body import QUATERNION, RK4_SCRATCH_ROWS
-from simulator.steps import STEP_S
 from simulator.vehicle.airframe import ROTOR_SIZE, advance_airframe
 from simulator.vehicle.attitude import ROW_WIDTH, angular_acceleration, delayed_thrust
-from simulator.vehicle.noise import advance_block, fill_normals
+from simulator.vehicle.noise import advance_process, fill_normals
 from simulator.vehicle.sensors import (
+    AXIS_STRIDE,
     EAST,
-    ERROR_BLOCKS,
     ERROR_COUNT,
     NORTH,
     REPORT_WIDTH,
     STANDING_NOISE,
     WHITE_COUNT,
     YAW,
-    report,
     turn_estimate,
 )
 from simulator.vehicle.wind import GUST_COUNT
 
 # As typed numbers: compiled code is made once more for each plain constant that is handed on
 _ERROR_LANE, _GUST_LANE, _WHITE_LANE, _RECEIVER_LANE = (np.uint64(lane) for lane in range(4))
-_GUST_BLOCKS = ((0, GUST_COUNT),)
 
 # Rows of the demand history: a power of two, more than the steps of any vehicle's longest delay
 _HISTORY_ROWS = 128
@@ -99,22 +95,25 @@ def draw_gusts(plants: Any) -> None:
 
 @entry(RECORD)
 def report_state(plants: Any) -> None:
-    """Write the estimate of the present state to `report`."""
+    """Write the estimate of the present state to `report`: truth plus errors, offset and white
+    noise."""
     plant = plants[0]
-    report(
-        plant.body,
-        plant.rotor,
-        plant.error,
-        plant.offset,
-        plant.lag_s,
-        plant.white_sds,
-        1.0 if plant.motors_on else STANDING_NOISE,
-        plant.seed,
-        _WHITE_LANE,
-        plant.step,
-        plant.normals,
-        plant.report,
-    )
+    body, error, white, out = plant.body, plant.error, plant.normals, plant.report
+    fill_normals(plant.seed, _WHITE_LANE, plant.step, white[:])
+    gain = 1.0 if plant.motors_on else STANDING_NOISE
+    for i in range(WHITE_COUNT):
+        white[i] *= gain * plant.white_sds[i]
+    for axis in range(3):
+        late = body[10 + axis] - plant.lag_s * body[7 + axis]
+        out[axis] = late + error[AXIS_STRIDE * axis] + plant.offset[axis] + white[axis]
+        slow = body[7 + axis] - plant.lag_s * plant.rotor[3 + axis]
+        out[3 + axis] = slow + error[AXIS_STRIDE * axis + 1] + white[3 + axis]
+        out[10 + axis] = body[4 + axis] + white[9 + axis]
+    turn = white[6:9]
+    turn[0] -= error[EAST + 2]
+    turn[1] += error[NORTH + 2]
+    turn[2] += error[YAW]
+    turn_estimate(body, turn, out[6:10])
 
 
 @entry(RECORD)
@@ -144,19 +143,7 @@ def advance_steps(count: int, plants: Any) -> None:
             plant.history[step % _HISTORY_ROWS, i] = plant.row[i]
         _move_air(plant, step)
         _control_attitude(plant, step)
-        advance_airframe(
-            plant.body,
-            plant.rotor,
-            delayed_thrust(plant.history, step, plant.delays) if plant.motors_on else 0.0,
-            plant.turn,
-            plant.wind,
-            plant.body_constants,
-            plant.rotor_constants,
-            STEP_S,
-            plant.substeps,
-            plant.inputs,
-            plant.slopes,
-        )
+        advance_airframe(plant, delayed_thrust(plant, step) if plant.motors_on else 0.0)
         if plant.noisy:
             _move_errors(plant, step)
         plant.step = step + 1
@@ -168,17 +155,14 @@ def _move_air(plant: Any, step: int) -> None:
     gust, air, wind = plant.gust, plant.air, plant.wind
     if plant.gusty:
         fill_normals(plant.seed, _GUST_LANE, step, plant.gust_normals[:])
-        for start, end in _GUST_BLOCKS:
-            advance_block(
-                plant.gust_transition[:],
-                plant.gust_scale[:],
-                start,
-                end,
-                1.0,
-                plant.gust_normals[:],
-                gust[:],
-                plant.work[:],
-            )
+        advance_process(
+            plant.gust_transition[:],
+            plant.gust_scale[:],
+            1.0,
+            plant.gust_normals[:],
+            gust[:],
+            plant.work[:],
+        )
     wind[0] = air[0] + air[3] * gust[0] - air[4] * gust[1]
     wind[1] = air[1] + air[4] * gust[0] + air[3] * gust[1]
     wind[2] = air[2] + gust[3]
@@ -191,31 +175,18 @@ def _control_attitude(plant: Any, step: int) -> None:
     turn_error[0], turn_error[1] = -error[EAST + 2], error[NORTH + 2]
     turn_error[2] = error[YAW]
     turn_estimate(plant.body, turn_error[:], plant.estimated[:])
-    angular_acceleration(
-        plant.estimated,
-        plant.body,
-        plant.history,
-        step,
-        plant.delays,
-        plant.gains,
-        turn_error,
-        plant.turn,
-    )
+    angular_acceleration(plant, step)
 
 
 @kernel
 def _move_errors(plant: Any, step: int) -> None:
     """Next errors of the estimator."""
     fill_normals(plant.seed, _ERROR_LANE, step, plant.normals[:])
-    gain = 1.0 if plant.motors_on else STANDING_NOISE
-    for start, end in ERROR_BLOCKS:
-        advance_block(
-            plant.error_transition[:],
-            plant.error_scale[:],
-            start,
-            end,
-            gain,
-            plant.normals[:],
-            plant.error[:],
-            plant.work[:],
-        )
+    advance_process(
+        plant.error_transition[:],
+        plant.error_scale[:],
+        1.0 if plant.motors_on else STANDING_NOISE,
+        plant.normals[:],
+        plant.error[:],
+        plant.work[:],
+    )

@@ -124,24 +124,18 @@ def fill_normals(seed: np.uint64, lane: np.uint64, step: int | np.int64, out: Ar
 
 
 @kernel
-def advance_block(
-    transition: Array,
-    scale: Array,
-    first: int,
-    end: int,
-    gain: float,
-    normals: Array,
-    x: Array,
-    work: Array,
+def advance_process(
+    transition: Array, scale: Array, gain: float, normals: Array, x: Array, work: Array
 ) -> None:
-    """One step in place of one diagonal block of a LinearProcess, states `first` to `end` - 1.
+    """One step in place of a LinearProcess with states `x` (n,).
 
     `gain` multiplies the noise; `work` (n,) is scratch.
     """
-    for i in range(first, end):
+    count = transition.shape[0]
+    for i in range(count):
         total = 0.0
-        for j in range(first, end):
+        for j in range(count):
             total += transition[i, j] * x[j] + gain * scale[i, j] * normals[j]
         work[i] = total
-    for i in range(first, end):
+    for i in range(count):
         x[i] = work[i]

@@ -14,23 +14,13 @@ from numpy.typing import NDArray
 from offboard.model.rigid_body import QUATERNION
 from offboard.model.vehicle import Triple, Vehicle
 from simulator.steps import STEP_S
-from simulator.vehicle.airframe import (
-    ACCELERATION,
-    CHARGE,
-    CONTACT,
-    THRUST,
-    build_airframe,
-)
+from simulator.vehicle.airframe import ACCELERATION, CHARGE, CONTACT, THRUST, build_airframe
 from simulator.vehicle.attitude import Demand, build_loop, encode
-from simulator.vehicle.battery import BatteryState, Pack
+from simulator.vehicle.battery import BatteryState
 from simulator.vehicle.conditions import Conditions
 from simulator.vehicle.dynamics import RECORD, advance_steps, draw_gusts, receive_fix, report_state
 from simulator.vehicle.noise import seed_word
-from simulator.vehicle.sensors import (
-    error_model,
-    error_process,
-    white_sds,
-)
+from simulator.vehicle.sensors import error_model, error_process, white_sds
 from simulator.vehicle.wind import dryden, wind_axes
 
 Array = NDArray[np.float64]
@@ -63,8 +53,8 @@ class Plant:
 
     def __init__(self, vehicle: Vehicle, conditions: Conditions, seed: int) -> None:
         self.record = np.zeros(1, RECORD)
-        body, rotor, substeps = build_airframe(vehicle, conditions, STEP_S)
-        loop, gusts = build_loop(vehicle, STEP_S), dryden(conditions.gusts, STEP_S)
+        body, rotor, substeps = build_airframe(vehicle, conditions)
+        (gains, delays), gusts = build_loop(vehicle), dryden(conditions.gusts, STEP_S)
         model = error_model(conditions.estimator, conditions.white_noise)
         errors, wind_ned_mps = error_process(model, STEP_S), conditions.wind_ned_mps
         constants = {
@@ -72,8 +62,8 @@ class Plant:
             "substeps": substeps,
             "body_constants": body,
             "rotor_constants": rotor,
-            "delays": loop.delays,
-            "gains": loop.gains,
+            "delays": delays,
+            "gains": gains,
             "noisy": np.any(errors.scale != 0.0),
             "lag_s": model.lag_s,
             "white_sds": white_sds(model),
@@ -87,7 +77,7 @@ class Plant:
         record = self.record
         for name, value in constants.items():
             record[name] = value
-        self.pack = Pack(conditions.battery, vehicle.hover_thrust)
+        self.battery, self._hover_thrust = conditions.battery, vehicle.hover_thrust
         self._demand: Demand | None = None
         self._body, self._rotor, self._wind = (
             record[name][0] for name in ("body", "rotor", "wind")
@@ -129,12 +119,13 @@ class Plant:
 
     def set_battery(self, remaining: float) -> None:
         """Set the remaining share of the battery's capacity, 0 .. 1."""
-        self._rotor[CHARGE] = self.pack.drawn_as(remaining)
+        self._rotor[CHARGE] = self.battery.drawn_as(remaining)
 
     @property
     def truth(self) -> Truth:
         """The true state; a copy."""
-        body = self._body.copy()
+        body, thrust = self._body.copy(), float(self._rotor[THRUST])
+        charge_as, hover_share = float(self._rotor[CHARGE]), thrust / self._hover_thrust
         return Truth(
             position_ned_m=body[QUATERNION.position],
             velocity_ned_mps=body[QUATERNION.velocity],
@@ -142,9 +133,9 @@ class Plant:
             attitude=body[QUATERNION.attitude],
             rates_frd_radps=body[QUATERNION.rates],
             on_ground=bool(self._rotor[CONTACT]),
-            thrust=float(self._rotor[THRUST]),
+            thrust=thrust,
             wind_ned_mps=self._wind.copy(),
-            battery=self.pack.state(float(self._rotor[CHARGE]), float(self._rotor[THRUST])),
+            battery=self.battery.state(charge_as, hover_share),
         )
 
     def fix(self) -> list[float]:

@@ -20,15 +20,14 @@ from pydantic import Field
 from offboard.compiled import kernel
 from offboard.documents.parameters import Parameters
 from offboard.model.vehicle import NonNegativeTriple
-from simulator.vehicle.noise import LinearProcess, block_diagonal, discretise, fill_normals
+from simulator.vehicle.noise import LinearProcess, block_diagonal, discretise
 
 Array = NDArray[np.float64]
 Rows = tuple[tuple[float, ...], ...]
 
 # Order of the error state: north p v b r, east p v b r, down p v r, yaw.
 NORTH, EAST, DOWN, YAW, ERROR_COUNT = 0, 4, 8, 11, 12
-ERROR_BLOCKS = ((NORTH, EAST), (EAST, DOWN), (DOWN, YAW), (YAW, ERROR_COUNT))
-_AXIS_STRIDE = 4
+AXIS_STRIDE = 4
 
 WHITE_COUNT = 12  # position, velocity, attitude, rates
 
@@ -193,12 +192,8 @@ def error_model(name: EstimatorName, white: WhiteNoise) -> ErrorModel:
 
 def error_process(model: ErrorModel, step_s: float) -> LinearProcess:
     """Process of the error state (NORTH, EAST, DOWN, YAW) with steps of `step_s`."""
-    parts = [
-        discretise(*_padded(axis, end - first), step_s)
-        for axis, (first, end) in zip(
-            (model.north, model.east, model.down), ERROR_BLOCKS, strict=False
-        )
-    ]
+    sizes = ((model.north, EAST - NORTH), (model.east, DOWN - EAST), (model.down, YAW - DOWN))
+    parts = [discretise(*_padded(axis, size), step_s) for axis, size in sizes]
     yaw_density = model.yaw_sd_rad * math.sqrt(2.0 / model.yaw_time_s)
     parts.append(discretise([[-1.0 / model.yaw_time_s]], [yaw_density], step_s))
     return block_diagonal(*parts)
@@ -241,40 +236,3 @@ def turn_estimate(body: Array, error: Array, out: Array) -> None:
 # Layout of a report: the estimate as one array.
 POSITION, VELOCITY, ATTITUDE, RATES = slice(0, 3), slice(3, 6), slice(6, 10), slice(10, 13)
 REPORT_WIDTH = 13
-
-
-@kernel
-def report(
-    body: Array,
-    acceleration: Array,
-    errors: Array,
-    offset: Array,
-    lag_s: float,
-    sds: Array,
-    gain: float,
-    seed: np.uint64,
-    lane: np.uint64,
-    step: int,
-    white: Array,
-    out: Array,
-) -> None:
-    """Estimate: truth (13,) plus errors, offset (3,) and `gain` times white noise, into `out`
-    (REPORT_WIDTH,).
-
-    `body` is [attitude, rates, velocity, position], as the rigid body has it; the NED acceleration
-    is `acceleration[3:6]`; `white` (WHITE_COUNT,) is scratch.
-    """
-    fill_normals(seed, lane, step, white[:])
-    for i in range(WHITE_COUNT):
-        white[i] *= gain * sds[i]
-    for axis in range(3):
-        late = body[10 + axis] - lag_s * body[7 + axis]
-        out[axis] = late + errors[_AXIS_STRIDE * axis] + offset[axis] + white[axis]
-        slow = body[7 + axis] - lag_s * acceleration[3 + axis]
-        out[3 + axis] = slow + errors[_AXIS_STRIDE * axis + 1] + white[3 + axis]
-        out[10 + axis] = body[4 + axis] + white[9 + axis]
-    turn = white[6:9]
-    turn[0] -= errors[EAST + 2]
-    turn[1] += errors[NORTH + 2]
-    turn[2] += errors[YAW]
-    turn_estimate(body, turn, out[6:10])

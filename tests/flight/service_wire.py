@@ -143,10 +143,11 @@ class Wire:
                 if mode not in self.asked:
                     self.asked.clear()
             self.mode, self.changed_s = mode, time_s
-        unheard = self.pair.lost_down or self.pair.paused
-        if unheard or not self.pair.instance.idle:  # on the ground, as the service may know
+        unheard, autopilot = self.pair.lost_down or self.pair.paused, self.pair.instance.autopilot
+        idle = not autopilot.commander.armed and autopilot.position_controller.landed
+        if unheard or not idle:  # on the ground, as the service may know
             self._flying_s = time_s
-        if not self.pair.instance.autopilot.plant.on_ground:
+        if not autopilot.plant.on_ground:
             self._off_ground_s = time_s
         joined = not (self.pair.lost_up or self.pair.lost_down or self.pair.paused)
         if not joined or time_s - self._other_s < OTHER_S or not (self.engaged and self._aloft):

@@ -20,7 +20,6 @@ from offboard.flight.record import IDENTIFIED_ID
 from offboard.identification.learner import LENGTH_S, IdentifySettings
 from offboard.model.vehicle import AxisResponse, Vehicle
 from simulator import config as simulated
-from simulator.steps import STEP_S
 from simulator.vehicle.attitude import build_loop
 
 IDENTIFY = IdentifySettings()
@@ -167,10 +166,10 @@ def test_attitude_loop_that_slows_is_noticed_and_flown(tmp_path: Path):
     """From 11.4 to 5 rad/s with the same delay. Unnoticed, it is 0.98 m off."""
     pair = learning()
     slow = TRUE.tilt.model_copy(update={"natural_frequency_radps": 5.0})
-    loop = build_loop(TRUE.model_copy(update={"tilt": slow}), STEP_S)
+    gains, _ = build_loop(TRUE.model_copy(update={"tilt": slow}))
 
     def slows(flying: Pair) -> None:
-        flying.instance.autopilot.plant.record["gains"][0] = loop.gains
+        flying.instance.autopilot.plant.record["gains"][0] = gains
 
     pair.at.append((in_phase(Phase.TRACK, 3.0), slows))
     pair.track()

@@ -13,7 +13,7 @@ from scipy.linalg import expm, solve_continuous_lyapunov
 from scipy.signal import welch
 
 from simulator.vehicle.noise import (
-    advance_block,
+    advance_process,
     discretise,
     fill_normals,
     seed_word,
@@ -45,7 +45,7 @@ def _simulate(process, steps: int, seed: int) -> np.ndarray:
 def _advance(transition, scale, x, work, path):
     """Normals into states."""
     for step in range(len(path)):
-        advance_block(transition, scale, 0, len(x), 1.0, path[step], x, work)
+        advance_process(transition, scale, 1.0, path[step], x, work)
         path[step] = x
 
 

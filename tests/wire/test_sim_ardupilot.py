@@ -112,6 +112,32 @@ def test_a_negative_limit_is_raised_to_the_least_one(name: str) -> None:
     assert vehicle.height_m > 6.0
 
 
+def test_a_request_of_the_present_mode_changes_nothing_and_disarming_ends_a_takeoff() -> None:
+    """Scripts ask for GUIDED until HEARTBEAT shows it; set_mode returns at once in that mode."""
+    vehicle = Bench(firmware=ARDUPILOT, boot_scale=0.1)
+    vehicle.run(4.5)
+
+    def take_off(up_m: float) -> None:
+        assert vehicle.command(176, 1, GUIDED) == [ACCEPTED]
+        assert vehicle.command(400, 1) == [ACCEPTED]
+        assert vehicle.command(22, 0, 0, 0, 0, 0, 0, 5.0) == [ACCEPTED]
+        vehicle.run_until(lambda: vehicle.height_m > up_m, 10.0)
+
+    take_off(2.0)
+    assert vehicle.command(176, 1, GUIDED) == [ACCEPTED]
+    assert vehicle.command(22, 0, 0, 0, 0, 0, 0, 9.0) == [FAILED]  # in the air
+    vehicle.run(4.0)
+    assert vehicle.height_m == pytest.approx(5.0, abs=0.2)
+    vehicle.command(176, 1, LAND)
+    vehicle.run_until(lambda: not vehicle.armed, 30.0)
+    take_off(0.05)
+    assert vehicle.command(400, 0, 21196) == [ACCEPTED]
+    vehicle.run(2.0)
+    assert vehicle.command(176, 1, GUIDED) == vehicle.command(400, 1) == [ACCEPTED]
+    vehicle.run(6.0)
+    assert vehicle.height_m == pytest.approx(0.0, abs=0.05)
+
+
 def test_modes_that_do_not_start_while_armed() -> None:
     """Disarmed any mode is entered."""
     vehicle = guided()

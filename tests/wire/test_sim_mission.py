@@ -123,8 +123,23 @@ def test_fences_and_rally_points_are_refused_and_there_are_none(firmware: Firmwa
     assert counts == [(0, 1), (0, 2)]
 
 
+@pytest.mark.parametrize(
+    ("firmware", "radius", "wide"), [(PX4, "NAV_ACC_RAD", 8.0), (ARDUPILOT, "WPNAV_RADIUS", 800.0)]
+)
+def test_a_waypoint_is_reached_within_the_radius_of_the_parameter(
+    firmware: Firmware, radius: str, wide: float
+) -> None:
+    """2 m by default, 8 m here: of 20 m across, 12."""
+    bench = aloft(firmware=firmware, height_m=5.0)
+    bench.set(radius, wide)
+    upload(bench, [place(WAYPOINT, 0, 0, 5, 0, 0), *[place(WAYPOINT, 20, 0, 5, 0, 0)] * 2])
+    assert bench.command(300) == [0]
+    bench.run_until(lambda: bench.instance.autopilot.mission.reached == 1, 20.0)
+    assert bench.place[0] == pytest.approx(12.0, abs=0.5)
+
+
 def test_the_first_item_of_arducopter_is_home() -> None:
-    """Scripts that download an empty mission wait for it."""
+    """Scripts that download an empty mission wait for it. MIS_TOTAL counts it, too."""
     bench = Bench(firmware=ARDUPILOT)
     bench.run(1.0)
     for _ in range(2):
@@ -133,6 +148,7 @@ def test_the_first_item_of_arducopter_is_home() -> None:
         assert (home.seq, home.frame, home.command) == (0, 0, WAYPOINT)
         assert (home.x, home.y, home.z) == pytest.approx(ARDUPILOT.origin, abs=1e-2)
         assert upload(bench, [place(WAYPOINT, 50, 50, 0), place(WAYPOINT, 9, 0, 5)]) == 0
+    assert bench.instance.autopilot.parameters["MIS_TOTAL"] == 2
     send(bench, mavlink.MAVLink_mission_request_message(1, 1, 2))
     assert acks(bench)[-1] == 13
 
