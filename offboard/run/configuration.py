@@ -37,7 +37,7 @@ from offboard.documents.shipped import locate, read_text
 from offboard.flight.phases import Limits
 from offboard.identification.learner import IdentifySettings
 from offboard.model.vehicle import Vehicle
-from offboard.reference.feasibility import Envelope, check
+from offboard.reference.feasibility import check
 from offboard.reference.shapes import SHAPES, FromTable, Shape, Waypoints
 from offboard.reference.track import Track
 from offboard.run.sitl import check_scenario
@@ -119,36 +119,29 @@ def build_track(config: FlightConfig) -> Track:
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # what overflows is beyond a limit
             track = config.reference.track()
-            envelope = check(track, vehicle)
+            _, height_m, radius_m = check(track, vehicle)
     except ValueError as error:
         raise DocumentError(f"reference {config.reference.title}: {error}") from None
-    landing_s = envelope.height_max_m / DESCENT_MPS
+    landing_s = height_m / DESCENT_MPS
     if landing_s > limits.land_s:
         raise DocumentError(
-            f"reference {config.reference.title}: landing from {envelope.height_max_m:.4g} m takes "
+            f"reference {config.reference.title}: landing from {height_m:.4g} m takes "
             f"{landing_s:.4g} s at {DESCENT_MPS} m/s, longer than limits.land_s "
             f"({limits.land_s:g} s); fly lower or allow more time"
         )
-    _check_volume(envelope, config)
-    refused = config.controller.refusal(track)
-    if refused:
-        raise DocumentError(f"controller: {refused}")
-    return track
-
-
-def _check_volume(envelope: Envelope, config: FlightConfig) -> None:
-    """The reference must stay within the volume whose limits end a flight. Raises DocumentError."""
-    limits = config.limits
-    reached = (
-        (envelope.height_max_m, "above", "limits.ceiling_m", limits.ceiling_m),
-        (envelope.radius_max_m, "away from", "limits.radius_m", limits.radius_m),
-    )
-    for reached_m, where, limit, limit_m in reached:
-        if reached_m > limit_m:
+    for reached_m, where, limit, limit_m in (
+        (height_m, "above", "limits.ceiling_m", limits.ceiling_m),
+        (radius_m, "away from", "limits.radius_m", limits.radius_m),
+    ):
+        if reached_m > limit_m:  # beyond, a flight is ended
             raise DocumentError(
                 f"reference {config.reference.title}: it goes {reached_m:.4g} m {where} the "
                 f"take-off point, beyond {limit} ({limit_m:g} m); fly nearer or raise the limit"
             )
+    refused = config.controller.refusal(track)
+    if refused:
+        raise DocumentError(f"controller: {refused}")
+    return track
 
 
 def build_controller(config: FlightConfig) -> Controller:
