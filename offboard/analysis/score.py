@@ -11,7 +11,6 @@ import math
 import operator
 import re
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,7 @@ from offboard.documents.errors import UserError, plain
 from offboard.flight.flight import Outcome
 from offboard.flight.outbox import Refusal
 from offboard.flight.phases import PHASE_CODES, ExitCode, Phase
-from offboard.link.log import LogError
+from offboard.link.log import LogError, replace_file
 
 Array = NDArray[np.float64]
 NAN = math.nan
@@ -175,13 +174,10 @@ def judged(outcome: Outcome, score: Score) -> Outcome:
 def keep_score(directory: Path, score: Score, flown: History) -> None:
     """Write score.json into a flight directory; a score that is there stays until the new one is
     complete. Raises LogError."""
-    path, incomplete = directory / "score.json", directory / "score.json.part"
+    path = directory / "score.json"
     try:
-        incomplete.write_text(as_text(score, flown), encoding="utf-8")
-        incomplete.replace(path)
+        replace_file(path, as_text(score, flown))
     except OSError as error:
-        with suppress(OSError):
-            incomplete.unlink()
         raise LogError(f"{path} cannot be written ({error.strerror})") from None
 
 

@@ -264,13 +264,13 @@ class Campaign:
         write = self.results.write
         for case in self.cases:
             if (name := case.scenario_file) and not (path := self.directory / name).exists():
-                write(path, case.scenario_text.encode())
-        write(self.directory / "campaign.csv", as_csv(columns(rows)).encode())
+                write(path, case.scenario_text)
+        write(self.directory / "campaign.csv", as_csv(columns(rows)))
         absent = len(self.cases) - len(rows)
         missing = [f"{absent} of {len(self.cases)} flights are not flown yet"] if absent else []
         missing += [stopped] if stopped else []
         text = page(groups(rows, self.drawn), missing, self._links)
-        write(self.directory / "campaign.html", text.encode())
+        write(self.directory / "campaign.html", text)
 
     def _links(self, row: Row) -> dict[str, str]:
         """Files of a kept flight by name, relative to the page."""

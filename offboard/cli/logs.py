@@ -20,7 +20,6 @@ from offboard.cli.shared import (
     check_new,
     complain,
     err,
-    free_name,
     grouped,
     keep,
     option,
@@ -31,6 +30,7 @@ from offboard.cli.shared import (
     write_new,
 )
 from offboard.documents.errors import UserError
+from offboard.link.log import free_name
 
 
 def score(

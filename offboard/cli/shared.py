@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import inspect
-import itertools
 import re
 import sys
 from collections.abc import Callable
@@ -211,12 +210,6 @@ def check_new(path: Path, option_name: str) -> None:
         raise UserError(f"{path} exists already; choose another file with {option_name}")
     if not path.parent.is_dir():
         raise UserError(f"{option_name} {path}: there is no directory {path.parent}")
-
-
-def free_name(path: Path) -> Path:
-    """`path`, or the first of NAME-2, NAME-3 ... that does not exist."""
-    numbered = (path.with_stem(f"{path.stem}-{number}") for number in itertools.count(2))
-    return next(each for each in itertools.chain([path], numbered) if not each.exists())
 
 
 def write_new(path: Path, text: str) -> None:

@@ -64,7 +64,7 @@ SETTINGS = SessionSettings(component_id=COMPONENT_ID, record_component_id=RECORD
 class Connection:
     """A vehicle at a link. `system_id`: its own, where several send; `signing_key`: a key file."""
 
-    address: str = "udpin:127.0.0.1:14540"
+    address: str
     system_id: int | None = None
     signing_key: Path | None = None
 
