@@ -139,12 +139,12 @@ class Track:
     @property
     def track_end_s(self) -> float:
         """End of the scored part."""
-        return self.run_in_s + self.cruise_s
+        return self.track_start_s + self.cruise_s
 
     @property
     def duration_s(self) -> float:
         """The time at which it comes to rest."""
-        return self.run_in_s + self.cruise_s + self.run_out_s
+        return self.track_end_s + self.run_out_s
 
     def path_time_s(self, time_s: float) -> float:
         """The path's own time at `time_s`: of a table, the time in its rows, from the first."""

@@ -257,7 +257,7 @@ def _draw(
 def _phase_shapes(flight: Flight) -> list[dict[str, Any]]:
     """A band where the track was flown, and a line where each phase begins."""
     shapes: list[dict[str, Any]] = []
-    for event, begin_s, end_s in timeline.spans(flight.history.phases, flight):
+    for event, begin_s, end_s in timeline.phases(flight):
         place = {"xref": "x", "yref": "paper", "x0": begin_s, "y0": 0, "y1": 1, "layer": "below"}
         line = {"color": GREY, "width": 1}
         if math.isfinite(event.time_s):

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from offboard.analysis.history import Event
 from offboard.analysis.page import BLUE_BAND, GREY_BAND, ORANGE_BAND
 from offboard.analysis.verdict import irregular
 from offboard.flight.outbox import Refusal
 from offboard.flight.phases import Phase
+from offboard.mavlink.event_record import SUPERVISOR
 from offboard.report.flight import Flight
 
-_ENDED_EARLY = {Phase.HOLD, Phase.STAND_DOWN, Phase.YIELDED, Phase.FAILED}
+_ENDED_EARLY = {"hold", "stand down", "yielded", "failed", SUPERVISOR}
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +33,7 @@ def bands(flight: Flight) -> list[Entry]:
     """Phases of offboard, and modes of the vehicle; the mode of its setpoints is blue."""
     found = [
         Entry("phase", begin_s, event.what, end_s, event.phase, _colour(event.phase))
-        for event, begin_s, end_s in spans(flight.history.phases, flight)
+        for event, begin_s, end_s in phases(flight)
     ]
     dialect = flight.history.dialect
     for event, begin_s, end_s in spans(flight.history.modes, flight):
@@ -59,6 +60,13 @@ def marks(flight: Flight) -> list[Entry]:
     return [mark for mark in found if math.isfinite(mark.begin_s)]
 
 
+def phases(flight: Flight) -> list[tuple[Event, float, float]]:
+    """The spans of the phases of offboard; the last one ends where the supervisor takes over."""
+    said = [event for event in flight.history.announcements if event.cause == SUPERVISOR]
+    took_over = [replace(event, phase=SUPERVISOR) for event in said[:1]]
+    return spans([*flight.history.phases, *took_over], flight)
+
+
 def spans(events: Sequence[Event], flight: Flight) -> list[tuple[Event, float, float]]:
     """Each event until the next one; the first may be older than telemetry."""
     begins = [flight.begin_s if math.isnan(e.time_s) else e.time_s for e in events]
@@ -70,4 +78,4 @@ def spans(events: Sequence[Event], flight: Flight) -> list[tuple[Event, float, f
 def _colour(phase: str) -> str:
     if phase == Phase.TRACK.value:
         return BLUE_BAND
-    return ORANGE_BAND if phase in {each.value for each in _ENDED_EARLY} else GREY_BAND
+    return ORANGE_BAND if phase in _ENDED_EARLY else GREY_BAND
