@@ -22,7 +22,7 @@ from offboard.analysis import tlog
 from offboard.analysis.history import Event, History, gather
 from offboard.analysis.tracking import passed_s, tracking_metrics, window_of
 from offboard.analysis.verdict import begin_times, verdict_metrics
-from offboard.documents.errors import UserError, plain
+from offboard.documents.errors import UserError, meant, plain
 from offboard.flight.flight import Outcome
 from offboard.flight.outbox import Refusal
 from offboard.flight.phases import PHASE_CODES, ExitCode, Phase
@@ -235,7 +235,8 @@ class Requirement:
             )
         metric, comparison, number = match.groups()
         if metric not in METRICS:
-            raise UserError(f"there is no metric {metric!r}; there are {', '.join(METRICS)}")
+            near = meant(metric, METRICS) or ";"
+            raise UserError(f"there is no metric {metric!r}{near} there are {', '.join(METRICS)}")
         return cls(metric, comparison, float(number))
 
     def met(self, metrics: Mapping[str, float]) -> bool:

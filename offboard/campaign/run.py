@@ -25,7 +25,7 @@ from offboard.campaign.flight import Job
 from offboard.campaign.results import Record, Results, code_hash
 from offboard.campaign.table import Row, as_csv, columns, groups, row_of
 from offboard.campaign.workers import Flyer, OpenFlyer
-from offboard.documents.errors import DocumentError, UserError, naming
+from offboard.documents.errors import DocumentError, UserError, counted, naming
 from offboard.link import clock
 from offboard.link.stop import StopRequests
 from offboard.run.configuration import build_controller, build_track
@@ -60,7 +60,7 @@ class Counter(Status):
         self._known += known
         if not self._flown:
             already = f", {self._known} already flown" if self._known else ""
-            self._show(f"{self.planned} flights{already}")
+            self._show(f"{counted(self.planned, 'flight')}{already}")
 
     def ended(self) -> None:
         """A flight has ended."""

@@ -27,7 +27,7 @@ from offboard.cli.shared import (
     write_new,
 )
 from offboard.documents import shipped
-from offboard.documents.errors import UserError
+from offboard.documents.errors import UserError, counted
 
 if TYPE_CHECKING:
     from offboard.campaign.run import Campaign, Summary
@@ -119,17 +119,18 @@ def conclude(summary: Summary, flown: Campaign) -> None:
     if 0 < len(found) <= GROUPS_SHOWN:
         out.print()
         show(out, found)
-    flights = f"{len(summary.rows)} flights, {summary.failed} failed"
+    flights = f"{counted(len(summary.rows), 'flight')}, {summary.failed} failed"
     say(f"{flights}, {summary.missing} not flown yet" if summary.missing else flights)
     if summary.kept:
-        say(f"kept: {len(summary.kept)} flights; `offboard report {summary.kept[0]}` shows one")
+        kept = counted(len(summary.kept), "flight")
+        say(f"kept: {kept}; `offboard report {summary.kept[0]}` shows one")
     say(f"written: {directory / 'campaign.csv'} and campaign.html")
     if summary.stopped or summary.mine_missing:
         why = summary.stopped or "interrupted"
         missing = f"{summary.mine_missing} of {summary.planned} flights are missing"
         raise UserError(f"{why}: {missing}; go on with the same command and --out {directory}", 4)
     if summary.failed:
-        raise UserError(f"{summary.failed} flights failed; the table says why", 1)
+        raise UserError(f"{counted(summary.failed, 'flight')} failed; the table says why", 1)
 
 
 def _search(flown: Campaign, source: str, count: int, open_workers: OpenFlyer) -> None:

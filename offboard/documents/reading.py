@@ -10,7 +10,6 @@ column of its key, the value and what is allowed, in pydantic's words:
 
 from __future__ import annotations
 
-import difflib
 import json
 import math
 import re
@@ -22,7 +21,7 @@ from pydantic import BaseModel, ValidationError
 from yaml.representer import SafeRepresenter
 
 from offboard.documents.errors import DocumentError as DocumentError
-from offboard.documents.errors import abridged, shown
+from offboard.documents.errors import abridged, meant, shown
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -215,10 +214,8 @@ def _unknown_key(path: str, model: type[BaseModel]) -> str:
         field = getattr(section, "model_fields", {}).get(name)
         section = field and field.annotation
     known = sorted(getattr(section, "model_fields", ()))
-    near = difflib.get_close_matches(key, known, n=1)
-    hint = f", did you mean {near[0]}?" if near else ""
     all_known = f" (known keys: {', '.join(known)})" if known else ""
-    return f"{path} is not a known key{hint}{all_known}"
+    return f"{path} is not a known key{meant(key, known)}{all_known}"
 
 
 def _key_path(detail: ErrorDetails, document: Any) -> str:

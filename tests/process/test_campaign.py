@@ -305,7 +305,7 @@ def test_what_is_finished_on_a_full_disk_is_kept_and_a_worker_of_its_own_flies_t
     write, failed = Path.write_bytes, []
 
     def full(path: Path, data: bytes) -> int:
-        if failed:
+        if failed or "results" not in path.parts:
             return write(path, data)
         failed.append(write(path, data[:10]))
         raise OSError(28, "No space left on device")

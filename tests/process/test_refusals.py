@@ -65,6 +65,7 @@ def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
         ("--set", "vehicle.hover_thrust=0.92", "0.92 exceeds limits.hover_thrust (0.9)"),
         ("--set", SWARM, "particles x iterations must be at most 500000, not 1000000000"),
         ("--require", "rmse<1", "there is no metric 'rmse'; there are completed, touchdown_mps,"),
+        ("--require", "rmse_position<1", "'rmse_position', did you mean rmse_position_m? there"),
         ("--connect", "udpin:127.0.0.1:0", "give the port that the vehicle sends to"),
         ("--connect", "udpin:127.0.0.1", "is not understood; use udpin:HOST:PORT"),
         ("--connect", "udpin:::1:14540", "an IPv6 address stands in brackets, as in udpin:[::1]"),
