@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.analysis.tlog import LoggedMessage, Tlog, TlogError, layout
+from offboard.analysis.tlog import LoggedMessage, Tlog, layout
+from offboard.documents.errors import UserError
 from offboard.flight import record
 from offboard.flight.phases import PHASE_CODES
 from offboard.flight.record import (
@@ -188,12 +189,12 @@ def gather(log: Tlog) -> History:
 
 def configuration(log: Tlog) -> str | None:
     """The configuration of the flight as YAML (see `run.configuration.flown`), None without.
-    Raises TlogError."""
+    Raises UserError."""
     pieces = (entry.tunnelled for entry in log if record_type(entry) == record.CONFIGURATION_TYPE)
     try:
         return record.joined_configuration(pieces)
     except ValueError as error:
-        raise TlogError(f"{log.path}: {error}") from None
+        raise UserError(f"{log.path}: {error}") from None
 
 
 def record_type(entry: LoggedMessage) -> int | None:

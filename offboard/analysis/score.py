@@ -153,7 +153,7 @@ def score_flight(flight: Path) -> tuple[Score, History]:
     """Score a flight from its log alone.
 
     `flight` is a flight directory or a .tlog file. Returns the values, and columns and events of
-    the log. Raises TlogError.
+    the log. Raises UserError.
 
     Example:
 

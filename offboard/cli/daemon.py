@@ -114,8 +114,7 @@ def may_pass(error: UserError | OSError) -> bool:
 
 
 def _print_unit(options: FlightOptions, out_directory: Path | None) -> None:
-    """Print the unit, and on stderr what its user cannot read. Raises UserError and
-    KeyFileError."""
+    """Print the unit, and on stderr what its user cannot read. Raises UserError."""
     import offboard
     from offboard.documents.signing_key import read_key
     from offboard.service.daemon import unit, unreadable

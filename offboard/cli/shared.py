@@ -226,7 +226,7 @@ def requirements_of(texts: list[str] | None) -> list[Requirement]:
 
 
 def scored(flight: Path) -> tuple[Score, History]:
-    """Score a flight and keep the score in its directory. Raises TlogError."""
+    """Score a flight and keep the score in its directory. Raises UserError."""
     from offboard.analysis.score import score_flight
 
     result, history = score_flight(flight)

@@ -14,7 +14,7 @@ import json
 import math
 import re
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -137,15 +137,18 @@ def override(mapping: Mapping[str, Any], assignment: str, option: str = "") -> J
     return changed
 
 
-def validate(mapping: Mapping[str, Any], model: type[M], source: str) -> M:
+def validate(
+    mapping: Mapping[str, Any], model: type[M], source: str, extra: Literal["ignore"] | None = None
+) -> M:
     """Raw mapping -> an instance of `model`. Raises DocumentError with the problems
     found, at most PROBLEMS_MOST of them.
 
-    `source` names the file in errors about what has no place in it.
+    `source` names the file in errors about what has no place in it; with `extra` the keys that
+    `model` does not have are ignored.
     """
     try:
         # as JSON: strict about scalars, yet a list may become a tuple and text an enum
-        return model.model_validate_json(json.dumps(mapping), strict=True)
+        return model.model_validate_json(json.dumps(mapping), strict=True, extra=extra)
     except ValidationError as error:
         details = error.errors(include_url=False)
         problems = [
@@ -155,22 +158,6 @@ def validate(mapping: Mapping[str, Any], model: type[M], source: str) -> M:
         if len(details) > PROBLEMS_MOST:
             problems.append(f"{source}: and {len(details) - PROBLEMS_MOST} more problems")
         raise DocumentError(*problems) from None
-
-
-def known(mapping: Mapping[str, Any], model: type[M]) -> Json:
-    """A copy of `mapping` without the keys that `model` does not have."""
-    kept: Json = json.loads(json.dumps(mapping))
-    try:
-        model.model_validate_json(json.dumps(mapping), strict=True)
-    except ValidationError as error:
-        for detail in error.errors(include_url=False):
-            if detail["type"] == "extra_forbidden":
-                *path, key = _key_path(detail, mapping).split(".")
-                section: Any = kept
-                for part in path:
-                    section = section[int(part)] if isinstance(section, list) else section[part]
-                del section[key]
-    return kept
 
 
 def _origin(detail: ErrorDetails, mapping: Mapping[str, Any], source: str) -> str:

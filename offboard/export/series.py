@@ -64,7 +64,7 @@ def phase_name(number: float) -> str:
 
 
 def read(path: Path) -> History:
-    """The flight in a directory or .tlog. Raises TlogError, or UserError without telemetry."""
+    """The flight in a directory or .tlog. Raises UserError, also without telemetry."""
     log = tlog.read(tlog.find(path))
     flown = gather(log)
     if not any(map(len, (flown.position, flown.attitude))):

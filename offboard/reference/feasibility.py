@@ -24,10 +24,6 @@ _STEP_S = 0.01
 _CHUNK = 20_000
 
 
-class InfeasibleReference(ValueError):
-    """The reference exceeds a limit: one sentence with quantity, time, value and limit."""
-
-
 class Envelope(NamedTuple):
     """The greatest tilt, height and horizontal distance from the take-off point."""
 
@@ -52,7 +48,7 @@ def check(reference: Reference, vehicle: Vehicle) -> Envelope:
     """Check that a vehicle can fly a reference without wind; return what it reaches.
 
     The reference, relative to the take-off point, is sampled every 10 ms. Raises
-    InfeasibleReference for a path that is too low or too far away, otherwise for the limit that is
+    ValueError for a path that is too low or too far away, otherwise for the limit that is
     exceeded first; of a track it names the path's own time, as a table has it.
     """
     count = int(np.ceil(reference.duration_s / _STEP_S)) + 1
@@ -78,7 +74,7 @@ def _envelope(reference: Reference, vehicle: Vehicle, times: Array) -> Envelope:
         worst_s, first_s = float(times[worst]), float(times[first])
         if isinstance(reference, Track):
             worst_s, first_s = map(reference.path_time_s, (worst_s, first_s))
-        raise InfeasibleReference(
+        raise ValueError(
             f"the reference asks for {demand.what} {demand.values[worst]:.3g} {demand.unit} at "
             f"{worst_s:.2f} s, beyond the limit of {demand.limit:.3g} {demand.unit} "
             f"(first at {first_s:.2f} s)"

@@ -61,7 +61,7 @@ class Recording:
 
 
 def read(flight: Path) -> Recording:
-    """The recording in a flight directory or .tlog. Raises UserError or TlogError."""
+    """The recording in a flight directory or .tlog. Raises UserError."""
     path = tlog.find(flight)
     log = tlog.read(path)
     configuration = history.configuration(log)

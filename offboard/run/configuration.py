@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import yaml
@@ -28,7 +28,6 @@ from offboard.documents.reading import (
     DocumentError,
     check_kind,
     kind_of,
-    known,
     override,
     read,
     validate,
@@ -198,17 +197,16 @@ def flown(text: str) -> FlightConfig:
     """The configuration in a log (`dump`ed then), without settings that no longer exist. Raises
     DocumentError."""
     source = "the log's configuration"
-    return _validated(read(text, source), source, ignores_unknown=True)
+    return _validated(read(text, source), source, "ignore")
 
 
-def _validated(raw: Raw, source: str, *, ignores_unknown: bool = False) -> FlightConfig:
-    """`raw` as a FlightConfig whose parts have the classes that they name."""
+def _validated(raw: Raw, source: str, extra: Literal["ignore"] | None = None) -> FlightConfig:
+    """`raw` as a FlightConfig whose parts have the classes that they name; `extra` as in
+    `validate`."""
     models = {part: _model(part, raw.get(part), f"{source}: {part}") for part in PARTS}
     parts: dict[str, Any] = {part: (model, ...) for part, model in models.items()}
     model = create_model("FlightConfig", __base__=FlightConfig, **parts)
-    if ignores_unknown:
-        raw = known(raw, model)
-    return FlightConfig(**dict(validate(raw, model, source)))
+    return FlightConfig(**dict(validate(raw, model, source, extra)))
 
 
 def _complete(config: FlightConfig) -> FlightConfig:
