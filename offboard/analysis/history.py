@@ -54,7 +54,7 @@ _TUNNEL = 385  # message id
 _ARMED = 0x80  # MAV_MODE_FLAG_SAFETY_ARMED
 _NO_VOLTAGE, _NO_PERCENTAGE = 0xFFFF, -1  # of SYS_STATUS
 _WRAP_MS = 2**32
-_PHASES: dict[int | None, str] = {code: phase.value for phase, code in PHASE_CODES.items()}
+PHASES: dict[int | None, str] = {code: phase.value for phase, code in PHASE_CODES.items()}
 BOOT_MS, BOOT_US, BEFORE = "time_boot_ms", "time_usec", ""  # stamps of messages
 # columns of a message: name -> the first of its fields and how many values, in an array from where
 Columns = Mapping[str, tuple[str, int] | tuple[str, int, int]]
@@ -411,7 +411,7 @@ class _Collector:
         events = []
         for last, event in event_record.join(payload for *_, payload in self._event_records):
             time_s, unix_s, _ = self._event_records[last]
-            phase = _PHASES.get(event.phase, "")
+            phase = PHASES.get(event.phase, "")
             events.append(Event(time_s, "offboard", event.text, phase, event.cause, unix_s))
         return History(
             position=position,

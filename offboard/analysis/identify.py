@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import yaml
@@ -146,27 +145,19 @@ def _line(entry: str, comment: str) -> str:
 # ---------------------------------------------------------------------- estimator's noise
 
 
-@dataclass(frozen=True, slots=True)
-class EstimatorNoise:
-    """Standard deviations; NaN where the trace is too short. The first three are white noise of
+def estimator_noise(trace: Trace) -> tuple[float, float, float, float]:
+    """Noise of the vehicle's estimator in a stretch of flight.
+
+    Standard deviations; NaN where the trace is too short. The first three are white noise of
     position (m), reported velocity (m/s) and thrust direction (rad); the last one is reported
     velocity less the derivative of reported position (m/s), as means over MEAN_OVER_S."""
-
-    position_m: float
-    velocity_mps: float
-    attitude_rad: float
-    velocity_contradiction_mps: float
-
-
-def estimator_noise(trace: Trace) -> EstimatorNoise:
-    """Noise of the attitudes, positions and velocities in a stretch of flight."""
     stamps, velocity = trace.position[:, STAMP], trace.position[:, VELOCITY]
     direction = trace.attitude[:, NORTH : NORTH + 2]
-    return EstimatorNoise(
-        position_m=_white_sd(stamps, trace.position[:, POSITION]),
-        velocity_mps=_white_sd(stamps, velocity),
-        attitude_rad=_white_sd(trace.attitude[:, STAMP], direction),
-        velocity_contradiction_mps=_velocity_contradiction(trace),
+    return (
+        _white_sd(stamps, trace.position[:, POSITION]),
+        _white_sd(stamps, velocity),
+        _white_sd(trace.attitude[:, STAMP], direction),
+        _velocity_contradiction(trace),
     )
 
 

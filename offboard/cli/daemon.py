@@ -14,14 +14,13 @@ from offboard.cli.shared import (
     FLIGHTS,
     FlightOptions,
     Report,
-    complain,
     grouped,
     option,
     out,
     say,
     write,
 )
-from offboard.documents.command_line import DISK_ERRORS, explained
+from offboard.documents.command_line import DISK_ERRORS, complain, explained
 from offboard.documents.errors import UserError
 from offboard.documents.shipped import is_file
 

@@ -18,7 +18,6 @@ from offboard.cli.shared import (
     Requirements,
     SimulatorOptions,
     check_new,
-    complain,
     err,
     grouped,
     keep,
@@ -29,6 +28,7 @@ from offboard.cli.shared import (
     scored,
     write_new,
 )
+from offboard.documents.command_line import complain
 from offboard.documents.errors import UserError
 from offboard.link.log import free_name
 

@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 from rich.console import Console
 
-from offboard.documents.command_line import complain as complain
-from offboard.documents.command_line import wrapped
+from offboard.documents.command_line import complain, wrapped
 from offboard.documents.errors import UserError, shown
 from offboard.link.log import new_file
 

@@ -20,8 +20,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 from yaml.representer import SafeRepresenter
 
-from offboard.documents.errors import DocumentError as DocumentError
-from offboard.documents.errors import abridged, meant, shown
+from offboard.documents.errors import DocumentError, abridged, meant, shown
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails

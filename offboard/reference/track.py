@@ -228,20 +228,9 @@ class Moved:
             clock = self._clock(time.reshape(-1))
             inner = self.reference.sample(clock[0])
             jet = np.zeros((5, time.size, 4))
-            jet[..., :HEADING] = (
-                inner.position_ned_m,
-                inner.velocity_ned_mps,
-                inner.acceleration_ned_mps2,
-                inner.jerk_ned_mps3,
-                inner.snap_ned_mps4,
-            )
-            jet[:3, :, HEADING] = (
-                inner.heading_rad,
-                inner.heading_rate_radps,
-                inner.heading_acceleration_radps2,
-            )
+            jet[..., :HEADING], jet[:3, :, HEADING] = inner[:5], inner[5:]
             sample = _composed(clock, jet, time.shape)
-        return replace(sample, position_ned_m=sample.position_ned_m + np.array(self.origin_ned_m))
+        return sample._replace(position_ned_m=sample.position_ned_m + np.array(self.origin_ned_m))
 
     def _clock(self, time_s: Array) -> Array:
         """The reference's own time and its first four derivatives (5, N) at `time_s` (N,)."""

@@ -54,12 +54,11 @@ def fits(found: Identified, trace: Trace, prior: Vehicle) -> Fits:
 
 
 def _noise(trace: Trace) -> str:
-    noise = estimator_noise(trace)
+    position_m, velocity_mps, attitude_rad, differ_mps = estimator_noise(trace)
     return (
-        f"Noise of the autopilot's estimate from sample to sample: position "
-        f"{1e3 * noise.position_m:.2g} mm, velocity {1e3 * noise.velocity_mps:.2g} mm/s, attitude "
-        f"{1e3 * noise.attitude_rad:.2g} mrad. Over half a second its velocity and the change of "
-        f"its position differ by {noise.velocity_contradiction_mps:.2g} m/s."
+        f"Noise of the autopilot's estimate from sample to sample: position {1e3 * position_m:.2g} "
+        f"mm, velocity {1e3 * velocity_mps:.2g} mm/s, attitude {1e3 * attitude_rad:.2g} mrad. Over "
+        f"half a second its velocity and the change of its position differ by {differ_mps:.2g} m/s."
     )
 
 

@@ -22,10 +22,9 @@ from pydantic import BaseModel, Field, SerializeAsAny, create_model
 from offboard.control import catalogue
 from offboard.control.base import Controller, ControllerSettings
 from offboard.documents import shipped
-from offboard.documents.errors import located
+from offboard.documents.errors import DocumentError, located
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import (
-    DocumentError,
     check_kind,
     kind_of,
     override,

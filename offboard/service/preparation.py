@@ -22,7 +22,8 @@ from pathlib import Path
 import yaml
 from pydantic import BaseModel, ConfigDict, Field
 
-from offboard.documents.reading import DocumentError, read, validate
+from offboard.documents.errors import DocumentError
+from offboard.documents.reading import read, validate
 from offboard.documents.shipped import read_text
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_estimate import IdentifiedVehicle
