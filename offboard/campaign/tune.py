@@ -31,8 +31,8 @@ from offboard.campaign.table import CONFIDENCE, FIGURE_COLUMNS
 from offboard.documents.errors import DocumentError, naming
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import override, parse, read
-from offboard.documents.shipped import locate, read_text
-from offboard.run.configuration import PARTS, read_part
+from offboard.documents.shipped import PARTS, locate, read_text
+from offboard.run.configuration import read_part
 
 
 def _figure(name: str) -> str:

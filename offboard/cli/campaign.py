@@ -53,7 +53,9 @@ def campaign(
     shard: Annotated[
         str | None, option("I/N", "Fly part I of N; the same --out, or copied together.")
     ] = None,
-    worst: Annotated[int | None, option("K", "Search for K failures that differ instead.")] = None,
+    worst: Annotated[
+        int | None, option("K", "Search for K failures that differ instead.", min=1, max=100)
+    ] = None,
 ) -> None:
     """Fly many flights and put them into one table.
 
@@ -67,8 +69,8 @@ def campaign(
     flight failed; 2 usage or configuration error; 4 flights are missing: the same command goes
     on.
     """
-    if worst is not None and (shard or not 1 <= worst <= 100):
-        raise UserError("--worst takes 1 .. 100, and no --shard: a search is one whole")
+    if worst and shard:
+        raise UserError("--worst takes no --shard: a search is one whole")
     if scheduler and workers:
         raise UserError("--scheduler has its own workers: use it or --workers, not both")
     with out.status("planning"):
@@ -161,7 +163,9 @@ def compare(
     controllers: Annotated[str, option("LIST", f"{NAMES}, or 'all'.")] = "pso,lqr,paper",
     reference: Annotated[str, option("LIST", f"{NAMES}.")] = "lemniscate",
     scenario: Annotated[str | None, option("LIST", f"{NAMES}.  [default: {SCENARIOS}]")] = None,
-    seeds: Annotated[int, option("N", "Flights of each combination, with seeds 1 .. N.")] = 3,
+    seeds: Annotated[
+        int, option("N", "Flights of each combination, with seeds 1 .. N.", min=1, max=1000)
+    ] = 3,
     vehicle: Vehicle = None,
     connect: Annotated[
         str | None,
@@ -188,8 +192,6 @@ def compare(
         raise UserError("--system and --signing-key are options of --connect: add it")
     if connect and (scenario or workers):
         raise UserError("--scenario and --workers are options of the simulator: omit them")
-    if not 1 <= seeds <= 1000:
-        raise UserError(f"--seeds {seeds}: give 1 .. 1000")
     laws = _names("--controllers", controllers, shipped.names("controller"))
     references = _names("--reference", reference)
     scenarios = ["connected"] if connect else _names("--scenario", scenario or SCENARIOS)

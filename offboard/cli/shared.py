@@ -20,6 +20,7 @@ from rich.console import Console
 
 from offboard.documents.command_line import complain, wrapped
 from offboard.documents.errors import UserError, shown
+from offboard.documents.shipped import PARTS
 from offboard.link.log import new_file
 
 if TYPE_CHECKING:
@@ -117,7 +118,7 @@ class FlightOptions:
 
         return load(
             self.config,
-            choices={part: getattr(self, part) for part in ("controller", "reference", "vehicle")},
+            choices={part: getattr(self, part) for part in PARTS},
             assignments=self.assignments or (),
             seed=seed,
             known_vehicle=known_vehicle,

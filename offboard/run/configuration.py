@@ -31,7 +31,7 @@ from offboard.documents.reading import (
     read,
     validate,
 )
-from offboard.documents.shipped import locate, read_text
+from offboard.documents.shipped import PARTS, locate, read_text
 from offboard.flight.phases import Limits
 from offboard.identification.learner import IdentifySettings
 from offboard.model.vehicle import Vehicle
@@ -44,7 +44,6 @@ Raw = dict[str, Any]
 RECORDED_VERSIONS = ("pso-offboard", "pymavlink", "numpy", "scipy", "numba")
 UNKNOWN_VEHICLE = "neutral"
 DESCENT_MPS = 0.5  # slowest default near the ground: ArduCopter LAND_SPEED; MPC_LAND_SPEED is 0.7
-PARTS = ("vehicle", "controller", "reference")  # of a flight, each a file of its own
 
 
 class FlightConfig(Parameters):
