@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import yaml
@@ -84,14 +84,9 @@ def _flown(history: History) -> tuple[float, float]:
     return (times[0] + LIFTED_OFF_S, times[-1]) if len(times) else (-math.inf, math.inf)
 
 
-def rows(found: Identified) -> Iterator[Row]:
-    """Name, estimate, unit, and reason without one of every constant that can be identified."""
-    for constants in _constants(found).values():
-        yield from constants
-
-
-def _constants(found: Identified) -> dict[str, list[Row]]:
-    """The rows by their key in a vehicle file."""
+def constants(found: Identified) -> dict[str, list[Row]]:
+    """Name, estimate, unit, and reason without one of every constant that can be identified, by
+    their key in a vehicle file."""
     by_key: dict[str, list[Row]] = {}
     for constant, estimate in found.estimates.items():
         *words, last = constant.split("_")
@@ -110,7 +105,7 @@ def vehicle_file(found: Identified, prior: Vehicle, flight: str) -> str:
     `prior`, with the reason why they were not identified. `flight` names the log.
     """
     comments = dict.fromkeys(_KEPT, "not identifiable from telemetry")
-    comments |= {key: _comment(constants) for key, constants in _constants(found).items()}
+    comments |= {key: _comment(rows) for key, rows in constants(found).items()}
     if found.drag_ps:
         comments["drag_translation_npmps"] += " times the mass"
     lines = [f"# Identified from {found.seconds:.0f} s of {flight}; +- is one standard deviation."]
@@ -123,11 +118,11 @@ def vehicle_file(found: Identified, prior: Vehicle, flight: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _comment(constants: Sequence[Row]) -> str:
+def _comment(rows: Sequence[Row]) -> str:
     """Standard deviations of the constants of one key, or why there are none."""
-    known = [(estimate.sd, unit) for _, estimate, unit, _ in constants if estimate]
+    known = [(estimate.sd, unit) for _, estimate, unit, _ in rows if estimate]
     if not known:
-        return f"not identified: {constants[0][-1]}"
+        return f"not identified: {rows[0][-1]}"
     return "+- " + ", ".join(f"{sd:.2g} {unit}".rstrip() for sd, unit in known)
 
 

@@ -25,11 +25,10 @@ from offboard.analysis.score import Score, score
 from offboard.cli.commands import app
 from offboard.flight.phases import Phase
 from offboard.report import report_page
-from offboard.report.figures import figures
+from offboard.report.figures import bands, figures, marks
 from offboard.report.flight import Flight, read
 from offboard.report.panels import thinned
 from offboard.report.report_page import page
-from offboard.report.timeline import bands, marks
 from offboard.run.configuration import load
 from offboard.run.flight import Simulated, fly
 from offboard.run.sitl import InMemorySimulator
