@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.analysis import tlog
-from offboard.analysis.history import Event, History, gather
+from offboard.analysis.history import History, gather
 from offboard.analysis.tracking import passed_s, tracking_metrics, window_of
 from offboard.analysis.verdict import begin_times, verdict_metrics
 from offboard.documents.errors import UserError, meant, plain
@@ -188,18 +188,15 @@ def as_text(score: Score, history: History) -> str:
         "ended_by": score.ended_by,
         "reason": score.reason,
         **score.metrics(),
-        "phases": _events(history.phases),
-        "modes": _events(history.modes),
-        "vehicle_messages": _events(history.vehicle_messages),
+        **{
+            name: [{"time_s": event.time_s, "what": event.what} for event in getattr(history, name)]
+            for name in ("phases", "modes", "vehicle_messages")
+        },
         "messages": dict(sorted(history.messages.items())),
         "wall_s": history.wall_s,
         "damage": history.damage,
     }
     return json.dumps(plain(document), indent=2, allow_nan=False) + "\n"
-
-
-def _events(events: tuple[Event, ...]) -> list[dict[str, Any]]:
-    return [{"time_s": event.time_s, "what": event.what} for event in events]
 
 
 _OPERATORS: dict[str, Callable[[float, float], bool]] = {

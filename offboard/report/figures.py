@@ -42,7 +42,7 @@ from offboard.flight.outbox import Refusal
 from offboard.flight.phases import Phase
 from offboard.mavlink.event_record import SUPERVISOR
 from offboard.report.flight import Flight
-from offboard.report.panels import GROUPS, Curve, Panel, Points, thinned
+from offboard.report.panels import GROUPS, LEAST_SHOWN, Curve, Panel, Points, thinned
 
 # of flights that share a figure, in an order that colour-blind people can tell apart
 COLOURS = (BLUE, ORANGE, GREEN, GREY, PINK, BROWN)
@@ -298,13 +298,14 @@ def _panels(title: str, group: Sequence[Panel], drawn: Sequence[DrawnFlight]) ->
 
 def _known(panel: Panel, drawn: Sequence[DrawnFlight]) -> list[tuple[DrawnFlight, Curve, Points]]:
     """The curves of a panel that have values; of several flights only the main ones."""
-    curves = [
-        (one, each, each.source(one.flight.history))
-        for one in drawn
-        for each in panel.curves
-        if each.main or not one.label
-    ]
-    return [curve for curve in curves if np.isfinite(curve[2][1]).any()]
+    shown = ((one, each) for one in drawn for each in panel.curves if each.main or not one.label)
+    found = []
+    for one, each in shown:
+        times, values, *sd = each.source(one.flight.history)
+        if np.isfinite(values).any():
+            least = LEAST_SHOWN if panel.logarithmic else -math.inf
+            found.append((one, each, (times, np.maximum(values, least), *sd)))
+    return found
 
 
 def _draw(
