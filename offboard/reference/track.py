@@ -172,9 +172,9 @@ def path_end_s(path: Path, run_in_s: float, run_out_s: float) -> float:
     return path.length_s + 0.5 * (run_in_s + run_out_s)
 
 
-def hold(position_ned_m: Triple, heading_rad: float, duration_s: float = 0.0) -> Track:
+def hold(position_ned_m: Triple, heading_rad: float) -> Track:
     """Rest at a point (NED, m) with a heading (rad)."""
-    at_rest = Harmonic(duration_s, bounded=True, offset_ned_m=position_ned_m)
+    at_rest = Harmonic(0.0, bounded=True, offset_ned_m=position_ned_m)
     return Track(at_rest, Fixed(heading_rad))
 
 

@@ -34,7 +34,7 @@ from offboard.paper.closed_loop import (
 )
 from offboard.paper.extensions import receding
 from offboard.paper.law import LimitedBox, PaperLaw, PaperSettings, StateLimits
-from offboard.paper.study import MAKERS, PAGE, check, reproduce
+from offboard.paper.study import MAKERS, PAGE, reproduce
 from offboard.run.configuration import load
 
 Array = NDArray[np.float64]
@@ -262,7 +262,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     out = tmp_path_factory.mktemp("paper")
     with pytest.MonkeyPatch.context() as short:
         short.setattr(closed_loop, "fly", lambda task: fly(replace(task, steps=50)))
-        return out, reproduce(out, seeds=1, console=Console(file=io.StringIO()))
+        return out, reproduce(out, [], 1, Console(file=io.StringIO()))
 
 
 # [name, whether plotly has drawn it, traces, height] of each figure
@@ -301,5 +301,5 @@ def test_the_page_opens_without_a_network_and_shows_everything(run: Run) -> None
 
 def test_bad_options_are_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="there is no figure '3'; known are 4, 5"):
-        check(tmp_path / "never", ["figure 3"])
+        reproduce(tmp_path / "never", ["figure 3"], 1, Console(file=io.StringIO()))
     assert not (tmp_path / "never").exists()
