@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.analysis.tlog import LoggedMessage, Tlog, TlogError, layout
+from offboard.analysis.tlog import LoggedMessage, Tlog, layout
+from offboard.documents.errors import UserError
 from offboard.flight import record
 from offboard.flight.phases import PHASE_CODES
 from offboard.flight.record import (
@@ -53,7 +54,7 @@ _TUNNEL = 385  # message id
 _ARMED = 0x80  # MAV_MODE_FLAG_SAFETY_ARMED
 _NO_VOLTAGE, _NO_PERCENTAGE = 0xFFFF, -1  # of SYS_STATUS
 _WRAP_MS = 2**32
-_PHASES: dict[int | None, str] = {code: phase.value for phase, code in PHASE_CODES.items()}
+PHASES: dict[int | None, str] = {code: phase.value for phase, code in PHASE_CODES.items()}
 BOOT_MS, BOOT_US, BEFORE = "time_boot_ms", "time_usec", ""  # stamps of messages
 # columns of a message: name -> the first of its fields and how many values, in an array from where
 Columns = Mapping[str, tuple[str, int] | tuple[str, int, int]]
@@ -188,12 +189,12 @@ def gather(log: Tlog) -> History:
 
 def configuration(log: Tlog) -> str | None:
     """The configuration of the flight as YAML (see `run.configuration.flown`), None without.
-    Raises TlogError."""
+    Raises UserError."""
     pieces = (entry.tunnelled for entry in log if record_type(entry) == record.CONFIGURATION_TYPE)
     try:
         return record.joined_configuration(pieces)
     except ValueError as error:
-        raise TlogError(f"{log.path}: {error}") from None
+        raise UserError(f"{log.path}: {error}") from None
 
 
 def record_type(entry: LoggedMessage) -> int | None:
@@ -410,7 +411,7 @@ class _Collector:
         events = []
         for last, event in event_record.join(payload for *_, payload in self._event_records):
             time_s, unix_s, _ = self._event_records[last]
-            phase = _PHASES.get(event.phase, "")
+            phase = PHASES.get(event.phase, "")
             events.append(Event(time_s, "offboard", event.text, phase, event.cause, unix_s))
         return History(
             position=position,

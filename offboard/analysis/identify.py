@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 import yaml
@@ -85,14 +84,9 @@ def _flown(history: History) -> tuple[float, float]:
     return (times[0] + LIFTED_OFF_S, times[-1]) if len(times) else (-math.inf, math.inf)
 
 
-def rows(found: Identified) -> Iterator[Row]:
-    """Name, estimate, unit, and reason without one of every constant that can be identified."""
-    for constants in _constants(found).values():
-        yield from constants
-
-
-def _constants(found: Identified) -> dict[str, list[Row]]:
-    """The rows by their key in a vehicle file."""
+def constants(found: Identified) -> dict[str, list[Row]]:
+    """Name, estimate, unit, and reason without one of every constant that can be identified, by
+    their key in a vehicle file."""
     by_key: dict[str, list[Row]] = {}
     for constant, estimate in found.estimates.items():
         *words, last = constant.split("_")
@@ -111,7 +105,7 @@ def vehicle_file(found: Identified, prior: Vehicle, flight: str) -> str:
     `prior`, with the reason why they were not identified. `flight` names the log.
     """
     comments = dict.fromkeys(_KEPT, "not identifiable from telemetry")
-    comments |= {key: _comment(constants) for key, constants in _constants(found).items()}
+    comments |= {key: _comment(rows) for key, rows in constants(found).items()}
     if found.drag_ps:
         comments["drag_translation_npmps"] += " times the mass"
     lines = [f"# Identified from {found.seconds:.0f} s of {flight}; +- is one standard deviation."]
@@ -124,11 +118,11 @@ def vehicle_file(found: Identified, prior: Vehicle, flight: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _comment(constants: Sequence[Row]) -> str:
+def _comment(rows: Sequence[Row]) -> str:
     """Standard deviations of the constants of one key, or why there are none."""
-    known = [(estimate.sd, unit) for _, estimate, unit, _ in constants if estimate]
+    known = [(estimate.sd, unit) for _, estimate, unit, _ in rows if estimate]
     if not known:
-        return f"not identified: {constants[0][-1]}"
+        return f"not identified: {rows[0][-1]}"
     return "+- " + ", ".join(f"{sd:.2g} {unit}".rstrip() for sd, unit in known)
 
 
@@ -146,27 +140,19 @@ def _line(entry: str, comment: str) -> str:
 # ---------------------------------------------------------------------- estimator's noise
 
 
-@dataclass(frozen=True, slots=True)
-class EstimatorNoise:
-    """Standard deviations; NaN where the trace is too short. The first three are white noise of
+def estimator_noise(trace: Trace) -> tuple[float, float, float, float]:
+    """Noise of the vehicle's estimator in a stretch of flight.
+
+    Standard deviations; NaN where the trace is too short. The first three are white noise of
     position (m), reported velocity (m/s) and thrust direction (rad); the last one is reported
     velocity less the derivative of reported position (m/s), as means over MEAN_OVER_S."""
-
-    position_m: float
-    velocity_mps: float
-    attitude_rad: float
-    velocity_contradiction_mps: float
-
-
-def estimator_noise(trace: Trace) -> EstimatorNoise:
-    """Noise of the attitudes, positions and velocities in a stretch of flight."""
     stamps, velocity = trace.position[:, STAMP], trace.position[:, VELOCITY]
     direction = trace.attitude[:, NORTH : NORTH + 2]
-    return EstimatorNoise(
-        position_m=_white_sd(stamps, trace.position[:, POSITION]),
-        velocity_mps=_white_sd(stamps, velocity),
-        attitude_rad=_white_sd(trace.attitude[:, STAMP], direction),
-        velocity_contradiction_mps=_velocity_contradiction(trace),
+    return (
+        _white_sd(stamps, trace.position[:, POSITION]),
+        _white_sd(stamps, velocity),
+        _white_sd(trace.attitude[:, STAMP], direction),
+        _velocity_contradiction(trace),
     )
 
 

@@ -11,7 +11,6 @@ import math
 import operator
 import re
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -20,14 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.analysis import tlog
-from offboard.analysis.history import Event, History, gather
+from offboard.analysis.history import History, gather
 from offboard.analysis.tracking import passed_s, tracking_metrics, window_of
 from offboard.analysis.verdict import begin_times, verdict_metrics
-from offboard.documents.errors import UserError, plain
+from offboard.documents.errors import UserError, meant, plain
 from offboard.flight.flight import Outcome
 from offboard.flight.outbox import Refusal
 from offboard.flight.phases import PHASE_CODES, ExitCode, Phase
-from offboard.link.log import LogError
+from offboard.link.log import LogError, replace_file
 
 Array = NDArray[np.float64]
 NAN = math.nan
@@ -154,7 +153,7 @@ def score_flight(flight: Path) -> tuple[Score, History]:
     """Score a flight from its log alone.
 
     `flight` is a flight directory or a .tlog file. Returns the values, and columns and events of
-    the log. Raises TlogError.
+    the log. Raises UserError.
 
     Example:
 
@@ -175,13 +174,10 @@ def judged(outcome: Outcome, score: Score) -> Outcome:
 def keep_score(directory: Path, score: Score, flown: History) -> None:
     """Write score.json into a flight directory; a score that is there stays until the new one is
     complete. Raises LogError."""
-    path, incomplete = directory / "score.json", directory / "score.json.part"
+    path = directory / "score.json"
     try:
-        incomplete.write_text(as_text(score, flown), encoding="utf-8")
-        incomplete.replace(path)
+        replace_file(path, as_text(score, flown))
     except OSError as error:
-        with suppress(OSError):
-            incomplete.unlink()
         raise LogError(f"{path} cannot be written ({error.strerror})") from None
 
 
@@ -192,18 +188,15 @@ def as_text(score: Score, history: History) -> str:
         "ended_by": score.ended_by,
         "reason": score.reason,
         **score.metrics(),
-        "phases": _events(history.phases),
-        "modes": _events(history.modes),
-        "vehicle_messages": _events(history.vehicle_messages),
+        **{
+            name: [{"time_s": event.time_s, "what": event.what} for event in getattr(history, name)]
+            for name in ("phases", "modes", "vehicle_messages")
+        },
         "messages": dict(sorted(history.messages.items())),
         "wall_s": history.wall_s,
         "damage": history.damage,
     }
     return json.dumps(plain(document), indent=2, allow_nan=False) + "\n"
-
-
-def _events(events: tuple[Event, ...]) -> list[dict[str, Any]]:
-    return [{"time_s": event.time_s, "what": event.what} for event in events]
 
 
 _OPERATORS: dict[str, Callable[[float, float], bool]] = {
@@ -239,7 +232,8 @@ class Requirement:
             )
         metric, comparison, number = match.groups()
         if metric not in METRICS:
-            raise UserError(f"there is no metric {metric!r}; there are {', '.join(METRICS)}")
+            near = meant(metric, METRICS) or ";"
+            raise UserError(f"there is no metric {metric!r}{near} there are {', '.join(METRICS)}")
         return cls(metric, comparison, float(number))
 
     def met(self, metrics: Mapping[str, float]) -> bool:

@@ -63,8 +63,9 @@ def verdict(score: Score) -> str:
         return score.ended_by
     if score.completed:
         return "completed"
-    if score.reason in ("", score.ended_by):
-        return f"not completed: {score.ended_by}"
+    said = score.reason or score.ended_by
+    if said.startswith(score.ended_by):
+        return f"not completed: {said}"
     return f"not completed ({score.ended_by}): {score.reason}"
 
 

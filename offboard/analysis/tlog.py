@@ -30,10 +30,6 @@ _BLOCK = 1 << 20
 _TUNNEL_BYTES = 133  # payload_type, target system and component, payload_length, 128 of data
 
 
-class TlogError(UserError):
-    """A file that cannot be read as a .tlog."""
-
-
 class LoggedMessage(NamedTuple):
     """One frame and the time at which it was sent or received."""
 
@@ -90,7 +86,7 @@ class Tlog:
             with self.path.open("rb") as file:
                 yield from self._messages(file)
         except OSError as error:
-            raise TlogError(f"{self.path} cannot be read: {error.strerror}") from None
+            raise UserError(f"{self.path} cannot be read: {error.strerror}") from None
 
     def _messages(self, file: BinaryIO) -> Iterator[LoggedMessage]:
         data, at, before = b"", 0, 0  # `before`: bytes of the file before `data`
@@ -121,7 +117,7 @@ class Tlog:
         else:
             self.truncated = before + len(data) - (before + at if lost is None else lost)
         if not found:
-            raise TlogError(
+            raise UserError(
                 f"{self.path} is not a .tlog, or empty: it holds no time stamp and MAVLink frame"
             )
 
@@ -154,16 +150,16 @@ def _begins(data: bytes, at: int) -> bool:
 
 
 def find(flight: Path) -> Path:
-    """The .tlog of a flight, given as flight directory or as file. Raises TlogError."""
+    """The .tlog of a flight, given as flight directory or as file. Raises UserError."""
     path = flight / "flight.tlog" if flight.is_dir() else flight
     if not path.is_file():
         problem = "is not a regular file" if path.exists() else "does not exist"
-        raise TlogError(f"{abridged(path)} {problem}; name a flight directory or a .tlog file")
+        raise UserError(f"{abridged(path)} {problem}; name a flight directory or a .tlog file")
     return path
 
 
 def read(path: Path) -> Tlog:
-    """A log to iterate over. Raises TlogError where the file is no .tlog or cannot be read."""
+    """A log to iterate over. Raises UserError where the file is no .tlog or cannot be read."""
     log = Tlog(path)
     next(iter(log))
     return log

@@ -118,7 +118,7 @@ class Case:
         disarmed = ("limits.begin_armed=false",) if self.link else ()
         return load(
             self.config,
-            choices={part: getattr(self, part) for part in ("vehicle", "controller", "reference")},
+            choices={part: getattr(self, part) for part in shipped.PARTS},
             assignments=(*disarmed, *self.assignments),
             seed=self.seed,
             known_vehicle=None if self.link else self.simulated().known_vehicle,

@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import platform
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from importlib.metadata import version
@@ -20,6 +18,7 @@ from pathlib import Path
 
 from offboard.documents import shipped
 from offboard.documents.errors import UserError
+from offboard.link.log import replace_file
 from offboard.run.sitl import registered
 
 # of plans, whose flights are hashed case by case
@@ -89,23 +88,17 @@ class Results:
 
     def put(self, key: str, record: Record) -> None:
         """Store a record at once. Raises UserError, for example when the disk is full."""
-        text = json.dumps(asdict(record), sort_keys=True)
-        self.write(self._folder / f"{key}.json", text.encode())
+        self.write(self._folder / f"{key}.json", json.dumps(asdict(record), sort_keys=True))
 
     def finished(self) -> int:
         """The number of finished flights in the folder."""
         return sum(1 for _ in self._folder.glob("*.json"))
 
-    def write(self, path: Path, data: bytes) -> None:
+    def write(self, path: Path, text: str) -> None:
         """Write a file of the campaign, whole or not at all. Raises UserError."""
-        incomplete = path.with_name(f".{path.name}.{os.getpid()}")
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            incomplete.write_bytes(data)
-            incomplete.replace(path)
+            replace_file(path, text)
         except OSError as error:
-            with suppress(OSError):
-                incomplete.unlink()
             raise UserError(
                 f"{self.directory} cannot be written ({error.strerror}); finished flights are kept"
             ) from None

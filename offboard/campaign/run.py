@@ -25,7 +25,7 @@ from offboard.campaign.flight import Job
 from offboard.campaign.results import Record, Results, code_hash
 from offboard.campaign.table import Row, as_csv, columns, groups, row_of
 from offboard.campaign.workers import Flyer, OpenFlyer
-from offboard.documents.errors import DocumentError, UserError, naming
+from offboard.documents.errors import DocumentError, UserError, counted, naming
 from offboard.link import clock
 from offboard.link.stop import StopRequests
 from offboard.run.configuration import build_controller, build_track
@@ -60,7 +60,7 @@ class Counter(Status):
         self._known += known
         if not self._flown:
             already = f", {self._known} already flown" if self._known else ""
-            self._show(f"{self.planned} flights{already}")
+            self._show(f"{counted(self.planned, 'flight')}{already}")
 
     def ended(self) -> None:
         """A flight has ended."""
@@ -264,13 +264,13 @@ class Campaign:
         write = self.results.write
         for case in self.cases:
             if (name := case.scenario_file) and not (path := self.directory / name).exists():
-                write(path, case.scenario_text.encode())
-        write(self.directory / "campaign.csv", as_csv(columns(rows)).encode())
+                write(path, case.scenario_text)
+        write(self.directory / "campaign.csv", as_csv(columns(rows)))
         absent = len(self.cases) - len(rows)
         missing = [f"{absent} of {len(self.cases)} flights are not flown yet"] if absent else []
         missing += [stopped] if stopped else []
         text = page(groups(rows, self.drawn), missing, self._links)
-        write(self.directory / "campaign.html", text.encode())
+        write(self.directory / "campaign.html", text)
 
     def _links(self, row: Row) -> dict[str, str]:
         """Files of a kept flight by name, relative to the page."""

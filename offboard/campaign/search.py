@@ -108,7 +108,7 @@ class FailureSearch:
         found = self._at_seeds(list(failures.values())[:count], fly)
         campaign.cases = list(runner.flown.values())
         campaign.write(campaign.rows())
-        campaign.results.write(campaign.directory / "worst.csv", as_csv(found).encode())
+        campaign.results.write(campaign.directory / "worst.csv", as_csv(found))
         return found
 
     def flights_most(self, count: int) -> int:

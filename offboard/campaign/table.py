@@ -124,14 +124,12 @@ def as_csv(table: Mapping[str, Sequence[Any]]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Flights of one combination: `name` is controller and values, `block` the rest. `low` and
-    `high` are Wilson's interval of the success rate; `best`: see `groups`."""
+    """Flights of one combination: `name` is controller and values, `block` the rest; `best`: see
+    `groups`."""
 
     name: str
     block: str
     rows: tuple[Row, ...]
-    low: float
-    high: float
     best: bool = False
 
     @property
@@ -145,6 +143,12 @@ class Group:
     @property
     def failed(self) -> int:
         return self.flights - self.successes
+
+    @property
+    def interval(self) -> Any:
+        """`low` and `high` of the success rate: Wilson's score, CONFIDENCE."""
+        counted = stats.binomtest(self.successes, self.flights)
+        return counted.proportion_ci(CONFIDENCE, method="wilson")
 
     @property
     def reasons(self) -> dict[str, list[int]]:
@@ -190,10 +194,7 @@ def groups(rows: Sequence[Row], drawn: frozenset[str] = frozenset()) -> list[Gro
         own.setdefault(_name(row.case, differ - drawn), []).append(row)
     found: list[Group] = []
     for block, members in blocks.items():
-        made = [
-            Group(name, block, tuple(rows), *wilson(sum(not r.failed for r in rows), len(rows)))
-            for name, rows in members.items()
-        ]
+        made = [Group(name, block, tuple(rows)) for name, rows in members.items()]
         errors = [_error(group) for group in made]
         median, highest = min(errors)
         bound = max(highest, (1.0 + EQUAL_SHARE) * median)
@@ -223,12 +224,6 @@ def _name(case: Case, named: Collection[str]) -> str:
 
 def _values(case: Case) -> list[tuple[str, Any]]:
     return [(key, _scalar(value)) for key, value in case.values]
-
-
-def wilson(successes: int, flights: int) -> tuple[float, float]:
-    """The interval of a success rate, Wilson's score, CONFIDENCE."""
-    interval = stats.binomtest(successes, flights).proportion_ci(CONFIDENCE, method="wilson")
-    return float(interval.low), float(interval.high)
 
 
 def digits(value: float) -> str:

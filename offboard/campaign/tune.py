@@ -24,15 +24,14 @@ from scipy import stats
 
 from offboard.campaign.cases import SCENARIO, Case, Values, expand, rounded
 from offboard.campaign.document import CampaignFile, Firmware, Name, Names, Ranges, Seed, Seeds
-from offboard.campaign.results import Record
 from offboard.campaign.run import check
 from offboard.campaign.search import Fly, ask, study_of
 from offboard.campaign.table import CONFIDENCE, FIGURE_COLUMNS
 from offboard.documents.errors import DocumentError, naming
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import override, parse, read
-from offboard.documents.shipped import locate, read_text
-from offboard.run.configuration import PARTS, read_part
+from offboard.documents.shipped import PARTS, locate, read_text
+from offboard.run.configuration import read_part
 
 
 def _figure(name: str) -> str:
@@ -143,12 +142,8 @@ class Tuning:
 
     def _costs(self, fly: Fly, cases: Sequence[Case], values: Values) -> list[float]:
         records = fly([replace(case, values=values) for case in cases])
-        return [self._cost(record) for record in records]
-
-    def _cost(self, record: Record) -> float:
-        if not record.completed:
-            return self.file.failure
-        return record.figures.get(self.file.objective, self.file.failure)
+        figures = (record.figures if record.completed else {} for record in records)
+        return [each.get(self.file.objective, self.file.failure) for each in figures]
 
 
 def planned(file: TuneFile) -> tuple[list[Case], list[Case], dict[str, float]]:

@@ -6,7 +6,6 @@ The first two are executors of `concurrent.futures`. A worker loads its code onc
 
 from __future__ import annotations
 
-import itertools
 import logging
 import multiprocessing
 import os
@@ -34,6 +33,7 @@ from offboard.campaign.results import Record
 from offboard.documents.errors import UserError, install, shown
 from offboard.flight.flight import STOPPED
 from offboard.flight.phases import ExitCode
+from offboard.link.log import free_name
 from offboard.run.flight import Connection, fly
 
 CONNECT_S = 5.0
@@ -163,18 +163,11 @@ class ConnectedVehicle:
 
     def _record(self, job: Job) -> Record:
         assert job.kept is not None
-        _move_aside(job.kept)
+        if job.kept.exists():  # the log of a flight that has no record: it is flown again
+            job.kept.rename(free_name(job.kept))
         assert job.case.link is not None
         vehicle = Connection(job.case.link, self.system_id, self.signing_key)
         return recorded(job, job.kept, lambda config, place: fly(config, place, vehicle))
-
-
-def _move_aside(directory: Path) -> None:
-    """Rename the log of a flight that has no record, so that it can be flown again."""
-    numbers = itertools.count(1)
-    aside = (directory.with_name(f"{directory.name}-before-{number}") for number in numbers)
-    if directory.exists():
-        directory.rename(next(path for path in aside if not path.exists()))
 
 
 @contextmanager

@@ -27,7 +27,7 @@ from offboard.cli.shared import (
     write_new,
 )
 from offboard.documents import shipped
-from offboard.documents.errors import UserError
+from offboard.documents.errors import UserError, counted
 
 if TYPE_CHECKING:
     from offboard.campaign.run import Campaign, Summary
@@ -53,7 +53,9 @@ def campaign(
     shard: Annotated[
         str | None, option("I/N", "Fly part I of N; the same --out, or copied together.")
     ] = None,
-    worst: Annotated[int | None, option("K", "Search for K failures that differ instead.")] = None,
+    worst: Annotated[
+        int | None, option("K", "Search for K failures that differ instead.", min=1, max=100)
+    ] = None,
 ) -> None:
     """Fly many flights and put them into one table.
 
@@ -67,8 +69,8 @@ def campaign(
     flight failed; 2 usage or configuration error; 4 flights are missing: the same command goes
     on.
     """
-    if worst is not None and (shard or not 1 <= worst <= 100):
-        raise UserError("--worst takes 1 .. 100, and no --shard: a search is one whole")
+    if worst and shard:
+        raise UserError("--worst takes no --shard: a search is one whole")
     if scheduler and workers:
         raise UserError("--scheduler has its own workers: use it or --workers, not both")
     with out.status("planning"):
@@ -119,17 +121,18 @@ def conclude(summary: Summary, flown: Campaign) -> None:
     if 0 < len(found) <= GROUPS_SHOWN:
         out.print()
         show(out, found)
-    flights = f"{len(summary.rows)} flights, {summary.failed} failed"
+    flights = f"{counted(len(summary.rows), 'flight')}, {summary.failed} failed"
     say(f"{flights}, {summary.missing} not flown yet" if summary.missing else flights)
     if summary.kept:
-        say(f"kept: {len(summary.kept)} flights; `offboard report {summary.kept[0]}` shows one")
+        kept = counted(len(summary.kept), "flight")
+        say(f"kept: {kept}; `offboard report {summary.kept[0]}` shows one")
     say(f"written: {directory / 'campaign.csv'} and campaign.html")
     if summary.stopped or summary.mine_missing:
         why = summary.stopped or "interrupted"
         missing = f"{summary.mine_missing} of {summary.planned} flights are missing"
         raise UserError(f"{why}: {missing}; go on with the same command and --out {directory}", 4)
     if summary.failed:
-        raise UserError(f"{summary.failed} flights failed; the table says why", 1)
+        raise UserError(f"{counted(summary.failed, 'flight')} failed; the table says why", 1)
 
 
 def _search(flown: Campaign, source: str, count: int, open_workers: OpenFlyer) -> None:
@@ -160,7 +163,9 @@ def compare(
     controllers: Annotated[str, option("LIST", f"{NAMES}, or 'all'.")] = "pso,lqr,paper",
     reference: Annotated[str, option("LIST", f"{NAMES}.")] = "lemniscate",
     scenario: Annotated[str | None, option("LIST", f"{NAMES}.  [default: {SCENARIOS}]")] = None,
-    seeds: Annotated[int, option("N", "Flights of each combination, with seeds 1 .. N.")] = 3,
+    seeds: Annotated[
+        int, option("N", "Flights of each combination, with seeds 1 .. N.", min=1, max=1000)
+    ] = 3,
     vehicle: Vehicle = None,
     connect: Annotated[
         str | None,
@@ -187,8 +192,6 @@ def compare(
         raise UserError("--system and --signing-key are options of --connect: add it")
     if connect and (scenario or workers):
         raise UserError("--scenario and --workers are options of the simulator: omit them")
-    if not 1 <= seeds <= 1000:
-        raise UserError(f"--seeds {seeds}: give 1 .. 1000")
     laws = _names("--controllers", controllers, shipped.names("controller"))
     references = _names("--reference", reference)
     scenarios = ["connected"] if connect else _names("--scenario", scenario or SCENARIOS)

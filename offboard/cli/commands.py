@@ -18,7 +18,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-PARTS = ("reference", "controller", "vehicle")
 
 
 def _version(wanted: bool) -> None:
@@ -39,14 +38,14 @@ def offboard(
 
 # the commands in the order of --help, and the kinds of shipped files that theirs names
 for command, kinds in (
-    (fly.fly, (*PARTS, "scenario")),
-    (daemon.daemon, PARTS),
+    (fly.fly, (*shipped.PARTS, "scenario")),
+    (daemon.daemon, shipped.PARTS),
     (doctor.doctor, ()),
     (logs.score, ()),
     (logs.report, ()),
     (files.check, ()),
-    (logs.identify, (*PARTS, "scenario")),
-    (campaign.compare, (*PARTS, "scenario")),
+    (logs.identify, (*shipped.PARTS, "scenario")),
+    (campaign.compare, (*shipped.PARTS, "scenario")),
     (campaign.campaign, ("campaign",)),
     (campaign.tune, ("tuning",)),
     (paper.paper, ()),

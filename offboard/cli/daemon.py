@@ -14,14 +14,13 @@ from offboard.cli.shared import (
     FLIGHTS,
     FlightOptions,
     Report,
-    complain,
     grouped,
     option,
     out,
     say,
     write,
 )
-from offboard.documents.command_line import DISK_ERRORS, explained
+from offboard.documents.command_line import DISK_ERRORS, complain, explained
 from offboard.documents.errors import UserError
 from offboard.documents.shipped import is_file
 
@@ -114,8 +113,7 @@ def may_pass(error: UserError | OSError) -> bool:
 
 
 def _print_unit(options: FlightOptions, out_directory: Path | None) -> None:
-    """Print the unit, and on stderr what its user cannot read. Raises UserError and
-    KeyFileError."""
+    """Print the unit, and on stderr what its user cannot read. Raises UserError."""
     import offboard
     from offboard.documents.signing_key import read_key
     from offboard.service.daemon import unit, unreadable

@@ -18,7 +18,6 @@ from offboard.cli.shared import (
     Report,
     Requirements,
     SimulatorOptions,
-    complain,
     grouped,
     option,
     out,
@@ -28,11 +27,11 @@ from offboard.cli.shared import (
     write,
 )
 from offboard.documents.arguments import LIVE_PAGE
-from offboard.documents.command_line import INTERRUPT, drop_output, explained
-from offboard.documents.errors import UserError
+from offboard.documents.command_line import INTERRUPT, complain, drop_output, explained
+from offboard.documents.errors import UserError, plain
 
 if TYPE_CHECKING:
-    from offboard.analysis.score import Requirement, Score
+    from offboard.analysis.score import Requirement
     from offboard.flight.flight import Outcome
     from offboard.live.process import Displays
 
@@ -91,9 +90,7 @@ def fly(
             directory = out_directory or FLIGHTS / clock.local_stamp()
             flown = simulated.vehicle(options)
             flight = options.load(seed, flown.known_vehicle)
-            for url in displays.await_ready():
-                displays.tell(f"live: {url}")
-            displays.title(f"{directory.name}: {flight.reference.shape} by {flight.controller.law}")
+            displays.begin(f"{directory.name}: {flight.reference.shape} by {flight.controller.law}")
             outcome = fly_once(
                 flight,
                 directory,
@@ -147,6 +144,7 @@ def _conclude(
     not shown of the flight."""
     from offboard.analysis.score import judged
     from offboard.analysis.score_table import summary
+    from offboard.live.display import DIGITS, line
 
     score, history = scored(directory)
     outcome = judged(outcome, score)
@@ -156,7 +154,20 @@ def _conclude(
     code = outcome.exit_code or int(bool(missed))
     try:
         if json_lines:
-            write(_result(code, outcome.sentence, results, score, directory, lost))
+            write(
+                line(
+                    "result",
+                    exit_code=code,
+                    sentence=outcome.sentence,
+                    requirements=results,
+                    completed=score.completed == 1.0,
+                    ended_by=score.ended_by,
+                    directory=str(directory),
+                    lost=lost,
+                    figures=plain(score.metrics(), DIGITS),
+                )
+                + "\n"
+            )
             raise typer.Exit(code)
         out.print()
         for sentence in lost:
@@ -181,23 +192,3 @@ def _conclude(
         complain(f"{outcome.sentence}; {explained(error)}")
     if code:
         raise typer.Exit(code)
-
-
-def _result(
-    code: int, sentence: str, requirements: str, score: Score, directory: Path, lost: list[str]
-) -> str:
-    """The last line of --json-lines."""
-    from offboard.documents.errors import plain
-    from offboard.live.display import DIGITS, line
-
-    result = {
-        "exit_code": code,
-        "sentence": sentence,
-        "requirements": requirements,
-        "completed": score.completed == 1.0,
-        "ended_by": score.ended_by,
-        "directory": str(directory),
-        "lost": lost,
-        "figures": plain(score.metrics(), DIGITS),
-    }
-    return line("result", **result) + "\n"

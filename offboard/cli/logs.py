@@ -18,9 +18,7 @@ from offboard.cli.shared import (
     Requirements,
     SimulatorOptions,
     check_new,
-    complain,
     err,
-    free_name,
     grouped,
     keep,
     option,
@@ -30,7 +28,9 @@ from offboard.cli.shared import (
     scored,
     write_new,
 )
+from offboard.documents.command_line import complain
 from offboard.documents.errors import UserError
+from offboard.link.log import free_name
 
 
 def score(

@@ -15,7 +15,9 @@ def paper(
     quick: Annotated[
         bool, typer.Option("--quick", help="One seed; less than a minute instead of several.")
     ] = False,
-    seeds: Annotated[int | None, option("N", "Flights per row.  [default: 20]")] = None,
+    seeds: Annotated[
+        int | None, option("N", "Flights per row.  [default: 20]", min=1, max=10_000)
+    ] = None,
     figure: Annotated[list[str] | None, option("NAME", "Only this figure; repeatable.")] = None,
     table: Annotated[list[str] | None, option("NAME", "Only this table; repeatable.")] = None,
 ) -> None:

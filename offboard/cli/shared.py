@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import inspect
-import itertools
 import re
 import sys
 from collections.abc import Callable
@@ -19,9 +18,9 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 from rich.console import Console
 
-from offboard.documents.command_line import complain as complain
-from offboard.documents.command_line import wrapped
+from offboard.documents.command_line import complain, wrapped
 from offboard.documents.errors import UserError, shown
+from offboard.documents.shipped import PARTS
 from offboard.link.log import new_file
 
 if TYPE_CHECKING:
@@ -119,7 +118,7 @@ class FlightOptions:
 
         return load(
             self.config,
-            choices={part: getattr(self, part) for part in ("controller", "reference", "vehicle")},
+            choices={part: getattr(self, part) for part in PARTS},
             assignments=self.assignments or (),
             seed=seed,
             known_vehicle=known_vehicle,
@@ -213,12 +212,6 @@ def check_new(path: Path, option_name: str) -> None:
         raise UserError(f"{option_name} {path}: there is no directory {path.parent}")
 
 
-def free_name(path: Path) -> Path:
-    """`path`, or the first of NAME-2, NAME-3 ... that does not exist."""
-    numbered = (path.with_stem(f"{path.stem}-{number}") for number in itertools.count(2))
-    return next(each for each in itertools.chain([path], numbered) if not each.exists())
-
-
 def write_new(path: Path, text: str) -> None:
     """Write a file that must not exist. It appears when it is complete. Raises UserError."""
     with new_file(path) as file:
@@ -233,7 +226,7 @@ def requirements_of(texts: list[str] | None) -> list[Requirement]:
 
 
 def scored(flight: Path) -> tuple[Score, History]:
-    """Score a flight and keep the score in its directory. Raises TlogError."""
+    """Score a flight and keep the score in its directory. Raises UserError."""
     from offboard.analysis.score import score_flight
 
     result, history = score_flight(flight)

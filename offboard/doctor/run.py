@@ -131,7 +131,7 @@ def observe(
     `directory`. Sends nothing that changes the vehicle. `tell` is called with sentences about the
     progress.
 
-    Raises LinkError for an address that is no address, KeyFileError and SigningTimeError.
+    Raises LinkError for an address that is no address, and UserError for a signing key.
     """
     began_s = clock.monotonic_s()
     connection, others, error = vehicle.address, holders(vehicle.address), ""

@@ -130,7 +130,7 @@ def configuration(seen: Observation) -> Iterable[Finding]:
     """The planned flight against this vehicle: hover thrust, tilt, reference, bandwidth."""
     config, tilt_rad = seen.config, 0.0
     try:
-        tilt_rad = check(build_track(config), config.vehicle).tilt_max_rad
+        tilt_rad = check(build_track(config), config.vehicle).tilt_rad
     except DocumentError as error:
         yield blocks(str(error), "change the reference or the vehicle file")
     if seen.vehicle.found:

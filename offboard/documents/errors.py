@@ -4,10 +4,11 @@ them, and sentences on what happens again and again.
 
 from __future__ import annotations
 
+import difflib
 import math
 import sysconfig
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -85,6 +86,17 @@ def abridged(name: object) -> str:
     """A name or path for a message: at most 100 characters, without what is no text."""
     text = str(name).encode(errors="backslashreplace").decode()
     return text if len(text) <= 100 else f"{text[:97]}..."
+
+
+def meant(name: str, known: Iterable[str]) -> str:
+    """ ", did you mean NAME?" with the nearest of the known names, empty where none is near."""
+    near = difflib.get_close_matches(name, known, n=1)
+    return f", did you mean {near[0]}?" if near else ""
+
+
+def counted(number: int, noun: str) -> str:
+    """ "1 flight", "2 flights"."""
+    return f"{number} {noun}{'s' * (number != 1)}"
 
 
 def plain(value: Any, digits: int | None = None) -> Any:

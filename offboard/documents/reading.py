@@ -10,19 +10,17 @@ column of its key, the value and what is allowed, in pydantic's words:
 
 from __future__ import annotations
 
-import difflib
 import json
 import math
 import re
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import yaml
 from pydantic import BaseModel, ValidationError
 from yaml.representer import SafeRepresenter
 
-from offboard.documents.errors import DocumentError as DocumentError
-from offboard.documents.errors import abridged, shown
+from offboard.documents.errors import DocumentError, abridged, meant, shown
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -138,15 +136,18 @@ def override(mapping: Mapping[str, Any], assignment: str, option: str = "") -> J
     return changed
 
 
-def validate(mapping: Mapping[str, Any], model: type[M], source: str) -> M:
+def validate(
+    mapping: Mapping[str, Any], model: type[M], source: str, extra: Literal["ignore"] | None = None
+) -> M:
     """Raw mapping -> an instance of `model`. Raises DocumentError with the problems
     found, at most PROBLEMS_MOST of them.
 
-    `source` names the file in errors about what has no place in it.
+    `source` names the file in errors about what has no place in it; with `extra` the keys that
+    `model` does not have are ignored.
     """
     try:
         # as JSON: strict about scalars, yet a list may become a tuple and text an enum
-        return model.model_validate_json(json.dumps(mapping), strict=True)
+        return model.model_validate_json(json.dumps(mapping), strict=True, extra=extra)
     except ValidationError as error:
         details = error.errors(include_url=False)
         problems = [
@@ -156,22 +157,6 @@ def validate(mapping: Mapping[str, Any], model: type[M], source: str) -> M:
         if len(details) > PROBLEMS_MOST:
             problems.append(f"{source}: and {len(details) - PROBLEMS_MOST} more problems")
         raise DocumentError(*problems) from None
-
-
-def known(mapping: Mapping[str, Any], model: type[M]) -> Json:
-    """A copy of `mapping` without the keys that `model` does not have."""
-    kept: Json = json.loads(json.dumps(mapping))
-    try:
-        model.model_validate_json(json.dumps(mapping), strict=True)
-    except ValidationError as error:
-        for detail in error.errors(include_url=False):
-            if detail["type"] == "extra_forbidden":
-                *path, key = _key_path(detail, mapping).split(".")
-                section: Any = kept
-                for part in path:
-                    section = section[int(part)] if isinstance(section, list) else section[part]
-                del section[key]
-    return kept
 
 
 def _origin(detail: ErrorDetails, mapping: Mapping[str, Any], source: str) -> str:
@@ -215,10 +200,8 @@ def _unknown_key(path: str, model: type[BaseModel]) -> str:
         field = getattr(section, "model_fields", {}).get(name)
         section = field and field.annotation
     known = sorted(getattr(section, "model_fields", ()))
-    near = difflib.get_close_matches(key, known, n=1)
-    hint = f", did you mean {near[0]}?" if near else ""
     all_known = f" (known keys: {', '.join(known)})" if known else ""
-    return f"{path} is not a known key{hint}{all_known}"
+    return f"{path} is not a known key{meant(key, known)}{all_known}"
 
 
 def _key_path(detail: ErrorDetails, document: Any) -> str:

@@ -13,6 +13,7 @@ from offboard.documents.errors import DocumentError, abridged, shown
 
 SIZE_MOST = 500_000  # characters of a file: a table of 10,000 rows, or 5 s to parse as YAML
 
+PARTS = ("vehicle", "controller", "reference")  # of a flight, each a file of its own
 # kind of file -> its folder
 FOLDERS = {
     "reference": "references",

@@ -29,31 +29,27 @@ _EXPECTED = (
 )
 
 
-class KeyFileError(UserError):
-    """A key file that cannot be used: one sentence for the user."""
-
-
 def read_key(path: Path) -> bytes:
-    """The 32 bytes of the key in the file at `path`. Raises KeyFileError."""
+    """The 32 bytes of the key in the file at `path`. Raises UserError."""
     shown = f"signing key {abridged(path)}"
     try:
         found = path.stat()
         if not stat.S_ISREG(found.st_mode):
-            raise KeyFileError(f"{shown} is not a file")
+            raise UserError(f"{shown} is not a file")
         if found.st_mode & _OTHERS:
-            raise KeyFileError(f"{shown} can be read or changed by other users: chmod 600 it")
+            raise UserError(f"{shown} can be read or changed by other users: chmod 600 it")
         if found.st_size > FILE_BYTES_MAX:
-            raise KeyFileError(f"{shown} has {found.st_size:,} bytes: that is no key file")
+            raise UserError(f"{shown} has {found.st_size:,} bytes: that is no key file")
         content = path.read_bytes()
     except (OSError, ValueError) as error:  # ValueError: a NUL in the path
         reason = getattr(error, "strerror", None) or error
-        raise KeyFileError(f"{shown} cannot be read: {reason}") from None
+        raise UserError(f"{shown} cannot be read: {reason}") from None
     return _key_in(content, shown)
 
 
 def create_key(path: Path) -> str:
     """Create a key file at `path` with a random passphrase, which is returned. Never replaces a
-    file. Raises KeyFileError."""
+    file. Raises UserError."""
     passphrase = secrets.token_hex(KEY_BYTES)
     try:
         with open(path, "x", encoding="ascii", opener=partial(os.open, mode=0o600)) as file:
@@ -66,10 +62,10 @@ def create_key(path: Path) -> str:
                 path.unlink(missing_ok=True)  # half a key is none
                 raise
     except FileExistsError:
-        raise KeyFileError(f"{abridged(path)} exists and is not replaced: name another") from None
+        raise UserError(f"{abridged(path)} exists and is not replaced: name another") from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise KeyFileError(f"{abridged(path)} cannot be created: {reason}") from None
+        raise UserError(f"{abridged(path)} cannot be created: {reason}") from None
     return passphrase
 
 
@@ -88,4 +84,4 @@ def _key_in(content: bytes, shown: str) -> bytes:
             key = b""
         if len(key) == KEY_BYTES and any(key):  # all zero means no signing
             return key
-    raise KeyFileError(f"{shown} is too short or no key file: {_EXPECTED}")
+    raise UserError(f"{shown} is too short or no key file: {_EXPECTED}")

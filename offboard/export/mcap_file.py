@@ -16,14 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from offboard.analysis.history import History, Rows
+from offboard.analysis.history import PHASES, History, Rows
 from offboard.documents.errors import UserError, install
 from offboard.export.series import (
     COLUMNS,
     PHASE,
     Array,
     events_of,
-    phase_name,
     series_of,
     values_of,
 )
@@ -113,7 +112,7 @@ def _rows(name: str, rows: Rows, stamps: Stamps) -> Iterator[Stamped]:
         stamps(times), times.tolist(), values_of(rows).tolist(), strict=True
     ):
         known = {
-            column: phase_name(value) if column == PHASE else value
+            column: PHASES[int(value)] if column == PHASE else value
             for column, value in zip(COLUMNS[name], row, strict=True)
             if math.isfinite(value)
         }

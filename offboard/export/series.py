@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.analysis import tlog
-from offboard.analysis.history import Event, History, Rows, gather
+from offboard.analysis.history import PHASES, Event, History, Rows, gather
 from offboard.documents.errors import UserError
-from offboard.flight.phases import PHASE_CODES
 from offboard.flight.record import FIELDS
 from offboard.link.log import new_file
 
@@ -55,16 +54,10 @@ COLUMNS = {
 _ARRAYS = {"decision": "records"}  # of History, where they have another name
 EVENT = "event"  # source and column of texts
 PHASE = "decision_phase"  # whose numbers tables show as names
-_PHASES: dict[int, str] = {code: phase.value for phase, code in PHASE_CODES.items()}
-
-
-def phase_name(number: float) -> str:
-    """The name of a phase in the column PHASE."""
-    return _PHASES[int(number)]
 
 
 def read(path: Path) -> History:
-    """The flight in a directory or .tlog. Raises TlogError, or UserError without telemetry."""
+    """The flight in a directory or .tlog. Raises UserError, also without telemetry."""
     log = tlog.read(tlog.find(path))
     flown = gather(log)
     if not any(map(len, (flown.position, flown.attitude))):
@@ -130,4 +123,4 @@ def _time_s(row: Any) -> float:
 def _cell(column: str, value: float) -> float | str:
     if math.isnan(value):
         return ""
-    return phase_name(value) if column == PHASE else value
+    return PHASES[int(value)] if column == PHASE else value

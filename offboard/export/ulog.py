@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -24,10 +25,6 @@ _INFO_LEVEL = ord("6")
 DECISION = "offboard_decision"
 
 
-def _column(name: str) -> Callable[[Rows], Array]:
-    return lambda rows: rows[name]
-
-
 def _attitude_setpoint(setpoint: Rows) -> Array:
     """Thrust is along the body's -z axis, as PX4 has it."""
     attitude, thrust = setpoint["quaternion"], setpoint["thrust"]
@@ -41,14 +38,14 @@ _NED = (("x", 1), ("y", 1), ("z", 1))
 _TOPICS: tuple[tuple[str, str, tuple[tuple[str, int], ...], Callable[[Rows], Array]], ...] = (
     ("position", "vehicle_local_position", (*_NED, ("vx", 1), ("vy", 1), ("vz", 1)), values_of),
     ("truth", "vehicle_local_position_groundtruth", _NED, values_of),
-    ("attitude", "vehicle_attitude", (("q", 4),), _column("quaternion")),
-    ("attitude", "vehicle_angular_velocity", (("xyz", 3),), _column("rates_radps")),
+    ("attitude", "vehicle_attitude", (("q", 4),), itemgetter("quaternion")),
+    ("attitude", "vehicle_angular_velocity", (("xyz", 3),), itemgetter("rates_radps")),
     ("reference", "trajectory_setpoint",
      (("position", 3), ("velocity", 3), ("acceleration", 3), ("yaw", 1)), values_of),
     ("setpoint", "vehicle_attitude_setpoint",
      (("yaw_body", 1), ("q_d", 4), ("thrust_body", 3)), _attitude_setpoint),
     ("decision", DECISION, tuple((name, 1) for name in FIELDS), values_of),
-    ("heartbeat", "actuator_armed", (("armed", 1),), _column("armed")),
+    ("heartbeat", "actuator_armed", (("armed", 1),), itemgetter("armed")),
 )  # fmt: skip
 _BYTES = {"actuator_armed"}  # topics of bytes; the others are of float32
 _AUTOPILOTS = {"px4": "PX4", "ardupilot": "ArduPilot"}  # as PX4's tools name them

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,14 +37,7 @@ class Offset:
     def sample(self, time_s: float | Array) -> FlatSample:
         """Flat outputs at `time_s`, a scalar or an array of any shape."""
         sample, offset = self.reference.sample(time_s), self.offset.sample(time_s)
-        return replace(
-            sample,
-            position_ned_m=sample.position_ned_m + offset.position_ned_m,
-            velocity_ned_mps=sample.velocity_ned_mps + offset.velocity_ned_mps,
-            acceleration_ned_mps2=sample.acceleration_ned_mps2 + offset.acceleration_ned_mps2,
-            jerk_ned_mps3=sample.jerk_ned_mps3 + offset.jerk_ned_mps3,
-            snap_ned_mps4=sample.snap_ned_mps4 + offset.snap_ned_mps4,
-        )
+        return FlatSample._make((*map(np.add, sample[:5], offset[:5]), *sample[5:]))
 
 
 class FlightPlan:

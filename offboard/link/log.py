@@ -1,5 +1,5 @@
 """Files: the flight directory and its .tlog, which has every frame sent or received and our own
-records; and `new_file`, for all others.
+records; and how all other files are written, whole or not at all.
 
 An entry of a .tlog is a big-endian uint64 of Unix microseconds, low two bits zero, and the frame
 unchanged. A thread writes them, so that a slow disk does not stop the flight: a crash loses the
@@ -8,6 +8,7 @@ last hundredths of a second.
 
 from __future__ import annotations
 
+import itertools
 import os
 import struct
 from collections.abc import Iterator
@@ -165,3 +166,22 @@ def new_file(path: Path) -> Iterator[BinaryIO]:
     finally:
         with suppress(OSError):
             incomplete.unlink()
+
+
+def replace_file(path: Path, text: str) -> None:
+    """Write a file, whole or not at all; one that is there stays until then. Raises OSError."""
+    incomplete = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        incomplete.write_bytes(text.encode())
+        incomplete.replace(path)
+    except OSError:
+        with suppress(OSError):
+            incomplete.unlink()
+        raise
+
+
+def free_name(path: Path) -> Path:
+    """`path`, or the first of NAME-2, NAME-3 ... that does not exist."""
+    numbered = (path.with_stem(f"{path.stem}-{number}") for number in itertools.count(2))
+    return next(each for each in itertools.chain([path], numbered) if not each.exists())

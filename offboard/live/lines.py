@@ -30,8 +30,12 @@ class Terminal(Display):
     LOST = "{} lines of the flight are missing above: the terminal was stopped"
 
     def __init__(self, console: Console, show_line: Callable[[str], None]) -> None:
-        in_place = console.is_terminal and not console.is_dumb_terminal
-        self._live = _status_line(console) if in_place else None
+        self._live: Live | None = None
+        if console.is_terminal and not console.is_dumb_terminal:
+            self._live = Live(
+                console=console, auto_refresh=False, transient=True, redirect_stdout=False,
+                redirect_stderr=False,
+            )  # fmt: skip
         self._show_line = show_line
         self._waits = False  # a status is queued: no second one
         super().__init__(self._write, LINES_MAX)
@@ -65,13 +69,6 @@ class Terminal(Display):
                 self._live.update(Text(status(item), no_wrap=True, overflow="ellipsis"))
                 self._live.refresh()
                 self._waits = False
-
-
-def _status_line(console: Console) -> Live:
-    return Live(
-        console=console, auto_refresh=False, transient=True, redirect_stdout=False,
-        redirect_stderr=False,
-    )  # fmt: skip
 
 
 def status(now: Snapshot) -> str:

@@ -108,17 +108,15 @@ class Displays:
         self._parts: list[Display] = [lines, *pages]
         self._working = list(self._parts)
 
-    def await_ready(self) -> list[str]:
-        """Wait until all processes listen; where. Raises UserError."""
-        return [page.await_ready() for page in self._pages]
-
     def tell(self, sentence: str) -> None:
         """A sentence about the preparation."""
         self._lines.tell(sentence)
 
-    def title(self, title: str) -> None:
-        """What is flown, for the pages."""
+    def begin(self, title: str) -> None:
+        """Wait until the pages are served, tell where, and give them their title: what is flown.
+        Raises UserError."""
         for page in self._pages:
+            self.tell(f"live: {page.await_ready()}")
             page.tell(title=title)
 
     def conclude(self, verdict: str, report: str) -> None:

@@ -45,16 +45,16 @@ _TRACE = ("time_s", "position_ned_m", "reference_ned_m", "position_error_m", "te
 
 
 class Metrics(Collector):
-    """What a monitor reads. `show` hands over a snapshot as it is in JSON."""
+    """What a monitor reads. `show` hands over a snapshot as it is in JSON, the `newest`."""
 
     def __init__(self) -> None:
-        self._newest: dict[str, Any] = {}
+        self.newest: dict[str, Any] = {}
         self._shown_s = -math.inf
         self._registry = CollectorRegistry(auto_describe=False)
         self._registry.register(self)
 
     def show(self, snapshot: dict[str, Any]) -> None:
-        self._newest, self._shown_s = snapshot, clock.monotonic_s()
+        self.newest, self._shown_s = snapshot, clock.monotonic_s()
 
     def text(self) -> bytes:
         """The metrics in the text format of Prometheus."""
@@ -62,16 +62,16 @@ class Metrics(Collector):
 
     def health(self) -> dict[str, Any]:
         """`healthy` if the loop runs and the vehicle is heard, else the `reason`; the snapshot."""
-        age_s, reason = self._newest.get("telemetry_age_s"), ""
+        age_s, reason = self.newest.get("telemetry_age_s"), ""
         if clock.monotonic_s() - self._shown_s > STALE_S:
             reason = "the loop does not run"
         elif age_s is None or age_s > HEALTHY_AGE_S:
             reason = "no telemetry"
-        return {"healthy": not reason, "reason": reason} | self._newest
+        return {"healthy": not reason, "reason": reason} | self.newest
 
     def collect(self) -> Iterator[Metric]:
         """The metrics of the newest snapshot, for Prometheus."""
-        now = self._newest
+        now = self.newest
         if not now:
             return
         age_s = clock.monotonic_s() - self._shown_s
@@ -90,18 +90,15 @@ class Broadcast:
 
     def __init__(self) -> None:
         self.metrics = Metrics()
-        self._clients: set[asyncio.Queue[str | None]] = set()
-        self._watching: set[web.RequestHandler] = set()
+        self._clients: dict[asyncio.Queue[str | None], web.RequestHandler] = {}
         self._kept: deque[dict[str, Any]] = deque(maxlen=KEPT)
         self._texts: deque[dict[str, Any]] = deque(maxlen=TEXTS_KEPT)
-        self._newest: dict[str, Any] | None = None
         self._flight: dict[str, Any] = {}
 
     def publish(self, text: str) -> None:
         """A snapshot, an announcement, or what is known of the flight, as JSON text."""
         message = json.loads(text)
         if message["type"] == "snapshot":
-            self._newest = message
             self.metrics.show(message)
             self._kept.append({name: message[name] for name in _TRACE})
         elif message["type"] == "announcement":
@@ -128,17 +125,15 @@ class Broadcast:
             headers={"Content-Type": "text/event-stream", "Cache-Control": "no-store"}
         )
         queue: asyncio.Queue[str | None] = asyncio.Queue(CLIENT_QUEUE)
-        known = {"newest": self._newest, "texts": list(self._texts), "flight": self._flight}
-        queue.put_nowait(line("history", rows=list(self._kept), **known))
-        self._clients.add(queue)
-        self._watching.add(request.protocol)
+        known = {"rows": list(self._kept), "texts": list(self._texts), "flight": self._flight}
+        queue.put_nowait(line("history", newest=self.metrics.newest or None, **known))
+        self._clients[queue] = request.protocol
         with suppress(ConnectionError, TimeoutError, asyncio.TimeoutError):
             await response.prepare(request)
             while (text := await queue.get()) is not None:
                 await asyncio.wait_for(response.write(f"data: {text}\n\n".encode()), CLIENT_S)
             await asyncio.wait_for(response.write(b"event: end\ndata: {}\n\n"), CLIENT_S)
-        self._clients.discard(queue)
-        self._watching.discard(request.protocol)
+        del self._clients[queue]
         return response
 
     def connection(self, server: web.Server) -> asyncio.Protocol:
@@ -150,9 +145,7 @@ class Broadcast:
         return handler
 
     def _end(self, handler: web.RequestHandler) -> None:
-        if handler in self._watching:
-            return
-        if handler.transport is not None:
+        if handler not in self._clients.values() and handler.transport is not None:
             handler.transport.abort()
 
 

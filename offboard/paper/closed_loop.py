@@ -110,48 +110,44 @@ class PlantKind(StrEnum):
     NONLINEAR = "nonlinear"
 
 
-class LinearPlant:
-    """Eq. 14 with C = I. A constant wind acts as a force through the drag, sampled exactly.
+Plant = Callable[[Array, Array], Array]  # x(k+1) (12,) from x(k) (12,) and u(k) (4,)
 
-    Args:
-        wind_ned_mps: wind velocity (3,).
-        thrust_loss: missing fraction of the total thrust, 0 to 1.
-    """
 
-    def __init__(self, wind_ned_mps: Array, thrust_loss: float = 0.0) -> None:
-        vehicle, self._thrust_loss = paper_vehicle(), thrust_loss
-        dynamics, _ = hover_matrices(vehicle)
-        force = np.zeros((len(dynamics), 1))
-        drag = np.array(vehicle.drag_translation_npmps) / vehicle.mass_kg
-        force[U : W + 1, 0] = drag * wind_ned_mps
-        self._wind_effect = LinearModel(dynamics, force).sampled(PAPER_STEP_S).input_map[:, 0]
+def linear_plant(wind_ned_mps: Array, thrust_loss: float) -> Plant:
+    """Eq. 14 with C = I. A constant wind (3,) acts as a force through the drag, sampled exactly;
+    `thrust_loss` is the missing fraction of the total thrust, 0 to 1."""
+    vehicle = paper_vehicle()
+    motion, _ = hover_matrices(vehicle)
+    force = np.zeros((len(motion), 1))
+    drag = np.array(vehicle.drag_translation_npmps) / vehicle.mass_kg
+    force[U : W + 1, 0] = drag * wind_ned_mps
+    wind_effect = LinearModel(motion, force).sampled(PAPER_STEP_S).input_map[:, 0]
+    dynamics, control_map = paper_model()
 
-    def next_state(self, state: Array, inputs: Array) -> Array:
-        """x(k+1) (12,) from x(k) (12,) and u(k) (4,)."""
-        (dynamics, control_map), delivered = paper_model(), _delivered(inputs, self._thrust_loss)
-        following: Array = dynamics @ state + control_map @ delivered + self._wind_effect
+    def next_state(state: Array, inputs: Array) -> Array:
+        delivered = _delivered(inputs, thrust_loss)
+        following: Array = dynamics @ state + control_map @ delivered + wind_effect
         return following
 
+    return next_state
 
-class NonlinearPlant:
+
+def nonlinear_plant(wind_ned_mps: Array, thrust_loss: float) -> Plant:
     """Eq. 7, integrated by RK4 in ten substeps; the total thrust is never negative.
 
-    Arguments and `next_state` as for `LinearPlant`; velocities u, v, w are in body axes.
+    Arguments as of `linear_plant`; velocities u, v, w are in body axes.
     """
+    hover, parameters = hover_input(paper_vehicle()), pack(paper_vehicle())
+    wind, scratch = np.array(wind_ned_mps, np.float64), np.empty((RK4_SCRATCH_ROWS, EULER.size))
 
-    def __init__(self, wind_ned_mps: Array, thrust_loss: float = 0.0) -> None:
-        vehicle, self._thrust_loss = paper_vehicle(), thrust_loss
-        self._hover = hover_input(vehicle)
-        self._constants = np.array(wind_ned_mps, np.float64), pack(vehicle)
-        self._scratch = np.empty((RK4_SCRATCH_ROWS, EULER.size))
-
-    def next_state(self, state: Array, inputs: Array) -> Array:
-        """x(k+1) (12,) from x(k) (12,) and u(k) (4,)."""
-        total = self._hover + _delivered(inputs, self._thrust_loss)
+    def next_state(state: Array, inputs: Array) -> Array:
+        total = hover + _delivered(inputs, thrust_loss)
         total[THRUST] = max(total[THRUST], 0.0)
         following, step_s = state.copy(), PAPER_STEP_S / _SUBSTEPS
-        follow(following, total, *self._constants, step_s, _SUBSTEPS, self._scratch)
+        follow(following, total, wind, parameters, step_s, _SUBSTEPS, scratch)
         return following
+
+    return next_state
 
 
 @entry(array(1), array(1), array(1), array(1), float, int, array(2))
@@ -236,7 +232,7 @@ class Flight:
 def fly(task: FlightTask) -> Flight:
     """Fly `task`; the same task gives the same flight, except for the solve times."""
     settings, nonlinear = task.settings, task.plant is PlantKind.NONLINEAR
-    plant = (NonlinearPlant if nonlinear else LinearPlant)(
+    plant = (nonlinear_plant if nonlinear else linear_plant)(
         np.array(task.wind_ned_mps), task.thrust_loss
     )
     lower, upper = flyable_box(paper_vehicle(), settings) if nonlinear else (None, None)
@@ -260,7 +256,7 @@ def fly(task: FlightTask) -> Flight:
         certificate = certify(move.problem, move.result, exact)
         quality.append((certificate.cost, certificate.spread, certificate.gap, solve_s))
         inputs.append(move.inputs)
-        state = plant.next_state(state, move.inputs)
+        state = plant(state, move.inputs)
         states.append(state)
     flown, applied = np.array(states), np.array(inputs)
     if nonlinear:

@@ -42,28 +42,11 @@ SECTIONS: dict[str, dict[str, Callable[[Flights], Table | Figure]]] = {
     },
 }  # fmt: skip
 MAKERS = {label: make for pieces in SECTIONS.values() for label, make in pieces.items()}
-SEEDS, SEEDS_MOST = 20, 10_000
-
-
-def check(out: Path, labels: Sequence[str], seeds: int) -> None:
-    """Create the output directory. Raises UserError for the first option that is not valid."""
-    for label in labels:
-        kind, _, name = label.partition(" ")
-        if label not in MAKERS:
-            known = [each.removeprefix(f"{kind} ") for each in MAKERS if each.startswith(kind)]
-            raise UserError(f"there is no {kind} {name!r}; known are {', '.join(known)}")
-    if not 1 <= seeds <= SEEDS_MOST:
-        raise UserError(f"seeds must be 1 .. {SEEDS_MOST}, not {seeds}")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        if any(out.iterdir()):
-            raise UserError(f"{out} is not empty; choose another directory with --out")
-    except OSError as error:
-        raise UserError(f"{out} cannot be written: {error.strerror or error}") from None
+SEEDS = 20
 
 
 def reproduce(
-    out: Path, labels: Sequence[str] = (), seeds: int = SEEDS, console: Console | None = None
+    out: Path, labels: Sequence[str], seeds: int, console: Console
 ) -> dict[str, Table | Figure]:
     """Compute and write tables and figures, with progress on `console` (stderr).
 
@@ -75,11 +58,21 @@ def reproduce(
     Writes table_NAME.csv, figure_NAME.json and paper.html to `out`. Returns tables and figures by
     label. Raises UserError for invalid arguments or an output that cannot be written.
     """
-    check(out, labels, seeds)
+    for label in labels:
+        kind, _, name = label.partition(" ")
+        if label not in MAKERS:
+            known = [each.removeprefix(f"{kind} ") for each in MAKERS if each.startswith(kind)]
+            raise UserError(f"there is no {kind} {name!r}; known are {', '.join(known)}")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        if any(out.iterdir()):
+            raise UserError(f"{out} is not empty; choose another directory with --out")
+    except OSError as error:
+        raise UserError(f"{out} cannot be written: {error.strerror or error}") from None
     labels = list(dict.fromkeys(labels)) or sorted(MAKERS, key=lambda label: label[0] == "f")
     made: dict[str, Table | Figure] = {}
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
-    progress = Progress(*columns, TimeElapsedColumn(), console=console or Console(stderr=True))
+    progress = Progress(*columns, TimeElapsedColumn(), console=console)
     bar = progress.add_task("paper", total=len(labels))
     count = 0
 

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from offboard.model.vehicle import Vehicle
-from offboard.reference.base import Reference
-from offboard.reference.flatness import flat_state
+from offboard.reference.base import FlatSample, Reference
+from offboard.reference.flatness import FlatState, flat_state
 from offboard.reference.track import Track
 
 Array = NDArray[np.float64]
@@ -24,22 +24,12 @@ _STEP_S = 0.01
 _CHUNK = 20_000
 
 
-class InfeasibleReference(ValueError):
-    """The reference exceeds a limit: one sentence with quantity, time, value and limit."""
+class Envelope(NamedTuple):
+    """The greatest tilt, height and horizontal distance from the take-off point."""
 
-
-@dataclass(frozen=True, slots=True)
-class Envelope:
-    """The extremes of a reference. SI; rates are magnitudes per body axis."""
-
-    thrust_min_mps2: float
-    thrust_max_mps2: float
-    tilt_max_rad: float
-    rates_max_frd_radps: tuple[float, float, float]
-    speed_max_mps: float
-    height_min_m: float
-    height_max_m: float
-    radius_max_m: float  # horizontal distance from the take-off point
+    tilt_rad: float
+    height_m: float
+    radius_m: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,86 +43,64 @@ class _Demand:
     sign: float = 1.0
     of_path: bool = False  # depends on the path alone, not on the vehicle
 
-    @property
-    def worst(self) -> int:
-        """Index of the extreme, or of the first NaN."""
-        return int(np.argmax(self.sign * self.values))
-
-    @property
-    def extreme(self) -> float:
-        return float(self.values[self.worst])
-
 
 def check(reference: Reference, vehicle: Vehicle) -> Envelope:
-    """Check that a vehicle can fly a reference without wind; return the extremes.
+    """Check that a vehicle can fly a reference without wind; return what it reaches.
 
     The reference, relative to the take-off point, is sampled every 10 ms. Raises
-    InfeasibleReference for a path that is too low or too far away, otherwise for the limit that is
+    ValueError for a path that is too low or too far away, otherwise for the limit that is
     exceeded first; of a track it names the path's own time, as a table has it.
     """
     count = int(np.ceil(reference.duration_s / _STEP_S)) + 1
     times = np.linspace(0.0, reference.duration_s, count)
-    parts = [
-        _envelope(reference, vehicle, times[first : first + _CHUNK])
-        for first in range(0, count, _CHUNK)
-    ]
-    lowest, highest = np.min(parts, axis=0), np.max(parts, axis=0)
-    return Envelope(
-        thrust_min_mps2=float(lowest[0]),
-        thrust_max_mps2=float(highest[1]),
-        tilt_max_rad=float(highest[2]),
-        rates_max_frd_radps=(float(highest[3]), float(highest[4]), float(highest[5])),
-        speed_max_mps=float(highest[6]),
-        height_min_m=float(lowest[7]),
-        height_max_m=float(highest[9]),
-        radius_max_m=float(highest[10]),
-    )
+    parts = [times[first : first + _CHUNK] for first in range(0, count, _CHUNK)]
+    reached = np.max([_envelope(reference, vehicle, part) for part in parts], axis=0)
+    return Envelope(*reached.tolist())
 
 
-def _envelope(reference: Reference, vehicle: Vehicle, times: Array) -> list[float]:
-    demands = _demands(reference, vehicle, times)
+def _envelope(reference: Reference, vehicle: Vehicle, times: Array) -> Envelope:
+    sample = reference.sample(times)
+    state = flat_state(sample, vehicle.gravity_mps2, vehicle.drag_per_mass_ps)
+    tilt = np.arccos(np.clip(state.thrust_direction_ned[:, 2], -1.0, 1.0))
     broken: list[tuple[int, _Demand]] = []
-    for demand in demands:
+    for demand in _demands(sample, state, tilt, vehicle):
         # in this form NaN exceeds the limit
         within = demand.sign * demand.values <= demand.sign * demand.limit
         if not within.all():
             broken.append((int(np.argmin(within)), demand))
     if broken:
-        index, demand = min(broken, key=lambda item: (not item[1].of_path, item[0]))
-        worst_s, first_s = float(times[demand.worst]), float(times[index])
+        first, demand = min(broken, key=lambda item: (not item[1].of_path, item[0]))
+        worst = int(np.argmax(demand.sign * demand.values))  # or the first NaN
+        worst_s, first_s = float(times[worst]), float(times[first])
         if isinstance(reference, Track):
             worst_s, first_s = map(reference.path_time_s, (worst_s, first_s))
-        raise InfeasibleReference(
-            f"the reference asks for {demand.what} {demand.extreme:.3g} {demand.unit} at "
+        raise ValueError(
+            f"the reference asks for {demand.what} {demand.values[worst]:.3g} {demand.unit} at "
             f"{worst_s:.2f} s, beyond the limit of {demand.limit:.3g} {demand.unit} "
             f"(first at {first_s:.2f} s)"
         )
-    return [demand.extreme for demand in demands]
+    north, east, down = sample.position_ned_m.T
+    return Envelope(float(tilt.max()), float(-down.min()), float(np.hypot(north, east).max()))
 
 
-def _demands(reference: Reference, vehicle: Vehicle, times: Array) -> tuple[_Demand, ...]:
-    sample = reference.sample(times)
-    state = flat_state(sample, vehicle.gravity_mps2, vehicle.drag_per_mass_ps)
+def _demands(
+    sample: FlatSample, state: FlatState, tilt: Array, vehicle: Vehicle
+) -> tuple[_Demand, ...]:
     thrust_max = vehicle.thrust_max_mps2
-    tilt = np.arccos(np.clip(state.thrust_direction_ned[:, 2], -1.0, 1.0))
     rates = np.abs(state.rates_frd_radps)
-    rates_max = RATES_MAX_FRD_RADPS
     speed = np.linalg.norm(sample.velocity_ned_mps, axis=-1)
     height = -sample.position_ned_m[:, 2]
     distance = np.linalg.norm(sample.position_ned_m, axis=-1)
-    radius = np.linalg.norm(sample.position_ned_m[:, :2], axis=-1)
     thrust = state.thrust_mps2
     thrust_min = max(THRUST_SHARE_MIN * thrust_max, vehicle.thrust_min_mps2)
     return (
         _Demand("a thrust of", "m/s^2", thrust, thrust_min, -1.0),
         _Demand("a thrust of", "m/s^2", thrust, THRUST_SHARE_MAX * thrust_max),
         _Demand("a tilt of", "rad", tilt, TILT_SHARE_MAX * vehicle.tilt_max_rad),
-        _Demand("a roll rate of", "rad/s", rates[:, 0], rates_max[0]),
-        _Demand("a pitch rate of", "rad/s", rates[:, 1], rates_max[1]),
-        _Demand("a yaw rate of", "rad/s", rates[:, 2], rates_max[2]),
+        _Demand("a roll rate of", "rad/s", rates[:, 0], RATES_MAX_FRD_RADPS[0]),
+        _Demand("a pitch rate of", "rad/s", rates[:, 1], RATES_MAX_FRD_RADPS[1]),
+        _Demand("a yaw rate of", "rad/s", rates[:, 2], RATES_MAX_FRD_RADPS[2]),
         _Demand("a speed of", "m/s", speed, SPEED_MAX_MPS),
         _Demand("a height of", "m", height, HEIGHT_MIN_M, -1.0, of_path=True),
         _Demand("a distance of", "m", distance, DISTANCE_MAX_M, of_path=True),
-        _Demand("a height of", "m", height, math.inf, of_path=True),
-        _Demand("a distance of", "m", radius, math.inf, of_path=True),
     )

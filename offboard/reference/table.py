@@ -29,10 +29,6 @@ _NAMES = {
 }  # fmt: skip
 
 
-class TableError(ValueError):
-    """The table cannot be used; the sentence names file, row and column."""
-
-
 @dataclass(frozen=True, slots=True)
 class Table:
     """The rows: times_s (N,) from 0, points_ned_m (N, 3), heading_rad (N,) unwrapped, or None."""
@@ -45,29 +41,29 @@ class Table:
 def parse(text: str, name: str) -> Table:
     """Parse CSV text. Times are shifted to begin at 0.
 
-    Raises TableError; it calls the table `name` and counts rows from 1, the header."""
+    Raises ValueError; it calls the table `name` and counts rows from 1, the header."""
     rows = [
         (number, row)
         for number, row in enumerate(_rows(text, name), start=1)
         if any(cell.strip() for cell in row)
     ]
     if not rows:
-        raise TableError(f"{name} is empty: it needs a header and at least {ROWS_MIN} rows")
+        raise ValueError(f"{name} is empty: it needs a header and at least {ROWS_MIN} rows")
     columns = _header(rows[0][1], name, rows[0][0])
     body = rows[1:]
     if len(body) < ROWS_MIN:
-        raise TableError(f"{name} has {len(body)} rows of data: at least {ROWS_MIN} are needed")
+        raise ValueError(f"{name} has {len(body)} rows of data: at least {ROWS_MIN} are needed")
     values = np.array([_numbers(row, columns, name, number) for number, row in body])
     by_name = dict(zip(columns, values.T, strict=True))
     times = by_name["time_s"]
     for index in range(1, len(body)):
         if times[index] <= times[index - 1]:
-            raise TableError(
+            raise ValueError(
                 f"{name}, row {body[index][0]}, column time_s: {times[index]:.12g} does not "
                 f"come after {times[index - 1]:.12g}; times must increase"
             )
     if times[-1] - times[0] > DURATION_MAX_S:
-        raise TableError(
+        raise ValueError(
             f"{name} lasts {times[-1] - times[0]:.12g} s: at most {DURATION_MAX_S:.0f} s are flown"
         )
     down = by_name["down_m"] if "down_m" in by_name else -by_name["altitude_m"]
@@ -80,7 +76,7 @@ def _rows(text: str, name: str) -> list[list[str]]:
     try:
         return list(csv.reader(io.StringIO(text.removeprefix("\ufeff"))))
     except csv.Error as error:
-        raise TableError(f"{name} is not a CSV table: {error}") from None
+        raise ValueError(f"{name} is not a CSV table: {error}") from None
 
 
 def _header(cells: list[str], name: str, number: int) -> list[str]:
@@ -88,25 +84,25 @@ def _header(cells: list[str], name: str, number: int) -> list[str]:
     for cell in cells:
         column = _NAMES.get(cell.strip().lower())
         if column is None:
-            raise TableError(
+            raise ValueError(
                 f"{name}, row {number}: unknown column {cell.strip()!r}; known are "
                 "time_s, north_m, east_m, down_m (or altitude_m), course_deg"
             )
         if column in columns:
-            raise TableError(f"{name}, row {number}: column {column} is given twice")
+            raise ValueError(f"{name}, row {number}: column {column} is given twice")
         columns.append(column)
     height = "down_m" if "down_m" in columns else "altitude_m"
     for column in ("time_s", "north_m", "east_m", height):
         if column not in columns:
-            raise TableError(f"{name}, row {number}: column {column} is missing")
+            raise ValueError(f"{name}, row {number}: column {column} is missing")
     if "down_m" in columns and "altitude_m" in columns:
-        raise TableError(f"{name}, row {number}: down_m and altitude_m exclude each other")
+        raise ValueError(f"{name}, row {number}: down_m and altitude_m exclude each other")
     return columns
 
 
 def _numbers(row: list[str], columns: list[str], name: str, number: int) -> list[float]:
     if len(row) != len(columns):
-        raise TableError(f"{name}, row {number}: {len(row)} cells for {len(columns)} columns")
+        raise ValueError(f"{name}, row {number}: {len(row)} cells for {len(columns)} columns")
     values = []
     for cell, column in zip(row, columns, strict=True):
         try:
@@ -114,7 +110,7 @@ def _numbers(row: list[str], columns: list[str], name: str, number: int) -> list
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise TableError(
+            raise ValueError(
                 f"{name}, row {number}, column {column}: {cell.strip()!r} is not a finite number"
             )
         values.append(value)

@@ -139,12 +139,12 @@ class Track:
     @property
     def track_end_s(self) -> float:
         """End of the scored part."""
-        return self.run_in_s + self.cruise_s
+        return self.track_start_s + self.cruise_s
 
     @property
     def duration_s(self) -> float:
         """The time at which it comes to rest."""
-        return self.run_in_s + self.cruise_s + self.run_out_s
+        return self.track_end_s + self.run_out_s
 
     def path_time_s(self, time_s: float) -> float:
         """The path's own time at `time_s`: of a table, the time in its rows, from the first."""
@@ -172,9 +172,9 @@ def path_end_s(path: Path, run_in_s: float, run_out_s: float) -> float:
     return path.length_s + 0.5 * (run_in_s + run_out_s)
 
 
-def hold(position_ned_m: Triple, heading_rad: float, duration_s: float = 0.0) -> Track:
+def hold(position_ned_m: Triple, heading_rad: float) -> Track:
     """Rest at a point (NED, m) with a heading (rad)."""
-    at_rest = Harmonic(duration_s, bounded=True, offset_ned_m=position_ned_m)
+    at_rest = Harmonic(0.0, bounded=True, offset_ned_m=position_ned_m)
     return Track(at_rest, Fixed(heading_rad))
 
 
@@ -228,20 +228,9 @@ class Moved:
             clock = self._clock(time.reshape(-1))
             inner = self.reference.sample(clock[0])
             jet = np.zeros((5, time.size, 4))
-            jet[..., :HEADING] = (
-                inner.position_ned_m,
-                inner.velocity_ned_mps,
-                inner.acceleration_ned_mps2,
-                inner.jerk_ned_mps3,
-                inner.snap_ned_mps4,
-            )
-            jet[:3, :, HEADING] = (
-                inner.heading_rad,
-                inner.heading_rate_radps,
-                inner.heading_acceleration_radps2,
-            )
+            jet[..., :HEADING], jet[:3, :, HEADING] = inner[:5], inner[5:]
             sample = _composed(clock, jet, time.shape)
-        return replace(sample, position_ned_m=sample.position_ned_m + np.array(self.origin_ned_m))
+        return sample._replace(position_ned_m=sample.position_ned_m + np.array(self.origin_ned_m))
 
     def _clock(self, time_s: Array) -> Array:
         """The reference's own time and its first four derivatives (5, N) at `time_s` (N,)."""

@@ -41,13 +41,11 @@ class Limits:
     cruise_vertical_mps: float = 1.5
 
 
-def stopping_place(
-    position_ned_m: Vector, velocity_ned_mps: Vector, limits: Limits = Limits()
-) -> Array:
+def stopping_place(position_ned_m: Vector, velocity_ned_mps: Vector) -> Array:
     """Where a vehicle at this position (3,), with this velocity (3,), NED, comes to rest if it is
-    braked smoothly within the limits."""
+    braked smoothly within the usual limits."""
     velocity = np.asarray(list(velocity_ned_mps), dtype=np.float64)
-    return np.asarray(list(position_ned_m)) + velocity * (_brake_s(velocity, limits) / 2.0)
+    return np.asarray(list(position_ned_m)) + velocity * (_brake_s(velocity, Limits()) / 2.0)
 
 
 def _brake_s(velocity: Array, limits: Limits) -> float:

@@ -39,7 +39,6 @@ from offboard.run.configuration import flown
 from offboard.run.flight import SETTINGS, Prepared, build
 
 CALLS = ("request_stop", "announce", "note_autopilot", "guard")  # methods of the companion
-_OUR_FIRST_SYSTEM = 1  # our system id before a vehicle was found
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +61,7 @@ class Recording:
 
 
 def read(flight: Path) -> Recording:
-    """The recording in a flight directory or .tlog. Raises UserError or TlogError."""
+    """The recording in a flight directory or .tlog. Raises UserError."""
     path = tlog.find(flight)
     log = tlog.read(path)
     configuration = history.configuration(log)
@@ -253,9 +252,7 @@ class Replay:
 
     def _note(self, message: LoggedMessage) -> bool:
         """Note what we sent; returns whether it was ours."""
-        vehicle = self.companion.vehicle.found
-        system = vehicle.system_id if vehicle else _OUR_FIRST_SYSTEM
-        if message.system_id != system:
+        if message.system_id != self.companion.session.senders.own.system_id:
             return False
         if message.component_id == RECORD_COMPONENT_ID:
             self._pieces += record_type(message) == PAYLOAD_TYPE

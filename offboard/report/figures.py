@@ -1,4 +1,6 @@
-"""Figures of a report: path, timeline and panels, of one flight or of several."""
+"""Figures of a report, of one flight or of several: path, timeline (phases and modes as bands,
+steps of the failsafe and texts as marks), and panels.
+"""
 
 from __future__ import annotations
 
@@ -6,21 +8,23 @@ import html
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
 
-from offboard.analysis.history import Rows
+from offboard.analysis.history import Event, Rows
 from offboard.analysis.page import (
     BLUE,
     BLUE_BAND,
     BROWN,
     GREEN,
     GREY,
+    GREY_BAND,
     INK,
     ORANGE,
+    ORANGE_BAND,
     PINK,
     PURPLE,
     RED,
@@ -33,9 +37,12 @@ from offboard.analysis.page import (
     panels,
     without_outliers,
 )
-from offboard.report import timeline
+from offboard.analysis.verdict import irregular
+from offboard.flight.outbox import Refusal
+from offboard.flight.phases import Phase
+from offboard.mavlink.event_record import SUPERVISOR
 from offboard.report.flight import Flight
-from offboard.report.panels import GROUPS, Curve, Panel, Points, thinned
+from offboard.report.panels import GROUPS, LEAST_SHOWN, Curve, Panel, Points, thinned
 
 # of flights that share a figure, in an order that colour-blind people can tell apart
 COLOURS = (BLUE, ORANGE, GREEN, GREY, PINK, BROWN)
@@ -44,6 +51,8 @@ PATH_POINTS = 1500
 PANEL_PX = 120
 LEFT_PX = 75  # beside the panels, the same in all figures: their time axes stand below each other
 ROW_PX = 34  # of the timeline
+# phases in which a flight was ended early: orange
+_ENDED_EARLY = {"hold", "stand down", "yielded", "failed", SUPERVISOR}
 _CUT = "Single values far from all others are outside; two clicks on the figure show them."
 
 
@@ -129,12 +138,76 @@ def _path_of(rows: Rows, name: str, colour: str, dash: str) -> go.Scatter3d:
 # ---------------------------------------------------------------------- timeline
 
 
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A band from `begin_s` to `end_s` with a label, or a mark at `begin_s`; `text` in full."""
+
+    row: str
+    begin_s: float
+    text: str
+    end_s: float = math.nan
+    label: str = ""
+    colour: str = ""
+
+
+def bands(flight: Flight) -> list[Entry]:
+    """Phases of offboard, and modes of the vehicle; the mode of its setpoints is blue."""
+    found = [
+        Entry("phase", begin_s, event.what, end_s, event.phase, _colour(event.phase))
+        for event, begin_s, end_s in phases(flight)
+    ]
+    dialect = flight.history.dialect
+    for event, begin_s, end_s in spans(flight.history.modes, flight):
+        colour = BLUE_BAND if dialect and event.what == dialect.engage_mode else GREY_BAND
+        text = f"mode {event.what}"
+        found.append(Entry("mode", begin_s, text, end_s, event.what, colour))
+    return found
+
+
+def marks(flight: Flight) -> list[Entry]:
+    """Steps of the failsafe, and texts of both sides."""
+    flown = flight.history
+    found = [Entry("failsafe", event.time_s, event.what) for event in irregular(flown.phases)]
+    refused = flown.records["refused"].astype(int)
+    for row in refused.nonzero()[0].tolist():
+        why = ", ".join(
+            flag.name.lower().replace("_", " ") for flag in Refusal(int(refused[row])) if flag.name
+        )
+        found.append(
+            Entry("failsafe", float(flown.records["time_s"][row]), f"setpoint not sent: {why}")
+        )
+    texts = (*flown.announcements, *flown.vehicle_messages)
+    found += [Entry("texts", event.time_s, f"{event.who}: {event.what}") for event in texts]
+    return [mark for mark in found if math.isfinite(mark.begin_s)]
+
+
+def phases(flight: Flight) -> list[tuple[Event, float, float]]:
+    """The spans of the phases of offboard; the last one ends where the supervisor takes over."""
+    said = [event for event in flight.history.announcements if event.cause == SUPERVISOR]
+    took_over = [replace(event, phase=SUPERVISOR) for event in said[:1]]
+    return spans([*flight.history.phases, *took_over], flight)
+
+
+def spans(events: Sequence[Event], flight: Flight) -> list[tuple[Event, float, float]]:
+    """Each event until the next one; the first may be older than telemetry."""
+    begins = [flight.begin_s if math.isnan(e.time_s) else e.time_s for e in events]
+    ends = [*begins[1:], flight.end_s]
+    rows = zip(events, begins, ends, strict=False)  # without events there is an end too many
+    return [(event, begin_s, max(end_s, begin_s)) for event, begin_s, end_s in rows]
+
+
+def _colour(phase: str) -> str:
+    if phase == Phase.TRACK.value:
+        return BLUE_BAND
+    return ORANGE_BAND if phase in _ENDED_EARLY else GREY_BAND
+
+
 def _timeline(drawn: Sequence[DrawnFlight]) -> Figure | None:
     figure = go.Figure()
     rows: list[str] = []
     for one in drawn:
         prefix = f"{one.label.partition(':')[0]} " if one.label else ""
-        shown = timeline.bands(one.flight), timeline.marks(one.flight)
+        shown = bands(one.flight), marks(one.flight)
         if one.label:  # of several flights only what differs most
             shown = (
                 [b for b in shown[0] if b.row == "phase"],
@@ -160,7 +233,7 @@ def _timeline(drawn: Sequence[DrawnFlight]) -> Figure | None:
     return Figure("Timeline", figure, "Point at a band or a mark to read its text.")
 
 
-def _add_bands(figure: go.Figure, row: str, bands: Sequence[timeline.Entry], zero_s: float) -> None:
+def _add_bands(figure: go.Figure, row: str, bands: Sequence[Entry], zero_s: float) -> None:
     if not bands:
         return
     figure.add_trace(
@@ -177,7 +250,7 @@ def _add_bands(figure: go.Figure, row: str, bands: Sequence[timeline.Entry], zer
     )  # fmt: skip
 
 
-def _add_marks(figure: go.Figure, row: str, marks: Sequence[timeline.Entry], zero_s: float) -> None:
+def _add_marks(figure: go.Figure, row: str, marks: Sequence[Entry], zero_s: float) -> None:
     if not marks:
         return
     failsafe = row.endswith("failsafe")
@@ -225,13 +298,14 @@ def _panels(title: str, group: Sequence[Panel], drawn: Sequence[DrawnFlight]) ->
 
 def _known(panel: Panel, drawn: Sequence[DrawnFlight]) -> list[tuple[DrawnFlight, Curve, Points]]:
     """The curves of a panel that have values; of several flights only the main ones."""
-    curves = [
-        (one, each, each.source(one.flight.history))
-        for one in drawn
-        for each in panel.curves
-        if each.main or not one.label
-    ]
-    return [curve for curve in curves if np.isfinite(curve[2][1]).any()]
+    shown = ((one, each) for one in drawn for each in panel.curves if each.main or not one.label)
+    found = []
+    for one, each in shown:
+        times, values, *sd = each.source(one.flight.history)
+        if np.isfinite(values).any():
+            least = LEAST_SHOWN if panel.logarithmic else -math.inf
+            found.append((one, each, (times, np.maximum(values, least), *sd)))
+    return found
 
 
 def _draw(
@@ -257,7 +331,7 @@ def _draw(
 def _phase_shapes(flight: Flight) -> list[dict[str, Any]]:
     """A band where the track was flown, and a line where each phase begins."""
     shapes: list[dict[str, Any]] = []
-    for event, begin_s, end_s in timeline.spans(flight.history.phases, flight):
+    for event, begin_s, end_s in phases(flight):
         place = {"xref": "x", "yref": "paper", "x0": begin_s, "y0": 0, "y1": 1, "layer": "below"}
         line = {"color": GREY, "width": 1}
         if math.isfinite(event.time_s):

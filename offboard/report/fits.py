@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.analysis.identify import Row, estimator_noise, rows
+from offboard.analysis.identify import constants, estimator_noise
 from offboard.analysis.page import BLUE, GREY, RED, Figure, curve, panels
 from offboard.identification.attitude_fit import tilt_signals, yaw_signals
 from offboard.identification.response import second_order
@@ -21,18 +21,9 @@ Array = NDArray[np.float64]
 SHOWN_S = 20.0  # the figures show the end of the flight; a longer part is too dense to read
 
 
-@dataclass(frozen=True, slots=True)
-class Fits:
-    """`rows` are those of `identify.rows`; `noise` is a sentence, empty where nothing was flown."""
-
-    title: str
-    rows: list[Row]
-    noise: str
-    figures: list[Figure]
-
-
-def fits(found: Identified, trace: Trace, prior: Vehicle) -> Fits:
-    """The constants of an identification, and how well they reproduce the end of the flight.
+def fits(found: Identified, trace: Trace, prior: Vehicle) -> dict[str, Any]:
+    """The constants of an identification, and how well they reproduce the end of the flight: what
+    the page shows of them.
 
     Args:
         found: what was identified.
@@ -49,17 +40,20 @@ def fits(found: Identified, trace: Trace, prior: Vehicle) -> Fits:
             _response("Tilt", axes, tilt_signals(last), vehicle.tilt),
             _response("Heading", ("heading, deg",), yaw_signals(last), vehicle.yaw, 180 / math.pi),
         ]
-    title = f"Identified from {found.seconds:.1f} s"
-    return Fits(title, list(rows(found)), _noise(trace) if found.seconds else "", figures)
+    return {
+        "title": f"Identified from {found.seconds:.1f} s",
+        "rows": [row for rows in constants(found).values() for row in rows],
+        "noise": _noise(trace) if found.seconds else "",
+        "figures": figures,
+    }
 
 
 def _noise(trace: Trace) -> str:
-    noise = estimator_noise(trace)
+    position_m, velocity_mps, attitude_rad, differ_mps = estimator_noise(trace)
     return (
-        f"Noise of the autopilot's estimate from sample to sample: position "
-        f"{1e3 * noise.position_m:.2g} mm, velocity {1e3 * noise.velocity_mps:.2g} mm/s, attitude "
-        f"{1e3 * noise.attitude_rad:.2g} mrad. Over half a second its velocity and the change of "
-        f"its position differ by {noise.velocity_contradiction_mps:.2g} m/s."
+        f"Noise of the autopilot's estimate from sample to sample: position {1e3 * position_m:.2g} "
+        f"mm, velocity {1e3 * velocity_mps:.2g} mm/s, attitude {1e3 * attitude_rad:.2g} mrad. Over "
+        f"half a second its velocity and the change of its position differ by {differ_mps:.2g} m/s."
     )
 
 

@@ -75,7 +75,7 @@ class Flight:
 
 
 def read(path: Path) -> Flight:
-    """Read a flight directory or a .tlog file. Raises TlogError."""
+    """Read a flight directory or a .tlog file. Raises UserError."""
     log = tlog.read(tlog.find(path))
     flown = history.gather(log)
     missing = [_NO_HEARTBEAT] if flown.vehicle is None else []

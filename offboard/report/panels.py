@@ -61,13 +61,6 @@ def _recorded(field: str, scale: float = 1.0) -> Source:
     return _column("records", field, None, scale)
 
 
-def _above_zero(field: str) -> Source:
-    def samples(flown: History) -> Points:
-        return flown.records["time_s"], np.maximum(flown.records[field], LEAST_SHOWN)
-
-    return samples
-
-
 def _away(array: str, axis: int | None = None) -> Source:
     """Distance from the reference, or its component along an axis; NaN where there is none."""
 
@@ -158,11 +151,11 @@ GROUPS: dict[str, tuple[str, tuple[Panel, ...]]] = {
     )),
     "decisions": ("Decisions", (
         Panel("gap: cost above the exact optimum", (
-            Curve("gap", _above_zero("gap"), BLUE, "dots"),
+            Curve("gap", _recorded("gap"), BLUE, "dots"),
         ), logarithmic=True, caption="Zero is drawn at 1e-16. Only decisions that were sent as "
               "certified have a gap."),
         Panel("spread of the swarm (ε, Eq. 29)", (
-            Curve("spread", _above_zero("spread"), BLUE, "dots"),
+            Curve("spread", _recorded("spread"), BLUE, "dots"),
         ), logarithmic=True),
         Panel("solve time, ms", (
             Curve("solve time", _recorded("solve_time_s", 1e3), BLUE, "dots"),

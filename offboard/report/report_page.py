@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from offboard.analysis.page import render
 from offboard.analysis.score import METRICS
 from offboard.analysis.score_table import summary, verdict
 from offboard.report.figures import figures, letter
-from offboard.report.fits import Fits
 from offboard.report.flight import Flight
 
 _SIGNS = {1.0: ("good", "✓"), 0.0: ("bad", "✗")}
 
 
-def page(flights: Sequence[Flight], fits: Fits | None = None) -> str:
+def page(flights: Sequence[Flight], fits: Mapping[str, Any] | None = None) -> str:
     """The page of one flight or of several, as the text of an HTML file. `fits`: what was
-    identified from the flight."""
+    identified from the flight, by `fits.fits`."""
     alone = len(flights) == 1
     title = f"Flight {flights[0].name}" if alone else f"{len(flights)} flights side by side"
     return render(

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import yaml
@@ -22,22 +22,20 @@ from pydantic import BaseModel, Field, SerializeAsAny, create_model
 from offboard.control import catalogue
 from offboard.control.base import Controller, ControllerSettings
 from offboard.documents import shipped
-from offboard.documents.errors import located
+from offboard.documents.errors import DocumentError, located
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import (
-    DocumentError,
     check_kind,
     kind_of,
-    known,
     override,
     read,
     validate,
 )
-from offboard.documents.shipped import locate, read_text
+from offboard.documents.shipped import PARTS, locate, read_text
 from offboard.flight.phases import Limits
 from offboard.identification.learner import IdentifySettings
 from offboard.model.vehicle import Vehicle
-from offboard.reference.feasibility import Envelope, check
+from offboard.reference.feasibility import check
 from offboard.reference.shapes import SHAPES, FromTable, Shape, Waypoints
 from offboard.reference.track import Track
 from offboard.run.sitl import check_scenario
@@ -46,7 +44,6 @@ Raw = dict[str, Any]
 RECORDED_VERSIONS = ("pso-offboard", "pymavlink", "numpy", "scipy", "numba")
 UNKNOWN_VEHICLE = "neutral"
 DESCENT_MPS = 0.5  # slowest default near the ground: ArduCopter LAND_SPEED; MPC_LAND_SPEED is 0.7
-PARTS = ("vehicle", "controller", "reference")  # of a flight, each a file of its own
 
 
 class FlightConfig(Parameters):
@@ -119,36 +116,29 @@ def build_track(config: FlightConfig) -> Track:
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # what overflows is beyond a limit
             track = config.reference.track()
-            envelope = check(track, vehicle)
+            _, height_m, radius_m = check(track, vehicle)
     except ValueError as error:
         raise DocumentError(f"reference {config.reference.title}: {error}") from None
-    landing_s = envelope.height_max_m / DESCENT_MPS
+    landing_s = height_m / DESCENT_MPS
     if landing_s > limits.land_s:
         raise DocumentError(
-            f"reference {config.reference.title}: landing from {envelope.height_max_m:.4g} m takes "
+            f"reference {config.reference.title}: landing from {height_m:.4g} m takes "
             f"{landing_s:.4g} s at {DESCENT_MPS} m/s, longer than limits.land_s "
             f"({limits.land_s:g} s); fly lower or allow more time"
         )
-    _check_volume(envelope, config)
-    refused = config.controller.refusal(track)
-    if refused:
-        raise DocumentError(f"controller: {refused}")
-    return track
-
-
-def _check_volume(envelope: Envelope, config: FlightConfig) -> None:
-    """The reference must stay within the volume whose limits end a flight. Raises DocumentError."""
-    limits = config.limits
-    reached = (
-        (envelope.height_max_m, "above", "limits.ceiling_m", limits.ceiling_m),
-        (envelope.radius_max_m, "away from", "limits.radius_m", limits.radius_m),
-    )
-    for reached_m, where, limit, limit_m in reached:
-        if reached_m > limit_m:
+    for reached_m, where, limit, limit_m in (
+        (height_m, "above", "limits.ceiling_m", limits.ceiling_m),
+        (radius_m, "away from", "limits.radius_m", limits.radius_m),
+    ):
+        if reached_m > limit_m:  # beyond, a flight is ended
             raise DocumentError(
                 f"reference {config.reference.title}: it goes {reached_m:.4g} m {where} the "
                 f"take-off point, beyond {limit} ({limit_m:g} m); fly nearer or raise the limit"
             )
+    refused = config.controller.refusal(track)
+    if refused:
+        raise DocumentError(f"controller: {refused}")
+    return track
 
 
 def build_controller(config: FlightConfig) -> Controller:
@@ -205,17 +195,16 @@ def flown(text: str) -> FlightConfig:
     """The configuration in a log (`dump`ed then), without settings that no longer exist. Raises
     DocumentError."""
     source = "the log's configuration"
-    return _validated(read(text, source), source, ignores_unknown=True)
+    return _validated(read(text, source), source, "ignore")
 
 
-def _validated(raw: Raw, source: str, *, ignores_unknown: bool = False) -> FlightConfig:
-    """`raw` as a FlightConfig whose parts have the classes that they name."""
+def _validated(raw: Raw, source: str, extra: Literal["ignore"] | None = None) -> FlightConfig:
+    """`raw` as a FlightConfig whose parts have the classes that they name; `extra` as in
+    `validate`."""
     models = {part: _model(part, raw.get(part), f"{source}: {part}") for part in PARTS}
     parts: dict[str, Any] = {part: (model, ...) for part, model in models.items()}
     model = create_model("FlightConfig", __base__=FlightConfig, **parts)
-    if ignores_unknown:
-        raw = known(raw, model)
-    return FlightConfig(**dict(validate(raw, model, source)))
+    return FlightConfig(**dict(validate(raw, model, source, extra)))
 
 
 def _complete(config: FlightConfig) -> FlightConfig:

@@ -64,7 +64,7 @@ SETTINGS = SessionSettings(component_id=COMPONENT_ID, record_component_id=RECORD
 class Connection:
     """A vehicle at a link. `system_id`: its own, where several send; `signing_key`: a key file."""
 
-    address: str = "udpin:127.0.0.1:14540"
+    address: str
     system_id: int | None = None
     signing_key: Path | None = None
 
@@ -82,8 +82,7 @@ class Connection:
         )
 
     def signing(self, stack: ExitStack) -> Signing | None:
-        """Signing with the kept time; closed with `stack`. Raises KeyFileError and
-        SigningTimeError."""
+        """Signing with the kept time; closed with `stack`. Raises UserError."""
         if self.signing_key is None:
             return None
         return stack.enter_context(SigningTime(read_key(self.signing_key)))
@@ -309,9 +308,8 @@ def fly(
     Example: `fly(load("flight"), Path("flights/1"), Simulated()).exit_code` is 0 if the flight was
     flown and landed.
 
-    Raises DocumentError, KeyFileError, LinkError, SupervisorError, SigningTimeError or LogError
-    before anything is sent, and KeyboardInterrupt if a stop was requested meanwhile. The log is
-    created last: a flight that cannot begin leaves no directory.
+    Raises UserError before anything is sent, and KeyboardInterrupt if a stop was requested
+    meanwhile. The log is created last: a flight that cannot begin leaves no directory.
     """
     simulated = isinstance(vehicle, Simulated)
     with ExitStack() as stack:

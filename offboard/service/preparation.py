@@ -22,10 +22,12 @@ from pathlib import Path
 import yaml
 from pydantic import BaseModel, ConfigDict, Field
 
-from offboard.documents.reading import DocumentError, read, validate
+from offboard.documents.errors import DocumentError
+from offboard.documents.reading import read, validate
 from offboard.documents.shipped import read_text
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_estimate import IdentifiedVehicle
+from offboard.link.log import replace_file
 from offboard.model.vehicle import Vehicle
 from offboard.run.configuration import FlightConfig, dump
 from offboard.run.flight import Prepared, build, rehearse
@@ -146,10 +148,7 @@ class VehicleFiles:
         }
         path = self._directory / f"{key}.yaml"
         with suppress(OSError):  # then the next start identifies it again
-            self._directory.mkdir(parents=True, exist_ok=True)
-            part = path.with_suffix(".part")
-            part.write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
-            part.replace(path)
+            replace_file(path, yaml.safe_dump(document, sort_keys=False))
 
     def _remove(self, key: str) -> None:
         with suppress(OSError):

@@ -16,7 +16,7 @@ from watch import copter, refused
 from offboard import compiled
 from offboard.compiled import Entry
 from offboard.control.base import Certificate, Decision, Situation
-from offboard.documents.reading import DocumentError
+from offboard.documents.errors import DocumentError
 from offboard.flight import outbox
 from offboard.flight.preflight import ParameterReading
 from offboard.flight.record import configuration_pieces, joined_configuration

@@ -21,15 +21,14 @@ from typer.testing import CliRunner
 from offboard.analysis import tlog
 from offboard.analysis.history import Event
 from offboard.analysis.page import logarithmic
-from offboard.analysis.score import Score
+from offboard.analysis.score import Score, score
 from offboard.cli.commands import app
 from offboard.flight.phases import Phase
 from offboard.report import report_page
-from offboard.report.figures import figures
+from offboard.report.figures import bands, figures, marks
 from offboard.report.flight import Flight, read
 from offboard.report.panels import thinned
 from offboard.report.report_page import page
-from offboard.report.timeline import bands, marks
 
 RECORDINGS = Path(__file__).parents[1] / "wire" / "recordings"
 ARDUCOPTER = RECORDINGS / "arducopter-4.6.3-guided.tlog"
@@ -153,6 +152,20 @@ def test_a_paused_track_has_two_bands_and_begins_with_the_first(flown: Flown) ->
     shapes = figures([paused])["tracking"].drawing.layout.shapes
     spans = [(shape.x0, shape.x1) for shape in shapes if shape.type == "rect"]
     assert spans == [(begun_s + 2.0, begun_s + 4.0), (begun_s + 6.0, begun_s + 8.0)]
+
+
+def test_the_track_ends_where_the_supervisor_takes_over(flown: Flown) -> None:
+    tracking, begun_s = of_phases(flown.flight, "ready", "track"), flown.flight.begin_s
+    said = [
+        Event(begun_s + 5.0 + number, "offboard", f"supervisor: {what}", cause="supervisor")
+        for number, what in enumerate(("taking over", "the vehicle is disarmed"))
+    ]
+    history = replace(tracking.history, announcements=tuple(said))
+    killed = replace(tracking, history=history, score=score(history))
+    *_, track, after = (band for band in bands(killed) if band.row == "phase")
+    assert (track.end_s, after.begin_s, after.end_s) == (begun_s + 5, begun_s + 5, killed.end_s)
+    assert (track.label, after.label) == ("track", "supervisor")
+    assert "✗</span> not completed: supervisor: taking over</p>" in page([killed])
 
 
 def test_the_metrics_on_the_page_are_those_of_the_score(flown: Flown, recorded: Flight) -> None:

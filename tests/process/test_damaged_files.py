@@ -138,8 +138,8 @@ def test_a_comparison_on_a_full_disk_says_what_cannot_be_written(
 
         monkeypatch.setattr("offboard.campaign.workers.recorded", flown)
         command = "offboard compare --connect udpin:127.0.0.1:PORT --controllers lqr --seeds 1"
-        code, _, said = called(command, "--out", "x")
-    assert (code, said.count("\n")) == (4, 1)
+        code, output, said = called(command, "--out", "x")
+    assert (code, said.count("\n"), "\n1 flight\n" in output) == (4, 1, True)
     assert said.startswith("x cannot be written (File too large); ")
 
 

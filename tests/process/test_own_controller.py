@@ -15,7 +15,7 @@ from processes import register
 import offboard.control
 from offboard.analysis import history, tlog
 from offboard.analysis.score import score
-from offboard.documents.reading import DocumentError
+from offboard.documents.errors import DocumentError
 from offboard.run.configuration import load
 from offboard.run.flight import Simulated, fly
 from offboard.run.sitl import InMemorySimulator

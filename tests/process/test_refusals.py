@@ -65,6 +65,7 @@ def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
         ("--set", "vehicle.hover_thrust=0.92", "0.92 exceeds limits.hover_thrust (0.9)"),
         ("--set", SWARM, "particles x iterations must be at most 500000, not 1000000000"),
         ("--require", "rmse<1", "there is no metric 'rmse'; there are completed, touchdown_mps,"),
+        ("--require", "rmse_position<1", "'rmse_position', did you mean rmse_position_m? there"),
         ("--connect", "udpin:127.0.0.1:0", "give the port that the vehicle sends to"),
         ("--connect", "udpin:127.0.0.1", "is not understood; use udpin:HOST:PORT"),
         ("--connect", "udpin:::1:14540", "an IPv6 address stands in brackets, as in udpin:[::1]"),
@@ -95,6 +96,14 @@ def test_what_cannot_be_flown_is_refused(
         ("offboard daemon --print-unit --out here", "can write below /var/lib/offboard alone"),
         ("offboard paper --quick --seeds 20 --table none", "--quick is --seeds 1: use one of them"),
         ("offboard compare --connect udpin:127.0.0.1:0", "give the port that the vehicle sends to"),
+        ("offboard compare --system 3", "are options of --connect"),
+        ("offboard compare --connect tcp:1:1 --workers 2", "options of the simulator"),
+        ("offboard compare --scenario ,", "--scenario is an empty list of names"),
+        ("offboard compare --set limits.nope=3", "limits.nope is not a known key"),
+        ("offboard compare --controllers pso,nope", "there is no controller named 'nope'"),
+        ("offboard identify x.tlog --system 3", "a log needs no --system,"),
+        ("offboard identify --sitl --system 3", "--system is an option of --connect"),
+        (f"{FLY} --seed {DIGITS}", "--seed"),
         ("--scenario storm", "there is no scenario named 'storm'; known are all_together, "),
         ("--vehicle no/such.yaml", "no/such.yaml cannot be read: No such file"),
         ("--firmware betaflight", "--firmware betaflight: unknown; there is px4"),
@@ -137,10 +146,6 @@ def test_an_unknown_option_is_named(called: Called) -> None:
 )
 def test_a_name_or_number_beyond_every_limit_is_refused(command: str, refused: Refused) -> None:
     assert len(refused(command)) < 600
-
-
-def test_a_seed_of_many_digits_is_refused(refused: Refused) -> None:
-    assert "--seed" in refused(f"{FLY} --seed {DIGITS}")
 
 
 @pytest.mark.parametrize("app", [offboard, simulator], ids=["offboard", "simulator"])

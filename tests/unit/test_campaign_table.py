@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from browser import opening
 from rich.console import Console
-from typer.testing import CliRunner
 
 from offboard.campaign import workers
 from offboard.campaign.campaign_page import FIGURES, page
@@ -25,7 +24,6 @@ from offboard.campaign.results import Record
 from offboard.campaign.run import Campaign, Counter
 from offboard.campaign.table import Group, groups, row_of, show
 from offboard.campaign.workers import ConnectedVehicle
-from offboard.cli.commands import app
 from offboard.link import clock
 
 LAWS = ("pso", "lqr", "an/uncommonly/long/name.yaml", "lost")
@@ -209,28 +207,6 @@ def test_margin(changes: dict[str, float], expected: tuple[str, float]) -> None:
     found = terms(Promises(), figures, Empty(), None)  # type: ignore[arg-type]
     weakest = min(found, key=lambda name: found[name])
     assert (weakest, found[weakest]) == (expected[0], pytest.approx(expected[1]))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        ("compare --system 3", "are options of --connect"),
-        ("compare --connect tcp:127.0.0.1:1 --signing-key none", "signing key none"),
-        ("compare --connect tcp:1:1 --workers 2", "options of the simulator"),
-        ("compare --scenario ,", "--scenario is an empty list of names"),
-        ("compare --set limits.nope=3", "limits.nope is not a known key"),
-        ("compare --controllers pso,nope", "there is no controller named 'nope'"),
-        ("identify x.tlog --system 3", "a log needs no --system,"),
-        ("identify --sitl --system 3", "--system is an option of --connect"),
-    ],
-)
-def test_what_a_command_cannot_fly_is_refused(
-    arguments: str, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    answer = CliRunner().invoke(app, arguments.split())
-    assert answer.exit_code != 0
-    assert says in f"{answer.exception} {answer.output}"
 
 
 def test_a_connected_flight_begins_disarmed_unless_told_otherwise() -> None:

@@ -236,7 +236,7 @@ def test_reported_velocity_is_not_used():
     assert misled.drag_ps == right.drag_ps
     assert misled.hover_thrust == right.hover_thrust
     contradictions = [
-        estimator_noise(Trace(true.commands, true.attitude, each)).velocity_contradiction_mps
+        estimator_noise(Trace(true.commands, true.attitude, each))[-1]
         for each in (true.position, wrong)
     ]
     assert contradictions[0] < 0.002

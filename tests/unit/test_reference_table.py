@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from laws import PX4
 
-from offboard.reference.feasibility import InfeasibleReference, check
+from offboard.reference.feasibility import check
 from offboard.reference.shapes import FromTable
-from offboard.reference.table import TableError, parse
+from offboard.reference.table import parse
 from offboard.reference.track import Track
 
 GOOD = "time_s,north_m,east_m,down_m\n0,0,0,-2\n1,1,0,-2\n2,2,1,-2\n3,3,3,-2.5\n"
@@ -62,11 +62,10 @@ def test_knots_forgive_rounded_rows() -> None:
         f"{t:.2f},{2 * math.sin(0.7 * t):.3f},{math.cos(0.7 * t):.3f},3.000\n" for t in times
     )
     text = "time_s,x,y,altitude_m\n" + rows
-    with pytest.raises(InfeasibleReference, match=r"rate of|tilt of"):
+    with pytest.raises(ValueError, match=r"rate of|tilt of"):
         check(table_track(text), PX4)
     fitted = table_track(text, knot_spacing_s=0.5)
-    envelope = check(fitted, PX4)
-    assert envelope.rates_max_frd_radps[1] < 0.5
+    check(fitted, PX4)
     s = np.linspace(2.0, 7.0, 100)
     expected = np.stack([2 * np.sin(0.7 * s), np.cos(0.7 * s)], -1)
     assert np.abs(fitted.sample(s + 1.0).position_ned_m[:, :2] - expected).max() < 1e-3
@@ -98,11 +97,11 @@ BODY = "0,0,0,-2\n1,1,0,-2\n2,2,1,-2\n"
     ],
 )
 def test_bad_tables_name_file_row_and_column(text: str, sentence: str) -> None:
-    with pytest.raises(TableError, match=sentence):
+    with pytest.raises(ValueError, match=sentence):
         parse(text, "a.csv")
 
 
 def test_table_of_more_than_an_hour_is_refused():
     rows = "".join(f"{1200.01 * i},0,0,3\n" for i in range(4))
-    with pytest.raises(TableError, match=r"^a\.csv lasts 3600\.03 s: at most 3600 s are flown$"):
+    with pytest.raises(ValueError, match=r"^a\.csv lasts 3600\.03 s: at most 3600 s are flown$"):
         parse("time_s,north_m,east_m,altitude_m\n" + rows, "a.csv")

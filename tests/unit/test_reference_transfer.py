@@ -8,7 +8,6 @@ import math
 import numpy as np
 import pytest
 
-from offboard.reference.base import FlatSample
 from offboard.reference.shapes import Circle, HeadingMode
 from offboard.reference.track import Moved, Track, hold
 from offboard.reference.transfer import Limits, transfer
@@ -101,8 +100,8 @@ def test_moved_and_held() -> None:
     np.testing.assert_allclose(
         there.position_ned_m - here.position_ned_m, np.broadcast_to([10, -5, 2], (2, 2, 3))
     )
-    for name in FlatSample.__slots__[1:]:
-        np.testing.assert_array_equal(getattr(there, name), getattr(here, name))
+    for one, other in zip(there[1:], here[1:], strict=True):
+        np.testing.assert_array_equal(one, other)
     rest = hold((1.0, 2.0, -3.0), 0.4)
     assert rest.duration_s == 0.0
     for time_s in (5.0, times):

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from offboard.documents.signing_key import FILE_BYTES_MAX, KeyFileError, create_key, read_key
+from offboard.documents.errors import UserError
+from offboard.documents.signing_key import FILE_BYTES_MAX, create_key, read_key
 
 SECRET = "0123456789abcdef" * 4
 
@@ -32,7 +33,7 @@ def test_a_new_key_is_private_random_and_the_hash_of_its_passphrase(tmp_path: Pa
     assert all(len(bytes.fromhex(each)) == 32 for each in passphrases)
     key = hashlib.sha256(passphrases[0].encode()).digest()
     assert read_key(tmp_path / "a") == key
-    with pytest.raises(KeyFileError, match="exists and is not replaced"):
+    with pytest.raises(UserError, match="exists and is not replaced"):
         create_key(tmp_path / "a")
     assert read_key(tmp_path / "a") == key
 
@@ -42,7 +43,7 @@ def test_a_file_that_cannot_be_written_whole_is_not_left(tmp_path: Path) -> None
     ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (20, limits[1]))
     try:
-        with pytest.raises(KeyFileError, match="cannot be created: File too large"):
+        with pytest.raises(UserError, match="cannot be created: File too large"):
             create_key(tmp_path / "key")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
@@ -79,7 +80,7 @@ def test_both_forms_are_read(text: str, key: bytes, tmp_path: Path) -> None:
     ],
 )
 def test_what_is_no_key_is_refused_without_showing_it(text: str, tmp_path: Path) -> None:
-    with pytest.raises(KeyFileError) as refused:
+    with pytest.raises(UserError) as refused:
         read_key(written(tmp_path / "key", text))
     sentence = str(refused.value)
     assert "too short or no key file" in sentence
@@ -89,7 +90,7 @@ def test_what_is_no_key_is_refused_without_showing_it(text: str, tmp_path: Path)
 
 def test_a_file_that_others_can_use_is_refused(tmp_path: Path) -> None:
     for mode in (0o640, 0o604, 0o620, 0o601):
-        with pytest.raises(KeyFileError, match="by other users: chmod 600 it"):
+        with pytest.raises(UserError, match="by other users: chmod 600 it"):
             read_key(written(tmp_path / "key", f"key: {SECRET}", mode))
 
 
@@ -103,5 +104,5 @@ def test_what_is_no_file_is_refused_without_waiting(tmp_path: Path) -> None:
         (large, "4,097 bytes: that is no key file"),
         (Path("a\0b"), "cannot be read"),
     ):
-        with pytest.raises(KeyFileError, match=reason):
+        with pytest.raises(UserError, match=reason):
             read_key(path)
