@@ -20,19 +20,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.control.gains import lateral_gain, vertical_gain
+from offboard.estimation.noise import Noise
 from offboard.model.axes import LinearModel, lateral_model, vertical_model
 from offboard.model.vehicle import DelayUncertainty, Vehicle
 
 Array = NDArray[np.float64]
 
+NOISE = Noise()
 LEAST_MARGIN_S, SHARE_OF_DELAY = 0.04, 0.15  # jitter, which grows with the delay
-SDS = 3.0  # of an identified delay: by how much it may be wrong
 STEP_RADPS, LEAST_RADPS = 0.25, 1.0
 SUBSTEPS = 10  # of a period, at which the observer is corrected
 STABLE = 1.0 - 1e-6
 # The observer: noise densities of [p v b b' d] and [z v f d], sds of measurements by index
-LATERAL_DENSITIES, LATERAL_SDS = (1e-5, 0.2, 1e-5, 0.6, 0.15), ((0, 0.002), (2, 0.001))
-VERTICAL_DENSITIES, VERTICAL_SDS = (1e-5, 0.2, 1e-5, 0.15), ((0, 0.002),)
+_Q = NOISE.acceleration_mps, 1e-5, NOISE.tilt_radps, NOISE.disturbance_mps2
+LATERAL_DENSITIES, VERTICAL_DENSITIES = (1e-5, *_Q), (1e-5, *_Q[:2], _Q[3])
+LATERAL_SDS = (0, NOISE.position_sd_m), (2, NOISE.attitude_sd_rad)
+VERTICAL_SDS = ((0, NOISE.position_sd_m),)
 
 
 def supported_bandwidth(

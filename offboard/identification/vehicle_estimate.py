@@ -36,9 +36,6 @@ MOST_CONTRADICTIONS, CALM_S = 2, 20.0
 # unexplained, is less than this share of the old one's
 BETTER = 0.7
 LEAST_JUMP_S, JUMP_SDS = 0.015, 4.0  # delays that differ by more contradict each other
-# Delay and lag of the thrust that are less certain than this are not adopted, unless those in use
-# are wrong by more: the height is unstable with 60 ms too much as well as with 90 ms too little
-THRUST_SD_S = 0.02
 FACTOR = 4.0  # greatest ratio, either way, of an identified constant to the vehicle file's
 DECISIVE = ("tilt", "hover_thrust")  # out of bounds, these end the flight
 LINKED = ("yaw", "thrust_delay_s")  # changed with the tilt's delay where not identified themselves
@@ -180,10 +177,6 @@ class VehicleEstimate:
         within, sentences = self.within_bounds(found)
         if any(getattr(found, name) and not getattr(within, name) for name in DECISIVE):
             self.contradiction = "; ".join(sentences)
-        effect = within.thrust_effect_s
-        in_use = Estimate(self.vehicle.thrust_delay_s + self.vehicle.thrust_lag_s, 0.0)
-        if effect and effect.sd > THRUST_SD_S and not _apart(effect, in_use):
-            within = replace(within, thrust_lag_s=None, thrust_delay_s=None, thrust_effect_s=None)
         applied = within.applied_to(self.vehicle)
         vehicle = with_link_delay(within, applied, self.file)
         if within.tilt is not None:

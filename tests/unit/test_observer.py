@@ -1,4 +1,4 @@
-"""The observer against an independent plant, SciPy's integrator and the gains measured on PX4."""
+"""The observer against an independent plant, SciPy's integrator and Riccati equation."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import pytest
 from attitude_plant import Plant, Truth
 from laws import LEVEL, PX4, G
 from scipy.integrate import solve_ivp
+from scipy.linalg import expm, solve_discrete_are
 
 from offboard.estimation.motion import COMMAND_SIZE, STATE_SIZE, THRUST, plant_of, propagate
 from offboard.estimation.noise import Noise
@@ -49,24 +50,38 @@ def hovering(noise: Noise | None = None, until_s: float = 5.0) -> Observer:
 # ---------------------------------------------------------------- gains and motion
 
 
-def test_steady_gains_equal_those_flown_on_px4() -> None:
-    """Per 10 ms with the velocity ignored (its sd 1 m/s): p .36, v 7.87, d 5.97 from position;
-    b .62, b' 28.2 from b. Found by disturbing one message by a little."""
-    small = 1e-5
+def test_steady_gains_are_those_of_the_riccati_equation() -> None:
+    """Lateral motion [p, v, b, b', d] by SciPy, with the velocity ignored (its sd 1 m/s), against
+    what disturbing one message by a little changes."""
+    small, step_s, noise = 1e-6, 0.01, Noise(velocity_sd_mps=1.0)
+    wn, damping, drag_ps = 11.4, 0.56, PX4.drag_per_mass_ps
+    a, b = np.zeros((5, 5)), np.zeros((5, 5))
+    a[0, 1] = a[1, 4] = a[2, 3] = 1.0
+    a[1, 1:3], a[3, 2:4] = (-drag_ps, -G), (-(wn**2), -2.0 * damping * wn)
+    densities = 0.0, noise.acceleration_mps, 0.0, noise.tilt_radps, noise.disturbance_mps2
+    b[range(5), range(5)] = np.square(densities)
+    van_loan = expm(np.block([[-a, b], [np.zeros((5, 5)), a.T]]) * step_s)
+    f = van_loan[5:, 5:].T
+    q = f @ van_loan[:5, 5:]
+    h, r = np.eye(5)[[0, 2]], np.diag([noise.position_sd_m**2, noise.attitude_sd_rad**2])
+    covariance = solve_discrete_are(f.T, h.T, q, r)
+    expected = covariance @ h.T @ np.linalg.inv(h @ covariance @ h.T + r)
 
     def after(position: float, tilt: float) -> np.ndarray:
-        observer = hovering(Noise(velocity_sd_mps=1.0), until_s=20.0)
+        observer = hovering(noise, until_s=40.0)
         direction = np.array([tilt, 0.0, math.sqrt(1 - tilt**2)])
         attitude = quaternion_from_thrust_direction(direction, 0.0)
-        feed(observer, 20.01, (position, 0.0, 0.0), attitude=attitude)
-        state = observer.predict(20.01)
-        north = (state.position_ned_m, state.velocity_ned_mps, state.disturbance_ned_mps2,
-                 state.thrust_direction_ned, state.thrust_direction_rate_ned_ps)  # fmt: skip
+        feed(observer, 40.01, (position, 0.0, 0.0), attitude=attitude)
+        state = observer.predict(40.01)
+        north = (state.position_ned_m, state.velocity_ned_mps, state.thrust_direction_ned,
+                 state.thrust_direction_rate_ned_ps, state.disturbance_ned_mps2)  # fmt: skip
         return np.array(north)[:, 0]
 
     at_rest = after(0, 0)
-    gains = [*(after(small, 0) - at_rest)[:3] / small, *(after(0, small) - at_rest)[3:] / small]
-    assert gains == pytest.approx([0.36, 7.87, 5.97, 0.62, 28.2], rel=0.01)
+    of_position = (after(small, 0) - at_rest) / small
+    of_tilt = (after(0, small) - at_rest) / small
+    assert of_position[[0, 1, 4]] == pytest.approx(expected[[0, 1, 4], 0], rel=0.02)
+    assert of_tilt[2:4] == pytest.approx(expected[2:4, 1], rel=0.02)
 
 
 @pytest.mark.parametrize("damping", [0.56, 1.115])
