@@ -29,7 +29,8 @@ VISIBLE_M = 1e-5  # smaller innovations do not count
 @dataclass(frozen=True, slots=True)
 class Noise:
     """Q by densities per root second, R by standard deviations. Half or twice the values made no
-    visible difference on PX4 and ArduCopter, whose positions have 2e-5 m of white noise. Noise of
+    visible difference on PX4 and ArduCopter. Their positions have 2e-5 m of white noise: a smaller sd
+    answers it with more chatter. Noise of
     position and velocity and drift of the disturbance are estimated in flight too, and never less
     than these; the drift at most `disturbance_limit_mps2`."""
 
@@ -39,7 +40,7 @@ class Noise:
     tilt_radps: float = 0.6
     heading_radps: float = 0.6
     bias_mps: float = 0.08
-    position_sd_m: float = 0.0001
+    position_sd_m: float = 0.0005
     velocity_sd_mps: float = 0.005
     attitude_sd_rad: float = 0.001
 

@@ -27,7 +27,9 @@ from offboard.model.vehicle import DelayUncertainty, Vehicle
 
 # What a delay may be wrong by: of a vehicle file in general; of one that is flown as it is
 UNKNOWN_DELAY_S, FILE_DELAY_S = 0.28, 0.13
-SDS = 3.0  # standard deviations that an identified delay may be wrong by
+# Standard deviations that an identified delay of tilt or thrust may be wrong by: too long a delay of
+# the tilt ends in a crash, of the thrust in a height that oscillates
+SDS, THRUST_SDS = 3.0, 2.0
 DIRECT_LINK_S = 0.004  # link delay without a slow link: age of telemetry
 LINK_DIGITS = 2  # of seconds: a smaller change of the link is ignored
 # After so many contradictions the delay stays uncertain until nothing contradicts for CALM_S
@@ -94,7 +96,7 @@ class VehicleEstimate:
         """What is not known of the delays of `vehicle`."""
         added_s, changed_s = self._link
         known_s = SDS * self.delay.sd if self.delay else self._unknown_s
-        thrust_s = SDS * self._thrust.sd if self._thrust else 0.0
+        thrust_s = THRUST_SDS * self._thrust.sd if self._thrust else 0.0
         tilt_s = max(known_s, self._doubt_s, changed_s)
         return DelayUncertainty(tilt_s=tilt_s, thrust_s=thrust_s, link_s=added_s)
 
