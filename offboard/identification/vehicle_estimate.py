@@ -27,8 +27,8 @@ from offboard.model.vehicle import DelayUncertainty, Vehicle
 
 # What a delay may be wrong by: of a vehicle file in general; of one that is flown as it is
 UNKNOWN_DELAY_S, FILE_DELAY_S = 0.28, 0.13
-# Standard deviations that an identified delay of tilt or thrust may be wrong by: too long a delay of
-# the tilt ends in a crash, of the thrust in a height that oscillates
+# Standard deviations by which an identified delay of tilt or thrust may be wrong: with an error of
+# the thrust's the height oscillates, with one of the tilt's the vehicle may crash
 SDS, THRUST_SDS = 3.0, 2.0
 DIRECT_LINK_S = 0.004  # link delay without a slow link: age of telemetry
 LINK_DIGITS = 2  # of seconds: a smaller change of the link is ignored
