@@ -198,13 +198,19 @@ SETTLED_S, END_S = 15.0, 19.0
 
 def test_settles_after_a_step_of_the_reference() -> None:
     """ArduCopter's vehicle, whose attitude loop limits its angular acceleration (1100 deg/s2), in
-    hover at 7 rad/s: the reference jumps by 2.4 m and returns slowly."""
+    hover at 7 rad/s: the reference jumps by 2.4 m and returns slowly. Afterwards it is as quiet as
+    without the jump, where only the telemetry's noise moves it."""
+    assert _turning_after(2.4) == pytest.approx(_turning_after(0.0), abs=0.002)
+
+
+def _turning_after(jump_m: float) -> float:
+    """The greatest roll or pitch rate (rad/s) when it should have settled."""
     hover = (f"reference.duration_s={END_S}", "controller.bandwidth_radps=7")
     pair = on_arducopter(*hover, reference="hover", seed=2, aloft=True)
 
     def step(flying: Pair) -> None:
         state = flying.companion
-        state.plan.follow_jump(state.time_s, np.array([2.4, 0.0, 0.0]))
+        state.plan.follow_jump(state.time_s, np.array([jump_m, 0.0, 0.0]))
 
     pair.at.append((in_phase(Phase.TRACK, 2.0), step))
     pair.track()
@@ -218,7 +224,7 @@ def test_settles_after_a_step_of_the_reference() -> None:
     away_m = settled(logged.position)["position_ned_m"]
     away_m = away_m - settled(logged.reference)["position_ned_m"][0]
     assert np.linalg.norm(away_m, axis=1).max() < 0.005
-    assert np.abs(settled(logged.attitude)["rates_radps"][:, :2]).max() < 0.02
+    return float(np.abs(settled(logged.attitude)["rates_radps"][:, :2]).max())
 
 
 # -- the ranking -----------------------------------------------------------------------------------
