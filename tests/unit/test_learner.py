@@ -149,7 +149,7 @@ def test_doubt_about_the_tilt_leaves_the_other_constants() -> None:
     assert estimate_with(fit(0.06)).vehicle.thrust_delay_s == 0.01  # the vehicle's own difference
     thrust = {"thrust_delay_s": Estimate(0.05, 0.01), "thrust_effect_s": Estimate(0.06, 0.01)}
     own = estimate_with(Identified(10.0, tilt=tilt, **thrust))
-    assert own.uncertainty.thrust_s == pytest.approx(0.03)
+    assert own.uncertainty.thrust_s == pytest.approx(0.02)
     own.on_contradiction(CONTRADICTS, AGREES, 20.0)
     assert own.vehicle == FILE.model_copy(update={"thrust_delay_s": 0.05})
 
