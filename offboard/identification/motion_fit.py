@@ -10,7 +10,7 @@ is not the derivative of the reported position. SI, NED.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,7 @@ from offboard.identification.uncertainty import (
     lag_count,
     long_run_covariance,
     sandwich,
+    scale_of,
 )
 
 Array = NDArray[np.float64]
@@ -91,6 +92,10 @@ class Motion:
             for along in self.positions[:2]
         ]
         return float(np.sqrt(np.mean(np.sum(np.square(moved), axis=0)))) / SPEED_OVER_S
+
+    def noise(self, axes: slice) -> float:
+        """Sd of the white noise of positions, m, by third differences, in which motion cancels."""
+        return scale_of(np.diff(self.positions[axes], n=3)) / math.sqrt(20.0)
 
     @property
     def sufficient(self) -> bool:
@@ -188,12 +193,17 @@ def motion_transitions(steps_s: Array, drag_ps: float) -> Array:
 # ---------------------------------------------------------------------- fits
 
 
+def _with_noise(noise: Noise, motion: Motion, axes: slice) -> Noise:
+    """`noise` with that of the positions, where it is greater."""
+    return replace(noise, measured=max(noise.measured, motion.noise(axes)))
+
+
 def fit_drag(motion: Motion, thrust_mps2: Array, start_ps: float) -> Estimate:
     """Lateral drag per unit of mass, 1/s, searched from `start_ps`; `thrust_mps2` (N,) at the
     motion's times."""
     start_ps = min(max(start_ps, STARTED_FROM[3]), 0.9 * DRAG_UPPER_PS)
     accelerations = -thrust_mps2 * motion.direction_ne
-    lateral = PositionFilter(motion.times, start_ps, LATERAL)
+    lateral = PositionFilter(motion.times, start_ps, _with_noise(LATERAL, motion, slice(2)))
     found = least_squares(
         lambda drag: lateral.innovations(motion.positions[:2], accelerations, drag[0]).ravel(),
         [start_ps],
@@ -229,7 +239,7 @@ def fit_vertical(
     sds = np.array([each.sd for each in known])
     upper = np.array((50.0, THRUST_DELAY_UPPER_S, LAG_UPPER_S, DRAG_UPPER_PS))
     start = np.clip([1.0 / hover_thrust, *means], STARTED_FROM, upper - 1e-3)
-    vertical = PositionFilter(motion.times, start[3], VERTICAL)
+    vertical = PositionFilter(motion.times, start[3], _with_noise(VERTICAL, motion, slice(2, 3)))
 
     def innovations(parameters: Array) -> Array:
         inverse, delay, lag, drag = parameters
