@@ -181,7 +181,7 @@ def test_attitude_loop_that_slows_is_noticed_and_flown(tmp_path: Path):
     pair.at.append((in_phase(Phase.TRACK, 3.0), slows))
     pair.track()
     said = after_doubt(pair)
-    assert float(said[7]) == pytest.approx(5.0, abs=0.2)
+    assert float(said[7]) == pytest.approx(5.0, rel=0.05)
     assert "bandwidth 7.0 rad/s as configured" in " ".join(said)
     assert "contradicts" not in said
     assert pair.score(tmp_path).max_position_m < 0.65
