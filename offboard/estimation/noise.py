@@ -85,7 +85,7 @@ class NoiseEstimate:
         velocity (m/s), each (6,), NED."""
         if self._measured is None:
             self._began_s = time_s
-        else:
+        elif time_s > self._last_s:  # else a newer attitude has overtaken both
             self._estimate_noise(time_s - self._last_s, measured, self._measured)
         self._measured, self._last_s = measured, time_s
         self._total += innovation[:3]

@@ -33,7 +33,7 @@ Role = str | float | tuple[str, float]
 
 
 RANGES = {"int8": (-128, 127), "int16": (-32768, 32767), "int32": (-(2**31), 2**31 - 1)}
-"""Of each kind of whole parameter."""
+"""The least and greatest value of each kind of whole parameter."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -142,3 +142,16 @@ def test_estimates_are_bounded_and_cleared_by_a_reset() -> None:
     observer.reset()
     assert observer.noise_sds == pytest.approx(START_SDS)
     assert observer.drift_densities_mps2 == pytest.approx([0.15, 0.15])
+
+
+def test_positions_that_an_attitude_has_overtaken_leave_the_noise_finite() -> None:
+    """Two of them arrive after a newer attitude: the state has the same time at both."""
+    observer = Observer(VEHICLE, NOISE)
+    observer.on_command(0.0, LEVEL)
+    for i in range(200):
+        time_s = 0.04 * i
+        observer.on_attitude(time_s + 0.05, UPRIGHT, STILL)
+        observer.on_position(time_s, (1e-4 * (i % 3), 0.0, -2.0), STILL)
+        observer.on_position(time_s + 0.02, (1e-4 * (i % 2), 0.0, -2.0), STILL)
+    assert np.isfinite(observer.noise_sds).all()
+    assert np.isfinite(observer.predict(8.0).position_ned_m).all()
