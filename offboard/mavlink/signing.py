@@ -1,4 +1,4 @@
-"""MAVLink 2 signing: pymavlink signs and checks; here are our own time and the reasons. No I/O.
+"""MAVLink 2 signing: pymavlink signs; here are our own time, the check and its reasons. No I/O.
 
 A time stamp has 48 bits and counts 10 us since 2015-01-01 UTC. It must be newer than the last one
 accepted of the same stream, which is link id, system and component; that of a new stream may be at
@@ -59,8 +59,7 @@ class Signing:
         self.clock = clock
         self._reserve = reserve
         self._reserved = reserved
-        self._mavlink = mavlink.MAVLink(None)
-        self._signing = self._mavlink.signing
+        self._signing = mavlink.MAVLink(None).signing
         self._signing.secret_key = key
         self._signing.sign_outgoing = True
         self._signing.link_id = LINK_ID
@@ -78,21 +77,19 @@ class Signing:
         raw = frame.raw
         if not frame.signed:
             return None if frame.message_id in ALLOWED_UNSIGNED else DropReason.UNSIGNED
-        # first of all: pymavlink notes a time stamp before it has verified the signature, so that a
-        # forged one would shut out the true sender
         digest = sha256(self.key + raw[:-_HASH_BYTES]).digest()
         if not compare_digest(digest[:_HASH_BYTES], raw[-_HASH_BYTES:]):
             return DropReason.BAD_SIGNATURE
-        signing = self._signing
         stream = raw[-13], frame.system_id, frame.component_id
-        before = signing.stream_timestamps.get(stream)
-        signing.timestamp = self._now()
-        if not self._mavlink.check_signature(bytearray(raw), *stream[1:]):
-            return DropReason.OLD_STAMP if before is None else DropReason.REPLAYED
-        if not note and before is None:
-            del signing.stream_timestamps[stream]
-        elif not note:
-            signing.stream_timestamps[stream] = before
+        stamp = int.from_bytes(raw[-12:-6], "little")
+        before = self._signing.stream_timestamps.get(stream)
+        if before is None and stamp < self._now() - RESERVED:
+            return DropReason.OLD_STAMP
+        if before is not None and stamp <= before:
+            return DropReason.REPLAYED
+        if note:
+            self._signing.stream_timestamps[stream] = stamp
+            self._signing.timestamp = max(self._signing.timestamp, stamp)
         return None
 
     def _now(self) -> int:
