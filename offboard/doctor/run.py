@@ -163,7 +163,8 @@ def _listen(
 ) -> Listening:
     heard = Listening(clock.monotonic_s(), settings, signing)
     while not heard.complete(clock.monotonic_s()):
-        for chunk in link.receive(POLL_S):
+        link.wait(POLL_S)
+        for chunk in link.receive():
             heard.take(chunk)
         for frame in heard.due(clock.monotonic_s()):
             link.send(frame, heard.peer)

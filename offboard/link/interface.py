@@ -94,8 +94,8 @@ class Link(Protocol):
         """Wait at most `timeout_s` until something has arrived. Reads nothing."""
         ...
 
-    def receive(self, timeout_s: float) -> list[Chunk]:
-        """What has arrived, oldest first and bounded, after waiting at most `timeout_s` for it."""
+    def receive(self) -> list[Chunk]:
+        """What has arrived, oldest first and bounded. Never waits."""
         ...
 
     def send(self, data: bytes, peer: Hashable | None) -> None:

@@ -238,12 +238,10 @@ class StreamLink:
         elif not self._readable(0.0):
             self._readable(timeout_s)
 
-    def receive(self, timeout_s: float) -> list[Chunk]:
+    def receive(self) -> list[Chunk]:
         self._renew()
         self._flush()
-        self.wait(timeout_s)
-        if not self._readable(0.0):
-            return []
+        self._readable(0.0)  # where nothing is waiting, it notes when
         arrived_s, data = self._empty_s, b""
         with suppress(BlockingIOError):
             while len(data) < BATCH_BYTES and self._readable(0.0) and (more := self._read()):

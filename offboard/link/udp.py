@@ -105,8 +105,7 @@ class UdpLink:
         awaited = [inbox.socket for inbox in self._awaited()]
         select.select(awaited, [], [], max(0.0, timeout_s))
 
-    def receive(self, timeout_s: float) -> list[Chunk]:
-        self.wait(timeout_s)
+    def receive(self) -> list[Chunk]:
         chunks = self._vehicle.drain(BATCH_MAX) if self._vehicle else []
         if self._listening:
             if self._vehicle is None:
@@ -232,9 +231,9 @@ class LockstepLink(UdpLink):
     def follow(self, peer: Hashable) -> None:
         """The simulator is ours, and a second socket would change the order of its datagrams."""
 
-    def receive(self, timeout_s: float) -> list[Chunk]:
+    def receive(self) -> list[Chunk]:
         complete: list[Chunk] = []
-        for chunk in super().receive(timeout_s):
+        for chunk in super().receive():
             self._block.append(chunk)
             if _is_barrier(chunk.data):
                 if chunk.data != self._barrier:

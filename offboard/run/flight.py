@@ -354,5 +354,5 @@ def fly(
 def discard(link: Link) -> None:
     """Drop the telemetry that arrived during the preparation: it is too old to use."""
     for _ in range(DISCARDED_MAX):
-        if not link.receive(0.0):
+        if not link.receive():
             return

@@ -113,7 +113,7 @@ class Loop:
             return
         if self._stops.requested:
             self._companion.request_stop()
-        chunks = self._link.receive(0.0)
+        chunks = self._link.receive()
         began_s = clock.monotonic_s()
         if chunks:
             self._heard_s = began_s

@@ -165,7 +165,7 @@ class InMemoryLink:
 
     def wait(self, timeout_s: float) -> None: ...
 
-    def receive(self, timeout_s: float) -> list[Chunk]:
+    def receive(self) -> list[Chunk]:
         """All datagrams up to the next barrier. Never waits."""
         frames, self._sent = self._sent, []
         if self.problem is not None:

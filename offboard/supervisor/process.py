@@ -132,18 +132,19 @@ class TakeOver:
     def run(self, reason: str) -> None:
         """Take over for `reason`, until the vehicle is disarmed or another has changed its mode."""
         for _ in range(BACKLOG_MAX):  # the mode may have been left since the last beat
-            if not self._receive(0.0):
+            if not self._receive():
                 break
         self._ask(f"taking over: {reason}")
         while not self._recovery.ended:
-            self._receive(POLL_S)
+            self._link.wait(POLL_S)
+            self._receive()
             self._ask()
         self._say(self._recovery.ended)
         self._log.close(CLOSE_S)
 
-    def _receive(self, timeout_s: float) -> bool:
+    def _receive(self) -> bool:
         """Process one batch; whether there was any."""
-        chunks = self._link.receive(timeout_s)
+        chunks = self._link.receive()
         for chunk in chunks:
             reception = self._session.receive(chunk.data, chunk.peer, chunk.arrived_s)
             self._record(*reception.frames)

@@ -66,7 +66,8 @@ class Rig:
             self.place = ours.getsockname()
         self.vehicle.connect(self.place)
         while stream and len(self.link.descriptors()) < 2:
-            self.link.receive(0.02)
+            self.link.wait(0.02)
+            self.link.receive()
         self.log = FlightLog(directory / "x", "", real_time=True)
         self.supervisor = Supervisor(self.signing)
 
@@ -136,7 +137,8 @@ def test_it_asks_the_vehicle_that_connected_last(rig: Rig) -> None:
     rig.beat(OURS)
     rig.vehicle.close()
     while len(rig.link.descriptors()) > 1:
-        rig.link.receive(0.02)
+        rig.link.wait(0.02)
+        rig.link.receive()
     rig.beat(OURS)
     rig.abandon()
     rig.vehicle = socket.create_connection(rig.place)

@@ -10,7 +10,7 @@ import pytest
 
 from offboard.link import clock
 from offboard.link.connection import open_link
-from offboard.link.interface import Chunk, LinkReport
+from offboard.link.interface import Chunk, Link, LinkReport
 from offboard.link.udp import LOOK_EVERY_S, UdpLink
 from offboard.mavlink.senders import PEER_SILENT_S
 
@@ -42,6 +42,11 @@ def now_s(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return now_s
 
 
+def received(link: Link) -> list[Chunk]:
+    link.wait(1.0)
+    return link.receive()
+
+
 def data(chunks: list[Chunk]) -> list[bytes]:
     return [chunk.data for chunk in chunks]
 
@@ -54,7 +59,7 @@ def test_a_datagram_has_the_time_of_its_arrival_not_of_its_reading(ends: Ends) -
     time.sleep(0.1)
     vehicle.send(b"second")
     time.sleep(0.1)
-    first, second = link.receive(1.0)
+    first, second = received(link)
     assert before_s - 1e-4 <= first.arrived_s <= between_s + 1e-4
     assert between_s + 0.1 <= second.arrived_s <= time.monotonic() - 0.1
     assert (first.peer, second.peer) == (vehicle.getsockname(), vehicle.getsockname())
@@ -66,11 +71,11 @@ def test_a_clock_that_is_set_does_not_move_arrivals(
 ) -> None:
     """Unix time jumps between the arrival and its reading."""
     link, vehicle, _ = ends
-    assert link.receive(0.0) == []
+    assert link.receive() == []
     empty_s, right = time.monotonic(), clock.monotonic_less_unix_s
     vehicle.send(b"x")
     monkeypatch.setattr(clock, "monotonic_less_unix_s", lambda: right() - jump_s)
-    (chunk,) = link.receive(1.0)
+    (chunk,) = received(link)
     assert empty_s - 0.01 <= chunk.arrived_s <= time.monotonic()
 
 
@@ -84,14 +89,14 @@ def test_other_senders_are_counted_and_neither_delay_nor_displace_the_vehicle(en
         other.send(bytes(1000))
     vehicle.send(b"v3")
     time.sleep(LOOK_EVERY_S)
-    heard = [*link.receive(1.0), *link.receive(0.1)]
+    heard = [*received(link), *link.receive()]
     assert data(heard) == [b"v1", b"v2", b"v3"]
     assert [chunk.arrived_s for chunk in heard] == sorted(chunk.arrived_s for chunk in heard)
     looks = 0
     while looks < 20:
         vehicle.send(b"v")
         time.sleep(LOOK_EVERY_S)
-        assert set(data(link.receive(1.0))) == {b"v"}
+        assert set(data(received(link))) == {b"v"}
         looks += 1
     assert 64 * 22 > link.report.ignored > 500  # of those that fit into the buffer
     name = f" from {LOCAL}:{other.getsockname()[1]}, which is not the vehicle, "
@@ -124,15 +129,15 @@ def test_another_port_is_heard_after_a_silence_that_was_observed(
         now_s[0] += 0.4 * PEER_SILENT_S
         vehicle.send(b"v")
         other.send(b"no")
-        assert data(link.receive(1.0)) == [b"v"]
+        assert data(received(link)) == [b"v"]
     for silent_s, heard in ((0.9, []), (0.2, [b"moved"])):
         now_s[0] += silent_s * PEER_SILENT_S
         other.send(b"moved")
-        assert data(link.receive(0.0)) == heard
+        assert data(link.receive()) == heard
     link.follow(other.getsockname())
     vehicle.send(b"of another now")
     other.send(b"v")
-    assert data(link.receive(1.0)) == [b"v"]
+    assert data(received(link)) == [b"v"]
 
 
 def test_our_own_pause_is_no_silence_of_the_vehicle(ends: Ends, now_s: list[float]) -> None:
@@ -142,10 +147,10 @@ def test_our_own_pause_is_no_silence_of_the_vehicle(ends: Ends, now_s: list[floa
     vehicle.send(b"v")
     now_s[0] += 3.0
     other.send(b"spoofed")
-    assert data(link.receive(1.0)) == [b"v"]
+    assert data(received(link)) == [b"v"]
     now_s[0] += 0.9 * PEER_SILENT_S
     other.send(b"spoofed")
-    assert link.receive(0.0) == []
+    assert link.receive() == []
 
 
 def test_udpout_hears_only_its_peer() -> None:
@@ -167,8 +172,8 @@ def test_udpout_hears_only_its_peer() -> None:
         assert heard == b"heard"
         other.sendto(b"no", ours)
         peer.sendto(b"yes", ours)
-        assert data(link.receive(1.0)) == [b"yes"]
-        assert link.receive(0.0) == []
+        assert data(received(link)) == [b"yes"]
+        assert link.receive() == []
     link.close()
 
 
