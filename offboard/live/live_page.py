@@ -8,27 +8,11 @@ import plotly.graph_objects as go
 
 from offboard.analysis.page import BLUE, INK, STYLE, Figure, curve, panels, render
 
-# label on the page and element that the script fills
-VALUES = {
-    "phase": "phase",
-    "time": "time",
-    "mode": "mode",
-    "authority": "authority",
-    "failsafe": "failsafe",
-    "position error": "error",
-    "link age": "age",
-    "link delay": "delay",
-    "missed decisions": "missed",
-    "skipped ticks": "skipped",
-    "computer": "computer",
-    "battery": "battery",
-}
-
 
 def page() -> str:
     """The page as text."""
     return render(
-        "live/templates/live.html", title="Live flight", values=VALUES,
+        "live/templates/live.html", title="Live flight",
         figures={"plan": _plan(), "curves": _curves()},
     )  # fmt: skip
 

@@ -229,7 +229,7 @@ def test_the_live_page_follows_the_flight_in_both_schemes_and_widths(shown: Show
     assert re.fullmatch(rf"\d+\.\d\d s +{re.escape(shown.pair.companion.announced[-1])}", last)
     assert opened.page.inner_text("h1") == "a flight: lemniscate by pso"
     assert opened.page.inner_text("#report").endswith("flights/a/report.html")
-    assert opened.page.inner_text("#skipped") == "0"
+    assert opened.page.inner_text("#skipped_ticks") == "0"
     assert opened.page.inner_text("#failsafe") == "none"
     assert opened.problems == opened.fetched == []
 

@@ -7,20 +7,30 @@ const $ = (name) => document.getElementById(name);
 const number = (value, digits, unit, scale = 1) =>
   value === null ? "–" : `${(scale * value).toFixed(digits)} ${unit}`;
 
+// Label, which with "_" for spaces is the id of its element, and text in a snapshot
+const VALUES = {
+  phase: (now) => `${now.phase}, ${number(now.in_phase_s, 1, "s")}`,
+  time: (now) => number(now.time_s, 1, "s"),
+  mode: (now) => `${now.mode || "unknown"}, ${now.armed ? "armed" : "disarmed"}`,
+  authority: (now) => AUTHORITY[now.authority] ?? now.authority,
+  failsafe: (now) => now.failsafe === "fly" ? "none" : `${now.failsafe}: ${now.failsafe_row}`,
+  "position error": (now) => number(now.position_error_m, 3, "m"),
+  "link age": (now) => number(now.telemetry_age_s, 0, "ms", 1e3),
+  "link delay": (now) => number(now.link_delay_s, 0, "ms", 1e3),
+  "missed decisions": (now) => now.missed_decisions,
+  "skipped ticks": (now) => now.skipped_ticks,
+  computer: (now) => now.computer || "keeps up",
+  battery: (now) => number(now.battery, 0, "%", 100),
+};
+const shown = Object.entries(VALUES).map(([label, text]) => {
+  const [name, value] = ["dt", "dd"].map((kind) => document.createElement(kind));
+  [name.textContent, value.textContent, value.id] = [label, "–", label.replaceAll(" ", "_")];
+  $("values").append(name, value);
+  return [value, text];
+});
+
 function tell() {
-  $("phase").textContent = `${newest.phase}, ${number(newest.in_phase_s, 1, "s")}`;
-  $("time").textContent = number(newest.time_s, 1, "s");
-  $("mode").textContent = `${newest.mode || "unknown"}, ${newest.armed ? "armed" : "disarmed"}`;
-  $("authority").textContent = AUTHORITY[newest.authority] ?? newest.authority;
-  $("failsafe").textContent = newest.failsafe === "fly"
-    ? "none" : `${newest.failsafe}: ${newest.failsafe_row}`;
-  $("error").textContent = number(newest.position_error_m, 3, "m");
-  $("age").textContent = number(newest.telemetry_age_s, 0, "ms", 1e3);
-  $("delay").textContent = number(newest.link_delay_s, 0, "ms", 1e3);
-  $("missed").textContent = newest.missed_decisions;
-  $("skipped").textContent = newest.skipped_ticks;
-  $("computer").textContent = newest.computer || "keeps up";
-  $("battery").textContent = number(newest.battery, 0, "%", 100);
+  for (const [value, text] of shown) value.textContent = text(newest);
   $("texts").replaceChildren(...[...texts].reverse().map(({ time_s, text }) => {
     const item = document.createElement("li");
     item.textContent = `${time_s.toFixed(2)} s  ${text}`;
