@@ -21,13 +21,7 @@ from offboard.analysis.tlog import LoggedMessage, Tlog, layout
 from offboard.documents.errors import UserError
 from offboard.flight import record
 from offboard.flight.phases import PHASE_CODES
-from offboard.flight.record import (
-    COMPONENT_ID,
-    FIELDS,
-    IDENTIFIED_ID,
-    RECORD_COMPONENT_ID,
-    RECORD_ID,
-)
+from offboard.flight.record import FIELDS, IDENTIFIED_ID, RECORD_ID
 from offboard.identification.vehicle_fit import RECORDED
 from offboard.mavlink import event_record
 from offboard.mavlink.decode import (
@@ -40,6 +34,7 @@ from offboard.mavlink.decode import (
 from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.framing import HEARTBEAT
 from offboard.mavlink.senders import DIALECTS, is_vehicle
+from offboard.mavlink.session import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.mavlink.texts import TextAssembler
 from offboard.mavlink.vehicle_time import Age, VehicleTime
 from offboard.model.frames import quaternion_from_euler

@@ -38,10 +38,6 @@ from offboard.mavlink.session import Reception, SessionSettings
 from offboard.model.command import Command, PositionCommand, PredictedState
 from offboard.reference.base import FlatSample
 
-COMPONENT_ID = 191  # MAV_COMP_ID_ONBOARD_COMPUTER: the sender of frames
-# MAV_COMP_ID_ONBOARD_COMPUTER2: the sender of records, which are only logged. Its own sequence
-# numbers leave no gap in those of the frames that the vehicle counts.
-RECORD_COMPONENT_ID = 192
 RECORD_NAME = "pso"
 NAN = float("nan")
 CERTIFIED = len(fields(Certificate))

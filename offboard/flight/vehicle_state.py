@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.flight.phases import CONTROLLING
-from offboard.flight.record import COMPONENT_ID
 from offboard.mavlink.events import (
     CRITICAL,
     GOOD_RESULTS,
@@ -37,6 +36,7 @@ from offboard.mavlink.events import (
     VehicleIdentity,
 )
 from offboard.mavlink.framing import HEARTBEAT
+from offboard.mavlink.session import COMPONENT_ID
 from offboard.model.frames import heading_from_quaternion, thrust_direction_from_quaternion
 
 HEALTH_S = 1.5  # SYS_STATUS is requested at 2 Hz

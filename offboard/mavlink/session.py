@@ -25,6 +25,10 @@ from offboard.mavlink.signing import Signing
 from offboard.mavlink.telemetry import Telemetry
 
 ACTIVE = 4  # MAV_STATE
+COMPONENT_ID = 191  # MAV_COMP_ID_ONBOARD_COMPUTER: the sender of frames
+# MAV_COMP_ID_ONBOARD_COMPUTER2: the sender of records, which only our log holds. Its own sequence
+# numbers leave no gap in those of the frames that the vehicle counts.
+RECORD_COMPONENT_ID = 192
 
 _NOT_LOGGED = (DropReason.ECHO, *FORGED)
 _ECHOES = 256  # newest frames of ours that are recognised when they come back
@@ -36,8 +40,7 @@ class SessionSettings:
     """How a session behaves.
 
     `system_id` is the only system that may be the vehicle; None: the first autopilot heard.
-    `record_component_id` is the sender of records, which only our log holds; each component id has
-    its own sequence numbers. `stream`: serial or TCP, bytes arrive in any portions. `sends_first`:
+    `stream`: serial or TCP, bytes arrive in any portions. `sends_first`:
     send heartbeats before an autopilot was heard. `capacity_bytes_ps` of the link limits the rates
     of telemetry that are requested; None: unknown. `lockstep`: the vehicle waits for our replies,
     and the host times given to `receive` and `poll` are ignored, so that nothing that is sent
@@ -46,8 +49,7 @@ class SessionSettings:
     """
 
     system_id: int | None = None
-    component_id: int = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
-    record_component_id: int = 191
+    component_id: int = COMPONENT_ID
     stream: bool = False
     sends_first: bool = False
     capacity_bytes_ps: float | None = None
@@ -97,7 +99,7 @@ class Session:
         self._signing = signing
         self._splitter = framing.FrameSplitter(settings.stream, self.counters)
         self._sending = mavlink.MAVLink(None, srcComponent=settings.component_id)
-        self._recording = mavlink.MAVLink(None, srcComponent=settings.record_component_id)
+        self._recording = mavlink.MAVLink(None, srcComponent=RECORD_COMPONENT_ID)
         self._sent: deque[bytes] = deque(maxlen=_ECHOES)
         self._telemetry = Telemetry(settings.capacity_bytes_ps, lockstep=settings.lockstep)
         self._time = self._telemetry.time
@@ -185,7 +187,7 @@ class Session:
 
     def _has_our_ids(self, frame: framing.Frame) -> bool:
         """Whether it has the ids of what we send, or of our records."""
-        ours = (self.settings.component_id, self.settings.record_component_id)
+        ours = (self.settings.component_id, RECORD_COMPONENT_ID)
         return frame.system_id == self.senders.own.system_id and frame.component_id in ours
 
     # --- the vehicle ---

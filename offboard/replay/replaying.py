@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +21,9 @@ from offboard.flight.flight import Flight
 from offboard.flight.record import (
     CALL,
     CHECK,
-    COMPONENT_ID,
     DROPPED,
     OTHERS,
     PAYLOAD_TYPE,
-    RECORD_COMPONENT_ID,
     Entry,
     InputsError,
     Note,
@@ -33,10 +31,10 @@ from offboard.flight.record import (
 )
 from offboard.link.interface import Chunk
 from offboard.mavlink.framing import Frame
-from offboard.mavlink.session import Session
+from offboard.mavlink.session import COMPONENT_ID, RECORD_COMPONENT_ID, Session, SessionSettings
 from offboard.mavlink.signing import Signing
 from offboard.run.configuration import flown
-from offboard.run.flight import SETTINGS, Prepared, build
+from offboard.run.flight import Prepared, build
 
 CALLS = ("request_stop", "announce", "note_autopilot", "guard")  # methods of the companion
 
@@ -146,7 +144,7 @@ class Replay:
         settings: dict[str, Any] = recording.settings
         signing = Accepted(bytes(KEY_BYTES)) if recording.signed else None
         try:
-            session = Session(replace(SETTINGS, **settings), signing)
+            session = Session(SessionSettings(**settings), signing)
         except TypeError:
             raise UserError(
                 f"{recording.log.path}: the settings of its session are those of another version"

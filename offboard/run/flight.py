@@ -24,7 +24,7 @@ from offboard.flight.flight import Flight, Outcome
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.outbox import usable
 from offboard.flight.phases import ServiceOptions
-from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID, configuration_pieces
+from offboard.flight.record import configuration_pieces
 from offboard.identification.learner import Learner
 from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from offboard.link import clock
@@ -57,7 +57,6 @@ from offboard.supervisor.supervisor import Supervisor
 REHEARSED_DECISIONS = 5  # the fastest counts: the machine may be busy
 DISCARDED_MAX = 20  # batches of a link
 SITL_TIMEOUT_S = 180.0  # for simulator and companion in lockstep: either may compile, or be slow
-SETTINGS = SessionSettings(component_id=COMPONENT_ID, record_component_id=RECORD_COMPONENT_ID)
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,8 +71,7 @@ class Connection:
 
     def settings(self, link: Link) -> SessionSettings:
         """Settings of the session over `link`."""
-        return replace(
-            SETTINGS,
+        return SessionSettings(
             system_id=self.system_id,
             stream=link.is_stream,
             capacity_bytes_ps=link.capacity_bytes_ps,
@@ -119,7 +117,7 @@ class Simulated:
 
     def settings(self, link: Link) -> SessionSettings:
         """Settings of the session over `link`."""
-        return replace(SETTINGS, lockstep=True)
+        return SessionSettings(lockstep=True)
 
     def open_link(self, simulator: SimulatorProcess | InMemorySimulator, seed: int) -> Link:
         """Start the vehicle and return the link to it."""

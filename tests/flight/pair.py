@@ -28,7 +28,6 @@ from offboard.estimation.observer import Observer
 from offboard.flight.flight import Flight, Outcome
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.phases import Action, Phase
-from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.identification.learner import IdentifySettings, Learner
 from offboard.link.interface import Chunk
 from offboard.link.log import FlightLog
@@ -335,11 +334,7 @@ def make(
     companion = Flight(
         model=believed,
         session=Session(
-            SessionSettings(
-                system_id=system_id,
-                component_id=COMPONENT_ID,
-                record_component_id=RECORD_COMPONENT_ID,
-            ),
+            SessionSettings(system_id=system_id),
             Signing(key) if key else None,
         ),
         observer=observer,

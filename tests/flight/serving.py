@@ -20,7 +20,6 @@ from pair import (
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.flight.phases import TRACKING, Anchor, Phase, ServiceOptions, Then
-from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.run import configuration as config
@@ -262,11 +261,8 @@ def serve(
     logs, memory = record or Logs(clock), memory or Remembered()
 
     def again(logs: Any) -> Flights:
-        settings = SessionSettings(
-            component_id=COMPONENT_ID, record_component_id=RECORD_COMPONENT_ID
-        )
         return Flights(
-            session=Session(settings),
+            session=Session(SessionSettings()),
             source=source,
             record=logs,
             memory=memory,

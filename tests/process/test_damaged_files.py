@@ -19,8 +19,9 @@ from offboard.analysis import tlog
 from offboard.analysis.score import keep_score, score_flight
 from offboard.campaign.results import Record
 from offboard.cli import fly
-from offboard.flight.record import RECORD_COMPONENT_ID, configuration_pieces
+from offboard.flight.record import configuration_pieces
 from offboard.link.log import LogError, entry
+from offboard.mavlink.session import RECORD_COMPONENT_ID
 
 NOW_US = 1_790_000_000_000_000  # of an entry of a log
 NO_VEHICLE = "offboard fly --connect udpin:127.0.0.1:PORT --set limits.connect_s=0.3 --out x"

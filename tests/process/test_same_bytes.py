@@ -19,8 +19,9 @@ import yaml
 from offboard.analysis import tlog
 from offboard.flight.flight import Flight, Outcome
 from offboard.flight.phases import Phase
-from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID, RECORD_ID, TickRecord
+from offboard.flight.record import RECORD_ID, TickRecord
 from offboard.link.stop import StopRequests
+from offboard.mavlink.session import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.run import flight, sitl
 from offboard.run.configuration import load
 from offboard.run.flight import Simulated, fly

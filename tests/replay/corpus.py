@@ -22,7 +22,6 @@ from offboard.flight.record import (
     CALL,
     CHECK,
     OTHERS,
-    RECORD_COMPONENT_ID,
     InputRecorder,
     Note,
     TurnInput,
@@ -32,7 +31,7 @@ from offboard.link.interface import Chunk
 from offboard.link.log import entry
 from offboard.mavlink.framing import SETPOINTS
 from offboard.mavlink.outgoing import ConfigurationRecord
-from offboard.mavlink.session import Reception, SessionSettings
+from offboard.mavlink.session import RECORD_COMPONENT_ID, Reception, SessionSettings
 from offboard.replay.difference import COMMANDS
 from offboard.replay.replaying import CALLS, Recording, Replay, Sent, read
 

@@ -202,7 +202,7 @@ def short_flight(key: bytes = b"", **options) -> Pair:
 
 
 def logged(pair: Pair, path: Path) -> Path:
-    session = Session(SessionSettings(record_component_id=192))
+    session = Session(SessionSettings())
     pieces = [
         session.encode(piece) for piece in configuration_pieces(configuration.dump(resolved()))
     ]

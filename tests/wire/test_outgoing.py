@@ -147,7 +147,7 @@ def test_modes_have_the_numbers_of_the_specification() -> None:
 
 def test_positions_and_references() -> None:
     """Their stamp has 32 bits."""
-    session = pinned(Sender(7), record_component_id=192)
+    session = pinned(Sender(7))
     for value, kind, component in (
         (POSITION, "SET_POSITION_TARGET_LOCAL_NED", 191),
         (ReferenceRecord(2**32 / 1e3 + 1.0, *MOTION), "POSITION_TARGET_LOCAL_NED", 192),
@@ -161,7 +161,7 @@ def test_positions_and_references() -> None:
 
 
 def test_numbers_for_the_log_have_sequence_numbers_of_their_own() -> None:
-    session = pinned(Sender(), record_component_id=192)
+    session = pinned(Sender())
     sequence = [session.encode(Heartbeat(18))[4] for _ in range(257)]
     assert sequence == [*range(256), 0]
     data = (1.0, math.nan, 1e300, -1e300, -2.5)
