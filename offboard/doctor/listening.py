@@ -22,7 +22,7 @@ from offboard.flight.timing import VehicleClock
 from offboard.flight.vehicle_state import VehicleState
 from offboard.link.interface import Chunk
 from offboard.mavlink.counters import Counters
-from offboard.mavlink.dialects.base import TYPE_GCS, Dialect, WantedMessage
+from offboard.mavlink.dialects.base import TYPE_GCS, Dialect, WantedMessage, id_of
 from offboard.mavlink.events import (
     Attitude,
     ClockBehind,
@@ -239,7 +239,7 @@ class Listening:
         unknown = {
             VERSION: state.version is None,
             GPS: fix_age_s > ASK_EVERY_S,
-            dialect.estimator_message: state.age_s(EstimatorReport) > ASK_EVERY_S,
+            id_of(dialect.estimator_message): state.age_s(EstimatorReport) > ASK_EVERY_S,
         }
         for message_id, missing in unknown.items():
             if missing and self._may_ask(message_id, now_s):

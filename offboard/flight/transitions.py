@@ -156,7 +156,7 @@ def _enter(flight: FlightState, row: Transition) -> None:
         flight.clock.settle()
         dialect = flight.session.dialect
         assert dialect is not None
-        flight.positioning.begin(flight.vehicle, flight.session.rates_hz, dialect.estimator_name)
+        flight.positioning.begin(flight.vehicle, flight.session.rates_hz, dialect.estimator_message)
         if flight.identification:
             flight.identification.on_link_delay(flight.clock.delay)
         if source is Phase.ARM:  # on the ground the time that it takes does no harm

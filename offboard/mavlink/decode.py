@@ -34,19 +34,30 @@ _FIX_3D = 3  # GPS_FIX_TYPE
 _REAL32 = 9  # MAV_PARAM_TYPE
 _UNSIGNED_TYPES, _SIGNED_TYPES = (1, 3, 5), (2, 4, 6)
 _LANDED = ("unknown", "on_ground", "in_air", "takeoff", "landing")  # MAV_LANDED_STATE
-_RESULTS = (  # MAV_RESULT, of which pymavlink's `all` lacks some
-    "ACCEPTED",
-    "TEMPORARILY_REJECTED",
-    "DENIED",
-    "UNSUPPORTED",
-    "FAILED",
-    "IN_PROGRESS",
-    "CANCELLED",
-    "COMMAND_LONG_ONLY",
-    "COMMAND_INT_ONLY",
-    "COMMAND_UNSUPPORTED_MAV_FRAME",
-    "NOT_IN_CONTROL",
-)
+# MAV_RESULT
+_RESULTS = {
+    number: result.name.removeprefix("MAV_RESULT_")
+    for number, result in mavlink.enums["MAV_RESULT"].items()
+}
+# which pymavlink's `all` lacks
+_RESULTS |= {6: "CANCELLED", 9: "COMMAND_UNSUPPORTED_MAV_FRAME", 10: "NOT_IN_CONTROL"}
+# innovation ratios of the estimator's messages
+_PX4_RATIOS = {
+    "GPS velocity": "vel_ratio",
+    "GPS position": "pos_horiz_ratio",
+    "height": "pos_vert_ratio",
+    "heading": "mag_ratio",
+    "height above ground": "hagl_ratio",
+    "airspeed": "tas_ratio",
+}
+_ARDUPILOT_RATIOS = {
+    "GPS velocity": "velocity_variance",
+    "GPS position": "pos_horiz_variance",
+    "height": "pos_vert_variance",
+    "compass": "compass_variance",
+    "terrain": "terrain_alt_variance",
+    "air": "airspeed_variance",
+}
 
 
 class Address(NamedTuple):
@@ -122,36 +133,21 @@ def _system_health(message: Any, _: Dialect) -> events.Event:
 
 
 def _px4_estimator(message: Any, _: Dialect) -> events.Event:
-    ratios = {
-        "GPS velocity": message.vel_ratio,
-        "GPS position": message.pos_horiz_ratio,
-        "height": message.pos_vert_ratio,
-        "heading": message.mag_ratio,
-        "height above ground": message.hagl_ratio,
-        "airspeed": message.tas_ratio,
-    }
     accuracy_m = message.pos_horiz_accuracy
-    return _estimator(message.flags, ratios, accuracy_m if math.isfinite(accuracy_m) else None)
+    return _estimator(message, _PX4_RATIOS, accuracy_m if math.isfinite(accuracy_m) else None)
 
 
 def _ardupilot_estimator(message: Any, _: Dialect) -> events.Event:
-    ratios = {
-        "GPS velocity": message.velocity_variance,
-        "GPS position": message.pos_horiz_variance,
-        "height": message.pos_vert_variance,
-        "compass": message.compass_variance,
-        "terrain": message.terrain_alt_variance,
-        "air": message.airspeed_variance,
-    }
-    return _estimator(message.flags, ratios)
+    return _estimator(message, _ARDUPILOT_RATIOS)
 
 
 def _estimator(
-    flags: int, ratios: dict[str, float], accuracy_m: float | None = None
+    message: Any, names: Mapping[str, str], accuracy_m: float | None = None
 ) -> events.EstimatorReport:
+    ratios = ((name, getattr(message, field)) for name, field in names.items())
     return events.EstimatorReport(
-        valid=frozenset(part for part, bit in _EKF_BITS.items() if flags & bit),
-        ratios=tuple((name, ratio) for name, ratio in ratios.items() if math.isfinite(ratio)),
+        valid=frozenset(part for part, bit in _EKF_BITS.items() if message.flags & bit),
+        ratios=tuple((name, ratio) for name, ratio in ratios if math.isfinite(ratio)),
         accuracy_m=accuracy_m,
     )
 
@@ -170,8 +166,7 @@ def _landed(message: Any, _: Dialect) -> events.Event:
 
 def _command_ack(message: Any, _: Dialect) -> events.Event:
     result = message.result
-    name = _RESULTS[result] if result < len(_RESULTS) else f"UNKNOWN({result})"
-    return events.CommandAck(message.command, name)
+    return events.CommandAck(message.command, _RESULTS.get(result, f"UNKNOWN({result})"))
 
 
 def _parameter(message: Any, dialect: Dialect) -> events.Event | DropReason | None:

@@ -143,7 +143,7 @@ def test_rates_fit_a_serial_line(baud: int, attitude_hz: float) -> None:
     sizes = {31: 60, 32: 40, 83: 49, 436: 21, 245: 14, 1: 55, 115: 76, 24: 64, 230: 54}  # extended
     rates_hz[436] = 2.0  # while the mode does not change
     assert sum(rate * sizes[number] for number, rate in rates_hz.items()) < 0.81 * baud / 10
-    mode = WantedMessage(436, "CURRENT_MODE", 50.0, optional=True, unchanged_hz=2.0)
+    mode = WantedMessage("CURRENT_MODE", 50.0, optional=True, unchanged_hz=2.0)
     assert fitted([mode], 3000.0) == (mode,)
 
 

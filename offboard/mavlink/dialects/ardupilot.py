@@ -109,8 +109,7 @@ ARDUPILOT = Dialect(
     ),
     hover_parameter="MOT_THST_HOVER",
     tilt_parameter=("ANGLE_MAX", math.radians(0.01)),
-    estimator_message=193,
-    estimator_name="EKF_STATUS_REPORT",
+    estimator_message="EKF_STATUS_REPORT",
     slow_hint="another ground station may set the rates (MAVProxy: `set streamrate -1`), or the "
     "link is full",
     unsaid="see the ground station",
@@ -118,8 +117,8 @@ ARDUPILOT = Dialect(
     loss_time=("GUID_TIMEOUT", 3.0),
     wanted=(
         *TRACKING_TELEMETRY,
-        WantedMessage(0, "HEARTBEAT", 10.0, optional=True),  # the only report of the mode
-        WantedMessage(193, "EKF_STATUS_REPORT", 2.0, optional=True),
-        WantedMessage(108, "SIM_STATE", 50.0, optional=True),  # simulated truth
+        WantedMessage("HEARTBEAT", 10.0, optional=True),  # the only report of the mode
+        WantedMessage("EKF_STATUS_REPORT", 2.0, optional=True),
+        WantedMessage("SIM_STATE", 50.0, optional=True),  # simulated truth
     ),
 )

@@ -11,11 +11,19 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
+from pymavlink.dialects.v20 import all as mavlink
+
 from offboard.mavlink.outgoing import CommandLong, ThrustRule
 
 SET_MODE, TAKEOFF = 176, 22  # MAV_CMD
 CUSTOM_MODE_ENABLED = 1.0  # MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 TYPE_ONBOARD_CONTROLLER, TYPE_GCS = 18, 6  # MAV_TYPE
+
+
+def id_of(message: str) -> int:
+    """The id of a message, by its name."""
+    number: int = getattr(mavlink, f"MAVLink_{message.lower()}_message").id
+    return number
 
 
 class ParameterEncoding(Enum):
@@ -38,11 +46,14 @@ class WantedMessage:
     another rate than its default, is requested at most twice. `unchanged_hz`: one that is sent at
     `rate_hz` only when it changes arrives at this rate."""
 
-    message_id: int
     name: str
     rate_hz: float
     optional: bool = False
     unchanged_hz: float | None = None
+
+    @property
+    def message_id(self) -> int:
+        return id_of(self.name)
 
     @property
     def arrives_hz(self) -> float:
@@ -171,8 +182,7 @@ class Dialect:
     wanted: tuple[WantedMessage, ...]
     hover_parameter: str  # normalised thrust that holds the weight
     tilt_parameter: tuple[str, float]  # greatest tilt of its own modes, and its unit in rad
-    estimator_message: int  # id of the message that becomes an EstimatorReport
-    estimator_name: str  # of this message
+    estimator_message: str  # the message that becomes an EstimatorReport
     slow_hint: str  # what to do where telemetry comes slower than it was requested
     unsaid: str  # where a reason is found that no STATUSTEXT tells us
     oldest: tuple[int, int]  # version that this dialect is made for
@@ -223,10 +233,10 @@ class Dialect:
 
 
 TRACKING_TELEMETRY = (
-    WantedMessage(31, "ATTITUDE_QUATERNION", 100.0),
-    WantedMessage(32, "LOCAL_POSITION_NED", 100.0),
-    WantedMessage(245, "EXTENDED_SYS_STATE", 5.0),
-    WantedMessage(1, "SYS_STATUS", 2.0),
-    WantedMessage(83, "ATTITUDE_TARGET", 8.0, optional=True),  # its own thrust, before ours
-    WantedMessage(24, "GPS_RAW_INT", 5.0, optional=True),
+    WantedMessage("ATTITUDE_QUATERNION", 100.0),
+    WantedMessage("LOCAL_POSITION_NED", 100.0),
+    WantedMessage("EXTENDED_SYS_STATE", 5.0),
+    WantedMessage("SYS_STATUS", 2.0),
+    WantedMessage("ATTITUDE_TARGET", 8.0, optional=True),  # its own thrust, before ours
+    WantedMessage("GPS_RAW_INT", 5.0, optional=True),
 )

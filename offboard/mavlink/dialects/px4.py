@@ -134,8 +134,7 @@ PX4 = Dialect(
     ),
     hover_parameter="MPC_THR_HOVER",
     tilt_parameter=("MPC_TILTMAX_AIR", math.radians(1.0)),
-    estimator_message=230,
-    estimator_name="ESTIMATOR_STATUS",
+    estimator_message="ESTIMATOR_STATUS",
     slow_hint="raise MAV_x_RATE of this link, in bytes/s: PX4 slows all messages down to it",
     # PX4 sends these texts only on a link on which a HEARTBEAT of type GCS arrives. Ours is not:
     # PX4 would not notice any more that its real ground station is lost (NAV_DLL_ACT)
@@ -152,8 +151,8 @@ PX4 = Dialect(
     wanted=(
         *TRACKING_TELEMETRY,
         # shows a change of the mode within 0.02 s; the rate of HEARTBEAT, 1 Hz, cannot be changed
-        WantedMessage(436, "CURRENT_MODE", 50.0, optional=True, unchanged_hz=2.0),
-        WantedMessage(230, "ESTIMATOR_STATUS", 2.0, optional=True),
-        WantedMessage(115, "HIL_STATE_QUATERNION", 50.0, optional=True),  # simulated truth
+        WantedMessage("CURRENT_MODE", 50.0, optional=True, unchanged_hz=2.0),
+        WantedMessage("ESTIMATOR_STATUS", 2.0, optional=True),
+        WantedMessage("HIL_STATE_QUATERNION", 50.0, optional=True),  # simulated truth
     ),
 )
