@@ -50,45 +50,39 @@ _ARMED = 0x80  # MAV_MODE_FLAG_SAFETY_ARMED
 _NO_VOLTAGE, _NO_PERCENTAGE = 0xFFFF, -1  # of SYS_STATUS
 _WRAP_MS = 2**32
 PHASES: dict[int | None, str] = {code: phase.value for phase, code in PHASE_CODES.items()}
-BOOT_MS, BOOT_US, BEFORE = "time_boot_ms", "time_usec", ""  # stamps of messages
-# columns of a message: name -> the first of its fields and how many values, in an array from where
+# Columns of a message: name -> the first of its fields and how many values, in an array from where
 Columns = Mapping[str, tuple[str, int] | tuple[str, int, int]]
-_MOTION = {"position_ned_m": ("x", 3), "velocity_ned_mps": ("vx", 3)}
-_REFERENCE = {**_MOTION, "acceleration_ned_mps2": ("afx", 3), "heading_rad": ("yaw", 1)}
-SETPOINT = {"quaternion": ("q", 4), "thrust": ("thrust", 1)}
-_BATTERY = {"voltage": ("voltage_battery", 1), "remaining": ("battery_remaining", 1)}
-_TIMESYNC: tuple[Columns, str] = ({"answered_ns": ("tc1", 1), "asked_ns": ("ts1", 1)}, BEFORE)
-_THEIRS: dict[str, tuple[Columns, str]] = {
+_MOTION: Columns = {"position_ned_m": ("x", 3), "velocity_ned_mps": ("vx", 3)}
+_SETPOINT: Columns = {"quaternion": ("q", 4), "thrust": ("thrust", 1)}
+_TIMESYNC: Columns = {"answered_ns": ("tc1", 1), "asked_ns": ("ts1", 1)}
+_THEIRS: dict[str, Columns] = {
     "TIMESYNC": _TIMESYNC,
-    "LOCAL_POSITION_NED": (_MOTION, BOOT_MS),
-    "ATTITUDE_QUATERNION": (
-        {"quaternion": ("q1", 4), "rates_radps": ("rollspeed", 3)}, BOOT_MS
-    ),
-    "HEARTBEAT": (
-        {"armed": ("base_mode", 1), "system_status": ("system_status", 1)}, BEFORE
-    ),
-    "SYS_STATUS": (_BATTERY, BEFORE),
-    "EXTENDED_SYS_STATE": ({"state": ("landed_state", 1)}, BEFORE),
+    "LOCAL_POSITION_NED": _MOTION,
+    "ATTITUDE_QUATERNION": {"quaternion": ("q1", 4), "rates_radps": ("rollspeed", 3)},
+    "HEARTBEAT": {"armed": ("base_mode", 1), "system_status": ("system_status", 1)},
+    "SYS_STATUS": {"voltage": ("voltage_battery", 1), "remaining": ("battery_remaining", 1)},
+    "EXTENDED_SYS_STATE": {"state": ("landed_state", 1)},
     # true positions of a simulated vehicle
-    "HIL_STATE_QUATERNION": ({"place": ("lat", 2), "altitude": ("alt", 1)}, BOOT_US),
-    "SIM_STATE": ({"place": ("lat_int", 2), "altitude": ("alt", 1)}, BEFORE),
+    "HIL_STATE_QUATERNION": {"place": ("lat", 2), "altitude": ("alt", 1)},
+    "SIM_STATE": {"place": ("lat_int", 2), "altitude": ("alt", 1)},
     # what ground stations record instead
-    "ATTITUDE": ({"angles": ("roll", 3), "rates_radps": ("rollspeed", 3)}, BOOT_MS),
-    "GLOBAL_POSITION_INT": ({"place": ("lat", 3), "velocity": ("vx", 3)}, BOOT_MS),
-    "ATTITUDE_TARGET": (SETPOINT, BOOT_MS),
-}  # fmt: skip
+    "ATTITUDE": {"angles": ("roll", 3), "rates_radps": ("rollspeed", 3)},
+    "GLOBAL_POSITION_INT": {"place": ("lat", 3), "velocity": ("vx", 3)},
+    "ATTITUDE_TARGET": _SETPOINT,
+}
 _INSTEAD_OF = {"ATTITUDE": "ATTITUDE_QUATERNION", "GLOBAL_POSITION_INT": "LOCAL_POSITION_NED"}
-_OURS: dict[str, tuple[Columns, str]] = {
-    "POSITION_TARGET_LOCAL_NED": (_REFERENCE, BOOT_MS),
-    "SET_ATTITUDE_TARGET": (SETPOINT, BOOT_MS),
+_ARRAY = "DEBUG_FLOAT_ARRAY"  # those of ours, with their array_id
+_RECORDS, _IDENTIFIED = f"{_ARRAY} {RECORD_ID}", f"{_ARRAY} {IDENTIFIED_ID}"
+_OURS: dict[str, Columns] = {
+    "POSITION_TARGET_LOCAL_NED": {
+        **_MOTION, "acceleration_ned_mps2": ("afx", 3), "heading_rad": ("yaw", 1)
+    },
+    "SET_ATTITUDE_TARGET": _SETPOINT,
     "TIMESYNC": _TIMESYNC,
-}
+    _RECORDS: {name: ("data", 1, place) for place, name in enumerate(FIELDS)},
+    _IDENTIFIED: {name: ("data", 2, 2 * place) for place, name in enumerate(RECORDED)},
+}  # fmt: skip
 _TRUTH = {"HIL_STATE_QUATERNION": 1e3, "SIM_STATE": 1.0}  # units of the altitude in a metre
-_ARRAY = "DEBUG_FLOAT_ARRAY"
-_ARRAYS: dict[int, Columns] = {  # by their array_id
-    RECORD_ID: {name: ("data", 1, place) for place, name in enumerate(FIELDS)},
-    IDENTIFIED_ID: {name: ("data", 2, 2 * place) for place, name in enumerate(RECORDED)},
-}
 _NO_ATTITUDE = struct.pack("<8f", *(math.nan,) * 8)  # of a setpoint, after its stamp
 _TIMES = struct.Struct("<2d")  # time_s, unix_s
 
@@ -201,15 +195,14 @@ def record_type(entry: LoggedMessage) -> int | None:
 
 class Samples:
     """Rows of the messages of one kind, in the order of arrival: their time, and the bytes of their
-    payloads that hold the columns.
+    payloads that hold the columns. A message without a stamp has that of the telemetry before it.
 
     Args:
         message: name in pymavlink.
         columns: name -> the first of its fields, or an array field, and how many values.
-        stamp: BOOT_MS or BOOT_US; BEFORE gives a message the time of the telemetry before it.
     """
 
-    def __init__(self, message: str, columns: Columns, stamp: str = BOOT_MS) -> None:
+    def __init__(self, message: str, columns: Columns) -> None:
         places = {column: _place(message, *fields) for column, fields in columns.items()}
         self._begin = min(at for at, _ in places.values())
         self._end = max(at + kind.itemsize for at, kind in places.values())
@@ -222,7 +215,7 @@ class Samples:
                 "itemsize": away + self._end,
             }
         )
-        self._stamp = stamp
+        self._stamps = layout(message).names or ()
         self._data = bytearray()
 
     @property
@@ -233,9 +226,9 @@ class Samples:
         """A message. `now_ms`: stamp of the telemetry before it, NaN without. `unix_s`: of its
         entry in the log."""
         stamp_ms = now_ms
-        if self._stamp == BOOT_MS:
+        if "time_boot_ms" in self._stamps:  # the first field, as is the next
             stamp_ms = int.from_bytes(payload[:4], "little")
-        elif self._stamp == BOOT_US and any(payload[:8]):
+        elif "time_usec" in self._stamps and any(payload[:8]):
             stamp_ms = 1e-3 * int.from_bytes(payload[:8], "little")
         self._data += _TIMES.pack(stamp_ms, unix_s)
         self._data += payload[self._begin : self._end].ljust(self._end - self._begin, b"\0")
@@ -284,9 +277,12 @@ class _Collector:
 
     def __init__(self, vehicle: Address | None, dialect: Dialect | None) -> None:
         self._vehicle, self._dialect = vehicle, dialect
-        self._theirs = {name: Samples(name, *spec) for name, spec in _THEIRS.items()}
-        self._ours = {name: Samples(name, *spec) for name, spec in _OURS.items()}
-        self._arrays = {i: Samples(_ARRAY, columns, BOOT_US) for i, columns in _ARRAYS.items()}
+        tables = ((True, _OURS), (False, _THEIRS))
+        self._samples = {
+            (ours, name): Samples(name.partition(" ")[0], columns)
+            for ours, table in tables
+            for name, columns in table.items()
+        }
         self._origin: Geodetic | None = None  # of the local frame
         self._assembler = TextAssembler()
         self._texts: list[Event] = []  # of the vehicle
@@ -311,33 +307,27 @@ class _Collector:
     def add(self, entry: LoggedMessage) -> None:
         self._counts[entry.name] += 1
         self._unix_us = (self._unix_us[0] or entry.unix_us, entry.unix_us)
+        payload, vehicle, name = entry.frame.payload, self._vehicle, entry.name
         ours = entry.component_id in OUR_COMPONENTS
-        if ours and (self._vehicle is None or entry.system_id == self._vehicle.system_id):
-            self._add_ours(entry, entry.frame.payload)
-        elif not ours and (entry.system_id, entry.component_id) == self._vehicle:
-            self._add_theirs(entry, entry.frame.payload)
+        if ours and (vehicle is None or entry.system_id == vehicle.system_id):
+            name = f"{name} {entry.message.array_id}" if name == _ARRAY else name
+        elif ours or (entry.system_id, entry.component_id) != vehicle or self._ahead(entry):
+            return
+        usual = self._samples.get((ours, _INSTEAD_OF.get(name, "")))
+        if (ours, name) in self._samples and (usual is None or usual.empty):  # else only memory
+            self._samples[ours, name].add(payload, self._now_ms, entry.unix_us / 1e6)
+        (self._add_ours if ours else self._add_theirs)(entry, payload, entry.unix_us / 1e6)
 
-    def _add_ours(self, entry: LoggedMessage, payload: bytes) -> None:
-        name, now_ms, unix_s = entry.name, self._now_ms, entry.unix_us / 1e6
-        if name in _OURS:
-            self._ours[name].add(payload, now_ms, unix_s)
-        elif name == "SET_POSITION_TARGET_LOCAL_NED":
+    def _add_ours(self, entry: LoggedMessage, payload: bytes, unix_s: float) -> None:
+        if entry.name == "SET_POSITION_TARGET_LOCAL_NED":
             setpoint = payload[:4] + _NO_ATTITUDE
-            self._ours["SET_ATTITUDE_TARGET"].add(setpoint, now_ms, unix_s)
-        elif name == _ARRAY and entry.message.array_id in _ARRAYS:
-            self._arrays[entry.message.array_id].add(payload, now_ms, unix_s)
+            self._samples[True, "SET_ATTITUDE_TARGET"].add(setpoint, self._now_ms, unix_s)
         elif record_type(entry) == event_record.PAYLOAD_TYPE:
             self._event_records.append((self.now_s, unix_s, entry.tunnelled))
 
-    def _add_theirs(self, entry: LoggedMessage, payload: bytes) -> None:
-        name, now_ms, unix_s = entry.name, self._now_ms, entry.unix_us / 1e6
-        if self._refused_as_ahead(entry.frame.message_id, payload):
-            return
-        if name in _THEIRS:
-            usual = self._theirs.get(_INSTEAD_OF.get(name, ""))
-            if usual is None or usual.empty:  # else it would only take memory
-                self._theirs[name].add(payload, now_ms, unix_s)
-        elif name == "STATUSTEXT":
+    def _add_theirs(self, entry: LoggedMessage, payload: bytes, unix_s: float) -> None:
+        name = entry.name
+        if name == "STATUSTEXT":
             whole = self._assembler.add(payload, unix_s)
             self._texts += [self._said(text.text, unix_s) for text in whole]
         elif name == "COMMAND_ACK":
@@ -358,13 +348,13 @@ class _Collector:
             if math.isnan(self._anchor_ms):
                 self._anchor_ms = self._now_ms
 
-    def _refused_as_ahead(self, message_id: int, payload: bytes) -> bool:
+    def _ahead(self, entry: LoggedMessage) -> bool:
         """Whether telemetry has a stamp so far ahead that the flight has refused it, too."""
-        if message_id not in TELEMETRY:
+        if entry.frame.message_id not in TELEMETRY:
             return False
-        time_s = int.from_bytes(payload[:4], "little") / 1e3
+        time_s = int.from_bytes(entry.frame.payload[:4], "little") / 1e3
         time_s += self._time.wrapped_s(time_s)
-        stale = self._time.check(message_id, time_s) is Age.STALE
+        stale = self._time.check(entry.frame.message_id, time_s) is Age.STALE
         return stale and time_s > self._time.newest_s
 
     def _add_origin(self, entry: LoggedMessage) -> None:
@@ -378,12 +368,11 @@ class _Collector:
 
     def history(self, damage: str) -> History:
         """All that was added."""
-        anchor_ms = self._anchor_ms
-        rows = {name: samples.rows(anchor_ms) for name, samples in self._theirs.items()}
-        ours = {name: samples.rows(anchor_ms) for name, samples in self._ours.items()}
-        arrays = {i: samples.rows(anchor_ms) for i, samples in self._arrays.items()}
+        found = {key: samples.rows(self._anchor_ms) for key, samples in self._samples.items()}
+        rows = {name: found[False, name] for name in _THEIRS}
+        ours = {name: found[True, name] for name in _OURS}
         heartbeat, battery = rows["HEARTBEAT"], rows["SYS_STATUS"]
-        voltage, remaining = (battery[name].astype(np.float32) for name in _BATTERY)
+        voltage, remaining = (battery[name].astype(np.float32) for name in _THEIRS["SYS_STATUS"])
         voltage[voltage == _NO_VOLTAGE] = remaining[remaining == _NO_PERCENTAGE] = math.nan
         position = _plausible(
             rows["LOCAL_POSITION_NED"],
@@ -415,8 +404,8 @@ class _Collector:
             reference=ours["POSITION_TARGET_LOCAL_NED"],
             setpoint=setpoint,
             commanded=setpoint if len(setpoint) else rows["ATTITUDE_TARGET"],
-            records=arrays[RECORD_ID],
-            identified=arrays[IDENTIFIED_ID],
+            records=ours[_RECORDS],
+            identified=ours[_IDENTIFIED],
             link_delay=_link_delay(ours["TIMESYNC"], rows["TIMESYNC"]),
             heartbeat=table(
                 heartbeat,
