@@ -159,14 +159,12 @@ def _flown_by_failsafe(ground: Ground) -> str:
 
 def several_vehicles(session: Session) -> str:
     """Several vehicles are heard, and none was chosen."""
-    senders, now_s = session.senders, session.link_time_s
-    if not senders.ambiguous(now_s):
-        return ""
-    return f"several vehicles are heard, systems {senders.named(now_s)}: choose one with --system"
+    systems = session.senders.candidates(session.link_time_s)
+    return systems and f"several vehicles are heard, systems {systems}: choose one with --system"
 
 
 def twin(session: Session) -> str:
-    if not session.has_twin:
+    if not session.time.mixed:
         return ""
     return (
         "two vehicles with the same system id send on this link, or its telemetry comes twice, "

@@ -54,7 +54,6 @@ class Counters:
     bytes_pending: int = 0
     frames: int = 0
     dropped: Counter[DropReason] = field(default_factory=Counter)
-    forged: int = 0  # frames that signing refused
     _reported_next: int = 1  # number of them in the next of `news`
 
     def count(self, why: DropReason | None) -> None:
@@ -62,7 +61,11 @@ class Counters:
         self.frames += 1
         if why is not None:
             self.dropped[why] += 1
-            self.forged += why in FORGED
+
+    @property
+    def forged(self) -> int:
+        """Frames that signing refused."""
+        return sum(self.dropped[each] for each in FORGED)
 
     def news(self) -> str:
         """What signing refused, on the 1st, 10th, 100th ... frame; else empty."""

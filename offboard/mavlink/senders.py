@@ -218,16 +218,11 @@ class Senders:
 
     # --- what to say ---
 
-    def ambiguous(self, now_s: float) -> bool:
-        """Several could be the vehicle, and none was chosen."""
-        return self._wanted is None and len(self._present(now_s)) > 1
-
-    def named(self, now_s: float) -> str:
-        """The systems that are heard, for a sentence."""
-        return _listed(self._present(now_s))
-
-    def _present(self, now_s: float) -> list[int]:
-        return [each for each, at_s in self.systems.items() if now_s - at_s <= HEARD_S]
+    def candidates(self, now_s: float) -> str:
+        """The systems that could be the vehicle, for a sentence, where they are several and none
+        was chosen; else empty."""
+        present = [each for each, at_s in self.systems.items() if now_s - at_s <= HEARD_S]
+        return _listed(present) if self._wanted is None and len(present) > 1 else ""
 
     def why_none(self, counters: Counters) -> str:
         """Why no vehicle was found, as far as the frames that were dropped tell; else empty."""

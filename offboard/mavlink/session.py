@@ -18,7 +18,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from offboard.mavlink import framing
 from offboard.mavlink.counters import FORGED, Counters, DropReason
 from offboard.mavlink.dialects.base import TYPE_ONBOARD_CONTROLLER, Dialect
-from offboard.mavlink.events import Event, PeerChanged, VehicleFound
+from offboard.mavlink.events import Event, PeerChanged, TimesyncReply, VehicleFound
 from offboard.mavlink.outgoing import CommandLong, Heartbeat, Outgoing, Record, Target, Timesync
 from offboard.mavlink.senders import COMMANDS, Senders
 from offboard.mavlink.signing import Signing
@@ -101,8 +101,8 @@ class Session:
         self._sending = mavlink.MAVLink(None, srcComponent=settings.component_id)
         self._recording = mavlink.MAVLink(None, srcComponent=RECORD_COMPONENT_ID)
         self._sent: deque[bytes] = deque(maxlen=_ECHOES)
-        self._telemetry = Telemetry(settings.capacity_bytes_ps, lockstep=settings.lockstep)
-        self._time = self._telemetry.time
+        self.telemetry = Telemetry(settings.capacity_bytes_ps, lockstep=settings.lockstep)
+        self.time = self.telemetry.time
         self._heartbeat_sent: tuple[float, float] | None = None  # host time, link time
         self._status_sent = self.status
 
@@ -118,8 +118,8 @@ class Session:
 
     def receive(self, datagram: bytes, peer: Hashable, now_s: float) -> Reception:
         """Process a datagram, or any portion of a stream, that came from `peer`. Never raises."""
-        self._time.on_datagram()
-        arrival = _Arrival(peer, self._time.now_s(now_s))
+        self.time.on_datagram()
+        arrival = _Arrival(peer, self.time.now_s(now_s))
         if self.senders.is_foreign(peer):
             if not self.senders.moves_to(peer, arrival.now_s, self._genuine(datagram)):
                 self.counters.dropped[DropReason.FOREIGN_PEER] += 1
@@ -128,7 +128,7 @@ class Session:
             arrival.events.append(PeerChanged(peer))
         frames: list[bytes] = []
         unlogged: list[tuple[int, bytes]] = []
-        arrival.events.extend(self._telemetry.texts.expire(arrival.now_s))
+        arrival.events.extend(self.telemetry.texts.expire(arrival.now_s))
         for frame in self._splitter.split(datagram):
             why = self._accept(frame, arrival)
             self.counters.count(why)
@@ -168,18 +168,19 @@ class Session:
         """TIMESYNC: tc1 is 0 in a request."""
         tc1_ns, ts1_ns = frame.message.tc1, frame.message.ts1
         if tc1_ns == 0:
-            self._time.on_request(ts1_ns * 1e-9)
+            self.time.on_request(ts1_ns * 1e-9)
             # a reply at time 0 would look like a request
             arrival.replies.append(Timesync(max(1, int(arrival.now_s * 1e9)), ts1_ns))
         elif self.vehicle is not None:
-            arrival.events.append(self._telemetry.timesync_reply(tc1_ns, ts1_ns))
+            wrapped_ns = round(self.time.wrapped_s(tc1_ns / 1e9) * 1e9)
+            arrival.events.append(TimesyncReply(ts1_ns, tc1_ns + wrapped_ns))
 
     def _interpret(self, frame: framing.Frame, arrival: _Arrival) -> DropReason | None:
         """Turn a frame of the vehicle into events."""
         assert self.dialect is not None
         if frame.message_id == framing.COMMAND_ACK and not self.senders.is_for_us(frame):
             return DropReason.NOT_FOR_US
-        found = self._telemetry.interpret(frame, self.dialect, arrival.now_s)
+        found = self.telemetry.interpret(frame, self.dialect, arrival.now_s)
         if isinstance(found, DropReason):
             return found
         arrival.events.extend(found)
@@ -200,7 +201,7 @@ class Session:
     def _begin(self) -> None:
         assert self.dialect is not None
         self._heartbeat_sent = None  # send it at once, with the vehicle's system id
-        self._telemetry.request_from(self.dialect)
+        self.telemetry.request_from(self.dialect)
 
     def overhear(self, datagram: bytes) -> list[int]:
         """Systems with an autopilot that this datagram, from another address than the vehicle's,
@@ -217,7 +218,7 @@ class Session:
         """Request half of the telemetry from now on: the link is saturated. False if the rates are
         the lowest already."""
         assert self.dialect is not None
-        return self._telemetry.thin(self.dialect)
+        return self.telemetry.thin(self.dialect)
 
     # --- out ---
 
@@ -228,8 +229,8 @@ class Session:
         custom_mode has changed, so that another program learns at once who flies; and requests for
         telemetry that is missing or too slow.
         """
-        now_s = self._time.now_s(now_s)
-        self._time.on_host(now_s)
+        now_s = self.time.now_s(now_s)
+        self.time.on_host(now_s)
         if not (self.dialect or self.senders.clock_behind or self.settings.sends_first):
             return ()
         due: list[Outgoing] = []
@@ -242,7 +243,7 @@ class Session:
         ):
             self._heartbeat_sent, self._status_sent = (now_s, link_s), self.status
             due.append(Heartbeat(TYPE_ONBOARD_CONTROLLER, *self.status))
-        requests = self._telemetry.rates.due(link_s)
+        requests = self.telemetry.rates.due(link_s)
         return (*due, *(CommandLong.message_interval(w.message_id, w.rate_hz) for w in requests))
 
     def encode(self, outgoing: Outgoing) -> bytes:
@@ -270,7 +271,7 @@ class Session:
 
     def elapsed_s(self, host_s: float) -> float:
         """Host time; in lockstep the simulated time, which goes on while telemetry is missing."""
-        return self._time.lockstep_s if self.settings.lockstep else host_s
+        return self.time.lockstep_s if self.settings.lockstep else host_s
 
     def clock_s(self, host_s: float) -> float:
         """Host time; in lockstep, where host time must decide nothing, the link's own seconds."""
@@ -279,19 +280,9 @@ class Session:
     @property
     def link_time_s(self) -> float:
         """Monotonic seconds that follow vehicle time, or host time while telemetry is missing."""
-        return self._time.seconds
-
-    @property
-    def has_twin(self) -> bool:
-        """Whether two vehicles with the same ids send, whose clocks are more than 2 s apart."""
-        return self._time.mixed
+        return self.time.seconds
 
     @property
     def rates_hz(self) -> dict[str, float]:
         """Measured rate of each wanted message over the last two seconds of `link_time_s`."""
-        return self._telemetry.rates.measured_hz(self.link_time_s)
-
-    @property
-    def wanted_bytes_ps(self) -> float:
-        """Bytes per second of the telemetry that is requested."""
-        return self._telemetry.rates.bytes_ps
+        return self.telemetry.rates.measured_hz(self.link_time_s)

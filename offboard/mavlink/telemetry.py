@@ -13,8 +13,6 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
-from pymavlink.dialects.v20.all import mavlink_map
-
 from offboard.mavlink.counters import DropReason
 from offboard.mavlink.decode import decode
 from offboard.mavlink.dialects.base import Dialect, WantedMessage
@@ -25,7 +23,6 @@ from offboard.mavlink.events import (
     LocalPosition,
     ModeReport,
     Rebooted,
-    TimesyncReply,
 )
 from offboard.mavlink.framing import STATUSTEXT, Frame
 from offboard.mavlink.texts import TextAssembler
@@ -38,7 +35,6 @@ _HALF_TURN = 128  # of the sequence number; further ahead is behind
 _GAP_S = 0.25  # without any frame, half a turn may have been lost
 SLOW_HZ = 20.0
 SHARE = 0.68  # of a link's capacity; the rest is for what is not requested
-FRAME_BYTES = 12  # of a MAVLink 2 frame besides its payload
 _WINDOW_S = 2.0
 _ENOUGH = 0.7  # of the rate wanted; a window holds few samples of a slow message
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 3.0, 30.0
@@ -110,11 +106,6 @@ class Telemetry:
         self._mode_report = number, now_s
         return False
 
-    def timesync_reply(self, tc1_ns: int, ts1_ns: int) -> TimesyncReply:
-        """A reply of the vehicle, whose clock is put on that of the stamps."""
-        wrapped_ns = round(self.time.wrapped_s(tc1_ns / 1e9) * 1e9)
-        return TimesyncReply(ts1_ns, tc1_ns + wrapped_ns)
-
     # --- rates ---
 
     def request_from(self, dialect: Dialect) -> None:
@@ -140,21 +131,12 @@ def fitted(wanted: Iterable[WantedMessage], bytes_ps: float) -> tuple[WantedMess
     """
     slow = [each for each in wanted if each.arrives_hz <= SLOW_HZ]
     fast = [each for each in wanted if each.arrives_hz > SLOW_HZ]
-    left = SHARE * bytes_ps - _bytes_ps(slow)
-    factor = min(max(left / _bytes_ps(fast), 0.0), 1.0) if fast else 1.0
+    left = SHARE * bytes_ps - sum(each.bytes_ps for each in slow)
+    factor = min(max(left / sum(each.bytes_ps for each in fast), 0.0), 1.0) if fast else 1.0
     return (
         *(replace(each, rate_hz=max(factor * each.rate_hz, SLOW_HZ)) for each in fast),
         *slow,
     )
-
-
-def _bytes_ps(wanted: Iterable[WantedMessage]) -> float:
-    return sum(each.arrives_hz * (FRAME_BYTES + _payload_bytes(each.message_id)) for each in wanted)
-
-
-def _payload_bytes(message_id: int) -> int:
-    size: int = mavlink_map[message_id].unpacker.size
-    return size
 
 
 @dataclass(slots=True)
@@ -204,7 +186,7 @@ class TelemetryRates:
     @property
     def bytes_ps(self) -> float:
         """Bytes per second of all wanted messages at the rates requested."""
-        return _bytes_ps(stream.wanted for stream in self._streams.values())
+        return sum(stream.wanted.bytes_ps for stream in self._streams.values())
 
     def count(self, message_id: int, now_s: float) -> None:
         """A message has arrived."""

@@ -173,7 +173,7 @@ EVENTS: dict[str, Setup] = {
     "at_rest": _track_for(TRACK.duration_s + 0.5),
     "other_sender": lambda flight: hear(flight, OtherSender(1, 190, 82)),
     "other_vehicle": lambda flight: vars(flight.session.senders).update(
-        ambiguous=lambda now_s: True
+        candidates=lambda now_s: "1 and 2"
     ),
     "disarmed": _disarm,
     "disarmed_again": _refuse_arming,

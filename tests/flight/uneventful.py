@@ -56,12 +56,10 @@ def uneventful(phase: Phase = Phase.TRACK, service: ServiceOptions | None = None
     """In `phase`, which has just begun. A vehicle that stands on the ground, so that it can lift
     off, land or be taken over."""
     session: Any = SimpleNamespace(
-        senders=SimpleNamespace(
-            ambiguous=lambda now_s: False, named=lambda now_s: "1, 2", why_none=lambda counted: ""
-        ),
+        senders=SimpleNamespace(candidates=lambda now_s: "", why_none=lambda counted: ""),
         counters=None,
         link_time_s=NOW_S,
-        has_twin=False,
+        time=SimpleNamespace(mixed=False),
         rates_hz={"ATTITUDE_QUATERNION": 50.0, "LOCAL_POSITION_NED": 30.0},
     )
     observer: Any = SimpleNamespace(

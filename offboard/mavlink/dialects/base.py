@@ -18,12 +18,12 @@ from offboard.mavlink.outgoing import CommandLong, ThrustRule
 SET_MODE, TAKEOFF = 176, 22  # MAV_CMD
 CUSTOM_MODE_ENABLED = 1.0  # MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 TYPE_ONBOARD_CONTROLLER, TYPE_GCS = 18, 6  # MAV_TYPE
+FRAME_BYTES = 12  # of a MAVLink 2 frame besides its payload
 
 
 def id_of(message: str) -> int:
     """The id of a message, by its name."""
-    number: int = getattr(mavlink, f"MAVLink_{message.lower()}_message").id
-    return number
+    return int(getattr(mavlink, f"MAVLink_{message.lower()}_message").id)
 
 
 class ParameterEncoding(Enum):
@@ -59,6 +59,12 @@ class WantedMessage:
     def arrives_hz(self) -> float:
         """Rate at which it arrives if it is sent as requested."""
         return self.rate_hz if self.unchanged_hz is None else self.unchanged_hz
+
+    @property
+    def bytes_ps(self) -> float:
+        """Bytes per second in which it arrives."""
+        payload_bytes: int = mavlink.mavlink_map[self.message_id].unpacker.size
+        return self.arrives_hz * (FRAME_BYTES + payload_bytes)
 
 
 class ParameterFault(NamedTuple):
