@@ -207,17 +207,13 @@ def _timeline(drawn: Sequence[DrawnFlight]) -> Figure | None:
     rows: list[str] = []
     for one in drawn:
         prefix = f"{one.label.partition(':')[0]} " if one.label else ""
-        shown = bands(one.flight), marks(one.flight)
+        entries = [*bands(one.flight), *marks(one.flight)]
         if one.label:  # of several flights only what differs most
-            shown = (
-                [b for b in shown[0] if b.row == "phase"],
-                [m for m in shown[1] if m.row == "failsafe"],
-            )
-        own = dict.fromkeys(each.row for part in shown for each in part)
-        rows += [prefix + row for row in own]
-        for row in own:
-            _add_bands(figure, prefix + row, [b for b in shown[0] if b.row == row], one.zero_s)
-            _add_marks(figure, prefix + row, [m for m in shown[1] if m.row == row], one.zero_s)
+            entries = [each for each in entries if each.row in ("phase", "failsafe")]
+        for row in dict.fromkeys(each.row for each in entries):
+            rows.append(prefix + row)
+            trace = _bands if row in ("phase", "mode") else _marks
+            figure.add_trace(trace([e for e in entries if e.row == row], rows[-1], one.zero_s))
     if not rows:
         return None
     figure.update_layout(
@@ -233,37 +229,29 @@ def _timeline(drawn: Sequence[DrawnFlight]) -> Figure | None:
     return Figure("Timeline", figure, "Point at a band or a mark to read its text.")
 
 
-def _add_bands(figure: go.Figure, row: str, bands: Sequence[Entry], zero_s: float) -> None:
-    if not bands:
-        return
-    figure.add_trace(
-        go.Bar(
-            orientation="h", y=[row] * len(bands),
-            base=[round(band.begin_s - zero_s, 3) for band in bands],
-            x=[round(band.end_s - band.begin_s, 3) for band in bands],
-            text=[html.escape(band.label) for band in bands],
-            hovertext=[html.escape(f"{b.begin_s:.2f} s: {b.text}") for b in bands],
-            hoverinfo="text", textposition="inside", insidetextanchor="middle", textangle=0,
-            textfont={"color": INK, "size": 12},
-            marker={"color": [b.colour for b in bands], "line": {"color": SURFACE, "width": 1.5}},
-        )
+def _bands(bands: Sequence[Entry], row: str, zero_s: float) -> go.Bar:
+    return go.Bar(
+        orientation="h", y=[row] * len(bands),
+        base=[round(band.begin_s - zero_s, 3) for band in bands],
+        x=[round(band.end_s - band.begin_s, 3) for band in bands],
+        text=[html.escape(band.label) for band in bands],
+        hovertext=[html.escape(f"{b.begin_s:.2f} s: {b.text}") for b in bands],
+        hoverinfo="text", textposition="inside", insidetextanchor="middle", textangle=0,
+        textfont={"color": INK, "size": 12},
+        marker={"color": [b.colour for b in bands], "line": {"color": SURFACE, "width": 1.5}},
     )  # fmt: skip
 
 
-def _add_marks(figure: go.Figure, row: str, marks: Sequence[Entry], zero_s: float) -> None:
-    if not marks:
-        return
-    failsafe = row.endswith("failsafe")
-    figure.add_trace(
-        go.Scatter(
-            cliponaxis=False, mode="markers", x=[round(mark.begin_s - zero_s, 3) for mark in marks],
-            y=[row] * len(marks), hoverinfo="text",
-            hovertext=[html.escape(f"{mark.begin_s:.2f} s: {mark.text}") for mark in marks],
-            marker={
-                "size": 11 if failsafe else 8, "color": RED if failsafe else PURPLE,
-                "symbol": "triangle-down" if failsafe else "circle-open", "line": {"width": 2},
-            },
-        )
+def _marks(marks: Sequence[Entry], row: str, zero_s: float) -> go.Scatter:
+    failsafe = marks[0].row == "failsafe"
+    return go.Scatter(
+        cliponaxis=False, mode="markers", x=[round(mark.begin_s - zero_s, 3) for mark in marks],
+        y=[row] * len(marks), hoverinfo="text",
+        hovertext=[html.escape(f"{mark.begin_s:.2f} s: {mark.text}") for mark in marks],
+        marker={
+            "size": 11 if failsafe else 8, "color": RED if failsafe else PURPLE,
+            "symbol": "triangle-down" if failsafe else "circle-open", "line": {"width": 2},
+        },
     )  # fmt: skip
 
 
