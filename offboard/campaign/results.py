@@ -1,9 +1,5 @@
-"""The results of a campaign: one JSON file per finished flight, DIR/results/CODE/CASE.json.
-
-CODE is a hash of the code that flies: results of other code are never mixed with ours. A file
-appears whole or not at all, so that a campaign may be killed at any time, and folders of several
-machines may be copied together.
-"""
+"""The results of a campaign: one JSON file per finished flight, DIR/results/CODE/CASE.json. CODE is
+a hash of the code that flies: results of other code are never mixed with ours."""
 
 from __future__ import annotations
 

@@ -1,9 +1,6 @@
-"""A campaign flown: plan, fly what is not finished, write table and page.
-
-The table is made of the folder of results alone, in the order of the plan. So it is the same
-whether the flights were flown at once, in shards, on a cluster, or after an interruption.
-`compare`, `--worst` and `tune` fly their cases in the same way (`Runner`).
-"""
+"""A campaign flown: plan, fly what is not finished, write table and page from the folder of results
+alone, in the order of the plan. `compare`, `--worst` and `tune` fly their cases in the same way
+(`Runner`)."""
 
 from __future__ import annotations
 

@@ -1,9 +1,5 @@
 """Search over cases: the study behind `--worst` and `tune`, and the failures that `--worst` finds.
 
-A study (optuna's TPE sampler) asks for values in batches and is told what they cost. It is in
-memory: the same seed asks the same values, and the folder of results has the flights, so that a
-search that was interrupted goes on.
-
 Failures: flights that break a promise, differ, and are as simple as possible. The budget is spent
 in rounds; a round is kept away from the failures of the rounds before it. Of the flights with a
 negative margin, worst first, each is reduced: values return to their defaults one by one, as long

@@ -1,12 +1,10 @@
-"""Tuning: parameters that lower a figure on training flights, judged on validation flights.
+"""Tuning: parameters that lower a figure on training flights, judged on validation flights, pair by
+pair (same scenario, same seed), with confidence.
 
     ranges:
       controller.bandwidth_radps: [3, 9]
     training: {scenarios: [px4_like, gusts], seeds: 3}
     validation: {scenarios: [all_together, wind_2mps], seeds: 10}
-
-The results of all flights lie in a folder, so that an interrupted tuning goes on. It is judged by
-paired flights (same scenario, same seed) with confidence.
 """
 
 from __future__ import annotations

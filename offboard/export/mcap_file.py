@@ -2,7 +2,6 @@
 
 Poses, paths and velocity are in the frame `map` (ENU, metres) and the body `base_link` (FLU). Every
 series is also a channel of JSON messages with the columns of the tables, in NED, as `/table/NAME`.
-Time is the vehicle's, counted from the Unix time of the first telemetry, also of a lockstep flight.
 """
 
 from __future__ import annotations

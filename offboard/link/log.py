@@ -2,8 +2,7 @@
 records; and how all other files are written, whole or not at all.
 
 An entry of a .tlog is a big-endian uint64 of Unix microseconds, low two bits zero, and the frame
-unchanged. A thread writes them, so that a slow disk does not stop the flight: a crash loses the
-last hundredths of a second.
+unchanged. A crash loses the last hundredths of a second.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
 """The time stamps of a signing key, kept on disk so that they never go back.
 
-One file for each key: in $STATE_DIRECTORY (systemd), else in $XDG_STATE_HOME/offboard or
-~/.local/state/offboard. Its name comes from a hash of the key, its content is a stamp that no frame
-has had yet: about a minute ahead of the newest one, so that it holds after a crash, too. Where the
-computer's clock has gone back since, stamps continue from there.
+One file for each key, whose name comes from a hash of the key. Its content is a stamp that no frame
+has had yet: about a minute ahead of the newest one, so that it holds after a crash, too.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
-"""TCP and serial links: streams of bytes through a file descriptor, renewed when they break.
-
-A broken stream is replaced by the next one that its source gives: `Redial` opens the same address
-again in a thread, `Listener` accepts the next client. Nothing here waits for either.
-"""
+"""TCP and serial links: streams of bytes through a file descriptor. One that breaks is replaced by
+the next one that its source gives: `Redial` opens the same address again, `Listener` accepts the
+next client."""
 
 from __future__ import annotations
 

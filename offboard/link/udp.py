@@ -1,9 +1,8 @@
-"""UDP links. The vehicle, once known, has a connected socket of its own, which the kernel filters.
+"""UDP links. The vehicle, once known, has a connected socket of its own on the same local port, so
+that nobody can fill its buffer or take our time.
 
-Two sockets share the local port then: the kernel gives the vehicle's datagrams to the connected
-one, and those of all other senders to the listening one, of which little is read. So nobody can
-fill the vehicle's buffer or take our time. Linux lets two sockets share a port with SO_REUSEADDR,
-macOS with SO_REUSEPORT; afterwards the option is cleared, so that no other program can join.
+Linux lets two sockets share a port with SO_REUSEADDR, macOS with SO_REUSEPORT; afterwards the
+option is cleared, so that no other program can join.
 """
 
 from __future__ import annotations

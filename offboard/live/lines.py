@@ -1,7 +1,4 @@
-"""The flight as lines: for a person, on a terminal with a status line in place, or for a machine.
-
-A thread writes, so that the loop does not wait for a terminal that Ctrl-S stops or for a full pipe.
-"""
+"""The flight as lines: on a terminal with a status line in place, or for a machine."""
 
 from __future__ import annotations
 

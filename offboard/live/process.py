@@ -1,8 +1,5 @@
-"""Feeds a display in a process of its own, so that the loop never waits for its clients.
-
-Snapshots pass through a bounded queue and a pipe as JSON lines; what does not fit is dropped and
-counted. The process ends when the pipe closes.
-"""
+"""Feeds a display in a process of its own, by a queue and a pipe of JSON lines, so that the loop
+never waits for its clients. The process ends when the pipe closes."""
 
 from __future__ import annotations
 

@@ -1,9 +1,7 @@
 """What serves clients: `python -m offboard.live.server HOST PORT`, snapshots as JSON on stdin.
 
-Serves the live page at /, server-sent events at /events (first what was kept of the flight so far,
-then each snapshot), /metrics and /health. A client that does not read misses snapshots; it delays
-nobody. The number of connections is limited, and so is the life of each but those of /events: slow
-or idle ones use up neither descriptors nor memory.
+The number of connections is limited, and so is the life of each but those of /events: slow or idle
+ones use up neither descriptors nor memory.
 """
 
 from __future__ import annotations

@@ -1,12 +1,9 @@
 """Framing: where frames are in received bytes. pymavlink decodes those whose message is read: half
 of an autopilot's telemetry never is.
 
-pymavlink's own `parse_buffer` drops as many bytes after a damaged frame as its length says, and
-good frames with them: where a serial line loses one byte in a thousand it loses a tenth of the
-frames, this search a twentieth. After bytes that are no frame it continues one byte later, so that
-a damaged length cannot hide a good frame. Nothing here raises, whatever the input.
-
-MAVLink 1 frames (0xFE) are accepted: their payloads lack the extension fields, which are zero.
+After bytes that are no frame the search continues one byte later, so that a damaged length cannot
+hide a good frame. Nothing here raises, whatever the input. MAVLink 1 frames (0xFE) are accepted:
+their payloads lack the extension fields, which are zero.
 """
 
 from __future__ import annotations

@@ -1,12 +1,8 @@
 """MAVLink 2 signing: pymavlink signs; here are our own time, the check and its reasons. No I/O.
 
-A time stamp has 48 bits and counts 10 us since 2015-01-01 UTC. It must be newer than the last one
-accepted of the same stream, which is link id, system and component; that of a new stream may be at
-most a minute behind our own time. A newer stamp than our own time becomes our own time, so that
-clocks agree that were never set. Our own time follows a monotonic clock: it does not go back when
-the computer's clock does.
-
-Nothing is accepted unsigned, except RADIO_STATUS, which telemetry radios insert.
+A time stamp has 48 bits and counts 10 us since 2015-01-01 UTC; its stream is link id, system and
+component. A newer stamp than our own time becomes our own time, so that clocks agree that were
+never set.
 """
 
 from __future__ import annotations
