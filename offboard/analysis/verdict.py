@@ -59,14 +59,8 @@ def _positions(flown: History) -> Iterator[LocalPosition]:
     """In the order of time."""
     order = np.argsort(flown.position["time_s"], kind="stable")
     for first in range(0, len(order), _BLOCK):
-        rows = flown.position[order[first : first + _BLOCK]]
-        for place, velocity, time_s in zip(
-            rows["position_ned_m"].tolist(),
-            rows["velocity_ned_mps"].tolist(),
-            rows["time_s"].tolist(),
-            strict=True,
-        ):
-            yield LocalPosition(time_s, tuple(place), tuple(velocity))
+        for time_s, _, place, velocity in flown.position[order[first : first + _BLOCK]].tolist():
+            yield LocalPosition(time_s, tuple(place.tolist()), tuple(velocity.tolist()))
 
 
 def begin_times(phases: tuple[Event, ...]) -> dict[str, float]:
