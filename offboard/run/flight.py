@@ -148,7 +148,7 @@ class Simulated:
     def _parameters(self) -> dict[str, float]:
         """Parameters that a user must set once on this autopilot."""
         watched = DIALECTS[self.firmware].watched_parameters
-        return {p.name: float(p.required_bits) for p in watched if p.required_bits}
+        return {p.name: float(p.required.bits) for p in watched if p.required.bits}
 
 
 # --- a configuration made ready ---

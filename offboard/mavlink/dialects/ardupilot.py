@@ -10,10 +10,10 @@ from pymavlink.dialects.v20.all import enums
 from offboard.mavlink.dialects.base import (
     CUSTOM_MODE_ENABLED,
     TRACKING_TELEMETRY,
-    Advice,
     Dialect,
     ParameterEncoding,
     Takeoff,
+    Valid,
     WantedMessage,
     WatchedParameter,
 )
@@ -48,23 +48,22 @@ ARDUPILOT = Dialect(
         WatchedParameter(
             "GUID_OPTIONS",
             "without bit 3 (value 8) the thrust field is a climb rate",
-            required_bits=8,
+            Valid(bits=8),
             must_answer=True,
         ),
         WatchedParameter(
             "GUID_TIMEOUT",
             "seconds without setpoints before the vehicle levels",
-            allowed=(0.3, 5.0),
-            default=1.0,  # not ArduCopter's 3, see the advice
+            Valid(lowest=0.3, highest=5.0, set_to=1.0),  # not ArduCopter's 3, see the advice
             advice=(
-                Advice(
+                Valid(
                     "where setpoints stop, as with a lost link, the last tilt is flown for so "
                     "long; then the vehicle levels, holds its height and drifts: it does not land, "
                     "and does not say so",
                     1.0,
                     highest=1.5,
                 ),
-                Advice(
+                Valid(
                     "it levels before the supervisor, which lands it if we stop, acts",
                     1.0,
                     lowest=0.6,
@@ -75,8 +74,7 @@ ARDUPILOT = Dialect(
         WatchedParameter(
             "ATC_ANGLE_BOOST",
             "the autopilot must divide thrust by the cosine of the tilt",
-            allowed=(1.0, 1.0),
-            default=1.0,
+            Valid(lowest=1.0, highest=1.0, set_to=1.0),
             must_answer=True,
         ),
         WatchedParameter(
@@ -89,7 +87,7 @@ ARDUPILOT = Dialect(
             "how soon BRAKE, which is asked for hold, stops the vehicle",
             # BRAKE slows down by PSC_JERK_XY / 7.5 of the speed per second
             advice=(
-                Advice(
+                Valid(
                     "BRAKE, which is asked for hold, takes 7.5 / PSC_JERK_XY metres to stop for "
                     "each m/s",
                     10.0,
@@ -103,7 +101,7 @@ ARDUPILOT = Dialect(
         WatchedParameter(
             "ARMING_CHECK",
             "pre-arm checks that the vehicle makes; 1 is all",
-            advice=(Advice("the vehicle arms without checking its sensors", 1.0, 1.0, 1.0),),
+            advice=(Valid("the vehicle arms without checking its sensors", 1.0, 1.0, 1.0),),
         ),
         WatchedParameter("ANGLE_MAX", "greatest tilt of its own modes, hundredths of a degree"),
     ),

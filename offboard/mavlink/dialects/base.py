@@ -79,15 +79,15 @@ def always(parameters: Mapping[str, float], radio: bool) -> bool:
 
 
 @dataclass(frozen=True, slots=True)
-class Advice:
-    """A value that is recommended and not required: `lowest` to `highest`, with `bits` set.
+class Valid:
+    """Valid values of a parameter: `lowest` to `highest`, with `bits` set.
 
-    `why` says what any other value means. `applies` is given all known parameters, and whether a
-    radio is received.
+    `why` says what any other value means, if the meaning of the parameter does not; `set_to` is
+    suggested instead. `applies` is given all known parameters, and whether a radio is received.
     """
 
-    why: str
-    set_to: float
+    why: str = ""
+    set_to: float = math.nan  # without `bits`
     lowest: float = -math.inf
     highest: float = math.inf
     bits: int = 0
@@ -98,54 +98,43 @@ class Advice:
 class WatchedParameter:
     """A parameter of the autopilot that is read before flight.
 
-    `required_bits` must be set and the value must be within `allowed`, else `default` is suggested.
-    Without a reply to one that `must_answer`, the flight is refused. `advice` is for `offboard
-    doctor`, and so is the whole parameter if it is `advice_only`. `values` explains the values of
-    an enumeration.
+    A flight is refused where a value is not as `required`, and without a reply to a parameter that
+    `must_answer`. `advice` is for `offboard doctor`, and so is the whole parameter if it is
+    `advice_only`. `values` explains the values of an enumeration.
     """
 
     name: str
     meaning: str
-    required_bits: int = 0
-    allowed: tuple[float, float] | None = None
-    default: float = math.nan
+    required: Valid = Valid()
     must_answer: bool = False
-    advice: tuple[Advice, ...] = ()
+    advice: tuple[Valid, ...] = ()
     advice_only: bool = False
     values: tuple[str, ...] = ()
 
     def fault(self, value: float) -> ParameterFault | None:
         """Why a vehicle with this `value` is not flown, or None if it is."""
-        bits = int(value)
-        if bits & self.required_bits != self.required_bits:
-            valid: float = bits | self.required_bits
-        elif self.allowed is not None and not self.allowed[0] <= value <= self.allowed[1]:
-            valid = self.default
-        else:
-            return None
-        return self._fault(value, self.meaning, valid)
+        return self._fault(value, self.required)
 
     def advised(
         self, value: float, known: Mapping[str, float], radio: bool
     ) -> ParameterFault | None:
         """What is not recommended about `value`, or None. `known`: all parameters; `radio`: one is
         received."""
-        for advice in self.advice:
-            within = advice.lowest <= value <= advice.highest
-            good = within and int(value) & advice.bits == advice.bits
-            if not good and advice.applies(known, radio):
-                set_to = int(value) | int(advice.set_to) if advice.bits else advice.set_to
-                return self._fault(value, advice.why, set_to)
-        return None
+        applying = (each for each in self.advice if each.applies(known, radio))
+        return next(filter(None, (self._fault(value, each) for each in applying)), None)
 
     def shown(self, value: float) -> str:
         """The value with its name, if it has one."""
         named = 0 <= value < len(self.values) and value == int(value)
         return f"{value:g} ({self.values[int(value)]})" if named else f"{value:g}"
 
-    def _fault(self, value: float, why: str, valid: float) -> ParameterFault:
-        line = f"param set {self.name} {valid:g}"
-        return ParameterFault(f"{self.name} is {self.shown(value)}: {why}", line)
+    def _fault(self, value: float, valid: Valid) -> ParameterFault | None:
+        bits = int(value)
+        if valid.lowest <= value <= valid.highest and bits & valid.bits == valid.bits:
+            return None
+        found = f"{self.name} is {self.shown(value)}: {valid.why or self.meaning}"
+        set_to = bits | valid.bits if valid.bits else valid.set_to
+        return ParameterFault(found, f"param set {self.name} {set_to:g}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,11 +9,11 @@ from types import MappingProxyType
 from offboard.mavlink.dialects.base import (
     CUSTOM_MODE_ENABLED,
     TRACKING_TELEMETRY,
-    Advice,
     Defect,
     Dialect,
     ParameterEncoding,
     Takeoff,
+    Valid,
     WantedMessage,
     WatchedParameter,
 )
@@ -74,10 +74,9 @@ PX4 = Dialect(
         WatchedParameter(
             "COM_OF_LOSS_T",
             "seconds without setpoints before the failsafe",
-            allowed=(0.3, 5.0),
-            default=1.0,
+            Valid(lowest=0.3, highest=5.0, set_to=1.0),
             advice=(
-                Advice(
+                Valid(
                     "its failsafe acts before the supervisor, which lands it if we stop",
                     1.0,
                     lowest=0.6,
@@ -87,8 +86,7 @@ PX4 = Dialect(
         WatchedParameter(
             "COM_OBL_RC_ACT",
             "what the vehicle does when setpoints stop; 6 and 7 stop the motors",
-            allowed=(0.0, 5.0),
-            default=4.0,  # not PX4's 0, which needs sticks
+            Valid(lowest=0.0, highest=5.0, set_to=4.0),  # not PX4's 0, which needs sticks
             values=(
                 "Position",
                 "Altitude",
@@ -100,7 +98,7 @@ PX4 = Dialect(
                 "Disarm",
             ),
             advice=(
-                Advice(
+                Valid(
                     "when setpoints stop, the vehicle enters a mode that is flown by sticks, and "
                     "no radio is received",
                     4.0,
@@ -113,16 +111,15 @@ PX4 = Dialect(
             "COM_RC_IN_MODE",
             "whether a radio or a joystick is used",
             values=("radio", "joystick", "radio or joystick", "the first of both", "disabled"),
-            advice=(Advice("a pilot cannot take over by sticks", 3.0, highest=3.0),),
+            advice=(Valid("a pilot cannot take over by sticks", 3.0, highest=3.0),),
         ),
         WatchedParameter(
             "COM_RCL_EXCEPT",
             "modes in which a lost radio is no failsafe; 4 is OFFBOARD",
             advice=(
-                Advice(
+                Valid(
                     "without 4, a radio or joystick that is received for a moment and lost again "
                     "ends OFFBOARD; none is received now",
-                    4.0,
                     bits=4,
                     applies=_misses_sticks,
                 ),
