@@ -33,21 +33,20 @@ def _attitude_setpoint(setpoint: Rows) -> Array:
     return np.column_stack((yaw, attitude, nothing, nothing, -thrust))
 
 
-# series of the flight, its topic, names of its fields and how many values each, and the values
-_NED = (("x", 1), ("y", 1), ("z", 1))
-_TOPICS: tuple[tuple[str, str, tuple[tuple[str, int], ...], Callable[[Rows], Array]], ...] = (
-    ("position", "vehicle_local_position", (*_NED, ("vx", 1), ("vy", 1), ("vz", 1)), values_of),
-    ("truth", "vehicle_local_position_groundtruth", _NED, values_of),
-    ("attitude", "vehicle_attitude", (("q", 4),), itemgetter("quaternion")),
-    ("attitude", "vehicle_angular_velocity", (("xyz", 3),), itemgetter("rates_radps")),
+# series of the flight, its topic, the format of its fields, and their values
+_TOPICS: tuple[tuple[str, str, str, Callable[[Rows], Array]], ...] = (
+    ("position", "vehicle_local_position", "float x;float y;float z;float vx;float vy;float vz;",
+     values_of),
+    ("truth", "vehicle_local_position_groundtruth", "float x;float y;float z;", values_of),
+    ("attitude", "vehicle_attitude", "float[4] q;", itemgetter("quaternion")),
+    ("attitude", "vehicle_angular_velocity", "float[3] xyz;", itemgetter("rates_radps")),
     ("reference", "trajectory_setpoint",
-     (("position", 3), ("velocity", 3), ("acceleration", 3), ("yaw", 1)), values_of),
+     "float[3] position;float[3] velocity;float[3] acceleration;float yaw;", values_of),
     ("setpoint", "vehicle_attitude_setpoint",
-     (("yaw_body", 1), ("q_d", 4), ("thrust_body", 3)), _attitude_setpoint),
-    ("decision", DECISION, tuple((name, 1) for name in FIELDS), values_of),
-    ("heartbeat", "actuator_armed", (("armed", 1),), itemgetter("armed")),
+     "float yaw_body;float[4] q_d;float[3] thrust_body;", _attitude_setpoint),
+    ("decision", DECISION, "".join(f"float {name};" for name in FIELDS), values_of),
+    ("heartbeat", "actuator_armed", "uint8_t armed;", itemgetter("armed")),
 )  # fmt: skip
-_BYTES = {"actuator_armed"}  # topics of bytes; the others are of float32
 _AUTOPILOTS = {"px4": "PX4", "ardupilot": "ArduPilot"}  # as PX4's tools name them
 
 
@@ -56,8 +55,9 @@ def write_ulog(flown: History, path: Path) -> None:
     found = series_of(flown)
     topics = [topic for topic in _TOPICS if topic[0] in found]
     entries: list[tuple[int, bytes]] = []
-    for number, (name, topic, _, values) in enumerate(topics):
-        rows = values(found[name]).astype(np.uint8 if topic in _BYTES else np.float32)
+    for number, (name, _, fields, values) in enumerate(topics):
+        kind = np.float32 if fields.startswith("float") else np.uint8
+        rows = values(found[name]).astype(kind)
         stamps = np.maximum(np.round(found[name]["time_s"] * 1e6), 0.0).astype(np.int64).tolist()
         for stamp, row in zip(stamps, rows, strict=True):
             data = struct.pack("<HQ", number, stamp) + row.tobytes()
@@ -75,16 +75,10 @@ def write_ulog(flown: History, path: Path) -> None:
             info = f"char[{len(value)}] {key}".encode()
             file.write(_message(_INFO, bytes([len(info)]) + info + value.encode()))
         for _, topic, fields, _ in topics:
-            file.write(_message(_FORMAT, _format(topic, fields).encode()))
+            file.write(_message(_FORMAT, f"{topic}:uint64_t timestamp;{fields}".encode()))
         for number, (_, topic, *_) in enumerate(topics):
             file.write(_message(_SUBSCRIBE, struct.pack("<BH", 0, number) + topic.encode()))
         file.writelines(entry for _, entry in entries)
-
-
-def _format(topic: str, fields: tuple[tuple[str, int], ...]) -> str:
-    kind = "uint8_t" if topic in _BYTES else "float"
-    rest = "".join(f"{kind}{f'[{n}]' if n > 1 else ''} {name};" for name, n in fields)
-    return f"{topic}:uint64_t timestamp;{rest}"
 
 
 def _message(kind: int, data: bytes) -> bytes:
