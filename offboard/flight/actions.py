@@ -76,7 +76,7 @@ def _end(flight: FlightState, time_s: float, *, steers: bool) -> None:
     if fails and authority.mode == dialect.return_mode:
         return  # the owner's choice for missing setpoints: it lands where it took off
     if authority.mode != mode:
-        if outbox.request(flight, dialect.hold() if holds else dialect.land()):
+        if outbox.request(flight, dialect.hold() if holds else CommandLong.land()):
             authority.request(mode)
     elif not holds:
         _disarm_if_standing(flight)

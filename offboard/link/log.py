@@ -172,7 +172,10 @@ def replace_file(path: Path, text: str) -> None:
     incomplete = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        incomplete.write_bytes(text.encode())
+        with incomplete.open("wb") as file:
+            file.write(text.encode())
+            file.flush()
+            os.fsync(file.fileno())
         incomplete.replace(path)
     except OSError:
         with suppress(OSError):

@@ -14,6 +14,7 @@ from pathlib import Path
 from offboard.documents.errors import UserError
 from offboard.link import clock
 from offboard.link.background import BackgroundWriter
+from offboard.link.log import replace_file
 from offboard.mavlink.signing import RESERVED, UNITS_PER_S, Signing, stamp_of_unix
 
 CLOSE_S = 2.0
@@ -90,9 +91,4 @@ class SigningTime:
         newest = stamps[-1]
         with suppress(SigningTimeError):
             newest = max(newest, self._kept())
-        beside = self._path.with_name(f"{self._path.name}.{os.getpid()}")
-        with beside.open("w", encoding="ascii") as file:
-            file.write(f"{newest}\n")
-            file.flush()
-            os.fsync(file.fileno())
-        beside.replace(self._path)
+        replace_file(self._path, f"{newest}\n")

@@ -197,7 +197,7 @@ class Recovery:
             self.ended = f"not landed after {LONGEST_S:.0f} s"
 
     def _wanted(self, now_s: float) -> CommandLong | None:
-        hold, land = self._dialect.hold(), self._dialect.land()
+        hold, land = self._dialect.hold(), CommandLong.land()
         first = hold if now_s - self._began_s < self._hold_s else land
         fresh = now_s - self._reported_s < FRESH_S
         if self._mode is None:

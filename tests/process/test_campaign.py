@@ -302,16 +302,16 @@ def test_what_is_finished_on_a_full_disk_is_kept_and_a_worker_of_its_own_flies_t
     whole: Path, half: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     flown = continued(half, tmp_path / "out")
-    write, failed = Path.write_bytes, []
+    replace_with, failed = Path.replace, []
 
-    def full(path: Path, data: bytes) -> int:
+    def full(path: Path, target: Path) -> Path:
         if failed or "results" not in path.parts:
-            return write(path, data)
-        failed.append(write(path, data[:10]))
+            return replace_with(path, target)
+        failed.append(path)
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as limited:
-        limited.setattr(Path, "write_bytes", full)
+        limited.setattr(Path, "replace", full)
         summary = fly(flown)
     assert "cannot be written (No space left on device); finished flights are kept" in (
         summary.stopped

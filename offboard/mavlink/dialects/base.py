@@ -193,13 +193,9 @@ class Dialect:
         return self.modes.get(custom_mode) or f"UNKNOWN(0x{custom_mode:08x})"
 
     def set_mode(self, name: str) -> CommandLong:
-        """MAV_CMD_DO_SET_MODE. Raises ValueError for an unknown mode."""
-        for custom_mode, known in self.modes.items():
-            if known == name:
-                return CommandLong(SET_MODE, self.mode_parameters(custom_mode))
-        raise ValueError(
-            f"{self.name} has no mode {name!r}; it has {', '.join(self.modes.values())}"
-        )
+        """MAV_CMD_DO_SET_MODE. Raises KeyError for an unknown mode."""
+        numbers = {known: custom_mode for custom_mode, known in self.modes.items()}
+        return CommandLong(SET_MODE, self.mode_parameters(numbers[name]))
 
     def setpoint_loss(self, parameters: Mapping[str, float]) -> SetpointLoss:
         """What the vehicle with these `parameters` does; without one, any of its modes."""
@@ -216,9 +212,6 @@ class Dialect:
 
     def hold(self) -> CommandLong:
         return self.set_mode(self.hold_mode)
-
-    def land(self) -> CommandLong:
-        return CommandLong.land()
 
     def take_off(self, altitude_m: float) -> CommandLong:
         """MAV_CMD_NAV_TAKEOFF at the present place. The altitude is above home on ArduCopter,
