@@ -63,8 +63,8 @@ def tracking_metrics(flown: History, window: tuple[float, float]) -> dict[str, f
     reference, clock = Reference(flown.reference), _Clock(flown)
 
     def away(rows: Rows, column: str, derivative: int = 0) -> Weighted:
-        distances = _length(rows[column] - reference.position(rows["time_s"], derivative))
-        return weighted(distances, clock.shares(rows["time_s"]))
+        errors = rows[column] - reference.position(rows["time_s"], derivative)
+        return weighted(np.linalg.norm(errors, axis=1), clock.shares(rows["time_s"]))
 
     rows = _within(flown.position, window)
     position, velocity = away(rows, "position_ned_m"), away(rows, "velocity_ned_mps", 1)
@@ -181,10 +181,6 @@ def each_once(rows: Rows) -> Rows:
 def _in_track(flown: History) -> NDArray[np.bool_]:
     chosen: NDArray[np.bool_] = flown.records["phase"] == PHASE_CODES[Phase.TRACK]
     return chosen
-
-
-def _length(vectors: Array) -> Array:
-    return np.asarray(np.linalg.norm(vectors, axis=1))
 
 
 # ---------------------------------------------------------------------- metrics by time

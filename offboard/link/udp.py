@@ -101,8 +101,10 @@ class UdpLink:
     # --- in ---
 
     def wait(self, timeout_s: float) -> None:
-        awaited = [inbox.socket for inbox in self._awaited()]
-        select.select(awaited, [], [], max(0.0, timeout_s))
+        # a flood of other senders must not end the waiting
+        looks = self._vehicle is None or clock.monotonic_s() >= self._look_s
+        awaited = (self._vehicle, self._listening if looks else None)
+        select.select([i.socket for i in awaited if i], [], [], max(0.0, timeout_s))
 
     def receive(self) -> list[Chunk]:
         chunks = self._vehicle.drain(BATCH_MAX) if self._vehicle else []
@@ -111,11 +113,6 @@ class UdpLink:
                 return self._listening.drain(BATCH_MAX)
             chunks += self._look(self._listening, bool(chunks))
         return sorted(chunks, key=lambda chunk: chunk.arrived_s)
-
-    def _awaited(self) -> list[_Inbox]:
-        """The sockets that end the waiting: a flood of other senders must not."""
-        looks = self._vehicle is None or clock.monotonic_s() >= self._look_s
-        return [i for i in (self._vehicle, self._listening if looks else None) if i]
 
     def _look(self, listening: _Inbox, heard: bool) -> list[Chunk]:
         """What other senders sent: nearly all is only counted. Returned is what the vehicle sent
