@@ -17,9 +17,9 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 
 from offboard.mavlink.dialects.base import NEVER, SetpointLoss
+from offboard.mavlink.events import MODE_KNOWN_S
 
 JUST_S = 0.6  # PX4 sends CURRENT_MODE twice a second, and at once when the mode changes
-KNOWN_S = 2.5  # longest age of a report; HEARTBEAT comes at 1 Hz
 
 
 class Standing(Enum):
@@ -182,11 +182,11 @@ class Authority:
 
     def known(self, now_s: float) -> bool:
         """Whether the newest report that counts is recent enough to act on."""
-        return now_s - self.reported_s <= KNOWN_S
+        return now_s - self.reported_s <= MODE_KNOWN_S
 
     def heard(self, now_s: float) -> bool:
         """Whether reports arrive, even if none counts yet."""
-        return now_s - self.heard_s <= KNOWN_S
+        return now_s - self.heard_s <= MODE_KNOWN_S
 
     def unheard_s(self, now_s: float) -> float:
         """Time since the newest report, if that is longer than usual; else 0."""

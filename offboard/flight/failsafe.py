@@ -18,7 +18,7 @@ import numpy as np
 from offboard.flight.authority import Standing
 from offboard.flight.phases import TRACKING, Action, Condition, Limits
 from offboard.flight.state import COMMANDS_KEPT, FlightState
-from offboard.mavlink.events import OtherSender, ThrustReport
+from offboard.mavlink.events import MODE_KNOWN_S, OtherSender, ThrustReport
 
 OPERATOR = "{flight.stop_cause}"  # the cause of a row for `stop_requested`
 REBOOTED = "the vehicle restarted"
@@ -296,11 +296,9 @@ LEVEL, HOLD, LAND = Action.LEVEL, Action.HOLD, Action.LAND
 MISSED = "{flight.failure_cause}", "{flight.failure}"
 LATE = "limits.link_growth_s, limits.setpoint_age_s"
 UNIDENTIFIED = "BOUNDS of identification"
-# a pilot's change of the mode is seen within this time, or `authority` acts
-FOLLOWED_S = 2.5
 ROWS = (
     # of `authority` nothing is asked before the mode is known again
-    Row("authority", another_may_control, "2.5 s", LAND, cause="link"),
+    Row("authority", another_may_control, f"{MODE_KNOWN_S:g} s", LAND, cause="link"),
     Row("silence", silent, "limits.silence_s", LAND, cause="link"),
     Row("blind", blind, f"{Limits.blind_s:g} s", LAND, cause="link"),
     Row("age", old, "limits.setpoint_age_s", LEVEL, cause="link"),
@@ -321,7 +319,8 @@ ROWS = (
     Row("thrust reserve", no_thrust_reserve, "limits.hover_thrust", LAND, 2.0),
     Row("full thrust", sinks_with_full_thrust, f"{SINK_MPS:g} m/s", LAND, 1.0),
     Row("second sender", other_sender, "one message", HOLD, cause="second sender"),
-    Row("other setpoints", follows_others, "1e-5", HOLD, FOLLOWED_S, "second sender"),
+    # within this time a pilot's change of the mode is seen, or the row "authority" acts
+    Row("other setpoints", follows_others, "1e-5", HOLD, MODE_KNOWN_S, "second sender"),
     Row("clock", clock_jumped, "0.5 s", LAND, cause=""),
     Row("contradiction", contradicted, UNIDENTIFIED, LAND, cause=""),
 )

@@ -22,6 +22,7 @@ from offboard.mavlink.dialects.base import NEVER, Dialect, SetpointLoss
 from offboard.mavlink.events import (
     CRITICAL,
     GOOD_RESULTS,
+    MODE_KNOWN_S,
     CommandAck,
     Event,
     Heartbeat,
@@ -36,7 +37,6 @@ REPEAT_S = 0.3  # between two requests
 UNHEARD_MAX = 3  # requests to a vehicle of which nothing is heard
 HOLD_S = 5.0  # then land
 ACKNOWLEDGED_S = 3.0  # after hold is reported; it is asked for again until then
-FRESH_S = 2.5  # an older report of the mode is no reason for a command
 LONGEST_S = 300.0
 EARLY_S = 0.3  # the newest setpoint left before the newest beat, and may have been lost
 SINK_MPS = 0.2  # downward speed of a vehicle that lands, within SINK_S
@@ -77,15 +77,13 @@ class Recovery:
 
     `ended` says how it ended, empty until then; `refusal` and `notice` have news for the user."""
 
-    def __init__(
-        self, dialect: Dialect, known: Supervised, began_s: float, beat_s: float = math.inf
-    ) -> None:
+    def __init__(self, dialect: Dialect, known: Supervised, began_s: float, beat_s: float) -> None:
         self._dialect = dialect
         self._holding = known.holding
         self._hold_s = 0.0 if known.landing else HOLD_S
         self._began_s = began_s
         self._loss = known.loss
-        missing_s = min(beat_s, began_s) + known.loss.after_s - EARLY_S
+        missing_s = beat_s + known.loss.after_s - EARLY_S
         self._loses_s = -math.inf if known.starved else missing_s
         self._sticks = known.sticks
         self._mode: str | None = None
@@ -199,10 +197,10 @@ class Recovery:
     def _wanted(self, now_s: float) -> CommandLong | None:
         hold, land = self._dialect.hold(), self._dialect.land()
         first = hold if now_s - self._began_s < self._hold_s else land
-        fresh = now_s - self._reported_s < FRESH_S
+        known = now_s - self._reported_s <= MODE_KNOWN_S
         if self._mode is None:
-            return first if fresh and self._requests < UNHEARD_MAX else None
-        answered = self._reported_s > self._asked_s and fresh
+            return first if known and self._requests < UNHEARD_MAX else None
+        answered = self._reported_s > self._asked_s and known
         if self._fallen_s < math.inf:
             lands = self._mode == self._dialect.return_mode or now_s - self._sank_s < SINK_S
             due = self._fallen_shown and now_s - self._fallen_s >= HOLD_S

@@ -40,7 +40,7 @@ def asked(
 ) -> tuple[list[tuple[float, int]], str]:
     """What is asked, and when, of a vehicle that has shown the mode `shown` 0.4 s before the
     recovery begins at 0 s, and reports these `events` at these times; and how it ended."""
-    recovery, waiting = Recovery(dialect, known, 0.0), sorted(events, key=lambda each: each[0])
+    recovery, waiting = Recovery(dialect, known, 0.0, 0.0), sorted(events, key=lambda each: each[0])
     if shown:
         recovery.see(Heartbeat(shown, True, 4, 2), -0.4)
     commands: list[tuple[float, int]] = []
@@ -189,7 +189,7 @@ def test_leaving_the_landing_mode_as_it_disarms_is_no_choice() -> None:
 
 
 def test_a_refusal_is_kept_to_be_said() -> None:
-    recovery = Recovery(PX4, OURS, 0.0)
+    recovery = Recovery(PX4, OURS, 0.0, 0.0)
     for result, refusal in (("ACCEPTED", ""), ("DENIED", "DENIED")):
         recovery.see(CommandAck(HOLD, result), 0.1)
         assert recovery.refusal == refusal
@@ -237,7 +237,7 @@ def recovered(
         if now_s < 1e-9 and step % 25 == 0:
             instance.feed(level)
         if recovery is None and now_s >= silent_s:
-            recovery = Recovery(PX4, known, now_s, beat_s=0.0)
+            recovery = Recovery(PX4, known, now_s, 0.0)
         if now_s >= pilot[0]:
             commander.switch(pilot[1])
             pilot = (math.inf, "")
