@@ -286,7 +286,7 @@ def test_another_supervisor_is_started_but_not_in_flight(
     fly(flight, tmp_path, supervisor=Starting())
     assert restarted_s == restarts
     assert flight.guarded is bool(restarts)
-    assert flight.announced == [UNGUARDED, "another supervisor is started"][: 1 + bool(restarts)]
+    assert flight.announced == [UNGUARDED, ANSWERS][: 1 + bool(restarts)]
 
 
 # -- what fails in this process --------------------------------------------------------------------
