@@ -8,6 +8,7 @@ what it says when no program of ours runs. Its component id is not that of a fli
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass, field, replace
@@ -26,7 +27,6 @@ from offboard.mavlink.dialects.base import TYPE_GCS, Dialect, WantedMessage
 from offboard.mavlink.events import (
     Attitude,
     ClockBehind,
-    CommandAck,
     EstimatorReport,
     Event,
     GpsFix,
@@ -158,7 +158,6 @@ class Listening:
         self.fix_type: int | None = None
         self.late_s = 0.0
         self.foreign_replies = 0
-        self.acknowledged: set[int] = set()  # MAV_CMD
         self.now_s = self._began_s = began_s  # `now_s`: until when it has listened
         self._found_s = 0.0
         self._parameters = ParameterReading(advice=True)
@@ -166,9 +165,6 @@ class Listening:
         self._settled = False
         self._may_greet = False  # a disarmed vehicle, whose signing time is behind ours
         self._timesync_s = 0.0
-        self._first: tuple[float, float] | None = None  # vehicle time and host time
-        self._newest: tuple[float, float] | None = None
-        self._prearm_s: float | None = None  # when it was acknowledged
 
     # --- in ---
 
@@ -198,13 +194,8 @@ class Listening:
                 self.fix_type = FIX_3D
             case ClockBehind(armed=armed):
                 self._may_greet = not armed
-            case CommandAck(command):
-                self.acknowledged.add(command)
-                if command == RUN_PREARM_CHECKS and self._prearm_s is None:
-                    self._prearm_s = at_s
             case Rebooted():
                 self.rebooted = True
-                self._first = self._newest = None
                 self.clock = VehicleClock()
 
     def _on_stamp(self, stamp_s: float, at_s: float) -> None:
@@ -213,10 +204,6 @@ class Listening:
         if not self._settled and at_s - self._found_s > SETTLE_S:
             self._settled = True
             self.clock.settle()
-        if self._first is None:
-            self._first = stamp_s, at_s
-        if self._newest is None or stamp_s > self._newest[0]:
-            self._newest = stamp_s, at_s
 
     # --- out ---
 
@@ -244,13 +231,14 @@ class Listening:
         for message_id, missing in unknown.items():
             if missing and self._may_ask(message_id, now_s):
                 yield CommandLong.message(message_id)
-        disarmed = self.vehicle.heartbeat is not None and not self.vehicle.armed
-        due = disarmed and self._prearm_s is None and now_s - self._found_s >= PREARM_AFTER_S
+        disarmed = state.heartbeat is not None and not state.armed
+        unasked = RUN_PREARM_CHECKS not in state.answered_s
+        due = disarmed and unasked and now_s - self._found_s >= PREARM_AFTER_S
         if due and self._may_ask(RUN_PREARM_CHECKS, now_s):
             yield CommandLong.run_prearm_checks()
-        if self._newest and now_s - self._timesync_s >= TIMESYNC_EVERY_S:
+        if state.time_s and now_s - self._timesync_s >= TIMESYNC_EVERY_S:
             self._timesync_s = now_s
-            yield self.clock.request(self._newest[0], now_s)
+            yield self.clock.request(state.time_s, now_s)
 
     def _permitted(self, outgoing: Outgoing) -> bool:
         """No heartbeats, and no rates for an armed vehicle, or before it is known."""
@@ -275,7 +263,8 @@ class Listening:
             return passed_s >= NOTHING_S
         if now_s - self._found_s < LEAST_S or passed_s >= LONGEST_S:
             return passed_s >= LONGEST_S
-        checked = state.armed or (self._prearm_s is not None and now_s - self._prearm_s >= TEXTS_S)
+        prearm_s = state.now_s - state.answered_s.get(RUN_PREARM_CHECKS, math.inf)
+        checked = state.armed or prearm_s >= TEXTS_S
         return (
             checked
             and state.version is not None
@@ -308,14 +297,6 @@ class Listening:
         """Whether a command was sent to which an acknowledgement is due."""
         return bool(self._asked.keys() - {TIMESYNC})
 
-    @property
-    def clock_rate(self) -> float | None:
-        """Seconds of vehicle time per second."""
-        if not (self._first and self._newest and self._newest[1] - self._first[1] > 1.0):
-            return None
-        (began_s, heard_s), (ended_s, ended_at_s) = self._first, self._newest
-        return (ended_s - began_s - self.clock.jumped_s) / (ended_at_s - heard_s)
-
 
 @dataclass(frozen=True, slots=True)
 class Observation:
@@ -345,18 +326,15 @@ class Observation:
     @property
     def ground(self) -> Ground:
         """What the preflight list judges."""
-        heard, vehicle = self.heard, self.vehicle
-        limits = self.config.limits
-        shared = vehicle.other_sender is not None and not limits.begin_with_other_sender
+        heard = self.heard
         return Ground(
-            vehicle,
-            limits,
+            self.vehicle,
+            self.config.limits,
             heard.session,
             heard.clock,
             heard.now_s,
             self.dialect,
             helicopter=self.config.vehicle.airframe == "helicopter",
             rates_requested=heard.requested,
-            other_sender=vehicle.other_sender_named if shared else "",
-            in_the_air=vehicle.armed,
+            in_the_air=self.vehicle.armed,
         )

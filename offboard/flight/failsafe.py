@@ -18,11 +18,10 @@ import numpy as np
 from offboard.flight.authority import Standing
 from offboard.flight.phases import TRACKING, Action, Condition, Limits
 from offboard.flight.state import COMMANDS_KEPT, FlightState
-from offboard.mavlink.events import MODE_KNOWN_S, OtherSender, ThrustReport
+from offboard.mavlink.events import MODE_KNOWN_S, ThrustReport
 
 OPERATOR = "{flight.stop_cause}"  # the cause of a row for `stop_requested`
 REBOOTED = "the vehicle restarted"
-OTHER_SENDER_S = 5.0  # a second sender is there for so long after its newest frame
 RECOVERY = 0.25  # speed at which a delay runs back
 STEP_MAX_S = 0.2  # what one sample counts for, also after a gap of telemetry
 SINK_MPS = 0.3  # that full thrust stops within the delay, on a vehicle that can be flown
@@ -62,10 +61,7 @@ def mode_unknown(flight: FlightState) -> str:
 def other_sender(flight: FlightState) -> str:
     """Another program sends setpoints or commands modes on this link, or says in its HEARTBEAT
     that it flies the vehicle."""
-    if flight.limits.begin_with_other_sender:
-        return ""
-    recent = flight.vehicle.age_s(OtherSender) < OTHER_SENDER_S
-    return flight.vehicle.other_sender_named if recent else ""
+    return "" if flight.limits.begin_with_other_sender else flight.vehicle.other_sender_named
 
 
 # ---------------------------------------------------------------------- who has the vehicle

@@ -133,7 +133,6 @@ class Flight(FlightState):
         self._heard |= self._ends_silence(event)
         if isinstance(event, Rebooted):
             self._tick = -1
-            transitions.on_reboot(self)
 
     def _ends_silence(self, event: Event) -> bool:
         """Whether the event is telemetry. Once position and attitude are received only they are:

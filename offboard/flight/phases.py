@@ -61,7 +61,7 @@ class Action(IntEnum):
 
 
 class Request(Enum):
-    """What a ground station has asked for, and is to be done at the next tick (see `telemetry`)."""
+    """What a ground station asks for (see `transitions.obey`)."""
 
     NONE = "nothing"
     START = "start"

@@ -68,7 +68,6 @@ class Ground:
     helicopter: bool = False  # by its vehicle file
     rates_requested: bool = True
     reads_parameters: bool = False  # replies are still awaited
-    other_sender: str = ""  # that another program controls it
     in_the_air: bool = False
     guarded: bool = True  # a supervisor lands it if this process ends
     origin_missing: bool = False  # the reference is relative to a take-off point that is not known
@@ -130,9 +129,9 @@ def unfit_type(ground: Ground) -> str:
     return senders.unfit_type(heartbeat.vehicle_type, helicopter=ground.helicopter)
 
 
-def armed_already(vehicle: VehicleState, limits: Limits) -> str:
+def armed_already(ground: Ground) -> str:
     """It is armed already, and the limits refuse such a vehicle."""
-    armed = vehicle.armed and not limits.begin_armed
+    armed = ground.vehicle.armed and not ground.limits.begin_armed
     return "the vehicle is armed already, by another controller or a pilot" if armed else ""
 
 
@@ -157,16 +156,21 @@ def _flown_by_failsafe(ground: Ground) -> str:
     )
 
 
-def several_vehicles(session: Session) -> str:
+def several_vehicles(ground: Ground) -> str:
     """Several vehicles are heard, and none was chosen."""
-    senders, now_s = session.senders, session.link_time_s
+    senders, now_s = ground.session.senders, ground.session.link_time_s
     if not senders.ambiguous(now_s):
         return ""
     return f"several vehicles are heard, systems {senders.named(now_s)}: choose one with --system"
 
 
-def twin(session: Session) -> str:
-    if not session.has_twin:
+def _shared(ground: Ground) -> str:
+    vehicle, limits = ground.vehicle, ground.limits
+    return "" if limits.begin_with_other_sender else vehicle.other_sender_named
+
+
+def twin(ground: Ground) -> str:
+    if not ground.session.has_twin:
         return ""
     return (
         "two vehicles with the same system id send on this link, or its telemetry comes twice, "
@@ -312,24 +316,10 @@ PREFLIGHT = (
     Row("vehicle", BLOCKS, unfit_type, _UNFIT, at_once=True),
     Row("state", BLOCKS, _flown_by_another, "stop that controller", at_once=True, fly_only=True),
     Row("state", BLOCKS, _flown_by_failsafe, _FAILSAFE, at_once=True, fly_only=True),
-    Row(
-        "state",
-        BLOCKS,
-        lambda ground: armed_already(ground.vehicle, ground.limits),
-        "disarm it",
-        at_once=True,
-        fly_only=True,
-    ),
-    Row(
-        "senders",
-        BLOCKS,
-        lambda ground: ground.other_sender,
-        "stop it",
-        at_once=True,
-        fly_only=True,
-    ),
-    Row("senders", BLOCKS, lambda ground: several_vehicles(ground.session), _PORTS, at_once=True),
-    Row("senders", BLOCKS, lambda ground: twin(ground.session), _TWIN, at_once=True),
+    Row("state", BLOCKS, armed_already, "disarm it", at_once=True, fly_only=True),
+    Row("senders", BLOCKS, _shared, "stop it", at_once=True, fly_only=True),
+    Row("senders", BLOCKS, several_vehicles, _PORTS, at_once=True),
+    Row("senders", BLOCKS, twin, _TWIN, at_once=True),
     Row("rates", WAIT, _no_telemetry),
     Row("supervisor", WAIT, _unguarded),
     Row("rates", BLOCKS, _slow, _slow_hint),

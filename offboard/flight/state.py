@@ -123,8 +123,8 @@ class FlightState:
     guarded: bool = True  # a supervisor lands the vehicle if this process ends
     rebooted: bool = False
     left_engaged: bool = False  # a flight that was cut short has left the vehicle engaged
-    request: Request = Request.NONE  # of the ground station, until the next tick
-    obeyed: Request = Request.NONE  # the newest one that changed the phase, or will
+    request: Request = Request.NONE  # of the ground station, while it is judged
+    obeyed: Request = Request.NONE  # the newest one that changed the phase
     stop_reason: str = ""  # why the flight shall end; empty while it shall not
     outcome: Outcome | None = None
 

@@ -12,14 +12,22 @@ from enum import IntEnum
 import numpy as np
 
 from offboard.flight import outbox, transitions
-from offboard.flight.authority import Authority
+from offboard.flight.authority import Authority, PilotSwitch
 from offboard.flight.estimates import HoverEstimate, PositionJumps
-from offboard.flight.failsafe import other_sender
-from offboard.flight.ground_contact import GroundContact
-from offboard.flight.phases import BEFORE_FLIGHT, FLYING, TRACKING, WAITING, Request
+from offboard.flight.failsafe import REBOOTED, other_sender
+from offboard.flight.ground_contact import GroundContact, Touchdown
+from offboard.flight.phases import (
+    BEFORE_FLIGHT,
+    FLYING,
+    TRACKING,
+    WAITING,
+    ExitCode,
+    Phase,
+    Request,
+)
 from offboard.flight.preflight import ParameterReading
 from offboard.flight.record import vehicle_record
-from offboard.flight.state import FlightState
+from offboard.flight.state import FlightState, Outcome
 from offboard.flight.timing import VehicleClock
 from offboard.mavlink.events import (
     Attitude,
@@ -180,7 +188,9 @@ def _on_mode(
 
 
 def _on_reboot(flight: FlightState) -> None:
-    """After a reboot of the vehicle: forget what was known of vehicle and link."""
+    """The vehicle was rebooted: forget what was known of vehicle and link. This ends the flight,
+    except while telemetry is awaited. A landing goes on, but the flight is none that was flown to
+    its end."""
     flight.observer.reset()
     flight.contact, flight.clock = GroundContact(flight.vehicle), VehicleClock()
     flight.hover, flight.jumps = HoverEstimate(), PositionJumps()
@@ -189,6 +199,13 @@ def _on_reboot(flight: FlightState) -> None:
     if flight.phase in BEFORE_FLIGHT:
         flight.authority = Authority()
     flight.authority.forget(flight.now_s)  # unheard from now on, not for ever
+    flight.rebooted = flight.phase not in (Phase.CONNECT, Phase.HEALTH)
+    flight.pilot = PilotSwitch()
+    if flight.phase is Phase.LAND:
+        flight.touchdown = Touchdown(None)
+        if flight.outcome is None:
+            flight.outcome = Outcome(ExitCode.ABORTED, f"{REBOOTED} while landing")
+    transitions.advance(flight)
 
 
 # ---------------------------------------------------------------------- requests
@@ -204,7 +221,8 @@ class Result(IntEnum):
 
 
 def _answer(flight: FlightState, asked: CommandRequest) -> None:
-    """Acknowledge a command to us; the next tick does what it asks for."""
+    """Do what a command to us asks for, and acknowledge it. One that is being obeyed is accepted
+    again: a ground station that missed the answer repeats it."""
     request, result = Request.NONE, Result.UNSUPPORTED
     if flight.service:
         request = {START: Request.START, SET_MODE: Request.HAND_BACK}.get(asked.command, request)
@@ -212,23 +230,7 @@ def _answer(flight: FlightState, asked: CommandRequest) -> None:
             wanted = {0.0: Request.PAUSE, 1.0: Request.CONTINUE}
             request, result = wanted.get(asked.parameters[0], request), Result.DENIED
     if request is not Request.NONE:
-        before, result = flight.request, _take_request(flight, request)
-        if flight.request is not before:  # else it repeats one
-            sender = f"system {asked.system_id} component {asked.component_id}"
-            outbox.announce(flight, f"{request.value} requested by {sender}")
+        sender = f"system {asked.system_id} component {asked.component_id}"
+        obeyed = transitions.obey(flight, request, sender) or request is flight.obeyed
+        result = Result.ACCEPTED if obeyed else Result.TEMPORARILY_REJECTED
     outbox.send(flight, CommandResult(asked.command, result, asked.system_id, asked.component_id))
-
-
-def _take_request(flight: FlightState, request: Request) -> Result:
-    """Accept it if it leads to another phase now. Of several in one tick the first counts, but to
-    hand the vehicle back replaces any other. One that is being obeyed is accepted again: a ground
-    station that missed the answer repeats it."""
-    if flight.request is Request.NONE:
-        possible = transitions.leads_on(flight, request)
-    else:
-        possible = request is Request.HAND_BACK
-    if not possible:
-        obeyed = request is flight.obeyed
-        return Result.ACCEPTED if obeyed else Result.TEMPORARILY_REJECTED
-    flight.request = flight.obeyed = request
-    return Result.ACCEPTED

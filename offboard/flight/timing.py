@@ -118,7 +118,7 @@ class VehicleClock:
         return True
 
     def _measure_rate(self, host_s: float) -> None:
-        down, up = self._telemetry.rate, self._replies.rate
+        down, up = self.telemetry_rate, self._replies.rate
         if down is None:
             return
         first, self._measured_s = math.isinf(self._measured_s), host_s
@@ -141,6 +141,11 @@ class VehicleClock:
     def age_s(self, stamp_s: float, host_s: float) -> float:
         """Age at `host_s` of telemetry stamped `stamp_s`, beyond the least delay of the window."""
         return max(self.now_s(host_s) - stamp_s, 0.0)
+
+    @property
+    def telemetry_rate(self) -> float | None:
+        """Vehicle time per host time, by the stamps of the last seconds; None before one second."""
+        return self._telemetry.rate
 
     # --- delay of both directions ---
 
