@@ -23,11 +23,10 @@ from offboard.flight.record import (
     RECORD_NAME,
     Decided,
     TickRecord,
-    reference_record,
 )
 from offboard.flight.state import FlightState
 from offboard.identification.learner import Learner, VehicleUpdate
-from offboard.mavlink.outgoing import SolverRecord
+from offboard.mavlink.outgoing import ReferenceRecord, SolverRecord
 from offboard.model.command import Command
 
 NOTICEABLE_RADPS = 0.5  # a smaller change of the bandwidth is not announced
@@ -185,7 +184,7 @@ def _record(flight: FlightState, decided: Decided, answer_s: float) -> None:
     record = tick_record(flight, decided, answer_s)
     outbox.send(
         flight,
-        reference_record(flight.time_s, sample),
+        ReferenceRecord(flight.time_s, sample.setpoint()),
         SolverRecord(flight.time_s, record.data(), RECORD_ID, RECORD_NAME),
     )
 

@@ -26,17 +26,13 @@ from collections.abc import Callable, Hashable, Iterable, Iterator
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from offboard.control.base import Certificate, Decision
 from offboard.flight.phases import Phase
 from offboard.link.interface import Chunk
 from offboard.mavlink.events import VehicleFound
-from offboard.mavlink.outgoing import ConfigurationRecord, ReferenceRecord
+from offboard.mavlink.outgoing import ConfigurationRecord
 from offboard.mavlink.session import Reception, SessionSettings
 from offboard.model.command import Command, PositionCommand, PredictedState
-from offboard.reference.base import FlatSample
 
 COMPONENT_ID = 191  # MAV_COMP_ID_ONBOARD_COMPUTER: the sender of frames
 # MAV_COMP_ID_ONBOARD_COMPUTER2: the sender of records, which are only logged. Its own sequence
@@ -45,7 +41,6 @@ RECORD_COMPONENT_ID = 192
 RECORD_NAME = "pso"
 NAN = float("nan")
 CERTIFIED = len(fields(Certificate))
-Array = NDArray[np.float64]
 IDENTIFIED_NAME, IDENTIFIED_ID = "identified", 2  # of the other DEBUG_FLOAT_ARRAY in the log
 
 
@@ -112,22 +107,6 @@ class Decided:
     age_s: float = 0.0  # of its telemetry, when it was checked
     refused: int = 0  # flags of `outbox.Refusal`
     failure: str = ""  # why it was refused
-
-
-def reference_record(time_s: float, sample: FlatSample) -> ReferenceRecord:
-    """The reference at a tick, for the log."""
-    return ReferenceRecord(
-        time_s=time_s,
-        position_ned_m=_triple(sample.position_ned_m),
-        velocity_ned_mps=_triple(sample.velocity_ned_mps),
-        acceleration_ned_mps2=_triple(sample.acceleration_ned_mps2),
-        heading_rad=float(sample.heading_rad),
-        heading_rate_radps=float(sample.heading_rate_radps),
-    )
-
-
-def _triple(values: Array) -> tuple[float, float, float]:
-    return float(values[0]), float(values[1]), float(values[2])
 
 
 # ---------------------------------------------------------------------- configuration and vehicle

@@ -21,6 +21,7 @@ from offboard.mavlink.dialects.px4 import PX4
 from offboard.mavlink.events import CommandAck, Event, Heartbeat, ModeReport, VehicleFound
 from offboard.mavlink.outgoing import AttitudeTarget, CommandLong
 from offboard.mavlink.session import Session, SessionSettings
+from offboard.model.command import Command
 from offboard.supervisor.recovery import LONGEST_S, Recovery, Supervised
 from simulator import config
 from simulator.instance import Instance
@@ -228,7 +229,7 @@ def recovered(
     session, result = Session(SessionSettings()), Recovered()
     session.set_vehicle(VEHICLE, "vehicle")
     instance.feed(session.encode(CommandLong.message_interval(436, 50.0)))  # CURRENT_MODE
-    level = session.encode(AttitudeTarget(0.0, 9.81, (0.0, 0.0, 1.0), 0.0, 0.489))
+    level = session.encode(AttitudeTarget(0.0, Command(9.81, (0.0, 0.0, 1.0), 0.0), 0.489))
     loss = PX4.setpoint_loss({"COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": fallback})
     known = Supervised(VEHICLE, ours=True, flying=True, reported_s=0.0, loss=loss)
     recovery: Recovery | None = None
