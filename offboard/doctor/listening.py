@@ -1,9 +1,7 @@
 """The listening pass: who sends, what is received and what is asked, until enough is known; and
 `Observation`, all that is known then.
 
-Sans-I/O: received chunks and host times in, frames out. It only asks: it never sends a setpoint, a
-mode, an arming or a parameter, and no heartbeat: the vehicle may count on one, and says without it
-what it says when no program of ours runs. Its component id is not that of a flight.
+Sans-I/O: received chunks and host times in, frames out. It only asks, see README.md.
 """
 
 from __future__ import annotations

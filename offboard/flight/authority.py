@@ -6,8 +6,6 @@ changed. A report has an age: without a recent one nothing is sent.
 
 The mode of the autopilot's own failsafe for missing setpoints is an exception, as nobody chose it:
 the vehicle may be asked to land from it, unless it receives a pilot's sticks.
-
-While it is not ours, `PilotSwitch` says whether the pilot of the service has engaged us.
 """
 
 from __future__ import annotations

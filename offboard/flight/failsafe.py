@@ -1,9 +1,5 @@
 """Failsafe: what follows when a limit is exceeded in flight. One row for each condition.
 
-The action of the worst row that is active counts. A row is active once its condition has held for
-its delay. The time that it has held runs down at a quarter of the speed while the condition does
-not hold, so that a condition that comes and goes does not start from zero each time.
-
 Its conditions come after those that the phase table has as well.
 """
 

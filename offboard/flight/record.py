@@ -47,7 +47,7 @@ class TickRecord(NamedTuple):
     the control law certified, because excitation or the limits changed it or it was not sent.
     """
 
-    phase: float  # of flight.phases.PHASE_CODES
+    phase: float  # of flight.phases.Phase
     thrust_mps2: float
     thrust_direction_north: float
     thrust_direction_east: float

@@ -1,20 +1,12 @@
 """Times: the vehicle's clock, the age of telemetry and the delay of the link; and whether this
 computer keeps up with the control ticks.
 
-The vehicle's clock is a line over host time, whose offset and rate are estimated together (one
-without the other would take a slow clock for a link that becomes later). Two measures enclose it:
-
-- Telemetry arrives after the time of its stamp: the least delayed of the last seconds shows what
-  the vehicle's clock has at least reached. Newest telemetry that is older has been delayed more
-  than usual, by a backlog or a stop of this process.
-- A request of TIMESYNC is stamped with the vehicle time of the newest telemetry and sent with a
-  setpoint; the reply holds this stamp and the vehicle time at which the request arrived. The
-  difference is the delay of both directions together, whatever the clock of this computer and the
-  way of the reply; and when the request was sent, the vehicle's clock was at most at that time.
-
-Both run at the rate of the clock, unless the delay of one direction changes: the rate lies between
-theirs, and there it stays where it was. From a vehicle without replies a slower clock cannot be
-told from a link that becomes later: within REAL_TIME its rate is 1.
+The vehicle's clock is a line over host time, whose offset and rate are estimated together. Two
+measures enclose it (README.md): telemetry arrives after the time of its stamp, and a request of
+TIMESYNC arrives after it was sent. That request is stamped with the vehicle time of the newest
+telemetry and sent with a setpoint; the reply holds this stamp and the vehicle time at which the
+request arrived. The difference is the delay of both directions together, whatever the clock of this
+computer and the way of the reply.
 """
 
 from __future__ import annotations

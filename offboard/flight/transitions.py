@@ -1,9 +1,5 @@
 """The phase table: which condition leads from which phases to which. The first row that holds is
 taken, and begins its phase. `actions` has what is sent in a phase.
-
-`fly` goes once from the ground to the ground. A flight of the service waits in STANDBY until the
-pilot engages it in the air, and hands back instead of landing when it is stopped; the service
-begins the next one where it has ended.
 """
 
 from __future__ import annotations

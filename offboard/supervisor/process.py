@@ -40,7 +40,7 @@ POLL_S = 0.02
 PAUSE_MAX_S = 0.1  # of a turn that counts as the controller's silence: the rest was a pause of ours
 BACKLOG_MAX = 20  # batches of the link that are read before the first request
 CLOSE_S = 2.0
-LANDING = 10  # custom_mode, `flight.phases.PHASE_CODES`: no other `offboard` begins a flight now
+LANDING = 10  # custom_mode, `flight.phases.Phase`: no other `offboard` begins a flight now
 DIED = "the controller ended in flight"
 HANGS = "the controller has not answered for {silent_s:g} s"
 

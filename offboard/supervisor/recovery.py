@@ -1,16 +1,9 @@
 """Recovery: what the supervisor asks of a vehicle that has lost its controller. No I/O, no clock.
 
-Hold, and after some seconds land; at once land, if the controller was landing it. Both are
-requested only while the vehicle shows the mode of our setpoints or one that we requested, and at
-most once for each report of the mode. Any other mode is the decision of a pilot or of the vehicle's
-own failsafe, and final, whatever is reported after it.
-So is hold if it was reported before our request, if the vehicle did not acknowledge the request
-though it was repeated, or if it comes after the landing mode.
-
-The failsafe for missing setpoints is an exception: it acts because the controller has ended. It is
-recognised by its mode, by its time and by HEARTBEAT.system_status, which a pilot's choice clears.
-In it the vehicle is observed, and asked to land if it does not descend by itself; not while it
-receives a pilot's sticks.
+Hold, and after some seconds land; at once land, if the controller was landing it. README.md has the
+modes in which, and which of them are a pilot's. The failsafe for missing setpoints acts because the
+controller has ended: it is recognised by its mode, its time and HEARTBEAT.system_status, which a
+pilot's choice clears.
 """
 
 from __future__ import annotations
