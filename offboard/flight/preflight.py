@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from functools import partial
 
 from offboard.flight.phases import Limits
 from offboard.flight.timing import VehicleClock
@@ -82,7 +81,7 @@ class Row:
     waits for its pilot, does not judge it."""
 
     check: str
-    level: Level
+    level: Level | Callable[[Ground], Level]
     problem: Callable[[Ground], str]
     fix: str | Callable[[Ground], str] = ""
     at_once: bool = False
@@ -95,8 +94,9 @@ def findings(ground: Ground) -> Iterator[tuple[str, bool, Finding]]:
     for row in PREFLIGHT:
         found = "" if row.fly_only and ground.serves else row.problem(ground)
         if found:
+            level = row.level if isinstance(row.level, Level) else row.level(ground)
             fix = row.fix if isinstance(row.fix, str) else row.fix(ground)
-            yield row.check, row.at_once, Finding(row.level, found, fix)
+            yield row.check, row.at_once, Finding(level, found, fix)
     for parameter in ground.dialect.watched_parameters if ground.dialect else ():
         name, value = parameter.name, ground.vehicle.parameters.get(parameter.name)
         fault = None if value is None else parameter.fault(value)
@@ -252,19 +252,18 @@ def _other_mode(ground: Ground) -> str:
     return f"select {mode}, as `offboard fly` does first"
 
 
-def _rejected(ground: Ground) -> str:
+def _no_estimate(ground: Ground) -> str:
     report = ground.vehicle.estimator
-    return report.problem if report and report.worst[1] > 1.0 else ""
+    return report.problem if report else ""
 
 
-def _no_estimate(ground: Ground, *, starting: bool) -> str:
+def _estimate_level(ground: Ground) -> Level:
+    """What is missing may come while the vehicle starts; what is rejected is wrong."""
     vehicle = ground.vehicle
-    report = vehicle.estimator
-    if report is None or report.worst[1] > 1.0:
-        return ""
     fixed = vehicle.age_s(GpsFix) < vehicle.age_s(NoFix)
     starts = not fixed or vehicle.time_s < STARTING_S
-    return report.problem if starts == starting else ""
+    rejects = vehicle.estimator is not None and vehicle.estimator.worst[1] > 1.0
+    return WAIT if starts and not rejects else BLOCKS
 
 
 def _empty_battery(ground: Ground) -> str:
@@ -328,9 +327,7 @@ PREFLIGHT = (
     Row("origin", WAIT, _origin),
     Row("prearm", WAIT, _prearm, fly_only=True),
     Row("prearm", WARN, _needs_setpoints, _other_mode, fly_only=True),
-    Row("estimator", BLOCKS, _rejected, _ESTIMATOR),
-    Row("estimator", WAIT, partial(_no_estimate, starting=True), _ESTIMATOR),
-    Row("estimator", BLOCKS, partial(_no_estimate, starting=False), _ESTIMATOR),
+    Row("estimator", _estimate_level, _no_estimate, _ESTIMATOR),
     Row("battery", BLOCKS, _empty_battery, "charge the battery"),
     Row("delay", WAIT, _measuring),
     Row("delay", BLOCKS, _late, "use a faster link"),

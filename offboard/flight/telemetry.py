@@ -7,8 +7,6 @@ parameters, hands the vehicle back.
 
 from __future__ import annotations
 
-from enum import IntEnum
-
 import numpy as np
 
 from offboard.flight import outbox, transitions
@@ -48,6 +46,7 @@ from offboard.mavlink.events import (
 from offboard.mavlink.outgoing import CommandResult, ThrustRule
 
 START, PAUSE_CONTINUE, SET_MODE = 300, 193, 176  # MAV_CMD
+ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED = range(4)  # MAV_RESULT
 SAME_THRUST = 1e-5  # of full throttle: rounding on the link
 OTHER_COMPANION = (
     "another companion computer is on the link: system {system} component {component}; only one of "
@@ -211,26 +210,17 @@ def _on_reboot(flight: FlightState) -> None:
 # ---------------------------------------------------------------------- requests
 
 
-class Result(IntEnum):
-    """MAV_RESULT."""
-
-    ACCEPTED = 0
-    TEMPORARILY_REJECTED = 1
-    DENIED = 2
-    UNSUPPORTED = 3
-
-
 def _answer(flight: FlightState, asked: CommandRequest) -> None:
     """Do what a command to us asks for, and acknowledge it. One that is being obeyed is accepted
     again: a ground station that missed the answer repeats it."""
-    request, result = Request.NONE, Result.UNSUPPORTED
+    request, result = Request.NONE, UNSUPPORTED
     if flight.service:
         request = {START: Request.START, SET_MODE: Request.HAND_BACK}.get(asked.command, request)
         if asked.command == PAUSE_CONTINUE:
             wanted = {0.0: Request.PAUSE, 1.0: Request.CONTINUE}
-            request, result = wanted.get(asked.parameters[0], request), Result.DENIED
+            request, result = wanted.get(asked.parameters[0], request), DENIED
     if request is not Request.NONE:
         sender = f"system {asked.system_id} component {asked.component_id}"
         obeyed = transitions.obey(flight, request, sender) or request is flight.obeyed
-        result = Result.ACCEPTED if obeyed else Result.TEMPORARILY_REJECTED
+        result = ACCEPTED if obeyed else TEMPORARILY_REJECTED
     outbox.send(flight, CommandResult(asked.command, result, asked.system_id, asked.component_id))

@@ -165,12 +165,8 @@ class TakeOver:
         if request:
             holds = request == self._dialect.hold()
             self._say(f"{'hold' if holds else 'land'} requested")
-        if self._recovery.refusal:
-            self._say(f"the vehicle answers {self._recovery.refusal}")
-            self._recovery.refusal = ""
-        if self._recovery.notice:
-            self._say(self._recovery.notice)
-            self._recovery.notice = ""
+        while self._recovery.news:
+            self._say(self._recovery.news.pop(0))
 
     def _say(self, sentence: str) -> None:
         """To the controller or its terminal, to the ground station and to the log."""

@@ -68,7 +68,7 @@ class Supervised:
 class Recovery:
     """Begins at `began_s`; the newest beat of the controller was at `beat_s`, and said `known`.
 
-    `ended` says how it ended, empty until then; `refusal` and `notice` have news for the user."""
+    `ended` says how it ended, empty until then; `news` are sentences for the user."""
 
     def __init__(self, dialect: Dialect, known: Supervised, began_s: float, beat_s: float) -> None:
         self._dialect = dialect
@@ -96,8 +96,7 @@ class Recovery:
         self._heartbeat_s = -math.inf
         self._requests = 0
         self._held_s = math.inf  # since when it holds
-        self.refusal = ""  # of the newest request
-        self.notice = ""
+        self.news: list[str] = []
         self.ended = ""
 
     def see(self, event: Event, at_s: float) -> None:
@@ -114,7 +113,7 @@ class Recovery:
             case LocalPosition(velocity_ned_mps=(_, _, down_mps)) if down_mps > SINK_MPS:
                 self._sank_s = at_s
             case CommandAck(_, result) if result not in GOOD_RESULTS:
-                self.refusal = result
+                self.news.append(f"the vehicle answers {result}")
             case CommandAck(command) if command == self._dialect.hold().command:
                 self._acknowledged |= at_s > self._first_s
 
@@ -146,7 +145,7 @@ class Recovery:
         followed = fell or self._before in (None, self._dialect.engage_mode)
         missing = followed and not self._acknowledged and at_s >= self._loses_s
         if missing and mode in self._loss.modes and self._sticks:
-            self.notice = f"{mode} for missing setpoints, and it receives a pilot's sticks"
+            self.news.append(f"{mode} for missing setpoints, and it receives a pilot's sticks")
         lands = mode == self._dialect.land_mode
         return missing and mode in self._loss.modes and not lands and not self._sticks
 
@@ -154,7 +153,7 @@ class Recovery:
         self._fallen_s = min(self._fallen_s, at_s)
         if shown and not self._fallen_shown:
             self._fallen_shown = True
-            self.notice = f"its own failsafe flies it, in {mode}: watching that it lands"
+            self.news.append(f"its own failsafe flies it, in {mode}: watching that it lands")
 
     def due(self, now_s: float) -> CommandLong | None:
         """What to ask for now."""

@@ -191,9 +191,9 @@ def test_leaving_the_landing_mode_as_it_disarms_is_no_choice() -> None:
 
 def test_a_refusal_is_kept_to_be_said() -> None:
     recovery = Recovery(PX4, OURS, 0.0, 0.0)
-    for result, refusal in (("ACCEPTED", ""), ("DENIED", "DENIED")):
+    for result, said in (("ACCEPTED", []), ("DENIED", ["the vehicle answers DENIED"])):
         recovery.see(CommandAck(HOLD, result), 0.1)
-        assert recovery.refusal == refusal
+        assert recovery.news == said
 
 
 # -- against the failsafe for missing setpoints ----------------------------------------------------
