@@ -55,7 +55,7 @@ def port(seen: Observation) -> Iterable[Finding]:
 
 def vehicle(seen: Observation) -> Iterable[Finding]:
     """Whether an autopilot that can be flown is heard, and what is heard if none is."""
-    found, heard, kind, known = seen.vehicle.found, seen.heard, _kind(seen), DIALECTS.values()
+    found, heard, kind, known = seen.found, seen.heard, _kind(seen), DIALECTS.values()
     senders, received = heard.senders.found, heard.senders.counters.bytes_received
     if seen.link_error:
         return
@@ -207,6 +207,6 @@ def _kind(seen: Observation) -> str:
 
 def _ids(seen: Observation) -> tuple[int, int]:
     """System and component of the vehicle."""
-    found = seen.vehicle.found
+    found = seen.found
     assert found is not None
     return found.system_id, found.component_id

@@ -32,6 +32,7 @@ from offboard.mavlink.events import (
     NoFix,
     Rebooted,
     TimesyncReply,
+    VehicleFound,
 )
 from offboard.mavlink.framing import HEARTBEAT, Frame, FrameSplitter
 from offboard.mavlink.outgoing import CommandLong, Outgoing, Timesync
@@ -312,6 +313,10 @@ class Observation:
     holders: tuple[str, ...] = ()
 
     @property
+    def found(self) -> VehicleFound | None:
+        return self.heard.session.vehicle
+
+    @property
     def vehicle(self) -> VehicleState:
         return self.heard.vehicle
 
@@ -331,7 +336,6 @@ class Observation:
             heard.session,
             heard.clock,
             heard.now_s,
-            self.dialect,
             helicopter=self.config.vehicle.airframe == "helicopter",
             rates_requested=heard.requested,
             in_the_air=self.vehicle.armed,

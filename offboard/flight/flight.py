@@ -151,7 +151,7 @@ class Flight(FlightState):
             outbox.announce(self, news)
         session.status = self._status()
         due = session.poll(now_s)
-        self.now_s = self.vehicle.now_s = session.link_time_s
+        self.vehicle.now_s = session.link_time_s
         if self.phase is Phase.LAND and self.unreached_s:
             self.began_s += self.now_s - before_s  # a landing that is not seen takes no time
         self.host_s = session.clock_s(now_s)

@@ -63,7 +63,6 @@ class Ground:
     session: Session
     clock: VehicleClock
     host_s: float
-    dialect: Dialect | None = None
     helicopter: bool = False  # by its vehicle file
     rates_requested: bool = True
     reads_parameters: bool = False  # replies are still awaited
@@ -71,6 +70,10 @@ class Ground:
     guarded: bool = True  # a supervisor lands it if this process ends
     origin_missing: bool = False  # the reference is relative to a take-off point that is not known
     serves: bool = False  # for `daemon`, whose pilot arms it and engages
+
+    @property
+    def dialect(self) -> Dialect | None:
+        return self.session.dialect
 
 
 @dataclass(frozen=True, slots=True)

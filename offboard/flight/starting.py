@@ -29,7 +29,7 @@ LISTENED_S = 0.5  # to hear another sender: PX4 leaves OFFBOARD below 2 Hz
 
 
 def vehicle_found(flight: FlightState) -> str:
-    return "vehicle found" if flight.vehicle.found is not None else ""
+    return "vehicle found" if flight.session.vehicle is not None else ""
 
 
 def not_found(flight: FlightState) -> str:
@@ -68,7 +68,6 @@ def ground_of(flight: FlightState) -> Ground:
         flight.session,
         flight.clock,
         flight.host_s,
-        dialect,
         helicopter=flight.model.airframe == "helicopter",
         reads_parameters=not read,
         in_the_air=contact.in_the_air,

@@ -57,8 +57,8 @@ class Outcome:
 
 # of the flight before, with the same vehicle
 KEPT = (
-    "vehicle", "contact", "clock", "hover", "reading", "dialect", "peer", "other_datagrams",
-    "now_s", "host_s", "turned_s", "silence_s", "heard_s", "guarded",
+    "vehicle", "contact", "clock", "hover", "reading", "peer", "other_datagrams", "host_s",
+    "turned_s", "silence_s", "heard_s", "guarded",
 )  # fmt: skip
 
 
@@ -107,14 +107,12 @@ class FlightState:
     home_ned_m: Triple = (0.0, 0.0, 0.0)  # the ground where the flight began
     took_off: bool = False  # from there; a vehicle that was found in the air has not
     touchdown: Touchdown | None = None  # of the landing
-    dialect: Dialect | None = None  # once the vehicle has reported its mode
     authority: Authority = field(default_factory=Authority)
     peer: Hashable | None = None  # address that the vehicle sends from; None before it is found
     other_datagrams: int = 0  # of other senders, for the log
 
     phase: Phase = Phase.CONNECT
     began_s: float = 0.0  # of the phase, on `Session.link_time_s`
-    now_s: float = 0.0  # `Session.link_time_s`
     turned_s: float = math.nan  # host time of the newest turn
     host_s: float = 0.0  # monotonic time of this computer at the present turn
     silence_s: float = 0.0  # host time since the newest telemetry
@@ -184,6 +182,16 @@ class FlightState:
             hasty=before.pilot.hasty or (before.taken and before.pilot.engaged),
             showed_ours=before.pilot.showed_ours,
         )
+
+    @property
+    def now_s(self) -> float:
+        """`Session.link_time_s` at the newest event, or at the present turn."""
+        return self.vehicle.now_s
+
+    @property
+    def dialect(self) -> Dialect | None:
+        """Of the vehicle; None before it is found."""
+        return self.session.dialect
 
     @property
     def in_phase_s(self) -> float:

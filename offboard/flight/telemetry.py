@@ -56,8 +56,7 @@ OTHER_COMPANION = (
 
 def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: float) -> None:
     """`arrived_s` is the host time of the event's arrival, `turned_s` that of the turn."""
-    flight.now_s = flight.session.link_time_s
-    flight.vehicle.update(event, flight.now_s)
+    flight.vehicle.update(event, flight.session.link_time_s)
     match event:
         case Attitude(time_s, attitude, rates) if not flight.vehicle.repeated:
             _on_telemetry(flight, time_s, arrived_s, turned_s)
@@ -156,13 +155,12 @@ def _follow_jump(flight: FlightState, event: LocalPosition) -> None:
 def _on_mode(
     flight: FlightState, event: Heartbeat | ModeReport, mode: str, arrived_s: float
 ) -> None:
+    dialect = flight.dialect
+    assert dialect is not None
     if not flight.authority.engage_mode:
-        flight.dialect = flight.session.dialect
-        assert flight.dialect is not None
-        flight.authority = Authority(flight.dialect.engage_mode)
-    assert flight.dialect is not None
+        flight.authority = Authority(dialect.engage_mode)
     vehicle, authority = flight.vehicle, flight.authority
-    authority.loss = flight.dialect.setpoint_loss(vehicle.parameters)
+    authority.loss = dialect.setpoint_loss(vehicle.parameters)
     authority.on_mode(
         mode,
         flight.now_s,

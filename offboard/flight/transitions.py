@@ -135,7 +135,7 @@ def _enter(flight: FlightState, row: Transition) -> None:
     outbox.announce_phase(flight, reason, cause)
     if source in BEFORE_FLIGHT and row.target in FLYING:
         flight.clock.settle()
-        dialect = flight.session.dialect
+        dialect = flight.dialect
         assert dialect is not None
         flight.positioning.begin(flight.vehicle, flight.session.rates_hz, dialect.estimator_name)
         if flight.identification:

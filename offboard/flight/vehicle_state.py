@@ -33,7 +33,6 @@ from offboard.mavlink.events import (
     Rebooted,
     StatusText,
     SystemHealth,
-    VehicleFound,
     VehicleIdentity,
 )
 from offboard.mavlink.framing import HEARTBEAT
@@ -53,7 +52,6 @@ SET_MESSAGE_INTERVAL = 511  # MAV_CMD: a refused rate explains no failure
 class VehicleState:
     """The newest telemetry of the vehicle; None until the first message of that kind."""
 
-    found: VehicleFound | None = None
     heartbeat: Heartbeat | None = None
     health: SystemHealth | None = None
     estimator: EstimatorReport | None = None
@@ -198,8 +196,6 @@ class VehicleState:
                 self.estimator = event
             case Landed(state):
                 self.landed = state
-            case VehicleFound():
-                self.found = event
             case VehicleIdentity(uid, version):
                 self.uid, self.version = uid, version
             case Parameter(name, value):

@@ -116,7 +116,7 @@ def _refuse_arming(flight: FlightState) -> None:
 
 def _lift_off(flight: FlightState) -> None:
     for step in range(4):
-        flight.now_s = NOW_S + 0.1 * step
+        flight.vehicle.now_s = NOW_S + 0.1 * step
         position(flight, -0.3 - 0.01 * step)
 
 
@@ -149,7 +149,7 @@ def _identify(**values: Any) -> Setup:
 
 # what makes each condition hold
 EVENTS: dict[str, Setup] = {
-    "vehicle_found": lambda flight: hear(flight, VehicleFound(1, 1, "px4")),
+    "vehicle_found": lambda flight: vars(flight.session).update(vehicle=VehicleFound(1, 1, "px4")),
     "usable": _fit,
     "refused": lambda flight: vars(flight.session).update(refusals=["no multirotor"]),
     "armed_already": _all(
@@ -348,16 +348,16 @@ def test_a_vehicle_that_reboots_as_it_arms_counts_as_unheard_from_then_on() -> N
     flight.identification = None
     flight.session.link_time_s, flight.observer.reset = NOW_S, lambda: None  # type: ignore[misc]
     telemetry.update(flight, Rebooted(0.0), NOW_S, turned_s=NOW_S)
-    flight.now_s += 4.0
+    flight.vehicle.now_s += 4.0
     assert flight.unreached_s == pytest.approx(4.0)
 
 
 def test_only_a_heartbeat_newer_than_the_acceptance_shows_a_disarming() -> None:
     """On a lossy link arming may be accepted late, and the next HEARTBEAT be lost."""
     flight = uneventful(Phase.ARM)
-    flight.now_s = flight.vehicle.now_s = NOW_S + 0.1
+    flight.vehicle.now_s = NOW_S + 0.1
     hear(flight, CommandAck(400, "ACCEPTED"))
-    flight.now_s = flight.vehicle.now_s = NOW_S + 2.7
+    flight.vehicle.now_s = NOW_S + 2.7
     assert next_row(flight) is None
     heartbeat(flight, armed=False)
     row = next_row(flight)
