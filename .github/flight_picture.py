@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
 from offboard.analysis import history, tlog
-from offboard.flight.phases import PHASE_CODES, Phase
+from offboard.flight.phases import Phase
 
 Array = NDArray[np.float64]
 SAMPLE_S = 0.05
@@ -33,7 +33,7 @@ LABELS = ("offboard", "the autopilot's own position loop")
 def tracked(flight: Path) -> tuple[Array, Array, Array]:
     """Time since the start of TRACK (N,), reference and flown position (N, 3), NED in metres."""
     flown = history.gather(tlog.read(tlog.find(flight)))
-    track = flown.records["phase"] == PHASE_CODES[Phase.TRACK]
+    track = flown.records["phase"] == Phase.TRACK.code
     begin_s, end_s = flown.records["time_s"][track][[0, -1]]
     times = np.arange(begin_s, end_s, SAMPLE_S)
     _, first = np.unique(flown.reference["time_s"], return_index=True)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from offboard.analysis.tlog import LoggedMessage, Tlog, layout
 from offboard.documents.errors import UserError
 from offboard.flight import record
-from offboard.flight.phases import PHASE_CODES
+from offboard.flight.phases import Phase
 from offboard.flight.record import FIELDS, IDENTIFIED_ID, RECORD_ID
 from offboard.identification.vehicle_fit import RECORDED
 from offboard.mavlink import event_record
@@ -49,7 +49,7 @@ _TUNNEL = 385  # message id
 _ARMED = 0x80  # MAV_MODE_FLAG_SAFETY_ARMED
 _NO_VOLTAGE, _NO_PERCENTAGE = 0xFFFF, -1  # of SYS_STATUS
 _WRAP_MS = 2**32
-PHASES: dict[int | None, str] = {code: phase.value for phase, code in PHASE_CODES.items()}
+PHASES: dict[int | None, str] = {phase.code: phase.value for phase in Phase}
 # Columns of a message: name -> the first of its fields and how many values, in an array from where
 Columns = Mapping[str, tuple[str, int] | tuple[str, int, int]]
 _MOTION: Columns = {"position_ned_m": ("x", 3), "velocity_ned_mps": ("vx", 3)}

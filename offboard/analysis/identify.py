@@ -16,7 +16,7 @@ from scipy.integrate import cumulative_trapezoid
 
 from offboard.analysis.history import History
 from offboard.documents.errors import plain
-from offboard.flight.phases import PHASE_CODES, TRACKING
+from offboard.flight.phases import TRACKING
 from offboard.identification.trace import NORTH, POSITION, STAMP, VELOCITY, Trace, clean
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_fit import AXES, Identified, identify
@@ -79,7 +79,7 @@ def _trace(history: History) -> Trace:
 
 
 def _flown(history: History) -> tuple[float, float]:
-    indices = [PHASE_CODES[phase] for phase in TRACKING]
+    indices = [phase.code for phase in TRACKING]
     times = history.records["time_s"][np.isin(history.records["phase"], indices)]
     return (times[0] + LIFTED_OFF_S, times[-1]) if len(times) else (-math.inf, math.inf)
 

@@ -24,7 +24,7 @@ from offboard.analysis.tracking import passed_s, tracking_metrics, window_of
 from offboard.analysis.verdict import begin_times, verdict_metrics
 from offboard.documents.errors import UserError, meant, plain
 from offboard.flight.flight import Outcome
-from offboard.flight.phases import PHASE_CODES, ExitCode, Phase
+from offboard.flight.phases import ExitCode, Phase
 from offboard.link.log import LogError, replace_file
 
 Array = NDArray[np.float64]
@@ -244,7 +244,7 @@ def decision_metrics(flown: History) -> dict[str, float]:
     solve_ms, gap = 1e3 * known("solve_time_s"), known("gap")
     # A setpoint without certificate was changed by the gate, in EXCITE perhaps by a step
     changed = np.isnan(columns["at_bound"]) & np.isfinite(columns["thrust_mps2"])
-    limited = changed & (columns["phase"] != PHASE_CODES[Phase.EXCITE])
+    limited = changed & (columns["phase"] != Phase.EXCITE.code)
     at_bound = np.where(limited, 1.0, columns["at_bound"])
     skipped = columns["missed_ticks"][columns["pause_s"] > 0.0]
     return {

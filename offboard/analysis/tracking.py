@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import PPoly
 
 from offboard.analysis.history import History, Rows
-from offboard.flight.phases import PHASE_CODES, Phase
+from offboard.flight.phases import Phase
 from offboard.model.frames import (
     heading_from_quaternion,
     thrust_direction_from_quaternion,
@@ -179,7 +179,7 @@ def each_once(rows: Rows) -> Rows:
 
 
 def _in_track(flown: History) -> NDArray[np.bool_]:
-    chosen: NDArray[np.bool_] = flown.records["phase"] == PHASE_CODES[Phase.TRACK]
+    chosen: NDArray[np.bool_] = flown.records["phase"] == Phase.TRACK.code
     return chosen
 
 

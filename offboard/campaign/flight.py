@@ -31,6 +31,7 @@ import numpy as np
 
 from offboard.analysis.history import History
 from offboard.analysis.score import judged, keep_score, score_flight
+from offboard.analysis.verdict import begin_times
 from offboard.campaign.cases import Case
 from offboard.campaign.document import Promises
 from offboard.campaign.results import INFEASIBLE, Record, code_hash
@@ -164,13 +165,13 @@ def terms(
 def _clearance(flown: History, controller: ControllerSettings) -> float:
     """Least true distance to a keep-out volume in metres, NaN without volumes or positions."""
     volumes = getattr(controller, "keep_out", ())
-    begun = [event.time_s for event in flown.phases if event.phase == "track"]
+    begun_s = begin_times(flown.phases[::-1]).get("track")
     path = flown.truth if len(flown.truth) else flown.position
-    if not volumes or not begun or not len(path):
+    if not volumes or begun_s is None or not len(path):
         return math.nan
-    rows = path[path["time_s"] >= begun[0]]
+    rows = path[path["time_s"] >= begun_s]
     if not len(rows):
         return math.nan
     places = rows["position_ned_m"].astype(np.float64)
     from_start = places - path["position_ned_m"][0]
-    return float(np.min(clearances(volumes, rows["time_s"] - begun[0], from_start)))
+    return float(np.min(clearances(volumes, rows["time_s"] - begun_s, from_start)))

@@ -129,7 +129,8 @@ def conclude(summary: Summary, flown: Campaign) -> None:
     say(f"written: {directory / 'campaign.csv'} and campaign.html")
     if summary.stopped or summary.mine_missing:
         why = summary.stopped or "interrupted"
-        missing = f"{summary.mine_missing} of {summary.planned} flights are missing"
+        are = "is" if summary.mine_missing == 1 else "are"
+        missing = f"{summary.mine_missing} of {counted(summary.planned, 'flight')} {are} missing"
         raise UserError(f"{why}: {missing}; go on with the same command and --out {directory}", 4)
     if summary.failed:
         raise UserError(f"{counted(summary.failed, 'flight')} failed; the table says why", 1)

@@ -6,13 +6,12 @@ For comparison: a user can send position, velocity and acceleration without this
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Literal
 
-import numpy as np
 from pydantic import Field
 
 from offboard.control.base import ControllerSettings, Decision, DecisionError, Situation
-from offboard.model.command import PositionCommand
 from offboard.model.frames import wrap_pi
 from offboard.model.vehicle import Vehicle
 
@@ -36,21 +35,10 @@ class AutopilotLaw:
 
     def decide(self, situation: Situation) -> Decision:
         sample = situation.reference.sample(situation.time_s + self._ahead_s)
-        vectors = (sample.position_ned_m, sample.velocity_ned_mps, sample.acceleration_ned_mps2)
-        if not (np.isfinite(vectors).all() and math.isfinite(float(sample.heading_rad))):
+        setpoint = sample.setpoint()
+        if not all(map(math.isfinite, setpoint.numbers())):
             raise DecisionError("the reference is not finite")
-        position, velocity, acceleration = (
-            (float(vector[0]), float(vector[1]), float(vector[2])) for vector in vectors
-        )
-        return Decision(
-            PositionCommand(
-                position,
-                velocity,
-                acceleration,
-                wrap_pi(float(sample.heading_rad)),
-                float(sample.heading_rate_radps),
-            )
-        )
+        return Decision(replace(setpoint, heading_rad=wrap_pi(setpoint.heading_rad)))
 
     def reset(self) -> None:
         """Nothing to do: the law has no state."""

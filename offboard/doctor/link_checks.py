@@ -9,13 +9,15 @@ from functools import partial
 
 from offboard.doctor.listening import Observation
 from offboard.flight.preflight import TELEMETRY, Finding, Level
+from offboard.flight.timing import REAL_TIME
 from offboard.link.connection import BITS_OF_A_BYTE
+from offboard.mavlink.events import CommandAck
 from offboard.mavlink.senders import DIALECTS
 from offboard.mavlink.telemetry import SHARE
 
 BAUDS = (57600, 115200, 230400, 460800, 921600)
 LOST_SHARE, FULL_SHARE = 0.02, 0.9
-LATE_S, REAL_TIME = 0.25, 0.05
+LATE_S = 0.25
 FOREIGN_TIMES = 3
 ELSEWHERE = (
     "if it runs elsewhere, listen on all addresses (--connect udpin:0.0.0.0:PORT); into a "
@@ -53,7 +55,7 @@ def port(seen: Observation) -> Iterable[Finding]:
 
 def vehicle(seen: Observation) -> Iterable[Finding]:
     """Whether an autopilot that can be flown is heard, and what is heard if none is."""
-    found, heard, kind, known = seen.vehicle.found, seen.heard, _kind(seen), DIALECTS.values()
+    found, heard, kind, known = seen.found, seen.heard, _kind(seen), DIALECTS.values()
     senders, received = heard.senders.found, heard.senders.counters.bytes_received
     if seen.link_error:
         return
@@ -99,7 +101,7 @@ def uplink(seen: Observation) -> Iterable[Finding]:
     """Whether what we send reaches the vehicle: it acknowledges commands without effect."""
     if not seen.heard.has_asked:
         return
-    if seen.heard.acknowledged:
+    if CommandAck in seen.vehicle.heard_s:
         yield ok("the vehicle acknowledges our commands, so that heartbeat and texts reach it")
     elif seen.vehicle.parameters:
         yield warn("parameters are answered, but no command is acknowledged")
@@ -193,11 +195,10 @@ def clock(seen: Observation) -> Iterable[Finding]:
     if masters:
         hint = "let one program alone exchange TIMESYNC with the vehicle"
         yield warn(f"another time master: {', '.join(masters)}", hint)
-    if heard.clock_rate is not None:
-        figures = (
-            f"the vehicle's clock runs {heard.clock_rate:.3f} times as fast as this computer's"
-        )
-        yield warn(figures) if abs(heard.clock_rate - 1.0) > REAL_TIME else ok(figures)
+    rate = heard.clock.telemetry_rate
+    if rate is not None:
+        figures = f"the vehicle's clock runs {rate:.3f} times as fast as this computer's"
+        yield warn(figures) if abs(rate - 1.0) > REAL_TIME else ok(figures)
 
 
 def _kind(seen: Observation) -> str:
@@ -206,6 +207,6 @@ def _kind(seen: Observation) -> str:
 
 def _ids(seen: Observation) -> tuple[int, int]:
     """System and component of the vehicle."""
-    found = seen.vehicle.found
+    found = seen.found
     assert found is not None
     return found.system_id, found.component_id

@@ -1,13 +1,12 @@
 """The listening pass: who sends, what is received and what is asked, until enough is known; and
 `Observation`, all that is known then.
 
-Sans-I/O: received chunks and host times in, frames out. It only asks: it never sends a setpoint, a
-mode, an arming or a parameter, and no heartbeat: the vehicle may count on one, and says without it
-what it says when no program of ours runs. Its component id is not that of a flight.
+Sans-I/O: received chunks and host times in, frames out. It only asks, see README.md.
 """
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass, field, replace
@@ -26,7 +25,6 @@ from offboard.mavlink.dialects.base import TYPE_GCS, Dialect, WantedMessage, id_
 from offboard.mavlink.events import (
     Attitude,
     ClockBehind,
-    CommandAck,
     EstimatorReport,
     Event,
     GpsFix,
@@ -34,6 +32,7 @@ from offboard.mavlink.events import (
     NoFix,
     Rebooted,
     TimesyncReply,
+    VehicleFound,
 )
 from offboard.mavlink.framing import HEARTBEAT, Frame, FrameSplitter
 from offboard.mavlink.outgoing import CommandLong, Outgoing, Timesync
@@ -141,9 +140,9 @@ class Listening:
     """One pass over one link, from host time `began_s`. `settings`: of the session of a flight.
 
     `vehicle`, `clock` and `session` are those of a flight, with the newest telemetry; `senders` has
-    all that sends. `peer` is the address of the vehicle. `fix_type` is its GPS_FIX_TYPE; `late_s`
-    the greatest age of its telemetry beyond the least; `foreign_replies` the number of its replies
-    to requests of TIMESYNC that are not ours.
+    all that sends. `fix_type` is the vehicle's GPS_FIX_TYPE; `late_s` the greatest age of its
+    telemetry beyond the least; `foreign_replies` the number of its replies to requests of TIMESYNC
+    that are not ours.
     """
 
     def __init__(
@@ -153,12 +152,10 @@ class Listening:
         self.vehicle = VehicleState()
         self.clock = VehicleClock()
         self.senders = Senders(settings.stream)
-        self.peer: Hashable | None = None
         self.requested = self.rebooted = False  # the rates of telemetry; in this pass
         self.fix_type: int | None = None
         self.late_s = 0.0
         self.foreign_replies = 0
-        self.acknowledged: set[int] = set()  # MAV_CMD
         self.now_s = self._began_s = began_s  # `now_s`: until when it has listened
         self._found_s = 0.0
         self._parameters = ParameterReading(advice=True)
@@ -166,21 +163,16 @@ class Listening:
         self._settled = False
         self._may_greet = False  # a disarmed vehicle, whose signing time is behind ours
         self._timesync_s = 0.0
-        self._first: tuple[float, float] | None = None  # vehicle time and host time
-        self._newest: tuple[float, float] | None = None
-        self._prearm_s: float | None = None  # when it was acknowledged
 
     # --- in ---
 
     def take(self, chunk: Chunk) -> None:
         """Process received bytes."""
         self.senders.receive(chunk.data, chunk.peer)
-        if self.peer not in (None, chunk.peer):  # another vehicle, perhaps
+        if self.session.peer not in (None, chunk.peer):  # another vehicle, perhaps
             self.session.overhear(chunk.data)
         reception = self.session.receive(chunk.data, chunk.peer, chunk.arrived_s)
         for event in reception.events:
-            if not self._found_s:
-                self.peer = chunk.peer
             if not self._found_s and self.session.vehicle is not None:
                 self._found_s = chunk.arrived_s
             self.vehicle.update(event, self.session.link_time_s)
@@ -198,13 +190,8 @@ class Listening:
                 self.fix_type = FIX_3D
             case ClockBehind(armed=armed):
                 self._may_greet = not armed
-            case CommandAck(command):
-                self.acknowledged.add(command)
-                if command == RUN_PREARM_CHECKS and self._prearm_s is None:
-                    self._prearm_s = at_s
             case Rebooted():
                 self.rebooted = True
-                self._first = self._newest = None
                 self.clock = VehicleClock()
 
     def _on_stamp(self, stamp_s: float, at_s: float) -> None:
@@ -213,10 +200,6 @@ class Listening:
         if not self._settled and at_s - self._found_s > SETTLE_S:
             self._settled = True
             self.clock.settle()
-        if self._first is None:
-            self._first = stamp_s, at_s
-        if self._newest is None or stamp_s > self._newest[0]:
-            self._newest = stamp_s, at_s
 
     # --- out ---
 
@@ -244,13 +227,14 @@ class Listening:
         for message_id, missing in unknown.items():
             if missing and self._may_ask(message_id, now_s):
                 yield CommandLong.message(message_id)
-        disarmed = self.vehicle.heartbeat is not None and not self.vehicle.armed
-        due = disarmed and self._prearm_s is None and now_s - self._found_s >= PREARM_AFTER_S
+        disarmed = state.heartbeat is not None and not state.armed
+        unasked = RUN_PREARM_CHECKS not in state.answered_s
+        due = disarmed and unasked and now_s - self._found_s >= PREARM_AFTER_S
         if due and self._may_ask(RUN_PREARM_CHECKS, now_s):
             yield CommandLong.run_prearm_checks()
-        if self._newest and now_s - self._timesync_s >= TIMESYNC_EVERY_S:
+        if state.time_s and now_s - self._timesync_s >= TIMESYNC_EVERY_S:
             self._timesync_s = now_s
-            yield self.clock.request(self._newest[0], now_s)
+            yield self.clock.request(state.time_s, now_s)
 
     def _permitted(self, outgoing: Outgoing) -> bool:
         """No heartbeats, and no rates for an armed vehicle, or before it is known."""
@@ -275,7 +259,8 @@ class Listening:
             return passed_s >= NOTHING_S
         if now_s - self._found_s < LEAST_S or passed_s >= LONGEST_S:
             return passed_s >= LONGEST_S
-        checked = state.armed or (self._prearm_s is not None and now_s - self._prearm_s >= TEXTS_S)
+        prearm_s = state.now_s - state.answered_s.get(RUN_PREARM_CHECKS, math.inf)
+        checked = state.armed or prearm_s >= TEXTS_S
         return (
             checked
             and state.version is not None
@@ -308,14 +293,6 @@ class Listening:
         """Whether a command was sent to which an acknowledgement is due."""
         return bool(self._asked.keys() - {TIMESYNC})
 
-    @property
-    def clock_rate(self) -> float | None:
-        """Seconds of vehicle time per second."""
-        if not (self._first and self._newest and self._newest[1] - self._first[1] > 1.0):
-            return None
-        (began_s, heard_s), (ended_s, ended_at_s) = self._first, self._newest
-        return (ended_s - began_s - self.clock.jumped_s) / (ended_at_s - heard_s)
-
 
 @dataclass(frozen=True, slots=True)
 class Observation:
@@ -333,6 +310,10 @@ class Observation:
     holders: tuple[str, ...] = ()
 
     @property
+    def found(self) -> VehicleFound | None:
+        return self.heard.session.vehicle
+
+    @property
     def vehicle(self) -> VehicleState:
         return self.heard.vehicle
 
@@ -345,18 +326,14 @@ class Observation:
     @property
     def ground(self) -> Ground:
         """What the preflight list judges."""
-        heard, vehicle = self.heard, self.vehicle
-        limits = self.config.limits
-        shared = vehicle.other_sender is not None and not limits.begin_with_other_sender
+        heard = self.heard
         return Ground(
-            vehicle,
-            limits,
+            self.vehicle,
+            self.config.limits,
             heard.session,
             heard.clock,
             heard.now_s,
-            self.dialect,
             helicopter=self.config.vehicle.airframe == "helicopter",
             rates_requested=heard.requested,
-            other_sender=vehicle.other_sender_named if shared else "",
-            in_the_air=vehicle.armed,
+            in_the_air=self.vehicle.armed,
         )

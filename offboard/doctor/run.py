@@ -167,8 +167,9 @@ def _listen(
         for chunk in link.receive():
             heard.take(chunk)
         for frame in heard.due(clock.monotonic_s()):
-            link.send(frame, heard.peer)
-        found = heard.vehicle.found.autopilot if heard.vehicle.found else "no vehicle yet"
+            link.send(frame, heard.session.peer)
+        vehicle = heard.session.vehicle
+        found = vehicle.autopilot if vehicle else "no vehicle yet"
         tell(f"listening, {heard.listened_s:.0f} s of at most {LONGEST_S:.0f} s: {found}")
     return heard
 
@@ -193,7 +194,7 @@ def _within(seconds: float, call: Callable[[], Result]) -> Result:
 
 def examine(chosen: Iterable[str], seen: Observation) -> list[Row]:
     """One row for each of the checks that has something to say."""
-    found = seen.vehicle.found is not None
+    found = seen.found is not None
     blocking = list(preflight.findings(seen.ground)) if found else []
     rows, known = [], checks()
     for name in chosen:
@@ -239,7 +240,7 @@ def verdict(rows: Iterable[Row], *, complete: bool) -> str:
 
 def as_json(rows: Sequence[Row], seen: Observation, sentence: str) -> str:
     """One object with the worst level, the verdict, what was observed where, and a list of rows."""
-    found, version = seen.vehicle.found, seen.vehicle.version
+    found, version = seen.found, seen.vehicle.version
     document = {
         "level": worst(rows).name.lower(),
         "verdict": sentence,

@@ -134,7 +134,7 @@ def configuration(seen: Observation) -> Iterable[Finding]:
         tilt_rad = check(build_track(config), config.vehicle).tilt_rad
     except DocumentError as error:
         yield blocks(str(error), "change the reference or the vehicle file")
-    if seen.vehicle.found:
+    if seen.found:
         yield from _hover(seen)
         yield from _tilt(seen, tilt_rad)
         yield from _bandwidth(seen)

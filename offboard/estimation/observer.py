@@ -226,7 +226,7 @@ class Observer:
         self._sent = np.empty((0, COMMAND_SIZE))
         self._state: Array = np.zeros(STATE_SIZE)
         self._densities = densities_of(self._noise)
-        self._estimated = NoiseEstimate(self._noise)
+        self.estimated = NoiseEstimate(self._noise)
         self._rates = np.zeros(3)
         self._restart()
 
@@ -247,7 +247,7 @@ class Observer:
         disturbance += slowed * state[VELOCITY : VELOCITY + 3]
         np.clip(disturbance, -DISTURBANCE_LIMIT_MPS2, DISTURBANCE_LIMIT_MPS2, out=disturbance)
         self._set_vehicle(vehicle)
-        self._estimated.permit_vertical_drift()
+        self.estimated.permit_vertical_drift()
 
     @property
     def ready(self) -> bool:
@@ -260,18 +260,6 @@ class Observer:
         take-off."""
         down = float(self._state[DISTURBANCE + 2])
         return self._vehicle.hover_thrust * (1.0 + down / self._vehicle.gravity_mps2)
-
-    @property
-    def noise_sds(self) -> tuple[float, float]:
-        """Noise of position (m) and reported velocity (m/s), as estimated."""
-        position, velocity = map(math.sqrt, self._estimated.variances)
-        return position, velocity
-
-    @property
-    def drift_densities_mps2(self) -> tuple[float, float]:
-        """Drift of the disturbance per root second, lateral and vertical, as estimated."""
-        lateral, vertical = self._estimated.drift_mps2.tolist()
-        return lateral, vertical
 
     def freeze(self, grounded: bool) -> None:
         """Stop or resume estimating. Frozen, on the ground or while the vehicle does not follow our
@@ -341,7 +329,7 @@ class Observer:
 
     def _update_by_position(self, measured: Array) -> None:
         """Update by the present position and velocity (6,); reset what jumped beyond its gate."""
-        state, estimated = self._state, self._estimated
+        state, estimated = self._state, self.estimated
         innovation = measured - H_POSITION @ state
         variances, jumped = estimated.variances, False
         for first, end in TOGETHER:
@@ -444,7 +432,7 @@ class Observer:
         """Covariance, disturbance and bias as at the first message."""
         self._covariance: Array = np.diag(START_SDS**2)
         self._state[DISTURBANCE : BIAS + 3] = 0.0
-        self._estimated.interrupt()
+        self.estimated.interrupt()
 
     def _is_new(self, time_s: float, last_s: float | None) -> bool:
         """Whether to use a message of `time_s`, the last of its kind having been of `last_s`;

@@ -6,8 +6,6 @@ changed. A report has an age: without a recent one nothing is sent.
 
 The mode of the autopilot's own failsafe for missing setpoints is an exception, as nobody chose it:
 the vehicle may be asked to land from it, unless it receives a pilot's sticks.
-
-While it is not ours, `PilotSwitch` says whether the pilot of the service has engaged us.
 """
 
 from __future__ import annotations
@@ -17,9 +15,9 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 
 from offboard.mavlink.dialects.base import NEVER, SetpointLoss
+from offboard.mavlink.events import MODE_KNOWN_S
 
 JUST_S = 0.6  # PX4 sends CURRENT_MODE twice a second, and at once when the mode changes
-KNOWN_S = 2.5  # longest age of a report; HEARTBEAT comes at 1 Hz
 
 
 class Standing(Enum):
@@ -55,7 +53,6 @@ class Authority:
     standing: Standing = Standing.FREE
     mode: str = "unknown"
     heard_s: float = -math.inf  # time of the newest report
-    reported_s: float = -math.inf  # time of the newest report that counts
     lost_reason: str = ""
     lost_s: float = math.inf  # time of the loss; -inf if a HEARTBEAT reported it
     loss: SetpointLoss = NEVER  # what the autopilot does without setpoints
@@ -87,8 +84,6 @@ class Authority:
         """
         before, self.mode = self.mode, mode
         self.heard_s, self.arrived_s = now_s, arrived_s
-        if arrived_s >= self._counts_from_s:
-            self.reported_s = now_s
         if self.standing is Standing.ASKED:
             if mode == self.engage_mode:
                 self.standing = Standing.OURS
@@ -128,8 +123,8 @@ class Authority:
             stays = self.standing is Standing.FAILSAFE and self.mode == before
             shown = stays and self._failsafe_shown
             self.standing = Standing.FAILSAFE
-            counts = self.arrived_s >= self._counts_from_s
-            self._failsafe_shown = shown or (heartbeat and counts and sticks is not None)
+            known = heartbeat and self._counts and sticks is not None
+            self._failsafe_shown = shown or known
 
     def _hand_over(self, mode: str) -> None:
         """It shows a mode that we requested; those requested before it do not count any more."""
@@ -162,14 +157,13 @@ class Authority:
         """After a pause of our own of `paused_s` that ended at `host_s`: only reports that arrive
         later count, or that have arrived just before if the pause was too short for the vehicle's
         failsafe to have acted in it."""
-        self._counts_from_s = host_s - (JUST_S if paused_s < self.loss.after_s else 0.0)
+        from_s = host_s - (JUST_S if paused_s < self.loss.after_s else 0.0)
+        self._counts_from_s = max(from_s, self._counts_from_s)
         self._failsafe_shown = False
-        if self.arrived_s < self._counts_from_s:
-            self.reported_s = -math.inf
 
     def forget(self, now_s: float) -> None:
         """The vehicle was rebooted: its standing is shown by the next report of the mode."""
-        self.heard_s = self.reported_s = -math.inf
+        self.heard_s = -math.inf
         self._forgot_s = now_s
         if self.is_ours:
             self.standing = Standing.OURS
@@ -181,12 +175,16 @@ class Authority:
             self.lost_s = -math.inf if heartbeat else now_s
 
     def known(self, now_s: float) -> bool:
-        """Whether the newest report that counts is recent enough to act on."""
-        return now_s - self.reported_s <= KNOWN_S
+        """Whether the newest report counts, and is recent enough to act on."""
+        return self._counts and self.heard(now_s)
+
+    @property
+    def _counts(self) -> bool:
+        return self.arrived_s >= self._counts_from_s
 
     def heard(self, now_s: float) -> bool:
         """Whether reports arrive, even if none counts yet."""
-        return now_s - self.heard_s <= KNOWN_S
+        return now_s - self.heard_s <= MODE_KNOWN_S
 
     def unheard_s(self, now_s: float) -> float:
         """Time since the newest report, if that is longer than usual; else 0."""

@@ -23,11 +23,10 @@ from offboard.flight.record import (
     RECORD_NAME,
     Decided,
     TickRecord,
-    reference_record,
 )
 from offboard.flight.state import FlightState
 from offboard.identification.learner import Learner, VehicleUpdate
-from offboard.mavlink.outgoing import SolverRecord
+from offboard.mavlink.outgoing import ReferenceRecord, SolverRecord
 from offboard.model.command import Command
 
 NOTICEABLE_RADPS = 0.5  # a smaller change of the bandwidth is not announced
@@ -87,7 +86,7 @@ def finish(flight: FlightState, sent_s: float) -> None:
     if not decided.refused:
         flight.missed = 0
         if flight.identification:
-            _identify(flight, decided, flight.identification)
+            _identify(flight, flight.identification)
 
 
 def _miss(flight: FlightState, failure: str, cause: str) -> None:
@@ -114,12 +113,12 @@ def _send(flight: FlightState, decided: Decided) -> None:
         decided.refused, decided.failure = refused.why, str(refused)
 
 
-def _identify(flight: FlightState, decided: Decided, identification: Learner) -> None:
+def _identify(flight: FlightState, identification: Learner) -> None:
     try:
         hover_thrust = flight.observer.hover_thrust_estimate
         update = identification.learn(flight.time_s, hover_thrust)
         if update is not None:
-            _set_vehicle(flight, flight.time_s, update)
+            _set_vehicle(flight, update)
     except Exception as error:  # the flight continues with the present vehicle model
         identification.give_up()
         outbox.warn(flight, f"identification stopped: {located(error)}")
@@ -148,14 +147,14 @@ def _decided(flight: FlightState) -> Decided:
     return Decided(flight.phase, state, decision, flight.stopwatch() - began_s)
 
 
-def _set_vehicle(flight: FlightState, time_s: float, update: VehicleUpdate) -> None:
+def _set_vehicle(flight: FlightState, update: VehicleUpdate) -> None:
     assert isinstance(flight.controller, Adaptive)
     flight.controller.set_vehicle(update.vehicle, update.uncertainty)
     if update.vehicle != flight.model:
         flight.observer.set_vehicle(update.vehicle)
         flight.model = update.vehicle
     if update.record:
-        record = SolverRecord(time_s, update.record, IDENTIFIED_ID, IDENTIFIED_NAME)
+        record = SolverRecord(flight.time_s, update.record, IDENTIFIED_ID, IDENTIFIED_NAME)
         outbox.send(flight, record)
     for sentence in _with_bandwidth(flight, update, flight.controller):
         outbox.announce(flight, sentence)
@@ -182,12 +181,9 @@ def _with_bandwidth(
 def _record(flight: FlightState, decided: Decided, answer_s: float) -> None:
     sample = flight.plan.sample(flight.time_s)
     assert sample is not None
-    record = tick_record(flight, decided, answer_s)
-    outbox.send(
-        flight,
-        reference_record(flight.time_s, sample),
-        SolverRecord(flight.time_s, record.data(), RECORD_ID, RECORD_NAME),
-    )
+    time_s, tick = flight.time_s, tick_record(flight, decided, answer_s)
+    reference = ReferenceRecord(time_s, sample.setpoint())
+    outbox.send(flight, reference, SolverRecord(time_s, tick, RECORD_ID, RECORD_NAME))
 
 
 def tick_record(flight: FlightState, decided: Decided, answer_s: float) -> TickRecord:
@@ -206,7 +202,7 @@ def tick_record(flight: FlightState, decided: Decided, answer_s: float) -> TickR
         *certificate,
         decided.solve_time_s,
         answer_s,
-        float(flight.missed_ticks),
+        float(flight.busyness.missed),
         *state.position_ned_m.tolist(),
         *state.velocity_ned_mps.tolist(),
         *state.disturbance_ned_mps2.tolist(),
@@ -216,6 +212,6 @@ def tick_record(flight: FlightState, decided: Decided, answer_s: float) -> TickR
         decided.age_s,
         float(decided.refused),
         float(flight.ignored),
-        flight.pause_s,
+        flight.busyness.paused_s,
     )
     return TickRecord(*values)

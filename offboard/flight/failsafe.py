@@ -1,9 +1,5 @@
 """Failsafe: what follows when a limit is exceeded in flight. One row for each condition.
 
-The action of the worst row that is active counts. A row is active once its condition has held for
-its delay. The time that it has held runs down at a quarter of the speed while the condition does
-not hold, so that a condition that comes and goes does not start from zero each time.
-
 Its conditions come after those that the phase table has as well.
 """
 
@@ -18,11 +14,10 @@ import numpy as np
 from offboard.flight.authority import Standing
 from offboard.flight.phases import TRACKING, Action, Condition, Limits
 from offboard.flight.state import COMMANDS_KEPT, FlightState
-from offboard.mavlink.events import OtherSender, ThrustReport
+from offboard.mavlink.events import MODE_KNOWN_S, ThrustReport
 
 OPERATOR = "{flight.stop_cause}"  # the cause of a row for `stop_requested`
 REBOOTED = "the vehicle restarted"
-OTHER_SENDER_S = 5.0  # a second sender is there for so long after its newest frame
 RECOVERY = 0.25  # speed at which a delay runs back
 STEP_MAX_S = 0.2  # what one sample counts for, also after a gap of telemetry
 SINK_MPS = 0.3  # that full thrust stops within the delay, on a vehicle that can be flown
@@ -62,10 +57,7 @@ def mode_unknown(flight: FlightState) -> str:
 def other_sender(flight: FlightState) -> str:
     """Another program sends setpoints or commands modes on this link, or says in its HEARTBEAT
     that it flies the vehicle."""
-    if flight.limits.begin_with_other_sender:
-        return ""
-    recent = flight.vehicle.age_s(OtherSender) < OTHER_SENDER_S
-    return flight.vehicle.other_sender_named if recent else ""
+    return "" if flight.limits.begin_with_other_sender else flight.vehicle.other_sender_named
 
 
 # ---------------------------------------------------------------------- who has the vehicle
@@ -296,11 +288,9 @@ LEVEL, HOLD, LAND = Action.LEVEL, Action.HOLD, Action.LAND
 MISSED = "{flight.failure_cause}", "{flight.failure}"
 LATE = "limits.link_growth_s, limits.setpoint_age_s"
 UNIDENTIFIED = "BOUNDS of identification"
-# a pilot's change of the mode is seen within this time, or `authority` acts
-FOLLOWED_S = 2.5
 ROWS = (
     # of `authority` nothing is asked before the mode is known again
-    Row("authority", another_may_control, "2.5 s", LAND, cause="link"),
+    Row("authority", another_may_control, f"{MODE_KNOWN_S:g} s", LAND, cause="link"),
     Row("silence", silent, "limits.silence_s", LAND, cause="link"),
     Row("blind", blind, f"{Limits.blind_s:g} s", LAND, cause="link"),
     Row("age", old, "limits.setpoint_age_s", LEVEL, cause="link"),
@@ -321,7 +311,8 @@ ROWS = (
     Row("thrust reserve", no_thrust_reserve, "limits.hover_thrust", LAND, 2.0),
     Row("full thrust", sinks_with_full_thrust, f"{SINK_MPS:g} m/s", LAND, 1.0),
     Row("second sender", other_sender, "one message", HOLD, cause="second sender"),
-    Row("other setpoints", follows_others, "1e-5", HOLD, FOLLOWED_S, "second sender"),
+    # within this time a pilot's change of the mode is seen, or the row "authority" acts
+    Row("other setpoints", follows_others, "1e-5", HOLD, MODE_KNOWN_S, "second sender"),
     Row("clock", clock_jumped, "0.5 s", LAND, cause=""),
     Row("contradiction", contradicted, UNIDENTIFIED, LAND, cause=""),
 )

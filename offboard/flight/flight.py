@@ -119,8 +119,6 @@ class Flight(FlightState):
         reception = self.session.receive(chunk.data, chunk.peer, arrived_s)
         self._inputs.chunk(chunk, reception)
         self._logged += reception.frames
-        if reception.events:
-            self.peer = chunk.peer
         for event in reception.events:
             if telemetry.is_of_another(self, event):
                 outbox.announce(self, "another vehicle answers, with the same system id")
@@ -133,7 +131,6 @@ class Flight(FlightState):
         self._heard |= self._ends_silence(event)
         if isinstance(event, Rebooted):
             self._tick = -1
-            transitions.on_reboot(self)
 
     def _ends_silence(self, event: Event) -> bool:
         """Whether the event is telemetry. Once position and attitude are received only they are:
@@ -152,7 +149,7 @@ class Flight(FlightState):
             outbox.announce(self, news)
         session.status = self._status()
         due = session.poll(now_s)
-        self.now_s = self.vehicle.now_s = session.link_time_s
+        self.vehicle.now_s = session.link_time_s
         if self.phase is Phase.LAND and self.unreached_s:
             self.began_s += self.now_s - before_s  # a landing that is not seen takes no time
         self.host_s = session.clock_s(now_s)
@@ -170,9 +167,8 @@ class Flight(FlightState):
             return False
         missed = number - self._tick - 1 if self._tick >= 0 else 0
         self._tick, self._ticked = number, True
-        pause_s = self.busyness.on_tick(missed, flying=self.phase in FLYING)
+        self.busyness.on_tick(missed, flying=self.phase in FLYING)
         ignored = self.other_datagrams + self.session.counters.forged
-        self.missed_ticks, self.pause_s = missed, pause_s
         self.ignored, self._recorded_others = ignored - self._recorded_others, ignored
         return True
 

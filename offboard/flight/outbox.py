@@ -92,13 +92,7 @@ def usable(command: Command | PositionCommand) -> bool:
     """Whether all values can be sent, as float32, and the thrust direction is a unit vector, as a
     tuple: commands are compared with ==."""
     if isinstance(command, PositionCommand):
-        vectors = (
-            command.position_ned_m,
-            command.velocity_ned_mps,
-            command.acceleration_ned_mps2,
-            (command.heading_rad, command.heading_rate_radps),
-        )
-        return all(abs(value) <= FLOAT32_MAX for vector in vectors for value in vector)
+        return all(abs(value) <= FLOAT32_MAX for value in command.numbers())
     direction: object = command.thrust_direction_ned
     if not isinstance(direction, tuple):
         return False
@@ -181,18 +175,8 @@ def _send_attitude(
     flight.thrusts.append(min(command.thrust_mps2 / model.thrust_max_mps2, 1.0))
     if flight.identification:
         flight.identification.on_command(flight.sent_s(time_s), command)
-    send(
-        flight,
-        AttitudeTarget(
-            time_s=time_s,
-            thrust_mps2=command.thrust_mps2,
-            thrust_direction_ned=command.thrust_direction_ned,
-            heading_rad=command.heading_rad,
-            hover_thrust=model.hover_thrust,
-            gravity_mps2=model.gravity_mps2,
-            body_z_down=body_z_down,
-        ),
-    )
+    target = AttitudeTarget(time_s, command, model.hover_thrust, model.gravity_mps2, body_z_down)
+    send(flight, target)
 
 
 def _send_position(flight: FlightState, time_s: float, command: PositionCommand) -> None:
@@ -201,17 +185,7 @@ def _send_position(flight: FlightState, time_s: float, command: PositionCommand)
     flight.observer.freeze(True)
     flight.thrusts.clear()  # the autopilot chooses the thrust
     flight.command = Command(flight.model.gravity_mps2, LEVEL, command.heading_rad)
-    send(
-        flight,
-        PositionTarget(
-            time_s,
-            command.position_ned_m,
-            command.velocity_ned_mps,
-            command.acceleration_ned_mps2,
-            command.heading_rad,
-            command.heading_rate_radps,
-        ),
-    )
+    send(flight, PositionTarget(time_s, command))
 
 
 def hover_mps2(flight: FlightState) -> float:

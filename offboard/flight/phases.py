@@ -3,7 +3,7 @@ limits, and options of the service."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Set
+from collections.abc import Callable, Set
 from dataclasses import dataclass
 from enum import Enum, IntEnum
 from typing import TYPE_CHECKING, ClassVar, Literal
@@ -61,7 +61,7 @@ class Action(IntEnum):
 
 
 class Request(Enum):
-    """What a ground station has asked for, and is to be done at the next tick (see `telemetry`)."""
+    """What a ground station asks for (see `transitions.obey`)."""
 
     NONE = "nothing"
     START = "start"
@@ -70,7 +70,6 @@ class Request(Enum):
     HAND_BACK = "hand back"
 
 
-PHASE_CODES: Mapping[Phase, int] = {phase: phase.code for phase in Phase}
 ENDS = frozenset({Phase.DISARMED, Phase.YIELDED, Phase.FAILED})
 WAITING = frozenset({Phase.CONNECT, Phase.HEALTH, Phase.STANDBY})
 BEFORE_FLIGHT = WAITING | {Phase.STREAM, Phase.ENGAGE, Phase.ARM}

@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from functools import partial
 
 from offboard.flight.phases import Limits
 from offboard.flight.timing import VehicleClock
@@ -64,15 +63,17 @@ class Ground:
     session: Session
     clock: VehicleClock
     host_s: float
-    dialect: Dialect | None = None
     helicopter: bool = False  # by its vehicle file
     rates_requested: bool = True
     reads_parameters: bool = False  # replies are still awaited
-    other_sender: str = ""  # that another program controls it
     in_the_air: bool = False
     guarded: bool = True  # a supervisor lands it if this process ends
     origin_missing: bool = False  # the reference is relative to a take-off point that is not known
     serves: bool = False  # for `daemon`, whose pilot arms it and engages
+
+    @property
+    def dialect(self) -> Dialect | None:
+        return self.session.dialect
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +84,7 @@ class Row:
     waits for its pilot, does not judge it."""
 
     check: str
-    level: Level
+    level: Level | Callable[[Ground], Level]
     problem: Callable[[Ground], str]
     fix: str | Callable[[Ground], str] = ""
     at_once: bool = False
@@ -96,8 +97,9 @@ def findings(ground: Ground) -> Iterator[tuple[str, bool, Finding]]:
     for row in PREFLIGHT:
         found = "" if row.fly_only and ground.serves else row.problem(ground)
         if found:
+            level = row.level if isinstance(row.level, Level) else row.level(ground)
             fix = row.fix if isinstance(row.fix, str) else row.fix(ground)
-            yield row.check, row.at_once, Finding(row.level, found, fix)
+            yield row.check, row.at_once, Finding(level, found, fix)
     for parameter in ground.dialect.watched_parameters if ground.dialect else ():
         name, value = parameter.name, ground.vehicle.parameters.get(parameter.name)
         fault = None if value is None else parameter.fault(value)
@@ -130,9 +132,9 @@ def unfit_type(ground: Ground) -> str:
     return senders.unfit_type(heartbeat.vehicle_type, helicopter=ground.helicopter)
 
 
-def armed_already(vehicle: VehicleState, limits: Limits) -> str:
+def armed_already(ground: Ground) -> str:
     """It is armed already, and the limits refuse such a vehicle."""
-    armed = vehicle.armed and not limits.begin_armed
+    armed = ground.vehicle.armed and not ground.limits.begin_armed
     return "the vehicle is armed already, by another controller or a pilot" if armed else ""
 
 
@@ -157,14 +159,20 @@ def _flown_by_failsafe(ground: Ground) -> str:
     )
 
 
-def several_vehicles(session: Session) -> str:
+def several_vehicles(ground: Ground) -> str:
     """Several vehicles are heard, and none was chosen."""
+    session = ground.session
     systems = session.senders.candidates(session.link_time_s)
     return systems and f"several vehicles are heard, systems {systems}: choose one with --system"
 
 
-def twin(session: Session) -> str:
-    if not session.time.mixed:
+def _shared(ground: Ground) -> str:
+    vehicle, limits = ground.vehicle, ground.limits
+    return "" if limits.begin_with_other_sender else vehicle.other_sender_named
+
+
+def twin(ground: Ground) -> str:
+    if not ground.session.time.mixed:
         return ""
     return (
         "two vehicles with the same system id send on this link, or its telemetry comes twice, "
@@ -246,19 +254,18 @@ def _other_mode(ground: Ground) -> str:
     return f"select {mode}, as `offboard fly` does first"
 
 
-def _rejected(ground: Ground) -> str:
+def _no_estimate(ground: Ground) -> str:
     report = ground.vehicle.estimator
-    return report.problem if report and report.worst[1] > 1.0 else ""
+    return report.problem if report else ""
 
 
-def _no_estimate(ground: Ground, *, starting: bool) -> str:
+def _estimate_level(ground: Ground) -> Level:
+    """What is missing may come while the vehicle starts; what is rejected is wrong."""
     vehicle = ground.vehicle
-    report = vehicle.estimator
-    if report is None or report.worst[1] > 1.0:
-        return ""
     fixed = vehicle.age_s(GpsFix) < vehicle.age_s(NoFix)
     starts = not fixed or vehicle.time_s < STARTING_S
-    return report.problem if starts == starting else ""
+    rejects = vehicle.estimator is not None and vehicle.estimator.worst[1] > 1.0
+    return WAIT if starts and not rejects else BLOCKS
 
 
 def _empty_battery(ground: Ground) -> str:
@@ -310,24 +317,10 @@ PREFLIGHT = (
     Row("vehicle", BLOCKS, unfit_type, _UNFIT, at_once=True),
     Row("state", BLOCKS, _flown_by_another, "stop that controller", at_once=True, fly_only=True),
     Row("state", BLOCKS, _flown_by_failsafe, _FAILSAFE, at_once=True, fly_only=True),
-    Row(
-        "state",
-        BLOCKS,
-        lambda ground: armed_already(ground.vehicle, ground.limits),
-        "disarm it",
-        at_once=True,
-        fly_only=True,
-    ),
-    Row(
-        "senders",
-        BLOCKS,
-        lambda ground: ground.other_sender,
-        "stop it",
-        at_once=True,
-        fly_only=True,
-    ),
-    Row("senders", BLOCKS, lambda ground: several_vehicles(ground.session), _PORTS, at_once=True),
-    Row("senders", BLOCKS, lambda ground: twin(ground.session), _TWIN, at_once=True),
+    Row("state", BLOCKS, armed_already, "disarm it", at_once=True, fly_only=True),
+    Row("senders", BLOCKS, _shared, "stop it", at_once=True, fly_only=True),
+    Row("senders", BLOCKS, several_vehicles, _PORTS, at_once=True),
+    Row("senders", BLOCKS, twin, _TWIN, at_once=True),
     Row("rates", WAIT, _no_telemetry),
     Row("supervisor", WAIT, _unguarded),
     Row("rates", BLOCKS, _slow, _slow_hint),
@@ -336,9 +329,7 @@ PREFLIGHT = (
     Row("origin", WAIT, _origin),
     Row("prearm", WAIT, _prearm, fly_only=True),
     Row("prearm", WARN, _needs_setpoints, _other_mode, fly_only=True),
-    Row("estimator", BLOCKS, _rejected, _ESTIMATOR),
-    Row("estimator", WAIT, partial(_no_estimate, starting=True), _ESTIMATOR),
-    Row("estimator", BLOCKS, partial(_no_estimate, starting=False), _ESTIMATOR),
+    Row("estimator", _estimate_level, _no_estimate, _ESTIMATOR),
     Row("battery", BLOCKS, _empty_battery, "charge the battery"),
     Row("delay", WAIT, _measuring),
     Row("delay", BLOCKS, _late, "use a faster link"),

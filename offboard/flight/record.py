@@ -2,19 +2,14 @@
 tick, of the configuration and the vehicle, and what the turns were given, so that `offboard replay`
 can give it the same again.
 
-The fields of `TickRecord` are the layout of DEBUG_FLOAT_ARRAY.data (name "pso") in the .tlog; the
-analysis reads the log with the same class. The array_id is the number of fields, so that the log
-of an older version, which lacks the last ones, stays readable.
+The fields of `TickRecord` are the layout of DEBUG_FLOAT_ARRAY.data (name "pso"; array_id: their
+number) in the .tlog; the analysis reads the log with the same class.
 
 All others are TUNNEL messages of our record component. The configuration is a text, compressed and
-in numbered pieces, the first entries of the log. Of the inputs of a turn the log holds every frame
-that was received. What else a turn depends on is recorded here: its host time, which frames arrived
-together, when and from whom, each reading of the stopwatch, and what the loop requested. Host times
-are whole microseconds, rounded before the flight sees them, so that the record is exact. In
-lockstep nothing depends on host time, and none is recorded. This record is a list of JSON texts,
-one in a line, compressed by zlib and cut into pieces: an object, or for a turn
-`[time, chunks, readings]` with the time since the turn before, and in its chunks and readings since
-its own time.
+in numbered pieces, the first entries of the log. The inputs (README.md) are JSON texts, one in a
+line, compressed by zlib and cut into pieces: an object, or for a turn `[time, chunks, readings]` in
+whole microseconds, with the time since the turn before, and in its chunks and readings since its
+own time.
 """
 
 from __future__ import annotations
@@ -24,29 +19,23 @@ import struct
 import zlib
 from collections.abc import Callable, Hashable, Iterable, Iterator
 from dataclasses import asdict, dataclass, fields
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any, NamedTuple
 
 from offboard.control.base import Certificate, Decision
 from offboard.flight.phases import Phase
 from offboard.link.interface import Chunk
 from offboard.mavlink.events import VehicleFound
-from offboard.mavlink.outgoing import ConfigurationRecord, ReferenceRecord
+from offboard.mavlink.outgoing import ConfigurationRecord
 from offboard.mavlink.session import Reception, SessionSettings
 from offboard.model.command import Command, PositionCommand, PredictedState
-from offboard.reference.base import FlatSample
 
 RECORD_NAME = "pso"
 NAN = float("nan")
 CERTIFIED = len(fields(Certificate))
-Array = NDArray[np.float64]
 IDENTIFIED_NAME, IDENTIFIED_ID = "identified", 2  # of the other DEBUG_FLOAT_ARRAY in the log
 
 
-@dataclass(frozen=True, slots=True)
-class TickRecord:
+class TickRecord(NamedTuple):
     """All floats, SI, NED, vehicle time; NaN for what the control law does not have.
 
     Thrust, direction and heading are those of the setpoint that was sent. The certificate, from
@@ -54,7 +43,7 @@ class TickRecord:
     the control law certified, because excitation or the limits changed it or it was not sent.
     """
 
-    phase: float  # of flight.phases.PHASE_CODES
+    phase: float  # of flight.phases.Phase
     thrust_mps2: float
     thrust_direction_north: float
     thrust_direction_east: float
@@ -81,18 +70,14 @@ class TickRecord:
     disturbance_down_mps2: float
     hover_thrust: float
     track_time_s: float  # time since the start of the track; NaN before it
-    seed_cost: float = NAN  # cost of the best plan that the search started from
-    age_s: float = NAN  # of the telemetry when the setpoint was sent, vehicle time
-    refused: float = 0.0  # flags of `outbox.Refusal`; 0 for a setpoint that was sent
-    other_datagrams: float = 0.0  # datagrams of other senders since the previous record
-    pause_s: float = 0.0  # longest pause of this process since the previous tick; 0 below a period
-
-    def data(self) -> tuple[float, ...]:
-        """The values in the order of DEBUG_FLOAT_ARRAY.data."""
-        return tuple(getattr(self, each.name) for each in fields(self))
+    seed_cost: float  # cost of the best plan that the search started from
+    age_s: float  # of the telemetry when the setpoint was sent, vehicle time
+    refused: float  # flags of `outbox.Refusal`; 0 for a setpoint that was sent
+    other_datagrams: float  # datagrams of other senders since the previous record
+    pause_s: float  # longest pause of this process since the previous tick; 0 below a period
 
 
-FIELDS = tuple(field.name for field in fields(TickRecord))
+FIELDS = TickRecord._fields
 RECORD_ID = len(FIELDS)
 
 
@@ -108,22 +93,6 @@ class Decided:
     age_s: float = 0.0  # of its telemetry, when it was checked
     refused: int = 0  # flags of `outbox.Refusal`
     failure: str = ""  # why it was refused
-
-
-def reference_record(time_s: float, sample: FlatSample) -> ReferenceRecord:
-    """The reference at a tick, for the log."""
-    return ReferenceRecord(
-        time_s=time_s,
-        position_ned_m=_triple(sample.position_ned_m),
-        velocity_ned_mps=_triple(sample.velocity_ned_mps),
-        acceleration_ned_mps2=_triple(sample.acceleration_ned_mps2),
-        heading_rad=float(sample.heading_rad),
-        heading_rate_radps=float(sample.heading_rate_radps),
-    )
-
-
-def _triple(values: Array) -> tuple[float, float, float]:
-    return float(values[0]), float(values[1]), float(values[2])
 
 
 # ---------------------------------------------------------------------- configuration and vehicle

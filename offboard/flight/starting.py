@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Set
-
 from offboard.flight import preflight
 from offboard.flight.failsafe import (
     OPERATOR,
@@ -31,7 +29,7 @@ LISTENED_S = 0.5  # to hear another sender: PX4 leaves OFFBOARD below 2 Hz
 
 
 def vehicle_found(flight: FlightState) -> str:
-    return "vehicle found" if flight.vehicle.found is not None else ""
+    return "vehicle found" if flight.session.vehicle is not None else ""
 
 
 def not_found(flight: FlightState) -> str:
@@ -54,7 +52,8 @@ def silent_for_another(flight: FlightState) -> str:
 
 def other_vehicle(flight: FlightState) -> str:
     """Several vehicles are heard, and none was chosen with --system, or none can be."""
-    return preflight.twin(flight.session) or preflight.several_vehicles(flight.session)
+    ground = ground_of(flight)
+    return preflight.twin(ground) or preflight.several_vehicles(ground)
 
 
 def ground_of(flight: FlightState) -> Ground:
@@ -69,10 +68,8 @@ def ground_of(flight: FlightState) -> Ground:
         flight.session,
         flight.clock,
         flight.host_s,
-        dialect,
         helicopter=flight.model.airframe == "helicopter",
         reads_parameters=not read,
-        other_sender=other_sender(flight),
         in_the_air=contact.in_the_air,
         guarded=flight.guarded,
         origin_missing=from_origin and contact.in_the_air and contact.rest_ned_m is None,
@@ -81,26 +78,12 @@ def ground_of(flight: FlightState) -> Ground:
 
 
 def armed_already(flight: FlightState) -> str:
-    return preflight.armed_already(flight.vehicle, flight.limits)
+    return preflight.armed_already(ground_of(flight))
 
 
 def refused(flight: FlightState) -> str:
     """What the preflight list refuses at once, without waiting."""
     return "; ".join(preflight.refusals(ground_of(flight)))
-
-
-def not_ready(flight: FlightState) -> str:
-    """What the preflight list still waits for."""
-    return preflight.not_ready(ground_of(flight))
-
-
-def ready(flight: FlightState) -> bool:
-    return not not_ready(flight)
-
-
-def not_ready_in_time(flight: FlightState) -> str:
-    waited = flight.in_phase_s > flight.limits.health_s
-    return f"not ready: {not_ready(flight)}" if waited else ""
 
 
 def unfit(flight: FlightState) -> str:
@@ -111,6 +94,11 @@ def unfit(flight: FlightState) -> str:
 
 def usable(flight: FlightState) -> bool:
     return not unfit(flight)
+
+
+def not_ready_in_time(flight: FlightState) -> str:
+    waited = flight.in_phase_s > flight.limits.health_s
+    return f"not ready: {unfit(flight)}" if waited else ""
 
 
 # ---------------------------------------------------------------------- the service waits
@@ -215,10 +203,6 @@ def disarmed_again(flight: FlightState) -> bool:
     return accepted and shown and ARMING_SHOWN_S < since_s < flight.in_phase_s
 
 
-def stopped_before_takeoff(flight: FlightState) -> str:
-    return f"{flight.stop_reason} before take-off" if flight.stop_reason else ""
-
-
 def stop_requested_on_ground(flight: FlightState) -> str:
     """A stop is requested while the vehicle is armed and stands on the ground by every sign."""
     stands = flight.vehicle.armed and not flight.contact.in_the_air
@@ -264,6 +248,7 @@ TOO_SOON = (
     "not engaged: {flight.vehicle.mode} again before a HEARTBEAT has shown another mode, or while "
     "a flight ended; switch again"
 )
+BEFORE_TAKEOFF = "{flight.stop_reason} before take-off"
 DISARMED_AGAIN = "the vehicle was disarmed just after it had armed"
 FLIGHT_DETECTED = "flight is detected as it was to disarm"
 LOST_AS_IT_ARMED = "{flight.authority.lost_reason} as it armed"
@@ -274,8 +259,10 @@ FLY_BEGINS = (
     Transition({CONNECT}, not_found, FAILED, REFUSED, "link"),
 )
 FLY_IS_READY = (
+    Transition({HEALTH}, silent_on_ground, FAILED, REFUSED, "link"),
+    Transition({HEALTH}, stop_requested, FAILED, REFUSED, OPERATOR, BEFORE_TAKEOFF),
     Transition({HEALTH}, refused, FAILED, REFUSED),
-    Transition({HEALTH}, ready, STREAM, reason="telemetry flows and the vehicle can arm"),
+    Transition({HEALTH}, usable, STREAM, reason="telemetry flows and the vehicle can arm"),
     Transition({HEALTH}, not_ready_in_time, FAILED, REFUSED),
 )
 SERVICE_WAITS = (
@@ -293,37 +280,32 @@ SERVICE_WAITS = (
     Transition({STANDBY}, started_in_the_air, CLIMB, FLOWN),
     Transition({STANDBY}, started_on_the_ground, STREAM, reason="start requested"),
 )
-
-
-def starting(before: Set[Phase]) -> tuple[Transition, ...]:
-    """From the ground to lift-off. `before`: the phases in which a flight is refused."""
-    return (
-        # first: from then on it is ours, and whatever ends the flight must ask for hold or land
-        Transition(STREAMING, engaged_in_the_air, CLIMB),
-        Transition(STREAMING, rebooted, FAILED, REFUSED, "restart"),
-        Transition(STREAMING, armed_already, FAILED, REFUSED),
-        Transition(before, silent_on_ground, FAILED, REFUSED, "link"),
-        Transition(before, stopped_before_takeoff, FAILED, REFUSED, OPERATOR),
-        Transition(STREAMING, other_sender, FAILED, REFUSED, "second sender"),
-        Transition(STREAMING, other_vehicle, FAILED, REFUSED),
-        Transition(STREAMING, blind, FAILED, REFUSED, "link"),
-        Transition(STREAMING, mode_unknown, FAILED, REFUSED, "link"),
-        Transition(STREAMING, lost, FAILED, REFUSED, "pilot"),
-        Transition({STREAM}, streamed, ENGAGE),
-        Transition({ENGAGE}, engaged, ARM),
-        Transition({ENGAGE}, not_engaged, FAILED, REFUSED),
-        Transition({ARM}, rebooted, STAND_DOWN, REFUSED, "restart"),
-        Transition({ARM}, lost_armed, YIELDED, ABORTED, "pilot", LOST_AS_IT_ARMED),
-        Transition({ARM}, lost_disarmed, FAILED, REFUSED, "pilot"),
-        Transition({ARM}, in_own_failsafe, STAND_DOWN, REFUSED, "link"),
-        Transition({ARM}, silent, STAND_DOWN, REFUSED, "link"),
-        Transition({ARM}, blind, STAND_DOWN, REFUSED, "link"),
-        Transition({ARM}, stop_requested, STAND_DOWN, REFUSED, OPERATOR),
-        Transition({ARM}, armed, TAKEOFF),
-        Transition({ARM}, disarmed_again, STAND_DOWN, REFUSED, reason=DISARMED_AGAIN),
-        Transition({ARM}, not_armed, STAND_DOWN, REFUSED),
-        Transition({TAKEOFF}, stop_requested_on_ground, STAND_DOWN, REFUSED, OPERATOR),
-        Transition({STAND_DOWN}, rises, LAND, ABORTED, reason=FLIGHT_DETECTED),
-        Transition({STAND_DOWN}, disarmed_for_good, FAILED, reason="disarmed on the ground"),
-        Transition({STAND_DOWN}, still_armed, FAILED, ABORTED),
-    )
+STARTING = (
+    # first: from then on it is ours, and whatever ends the flight must ask for hold or land
+    Transition(STREAMING, engaged_in_the_air, CLIMB),
+    Transition(STREAMING, rebooted, FAILED, REFUSED, "restart"),
+    Transition(STREAMING, armed_already, FAILED, REFUSED),
+    Transition(STREAMING, stop_requested, FAILED, REFUSED, OPERATOR, BEFORE_TAKEOFF),
+    Transition(STREAMING, other_sender, FAILED, REFUSED, "second sender"),
+    Transition(STREAMING, other_vehicle, FAILED, REFUSED),
+    Transition(STREAMING, blind, FAILED, REFUSED, "link"),
+    Transition(STREAMING, mode_unknown, FAILED, REFUSED, "link"),
+    Transition(STREAMING, lost, FAILED, REFUSED, "pilot"),
+    Transition({STREAM}, streamed, ENGAGE),
+    Transition({ENGAGE}, engaged, ARM),
+    Transition({ENGAGE}, not_engaged, FAILED, REFUSED),
+    Transition({ARM}, rebooted, STAND_DOWN, REFUSED, "restart"),
+    Transition({ARM}, lost_armed, YIELDED, ABORTED, "pilot", LOST_AS_IT_ARMED),
+    Transition({ARM}, lost_disarmed, FAILED, REFUSED, "pilot"),
+    Transition({ARM}, in_own_failsafe, STAND_DOWN, REFUSED, "link"),
+    Transition({ARM}, silent, STAND_DOWN, REFUSED, "link"),
+    Transition({ARM}, blind, STAND_DOWN, REFUSED, "link"),
+    Transition({ARM}, stop_requested, STAND_DOWN, REFUSED, OPERATOR),
+    Transition({ARM}, armed, TAKEOFF),
+    Transition({ARM}, disarmed_again, STAND_DOWN, REFUSED, reason=DISARMED_AGAIN),
+    Transition({ARM}, not_armed, STAND_DOWN, REFUSED),
+    Transition({TAKEOFF}, stop_requested_on_ground, STAND_DOWN, REFUSED, OPERATOR),
+    Transition({STAND_DOWN}, rises, LAND, ABORTED, reason=FLIGHT_DETECTED),
+    Transition({STAND_DOWN}, disarmed_for_good, FAILED, reason="disarmed on the ground"),
+    Transition({STAND_DOWN}, still_armed, FAILED, ABORTED),
+)

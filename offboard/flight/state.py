@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import operator
 from collections import deque
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import InitVar, dataclass, field
 
 import numpy as np
@@ -57,8 +57,8 @@ class Outcome:
 
 # of the flight before, with the same vehicle
 KEPT = (
-    "vehicle", "contact", "clock", "hover", "reading", "dialect", "peer", "other_datagrams",
-    "now_s", "host_s", "turned_s", "silence_s", "heard_s", "guarded",
+    "vehicle", "contact", "clock", "hover", "reading", "other_datagrams", "host_s",
+    "turned_s", "silence_s", "heard_s", "guarded",
 )  # fmt: skip
 
 
@@ -107,14 +107,11 @@ class FlightState:
     home_ned_m: Triple = (0.0, 0.0, 0.0)  # the ground where the flight began
     took_off: bool = False  # from there; a vehicle that was found in the air has not
     touchdown: Touchdown | None = None  # of the landing
-    dialect: Dialect | None = None  # once the vehicle has reported its mode
     authority: Authority = field(default_factory=Authority)
-    peer: Hashable | None = None  # address that the vehicle sends from; None before it is found
     other_datagrams: int = 0  # of other senders, for the log
 
     phase: Phase = Phase.CONNECT
     began_s: float = 0.0  # of the phase, on `Session.link_time_s`
-    now_s: float = 0.0  # `Session.link_time_s`
     turned_s: float = math.nan  # host time of the newest turn
     host_s: float = 0.0  # monotonic time of this computer at the present turn
     silence_s: float = 0.0  # host time since the newest telemetry
@@ -123,8 +120,8 @@ class FlightState:
     guarded: bool = True  # a supervisor lands the vehicle if this process ends
     rebooted: bool = False
     left_engaged: bool = False  # a flight that was cut short has left the vehicle engaged
-    request: Request = Request.NONE  # of the ground station, until the next tick
-    obeyed: Request = Request.NONE  # the newest one that changed the phase, or will
+    request: Request = Request.NONE  # of the ground station, while it is judged
+    obeyed: Request = Request.NONE  # the newest one that changed the phase
     stop_reason: str = ""  # why the flight shall end; empty while it shall not
     outcome: Outcome | None = None
 
@@ -132,9 +129,7 @@ class FlightState:
     heard_s: float = math.nan  # host time of the newest telemetry, as `Session.elapsed_s`
     telemetry_arrived_s: float = 0.0  # host time at which it arrived
     bridged_s: float = 0.0  # silence at the newest setpoint that needs no telemetry
-    missed_ticks: int = 0  # skipped between the newest tick and the one before
-    ignored: int = 0  # datagrams of others and forged frames between the two
-    pause_s: float = 0.0  # of this process, between the two
+    ignored: int = 0  # datagrams of others and forged frames between the two newest ticks
     command: Command = field(default_factory=lambda: Command(0.0, LEVEL, 0.0))  # in force
     decided: Decided | None = None  # in this turn
     announced_radps: float = math.nan  # bandwidth in use, as the user knows it
@@ -184,6 +179,16 @@ class FlightState:
             hasty=before.pilot.hasty or (before.taken and before.pilot.engaged),
             showed_ours=before.pilot.showed_ours,
         )
+
+    @property
+    def now_s(self) -> float:
+        """`Session.link_time_s` at the newest event, or at the present turn."""
+        return self.vehicle.now_s
+
+    @property
+    def dialect(self) -> Dialect | None:
+        """Of the vehicle; None before it is found."""
+        return self.session.dialect
 
     @property
     def in_phase_s(self) -> float:

@@ -7,19 +7,25 @@ parameters, hands the vehicle back.
 
 from __future__ import annotations
 
-from enum import IntEnum
-
 import numpy as np
 
 from offboard.flight import outbox, transitions
-from offboard.flight.authority import Authority
+from offboard.flight.authority import Authority, PilotSwitch
 from offboard.flight.estimates import HoverEstimate, PositionJumps
-from offboard.flight.failsafe import other_sender
-from offboard.flight.ground_contact import GroundContact
-from offboard.flight.phases import BEFORE_FLIGHT, FLYING, TRACKING, WAITING, Request
+from offboard.flight.failsafe import REBOOTED, other_sender
+from offboard.flight.ground_contact import GroundContact, Touchdown
+from offboard.flight.phases import (
+    BEFORE_FLIGHT,
+    FLYING,
+    TRACKING,
+    WAITING,
+    ExitCode,
+    Phase,
+    Request,
+)
 from offboard.flight.preflight import ParameterReading
 from offboard.flight.record import vehicle_record
-from offboard.flight.state import FlightState
+from offboard.flight.state import FlightState, Outcome
 from offboard.flight.timing import VehicleClock
 from offboard.mavlink.events import (
     Attitude,
@@ -40,6 +46,7 @@ from offboard.mavlink.events import (
 from offboard.mavlink.outgoing import CommandResult, ThrustRule
 
 START, PAUSE_CONTINUE, SET_MODE = 300, 193, 176  # MAV_CMD
+ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED = range(4)  # MAV_RESULT
 SAME_THRUST = 1e-5  # of full throttle: rounding on the link
 OTHER_COMPANION = (
     "another companion computer is on the link: system {system} component {component}; only one of "
@@ -49,8 +56,7 @@ OTHER_COMPANION = (
 
 def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: float) -> None:
     """`arrived_s` is the host time of the event's arrival, `turned_s` that of the turn."""
-    flight.now_s = flight.session.link_time_s
-    flight.vehicle.update(event, flight.now_s)
+    flight.vehicle.update(event, flight.session.link_time_s)
     match event:
         case Attitude(time_s, attitude, rates) if not flight.vehicle.repeated:
             _on_telemetry(flight, time_s, arrived_s, turned_s)
@@ -149,13 +155,12 @@ def _follow_jump(flight: FlightState, event: LocalPosition) -> None:
 def _on_mode(
     flight: FlightState, event: Heartbeat | ModeReport, mode: str, arrived_s: float
 ) -> None:
+    dialect = flight.dialect
+    assert dialect is not None
     if not flight.authority.engage_mode:
-        flight.dialect = flight.session.dialect
-        assert flight.dialect is not None
-        flight.authority = Authority(flight.dialect.engage_mode)
-    assert flight.dialect is not None
+        flight.authority = Authority(dialect.engage_mode)
     vehicle, authority = flight.vehicle, flight.authority
-    authority.loss = flight.dialect.setpoint_loss(vehicle.parameters)
+    authority.loss = dialect.setpoint_loss(vehicle.parameters)
     authority.on_mode(
         mode,
         flight.now_s,
@@ -180,7 +185,9 @@ def _on_mode(
 
 
 def _on_reboot(flight: FlightState) -> None:
-    """After a reboot of the vehicle: forget what was known of vehicle and link."""
+    """The vehicle was rebooted: forget what was known of vehicle and link. This ends the flight,
+    except while telemetry is awaited. A landing goes on, but the flight is none that was flown to
+    its end."""
     flight.observer.reset()
     flight.contact, flight.clock = GroundContact(flight.vehicle), VehicleClock()
     flight.hover, flight.jumps = HoverEstimate(), PositionJumps()
@@ -189,46 +196,29 @@ def _on_reboot(flight: FlightState) -> None:
     if flight.phase in BEFORE_FLIGHT:
         flight.authority = Authority()
     flight.authority.forget(flight.now_s)  # unheard from now on, not for ever
+    flight.rebooted = flight.phase not in (Phase.CONNECT, Phase.HEALTH)
+    flight.pilot = PilotSwitch()
+    if flight.phase is Phase.LAND:
+        flight.touchdown = Touchdown(None)
+        if flight.outcome is None:
+            flight.outcome = Outcome(ExitCode.ABORTED, f"{REBOOTED} while landing")
+    transitions.advance(flight)
 
 
 # ---------------------------------------------------------------------- requests
 
 
-class Result(IntEnum):
-    """MAV_RESULT."""
-
-    ACCEPTED = 0
-    TEMPORARILY_REJECTED = 1
-    DENIED = 2
-    UNSUPPORTED = 3
-
-
 def _answer(flight: FlightState, asked: CommandRequest) -> None:
-    """Acknowledge a command to us; the next tick does what it asks for."""
-    request, result = Request.NONE, Result.UNSUPPORTED
+    """Do what a command to us asks for, and acknowledge it. One that is being obeyed is accepted
+    again: a ground station that missed the answer repeats it."""
+    request, result = Request.NONE, UNSUPPORTED
     if flight.service:
         request = {START: Request.START, SET_MODE: Request.HAND_BACK}.get(asked.command, request)
         if asked.command == PAUSE_CONTINUE:
             wanted = {0.0: Request.PAUSE, 1.0: Request.CONTINUE}
-            request, result = wanted.get(asked.parameters[0], request), Result.DENIED
+            request, result = wanted.get(asked.parameters[0], request), DENIED
     if request is not Request.NONE:
-        before, result = flight.request, _take_request(flight, request)
-        if flight.request is not before:  # else it repeats one
-            sender = f"system {asked.system_id} component {asked.component_id}"
-            outbox.announce(flight, f"{request.value} requested by {sender}")
+        sender = f"system {asked.system_id} component {asked.component_id}"
+        obeyed = transitions.obey(flight, request, sender) or request is flight.obeyed
+        result = ACCEPTED if obeyed else TEMPORARILY_REJECTED
     outbox.send(flight, CommandResult(asked.command, result, asked.system_id, asked.component_id))
-
-
-def _take_request(flight: FlightState, request: Request) -> Result:
-    """Accept it if it leads to another phase now. Of several in one tick the first counts, but to
-    hand the vehicle back replaces any other. One that is being obeyed is accepted again: a ground
-    station that missed the answer repeats it."""
-    if flight.request is Request.NONE:
-        possible = transitions.leads_on(flight, request)
-    else:
-        possible = request is Request.HAND_BACK
-    if not possible:
-        obeyed = request is flight.obeyed
-        return Result.ACCEPTED if obeyed else Result.TEMPORARILY_REJECTED
-    flight.request = flight.obeyed = request
-    return Result.ACCEPTED

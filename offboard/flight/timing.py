@@ -1,20 +1,12 @@
 """Times: the vehicle's clock, the age of telemetry and the delay of the link; and whether this
 computer keeps up with the control ticks.
 
-The vehicle's clock is a line over host time, whose offset and rate are estimated together (one
-without the other would take a slow clock for a link that becomes later). Two measures enclose it:
-
-- Telemetry arrives after the time of its stamp: the least delayed of the last seconds shows what
-  the vehicle's clock has at least reached. Newest telemetry that is older has been delayed more
-  than usual, by a backlog or a stop of this process.
-- A request of TIMESYNC is stamped with the vehicle time of the newest telemetry and sent with a
-  setpoint; the reply holds this stamp and the vehicle time at which the request arrived. The
-  difference is the delay of both directions together, whatever the clock of this computer and the
-  way of the reply; and when the request was sent, the vehicle's clock was at most at that time.
-
-Both run at the rate of the clock, unless the delay of one direction changes: the rate lies between
-theirs, and there it stays where it was. From a vehicle without replies a slower clock cannot be
-told from a link that becomes later: within REAL_TIME its rate is 1.
+The vehicle's clock is a line over host time, whose offset and rate are estimated together. Two
+measures enclose it (README.md): telemetry arrives after the time of its stamp, and a request of
+TIMESYNC arrives after it was sent. That request is stamped with the vehicle time of the newest
+telemetry and sent with a setpoint; the reply holds this stamp and the vehicle time at which the
+request arrived. The difference is the delay of both directions together, whatever the clock of this
+computer and the way of the reply.
 """
 
 from __future__ import annotations
@@ -118,7 +110,7 @@ class VehicleClock:
         return True
 
     def _measure_rate(self, host_s: float) -> None:
-        down, up = self._telemetry.rate, self._replies.rate
+        down, up = self.telemetry_rate, self._replies.rate
         if down is None:
             return
         first, self._measured_s = math.isinf(self._measured_s), host_s
@@ -141,6 +133,11 @@ class VehicleClock:
     def age_s(self, stamp_s: float, host_s: float) -> float:
         """Age at `host_s` of telemetry stamped `stamp_s`, beyond the least delay of the window."""
         return max(self.now_s(host_s) - stamp_s, 0.0)
+
+    @property
+    def telemetry_rate(self) -> float | None:
+        """Vehicle time per host time, by the stamps of the last seconds; None before one second."""
+        return self._telemetry.rate
 
     # --- delay of both directions ---
 
@@ -264,29 +261,29 @@ def too_busy(skipped: float, ticks: float, pause_s: float) -> str:
 
 
 class Busyness:
-    """Counts in the air. `period_s`: of control; a shorter gap between two turns skips no tick."""
+    """Counts in the air. `period_s`: of control; a shorter gap between two turns skips no tick.
+
+    `missed` is the number of ticks between the newest one and that before it, `paused_s` the pause
+    that it came after, 0 without one."""
 
     def __init__(self, period_s: float) -> None:
         self._period_s = period_s
         self._gap_s = 0.0  # longest between two turns, since the previous tick
-        self.skipped = self.ticks = 0
-        self.pause_s = 0.0
+        self.skipped = self.ticks = self.missed = 0
+        self.pause_s = self.paused_s = 0.0
 
     def on_turn(self, gap_s: float) -> None:
         """A turn begins `gap_s` after the one before it, host time."""
         self._gap_s = max(self._gap_s, gap_s)
 
-    def on_tick(self, missed: int, *, flying: bool) -> float:
-        """A tick, `missed` ticks after the previous one. Returns the pause that it came after, 0
-        without one."""
-        pause_s, self._gap_s = self._gap_s, 0.0
-        if pause_s <= self._period_s:
-            pause_s = 0.0
+    def on_tick(self, missed: int, *, flying: bool) -> None:
+        """A tick, `missed` ticks after the previous one."""
+        self.missed = missed
+        self.paused_s, self._gap_s = self._gap_s if self._gap_s > self._period_s else 0.0, 0.0
         if flying:
             self.ticks += 1 + missed
-            self.skipped += missed if pause_s else 0
-            self.pause_s = max(self.pause_s, pause_s)
-        return pause_s
+            self.skipped += missed if self.paused_s else 0
+            self.pause_s = max(self.pause_s, self.paused_s)
 
     @property
     def sentence(self) -> str:

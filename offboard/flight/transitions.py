@@ -1,9 +1,5 @@
 """The phase table: which condition leads from which phases to which. The first row that holds is
 taken, and begins its phase. `actions` has what is sent in a phase.
-
-`fly` goes once from the ground to the ground. A flight of the service waits in STANDBY until the
-pilot engages it in the air, and hands back instead of landing when it is stopped; the service
-begins the next one where it has ended.
 """
 
 from __future__ import annotations
@@ -14,8 +10,7 @@ from functools import cache
 import numpy as np
 
 from offboard.flight import decision, failsafe, flying, outbox, starting
-from offboard.flight.authority import PilotSwitch
-from offboard.flight.failsafe import REBOOTED, in_own_failsafe
+from offboard.flight.failsafe import in_own_failsafe
 from offboard.flight.ground_contact import Touchdown
 from offboard.flight.phases import (
     BEFORE_FLIGHT,
@@ -51,8 +46,8 @@ def table(service: ServiceOptions | None = None) -> tuple[Transition, ...]:
     if service is None:
         rows = (
             *starting.FLY_BEGINS,
-            *starting.starting({Phase.HEALTH, *starting.STREAMING}),
             *starting.FLY_IS_READY,
+            *starting.STARTING,
             *flying.ends_early(serves=False),
             *flying.TO_THE_END,
             *flying.AT_REST["land"],
@@ -61,10 +56,10 @@ def table(service: ServiceOptions | None = None) -> tuple[Transition, ...]:
     else:
         rows = (
             *starting.SERVICE_WAITS,
-            *starting.starting(starting.STREAMING),
+            *starting.STARTING,
             Transition({Phase.HAND_BACK}, flying.handed, Phase.YIELDED),
             *flying.ends_early(serves=True),
-            *flying.SERVICE_ENDS,  # before the regular ones: a request is for one tick only
+            *flying.SERVICE_ENDS,
             *flying.TO_THE_END,
             *flying.AT_REST[service.then],
         )
@@ -75,17 +70,6 @@ def next_row(flight: FlightState) -> Transition | None:
     """The first row of the flight's phase whose condition holds, or None to stay."""
     rows = _by_phase(flight.service)[flight.phase]
     return next((row for row in rows if row.condition(flight)), None)
-
-
-def leads_on(flight: FlightState, request: Request) -> bool:
-    """Whether a row of the flight's phase holds with the request, and does not without it."""
-    rows, pending = _by_phase(flight.service)[flight.phase], flight.request
-    flight.request = Request.NONE
-    without = [row for row in rows if row.condition(flight)]
-    flight.request = request
-    accepted = [row for row in rows if row.condition(flight)] != without
-    flight.request = pending
-    return accepted
 
 
 @cache
@@ -107,8 +91,20 @@ def advance(flight: FlightState) -> None:
         if row is None:
             break
         _enter(flight, row)
-    if flight.request is not Request.NONE:  # its row holds no more
-        flight.request = flight.obeyed = Request.NONE
+
+
+def obey(flight: FlightState, request: Request, sender: str) -> bool:
+    """Take the row that this request of a ground station leads to now, after what is due without
+    it; whether there is one."""
+    advance(flight)
+    flight.request = request
+    row = next_row(flight)
+    if row is not None:
+        outbox.announce(flight, f"{request.value} requested by {sender}")
+        _enter(flight, row)
+        flight.obeyed = request
+    flight.request = Request.NONE
+    return row is not None
 
 
 def _note_failsafe(flight: FlightState) -> None:
@@ -128,33 +124,19 @@ def name_failsafe(flight: FlightState) -> None:
         flight.outcome = Outcome(before.exit_code, f"{before.sentence}; {sentence}")
 
 
-def on_reboot(flight: FlightState) -> None:
-    """The vehicle was rebooted: this ends the flight, except while telemetry is awaited. A
-    landing goes on, but the flight is none that was flown to its end."""
-    flight.rebooted = flight.phase not in (Phase.CONNECT, Phase.HEALTH)
-    flight.pilot = PilotSwitch()
-    if flight.phase is Phase.LAND:
-        flight.touchdown = Touchdown(None)
-        if flight.outcome is None:
-            flight.outcome = Outcome(ExitCode.ABORTED, f"{REBOOTED} while landing")
-    advance(flight)
-
-
 def _enter(flight: FlightState, row: Transition) -> None:
     source, reason, cause = flight.phase, row.why(flight), row.cause.format(flight=flight)
-    asked, flight.request = flight.request, Request.NONE
-    if row.condition(flight):  # also without the request, which is still to be obeyed
-        flight.request = asked
     _conclude(flight, row, reason)
     flight.vehicle.clear_messages()
-    if asked is Request.NONE and row.target not in PROCEEDS:
+    if flight.request is Request.NONE and row.target not in PROCEEDS:
         flight.obeyed = Request.NONE  # the flight ends for another reason
     flight.phase = row.target
     flight.began_s = flight.now_s
     outbox.announce_phase(flight, reason, cause)
     if source in BEFORE_FLIGHT and row.target in FLYING:
+        flight.authority.ask()  # it may show the mode already
         flight.clock.settle()
-        dialect = flight.session.dialect
+        dialect = flight.dialect
         assert dialect is not None
         flight.positioning.begin(flight.vehicle, flight.session.rates_hz, dialect.estimator_message)
         if flight.identification:
@@ -164,8 +146,6 @@ def _enter(flight: FlightState, row: Transition) -> None:
     if flight.identification:
         stage = STAGES.get(row.target, Stage.OTHER)
         flight.identification.on_stage(stage, flight.time_s)
-    if source in BEFORE_FLIGHT and row.target in FLYING:
-        flight.authority.ask()  # it may show the mode already
     if row.target is Phase.ENGAGE:
         # here, not with the request: a vehicle that shows the mode already passes without one
         flight.authority.ask()

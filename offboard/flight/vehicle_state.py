@@ -32,7 +32,6 @@ from offboard.mavlink.events import (
     Rebooted,
     StatusText,
     SystemHealth,
-    VehicleFound,
     VehicleIdentity,
 )
 from offboard.mavlink.framing import HEARTBEAT
@@ -44,6 +43,7 @@ DISARMED_S = 1.5  # longer than a period of HEARTBEAT: arming may have been in p
 ARMED_KNOWN_S = 3.0  # PX4 reports it in HEARTBEAT alone, at 1 Hz
 STILL_S = 0.05  # PX4 and ArduCopter repeat a component of the position for 0.03 s at most
 OUTAGE_S = 0.3  # a longer gap of all telemetry is an outage of the link
+OTHER_SENDER_S = 5.0  # a second sender is there for so long after its newest frame
 MESSAGES_MAX = 12  # texts and refusals kept for the sentence that explains a failure
 SET_MESSAGE_INTERVAL = 511  # MAV_CMD: a refused rate explains no failure
 
@@ -52,7 +52,6 @@ SET_MESSAGE_INTERVAL = 511  # MAV_CMD: a refused rate explains no failure
 class VehicleState:
     """The newest telemetry of the vehicle; None until the first message of that kind."""
 
-    found: VehicleFound | None = None
     heartbeat: Heartbeat | None = None
     health: SystemHealth | None = None
     estimator: EstimatorReport | None = None
@@ -125,11 +124,13 @@ class VehicleState:
 
     @property
     def other_sender_named(self) -> str:
-        """That another program controls the vehicle, and which was heard last."""
+        """That another program controls the vehicle, and which; empty if none was heard lately."""
         other = self.other_sender
-        name = f": system {other.system_id} component {other.component_id}" if other else ""
+        if other is None or self.age_s(OtherSender) >= OTHER_SENDER_S:
+            return ""
         return (
-            f"another program controls the vehicle on this link, too{name} "
+            "another program controls the vehicle on this link, too: system "
+            f"{other.system_id} component {other.component_id} "
             "(limits.begin_with_other_sender=true flies all the same)"
         )
 
@@ -195,8 +196,6 @@ class VehicleState:
                 self.estimator = event
             case Landed(state):
                 self.landed = state
-            case VehicleFound():
-                self.found = event
             case VehicleIdentity(uid, version):
                 self.uid, self.version = uid, version
             case Parameter(name, value):

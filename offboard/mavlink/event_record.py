@@ -21,7 +21,7 @@ _TEXT_MOST = 2000  # characters
 
 
 class EventRecord(NamedTuple):
-    """`phase`: number of the phase that begins (`flight.phases.PHASE_CODES`), None for another
+    """`phase`: number of the phase that begins (`flight.phases.Phase`), None for another
     event. `cause`: a word for what caused it, empty without one."""
 
     text: str

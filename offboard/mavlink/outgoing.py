@@ -15,8 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 
-from offboard.mavlink.events import Quaternion, Triple
+from offboard.mavlink.events import Quaternion
 from offboard.model import frames
+from offboard.model.command import Command, PositionCommand
 
 Message = Any  # of pymavlink, to be packed
 FLOAT32_MAX = 3.4028234663852886e38
@@ -62,16 +63,13 @@ class Record(Outgoing):
 class AttitudeTarget(Outgoing):
     """SET_ATTITUDE_TARGET, attitude and thrust.
 
-    `thrust_mps2` is thrust per unit of mass, `thrust_direction_ned` the commanded third body axis
-    (unit), `heading_rad` the commanded heading. `hover_thrust` is the normalised thrust that holds
-    the weight. `body_z_down` is the third component of the body's own third axis when the command
-    acts, for autopilots that divide by it; None: that of `thrust_direction_ned`.
+    `hover_thrust` is the normalised thrust that holds the weight. `body_z_down` is the third
+    component of the body's own third axis when the command acts, for autopilots that divide by it;
+    None: that of the commanded direction.
     """
 
     time_s: float
-    thrust_mps2: float
-    thrust_direction_ned: Triple
-    heading_rad: float
+    command: Command
     hover_thrust: float
     gravity_mps2: float = 9.81
     body_z_down: float | None = None
@@ -92,12 +90,13 @@ class AttitudeTarget(Outgoing):
 
     def attitude(self) -> Quaternion:
         """The commanded attitude."""
-        direction = np.asarray(self.thrust_direction_ned, dtype=np.float64)
-        _finite("thrust direction and heading", *direction, self.heading_rad)
+        direction = np.asarray(self.command.thrust_direction_ned, dtype=np.float64)
+        heading_rad = self.command.heading_rad
+        _finite("thrust direction and heading", *direction, heading_rad)
         norm = float(np.linalg.norm(direction))
         if not 0.9 < norm < 1.1:
             raise ValueError(f"thrust direction must be a unit vector; its length is {norm:g}")
-        quaternion = frames.quaternion_from_thrust_direction(direction / norm, self.heading_rad)
+        quaternion = frames.quaternion_from_thrust_direction(direction / norm, heading_rad)
         # last of all: ArduCopter drops a quaternion whose length differs from 1 by 0.0005
         quaternion = quaternion / np.linalg.norm(quaternion)
         w, x, y, z = (float(c) for c in (quaternion if quaternion[0] >= 0.0 else -quaternion))
@@ -106,15 +105,17 @@ class AttitudeTarget(Outgoing):
 
     def normalised_thrust(self, rule: ThrustRule) -> float:
         """Thrust 0 .. 1: u = u_h T / g, times the body's b_z if the autopilot divides by it."""
-        _finite("thrust", self.thrust_mps2, self.hover_thrust, self.gravity_mps2)
+        command = self.command
+        _finite("thrust", command.thrust_mps2, self.hover_thrust, self.gravity_mps2)
         if not (0.0 < self.hover_thrust < 1.0 and self.gravity_mps2 > 0.0):
             raise ValueError(
                 f"hover thrust must be within 0 and 1 and gravity positive, "
                 f"not {self.hover_thrust!r} and {self.gravity_mps2!r}"
             )
-        thrust = self.hover_thrust * self.thrust_mps2 / self.gravity_mps2
+        thrust = self.hover_thrust * command.thrust_mps2 / self.gravity_mps2
         if rule is ThrustRule.TILT_COMPENSATED:
-            down = self.thrust_direction_ned[2] if self.body_z_down is None else self.body_z_down
+            down = self.body_z_down
+            down = command.thrust_direction_ned[2] if down is None else down
             _finite("body_z_down", down)
             thrust *= down
         return min(max(thrust, 0.0), 1.0)
@@ -122,24 +123,12 @@ class AttitudeTarget(Outgoing):
 
 @dataclass(frozen=True, slots=True)
 class _Motion:
-    """A position, its derivatives and a heading."""
-
     time_s: float
-    position_ned_m: Triple
-    velocity_ned_mps: Triple
-    acceleration_ned_mps2: Triple
-    heading_rad: float
-    heading_rate_radps: float
+    command: PositionCommand
 
     def _fields(self) -> tuple[float, ...]:
         """From coordinate_frame and type_mask, 0: all in use, to yaw_rate, in MAVLink's order."""
-        numbers = (
-            *self.position_ned_m,
-            *self.velocity_ned_mps,
-            *self.acceleration_ned_mps2,
-            self.heading_rad,
-            self.heading_rate_radps,
-        )
+        numbers = self.command.numbers()
         _finite("a position target", *numbers)
         return _LOCAL_NED, 0, *numbers
 

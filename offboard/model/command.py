@@ -93,3 +93,8 @@ class PositionCommand:
     acceleration_ned_mps2: tuple[float, float, float]
     heading_rad: float
     heading_rate_radps: float
+
+    def numbers(self) -> tuple[float, ...]:
+        """All eleven, in this order, which is MAVLink's."""
+        vectors = (*self.position_ned_m, *self.velocity_ned_mps, *self.acceleration_ned_mps2)
+        return (*vectors, self.heading_rad, self.heading_rate_radps)

@@ -7,6 +7,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from offboard.model.command import PositionCommand
+
 Array = NDArray[np.float64]
 
 
@@ -28,6 +30,14 @@ class FlatSample(NamedTuple):
     heading_rad: Array
     heading_rate_radps: Array
     heading_acceleration_radps2: Array
+
+    def setpoint(self) -> PositionCommand:
+        """At one time: as a setpoint of the autopilot's position loop."""
+        position, velocity, acceleration = (
+            (float(vector[0]), float(vector[1]), float(vector[2])) for vector in self[:3]
+        )
+        heading_rad, rate_radps = float(self.heading_rad), float(self.heading_rate_radps)
+        return PositionCommand(position, velocity, acceleration, heading_rad, rate_radps)
 
 
 class Reference(Protocol):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from difflib import get_close_matches
 from importlib.metadata import version
 from pathlib import Path
@@ -192,10 +193,13 @@ def dump(config: FlightConfig) -> str:
 
 
 def flown(text: str) -> FlightConfig:
-    """The configuration in a log (`dump`ed then), without settings that no longer exist. Raises
-    DocumentError."""
+    """The configuration in a log (`dump`ed then), without settings that no longer exist, if there
+    are such. Raises DocumentError."""
     source = "the log's configuration"
-    return _validated(read(text, source), source, "ignore")
+    raw = read(text, source)
+    with suppress(DocumentError):
+        return _validated(raw, source)
+    return _validated(raw, source, "ignore")
 
 
 def _validated(raw: Raw, source: str, extra: Literal["ignore"] | None = None) -> FlightConfig:

@@ -82,6 +82,7 @@ class Loop:
         self._patience_s = patience_s
         self._supervisor = supervisor
         self._warned: set[str] = set()
+        self._unguarded = ""  # why nobody would land the vehicle, as the user knows it
         self._error = ""  # the first exception of this flight
         self._restarted_s = -RESTART_S
         self._succeeded_s = self._heard_s = clock.monotonic_s()
@@ -138,7 +139,7 @@ class Loop:
     def _send(self, frames: Sequence[bytes], began_s: float) -> list[bytes]:
         """Send what a turn has decided. This process may have been stopped since the turn began:
         then it is dropped, and returned."""
-        peer = self._companion.current.peer
+        peer = self._companion.current.session.peer
         dropped: list[bytes] = []
         for frame in frames:
             if self._supervisor and clock.monotonic_s() - began_s > STOPPED_S:
@@ -157,28 +158,24 @@ class Loop:
     # --- the supervisor ---
 
     def _check_supervisor(self) -> None:
-        """Start another one in place of one that has ended, while no flight needs this loop: it
-        waits some milliseconds for the new process."""
-        supervisor = self._supervisor
+        """Say whether it guards the flight. Start another one in place of one that has ended, while
+        no flight needs this loop: it waits some milliseconds for the new process."""
+        supervisor, current = self._supervisor, self._companion.current
         if supervisor is None:
             return
-        guarded = supervisor.guards
-        self._companion.current.guard(guarded)
-        if guarded and UNANSWERED in self._warned:
-            self._warned.discard(UNANSWERED)
-            self._companion.current.announce(ANSWERS)
-        elif supervisor.loaded and not (guarded or supervisor.lost):
-            self._warn(UNANSWERED)
-        if not supervisor.lost:
-            return
-        self._warn(UNGUARDED)
+        guards = supervisor.guards
+        current.guard(guards)
+        if supervisor.loaded:
+            unguarded = "" if guards else UNGUARDED if supervisor.lost else UNANSWERED
+            if unguarded != self._unguarded:
+                self._unguarded = unguarded
+                current.announce(unguarded or ANSWERS)
         now_s = clock.monotonic_s()
-        if self._companion.current.phase in WAITING and now_s - self._restarted_s >= RESTART_S:
+        waits = current.phase in WAITING and now_s - self._restarted_s >= RESTART_S
+        if supervisor.lost and waits:
             self._restarted_s = now_s
             with suppress(SupervisorError):
                 supervisor.restart()
-                self._warned -= {UNGUARDED, UNANSWERED}
-                self._companion.current.announce("another supervisor is started")
 
     def _taken_over(self) -> bool:
         """Whether the supervisor has the vehicle; then wait until it is done with it."""

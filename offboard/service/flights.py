@@ -162,7 +162,7 @@ class Flights:
     def _identity(self) -> str:
         """Autopilot, system id and the hardware's number, 0 where it has none; empty until they
         are known."""
-        found, uid = self.current.vehicle.found, self.current.vehicle.uid
+        found, uid = self._session.vehicle, self.current.vehicle.uid
         return f"{found.autopilot}-{found.system_id}-{uid:x}" if found and uid is not None else ""
 
     @property

@@ -1,10 +1,6 @@
 """What the service's next flight begins with: the configuration, read again while the service
 waits, and what earlier flights have identified of the vehicle.
 
-A thread resolves the configuration every `EVERY_S` while no vehicle follows us. One that has
-changed is built and called once, so that nothing is compiled in flight; one that cannot be used is
-refused with a sentence, and the one before stays in use.
-
 `DIR/vehicles/KEY.yaml` holds an identified vehicle, the delay of its tilt, and the vehicle file
 that it was identified from: for another vehicle file it is not used.
 """
@@ -36,9 +32,10 @@ EVERY_S = 2.0
 
 
 class Preparation:
-    """The newest usable configuration of those that `load` returns. The thread works only while it
-    is `allowed`: not while the vehicle is armed. Raises DocumentError if the first configuration
-    cannot be used."""
+    """The newest usable configuration of those that `load` returns. A thread calls it every
+    `EVERY_S` while it is `allowed`: not while the vehicle is armed. One that has changed is built
+    and called once, so that nothing is compiled in flight. Raises DocumentError if the first
+    configuration cannot be used."""
 
     def __init__(self, load: Callable[[], FlightConfig]) -> None:
         self._load = load

@@ -12,7 +12,6 @@ import select
 import signal
 import socket
 import stat
-import subprocess
 import sys
 from collections.abc import Hashable, Mapping
 from contextlib import suppress
@@ -21,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from offboard.link import clock
+from offboard.link.after_flight import begin
 from offboard.link.background import BackgroundWriter
 from offboard.link.interface import Link
 from offboard.link.log import append, entry
@@ -40,7 +40,7 @@ POLL_S = 0.02
 PAUSE_MAX_S = 0.1  # of a turn that counts as the controller's silence: the rest was a pause of ours
 BACKLOG_MAX = 20  # batches of the link that are read before the first request
 CLOSE_S = 2.0
-LANDING = 10  # custom_mode, `flight.phases.PHASE_CODES`: no other `offboard` begins a flight now
+LANDING = 10  # custom_mode, `flight.phases.Phase`: no other `offboard` begins a flight now
 DIED = "the controller ended in flight"
 HANGS = "the controller has not answered for {silent_s:g} s"
 
@@ -113,16 +113,14 @@ class TakeOver:
         beat = watch.newest
         self._tell = tell
         # JSON has no tuples
-        self._peer: Hashable = (
-            tuple(beat["peer"]) if isinstance(beat["peer"], list) else beat["peer"]
-        )
-        self._link = _link(watch.descriptors[:-1], str(self._peer) if beat["stream"] else "")
+        peer: Hashable = tuple(beat["peer"]) if isinstance(beat["peer"], list) else beat["peer"]
+        self._link = _link(watch.descriptors[:-1], str(peer) if beat["stream"] else "")
         self._log = BackgroundWriter[bytes](
             lambda entries: append(watch.descriptors[-1], entries), 100_000
         )
         signing = watch.key and Signing.resumed(watch.key, clock.monotonic_s, beat["signing"])
         self._session = Session(SessionSettings(stream=beat["stream"]), signing or None)
-        self._session.set_vehicle(known.vehicle, self._peer)
+        self._session.set_vehicle(known.vehicle, peer)
         self._session.status = ACTIVE, LANDING
         assert self._session.dialect is not None
         self._dialect = self._session.dialect
@@ -166,12 +164,8 @@ class TakeOver:
         if request:
             holds = request == self._dialect.hold()
             self._say(f"{'hold' if holds else 'land'} requested")
-        if self._recovery.refusal:
-            self._say(f"the vehicle answers {self._recovery.refusal}")
-            self._recovery.refusal = ""
-        if self._recovery.notice:
-            self._say(self._recovery.notice)
-            self._recovery.notice = ""
+        while self._recovery.news:
+            self._say(self._recovery.news.pop(0))
 
     def _say(self, sentence: str) -> None:
         """To the controller or its terminal, to the ground station and to the log."""
@@ -189,7 +183,7 @@ class TakeOver:
     def _send(self, *messages: Outgoing) -> None:
         for message in messages:
             frame = self._session.encode(message)
-            self._link.send(frame, self._peer)
+            self._link.send(frame, self._session.peer)
             self._record(frame)
 
     def _record(self, *frames: bytes) -> None:
@@ -268,13 +262,7 @@ def _score(log: int) -> None:
     with suppress(OSError):
         path = Path(f"/proc/self/fd/{log}").readlink()
         if path.name == "flight.tlog":
-            subprocess.Popen(
-                [sys.executable, "-P", "-m", "offboard", "score", str(path.parent)],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-                start_new_session=True,
-            )
+            begin("score", path.parent)
 
 
 def _say_to(channel: socket.socket, sentence: str) -> None:

@@ -1,16 +1,9 @@
 """Recovery: what the supervisor asks of a vehicle that has lost its controller. No I/O, no clock.
 
-Hold, and after some seconds land; at once land, if the controller was landing it. Both are
-requested only while the vehicle shows the mode of our setpoints or one that we requested, and at
-most once for each report of the mode. Any other mode is the decision of a pilot or of the vehicle's
-own failsafe, and final, whatever is reported after it.
-So is hold if it was reported before our request, if the vehicle did not acknowledge the request
-though it was repeated, or if it comes after the landing mode.
-
-The failsafe for missing setpoints is an exception: it acts because the controller has ended. It is
-recognised by its mode, by its time and by HEARTBEAT.system_status, which a pilot's choice clears.
-In it the vehicle is observed, and asked to land if it does not descend by itself; not while it
-receives a pilot's sticks.
+Hold, and after some seconds land; at once land, if the controller was landing it. README.md has the
+modes in which, and which of them are a pilot's. The failsafe for missing setpoints acts because the
+controller has ended: it is recognised by its mode, its time and HEARTBEAT.system_status, which a
+pilot's choice clears.
 """
 
 from __future__ import annotations
@@ -22,6 +15,7 @@ from offboard.mavlink.dialects.base import NEVER, Dialect, SetpointLoss
 from offboard.mavlink.events import (
     CRITICAL,
     GOOD_RESULTS,
+    MODE_KNOWN_S,
     CommandAck,
     Event,
     Heartbeat,
@@ -36,7 +30,6 @@ REPEAT_S = 0.3  # between two requests
 UNHEARD_MAX = 3  # requests to a vehicle of which nothing is heard
 HOLD_S = 5.0  # then land
 ACKNOWLEDGED_S = 3.0  # after hold is reported; it is asked for again until then
-FRESH_S = 2.5  # an older report of the mode is no reason for a command
 LONGEST_S = 300.0
 EARLY_S = 0.3  # the newest setpoint left before the newest beat, and may have been lost
 SINK_MPS = 0.2  # downward speed of a vehicle that lands, within SINK_S
@@ -75,17 +68,15 @@ class Supervised:
 class Recovery:
     """Begins at `began_s`; the newest beat of the controller was at `beat_s`, and said `known`.
 
-    `ended` says how it ended, empty until then; `refusal` and `notice` have news for the user."""
+    `ended` says how it ended, empty until then; `news` are sentences for the user."""
 
-    def __init__(
-        self, dialect: Dialect, known: Supervised, began_s: float, beat_s: float = math.inf
-    ) -> None:
+    def __init__(self, dialect: Dialect, known: Supervised, began_s: float, beat_s: float) -> None:
         self._dialect = dialect
         self._holding = known.holding
         self._hold_s = 0.0 if known.landing else HOLD_S
         self._began_s = began_s
         self._loss = known.loss
-        missing_s = min(beat_s, began_s) + known.loss.after_s - EARLY_S
+        missing_s = beat_s + known.loss.after_s - EARLY_S
         self._loses_s = -math.inf if known.starved else missing_s
         self._sticks = known.sticks
         self._mode: str | None = None
@@ -105,8 +96,7 @@ class Recovery:
         self._heartbeat_s = -math.inf
         self._requests = 0
         self._held_s = math.inf  # since when it holds
-        self.refusal = ""  # of the newest request
-        self.notice = ""
+        self.news: list[str] = []
         self.ended = ""
 
     def see(self, event: Event, at_s: float) -> None:
@@ -123,7 +113,7 @@ class Recovery:
             case LocalPosition(velocity_ned_mps=(_, _, down_mps)) if down_mps > SINK_MPS:
                 self._sank_s = at_s
             case CommandAck(_, result) if result not in GOOD_RESULTS:
-                self.refusal = result
+                self.news.append(f"the vehicle answers {result}")
             case CommandAck(command) if command == self._dialect.hold().command:
                 self._acknowledged |= at_s > self._first_s
 
@@ -155,7 +145,7 @@ class Recovery:
         followed = fell or self._before in (None, self._dialect.engage_mode)
         missing = followed and not self._acknowledged and at_s >= self._loses_s
         if missing and mode in self._loss.modes and self._sticks:
-            self.notice = f"{mode} for missing setpoints, and it receives a pilot's sticks"
+            self.news.append(f"{mode} for missing setpoints, and it receives a pilot's sticks")
         lands = mode == self._dialect.land_mode
         return missing and mode in self._loss.modes and not lands and not self._sticks
 
@@ -163,7 +153,7 @@ class Recovery:
         self._fallen_s = min(self._fallen_s, at_s)
         if shown and not self._fallen_shown:
             self._fallen_shown = True
-            self.notice = f"its own failsafe flies it, in {mode}: watching that it lands"
+            self.news.append(f"its own failsafe flies it, in {mode}: watching that it lands")
 
     def due(self, now_s: float) -> CommandLong | None:
         """What to ask for now."""
@@ -199,10 +189,10 @@ class Recovery:
     def _wanted(self, now_s: float) -> CommandLong | None:
         hold, land = self._dialect.hold(), CommandLong.land()
         first = hold if now_s - self._began_s < self._hold_s else land
-        fresh = now_s - self._reported_s < FRESH_S
+        known = now_s - self._reported_s <= MODE_KNOWN_S
         if self._mode is None:
-            return first if fresh and self._requests < UNHEARD_MAX else None
-        answered = self._reported_s > self._asked_s and fresh
+            return first if known and self._requests < UNHEARD_MAX else None
+        answered = self._reported_s > self._asked_s and known
         if self._fallen_s < math.inf:
             lands = self._mode == self._dialect.return_mode or now_s - self._sank_s < SINK_S
             due = self._fallen_shown and now_s - self._fallen_s >= HOLD_S

@@ -1,12 +1,8 @@
 """The supervisor, as the controller sees it: a process that outlives it.
 
-The loop tells it in every turn whether the vehicle is ours and in the air (`Supervised`). When
-these beats stop for `Supervised.silent_s`, or the controller ends meanwhile, the process
-takes over the link and asks the vehicle to hold, then to land. From then on the controller must not
-send.
-
-Beats are JSON lines on a socket pair, and so are the answers; an empty one says that it has read
-what we sent. The descriptors of link and log go along when they change.
+From the moment when it takes over the controller must not send. Beats are JSON lines on a socket
+pair, and so are the answers; an empty one says that it has read what we sent. The descriptors of
+link and log go along when they change.
 """
 
 from __future__ import annotations

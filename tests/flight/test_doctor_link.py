@@ -197,4 +197,4 @@ def test_flood_of_addresses_and_ids_is_bounded() -> None:
 
     seen = bench(before=before).listen()
     assert len(seen.heard.senders.found) == 64
-    assert seen.vehicle.found is not None
+    assert seen.found is not None

@@ -12,6 +12,7 @@ import tty
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -66,7 +67,7 @@ class Brief(Silent):
     """A companion whose flight lasts `turns`, in each of which `during` happens, and which counts
     stop requests. `sends` are the frames of the turn in progress, `log` what it logs."""
 
-    peer, outcome = None, None
+    session, outcome = SimpleNamespace(peer=None), None
     guarded = True
     limits = Limits()
     stops = dropped = 0
@@ -286,7 +287,7 @@ def test_another_supervisor_is_started_but_not_in_flight(
     fly(flight, tmp_path, supervisor=Starting())
     assert restarted_s == restarts
     assert flight.guarded is bool(restarts)
-    assert flight.announced == [UNGUARDED, "another supervisor is started"][: 1 + bool(restarts)]
+    assert flight.announced == [UNGUARDED, ANSWERS][: 1 + bool(restarts)]
 
 
 # -- what fails in this process --------------------------------------------------------------------

@@ -43,7 +43,7 @@ def actions(*moments: Sequence[str], rows: Sequence[Row] = ROWS) -> list[Action]
     for number, names in enumerate(moments):
         holding.clear()
         holding.update(names)
-        flight.now_s = NOW_S + STEP_S * number
+        flight.vehicle.now_s = NOW_S + STEP_S * number
         judge(flight, driven)
         seen.append(flight.failsafe.action)
     return seen
@@ -88,11 +88,11 @@ def test_of_equally_bad_rows_the_report_of_the_mode_is_named() -> None:
 def test_neither_a_step_back_of_time_nor_a_gap_of_telemetry_counts() -> None:
     for last, action in ((50.125, HOLD), (50.0625, FLY)):
         flight = uneventful()
-        for flight.now_s in (100.0, 100.1875, 100.375, 50.0, last):
+        for flight.vehicle.now_s in (100.0, 100.1875, 100.375, 50.0, last):
             judge(flight, [replace(BY_NAME["link"], condition=lambda _: True)])
         assert flight.failsafe.action is action
     flight = uneventful()
-    for flight.now_s, holds in ((100.0, False), (100.8, True)):
+    for flight.vehicle.now_s, holds in ((100.0, False), (100.8, True)):
         judge(flight, [replace(BY_NAME["tilt error"], condition=lambda _, now=holds: now)])
     assert flight.failsafe.action is FLY
 
@@ -100,6 +100,11 @@ def test_neither_a_step_back_of_time_nor_a_gap_of_telemetry_counts() -> None:
 # --- each row at its limit ------------------------------------------------------------------------
 
 Measure = Callable[[Any, Any], object]
+
+
+def hears_another(flight: FlightState, since_s: float) -> None:
+    flight.vehicle.update(OtherSender(1, 190, 82), NOW_S - since_s)
+    flight.vehicle.now_s = NOW_S
 
 
 def holding(**values: Callable[[Any], Any]) -> Measure:
@@ -238,9 +243,7 @@ MEASURED: list[tuple[str, Measure, Any, Any]] = [
     ("battery", lambda flight, left: hear(flight, SystemHealth(True, left)), 0.1, 0.09),
     ("thrust reserve", hovers, 0.9, 0.91),
     ("full thrust", sinks, 0.3, 0.31),
-    ("second sender",
-     lambda flight, since_s: flight.vehicle.heard_s.update({OtherSender: NOW_S - since_s}),
-     5.0, 4.9),
+    ("second sender", hears_another, 5.0, 4.9),
     ("other setpoints", follows, "POSCTL", "OFFBOARD"),
     ("clock", clock(jumped_s=float), 0.0, 0.6),
     ("contradiction", holding(identification=lambda why: SimpleNamespace(contradiction=why)),

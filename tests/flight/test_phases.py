@@ -116,7 +116,7 @@ def _refuse_arming(flight: FlightState) -> None:
 
 def _lift_off(flight: FlightState) -> None:
     for step in range(4):
-        flight.now_s = NOW_S + 0.1 * step
+        flight.vehicle.now_s = NOW_S + 0.1 * step
         position(flight, -0.3 - 0.01 * step)
 
 
@@ -149,8 +149,7 @@ def _identify(**values: Any) -> Setup:
 
 # what makes each condition hold
 EVENTS: dict[str, Setup] = {
-    "vehicle_found": lambda flight: hear(flight, VehicleFound(1, 1, "px4")),
-    "ready": _fit,
+    "vehicle_found": lambda flight: vars(flight.session).update(vehicle=VehicleFound(1, 1, "px4")),
     "usable": _fit,
     "refused": lambda flight: vars(flight.session).update(refusals=["no multirotor"]),
     "armed_already": _all(
@@ -198,7 +197,6 @@ EVENTS: dict[str, Setup] = {
     "not_disarmed": _since(Limits().land_s + 0.1),
     "blind": _age_attitude,
     "stop_requested": _stop,
-    "stopped_before_takeoff": _stop,
     "stop_requested_on_ground": _all(_rest, _set(stop_reason="stop requested")),
     "rises": _lift_off,
     "engaged_by_pilot": _all(_engage(engaged=True), _fit),
@@ -217,11 +215,16 @@ EVENTS: dict[str, Setup] = {
 @pytest.fixture(autouse=True)
 def preflight_list(monkeypatch: pytest.MonkeyPatch) -> None:
     """The preflight list finds what `EVENTS` says."""
-    monkeypatch.setattr(starting, "ground_of", lambda flight: vars(flight.session))
-    monkeypatch.setattr(
-        preflight, "not_ready", lambda known: "" if known.get("ready") else "not yet"
-    )
-    monkeypatch.setattr(preflight, "refusals", lambda known: known.get("refusals", []))
+
+    def not_ready(ground: Any) -> str:
+        return "" if vars(ground.session).get("ready") else "not yet"
+
+    def refusals(ground: Any) -> list[str]:
+        return vars(ground.session).get("refusals", [])
+
+    monkeypatch.setattr(starting, "ground_of", lambda flight: flight)
+    monkeypatch.setattr(preflight, "not_ready", not_ready)
+    monkeypatch.setattr(preflight, "refusals", refusals)
     monkeypatch.setattr(preflight, "unfit_type", lambda known: "")
 
 
@@ -342,18 +345,19 @@ def test_no_way_out_of_the_air_leaves_the_vehicle_unasked(service: ServiceOption
 def test_a_vehicle_that_reboots_as_it_arms_counts_as_unheard_from_then_on() -> None:
     """Not for ever: a landing that follows at once waits for its HEARTBEAT."""
     flight = uneventful(Phase.ARM)
+    flight.identification = None
     flight.session.link_time_s, flight.observer.reset = NOW_S, lambda: None  # type: ignore[misc]
     telemetry.update(flight, Rebooted(0.0), NOW_S, turned_s=NOW_S)
-    flight.now_s += 4.0
+    flight.vehicle.now_s += 4.0
     assert flight.unreached_s == pytest.approx(4.0)
 
 
 def test_only_a_heartbeat_newer_than_the_acceptance_shows_a_disarming() -> None:
     """On a lossy link arming may be accepted late, and the next HEARTBEAT be lost."""
     flight = uneventful(Phase.ARM)
-    flight.now_s = flight.vehicle.now_s = NOW_S + 0.1
+    flight.vehicle.now_s = NOW_S + 0.1
     hear(flight, CommandAck(400, "ACCEPTED"))
-    flight.now_s = flight.vehicle.now_s = NOW_S + 2.7
+    flight.vehicle.now_s = NOW_S + 2.7
     assert next_row(flight) is None
     heartbeat(flight, armed=False)
     row = next_row(flight)

@@ -21,6 +21,7 @@ from offboard.mavlink.dialects.px4 import PX4
 from offboard.mavlink.events import CommandAck, Event, Heartbeat, ModeReport, VehicleFound
 from offboard.mavlink.outgoing import AttitudeTarget, CommandLong
 from offboard.mavlink.session import Session, SessionSettings
+from offboard.model.command import Command
 from offboard.supervisor.recovery import LONGEST_S, Recovery, Supervised
 from simulator import config
 from simulator.instance import Instance
@@ -40,7 +41,7 @@ def asked(
 ) -> tuple[list[tuple[float, int]], str]:
     """What is asked, and when, of a vehicle that has shown the mode `shown` 0.4 s before the
     recovery begins at 0 s, and reports these `events` at these times; and how it ended."""
-    recovery, waiting = Recovery(dialect, known, 0.0), sorted(events, key=lambda each: each[0])
+    recovery, waiting = Recovery(dialect, known, 0.0, 0.0), sorted(events, key=lambda each: each[0])
     if shown:
         recovery.see(Heartbeat(shown, True, 4, 2), -0.4)
     commands: list[tuple[float, int]] = []
@@ -189,10 +190,10 @@ def test_leaving_the_landing_mode_as_it_disarms_is_no_choice() -> None:
 
 
 def test_a_refusal_is_kept_to_be_said() -> None:
-    recovery = Recovery(PX4, OURS, 0.0)
-    for result, refusal in (("ACCEPTED", ""), ("DENIED", "DENIED")):
+    recovery = Recovery(PX4, OURS, 0.0, 0.0)
+    for result, said in (("ACCEPTED", []), ("DENIED", ["the vehicle answers DENIED"])):
         recovery.see(CommandAck(HOLD, result), 0.1)
-        assert recovery.refusal == refusal
+        assert recovery.news == said
 
 
 # -- against the failsafe for missing setpoints ----------------------------------------------------
@@ -228,7 +229,7 @@ def recovered(
     session, result = Session(SessionSettings()), Recovered()
     session.set_vehicle(VEHICLE, "vehicle")
     instance.feed(session.encode(CommandLong.message_interval(436, 50.0)))  # CURRENT_MODE
-    level = session.encode(AttitudeTarget(0.0, 9.81, (0.0, 0.0, 1.0), 0.0, 0.489))
+    level = session.encode(AttitudeTarget(0.0, Command(9.81, (0.0, 0.0, 1.0), 0.0), 0.489))
     loss = PX4.setpoint_loss({"COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": fallback})
     known = Supervised(VEHICLE, ours=True, flying=True, reported_s=0.0, loss=loss)
     recovery: Recovery | None = None
@@ -237,7 +238,7 @@ def recovered(
         if now_s < 1e-9 and step % 25 == 0:
             instance.feed(level)
         if recovery is None and now_s >= silent_s:
-            recovery = Recovery(PX4, known, now_s, beat_s=0.0)
+            recovery = Recovery(PX4, known, now_s, 0.0)
         if now_s >= pilot[0]:
             commander.switch(pilot[1])
             pilot = (math.inf, "")

@@ -32,7 +32,7 @@ from watch import (
     sent_after,
 )
 
-from offboard.flight.phases import PHASE_CODES, Action, Phase
+from offboard.flight.phases import Action, Phase
 from offboard.identification.learner import IdentifySettings
 from simulator import config as simulated
 from simulator.firmware.px4 import PX4
@@ -44,7 +44,7 @@ TRACKING = in_phase(Phase.TRACK, 1.0)
 
 def another_companion(**fault: Any) -> Any:
     """A second `offboard fly` that tracks: our own ids."""
-    tracks = {"system": 1, "component": 191, "custom_mode": PHASE_CODES[Phase.TRACK]}
+    tracks = {"system": 1, "component": 191, "custom_mode": Phase.TRACK.code}
     return scenario_of({"fault": "second_sender", **tracks, **fault})
 
 
@@ -292,7 +292,7 @@ def test_a_vehicle_that_another_has_is_refused(on: Vehicle, scenario: Any, says:
 
 def test_a_second_flight_that_waits_disturbs_no_flight() -> None:
     """By mistake, on another port: it has our ids, and is refused, see above."""
-    waits = another_companion(setpoint_rate_hz=0, custom_mode=PHASE_CODES[Phase.HEALTH])
+    waits = another_companion(setpoint_rate_hz=0, custom_mode=Phase.HEALTH.code)
     pair = copter.hover(scenario=waits)
     flown(pair, failsafes=())
     assert said(pair, "another companion computer is on the link: system 1 component 191")

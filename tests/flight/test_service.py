@@ -23,7 +23,7 @@ from serving import (
     serve,
 )
 
-from offboard.flight.phases import TRACKING, Phase, Request
+from offboard.flight.phases import TRACKING, Phase
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from simulator import config as simulated
@@ -485,8 +485,6 @@ def test_a_request_is_accepted_again_and_no_more_once_the_flight_ends(served: Se
     is handed back, or lands, will pause."""
     pair = served.engaged("ardupilot", reference="lemniscate")
     pair.until(lambda: pair.phase is Phase.TRACK, 30.0)
-    pair.state.request = pair.state.obeyed = Request.CONTINUE  # accepted in PAUSE, which has ended
-    pair.run(0.2)
     pair.command(PAUSE_CONTINUE, 1.0)
     pair.run(0.2)
     rejected = (PAUSE_CONTINUE, TEMPORARILY_REJECTED)

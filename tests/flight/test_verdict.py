@@ -23,7 +23,7 @@ from offboard.analysis.score_table import summary, verdict
 from offboard.cli.commands import app
 from offboard.flight.flight import Outcome
 from offboard.flight.ground_contact import Touchdown
-from offboard.flight.phases import PHASE_CODES, Action, Phase
+from offboard.flight.phases import Action, Phase
 from offboard.identification.learner import IdentifySettings
 from offboard.link.log import FlightLog
 from offboard.model.frames import thrust_direction_from_quaternion
@@ -127,7 +127,7 @@ def test_a_flight_is_not_completed_that_is_not_tracked_landed_and_disarmed(flown
     records, heartbeat = flown.records, flown.heartbeat.copy()
     since_s = records["time_s"] - track_begin_s(flown)
     heartbeat["armed"][-1] = 1
-    tracked = records["phase"] == PHASE_CODES[Phase.TRACK]
+    tracked = records["phase"] == Phase.TRACK.code
     for changed, why in (
         ({"records": records[(since_s < 0.45) | (since_s > 2.45)]}, "2.1 s of the reference were"),
         ({"records": records[~tracked | (since_s < 0.05)]}, "too short at full speed to be scored"),
@@ -257,7 +257,7 @@ def test_the_outcome_follows_the_log(flown: History) -> None:
 def test_a_record_says_what_was_sent(px4_like: Pair) -> None:
     """Identification steps change the command after the decision: no certificate then."""
     flown = px4_like.history()
-    excited = flown.records["phase"] == PHASE_CODES[Phase.EXCITE]
+    excited = flown.records["phase"] == Phase.EXCITE.code
     certified = np.isfinite(flown.records["gap"])
     assert excited.sum() > 20
     assert certified[~excited].all()
@@ -284,7 +284,7 @@ def beside(flown: History, offset_m: Callable[[np.ndarray], np.ndarray]) -> Hist
 
 
 def track_begin_s(flown: History) -> float:
-    track = flown.records["phase"] == PHASE_CODES[Phase.TRACK]
+    track = flown.records["phase"] == Phase.TRACK.code
     return float(flown.records["time_s"][track][0])
 
 

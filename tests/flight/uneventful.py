@@ -60,6 +60,8 @@ def uneventful(phase: Phase = Phase.TRACK, service: ServiceOptions | None = None
         counters=None,
         link_time_s=NOW_S,
         time=SimpleNamespace(mixed=False),
+        vehicle=None,
+        dialect=None,
         rates_hz={"ATTITUDE_QUATERNION": 50.0, "LOCAL_POSITION_NED": 30.0},
     )
     observer: Any = SimpleNamespace(
@@ -82,14 +84,13 @@ def uneventful(phase: Phase = Phase.TRACK, service: ServiceOptions | None = None
         identification=identification,
         service=service,
         phase=phase,
-        now_s=NOW_S,
         began_s=NOW_S,
     )
     flight.vehicle.now_s = NOW_S
     flight.pilot.unclaimed = False
     if phase is Phase.CONNECT:
         return flight
-    flight.dialect = PX4
+    session.dialect = PX4
     flight.authority = Authority("OFFBOARD")
     hear(flight, Attitude(NOW_S, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
     hear(flight, Landed("on_ground"))

@@ -77,6 +77,11 @@ def observe(
     return observer, positions, disturbances
 
 
+def noise_sds(observer: Observer) -> Array:
+    """Noise of position (m) and reported velocity (m/s), as estimated (2,)."""
+    return np.sqrt(observer.estimated.variances)
+
+
 def rms(errors: Array, share: float = 0.5) -> float:
     """The RMS of the last `share` of the rows, per axis."""
     return float(np.sqrt(np.mean(errors[-round(share * len(errors)) :] ** 2)))
@@ -88,8 +93,8 @@ def test_white_noise_is_measured_and_filtered(gap_s: float) -> None:
     most 0.6 cm per sample at 125 Hz is left; with R as configured, 2 mm, 1 cm."""
     flown = hover(25.0, gap_s, seed=1, drift=0.1)
     observer, adapted, _ = observe(flown, white=(0.02, 0.05))
-    assert observer.noise_sds[0] == pytest.approx(0.02, rel=0.25)
-    assert observer.noise_sds[1] == pytest.approx(0.05, rel=0.25)
+    assert noise_sds(observer)[0] == pytest.approx(0.02, rel=0.25)
+    assert noise_sds(observer)[1] == pytest.approx(0.05, rel=0.25)
     if gap_s == 0.008:
         assert rms(adapted - flown.positions) < 0.006
 
@@ -100,10 +105,10 @@ def test_estimate_that_wanders_is_neither_noise_nor_gusts() -> None:
     kicks, 0.0103 m/s, is taken for noise of the velocity."""
     for seed in (3, 4):
         observer, _, _ = observe(hover(20.0, 0.008, seed=seed, kicks=0.2))
-        assert observer.noise_sds[0] == NOISE.position_sd_m
-        assert observer.noise_sds[1] < 0.011
+        assert noise_sds(observer)[0] == NOISE.position_sd_m
+        assert noise_sds(observer)[1] < 0.011
         floor = NOISE.disturbance_mps2
-        assert observer.drift_densities_mps2 == pytest.approx([floor, floor], rel=0.3)
+        assert observer.estimated.drift_mps2 == pytest.approx([floor, floor], rel=0.3)
 
 
 def test_gusts_are_followed_faster() -> None:
@@ -113,16 +118,16 @@ def test_gusts_are_followed_faster() -> None:
     flown = hover(20.0, 0.01, seed=6, drift=0.7)
     _, _, fixed = observe(flown, FIXED_DRIFT)
     early, _, _ = observe(flown, adopted=False)
-    assert early.drift_densities_mps2[1] == NOISE.disturbance_mps2
-    assert early.drift_densities_mps2[0] > 0.5
+    assert early.estimated.drift_mps2[1] == NOISE.disturbance_mps2
+    assert early.estimated.drift_mps2[0] > 0.5
     observer, _, adapted = observe(flown)
-    assert min(observer.drift_densities_mps2) > 0.5
+    assert min(observer.estimated.drift_mps2) > 0.5
     assert rms(adapted - flown.disturbances) < 0.7 * rms(fixed - flown.disturbances)
     for i in range(2000):
         time_s = 20.0 + 0.01 * i
         observer.on_attitude(time_s, UPRIGHT, STILL)
         observer.on_position(time_s, tuple(flown.positions[-1]), STILL)
-    assert observer.drift_densities_mps2 == pytest.approx([0.15, 0.15])
+    assert observer.estimated.drift_mps2 == pytest.approx([0.15, 0.15])
 
 
 def test_jumps_are_not_noise_and_do_not_hide_gusts() -> None:
@@ -130,18 +135,18 @@ def test_jumps_are_not_noise_and_do_not_hide_gusts() -> None:
     flown = hover(15.0, 0.01, seed=9, drift=0.7)
     jumps = 2.0 * np.cumsum(np.arange(len(flown.times)) % 100 == 50)[:, None]
     observer, _, _ = observe(Hover(flown.times, flown.positions + jumps, *[flown.velocities] * 2))
-    assert observer.noise_sds[0] == NOISE.position_sd_m
-    assert observer.drift_densities_mps2[0] > 0.5
+    assert noise_sds(observer)[0] == NOISE.position_sd_m
+    assert observer.estimated.drift_mps2[0] > 0.5
 
 
 def test_estimates_are_bounded_and_cleared_by_a_reset() -> None:
     noise = replace(NOISE, disturbance_limit_mps2=0.4)
     observer, _, _ = observe(hover(15.0, 0.01, seed=10, drift=2.0), noise, (0.05, 0.0))
-    assert observer.noise_sds[0] > 0.03
-    assert max(observer.drift_densities_mps2) <= 0.4
+    assert noise_sds(observer)[0] > 0.03
+    assert max(observer.estimated.drift_mps2) <= 0.4
     observer.reset()
-    assert observer.noise_sds == pytest.approx(START_SDS)
-    assert observer.drift_densities_mps2 == pytest.approx([0.15, 0.15])
+    assert noise_sds(observer) == pytest.approx(START_SDS)
+    assert observer.estimated.drift_mps2 == pytest.approx([0.15, 0.15])
 
 
 def test_positions_that_an_attitude_has_overtaken_leave_the_noise_finite() -> None:
@@ -153,5 +158,5 @@ def test_positions_that_an_attitude_has_overtaken_leave_the_noise_finite() -> No
         observer.on_attitude(time_s + 0.05, UPRIGHT, STILL)
         observer.on_position(time_s, (1e-4 * (i % 3), 0.0, -2.0), STILL)
         observer.on_position(time_s + 0.02, (1e-4 * (i % 2), 0.0, -2.0), STILL)
-    assert np.isfinite(observer.noise_sds).all()
+    assert np.isfinite(noise_sds(observer)).all()
     assert np.isfinite(observer.predict(8.0).position_ned_m).all()

@@ -25,10 +25,11 @@ from offboard.mavlink.outgoing import (
 )
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.texts import TextAssembler, chunks
+from offboard.model.command import Command, PositionCommand
 
-LEVEL = AttitudeTarget(12.345, 9.81, (0.0, 0.0, 1.0), 0.0, 0.489)
+LEVEL = AttitudeTarget(12.345, Command(9.81, (0.0, 0.0, 1.0), 0.0), 0.489)
 MOTION = ((1.0, 2.0, -3.0), (0.1, 0.2, 0.3), (0.4, 0.5, 0.6), 0.5, 0.25)
-POSITION = PositionTarget(1.0, *MOTION)
+POSITION = PositionTarget(1.0, PositionCommand(*MOTION))
 
 
 def sent(value: Outgoing, autopilot: int = PX4, system_id: int = 7) -> Any:
@@ -48,7 +49,7 @@ def test_body_axes_have_the_commanded_direction() -> None:
         direction /= np.linalg.norm(direction)
         heading_rad = generator.uniform(-20.0, 20.0)
         given = tuple((direction * generator.uniform(0.95, 1.05)).tolist())
-        value = replace(LEVEL, thrust_direction_ned=given, heading_rad=heading_rad)
+        value = replace(LEVEL, command=Command(9.81, given, heading_rad))
         w, x, y, z = quaternion = understood(session.encode(value)).q
         assert abs(np.linalg.norm(quaternion) - 1.0) < 1e-6
         assert w >= 0.0
@@ -77,24 +78,30 @@ TILTED = (0.5, 0.0, math.cos(math.pi / 6))  # 30 degrees
 def test_thrust_rules(
     autopilot: int, thrust_mps2: float, direction: Any, body_z_down: Any, expected: float
 ) -> None:
-    value = AttitudeTarget(1.0, thrust_mps2, direction, 0.0, 0.489, body_z_down=body_z_down)
+    command = Command(thrust_mps2, direction, 0.0)
+    value = AttitudeTarget(1.0, command, 0.489, body_z_down=body_z_down)
     assert sent(value, autopilot).thrust == pytest.approx(expected, abs=1e-6)
 
 
 def test_what_is_not_finite_or_out_of_range_is_refused() -> None:
-    numbers = ("time_s", "thrust_mps2", "heading_rad", "hover_thrust", "gravity_mps2")
+    bad = (math.nan, math.inf, -math.inf)
     refused: list[tuple[Outgoing, str]] = [
-        (replace(LEVEL, **{name: bad}), "finite")  # type: ignore[arg-type]
-        for name in (*numbers, "body_z_down")
-        for bad in (math.nan, math.inf, -math.inf)
+        (replace(LEVEL, **{name: each}), "finite")  # type: ignore[arg-type]
+        for name in ("time_s", "hover_thrust", "gravity_mps2", "body_z_down")
+        for each in bad
     ]
     refused += [
-        (replace(LEVEL, thrust_direction_ned=(math.nan, 0.0, 1.0)), "finite"),
-        (replace(LEVEL, thrust_direction_ned=(0.0, 0.0, 2.0)), "unit vector"),
+        (replace(LEVEL, command=replace(LEVEL.command, **{name: each})), "finite")
+        for name in ("thrust_mps2", "heading_rad")
+        for each in bad
+    ]
+    refused += [
+        (replace(LEVEL, command=Command(9.81, (math.nan, 0.0, 1.0), 0.0)), "finite"),
+        (replace(LEVEL, command=Command(9.81, (0.0, 0.0, 2.0), 0.0)), "unit vector"),
         (replace(LEVEL, hover_thrust=1.0), "hover thrust"),
         (CommandLong(22, (math.inf,)), "finite"),
         (CommandLong(22, (1e39,)), "finite"),
-        (replace(POSITION, position_ned_m=(0.0, math.nan, 0.0)), "finite"),
+        (PositionTarget(1.0, PositionCommand((0.0, math.nan, 0.0), *MOTION[1:])), "finite"),
         (replace(POSITION, time_s=-1.0), "finite"),
         (ParamRead(""), "1 to 16"),
         (ParamRead("A_NAME_OF_17_CHAR"), "1 to 16"),
@@ -149,7 +156,11 @@ def test_positions_and_references() -> None:
     session = pinned(Sender(7))
     for value, kind, component in (
         (POSITION, "SET_POSITION_TARGET_LOCAL_NED", 191),
-        (ReferenceRecord(2**32 / 1e3 + 1.0, *MOTION), "POSITION_TARGET_LOCAL_NED", 192),
+        (
+            ReferenceRecord(2**32 / 1e3 + 1.0, PositionCommand(*MOTION)),
+            "POSITION_TARGET_LOCAL_NED",
+            192,
+        ),
     ):
         fields = understood(session.encode(value))
         assert (fields.get_type(), fields.get_srcComponent()) == (kind, component)
