@@ -34,9 +34,11 @@ def test_fails(sitl):
     vehicle.close()
     pytest.fail("it fails")
 
-def test_is_perfect(fly):
+def test_is_perfect(fly, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    pathlib.Path("mine.yaml").write_text("{name: mine, conditions: {thrust_scale: 1.01}}")
     settings = ("reference.duration_s=1.0", "reference.height_m=1.0", "identify.online=false")
-    flight = fly(reference="hover", scenario="calm", seed=3, settings=settings)
+    flight = fly(reference="hover", scenario="mine.yaml", seed=3, settings=settings)
     assert flight.log.exists()
     assert flight.score.rmse_position_m < 0.05
     assert flight.score.rmse_position_m < 0.0
