@@ -83,13 +83,13 @@ def fly(
 
     def fly_once(
         *,
-        reference: str | None = None,
-        controller: str | None = None,
-        vehicle: str | None = None,
-        scenario: str | None = None,
+        reference: str | Path | None = None,
+        controller: str | Path | None = None,
+        vehicle: str | Path | None = None,
+        scenario: str | Path | None = None,
         firmware: str = "px4",
         seed: int | None = None,
-        config: str = "flight",
+        config: str | Path = "flight",
         settings: Sequence[str] = (),
         must_succeed: bool = True,
     ) -> Flight:
@@ -102,11 +102,12 @@ def fly(
         flown.append(directory / "flight.tlog")
         problem, outcome = "", None
         try:
-            simulated = Simulated(firmware, scenario)
+            simulated = Simulated(firmware, str(scenario) if scenario else None)
             simulated.check()
+            chosen = {"reference": reference, "controller": controller, "vehicle": vehicle}
             flown_config = load(
-                config,
-                choices={"reference": reference, "controller": controller, "vehicle": vehicle},
+                str(config),
+                choices={part: str(file) for part, file in chosen.items() if file},
                 assignments=settings,
                 seed=seed,
                 known_vehicle=simulated.known_vehicle,

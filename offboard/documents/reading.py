@@ -20,7 +20,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 from yaml.representer import SafeRepresenter
 
-from offboard.documents.errors import DocumentError, abridged, meant, shown
+from offboard.documents.errors import DocumentError, abridged, counted, meant, shown
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -287,13 +287,16 @@ def _with(value: Any, keys: list[str], new: Any, option: str) -> Any:
     if not keys:
         return new
     key, rest = keys[0], keys[1:]
-    if isinstance(value, list) and key in map(str, range(len(value))):
+    if isinstance(value, list):
+        if key not in map(str, range(len(value))):
+            entries = f"a list of {counted(len(value), 'value')}, counted from 0"
+            raise DocumentError(f"{option}: {shown(key)} is no place in {entries}")
         index = int(key)
         changed = _with(value[index], rest, new, option)
         return [*value[:index], changed, *value[index + 1 :]]
     section = Section(value if isinstance(value, Mapping) else {})
     before = section.get(key)
     section[key] = _with(before, rest, new, option)
-    if not rest or type(before) is not type(section[key]):  # not of the file any more
+    if not rest or not isinstance(before, Mapping):  # not of the file any more
         section.places[key] = option
     return section

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 
-from offboard.documents.errors import DocumentError, abridged, shown
+from offboard.documents.errors import DocumentError, abridged, meant, shown
 
 SIZE_MOST = 500_000  # characters of a file: a table of 10,000 rows, or 5 s to parse as YAML
 
@@ -64,7 +64,10 @@ def locate(name: str, kind: str, others: Sequence[str] = ()) -> Path:
     if name in names(kind):
         return directory() / FOLDERS[kind] / f"{name}.yaml"
     known = sorted({*names(kind), *others})
-    raise DocumentError(f"there is no {kind} named {shown(name)}; known are {', '.join(known)}")
+    near = meant(name, known) or ";"
+    raise DocumentError(
+        f"there is no {kind} named {shown(name)}{near} known are {', '.join(known)}"
+    )
 
 
 def read_text(path: Path) -> str:

@@ -169,13 +169,13 @@ class Limits(Parameters):
     setpoint_age_s: float = Field(default=0.25, ge=0.1, le=2)  # of telemetry beyond link delay
     link_growth_s: float = Field(default=0.3, gt=0, le=2)  # of the link's delay since take-off
     missed_decisions: int = Field(default=3, ge=1, le=100)  # in a row
-    position_error_m: float = Field(default=5.0, gt=0.1, le=100)
+    position_error_m: float = Field(default=5.0, ge=0.1, le=100)
     gps_s: float = Field(default=1.0, ge=0.5, le=600)  # without the fix of the take-off
-    accuracy_m: float = Field(default=3.0, gt=0.5, le=100)  # of the position, as the vehicle says
-    position_jump_m: float = Field(default=2.0, gt=0.3, le=100)  # of the estimate, in 10 s
-    hover_thrust: float = Field(default=0.9, gt=0.05, le=1)  # normalised thrust that hovers
-    tilt_rad: float = Field(default=1.3, gt=0.2, le=1.5)
-    tilt_error_rad: float = Field(default=0.5, gt=0.1, le=3.2)  # from every recent command
+    accuracy_m: float = Field(default=3.0, ge=0.5, le=100)  # of the position, as the vehicle says
+    position_jump_m: float = Field(default=2.0, ge=0.3, le=100)  # of the estimate, in 10 s
+    hover_thrust: float = Field(default=0.9, ge=0.05, le=1)  # normalised thrust that hovers
+    tilt_rad: float = Field(default=1.3, ge=0.2, le=1.5)
+    tilt_error_rad: float = Field(default=0.5, ge=0.1, le=3.2)  # from every recent command
     ceiling_m: float = Field(default=120.0, gt=0, le=10000)  # above the take-off point
     radius_m: float = Field(default=1000.0, gt=0, le=100000)  # from the take-off point
     battery: float = Field(default=0.1, ge=0, le=1)  # remaining, of 1

@@ -217,7 +217,9 @@ def rises(flight: FlightState) -> bool:
 
 
 def disarmed_for_good(flight: FlightState) -> bool:
-    return flight.vehicle.disarmed and flight.in_phase_s > DISARMED_S
+    """A HEARTBEAT of this phase shows it; it may have been arming before."""
+    shown = flight.vehicle.disarmed and flight.vehicle.age_s(Heartbeat) < flight.in_phase_s
+    return shown and flight.in_phase_s > DISARMED_S
 
 
 def not_armed(flight: FlightState) -> str:

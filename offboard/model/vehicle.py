@@ -55,8 +55,8 @@ class Vehicle(Parameters):
 
     name: str = Field(min_length=1, max_length=40)
     airframe: Literal["multirotor", "helicopter"] = "multirotor"  # MAV_TYPEs that are flown
-    mass_kg: float = Field(gt=0.01, le=200)
-    gravity_mps2: float = Field(default=9.80665, gt=9.7, lt=9.9)
+    mass_kg: float = Field(ge=0.01, le=200)
+    gravity_mps2: float = Field(default=9.80665, ge=9.7, le=9.9)
     inertia_kgm2: PositiveTriple
     arm_m: float = Field(default=1.0, gt=0, le=10)
     drag_translation_npmps: NonNegativeTriple  # D_t, Eq. 3, N per m/s
@@ -69,7 +69,7 @@ class Vehicle(Parameters):
     tilt: AxisResponse
     yaw: AxisResponse
     angular_acceleration_limit_radps2: PositiveTriple = (50.0, 50.0, 20.0)
-    tilt_max_rad: float = Field(default=0.7, gt=0.05, lt=1.4)
+    tilt_max_rad: float = Field(default=0.7, ge=0.05, le=1.4)
 
     def later_by(self, delay_s: float) -> Vehicle:
         """This vehicle behind a link that adds `delay_s` to each of its delays."""

@@ -50,7 +50,7 @@ from offboard.paper.controller import flyable_box, heading_frame
 from offboard.paper.law import INTEGRATED, PAPER_STEP_S, PaperLaw, PaperSettings
 from offboard.reference.base import FlatSample
 from offboard.reference.path import Smoothness
-from offboard.reference.shapes import HeadingMode, Hover, Waypoints
+from offboard.reference.shapes import Hover, Waypoints
 
 Array = NDArray[np.float64]
 
@@ -63,7 +63,7 @@ TOUR = Waypoints(
     ),
     speed_mps=2.8,  # mean of an inner leg
     minimise=Smoothness.SNAP,
-    course=HeadingMode.ALONG_VELOCITY,
+    course="along_velocity",
 )  # fmt: skip
 FIRST = PaperSettings.first_configuration()
 TRACKED = (*range(U, Z + 1), PSI)  # Eq. 31, in the order of Tables 3 and 4: u v w x y z psi

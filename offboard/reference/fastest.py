@@ -33,10 +33,10 @@ class PathLimits(Parameters):
     thrust per unit of mass, tilt, and how fast the thrust direction turns. What the vehicle has
     beyond them is left to feedback."""
 
-    speed_mps: float = Field(default=10.0, gt=0.1, le=30)
+    speed_mps: float = Field(default=10.0, ge=0.1, le=30)
     thrust_mps2: float = Field(default=14.0, gt=GRAVITY_MPS2, le=100)
-    tilt_deg: float = Field(default=35.0, gt=1, le=80)
-    tilt_rate_dps: float = Field(default=150.0, gt=5, le=1000)
+    tilt_deg: float = Field(default=35.0, ge=1, le=80)
+    tilt_rate_dps: float = Field(default=150.0, ge=5, le=1000)
     drag_per_mass_ps: float = Field(default=0.3, ge=0, le=2)
 
 

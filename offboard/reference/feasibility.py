@@ -89,7 +89,7 @@ def _demands(
     thrust_max = vehicle.thrust_max_mps2
     rates = np.abs(state.rates_frd_radps)
     speed = np.linalg.norm(sample.velocity_ned_mps, axis=-1)
-    height = -sample.position_ned_m[:, 2]
+    height = 0.0 - sample.position_ned_m[:, 2]  # no -0
     distance = np.linalg.norm(sample.position_ned_m, axis=-1)
     thrust = state.thrust_mps2
     thrust_min = max(THRUST_SHARE_MIN * thrust_max, vehicle.thrust_min_mps2)

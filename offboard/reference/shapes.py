@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from enum import StrEnum
 from typing import Annotated, Literal, Self
 
 import numpy as np
@@ -40,22 +39,14 @@ Period = Annotated[float, Field(ge=1, le=600)]
 Laps = Annotated[int, Field(ge=1, le=100)]
 Height = Annotated[float, Field(ge=0.5, le=500)]
 Coordinate = Annotated[float, Field(ge=-1000, le=1000)]
-Size = Annotated[float, Field(gt=0.05, le=500)]
-Speed = Annotated[float, Field(gt=0.05, le=30)]
+Size = Annotated[float, Field(ge=0.05, le=500)]
+Speed = Annotated[float, Field(ge=0.05, le=30)]
 Climb = Annotated[float, Field(ge=-5, le=5)]
 Term = tuple[
     Annotated[float, Field(ge=-500, le=500)],
     Annotated[int, Field(ge=1, le=20)],
     Annotated[float, Field(ge=-360, le=360)],
 ]
-
-
-class HeadingMode(StrEnum):
-    """Where the nose points: a fixed heading, along the horizontal velocity, as in the table."""
-
-    FIXED = "fixed"
-    ALONG_VELOCITY = "along_velocity"
-    TABLE = "table"
 
 
 class Shape(Parameters, ABC):
@@ -69,7 +60,7 @@ class Shape(Parameters, ABC):
     height_m: Height = 3.0
     origin_north_m: Coordinate = 0.0
     origin_east_m: Coordinate = 0.0
-    course: Literal[HeadingMode.FIXED, HeadingMode.ALONG_VELOCITY] = HeadingMode.FIXED
+    course: Literal["fixed", "along_velocity"] = "fixed"
     course_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
     run_in_s: Seconds = 4.0
     run_out_s: Seconds = 3.0
@@ -97,7 +88,7 @@ class Shape(Parameters, ABC):
 
     def _heading(self, path: Path) -> Heading:
         fixed_rad = math.radians(self.course_deg)
-        if self.course is HeadingMode.ALONG_VELOCITY:
+        if self.course == "along_velocity":
             return AlongVelocity(path, path_end_s(path, self.run_in_s, self.run_out_s), fixed_rad)
         return Fixed(fixed_rad)
 
@@ -106,7 +97,7 @@ class Hover(Shape):
     """Rest at the origin."""
 
     shape: Literal["hover"] = "hover"
-    duration_s: Annotated[float, Field(gt=0.1, le=3600)] = 15.0
+    duration_s: Annotated[float, Field(ge=0.1, le=3600)] = 15.0
     run_in_s: Literal[0] = 0
     run_out_s: Literal[0] = 0
 
@@ -260,7 +251,7 @@ class FromTable(Shape):
     text: str | None = None
     height_m: Literal[0] = 0
     knot_spacing_s: Annotated[float, Field(ge=0, le=60)] = 0.0
-    course: HeadingMode = HeadingMode.TABLE  # type: ignore[assignment]  # one more choice
+    course: Literal["table", "fixed", "along_velocity"] = "table"  # type: ignore[assignment]
     run_in_s: Seconds = 2.0
     run_out_s: Seconds = 2.0
 
@@ -271,12 +262,12 @@ class FromTable(Shape):
     def path(self) -> Path:
         rows = self._rows()
         values = rows.points_ned_m
-        if self.course is HeadingMode.TABLE and rows.heading_rad is not None:
+        if self.course == "table" and rows.heading_rad is not None:
             values = np.column_stack((values, rows.heading_rad))
         return interpolate(rows.times_s, values, self.knot_spacing_s)
 
     def _heading(self, path: Path) -> Heading:
-        if self.course is HeadingMode.TABLE and self._rows().heading_rad is not None:
+        if self.course == "table" and self._rows().heading_rad is not None:
             return Column()
         return super()._heading(path)
 

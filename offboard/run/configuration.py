@@ -56,7 +56,7 @@ class FlightConfig(Parameters):
     limits: Limits = Limits()
     identify: IdentifySettings = IdentifySettings()
     period_s: float = Field(default=0.1, ge=0.01, le=0.5)  # control period, vehicle time
-    deadline_s: float = Field(default=0.05, gt=0.0005, le=0.5)  # for one decision, wall time
+    deadline_s: float = Field(default=0.05, ge=0.0005, le=0.5)  # for one decision, wall time
     seed: int = Field(default=7, ge=0, lt=2**32)
 
     @property

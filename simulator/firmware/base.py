@@ -218,6 +218,8 @@ class Firmware(ABC):
     ground_station_stays_s: float = 0.0  # after its last heartbeat
     ground_station_parameter: str = ""  # its system id; "": known by its MAV_TYPE
     target_component_checked: bool = False
+    # kinds of messages, as their names begin, that are ignored if they are sent to all systems (0)
+    never_to_all: frozenset[str] = frozenset()
     text_suffix: str = ""
     text_to_ground_stations_only: bool = False
     parameters_bytewise: bool = False  # PARAM_VALUE holds the bytes of an integer, not its value

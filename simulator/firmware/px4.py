@@ -283,6 +283,7 @@ PX4 = Px4(
     request_refusal=Result.DENIED,
     ground_station_stays_s=2.5,
     target_component_checked=True,
+    never_to_all=frozenset({"COMMAND", "MISSION", "PARAM"}),
     text_suffix="\t",
     text_to_ground_stations_only=True,
     parameters_bytewise=True,

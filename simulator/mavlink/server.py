@@ -21,6 +21,7 @@ from simulator.mavlink.view import View
 _GUIDED = 2  # `current` of a mission item that is a place to fly to now
 _AXIS_NOT_USED = 2**15 - 1  # of MANUAL_CONTROL
 _NO_PLACE = 2**31 - 1  # in x and y of COMMAND_INT
+_OF_ALL = (519, 520)  # MAV_CMD: requests of the protocol and the version, which all systems answer
 _FTP_NAK, _FTP_ERROR_NOT_FOUND = 128 + 1, 10
 
 
@@ -106,15 +107,16 @@ class Server:
 
     def _is_for_us(self, message: Message) -> bool:
         """Whether its target is this system and its autopilot, or all."""
+        firmware, ours = self.view.autopilot.firmware, self.view.system
         system = getattr(message, "target_system", 0)
         component = getattr(message, "target_component", 0)
-        checked = self.view.autopilot.firmware.target_component_checked
-        for_autopilot = component in (0, MAV_COMP_ID_AUTOPILOT) or not checked
+        kind = message.get_type().partition("_")[0]
+        to_all = kind not in firmware.never_to_all or getattr(message, "command", 0) in _OF_ALL
+        for_autopilot = component in (0, MAV_COMP_ID_AUTOPILOT)
+        for_autopilot |= not firmware.target_component_checked
         read = self.view.autopilot.parameters.__getitem__
-        obeyed = self.view.autopilot.firmware.obeys_system(
-            message.get_srcSystem(), self.view.system, read
-        )
-        return system in (0, self.view.system) and for_autopilot and obeyed
+        obeyed = firmware.obeys_system(message.get_srcSystem(), ours, read)
+        return (system == ours or (to_all and system == 0)) and for_autopilot and obeyed
 
     def _heartbeat(self, message: Message) -> None:
         autopilot = self.view.autopilot

@@ -17,7 +17,7 @@ class Battery(Parameters):
     the drop at the internal resistance."""
 
     cells: int = Field(default=4, ge=1, le=16)
-    capacity_ah: float = Field(default=5.0, gt=0.01, le=200)
+    capacity_ah: float = Field(default=5.0, ge=0.01, le=200)
     hover_current_a: float = Field(default=12.0, ge=0, le=500)
     resistance_ohm: float = Field(default=0.02, ge=0, le=1)
     remaining: float = Field(default=1.0, ge=0, le=1)  # at boot

@@ -30,9 +30,9 @@ class Gusts(Parameters):
 
     intensity_mps: float = Field(default=0.0, ge=0, le=15)  # sd along and across the mean wind
     vertical_ratio: float = Field(default=0.5, ge=0, le=2)  # vertical sd / intensity
-    length_m: float = Field(default=20.0, gt=0.1, le=2000)  # L_u = L_v
-    vertical_length_m: float = Field(default=5.0, gt=0.1, le=2000)  # L_w
-    speed_mps: float = Field(default=5.0, gt=0.1, le=50)
+    length_m: float = Field(default=20.0, ge=0.1, le=2000)  # L_u = L_v
+    vertical_length_m: float = Field(default=5.0, ge=0.1, le=2000)  # L_w
+    speed_mps: float = Field(default=5.0, ge=0.1, le=50)
 
 
 def dryden(gusts: Gusts, step_s: float) -> LinearProcess:

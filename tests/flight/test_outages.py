@@ -10,7 +10,7 @@ from collections.abc import Callable
 import pytest
 from faults import CURRENT_MODE, HEARTBEAT, late, without
 from pair import Bytes, Filter, Pair, hover, in_phase, on_arducopter
-from watch import aborted, begun_s, flown, said, sent_after
+from watch import aborted, begun_s, flown, refused, said, sent_after
 
 from offboard.flight.phases import Phase
 
@@ -61,6 +61,13 @@ def test_after_an_outage_the_vehicle_is_landed(vehicle: str, outage_s: float) ->
     assert not pair.armed
     assert pair.instance.autopilot.state.truth.position_ned_m[2] > -0.1
     assert said(pair, "waiting for the link, then landing is asked again") is (outage_s > 2.0)
+
+
+def test_after_an_outage_as_it_arms_the_vehicle_is_disarmed() -> None:
+    """A HEARTBEAT from before the outage said that it was, and it was left armed."""
+    pair = hover(at=[(lambda pair: pair.armed, cut(2.3))])
+    refused(pair, "no telemetry for 1.0 s$")
+    assert not pair.armed
 
 
 def test_a_gap_of_telemetry_on_a_late_link_is_no_loss_of_setpoints() -> None:

@@ -34,15 +34,22 @@ def test_fails(sitl):
     vehicle.close()
     pytest.fail("it fails")
 
-def test_is_perfect(fly):
+def test_is_perfect(fly, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    pathlib.Path("mine.yaml").write_text("{name: mine, conditions: {thrust_scale: 1.01}}")
     settings = ("reference.duration_s=1.0", "reference.height_m=1.0", "identify.online=false")
-    flight = fly(reference="hover", scenario="calm", seed=3, settings=settings)
+    flight = fly(reference="hover", scenario="mine.yaml", seed=3, settings=settings)
     assert flight.log.exists()
     assert flight.score.rmse_position_m < 0.05
     assert flight.score.rmse_position_m < 0.0
 
 def test_unknown_reference(fly):
     fly(reference="moon")
+
+def test_path_of_a_file(fly, tmp_path):
+    table = tmp_path / "table.csv"
+    table.write_text("time_s,north_m,east_m,altitude_m")
+    fly(reference=table)
 
 @pytest.mark.sitl(scenario="storm")
 def test_unknown_scenario(sitl):
@@ -66,7 +73,7 @@ def test_the_fixtures_as_the_readme_shows_them(workers: int, pytester: pytest.Py
     assert example.count("\ndef test_") == 2
     pytester.makepyfile(test_readme=example, test_mine=MINE)
     result = pytester.runpytest_subprocess("-q", "--strict-markers", f"-n{workers}", timeout=120)
-    result.assert_outcomes(passed=2, failed=3, errors=3)
+    result.assert_outcomes(passed=2, failed=4, errors=3)
     logs = [Path(line) for line in result.outlines if line.endswith(".tlog")]
     assert len(logs) == 2
     assert all(log.stat().st_size > 10_000 for log in logs)
@@ -76,6 +83,7 @@ def test_the_fixtures_as_the_readme_shows_them(workers: int, pytester: pytest.Py
         "*Failed: it fails*",
         "*assert * < 0.0*",
         "*nothing was flown: there is no reference named 'moon'*",
+        "*nothing was flown: reference */table.csv: */table.csv has 0 rows of data*",
         "*there is no scenario named 'storm'; known are*",
         "*pytest.mark.sitl: weather is unknown; there is scenario, firmware*",
         "*pytest.mark.sitl: name the option 'wind_2mps'; there is scenario, firmware*",

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from offboard.reference.shapes import Circle, HeadingMode
+from offboard.reference.shapes import Circle
 from offboard.reference.track import Moved, Track, hold
 from offboard.reference.transfer import Limits, transfer
 
@@ -92,7 +92,7 @@ def test_no_start_is_planned_further_out_than_it_needs_to_brake() -> None:
 
 
 def test_moved_and_held() -> None:
-    track = Circle(course=HeadingMode.ALONG_VELOCITY).track()
+    track = Circle(course="along_velocity").track()
     moved = Moved(track, 100.0, (10.0, -5.0, 2.0))
     assert moved.duration_s == track.duration_s + 100.0
     times = np.array([[90.0, 101.0], [110.0, 200.0]])

@@ -42,6 +42,22 @@ def test_garbage_in_a_datagram_hides_no_frame(garbage: bytes) -> None:
     assert decoder.dropped["not a frame"] == 2 * len(garbage)
 
 
+@pytest.mark.parametrize(("name", "obeyed"), [("px4", False), ("ardupilot", True)])
+def test_whether_what_is_sent_to_all_systems_is_obeyed(name: str, obeyed: bool) -> None:
+    """PX4 1.16 ignores commands, parameters and missions for system 0, but a request of its
+    version."""
+    bench = Bench(firmware=FIRMWARES[name])
+    bench.run(1.0)
+    bench.system = 0
+    ask_version, set_home = (bench.command(520), bench.command(179, 1))
+    bench.send(mavlink.MAVLink_param_request_read_message(0, 1, b"SYSID_MYGCS", -1))
+    bench.send(mavlink.MAVLink_param_request_read_message(0, 1, b"COM_OF_LOSS_T", -1))
+    bench.send(mavlink.MAVLink_mission_request_list_message(0, 1))
+    bench.run(0.1)
+    assert (ask_version, set_home) == ([0], [0] if obeyed else [])
+    assert len(bench.of("PARAM_VALUE")) == len(bench.of("MISSION_COUNT")) == obeyed
+
+
 # -- rates -----------------------------------------------------------------------------------
 
 
