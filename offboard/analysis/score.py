@@ -24,6 +24,7 @@ from offboard.analysis.tracking import passed_s, tracking_metrics, window_of
 from offboard.analysis.verdict import begin_times, verdict_metrics
 from offboard.documents.errors import UserError, meant, plain
 from offboard.flight.flight import Outcome
+from offboard.flight.outbox import Refusal
 from offboard.flight.phases import ExitCode, Phase
 from offboard.link.log import LogError, replace_file
 
@@ -71,6 +72,7 @@ class Score:
     max_velocity_mps: float = _metric("velocity error, maximum", "m/s")
     rmse_heading_deg: float = _metric("heading error, RMSE", "deg")
     max_heading_deg: float = _metric("heading error, maximum", "deg")
+    mu_e: float = _metric("fitness of the paper, Eq. 31")
     tracked_s: float = _metric("time of the reference tracked", "s")
     tilt_max_deg: float = _metric("tilt, maximum", "deg")
     tilt_agitation_deg: float = _metric("tilt beside the reference's, RMS", "deg")
@@ -86,6 +88,10 @@ class Score:
     skipped_ticks: float = _metric("of these, in pauses of this process")
     pause_max_s: float = _metric("longest pause of this process", "s")
     refused_setpoints: float = _metric("setpoints not sent")
+    refused_late: float = _metric("setpoints decided too late")
+    refused_stale: float = _metric("setpoints of too old telemetry")
+    refused_not_ours: float = _metric("setpoints without authority")
+    refused_unusable: float = _metric("setpoints not finite or beyond limits")
     decisions: float = _metric("decisions")
     solve_time_p50_ms: float = _metric("time of a decision, median", "ms")
     solve_time_p99_ms: float = _metric("time of a decision, 99th perc.", "ms")
@@ -235,10 +241,14 @@ def decision_metrics(flown: History) -> dict[str, float]:
     columns = flown.records
     if not len(columns):
         return {}
+    refused = columns["refused"].astype(np.int64)
 
     def known(name: str) -> Array:
         values = columns[name].astype(np.float64)
         return values[np.isfinite(values)]
+
+    def refusals(flag: int) -> float:
+        return float(((refused & flag) != 0).sum())
 
     answer_ms, age_ms = 1e3 * known("answer_s"), 1e3 * known("age_s")
     solve_ms, gap = 1e3 * known("solve_time_s"), known("gap")
@@ -248,7 +258,7 @@ def decision_metrics(flown: History) -> dict[str, float]:
     at_bound = np.where(limited, 1.0, columns["at_bound"])
     skipped = columns["missed_ticks"][columns["pause_s"] > 0.0]
     return {
-        "decisions": float(len(columns)),
+        "decisions": float(len(refused)),
         "answer_p50_ms": _percentile(answer_ms, 50),
         "answer_p99_ms": _percentile(answer_ms, 99),
         "answer_max_ms": _percentile(answer_ms, 100),
@@ -256,11 +266,15 @@ def decision_metrics(flown: History) -> dict[str, float]:
         "missed_ticks": float(known("missed_ticks").sum()),
         "skipped_ticks": float(skipped.sum(dtype=np.float64)),
         "pause_max_s": float(columns["pause_s"].max()),
-        "refused_setpoints": float((columns["refused"] != 0.0).sum()),
+        "refused_setpoints": float((refused != 0).sum()),
+        "refused_late": refusals(Refusal.LATE),
+        "refused_stale": refusals(Refusal.STALE),
+        "refused_not_ours": refusals(Refusal.NOT_OURS),
+        "refused_unusable": refusals(Refusal.UNUSABLE),
         "other_datagrams": float(known("other_datagrams").sum()),
         "solve_time_p50_ms": _percentile(solve_ms, 50),
         "solve_time_p99_ms": _percentile(solve_ms, 99),
-        "certified_share": len(gap) / len(columns),
+        "certified_share": len(gap) / len(refused),
         "gap_median": _percentile(gap, 50),
         "gap_max": _percentile(gap, 100),
         "spread_median": _percentile(known("spread"), 50),

@@ -1,7 +1,8 @@
-"""Metrics of the phase TRACK: errors, activity, truth.
+"""Metrics of the phase TRACK: errors, fitness, activity, truth.
 
 Errors and motion are weighted by the time of the reference (see `weighted`): a metric depends
-neither on the rate of the telemetry nor on jumps of the vehicle's clock.
+neither on the rate of the telemetry nor on jumps of the vehicle's clock. Sums of the paper's
+fitness are over the control ticks, as in its Eq. 32.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from offboard.analysis.history import History, Rows
 from offboard.flight.phases import Phase
 from offboard.model.frames import (
     heading_from_quaternion,
+    rotation_from_quaternion,
     thrust_direction_from_quaternion,
     wrap_pi,
 )
@@ -49,9 +51,7 @@ def window_of(flown: History) -> tuple[float, float] | None:
 
 def passed_s(flown: History, window: tuple[float, float]) -> tuple[float, float]:
     """Time of the reference that was tracked, and that for which nothing was decided, in s."""
-    times = flown.records["time_s"]
-    ticks = _in_track(flown) & (times >= window[0]) & (times <= window[1])
-    track_s = flown.records["track_time_s"][ticks].astype(np.float64)
+    track_s = flown.records["track_time_s"][_ticks(flown, window)].astype(np.float64)
     intervals = np.diff(track_s)
     intervals = np.maximum(intervals[np.isfinite(intervals)], 0.0)  # flown again from its start
     flowing = intervals <= SKIPPED_S
@@ -85,10 +85,27 @@ def tracking_metrics(flown: History, window: tuple[float, float]) -> dict[str, f
         "max_velocity_mps": velocity.max,
         "rmse_heading_deg": heading.rms,
         "max_heading_deg": heading.max,
+        "mu_e": _fitness(flown, reference, window),
         "tracked_s": passed_s(flown, window)[0],
         "tilt_max_deg": tilt.max,
         **_agitation(reference, rows, weights),
     }
+
+
+def _fitness(flown: History, reference: Reference, window: tuple[float, float]) -> float:
+    """Eqs. 31-32: velocities in the body frame, heading in degrees."""
+    ticks = flown.records["time_s"][_ticks(flown, window)]
+    quaternion = flown.attitude["quaternion"][_nearest(flown.attitude["time_s"], ticks)]
+    body = rotation_from_quaternion(quaternion).swapaxes(-1, -2)
+    stamps = flown.position["time_s"]
+    position, velocity = (
+        np.stack([np.interp(ticks, stamps, axis) for axis in flown.position[column].T], axis=1)
+        for column in ("position_ned_m", "velocity_ned_mps")
+    )
+    slip = np.einsum("nij,nj->ni", body, reference.position(ticks, 1) - velocity)
+    turn = np.degrees(wrap_pi(reference.heading(ticks) - heading_from_quaternion(quaternion)))
+    errors = np.column_stack((slip, reference.position(ticks) - position, turn))
+    return float(sum((errors**2).sum(axis=0).tolist()))
 
 
 def _agitation(reference: Reference, attitude: Rows, weights: Array) -> dict[str, float]:
@@ -114,6 +131,13 @@ def _agitation(reference: Reference, attitude: Rows, weights: Array) -> dict[str
         "tilt_agitation_deg": float(np.degrees(tilt)),
         "rate_agitation_radps": float(rate),
     }
+
+
+def _ticks(flown: History, window: tuple[float, float]) -> NDArray[np.bool_]:
+    """The ticks of TRACK in the window."""
+    times = flown.records["time_s"]
+    chosen: NDArray[np.bool_] = _in_track(flown) & (times >= window[0]) & (times <= window[1])
+    return chosen
 
 
 class _Clock:
@@ -181,6 +205,16 @@ def each_once(rows: Rows) -> Rows:
 def _in_track(flown: History) -> NDArray[np.bool_]:
     chosen: NDArray[np.bool_] = flown.records["phase"] == Phase.TRACK.code
     return chosen
+
+
+def _length(vectors: Array) -> Array:
+    return np.asarray(np.linalg.norm(vectors, axis=1))
+
+
+def _nearest(stamps: Array, times: Array) -> NDArray[np.intp]:
+    right = np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1)
+    nearest: NDArray[np.intp] = right - (times - stamps[right - 1] < stamps[right] - times)
+    return nearest
 
 
 # ---------------------------------------------------------------------- metrics by time

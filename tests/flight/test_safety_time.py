@@ -154,7 +154,7 @@ def test_a_slow_law_is_late_and_then_landed() -> None:
     rows = ("decision", "decisions")
     says = "the controller failed: decided 0.05 s too late"
     aborted(pair, says, failsafes=rows, error_m=0.5, ended_by="controller")
-    assert pair.score().refused_setpoints == 3.0
+    assert pair.score().refused_late == 3.0
     assert not pair.armed
 
 
