@@ -47,9 +47,9 @@ class Score:
 
     Errors are relative to the reference, during the phase TRACK: `position` as the vehicle
     estimates it (LOCAL_POSITION_NED), `truth` as it is in the simulator (HIL_STATE_QUATERNION or
-    SIM_STATE). RMSE and percentiles of errors and motion are weighted by the time of the reference:
-    each sample stands for half of the interval before it and half of the one after it, so that
-    telemetry which is thinned or lost counts with the mean of what surrounds it
+    SIM_STATE). RMSE, mean, sd and percentiles of errors and motion are weighted by the time of the
+    reference: each sample stands for half of the interval before it and half of the one after it,
+    so that telemetry which is thinned or lost counts with the mean of what surrounds it
     (`analysis.tracking`). `position_gap_max_s` is the longest gap. The metrics of the certificate
     are of the decisions that were sent as they were certified, a share `certified_share` of all.
     Times are vehicle time. A metric that the log does not hold is NaN.
@@ -64,19 +64,32 @@ class Score:
     reason: str = ""
     touchdown_mps: float = _metric("downward speed at touch-down", "m/s")
     rmse_position_m: float = _metric("position error, RMSE", "m")
+    mean_position_m: float = _metric("position error, mean", "m")
     p95_position_m: float = _metric("position error, 95th percentile", "m")
     max_position_m: float = _metric("position error, maximum", "m")
     rmse_truth_m: float = _metric("true position error, RMSE", "m")
     max_truth_m: float = _metric("true position error, maximum", "m")
     rmse_velocity_mps: float = _metric("velocity error, RMSE", "m/s")
+    p95_velocity_mps: float = _metric("velocity error, 95th percentile", "m/s")
     max_velocity_mps: float = _metric("velocity error, maximum", "m/s")
     rmse_heading_deg: float = _metric("heading error, RMSE", "deg")
     max_heading_deg: float = _metric("heading error, maximum", "deg")
     mu_e: float = _metric("fitness of the paper, Eq. 31")
+    e_u: float = _metric("Eq. 32, body velocity u", "m2/s2")
+    e_v: float = _metric("Eq. 32, body velocity v", "m2/s2")
+    e_w: float = _metric("Eq. 32, body velocity w", "m2/s2")
+    e_x: float = _metric("Eq. 32, north", "m2")
+    e_y: float = _metric("Eq. 32, east", "m2")
+    e_z: float = _metric("Eq. 32, down", "m2")
+    e_psi: float = _metric("Eq. 32, heading", "deg2")
     tracked_s: float = _metric("time of the reference tracked", "s")
+    thrust_sd: float = _metric("commanded thrust (0 .. 1), sd")
+    tilt_command_step_deg: float = _metric("commanded tilt, RMS of its steps", "deg")
     tilt_max_deg: float = _metric("tilt, maximum", "deg")
     tilt_agitation_deg: float = _metric("tilt beside the reference's, RMS", "deg")
     rate_agitation_radps: float = _metric("rates beside the reference's, RMS", "rad/s")
+    roll_rate_sd_radps: float = _metric("roll rate, sd", "rad/s")
+    pitch_rate_sd_radps: float = _metric("pitch rate, sd", "rad/s")
     setpoint_hz: float = _metric("setpoints sent", "Hz")
     setpoint_gap_max_s: float = _metric("longest gap of setpoints", "s")
     setpoint_gap_wall_max_s: float = _metric("longest gap of setpoints, wall time", "s")
@@ -84,6 +97,7 @@ class Score:
     answer_p99_ms: float = _metric("telemetry in to setpoint out, 99th p.", "ms")
     answer_max_ms: float = _metric("telemetry in to setpoint out, maximum", "ms")
     setpoint_age_p99_ms: float = _metric("telemetry at its setpoint, 99th perc.", "ms")
+    setpoint_age_max_ms: float = _metric("telemetry at its setpoint, maximum", "ms")
     missed_ticks: float = _metric("control periods without telemetry")
     skipped_ticks: float = _metric("of these, in pauses of this process")
     pause_max_s: float = _metric("longest pause of this process", "s")
@@ -263,6 +277,7 @@ def decision_metrics(flown: History) -> dict[str, float]:
         "answer_p99_ms": _percentile(answer_ms, 99),
         "answer_max_ms": _percentile(answer_ms, 100),
         "setpoint_age_p99_ms": _percentile(age_ms, 99),
+        "setpoint_age_max_ms": _percentile(age_ms, 100),
         "missed_ticks": float(known("missed_ticks").sum()),
         "skipped_ticks": float(skipped.sum(dtype=np.float64)),
         "pause_max_s": float(columns["pause_s"].max()),

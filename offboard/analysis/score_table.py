@@ -17,6 +17,7 @@ from offboard.flight.timing import too_busy
 SECTIONS = {
     "completed": "verdict",
     "rmse_position_m": "tracking",
+    "mu_e": "fitness of the paper",
     "tracked_s": "activity",
     "setpoint_hz": "setpoints",
     "decisions": "decisions",

@@ -36,6 +36,7 @@ _QUINTIC = np.linalg.inv(
         for order in range(3)
     ]
 )
+_FITNESS = ("e_u", "e_v", "e_w", "e_x", "e_y", "e_z", "e_psi")
 
 
 def window_of(flown: History) -> tuple[float, float] | None:
@@ -66,33 +67,47 @@ def tracking_metrics(flown: History, window: tuple[float, float]) -> dict[str, f
         errors = rows[column] - reference.position(rows["time_s"], derivative)
         return weighted(np.linalg.norm(errors, axis=1), clock.shares(rows["time_s"]))
 
+    fitness = _fitness(flown, reference, window)
     rows = _within(flown.position, window)
     position, velocity = away(rows, "position_ned_m"), away(rows, "velocity_ned_mps", 1)
     true = away(_within(flown.truth, window), "position_ned_m")
+    rows = _within(flown.setpoint, window)
+    steps = _length(np.diff(thrust_direction_from_quaternion(rows["quaternion"]), axis=0))
+    thrust = weighted(rows["thrust"].astype(np.float64), clock.shares(rows["time_s"]))
     rows = _within(flown.attitude, window)
     weights = clock.shares(rows["time_s"])
     direction = thrust_direction_from_quaternion(rows["quaternion"])
     turn = heading_from_quaternion(rows["quaternion"]) - reference.heading(rows["time_s"])
     heading = weighted(np.abs(np.degrees(wrap_pi(turn))), weights)
     tilt = weighted(np.degrees(np.arccos(np.clip(direction[:, 2], -1.0, 1.0))), weights)
+    rates = rows["rates_radps"].astype(np.float64)
     return {
         "rmse_position_m": position.rms,
+        "mean_position_m": position.mean,
         "p95_position_m": position.p95,
         "max_position_m": position.max,
         "rmse_truth_m": true.rms,
         "max_truth_m": true.max,
         "rmse_velocity_mps": velocity.rms,
+        "p95_velocity_mps": velocity.p95,
         "max_velocity_mps": velocity.max,
         "rmse_heading_deg": heading.rms,
         "max_heading_deg": heading.max,
-        "mu_e": _fitness(flown, reference, window),
+        **fitness,
+        "mu_e": sum(fitness.values()),
         "tracked_s": passed_s(flown, window)[0],
+        "thrust_sd": thrust.sd,
+        "tilt_command_step_deg": math.degrees(math.sqrt((steps**2).mean()))
+        if len(steps)
+        else math.nan,
         "tilt_max_deg": tilt.max,
+        "roll_rate_sd_radps": weighted(rates[:, 0], weights).sd,
+        "pitch_rate_sd_radps": weighted(rates[:, 1], weights).sd,
         **_agitation(reference, rows, weights),
     }
 
 
-def _fitness(flown: History, reference: Reference, window: tuple[float, float]) -> float:
+def _fitness(flown: History, reference: Reference, window: tuple[float, float]) -> dict[str, float]:
     """Eqs. 31-32: velocities in the body frame, heading in degrees."""
     ticks = flown.records["time_s"][_ticks(flown, window)]
     quaternion = flown.attitude["quaternion"][_nearest(flown.attitude["time_s"], ticks)]
@@ -105,7 +120,7 @@ def _fitness(flown: History, reference: Reference, window: tuple[float, float]) 
     slip = np.einsum("nij,nj->ni", body, reference.position(ticks, 1) - velocity)
     turn = np.degrees(wrap_pi(reference.heading(ticks) - heading_from_quaternion(quaternion)))
     errors = np.column_stack((slip, reference.position(ticks) - position, turn))
-    return float(sum((errors**2).sum(axis=0).tolist()))
+    return dict(zip(_FITNESS, (errors**2).sum(axis=0).tolist(), strict=True))
 
 
 def _agitation(reference: Reference, attitude: Rows, weights: Array) -> dict[str, float]:
@@ -224,7 +239,9 @@ def _nearest(stamps: Array, times: Array) -> NDArray[np.intp]:
 class Weighted:
     """Metrics of one signal; `p95` is not exceeded for 95 % of the time. NaN without samples."""
 
+    mean: float = math.nan
     rms: float = math.nan
+    sd: float = math.nan
     max: float = math.nan
     p95: float = math.nan
 
@@ -235,11 +252,14 @@ def weighted(values: Array, weights: Array) -> Weighted:
     total = float(weights.sum())
     if not total:
         return Weighted()
+    mean = float(weights @ values / total)
     square = float(np.einsum("i,i,i", weights, values, values) / total)
     order = np.argsort(values)
     upto = np.searchsorted(np.cumsum(weights[order]), 0.95 * total)
     return Weighted(
+        mean=mean,
         rms=math.sqrt(square),
+        sd=math.sqrt(max(square - mean**2, 0.0)),
         max=float(np.max(values, where=weights > 0.0, initial=-math.inf)),
         p95=float(values[order[upto]]),
     )
