@@ -241,7 +241,7 @@ def test_waypoints_minimise_what_they_say(minimise: str, order: int) -> None:
         ({"shape": "line", "run_in_s": 0.0}, "without a run-in the path must be at rest"),
         ({"shape": "circle", "run_out_s": 0.0}, "without a run-out the path must be at rest"),
         ({"shape": "line", "to_north_m": 0.0}, "longer than zero"),
-        ({"shape": "circle", "radius_m": -1}, "greater than 0.05"),
+        ({"shape": "circle", "radius_m": -1}, "greater than or equal to 0.05"),
         ({"shape": "circle", "course": "table"}, "fixed"),
         ({"shape": "hover", "run_in_s": 2}, "Input should be 0"),
         ({"shape": "waypoints", "points_m": POINTS}, "one of speed_mps, times_s and fastest"),
