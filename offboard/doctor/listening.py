@@ -140,9 +140,9 @@ class Listening:
     """One pass over one link, from host time `began_s`. `settings`: of the session of a flight.
 
     `vehicle`, `clock` and `session` are those of a flight, with the newest telemetry; `senders` has
-    all that sends. `peer` is the address of the vehicle. `fix_type` is its GPS_FIX_TYPE; `late_s`
-    the greatest age of its telemetry beyond the least; `foreign_replies` the number of its replies
-    to requests of TIMESYNC that are not ours.
+    all that sends. `fix_type` is the vehicle's GPS_FIX_TYPE; `late_s` the greatest age of its
+    telemetry beyond the least; `foreign_replies` the number of its replies to requests of TIMESYNC
+    that are not ours.
     """
 
     def __init__(
@@ -152,7 +152,6 @@ class Listening:
         self.vehicle = VehicleState()
         self.clock = VehicleClock()
         self.senders = Senders(settings.stream)
-        self.peer: Hashable | None = None
         self.requested = self.rebooted = False  # the rates of telemetry; in this pass
         self.fix_type: int | None = None
         self.late_s = 0.0
@@ -170,12 +169,10 @@ class Listening:
     def take(self, chunk: Chunk) -> None:
         """Process received bytes."""
         self.senders.receive(chunk.data, chunk.peer)
-        if self.peer not in (None, chunk.peer):  # another vehicle, perhaps
+        if self.session.peer not in (None, chunk.peer):  # another vehicle, perhaps
             self.session.overhear(chunk.data)
         reception = self.session.receive(chunk.data, chunk.peer, chunk.arrived_s)
         for event in reception.events:
-            if not self._found_s:
-                self.peer = chunk.peer
             if not self._found_s and self.session.vehicle is not None:
                 self._found_s = chunk.arrived_s
             self.vehicle.update(event, self.session.link_time_s)

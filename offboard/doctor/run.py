@@ -166,7 +166,7 @@ def _listen(
         for chunk in link.receive(POLL_S):
             heard.take(chunk)
         for frame in heard.due(clock.monotonic_s()):
-            link.send(frame, heard.peer)
+            link.send(frame, heard.session.peer)
         vehicle = heard.session.vehicle
         found = vehicle.autopilot if vehicle else "no vehicle yet"
         tell(f"listening, {heard.listened_s:.0f} s of at most {LONGEST_S:.0f} s: {found}")

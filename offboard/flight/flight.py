@@ -119,8 +119,6 @@ class Flight(FlightState):
         reception = self.session.receive(chunk.data, chunk.peer, arrived_s)
         self._inputs.chunk(chunk, reception)
         self._logged += reception.frames
-        if reception.events:
-            self.peer = chunk.peer
         for event in reception.events:
             if telemetry.is_of_another(self, event):
                 outbox.announce(self, "another vehicle answers, with the same system id")

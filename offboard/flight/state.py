@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import operator
 from collections import deque
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import InitVar, dataclass, field
 
 import numpy as np
@@ -57,7 +57,7 @@ class Outcome:
 
 # of the flight before, with the same vehicle
 KEPT = (
-    "vehicle", "contact", "clock", "hover", "reading", "peer", "other_datagrams", "host_s",
+    "vehicle", "contact", "clock", "hover", "reading", "other_datagrams", "host_s",
     "turned_s", "silence_s", "heard_s", "guarded",
 )  # fmt: skip
 
@@ -108,7 +108,6 @@ class FlightState:
     took_off: bool = False  # from there; a vehicle that was found in the air has not
     touchdown: Touchdown | None = None  # of the landing
     authority: Authority = field(default_factory=Authority)
-    peer: Hashable | None = None  # address that the vehicle sends from; None before it is found
     other_datagrams: int = 0  # of other senders, for the log
 
     phase: Phase = Phase.CONNECT

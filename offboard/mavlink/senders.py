@@ -69,30 +69,32 @@ class Senders:
         self.heard_s = 0.0
         self._wanted = wanted
         self._has_key = has_key
-        self._place: Hashable | None = None  # the vehicle's address
+        self.place: Hashable | None = (
+            None  # address of the vehicle, or of one that awaits our clock
+        )
 
     def set_vehicle(self, vehicle: VehicleFound, place: Hashable) -> None:
         """Take this vehicle, which sends from `place`, as ours."""
-        self.vehicle, self.dialect, self._place = vehicle, DIALECTS[vehicle.autopilot], place
+        self.vehicle, self.dialect, self.place = vehicle, DIALECTS[vehicle.autopilot], place
         self.own = Address(vehicle.system_id, self.own.component_id)
 
     # --- addresses ---
 
     def is_foreign(self, place: Hashable) -> bool:
         """Whether the vehicle sends from another address."""
-        return self.vehicle is not None and place != self._place
+        return self.vehicle is not None and place != self.place
 
     def moves_to(self, place: Hashable, now_s: float, genuine: Iterable[Frame]) -> bool:
         """Take `place` as the vehicle's address if one of the `genuine` frames from it shows that
         the vehicle sends from there now."""
-        if now_s - self.heard_s <= PEER_SILENT_S or not same_host(place, self._place):
+        if now_s - self.heard_s <= PEER_SILENT_S or not same_host(place, self.place):
             return False
         vehicle = self.vehicle
         assert vehicle is not None
         ids = vehicle.system_id, vehicle.component_id
         moves = any((frame.system_id, frame.component_id) == ids for frame in genuine)
         if moves:
-            self._place = place
+            self.place = place
         return moves
 
     # --- frames ---
@@ -200,7 +202,9 @@ class Senders:
         if len(self.systems) > SYSTEMS_MAX:
             del self.systems[next(iter(self.systems))]
 
-    def note_clock_behind(self, frame: Frame, now_s: float, events: list[Event]) -> None:
+    def note_clock_behind(
+        self, frame: Frame, place: Hashable, now_s: float, events: list[Event]
+    ) -> None:
         """Note the autopilot whose frame has a right signature and a clock that is behind: its
         clock follows ours with our heartbeat. The frame may be a replay: nothing else is
         believed."""
@@ -208,7 +212,7 @@ class Senders:
         if isinstance(heard, Dialect) and self._wanted in (None, frame.system_id):
             beat = decode(frame, heard)
             assert isinstance(beat, Heartbeat)
-            self.clock_behind = True
+            self.clock_behind, self.place = True, place
             events.append(ClockBehind(frame.system_id, beat.armed))
 
     def is_for_us(self, ack: Frame) -> bool:

@@ -112,6 +112,11 @@ class Session:
     def dialect(self) -> Dialect | None:
         return self.senders.dialect
 
+    @property
+    def peer(self) -> Hashable | None:
+        """Address that the vehicle sends from; None before it is heard."""
+        return self.senders.place
+
     # --- in ---
 
     def receive(self, datagram: bytes, peer: Hashable, now_s: float) -> Reception:
@@ -147,7 +152,9 @@ class Session:
         forged = self._signing.refusal(frame) if self._signing else None
         if forged:
             if forged is DropReason.OLD_STAMP and self.vehicle is None:
-                self.senders.note_clock_behind(frame, self.link_time_s, arrival.events)
+                self.senders.note_clock_behind(
+                    frame, arrival.place, self.link_time_s, arrival.events
+                )
             return forged
         was_found = self.vehicle is not None
         foreign = self.senders.judge(frame, arrival.place, self.link_time_s, arrival.events)

@@ -139,7 +139,7 @@ class Loop:
     def _send(self, frames: Sequence[bytes], began_s: float) -> list[bytes]:
         """Send what a turn has decided. This process may have been stopped since the turn began:
         then it is dropped, and returned."""
-        peer = self._companion.current.peer
+        peer = self._companion.current.session.peer
         dropped: list[bytes] = []
         for frame in frames:
             if self._supervisor and clock.monotonic_s() - began_s > STOPPED_S:

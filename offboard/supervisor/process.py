@@ -113,16 +113,14 @@ class TakeOver:
         beat = watch.newest
         self._tell = tell
         # JSON has no tuples
-        self._peer: Hashable = (
-            tuple(beat["peer"]) if isinstance(beat["peer"], list) else beat["peer"]
-        )
-        self._link = _link(watch.descriptors[:-1], str(self._peer) if beat["stream"] else "")
+        peer: Hashable = tuple(beat["peer"]) if isinstance(beat["peer"], list) else beat["peer"]
+        self._link = _link(watch.descriptors[:-1], str(peer) if beat["stream"] else "")
         self._log = BackgroundWriter[bytes](
             lambda entries: append(watch.descriptors[-1], entries), 100_000
         )
         signing = watch.key and Signing.resumed(watch.key, clock.monotonic_s, beat["signing"])
         self._session = Session(SessionSettings(stream=beat["stream"]), signing or None)
-        self._session.set_vehicle(known.vehicle, self._peer)
+        self._session.set_vehicle(known.vehicle, peer)
         self._session.status = ACTIVE, LANDING
         assert self._session.dialect is not None
         self._dialect = self._session.dialect
@@ -184,7 +182,7 @@ class TakeOver:
     def _send(self, *messages: Outgoing) -> None:
         for message in messages:
             frame = self._session.encode(message)
-            self._link.send(frame, self._peer)
+            self._link.send(frame, self._session.peer)
             self._record(frame)
 
     def _record(self, *frames: bytes) -> None:

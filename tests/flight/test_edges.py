@@ -12,6 +12,7 @@ import tty
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -66,7 +67,7 @@ class Brief(Silent):
     """A companion whose flight lasts `turns`, in each of which `during` happens, and which counts
     stop requests. `sends` are the frames of the turn in progress, `log` what it logs."""
 
-    peer, outcome = None, None
+    session, outcome = SimpleNamespace(peer=None), None
     guarded = True
     limits = Limits()
     stops = dropped = 0
