@@ -111,7 +111,7 @@ def fly(
         )
     finally:
         if report:
-            from offboard.report.background import begin_report
+            from offboard.link.after_flight import begin_report
 
             begin_report(directory)
 

@@ -21,6 +21,7 @@ from offboard import compiled
 from offboard.flight.flight import Outcome
 from offboard.flight.phases import WAITING, ExitCode, ServiceOptions
 from offboard.link import clock
+from offboard.link.after_flight import begin
 from offboard.link.background import BackgroundWriter
 from offboard.link.connection import open_link
 from offboard.link.interface import Link, LinkError
@@ -28,7 +29,6 @@ from offboard.link.lock import connection_lock, directory_lock
 from offboard.link.stop import StopRequests
 from offboard.live.process import LiveProcess
 from offboard.mavlink.session import Session
-from offboard.report.background import begin
 from offboard.run.configuration import FlightConfig
 from offboard.run.flight import Connection, discard
 from offboard.run.loop import Loop

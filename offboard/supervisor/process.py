@@ -12,7 +12,6 @@ import select
 import signal
 import socket
 import stat
-import subprocess
 import sys
 from collections.abc import Hashable, Mapping
 from contextlib import suppress
@@ -21,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from offboard.link import clock
+from offboard.link.after_flight import begin
 from offboard.link.background import BackgroundWriter
 from offboard.link.interface import Link
 from offboard.link.log import append, entry
@@ -261,13 +261,7 @@ def _score(log: int) -> None:
     with suppress(OSError):
         path = Path(f"/proc/self/fd/{log}").readlink()
         if path.name == "flight.tlog":
-            subprocess.Popen(
-                [sys.executable, "-P", "-m", "offboard", "score", str(path.parent)],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-                start_new_session=True,
-            )
+            begin("score", path.parent)
 
 
 def _say_to(channel: socket.socket, sentence: str) -> None:
