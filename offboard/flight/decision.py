@@ -202,7 +202,7 @@ def tick_record(flight: FlightState, decided: Decided, answer_s: float) -> TickR
         *certificate,
         decided.solve_time_s,
         answer_s,
-        float(flight.missed_ticks),
+        float(flight.busyness.missed),
         *state.position_ned_m.tolist(),
         *state.velocity_ned_mps.tolist(),
         *state.disturbance_ned_mps2.tolist(),
@@ -212,6 +212,6 @@ def tick_record(flight: FlightState, decided: Decided, answer_s: float) -> TickR
         decided.age_s,
         float(decided.refused),
         float(flight.ignored),
-        flight.pause_s,
+        flight.busyness.paused_s,
     )
     return TickRecord(*values)

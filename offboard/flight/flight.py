@@ -167,9 +167,8 @@ class Flight(FlightState):
             return False
         missed = number - self._tick - 1 if self._tick >= 0 else 0
         self._tick, self._ticked = number, True
-        pause_s = self.busyness.on_tick(missed, flying=self.phase in FLYING)
+        self.busyness.on_tick(missed, flying=self.phase in FLYING)
         ignored = self.other_datagrams + self.session.counters.forged
-        self.missed_ticks, self.pause_s = missed, pause_s
         self.ignored, self._recorded_others = ignored - self._recorded_others, ignored
         return True
 

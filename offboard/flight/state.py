@@ -129,9 +129,7 @@ class FlightState:
     heard_s: float = math.nan  # host time of the newest telemetry, as `Session.elapsed_s`
     telemetry_arrived_s: float = 0.0  # host time at which it arrived
     bridged_s: float = 0.0  # silence at the newest setpoint that needs no telemetry
-    missed_ticks: int = 0  # skipped between the newest tick and the one before
-    ignored: int = 0  # datagrams of others and forged frames between the two
-    pause_s: float = 0.0  # of this process, between the two
+    ignored: int = 0  # datagrams of others and forged frames between the two newest ticks
     command: Command = field(default_factory=lambda: Command(0.0, LEVEL, 0.0))  # in force
     decided: Decided | None = None  # in this turn
     announced_radps: float = math.nan  # bandwidth in use, as the user knows it

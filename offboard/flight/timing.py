@@ -261,29 +261,29 @@ def too_busy(skipped: float, ticks: float, pause_s: float) -> str:
 
 
 class Busyness:
-    """Counts in the air. `period_s`: of control; a shorter gap between two turns skips no tick."""
+    """Counts in the air. `period_s`: of control; a shorter gap between two turns skips no tick.
+
+    `missed` is the number of ticks between the newest one and that before it, `paused_s` the pause
+    that it came after, 0 without one."""
 
     def __init__(self, period_s: float) -> None:
         self._period_s = period_s
         self._gap_s = 0.0  # longest between two turns, since the previous tick
-        self.skipped = self.ticks = 0
-        self.pause_s = 0.0
+        self.skipped = self.ticks = self.missed = 0
+        self.pause_s = self.paused_s = 0.0
 
     def on_turn(self, gap_s: float) -> None:
         """A turn begins `gap_s` after the one before it, host time."""
         self._gap_s = max(self._gap_s, gap_s)
 
-    def on_tick(self, missed: int, *, flying: bool) -> float:
-        """A tick, `missed` ticks after the previous one. Returns the pause that it came after, 0
-        without one."""
-        pause_s, self._gap_s = self._gap_s, 0.0
-        if pause_s <= self._period_s:
-            pause_s = 0.0
+    def on_tick(self, missed: int, *, flying: bool) -> None:
+        """A tick, `missed` ticks after the previous one."""
+        self.missed = missed
+        self.paused_s, self._gap_s = self._gap_s if self._gap_s > self._period_s else 0.0, 0.0
         if flying:
             self.ticks += 1 + missed
-            self.skipped += missed if pause_s else 0
-            self.pause_s = max(self.pause_s, pause_s)
-        return pause_s
+            self.skipped += missed if self.paused_s else 0
+            self.pause_s = max(self.pause_s, self.paused_s)
 
     @property
     def sentence(self) -> str:

@@ -134,6 +134,7 @@ def _enter(flight: FlightState, row: Transition) -> None:
     flight.began_s = flight.now_s
     outbox.announce_phase(flight, reason, cause)
     if source in BEFORE_FLIGHT and row.target in FLYING:
+        flight.authority.ask()  # it may show the mode already
         flight.clock.settle()
         dialect = flight.dialect
         assert dialect is not None
@@ -145,8 +146,6 @@ def _enter(flight: FlightState, row: Transition) -> None:
     if flight.identification:
         stage = STAGES.get(row.target, Stage.OTHER)
         flight.identification.on_stage(stage, flight.time_s)
-    if source in BEFORE_FLIGHT and row.target in FLYING:
-        flight.authority.ask()  # it may show the mode already
     if row.target is Phase.ENGAGE:
         # here, not with the request: a vehicle that shows the mode already passes without one
         flight.authority.ask()

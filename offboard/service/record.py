@@ -131,7 +131,6 @@ class Recorder:
         self._closed = False
         self._engaged = sorted(path.parent for path in directory.glob(f"*/{ENGAGED}"))
         self._left, self._left_until_s = _left(self._engaged)
-        self._vehicle = ""
         logs = sorted(directory.glob("*/flight.tlog"))
         self.unscored = [log.parent for log in logs if not (log.parent / "score.json").exists()]
         # read once: in flight the file system may keep its caller waiting
@@ -176,7 +175,7 @@ class Recorder:
         """A log of its own for a flight of `vehicle` that begins. Returns its directory."""
         self.settle()
         directory = self._new_directory()
-        self._engaged, self._vehicle = [directory], vehicle
+        self._engaged = [directory]
         self._flight = flight = FlightRecord(directory, configuration, vehicle)
         now_us = clock.unix_us()
         assert session.vehicle is not None
@@ -203,9 +202,10 @@ class Recorder:
     def end(self, *, engaged: bool) -> None:
         """Close the flight's log and score it, in another thread. `engaged`: the vehicle may still
         be in the mode of setpoints."""
+        vehicle = self._flight.vehicle if self._flight else ""
         self._close_flight()
         if engaged:
-            self._left, self._left_until_s = self._vehicle, clock.monotonic_s() + ENGAGED_MAX_S
+            self._left, self._left_until_s = vehicle, clock.monotonic_s() + ENGAGED_MAX_S
         else:
             self.settle()
 
