@@ -79,6 +79,8 @@ class Flight(FlightState):
             self._go_on_without_telemetry()
             for sentence in self._news.due(self, now_s):
                 outbox.announce(self, sentence)
+            if self.ended and self.service and self.busyness.sentence:
+                outbox.announce(self, self.busyness.sentence, once=True)
             outbox.send(self, *due, *replies)
         finally:
             self._inputs.end()
@@ -232,11 +234,6 @@ class Flight(FlightState):
         """Whether the flight is over. After another has taken the vehicle, its next HEARTBEAT is
         awaited, as the log must have what it shows; nothing is sent to it any more."""
         return self.ended and not self.awaits_heartbeat
-
-    @property
-    def announcements(self) -> int:
-        """How many there were."""
-        return len(self.announced)
 
     def snapshot(self, flights: int = 0) -> Snapshot:
         """The flight at this moment, for displays; `flights` that the service has begun."""

@@ -22,13 +22,8 @@ CLOSE_S = 2.0  # for what is queued, after the flight
 
 
 class Shown(Protocol):
-    """A companion, or the flights of a service. `announced` has the newest sentences, oldest first,
-    `announcements` counts all that there were."""
+    """A companion, or the flights of a service."""
 
-    @property
-    def announced(self) -> list[str]: ...
-    @property
-    def announcements(self) -> int: ...
     @property
     def phase(self) -> Phase: ...
     @property
@@ -50,8 +45,9 @@ class Display:
 
     def show(self, shown: Shown) -> None:
         """Queue what is new. Called in every turn of the loop."""
-        new, self._seen = shown.announcements - self._seen, shown.announcements
-        for sentence in shown.announced[-new:] if new else []:
+        flight = shown.current
+        new, self._seen = flight.announcements - self._seen, flight.announcements
+        for sentence in flight.announced[-new:] if new else []:
             self._writer.put(self.announcement(shown, sentence))
         if self.is_due(shown):
             self._writer.put(shown.snapshot())
