@@ -15,7 +15,6 @@ from offboard.link.background import BackgroundWriter
 if TYPE_CHECKING:  # the process that serves clients starts without the controller
     from offboard.flight.display import Snapshot
     from offboard.flight.flight import Flight
-    from offboard.flight.phases import Phase
 
 DIGITS = 9  # of a float
 CLOSE_S = 2.0  # for what is queued, after the flight
@@ -24,8 +23,6 @@ CLOSE_S = 2.0  # for what is queued, after the flight
 class Shown(Protocol):
     """A companion, or the flights of a service."""
 
-    @property
-    def phase(self) -> Phase: ...
     @property
     def current(self) -> Flight: ...
     def snapshot(self) -> Snapshot: ...

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from offboard.flight.display import Snapshot
-from offboard.flight.flight import STOPPED, Flight, Outcome
+from offboard.flight.flight import STOPPED, Flight
 from offboard.flight.phases import ENDS, WAITING, Phase, ServiceOptions
 from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from offboard.link.interface import Chunk
@@ -54,11 +54,6 @@ class Flights:
     @property
     def phase(self) -> Phase:
         return self.current.phase
-
-    @property
-    def outcome(self) -> Outcome | None:
-        """How the newest flight ended."""
-        return self.current.outcome
 
     def snapshot(self) -> Snapshot:
         return self.current.snapshot(self.engagements)

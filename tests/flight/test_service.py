@@ -123,8 +123,8 @@ def test_engaged_handed_back_and_engaged_again(served: Served, on: str) -> None:
     pair.until(pair.service.has_ended, 3.0)
     pair.run(0.5)
     assert pair.mode == HOLD[on]
-    assert pair.service.outcome is not None
-    assert pair.service.outcome.exit_code == 0
+    assert pair.service.current.outcome is not None
+    assert pair.service.current.outcome.exit_code == 0
 
 
 def fly_north(pair: Serving, speed_mps: float) -> None:
