@@ -1,9 +1,4 @@
-"""One flight on the companion computer, without I/O: received bytes and times in, frames out.
-
-`Flight.turn` takes all that has arrived, in order; then, if vehicle time has crossed a multiple of
-the control period, it decides once, on the newest state. What no setpoint waits for comes in
-`finish_turn`: records and identification.
-"""
+"""One flight on the companion computer, without I/O: received bytes and times in, frames out."""
 
 from __future__ import annotations
 
@@ -46,8 +41,6 @@ class Flight(FlightState):
         self._inputs = InputRecorder(self.session.settings, kept=self.service is None)
         self.stopwatch = self._inputs.watch(self.stopwatch)
         self._tick = -1  # number of the newest
-        if isinstance(before, Flight) and before.period_s == self.period_s:
-            self._tick = before._tick
         self._recorded_others = self.other_datagrams
         self._news = News()
         self._logged: list[bytes] = []  # frames since the newest `finish_turn`
