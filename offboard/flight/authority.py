@@ -6,6 +6,8 @@ changed. A report has an age: without a recent one nothing is sent.
 
 The mode of the autopilot's own failsafe for missing setpoints is an exception, as nobody chose it:
 the vehicle may be asked to land from it, unless it receives a pilot's sticks.
+
+While it is not ours, `PilotSwitch` says whether the pilot of the service has engaged us.
 """
 
 from __future__ import annotations
@@ -53,6 +55,7 @@ class Authority:
     standing: Standing = Standing.FREE
     mode: str = "unknown"
     heard_s: float = -math.inf  # time of the newest report
+    reported_s: float = -math.inf  # time of the newest report that counts
     lost_reason: str = ""
     lost_s: float = math.inf  # time of the loss; -inf if a HEARTBEAT reported it
     loss: SetpointLoss = NEVER  # what the autopilot does without setpoints
@@ -84,6 +87,8 @@ class Authority:
         """
         before, self.mode = self.mode, mode
         self.heard_s, self.arrived_s = now_s, arrived_s
+        if arrived_s >= self._counts_from_s:
+            self.reported_s = now_s
         if self.standing is Standing.ASKED:
             if mode == self.engage_mode:
                 self.standing = Standing.OURS
@@ -123,8 +128,8 @@ class Authority:
             stays = self.standing is Standing.FAILSAFE and self.mode == before
             shown = stays and self._failsafe_shown
             self.standing = Standing.FAILSAFE
-            known = heartbeat and self._counts and sticks is not None
-            self._failsafe_shown = shown or known
+            counts = self.arrived_s >= self._counts_from_s
+            self._failsafe_shown = shown or (heartbeat and counts and sticks is not None)
 
     def _hand_over(self, mode: str) -> None:
         """It shows a mode that we requested; those requested before it do not count any more."""
@@ -157,13 +162,14 @@ class Authority:
         """After a pause of our own of `paused_s` that ended at `host_s`: only reports that arrive
         later count, or that have arrived just before if the pause was too short for the vehicle's
         failsafe to have acted in it."""
-        from_s = host_s - (JUST_S if paused_s < self.loss.after_s else 0.0)
-        self._counts_from_s = max(from_s, self._counts_from_s)
+        self._counts_from_s = host_s - (JUST_S if paused_s < self.loss.after_s else 0.0)
         self._failsafe_shown = False
+        if self.arrived_s < self._counts_from_s:
+            self.reported_s = -math.inf
 
     def forget(self, now_s: float) -> None:
         """The vehicle was rebooted: its standing is shown by the next report of the mode."""
-        self.heard_s = -math.inf
+        self.heard_s = self.reported_s = -math.inf
         self._forgot_s = now_s
         if self.is_ours:
             self.standing = Standing.OURS
@@ -175,12 +181,8 @@ class Authority:
             self.lost_s = -math.inf if heartbeat else now_s
 
     def known(self, now_s: float) -> bool:
-        """Whether the newest report counts, and is recent enough to act on."""
-        return self._counts and self.heard(now_s)
-
-    @property
-    def _counts(self) -> bool:
-        return self.arrived_s >= self._counts_from_s
+        """Whether the newest report that counts is recent enough to act on."""
+        return now_s - self.reported_s <= MODE_KNOWN_S
 
     def heard(self, now_s: float) -> bool:
         """Whether reports arrive, even if none counts yet."""

@@ -37,9 +37,8 @@ class News:
 
     def due(self, state: FlightState, now_s: float) -> list[str]:
         """The sentences to announce now, at host time `now_s`."""
-        ended = state.busyness.sentence if state.ended and state.service else ""
         told = [self.paused.news(now_s), self.dropped.news(now_s), self._waiting(state)]
-        return list(filter(None, [*told, "" if ended in state.announced else ended]))
+        return list(filter(None, told))
 
     def _waiting(self, state: FlightState) -> str:
         if state.phase not in FIRST_S:

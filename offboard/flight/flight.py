@@ -1,9 +1,4 @@
-"""One flight on the companion computer, without I/O: received bytes and times in, frames out.
-
-`Flight.turn` takes all that has arrived, in order; then, if vehicle time has crossed a multiple of
-the control period, it decides once, on the newest state. What no setpoint waits for comes in
-`finish_turn`: records and identification.
-"""
+"""One flight on the companion computer, without I/O: received bytes and times in, frames out."""
 
 from __future__ import annotations
 
@@ -46,8 +41,6 @@ class Flight(FlightState):
         self._inputs = InputRecorder(self.session.settings, kept=self.service is None)
         self.stopwatch = self._inputs.watch(self.stopwatch)
         self._tick = -1  # number of the newest
-        if isinstance(before, Flight) and before.period_s == self.period_s:
-            self._tick = before._tick
         self._recorded_others = self.other_datagrams
         self._news = News()
         self._logged: list[bytes] = []  # frames since the newest `finish_turn`
@@ -79,6 +72,8 @@ class Flight(FlightState):
             self._go_on_without_telemetry()
             for sentence in self._news.due(self, now_s):
                 outbox.announce(self, sentence)
+            if self.ended and self.service and self.busyness.sentence:
+                outbox.announce(self, self.busyness.sentence, once=True)
             outbox.send(self, *due, *replies)
         finally:
             self._inputs.end()
@@ -232,11 +227,6 @@ class Flight(FlightState):
         """Whether the flight is over. After another has taken the vehicle, its next HEARTBEAT is
         awaited, as the log must have what it shows; nothing is sent to it any more."""
         return self.ended and not self.awaits_heartbeat
-
-    @property
-    def announcements(self) -> int:
-        """How many there were."""
-        return len(self.announced)
 
     def snapshot(self, flights: int = 0) -> Snapshot:
         """The flight at this moment, for displays; `flights` that the service has begun."""

@@ -30,6 +30,7 @@ from offboard.model.vehicle import Vehicle
 
 INFO = 6  # MAV_SEVERITY
 TEXT_ID_MAX = 65535  # STATUSTEXT.id; 0 is for texts of one chunk
+ANNOUNCED_KEPT = 200
 REPEAT_S = 1.0  # after this a request that was refused, or not answered, is sent again
 _LENGTH_TOLERANCE = 0.01
 
@@ -218,22 +219,32 @@ def request(flight: FlightState, request: CommandLong) -> bool:
 
 
 def announce(flight: FlightState, sentence: str, *, once: bool = False) -> None:
-    """Report to the user, the ground station and the log; `once`: unless it has been."""
-    if not (once and sentence in flight.announced):
-        flight.announced.append(sentence)
-        _say(flight, INFO, EventRecord(sentence))
+    """Report to the user, the ground station and the log; `once`: unless this flight has."""
+    if once and sentence in flight.told:
+        return
+    if once:
+        flight.told.add(sentence)
+    _show(flight, sentence)
+    _say(flight, INFO, EventRecord(sentence))
 
 
 def announce_phase(flight: FlightState, reason: str, cause: str) -> None:
     """Report that the phase begins; `cause` is a word for the log, empty without one."""
     sentence = f"{flight.phase.value}: {reason}"
-    flight.announced.append(sentence)
+    _show(flight, sentence)
     _say(flight, INFO, EventRecord(sentence, flight.phase.code, cause), title="offboard: ")
 
 
 def warn(flight: FlightState, sentence: str) -> None:
     """Report to the ground station and the log."""
     _say(flight, WARNING, EventRecord(sentence))
+
+
+def _show(flight: FlightState, sentence: str) -> None:
+    """To the user. A vehicle may wait for weeks: only the newest sentences are kept."""
+    flight.announcements += 1
+    flight.announced.append(sentence)
+    del flight.announced[:-ANNOUNCED_KEPT]
 
 
 def _say(flight: FlightState, severity: int, event: EventRecord, title: str = "") -> None:

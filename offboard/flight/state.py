@@ -57,8 +57,8 @@ class Outcome:
 
 # of the flight before, with the same vehicle
 KEPT = (
-    "vehicle", "contact", "clock", "hover", "reading", "other_datagrams", "host_s",
-    "turned_s", "silence_s", "heard_s", "guarded",
+    "vehicle", "contact", "clock", "hover", "reading", "other_datagrams", "host_s", "turned_s",
+    "silence_s", "heard_s", "guarded", "announced", "announcements",
 )  # fmt: skip
 
 
@@ -138,7 +138,11 @@ class FlightState:
     failure_cause: str = ""  # in a word: controller, link or computer
     commands: deque[Command] = field(default_factory=lambda: deque(maxlen=COMMANDS_KEPT))
     thrusts: deque[float] = field(default_factory=lambda: deque(maxlen=THRUSTS_KEPT))
-    announced: list[str] = field(default_factory=list)  # sentences for the user, oldest first
+    announced: list[str] = field(
+        default_factory=list
+    )  # newest sentences for the user, oldest first
+    announcements: int = 0  # how many there were
+    told: set[str] = field(default_factory=set)  # of those that are announced once in a flight
     queue: list[Outgoing] = field(default_factory=list)  # to be sent
     records: list[Record] = field(default_factory=list)  # to be logged
     requested_s: dict[tuple[Phase, CommandLong], float] = field(default_factory=dict)

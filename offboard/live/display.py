@@ -15,22 +15,14 @@ from offboard.link.background import BackgroundWriter
 if TYPE_CHECKING:  # the process that serves clients starts without the controller
     from offboard.flight.display import Snapshot
     from offboard.flight.flight import Flight
-    from offboard.flight.phases import Phase
 
 DIGITS = 9  # of a float
 CLOSE_S = 2.0  # for what is queued, after the flight
 
 
 class Shown(Protocol):
-    """A companion, or the flights of a service. `announced` has the newest sentences, oldest first,
-    `announcements` counts all that there were."""
+    """A companion, or the flights of a service."""
 
-    @property
-    def announced(self) -> list[str]: ...
-    @property
-    def announcements(self) -> int: ...
-    @property
-    def phase(self) -> Phase: ...
     @property
     def current(self) -> Flight: ...
     def snapshot(self) -> Snapshot: ...
@@ -50,8 +42,9 @@ class Display:
 
     def show(self, shown: Shown) -> None:
         """Queue what is new. Called in every turn of the loop."""
-        new, self._seen = shown.announcements - self._seen, shown.announcements
-        for sentence in shown.announced[-new:] if new else []:
+        flight = shown.current
+        new, self._seen = flight.announcements - self._seen, flight.announcements
+        for sentence in flight.announced[-new:] if new else []:
             self._writer.put(self.announcement(shown, sentence))
         if self.is_due(shown):
             self._writer.put(shown.snapshot())

@@ -115,7 +115,7 @@ class JsonLog(JsonLines):
         self._writer.put(_logged("service", sentence))
 
     def announcement(self, shown: Shown, sentence: str) -> str:
-        return _logged(shown.phase.value, sentence, vehicle_time_s=shown.current.time_s)
+        return _logged(shown.current.phase.value, sentence, vehicle_time_s=shown.current.time_s)
 
     def is_due(self, shown: Shown) -> bool:
         return False

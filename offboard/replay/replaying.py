@@ -133,7 +133,6 @@ class Replay:
         self.count = 0
         self.recording = recording
         self._messages = iter(recording.log)
-        self._next: LoggedMessage | None = None
         self._pieces = 0  # of the inputs, found among the messages
         self._leaving: list[Sent] = []  # by the newest turn
         self._crc, self._checked_s = 0, 0.0

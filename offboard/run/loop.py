@@ -1,8 +1,4 @@
-"""The loop: link -> companion -> link and log, paced by the vehicle's telemetry.
-
-Nothing in it waits, except for telemetry: log and terminal are written by other threads. An
-exception in it requests the landing.
-"""
+"""The loop: link -> companion -> link and log, paced by the vehicle's telemetry."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ def check_scenario(text: str, source: str) -> None:
 
 class SimulatorProcess:
     """Context manager around `python -m simulator.pool`, which loads once and then starts vehicles,
-    one after the other, each as a child process. Leaving it ends all processes."""
+    one after the other, each as a child of `process`. Leaving it ends all processes."""
 
     def __init__(self) -> None:
         self._ending: Ending | None = None
@@ -69,7 +69,7 @@ class SimulatorProcess:
 
     def _open(self) -> None:
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `close`
-        self._process = subprocess.Popen(
+        self.process = subprocess.Popen(
             [sys.executable, "-P", "-m", "simulator.pool"],
             bufsize=0,
             stdin=subprocess.PIPE,
@@ -81,24 +81,19 @@ class SimulatorProcess:
 
     def launch(self, options: Sequence[str]) -> None:
         """Start a vehicle with `options` of the `simulator` command."""
-        if self._process.poll() is not None:  # it died in an earlier flight
+        if self.process.poll() is not None:  # it died in an earlier flight
             self.close()
             self._open()
         self._errors_before = os.fstat(self._errors.fileno()).st_size
         self._ending = None
         self._write(json.dumps(options).encode() + b"\n")
 
-    @property
-    def pid(self) -> int:
-        """Process id of the pool; a vehicle is its child."""
-        return self._process.pid
-
     def ended(self, timeout_s: float = 0.0) -> Ending | None:
         """How the vehicle's process ended, or None if it still runs after `timeout_s`."""
-        assert self._process.stdout is not None
-        if self._ending is None and select.select([self._process.stdout], [], [], timeout_s)[0]:
-            code = self._process.stdout.readline()
-            self._ending = self._explain(int(code) if code else self._process.wait())
+        assert self.process.stdout is not None
+        if self._ending is None and select.select([self.process.stdout], [], [], timeout_s)[0]:
+            code = self.process.stdout.readline()
+            self._ending = self._explain(int(code) if code else self.process.wait())
             if not code:
                 self.close()  # the pool died, its vehicle may still run
         return self._ending
@@ -111,9 +106,9 @@ class SimulatorProcess:
                 self.close()
 
     def _write(self, line: bytes) -> None:
-        assert self._process.stdin is not None
+        assert self.process.stdin is not None
         with suppress(BrokenPipeError):  # the pool died; `ended` reports it
-            self._process.stdin.write(line)
+            self.process.stdin.write(line)
 
     def _explain(self, code: int) -> Ending:
         errors = os.pread(self._errors.fileno(), ERRORS_BYTES, self._errors_before)
@@ -129,9 +124,9 @@ class SimulatorProcess:
         if self._errors.closed:
             return
         with suppress(ProcessLookupError, PermissionError):  # no process is left
-            os.killpg(self._process.pid, signal.SIGKILL)  # the pool and its vehicle
-        self._process.wait()
-        for pipe in (self._process.stdin, self._process.stdout, self._errors):
+            os.killpg(self.process.pid, signal.SIGKILL)  # the pool and its vehicle
+        self.process.wait()
+        for pipe in (self.process.stdin, self.process.stdout, self._errors):
             assert pipe is not None
             pipe.close()
 

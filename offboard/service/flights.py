@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from offboard.flight.display import Snapshot
-from offboard.flight.flight import STOPPED, Flight, Outcome
+from offboard.flight.flight import STOPPED, Flight
 from offboard.flight.phases import ENDS, WAITING, Phase, ServiceOptions
 from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from offboard.link.interface import Chunk
@@ -19,15 +19,11 @@ from offboard.run.flight import Prepared
 from offboard.service.preparation import Preparation, VehicleFiles
 from offboard.service.record import Recorder
 
-TEXTS_KEPT = 200
-
 
 class Flights:
     """See the module. `stopwatch` reads host time.
 
     `current` is the flight that waits or flies. `engagements` counts the flights that have begun.
-    `announced` has the newest sentences for the user, oldest first, `announcements` how many there
-    were.
     """
 
     def __init__(
@@ -48,9 +44,6 @@ class Flights:
         self._stopwatch = stopwatch
         self._stopping = False
         self._recording = False
-        self._shown = 0  # of the present companion's announcements
-        self.announced: list[str] = []
-        self.announcements = 0
         self.engagements = 0
         self._prepared = source.newest()
         self._known: IdentifiedVehicle | None = None  # that the present flight began with
@@ -61,11 +54,6 @@ class Flights:
     @property
     def phase(self) -> Phase:
         return self.current.phase
-
-    @property
-    def outcome(self) -> Outcome | None:
-        """How the newest flight ended."""
-        return self.current.outcome
 
     def snapshot(self) -> Snapshot:
         return self.current.snapshot(self.engagements)
@@ -97,7 +85,6 @@ class Flights:
             self._begin_record()
         if self._recording and before is not self.phase:
             self._keep_identified()
-        self._collect()
         return frames
 
     # ------------------------------------------------------------------ one flight after another
@@ -113,10 +100,8 @@ class Flights:
 
     def _follow(self, prepared: Prepared) -> None:
         """Continue with a new companion where the present one has ended or waits."""
-        self._collect()
         self._prepared, self._known = prepared, self._remembered(prepared)
         self.current = self._companion(self.current)
-        self._shown = 0
 
     def _companion(self, before: Flight | None) -> Flight:
         self._prepared.controller.reset()
@@ -187,13 +172,3 @@ class Flights:
         elif not identification.contradicted and self._known is None and identification.result:
             self._memory.keep(self._key, self._prepared, identification.result)
             self._known = self._remembered(self._prepared)
-
-    # ------------------------------------------------------------------ what the user reads
-
-    def _collect(self) -> None:
-        said = self.current.announced
-        new = said[self._shown :]
-        del said[:-TEXTS_KEPT]  # the companion of a vehicle that waits may live for weeks
-        self._shown = len(said)
-        self.announcements += len(new)
-        self.announced = [*self.announced, *new][-TEXTS_KEPT:]

@@ -71,11 +71,9 @@ class Recovery:
     `ended` says how it ended, empty until then; `news` are sentences for the user."""
 
     def __init__(self, dialect: Dialect, known: Supervised, began_s: float, beat_s: float) -> None:
-        self._dialect = dialect
-        self._holding = known.holding
+        self._dialect, self._known = dialect, known
         self._hold_s = 0.0 if known.landing else HOLD_S
         self._began_s = began_s
-        self._loss = known.loss
         missing_s = beat_s + known.loss.after_s - EARLY_S
         self._loses_s = -math.inf if known.starved else missing_s
         self._sticks = known.sticks
@@ -124,14 +122,17 @@ class Recovery:
         self._mode, self._reported_s = mode, at_s
         ours = mode in (self._dialect.engage_mode, self._dialect.land_mode)
         if mode == self._dialect.hold_mode and not self._landing:
-            ours = self._holding or at_s > self._first_s
+            ours = self._known.holding or at_s > self._first_s
         self._landing |= mode == self._dialect.land_mode
         if (
             failsafe is not False
             and self._explains(mode, at_s)
             and (failsafe or not ours or self._fallen_s < math.inf)
         ):
-            self._fall(mode, at_s, shown=bool(failsafe))
+            self._fallen_s = min(self._fallen_s, at_s)
+            if failsafe and not self._fallen_shown:
+                self._fallen_shown = True
+                self.news.append(f"its own failsafe flies it, in {mode}: watching that it lands")
             return
         self._fallen_s, self._fallen_shown = math.inf, False
         if not ours and not self._left_for:
@@ -144,16 +145,10 @@ class Recovery:
         fell = self._fallen_s < math.inf
         followed = fell or self._before in (None, self._dialect.engage_mode)
         missing = followed and not self._acknowledged and at_s >= self._loses_s
-        if missing and mode in self._loss.modes and self._sticks:
+        if missing and mode in self._known.loss.modes and self._sticks:
             self.news.append(f"{mode} for missing setpoints, and it receives a pilot's sticks")
         lands = mode == self._dialect.land_mode
-        return missing and mode in self._loss.modes and not lands and not self._sticks
-
-    def _fall(self, mode: str, at_s: float, *, shown: bool) -> None:
-        self._fallen_s = min(self._fallen_s, at_s)
-        if shown and not self._fallen_shown:
-            self._fallen_shown = True
-            self.news.append(f"its own failsafe flies it, in {mode}: watching that it lands")
+        return missing and mode in self._known.loss.modes and not lands and not self._sticks
 
     def due(self, now_s: float) -> CommandLong | None:
         """What to ask for now."""
@@ -171,7 +166,7 @@ class Recovery:
         """Note since when it holds, and whether the recovery has ended."""
         holds = self._mode == self._dialect.hold_mode and self._fallen_s == math.inf
         self._held_s = min(self._held_s, now_s) if holds else math.inf
-        ours = self._holding or self._acknowledged
+        ours = self._known.holding or self._acknowledged
         # PX4 leaves its landing mode when it disarms, which HEARTBEAT shows later
         shown = not self._landing or self._heartbeat_s >= self._left_s
         if not self._armed:
@@ -201,6 +196,6 @@ class Recovery:
             return None
         if self._mode == self._dialect.engage_mode:
             return first
-        if not (self._holding or self._acknowledged):
+        if not (self._known.holding or self._acknowledged):
             return hold  # it holds, but the acknowledgement may have been lost
         return land if now_s - self._held_s >= HOLD_S else None

@@ -55,7 +55,7 @@ class Supervisor:
         self._channel.setblocking(False)
         with theirs:
             try:
-                self._process = subprocess.Popen(
+                self.process = subprocess.Popen(
                     [sys.executable, "-P", "-m", "offboard.supervisor.process"],
                     stdin=theirs.fileno(),
                     stdout=subprocess.DEVNULL,
@@ -67,11 +67,6 @@ class Supervisor:
         if self._signing:  # not in arguments or environment, which others can read
             self._channel.send(json.dumps({"key": self._signing.key.hex()}).encode() + b"\n")
         return self
-
-    @property
-    def pid(self) -> int:
-        """Process id."""
-        return self._process.pid
 
     @property
     def said(self) -> list[str]:
@@ -92,7 +87,7 @@ class Supervisor:
     def restart(self) -> None:
         """Start another process in place of one that has ended. Raises SupervisorError."""
         self._channel.close()
-        self._process.poll()
+        self.process.poll()
         self._received, self._lines = b"", []
         self._passed = None
         self._unanswered_s = math.inf
@@ -151,10 +146,10 @@ class Supervisor:
         """Wait at most `timeout_s` for its next sentence; whether it has ended."""
         select.select([self._channel], [], [], timeout_s)
         self._receive()
-        return self._process.poll() is not None
+        return self.process.poll() is not None
 
     def __exit__(self, *_: object) -> None:
         """Close the channel: the process ends, or takes over if the last beat says so."""
         self._channel.close()
         with suppress(subprocess.TimeoutExpired):  # it holds the link's port
-            self._process.wait(END_S)
+            self.process.wait(END_S)

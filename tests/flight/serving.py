@@ -131,7 +131,7 @@ class Serving(Pair):
         end_s = self.time_s + longest_s
         while not done():
             assert self.time_s < end_s, (
-                f"{self.service.phase} {self.mode}: {self.service.announced}"
+                f"{self.service.phase} {self.mode}: {self.service.current.announced}"
             )
             self.advance()
 
@@ -234,7 +234,7 @@ class Serving(Pair):
         ]
 
     def said(self, words: str) -> bool:
-        return any(words in sentence for sentence in self.service.announced)
+        return any(words in sentence for sentence in self.service.current.announced)
 
 
 def serve(

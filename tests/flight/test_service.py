@@ -109,20 +109,22 @@ def test_engaged_handed_back_and_engaged_again(served: Served, on: str) -> None:
             ticks = round((left_s - began_s) / 0.1)
             score = pair.score()
             assert (score.completed, score.ended_by) == (1.0, "reference over")
-    (busy,) = (said for said in pair.service.announced if "too busy" in said)
+    (busy,) = (said for said in pair.service.current.announced if "too busy" in said)
     counted = rf"this computer was too busy: [45] of ({ticks}|{ticks + 1}) ticks were "
     assert re.fullmatch(rf"{counted}skipped, pauses up to 0\.5[0-9] s", busy)
     assert len(pair.logs.begun) == len(pair.logs.ended) == 2
     known = r"this vehicle was identified before: tilt delay \d+ ms; no identification steps"
-    assert any(re.fullmatch(known, said) for said in pair.service.announced)  # no hover thrust
+    assert any(
+        re.fullmatch(known, said) for said in pair.service.current.announced
+    )  # no hover thrust
     pair.engage()
     pair.run(1.0)
     pair.service.request_stop()
     pair.until(pair.service.has_ended, 3.0)
     pair.run(0.5)
     assert pair.mode == HOLD[on]
-    assert pair.service.outcome is not None
-    assert pair.service.outcome.exit_code == 0
+    assert pair.service.current.outcome is not None
+    assert pair.service.current.outcome.exit_code == 0
 
 
 def fly_north(pair: Serving, speed_mps: float) -> None:
@@ -502,7 +504,11 @@ def test_a_request_is_accepted_again_and_no_more_once_the_flight_ends(served: Se
     pair.run(0.2)
     repeated = [(PAUSE_CONTINUE, ACCEPTED)] * 6 + [(SET_MODE, ACCEPTED)] * 2
     assert pair.acks == [rejected, *repeated, rejected]
-    said = [text.split(" requested by ")[0] for text in pair.service.announced if "ted by" in text]
+    said = [
+        text.split(" requested by ")[0]
+        for text in pair.service.current.announced
+        if "ted by" in text
+    ]
     assert said == ["pause", "continue", "hand back"]
     pair.engage()
     pair.until(lambda: pair.phase is Phase.TRACK, 30.0)
@@ -546,7 +552,7 @@ def test_a_pilot_takes_a_vehicle_whose_own_failsafe_acts_soon(served: Served) ->
     pair.run(0.3)  # CURRENT_MODE shows it first, which does not tell a pilot from a failsafe
     pair.switch("pilot")
     pair.until(lambda: pair.phase is Phase.STANDBY, 2.0)
-    assert pair.service.announced[-1].startswith(
+    assert pair.service.current.announced[-1].startswith(
         "yielded: the vehicle left OFFBOARD for AUTO.LOITER"
     )
     assert not pair.said("own failsafe")
@@ -636,7 +642,7 @@ def test_what_is_heard_after_a_silence_in_health_may_be_another_vehicle_too(serv
     pair.run(6.0)
     assert pair.phase is Phase.HEALTH
     assert pair.said("waiting: GUID_OPTIONS is 0: without bit 3")
-    assert sum("health: no telemetry for 5" in said for said in pair.service.announced) == 1
+    assert sum("health: no telemetry for 5" in said for said in pair.service.current.announced) == 1
 
 
 def test_another_hardware_number_is_another_vehicle(served: Served) -> None:
@@ -676,7 +682,7 @@ def test_the_reference_is_repeated_with_the_newest_configuration(served: Served)
     assert score.max_position_m < 0.01
     assert pair.service.current is model
     assert len(model.announced) <= 200
-    assert pair.service.announcements > 500
+    assert pair.service.current.announcements > 500
     beats = [decode(frame) for _, _, frame in pair.sent if frame[7:10] == b"\0\0\0"]
     assert (3, 17) in [(beat.system_status, beat.custom_mode) for beat in beats]
     assert (4, 6) in [(beat.system_status, beat.custom_mode) for beat in beats]

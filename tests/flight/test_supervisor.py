@@ -82,7 +82,7 @@ class Rig:
         self.link.close()
 
     def await_end(self) -> None:
-        self.supervisor._process.wait(LONG_S)
+        self.supervisor.process.wait(LONG_S)
 
     def next_command(self) -> Any:
         """The next COMMAND_LONG that the vehicle receives."""
@@ -154,7 +154,7 @@ def test_it_signs_with_stamps_that_follow_ours(rig: Rig) -> None:
         rig.beat(OURS)
         newest = ours.encode(Heartbeat(6))
     assert rig.codec.decode(bytearray(newest)).get_type() == "HEARTBEAT"
-    assert KEY.hex() not in str(rig.supervisor._process.args)
+    assert KEY.hex() not in str(rig.supervisor.process.args)
     rig.abandon()
     command = rig.next_command()
     assert command.command == 176
@@ -170,7 +170,7 @@ def test_it_signs_with_stamps_that_follow_ours(rig: Rig) -> None:
 def test_it_takes_over_when_the_beats_stop_and_says_so_first(rig: Rig) -> None:
     """Signals do not end it: a service manager signals all processes of a service."""
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        os.kill(rig.supervisor.pid, number)
+        os.kill(rig.supervisor.process.pid, number)
     rig.beat(OURS)
     assert not rig.supervisor.has_taken_over()
     assert rig.next_command().command == 176
@@ -214,13 +214,13 @@ def test_one_that_is_stopped_does_not_guard_until_it_continues(rig: Rig) -> None
     controller: it does not take over as it continues, but once the beats stop."""
     for guard in (ON_GROUND, OURS):
         beat_until(rig, True, guard)
-        os.kill(rig.supervisor.pid, signal.SIGSTOP)
+        os.kill(rig.supervisor.process.pid, signal.SIGSTOP)
         assert 0.9 < beat_until(rig, False, guard) < 2.0
-        os.kill(rig.supervisor.pid, signal.SIGCONT)
+        os.kill(rig.supervisor.process.pid, signal.SIGCONT)
         assert beat_until(rig, True, guard) < 1.0
-    os.kill(rig.supervisor.pid, signal.SIGSTOP)
+    os.kill(rig.supervisor.process.pid, signal.SIGSTOP)
     time.sleep(1.2)  # both are stopped, and the controller wakes up later
-    os.kill(rig.supervisor.pid, signal.SIGCONT)
+    os.kill(rig.supervisor.process.pid, signal.SIGCONT)
     time.sleep(0.2)
     assert not rig.supervisor.has_taken_over()
     beat_until(rig, True, OURS)
@@ -263,7 +263,7 @@ def test_a_vehicle_that_is_not_ours_or_on_the_ground_is_left_alone(
 def test_a_supervisor_that_ends_is_noticed_and_another_one_takes_over(rig: Rig) -> None:
     rig.beat(OURS)
     assert not rig.supervisor.lost
-    os.kill(rig.supervisor.pid, signal.SIGKILL)
+    os.kill(rig.supervisor.process.pid, signal.SIGKILL)
     rig.await_end()
     rig.beat(OURS)
     rig.beat(OURS)

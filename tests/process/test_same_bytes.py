@@ -74,9 +74,9 @@ class LateSimulator(SimulatorProcess):
     """Starts each vehicle a tenth of a second after the launch."""
 
     def launch(self, options: Sequence[str]) -> None:
-        os.killpg(self.pid, signal.SIGSTOP)
+        os.killpg(self.process.pid, signal.SIGSTOP)
         super().launch(options)
-        Timer(0.1, os.killpg, (self.pid, signal.SIGCONT)).start()
+        Timer(0.1, os.killpg, (self.process.pid, signal.SIGCONT)).start()
 
 
 def test_over_udp_and_disturbed_every_frame_is_the_same(

@@ -31,13 +31,13 @@ def flying(simulator: SimulatorProcess) -> Iterator[int]:
         port = ours.getsockname()[1]
         simulator.launch(["--connect", f"udpout:127.0.0.1:{port}", "--gcs", "none", "--lockstep"])
         assert ours.recv(65535)
-        (vehicle,) = children(simulator.pid)
+        (vehicle,) = children(simulator.process.pid)
         yield vehicle
 
 
 def test_how_each_vehicle_ends_is_reported_and_the_next_one_flies() -> None:
     with SimulatorProcess() as simulator:
-        pid = simulator.pid
+        pid = simulator.process.pid
         for options, says in (
             (["--scenario", "storm"], "there is no scenario named 'storm'; known are"),
             (["--firmware", "betaflight"], "--firmware betaflight: unknown"),
@@ -52,7 +52,7 @@ def test_how_each_vehicle_ends_is_reported_and_the_next_one_flies() -> None:
         with flying(simulator):
             assert simulator.ended() is None
         simulator.recall()
-        assert (children(simulator.pid), simulator.pid) == ([], pid)
+        assert (children(simulator.process.pid), simulator.process.pid) == ([], pid)
 
 
 def test_one_that_dies_in_flight_ends_it_and_is_replaced(tmp_path: Path) -> None:
@@ -60,8 +60,8 @@ def test_one_that_dies_in_flight_ends_it_and_is_replaced(tmp_path: Path) -> None
 
     def kill(companion: Flight) -> None:
         if companion.phase is Phase.TRACK and not lost:
-            lost.extend((*children(simulator.pid), simulator.pid))
-            os.kill(simulator.pid, signal.SIGKILL)
+            lost.extend((*children(simulator.process.pid), simulator.process.pid))
+            os.kill(simulator.process.pid, signal.SIGKILL)
 
     config = load("flight", choices={"reference": "hover"}, assignments=SHORT)
     with SimulatorProcess() as simulator:
@@ -74,5 +74,5 @@ def test_one_that_dies_in_flight_ends_it_and_is_replaced(tmp_path: Path) -> None
         orphan, pool = lost
         eventually(lambda: ended(orphan))
         with flying(simulator):
-            assert simulator.pid != pool
-    assert ended(simulator.pid)
+            assert simulator.process.pid != pool
+    assert ended(simulator.process.pid)
