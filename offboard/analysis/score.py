@@ -46,9 +46,8 @@ class Score:
 
     Errors are relative to the reference, during the phase TRACK: `position` as the vehicle
     estimates it (LOCAL_POSITION_NED), `truth` as it is in the simulator (HIL_STATE_QUATERNION or
-    SIM_STATE). RMSE and percentiles of errors and motion are weighted by the time of the reference:
-    each sample stands for half of the interval before it and half of the one after it, so that
-    telemetry which is thinned or lost counts with the mean of what surrounds it
+    SIM_STATE). RMSE and percentiles of errors and motion are weighted by the time of the reference,
+    so that telemetry which is thinned or lost counts with the mean of what surrounds it
     (`analysis.tracking`). `position_gap_max_s` is the longest gap. The metrics of the certificate
     are of the decisions that were sent as they were certified, a share `certified_share` of all.
     Times are vehicle time. A metric that the log does not hold is NaN.
