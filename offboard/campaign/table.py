@@ -88,24 +88,22 @@ def row_of(case: Case, record: Record, requirements: Sequence[Requirement]) -> R
 
 def columns(rows: Sequence[Row]) -> dict[str, list[Any]]:
     """The table by columns; what a flight does not have is None."""
-    keys = dict.fromkeys(key for row in rows for key, _ in row.case.values)
-    found: dict[str, list[Any]] = {"case": [row.case.key for row in rows]}
-    for name in CASE_COLUMNS:
-        found[name] = [getattr(row.case, name) for row in rows]
     values = [dict(row.case.values) for row in rows]
-    for key in keys:
-        found[key] = [_scalar(own.get(key)) for own in values]
-    found["seed"] = [row.case.seed for row in rows]
-    found["success"] = [int(not row.failed) for row in rows]
-    found["exit_code"] = [row.record.exit_code for row in rows]
-    found["ended"] = [row.record.sentence for row in rows]
-    found["failed"] = [row.failed for row in rows]
-    found["margin"] = [row.record.margin for row in rows]
-    found["weakest"] = [row.record.weakest for row in rows]
-    for name in FIGURE_COLUMNS:
-        found[name] = [row.record.figures.get(name) for row in rows]
-    found["fly_again"] = [row.case.line for row in rows]
-    return found
+    keys = dict.fromkeys(itertools.chain.from_iterable(values))
+    return {
+        "case": [row.case.key for row in rows],
+        **{name: [getattr(row.case, name) for row in rows] for name in CASE_COLUMNS},
+        **{key: [_scalar(own.get(key)) for own in values] for key in keys},
+        "seed": [row.case.seed for row in rows],
+        "success": [int(not row.failed) for row in rows],
+        "exit_code": [row.record.exit_code for row in rows],
+        "ended": [row.record.sentence for row in rows],
+        "failed": [row.failed for row in rows],
+        "margin": [row.record.margin for row in rows],
+        "weakest": [row.record.weakest for row in rows],
+        **{name: [row.record.figures.get(name) for row in rows] for name in FIGURE_COLUMNS},
+        "fly_again": [row.case.line for row in rows],
+    }
 
 
 def _scalar(value: Any) -> Any:

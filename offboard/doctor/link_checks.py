@@ -145,7 +145,7 @@ def bandwidth(seen: Observation) -> Iterable[Finding]:
     """Whether the link carries the telemetry that a flight requests."""
     heard, session = seen.heard, seen.heard.session
     figures = f"{heard.bytes_ps / 1e3:.1f} kB/s received"
-    most, wanted = session.settings.capacity_bytes_ps, session.telemetry.rates.bytes_ps
+    most, wanted = session.settings.capacity_bytes_ps, session.telemetry.bytes_ps
     if most is None:
         yield ok(figures)
         return

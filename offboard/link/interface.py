@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -39,12 +39,13 @@ class Chunk:
 
 
 class LinkReport:
-    """What a link tells: what other addresses than the vehicle's send, counted, and breaks."""
+    """What a link tells: what other addresses than the vehicle's send, counted, and breaks.
+    `overheard`: some of these datagrams, until the loop has taken them."""
 
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()
         self._news: list[str] = []
-        self._overheard: list[bytes] = []
+        self.overheard: list[bytes] = []
 
     @property
     def ignored(self) -> int:
@@ -70,15 +71,6 @@ class LinkReport:
         """Sentences since the last call, on the 1st, 10th, 100th ... datagram of a sender."""
         news, self._news = self._news, []
         return news
-
-    def keep(self, datagrams: Iterable[bytes]) -> None:
-        """Some of the datagrams, until the next call."""
-        self._overheard = list(datagrams)
-
-    def overheard(self) -> list[bytes]:
-        """The datagrams that were kept since the last call."""
-        overheard, self._overheard = self._overheard, []
-        return overheard
 
 
 class Link(Protocol):

@@ -133,7 +133,7 @@ class UdpLink:
         for sender, number in Counter(_name(chunk.peer) for chunk in others).items():
             self.report.count(sender, number)
         if others:
-            self.report.keep(chunk.data for chunk in others)
+            self.report.overheard = [chunk.data for chunk in others]
         return ours
 
     # --- out ---

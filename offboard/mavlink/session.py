@@ -40,12 +40,10 @@ class SessionSettings:
     """How a session behaves.
 
     `system_id` is the only system that may be the vehicle; None: the first autopilot heard.
-    `stream`: serial or TCP, bytes arrive in any portions. `sends_first`:
-    send heartbeats before an autopilot was heard. `capacity_bytes_ps` of the link limits the rates
-    of telemetry that are requested; None: unknown. `lockstep`: the vehicle waits for our replies,
-    and the host times given to `receive` and `poll` are ignored, so that nothing that is sent
-    depends on them. Vehicle time replaces them; while telemetry is missing, its TIMESYNC requests
-    count on.
+    `stream`: serial or TCP, bytes arrive in any portions. `sends_first`: send heartbeats before an
+    autopilot was heard. `capacity_bytes_ps` of the link limits the rates of telemetry that are
+    requested; None: unknown. `lockstep`: the host times given to `receive` and `poll` are ignored,
+    see `VehicleTime`.
     """
 
     system_id: int | None = None
@@ -250,7 +248,7 @@ class Session:
         ):
             self._heartbeat_sent, self._status_sent = (now_s, link_s), self.status
             due.append(Heartbeat(TYPE_ONBOARD_CONTROLLER, *self.status))
-        requests = self.telemetry.rates.due(link_s)
+        requests = self.telemetry.due()
         return (*due, *(CommandLong.message_interval(w.message_id, w.rate_hz) for w in requests))
 
     def encode(self, outgoing: Outgoing) -> bytes:
@@ -292,4 +290,4 @@ class Session:
     @property
     def rates_hz(self) -> dict[str, float]:
         """Measured rate of each wanted message over the last two seconds of `link_time_s`."""
-        return self.telemetry.rates.measured_hz(self.link_time_s)
+        return self.telemetry.rates_hz

@@ -50,7 +50,7 @@ class Telemetry:
     def __init__(self, capacity_bytes_ps: float | None, *, lockstep: bool) -> None:
         self.time = VehicleTime(lockstep)
         self.texts = TextAssembler()
-        self.rates = TelemetryRates((), 0.0)
+        self._streams: dict[int, _Stream] = {}  # those that are wanted, by message id
         self._capacity_bytes_ps = capacity_bytes_ps
         self._frames = 0  # sent by the vehicle, as the sequence numbers show; modulo 256 the newest
         self._heard_s = -math.inf  # when the newest frame arrived
@@ -70,7 +70,7 @@ class Telemetry:
             return self._stamped(event, frame.message_id, dialect, now_s)
         if isinstance(event, (Heartbeat, ModeReport)) and self._overtaken(number, now_s):
             return DropReason.STALE
-        self.rates.count(frame.message_id, self.time.seconds)
+        self._count(frame.message_id)
         return () if event is None else (event,)
 
     def _stamped(
@@ -83,7 +83,7 @@ class Telemetry:
         if age is Age.STALE:
             return DropReason.STALE
         # after the check of the stamp: duplicates must not raise the measured rate
-        self.rates.count(message_id, self.time.seconds)
+        self._count(message_id)
         if age is Age.REBOOTED:
             self._mode_report = (0, -math.inf)  # it counts anew
             self.request_from(dialect)  # a rebooted vehicle has its default rates
@@ -113,14 +113,35 @@ class Telemetry:
         wanted = dialect.wanted
         if self._capacity_bytes_ps is not None:
             wanted = fitted(wanted, self._capacity_bytes_ps)
-        self.rates = TelemetryRates(wanted, self.time.seconds)
+        self._streams = {each.message_id: _Stream(each, self.time.seconds) for each in wanted}
 
     def thin(self, dialect: Dialect) -> bool:
         """Request half of it from now on. False if the rates are the lowest already."""
-        before = self.rates.bytes_ps
+        before = self.bytes_ps
         self._capacity_bytes_ps = 0.5 * before / SHARE
         self.request_from(dialect)
-        return self.rates.bytes_ps < 0.99 * before
+        return self.bytes_ps < 0.99 * before
+
+    def due(self) -> list[WantedMessage]:
+        """Messages to request now; they count as requested."""
+        now_s = self.time.seconds
+        return [each.wanted for each in self._streams.values() if each.request(now_s)]
+
+    @property
+    def rates_hz(self) -> dict[str, float]:
+        """Measured rate of each wanted message over the last two seconds, by name."""
+        now_s = self.time.seconds
+        return {each.wanted.name: each.rate_hz(now_s) for each in self._streams.values()}
+
+    @property
+    def bytes_ps(self) -> float:
+        """Bytes per second of all wanted messages at the rates requested."""
+        return sum(each.wanted.bytes_ps for each in self._streams.values())
+
+    def _count(self, message_id: int) -> None:
+        """A message has arrived."""
+        if message_id in self._streams:
+            self._streams[message_id].arrivals_s.append(self.time.seconds)
 
 
 def fitted(wanted: Iterable[WantedMessage], bytes_ps: float) -> tuple[WantedMessage, ...]:
@@ -175,29 +196,3 @@ class _Stream:
             self.wait_s, self.requests = _FIRST_WAIT_S, 0
             return False
         return not (self.wanted.optional and self.requests >= _OPTIONAL_TRIES)
-
-
-class TelemetryRates:
-    """Measured rates of the wanted messages. All times are `Session.link_time_s`."""
-
-    def __init__(self, wanted: Iterable[WantedMessage], began_s: float) -> None:
-        self._streams = {w.message_id: _Stream(w, began_s) for w in wanted}
-
-    @property
-    def bytes_ps(self) -> float:
-        """Bytes per second of all wanted messages at the rates requested."""
-        return sum(stream.wanted.bytes_ps for stream in self._streams.values())
-
-    def count(self, message_id: int, now_s: float) -> None:
-        """A message has arrived."""
-        stream = self._streams.get(message_id)
-        if stream is not None:
-            stream.arrivals_s.append(now_s)
-
-    def due(self, now_s: float) -> list[WantedMessage]:
-        """Messages to request now; they count as requested."""
-        return [each.wanted for each in self._streams.values() if each.request(now_s)]
-
-    def measured_hz(self, now_s: float) -> dict[str, float]:
-        """Rate of each wanted message over the last two seconds, by name."""
-        return {s.wanted.name: s.rate_hz(now_s) for s in self._streams.values()}

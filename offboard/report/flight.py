@@ -20,27 +20,13 @@ _NO_HEARTBEAT = "no HEARTBEAT of an autopilot: no telemetry used"
 _NO_RECORDS = (
     "no records of offboard: no reference, decisions, identification or figures of the score"
 )
-# array of History, what to say without it, its substitute, and what to say of that
+# array of History, what it is, its message, what takes its place, and how
 _TELEMETRY = (
-    (
-        "attitude",
-        "no attitude (ATTITUDE_QUATERNION, ATTITUDE)",
-        "ATTITUDE",
-        "no ATTITUDE_QUATERNION: the attitude is that of ATTITUDE",
-    ),
-    (
-        "position",
-        "no position (LOCAL_POSITION_NED, GLOBAL_POSITION_INT)",
-        "GLOBAL_POSITION_INT",
-        "no LOCAL_POSITION_NED: positions are of GLOBAL_POSITION_INT, relative to the first one",
-    ),
-    (
-        "commanded",
-        "no setpoints (SET_ATTITUDE_TARGET of offboard, ATTITUDE_TARGET)",
-        "ATTITUDE_TARGET",
-        "no setpoints of offboard: the commanded attitude is the vehicle's ATTITUDE_TARGET",
-    ),
-)
+    ("attitude", "attitude", "ATTITUDE_QUATERNION", "ATTITUDE", ""),
+    ("position", "position", "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT",
+     ", relative to the first one"),
+    ("commanded", "commanded attitude", "SET_ATTITUDE_TARGET of offboard", "ATTITUDE_TARGET", ""),
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,11 +67,11 @@ def read(path: Path) -> Flight:
     missing = [_NO_HEARTBEAT] if flown.vehicle is None else []
     if not len(flown.records):
         missing.append(_NO_RECORDS)
-    for array, without, substitute, replaced in _TELEMETRY:
+    for array, what, usual, substitute, how in _TELEMETRY:
         if not len(getattr(flown, array)):
-            missing.append(without)
+            missing.append(f"no {what}: neither {usual} nor {substitute}")
         elif substitute in flown.substitutes:
-            missing.append(replaced)
+            missing.append(f"no {usual}: the {what} is that of {substitute}{how}")
     if flown.damage:
         at = "" if math.isnan(flown.damage_s) else f", at {flown.damage_s:.2f} s of vehicle time"
         missing.append(f"damaged log: {flown.damage}{at}")

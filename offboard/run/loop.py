@@ -124,7 +124,8 @@ class Loop:
                 self._log.write(stamp, frame)
         report = self._link.report
         self._companion.current.other_datagrams = report.ignored
-        self._companion.current.overhear(report.overheard())
+        self._companion.current.overhear(report.overheard)
+        report.overheard = []
         for sentence in report.news():
             self._companion.current.announce(sentence)
         self._check_log()

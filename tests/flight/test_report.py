@@ -191,8 +191,11 @@ def test_a_log_of_another_program_gives_what_it_holds(tmp_path: Path, recorded: 
     bare = tmp_path / "bare.tlog"
     bare.write_bytes(of_kinds(PX4, {31, 32, 82, 83, 84}))  # ATTITUDE, GLOBAL_POSITION_INT
     whole, flight = recorded, read(bare)
-    assert "no setpoints (SET_ATTITUDE_TARGET of offboard, ATTITUDE_TARGET)" in flight.missing
-    assert any("positions are of GLOBAL_POSITION_INT" in each for each in flight.missing)
+    assert (
+        "no commanded attitude: neither SET_ATTITUDE_TARGET of offboard nor ATTITUDE_TARGET"
+        in flight.missing
+    )
+    assert any("position is that of GLOBAL_POSITION_INT" in each for each in flight.missing)
     assert math.isnan(flight.score.completed)
     climbed = [-part.history.position["position_ned_m"][:, 2] for part in (whole, flight)]
     assert [np.ptp(each) for each in climbed] == pytest.approx([5.0, 5.0], abs=1.5)

@@ -74,10 +74,6 @@ class ParameterFault(NamedTuple):
     fix: str
 
 
-def always(parameters: Mapping[str, float], radio: bool) -> bool:
-    return True
-
-
 @dataclass(frozen=True, slots=True)
 class Valid:
     """Valid values of a parameter: `lowest` to `highest`, with `bits` set.
@@ -91,7 +87,7 @@ class Valid:
     lowest: float = -math.inf
     highest: float = math.inf
     bits: int = 0
-    applies: Callable[[Mapping[str, float], bool], bool] = always
+    applies: Callable[[Mapping[str, float], bool], bool] = lambda known, radio: True
 
 
 @dataclass(frozen=True, slots=True)
