@@ -319,7 +319,8 @@ class Learner(VehicleEstimate):
         begin_s = self._time_s - COMPARE_OVER_S
         trace = self._flown_since(begin_s)
         now = unexplained(trace, self.vehicle.tilt)
-        self._in_a_row = self._in_a_row + 1 if now.contradicts else 0
+        contradicts = now.contradicts and not self.link_changed
+        self._in_a_row = self._in_a_row + 1 if contradicts else 0
         if self._in_a_row >= COMPARE_TIMES:
             self._in_a_row, self._doubted_from_s = 0, begin_s
             self.on_contradiction(now, unexplained(trace, self.previous.tilt), self._time_s)

@@ -37,6 +37,7 @@ MOST_CONTRADICTIONS, CALM_S = 2, 20.0
 # A new tilt fit replaces the old one if its delay's sd, or in doubt the tilt that it leaves
 # unexplained, is less than this share of the old one's
 BETTER = 0.7
+LINK_CHANGE_S = 0.1  # a link that changed by more explains a tilt that is not as predicted
 LEAST_JUMP_S, JUMP_SDS = 0.015, 4.0  # delays that differ by more contradict each other
 FACTOR = 4.0  # greatest ratio, either way, of an identified constant to the vehicle file's
 DECISIVE = ("tilt", "hover_thrust")  # out of bounds, these end the flight
@@ -104,6 +105,11 @@ class VehicleEstimate:
     def in_doubt(self) -> bool:
         """Whether telemetry contradicts the delay, and no fit has explained it yet."""
         return self._doubt_s > 0.0
+
+    @property
+    def link_changed(self) -> bool:
+        """Whether the link's delay has just changed: the times of commands before were wrong."""
+        return self._link[1] > LINK_CHANGE_S
 
     @property
     def contradicted(self) -> bool:

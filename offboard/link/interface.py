@@ -29,7 +29,8 @@ class Chunk:
     """Received bytes: a datagram, or any portion of a stream.
 
     `arrived_s` is on the clock of `clock.monotonic_s`: the kernel's stamp of a datagram; for a
-    stream the last time when nothing was waiting, since the bytes arrived after it.
+    stream the end of the waiting for it, or if it was not awaited the last time when nothing had
+    arrived.
     """
 
     data: bytes

@@ -258,8 +258,11 @@ class StreamLink:
         began_s = clock.monotonic_s()
         awaited = [self._stream.descriptor]
         readable = bool(select.select(awaited, [], [], max(0.0, timeout_s))[0])
+        ended_s = clock.monotonic_s()
         if not readable:
             self._empty_s = began_s
+        elif 0.0 < timeout_s >= ended_s - began_s:  # it was awaited, and this process not stopped
+            self._empty_s = ended_s
         return readable
 
     def _read(self) -> bytes:
