@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from functools import partial
@@ -125,13 +126,14 @@ def conclude(summary: Summary, flown: Campaign) -> None:
     say(f"{flights}, {summary.missing} not flown yet" if summary.missing else flights)
     if summary.kept:
         kept = counted(len(summary.kept), "flight")
-        say(f"kept: {kept}; `offboard report {summary.kept[0]}` shows one")
+        say(f"kept: {kept}; `{shlex.join(['offboard', 'report', str(summary.kept[0])])}` shows one")
     say(f"written: {directory / 'campaign.csv'} and campaign.html")
     if summary.stopped or summary.mine_missing:
         why = summary.stopped or "interrupted"
+        again = shlex.join(["--out", str(directory)])
         are = "is" if summary.mine_missing == 1 else "are"
         missing = f"{summary.mine_missing} of {counted(summary.planned, 'flight')} {are} missing"
-        raise UserError(f"{why}: {missing}; go on with the same command and --out {directory}", 4)
+        raise UserError(f"{why}: {missing}; go on with the same command and {again}", 4)
     if summary.failed:
         raise UserError(f"{counted(summary.failed, 'flight')} failed; the table says why", 1)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -95,5 +96,6 @@ def key(
     say("  QGroundControl, Mission Planner: their page on MAVLink signing", indent=4)
     say("  It needs ArduPilot, or PX4 1.17 or later.", indent=4)
     say("")
-    say(f"Then: offboard fly --signing-key {file}")
-    say(f"or, without a vehicle: simulator --signing-key {file}")
+    option = shlex.join(["--signing-key", str(file)])
+    say(f"Then: offboard fly {option}")
+    say(f"or, without a vehicle: simulator {option}")

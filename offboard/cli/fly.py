@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 from contextlib import closing, nullcontext
 from functools import partial
@@ -181,7 +182,7 @@ def _conclude(
         rows = summary(score, history)
         if rows:
             rows["log"] = str(directory / "flight.tlog")
-            rows["all figures"] = f"offboard score {directory}"
+            rows["all figures"] = shlex.join(["offboard", "score", str(directory)])
         if report:
             rows["report"] = f"{directory / 'report.html'}, in some seconds"
         for label, text in rows.items():

@@ -246,7 +246,10 @@ class Loop:
         if self._log.problem:
             lands = self._companion.current.limits.log_lost == "land"
             code = code or (ExitCode.ABORTED if lands else ExitCode.FLOWN)
-            sentence = f"{self._log.problem}: {self._log.lost} entries lost; {sentence}"
+            problem = self._log.problem
+            lost = f"{problem}: {self._log.lost} entries lost"
+            named = sentence.startswith(problem)  # the flight was landed for it
+            sentence = lost + (sentence.removeprefix(problem) if named else f"; {sentence}")
         return Outcome(code, sentence, self._log.problem)
 
     def _interrupted(self) -> Outcome:
