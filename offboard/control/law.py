@@ -19,7 +19,7 @@ or, where the bounds or a horizon couple the inputs, the u that minimises the sa
 In NED, acceleration = g e3 - T b - c v + d: written in b, the lateral axes [p, v, b, b'], the
 vertical [z, v_z, T b_z] and the heading decouple, and no heading frame is needed. K is that of a
 vehicle that hovers, where a change of b accelerates by g. At thrust T and a tilted b, with T b_z
-kept, it accelerates by T (1 + b b'/b_z^2): position and velocity enter as what they would be in
+kept, it accelerates by T (1 + b b^T/b_z^2): position and velocity enter as what they would be in
 hover, for the same answer (`Target.to_hover`). Otherwise the loop gain at 45 degrees is 2.8 times
 that of hover, and ends in a limit cycle.
 
@@ -95,7 +95,7 @@ class Target:
     (3,), [z, v_z, T b_z], when the thrust acts; both with the ripple of held commands
     (`gains.hold_ripple`). `feedforward` (3,), b_c north, b_c east and T b_z, and `heading_rad` are
     taken half a period after their own delays and led through their own responses. `to_hover`
-    (2, 2), (T_hover / T) (1 - b b'), turns lateral deviations into those of a hovering vehicle that
+    (2, 2), (T_hover / T) (1 - b b^T), turns lateral deviations into those of a hovering vehicle that
     needs the same change of b.
     """
 

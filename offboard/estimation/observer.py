@@ -64,6 +64,7 @@ LONGEST_GAP_S = 1.0  # a longer gap or a step back in time restarts; a gap keeps
 GATE_SDS, GATES = 3.0, (0.3, 0.5)
 DISTURBANCE_LIMIT_MPS2 = 8.0
 COMMANDS_KEPT = 128
+FARTHEST_S = 5.0  # of a prediction: no limits let a link and a vehicle be later than that
 
 # H of position and reported velocity (6, 19), and of attitude (3, 19): thrust direction, heading
 H_POSITION, H_ATTITUDE = np.zeros((6, STATE_SIZE)), np.zeros((3, STATE_SIZE))
@@ -396,7 +397,7 @@ class Observer:
     def _propagated(self, time_s: float) -> Array:
         """A copy of the state, propagated to `time_s`."""
         state = self._state.copy()
-        ahead_s = min(max(time_s - self._time_s, 0.0), LONGEST_GAP_S)
+        ahead_s = min(max(time_s - self._time_s, 0.0), FARTHEST_S)
         if self._frozen:
             state[POSITION : POSITION + 3] += ahead_s * state[VELOCITY : VELOCITY + 3]
         else:

@@ -248,6 +248,17 @@ def test_observer_goes_on_smoothly_with_another_drag() -> None:
 # ---------------------------------------------------------------- ground, gaps, jumps
 
 
+def test_prediction_reaches_to_its_time_on_a_link_that_is_2_s_late() -> None:
+    """A vehicle that hovers level at 1 m/s is slowed by its drag alone."""
+    observer, drag_ps, ahead_s = Observer(PX4), PX4.drag_per_mass_ps, 2.5
+    observer.on_command(0.0, LEVEL)
+    feed(observer, 1.0, velocity=(1.0, 0.0, 0.0))
+    state = observer.predict(1.0 + ahead_s - PX4.tilt.delay_s)
+    assert state.time_s == pytest.approx(1.0 + ahead_s)
+    assert state.velocity_ned_mps[0] == pytest.approx(math.exp(-drag_ps * ahead_s), rel=1e-6)
+    assert state.position_ned_m[0] == pytest.approx(-math.expm1(-drag_ps * ahead_s) / drag_ps)
+
+
 def test_frozen_observer_integrates_nothing() -> None:
     observer = Observer(PX4)
     observer.freeze(True)
