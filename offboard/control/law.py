@@ -95,8 +95,8 @@ class Target:
     (3,), [z, v_z, T b_z], when the thrust acts; both with the ripple of held commands
     (`gains.hold_ripple`). `feedforward` (3,), b_c north, b_c east and T b_z, and `heading_rad` are
     taken half a period after their own delays and led through their own responses. `to_hover`
-    (2, 2), (T_hover / T) (1 - b b^T), turns lateral deviations into those of a hovering vehicle that
-    needs the same change of b.
+    (2, 2), (T_hover / T) (1 - b b^T), turns lateral deviations into those of a hovering vehicle
+    that needs the same change of b.
     """
 
     lateral: Array
