@@ -191,7 +191,7 @@ class FlightState:
 
     @property
     def dialect(self) -> Dialect | None:
-        """Of the vehicle; None before it is found."""
+        """The dialect of the vehicle; None before it is found."""
         return self.session.dialect
 
     @property
