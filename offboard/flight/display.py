@@ -20,20 +20,20 @@ DROPPED = (
 # In a phase, before the first reason: telemetry has only just been requested, checks are running,
 # the vehicle has not said yet which one it is
 FIRST_S = {Phase.CONNECT: 2.5, Phase.HEALTH: 5.0, Phase.STANDBY: 1.0}
-CHANGED_S = 1.0  # between two reasons
+HELD_S = 0.5  # for so long a reason must have held: what has just begun to arrive seems slow
 AGAIN_S = 10.0  # the same reason, in other figures too
 
 
 class News:
-    """Announcements of one flight beside its phases, each kind at most once a second: pauses of
-    this process and dropped messages (`add` them), and why the flight does not begin yet. A reason
+    """Announcements of one flight beside its phases: pauses of this process and dropped messages
+    (`add` them), each at most once a second, and why the flight does not begin yet. A reason
     of a found vehicle is repeated every ten seconds with new figures; that no vehicle is heard is
     said once."""
 
     def __init__(self) -> None:
         self.paused, self.dropped = Repeated(PAUSED), Repeated(DROPPED)
-        self._kind = ""  # of the newest reason: without its figures
-        self._said_s = -math.inf
+        self._kind = self._said = ""  # of reasons, without figures: the present, the newest told
+        self._since_s = self._said_s = -math.inf
 
     def due(self, state: FlightState, now_s: float) -> list[str]:
         """The sentences to announce now, at host time `now_s`."""
@@ -42,18 +42,20 @@ class News:
 
     def _waiting(self, state: FlightState) -> str:
         if state.phase not in FIRST_S:
-            self._kind = ""
+            self._kind = self._said = ""
             return ""
-        passed_s = state.now_s - self._said_s
-        if state.in_phase_s < FIRST_S[state.phase] or passed_s < CHANGED_S:
-            return ""
+        now_s = state.now_s
         why = {Phase.CONNECT: _unheard, Phase.HEALTH: unfit, Phase.STANDBY: _left_alone}
         reason = why[state.phase](state)
         kind = re.sub(r"[0-9]+", "", reason)
-        again = state.phase is Phase.HEALTH and passed_s >= AGAIN_S
-        if not reason or (kind == self._kind and not again):
+        if kind != self._kind:
+            self._kind, self._since_s = kind, now_s
+        if state.in_phase_s < FIRST_S[state.phase] or now_s - self._since_s < HELD_S:
             return ""
-        self._kind, self._said_s = kind, state.now_s
+        again = state.phase is Phase.HEALTH and now_s - self._said_s >= AGAIN_S
+        if not reason or (kind == self._said and not again):
+            return ""
+        self._said, self._said_s = kind, now_s
         return f"waiting: {reason}"
 
 
