@@ -205,13 +205,6 @@ def test_a_scheduler_that_is_lost_is_one_sentence_and_keeps_what_is_finished(
     assert 1 <= len(rows(tmp_path / "out")) < 6
 
 
-@pytest.mark.slow
-def test_no_scheduler_is_a_sentence_at_once(called: Called) -> None:
-    for address in ("udp://127.0.0.1:9", "tcp://127.0.0.1:9"):
-        code, _, said = called("offboard campaign quick --out x --scheduler", address)
-        assert (code, said.count("\n"), address in said) == (2, 1, True), said
-
-
 def test_an_infeasible_case_is_a_row_with_its_reason(tmp_path: Path) -> None:
     flown = campaign(INFEASIBLE, tmp_path / "out")
     fly(flown, shard=slice(1, None, 2))  # the one at 400 m
@@ -267,27 +260,6 @@ def test_a_file_that_a_file_names_decides_the_case(
         (tmp_path / "path.yaml").write_text(f"shape: hover\nduration_s: 1\nheight_m: {height_m}")
         keys.add(next(base_cases(CampaignFile(config="./mine.yaml"))).key)
     assert len(keys) == 2
-
-
-def test_a_table_whose_name_is_in_capitals_is_a_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As for `fly --reference PATH.CSV`."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "PATH.CSV").write_text("time_s,north_m,east_m,down_m\n")
-    (case,) = base_cases(CampaignFile(references=("PATH.CSV",)))
-    assert "reference" in dict(case.files)
-    assert shlex.split(case.line)[4] == str(tmp_path / "PATH.CSV")
-
-
-def test_a_lack_of_memory_is_no_record_of_the_case(monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*parts: object, **options: object) -> None:
-        raise MemoryError
-
-    monkeypatch.setattr(flight, "fly", full)
-    case = Case("flight", "lqr", "hover", None, None, "px4", "calm", 1)
-    with pytest.raises(UserError, match="no flight can be flown here: out of memory"):
-        flight.fly_job(Job(case, Promises(), code_hash()))
 
 
 def test_results_of_other_code_are_refused_and_kept(
@@ -411,18 +383,3 @@ def test_a_killed_or_interrupted_comparison_keeps_what_landed_and_goes_on(
     again = rows(tmp_path / "x")
     assert len(again) == 8
     assert all(row in again for row in flown)
-
-
-@pytest.mark.slow
-def test_interrupted_while_its_processes_load_it_ends_in_order(
-    spawn: Spawn, tmp_path: Path
-) -> None:
-    (tmp_path / "c.yaml").write_text(FILE.replace("draws: 1", "draws: 9"))
-    process = spawn("offboard", "campaign", "c.yaml", "--out", "out", "--workers", 2)
-    while process.poll() is None and len(children(process.pid)) < 3:  # a tracker, two of ours
-        time.sleep(0.01)
-    os.killpg(process.pid, signal.SIGINT)
-    output, errors = process.communicate(timeout=60)
-    assert (process.returncode, errors.count("\n")) == (4, 1), errors
-    assert "the process that flew it ended" not in output
-    assert "flights are missing" in errors

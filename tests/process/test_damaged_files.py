@@ -7,7 +7,6 @@ import io
 import os
 import subprocess
 import sys
-from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -17,7 +16,6 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from offboard.analysis import tlog
 from offboard.analysis.score import keep_score, score_flight
-from offboard.campaign.results import Record
 from offboard.cli import fly
 from offboard.flight.record import configuration_pieces
 from offboard.link.log import LogError, entry
@@ -90,19 +88,6 @@ def test_a_log_with_attitude_as_angles_is_identified(called: Called, tmp_path: P
     assert found["tilt"]["natural_frequency_radps"] == pytest.approx(11.4, abs=1.0)
 
 
-def test_the_page_of_a_second_identification_has_a_name_of_its_own(
-    called: Called, tmp_path: Path
-) -> None:
-    """Its title is the name of the flight directory, also of the working directory."""
-    (tmp_path / "flight.tlog").write_bytes(RECORDING.read_bytes())
-    (tmp_path / "identify.html").write_text("precious")
-    assert called("offboard identify .")[::2] == (0, "")
-    assert (tmp_path / "identify.html").read_text() == "precious"
-    page = (tmp_path / "identify-2.html").read_text()
-    assert f"<title>Flight {tmp_path.name}</title>" in page
-    assert page.count(' id="fit_') == 2 * 2  # tilt and heading, with their data
-
-
 def test_a_score_that_cannot_be_written_is_reported(called: Called, tmp_path: Path) -> None:
     (tmp_path / "x" / "score.json").mkdir(parents=True)
     (tmp_path / "x" / "flight.tlog").write_bytes(RECORDING.read_bytes())
@@ -126,22 +111,6 @@ def test_a_page_on_a_full_disk_leaves_no_file(called: Called, tmp_path: Path) ->
     assert (code, said.count("\n")) == (2, 1)
     assert said.startswith("identify.html cannot be written (File")
     assert not list(tmp_path.iterdir())
-
-
-def test_a_comparison_on_a_full_disk_says_what_cannot_be_written(
-    called: Called, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with ExitStack() as ended:
-
-        def flown(*_: object) -> Record:
-            ended.enter_context(full_disk(10))
-            return Record(4, "no vehicle", -1.0, "completed")
-
-        monkeypatch.setattr("offboard.campaign.workers.recorded", flown)
-        command = "offboard compare --connect udpin:127.0.0.1:PORT --controllers lqr --seeds 1"
-        code, output, said = called(command, "--out", "x")
-    assert (code, said.count("\n"), "\n1 flight\n" in output) == (4, 1, True)
-    assert said.startswith("x cannot be written (File too large); ")
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ from scipy import signal
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from offboard.analysis.identify import estimator_noise
 from offboard.identification import attitude_fit
 from offboard.identification.attitude_fit import ResponseFit
 from offboard.identification.motion_fit import Noise, PositionFilter
@@ -222,25 +221,6 @@ def test_every_constant_is_identified():
     applied = found.applied_to(VEHICLE_FILE)
     assert applied.drag_per_mass_ps == pytest.approx(values["drag_ps"])
     assert applied.tilt.damping == values["tilt_damping"]
-
-
-def test_reported_velocity_is_not_used():
-    """A velocity that is wrong by 0.4 m/s for seconds changes nothing but the noise figure."""
-    true = flown()
-    wrong = true.position.copy()
-    wrong[:, 4:7] += 0.4 * np.sin(1.5 * wrong[:, :1])
-    right, misled = (
-        identify(Trace(true.commands, true.attitude, each), VEHICLE_FILE)
-        for each in (true.position, wrong)
-    )
-    assert misled.drag_ps == right.drag_ps
-    assert misled.hover_thrust == right.hover_thrust
-    contradictions = [
-        estimator_noise(Trace(true.commands, true.attitude, each))[-1]
-        for each in (true.position, wrong)
-    ]
-    assert contradictions[0] < 0.002
-    assert 0.2 < contradictions[1] < 0.4
 
 
 def test_constant_that_the_flight_does_not_determine_is_refused():
