@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from sim_hover import attitude, hovering, load, response
 
-from offboard.model.frames import euler_from_quaternion, thrust_direction_from_quaternion
+from offboard.model.frames import thrust_direction_from_quaternion
 from simulator.vehicle.attitude import Demand
 from simulator.vehicle.battery import Battery
 from simulator.vehicle.conditions import Conditions
@@ -108,16 +106,6 @@ def test_ground_effect_lifts_near_the_ground_only():
     assert _climbing(share * PX4.hover_thrust, 2.0).truth.on_ground
     high = _climbing(share * PX4.hover_thrust, 60.0, ground_effect=True).truth
     assert 0.0 < -high.position_ned_m[2] < 0.3
-
-
-def test_torque_needs_thrust():
-    """With the rotors stopped an attitude demand turns nothing; with thrust it does."""
-    plant = _climbing(0.8, 2.0)
-    plant.advance(0.3, Demand(True, 0.0, LEVEL))
-    plant.advance(0.3, Demand(True, 0.0, attitude(roll_deg=30.0)))
-    assert abs(euler_from_quaternion(plant.truth.attitude)[0]) < math.radians(0.5)
-    plant.advance(0.4, Demand(True, 0.5, attitude(roll_deg=30.0)))
-    assert abs(euler_from_quaternion(plant.truth.attitude)[0]) > math.radians(15.0)
 
 
 def test_battery_empties_by_the_current_and_sags_under_load():

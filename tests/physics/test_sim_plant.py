@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from sim_hover import attitude, estimate_of, hovering, load
+from sim_hover import attitude, estimate_of, load
 
 from simulator.steps import STEP_S
 from simulator.vehicle.attitude import Demand
@@ -54,17 +54,6 @@ def test_same_seed_gives_the_same_bytes_however_time_is_cut():
     assert _fly(17, 1) == _fly(17, 24) == _fly(17, 240) != _fly(18, 240)
 
 
-def test_asking_changes_nothing():
-    asked, silent = hovering(PX4, ROUGH), hovering(PX4, ROUGH)
-    first = estimate_of(asked).position_ned_m
-    assert np.array_equal(first, estimate_of(asked).position_ned_m)
-    first[:] = math.nan  # nor does what the asker does with the answer
-    asked.truth.attitude[:] = 0.0
-    for plant in (asked, silent):
-        plant.advance(1.0, Demand(True, 0.5, attitude()))
-    assert _bytes(asked) == _bytes(silent)
-
-
 HOSTILE = [math.nan, math.inf, -math.inf, 0.0, -1.0, 1e300, -1e300, 1e-300, 1.5, 0.5]
 
 
@@ -92,14 +81,3 @@ def test_hostile_demands_never_make_anything_infinite():
     assert np.linalg.norm(estimate.attitude) == pytest.approx(1.0, abs=1e-9)
     assert np.abs(truth.rates_frd_radps).max() < 20.0
     assert truth.position_ned_m[2] <= 0.0
-
-
-def test_attitude_of_any_length_and_sign_is_the_same_attitude():
-    flights = []
-    for scale in (1.0, 2.0, -1.0, 1e-200, 1e200):
-        plant = hovering(PX4)
-        goal = tuple(scale * part for part in attitude(roll_deg=10.0, yaw_deg=20.0))
-        plant.advance(1.0, Demand(True, PX4.hover_thrust, goal))
-        flights.append(plant.truth.attitude)
-    for flight in flights[1:]:
-        assert flight == pytest.approx(flights[0], abs=1e-9)

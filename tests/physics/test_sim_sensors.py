@@ -135,14 +135,3 @@ def test_perfect_estimator_reports_the_truth_but_never_the_same_twice():
         seen = estimate_of(standing)
         estimates.append((*np.float32(seen.position_ned_m), *np.float32(seen.velocity_ned_mps)))
     assert len(set(estimates)) == 100
-
-
-def test_estimate_reset_jumps_and_is_counted():
-    plant = hovering(load("px4_sih"))
-    before = estimate_of(plant).position_ned_m
-    plant.reset_estimate((1.5, -0.5, 0.2))
-    assert estimate_of(plant).position_ned_m - before == pytest.approx([1.5, -0.5, 0.2])
-    assert plant.reset_counter == 1
-    for _ in range(255):
-        plant.reset_estimate((0.0, 0.0, 0.0))
-    assert plant.reset_counter == 0  # MAVLink: one byte

@@ -86,18 +86,6 @@ def test_a_flight_log_begins_with_what_came_before(tmp_path: Path) -> None:
     assert (first / "flight.yaml").read_text() == "vehicle: neutral\n"
 
 
-def test_a_clock_that_is_set_back_ends_what_came_before(tmp_path: Path) -> None:
-    recorder, _ = recorded(tmp_path)
-    talk = session()
-    frames = [talk.encode(Heartbeat(6)) for _ in range(3)]
-    for unix_s, frame in zip((2000, 1000, 1001), frames, strict=True):
-        recorder.write(1_000_000 * unix_s, frame)
-    flight = Path(recorder.begin(talk, "", ""))
-    recorder.close()
-    log = (flight / "flight.tlog").read_bytes()
-    assert [frame in log for frame in frames] == [False, True, True]
-
-
 @pytest.mark.parametrize(("age_s", "left"), [(0, "px4-1-7"), (700, ""), (-4000, "px4-1-7")])
 def test_what_a_killed_service_has_not_done(tmp_path: Path, age_s: int, left: str) -> None:
     """The vehicle that it had engaged is known for ten minutes. A log of the future: this computer
@@ -224,19 +212,6 @@ def test_a_full_disk_is_no_wrong_option(tmp_path: Path, monkeypatch: pytest.Monk
     with pytest.raises(LogError) as passing:
         recorded(tmp_path)
     assert [may_pass(each.value) for each in (wrong, passing)] == [False, True]
-
-
-def test_what_the_user_of_the_unit_cannot_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    file = tmp_path / "home" / "my.yaml"
-    file.parent.mkdir()
-    file.touch(0o644)
-    assert daemon.unreadable(file).startswith(f"the unit cannot see {file}: it has its own /tmp")
-    monkeypatch.setattr(daemon, "PRIVATE", ())
-    tmp_path.chmod(0o750)
-    assert daemon.unreadable(file).endswith("is closed to others")
-    assert daemon.unreadable(Path("/etc/passwd")) == ""
 
 
 def test_the_link_is_opened_when_it_can_be(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -57,16 +57,6 @@ def test_without_requests_it_sends_heartbeat_timesync_and_home() -> None:
     }
 
 
-def test_gps_raw_int_shows_no_fix_before_the_first_one() -> None:
-    """At 10.2 s."""
-    vehicle = Bench(firmware=ARDUPILOT)
-    vehicle.command(511, 24, 200_000)
-    vehicle.run(11.0)
-    fixes = vehicle.of("GPS_RAW_INT")
-    assert {m.fix_type for at_s, m in fixes if at_s < 10.1} == {1}
-    assert {m.fix_type for at_s, m in fixes if at_s > 10.3} == {3}
-
-
 @pytest.mark.parametrize(("thrust", "lifts"), [(0.45, True), (0.05, False)])
 def test_takeoff_by_setpoints_alone(thrust: float, lifts: bool) -> None:
     """.3 m after 3.3-3.9 s; any thrust is flight, even if it cannot lift."""
@@ -100,16 +90,6 @@ def test_without_guid_options_thrust_is_a_climb_rate() -> None:
     for thrust, climb in ((0.5, 0.0), (1.0, 2.5), (0.75, 1.25), (0.0, -1.5), (2.0, 2.5)):
         vehicle.run(3.0, lambda u=thrust: vehicle.attitude(LEVEL, u))
         assert climb_mps(vehicle) == pytest.approx(climb, abs=0.1)
-
-
-@pytest.mark.parametrize("name", ["WPNAV_SPEED", "WPNAV_ACCEL", "ANGLE_MAX"])
-def test_a_negative_limit_is_raised_to_the_least_one(name: str) -> None:
-    vehicle = guided(GUID_OPTIONS=0)
-    kind = 4 if name == "ANGLE_MAX" else 9
-    vehicle.send(mavlink.MAVLink_param_set_message(1, 1, name.encode(), -500.0, kind))
-    vehicle.run(0.5, lambda: vehicle.attitude(LEVEL, 0.5))
-    vehicle.run(1.0, lambda: vehicle.position(0, 0, 0, mask=0b110111000111))
-    assert vehicle.height_m > 6.0
 
 
 def test_a_request_of_the_present_mode_changes_nothing_and_disarming_ends_a_takeoff() -> None:
