@@ -110,13 +110,6 @@ def test_the_limit_that_is_met_first_is_named(start_down_m: float, sentence: str
         check(Leap(start_down_m), vehicle())
 
 
-def test_the_time_is_that_of_the_rows_of_a_table() -> None:
-    """The run-in makes the flight along it later by 1 s."""
-    rows = "time_s,north_m,east_m,altitude_m\n0,0,0,3\n2,1,0,3\n4,2,0,3\n6,3,0,-3\n"
-    with pytest.raises(ValueError, match=r"a height of -3 m at 6.00 s, .*first at 5.\d\d"):
-        check(track(shape="table", file="own.csv", text=rows), vehicle())
-
-
 def test_what_is_not_a_number_is_refused() -> None:
     with pytest.raises(ValueError, match="a height of nan m"):
         check(hold((0.0, 0.0, math.nan), 0.0), vehicle())

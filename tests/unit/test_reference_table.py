@@ -13,8 +13,6 @@ from offboard.reference.shapes import FromTable
 from offboard.reference.table import parse
 from offboard.reference.track import Track
 
-GOOD = "time_s,north_m,east_m,down_m\n0,0,0,-2\n1,1,0,-2\n2,2,1,-2\n3,3,3,-2.5\n"
-
 
 def table_track(text: str, **settings: object) -> Track:
     return FromTable(**{"file": "flown.csv", "text": text} | settings).track()
@@ -69,11 +67,6 @@ def test_knots_forgive_rounded_rows() -> None:
     s = np.linspace(2.0, 7.0, 100)
     expected = np.stack([2 * np.sin(0.7 * s), np.cos(0.7 * s)], -1)
     assert np.abs(fitted.sample(s + 1.0).position_ned_m[:, :2] - expected).max() < 1e-3
-
-
-def test_a_table_without_heading_takes_the_configured_one() -> None:
-    track = table_track(GOOD, course_deg=90.0, run_in_s=1.0, run_out_s=1.0)
-    assert float(track.sample(2.0).heading_rad) == math.radians(90.0)
 
 
 HEAD = "time_s,north_m,east_m,down_m\n"

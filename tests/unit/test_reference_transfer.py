@@ -8,8 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from offboard.reference.shapes import Circle
-from offboard.reference.track import Moved, Track, hold
+from offboard.reference.track import Track
 from offboard.reference.transfer import Limits, transfer
 
 
@@ -89,24 +88,3 @@ def test_no_start_is_planned_further_out_than_it_needs_to_brake() -> None:
             assert flown.duration_s < 20.0 + 2.0 * braking_m + size_m * math.sqrt(12.0)
             np.testing.assert_allclose(flown.sample(0.0).velocity_ned_mps, velocity, atol=1e-9)
             np.testing.assert_allclose(path[-1], target, atol=1e-6)
-
-
-def test_moved_and_held() -> None:
-    track = Circle(course="along_velocity").track()
-    moved = Moved(track, 100.0, (10.0, -5.0, 2.0))
-    assert moved.duration_s == track.duration_s + 100.0
-    times = np.array([[90.0, 101.0], [110.0, 200.0]])
-    there, here = moved.sample(times), track.sample(times - 100.0)
-    np.testing.assert_allclose(
-        there.position_ned_m - here.position_ned_m, np.broadcast_to([10, -5, 2], (2, 2, 3))
-    )
-    for one, other in zip(there[1:], here[1:], strict=True):
-        np.testing.assert_array_equal(one, other)
-    rest = hold((1.0, 2.0, -3.0), 0.4)
-    assert rest.duration_s == 0.0
-    for time_s in (5.0, times):
-        sample = rest.sample(time_s)
-        assert sample.position_ned_m.shape == (*np.shape(time_s), 3)
-        np.testing.assert_array_equal(sample.position_ned_m[..., 2], -3.0)
-        np.testing.assert_array_equal(sample.heading_rad, np.full(np.shape(time_s), 0.4))
-        assert np.all(sample.velocity_ned_mps == 0.0)
