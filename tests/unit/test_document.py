@@ -69,6 +69,7 @@ def test_scalars_are_those_of_yaml_1_2() -> None:
         assert parse(f"title: a\ntilt_rad: {text}", Drawing, "d.yaml").tilt_rad == number
     for text in ("no", "12:30", "off", "'1'", '"true"', "a:b"):
         assert parse(f"title: {text}", Drawing, "d.yaml").title == text.strip("'\"")
+    assert not parse("title: x\nvisible: false", Drawing, "d.yaml").visible
 
 
 KEYS = "circles, colour, corner, named, scale, shape, tilt_rad, title, visible"
