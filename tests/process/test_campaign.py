@@ -23,7 +23,7 @@ import pytest
 from processes import CONFIG, SHORT, Called, Spawn, children, ended, eventually
 from rich.console import Console
 
-from offboard.campaign import flight, workers
+from offboard.campaign import workers
 from offboard.campaign.cases import Case, base_cases
 from offboard.campaign.document import CampaignFile, Promises, read_campaign
 from offboard.campaign.flight import Job
@@ -323,28 +323,6 @@ def test_a_flight_whose_worker_dies_twice_is_a_row(
     assert (tmp_path / "deaths").read_text() == "died\n" * 2
     assert ended[1].exit_code == 0
     assert (ended[2].exit_code, ended[2].sentence) == (4, "the process that flew it ended, twice")
-
-
-@pytest.mark.slow
-def test_a_kept_flight_appears_when_it_is_complete(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """One that ends before leaves no directory that looks like a kept flight."""
-    case = campaign(FILE, tmp_path / "out").cases[0]
-    kept = tmp_path / "flights" / case.key
-    job = Job(case, Promises(), code_hash(), kept)
-
-    def ends(directory: Path, *score: object) -> None:
-        assert (directory / "flight.tlog").is_file()
-        raise SystemExit
-
-    with monkeypatch.context() as ending:
-        ending.setattr(flight, "keep_score", ends)
-        with pytest.raises(SystemExit):
-            flight.fly_job(job)
-    assert not kept.exists()
-    assert flight.fly_job(job).completed
-    assert {path.name for path in kept.iterdir()} >= {"flight.tlog", "flight.yaml", "score.json"}
 
 
 @pytest.mark.slow

@@ -291,11 +291,3 @@ def test_the_fastest_path_keeps_its_limits_and_no_leg_can_be_shorter(
         legs_s[leg] *= 0.95
         shorter = through(NED, np.append(0.0, np.cumsum(legs_s)), smoothness)
         assert max(shares(shorter)) > 1.01, leg
-
-
-def test_the_fastest_path_is_faster_than_the_best_constant_mean_speed() -> None:
-    """By 8 % here: at one mean speed a single leg decides how fast all are flown."""
-    times_s = fastest_times(CORNERS, Smoothness.SNAP, LIMITS)
-    lengths_m = np.linalg.norm(np.diff(NED, axis=0), axis=1) * (1.5, 1.0, 1.0, 1.5)
-    even_s = np.append(0.0, np.cumsum(lengths_m)) * times_s[-1] / lengths_m.sum()
-    assert max(shares(through(NED, 1.05 * even_s, Smoothness.SNAP))) > 1.01
