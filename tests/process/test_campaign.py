@@ -262,6 +262,16 @@ def test_a_file_that_a_file_names_decides_the_case(
     assert len(keys) == 2
 
 
+def test_a_lack_of_memory_is_no_record_of_the_case(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*parts: object, **options: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(flight, "fly", full)
+    case = Case("flight", "lqr", "hover", None, None, "px4", "calm", 1)
+    with pytest.raises(UserError, match="no flight can be flown here: out of memory"):
+        flight.fly_job(Job(case, Promises(), code_hash()))
+
+
 def test_results_of_other_code_are_refused_and_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -37,6 +37,23 @@ def test_what_a_run_cannot_simulate_is_refused() -> None:
         scenario(start={"height_m": 3.0, "mode": "NOPE"})
 
 
+def test_refusals_with_their_texts_until_they_end() -> None:
+    requests = (
+        ("arm", 400, (1.0,), "Arming denied: low battery"),
+        ("offboard", 176, (1.0, 6.0), "Switching to Offboard denied: low battery"),
+        ("takeoff", 22, (), "Takeoff denied: low battery"),
+    )
+    refused = {"fault": "refusal", "text": "low battery", "for_s": 7.0}
+    bench = Bench(scenario=scenario(*({**refused, "of": of} for of, *_ in requests)))
+    bench.run(5.6, lambda: bench.position(0, 0, -3.0))
+    for _, number, params, text in requests:
+        assert bench.command(number, *params)[-1] == 1
+        assert bench.texts()[-1] == text
+    bench.run(2.0, lambda: bench.position(0, 0, -3.0))
+    for _, number, params, _ in requests:
+        assert bench.command(number, *params)[-1] == 0
+
+
 @pytest.mark.parametrize(("timeout_us", "late"), [(5e6, 895), (2e6, 229)])
 def test_gps_loss_drifts_and_jumps_back_and_px4_loses_the_position(
     timeout_us: float, late: int
