@@ -154,7 +154,7 @@ def test_a_vehicle_without_thrust_reserve_is_landed() -> None:
     scenario = scenario_of(conditions={"mass_scale": scale})
     pair = px4.lap(HIGH, scenario=scenario, learning=IdentifySettings())
     pair.at.append((TRACKING, lambda flying: flying.instance.autopilot.plant.scale_mass(scale)))
-    says = r".*% of its thrust \(limits\.hover_thrust\)"
+    says = r".*% of its thrust \(limits\.hover_thrust is 0\.9\)"
     aborted(pair, says, failsafes=["thrust reserve"])
     assert not pair.armed
 
