@@ -23,7 +23,7 @@ import pytest
 from processes import CONFIG, SHORT, Called, Spawn, children, ended, eventually
 from rich.console import Console
 
-from offboard.campaign import workers
+from offboard.campaign import flight, workers
 from offboard.campaign.cases import Case, base_cases
 from offboard.campaign.document import CampaignFile, Promises, read_campaign
 from offboard.campaign.flight import Job
