@@ -1,22 +1,41 @@
-"""What the commands print of the shipped files: their names and descriptions, within the window."""
+"""What the commands print: it names the shipped files and the exit codes."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
 
+import typer
 import yaml
 from processes import CONFIG, Called
 from typer.testing import CliRunner
 
 from offboard.cli.commands import app as offboard
 from offboard.documents import shipped as documents
+from simulator.command import app as simulator
 
 FOLDERS = ("references", "controllers", "vehicles", "scenarios", "campaigns", "tunings", "")
+COMMANDS = tuple(typer.main.get_command(offboard).commands)  # type: ignore[attr-defined]
+CODES = {"fly": "0 1 2 3 4 130 141", "daemon": "0 2 3 4", "doctor": "0 2 3", "list": "",
+         **dict.fromkeys(("check", "report", "export", "key", "paper"), "0 2"),
+         **dict.fromkeys(("score", "identify", "replay"), "0 1 2"),
+         **dict.fromkeys(("campaign", "compare", "tune"), "0 1 2 4")}  # fmt: skip
+NAMED = {"fly": FOLDERS[:4], "compare": FOLDERS[:4], "simulator": FOLDERS[2:4]}
 
 
 def shipped(folder: str) -> list[Path]:
     return sorted((CONFIG / folder).glob("*.yaml"))
+
+
+def test_help_has_the_exit_codes_and_the_shipped_files() -> None:
+    for command in (*COMMANDS, "simulator"):
+        app, words = (simulator, []) if command == "simulator" else (offboard, [command])
+        shown = CliRunner().invoke(app, [*words, "--help"], terminal_width=80).output
+        codes = re.findall(r"(?:codes:|;)\s+(\d+)\s", shown.partition("Exit")[2])
+        assert command == "simulator" or " ".join(codes) == CODES[command], command
+        for folder in NAMED.get(command, ()):
+            named = set(re.split(r"[\s,.]+", shown))
+            assert {path.stem for path in shipped(folder)} <= named
 
 
 def test_every_shipped_file_is_listed_with_what_it_is(called: Called) -> None:
