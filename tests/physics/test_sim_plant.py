@@ -1,4 +1,4 @@
-"""The simulated vehicle: its attitude loop, rotors, ground and battery against measured responses and
+"""The simulated vehicle: attitude loop, rotors, ground and battery against measured responses and
 closed forms; determinism, time, and demands no sane flight stack would send."""
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Flights of the simulated PX4: stream and position lost, hold and landing, setpoint rules; faults of
-a scenario, each of which flies in `tests/flight/test_safety.py`."""
+"""Flights of the simulated PX4: stream and position lost, hold and landing, setpoint rules; faults
+of a scenario."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from simulator.config import Scenario
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
+from simulator.mavlink.codec import Decoder, sender_of
 
 
 def climb_mps(bench: Bench) -> float:
@@ -184,6 +185,23 @@ def test_gps_loss_drifts_and_jumps_back_and_px4_loses_the_position(
     assert found.reset_counter == 1
 
 
+def strange(**fault: Any) -> list[bytes]:
+    bench = Bench(scenario=scenario({"fault": "stranger", "at_s": 1.0, **fault}))
+    bench.run(2.0)
+    (queue,) = bench.instance.strangers
+    return queue
+
+
+def test_a_stranger_sends_noise_or_a_spoof_with_the_ids_of_the_vehicle() -> None:
+    sent = strange(rate_hz=1000.0, size_bytes=40)
+    assert len(set(sent)) == len(sent) == pytest.approx(1000, abs=4)
+    assert {len(datagram) for datagram in sent} == {40}
+    decoder = Decoder()
+    spoofs = [m for each in strange(sends="heartbeat", rate_hz=20) for m in decoder.read(each)]
+    assert {(m.get_type(), *sender_of(m), m.autopilot) for m in spoofs} == {("HEARTBEAT", 1, 1, 12)}
+    assert len(spoofs) == pytest.approx(20, abs=1)
+
+
 @pytest.mark.parametrize("firmware", [PX4, ARDUPILOT], ids=lambda firmware: firmware.name)
 def test_the_same_seed_gives_the_same_bytes_with_every_new_fault(firmware: Firmware) -> None:
     stalled = {"stalled": True, "queue_bytes": 100_000, "at_s": 2.0, "for_s": 0.5}
@@ -227,6 +245,32 @@ def test_a_weaker_or_heavier_vehicle_accelerates_less() -> None:
         assert lift_at(fault["at_s"] + 0.04) == pytest.approx(ratio, abs=0.02)
         lifted = lift_at(fault["at_s"] + 0.17)
         assert lift_at(fault["at_s"] + 0.24) == pytest.approx(lifted / ratio, abs=0.02)
+
+
+def test_motors_are_cut_at_a_height_in_the_landing() -> None:
+    bench = engaged({"fault": "motors_cut", "after": "landing", "below_m": 2.5})
+    bench.command(21)
+    state = bench.instance.autopilot.state
+    bench.run_until(lambda: bench.height_m < 2.6, 20.0)
+    assert state.truth.acceleration_ned_mps2[2] < 1.0
+    bench.run_until(lambda: bench.height_m < 2.4, 5.0)
+    bench.run(0.1)
+    assert state.truth.acceleration_ned_mps2[2] > 7.0
+
+
+def test_disarmed_by_the_pilot_or_by_a_reboot_it_falls() -> None:
+    """After the reboot it is silent, and its time begins again."""
+    bench = aloft({"fault": "pilot_disarms", "at_s": 0.5})
+    bench.run(2.0)
+    assert not bench.armed
+    assert bench.height_m < 4.0
+    bench = aloft({"fault": "reboot", "at_s": 1.0, "for_s": 0.5})
+    bench.run(3.0)
+    assert bench.height_m < 1.0
+    beats = [(at_s, m) for at_s, m in bench.of("HEARTBEAT") if at_s > 1.01]
+    assert beats[0][0] == pytest.approx(1.5, abs=0.05)
+    assert not any(m.base_mode & 128 for _, m in beats)
+    assert bench.of("ATTITUDE", 1.01)[0][1].time_boot_ms < 50
 
 
 def test_faults_that_run_go_on_after_a_reboot_and_end_as_they_should() -> None:
