@@ -164,6 +164,17 @@ def test_refusals_with_their_texts_until_they_end() -> None:
         assert bench.command(number, *params)[-1] == 0
 
 
+def test_a_stuck_message_repeats_its_content_with_or_without_its_stamp() -> None:
+    stuck = {"fault": "stuck_message", "message": "ATTITUDE", "for_s": 0.9}
+    bench = aloft({**stuck, "at_s": 1.0}, {**stuck, "at_s": 2.0, "stamp_runs": False})
+    bench.run(3.0)
+    for begin_s, runs in ((1.0, True), (2.0, False)):
+        told = [m for at_s, m in bench.of("ATTITUDE", begin_s + 0.05) if at_s < begin_s + 0.9]
+        assert len(told) > 50
+        assert len({(m.roll, m.pitch, m.rollspeed) for m in told}) == 1
+        assert (len({m.time_boot_ms for m in told}) == len(told)) is runs
+
+
 @pytest.mark.parametrize(("timeout_us", "late"), [(5e6, 895), (2e6, 229)])
 def test_gps_loss_drifts_and_jumps_back_and_px4_loses_the_position(
     timeout_us: float, late: int
