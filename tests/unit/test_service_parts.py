@@ -214,6 +214,19 @@ def test_a_full_disk_is_no_wrong_option(tmp_path: Path, monkeypatch: pytest.Monk
     assert [may_pass(each.value) for each in (wrong, passing)] == [False, True]
 
 
+def test_what_the_user_of_the_unit_cannot_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "home" / "my.yaml"
+    file.parent.mkdir()
+    file.touch(0o644)
+    assert daemon.unreadable(file).startswith(f"the unit cannot see {file}: it has its own /tmp")
+    monkeypatch.setattr(daemon, "PRIVATE", ())
+    tmp_path.chmod(0o750)
+    assert daemon.unreadable(file).endswith("is closed to others")
+    assert daemon.unreadable(Path("/etc/passwd")) == ""
+
+
 def test_the_link_is_opened_when_it_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
     """Port in use: said once, tried again until it is free. A wrong address is an error at once."""
     monkeypatch.setattr(daemon, "LINK_EVERY_S", 0.01)
