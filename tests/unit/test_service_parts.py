@@ -59,6 +59,7 @@ def test_a_flight_log_begins_with_what_came_before(tmp_path: Path) -> None:
     talk, began_us = session(), clock.unix_us() - 20_000_000
     codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     home = mavlink.MAVLink_gps_global_origin_message(1, 2, 3).pack(codec)
+    recorder.write(began_us + 10**10, talk.encode(Heartbeat(30)))  # then the clock is set back
     for number in range(150):  # a ground station reads all parameters
         name = f"P{number}".encode()
         parameter = mavlink.MAVLink_param_value_message(name, number, 9, 150, number)
