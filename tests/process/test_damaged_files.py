@@ -88,6 +88,19 @@ def test_a_log_with_attitude_as_angles_is_identified(called: Called, tmp_path: P
     assert found["tilt"]["natural_frequency_radps"] == pytest.approx(11.4, abs=1.0)
 
 
+def test_the_page_of_a_second_identification_has_a_name_of_its_own(
+    called: Called, tmp_path: Path
+) -> None:
+    """Its title is the name of the flight directory, also of the working directory."""
+    (tmp_path / "flight.tlog").write_bytes(RECORDING.read_bytes())
+    (tmp_path / "identify.html").write_text("precious")
+    assert called("offboard identify .")[::2] == (0, "")
+    assert (tmp_path / "identify.html").read_text() == "precious"
+    page = (tmp_path / "identify-2.html").read_text()
+    assert f"<title>Flight {tmp_path.name}</title>" in page
+    assert page.count(' id="fit_') == 2 * 2  # tilt and heading, with their data
+
+
 def test_a_score_that_cannot_be_written_is_reported(called: Called, tmp_path: Path) -> None:
     (tmp_path / "x" / "score.json").mkdir(parents=True)
     (tmp_path / "x" / "flight.tlog").write_bytes(RECORDING.read_bytes())

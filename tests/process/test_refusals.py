@@ -52,6 +52,7 @@ def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
         ("--config", "nonsense", "no configuration named 'nonsense'; known are flight, paper"),
         ("--reference", "lemniscte", "'lemniscte', did you mean lemniscate? known are circle"),
         ("--set", "reference.course=no", "course: 'no' should be 'fixed' or 'along_velocity'"),
+        ("--reference", "missing.CSV", "missing.CSV cannot be read: No such file"),
         ("--set", "period_s=7", "period_s: 7 should be less than or equal to 0.5"),
         ("--set", "vehicle.mass=3", "vehicle.mass is not a known key, did you mean mass_kg? ("),
         ("--set", "controller.law=frog", "controller: law: 'frog' is not one of pso, lqr,"),

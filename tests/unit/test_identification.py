@@ -12,6 +12,7 @@ from scipy import signal
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
+from offboard.analysis.identify import estimator_noise
 from offboard.identification import attitude_fit
 from offboard.identification.attitude_fit import ResponseFit
 from offboard.identification.motion_fit import Noise, PositionFilter
@@ -221,6 +222,17 @@ def test_every_constant_is_identified():
     applied = found.applied_to(VEHICLE_FILE)
     assert applied.drag_per_mass_ps == pytest.approx(values["drag_ps"])
     assert applied.tilt.damping == values["tilt_damping"]
+
+
+def test_a_velocity_that_contradicts_the_positions_is_told() -> None:
+    """Wrong by 0.4 m/s for seconds."""
+    true, told_mps = flown(), []
+    for wrong_mps in (0.0, 0.4):
+        position = true.position.copy()
+        position[:, 4:7] += wrong_mps * np.sin(1.5 * position[:, :1])
+        told_mps.append(estimator_noise(Trace(true.commands, true.attitude, position))[-1])
+    assert told_mps[0] < 0.002
+    assert 0.2 < told_mps[1] < 0.4
 
 
 def test_constant_that_the_flight_does_not_determine_is_refused():

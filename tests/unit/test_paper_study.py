@@ -23,6 +23,8 @@ from offboard.paper import closed_loop, extensions, tables
 from offboard.paper.closed_loop import (
     Flight,
     Flights,
+    FlightTask,
+    PlantKind,
     damped,
     fly,
     linear_plant,
@@ -99,6 +101,18 @@ def test_time_constant_by_horizon() -> None:
         assert -0.1 / math.log(slowest) == pytest.approx(time_constant_s, rel=5e-3)
     long, endless = receding(*paper_model(), Q, R, RATE, 300), receding(*paper_model(), Q, R, RATE)
     np.testing.assert_allclose(np.abs(long)[:6], np.abs(endless)[:6], rtol=1e-4)
+
+
+@pytest.mark.parametrize("plant", PlantKind)
+def test_cost_to_go_settles_a_hundred_times_closer(plant: PlantKind) -> None:
+    """1 m off at hover, after 20 s: the time constants are 39 s and about 1 s."""
+    task = FlightTask(PaperSettings(), plant, hover=True, start_offset_m=(1.0, 0.0, 0.0), steps=200)
+    one, best = (
+        fly(replace(task, cost_to_go=cost_to_go)).position_errors_m[-1]
+        for cost_to_go in (False, True)
+    )
+    assert one > 0.5
+    assert best < 0.01 * one
 
 
 def test_both_plants_settle_alike_in_wind_and_with_weak_thrust() -> None:
@@ -190,6 +204,16 @@ def test_limits_hold_whatever_is_done_within_the_narrowed_box() -> None:
     for index, limit in TIGHT.per_state().items():
         assert greatest[index] <= limit * (1 + 1e-9)
         assert greatest[index] > 0.9 * limit
+
+
+def test_outside_the_limits_the_vehicle_brakes_and_comes_back() -> None:
+    dynamics, inputs = paper_model()
+    box, state = LimitedBox(dynamics, inputs, TIGHT, *BOX), np.zeros(12)
+    state[6] = 2.0 * TIGHT.speed_mps  # a gust
+    for _ in range(60):
+        lower, _ = box.narrow(state)
+        state = dynamics @ state + inputs @ lower
+    assert abs(state[6]) <= TIGHT.speed_mps
 
 
 def test_the_certificate_is_of_the_narrowed_box() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from pathlib import Path
@@ -19,7 +20,7 @@ from offboard.campaign.results import Record, Results
 from offboard.campaign.run import Campaign, Counter, Incomplete, Runner
 from offboard.campaign.search import Failure, FailureSearch, as_csv
 from offboard.campaign.tune import Tuned, Tuning, judge, profile, read_tune
-from offboard.documents.errors import DocumentError
+from offboard.documents.errors import DocumentError, UserError
 from offboard.run.configuration import load
 
 SEARCH = """
@@ -126,6 +127,15 @@ def test_an_interrupted_search_goes_on_and_finds_the_same(
     assert as_csv(again) == as_csv(failures)
     tables = [(each.directory / "campaign.csv").read_bytes() for each in (parts, whole)]
     assert tables[0] == tables[1]
+
+
+def test_a_search_without_its_package_flies_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    with pytest.raises(UserError, match="a search needs optuna"):
+        searched(tmp_path)
+    assert not list(tmp_path.rglob("*.json"))
 
 
 TUNE = """
