@@ -16,7 +16,7 @@ import offboard.control
 from offboard.analysis import history, tlog
 from offboard.analysis.score import score
 from offboard.documents.errors import DocumentError
-from offboard.run.configuration import load
+from offboard.run.configuration import dump, flown, load
 from offboard.run.flight import Simulated, fly
 from offboard.run.sitl import InMemorySimulator
 
@@ -62,6 +62,23 @@ def test_documented_controller_flies(
     (tmp_path / "my.yaml").write_text("law: pd\ndamping: 4\n")
     with pytest.raises(DocumentError, match="damping is not a known key, did you mean damping_ps"):
         load("flight", choices={"controller": str(tmp_path / "my.yaml")})
+
+
+def test_settings_of_any_key_are_read_back_from_a_log(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A replay decided without them. A setting that no longer exists is dropped all the same."""
+    (tmp_path / "anything.py").write_text(
+        "from offboard.control.base import ControllerSettings\n\n\n"
+        "class Settings(ControllerSettings, extra='allow'):\n    law: str = 'any'\n\n"
+        "    def build(self, vehicle, *, period_s, seed): ...\n"
+    )
+    register(tmp_path, "first", "pso_offboard.controllers", any="anything:Settings")
+    monkeypatch.syspath_prepend(tmp_path)
+    config = load("flight", choices={"controller": "any"}, assignments=["controller.gain=3.5"])
+    text = dump(config)
+    assert flown(text) == config
+    assert flown(text.replace("limits:\n", "limits:\n  gone_s: 1.0\n")).limits == config.limits
 
 
 @pytest.mark.parametrize(
