@@ -273,3 +273,14 @@ def test_hostile_demands_never_make_anything_infinite():
     assert np.linalg.norm(estimate.attitude) == pytest.approx(1.0, abs=1e-9)
     assert np.abs(truth.rates_frd_radps).max() < 20.0
     assert truth.position_ned_m[2] <= 0.0
+
+
+def test_attitude_of_any_length_and_sign_is_the_same_attitude():
+    flights = []
+    for scale in (1.0, 2.0, -1.0, 1e-200, 1e200):
+        plant = hovering(PX4)
+        goal = tuple(scale * part for part in attitude(roll_deg=10.0, yaw_deg=20.0))
+        plant.advance(1.0, Demand(True, PX4.hover_thrust, goal))
+        flights.append(plant.truth.attitude)
+    for flight in flights[1:]:
+        assert flight == pytest.approx(flights[0], abs=1e-9)

@@ -60,6 +60,16 @@ def test_without_requests_it_sends_heartbeat_timesync_and_home() -> None:
     }
 
 
+def test_gps_raw_int_shows_no_fix_before_the_first_one() -> None:
+    """At 10.2 s."""
+    vehicle = Bench(firmware=ARDUPILOT)
+    vehicle.command(511, 24, 200_000)
+    vehicle.run(11.0)
+    fixes = vehicle.of("GPS_RAW_INT")
+    assert {m.fix_type for at_s, m in fixes if at_s < 10.1} == {1}
+    assert {m.fix_type for at_s, m in fixes if at_s > 10.3} == {3}
+
+
 @pytest.mark.parametrize(("thrust", "lifts"), [(0.45, True), (0.05, False)])
 def test_takeoff_by_setpoints_alone(thrust: float, lifts: bool) -> None:
     """.3 m after 3.3-3.9 s; any thrust is flight, even if it cannot lift."""
