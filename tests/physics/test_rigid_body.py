@@ -199,6 +199,13 @@ def test_a_batch_is_the_loop_and_machine_code_steps_as_python_does(lopsided: Veh
             assert_allclose(found, expected, rtol=1e-14, atol=1e-14)
 
 
+def test_other_lengths_are_refused(lopsided: Vehicle) -> None:
+    for shapes in ((11, 4, 3), (12, 3, 3), (13, 4, 2)):
+        state, inputs, wind = map(np.zeros, shapes)
+        with pytest.raises(ValueError, match="12 or 13, 4 and 3"):
+            derivative(state, inputs, pack(lopsided), wind)
+
+
 # --- the linear model -----------------------------------------------------------------------------
 
 

@@ -155,6 +155,12 @@ def test_the_spread_is_the_mean_distance_of_the_last_positions_from_the_best() -
         assert (result.iterations, result.cost <= problem(asked).min() + 1e-12) == (until, True)
 
 
+def test_bounds_that_make_no_box_are_refused() -> None:
+    for lower, upper in (([1.0], [0.0]), ([0.0, 0.0], [1.0]), ([-np.inf], [0.0]), ([], [])):
+        with pytest.raises(ValueError, match="bounds must be"):
+            Swarm(SwarmSettings(), lower, upper, rng(0))
+
+
 def test_one_move_is_eq_30_then_eq_20_then_the_box() -> None:
     """Against the equations in NumPy, with the same random numbers."""
     settings = SwarmSettings(social=1.4, rebound=0.25, inertia=1.9)
