@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from string import Formatter
@@ -48,12 +47,6 @@ def with_tables(text: str) -> str:
 @pytest.mark.parametrize("firmware", FIRMWARES.values(), ids=FIRMWARES)
 def test_the_state_table_is_the_one_in_the_code(firmware: Firmware) -> None:
     assert table(firmware) in README.read_text(), "run: python tests/test_simulator_readme.py"
-
-
-def test_every_file_that_is_named_exists() -> None:
-    named = re.findall(r"`((?:simulator|tests|config)/[\w./-]*)`", README.read_text())
-    assert named
-    assert [path for path in named if not (ROOT / path).exists()] == []
 
 
 def test_every_fault_is_in_the_table() -> None:

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from processes import free_port
+from sim_peer import simulator
 
 LIMIT_S = 160.0
 MAVPROXY = Path(sys.executable).with_name("mavproxy.py")
@@ -23,15 +24,7 @@ MAVPROXY = Path(sys.executable).with_name("mavproxy.py")
 def vehicle(*options: str) -> Iterator[int]:
     """Yield the port that it sends to; the process is gone when the block ends."""
     port = free_port()
-    command = (sys.executable, "-m", "simulator", "--connect", f"udpout:127.0.0.1:{port}")
-    process = subprocess.Popen(
-        (*command, "--gcs", "none", *options),
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-    try:
+    with simulator("--connect", f"udpout:127.0.0.1:{port}", "--gcs", "none", *options) as process:
         assert process.stdout is not None
         ready = process.stdout.readline()
         while ready.startswith("simulator: "):  # compiling, the first time
@@ -39,13 +32,6 @@ def vehicle(*options: str) -> Iterator[int]:
         assert f"127.0.0.1:{port}" in ready, ready
         yield port
         assert process.poll() is None, "the simulator ended by itself"
-    finally:
-        process.terminate()
-        try:
-            process.communicate(timeout=5.0)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.communicate()
 
 
 class Terminal:

@@ -140,15 +140,6 @@ def test_acceleration_is_newtons_in_the_inertial_frame(lopsided: Vehicle) -> Non
         assert_allclose(slope[POSITION], state[VELOCITY])
 
 
-def test_attitude_turns_by_the_body_rates(lopsided: Vehicle) -> None:
-    """A short step composes with SciPy's exponential of the rates, on the body's side."""
-    step_s, state = 1e-4, state_of(random_states(1, 11)[0])
-    after = step(state, hover_input(lopsided), pack(lopsided), step_s)
-    middle = 0.5 * (state[RATES] + after[RATES])
-    expected = rotation(state) * Rotation.from_rotvec(middle * step_s)
-    assert (expected.inv() * rotation(after)).magnitude() < 1e-10
-
-
 def manoeuvre(vehicle: Vehicle, seed: int) -> Callable[[float], Array]:
     """Smooth random inputs: three sines each, gentle enough to stay off the singularity."""
     generator = np.random.default_rng(seed)
@@ -234,21 +225,6 @@ EQ_16 = {
     (Z, THRUST): -0.0120,
     (W, THRUST): -0.2350,
 }
-
-
-def test_hover_matrices_are_the_physics_written_by_hand() -> None:
-    """Kinematics, gravity tilting into the lateral axes, drag over mass, inputs over inertia."""
-    a, b = np.zeros((12, 12)), np.zeros((12, 4))
-    a[0:3, 3:6] = a[9:12, 6:9] = np.eye(3)
-    a[U, THETA], a[V, PHI] = -9.81, 9.81
-    a[3:6, 3:6] = np.diag([-0.1 / 0.0196, -0.1 / 0.0196, -0.1 / 0.0264])
-    a[6:9, 6:9] = np.diag([-0.5 / 0.4] * 3)
-    b[W, THRUST] = -1 / 0.4
-    b[P, TAU_X] = b[Q, TAU_Y] = 0.225 / 0.0196
-    b[R, TAU_Z] = 1 / 0.0264
-    model_a, model_b = hover_matrices(PAPER)
-    assert_allclose(model_a, a, rtol=1e-14)
-    assert_allclose(model_b, b, rtol=1e-14)
 
 
 def test_zero_order_hold_is_the_exponential_of_the_augmented_matrix() -> None:

@@ -13,8 +13,6 @@ from typing import Any
 
 from pymavlink.dialects.v20 import all as mavlink
 
-HOVER = 0.4895
-
 
 @contextmanager
 def simulator(*options: str) -> Iterator[subprocess.Popen[str]]:
@@ -104,22 +102,3 @@ class Peer:
     def command(self, number: int, *params: float) -> None:
         filled = (*params, *(0.0,) * (7 - len(params)))
         self.send(mavlink.MAVLink_command_long_message(1, 1, number, 0, *filled))
-
-    def attitude(self, thrust: float) -> None:
-        self.send(
-            mavlink.MAVLink_set_attitude_target_message(
-                0, 1, 1, 7, (1.0, 0.0, 0.0, 0.0), 0, 0, 0, thrust
-            )
-        )
-
-    def climb(self) -> None:
-        """Boot, engage, arm, climb and hover by attitude setpoints."""
-        self.listen(lambda: self.vehicle is not None)
-        self.heartbeat()
-        self.listen(lambda: self.time_s > 4.2)
-        start_s = self.time_s
-        self.listen(lambda: self.time_s > start_s + 0.6, each=lambda: self.attitude(HOVER))
-        self.command(176, 1, 6)
-        self.command(400, 1)
-        self.listen(lambda: self.time_s > start_s + 2.0, each=lambda: self.attitude(1.15 * HOVER))
-        self.listen(lambda: self.time_s > start_s + 3.0, each=lambda: self.attitude(HOVER))

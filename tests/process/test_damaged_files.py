@@ -1,5 +1,5 @@
 """Foreign and damaged logs, full disks, outputs that nobody reads: one sentence, the right exit
-code, and no file that is incomplete. Called in this process."""
+code, and no file that is incomplete. The log of a flight holds what was flown."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import io
 import os
 import subprocess
 import sys
-from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -15,13 +14,14 @@ import yaml
 from processes import RECORDING, Called, full_disk
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from offboard.analysis import tlog
+from offboard.analysis import history, tlog
 from offboard.analysis.score import keep_score, score_flight
-from offboard.campaign.results import Record
 from offboard.cli import fly
 from offboard.flight.record import configuration_pieces
 from offboard.link.log import LogError, entry
 from offboard.mavlink.session import RECORD_COMPONENT_ID
+from offboard.report.flight import read
+from offboard.run import configuration as config
 
 NOW_US = 1_790_000_000_000_000  # of an entry of a log
 NO_VEHICLE = "offboard fly --connect udpin:127.0.0.1:PORT --set limits.connect_s=0.3 --out x"
@@ -128,22 +128,6 @@ def test_a_page_on_a_full_disk_leaves_no_file(called: Called, tmp_path: Path) ->
     assert not list(tmp_path.iterdir())
 
 
-def test_a_comparison_on_a_full_disk_says_what_cannot_be_written(
-    called: Called, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with ExitStack() as ended:
-
-        def flown(*_: object) -> Record:
-            ended.enter_context(full_disk(10))
-            return Record(4, "no vehicle", -1.0, "completed")
-
-        monkeypatch.setattr("offboard.campaign.workers.recorded", flown)
-        command = "offboard compare --connect udpin:127.0.0.1:PORT --controllers lqr --seeds 1"
-        code, output, said = called(command, "--out", "x")
-    assert (code, said.count("\n"), "\n1 flight\n" in output) == (4, 1, True)
-    assert said.startswith("x cannot be written (File too large); ")
-
-
 @pytest.mark.parametrize(
     ("command", "holds_bytes", "code"),
     [("fly", 0, 2), ("daemon", 10, 3)],
@@ -186,3 +170,25 @@ def test_a_flight_whose_result_cannot_be_printed_keeps_its_exit_code(
     code, _, said = called(NO_VEHICLE)
     assert code == 3
     assert said.endswith("; the output cannot be written: No space left on device\n")
+
+
+# --- what a log holds ---
+
+
+@pytest.mark.usefixtures("in_memory")
+def test_the_log_alone_holds_what_was_flown(called: Called, tmp_path: Path) -> None:
+    """Along a table whose file is gone."""
+    rows = "".join(f"{t},{0.5 * t},0,-1\n" for t in range(9))
+    (tmp_path / "line.csv").write_text("time_s,north_m,east_m,down_m\n" + rows)
+    command = "offboard fly --sitl --controller lqr --reference line.csv --seed 7 --out x"
+    assert called(command)[0] == 0
+    (tmp_path / "line.csv").unlink()
+    text = history.configuration(tlog.read(tmp_path / "x" / "flight.tlog"))
+    assert text is not None
+    flown = config.flown(text)
+    assert flown == config.load(str(tmp_path / "x" / "flight.yaml"))
+    assert flown.seed == 7
+    track = config.build_track(flown)
+    assert track.sample(track.track_start_s).position_ned_m[0] > 0.2
+    facts = read(tmp_path / "x").facts  # the report names the table by its file
+    assert (facts["reference"], facts["controller"]) == ("line.csv", "lqr")

@@ -11,7 +11,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -164,11 +163,3 @@ def test_a_process_ends_in_order(begin: str, command: list[str], code: int, said
     script += "from offboard.cli import main\nsys.exit(main())"
     answer = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert (answer.returncode, answer.stderr) == (code, said)
-
-
-def test_an_interrupted_score_is_one_sentence(
-    called: Called, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stop: Callable[[object], None] = lambda _: signal.raise_signal(signal.SIGINT)  # noqa: E731
-    monkeypatch.setattr("offboard.analysis.score.score_flight", stop)
-    assert called("offboard score", RECORDING) == (130, "", "interrupted\n")

@@ -22,7 +22,6 @@ from simulator.command import app as simulator
 Refused = Callable[..., str]
 FLY = "offboard fly --connect udpin:127.0.0.1:PORT --set limits.connect_s=0.1"
 SIMULATOR = "simulator --gcs none"
-COMPARE = "offboard compare --controllers lqr --scenario calm"
 LONG, DIGITS = 300 * "n", 5000 * "9"
 SWARM = "controller.swarm={particles: 10000, iterations: 100000}"
 SLOW = "--set controller.steps=40 --set controller.swarm.particles=2000 --set deadline_s=0.0006"
@@ -37,8 +36,6 @@ SPHERE = {"shape": "sphere", "north_m": 0, "east_m": 0, "height_m": 3, "radius_m
     ("options", "says"),
     [
         ("--firmware frog", "--firmware frog: unknown; there is px4, ardupilot"),
-        ("--sim-vehicle tank", "there is no vehicle named 'tank'; known are arducopter"),
-        ("--scenario no.yaml", "no.yaml cannot be read: No such file"),
         ("--connect tcp:127.0.0.1:1", "--sitl starts its own simulator: use --sitl or --connect"),
     ],
 )
@@ -53,20 +50,17 @@ def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
     ("options", "value", "says"),
     [
         ("--config", "nonsense", "no configuration named 'nonsense'; known are flight, paper"),
-        ("--reference", "snail", "no reference named 'snail'; known are circle"),
         ("--reference", "lemniscte", "'lemniscte', did you mean lemniscate? known are circle"),
         ("--set", "reference.course=no", "course: 'no' should be 'fixed' or 'along_velocity'"),
-        ("--reference", "missing.csv", "missing.csv cannot be read: No such file"),
+        ("--reference", "missing.CSV", "missing.CSV cannot be read: No such file"),
         ("--set", "period_s=7", "period_s: 7 should be less than or equal to 0.5"),
         ("--set", "vehicle.mass=3", "vehicle.mass is not a known key, did you mean mass_kg? ("),
         ("--set", "controller.law=frog", "controller: law: 'frog' is not one of pso, lqr,"),
-        ("--set", "controller=pid2", "no controller named 'pid2', did you mean pid? known are"),
         ("--set", "vehicle.drag_translation_npmps=[0, 0, 1e9]", "must be at most 100 per kg"),
         ("--set", "reference.height_m=100", "from 100 m takes 200 s at 0.5 m/s, longer than"),
         ("--set", "limits.radius_m=1.5", "it goes 2 m away from the take-off point, beyond limits"),
         ("--set", "vehicle.hover_thrust=0.92", "0.92 exceeds limits.hover_thrust (0.9)"),
         ("--set", SWARM, "particles x iterations must be at most 500000, not 1000000000"),
-        ("--require", "rmse<1", "there is no metric 'rmse'; there are completed, touchdown_mps,"),
         ("--require", "rmse_position<1", "'rmse_position', did you mean rmse_position_m? there"),
         ("--connect", "udpin:127.0.0.1:0", "give the port that the vehicle sends to"),
         ("--connect", "udpin:127.0.0.1", "is not understood; use udpin:HOST:PORT"),
@@ -92,33 +86,20 @@ def test_what_cannot_be_flown_is_refused(
     ("command", "says"),
     [
         ("offboard doctor gsp", "there is no check named 'gsp'; known are port, vehicle,"),
-        ("offboard doctor --connect nowhere", "connection 'nowhere' is not understood; use udpin:"),
-        ("offboard daemon --print-unit --config no.yaml", "no.yaml cannot be read: No such file"),
-        ("offboard daemon --print-unit --signing-key no", "signing key no"),
         ("offboard daemon --print-unit --out here", "can write below /var/lib/offboard alone"),
         ("offboard paper --quick --seeds 20 --table none", "--quick is --seeds 1: use one of them"),
-        ("offboard compare --connect udpin:127.0.0.1:0", "give the port that the vehicle sends to"),
         ("offboard compare --system 3", "are options of --connect"),
         ("offboard compare --connect tcp:1:1 --workers 2", "options of the simulator"),
         ("offboard compare --scenario ,", "--scenario is an empty list of names"),
-        ("offboard compare --set limits.nope=3", "limits.nope is not a known key"),
-        ("offboard compare --controllers pso,nope", "there is no controller named 'nope'"),
         ("offboard identify x.tlog --system 3", "a log needs no --system,"),
         ("offboard identify --sitl --system 3", "--system is an option of --connect"),
         (f"{FLY} --seed {DIGITS}", "--seed"),
-        ("--scenario storm", "there is no scenario named 'storm'; known are all_together, "),
-        ("--vehicle no/such.yaml", "no/such.yaml cannot be read: No such file"),
-        ("--firmware betaflight", "--firmware betaflight: unknown; there is px4"),
         ("--connect tcp:127.0.0.1:1", "tcp:127.0.0.1:1 is not a link"),
-        ("--connect udpout:127.0.0.1:99999", "is not a link"),
         ("--param MIS_TAKEOFF_ALT", "--param MIS_TAKEOFF_ALT: give NAME=NUMBER"),
-        ("--param TAKEOFF_ALT", "--param TAKEOFF_ALT: give NAME=NUMBER"),
-        ("--speed 0", "--speed 0: must be 0.1 .. 1000"),
         ("--speed nan", "--speed nan: must be 0.1 .. 1000"),
         ("--speed 2 --lockstep", "exclude each other"),
         ("--seed -1", "--seed"),
         ("--log no/x.tlog", "--log no/x.tlog cannot be written: No such file or directory"),
-        ("--instances 2 --lockstep", "--lockstep and --instances exclude each other"),
         ("--instances 20 --instance 240", "system ids end at 250"),
     ],
 )
@@ -135,15 +116,11 @@ def test_an_unknown_option_is_named(called: Called) -> None:
 @pytest.mark.parametrize(
     "command",
     [
-        *(f"{FLY} --config {LONG}", f"{FLY} --reference {LONG}.csv", f"{FLY} --out {LONG}"),
-        *(f'{FLY} --set vehicle="a\\0/b"', f'{FLY} --set vehicle.name="\\ud800"'),
+        *(f"{FLY} --config {LONG}", f"{FLY} --out {LONG}", f'{FLY} --set vehicle.name="\\ud800"'),
         *(f"{FLY} --set controller.{DIGITS}=1", f"{FLY} --connect udpin:127.0.0.1:{DIGITS}"),
         *(f"{FLY} --connect udpin:127.0.0.1:²", f"{FLY} --connect udpin:a..b:14540"),
-        f"{FLY} --connect serial:/dev/null:9999999999",
-        *(f"{COMPARE} --out {LONG}", f"offboard score {LONG}"),
-        *(f"offboard identify {RECORDING} -o no/{LONG}", f"offboard report {RECORDING} -o {LONG}"),
-        *(f"{SIMULATOR} --scenario {LONG}.yaml", f"{SIMULATOR} --log /dev/full --duration 0.1"),
-        *(f"{SIMULATOR} --connect udpin:a..b:14540", f"{SIMULATOR} --duration nan"),
+        *(f"{FLY} --connect serial:/dev/null:9999999999", f"offboard score {LONG}"),
+        *(f"{SIMULATOR} --log /dev/full --duration 0.1", f"{SIMULATOR} --duration nan"),
     ],
 )
 def test_a_name_or_number_beyond_every_limit_is_refused(command: str, refused: Refused) -> None:
@@ -187,12 +164,12 @@ CSV = "time_s,north_m,east_m,altitude_m\n0,0,0,3\n3,2,0,3\n6,2,{east},4\n9,0,0,3
         ("circle.yaml", "shape: circle\nperiod_s: 0", "circle.yaml, line 2, column 1: period_s: 0"),
         ("storm.yaml", "name: s\nconditions: {thrust_scale: 9}",
          "storm.yaml, line 2, column 14: conditions.thrust_scale: 9 should be less"),
-        ("storm.yaml", "name: s\nfaults: [{kind: frogs}]", "storm.yaml, line 2, column 1: faults."),
+        ("storm.yaml", "name: s\nfaults: [{fault: frogs}]", "column 1: faults.0.fault: 'frogs' is"),
+        ("storm.yaml", "name: s\nfaults: [{fault: silent_message, message: NOPE}]",
+         "'NOPE' is not a MAVLink message"),
         ("c.yaml", "parameters: {seed: [1]}\nrequire: [x<1]", "require.0: there is no metric 'x'"),
-        ("c.yaml", "controllers: [nope]", "c.yaml: there is no controller named 'nope'; known are"),
         ("quick", "controllers: [nope]", "quick: there is no controller named 'nope'; known are"),
         ("t.yaml", TUNING % ("feedback", "calm"), "ranges.controller.feedback is no number of"),
-        ("t.yaml", TUNING % ("feedback_limit", "snow"), "there is no scenario named 'snow'"),
     ],
 )  # fmt: skip
 def test_every_kind_of_file_is_checked(
@@ -205,10 +182,9 @@ def test_every_kind_of_file_is_checked(
 
 
 def test_all_shipped_files_are_valid(called: Called) -> None:
-    files = [path for path in CONFIG.rglob("*.yaml") if "scenarios" not in path.parts]
-    assert len(files) > 25
-    scenario = CONFIG / "scenarios" / "all_together.yaml"
-    assert called("offboard check", scenario, *files)[::2] == (0, "")
+    files = list(CONFIG.rglob("*.yaml"))
+    assert len(files) > 44
+    assert called("offboard check", *files)[::2] == (0, "")
 
 
 def test_of_many_errors_the_first_ten_are_printed(called: Called, tmp_path: Path) -> None:

@@ -63,11 +63,6 @@ def supported(vehicle: Vehicle, bandwidth: float, sd_s: float, thrust_sd_s: floa
     return supported_bandwidth(vehicle, uncertainty, 0.1, bandwidth)
 
 
-def test_bandwidth_is_kept_where_the_delay_bears_it():
-    for delay_s, bandwidth in ((0.01, 7.0), (0.057, 7.0), (0.17, 5.0), (0.17, 7.0)):
-        assert supported(delayed(delay_s), bandwidth, 0.002) == bandwidth
-
-
 @pytest.mark.parametrize(("delay_s", "sd_s"), [(0.4, 0.002), (0.057, 0.05)])
 def test_bandwidth_is_lowered_until_the_margin_suffices(delay_s, sd_s):
     vehicle = delayed(delay_s)

@@ -21,10 +21,9 @@ from offboard.campaign.cases import Case
 from offboard.campaign.document import CampaignFile, Promises
 from offboard.campaign.flight import LOWEST, Job, terms
 from offboard.campaign.results import Record
-from offboard.campaign.run import Campaign, Counter
+from offboard.campaign.run import Campaign
 from offboard.campaign.table import Group, groups, row_of, show
 from offboard.campaign.workers import ConnectedVehicle
-from offboard.link import clock
 
 LAWS = ("pso", "lqr", "an/uncommonly/long/name.yaml", "lost")
 SCENARIOS = ("calm", "all_together")
@@ -117,22 +116,6 @@ def test_the_page_shows_every_group_and_the_worst_flights_without_a_network(
             assert opened.unreadable() == opened.problems == []
     for words in (*LAWS, *SCENARIOS, WHY, "3 of 3 failed", "<i>calm</i>", "--seed 3"):
         assert words in told, words
-
-
-def test_the_time_left_counts_the_flights_of_this_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    """100 flights, of which an earlier run has flown 40; one in 2 s."""
-    now_s = [0.0]
-    monkeypatch.setattr(clock, "monotonic_s", lambda: now_s[0])
-    told = Console(file=io.StringIO(), width=80)
-    counter = Counter(told, 100)
-    counter.begin(40)
-    for _ in range(60):
-        now_s[0] += 2.0
-        counter.ended()
-    lines = told.file.getvalue().splitlines()  # type: ignore[attr-defined]
-    assert lines[0] == "100 flights, 40 already flown"
-    assert "95 of 100 flights, 30 a minute, 10 s left" in lines
-    assert len(lines) == 13
 
 
 @pytest.mark.parametrize(

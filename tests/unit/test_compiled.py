@@ -8,10 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
-
-from offboard.control.swarm import SEARCH, iterate
 
 ROOT = Path(__file__).parents[2]
 OFFSET = "OFFSET = 1.0\n"
@@ -127,15 +124,6 @@ def test_the_directory_is_below_the_first_usable_one(package: Path, tmp_path: Pa
     assert not list(package.rglob("here"))
     nowhere = dict.fromkeys(given, str(first))  # a file: compiled, and kept in no directory
     assert answer(package, **nowhere).startswith("68.0\n")
-
-
-def test_arguments_of_other_types_are_refused() -> None:
-    """Or they might be compiled in flight, for seconds."""
-    bounds, best, random = np.zeros((2, 2)), np.ones(2), np.zeros((1, 2, 4, 2))
-    strided, transposed = np.zeros((3, 2, 8))[..., ::2], np.zeros((4, 2, 3)).T
-    for wrong in (strided, np.zeros(3), np.zeros((3, 2, 4), "f4"), transposed):
-        with pytest.raises(TypeError, match="No matching definition"):
-            iterate(np.zeros(1, SEARCH), random, bounds, wrong, best, bounds, bounds, best, 0.0, 1)
 
 
 def test_importing_a_flight_does_not_import_numba() -> None:

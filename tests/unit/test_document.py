@@ -69,20 +69,7 @@ def test_scalars_are_those_of_yaml_1_2() -> None:
         assert parse(f"title: a\ntilt_rad: {text}", Drawing, "d.yaml").tilt_rad == number
     for text in ("no", "12:30", "off", "'1'", '"true"', "a:b"):
         assert parse(f"title: {text}", Drawing, "d.yaml").title == text.strip("'\"")
-
-
-def test_lists_become_tuples_text_an_enum_and_tags_choose_the_model() -> None:
-    drawing = parse(
-        "title: x\ncolour: blue\ncorner: [1, 2.5]\nshape: {kind: line, points: 3}\n"
-        "named: {sun: {kind: circle, radius_m: 2}}\nvisible: false\n",
-        Drawing,
-        "d.yaml",
-    )
-    assert drawing.colour is Colour.BLUE
-    assert drawing.corner == (1.0, 2.5)
-    assert drawing.shape == Line(kind="line", points=3)
-    assert drawing.named["sun"].radius_m == 2.0
-    assert drawing.visible is False
+    assert not parse("title: x\nvisible: false", Drawing, "d.yaml").visible
 
 
 KEYS = "circles, colour, corner, named, scale, shape, tilt_rad, title, visible"

@@ -207,16 +207,6 @@ def test_learner_announces_what_is_new_in_motion(monkeypatch: pytest.MonkeyPatch
         assert sum(line.startswith("identified hover thrust") for line in said) == (used != 0.42)
 
 
-def test_what_is_recalled_needs_no_steps_and_is_not_adopted_again() -> None:
-    recalled = IdentifiedVehicle(FILE, Estimate(0.04, 0.002), 0.0)
-    learner = Learner(FILE, IdentifySettings(), known=recalled)
-    assert not learner.wants_excitation
-    assert learner.finished(0.0)
-    learner.on_stage(Stage.CLIMB, 10.0)
-    assert learner.learn(10.0, 0.42) is None
-    assert learner.result == recalled
-
-
 def test_steps_end_where_they_began_and_outside_the_box() -> None:
     """Integrated twice, tilts by 2 degrees to either side leave the vehicle where it was."""
     learner = Learner(FILE, IdentifySettings(box_m=0.5))

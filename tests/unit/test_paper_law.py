@@ -163,17 +163,6 @@ def test_an_input_accelerates_every_vehicle_as_it_does_the_papers(vehicle: Vehic
     assert upper[0] <= 3.942
 
 
-def test_full_deflection_stays_within_what_the_vehicle_can() -> None:
-    controller = PaperController(PAPER)
-    thrusts = []
-    for down in (1000.0, -1000.0):
-        reference = Straight(np.array([0, 0, down]), np.zeros(3), 0.0)
-        decision = controller.decide(Situation(0.0, state_at(), reference, HOVER))
-        assert decision.certificate.at_bound
-        thrusts.append(decision.command.thrust_mps2)
-    assert thrusts == pytest.approx([0.0, PAPER.thrust_max_mps2], abs=1e-9)
-
-
 @pytest.mark.parametrize(
     ("field", "value", "reason"),
     [
@@ -193,21 +182,12 @@ def test_a_state_without_a_finite_cost_gives_no_decision(
         PaperController(PAPER).decide(Situation(0.0, spoilt, reference, HOVER))
 
 
-def test_a_deadline_is_kept_and_every_decision_has_its_certificate() -> None:
+def test_a_deadline_is_kept() -> None:
     """The time left is asked for after every 25 iterations."""
     remaining_s = iter((0.002, 0.001, 0.0))
-    state, reference = tilted(1.0)
-    controller = PaperController(PAPER)
-    hurried = Situation(0.0, state, reference, HOVER, lambda: next(remaining_s))
-    certificate = controller.decide(hurried).certificate
+    hurried = Situation(0.0, *tilted(1.0), HOVER, lambda: next(remaining_s))
+    certificate = PaperController(PAPER).decide(hurried).certificate
     assert (certificate.cut_short, certificate.iterations) == (True, 75)
-    controller.reset()
-    certificate = controller.decide(replace(hurried, remaining_s=None)).certificate
-    assert (certificate.cut_short, certificate.iterations) == (False, 150)
-    assert 0 <= certificate.gap < 1e-9
-    assert certificate.cost == pytest.approx(certificate.optimal_cost, rel=1e-9)
-    assert 0 < certificate.spread < 1e-6
-    assert not certificate.at_bound
 
 
 def test_the_summed_error_stays_within_its_limits() -> None:

@@ -35,7 +35,6 @@ from offboard.paper.closed_loop import (
 from offboard.paper.extensions import receding
 from offboard.paper.law import LimitedBox, PaperLaw, PaperSettings, StateLimits
 from offboard.paper.study import MAKERS, PAGE, reproduce
-from offboard.run.configuration import load
 
 Array = NDArray[np.float64]
 
@@ -187,17 +186,6 @@ def test_limits_hold_in_every_sample_of_the_path() -> None:
         if row["state"] in ("tilt_rad", "speed_mps"):
             free = row["law"] == "free"
             assert row["greatest"] > (1.2 if free else 0.8) * row["limit"], row
-
-
-def test_flight_and_study_fly_the_same_extensions() -> None:
-    law = load("paper", choices={"controller": "paper_integral"}).controller
-    assert (law.fitness, law.integral) == (
-        extensions.INTEGRAL.fitness,
-        extensions.INTEGRAL.integral,
-    )
-    limits = load("paper", choices={"controller": "paper_limited"}).controller.limits
-    assert limits.margin >= extensions.MARGIN
-    assert limits.model_copy(update={"margin": 0.0}) == extensions.LIMITS
 
 
 def test_limits_hold_whatever_is_done_within_the_narrowed_box() -> None:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import os
-import resource
-import signal
 from pathlib import Path
 
 import pytest
+from processes import full_disk
 
 from offboard.documents.errors import UserError
 from offboard.documents.signing_key import FILE_BYTES_MAX, create_key, read_key
@@ -39,15 +38,8 @@ def test_a_new_key_is_private_random_and_the_hash_of_its_passphrase(tmp_path: Pa
 
 
 def test_a_file_that_cannot_be_written_whole_is_not_left(tmp_path: Path) -> None:
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (20, limits[1]))
-    try:
-        with pytest.raises(UserError, match="cannot be created: File too large"):
-            create_key(tmp_path / "key")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        signal.signal(signal.SIGXFSZ, ignored)
+    with full_disk(20), pytest.raises(UserError, match="cannot be created: File too large"):
+        create_key(tmp_path / "key")
     assert not (tmp_path / "key").exists()
 
 

@@ -15,8 +15,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from offboard.control.base import DecisionError, Situation
-from offboard.control.gains import thrust_ripple, tilt_ripple
-from offboard.model.axes import lateral_model, lead, vertical_model
+from offboard.model.axes import lateral_model, vertical_model
 from offboard.model.command import PredictedState
 from offboard.model.vehicle import Vehicle
 from offboard.reference.base import FlatSample, Reference
@@ -55,15 +54,6 @@ def test_cost_is_the_sum_it_stands_for() -> None:
             claimed = 0.5 * to_go.curvature * held**2 + to_go.coupling @ start * held
             claimed += 0.5 * start @ to_go.state_cost @ start
             assert claimed == pytest.approx(cost, rel=1e-4)
-
-
-def test_lead_inverts_the_second_order_response() -> None:
-    """The response to lead(s) of s = sin 2t is s, with SciPy's transfer function at 2 rad/s."""
-    t = np.linspace(0, 3, 7)
-    commanded = lead(np.sin(2 * t), 2 * np.cos(2 * t), -4 * np.sin(2 * t), PX4.tilt)
-    s = 2j
-    response = 11.4**2 / (s**2 + 2 * 0.56 * 11.4 * s + 11.4**2)
-    assert commanded == pytest.approx((np.exp(s * t) / response).imag)
 
 
 def slope_of_force(reference: Reference, vehicle: Vehicle, state: PredictedState) -> np.ndarray:
@@ -209,12 +199,6 @@ def _after(held: bool) -> np.ndarray:
     return x
 
 
-def test_ripple_is_what_a_staircase_leaves_where_it_steps() -> None:
-    off = _after(held=True) - _after(held=False)
-    assert tilt_ripple(PX4, PERIOD_S) == pytest.approx(off[:2], abs=1e-6)
-    assert thrust_ripple(PX4, PERIOD_S) == pytest.approx(off[2], abs=1e-6)
-
-
 @dataclass
 class Jerking:
     """At rest, level and unaccelerated at 0.057 s, with a constant jerk, NED."""
@@ -249,8 +233,3 @@ def test_what_is_left_on_a_known_vehicle(vertical_m: float, most_m: float) -> No
     """Without noise, everything known: 0.8 and 1.5 mm by a law that fights its own ripple."""
     reference = lemniscate(8.0, vertical_m=vertical_m)
     assert fly(Truth(PX4), lqr(), PX4, reference, 16.0) < most_m
-
-
-def test_sixty_milliseconds_of_unknown_delay_are_survived() -> None:
-    """On real PX4, whose estimate wanders, .047."""
-    assert rmse_m(5.0, Truth(PX4, extra_delay_s=0.06)) < 0.005

@@ -137,17 +137,6 @@ def test_commands(command: CommandLong, number: int, leading: list[float]) -> No
     assert parameters == pytest.approx(leading + [0.0] * (7 - len(leading)), nan_ok=True)
 
 
-def test_modes_have_the_numbers_of_the_specification() -> None:
-    for number, name in (
-        (0x00060000, "OFFBOARD"), (0x03040000, "AUTO.LOITER"), (0x02040000, "AUTO.TAKEOFF"),
-        (0x06040000, "AUTO.LAND"), (0x00030000, "POSCTL"), (0xFF00FFFF, "UNKNOWN(0xff00ffff)"),
-    ):  # fmt: skip
-        assert PX4_DIALECT.mode_name(number) == name
-    assert [ARDUPILOT_DIALECT.mode_name(n) for n in (4, 9, 17)] == ["GUIDED", "LAND", "BRAKE"]
-    with pytest.raises(KeyError):
-        PX4_DIALECT.set_mode("NONSENSE")
-
-
 # --- the others ---
 
 

@@ -104,17 +104,6 @@ def test_an_interval_can_be_stopped_restored_and_read() -> None:
         assert bench.of("MESSAGE_INTERVAL")[-1][1].interval_us == shown_us
 
 
-@pytest.mark.parametrize(
-    ("firmware", "at_s", "answer"), [("ardupilot", 1.0, 4), ("ardupilot", 21.0, 0), ("px4", 1.0, 0)]
-)
-def test_home_is_sent_on_request_once_it_is_known(firmware: str, at_s: float, answer: int) -> None:
-    bench = Bench(firmware=FIRMWARES[firmware])
-    bench.run(at_s)
-    heard = len(bench.of("HOME_POSITION"))
-    assert bench.command(410) == [answer]
-    assert len(bench.of("HOME_POSITION")) - heard == (answer == 0)
-
-
 # -- time, files -----------------------------------------------------------------------------
 
 

@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from sim_bench import Bench
-from sim_rows import Rows, compare
-from sim_talk import ask_again, recorded_frames
+from sim_rows import Rows, ask_again, compare, recorded_frames
 
 from simulator.firmware.catalogue import FIRMWARES
 from simulator.vehicle.sensors import EstimatorName

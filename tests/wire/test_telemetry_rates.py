@@ -117,19 +117,6 @@ def test_two_clocks_by_turns_are_two_vehicles_and_a_reboot_is_one() -> None:
     assert not link.mixed
 
 
-def test_a_stamp_far_ahead_counts_once_others_go_on_from_it() -> None:
-    """One of them was a jump of the clock, which lands, and those after it a restart."""
-    link = VehicleTime()
-
-    def stamps(begin_s: float) -> list[Age]:
-        return [link.check(32, begin_s + number / 32) for number in range(10)]
-
-    assert stamps(10.0) == [Age.FRESH] * 10
-    assert link.check(32, 15.0) is Age.STALE
-    assert stamps(10.5) == [Age.FRESH] * 10
-    assert stamps(13.0) == [Age.STALE] * 4 + [Age.FRESH] * 6  # an outage, or a jump
-
-
 @pytest.mark.parametrize(
     ("baud", "attitude_hz"),
     # 0.7 of 5,760 bytes/s less 620 for slow messages, over 84 per pair; HIL_STATE_QUATERNION too
