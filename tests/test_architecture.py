@@ -4,6 +4,7 @@ format, lint, strict types and import rules."""
 from __future__ import annotations
 
 import ast
+import subprocess
 from functools import cache
 from pathlib import Path
 
@@ -75,3 +76,12 @@ def test_one_place_makes_a_setpoint() -> None:
         and node.func.id in ("AttitudeTarget", "PositionTarget")
     }
     assert makers == {"offboard/flight/outbox.py"}
+
+
+def test_top_level_holds_only_what_the_layout_names() -> None:
+    listed = subprocess.run(
+        ("git", "ls-files"), cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.split()
+    top = {name.split("/")[0] for name in listed if not name.startswith(".")}
+    pages = {"README.md", "LICENSE", "CHANGELOG.md", "CONTRIBUTING.md"}
+    assert top <= {"pyproject.toml", "offboard", "simulator", "config", "tests"} | pages

@@ -343,6 +343,28 @@ def test_a_flight_whose_worker_dies_twice_is_a_row(
 
 
 @pytest.mark.slow
+def test_a_kept_flight_appears_when_it_is_complete(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that ends before leaves no directory that looks like a kept flight."""
+    case = campaign(FILE, tmp_path / "out").cases[0]
+    kept = tmp_path / "flights" / case.key
+    job = Job(case, Promises(), code_hash(), kept)
+
+    def ends(directory: Path, *score: object) -> None:
+        assert (directory / "flight.tlog").is_file()
+        raise SystemExit
+
+    with monkeypatch.context() as ending:
+        ending.setattr(flight, "keep_score", ends)
+        with pytest.raises(SystemExit):
+            flight.fly_job(job)
+    assert not kept.exists()
+    assert flight.fly_job(job).completed
+    assert {path.name for path in kept.iterdir()} >= {"flight.tlog", "flight.yaml", "score.json"}
+
+
+@pytest.mark.slow
 def test_a_killed_or_interrupted_comparison_keeps_what_landed_and_goes_on(
     spawn: Spawn, tmp_path: Path
 ) -> None:
@@ -378,3 +400,18 @@ def test_a_killed_or_interrupted_comparison_keeps_what_landed_and_goes_on(
     again = rows(tmp_path / "x")
     assert len(again) == 8
     assert all(row in again for row in flown)
+
+
+@pytest.mark.slow
+def test_interrupted_while_its_processes_load_it_ends_in_order(
+    spawn: Spawn, tmp_path: Path
+) -> None:
+    (tmp_path / "c.yaml").write_text(FILE.replace("draws: 1", "draws: 9"))
+    process = spawn("offboard", "campaign", "c.yaml", "--out", "out", "--workers", 2)
+    while process.poll() is None and len(children(process.pid)) < 3:  # a tracker, two of ours
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGINT)
+    output, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors.count("\n")) == (4, 1), errors
+    assert "the process that flew it ended" not in output
+    assert "flights are missing" in errors

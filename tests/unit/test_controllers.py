@@ -14,6 +14,7 @@ from laws import LEVEL, G, at, law_named, state_of
 from offboard.control.base import Controller, Situation
 from offboard.control.catalogue import names, settings_of
 from offboard.documents import shipped
+from offboard.documents.errors import DocumentError
 from offboard.documents.reading import read
 from offboard.flight.phases import Limits
 from offboard.identification.learner import IdentifySettings
@@ -23,6 +24,8 @@ from offboard.run.configuration import FlightConfig, load, read_part
 from offboard.run.flight import Simulated
 
 ENDS = ("minimum", "exclusiveMinimum", "maximum")  # of a JSON schema
+# a key with a number, and the ends of the range in its comment
+RANGED = re.compile(r"^(\w+): [-\d.]+ .*# .*?(-?[\d.]+) \.\. ([\d.]+)", re.MULTILINE)
 
 
 def test_every_law_has_a_shipped_file_and_every_file_a_law() -> None:
@@ -47,6 +50,24 @@ def test_flight_yaml_states_every_setting_with_its_default_and_range() -> None:
             ends = [f"{schema[key]:g}" for key in ENDS if key in schema]
             (line,) = re.findall(rf"^  {name}: .*", text, re.MULTILINE)
             assert " .. ".join(ends) in line
+
+
+@pytest.mark.parametrize("part", shipped.PARTS)
+def test_the_ends_of_the_ranges_that_shipped_files_state_are_allowed(part: str) -> None:
+    """But a lower end of 0 may mean more than that."""
+    stated = {}  # by law or shape, key and end: one of the files
+    for name in shipped.names(part):
+        text = shipped.read_text(shipped.locate(name, part))
+        for key, *ends in re.findall(RANGED, text):
+            stated |= {(*re.findall("\n(?:law|shape): .*", text), key, end): name for end in ends}
+    assert stated
+    refused = []
+    for (*_, key, end), name in stated.items():
+        try:
+            load("flight", choices={part: name}, assignments=[f"{part}.{key}={end}"])
+        except DocumentError as error:
+            refused += [str(error)] if end != "0" and f"{end} should be" in str(error) else []
+    assert refused == []
 
 
 @pytest.mark.parametrize("law", names())
