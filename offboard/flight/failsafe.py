@@ -109,9 +109,9 @@ def old(flight: FlightState) -> str:
 
 def late_link(flight: FlightState) -> str:
     """Growth of the link's delay since take-off (TIMESYNC), or the age of telemetry."""
-    limits, growth_s = flight.limits, flight.link_growth_s
-    late = growth_s > limits.link_growth_s or flight.age_s > limits.setpoint_age_s
-    return f"the delay of the link has grown by {growth_s:.2f} s" if late else ""
+    growth_s = flight.clock.delay_growth_s
+    grown = growth_s > flight.limits.link_growth_s
+    return f"the delay of the link has grown by {growth_s:.2f} s" if grown else old(flight)
 
 
 def unanswered(flight: FlightState) -> str:

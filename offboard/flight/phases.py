@@ -55,7 +55,7 @@ class Action(IntEnum):
     """What follows when a limit is exceeded in flight, from mild to severe (see `failsafe`)."""
 
     FLY = 0
-    LEVEL = 1  # this tick: level, with the estimated hover thrust, instead of the decision
+    LEVEL = 1  # shows that the last decision was replaced by level flight; asks for nothing
     HOLD = 2  # the autopilot is asked to hold, after `Limits.hold_s` to land
     LAND = 3  # the autopilot is asked to land
 

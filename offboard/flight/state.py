@@ -327,7 +327,7 @@ class FlightState:
 
     @property
     def link_growth_s(self) -> float:
-        """Growth of the link's delay since take-off."""
+        """Growth of the link's delay since take-off, or the age of telemetry if that is more."""
         return max(self.clock.delay_growth_s, self.age_s)
 
     def sent_s(self, time_s: float) -> float:

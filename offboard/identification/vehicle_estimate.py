@@ -165,8 +165,10 @@ class VehicleEstimate:
         if self._link == link:
             return
         self._link = link
-        change_ms = round(1e3 * link[0])
-        of_link = f"has grown by {change_ms} ms" if change_ms > 0 else "is that of take-off"
+        grown_ms, lately_ms = (round(1e3 * each) for each in link)
+        of_link = f"has changed by {lately_ms} ms lately" if lately_ms else "is that of take-off"
+        if grown_ms > 0:
+            of_link = f"has grown by {grown_ms} ms"
         of_tilt = f"is {in_ms(self.delay)}" if self.delay else "is not identified yet"
         self.cause = f"the link's delay {of_link}, the tilt's {of_tilt}"
 

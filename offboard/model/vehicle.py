@@ -113,9 +113,9 @@ class Vehicle(Parameters):
 class DelayUncertainty:
     """What is not known of a vehicle's delays, s.
 
-    `tilt_s` and `thrust_s`: by how much the true delay may differ; three standard deviations of an
-    identified one. `link_s`: what the link adds to all delays since take-off, which is known and
-    compensated by prediction.
+    `tilt_s` and `thrust_s`: by how much the true delay may differ, of an identified one three
+    (tilt) and two (thrust) standard deviations. `link_s`: what the link adds to all delays since
+    take-off, which is known and compensated by prediction.
     """
 
     tilt_s: float = 0.0
