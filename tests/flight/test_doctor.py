@@ -1,5 +1,5 @@
-"""`offboard doctor` finds what is wrong with a vehicle, its link and this computer, and what it prints
-makes it right."""
+"""`offboard doctor` finds what is wrong with a vehicle, its link and this computer, and what it
+prints makes it right."""
 
 from __future__ import annotations
 

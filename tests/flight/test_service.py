@@ -314,9 +314,11 @@ def test_another_controller_is_left_alone(served: Served) -> None:
     assert pair.said("not engaged: OFFBOARD, but another program sends setpoints")
 
 
-def test_engaged_while_it_lands_it_is_held_and_the_pilot_is_told(served: Served) -> None:
-    """ArduCopter was left in GUIDED, with nobody to send setpoints, without a word. PX4 refuses
-    OFFBOARD without a stream."""
+def test_engaged_while_it_lands_or_stands_it_is_not_flown_and_the_pilot_is_told(
+    served: Served,
+) -> None:
+    """ArduCopter was left in GUIDED, with nobody to send setpoints, without a word. Its land
+    detector does not see that it stands in BRAKE, nor is it started there."""
     pair = served.engaged("ardupilot", then="land")
     pair.until(lambda: pair.phase is Phase.LAND, 30.0)
     pair.run(1.0)
@@ -327,11 +329,6 @@ def test_engaged_while_it_lands_it_is_held_and_the_pilot_is_told(served: Served)
     pair.switch("pilot")
     pair.run(1.5)
     pair.engage()
-
-
-def test_switched_where_it_has_touched_down_it_stays_there(served: Served) -> None:
-    """ArduCopter's land detector does not see that it stands in BRAKE. Nor is it started there."""
-    pair = served.engaged("ardupilot")
     pair.switch("land")
     pair.until(lambda: -pair.place[2] < 0.01)
     pair.switch("pilot")
@@ -341,7 +338,6 @@ def test_switched_where_it_has_touched_down_it_stays_there(served: Served) -> No
     pair.switch("engage")
     pair.run(1.0)
     assert (pair.phase, pair.mode) == (Phase.STANDBY, "GUIDED")
-    assert pair.after(switched_s, SETPOINT, COMMAND) == []
     assert pair.said("not engaged: GUIDED, but the vehicle may stand on the ground")
     pair.command(START)
     pair.run(1.0)
@@ -349,27 +345,10 @@ def test_switched_where_it_has_touched_down_it_stays_there(served: Served) -> No
     assert pair.after(switched_s, SETPOINT, COMMAND) == []
 
 
-def test_armed_in_offboard_on_the_ground_it_stays_there(served: Served) -> None:
-    """And is not left engaged any more, as by a flight that was cut short: who engages it later is
-    another."""
-    pair = served()
-    pair.until(lambda: pair.phase is Phase.STANDBY)
-    pair.restart()
-    pair.logs.left = "px4-1-1"
-    pair.until(lambda: pair.logs.left == "", 5.0)
-    pair.until(lambda: pair.phase is Phase.STANDBY)
-    pair.switch("engage")
-    commander = pair.instance.autopilot.commander
-    pair.until(lambda: pair.try_arm(commander), 20.0)
-    armed_s = pair.time_s
-    pair.run(6.0)
-    assert pair.phase is Phase.STANDBY
-    assert set(thrusts(pair, armed_s)) == {0.0}
-    assert -pair.place[2] < 0.05
-
-
-def test_without_arms_a_start_on_the_ground_is_rejected(served: Served) -> None:
-    """Another vehicle passed by, which prevents standby for 10 s."""
+def test_without_arms_it_stays_on_the_ground(served: Served) -> None:
+    """Another vehicle passed by, which prevents standby for 10 s. A start is rejected; armed in
+    OFFBOARD it is not lifted. A flight that was cut short counts as ended there: who engages the
+    vehicle later is another."""
     pair = served()
     codec = mavlink.MAVLink(None, srcSystem=9, srcComponent=1)
     pair.run(0.5)
@@ -382,6 +361,18 @@ def test_without_arms_a_start_on_the_ground_is_rejected(served: Served) -> None:
     pair.run(3.0)
     assert pair.acks == [(START, TEMPORARILY_REJECTED)]
     assert pair.after(0.0, COMMAND) == []
+    pair.restart()
+    pair.logs.left = "px4-1-1"
+    pair.until(lambda: pair.logs.left == "", 5.0)
+    pair.until(lambda: pair.phase is Phase.STANDBY)
+    pair.switch("engage")
+    commander = pair.instance.autopilot.commander
+    pair.until(lambda: pair.try_arm(commander), 20.0)
+    armed_s = pair.time_s
+    pair.run(6.0)
+    assert pair.phase is Phase.STANDBY
+    assert set(thrusts(pair, armed_s)) == {0.0}
+    assert -pair.place[2] < 0.05
 
 
 def test_with_arms_a_start_takes_off_and_flies(served: Served) -> None:
@@ -422,127 +413,88 @@ def test_a_reboot_between_two_flights(served: Served) -> None:
     pair.until(lambda: pair.phase is Phase.HOVER, 40.0)
 
 
-def test_a_vehicle_that_is_not_heard_for_long_is_landed(served: Served) -> None:
-    """It has waited in GUIDED without anybody who flies it."""
-    pair = served.engaged("ardupilot")
+@BOTH
+def test_after_an_outage_it_is_landed(served: Served, on: str) -> None:
+    """ArduCopter, unheard for 4 s, has waited in GUIDED without anybody who flies it. PX4 returns
+    to OFFBOARD from its failsafe by itself when setpoints arrive again: none is sent, and no pilot
+    has switched."""
+    pair = served.engaged(on)
     pair.run(1.0)
-    pair.lost_down = pair.lost_up = True
-    pair.run(4.0)
-    pair.lost_down = pair.lost_up = False
-    assert pair.mode == "GUIDED"
-    pair.until(lambda: pair.mode == "LAND", 3.0)
+    pair.lost_up, pair.lost_down = True, on == "ardupilot"
+    pair.run(4.0 if pair.lost_down else 1.5)
+    pair.lost_up = pair.lost_down = False
+    pair.until(lambda: pair.mode in ("LAND", "AUTO.LAND"), 3.0)
     assert len(pair.logs.begun) == 1  # the same flight
-
-
-def test_a_vehicle_in_the_failsafe_for_missing_setpoints_is_landed(served: Served) -> None:
-    """PX4 returns to OFFBOARD by itself when setpoints arrive again: none is sent, and no pilot has
-    switched."""
-    pair = served.engaged()
-    pair.run(1.0)
-    pair.lost_up = True
-    pair.until(lambda: pair.mode != "OFFBOARD", 4.0)
-    pair.lost_up = False
-    pair.until(lambda: pair.mode == "AUTO.LAND", 3.0)
-    pair.until(lambda: not pair.armed, 30.0)
-    pair.until(lambda: pair.phase is Phase.STANDBY, 5.0)
+    if on == "px4":
+        pair.until(lambda: not pair.armed, 30.0)
+        pair.until(lambda: pair.phase is Phase.STANDBY, 5.0)
 
 
 def test_requests_over_mavlink(served: Served) -> None:
+    """A ground station that missed an answer repeats its command, which is accepted again; but it
+    is not told that a vehicle that is handed back, or lands, will pause."""
     pair = served.engaged("ardupilot", reference="lemniscate")
     pair.until(lambda: pair.phase is Phase.TRACK, 30.0)
-    pair.run(1.0)
-    pair.command(PAUSE_CONTINUE, 0.0)
-    pair.run(4.0)
+    expected: list[tuple[int, int]] = []
+
+    def ask(command: int, *params: float, result: int = ACCEPTED, times: int = 1) -> None:
+        for _ in range(times):
+            pair.command(command, *params)
+        expected.extend([(command, result)] * times)
+        pair.run(0.2)
+        assert pair.acks == expected
+
+    ask(PAUSE_CONTINUE, 1.0, result=TEMPORARILY_REJECTED)
+    ask(PAUSE_CONTINUE, 0.0, times=2)
+    pair.run(3.8)
+    ask(PAUSE_CONTINUE, 0.0)
     assert pair.phase is Phase.PAUSE
     at_m = pair.place
     pair.run(1.0)
     assert float(np.linalg.norm(pair.place - at_m)) < 0.05
-    pair.command(PAUSE_CONTINUE, 1.0)
+    ask(PAUSE_CONTINUE, 1.0, times=2)
+    ask(PAUSE_CONTINUE, 1.0)
     pair.until(lambda: float(np.linalg.norm(pair.place - at_m)) > 0.5, 6.0)
-    pair.command(START)
-    pair.until(lambda: pair.phase is Phase.CLIMB, 1.0)
-    pair.command(PAUSE_CONTINUE, 0.5)
-    pair.command(ARM, 1.0)
-    pair.run(0.2)
-    pair.command(SET_MODE, 1.0, 4.0, 3.0)
+    ask(START)
+    assert pair.phase is Phase.CLIMB
+    ask(PAUSE_CONTINUE, 0.5, result=DENIED)
+    ask(ARM, 1.0, result=UNSUPPORTED)
+    ask(SET_MODE, 1.0, 4.0, 3.0, times=2)
     pair.until(lambda: pair.phase is Phase.STANDBY, 3.0)
     assert pair.mode == "BRAKE"
-    pair.command(SET_MODE, 1.0)
-    pair.command(START)
-    pair.run(0.2)
-    assert pair.acks == [
-        (PAUSE_CONTINUE, ACCEPTED),
-        (PAUSE_CONTINUE, ACCEPTED),
-        (START, ACCEPTED),
-        (PAUSE_CONTINUE, DENIED),
-        (ARM, UNSUPPORTED),
-        (SET_MODE, ACCEPTED),
-        (SET_MODE, TEMPORARILY_REJECTED),
-        (START, TEMPORARILY_REJECTED),
-    ]
-
-
-def test_a_request_is_accepted_again_and_no_more_once_the_flight_ends(served: Served) -> None:
-    """A ground station that missed the answer repeats its command. It was told that a vehicle that
-    is handed back, or lands, will pause."""
-    pair = served.engaged("ardupilot", reference="lemniscate")
-    pair.until(lambda: pair.phase is Phase.TRACK, 30.0)
-    pair.command(PAUSE_CONTINUE, 1.0)
-    pair.run(0.2)
-    rejected = (PAUSE_CONTINUE, TEMPORARILY_REJECTED)
-    assert pair.acks == [rejected]
-    for parameter in (0.0, 1.0):
-        pair.command(PAUSE_CONTINUE, parameter)
-        pair.command(PAUSE_CONTINUE, parameter)
-        pair.run(0.2)
-        pair.command(PAUSE_CONTINUE, parameter)
-        pair.run(0.2)
-    pair.command(SET_MODE, 1.0)
-    pair.command(SET_MODE, 1.0)
-    pair.until(lambda: pair.phase is Phase.STANDBY, 3.0)
-    pair.command(PAUSE_CONTINUE, 1.0)
-    pair.run(0.2)
-    repeated = [(PAUSE_CONTINUE, ACCEPTED)] * 6 + [(SET_MODE, ACCEPTED)] * 2
-    assert pair.acks == [rejected, *repeated, rejected]
-    said = [
-        text.split(" requested by ")[0]
-        for text in pair.service.current.announced
-        if "ted by" in text
-    ]
-    assert said == ["pause", "continue", "hand back"]
+    for command, parameter in ((SET_MODE, 1.0), (START, 0.0), (PAUSE_CONTINUE, 1.0)):
+        ask(command, parameter, result=TEMPORARILY_REJECTED)
+    told = [said for said in pair.service.current.announced if "ted by" in said]
+    words = ["pause", "continue", "start", "hand back"]
+    assert [said.split(" requested by ")[0] for said in told] == words
     pair.engage()
     pair.until(lambda: pair.phase is Phase.TRACK, 30.0)
-    pair.command(PAUSE_CONTINUE, 0.0)
-    pair.until(lambda: pair.phase is Phase.PAUSE, 0.5)
+    ask(PAUSE_CONTINUE, 0.0)
     pair.service.request_stop("the disk is full")
     pair.until(lambda: pair.phase is Phase.HAND_BACK, 0.5)
-    pair.command(PAUSE_CONTINUE, 0.0)
-    pair.run(0.2)
-    assert pair.acks[-2:] == [(PAUSE_CONTINUE, ACCEPTED), rejected]
+    ask(PAUSE_CONTINUE, 0.0, result=TEMPORARILY_REJECTED)
 
 
-def test_a_pilot_who_engages_and_takes_it_again_at_once_has_it(served: Served) -> None:
-    """On a real PX4 it was asked to land: no TIMESYNC was asked for while the HEARTBEAT after the
-    first switch was awaited, so that setpoints seemed lost, and the second switch a failsafe."""
-    pair = served.engaged()
-    pair.run(1.0)
-    heard = pair.state.vehicle.heartbeat
-    pair.until(lambda: pair.state.vehicle.heartbeat is not heard, 1.5)
-    pair.switch("pilot")
-    pair.until(lambda: pair.phase is Phase.STANDBY, 1.5)
-    pair.run(0.1)
-    pair.engage()
-    pair.run(0.1)
-    pair.switch("pilot")
-    pair.run(0.15)
-    pair.switch("engage")
+def test_requests_within_one_tick(served: Served) -> None:
+    """A start is cancelled, and nothing cancels that the vehicle is to be given back."""
+    pair = served("ardupilot", arms=True)
+    pair.until(lambda: pair.phase is Phase.STANDBY)
+    pair.command(START)
+    pair.command(SET_MODE, 1.0)
     pair.run(2.0)
-    assert not pair.said("own failsafe")
-    assert pair.commands(21) == []  # to land
+    assert (pair.phase, pair.armed) == (Phase.STANDBY, False)
+    flies = served.engaged("ardupilot")
+    flies.command(SET_MODE, 1.0)
+    flies.command(START)
+    flies.until(lambda: flies.phase is Phase.STANDBY, 3.0)
+    assert pair.acks == [(START, ACCEPTED), (SET_MODE, ACCEPTED)]
+    assert flies.acks == [(SET_MODE, ACCEPTED), (START, TEMPORARILY_REJECTED)]
 
 
 def test_a_pilot_takes_a_vehicle_whose_own_failsafe_acts_soon(served: Served) -> None:
-    """With the least COM_OF_LOSS_T setpoints seemed to be missing always, and this its failsafe."""
+    """With the least COM_OF_LOSS_T setpoints seemed to be missing always, and this its failsafe.
+    And he engages it and takes it again at once: on a real PX4 it was asked to land, as no TIMESYNC
+    was asked for while the HEARTBEAT after the first switch was awaited."""
     pair = served.aloft()
     pair.instance.autopilot.parameters.set("COM_OF_LOSS_T", 0.3)
     pair.state.vehicle.parameters["COM_OF_LOSS_T"] = 0.3  # as it reports a change
@@ -555,7 +507,48 @@ def test_a_pilot_takes_a_vehicle_whose_own_failsafe_acts_soon(served: Served) ->
     assert pair.service.current.announced[-1].startswith(
         "yielded: the vehicle left OFFBOARD for AUTO.LOITER"
     )
+    pair.run(0.1)
+    pair.engage()
+    pair.run(0.1)
+    pair.switch("pilot")
+    pair.run(0.15)
+    pair.switch("engage")
+    pair.run(2.0)
     assert not pair.said("own failsafe")
+    assert pair.landings == []
+
+
+def test_what_is_heard_after_a_silence_may_be_another_vehicle(served: Served) -> None:
+    """With the same system id, on the same radio, switched on earlier, whether the service waits
+    for a pilot or for this one to be ready: parameters and hardware number are read again. It was
+    flown with those of the one before, its thrust taken for a climb rate."""
+    pair = served.engaged("ardupilot")
+    pair.switch("pilot")
+    pair.run(2.0)
+
+    def silence(options: float) -> None:
+        """After which the vehicle has these GUID_OPTIONS."""
+        asked = len(pair.commands(512))
+        pair.lost_down = pair.lost_up = True
+        pair.run(6.0)
+        assert pair.phase is Phase.HEALTH
+        pair.instance.autopilot.parameters.set("GUID_OPTIONS", options)
+        pair.lost_down = pair.lost_up = False
+        pair.run(4.0)
+        assert len(pair.commands(512)) > asked
+
+    assert pair.state.vehicle.uid == 1
+    silence(0.0)
+    assert not pair.said("another vehicle answers")
+    pair.switch("engage")
+    pair.until(lambda: pair.mode == "BRAKE", 3.0)
+    assert pair.said("not engaged: GUID_OPTIONS is 0: without bit 3")
+    pair.run(2.0)
+    pair.state.vehicle.uid = 7  # of the one that was heard until now
+    silence(8.0)
+    pair.until(lambda: pair.phase is Phase.STANDBY, 5.0)
+    assert pair.said("another vehicle answers")
+    assert pair.state.vehicle.uid == 1
 
 
 def test_a_request_in_the_tick_of_a_transition_is_obeyed(served: Served) -> None:
@@ -578,22 +571,6 @@ def test_a_request_in_the_tick_of_a_transition_is_obeyed(served: Served) -> None
         assert (pair.acks[-1], pair.mode) == ((SET_MODE, ACCEPTED), "AUTO.LOITER")
 
 
-def test_requests_within_one_tick(served: Served) -> None:
-    """A start is cancelled, and nothing cancels that the vehicle is to be given back."""
-    pair = served("ardupilot", arms=True)
-    pair.until(lambda: pair.phase is Phase.STANDBY)
-    pair.command(START)
-    pair.command(SET_MODE, 1.0)
-    pair.run(2.0)
-    assert (pair.phase, pair.armed) == (Phase.STANDBY, False)
-    flies = served.engaged("ardupilot")
-    flies.command(SET_MODE, 1.0)
-    flies.command(START)
-    flies.until(lambda: flies.phase is Phase.STANDBY, 3.0)
-    assert pair.acks == [(START, ACCEPTED), (SET_MODE, ACCEPTED)]
-    assert flies.acks == [(SET_MODE, ACCEPTED), (START, TEMPORARILY_REJECTED)]
-
-
 def test_a_vehicle_that_is_engaged_as_the_service_stops_is_held(served: Served) -> None:
     pair = served.aloft()
     pair.run(0.04)  # the report of the mode comes between two ticks
@@ -603,63 +580,6 @@ def test_a_vehicle_that_is_engaged_as_the_service_stops_is_held(served: Served) 
     pair.service.request_stop()
     pair.until(pair.service.has_ended, 5.0)
     assert pair.mode == "AUTO.LOITER"
-
-
-def test_what_is_heard_after_a_silence_may_be_another_vehicle(served: Served) -> None:
-    """With the same system id, on the same radio, switched on earlier: its parameters are read. It
-    was flown with those of the one before, its thrust taken for a climb rate."""
-    pair = served.engaged("ardupilot")
-    pair.switch("pilot")
-    pair.run(2.0)
-    pair.lost_down = pair.lost_up = True
-    pair.run(6.0)
-    assert pair.phase is Phase.HEALTH
-    pair.instance.autopilot.parameters.set("GUID_OPTIONS", 0.0)
-    pair.lost_down = pair.lost_up = False
-    pair.run(4.0)
-    pair.switch("engage")
-    pair.until(lambda: pair.mode == "BRAKE", 3.0)
-    assert pair.said("not engaged: GUID_OPTIONS is 0: without bit 3")
-    pair.instance.autopilot.parameters.set("GUID_OPTIONS", 8.0)
-    pair.state.vehicle.parameters["GUID_OPTIONS"] = 8.0  # as a ground station sets it
-    pair.until(lambda: pair.phase is Phase.STANDBY, 5.0)
-    assert pair.state.vehicle.uid == 1
-
-
-def test_what_is_heard_after_a_silence_in_health_may_be_another_vehicle_too(served: Served) -> None:
-    """A third one passes by, which prevents standby for 10 s. It was ready with the parameters of
-    the one before."""
-    pair = served("ardupilot")
-    codec = mavlink.MAVLink(None, srcSystem=9, srcComponent=1)
-    pair.run(0.5)
-    pair.forwarded.append(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3).pack(codec))
-    pair.run(3.0)
-    assert pair.state.vehicle.parameters["GUID_OPTIONS"] == 8.0
-    pair.lost_down = pair.lost_up = True
-    pair.run(6.0)
-    pair.instance.autopilot.parameters.set("GUID_OPTIONS", 0.0)
-    pair.lost_down = pair.lost_up = False
-    pair.run(6.0)
-    assert pair.phase is Phase.HEALTH
-    assert pair.said("waiting: GUID_OPTIONS is 0: without bit 3")
-    assert sum("health: no telemetry for 5" in said for said in pair.service.current.announced) == 1
-
-
-def test_another_hardware_number_is_another_vehicle(served: Served) -> None:
-    """Asked after each silence, also before the first flight. Nothing known is of it."""
-    pair = served("ardupilot")
-    for number_before in (1, 7):
-        pair.until(lambda: pair.phase is Phase.STANDBY)
-        assert pair.state.vehicle.uid == 1
-        pair.state.vehicle.uid = number_before  # of the one that was heard until now
-        pair.lost_down = pair.lost_up = True
-        pair.run(6.0)
-        assert pair.phase is Phase.HEALTH
-        asked = len(pair.commands(512))
-        pair.lost_down = pair.lost_up = False
-        pair.run(4.0)
-        assert len(pair.commands(512)) > asked
-        assert pair.said("another vehicle answers") is (number_before == 7)
 
 
 def test_the_reference_is_repeated_with_the_newest_configuration(served: Served) -> None:
