@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 from faults import disarmed, downlink, kill_motors, stop
-from pair import Pair, in_phase, with_rate
+from pair import STEP_S, Bytes, Pair, in_phase, with_rate
 from watch import (
+    BOTH,
     HIGH,
     REACTION_S,
     Vehicle,
@@ -236,12 +237,22 @@ def test_resets_of_the_estimate_move_its_place_and_the_ground(resets: list[dict[
 # -- whose it is -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("scenario", "on"), alternately("pilot_refuses", "pilot_comes_back"))
-def test_a_pilot_is_not_overridden(scenario: str, on: Vehicle) -> None:
-    """Nothing leaves after the report of the pilot's mode, and the mode is asked for once. Just
-    after engaging; and in track, from where the pilot is back after 0.6 s, too late."""
-    pair = on.lap(scenario=early(scenario) if scenario != "pilot_refuses" else scenario)
-    watch = aborted(pair, "the vehicle left (OFFBOARD|GUIDED) for", ended_by="pilot")
+@pytest.mark.parametrize(
+    ("scenario", "on", "says", "ended_by"),
+    [
+        ("pilot_refuses", px4, "", "pilot"),  # just after engaging
+        (early("pilot_comes_back"), copter, "", "pilot"),  # in track; back after 0.6 s, too late
+        (early("lost_heartbeat"), px4, "", ""),  # CURRENT_MODE shows him
+        # the HEARTBEAT that shows a failsafe comes after CURRENT_MODE
+        (early("empty_battery"), px4, ".*; a failsafe of the vehicle has it", "failsafe"),
+    ],
+)
+def test_who_takes_it_is_not_overridden(
+    scenario: Any, on: Vehicle, says: str, ended_by: str
+) -> None:
+    """Nothing leaves after the report of the other mode, and ours is asked for once."""
+    pair = on.lap(scenario=scenario)
+    watch = aborted(pair, f"the vehicle left (OFFBOARD|GUIDED) for{says}", ended_by=ended_by)
     left_s = watch.left_s(engage_mode(pair))
     assert len(pair.modes) == 1
     assert pair.landings == []
@@ -249,22 +260,6 @@ def test_a_pilot_is_not_overridden(scenario: str, on: Vehicle) -> None:
     assert pair.armed
     assert sent_after(pair, left_s + REACTION_S) == []
     assert sent_after(pair, left_s - 0.5) != []
-
-
-def test_current_mode_shows_the_pilot_without_heartbeats() -> None:
-    """ArduCopter has no other report: see test_outages."""
-    pair = px4.lap(scenario=early("lost_heartbeat"))
-    watch = aborted(pair, "the vehicle left OFFBOARD for ")
-    assert sent_after(pair, watch.left_s("OFFBOARD") + REACTION_S) == []
-    assert pair.landings == []
-
-
-def test_the_vehicles_own_failsafe_has_it() -> None:
-    """And is named, though on PX4 the HEARTBEAT that shows it comes after CURRENT_MODE."""
-    pair = px4.lap(scenario=early("empty_battery"))
-    says = "the vehicle left OFFBOARD for AUTO.LOITER.*; a failsafe of the vehicle has it"
-    watch = aborted(pair, says, ended_by="failsafe")
-    assert sent_after(pair, watch.left_s("OFFBOARD") + REACTION_S) == []
 
 
 STREAMED = {"fault": "second_sender", "setpoint_rate_hz": 10.0, "thrust": 0.49}
@@ -288,6 +283,24 @@ def test_a_vehicle_that_another_has_is_refused(on: Vehicle, scenario: Any, says:
     pair = on.lap(scenario=scenario)
     refused(pair, says)
     assert sent_after(pair, 0.0) == []
+
+
+@BOTH
+def test_of_two_vehicles_with_the_same_ids_on_one_radio_none_is_armed(on: Vehicle) -> None:
+    """Both obey: the other one was flown too, by setpoints that were not made for it."""
+    pair, twin = on.hop(), on.hop(seed=8).instance
+    for _ in range(int(5.0 / STEP_S)):  # it was switched on earlier
+        twin.step()
+
+    def obeyed_by_both(_: float, frames: Bytes) -> Bytes:
+        for frame in frames:
+            twin.feed(frame)
+        return frames
+
+    pair.down, pair.up = lambda _, datagrams: [*datagrams, *twin.step()], obeyed_by_both
+    refused(pair, "two vehicles with the same system id send on this link")
+    assert not pair.armed
+    assert not twin.autopilot.commander.armed
 
 
 def test_a_second_flight_that_waits_disturbs_no_flight() -> None:
