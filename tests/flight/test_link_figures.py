@@ -4,10 +4,10 @@ says of them, and how they are flown. The oracle is the parameter of the fault."
 from __future__ import annotations
 
 import pytest
-from faults import both, late, repeating, stuttering, without
+from faults import both, late, repeating, stuttering
 from pair import OBEDIENT, Filter, Pair, in_phase, make, through
 
-from offboard.flight.phases import Limits, Phase
+from offboard.flight.phases import Phase
 from offboard.flight.timing import LEAST_GROWTH_S
 from offboard.identification.learner import IdentifySettings
 
@@ -137,13 +137,3 @@ def test_simulator_slower_than_real_time_is_flown_as_any_other() -> None:
     assert rmse_m <= real_time_rmse_m + 0.002
     assert delay_s == pytest.approx(real_time_delay_s, abs=0.002)
     assert grown_s <= LEAST_GROWTH_S
-
-
-@pytest.mark.slow
-def test_a_late_link_that_cannot_be_measured_ends_the_flight(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The vehicle replies to no TIMESYNC (111)."""
-    monkeypatch.setattr(Limits, "late_s", 20.0)  # instead of 90 s
-    unanswered = over(both(without(111), late(0.3)), aloft=False)
-    assert unanswered.fly().exit_code == 4

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-import sys
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +11,7 @@ import pytest
 from corpus import expected, replayed, unpacked
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pair import SHORT, UNIX_EPOCH_US, HostClock, Pair, hover, in_phase
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from typer.testing import CliRunner, Result
 
@@ -43,10 +43,6 @@ from offboard.replay.difference import compare, verdict
 from offboard.replay.replaying import Replay, read
 from offboard.run import configuration
 from offboard.run.configuration import FlightConfig
-
-sys.path.append(str(Path(__file__).parents[1] / "flight"))
-
-from pair import SHORT, UNIX_EPOCH_US, HostClock, Pair, hover, in_phase
 
 WIRE = Path(__file__).parents[1] / "wire" / "recordings"
 KEY = bytes(range(32))
@@ -359,22 +355,3 @@ def test_in_real_time_each_input_is_recorded() -> None:
             for peer in (("::1", 14580, 0, 0), "serial")
         )
         assert found == TurnInput(turn_s, chunks, (clock_s[0],))
-
-
-def test_in_lockstep_no_host_time_is_recorded() -> None:
-    def pieces(offset_s: float, port: int) -> list[bytes]:
-        recorder = InputRecorder(SessionSettings(lockstep=True))
-        read = recorder.watch(lambda: offset_s)
-        for number in range(50):
-            now_s = offset_s * number
-            recorder.begin(now_s, 0)
-            if number % 3:  # the machine was busy: a turn in which nothing had arrived
-                recorder.chunk(Chunk(b"", ("127.0.0.1", port), now_s), Reception((b"frame",)))
-            read()
-            recorder.end()
-        return [piece.data for piece in recorder.pieces(all_of_it=True)]
-
-    assert pieces(0.01, 14580) == pieces(0.37, 20000)
-    first = next(entries(pieces(0.01, 14580)))
-    assert isinstance(first, Note)
-    assert first.values[1]["lockstep"] is True
