@@ -63,6 +63,13 @@ def overload(pair: Pair) -> None:
     pair.instance.autopilot.plant.scale_mass(scale)
 
 
+def overloaded_twice() -> Pair:
+    scale = float(np.sqrt(0.95 / px4.lap().companion.model.hover_thrust))
+    scenario = scenario_of(conditions={"mass_scale": scale})
+    more = (TRACKING, lambda flying: flying.instance.autopilot.plant.scale_mass(scale))
+    return px4.lap(HIGH, scenario=scenario, learning=IdentifySettings(), at=[more])
+
+
 GPS_LOST = {"fault": "gps_loss", "after": "engaged", "at_s": 7.0, "drift_mps": 0.45}
 SILENT_GPS = {"fault": "silent_message", "message": "GPS_RAW_INT", "after": "engaged", "at_s": 7.0}
 OTHER = another_companion(after="engaged", at_s=7.0, setpoint_rate_hz=10, thrust=0.5)
@@ -82,6 +89,11 @@ LANDED_EARLY: dict[str, Any] = {
         lambda: copter.lap(HIGH, at=[(TRACKING, overload)]),
         r"the vehicle sinks at [1-3]\.[0-9] m/s with full thrust",
         {"failsafes": ["full thrust"], "soon": (TRACKING, 2.0)},
+    ),
+    # by 5 %, of which half when it is identified and half in track (`limits.hover_thrust`: 0.9)
+    "a load that leaves no thrust reserve": (
+        overloaded_twice, r".*% of its thrust \(limits\.hover_thrust\)",
+        {"failsafes": ["thrust reserve"]},
     ),
     # the autopilot brakes the climb with 2.5 m/s2 after it was asked to land
     "above the ceiling": (
@@ -148,18 +160,6 @@ def test_it_is_landed(title: str) -> None:
     assert pair.instance.autopilot.position_controller.landed
 
 
-def test_a_vehicle_without_thrust_reserve_is_landed() -> None:
-    """Heavier than its file, it is identified; then a load in track, with which it hovers with 95 %
-    of its thrust (`limits.hover_thrust`: 0.9)."""
-    scale = float(np.sqrt(0.95 / px4.lap().companion.model.hover_thrust))
-    scenario = scenario_of(conditions={"mass_scale": scale})
-    pair = px4.lap(HIGH, scenario=scenario, learning=IdentifySettings())
-    pair.at.append((TRACKING, lambda flying: flying.instance.autopilot.plant.scale_mass(scale)))
-    says = r".*% of its thrust \(limits\.hover_thrust\)"
-    aborted(pair, says, failsafes=["thrust reserve"])
-    assert not pair.armed
-
-
 # -- flights that go on ----------------------------------------------------------------------------
 
 
@@ -181,6 +181,12 @@ NEEDED: dict[str, tuple[Callable[[], Pair], dict[str, Any]]] = {
     "one wrong heartbeat in track": (partial(wrongly_disarmed, px4, Phase.TRACK), {}),
     "one wrong heartbeat in the take-off": (partial(wrongly_disarmed, copter, Phase.TAKEOFF), {}),
     "one wrong heartbeat in the landing": (partial(wrongly_disarmed, px4, Phase.LAND), {}),
+    # as `offboard fly` does it: nothing known of the vehicle, identified in flight
+    "all disturbances together": (
+        lambda: px4.lap(aloft=False, scenario="all_together", seed=1, deadline_s=0.05,
+                        believed=simulated.vehicle("neutral"), learning=IdentifySettings()),
+        {},
+    ),
     "no GPS from the beginning, by motion capture": (
         lambda: px4.hover(firmware=WITH_GPS, scenario=NO_GPS), {"failsafes": ()}
     ),

@@ -298,6 +298,10 @@ ROWS = {
         nothing_sent, firmware=faults.with_default("COM_OF_LOSS_T", 30.0),
         down=faults.without(faults.POSITION),
     ),
+    "no reply for GUID_OPTIONS, which may say that thrust is a climb rate": refusal(
+        "not ready: no reply for parameter GUID_OPTIONS", nothing_sent, fly=copter.hop,
+        down=faults.without(faults.PARAM_VALUE), limits=LATER,
+    ),
     "battery too low": refusal(
         "not ready: its battery has 50% left, limits.battery is 100%", nothing_sent,
         scenario=scenario_of(conditions={"battery": {"remaining": 0.5}}),
