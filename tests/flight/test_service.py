@@ -23,6 +23,7 @@ from serving import (
     prepared,
     serve,
 )
+from watch import announced, said, sent_after
 
 from offboard.flight.phases import TRACKING, Phase
 from offboard.identification.uncertainty import Estimate
@@ -32,7 +33,6 @@ from simulator import config as simulated
 BOTH = pytest.mark.parametrize("on", ["px4", "ardupilot"])
 HOLD = {"px4": "AUTO.LOITER", "ardupilot": "BRAKE"}
 REPOSITION, LOITER = 192, 5  # MAV_CMD; ArduCopter's mode
-SETPOINT, COMMAND = "SET_ATTITUDE_TARGET", "COMMAND_LONG"
 ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED = range(4)  # MAV_RESULT
 
 
@@ -70,8 +70,11 @@ def served() -> Iterator[Served]:
 
 
 def thrusts(pair: Serving, since_s: float) -> list[float]:
-    decoded = ((at_s, decode(frame)) for at_s, _, frame in pair.sent if at_s > since_s)
-    return [m.thrust for _, m in decoded if m.get_type() == SETPOINT]
+    return [setpoint.thrust for at_s, _, setpoint in pair.setpoints if at_s > since_s]
+
+
+def commanded(pair: Serving, since_s: float) -> list[str]:
+    return [sent for sent in sent_after(pair, since_s) if sent.startswith("COMMAND_LONG")]
 
 
 @BOTH
@@ -105,19 +108,17 @@ def test_engaged_handed_back_and_engaged_again(served: Served, on: str) -> None:
         pair.switch("pilot")
         pair.run(2.0)
         assert pair.phase is Phase.STANDBY
-        assert pair.after(left_s, COMMAND) == []
+        assert commanded(pair, left_s) == []
         if flight == 1:
             ticks = round((left_s - began_s) / 0.1)
             score = pair.score()
             assert (score.completed, score.ended_by) == (1.0, "reference over")
-    (busy,) = (said for said in pair.service.current.announced if "too busy" in said)
+    (busy,) = (text for text in announced(pair) if "too busy" in text)
     counted = rf"this computer was too busy: [45] of ({ticks}|{ticks + 1}) ticks were "
     assert re.fullmatch(rf"{counted}skipped, pauses up to 0\.5[0-9] s", busy)
     assert len(pair.logs.begun) == len(pair.logs.ended) == 2
     known = r"this vehicle was identified before: tilt delay \d+ ms; no identification steps"
-    assert any(
-        re.fullmatch(known, said) for said in pair.service.current.announced
-    )  # no hover thrust
+    assert any(re.fullmatch(known, text) for text in announced(pair))  # no hover thrust
     pair.engage()
     pair.run(1.0)
     pair.service.request_stop()
@@ -184,21 +185,10 @@ def test_a_contradicted_vehicle_is_identified_again(served: Served) -> None:
     pair.switch("pilot")
     pair.run(1.0)
     assert memory.discarded == ["px4-1-1"]
-    assert pair.said("contradicted, and discarded")
+    assert said(pair, "contradicted, and discarded")
 
 
 # --- who may engage, and when ---------------------------------------------------------------------
-
-
-def is_held(pair: Serving, why: str) -> None:
-    """The pilot engages: the service asks once for hold, sends no setpoint, and says why."""
-    engaged_s = pair.time_s
-    pair.switch("engage")
-    pair.until(lambda: pair.mode in ("OFFBOARD", "GUIDED"), 0.5)
-    pair.until(lambda: pair.mode == HOLD[pair.firmware], 1.0)
-    assert thrusts(pair, engaged_s) == []
-    assert len(pair.after(engaged_s, COMMAND)) == 1
-    assert pair.said(f"not engaged: {why}")
 
 
 def test_a_restarted_service_asks_for_hold_and_waits_for_the_pilot(served: Served) -> None:
@@ -230,26 +220,13 @@ def test_a_vehicle_that_the_service_has_not_engaged_is_left_alone(
     began_s = pair.time_s
     pair.run(4.0)
     assert pair.mode in ("OFFBOARD", "GUIDED")
-    assert pair.after(began_s, SETPOINT, COMMAND) == []
-    assert pair.said("in the air, and this service has not engaged it: it is left alone")
+    assert sent_after(pair, began_s) == []
+    assert said(pair, "in the air, and this service has not engaged it: it is left alone")
     assert len(pair.logs.begun) == 1
     pair.switch("pilot")
     pair.run(2.0)
     assert pair.logs.left == left
     pair.engage()
-
-
-def test_engaging_a_service_that_is_not_ready_asks_for_hold_and_says_why(served: Served) -> None:
-    """A restarted service has not reached standby, because a parameter must be changed first. PX4
-    accepts OFFBOARD as the setpoints of before are not older than COM_OF_LOSS_T."""
-    pair = served.aloft()
-    pair.instance.autopilot.parameters.set("COM_OF_LOSS_T", 60.0)
-    pair.restart()
-    pair.run(5.0)
-    assert pair.phase is Phase.HEALTH
-    is_held(pair, "COM_OF_LOSS_T")
-    pair.run(2.0)
-    assert pair.phase not in TRACKING
 
 
 def test_a_take_off_point_that_was_not_seen_is_no_origin(served: Served) -> None:
@@ -262,27 +239,13 @@ def test_a_take_off_point_that_was_not_seen_is_no_origin(served: Served) -> None
     pair.run(1.0)
     pair.restart()
     pair.run(6.0)
-    is_held(pair, "its take-off point is not known")
-
-
-def test_engaged_again_before_a_heartbeat_has_shown_the_other_mode(served: Served) -> None:
-    """PX4 sends HEARTBEAT once a second, and returns to OFFBOARD by itself after a failsafe: which
-    of both it was cannot be known, and nobody flies it."""
-    pair = served.engaged()
-    pair.instance.autopilot.parameters.set("COM_OF_LOSS_T", 5.0)
-    pair.run(2.0)
-    pair.until(lambda: pair.time_s % 1.0 < 0.05)
-    pair.switch("pilot")
-    pair.until(lambda: pair.phase is Phase.YIELDED, 0.3)
+    engaged_s = pair.time_s
     pair.switch("engage")
-    pair.until(lambda: pair.mode == "OFFBOARD", 0.1)
-    assert not pair.state.pilot.elsewhere
-    again_s = pair.time_s
-    pair.until(lambda: pair.mode == "AUTO.LOITER", 1.0)
-    assert thrusts(pair, again_s) == []
-    assert pair.said("not engaged: OFFBOARD again before a HEARTBEAT")
-    pair.run(2.0)
-    pair.engage()
+    pair.until(lambda: pair.mode == "GUIDED", 0.5)
+    pair.until(lambda: pair.mode == "BRAKE", 1.0)
+    assert thrusts(pair, engaged_s) == []
+    assert len(commanded(pair, engaged_s)) == 1
+    assert said(pair, "not engaged: its take-off point is not known")
 
 
 def test_without_its_supervisor_a_flight_goes_on_and_none_begins(served: Served) -> None:
@@ -293,7 +256,7 @@ def test_without_its_supervisor_a_flight_goes_on_and_none_begins(served: Served)
     pair.switch("pilot")
     pair.run(2.0)
     pair.switch("engage")
-    pair.until(lambda: pair.said("not engaged: the supervisor, which lands it if this"), 1.0)
+    pair.until(lambda: said(pair, "not engaged: the supervisor, which lands it if this"), 1.0)
     pair.until(lambda: pair.mode == "AUTO.LOITER", 1.0)
 
 
@@ -310,9 +273,9 @@ def test_another_controller_is_left_alone(served: Served) -> None:
         pair.run(0.3)
     pair.run(6.0)  # it is silent, and has not been switched for us
     assert pair.mode == "OFFBOARD"
-    assert pair.after(heard_s, SETPOINT, COMMAND) == []
+    assert sent_after(pair, heard_s) == []
     assert pair.phase is Phase.STANDBY
-    assert pair.said("not engaged: OFFBOARD, but another program sends setpoints")
+    assert said(pair, "not engaged: OFFBOARD, but another program sends setpoints")
 
 
 def test_engaged_while_it_lands_or_stands_it_is_not_flown_and_the_pilot_is_told(
@@ -326,7 +289,7 @@ def test_engaged_while_it_lands_or_stands_it_is_not_flown_and_the_pilot_is_told(
     pair.switch("engage")
     pair.run(4.0)
     assert (pair.phase, pair.mode) == (Phase.STANDBY, "BRAKE")
-    assert pair.said("switch again")
+    assert said(pair, "switch again")
     pair.switch("pilot")
     pair.run(1.5)
     pair.engage()
@@ -339,11 +302,11 @@ def test_engaged_while_it_lands_or_stands_it_is_not_flown_and_the_pilot_is_told(
     pair.switch("engage")
     pair.run(1.0)
     assert (pair.phase, pair.mode) == (Phase.STANDBY, "GUIDED")
-    assert pair.said("not engaged: GUIDED, but the vehicle may stand on the ground")
+    assert said(pair, "not engaged: GUIDED, but the vehicle may stand on the ground")
     pair.command(START)
     pair.run(1.0)
     assert (pair.phase, pair.acks) == (Phase.STANDBY, [(START, TEMPORARILY_REJECTED)])
-    assert pair.after(switched_s, SETPOINT, COMMAND) == []
+    assert sent_after(pair, switched_s) == []
 
 
 def test_without_arms_it_stays_on_the_ground(served: Served) -> None:
@@ -356,12 +319,12 @@ def test_without_arms_it_stays_on_the_ground(served: Served) -> None:
     pair.forwarded.append(mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 3, 3).pack(codec))
     pair.run(9.8)
     assert pair.phase is Phase.HEALTH
-    assert pair.said("several vehicles are heard, systems 1 and 9: choose one with --system")
+    assert said(pair, "several vehicles are heard, systems 1 and 9: choose one with --system")
     pair.until(lambda: pair.phase is Phase.STANDBY, 1.0)
     pair.command(START)
     pair.run(3.0)
     assert pair.acks == [(START, TEMPORARILY_REJECTED)]
-    assert pair.after(0.0, COMMAND) == []
+    assert commanded(pair, 0.0) == []
     pair.restart()
     pair.logs.left = "px4-1-1"
     pair.until(lambda: pair.logs.left == "", 5.0)
@@ -406,7 +369,7 @@ def test_a_reboot_between_two_flights(served: Served) -> None:
     pair.until(lambda: not pair.armed, 40.0)
     before_s = pair.state.time_s
     pair.instance.reboot(1.0)
-    pair.until(lambda: pair.said("the vehicle restarted"), 10.0)
+    pair.until(lambda: said(pair, "the vehicle restarted"), 10.0)
     pair.fly_up()
     pair.until(lambda: pair.state.time_s > before_s + 0.1)  # vehicle time repeats
     assert pair.state.hover.thrust(pair.state.time_s) == pytest.approx(HOVER["px4"], rel=0.05)
@@ -465,9 +428,9 @@ def test_requests_over_mavlink(served: Served) -> None:
     assert pair.mode == "BRAKE"
     for command, parameter in ((SET_MODE, 1.0), (START, 0.0), (PAUSE_CONTINUE, 1.0)):
         ask(command, parameter, result=TEMPORARILY_REJECTED)
-    told = [said for said in pair.service.current.announced if "ted by" in said]
+    told = [text for text in pair.service.current.announced if "ted by" in text]
     words = ["pause", "continue", "start", "hand back"]
-    assert [said.split(" requested by ")[0] for said in told] == words
+    assert [text.split(" requested by ")[0] for text in told] == words
     pair.engage()
     pair.until(lambda: pair.phase is Phase.TRACK, 30.0)
     ask(PAUSE_CONTINUE, 0.0)
@@ -515,7 +478,7 @@ def test_a_pilot_takes_a_vehicle_whose_own_failsafe_acts_soon(served: Served) ->
     pair.run(0.15)
     pair.switch("engage")
     pair.run(2.0)
-    assert not pair.said("own failsafe")
+    assert not said(pair, "own failsafe")
     assert pair.landings == []
 
 
@@ -540,15 +503,15 @@ def test_what_is_heard_after_a_silence_may_be_another_vehicle(served: Served) ->
 
     assert pair.state.vehicle.uid == 1
     silence(0.0)
-    assert not pair.said("another vehicle answers")
+    assert not said(pair, "another vehicle answers")
     pair.switch("engage")
     pair.until(lambda: pair.mode == "BRAKE", 3.0)
-    assert pair.said("not engaged: GUID_OPTIONS is 0: without bit 3")
+    assert said(pair, "not engaged: GUID_OPTIONS is 0: without bit 3")
     pair.run(2.0)
     pair.state.vehicle.uid = 7  # of the one that was heard until now
     silence(8.0)
     pair.until(lambda: pair.phase is Phase.STANDBY, 5.0)
-    assert pair.said("another vehicle answers")
+    assert said(pair, "another vehicle answers")
     assert pair.state.vehicle.uid == 1
 
 
@@ -626,5 +589,5 @@ def test_a_plane_is_left_alone(served: Served) -> None:
     pair.switch("engage")
     pair.run(2.0)
     assert pair.phase is Phase.HEALTH
-    assert pair.said("waiting: the vehicle is a FIXED_WING; offboard flies multirotors")
+    assert said(pair, "waiting: the vehicle is a FIXED_WING; offboard flies multirotors")
     assert pair.mode == "GUIDED"
