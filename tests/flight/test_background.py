@@ -30,6 +30,16 @@ class Disk:
         self.items += items
 
 
+def test_in_lockstep_it_waits_and_loses_nothing() -> None:
+    disk = Disk()
+    disk.free.set()
+    writer = BackgroundWriter(disk.write, 100, waits=True)
+    for number in range(2000):
+        writer.put(number)
+    writer.close(LONG_S)
+    assert (disk.items, writer.dropped) == ([*range(2000)], 0)
+
+
 def test_a_failure_is_kept_and_ends_the_writing() -> None:
     """Of a display: rich ends the program where nobody reads its pipe."""
     failure = SystemExit(1)
