@@ -508,6 +508,8 @@ def test_what_is_heard_after_a_silence_may_be_another_vehicle(served: Served) ->
     pair.until(lambda: pair.mode == "BRAKE", 3.0)
     assert said(pair, "not engaged: GUID_OPTIONS is 0: without bit 3")
     pair.run(2.0)
+    silence(8.0)
+    pair.until(lambda: pair.phase is Phase.STANDBY, 5.0)
     pair.state.vehicle.uid = 7  # of the one that was heard until now
     silence(8.0)
     pair.until(lambda: pair.phase is Phase.STANDBY, 5.0)
