@@ -68,6 +68,9 @@ Array = NDArray[np.float64]
 
 HEADING_BOX_RAD = 0.5  # about the feed-forward: the autopilot closes the yaw loop
 HEADING_CURVATURE = 1.0
+# Times at which `TrackingLaw.target` samples the reference: when the command begins to act on the
+# tilt, and half a period later, in the middle of its hold; the same of the thrust and the heading
+TILT_BEGINS, TILT_HELD, THRUST_BEGINS, THRUST_HELD, HEADING_HELD = range(5)
 
 
 class TrackingSettings(ControllerSettings):
@@ -129,20 +132,20 @@ class TrackingLaw:
     """Base class of the laws: makes the `TrackingProblem` of each decision, for the vehicle and the
     bandwidth in use, which `set_vehicle` sets.
 
-    `limits` are the settings, `vehicle` is the vehicle in use; `lateral` and `vertical` are the
-    models of its axes with the optimal cost that follows one held input.
+    `vehicle` is the one in use; `lateral` and `vertical` are models of its axes, each with the
+    optimal cost that follows one held input.
     """
 
     def __init__(self, vehicle: Vehicle, settings: TrackingSettings, period_s: float = 0.1) -> None:
         self.period_s = period_s
         self.configured_radps = self.bandwidth_radps = settings.bandwidth_radps
-        self.limits, self._file = settings, vehicle
-        self._delays: object = None  # and their uncertainty, that the bandwidth was found for
+        self.settings, self._vehicle_file = settings, vehicle
+        self._supports: object = None  # delays and uncertainty that the bandwidth was found for
         self.set_vehicle(vehicle)
 
     def reset(self) -> None:
         """Return to the vehicle file and the configured bandwidth."""
-        self.set_vehicle(self._file)
+        self.set_vehicle(self._vehicle_file)
 
     def set_vehicle(self, vehicle: Vehicle, uncertainty: DelayUncertainty | None = None) -> None:
         """See `base.Adaptive`; without an uncertainty the bandwidth is the configured one."""
@@ -153,10 +156,10 @@ class TrackingLaw:
         bandwidth = self.bandwidth_radps
         if uncertainty is None:
             bandwidth = self.configured_radps
-        elif delays != self._delays:  # another drag alone changes no bandwidth
+        elif delays != self._supports:  # another drag alone changes no bandwidth
             configured = self.configured_radps
             bandwidth = supported_bandwidth(vehicle, uncertainty, self.period_s, configured)
-        self._delays = delays
+        self._supports = delays
         self._use_gains(bandwidth)
 
     def _use_gains(self, bandwidth_radps: float) -> None:
@@ -203,37 +206,40 @@ class TrackingLaw:
         )
         b, b1 = flat.thrust_direction_ned, flat.thrust_direction_rate_ned_ps
         b2 = flat.thrust_direction_acceleration_ned_ps2
-        lateral = np.array((sample.position_ned_m[0], sample.velocity_ned_mps[0], b[0], b1[0]))
-        tilt_slope = lead(b1[0], b2[0], np.zeros(3), vehicle.tilt)
+        at = TILT_BEGINS
+        lateral = np.array((sample.position_ned_m[at], sample.velocity_ned_mps[at], b[at], b1[at]))
+        tilt_slope = lead(b1[at], b2[at], np.zeros(3), vehicle.tilt)
         lateral[2:] += np.outer(self._tilt_ripple, tilt_slope)
         thrust, thrust_rate = flat.thrust_mps2, flat.thrust_rate_mps3
-        thrust_slope = thrust_rate[2] * b[2, 2] + thrust[2] * b1[2, 2]
+        at = THRUST_BEGINS
+        thrust_slope = thrust_rate[at] * b[at, 2] + thrust[at] * b1[at, 2]
         vertical = (
-            sample.position_ned_m[2, 2],
-            sample.velocity_ned_mps[2, 2],
-            thrust[2] * b[2, 2] + self._thrust_ripple * thrust_slope,
+            sample.position_ned_m[at, 2],
+            sample.velocity_ned_mps[at, 2],
+            thrust[at] * b[at, 2] + self._thrust_ripple * thrust_slope,
         )
-        led_tilt = held_lead(b[1], b1[1], b2[1], vehicle.tilt, period_s)
-        led_thrust = thrust[3] + vehicle.thrust_lag_s * thrust_rate[3]  # T lags, b_z does not
+        at = TILT_HELD
+        led_tilt = held_lead(b[at], b1[at], b2[at], vehicle.tilt, period_s)
+        led_thrust = thrust[THRUST_HELD] + vehicle.thrust_lag_s * thrust_rate[THRUST_HELD]  # of T
         heading_rad = lead(
-            sample.heading_rad[4],
-            sample.heading_rate_radps[4],
-            sample.heading_acceleration_radps2[4],
+            sample.heading_rad[HEADING_HELD],
+            sample.heading_rate_radps[HEADING_HELD],
+            sample.heading_acceleration_radps2[HEADING_HELD],
             vehicle.yaw,
         )
         return Target(
             lateral=lateral[:, :2],
             vertical=np.array(vertical),
-            feedforward=np.array((led_tilt[0], led_tilt[1], led_thrust * b[3, 2])),
+            feedforward=np.array((led_tilt[0], led_tilt[1], led_thrust * b[THRUST_HELD, 2])),
             heading_rad=float(heading_rad),
-            to_hover=to_hover(b[0], thrust[0], state, vehicle),
+            to_hover=to_hover(b[TILT_BEGINS], thrust[TILT_BEGINS], state, vehicle),
         )
 
     def _weighed(
         self, target: Target, lateral: Array, vertical: Array, b_z: float
     ) -> TrackingProblem:
         """The problem of these deviations: J, and the bounds of u to which the law clips."""
-        settings, vehicle = self.limits, self.vehicle
+        settings, vehicle = self.settings, self.vehicle
         curvature = np.array(
             [
                 self.vertical.curvature * b_z**2,
@@ -264,7 +270,7 @@ class TrackingLaw:
         """Lower and upper b_c (..., 2): |b_c| and |b_c - b_ff| per axis for feed-forwards (..., 2);
         one beyond the tilt limit counts as being at the limit."""
         limit = math.sin(self.vehicle.tilt_max_rad)
-        centre, reach = np.clip(nominal, -limit, limit), self.limits.feedback_limit
+        centre, reach = np.clip(nominal, -limit, limit), self.settings.feedback_limit
         return np.maximum(centre - reach, -limit), np.minimum(centre + reach, limit)
 
 

@@ -63,7 +63,7 @@ LONGEST_GAP_S = 1.0  # a longer gap or a step back in time restarts; a gap keeps
 # deviations of its innovation and a distance: position (m), velocity (m/s)
 GATE_SDS, GATES = 3.0, (0.3, 0.5)
 DISTURBANCE_LIMIT_MPS2 = 8.0
-COMMANDS_KEPT = 128
+COMMANDS_REPLAYED = 128  # at most
 FARTHEST_S = 5.0  # of a prediction: no limits let a link and a vehicle be later than that
 
 # H of position and reported velocity (6, 19), and of attitude (3, 19): thrust direction, heading
@@ -109,7 +109,7 @@ def densities_of(noise: Noise) -> Array:
 
 
 @entry(array(2), array(2), array(1), float, float)
-def predict(
+def predict_covariance(
     covariance: Array, dynamics: Array, densities: Array, interval_s: float, longest_s: float
 ) -> None:
     """P <- F P F' + Q over `interval_s`, in place, in steps of at most `longest_s`."""
@@ -262,13 +262,13 @@ class Observer:
         down = float(self._state[DISTURBANCE + 2])
         return self._vehicle.hover_thrust * (1.0 + down / self._vehicle.gravity_mps2)
 
-    def freeze(self, grounded: bool) -> None:
+    def freeze(self, frozen: bool) -> None:
         """Stop or resume estimating. Frozen, on the ground or while the vehicle does not follow our
         commands, the state is the reported velocity and the measured thrust direction, without a
         disturbance; the filter starts from there."""
-        if grounded != self._frozen:
-            self._reset_covariance()
-        self._frozen = grounded
+        if frozen != self._frozen:
+            self._forget_errors()
+        self._frozen = frozen
 
     def on_command(self, time_s: float, command: Command) -> None:
         """A command sent when the newest telemetry had vehicle time `time_s`."""
@@ -276,11 +276,11 @@ class Observer:
         if len(self._sent):
             time_s = max(time_s, float(self._sent[-1, SENT_AT]))
         row = time_s, north, east, command.thrust_mps2, command.heading_rad
-        self._sent = np.vstack((self._sent[1 - COMMANDS_KEPT :], row))
+        self._sent = np.vstack((self._sent[1 - COMMANDS_REPLAYED :], row))
 
     def on_attitude(self, time_s: float, q: Quaternion, rates: Triple) -> None:
         """Attitude quaternion (FRD to NED, w first) and body rates (rad/s, FRD) at `time_s`."""
-        if not self._is_new(time_s, self._attitude_at):
+        if not self._accepts(time_s, self._attitude_at):
             return
         north, east, _ = thrust_direction_from_quaternion(q).tolist()
         heading = float(heading_from_quaternion(q))
@@ -304,7 +304,7 @@ class Observer:
 
     def on_position(self, time_s: float, position_ned_m: Triple, velocity_ned_mps: Triple) -> None:
         """Reported position and velocity at `time_s`."""
-        if not self._is_new(time_s, self._position_at):
+        if not self._accepts(time_s, self._position_at):
             return
         if self._position_at is None or self._frozen:
             self._state[POSITION : POSITION + 3] = position_ned_m
@@ -412,7 +412,9 @@ class Observer:
         if complete:
             interval_s = time_s - self._time_s
             propagate(self._state, self._plant, self._sent, self._time_s, time_s)
-            predict(self._covariance, self._dynamics, self._densities, interval_s, self._longest_s)
+            predict_covariance(
+                self._covariance, self._dynamics, self._densities, interval_s, self._longest_s
+            )
         self._time_s = time_s
 
     def _set_vehicle(self, vehicle: Vehicle) -> None:
@@ -427,15 +429,15 @@ class Observer:
         self._time_s = -math.inf
         self._position_at = self._attitude_at = None
         self._state[THRUST] = self._vehicle.gravity_mps2
-        self._reset_covariance()
+        self._forget_errors()
 
-    def _reset_covariance(self) -> None:
+    def _forget_errors(self) -> None:
         """Covariance, disturbance and bias as at the first message."""
         self._covariance: Array = np.diag(START_SDS**2)
         self._state[DISTURBANCE : BIAS + 3] = 0.0
         self.estimated.interrupt()
 
-    def _is_new(self, time_s: float, last_s: float | None) -> bool:
+    def _accepts(self, time_s: float, last_s: float | None) -> bool:
         """Whether to use a message of `time_s`, the last of its kind having been of `last_s`;
         restarts after a long gap."""
         now_s = self._time_s

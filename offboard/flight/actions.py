@@ -7,7 +7,7 @@ from offboard.flight.authority import Standing
 from offboard.flight.failsafe import old, other_sender
 from offboard.flight.ground_contact import STANDING_S, STILL_ARMED
 from offboard.flight.phases import BEFORE_FLIGHT, TRACKING, Phase
-from offboard.flight.state import LEVEL, FlightState
+from offboard.flight.state import LEVEL_DIRECTION, FlightState
 from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.events import VehicleIdentity
 from offboard.mavlink.outgoing import CommandLong
@@ -31,7 +31,7 @@ LAND_STREAM_S = 3.0  # if the landing is refused, setpoints stop and the autopil
 
 def act(flight: FlightState) -> None:
     """Send the requests of the phase, at most one setpoint, and a request of the vehicle's time."""
-    if flight.ended:
+    if flight.in_end_phase:
         return
     time_s = flight.time_s
     if flight.phase in BEFORE_FLIGHT:
@@ -61,7 +61,7 @@ def hold(flight: FlightState, time_s: float) -> None:
     elif phase is Phase.STAND_DOWN:
         outbox.request(flight, CommandLong.disarm())
         if steers:
-            idle = Command(0.0, LEVEL, flight.command.heading_rad)
+            idle = Command(0.0, LEVEL_DIRECTION, flight.command.heading_rad)
             outbox.send_level(flight, time_s, idle)
 
 
@@ -133,7 +133,7 @@ def _prepare(flight: FlightState, time_s: float) -> None:
     if flight.takes_off_by_command and not flying:
         return
     thrust_mps2 = outbox.hover_mps2(flight) if flying else 0.0
-    command = Command(thrust_mps2, LEVEL, flight.vehicle.heading_rad)
+    command = Command(thrust_mps2, LEVEL_DIRECTION, flight.vehicle.heading_rad)
     outbox.send_level(flight, time_s, command)
 
 
@@ -142,7 +142,7 @@ def _stand_by(flight: FlightState, time_s: float) -> None:
     the ground no thrust, in the air the vehicle's own attitude and thrust. None in the air in a
     failsafe, after which PX4 would return to OFFBOARD by itself, or while another program sends."""
     on_ground, vehicle = flight.contact.on_ground, flight.vehicle
-    command = Command(0.0, LEVEL, vehicle.heading_rad) if on_ground else _flown(flight)
+    command = Command(0.0, LEVEL_DIRECTION, vehicle.heading_rad) if on_ground else _flown(flight)
     quiet = bool(flight.takes_off_by_command or old(flight) or other_sender(flight))
     if on_ground:
         quiet |= vehicle.armed and vehicle.in_failsafe
@@ -198,7 +198,9 @@ def _take_off(flight: FlightState, time_s: float) -> None:
         rising_s, most = rising_s - age_s, SPOOL_UNSEEN
     spool = min(most, max(0.0, SPOOL_UP_PER_S * rising_s))
     thrust_mps2 = spool * flight.model.gravity_mps2
-    outbox.send_level(flight, time_s, Command(thrust_mps2, LEVEL, flight.command.heading_rad))
+    outbox.send_level(
+        flight, time_s, Command(thrust_mps2, LEVEL_DIRECTION, flight.command.heading_rad)
+    )
 
 
 def _request_takeoff(flight: FlightState, time_s: float) -> None:
@@ -209,7 +211,7 @@ def _request_takeoff(flight: FlightState, time_s: float) -> None:
     least_m, most_m = TAKEOFF_HEIGHTS_M
     height_m = -float(flight.plan.track.sample(0.0).position_ned_m[2])
     outbox.request(flight, _dialect(flight).take_off(min(max(height_m, least_m), most_m)))
-    hovering = Command(flight.model.gravity_mps2, LEVEL, flight.vehicle.heading_rad)
+    hovering = Command(flight.model.gravity_mps2, LEVEL_DIRECTION, flight.vehicle.heading_rad)
     outbox.set_command(flight, time_s, hovering)
 
 
@@ -220,7 +222,7 @@ def _level(flight: FlightState) -> Command:
     thrust_mps2 = min(reached_mps2, SPOOL_UNSEEN * gravity_mps2)
     if flight.plan.reference is not None:
         thrust_mps2 = outbox.hover_mps2(flight)
-    return Command(thrust_mps2, LEVEL, flight.command.heading_rad)
+    return Command(thrust_mps2, LEVEL_DIRECTION, flight.command.heading_rad)
 
 
 def _dialect(flight: FlightState) -> Dialect:

@@ -1,11 +1,12 @@
 """Failsafe: what follows when a limit is exceeded in flight. One row for each condition.
 
-Its conditions come after those that the phase table has as well.
+The first conditions below are used by the phase table too.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -29,7 +30,7 @@ THRUST_REPORT_S = 1.0  # age of a ThrustReport that counts
 
 
 def silent(flight: FlightState) -> str:
-    """Host time without position and attitude."""
+    """Time since the newest position or attitude arrived, by the clock of this computer."""
     return silent_for(flight, flight.limits.silence_s)
 
 
@@ -101,7 +102,7 @@ def another_may_control(flight: FlightState) -> str:
 
 
 def old(flight: FlightState) -> str:
-    """Age of the newest telemetry beyond the known delay of the link."""
+    """Age of the newest telemetry beyond the least delay of the link."""
     age_s = flight.age_s
     return f"telemetry is {age_s:.2f} s old" if age_s > flight.limits.setpoint_age_s else ""
 
@@ -141,8 +142,8 @@ def tilted(flight: FlightState) -> str:
 
 
 def away_from_commands(flight: FlightState) -> str:
-    """Angle between the thrust direction and the nearest of the newest commands, all of which were
-    attitudes."""
+    """Angle between the thrust direction and that of the nearest of the newest 7 setpoints, if all
+    of them had an attitude."""
     vehicle, commands = flight.vehicle, flight.commands
     if vehicle.attitude is None or len(flight.thrusts) < COMMANDS_KEPT:
         return ""
@@ -159,10 +160,10 @@ def away_from_commands(flight: FlightState) -> str:
 
 def away_from_reference(flight: FlightState) -> str:
     """Distance from the reference."""
-    error_m, limit_m = flight.position_error_m, flight.limits.position_error_m
-    if not error_m > limit_m:
+    error_m = flight.position_error_m
+    if not error_m > flight.limits.position_error_m:
         return ""
-    return f"{error_m:.1f} m from the reference (limit {limit_m:.1f} m){_other_companion(flight)}"
+    return f"{error_m:.1f} m from the reference{_other_companion(flight)}"
 
 
 def away_from_prediction(flight: FlightState) -> str:
@@ -201,10 +202,7 @@ def outside_volume(flight: FlightState) -> str:
     distance_m = math.hypot(north_m, east_m)
     if not (height_m > flight.limits.ceiling_m or distance_m > flight.limits.radius_m):
         return ""
-    return (
-        f"{height_m:.0f} m above and {distance_m:.0f} m from the take-off point "
-        "(limits.ceiling_m, limits.radius_m)"
-    )
+    return f"{height_m:.0f} m above and {distance_m:.0f} m from the take-off point"
 
 
 def battery_empty(flight: FlightState) -> str:
@@ -218,7 +216,7 @@ def no_thrust_reserve(flight: FlightState) -> str:
     thrust = flight.observer.hover_thrust_estimate
     if flight.phase not in TRACKING or not thrust > flight.limits.hover_thrust:
         return ""
-    return f"the vehicle hovers with {100.0 * thrust:.0f} % of its thrust (limits.hover_thrust)"
+    return f"the vehicle hovers with {100.0 * thrust:.0f} % of its thrust"
 
 
 def sinks_with_full_thrust(flight: FlightState) -> str:
@@ -272,8 +270,8 @@ def contradicted(flight: FlightState) -> str:
 @dataclass(frozen=True, slots=True)
 class Row:
     """`action` is taken when `condition` has held for `held_s`. `cause` and `reason` are as in
-    `phases.Transition`. `limit` is for the documentation, as is the first line of the condition's
-    docstring: what is measured."""
+    `phases.Transition`. `limit`: the settings that have it, or its value. The first line of the
+    condition's docstring says in the documentation what is measured."""
 
     name: str
     condition: Condition
@@ -282,6 +280,12 @@ class Row:
     held_s: float = 0.0
     cause: str = "limit"
     reason: str = ""
+
+    def settings(self, limits: Limits) -> str:
+        """The end of the sentence: which settings have the limit, and their values."""
+        keys = re.findall(r"limits\.(\w+)", self.limit)
+        named = ", ".join(f"limits.{key} is {getattr(limits, key):g}" for key in keys)
+        return named and f" ({named})"
 
 
 LEVEL, HOLD, LAND = Action.LEVEL, Action.HOLD, Action.LAND
@@ -335,5 +339,6 @@ def judge(flight: FlightState, rows: Sequence[Row] = ROWS) -> None:
         known.held_s[row.name] = held_s
         if holds and held_s >= row.held_s and row.action > known.action:
             known.action, known.row = row.action, row.name
-            known.reason = row.reason.format(flight=flight) or str(holds)
+            sentence = row.reason.format(flight=flight) or str(holds)
+            known.reason = sentence + row.settings(flight.limits)
             known.cause = row.cause.format(flight=flight)

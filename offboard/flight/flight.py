@@ -33,8 +33,8 @@ BRIDGED_SHARE = 0.3  # of `Limits.silence_s`; after it, level setpoints replace 
 
 
 class Flight(FlightState):
-    """The state of the flight, and its turn. After `before`, which has ended or waits, with the
-    same session, what it knows of vehicle and link stays known."""
+    """The state of the flight, and its turn. With `before`, a flight of the same
+    session that has ended or waits, it begins with what that one knows of vehicle and link."""
 
     def __post_init__(self, before: FlightState | None) -> None:
         super().__post_init__(before)
@@ -48,31 +48,31 @@ class Flight(FlightState):
 
     # ------------------------------------------------------------------ the turn
 
-    def turn(self, chunks: Sequence[Chunk], now_s: float) -> tuple[bytes, ...]:
+    def turn(self, chunks: Sequence[Chunk], host_now_s: float) -> tuple[bytes, ...]:
         """Process all that has arrived, then act once if a tick is due. Returns the frames to
         send.
 
-        Call it at least every 50 ms, and `finish_turn` after the frames were sent. `now_s` is host
-        time. In lockstep a turn without chunks does nothing: how many there are between two
+        Call it at least every 50 ms, and `finish_turn` after the frames were sent. `host_now_s` is
+        host time. In lockstep a turn without chunks does nothing: how many there are between two
         barriers depends on the load of the machine.
         """
         self._ticked = self._heard = False
         if self.session.settings.lockstep and not chunks:
             return ()
-        now_s = self._inputs.begin(now_s, self.other_datagrams)
+        host_now_s = self._inputs.begin(host_now_s, self.other_datagrams)
         try:
             before_s = self.now_s
-            self._begin_turn(now_s)
-            replies = [reply for chunk in chunks for reply in self._receive(chunk, now_s)]
-            due = self._poll(now_s, before_s)
+            self._begin_turn(host_now_s)
+            replies = [reply for chunk in chunks for reply in self._receive(chunk, host_now_s)]
+            due = self._poll(host_now_s, before_s)
             if self._begin_tick():
                 transitions.advance(self)
                 self._follow_link()
                 actions.act(self)
             self._go_on_without_telemetry()
-            for sentence in self._news.due(self, now_s):
+            for sentence in self._news.due(self, host_now_s):
                 outbox.announce(self, sentence)
-            if self.ended and self.service and self.busyness.sentence:
+            if self.in_end_phase and self.service and self.busyness.sentence:
                 outbox.announce(self, self.busyness.sentence, once=True)
             outbox.send(self, *due, *replies)
         finally:
@@ -92,23 +92,23 @@ class Flight(FlightState):
         logged, self._logged = self._logged, []
         return [*logged, *outbox.log(self), *map(self.session.encode, pieces)]
 
-    def _begin_turn(self, now_s: float) -> None:
+    def _begin_turn(self, host_now_s: float) -> None:
         session = self.session
-        elapsed_s = session.elapsed_s(now_s)
+        elapsed_s = session.elapsed_s(host_now_s)
         if math.isnan(self.turned_s):
-            self.turned_s, self.heard_s = now_s, elapsed_s
-        paused_s, self.turned_s = now_s - self.turned_s, now_s
-        self.host_s = session.clock_s(now_s)
+            self.turned_s, self.heard_s = host_now_s, elapsed_s
+        paused_s, self.turned_s = host_now_s - self.turned_s, host_now_s
+        self.host_s = session.clock_s(host_now_s)
         self.silence_s = elapsed_s - self.heard_s
         self.note_starvation()
         if session.settings.lockstep:
             return
         if paused_s > PAUSE_S and self.authority.engage_mode:
-            self.authority.doubt(now_s, paused_s)
+            self.authority.doubt(host_now_s, paused_s)
             self._news.paused.add(paused_s)
         self.busyness.on_turn(paused_s)
 
-    def _receive(self, chunk: Chunk, now_s: float) -> Sequence[Outgoing]:
+    def _receive(self, chunk: Chunk, host_now_s: float) -> Sequence[Outgoing]:
         """Take what a chunk reports, in order. Returns replies of the session."""
         arrived_s = self._inputs.arrived_s(chunk)
         reception = self.session.receive(chunk.data, chunk.peer, arrived_s)
@@ -117,12 +117,12 @@ class Flight(FlightState):
         for event in reception.events:
             if telemetry.is_of_another(self, event):
                 outbox.announce(self, "another vehicle answers, with the same system id")
-                self._take(Rebooted(self.time_s), arrived_s, now_s)
-            self._take(event, arrived_s, now_s)
+                self._take(Rebooted(self.time_s), arrived_s, host_now_s)
+            self._take(event, arrived_s, host_now_s)
         return reception.replies
 
-    def _take(self, event: Event, arrived_s: float, now_s: float) -> None:
-        telemetry.update(self, event, arrived_s, turned_s=now_s)
+    def _take(self, event: Event, arrived_s: float, host_now_s: float) -> None:
+        telemetry.update(self, event, arrived_s, turned_s=host_now_s)
         self._heard |= self._ends_silence(event)
         if isinstance(event, Rebooted):
             self._tick = -1
@@ -136,26 +136,26 @@ class Flight(FlightState):
             return self.phase in BEFORE_FLIGHT and not isinstance(event, ClockBehind)
         return isinstance(event, (Attitude, LocalPosition)) and not vehicle.repeated
 
-    def _poll(self, now_s: float, before_s: float) -> Sequence[Outgoing]:
+    def _poll(self, host_now_s: float, before_s: float) -> Sequence[Outgoing]:
         """The time at which this turn acts; returns what the session sends by itself."""
         session = self.session
         news = session.counters.news()
         if news:
             outbox.announce(self, news)
         session.status = self._status()
-        due = session.poll(now_s)
+        due = session.poll(host_now_s)
         self.vehicle.now_s = session.link_time_s
         if self.phase is Phase.LAND and self.unreached_s:
             self.began_s += self.now_s - before_s  # a landing that is not seen takes no time
-        self.host_s = session.clock_s(now_s)
+        self.host_s = session.clock_s(host_now_s)
         if self._heard:
-            self.heard_s = session.elapsed_s(now_s)
+            self.heard_s = session.elapsed_s(host_now_s)
             self.silence_s = self.bridged_s = 0.0
         return due
 
     def _begin_tick(self) -> bool:
         """Whether a multiple of the control period has been crossed."""
-        if not self.vehicle.has_state or self.ended:
+        if not self.vehicle.has_state or self.in_end_phase:
             return False
         number = math.floor(self.time_s / self.period_s + 1e-6)
         if number <= self._tick:
@@ -183,7 +183,7 @@ class Flight(FlightState):
             transitions.advance(self)
         if unknown and self.phase is Phase.HEALTH:
             actions.request_parameters(self)
-        bridges = silence_s > BRIDGED_SHARE * limits.silence_s and not self.ended
+        bridges = silence_s > BRIDGED_SHARE * limits.silence_s and not self.in_end_phase
         if bridges and silence_s - self.bridged_s >= self.period_s:
             self.bridged_s = silence_s
             actions.hold(self, self.time_s + silence_s)
@@ -226,7 +226,7 @@ class Flight(FlightState):
     def has_ended(self) -> bool:
         """Whether the flight is over. After another has taken the vehicle, its next HEARTBEAT is
         awaited, as the log must have what it shows; nothing is sent to it any more."""
-        return self.ended and not self.awaits_heartbeat
+        return self.in_end_phase and not self.awaits_heartbeat
 
     def snapshot(self, flights: int = 0) -> Snapshot:
         """The flight at this moment, for displays; `flights` that the service has begun."""

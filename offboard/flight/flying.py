@@ -229,13 +229,13 @@ TO_THE_END = (
     Transition({LAND}, out_of_reach, FAILED, ABORTED),
     Transition({LAND}, not_disarmed, FAILED, ABORTED),
 )
-HANDED, STOPPED = "handed back on request", "stopped on request"
+HANDED_BACK, NOT_BEGUN = "handed back on request", "stopped on request"
 hand_back, start = requested(Request.HAND_BACK), requested(Request.START)
 SERVICE_ENDS = (
     Transition({HAND_BACK}, longer_than("hand_back_s"), LAND, ABORTED, reason=DID_NOT_HOLD),
-    Transition({TAKEOFF} | TRACKING, hand_back, HAND_BACK, FLOWN, reason=HANDED),
-    Transition({STREAM, ENGAGE}, hand_back, FAILED, FLOWN, reason=STOPPED),
-    Transition({ARM}, hand_back, STAND_DOWN, FLOWN, reason=STOPPED),
+    Transition({TAKEOFF} | TRACKING, hand_back, HAND_BACK, FLOWN, reason=HANDED_BACK),
+    Transition({STREAM, ENGAGE}, hand_back, FAILED, FLOWN, reason=NOT_BEGUN),
+    Transition({ARM}, hand_back, STAND_DOWN, FLOWN, reason=NOT_BEGUN),
     Transition(TRACKING - {CLIMB}, start, CLIMB, reason="start requested"),
     Transition(MOVING, requested(Request.PAUSE), PAUSE, reason="pause requested"),
     Transition({PAUSE}, requested(Request.CONTINUE), TRACK, reason="continue requested"),

@@ -12,7 +12,7 @@ import math
 from contextlib import suppress
 from enum import IntFlag
 
-from offboard.flight.state import LEVEL, FlightState
+from offboard.flight.state import LEVEL_DIRECTION, FlightState
 from offboard.mavlink import event_record
 from offboard.mavlink.event_record import EventRecord
 from offboard.mavlink.events import GOOD_RESULTS, WARNING
@@ -67,7 +67,7 @@ def admit(
     Args:
         ours: the vehicle is ours to command (`Authority.permits_setpoint`).
         on_ground: it stands on the ground by every sign (`GroundContact.on_ground`).
-        age_s: age of the telemetry that the setpoint was computed from, beyond the known delay of
+        age_s: age of the telemetry that the setpoint was computed from, beyond the least delay of
             the link; 0 for a setpoint that needs none.
         age_limit_s: the greatest age that may leave.
         late_s: time by which the setpoint is ready later than one control period after the arrival
@@ -185,7 +185,7 @@ def _send_position(flight: FlightState, time_s: float, command: PositionCommand)
     stops predicting with commands."""
     flight.observer.freeze(True)
     flight.thrusts.clear()  # the autopilot chooses the thrust
-    flight.command = Command(flight.model.gravity_mps2, LEVEL, command.heading_rad)
+    flight.command = Command(flight.model.gravity_mps2, LEVEL_DIRECTION, command.heading_rad)
     send(flight, PositionTarget(time_s, command))
 
 

@@ -34,7 +34,7 @@ from offboard.mavlink.session import Session
 from offboard.model.command import Command, PredictedState
 from offboard.model.vehicle import Vehicle
 
-LEVEL = (0.0, 0.0, 1.0)  # thrust direction
+LEVEL_DIRECTION = (0.0, 0.0, 1.0)  # of the thrust: the third body axis in NED
 COMMANDS_KEPT = 7  # as long as an attitude may take to follow
 THRUSTS_KEPT = 40  # as long as a setpoint may be on its way, or the next ones be lost
 PREDICTIONS_KEPT = 8
@@ -130,7 +130,7 @@ class FlightState:
     telemetry_arrived_s: float = 0.0  # host time at which it arrived
     bridged_s: float = 0.0  # silence at the newest setpoint that needs no telemetry
     ignored: int = 0  # datagrams of others and forged frames between the two newest ticks
-    command: Command = field(default_factory=lambda: Command(0.0, LEVEL, 0.0))  # in force
+    command: Command = field(default_factory=lambda: Command(0.0, LEVEL_DIRECTION, 0.0))  # in force
     decided: Decided | None = None  # in this turn
     announced_radps: float = math.nan  # bandwidth in use, as the user knows it
     missed: int = 0  # decisions in a row that were not sent
@@ -170,7 +170,7 @@ class FlightState:
         # for a vehicle that was taken nothing was asked: not unanswered, see `note_starvation`
         self.vehicle.heard_s.pop(TimesyncReply, None)
         self.authority = before.authority.renewed()
-        if not before.ended:  # nothing was flown: what the pilot did before counts
+        if not before.in_end_phase:  # nothing was flown: what the pilot did before counts
             self.pilot, self.phase, self.began_s = before.pilot, before.phase, before.began_s
             return
         prepared = before.phase not in (Phase.CONNECT, Phase.HEALTH) and not before.rebooted
@@ -200,7 +200,7 @@ class FlightState:
         return self.now_s - self.began_s
 
     @property
-    def ended(self) -> bool:
+    def in_end_phase(self) -> bool:
         return self.phase in ENDS
 
     @property

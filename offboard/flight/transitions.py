@@ -83,7 +83,7 @@ def _by_phase(service: ServiceOptions | None) -> dict[Phase, tuple[Transition, .
 
 def advance(flight: FlightState) -> None:
     """Make every transition whose guard holds."""
-    while not flight.ended:
+    while not flight.in_end_phase:
         if flight.phase in FLYING:
             failsafe.judge(flight)
         _note_failsafe(flight)

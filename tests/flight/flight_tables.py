@@ -5,11 +5,12 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from offboard.flight import flying
 from offboard.flight.failsafe import ROWS
-from offboard.flight.phases import ENDS, FLYING, Phase, ServiceOptions, Transition
+from offboard.flight.phases import ENDS, FLYING, Limits, Phase, ServiceOptions, Transition
 from offboard.flight.transitions import table
 
 README = Path(__file__).parents[2] / "offboard" / "flight" / "README.md"
@@ -63,13 +64,19 @@ def exits_markdown() -> str:
     return "\n".join(lines)
 
 
+def with_default(setting: re.Match[str]) -> str:
+    """The name of a setting of `Limits`, and its default."""
+    return f"{setting[0]}: {getattr(Limits(), setting[1]):g}"
+
+
 def failsafe_markdown() -> str:
     """The table for the README of `flight/`."""
     lines = ["| row | what is measured | limit | held for | then |", "|---|---|---|---|---|"]
     for row in ROWS:
         then = row.action.name.lower()
         measured = " ".join((row.condition.__doc__ or "").partition(".")[0].split())
-        lines.append(f"| {row.name} | {measured} | {row.limit} | {row.held_s:g} s | {then} |")
+        limit = re.sub(r"limits\.(\w+)", with_default, row.limit)
+        lines.append(f"| {row.name} | {measured} | {limit} | {row.held_s:g} s | {then} |")
     return "\n".join(lines)
 
 

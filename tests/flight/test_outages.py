@@ -57,7 +57,7 @@ def test_after_an_outage_the_vehicle_is_landed(vehicle: str, outage_s: float) ->
     if outage_s < 1.0:
         flown(pair)
     else:
-        aborted(pair, "no telemetry for 1.0 s$")  # no pilot is named
+        aborted(pair, r"no telemetry for 1.0 s \(limits.silence_s is 1\)$")  # no pilot is named
     assert not pair.armed
     assert pair.instance.autopilot.state.truth.position_ned_m[2] > -0.1
     assert said(pair, "waiting for the link, then landing is asked again") is (outage_s > 2.0)

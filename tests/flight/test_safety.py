@@ -92,7 +92,7 @@ LANDED_EARLY: dict[str, Any] = {
     ),
     # by 5 %, of which half when it is identified and half in track (`limits.hover_thrust`: 0.9)
     "a load that leaves no thrust reserve": (
-        overloaded_twice, r".*% of its thrust \(limits\.hover_thrust\)",
+        overloaded_twice, r".*% of its thrust \(limits\.hover_thrust is 0\.9\)",
         {"failsafes": ["thrust reserve"]},
     ),
     # the autopilot brakes the climb with 2.5 m/s2 after it was asked to land

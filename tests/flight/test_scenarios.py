@@ -360,7 +360,7 @@ ROWS = {
     ),
     "dies in flight": aborts(
         Phase.FAILED,
-        "no telemetry for 1.0 s; not heard for 300 s while landing; last known: armed in OFFBOARD,",
+        "no telemetry for 1.0 s .*; not heard for 300 s while landing; last known: armed in ",
         held_then_silent, fly=px4.lap, armed=True, ended_by="link", at=tracking(faults.die),
     ),
     "restart in flight": aborts(
@@ -372,7 +372,7 @@ ROWS = {
         at=tracking(faults.downlink(faults.restamped(10.0))),
     ),
     "position and attitude stop, heartbeats go on": aborts(
-        Phase.FAILED, "no telemetry for 1.0 s; disarmed, landing not confirmed: ",
+        Phase.FAILED, "no telemetry for 1.0 s .*; disarmed, landing not confirmed: ",
         landing_requested, fly=px4.lap, at=tracking(lost(faults.POSITION, faults.ATTITUDE)),
     ),
     # the law

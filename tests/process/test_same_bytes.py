@@ -128,7 +128,7 @@ def test_a_vehicle_that_fails_or_hangs_ends_the_flight_with_a_sentence(
 
 
 LINK_LOST = {"fault": "link", "direction": "down", "loss": 1.0, "after": "engaged", "at_s": 8.0}
-SILENT = "no telemetry for 1.0 s; not heard for 300 s while landing; last known: "
+SILENT = "no telemetry for 1.0 s (limits.silence_s is 1); not heard for 300 s while landing; "
 
 
 @pytest.mark.parametrize(
