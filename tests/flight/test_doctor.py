@@ -167,9 +167,9 @@ def test_what_is_found_and_what_mends_it(
     assert tested.instance.time_s - began_s < LONGEST_S + 1.1  # 15 s with the rest
     assert row.level is level
     assert re.search(found, row.findings[0].sentence)
-    if level is BLOCKS:
-        about = row.findings[0].about or check
-        assert verdict([row], complete=True).startswith(f"1 blocks: {about}")
+    about = row.findings[0].about or check
+    said_at_last = {BLOCKS: f"1 blocks: {about}", WARN: "ready to fly; warnings: "}.get(level, "")
+    assert verdict([row], complete=True).startswith(said_at_last)
     if PARAMETER.search(row.findings[0].hint):
         tested.follow(row)
         assert tested.check(check)[check].level is OK
