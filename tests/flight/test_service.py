@@ -483,9 +483,9 @@ def test_a_pilot_takes_a_vehicle_whose_own_failsafe_acts_soon(served: Served) ->
 
 
 def test_what_is_heard_after_a_silence_may_be_another_vehicle(served: Served) -> None:
-    """With the same system id, on the same radio, switched on earlier, whether the service waits
-    for a pilot or for this one to be ready: parameters and hardware number are read again. It was
-    flown with those of the one before, its thrust taken for a climb rate."""
+    """With the same system id, on the same radio, switched on earlier: parameters
+    and hardware number are read again. It was flown with those of the one before, its thrust taken
+    for a climb rate."""
     pair = served.engaged("ardupilot")
     pair.switch("pilot")
     pair.run(2.0)
@@ -508,8 +508,6 @@ def test_what_is_heard_after_a_silence_may_be_another_vehicle(served: Served) ->
     pair.until(lambda: pair.mode == "BRAKE", 3.0)
     assert said(pair, "not engaged: GUID_OPTIONS is 0: without bit 3")
     pair.run(2.0)
-    silence(8.0)
-    pair.until(lambda: pair.phase is Phase.STANDBY, 5.0)
     pair.state.vehicle.uid = 7  # of the one that was heard until now
     silence(8.0)
     pair.until(lambda: pair.phase is Phase.STANDBY, 5.0)
@@ -593,3 +591,22 @@ def test_a_plane_is_left_alone(served: Served) -> None:
     assert pair.phase is Phase.HEALTH
     assert said(pair, "waiting: the vehicle is a FIXED_WING; offboard flies multirotors")
     assert pair.mode == "GUIDED"
+
+
+def test_what_is_heard_after_a_silence_in_health_may_be_another_vehicle_too(served: Served) -> None:
+    """A third one passes by, which prevents standby for 10 s. It was ready with the parameters of
+    the one before."""
+    pair = served("ardupilot")
+    codec = mavlink.MAVLink(None, srcSystem=9, srcComponent=1)
+    pair.run(0.5)
+    pair.forwarded.append(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3).pack(codec))
+    pair.run(3.0)
+    assert pair.state.vehicle.parameters["GUID_OPTIONS"] == 8.0
+    pair.lost_down = pair.lost_up = True
+    pair.run(6.0)
+    pair.instance.autopilot.parameters.set("GUID_OPTIONS", 0.0)
+    pair.lost_down = pair.lost_up = False
+    pair.run(6.0)
+    assert pair.phase is Phase.HEALTH
+    assert said(pair, "waiting: GUID_OPTIONS is 0: without bit 3")
+    assert sum("health: no telemetry for 5" in text for text in announced(pair)) == 1

@@ -355,3 +355,22 @@ def test_in_real_time_each_input_is_recorded() -> None:
             for peer in (("::1", 14580, 0, 0), "serial")
         )
         assert found == TurnInput(turn_s, chunks, (clock_s[0],))
+
+
+def test_in_lockstep_no_host_time_is_recorded() -> None:
+    def pieces(offset_s: float, port: int) -> list[bytes]:
+        recorder = InputRecorder(SessionSettings(lockstep=True))
+        read = recorder.watch(lambda: offset_s)
+        for number in range(50):
+            now_s = offset_s * number
+            recorder.begin(now_s, 0)
+            if number % 3:  # the machine was busy: a turn in which nothing had arrived
+                recorder.chunk(Chunk(b"", ("127.0.0.1", port), now_s), Reception((b"frame",)))
+            read()
+            recorder.end()
+        return [piece.data for piece in recorder.pieces(all_of_it=True)]
+
+    assert pieces(0.01, 14580) == pieces(0.37, 20000)
+    first = next(entries(pieces(0.01, 14580)))
+    assert isinstance(first, Note)
+    assert first.values[1]["lockstep"] is True
