@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
+from pair import PX4, hover
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from pyulog import ULog
@@ -25,10 +26,6 @@ from offboard.flight.phases import Phase
 from offboard.flight.record import RECORD_ID
 from offboard.link.log import entry
 from offboard.mavlink import event_record
-
-sys.path.append(str(Path(__file__).parents[1] / "flight"))
-
-from pair import PX4, hover
 
 RECORDINGS = Path(__file__).parents[1] / "wire" / "recordings"
 REAL = RECORDINGS / "px4-1.16.1-offboard.tlog"

@@ -135,6 +135,7 @@ def bench(
     choices: dict[str, str] | None = None,
     assignments: Sequence[str] = (),
     parameters: dict[str, float] | None = None,
+    mode: str = "",
     **options: Any,
 ) -> Bench:
     """A vehicle that has booted and that nothing is wrong with, but for what is given. Times of
@@ -153,6 +154,8 @@ def bench(
     config = configuration.load("flight", choices=choices or {}, assignments=assignments)
     made = Bench(instance, config, **options)
     made.run_to(BOOT_S[firmware.name])
+    if mode:
+        instance.autopilot.commander.switch(mode)
     return made
 
 

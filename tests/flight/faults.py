@@ -70,21 +70,6 @@ def stuttering(hold_s: float, every_s: float) -> Filter:
     return delivering(lambda time_s, _: [max(hold_s - time_s % every_s, 0.0)])
 
 
-def interrupted(for_s: float) -> Filter:
-    """A link without any arrivals for a time, after which attitude arrives 50 ms after the rest."""
-    began: list[float] = []
-    rest = without(ATTITUDE)
-
-    def arriving(time_s: float, datagrams: Bytes) -> Bytes:
-        began.append(time_s)
-        passed_s = time_s - began[0]
-        if passed_s > for_s + 0.05:
-            return datagrams
-        return rest(time_s, datagrams) if passed_s > for_s else []
-
-    return arriving
-
-
 def late(delay_s: float) -> Filter:
     """A link with a constant delay."""
     return delivering(lambda *_: [delay_s])

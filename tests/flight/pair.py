@@ -110,7 +110,6 @@ class Pair:
     up: Filter = through
     at: list[tuple[Callable[[Pair], bool], Callable[[Pair], object]]] = field(default_factory=list)
     dead: bool = False
-    rate: float = 1.0  # of the vehicle's clock, against that of the host
     time_s: float = 0.0
     steps: int = 0
     turned: int = 0  # steps at the newest turn
@@ -191,7 +190,7 @@ class Pair:
     @property
     def host_s(self) -> float:
         """Host time."""
-        return HOST_EPOCH_S + self.time_s / self.rate
+        return HOST_EPOCH_S + self.time_s
 
     def pause(self, seconds: float) -> None:
         """The process of the companion is stopped, as by SIGSTOP."""

@@ -224,18 +224,6 @@ class Serving(Pair):
         decoded = (decode(frame) for _, _, frame in self.sent if frame[7] == 77)
         return [(message.command, message.result) for message in decoded]
 
-    def after(self, time_s: float, *names: str) -> list[str]:
-        """Messages of these kinds that left after `time_s`, except requests for telemetry."""
-        decoded = ((at, decode(frame)) for at, _, frame in self.sent if at > time_s)
-        return [
-            f"{at:.2f} {m.get_type()} {getattr(m, 'command', '')}"
-            for at, m in decoded
-            if m.get_type() in names and getattr(m, "command", 0) not in (511, 512)
-        ]
-
-    def said(self, words: str) -> bool:
-        return any(words in sentence for sentence in self.service.current.announced)
-
 
 def serve(
     *assignments: str,

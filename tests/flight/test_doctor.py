@@ -1,28 +1,77 @@
-"""`offboard doctor` finds what is wrong with a vehicle, and what it prints makes it right."""
+"""`offboard doctor` finds what is wrong with a vehicle, its link and this computer, and what it
+prints makes it right."""
 
 from __future__ import annotations
 
-import dataclasses
+import random
+import re
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
-from doctor_bench import bench, said
-from pair import OBEDIENT
-from pair import make as flight
+from doctor_bench import PARAMETER, bench, from_others, said
+from pair import OBEDIENT, Bytes, decode, frames_of
+from processes import register
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from offboard.doctor import computer, run
+from offboard.doctor.listening import LONGEST_S, NOTHING_S, Listening, Observation
 from offboard.doctor.run import verdict
-from offboard.flight.phases import ExitCode, Limits
+from offboard.flight.phases import Limits
 from offboard.flight.preflight import Ground, Level, findings
 from offboard.flight.timing import VehicleClock
 from offboard.flight.vehicle_state import VehicleState
 from offboard.mavlink.events import ESTIMATE, Attitude, EstimatorReport, GpsFix
 from offboard.mavlink.session import Session, SessionSettings
+from offboard.mavlink.signing import UNITS_PER_S, Signing
+from offboard.run.configuration import load
+from offboard.run.flight import Connection
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
 from simulator.start import Start
 
+README = Path(__file__).parents[2] / "offboard" / "doctor" / "README.md"
 OK, WARN, WAIT, BLOCKS = Level.OK, Level.WARN, Level.WAIT, Level.BLOCKS
+GCS_HEARTBEAT = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
+AUTOPILOT_HEARTBEAT = mavlink.MAVLink_heartbeat_message(2, 12, 81, 0, 3, 3)
+UNKNOWN_HEARTBEAT = mavlink.MAVLink_heartbeat_message(2, 4, 0, 0, 3, 3)
+CAMERA_HEARTBEAT = mavlink.MAVLink_heartbeat_message(30, 8, 0, 0, 4, 3)
+SETPOINT = mavlink.MAVLink_set_attitude_target_message(0, 1, 1, 7, (1, 0, 0, 0), 0, 0, 0, 0.5)
+TIME = mavlink.MAVLink_timesync_message(0, 12345)
+SAME_PLACE = ("127.0.0.1", 14580)
+COUNTED = mavlink.MAVLink(None, srcSystem=1)
+KEY = bytes(range(32))
+REJECTED = {"fault": "velocity_error", "offset_ned_mps": (3.0, 0.0, 0.0), "for_s": 12.0}
+
+
+def link(**fault: Any) -> dict[str, Any]:
+    """A fault of both directions, after the vehicle has booted."""
+    return {"faults": [{"fault": "link", "at_s": 5.9} | fault]}
+
+
+def beside(*other: Any, **options: Any) -> dict[str, Any]:
+    """Another sender on the link."""
+    return {"before": from_others(*other, **options)}
+
+
+def alone(*other: Any) -> dict[str, Any]:
+    """A sender, and no vehicle."""
+    return {"has_vehicle": False} | beside(*other)
+
+
+def shared_counter(datagrams: Bytes) -> Bytes:
+    """Each frame of the vehicle is followed by one of its camera, with the next sequence number."""
+    sent = []
+    for frame in (each for datagram in datagrams for each in frames_of(datagram)):
+        known = [] if decode(frame).get_type().startswith("UNKNOWN") else [(decode(frame), 1)]
+        for message, component in (*known, (CAMERA_HEARTBEAT, 100)):
+            COUNTED.srcComponent, COUNTED.seq = component, (COUNTED.seq + 1) % 256
+            sent.append(message.pack(COUNTED))
+    return sent
 
 
 @pytest.mark.parametrize("firmware", [PX4, ARDUPILOT], ids=["px4", "ardupilot"])
@@ -36,28 +85,97 @@ def test_nothing_is_said_of_a_good_vehicle(firmware: Firmware) -> None:
 
 
 @pytest.mark.parametrize(
-    ("firmware", "name", "value", "level", "line"),
+    ("options", "check", "level", "found"),
     [
-        (OBEDIENT, "COM_OF_LOSS_T", 0.0, BLOCKS, "param set COM_OF_LOSS_T 1"),
-        (OBEDIENT, "COM_OF_LOSS_T", 0.5, WARN, "param set COM_OF_LOSS_T 1"),
-        (OBEDIENT, "COM_OBL_RC_ACT", 0.0, WARN, "param set COM_OBL_RC_ACT 4"),
-        (OBEDIENT, "COM_RCL_EXCEPT", 0.0, WARN, "param set COM_RCL_EXCEPT 4"),
-        (ARDUPILOT, "GUID_OPTIONS", 2.0, BLOCKS, "param set GUID_OPTIONS 10"),
-        (ARDUPILOT, "ATC_ANGLE_BOOST", 0.0, BLOCKS, "param set ATC_ANGLE_BOOST 1"),
+        # parameters: the line that is printed for one mends it
+        ({"parameters": {"COM_OF_LOSS_T": 0.0}}, "parameters", BLOCKS,
+         "COM_OF_LOSS_T is 0: .* param set COM_OF_LOSS_T 1$"),
+        ({"parameters": {"COM_OF_LOSS_T": 0.5}}, "parameters", WARN,
+         "COM_OF_LOSS_T is 0.5.* param set COM_OF_LOSS_T 1$"),
+        ({"parameters": {"COM_OBL_RC_ACT": 0.0}}, "parameters", WARN, "param set COM_OBL_RC_ACT 4"),
+        ({"parameters": {"COM_RCL_EXCEPT": 0.0}}, "parameters", WARN, "param set COM_RCL_EXCEPT 4"),
+        ({"firmware": ARDUPILOT, "parameters": {"GUID_OPTIONS": 2.0}}, "parameters", BLOCKS,
+         "param set GUID_OPTIONS 10$"),
+        ({"firmware": ARDUPILOT, "parameters": {"ATC_ANGLE_BOOST": 0.0}}, "parameters", BLOCKS,
+         "param set ATC_ANGLE_BOOST 1$"),
+        ({"parameters": {"MPC_TILTMAX_AIR": 20.0}, "choices": {"reference": "lemniscate_4mps"}},
+         "configuration", WARN, "param set MPC_TILTMAX_AIR "),
+        ({"assignments": ["vehicle.hover_thrust=0.3"], "choices": {"vehicle": "px4_sih"}},
+         "configuration", WARN, "hover_thrust 0.3, the autopilot has MPC_THR_HOVER 0.5"),
+        # the vehicle
+        ({"assignments": ["reference.period_s=1.2"]}, "configuration", BLOCKS, "reference"),
+        ({"charge": 0.08}, "battery", BLOCKS, "its battery has 8% left"),
+        ({"charge": 0.2}, "battery", WARN, "20% left"),
+        ({"firmware": replace(OBEDIENT, version=0x010D03FF)}, "firmware", WARN,
+         r"px4 1.13.3 \(release\) is older than 1.14"),
+        ({"firmware": replace(OBEDIENT, version=0x01110000)}, "firmware", WARN,
+         r"px4 1.17.0 \(development\) is no release"),
+        ({"start": Start(height_m=5.0, mode="AUTO.LOITER", by_failsafe=True)}, "state", BLOCKS,
+         "a failsafe flies the vehicle, in AUTO.LOITER"),
+        # which is not blamed on the radio, which nobody needs
+        ({"mode": "OFFBOARD"}, "prearm", WARN, "its pre-arm checks pass in OFFBOARD only while "
+         "setpoints arrive. Fix: select AUTO.LOITER, as `offboard fly` does first"),
+        # its estimator: 3 m/s are two of the gates of 1.5 m/s; PX4's ratios are squared
+        ({"faults": [REJECTED]}, "estimator", BLOCKS,
+         r"rejects GPS velocity \(innovation ratio 4.00, limit 1\)"),
+        ({"faults": [REJECTED]}, "prearm", WAIT, "unhealthy by SYS_STATUS: RC_RECEIVER"),
+        ({"firmware": ARDUPILOT, "faults": [REJECTED]}, "estimator", BLOCKS,
+         r"rejects GPS velocity \(innovation ratio 2.00, limit 1\)"),
+        ({"firmware": ARDUPILOT, "faults": [REJECTED]}, "prearm", WAIT, "EKF velocity variance"),
+        # other programs on the link
+        (beside(AUTOPILOT_HEARTBEAT, 1, 1, 1.0, ("::1", 14999, 0, 0)), "senders", WARN,
+         r"two programs send as vehicle 1/1: 127.0.0.1:14580, \[::1\]:14999"),
+        (beside(SETPOINT, 1, 194, place=SAME_PLACE), "senders", BLOCKS, "component 194"),
+        (beside(SETPOINT, 1, 191, place=SAME_PLACE), "senders", BLOCKS, "component 191"),
+        (beside(GCS_HEARTBEAT, 255, 190, 1.0), "senders", OK,
+         "besides the vehicle: ground station 255/190"),
+        (beside(TIME, 255, 190, 2.0), "clock", WARN, "another time master: component 255/190"),
+        # the link
+        (link(latency_s=0.3), "delay", BLOCKS, "the link delays by"),
+        (link(jitter_s=0.8, direction="up"), "delay", BLOCKS, "the link delays by"),
+        (link(corruption=0.2, direction="down"), "loss", WARN, "of the bytes damaged"),
+        # half of the vehicle's sequence numbers are its camera's, and no frame is lost
+        ({"down": shared_counter}, "loss", OK, "0.0% of the frames lost"),
+        (link(message_rate_hz=30.0, direction="down"), "rates", WARN,
+         "LOCAL_POSITION_NED 30.0 of 100 Hz"),
+        (link(message_rate_hz=5.0, direction="down", for_s=20.0), "rates", BLOCKS,
+         "at least 10 Hz are needed.*MAV_x_RATE"),
+        # what it asks for is thinned to fit; 38400 baud do not carry the least of it
+        ({"capacity_bytes_ps": 3840.0}, "bandwidth", WARN, "use at least 115200 baud$"),
+        ({"capacity_bytes_ps": 11520.0}, "bandwidth", OK, "the link carries"),
+        ({"faults": [{"fault": "clock_jump", "at_s": 9.0, "jump_s": 30.0}]}, "clock", BLOCKS,
+         "the vehicle's clock jumped by 30.0 s"),
+        ({"faults": [{"fault": "reboot", "at_s": 7.0, "for_s": 0.5}]}, "clock", BLOCKS,
+         "the vehicle restarted while it was observed"),
+        # no vehicle
+        (alone(random.Random(1).randbytes(300), 0, 0, 20.0), "vehicle", BLOCKS,
+         "bytes are heard that are not"),
+        (alone(GCS_HEARTBEAT, 255, 190, 1.0), "vehicle", BLOCKS,
+         "but no autopilot: ground station 255/190"),
+        (alone(UNKNOWN_HEARTBEAT, 1, 1, 1.0), "vehicle", BLOCKS,
+         "autopilot 1/1 is neither PX4 nor ArduCopter"),
+        (alone(AUTOPILOT_HEARTBEAT, 1, 50, 1.0), "vehicle", BLOCKS,
+         "autopilot 1/50 is heard, but only"),
     ],
-)
-def test_line_for_a_parameter_mends_it(
-    firmware: Firmware, name: str, value: float, level: Level, line: str
+)  # fmt: skip
+def test_what_is_found_and_what_mends_it(
+    options: dict[str, Any], check: str, level: Level, found: str
 ) -> None:
-    tested = bench(firmware, parameters={name: value})
-    row = tested.check("parameters")["parameters"]
+    tested = bench(**options)
+    began_s = tested.instance.time_s
+    row = tested.check(check)[check]
+    assert tested.instance.time_s - began_s < LONGEST_S + 1.1  # 15 s with the rest
     assert row.level is level
-    assert row.findings[0].hint == line
-    assert f"{name} is {value:g}" in row.findings[0].found
-    named = f"1 blocks: {name}" if level is BLOCKS else "ready to fly; warnings: "
-    assert verdict([row], complete=True).startswith(named)
-    tested.follow(row)
-    assert tested.check("parameters")["parameters"].level is OK
+    assert re.search(found, row.findings[0].sentence)
+    about = row.findings[0].about or check
+    said_at_last = {BLOCKS: f"1 blocks: {about}", WARN: "ready to fly; warnings: "}.get(level, "")
+    assert verdict([row], complete=True).startswith(said_at_last)
+    if PARAMETER.search(row.findings[0].hint):
+        tested.follow(row)
+        assert tested.check(check)[check].level is OK
+
+
+# --- the vehicle ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("start", [None, Start(height_m=3.0)], ids=["on_the_ground", "armed"])
@@ -81,74 +199,14 @@ def test_gps_that_is_lost_waits_and_comes_back() -> None:
     assert said(tested.check()) == {}
 
 
-@pytest.mark.parametrize(
-    ("firmware", "text", "ratio"),
-    [(PX4, "unhealthy by SYS_STATUS: RC_RECEIVER", 4), (ARDUPILOT, "EKF velocity variance", 2)],
-    ids=["px4", "ardupilot"],
-)
-def test_velocity_that_the_estimator_rejects(firmware: Firmware, text: str, ratio: int) -> None:
-    """3 m/s are two of the gates of 1.5 m/s; PX4's ratios are squared."""
-    fault = {"fault": "velocity_error", "offset_ned_mps": (3.0, 0.0, 0.0), "for_s": 12.0}
-    rows = bench(firmware, faults=[fault]).check()
-    found = {name: (row.level, row.findings[0].found) for name, row in rows.items() if row.level}
-    assert found.keys() == {"estimator", "prearm"}
-    assert [level for level, _ in found.values()] == [BLOCKS, WAIT]
-    rejected = f"rejects GPS velocity (innovation ratio {ratio}.00, limit 1)"
-    assert rejected in found["estimator"][1]
-    assert text in found["prearm"][1]
-
-
 def test_arducopter_says_itself_why_it_cannot_arm() -> None:
     """Before it has a position; the texts are those of 4.6.3."""
-    tested = bench(ARDUPILOT, faults=[{"fault": "gps_loss", "at_s": 0.1, "for_s": 30.0}])
-    tested.instance.autopilot.commander.switch("GUIDED")
+    lost = {"fault": "gps_loss", "at_s": 0.1, "for_s": 30.0}
+    tested = bench(ARDUPILOT, faults=[lost], mode="GUIDED")
     tested.run_to(9.0)
     (finding,) = tested.check()["prearm"].findings
     assert "do not pass in GUIDED; the vehicle said: PreArm: Need Position" in finding.found
     assert finding.level is WAIT
-
-
-def test_px4_in_offboard_without_setpoints() -> None:
-    """It is not blamed on the radio, which nobody needs; `fly` selects the mode that is named."""
-    tested = bench()
-    tested.instance.autopilot.commander.switch("OFFBOARD")
-    (finding,) = tested.check("prearm")["prearm"].findings
-    assert finding.found == "its pre-arm checks pass in OFFBOARD only while setpoints arrive"
-    assert finding.hint == "select AUTO.LOITER, as `offboard fly` does first"
-    assert finding.level is WARN
-    tested.instance.autopilot.commander.switch("AUTO.LOITER")
-    assert said(tested.check("prearm")) == {}
-
-
-@pytest.mark.parametrize(
-    ("options", "check", "level", "found"),
-    [
-        ({"charge": 0.08}, "battery", BLOCKS, "its battery has 8% left"),
-        ({"charge": 0.2}, "battery", WARN, "20% left"),
-        ({"firmware": dataclasses.replace(OBEDIENT, version=0x010D03FF)}, "firmware", WARN,
-         "px4 1.13.3 (release) is older than 1.14"),
-        ({"firmware": dataclasses.replace(OBEDIENT, version=0x01110000)}, "firmware", WARN,
-         "px4 1.17.0 (development) is no release"),
-        ({"start": Start(height_m=5.0, mode="AUTO.LOITER", by_failsafe=True)}, "state", BLOCKS,
-         "a failsafe flies the vehicle, in AUTO.LOITER"),
-        ({"assignments": ["vehicle.hover_thrust=0.3"], "choices": {"vehicle": "px4_sih"}},
-         "configuration", WARN, "hover_thrust 0.3, the autopilot has MPC_THR_HOVER 0.5"),
-        ({"assignments": ["reference.period_s=1.2"]}, "configuration", BLOCKS, "reference"),
-    ],
-)  # fmt: skip
-def test_condition_of_the_vehicle(options: Any, check: str, level: Level, found: str) -> None:
-    rows = bench(**options).check()
-    assert said(rows).keys() == {check}
-    assert rows[check].level is level
-    assert found in rows[check].findings[0].found
-
-
-def test_tilt_limit_of_the_vehicle_that_the_reference_exceeds() -> None:
-    tested = bench(parameters={"MPC_TILTMAX_AIR": 20.0}, choices={"reference": "lemniscate_4mps"})
-    row = tested.check("configuration")["configuration"]
-    assert row.level is WARN
-    tested.follow(row)
-    assert tested.check("configuration")["configuration"].level is OK
 
 
 def test_armed_vehicle_is_left_alone() -> None:
@@ -163,15 +221,6 @@ def test_armed_vehicle_is_left_alone() -> None:
     assert said(rows) == {}
 
 
-def test_flight_is_refused_as_the_doctor_says() -> None:
-    pair = flight(limits={"health_s": 9.0, "battery": 0.999})
-    pair.instance.autopilot.plant.set_battery(0.5)
-    outcome = pair.fly()
-    assert outcome.exit_code == ExitCode.REFUSED
-    assert "its battery has 50% left, limits.battery is 100%" in outcome.sentence
-    assert pair.setpoints == []
-
-
 @pytest.mark.parametrize(("boot_s", "level"), [(33.0, WAIT), (300.0, BLOCKS)])
 def test_estimator_without_position_although_the_gps_has_a_fix(boot_s: float, level: Level) -> None:
     """ArduCopter 4.6.3 reports a 3D fix 10 s after its start, and a position 42 s after it."""
@@ -182,3 +231,145 @@ def test_estimator_without_position_although_the_gps_has_a_fix(boot_s: float, le
     starting.heard_s[GpsFix] = starting.now_s
     ground = Ground(starting, Limits(), Session(SessionSettings()), VehicleClock(), 0.0)
     assert {found.level for check, _, found in findings(ground) if check == "estimator"} == {level}
+
+
+# --- the link -------------------------------------------------------------------------------------
+
+
+def test_nothing_is_heard() -> None:
+    tested = bench(has_vehicle=False)
+    began_s = tested.instance.time_s
+    rows = tested.check()
+    assert tested.instance.time_s - began_s == pytest.approx(NOTHING_S, abs=0.1)
+    assert said(rows).keys() == {"vehicle"}
+    assert rows["vehicle"].findings[0].found == "nothing is heard in 6 s"
+    assert rows["vehicle"].level is BLOCKS
+    for hint in ("--connect udpin:0.0.0.0", "-p PORT:PORT/udp", "hostname -I"):
+        assert hint in rows["vehicle"].findings[0].hint
+    assert tested.sent == []
+    tested.has_vehicle = True
+    assert said(tested.check()) == {}
+
+
+@pytest.mark.parametrize("start", [None, Start(height_m=5.0)], ids=["disarmed", "armed"])
+def test_vehicle_whose_signing_time_is_behind_hears_ours_unless_it_is_armed(
+    start: Start | None,
+) -> None:
+    """By ten minutes."""
+    tested = bench(signing=Signing(KEY, 100 * 60 * UNITS_PER_S), start=start)
+    tested.instance.keyring.set_up(KEY, 90 * 60 * UNITS_PER_S)
+    rows = tested.check()
+    if start is None:
+        assert said(rows) == {}
+        assert tested.sent[0].get_type() == "TIMESYNC"
+    else:
+        assert rows["vehicle"].level is BLOCKS
+        assert "their time stamps are too old" in rows["vehicle"].findings[0].found
+        assert tested.sent == []
+
+
+def test_second_vehicle_on_the_link() -> None:
+    tested = bench(before=from_others(AUTOPILOT_HEARTBEAT, 2, 1, 1.0))
+    rows = tested.check()
+    assert said(rows).keys() == {"senders"}
+    several, heard = rows["senders"].findings
+    assert several.level is BLOCKS
+    assert several.found == "several vehicles are heard, systems 1 and 2: choose one with --system"
+    assert heard.found == "besides the vehicle: autopilot 2/1, from 127.0.0.1:14999"
+    tested.system_id = 1
+    assert tested.check("senders")["senders"].level is OK
+
+
+def test_delay_is_measured_and_lowers_the_bandwidth() -> None:
+    tested = bench(**link(latency_s=0.2))
+    row = tested.check("configuration")["configuration"]
+    assert row.level is WARN
+    measured_ms = float(row.findings[0].found.removeprefix("with a delay of ").split()[0])
+    assert measured_ms == pytest.approx(400.0, abs=30.0)  # both directions
+    possible = row.findings[0].hint.rpartition("=")[2]
+    assert 1.0 <= float(possible) < 7.0
+    again = bench(**link(latency_s=0.2), assignments=[f"controller.bandwidth_radps={possible}"])
+    assert again.check("configuration")["configuration"].level is OK
+
+
+def test_loss_is_counted() -> None:
+    tested = bench(PX4, **link(loss=0.2, direction="down", for_s=9.0))
+    row = tested.check("loss")["loss"]
+    assert row.level is WARN
+    share = float(row.findings[0].found.partition("%")[0])
+    assert share == pytest.approx(20.0, abs=3.0)
+    tested.run_to(16.0)
+    assert tested.check("loss")["loss"].level is OK
+
+
+def test_what_we_send_does_not_arrive() -> None:
+    rows = bench(up=lambda _: []).check()
+    assert rows["uplink"].level is BLOCKS
+    assert rows["delay"].level is WAIT
+    assert rows["parameters"].level is WARN  # PX4 has none that must be answered
+    assert rows["parameters"].findings[0].found.startswith("no reply for MPC_THR_HOVER, ")
+
+
+def test_flood_of_addresses_and_ids_is_bounded() -> None:
+    generator = random.Random(3)
+
+    def before(time_s: float) -> list[Any]:
+        ids, port = generator.sample(range(1, 255), 2), generator.randrange(9999)
+        return from_others(GCS_HEARTBEAT, *ids, 250.0, ("10.0.0.1", port))(time_s)
+
+    seen = bench(before=before).listen()
+    assert len(seen.heard.senders.found) == 64
+    assert seen.found is not None
+
+
+# --- checks by name, and this computer ------------------------------------------------------------
+
+
+def test_checks_of_other_packages_are_rows_and_broken_ones_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The one that the README shows; one that cannot be imported; one named as one of ours."""
+    (code,) = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+    (tmp_path / "site_checks.py").write_text(code)
+    checks = {"ceiling": "site_checks:ceiling", "gone": "no_such_module:check", "gps": "json:loads"}
+    register(tmp_path, "site_checks", run.GROUP, **checks)
+    monkeypatch.syspath_prepend(tmp_path)
+    seen = bench().listen()
+    rows = {row.check: row for row in run.examine(run.names(["ceiling", "gone", "gps"]), seen)}
+    assert rows["ceiling"].findings[0].hint == "--set limits.ceiling_m=6"
+    assert "ModuleNotFoundError" in rows["gone"].findings[0].found
+    assert rows["gps"].level is Level.OK
+
+
+def test_the_command_ends_in_time_although_nothing_of_it_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A link that does not open, and a look at the computer without end."""
+    never = threading.Event()
+    monkeypatch.setattr(run, "OPEN_S", 0.1)
+    monkeypatch.setattr(run, "LOOK_S", 0.4)
+    monkeypatch.setattr(run, "open_link", lambda connection: never.wait())
+    monkeypatch.setattr(computer, "build", lambda config: never.wait())
+    monkeypatch.setattr(computer, "_not_compiled", lambda: 0)
+    began_s = time.monotonic()
+    seen = run.observe(Connection("tcp:10.0.0.1:5760"), load("flight"), tmp_path)
+    rows = {row.check: row for row in run.examine(["port", "computer"], seen)}
+    assert time.monotonic() - began_s < 2.0
+    assert "cannot be opened in 0.1 s" in rows["port"].findings[0].found
+    assert rows["computer"].level is Level.WAIT
+
+
+def test_what_is_wrong_with_this_computer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A full disk, a slow decision, and late waking up."""
+    monkeypatch.setattr(computer, "LEAST_FREE_BYTES", 10**18)
+    monkeypatch.setattr(computer, "_not_compiled", lambda: 0)
+    monkeypatch.setattr(computer, "rehearse", lambda prepared, keeps_deadline: 0.04)
+    monkeypatch.setattr(computer, "_sleep", lambda: 0.03)
+    heard = Listening(0.0, SessionSettings())
+    seen = Observation(load("flight"), heard, "udpin:127.0.0.1:1", Path(), time.monotonic())
+    rows = run.examine(["disk", "compiled", "computer"], seen)
+    levels = {row.check: [finding.level for finding in row.findings] for row in rows}
+    assert levels == {"disk": [Level.WARN], "compiled": [Level.OK], "computer": [Level.WARN] * 2}
+    found = " ".join(finding.found for finding in rows[-1].findings)
+    assert "a decision takes 40.0 ms of 50 ms" in found
+    assert "wakes up at most 30.0 ms late" in found

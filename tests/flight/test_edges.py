@@ -1,17 +1,12 @@
-"""Loop and links under failures of terminal, pipe and cable, and under signals."""
+"""The loop under failures of terminal, pipe, disk and supervisor, and under signals."""
 
 from __future__ import annotations
 
 import os
-import pty
 import re
-import select
 import signal
-import socket
 import time
-import tty
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,12 +18,9 @@ from offboard.flight.flight import Outcome
 from offboard.flight.phases import Limits, Phase
 from offboard.link import clock
 from offboard.link import log as log_module
-from offboard.link.connection import open_link
-from offboard.link.interface import LinkReport, LinkUnavailable
+from offboard.link.interface import LinkReport
 from offboard.link.log import FlightLog
 from offboard.link.stop import StopRequests
-from offboard.mavlink.counters import Counters
-from offboard.mavlink.framing import FrameSplitter
 from offboard.run.loop import ANSWERS, UNANSWERED, UNGUARDED, Loop
 from offboard.supervisor.supervisor import SupervisorError
 
@@ -355,9 +347,6 @@ def test_an_exception_in_every_turn_ends_in_silence(tmp_path: Path, now_s: list[
     assert outcome.sentence.endswith("; setpoints stopped")
 
 
-# -- links -----------------------------------------------------------------------------------------
-
-
 def framed(message: mavlink.MAVLink_message, number: int) -> bytes:
     sender = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
     sender.seq = number % 256
@@ -371,52 +360,3 @@ def setpoint(number: int) -> bytes:
 
 def said(number: int) -> bytes:
     return framed(mavlink.MAVLink_statustext_message(number, b""), number)
-
-
-@pytest.mark.parametrize(
-    ("kind", "count"), [("tcp", 20_000), ("serial", 5_000)]
-)  # 1 MB and 250 kB, more than the buffers hold
-def test_a_full_stream_does_not_block_and_sends_the_newest_setpoint(kind: str, count: int) -> None:
-    heartbeat = framed(mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3), 7)
-    setpoints = [setpoint(number) for number in range(count)]
-    with ExitStack() as ends:
-        if kind == "tcp":
-            server = ends.enter_context(socket.create_server(("127.0.0.1", 0)))
-            server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-            link = open_link(f"tcp:127.0.0.1:{server.getsockname()[1]}")
-            theirs = ends.enter_context(server.accept()[0]).fileno()
-        else:
-            theirs, ours = pty.openpty()
-            tty.setraw(ours)
-            link = open_link(f"serial:{os.ttyname(ours)}:57600")
-            ends.callback(os.close, ours)
-            ends.callback(os.close, theirs)
-        ends.callback(link.close)
-        for each in setpoints:  # TCP breaks 5 s after the first byte that nobody reads
-            link.send(each, None)
-        link.send(heartbeat, None)
-        link.send(setpoint(count), None)
-        splitter, frames = FrameSplitter(True, Counters()), list[Any]()
-        while not frames or frames[-1].raw != setpoint(count):
-            link.receive()
-            assert select.select([theirs], [], [], 10.0)[0], "silent"
-            frames += splitter.split(os.read(theirs, 65536))
-    numbers = [int.from_bytes(f.payload[:4], "little") for f in frames if f.message_id == 82]
-    assert all(frame.verified for frame in frames)
-    assert numbers == sorted(numbers)
-    assert len(numbers) < count  # queued ones were replaced
-    assert numbers[-2] < count - 1  # by the last one
-    assert frames[-2].raw == heartbeat
-
-
-def test_a_serial_port_is_opened_once() -> None:
-    """Two readers would each get a part of the telemetry."""
-    ours, theirs = pty.openpty()
-    address = f"serial:{os.ttyname(theirs)}:57600"
-    open_link(address).close()
-    link = open_link(address)
-    with pytest.raises(LinkUnavailable, match="another program has it open"):
-        open_link(address)
-    link.close()
-    os.close(ours)
-    os.close(theirs)

@@ -4,11 +4,10 @@ says of them, and how they are flown. The oracle is the parameter of the fault."
 from __future__ import annotations
 
 import pytest
-from faults import both, late, repeating, stuttering, without
-from pair import OBEDIENT, Filter, Pair, in_phase, make, through
+from faults import both, late, repeating, stuttering
+from pair import Filter, Pair, in_phase, make, through
 
-from offboard.flight.phases import Limits, Phase
-from offboard.flight.timing import LEAST_GROWTH_S
+from offboard.flight.phases import Phase
 from offboard.identification.learner import IdentifySettings
 
 LAP = ("controller={law: lqr}", "reference.laps=1", "reference.height_m=1.0")
@@ -52,28 +51,6 @@ def test_the_delay_of_the_link_is_measured_before_lift_off() -> None:
     assert answered.score().rmse_position_m < 0.15
 
 
-@pytest.mark.slow
-def test_sixty_ms_each_way_cause_a_limit_cycle_unless_identified() -> None:
-    """On the real PX4, with its vehicle file, which does not contain this delay: 0.5 to 0.9 m
-    without identification, 0.05 m with it."""
-    scores = []
-    for bandwidth_radps, learning in ((5, None), (10, IdentifySettings())):
-        law = f"controller={{law: lqr, feedback_limit: 0.6, bandwidth_radps: {bandwidth_radps}}}"
-        pair = over(late(0.06), law, *LAP[1:], aloft=False, seed=1, up=late(0.06),
-                    learning=learning, firmware=OBEDIENT)  # fmt: skip
-        pair.track()
-        scores.append(pair.score())
-    unknown, known = scores
-    assert unknown.rmse_position_m > 0.2
-    assert unknown.tilt_agitation_deg > 12.0
-    assert known.rmse_position_m < 0.06
-    assert known.delay_ms == pytest.approx(PLAIN_DELAY_MS + 120.0, abs=10.0)
-    sentence = next(line for line in pair.companion.announced if "identified delay" in line)
-    used_radps = float(sentence.removeprefix("bandwidth limited to ").split()[0])
-    assert 6.0 < used_radps < 10.0
-    assert f"(configured 10.0): identified delay, {known.delay_ms:.0f} " in sentence
-
-
 # -- a link that becomes later in flight: TIMESYNC and the age of telemetry show it ----------------
 
 CHANGED_S, BACK_S = 2.0, 8.0  # in track
@@ -114,36 +91,3 @@ def test_late_link_is_noticed_and_flown(direction: str, most_m: float) -> None:
     assert not any("grown by 0 ms" in line for line in lines)
     assert not any("contradicts" in line for line in lines)
     assert any("the link's delay has changed by 200 ms lately" in line for line in lines)
-
-
-def flown_at(rate: float) -> tuple[float, float, float]:
-    """RMSE, identified delay, and by how much the link's delay is thought to have grown, where
-    the vehicle's clock runs at `rate` of host time; 60 ms each way."""
-    pair = over(late(0.06), "reference.laps=1", up=late(0.06), rate=rate)
-    pair.track()
-    assert not pair.failsafes
-    state = pair.companion
-    return pair.score().rmse_position_m, state.model.tilt.delay_s, state.clock.growth.added_s
-
-
-@pytest.mark.slow
-def test_simulator_slower_than_real_time_is_flown_as_any_other() -> None:
-    """PX4's simulation on a busy computer. Taken for a link that becomes later, its identified
-    delay was 70 to 130 ms too short, and the error 1.4 times as large."""
-    real_time_rmse_m, real_time_delay_s, real_time_grown_s = flown_at(1.0)
-    assert real_time_delay_s == pytest.approx(0.178, abs=0.01)
-    assert real_time_grown_s == 0.0
-    rmse_m, delay_s, grown_s = flown_at(0.9)
-    assert rmse_m <= real_time_rmse_m + 0.002
-    assert delay_s == pytest.approx(real_time_delay_s, abs=0.002)
-    assert grown_s <= LEAST_GROWTH_S
-
-
-@pytest.mark.slow
-def test_a_late_link_that_cannot_be_measured_ends_the_flight(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The vehicle replies to no TIMESYNC (111)."""
-    monkeypatch.setattr(Limits, "late_s", 20.0)  # instead of 90 s
-    unanswered = over(both(without(111), late(0.3)), aloft=False)
-    assert unanswered.fly().exit_code == 4

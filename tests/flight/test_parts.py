@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from faults import PARAM_VALUE, failing, no_direction, raises, without
+from faults import failing, no_direction, raises
 from pair import hover
-from watch import copter, refused
 
 from offboard import compiled
 from offboard.compiled import Entry
@@ -100,12 +99,6 @@ def test_parameters_are_requested_until_they_are_answered() -> None:
     for at_s, names in ((10.0, unknown), (10.4, []), (10.5, unknown)):
         assert [request.name for request in reading.due(PX4, known, at_s)] == names
     assert [reading.complete(PX4, known, at_s) for at_s in (11.9, 12.0)] == [False, True]
-
-
-def test_arducopter_is_not_flown_without_a_reply_for_guid_options() -> None:
-    """Which may say that thrust is a climb rate."""
-    pair = copter.hop(down=without(PARAM_VALUE), limits={"health_s": 8.0})
-    refused(pair, "not ready: no reply for parameter GUID_OPTIONS")
 
 
 def test_what_a_horizon_calls_near_a_volume_was_loaded_at_the_rehearsal(

@@ -14,9 +14,10 @@ from typing import Any
 import faults
 import pytest
 from pair import Pair, in_phase
-from watch import HIGH, LANDED, announced, begun_s, copter, flown, px4, sent_after
+from watch import HIGH, LANDED, announced, begun_s, copter, flown, px4, scenario_of, sent_after
 
 from offboard.flight.phases import TRACKING, ExitCode, Phase
+from simulator import config
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Rule
 from simulator.firmware.values import Result
@@ -43,6 +44,11 @@ def says_what_it_waits_for(pair: Pair) -> None:
     waiting = [each for each in announced(pair) if each.startswith("waiting:")]
     assert "waiting: no LOCAL_POSITION_NED arrives" in waiting
     assert len(waiting) <= 3
+
+
+def names_the_key_soon(pair: Pair) -> None:
+    nothing_sent(pair)
+    assert any("their signature does not match" in said for said in announced(pair)[:-1])
 
 
 def on_the_ground(pair: Pair) -> None:
@@ -83,14 +89,6 @@ def without_a_gap(pair: Pair) -> None:
     whole(pair)
     times = [at_s for at_s, phase, _ in pair.setpoints if phase is not Phase.LAND]
     assert max(after - before for before, after in pairwise(times)) < 0.2
-
-
-def continued_in_the_air(pair: Pair) -> None:
-    """Never less thrust than flies."""
-    whole(pair)
-    assert pair.armings == []
-    assert not pair.went_through(Phase.TAKEOFF)
-    assert min(setpoint.thrust for _, _, setpoint in pair.setpoints) > 0.3
 
 
 def level(setpoints: list[Any]) -> bool:
@@ -227,19 +225,24 @@ def stop_unheard(pair: Pair) -> None:
     pair.up = pair.down = lambda *_: []
 
 
+def of_type(kind: int, says: str, checks: Checks = nothing_sent, **options: Any) -> Row:
+    return refusal(says, checks, down=faults.heartbeats(type=kind), **options)
+
+
+def signed_by_another() -> Pair:
+    pair = px4.hop(key=bytes(32))
+    pair.instance.keyring.set_up(bytes(range(32)), 1)
+    return pair
+
+
 STOPPED = "stop requested by the operator"
+HELICOPTER = config.vehicle("px4_sih").model_copy(update={"airframe": "helicopter"})
 SOON, LATER = {"health_s": 5.0}, {"health_s": 8.0}
 NO_TAKEOFF = Rule("takeoff", result=Result.FAILED)
 REJECTED = r"; the vehicle said: command {} TEMPORARILY_REJECTED; unhealthy by SYS_STATUS: RC_"
 ROWS = {
     "armed by another": flies(whole, at=then(Phase.STREAM, 0.5, arm)),
     # the operator
-    "stop before it is heard": refusal(
-        STOPPED, nothing_sent, dead=True, at=then(Phase.CONNECT, 0.5, faults.stop)
-    ),
-    "stop in arm": refusal(
-        STOPPED, disarmed_by_us, ended_by="operator", at=then(Phase.ARM, 0.3, faults.stop)
-    ),
     "stop in arm, and it cannot be disarmed": aborts(
         Phase.FAILED, f"{STOPPED}; still armed after 5 s", None, armed=True,
         firmware=faults.refusing("disarm", "Disarming denied"),
@@ -295,6 +298,28 @@ ROWS = {
         nothing_sent, firmware=faults.with_default("COM_OF_LOSS_T", 30.0),
         down=faults.without(faults.POSITION),
     ),
+    "no reply for GUID_OPTIONS, which may say that thrust is a climb rate": refusal(
+        "not ready: no reply for parameter GUID_OPTIONS", nothing_sent, fly=copter.hop,
+        down=faults.without(faults.PARAM_VALUE), limits=LATER,
+    ),
+    "battery too low": refusal(
+        "not ready: its battery has 50% left, limits.battery is 100%", nothing_sent,
+        scenario=scenario_of(conditions={"battery": {"remaining": 0.5}}),
+        limits=SOON | {"battery": 0.999},
+    ),
+    # which vehicles are flown, by the MAV_TYPE in their HEARTBEAT
+    "a plane": of_type(1, "the vehicle is a FIXED_WING; offboard flies multirotors"),
+    "a helicopter": of_type(4, r".*\(airframe: helicopter in its vehicle file flies it\)"),
+    "a hexarotor that is no helicopter": of_type(
+        13, "the vehicle is a HEXAROTOR; its vehicle file says airframe", believed=HELICOPTER
+    ),
+    "a helicopter by its file": of_type(
+        4, STOPPED, on_the_ground, believed=HELICOPTER, at=then(Phase.STREAM, 0.1, faults.stop)
+    ),
+    "a signed link with another key": refusal(
+        ".*their signature does not match: it is another key's", names_the_key_soon,
+        fly=signed_by_another,
+    ),
     "no position": refusal(
         "not ready: no LOCAL_POSITION_NED arrives", says_what_it_waits_for,
         down=faults.without(faults.POSITION), limits=LATER,
@@ -324,10 +349,6 @@ ROWS = {
         Phase.YIELDED, "the vehicle left OFFBOARD for AUTO.LOITER as it armed", the_pilots,
         armed=True, at=then(Phase.ARM, 0.0, faults.take_over),
     ),
-    "pilot takes over while landing": aborts(
-        Phase.YIELDED, "the vehicle left AUTO.LAND for AUTO.LOITER", the_pilots, armed=True,
-        fly=px4.hover, ended_by="pilot", at=then(Phase.LAND, 0.5, faults.take_over),
-    ),
     "motors cut in flight": ends(
         "the vehicle disarmed in flight", None, fly=px4.hover,
         ended_by="disarmed in flight", at=tracking(faults.kill_motors),
@@ -353,10 +374,6 @@ ROWS = {
     "position and attitude stop, heartbeats go on": aborts(
         Phase.FAILED, "no telemetry for 1.0 s .*; disarmed, landing not confirmed: ",
         landing_requested, fly=px4.lap, at=tracking(lost(faults.POSITION, faults.ATTITUDE)),
-    ),
-    "found in the air, and everything stops for 0.8 s": flies(
-        continued_in_the_air, fly=px4.hover,
-        at=tracking(faults.downlink(faults.interrupted(0.8))),
     ),
     # the law
     "a law that raises": in_track(

@@ -86,16 +86,6 @@ def test_default_flight_in_other_scenarios(scenario: str, most_m: float) -> None
     achieves(default_flight(scenario), most_m)
 
 
-@pytest.mark.slow
-def test_a_wide_fast_circle_that_begins_far_away() -> None:
-    """7.5 m/s at 39 degrees of tilt, 60 m from the take-off point."""
-    wide = {"radius_m": 30, "period_s": 25, "laps": 1, "run_in_s": 8, "origin_north_m": 50}
-    assignments = (f"reference.{key}={value}" for key, value in wide.items())
-    pair = make(*assignments, scenario="px4_like", reference="circle_course", aloft=True)
-    pair.track()
-    assert pair.score().rmse_position_m < 0.08
-
-
 def test_decisions_at_the_tilt_limit_are_counted_and_reported() -> None:
     """The wind of `wind_light` needs more than 45 degrees of tilt, to which the gate turns back."""
     pair = make("reference.laps=1", reference="lemniscate", vehicle="neutral",

@@ -20,7 +20,7 @@ from offboard.flight.phases import ENDS, TRACKING, Action, ExitCode, Phase
 from simulator import config as simulated
 from simulator.config import Scenario
 
-SET_MESSAGE_INTERVAL = 511  # MAV_CMD
+SET_MESSAGE_INTERVAL, REQUEST_MESSAGE = 511, 512  # MAV_CMD
 HIGH = "reference.height_m=3.0"
 LANDED = "flown and landed$"
 REACTION_S = 0.13  # a report of the mode at 10 Hz, and a turn
@@ -220,7 +220,7 @@ def without_texts(pair: Pair) -> Pair:
 
 
 def announced(pair: Pair) -> tuple[str, ...]:
-    return tuple(pair.companion.announced)
+    return tuple(pair.companion.current.announced)
 
 
 def engage_mode(pair: Pair) -> str:
@@ -230,13 +230,13 @@ def engage_mode(pair: Pair) -> str:
 
 
 def sent_after(pair: Pair, time_s: float) -> list[str]:
-    """Setpoints and commands, but requests for telemetry, that left after `time_s`."""
+    """Setpoints and commands, but requests for messages, that left after `time_s`."""
     frames = [(at_s, decode(frame)) for at_s, _, frame in pair.sent if at_s > time_s]
     return [
         f"{message.get_type()} at {at_s:.2f}"
         for at_s, message in frames
         if message.get_type() in ("COMMAND_LONG", "SET_ATTITUDE_TARGET")
-        and getattr(message, "command", None) != SET_MESSAGE_INTERVAL
+        and getattr(message, "command", None) not in (SET_MESSAGE_INTERVAL, REQUEST_MESSAGE)
     ]
 
 

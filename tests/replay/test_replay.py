@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-import sys
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +11,7 @@ import pytest
 from corpus import expected, replayed, unpacked
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pair import SHORT, UNIX_EPOCH_US, HostClock, Pair, hover, in_phase
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from typer.testing import CliRunner, Result
 
@@ -43,10 +43,6 @@ from offboard.replay.difference import compare, verdict
 from offboard.replay.replaying import Replay, read
 from offboard.run import configuration
 from offboard.run.configuration import FlightConfig
-
-sys.path.append(str(Path(__file__).parents[1] / "flight"))
-
-from pair import SHORT, UNIX_EPOCH_US, HostClock, Pair, hover, in_phase
 
 WIRE = Path(__file__).parents[1] / "wire" / "recordings"
 KEY = bytes(range(32))

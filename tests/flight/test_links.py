@@ -1,0 +1,449 @@
+"""Links on real sockets and pseudo-terminals: arrival stamps, other senders, a vehicle that changes
+its port, streams that are full, links that break and come back, addresses of IPv6."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import pty
+import select
+import socket
+import sys
+import termios
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from offboard.link import clock
+from offboard.link.connection import open_link
+from offboard.link.interface import Chunk, Link, LinkError, LinkReport, LinkUnavailable
+from offboard.link.stream import BROKEN, RENEWED
+from offboard.link.udp import LOOK_EVERY_S, UdpLink
+from offboard.mavlink.counters import Counters
+from offboard.mavlink.framing import FrameSplitter
+from offboard.mavlink.senders import PEER_SILENT_S
+
+LOCAL = "127.0.0.1"
+LONG_S = 10.0
+TURN_S = 1.0  # for one turn of the loop, whatever the link does, on a busy machine
+Udp = tuple[UdpLink, socket.socket, socket.socket]
+IPV6 = socket.has_ipv6 and Path("/proc/net/if_inet6").exists()
+
+
+@pytest.fixture
+def ends() -> Iterator[ExitStack]:
+    """Closes links and their other ends after the test."""
+    with ExitStack() as ends:
+        yield ends
+
+
+def opened(address: str, ends: ExitStack) -> Link:
+    return ends.enter_context(closing(open_link(address)))
+
+
+def listening(ends: ExitStack, port: int = 0) -> socket.socket:
+    server = ends.enter_context(socket.create_server(("127.0.0.1", port)))
+    server.settimeout(LONG_S)
+    return server
+
+
+def plugged(ends: ExitStack) -> tuple[int, str, Callable[[], object]]:
+    """A serial device: the descriptor of its other end, its path, and what unplugs it."""
+    ours, theirs = pty.openpty()
+    tty.setraw(theirs)
+    unplugs = ends.enter_context(ExitStack())
+    unplugs.callback(os.close, ours)
+    unplugs.callback(os.close, theirs)
+    return ours, os.ttyname(theirs), unplugs.close
+
+
+def turns(link: Link, until: Callable[[bytes], object]) -> bytes:
+    """Turns of the loop until `until` holds for all that was received; none of them may wait."""
+    received, deadline_s = b"", time.monotonic() + LONG_S
+    while not until(received):
+        began_s = time.monotonic()
+        assert began_s < deadline_s, received
+        link.wait(0.02)
+        received += b"".join(chunk.data for chunk in link.receive())
+        link.send(b"\xfd\0\0\0\0\0\0\0\0\0\0\0", None)
+        assert time.monotonic() - began_s < TURN_S
+    return received
+
+
+def run(link: Link, seconds: float) -> None:
+    end_s = time.monotonic() + seconds
+    turns(link, lambda _: time.monotonic() > end_s)
+
+
+def run_until_it_breaks(link: Link) -> None:
+    turns(link, lambda _: BROKEN in link.report.news())
+
+
+# --- UDP ---
+
+
+@pytest.fixture
+def udp() -> Iterator[Udp]:
+    """A link that listens, the socket of a vehicle, and that of another program."""
+    link = open_link(f"udpin:{LOCAL}:0")
+    assert isinstance(link, UdpLink)
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other,
+    ):
+        for one in (vehicle, other):
+            one.settimeout(5.0)
+            one.connect((LOCAL, link.port))
+        yield link, vehicle, other
+    link.close()
+
+
+@pytest.fixture
+def now_s(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The time of the link's clock, which the test sets."""
+    now_s = [clock.monotonic_s()]
+    monkeypatch.setattr(clock, "monotonic_s", lambda: now_s[0])
+    return now_s
+
+
+def received(link: Link) -> list[Chunk]:
+    link.wait(1.0)
+    return link.receive()
+
+
+def data(chunks: list[Chunk]) -> list[bytes]:
+    return [chunk.data for chunk in chunks]
+
+
+def test_a_datagram_has_the_time_of_its_arrival_not_of_its_reading(udp: Udp) -> None:
+    link, vehicle, _ = udp
+    before_s = time.monotonic()
+    vehicle.send(b"first")
+    between_s = time.monotonic()
+    time.sleep(0.1)
+    vehicle.send(b"second")
+    time.sleep(0.1)
+    first, second = received(link)
+    assert before_s - 1e-4 <= first.arrived_s <= between_s + 1e-4
+    assert between_s + 0.1 <= second.arrived_s <= time.monotonic() - 0.1
+    assert (first.peer, second.peer) == (vehicle.getsockname(), vehicle.getsockname())
+
+
+@pytest.mark.parametrize("jump_s", [-3600.0, 3600.0])
+def test_a_clock_that_is_set_does_not_move_arrivals(
+    jump_s: float, udp: Udp, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Unix time jumps between the arrival and its reading."""
+    link, vehicle, _ = udp
+    assert link.receive() == []
+    empty_s, right = time.monotonic(), clock.monotonic_less_unix_s
+    vehicle.send(b"x")
+    monkeypatch.setattr(clock, "monotonic_less_unix_s", lambda: right() - jump_s)
+    (chunk,) = received(link)
+    assert empty_s - 0.01 <= chunk.arrived_s <= time.monotonic()
+
+
+def test_other_senders_are_counted_and_neither_delay_nor_displace_the_vehicle(udp: Udp) -> None:
+    link, vehicle, other = udp
+    other.send(b"waits already")
+    vehicle.send(b"v1")
+    link.follow(vehicle.getsockname())
+    vehicle.send(b"v2")
+    for _ in range(20_000):  # ten times the buffer
+        other.send(bytes(1000))
+    vehicle.send(b"v3")
+    time.sleep(LOOK_EVERY_S)
+    heard = [*received(link), *link.receive()]
+    assert data(heard) == [b"v1", b"v2", b"v3"]
+    assert [chunk.arrived_s for chunk in heard] == sorted(chunk.arrived_s for chunk in heard)
+    looks = 0
+    while looks < 20:
+        vehicle.send(b"v")
+        time.sleep(LOOK_EVERY_S)
+        assert set(data(received(link))) == {b"v"}
+        looks += 1
+    assert 64 * 22 > link.report.ignored > 500  # of those that fit into the buffer
+    name = f" from {LOCAL}:{other.getsockname()[1]}, which is not the vehicle, "
+    assert all(name in sentence for sentence in link.report.news())
+    assert link.report.news() == []
+
+
+def test_frames_reach_the_vehicle_before_and_after_it_is_followed(udp: Udp) -> None:
+    """And no other program gets the port: with pymavlink's SO_REUSEADDR it would take the vehicle's
+    datagrams."""
+    link, vehicle, _ = udp
+    link.send(b"nobody", None)
+    for sent in (b"one", b"two"):
+        link.send(sent, vehicle.getsockname())
+        assert vehicle.recv(100) == sent
+        for option in (socket.SO_REUSEADDR, socket.SO_REUSEPORT):
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+                other.setsockopt(socket.SOL_SOCKET, option, 1)
+                with pytest.raises(OSError, match="in use"):
+                    other.bind(("0.0.0.0", link.port))
+        link.follow(vehicle.getsockname())
+
+
+def test_another_port_is_heard_after_a_silence_that_was_observed(
+    udp: Udp, now_s: list[float]
+) -> None:
+    """A pause of ours is none, of 3 s here: the vehicle's datagrams wait, but a flood may have
+    dropped the newest."""
+    link, vehicle, other = udp
+    link.follow(vehicle.getsockname())
+    for passed_s in (0.4, 0.4, 0.4, 1.5):
+        now_s[0] += passed_s * PEER_SILENT_S
+        vehicle.send(b"v")
+        other.send(b"no")
+        assert data(received(link)) == [b"v"]
+    for silent_s, heard in ((0.9, []), (0.2, [b"moved"])):
+        now_s[0] += silent_s * PEER_SILENT_S
+        other.send(b"moved")
+        assert data(link.receive()) == heard
+    link.follow(other.getsockname())
+    vehicle.send(b"of another now")
+    other.send(b"v")
+    assert data(received(link)) == [b"v"]
+
+
+def test_udpout_hears_only_its_peer() -> None:
+    """A refused datagram does not cost the next one: a connected socket reports the ICMP message
+    of the one before instead of sending."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind((LOCAL, 0))
+        place = probe.getsockname()
+    link = open_link(f"udpout:{LOCAL}:{place[1]}")
+    link.send(b"too early", None)
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other,
+    ):
+        peer.bind(place)
+        peer.settimeout(5.0)
+        link.send(b"heard", None)
+        heard, ours = peer.recvfrom(100)
+        assert heard == b"heard"
+        other.sendto(b"no", ours)
+        peer.sendto(b"yes", ours)
+        assert data(received(link)) == [b"yes"]
+        assert link.receive() == []
+    link.close()
+
+
+def test_senders_are_named_at_powers_of_ten_and_bounded_in_number() -> None:
+    report = LinkReport()
+    for _ in range(100):
+        report.count("a:1", 1)
+    named = [sentence.partition(" from")[0] for sentence in report.news()]
+    assert named == ["1 datagram", "10 datagrams", "100 datagrams"]
+    report.count("b:2", 78_000)
+    assert report.news() == ["78,000 datagrams from b:2, which is not the vehicle, were ignored"]
+    for port in range(1000):
+        report.count(f"c:{port}", 1)
+    assert len(report.news()) == 6 + 3  # six more names, then 1, 10 and 100 others
+    assert report.ignored == 100 + 78_000 + 1000
+
+
+# --- streams ---
+
+
+@pytest.mark.parametrize(
+    ("kind", "count"), [("tcp", 20_000), ("serial", 5_000)]
+)  # 1 MB and 250 kB, more than the buffers hold
+def test_a_full_stream_does_not_block_and_sends_the_newest_setpoint(
+    kind: str, count: int, ends: ExitStack
+) -> None:
+    codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
+
+    def framed(message: mavlink.MAVLink_message, number: int) -> bytes:
+        codec.seq = number % 256
+        return bytes(message.pack(codec))
+
+    heartbeat = framed(mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3), 7)
+    level = partial(mavlink.MAVLink_set_attitude_target_message, type_mask=7, q=[0] * 4,
+                    target_system=1, target_component=1, body_roll_rate=0, body_pitch_rate=0,
+                    body_yaw_rate=0, thrust=0)  # fmt: skip
+    setpoints = [framed(level(number), number) for number in range(count + 1)]
+    if kind == "tcp":
+        server = listening(ends)
+        server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        link = opened(f"tcp:{LOCAL}:{server.getsockname()[1]}", ends)
+        theirs = ends.enter_context(server.accept()[0]).fileno()
+    else:
+        theirs, path, _ = plugged(ends)
+        link = opened(f"serial:{path}:57600", ends)
+    for each in setpoints[:-1]:  # TCP breaks 5 s after the first byte that nobody reads
+        link.send(each, None)
+    link.send(heartbeat, None)
+    link.send(setpoints[-1], None)
+    splitter, frames = FrameSplitter(True, Counters()), list[Any]()
+    while not frames or frames[-1].raw != setpoints[-1]:
+        link.receive()
+        assert select.select([theirs], [], [], 10.0)[0], "silent"
+        frames += splitter.split(os.read(theirs, 65536))
+    numbers = [int.from_bytes(f.payload[:4], "little") for f in frames if f.message_id == 82]
+    assert all(frame.verified for frame in frames)
+    assert numbers == sorted(numbers)
+    assert len(numbers) < count  # queued ones were replaced
+    assert numbers[-2] < count - 1  # by the last one
+    assert frames[-2].raw == heartbeat
+
+
+def test_a_tcp_peer_that_goes_and_returns_is_connected_again(ends: ExitStack) -> None:
+    server = listening(ends)
+    server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    port = server.getsockname()[1]
+    link = opened(f"tcp:127.0.0.1:{port}", ends)
+    with server.accept()[0] as peer:
+        peer.sendall(b"first")
+        turns(link, lambda data: data == b"first")
+        before = link.opened
+        for _ in range(1000):  # more than both ends hold
+            link.send(b"old" * 1000, None)
+        server.close()
+    run_until_it_breaks(link)  # nobody listens now
+    assert link.descriptors() == ()
+    run(link, 0.7)
+    server = listening(ends, port)
+    turns(link, lambda _: link.descriptors())
+    peer = ends.enter_context(server.accept()[0])
+    peer.settimeout(LONG_S)
+    peer.sendall(b"again")
+    turns(link, lambda data: data == b"again")
+    assert link.report.news() == [RENEWED]
+    assert link.opened > before
+    after = peer.recv(65536)
+    assert len(after) < 12 * 30  # what was sent meanwhile was dropped, not queued
+    assert b"old" not in after
+
+
+def test_tcpin_takes_one_client_and_the_next_one_when_it_is_silent(ends: ExitStack) -> None:
+    link = opened("tcpin:127.0.0.1:0", ends)
+    place = socket.socket(fileno=os.dup(link.descriptors()[0])).getsockname()
+    assert link.receive() == []
+    link.send(b"to nobody", None)
+    vehicle = ends.enter_context(socket.create_connection(place))
+    vehicle.settimeout(LONG_S)
+    vehicle.sendall(b"one")
+    turns(link, lambda data: data == b"one")
+    link.follow("tcp")
+    with socket.create_connection(place) as other:
+        other.settimeout(LONG_S)
+
+        def refused(_: bytes) -> bool:
+            vehicle.sendall(b".")
+            return any("connection from 127.0.0.1" in each for each in link.report.news())
+
+        turns(link, refused)
+        assert other.recv(10) == b""  # closed
+    run(link, 0.6)
+    with socket.create_connection(place) as back:  # and the first one has gone silently
+        back.sendall(b"two")
+        turns(link, lambda data: data.endswith(b"two"))
+        while vehicle.recv(65536):
+            pass
+    run_until_it_breaks(link)
+
+
+def test_a_serial_device_that_is_unplugged_and_back(tmp_path: Path, ends: ExitStack) -> None:
+    """Nobody else opens it meanwhile: two readers would each get a part of the telemetry."""
+    device = tmp_path / "ttyACM0"
+    other_end, path, unplug = plugged(ends)
+    device.symlink_to(path)
+    link = opened(f"serial:{device}:57600", ends)
+    os.write(other_end, b"first")
+    turns(link, lambda data: data == b"first")
+    with pytest.raises(LinkUnavailable, match="another program has it open"):
+        open_link(f"serial:{device}:57600")
+    unplug()
+    device.unlink()
+    run_until_it_breaks(link)
+    assert link.descriptors() == ()  # else the device would come back under another name
+    other_end, path, _ = plugged(ends)
+    device.symlink_to(path)
+    turns(link, lambda _: link.descriptors())
+    os.write(other_end, b"again")
+    turns(link, lambda data: data == b"again")
+
+
+@pytest.mark.parametrize("kind", ["tcp", "serial", "udp"])
+def test_what_arrives_while_it_waits_is_not_read(kind: str, ends: ExitStack) -> None:
+    """The supervisor has the same descriptors, and must find what the controller has waited for."""
+    link, send = joined(kind, ends)
+    descriptor = link.descriptors()[-1]
+    assert waiting_bytes(descriptor) == 0
+    began_s = clock.monotonic_s()
+    sent_s: list[float] = []
+
+    def send_later() -> None:
+        sent_s.append(clock.monotonic_s())
+        send(b"\xfd while it waits")
+
+    later = threading.Timer(0.1, send_later)
+    later.start()
+    link.wait(LONG_S)
+    waited_s = clock.monotonic_s() - began_s
+    later.join()
+    assert 0.09 < waited_s < 0.09 + TURN_S
+    assert waiting_bytes(descriptor) == 16
+    link.wait(LONG_S)  # returns at once
+    (chunk,) = link.receive()
+    assert chunk.data == b"\xfd while it waits"
+    assert sent_s[0] - 1e-4 < chunk.arrived_s < clock.monotonic_s()
+    assert link.receive() == []
+
+
+def joined(kind: str, ends: ExitStack) -> tuple[Link, Callable[[bytes], object]]:
+    """A link, and what sends on its other end."""
+    if kind == "serial":
+        other_end, path, _ = plugged(ends)
+        return opened(f"serial:{path}:57600", ends), partial(os.write, other_end)
+    if kind == "tcp":
+        server = listening(ends)
+        link = opened(f"tcp:127.0.0.1:{server.getsockname()[1]}", ends)
+        return link, ends.enter_context(server.accept()[0]).sendall
+    link = opened("udpin:127.0.0.1:0", ends)
+    other = ends.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+    assert isinstance(link, UdpLink)
+    other.connect(("127.0.0.1", link.port))
+    return link, other.send
+
+
+def waiting_bytes(descriptor: int) -> int:
+    """That nobody has read yet."""
+    return int.from_bytes(fcntl.ioctl(descriptor, termios.FIONREAD, bytes(4)), sys.byteorder)
+
+
+@pytest.mark.skipif(not IPV6, reason="this computer has no IPv6")
+def test_ipv6_addresses(ends: ExitStack) -> None:
+    link = opened("udpin:[::1]:0", ends)
+    assert isinstance(link, UdpLink)
+    other = ends.enter_context(socket.socket(socket.AF_INET6, socket.SOCK_DGRAM))
+    other.settimeout(LONG_S)
+    other.sendto(b"hello", ("::1", link.port))
+    turns(link, lambda data: data == b"hello")
+    peer = ("::1", other.getsockname()[1], 0, 0)
+    link.follow(peer)
+    link.send(b"answer", peer)
+    assert other.recv(100) == b"answer"
+    with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as third:
+        third.sendto(b"x", ("::1", link.port))
+        turns(link, lambda _: link.report.ignored)
+    assert "1 datagram from [::1]:" in link.report.news()[0]
+    server = ends.enter_context(socket.create_server(("::1", 0), family=socket.AF_INET6))
+    server.settimeout(LONG_S)
+    stream = opened(f"tcp:[::1]:{server.getsockname()[1]}", ends)
+    connection = ends.enter_context(server.accept()[0])
+    connection.settimeout(LONG_S)
+    stream.send(b"answer", None)
+    assert connection.recv(100) == b"answer"
+    with pytest.raises(LinkError, match=r"stands in brackets, as in udpin:\[::1\]:14540"):
+        open_link("udpin:::1:14540")
