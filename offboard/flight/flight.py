@@ -45,6 +45,7 @@ class Flight(FlightState):
         self._news = News()
         self._logged: list[bytes] = []  # frames since the newest `finish_turn`
         self._ticked = self._heard = False  # in this turn
+        self._setpoint_before_s = self.setpoint_s  # this turn
 
     # ------------------------------------------------------------------ the turn
 
@@ -57,6 +58,7 @@ class Flight(FlightState):
         barriers depends on the load of the machine.
         """
         self._ticked = self._heard = False
+        self._setpoint_before_s = self.setpoint_s
         if self.session.settings.lockstep and not chunks:
             return ()
         host_now_s = self._inputs.begin(host_now_s, self.other_datagrams)
@@ -252,6 +254,7 @@ class Flight(FlightState):
     def on_dropped(self, frames: int) -> None:
         """The last frames of the newest turn were not sent: they became too old."""
         self._inputs.note(DROPPED, frames)
+        self.setpoint_s = self._setpoint_before_s
         self._news.dropped.add(frames)
 
     def overhear(self, datagrams: Sequence[bytes]) -> None:

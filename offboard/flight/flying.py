@@ -195,13 +195,14 @@ def ends_early(*, serves: bool) -> tuple[Transition, ...]:
     """Rows that end a flight in the air early. A stop makes `fly` land and the service hold; in the
     service a change of mode by the pilot is the usual end."""
     followed = TRACKING if serves else frozenset[Phase]()
+    taken = TRACKING | {HAND_BACK} if serves else frozenset[Phase]()
     others = FLYING - followed
     return (
         Transition(FLYING, rebooted_in_flight, LAND, ABORTED, "restart"),
         # HEARTBEAT may be wrong: what still flies is to land
         Transition(FLYING, disarmed, LAND, ABORTED, "disarmed in flight"),
-        Transition(followed, lost, YIELDED, FLOWN, "pilot"),
-        Transition(others, lost, YIELDED, ABORTED, "pilot"),
+        Transition(taken, lost, YIELDED, FLOWN, "pilot"),
+        Transition(FLYING - taken, lost, YIELDED, ABORTED, "pilot"),
         Transition(FLYING, in_own_failsafe, LAND, ABORTED, "link"),
         Transition(FLYING, failsafe_land, LAND, ABORTED, *FAILSAFE),
         Transition(followed, stop_requested, HAND_BACK, FLOWN, OPERATOR),

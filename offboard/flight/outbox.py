@@ -151,7 +151,7 @@ def send_setpoint(
         _send_attitude(flight, time_s, admitted, body_z_down)
     else:
         _send_position(flight, time_s, admitted)
-    flight.setpoint_s = flight.now_s
+    flight.setpoint_s = flight.host_s
     return admitted
 
 

@@ -285,18 +285,18 @@ class FlightState:
         none was sent, nothing was heard, or no TIMESYNC was answered."""
         unanswered_s = self.vehicle.age_s(TimesyncReply)
         gap_s = max(
-            self.now_s - self.setpoint_s,
+            self.host_s - self.setpoint_s,
             self.silence_s,
             unanswered_s if math.isfinite(unanswered_s) else 0.0,
         )
         after_s = self.authority.loss.after_s
         if gap_s > max(after_s - STARVED_EARLY_S, after_s * 2.0 / 3.0):
-            self.starved_s = self.now_s
+            self.starved_s = self.host_s
 
     @property
     def starved(self) -> bool:
         """Whether `note_starvation` found this within the last STARVED_KNOWN_S."""
-        return self.now_s - self.starved_s < STARVED_KNOWN_S
+        return self.host_s - self.starved_s < STARVED_KNOWN_S
 
     @property
     def ours(self) -> bool:

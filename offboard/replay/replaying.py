@@ -181,6 +181,7 @@ class Replay:
         """What came between two turns."""
         if kind == DROPPED:
             del self._leaving[len(self._leaving) - value :]
+            self.companion.on_dropped(value)
         elif kind == OTHERS:
             self.companion.other_datagrams = value
         elif kind == CALL and value in CALLS:

@@ -75,11 +75,6 @@ class Watch:
         silent_s = self.known.silent_s
         return HANGS.format(silent_s=silent_s) if self._silent_s >= silent_s else ""
 
-    @property
-    def beat_s(self) -> float:
-        """When the newest beat was read, at the latest."""
-        return clock.monotonic_s() - self._silent_s
-
     def _read(self) -> None:
         data = b""
         descriptors: list[int] = []
@@ -124,7 +119,7 @@ class TakeOver:
         self._session.status = ACTIVE, LANDING
         assert self._session.dialect is not None
         self._dialect = self._session.dialect
-        self._recovery = Recovery(self._dialect, known, clock.monotonic_s(), watch.beat_s)
+        self._recovery = Recovery(self._dialect, known, clock.monotonic_s(), beat["sent_s"])
         self._text_id = 0
 
     def run(self, reason: str) -> None:

@@ -66,7 +66,7 @@ class Supervised:
 
 
 class Recovery:
-    """Begins at `began_s`; the newest beat of the controller was at `beat_s`, and said `known`.
+    """Begins at `began_s`; the newest beat of the controller left at `beat_s`, and said `known`.
 
     `ended` says how it ended, empty until then; `news` are sentences for the user."""
 

@@ -6,6 +6,7 @@ period, when it reaches the vehicle.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import count
@@ -278,6 +279,37 @@ def test_after_three_seconds_a_px4_in_its_failsafe_is_landed_without_a_setpoint(
     pair, _, end_s = paused(px4, 3.0, ExitCode.ABORTED, says)
     assert pair.went_through(Phase.DISARMED)
     assert [at_s for at_s, _, _ in pair.setpoints if at_s > end_s - 3.0 + 0.01] == []
+
+
+def test_setpoints_that_were_dropped_between_two_pauses_are_missing() -> None:
+    """0.5 and 0.55 s, 50 ms apart: PX4 holds by its own failsafe, and is landed from it."""
+    pair = px4.lap("reference.run_in_s=4.0", deadline_s=DEADLINE_S)
+    pair.instance.autopilot.parameters.set("COM_OBL_RC_ACT", 5.0)
+    turn, resumes_s = pair.companion.turn, [math.inf]
+
+    def dropping(chunks: Sequence[Chunk], now_s: float) -> tuple[bytes, ...]:
+        """As the loop, where it was stopped between a turn and its sending."""
+        frames = turn(chunks, now_s)
+        if pair.time_s < resumes_s[0]:
+            return frames
+        if frames:
+            pair.companion.on_dropped(len(frames))
+        return ()
+
+    def stop(pair: Pair) -> None:
+        resumes_s[0] = pair.time_s + 0.5
+        pair.pause(0.5)
+
+    def again(pair: Pair) -> None:
+        resumes_s[0] = math.inf
+        pair.pause(0.55)
+
+    pair.companion.turn = dropping  # type: ignore[method-assign]
+    pair.at.append((IN_TRACK, stop))
+    pair.at.append((lambda pair: pair.time_s > resumes_s[0] + 0.05, again))
+    aborted(pair, ".*the vehicle's own failsafe flies it, in AUTO.LOITER")
+    assert pair.landings
+    assert not pair.armed
 
 
 def test_after_a_pause_a_report_of_the_mode_is_awaited() -> None:

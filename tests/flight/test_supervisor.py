@@ -25,6 +25,7 @@ from offboard.link import clock
 from offboard.link.connection import open_link
 from offboard.link.log import FlightLog
 from offboard.link.udp import BATCH_MAX
+from offboard.mavlink.dialects.base import SetpointLoss
 from offboard.mavlink.events import VehicleFound
 from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings
@@ -33,7 +34,12 @@ from offboard.supervisor.recovery import Supervised
 from offboard.supervisor.supervisor import Supervisor, SupervisorError
 
 LONG_S = 20.0
-OFFBOARD, POSCTL, LANDING = 0x00060000, 0x00030000, 0x06040000  # custom_mode of PX4
+OFFBOARD, POSCTL, LOITER, LANDING = (
+    0x00060000,
+    0x00030000,
+    0x03040000,
+    0x06040000,
+)  # custom_mode of PX4
 KEY, SIGNED_FROM = bytes(range(32)), 10**12
 VEHICLE = VehicleFound(7, 1, "px4")
 OURS, ON_GROUND, NOT_OURS = (
@@ -84,16 +90,16 @@ class Rig:
     def await_end(self) -> None:
         self.supervisor.process.wait(LONG_S)
 
-    def next_command(self) -> Any:
-        """The next COMMAND_LONG that the vehicle receives."""
+    def next_message(self, kind: str = "COMMAND_LONG") -> Any:
+        """The next message of this kind that the vehicle receives."""
         while True:
             for message in self.codec.parse_buffer(self.vehicle.recv(65536)) or []:
-                if message.get_type() == "COMMAND_LONG":
+                if message.get_type() == kind:
                     return message
 
-    def report(self, mode: int, *, armed: bool = True, codec: Any = None) -> None:
-        """The vehicle reports its mode, as custom mode of PX4."""
-        message = mavlink.MAVLink_heartbeat_message(2, 12, 129 if armed else 1, mode, 4, 3)
+    def report(self, mode: int, *, armed: bool = True, status: int = 4, codec: Any = None) -> None:
+        """The vehicle reports its mode, as custom mode of PX4, and its MAV_STATE."""
+        message = mavlink.MAVLink_heartbeat_message(2, 12, 129 if armed else 1, mode, status, 3)
         self.vehicle.send(message.pack(codec or self.codec))
 
     def disarm(self) -> None:
@@ -120,7 +126,7 @@ def test_it_takes_over_when_the_controller_ends(rig: Rig) -> None:
     rig.beat(ON_GROUND)
     rig.beat(OURS)
     rig.abandon()
-    command = rig.next_command()
+    command = rig.next_message()
     assert (command.command, command.param2, command.param3) == (176, 4.0, 3.0)  # AUTO.LOITER
     assert (command.target_system, command.get_srcSystem()) == (7, 7)
     rig.disarm()
@@ -142,7 +148,7 @@ def test_it_asks_the_vehicle_that_connected_last(rig: Rig) -> None:
     rig.beat(OURS)
     rig.abandon()
     rig.vehicle = socket.create_connection(rig.place)
-    assert rig.next_command().command == 176
+    assert rig.next_message().command == 176
     rig.disarm()
 
 
@@ -156,12 +162,12 @@ def test_it_signs_with_stamps_that_follow_ours(rig: Rig) -> None:
     assert rig.codec.decode(bytearray(newest)).get_type() == "HEARTBEAT"
     assert KEY.hex() not in str(rig.supervisor.process.args)
     rig.abandon()
-    command = rig.next_command()
+    command = rig.next_message()
     assert command.command == 176
     assert command.get_signed()
     forged = mavlink.MAVLink(None, srcSystem=7, srcComponent=1)
     rig.report(LANDING, armed=False, codec=forged)
-    assert rig.next_command().command == 176  # it does not believe that
+    assert rig.next_message().command == 176  # it does not believe that
     rig.disarm()
     rig.await_end()
     assert all(each.frame.signed for each in tlog.read(rig.log.path) if each.name != "TUNNEL")
@@ -173,7 +179,7 @@ def test_it_takes_over_when_the_beats_stop_and_says_so_first(rig: Rig) -> None:
         os.kill(rig.supervisor.process.pid, number)
     rig.beat(OURS)
     assert not rig.supervisor.has_taken_over()
-    assert rig.next_command().command == 176
+    assert rig.next_message().command == 176
     assert rig.supervisor.has_taken_over()
     assert rig.supervisor.said[0] == "taking over: the controller has not answered for 0.9 s"
     rig.disarm()
@@ -188,7 +194,7 @@ def test_a_controller_that_hangs_and_is_then_killed_is_scored(rig: Rig) -> None:
     for entry in tlog.read(RECORDING):
         rig.log.write(entry.unix_us, entry.frame.raw)
     rig.beat(OURS)
-    assert rig.next_command().command == 176
+    assert rig.next_message().command == 176
     rig.abandon()
     rig.disarm()
     rig.await_end()
@@ -225,7 +231,23 @@ def test_one_that_is_stopped_does_not_guard_until_it_continues(rig: Rig) -> None
     assert not rig.supervisor.has_taken_over()
     beat_until(rig, True, OURS)
     assert not rig.supervisor.has_taken_over()
-    assert rig.next_command().command == 176
+    assert rig.next_message().command == 176
+    rig.disarm()
+
+
+def test_stopped_while_the_controller_ends_it_knows_the_failsafe_of_the_vehicle(rig: Rig) -> None:
+    """Beats have the time at which they were sent. By the time at which they are read the failsafe
+    came too early, and seemed to be a pilot's choice."""
+    rig.beat(replace(OURS, loss=SetpointLoss(1.0, ("AUTO.LOITER",))))
+    os.kill(rig.supervisor.process.pid, signal.SIGSTOP)
+    rig.abandon()
+    time.sleep(1.2)
+    rig.report(LOITER, status=5)
+    os.kill(rig.supervisor.process.pid, signal.SIGCONT)
+    told = ""
+    while "has it" not in told and "flies it" not in told:
+        told += rig.next_message("STATUSTEXT").text
+    assert "its own failsafe flies it" in told
     rig.disarm()
 
 
@@ -237,10 +259,10 @@ def test_the_report_of_the_mode_may_be_old_and_is_awaited_then(rig: Rig) -> None
     rig.abandon()
     rig.vehicle.settimeout(1.0)
     with pytest.raises(TimeoutError):
-        rig.next_command()
+        rig.next_message()
     rig.vehicle.settimeout(LONG_S)
     rig.report(OFFBOARD)
-    assert rig.next_command().command == 176
+    assert rig.next_message().command == 176
     rig.disarm()
 
 
@@ -257,7 +279,7 @@ def test_a_vehicle_that_is_not_ours_or_on_the_ground_is_left_alone(
     rig.await_end()
     rig.vehicle.settimeout(0.0)
     with pytest.raises(BlockingIOError):
-        rig.next_command()
+        rig.next_message()
 
 
 def test_a_supervisor_that_ends_is_noticed_and_another_one_takes_over(rig: Rig) -> None:
@@ -275,7 +297,7 @@ def test_a_supervisor_that_ends_is_noticed_and_another_one_takes_over(rig: Rig) 
     rig.supervisor.await_ready()
     assert rig.supervisor.guards
     rig.beat(OURS)
-    assert rig.next_command().command == 176
+    assert rig.next_message().command == 176
     assert rig.supervisor.has_taken_over()
     rig.disarm()
 
