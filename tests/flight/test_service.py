@@ -129,6 +129,18 @@ def test_engaged_handed_back_and_engaged_again(served: Served, on: str) -> None:
     assert pair.service.current.outcome.exit_code == 0
 
 
+def test_a_pilot_may_take_a_vehicle_that_is_handed_back(served: Served) -> None:
+    """The service was stopped, and the vehicle has not shown hold yet."""
+    pair = served.engaged()
+    pair.service.request_stop()
+    pair.until(lambda: pair.phase is Phase.HAND_BACK, 0.5)
+    pair.instance.autopilot.commander.switch("POSCTL")
+    pair.until(pair.service.has_ended, 3.0)
+    outcome = pair.service.current.outcome
+    assert outcome is not None
+    assert (outcome.exit_code, pair.service.current.taken) == (0, True)
+
+
 def fly_north(pair: Serving, speed_mps: float) -> None:
     """The pilot flies north, faster than `speed_mps`; with ArduCopter by the sticks."""
 
