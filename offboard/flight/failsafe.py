@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from offboard.flight.authority import Standing
-from offboard.flight.phases import TRACKING, Action, Condition, Limits
+from offboard.flight.ground_contact import STOOD_S
+from offboard.flight.phases import TRACKING, Action, Condition, Limits, Phase
 from offboard.flight.state import COMMANDS_KEPT, FlightState
 from offboard.mavlink.events import MODE_KNOWN_S, ThrustReport
 
@@ -23,6 +24,7 @@ RECOVERY = 0.25  # speed at which a delay runs back
 STEP_MAX_S = 0.2  # what one sample counts for, also after a gap of telemetry
 SINK_MPS = 0.3  # that full thrust stops within the delay, on a vehicle that can be flown
 FULL_THRUST = 0.99
+STANDS_BELOW_M = 0.25  # references are at least 0.5 m above the take-off point
 THRUST_REPORT_S = 1.0  # age of a ThrustReport that counts
 
 
@@ -231,6 +233,20 @@ def sinks_with_full_thrust(flight: FlightState) -> str:
     return f"the vehicle sinks at {sink_mps:.1f} m/s with full thrust" if sinks else ""
 
 
+def stands_on_ground(flight: FlightState) -> str:
+    """Height of the reference above a vehicle that has stood at its take-off height for 1 s.
+
+    Not in the climb: a weak vehicle may be slow to leave the ground."""
+    position, flies = flight.vehicle.position, flight.phase in TRACKING - {Phase.CLIMB}
+    if position is None or not (flies and flight.contact.stood_for(STOOD_S)):
+        return ""
+    sample = flight.plan.sample(position.time_s)
+    above_m = position.position_ned_m[2] - sample.position_ned_m[2] if sample else 0.0
+    if not above_m > STANDS_BELOW_M:
+        return ""
+    return f"the vehicle stands on the ground, {above_m:.1f} m below the reference"
+
+
 def follows_others(flight: FlightState) -> str:
     """Thrust of the setpoint that PX4 follows (ATTITUDE_TARGET): none of our newest 40.
 
@@ -314,6 +330,7 @@ ROWS = (
     Row("battery", battery_empty, "limits.battery", LAND, 2.0),
     Row("thrust reserve", no_thrust_reserve, "limits.hover_thrust", LAND, 2.0),
     Row("full thrust", sinks_with_full_thrust, f"{SINK_MPS:g} m/s", LAND, 1.0),
+    Row("ground", stands_on_ground, f"{STANDS_BELOW_M:g} m", LAND, cause="ground contact"),
     Row("second sender", other_sender, "one message", HOLD, cause="second sender"),
     # within this time a pilot's change of the mode is seen, or the row "authority" acts
     Row("other setpoints", follows_others, "1e-5", HOLD, MODE_KNOWN_S, "second sender"),

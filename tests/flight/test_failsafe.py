@@ -189,6 +189,14 @@ def sinks(flight: FlightState, sink_mps: float) -> None:
     flight.thrusts.append(1.0)
 
 
+def stands(flight: FlightState, height_m: float) -> None:
+    """For 1.2 s; the reference is 3 m high."""
+    for step in range(1, 13):
+        reported = LocalPosition(NOW_S + 0.1 * step, (0.0, 0.0, -height_m), (0.0, 0.0, 0.0))
+        flight.vehicle.position = reported
+        flight.contact.on_position(reported)
+
+
 def follows(flight: Any, mode: str) -> None:
     hear(flight, ThrustReport(0.3))
     flight.authority.mode, flight.follows_others = mode, True
@@ -243,6 +251,7 @@ MEASURED: list[tuple[str, Measure, Any, Any]] = [
     ("battery", lambda flight, left: hear(flight, SystemHealth(True, left)), 0.1, 0.09),
     ("thrust reserve", hovers, 0.9, 0.91),
     ("full thrust", sinks, 0.3, 0.31),
+    ("ground", stands, 0.31, 0.29),
     ("second sender", hears_another, 5.0, 4.9),
     ("other setpoints", follows, "POSCTL", "OFFBOARD"),
     ("clock", clock(jumped_s=float), 0.0, 0.6),

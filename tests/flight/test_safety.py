@@ -70,6 +70,11 @@ def overloaded_twice() -> Pair:
     return px4.lap(HIGH, scenario=scenario, learning=IdentifySettings(), at=[more])
 
 
+def too_heavy(pair: Pair) -> None:
+    """It falls at once, with full thrust."""
+    pair.instance.autopilot.plant.scale_mass(4.0)
+
+
 GPS_LOST = {"fault": "gps_loss", "after": "engaged", "at_s": 7.0, "drift_mps": 0.45}
 SILENT_GPS = {"fault": "silent_message", "message": "GPS_RAW_INT", "after": "engaged", "at_s": 7.0}
 OTHER = another_companion(after="engaged", at_s=7.0, setpoint_rate_hz=10, thrust=0.5)
@@ -94,6 +99,12 @@ LANDED_EARLY: dict[str, Any] = {
     "a load that leaves no thrust reserve": (
         overloaded_twice, r".*% of its thrust \(limits\.hover_thrust is 0\.9\)",
         {"failsafes": ["thrust reserve"]},
+    ),
+    # "flown and landed" before, after 20 s on the ground
+    "it has fallen to the ground": (
+        lambda: copter.hover(at=[(TRACKING, too_heavy)]),
+        r"the vehicle stands on the ground, [0-9.]+ m below the reference",
+        {"failsafes": ["ground"], "soon": (TRACKING, 3.0), "ended_by": "ground contact"},
     ),
     # the autopilot brakes the climb with 2.5 m/s2 after it was asked to land
     "above the ceiling": (
