@@ -24,8 +24,8 @@ class StopRequests:
     """Context manager that stores SIGINT, SIGTERM and, unless it is ignored (nohup), SIGHUP.
 
     A second request, a second or more after the first, exits immediately: before the flight it
-    calls `at_once`, in flight the loop sees `repeated`. SIGHUP never counts as a second one: a
-    closing terminal may send it twice.
+    calls `at_once`, in flight the loop sees `repeated`. A third one interrupts a loop that hangs.
+    SIGHUP counts only as the first: a closing terminal may send it twice.
     """
 
     def __init__(self, at_once: Callable[[], None] = interrupt) -> None:
@@ -59,6 +59,8 @@ class StopRequests:
         if self._first_s is None:
             self._first_s = now_s
         elif number != signal.SIGHUP and now_s - self._first_s >= AGAIN_S:
+            if self.repeated and self.in_flight:
+                interrupt()
             self.repeated = True
         if self.repeated and not self.in_flight:
             self._at_once()

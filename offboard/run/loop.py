@@ -98,7 +98,8 @@ class Loop:
                 if self._companion.current.phase in WAITING:
                     self._error = ""  # the flight that it ended is over
             except BaseException as error:  # a law may even end the program
-                self._hand_back(error)
+                if not self._stops.repeated:  # else it interrupts a law that hangs
+                    self._hand_back(error)
         self._show()
         return self._outcome()
 

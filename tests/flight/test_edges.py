@@ -192,6 +192,18 @@ def test_two_signals(
     assert (outcome.exit_code == 0) is (turns_left == 0)
 
 
+def test_a_third_signal_interrupts_a_law_that_hangs(tmp_path: Path, now_s: list[float]) -> None:
+    def hang(left: int) -> None:
+        for _ in range(3):
+            os.kill(os.getpid(), signal.SIGINT)
+            now_s[0] += 1.1
+        pytest.fail("it is not interrupted")
+
+    outcome = fly(Brief(5, hang), tmp_path)
+    assert outcome.exit_code == 4
+    assert outcome.sentence.startswith("interrupted twice")
+
+
 def test_an_ignored_sighup_stays_ignored(tmp_path: Path) -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
