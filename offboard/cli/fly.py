@@ -102,7 +102,7 @@ def fly(
                 progress=displays.show,
                 tell=displays.tell,
             )
-            page = str(directory / "report.html") if report else ""
+            page = str(directory / "report.html") if report and not outcome.log_problem else ""
             displays.conclude(outcome.sentence, page)
     except KeyboardInterrupt:  # before the flight; in flight an interrupt lands the vehicle
         raise UserError(INTERRUPTED, INTERRUPT) from None

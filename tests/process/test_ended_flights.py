@@ -19,6 +19,7 @@ from processes import RECORDING, SHORT, Called, Spawn, children, ended, eventual
 
 from offboard.analysis import history, tlog
 from offboard.flight.flight import Outcome
+from offboard.link import after_flight
 from offboard.run import flight as run
 
 NO_VEHICLE = "offboard fly --connect udpin:127.0.0.1:PORT --set limits.connect_s=0.3 --out x"
@@ -94,13 +95,15 @@ def test_no_vehicle(called: Called, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("in_memory")
-def test_a_full_disk_lands(called: Called, tmp_path: Path) -> None:
+def test_a_full_disk_lands(called: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(after_flight, "begin_report", lambda _: None)
     with full_disk(380_000):
-        code, shown, said = called("offboard fly --sitl --out x", *SHORT)
+        code, shown, said = called("offboard fly --sitl --report --out x", *SHORT)
     assert (code, said.count("\n")) == (4, 1), said
     assert "flight.tlog cannot be written (File too large)" in said
     assert "land: the log x/flight.tlog cannot be written (File too large)" in shown
     assert "by the operator" not in shown
+    assert "report.html" not in shown  # the disk that is full has no room for it
     assert sum(1 for _ in tlog.read(tmp_path / "x" / "flight.tlog")) > 1000
 
 
