@@ -23,6 +23,7 @@ from offboard.analysis.history import History, gather
 from offboard.analysis.tracking import passed_s, tracking_metrics, window_of
 from offboard.analysis.verdict import begin_times, verdict_metrics
 from offboard.documents.errors import UserError, meant, plain
+from offboard.flight.decision import FAILED
 from offboard.flight.flight import Outcome
 from offboard.flight.outbox import Refusal
 from offboard.flight.phases import ExitCode, Phase
@@ -52,7 +53,8 @@ class Score:
     so that telemetry which is thinned or lost counts with the mean of what surrounds it
     (`analysis.tracking`). `position_gap_max_s` is the longest gap. The metrics of the certificate
     are of the decisions that were sent as they were certified, a share `certified_share` of all.
-    Times are vehicle time. A metric that the log does not hold is NaN.
+    A tick counts as one of `decisions`, `failed_decisions` or `missed_ticks`; `refused_setpoints`
+    are among `decisions`. Times are vehicle time. A metric that the log does not hold is NaN.
 
     Example, with the pytest fixture `fly`:
 
@@ -107,6 +109,7 @@ class Score:
     refused_not_ours: float = _metric("setpoints without authority")
     refused_unusable: float = _metric("setpoints not finite or beyond limits")
     decisions: float = _metric("decisions")
+    failed_decisions: float = _metric("decisions that raised an error")
     solve_time_p50_ms: float = _metric("time of a decision, median", "ms")
     solve_time_p99_ms: float = _metric("time of a decision, 99th perc.", "ms")
     certified_share: float = _metric("share of decisions sent as certified")
@@ -251,10 +254,11 @@ class Requirement:
 
 
 def decision_metrics(flown: History) -> dict[str, float]:
-    """Values of a Score; empty without records."""
+    """Values of a Score; empty without decisions."""
     columns = flown.records
+    failed = float(sum(event.what.startswith(FAILED) for event in flown.announcements))
     if not len(columns):
-        return {}
+        return {"failed_decisions": failed} if failed else {}
     refused = columns["refused"].astype(np.int64)
 
     def known(name: str) -> Array:
@@ -273,6 +277,7 @@ def decision_metrics(flown: History) -> dict[str, float]:
     skipped = columns["missed_ticks"][columns["pause_s"] > 0.0]
     return {
         "decisions": float(len(refused)),
+        "failed_decisions": failed,
         "answer_p50_ms": _percentile(answer_ms, 50),
         "answer_p99_ms": _percentile(answer_ms, 99),
         "answer_max_ms": _percentile(answer_ms, 100),

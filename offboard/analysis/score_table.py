@@ -38,11 +38,12 @@ def summary(score: Score, history: History) -> dict[str, str]:
     if math.isfinite(score.rmse_truth_m):
         error = f"{score.rmse_truth_m:.3f} m RMSE, {score.max_truth_m:.3f} m maximum"
         rows["true error"] = f"{error} (simulated vehicle)"
+    undecided = score.missed_ticks + score.failed_decisions
+    ticks = score.decisions + undecided
     if math.isfinite(score.answer_p99_ms):
         answer = f"{score.answer_p50_ms:.1f} ms (p99 {score.answer_p99_ms:.1f} ms)"
-        missed = f"{score.missed_ticks:.0f} of {score.decisions:.0f} ticks missed"
+        missed = f"{undecided + score.refused_setpoints:.0f} of {ticks:.0f} ticks missed"
         rows["timing"] = f"setpoint after {answer}, {missed}"
-    ticks = score.decisions + score.missed_ticks
     if busy := too_busy(score.skipped_ticks, ticks, score.pause_max_s):
         rows["computer"] = busy
     elif score.at_bound_share >= AT_LIMIT_SHARE:

@@ -6,6 +6,7 @@ import os
 import shlex
 import sys
 from contextlib import closing, nullcontext
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -69,10 +70,10 @@ def fly(
     known) or, as the last one, result. What is refused before the log is created (wrong options or
     files, a link that does not open) has no result: it is a sentence on stderr, exit code 2 or 3.
 
-    Exit codes: 0 flown and all requirements met; 1 a requirement missed; 2 usage or
-    configuration error, nothing sent; 3 not flown: no vehicle or connection, refused, or
-    stopped on the ground; 4 aborted in flight, or left armed; 130 interrupted before anything
-    was sent; 141 nobody reads the output.
+    Exit codes: 0 flown and all requirements met; 1 a requirement missed, as all are if the log
+    is gone; 2 usage or configuration error, nothing sent; 3 not flown: no vehicle or connection,
+    refused, or stopped on the ground; 4 aborted in flight, or left armed; 130 interrupted before
+    anything was sent; 141 nobody reads the output.
     """
     simulated.check(options)
     try:
@@ -101,15 +102,14 @@ def fly(
                 progress=displays.show,
                 tell=displays.tell,
             )
-            displays.conclude(outcome.sentence, str(directory / "report.html") if report else "")
+            page = str(directory / "report.html") if report and not outcome.log_problem else ""
+            displays.conclude(outcome.sentence, page)
     except KeyboardInterrupt:  # before the flight; in flight an interrupt lands the vehicle
         raise UserError(INTERRUPTED, INTERRUPT) from None
     if outcome.exit_code == 2:
         raise UserError(outcome.sentence)
     try:
-        _conclude(
-            outcome, directory, requirements, displays.lost, report=report, json_lines=json_lines
-        )
+        _conclude(outcome, directory, requirements, displays.lost, page=page, json_lines=json_lines)
     finally:
         if report:
             from offboard.link.after_flight import begin_report
@@ -138,17 +138,24 @@ def _conclude(
     requirements: list[Requirement],
     lost: list[str],
     *,
-    report: bool,
+    page: str,
     json_lines: bool,
 ) -> None:
-    """Print verdict and result. Exits with the code of the verdict. `lost`: sentences on what was
-    not shown of the flight."""
-    from offboard.analysis.score import judged
+    """Print verdict and result. Exits with the code of the verdict, also if the log was deleted
+    or replaced meanwhile; then every requirement is missed. `lost`: sentences on what was not shown
+    of the flight. `page`: where the report will be, empty without one."""
+    from offboard.analysis.score import Score, judged
     from offboard.analysis.score_table import summary
     from offboard.live.display import DIGITS, line
 
-    score, history = scored(directory)
-    outcome = judged(outcome, score)
+    rows: dict[str, str] = {}
+    try:
+        score, history = scored(directory)
+    except UserError as error:
+        score = Score(ended_by=f"it cannot be scored: {error}")
+        outcome, page = replace(outcome, sentence=f"{outcome.sentence}; {score.ended_by}"), ""
+    else:
+        outcome, rows = judged(outcome, score), summary(score, history)
     checked = [] if outcome.exit_code else requirements
     missed = [each for each in checked if not each.met(score.metrics())]
     results = "; ".join(each.sentence(score.metrics()) for each in missed or checked)
@@ -179,12 +186,11 @@ def _conclude(
             complain(f"{outcome.sentence}; requirement missed: {results}")
         else:
             say(f"{outcome.sentence}{'; requirement met: ' if results else ''}{results}")
-        rows = summary(score, history)
         if rows:
             rows["log"] = str(directory / "flight.tlog")
             rows["all figures"] = shlex.join(["offboard", "score", str(directory)])
-        if report:
-            rows["report"] = f"{directory / 'report.html'}, in some seconds"
+        if page:
+            rows["report"] = f"{page}, in some seconds"
         for label, text in rows.items():
             say(f"  {label:<{LABEL_WIDTH}}{text}", indent=2 + LABEL_WIDTH)
         sys.stdout.flush()

@@ -29,6 +29,9 @@ from offboard.identification.learner import Learner, VehicleUpdate
 from offboard.mavlink.outgoing import ReferenceRecord, SolverRecord
 from offboard.model.command import Command
 
+# begins the text of a decision that raised an error, which has no record of its tick: the analysis
+# counts the texts; and of one that was refused
+FAILED, MISSED = "decision failed: ", "decision missed: "
 NOTICEABLE_RADPS = 0.5  # a smaller change of the bandwidth is not announced
 # in a word -> what a missed decision is ascribed to
 _BY = {
@@ -59,7 +62,7 @@ def decide(flight: FlightState) -> bool:
         decided = _decided(flight)
         _send(flight, decided)
     except Exception as error:  # any error: the vehicle is in the air
-        _miss(flight, located(error), "controller")
+        _miss(flight, located(error), "controller", FAILED)
         return False
     flight.decided = decided
     if was_old and decided.refused == Refusal.STALE:
@@ -81,7 +84,7 @@ def finish(flight: FlightState, sent_s: float) -> None:
     try:
         _record(flight, decided, sent_s - flight.telemetry_arrived_s)
     except Exception as error:  # the certificate is the law's
-        _miss(flight, located(error), "controller")
+        _miss(flight, located(error), "controller", FAILED)
         return
     if not decided.refused:
         flight.missed = 0
@@ -89,10 +92,10 @@ def finish(flight: FlightState, sent_s: float) -> None:
             _identify(flight, flight.identification)
 
 
-def _miss(flight: FlightState, failure: str, cause: str) -> None:
+def _miss(flight: FlightState, failure: str, cause: str, begins: str = MISSED) -> None:
     flight.missed += 1
     flight.failure, flight.failure_cause = f"{_BY[cause]}: {failure}", cause
-    outbox.warn(flight, f"decision missed: {failure}")
+    outbox.warn(flight, f"{begins}{failure}")
 
 
 def _send(flight: FlightState, decided: Decided) -> None:

@@ -11,7 +11,6 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
-from functools import partial
 from pathlib import Path
 
 from jinja2 import Environment, StrictUndefined
@@ -21,7 +20,7 @@ from offboard import compiled
 from offboard.flight.flight import Outcome
 from offboard.flight.phases import WAITING, ExitCode, ServiceOptions
 from offboard.link import clock
-from offboard.link.after_flight import begin
+from offboard.link.after_flight import OneByOne
 from offboard.link.background import BackgroundWriter
 from offboard.link.connection import open_link
 from offboard.link.interface import Link, LinkError
@@ -81,7 +80,8 @@ def run(
         compiled.prepare(tell)
         preparation = stack.enter_context(closing(Preparation(load)))
         supervisor.await_ready()
-        recorder = Recorder(directory, score=partial(begin, "report" if report else "score"))
+        scoring = stack.enter_context(closing(OneByOne("report" if report else "score")))
+        recorder = Recorder(directory, score=scoring.add)
         stack.callback(recorder.close)
         if recorder.unscored:
             tell(UNSCORED.format(number=len(recorder.unscored), newest=recorder.unscored[-1]))

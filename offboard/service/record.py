@@ -109,8 +109,8 @@ class FlightRecord(FlightLog):
 
 class Recorder:
     """The log of the loop, and the directories of the flights, below `directory`. No method but
-    `close` waits. `score` starts the process that scores a flight, and outlives this one; a failure
-    is ignored. `unscored`: the flights of earlier services that have no score."""
+    `close` waits. `score` hands a flight to the process that scores it, and outlives this one; a
+    failure is ignored. `unscored`: the flights of earlier services that have no score."""
 
     def __init__(
         self,

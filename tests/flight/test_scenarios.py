@@ -16,6 +16,7 @@ import pytest
 from pair import Pair, in_phase
 from watch import HIGH, LANDED, announced, begun_s, copter, flown, px4, scenario_of, sent_after
 
+from offboard.analysis.score_table import summary
 from offboard.flight.phases import TRACKING, ExitCode, Phase
 from simulator import config
 from simulator.firmware.ardupilot import ARDUPILOT
@@ -151,10 +152,15 @@ def bridged(pair: Pair) -> None:
     """Two missed decisions are bridged with level setpoints; the next good one resets their
     count."""
     whole(pair)
-    missed_s = [at_s for at_s, _, frame in pair.sent if b"decision missed" in frame]
+    texts = (b"decision missed", b"decision failed")
+    missed_s = [at_s for at_s, _, frame in pair.sent if any(text in frame for text in texts)]
     bridges = [s for at_s, _, s in pair.setpoints if at_s in missed_s]
     assert len(missed_s) == len(bridges) == 4
     assert level(bridges)
+    scored = pair.score()
+    assert (scored.failed_decisions, scored.refused_unusable, scored.missed_ticks) == (2, 2, 0)
+    timing = summary(scored, pair.history())["timing"]
+    assert timing.endswith(f", 4 of {scored.decisions + 2:.0f} ticks missed")
 
 
 def took_off_by_command(pair: Pair) -> None:

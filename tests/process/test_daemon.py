@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import resource
 import shutil
 import signal
@@ -19,9 +20,11 @@ from typing import Any
 import pytest
 from processes import (
     LONG_S,
+    RECORDING,
     Called,
     Spawn,
     children,
+    ended,
     eventually,
     free_port,
     hovering,
@@ -34,6 +37,7 @@ from sim_peer import Peer
 from offboard.analysis import tlog
 from offboard.analysis.score import as_text, score_flight
 from offboard.documents.signing_key import create_key, read_key
+from offboard.link.after_flight import OneByOne
 
 SET_MODE = 176  # MAV_CMD
 OFFBOARD, HOLDING, RETURNING = 0x00060000, 0x03040000, 0x05040000
@@ -98,6 +102,21 @@ def many_clients(port: int, service: int) -> list[socket.socket]:
         with suppress(ConnectionError):
             client.send(b"GET /metrics HTTP/1.1\r\nHost:")
     return clients
+
+
+def test_flights_are_scored_one_at_a_time_also_after_the_service(tmp_path: Path) -> None:
+    before, flights = set(children(os.getpid())), [tmp_path / f"{n}\n" for n in range(3)]
+    service = OneByOne("score")
+    for flight in flights:
+        flight.mkdir()
+        shutil.copy(RECORDING, flight / "flight.tlog")
+        service.add(flight)
+    (scoring,) = set(children(os.getpid())) - before
+    service.close()
+    at_once = set()
+    eventually(lambda: at_once.add(len(children(scoring))) or ended(scoring))
+    assert at_once == {0, 1}
+    assert all((flight / "score.json").exists() for flight in flights)
 
 
 def test_a_pilot_engages_and_a_stop_hands_back(

@@ -18,6 +18,8 @@ import pytest
 from processes import RECORDING, SHORT, Called, Spawn, children, ended, eventually, full_disk
 
 from offboard.analysis import history, tlog
+from offboard.flight.flight import Outcome
+from offboard.link import after_flight
 from offboard.run import flight as run
 
 NO_VEHICLE = "offboard fly --connect udpin:127.0.0.1:PORT --set limits.connect_s=0.3 --out x"
@@ -93,14 +95,43 @@ def test_no_vehicle(called: Called, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("in_memory")
-def test_a_full_disk_lands(called: Called, tmp_path: Path) -> None:
+def test_a_full_disk_lands(called: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(after_flight, "begin_report", lambda _: None)
     with full_disk(380_000):
-        code, shown, said = called("offboard fly --sitl --out x", *SHORT)
+        code, shown, said = called("offboard fly --sitl --report --out x", *SHORT)
     assert (code, said.count("\n")) == (4, 1), said
     assert "flight.tlog cannot be written (File too large)" in said
     assert "land: the log x/flight.tlog cannot be written (File too large)" in shown
     assert "by the operator" not in shown
+    assert "report.html" not in shown  # the disk that is full has no room for it
     assert sum(1 for _ in tlog.read(tmp_path / "x" / "flight.tlog")) > 1000
+
+
+@pytest.mark.usefixtures("in_memory")
+@pytest.mark.parametrize("log", [None, "of another"], ids=["deleted", "replaced"])
+@pytest.mark.parametrize(
+    ("outcome", "options", "code"),
+    [
+        (Outcome(0, "flown and landed"), (), 0),
+        (Outcome(0, "flown and landed"), ("--require", "rmse_position_m<9"), 1),
+        (Outcome(4, "not disarmed"), ("--require", "rmse_position_m<9"), 4),
+    ],
+)
+def test_a_flight_whose_log_is_gone_keeps_its_outcome(
+    called: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    log: str | None, outcome: Outcome, options: tuple[str, ...], code: int,
+) -> None:  # fmt: skip
+    if log:
+        (tmp_path / "x").mkdir()
+        (tmp_path / "x" / "flight.tlog").write_text(log)
+    monkeypatch.setattr(run, "fly", lambda *_, **__: outcome)
+    found, *printed = called("offboard fly --sitl --out x", *options)
+    text = " ".join("".join(printed).split())
+    assert (found, f"{outcome.sentence}; it cannot be scored: x" in text) == (code, True), text
+    assert ("requirement missed: rmse_position_m is not in this log" in text) == (code == 1)
+    found, shown, _ = called("offboard fly --sitl --json-lines --out x", *options)
+    result = json.loads(shown.splitlines()[-1])
+    assert (found, result["exit_code"], result["completed"]) == (code, code, False)
 
 
 @pytest.mark.usefixtures("in_memory")
