@@ -159,7 +159,7 @@ class Loop:
         """Say whether it guards the flight. Start another one in place of one that has ended, while
         no flight needs this loop: it waits some milliseconds for the new process."""
         supervisor, current = self._supervisor, self._companion.current
-        if supervisor is None:
+        if supervisor is None or supervisor.has_taken_over():  # while this process was stopped
             return
         guards = supervisor.guards
         current.guard(guards)
