@@ -140,7 +140,7 @@ class TrackingLaw:
         self.period_s = period_s
         self.configured_radps = self.bandwidth_radps = settings.bandwidth_radps
         self.settings, self._vehicle_file = settings, vehicle
-        self._supports: object = None  # delays and uncertainty that the bandwidth was found for
+        self._bandwidth_found_for: object = None  # delays and their uncertainty
         self.set_vehicle(vehicle)
 
     def reset(self) -> None:
@@ -156,10 +156,10 @@ class TrackingLaw:
         bandwidth = self.bandwidth_radps
         if uncertainty is None:
             bandwidth = self.configured_radps
-        elif delays != self._supports:  # another drag alone changes no bandwidth
+        elif delays != self._bandwidth_found_for:  # another drag alone changes no bandwidth
             configured = self.configured_radps
             bandwidth = supported_bandwidth(vehicle, uncertainty, self.period_s, configured)
-        self._supports = delays
+        self._bandwidth_found_for = delays
         self._use_gains(bandwidth)
 
     def _use_gains(self, bandwidth_radps: float) -> None:
@@ -220,7 +220,8 @@ class TrackingLaw:
         )
         at = TILT_HELD
         led_tilt = held_lead(b[at], b1[at], b2[at], vehicle.tilt, period_s)
-        led_thrust = thrust[THRUST_HELD] + vehicle.thrust_lag_s * thrust_rate[THRUST_HELD]  # of T
+        # T lags, b_z does not
+        led_thrust = thrust[THRUST_HELD] + vehicle.thrust_lag_s * thrust_rate[THRUST_HELD]
         heading_rad = lead(
             sample.heading_rad[HEADING_HELD],
             sample.heading_rate_radps[HEADING_HELD],

@@ -29,8 +29,8 @@ from offboard.identification.learner import Learner, VehicleUpdate
 from offboard.mavlink.outgoing import ReferenceRecord, SolverRecord
 from offboard.model.command import Command
 
-# begins the text of a decision that raised an error, which has no record of its tick: the analysis
-# counts the texts; and of one that was refused
+# How the texts of missed decisions begin. One that raised an error has no record of its tick: the
+# analysis counts the texts
 FAILED, MISSED = "decision failed: ", "decision missed: "
 NOTICEABLE_RADPS = 0.5  # a smaller change of the bandwidth is not announced
 # in a word -> what a missed decision is ascribed to

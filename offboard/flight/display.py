@@ -20,7 +20,7 @@ DROPPED = (
 # In a phase, before the first reason: telemetry has only just been requested, checks are running,
 # the vehicle has not said yet which one it is
 FIRST_S = {Phase.CONNECT: 2.5, Phase.HEALTH: 5.0, Phase.STANDBY: 1.0}
-HELD_S = 0.5  # for so long a reason must have held: what has just begun to arrive seems slow
+HELD_S = 0.5  # a reason that holds for less is not told: a new message is slow at first
 AGAIN_S = 10.0  # the same reason, in other figures too
 
 

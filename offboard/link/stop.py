@@ -33,6 +33,7 @@ class StopRequests:
         self._first_s: float | None = None
         self.repeated = False
         self.in_flight = False
+        self.interruptible = False  # the loop runs, and ends in order if it is interrupted
 
     @property
     def requested(self) -> bool:
@@ -59,7 +60,7 @@ class StopRequests:
         if self._first_s is None:
             self._first_s = now_s
         elif number != signal.SIGHUP and now_s - self._first_s >= AGAIN_S:
-            if self.repeated and self.in_flight:
+            if self.repeated and self.interruptible:
                 interrupt()
             self.repeated = True
         if self.repeated and not self.in_flight:

@@ -86,7 +86,7 @@ class Loop:
 
     def run(self) -> Outcome:
         """Fly to the end. The first stop request lands, a second one exits immediately."""
-        self._stops.in_flight = True
+        self._stops.in_flight = self._stops.interruptible = True
         gc.collect()
         if not gc.get_freeze_count():  # by an earlier flight in this process
             gc.freeze()
@@ -100,6 +100,7 @@ class Loop:
             except BaseException as error:  # a law may even end the program
                 if not self._stops.repeated:  # else it interrupts a law that hangs
                     self._hand_back(error)
+        self._stops.interruptible = False  # log and outcome are not lost to another signal
         self._show()
         return self._outcome()
 

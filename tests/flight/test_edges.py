@@ -192,13 +192,22 @@ def test_two_signals(
     assert (outcome.exit_code == 0) is (turns_left == 0)
 
 
-def test_a_third_signal_interrupts_a_law_that_hangs(tmp_path: Path, now_s: list[float]) -> None:
+def test_a_third_signal_interrupts_a_law_that_hangs(
+    tmp_path: Path, now_s: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
     def hang(left: int) -> None:
         for _ in range(3):
             os.kill(os.getpid(), signal.SIGINT)
             now_s[0] += 1.1
         pytest.fail("it is not interrupted")
 
+    def close(log: FlightLog) -> None:  # another one, while what was flown is written
+        monkeypatch.setattr(FlightLog, "close", ended)
+        os.kill(os.getpid(), signal.SIGINT)
+        log.close()
+
+    ended = FlightLog.close
+    monkeypatch.setattr(FlightLog, "close", close)
     outcome = fly(Brief(5, hang), tmp_path)
     assert outcome.exit_code == 4
     assert outcome.sentence.startswith("interrupted twice")
@@ -258,6 +267,19 @@ def test_a_stopped_controller_leaves_the_answers_to_the_supervisor(tmp_path: Pat
     watcher, link = Watcher(), Wire(stopped)
     assert fly(Brief(5), tmp_path, link=link, supervisor=watcher).exit_code == 4
     assert link.read == 2
+
+
+def test_a_supervisor_that_has_taken_over_is_not_called_silent(tmp_path: Path) -> None:
+    """The controller was stopped at the end of a turn."""
+
+    def stopped(sent_s: float) -> Sequence[bytes]:
+        watcher.taken, watcher.answers = True, False
+        return ()
+
+    flight, watcher = Brief(5), Watcher()
+    flight.finish_turn = stopped  # type: ignore[method-assign]
+    assert fly(flight, tmp_path, supervisor=watcher).exit_code == 4
+    assert UNANSWERED not in flight.announced
 
 
 def test_a_supervisor_that_does_not_answer_is_announced_once_and_when_it_does(
