@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import struct
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -260,6 +260,17 @@ def table(times: Any, **columns: Any) -> Rows:
     return rows
 
 
+def parts(values: NDArray[Any]) -> list[NDArray[Any]]:
+    """Parts of about 8192 rows. What is computed of a part needs little memory: a log may last
+    many hours."""
+    return np.array_split(values, 1 + len(values) // 8192)
+
+
+def in_parts(function: Callable[[Rows], Array], rows: Rows) -> Array:
+    """`function` of all rows, (N, ...)."""
+    return np.concatenate([function(part) for part in parts(rows)])
+
+
 def continuous_s(stamps_ms: Any, anchor_ms: float) -> Any:
     """Vehicle time in s from `time_boot_ms`, which begins again at zero after 2^32 ms.
 
@@ -313,6 +324,8 @@ class _Collector:
             name = f"{name} {entry.message.array_id}" if name == _ARRAY else name
         elif ours or (entry.system_id, entry.component_id) != vehicle or self._ahead(entry):
             return
+        if name == "TIMESYNC" and ours == any(payload[:8]):  # tc1 is 0 in a request
+            return  # the delay of the link is that of our requests and their replies
         usual = self._samples.get((ours, _INSTEAD_OF.get(name, "")))
         if (ours, name) in self._samples and (usual is None or usual.empty):  # else only memory
             self._samples[ours, name].add(payload, self._now_ms, entry.unix_us / 1e6)
@@ -429,14 +442,16 @@ class _Collector:
 
 
 def _truth(rows: Mapping[str, Rows], origin: Geodetic | None) -> Rows:
-    none = {"time_s": np.zeros(0), "unix_s": np.zeros(0)}
-    parts = [table(none, position_ned_m=np.zeros((0, 3), np.float32))]
     for name, unit in _TRUTH.items():
         if origin is not None and len(rows[name]):
-            places = np.column_stack((rows[name]["place"] / 1e7, rows[name]["altitude"] / unit))
-            position = position_ned_m(places, origin).astype(np.float32)
-            parts.append(table(rows[name], position_ned_m=position))
-    return np.concatenate(parts)
+
+            def position(part: Rows, unit: float = unit, origin: Geodetic = origin) -> Array:
+                places = np.column_stack((part["place"] / 1e7, part["altitude"] / unit))
+                return position_ned_m(places, origin).astype(np.float32)
+
+            return table(rows[name], position_ned_m=in_parts(position, rows[name]))
+    none = {"time_s": np.zeros(0), "unix_s": np.zeros(0)}
+    return table(none, position_ned_m=np.zeros((0, 3), np.float32))
 
 
 def _local(rows: Rows) -> Rows:
@@ -458,9 +473,8 @@ def _turned(rows: Rows) -> Rows:
 
 
 def _link_delay(requests: Rows, replies: Rows) -> Rows:
-    """From the vehicle's replies to our TIMESYNC requests, which have tc1 = 0."""
-    asked = requests["asked_ns"][requests["answered_ns"] == 0]
-    replies = replies[(replies["answered_ns"] != 0) & np.isin(replies["asked_ns"], asked)]
+    """From the vehicle's replies to our TIMESYNC requests."""
+    replies = replies[np.isin(replies["asked_ns"], requests["asked_ns"])]
     times = {"time_s": 1e-9 * replies["asked_ns"], "unix_s": np.full(len(replies), np.nan)}
     return table(times, delay_s=1e-9 * (replies["answered_ns"] - replies["asked_ns"]))
 

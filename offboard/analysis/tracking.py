@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import PPoly
 
-from offboard.analysis.history import History, Rows
+from offboard.analysis.history import History, Rows, in_parts, parts
 from offboard.flight.phases import Phase
 from offboard.model.frames import (
     heading_from_quaternion,
@@ -64,8 +64,19 @@ def tracking_metrics(flown: History, window: tuple[float, float]) -> dict[str, f
     reference, clock = Reference(flown.reference), _Clock(flown)
 
     def away(rows: Rows, column: str, derivative: int = 0) -> Weighted:
-        errors = rows[column] - reference.position(rows["time_s"], derivative)
-        return weighted(np.linalg.norm(errors, axis=1), clock.shares(rows["time_s"]))
+        def size(part: Rows) -> Array:
+            errors = part[column] - reference.position(part["time_s"], derivative)
+            return np.asarray(np.linalg.norm(errors, axis=1))
+
+        return weighted(in_parts(size, rows), clock.shares(rows["time_s"]))
+
+    def turned_deg(part: Rows) -> Array:
+        turn = heading_from_quaternion(part["quaternion"]) - reference.heading(part["time_s"])
+        return np.asarray(np.abs(np.degrees(wrap_pi(turn))))
+
+    def tilted_deg(part: Rows) -> Array:
+        down = thrust_direction_from_quaternion(part["quaternion"])[:, 2]
+        return np.degrees(np.arccos(np.clip(down, -1.0, 1.0)))
 
     fitness = _fitness(flown, reference, window)
     rows = _within(flown.position, window)
@@ -76,11 +87,9 @@ def tracking_metrics(flown: History, window: tuple[float, float]) -> dict[str, f
     thrust = weighted(rows["thrust"].astype(np.float64), clock.shares(rows["time_s"]))
     rows = _within(flown.attitude, window)
     weights = clock.shares(rows["time_s"])
-    direction = thrust_direction_from_quaternion(rows["quaternion"])
-    turn = heading_from_quaternion(rows["quaternion"]) - reference.heading(rows["time_s"])
-    heading = weighted(np.abs(np.degrees(wrap_pi(turn))), weights)
-    tilt = weighted(np.degrees(np.arccos(np.clip(direction[:, 2], -1.0, 1.0))), weights)
-    rates = rows["rates_radps"].astype(np.float64)
+    heading = weighted(in_parts(turned_deg, rows), weights)
+    tilt = weighted(in_parts(tilted_deg, rows), weights)
+    rates = rows["rates_radps"]
     return {
         "rmse_position_m": position.rms,
         "mean_position_m": position.mean,
@@ -101,8 +110,8 @@ def tracking_metrics(flown: History, window: tuple[float, float]) -> dict[str, f
         if len(steps)
         else math.nan,
         "tilt_max_deg": tilt.max,
-        "roll_rate_sd_radps": weighted(rates[:, 0], weights).sd,
-        "pitch_rate_sd_radps": weighted(rates[:, 1], weights).sd,
+        "roll_rate_sd_radps": weighted(rates[:, 0].astype(np.float64), weights).sd,
+        "pitch_rate_sd_radps": weighted(rates[:, 1].astype(np.float64), weights).sd,
         **_agitation(reference, rows, weights),
     }
 
@@ -127,12 +136,11 @@ def _agitation(reference: Reference, attitude: Rows, weights: Array) -> dict[str
     """Motion beside that of the reference: thrust direction and rates minus their linear fit by
     the reference's velocity, acceleration and jerk. The fit needs no model of drag and lag.
 
-    The factor R of the samples has their residuals; made of parts, it takes little memory.
+    The factor R of the samples has their residuals.
     """
     factor: Any = np.zeros((0, 11))
-    parts = 1 + len(weights) // 8192
-    shares = np.array_split(np.sqrt(weights / weights.sum())[:, None], parts)
-    for rows, share in zip(np.array_split(attitude, parts), shares, strict=True):
+    shares = parts(np.sqrt(weights / weights.sum())[:, None])
+    for rows, share in zip(parts(attitude), shares, strict=True):
         explained = [reference.position(rows["time_s"], order)[:, :2] for order in (1, 2, 3)]
         direction = thrust_direction_from_quaternion(rows["quaternion"])[:, :2]
         motion = direction, rows["rates_radps"][:, :2]
@@ -172,7 +180,8 @@ class _Clock:
         interval before it and half of the one after it (the trapezoidal rule). So a metric does not
         depend on how often the signal was sampled, and a gap counts with its length.
         """
-        halves = 0.5 * np.diff(np.interp(times, self._times, self._passed_s))
+        halves = np.diff(np.interp(times, self._times, self._passed_s))
+        halves *= 0.5
         weights = np.zeros(len(times))
         weights[:-1] += halves
         weights[1:] += halves
