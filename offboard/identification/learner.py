@@ -139,6 +139,8 @@ class Learner(VehicleEstimate):
         # What to fly with as was told last, and whether that was in the turn before
         self._told = VehicleUpdate(self.vehicle, self.uncertainty)
         self._has_told = False
+        if known is None:
+            self.cause = "the vehicle's delay is not identified yet"
         if not settings.online:
             self.cause = (
                 f"without identification the vehicle file's delay may be wrong by "

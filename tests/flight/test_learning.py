@@ -116,6 +116,8 @@ def test_slow_attitude_is_identified(tmp_path: Path) -> None:
     tilt = pair.companion.model.tilt
     assert tilt.natural_frequency_radps == pytest.approx(3.0, rel=0.1)
     assert tilt.delay_s == pytest.approx(0.057, abs=0.02)
+    said = " | ".join(pair.companion.announced)
+    assert "(configured 7.0): the vehicle's delay is not identified yet" in said
 
 
 def test_white_noise_of_positions_is_no_delay_of_the_thrust(tmp_path: Path) -> None:
