@@ -155,6 +155,21 @@ def started_on_the_ground(flight: FlightState) -> bool:
     return flight.request is Request.START and may_arm and usable(flight)
 
 
+def not_started(flight: FlightState) -> str:
+    """Why the vehicle that waits is not started on request."""
+    vehicle, contact, service = flight.vehicle, flight.contact, flight.service
+    if contact.in_the_air and not flight.engaged:
+        return f"it flies in {vehicle.mode}: switch to {flight.authority.engage_mode} instead"
+    if contact.in_the_air:
+        prevented = (unfit, other_sender, mode_unknown, silent, blind)
+        return next(
+            filter(None, (each(flight) for each in prevented)), "it may stand on the ground"
+        )
+    if service is None or not service.arms:
+        return "it is on the ground, and may not be armed without --arms"
+    return "it is armed on the ground" if vehicle.armed else unfit(flight)
+
+
 # ---------------------------------------------------------------------- to the air
 
 

@@ -219,6 +219,6 @@ def _answer(flight: FlightState, asked: CommandRequest) -> None:
             request, result = wanted.get(asked.parameters[0], request), DENIED
     if request is not Request.NONE:
         sender = f"system {asked.system_id} component {asked.component_id}"
-        obeyed = transitions.obey(flight, request, sender) or request is flight.obeyed
+        obeyed = transitions.obey(flight, request, sender)
         result = ACCEPTED if obeyed else TEMPORARILY_REJECTED
     outbox.send(flight, CommandResult(asked.command, result, asked.system_id, asked.component_id))

@@ -95,16 +95,24 @@ def advance(flight: FlightState) -> None:
 
 def obey(flight: FlightState, request: Request, sender: str) -> bool:
     """Take the row that this request of a ground station leads to now, after what is due without
-    it; whether there is one."""
+    it; whether there is one, or the flight obeys it already. A refusal says why, once."""
     advance(flight)
     flight.request = request
     row = next_row(flight)
+    obeyed = row is not None or request is flight.obeyed
+    sentence = f"{request.value} requested by {sender}"
     if row is not None:
-        outbox.announce(flight, f"{request.value} requested by {sender}")
+        outbox.announce(flight, sentence)
         _enter(flight, row)
         flight.obeyed = request
+    elif not obeyed:
+        starts = request is Request.START and flight.phase is Phase.STANDBY
+        why = starting.not_started(flight) if starts else f"not in the phase {flight.phase.value}"
+        sentence = f"refused: {sentence}, but {why}"
+        if sentence not in flight.announced[-1:]:
+            outbox.announce(flight, sentence)
     flight.request = Request.NONE
-    return row is not None
+    return obeyed
 
 
 def _note_failsafe(flight: FlightState) -> None:

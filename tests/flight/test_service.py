@@ -318,6 +318,7 @@ def test_engaged_while_it_lands_or_stands_it_is_not_flown_and_the_pilot_is_told(
     pair.command(START)
     pair.run(1.0)
     assert (pair.phase, pair.acks) == (Phase.STANDBY, [(START, TEMPORARILY_REJECTED)])
+    assert said(pair, "but it may stand on the ground")
     assert sent_after(pair, switched_s) == []
 
 
@@ -336,6 +337,7 @@ def test_without_arms_it_stays_on_the_ground(served: Served) -> None:
     pair.command(START)
     pair.run(3.0)
     assert pair.acks == [(START, TEMPORARILY_REJECTED)]
+    assert said(pair, "but it is on the ground, and may not be armed without --arms")
     assert commanded(pair, 0.0) == []
     pair.restart()
     pair.logs.left = "px4-1-1"
@@ -441,8 +443,11 @@ def test_requests_over_mavlink(served: Served) -> None:
     for command, parameter in ((SET_MODE, 1.0), (START, 0.0), (PAUSE_CONTINUE, 1.0)):
         ask(command, parameter, result=TEMPORARILY_REJECTED)
     told = [text for text in pair.service.current.announced if "ted by" in text]
-    words = ["pause", "continue", "start", "hand back"]
+    refused = [f"refused: {word}" for word in ("continue", "hand back", "start", "continue")]
+    words = [refused[0], "pause", "continue", "start", "hand back", *refused[1:]]
     assert [text.split(" requested by ")[0] for text in told] == words
+    assert told[0].endswith("but not in the phase track")
+    assert told[-2].endswith("but it flies in BRAKE: switch to GUIDED instead")
     pair.engage()
     pair.until(lambda: pair.phase is Phase.TRACK, 30.0)
     ask(PAUSE_CONTINUE, 0.0)
