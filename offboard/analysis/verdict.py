@@ -1,8 +1,8 @@
 """The verdict on a flight, from its log alone: was all of it flown, and what ended it.
 
-A flight is completed if the whole reference was tracked, the vehicle landed, and it was disarmed;
-one that the pilot engaged in the air also if the vehicle was given back while it hovered at the end
-of the reference.
+A flight is completed if the whole reference was tracked, nothing else ended it, the vehicle landed,
+and it was disarmed; one that the pilot engaged in the air also if the vehicle was given back while
+it hovered at the end of the reference.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from offboard.analysis.history import Event, History
 from offboard.flight.estimates import PositionJumps
 from offboard.flight.ground_contact import Touchdown, moved
+from offboard.flight.phases import RESTS
 from offboard.mavlink.event_record import SUPERVISOR
 from offboard.mavlink.events import CRITICAL, LocalPosition
 
@@ -121,7 +122,8 @@ def irregular(phases: tuple[Event, ...]) -> list[Event]:
         event
         for before, event in pairwise(phases)
         if event.phase in {"hold", "land", "stand down", *_LANDING_ENDS}
-        and (before.phase, event.phase) not in (("hover", "land"), ("land", "disarmed"))
+        and (before.phase, event.phase) != ("land", "disarmed")
+        and (before.phase, event.phase, event.reason) != ("hover", "land", RESTS)
     ]
 
 

@@ -28,6 +28,7 @@ from offboard.link.stop import StopRequests
 from offboard.run.configuration import build_controller, build_track
 from offboard.run.sitl import check_scenario
 
+TABLES = ("campaign.csv", "campaign.html", "worst.csv")  # that are replaced as flights end
 KEPT = "flights"  # directory of the logs that are kept
 KEPT_FILES = {"report": "report.html", "log": "flight.tlog"}
 TABLE_S = 5.0  # at least, from one table to the next
@@ -207,6 +208,12 @@ class Campaign:
         with naming(source):
             self.cases = expand(file, link)
             check(self.cases)
+        taken = [name for name in TABLES if (directory / name).exists()]
+        if taken and not (directory / "results").exists():
+            raise UserError(
+                f"{directory / taken[0]} exists, without results of a campaign beside it; choose "
+                "another --out, or delete it"
+            )
         self.results = Results(directory, code_hash())
         self._requirements = [Requirement.parse(text) for text in file.require]
         self._next_table_s = 0.0

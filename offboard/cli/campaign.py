@@ -271,7 +271,7 @@ def tune(
         from offboard.campaign.workers import local_workers
 
         tuning = Tuning(*read_tune(file))
-        results = Results(profile.with_suffix(".tune"), code_hash())
+        results = Results(profile.with_name(f"{profile.name}.tune"), code_hash())
     counter = Counter(out, tuning.flights)
     with (
         resumable(),

@@ -29,7 +29,7 @@ from offboard.cli.shared import (
     write,
 )
 from offboard.documents.arguments import LIVE_PAGE
-from offboard.documents.command_line import INTERRUPT, complain, drop_output, explained
+from offboard.documents.command_line import INTERRUPT, complain, drop, explained
 from offboard.documents.errors import UserError, plain
 
 if TYPE_CHECKING:
@@ -195,7 +195,7 @@ def _conclude(
             say(f"  {label:<{LABEL_WIDTH}}{text}", indent=2 + LABEL_WIDTH)
         sys.stdout.flush()
     except OSError as error:  # the exit code stays that of the flight
-        drop_output()
+        drop(sys.stdout)
         complain(f"{outcome.sentence}; {explained(error)}")
     if code:
         raise typer.Exit(code)

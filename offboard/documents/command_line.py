@@ -27,20 +27,23 @@ def run(load: Callable[[], Callable[[], object]]) -> NoReturn:
     error of a file or of the output, with 2; an interrupt with 130. Where nobody reads the output
     any more (`| head -1`), the exit code is 141 without a sentence.
     """
-    if sys.stdout is not None:  # text that the encoding of the output does not have is escaped
-        sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # whoever started it has closed it
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
+    # text that the encoding of the output does not have is escaped
+    sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     try:
         load()()
         sentence, code = "", 0
     except SystemExit as ended:
         sentence, code = "", ended.code if isinstance(ended.code, int) else 0
         if isinstance(ended.__context__, BrokenPipeError):  # typer's exit, with 1
-            drop_output()
+            drop(sys.stdout)
             code = CLOSED_PIPE
     except KeyboardInterrupt:
         sentence, code = INTERRUPTED, INTERRUPT
     except BrokenPipeError:
-        drop_output()
+        drop(sys.stdout)
         sentence, code = "", CLOSED_PIPE
     except MemoryError:
         sentence, code = "not enough memory", USAGE
@@ -63,8 +66,12 @@ def run(load: Callable[[], Callable[[], object]]) -> NoReturn:
 
 
 def complain(text: str) -> None:
-    """Print to stderr at once; on a terminal each line is wrapped at words to its width."""
-    tell(text, sys.stderr)
+    """Print to stderr at once; on a terminal each line is wrapped at words to its width. If nobody
+    can read it, exit codes stay as they are."""
+    try:
+        tell(text, sys.stderr)
+    except OSError:
+        drop(sys.stderr)
 
 
 def tell(text: str, file: TextIO) -> None:
@@ -108,11 +115,11 @@ def _flushed() -> OSError | None:
     try:
         sys.stdout.flush()
     except OSError as error:
-        drop_output()
+        drop(sys.stdout)
         return error
     return None
 
 
-def drop_output() -> None:
-    """Send stdout to /dev/null from now on, after an error of it."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+def drop(output: TextIO) -> None:
+    """Send what is printed there to /dev/null from now on, after an error of it."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), output.fileno())

@@ -100,8 +100,12 @@ class FlightPlan:
     def pause(self, time_s: float) -> None:
         """Come to rest on the track, which has begun."""
         assert self._planned is not None
-        if self._paused and self._paused.at_full_speed(time_s):
-            self.start_track(time_s - self._paused.own_s(time_s))
+        paused = self._paused
+        if paused and time_s < paused.resumed_s:  # it still stops: it does not run again
+            self._paused = self._planned = paused.resumed(math.inf)
+            return
+        if paused and paused.at_full_speed(time_s):
+            self.start_track(time_s - paused.own_s(time_s))
         self._paused = self._planned = Moved(self._planned, paused_s=time_s)
 
     def resume(self, time_s: float) -> None:

@@ -20,6 +20,7 @@ from offboard.flight.phases import (
     FLYING,
     MOVING,
     OUTAGE_MAX_S,
+    RESTS,
     TRACKING,
     Action,
     Condition,
@@ -243,6 +244,6 @@ SERVICE_ENDS = (
 )
 AT_REST = {
     "hold": (),
-    "land": (Transition({HOVER}, at_rest, LAND, reason="at rest"),),
+    "land": (Transition({HOVER}, at_rest, LAND, reason=RESTS),),
     "repeat": (Transition({HOVER}, at_rest, CLIMB, reason="once more"),),
 }

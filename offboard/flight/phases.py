@@ -81,6 +81,7 @@ MOVING = frozenset({Phase.JOIN, Phase.TRACK})  # along the reference
 FLYING = TRACKING | {Phase.TAKEOFF, Phase.HAND_BACK, Phase.HOLD}
 OUTAGE_MAX_S = 300.0  # so long a vehicle that was asked to land, and is not heard, is waited for
 STOPPED = "stop requested by the operator"
+RESTS = "at rest"  # why a landing begins that is no early end
 
 
 class ExitCode:

@@ -165,13 +165,12 @@ class Senders:
         return frame.message.target_system in (0, self.own.system_id)
 
     def _is_companion(self, frame: Frame) -> bool:
-        """Whether it is the HEARTBEAT of a companion computer. On PX4 some of them call themselves
-        a ground station, but with the system id of the vehicle."""
+        """Whether it is the HEARTBEAT of another companion computer of our vehicle, with the
+        vehicle's system id as ours. On PX4 some call themselves a ground station."""
         if frame.message_id != HEARTBEAT or frame.message.autopilot != _NO_AUTOPILOT:
             return False
         on_vehicle = frame.system_id == self.own.system_id
-        kinds = (TYPE_ONBOARD_CONTROLLER, *((TYPE_GCS,) if on_vehicle else ()))
-        return frame.message.type in kinds
+        return on_vehicle and frame.message.type in (TYPE_ONBOARD_CONTROLLER, TYPE_GCS)
 
     def note(self, frame: Frame, now_s: float) -> Dialect | DropReason | None:
         """The autopilot that a frame shows, why it is none, or None if it is no HEARTBEAT of an

@@ -233,7 +233,8 @@ def main() -> None:
         signal.signal(number, signal.SIG_IGN)  # they are meant for the controller
     channel = socket.socket(fileno=os.dup(sys.stdin.fileno()))
     watch = Watch(channel)
-    _say_to(channel, READY)
+    with suppress(OSError):  # it has ended already
+        _say_to(channel, READY)
     reason, before_s = "", clock.monotonic_s()
     while not (reason or watch.ended):
         select.select([], [], [], POLL_S)

@@ -328,6 +328,15 @@ def test_a_second_flight_that_waits_disturbs_no_flight() -> None:
     assert said(pair, "another companion computer is on the link: system 1 component 191")
 
 
+def test_an_offboard_that_flies_another_vehicle_on_the_link_disturbs_no_flight() -> None:
+    """Its HEARTBEAT, which a router forwards to us, shows that it tracks: it was taken for a second
+    controller of our vehicle, and the flight ended."""
+    other = another_companion(system=2, setpoint_rate_hz=0)
+    pair = px4.hover(scenario=other, system_id=1)
+    flown(pair, failsafes=())
+    assert not said(pair, "another companion computer")
+
+
 def test_a_failsafe_is_taken_over_if_that_is_allowed() -> None:
     pair = copter.lap(scenario="in_failsafe", limits={"begin_in_failsafe": True},
                       at=[(in_phase(Phase.CLIMB, 1.0), stop)])  # fmt: skip

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -300,6 +301,15 @@ def test_a_supervisor_that_ends_is_noticed_and_another_one_takes_over(rig: Rig) 
     assert rig.next_message().command == 176
     assert rig.supervisor.has_taken_over()
     rig.disarm()
+
+
+def test_it_ends_in_silence_with_a_controller_that_ends_before_it_has_started() -> None:
+    ours, its = socket.socketpair()
+    ours.close()
+    command = [sys.executable, "-P", "-m", "offboard.supervisor.process"]
+    with its:
+        ended = subprocess.run(command, stdin=its, capture_output=True, timeout=LONG_S, check=False)
+    assert (ended.returncode, ended.stderr) == (0, b"")
 
 
 def test_a_supervisor_that_cannot_be_started_is_said(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from faults import ATTITUDE, POSITION, frame_id, rewritten, setting
+from faults import ATTITUDE, POSITION, frame_id, rewritten, setting, stop
 from pair import PX4, UNIX_EPOCH_US, Pair, calm_hover, frames_of, hover, in_phase, make
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from typer.testing import CliRunner
-from watch import watched
+from watch import aborted, watched
 
 from offboard.analysis.history import History
 from offboard.analysis.score import Score, judged, score
@@ -126,6 +126,12 @@ def test_a_flight_is_not_completed_that_is_not_tracked_landed_and_disarmed(flown
     ):
         scored = score(replace(flown, **changed))
         assert (scored.completed, scored.ended_by.startswith(why)) == (0.0, True), scored.ended_by
+
+
+def test_a_flight_that_is_stopped_after_its_reference_is_not_completed() -> None:
+    """Its exit code was 4, and by its score it was completed."""
+    pair = hover(aloft=True, at=[(in_phase(Phase.HOVER, 0.1), stop)])
+    aborted(pair, "stop requested", ended_by="operator")
 
 
 def test_a_log_with_parts_missing_is_scored_as_far_as_it_goes(flown: History) -> None:

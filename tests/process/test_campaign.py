@@ -29,6 +29,7 @@ from offboard.campaign.document import CampaignFile, Promises, read_campaign
 from offboard.campaign.flight import Job
 from offboard.campaign.results import Record, Results, code_hash
 from offboard.campaign.run import Campaign, Summary
+from offboard.campaign.tune import Tuned, Tuning
 from offboard.campaign.workers import Workers, cluster_workers, local_workers
 from offboard.documents.errors import DocumentError, UserError
 
@@ -287,6 +288,24 @@ def test_results_of_other_code_are_refused_and_kept(
         campaign(FILE, tmp_path)
     (tmp_path / "results" / ".DS_Store").touch()  # macOS makes one
     assert Results(tmp_path, "0123456789ab").finished() == 1
+
+
+@pytest.mark.parametrize("name", ["campaign.csv", "campaign.html", "worst.csv"])
+def test_a_table_of_somebody_else_is_not_replaced(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(UserError, match=f"{name} exists, without results of a campaign"):
+        campaign(FILE, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_a_profile_may_have_any_name(
+    called: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The folder of its flights had this one's, so that nothing could be written in the end."""
+    better = Tuned((("controller.bandwidth_radps", 5.0),), 5, 2.0, 1.0, 0.01)
+    monkeypatch.setattr(Tuning, "run", lambda *_: better)
+    assert called("offboard tune tracking --out x.tune")[0] == 0
+    assert "bandwidth_radps: 5.0" in (tmp_path / "x.tune").read_text()
 
 
 def test_what_is_finished_on_a_full_disk_is_kept_and_a_worker_of_its_own_flies_the_rest(

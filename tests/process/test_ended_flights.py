@@ -186,8 +186,10 @@ CLOSED = "import os; r, w = os.pipe(); os.close(r); os.dup2(w, 1)"
     [
         (IMPORTS, ["--help"], 130, "interrupted\n"),  # by the 100th import of `main`
         (CLOSED, ["score", str(RECORDING)], 141, ""),  # nobody reads it: as SIGPIPE
+        (f"{CLOSED}; os.dup2(w, 2)", ["check", "nothere.yaml"], 2, ""),
+        ("sys.stdout = sys.stderr = None", ["check", "nothere.yaml"], 2, ""),
     ],
-    ids=["interrupted import", "closed pipe"],
+    ids=["interrupted import", "closed pipe", "closed pipe of both", "closed output"],
 )
 def test_a_process_ends_in_order(begin: str, command: list[str], code: int, said: str) -> None:
     script = f"import sys; sys.argv = {['offboard', *command]!r}\n{begin}\n"

@@ -180,7 +180,8 @@ def test_refused_with_time_value_and_limit(
     settings: dict[str, object], what: str, limit: str
 ) -> None:
     flown = track(**settings)
-    with pytest.raises(ValueError, match=f"beyond the limit of {re.escape(limit)}") as caught:
+    side = "below" if limit in ("0.3 m", "3.27 m/s^2") else "beyond"
+    with pytest.raises(ValueError, match=f"{side} the limit of {re.escape(limit)}") as caught:
         check(flown, vehicle(tilt_max_rad=0.4 / 0.9))
     sentence = str(caught.value)
     found = re.match(rf"the reference asks for {what} (-?[\d.e+]+) \S+ at ([\d.]+) s, ", sentence)

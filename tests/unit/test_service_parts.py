@@ -31,6 +31,7 @@ from offboard.link.stop import StopRequests
 from offboard.mavlink.events import VehicleFound
 from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings
+from offboard.reference.track import STOP_S
 from offboard.run.configuration import load
 from offboard.run.flight import build
 from offboard.service import daemon, preparation
@@ -342,6 +343,22 @@ def test_a_reference_that_is_placed_low_stays_clear_of_the_ground() -> None:
     raised_m = plan.place_start((3.0, 4.0, -1.0), REST, 0.0)
     assert raised_m == pytest.approx(max(falls_m - 1.0 + CLEAR_M, 0.0), abs=0.02)
     assert plan.place_start((3.0, 4.0, -20.0), REST, None) == pytest.approx(falls_m, abs=0.02)
+
+
+def test_a_pause_that_is_continued_and_paused_again_while_it_stops_is_one_pause() -> None:
+    """Each such pair made every later sample slower, until one raised RecursionError."""
+    config = load("flight", choices={"reference": "lemniscate", "vehicle": "px4_sih"})
+    plan = FlightPlan(build(config).track)
+    plan.start_track(100.0)
+    plan.pause(110.0)
+    for time_s in np.linspace(110.0, 110.0 + STOP_S, 1000, endpoint=False).tolist():
+        plan.resume(time_s)
+        plan.pause(time_s)
+    flown = plan.sample(200.0)
+    assert flown is not None
+    stopped_m = plan.track.sample(10.0 + STOP_S / 2.0).position_ned_m
+    np.testing.assert_allclose(flown.position_ned_m, stopped_m, atol=1e-9)
+    assert plan.track_time_s(200.0) == pytest.approx(10.0 + STOP_S / 2.0)
 
 
 @pytest.mark.parametrize("speed_mps", [0.3, 4.0])

@@ -205,7 +205,7 @@ def test_every_report_of_the_mode_counts_after_outages_and_restarts(seed: int) -
     ("ids", "vehicle_type", "autopilot", "seen"),
     [
         ((1, 192), 18, 8, True),
-        ((7, 191), 18, 8, True),
+        ((7, 191), 18, 8, False),  # of another vehicle
         ((1, 192), 6, 8, True),  # as a companion of PX4 calls itself
         ((255, 190), 6, 8, False),
         ((1, 154), 26, 8, False),
