@@ -41,7 +41,7 @@ CALLS = ("request_stop", "announce", "note_autopilot", "guard")  # methods of th
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """`settings` are those of the session: lockstep, stream, sends_first, capacity_bytes_ps."""
+    """`settings` are the RECORDED_SETTINGS (`flight.record`) of the session."""
 
     log: Tlog
     configuration: str
