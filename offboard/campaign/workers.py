@@ -31,8 +31,7 @@ from typing import Protocol
 from offboard.campaign.flight import NOT_FLOWN, Job, fly_job, recorded
 from offboard.campaign.results import Record
 from offboard.documents.errors import UserError, install, shown
-from offboard.flight.flight import STOPPED
-from offboard.flight.phases import ExitCode
+from offboard.flight.phases import OPERATOR_STOP, ExitCode
 from offboard.link.log import free_name
 from offboard.run.flight import Connection, fly
 
@@ -150,7 +149,7 @@ class ConnectedVehicle:
             if ending():
                 return
             record = self._record(job)
-            if record.sentence.startswith(STOPPED):
+            if record.sentence.startswith(OPERATOR_STOP):
                 return  # the flight received the interrupt
             if record.exit_code != ExitCode.REFUSED:
                 yield job, record

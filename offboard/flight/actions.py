@@ -41,7 +41,7 @@ def act(flight: FlightState) -> None:
         _take_off(flight, time_s)
     elif flight.phase not in TRACKING:
         hold(flight, time_s)
-    elif flight.ours and not decision.decide(flight):
+    elif flight.authority.permits_setpoint(flight.now_s) and not decision.decide(flight):
         outbox.send_level(flight, time_s, _level(flight))
     outbox.send(flight, flight.clock.request(time_s, flight.host_s))
 
@@ -147,7 +147,7 @@ def _stand_by(flight: FlightState, time_s: float) -> None:
     if on_ground:
         quiet |= vehicle.armed and vehicle.in_failsafe
     else:
-        quiet |= vehicle.in_failsafe or not flight.pilot.elsewhere
+        quiet |= vehicle.in_failsafe or not flight.pilot.other_mode_shown
     if quiet:
         outbox.set_command(flight, time_s, command)
     else:

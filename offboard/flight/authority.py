@@ -216,37 +216,37 @@ class PilotSwitch:
     that was shown without a failsafe: after a failsafe PX4 returns to OFFBOARD by itself as soon as
     setpoints arrive. For the service, which does not ask for that mode.
 
-    `elsewhere`: a HEARTBEAT has shown another mode than that of setpoints, without a failsafe.
-    `engaged`: from there it was switched to the mode of setpoints, in the air. `unclaimed`: since
-    the service began, or the vehicle rebooted, it has shown the mode of setpoints only, in the air.
-    `hasty`: it left that mode and returned, in the air, before a HEARTBEAT could show the other one
-    without a failsafe. `showed_ours`: whether the previous report showed the mode of setpoints;
-    None after a failsafe, which may have changed it.
+    `other_mode_shown`: a HEARTBEAT has shown another mode, without a failsafe, and since then none
+    has shown the mode of setpoints. `engaged`: from there it was switched to the mode of setpoints,
+    in the air. `always_in_engage_mode`: since the service began, or the vehicle rebooted, every
+    report has shown the mode of setpoints, in the air. `returned_too_soon`: it left that mode and
+    returned, in the air, before a HEARTBEAT could show the other one without a failsafe.
+    `was_in_engage_mode`: by the previous report; None after a failsafe, which may have changed it.
     """
 
-    elsewhere: bool = False
+    other_mode_shown: bool = False
     engaged: bool = False
-    unclaimed: bool = True
-    hasty: bool = False
-    showed_ours: bool | None = None
+    always_in_engage_mode: bool = True
+    returned_too_soon: bool = False
+    was_in_engage_mode: bool | None = None
 
-    def on_heartbeat(self, *, ours: bool, failsafe: bool) -> None:
-        """A HEARTBEAT shows the mode of setpoints (`ours`) or another one."""
+    def on_heartbeat(self, *, in_engage_mode: bool, failsafe: bool) -> None:
+        """A HEARTBEAT shows the mode of setpoints or another one."""
         if failsafe:
-            self.elsewhere = self.engaged = self.hasty = False
-            self.showed_ours = None
-        elif not ours:
-            self.elsewhere = True
+            self.other_mode_shown = self.engaged = self.returned_too_soon = False
+            self.was_in_engage_mode = None
+        elif not in_engage_mode:
+            self.other_mode_shown = True
 
-    def on_mode(self, *, ours: bool, in_the_air: bool, flies: bool) -> None:
+    def on_mode(self, *, in_engage_mode: bool, in_the_air: bool, flies: bool) -> None:
         """Any report of the mode, before `on_heartbeat` of the same message. Only a vehicle that
         `flies` by every sign (`GroundContact.flies`) is engaged."""
-        if not (ours and in_the_air):
-            self.unclaimed = False
-        if not ours:
-            self.engaged = self.hasty = False
-        elif self.elsewhere:
-            self.elsewhere, self.engaged = False, flies
-        elif self.showed_ours is False:
-            self.hasty = in_the_air
-        self.showed_ours = ours
+        if not (in_engage_mode and in_the_air):
+            self.always_in_engage_mode = False
+        if not in_engage_mode:
+            self.engaged = self.returned_too_soon = False
+        elif self.other_mode_shown:
+            self.other_mode_shown, self.engaged = False, flies
+        elif self.was_in_engage_mode is False:
+            self.returned_too_soon = in_the_air
+        self.was_in_engage_mode = in_engage_mode

@@ -130,21 +130,21 @@ def _identify(flight: FlightState, identification: Learner) -> None:
 def _decided(flight: FlightState) -> Decided:
     plan = flight.plan
     assert plan.reference is not None
-    sent_s = flight.sent_s(flight.time_s)
-    state = flight.observer.predict(sent_s)
+    time_s = flight.delays_begin_s(flight.time_s)
+    state = flight.observer.predict(time_s)
     began_s, deadline_s = flight.stopwatch(), flight.deadline_s or math.inf
 
     def remaining_s() -> float:
         return deadline_s - (flight.stopwatch() - began_s)
 
     situation = Situation(
-        sent_s,
+        time_s,
         state,
         plan.reference,
         previous=flight.command,
         remaining_s=remaining_s if flight.deadline_s is not None else None,
         origin_ned_m=plan.origin_ned_m,
-        track_time_s=plan.track_time_s(sent_s),
+        track_time_s=plan.track_time_s(time_s),
     )
     decision = flight.controller.decide(situation)
     return Decided(flight.phase, state, decision, flight.stopwatch() - began_s)

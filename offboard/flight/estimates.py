@@ -191,8 +191,8 @@ class HoverEstimate:
         speeds = _within(self._speeds, time_s - WINDOW_S, time_s)
         if len(speeds) < LEAST_SPEEDS or speeds[-1, 0] - speeds[0, 0] < LEAST_S:
             return None
-        late_s = vehicle.thrust_delay_s + vehicle.thrust_lag_s
-        thrusts = _within(self._thrusts, speeds[0, 0] - late_s, time_s - late_s)
+        response_s = vehicle.thrust_delay_s + vehicle.thrust_lag_s
+        thrusts = _within(self._thrusts, speeds[0, 0] - response_s, time_s - response_s)
         if len(thrusts) < LEAST_THRUSTS:
             return None
         gravity_mps2 = vehicle.gravity_mps2

@@ -70,16 +70,16 @@ def rebooted(flight: FlightState) -> str:
     return REBOOTED if flight.rebooted else ""
 
 
-def lost(flight: FlightState) -> str:
+def authority_lost(flight: FlightState) -> str:
     """Another has taken control of the vehicle."""
     if flight.authority.standing is not Standing.LOST:
         return ""
     return flight.authority.lost_reason or Standing.LOST.value
 
 
-def lost_armed(flight: FlightState) -> str:
+def authority_lost_armed(flight: FlightState) -> str:
     """A pilot has changed the mode of a vehicle that stays armed."""
-    return lost(flight) if flight.shown_since_lost and flight.vehicle.armed else ""
+    return authority_lost(flight) if flight.shown_since_lost and flight.vehicle.armed else ""
 
 
 def in_own_failsafe(flight: FlightState) -> str:
@@ -253,7 +253,7 @@ def follows_others(flight: FlightState) -> str:
     The vehicle follows setpoints of another program in the mode that we asked for."""
     reported = flight.vehicle.age_s(ThrustReport) < THRUST_REPORT_S
     followed = flight.follows_others and reported and flight.phase in TRACKING
-    if not followed or not flight.engaged or flight.limits.begin_with_other_sender:
+    if not followed or not flight.in_engage_mode or flight.limits.begin_with_other_sender:
         return ""
     return f"the vehicle follows setpoints of another program{_other_companion(flight)}"
 

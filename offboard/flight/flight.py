@@ -12,7 +12,7 @@ from offboard.flight.phases import (
     BEFORE_FLIGHT,
     ENDS,
     FLYING,
-    STOPPED,
+    OPERATOR_STOP,
     WAITING,
     Action,
     Phase,
@@ -26,7 +26,7 @@ from offboard.mavlink.outgoing import Outgoing
 from offboard.mavlink.session import ACTIVE
 from offboard.supervisor.recovery import Supervised
 
-__all__ = ["STOPPED", "Flight", "Outcome"]
+__all__ = ["Flight", "Outcome"]
 
 STANDBY = 3  # MAV_STATE
 BRIDGED_SHARE = 0.3  # of `Limits.silence_s`; after it, level setpoints replace the control law
@@ -234,7 +234,7 @@ class Flight(FlightState):
         """The flight at this moment, for displays; `flights` that the service has begun."""
         return Snapshot(self, flights)
 
-    def request_stop(self, why: str = STOPPED) -> None:
+    def request_stop(self, why: str = OPERATOR_STOP) -> None:
         """Land, or do not take off; takes effect at the next turn."""
         if not self.stop_reason:
             self._inputs.call("request_stop", why)

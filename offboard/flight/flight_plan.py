@@ -131,8 +131,8 @@ class FlightPlan:
         """Time since the start of the track, without pauses; NaN before it."""
         return self._paused.own_s(time_s) if self._paused else time_s - self._track_began_s
 
-    def late_s(self, time_s: float) -> float:
-        """Time since the planned end of the climb; negative before it, NaN without a climb."""
+    def overdue_s(self, time_s: float) -> float:
+        """Time since the planned end of the climb, s; negative before it, NaN without a climb."""
         return time_s - self._arrival_s
 
     def at_start(self, time_s: float, position: Array, velocity: Array) -> bool:

@@ -11,7 +11,7 @@ import math
 import operator
 from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import InitVar, dataclass, field
+from dataclasses import InitVar, dataclass, field, replace
 
 import numpy as np
 
@@ -21,7 +21,15 @@ from offboard.flight.authority import Authority, PilotSwitch, Standing
 from offboard.flight.estimates import HoverEstimate, Positioning, PositionJumps
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.ground_contact import DETECTOR_KNOWN_S, GroundContact, Touchdown, moved
-from offboard.flight.phases import ENDS, STOPPED, Action, Limits, Phase, Request, ServiceOptions
+from offboard.flight.phases import (
+    ENDS,
+    OPERATOR_STOP,
+    Action,
+    Limits,
+    Phase,
+    Request,
+    ServiceOptions,
+)
 from offboard.flight.preflight import ParameterReading
 from offboard.flight.record import Decided
 from offboard.flight.timing import Busyness, LinkGrowth, VehicleClock
@@ -176,12 +184,13 @@ class FlightState:
         prepared = before.phase not in (Phase.CONNECT, Phase.HEALTH) and not before.rebooted
         self.phase = Phase.STANDBY if prepared and self.authority.engage_mode else Phase.CONNECT
         self.began_s = before.now_s
-        self.pilot = PilotSwitch(
-            elsewhere=before.pilot.elsewhere,
-            unclaimed=before.ends_engaged,
-            # selected while the flight ended: not flown, and not left without anybody
-            hasty=before.pilot.hasty or (before.taken and before.pilot.engaged),
-            showed_ours=before.pilot.showed_ours,
+        pilot = before.pilot
+        self.pilot = replace(
+            pilot,
+            engaged=False,
+            always_in_engage_mode=before.ends_engaged,
+            # a switch while the flight ended is answered by hold
+            returned_too_soon=pilot.returned_too_soon or (before.taken and pilot.engaged),
         )
 
     @property
@@ -206,10 +215,10 @@ class FlightState:
     @property
     def stop_cause(self) -> str:
         """A word for who requested the stop: "operator", or empty for any other reason."""
-        return "operator" if self.stop_reason == STOPPED else ""
+        return "operator" if self.stop_reason == OPERATOR_STOP else ""
 
     @property
-    def engaged(self) -> bool:
+    def in_engage_mode(self) -> bool:
         """The vehicle shows the mode in which it follows setpoints."""
         return self.authority.mode == self.authority.engage_mode
 
@@ -253,7 +262,7 @@ class FlightState:
     def awaits_heartbeat(self) -> bool:
         """The vehicle was taken, and no HEARTBEAT since then shows whether by a failsafe. False
         while it shows the mode of setpoints again: the pilot may want the next flight."""
-        if not self.taken or self.engaged:
+        if not self.taken or self.in_engage_mode:
             return False
         return not self.shown_since_lost and self.in_phase_s < SHOWN_S
 
@@ -262,7 +271,7 @@ class FlightState:
         """Whether the flight ends with a vehicle that nobody has seen in another mode than that of
         setpoints: it was not heard any more, or has rebooted."""
         unheard = self.authority.standing is Standing.OURS
-        return unheard or (self.rebooted and self.pilot.unclaimed)
+        return unheard or (self.rebooted and self.pilot.always_in_engage_mode)
 
     @property
     def time_s(self) -> float:
@@ -298,11 +307,6 @@ class FlightState:
         """Whether `note_starvation` found this within the last STARVED_KNOWN_S."""
         return self.host_s - self.starved_s < STARVED_KNOWN_S
 
-    @property
-    def ours(self) -> bool:
-        """Whether a setpoint may be sent, by the reported mode and its age."""
-        return self.authority.permits_setpoint(self.now_s)
-
     def not_landed(self) -> str:
         """Why the vehicle has not landed; empty if it has."""
         vehicle = self.vehicle
@@ -330,8 +334,8 @@ class FlightState:
         """Growth of the link's delay since take-off, or the age of telemetry if that is more."""
         return max(self.clock.delay_growth_s, self.age_s)
 
-    def sent_s(self, time_s: float) -> float:
-        """The vehicle time from which the vehicle model's delays run for a command of the tick
+    def delays_begin_s(self, time_s: float) -> float:
+        """The vehicle time at which the vehicle model's delays begin for a command of the tick
         `time_s`: later by what the link has added to its delay since take-off."""
         return time_s + self.clock.growth.added_s
 

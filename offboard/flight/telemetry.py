@@ -170,18 +170,17 @@ def _on_mode(
         starved=flight.starved,
         sticks=vehicle.sticks,
     )
-    ours = mode == authority.engage_mode
-    contact = flight.contact
-    in_the_air, switched = contact.in_the_air, ours and flight.pilot.elsewhere
-    flight.pilot.on_mode(ours=ours, in_the_air=in_the_air, flies=contact.flies)
-    why = "" if flight.pilot.engaged or not in_the_air else "the vehicle may stand on the ground"
-    if flight.pilot.engaged and other_sender(flight):
-        flight.pilot.engaged = False  # it was not switched for us
+    pilot, contact, in_engage_mode = flight.pilot, flight.contact, flight.in_engage_mode
+    in_the_air, switched = contact.in_the_air, in_engage_mode and pilot.other_mode_shown
+    pilot.on_mode(in_engage_mode=in_engage_mode, in_the_air=in_the_air, flies=contact.flies)
+    why = "" if pilot.engaged or not in_the_air else "the vehicle may stand on the ground"
+    if pilot.engaged and other_sender(flight):
+        pilot.engaged = False  # it was not switched for us
         why = "another program sends setpoints"
     if switched and why and flight.phase in WAITING:
         outbox.announce(flight, f"not engaged: {mode}, but {why}")
     if isinstance(event, Heartbeat):
-        flight.pilot.on_heartbeat(ours=ours, failsafe=flight.vehicle.in_failsafe)
+        pilot.on_heartbeat(in_engage_mode=in_engage_mode, failsafe=vehicle.in_failsafe)
 
 
 def _on_reboot(flight: FlightState) -> None:

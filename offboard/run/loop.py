@@ -18,7 +18,7 @@ from offboard.run.sitl import Ending, InMemorySimulator, SimulatorProcess
 from offboard.supervisor.supervisor import Supervisor, SupervisorError
 
 POLL_S = 0.02
-STOPPED_S = 0.2  # from the beginning of a turn: what it decided does not leave later
+SEND_WITHIN_S = 0.2  # from the beginning of a turn: what it decided does not leave later
 FAILING_S = 0.3  # without a turn that succeeds: give up
 UNGUARDED = "the supervisor ended: nobody lands the vehicle if this process dies"
 UNANSWERED = "the supervisor does not answer: nobody lands the vehicle if this process dies"
@@ -141,7 +141,7 @@ class Loop:
         peer = self._companion.current.session.peer
         dropped: list[bytes] = []
         for frame in frames:
-            if self._supervisor and clock.monotonic_s() - began_s > STOPPED_S:
+            if self._supervisor and clock.monotonic_s() - began_s > SEND_WITHIN_S:
                 dropped.append(frame)
             else:
                 self._link.send(frame, peer)
