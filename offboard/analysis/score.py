@@ -30,11 +30,10 @@ from offboard.flight.phases import ExitCode, Phase
 from offboard.link.log import LogError, replace_file
 
 Array = NDArray[np.float64]
-NAN = math.nan
 
 
 def _metric(meaning: str, unit: str = "") -> float:
-    value: float = field(default=NAN, metadata={"meaning": meaning, "unit": unit})
+    value: float = field(default=math.nan, metadata={"meaning": meaning, "unit": unit})
     return value
 
 
@@ -317,9 +316,9 @@ def link_metrics(flown: History, window: tuple[float, float] | None) -> dict[str
         values["setpoint_gap_max_s"] = float(np.diff(sent["time_s"]).max(initial=0.0))
         values["setpoint_gap_wall_max_s"] = float(np.diff(sent["unix_s"]).max(initial=0.0))
     if len(flown.link_delay):
-        late_ms = 1e3 * flown.link_delay["delay_s"]
-        values["link_delay_p50_ms"] = _percentile(late_ms, 50)
-        values["link_delay_p99_ms"] = _percentile(late_ms, 99)
+        link_ms = 1e3 * flown.link_delay["delay_s"]
+        values["link_delay_p50_ms"] = _percentile(link_ms, 50)
+        values["link_delay_p99_ms"] = _percentile(link_ms, 99)
     delay_s = flown.identified["tilt_delay_s"]
     if len(delay_s := delay_s[np.isfinite(delay_s[:, 0])]):
         values["delay_ms"], values["delay_sd_ms"] = (1e3 * delay_s[-1].astype(float)).tolist()

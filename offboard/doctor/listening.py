@@ -21,6 +21,7 @@ from offboard.flight.timing import VehicleClock
 from offboard.flight.vehicle_state import VehicleState
 from offboard.link.interface import Chunk
 from offboard.mavlink.counters import Counters
+from offboard.mavlink.decode import FIX_3D
 from offboard.mavlink.dialects.base import TYPE_GCS, Dialect, WantedMessage, id_of
 from offboard.mavlink.events import (
     Attitude,
@@ -34,7 +35,7 @@ from offboard.mavlink.events import (
     TimesyncReply,
     VehicleFound,
 )
-from offboard.mavlink.framing import HEARTBEAT, Frame, FrameSplitter
+from offboard.mavlink.framing import HEARTBEAT, TIMESYNC, Frame, FrameSplitter
 from offboard.mavlink.outgoing import CommandLong, Outgoing, Timesync
 from offboard.mavlink.senders import is_vehicle
 from offboard.mavlink.session import Session, SessionSettings
@@ -52,9 +53,8 @@ TEXTS_S = 1.0  # for the texts after the acknowledgement
 ENOUGH = 0.7  # of a rate, measured over two seconds
 SETTLE_S = 1.0  # until jumps of the vehicle's clock count
 RUN_PREARM_CHECKS = 401  # MAV_CMD
-FIX_3D = 3  # GPS_FIX_TYPE; also stands for better ones
-VERSION, GPS, TIMESYNC = 148, 24, 111  # message ids
-_TIMES = frozenset({2, 111})  # SYSTEM_TIME, TIMESYNC
+VERSION, GPS = 148, 24  # message ids
+_TIMES = frozenset({2, TIMESYNC})  # 2: SYSTEM_TIME
 _PLACES_MAX, _SENDERS_MAX = 16, 64  # a flood of addresses or ids must not use up the memory
 
 
@@ -140,9 +140,9 @@ class Listening:
     """One pass over one link, from host time `began_s`. `settings`: of the session of a flight.
 
     `vehicle`, `clock` and `session` are those of a flight, with the newest telemetry; `senders` has
-    all that sends. `fix_type` is the vehicle's GPS_FIX_TYPE; `late_s` the greatest age of its
-    telemetry beyond the least; `foreign_replies` the number of its replies to requests of TIMESYNC
-    that are not ours.
+    all that sends. `fix_type` is the vehicle's GPS_FIX_TYPE, at most FIX_3D; `late_s` the greatest
+    age of its telemetry beyond the least; `foreign_replies` the number of its replies to requests
+    of TIMESYNC that are not ours.
     """
 
     def __init__(

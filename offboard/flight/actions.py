@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from offboard.flight import decision, outbox
 from offboard.flight.authority import Standing
-from offboard.flight.failsafe import old, other_sender
+from offboard.flight.failsafe import other_sender, telemetry_old
 from offboard.flight.ground_contact import STANDING_S, STILL_ARMED
 from offboard.flight.phases import BEFORE_FLIGHT, TRACKING, Phase
 from offboard.flight.state import LEVEL_DIRECTION, FlightState
@@ -143,7 +143,7 @@ def _stand_by(flight: FlightState, time_s: float) -> None:
     failsafe, after which PX4 would return to OFFBOARD by itself, or while another program sends."""
     on_ground, vehicle = flight.contact.on_ground, flight.vehicle
     command = Command(0.0, LEVEL_DIRECTION, vehicle.heading_rad) if on_ground else _flown(flight)
-    quiet = bool(flight.takes_off_by_command or old(flight) or other_sender(flight))
+    quiet = bool(flight.takes_off_by_command or telemetry_old(flight) or other_sender(flight))
     if on_ground:
         quiet |= vehicle.armed and vehicle.in_failsafe
     else:

@@ -76,14 +76,15 @@ class Authority:
         arrived_s: float = math.inf,
         failsafe: bool = False,
         heartbeat: bool = True,
-        starved: bool = False,
+        setpoints_missing: bool = False,
         sticks: bool | None = False,
     ) -> None:
         """The vehicle reports `mode`. A failsafe may interrupt a landing that we asked for.
 
-        `failsafe`: the newest HEARTBEAT shows one; `heartbeat`: it is this report. `starved`: it
-        may have been without setpoints for so long that its failsafe acts; `sticks`: it receives
-        those of a pilot, who may fly it in that failsafe, None: that is not known.
+        `failsafe`: the newest HEARTBEAT shows one; `heartbeat`: it is this report.
+        `setpoints_missing`: it may have been without setpoints for so long that its failsafe acts;
+        `sticks`: it receives those of a pilot, who may fly it in that failsafe, None: that is not
+        known.
         """
         before, self.mode = self.mode, mode
         self.heard_s, self.arrived_s = now_s, arrived_s
@@ -101,7 +102,9 @@ class Authority:
                 self.standing = Standing.OURS
             elif mode in self._requested:
                 self._hand_over(mode)
-            elif mode in self.loss.modes and (starved or self.standing is Standing.FAILSAFE):
+            elif mode in self.loss.modes and (
+                setpoints_missing or self.standing is Standing.FAILSAFE
+            ):
                 self._on_failsafe(before, now_s, failsafe, heartbeat=heartbeat, sticks=sticks)
             else:
                 self.lose(f"the vehicle left {self.engage_mode} for {mode}", now_s, heartbeat)
@@ -174,7 +177,7 @@ class Authority:
         if self.is_ours:
             self.standing = Standing.OURS
 
-    def lose(self, reason: str, now_s: float, heartbeat: bool = True) -> None:
+    def lose(self, reason: str, now_s: float, heartbeat: bool) -> None:
         """The vehicle is not ours any more, for good; `heartbeat`: HEARTBEAT shows it."""
         if self.standing is not Standing.LOST:
             self.standing, self.lost_reason = Standing.LOST, reason

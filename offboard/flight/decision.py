@@ -18,7 +18,6 @@ from offboard.flight.record import (
     CERTIFIED,
     IDENTIFIED_ID,
     IDENTIFIED_NAME,
-    NAN,
     RECORD_ID,
     RECORD_NAME,
     Decided,
@@ -57,7 +56,7 @@ def decide(flight: FlightState) -> bool:
     nothing is sent. Telemetry that was too old before the decision began does not count: the
     failsafe has a row for it.
     """
-    was_old = failsafe.old(flight)
+    was_old = failsafe.telemetry_old(flight)
     try:
         decided = _decided(flight)
         _send(flight, decided)
@@ -195,13 +194,13 @@ def tick_record(flight: FlightState, decided: Decided, answer_s: float) -> TickR
     # with a position setpoint, the autopilot chooses thrust and direction
     attitude = sent if isinstance(sent, Command) else None
     certified = sent == decided.decision.command
-    figures = astuple(decided.decision.certificate) if certified else (NAN,) * CERTIFIED
+    figures = astuple(decided.decision.certificate) if certified else (math.nan,) * CERTIFIED
     *certificate, seed_cost = map(float, figures)
     values = (
         float(decided.phase.code),
-        attitude.thrust_mps2 if attitude else NAN,
-        *(attitude.thrust_direction_ned if attitude else (NAN, NAN, NAN)),
-        sent.heading_rad if sent else NAN,
+        attitude.thrust_mps2 if attitude else math.nan,
+        *(attitude.thrust_direction_ned if attitude else (math.nan, math.nan, math.nan)),
+        sent.heading_rad if sent else math.nan,
         *certificate,
         decided.solve_time_s,
         answer_s,

@@ -103,7 +103,7 @@ def another_may_control(flight: FlightState) -> str:
     return f"{unknown}: another may control the vehicle" if unknown else ""
 
 
-def old(flight: FlightState) -> str:
+def telemetry_old(flight: FlightState) -> str:
     """Age of the newest telemetry beyond the least delay of the link."""
     age_s = flight.age_s
     return f"telemetry is {age_s:.2f} s old" if age_s > flight.limits.setpoint_age_s else ""
@@ -112,8 +112,9 @@ def old(flight: FlightState) -> str:
 def late_link(flight: FlightState) -> str:
     """Growth of the link's delay since take-off (TIMESYNC), or the age of telemetry."""
     growth_s = flight.clock.delay_growth_s
-    grown = growth_s > flight.limits.link_growth_s
-    return f"the delay of the link has grown by {growth_s:.2f} s" if grown else old(flight)
+    if growth_s > flight.limits.link_growth_s:
+        return f"the delay of the link has grown by {growth_s:.2f} s"
+    return telemetry_old(flight)
 
 
 def unanswered(flight: FlightState) -> str:
@@ -313,7 +314,7 @@ ROWS = (
     Row("authority", another_may_control, f"{MODE_KNOWN_S:g} s", LAND, cause="link"),
     Row("silence", silent, "limits.silence_s", LAND, cause="link"),
     Row("blind", blind, f"{Limits.blind_s:g} s", LAND, cause="link"),
-    Row("age", old, "limits.setpoint_age_s", LEVEL, cause="link"),
+    Row("age", telemetry_old, "limits.setpoint_age_s", LEVEL, cause="link"),
     Row("link", late_link, LATE, HOLD, 0.5, "link"),
     Row("uplink", unanswered, "limits.silence_s", HOLD, 0.5, "link"),
     Row("decision", decision_missed, "one", LEVEL, 0.0, *MISSED),

@@ -102,7 +102,7 @@ class Flight(FlightState):
         paused_s, self.turned_s = host_now_s - self.turned_s, host_now_s
         self.host_s = session.clock_s(host_now_s)
         self.silence_s = elapsed_s - self.heard_s
-        self.note_starvation()
+        self.note_missing_setpoints()
         if session.settings.lockstep:
             return
         if paused_s > PAUSE_S and self.authority.engage_mode:
@@ -208,7 +208,7 @@ class Flight(FlightState):
             landing=self.phase is Phase.LAND,
             loss=authority.loss,
             sticks=health is not None and health.radio_ok,
-            starved=self.starved or authority.standing is Standing.FAILSAFE,
+            setpoints_missing=self.setpoints_missing or authority.standing is Standing.FAILSAFE,
         )
 
     def _status(self) -> tuple[int, int]:

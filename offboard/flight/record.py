@@ -30,7 +30,6 @@ from offboard.mavlink.session import Reception, SessionSettings
 from offboard.model.command import Command, PositionCommand, PredictedState
 
 RECORD_NAME = "pso"
-NAN = float("nan")
 CERTIFIED = len(fields(Certificate))
 IDENTIFIED_NAME, IDENTIFIED_ID = "identified", 2  # of the other DEBUG_FLOAT_ARRAY in the log
 
@@ -98,7 +97,7 @@ class Decided:
 # ---------------------------------------------------------------------- configuration and vehicle
 
 # TUNNEL.payload_type; numbers above 32767 need no registration
-CONFIGURATION_TYPE, VEHICLE_TYPE, PAYLOAD_TYPE = 0xC0F1, 0xC0F3, 0xC0F5
+CONFIGURATION_TYPE, VEHICLE_TYPE, INPUTS_TYPE = 0xC0F1, 0xC0F3, 0xC0F5
 _NUMBERED = struct.Struct("<HH")  # index of the piece, number of pieces of a configuration
 _PART_BYTES = 128 - _NUMBERED.size
 TEXT_MOST = 4_000_000  # bytes: eight of the longest configuration files; a log may be anybody's
@@ -237,7 +236,7 @@ class InputRecorder:
         records: list[ConfigurationRecord] = []
         while len(self._data) >= _PIECE_BYTES or (all_of_it and self._data):
             data = _HEAD.pack(self._pieces) + bytes(self._data[:_PIECE_BYTES])
-            records.append(ConfigurationRecord(data, PAYLOAD_TYPE))
+            records.append(ConfigurationRecord(data, INPUTS_TYPE))
             self._pieces += 1
             del self._data[:_PIECE_BYTES]
         return records

@@ -48,9 +48,9 @@ THRUSTS_KEPT = 40  # as long as a setpoint may be on its way, or the next ones b
 PREDICTIONS_KEPT = 8
 # Setpoints count as missing so long before the autopilot's timeout, at most a third of it: the
 # newest may be on its way or lost
-STARVED_EARLY_S = 0.3
-SHOWN_S = 1.2  # HEARTBEAT comes at 1 Hz
-STARVED_KNOWN_S = 3.0  # HEARTBEAT, at 1 Hz, shows the failsafe
+MISSING_EARLY_S = 0.3
+HEARTBEAT_AWAITED_S = 1.2  # HEARTBEAT comes at 1 Hz
+MISSING_KNOWN_S = 3.0  # HEARTBEAT, at 1 Hz, shows the failsafe
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +124,7 @@ class FlightState:
     host_s: float = 0.0  # monotonic time of this computer at the present turn
     silence_s: float = 0.0  # host time since the newest telemetry
     setpoint_s: float = math.inf  # when the newest setpoint left
-    starved_s: float = -math.inf  # when setpoints may have been missing for long
+    setpoints_missed_s: float = -math.inf  # when setpoints may have been missing for long
     guarded: bool = True  # a supervisor lands the vehicle if this process ends
     rebooted: bool = False
     left_engaged: bool = False  # a flight that was cut short has left the vehicle engaged
@@ -175,7 +175,7 @@ class FlightState:
         for name in KEPT:
             setattr(self, name, getattr(before, name))
         self.clock.growth = LinkGrowth()
-        # for a vehicle that was taken nothing was asked: not unanswered, see `note_starvation`
+        # of a taken vehicle nothing was asked: no reply is missing in `note_missing_setpoints`
         self.vehicle.heard_s.pop(TimesyncReply, None)
         self.authority = before.authority.renewed()
         if not before.in_end_phase:  # nothing was flown: what the pilot did before counts
@@ -264,7 +264,7 @@ class FlightState:
         while it shows the mode of setpoints again: the pilot may want the next flight."""
         if not self.taken or self.in_engage_mode:
             return False
-        return not self.shown_since_lost and self.in_phase_s < SHOWN_S
+        return not self.shown_since_lost and self.in_phase_s < HEARTBEAT_AWAITED_S
 
     @property
     def ends_engaged(self) -> bool:
@@ -289,7 +289,7 @@ class FlightState:
         silent_s = self.silence_s if self.silence_s > self.limits.silence_s else 0.0
         return max(silent_s, self.authority.unheard_s(self.now_s))
 
-    def note_starvation(self) -> None:
+    def note_missing_setpoints(self) -> None:
         """Note when the vehicle may have been without setpoints for so long that its failsafe acts:
         none was sent, nothing was heard, or no TIMESYNC was answered."""
         unanswered_s = self.vehicle.age_s(TimesyncReply)
@@ -299,20 +299,20 @@ class FlightState:
             unanswered_s if math.isfinite(unanswered_s) else 0.0,
         )
         after_s = self.authority.loss.after_s
-        if gap_s > max(after_s - STARVED_EARLY_S, after_s * 2.0 / 3.0):
-            self.starved_s = self.host_s
+        if gap_s > max(after_s - MISSING_EARLY_S, after_s * 2.0 / 3.0):
+            self.setpoints_missed_s = self.host_s
 
     @property
-    def starved(self) -> bool:
-        """Whether `note_starvation` found this within the last STARVED_KNOWN_S."""
-        return self.host_s - self.starved_s < STARVED_KNOWN_S
+    def setpoints_missing(self) -> bool:
+        """Whether `note_missing_setpoints` found this within the last MISSING_KNOWN_S."""
+        return self.host_s - self.setpoints_missed_s < MISSING_KNOWN_S
 
     def not_landed(self) -> str:
         """Why the vehicle has not landed; empty if it has."""
         vehicle = self.vehicle
         if self.touchdown is None:
             return "it was not told to land"
-        if not self.contact.alive:
+        if not self.contact.position_known:
             return "no LOCAL_POSITION_NED shows it"
         on_ground = vehicle.landed == "on_ground" and vehicle.age_s(Landed) < DETECTOR_KNOWN_S
         return self.touchdown.not_landed(on_ground=on_ground)

@@ -167,7 +167,7 @@ def _on_mode(
         arrived_s=arrived_s,
         failsafe=vehicle.in_failsafe,
         heartbeat=isinstance(event, Heartbeat),
-        starved=flight.starved,
+        setpoints_missing=flight.setpoints_missing,
         sticks=vehicle.sticks,
     )
     pilot, contact, in_engage_mode = flight.pilot, flight.contact, flight.in_engage_mode

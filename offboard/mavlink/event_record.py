@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from offboard.mavlink.outgoing import ConfigurationRecord
 
-PAYLOAD_TYPE = 0xC0F4  # TUNNEL.payload_type; numbers above 32767 need no registration
+EVENT_TYPE = 0xC0F4  # TUNNEL.payload_type; numbers above 32767 need no registration
 SUPERVISOR = "supervisor"  # the cause of what the supervisor says
 _HEAD = struct.Struct("<BB")  # index of the piece, number of pieces
 _PIECE_BYTES = 128 - _HEAD.size
@@ -34,7 +34,7 @@ def pieces(event: EventRecord) -> list[ConfigurationRecord]:
     data = json.dumps(event._replace(text=event.text[:_TEXT_MOST])).encode()
     parts = [data[at : at + _PIECE_BYTES] for at in range(0, len(data), _PIECE_BYTES)]
     return [
-        ConfigurationRecord(_HEAD.pack(index, len(parts)) + part, PAYLOAD_TYPE)
+        ConfigurationRecord(_HEAD.pack(index, len(parts)) + part, EVENT_TYPE)
         for index, part in enumerate(parts)
     ]
 

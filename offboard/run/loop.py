@@ -225,15 +225,15 @@ class Loop:
         """End the flight if the bundled simulator has ended."""
         if self._simulator is None or self._companion.has_ended():
             return
-        ended = self._simulator.ended()
-        if ended is None and silent_s > self._patience_s:
-            ended = Ending(f"the bundled simulator has not answered for {silent_s:.1f} s", False)
-        if ended is None:
+        ending = self._simulator.ending()
+        if ending is None and silent_s > self._patience_s:
+            ending = Ending(f"the bundled simulator has not answered for {silent_s:.1f} s", False)
+        if ending is None:
             return
         code = ExitCode.ABORTED
         if self._companion.current.phase in BEFORE_FLIGHT:
-            code = ExitCode.USAGE if ended.unusable else ExitCode.REFUSED
-        self._ended_early = Outcome(code, ended.sentence)
+            code = ExitCode.USAGE if ending.unusable else ExitCode.REFUSED
+        self._ended_early = Outcome(code, ending.sentence)
 
     # --- the end ---
 

@@ -128,11 +128,11 @@ class TakeOver:
             if not self._receive():
                 break
         self._ask(f"taking over: {reason}")
-        while not self._recovery.ended:
+        while not self._recovery.end_reason:
             self._link.wait(POLL_S)
             self._receive()
             self._ask()
-        self._say(self._recovery.ended)
+        self._say(self._recovery.end_reason)
         self._log.close(CLOSE_S)
 
     def _receive(self) -> bool:

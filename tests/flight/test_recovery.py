@@ -45,14 +45,14 @@ def asked(
         recovery.see(Heartbeat(shown, True, 4, 2), -0.4)
     commands: list[tuple[float, int]] = []
     now_s, end_s = 0.0, 1.0 + (waiting[-1][0] if waiting else LONGEST_S)
-    while not recovery.ended and now_s < end_s:
+    while not recovery.end_reason and now_s < end_s:
         request = recovery.due(now_s)
         commands += [(now_s, request.command)] if request else []
         while waiting and waiting[0][0] <= now_s:
             at_s, event = waiting.pop(0)
             recovery.see(event, at_s)
         now_s = round(now_s + 0.02, 2)
-    return commands, recovery.ended
+    return commands, recovery.end_reason
 
 
 def beats(mode: str, first_s: float, last_s: float, *, armed: bool = True) -> list[Timed]:
@@ -250,8 +250,8 @@ def recovered(
             result.asked.append((now_s, command, height_m))
             if arrives(command):
                 instance.feed(session.encode(request))
-        if recovery and recovery.ended:
-            result.ended, result.armed = recovery.ended, commander.armed
+        if recovery and recovery.end_reason:
+            result.ended, result.armed = recovery.end_reason, commander.armed
             return result
     raise AssertionError(result)
 

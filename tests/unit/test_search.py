@@ -17,7 +17,7 @@ from offboard.campaign.cases import Case
 from offboard.campaign.document import Promises, read_campaign
 from offboard.campaign.flight import Job
 from offboard.campaign.results import Record, Results
-from offboard.campaign.run import Campaign, Counter, Incomplete, Runner
+from offboard.campaign.run import Campaign, Incomplete, Progress, Runner
 from offboard.campaign.search import Failure, FailureSearch, as_csv
 from offboard.campaign.tune import Tuned, Tuning, judge, profile, read_tune
 from offboard.documents.errors import DocumentError, UserError
@@ -57,8 +57,8 @@ class Known:
 
 
 def runner(results: Results, flyer: Known) -> Runner:
-    counter = Counter(Console(file=io.StringIO()))
-    return Runner(results, Promises(), lambda: nullcontext(flyer), counter)
+    progress = Progress(Console(file=io.StringIO()))
+    return Runner(results, Promises(), lambda: nullcontext(flyer), progress)
 
 
 def two_regions(case: Case) -> Record:
