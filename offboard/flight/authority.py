@@ -58,7 +58,7 @@ class Authority:
     reported_s: float = -math.inf  # time of the newest report that counts
     lost_reason: str = ""
     lost_s: float = math.inf  # time of the loss; -inf if a HEARTBEAT reported it
-    loss: SetpointLoss = NEVER  # what the autopilot does without setpoints
+    setpoint_loss: SetpointLoss = NEVER  # what the autopilot does without setpoints
     arrived_s: float = -math.inf  # host time of the arrival of the newest report
     _asked_in: str = ""  # the mode reported when we asked for `engage_mode`
     # modes that we asked for to end the flight, oldest first; those before the one that it shows
@@ -102,7 +102,7 @@ class Authority:
                 self.standing = Standing.OURS
             elif mode in self._requested:
                 self._hand_over(mode)
-            elif mode in self.loss.modes and (
+            elif mode in self.setpoint_loss.modes and (
                 setpoints_missing or self.standing is Standing.FAILSAFE
             ):
                 self._on_failsafe(before, now_s, failsafe, heartbeat=heartbeat, sticks=sticks)
@@ -165,7 +165,7 @@ class Authority:
         """After a pause of our own of `paused_s` that ended at `host_s`: only reports that arrive
         later count, or that have arrived just before if the pause was too short for the vehicle's
         failsafe to have acted in it."""
-        self._counts_from_s = host_s - (JUST_S if paused_s < self.loss.after_s else 0.0)
+        self._counts_from_s = host_s - (JUST_S if paused_s < self.setpoint_loss.after_s else 0.0)
         self._failsafe_shown = False
         if self.arrived_s < self._counts_from_s:
             self.reported_s = -math.inf

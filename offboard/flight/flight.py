@@ -206,7 +206,7 @@ class Flight(FlightState):
             reported_s=authority.arrived_s,
             holding=self.phase is Phase.HOLD,
             landing=self.phase is Phase.LAND,
-            loss=authority.loss,
+            setpoint_loss=authority.setpoint_loss,
             sticks=health is not None and health.radio_ok,
             setpoints_missing=self.setpoints_missing or authority.standing is Standing.FAILSAFE,
         )

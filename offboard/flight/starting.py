@@ -53,7 +53,7 @@ def silent_for_another(flight: FlightState) -> str:
 def other_vehicle(flight: FlightState) -> str:
     """Several vehicles are heard, and none was chosen with --system, or none can be."""
     ground = ground_of(flight)
-    return preflight.twin(ground) or preflight.several_vehicles(ground)
+    return preflight.same_system_id(ground) or preflight.several_vehicles(ground)
 
 
 def ground_of(flight: FlightState) -> Ground:

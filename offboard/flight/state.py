@@ -298,7 +298,7 @@ class FlightState:
             self.silence_s,
             unanswered_s if math.isfinite(unanswered_s) else 0.0,
         )
-        after_s = self.authority.loss.after_s
+        after_s = self.authority.setpoint_loss.after_s
         if gap_s > max(after_s - MISSING_EARLY_S, after_s * 2.0 / 3.0):
             self.setpoints_missed_s = self.host_s
 

@@ -160,7 +160,7 @@ def _on_mode(
     if not flight.authority.engage_mode:
         flight.authority = Authority(dialect.engage_mode)
     vehicle, authority = flight.vehicle, flight.authority
-    authority.loss = dialect.setpoint_loss(vehicle.parameters)
+    authority.setpoint_loss = dialect.setpoint_loss(vehicle.parameters)
     authority.on_mode(
         mode,
         flight.now_s,

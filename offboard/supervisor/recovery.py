@@ -41,13 +41,13 @@ EARLIER_S, SILENT_MIN_S, SILENT_MAX_S = 0.4, 0.4, 0.9
 
 @dataclass(frozen=True, slots=True)
 class Supervised:
-    """What the controller tells, and the supervisor must know before it may act: the vehicle,
-    whether it is `ours`, in the mode of our setpoints or in one that we asked for, by a report that
-    arrived at `reported_s` (`clock.monotonic_s`), of which the supervisor judges the age; whether
-    it may be `flying`, and whether it was asked to hold (`holding`): then this mode is ours, too;
-    or to land (`landing`).
-    `loss`: what its autopilot does without setpoints; `sticks`: it receives those of a pilot;
-    `setpoints_missing`: setpoints were missing already, or its failsafe for that flies it."""
+    """What the controller tells, and the supervisor must know before it may act.
+
+    `ours`: the vehicle is in the mode of our setpoints, or in one that we asked for, by a report
+    that arrived at `reported_s` (`clock.monotonic_s`), whose age the supervisor judges. `flying`:
+    it is armed. `holding`: it was asked to hold, so that this mode is ours, too; `landing`: to
+    land. `setpoint_loss`: what its autopilot does without setpoints; `sticks`: it receives those of
+    a pilot; `setpoints_missing`: they were missing already, or its failsafe for that flies it."""
 
     vehicle: VehicleFound
     ours: bool
@@ -55,14 +55,14 @@ class Supervised:
     reported_s: float = -math.inf
     holding: bool = False
     landing: bool = False
-    loss: SetpointLoss = NEVER
+    setpoint_loss: SetpointLoss = NEVER
     sticks: bool = False
     setpoints_missing: bool = False
 
     @property
     def silent_s(self) -> float:
         """Time without a beat after which the supervisor acts."""
-        return min(max(self.loss.after_s - EARLIER_S, SILENT_MIN_S), SILENT_MAX_S)
+        return min(max(self.setpoint_loss.after_s - EARLIER_S, SILENT_MIN_S), SILENT_MAX_S)
 
 
 class Recovery:
@@ -74,7 +74,7 @@ class Recovery:
         self._dialect, self._known = dialect, known
         self._hold_s = 0.0 if known.landing else HOLD_S
         self._began_s = began_s
-        missing_s = beat_s + known.loss.after_s - EARLY_S
+        missing_s = beat_s + known.setpoint_loss.after_s - EARLY_S
         self._loses_s = -math.inf if known.setpoints_missing else missing_s
         self._sticks = known.sticks
         self._mode: str | None = None
@@ -145,10 +145,12 @@ class Recovery:
         fell = self._fallen_s < math.inf
         followed = fell or self._before in (None, self._dialect.engage_mode)
         missing = followed and not self._acknowledged and at_s >= self._loses_s
-        if missing and mode in self._known.loss.modes and self._sticks:
+        if missing and mode in self._known.setpoint_loss.modes and self._sticks:
             self.news.append(f"{mode} for missing setpoints, and it receives a pilot's sticks")
         lands = mode == self._dialect.land_mode
-        return missing and mode in self._known.loss.modes and not lands and not self._sticks
+        return (
+            missing and mode in self._known.setpoint_loss.modes and not lands and not self._sticks
+        )
 
     def due(self, now_s: float) -> CommandLong | None:
         """What to ask for now."""

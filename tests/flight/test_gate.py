@@ -340,7 +340,7 @@ def test_a_failsafe_may_interrupt_a_mode_that_we_asked_for(
 def test_a_failsafe_that_was_shown_within_a_pause_permits_nothing() -> None:
     """A pilot may have taken it since, in the same mode."""
     authority, _ = replayed(HELD[:2])
-    authority.loss = SetpointLoss(1.0, ("POSCTL",))
+    authority.setpoint_loss = SetpointLoss(1.0, ("POSCTL",))
 
     def permits(heartbeat: bool, arrived_s: float) -> bool:
         authority.on_mode(
