@@ -76,14 +76,11 @@ class Row:
 
 def row_of(case: Case, record: Record, requirements: Sequence[Requirement]) -> Row:
     """The row of a finished flight: completed, with all requirements met, or why not."""
-    failed = ""
     if not record.completed:
-        failed = record.sentence
-    else:
-        figures = {name: record.figures.get(name, float("nan")) for name in METRICS}
-        missed = [each.sentence(figures) for each in requirements if not each.met(figures)]
-        failed = "; ".join(missed)
-    return Row(case, record, failed)
+        return Row(case, record, record.sentence)
+    figures = {name: record.figures.get(name, math.nan) for name in METRICS}
+    missed = [each.sentence(figures) for each in requirements if not each.met(figures)]
+    return Row(case, record, "; ".join(missed))
 
 
 def columns(rows: Sequence[Row]) -> dict[str, list[Any]]:

@@ -39,9 +39,8 @@ CONNECT_S = 5.0
 POLL_S = 0.2
 QUEUED = 2  # flights per thread of a cluster, so that none waits for us
 ORPHANED = 1  # exit code of a worker whose parent has ended
-DIED = Record(
-    ExitCode.ABORTED, "the process that flew it ended, twice", NOT_FLOWN, "crash"
-)  # as its worker cannot tell
+# as its worker cannot tell
+DIED = Record(ExitCode.ABORTED, "the process that flew it ended, twice", NOT_FLOWN, "crash")
 
 
 class Flyer(Protocol):
@@ -115,9 +114,8 @@ class Workers:
         except CancelledError:
             raise UserError(self._lost) from None
         except Exception as error:
-            if (
-                isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker"
-            ):  # dask's
+            died = isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker"
+            if died:  # the latter is dask's
                 return None
             raise
 

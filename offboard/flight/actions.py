@@ -40,13 +40,13 @@ def act(flight: FlightState) -> None:
     elif flight.phase is Phase.TAKEOFF:
         _take_off(flight, time_s)
     elif flight.phase not in TRACKING:
-        hold(flight, time_s)
+        act_without_telemetry(flight, time_s)
     elif flight.authority.permits_setpoint(flight.now_s) and not decision.decide(flight):
         outbox.send_level(flight, time_s, _level(flight))
     outbox.send(flight, flight.clock.request(time_s, flight.host_s))
 
 
-def hold(flight: FlightState, time_s: float) -> None:
+def act_without_telemetry(flight: FlightState, time_s: float) -> None:
     """Send what needs no telemetry: level setpoints, and the request that ends the flight."""
     phase = flight.phase
     # Until setpoints have replaced an autopilot's own take-off, none must be sent

@@ -20,7 +20,7 @@ from offboard.mavlink.events import MODE_KNOWN_S, ThrustReport
 
 OPERATOR = "{flight.stop_cause}"  # the cause of a row for `stop_requested`
 REBOOTED = "the vehicle restarted"
-RECOVERY = 0.25  # speed at which a delay runs back
+RECOVERY = 0.25  # seconds by which a held time decreases in one without the condition
 STEP_MAX_S = 0.2  # what one sample counts for, also after a gap of telemetry
 SINK_MPS = 0.3  # that full thrust stops within the delay, on a vehicle that can be flown
 FULL_THRUST = 0.99

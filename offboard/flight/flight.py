@@ -188,7 +188,7 @@ class Flight(FlightState):
         bridges = silence_s > BRIDGED_SHARE * limits.silence_s and not self.in_end_phase
         if bridges and silence_s - self.bridged_s >= self.period_s:
             self.bridged_s = silence_s
-            actions.hold(self, self.time_s + silence_s)
+            actions.act_without_telemetry(self, self.time_s + silence_s)
         if self.has_ended():
             transitions.name_failsafe(self)
 

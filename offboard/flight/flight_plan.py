@@ -16,9 +16,8 @@ from offboard.reference.transfer import Limits, stopping_place, transfer
 Array = NDArray[np.float64]
 SETTLED_DISTANCE_M = 0.3
 SETTLED_SPEED_MPS = 0.3
-RETURN = Limits(
-    speed_mps=0.5, acceleration_mps2=0.5, cruise_mps=0.5, cruise_vertical_mps=0.5
-)  # after a jump of the estimate
+# after a jump of the estimate
+RETURN = Limits(speed_mps=0.5, acceleration_mps2=0.5, cruise_mps=0.5, cruise_vertical_mps=0.5)
 CLEAR_M = 0.5  # above the ground, of a track that is placed in the air
 SAMPLED_S = 0.1
 

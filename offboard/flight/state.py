@@ -45,7 +45,6 @@ from offboard.model.vehicle import Vehicle
 LEVEL_DIRECTION = (0.0, 0.0, 1.0)  # of the thrust: the third body axis in NED
 COMMANDS_KEPT = 7  # as long as an attitude may take to follow
 THRUSTS_KEPT = 40  # as long as a setpoint may be on its way, or the next ones be lost
-PREDICTIONS_KEPT = 8
 # Setpoints count as missing so long before the autopilot's timeout, at most a third of it: the
 # newest may be on its way or lost
 MISSING_EARLY_S = 0.3
@@ -136,7 +135,7 @@ class FlightState:
     busyness: Busyness = field(init=False)  # of this computer
     heard_s: float = math.nan  # host time of the newest telemetry, as `Session.elapsed_s`
     telemetry_arrived_s: float = 0.0  # host time at which it arrived
-    bridged_s: float = 0.0  # silence at the newest setpoint that needs no telemetry
+    bridged_s: float = 0.0  # `silence_s` at the newest setpoint that was sent without telemetry
     ignored: int = 0  # datagrams of others and forged frames between the two newest ticks
     command: Command = field(default_factory=lambda: Command(0.0, LEVEL_DIRECTION, 0.0))  # in force
     decided: Decided | None = None  # in this turn
@@ -146,9 +145,7 @@ class FlightState:
     failure_cause: str = ""  # in a word: controller, link or computer
     commands: deque[Command] = field(default_factory=lambda: deque(maxlen=COMMANDS_KEPT))
     thrusts: deque[float] = field(default_factory=lambda: deque(maxlen=THRUSTS_KEPT))
-    announced: list[str] = field(
-        default_factory=list
-    )  # newest sentences for the user, oldest first
+    announced: list[str] = field(default_factory=list)  # newest for the user, oldest first
     announcements: int = 0  # how many there were
     told: set[str] = field(default_factory=set)  # of those that are announced once in a flight
     queue: list[Outgoing] = field(default_factory=list)  # to be sent
@@ -158,9 +155,7 @@ class FlightState:
     thinned_s: float = 0.0  # when less telemetry was requested, since the phase HEALTH began
     awaits_link: bool = False  # while landing
     follows_others: bool = False  # the newest ThrustReport is of none of `thrusts`
-    predictions: deque[PredictedState] = field(
-        default_factory=lambda: deque(maxlen=PREDICTIONS_KEPT)
-    )
+    predictions: deque[PredictedState] = field(default_factory=lambda: deque(maxlen=8))
 
     def __post_init__(self, before: FlightState | None) -> None:
         self.busyness = Busyness(self.period_s)

@@ -194,7 +194,7 @@ def _on_reboot(flight: FlightState) -> None:
     flight.took_off = False  # the local frame begins elsewhere
     if flight.phase in BEFORE_FLIGHT:
         flight.authority = Authority()
-    flight.authority.forget(flight.now_s)  # unheard from now on, not for ever
+    flight.authority.forget(flight.now_s)  # the age of its report counts from now
     flight.rebooted = flight.phase not in (Phase.CONNECT, Phase.HEALTH)
     flight.pilot = PilotSwitch()
     if flight.phase is Phase.LAND:
