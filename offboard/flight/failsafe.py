@@ -148,6 +148,7 @@ def away_from_commands(flight: FlightState) -> str:
     """Angle between the thrust direction and that of the nearest of the newest 7 setpoints, if all
     of them had an attitude."""
     vehicle, commands = flight.vehicle, flight.commands
+    # a position setpoint empties `thrusts`: fewer are newer than it
     if vehicle.attitude is None or len(flight.thrusts) < COMMANDS_KEPT:
         return ""
     flown = vehicle.thrust_direction_ned

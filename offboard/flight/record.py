@@ -24,8 +24,9 @@ from typing import Any, NamedTuple
 from offboard.control.base import Certificate, Decision
 from offboard.flight.phases import Phase
 from offboard.link.interface import Chunk
+from offboard.mavlink.event_record import numbered
 from offboard.mavlink.events import VehicleFound
-from offboard.mavlink.outgoing import ConfigurationRecord
+from offboard.mavlink.outgoing import PIECE_BYTES, ConfigurationRecord
 from offboard.mavlink.session import Reception, SessionSettings
 from offboard.model.command import Command, PositionCommand, PredictedState
 
@@ -99,10 +100,9 @@ class Decided:
 # TUNNEL.payload_type; numbers above 32767 need no registration
 CONFIGURATION_TYPE, VEHICLE_TYPE, INPUTS_TYPE = 0xC0F1, 0xC0F3, 0xC0F5
 _NUMBERED = struct.Struct("<HH")  # index of the piece, number of pieces of a configuration
-_PART_BYTES = 128 - _NUMBERED.size
 TEXT_MOST = 4_000_000  # bytes: eight of the longest configuration files; a log may be anybody's
 _HEAD = struct.Struct("<I")  # number of the piece
-_PIECE_BYTES = 128 - _HEAD.size
+_PIECE_BYTES = PIECE_BYTES - _HEAD.size
 # what an object holds: the name and the arguments of a call of the flight, or the total of others'
 # datagrams, a number of frames that were not sent, a checksum
 CALL, OTHERS, DROPPED, CHECK = "call", "others", "dropped", "crc"
@@ -125,12 +125,7 @@ def vehicle_of(payload: bytes) -> VehicleFound | None:
 
 def configuration_pieces(text: str) -> list[ConfigurationRecord]:
     """Records that hold `text`, in order."""
-    data = zlib.compress(text.encode("utf-8"), 9)
-    parts = [data[at : at + _PART_BYTES] for at in range(0, len(data), _PART_BYTES)]
-    return [
-        ConfigurationRecord(_NUMBERED.pack(index, len(parts)) + part, CONFIGURATION_TYPE)
-        for index, part in enumerate(parts)
-    ]
+    return numbered(zlib.compress(text.encode("utf-8"), 9), _NUMBERED, CONFIGURATION_TYPE)
 
 
 def joined_configuration(payloads: Iterable[bytes]) -> str | None:

@@ -21,6 +21,7 @@ from offboard.model.command import Command, PositionCommand
 
 Message = Any  # of pymavlink, to be packed
 FLOAT32_MAX = 3.4028234663852886e38
+PIECE_BYTES = 128  # of TUNNEL.payload
 _LOCAL_NED = 1  # MAV_FRAME_LOCAL_NED
 # SET_ATTITUDE_TARGET.type_mask for attitude and thrust: the body rates are ignored. On ArduCopter
 # masks 1 to 6 hold the position, 71 and 199 make it ignore the message
