@@ -183,7 +183,7 @@ class Authority:
             self.standing, self.lost_reason = Standing.LOST, reason
             self.lost_s = -math.inf if heartbeat else now_s
 
-    def known(self, now_s: float) -> bool:
+    def _known(self, now_s: float) -> bool:
         """Whether the newest report that counts is recent enough to act on."""
         return now_s - self.reported_s <= MODE_KNOWN_S
 
@@ -199,13 +199,13 @@ class Authority:
         """Whether a setpoint may leave: to a vehicle that follows it, or as the stream that PX4
         needs before it accepts the mode."""
         beginning = self.standing in (Standing.FREE, Standing.ASKED)
-        return self.known(now_s) and (beginning or self.standing is Standing.OURS)
+        return self._known(now_s) and (beginning or self.standing is Standing.OURS)
 
     def permits_command(self, now_s: float) -> bool:
         """Whether a command may leave."""
         handed = self.standing is Standing.HANDED and self.mode in self._requested
         fallen = self.standing is Standing.FAILSAFE and self._failsafe_shown
-        return self.permits_setpoint(now_s) or (self.known(now_s) and (handed or fallen))
+        return self.permits_setpoint(now_s) or (self._known(now_s) and (handed or fallen))
 
     @property
     def is_ours(self) -> bool:

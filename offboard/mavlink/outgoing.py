@@ -72,7 +72,7 @@ class AttitudeTarget(Outgoing):
     time_s: float
     command: Command
     hover_thrust: float
-    gravity_mps2: float = 9.81
+    gravity_mps2: float
     body_z_down: float | None = None
 
     def encode(self, target: Target | None) -> Message:
@@ -281,8 +281,8 @@ class SolverRecord(Record):
 
     time_s: float
     data: tuple[float, ...]
-    array_id: int = 0
-    name: str = "pso"
+    array_id: int
+    name: str
 
     def encode(self, target: Target | None) -> Message:
         kind = mavlink.MAVLink_debug_float_array_message

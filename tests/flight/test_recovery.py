@@ -227,7 +227,7 @@ def recovered(
     session, result = Session(SessionSettings()), Recovered()
     session.set_vehicle(VEHICLE, "vehicle")
     instance.feed(session.encode(CommandLong.message_interval(436, 50.0)))  # CURRENT_MODE
-    level = session.encode(AttitudeTarget(0.0, Command(9.81, (0.0, 0.0, 1.0), 0.0), 0.489))
+    level = session.encode(AttitudeTarget(0.0, Command(9.81, (0.0, 0.0, 1.0), 0.0), 0.489, 9.81))
     loss = PX4.setpoint_loss({"COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": fallback})
     known = Supervised(VEHICLE, ours=True, flying=True, reported_s=0.0, setpoint_loss=loss)
     recovery: Recovery | None = None
