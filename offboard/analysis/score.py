@@ -23,7 +23,7 @@ from offboard.analysis.history import History, gather
 from offboard.analysis.tracking import passed_s, tracking_metrics, window_of
 from offboard.analysis.verdict import begin_times, verdict_metrics
 from offboard.documents.errors import UserError, meant, plain
-from offboard.flight.decision import FAILED
+from offboard.flight.decision import DECISION_FAILED
 from offboard.flight.flight import Outcome
 from offboard.flight.outbox import Refusal
 from offboard.flight.phases import ExitCode, Phase
@@ -255,7 +255,7 @@ class Requirement:
 def decision_metrics(flown: History) -> dict[str, float]:
     """Values of a Score; empty without decisions."""
     columns = flown.records
-    failed = float(sum(event.what.startswith(FAILED) for event in flown.announcements))
+    failed = float(sum(event.what.startswith(DECISION_FAILED) for event in flown.announcements))
     if not len(columns):
         return {"failed_decisions": failed} if failed else {}
     refused = columns["refused"].astype(np.int64)
@@ -322,17 +322,18 @@ def link_metrics(flown: History, window: tuple[float, float] | None) -> dict[str
     delay_s = flown.identified["tilt_delay_s"]
     if len(delay_s := delay_s[np.isfinite(delay_s[:, 0])]):
         values["delay_ms"], values["delay_sd_ms"] = (1e3 * delay_s[-1].astype(float)).tolist()
+    if window is None:
+        return values
     for name, rows in (("position", flown.position), ("attitude", flown.attitude)):
-        if window is not None:
-            stamps = rows["time_s"]
-            stamps = stamps[(stamps >= window[0]) & (stamps <= window[1])]
-            intervals = np.diff(np.maximum.accumulate(stamps))  # repeated and late ones: zero
-            span_s = float(np.ptp(stamps)) if len(stamps) else 0.0
-            count = len(np.unique(stamps))
-            values[f"{name}_hz"] = (count - 1) / span_s if span_s > 0.0 else math.nan
-            values[f"{name}_gap_max_s"] = float(intervals.max(initial=0.0))
-            if name == "position":
-                values["stale_share"] = _mean(intervals <= 0.0)
+        stamps = rows["time_s"]
+        stamps = stamps[(stamps >= window[0]) & (stamps <= window[1])]
+        intervals = np.diff(np.maximum.accumulate(stamps))  # repeated and late ones: zero
+        span_s = float(np.ptp(stamps)) if len(stamps) else 0.0
+        count = len(np.unique(stamps))
+        values[f"{name}_hz"] = (count - 1) / span_s if span_s > 0.0 else math.nan
+        values[f"{name}_gap_max_s"] = float(intervals.max(initial=0.0))
+        if name == "position":
+            values["stale_share"] = _mean(intervals <= 0.0)
     return values
 
 

@@ -30,7 +30,7 @@ from offboard.model.command import Command
 
 # How the texts of missed decisions begin. One that raised an error has no record of its tick: the
 # analysis counts the texts
-FAILED, MISSED = "decision failed: ", "decision missed: "
+DECISION_FAILED, DECISION_MISSED = "decision failed: ", "decision missed: "
 NOTICEABLE_RADPS = 0.5  # a smaller change of the bandwidth is not announced
 # in a word -> what a missed decision is ascribed to
 _BY = {
@@ -61,7 +61,7 @@ def decide(flight: FlightState) -> bool:
         decided = _decided(flight)
         _send(flight, decided)
     except Exception as error:  # any error: the vehicle is in the air
-        _miss(flight, located(error), "controller", FAILED)
+        _miss(flight, located(error), "controller", DECISION_FAILED)
         return False
     flight.decided = decided
     if was_old and decided.refused == Refusal.STALE:
@@ -83,7 +83,7 @@ def finish(flight: FlightState, sent_s: float) -> None:
     try:
         _record(flight, decided, sent_s - flight.telemetry_arrived_s)
     except Exception as error:  # the certificate is the law's
-        _miss(flight, located(error), "controller", FAILED)
+        _miss(flight, located(error), "controller", DECISION_FAILED)
         return
     if not decided.refused:
         flight.missed = 0
@@ -91,7 +91,7 @@ def finish(flight: FlightState, sent_s: float) -> None:
             _identify(flight, flight.identification)
 
 
-def _miss(flight: FlightState, failure: str, cause: str, begins: str = MISSED) -> None:
+def _miss(flight: FlightState, failure: str, cause: str, begins: str = DECISION_MISSED) -> None:
     flight.missed += 1
     flight.failure, flight.failure_cause = f"{_BY[cause]}: {failure}", cause
     outbox.warn(flight, f"{begins}{failure}")

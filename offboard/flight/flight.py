@@ -28,7 +28,7 @@ from offboard.supervisor.recovery import Supervised
 
 __all__ = ["Flight", "Outcome"]
 
-STANDBY = 3  # MAV_STATE
+STATE_STANDBY = 3  # MAV_STATE
 BRIDGED_SHARE = 0.3  # of `Limits.silence_s`; after it, level setpoints replace the control law
 
 
@@ -215,7 +215,7 @@ class Flight(FlightState):
         """MAV_STATE and custom_mode of our heartbeat."""
         calm = self.phase in WAITING | ENDS
         critical = self.phase in FLYING and self.failsafe.action >= Action.HOLD
-        status = CRITICAL if critical else STANDBY if calm else ACTIVE
+        status = CRITICAL if critical else STATE_STANDBY if calm else ACTIVE
         return status, self.phase.code
 
     # ------------------------------------------------------------------ what others ask and say
