@@ -254,7 +254,7 @@ def tune(
 ) -> None:
     """Tune parameters, and write a configuration that flies better.
 
-    Minimises a figure over training flights, then flies the validation flights with and without
+    Minimises a metric over training flights, then flies the validation flights with and without
     the result. It is written only if it is better with 95 % confidence. The flights are in a
     folder beside it: the same command goes on. The shipped tuning shows all keys of the file.
 
