@@ -55,7 +55,7 @@ SHOWN = (
 DEFAULT_WIDTH = 80  # of a terminal
 LEGEND = (
     "RMSE, maximum: position error, medians of all flights [lowest\N{EN DASH}highest]. "
-    "tilt, rates: motion beside the reference's, RMS. decision: 99th percentile of its time.",
+    "tilt, rates: motion not due to the reference, RMS. decision: 99th percentile of its time.",
     BEST,
 )
 

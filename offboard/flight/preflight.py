@@ -64,7 +64,7 @@ class Ground:
     clock: VehicleClock
     host_s: float
     helicopter: bool = False  # by its vehicle file
-    rates_requested: bool = True
+    rates_requested: bool = True  # of telemetry: only then slow ones count
     reads_parameters: bool = False  # replies are still awaited
     in_the_air: bool = False
     guarded: bool = True  # a supervisor lands it if this process ends
