@@ -16,6 +16,7 @@ from offboard.flight.authority import Standing
 from offboard.flight.ground_contact import STOOD_S
 from offboard.flight.phases import TRACKING, Action, Condition, Limits, Phase
 from offboard.flight.state import COMMANDS_KEPT, FlightState
+from offboard.flight.timing import JUMP_S
 from offboard.mavlink.events import MODE_KNOWN_S, ThrustReport
 
 OPERATOR = "{flight.stop_cause}"  # the cause of a row for `stop_requested`
@@ -336,7 +337,7 @@ ROWS = (
     Row("second sender", other_sender, "one message", HOLD, cause="second sender"),
     # within this time a pilot's change of the mode is seen, or the row "authority" acts
     Row("other setpoints", follows_others, "1e-5", HOLD, MODE_KNOWN_S, "second sender"),
-    Row("clock", clock_jumped, "0.5 s", LAND, cause=""),
+    Row("clock", clock_jumped, f"{JUMP_S:g} s", LAND, cause=""),
     Row("contradiction", contradicted, UNIDENTIFIED, LAND, cause=""),
 )
 
