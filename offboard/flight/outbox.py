@@ -114,7 +114,7 @@ def clamp(command: Command, vehicle: Vehicle, *, on_ground: bool) -> Command:
     north, east, down = command.thrust_direction_ned
     lateral = math.hypot(north, east)
     if math.atan2(lateral, down) > vehicle.tilt_max_rad:
-        # a direction that is exactly vertical is tilted to the north (atan2 of zeros)
+        # an exactly inverted one is turned to the north (atan2 of zeros)
         towards_rad, scale = math.atan2(east, north), math.sin(vehicle.tilt_max_rad)
         north, east = scale * math.cos(towards_rad), scale * math.sin(towards_rad)
         down = math.cos(vehicle.tilt_max_rad)
