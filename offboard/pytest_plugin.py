@@ -29,7 +29,7 @@ class Flight:
     """A flight that has ended.
 
     `exit_code` is that of `offboard fly`: 0 flown and landed, 3 not flown, 4 aborted. `sentence`
-    says how it ended. `score` has the figures of the flight (see `offboard.analysis.score.Score`),
+    says how it ended. `score` has the metrics of the flight (see `offboard.analysis.score.Score`),
     `directory` holds flight.tlog and flight.yaml.
     """
 

@@ -83,7 +83,7 @@ def test_the_first_command_flies_prints_and_scores_and_the_report_follows(
     verdict, *rows = lines[lines.index("\n") + 1 :]
     assert verdict == "flown and landed\n"
     labels = [row[2:17].strip() for row in rows if row[2] != " "]
-    assert labels == ["tracked error", "true error", "timing", "identified", "log", "all figures",
+    assert labels == ["tracked error", "true error", "timing", "identified", "log", "all metrics",
                       "report"]  # fmt: skip
 
     monkeypatch.setattr(sys, "argv", ["", str(flight)])

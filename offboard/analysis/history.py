@@ -25,6 +25,7 @@ from offboard.flight.record import FIELDS, IDENTIFIED_ID, RECORD_ID
 from offboard.identification.vehicle_fit import RECORDED
 from offboard.mavlink import event_record
 from offboard.mavlink.decode import (
+    ARMED,
     POSITION_LIMIT_M,
     RATE_LIMIT_RADPS,
     UNIT_LENGTHS,
@@ -46,7 +47,6 @@ OUR_COMPONENTS = (COMPONENT_ID, RECORD_COMPONENT_ID)
 TELEMETRY = (31, 32)  # ATTITUDE_QUATERNION, LOCAL_POSITION_NED
 _SUBSTITUTES = (30, 33)  # ATTITUDE, GLOBAL_POSITION_INT: the clock of logs without these
 _TUNNEL = 385  # message id
-_ARMED = 0x80  # MAV_MODE_FLAG_SAFETY_ARMED
 _NO_VOLTAGE, _NO_PERCENTAGE = 0xFFFF, -1  # of SYS_STATUS
 _WRAP_MS = 2**32
 PHASES: dict[int | None, str] = {phase.code: phase.value for phase in Phase}
@@ -335,7 +335,7 @@ class _Collector:
         if entry.name == "SET_POSITION_TARGET_LOCAL_NED":
             setpoint = payload[:4] + _NO_ATTITUDE
             self._samples[True, "SET_ATTITUDE_TARGET"].add(setpoint, self._now_ms, unix_s)
-        elif record_type(entry) == event_record.PAYLOAD_TYPE:
+        elif record_type(entry) == event_record.EVENT_TYPE:
             self._event_records.append((self.now_s, unix_s, entry.tunnelled))
 
     def _add_theirs(self, entry: LoggedMessage, payload: bytes, unix_s: float) -> None:
@@ -398,10 +398,10 @@ class _Collector:
         setpoint = ours["SET_ATTITUDE_TARGET"]
         substitutes = []
         if not len(position) and not len(ours["POSITION_TARGET_LOCAL_NED"]):  # of another origin
-            position = _local(rows["GLOBAL_POSITION_INT"])
+            position = _position_of_global(rows["GLOBAL_POSITION_INT"])
             substitutes.append("GLOBAL_POSITION_INT")
         if not len(attitude):
-            attitude = _turned(rows["ATTITUDE"])
+            attitude = _attitude_of_angles(rows["ATTITUDE"])
             substitutes.append("ATTITUDE")
         if not len(setpoint):
             substitutes.append("ATTITUDE_TARGET")
@@ -422,7 +422,7 @@ class _Collector:
             link_delay=_link_delay(ours["TIMESYNC"], rows["TIMESYNC"]),
             heartbeat=table(
                 heartbeat,
-                armed=(heartbeat["armed"] & _ARMED > 0).astype(np.float32),
+                armed=(heartbeat["armed"] & ARMED > 0).astype(np.float32),
                 system_status=heartbeat["system_status"].astype(np.float32),
             ),
             battery=table(battery, voltage_mv=voltage, remaining=remaining),
@@ -454,7 +454,7 @@ def _truth(rows: Mapping[str, Rows], origin: Geodetic | None) -> Rows:
     return table(none, position_ned_m=np.zeros((0, 3), np.float32))
 
 
-def _local(rows: Rows) -> Rows:
+def _position_of_global(rows: Rows) -> Rows:
     """Positions of GLOBAL_POSITION_INT relative to the first. 1e-7 deg, mm, cm/s."""
     places = rows["place"] / (1e7, 1e7, 1e3)
     position = position_ned_m(places, Geodetic(*places[0].tolist())) if len(rows) else places
@@ -465,8 +465,8 @@ def _local(rows: Rows) -> Rows:
     )
 
 
-def _turned(rows: Rows) -> Rows:
-    """Attitudes of ATTITUDE."""
+def _attitude_of_angles(rows: Rows) -> Rows:
+    """Attitudes from the Euler angles of ATTITUDE."""
     quaternion = quaternion_from_euler(*rows["angles"].astype(np.float64).T)
     rates = rows["rates_radps"]
     return table(rows, quaternion=np.asarray(quaternion, np.float32), rates_radps=rates)

@@ -17,6 +17,7 @@ from scipy.integrate import cumulative_trapezoid
 from offboard.analysis.history import History
 from offboard.documents.errors import plain
 from offboard.flight.phases import TRACKING
+from offboard.identification.learner import LIFTED_OFF_S
 from offboard.identification.trace import NORTH, POSITION, STAMP, VELOCITY, Trace, clean
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_fit import AXES, Identified, identify
@@ -27,7 +28,6 @@ from offboard.model.vehicle import Vehicle
 Array = NDArray[np.float64]
 Row = tuple[str, Estimate | None, str, str]  # name, estimate, unit, reason without one
 
-LIFTED_OFF_S = 0.5  # the ground's effect on the thrust ends
 _KEPT = (
     "mass_kg", "inertia_kgm2", "arm_m", "drag_rotation_nmpradps",
     "angular_acceleration_limit_radps2",

@@ -23,18 +23,17 @@ from offboard.analysis.history import History, gather
 from offboard.analysis.tracking import passed_s, tracking_metrics, window_of
 from offboard.analysis.verdict import begin_times, verdict_metrics
 from offboard.documents.errors import UserError, meant, plain
-from offboard.flight.decision import FAILED
+from offboard.flight.decision import DECISION_FAILED
 from offboard.flight.flight import Outcome
 from offboard.flight.outbox import Refusal
 from offboard.flight.phases import ExitCode, Phase
 from offboard.link.log import LogError, replace_file
 
 Array = NDArray[np.float64]
-NAN = math.nan
 
 
 def _metric(meaning: str, unit: str = "") -> float:
-    value: float = field(default=NAN, metadata={"meaning": meaning, "unit": unit})
+    value: float = field(default=math.nan, metadata={"meaning": meaning, "unit": unit})
     return value
 
 
@@ -88,18 +87,18 @@ class Score:
     thrust_sd: float = _metric("commanded thrust (0 .. 1), sd")
     tilt_command_step_deg: float = _metric("commanded tilt, RMS of its steps", "deg")
     tilt_max_deg: float = _metric("tilt, maximum", "deg")
-    tilt_agitation_deg: float = _metric("tilt beside the reference's, RMS", "deg")
-    rate_agitation_radps: float = _metric("rates beside the reference's, RMS", "rad/s")
+    tilt_agitation_deg: float = _metric("tilt not due to the reference, RMS", "deg")
+    rate_agitation_radps: float = _metric("rates not due to the reference, RMS", "rad/s")
     roll_rate_sd_radps: float = _metric("roll rate, sd", "rad/s")
     pitch_rate_sd_radps: float = _metric("pitch rate, sd", "rad/s")
     setpoint_hz: float = _metric("setpoints sent", "Hz")
     setpoint_gap_max_s: float = _metric("longest gap of setpoints", "s")
     setpoint_gap_wall_max_s: float = _metric("longest gap of setpoints, wall time", "s")
-    answer_p50_ms: float = _metric("telemetry in to setpoint out, median", "ms")
-    answer_p99_ms: float = _metric("telemetry in to setpoint out, 99th p.", "ms")
-    answer_max_ms: float = _metric("telemetry in to setpoint out, maximum", "ms")
-    setpoint_age_p99_ms: float = _metric("telemetry at its setpoint, 99th perc.", "ms")
-    setpoint_age_max_ms: float = _metric("telemetry at its setpoint, maximum", "ms")
+    answer_p50_ms: float = _metric("telemetry to setpoint, median", "ms")
+    answer_p99_ms: float = _metric("telemetry to setpoint, 99th perc.", "ms")
+    answer_max_ms: float = _metric("telemetry to setpoint, maximum", "ms")
+    setpoint_age_p99_ms: float = _metric("telemetry age at setpoint, 99th perc.", "ms")
+    setpoint_age_max_ms: float = _metric("telemetry age at setpoint, maximum", "ms")
     missed_ticks: float = _metric("control periods without telemetry")
     skipped_ticks: float = _metric("of these, in pauses of this process")
     pause_max_s: float = _metric("longest pause of this process", "s")
@@ -256,7 +255,7 @@ class Requirement:
 def decision_metrics(flown: History) -> dict[str, float]:
     """Values of a Score; empty without decisions."""
     columns = flown.records
-    failed = float(sum(event.what.startswith(FAILED) for event in flown.announcements))
+    failed = float(sum(event.what.startswith(DECISION_FAILED) for event in flown.announcements))
     if not len(columns):
         return {"failed_decisions": failed} if failed else {}
     refused = columns["refused"].astype(np.int64)
@@ -317,23 +316,24 @@ def link_metrics(flown: History, window: tuple[float, float] | None) -> dict[str
         values["setpoint_gap_max_s"] = float(np.diff(sent["time_s"]).max(initial=0.0))
         values["setpoint_gap_wall_max_s"] = float(np.diff(sent["unix_s"]).max(initial=0.0))
     if len(flown.link_delay):
-        late_ms = 1e3 * flown.link_delay["delay_s"]
-        values["link_delay_p50_ms"] = _percentile(late_ms, 50)
-        values["link_delay_p99_ms"] = _percentile(late_ms, 99)
+        link_ms = 1e3 * flown.link_delay["delay_s"]
+        values["link_delay_p50_ms"] = _percentile(link_ms, 50)
+        values["link_delay_p99_ms"] = _percentile(link_ms, 99)
     delay_s = flown.identified["tilt_delay_s"]
     if len(delay_s := delay_s[np.isfinite(delay_s[:, 0])]):
         values["delay_ms"], values["delay_sd_ms"] = (1e3 * delay_s[-1].astype(float)).tolist()
+    if window is None:
+        return values
     for name, rows in (("position", flown.position), ("attitude", flown.attitude)):
-        if window is not None:
-            stamps = rows["time_s"]
-            stamps = stamps[(stamps >= window[0]) & (stamps <= window[1])]
-            intervals = np.diff(np.maximum.accumulate(stamps))  # repeated and late ones: zero
-            span_s = float(np.ptp(stamps)) if len(stamps) else 0.0
-            count = len(np.unique(stamps))
-            values[f"{name}_hz"] = (count - 1) / span_s if span_s > 0.0 else math.nan
-            values[f"{name}_gap_max_s"] = float(intervals.max(initial=0.0))
-            if name == "position":
-                values["stale_share"] = _mean(intervals <= 0.0)
+        stamps = rows["time_s"]
+        stamps = stamps[(stamps >= window[0]) & (stamps <= window[1])]
+        intervals = np.diff(np.maximum.accumulate(stamps))  # repeated and late ones: zero
+        span_s = float(np.ptp(stamps)) if len(stamps) else 0.0
+        count = len(np.unique(stamps))
+        values[f"{name}_hz"] = (count - 1) / span_s if span_s > 0.0 else math.nan
+        values[f"{name}_gap_max_s"] = float(intervals.max(initial=0.0))
+        if name == "position":
+            values["stale_share"] = _mean(intervals <= 0.0)
     return values
 
 

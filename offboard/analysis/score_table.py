@@ -102,14 +102,14 @@ def show(console: Console, score: Score, history: History) -> None:
     if not known:
         console.print("nothing was flown that could be scored")
         return
-    figures = Table(box=None, pad_edge=False, show_header=False)
-    figures.add_column(no_wrap=True)
-    figures.add_column(justify="right")
-    figures.add_column()
-    figures.add_column(style="dim")
+    metrics = Table(box=None, pad_edge=False, show_header=False)
+    metrics.add_column(no_wrap=True)
+    metrics.add_column(justify="right")
+    metrics.add_column()
+    metrics.add_column(style="dim")
     for name, value in score.metrics().items():
         if name in SECTIONS:
-            figures.add_row(Text(f"\n{SECTIONS[name]}", "bold"))
+            metrics.add_row(Text(f"\n{SECTIONS[name]}", "bold"))
         if name in known:
-            figures.add_row(name, f"{value:.4g}", METRICS[name]["unit"], METRICS[name]["meaning"])
-    console.print(figures)
+            metrics.add_row(name, f"{value:.4g}", METRICS[name]["unit"], METRICS[name]["meaning"])
+    console.print(metrics)

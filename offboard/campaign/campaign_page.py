@@ -1,4 +1,4 @@
-"""The page of a campaign: figures by block, a table, worst flights."""
+"""The page of a campaign: plots by block, a table, worst flights."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NARROWEST_PX = 960
 _ROW_PX, _TOP_PX = 22, 120  # _TOP_PX: tool bar, titles and numbers of the axes
 
 
-# figure of the score, the title of its panel
+# metric of the score, the title of its panel
 PANELS = {
     ERROR: "position error<br>RMSE [m]",
     "margin": "margin",
@@ -25,7 +25,7 @@ PANELS = {
     "rate_agitation_radps": "excess rates<br>RMS [rad/s]",
 }
 # of the table
-FIGURES = (
+TABLE_METRICS = (
     ERROR, "max_position_m", "margin", "rmse_truth_m", "tilt_agitation_deg",
     "rate_agitation_radps", "rmse_heading_deg",
 )  # fmt: skip
@@ -52,7 +52,7 @@ def page(
         successes=sum(not row.failed for row in rows),
         missing_flights=missing,
         figure=_figure(groups) if rows else None,
-        figures=FIGURES,
+        metrics=TABLE_METRICS,
         groups=groups,
         best=BEST if any(group.best for group in groups) else "",
         worst=sorted(rows, key=lambda row: row.severity)[:WORST_SHOWN],

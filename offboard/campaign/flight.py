@@ -106,15 +106,15 @@ def recorded(job: Job, directory: Path, fly: Callable[[FlightConfig, Path], Outc
         sentence = f"{type(error).__name__}: {error}"
         return Record(ExitCode.ABORTED, sentence, NOT_FLOWN, "crash")
     keep_score(directory, score, history)
-    outcome, figures = judged(outcome, score), score.metrics()
-    margins = terms(job.promises, figures, history, config.controller)
+    outcome, metrics = judged(outcome, score), score.metrics()
+    margins = terms(job.promises, metrics, history, config.controller)
     weakest = min(margins, key=lambda name: margins[name])
     return Record(
         outcome.exit_code,
         outcome.sentence,
         margins[weakest],
         weakest,
-        {name: value for name, value in figures.items() if math.isfinite(value)},
+        {name: value for name, value in metrics.items() if math.isfinite(value)},
     )
 
 
@@ -139,21 +139,21 @@ def _fly(case: Case, scratch: Path, config: FlightConfig, directory: Path) -> Ou
 
 def terms(
     promises: Promises,
-    figures: Mapping[str, float],
+    metrics: Mapping[str, float],
     flown: History,
     controller: ControllerSettings,
 ) -> dict[str, float]:
     """The terms by name; without those that the log does not hold."""
     used = {
-        "error": figures["max_position_m"] / promises.error_m,
-        "tilt": figures["tilt_max_deg"] / promises.tilt_deg,
-        "age": 1e-3 * figures["link_delay_p99_ms"] / promises.age_s,
-        "authority": figures["at_bound_share"] / promises.at_bound,
-        "touchdown": figures["touchdown_mps"] / promises.touchdown_mps,
+        "error": metrics["max_position_m"] / promises.error_m,
+        "tilt": metrics["tilt_max_deg"] / promises.tilt_deg,
+        "age": 1e-3 * metrics["link_delay_p99_ms"] / promises.age_s,
+        "authority": metrics["at_bound_share"] / promises.at_bound,
+        "touchdown": metrics["touchdown_mps"] / promises.touchdown_mps,
     }
     margins = {name: 1.0 - share for name, share in used.items()}
     margins["clearance"] = _clearance(flown, controller) / promises.clearance_m - 1.0
-    if figures["completed"] != 1.0:
+    if metrics["completed"] != 1.0:
         margins["completed"] = NOT_COMPLETED
     return {
         name: max(LOWEST, min(1.0, value))

@@ -26,7 +26,7 @@ INFEASIBLE = "infeasible"
 @dataclass(frozen=True, slots=True)
 class Record:
     """The end of a flight. `margin` and its smallest term are those of `campaign.flight`;
-    `figures` those of the score, without NaN."""
+    `figures` are the metrics of the score, without NaN."""
 
     exit_code: int
     sentence: str

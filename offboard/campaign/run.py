@@ -41,7 +41,7 @@ class Incomplete(Exception):
     """No further flight begins. `str()` says why, empty by request."""
 
 
-class Counter(Status):
+class Progress(Status):
     """Context manager that shows how many of at most `planned` flights have ended, how fast, and
     how long the rest takes: one line in place on a terminal, else a line at the beginning and for
     every twentieth of them."""
@@ -60,7 +60,7 @@ class Counter(Status):
             already = f", {self._known} already flown" if self._known else ""
             self._show(f"{counted(self.planned, 'flight')}{already}")
 
-    def ended(self) -> None:
+    def flight_ended(self) -> None:
         """A flight has ended."""
         self._flown += 1
         done = self._known + self._flown
@@ -104,7 +104,7 @@ class Runner(ExitStack):
         results: Results,
         promises: Promises,
         open_flyer: OpenFlyer,
-        counter: Counter,
+        progress: Progress,
         *,
         keep: Path | None = None,
         written: Callable[[], None] = lambda: None,
@@ -113,15 +113,15 @@ class Runner(ExitStack):
         self._results = results
         self._promises = promises
         self._open_flyer = open_flyer
-        self._counter = counter
+        self._progress = progress
         self._keep = keep
         self._written = written
         self._flyer: Flyer | None = None
         self.flown: dict[str, Case] = {}  # by key, in order
 
     def __enter__(self) -> Self:
-        self._ending = partial(self._counter.ending, self.enter_context(StopRequests()))
-        self.enter_context(self._counter)
+        self._ending = partial(self._progress.ending, self.enter_context(StopRequests()))
+        self.enter_context(self._progress)
         return self
 
     def fly(self, cases: Sequence[Case]) -> list[Record]:
@@ -130,7 +130,7 @@ class Runner(ExitStack):
         known = {case.key: self._results.get(case.key) for case in cases}
         missing = [case for case in cases if not self._is_done(case, known[case.key])]
         new = {case.key: case for case in cases if case.key not in self.flown}
-        self._counter.begin(len(new.keys() - {case.key for case in missing}))
+        self._progress.begin(len(new.keys() - {case.key for case in missing}))
         for job, record in self._fly(missing):
             known[job.case.key] = record
             try:
@@ -138,7 +138,7 @@ class Runner(ExitStack):
                 self._written()
             except UserError as error:
                 raise Incomplete(str(error)) from None
-            self._counter.ended()
+            self._progress.flight_ended()
         found = [known[case.key] for case in cases]
         records = [record for record in found if record is not None]
         if len(records) < len(found):
@@ -218,11 +218,11 @@ class Campaign:
         self._requirements = [Requirement.parse(text) for text in file.require]
         self._next_table_s = 0.0
 
-    def runner(self, open_flyer: OpenFlyer, counter: Counter) -> Runner:
+    def runner(self, open_flyer: OpenFlyer, progress: Progress) -> Runner:
         """What flies the cases of this campaign, and writes table and page while it does."""
         keep = self.directory / KEPT if self.file.keep else None
         return Runner(
-            self.results, self.file.promises, open_flyer, counter, keep=keep, written=self._written
+            self.results, self.file.promises, open_flyer, progress, keep=keep, written=self._written
         )
 
     def fly(self, open_flyer: OpenFlyer, console: Console, shard: slice = slice(None)) -> Summary:
@@ -231,7 +231,7 @@ class Campaign:
         mine = self.cases[shard]
         stopped = ""
         try:
-            with self.runner(open_flyer, Counter(console, len(mine))) as runner:
+            with self.runner(open_flyer, Progress(console, len(mine))) as runner:
                 runner.fly(mine)
         except Incomplete as reason:
             stopped = str(reason)

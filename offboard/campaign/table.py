@@ -1,6 +1,6 @@
 """The table of a campaign: one row per flight as CSV, and groups of flights for page and terminal.
 
-The CSV has no figure that a clock decides: it is the same bytes however the flights were flown.
+The CSV has no metric that a clock decides: it is the same bytes however the flights were flown.
 A group is the flights of one combination: they differ in seed and draw only.
 """
 
@@ -26,7 +26,7 @@ from offboard.analysis.score import METRICS, Requirement
 from offboard.campaign.cases import Case
 from offboard.campaign.results import Record
 
-# figures that this computer's clock decides: they differ between two runs of one flight
+# metrics that this computer's clock decides: they differ between two runs of one flight
 WALL_TIMES = (
     "setpoint_gap_wall_max_s",
     "answer_p50_ms",
@@ -36,7 +36,7 @@ WALL_TIMES = (
     "solve_time_p99_ms",
 )
 CASE_COLUMNS = ("controller", "reference", "scenario", "vehicle", "sim_vehicle", "firmware")
-FIGURE_COLUMNS = tuple(name for name in METRICS if name not in WALL_TIMES)
+METRIC_COLUMNS = tuple(name for name in METRICS if name not in WALL_TIMES)
 CONFIDENCE = 0.95
 ERROR = "rmse_position_m"
 EQUAL_SHARE = 0.01  # medians that are closer than this share of the best are equal
@@ -44,7 +44,7 @@ BEST = (
     "* best: lowest median RMSE of its block; or a median within the range of the best, or within "
     f"{EQUAL_SHARE:.0%} of its median."
 )
-# figure of the score, its title in the terminal
+# metric of the score, its title in the terminal
 SHOWN = (
     (ERROR, "RMSE\n[m]"),
     ("max_position_m", "maximum\n[m]"),
@@ -55,7 +55,7 @@ SHOWN = (
 DEFAULT_WIDTH = 80  # of a terminal
 LEGEND = (
     "RMSE, maximum: position error, medians of all flights [lowest\N{EN DASH}highest]. "
-    "tilt, rates: motion beside the reference's, RMS. decision: 99th percentile of its time.",
+    "tilt, rates: motion not due to the reference, RMS. decision: 99th percentile of its time.",
     BEST,
 )
 
@@ -76,14 +76,11 @@ class Row:
 
 def row_of(case: Case, record: Record, requirements: Sequence[Requirement]) -> Row:
     """The row of a finished flight: completed, with all requirements met, or why not."""
-    failed = ""
     if not record.completed:
-        failed = record.sentence
-    else:
-        figures = {name: record.figures.get(name, float("nan")) for name in METRICS}
-        missed = [each.sentence(figures) for each in requirements if not each.met(figures)]
-        failed = "; ".join(missed)
-    return Row(case, record, failed)
+        return Row(case, record, record.sentence)
+    metrics = {name: record.figures.get(name, math.nan) for name in METRICS}
+    missed = [each.sentence(metrics) for each in requirements if not each.met(metrics)]
+    return Row(case, record, "; ".join(missed))
 
 
 def columns(rows: Sequence[Row]) -> dict[str, list[Any]]:
@@ -101,7 +98,7 @@ def columns(rows: Sequence[Row]) -> dict[str, list[Any]]:
         "failed": [row.failed for row in rows],
         "margin": [row.record.margin for row in rows],
         "weakest": [row.record.weakest for row in rows],
-        **{name: [row.record.figures.get(name) for row in rows] for name in FIGURE_COLUMNS},
+        **{name: [row.record.figures.get(name) for row in rows] for name in METRIC_COLUMNS},
         "fly_again": [row.case.line for row in rows],
     }
 
@@ -157,23 +154,23 @@ class Group:
                 found.setdefault(row.failed, []).append(row.case.seed)
         return found
 
-    def values(self, figure: str) -> list[float]:
-        """One figure of every completed flight; `margin` of every flight."""
-        if figure == "margin":
+    def values(self, metric: str) -> list[float]:
+        """One metric of every completed flight; `margin` of every flight."""
+        if metric == "margin":
             return [row.record.margin for row in self.rows]
         completed = (row.record for row in self.rows if row.record.completed)
-        return [r.figures[figure] for r in completed if figure in r.figures]
+        return [r.figures[metric] for r in completed if metric in r.figures]
 
-    def spread(self, figure: str) -> tuple[float, float, float]:
+    def spread(self, metric: str) -> tuple[float, float, float]:
         """Lowest, median and highest value; NaN without values."""
-        values = self.values(figure)
+        values = self.values(metric)
         if not values:
             return math.nan, math.nan, math.nan
         return min(values), float(np.median(values)), max(values)
 
-    def shown(self, figure: str) -> str:
-        """Median and range of a figure as text, empty without values."""
-        low, middle, high = map(digits, self.spread(figure))
+    def shown(self, metric: str) -> str:
+        """Median and range of a metric as text, empty without values."""
+        low, middle, high = map(digits, self.spread(metric))
         return middle if low == high else f"{middle} [{low}\N{EN DASH}{high}]"
 
 
@@ -245,7 +242,7 @@ def show(console: Console, flown: Sequence[Group]) -> None:
         for group in members:
             mark, style = ("*", "bold") if group.best else (" ", "" if group.successes else "red")
             part = f" ({group.successes} of {group.flights})" if group.failed else ""
-            medians = [digits(group.spread(figure)[1]) for figure, _ in SHOWN[1:]]
+            medians = [digits(group.spread(metric)[1]) for metric, _ in SHOWN[1:]]
             cells = (group.shown(ERROR).replace(" ", separator), *medians)
             table.add_row(Text(f"{mark} {group.name}{part}"), *map(Text, cells), style=style)
     console.print(table)

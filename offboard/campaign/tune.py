@@ -1,4 +1,4 @@
-"""Tuning: parameters that lower a figure on training flights, judged on validation flights, pair by
+"""Tuning: parameters that lower a metric on training flights, judged on validation flights, pair by
 pair (same scenario, same seed), with confidence.
 
     ranges:
@@ -24,7 +24,7 @@ from offboard.campaign.cases import SCENARIO, Case, Values, expand, rounded
 from offboard.campaign.document import CampaignFile, Firmware, Name, Names, Ranges, Seed, Seeds
 from offboard.campaign.run import check
 from offboard.campaign.search import Fly, ask, study_of
-from offboard.campaign.table import CONFIDENCE, FIGURE_COLUMNS
+from offboard.campaign.table import CONFIDENCE, METRIC_COLUMNS
 from offboard.documents.errors import DocumentError, naming
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import override, parse, read
@@ -32,10 +32,10 @@ from offboard.documents.shipped import PARTS, locate, read_text
 from offboard.run.configuration import read_part
 
 
-def _figure(name: str) -> str:
-    if name not in FIGURE_COLUMNS:
-        known = ", ".join(FIGURE_COLUMNS)
-        raise ValueError(f"{name!r} is no figure of a lockstep flight; there are {known}")
+def _metric(name: str) -> str:
+    if name not in METRIC_COLUMNS:
+        known = ", ".join(METRIC_COLUMNS)
+        raise ValueError(f"{name!r} is no metric of a lockstep flight; there are {known}")
     return name
 
 
@@ -48,7 +48,7 @@ class Flights(Parameters):
 
 
 class TuneFile(Parameters):
-    """A tuning. `objective` is the figure that is minimised, averaged over the flights; a flight
+    """A tuning. `objective` is the metric that is minimised, averaged over the flights; a flight
     that is not completed costs `failure`."""
 
     config: Name = "flight"
@@ -57,7 +57,7 @@ class TuneFile(Parameters):
     ranges: Ranges
     training: Flights
     validation: Flights
-    objective: Annotated[str, AfterValidator(_figure)] = "rmse_position_m"
+    objective: Annotated[str, AfterValidator(_metric)] = "rmse_position_m"
     failure: float = Field(default=5.0, gt=0, le=1e6)
     trials: int = Field(default=60, ge=2, le=100_000)
     seed: Seed = 1
@@ -140,8 +140,8 @@ class Tuning:
 
     def _costs(self, fly: Fly, cases: Sequence[Case], values: Values) -> list[float]:
         records = fly([replace(case, values=values) for case in cases])
-        figures = (record.figures if record.completed else {} for record in records)
-        return [each.get(self.file.objective, self.file.failure) for each in figures]
+        metrics = (record.figures if record.completed else {} for record in records)
+        return [each.get(self.file.objective, self.file.failure) for each in metrics]
 
 
 def planned(file: TuneFile) -> tuple[list[Case], list[Case], dict[str, float]]:

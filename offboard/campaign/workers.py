@@ -31,8 +31,7 @@ from typing import Protocol
 from offboard.campaign.flight import NOT_FLOWN, Job, fly_job, recorded
 from offboard.campaign.results import Record
 from offboard.documents.errors import UserError, install, shown
-from offboard.flight.flight import STOPPED
-from offboard.flight.phases import ExitCode
+from offboard.flight.phases import OPERATOR_STOP, ExitCode
 from offboard.link.log import free_name
 from offboard.run.flight import Connection, fly
 
@@ -40,9 +39,8 @@ CONNECT_S = 5.0
 POLL_S = 0.2
 QUEUED = 2  # flights per thread of a cluster, so that none waits for us
 ORPHANED = 1  # exit code of a worker whose parent has ended
-DIED = Record(
-    ExitCode.ABORTED, "the process that flew it ended, twice", NOT_FLOWN, "crash"
-)  # as its worker cannot tell
+# as its worker cannot tell
+DIED = Record(ExitCode.ABORTED, "the process that flew it ended, twice", NOT_FLOWN, "crash")
 
 
 class Flyer(Protocol):
@@ -116,9 +114,8 @@ class Workers:
         except CancelledError:
             raise UserError(self._lost) from None
         except Exception as error:
-            if (
-                isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker"
-            ):  # dask's
+            died = isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker"
+            if died:  # the latter is dask's
                 return None
             raise
 
@@ -150,7 +147,7 @@ class ConnectedVehicle:
             if ending():
                 return
             record = self._record(job)
-            if record.sentence.startswith(STOPPED):
+            if record.sentence.startswith(OPERATOR_STOP):
                 return  # the flight received the interrupt
             if record.exit_code != ExitCode.REFUSED:
                 yield job, record

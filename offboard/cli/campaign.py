@@ -140,12 +140,12 @@ def conclude(summary: Summary, flown: Campaign) -> None:
 
 def _search(flown: Campaign, source: str, count: int, open_workers: OpenFlyer) -> None:
     """Search for failures and print them; exits with 1 if there is one."""
-    from offboard.campaign.run import Counter
+    from offboard.campaign.run import Progress
     from offboard.campaign.search import FailureSearch
 
     search = FailureSearch(flown, source)
-    counter = Counter(out, search.flights_most(count))
-    with resumable(), flown.runner(open_workers, counter) as runner:
+    progress = Progress(out, search.flights_most(count))
+    with resumable(), flown.runner(open_workers, progress) as runner:
         failures = search.find(count, runner)
     unflown = sum(row.record.infeasible for row in flown.rows())
     cannot = f", {unflown} cannot be flown (the table says why)" if unflown else ""
@@ -254,7 +254,7 @@ def tune(
 ) -> None:
     """Tune parameters, and write a configuration that flies better.
 
-    Minimises a figure over training flights, then flies the validation flights with and without
+    Minimises a metric over training flights, then flies the validation flights with and without
     the result. It is written only if it is better with 95 % confidence. The flights are in a
     folder beside it: the same command goes on. The shipped tuning shows all keys of the file.
 
@@ -265,17 +265,17 @@ def tune(
     with out.status("planning"):
         from offboard.campaign.document import Promises
         from offboard.campaign.results import Results, code_hash
-        from offboard.campaign.run import Counter, Runner
+        from offboard.campaign.run import Progress, Runner
         from offboard.campaign.tune import Tuning, read_tune
         from offboard.campaign.tune import profile as text_of
         from offboard.campaign.workers import local_workers
 
         tuning = Tuning(*read_tune(file))
         results = Results(profile.with_name(f"{profile.name}.tune"), code_hash())
-    counter = Counter(out, tuning.flights)
+    progress = Progress(out, tuning.flights)
     with (
         resumable(),
-        Runner(results, Promises(), partial(local_workers, workers), counter) as runner,
+        Runner(results, Promises(), partial(local_workers, workers), progress) as runner,
     ):
         tuned = tuning.run(
             runner.fly,

@@ -37,7 +37,7 @@ def doctor(
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
     listing: Annotated[bool, typer.Option("--list", help="List the checks and exit.")] = False,
 ) -> None:
-    """Check vehicle, link and computer; changes nothing.
+    """Check vehicle, link and computer before a flight.
 
     Listens for 4 to 9 s, and ends within 15 s: what takes longer is a row. Sends TIMESYNC and
     requests: for parameters, for single messages, for the telemetry rates of a flight, and that the

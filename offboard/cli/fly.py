@@ -188,7 +188,7 @@ def _conclude(
             say(f"{outcome.sentence}{'; requirement met: ' if results else ''}{results}")
         if rows:
             rows["log"] = str(directory / "flight.tlog")
-            rows["all figures"] = shlex.join(["offboard", "score", str(directory)])
+            rows["all metrics"] = shlex.join(["offboard", "score", str(directory)])
         if page:
             rows["report"] = f"{page}, in some seconds"
         for label, text in rows.items():

@@ -58,8 +58,8 @@ def score(
         show(out, result, history)
     if history.damage:
         complain(history.damage)
-    figures = result.metrics()
-    missed = [each.sentence(figures) for each in requirements if not each.met(figures)]
+    metrics = result.metrics()
+    missed = [each.sentence(metrics) for each in requirements if not each.met(metrics)]
     if requirements and result.completed != 1.0:
         missed.insert(0, verdict(result))
     if missed:
@@ -79,7 +79,7 @@ def report(
     """Show flights on one HTML page, from their .tlog alone.
 
     Verdict, path, errors, attitude, thrust, decisions, link and identification over one time axis.
-    Several flights are drawn over each other, with a table of their figures side by side. A log of
+    Several flights are drawn over each other, with a table of their metrics side by side. A log of
     another program gives what it holds; the page says what is missing or damaged. A flight
     directory without score.json gets one.
 

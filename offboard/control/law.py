@@ -14,7 +14,7 @@ or, where the bounds or a horizon couple the inputs, the u that minimises the sa
                  is held for one period and acts on average in its middle, and led through the
                  response of attitude and thrust, so that these arrive in time
     K            gain of the linear-quadratic regulator of each axis for one bandwidth (`gains`)
-    clip         thrust, tilt, and the feedback about u_ff (`TrackingLaw._weighed`)
+    clip         thrust, tilt, and the feedback about u_ff (`TrackingLaw._problem_of`)
 
 In NED, acceleration = g e3 - T b - c v + d: written in b, the lateral axes [p, v, b, b'], the
 vertical [z, v_z, T b_z] and the heading decouple, and no heading frame is needed. K is that of a
@@ -180,7 +180,7 @@ class TrackingLaw:
         lateral = np.array(motion)[:, :2] - target.lateral
         down = vertical_of(state)
         vertical = (down.position_down_m, down.velocity_down_mps, down.thrust_down_mps2)
-        problem = self._weighed(
+        problem = self._problem_of(
             target, lateral, vertical - target.vertical, float(state.thrust_direction_ned[2])
         )
         cost = problem.quadratic
@@ -236,7 +236,7 @@ class TrackingLaw:
             to_hover=to_hover(b[TILT_BEGINS], thrust[TILT_BEGINS], state, vehicle),
         )
 
-    def _weighed(
+    def _problem_of(
         self, target: Target, lateral: Array, vertical: Array, b_z: float
     ) -> TrackingProblem:
         """The problem of these deviations: J, and the bounds of u to which the law clips."""

@@ -27,7 +27,7 @@ TABLES = {"udpin": ("udp", "udp6"), "tcpin": ("tcp", "tcp6")}
 # States of a socket that has a port: UDP bound or connected, TCP listening
 STATES = {"udp": ("07", "01"), "tcp": ("0A",)}
 SLEEPS, SLEEP_S = 40, 0.01
-LEAST_FREE_BYTES = 500_000_000  # four hours of log
+LEAST_FREE_BYTES = 500_000_000  # three hours of log
 OVERSHOOT_S = 0.02
 MARGIN = 0.5  # of the deadline
 

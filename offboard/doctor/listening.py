@@ -21,6 +21,7 @@ from offboard.flight.timing import VehicleClock
 from offboard.flight.vehicle_state import VehicleState
 from offboard.link.interface import Chunk
 from offboard.mavlink.counters import Counters
+from offboard.mavlink.decode import FIX_3D
 from offboard.mavlink.dialects.base import TYPE_GCS, Dialect, WantedMessage, id_of
 from offboard.mavlink.events import (
     Attitude,
@@ -34,7 +35,7 @@ from offboard.mavlink.events import (
     TimesyncReply,
     VehicleFound,
 )
-from offboard.mavlink.framing import HEARTBEAT, Frame, FrameSplitter
+from offboard.mavlink.framing import HEARTBEAT, TIMESYNC, Frame, FrameSplitter
 from offboard.mavlink.outgoing import CommandLong, Outgoing, Timesync
 from offboard.mavlink.senders import is_vehicle
 from offboard.mavlink.session import Session, SessionSettings
@@ -52,21 +53,20 @@ TEXTS_S = 1.0  # for the texts after the acknowledgement
 ENOUGH = 0.7  # of a rate, measured over two seconds
 SETTLE_S = 1.0  # until jumps of the vehicle's clock count
 RUN_PREARM_CHECKS = 401  # MAV_CMD
-FIX_3D = 3  # GPS_FIX_TYPE; also stands for better ones
-VERSION, GPS, TIMESYNC = 148, 24, 111  # message ids
-_TIMES = frozenset({2, 111})  # SYSTEM_TIME, TIMESYNC
-_PLACES_MAX, _SENDERS_MAX = 16, 64  # a flood of addresses or ids must not use up the memory
+VERSION, GPS = 148, 24  # message ids
+_TIMES = frozenset({2, TIMESYNC})  # 2: SYSTEM_TIME
+_PEERS_MAX, _SENDERS_MAX = 16, 64  # a flood of addresses or ids must not use up the memory
 
 
 @dataclass(slots=True)
 class Sender:
-    """One MAVLink sender. `heartbeat` is its newest HEARTBEAT, None without one; `places` are the
+    """One MAVLink sender. `heartbeat` is its newest HEARTBEAT, None without one; `peers` are the
     addresses that it sends from."""
 
     system_id: int
     component_id: int
     heartbeat: Any = None  # message of pymavlink
-    places: set[str] = field(default_factory=set)
+    peers: set[str] = field(default_factory=set)
     frames: int = 0
     times: int = 0  # TIMESYNC and SYSTEM_TIME
 
@@ -98,17 +98,17 @@ class Senders:
         self.counters = Counters()
         self.message_bytes: Counter[str] = Counter()
 
-    def receive(self, data: bytes, place: Hashable) -> None:
-        """Count the frames in `data`, which came from `place`."""
-        if place not in self._splitters and len(self._splitters) >= _PLACES_MAX:
-            place = None
-        splitter = self._splitters.get(place)
+    def receive(self, data: bytes, peer: Hashable) -> None:
+        """Count the frames in `data`, which came from `peer`."""
+        if peer not in self._splitters and len(self._splitters) >= _PEERS_MAX:
+            peer = None
+        splitter = self._splitters.get(peer)
         if splitter is None:
-            splitter = self._splitters[place] = FrameSplitter(self._stream, self.counters)
+            splitter = self._splitters[peer] = FrameSplitter(self._stream, self.counters)
         for frame in splitter.split(data):
-            self._count(frame, place)
+            self._count(frame, peer)
 
-    def _count(self, frame: Frame, place: Hashable) -> None:
+    def _count(self, frame: Frame, peer: Hashable) -> None:
         ids = frame.system_id, frame.component_id
         if ids not in self._senders and len(self._senders) >= _SENDERS_MAX:
             return
@@ -116,7 +116,7 @@ class Senders:
         message = mavlink_map.get(frame.message_id)
         self.message_bytes[message.msgname if message else str(frame.message_id)] += len(frame.raw)
         sender.frames += 1
-        sender.places.add(join_address(*place[:2]) if isinstance(place, tuple) else str(place))
+        sender.peers.add(join_address(*peer[:2]) if isinstance(peer, tuple) else str(peer))
         sender.times += frame.message_id in _TIMES
         if frame.message_id == HEARTBEAT:
             sender.heartbeat = frame.message
@@ -140,9 +140,9 @@ class Listening:
     """One pass over one link, from host time `began_s`. `settings`: of the session of a flight.
 
     `vehicle`, `clock` and `session` are those of a flight, with the newest telemetry; `senders` has
-    all that sends. `fix_type` is the vehicle's GPS_FIX_TYPE; `late_s` the greatest age of its
-    telemetry beyond the least; `foreign_replies` the number of its replies to requests of TIMESYNC
-    that are not ours.
+    all that sends. `fix_type` is the vehicle's GPS_FIX_TYPE, at most FIX_3D; `late_s` the greatest
+    age of its telemetry beyond the least; `foreign_replies` the number of its replies to requests
+    of TIMESYNC that are not ours.
     """
 
     def __init__(

@@ -8,10 +8,11 @@ from collections.abc import Iterable
 
 from offboard.control.bandwidth import supported_bandwidth
 from offboard.doctor.link_checks import blocks, ok, wait, warn
-from offboard.doctor.listening import FIX_3D, Observation
+from offboard.doctor.listening import Observation
 from offboard.documents.errors import DocumentError
 from offboard.flight.preflight import Finding
 from offboard.identification.vehicle_estimate import SDS
+from offboard.mavlink.decode import FIX_3D
 from offboard.model.vehicle import DelayUncertainty
 from offboard.reference.feasibility import check
 from offboard.run.configuration import UNKNOWN_VEHICLE, build_track

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from offboard.flight import decision, outbox
 from offboard.flight.authority import Standing
-from offboard.flight.failsafe import old, other_sender
+from offboard.flight.failsafe import other_sender, telemetry_old
 from offboard.flight.ground_contact import STANDING_S, STILL_ARMED
 from offboard.flight.phases import BEFORE_FLIGHT, TRACKING, Phase
 from offboard.flight.state import LEVEL_DIRECTION, FlightState
@@ -40,13 +40,13 @@ def act(flight: FlightState) -> None:
     elif flight.phase is Phase.TAKEOFF:
         _take_off(flight, time_s)
     elif flight.phase not in TRACKING:
-        hold(flight, time_s)
-    elif flight.ours and not decision.decide(flight):
+        act_without_telemetry(flight, time_s)
+    elif flight.authority.permits_setpoint(flight.now_s) and not decision.decide(flight):
         outbox.send_level(flight, time_s, _level(flight))
     outbox.send(flight, flight.clock.request(time_s, flight.host_s))
 
 
-def hold(flight: FlightState, time_s: float) -> None:
+def act_without_telemetry(flight: FlightState, time_s: float) -> None:
     """Send what needs no telemetry: level setpoints, and the request that ends the flight."""
     phase = flight.phase
     # Until setpoints have replaced an autopilot's own take-off, none must be sent
@@ -143,11 +143,11 @@ def _stand_by(flight: FlightState, time_s: float) -> None:
     failsafe, after which PX4 would return to OFFBOARD by itself, or while another program sends."""
     on_ground, vehicle = flight.contact.on_ground, flight.vehicle
     command = Command(0.0, LEVEL_DIRECTION, vehicle.heading_rad) if on_ground else _flown(flight)
-    quiet = bool(flight.takes_off_by_command or old(flight) or other_sender(flight))
+    quiet = bool(flight.takes_off_by_command or telemetry_old(flight) or other_sender(flight))
     if on_ground:
         quiet |= vehicle.armed and vehicle.in_failsafe
     else:
-        quiet |= vehicle.in_failsafe or not flight.pilot.elsewhere
+        quiet |= vehicle.in_failsafe or not flight.pilot.other_mode_shown
     if quiet:
         outbox.set_command(flight, time_s, command)
     else:

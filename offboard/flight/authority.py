@@ -58,7 +58,7 @@ class Authority:
     reported_s: float = -math.inf  # time of the newest report that counts
     lost_reason: str = ""
     lost_s: float = math.inf  # time of the loss; -inf if a HEARTBEAT reported it
-    loss: SetpointLoss = NEVER  # what the autopilot does without setpoints
+    setpoint_loss: SetpointLoss = NEVER  # what the autopilot does without setpoints
     arrived_s: float = -math.inf  # host time of the arrival of the newest report
     _asked_in: str = ""  # the mode reported when we asked for `engage_mode`
     # modes that we asked for to end the flight, oldest first; those before the one that it shows
@@ -76,14 +76,15 @@ class Authority:
         arrived_s: float = math.inf,
         failsafe: bool = False,
         heartbeat: bool = True,
-        starved: bool = False,
+        setpoints_missing: bool = False,
         sticks: bool | None = False,
     ) -> None:
         """The vehicle reports `mode`. A failsafe may interrupt a landing that we asked for.
 
-        `failsafe`: the newest HEARTBEAT shows one; `heartbeat`: it is this report. `starved`: it
-        may have been without setpoints for so long that its failsafe acts; `sticks`: it receives
-        those of a pilot, who may fly it in that failsafe, None: that is not known.
+        `failsafe`: the newest HEARTBEAT shows one; `heartbeat`: it is this report.
+        `setpoints_missing`: it may have been without setpoints for so long that its failsafe acts;
+        `sticks`: it receives those of a pilot, who may fly it in that failsafe, None: that is not
+        known.
         """
         before, self.mode = self.mode, mode
         self.heard_s, self.arrived_s = now_s, arrived_s
@@ -101,7 +102,9 @@ class Authority:
                 self.standing = Standing.OURS
             elif mode in self._requested:
                 self._hand_over(mode)
-            elif mode in self.loss.modes and (starved or self.standing is Standing.FAILSAFE):
+            elif mode in self.setpoint_loss.modes and (
+                setpoints_missing or self.standing is Standing.FAILSAFE
+            ):
                 self._on_failsafe(before, now_s, failsafe, heartbeat=heartbeat, sticks=sticks)
             else:
                 self.lose(f"the vehicle left {self.engage_mode} for {mode}", now_s, heartbeat)
@@ -162,7 +165,7 @@ class Authority:
         """After a pause of our own of `paused_s` that ended at `host_s`: only reports that arrive
         later count, or that have arrived just before if the pause was too short for the vehicle's
         failsafe to have acted in it."""
-        self._counts_from_s = host_s - (JUST_S if paused_s < self.loss.after_s else 0.0)
+        self._counts_from_s = host_s - (JUST_S if paused_s < self.setpoint_loss.after_s else 0.0)
         self._failsafe_shown = False
         if self.arrived_s < self._counts_from_s:
             self.reported_s = -math.inf
@@ -174,13 +177,13 @@ class Authority:
         if self.is_ours:
             self.standing = Standing.OURS
 
-    def lose(self, reason: str, now_s: float, heartbeat: bool = True) -> None:
+    def lose(self, reason: str, now_s: float, heartbeat: bool) -> None:
         """The vehicle is not ours any more, for good; `heartbeat`: HEARTBEAT shows it."""
         if self.standing is not Standing.LOST:
             self.standing, self.lost_reason = Standing.LOST, reason
             self.lost_s = -math.inf if heartbeat else now_s
 
-    def known(self, now_s: float) -> bool:
+    def _known(self, now_s: float) -> bool:
         """Whether the newest report that counts is recent enough to act on."""
         return now_s - self.reported_s <= MODE_KNOWN_S
 
@@ -196,13 +199,13 @@ class Authority:
         """Whether a setpoint may leave: to a vehicle that follows it, or as the stream that PX4
         needs before it accepts the mode."""
         beginning = self.standing in (Standing.FREE, Standing.ASKED)
-        return self.known(now_s) and (beginning or self.standing is Standing.OURS)
+        return self._known(now_s) and (beginning or self.standing is Standing.OURS)
 
     def permits_command(self, now_s: float) -> bool:
         """Whether a command may leave."""
         handed = self.standing is Standing.HANDED and self.mode in self._requested
         fallen = self.standing is Standing.FAILSAFE and self._failsafe_shown
-        return self.permits_setpoint(now_s) or (self.known(now_s) and (handed or fallen))
+        return self.permits_setpoint(now_s) or (self._known(now_s) and (handed or fallen))
 
     @property
     def is_ours(self) -> bool:
@@ -216,37 +219,37 @@ class PilotSwitch:
     that was shown without a failsafe: after a failsafe PX4 returns to OFFBOARD by itself as soon as
     setpoints arrive. For the service, which does not ask for that mode.
 
-    `elsewhere`: a HEARTBEAT has shown another mode than that of setpoints, without a failsafe.
-    `engaged`: from there it was switched to the mode of setpoints, in the air. `unclaimed`: since
-    the service began, or the vehicle rebooted, it has shown the mode of setpoints only, in the air.
-    `hasty`: it left that mode and returned, in the air, before a HEARTBEAT could show the other one
-    without a failsafe. `showed_ours`: whether the previous report showed the mode of setpoints;
-    None after a failsafe, which may have changed it.
+    `other_mode_shown`: a HEARTBEAT has shown another mode, without a failsafe, and since then none
+    has shown the mode of setpoints. `engaged`: from there it was switched to the mode of setpoints,
+    in the air. `always_in_engage_mode`: since the service began, or the vehicle rebooted, every
+    report has shown the mode of setpoints, in the air. `returned_too_soon`: it left that mode and
+    returned, in the air, before a HEARTBEAT could show the other one without a failsafe.
+    `was_in_engage_mode`: by the previous report; None after a failsafe, which may have changed it.
     """
 
-    elsewhere: bool = False
+    other_mode_shown: bool = False
     engaged: bool = False
-    unclaimed: bool = True
-    hasty: bool = False
-    showed_ours: bool | None = None
+    always_in_engage_mode: bool = True
+    returned_too_soon: bool = False
+    was_in_engage_mode: bool | None = None
 
-    def on_heartbeat(self, *, ours: bool, failsafe: bool) -> None:
-        """A HEARTBEAT shows the mode of setpoints (`ours`) or another one."""
+    def on_heartbeat(self, *, in_engage_mode: bool, failsafe: bool) -> None:
+        """A HEARTBEAT shows the mode of setpoints or another one."""
         if failsafe:
-            self.elsewhere = self.engaged = self.hasty = False
-            self.showed_ours = None
-        elif not ours:
-            self.elsewhere = True
+            self.other_mode_shown = self.engaged = self.returned_too_soon = False
+            self.was_in_engage_mode = None
+        elif not in_engage_mode:
+            self.other_mode_shown = True
 
-    def on_mode(self, *, ours: bool, in_the_air: bool, flies: bool) -> None:
+    def on_mode(self, *, in_engage_mode: bool, in_the_air: bool, flies: bool) -> None:
         """Any report of the mode, before `on_heartbeat` of the same message. Only a vehicle that
         `flies` by every sign (`GroundContact.flies`) is engaged."""
-        if not (ours and in_the_air):
-            self.unclaimed = False
-        if not ours:
-            self.engaged = self.hasty = False
-        elif self.elsewhere:
-            self.elsewhere, self.engaged = False, flies
-        elif self.showed_ours is False:
-            self.hasty = in_the_air
-        self.showed_ours = ours
+        if not (in_engage_mode and in_the_air):
+            self.always_in_engage_mode = False
+        if not in_engage_mode:
+            self.engaged = self.returned_too_soon = False
+        elif self.other_mode_shown:
+            self.other_mode_shown, self.engaged = False, flies
+        elif self.was_in_engage_mode is False:
+            self.returned_too_soon = in_the_air
+        self.was_in_engage_mode = in_engage_mode

@@ -18,7 +18,6 @@ from offboard.flight.record import (
     CERTIFIED,
     IDENTIFIED_ID,
     IDENTIFIED_NAME,
-    NAN,
     RECORD_ID,
     RECORD_NAME,
     Decided,
@@ -31,7 +30,7 @@ from offboard.model.command import Command
 
 # How the texts of missed decisions begin. One that raised an error has no record of its tick: the
 # analysis counts the texts
-FAILED, MISSED = "decision failed: ", "decision missed: "
+DECISION_FAILED, DECISION_MISSED = "decision failed: ", "decision missed: "
 NOTICEABLE_RADPS = 0.5  # a smaller change of the bandwidth is not announced
 # in a word -> what a missed decision is ascribed to
 _BY = {
@@ -57,12 +56,12 @@ def decide(flight: FlightState) -> bool:
     nothing is sent. Telemetry that was too old before the decision began does not count: the
     failsafe has a row for it.
     """
-    was_old = failsafe.old(flight)
+    was_old = failsafe.telemetry_old(flight)
     try:
         decided = _decided(flight)
         _send(flight, decided)
     except Exception as error:  # any error: the vehicle is in the air
-        _miss(flight, located(error), "controller", FAILED)
+        _miss(flight, located(error), "controller", DECISION_FAILED)
         return False
     flight.decided = decided
     if was_old and decided.refused == Refusal.STALE:
@@ -84,7 +83,7 @@ def finish(flight: FlightState, sent_s: float) -> None:
     try:
         _record(flight, decided, sent_s - flight.telemetry_arrived_s)
     except Exception as error:  # the certificate is the law's
-        _miss(flight, located(error), "controller", FAILED)
+        _miss(flight, located(error), "controller", DECISION_FAILED)
         return
     if not decided.refused:
         flight.missed = 0
@@ -92,7 +91,7 @@ def finish(flight: FlightState, sent_s: float) -> None:
             _identify(flight, flight.identification)
 
 
-def _miss(flight: FlightState, failure: str, cause: str, begins: str = MISSED) -> None:
+def _miss(flight: FlightState, failure: str, cause: str, begins: str = DECISION_MISSED) -> None:
     flight.missed += 1
     flight.failure, flight.failure_cause = f"{_BY[cause]}: {failure}", cause
     outbox.warn(flight, f"{begins}{failure}")
@@ -130,21 +129,21 @@ def _identify(flight: FlightState, identification: Learner) -> None:
 def _decided(flight: FlightState) -> Decided:
     plan = flight.plan
     assert plan.reference is not None
-    sent_s = flight.sent_s(flight.time_s)
-    state = flight.observer.predict(sent_s)
+    time_s = flight.delays_begin_s(flight.time_s)
+    state = flight.observer.predict(time_s)
     began_s, deadline_s = flight.stopwatch(), flight.deadline_s or math.inf
 
     def remaining_s() -> float:
         return deadline_s - (flight.stopwatch() - began_s)
 
     situation = Situation(
-        sent_s,
+        time_s,
         state,
         plan.reference,
         previous=flight.command,
         remaining_s=remaining_s if flight.deadline_s is not None else None,
         origin_ned_m=plan.origin_ned_m,
-        track_time_s=plan.track_time_s(sent_s),
+        track_time_s=plan.track_time_s(time_s),
     )
     decision = flight.controller.decide(situation)
     return Decided(flight.phase, state, decision, flight.stopwatch() - began_s)
@@ -195,13 +194,13 @@ def tick_record(flight: FlightState, decided: Decided, answer_s: float) -> TickR
     # with a position setpoint, the autopilot chooses thrust and direction
     attitude = sent if isinstance(sent, Command) else None
     certified = sent == decided.decision.command
-    figures = astuple(decided.decision.certificate) if certified else (NAN,) * CERTIFIED
+    figures = astuple(decided.decision.certificate) if certified else (math.nan,) * CERTIFIED
     *certificate, seed_cost = map(float, figures)
     values = (
         float(decided.phase.code),
-        attitude.thrust_mps2 if attitude else NAN,
-        *(attitude.thrust_direction_ned if attitude else (NAN, NAN, NAN)),
-        sent.heading_rad if sent else NAN,
+        attitude.thrust_mps2 if attitude else math.nan,
+        *(attitude.thrust_direction_ned if attitude else (math.nan, math.nan, math.nan)),
+        sent.heading_rad if sent else math.nan,
         *certificate,
         decided.solve_time_s,
         answer_s,

@@ -13,7 +13,7 @@ from offboard.flight.starting import found_engaged, unfit
 from offboard.flight.state import FlightState
 
 PAUSED = "this computer paused for {most:.2f} s{times}: no setpoint before the mode is reported"
-DROPPED = (
+MESSAGES_DROPPED = (
     "{total:.0f} of our messages to the vehicle dropped: this computer was too busy, and they "
     "became too old"
 )
@@ -31,7 +31,7 @@ class News:
     said once."""
 
     def __init__(self) -> None:
-        self.paused, self.dropped = Repeated(PAUSED), Repeated(DROPPED)
+        self.paused, self.dropped = Repeated(PAUSED), Repeated(MESSAGES_DROPPED)
         self._kind = self._said = ""  # of reasons, without figures: the present, the newest told
         self._since_s = self._said_s = -math.inf
 
@@ -80,7 +80,6 @@ def _unheard(state: FlightState) -> str:
     return known or "MAVLink is heard, but no heartbeat of an autopilot"
 
 
-NAN = float("nan")
 TEXTS_KEPT = 8
 
 
@@ -99,7 +98,7 @@ class Snapshot:
             state.plan.sample(position.time_s) if position and state.phase in TRACKING else None
         )
         charge = vehicle.health.battery_remaining if vehicle.health else None
-        age_s = state.telemetry_age_s(state.host_s) if vehicle.has_state else NAN
+        age_s = state.telemetry_age_s(state.host_s) if vehicle.has_state else math.nan
         self.time_s = state.time_s  # of the newest telemetry
         self.phase = state.phase.value
         self.in_phase_s = state.in_phase_s
@@ -117,20 +116,20 @@ class Snapshot:
         self.attitude = attitude.attitude if attitude else None  # (w, x, y, z), NED to FRD
         # from the climb to the landing, as is the error
         self.reference_ned_m = sample.position_ned_m.tolist() if sample else None
-        self.position_error_m = state.position_error_m if sample else NAN
+        self.position_error_m = state.position_error_m if sample else math.nan
         self.thrust_mps2 = command.thrust_mps2  # of the command in force, as are the next two
         self.thrust_direction_ned = command.thrust_direction_ned
         self.heading_rad = command.heading_rad
         self.hover_thrust = state.model.hover_thrust  # of the vehicle model in use, 0 to 1
         # beyond the least delay of the link
-        self.telemetry_age_s = age_s if math.isfinite(age_s) else NAN
-        self.link_delay_s = link.value if link else NAN  # telemetry and setpoint together
-        self.link_delay_sd_s = link.sd if link else NAN
+        self.telemetry_age_s = age_s if math.isfinite(age_s) else math.nan
+        self.link_delay_s = link.value if link else math.nan  # telemetry and setpoint together
+        self.link_delay_sd_s = link.sd if link else math.nan
         self.link_growth_s = state.clock.growth.added_s  # since take-off
         self.missed_decisions = state.missed  # in a row
         self.skipped_ticks = state.busyness.skipped  # in pauses of this process, since take-off
         self.computer = state.busyness.sentence  # that it is too busy; empty if it keeps up
-        self.battery = NAN if charge is None else charge  # remaining, of 1
+        self.battery = math.nan if charge is None else charge  # remaining, of 1
         self.other_datagrams = state.other_datagrams  # of other senders, since the start
         self.forged = state.session.counters.forged  # frames that signing refused since the start
         self.texts = tuple(state.announced[-TEXTS_KEPT:])  # the newest announcements, oldest first

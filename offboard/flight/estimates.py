@@ -34,7 +34,7 @@ from offboard.model.vehicle import HOVER_THRUST_LIMITS, Vehicle
 Array = NDArray[np.float64]
 
 KNOWN_S = 2.5  # age of a report that counts when the flight begins
-SILENT_S, SILENT_MESSAGES = 2.0, 10.0  # missing in a row: no loss of the link
+SILENT_S, SILENT_MESSAGES = 2.0, 10.0  # missing in a row: more than a lossy link loses
 WORSE = 2.0  # times the accuracy of the beginning, where that was no better than the limit
 
 
@@ -87,7 +87,7 @@ def _silent_s(rate_hz: float) -> float:
 # ---------------------------------------------------------------------- jumps
 
 LEAST_JUMP_M = GATES[0]  # a smaller one is corrected as an error
-ACCELERATION_MPS2 = 20.0  # that the reported velocities need not show
+ACCELERATION_MPS2 = 20.0  # of a motion between two reports, which their velocities do not show
 LONGEST_GAP_S = 0.5  # after a longer one nothing is concluded
 RECENT_S = 10.0
 NOISES = 6.0  # times the mean difference of successive positions; less is no jump, but noise
@@ -191,16 +191,15 @@ class HoverEstimate:
         speeds = _within(self._speeds, time_s - WINDOW_S, time_s)
         if len(speeds) < LEAST_SPEEDS or speeds[-1, 0] - speeds[0, 0] < LEAST_S:
             return None
-        late_s = vehicle.thrust_delay_s + vehicle.thrust_lag_s
-        thrusts = _within(self._thrusts, speeds[0, 0] - late_s, time_s - late_s)
+        response_s = vehicle.thrust_delay_s + vehicle.thrust_lag_s
+        thrusts = _within(self._thrusts, speeds[0, 0] - response_s, time_s - response_s)
         if len(thrusts) < LEAST_THRUSTS:
             return None
         gravity_mps2 = vehicle.gravity_mps2
         a_down_mps2 = float(np.polyfit(speeds[:, 0] - time_s, speeds[:, 1], 1)[0])
         down_mps = float(np.mean(speeds[:, 1]))
-        lift_mps2 = acceleration(
-            gravity_mps2, a_down_mps2, vehicle.drag_per_mass_ps, down_mps, 0.0
-        )  # solved for the thrust
+        # solved for the thrust
+        lift_mps2 = acceleration(gravity_mps2, a_down_mps2, vehicle.drag_per_mass_ps, down_mps, 0.0)
         if lift_mps2 < LEAST_LIFT * gravity_mps2:
             return None
         share = float(np.mean(thrusts[:, 2])) * gravity_mps2 / lift_mps2

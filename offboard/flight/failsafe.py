@@ -16,11 +16,12 @@ from offboard.flight.authority import Standing
 from offboard.flight.ground_contact import STOOD_S
 from offboard.flight.phases import TRACKING, Action, Condition, Limits, Phase
 from offboard.flight.state import COMMANDS_KEPT, FlightState
+from offboard.flight.timing import JUMP_S
 from offboard.mavlink.events import MODE_KNOWN_S, ThrustReport
 
 OPERATOR = "{flight.stop_cause}"  # the cause of a row for `stop_requested`
 REBOOTED = "the vehicle restarted"
-RECOVERY = 0.25  # speed at which a delay runs back
+RECOVERY = 0.25  # seconds by which a held time decreases in one without the condition
 STEP_MAX_S = 0.2  # what one sample counts for, also after a gap of telemetry
 SINK_MPS = 0.3  # that full thrust stops within the delay, on a vehicle that can be flown
 FULL_THRUST = 0.99
@@ -70,16 +71,16 @@ def rebooted(flight: FlightState) -> str:
     return REBOOTED if flight.rebooted else ""
 
 
-def lost(flight: FlightState) -> str:
+def authority_lost(flight: FlightState) -> str:
     """Another has taken control of the vehicle."""
     if flight.authority.standing is not Standing.LOST:
         return ""
     return flight.authority.lost_reason or Standing.LOST.value
 
 
-def lost_armed(flight: FlightState) -> str:
+def authority_lost_armed(flight: FlightState) -> str:
     """A pilot has changed the mode of a vehicle that stays armed."""
-    return lost(flight) if flight.shown_since_lost and flight.vehicle.armed else ""
+    return authority_lost(flight) if flight.shown_since_lost and flight.vehicle.armed else ""
 
 
 def in_own_failsafe(flight: FlightState) -> str:
@@ -103,7 +104,7 @@ def another_may_control(flight: FlightState) -> str:
     return f"{unknown}: another may control the vehicle" if unknown else ""
 
 
-def old(flight: FlightState) -> str:
+def telemetry_old(flight: FlightState) -> str:
     """Age of the newest telemetry beyond the least delay of the link."""
     age_s = flight.age_s
     return f"telemetry is {age_s:.2f} s old" if age_s > flight.limits.setpoint_age_s else ""
@@ -112,8 +113,9 @@ def old(flight: FlightState) -> str:
 def late_link(flight: FlightState) -> str:
     """Growth of the link's delay since take-off (TIMESYNC), or the age of telemetry."""
     growth_s = flight.clock.delay_growth_s
-    grown = growth_s > flight.limits.link_growth_s
-    return f"the delay of the link has grown by {growth_s:.2f} s" if grown else old(flight)
+    if growth_s > flight.limits.link_growth_s:
+        return f"the delay of the link has grown by {growth_s:.2f} s"
+    return telemetry_old(flight)
 
 
 def unanswered(flight: FlightState) -> str:
@@ -147,6 +149,7 @@ def away_from_commands(flight: FlightState) -> str:
     """Angle between the thrust direction and that of the nearest of the newest 7 setpoints, if all
     of them had an attitude."""
     vehicle, commands = flight.vehicle, flight.commands
+    # a position setpoint empties `thrusts`: fewer are newer than it
     if vehicle.attitude is None or len(flight.thrusts) < COMMANDS_KEPT:
         return ""
     flown = vehicle.thrust_direction_ned
@@ -253,7 +256,7 @@ def follows_others(flight: FlightState) -> str:
     The vehicle follows setpoints of another program in the mode that we asked for."""
     reported = flight.vehicle.age_s(ThrustReport) < THRUST_REPORT_S
     followed = flight.follows_others and reported and flight.phase in TRACKING
-    if not followed or not flight.engaged or flight.limits.begin_with_other_sender:
+    if not followed or not flight.in_engage_mode or flight.limits.begin_with_other_sender:
         return ""
     return f"the vehicle follows setpoints of another program{_other_companion(flight)}"
 
@@ -313,7 +316,7 @@ ROWS = (
     Row("authority", another_may_control, f"{MODE_KNOWN_S:g} s", LAND, cause="link"),
     Row("silence", silent, "limits.silence_s", LAND, cause="link"),
     Row("blind", blind, f"{Limits.blind_s:g} s", LAND, cause="link"),
-    Row("age", old, "limits.setpoint_age_s", LEVEL, cause="link"),
+    Row("age", telemetry_old, "limits.setpoint_age_s", LEVEL, cause="link"),
     Row("link", late_link, LATE, HOLD, 0.5, "link"),
     Row("uplink", unanswered, "limits.silence_s", HOLD, 0.5, "link"),
     Row("decision", decision_missed, "one", LEVEL, 0.0, *MISSED),
@@ -334,7 +337,7 @@ ROWS = (
     Row("second sender", other_sender, "one message", HOLD, cause="second sender"),
     # within this time a pilot's change of the mode is seen, or the row "authority" acts
     Row("other setpoints", follows_others, "1e-5", HOLD, MODE_KNOWN_S, "second sender"),
-    Row("clock", clock_jumped, "0.5 s", LAND, cause=""),
+    Row("clock", clock_jumped, f"{JUMP_S:g} s", LAND, cause=""),
     Row("contradiction", contradicted, UNIDENTIFIED, LAND, cause=""),
 )
 

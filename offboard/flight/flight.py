@@ -12,7 +12,7 @@ from offboard.flight.phases import (
     BEFORE_FLIGHT,
     ENDS,
     FLYING,
-    STOPPED,
+    OPERATOR_STOP,
     WAITING,
     Action,
     Phase,
@@ -26,9 +26,9 @@ from offboard.mavlink.outgoing import Outgoing
 from offboard.mavlink.session import ACTIVE
 from offboard.supervisor.recovery import Supervised
 
-__all__ = ["STOPPED", "Flight", "Outcome"]
+__all__ = ["Flight", "Outcome"]
 
-STANDBY = 3  # MAV_STATE
+STATE_STANDBY = 3  # MAV_STATE
 BRIDGED_SHARE = 0.3  # of `Limits.silence_s`; after it, level setpoints replace the control law
 
 
@@ -102,7 +102,7 @@ class Flight(FlightState):
         paused_s, self.turned_s = host_now_s - self.turned_s, host_now_s
         self.host_s = session.clock_s(host_now_s)
         self.silence_s = elapsed_s - self.heard_s
-        self.note_starvation()
+        self.note_missing_setpoints()
         if session.settings.lockstep:
             return
         if paused_s > PAUSE_S and self.authority.engage_mode:
@@ -188,7 +188,7 @@ class Flight(FlightState):
         bridges = silence_s > BRIDGED_SHARE * limits.silence_s and not self.in_end_phase
         if bridges and silence_s - self.bridged_s >= self.period_s:
             self.bridged_s = silence_s
-            actions.hold(self, self.time_s + silence_s)
+            actions.act_without_telemetry(self, self.time_s + silence_s)
         if self.has_ended():
             transitions.name_failsafe(self)
 
@@ -206,16 +206,16 @@ class Flight(FlightState):
             reported_s=authority.arrived_s,
             holding=self.phase is Phase.HOLD,
             landing=self.phase is Phase.LAND,
-            loss=authority.loss,
+            setpoint_loss=authority.setpoint_loss,
             sticks=health is not None and health.radio_ok,
-            starved=self.starved or authority.standing is Standing.FAILSAFE,
+            setpoints_missing=self.setpoints_missing or authority.standing is Standing.FAILSAFE,
         )
 
     def _status(self) -> tuple[int, int]:
         """MAV_STATE and custom_mode of our heartbeat."""
         calm = self.phase in WAITING | ENDS
         critical = self.phase in FLYING and self.failsafe.action >= Action.HOLD
-        status = CRITICAL if critical else STANDBY if calm else ACTIVE
+        status = CRITICAL if critical else STATE_STANDBY if calm else ACTIVE
         return status, self.phase.code
 
     # ------------------------------------------------------------------ what others ask and say
@@ -234,7 +234,7 @@ class Flight(FlightState):
         """The flight at this moment, for displays; `flights` that the service has begun."""
         return Snapshot(self, flights)
 
-    def request_stop(self, why: str = STOPPED) -> None:
+    def request_stop(self, why: str = OPERATOR_STOP) -> None:
         """Land, or do not take off; takes effect at the next turn."""
         if not self.stop_reason:
             self._inputs.call("request_stop", why)

@@ -16,9 +16,8 @@ from offboard.reference.transfer import Limits, stopping_place, transfer
 Array = NDArray[np.float64]
 SETTLED_DISTANCE_M = 0.3
 SETTLED_SPEED_MPS = 0.3
-RETURN = Limits(
-    speed_mps=0.5, acceleration_mps2=0.5, cruise_mps=0.5, cruise_vertical_mps=0.5
-)  # after a jump of the estimate
+# after a jump of the estimate
+RETURN = Limits(speed_mps=0.5, acceleration_mps2=0.5, cruise_mps=0.5, cruise_vertical_mps=0.5)
 CLEAR_M = 0.5  # above the ground, of a track that is placed in the air
 SAMPLED_S = 0.1
 
@@ -63,16 +62,16 @@ class FlightPlan:
         return Offset(self._planned, self._offset)
 
     def start_climb(
-        self, time_s: float, position: Array, velocity: Array, heading_rad: float
+        self, time_s: float, position_ned_m: Array, velocity_ned_mps: Array, heading_rad: float
     ) -> None:
         """Fly from this position and velocity (3,) to rest at the start of the track."""
         start = Moved(self.track, origin_ned_m=self.origin_ned_m).sample(0.0)
         climb = transfer(
-            position,
+            position_ned_m,
             start.position_ned_m,
             heading_rad,
             float(start.heading_rad),
-            start_velocity_ned_mps=velocity,
+            start_velocity_ned_mps=velocity_ned_mps,
         )
         self._track_began_s, self._paused = math.nan, None
         self._arrival_s = time_s + climb.duration_s
@@ -135,18 +134,19 @@ class FlightPlan:
         """Time since the start of the track, without pauses; NaN before it."""
         return self._paused.own_s(time_s) if self._paused else time_s - self._track_began_s
 
-    def late_s(self, time_s: float) -> float:
-        """Time since the planned end of the climb; negative before it, NaN without a climb."""
+    def overdue_s(self, time_s: float) -> float:
+        """Time since the planned end of the climb, s; negative before it, NaN without a climb."""
         return time_s - self._arrival_s
 
-    def at_start(self, time_s: float, position: Array, velocity: Array) -> bool:
-        """Whether the planned climb is over and the vehicle hovers at its end."""
+    def at_start(self, time_s: float, position_ned_m: Array, velocity_ned_mps: Array) -> bool:
+        """Whether the planned climb is over and a vehicle at this position, with this velocity
+        (3,), hovers at its end."""
         if not time_s >= self._arrival_s or self.reference is None:
             return False
         target = self.reference.sample(time_s)
         return bool(
-            np.linalg.norm(position - target.position_ned_m) < SETTLED_DISTANCE_M
-            and np.linalg.norm(velocity) < SETTLED_SPEED_MPS
+            np.linalg.norm(position_ned_m - target.position_ned_m) < SETTLED_DISTANCE_M
+            and np.linalg.norm(velocity_ned_mps) < SETTLED_SPEED_MPS
         )
 
     def sample(self, time_s: float) -> FlatSample | None:

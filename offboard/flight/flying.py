@@ -8,9 +8,9 @@ from offboard.flight.authority import Standing
 from offboard.flight.failsafe import (
     OPERATOR,
     REBOOTED,
+    authority_lost,
+    authority_lost_armed,
     in_own_failsafe,
-    lost,
-    lost_armed,
     mode_unknown,
     rebooted,
     stop_requested,
@@ -46,7 +46,7 @@ def lifted_off(flight: FlightState) -> bool:
 def at_start(flight: FlightState) -> bool:
     """The vehicle hovers at the start of the reference."""
     position, time_s = flight.vehicle.position, flight.time_s
-    if position is None or not flight.plan.late_s(time_s) >= 0.0:
+    if position is None or not flight.plan.overdue_s(time_s) >= 0.0:
         return False
     velocity_ned_mps = flight.observer.predict(time_s).velocity_ned_mps
     return flight.plan.at_start(time_s, np.array(position.position_ned_m), velocity_ned_mps)
@@ -59,11 +59,11 @@ def at_start_to_excite(flight: FlightState) -> bool:
 
 
 def too_late_at_start(flight: FlightState) -> str:
-    if not flight.plan.late_s(flight.time_s) > flight.limits.late_s:
+    if not flight.plan.overdue_s(flight.time_s) > flight.limits.overdue_s:
         return ""
     return (
         f"the start of the reference was not reached: {flight.position_error_m:.1f} m away, "
-        f"{flight.plan.late_s(flight.time_s):.0f} s late; is hover_thrust in the vehicle file "
+        f"{flight.plan.overdue_s(flight.time_s):.0f} s late; is hover_thrust in the vehicle file "
         "right, and is the vehicle fast enough for controller.bandwidth_radps?"
     )
 
@@ -101,10 +101,10 @@ def _when(flight: FlightState) -> str:
     return "before lift-off" if flight.phase is Phase.TAKEOFF else "in flight"
 
 
-def handed(flight: FlightState) -> str:
+def in_requested_mode(flight: FlightState) -> str:
     """The vehicle shows the mode that we requested as the end of the flight."""
-    handed = flight.authority.standing is Standing.HANDED
-    return f"the vehicle shows {flight.vehicle.mode}" if handed else ""
+    shown = flight.authority.standing is Standing.HANDED
+    return f"the vehicle shows {flight.vehicle.mode}" if shown else ""
 
 
 def failsafe_land(flight: FlightState) -> bool:
@@ -123,7 +123,7 @@ def rebooted_disarmed(flight: FlightState) -> bool:
     return flight.rebooted and not flight.vehicle.armed and bool(flight.not_landed())
 
 
-def disarmed_elsewhere(flight: FlightState) -> str:
+def disarmed_not_landed(flight: FlightState) -> str:
     """Disarmed, but not landed; the land detector has had time to report, and the vehicle was asked
     to land, as HEARTBEAT may be wrong."""
     known = flight.vehicle.disarmed_s > DISARMED_S + DETECTOR_S
@@ -202,8 +202,8 @@ def ends_early(*, serves: bool) -> tuple[Transition, ...]:
         Transition(FLYING, rebooted_in_flight, LAND, ABORTED, "restart"),
         # HEARTBEAT may be wrong: what still flies is to land
         Transition(FLYING, disarmed, LAND, ABORTED, "disarmed in flight"),
-        Transition(taken, lost, YIELDED, FLOWN, "pilot"),
-        Transition(FLYING - taken, lost, YIELDED, ABORTED, "pilot"),
+        Transition(taken, authority_lost, YIELDED, FLOWN, "pilot"),
+        Transition(FLYING - taken, authority_lost, YIELDED, ABORTED, "pilot"),
         Transition(FLYING, in_own_failsafe, LAND, ABORTED, "link"),
         Transition(FLYING, failsafe_land, LAND, ABORTED, *FAILSAFE),
         Transition(followed, stop_requested, HAND_BACK, FLOWN, OPERATOR),
@@ -225,8 +225,8 @@ TO_THE_END = (
     Transition({HOLD}, longer_than("hold_s"), LAND, ABORTED, reason=HELD),
     Transition({LAND}, landed, DISARMED, reason="disarmed on the ground"),
     Transition({LAND}, rebooted_disarmed, FAILED, ABORTED, "restart", RESTARTED),
-    Transition({LAND}, disarmed_elsewhere, FAILED, ABORTED),
-    Transition({LAND}, lost_armed, YIELDED, ABORTED, "pilot"),
+    Transition({LAND}, disarmed_not_landed, FAILED, ABORTED),
+    Transition({LAND}, authority_lost_armed, YIELDED, ABORTED, "pilot"),
     Transition({LAND}, unheard_on_ground, FAILED, ABORTED, reason=UNHEARD),
     Transition({LAND}, out_of_reach, FAILED, ABORTED),
     Transition({LAND}, not_disarmed, FAILED, ABORTED),

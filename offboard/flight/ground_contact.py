@@ -73,14 +73,14 @@ class GroundContact:
         return self.rest_down_m - position.position_ned_m[2] if position else 0.0
 
     @property
-    def alive(self) -> bool:
+    def position_known(self) -> bool:
         """Positions arrive, so that the height is known."""
         return self.vehicle.position_age_s < POSITION_KNOWN_S
 
     @property
     def stands(self) -> bool:
         """It has stood for so long, by positions that still arrive, that it does not hover."""
-        return self.alive and self.stood_for(STANDING_S)
+        return self.position_known and self.stood_for(STANDING_S)
 
     @property
     def detects_flight(self) -> bool:
@@ -197,14 +197,9 @@ class Touchdown:
             return "the land detector does not report the ground"
         if math.isnan(self.speed_mps):
             return "it has not come to rest"
-        height_m, limit_m = self._height_m(), ABOVE_TAKEOFF_M
-        if self._takeoff_ned_m is not None:
-            limit_m += SLOPE * math.dist(self._takeoff_ned_m[:2], self._position_ned_m[:2])
-        if height_m > limit_m:
-            return f"{height_m:.1f} m above the take-off point"
-        return ""
-
-    def _height_m(self) -> float:
-        if self._takeoff_ned_m is None:
-            return 0.0
-        return self._takeoff_ned_m[2] - self._position_ned_m[2]
+        takeoff_ned_m, position_ned_m = self._takeoff_ned_m, self._position_ned_m
+        if takeoff_ned_m is None:
+            return ""
+        height_m = takeoff_ned_m[2] - position_ned_m[2]
+        limit_m = ABOVE_TAKEOFF_M + SLOPE * math.dist(takeoff_ned_m[:2], position_ned_m[:2])
+        return f"{height_m:.1f} m above the take-off point" if height_m > limit_m else ""

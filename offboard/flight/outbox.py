@@ -114,7 +114,7 @@ def clamp(command: Command, vehicle: Vehicle, *, on_ground: bool) -> Command:
     north, east, down = command.thrust_direction_ned
     lateral = math.hypot(north, east)
     if math.atan2(lateral, down) > vehicle.tilt_max_rad:
-        # a direction that is exactly vertical is tilted to the north (atan2 of zeros)
+        # an exactly inverted one is turned to the north (atan2 of zeros)
         towards_rad, scale = math.atan2(east, north), math.sin(vehicle.tilt_max_rad)
         north, east = scale * math.cos(towards_rad), scale * math.sin(towards_rad)
         down = math.cos(vehicle.tilt_max_rad)
@@ -141,7 +141,7 @@ def send_setpoint(
     admitted = admit(
         command,
         flight.model,
-        ours=flight.ours,
+        ours=flight.authority.permits_setpoint(flight.now_s),
         on_ground=flight.contact.on_ground,
         age_s=age_s,
         age_limit_s=flight.limits.setpoint_age_s,
@@ -164,7 +164,7 @@ def send_level(flight: FlightState, time_s: float, command: Command) -> None:
 def set_command(flight: FlightState, time_s: float, command: Command) -> None:
     """Note the command in force without sending it, for example the autopilot's own."""
     flight.command = command
-    flight.observer.on_command(flight.sent_s(time_s), command)
+    flight.observer.on_command(flight.delays_begin_s(time_s), command)
 
 
 def _send_attitude(
@@ -175,7 +175,7 @@ def _send_attitude(
     flight.commands.append(command)
     flight.thrusts.append(min(command.thrust_mps2 / model.thrust_max_mps2, 1.0))
     if flight.identification:
-        flight.identification.on_command(flight.sent_s(time_s), command)
+        flight.identification.on_command(flight.delays_begin_s(time_s), command)
     target = AttitudeTarget(time_s, command, model.hover_thrust, model.gravity_mps2, body_z_down)
     send(flight, target)
 

@@ -80,7 +80,7 @@ MOVING = frozenset({Phase.JOIN, Phase.TRACK})  # along the reference
 # phases in which the failsafe judges
 FLYING = TRACKING | {Phase.TAKEOFF, Phase.HAND_BACK, Phase.HOLD}
 OUTAGE_MAX_S = 300.0  # so long a vehicle that was asked to land, and is not heard, is waited for
-STOPPED = "stop requested by the operator"
+OPERATOR_STOP = "stop requested by the operator"
 RESTS = "at rest"  # why a landing begins that is no early end
 
 
@@ -138,17 +138,16 @@ class ServiceOptions:
 
 
 class Limits(Parameters):
-    """Limits of a flight. SI; seconds of vehicle time, but `connect_s`, `silence_s` and `late_s`
-    of a decision are wall time, in lockstep simulated time. `failsafe` has what follows when one is
-    exceeded in flight. The class variables are no settings: no vehicle, link or site needed
-    another value."""
+    """Limits of a flight. SI; seconds of vehicle time, but `connect_s` and `silence_s` are wall
+    time, in lockstep simulated time. `failsafe` has what follows when one is exceeded in flight.
+    The class variables are no settings: no vehicle, link or site needed another value."""
 
     stream_s: ClassVar[float] = 1.0  # PX4 wants setpoints for 0.5 s before OFFBOARD
     engage_s: ClassVar[float] = 10.0  # HEARTBEAT, at 1 Hz, may be the only report of the mode
     arm_s: ClassVar[float] = 15.0  # refusals are asked again: checks may still be running
     lift_off_s: ClassVar[float] = 8.0  # setpoints ramp to hover thrust in less than 2 s
     disarm_s: ClassVar[float] = 5.0  # asked for again each second
-    late_s: ClassVar[float] = 90.0  # after the planned end of the climb: a strong head wind
+    overdue_s: ClassVar[float] = 90.0  # after the planned end of the climb: a strong head wind
     excite_s: ClassVar[float] = 30.0  # three rounds of identification steps end within it
     hold_s: ClassVar[float] = 2.0  # from hold to land
     hand_back_s: ClassVar[float] = 3.0  # from the request to hold, to land

@@ -64,7 +64,7 @@ class Ground:
     clock: VehicleClock
     host_s: float
     helicopter: bool = False  # by its vehicle file
-    rates_requested: bool = True
+    rates_requested: bool = True  # of telemetry: only then slow ones count
     reads_parameters: bool = False  # replies are still awaited
     in_the_air: bool = False
     guarded: bool = True  # a supervisor lands it if this process ends
@@ -166,12 +166,12 @@ def several_vehicles(ground: Ground) -> str:
     return systems and f"several vehicles are heard, systems {systems}: choose one with --system"
 
 
-def _shared(ground: Ground) -> str:
+def _other_sender(ground: Ground) -> str:
     vehicle, limits = ground.vehicle, ground.limits
     return "" if limits.begin_with_other_sender else vehicle.other_sender_named
 
 
-def twin(ground: Ground) -> str:
+def same_system_id(ground: Ground) -> str:
     if not ground.session.time.mixed:
         return ""
     return (
@@ -212,7 +212,7 @@ def _slow(ground: Ground) -> str:
     return ""
 
 
-def _may_fly(ground: Ground) -> str:
+def _landed_unknown(ground: Ground) -> str:
     unknown = ground.vehicle.landed == "unknown"
     return "it does not report whether it flies (EXTENDED_SYS_STATE)" if unknown else ""
 
@@ -305,7 +305,7 @@ _ESTIMATOR = "wait for a GPS fix, keep the vehicle still and away from metal; th
 _UNFIT = "fly it with its own autopilot; is MAV_TYPE or FRAME_CLASS right?"
 _FAILSAFE = "let the pilot take over first"
 _PORTS = "or give each vehicle its own port"
-_TWIN = "switch one off, or change its system id"
+_SAME_ID = "switch one off, or change its system id"
 
 
 def _slow_hint(ground: Ground) -> str:
@@ -318,13 +318,13 @@ PREFLIGHT = (
     Row("state", BLOCKS, _flown_by_another, "stop that controller", at_once=True, fly_only=True),
     Row("state", BLOCKS, _flown_by_failsafe, _FAILSAFE, at_once=True, fly_only=True),
     Row("state", BLOCKS, armed_already, "disarm it", at_once=True, fly_only=True),
-    Row("senders", BLOCKS, _shared, "stop it", at_once=True, fly_only=True),
+    Row("senders", BLOCKS, _other_sender, "stop it", at_once=True, fly_only=True),
     Row("senders", BLOCKS, several_vehicles, _PORTS, at_once=True),
-    Row("senders", BLOCKS, twin, _TWIN, at_once=True),
+    Row("senders", BLOCKS, same_system_id, _SAME_ID, at_once=True),
     Row("rates", WAIT, _no_telemetry),
     Row("supervisor", WAIT, _unguarded),
     Row("rates", BLOCKS, _slow, _slow_hint),
-    Row("state", BLOCKS, _may_fly),
+    Row("state", BLOCKS, _landed_unknown),
     Row("parameters", WAIT, _reading),
     Row("origin", WAIT, _origin),
     Row("prearm", WAIT, _prearm, fly_only=True),

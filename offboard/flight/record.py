@@ -24,13 +24,13 @@ from typing import Any, NamedTuple
 from offboard.control.base import Certificate, Decision
 from offboard.flight.phases import Phase
 from offboard.link.interface import Chunk
+from offboard.mavlink.event_record import numbered
 from offboard.mavlink.events import VehicleFound
-from offboard.mavlink.outgoing import ConfigurationRecord
+from offboard.mavlink.outgoing import PIECE_BYTES, ConfigurationRecord
 from offboard.mavlink.session import Reception, SessionSettings
 from offboard.model.command import Command, PositionCommand, PredictedState
 
 RECORD_NAME = "pso"
-NAN = float("nan")
 CERTIFIED = len(fields(Certificate))
 IDENTIFIED_NAME, IDENTIFIED_ID = "identified", 2  # of the other DEBUG_FLOAT_ARRAY in the log
 
@@ -98,12 +98,11 @@ class Decided:
 # ---------------------------------------------------------------------- configuration and vehicle
 
 # TUNNEL.payload_type; numbers above 32767 need no registration
-CONFIGURATION_TYPE, VEHICLE_TYPE, PAYLOAD_TYPE = 0xC0F1, 0xC0F3, 0xC0F5
+CONFIGURATION_TYPE, VEHICLE_TYPE, INPUTS_TYPE = 0xC0F1, 0xC0F3, 0xC0F5
 _NUMBERED = struct.Struct("<HH")  # index of the piece, number of pieces of a configuration
-_PART_BYTES = 128 - _NUMBERED.size
 TEXT_MOST = 4_000_000  # bytes: eight of the longest configuration files; a log may be anybody's
 _HEAD = struct.Struct("<I")  # number of the piece
-_PIECE_BYTES = 128 - _HEAD.size
+_PIECE_BYTES = PIECE_BYTES - _HEAD.size
 # what an object holds: the name and the arguments of a call of the flight, or the total of others'
 # datagrams, a number of frames that were not sent, a checksum
 CALL, OTHERS, DROPPED, CHECK = "call", "others", "dropped", "crc"
@@ -126,12 +125,7 @@ def vehicle_of(payload: bytes) -> VehicleFound | None:
 
 def configuration_pieces(text: str) -> list[ConfigurationRecord]:
     """Records that hold `text`, in order."""
-    data = zlib.compress(text.encode("utf-8"), 9)
-    parts = [data[at : at + _PART_BYTES] for at in range(0, len(data), _PART_BYTES)]
-    return [
-        ConfigurationRecord(_NUMBERED.pack(index, len(parts)) + part, CONFIGURATION_TYPE)
-        for index, part in enumerate(parts)
-    ]
+    return numbered(zlib.compress(text.encode("utf-8"), 9), _NUMBERED, CONFIGURATION_TYPE)
 
 
 def joined_configuration(payloads: Iterable[bytes]) -> str | None:
@@ -237,7 +231,7 @@ class InputRecorder:
         records: list[ConfigurationRecord] = []
         while len(self._data) >= _PIECE_BYTES or (all_of_it and self._data):
             data = _HEAD.pack(self._pieces) + bytes(self._data[:_PIECE_BYTES])
-            records.append(ConfigurationRecord(data, PAYLOAD_TYPE))
+            records.append(ConfigurationRecord(data, INPUTS_TYPE))
             self._pieces += 1
             del self._data[:_PIECE_BYTES]
         return records

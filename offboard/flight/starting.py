@@ -5,10 +5,10 @@ from __future__ import annotations
 from offboard.flight import preflight
 from offboard.flight.failsafe import (
     OPERATOR,
+    authority_lost,
+    authority_lost_armed,
     blind,
     in_own_failsafe,
-    lost,
-    lost_armed,
     mode_unknown,
     other_sender,
     rebooted,
@@ -53,7 +53,7 @@ def silent_for_another(flight: FlightState) -> str:
 def other_vehicle(flight: FlightState) -> str:
     """Several vehicles are heard, and none was chosen with --system, or none can be."""
     ground = ground_of(flight)
-    return preflight.twin(ground) or preflight.several_vehicles(ground)
+    return preflight.same_system_id(ground) or preflight.several_vehicles(ground)
 
 
 def ground_of(flight: FlightState) -> Ground:
@@ -127,14 +127,14 @@ def engaged_but_unfit(flight: FlightState) -> str:
 
 def engaged_too_soon(flight: FlightState) -> bool:
     """It left the mode of setpoints and returned so soon that a failsafe may have done it."""
-    hasty = flight.pilot.hasty and flight.in_phase_s > LISTENED_S
-    return hasty and can_take_over(flight)
+    too_soon = flight.pilot.returned_too_soon and flight.in_phase_s > LISTENED_S
+    return too_soon and can_take_over(flight)
 
 
 def found_engaged(flight: FlightState) -> bool:
     """It was found in the air in the mode of setpoints: another program may fly it."""
-    unclaimed = flight.pilot.unclaimed and flight.vehicle.landed != "unknown"
-    return unclaimed and flight.in_phase_s > LISTENED_S and bool(engaged_in_the_air(flight))
+    found = flight.pilot.always_in_engage_mode and flight.vehicle.landed != "unknown"
+    return found and flight.in_phase_s > LISTENED_S and bool(engaged_in_the_air(flight))
 
 
 def abandoned(flight: FlightState) -> bool:
@@ -158,7 +158,7 @@ def started_on_the_ground(flight: FlightState) -> bool:
 def not_started(flight: FlightState) -> str:
     """Why the vehicle that waits is not started on request."""
     vehicle, contact, service = flight.vehicle, flight.contact, flight.service
-    if contact.in_the_air and not flight.engaged:
+    if contact.in_the_air and not flight.in_engage_mode:
         return f"it flies in {vehicle.mode}: switch to {flight.authority.engage_mode} instead"
     if contact.in_the_air:
         prevented = (unfit, other_sender, mode_unknown, silent, blind)
@@ -175,12 +175,12 @@ def not_started(flight: FlightState) -> str:
 
 def engaged_in_the_air(flight: FlightState) -> str:
     """The vehicle flies in the mode in which it follows setpoints."""
-    flies = flight.engaged and flight.contact.in_the_air
+    flies = flight.in_engage_mode and flight.contact.in_the_air
     return f"{flight.vehicle.mode} in the air" if flies else ""
 
 
-def lost_disarmed(flight: FlightState) -> str:
-    return lost(flight) if flight.shown_since_lost and not flight.vehicle.armed else ""
+def authority_lost_disarmed(flight: FlightState) -> str:
+    return authority_lost(flight) if flight.shown_since_lost and not flight.vehicle.armed else ""
 
 
 def streamed(flight: FlightState) -> str:
@@ -190,7 +190,7 @@ def streamed(flight: FlightState) -> str:
 
 
 def engaged(flight: FlightState) -> str:
-    return f"the vehicle shows {flight.vehicle.mode}" if flight.engaged else ""
+    return f"the vehicle shows {flight.vehicle.mode}" if flight.in_engage_mode else ""
 
 
 def not_engaged(flight: FlightState) -> str:
@@ -204,7 +204,7 @@ def not_engaged(flight: FlightState) -> str:
 
 
 def armed(flight: FlightState) -> str:
-    return "armed" if flight.vehicle.armed and flight.engaged else ""
+    return "armed" if flight.vehicle.armed and flight.in_engage_mode else ""
 
 
 def disarmed_again(flight: FlightState) -> bool:
@@ -221,7 +221,7 @@ def disarmed_again(flight: FlightState) -> bool:
 def stop_requested_on_ground(flight: FlightState) -> str:
     """A stop is requested while the vehicle is armed and stands on the ground by every sign."""
     stands = flight.vehicle.armed and not flight.contact.in_the_air
-    stopped = flight.stop_reason and stands and not lost(flight)
+    stopped = flight.stop_reason and stands and not authority_lost(flight)
     return f"{flight.stop_reason} before lift-off" if stopped else ""
 
 
@@ -307,13 +307,13 @@ STARTING = (
     Transition(STREAMING, other_vehicle, FAILED, REFUSED),
     Transition(STREAMING, blind, FAILED, REFUSED, "link"),
     Transition(STREAMING, mode_unknown, FAILED, REFUSED, "link"),
-    Transition(STREAMING, lost, FAILED, REFUSED, "pilot"),
+    Transition(STREAMING, authority_lost, FAILED, REFUSED, "pilot"),
     Transition({STREAM}, streamed, ENGAGE),
     Transition({ENGAGE}, engaged, ARM),
     Transition({ENGAGE}, not_engaged, FAILED, REFUSED),
     Transition({ARM}, rebooted, STAND_DOWN, REFUSED, "restart"),
-    Transition({ARM}, lost_armed, YIELDED, ABORTED, "pilot", LOST_AS_IT_ARMED),
-    Transition({ARM}, lost_disarmed, FAILED, REFUSED, "pilot"),
+    Transition({ARM}, authority_lost_armed, YIELDED, ABORTED, "pilot", LOST_AS_IT_ARMED),
+    Transition({ARM}, authority_lost_disarmed, FAILED, REFUSED, "pilot"),
     Transition({ARM}, in_own_failsafe, STAND_DOWN, REFUSED, "link"),
     Transition({ARM}, silent, STAND_DOWN, REFUSED, "link"),
     Transition({ARM}, blind, STAND_DOWN, REFUSED, "link"),

@@ -11,7 +11,7 @@ import math
 import operator
 from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import InitVar, dataclass, field
+from dataclasses import InitVar, dataclass, field, replace
 
 import numpy as np
 
@@ -21,7 +21,15 @@ from offboard.flight.authority import Authority, PilotSwitch, Standing
 from offboard.flight.estimates import HoverEstimate, Positioning, PositionJumps
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.ground_contact import DETECTOR_KNOWN_S, GroundContact, Touchdown, moved
-from offboard.flight.phases import ENDS, STOPPED, Action, Limits, Phase, Request, ServiceOptions
+from offboard.flight.phases import (
+    ENDS,
+    OPERATOR_STOP,
+    Action,
+    Limits,
+    Phase,
+    Request,
+    ServiceOptions,
+)
 from offboard.flight.preflight import ParameterReading
 from offboard.flight.record import Decided
 from offboard.flight.timing import Busyness, LinkGrowth, VehicleClock
@@ -37,12 +45,11 @@ from offboard.model.vehicle import Vehicle
 LEVEL_DIRECTION = (0.0, 0.0, 1.0)  # of the thrust: the third body axis in NED
 COMMANDS_KEPT = 7  # as long as an attitude may take to follow
 THRUSTS_KEPT = 40  # as long as a setpoint may be on its way, or the next ones be lost
-PREDICTIONS_KEPT = 8
 # Setpoints count as missing so long before the autopilot's timeout, at most a third of it: the
 # newest may be on its way or lost
-STARVED_EARLY_S = 0.3
-SHOWN_S = 1.2  # HEARTBEAT comes at 1 Hz
-STARVED_KNOWN_S = 3.0  # HEARTBEAT, at 1 Hz, shows the failsafe
+MISSING_EARLY_S = 0.3
+HEARTBEAT_AWAITED_S = 1.2  # HEARTBEAT comes at 1 Hz
+MISSING_KNOWN_S = 3.0  # HEARTBEAT, at 1 Hz, shows the failsafe
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +123,7 @@ class FlightState:
     host_s: float = 0.0  # monotonic time of this computer at the present turn
     silence_s: float = 0.0  # host time since the newest telemetry
     setpoint_s: float = math.inf  # when the newest setpoint left
-    starved_s: float = -math.inf  # when setpoints may have been missing for long
+    setpoints_missed_s: float = -math.inf  # when setpoints may have been missing for long
     guarded: bool = True  # a supervisor lands the vehicle if this process ends
     rebooted: bool = False
     left_engaged: bool = False  # a flight that was cut short has left the vehicle engaged
@@ -128,7 +135,7 @@ class FlightState:
     busyness: Busyness = field(init=False)  # of this computer
     heard_s: float = math.nan  # host time of the newest telemetry, as `Session.elapsed_s`
     telemetry_arrived_s: float = 0.0  # host time at which it arrived
-    bridged_s: float = 0.0  # silence at the newest setpoint that needs no telemetry
+    bridged_s: float = 0.0  # `silence_s` at the newest setpoint that was sent without telemetry
     ignored: int = 0  # datagrams of others and forged frames between the two newest ticks
     command: Command = field(default_factory=lambda: Command(0.0, LEVEL_DIRECTION, 0.0))  # in force
     decided: Decided | None = None  # in this turn
@@ -138,9 +145,7 @@ class FlightState:
     failure_cause: str = ""  # in a word: controller, link or computer
     commands: deque[Command] = field(default_factory=lambda: deque(maxlen=COMMANDS_KEPT))
     thrusts: deque[float] = field(default_factory=lambda: deque(maxlen=THRUSTS_KEPT))
-    announced: list[str] = field(
-        default_factory=list
-    )  # newest sentences for the user, oldest first
+    announced: list[str] = field(default_factory=list)  # newest for the user, oldest first
     announcements: int = 0  # how many there were
     told: set[str] = field(default_factory=set)  # of those that are announced once in a flight
     queue: list[Outgoing] = field(default_factory=list)  # to be sent
@@ -150,9 +155,7 @@ class FlightState:
     thinned_s: float = 0.0  # when less telemetry was requested, since the phase HEALTH began
     awaits_link: bool = False  # while landing
     follows_others: bool = False  # the newest ThrustReport is of none of `thrusts`
-    predictions: deque[PredictedState] = field(
-        default_factory=lambda: deque(maxlen=PREDICTIONS_KEPT)
-    )
+    predictions: deque[PredictedState] = field(default_factory=lambda: deque(maxlen=8))
 
     def __post_init__(self, before: FlightState | None) -> None:
         self.busyness = Busyness(self.period_s)
@@ -167,7 +170,7 @@ class FlightState:
         for name in KEPT:
             setattr(self, name, getattr(before, name))
         self.clock.growth = LinkGrowth()
-        # for a vehicle that was taken nothing was asked: not unanswered, see `note_starvation`
+        # of a taken vehicle nothing was asked: no reply is missing in `note_missing_setpoints`
         self.vehicle.heard_s.pop(TimesyncReply, None)
         self.authority = before.authority.renewed()
         if not before.in_end_phase:  # nothing was flown: what the pilot did before counts
@@ -176,12 +179,13 @@ class FlightState:
         prepared = before.phase not in (Phase.CONNECT, Phase.HEALTH) and not before.rebooted
         self.phase = Phase.STANDBY if prepared and self.authority.engage_mode else Phase.CONNECT
         self.began_s = before.now_s
-        self.pilot = PilotSwitch(
-            elsewhere=before.pilot.elsewhere,
-            unclaimed=before.ends_engaged,
-            # selected while the flight ended: not flown, and not left without anybody
-            hasty=before.pilot.hasty or (before.taken and before.pilot.engaged),
-            showed_ours=before.pilot.showed_ours,
+        pilot = before.pilot
+        self.pilot = replace(
+            pilot,
+            engaged=False,
+            always_in_engage_mode=before.ends_engaged,
+            # a switch while the flight ended is answered by hold
+            returned_too_soon=pilot.returned_too_soon or (before.taken and pilot.engaged),
         )
 
     @property
@@ -206,10 +210,10 @@ class FlightState:
     @property
     def stop_cause(self) -> str:
         """A word for who requested the stop: "operator", or empty for any other reason."""
-        return "operator" if self.stop_reason == STOPPED else ""
+        return "operator" if self.stop_reason == OPERATOR_STOP else ""
 
     @property
-    def engaged(self) -> bool:
+    def in_engage_mode(self) -> bool:
         """The vehicle shows the mode in which it follows setpoints."""
         return self.authority.mode == self.authority.engage_mode
 
@@ -253,16 +257,16 @@ class FlightState:
     def awaits_heartbeat(self) -> bool:
         """The vehicle was taken, and no HEARTBEAT since then shows whether by a failsafe. False
         while it shows the mode of setpoints again: the pilot may want the next flight."""
-        if not self.taken or self.engaged:
+        if not self.taken or self.in_engage_mode:
             return False
-        return not self.shown_since_lost and self.in_phase_s < SHOWN_S
+        return not self.shown_since_lost and self.in_phase_s < HEARTBEAT_AWAITED_S
 
     @property
     def ends_engaged(self) -> bool:
         """Whether the flight ends with a vehicle that nobody has seen in another mode than that of
         setpoints: it was not heard any more, or has rebooted."""
         unheard = self.authority.standing is Standing.OURS
-        return unheard or (self.rebooted and self.pilot.unclaimed)
+        return unheard or (self.rebooted and self.pilot.always_in_engage_mode)
 
     @property
     def time_s(self) -> float:
@@ -280,7 +284,7 @@ class FlightState:
         silent_s = self.silence_s if self.silence_s > self.limits.silence_s else 0.0
         return max(silent_s, self.authority.unheard_s(self.now_s))
 
-    def note_starvation(self) -> None:
+    def note_missing_setpoints(self) -> None:
         """Note when the vehicle may have been without setpoints for so long that its failsafe acts:
         none was sent, nothing was heard, or no TIMESYNC was answered."""
         unanswered_s = self.vehicle.age_s(TimesyncReply)
@@ -289,26 +293,21 @@ class FlightState:
             self.silence_s,
             unanswered_s if math.isfinite(unanswered_s) else 0.0,
         )
-        after_s = self.authority.loss.after_s
-        if gap_s > max(after_s - STARVED_EARLY_S, after_s * 2.0 / 3.0):
-            self.starved_s = self.host_s
+        after_s = self.authority.setpoint_loss.after_s
+        if gap_s > max(after_s - MISSING_EARLY_S, after_s * 2.0 / 3.0):
+            self.setpoints_missed_s = self.host_s
 
     @property
-    def starved(self) -> bool:
-        """Whether `note_starvation` found this within the last STARVED_KNOWN_S."""
-        return self.host_s - self.starved_s < STARVED_KNOWN_S
-
-    @property
-    def ours(self) -> bool:
-        """Whether a setpoint may be sent, by the reported mode and its age."""
-        return self.authority.permits_setpoint(self.now_s)
+    def setpoints_missing(self) -> bool:
+        """Whether `note_missing_setpoints` found this within the last MISSING_KNOWN_S."""
+        return self.host_s - self.setpoints_missed_s < MISSING_KNOWN_S
 
     def not_landed(self) -> str:
         """Why the vehicle has not landed; empty if it has."""
         vehicle = self.vehicle
         if self.touchdown is None:
             return "it was not told to land"
-        if not self.contact.alive:
+        if not self.contact.position_known:
             return "no LOCAL_POSITION_NED shows it"
         on_ground = vehicle.landed == "on_ground" and vehicle.age_s(Landed) < DETECTOR_KNOWN_S
         return self.touchdown.not_landed(on_ground=on_ground)
@@ -330,8 +329,8 @@ class FlightState:
         """Growth of the link's delay since take-off, or the age of telemetry if that is more."""
         return max(self.clock.delay_growth_s, self.age_s)
 
-    def sent_s(self, time_s: float) -> float:
-        """The vehicle time from which the vehicle model's delays run for a command of the tick
+    def delays_begin_s(self, time_s: float) -> float:
+        """The vehicle time at which the vehicle model's delays begin for a command of the tick
         `time_s`: later by what the link has added to its delay since take-off."""
         return time_s + self.clock.growth.added_s
 

@@ -160,28 +160,27 @@ def _on_mode(
     if not flight.authority.engage_mode:
         flight.authority = Authority(dialect.engage_mode)
     vehicle, authority = flight.vehicle, flight.authority
-    authority.loss = dialect.setpoint_loss(vehicle.parameters)
+    authority.setpoint_loss = dialect.setpoint_loss(vehicle.parameters)
     authority.on_mode(
         mode,
         flight.now_s,
         arrived_s=arrived_s,
         failsafe=vehicle.in_failsafe,
         heartbeat=isinstance(event, Heartbeat),
-        starved=flight.starved,
+        setpoints_missing=flight.setpoints_missing,
         sticks=vehicle.sticks,
     )
-    ours = mode == authority.engage_mode
-    contact = flight.contact
-    in_the_air, switched = contact.in_the_air, ours and flight.pilot.elsewhere
-    flight.pilot.on_mode(ours=ours, in_the_air=in_the_air, flies=contact.flies)
-    why = "" if flight.pilot.engaged or not in_the_air else "the vehicle may stand on the ground"
-    if flight.pilot.engaged and other_sender(flight):
-        flight.pilot.engaged = False  # it was not switched for us
+    pilot, contact, in_engage_mode = flight.pilot, flight.contact, flight.in_engage_mode
+    in_the_air, switched = contact.in_the_air, in_engage_mode and pilot.other_mode_shown
+    pilot.on_mode(in_engage_mode=in_engage_mode, in_the_air=in_the_air, flies=contact.flies)
+    why = "" if pilot.engaged or not in_the_air else "the vehicle may stand on the ground"
+    if pilot.engaged and other_sender(flight):
+        pilot.engaged = False  # it was not switched for us
         why = "another program sends setpoints"
     if switched and why and flight.phase in WAITING:
         outbox.announce(flight, f"not engaged: {mode}, but {why}")
     if isinstance(event, Heartbeat):
-        flight.pilot.on_heartbeat(ours=ours, failsafe=flight.vehicle.in_failsafe)
+        pilot.on_heartbeat(in_engage_mode=in_engage_mode, failsafe=vehicle.in_failsafe)
 
 
 def _on_reboot(flight: FlightState) -> None:
@@ -195,7 +194,7 @@ def _on_reboot(flight: FlightState) -> None:
     flight.took_off = False  # the local frame begins elsewhere
     if flight.phase in BEFORE_FLIGHT:
         flight.authority = Authority()
-    flight.authority.forget(flight.now_s)  # unheard from now on, not for ever
+    flight.authority.forget(flight.now_s)  # the age of its report counts from now
     flight.rebooted = flight.phase not in (Phase.CONNECT, Phase.HEALTH)
     flight.pilot = PilotSwitch()
     if flight.phase is Phase.LAND:

@@ -27,7 +27,7 @@ NORMAL = 1.4826  # standard deviation of a normal distribution / median absolute
 WINDOW_S, BIN_S = 5.0, 0.1
 RATE_OVER_S, RATE_EVERY_S = 1.0, 1.0  # the rate: from how much at least, and how often
 REAL_TIME = 0.05  # a rate that differs from 1 by less is that of a vehicle in real time
-BOUNDS_S = 1.0  # a reply to an older request bounds the vehicle time no more
+BOUNDS_S = 1.0  # replies to older requests do not bound the vehicle time
 LEAST_GROWTH_S, STEADY_S = 0.01, 5.0  # see `LinkGrowth`
 JUMP_S = 0.5  # a stamp further ahead of the vehicle time now shows a jump of the clock
 

@@ -57,7 +57,7 @@ def table(service: ServiceOptions | None = None) -> tuple[Transition, ...]:
         rows = (
             *starting.SERVICE_WAITS,
             *starting.STARTING,
-            Transition({Phase.HAND_BACK}, flying.handed, Phase.YIELDED),
+            Transition({Phase.HAND_BACK}, flying.in_requested_mode, Phase.YIELDED),
             *flying.ends_early(serves=True),
             *flying.SERVICE_ENDS,
             *flying.TO_THE_END,

@@ -41,7 +41,7 @@ from offboard.model.frames import heading_from_quaternion, thrust_direction_from
 HEALTH_S = 1.5  # SYS_STATUS is requested at 2 Hz
 DISARMED_S = 1.5  # longer than a period of HEARTBEAT: arming may have been in progress
 ARMED_KNOWN_S = 3.0  # PX4 reports it in HEARTBEAT alone, at 1 Hz
-STILL_S = 0.05  # PX4 and ArduCopter repeat a component of the position for 0.03 s at most
+REPEATED_S = 0.05  # PX4 and ArduCopter repeat a component of the position for 0.03 s at most
 OUTAGE_S = 0.3  # a longer gap of all telemetry is an outage of the link
 OTHER_SENDER_S = 5.0  # a second sender is there for so long after its newest frame
 MESSAGES_MAX = 12  # texts and refusals kept for the sentence that explains a failure
@@ -75,7 +75,7 @@ class VehicleState:
     repeated: bool = False  # the newest event repeats the one of its kind before: no measurement
     _was_armed: bool = False
     # components of position and velocity, each with the stamp from which on it is the same
-    _changed: tuple[tuple[float, float], ...] = ((math.nan, math.inf),) * 6
+    _same_since: tuple[tuple[float, float], ...] = ((math.nan, math.inf),) * 6
 
     @property
     def time_s(self) -> float:
@@ -165,7 +165,7 @@ class VehicleState:
     def update(self, event: Event, now_s: float) -> None:
         """Store what one event reports."""
         self.now_s = now_s
-        self.repeated = self._stands_still(event) and self._was_armed
+        self.repeated = self._repeats(event) and self._was_armed
         if self.repeated:
             return
         self.heard_s[type(event)] = now_s
@@ -209,22 +209,22 @@ class VehicleState:
             case Rebooted():
                 self._reset()
 
-    def _stands_still(self, event: Event) -> bool:
+    def _repeats(self, event: Event) -> bool:
         """Whether position and velocity on one axis, or an attitude, are those of the message
-        before, or one component of them has been the same for STILL_S, whatever the stamps. No
+        before, or one component of them has been the same for REPEATED_S, whatever the stamps. No
         estimator repeats itself once motors have run, not even on the ground."""
         match event:
             case LocalPosition(time_s, position, velocity):
                 since_s = [
                     at_s if before == value and at_s <= time_s else time_s
                     for value, (before, at_s) in zip(
-                        (*position, *velocity), self._changed, strict=True
+                        (*position, *velocity), self._same_since, strict=True
                     )
                 ]
-                self._changed = tuple(zip((*position, *velocity), since_s, strict=True))
+                self._same_since = tuple(zip((*position, *velocity), since_s, strict=True))
                 axes = zip(since_s[:3], since_s[3:], strict=True)
                 repeated = any(max(axis) < time_s for axis in axes)
-                return repeated or time_s - min(since_s) > STILL_S
+                return repeated or time_s - min(since_s) > REPEATED_S
             case Attitude(_, attitude, rates):
                 before = self.attitude
                 return before is not None and (attitude, rates) == (

@@ -262,7 +262,7 @@ class StreamLink:
         return readable
 
     def _read(self) -> bytes:
-        """Bytes that are waiting. None although it is readable: closed or unplugged."""
+        """Bytes that are waiting; none where it is closed or unplugged, which drops the stream."""
         assert self._stream is not None
         try:
             data = os.read(self._stream.descriptor, READ_BYTES)

@@ -94,7 +94,7 @@ class UdpLink:
         self.report = LinkReport()
         self._listening = _Inbox(listening) if listening else None
         self._vehicle = _Inbox(vehicle) if vehicle else None
-        self._place: Hashable = vehicle.getpeername() if vehicle else None
+        self._peer: Hashable = vehicle.getpeername() if vehicle else None
         self._heard_s = clock.monotonic_s()  # when we last found a datagram of the vehicle
         self._look_s = 0.0  # when other senders are read next
 
@@ -120,16 +120,16 @@ class UdpLink:
         observed ourselves (not one of our own pauses) what may come from its new port."""
         now_s = clock.monotonic_s()
         found = listening.drain(LOOK_MAX) if now_s >= self._look_s else []
-        ours = [chunk for chunk in found if chunk.peer == self._place]
-        others = [chunk for chunk in found if chunk.peer != self._place]
+        ours = [chunk for chunk in found if chunk.peer == self._peer]
+        others = [chunk for chunk in found if chunk.peer != self._peer]
         silent = now_s - self._heard_s > PEER_SILENT_S
         if others:
             self._look_s = now_s + LOOK_EVERY_S
         if heard or ours:
             self._heard_s = now_s
         elif silent:
-            ours = [chunk for chunk in others if same_host(chunk.peer, self._place)]
-            others = [chunk for chunk in others if not same_host(chunk.peer, self._place)]
+            ours = [chunk for chunk in others if same_host(chunk.peer, self._peer)]
+            others = [chunk for chunk in others if not same_host(chunk.peer, self._peer)]
         for sender, number in Counter(_name(chunk.peer) for chunk in others).items():
             self.report.count(sender, number)
         if others:
@@ -152,7 +152,7 @@ class UdpLink:
     # --- the vehicle ---
 
     def follow(self, peer: Hashable) -> None:
-        if self._listening is None or peer == self._place or not isinstance(peer, tuple):
+        if self._listening is None or peer == self._peer or not isinstance(peer, tuple):
             return
         listening = self._listening
         before, self._vehicle = self._vehicle, None
@@ -164,7 +164,7 @@ class UdpLink:
             with suppress(OSError):
                 listening.socket.connect(peer)
             self._listening, sock = None, listening.socket
-        self._vehicle, self._place = _Inbox(sock), peer
+        self._vehicle, self._peer = _Inbox(sock), peer
         self.opened += 1
         self._heard_s = clock.monotonic_s()
 
@@ -203,11 +203,11 @@ def _second_socket(listening: socket.socket, peer: tuple[str | int, ...]) -> soc
     return sock
 
 
-def _name(place: Hashable) -> str:
+def _name(peer: Hashable) -> str:
     """An address as the user writes it, 127.0.0.1:14540 or [::1]:14540."""
-    if not isinstance(place, tuple):
-        return str(place)
-    host, port = place[:2]
+    if not isinstance(peer, tuple):
+        return str(peer)
+    host, port = peer[:2]
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 

@@ -29,8 +29,8 @@ _SENSORS = {
 }
 # ESTIMATOR_STATUS_FLAGS and EKF_STATUS_FLAGS have the same bits
 _EKF_BITS = dict(zip(events.ESTIMATE, (1, 2, 8, 32), strict=True))
-_ARMED = 0x80  # MAV_MODE_FLAG_SAFETY_ARMED
-_FIX_3D = 3  # GPS_FIX_TYPE
+ARMED = 0x80  # MAV_MODE_FLAG_SAFETY_ARMED
+FIX_3D = 3  # GPS_FIX_TYPE; greater numbers are better fixes
 _REAL32 = 9  # MAV_PARAM_TYPE
 _UNSIGNED_TYPES, _SIGNED_TYPES = (1, 3, 5), (2, 4, 6)
 _LANDED = ("unknown", "on_ground", "in_air", "takeoff", "landing")  # MAV_LANDED_STATE
@@ -74,7 +74,7 @@ def decode(frame: Frame, dialect: Dialect) -> events.Event | DropReason | None:
 
 
 def _heartbeat(message: Any, dialect: Dialect) -> events.Event:
-    armed = bool(message.base_mode & _ARMED)
+    armed = bool(message.base_mode & ARMED)
     mode = dialect.mode_name(message.custom_mode)
     return events.Heartbeat(mode, armed, message.system_status, message.type)
 
@@ -116,7 +116,7 @@ def _thrust_report(message: Any, _: Dialect) -> events.Event | DropReason:
 
 
 def _gps_fix(message: Any, _: Dialect) -> events.Event:
-    if message.fix_type < _FIX_3D:
+    if message.fix_type < FIX_3D:
         return events.NoFix(message.fix_type)
     return events.GpsFix(message.h_acc * 1e-3 if message.h_acc else None)
 

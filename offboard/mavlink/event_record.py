@@ -11,12 +11,11 @@ import struct
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
-from offboard.mavlink.outgoing import ConfigurationRecord
+from offboard.mavlink.outgoing import PIECE_BYTES, ConfigurationRecord
 
-PAYLOAD_TYPE = 0xC0F4  # TUNNEL.payload_type; numbers above 32767 need no registration
+EVENT_TYPE = 0xC0F4  # TUNNEL.payload_type; numbers above 32767 need no registration
 SUPERVISOR = "supervisor"  # the cause of what the supervisor says
 _HEAD = struct.Struct("<BB")  # index of the piece, number of pieces
-_PIECE_BYTES = 128 - _HEAD.size
 _TEXT_MOST = 2000  # characters
 
 
@@ -32,9 +31,15 @@ class EventRecord(NamedTuple):
 def pieces(event: EventRecord) -> list[ConfigurationRecord]:
     """The messages that hold an event."""
     data = json.dumps(event._replace(text=event.text[:_TEXT_MOST])).encode()
-    parts = [data[at : at + _PIECE_BYTES] for at in range(0, len(data), _PIECE_BYTES)]
+    return numbered(data, _HEAD, EVENT_TYPE)
+
+
+def numbered(data: bytes, head: struct.Struct, payload_type: int) -> list[ConfigurationRecord]:
+    """Records that hold `data`, each piece after a `head` with its index and their number."""
+    size = PIECE_BYTES - head.size
+    parts = [data[at : at + size] for at in range(0, len(data), size)]
     return [
-        ConfigurationRecord(_HEAD.pack(index, len(parts)) + part, PAYLOAD_TYPE)
+        ConfigurationRecord(head.pack(index, len(parts)) + part, payload_type)
         for index, part in enumerate(parts)
     ]
 

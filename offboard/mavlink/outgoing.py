@@ -21,6 +21,7 @@ from offboard.model.command import Command, PositionCommand
 
 Message = Any  # of pymavlink, to be packed
 FLOAT32_MAX = 3.4028234663852886e38
+PIECE_BYTES = 128  # of TUNNEL.payload
 _LOCAL_NED = 1  # MAV_FRAME_LOCAL_NED
 # SET_ATTITUDE_TARGET.type_mask for attitude and thrust: the body rates are ignored. On ArduCopter
 # masks 1 to 6 hold the position, 71 and 199 make it ignore the message
@@ -71,7 +72,7 @@ class AttitudeTarget(Outgoing):
     time_s: float
     command: Command
     hover_thrust: float
-    gravity_mps2: float = 9.81
+    gravity_mps2: float
     body_z_down: float | None = None
 
     def encode(self, target: Target | None) -> Message:
@@ -280,8 +281,8 @@ class SolverRecord(Record):
 
     time_s: float
     data: tuple[float, ...]
-    array_id: int = 0
-    name: str = "pso"
+    array_id: int
+    name: str
 
     def encode(self, target: Target | None) -> Message:
         kind = mavlink.MAVLink_debug_float_array_message

@@ -69,44 +69,39 @@ class Senders:
         self.heard_s = 0.0
         self._wanted = wanted
         self._has_key = has_key
-        self.place: Hashable | None = (
-            None  # address of the vehicle, or of one that awaits our clock
-        )
+        # address of the vehicle, or of one that awaits our clock
+        self.peer: Hashable | None = None
 
-    def set_vehicle(self, vehicle: VehicleFound, place: Hashable) -> None:
-        """Take this vehicle, which sends from `place`, as ours."""
-        self.vehicle, self.dialect, self.place = vehicle, DIALECTS[vehicle.autopilot], place
+    def set_vehicle(self, vehicle: VehicleFound, peer: Hashable) -> None:
+        """Take this vehicle, which sends from `peer`, as ours."""
+        self.vehicle, self.dialect, self.peer = vehicle, DIALECTS[vehicle.autopilot], peer
         self.own = Address(vehicle.system_id, self.own.component_id)
 
     # --- addresses ---
 
-    def is_foreign(self, place: Hashable) -> bool:
-        """Whether the vehicle sends from another address."""
-        return self.vehicle is not None and place != self.place
-
-    def moves_to(self, place: Hashable, now_s: float, genuine: Iterable[Frame]) -> bool:
-        """Take `place` as the vehicle's address if one of the `genuine` frames from it shows that
+    def moves_to(self, peer: Hashable, now_s: float, genuine: Iterable[Frame]) -> bool:
+        """Take `peer` as the vehicle's address if one of the `genuine` frames from it shows that
         the vehicle sends from there now."""
-        if now_s - self.heard_s <= PEER_SILENT_S or not same_host(place, self.place):
+        if now_s - self.heard_s <= PEER_SILENT_S or not same_host(peer, self.peer):
             return False
         vehicle = self.vehicle
         assert vehicle is not None
         ids = vehicle.system_id, vehicle.component_id
         moves = any((frame.system_id, frame.component_id) == ids for frame in genuine)
         if moves:
-            self.place = place
+            self.peer = peer
         return moves
 
     # --- frames ---
 
     def judge(
-        self, frame: Frame, place: Hashable, now_s: float, events: list[Event]
+        self, frame: Frame, peer: Hashable, now_s: float, events: list[Event]
     ) -> DropReason | None:
         """Why this frame is not one of our vehicle, nor a command to us. Adds to `events` the
         vehicle when it is found, commands to us, and others that control the vehicle."""
         heard = self._whose(frame, now_s)
         if self.vehicle is None:
-            return self._find(frame, heard, place, events)
+            return self._find(frame, heard, peer, events)
         sender = Address(frame.system_id, frame.component_id)
         if self._controls(frame):
             events.append(OtherSender(*sender, frame.message_id))
@@ -136,7 +131,7 @@ class Senders:
         self,
         frame: Frame,
         heard: Dialect | DropReason | None,
-        place: Hashable,
+        peer: Hashable,
         events: list[Event],
     ) -> DropReason | None:
         """The first heartbeat of an autopilot makes it the vehicle."""
@@ -147,7 +142,7 @@ class Senders:
         if frame.signed and not self._has_key:
             return DropReason.NO_KEY
         vehicle = VehicleFound(frame.system_id, frame.component_id, heard.name)
-        self.set_vehicle(vehicle, place)
+        self.set_vehicle(vehicle, peer)
         events.append(vehicle)
         return None
 
@@ -202,7 +197,7 @@ class Senders:
             del self.systems[next(iter(self.systems))]
 
     def note_clock_behind(
-        self, frame: Frame, place: Hashable, now_s: float, events: list[Event]
+        self, frame: Frame, peer: Hashable, now_s: float, events: list[Event]
     ) -> None:
         """Note the autopilot whose frame has a right signature and a clock that is behind: its
         clock follows ours with our heartbeat. The frame may be a replay: nothing else is
@@ -211,7 +206,7 @@ class Senders:
         if isinstance(heard, Dialect) and self._wanted in (None, frame.system_id):
             beat = decode(frame, heard)
             assert isinstance(beat, Heartbeat)
-            self.clock_behind, self.place = True, place
+            self.clock_behind, self.peer = True, peer
             events.append(ClockBehind(frame.system_id, beat.armed))
 
     def is_for_us(self, ack: Frame) -> bool:
@@ -251,9 +246,9 @@ def _listed(systems: Collection[int]) -> str:
     return f"{', '.join(others)} and {last}" if others else last
 
 
-def same_host(place: Hashable, other: Hashable) -> bool:
+def same_host(peer: Hashable, other: Hashable) -> bool:
     """Whether two UDP addresses (host, port) have the same host."""
-    return isinstance(place, tuple) and isinstance(other, tuple) and place[0] == other[0]
+    return isinstance(peer, tuple) and isinstance(other, tuple) and peer[0] == other[0]
 
 
 def is_vehicle(heartbeat: Any) -> bool:

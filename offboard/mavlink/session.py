@@ -76,7 +76,7 @@ class Reception:
 class _Arrival:
     """A datagram, or a portion of a stream, and what is found in it."""
 
-    place: Hashable
+    peer: Hashable
     now_s: float
     events: list[Event] = field(default_factory=list)
     replies: list[Outgoing] = field(default_factory=list)
@@ -115,7 +115,7 @@ class Session:
     @property
     def peer(self) -> Hashable | None:
         """Address that the vehicle sends from; None before it is heard."""
-        return self.senders.place
+        return self.senders.peer
 
     # --- in ---
 
@@ -123,7 +123,7 @@ class Session:
         """Process a datagram, or any portion of a stream, that came from `peer`. Never raises."""
         self.time.on_datagram()
         arrival = _Arrival(peer, self.time.now_s(now_s))
-        if self.senders.is_foreign(peer):
+        if self.vehicle is not None and peer != self.peer:
             if not self.senders.moves_to(peer, arrival.now_s, self._genuine(datagram)):
                 self.counters.dropped[DropReason.FOREIGN_PEER] += 1
                 return Reception()
@@ -153,11 +153,11 @@ class Session:
         if forged:
             if forged is DropReason.OLD_STAMP and self.vehicle is None:
                 self.senders.note_clock_behind(
-                    frame, arrival.place, self.link_time_s, arrival.events
+                    frame, arrival.peer, self.link_time_s, arrival.events
                 )
             return forged
         was_found = self.vehicle is not None
-        foreign = self.senders.judge(frame, arrival.place, self.link_time_s, arrival.events)
+        foreign = self.senders.judge(frame, arrival.peer, self.link_time_s, arrival.events)
         if foreign or frame.message_id in COMMANDS:
             return foreign
         if self.vehicle is not None:

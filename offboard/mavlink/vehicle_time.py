@@ -15,7 +15,7 @@ from enum import Enum, auto
 # are a new epoch
 _REBOOT_S = 2.0
 _EPOCH_STAMPS, _EPOCH_S, _GAP_S = 3, 0.1, 10.0
-# So often within this time a stamp of this epoch follows one of another: two clocks send by turns
+# So often within this time a stamp of this epoch follows one of another: two clocks alternate
 _TURNS, _TURNS_S = 10, 2.0
 SILENCE_S = 1.0
 _WRAP_S = 2**32 / 1e3
@@ -102,7 +102,7 @@ class VehicleTime:
 
     @property
     def mixed(self) -> bool:
-        """Whether stamps of two clocks, more than _REBOOT_S apart, arrive by turns."""
+        """Whether stamps of two clocks, more than _REBOOT_S apart, alternate."""
         return len(self._turns_s) == _TURNS and self.seconds - self._turns_s[0] < _TURNS_S
 
     # --- seconds ---

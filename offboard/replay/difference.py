@@ -14,9 +14,9 @@ import numpy as np
 from offboard.analysis.tlog import layout, name_of
 from offboard.documents.errors import UserError
 from offboard.mavlink.framing import SETPOINTS
+from offboard.mavlink.senders import COMMANDS
 from offboard.replay.replaying import Recording, Replay, Sent, Turn
 
-COMMANDS = (75, 76)  # COMMAND_INT, COMMAND_LONG
 # Of a field, relative to its value or to 1: another processor or library rounds differently, by up
 # to 1e-8 rad and 6e-8 of thrust between two x86-64 processors
 ROUNDING = 1e-6

@@ -22,8 +22,8 @@ from offboard.flight.record import (
     CALL,
     CHECK,
     DROPPED,
+    INPUTS_TYPE,
     OTHERS,
-    PAYLOAD_TYPE,
     Entry,
     InputsError,
     Note,
@@ -41,7 +41,7 @@ CALLS = ("request_stop", "announce", "note_autopilot", "guard")  # methods of th
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """`settings` are those of the session: lockstep, stream, sends_first, capacity_bytes_ps."""
+    """`settings` are the RECORDED_SETTINGS (`flight.record`) of the session."""
 
     log: Tlog
     configuration: str
@@ -68,7 +68,7 @@ def read(flight: Path) -> Recording:
             f"{path} does not hold the configuration of a flight: only logs of offboard can be "
             "replayed"
         )
-    recorded = tuple(m.tunnelled for m in log if record_type(m) == PAYLOAD_TYPE)
+    recorded = tuple(m.tunnelled for m in log if record_type(m) == INPUTS_TYPE)
     if not recorded:
         raise UserError(
             f"{path} cannot be replayed, only scored and reported: it has no inputs of each turn; "
@@ -253,7 +253,7 @@ class Replay:
         if message.system_id != self.companion.session.senders.own.system_id:
             return False
         if message.component_id == RECORD_COMPONENT_ID:
-            self._pieces += record_type(message) == PAYLOAD_TYPE
+            self._pieces += record_type(message) == INPUTS_TYPE
             return True
         if message.component_id != COMPONENT_ID:
             return False

@@ -18,7 +18,7 @@ from offboard.analysis.verdict import begin_times
 _PARTS = {"controller": "law", "reference": "shape", "vehicle": "name"}  # key that names each
 _NO_HEARTBEAT = "no HEARTBEAT of an autopilot: no telemetry used"
 _NO_RECORDS = (
-    "no records of offboard: no reference, decisions, identification or figures of the score"
+    "no records of offboard: no reference, decisions, identification or metrics of the score"
 )
 # array of History, what it is, its message, what takes its place, and how
 _TELEMETRY = (

@@ -1,4 +1,4 @@
-"""The page of a report: verdict first, then path, timeline and panels, events and figures."""
+"""The page of a report: verdict first, then path, timeline and panels, events and metrics."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def _verdict(place: int, flight: Flight, alone: bool) -> dict[str, object]:
 
 
 def rows(flights: Sequence[Flight]) -> dict[str, tuple[str, ...]]:
-    """Every figure that a log holds, by name, for each flight as text."""
+    """Every metric that a log holds, by name, for each flight as text."""
     scores = [flight.score.metrics() for flight in flights]
     return {
         name: tuple(f"{each:.4g}" if math.isfinite(each) else "–" for each in values)

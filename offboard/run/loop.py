@@ -18,7 +18,7 @@ from offboard.run.sitl import Ending, InMemorySimulator, SimulatorProcess
 from offboard.supervisor.supervisor import Supervisor, SupervisorError
 
 POLL_S = 0.02
-STOPPED_S = 0.2  # from the beginning of a turn: what it decided does not leave later
+SEND_WITHIN_S = 0.2  # from the beginning of a turn: what it decided does not leave later
 FAILING_S = 0.3  # without a turn that succeeds: give up
 UNGUARDED = "the supervisor ended: nobody lands the vehicle if this process dies"
 UNANSWERED = "the supervisor does not answer: nobody lands the vehicle if this process dies"
@@ -141,7 +141,7 @@ class Loop:
         peer = self._companion.current.session.peer
         dropped: list[bytes] = []
         for frame in frames:
-            if self._supervisor and clock.monotonic_s() - began_s > STOPPED_S:
+            if self._supervisor and clock.monotonic_s() - began_s > SEND_WITHIN_S:
                 dropped.append(frame)
             else:
                 self._link.send(frame, peer)
@@ -225,15 +225,15 @@ class Loop:
         """End the flight if the bundled simulator has ended."""
         if self._simulator is None or self._companion.has_ended():
             return
-        ended = self._simulator.ended()
-        if ended is None and silent_s > self._patience_s:
-            ended = Ending(f"the bundled simulator has not answered for {silent_s:.1f} s", False)
-        if ended is None:
+        ending = self._simulator.ending()
+        if ending is None and silent_s > self._patience_s:
+            ending = Ending(f"the bundled simulator has not answered for {silent_s:.1f} s", False)
+        if ending is None:
             return
         code = ExitCode.ABORTED
         if self._companion.current.phase in BEFORE_FLIGHT:
-            code = ExitCode.USAGE if ended.unusable else ExitCode.REFUSED
-        self._ended_early = Outcome(code, ended.sentence)
+            code = ExitCode.USAGE if ending.unusable else ExitCode.REFUSED
+        self._ended_early = Outcome(code, ending.sentence)
 
     # --- the end ---
 

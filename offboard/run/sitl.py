@@ -88,7 +88,7 @@ class SimulatorProcess:
         self._ending = None
         self._write(json.dumps(options).encode() + b"\n")
 
-    def ended(self, timeout_s: float = 0.0) -> Ending | None:
+    def ending(self, timeout_s: float = 0.0) -> Ending | None:
         """How the vehicle's process ended, or None if it still runs after `timeout_s`."""
         assert self.process.stdout is not None
         if self._ending is None and select.select([self.process.stdout], [], [], timeout_s)[0]:
@@ -100,14 +100,14 @@ class SimulatorProcess:
 
     def recall(self) -> None:
         """End the vehicle's process."""
-        if self.ended() is None:
+        if self.ending() is None:
             self._write(b"\n")
-            if self.ended(STOP_S) is None:
+            if self.ending(STOP_S) is None:
                 self.close()
 
     def _write(self, line: bytes) -> None:
         assert self.process.stdin is not None
-        with suppress(BrokenPipeError):  # the pool died; `ended` reports it
+        with suppress(BrokenPipeError):  # the pool died; `ending` reports it
             self.process.stdin.write(line)
 
     def _explain(self, code: int) -> Ending:
@@ -199,7 +199,7 @@ class InMemorySimulator:
         self._link = InMemoryLink(vehicle)
         return self._link
 
-    def ended(self, timeout_s: float = 0.0) -> Ending | None:
+    def ending(self, timeout_s: float = 0.0) -> Ending | None:
         """How the vehicle ended, None while it runs."""
         problem = self._link.problem if self._link else None
         if problem is None:

@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from offboard.flight.display import Snapshot
-from offboard.flight.flight import STOPPED, Flight
-from offboard.flight.phases import ENDS, WAITING, Phase, ServiceOptions
+from offboard.flight.flight import Flight
+from offboard.flight.phases import ENDS, OPERATOR_STOP, WAITING, Phase, ServiceOptions
 from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from offboard.link.interface import Chunk
 from offboard.mavlink.session import Session
@@ -62,10 +62,10 @@ class Flights:
         """Whether the service was stopped, and no flight is left."""
         return self._stopping and self.current.has_ended()
 
-    def request_stop(self, why: str = STOPPED) -> None:
+    def request_stop(self, why: str = OPERATOR_STOP) -> None:
         """Stop the service, after the vehicle was handed back. For another reason than the
         operator's, only the present flight ends."""
-        self._stopping |= why == STOPPED
+        self._stopping |= why == OPERATOR_STOP
         if self._stopping or self.phase not in WAITING:
             self.current.request_stop(why)
         elif self.current.announced[-1:] != [why]:
@@ -138,7 +138,7 @@ class Flights:
         vehicle was seen in another mode or on the ground."""
         state, left = self.current, self._record.left
         state.left_engaged = bool(left) and left == self._identity
-        if state.left_engaged and not state.pilot.unclaimed:
+        if state.left_engaged and not state.pilot.always_in_engage_mode:
             self._record.settle()
 
     # ------------------------------------------------------------------ the identified vehicle

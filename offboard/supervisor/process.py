@@ -128,11 +128,11 @@ class TakeOver:
             if not self._receive():
                 break
         self._ask(f"taking over: {reason}")
-        while not self._recovery.ended:
+        while not self._recovery.end_reason:
             self._link.wait(POLL_S)
             self._receive()
             self._ask()
-        self._say(self._recovery.ended)
+        self._say(self._recovery.end_reason)
         self._log.close(CLOSE_S)
 
     def _receive(self) -> bool:
@@ -186,10 +186,12 @@ class TakeOver:
             self._log.put(entry(clock.unix_us(), frame))
 
 
-def _known(vehicle: Mapping[str, Any], loss: Mapping[str, Any], **more: Any) -> Supervised:
+def _known(vehicle: Mapping[str, Any], setpoint_loss: Mapping[str, Any], **more: Any) -> Supervised:
     """From JSON."""
-    modes = tuple(loss["modes"])
-    return Supervised(VehicleFound(**vehicle), loss=SetpointLoss(loss["after_s"], modes), **more)
+    modes = tuple(setpoint_loss["modes"])
+    return Supervised(
+        VehicleFound(**vehicle), setpoint_loss=SetpointLoss(setpoint_loss["after_s"], modes), **more
+    )
 
 
 def _link(descriptors: list[int], stream: str) -> Link:

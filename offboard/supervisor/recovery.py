@@ -41,13 +41,13 @@ EARLIER_S, SILENT_MIN_S, SILENT_MAX_S = 0.4, 0.4, 0.9
 
 @dataclass(frozen=True, slots=True)
 class Supervised:
-    """What the controller tells, and the supervisor must know before it may act: the vehicle,
-    whether it is `ours`, in the mode of our setpoints or in one that we asked for, by a report that
-    arrived at `reported_s` (`clock.monotonic_s`), of which the supervisor judges the age; whether
-    it may be `flying`, and whether it was asked to hold (`holding`): then this mode is ours, too;
-    or to land (`landing`).
-    `loss`: what its autopilot does without setpoints; `sticks`: it receives those of a pilot;
-    `starved`: setpoints were missing already, or its failsafe for that flies it."""
+    """What the controller tells, and the supervisor must know before it may act.
+
+    `ours`: the vehicle is in the mode of our setpoints, or in one that we asked for, by a report
+    that arrived at `reported_s` (`clock.monotonic_s`), whose age the supervisor judges. `flying`:
+    it is armed. `holding`: it was asked to hold, so that this mode is ours, too; `landing`: to
+    land. `setpoint_loss`: what its autopilot does without setpoints; `sticks`: it receives those of
+    a pilot; `setpoints_missing`: they were missing already, or its failsafe for that flies it."""
 
     vehicle: VehicleFound
     ours: bool
@@ -55,27 +55,27 @@ class Supervised:
     reported_s: float = -math.inf
     holding: bool = False
     landing: bool = False
-    loss: SetpointLoss = NEVER
+    setpoint_loss: SetpointLoss = NEVER
     sticks: bool = False
-    starved: bool = False
+    setpoints_missing: bool = False
 
     @property
     def silent_s(self) -> float:
         """Time without a beat after which the supervisor acts."""
-        return min(max(self.loss.after_s - EARLIER_S, SILENT_MIN_S), SILENT_MAX_S)
+        return min(max(self.setpoint_loss.after_s - EARLIER_S, SILENT_MIN_S), SILENT_MAX_S)
 
 
 class Recovery:
     """Begins at `began_s`; the newest beat of the controller left at `beat_s`, and said `known`.
 
-    `ended` says how it ended, empty until then; `news` are sentences for the user."""
+    `end_reason` says how it ended, empty until then; `news` are sentences for the user."""
 
     def __init__(self, dialect: Dialect, known: Supervised, began_s: float, beat_s: float) -> None:
         self._dialect, self._known = dialect, known
         self._hold_s = 0.0 if known.landing else HOLD_S
         self._began_s = began_s
-        missing_s = beat_s + known.loss.after_s - EARLY_S
-        self._loses_s = -math.inf if known.starved else missing_s
+        missing_s = beat_s + known.setpoint_loss.after_s - EARLY_S
+        self._loses_s = -math.inf if known.setpoints_missing else missing_s
         self._sticks = known.sticks
         self._mode: str | None = None
         self._before: str | None = None  # the mode before it
@@ -95,7 +95,7 @@ class Recovery:
         self._requests = 0
         self._held_s = math.inf  # since when it holds
         self.news: list[str] = []
-        self.ended = ""
+        self.end_reason = ""
 
     def see(self, event: Event, at_s: float) -> None:
         """An event of the vehicle that arrived at `at_s` at the latest, which may be before
@@ -145,16 +145,18 @@ class Recovery:
         fell = self._fallen_s < math.inf
         followed = fell or self._before in (None, self._dialect.engage_mode)
         missing = followed and not self._acknowledged and at_s >= self._loses_s
-        if missing and mode in self._known.loss.modes and self._sticks:
+        if missing and mode in self._known.setpoint_loss.modes and self._sticks:
             self.news.append(f"{mode} for missing setpoints, and it receives a pilot's sticks")
         lands = mode == self._dialect.land_mode
-        return missing and mode in self._known.loss.modes and not lands and not self._sticks
+        return (
+            missing and mode in self._known.setpoint_loss.modes and not lands and not self._sticks
+        )
 
     def due(self, now_s: float) -> CommandLong | None:
         """What to ask for now."""
         self._begun = True
         self._conclude(now_s)
-        if self.ended or self._left_for or now_s - self._asked_s < REPEAT_S:
+        if self.end_reason or self._left_for or now_s - self._asked_s < REPEAT_S:
             return None
         request = self._wanted(now_s)
         if request:
@@ -170,16 +172,18 @@ class Recovery:
         # PX4 leaves its landing mode when it disarms, which HEARTBEAT shows later
         shown = not self._landing or self._heartbeat_s >= self._left_s
         if not self._armed:
-            self.ended = "the vehicle is disarmed"
+            self.end_reason = "the vehicle is disarmed"
         elif self._left_for and shown:
-            self.ended = f"the vehicle shows {self._left_for}: its pilot or its failsafe has it"
+            self.end_reason = (
+                f"the vehicle shows {self._left_for}: its pilot or its failsafe has it"
+            )
         elif not ours and now_s - self._held_s > ACKNOWLEDGED_S:
-            self.ended = (
+            self.end_reason = (
                 f"the vehicle shows {self._mode}, and has not acknowledged the request: its pilot "
                 "or its failsafe has it"
             )
         elif now_s - self._began_s > LONGEST_S:
-            self.ended = f"not landed after {LONGEST_S:.0f} s"
+            self.end_reason = f"not landed after {LONGEST_S:.0f} s"
 
     def _wanted(self, now_s: float) -> CommandLong | None:
         hold, land = self._dialect.hold(), CommandLong.land()

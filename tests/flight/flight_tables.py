@@ -23,7 +23,7 @@ _ASKED = {
 _DISARMED = (
     flying.disarmed,
     flying.rebooted_disarmed,
-    flying.disarmed_elsewhere,
+    flying.disarmed_not_landed,
     flying.landed,
 )
 IN_THE_AIR = FLYING | {Phase.LAND}

@@ -99,7 +99,7 @@ def replayed(history: list[Occurrence], *, failsafes: bool = True) -> tuple[Auth
         elif each.kind == "pause":
             authority.doubt(now_s, 0.9)
         else:
-            authority.lose("by a test", now_s)
+            authority.lose("by a test", now_s, heartbeat=True)
     return authority, now_s
 
 
@@ -340,11 +340,16 @@ def test_a_failsafe_may_interrupt_a_mode_that_we_asked_for(
 def test_a_failsafe_that_was_shown_within_a_pause_permits_nothing() -> None:
     """A pilot may have taken it since, in the same mode."""
     authority, _ = replayed(HELD[:2])
-    authority.loss = SetpointLoss(1.0, ("POSCTL",))
+    authority.setpoint_loss = SetpointLoss(1.0, ("POSCTL",))
 
     def permits(heartbeat: bool, arrived_s: float) -> bool:
         authority.on_mode(
-            "POSCTL", 207.0, arrived_s=arrived_s, failsafe=True, heartbeat=heartbeat, starved=True
+            "POSCTL",
+            207.0,
+            arrived_s=arrived_s,
+            failsafe=True,
+            heartbeat=heartbeat,
+            setpoints_missing=True,
         )
         assert authority.standing is Standing.FAILSAFE
         return authority.permits_command(207.0)
@@ -360,7 +365,7 @@ def test_a_failsafe_that_was_shown_within_a_pause_permits_nothing() -> None:
 
 def test_the_first_loss_is_the_one_that_is_told() -> None:
     authority, _ = replayed([*HELD[:2], Occurrence("report", mode="B")])
-    authority.lose("the supervisor has it", 109.0)
+    authority.lose("the supervisor has it", 109.0, heartbeat=True)
     assert authority.lost_reason == "the vehicle left E for B"
     assert authority.lost_s == -math.inf  # HEARTBEAT has shown it
     assert math.isinf(Authority("E").lost_s)

@@ -96,10 +96,10 @@ def _age_attitude(flight: FlightState) -> None:
     flight.vehicle.attitude = Attitude(NOW_S - 0.51, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
 
-def _climb(late_s: float, at_start: bool) -> Setup:
+def _climb(overdue_s: float, at_start: bool) -> Setup:
     plan: Any = SimpleNamespace(
-        late_s=lambda time_s: late_s, at_start=lambda *_: at_start, sample=lambda time_s: None,
-        track=TRACK, reference=None, track_time_s=lambda time_s: math.nan,
+        overdue_s=lambda time_s: overdue_s, at_start=lambda *_: at_start, track=TRACK,
+        sample=lambda time_s: None, reference=None, track_time_s=lambda time_s: math.nan,
     )  # fmt: skip
     return _set(plan=plan)
 
@@ -178,10 +178,10 @@ EVENTS: dict[str, Setup] = {
     "disarmed_again": _refuse_arming,
     "disarmed_for_good": _disarm,
     "landed": _disarm,
-    "disarmed_elsewhere": partial(_disarm, for_s=2.6, landed="in_air"),
-    "lost": _stand(Standing.LOST),
-    "lost_armed": _stand(Standing.LOST, armed=True),
-    "lost_disarmed": _stand(Standing.LOST, armed=False),
+    "disarmed_not_landed": partial(_disarm, for_s=2.6, landed="in_air"),
+    "authority_lost": _stand(Standing.LOST),
+    "authority_lost_armed": _stand(Standing.LOST, armed=True),
+    "authority_lost_disarmed": _stand(Standing.LOST, armed=False),
     "mode_unknown": _unhear_mode,
     "silent": _set(silence_s=1.01),
     "in_own_failsafe": _stand(Standing.FAILSAFE),
@@ -203,9 +203,9 @@ EVENTS: dict[str, Setup] = {
     "engaged_but_unfit": _engage(engaged=True),
     "started_in_the_air": _all(lift, _fit, _set(request=Request.START)),
     "started_on_the_ground": _all(_fit, _set(request=Request.START)),
-    "engaged_too_soon": _engage(hasty=True),
-    "abandoned": _all(_engage(unclaimed=True), _set(left_engaged=True)),
-    "handed": _stand(Standing.HANDED),
+    "engaged_too_soon": _engage(returned_too_soon=True),
+    "abandoned": _all(_engage(always_in_engage_mode=True), _set(left_engaged=True)),
+    "in_requested_mode": _stand(Standing.HANDED),
     "failsafe_hold": _act(Action.HOLD),
     "failsafe_land": _act(Action.LAND),
     **{f"requested_{each.name.lower()}": _set(request=each) for each in Request},

@@ -45,14 +45,14 @@ def asked(
         recovery.see(Heartbeat(shown, True, 4, 2), -0.4)
     commands: list[tuple[float, int]] = []
     now_s, end_s = 0.0, 1.0 + (waiting[-1][0] if waiting else LONGEST_S)
-    while not recovery.ended and now_s < end_s:
+    while not recovery.end_reason and now_s < end_s:
         request = recovery.due(now_s)
         commands += [(now_s, request.command)] if request else []
         while waiting and waiting[0][0] <= now_s:
             at_s, event = waiting.pop(0)
             recovery.see(event, at_s)
         now_s = round(now_s + 0.02, 2)
-    return commands, recovery.ended
+    return commands, recovery.end_reason
 
 
 def beats(mode: str, first_s: float, last_s: float, *, armed: bool = True) -> list[Timed]:
@@ -167,7 +167,7 @@ def test_the_failsafe_for_missing_setpoints_may_act_a_little_early() -> None:
     loss = PX4.setpoint_loss({"COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": POSCTL})
     for at_s, end in ((0.6, "the vehicle shows POSCTL"), (0.8, DISARMED)):
         falls = [(at_s, Heartbeat("POSCTL", True, 5, 2)), *beats("POSCTL", 2.0, 2.0, armed=False)]
-        known = replace(OURS, loss=loss)
+        known = replace(OURS, setpoint_loss=loss)
         _, ended = asked(PX4, *falls, shown=PX4.engage_mode, known=known)
         assert ended.startswith(end)
 
@@ -176,7 +176,7 @@ def test_from_hold_even_the_mode_of_that_failsafe_is_a_pilots_choice() -> None:
     """The controller has asked for hold; HEARTBEAT shows another failsafe, as an empty battery."""
     loss = PX4.setpoint_loss({"COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": POSCTL})
     switched = [(2.0 + n, Heartbeat("POSCTL", True, 5, 2)) for n in range(10)]
-    known = replace(OURS, loss=loss, holding=True)
+    known = replace(OURS, setpoint_loss=loss, holding=True)
     commands, ended = asked(PX4, *switched, shown=PX4.hold_mode, known=known)
     assert ended.startswith("the vehicle shows POSCTL")
     assert commands == []
@@ -227,9 +227,9 @@ def recovered(
     session, result = Session(SessionSettings()), Recovered()
     session.set_vehicle(VEHICLE, "vehicle")
     instance.feed(session.encode(CommandLong.message_interval(436, 50.0)))  # CURRENT_MODE
-    level = session.encode(AttitudeTarget(0.0, Command(9.81, (0.0, 0.0, 1.0), 0.0), 0.489))
+    level = session.encode(AttitudeTarget(0.0, Command(9.81, (0.0, 0.0, 1.0), 0.0), 0.489, 9.81))
     loss = PX4.setpoint_loss({"COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": fallback})
-    known = Supervised(VEHICLE, ours=True, flying=True, reported_s=0.0, loss=loss)
+    known = Supervised(VEHICLE, ours=True, flying=True, reported_s=0.0, setpoint_loss=loss)
     recovery: Recovery | None = None
     for step in range(round(90.0 / STEP_S)):
         now_s = step * STEP_S - STREAM_S
@@ -250,8 +250,8 @@ def recovered(
             result.asked.append((now_s, command, height_m))
             if arrives(command):
                 instance.feed(session.encode(request))
-        if recovery and recovery.ended:
-            result.ended, result.armed = recovery.ended, commander.armed
+        if recovery and recovery.end_reason:
+            result.ended, result.armed = recovery.end_reason, commander.armed
             return result
     raise AssertionError(result)
 
@@ -266,7 +266,7 @@ def test_before_the_failsafe_and_in_a_race_with_it_it_is_landed(
     """The supervisor acts so long after the failsafe, by itself 0.4 s before it; it took that mode
     for a pilot's and gave up."""
     loss = PX4.setpoint_loss({"COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": fallback})
-    assert replace(OURS, loss=loss).silent_s == pytest.approx(0.6)
+    assert replace(OURS, setpoint_loss=loss).silent_s == pytest.approx(0.6)
     result = recovered(fallback, 1.0 + after_s)
     assert (result.ended, result.armed) == (DISARMED, False)
 

@@ -264,7 +264,10 @@ ROWS = {
     "stop as it lifts off": ends(STOPPED, landed, at=then(Phase.TAKEOFF, 0.5, faults.stop)),
     "stop after the pilot has engaged it in the air, before we ask": ends(
         STOPPED, landed, fly=px4.hover, ended_by="operator",
-        at=[*then(Phase.STREAM, 0.2, engage), (lambda pair: pair.companion.engaged, faults.stop)],
+        at=[
+            *then(Phase.STREAM, 0.2, engage),
+            (lambda pair: pair.companion.in_engage_mode, faults.stop),
+        ],
     ),
     # the vehicle refuses or is not there
     "no vehicle": refusal(

@@ -239,7 +239,7 @@ def test_one_that_is_stopped_does_not_guard_until_it_continues(rig: Rig) -> None
 def test_stopped_while_the_controller_ends_it_knows_the_failsafe_of_the_vehicle(rig: Rig) -> None:
     """Beats have the time at which they were sent. By the time at which they are read the failsafe
     came too early, and seemed to be a pilot's choice."""
-    rig.beat(replace(OURS, loss=SetpointLoss(1.0, ("AUTO.LOITER",))))
+    rig.beat(replace(OURS, setpoint_loss=SetpointLoss(1.0, ("AUTO.LOITER",))))
     os.kill(rig.supervisor.process.pid, signal.SIGSTOP)
     rig.abandon()
     time.sleep(1.2)
@@ -258,7 +258,7 @@ def test_the_report_of_the_mode_may_be_old_and_is_awaited_then(rig: Rig) -> None
     old = replace(OURS, reported_s=clock.monotonic_s() - 3.0)
     rig.supervisor.beat(old, rig.peer, rig.link, rig.log.descriptor)
     rig.abandon()
-    rig.vehicle.settimeout(1.0)
+    rig.vehicle.settimeout(0.7)  # less than the period of HEARTBEAT
     with pytest.raises(TimeoutError):
         rig.next_message()
     rig.vehicle.settimeout(LONG_S)

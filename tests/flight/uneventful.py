@@ -87,7 +87,7 @@ def uneventful(phase: Phase = Phase.TRACK, service: ServiceOptions | None = None
         began_s=NOW_S,
     )
     flight.vehicle.now_s = NOW_S
-    flight.pilot.unclaimed = False
+    flight.pilot.always_in_engage_mode = False
     if phase is Phase.CONNECT:
         return flight
     session.dialect = PX4

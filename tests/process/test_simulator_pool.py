@@ -43,14 +43,14 @@ def test_how_each_vehicle_ends_is_reported_and_the_next_one_flies() -> None:
             (["--firmware", "betaflight"], "--firmware betaflight: unknown"),
         ):
             simulator.launch(options)
-            ending = simulator.ended(10.0)
+            ending = simulator.ending(10.0)
             assert ending is not None
             assert (ending.unusable, ending.sentence.startswith(says)) == (True, True)
             with flying(simulator) as vehicle:
                 os.kill(vehicle, signal.SIGKILL)
-                assert simulator.ended(10.0) == KILLED  # not the words before
+                assert simulator.ending(10.0) == KILLED  # not the words before
         with flying(simulator):
-            assert simulator.ended() is None
+            assert simulator.ending() is None
         simulator.recall()
         assert (children(simulator.process.pid), simulator.process.pid) == ([], pid)
 

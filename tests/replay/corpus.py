@@ -31,8 +31,8 @@ from offboard.link.interface import Chunk
 from offboard.link.log import entry
 from offboard.mavlink.framing import SETPOINTS
 from offboard.mavlink.outgoing import ConfigurationRecord
+from offboard.mavlink.senders import COMMANDS
 from offboard.mavlink.session import RECORD_COMPONENT_ID, Reception, SessionSettings
-from offboard.replay.difference import COMMANDS
 from offboard.replay.replaying import CALLS, Recording, Replay, Sent, read
 
 FLIGHTS = Path(__file__).parent / "recordings"

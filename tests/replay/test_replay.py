@@ -24,8 +24,8 @@ from offboard.flight import actions
 from offboard.flight.phases import Phase
 from offboard.flight.record import (
     DROPPED,
+    INPUTS_TYPE,
     OTHERS,
-    PAYLOAD_TYPE,
     ChunkInput,
     InputRecorder,
     InputsError,
@@ -128,7 +128,7 @@ def test_the_rounding_of_another_computer_is_no_difference(by: float, significan
 
 def test_logs_that_cannot_be_replayed(flight: Path, tmp_path: Path) -> None:
     old, silent = tmp_path / "old.tlog", tmp_path / "silent.tlog"
-    old.write_bytes(without(flight, lambda message: record_type(message) == PAYLOAD_TYPE))
+    old.write_bytes(without(flight, lambda message: record_type(message) == INPUTS_TYPE))
     silent.write_bytes(without(flight, lambda message: record_type(message) is None))
     for log, why in (
         (WIRE / "px4-1.16.1-offboard.tlog", "does not hold the configuration"),

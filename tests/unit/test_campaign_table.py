@@ -16,7 +16,7 @@ from browser import opening
 from rich.console import Console
 
 from offboard.campaign import workers
-from offboard.campaign.campaign_page import FIGURES, page
+from offboard.campaign.campaign_page import TABLE_METRICS, page
 from offboard.campaign.cases import Case
 from offboard.campaign.document import CampaignFile, Promises
 from offboard.campaign.flight import LOWEST, Job, terms
@@ -44,7 +44,7 @@ WHY = "7.1 m <b>away</b>"
 def record(error_m: float) -> Record:
     if math.isnan(error_m):
         return Record(4, WHY, -1.0, "completed")
-    figures = {name: error_m * (1 + index) for index, name in enumerate(FIGURES)}
+    figures = {name: error_m * (1 + index) for index, name in enumerate(TABLE_METRICS)}
     return Record(0, "flown and landed", 0.9, "error", figures)
 
 

@@ -17,7 +17,7 @@ from offboard.campaign.cases import Case
 from offboard.campaign.document import Promises, read_campaign
 from offboard.campaign.flight import Job
 from offboard.campaign.results import Record, Results
-from offboard.campaign.run import Campaign, Counter, Incomplete, Runner
+from offboard.campaign.run import Campaign, Incomplete, Progress, Runner
 from offboard.campaign.search import Failure, FailureSearch, as_csv
 from offboard.campaign.tune import Tuned, Tuning, judge, profile, read_tune
 from offboard.documents.errors import DocumentError, UserError
@@ -57,8 +57,8 @@ class Known:
 
 
 def runner(results: Results, flyer: Known) -> Runner:
-    counter = Counter(Console(file=io.StringIO()))
-    return Runner(results, Promises(), lambda: nullcontext(flyer), counter)
+    progress = Progress(Console(file=io.StringIO()))
+    return Runner(results, Promises(), lambda: nullcontext(flyer), progress)
 
 
 def two_regions(case: Case) -> Record:
@@ -149,7 +149,7 @@ trials: 40
 
 
 def bowl(case: Case) -> Record:
-    """A flight whose error is least at 4 rad/s and 0.4, plus a figure of scenario and seed."""
+    """A flight whose error is least at 4 rad/s and 0.4, plus a number of scenario and seed."""
     at = {BANDWIDTH: 7.0, LIMIT: 0.3, **dict(case.values)}
     cost = (at[BANDWIDTH] - 4.0) ** 2 / 36 + (at[LIMIT] - 0.4) ** 2
     cost += 0.01 * case.seed + 0.002 * len(case.scenario)
@@ -210,7 +210,7 @@ def test_a_file_that_cannot_be_tuned_is_refused(tmp_path: Path) -> None:
     for change, sentence in (
         (("[gusts, noise]", "[calm, noise]"), "2 flights are in training and in validation"),
         (("feedback_limit", "feedback"), "ranges.controller.feedback is no number"),
-        (("trials: 40", "objective: solve_time_p50_ms"), "is no figure of a lockstep flight"),
+        (("trials: 40", "objective: solve_time_p50_ms"), "is no metric of a lockstep flight"),
         ((LIMIT, "scenario.conditions.mass_scale"), "no scenario and no vehicle is tuned"),
     ):
         with pytest.raises(DocumentError, match=sentence):

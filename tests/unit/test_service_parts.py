@@ -306,14 +306,14 @@ def test_a_switch_counts_in_the_air_from_a_mode_without_failsafe() -> None:
     switch = PilotSwitch()
 
     def shows(ours: bool, failsafe: bool = False, in_the_air: bool = True) -> bool:
-        switch.on_mode(ours=ours, in_the_air=in_the_air, flies=in_the_air)
-        switch.on_heartbeat(ours=ours, failsafe=failsafe)
+        switch.on_mode(in_engage_mode=ours, in_the_air=in_the_air, flies=in_the_air)
+        switch.on_heartbeat(in_engage_mode=ours, failsafe=failsafe)
         return switch.engaged
 
     assert not shows(ours=True)  # found so
     assert not shows(ours=False, failsafe=True)
     assert not shows(ours=True)  # PX4 returns by itself
-    assert not switch.hasty
+    assert not switch.returned_too_soon
     assert not shows(ours=False)
     assert shows(ours=True)
     assert not shows(ours=False)
@@ -321,8 +321,8 @@ def test_a_switch_counts_in_the_air_from_a_mode_without_failsafe() -> None:
     assert not shows(ours=True)  # took off in this mode
     for flies in (True, False):  # by every sign
         switch = PilotSwitch()
-        switch.on_heartbeat(ours=False, failsafe=False)
-        switch.on_mode(ours=True, in_the_air=True, flies=flies)
+        switch.on_heartbeat(in_engage_mode=False, failsafe=False)
+        switch.on_mode(in_engage_mode=True, in_the_air=True, flies=flies)
         assert switch.engaged is flies
 
 

@@ -27,7 +27,7 @@ from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.texts import TextAssembler, chunks
 from offboard.model.command import Command, PositionCommand
 
-LEVEL = AttitudeTarget(12.345, Command(9.81, (0.0, 0.0, 1.0), 0.0), 0.489)
+LEVEL = AttitudeTarget(12.345, Command(9.81, (0.0, 0.0, 1.0), 0.0), 0.489, 9.81)
 MOTION = ((1.0, 2.0, -3.0), (0.1, 0.2, 0.3), (0.4, 0.5, 0.6), 0.5, 0.25)
 POSITION = PositionTarget(1.0, PositionCommand(*MOTION))
 
@@ -79,7 +79,7 @@ def test_thrust_rules(
     autopilot: int, thrust_mps2: float, direction: Any, body_z_down: Any, expected: float
 ) -> None:
     command = Command(thrust_mps2, direction, 0.0)
-    value = AttitudeTarget(1.0, command, 0.489, body_z_down=body_z_down)
+    value = AttitudeTarget(1.0, command, 0.489, 9.81, body_z_down)
     assert sent(value, autopilot).thrust == pytest.approx(expected, abs=1e-6)
 
 
@@ -105,7 +105,7 @@ def test_what_is_not_finite_or_out_of_range_is_refused() -> None:
         (replace(POSITION, time_s=-1.0), "finite"),
         (ParamRead(""), "1 to 16"),
         (ParamRead("A_NAME_OF_17_CHAR"), "1 to 16"),
-        (SolverRecord(2.5, (0.0,) * 59), "58"),
+        (SolverRecord(2.5, (0.0,) * 59, 3, "pso"), "58"),
     ]
     session = pinned(Sender(), ARDUPILOT)
     for value, why in refused:
@@ -164,7 +164,7 @@ def test_numbers_for_the_log_have_sequence_numbers_of_their_own() -> None:
     sequence = [session.encode(Heartbeat(18))[4] for _ in range(257)]
     assert sequence == [*range(256), 0]
     data = (1.0, math.nan, 1e300, -1e300, -2.5)
-    message = understood(session.encode(SolverRecord(2.5, data, array_id=3)))
+    message = understood(session.encode(SolverRecord(2.5, data, 3, "pso")))
     assert (message.time_usec, message.name, message.array_id) == (2_500_000, "pso", 3)
     kept = [1.0, math.nan, math.inf, -math.inf, -2.5, *(0.0,) * 53]
     assert message.data == pytest.approx(kept, nan_ok=True)
