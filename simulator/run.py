@@ -66,9 +66,8 @@ class Endpoint:
         self.send_ground()
 
     def send_ground(self) -> None:
-        datagrams = self.instance.ground.outbox.drain()
         if self.ground is not None:
-            self.ground.send(datagrams)
+            self.ground.send(self.instance.drain_ground())
 
     def send_barrier(self) -> tuple[int, list[bytes]]:
         """Send everything queued and the barrier; return its time stamp and its datagrams."""

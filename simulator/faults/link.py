@@ -19,7 +19,7 @@ from simulator.faults.fault import (
 )
 from simulator.firmware.base import Firmware
 from simulator.link.impairment import Impairment
-from simulator.mavlink.codec import Encoder, fields_of, message_of
+from simulator.mavlink.codec import Encoder, fields_of
 from simulator.mavlink.outbox import MAV_COMP_ID_AUTOPILOT
 from simulator.mavlink.view import Stuck
 from simulator.steps import STEP_S
@@ -127,7 +127,7 @@ class Sender:
 
     def frame(self, name: str, *values: object) -> bytes:
         """A message with these values, as one frame."""
-        return self._encoder.frame(message_of(name, values))
+        return self._encoder.frame(name, values)
 
     def autopilot_heartbeat(self, firmware: Firmware) -> bytes:
         """HEARTBEAT of an autopilot with this firmware, disarmed and in its first mode."""

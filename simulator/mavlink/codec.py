@@ -92,7 +92,7 @@ class Keyring:
 
 
 _codec = dialect.MAVLink(None)
-
+_BY_NAME: dict[str, Any] = {each.msgname: each for each in dialect.mavlink_map.values()}
 
 Message = Any  # pymavlink's: fields are attributes, strings without padding
 Peer = tuple[int, int]  # system, component
@@ -105,8 +105,7 @@ def sender_of(message: Message) -> Peer:
 
 def id_of(name: str) -> int | None:
     """Id of the message called `name`, or None when the dialect has none."""
-    found = getattr(dialect, f"MAVLINK_MSG_ID_{name}", None)
-    return found if found in dialect.mavlink_map else None
+    return _BY_NAME[name].id if name in _BY_NAME else None
 
 
 def name_of(message_id: int) -> str | None:
@@ -117,16 +116,7 @@ def name_of(message_id: int) -> str | None:
 
 def fields_of(name: str) -> list[str]:
     """The fields of the message called `name`, in the order of the XML."""
-    message = dialect.mavlink_map[getattr(dialect, f"MAVLINK_MSG_ID_{name}")]
-    return list(message.fieldnames)
-
-
-def message_of(name: str, values: Sequence[object]) -> Any:
-    """pymavlink's message; `values` in the field order of the XML, extensions may be left out.
-
-    Raises KeyError when the dialect has no such message, TypeError for a wrong number of values.
-    """
-    return dialect.mavlink_map[getattr(dialect, f"MAVLINK_MSG_ID_{name}")](*values)
+    return list(_BY_NAME[name].fieldnames)
 
 
 class Encoder:
@@ -143,15 +133,20 @@ class Encoder:
         """The next frame has sequence number 0."""
         self._mavlink.seq = 0
 
-    def frame(self, message: Any) -> bytes:
-        """The message as one MAVLink 2 frame with the next sequence number."""
+    def frame(self, name: str, values: Sequence[object]) -> bytes:
+        """A message as one MAVLink 2 frame with the next sequence number; `values` in the field
+        order of the XML, extensions may be left out.
+
+        Raises KeyError when the dialect has no such message, TypeError for a wrong number of
+        values.
+        """
         mavlink = self._mavlink
         if self._keyring is not None:
             mavlink.signing.sign_outgoing = self._keyring.on
             if self._keyring.on:
                 mavlink.signing.secret_key = self._keyring.key
                 mavlink.signing.timestamp = self._keyring.next_stamp()
-        packed: bytes = message.pack(mavlink)
+        packed: bytes = _BY_NAME[name](*values).pack(mavlink)
         mavlink.seq = (mavlink.seq + 1) & 0xFF
         return packed
 

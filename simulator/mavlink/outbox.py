@@ -11,7 +11,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from simulator.firmware.values import StatusText
-from simulator.mavlink.codec import Encoder, Keyring, message_of
+from simulator.mavlink.codec import Encoder, Keyring
 from simulator.mavlink.view import View
 
 MAV_COMP_ID_AUTOPILOT = 1
@@ -35,12 +35,12 @@ class Outbox:
 
     def send(self, name: str, *values: object) -> None:
         """Queue one message; `values` in the field order of the XML."""
-        self._frames.append(self._encoder.frame(message_of(name, values)))
+        self._frames.append(self._encoder.frame(name, values))
 
     def send_now(self, name: str) -> None:
         """Queue a message with its contents of now, filled by the view, unless a fault stops it."""
         if name not in self.view.silent or self._passes(name):
-            self._frames.append(self._encoder.frame(self.view.message(name)))
+            self._frames.append(self._encoder.frame(name, self.view.fields(name)))
 
     def forward(self, frame: bytes) -> None:
         """Queue a frame of another sender."""

@@ -1,7 +1,7 @@
 """Contents of all messages of one vehicle: its autopilot, with the faults that change telemetry,
 and the conversion of SI values to fields of messages: scaled, rounded, limited to their range.
 
-Builds each message once per step for all links. Knows no links, rates or sequence numbers.
+Knows no links, rates or sequence numbers.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from simulator.autopilot.autopilot import Autopilot
 from simulator.autopilot.position_loop import GRAVITY_MPS2
 from simulator.firmware.values import Triple
 from simulator.geodesy import to_degrees
-from simulator.mavlink.codec import message_of
 
 _GPS, _PREARM = 0x20, 0x10000000  # MAV_SYS_STATUS_SENSOR
 
@@ -49,8 +48,6 @@ class View:
     silent: dict[str, int] = field(default_factory=dict)
     wrong_landed_state: int | None = None  # reported in place of the true one
     stuck: dict[str, Stuck] = field(default_factory=dict)
-    _messages: dict[str, Any] = field(default_factory=dict)
-    _at_step: int = -1
 
     def withheld(self, name: str) -> bool:
         """Whether the vehicle cannot send this message yet, whatever its rate."""
@@ -58,18 +55,10 @@ class View:
         event = autopilot.firmware.withheld_until.get(name)
         return event is not None and event not in autopilot.health.reached
 
-    def message(self, name: str) -> Any:
-        """Message `name` of now; built once per step for all links."""
-        if self._at_step != self.autopilot.state.steps:
-            self._at_step = self.autopilot.state.steps
-            self._messages.clear()
-        message = self._messages.get(name)
-        if message is None:
-            values = self.builders[name](self)
-            if name in self.stuck:
-                values = self.stuck[name].instead_of(values)
-            message = self._messages[name] = message_of(name, values)
-        return message
+    def fields(self, name: str) -> Sequence[Any]:
+        """Fields of message `name` now."""
+        values = self.builders[name](self)
+        return self.stuck[name].instead_of(values) if name in self.stuck else values
 
     def heartbeat(self, base_mode: int, state: int) -> tuple[int, ...]:
         """Fields of HEARTBEAT of a quadrotor; the armed bit is added. `state`: MAV_STATE."""
@@ -84,7 +73,6 @@ class View:
         autopilot.commander.refused = self.autopilot.commander.refused
         self.autopilot = autopilot
         self.clock_offset_us = 0
-        self._at_step = -1
 
     @property
     def sensor_bits(self) -> tuple[int, int, int]:

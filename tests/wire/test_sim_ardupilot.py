@@ -60,6 +60,15 @@ def test_without_requests_it_sends_heartbeat_timesync_and_home() -> None:
     }
 
 
+def test_the_heartbeat_after_a_mode_change_shows_it_also_in_the_step_of_the_last_one() -> None:
+    vehicle = guided()
+    since_s = vehicle.time_s
+    while not vehicle.of("HEARTBEAT", since_s):
+        vehicle.run(0.004)
+    vehicle.command(176, 1, LAND)
+    assert [m.custom_mode for _, m in vehicle.of("HEARTBEAT", since_s)] == [GUIDED, LAND]
+
+
 def test_gps_raw_int_shows_no_fix_before_the_first_one() -> None:
     """At 10.2 s."""
     vehicle = Bench(firmware=ARDUPILOT)
