@@ -27,9 +27,8 @@ from simulator.steps import STEP_S, STEP_US
 from simulator.vehicle.conditions import Conditions
 from simulator.vehicle.plant import Plant
 
-STEP_MS = STEP_US // 1000
 VIRTUAL_EPOCH_US = 1_767_225_600_000_000  # 2026-01-01, where virtual time begins
-BARRIER_INTERVAL_MS = 20
+BARRIER_STEPS = 5  # 20 ms
 RESTART_S = 1.0  # duration of a reboot by command
 _TIMESYNC = 111
 
@@ -102,8 +101,7 @@ class Instance:
         self.steps = 0
         self._injection = prepare(faults, seed)
         self._arrived: list[bytes] = []
-        self._barrier_ms = 0
-        self._position_interval_ms = firmware.position_grid_steps * STEP_MS
+        self._barrier_at_step = 0
         self._back_at_step = 0
 
     @property
@@ -196,10 +194,10 @@ class Instance:
         True at the first step with a position at or after each multiple of 20 ms, so that a
         command takes effect at the stamp of the newest position, as it nearly does in real time.
         """
-        now_ms = self.steps * STEP_MS
-        if now_ms < self._barrier_ms or now_ms % self._position_interval_ms:
+        position_steps = self.autopilot.firmware.position_grid_steps
+        if self.steps < self._barrier_at_step or self.steps % position_steps:
             return False
-        self._barrier_ms = (now_ms // BARRIER_INTERVAL_MS + 1) * BARRIER_INTERVAL_MS
+        self._barrier_at_step = (self.steps // BARRIER_STEPS + 1) * BARRIER_STEPS
         return True
 
     def barrier(self) -> tuple[int, list[bytes]]:
@@ -210,7 +208,7 @@ class Instance:
         Returns:
             Its time stamp in nanoseconds, and all datagrams for the companion.
         """
-        stamp_ns = self.steps * STEP_MS * 1_000_000
+        stamp_ns = self._now_us * 1000
         if self._injection is None:
             self.companion.send_barrier(stamp_ns)
             return stamp_ns, self.companion.outbox.drain()
@@ -233,7 +231,7 @@ class Instance:
 
     @property
     def _now_us(self) -> int:
-        return self.steps * STEP_MS * 1000
+        return self.steps * STEP_US
 
     def _inject(self) -> None:
         assert self._injection is not None

@@ -68,7 +68,6 @@ class Commander:
         self._intended = self._remembered = firmware.boot_mode
         self.armed = self.failsafe = False
         self.reboot_requested = False
-        self.refused: dict[str, StatusText] = {}  # by a fault: events, and "offboard"
         self.texts: list[StatusText] = []
         self.announcements: list[str] = []
         self._event, self._request = "", NO_REQUEST  # being handled
@@ -114,9 +113,6 @@ class Commander:
         """Apply the row of the state table that decides about an event; a firmware without rows
         for it does not support it."""
         self._event, self._request = event, request
-        if self.refused and (text := self.refused.get(self._refusal_name)) is not None:
-            self.texts.append(text)
-            return Result.TEMPORARILY_REJECTED
         rule = self._row(event)
         if rule is None:
             return Result.ACCEPTED if event in self._rows else Result.UNSUPPORTED
@@ -140,11 +136,6 @@ class Commander:
     def _requested(self) -> Mode:
         """The requested mode, or the present one."""
         return self._firmware.modes[self._request.mode] if self._request.mode else self.mode
-
-    @property
-    def _refusal_name(self) -> str:
-        offboard = self._event == "mode" and self._requested.behaviour is Behaviour.SETPOINT
-        return "offboard" if offboard else self._event
 
     def _row(self, event: str) -> Rule | None:
         """The row that decides about an event; None: nothing happens."""

@@ -9,56 +9,27 @@ from typing import Annotated
 
 from pydantic import Field
 
-from simulator.faults.fault import Direction
-from simulator.faults.link import (
-    ClockJump,
-    LinkFault,
-    SecondSender,
-    SecondVehicle,
-    SilentMessage,
-    Stranger,
-    StuckMessage,
-)
-from simulator.faults.vehicle import (
-    BatteryDrop,
-    BlindLandDetector,
-    EstimatorJump,
-    GpsLoss,
-    MassChange,
-    MotorsCut,
-    PilotDisarms,
-    PilotTakesOver,
-    Reboot,
-    Refusal,
-    ThrustChange,
-    VelocityError,
-    WeakMotor,
-    WrongLandedState,
-)
-
-__all__ = ["Direction", "Fault", "GpsLoss", "PilotTakesOver", "Stranger", "VelocityError"]
+from simulator.faults import link, vehicle
 
 Fault = Annotated[
-    LinkFault
-    | EstimatorJump
-    | GpsLoss
-    | SilentMessage
-    | StuckMessage
-    | VelocityError
-    | WrongLandedState
-    | BlindLandDetector
-    | WeakMotor
-    | MotorsCut
-    | ThrustChange
-    | MassChange
-    | BatteryDrop
-    | Reboot
-    | ClockJump
-    | Refusal
-    | PilotTakesOver
-    | PilotDisarms
-    | SecondSender
-    | SecondVehicle
-    | Stranger,
+    link.LinkFault
+    | vehicle.EstimatorJump
+    | vehicle.GpsLoss
+    | link.SilentMessage
+    | link.StuckMessage
+    | vehicle.VelocityError
+    | vehicle.WrongLandedState
+    | vehicle.BlindLandDetector
+    | vehicle.MotorsCut
+    | vehicle.ThrustChange
+    | vehicle.MassChange
+    | vehicle.BatteryDrop
+    | vehicle.Reboot
+    | link.ClockJump
+    | vehicle.PilotTakesOver
+    | vehicle.PilotDisarms
+    | link.SecondSender
+    | link.SecondVehicle
+    | link.Stranger,
     Field(discriminator="fault"),
 ]

@@ -1,6 +1,4 @@
-"""Faults of motors, mass, battery, estimator and land detector; what a pilot does, and what the
-autopilot refuses or forgets.
-"""
+"""Faults of motors, mass, battery, estimator and land detector; what a pilot does, and a reboot."""
 
 from __future__ import annotations
 
@@ -12,36 +10,22 @@ from pydantic import Field
 from offboard.model.vehicle import Triple
 from simulator.autopilot.commander import Request
 from simulator.faults.fault import Effect, ModeName, Running, Timed, Vehicle, until_the_end
-from simulator.firmware.values import critical
 from simulator.steps import STEP_S
 
 _NO_THRUST = 1e-9  # a factor that can be undone
 
 
-def _scaled_thrust(vehicle: Vehicle, factor: float) -> Effect:
-    vehicle.autopilot.plant.scale_thrust(factor)
-    yield from until_the_end()
-    vehicle.autopilot.plant.scale_thrust(1.0 / factor)
-
-
-class WeakMotor(Timed):
-    """One of four motors has `motor_scale` of its thrust; the mixer keeps the torques."""
-
-    fault: Literal["weak_motor"]
-    motor_scale: float = Field(ge=0, le=1)
-
-    def effect(self, vehicle: Vehicle, running: Running) -> Effect:
-        return _scaled_thrust(vehicle, (3.0 + self.motor_scale) / 4.0)
-
-
 class ThrustChange(Timed):
-    """Thrust of all motors multiplied by `thrust_scale`."""
+    """Thrust of all motors multiplied by `thrust_scale`; (3 + s) / 4: one of four has the share s,
+    and the mixer keeps the torques."""
 
     fault: Literal["thrust_change"]
     thrust_scale: float = Field(ge=0.1, le=3)
 
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
-        return _scaled_thrust(vehicle, self.thrust_scale)
+        vehicle.autopilot.plant.scale_thrust(self.thrust_scale)
+        yield from until_the_end()
+        vehicle.autopilot.plant.scale_thrust(1.0 / self.thrust_scale)
 
 
 class MotorsCut(Timed):
@@ -155,38 +139,6 @@ class BlindLandDetector(Timed):
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
         while (yield):
             vehicle.autopilot.position_controller.detector.reset()
-
-
-class Refusable(StrEnum):
-    """Requests that a fault can make the autopilot refuse."""
-
-    ARM = "arm"
-    OFFBOARD = "offboard"
-    TAKEOFF = "takeoff"
-
-
-# events that are refused, and the beginning of the text
-_REFUSED = {
-    Refusable.ARM: (("arm", "force arm"), "Arming denied"),
-    Refusable.OFFBOARD: (("offboard",), "Switching to Offboard denied"),
-    Refusable.TAKEOFF: (("takeoff",), "Takeoff denied"),
-}
-
-
-class Refusal(Timed):
-    """The autopilot refuses a request, with a text."""
-
-    fault: Literal["refusal"]
-    of: Refusable
-    text: str = Field(default="Resolve system health failures first", min_length=1, max_length=200)
-
-    def effect(self, vehicle: Vehicle, running: Running) -> Effect:
-        events, title = _REFUSED[self.of]
-        for event in events:
-            vehicle.autopilot.commander.refused[event] = critical(f"{title}: {self.text}")
-        yield from until_the_end()
-        for event in events:
-            vehicle.autopilot.commander.refused.pop(event, None)
 
 
 class PilotTakesOver(Timed):

@@ -207,7 +207,6 @@ class ArduCopter(Firmware):
             speed_down_mps=2.5,
             tilt_max_rad=math.radians(parameter("ANGLE_MAX") * 0.01),
             thrust_max=1.0,
-            derivative_cutoff_hz=5.0,
             turn_radps=math.radians(parameter("ATC_SLEW_YAW") * 0.01),
             speeding_mps2=parameter("WPNAV_ACCEL") * 0.01,
             braking_mps2=0.5 * parameter("WPNAV_ACCEL") * 0.01,  # as the jerk is limited

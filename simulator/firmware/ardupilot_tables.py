@@ -169,15 +169,6 @@ _ARMING = Rule("arm", do=("arm",), texts=(info("Arming motors"),), send=_ORIGIN_
 _DISARMING = info("Disarming motors")
 
 _UNTIL_REBOOT = ("failsafe", "latch")
-# FS_GCS_ENABLE 6 looks for a landing sequence in the mission first
-_FURTHER_TEXTS = {
-    ("ground station lost", 6): (
-        warning("Unable to start landing sequence"),
-        warning("Mode change to AUTO RTL failed: No return path or landing sequence found"),
-        warning("Trying RTL Mode"),
-    ),
-}
-
 _FAILSAFE = {
     "ground station lost": (warning("GCS Failsafe"),),
     "battery low": (
@@ -201,7 +192,7 @@ def _failsafe(
             when=("armed", f"{parameter}={value}"),
             to=mode,
             do=do,
-            texts=(*_FAILSAFE[event], *_FURTHER_TEXTS.get((event, value), ())),
+            texts=_FAILSAFE[event],
             send=_HEARTBEAT,
         )
         for value, mode in modes.items()
@@ -211,7 +202,7 @@ def _failsafe(
 # Modes that FS_OPTIONS bit 4 leaves to the pilot
 _PILOTED = ("STABILIZE", "ACRO", "ALT_HOLD", "LOITER", "DRIFT", "POSHOLD", "BRAKE", "THROW")
 _BATTERY_MODES = {1: "LAND", 2: "RTL", 3: "SMART_RTL", 4: "SMART_RTL", 7: "BRAKE"}
-_GROUND_MODES = {**_BATTERY_MODES, 1: "RTL", 5: "LAND", 6: "RTL"}
+_GROUND_MODES = {**_BATTERY_MODES, 1: "RTL", 5: "LAND"}
 
 
 def _refusals(event: str, prefix: str, result: Result) -> list[Rule]:
@@ -319,6 +310,19 @@ RULES = (
         for mode in _PILOTED
     ),
     *_failsafe("ground station lost", "FS_GCS_ENABLE", _GROUND_MODES),
+    Rule(  # it looks for a landing sequence in the mission first
+        "ground station lost",
+        when=("armed", "FS_GCS_ENABLE=6"),
+        to="RTL",
+        do=("failsafe",),
+        texts=(
+            *_FAILSAFE["ground station lost"],
+            warning("Unable to start landing sequence"),
+            warning("Mode change to AUTO RTL failed: No return path or landing sequence found"),
+            warning("Trying RTL Mode"),
+        ),
+        send=_HEARTBEAT,
+    ),
     Rule(
         "ground station found",
         when=("since ground station lost",),

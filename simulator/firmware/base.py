@@ -51,27 +51,13 @@ class ParameterSpec:
 AFTER_DELAY = " after delay"
 """Ends the event of a failsafe whose action was delayed."""
 
-EVENTS = frozenset({
-    # requests: commands, messages, faults that act for a pilot
-    "mode", "takeoff", "land", "return", "loiter", "turn", "mission", "reboot", "terminate",
-    "arm", "disarm", "force arm", "force disarm", "checks", "thrust not a number",
-    # monitoring
-    "stream lost", "stream found", "position lost", "position found",
-    "ground station lost", "ground station found",
-    "battery low", "battery critical", "battery emergency",
-    # flight
-    "took off", "landed", "settled", "idle", "climbed", "already higher", "item reached",
-    "mission progress", "mission return", "mission finished",
-})  # fmt: skip
-"""Events of every firmware; `Firmware.boot_events_s` has those of the start."""
-
 
 @dataclass(frozen=True, slots=True)
 class Rule:
     """One row of the state table: the first row that fits an event decides.
 
     Args:
-        event: one of EVENTS, or a boot event.
+        event: its name; those of the start are in `Firmware.boot_events_s`.
         mode: name of the mode in which it happened, or "*".
         when: conditions that must all hold (`simulator.autopilot.commander.CONDITIONS`). "not X"
             negates, "NAME=2" compares a parameter, "since X" is a failsafe because of event X,
@@ -107,7 +93,6 @@ class PositionGains:
     speed_down_mps: float
     tilt_max_rad: float
     thrust_max: float
-    derivative_cutoff_hz: float
     # of automatic flight
     turn_radps: float
     speeding_mps2: float

@@ -70,7 +70,6 @@ class View:
         """Show another autopilot, after a reboot; faults that run go on."""
         autopilot.state.gps_healthy = self.autopilot.state.gps_healthy
         autopilot.state.velocity_error_ned_mps = self.autopilot.state.velocity_error_ned_mps
-        autopilot.commander.refused = self.autopilot.commander.refused
         self.autopilot = autopilot
         self.clock_offset_us = 0
 

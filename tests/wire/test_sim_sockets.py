@@ -12,7 +12,7 @@ from processes import free_port
 from pymavlink.dialects.v20 import common as mavlink
 
 from simulator import config, run
-from simulator.faults import Stranger
+from simulator.faults.link import Stranger
 from simulator.firmware.px4 import PX4
 from simulator.instance import Instance
 from simulator.link.sockets import (
