@@ -88,12 +88,12 @@ class Commander:
     @property
     def has_fix(self) -> bool:
         """GPS has a fix: its first one, and no fault takes it away."""
-        return self._health.first_fix(self._state.time_s) and self._state.gps_healthy
+        return self._health.first_fix(self._state.time_s) and self._state.plant.gps_healthy
 
     @property
     def velocity_ratio(self) -> float:
         """Innovation ratio of the velocity in the estimator, as the firmware reports it."""
-        ratio = math.hypot(*self._state.velocity_error_ned_mps) / _GATE_MPS
+        ratio = math.hypot(*self._state.plant.velocity_error_ned_mps) / _GATE_MPS
         return ratio**2 if self._firmware.velocity_ratio_squared else ratio
 
     @property

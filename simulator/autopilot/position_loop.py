@@ -14,9 +14,9 @@ from offboard.model.frames import quaternion_from_euler, wrap_pi
 from simulator.autopilot.state import StateEstimate
 from simulator.firmware.base import PositionGains
 from simulator.firmware.values import NAN3, MotionSetpoint, Quaternion, Triple
+from simulator.geodesy import GRAVITY_MPS2
 from simulator.steps import LOOP_S
 
-GRAVITY_MPS2 = 9.80665
 # The vertical integral may carry any vehicle; m/s^2 of north, east and down
 _INTEGRAL_MAX_MPS2 = (4.0, 4.0, GRAVITY_MPS2)
 _TILT_COSINE_MIN = 0.1  # least divisor of the thrust

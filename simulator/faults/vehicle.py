@@ -87,16 +87,16 @@ class GpsLoss(Timed):
     drift_mps2: float = Field(default=0.0, ge=0, le=10)
 
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
-        vehicle.autopilot.state.gps_healthy = False
-        speed_mps, drifted_m = self.drift_mps, 0.0
+        plant, speed_mps, drifted_m = vehicle.autopilot.plant, self.drift_mps, 0.0
+        plant.gps_healthy = False
         while (yield):
             step_m = speed_mps * STEP_S * 0.5**0.5
             speed_mps += self.drift_mps2 * STEP_S
             drifted_m += step_m
-            vehicle.autopilot.plant.drift_estimate((step_m, step_m, 0.0))
-        vehicle.autopilot.state.gps_healthy = True
+            plant.drift_estimate((step_m, step_m, 0.0))
+        plant.gps_healthy = True
         if drifted_m:
-            vehicle.autopilot.plant.reset_estimate((-drifted_m, -drifted_m, 0.0))
+            plant.reset_estimate((-drifted_m, -drifted_m, 0.0))
 
 
 class VelocityError(Timed):
@@ -106,9 +106,9 @@ class VelocityError(Timed):
     offset_ned_mps: Triple
 
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
-        vehicle.autopilot.state.velocity_error_ned_mps = self.offset_ned_mps
+        vehicle.autopilot.plant.velocity_error_ned_mps[:] = self.offset_ned_mps
         yield from until_the_end()
-        vehicle.autopilot.state.velocity_error_ned_mps = (0.0, 0.0, 0.0)
+        vehicle.autopilot.plant.velocity_error_ned_mps[:] = 0.0
 
 
 class LandedState(StrEnum):

@@ -14,7 +14,7 @@ from typing import Any
 from simulator.autopilot.state import StateEstimate
 from simulator.firmware import ardupilot_messages as telemetry
 from simulator.firmware.ardupilot_tables import MODES, PARAMETERS, ROLES, RULES
-from simulator.firmware.base import Firmware, Landing, PositionGains, StickFlight
+from simulator.firmware.base import Firmware, Landing, PositionGains
 from simulator.firmware.values import (
     NAN3,
     Asked,
@@ -316,14 +316,5 @@ ARDUPILOT = ArduCopter(
         place_below_is_descent=True,
     ),
     descend_speed_mps=2.4,
-    sticks=StickFlight(
-        # throttle down; mode switch and other channels as SITL has them
-        default_pulses_us=(1500, 1500, 1000, 1500, 1800, 1000, 1000, 1800),
-        climb_mps=2.5,  # PILOT_SPEED_UP
-        turn_radps=math.radians(202.5),  # PILOT_Y_RATE
-        speed_mps=12.5,  # LOIT_SPEED
-        acceleration_mps2=3.57,  # of two thirds of ANGLE_MAX
-        braking_mps2=2.5,  # LOIT_BRK_ACCEL
-        braking_after_s=1.0,  # LOIT_BRK_DELAY
-    ),
+    flown_by_sticks=True,
 )

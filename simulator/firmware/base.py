@@ -114,19 +114,6 @@ class Landing:
     place_below_is_descent: bool
 
 
-@dataclass(frozen=True, slots=True)
-class StickFlight:
-    """How a firmware flies by sticks."""
-
-    default_pulses_us: tuple[int, ...]  # without RC: roll, pitch, throttle, yaw, further channels
-    climb_mps: float  # at full throttle, and down without
-    turn_radps: float
-    speed_mps: float
-    acceleration_mps2: float  # at full deflection
-    braking_mps2: float  # with all sticks centred
-    braking_after_s: float
-
-
 @dataclass(frozen=True, kw_only=True)
 class Firmware(ABC):
     """One firmware. A method's `parameter` reads a parameter by name."""
@@ -228,7 +215,7 @@ class Firmware(ABC):
     integrates_on_ramp: bool = False  # position loop, in a takeoff that still stands on the ground
     landing: Landing
     descend_speed_mps: float  # in a manual mode without stick input
-    sticks: StickFlight | None = None  # None: not flown by sticks
+    flown_by_sticks: bool = False
 
     def mode_named(self, name: str) -> Mode | None:
         """Mode by its name, of which "AUTO." may be left out; None where there is none."""

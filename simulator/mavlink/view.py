@@ -13,9 +13,8 @@ from typing import Any
 
 from offboard.model.frames import rotation_from_quaternion
 from simulator.autopilot.autopilot import Autopilot
-from simulator.autopilot.position_loop import GRAVITY_MPS2
 from simulator.firmware.values import Triple
-from simulator.geodesy import to_degrees
+from simulator.geodesy import GRAVITY_MPS2, to_degrees
 
 _GPS, _PREARM = 0x20, 0x10000000  # MAV_SYS_STATUS_SENSOR
 
@@ -67,9 +66,7 @@ class View:
         return (2, firmware.mav_autopilot, base_mode, commander.mode.custom_mode, state, 3)
 
     def restart(self, autopilot: Autopilot) -> None:
-        """Show another autopilot, after a reboot; faults that run go on."""
-        autopilot.state.gps_healthy = self.autopilot.state.gps_healthy
-        autopilot.state.velocity_error_ned_mps = self.autopilot.state.velocity_error_ned_mps
+        """Show another autopilot, after a reboot."""
         self.autopilot = autopilot
         self.clock_offset_us = 0
 

@@ -84,6 +84,8 @@ class Plant:
         )
         self._row, self._report = record["row"][0], record["report"][0]
         self._offset_ned_m = record["offset"][0]
+        self.velocity_error_ned_mps = record["velocity_error"][0]  # by a fault
+        self.gps_healthy = True  # False while a fault takes the fix away
         self.reset_counter = 0  # estimator resets, modulo 256
         self._body[0] = 1.0
         self._rotor[CONTACT] = 1.0

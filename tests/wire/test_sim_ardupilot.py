@@ -206,13 +206,13 @@ def test_without_gps_the_position_is_lost_after_eight_seconds(
     vehicle = guided(FS_EKF_ACTION=action)
     vehicle.command(511, 193, 100_000)
     autopilot = vehicle.instance.autopilot
-    autopilot.state.gps_healthy = False
+    autopilot.plant.gps_healthy = False
     vehicle.run(7.8)
     assert (vehicle.mode, vehicle.system_status) == (GUIDED, 4)
     vehicle.run(0.5)
     assert (vehicle.mode, vehicle.system_status) == (mode, 5 if texts else 4)
     assert vehicle.of("EKF_STATUS_REPORT")[-1][1].flags == 167
-    autopilot.state.gps_healthy = True
+    autopilot.plant.gps_healthy = True
     vehicle.run(0.5)
     assert vehicle.of("EKF_STATUS_REPORT")[-1][1].flags == 831
     assert (vehicle.mode, vehicle.system_status) == (mode, 4)
