@@ -34,16 +34,12 @@ class Keyring:
         unix_us: Unix time of the vehicle's clock, in microseconds; None: stamps follow no clock.
     """
 
-    accepted_unsigned: frozenset[int]
+    accepted_unsigned: frozenset[int] = frozenset()
     unix_us: Callable[[], int] | None = None
     key: bytes = field(default=b"", repr=False)
     newest: int = 0  # stamp that was sent, or heard from somebody else
     stored: int = 0  # stamp that came with the key
     heard: dict[tuple[int, int, int], int] = field(default_factory=dict)  # system, component, link
-
-    @property
-    def on(self) -> bool:
-        return bool(self.key)
 
     def set_up(self, key: bytes, stamp: int) -> None:
         """SETUP_SIGNING: a new key, or none if key and stamp are zero."""
@@ -64,7 +60,7 @@ class Keyring:
     def complaint(self, message_id: int, sender: tuple[int, int], frame: bytes | None) -> str:
         """Why a received message is refused, empty if it is not. `frame` with its signature; None
         for an unsigned one."""
-        if not self.on:
+        if not self.key:
             return ""
         flaw = UNSIGNED if frame is None else self._flaw(sender, frame)
         return "" if message_id in self.accepted_unsigned else flaw
@@ -126,7 +122,8 @@ class Encoder:
     def __init__(
         self, system: int, component: int, keyring: Keyring | None = None, link: int = 0
     ) -> None:
-        self._keyring, self._mavlink = keyring, dialect.MAVLink(None, system, component)
+        self._keyring = keyring or Keyring()
+        self._mavlink = dialect.MAVLink(None, system, component)
         self._mavlink.signing.link_id = link
 
     def restart(self) -> None:
@@ -140,12 +137,11 @@ class Encoder:
         Raises KeyError when the dialect has no such message, TypeError for a wrong number of
         values.
         """
-        mavlink = self._mavlink
-        if self._keyring is not None:
-            mavlink.signing.sign_outgoing = self._keyring.on
-            if self._keyring.on:
-                mavlink.signing.secret_key = self._keyring.key
-                mavlink.signing.timestamp = self._keyring.next_stamp()
+        mavlink, key = self._mavlink, self._keyring.key
+        mavlink.signing.sign_outgoing = bool(key)
+        if key:
+            mavlink.signing.secret_key = key
+            mavlink.signing.timestamp = self._keyring.next_stamp()
         packed: bytes = _BY_NAME[name](*values).pack(mavlink)
         mavlink.seq = (mavlink.seq + 1) & 0xFF
         return packed
@@ -159,7 +155,7 @@ class Decoder:
     refuses is dropped.
     """
 
-    keyring: Keyring | None = None
+    keyring: Keyring = field(default_factory=Keyring)
     dropped: Counter[str] = field(default_factory=Counter)
 
     @property
@@ -202,12 +198,11 @@ class Decoder:
             message = _codec.decode(bytearray(frame))
         except dialect.MAVError:
             return self._skip("checksum")
-        if self.keyring is not None:
-            signed = frame if flags & SIGNED else None
-            refused = self.keyring.complaint(message_id, sender_of(message), signed)
-            if refused:
-                self.dropped[refused] += 1
-                return length, None
+        signed = frame if flags & SIGNED else None
+        refused = self.keyring.complaint(message_id, sender_of(message), signed)
+        if refused:
+            self.dropped[refused] += 1
+            return length, None
         return length, message
 
     def _skip(self, reason: str) -> tuple[int, None]:
