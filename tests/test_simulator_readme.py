@@ -16,6 +16,7 @@ import pytest
 from simulator import config
 from simulator.autopilot.commander import ACTIONS, CONDITIONS, TEXT_VALUES
 from simulator.faults import Fault
+from simulator.faults.fault import Timed
 from simulator.firmware.base import AFTER_DELAY, Firmware, Rule
 from simulator.firmware.catalogue import FIRMWARES
 from simulator.firmware.values import Result
@@ -64,17 +65,20 @@ def test_the_state_table_is_the_one_in_the_code(firmware: Firmware) -> None:
     assert table(firmware) in README.read_text(), "run: python tests/test_simulator_readme.py"
 
 
-def test_every_fault_is_in_the_table_with_scenarios_that_have_it() -> None:
+def test_every_fault_is_in_the_table_with_its_keys_and_scenarios_that_have_it() -> None:
     faults = get_args(get_args(Fault)[0])
-    named = {get_args(fault.model_fields["fault"].annotation)[0] for fault in faults}
+    named = {get_args(fault.model_fields["fault"].annotation)[0]: fault for fault in faults}
     section = README.read_text().partition("## Faults")[2].partition("## Behaviours")[0]
-    listed: set[str] = set()
+    keys: dict[str, set[str]] = {}
     for row in (line for line in section.splitlines() if line.startswith("| `")):
         cells = [set(re.findall(r"`(\w+)`", cell)) for cell in row.split(" | ")]
-        listed |= cells[0]
+        for name in cells[0]:
+            keys.setdefault(name, set()).update(cells[1])
         for name in cells[-1]:
             assert {fault.fault for fault in config.scenario(name).faults} & cells[0], row
-    assert (listed, len(named)) == (named, 19)
+    assert (keys.keys(), len(named)) == (named.keys(), 19)
+    for name, fault in named.items():
+        assert fault.model_fields.keys() - Timed.model_fields - {"fault"} <= keys[name], name
 
 
 def unknown(firmware: Firmware, rule: Rule) -> Iterator[str]:
