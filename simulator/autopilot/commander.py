@@ -80,7 +80,7 @@ class Commander:
     @property
     def healthy(self) -> bool:
         """The pre-arm checks pass in the intended mode."""
-        battery, read = self._state.truth.battery, self._parameters.__getitem__
+        battery, read = self._state.plant.battery, self._parameters.__getitem__
         if self.rejects_velocity or self._firmware.battery_level(battery, read) >= _CRITICAL:
             return False
         return self._health.passes(self.intended, self._state.time_s, latched=bool(self.latched))
@@ -264,7 +264,7 @@ ACTIONS: dict[str, Callable[[Commander], None]] = {
 
 TEXT_VALUES: dict[str, Callable[[Commander], float | str]] = {
     "mode": lambda c: c._requested.title,
-    "battery_v": lambda c: c._state.truth.battery.voltage_v,
-    "used_mah": lambda c: c._state.truth.battery.used_mah,
+    "battery_v": lambda c: c._state.plant.battery.voltage_v,
+    "used_mah": lambda c: c._state.plant.battery.used_mah,
     "delay_s": lambda c: c._parameters.role("failsafe_delay_s"),
 }

@@ -67,7 +67,7 @@ class VehicleState:
 
     @property
     def truth(self) -> Truth:
-        """True state. The autopilot itself uses only the battery's."""
+        """True state, which the autopilot itself does not use."""
         if self._truth is None:
             self._truth = self.plant.truth
         return self._truth

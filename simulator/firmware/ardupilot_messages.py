@@ -49,19 +49,19 @@ def heartbeat(view: View) -> Sequence[Any]:
 def sim_state(view: View) -> Sequence[Any]:
     """True state without time stamp; latitude and longitude have a resolution of 1 cm."""
     truth = view.autopilot.state.truth
-    north, east, down = truth.position_ned_m.tolist()
+    north, east, down = truth.position_ned_m
     latitude, longitude = view.geodetic(north, east)
     return (
-        *truth.attitude.tolist(),
+        *truth.attitude,
         *euler_from_quaternion(truth.attitude).tolist(),
         *view.specific_force,
-        *truth.rates_frd_radps.tolist(),
+        *truth.rates_frd_radps,
         latitude * 1e-7,
         longitude * 1e-7,
         view.altitude_mm(down) * 1e-3,
         0.0,
         0.0,
-        *truth.velocity_ned_mps.tolist(),
+        *truth.velocity_ned_mps,
         latitude,
         longitude,
     )

@@ -87,7 +87,7 @@ class View:
     def specific_force(self) -> Triple:
         """True specific force, FRD, m/s^2."""
         truth = self.autopilot.state.truth
-        north, east, down = truth.acceleration_ned_mps2.tolist()
+        north, east, down = truth.acceleration_ned_mps2
         force_ned = (north, east, down - GRAVITY_MPS2)
         forward, right, down = (force_ned @ rotation_from_quaternion(truth.attitude)).tolist()
         return forward, right, down

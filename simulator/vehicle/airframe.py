@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 # Rotor state, beside the rigid body's 13 numbers: actual normalised collective thrust, 1 while the
 # ground carries the vehicle, charge consumed (A s), NED acceleration of the last step.
-THRUST, CONTACT, CHARGE, ACCELERATION, ROTOR_SIZE = 0, 1, 2, slice(3, 6), 6
+THRUST, CONTACT, CHARGE, ROTOR_SIZE = 0, 1, 2, 6
 
 # Below this share of hover thrust the torques fall to zero with the thrust.
 _AUTHORITY_SHARE = 0.2
