@@ -13,8 +13,7 @@ from collections.abc import Mapping, Sequence
 from offboard.model.vehicle import Vehicle
 from simulator.autopilot.autopilot import Autopilot
 from simulator.autopilot.position_controller import OFF
-from simulator.faults import Fault
-from simulator.faults.fault import prepare
+from simulator.faults import Fault, prepare
 from simulator.firmware.base import Firmware
 from simulator.link.framing import frames
 from simulator.link.impairment import carry

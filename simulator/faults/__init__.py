@@ -5,11 +5,15 @@ One class is one fault: its keys, and what it does to the vehicle. A new one is 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from random import Random
 from typing import Annotated
 
 from pydantic import Field
 
 from simulator.faults import link, vehicle
+from simulator.faults.fault import Injection, Running
+from simulator.link.impairment import Channel
 
 Fault = Annotated[
     link.LinkFault
@@ -33,3 +37,21 @@ Fault = Annotated[
     | link.Stranger,
     Field(discriminator="fault"),
 ]
+
+
+def prepare(scenario: Sequence[Fault], seed: int) -> Injection | None:
+    """Faults of one flight, none begun; None when the scenario has none."""
+    if not scenario:
+        return None
+    paths: dict[str, list[Channel]] = {"down": [], "up": []}
+    waiting: list[Running] = []
+    for number, fault in enumerate(scenario):
+        channels = []
+        for direction, path in paths.items():
+            if isinstance(fault, link.LinkFault) and fault.direction in (direction, "both"):
+                channels.append(Channel(fault, Random(f"{seed} {number} {direction}")))
+                channels[-1].on = False
+                path.append(channels[-1])
+        waiting.append(Running(fault, channels, Random(f"{seed} {number}")))
+    strangers = [one.datagrams for one in waiting if isinstance(one.fault, link.Stranger)]
+    return Injection(paths["down"], paths["up"], strangers, waiting)

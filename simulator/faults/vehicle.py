@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from typing import Literal
 
 from pydantic import Field
@@ -111,22 +110,14 @@ class VelocityError(Timed):
         vehicle.autopilot.plant.velocity_error_ned_mps[:] = 0.0
 
 
-class LandedState(StrEnum):
-    """What EXTENDED_SYS_STATE can report wrongly."""
-
-    ON_GROUND = "on_ground"
-    IN_AIR = "in_air"
-
-
 class WrongLandedState(Timed):
     """EXTENDED_SYS_STATE reports this state; the autopilot itself knows the true one."""
 
     fault: Literal["wrong_landed_state"]
-    reports: LandedState
+    reports: Literal["on_ground", "in_air"]
 
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
-        on_ground = self.reports is LandedState.ON_GROUND
-        vehicle.view.wrong_landed_state = 1 if on_ground else 2
+        vehicle.view.wrong_landed_state = 1 if self.reports == "on_ground" else 2
         yield from until_the_end()
         vehicle.view.wrong_landed_state = None
 
