@@ -45,7 +45,6 @@ class ParameterSpec:
     default: float
     minimum: float
     maximum: float
-    meaning: str
 
 
 AFTER_DELAY = " after delay"
