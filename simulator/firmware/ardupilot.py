@@ -28,7 +28,6 @@ from simulator.firmware.values import (
     info,
     warning,
 )
-from simulator.mavlink.telemetry import builders_in
 from simulator.vehicle.battery import BatteryState
 
 _CUSTOM_MODE_ENABLED = 1
@@ -269,7 +268,7 @@ ARDUPILOT = ArduCopter(
     mission_text=info("Flight plan received"),
     companion_rates_hz=telemetry.COMPANION_RATES_HZ,
     ground_rates_hz=telemetry.GROUND_RATES_HZ,
-    messages=builders_in(telemetry),
+    messages=telemetry,
     ground_station_parameter="SYSID_MYGCS",
     withheld_until={
         "LOCAL_POSITION_NED": "position",

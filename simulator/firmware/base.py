@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field
+from types import ModuleType
 from typing import Any, Literal
 
 from simulator.autopilot.state import StateEstimate
@@ -169,8 +170,7 @@ class Firmware(ABC):
     # telemetry
     companion_rates_hz: Mapping[str, float]  # without a request, by link
     ground_rates_hz: Mapping[str, float]
-    # message -> builder, beside `simulator.mavlink.messages` or in place of one
-    messages: Mapping[str, Callable[[Any], Sequence[Any]]]
+    messages: ModuleType  # builders beside those of `simulator.mavlink.messages`, or in their place
     withheld_until: Mapping[str, str] = field(default_factory=dict)  # by message: boot event
     # message -> version of its content: a message that is due waits until it is a new one
     message_versions: Mapping[str, Callable[[Any], Hashable]] = field(default_factory=dict)

@@ -27,7 +27,6 @@ from simulator.firmware.values import (
     Triple,
     critical,
 )
-from simulator.mavlink.telemetry import builders_in
 from simulator.vehicle.battery import BatteryState
 
 # By PX4_CUSTOM_MAIN_MODE and PX4_CUSTOM_SUB_MODE_AUTO
@@ -268,7 +267,7 @@ PX4 = Px4(
     turning_items=frozenset({16, 17, 19, 21}),
     companion_rates_hz=telemetry.COMPANION_RATES_HZ,
     ground_rates_hz=telemetry.GROUND_RATES_HZ,
-    messages=builders_in(telemetry),
+    messages=telemetry,
     message_versions=telemetry.VERSIONS,
     position_grid_steps=2,
     fixed_streams=telemetry.ON_EVENT | {"HEARTBEAT"},

@@ -26,7 +26,7 @@ LEAST_INTERVAL_US = {"GPS_RAW_INT": 125_000.0}  # a receiver gives eight fixes a
 INTERVAL_MAX_US = 2.0**31 - 1  # MESSAGE_INTERVAL.interval_us is an int32
 
 
-def builders_in(module: ModuleType) -> dict[str, Builder]:
+def _builders_in(module: ModuleType) -> dict[str, Builder]:
     """The public functions of a module, by the message that each builds."""
     return {
         name.upper(): function
@@ -39,7 +39,7 @@ def builders_in(module: ModuleType) -> dict[str, Builder]:
 
 def builders(firmware: Firmware) -> dict[str, Builder]:
     """All messages of this firmware, with their builders."""
-    return {**builders_in(messages), **firmware.messages}
+    return {**_builders_in(messages), **_builders_in(firmware.messages)}
 
 
 @dataclass(slots=True)
