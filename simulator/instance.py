@@ -268,7 +268,7 @@ class Instance:
         commander = self.autopilot.commander
         for text in commander.texts:
             for link in self.links:
-                link.texts.send(text)
+                link.outbox.send_text(text)
         commander.texts.clear()
         for name in commander.announcements:
             for link in self.links:

@@ -199,7 +199,7 @@ class Runner:
                 continue
             stamp_ns, datagrams = endpoint.send_barrier()
             endpoint.read_ground()
-            first = not instance.companion.texts.connected
+            first = not instance.companion.outbox.connected
             waits_s = timeout_s or (FIRST_ANSWER_TIMEOUT_S if first else ANSWER_TIMEOUT_S)
             if self._answered(endpoint, stamp_ns, datagrams, waits_s) or self.stopping():
                 continue
@@ -227,7 +227,7 @@ class Runner:
             now_s = monotonic_s()
             if now_s - begun_s > timeout_s:
                 return False
-            if now_s - sent_s >= (RESEND_SILENT_S if server.texts.connected else RESEND_S):
+            if now_s - sent_s >= (RESEND_SILENT_S if server.outbox.connected else RESEND_S):
                 link.send(datagrams)
                 sent_s = now_s
             wait([link], POLL_S if now_s - begun_s > SPIN_S else 0.0)
