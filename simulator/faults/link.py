@@ -98,21 +98,11 @@ _HEARTBEAT_HZ = 1.0
 _DATAGRAMS_MAX = 2000  # of a stranger, that wait
 
 
-class Sender:
-    """Another sender with its MAVLink ids."""
-
-    def __init__(self, system: int, component: int) -> None:
-        self._encoder = Encoder(system, component)
-
-    def frame(self, name: str, *values: object) -> bytes:
-        """A message with these values, as one frame."""
-        return self._encoder.frame(name, values)
-
-    def autopilot_heartbeat(self, firmware: Firmware) -> bytes:
-        """HEARTBEAT of an autopilot with this firmware, disarmed and in its first mode."""
-        mode = firmware.modes[firmware.boot_mode]
-        state = (mode.base_mode, mode.custom_mode, _STANDBY, _MAVLINK)
-        return self.frame("HEARTBEAT", _QUADROTOR, firmware.mav_autopilot, *state)
+def _autopilot_heartbeat(sender: Encoder, firmware: Firmware) -> bytes:
+    """HEARTBEAT of an autopilot with this firmware, disarmed and in its first mode."""
+    mode = firmware.modes[firmware.boot_mode]
+    kind, state = (_QUADROTOR, firmware.mav_autopilot), (_STANDBY, _MAVLINK)
+    return sender.frame("HEARTBEAT", (*kind, mode.base_mode, mode.custom_mode, *state))
 
 
 def due(rate_hz: float, step: int) -> range:
@@ -124,9 +114,9 @@ def due(rate_hz: float, step: int) -> range:
 class SecondSender(Timed):
     """Another companion or ground station sends to the vehicle, which obeys any source.
 
-    Level attitude setpoints at `setpoint_rate_hz` with this thrust, heading north, and a command
-    when it begins. Its HEARTBEAT with `custom_mode`, which is the phase of an `offboard`, reaches
-    the companion once a second, as an autopilot forwards it.
+    Level attitude setpoints at `setpoint_rate_hz` with this thrust, heading north. Its HEARTBEAT
+    with `custom_mode`, which is the phase of an `offboard`, reaches the companion once a second, as
+    an autopilot forwards it.
     """
 
     fault: Literal["second_sender"]
@@ -135,23 +125,17 @@ class SecondSender(Timed):
     custom_mode: int = Field(default=0, ge=0, le=255)
     setpoint_rate_hz: float = Field(default=10.0, ge=0, le=250)
     thrust: float = Field(default=0.5, ge=0, le=1)
-    command: int | None = Field(default=None, ge=0, le=65535)  # MAV_CMD
-    params: tuple[float, ...] = Field(default=(), max_length=7)  # param1 .. param7; the rest is 0
 
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
-        sender = Sender(self.system, self.component)
-        target = (vehicle.view.system, MAV_COMP_ID_AUTOPILOT)
-        if self.command is not None:
-            filled = (*self.params, *(0.0,) * (7 - len(self.params)))
-            command = sender.frame("COMMAND_LONG", *target, self.command, 0, *filled)
-            vehicle.companion.receive(command)
-        level = (_ATTITUDE_AND_THRUST, (1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0, self.thrust)
+        sender = Encoder(self.system, self.component)
+        target = (0, vehicle.view.system, MAV_COMP_ID_AUTOPILOT)
+        level = (*target, _ATTITUDE_AND_THRUST, (1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0, self.thrust)
         heartbeat = (_ONBOARD_CONTROLLER, _NO_AUTOPILOT, 0, self.custom_mode, _ACTIVE, _MAVLINK)
         while (yield):
             for _ in due(self.setpoint_rate_hz, running.step):
-                vehicle.companion.receive(sender.frame("SET_ATTITUDE_TARGET", 0, *target, *level))
+                vehicle.companion.receive(sender.frame("SET_ATTITUDE_TARGET", level))
             for _ in due(_HEARTBEAT_HZ, running.step):
-                vehicle.companion.outbox.forward(sender.frame("HEARTBEAT", *heartbeat))
+                vehicle.companion.outbox.forward(sender.frame("HEARTBEAT", heartbeat))
 
 
 class SecondVehicle(Timed):
@@ -163,10 +147,10 @@ class SecondVehicle(Timed):
     rate_hz: float = Field(default=1.0, gt=0, le=250)
 
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
-        sender = Sender(self.system, self.component)
+        sender = Encoder(self.system, self.component)
         while (yield):
             for _ in due(self.rate_hz, running.step):
-                heartbeat = sender.autopilot_heartbeat(vehicle.autopilot.firmware)
+                heartbeat = _autopilot_heartbeat(sender, vehicle.autopilot.firmware)
                 vehicle.companion.outbox.forward(heartbeat)
 
 
@@ -183,12 +167,12 @@ class Stranger(Timed):
 
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
         """At most _DATAGRAMS_MAX datagrams wait to be sent; older ones are dropped."""
-        sender = Sender(self.system or vehicle.view.system, self.component)
+        sender = Encoder(self.system or vehicle.view.system, self.component)
         while (yield):
             for _ in due(self.rate_hz, running.step):
                 if self.sends == "noise":
                     running.datagrams.append(running.random.randbytes(self.size_bytes))
                 else:
-                    heartbeat = sender.autopilot_heartbeat(vehicle.autopilot.firmware)
+                    heartbeat = _autopilot_heartbeat(sender, vehicle.autopilot.firmware)
                     running.datagrams.append(heartbeat)
             del running.datagrams[:-_DATAGRAMS_MAX]
