@@ -222,6 +222,7 @@ class Instance:
             old.firmware, old.plant, old.parameters, old.mission, boot_scale=old.health.boot_scale
         )
         self.autopilot.position_controller.detector.set_landed(old.plant.on_ground)
+        self.autopilot.commander.refused = old.commander.refused  # faults that run go on
         self.view.restart(self.autopilot)
         self.keyring.restart()
         for link in self.links:

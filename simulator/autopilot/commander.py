@@ -68,6 +68,7 @@ class Commander:
         self._intended = self._remembered = firmware.boot_mode
         self.armed = self.failsafe = False
         self.reboot_requested = False
+        self.refused: dict[str, StatusText] = {}  # by a fault: events, and "offboard"
         self.texts: list[StatusText] = []
         self.announcements: list[str] = []
         self._event, self._request = "", NO_REQUEST  # being handled
@@ -113,6 +114,10 @@ class Commander:
         """Apply the row of the state table that decides about an event; a firmware without rows
         for it does not support it."""
         self._event, self._request = event, request
+        offboard = event == "mode" and self._requested.behaviour is Behaviour.SETPOINT
+        if self.refused and (text := self.refused.get("offboard" if offboard else event)):
+            self.texts.append(text)
+            return Result.TEMPORARILY_REJECTED
         rule = self._row(event)
         if rule is None:
             return Result.ACCEPTED if event in self._rows else Result.UNSUPPORTED

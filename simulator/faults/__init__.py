@@ -24,12 +24,14 @@ Fault = Annotated[
     | vehicle.VelocityError
     | vehicle.WrongLandedState
     | vehicle.BlindLandDetector
+    | vehicle.WeakMotor
     | vehicle.MotorsCut
     | vehicle.ThrustChange
     | vehicle.MassChange
     | vehicle.BatteryDrop
     | vehicle.Reboot
     | link.ClockJump
+    | vehicle.Refusal
     | vehicle.PilotTakesOver
     | vehicle.PilotDisarms
     | link.SecondSender

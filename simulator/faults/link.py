@@ -114,9 +114,9 @@ def due(rate_hz: float, step: int) -> range:
 class SecondSender(Timed):
     """Another companion or ground station sends to the vehicle, which obeys any source.
 
-    Level attitude setpoints at `setpoint_rate_hz` with this thrust, heading north. Its HEARTBEAT
-    with `custom_mode`, which is the phase of an `offboard`, reaches the companion once a second, as
-    an autopilot forwards it.
+    Level attitude setpoints at `setpoint_rate_hz` with this thrust, heading north, and a command
+    when it begins. Its HEARTBEAT with `custom_mode`, which is the phase of an `offboard`, reaches
+    the companion once a second, as an autopilot forwards it.
     """
 
     fault: Literal["second_sender"]
@@ -125,11 +125,17 @@ class SecondSender(Timed):
     custom_mode: int = Field(default=0, ge=0, le=255)
     setpoint_rate_hz: float = Field(default=10.0, ge=0, le=250)
     thrust: float = Field(default=0.5, ge=0, le=1)
+    command: int | None = Field(default=None, ge=0, le=65535)  # MAV_CMD
+    params: tuple[float, ...] = Field(default=(), max_length=7)  # param1 .. param7; the rest is 0
 
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
         sender = Encoder(self.system, self.component)
-        target = (0, vehicle.view.system, MAV_COMP_ID_AUTOPILOT)
-        level = (*target, _ATTITUDE_AND_THRUST, (1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0, self.thrust)
+        target = (vehicle.view.system, MAV_COMP_ID_AUTOPILOT)
+        if self.command is not None:
+            filled = (*self.params, *(0.0,) * (7 - len(self.params)))
+            command = sender.frame("COMMAND_LONG", (*target, self.command, 0, *filled))
+            vehicle.companion.receive(command)
+        level = (0, *target, _ATTITUDE_AND_THRUST, (1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0, self.thrust)
         heartbeat = (_ONBOARD_CONTROLLER, _NO_AUTOPILOT, 0, self.custom_mode, _ACTIVE, _MAVLINK)
         while (yield):
             for _ in due(self.setpoint_rate_hz, running.step):

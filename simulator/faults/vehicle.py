@@ -1,4 +1,6 @@
-"""Faults of motors, mass, battery, estimator and land detector; what a pilot does, and a reboot."""
+"""Faults of motors, mass, battery, estimator and land detector; what a pilot does, what the
+autopilot refuses, and a reboot.
+"""
 
 from __future__ import annotations
 
@@ -9,22 +11,36 @@ from pydantic import Field
 from offboard.model.vehicle import Triple
 from simulator.autopilot.commander import Request
 from simulator.faults.fault import Effect, ModeName, Running, Timed, Vehicle, until_the_end
+from simulator.firmware.values import critical
 from simulator.steps import STEP_S
 
 _NO_THRUST = 1e-9  # a factor that can be undone
 
 
+def _scaled_thrust(vehicle: Vehicle, factor: float) -> Effect:
+    vehicle.autopilot.plant.scale_thrust(factor)
+    yield from until_the_end()
+    vehicle.autopilot.plant.scale_thrust(1.0 / factor)
+
+
+class WeakMotor(Timed):
+    """One of four motors has `motor_scale` of its thrust; the mixer keeps the torques."""
+
+    fault: Literal["weak_motor"]
+    motor_scale: float = Field(ge=0, le=1)
+
+    def effect(self, vehicle: Vehicle, running: Running) -> Effect:
+        return _scaled_thrust(vehicle, (3.0 + self.motor_scale) / 4.0)
+
+
 class ThrustChange(Timed):
-    """Thrust of all motors multiplied by `thrust_scale`; (3 + s) / 4: one of four has the share s,
-    and the mixer keeps the torques."""
+    """Thrust of all motors multiplied by `thrust_scale`."""
 
     fault: Literal["thrust_change"]
     thrust_scale: float = Field(ge=0.1, le=3)
 
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
-        vehicle.autopilot.plant.scale_thrust(self.thrust_scale)
-        yield from until_the_end()
-        vehicle.autopilot.plant.scale_thrust(1.0 / self.thrust_scale)
+        return _scaled_thrust(vehicle, self.thrust_scale)
 
 
 class MotorsCut(Timed):
@@ -130,6 +146,30 @@ class BlindLandDetector(Timed):
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
         while (yield):
             vehicle.autopilot.position_controller.detector.reset()
+
+
+# requests that a fault makes the autopilot refuse: their events, and the beginning of the text
+_REFUSED = {
+    "arm": (("arm", "force arm"), "Arming denied"),
+    "offboard": (("offboard",), "Switching to Offboard denied"),
+    "takeoff": (("takeoff",), "Takeoff denied"),
+}
+
+
+class Refusal(Timed):
+    """The autopilot refuses a request, with a text."""
+
+    fault: Literal["refusal"]
+    of: Literal["arm", "offboard", "takeoff"]
+    text: str = Field(default="Resolve system health failures first", min_length=1, max_length=200)
+
+    def effect(self, vehicle: Vehicle, running: Running) -> Effect:
+        events, title = _REFUSED[self.of]
+        refused = vehicle.autopilot.commander.refused  # a reboot keeps it
+        refused |= dict.fromkeys(events, critical(f"{title}: {self.text}"))
+        yield from until_the_end()
+        for event in events:
+            refused.pop(event, None)
 
 
 class PilotTakesOver(Timed):

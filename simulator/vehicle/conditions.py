@@ -23,6 +23,7 @@ class Conditions(Parameters):
     gusts: Gusts = Gusts()
     thrust_scale: float = Field(default=1.0, ge=0.1, le=3)  # 0.85: 15 % less than the model
     mass_scale: float = Field(default=1.0, ge=0.1, le=5)
+    ground_effect: bool = False
     battery: Battery = Battery()
     # vehicle clock at the start; its 32-bit milliseconds wrap at 4294967.296 s
     clock_start_s: float = Field(default=0.0, ge=0, le=1e8)

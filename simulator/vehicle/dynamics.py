@@ -62,7 +62,7 @@ RECORD = np.dtype(
         ("gains", "f8", (3, 3)),
         # constants
         ("body_constants", "f8", 12),
-        ("rotor_constants", "f8", 5),
+        ("rotor_constants", "f8", 6),
         ("air", "f8", 5),
         ("error_transition", "f8", (ERROR_COUNT, ERROR_COUNT)),
         ("error_scale", "f8", (ERROR_COUNT, ERROR_COUNT)),

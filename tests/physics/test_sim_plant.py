@@ -174,6 +174,14 @@ def test_crash_upside_down_at_speed_is_survived_and_ends_level():
     assert np.abs(truth.velocity_ned_mps).max() < 1e-12
 
 
+def test_ground_effect_lifts_near_the_ground_only():
+    share = 0.96  # of hover thrust: flies in ground effect and not without it
+    assert not _climbing(share * PX4.hover_thrust, 2.0, ground_effect=True).truth.on_ground
+    assert _climbing(share * PX4.hover_thrust, 2.0).truth.on_ground
+    high = _climbing(share * PX4.hover_thrust, 60.0, ground_effect=True).truth
+    assert 0.0 < -high.position_ned_m[2] < 0.3
+
+
 def test_battery_empties_by_the_current_and_sags_under_load():
     battery = Battery(capacity_ah=1.0, hover_current_a=12.0, resistance_ohm=0.05)
     plant = Plant(PX4, Conditions(battery=battery), 1)
@@ -202,6 +210,7 @@ ROUGH = Conditions(
     estimator="px4_like",
     wind_ned_mps=(3.0, 1.0, 0.0),
     gusts={"intensity_mps": 1.5},
+    ground_effect=True,
 )
 
 

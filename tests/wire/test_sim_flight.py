@@ -148,6 +148,23 @@ def test_what_a_run_cannot_simulate_is_refused() -> None:
         scenario(start={"height_m": 3.0, "mode": "NOPE"})
 
 
+def test_refusals_with_their_texts_until_they_end() -> None:
+    requests = (
+        ("arm", 400, (1.0,), "Arming denied: low battery"),
+        ("offboard", 176, (1.0, 6.0), "Switching to Offboard denied: low battery"),
+        ("takeoff", 22, (), "Takeoff denied: low battery"),
+    )
+    refused = {"fault": "refusal", "text": "low battery", "for_s": 7.0}
+    bench = Bench(scenario=scenario(*({**refused, "of": of} for of, *_ in requests)))
+    bench.run(5.6, lambda: bench.position(0, 0, -3.0))
+    for _, number, params, text in requests:
+        assert bench.command(number, *params)[-1] == 1
+        assert bench.texts()[-1] == text
+    bench.run(2.0, lambda: bench.position(0, 0, -3.0))
+    for _, number, params, _ in requests:
+        assert bench.command(number, *params)[-1] == 0
+
+
 def test_a_stuck_message_repeats_its_content_with_or_without_its_stamp() -> None:
     stuck = {"fault": "stuck_message", "message": "ATTITUDE", "for_s": 0.9}
     bench = aloft({**stuck, "at_s": 1.0}, {**stuck, "at_s": 2.0, "stamp_runs": False})
@@ -223,8 +240,9 @@ def test_the_same_seed_gives_the_same_bytes_with_every_new_fault(firmware: Firmw
 def test_a_weaker_or_heavier_vehicle_accelerates_less() -> None:
     """Level at hover thrust the vertical specific force is what the change leaves of gravity."""
     sinking: tuple[tuple[dict[str, Any], float], ...] = (
-        ({"fault": "thrust_change", "thrust_scale": 0.8, "at_s": 2.0}, 0.8),
-        ({"fault": "mass_change", "mass_scale": 1.25, "at_s": 6.0}, 0.8),
+        ({"fault": "weak_motor", "motor_scale": 0.4, "at_s": 2.0}, 0.85),
+        ({"fault": "thrust_change", "thrust_scale": 0.8, "at_s": 6.0}, 0.8),
+        ({"fault": "mass_change", "mass_scale": 1.25, "at_s": 10.0}, 0.8),
     )
     bench = engaged(*({**fault, "for_s": 0.2} for fault, _ in sinking))
     begun_s = bench.time_s
@@ -273,6 +291,7 @@ def test_faults_that_run_go_on_after_a_reboot_and_end_as_they_should() -> None:
         scenario=scenario(
             {"fault": "clock_jump", "jump_s": -30.0, "for_s": 8.0},
             {"fault": "velocity_error", "offset_ned_mps": (0.0, 2.0, 0.0), "for_s": 8.0},
+            {"fault": "refusal", "of": "arm", "text": "no", "for_s": 8.0},
             {"fault": "reboot", "at_s": 1.0, "for_s": 0.5},
         )
     )
@@ -280,7 +299,7 @@ def test_faults_that_run_go_on_after_a_reboot_and_end_as_they_should() -> None:
     autopilot = bench.instance.autopilot
     assert autopilot.state.estimate.velocity_ned_mps[1] == pytest.approx(2.0, abs=0.1)
     assert bench.command(400, 1) == [1]
-    assert bench.texts()[-1] == "Arming denied: Resolve system health failures first"
+    assert bench.texts()[-1] == "Arming denied: no"
     bench.run(2.0)
     assert autopilot.state.estimate.velocity_ned_mps[1] == pytest.approx(0.0, abs=0.1)
     assert bench.command(400, 1) == [0]
