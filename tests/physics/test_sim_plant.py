@@ -176,8 +176,8 @@ def test_crash_upside_down_at_speed_is_survived_and_ends_level():
 
 def test_ground_effect_lifts_near_the_ground_only():
     share = 0.96  # of hover thrust: flies in ground effect and not without it
-    assert not _climbing(share * PX4.hover_thrust, 2.0, ground_effect=True).truth.on_ground
-    assert _climbing(share * PX4.hover_thrust, 2.0).truth.on_ground
+    assert not _climbing(share * PX4.hover_thrust, 2.0, ground_effect=True).on_ground
+    assert _climbing(share * PX4.hover_thrust, 2.0).on_ground
     high = _climbing(share * PX4.hover_thrust, 60.0, ground_effect=True).truth
     assert 0.0 < -high.position_ned_m[2] < 0.3
 
