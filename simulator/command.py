@@ -113,7 +113,7 @@ def simulate(
         scenario=scenario,
         vehicle=vehicle,
         parameters=tuple(param or ()),
-        duration_s=duration,
+        duration_s=math.inf if duration is None else duration,
         numbers=range(instance, instance + instances),
         patience_s=patience,
         signing_key=signing_key,

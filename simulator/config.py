@@ -9,7 +9,9 @@ from offboard.documents.parameters import Parameters
 from offboard.documents.reading import M, parse
 from offboard.documents.shipped import locate, read_text
 from offboard.model.vehicle import Vehicle
-from simulator.faults import Fault, PilotTakesOver, Stranger
+from simulator.faults import Fault
+from simulator.faults.link import Stranger
+from simulator.faults.vehicle import PilotTakesOver
 from simulator.firmware.base import Firmware
 from simulator.start import Start
 from simulator.vehicle.conditions import Conditions

@@ -1,9 +1,11 @@
-"""Latitude, longitude and height to metres round the origin, on a sphere. Knows no vehicle."""
+"""The Earth: latitude, longitude and height to metres round the origin, on a sphere; gravity. Knows
+no vehicle."""
 
 from __future__ import annotations
 
 import math
 
+GRAVITY_MPS2 = 9.80665
 EARTH_RADIUS_M = 6_371_000.0
 DEGREES_PER_M = math.degrees(1.0 / EARTH_RADIUS_M)  # northwards
 Origin = tuple[float, float, float]  # latitude, longitude deg, AMSL m

@@ -81,7 +81,6 @@ class InMemoryVehicle:
             return []
         instance.advance_to_barrier()
         self._stamp_ns, datagrams = instance.barrier()
-        instance.ground.outbox.drain()
         return [*self._strange(), *((VEHICLE, datagram) for datagram in datagrams)]
 
     def _strange(self) -> list[tuple[int, bytes]]:

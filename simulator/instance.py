@@ -7,13 +7,13 @@ the same datagrams at the same steps give the same datagrams out.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 
 from offboard.model.vehicle import Vehicle
 from simulator.autopilot.autopilot import Autopilot
 from simulator.autopilot.position_controller import OFF
-from simulator.faults import Fault
-from simulator.faults.fault import prepare
+from simulator.faults import Fault, prepare
 from simulator.firmware.base import Firmware
 from simulator.link.framing import frames
 from simulator.link.impairment import carry
@@ -26,9 +26,8 @@ from simulator.steps import STEP_S, STEP_US
 from simulator.vehicle.conditions import Conditions
 from simulator.vehicle.plant import Plant
 
-STEP_MS = STEP_US // 1000
 VIRTUAL_EPOCH_US = 1_767_225_600_000_000  # 2026-01-01, where virtual time begins
-BARRIER_INTERVAL_MS = 20
+BARRIER_STEPS = 5  # 20 ms
 RESTART_S = 1.0  # duration of a reboot by command
 _TIMESYNC = 111
 
@@ -43,7 +42,7 @@ class Instance:
         seed: of all noise.
         system: MAVLink system id.
         lockstep: replace the TIMESYNC stream of the companion link by barriers (`barrier_due`).
-        ground_link: send telemetry to a ground station too.
+        ground_link: has a link to a ground station too.
         epoch_us: Unix time of boot in SYSTEM_TIME, microseconds.
         parameters: of the autopilot, in place of its defaults.
         faults: what goes wrong, and when (`simulator.faults`).
@@ -93,20 +92,15 @@ class Instance:
             self._unix_us if firmware.stamps_follow_clock else None,
             signing_key,
         )
-        rates_hz = firmware.ground_rates_hz if ground_link else {}
-        self.companion = Server(
-            self.view,
-            firmware.companion_rates_hz,
-            self.keyring,
-            number=0,
-            barrier=lockstep,
-        )
-        self.ground = Server(self.view, rates_hz, self.keyring, number=1)
+        rates_hz = firmware.companion_rates_hz
+        self.companion = Server(self.view, rates_hz, self.keyring, number=0, barrier=lockstep)
+        self.links = [self.companion]
+        if ground_link:
+            self.links.append(Server(self.view, firmware.ground_rates_hz, self.keyring, number=1))
         self.steps = 0
         self._injection = prepare(faults, seed)
         self._arrived: list[bytes] = []
-        self._barrier_ms = 0
-        self._position_interval_ms = firmware.position_grid_steps * STEP_MS
+        self._barrier_at_step = 0
         self._back_at_step = 0
 
     @property
@@ -115,9 +109,9 @@ class Instance:
         return self.steps * STEP_S
 
     @property
-    def complaints(self) -> Mapping[str, int]:
+    def complaints(self) -> Counter[str]:
         """Number of messages that signing refused, by reason."""
-        return self.companion.decoder.refused + self.ground.decoder.refused
+        return sum((link.decoder.refused for link in self.links), Counter())
 
     def _unix_us(self) -> int:
         """The vehicle's clock, as in SYSTEM_TIME."""
@@ -143,8 +137,8 @@ class Instance:
             return
         if self.autopilot.commander.texts or self.autopilot.commander.announcements:
             self._send_texts()
-        self.companion.step()
-        self.ground.step()
+        for link in self.links:
+            link.step()
         if self._injection is not None:
             self._arrived += carry(
                 self._injection.down, self.companion.outbox.drain(), self._now_us
@@ -162,7 +156,7 @@ class Instance:
         """`advance`, then the datagrams of the companion link; those of the ground link are
         dropped."""
         self.advance()
-        self.ground.outbox.drain()
+        self.drain_ground()
         return self.drain()
 
     def drain(self) -> list[bytes]:
@@ -172,6 +166,10 @@ class Instance:
         sent = carry(self._injection.down, self.companion.outbox.drain(), self._now_us)
         arrived, self._arrived = self._arrived + sent, []
         return arrived
+
+    def drain_ground(self) -> list[bytes]:
+        """Datagrams for the ground station since the last call."""
+        return [datagram for link in self.links[1:] for datagram in link.outbox.drain()]
 
     def feed(self, datagram: bytes) -> None:
         """Receive one datagram of the companion at the present vehicle time."""
@@ -186,7 +184,7 @@ class Instance:
         """Receive one datagram of the ground station."""
         if self.steps < self._back_at_step:
             return
-        self.ground.receive(datagram)
+        self.links[1].receive(datagram)
         self._send_texts()
 
     def barrier_due(self) -> bool:
@@ -195,10 +193,10 @@ class Instance:
         True at the first step with a position at or after each multiple of 20 ms, so that a
         command takes effect at the stamp of the newest position, as it nearly does in real time.
         """
-        now_ms = self.steps * STEP_MS
-        if now_ms < self._barrier_ms or now_ms % self._position_interval_ms:
+        position_steps = self.autopilot.firmware.position_grid_steps
+        if self.steps < self._barrier_at_step or self.steps % position_steps:
             return False
-        self._barrier_ms = (now_ms // BARRIER_INTERVAL_MS + 1) * BARRIER_INTERVAL_MS
+        self._barrier_at_step = (self.steps // BARRIER_STEPS + 1) * BARRIER_STEPS
         return True
 
     def barrier(self) -> tuple[int, list[bytes]]:
@@ -209,7 +207,7 @@ class Instance:
         Returns:
             Its time stamp in nanoseconds, and all datagrams for the companion.
         """
-        stamp_ns = self.steps * STEP_MS * 1_000_000
+        stamp_ns = self._now_us * 1000
         if self._injection is None:
             self.companion.send_barrier(stamp_ns)
             return stamp_ns, self.companion.outbox.drain()
@@ -224,15 +222,16 @@ class Instance:
             old.firmware, old.plant, old.parameters, old.mission, boot_scale=old.health.boot_scale
         )
         self.autopilot.position_controller.detector.set_landed(old.plant.on_ground)
+        self.autopilot.commander.refused = old.commander.refused  # faults that run go on
         self.view.restart(self.autopilot)
         self.keyring.restart()
-        self.companion.restart()
-        self.ground.restart()
+        for link in self.links:
+            link.restart()
         self._back_at_step = self.steps + round(silent_s / STEP_S)
 
     @property
     def _now_us(self) -> int:
-        return self.steps * STEP_MS * 1000
+        return self.steps * STEP_US
 
     def _inject(self) -> None:
         assert self._injection is not None
@@ -266,13 +265,13 @@ class Instance:
         return self.companion.barrier and is_timesync and any(frame[10:18])
 
     def _send_texts(self) -> None:
-        """Queue new texts and announced messages on both links."""
+        """Queue new texts and announced messages on every link."""
         commander = self.autopilot.commander
         for text in commander.texts:
-            self.companion.texts.send(text)
-            self.ground.texts.send(text)
+            for link in self.links:
+                link.outbox.send_text(text)
         commander.texts.clear()
         for name in commander.announcements:
-            self.companion.outbox.send_now(name)
-            self.ground.outbox.send_now(name)
+            for link in self.links:
+                link.outbox.send_now(name)
         commander.announcements.clear()

@@ -24,7 +24,7 @@ class Options:
     scenario: str | None
     vehicle: str | None
     parameters: tuple[str, ...]  # NAME=VALUE
-    duration_s: float | None
+    duration_s: float
     numbers: range
     patience_s: float | None
     signing_key: Path | None

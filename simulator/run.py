@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import gc
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 from offboard.documents.errors import Repeated
 from offboard.link.clock import monotonic_s, unix_us
@@ -29,14 +29,6 @@ SPIN_S = 50e-6  # poll without sleeping: most answers arrive sooner than a core 
 POLL_S = 0.05  # longest wait, so that a stop is noticed
 BEHIND = "the simulator was {most:.1f} s behind real time{times}: not catching up"
 BEHIND_S = 0.5
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """Exit code and, unless it is 0, a sentence."""
-
-    code: int
-    sentence: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,9 +58,8 @@ class Endpoint:
         self.send_ground()
 
     def send_ground(self) -> None:
-        datagrams = self.instance.ground.outbox.drain()
         if self.ground is not None:
-            self.ground.send(datagrams)
+            self.ground.send(self.instance.drain_ground())
 
     def send_barrier(self) -> tuple[int, list[bytes]]:
         """Send everything queued and the barrier; return its time stamp and its datagrams."""
@@ -125,43 +116,29 @@ def warm_up(instance: Instance) -> None:
         instance.advance()
 
 
+@dataclass(slots=True)
 class Runner:
-    """Runs instances with their sockets.
+    """Runs instances with their sockets; lockstep takes one.
 
-    Args:
-        endpoints: the instances; lockstep takes one.
-        stopping: called often; True ends the run.
-        report: takes sentences for the user.
-        duration_s: vehicle time at which the run ends.
+    `stopping` is called often, and True ends the run; `report` takes sentences for the user;
+    `end_s`: vehicle time at which the run ends.
     """
 
-    def __init__(
-        self,
-        endpoints: Sequence[Endpoint],
-        *,
-        stopping: Callable[[], bool],
-        report: Callable[[str], None],
-        duration_s: float | None = None,
-    ) -> None:
-        self._endpoints = endpoints
-        self._endpoint = endpoints[0]
-        self._instance = self._endpoint.instance
-        self._companion = self._endpoint.companion
-        self._owner = {link: endpoint for endpoint in endpoints for link in endpoint.links}
-        self._links = list(self._owner)
-        self._stopping = stopping
-        self._report = report
-        self._end_s = math.inf if duration_s is None else duration_s
-        self.punctuality = Punctuality()
+    endpoints: list[Endpoint]
+    stopping: Callable[[], bool]
+    report: Callable[[str], None]
+    end_s: float = math.inf
+    punctuality: Punctuality = field(default_factory=Punctuality)
 
     def _over(self) -> bool:
-        return self._instance.time_s >= self._end_s or self._stopping()
+        return self.endpoints[0].instance.time_s >= self.end_s or self.stopping()
 
     # -- real time ---------------------------------------------------------------------------
 
-    def real_time(self, speed: float) -> Outcome:
+    def real_time(self, speed: float) -> None:
         """Run at `speed` x real time by absolute deadlines; answers are sent at once."""
-        instance = self._instance
+        instance = self.endpoints[0].instance
+        owners = {link: endpoint for endpoint in self.endpoints for link in endpoint.links}
         self._stagger()
         gc.collect()
         gc.freeze()
@@ -169,8 +146,8 @@ class Runner:
         behind = Repeated(BEHIND)
         while not self._over():
             deadline_s = epoch_s + (instance.time_s + STEP_S) / speed
-            self._serve_until(deadline_s)
-            for endpoint in self._endpoints:
+            self._serve_until(deadline_s, owners)
+            for endpoint in self.endpoints:
                 endpoint.instance.advance()
                 endpoint.send()
             behind_s = monotonic_s() - deadline_s
@@ -179,32 +156,31 @@ class Runner:
                 behind.add(behind_s)
                 epoch_s += behind_s
             if news := behind.news(monotonic_s()):
-                self._report(news)
-        return Outcome(0)
+                self.report(news)
 
     def _stagger(self) -> None:
         """Start each vehicle one step later, so that they do not all send in the same step."""
-        for ahead, endpoint in enumerate(self._endpoints):
+        for ahead, endpoint in enumerate(self.endpoints):
             for _ in range(ahead):
                 endpoint.instance.advance()
                 endpoint.send()
 
-    def _serve_until(self, deadline_s: float) -> None:
+    def _serve_until(self, deadline_s: float, owners: Mapping[Link, Endpoint]) -> None:
         """Handle what arrives before the deadline; at least once."""
         while True:
             remaining_s = deadline_s - monotonic_s()
-            ready = wait(self._links, min(remaining_s, POLL_S))
-            for endpoint in dict.fromkeys(self._owner[link] for link in ready):
+            ready = wait(owners, min(remaining_s, POLL_S))
+            for endpoint in dict.fromkeys(owners[link] for link in ready):
                 if endpoint.read():
                     endpoint.send()
                 else:
                     endpoint.send_ground()
-            if remaining_s <= 0 or self._stopping():
+            if remaining_s <= 0 or self.stopping():
                 return
 
     # -- lockstep ----------------------------------------------------------------------------
 
-    def lockstep(self, timeout_s: float | None = None) -> Outcome:
+    def lockstep(self, timeout_s: float | None = None) -> str:
         """Run in virtual time that waits for the companion at every barrier.
 
         Args:
@@ -212,45 +188,47 @@ class Runner:
                 FIRST_ANSWER_TIMEOUT_S for the first one.
 
         Returns:
-            Code 3 if no companion answered, else 0.
+            Why no companion answers; empty if the run was stopped.
         """
+        (endpoint,) = self.endpoints
+        instance = endpoint.instance
         gc.collect()
         gc.freeze()
         while not self._over():
-            if not self._instance.advance_to_barrier(self._end_s):
+            if not instance.advance_to_barrier(self.end_s):
                 continue
-            stamp_ns, datagrams = self._endpoint.send_barrier()
-            self._endpoint.read_ground()
-            first = not self._instance.companion.texts.connected
+            stamp_ns, datagrams = endpoint.send_barrier()
+            endpoint.read_ground()
+            first = not instance.companion.outbox.connected
             waits_s = timeout_s or (FIRST_ANSWER_TIMEOUT_S if first else ANSWER_TIMEOUT_S)
-            if self._answered(stamp_ns, datagrams, waits_s) or self._stopping():
+            if self._answered(endpoint, stamp_ns, datagrams, waits_s) or self.stopping():
                 continue
-            if self._instance.companion.answered_ns < 0:
-                return Outcome(
-                    3,
+            if instance.companion.answered_ns < 0:
+                return (
                     f"no companion answered TIMESYNC within {waits_s:g} s:"
-                    " start one, or run without --lockstep",
+                    " start one, or run without --lockstep"
                 )
-            at_s = self._instance.time_s
-            return Outcome(3, f"the companion stopped answering at {at_s:.2f} s")
-        return Outcome(0)
+            return f"the companion stopped answering at {instance.time_s:.2f} s"
+        return ""
 
-    def _answered(self, stamp_ns: int, datagrams: list[bytes], timeout_s: float) -> bool:
+    def _answered(
+        self, endpoint: Endpoint, stamp_ns: int, datagrams: list[bytes], timeout_s: float
+    ) -> bool:
         """Wait for the answer to this barrier, applying all that comes before it."""
-        server = self._instance.companion
+        server, link = endpoint.instance.companion, endpoint.companion
         begun_s = sent_s = monotonic_s()
         while server.answered_ns != stamp_ns:
-            datagram = self._companion.receive()
+            datagram = link.receive()
             if datagram is not None:
-                self._endpoint.handle(datagram)
+                endpoint.handle(datagram)
                 continue
-            if self._stopping():
+            if self.stopping():
                 return False
             now_s = monotonic_s()
             if now_s - begun_s > timeout_s:
                 return False
-            if now_s - sent_s >= (RESEND_SILENT_S if server.texts.connected else RESEND_S):
-                self._companion.send(datagrams)
+            if now_s - sent_s >= (RESEND_SILENT_S if server.outbox.connected else RESEND_S):
+                link.send(datagrams)
                 sent_s = now_s
-            wait([self._companion], POLL_S if now_s - begun_s > SPIN_S else 0.0)
+            wait([link], POLL_S if now_s - begun_s > SPIN_S else 0.0)
         return True

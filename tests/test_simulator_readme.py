@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from string import Formatter
@@ -12,14 +13,29 @@ from typing import get_args
 
 import pytest
 
+from simulator import config
 from simulator.autopilot.commander import ACTIONS, CONDITIONS, TEXT_VALUES
 from simulator.faults import Fault
-from simulator.firmware.base import AFTER_DELAY, EVENTS, Firmware, Rule
+from simulator.faults.fault import Timed
+from simulator.firmware.base import AFTER_DELAY, Firmware, Rule
 from simulator.firmware.catalogue import FIRMWARES
 from simulator.firmware.values import Result
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "simulator" / "README.md"
+# Of every firmware; `Firmware.boot_events_s` has those of the start
+EVENTS = frozenset({
+    # requests: commands, messages, faults that act for a pilot
+    "mode", "takeoff", "land", "return", "loiter", "turn", "mission", "reboot", "terminate",
+    "arm", "disarm", "force arm", "force disarm", "checks", "thrust not a number",
+    # monitoring
+    "stream lost", "stream found", "position lost", "position found",
+    "ground station lost", "ground station found",
+    "battery low", "battery critical", "battery emergency",
+    # flight
+    "took off", "landed", "settled", "idle", "climbed", "already higher", "item reached",
+    "mission progress", "mission return", "mission finished",
+})  # fmt: skip
 HEAD = ("event", "in mode", "if", "next mode", "answer and texts")
 
 
@@ -49,12 +65,20 @@ def test_the_state_table_is_the_one_in_the_code(firmware: Firmware) -> None:
     assert table(firmware) in README.read_text(), "run: python tests/test_simulator_readme.py"
 
 
-def test_every_fault_is_in_the_table() -> None:
+def test_every_fault_is_in_the_table_with_its_keys_and_scenarios_that_have_it() -> None:
     faults = get_args(get_args(Fault)[0])
-    named = {get_args(fault.model_fields["fault"].annotation)[0] for fault in faults}
-    rows = "\n".join(line for line in README.read_text().splitlines() if line.startswith("| `"))
-    assert {name for name in named if f"`{name}`" not in rows} == set()
-    assert len(named) == 21
+    named = {get_args(fault.model_fields["fault"].annotation)[0]: fault for fault in faults}
+    section = README.read_text().partition("## Faults")[2].partition("## Behaviours")[0]
+    keys: dict[str, set[str]] = {}
+    for row in (line for line in section.splitlines() if line.startswith("| `")):
+        cells = [set(re.findall(r"`(\w+)`", cell)) for cell in row.split(" | ")]
+        for name in cells[0]:
+            keys.setdefault(name, set()).update(cells[1])
+        for name in cells[-1]:
+            assert {fault.fault for fault in config.scenario(name).faults} & cells[0], row
+    assert (keys.keys(), len(named)) == (named.keys(), 21)
+    for name, fault in named.items():
+        assert fault.model_fields.keys() - Timed.model_fields - {"fault"} <= keys[name], name
 
 
 def unknown(firmware: Firmware, rule: Rule) -> Iterator[str]:

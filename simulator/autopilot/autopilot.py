@@ -117,6 +117,6 @@ class Autopilot:
         if commander.armed:
             yield from commander.flight_time.timeout(now_s, controller.landed)
         if self.state.steps % MONITOR_STEPS == 0:
-            battery, has_fix = self.state.truth.battery, self.state.gps_healthy
+            battery, has_fix = self.plant.battery, self.plant.gps_healthy
             yield from self.health.monitor(now_s, commander.armed, battery, has_fix)
             yield from commander.due_events()

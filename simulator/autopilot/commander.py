@@ -81,7 +81,7 @@ class Commander:
     @property
     def healthy(self) -> bool:
         """The pre-arm checks pass in the intended mode."""
-        battery, read = self._state.truth.battery, self._parameters.__getitem__
+        battery, read = self._state.plant.battery, self._parameters.__getitem__
         if self.rejects_velocity or self._firmware.battery_level(battery, read) >= _CRITICAL:
             return False
         return self._health.passes(self.intended, self._state.time_s, latched=bool(self.latched))
@@ -89,12 +89,12 @@ class Commander:
     @property
     def has_fix(self) -> bool:
         """GPS has a fix: its first one, and no fault takes it away."""
-        return self._health.first_fix(self._state.time_s) and self._state.gps_healthy
+        return self._health.first_fix(self._state.time_s) and self._state.plant.gps_healthy
 
     @property
     def velocity_ratio(self) -> float:
         """Innovation ratio of the velocity in the estimator, as the firmware reports it."""
-        ratio = math.hypot(*self._state.velocity_error_ned_mps) / _GATE_MPS
+        ratio = math.hypot(*self._state.plant.velocity_error_ned_mps) / _GATE_MPS
         return ratio**2 if self._firmware.velocity_ratio_squared else ratio
 
     @property
@@ -114,7 +114,8 @@ class Commander:
         """Apply the row of the state table that decides about an event; a firmware without rows
         for it does not support it."""
         self._event, self._request = event, request
-        if self.refused and (text := self.refused.get(self._refusal_name)) is not None:
+        offboard = event == "mode" and self._requested.behaviour is Behaviour.SETPOINT
+        if self.refused and (text := self.refused.get("offboard" if offboard else event)):
             self.texts.append(text)
             return Result.TEMPORARILY_REJECTED
         rule = self._row(event)
@@ -140,11 +141,6 @@ class Commander:
     def _requested(self) -> Mode:
         """The requested mode, or the present one."""
         return self._firmware.modes[self._request.mode] if self._request.mode else self.mode
-
-    @property
-    def _refusal_name(self) -> str:
-        offboard = self._event == "mode" and self._requested.behaviour is Behaviour.SETPOINT
-        return "offboard" if offboard else self._event
 
     def _row(self, event: str) -> Rule | None:
         """The row that decides about an event; None: nothing happens."""
@@ -273,7 +269,7 @@ ACTIONS: dict[str, Callable[[Commander], None]] = {
 
 TEXT_VALUES: dict[str, Callable[[Commander], float | str]] = {
     "mode": lambda c: c._requested.title,
-    "battery_v": lambda c: c._state.truth.battery.voltage_v,
-    "used_mah": lambda c: c._state.truth.battery.used_mah,
+    "battery_v": lambda c: c._state.plant.battery.voltage_v,
+    "used_mah": lambda c: c._state.plant.battery.used_mah,
     "delay_s": lambda c: c._parameters.role("failsafe_delay_s"),
 }

@@ -9,9 +9,9 @@ import math
 from dataclasses import dataclass
 
 from simulator.autopilot.parameters import ParameterTable
-from simulator.autopilot.position_loop import GRAVITY_MPS2
 from simulator.autopilot.state import StateEstimate
 from simulator.firmware.base import Landing
+from simulator.geodesy import GRAVITY_MPS2
 from simulator.steps import LOOP_S
 
 _AIRBORNE_S = 0.1  # off the ground until it is no longer landed

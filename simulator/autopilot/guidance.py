@@ -88,7 +88,7 @@ class Guidance:
     ) -> None:
         self.firmware, self.parameters, self.mission = firmware, parameters, mission
         self.events = mission.events
-        self.sticks = None if firmware.sticks is None else Sticks(firmware.sticks)
+        self.sticks = Sticks() if firmware.flown_by_sticks else None
         self.newest: Setpoint | None = None  # setpoint of a client
         self.hold = MotionSetpoint(ORIGIN)
         self.home_ned_m = ORIGIN

@@ -43,11 +43,13 @@ class FlightTime:
 
     def timeout(self, now_s: float, landed: bool) -> Iterator[str]:
         """The event of a vehicle that stays on the ground, after a flight or without one."""
+        if not landed:
+            return
         event, since_s, role = "idle", self._armed_s, "disarm_idle_s"
         if self._flown:
             event, since_s, role = "settled", self._landed_s, "disarm_landed_s"
         limit_s = self.parameters.role(role)
-        if landed and limit_s > 0 and now_s - since_s >= limit_s - 1e-6:
+        if limit_s > 0 and now_s - since_s >= limit_s - 1e-6:
             yield event
 
 

@@ -14,12 +14,15 @@ from offboard.model.frames import quaternion_from_euler, wrap_pi
 from simulator.autopilot.state import StateEstimate
 from simulator.firmware.base import PositionGains
 from simulator.firmware.values import NAN3, MotionSetpoint, Quaternion, Triple
+from simulator.geodesy import GRAVITY_MPS2
 from simulator.steps import LOOP_S
 
-GRAVITY_MPS2 = 9.80665
 # The vertical integral may carry any vehicle; m/s^2 of north, east and down
 _INTEGRAL_MAX_MPS2 = (4.0, 4.0, GRAVITY_MPS2)
 _TILT_COSINE_MIN = 0.1  # least divisor of the thrust
+# The derivative of the velocity through a first-order low-pass of 5 Hz: share of the newest
+_TIMES_CUTOFF = LOOP_S * 2.0 * math.pi * 5.0
+_FILTER_SHARE = _TIMES_CUTOFF / (1.0 + _TIMES_CUTOFF)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,8 +49,6 @@ class PositionLoop:
         self.gains = gains
         self._position_p = (gains.position_xy_ps, gains.position_xy_ps, gains.position_z_ps)
         self._velocity_pid = (gains.velocity_xy, gains.velocity_xy, gains.velocity_z)
-        share = LOOP_S * 2.0 * math.pi * gains.derivative_cutoff_hz
-        self._filter_share = share / (1.0 + share)
 
     def reset(self, yaw_rad: float) -> None:
         """Clear the integrators and the filter; hold this yaw."""
@@ -92,14 +93,14 @@ class PositionLoop:
         return attitude(direction, self.yaw_rad), thrust, setpoint
 
     def _filter_acceleration(self, velocity: Triple) -> None:
-        """Derivative of the estimated velocity through a first-order low-pass."""
+        """Derivative of the estimated velocity, filtered."""
         before, self._velocity_mps = self._velocity_mps, velocity
         if math.isnan(before[0]):
             return
-        filtered, share = self._acceleration_mps2, self._filter_share
+        filtered = self._acceleration_mps2
         for i in range(3):
             slope = (velocity[i] - before[i]) / LOOP_S
-            filtered[i] += share * (slope - filtered[i])
+            filtered[i] += _FILTER_SHARE * (slope - filtered[i])
 
     def _velocity_demanded(self, motion: MotionSetpoint, position: Triple) -> Triple:
         """P on the position error plus the demanded velocity, before any limit."""

@@ -41,10 +41,8 @@ class VehicleState:
     """Time, estimate and truth of the present step; both are read from the plant once a step."""
 
     def __init__(self, plant: Plant) -> None:
-        self._plant = plant
+        self.plant = plant
         self.steps = 0  # of STEP_S since boot
-        self.gps_healthy = True  # False while a fault takes the fix away
-        self.velocity_error_ned_mps: Triple = (0.0, 0.0, 0.0)  # by a fault
         self._truth: Truth | None = None
         self._estimate: StateEstimate | None = None
 
@@ -69,23 +67,23 @@ class VehicleState:
 
     @property
     def truth(self) -> Truth:
-        """True state. The autopilot itself uses only the battery's."""
+        """True state, which the autopilot itself does not use."""
         if self._truth is None:
-            self._truth = self._plant.truth
+            self._truth = self.plant.truth
         return self._truth
 
     @property
     def estimate(self) -> StateEstimate:
         """State as the autopilot estimates it."""
         if self._estimate is None:
-            plant, error = self._plant, self.velocity_error_ned_mps
+            plant = self.plant
             north, east, down, v_north, v_east, v_down, w, x, y, z, p, q, r = (
                 plant.report().tolist()
             )
             self._estimate = StateEstimate(
                 self.time_s,
                 (north, east, down),
-                (v_north + error[0], v_east + error[1], v_down + error[2]),
+                (v_north, v_east, v_down),
                 (w, x, y, z),
                 (p, q, r),
                 plant.on_ground,

@@ -1,4 +1,4 @@
-"""The pilot's sticks: default RC input, and channels that a client overrides.
+"""The pilot's sticks of ArduCopter: default RC input, and channels that a client overrides.
 
 Pulse widths in, stick deflection and speeds out. Knows no modes and no vehicle.
 """
@@ -8,28 +8,32 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from simulator.firmware.base import StickFlight
-
 KEEP, RELEASE = 65535, 0  # RC_CHANNELS_OVERRIDE: leave this channel, end its override
 OVERRIDE_S = 3.0  # RC_OVERRIDE_TIME
 _CENTRE_US, _RANGE_US = 1500, 500
 _PERIOD_MIN_S, _PERIOD_MAX_S = 1e-3, 0.1  # between two calls of `demand`
 _THROTTLE_DEAD_ZONE_US = 100  # THR_DZ
+# Without RC: roll, pitch, throttle down, yaw; mode switch and other channels as SITL has them
+_DEFAULT_US = (1500, 1500, 1000, 1500, 1800, 1000, 1000, 1800)
+_CLIMB_MPS = 2.5  # PILOT_SPEED_UP, and down without throttle
+_TURN_RADPS = math.radians(202.5)  # PILOT_Y_RATE
+_SPEED_MPS = 12.5  # LOIT_SPEED
+_ACCELERATION_MPS2 = 3.57  # of two thirds of ANGLE_MAX
+_BRAKING_MPS2, _BRAKING_AFTER_S = 2.5, 1.0  # LOIT_BRK_ACCEL, LOIT_BRK_DELAY: sticks centred
 Pair = tuple[float, float]
 
 
 class Sticks:
     """RC channels of one vehicle; times are vehicle seconds."""
 
-    def __init__(self, flight: StickFlight) -> None:
-        self._flight = flight
+    def __init__(self) -> None:
         self._overridden: dict[int, tuple[int, float]] = {}  # channel -> pulse width, until
         self._velocity_mps = (0.0, 0.0)  # north, east
         self._called_s = self._deflected_s = math.nan  # last call, last with a deflection
 
     def override(self, pulses_us: Sequence[int], now_s: float) -> None:
         """RC_CHANNELS_OVERRIDE, from the first channel on."""
-        for channel, pulse_us in enumerate(pulses_us[: len(self._flight.default_pulses_us)]):
+        for channel, pulse_us in enumerate(pulses_us[: len(_DEFAULT_US)]):
             if pulse_us == RELEASE:
                 self._overridden.pop(channel, None)
             elif pulse_us != KEEP:
@@ -41,7 +45,7 @@ class Sticks:
             self._overridden[channel][0]
             if now_s < self._overridden.get(channel, (0, -math.inf))[1]
             else default_us
-            for channel, default_us in enumerate(self._flight.default_pulses_us)
+            for channel, default_us in enumerate(_DEFAULT_US)
         )
 
     def begin(self) -> None:
@@ -53,7 +57,6 @@ class Sticks:
 
         The velocity accelerates with the deflection, against a drag that limits its speed.
         """
-        flight = self._flight
         roll, pitch, throttle, yaw = self.pulses_us(now_s)[:4]
         forward, right = -_deflection(pitch), _deflection(roll)
         duration_s = min(_PERIOD_MAX_S, max(0.0, now_s - self._called_s))
@@ -65,19 +68,18 @@ class Sticks:
         self._accelerate((cos * forward - sin * right, sin * forward + cos * right), duration_s)
         changes = zip(self._velocity_mps, before, strict=True)
         north, east = ((after - first) / max(duration_s, _PERIOD_MIN_S) for after, first in changes)
-        climb_mps = flight.climb_mps * _deflection(throttle, _THROTTLE_DEAD_ZONE_US)
-        return self._velocity_mps, (north, east), climb_mps, flight.turn_radps * _deflection(yaw)
+        climb_mps = _CLIMB_MPS * _deflection(throttle, _THROTTLE_DEAD_ZONE_US)
+        return self._velocity_mps, (north, east), climb_mps, _TURN_RADPS * _deflection(yaw)
 
     def _accelerate(self, deflection: Pair, duration_s: float) -> None:
-        flight = self._flight
-        drag_ps = flight.acceleration_mps2 / flight.speed_mps
+        drag_ps = _ACCELERATION_MPS2 / _SPEED_MPS
         north, east = (
-            speed + duration_s * (flight.acceleration_mps2 * share - drag_ps * speed)
+            speed + duration_s * (_ACCELERATION_MPS2 * share - drag_ps * speed)
             for speed, share in zip(self._velocity_mps, deflection, strict=True)
         )
         speed = math.hypot(north, east)
-        if speed > 0.0 and self._called_s - self._deflected_s > flight.braking_after_s:
-            factor = max(0.0, speed - flight.braking_mps2 * duration_s) / speed
+        if speed > 0.0 and self._called_s - self._deflected_s > _BRAKING_AFTER_S:
+            factor = max(0.0, speed - _BRAKING_MPS2 * duration_s) / speed
             north, east = factor * north, factor * east
         self._velocity_mps = (north, east)
 

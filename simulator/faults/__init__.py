@@ -5,60 +5,55 @@ One class is one fault: its keys, and what it does to the vehicle. A new one is 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from random import Random
 from typing import Annotated
 
 from pydantic import Field
 
-from simulator.faults.fault import Direction
-from simulator.faults.link import (
-    ClockJump,
-    LinkFault,
-    SecondSender,
-    SecondVehicle,
-    SilentMessage,
-    Stranger,
-    StuckMessage,
-)
-from simulator.faults.vehicle import (
-    BatteryDrop,
-    BlindLandDetector,
-    EstimatorJump,
-    GpsLoss,
-    MassChange,
-    MotorsCut,
-    PilotDisarms,
-    PilotTakesOver,
-    Reboot,
-    Refusal,
-    ThrustChange,
-    VelocityError,
-    WeakMotor,
-    WrongLandedState,
-)
-
-__all__ = ["Direction", "Fault", "GpsLoss", "PilotTakesOver", "Stranger", "VelocityError"]
+from simulator.faults import link, vehicle
+from simulator.faults.fault import Injection, Running
+from simulator.link.impairment import Channel
 
 Fault = Annotated[
-    LinkFault
-    | EstimatorJump
-    | GpsLoss
-    | SilentMessage
-    | StuckMessage
-    | VelocityError
-    | WrongLandedState
-    | BlindLandDetector
-    | WeakMotor
-    | MotorsCut
-    | ThrustChange
-    | MassChange
-    | BatteryDrop
-    | Reboot
-    | ClockJump
-    | Refusal
-    | PilotTakesOver
-    | PilotDisarms
-    | SecondSender
-    | SecondVehicle
-    | Stranger,
+    link.LinkFault
+    | vehicle.EstimatorJump
+    | vehicle.GpsLoss
+    | link.SilentMessage
+    | link.StuckMessage
+    | vehicle.VelocityError
+    | vehicle.WrongLandedState
+    | vehicle.BlindLandDetector
+    | vehicle.WeakMotor
+    | vehicle.MotorsCut
+    | vehicle.ThrustChange
+    | vehicle.MassChange
+    | vehicle.BatteryDrop
+    | vehicle.Reboot
+    | link.ClockJump
+    | vehicle.Refusal
+    | vehicle.PilotTakesOver
+    | vehicle.PilotDisarms
+    | link.SecondSender
+    | link.SecondVehicle
+    | link.Stranger,
     Field(discriminator="fault"),
 ]
+
+
+def prepare(scenario: Sequence[Fault], seed: int) -> Injection | None:
+    """Faults of one flight, none begun; None when the scenario has none."""
+    if not scenario:
+        return None
+    paths: dict[str, list[Channel]] = {"down": [], "up": []}
+    waiting: list[Running] = []
+    for number, fault in enumerate(scenario):
+        channels = []
+        for direction, path in paths.items():
+            if isinstance(fault, link.LinkFault) and fault.direction in (direction, "both"):
+                channels.append(Channel(fault, Random(f"{seed} {number} {direction}")))
+                channels[-1].on = False
+                path.append(channels[-1])
+        waiting.append(Running(fault, channels, Random(f"{seed} {number}")))
+    strangers = [one.datagrams for one in waiting if isinstance(one.fault, link.Stranger)]
+    return Injection(paths["down"], paths["up"], strangers, waiting)

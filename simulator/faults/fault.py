@@ -8,11 +8,11 @@ the vehicle, the step of its beginning among them, and False when the fault ends
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Generator, Sequence
+from collections.abc import Generator
 from dataclasses import dataclass, field
 from enum import StrEnum
 from random import Random
-from typing import Annotated, ClassVar, Protocol
+from typing import Annotated, Protocol
 
 from pydantic import AfterValidator, Field
 
@@ -20,7 +20,7 @@ from offboard.documents.parameters import Parameters
 from simulator.autopilot.autopilot import Autopilot
 from simulator.firmware.catalogue import FIRMWARES
 from simulator.firmware.values import Behaviour
-from simulator.link.impairment import Channel, Impairment
+from simulator.link.impairment import Channel
 from simulator.mavlink.codec import id_of
 from simulator.mavlink.server import Server
 from simulator.mavlink.view import View
@@ -55,14 +55,6 @@ class Moment(StrEnum):
     LANDED = "landed"  # after a flight
 
 
-class Direction(StrEnum):
-    """Direction of a link seen from the vehicle: telemetry is down, commands are up."""
-
-    DOWN = "down"
-    UP = "up"
-    BOTH = "both"
-
-
 class Vehicle(Protocol):
     """What faults act on."""
 
@@ -79,12 +71,6 @@ class Timed(Parameters):
     at_s: float = Field(default=0.0, ge=0, le=1e5)
     after: Moment = Moment.BOOT
     for_s: float | None = Field(default=None, gt=0, le=1e5)
-    from_another_port: ClassVar[bool] = False  # it sends datagrams that the vehicle does not
-
-    @property
-    def impaired(self) -> tuple[Direction, ...]:
-        """Directions of the link that it impairs."""
-        return ()
 
     @abstractmethod
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
@@ -101,7 +87,7 @@ class Running:
     datagrams: list[bytes] = field(default_factory=list)  # of a stranger, to be sent
     begins_s: float | None = None  # None until the event that starts its delay
     effect: Effect | None = None  # once it has begun
-    over: bool = False
+    step: int = -1  # of those in which it has run, from 0
 
 
 def until_the_end() -> Effect:
@@ -126,10 +112,7 @@ class Injection:
     def step(self, now_s: float, vehicle: Vehicle) -> None:
         """Begin and end the faults due at `now_s`, seconds since the start."""
         self._note_moments(now_s, vehicle.autopilot)
-        for running in self._waiting:
-            self._advance(running, now_s + 1e-6, vehicle)
-        if any(running.over for running in self._waiting):
-            self._waiting = [running for running in self._waiting if not running.over]
+        self._waiting = [one for one in self._waiting if self._goes_on(one, now_s + 1e-6, vehicle)]
 
     def _note_moments(self, now_s: float, autopilot: Autopilot) -> None:
         landed = autopilot.position_controller.landed
@@ -146,38 +129,23 @@ class Injection:
             if reached:
                 self._moments.setdefault(moment, now_s)
 
-    def _advance(self, running: Running, now_s: float, vehicle: Vehicle) -> None:
+    def _goes_on(self, running: Running, now_s: float, vehicle: Vehicle) -> bool:
+        """Advance one fault; False once it is over."""
         fault = running.fault
         if running.begins_s is None:
             since_s = self._moments.get(fault.after)
             if since_s is None:
-                return
+                return True
             running.begins_s = since_s + fault.at_s
         if now_s < running.begins_s:
-            return
+            return True
         try:
             if running.effect is None:
                 running.effect = fault.effect(vehicle, running)
                 next(running.effect)
             lasts = fault.for_s is None or now_s < running.begins_s + fault.for_s
+            running.step += 1
             running.effect.send(lasts)
         except StopIteration:
-            running.over = True
-
-
-def prepare(scenario: Sequence[Timed], seed: int) -> Injection | None:
-    """Faults of one flight, none begun; None when the scenario has none."""
-    if not scenario:
-        return None
-    paths: dict[Direction, list[Channel]] = {Direction.DOWN: [], Direction.UP: []}
-    waiting: list[Running] = []
-    for number, fault in enumerate(scenario):
-        channels = []
-        for direction, path in paths.items():
-            if isinstance(fault, Impairment) and direction in fault.impaired:
-                channels.append(Channel(fault, Random(f"{seed} {number} {direction}")))
-                channels[-1].on = False
-                path.append(channels[-1])
-        waiting.append(Running(fault, channels, Random(f"{seed} {number}")))
-    strangers = [one.datagrams for one in waiting if one.fault.from_another_port]
-    return Injection(paths[Direction.DOWN], paths[Direction.UP], strangers, waiting)
+            return False
+        return True

@@ -3,23 +3,14 @@
 from __future__ import annotations
 
 import math
-from enum import StrEnum
 from typing import Literal
 
 from pydantic import Field, model_validator
 
-from simulator.faults.fault import (
-    Direction,
-    Effect,
-    MessageName,
-    Running,
-    Timed,
-    Vehicle,
-    until_the_end,
-)
+from simulator.faults.fault import Effect, MessageName, Running, Timed, Vehicle, until_the_end
 from simulator.firmware.base import Firmware
 from simulator.link.impairment import Impairment
-from simulator.mavlink.codec import Encoder, fields_of, message_of
+from simulator.mavlink.codec import Encoder, fields_of
 from simulator.mavlink.outbox import MAV_COMP_ID_AUTOPILOT
 from simulator.mavlink.view import Stuck
 from simulator.steps import STEP_S
@@ -32,19 +23,13 @@ class LinkFault(Timed, Impairment):
     """
 
     fault: Literal["link"]
-    direction: Direction = Direction.BOTH
+    direction: Literal["down", "up", "both"] = "both"  # telemetry is down, commands are up
 
     @model_validator(mode="after")
     def _ends(self) -> LinkFault:
         if self.stalled and self.for_s is None:
             raise ValueError("a stalled link needs for_s: what waits arrives when the fault ends")
         return self
-
-    @property
-    def impaired(self) -> tuple[Direction, ...]:
-        """Directions of the link that it impairs."""
-        both = (Direction.DOWN, Direction.UP)
-        return both if self.direction is Direction.BOTH else (self.direction,)
 
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
         for channel in running.channels:
@@ -113,27 +98,17 @@ _HEARTBEAT_HZ = 1.0
 _DATAGRAMS_MAX = 2000  # of a stranger, that wait
 
 
-class Sender:
-    """Another sender with its MAVLink ids. `step` counts the steps in which it sends, from 0."""
+def _autopilot_heartbeat(sender: Encoder, firmware: Firmware) -> bytes:
+    """HEARTBEAT of an autopilot with this firmware, disarmed and in its first mode."""
+    mode = firmware.modes[firmware.boot_mode]
+    kind, state = (_QUADROTOR, firmware.mav_autopilot), (_STANDBY, _MAVLINK)
+    return sender.frame("HEARTBEAT", (*kind, mode.base_mode, mode.custom_mode, *state))
 
-    def __init__(self, system: int, component: int) -> None:
-        self.step = -1
-        self._encoder = Encoder(system, component)
 
-    def due(self, rate_hz: float) -> range:
-        """As many numbers as messages of this rate are due in this step; the first is at once."""
-        before, now = (math.floor(n * rate_hz * STEP_S + 1e-9) for n in (self.step - 1, self.step))
-        return range(now - before)
-
-    def frame(self, name: str, *values: object) -> bytes:
-        """A message with these values, as one frame."""
-        return self._encoder.frame(message_of(name, values))
-
-    def autopilot_heartbeat(self, firmware: Firmware) -> bytes:
-        """HEARTBEAT of an autopilot with this firmware, disarmed and in its first mode."""
-        mode = firmware.modes[firmware.boot_mode]
-        state = (mode.base_mode, mode.custom_mode, _STANDBY, _MAVLINK)
-        return self.frame("HEARTBEAT", _QUADROTOR, firmware.mav_autopilot, *state)
+def due(rate_hz: float, step: int) -> range:
+    """As many numbers as messages of this rate are due in this step; the first is at once."""
+    before, now = (math.floor(n * rate_hz * STEP_S + 1e-9) for n in (step - 1, step))
+    return range(now - before)
 
 
 class SecondSender(Timed):
@@ -154,20 +129,19 @@ class SecondSender(Timed):
     params: tuple[float, ...] = Field(default=(), max_length=7)  # param1 .. param7; the rest is 0
 
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
-        sender = Sender(self.system, self.component)
+        sender = Encoder(self.system, self.component)
         target = (vehicle.view.system, MAV_COMP_ID_AUTOPILOT)
         if self.command is not None:
             filled = (*self.params, *(0.0,) * (7 - len(self.params)))
-            command = sender.frame("COMMAND_LONG", *target, self.command, 0, *filled)
+            command = sender.frame("COMMAND_LONG", (*target, self.command, 0, *filled))
             vehicle.companion.receive(command)
-        level = (_ATTITUDE_AND_THRUST, (1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0, self.thrust)
+        level = (0, *target, _ATTITUDE_AND_THRUST, (1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0, self.thrust)
         heartbeat = (_ONBOARD_CONTROLLER, _NO_AUTOPILOT, 0, self.custom_mode, _ACTIVE, _MAVLINK)
         while (yield):
-            sender.step += 1
-            for _ in sender.due(self.setpoint_rate_hz):
-                vehicle.companion.receive(sender.frame("SET_ATTITUDE_TARGET", 0, *target, *level))
-            for _ in sender.due(_HEARTBEAT_HZ):
-                vehicle.companion.outbox.forward(sender.frame("HEARTBEAT", *heartbeat))
+            for _ in due(self.setpoint_rate_hz, running.step):
+                vehicle.companion.receive(sender.frame("SET_ATTITUDE_TARGET", level))
+            for _ in due(_HEARTBEAT_HZ, running.step):
+                vehicle.companion.outbox.forward(sender.frame("HEARTBEAT", heartbeat))
 
 
 class SecondVehicle(Timed):
@@ -179,27 +153,19 @@ class SecondVehicle(Timed):
     rate_hz: float = Field(default=1.0, gt=0, le=250)
 
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
-        sender = Sender(self.system, self.component)
+        sender = Encoder(self.system, self.component)
         while (yield):
-            sender.step += 1
-            for _ in sender.due(self.rate_hz):
-                heartbeat = sender.autopilot_heartbeat(vehicle.autopilot.firmware)
+            for _ in due(self.rate_hz, running.step):
+                heartbeat = _autopilot_heartbeat(sender, vehicle.autopilot.firmware)
                 vehicle.companion.outbox.forward(heartbeat)
-
-
-class Datagrams(StrEnum):
-    """Content of a stranger's datagrams."""
-
-    NOISE = "noise"  # random bytes
-    HEARTBEAT = "heartbeat"  # of an autopilot like the vehicle's, disarmed
 
 
 class Stranger(Timed):
     """Datagrams from another port of the vehicle's host reach the companion. UDP links only."""
 
     fault: Literal["stranger"]
-    from_another_port = True
-    sends: Datagrams = Datagrams.NOISE
+    # random bytes, or those of an autopilot like the vehicle's, disarmed
+    sends: Literal["noise", "heartbeat"] = "noise"
     rate_hz: float = Field(default=100.0, gt=0, le=100_000)
     size_bytes: int = Field(default=64, ge=1, le=1400)  # of noise
     system: int | None = Field(default=None, ge=1, le=255)  # None: the vehicle's own id, a spoof
@@ -207,13 +173,12 @@ class Stranger(Timed):
 
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
         """At most _DATAGRAMS_MAX datagrams wait to be sent; older ones are dropped."""
-        sender = Sender(self.system or vehicle.view.system, self.component)
+        sender = Encoder(self.system or vehicle.view.system, self.component)
         while (yield):
-            sender.step += 1
-            for _ in sender.due(self.rate_hz):
-                if self.sends is Datagrams.NOISE:
+            for _ in due(self.rate_hz, running.step):
+                if self.sends == "noise":
                     running.datagrams.append(running.random.randbytes(self.size_bytes))
                 else:
-                    heartbeat = sender.autopilot_heartbeat(vehicle.autopilot.firmware)
+                    heartbeat = _autopilot_heartbeat(sender, vehicle.autopilot.firmware)
                     running.datagrams.append(heartbeat)
             del running.datagrams[:-_DATAGRAMS_MAX]

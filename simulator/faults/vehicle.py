@@ -1,10 +1,9 @@
-"""Faults of motors, mass, battery, estimator and land detector; what a pilot does, and what the
-autopilot refuses or forgets.
+"""Faults of motors, mass, battery, estimator and land detector; what a pilot does, what the
+autopilot refuses, and a reboot.
 """
 
 from __future__ import annotations
 
-from enum import StrEnum
 from typing import Literal
 
 from pydantic import Field
@@ -103,16 +102,16 @@ class GpsLoss(Timed):
     drift_mps2: float = Field(default=0.0, ge=0, le=10)
 
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
-        vehicle.autopilot.state.gps_healthy = False
-        speed_mps, drifted_m = self.drift_mps, 0.0
+        plant, speed_mps, drifted_m = vehicle.autopilot.plant, self.drift_mps, 0.0
+        plant.gps_healthy = False
         while (yield):
             step_m = speed_mps * STEP_S * 0.5**0.5
             speed_mps += self.drift_mps2 * STEP_S
             drifted_m += step_m
-            vehicle.autopilot.plant.drift_estimate((step_m, step_m, 0.0))
-        vehicle.autopilot.state.gps_healthy = True
+            plant.drift_estimate((step_m, step_m, 0.0))
+        plant.gps_healthy = True
         if drifted_m:
-            vehicle.autopilot.plant.reset_estimate((-drifted_m, -drifted_m, 0.0))
+            plant.reset_estimate((-drifted_m, -drifted_m, 0.0))
 
 
 class VelocityError(Timed):
@@ -122,27 +121,19 @@ class VelocityError(Timed):
     offset_ned_mps: Triple
 
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
-        vehicle.autopilot.state.velocity_error_ned_mps = self.offset_ned_mps
+        vehicle.autopilot.plant.velocity_error_ned_mps[:] = self.offset_ned_mps
         yield from until_the_end()
-        vehicle.autopilot.state.velocity_error_ned_mps = (0.0, 0.0, 0.0)
-
-
-class LandedState(StrEnum):
-    """What EXTENDED_SYS_STATE can report wrongly."""
-
-    ON_GROUND = "on_ground"
-    IN_AIR = "in_air"
+        vehicle.autopilot.plant.velocity_error_ned_mps[:] = 0.0
 
 
 class WrongLandedState(Timed):
     """EXTENDED_SYS_STATE reports this state; the autopilot itself knows the true one."""
 
     fault: Literal["wrong_landed_state"]
-    reports: LandedState
+    reports: Literal["on_ground", "in_air"]
 
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
-        on_ground = self.reports is LandedState.ON_GROUND
-        vehicle.view.wrong_landed_state = 1 if on_ground else 2
+        vehicle.view.wrong_landed_state = 1 if self.reports == "on_ground" else 2
         yield from until_the_end()
         vehicle.view.wrong_landed_state = None
 
@@ -157,19 +148,11 @@ class BlindLandDetector(Timed):
             vehicle.autopilot.position_controller.detector.reset()
 
 
-class Refusable(StrEnum):
-    """Requests that a fault can make the autopilot refuse."""
-
-    ARM = "arm"
-    OFFBOARD = "offboard"
-    TAKEOFF = "takeoff"
-
-
-# events that are refused, and the beginning of the text
+# requests that a fault makes the autopilot refuse: their events, and the beginning of the text
 _REFUSED = {
-    Refusable.ARM: (("arm", "force arm"), "Arming denied"),
-    Refusable.OFFBOARD: (("offboard",), "Switching to Offboard denied"),
-    Refusable.TAKEOFF: (("takeoff",), "Takeoff denied"),
+    "arm": (("arm", "force arm"), "Arming denied"),
+    "offboard": (("offboard",), "Switching to Offboard denied"),
+    "takeoff": (("takeoff",), "Takeoff denied"),
 }
 
 
@@ -177,16 +160,16 @@ class Refusal(Timed):
     """The autopilot refuses a request, with a text."""
 
     fault: Literal["refusal"]
-    of: Refusable
+    of: Literal["arm", "offboard", "takeoff"]
     text: str = Field(default="Resolve system health failures first", min_length=1, max_length=200)
 
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
         events, title = _REFUSED[self.of]
-        for event in events:
-            vehicle.autopilot.commander.refused[event] = critical(f"{title}: {self.text}")
+        refused = vehicle.autopilot.commander.refused  # a reboot keeps it
+        refused |= dict.fromkeys(events, critical(f"{title}: {self.text}"))
         yield from until_the_end()
         for event in events:
-            vehicle.autopilot.commander.refused.pop(event, None)
+            refused.pop(event, None)
 
 
 class PilotTakesOver(Timed):

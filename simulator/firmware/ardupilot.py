@@ -14,7 +14,7 @@ from typing import Any
 from simulator.autopilot.state import StateEstimate
 from simulator.firmware import ardupilot_messages as telemetry
 from simulator.firmware.ardupilot_tables import MODES, PARAMETERS, ROLES, RULES
-from simulator.firmware.base import Firmware, Landing, PositionGains, StickFlight
+from simulator.firmware.base import Firmware, Landing, PositionGains
 from simulator.firmware.values import (
     NAN3,
     Asked,
@@ -28,7 +28,6 @@ from simulator.firmware.values import (
     info,
     warning,
 )
-from simulator.mavlink.telemetry import builders_in
 from simulator.vehicle.battery import BatteryState
 
 _CUSTOM_MODE_ENABLED = 1
@@ -207,7 +206,6 @@ class ArduCopter(Firmware):
             speed_down_mps=2.5,
             tilt_max_rad=math.radians(parameter("ANGLE_MAX") * 0.01),
             thrust_max=1.0,
-            derivative_cutoff_hz=5.0,
             turn_radps=math.radians(parameter("ATC_SLEW_YAW") * 0.01),
             speeding_mps2=parameter("WPNAV_ACCEL") * 0.01,
             braking_mps2=0.5 * parameter("WPNAV_ACCEL") * 0.01,  # as the jerk is limited
@@ -270,7 +268,7 @@ ARDUPILOT = ArduCopter(
     mission_text=info("Flight plan received"),
     companion_rates_hz=telemetry.COMPANION_RATES_HZ,
     ground_rates_hz=telemetry.GROUND_RATES_HZ,
-    messages=builders_in(telemetry),
+    messages=telemetry,
     ground_station_parameter="SYSID_MYGCS",
     withheld_until={
         "LOCAL_POSITION_NED": "position",
@@ -317,14 +315,5 @@ ARDUPILOT = ArduCopter(
         place_below_is_descent=True,
     ),
     descend_speed_mps=2.4,
-    sticks=StickFlight(
-        # throttle down; mode switch and other channels as SITL has them
-        default_pulses_us=(1500, 1500, 1000, 1500, 1800, 1000, 1000, 1800),
-        climb_mps=2.5,  # PILOT_SPEED_UP
-        turn_radps=math.radians(202.5),  # PILOT_Y_RATE
-        speed_mps=12.5,  # LOIT_SPEED
-        acceleration_mps2=3.57,  # of two thirds of ANGLE_MAX
-        braking_mps2=2.5,  # LOIT_BRK_ACCEL
-        braking_after_s=1.0,  # LOIT_BRK_DELAY
-    ),
+    flown_by_sticks=True,
 )

@@ -49,19 +49,19 @@ def heartbeat(view: View) -> Sequence[Any]:
 def sim_state(view: View) -> Sequence[Any]:
     """True state without time stamp; latitude and longitude have a resolution of 1 cm."""
     truth = view.autopilot.state.truth
-    north, east, down = truth.position_ned_m.tolist()
+    north, east, down = truth.position_ned_m
     latitude, longitude = view.geodetic(north, east)
     return (
-        *truth.attitude.tolist(),
+        *truth.attitude,
         *euler_from_quaternion(truth.attitude).tolist(),
         *view.specific_force,
-        *truth.rates_frd_radps.tolist(),
+        *truth.rates_frd_radps,
         latitude * 1e-7,
         longitude * 1e-7,
         view.altitude_mm(down) * 1e-3,
         0.0,
         0.0,
-        *truth.velocity_ned_mps.tolist(),
+        *truth.velocity_ned_mps,
         latitude,
         longitude,
     )
@@ -79,8 +79,9 @@ def ekf_status_report(view: View) -> Sequence[Any]:
 
 def rc_channels(view: View) -> Sequence[Any]:
     """The channels of SITL without RC, or those of RC_CHANNELS_OVERRIDE."""
-    sticks, now_s = view.autopilot.guidance.sticks, view.autopilot.state.time_s
-    widths_us = () if sticks is None else sticks.pulses_us(now_s)
+    sticks = view.autopilot.guidance.sticks
+    assert sticks is not None
+    widths_us = sticks.pulses_us(view.autopilot.state.time_s)
     return (view.time_ms, len(widths_us), *widths_us, *(0,) * (18 - len(widths_us)), 255)
 
 

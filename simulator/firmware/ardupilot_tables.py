@@ -47,79 +47,79 @@ MODES = {
 }
 
 
-def _real(name: str, default: float, meaning: str, least: float = -3.4e38) -> ParameterSpec:
-    return ParameterSpec(name, "real32", default, least, 3.4e38, meaning)
+def _real(name: str, default: float, least: float = -3.4e38) -> ParameterSpec:
+    return ParameterSpec(name, "real32", default, least, 3.4e38)
 
 
-def _int8(name: str, default: int, meaning: str) -> ParameterSpec:
-    return ParameterSpec(name, "int8", default, *RANGES["int8"], meaning)
+def _int8(name: str, default: int) -> ParameterSpec:
+    return ParameterSpec(name, "int8", default, *RANGES["int8"])
 
 
-def _int16(name: str, default: int, meaning: str) -> ParameterSpec:
-    return ParameterSpec(name, "int16", default, *RANGES["int16"], meaning)
+def _int16(name: str, default: int) -> ParameterSpec:
+    return ParameterSpec(name, "int16", default, *RANGES["int16"])
 
 
-def _int32(name: str, default: int, meaning: str) -> ParameterSpec:
-    return ParameterSpec(name, "int32", default, *RANGES["int32"], meaning)
+def _int32(name: str, default: int) -> ParameterSpec:
+    return ParameterSpec(name, "int32", default, *RANGES["int32"])
 
 
 PARAMETERS = (
-    ParameterSpec("ANGLE_MAX", "int16", 3000, 1000, 8000, "cdeg, greatest tilt it flies by itself"),
-    _int32("ARMING_CHECK", 1, "pre-arm checks, 1 all"),
-    _real("ATC_ACCEL_P_MAX", 110000.0, "cdeg/s^2 of pitch"),
-    _real("ATC_ACCEL_R_MAX", 110000.0, "cdeg/s^2 of roll"),
-    _int8("ATC_ANGLE_BOOST", 1, "divide thrust by the cosine of the tilt"),
-    _real("ATC_INPUT_TC", 0.15, "s, shaping of demanded attitudes"),
-    _real("ATC_SLEW_YAW", 6000.0, "cdeg/s, largest yaw rate"),
-    _int32("AUTO_OPTIONS", 0, "bit 0 arms in AUTO"),
-    _real("BATT_ARM_VOLT", 0.0, "V below which arming is refused, 0 off"),
-    _int32("BATT_CAPACITY", 3300, "mAh"),
-    _real("BATT_CRT_MAH", 0.0, "mAh left at which it is critical, 0 off"),
-    _real("BATT_CRT_VOLT", 0.0, "V below which it is critical, 0 off"),
-    _int8("BATT_FS_CRT_ACT", 0, "battery critical: 0 nothing, 1 LAND, 2 RTL, 3 or 4 SMART_RTL"),
-    _int8("BATT_FS_LOW_ACT", 0, "battery low: 0 nothing, 1 LAND, 2 RTL, 3 or 4 SMART_RTL"),
-    _real("BATT_LOW_MAH", 0.0, "mAh left at which it is low, 0 off"),
-    _int8("BATT_LOW_TIMER", 10, "s below the limit until the failsafe acts"),
-    _real("BATT_LOW_VOLT", 10.5, "V below which it is low, 0 off"),
-    _int8("BATT_MONITOR", 4, "battery monitor, 4 voltage and current"),
-    _int8("DISARM_DELAY", 10, "s armed on the ground until disarming, 0 never"),
-    _int8("FLTMODE_CH", 5, "channel of the mode switch"),
-    _int8("FRAME_CLASS", 1, "1 quadrotor"),
-    _int8("FRAME_TYPE", 0, "0 plus"),
-    _int8("FS_EKF_ACTION", 1, "estimator lost: 0 nothing, 1 or 3 LAND, 2 ALT_HOLD"),
-    _real("FS_EKF_THRESH", 0.8, "variance at which the estimator is lost"),
-    _int8("FS_GCS_ENABLE", 0, "ground station lost: 0 nothing, 1 RTL, 5 LAND"),
-    _real("FS_GCS_TIMEOUT", 5.0, "s without heartbeat until the ground station is lost"),
-    _int32("FS_OPTIONS", 16, "bits: cases in which failsafes do not act"),
-    _int8("FS_THR_ENABLE", 1, "radio lost: 0 nothing, 1 RTL"),
-    _int32("GUID_OPTIONS", 0, "bit 3: the thrust field is thrust, not a climb rate"),
-    _real("GUID_TIMEOUT", 3.0, "s without setpoint until the vehicle levels or stops"),
-    _int16("LAND_ALT_LOW", 1000, "cm below which it lands with LAND_SPEED"),
-    _int16("LAND_SPEED", 50, "cm/s near the ground"),
-    _int16("LAND_SPEED_HIGH", 0, "cm/s higher up, 0 WPNAV_SPEED_DN"),
-    _int8("MIS_RESTART", 0, "AUTO: 0 resumes the mission, 1 restarts it"),
-    _int16("MIS_TOTAL", 0, "items of the mission"),
-    _int8("MOT_HOVER_LEARN", 2, "learn the hover thrust: 1 until reboot, 2 saved"),
-    _real("MOT_THST_EXPO", 0.65, "curvature of thrust over throttle, 0 linear"),
-    _real("MOT_THST_HOVER", 0.39, "hover thrust, normalised"),
-    _real("PSC_JERK_XY", 5.0, "m/s^3 across the ground; without effect"),
-    _real("PSC_POSXY_P", 1.0, "1/s"),
-    _real("PSC_POSZ_P", 1.0, "1/s"),
-    _real("PSC_VELXY_P", 2.0, "1/s"),
-    _int32("RTL_ALT", 1500, "cm above home while returning"),
-    _int16("RTL_ALT_FINAL", 0, "cm above home where RTL ends, 0 lands"),
-    _real("RTL_CONE_SLOPE", 3.0, "slope of the cone that limits the height of RTL, 0 off"),
-    _int32("RTL_LOIT_TIME", 5000, "ms of loiter above home before RTL lands"),
-    _int16("SCHED_LOOP_RATE", 400, "Hz"),
-    _int8("SYSID_ENFORCE", 0, "1: obey SYSID_MYGCS only"),
-    _int16("SYSID_MYGCS", 255, "system id of the ground station"),
-    _int16("SYSID_THISMAV", 1, "system id"),
-    _real("WPNAV_ACCEL", 250.0, "cm/s^2 across the ground", 1.0),
-    _real("WPNAV_RADIUS", 200.0, "cm, a waypoint is reached", 5.0),
-    _real("WPNAV_SPEED", 1000.0, "cm/s of automatic flight", 10.0),
-    _real("WPNAV_SPEED_DN", 150.0, "cm/s of descent"),
-    _real("WPNAV_SPEED_UP", 250.0, "cm/s of climb"),
-    _int8("WP_YAW_BEHAVIOR", 2, "yaw: 0 unchanged, 1 to the waypoint, 2 the same except in RTL"),
+    ParameterSpec("ANGLE_MAX", "int16", 3000, 1000, 8000),  # cdeg, greatest tilt it flies by itself
+    _int32("ARMING_CHECK", 1),  # pre-arm checks, 1 all
+    _real("ATC_ACCEL_P_MAX", 110000.0),  # cdeg/s^2 of pitch
+    _real("ATC_ACCEL_R_MAX", 110000.0),  # cdeg/s^2 of roll
+    _int8("ATC_ANGLE_BOOST", 1),  # divide thrust by the cosine of the tilt
+    _real("ATC_INPUT_TC", 0.15),  # s, shaping of demanded attitudes
+    _real("ATC_SLEW_YAW", 6000.0),  # cdeg/s, largest yaw rate
+    _int32("AUTO_OPTIONS", 0),  # bit 0 arms in AUTO
+    _real("BATT_ARM_VOLT", 0.0),  # V below which arming is refused, 0 off
+    _int32("BATT_CAPACITY", 3300),  # mAh
+    _real("BATT_CRT_MAH", 0.0),  # mAh left at which it is critical, 0 off
+    _real("BATT_CRT_VOLT", 0.0),  # V below which it is critical, 0 off
+    _int8("BATT_FS_CRT_ACT", 0),  # battery critical: 0 nothing, 1 LAND, 2 RTL, 3 or 4 SMART_RTL
+    _int8("BATT_FS_LOW_ACT", 0),  # battery low: 0 nothing, 1 LAND, 2 RTL, 3 or 4 SMART_RTL
+    _real("BATT_LOW_MAH", 0.0),  # mAh left at which it is low, 0 off
+    _int8("BATT_LOW_TIMER", 10),  # s below the limit until the failsafe acts
+    _real("BATT_LOW_VOLT", 10.5),  # V below which it is low, 0 off
+    _int8("BATT_MONITOR", 4),  # battery monitor, 4 voltage and current
+    _int8("DISARM_DELAY", 10),  # s armed on the ground until disarming, 0 never
+    _int8("FLTMODE_CH", 5),  # channel of the mode switch
+    _int8("FRAME_CLASS", 1),  # 1 quadrotor
+    _int8("FRAME_TYPE", 0),  # 0 plus
+    _int8("FS_EKF_ACTION", 1),  # estimator lost: 0 nothing, 1 or 3 LAND, 2 ALT_HOLD
+    _real("FS_EKF_THRESH", 0.8),  # variance at which the estimator is lost
+    _int8("FS_GCS_ENABLE", 0),  # ground station lost: 0 nothing, 1 RTL, 5 LAND
+    _real("FS_GCS_TIMEOUT", 5.0),  # s without heartbeat until the ground station is lost
+    _int32("FS_OPTIONS", 16),  # bits: cases in which failsafes do not act
+    _int8("FS_THR_ENABLE", 1),  # radio lost: 0 nothing, 1 RTL
+    _int32("GUID_OPTIONS", 0),  # bit 3: the thrust field is thrust, not a climb rate
+    _real("GUID_TIMEOUT", 3.0),  # s without setpoint until the vehicle levels or stops
+    _int16("LAND_ALT_LOW", 1000),  # cm below which it lands with LAND_SPEED
+    _int16("LAND_SPEED", 50),  # cm/s near the ground
+    _int16("LAND_SPEED_HIGH", 0),  # cm/s higher up, 0 WPNAV_SPEED_DN
+    _int8("MIS_RESTART", 0),  # AUTO: 0 resumes the mission, 1 restarts it
+    _int16("MIS_TOTAL", 0),  # items of the mission
+    _int8("MOT_HOVER_LEARN", 2),  # learn the hover thrust: 1 until reboot, 2 saved
+    _real("MOT_THST_EXPO", 0.65),  # curvature of thrust over throttle, 0 linear
+    _real("MOT_THST_HOVER", 0.39),  # hover thrust, normalised
+    _real("PSC_JERK_XY", 5.0),  # m/s^3 across the ground; without effect
+    _real("PSC_POSXY_P", 1.0),  # 1/s
+    _real("PSC_POSZ_P", 1.0),  # 1/s
+    _real("PSC_VELXY_P", 2.0),  # 1/s
+    _int32("RTL_ALT", 1500),  # cm above home while returning
+    _int16("RTL_ALT_FINAL", 0),  # cm above home where RTL ends, 0 lands
+    _real("RTL_CONE_SLOPE", 3.0),  # slope of the cone that limits the height of RTL, 0 off
+    _int32("RTL_LOIT_TIME", 5000),  # ms of loiter above home before RTL lands
+    _int16("SCHED_LOOP_RATE", 400),  # Hz
+    _int8("SYSID_ENFORCE", 0),  # 1: obey SYSID_MYGCS only
+    _int16("SYSID_MYGCS", 255),  # system id of the ground station
+    _int16("SYSID_THISMAV", 1),  # system id
+    _real("WPNAV_ACCEL", 250.0, 1.0),  # cm/s^2 across the ground
+    _real("WPNAV_RADIUS", 200.0, 5.0),  # cm, a waypoint is reached
+    _real("WPNAV_SPEED", 1000.0, 10.0),  # cm/s of automatic flight
+    _real("WPNAV_SPEED_DN", 150.0),  # cm/s of descent
+    _real("WPNAV_SPEED_UP", 250.0),  # cm/s of climb
+    _int8("WP_YAW_BEHAVIOR", 2),  # yaw: 0 unchanged, 1 to the waypoint, 2 the same except in RTL
 )
 
 _CENTI = 0.01
@@ -169,15 +169,6 @@ _ARMING = Rule("arm", do=("arm",), texts=(info("Arming motors"),), send=_ORIGIN_
 _DISARMING = info("Disarming motors")
 
 _UNTIL_REBOOT = ("failsafe", "latch")
-# FS_GCS_ENABLE 6 looks for a landing sequence in the mission first
-_FURTHER_TEXTS = {
-    ("ground station lost", 6): (
-        warning("Unable to start landing sequence"),
-        warning("Mode change to AUTO RTL failed: No return path or landing sequence found"),
-        warning("Trying RTL Mode"),
-    ),
-}
-
 _FAILSAFE = {
     "ground station lost": (warning("GCS Failsafe"),),
     "battery low": (
@@ -201,7 +192,7 @@ def _failsafe(
             when=("armed", f"{parameter}={value}"),
             to=mode,
             do=do,
-            texts=(*_FAILSAFE[event], *_FURTHER_TEXTS.get((event, value), ())),
+            texts=_FAILSAFE[event],
             send=_HEARTBEAT,
         )
         for value, mode in modes.items()
@@ -211,7 +202,7 @@ def _failsafe(
 # Modes that FS_OPTIONS bit 4 leaves to the pilot
 _PILOTED = ("STABILIZE", "ACRO", "ALT_HOLD", "LOITER", "DRIFT", "POSHOLD", "BRAKE", "THROW")
 _BATTERY_MODES = {1: "LAND", 2: "RTL", 3: "SMART_RTL", 4: "SMART_RTL", 7: "BRAKE"}
-_GROUND_MODES = {**_BATTERY_MODES, 1: "RTL", 5: "LAND", 6: "RTL"}
+_GROUND_MODES = {**_BATTERY_MODES, 1: "RTL", 5: "LAND"}
 
 
 def _refusals(event: str, prefix: str, result: Result) -> list[Rule]:
@@ -319,6 +310,19 @@ RULES = (
         for mode in _PILOTED
     ),
     *_failsafe("ground station lost", "FS_GCS_ENABLE", _GROUND_MODES),
+    Rule(  # it looks for a landing sequence in the mission first
+        "ground station lost",
+        when=("armed", "FS_GCS_ENABLE=6"),
+        to="RTL",
+        do=("failsafe",),
+        texts=(
+            *_FAILSAFE["ground station lost"],
+            warning("Unable to start landing sequence"),
+            warning("Mode change to AUTO RTL failed: No return path or landing sequence found"),
+            warning("Trying RTL Mode"),
+        ),
+        send=_HEARTBEAT,
+    ),
     Rule(
         "ground station found",
         when=("since ground station lost",),

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field
+from types import ModuleType
 from typing import Any, Literal
 
 from simulator.autopilot.state import StateEstimate
@@ -45,25 +46,10 @@ class ParameterSpec:
     default: float
     minimum: float
     maximum: float
-    meaning: str
 
 
 AFTER_DELAY = " after delay"
 """Ends the event of a failsafe whose action was delayed."""
-
-EVENTS = frozenset({
-    # requests: commands, messages, faults that act for a pilot
-    "mode", "takeoff", "land", "return", "loiter", "turn", "mission", "reboot", "terminate",
-    "arm", "disarm", "force arm", "force disarm", "checks", "thrust not a number",
-    # monitoring
-    "stream lost", "stream found", "position lost", "position found",
-    "ground station lost", "ground station found",
-    "battery low", "battery critical", "battery emergency",
-    # flight
-    "took off", "landed", "settled", "idle", "climbed", "already higher", "item reached",
-    "mission progress", "mission return", "mission finished",
-})  # fmt: skip
-"""Events of every firmware; `Firmware.boot_events_s` has those of the start."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +57,7 @@ class Rule:
     """One row of the state table: the first row that fits an event decides.
 
     Args:
-        event: one of EVENTS, or a boot event.
+        event: its name; those of the start are in `Firmware.boot_events_s`.
         mode: name of the mode in which it happened, or "*".
         when: conditions that must all hold (`simulator.autopilot.commander.CONDITIONS`). "not X"
             negates, "NAME=2" compares a parameter, "since X" is a failsafe because of event X,
@@ -107,7 +93,6 @@ class PositionGains:
     speed_down_mps: float
     tilt_max_rad: float
     thrust_max: float
-    derivative_cutoff_hz: float
     # of automatic flight
     turn_radps: float
     speeding_mps2: float
@@ -127,19 +112,6 @@ class Landing:
     speed_across_mps: float
     rate_radps: float  # roll and pitch together
     place_below_is_descent: bool
-
-
-@dataclass(frozen=True, slots=True)
-class StickFlight:
-    """How a firmware flies by sticks."""
-
-    default_pulses_us: tuple[int, ...]  # without RC: roll, pitch, throttle, yaw, further channels
-    climb_mps: float  # at full throttle, and down without
-    turn_radps: float
-    speed_mps: float
-    acceleration_mps2: float  # at full deflection
-    braking_mps2: float  # with all sticks centred
-    braking_after_s: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,8 +170,7 @@ class Firmware(ABC):
     # telemetry
     companion_rates_hz: Mapping[str, float]  # without a request, by link
     ground_rates_hz: Mapping[str, float]
-    # message -> builder, beside `simulator.mavlink.messages` or in place of one
-    messages: Mapping[str, Callable[[Any], Sequence[Any]]]
+    messages: ModuleType  # builders beside those of `simulator.mavlink.messages`, or in their place
     withheld_until: Mapping[str, str] = field(default_factory=dict)  # by message: boot event
     # message -> version of its content: a message that is due waits until it is a new one
     message_versions: Mapping[str, Callable[[Any], Hashable]] = field(default_factory=dict)
@@ -243,7 +214,7 @@ class Firmware(ABC):
     integrates_on_ramp: bool = False  # position loop, in a takeoff that still stands on the ground
     landing: Landing
     descend_speed_mps: float  # in a manual mode without stick input
-    sticks: StickFlight | None = None  # None: not flown by sticks
+    flown_by_sticks: bool = False
 
     def mode_named(self, name: str) -> Mode | None:
         """Mode by its name, of which "AUTO." may be left out; None where there is none."""

@@ -27,20 +27,15 @@ from simulator.firmware.values import (
     Triple,
     critical,
 )
-from simulator.mavlink.telemetry import builders_in
 from simulator.vehicle.battery import BatteryState
 
-# PX4_CUSTOM_MAIN_MODE, PX4_CUSTOM_SUB_MODE_AUTO
-_MAIN = {1: "MANUAL", 2: "ALTCTL", 3: "POSCTL", 5: "ACRO", 6: "OFFBOARD", 7: "STABILIZED"}
-_AUTO_SUB = {
-    2: "AUTO.TAKEOFF",
-    3: "AUTO.LOITER",
-    4: "AUTO.MISSION",
-    5: "AUTO.RTL",
-    6: "AUTO.LAND",
-    8: "AUTO.FOLLOW",
-    9: "AUTO.PRECLAND",
+# By PX4_CUSTOM_MAIN_MODE and PX4_CUSTOM_SUB_MODE_AUTO
+_BY_NUMBER = {
+    (mode.custom_mode >> 16 & 0xFF, mode.custom_mode >> 24): mode.name
+    for mode in MODES.values()
+    if mode.name != "TERMINATION"
 }
+_AUTO = 4  # main mode
 _CUSTOM_MODE_ENABLED = 1
 _NO_AUTO_MODE = critical("Unsupported auto mode")
 
@@ -79,10 +74,10 @@ class Px4(Firmware):
         base, main, sub = (int(p) if math.isfinite(p) else 0 for p in params[:3])
         if not base & _CUSTOM_MODE_ENABLED:
             return Asked(refusal=Result.ACCEPTED)
-        if main == 4:
-            known = _AUTO_SUB.get(sub, "")
+        if main == _AUTO:
+            known = _BY_NUMBER.get((main, sub), "")
             return Asked(known, Result.TEMPORARILY_REJECTED, _NO_AUTO_MODE)
-        return Asked(_MAIN.get(main, ""), Result.ACCEPTED)
+        return Asked(_BY_NUMBER.get((main, 0), ""), Result.ACCEPTED)
 
     def set_mode(self, base_mode: int, custom_mode: int) -> Asked:
         """SET_MODE: main mode in the third byte of custom_mode, sub mode in the fourth."""
@@ -213,7 +208,6 @@ class Px4(Firmware):
             speed_down_mps=parameter("MPC_Z_VEL_MAX_DN"),
             tilt_max_rad=math.radians(parameter("MPC_TILTMAX_AIR")),
             thrust_max=parameter("MPC_THR_MAX"),
-            derivative_cutoff_hz=5.0,
             turn_radps=math.radians(parameter("MPC_YAWRAUTO_MAX")),
             # jerk is limited in the real one (MPC_JERK_AUTO), which lowers both on average
             speeding_mps2=0.7 * parameter("MPC_ACC_HOR"),
@@ -273,7 +267,7 @@ PX4 = Px4(
     turning_items=frozenset({16, 17, 19, 21}),
     companion_rates_hz=telemetry.COMPANION_RATES_HZ,
     ground_rates_hz=telemetry.GROUND_RATES_HZ,
-    messages=builders_in(telemetry),
+    messages=telemetry,
     message_versions=telemetry.VERSIONS,
     position_grid_steps=2,
     fixed_streams=telemetry.ON_EVENT | {"HEARTBEAT"},

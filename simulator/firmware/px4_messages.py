@@ -6,9 +6,9 @@ import math
 from collections.abc import Hashable, Sequence
 from typing import Any
 
-from simulator.autopilot.position_loop import GRAVITY_MPS2
 from simulator.firmware.px4_tables import OFFBOARD, RATES
 from simulator.firmware.values import AttitudeSetpoint, Behaviour
+from simulator.geodesy import GRAVITY_MPS2
 from simulator.mavlink.view import View, centi, fit, pressure_hpa
 
 COMPANION_RATES_HZ = {
@@ -147,24 +147,19 @@ def highres_imu(view: View) -> Sequence[Any]:
 def hil_state_quaternion(view: View) -> Sequence[Any]:
     """True state. Latitude and longitude have a resolution of 1 cm."""
     truth = view.autopilot.state.truth
-    north, east, down = truth.position_ned_m.tolist()
-    a, b, c = (
-        fit(value / GRAVITY_MPS2 * 1e3, 16) for value in truth.acceleration_ned_mps2.tolist()
-    )
-    v_north, v_east, v_down = truth.velocity_ned_mps.tolist()
+    north, east, down = truth.position_ned_m
+    v_north, v_east, _ = truth.velocity_ned_mps
     airspeed = fit(math.hypot(v_north, v_east) * 100, 16, signed=False)
     return (
         view.time_us,
-        truth.attitude.tolist(),
-        *truth.rates_frd_radps.tolist(),
+        truth.attitude,
+        *truth.rates_frd_radps,
         *view.geodetic(north, east),
         view.altitude_mm(down),
-        *centi((v_north, v_east, v_down)),
+        *centi(truth.velocity_ned_mps),
         airspeed,
         airspeed,
-        a,
-        b,
-        c,
+        *(fit(value / GRAVITY_MPS2 * 1e3, 16) for value in truth.acceleration_ned_mps2),
     )
 
 

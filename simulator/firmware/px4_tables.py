@@ -52,86 +52,86 @@ MODES = {
 }
 
 
-def _real(name: str, default: float, low: float, high: float, meaning: str) -> ParameterSpec:
-    return ParameterSpec(name, "real32", default, low, high, meaning)
+def _real(name: str, default: float, low: float, high: float) -> ParameterSpec:
+    return ParameterSpec(name, "real32", default, low, high)
 
 
-def _int(name: str, default: int, low: int, high: int, meaning: str) -> ParameterSpec:
-    return ParameterSpec(name, "int32", default, low, high, meaning)
+def _int(name: str, default: int, low: int, high: int) -> ParameterSpec:
+    return ParameterSpec(name, "int32", default, low, high)
 
 
 PARAMETERS = (
-    _int("BAT1_N_CELLS", 4, 1, 16, "cells of the battery"),
-    _real("BAT_CRIT_THR", 0.07, 0.05, 0.5, "remaining share at which the battery is critical"),
-    _real("BAT_EMERGEN_THR", 0.05, 0.03, 0.5, "remaining share that is an emergency"),
-    _real("BAT_LOW_THR", 0.15, 0.12, 0.5, "remaining share at which the battery is low"),
-    _int("CAL_ACC0_ID", 1310988, 0, 2147483647, "calibrated accelerometer"),
-    _int("CAL_GYRO0_ID", 1310988, 0, 2147483647, "calibrated gyroscope"),
-    _int("CAL_MAG0_ID", 197388, 0, 2147483647, "calibrated magnetometer"),
-    _int("COM_ARM_WO_GPS", 1, 0, 2, "arm without GPS: 1 with a warning"),
-    _real("COM_DISARM_LAND", 2.0, -1, 20, "s from landing to disarming, < 0 never"),
-    _real("COM_DISARM_PRFLT", 10.0, -1, 100, "s armed without takeoff until disarming, < 0 never"),
-    _int("COM_DL_LOSS_T", 10, 5, 300, "s without ground station until it is lost"),
-    _real("COM_FAIL_ACT_T", 5.0, 0, 25, "s of hold before a failsafe acts"),
-    _int("COM_LOW_BAT_ACT", 3, 0, 3, "battery: 0 warning, 1 return, 2 land, 3 return or land"),
-    _int("COM_OBL_RC_ACT", 0, 0, 5, "offboard lost: POSCTL ALTCTL STABILIZED RTL LAND LOITER"),
-    _real("COM_OF_LOSS_T", 1.0, 0, 60, "s without setpoint until offboard is lost"),
-    _int("COM_RCL_EXCEPT", 0, 0, 31, "modes without failsafe when sticks are lost, bit 2 offboard"),
-    _int("COM_RC_IN_MODE", 1, 0, 4, "manual input: 0 RC, 1 joystick, 4 none"),
-    _real("COM_SPOOLUP_TIME", 1.0, 0, 30, "s from arming until takeoff may begin"),
-    _int("COM_TAKEOFF_ACT", 0, 0, 1, "after takeoff: 0 hold"),
-    _int("EKF2_NOAID_TOUT", 5000000, 500000, 10000000, "us without aiding until position is lost"),
-    _int("GF_ACTION", 2, 0, 5, "geofence: 2 hold"),
-    _real("LNDMC_TRIG_TIME", 1.0, 0.1, 10, "s of each of three stages of land detection"),
-    _int("MAV_SYS_ID", 1, 1, 250, "system id; read at start"),
-    _int("MAV_TYPE", 2, 0, 22, "MAV_TYPE"),
-    _real("MIS_TAKEOFF_ALT", 2.5, 0, 80, "m, takeoff height"),
-    _int("MIS_TKO_LAND_REQ", 0, 0, 4, "what a mission must have"),
-    _real("MPC_ACC_DOWN_MAX", 3.0, 2, 15, "m/s^2 downwards of automatic flight"),
-    _real("MPC_ACC_HOR", 3.0, 2, 15, "m/s^2 across of automatic flight"),
-    _real("MPC_LAND_ALT1", 10.0, 0, 122, "m below which a descent slows down"),
-    _real("MPC_LAND_ALT2", 5.0, 0, 122, "m below which the speed is MPC_LAND_SPEED"),
-    _real("MPC_LAND_ALT3", 1.0, 0, 122, "m above ground, below which MPC_LAND_CRWL applies"),
-    _real("MPC_LAND_CRWL", 0.3, 0.1, 10, "m/s of descent just above the ground"),
-    _real("MPC_LAND_SPEED", 0.7, 0.6, 10, "m/s near the ground"),
-    _real("MPC_MANTHR_MIN", 0.08, 0, 1, "least thrust of stick flight"),
-    _real("MPC_THR_HOVER", 0.5, 0.1, 0.8, "hover thrust, normalised"),
-    _real("MPC_THR_MAX", 1.0, 0, 1, "most thrust of the position loop"),
-    _real("MPC_THR_MIN", 0.12, 0.05, 0.5, "least thrust of the position loop"),
-    _real("MPC_TILTMAX_AIR", 45.0, 20, 89, "deg"),
-    _real("MPC_TKO_RAMP_T", 3.0, 0, 5, "s until the climb rate of a takeoff is reached"),
-    _real("MPC_TKO_SPEED", 1.5, 1, 5, "m/s of climb at takeoff"),
-    _int("MPC_USE_HTE", 1, 0, 1, "estimate the hover thrust"),
-    _real("MPC_XY_CRUISE", 5.0, 3, 20, "m/s of automatic flight"),
-    _real("MPC_XY_P", 0.95, 0, 2, "1/s"),
-    _real("MPC_XY_VEL_D_ACC", 0.2, 0.1, 2, "-"),
-    _real("MPC_XY_VEL_I_ACC", 0.4, 0, 60, "1/s^2"),
-    _real("MPC_XY_VEL_MAX", 12.0, 0, 20, "m/s"),
-    _real("MPC_XY_VEL_P_ACC", 1.8, 1.2, 5, "1/s"),
-    _real("MPC_YAWRAUTO_MAX", 45.0, 5, 360, "deg/s of turns in automatic flight"),
-    _int("MPC_YAW_MODE", 0, 0, 4, "yaw of automatic flight: 0 towards the waypoint"),
-    _real("MPC_Z_P", 1.0, 0.1, 1.5, "1/s"),
-    _real("MPC_Z_VEL_D_ACC", 0.0, 0, 2, "-"),
-    _real("MPC_Z_VEL_I_ACC", 2.0, 0.2, 3, "1/s^2"),
-    _real("MPC_Z_VEL_MAX_DN", 1.5, 0.5, 4, "m/s"),
-    _real("MPC_Z_VEL_MAX_UP", 3.0, 0.5, 8, "m/s"),
-    _real("MPC_Z_VEL_P_ACC", 4.0, 2, 15, "1/s"),
-    _real("MPC_Z_V_AUTO_DN", 1.5, 0.5, 4, "m/s of automatic descent"),
-    _real("MPC_Z_V_AUTO_UP", 3.0, 0.5, 8, "m/s of automatic climb"),
-    _real("NAV_ACC_RAD", 2.0, 0.05, 200, "m, a waypoint is reached"),
-    _int("NAV_DLL_ACT", 0, 0, 6, "ground station lost: 0 nothing, 1 hold, 2 return, 3 land"),
-    _real("NAV_MC_ALT_RAD", 0.8, 0.05, 200, "m, a height is reached"),
-    _int("NAV_RCL_ACT", 2, 1, 6, "sticks lost: 2 return"),
-    _int("RC_MAP_THROTTLE", 0, 0, 18, "channel of the throttle stick"),
-    _int("RTL_CONE_ANG", 45, 0, 90, "deg, of the cone above home within RTL_MIN_DIST"),
-    _real("RTL_DESCEND_ALT", 10.0, 0, 100, "m above home, where a return loiters"),
-    _real("RTL_LAND_DELAY", 0.0, -1, 600, "s of loiter there, < 0 without end"),
-    _real("RTL_MIN_DIST", 10.0, 0.5, 100, "m from home, within which RTL_CONE_ANG applies"),
-    _real("RTL_RETURN_ALT", 30.0, 0, 150, "m above home while returning"),
-    _int("RTL_TYPE", 0, 0, 5, "0 home or rally point"),
-    _int("SYS_AUTOCONFIG", 0, 0, 1, "set up the airframe at start"),
-    _int("SYS_AUTOSTART", 10040, 0, 9999999, "airframe"),
-    _int("SYS_HAS_GPS", 1, 0, 1, "1: has GPS"),
+    _int("BAT1_N_CELLS", 4, 1, 16),  # cells of the battery
+    _real("BAT_CRIT_THR", 0.07, 0.05, 0.5),  # remaining share at which the battery is critical
+    _real("BAT_EMERGEN_THR", 0.05, 0.03, 0.5),  # remaining share that is an emergency
+    _real("BAT_LOW_THR", 0.15, 0.12, 0.5),  # remaining share at which the battery is low
+    _int("CAL_ACC0_ID", 1310988, 0, 2147483647),  # calibrated accelerometer
+    _int("CAL_GYRO0_ID", 1310988, 0, 2147483647),  # calibrated gyroscope
+    _int("CAL_MAG0_ID", 197388, 0, 2147483647),  # calibrated magnetometer
+    _int("COM_ARM_WO_GPS", 1, 0, 2),  # arm without GPS: 1 with a warning
+    _real("COM_DISARM_LAND", 2.0, -1, 20),  # s from landing to disarming, < 0 never
+    _real("COM_DISARM_PRFLT", 10.0, -1, 100),  # s armed without takeoff until disarming, < 0 never
+    _int("COM_DL_LOSS_T", 10, 5, 300),  # s without ground station until it is lost
+    _real("COM_FAIL_ACT_T", 5.0, 0, 25),  # s of hold before a failsafe acts
+    _int("COM_LOW_BAT_ACT", 3, 0, 3),  # battery: 0 warning, 1 return, 2 land, 3 return or land
+    _int("COM_OBL_RC_ACT", 0, 0, 5),  # offboard lost: POSCTL ALTCTL STABILIZED RTL LAND LOITER
+    _real("COM_OF_LOSS_T", 1.0, 0, 60),  # s without setpoint until offboard is lost
+    _int("COM_RCL_EXCEPT", 0, 0, 31),  # modes without failsafe when sticks are lost, bit 2 offboard
+    _int("COM_RC_IN_MODE", 1, 0, 4),  # manual input: 0 RC, 1 joystick, 4 none
+    _real("COM_SPOOLUP_TIME", 1.0, 0, 30),  # s from arming until takeoff may begin
+    _int("COM_TAKEOFF_ACT", 0, 0, 1),  # after takeoff: 0 hold
+    _int("EKF2_NOAID_TOUT", 5000000, 500000, 10000000),  # us without aiding until position is lost
+    _int("GF_ACTION", 2, 0, 5),  # geofence: 2 hold
+    _real("LNDMC_TRIG_TIME", 1.0, 0.1, 10),  # s of each of three stages of land detection
+    _int("MAV_SYS_ID", 1, 1, 250),  # system id; read at start
+    _int("MAV_TYPE", 2, 0, 22),  # MAV_TYPE
+    _real("MIS_TAKEOFF_ALT", 2.5, 0, 80),  # m, takeoff height
+    _int("MIS_TKO_LAND_REQ", 0, 0, 4),  # what a mission must have
+    _real("MPC_ACC_DOWN_MAX", 3.0, 2, 15),  # m/s^2 downwards of automatic flight
+    _real("MPC_ACC_HOR", 3.0, 2, 15),  # m/s^2 across of automatic flight
+    _real("MPC_LAND_ALT1", 10.0, 0, 122),  # m below which a descent slows down
+    _real("MPC_LAND_ALT2", 5.0, 0, 122),  # m below which the speed is MPC_LAND_SPEED
+    _real("MPC_LAND_ALT3", 1.0, 0, 122),  # m above ground, below which MPC_LAND_CRWL applies
+    _real("MPC_LAND_CRWL", 0.3, 0.1, 10),  # m/s of descent just above the ground
+    _real("MPC_LAND_SPEED", 0.7, 0.6, 10),  # m/s near the ground
+    _real("MPC_MANTHR_MIN", 0.08, 0, 1),  # least thrust of stick flight
+    _real("MPC_THR_HOVER", 0.5, 0.1, 0.8),  # hover thrust, normalised
+    _real("MPC_THR_MAX", 1.0, 0, 1),  # most thrust of the position loop
+    _real("MPC_THR_MIN", 0.12, 0.05, 0.5),  # least thrust of the position loop
+    _real("MPC_TILTMAX_AIR", 45.0, 20, 89),  # deg
+    _real("MPC_TKO_RAMP_T", 3.0, 0, 5),  # s until the climb rate of a takeoff is reached
+    _real("MPC_TKO_SPEED", 1.5, 1, 5),  # m/s of climb at takeoff
+    _int("MPC_USE_HTE", 1, 0, 1),  # estimate the hover thrust
+    _real("MPC_XY_CRUISE", 5.0, 3, 20),  # m/s of automatic flight
+    _real("MPC_XY_P", 0.95, 0, 2),  # 1/s
+    _real("MPC_XY_VEL_D_ACC", 0.2, 0.1, 2),  # -
+    _real("MPC_XY_VEL_I_ACC", 0.4, 0, 60),  # 1/s^2
+    _real("MPC_XY_VEL_MAX", 12.0, 0, 20),  # m/s
+    _real("MPC_XY_VEL_P_ACC", 1.8, 1.2, 5),  # 1/s
+    _real("MPC_YAWRAUTO_MAX", 45.0, 5, 360),  # deg/s of turns in automatic flight
+    _int("MPC_YAW_MODE", 0, 0, 4),  # yaw of automatic flight: 0 towards the waypoint
+    _real("MPC_Z_P", 1.0, 0.1, 1.5),  # 1/s
+    _real("MPC_Z_VEL_D_ACC", 0.0, 0, 2),  # -
+    _real("MPC_Z_VEL_I_ACC", 2.0, 0.2, 3),  # 1/s^2
+    _real("MPC_Z_VEL_MAX_DN", 1.5, 0.5, 4),  # m/s
+    _real("MPC_Z_VEL_MAX_UP", 3.0, 0.5, 8),  # m/s
+    _real("MPC_Z_VEL_P_ACC", 4.0, 2, 15),  # 1/s
+    _real("MPC_Z_V_AUTO_DN", 1.5, 0.5, 4),  # m/s of automatic descent
+    _real("MPC_Z_V_AUTO_UP", 3.0, 0.5, 8),  # m/s of automatic climb
+    _real("NAV_ACC_RAD", 2.0, 0.05, 200),  # m, a waypoint is reached
+    _int("NAV_DLL_ACT", 0, 0, 6),  # ground station lost: 0 nothing, 1 hold, 2 return, 3 land
+    _real("NAV_MC_ALT_RAD", 0.8, 0.05, 200),  # m, a height is reached
+    _int("NAV_RCL_ACT", 2, 1, 6),  # sticks lost: 2 return
+    _int("RC_MAP_THROTTLE", 0, 0, 18),  # channel of the throttle stick
+    _int("RTL_CONE_ANG", 45, 0, 90),  # deg, of the cone above home within RTL_MIN_DIST
+    _real("RTL_DESCEND_ALT", 10.0, 0, 100),  # m above home, where a return loiters
+    _real("RTL_LAND_DELAY", 0.0, -1, 600),  # s of loiter there, < 0 without end
+    _real("RTL_MIN_DIST", 10.0, 0.5, 100),  # m from home, within which RTL_CONE_ANG applies
+    _real("RTL_RETURN_ALT", 30.0, 0, 150),  # m above home while returning
+    _int("RTL_TYPE", 0, 0, 5),  # 0 home or rally point
+    _int("SYS_AUTOCONFIG", 0, 0, 1),  # set up the airframe at start
+    _int("SYS_AUTOSTART", 10040, 0, 9999999),  # airframe
+    _int("SYS_HAS_GPS", 1, 0, 1),  # 1: has GPS
 )
 
 ROLES: dict[str, Role] = {

@@ -11,7 +11,7 @@ import select
 import selectors
 import socket
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from offboard.documents.errors import UserError, abridged
@@ -111,8 +111,7 @@ class TcpLink:
 
     def fileno(self) -> int:
         """File descriptor for select; it covers the listener and all clients."""
-        fileno = getattr(self._selector, "fileno", self._listener.fileno)
-        return int(fileno())
+        return self._selector.fileno()
 
     @property
     def port(self) -> int:
@@ -204,7 +203,7 @@ def free_ports(count: int) -> list[int]:
             sock.close()
 
 
-def wait(links: Sequence[Link], timeout_s: float) -> list[Link]:
+def wait(links: Iterable[Link], timeout_s: float) -> list[Link]:
     """Links with a datagram to receive; returns with the first one, or after `timeout_s`."""
     return select.select(links, [], [], max(0.0, timeout_s))[0]
 

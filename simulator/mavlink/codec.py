@@ -34,16 +34,12 @@ class Keyring:
         unix_us: Unix time of the vehicle's clock, in microseconds; None: stamps follow no clock.
     """
 
-    accepted_unsigned: frozenset[int]
+    accepted_unsigned: frozenset[int] = frozenset()
     unix_us: Callable[[], int] | None = None
     key: bytes = field(default=b"", repr=False)
     newest: int = 0  # stamp that was sent, or heard from somebody else
     stored: int = 0  # stamp that came with the key
     heard: dict[tuple[int, int, int], int] = field(default_factory=dict)  # system, component, link
-
-    @property
-    def on(self) -> bool:
-        return bool(self.key)
 
     def set_up(self, key: bytes, stamp: int) -> None:
         """SETUP_SIGNING: a new key, or none if key and stamp are zero."""
@@ -64,7 +60,7 @@ class Keyring:
     def complaint(self, message_id: int, sender: tuple[int, int], frame: bytes | None) -> str:
         """Why a received message is refused, empty if it is not. `frame` with its signature; None
         for an unsigned one."""
-        if not self.on:
+        if not self.key:
             return ""
         flaw = UNSIGNED if frame is None else self._flaw(sender, frame)
         return "" if message_id in self.accepted_unsigned else flaw
@@ -92,7 +88,7 @@ class Keyring:
 
 
 _codec = dialect.MAVLink(None)
-
+_BY_NAME: dict[str, Any] = {each.msgname: each for each in dialect.mavlink_map.values()}
 
 Message = Any  # pymavlink's: fields are attributes, strings without padding
 Peer = tuple[int, int]  # system, component
@@ -105,8 +101,7 @@ def sender_of(message: Message) -> Peer:
 
 def id_of(name: str) -> int | None:
     """Id of the message called `name`, or None when the dialect has none."""
-    found = getattr(dialect, f"MAVLINK_MSG_ID_{name}", None)
-    return found if found in dialect.mavlink_map else None
+    return _BY_NAME[name].id if name in _BY_NAME else None
 
 
 def name_of(message_id: int) -> str | None:
@@ -117,16 +112,7 @@ def name_of(message_id: int) -> str | None:
 
 def fields_of(name: str) -> list[str]:
     """The fields of the message called `name`, in the order of the XML."""
-    message = dialect.mavlink_map[getattr(dialect, f"MAVLINK_MSG_ID_{name}")]
-    return list(message.fieldnames)
-
-
-def message_of(name: str, values: Sequence[object]) -> Any:
-    """pymavlink's message; `values` in the field order of the XML, extensions may be left out.
-
-    Raises KeyError when the dialect has no such message, TypeError for a wrong number of values.
-    """
-    return dialect.mavlink_map[getattr(dialect, f"MAVLINK_MSG_ID_{name}")](*values)
+    return list(_BY_NAME[name].fieldnames)
 
 
 class Encoder:
@@ -136,22 +122,27 @@ class Encoder:
     def __init__(
         self, system: int, component: int, keyring: Keyring | None = None, link: int = 0
     ) -> None:
-        self._keyring, self._mavlink = keyring, dialect.MAVLink(None, system, component)
+        self._keyring = keyring or Keyring()
+        self._mavlink = dialect.MAVLink(None, system, component)
         self._mavlink.signing.link_id = link
 
     def restart(self) -> None:
         """The next frame has sequence number 0."""
         self._mavlink.seq = 0
 
-    def frame(self, message: Any) -> bytes:
-        """The message as one MAVLink 2 frame with the next sequence number."""
-        mavlink = self._mavlink
-        if self._keyring is not None:
-            mavlink.signing.sign_outgoing = self._keyring.on
-            if self._keyring.on:
-                mavlink.signing.secret_key = self._keyring.key
-                mavlink.signing.timestamp = self._keyring.next_stamp()
-        packed: bytes = message.pack(mavlink)
+    def frame(self, name: str, values: Sequence[object]) -> bytes:
+        """A message as one MAVLink 2 frame with the next sequence number; `values` in the field
+        order of the XML, extensions may be left out.
+
+        Raises KeyError when the dialect has no such message, TypeError for a wrong number of
+        values.
+        """
+        mavlink, key = self._mavlink, self._keyring.key
+        mavlink.signing.sign_outgoing = bool(key)
+        if key:
+            mavlink.signing.secret_key = key
+            mavlink.signing.timestamp = self._keyring.next_stamp()
+        packed: bytes = _BY_NAME[name](*values).pack(mavlink)
         mavlink.seq = (mavlink.seq + 1) & 0xFF
         return packed
 
@@ -164,7 +155,7 @@ class Decoder:
     refuses is dropped.
     """
 
-    keyring: Keyring | None = None
+    keyring: Keyring = field(default_factory=Keyring)
     dropped: Counter[str] = field(default_factory=Counter)
 
     @property
@@ -207,12 +198,11 @@ class Decoder:
             message = _codec.decode(bytearray(frame))
         except dialect.MAVError:
             return self._skip("checksum")
-        if self.keyring is not None:
-            signed = frame if flags & SIGNED else None
-            refused = self.keyring.complaint(message_id, sender_of(message), signed)
-            if refused:
-                self.dropped[refused] += 1
-                return length, None
+        signed = frame if flags & SIGNED else None
+        refused = self.keyring.complaint(message_id, sender_of(message), signed)
+        if refused:
+            self.dropped[refused] += 1
+            return length, None
         return length, message
 
     def _skip(self, reason: str) -> tuple[int, None]:

@@ -115,8 +115,7 @@ def position_target_local_ned(view: View) -> Sequence[Any]:
 
 
 def sys_status(view: View) -> Sequence[Any]:
-    autopilot = view.autopilot
-    battery = autopilot.state.truth.battery
+    battery = view.autopilot.plant.battery
     present, enabled, health = view.sensor_bits
     return (
         present, enabled, health, 80,
@@ -128,7 +127,7 @@ def sys_status(view: View) -> Sequence[Any]:
 
 
 def battery_status(view: View) -> Sequence[Any]:
-    battery = view.autopilot.state.truth.battery
+    battery = view.autopilot.plant.battery
     voltage = fit(battery.voltage_v * 1e3, 16, signed=False)
     return (
         0, 1, 1, 32767, (voltage, *(65535,) * 9), fit(battery.current_a * 100, 16), 0, -1,

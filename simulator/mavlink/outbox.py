@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass, field
 
 from simulator.firmware.values import StatusText
-from simulator.mavlink.codec import Encoder, Keyring, message_of
+from simulator.mavlink.codec import Encoder, Keyring
 from simulator.mavlink.view import View
 
 MAV_COMP_ID_AUTOPILOT = 1
@@ -21,26 +20,35 @@ TEXT_LENGTH = 50  # STATUSTEXT.text
 
 
 class Outbox:
-    """Send queue. `keyring`: of the vehicle; `link`: number of the link in signatures."""
+    """Send queue. STATUSTEXTs are cut into chunks and, by PX4, held back until a ground station is
+    there.
+
+    `keyring`: of the vehicle; `link`: number of the link in signatures; `connected`: anything was
+    received on the link.
+    """
 
     def __init__(self, view: View, keyring: Keyring, link: int) -> None:
-        self.view = view
+        self.view, self.connected = view, False
         self._frames: list[bytes] = []
         self._suppressed: Counter[str] = Counter()
         self._encoder = Encoder(view.system, MAV_COMP_ID_AUTOPILOT, keyring, link)
+        self.restart()
 
     def restart(self) -> None:
-        """As after boot: frames are numbered from 0."""
+        """As after boot: frames are numbered from 0; texts already sent are not repeated."""
         self._encoder.restart()
+        self._ground_station_us = -math.inf  # its last heartbeat
+        self._held: list[tuple[int, StatusText]] = []
+        self._text_number = 0
 
     def send(self, name: str, *values: object) -> None:
         """Queue one message; `values` in the field order of the XML."""
-        self._frames.append(self._encoder.frame(message_of(name, values)))
+        self._frames.append(self._encoder.frame(name, values))
 
     def send_now(self, name: str) -> None:
         """Queue a message with its contents of now, filled by the view, unless a fault stops it."""
         if name not in self.view.silent or self._passes(name):
-            self._frames.append(self._encoder.frame(self.view.message(name)))
+            self._frames.append(self._encoder.frame(name, self.view.fields(name)))
 
     def forward(self, frame: bytes) -> None:
         """Queue a frame of another sender."""
@@ -66,25 +74,11 @@ class Outbox:
         self._frames.clear()
         return [*datagrams, b"".join(waiting)] if waiting else datagrams
 
+    # -- texts ---------------------------------------------------------------------------------
 
-@dataclass(slots=True)
-class Texts:
-    """STATUSTEXTs of one link: cut into chunks and, by PX4, held back until a ground station is
-    there. `connected`: anything was received on the link."""
-
-    outbox: Outbox
-    connected: bool = False
-    _ground_station_us: float = -math.inf  # its last heartbeat
-    _held: list[tuple[int, StatusText]] = field(default_factory=list)
-    _number: int = 0
-
-    def restart(self) -> None:
-        """Reset as after boot; texts already sent are not repeated."""
-        self._ground_station_us, self._held, self._number = -math.inf, [], 0
-
-    def send(self, text: StatusText) -> None:
+    def send_text(self, text: StatusText) -> None:
         """Queue a text, or hold it back until a ground station is there (PX4)."""
-        firmware = self.outbox.view.autopilot.firmware
+        firmware = self.view.autopilot.firmware
         if firmware.text_to_ground_stations_only and not self._has_ground_station:
             self._held.append((self._now_us, text))
             return
@@ -93,8 +87,8 @@ class Texts:
         encoded = (text.text + firmware.text_suffix).encode("ascii", "replace")
         for chunk, at in enumerate(range(0, len(encoded), TEXT_LENGTH)):
             piece = encoded[at : at + TEXT_LENGTH]
-            self.outbox.send("STATUSTEXT", int(text.severity), piece, self._number, chunk)
-        self._number = (self._number + 1) & 0xFFFF
+            self.send("STATUSTEXT", int(text.severity), piece, self._text_number, chunk)
+        self._text_number = (self._text_number + 1) & 0xFFFF
 
     def note_ground_station(self) -> None:
         """A ground station sent a heartbeat: send the texts held back for at most HELD_US."""
@@ -102,13 +96,13 @@ class Texts:
         held, self._held = self._held, []
         for at_us, text in held:
             if self._now_us - at_us < HELD_US:
-                self.send(text)
+                self.send_text(text)
 
     @property
     def _has_ground_station(self) -> bool:
-        stays_us = self.outbox.view.autopilot.firmware.ground_station_stays_s * 1e6
+        stays_us = self.view.autopilot.firmware.ground_station_stays_s * 1e6
         return self._now_us - self._ground_station_us <= stays_us
 
     @property
     def _now_us(self) -> int:
-        return self.outbox.view.autopilot.state.time_us
+        return self.view.autopilot.state.time_us

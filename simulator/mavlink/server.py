@@ -13,7 +13,7 @@ from simulator.autopilot.setpoints import ATTITUDE, GLOBAL, LOCAL
 from simulator.autopilot.sticks import RELEASE
 from simulator.mavlink.codec import Decoder, Keyring, Message, sender_of
 from simulator.mavlink.commands import Command, Commands
-from simulator.mavlink.outbox import MAV_COMP_ID_AUTOPILOT, Outbox, Texts
+from simulator.mavlink.outbox import MAV_COMP_ID_AUTOPILOT, Outbox
 from simulator.mavlink.telemetry import Schedule
 from simulator.mavlink.transfers import Handlers, MissionTransfer, ParameterTransfer
 from simulator.mavlink.view import View
@@ -52,13 +52,12 @@ class Server:
         clock = ("TIMESYNC",) if barrier else ()
         rates_hz = {name: hz for name, hz in rates_hz.items() if name not in clock}
         self.schedule = Schedule(view, rates_hz)
-        self.texts = Texts(self.outbox)
         self._commands = Commands(self.outbox, self.schedule)
         self._begin_transfers()
 
     def _begin_transfers(self) -> None:
         self._parameters = ParameterTransfer(self.outbox)
-        self._missions = MissionTransfer(self.outbox, self.texts)
+        self._missions = MissionTransfer(self.outbox)
         self._handlers: Handlers = {  # by message
             "HEARTBEAT": self._heartbeat,
             "COMMAND_LONG": self._command_long,
@@ -81,7 +80,6 @@ class Server:
         """Reset as after boot: default rates, no known client."""
         self.outbox.restart()
         self.schedule.restart()
-        self.texts.restart()
         self._begin_transfers()
 
     def step(self) -> None:
@@ -100,7 +98,7 @@ class Server:
     def receive(self, datagram: bytes) -> None:
         """Handle all messages of one datagram; no bytes make this raise."""
         for message in self.decoder.read(datagram):
-            self.texts.connected = True
+            self.outbox.connected = True
             handler = self._handlers.get(message.get_type())
             if handler is not None and self._is_for_us(message):
                 handler(message)
@@ -123,7 +121,7 @@ class Server:
         read = autopilot.parameters.__getitem__
         if autopilot.firmware.is_ground_station(message.type, message.get_srcSystem(), read):
             autopilot.health.ground_station_heard(autopilot.state.time_s)
-            self.texts.note_ground_station()
+            self.outbox.note_ground_station()
 
     def _command_long(self, message: Message) -> None:
         params = tuple(getattr(message, f"param{i}") for i in range(1, 8))

@@ -26,7 +26,7 @@ LEAST_INTERVAL_US = {"GPS_RAW_INT": 125_000.0}  # a receiver gives eight fixes a
 INTERVAL_MAX_US = 2.0**31 - 1  # MESSAGE_INTERVAL.interval_us is an int32
 
 
-def builders_in(module: ModuleType) -> dict[str, Builder]:
+def _builders_in(module: ModuleType) -> dict[str, Builder]:
     """The public functions of a module, by the message that each builds."""
     return {
         name.upper(): function
@@ -39,7 +39,7 @@ def builders_in(module: ModuleType) -> dict[str, Builder]:
 
 def builders(firmware: Firmware) -> dict[str, Builder]:
     """All messages of this firmware, with their builders."""
-    return {**builders_in(messages), **firmware.messages}
+    return {**_builders_in(messages), **_builders_in(firmware.messages)}
 
 
 @dataclass(slots=True)
@@ -52,7 +52,8 @@ class Stream:
     interval_us: int
     due_us: int
     grid_us: int
-    version: Hashable = None  # of the content sent last, for messages that wait for a new one
+    version: Callable[[View], Hashable] | None  # None: it does not wait for a new content
+    sent: Hashable  # version of the content sent last
 
     def next_after(self, now_us: int) -> None:
         """Due at the next multiple of the interval, so that the mean rate is exact."""
@@ -85,8 +86,9 @@ class Schedule:
         """A stream of message `name`; in its old place if there was one."""
         steps = self.view.autopilot.firmware.position_grid_steps
         grid_us = STEP_US * (steps if name in ON_POSITION_GRID else 1)
-        version = self.streams[name].version if name in self.streams else None
-        self.streams[name] = stream = Stream(interval_us, 0, grid_us, version)
+        version = self.view.autopilot.firmware.message_versions.get(name)
+        sent = self.streams[name].sent if name in self.streams else None
+        self.streams[name] = stream = Stream(interval_us, 0, grid_us, version, sent)
         self._next_us = 0.0
         return stream
 
@@ -98,7 +100,7 @@ class Schedule:
         due: list[str] = []
         next_us = math.inf
         for name, stream in self.streams.items():
-            if now_us >= stream.due_us and self._is_new(name, stream):
+            if now_us >= stream.due_us and (stream.version is None or self._is_new(stream)):
                 stream.next_after(now_us)
                 if not view.withheld(name):
                     due.append(name)
@@ -107,13 +109,11 @@ class Schedule:
         self._next_us = next_us
         return due
 
-    def _is_new(self, name: str, stream: Stream) -> bool:
-        """Whether the message has a content that was not sent yet; most always have."""
-        version = self.view.autopilot.firmware.message_versions.get(name)
-        if version is None:
-            return True
-        newest = version(self.view)
-        new, stream.version = newest != stream.version, newest
+    def _is_new(self, stream: Stream) -> bool:
+        """Whether the message has a content that was not sent yet."""
+        assert stream.version is not None
+        newest = stream.version(self.view)
+        new, stream.sent = newest != stream.sent, newest
         return new
 
     def set_interval(self, name: str, interval_us: float) -> bool:

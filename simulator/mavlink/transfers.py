@@ -15,7 +15,7 @@ from simulator.autopilot.mission import ITEMS_MAX, Kind
 from simulator.autopilot.parameters import HASH, MAV_PARAM_TYPE_UINT32
 from simulator.firmware.values import MissionItem
 from simulator.mavlink.codec import Message, Peer, sender_of
-from simulator.mavlink.outbox import Outbox, Texts
+from simulator.mavlink.outbox import Outbox
 
 PER_STEP = 4  # parameters of a list
 NO_INDEX = 65535  # PARAM_VALUE.param_index of an answer without one
@@ -108,10 +108,10 @@ class Upload:
 
 
 class MissionTransfer:
-    """Mission transfers of one link; `texts`: of this link. A download needs no state."""
+    """Mission transfers of one link. A download needs no state."""
 
-    def __init__(self, outbox: Outbox, texts: Texts) -> None:
-        self.outbox, self.texts = outbox, texts
+    def __init__(self, outbox: Outbox) -> None:
+        self.outbox = outbox
         autopilot = outbox.view.autopilot
         self.mission, self._firmware = autopilot.mission, autopilot.firmware
         self._upload: Upload | None = None
@@ -186,7 +186,7 @@ class MissionTransfer:
             result, text = refused
             self._acknowledge(upload.peer, result)
             if text is not None:
-                self.texts.send(text)
+                self.outbox.send_text(text)
             self._upload = None
             return
         upload.items.append(item)
@@ -198,7 +198,7 @@ class MissionTransfer:
         self._upload, self._taken = None, upload.count
         self._acknowledge(upload.peer, Ack.ACCEPTED)
         if self._firmware.mission_text is not None:
-            self.texts.send(self._firmware.mission_text)
+            self.outbox.send_text(self._firmware.mission_text)
 
     def _ack(self, message: Message) -> None:
         """MISSION_ACK of the peer: it wants the other kind of request, or cancels."""

@@ -1,7 +1,7 @@
 """Contents of all messages of one vehicle: its autopilot, with the faults that change telemetry,
 and the conversion of SI values to fields of messages: scaled, rounded, limited to their range.
 
-Builds each message once per step for all links. Knows no links, rates or sequence numbers.
+Knows no links, rates or sequence numbers.
 """
 
 from __future__ import annotations
@@ -13,10 +13,8 @@ from typing import Any
 
 from offboard.model.frames import rotation_from_quaternion
 from simulator.autopilot.autopilot import Autopilot
-from simulator.autopilot.position_loop import GRAVITY_MPS2
 from simulator.firmware.values import Triple
-from simulator.geodesy import to_degrees
-from simulator.mavlink.codec import message_of
+from simulator.geodesy import GRAVITY_MPS2, to_degrees
 
 _GPS, _PREARM = 0x20, 0x10000000  # MAV_SYS_STATUS_SENSOR
 
@@ -49,8 +47,6 @@ class View:
     silent: dict[str, int] = field(default_factory=dict)
     wrong_landed_state: int | None = None  # reported in place of the true one
     stuck: dict[str, Stuck] = field(default_factory=dict)
-    _messages: dict[str, Any] = field(default_factory=dict)
-    _at_step: int = -1
 
     def withheld(self, name: str) -> bool:
         """Whether the vehicle cannot send this message yet, whatever its rate."""
@@ -58,18 +54,10 @@ class View:
         event = autopilot.firmware.withheld_until.get(name)
         return event is not None and event not in autopilot.health.reached
 
-    def message(self, name: str) -> Any:
-        """Message `name` of now; built once per step for all links."""
-        if self._at_step != self.autopilot.state.steps:
-            self._at_step = self.autopilot.state.steps
-            self._messages.clear()
-        message = self._messages.get(name)
-        if message is None:
-            values = self.builders[name](self)
-            if name in self.stuck:
-                values = self.stuck[name].instead_of(values)
-            message = self._messages[name] = message_of(name, values)
-        return message
+    def fields(self, name: str) -> Sequence[Any]:
+        """Fields of message `name` now."""
+        values = self.builders[name](self)
+        return self.stuck[name].instead_of(values) if name in self.stuck else values
 
     def heartbeat(self, base_mode: int, state: int) -> tuple[int, ...]:
         """Fields of HEARTBEAT of a quadrotor; the armed bit is added. `state`: MAV_STATE."""
@@ -78,13 +66,9 @@ class View:
         return (2, firmware.mav_autopilot, base_mode, commander.mode.custom_mode, state, 3)
 
     def restart(self, autopilot: Autopilot) -> None:
-        """Show another autopilot, after a reboot; faults that run go on."""
-        autopilot.state.gps_healthy = self.autopilot.state.gps_healthy
-        autopilot.state.velocity_error_ned_mps = self.autopilot.state.velocity_error_ned_mps
-        autopilot.commander.refused = self.autopilot.commander.refused
+        """Show another autopilot, after a reboot."""
         self.autopilot = autopilot
         self.clock_offset_us = 0
-        self._at_step = -1
 
     @property
     def sensor_bits(self) -> tuple[int, int, int]:
@@ -103,7 +87,7 @@ class View:
     def specific_force(self) -> Triple:
         """True specific force, FRD, m/s^2."""
         truth = self.autopilot.state.truth
-        north, east, down = truth.acceleration_ned_mps2.tolist()
+        north, east, down = truth.acceleration_ned_mps2
         force_ned = (north, east, down - GRAVITY_MPS2)
         forward, right, down = (force_ned @ rotation_from_quaternion(truth.attitude)).tolist()
         return forward, right, down

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 # Rotor state, beside the rigid body's 13 numbers: actual normalised collective thrust, 1 while the
 # ground carries the vehicle, charge consumed (A s), NED acceleration of the last step.
-THRUST, CONTACT, CHARGE, ACCELERATION, ROTOR_SIZE = 0, 1, 2, slice(3, 6), 6
+THRUST, CONTACT, CHARGE, ROTOR_SIZE = 0, 1, 2, 6
 
 # Below this share of hover thrust the torques fall to zero with the thrust.
 _AUTHORITY_SHARE = 0.2
@@ -42,8 +42,8 @@ def build_airframe(vehicle: Vehicle, conditions: Conditions) -> tuple[Array, Arr
     of the conditions on thrust and mass.
 
     Returns those of the body, as `offboard.model.rigid_body.pack` has them; of the rotors: thrust
-    at full throttle N, factor of the lag in a step, thrust above which torques are full, ground
-    effect 0/1, hover thrust, hover current A; and the substeps of a step.
+    at full throttle N, factor of the lag in a step, thrust above which torques are full, hover
+    thrust, hover current A, ground effect 0/1; and the substeps of a step.
     """
     body = pack(vehicle)
     lag_s = vehicle.thrust_lag_s
@@ -52,9 +52,9 @@ def build_airframe(vehicle: Vehicle, conditions: Conditions) -> tuple[Array, Arr
             conditions.thrust_scale * vehicle.mass_kg * vehicle.thrust_max_mps2,
             math.exp(-STEP_S / lag_s) if lag_s > 0.0 else 0.0,
             _AUTHORITY_SHARE * vehicle.hover_thrust,
-            float(conditions.ground_effect),
             vehicle.hover_thrust,
             conditions.battery.hover_current_a,
+            float(conditions.ground_effect),
         ]
     )
     body[0] *= conditions.mass_scale
@@ -73,7 +73,7 @@ def advance_airframe(plant: Any, thrust_demand: float) -> None:
     rotor[THRUST] = thrust_demand + (before - thrust_demand) * rotor_constants[1]
     mean = 0.5 * (before + rotor[THRUST])
     north, east, down = body[7], body[8], body[9]
-    inputs[0] = rotor_constants[0] * mean * _ground_gain(body[12], rotor_constants[3])
+    inputs[0] = rotor_constants[0] * mean * _ground_gain(body[12], rotor_constants[5])
     # On the ground it does not rotate
     authority = 0.0 if rotor[CONTACT] > 0.5 else min(mean / rotor_constants[2], 1.0)
     _torques(body, plant.turn, authority, body_constants, inputs)
@@ -96,7 +96,7 @@ def advance_airframe(plant: Any, thrust_demand: float) -> None:
     rotor[3] = (body[7] - north) / STEP_S
     rotor[4] = (body[8] - east) / STEP_S
     rotor[5] = (body[9] - down) / STEP_S
-    rotor[CHARGE] += rotor_constants[5] * (mean / rotor_constants[4]) ** 1.5 * STEP_S
+    rotor[CHARGE] += rotor_constants[4] * (mean / rotor_constants[3]) ** 1.5 * STEP_S
 
 
 @kernel

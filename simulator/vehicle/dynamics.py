@@ -50,6 +50,7 @@ RECORD = np.dtype(
         # the estimator
         ("error", "f8", ERROR_COUNT),
         ("offset", "f8", 3),
+        ("velocity_error", "f8", 3),
         ("lag_s", "f8"),
         ("white_sds", "f8", WHITE_COUNT),
         # the satellite receiver: position NED and velocity NE
@@ -95,7 +96,7 @@ def draw_gusts(plants: Any) -> None:
 
 @entry(RECORD)
 def report_state(plants: Any) -> None:
-    """Write the estimate of the present state to `report`: truth plus errors, offset and white
+    """Write the estimate of the present state to `report`: truth plus errors, offsets and white
     noise."""
     plant = plants[0]
     body, error, white, out = plant.body, plant.error, plant.normals, plant.report
@@ -107,7 +108,8 @@ def report_state(plants: Any) -> None:
         late = body[10 + axis] - plant.lag_s * body[7 + axis]
         out[axis] = late + error[AXIS_STRIDE * axis] + plant.offset[axis] + white[axis]
         slow = body[7 + axis] - plant.lag_s * plant.rotor[3 + axis]
-        out[3 + axis] = slow + error[AXIS_STRIDE * axis + 1] + white[3 + axis]
+        drifting = slow + error[AXIS_STRIDE * axis + 1] + white[3 + axis]
+        out[3 + axis] = drifting + plant.velocity_error[axis]
         out[10 + axis] = body[4 + axis] + white[9 + axis]
     turn = white[6:9]
     turn[0] -= error[EAST + 2]

@@ -11,11 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.model.rigid_body import QUATERNION
 from offboard.model.vehicle import Triple, Vehicle
 from simulator.steps import STEP_S
-from simulator.vehicle.airframe import ACCELERATION, CHARGE, CONTACT, THRUST, build_airframe
-from simulator.vehicle.attitude import Demand, build_loop, encode
+from simulator.vehicle.airframe import CHARGE, CONTACT, THRUST, build_airframe
+from simulator.vehicle.attitude import Demand, Quaternion, build_loop, encode
 from simulator.vehicle.battery import BatteryState
 from simulator.vehicle.conditions import Conditions
 from simulator.vehicle.dynamics import RECORD, advance_steps, draw_gusts, receive_fix, report_state
@@ -30,17 +29,14 @@ _MASS, _THRUST_MAX = 0, 0  # places in the constants of body and rotors
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """True state. Arrays (3,) NED or FRD, SI; quaternion (4,) wxyz FRD -> NED."""
+    """True state as plain floats, NED or FRD, SI."""
 
-    position_ned_m: Array
-    velocity_ned_mps: Array
-    acceleration_ned_mps2: Array
-    attitude: Array
-    rates_frd_radps: Array
-    on_ground: bool
+    position_ned_m: Triple
+    velocity_ned_mps: Triple
+    acceleration_ned_mps2: Triple
+    attitude: Quaternion
+    rates_frd_radps: Triple
     thrust: float  # normalised collective thrust after the rotor lag
-    wind_ned_mps: Array  # steady wind and gust
-    battery: BatteryState
 
 
 class Plant:
@@ -77,17 +73,18 @@ class Plant:
         record = self.record
         for name, value in constants.items():
             record[name] = value
-        self.battery, self._hover_thrust = conditions.battery, vehicle.hover_thrust
+        self._battery, self._hover_thrust = conditions.battery, vehicle.hover_thrust
         self._demand: Demand | None = None
-        self._body, self._rotor, self._wind = (
-            record[name][0] for name in ("body", "rotor", "wind")
-        )
+        self._body, self._rotor = record["body"][0], record["rotor"][0]
         self._row, self._report = record["row"][0], record["report"][0]
         self._offset_ned_m = record["offset"][0]
+        self.velocity_error_ned_mps = record["velocity_error"][0]  # by a fault
+        self.gps_healthy = True  # False while a fault takes the fix away
         self.reset_counter = 0  # estimator resets, modulo 256
         self._body[0] = 1.0
         self._rotor[CONTACT] = 1.0
-        self._wind[:] = wind_ned_mps
+        self.wind_ned_mps = record["wind"][0]  # steady wind and gust
+        self.wind_ned_mps[:] = wind_ned_mps
         draw_gusts(record)
         record["gust"][0] = gusts.stationary_scale @ record["gust_normals"][0]
         record["gusty"] = np.any(record["gust"] != 0.0)
@@ -119,24 +116,27 @@ class Plant:
 
     def set_battery(self, remaining: float) -> None:
         """Set the remaining share of the battery's capacity, 0 .. 1."""
-        self._rotor[CHARGE] = self.battery.drawn_as(remaining)
+        self._rotor[CHARGE] = self._battery.drawn_as(remaining)
 
     @property
     def truth(self) -> Truth:
-        """The true state; a copy."""
-        body, thrust = self._body.copy(), float(self._rotor[THRUST])
-        charge_as, hover_share = float(self._rotor[CHARGE]), thrust / self._hover_thrust
+        """The true state."""
+        w, x, y, z, p, q, r, v_north, v_east, v_down, north, east, down = self._body.tolist()
+        thrust, _, _, a_north, a_east, a_down = self._rotor.tolist()
         return Truth(
-            position_ned_m=body[QUATERNION.position],
-            velocity_ned_mps=body[QUATERNION.velocity],
-            acceleration_ned_mps2=self._rotor[ACCELERATION].copy(),
-            attitude=body[QUATERNION.attitude],
-            rates_frd_radps=body[QUATERNION.rates],
-            on_ground=bool(self._rotor[CONTACT]),
-            thrust=thrust,
-            wind_ned_mps=self._wind.copy(),
-            battery=self.battery.state(charge_as, hover_share),
+            (north, east, down),
+            (v_north, v_east, v_down),
+            (a_north, a_east, a_down),
+            (w, x, y, z),
+            (p, q, r),
+            thrust,
         )
+
+    @property
+    def battery(self) -> BatteryState:
+        """What a battery monitor measures."""
+        hover_share = float(self._rotor[THRUST]) / self._hover_thrust
+        return self._battery.state(float(self._rotor[CHARGE]), hover_share)
 
     def fix(self) -> list[float]:
         """GPS fix of the present step: NED position, then velocity north and east; repeated calls

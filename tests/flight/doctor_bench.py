@@ -146,7 +146,6 @@ def bench(
         simulated.vehicle(firmware.vehicle),
         conditions,
         seed=7,
-        ground_link=False,
         parameters=GOOD[firmware.name] | (parameters or {}),
         faults=TypeAdapter(list[Fault]).validate_python(list(faults)),
         start=start,

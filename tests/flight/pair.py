@@ -354,7 +354,6 @@ def make(
         flies or simulated.vehicle(firmware.vehicle),
         flown.conditions.model_copy(update={"boot_scale": boot_scale}),
         seed,
-        ground_link=False,
         faults=flown.faults,
         start=flown.start or hovers,
     )

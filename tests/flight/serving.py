@@ -265,7 +265,6 @@ def serve(
         simulated.vehicle(firmware.vehicle),
         flown.conditions.model_copy(update={"boot_scale": 1.0 if on == "px4" else 0.1}),
         seed,
-        ground_link=False,
         faults=flown.faults,
         start=Start(height_m=3.0) if aloft else flown.start,
     )

@@ -83,7 +83,7 @@ NAMED = "; another companion computer, system 1 component 194, may send setpoint
 
 
 def no_fix(pair: Pair) -> bool:
-    return not pair.instance.autopilot.state.gps_healthy
+    return not pair.instance.autopilot.plant.gps_healthy
 
 
 # How it is flown, the sentence, and more about its end. `soon`: from when on it must land how soon;

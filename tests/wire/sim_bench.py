@@ -73,11 +73,11 @@ class Bench:
     @property
     def place(self) -> tuple[float, ...]:
         """Where it is: north, east, down, m."""
-        return tuple(self.instance.autopilot.state.truth.position_ned_m.tolist())
+        return self.instance.autopilot.state.truth.position_ned_m
 
     @property
     def velocity(self) -> tuple[float, ...]:
-        return tuple(self.instance.autopilot.state.truth.velocity_ned_mps.tolist())
+        return self.instance.autopilot.state.truth.velocity_ned_mps
 
     @property
     def heading_deg(self) -> float:

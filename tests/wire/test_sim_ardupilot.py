@@ -60,6 +60,15 @@ def test_without_requests_it_sends_heartbeat_timesync_and_home() -> None:
     }
 
 
+def test_the_heartbeat_after_a_mode_change_shows_it_also_in_the_step_of_the_last_one() -> None:
+    vehicle = guided()
+    since_s = vehicle.time_s
+    while not vehicle.of("HEARTBEAT", since_s):
+        vehicle.run(0.004)
+    vehicle.command(176, 1, LAND)
+    assert [m.custom_mode for _, m in vehicle.of("HEARTBEAT", since_s)] == [GUIDED, LAND]
+
+
 def test_gps_raw_int_shows_no_fix_before_the_first_one() -> None:
     """At 10.2 s."""
     vehicle = Bench(firmware=ARDUPILOT)
@@ -197,13 +206,13 @@ def test_without_gps_the_position_is_lost_after_eight_seconds(
     vehicle = guided(FS_EKF_ACTION=action)
     vehicle.command(511, 193, 100_000)
     autopilot = vehicle.instance.autopilot
-    autopilot.state.gps_healthy = False
+    autopilot.plant.gps_healthy = False
     vehicle.run(7.8)
     assert (vehicle.mode, vehicle.system_status) == (GUIDED, 4)
     vehicle.run(0.5)
     assert (vehicle.mode, vehicle.system_status) == (mode, 5 if texts else 4)
     assert vehicle.of("EKF_STATUS_REPORT")[-1][1].flags == 167
-    autopilot.state.gps_healthy = True
+    autopilot.plant.gps_healthy = True
     vehicle.run(0.5)
     assert vehicle.of("EKF_STATUS_REPORT")[-1][1].flags == 831
     assert (vehicle.mode, vehicle.system_status) == (mode, 4)

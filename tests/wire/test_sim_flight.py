@@ -26,17 +26,17 @@ def climb_mps(bench: Bench) -> float:
 def test_without_position_automatic_flight_lands_and_attitude_setpoints_continue() -> None:
     bench = aloft()
     autopilot = bench.instance.autopilot
-    autopilot.state.gps_healthy = False
+    autopilot.plant.gps_healthy = False
     bench.run(4.5)
     assert bench.mode == LOITER
     bench.run(1.0)
     assert (bench.mode, bench.system_status) == (LAND, 5)
-    autopilot.state.gps_healthy = True
+    autopilot.plant.gps_healthy = True
     bench.run(0.5)
     assert (bench.mode, bench.system_status) == (LOITER, 4)
     bench.run(0.6, bench.attitude)
     bench.ask_mode(OFFBOARD)
-    autopilot.state.gps_healthy = False
+    autopilot.plant.gps_healthy = False
     bench.run(6.0, bench.attitude)
     assert (bench.mode, bench.system_status) == (OFFBOARD, 4)
 

@@ -98,7 +98,7 @@ def assault(instance: Instance, seed: int, count: int) -> None:
         (instance.feed if index % 4 else instance.feed_ground)(datagram)
         if index % PER_STEP == 0:
             instance.advance()
-            for datagram_out in (*instance.drain(), *instance.ground.outbox.drain()):
+            for datagram_out in (*instance.drain(), *instance.drain_ground()):
                 for m in reader.read(datagram_out):
                     assert m.get_type() != "LOCAL_POSITION_NED" or math.isfinite(m.x + m.y + m.z)
     assert not reader.dropped

@@ -65,7 +65,7 @@ def test_each_link_has_the_rates_of_px4_and_its_own_sequence() -> None:
     """In datagrams of whole frames."""
     bench = Bench(ground_link=True)
     bench.send(mavlink.MAVLink_param_request_list_message(1, 1))
-    companion, ground = bench.instance.companion.outbox, bench.instance.ground.outbox
+    companion, ground = (link.outbox for link in bench.instance.links)
     heard: dict[str, list[bytes]] = {"companion": [], "ground": []}
     for _ in range(5000):
         bench.instance.advance()

@@ -18,6 +18,7 @@ from sim_bench import Bench
 from sim_rows import Rows, ask_again, compare, recorded_frames
 
 from simulator.firmware.catalogue import FIRMWARES
+from simulator.vehicle.battery import Battery
 from simulator.vehicle.sensors import EstimatorName
 
 RECORDINGS = Path(__file__).parent / "recordings"
@@ -274,7 +275,7 @@ def heard(session: Session) -> tuple[Rows, Rows]:
         if session.name == "battery" and kind == "SYS_STATUS":
             plant.set_battery(max(0, message.battery_remaining) / 100)
         elif kind == "PARAM_VALUE" and message.param_id == "SIM_BATT_VOLTAGE":
-            plant.set_battery((message.param_value / plant.battery.cells - 3.5) / 0.7)
+            plant.set_battery((message.param_value / Battery().cells - 3.5) / 0.7)
 
     ask_again(session.recording, bench, real, ours, run_on_s=2.0, each=drain)
     return real, ours

@@ -114,7 +114,7 @@ def test_setup_signing_sets_and_removes_the_key_but_not_while_armed() -> None:
 
     instance.autopilot.commander.armed = True
     set_up(client, KEY, EPOCH)
-    assert not instance.keyring.on
+    assert not instance.keyring.key
     instance.autopilot.commander.armed = False
     set_up(client, KEY, EPOCH)
     instance.feed(request(client))

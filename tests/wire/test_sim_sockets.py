@@ -12,7 +12,7 @@ from processes import free_port
 from pymavlink.dialects.v20 import common as mavlink
 
 from simulator import config, run
-from simulator.faults import Stranger
+from simulator.faults.link import Stranger
 from simulator.firmware.px4 import PX4
 from simulator.instance import Instance
 from simulator.link.sockets import (
@@ -26,7 +26,7 @@ from simulator.link.sockets import (
     wait,
     whole_frames,
 )
-from simulator.run import Endpoint, Outcome, Runner
+from simulator.run import Endpoint, Runner
 from simulator.vehicle.conditions import Conditions
 
 CODEC = mavlink.MAVLink(None, srcSystem=255)
@@ -88,8 +88,8 @@ def test_a_companion_that_does_not_answer_ends_the_run_with_code_3(
         answer = mavlink.MAVLink_timesync_message(1, 8_000_000).pack(mavlink.MAVLink(None))
         companion.sendto(answer, ("127.0.0.1", link.port))
     reports: list[str] = []
-    runner = Runner([Endpoint(instance(), link)], stopping=lambda: False, report=reports.append)
-    assert runner.lockstep(0.1) == Outcome(3, says)
+    runner = Runner([Endpoint(instance(), link)], lambda: False, reports.append)
+    assert runner.lockstep(0.1) == says
     assert reports == []
 
 
