@@ -124,6 +124,7 @@ def data(chunks: list[Chunk]) -> list[bytes]:
 
 
 def test_a_datagram_has_the_time_of_its_arrival_not_of_its_reading(udp: Udp) -> None:
+    """On a busy machine the time may be some milliseconds too old."""
     link, vehicle, _ = udp
     before_s = time.monotonic()
     vehicle.send(b"first")
@@ -132,8 +133,8 @@ def test_a_datagram_has_the_time_of_its_arrival_not_of_its_reading(udp: Udp) -> 
     vehicle.send(b"second")
     time.sleep(0.1)
     first, second = received(link)
-    assert before_s - 1e-4 <= first.arrived_s <= between_s + 1e-4
-    assert between_s + 0.1 <= second.arrived_s <= time.monotonic() - 0.1
+    assert before_s - 0.05 <= first.arrived_s <= between_s + 1e-4
+    assert between_s + 0.05 <= second.arrived_s <= time.monotonic() - 0.1
     assert (first.peer, second.peer) == (vehicle.getsockname(), vehicle.getsockname())
 
 
