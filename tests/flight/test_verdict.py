@@ -152,6 +152,18 @@ def test_a_landing_that_was_not_ours_to_the_end_is_not_completed(
     aborted(hover(aloft=True, **options), says, ended_by=ended_by)
 
 
+def test_a_restart_before_the_flight_is_none_of_it() -> None:
+    """What it had reported before, in the air, has stamps that come again in the flight: both were
+    mixed, and by its score a flight was 3.3 m above the take-off point in the end."""
+    restarts = {"fault": "reboot", "after": "boot", "at_s": 1.0}
+    scenario = scenario_of(restarts, conditions={"clock_start_s": 12.0})
+    pair = hover(scenario=scenario, aloft=True)
+    assert pair.fly() == Outcome(0, "flown and landed")
+    logged = pair.history()
+    assert np.diff(logged.position["time_s"]).min() > 0.0
+    assert (score(logged).completed, score(logged).ended_by) == (1.0, "reference over")
+
+
 def test_a_log_with_parts_missing_is_scored_as_far_as_it_goes(flown: History) -> None:
     whole = score(flown)
     assert whole.rmse_position_m < 0.05
