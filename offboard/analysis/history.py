@@ -222,6 +222,9 @@ class Samples:
     def empty(self) -> bool:
         return not self._data
 
+    def clear(self) -> None:
+        self._data.clear()
+
     def add(self, payload: bytes, now_ms: float, unix_s: float) -> None:
         """A message. `now_ms`: stamp of the telemetry before it, NaN without. `unix_s`: of its
         entry in the log."""
@@ -367,8 +370,18 @@ class _Collector:
             return False
         time_s = int.from_bytes(entry.frame.payload[:4], "little") / 1e3
         time_s += self._time.wrapped_s(time_s)
-        stale = self._time.check(entry.frame.message_id, time_s) is Age.STALE
-        return stale and time_s > self._time.newest_s
+        age = self._time.check(entry.frame.message_id, time_s)
+        if age is Age.REBOOTED and self._event_records:
+            self._forget_before_flight()
+        return age is Age.STALE and time_s > self._time.newest_s
+
+    def _forget_before_flight(self) -> None:
+        """The vehicle was rebooted, and its time begins anew: if nothing was flown yet, what it had
+        reported is none of the flight."""
+        if self._samples[True, "SET_ATTITUDE_TARGET"].empty:
+            for (ours, _), samples in self._samples.items():
+                if not ours:
+                    samples.clear()
 
     def _add_origin(self, entry: LoggedMessage) -> None:
         """HOME_POSITION gives one point in both frames."""

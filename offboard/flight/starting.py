@@ -215,7 +215,7 @@ def disarmed_again(flight: FlightState) -> bool:
     accepted = vehicle.results.get(ARM_DISARM) == "ACCEPTED"
     since_s = flight.now_s - vehicle.answered_s.get(ARM_DISARM, flight.now_s)
     shown = vehicle.disarmed and vehicle.age_s(Heartbeat) < since_s
-    return accepted and shown and ARMING_SHOWN_S < since_s < flight.in_phase_s
+    return accepted and shown and ARMING_SHOWN_S < since_s <= flight.in_phase_s
 
 
 def stop_requested_on_ground(flight: FlightState) -> str:

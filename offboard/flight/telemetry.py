@@ -200,7 +200,9 @@ def _on_reboot(flight: FlightState) -> None:
     if flight.phase is Phase.LAND:
         flight.touchdown = Touchdown(None)
         if flight.outcome is None:
-            flight.outcome = Outcome(ExitCode.ABORTED, f"{REBOOTED} while landing")
+            sentence = f"{REBOOTED} while landing"
+            outbox.announce_phase(flight, sentence, "restart")  # the score must know it, too
+            flight.outcome = Outcome(ExitCode.ABORTED, sentence)
     transitions.advance(flight)
 
 

@@ -120,6 +120,7 @@ def _note_failsafe(flight: FlightState) -> None:
     fallen = flight.phase is Phase.LAND and in_own_failsafe(flight)
     if fallen and flight.outcome is None:
         sentence = f"the vehicle's own failsafe flew it, in {flight.vehicle.mode}"
+        outbox.announce_phase(flight, sentence, "link")  # the score must know it, too
         flight.outcome = Outcome(ExitCode.ABORTED, sentence + _explanation(flight))
 
 

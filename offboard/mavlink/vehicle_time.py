@@ -110,7 +110,9 @@ class VehicleTime:
     def on_telemetry(self, time_s: float, now_s: float) -> None:
         """Telemetry with the valid stamp `time_s` arrived at host time `now_s`. A stamp older than
         the newest adds nothing: messages of several streams may arrive out of order."""
-        self._received_s, self._telemetry_s = now_s, self.lockstep_s
+        # in lockstep it is the time now, which a jump of the clock has moved
+        self._received_s = self.newest_s if self._lockstep else now_s
+        self._telemetry_s = self.lockstep_s
         step_s = 0.0 if self._counted_s is None else time_s - self._counted_s
         if self._counted_s is None or step_s > 0.0 or step_s < -_REBOOT_S:
             self.seconds += max(min(step_s, SILENCE_S) - self._bridged_s, 0.0)
