@@ -47,6 +47,7 @@ Parameter = type[int | float] | np.dtype[Any] | tuple[int, np.dtype[Any]]
 
 defined: list[Entry[Any, Any]] = []  # the entries of the modules imported so far
 _kernels: list[Callable[..., Any]] = []  # not yet registered with numba
+_COMPILES = re.compile(rb"^from offboard\.compiled import .*\b(?:entry|kernel)\b", re.M)
 _IMPORT = re.compile(rb"^from ((?:offboard|simulator)[.\w]+) import", re.M)
 
 
@@ -146,7 +147,7 @@ def directory() -> Path:
     root = Path(__file__).parents[1]
     packages = (root / package for package in ("offboard", "simulator"))
     texts = {path: path.read_bytes() for package in packages for path in package.rglob("*.py")}
-    used = {path for path, text in texts.items() if b"from offboard.compiled import" in text}
+    used = {path for path, text in texts.items() if _COMPILES.search(text)}
     for path in tuple(used):
         modules = (name.decode().replace(".", "/") for name in _IMPORT.findall(texts[path]))
         used.update({root / f"{module}.py" for module in modules} & texts.keys())

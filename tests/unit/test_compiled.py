@@ -96,6 +96,7 @@ def test_compiled_once_and_again_when_another_file_has_changed(
     assert answer(package, **given) == "68.0\n1 [2, 10] 1"
     made = machine_code(cache / "pso-offboard")
     assert len(made) == 1
+    (package / "offboard" / "plain.py").write_text("from offboard.compiled import prepare\n")
     assert answer(package, **given) == "68.0\n1 [2, 10] 0"
     assert machine_code(cache) == made
     (package / "offboard" / "constants.py").write_text("OFFSET = 2.0\n")
