@@ -12,6 +12,7 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -325,7 +326,7 @@ class _Collector:
         ours = entry.component_id in OUR_COMPONENTS
         if ours and (vehicle is None or entry.system_id == vehicle.system_id):
             name = f"{name} {entry.message.array_id}" if name == _ARRAY else name
-        elif ours or (entry.system_id, entry.component_id) != vehicle or self._ahead(entry):
+        elif ours or (entry.system_id, entry.component_id) != vehicle or not self._accept(entry):
             return
         if name == "TIMESYNC" and ours == any(payload[:8]):  # tc1 is 0 in a request
             return  # the delay of the link is that of our requests and their replies
@@ -364,20 +365,21 @@ class _Collector:
             if math.isnan(self._anchor_ms):
                 self._anchor_ms = self._now_ms
 
-    def _ahead(self, entry: LoggedMessage) -> bool:
-        """Whether telemetry has a stamp so far ahead that the flight has refused it, too."""
+    def _accept(self, entry: LoggedMessage) -> bool:
+        """Follow the vehicle's clock, also to its beginning after a restart. False for telemetry
+        with a stamp so far ahead that the flight has refused it, too."""
         if entry.frame.message_id not in TELEMETRY:
-            return False
+            return True
         time_s = int.from_bytes(entry.frame.payload[:4], "little") / 1e3
         time_s += self._time.wrapped_s(time_s)
         age = self._time.check(entry.frame.message_id, time_s)
         if age is Age.REBOOTED and self._event_records:
             self._forget_before_flight()
-        return age is Age.STALE and time_s > self._time.newest_s
+        return age is not Age.STALE or time_s <= self._time.newest_s
 
     def _forget_before_flight(self) -> None:
-        """The vehicle was rebooted, and its time begins anew: if nothing was flown yet, what it had
-        reported is none of the flight."""
+        """The vehicle was rebooted, and its time begins anew: if no setpoint was sent yet, what it
+        reported before does not belong to the flight."""
         if self._samples[True, "SET_ATTITUDE_TARGET"].empty:
             for (ours, _), samples in self._samples.items():
                 if not ours:
@@ -457,14 +459,16 @@ class _Collector:
 def _truth(rows: Mapping[str, Rows], origin: Geodetic | None) -> Rows:
     for name, unit in _TRUTH.items():
         if origin is not None and len(rows[name]):
-
-            def position(part: Rows, unit: float = unit, origin: Geodetic = origin) -> Array:
-                places = np.column_stack((part["place"] / 1e7, part["altitude"] / unit))
-                return position_ned_m(places, origin).astype(np.float32)
-
+            position = partial(_true_position, unit=unit, origin=origin)
             return table(rows[name], position_ned_m=in_parts(position, rows[name]))
     none = {"time_s": np.zeros(0), "unix_s": np.zeros(0)}
     return table(none, position_ned_m=np.zeros((0, 3), np.float32))
+
+
+def _true_position(rows: Rows, *, unit: float, origin: Geodetic) -> Array:
+    """NED in m (N, 3), as float32. `unit` of the altitude in a metre."""
+    places = np.column_stack((rows["place"] / 1e7, rows["altitude"] / unit))
+    return position_ned_m(places, origin).astype(np.float32)
 
 
 def _position_of_global(rows: Rows) -> Rows:

@@ -160,6 +160,8 @@ def not_started(flight: FlightState) -> str:
     vehicle, contact, service = flight.vehicle, flight.contact, flight.service
     if contact.in_the_air and not flight.in_engage_mode:
         return f"it flies in {vehicle.mode}: switch to {flight.authority.engage_mode} instead"
+    if vehicle.in_failsafe:
+        return f"a failsafe of the vehicle flies it, in {vehicle.mode}"
     if contact.in_the_air:
         prevented = (unfit, other_sender, mode_unknown, silent, blind)
         return next(

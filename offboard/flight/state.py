@@ -129,6 +129,7 @@ class FlightState:
     left_engaged: bool = False  # a flight that was cut short has left the vehicle engaged
     request: Request = Request.NONE  # of the ground station, while it is judged
     obeyed: Request = Request.NONE  # the newest one that changed the phase
+    refused_s: float = -math.inf  # when the user was told of one that was refused
     stop_reason: str = ""  # why the flight shall end; empty while it shall not
     outcome: Outcome | None = None
 

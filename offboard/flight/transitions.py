@@ -28,6 +28,7 @@ from offboard.identification.learner import Stage
 from offboard.mavlink.events import LocalPosition
 
 DIFFERENT = 0.1  # of the hover thrust: a smaller difference is left to the observer
+REFUSALS_EVERY_S = 1.0
 SETTLED = 0.02  # the same, of a vehicle that has flown by itself for long
 TAKEN = "a failsafe of the vehicle has it, as its HEARTBEAT shows"
 STAGES = {
@@ -95,7 +96,8 @@ def advance(flight: FlightState) -> None:
 
 def obey(flight: FlightState, request: Request, sender: str) -> bool:
     """Take the row that this request of a ground station leads to now, after what is due without
-    it; whether there is one, or the flight obeys it already. A refusal says why, once."""
+    it; whether there is one, or the flight obeys it already. A refusal says why, once a second at
+    most: a ground station may repeat what it asks for."""
     advance(flight)
     flight.request = request
     row = next_row(flight)
@@ -105,12 +107,11 @@ def obey(flight: FlightState, request: Request, sender: str) -> bool:
         outbox.announce(flight, sentence)
         _enter(flight, row)
         flight.obeyed = request
-    elif not obeyed:
+    elif not obeyed and flight.now_s - flight.refused_s >= REFUSALS_EVERY_S:
         starts = request is Request.START and flight.phase is Phase.STANDBY
         why = starting.not_started(flight) if starts else f"not in the phase {flight.phase.value}"
-        sentence = f"refused: {sentence}, but {why}"
-        if sentence not in flight.announced[-1:]:
-            outbox.announce(flight, sentence)
+        outbox.announce(flight, f"refused: {sentence}, but {why}")
+        flight.refused_s = flight.now_s
     flight.request = Request.NONE
     return obeyed
 

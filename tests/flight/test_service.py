@@ -441,7 +441,8 @@ def test_requests_over_mavlink(served: Served) -> None:
     pair.until(lambda: pair.phase is Phase.STANDBY, 3.0)
     assert pair.mode == "BRAKE"
     for command, parameter in ((SET_MODE, 1.0), (START, 0.0), (PAUSE_CONTINUE, 1.0)):
-        ask(command, parameter, result=TEMPORARILY_REJECTED)
+        ask(command, parameter, result=TEMPORARILY_REJECTED, times=3)  # told once
+        pair.run(1.0)
     told = [text for text in pair.service.current.announced if "ted by" in text]
     refused = [f"refused: {word}" for word in ("continue", "hand back", "start", "continue")]
     words = [refused[0], "pause", "continue", "start", "hand back", *refused[1:]]
