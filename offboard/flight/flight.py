@@ -71,6 +71,8 @@ class Flight(FlightState):
                 transitions.advance(self)
                 self._follow_link()
                 actions.act(self)
+            else:
+                outbox.repeat_setpoint(self)
             self._go_on_without_telemetry()
             for sentence in self._news.due(self, host_now_s):
                 outbox.announce(self, sentence)

@@ -12,6 +12,7 @@ import math
 from contextlib import suppress
 from enum import IntFlag
 
+from offboard.flight.phases import TRACKING
 from offboard.flight.state import LEVEL_DIRECTION, FlightState
 from offboard.mavlink import event_record
 from offboard.mavlink.event_record import EventRecord
@@ -161,6 +162,18 @@ def send_level(flight: FlightState, time_s: float, command: Command) -> None:
         send_setpoint(flight, time_s, command)
 
 
+def repeat_setpoint(flight: FlightState) -> None:
+    """Where the link loses setpoints, send the newest once more, half a period after it: a lost one
+    leaves the one before in force for a whole period."""
+    newest = flight.newest_setpoint
+    if newest is None or flight.time_s < newest.time_s + 0.5 * flight.period_s - 1e-6:
+        return
+    flight.newest_setpoint = None
+    ours = flight.phase in TRACKING and flight.authority.permits_setpoint(flight.now_s)
+    if ours and flight.clock.loses(flight.host_s):
+        send(flight, newest)
+
+
 def set_command(flight: FlightState, time_s: float, command: Command) -> None:
     """Note the command in force without sending it, for example the autopilot's own."""
     flight.command = command
@@ -176,8 +189,10 @@ def _send_attitude(
     flight.thrusts.append(min(command.thrust_mps2 / model.thrust_max_mps2, 1.0))
     if flight.identification:
         flight.identification.on_command(flight.delays_begin_s(time_s), command)
-    target = AttitudeTarget(time_s, command, model.hover_thrust, model.gravity_mps2, body_z_down)
-    send(flight, target)
+    flight.newest_setpoint = AttitudeTarget(
+        time_s, command, model.hover_thrust, model.gravity_mps2, body_z_down
+    )
+    send(flight, flight.newest_setpoint)
 
 
 def _send_position(flight: FlightState, time_s: float, command: PositionCommand) -> None:
@@ -186,7 +201,8 @@ def _send_position(flight: FlightState, time_s: float, command: PositionCommand)
     flight.observer.freeze(True)
     flight.thrusts.clear()  # the autopilot chooses the thrust
     flight.command = Command(flight.model.gravity_mps2, LEVEL_DIRECTION, command.heading_rad)
-    send(flight, PositionTarget(time_s, command))
+    flight.newest_setpoint = PositionTarget(time_s, command)
+    send(flight, flight.newest_setpoint)
 
 
 def hover_mps2(flight: FlightState) -> float:

@@ -37,7 +37,13 @@ from offboard.flight.vehicle_state import VehicleState
 from offboard.identification.learner import Learner
 from offboard.mavlink.dialects.base import Dialect, Takeoff
 from offboard.mavlink.events import Heartbeat, Landed, TimesyncReply, Triple
-from offboard.mavlink.outgoing import CommandLong, Outgoing, Record
+from offboard.mavlink.outgoing import (
+    AttitudeTarget,
+    CommandLong,
+    Outgoing,
+    PositionTarget,
+    Record,
+)
 from offboard.mavlink.session import Session
 from offboard.model.command import Command, PredictedState
 from offboard.model.vehicle import Vehicle
@@ -139,6 +145,7 @@ class FlightState:
     bridged_s: float = 0.0  # `silence_s` at the newest setpoint that was sent without telemetry
     ignored: int = 0  # datagrams of others and forged frames between the two newest ticks
     command: Command = field(default_factory=lambda: Command(0.0, LEVEL_DIRECTION, 0.0))  # in force
+    newest_setpoint: AttitudeTarget | PositionTarget | None = None  # until it is repeated
     decided: Decided | None = None  # in this turn
     announced_radps: float = math.nan  # bandwidth in use, as the user knows it
     missed: int = 0  # decisions in a row that were not sent

@@ -27,6 +27,7 @@ NORMAL = 1.4826  # standard deviation of a normal distribution / median absolute
 WINDOW_S, BIN_S = 5.0, 0.1
 RATE_OVER_S, RATE_EVERY_S = 1.0, 1.0  # the rate: from how much at least, and how often
 REAL_TIME = 0.05  # a rate that differs from 1 by less is that of a vehicle in real time
+LOSS_OVER, LOSSY = 50, 0.05  # of so many requests, a share without reply from which a link loses
 BOUNDS_S = 1.0  # replies to older requests do not bound the vehicle time
 LEAST_GROWTH_S, STEADY_S = 0.01, 5.0  # see `LinkGrowth`
 JUMP_S = 0.5  # a stamp further ahead of the vehicle time now shows a jump of the clock
@@ -56,6 +57,7 @@ class VehicleClock:
     def measure_delay_again(self) -> None:
         """The link is loaded otherwise from now on: forget its delay."""
         self._requests.clear()
+        self._asked_s: deque[float] = deque(maxlen=LOSS_OVER)  # host times of the newest
         self._delays_s: deque[float] = deque(maxlen=REPLIES_MAX)
         self._began_s = math.inf  # host time of the first request
         self._answered_s = -math.inf  # host time of the newest request with a reply
@@ -90,6 +92,7 @@ class VehicleClock:
         telemetry."""
         stamp_ns = round(stamp_s * 1e9)
         self._requests.append((stamp_ns, host_s))
+        self._asked_s.append(host_s)
         self._began_s = min(self._began_s, host_s)
         return Timesync(0, stamp_ns)
 
@@ -162,11 +165,22 @@ class VehicleClock:
     def overdue(self, host_s: float) -> int:
         """Number of requests since the newest one with a reply that should have one at host time
         `host_s`: a reply takes at most one way more than `delay`. 0 while no delay is known."""
+        return self._unanswered(self._answered_s, host_s)
+
+    def loses(self, host_s: float) -> bool:
+        """Whether more than LOSSY of the newest requests have no reply at host time `host_s`,
+        although it was due."""
+        if len(self._asked_s) < LOSS_OVER:
+            return False
+        return self._unanswered(self._asked_s[0], host_s) > LOSSY * LOSS_OVER
+
+    def _unanswered(self, since_s: float, host_s: float) -> int:
+        """Number of requests sent after `since_s` whose reply was due at `host_s`."""
         delay = self.delay
         if delay is None:
             return 0
         due_s = host_s - 2.0 * delay.value
-        return sum(self._answered_s < sent_s <= due_s for _, sent_s in self._requests)
+        return sum(since_s < sent_s <= due_s for _, sent_s in self._requests)
 
     @property
     def delay_growth_s(self) -> float:

@@ -3,8 +3,11 @@ says of them, and how they are flown. The oracle is the parameter of the fault."
 
 from __future__ import annotations
 
+from itertools import pairwise
+from statistics import median
+
 import pytest
-from faults import both, late, repeating, stuttering
+from faults import both, late, losing, repeating, stuttering
 from pair import Filter, Pair, in_phase, make, through
 
 from offboard.flight.phases import Phase
@@ -49,6 +52,21 @@ def test_the_delay_of_the_link_is_measured_before_lift_off() -> None:
     answered = over(late(0.3), aloft=False)
     answered.track()
     assert answered.score().rmse_position_m < 0.15
+
+
+@pytest.mark.parametrize(("lost", "sent", "most_m"), [(0.0, 1.0, 0.04), (0.3, 2.0, 0.04)])
+def test_setpoints_are_sent_twice_where_some_are_lost(
+    lost: float, sent: float, most_m: float
+) -> None:
+    """Each once more after half a period. Sent once, this lap has 0.20 m."""
+    pair = over(through)
+    pair.up = losing(lost, seed=5)
+    pair.track()
+    times = [at_s for at_s, phase, _ in pair.setpoints if phase is Phase.TRACK]
+    gaps = [after - before for before, after in pairwise(times)]
+    assert len(times) == pytest.approx((times[-1] - times[0]) / 0.1 * sent, rel=0.1)
+    assert median(gaps) == pytest.approx(0.1 / sent, abs=0.011)  # telemetry comes every 20 ms
+    assert pair.score().rmse_position_m < most_m
 
 
 # -- a link that becomes later in flight: TIMESYNC and the age of telemetry show it ----------------

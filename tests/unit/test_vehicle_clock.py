@@ -192,6 +192,21 @@ def test_all_requests_without_a_reply_count_in_the_longest_silence_s() -> None:
     assert link.overdue(60.2) == 6000
 
 
+@pytest.mark.parametrize(("lost", "loses"), [(2, False), (3, True)])
+def test_link_loses_where_more_than_5_percent_of_50_requests_have_no_reply(
+    lost: int, loses: bool
+) -> None:
+    link = VehicleClock()
+    for number in range(5):
+        link.on_reply(reply(link, float(number), 0.05))
+    for number in range(50):
+        at_s = 10.0 + 0.1 * number
+        request_ns = link.request(at_s, at_s).ts1_ns
+        if number % 10 or number >= 10 * lost:
+            link.on_reply(TimesyncReply(request_ns, request_ns + 50_000_000))
+    assert link.loses(15.0) is loses
+
+
 @pytest.mark.parametrize(("delay_s", "measured_s"), [(0.05, 2.0), (4.4, 6.3), (math.inf, 10.1)])
 def test_link_delay_is_measured_by_twenty_replies(delay_s: float, measured_s: float) -> None:
     """Behind a full buffer of 50 kB, at 11.5 kB/s, the first one takes 4.4 s. Without any, the
