@@ -6,14 +6,15 @@ from offboard.flight import decision, outbox
 from offboard.flight.authority import Standing
 from offboard.flight.failsafe import other_sender, telemetry_old
 from offboard.flight.ground_contact import STANDING_S, STILL_ARMED
-from offboard.flight.phases import BEFORE_FLIGHT, TRACKING, Phase
+from offboard.flight.phases import BEFORE_FLIGHT, FLYING, TRACKING, Phase
 from offboard.flight.state import LEVEL_DIRECTION, FlightState
 from offboard.mavlink.dialects.base import Dialect
-from offboard.mavlink.events import VehicleIdentity
+from offboard.mavlink.events import Heartbeat, VehicleIdentity
 from offboard.mavlink.outgoing import CommandLong
 from offboard.model.command import Command
 
-AUTOPILOT_VERSION = 148  # message id
+HEARTBEAT, AUTOPILOT_VERSION = 0, 148  # message ids
+HEARTBEAT_DUE_S = 1.5  # PX4 sends one a second; a lossy link may lose several, mode and arming too
 FIT_EVERY_S = 4.0  # between two reductions of the telemetry: a backlog must drain first
 SPOOL_UP_PER_S = 0.7  # thrust ramp before lift-off, in units of gravity
 SPOOL_MAX = 2.0
@@ -32,7 +33,8 @@ LAND_STREAM_S, UNANSWERED_STREAM_S = 3.0, 6.0
 
 
 def act(flight: FlightState) -> None:
-    """Send the requests of the phase, at most one setpoint, and a request of the vehicle's time."""
+    """Send the requests of the phase, at most one setpoint, and requests of the vehicle's time and
+    of a HEARTBEAT that is missing."""
     if flight.in_end_phase:
         return
     time_s = flight.time_s
@@ -45,6 +47,9 @@ def act(flight: FlightState) -> None:
         act_without_telemetry(flight, time_s)
     elif flight.authority.permits_setpoint(flight.now_s) and not decision.decide(flight):
         outbox.send_level(flight, time_s, _level(flight))
+    airborne = flight.phase in FLYING or flight.phase is Phase.LAND
+    if airborne and flight.vehicle.age_s(Heartbeat) > HEARTBEAT_DUE_S:
+        outbox.send(flight, CommandLong.message(HEARTBEAT))
     outbox.send(flight, flight.clock.request(time_s, flight.host_s))
 
 

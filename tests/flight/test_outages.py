@@ -13,6 +13,7 @@ from pair import Bytes, Filter, Pair, hover, in_phase, on_arducopter
 from watch import aborted, begun_s, flown, refused, said, sent_after
 
 from offboard.flight.phases import Phase
+from offboard.mavlink.events import Heartbeat
 
 LONG = ("reference.height_m=3.0", "reference.duration_s=6.0")
 FALLBACKS = {"px4": 0.0, "px4, which holds": 5.0}  # COM_OBL_RC_ACT: POSCTL, LOITER
@@ -164,3 +165,22 @@ def test_a_vehicle_that_does_not_receive_setpoints_is_held() -> None:
     )  # fmt: skip
     assert begun_s(pair, Phase.HOLD) - lost_up[0] < 1.8
     assert watch.top_m < 3.5
+
+
+def test_a_heartbeat_that_is_missing_is_requested() -> None:
+    """Two are lost and no CURRENT_MODE arrives: the third, 3 s after the first, is too late."""
+
+    def after_the_next(pair: Pair) -> None:
+        pair.down = without(CURRENT_MODE)
+        pair.at.append((heard, lose))
+
+    def heard(pair: Pair) -> bool:
+        return pair.companion.vehicle.age_s(Heartbeat) == 0.0
+
+    def lose(pair: Pair) -> None:
+        ends_s = pair.time_s + 2.2
+        quiet, rest = without(CURRENT_MODE, HEARTBEAT), without(CURRENT_MODE)
+        pair.down = lambda time_s, sent: (quiet if time_s < ends_s else rest)(time_s, sent)
+
+    pair = make("px4", after_the_next)
+    flown(pair)
