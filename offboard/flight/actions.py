@@ -27,9 +27,9 @@ DISARMING = (
     f"disarming: {STANDING_S:.0f} s without motion on the ground, and the vehicle does not disarm "
     "by itself"
 )
-# If the landing is refused, setpoints stop and the autopilot's failsafe lands; later if the request
-# is not answered, as a link that loses some may need several
-LAND_STREAM_S, UNANSWERED_STREAM_S = 3.0, 6.0
+# If the landing is refused, setpoints stop and the autopilot's failsafe lands; a link that loses
+# some may need several requests, one a second
+LAND_STREAM_S = 5.0
 
 
 def act(flight: FlightState) -> None:
@@ -82,15 +82,12 @@ def _end(flight: FlightState, time_s: float, *, steers: bool) -> None:
     fails = authority.standing is Standing.FAILSAFE
     if fails and authority.mode == dialect.return_mode:
         return  # the owner's choice for missing setpoints: it lands where it took off
-    request = dialect.hold() if holds else CommandLong.land()
     if authority.mode != mode:
-        if outbox.request(flight, request):
+        if outbox.request(flight, dialect.hold() if holds else CommandLong.land()):
             authority.request(mode)
     elif not holds:
         _disarm_if_standing(flight)
-    answered = request.command in flight.vehicle.results
-    streams_s = LAND_STREAM_S if answered else UNANSWERED_STREAM_S
-    streams = steers and not flight.awaits_link and flight.in_phase_s < streams_s
+    streams = steers and not flight.awaits_link and flight.in_phase_s < LAND_STREAM_S
     if streams and authority.mode == authority.engage_mode:
         outbox.send_level(flight, time_s, _level(flight))
 

@@ -132,7 +132,7 @@ def landing_requested(pair: Pair) -> None:
 def landed_by_its_failsafe(pair: Pair) -> None:
     """After a refused landing the setpoints faults.stop, so that the vehicle's failsafe acts."""
     assert pair.went_through(Phase.HOVER)
-    assert 25 <= sum(phase is Phase.LAND for _, phase, _ in pair.setpoints) <= 32
+    assert 45 <= sum(phase is Phase.LAND for _, phase, _ in pair.setpoints) <= 52
     assert len(pair.landings) > 3
 
 

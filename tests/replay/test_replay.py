@@ -98,7 +98,7 @@ def test_a_changed_law_is_found_at_its_first_decision(
     """A thrust of 0.01 m/s2 more is 0.00043 of the whole, by the vehicle file's hover thrust."""
     change_the_law(monkeypatch, 0.01)
     result = run(flight)
-    assert " of 215 setpoints and 25 commands differ; largest difference" in reason(result)
+    assert " of 339 setpoints and 25 commands differ; largest difference" in reason(result)
     assert getattr(result.exception, "code", None) == 1
     first = verdict(Replay(read(flight))).significant[0]
     assert CLIMB_BEGAN_S <= first.time_s < CLIMB_BEGAN_S + 0.7
