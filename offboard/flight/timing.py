@@ -57,7 +57,7 @@ class VehicleClock:
     def measure_delay_again(self) -> None:
         """The link is loaded otherwise from now on: forget its delay."""
         self._requests.clear()
-        self._asked_s: deque[float] = deque(maxlen=LOSS_OVER)  # host times of the newest
+        self._asked_s: deque[float] = deque(maxlen=LOSS_OVER + 1)  # host times of the newest
         self._delays_s: deque[float] = deque(maxlen=REPLIES_MAX)
         self._began_s = math.inf  # host time of the first request
         self._answered_s = -math.inf  # host time of the newest request with a reply
@@ -170,7 +170,7 @@ class VehicleClock:
     def loses(self, host_s: float) -> bool:
         """Whether more than LOSSY of the newest requests have no reply at host time `host_s`,
         although it was due."""
-        if len(self._asked_s) < LOSS_OVER:
+        if len(self._asked_s) <= LOSS_OVER:
             return False
         return self._unanswered(self._asked_s[0], host_s) > LOSSY * LOSS_OVER
 

@@ -199,12 +199,12 @@ def test_link_loses_where_more_than_5_percent_of_50_requests_have_no_reply(
     link = VehicleClock()
     for number in range(5):
         link.on_reply(reply(link, float(number), 0.05))
-    for number in range(50):
+    for number in range(51):
         at_s = 10.0 + 0.1 * number
         request_ns = link.request(at_s, at_s).ts1_ns
-        if number % 10 or number >= 10 * lost:
+        if number % 10 or not 0 < number <= 10 * lost:
             link.on_reply(TimesyncReply(request_ns, request_ns + 50_000_000))
-    assert link.loses(15.0) is loses
+    assert link.loses(15.2) is loses
 
 
 @pytest.mark.parametrize(("delay_s", "measured_s"), [(0.05, 2.0), (4.4, 6.3), (math.inf, 10.1)])
