@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from offboard.flight import decision, outbox
 from offboard.flight.authority import Standing
-from offboard.flight.failsafe import other_sender, telemetry_old
+from offboard.flight.failsafe import telemetry_old
 from offboard.flight.ground_contact import STANDING_S, STILL_ARMED
 from offboard.flight.phases import BEFORE_FLIGHT, TRACKING, Phase
+from offboard.flight.preflight import other_sender
 from offboard.flight.state import LEVEL_DIRECTION, FlightState
 from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.events import VehicleIdentity
@@ -164,7 +165,7 @@ def _flown(flight: FlightState) -> Command:
 
 def request_parameters(flight: FlightState) -> None:
     """In HEALTH: ask what decides whether the vehicle can be flown; it needs no telemetry."""
-    due = flight.reading.due(_dialect(flight), flight.vehicle.parameters, flight.now_s)
+    due = flight.reading.due(_dialect(flight), flight.vehicle)
     outbox.send(flight, *due)
     if flight.service:
         if flight.vehicle.age_s(VehicleIdentity) > flight.in_phase_s:

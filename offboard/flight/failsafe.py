@@ -15,6 +15,7 @@ import numpy as np
 from offboard.flight.authority import Standing
 from offboard.flight.ground_contact import STOOD_S
 from offboard.flight.phases import TRACKING, Action, Condition, Limits, Phase
+from offboard.flight.preflight import other_sender
 from offboard.flight.state import COMMANDS_KEPT, FlightState
 from offboard.flight.timing import JUMP_S
 from offboard.mavlink.events import MODE_KNOWN_S, ThrustReport
@@ -56,12 +57,6 @@ def mode_unknown(flight: FlightState) -> str:
     if flight.authority.heard(flight.now_s):
         return ""
     return f"no report of the mode for {flight.now_s - flight.authority.heard_s:.1f} s"
-
-
-def other_sender(flight: FlightState) -> str:
-    """Another program sends setpoints or commands modes on this link, or says in its HEARTBEAT
-    that it flies the vehicle."""
-    return "" if flight.limits.begin_with_other_sender else flight.vehicle.other_sender_named
 
 
 # ---------------------------------------------------------------------- who has the vehicle

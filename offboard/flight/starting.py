@@ -10,14 +10,13 @@ from offboard.flight.failsafe import (
     blind,
     in_own_failsafe,
     mode_unknown,
-    other_sender,
     rebooted,
     silent,
     silent_for,
     stop_requested,
 )
 from offboard.flight.phases import ExitCode, Phase, Request, Transition
-from offboard.flight.preflight import Ground
+from offboard.flight.preflight import armed_already, other_sender, other_vehicle, unfit_type
 from offboard.flight.state import FlightState
 from offboard.flight.vehicle_state import ARMED_KNOWN_S, DISARMED_S
 from offboard.mavlink.events import Heartbeat
@@ -50,46 +49,14 @@ def silent_for_another(flight: FlightState) -> str:
     return silent_for(flight, OTHER_VEHICLE_S) if heard else ""
 
 
-def other_vehicle(flight: FlightState) -> str:
-    """Several vehicles are heard, and none was chosen with --system, or none can be."""
-    ground = ground_of(flight)
-    return preflight.same_system_id(ground) or preflight.several_vehicles(ground)
-
-
-def ground_of(flight: FlightState) -> Ground:
-    """What the preflight list judges."""
-    vehicle, contact, dialect = flight.vehicle, flight.contact, flight.dialect
-    service = flight.service
-    read = dialect and flight.reading.complete(dialect, vehicle.parameters, flight.now_s)
-    from_origin = service is not None and service.anchor == "origin"
-    return Ground(
-        vehicle,
-        flight.limits,
-        flight.session,
-        flight.clock,
-        flight.host_s,
-        helicopter=flight.model.airframe == "helicopter",
-        reads_parameters=not read,
-        in_the_air=contact.in_the_air,
-        guarded=flight.guarded,
-        origin_missing=from_origin and contact.in_the_air and contact.rest_ned_m is None,
-        serves=service is not None,
-    )
-
-
-def armed_already(flight: FlightState) -> str:
-    return preflight.armed_already(ground_of(flight))
-
-
 def refused(flight: FlightState) -> str:
     """What the preflight list refuses at once, without waiting."""
-    return "; ".join(preflight.refusals(ground_of(flight)))
+    return "; ".join(preflight.refusals(flight))
 
 
 def unfit(flight: FlightState) -> str:
     """What the preflight list refuses, and the first that it waits for; empty for neither."""
-    ground = ground_of(flight)
-    return "; ".join(filter(None, [*preflight.refusals(ground), preflight.not_ready(ground)]))
+    return "; ".join(filter(None, [*preflight.refusals(flight), preflight.not_ready(flight)]))
 
 
 def usable(flight: FlightState) -> bool:
@@ -108,10 +75,8 @@ def can_take_over(flight: FlightState) -> bool:
     """It flies in the mode of setpoints, without a failsafe, and no other program controls it."""
     if flight.vehicle.in_failsafe or not engaged_in_the_air(flight):
         return False
-    prevented = (other_sender, mode_unknown, silent, blind)
-    return not any(each(flight) for each in prevented) and not preflight.unfit_type(
-        ground_of(flight)
-    )
+    prevented = (other_sender, mode_unknown, silent, blind, unfit_type)
+    return not any(each(flight) for each in prevented)
 
 
 def engaged_by_pilot(flight: FlightState) -> str:

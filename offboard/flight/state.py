@@ -25,22 +25,17 @@ from offboard.flight.phases import (
     ENDS,
     OPERATOR_STOP,
     Action,
-    Limits,
     Phase,
     Request,
-    ServiceOptions,
 )
-from offboard.flight.preflight import ParameterReading
+from offboard.flight.preflight import Ground
 from offboard.flight.record import Decided
-from offboard.flight.timing import Busyness, LinkGrowth, VehicleClock
-from offboard.flight.vehicle_state import VehicleState
+from offboard.flight.timing import Busyness, LinkGrowth
 from offboard.identification.learner import Learner
-from offboard.mavlink.dialects.base import Dialect, Takeoff
+from offboard.mavlink.dialects.base import Takeoff
 from offboard.mavlink.events import Heartbeat, Landed, TimesyncReply, Triple
 from offboard.mavlink.outgoing import CommandLong, Outgoing, Record
-from offboard.mavlink.session import Session
 from offboard.model.command import Command, PredictedState
-from offboard.model.vehicle import Vehicle
 
 LEVEL_DIRECTION = (0.0, 0.0, 1.0)  # of the thrust: the third body axis in NED
 COMMANDS_KEPT = 7  # as long as an attitude may take to follow
@@ -82,31 +77,23 @@ class Failsafe:
     cause: str = ""
 
 
-@dataclass(slots=True)
-class FlightState:
-    """One flight. `model` is the vehicle model in use: it scales the thrust of setpoints.
-    `stopwatch` reads host time. `deadline_s` is the wall time that one decision may take, None
-    where the vehicle waits for each decision, so that nothing can be late or old. `identification`
-    is None with a controller that cannot use it, `service` in a flight of `fly`.
+@dataclass(slots=True, kw_only=True)
+class FlightState(Ground):
+    """One flight. `stopwatch` reads host time. `deadline_s` is the wall time that one decision may
+    take, None where the vehicle waits for each decision, so that nothing can be late or old.
+    `identification` is None with a controller that cannot use it, `service` in a flight of `fly`.
     """
 
-    limits: Limits
     plan: FlightPlan
-    model: Vehicle
-    session: Session
     observer: Observer
     controller: Controller
     period_s: float
     stopwatch: Callable[[], float]
     deadline_s: float | None = None
     identification: Learner | None = None
-    service: ServiceOptions | None = None
     before: InitVar[FlightState | None] = None
-    vehicle: VehicleState = field(default_factory=VehicleState)
-    clock: VehicleClock = field(default_factory=VehicleClock)
     hover: HoverEstimate = field(default_factory=HoverEstimate)
     jumps: PositionJumps = field(default_factory=PositionJumps)
-    reading: ParameterReading = field(default_factory=ParameterReading)
     positioning: Positioning = field(default_factory=Positioning)
     failsafe: Failsafe = field(default_factory=Failsafe)
     contact: GroundContact = field(init=False)
@@ -120,11 +107,9 @@ class FlightState:
     phase: Phase = Phase.CONNECT
     began_s: float = 0.0  # of the phase, on `Session.link_time_s`
     turned_s: float = math.nan  # host time of the newest turn
-    host_s: float = 0.0  # monotonic time of this computer at the present turn
     silence_s: float = 0.0  # host time since the newest telemetry
     setpoint_s: float = math.inf  # when the newest setpoint left
     setpoints_missed_s: float = -math.inf  # when setpoints may have been missing for long
-    guarded: bool = True  # a supervisor lands the vehicle if this process ends
     rebooted: bool = False
     left_engaged: bool = False  # a flight that was cut short has left the vehicle engaged
     request: Request = Request.NONE  # of the ground station, while it is judged
@@ -195,9 +180,13 @@ class FlightState:
         return self.vehicle.now_s
 
     @property
-    def dialect(self) -> Dialect | None:
-        """The dialect of the vehicle; None before it is found."""
-        return self.session.dialect
+    def in_the_air(self) -> bool:
+        return self.contact.in_the_air
+
+    @property
+    def origin_missing(self) -> bool:
+        unseen = self.in_the_air and self.contact.rest_ned_m is None
+        return unseen and self.service is not None and self.service.anchor == "origin"
 
     @property
     def in_phase_s(self) -> float:

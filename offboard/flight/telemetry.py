@@ -12,7 +12,7 @@ import numpy as np
 from offboard.flight import outbox, transitions
 from offboard.flight.authority import Authority, PilotSwitch
 from offboard.flight.estimates import HoverEstimate, PositionJumps
-from offboard.flight.failsafe import REBOOTED, other_sender
+from offboard.flight.failsafe import REBOOTED
 from offboard.flight.ground_contact import GroundContact, Touchdown
 from offboard.flight.phases import (
     BEFORE_FLIGHT,
@@ -23,7 +23,7 @@ from offboard.flight.phases import (
     Phase,
     Request,
 )
-from offboard.flight.preflight import ParameterReading
+from offboard.flight.preflight import ParameterReading, other_sender
 from offboard.flight.record import vehicle_record
 from offboard.flight.state import FlightState, Outcome
 from offboard.flight.timing import VehicleClock

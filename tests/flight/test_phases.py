@@ -222,10 +222,8 @@ def preflight_list(monkeypatch: pytest.MonkeyPatch) -> None:
     def refusals(ground: Any) -> list[str]:
         return vars(ground.session).get("refusals", [])
 
-    monkeypatch.setattr(starting, "ground_of", lambda flight: flight)
     monkeypatch.setattr(preflight, "not_ready", not_ready)
     monkeypatch.setattr(preflight, "refusals", refusals)
-    monkeypatch.setattr(preflight, "unfit_type", lambda known: "")
 
 
 def event_of(row: Transition) -> Setup:

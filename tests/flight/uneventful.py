@@ -73,14 +73,14 @@ def uneventful(phase: Phase = Phase.TRACK, service: ServiceOptions | None = None
     )
     controller: Any = None
     flight = FlightState(
-        Limits(),
-        FlightPlan(TRACK),
-        CONFIG.vehicle,
-        session,
-        observer,
-        controller,
-        CONFIG.period_s,
-        lambda: 0.0,
+        limits=Limits(),
+        plan=FlightPlan(TRACK),
+        model=CONFIG.vehicle,
+        session=session,
+        observer=observer,
+        controller=controller,
+        period_s=CONFIG.period_s,
+        stopwatch=lambda: 0.0,
         identification=identification,
         service=service,
         phase=phase,
