@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from offboard.flight import decision, outbox
-from offboard.flight.authority import Standing
+from offboard.flight.authority import PilotSwitch, Standing
 from offboard.flight.failsafe import telemetry_old
 from offboard.flight.ground_contact import STANDING_S, STILL_ARMED
 from offboard.flight.phases import BEFORE_FLIGHT, TRACKING, Phase
@@ -148,7 +148,7 @@ def _stand_by(flight: FlightState, time_s: float) -> None:
     if on_ground:
         quiet |= vehicle.armed and vehicle.in_failsafe
     else:
-        quiet |= vehicle.in_failsafe or not flight.pilot.other_mode_shown
+        quiet |= vehicle.in_failsafe or flight.pilot is not PilotSwitch.READY
     if quiet:
         outbox.set_command(flight, time_s, command)
     else:

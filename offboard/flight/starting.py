@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from offboard.flight import preflight
+from offboard.flight.authority import PilotSwitch
 from offboard.flight.failsafe import (
     OPERATOR,
     authority_lost,
@@ -80,25 +81,25 @@ def can_take_over(flight: FlightState) -> bool:
 
 
 def engaged_by_pilot(flight: FlightState) -> str:
-    fit = flight.pilot.engaged and can_take_over(flight) and usable(flight)
+    fit = flight.pilot is PilotSwitch.ENGAGED and can_take_over(flight) and usable(flight)
     return f"engaged: {flight.vehicle.mode} in the air" if fit else ""
 
 
 def engaged_but_unfit(flight: FlightState) -> str:
-    may_fly = flight.pilot.engaged and can_take_over(flight)
+    may_fly = flight.pilot is PilotSwitch.ENGAGED and can_take_over(flight)
     why = unfit(flight) if may_fly else ""
     return f"not engaged: {why}" if why else ""
 
 
 def engaged_too_soon(flight: FlightState) -> bool:
     """It left the mode of setpoints and returned so soon that a failsafe may have done it."""
-    too_soon = flight.pilot.returned_too_soon and flight.in_phase_s > LISTENED_S
+    too_soon = flight.pilot is PilotSwitch.TOO_SOON and flight.in_phase_s > LISTENED_S
     return too_soon and can_take_over(flight)
 
 
 def found_engaged(flight: FlightState) -> bool:
     """It was found in the air in the mode of setpoints: another program may fly it."""
-    found = flight.pilot.always_in_engage_mode and flight.vehicle.landed != "unknown"
+    found = flight.pilot is PilotSwitch.FOUND and flight.vehicle.landed != "unknown"
     return found and flight.in_phase_s > LISTENED_S and bool(engaged_in_the_air(flight))
 
 

@@ -11,7 +11,7 @@ import math
 import operator
 from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import InitVar, dataclass, field, replace
+from dataclasses import InitVar, dataclass, field
 
 import numpy as np
 
@@ -97,7 +97,7 @@ class FlightState(Ground):
     positioning: Positioning = field(default_factory=Positioning)
     failsafe: Failsafe = field(default_factory=Failsafe)
     contact: GroundContact = field(init=False)
-    pilot: PilotSwitch = field(default_factory=PilotSwitch)
+    pilot: PilotSwitch = PilotSwitch.FOUND
     home_ned_m: Triple = (0.0, 0.0, 0.0)  # the ground where the flight began
     took_off: bool = False  # from there; a vehicle that was found in the air has not
     touchdown: Touchdown | None = None  # of the landing
@@ -165,14 +165,14 @@ class FlightState(Ground):
         prepared = before.phase not in (Phase.CONNECT, Phase.HEALTH) and not before.rebooted
         self.phase = Phase.STANDBY if prepared and self.authority.engage_mode else Phase.CONNECT
         self.began_s = before.now_s
-        pilot = before.pilot
-        self.pilot = replace(
-            pilot,
-            engaged=False,
-            always_in_engage_mode=before.ends_engaged,
+        self.pilot = before.pilot
+        if before.ends_engaged:
+            self.pilot = PilotSwitch.FOUND
+        elif before.pilot is PilotSwitch.ENGAGED:
             # a switch while the flight ended is answered by hold
-            returned_too_soon=pilot.returned_too_soon or (before.taken and pilot.engaged),
-        )
+            self.pilot = PilotSwitch.TOO_SOON if before.taken else PilotSwitch.IDLE
+        elif before.pilot is PilotSwitch.FOUND:
+            self.pilot = PilotSwitch.IDLE
 
     @property
     def now_s(self) -> float:
@@ -256,7 +256,7 @@ class FlightState(Ground):
         """Whether the flight ends with a vehicle that nobody has seen in another mode than that of
         setpoints: it was not heard any more, or has rebooted."""
         unheard = self.authority.standing is Standing.OURS
-        return unheard or (self.rebooted and self.pilot.always_in_engage_mode)
+        return unheard or (self.rebooted and self.pilot is PilotSwitch.FOUND)
 
     @property
     def time_s(self) -> float:

@@ -170,17 +170,20 @@ def _on_mode(
         setpoints_missing=flight.setpoints_missing,
         sticks=vehicle.sticks,
     )
-    pilot, contact, in_engage_mode = flight.pilot, flight.contact, flight.in_engage_mode
-    in_the_air, switched = contact.in_the_air, in_engage_mode and pilot.other_mode_shown
-    pilot.on_mode(in_engage_mode=in_engage_mode, in_the_air=in_the_air, flies=contact.flies)
-    why = "" if pilot.engaged or not in_the_air else "the vehicle may stand on the ground"
-    if pilot.engaged and other_sender(flight):
-        pilot.engaged = False  # it was not switched for us
-        why = "another program sends setpoints"
+    switched = flight.pilot is PilotSwitch.READY and flight.in_engage_mode
+    in_the_air, flies, why = flight.in_the_air, flight.contact.flies, ""
+    flight.pilot = flight.pilot.after(
+        in_engage_mode=flight.in_engage_mode,
+        in_the_air=in_the_air,
+        flies=flies,
+        failsafe=vehicle.in_failsafe if isinstance(event, Heartbeat) else None,
+    )
+    if flight.pilot is PilotSwitch.ENGAGED and other_sender(flight):
+        flight.pilot, why = PilotSwitch.IDLE, "another program sends setpoints"  # not for us
+    elif in_the_air and not flies:
+        why = "the vehicle may stand on the ground"
     if switched and why and flight.phase in WAITING:
         outbox.announce(flight, f"not engaged: {mode}, but {why}")
-    if isinstance(event, Heartbeat):
-        pilot.on_heartbeat(in_engage_mode=in_engage_mode, failsafe=vehicle.in_failsafe)
 
 
 def _on_reboot(flight: FlightState) -> None:
@@ -196,7 +199,7 @@ def _on_reboot(flight: FlightState) -> None:
         flight.authority = Authority()
     flight.authority.forget(flight.now_s)  # the age of its report counts from now
     flight.rebooted = flight.phase not in (Phase.CONNECT, Phase.HEALTH)
-    flight.pilot = PilotSwitch()
+    flight.pilot = PilotSwitch.FOUND
     if flight.phase is Phase.LAND:
         flight.touchdown = Touchdown(None)
         if flight.outcome is None:

@@ -13,7 +13,7 @@ from flight_tables import IN_THE_AIR, README, asked, exits, with_tables
 from uneventful import NOW_S, TRACK, hear, heartbeat, lift, position, uneventful
 
 from offboard.flight import preflight, starting, telemetry
-from offboard.flight.authority import Standing
+from offboard.flight.authority import PilotSwitch, Standing
 from offboard.flight.phases import (
     ENDS,
     FLYING,
@@ -74,14 +74,8 @@ def _disarm(flight: FlightState, for_s: float = 1.6, landed: str = "on_ground") 
     flight.began_s = flight.vehicle.armed_changed_s = NOW_S - for_s
 
 
-def _engage(**pilot: bool) -> Setup:
-    def apply(flight: FlightState) -> None:
-        lift(flight)
-        flight.began_s = NOW_S - 0.6
-        for name, value in pilot.items():
-            setattr(flight.pilot, name, value)
-
-    return apply
+def _engage(pilot: PilotSwitch) -> Setup:
+    return _all(lift, _since(0.6), _set(pilot=pilot))
 
 
 def _fit(flight: FlightState) -> None:
@@ -199,12 +193,12 @@ EVENTS: dict[str, Setup] = {
     "stop_requested": _stop,
     "stop_requested_on_ground": _all(_rest, _set(stop_reason="stop requested")),
     "rises": _lift_off,
-    "engaged_by_pilot": _all(_engage(engaged=True), _fit),
-    "engaged_but_unfit": _engage(engaged=True),
+    "engaged_by_pilot": _all(_engage(PilotSwitch.ENGAGED), _fit),
+    "engaged_but_unfit": _engage(PilotSwitch.ENGAGED),
     "started_in_the_air": _all(lift, _fit, _set(request=Request.START)),
     "started_on_the_ground": _all(_fit, _set(request=Request.START)),
-    "engaged_too_soon": _engage(returned_too_soon=True),
-    "abandoned": _all(_engage(always_in_engage_mode=True), _set(left_engaged=True)),
+    "engaged_too_soon": _engage(PilotSwitch.TOO_SOON),
+    "abandoned": _all(_engage(PilotSwitch.FOUND), _set(left_engaged=True)),
     "in_requested_mode": _stand(Standing.HANDED),
     "failsafe_hold": _act(Action.HOLD),
     "failsafe_land": _act(Action.LAND),

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from offboard.flight.authority import Authority
+from offboard.flight.authority import Authority, PilotSwitch
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.ground_contact import Touchdown
 from offboard.flight.phases import Limits, Phase, ServiceOptions
@@ -87,7 +87,7 @@ def uneventful(phase: Phase = Phase.TRACK, service: ServiceOptions | None = None
         began_s=NOW_S,
     )
     flight.vehicle.now_s = NOW_S
-    flight.pilot.always_in_engage_mode = False
+    flight.pilot = PilotSwitch.IDLE
     if phase is Phase.CONNECT:
         return flight
     session.dialect = PX4
