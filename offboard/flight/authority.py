@@ -64,7 +64,6 @@ class Authority:
     # modes that we asked for to end the flight, oldest first; those before the one that it shows
     # are dropped
     _requested: list[str] = field(default_factory=list)
-    _forgot_s: float = -math.inf  # time of a reboot
     _failsafe_shown: bool = False  # a HEARTBEAT shows what `Standing.FAILSAFE` supposes
     _counts_from_s: float = -math.inf  # host time: reports that arrived earlier do not count
 
@@ -172,8 +171,7 @@ class Authority:
 
     def forget(self, now_s: float) -> None:
         """The vehicle was rebooted: its standing is shown by the next report of the mode."""
-        self.heard_s = self.reported_s = -math.inf
-        self._forgot_s = now_s
+        self.heard_s, self.reported_s = now_s, -math.inf  # no report counts as unheard before now
         if self.is_ours:
             self.standing = Standing.OURS
 
@@ -193,7 +191,7 @@ class Authority:
 
     def unheard_s(self, now_s: float) -> float:
         """Time since the newest report, if that is longer than usual; else 0."""
-        return 0.0 if self.heard(now_s) else now_s - max(self.heard_s, self._forgot_s)
+        return 0.0 if self.heard(now_s) else now_s - self.heard_s
 
     def permits_setpoint(self, now_s: float) -> bool:
         """Whether a setpoint may leave: to a vehicle that follows it, or as the stream that PX4

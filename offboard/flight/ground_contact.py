@@ -151,8 +151,7 @@ class Touchdown:
     def __init__(self, takeoff_ned_m: Triple | None) -> None:
         self._takeoff_ned_m = takeoff_ned_m
         self._newest: deque[tuple[float, float, float]] = deque()  # time, down, downward speed
-        self._position_ned_m: Triple = (math.nan,) * 3
-        self._reported: tuple[Triple, float] | None = None
+        self._reported: tuple[Triple, float] = (math.nan,) * 3, math.nan  # position, down
         self._rest_down_m = math.nan
         self.speed_mps = math.nan
 
@@ -161,8 +160,7 @@ class Touchdown:
         if (position_ned_m, down_mps) == self._reported:
             return  # no estimator reports the same twice: it has stopped
         self._reported = position_ned_m, down_mps
-        self._position_ned_m, down_m = position_ned_m, position_ned_m[2]
-        newest = self._newest
+        newest, down_m = self._newest, position_ned_m[2]
         newest.append((time_s, down_m, down_mps))
         while newest[0][0] < time_s - BEFORE_S - REST_S:
             newest.popleft()
@@ -197,7 +195,7 @@ class Touchdown:
             return "the land detector does not report the ground"
         if math.isnan(self.speed_mps):
             return "it has not come to rest"
-        takeoff_ned_m, position_ned_m = self._takeoff_ned_m, self._position_ned_m
+        takeoff_ned_m, (position_ned_m, _) = self._takeoff_ned_m, self._reported
         if takeoff_ned_m is None:
             return ""
         height_m = takeoff_ned_m[2] - position_ned_m[2]

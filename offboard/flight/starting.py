@@ -72,12 +72,14 @@ def not_ready_in_time(flight: FlightState) -> str:
 # ---------------------------------------------------------------------- the service waits
 
 
+PREVENTED = other_sender, mode_unknown, silent, blind  # what prevents that a vehicle is taken over
+
+
 def can_take_over(flight: FlightState) -> bool:
     """It flies in the mode of setpoints, without a failsafe, and no other program controls it."""
     if flight.vehicle.in_failsafe or not engaged_in_the_air(flight):
         return False
-    prevented = (other_sender, mode_unknown, silent, blind, unfit_type)
-    return not any(each(flight) for each in prevented)
+    return not any(each(flight) for each in (*PREVENTED, unfit_type))
 
 
 def engaged_by_pilot(flight: FlightState) -> str:
@@ -110,32 +112,28 @@ def abandoned(flight: FlightState) -> bool:
 
 
 def started_in_the_air(flight: FlightState) -> str:
-    """On request, as by a pilot's switch, only where every sign says that it flies."""
-    flies = flight.request is Request.START and flight.contact.flies
-    fit = flies and can_take_over(flight) and usable(flight)
-    return f"start requested, {flight.vehicle.mode}" if fit else ""
+    started = flight.request is Request.START and flight.in_the_air and not not_started(flight)
+    return f"start requested, {flight.vehicle.mode}" if started else ""
 
 
 def started_on_the_ground(flight: FlightState) -> bool:
-    may_arm = flight.service is not None and flight.service.arms and not flight.vehicle.armed
-    return flight.request is Request.START and may_arm and usable(flight)
+    return flight.request is Request.START and not flight.in_the_air and not not_started(flight)
 
 
 def not_started(flight: FlightState) -> str:
-    """Why the vehicle that waits is not started on request."""
-    vehicle, contact, service = flight.vehicle, flight.contact, flight.service
-    if contact.in_the_air and not flight.in_engage_mode:
+    """Why the vehicle that waits is not started on request; empty if it is. In the air, as by a
+    pilot's switch, only where every sign says that it flies."""
+    vehicle, service = flight.vehicle, flight.service
+    if not flight.in_the_air:
+        if service is None or not service.arms:
+            return "it is on the ground, and may not be armed without --arms"
+        return "it is armed on the ground" if vehicle.armed else unfit(flight)
+    if not flight.in_engage_mode:
         return f"it flies in {vehicle.mode}: switch to {flight.authority.engage_mode} instead"
     if vehicle.in_failsafe:
         return f"a failsafe of the vehicle flies it, in {vehicle.mode}"
-    if contact.in_the_air:
-        prevented = (unfit, other_sender, mode_unknown, silent, blind)
-        return next(
-            filter(None, (each(flight) for each in prevented)), "it may stand on the ground"
-        )
-    if service is None or not service.arms:
-        return "it is on the ground, and may not be armed without --arms"
-    return "it is armed on the ground" if vehicle.armed else unfit(flight)
+    why = next(filter(None, (each(flight) for each in (unfit, *PREVENTED))), "")
+    return why or ("" if flight.contact.flies else "it may stand on the ground")
 
 
 # ---------------------------------------------------------------------- to the air

@@ -108,7 +108,7 @@ class FlightState(Ground):
     began_s: float = 0.0  # of the phase, on `Session.link_time_s`
     turned_s: float = math.nan  # host time of the newest turn
     silence_s: float = 0.0  # host time since the newest telemetry
-    setpoint_s: float = math.inf  # when the newest setpoint left
+    setpoint_s: float = math.inf  # when the newest setpoint left; infinite before the first
     setpoints_missed_s: float = -math.inf  # when setpoints may have been missing for long
     rebooted: bool = False
     left_engaged: bool = False  # a flight that was cut short has left the vehicle engaged
@@ -138,7 +138,6 @@ class FlightState(Ground):
     records: list[Record] = field(default_factory=list)  # to be logged
     requested_s: dict[tuple[Phase, CommandLong], float] = field(default_factory=dict)
     text_id: int = 0
-    thinned_s: float = 0.0  # when less telemetry was requested, since the phase HEALTH began
     awaits_link: bool = False  # while landing
     follows_others: bool = False  # the newest ThrustReport is of none of `thrusts`
     predictions: deque[PredictedState] = field(default_factory=lambda: deque(maxlen=8))

@@ -162,7 +162,7 @@ def _enter(flight: FlightState, row: Transition) -> None:
         _set_hover_thrust(flight)
     elif row.target is Phase.HEALTH:  # it may be another vehicle, or have other parameters
         flight.vehicle.parameters.clear()
-        flight.reading, flight.thinned_s = ParameterReading(), 0.0
+        flight.reading = ParameterReading()
         flight.requested_s.clear()
     elif row.target is Phase.TAKEOFF:
         _begin_takeoff(flight)
