@@ -17,6 +17,7 @@ whatever the vehicle file says and however fast it climbs.
 from __future__ import annotations
 
 import math
+import operator
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -27,7 +28,7 @@ from numpy.typing import NDArray
 from offboard.estimation.observer import GATES
 from offboard.flight.phases import Limits
 from offboard.flight.vehicle_state import VehicleState
-from offboard.mavlink.events import EstimatorReport, GpsFix, LocalPosition, NoFix
+from offboard.mavlink.events import EstimatorReport, GpsFix, LocalPosition, NoFix, Triple
 from offboard.model.axes import acceleration
 from offboard.model.vehicle import HOVER_THRUST_LIMITS, Vehicle
 
@@ -96,15 +97,17 @@ DRIFT_S = 1.0  # time constant; real PX4 drifts by 0.7 m at most, without a fix 
 
 
 class PositionJumps:
-    """Finds the jumps between successive positions. `total_ned_m` (3,) is the sum of all.
-    `drift_m`: by how much positions, without the jumps, and velocities of the last second
-    contradict each other."""
+    """Finds the jumps between successive positions. `drift_m`: by how much positions, without the
+    jumps, and velocities of the last second contradict each other.
+
+    The vehicle does not move with a jump: a place on the ground is kept without the jumps before
+    it, and compared with positions without theirs."""
 
     def __init__(self) -> None:
         self._newest: LocalPosition | None = None
         self._jumps: deque[tuple[float, float]] = deque()  # when, by how many metres
         self._noise_m = 0.0  # mean distance between a position and what the one before leads to
-        self.total_ned_m: Array = np.zeros(3)
+        self._total_ned_m = (0.0, 0.0, 0.0)  # sum of all
         self._drift_ned_m = (0.0, 0.0, 0.0)
 
     @property
@@ -138,9 +141,19 @@ class PositionJumps:
             self._drift_ned_m = north, east, down
             return None
         self._jumps.append((position.time_s, size_m))
-        jump = np.array(jump_m)
-        self.total_ned_m = self.total_ned_m + jump
-        return jump
+        north, east, down = jump_m
+        self._total_ned_m = self.reported((north, east, down))
+        return np.array(jump_m)
+
+    def without(self, reported_ned_m: Triple) -> Triple:
+        """The place of a position that is reported now."""
+        north, east, down = map(operator.sub, reported_ned_m, self._total_ned_m)
+        return north, east, down
+
+    def reported(self, place_ned_m: Triple) -> Triple:
+        """The position that a vehicle at this place would report now."""
+        north, east, down = map(operator.add, place_ned_m, self._total_ned_m)
+        return north, east, down
 
     def recent_m(self, time_s: float) -> float:
         """Sum of the sizes of the jumps in the last RECENT_S."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import operator
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import InitVar, dataclass, field
 
 import numpy as np
@@ -20,7 +20,7 @@ from offboard.estimation.observer import Observer
 from offboard.flight.authority import Authority, PilotSwitch, Standing
 from offboard.flight.estimates import HoverEstimate, Positioning, PositionJumps
 from offboard.flight.flight_plan import FlightPlan
-from offboard.flight.ground_contact import DETECTOR_KNOWN_S, GroundContact, Touchdown, moved
+from offboard.flight.ground_contact import DETECTOR_KNOWN_S, GroundContact, Touchdown
 from offboard.flight.phases import (
     ENDS,
     OPERATOR_STOP,
@@ -59,8 +59,8 @@ class Outcome:
 
 # of the flight before, with the same vehicle
 KEPT = (
-    "vehicle", "contact", "clock", "hover", "reading", "other_datagrams", "host_s", "turned_s",
-    "silence_s", "heard_s", "guarded", "announced", "announcements",
+    "vehicle", "contact", "clock", "hover", "jumps", "reading", "other_datagrams", "host_s",
+    "turned_s", "silence_s", "heard_s", "guarded", "announced", "announcements",
 )  # fmt: skip
 
 
@@ -98,7 +98,8 @@ class FlightState(Ground):
     failsafe: Failsafe = field(default_factory=Failsafe)
     contact: GroundContact = field(init=False)
     pilot: PilotSwitch = PilotSwitch.FOUND
-    home_ned_m: Triple = (0.0, 0.0, 0.0)  # the ground where the flight began
+    # the ground where the flight began, without the jumps of the estimate before that
+    home_ned_m: Triple = (0.0, 0.0, 0.0)
     took_off: bool = False  # from there; a vehicle that was found in the air has not
     touchdown: Touchdown | None = None  # of the landing
     authority: Authority = field(default_factory=Authority)
@@ -218,7 +219,8 @@ class FlightState(Ground):
         position = self.vehicle.position
         if position is None or self.plan.reference is None:
             return 0.0, 0.0, 0.0
-        north, east, down = map(operator.sub, position.position_ned_m, self.home_ned_m)
+        place_ned_m = self.jumps.without(position.position_ned_m)
+        north, east, down = map(operator.sub, place_ned_m, self.home_ned_m)
         return north, east, -down
 
     @property
@@ -300,18 +302,6 @@ class FlightState(Ground):
             return "no LOCAL_POSITION_NED shows it"
         on_ground = vehicle.landed == "on_ground" and vehicle.age_s(Landed) < DETECTOR_KNOWN_S
         return self.touchdown.not_landed(on_ground=on_ground)
-
-    def move_ground(self, jump_ned_m: Iterable[float]) -> None:
-        """The reported position has jumped by this (3,), but the vehicle has not moved: move all
-        places on the ground by as much."""
-        jump = tuple(jump_ned_m)
-        self.home_ned_m = moved(self.home_ned_m, jump)
-        if self.phase is Phase.TAKEOFF:  # the reference is not in force yet
-            self.plan.origin_ned_m = moved(self.plan.origin_ned_m, jump)
-        if self.contact.rest_ned_m is not None:
-            self.contact.rest_ned_m = moved(self.contact.rest_ned_m, jump)
-        if self.touchdown is not None:
-            self.touchdown.on_jump(jump)
 
     @property
     def link_growth_s(self) -> float:

@@ -126,21 +126,19 @@ def _on_telemetry(flight: FlightState, stamp_s: float, arrived_s: float, turned_
 def _on_position(flight: FlightState, event: LocalPosition) -> None:
     time_s, down_mps = event.time_s, event.velocity_ned_mps[2]
     _follow_jump(flight, event)
-    flight.contact.on_position(event)
+    place_ned_m = flight.jumps.without(event.position_ned_m)
+    flight.contact.on_position(time_s, place_ned_m, down_mps)
     flight.hover.on_position(time_s, flight.contact.height_m, down_mps)
     if flight.touchdown:
-        flight.touchdown.on_position(time_s, event.position_ned_m, down_mps)
+        flight.touchdown.on_position(time_s, place_ned_m, down_mps)
     flight.observer.on_position(time_s, event.position_ned_m, event.velocity_ned_mps)
     if flight.identification:
-        north, east, down = np.subtract(event.position_ned_m, flight.jumps.total_ned_m).tolist()
-        flight.identification.on_position(time_s, (north, east, down), event.velocity_ned_mps)
+        flight.identification.on_position(time_s, place_ned_m, event.velocity_ned_mps)
 
 
 def _follow_jump(flight: FlightState, event: LocalPosition) -> None:
-    """The position estimate has jumped, not the vehicle: move the reference and the ground too."""
+    """The position estimate has jumped, not the vehicle: move the reference, too."""
     jump_ned_m = flight.jumps.on_position(event)
-    if jump_ned_m is not None:
-        flight.move_ground(jump_ned_m.tolist())
     if flight.phase not in FLYING:
         flight.jumps.forget()
     elif jump_ned_m is not None and flight.phase in TRACKING:

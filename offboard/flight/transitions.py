@@ -165,7 +165,9 @@ def _enter(flight: FlightState, row: Transition) -> None:
         flight.reading = ParameterReading()
         flight.requested_s.clear()
     elif row.target is Phase.TAKEOFF:
-        _begin_takeoff(flight)
+        position = flight.vehicle.position
+        assert position is not None
+        flight.home_ned_m, flight.took_off = flight.jumps.without(position.position_ned_m), True
     elif row.target is Phase.CLIMB:
         _begin_climb(flight, source)
     elif row.target is Phase.JOIN:
@@ -195,13 +197,6 @@ def _explanation(flight: FlightState) -> str:
     return flight.vehicle.explanation(dialect.unsaid if dialect else "")
 
 
-def _begin_takeoff(flight: FlightState) -> None:
-    position = flight.vehicle.position
-    assert position is not None
-    flight.home_ned_m = flight.plan.origin_ned_m = position.position_ned_m
-    flight.took_off = True
-
-
 def _begin_climb(flight: FlightState, source: Phase) -> None:
     """To the start of the reference, after the take-off, in the air, or once more."""
     position = flight.vehicle.position
@@ -216,6 +211,8 @@ def _begin_climb(flight: FlightState, source: Phase) -> None:
     in_the_air = source is not Phase.TAKEOFF
     if in_the_air:
         _place_reference(flight, position)
+    else:
+        flight.plan.origin_ned_m = flight.jumps.reported(flight.home_ned_m)
     if in_the_air or flight.takes_off_by_command:
         _set_hover_thrust(flight, SETTLED if source is Phase.STANDBY else DIFFERENT)
     flight.observer.freeze(False)
@@ -231,10 +228,10 @@ def _begin_climb(flight: FlightState, source: Phase) -> None:
 def _place_reference(flight: FlightState, position: LocalPosition) -> None:
     """Place the reference of a vehicle that was found in the air. A take-off point that was not
     seen is below it, at the height of its last rest."""
-    contact = flight.contact
-    flight.home_ned_m = (*position.position_ned_m[:2], contact.rest_down_m)
+    contact, jumps = flight.contact, flight.jumps
+    flight.home_ned_m = (*jumps.without(position.position_ned_m)[:2], contact.rest_down_m)
+    rest = contact.rest_ned_m and jumps.reported(contact.rest_ned_m)
     if flight.service and flight.service.anchor == "here":
-        rest = contact.rest_ned_m
         above_m = flight.plan.place_start(
             position.position_ned_m, position.velocity_ned_mps, rest[2] if rest else None
         )
@@ -244,10 +241,9 @@ def _place_reference(flight: FlightState, position: LocalPosition) -> None:
                 f"the reference starts {above_m:.1f} m higher: from here it would "
                 + ("touch the ground" if rest else "go lower, and the ground is not known"),
             )
-    elif contact.rest_ned_m is not None and flight.service:
-        flight.plan.origin_ned_m = contact.rest_ned_m
     else:
-        flight.plan.origin_ned_m = flight.home_ned_m
+        from_rest = rest if flight.service else None
+        flight.plan.origin_ned_m = from_rest or jumps.reported(flight.home_ned_m)
 
 
 def _set_hover_thrust(flight: FlightState, least: float = DIFFERENT) -> None:

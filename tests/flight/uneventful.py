@@ -43,7 +43,7 @@ def heartbeat(flight: FlightState, *, armed: bool, mode: str = "OFFBOARD", statu
 def position(flight: FlightState, down_m: float, down_mps: float = 0.0) -> None:
     reported = LocalPosition(flight.now_s, (0.0, 0.0, down_m), (0.0, 0.0, down_mps))
     hear(flight, reported)
-    flight.contact.on_position(reported)
+    flight.contact.on_position(flight.now_s, reported.position_ned_m, down_mps)
 
 
 def lift(flight: FlightState) -> None:
