@@ -96,11 +96,11 @@ class Flight(FlightState):
 
     def _begin_turn(self, host_now_s: float) -> None:
         session = self.session
-        elapsed_s = session.elapsed_s(host_now_s)
-        if math.isnan(self.turned_s):
-            self.turned_s, self.heard_s = host_now_s, elapsed_s
-        paused_s, self.turned_s = host_now_s - self.turned_s, host_now_s
+        elapsed_s, before_s = session.elapsed_s(host_now_s), self.host_s
         self.host_s = session.clock_s(host_now_s)
+        if math.isnan(before_s):
+            before_s, self.heard_s = self.host_s, elapsed_s
+        paused_s = self.host_s - before_s
         self.silence_s = elapsed_s - self.heard_s
         self.note_missing_setpoints()
         if session.settings.lockstep:

@@ -93,7 +93,7 @@ class Ground:
     model: Vehicle
     vehicle: VehicleState = field(default_factory=VehicleState)
     clock: VehicleClock = field(default_factory=VehicleClock)
-    host_s: float = 0.0  # monotonic time of this computer at the present turn
+    host_s: float = math.nan  # monotonic time of this computer at the present turn
     guarded: bool = True  # a supervisor lands the vehicle if this process ends
     rates_requested: bool = True  # of telemetry: only then slow ones count
     service: ServiceOptions | None = None  # of `daemon`, whose pilot arms it and engages
@@ -317,9 +317,8 @@ def _estimate_level(ground: Ground) -> Level:
 
 
 def _empty_battery(ground: Ground) -> str:
-    health, least = ground.vehicle.health, ground.limits.battery
-    charge = health.battery_remaining if health else None
-    if charge is None or charge >= least:
+    charge, least = ground.vehicle.battery, ground.limits.battery
+    if charge >= least:
         return ""
     return f"its battery has {charge:.0%} left, limits.battery is {least:.0%}"
 

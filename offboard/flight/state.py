@@ -60,7 +60,7 @@ class Outcome:
 # of the flight before, with the same vehicle
 KEPT = (
     "vehicle", "contact", "clock", "hover", "jumps", "reading", "other_datagrams", "host_s",
-    "turned_s", "silence_s", "heard_s", "guarded", "announced", "announcements",
+    "silence_s", "heard_s", "guarded", "announced", "announcements",
 )  # fmt: skip
 
 
@@ -107,7 +107,6 @@ class FlightState(Ground):
 
     phase: Phase = Phase.CONNECT
     began_s: float = 0.0  # of the phase, on `Session.link_time_s`
-    turned_s: float = math.nan  # host time of the newest turn
     silence_s: float = 0.0  # host time since the newest telemetry
     setpoint_s: float = math.inf  # when the newest setpoint left; infinite before the first
     setpoints_missed_s: float = -math.inf  # when setpoints may have been missing for long
@@ -137,7 +136,7 @@ class FlightState(Ground):
     told: set[str] = field(default_factory=set)  # of those that are announced once in a flight
     queue: list[Outgoing] = field(default_factory=list)  # to be sent
     records: list[Record] = field(default_factory=list)  # to be logged
-    requested_s: dict[tuple[Phase, CommandLong], float] = field(default_factory=dict)
+    requested_s: dict[CommandLong, float] = field(default_factory=dict)  # in this phase
     text_id: int = 0
     awaits_link: bool = False  # while landing
     follows_others: bool = False  # the newest ThrustReport is of none of `thrusts`

@@ -138,6 +138,7 @@ def _enter(flight: FlightState, row: Transition) -> None:
     source, reason, cause = flight.phase, row.why(flight), row.cause.format(flight=flight)
     _conclude(flight, row, reason)
     flight.vehicle.clear_messages()
+    flight.requested_s.clear()
     if flight.request is Request.NONE and row.target not in PROCEEDS:
         flight.obeyed = Request.NONE  # the flight ends for another reason
     flight.phase = row.target
@@ -163,7 +164,6 @@ def _enter(flight: FlightState, row: Transition) -> None:
     elif row.target is Phase.HEALTH:  # it may be another vehicle, or have other parameters
         flight.vehicle.parameters.clear()
         flight.reading = ParameterReading()
-        flight.requested_s.clear()
     elif row.target is Phase.TAKEOFF:
         position = flight.vehicle.position
         assert position is not None

@@ -77,6 +77,7 @@ def uneventful(phase: Phase = Phase.TRACK, service: ServiceOptions | None = None
         plan=FlightPlan(TRACK),
         model=CONFIG.vehicle,
         session=session,
+        host_s=0.0,
         observer=observer,
         controller=controller,
         period_s=CONFIG.period_s,
