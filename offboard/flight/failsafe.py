@@ -90,6 +90,16 @@ def stop_requested(flight: FlightState) -> str:
     return flight.stop_reason
 
 
+def longer_than(limit: str) -> Condition:
+    """Holds once the phase has lasted longer than the limit of this name."""
+
+    def too_long(flight: FlightState) -> bool:
+        return flight.in_phase_s > float(getattr(flight.limits, limit))
+
+    too_long.__name__ = f"longer_than_{limit}"
+    return too_long
+
+
 # ---------------------------------------------------------------------- conditions of the failsafe
 
 

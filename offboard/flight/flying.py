@@ -11,6 +11,7 @@ from offboard.flight.failsafe import (
     authority_lost,
     authority_lost_armed,
     in_own_failsafe,
+    longer_than,
     mode_unknown,
     rebooted,
     stop_requested,
@@ -148,23 +149,11 @@ def out_of_reach(flight: FlightState) -> str:
 
 
 def not_disarmed(flight: FlightState) -> str:
-    if flight.in_phase_s <= flight.limits.land_s:
-        return ""
     contact = flight.contact
     shows = contact.stands and contact.detects_flight and flight.vehicle.armed
     return f"not landed and disarmed after {flight.in_phase_s:.0f} s" + (
         f"; {STILL_ARMED}" if shows else ""
     )
-
-
-def longer_than(limit: str) -> Condition:
-    """Holds once the phase has lasted longer than the limit of this name."""
-
-    def too_long(flight: FlightState) -> bool:
-        return flight.in_phase_s > float(getattr(flight.limits, limit))
-
-    too_long.__name__ = f"longer_than_{limit}"
-    return too_long
 
 
 def requested(request: Request) -> Condition:
@@ -229,7 +218,7 @@ TO_THE_END = (
     Transition({LAND}, authority_lost_armed, YIELDED, ABORTED, "pilot"),
     Transition({LAND}, unheard_on_ground, FAILED, ABORTED, reason=UNHEARD),
     Transition({LAND}, out_of_reach, FAILED, ABORTED),
-    Transition({LAND}, not_disarmed, FAILED, ABORTED),
+    Transition({LAND}, longer_than("land_s"), FAILED, ABORTED, reason=not_disarmed),
 )
 HANDED_BACK, NOT_BEGUN = "handed back on request", "stopped on request"
 hand_back, start = requested(Request.HAND_BACK), requested(Request.START)

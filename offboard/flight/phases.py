@@ -105,8 +105,8 @@ class Transition:
 
     `exit_code` is set if this row decides the result; a later row can only make it more severe.
     `cause` is a word for what ended a flight that the row ends (see `analysis.verdict`). `reason`
-    is the sentence, where the condition does not say it. Both may have values of the flight in
-    braces.
+    is the sentence, or a function that says it, where the condition does not. Texts may have values
+    of the flight in braces.
     """
 
     phases: Set[Phase]
@@ -114,10 +114,12 @@ class Transition:
     target: Phase
     exit_code: int | None = None
     cause: str = ""
-    reason: str = ""
+    reason: str | Callable[[FlightState], str] = ""
 
     def why(self, flight: FlightState) -> str:
         """The sentence that says why the row is taken, while its condition holds."""
+        if callable(self.reason):
+            return self.reason(flight)
         return self.reason.format(flight=flight) or str(self.condition(flight))
 
 

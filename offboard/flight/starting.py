@@ -10,6 +10,7 @@ from offboard.flight.failsafe import (
     authority_lost_armed,
     blind,
     in_own_failsafe,
+    longer_than,
     mode_unknown,
     rebooted,
     silent,
@@ -64,9 +65,8 @@ def usable(flight: FlightState) -> bool:
     return not unfit(flight)
 
 
-def not_ready_in_time(flight: FlightState) -> str:
-    waited = flight.in_phase_s > flight.limits.health_s
-    return f"not ready: {unfit(flight)}" if waited else ""
+def not_ready(flight: FlightState) -> str:
+    return f"not ready: {unfit(flight)}"
 
 
 # ---------------------------------------------------------------------- the service waits
@@ -160,8 +160,6 @@ def engaged(flight: FlightState) -> str:
 
 
 def not_engaged(flight: FlightState) -> str:
-    if flight.in_phase_s <= flight.limits.engage_s:
-        return ""
     unanswered = preflight.unanswered(flight.clock.unanswered_s(flight.host_s))
     return (
         f"the vehicle did not enter {flight.authority.engage_mode} in {flight.in_phase_s:.0f} s "
@@ -204,17 +202,13 @@ def disarmed_for_good(flight: FlightState) -> bool:
 
 
 def not_armed(flight: FlightState) -> str:
-    waited_s, silent_s = flight.in_phase_s, flight.vehicle.age_s(Heartbeat)
-    if waited_s <= flight.limits.arm_s:
-        return ""
+    silent_s = flight.vehicle.age_s(Heartbeat)
     if silent_s > ARMED_KNOWN_S:
         return f"no HEARTBEAT for {silent_s:.0f} s: it is not known whether the vehicle has armed"
-    return f"the vehicle did not arm in {waited_s:.0f} s"
+    return f"the vehicle did not arm in {flight.in_phase_s:.0f} s"
 
 
 def still_armed(flight: FlightState) -> str:
-    if flight.in_phase_s <= flight.limits.disarm_s:
-        return ""
     unheard = flight.vehicle.age_s(Heartbeat) > ARMED_KNOWN_S
     state = "no HEARTBEAT shows whether it is armed" if unheard else "still armed"
     return f"{state} after {flight.in_phase_s:.0f} s"
@@ -246,7 +240,7 @@ FLY_IS_READY = (
     Transition({HEALTH}, stop_requested, FAILED, REFUSED, OPERATOR, BEFORE_TAKEOFF),
     Transition({HEALTH}, refused, FAILED, REFUSED),
     Transition({HEALTH}, usable, STREAM, reason="telemetry flows and the vehicle can arm"),
-    Transition({HEALTH}, not_ready_in_time, FAILED, REFUSED),
+    Transition({HEALTH}, longer_than("health_s"), FAILED, REFUSED, reason=not_ready),
 )
 SERVICE_WAITS = (
     Transition({CONNECT}, stop_requested, FAILED, FLOWN, OPERATOR),
@@ -276,7 +270,7 @@ STARTING = (
     Transition(STREAMING, authority_lost, FAILED, REFUSED, "pilot"),
     Transition({STREAM}, streamed, ENGAGE),
     Transition({ENGAGE}, engaged, ARM),
-    Transition({ENGAGE}, not_engaged, FAILED, REFUSED),
+    Transition({ENGAGE}, longer_than("engage_s"), FAILED, REFUSED, reason=not_engaged),
     Transition({ARM}, rebooted, STAND_DOWN, REFUSED, "restart"),
     Transition({ARM}, authority_lost_armed, YIELDED, ABORTED, "pilot", LOST_AS_IT_ARMED),
     Transition({ARM}, authority_lost_disarmed, FAILED, REFUSED, "pilot"),
@@ -286,9 +280,9 @@ STARTING = (
     Transition({ARM}, stop_requested, STAND_DOWN, REFUSED, OPERATOR),
     Transition({ARM}, armed, TAKEOFF),
     Transition({ARM}, disarmed_again, STAND_DOWN, REFUSED, reason=DISARMED_AGAIN),
-    Transition({ARM}, not_armed, STAND_DOWN, REFUSED),
+    Transition({ARM}, longer_than("arm_s"), STAND_DOWN, REFUSED, reason=not_armed),
     Transition({TAKEOFF}, stop_requested_on_ground, STAND_DOWN, REFUSED, OPERATOR),
     Transition({STAND_DOWN}, rises, LAND, ABORTED, reason=FLIGHT_DETECTED),
     Transition({STAND_DOWN}, disarmed_for_good, FAILED, reason="disarmed on the ground"),
-    Transition({STAND_DOWN}, still_armed, FAILED, ABORTED),
+    Transition({STAND_DOWN}, longer_than("disarm_s"), FAILED, ABORTED, reason=still_armed),
 )
