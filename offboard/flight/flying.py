@@ -22,6 +22,7 @@ from offboard.flight.phases import (
     MOVING,
     OUTAGE_MAX_S,
     RESTS,
+    SERVICE_ONLY,
     TRACKING,
     Action,
     Condition,
@@ -184,20 +185,22 @@ RESTARTED = f"{REBOOTED} and is disarmed"
 def ends_early(*, serves: bool) -> tuple[Transition, ...]:
     """Rows that end a flight in the air early. A stop makes `fly` land and the service hold; in the
     service a change of mode by the pilot is the usual end."""
+    flown = FLYING if serves else FLYING - SERVICE_ONLY
     followed = TRACKING if serves else frozenset[Phase]()
-    taken = TRACKING | {HAND_BACK} if serves else frozenset[Phase]()
-    others = FLYING - followed
+    handed = flown & {HAND_BACK}
+    taken = followed | handed
     return (
-        Transition(FLYING, rebooted_in_flight, LAND, ABORTED, "restart"),
+        Transition(handed, in_requested_mode, YIELDED),
+        Transition(flown, rebooted_in_flight, LAND, ABORTED, "restart"),
         # HEARTBEAT may be wrong: what still flies is to land
-        Transition(FLYING, disarmed, LAND, ABORTED, "disarmed in flight"),
+        Transition(flown, disarmed, LAND, ABORTED, "disarmed in flight"),
         Transition(taken, authority_lost, YIELDED, FLOWN, "pilot"),
-        Transition(FLYING - taken, authority_lost, YIELDED, ABORTED, "pilot"),
-        Transition(FLYING, in_own_failsafe, LAND, ABORTED, "link"),
-        Transition(FLYING, failsafe_land, LAND, ABORTED, *FAILSAFE),
+        Transition(flown - taken, authority_lost, YIELDED, ABORTED, "pilot"),
+        Transition(flown, in_own_failsafe, LAND, ABORTED, "link"),
+        Transition(flown, failsafe_land, LAND, ABORTED, *FAILSAFE),
         Transition(followed, stop_requested, HAND_BACK, FLOWN, OPERATOR),
-        Transition(others - {HAND_BACK}, stop_requested, LAND, ABORTED, OPERATOR),
-        Transition(FLYING - {HAND_BACK, HOLD}, failsafe_hold, HOLD, ABORTED, *FAILSAFE),
+        Transition(flown - taken, stop_requested, LAND, ABORTED, OPERATOR),
+        Transition(flown - {HAND_BACK, HOLD}, failsafe_hold, HOLD, ABORTED, *FAILSAFE),
     )
 
 

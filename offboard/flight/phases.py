@@ -79,6 +79,7 @@ TRACKING = frozenset({Phase.CLIMB, Phase.EXCITE, Phase.JOIN, Phase.TRACK, Phase.
 MOVING = frozenset({Phase.JOIN, Phase.TRACK})  # along the reference
 # phases in which the failsafe judges
 FLYING = TRACKING | {Phase.TAKEOFF, Phase.HAND_BACK, Phase.HOLD}
+SERVICE_ONLY = frozenset({Phase.STANDBY, Phase.PAUSE, Phase.HAND_BACK})  # never in `fly`
 OUTAGE_MAX_S = 300.0  # so long a vehicle that was asked to land, and is not heard, is waited for
 OPERATOR_STOP = "stop requested by the operator"
 RESTS = "at rest"  # why a landing begins that is no early end

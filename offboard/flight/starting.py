@@ -234,15 +234,13 @@ FLY_BEGINS = (
     Transition({CONNECT}, stop_requested, FAILED, REFUSED, OPERATOR),
     Transition({CONNECT}, vehicle_found, HEALTH),
     Transition({CONNECT}, not_found, FAILED, REFUSED, "link"),
-)
-FLY_IS_READY = (
     Transition({HEALTH}, silent_on_ground, FAILED, REFUSED, "link"),
     Transition({HEALTH}, stop_requested, FAILED, REFUSED, OPERATOR, BEFORE_TAKEOFF),
     Transition({HEALTH}, refused, FAILED, REFUSED),
     Transition({HEALTH}, usable, STREAM, reason="telemetry flows and the vehicle can arm"),
     Transition({HEALTH}, longer_than("health_s"), FAILED, REFUSED, reason=not_ready),
 )
-SERVICE_WAITS = (
+SERVICE_BEGINS = (
     Transition({CONNECT}, stop_requested, FAILED, FLOWN, OPERATOR),
     Transition({CONNECT}, vehicle_found, HEALTH),
     Transition({STANDBY}, rebooted, FAILED, FLOWN, "restart"),

@@ -4,7 +4,6 @@ taken, and begins its phase. `actions` has what is sent in a phase.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -38,32 +37,20 @@ STAGES = {
     Phase.TRACK: Stage.MOTION,
 }  # of the identification
 PROCEEDS = BEFORE_FLIGHT | TRACKING | {Phase.TAKEOFF}  # phases of a flight that goes on
-SERVICE_ONLY = frozenset({Phase.STANDBY, Phase.PAUSE, Phase.HAND_BACK})
 
 
 @cache
 def table(service: ServiceOptions | None = None) -> tuple[Transition, ...]:
     """The phase table of the service with these options; without them that of `fly`."""
-    if service is None:
-        rows = (
-            *starting.FLY_BEGINS,
-            *starting.FLY_IS_READY,
-            *starting.STARTING,
-            *flying.ends_early(serves=False),
-            *flying.TO_THE_END,
-            *flying.AT_REST["land"],
-        )
-        rows = tuple(replace(row, phases=row.phases - SERVICE_ONLY) for row in rows)
-    else:
-        rows = (
-            *starting.SERVICE_WAITS,
-            *starting.STARTING,
-            Transition({Phase.HAND_BACK}, flying.in_requested_mode, Phase.YIELDED),
-            *flying.ends_early(serves=True),
-            *flying.SERVICE_ENDS,
-            *flying.TO_THE_END,
-            *flying.AT_REST[service.then],
-        )
+    serves = service is not None
+    rows = (
+        *(starting.SERVICE_BEGINS if serves else starting.FLY_BEGINS),
+        *starting.STARTING,
+        *flying.ends_early(serves=serves),
+        *(flying.SERVICE_ENDS if serves else ()),
+        *flying.TO_THE_END,
+        *flying.AT_REST[service.then if service else "land"],
+    )
     return tuple(row for row in rows if row.phases)
 
 

@@ -18,6 +18,7 @@ from offboard.flight.phases import (
     ENDS,
     FLYING,
     OUTAGE_MAX_S,
+    SERVICE_ONLY,
     Action,
     ExitCode,
     Limits,
@@ -27,7 +28,7 @@ from offboard.flight.phases import (
     Transition,
 )
 from offboard.flight.state import FlightState
-from offboard.flight.transitions import SERVICE_ONLY, next_row, table
+from offboard.flight.transitions import next_row, table
 from offboard.mavlink.events import (
     Attitude,
     CommandAck,
