@@ -44,39 +44,37 @@ class Positioning:
     """What the position estimate had when the flight began; nothing before that."""
 
     had_fix: bool = False
-    had_valid: frozenset[str] = frozenset()  # parts of the estimate
-    accuracy_m: float | None = None
-    fixes_hz: float = 0.0
-    reports_hz: float = 0.0
+    report: EstimatorReport | None = None
+    fixes_silent_s: float = math.inf  # so long without fixes their messages are missing
+    reports_silent_s: float = math.inf
 
     def begin(self, vehicle: VehicleState, rates_hz: Mapping[str, float], estimator: str) -> None:
         """The flight begins. `rates_hz` of the messages that arrive, `estimator` the name of the
         one that becomes an EstimatorReport."""
         self.had_fix = vehicle.age_s(GpsFix) < KNOWN_S
-        self.fixes_hz = rates_hz.get("GPS_RAW_INT", 0.0)
-        report = vehicle.estimator
-        if report is not None and vehicle.age_s(EstimatorReport) < KNOWN_S:
-            self.had_valid, self.accuracy_m = report.valid, report.accuracy_m
-            self.reports_hz = rates_hz.get(estimator, 0.0)
+        self.fixes_silent_s = _silent_s(rates_hz.get("GPS_RAW_INT", 0.0))
+        if vehicle.age_s(EstimatorReport) < KNOWN_S:
+            self.report = vehicle.estimator
+            self.reports_silent_s = _silent_s(rates_hz.get(estimator, 0.0))
 
     def lost(self, vehicle: VehicleState, limits: Limits) -> str:
         """What is lost, as a sentence; empty if nothing is."""
-        fix_age_s, report = vehicle.age_s(GpsFix), vehicle.estimator
+        fix_age_s, before, now = vehicle.age_s(GpsFix), self.report, vehicle.estimator
         if self.had_fix and fix_age_s > limits.gps_s and vehicle.age_s(NoFix) < fix_age_s:
             return f"GPS has no fix for {fix_age_s:.1f} s"
-        if self.had_fix and fix_age_s > max(_silent_s(self.fixes_hz), limits.gps_s):
+        if self.had_fix and fix_age_s > max(self.fixes_silent_s, limits.gps_s):
             return f"no GPS_RAW_INT for {fix_age_s:.1f} s"
-        if report is None:
+        if before is None or now is None:
             return ""
-        missing = sorted(self.had_valid - report.valid)
+        missing = sorted(before.valid - now.valid)
         if missing:
             return f"its estimator has no valid {', '.join(missing)} any more"
-        if self.accuracy_m is not None and self.had_valid:
-            if report.accuracy_m is None:
+        if before.accuracy_m is not None and before.valid:
+            if now.accuracy_m is None:
                 return "its estimator reports no accuracy of the position any more"
-            if report.accuracy_m > max(limits.accuracy_m, WORSE * self.accuracy_m):
-                return f"its estimated position is only accurate to {report.accuracy_m:.1f} m"
-        if vehicle.age_s(EstimatorReport) > _silent_s(self.reports_hz):
+            if now.accuracy_m > max(limits.accuracy_m, WORSE * before.accuracy_m):
+                return f"its estimated position is only accurate to {now.accuracy_m:.1f} m"
+        if vehicle.age_s(EstimatorReport) > self.reports_silent_s:
             return "no report of its estimator"
         return ""
 

@@ -165,7 +165,7 @@ def predicted(flight: Any, away_m: float) -> None:
 def valid(flight: FlightState, estimates: frozenset[str]) -> None:
     for each in (frozenset(ESTIMATE), estimates):
         hear(flight, EstimatorReport(each, (), 0.5))
-        if not flight.positioning.had_valid:
+        if not flight.positioning.report:
             flight.positioning.begin(flight.vehicle, {}, "ESTIMATOR_STATUS")
 
 
