@@ -354,8 +354,7 @@ def judge(flight: FlightState, rows: Sequence[Row] = ROWS) -> None:
     """Measure for how long each condition has held by now, and note the worst row that is active,
     the first of those that are equally bad."""
     known = flight.failsafe
-    passed_s = 0.0 if known.judged_s is None else flight.now_s - known.judged_s
-    step_s = min(max(passed_s, 0.0), STEP_MAX_S)
+    step_s = min(max(flight.now_s - known.judged_s, 0.0), STEP_MAX_S)
     known.judged_s = flight.now_s
     known.action, known.row, known.reason, known.cause = Action.FLY, "", "", ""
     for row in rows:

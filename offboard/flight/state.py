@@ -70,7 +70,7 @@ class Failsafe:
     worst row that is active."""
 
     held_s: dict[str, float] = field(default_factory=dict)
-    judged_s: float | None = None  # when, on `Session.link_time_s`
+    judged_s: float = math.inf  # when, on `Session.link_time_s`; infinite before the first time
     row: str = ""
     action: Action = Action.FLY
     reason: str = ""  # why the action is taken, as a sentence, and its cause in a word

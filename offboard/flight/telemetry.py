@@ -54,16 +54,18 @@ OTHER_COMPANION = (
 )
 
 
-def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: float) -> None:
-    """`arrived_s` is the host time of the event's arrival, `turned_s` that of the turn."""
-    flight.vehicle.update(event, flight.session.link_time_s)
+def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: float) -> bool:
+    """`arrived_s` is the host time of the event's arrival, `turned_s` that of the turn. False if
+    the event is no news (see `VehicleState.update`)."""
+    if not flight.vehicle.update(event, flight.session.link_time_s):
+        return False
     match event:
-        case Attitude(time_s, attitude, rates) if not flight.vehicle.repeated:
+        case Attitude(time_s, attitude, rates):
             _on_telemetry(flight, time_s, arrived_s, turned_s)
             flight.observer.on_attitude(time_s, attitude, rates)
             if flight.identification:
                 flight.identification.on_attitude(time_s, attitude)
-        case LocalPosition() if not flight.vehicle.repeated:
+        case LocalPosition():
             _on_telemetry(flight, event.time_s, arrived_s, turned_s)
             _on_position(flight, event)
         case ThrustReport(thrust):
@@ -87,6 +89,7 @@ def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: flo
             outbox.announce(flight, sentence, once=True)
         case Rebooted():
             _on_reboot(flight)
+    return True
 
 
 def is_of_another(flight: FlightState, event: Event) -> bool:
