@@ -12,20 +12,18 @@ import numpy as np
 from offboard.flight import outbox, transitions
 from offboard.flight.authority import Authority, PilotSwitch
 from offboard.flight.estimates import HoverEstimate, PositionJumps
-from offboard.flight.failsafe import REBOOTED
 from offboard.flight.ground_contact import GroundContact, Touchdown
 from offboard.flight.phases import (
     BEFORE_FLIGHT,
     FLYING,
     TRACKING,
     WAITING,
-    ExitCode,
     Phase,
     Request,
 )
 from offboard.flight.preflight import ParameterReading, other_sender
 from offboard.flight.record import vehicle_record
-from offboard.flight.state import FlightState, Outcome
+from offboard.flight.state import FlightState
 from offboard.flight.timing import VehicleClock
 from offboard.mavlink.events import (
     Attitude,
@@ -203,10 +201,6 @@ def _on_reboot(flight: FlightState) -> None:
     flight.pilot = PilotSwitch.FOUND
     if flight.phase is Phase.LAND:
         flight.touchdown = Touchdown(None)
-        if flight.outcome is None:
-            sentence = f"{REBOOTED} while landing"
-            outbox.announce_phase(flight, sentence, "restart")  # the score must know it, too
-            flight.outcome = Outcome(ExitCode.ABORTED, sentence)
     transitions.advance(flight)
 
 

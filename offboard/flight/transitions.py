@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 
 from offboard.flight import decision, failsafe, flying, outbox, starting
-from offboard.flight.failsafe import in_own_failsafe
+from offboard.flight.failsafe import REBOOTED, in_own_failsafe
 from offboard.flight.ground_contact import Touchdown
 from offboard.flight.phases import (
     BEFORE_FLIGHT,
@@ -74,7 +74,7 @@ def advance(flight: FlightState) -> None:
     while not flight.in_end_phase:
         if flight.phase in FLYING:
             failsafe.judge(flight)
-        _note_failsafe(flight)
+        _note_spoiled(flight)
         row = next_row(flight)
         if row is None:
             break
@@ -103,13 +103,18 @@ def obey(flight: FlightState, request: Request, sender: str) -> bool:
     return obeyed
 
 
-def _note_failsafe(flight: FlightState) -> None:
-    """A landing by the vehicle's own failsafe is awaited, but it is not ours."""
-    fallen = flight.phase is Phase.LAND and in_own_failsafe(flight)
-    if fallen and flight.outcome is None:
-        sentence = f"the vehicle's own failsafe flew it, in {flight.vehicle.mode}"
-        outbox.announce_phase(flight, sentence, "link")  # the score must know it, too
-        flight.outcome = Outcome(ExitCode.ABORTED, sentence + _explanation(flight))
+def _note_spoiled(flight: FlightState) -> None:
+    """A landing is awaited, but it is not ours: the score must know it, too."""
+    if flight.phase is not Phase.LAND or flight.outcome is not None:
+        return
+    if in_own_failsafe(flight):
+        sentence, cause = f"the vehicle's own failsafe flew it, in {flight.vehicle.mode}", "link"
+    elif flight.rebooted:
+        sentence, cause = f"{REBOOTED} while landing", "restart"
+    else:
+        return
+    outbox.announce_phase(flight, sentence, cause)
+    flight.outcome = Outcome(ExitCode.ABORTED, sentence + _explanation(flight))
 
 
 def name_failsafe(flight: FlightState) -> None:
