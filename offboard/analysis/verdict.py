@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from offboard.analysis.history import Event, History
 from offboard.flight.estimates import PositionJumps
-from offboard.flight.ground_contact import Touchdown, moved
+from offboard.flight.ground_contact import Touchdown
 from offboard.flight.phases import RESTS
 from offboard.mavlink.event_record import SUPERVISOR
 from offboard.mavlink.events import CRITICAL, LocalPosition
@@ -37,17 +37,14 @@ def landing(flown: History) -> tuple[str, float]:
     takes_off_s, lands_s = (begun.get(phase, math.inf) for phase in ("takeoff", "land"))
     jumps, takeoff, touchdown = PositionJumps(), None, None
     for position in _positions(flown):
-        jump_ned_m, place = jumps.on_position(position), position.position_ned_m
+        jumps.on_position(position)
+        place = jumps.without(position.position_ned_m)
         if position.time_s <= takes_off_s:
             takeoff = place
-        elif jump_ned_m is not None and takeoff is not None:
-            takeoff = moved(takeoff, jump_ned_m.tolist())
         if position.time_s <= lands_s:
             continue
         if touchdown is None:
             touchdown = Touchdown(takeoff if takes_off_s < math.inf else None)
-        elif jump_ned_m is not None:
-            touchdown.on_jump(jump_ned_m.tolist())
         touchdown.on_position(position.time_s, place, position.velocity_ned_mps[2])
     if touchdown is None:
         return "not landed", math.nan

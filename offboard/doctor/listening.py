@@ -158,7 +158,7 @@ class Listening:
         self.foreign_replies = 0
         self.now_s = self._began_s = began_s  # `now_s`: until when it has listened
         self._found_s = 0.0
-        self._parameters = ParameterReading(advice=True)
+        self.parameters = ParameterReading(advice=True)
         self._asked: dict[int, tuple[int, float]] = {}  # message or command: tries, when
         self._settled = False
         self._may_greet = False  # a disarmed vehicle, whose signing time is behind ours
@@ -217,7 +217,7 @@ class Listening:
             if greets and self._may_ask(TIMESYNC, now_s):
                 yield Timesync(0, round(now_s * 1e9))
             return
-        yield from self._parameters.due(dialect, state.parameters, now_s)
+        yield from self.parameters.due(dialect, state)
         fix_age_s = min(state.age_s(NoFix), state.age_s(GpsFix))
         unknown = {
             VERSION: state.version is None,
@@ -265,7 +265,7 @@ class Listening:
             checked
             and state.version is not None
             and self.clock.delay is not None
-            and self._parameters.complete(dialect, state.parameters, now_s)
+            and self.parameters.complete(dialect, state)
             and not self.slow(lambda each: each.arrives_hz)
         )
 
@@ -328,12 +328,12 @@ class Observation:
         """What the preflight list judges."""
         heard = self.heard
         return Ground(
-            self.vehicle,
-            self.config.limits,
-            heard.session,
-            heard.clock,
-            heard.now_s,
-            helicopter=self.config.vehicle.airframe == "helicopter",
+            limits=self.config.limits,
+            session=heard.session,
+            model=self.config.vehicle,
+            vehicle=self.vehicle,
+            clock=heard.clock,
+            host_s=heard.now_s,
             rates_requested=heard.requested,
-            in_the_air=self.vehicle.armed,
+            reading=heard.parameters,
         )

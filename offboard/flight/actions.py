@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 from offboard.flight import decision, outbox
-from offboard.flight.authority import Standing
-from offboard.flight.failsafe import other_sender, telemetry_old
+from offboard.flight.authority import PilotSwitch, Standing
+from offboard.flight.failsafe import telemetry_old
 from offboard.flight.ground_contact import STANDING_S, STILL_ARMED
 from offboard.flight.phases import BEFORE_FLIGHT, FLYING, TRACKING, Phase
+from offboard.flight.preflight import other_sender
 from offboard.flight.state import LEVEL_DIRECTION, FlightState
 from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.events import Heartbeat, VehicleIdentity
@@ -55,25 +58,23 @@ def act(flight: FlightState) -> None:
 
 def act_without_telemetry(flight: FlightState, time_s: float) -> None:
     """Send what needs no telemetry: level setpoints, and the request that ends the flight."""
-    phase = flight.phase
-    # Until setpoints have replaced an autopilot's own take-off, none must be sent
-    steers = not flight.takes_off_by_command or flight.plan.reference is not None
-    if phase is Phase.TAKEOFF or phase in TRACKING:
-        if steers:
-            outbox.send_level(flight, time_s, _level(flight))
-    elif phase in (Phase.HOLD, Phase.LAND):
-        _end(flight, time_s, steers=steers)
-    elif phase is Phase.HAND_BACK:
-        _end(flight, time_s, steers=bool(flight.commands))
-    elif phase is Phase.STAND_DOWN:
+    phase, command = flight.phase, _level(flight)
+    if phase is Phase.STAND_DOWN:
         outbox.request(flight, CommandLong.disarm())
-        if steers:
-            idle = Command(0.0, LEVEL_DIRECTION, flight.command.heading_rad)
-            outbox.send_level(flight, time_s, idle)
+        command = Command(0.0, LEVEL_DIRECTION, flight.command.heading_rad)
+    elif phase in (Phase.HOLD, Phase.LAND, Phase.HAND_BACK):
+        _end(flight)
+        if flight.awaits_link or flight.in_phase_s >= LAND_STREAM_S or not flight.in_engage_mode:
+            return
+    elif phase is not Phase.TAKEOFF and phase not in TRACKING:
+        return
+    # Until setpoints have replaced an autopilot's own take-off, none must be sent
+    if math.isfinite(flight.setpoint_s):
+        outbox.send_level(flight, time_s, command)
 
 
-def _end(flight: FlightState, time_s: float, *, steers: bool) -> None:
-    """Ask the autopilot to hold or to land, with level setpoints until it does."""
+def _end(flight: FlightState) -> None:
+    """Ask the autopilot to hold or to land."""
     dialect, authority = _dialect(flight), flight.authority
     holds = flight.phase is not Phase.LAND
     if not holds:
@@ -87,9 +88,6 @@ def _end(flight: FlightState, time_s: float, *, steers: bool) -> None:
             authority.request(mode)
     elif not holds:
         _disarm_if_standing(flight)
-    streams = steers and not flight.awaits_link and flight.in_phase_s < LAND_STREAM_S
-    if streams and authority.mode == authority.engage_mode:
-        outbox.send_level(flight, time_s, _level(flight))
 
 
 def _await_link(flight: FlightState) -> None:
@@ -154,7 +152,7 @@ def _stand_by(flight: FlightState, time_s: float) -> None:
     if on_ground:
         quiet |= vehicle.armed and vehicle.in_failsafe
     else:
-        quiet |= vehicle.in_failsafe or not flight.pilot.other_mode_shown
+        quiet |= vehicle.in_failsafe or flight.pilot is not PilotSwitch.READY
     if quiet:
         outbox.set_command(flight, time_s, command)
     else:
@@ -171,7 +169,7 @@ def _flown(flight: FlightState) -> Command:
 
 def request_parameters(flight: FlightState) -> None:
     """In HEALTH: ask what decides whether the vehicle can be flown; it needs no telemetry."""
-    due = flight.reading.due(_dialect(flight), flight.vehicle.parameters, flight.now_s)
+    due = flight.reading.due(_dialect(flight), flight.vehicle)
     outbox.send(flight, *due)
     if flight.service:
         if flight.vehicle.age_s(VehicleIdentity) > flight.in_phase_s:
@@ -185,15 +183,14 @@ def request_parameters(flight: FlightState) -> None:
 def _fit_telemetry(flight: FlightState) -> None:
     """Request less telemetry while the link delays by more than can be flown: it may be
     saturated."""
-    link, limits, in_phase_s = flight.clock.delay, flight.limits, flight.in_phase_s
-    if in_phase_s - flight.thinned_s < FIT_EVERY_S or link is None:
+    link, limits = flight.clock.delay, flight.limits
+    if link is None or flight.host_s - flight.clock.began_s < FIT_EVERY_S:
         return
-    if link.value > limits.link_delay_s or link.sd > limits.link_jitter_s:
-        flight.thinned_s = in_phase_s
-        if flight.session.thin_telemetry():
-            flight.clock.measure_delay_again()
-            delay = f"{1e3 * link.value:.0f} +- {1e3 * link.sd:.0f} ms"
-            outbox.announce(flight, f"the link delays by {delay}: less telemetry is requested")
+    late = link.value > limits.link_delay_s or link.sd > limits.link_jitter_s
+    if late and flight.session.thin_telemetry():
+        flight.clock.measure_delay_again()
+        delay = f"{1e3 * link.value:.0f} +- {1e3 * link.sd:.0f} ms"
+        outbox.announce(flight, f"the link delays by {delay}: less telemetry is requested")
 
 
 def _take_off(flight: FlightState, time_s: float) -> None:

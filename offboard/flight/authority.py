@@ -64,7 +64,6 @@ class Authority:
     # modes that we asked for to end the flight, oldest first; those before the one that it shows
     # are dropped
     _requested: list[str] = field(default_factory=list)
-    _forgot_s: float = -math.inf  # time of a reboot
     _failsafe_shown: bool = False  # a HEARTBEAT shows what `Standing.FAILSAFE` supposes
     _counts_from_s: float = -math.inf  # host time: reports that arrived earlier do not count
 
@@ -172,8 +171,7 @@ class Authority:
 
     def forget(self, now_s: float) -> None:
         """The vehicle was rebooted: its standing is shown by the next report of the mode."""
-        self.heard_s = self.reported_s = -math.inf
-        self._forgot_s = now_s
+        self.heard_s, self.reported_s = now_s, -math.inf  # no report counts as unheard before now
         if self.is_ours:
             self.standing = Standing.OURS
 
@@ -193,7 +191,7 @@ class Authority:
 
     def unheard_s(self, now_s: float) -> float:
         """Time since the newest report, if that is longer than usual; else 0."""
-        return 0.0 if self.heard(now_s) else now_s - max(self.heard_s, self._forgot_s)
+        return 0.0 if self.heard(now_s) else now_s - self.heard_s
 
     def permits_setpoint(self, now_s: float) -> bool:
         """Whether a setpoint may leave: to a vehicle that follows it, or as the stream that PX4
@@ -213,43 +211,35 @@ class Authority:
         return self.standing in (Standing.OURS, Standing.FAILSAFE, Standing.HANDED)
 
 
-@dataclass(slots=True)
-class PilotSwitch:
-    """Whether the pilot has switched the vehicle, in the air, to the mode of setpoints, from one
-    that was shown without a failsafe: after a failsafe PX4 returns to OFFBOARD by itself as soon as
-    setpoints arrive. For the service, which does not ask for that mode.
-
-    `other_mode_shown`: a HEARTBEAT has shown another mode, without a failsafe, and since then none
-    has shown the mode of setpoints. `engaged`: from there it was switched to the mode of setpoints,
-    in the air. `always_in_engage_mode`: since the service began, or the vehicle rebooted, every
-    report has shown the mode of setpoints, in the air. `returned_too_soon`: it left that mode and
-    returned, in the air, before a HEARTBEAT could show the other one without a failsafe.
-    `was_in_engage_mode`: by the previous report; None after a failsafe, which may have changed it.
+class PilotSwitch(Enum):
+    """How the vehicle came to the mode of setpoints, or whether it is in another one, by its
+    reports. The pilot of the service, which does not ask for that mode, engages by a switch to it,
+    in the air, from a mode that was shown without a failsafe: after a failsafe PX4 returns to
+    OFFBOARD by itself as soon as setpoints arrive.
     """
 
-    other_mode_shown: bool = False
-    engaged: bool = False
-    always_in_engage_mode: bool = True
-    returned_too_soon: bool = False
-    was_in_engage_mode: bool | None = None
+    FOUND = "in it, in the air, in every report since the service began or the vehicle rebooted"
+    ELSEWHERE = "in another mode, which a failsafe may have chosen"
+    READY = "in another mode, and a HEARTBEAT has shown it without a failsafe"
+    ENGAGED = "switched to it in the air"
+    TOO_SOON = "in it again, in the air, before a HEARTBEAT could show the other mode"
+    IDLE = "in it without a switch in the air, or in a failsafe"
 
-    def on_heartbeat(self, *, in_engage_mode: bool, failsafe: bool) -> None:
-        """A HEARTBEAT shows the mode of setpoints or another one."""
+    def after(
+        self, *, in_engage_mode: bool, in_the_air: bool, flies: bool, failsafe: bool | None
+    ) -> PilotSwitch:
+        """After a report of the mode. Only a vehicle that `flies` by every sign
+        (`GroundContact.flies`) is engaged. `failsafe`: whether HEARTBEAT shows one, None if the
+        report is none."""
+        shown = PilotSwitch
+        if self is shown.FOUND and in_engage_mode and in_the_air:
+            return self
         if failsafe:
-            self.other_mode_shown = self.engaged = self.returned_too_soon = False
-            self.was_in_engage_mode = None
-        elif not in_engage_mode:
-            self.other_mode_shown = True
-
-    def on_mode(self, *, in_engage_mode: bool, in_the_air: bool, flies: bool) -> None:
-        """Any report of the mode, before `on_heartbeat` of the same message. Only a vehicle that
-        `flies` by every sign (`GroundContact.flies`) is engaged."""
-        if not (in_engage_mode and in_the_air):
-            self.always_in_engage_mode = False
+            return shown.IDLE
         if not in_engage_mode:
-            self.engaged = self.returned_too_soon = False
-        elif self.other_mode_shown:
-            self.other_mode_shown, self.engaged = False, flies
-        elif self.was_in_engage_mode is False:
-            self.returned_too_soon = in_the_air
-        self.was_in_engage_mode = in_engage_mode
+            return shown.ELSEWHERE if failsafe is None and self is not shown.READY else shown.READY
+        if self is shown.READY:
+            return shown.ENGAGED if flies else shown.IDLE
+        if self is shown.ELSEWHERE:
+            return shown.TOO_SOON if in_the_air else shown.IDLE
+        return shown.IDLE if self is shown.FOUND else self

@@ -17,6 +17,7 @@ whatever the vehicle file says and however fast it climbs.
 from __future__ import annotations
 
 import math
+import operator
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -27,7 +28,7 @@ from numpy.typing import NDArray
 from offboard.estimation.observer import GATES
 from offboard.flight.phases import Limits
 from offboard.flight.vehicle_state import VehicleState
-from offboard.mavlink.events import EstimatorReport, GpsFix, LocalPosition, NoFix
+from offboard.mavlink.events import EstimatorReport, GpsFix, LocalPosition, NoFix, Triple
 from offboard.model.axes import acceleration
 from offboard.model.vehicle import HOVER_THRUST_LIMITS, Vehicle
 
@@ -43,39 +44,37 @@ class Positioning:
     """What the position estimate had when the flight began; nothing before that."""
 
     had_fix: bool = False
-    had_valid: frozenset[str] = frozenset()  # parts of the estimate
-    accuracy_m: float | None = None
-    fixes_hz: float = 0.0
-    reports_hz: float = 0.0
+    report: EstimatorReport | None = None
+    fixes_silent_s: float = math.inf  # so long without fixes their messages are missing
+    reports_silent_s: float = math.inf
 
     def begin(self, vehicle: VehicleState, rates_hz: Mapping[str, float], estimator: str) -> None:
         """The flight begins. `rates_hz` of the messages that arrive, `estimator` the name of the
         one that becomes an EstimatorReport."""
         self.had_fix = vehicle.age_s(GpsFix) < KNOWN_S
-        self.fixes_hz = rates_hz.get("GPS_RAW_INT", 0.0)
-        report = vehicle.estimator
-        if report is not None and vehicle.age_s(EstimatorReport) < KNOWN_S:
-            self.had_valid, self.accuracy_m = report.valid, report.accuracy_m
-            self.reports_hz = rates_hz.get(estimator, 0.0)
+        self.fixes_silent_s = _silent_s(rates_hz.get("GPS_RAW_INT", 0.0))
+        if vehicle.age_s(EstimatorReport) < KNOWN_S:
+            self.report = vehicle.estimator
+            self.reports_silent_s = _silent_s(rates_hz.get(estimator, 0.0))
 
     def lost(self, vehicle: VehicleState, limits: Limits) -> str:
         """What is lost, as a sentence; empty if nothing is."""
-        fix_age_s, report = vehicle.age_s(GpsFix), vehicle.estimator
+        fix_age_s, before, now = vehicle.age_s(GpsFix), self.report, vehicle.estimator
         if self.had_fix and fix_age_s > limits.gps_s and vehicle.age_s(NoFix) < fix_age_s:
             return f"GPS has no fix for {fix_age_s:.1f} s"
-        if self.had_fix and fix_age_s > max(_silent_s(self.fixes_hz), limits.gps_s):
+        if self.had_fix and fix_age_s > max(self.fixes_silent_s, limits.gps_s):
             return f"no GPS_RAW_INT for {fix_age_s:.1f} s"
-        if report is None:
+        if before is None or now is None:
             return ""
-        missing = sorted(self.had_valid - report.valid)
+        missing = sorted(before.valid - now.valid)
         if missing:
             return f"its estimator has no valid {', '.join(missing)} any more"
-        if self.accuracy_m is not None and self.had_valid:
-            if report.accuracy_m is None:
+        if before.accuracy_m is not None and before.valid:
+            if now.accuracy_m is None:
                 return "its estimator reports no accuracy of the position any more"
-            if report.accuracy_m > max(limits.accuracy_m, WORSE * self.accuracy_m):
-                return f"its estimated position is only accurate to {report.accuracy_m:.1f} m"
-        if vehicle.age_s(EstimatorReport) > _silent_s(self.reports_hz):
+            if now.accuracy_m > max(limits.accuracy_m, WORSE * before.accuracy_m):
+                return f"its estimated position is only accurate to {now.accuracy_m:.1f} m"
+        if vehicle.age_s(EstimatorReport) > self.reports_silent_s:
             return "no report of its estimator"
         return ""
 
@@ -96,15 +95,17 @@ DRIFT_S = 1.0  # time constant; real PX4 drifts by 0.7 m at most, without a fix 
 
 
 class PositionJumps:
-    """Finds the jumps between successive positions. `total_ned_m` (3,) is the sum of all.
-    `drift_m`: by how much positions, without the jumps, and velocities of the last second
-    contradict each other."""
+    """Finds the jumps between successive positions. `drift_m`: by how much positions, without the
+    jumps, and velocities of the last second contradict each other.
+
+    The vehicle does not move with a jump: a place on the ground is kept without the jumps before
+    it, and compared with positions without theirs."""
 
     def __init__(self) -> None:
         self._newest: LocalPosition | None = None
         self._jumps: deque[tuple[float, float]] = deque()  # when, by how many metres
         self._noise_m = 0.0  # mean distance between a position and what the one before leads to
-        self.total_ned_m: Array = np.zeros(3)
+        self._total_ned_m = (0.0, 0.0, 0.0)  # sum of all
         self._drift_ned_m = (0.0, 0.0, 0.0)
 
     @property
@@ -138,9 +139,19 @@ class PositionJumps:
             self._drift_ned_m = north, east, down
             return None
         self._jumps.append((position.time_s, size_m))
-        jump = np.array(jump_m)
-        self.total_ned_m = self.total_ned_m + jump
-        return jump
+        north, east, down = jump_m
+        self._total_ned_m = self.reported((north, east, down))
+        return np.array(jump_m)
+
+    def without(self, reported_ned_m: Triple) -> Triple:
+        """The place of a position that is reported now."""
+        north, east, down = map(operator.sub, reported_ned_m, self._total_ned_m)
+        return north, east, down
+
+    def reported(self, place_ned_m: Triple) -> Triple:
+        """The position that a vehicle at this place would report now."""
+        north, east, down = map(operator.add, place_ned_m, self._total_ned_m)
+        return north, east, down
 
     def recent_m(self, time_s: float) -> float:
         """Sum of the sizes of the jumps in the last RECENT_S."""

@@ -15,6 +15,7 @@ import numpy as np
 from offboard.flight.authority import Standing
 from offboard.flight.ground_contact import STOOD_S
 from offboard.flight.phases import TRACKING, Action, Condition, Limits, Phase
+from offboard.flight.preflight import other_sender
 from offboard.flight.state import COMMANDS_KEPT, FlightState
 from offboard.flight.timing import JUMP_S
 from offboard.mavlink.events import MODE_KNOWN_S, ThrustReport
@@ -58,12 +59,6 @@ def mode_unknown(flight: FlightState) -> str:
     return f"no report of the mode for {flight.now_s - flight.authority.heard_s:.1f} s"
 
 
-def other_sender(flight: FlightState) -> str:
-    """Another program sends setpoints or commands modes on this link, or says in its HEARTBEAT
-    that it flies the vehicle."""
-    return "" if flight.limits.begin_with_other_sender else flight.vehicle.other_sender_named
-
-
 # ---------------------------------------------------------------------- who has the vehicle
 
 
@@ -93,6 +88,16 @@ def in_own_failsafe(flight: FlightState) -> str:
 
 def stop_requested(flight: FlightState) -> str:
     return flight.stop_reason
+
+
+def longer_than(limit: str) -> Condition:
+    """Holds once the phase has lasted longer than the limit of this name."""
+
+    def too_long(flight: FlightState) -> bool:
+        return flight.in_phase_s > float(getattr(flight.limits, limit))
+
+    too_long.__name__ = f"longer_than_{limit}"
+    return too_long
 
 
 # ---------------------------------------------------------------------- conditions of the failsafe
@@ -349,8 +354,7 @@ def judge(flight: FlightState, rows: Sequence[Row] = ROWS) -> None:
     """Measure for how long each condition has held by now, and note the worst row that is active,
     the first of those that are equally bad."""
     known = flight.failsafe
-    passed_s = 0.0 if known.judged_s is None else flight.now_s - known.judged_s
-    step_s = min(max(passed_s, 0.0), STEP_MAX_S)
+    step_s = min(max(flight.now_s - known.judged_s, 0.0), STEP_MAX_S)
     known.judged_s = flight.now_s
     known.action, known.row, known.reason, known.cause = Action.FLY, "", "", ""
     for row in rows:

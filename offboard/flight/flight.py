@@ -98,11 +98,11 @@ class Flight(FlightState):
 
     def _begin_turn(self, host_now_s: float) -> None:
         session = self.session
-        elapsed_s = session.elapsed_s(host_now_s)
-        if math.isnan(self.turned_s):
-            self.turned_s, self.heard_s = host_now_s, elapsed_s
-        paused_s, self.turned_s = host_now_s - self.turned_s, host_now_s
+        elapsed_s, before_s = session.elapsed_s(host_now_s), self.host_s
         self.host_s = session.clock_s(host_now_s)
+        if math.isnan(before_s):
+            before_s, self.heard_s = self.host_s, elapsed_s
+        paused_s = self.host_s - before_s
         self.silence_s = elapsed_s - self.heard_s
         self.note_missing_setpoints()
         if session.settings.lockstep:
@@ -126,8 +126,8 @@ class Flight(FlightState):
         return reception.replies
 
     def _take(self, event: Event, arrived_s: float, host_now_s: float) -> None:
-        telemetry.update(self, event, arrived_s, turned_s=host_now_s)
-        self._heard |= self._ends_silence(event)
+        is_news = telemetry.update(self, event, arrived_s, turned_s=host_now_s)
+        self._heard |= is_news and self._ends_silence(event)
         if isinstance(event, Rebooted):
             self._tick = -1
 
@@ -135,10 +135,9 @@ class Flight(FlightState):
         """Whether the event is telemetry. Once position and attitude are received only they are:
         without them vehicle time stands still and nothing is decided. After a reboot in flight both
         must be received again."""
-        vehicle = self.vehicle
-        if not vehicle.has_state:
+        if not self.vehicle.has_state:
             return self.phase in BEFORE_FLIGHT and not isinstance(event, ClockBehind)
-        return isinstance(event, (Attitude, LocalPosition)) and not vehicle.repeated
+        return isinstance(event, (Attitude, LocalPosition))
 
     def _poll(self, host_now_s: float, before_s: float) -> Sequence[Outgoing]:
         """The time at which this turn acts; returns what the session sends by itself."""

@@ -48,10 +48,9 @@ class FlightPlan:
     def __init__(self, track: Track) -> None:
         self.track = track
         self.origin_ned_m = (0.0, 0.0, 0.0)
-        self._track_began_s = math.nan
         self._arrival_s = math.nan
-        self._planned: Reference | None = None
-        self._paused: Moved | None = None
+        self._planned: Moved | None = None
+        self._tracks = False  # `_planned` is the track, not the climb
         self._offset: Reference | None = None  # since a jump of the estimate
 
     @property
@@ -73,15 +72,13 @@ class FlightPlan:
             float(start.heading_rad),
             start_velocity_ned_mps=velocity_ned_mps,
         )
-        self._track_began_s, self._paused = math.nan, None
         self._arrival_s = time_s + climb.duration_s
-        self._planned = Moved(climb, time_s)
+        self._planned, self._tracks = Moved(climb, time_s), False
         self._offset = None
 
     def start_track(self, time_s: float) -> None:
         """Fly the track, whose time 0 is `time_s`."""
-        self._track_began_s, self._paused = time_s, None
-        self._planned = Moved(self.track, time_s, self.origin_ned_m)
+        self._planned, self._tracks = Moved(self.track, time_s, self.origin_ned_m), True
 
     def follow_jump(self, time_s: float, jump_ned_m: Array) -> float:
         """The estimated position has jumped by `jump_ned_m` (3,), not the vehicle: move the
@@ -98,19 +95,20 @@ class FlightPlan:
 
     def pause(self, time_s: float) -> None:
         """Come to rest on the track, which has begun."""
-        assert self._planned is not None
-        paused = self._paused
-        if paused and time_s < paused.resumed_s:  # it still stops: it does not run again
-            self._paused = self._planned = paused.resumed(math.inf)
+        planned = self._planned
+        assert planned is not None
+        was_paused = math.isfinite(planned.paused_s)
+        if was_paused and time_s < planned.resumed_s:  # it still stops: it does not run again
+            self._planned = planned.resumed(math.inf)
             return
-        if paused and paused.at_full_speed(time_s):
-            self.start_track(time_s - paused.own_s(time_s))
-        self._paused = self._planned = Moved(self._planned, paused_s=time_s)
+        if was_paused and planned.at_full_speed(time_s):
+            planned = Moved(self.track, time_s - planned.own_s(time_s), self.origin_ned_m)
+        self._planned = Moved(planned, paused_s=time_s)
 
     def resume(self, time_s: float) -> None:
         """Continue the track after `pause`."""
-        if self._paused is not None:
-            self._paused = self._planned = self._paused.resumed(time_s)
+        assert self._planned is not None
+        self._planned = self._planned.resumed(time_s)
 
     def place_start(
         self, position_ned_m: Triple, velocity_ned_mps: Triple, ground_down_m: float | None
@@ -132,7 +130,7 @@ class FlightPlan:
 
     def track_time_s(self, time_s: float) -> float:
         """Time since the start of the track, without pauses; NaN before it."""
-        return self._paused.own_s(time_s) if self._paused else time_s - self._track_began_s
+        return self._planned.own_s(time_s) if self._planned and self._tracks else math.nan
 
     def overdue_s(self, time_s: float) -> float:
         """Time since the planned end of the climb, s; negative before it, NaN without a climb."""

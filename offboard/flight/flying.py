@@ -11,6 +11,7 @@ from offboard.flight.failsafe import (
     authority_lost,
     authority_lost_armed,
     in_own_failsafe,
+    longer_than,
     mode_unknown,
     rebooted,
     stop_requested,
@@ -21,6 +22,7 @@ from offboard.flight.phases import (
     MOVING,
     OUTAGE_MAX_S,
     RESTS,
+    SERVICE_ONLY,
     TRACKING,
     Action,
     Condition,
@@ -148,23 +150,11 @@ def out_of_reach(flight: FlightState) -> str:
 
 
 def not_disarmed(flight: FlightState) -> str:
-    if flight.in_phase_s <= flight.limits.land_s:
-        return ""
     contact = flight.contact
     shows = contact.stands and contact.detects_flight and flight.vehicle.armed
     return f"not landed and disarmed after {flight.in_phase_s:.0f} s" + (
         f"; {STILL_ARMED}" if shows else ""
     )
-
-
-def longer_than(limit: str) -> Condition:
-    """Holds once the phase has lasted longer than the limit of this name."""
-
-    def too_long(flight: FlightState) -> bool:
-        return flight.in_phase_s > float(getattr(flight.limits, limit))
-
-    too_long.__name__ = f"longer_than_{limit}"
-    return too_long
 
 
 def requested(request: Request) -> Condition:
@@ -195,20 +185,22 @@ RESTARTED = f"{REBOOTED} and is disarmed"
 def ends_early(*, serves: bool) -> tuple[Transition, ...]:
     """Rows that end a flight in the air early. A stop makes `fly` land and the service hold; in the
     service a change of mode by the pilot is the usual end."""
+    flown = FLYING if serves else FLYING - SERVICE_ONLY
     followed = TRACKING if serves else frozenset[Phase]()
-    taken = TRACKING | {HAND_BACK} if serves else frozenset[Phase]()
-    others = FLYING - followed
+    handed = flown & {HAND_BACK}
+    taken = followed | handed
     return (
-        Transition(FLYING, rebooted_in_flight, LAND, ABORTED, "restart"),
+        Transition(handed, in_requested_mode, YIELDED),
+        Transition(flown, rebooted_in_flight, LAND, ABORTED, "restart"),
         # HEARTBEAT may be wrong: what still flies is to land
-        Transition(FLYING, disarmed, LAND, ABORTED, "disarmed in flight"),
+        Transition(flown, disarmed, LAND, ABORTED, "disarmed in flight"),
         Transition(taken, authority_lost, YIELDED, FLOWN, "pilot"),
-        Transition(FLYING - taken, authority_lost, YIELDED, ABORTED, "pilot"),
-        Transition(FLYING, in_own_failsafe, LAND, ABORTED, "link"),
-        Transition(FLYING, failsafe_land, LAND, ABORTED, *FAILSAFE),
+        Transition(flown - taken, authority_lost, YIELDED, ABORTED, "pilot"),
+        Transition(flown, in_own_failsafe, LAND, ABORTED, "link"),
+        Transition(flown, failsafe_land, LAND, ABORTED, *FAILSAFE),
         Transition(followed, stop_requested, HAND_BACK, FLOWN, OPERATOR),
-        Transition(others - {HAND_BACK}, stop_requested, LAND, ABORTED, OPERATOR),
-        Transition(FLYING - {HAND_BACK, HOLD}, failsafe_hold, HOLD, ABORTED, *FAILSAFE),
+        Transition(flown - taken, stop_requested, LAND, ABORTED, OPERATOR),
+        Transition(flown - {HAND_BACK, HOLD}, failsafe_hold, HOLD, ABORTED, *FAILSAFE),
     )
 
 
@@ -229,7 +221,7 @@ TO_THE_END = (
     Transition({LAND}, authority_lost_armed, YIELDED, ABORTED, "pilot"),
     Transition({LAND}, unheard_on_ground, FAILED, ABORTED, reason=UNHEARD),
     Transition({LAND}, out_of_reach, FAILED, ABORTED),
-    Transition({LAND}, not_disarmed, FAILED, ABORTED),
+    Transition({LAND}, longer_than("land_s"), FAILED, ABORTED, reason=not_disarmed),
 )
 HANDED_BACK, NOT_BEGUN = "handed back on request", "stopped on request"
 hand_back, start = requested(Request.HAND_BACK), requested(Request.START)

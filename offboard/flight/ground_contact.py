@@ -8,13 +8,11 @@ the score uses it too, so that both give the same verdict.
 from __future__ import annotations
 
 import math
-import operator
 from collections import deque
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from offboard.flight.vehicle_state import VehicleState
-from offboard.mavlink.events import Landed, LocalPosition, Triple
+from offboard.mavlink.events import Landed, Triple
 
 DETECTOR_KNOWN_S = 1.5  # EXTENDED_SYS_STATE is requested at 5 Hz
 RESTING_HEIGHT_M = 0.75  # errors of an estimate on the ground
@@ -41,23 +39,25 @@ SLOPE = 0.1  # of the terrain
 
 @dataclass(slots=True)
 class GroundContact:
-    """Updated with every position; `vehicle` holds the other signs."""
+    """Updated with every position; `vehicle` holds the other signs. Places are without the jumps of
+    the estimate (`estimates.PositionJumps`)."""
 
     vehicle: VehicleState
     rest_ned_m: Triple | None = None  # where it last rested; None if it has not been seen at rest
+    _down_m: float = math.nan  # of the newest place
     _lifted: int = 0  # samples in a row
     _heights: deque[tuple[float, float]] = field(default_factory=deque)  # when, and how high
 
-    def on_position(self, position: LocalPosition) -> None:
-        """The newest position."""
-        speed_mps = position.velocity_ned_mps[2]
-        if self.vehicle.disarmed and abs(speed_mps) < GROUND_SPEED_MPS:
-            self.rest_ned_m = position.position_ned_m
-        climbs = speed_mps < -LIFTED_CLIMB_MPS and self.height_m > 0.3 * LIFTED_HEIGHT_M
+    def on_position(self, time_s: float, place_ned_m: Triple, down_mps: float) -> None:
+        """The newest place, and the downward component of the velocity."""
+        self._down_m = place_ned_m[2]
+        if self.vehicle.disarmed and abs(down_mps) < GROUND_SPEED_MPS:
+            self.rest_ned_m = place_ned_m
+        climbs = down_mps < -LIFTED_CLIMB_MPS and self.height_m > 0.3 * LIFTED_HEIGHT_M
         lifted = self.height_m > LIFTED_HEIGHT_M or climbs
         self._lifted = self._lifted + 1 if lifted else 0
-        self._heights.append((position.time_s, self.height_m))
-        while self._heights[0][0] < position.time_s - KEPT_S:
+        self._heights.append((time_s, self.height_m))
+        while self._heights[0][0] < time_s - KEPT_S:
             self._heights.popleft()
 
     @property
@@ -69,8 +69,7 @@ class GroundContact:
     @property
     def height_m(self) -> float:
         """Height above `rest_down_m`; 0 before the first position."""
-        position = self.vehicle.position
-        return self.rest_down_m - position.position_ned_m[2] if position else 0.0
+        return 0.0 if math.isnan(self._down_m) else self.rest_down_m - self._down_m
 
     @property
     def position_known(self) -> bool:
@@ -133,15 +132,9 @@ class GroundContact:
 # ---------------------------------------------------------------------- a landing
 
 
-def moved(point_ned_m: Triple, jump_ned_m: Iterable[float]) -> Triple:
-    """A place on the ground after the reported position has jumped by `jump_ned_m` (3,)."""
-    north, east, down = map(operator.add, point_ned_m, jump_ned_m)
-    return north, east, down
-
-
 class Touchdown:
-    """One landing. Give it each position from the beginning of the landing on, and each jump of the
-    reported position (`estimates.PositionJumps`) before it: they move the ground as well.
+    """One landing. Give it each position from the beginning of the landing on, without the jumps of
+    the estimate (`estimates.PositionJumps`).
 
     `takeoff_ned_m` is the take-off point; None if unknown, then the height is not judged.
     `speed_mps` is the largest downward speed within a second before the vehicle came to rest where
@@ -151,8 +144,7 @@ class Touchdown:
     def __init__(self, takeoff_ned_m: Triple | None) -> None:
         self._takeoff_ned_m = takeoff_ned_m
         self._newest: deque[tuple[float, float, float]] = deque()  # time, down, downward speed
-        self._position_ned_m: Triple = (math.nan,) * 3
-        self._reported: tuple[Triple, float] | None = None
+        self._reported: tuple[Triple, float] = (math.nan,) * 3, math.nan  # position, down
         self._rest_down_m = math.nan
         self.speed_mps = math.nan
 
@@ -161,8 +153,7 @@ class Touchdown:
         if (position_ned_m, down_mps) == self._reported:
             return  # no estimator reports the same twice: it has stopped
         self._reported = position_ned_m, down_mps
-        self._position_ned_m, down_m = position_ned_m, position_ned_m[2]
-        newest = self._newest
+        newest, down_m = self._newest, position_ned_m[2]
         newest.append((time_s, down_m, down_mps))
         while newest[0][0] < time_s - BEFORE_S - REST_S:
             newest.popleft()
@@ -173,14 +164,6 @@ class Touchdown:
             self._rest_down_m = down_m
         elif abs(down_m - self._rest_down_m) > BOUNCE_M:
             self.speed_mps = math.nan
-
-    def on_jump(self, jump_ned_m: Iterable[float]) -> None:
-        """The reported position has jumped by this (3,), and with it all places on the ground."""
-        jump = tuple(jump_ned_m)
-        self._rest_down_m += jump[2]
-        self._newest = deque((at_s, down + jump[2], mps) for at_s, down, mps in self._newest)
-        if self._takeoff_ned_m is not None:
-            self._takeoff_ned_m = moved(self._takeoff_ned_m, jump)
 
     def _rests(self, time_s: float) -> bool:
         downs = [down for at_s, down, _ in self._newest if at_s >= time_s - REST_S]
@@ -197,7 +180,7 @@ class Touchdown:
             return "the land detector does not report the ground"
         if math.isnan(self.speed_mps):
             return "it has not come to rest"
-        takeoff_ned_m, position_ned_m = self._takeoff_ned_m, self._position_ned_m
+        takeoff_ned_m, (position_ned_m, _) = self._takeoff_ned_m, self._reported
         if takeoff_ned_m is None:
             return ""
         height_m = takeoff_ned_m[2] - position_ned_m[2]

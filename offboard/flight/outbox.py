@@ -221,14 +221,13 @@ def request(flight: FlightState, request: CommandLong) -> bool:
     In one phase it is sent once. Only one that was refused, or that nothing has answered, is
     sent again, after a second and a new report of the mode: a pilot may have changed it.
     """
-    key = flight.phase, request
     result = flight.vehicle.results.get(request.command)
-    requested_s = flight.requested_s.get(key, -math.inf)
+    requested_s = flight.requested_s.get(request, -math.inf)
     waits = flight.now_s - requested_s < REPEAT_S - 1e-6 or flight.authority.heard_s < requested_s
     done = math.isfinite(requested_s) and result in GOOD_RESULTS
     if waits or done or not flight.authority.permits_command(flight.now_s):
         return False
-    flight.requested_s[key] = flight.now_s
+    flight.requested_s[request] = flight.now_s
     flight.vehicle.results.pop(request.command, None)
     send(flight, request)
     return True

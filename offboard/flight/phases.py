@@ -79,6 +79,7 @@ TRACKING = frozenset({Phase.CLIMB, Phase.EXCITE, Phase.JOIN, Phase.TRACK, Phase.
 MOVING = frozenset({Phase.JOIN, Phase.TRACK})  # along the reference
 # phases in which the failsafe judges
 FLYING = TRACKING | {Phase.TAKEOFF, Phase.HAND_BACK, Phase.HOLD}
+SERVICE_ONLY = frozenset({Phase.STANDBY, Phase.PAUSE, Phase.HAND_BACK})  # never in `fly`
 OUTAGE_MAX_S = 300.0  # so long a vehicle that was asked to land, and is not heard, is waited for
 OPERATOR_STOP = "stop requested by the operator"
 RESTS = "at rest"  # why a landing begins that is no early end
@@ -105,8 +106,8 @@ class Transition:
 
     `exit_code` is set if this row decides the result; a later row can only make it more severe.
     `cause` is a word for what ended a flight that the row ends (see `analysis.verdict`). `reason`
-    is the sentence, where the condition does not say it. Both may have values of the flight in
-    braces.
+    is the sentence, or a function that says it, where the condition does not. Texts may have values
+    of the flight in braces.
     """
 
     phases: Set[Phase]
@@ -114,10 +115,12 @@ class Transition:
     target: Phase
     exit_code: int | None = None
     cause: str = ""
-    reason: str = ""
+    reason: str | Callable[[FlightState], str] = ""
 
     def why(self, flight: FlightState) -> str:
         """The sentence that says why the row is taken, while its condition holds."""
+        if callable(self.reason):
+            return self.reason(flight)
         return self.reason.format(flight=flight) or str(self.condition(flight))
 
 

@@ -7,18 +7,19 @@ a `Ground`. What an autopilot requires of its parameters is in its dialect; each
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from enum import IntEnum
 
-from offboard.flight.phases import Limits
+from offboard.flight.phases import Limits, ServiceOptions
 from offboard.flight.timing import VehicleClock
 from offboard.flight.vehicle_state import ARMED_KNOWN_S, VehicleState
 from offboard.mavlink import senders
-from offboard.mavlink.dialects.base import Dialect, Takeoff, WatchedParameter
+from offboard.mavlink.dialects.base import Dialect, Takeoff
 from offboard.mavlink.events import GpsFix, Heartbeat, NoFix
 from offboard.mavlink.outgoing import ParamRead
 from offboard.mavlink.session import Session
+from offboard.model.vehicle import Vehicle
 
 TELEMETRY = ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED")
 MINIMUM_TELEMETRY_HZ = 10.0
@@ -53,27 +54,65 @@ class Finding:
         return f"{self.found}. Fix: {self.hint}" if self.hint else self.found
 
 
-@dataclass(slots=True)
-class Ground:
-    """What is known of a vehicle before its flight, by a flight or by the listening of `doctor`, at
-    host time `host_s`."""
+class ParameterReading:
+    """Progress of reading the watched parameters of one vehicle.
 
-    vehicle: VehicleState
+    `advice`: also those that are only for the advice of `doctor`."""
+
+    def __init__(self, *, advice: bool = False) -> None:
+        self._advice = advice
+        self._began_s = math.nan
+        self._requested_s = -math.inf
+
+    def due(self, dialect: Dialect, vehicle: VehicleState) -> list[ParamRead]:
+        """Requests to send now, for every watched parameter without a reply."""
+        if math.isnan(self._began_s):
+            self._began_s = vehicle.now_s
+        if vehicle.now_s - self._requested_s < REPEAT_S - 1e-6:
+            return []
+        self._requested_s = vehicle.now_s
+        return [ParamRead(name) for name in self._missing(dialect, vehicle)]
+
+    def complete(self, dialect: Dialect, vehicle: VehicleState) -> bool:
+        """Every parameter has a reply, or had time enough for one."""
+        timeout = vehicle.now_s - self._began_s >= REPLY_TIMEOUT_S
+        return timeout or not self._missing(dialect, vehicle)
+
+    def _missing(self, dialect: Dialect, vehicle: VehicleState) -> list[str]:
+        watched = (p.name for p in dialect.watched_parameters if self._advice or not p.advice_only)
+        return [name for name in watched if name not in vehicle.parameters]
+
+
+@dataclass(slots=True, kw_only=True)
+class Ground:
+    """What is known of a vehicle on the ground, by the listening of `doctor`, or by a flight, which
+    is one. `model` is the vehicle model in use: it scales the thrust of setpoints."""
+
     limits: Limits
     session: Session
-    clock: VehicleClock
-    host_s: float
-    helicopter: bool = False  # by its vehicle file
+    model: Vehicle
+    vehicle: VehicleState = field(default_factory=VehicleState)
+    clock: VehicleClock = field(default_factory=VehicleClock)
+    host_s: float = math.nan  # monotonic time of this computer at the present turn
+    guarded: bool = True  # a supervisor lands the vehicle if this process ends
     rates_requested: bool = True  # of telemetry: only then slow ones count
-    reads_parameters: bool = False  # replies are still awaited
-    in_the_air: bool = False
-    guarded: bool = True  # a supervisor lands it if this process ends
-    origin_missing: bool = False  # the reference is relative to a take-off point that is not known
-    serves: bool = False  # for `daemon`, whose pilot arms it and engages
+    service: ServiceOptions | None = None  # of `daemon`, whose pilot arms it and engages
+    reading: ParameterReading = field(default_factory=ParameterReading)
 
     @property
     def dialect(self) -> Dialect | None:
+        """The dialect of the vehicle; None before it is found."""
         return self.session.dialect
+
+    @property
+    def in_the_air(self) -> bool:
+        """Whether it may fly; in doubt it does."""
+        return self.vehicle.armed
+
+    @property
+    def origin_missing(self) -> bool:
+        """The reference is relative to a take-off point that is not known."""
+        return False
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +134,7 @@ def findings(ground: Ground) -> Iterator[tuple[str, bool, Finding]]:
     """What is wrong, in the order of the list, and last what the autopilot requires of its
     parameters: the name of the check, whether `fly` refuses it at once, and the finding."""
     for row in PREFLIGHT:
-        found = "" if row.fly_only and ground.serves else row.problem(ground)
+        found = "" if row.fly_only and ground.service else row.problem(ground)
         if found:
             level = row.level if isinstance(row.level, Level) else row.level(ground)
             fix = row.fix if isinstance(row.fix, str) else row.fix(ground)
@@ -129,7 +168,8 @@ def unfit_type(ground: Ground) -> str:
     heartbeat = ground.vehicle.heartbeat
     if heartbeat is None or ground.dialect is None:
         return ""
-    return senders.unfit_type(heartbeat.vehicle_type, helicopter=ground.helicopter)
+    helicopter = ground.model.airframe == "helicopter"
+    return senders.unfit_type(heartbeat.vehicle_type, helicopter=helicopter)
 
 
 def armed_already(ground: Ground) -> str:
@@ -159,25 +199,32 @@ def _flown_by_failsafe(ground: Ground) -> str:
     )
 
 
-def several_vehicles(ground: Ground) -> str:
+def _several_vehicles(ground: Ground) -> str:
     """Several vehicles are heard, and none was chosen."""
     session = ground.session
     systems = session.senders.candidates(session.link_time_s)
     return systems and f"several vehicles are heard, systems {systems}: choose one with --system"
 
 
-def _other_sender(ground: Ground) -> str:
+def other_sender(ground: Ground) -> str:
+    """Another program sends setpoints or commands modes on this link, or says in its HEARTBEAT
+    that it flies the vehicle."""
     vehicle, limits = ground.vehicle, ground.limits
     return "" if limits.begin_with_other_sender else vehicle.other_sender_named
 
 
-def same_system_id(ground: Ground) -> str:
+def _same_system_id(ground: Ground) -> str:
     if not ground.session.time.mixed:
         return ""
     return (
         "two vehicles with the same system id send on this link, or its telemetry comes twice, "
         "seconds apart"
     )
+
+
+def other_vehicle(ground: Ground) -> str:
+    """Several vehicles are heard, and none was chosen with --system, or none can be."""
+    return _same_system_id(ground) or _several_vehicles(ground)
 
 
 def _no_telemetry(ground: Ground) -> str:
@@ -218,7 +265,8 @@ def _landed_unknown(ground: Ground) -> str:
 
 
 def _reading(ground: Ground) -> str:
-    return "its parameters are still being read" if ground.reads_parameters else ""
+    read = ground.dialect is not None and ground.reading.complete(ground.dialect, ground.vehicle)
+    return "" if read else "its parameters are still being read"
 
 
 def _origin(ground: Ground) -> str:
@@ -269,9 +317,8 @@ def _estimate_level(ground: Ground) -> Level:
 
 
 def _empty_battery(ground: Ground) -> str:
-    health, least = ground.vehicle.health, ground.limits.battery
-    charge = health.battery_remaining if health else None
-    if charge is None or charge >= least:
+    charge, least = ground.vehicle.battery, ground.limits.battery
+    if charge >= least:
         return ""
     return f"its battery has {charge:.0%} left, limits.battery is {least:.0%}"
 
@@ -318,9 +365,9 @@ PREFLIGHT = (
     Row("state", BLOCKS, _flown_by_another, "stop that controller", at_once=True, fly_only=True),
     Row("state", BLOCKS, _flown_by_failsafe, _FAILSAFE, at_once=True, fly_only=True),
     Row("state", BLOCKS, armed_already, "disarm it", at_once=True, fly_only=True),
-    Row("senders", BLOCKS, _other_sender, "stop it", at_once=True, fly_only=True),
-    Row("senders", BLOCKS, several_vehicles, _PORTS, at_once=True),
-    Row("senders", BLOCKS, same_system_id, _SAME_ID, at_once=True),
+    Row("senders", BLOCKS, other_sender, "stop it", at_once=True, fly_only=True),
+    Row("senders", BLOCKS, _several_vehicles, _PORTS, at_once=True),
+    Row("senders", BLOCKS, _same_system_id, _SAME_ID, at_once=True),
     Row("rates", WAIT, _no_telemetry),
     Row("supervisor", WAIT, _unguarded),
     Row("rates", BLOCKS, _slow, _slow_hint),
@@ -334,34 +381,3 @@ PREFLIGHT = (
     Row("delay", WAIT, _measuring),
     Row("delay", BLOCKS, _late, "use a faster link"),
 )
-
-
-# --- parameters ---
-
-
-class ParameterReading:
-    """Progress of reading one vehicle's watched parameters. Times are seconds of any one clock.
-
-    `advice`: also those that are only for the advice of `doctor`."""
-
-    def __init__(self, *, advice: bool = False) -> None:
-        self._advice = advice
-        self._began_s = math.nan
-        self._requested_s = -math.inf
-
-    def due(self, dialect: Dialect, known: Mapping[str, float], now_s: float) -> list[ParamRead]:
-        """Requests to send now, for every watched parameter without a reply."""
-        if math.isnan(self._began_s):
-            self._began_s = now_s
-        if now_s - self._requested_s < REPEAT_S - 1e-6:
-            return []
-        self._requested_s = now_s
-        return [ParamRead(p.name) for p in self._wanted(dialect) if p.name not in known]
-
-    def complete(self, dialect: Dialect, known: Mapping[str, float], now_s: float) -> bool:
-        """Every parameter has a reply, or had time enough for one."""
-        answered = all(each.name in known for each in self._wanted(dialect))
-        return answered or now_s - self._began_s >= REPLY_TIMEOUT_S
-
-    def _wanted(self, dialect: Dialect) -> list[WatchedParameter]:
-        return [p for p in dialect.watched_parameters if self._advice or not p.advice_only]

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from offboard.flight import preflight
+from offboard.flight.authority import PilotSwitch
 from offboard.flight.failsafe import (
     OPERATOR,
     authority_lost,
     authority_lost_armed,
     blind,
     in_own_failsafe,
+    longer_than,
     mode_unknown,
-    other_sender,
     rebooted,
     silent,
     silent_for,
     stop_requested,
 )
 from offboard.flight.phases import ExitCode, Phase, Request, Transition
-from offboard.flight.preflight import Ground
+from offboard.flight.preflight import armed_already, other_sender, other_vehicle, unfit_type
 from offboard.flight.state import FlightState
 from offboard.flight.vehicle_state import ARMED_KNOWN_S, DISARMED_S
 from offboard.mavlink.events import Heartbeat
@@ -50,90 +51,57 @@ def silent_for_another(flight: FlightState) -> str:
     return silent_for(flight, OTHER_VEHICLE_S) if heard else ""
 
 
-def other_vehicle(flight: FlightState) -> str:
-    """Several vehicles are heard, and none was chosen with --system, or none can be."""
-    ground = ground_of(flight)
-    return preflight.same_system_id(ground) or preflight.several_vehicles(ground)
-
-
-def ground_of(flight: FlightState) -> Ground:
-    """What the preflight list judges."""
-    vehicle, contact, dialect = flight.vehicle, flight.contact, flight.dialect
-    service = flight.service
-    read = dialect and flight.reading.complete(dialect, vehicle.parameters, flight.now_s)
-    from_origin = service is not None and service.anchor == "origin"
-    return Ground(
-        vehicle,
-        flight.limits,
-        flight.session,
-        flight.clock,
-        flight.host_s,
-        helicopter=flight.model.airframe == "helicopter",
-        reads_parameters=not read,
-        in_the_air=contact.in_the_air,
-        guarded=flight.guarded,
-        origin_missing=from_origin and contact.in_the_air and contact.rest_ned_m is None,
-        serves=service is not None,
-    )
-
-
-def armed_already(flight: FlightState) -> str:
-    return preflight.armed_already(ground_of(flight))
-
-
 def refused(flight: FlightState) -> str:
     """What the preflight list refuses at once, without waiting."""
-    return "; ".join(preflight.refusals(ground_of(flight)))
+    return "; ".join(preflight.refusals(flight))
 
 
 def unfit(flight: FlightState) -> str:
     """What the preflight list refuses, and the first that it waits for; empty for neither."""
-    ground = ground_of(flight)
-    return "; ".join(filter(None, [*preflight.refusals(ground), preflight.not_ready(ground)]))
+    return "; ".join(filter(None, [*preflight.refusals(flight), preflight.not_ready(flight)]))
 
 
 def usable(flight: FlightState) -> bool:
     return not unfit(flight)
 
 
-def not_ready_in_time(flight: FlightState) -> str:
-    waited = flight.in_phase_s > flight.limits.health_s
-    return f"not ready: {unfit(flight)}" if waited else ""
+def not_ready(flight: FlightState) -> str:
+    return f"not ready: {unfit(flight)}"
 
 
 # ---------------------------------------------------------------------- the service waits
+
+
+PREVENTED = other_sender, mode_unknown, silent, blind  # what prevents that a vehicle is taken over
 
 
 def can_take_over(flight: FlightState) -> bool:
     """It flies in the mode of setpoints, without a failsafe, and no other program controls it."""
     if flight.vehicle.in_failsafe or not engaged_in_the_air(flight):
         return False
-    prevented = (other_sender, mode_unknown, silent, blind)
-    return not any(each(flight) for each in prevented) and not preflight.unfit_type(
-        ground_of(flight)
-    )
+    return not any(each(flight) for each in (*PREVENTED, unfit_type))
 
 
 def engaged_by_pilot(flight: FlightState) -> str:
-    fit = flight.pilot.engaged and can_take_over(flight) and usable(flight)
+    fit = flight.pilot is PilotSwitch.ENGAGED and can_take_over(flight) and usable(flight)
     return f"engaged: {flight.vehicle.mode} in the air" if fit else ""
 
 
 def engaged_but_unfit(flight: FlightState) -> str:
-    may_fly = flight.pilot.engaged and can_take_over(flight)
+    may_fly = flight.pilot is PilotSwitch.ENGAGED and can_take_over(flight)
     why = unfit(flight) if may_fly else ""
     return f"not engaged: {why}" if why else ""
 
 
 def engaged_too_soon(flight: FlightState) -> bool:
     """It left the mode of setpoints and returned so soon that a failsafe may have done it."""
-    too_soon = flight.pilot.returned_too_soon and flight.in_phase_s > LISTENED_S
+    too_soon = flight.pilot is PilotSwitch.TOO_SOON and flight.in_phase_s > LISTENED_S
     return too_soon and can_take_over(flight)
 
 
 def found_engaged(flight: FlightState) -> bool:
     """It was found in the air in the mode of setpoints: another program may fly it."""
-    found = flight.pilot.always_in_engage_mode and flight.vehicle.landed != "unknown"
+    found = flight.pilot is PilotSwitch.FOUND and flight.vehicle.landed != "unknown"
     return found and flight.in_phase_s > LISTENED_S and bool(engaged_in_the_air(flight))
 
 
@@ -144,32 +112,28 @@ def abandoned(flight: FlightState) -> bool:
 
 
 def started_in_the_air(flight: FlightState) -> str:
-    """On request, as by a pilot's switch, only where every sign says that it flies."""
-    flies = flight.request is Request.START and flight.contact.flies
-    fit = flies and can_take_over(flight) and usable(flight)
-    return f"start requested, {flight.vehicle.mode}" if fit else ""
+    started = flight.request is Request.START and flight.in_the_air and not not_started(flight)
+    return f"start requested, {flight.vehicle.mode}" if started else ""
 
 
 def started_on_the_ground(flight: FlightState) -> bool:
-    may_arm = flight.service is not None and flight.service.arms and not flight.vehicle.armed
-    return flight.request is Request.START and may_arm and usable(flight)
+    return flight.request is Request.START and not flight.in_the_air and not not_started(flight)
 
 
 def not_started(flight: FlightState) -> str:
-    """Why the vehicle that waits is not started on request."""
-    vehicle, contact, service = flight.vehicle, flight.contact, flight.service
-    if contact.in_the_air and not flight.in_engage_mode:
+    """Why the vehicle that waits is not started on request; empty if it is. In the air, as by a
+    pilot's switch, only where every sign says that it flies."""
+    vehicle, service = flight.vehicle, flight.service
+    if not flight.in_the_air:
+        if service is None or not service.arms:
+            return "it is on the ground, and may not be armed without --arms"
+        return "it is armed on the ground" if vehicle.armed else unfit(flight)
+    if not flight.in_engage_mode:
         return f"it flies in {vehicle.mode}: switch to {flight.authority.engage_mode} instead"
     if vehicle.in_failsafe:
         return f"a failsafe of the vehicle flies it, in {vehicle.mode}"
-    if contact.in_the_air:
-        prevented = (unfit, other_sender, mode_unknown, silent, blind)
-        return next(
-            filter(None, (each(flight) for each in prevented)), "it may stand on the ground"
-        )
-    if service is None or not service.arms:
-        return "it is on the ground, and may not be armed without --arms"
-    return "it is armed on the ground" if vehicle.armed else unfit(flight)
+    why = next(filter(None, (each(flight) for each in (unfit, *PREVENTED))), "")
+    return why or ("" if flight.contact.flies else "it may stand on the ground")
 
 
 # ---------------------------------------------------------------------- to the air
@@ -196,8 +160,6 @@ def engaged(flight: FlightState) -> str:
 
 
 def not_engaged(flight: FlightState) -> str:
-    if flight.in_phase_s <= flight.limits.engage_s:
-        return ""
     unanswered = preflight.unanswered(flight.clock.unanswered_s(flight.host_s))
     return (
         f"the vehicle did not enter {flight.authority.engage_mode} in {flight.in_phase_s:.0f} s "
@@ -240,17 +202,13 @@ def disarmed_for_good(flight: FlightState) -> bool:
 
 
 def not_armed(flight: FlightState) -> str:
-    waited_s, silent_s = flight.in_phase_s, flight.vehicle.age_s(Heartbeat)
-    if waited_s <= flight.limits.arm_s:
-        return ""
+    silent_s = flight.vehicle.age_s(Heartbeat)
     if silent_s > ARMED_KNOWN_S:
         return f"no HEARTBEAT for {silent_s:.0f} s: it is not known whether the vehicle has armed"
-    return f"the vehicle did not arm in {waited_s:.0f} s"
+    return f"the vehicle did not arm in {flight.in_phase_s:.0f} s"
 
 
 def still_armed(flight: FlightState) -> str:
-    if flight.in_phase_s <= flight.limits.disarm_s:
-        return ""
     unheard = flight.vehicle.age_s(Heartbeat) > ARMED_KNOWN_S
     state = "no HEARTBEAT shows whether it is armed" if unheard else "still armed"
     return f"{state} after {flight.in_phase_s:.0f} s"
@@ -276,15 +234,13 @@ FLY_BEGINS = (
     Transition({CONNECT}, stop_requested, FAILED, REFUSED, OPERATOR),
     Transition({CONNECT}, vehicle_found, HEALTH),
     Transition({CONNECT}, not_found, FAILED, REFUSED, "link"),
-)
-FLY_IS_READY = (
     Transition({HEALTH}, silent_on_ground, FAILED, REFUSED, "link"),
     Transition({HEALTH}, stop_requested, FAILED, REFUSED, OPERATOR, BEFORE_TAKEOFF),
     Transition({HEALTH}, refused, FAILED, REFUSED),
     Transition({HEALTH}, usable, STREAM, reason="telemetry flows and the vehicle can arm"),
-    Transition({HEALTH}, not_ready_in_time, FAILED, REFUSED),
+    Transition({HEALTH}, longer_than("health_s"), FAILED, REFUSED, reason=not_ready),
 )
-SERVICE_WAITS = (
+SERVICE_BEGINS = (
     Transition({CONNECT}, stop_requested, FAILED, FLOWN, OPERATOR),
     Transition({CONNECT}, vehicle_found, HEALTH),
     Transition({STANDBY}, rebooted, FAILED, FLOWN, "restart"),
@@ -312,7 +268,7 @@ STARTING = (
     Transition(STREAMING, authority_lost, FAILED, REFUSED, "pilot"),
     Transition({STREAM}, streamed, ENGAGE),
     Transition({ENGAGE}, engaged, ARM),
-    Transition({ENGAGE}, not_engaged, FAILED, REFUSED),
+    Transition({ENGAGE}, longer_than("engage_s"), FAILED, REFUSED, reason=not_engaged),
     Transition({ARM}, rebooted, STAND_DOWN, REFUSED, "restart"),
     Transition({ARM}, authority_lost_armed, YIELDED, ABORTED, "pilot", LOST_AS_IT_ARMED),
     Transition({ARM}, authority_lost_disarmed, FAILED, REFUSED, "pilot"),
@@ -322,9 +278,9 @@ STARTING = (
     Transition({ARM}, stop_requested, STAND_DOWN, REFUSED, OPERATOR),
     Transition({ARM}, armed, TAKEOFF),
     Transition({ARM}, disarmed_again, STAND_DOWN, REFUSED, reason=DISARMED_AGAIN),
-    Transition({ARM}, not_armed, STAND_DOWN, REFUSED),
+    Transition({ARM}, longer_than("arm_s"), STAND_DOWN, REFUSED, reason=not_armed),
     Transition({TAKEOFF}, stop_requested_on_ground, STAND_DOWN, REFUSED, OPERATOR),
     Transition({STAND_DOWN}, rises, LAND, ABORTED, reason=FLIGHT_DETECTED),
     Transition({STAND_DOWN}, disarmed_for_good, FAILED, reason="disarmed on the ground"),
-    Transition({STAND_DOWN}, still_armed, FAILED, ABORTED),
+    Transition({STAND_DOWN}, longer_than("disarm_s"), FAILED, ABORTED, reason=still_armed),
 )

@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 import operator
 from collections import deque
-from collections.abc import Callable, Iterable
-from dataclasses import InitVar, dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import InitVar, dataclass, field
 
 import numpy as np
 
@@ -20,22 +20,19 @@ from offboard.estimation.observer import Observer
 from offboard.flight.authority import Authority, PilotSwitch, Standing
 from offboard.flight.estimates import HoverEstimate, Positioning, PositionJumps
 from offboard.flight.flight_plan import FlightPlan
-from offboard.flight.ground_contact import DETECTOR_KNOWN_S, GroundContact, Touchdown, moved
+from offboard.flight.ground_contact import DETECTOR_KNOWN_S, GroundContact, Touchdown
 from offboard.flight.phases import (
     ENDS,
     OPERATOR_STOP,
     Action,
-    Limits,
     Phase,
     Request,
-    ServiceOptions,
 )
-from offboard.flight.preflight import ParameterReading
+from offboard.flight.preflight import Ground
 from offboard.flight.record import Decided
-from offboard.flight.timing import Busyness, LinkGrowth, VehicleClock
-from offboard.flight.vehicle_state import VehicleState
+from offboard.flight.timing import Busyness, LinkGrowth
 from offboard.identification.learner import Learner
-from offboard.mavlink.dialects.base import Dialect, Takeoff
+from offboard.mavlink.dialects.base import Takeoff
 from offboard.mavlink.events import Heartbeat, Landed, TimesyncReply, Triple
 from offboard.mavlink.outgoing import (
     AttitudeTarget,
@@ -44,9 +41,7 @@ from offboard.mavlink.outgoing import (
     PositionTarget,
     Record,
 )
-from offboard.mavlink.session import Session
 from offboard.model.command import Command, PredictedState
-from offboard.model.vehicle import Vehicle
 
 LEVEL_DIRECTION = (0.0, 0.0, 1.0)  # of the thrust: the third body axis in NED
 COMMANDS_KEPT = 7  # as long as an attitude may take to follow
@@ -70,7 +65,7 @@ class Outcome:
 
 # of the flight before, with the same vehicle
 KEPT = (
-    "vehicle", "contact", "clock", "hover", "reading", "other_datagrams", "host_s", "turned_s",
+    "vehicle", "contact", "clock", "hover", "jumps", "reading", "other_datagrams", "host_s",
     "silence_s", "heard_s", "guarded", "announced", "announcements",
 )  # fmt: skip
 
@@ -81,43 +76,36 @@ class Failsafe:
     worst row that is active."""
 
     held_s: dict[str, float] = field(default_factory=dict)
-    judged_s: float | None = None  # when, on `Session.link_time_s`
+    judged_s: float = math.inf  # when, on `Session.link_time_s`; infinite before the first time
     row: str = ""
     action: Action = Action.FLY
     reason: str = ""  # why the action is taken, as a sentence, and its cause in a word
     cause: str = ""
 
 
-@dataclass(slots=True)
-class FlightState:
-    """One flight. `model` is the vehicle model in use: it scales the thrust of setpoints.
-    `stopwatch` reads host time. `deadline_s` is the wall time that one decision may take, None
-    where the vehicle waits for each decision, so that nothing can be late or old. `identification`
-    is None with a controller that cannot use it, `service` in a flight of `fly`.
+@dataclass(slots=True, kw_only=True)
+class FlightState(Ground):
+    """One flight. `stopwatch` reads host time. `deadline_s` is the wall time that one decision may
+    take, None where the vehicle waits for each decision, so that nothing can be late or old.
+    `identification` is None with a controller that cannot use it, `service` in a flight of `fly`.
     """
 
-    limits: Limits
     plan: FlightPlan
-    model: Vehicle
-    session: Session
     observer: Observer
     controller: Controller
     period_s: float
     stopwatch: Callable[[], float]
     deadline_s: float | None = None
     identification: Learner | None = None
-    service: ServiceOptions | None = None
     before: InitVar[FlightState | None] = None
-    vehicle: VehicleState = field(default_factory=VehicleState)
-    clock: VehicleClock = field(default_factory=VehicleClock)
     hover: HoverEstimate = field(default_factory=HoverEstimate)
     jumps: PositionJumps = field(default_factory=PositionJumps)
-    reading: ParameterReading = field(default_factory=ParameterReading)
     positioning: Positioning = field(default_factory=Positioning)
     failsafe: Failsafe = field(default_factory=Failsafe)
     contact: GroundContact = field(init=False)
-    pilot: PilotSwitch = field(default_factory=PilotSwitch)
-    home_ned_m: Triple = (0.0, 0.0, 0.0)  # the ground where the flight began
+    pilot: PilotSwitch = PilotSwitch.FOUND
+    # the ground where the flight began, without the jumps of the estimate before that
+    home_ned_m: Triple = (0.0, 0.0, 0.0)
     took_off: bool = False  # from there; a vehicle that was found in the air has not
     touchdown: Touchdown | None = None  # of the landing
     authority: Authority = field(default_factory=Authority)
@@ -125,12 +113,9 @@ class FlightState:
 
     phase: Phase = Phase.CONNECT
     began_s: float = 0.0  # of the phase, on `Session.link_time_s`
-    turned_s: float = math.nan  # host time of the newest turn
-    host_s: float = 0.0  # monotonic time of this computer at the present turn
     silence_s: float = 0.0  # host time since the newest telemetry
-    setpoint_s: float = math.inf  # when the newest setpoint left
+    setpoint_s: float = math.inf  # when the newest setpoint left; infinite before the first
     setpoints_missed_s: float = -math.inf  # when setpoints may have been missing for long
-    guarded: bool = True  # a supervisor lands the vehicle if this process ends
     rebooted: bool = False
     left_engaged: bool = False  # a flight that was cut short has left the vehicle engaged
     request: Request = Request.NONE  # of the ground station, while it is judged
@@ -158,9 +143,8 @@ class FlightState:
     told: set[str] = field(default_factory=set)  # of those that are announced once in a flight
     queue: list[Outgoing] = field(default_factory=list)  # to be sent
     records: list[Record] = field(default_factory=list)  # to be logged
-    requested_s: dict[tuple[Phase, CommandLong], float] = field(default_factory=dict)
+    requested_s: dict[CommandLong, float] = field(default_factory=dict)  # in this phase
     text_id: int = 0
-    thinned_s: float = 0.0  # when less telemetry was requested, since the phase HEALTH began
     awaits_link: bool = False  # while landing
     follows_others: bool = False  # the newest ThrustReport is of none of `thrusts`
     predictions: deque[PredictedState] = field(default_factory=lambda: deque(maxlen=8))
@@ -187,14 +171,14 @@ class FlightState:
         prepared = before.phase not in (Phase.CONNECT, Phase.HEALTH) and not before.rebooted
         self.phase = Phase.STANDBY if prepared and self.authority.engage_mode else Phase.CONNECT
         self.began_s = before.now_s
-        pilot = before.pilot
-        self.pilot = replace(
-            pilot,
-            engaged=False,
-            always_in_engage_mode=before.ends_engaged,
+        self.pilot = before.pilot
+        if before.ends_engaged:
+            self.pilot = PilotSwitch.FOUND
+        elif before.pilot is PilotSwitch.ENGAGED:
             # a switch while the flight ended is answered by hold
-            returned_too_soon=pilot.returned_too_soon or (before.taken and pilot.engaged),
-        )
+            self.pilot = PilotSwitch.TOO_SOON if before.taken else PilotSwitch.IDLE
+        elif before.pilot is PilotSwitch.FOUND:
+            self.pilot = PilotSwitch.IDLE
 
     @property
     def now_s(self) -> float:
@@ -202,9 +186,13 @@ class FlightState:
         return self.vehicle.now_s
 
     @property
-    def dialect(self) -> Dialect | None:
-        """The dialect of the vehicle; None before it is found."""
-        return self.session.dialect
+    def in_the_air(self) -> bool:
+        return self.contact.in_the_air
+
+    @property
+    def origin_missing(self) -> bool:
+        unseen = self.in_the_air and self.contact.rest_ned_m is None
+        return unseen and self.service is not None and self.service.anchor == "origin"
 
     @property
     def in_phase_s(self) -> float:
@@ -237,7 +225,8 @@ class FlightState:
         position = self.vehicle.position
         if position is None or self.plan.reference is None:
             return 0.0, 0.0, 0.0
-        north, east, down = map(operator.sub, position.position_ned_m, self.home_ned_m)
+        place_ned_m = self.jumps.without(position.position_ned_m)
+        north, east, down = map(operator.sub, place_ned_m, self.home_ned_m)
         return north, east, -down
 
     @property
@@ -274,7 +263,7 @@ class FlightState:
         """Whether the flight ends with a vehicle that nobody has seen in another mode than that of
         setpoints: it was not heard any more, or has rebooted."""
         unheard = self.authority.standing is Standing.OURS
-        return unheard or (self.rebooted and self.pilot.always_in_engage_mode)
+        return unheard or (self.rebooted and self.pilot is PilotSwitch.FOUND)
 
     @property
     def time_s(self) -> float:
@@ -319,18 +308,6 @@ class FlightState:
             return "no LOCAL_POSITION_NED shows it"
         on_ground = vehicle.landed == "on_ground" and vehicle.age_s(Landed) < DETECTOR_KNOWN_S
         return self.touchdown.not_landed(on_ground=on_ground)
-
-    def move_ground(self, jump_ned_m: Iterable[float]) -> None:
-        """The reported position has jumped by this (3,), but the vehicle has not moved: move all
-        places on the ground by as much."""
-        jump = tuple(jump_ned_m)
-        self.home_ned_m = moved(self.home_ned_m, jump)
-        if self.phase is Phase.TAKEOFF:  # the reference is not in force yet
-            self.plan.origin_ned_m = moved(self.plan.origin_ned_m, jump)
-        if self.contact.rest_ned_m is not None:
-            self.contact.rest_ned_m = moved(self.contact.rest_ned_m, jump)
-        if self.touchdown is not None:
-            self.touchdown.on_jump(jump)
 
     @property
     def link_growth_s(self) -> float:

@@ -12,20 +12,18 @@ import numpy as np
 from offboard.flight import outbox, transitions
 from offboard.flight.authority import Authority, PilotSwitch
 from offboard.flight.estimates import HoverEstimate, PositionJumps
-from offboard.flight.failsafe import REBOOTED, other_sender
 from offboard.flight.ground_contact import GroundContact, Touchdown
 from offboard.flight.phases import (
     BEFORE_FLIGHT,
     FLYING,
     TRACKING,
     WAITING,
-    ExitCode,
     Phase,
     Request,
 )
-from offboard.flight.preflight import ParameterReading
+from offboard.flight.preflight import ParameterReading, other_sender
 from offboard.flight.record import vehicle_record
-from offboard.flight.state import FlightState, Outcome
+from offboard.flight.state import FlightState
 from offboard.flight.timing import VehicleClock
 from offboard.mavlink.events import (
     Attitude,
@@ -54,16 +52,18 @@ OTHER_COMPANION = (
 )
 
 
-def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: float) -> None:
-    """`arrived_s` is the host time of the event's arrival, `turned_s` that of the turn."""
-    flight.vehicle.update(event, flight.session.link_time_s)
+def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: float) -> bool:
+    """`arrived_s` is the host time of the event's arrival, `turned_s` that of the turn. False if
+    the event is no news (see `VehicleState.update`)."""
+    if not flight.vehicle.update(event, flight.session.link_time_s):
+        return False
     match event:
-        case Attitude(time_s, attitude, rates) if not flight.vehicle.repeated:
+        case Attitude(time_s, attitude, rates):
             _on_telemetry(flight, time_s, arrived_s, turned_s)
             flight.observer.on_attitude(time_s, attitude, rates)
             if flight.identification:
                 flight.identification.on_attitude(time_s, attitude)
-        case LocalPosition() if not flight.vehicle.repeated:
+        case LocalPosition():
             _on_telemetry(flight, event.time_s, arrived_s, turned_s)
             _on_position(flight, event)
         case ThrustReport(thrust):
@@ -87,6 +87,7 @@ def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: flo
             outbox.announce(flight, sentence, once=True)
         case Rebooted():
             _on_reboot(flight)
+    return True
 
 
 def is_of_another(flight: FlightState, event: Event) -> bool:
@@ -126,21 +127,19 @@ def _on_telemetry(flight: FlightState, stamp_s: float, arrived_s: float, turned_
 def _on_position(flight: FlightState, event: LocalPosition) -> None:
     time_s, down_mps = event.time_s, event.velocity_ned_mps[2]
     _follow_jump(flight, event)
-    flight.contact.on_position(event)
+    place_ned_m = flight.jumps.without(event.position_ned_m)
+    flight.contact.on_position(time_s, place_ned_m, down_mps)
     flight.hover.on_position(time_s, flight.contact.height_m, down_mps)
     if flight.touchdown:
-        flight.touchdown.on_position(time_s, event.position_ned_m, down_mps)
+        flight.touchdown.on_position(time_s, place_ned_m, down_mps)
     flight.observer.on_position(time_s, event.position_ned_m, event.velocity_ned_mps)
     if flight.identification:
-        north, east, down = np.subtract(event.position_ned_m, flight.jumps.total_ned_m).tolist()
-        flight.identification.on_position(time_s, (north, east, down), event.velocity_ned_mps)
+        flight.identification.on_position(time_s, place_ned_m, event.velocity_ned_mps)
 
 
 def _follow_jump(flight: FlightState, event: LocalPosition) -> None:
-    """The position estimate has jumped, not the vehicle: move the reference and the ground too."""
+    """The position estimate has jumped, not the vehicle: move the reference, too."""
     jump_ned_m = flight.jumps.on_position(event)
-    if jump_ned_m is not None:
-        flight.move_ground(jump_ned_m.tolist())
     if flight.phase not in FLYING:
         flight.jumps.forget()
     elif jump_ned_m is not None and flight.phase in TRACKING:
@@ -170,17 +169,20 @@ def _on_mode(
         setpoints_missing=flight.setpoints_missing,
         sticks=vehicle.sticks,
     )
-    pilot, contact, in_engage_mode = flight.pilot, flight.contact, flight.in_engage_mode
-    in_the_air, switched = contact.in_the_air, in_engage_mode and pilot.other_mode_shown
-    pilot.on_mode(in_engage_mode=in_engage_mode, in_the_air=in_the_air, flies=contact.flies)
-    why = "" if pilot.engaged or not in_the_air else "the vehicle may stand on the ground"
-    if pilot.engaged and other_sender(flight):
-        pilot.engaged = False  # it was not switched for us
-        why = "another program sends setpoints"
+    switched = flight.pilot is PilotSwitch.READY and flight.in_engage_mode
+    in_the_air, flies, why = flight.in_the_air, flight.contact.flies, ""
+    flight.pilot = flight.pilot.after(
+        in_engage_mode=flight.in_engage_mode,
+        in_the_air=in_the_air,
+        flies=flies,
+        failsafe=vehicle.in_failsafe if isinstance(event, Heartbeat) else None,
+    )
+    if flight.pilot is PilotSwitch.ENGAGED and other_sender(flight):
+        flight.pilot, why = PilotSwitch.IDLE, "another program sends setpoints"  # not for us
+    elif in_the_air and not flies:
+        why = "the vehicle may stand on the ground"
     if switched and why and flight.phase in WAITING:
         outbox.announce(flight, f"not engaged: {mode}, but {why}")
-    if isinstance(event, Heartbeat):
-        pilot.on_heartbeat(in_engage_mode=in_engage_mode, failsafe=vehicle.in_failsafe)
 
 
 def _on_reboot(flight: FlightState) -> None:
@@ -196,13 +198,9 @@ def _on_reboot(flight: FlightState) -> None:
         flight.authority = Authority()
     flight.authority.forget(flight.now_s)  # the age of its report counts from now
     flight.rebooted = flight.phase not in (Phase.CONNECT, Phase.HEALTH)
-    flight.pilot = PilotSwitch()
+    flight.pilot = PilotSwitch.FOUND
     if flight.phase is Phase.LAND:
         flight.touchdown = Touchdown(None)
-        if flight.outcome is None:
-            sentence = f"{REBOOTED} while landing"
-            outbox.announce_phase(flight, sentence, "restart")  # the score must know it, too
-            flight.outcome = Outcome(ExitCode.ABORTED, sentence)
     transitions.advance(flight)
 
 

@@ -59,7 +59,7 @@ class VehicleClock:
         self._requests.clear()
         self._asked_s: deque[float] = deque(maxlen=LOSS_OVER + 1)  # host times of the newest
         self._delays_s: deque[float] = deque(maxlen=REPLIES_MAX)
-        self._began_s = math.inf  # host time of the first request
+        self.began_s = math.inf  # host time of the first request
         self._answered_s = -math.inf  # host time of the newest request with a reply
         self._settled_delay_s = math.nan
 
@@ -93,7 +93,7 @@ class VehicleClock:
         stamp_ns = round(stamp_s * 1e9)
         self._requests.append((stamp_ns, host_s))
         self._asked_s.append(host_s)
-        self._began_s = min(self._began_s, host_s)
+        self.began_s = min(self.began_s, host_s)
         return Timesync(0, stamp_ns)
 
     def on_reply(self, reply: TimesyncReply) -> bool:
@@ -155,12 +155,12 @@ class VehicleClock:
 
     def delay_is_measured(self, host_s: float) -> bool:
         """Whether `delay` is reliable at host time `host_s`, or the vehicle answers nothing."""
-        unanswered = not self._delays_s and host_s - self._began_s > DELAY_MAX_S
+        unanswered = not self._delays_s and host_s - self.began_s > DELAY_MAX_S
         return len(self._delays_s) >= REPLIES_MEASURED or unanswered
 
     def unanswered_s(self, host_s: float) -> float:
         """For how long at host time `host_s` no request has been answered; 0 before the first."""
-        return max(host_s - max(self._began_s, self._answered_s), 0.0)
+        return max(host_s - max(self.began_s, self._answered_s), 0.0)
 
     def overdue(self, host_s: float) -> int:
         """Number of requests since the newest one with a reply that should have one at host time

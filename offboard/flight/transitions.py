@@ -4,13 +4,12 @@ taken, and begins its phase. `actions` has what is sent in a phase.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
 
 from offboard.flight import decision, failsafe, flying, outbox, starting
-from offboard.flight.failsafe import in_own_failsafe
+from offboard.flight.failsafe import REBOOTED, in_own_failsafe
 from offboard.flight.ground_contact import Touchdown
 from offboard.flight.phases import (
     BEFORE_FLIGHT,
@@ -38,32 +37,20 @@ STAGES = {
     Phase.TRACK: Stage.MOTION,
 }  # of the identification
 PROCEEDS = BEFORE_FLIGHT | TRACKING | {Phase.TAKEOFF}  # phases of a flight that goes on
-SERVICE_ONLY = frozenset({Phase.STANDBY, Phase.PAUSE, Phase.HAND_BACK})
 
 
 @cache
 def table(service: ServiceOptions | None = None) -> tuple[Transition, ...]:
     """The phase table of the service with these options; without them that of `fly`."""
-    if service is None:
-        rows = (
-            *starting.FLY_BEGINS,
-            *starting.FLY_IS_READY,
-            *starting.STARTING,
-            *flying.ends_early(serves=False),
-            *flying.TO_THE_END,
-            *flying.AT_REST["land"],
-        )
-        rows = tuple(replace(row, phases=row.phases - SERVICE_ONLY) for row in rows)
-    else:
-        rows = (
-            *starting.SERVICE_WAITS,
-            *starting.STARTING,
-            Transition({Phase.HAND_BACK}, flying.in_requested_mode, Phase.YIELDED),
-            *flying.ends_early(serves=True),
-            *flying.SERVICE_ENDS,
-            *flying.TO_THE_END,
-            *flying.AT_REST[service.then],
-        )
+    serves = service is not None
+    rows = (
+        *(starting.SERVICE_BEGINS if serves else starting.FLY_BEGINS),
+        *starting.STARTING,
+        *flying.ends_early(serves=serves),
+        *(flying.SERVICE_ENDS if serves else ()),
+        *flying.TO_THE_END,
+        *flying.AT_REST[service.then if service else "land"],
+    )
     return tuple(row for row in rows if row.phases)
 
 
@@ -87,7 +74,7 @@ def advance(flight: FlightState) -> None:
     while not flight.in_end_phase:
         if flight.phase in FLYING:
             failsafe.judge(flight)
-        _note_failsafe(flight)
+        _note_spoiled(flight)
         row = next_row(flight)
         if row is None:
             break
@@ -116,13 +103,18 @@ def obey(flight: FlightState, request: Request, sender: str) -> bool:
     return obeyed
 
 
-def _note_failsafe(flight: FlightState) -> None:
-    """A landing by the vehicle's own failsafe is awaited, but it is not ours."""
-    fallen = flight.phase is Phase.LAND and in_own_failsafe(flight)
-    if fallen and flight.outcome is None:
-        sentence = f"the vehicle's own failsafe flew it, in {flight.vehicle.mode}"
-        outbox.announce_phase(flight, sentence, "link")  # the score must know it, too
-        flight.outcome = Outcome(ExitCode.ABORTED, sentence + _explanation(flight))
+def _note_spoiled(flight: FlightState) -> None:
+    """A landing is awaited, but it is not ours: the score must know it, too."""
+    if flight.phase is not Phase.LAND or flight.outcome is not None:
+        return
+    if in_own_failsafe(flight):
+        sentence, cause = f"the vehicle's own failsafe flew it, in {flight.vehicle.mode}", "link"
+    elif flight.rebooted:
+        sentence, cause = f"{REBOOTED} while landing", "restart"
+    else:
+        return
+    outbox.announce_phase(flight, sentence, cause)
+    flight.outcome = Outcome(ExitCode.ABORTED, sentence + _explanation(flight))
 
 
 def name_failsafe(flight: FlightState) -> None:
@@ -138,6 +130,7 @@ def _enter(flight: FlightState, row: Transition) -> None:
     source, reason, cause = flight.phase, row.why(flight), row.cause.format(flight=flight)
     _conclude(flight, row, reason)
     flight.vehicle.clear_messages()
+    flight.requested_s.clear()
     if flight.request is Request.NONE and row.target not in PROCEEDS:
         flight.obeyed = Request.NONE  # the flight ends for another reason
     flight.phase = row.target
@@ -162,10 +155,11 @@ def _enter(flight: FlightState, row: Transition) -> None:
         _set_hover_thrust(flight)
     elif row.target is Phase.HEALTH:  # it may be another vehicle, or have other parameters
         flight.vehicle.parameters.clear()
-        flight.reading, flight.thinned_s = ParameterReading(), 0.0
-        flight.requested_s.clear()
+        flight.reading = ParameterReading()
     elif row.target is Phase.TAKEOFF:
-        _begin_takeoff(flight)
+        position = flight.vehicle.position
+        assert position is not None
+        flight.home_ned_m, flight.took_off = flight.jumps.without(position.position_ned_m), True
     elif row.target is Phase.CLIMB:
         _begin_climb(flight, source)
     elif row.target is Phase.JOIN:
@@ -195,13 +189,6 @@ def _explanation(flight: FlightState) -> str:
     return flight.vehicle.explanation(dialect.unsaid if dialect else "")
 
 
-def _begin_takeoff(flight: FlightState) -> None:
-    position = flight.vehicle.position
-    assert position is not None
-    flight.home_ned_m = flight.plan.origin_ned_m = position.position_ned_m
-    flight.took_off = True
-
-
 def _begin_climb(flight: FlightState, source: Phase) -> None:
     """To the start of the reference, after the take-off, in the air, or once more."""
     position = flight.vehicle.position
@@ -216,6 +203,8 @@ def _begin_climb(flight: FlightState, source: Phase) -> None:
     in_the_air = source is not Phase.TAKEOFF
     if in_the_air:
         _place_reference(flight, position)
+    else:
+        flight.plan.origin_ned_m = flight.jumps.reported(flight.home_ned_m)
     if in_the_air or flight.takes_off_by_command:
         _set_hover_thrust(flight, SETTLED if source is Phase.STANDBY else DIFFERENT)
     flight.observer.freeze(False)
@@ -231,10 +220,10 @@ def _begin_climb(flight: FlightState, source: Phase) -> None:
 def _place_reference(flight: FlightState, position: LocalPosition) -> None:
     """Place the reference of a vehicle that was found in the air. A take-off point that was not
     seen is below it, at the height of its last rest."""
-    contact = flight.contact
-    flight.home_ned_m = (*position.position_ned_m[:2], contact.rest_down_m)
+    contact, jumps = flight.contact, flight.jumps
+    flight.home_ned_m = (*jumps.without(position.position_ned_m)[:2], contact.rest_down_m)
+    rest = contact.rest_ned_m and jumps.reported(contact.rest_ned_m)
     if flight.service and flight.service.anchor == "here":
-        rest = contact.rest_ned_m
         above_m = flight.plan.place_start(
             position.position_ned_m, position.velocity_ned_mps, rest[2] if rest else None
         )
@@ -244,10 +233,9 @@ def _place_reference(flight: FlightState, position: LocalPosition) -> None:
                 f"the reference starts {above_m:.1f} m higher: from here it would "
                 + ("touch the ground" if rest else "go lower, and the ground is not known"),
             )
-    elif contact.rest_ned_m is not None and flight.service:
-        flight.plan.origin_ned_m = contact.rest_ned_m
     else:
-        flight.plan.origin_ned_m = flight.home_ned_m
+        from_rest = rest if flight.service else None
+        flight.plan.origin_ned_m = from_rest or jumps.reported(flight.home_ned_m)
 
 
 def _set_hover_thrust(flight: FlightState, least: float = DIFFERENT) -> None:

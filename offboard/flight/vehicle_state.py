@@ -68,12 +68,10 @@ class VehicleState:
     mode: str = "unknown"
     other_sender: OtherSender | None = None
     other_companion: OtherCompanion | None = None
-    armed_changed_s: float = 0.0
+    armed_changed_s: float = -math.inf  # before it was first seen armed
     resumed_s: float = -math.inf  # vehicle time of the first telemetry after an outage
     now_s: float = 0.0
     heard_s: dict[type, float] = field(default_factory=dict)  # by type of event
-    repeated: bool = False  # the newest event repeats the one of its kind before: no measurement
-    _was_armed: bool = False
     # components of position and velocity, each with the stamp from which on it is the same
     _same_since: tuple[tuple[float, float], ...] = ((math.nan, math.inf),) * 6
 
@@ -162,12 +160,12 @@ class VehicleState:
         """SYS_STATUS reports that the vehicle's pre-arm checks pass."""
         return self.health is not None and self.health.prearm_ok
 
-    def update(self, event: Event, now_s: float) -> None:
-        """Store what one event reports."""
+    def update(self, event: Event, now_s: float) -> bool:
+        """Store what one event reports. False if it repeats the one of its kind before: it is no
+        measurement."""
         self.now_s = now_s
-        self.repeated = self._repeats(event) and self._was_armed
-        if self.repeated:
-            return
+        if self._repeats(event) and math.isfinite(self.armed_changed_s):
+            return False
         self.heard_s[type(event)] = now_s
         if isinstance(event, (LocalPosition, Attitude)):
             self._detect_outage(event.time_s)
@@ -176,7 +174,6 @@ class VehicleState:
                 if armed != self.armed:
                     self.armed_changed_s = now_s
                 self.heartbeat, self.mode = event, mode
-                self._was_armed |= armed
             case ModeReport(mode):
                 self.mode = mode
             case OtherSender():
@@ -208,6 +205,7 @@ class VehicleState:
                     self.refusals.append(f"command {command} {result}")
             case Rebooted():
                 self._reset()
+        return True
 
     def _repeats(self, event: Event) -> bool:
         """Whether position and velocity on one axis, or an attitude, are those of the message

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from offboard.flight.authority import PilotSwitch
 from offboard.flight.display import Snapshot
 from offboard.flight.flight import Flight
 from offboard.flight.phases import ENDS, OPERATOR_STOP, WAITING, Phase, ServiceOptions
@@ -138,7 +139,7 @@ class Flights:
         vehicle was seen in another mode or on the ground."""
         state, left = self.current, self._record.left
         state.left_engaged = bool(left) and left == self._identity
-        if state.left_engaged and not state.pilot.always_in_engage_mode:
+        if state.left_engaged and state.pilot is not PilotSwitch.FOUND:
             self._record.settle()
 
     # ------------------------------------------------------------------ the identified vehicle

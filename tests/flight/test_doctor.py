@@ -22,7 +22,6 @@ from offboard.doctor.listening import LONGEST_S, NOTHING_S, Listening, Observati
 from offboard.doctor.run import verdict
 from offboard.flight.phases import Limits
 from offboard.flight.preflight import Ground, Level, findings
-from offboard.flight.timing import VehicleClock
 from offboard.flight.vehicle_state import VehicleState
 from offboard.mavlink.events import ESTIMATE, Attitude, EstimatorReport, GpsFix
 from offboard.mavlink.session import Session, SessionSettings
@@ -229,7 +228,9 @@ def test_estimator_without_position_although_the_gps_has_a_fix(boot_s: float, le
         attitude=Attitude(boot_s, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
     )
     starting.heard_s[GpsFix] = starting.now_s
-    ground = Ground(starting, Limits(), Session(SessionSettings()), VehicleClock(), 0.0)
+    session = Session(SessionSettings())
+    model = load("flight").vehicle
+    ground = Ground(limits=Limits(), session=session, model=model, vehicle=starting)
     assert {found.level for check, _, found in findings(ground) if check == "estimator"} == {level}
 
 

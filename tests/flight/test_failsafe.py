@@ -165,7 +165,7 @@ def predicted(flight: Any, away_m: float) -> None:
 def valid(flight: FlightState, estimates: frozenset[str]) -> None:
     for each in (frozenset(ESTIMATE), estimates):
         hear(flight, EstimatorReport(each, (), 0.5))
-        if not flight.positioning.had_valid:
+        if not flight.positioning.report:
             flight.positioning.begin(flight.vehicle, {}, "ESTIMATOR_STATUS")
 
 
@@ -194,7 +194,7 @@ def stands(flight: FlightState, height_m: float) -> None:
     for step in range(1, 13):
         reported = LocalPosition(NOW_S + 0.1 * step, (0.0, 0.0, -height_m), (0.0, 0.0, 0.0))
         flight.vehicle.position = reported
-        flight.contact.on_position(reported)
+        flight.contact.on_position(reported.time_s, reported.position_ned_m, 0.0)
 
 
 def follows(flight: Any, mode: str) -> None:

@@ -19,6 +19,7 @@ from offboard.documents.errors import DocumentError
 from offboard.flight import outbox
 from offboard.flight.preflight import ParameterReading
 from offboard.flight.record import configuration_pieces, joined_configuration
+from offboard.flight.vehicle_state import VehicleState
 from offboard.link import clock
 from offboard.mavlink.dialects.px4 import PX4
 from offboard.mavlink.outgoing import CommandLong
@@ -97,8 +98,10 @@ def test_parameters_are_requested_until_they_are_answered() -> None:
     reading, known = ParameterReading(), {"MPC_THR_HOVER": 0.5}
     unknown = [each.name for each in PX4.watched_parameters if each.name not in known]
     for at_s, names in ((10.0, unknown), (10.4, []), (10.5, unknown)):
-        assert [request.name for request in reading.due(PX4, known, at_s)] == names
-    assert [reading.complete(PX4, known, at_s) for at_s in (11.9, 12.0)] == [False, True]
+        due = reading.due(PX4, VehicleState(parameters=known, now_s=at_s))
+        assert [request.name for request in due] == names
+    then = [VehicleState(parameters=known, now_s=at_s) for at_s in (11.9, 12.0)]
+    assert [reading.complete(PX4, each) for each in then] == [False, True]
 
 
 def test_what_a_horizon_calls_near_a_volume_was_loaded_at_the_rehearsal(

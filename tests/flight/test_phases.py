@@ -13,11 +13,12 @@ from flight_tables import IN_THE_AIR, README, asked, exits, with_tables
 from uneventful import NOW_S, TRACK, hear, heartbeat, lift, position, uneventful
 
 from offboard.flight import preflight, starting, telemetry
-from offboard.flight.authority import Standing
+from offboard.flight.authority import PilotSwitch, Standing
 from offboard.flight.phases import (
     ENDS,
     FLYING,
     OUTAGE_MAX_S,
+    SERVICE_ONLY,
     Action,
     ExitCode,
     Limits,
@@ -27,7 +28,7 @@ from offboard.flight.phases import (
     Transition,
 )
 from offboard.flight.state import FlightState
-from offboard.flight.transitions import SERVICE_ONLY, next_row, table
+from offboard.flight.transitions import next_row, table
 from offboard.mavlink.events import (
     Attitude,
     CommandAck,
@@ -74,14 +75,8 @@ def _disarm(flight: FlightState, for_s: float = 1.6, landed: str = "on_ground") 
     flight.began_s = flight.vehicle.armed_changed_s = NOW_S - for_s
 
 
-def _engage(**pilot: bool) -> Setup:
-    def apply(flight: FlightState) -> None:
-        lift(flight)
-        flight.began_s = NOW_S - 0.6
-        for name, value in pilot.items():
-            setattr(flight.pilot, name, value)
-
-    return apply
+def _engage(pilot: PilotSwitch) -> Setup:
+    return _all(lift, _since(0.6), _set(pilot=pilot))
 
 
 def _fit(flight: FlightState) -> None:
@@ -190,21 +185,16 @@ EVENTS: dict[str, Setup] = {
     "silent_on_ground": _set(silence_s=20.1),
     "silent_for_another": _all(_since(5.2), _set(silence_s=5.1)),
     "not_found": _set(silence_s=20.1),
-    "not_ready_in_time": _since(Limits().health_s + 0.1),
-    "not_engaged": _since(Limits.engage_s + 0.1),
-    "not_armed": _since(Limits.arm_s + 0.1),
-    "still_armed": _since(Limits.disarm_s + 0.1),
-    "not_disarmed": _since(Limits().land_s + 0.1),
     "blind": _age_attitude,
     "stop_requested": _stop,
     "stop_requested_on_ground": _all(_rest, _set(stop_reason="stop requested")),
     "rises": _lift_off,
-    "engaged_by_pilot": _all(_engage(engaged=True), _fit),
-    "engaged_but_unfit": _engage(engaged=True),
+    "engaged_by_pilot": _all(_engage(PilotSwitch.ENGAGED), _fit),
+    "engaged_but_unfit": _engage(PilotSwitch.ENGAGED),
     "started_in_the_air": _all(lift, _fit, _set(request=Request.START)),
     "started_on_the_ground": _all(_fit, _set(request=Request.START)),
-    "engaged_too_soon": _engage(returned_too_soon=True),
-    "abandoned": _all(_engage(always_in_engage_mode=True), _set(left_engaged=True)),
+    "engaged_too_soon": _engage(PilotSwitch.TOO_SOON),
+    "abandoned": _all(_engage(PilotSwitch.FOUND), _set(left_engaged=True)),
     "in_requested_mode": _stand(Standing.HANDED),
     "failsafe_hold": _act(Action.HOLD),
     "failsafe_land": _act(Action.LAND),
@@ -222,10 +212,8 @@ def preflight_list(monkeypatch: pytest.MonkeyPatch) -> None:
     def refusals(ground: Any) -> list[str]:
         return vars(ground.session).get("refusals", [])
 
-    monkeypatch.setattr(starting, "ground_of", lambda flight: flight)
     monkeypatch.setattr(preflight, "not_ready", not_ready)
     monkeypatch.setattr(preflight, "refusals", refusals)
-    monkeypatch.setattr(preflight, "unfit_type", lambda known: "")
 
 
 def event_of(row: Transition) -> Setup:

@@ -25,6 +25,7 @@ from serving import (
 )
 from watch import announced, said, sent_after
 
+from offboard.flight.authority import PilotSwitch
 from offboard.flight.phases import TRACKING, Phase
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_estimate import IdentifiedVehicle
@@ -557,7 +558,7 @@ def test_a_vehicle_that_is_engaged_as_the_service_stops_is_held(served: Served) 
     pair = served.aloft()
     pair.run(0.04)  # the report of the mode comes between two ticks
     pair.switch("engage")
-    pair.until(lambda: pair.state.pilot.engaged, 1.0)
+    pair.until(lambda: pair.state.pilot is PilotSwitch.ENGAGED, 1.0)
     assert pair.phase is Phase.STANDBY
     pair.service.request_stop()
     pair.until(pair.service.has_ended, 5.0)

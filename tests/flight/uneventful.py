@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from offboard.flight.authority import Authority
+from offboard.flight.authority import Authority, PilotSwitch
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.ground_contact import Touchdown
 from offboard.flight.phases import Limits, Phase, ServiceOptions
@@ -43,7 +43,7 @@ def heartbeat(flight: FlightState, *, armed: bool, mode: str = "OFFBOARD", statu
 def position(flight: FlightState, down_m: float, down_mps: float = 0.0) -> None:
     reported = LocalPosition(flight.now_s, (0.0, 0.0, down_m), (0.0, 0.0, down_mps))
     hear(flight, reported)
-    flight.contact.on_position(reported)
+    flight.contact.on_position(flight.now_s, reported.position_ned_m, down_mps)
 
 
 def lift(flight: FlightState) -> None:
@@ -73,21 +73,22 @@ def uneventful(phase: Phase = Phase.TRACK, service: ServiceOptions | None = None
     )
     controller: Any = None
     flight = FlightState(
-        Limits(),
-        FlightPlan(TRACK),
-        CONFIG.vehicle,
-        session,
-        observer,
-        controller,
-        CONFIG.period_s,
-        lambda: 0.0,
+        limits=Limits(),
+        plan=FlightPlan(TRACK),
+        model=CONFIG.vehicle,
+        session=session,
+        host_s=0.0,
+        observer=observer,
+        controller=controller,
+        period_s=CONFIG.period_s,
+        stopwatch=lambda: 0.0,
         identification=identification,
         service=service,
         phase=phase,
         began_s=NOW_S,
     )
     flight.vehicle.now_s = NOW_S
-    flight.pilot.always_in_engage_mode = False
+    flight.pilot = PilotSwitch.IDLE
     if phase is Phase.CONNECT:
         return flight
     session.dialect = PX4

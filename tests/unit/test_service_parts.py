@@ -303,27 +303,33 @@ def test_a_changed_configuration_is_used_and_a_bad_one_refused(
 
 
 def test_a_switch_counts_in_the_air_from_a_mode_without_failsafe() -> None:
-    switch = PilotSwitch()
+    switch = PilotSwitch.FOUND
 
-    def shows(ours: bool, failsafe: bool = False, in_the_air: bool = True) -> bool:
-        switch.on_mode(in_engage_mode=ours, in_the_air=in_the_air, flies=in_the_air)
-        switch.on_heartbeat(in_engage_mode=ours, failsafe=failsafe)
-        return switch.engaged
+    def shows(
+        ours: bool, failsafe: bool | None = False, in_the_air: bool = True, flies: bool = True
+    ) -> bool:
+        nonlocal switch
+        switch = switch.after(
+            in_engage_mode=ours, in_the_air=in_the_air, flies=in_the_air and flies,
+            failsafe=failsafe,
+        )  # fmt: skip
+        return switch is PilotSwitch.ENGAGED
 
     assert not shows(ours=True)  # found so
     assert not shows(ours=False, failsafe=True)
     assert not shows(ours=True)  # PX4 returns by itself
-    assert not switch.returned_too_soon
+    assert switch is PilotSwitch.IDLE
     assert not shows(ours=False)
     assert shows(ours=True)
     assert not shows(ours=False)
     assert not shows(ours=True, in_the_air=False)
     assert not shows(ours=True)  # took off in this mode
     for flies in (True, False):  # by every sign
-        switch = PilotSwitch()
-        switch.on_heartbeat(in_engage_mode=False, failsafe=False)
-        switch.on_mode(in_engage_mode=True, in_the_air=True, flies=flies)
-        assert switch.engaged is flies
+        assert not shows(ours=False)
+        assert shows(ours=True, failsafe=None, flies=flies) is flies
+    assert not shows(ours=False, failsafe=None)
+    assert not shows(ours=True)
+    assert switch is PilotSwitch.TOO_SOON
 
 
 def test_a_reference_that_is_placed_low_stays_clear_of_the_ground() -> None:

@@ -30,7 +30,7 @@ class Standing:
         place = (5.0 + noise, noise - 3.0, 2.0 - height_m + noise)
         event = LocalPosition(now_s, place, (noise, noise, -climb_mps + noise))
         self.vehicle.update(event, now_s)
-        self.contact.on_position(event)
+        self.contact.on_position(now_s, place, -climb_mps + noise)
 
     def at(self, now_s: float) -> GroundContact:
         self.vehicle.now_s = now_s
