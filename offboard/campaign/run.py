@@ -4,9 +4,9 @@ alone, in the order of the plan. `compare`, `--worst` and `tune` fly their cases
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Self
@@ -131,14 +131,21 @@ class Runner(ExitStack):
         missing = [case for case in cases if not self._is_done(case, known[case.key])]
         new = {case.key: case for case in cases if case.key not in self.flown}
         self._progress.begin(len(new.keys() - {case.key for case in missing}))
-        for job, record in self._fly(missing):
-            known[job.case.key] = record
-            try:
+        folder = self._keep.absolute() if self._keep else None
+        jobs = [
+            Job(case, self._promises, code_hash(), folder / case.folder if folder else None)
+            for case in missing
+        ]
+        if missing and self._flyer is None:
+            self._flyer = self.enter_context(self._open_flyer())
+        try:
+            for job, record in self._flyer.fly(jobs, self._ending) if self._flyer else ():
+                known[job.case.key] = record
                 self._results.put(job.case.key, record)
                 self._written()
-            except UserError as error:
-                raise Incomplete(str(error)) from None
-            self._progress.flight_ended()
+                self._progress.flight_ended()
+        except UserError as error:
+            raise Incomplete(str(error)) from None
         found = [known[case.key] for case in cases]
         records = [record for record in found if record is not None]
         if len(records) < len(found):
@@ -151,21 +158,6 @@ class Runner(ExitStack):
         if record is None or self._keep is None or not record.figures:
             return record is not None
         return (self._keep / case.folder).exists()
-
-    def _fly(self, cases: Sequence[Case]) -> Iterator[tuple[Job, Record]]:
-        if not cases:
-            return
-        if self._flyer is None:
-            self._flyer = self.enter_context(self._open_flyer())
-        folder = self._keep.absolute() if self._keep else None
-        jobs = [
-            Job(case, self._promises, code_hash(), folder / case.folder if folder else None)
-            for case in cases
-        ]
-        try:
-            yield from self._flyer.fly(jobs, self._ending)
-        except UserError as error:
-            raise Incomplete(str(error)) from None
 
 
 @dataclass(frozen=True, slots=True)
@@ -296,9 +288,8 @@ def check(cases: Sequence[Case]) -> None:
     cannot is no error: it becomes a row with its reason."""
     distinct: dict[object, Case] = {}
     for case in cases:
-        names = (case.config, case.controller, case.reference, case.vehicle, case.firmware)
-        keys = tuple(key for key, _ in case.values)
-        distinct.setdefault((*names, case.sim_vehicle, case.scenario, keys), case)
+        names = replace(case, values=(), seed=0)
+        distinct.setdefault((names, *dict(case.values)), case)
     problems: list[str] = []
     for case in distinct.values():
         try:

@@ -131,7 +131,7 @@ class Tuning:
         study.enqueue_trial(within)  # the present values first
         for number in range(1, self.file.trials + 1):
             trial, values = ask(study, ranges)
-            costs = self._costs(fly, self._training, values)
+            costs = self._costs(fly, self._training, tuple(values.items()))
             study.tell(trial, sum(costs) / len(costs))
             progress(number, study.best_value)
         best = tuple((key, rounded(study.best_params[key])) for key in ranges)

@@ -150,30 +150,17 @@ def validate(
         return model.model_validate_json(json.dumps(mapping), strict=True, extra=extra)
     except ValidationError as error:
         details = error.errors(include_url=False)
-        problems = [
-            f"{_origin(detail, mapping, source)}: {_sentence(detail, mapping, model)}"
-            for detail in details[:PROBLEMS_MOST]
-        ]
+        problems = []
+        for detail in details[:PROBLEMS_MOST]:
+            path, origin = _key_path(detail, mapping, source)
+            problems.append(f"{origin}: {_sentence(detail, abridged(path), model)}")
         if len(details) > PROBLEMS_MOST:
             problems.append(f"{source}: and {len(details) - PROBLEMS_MOST} more problems")
         raise DocumentError(*problems) from None
 
 
-def _origin(detail: ErrorDetails, mapping: Mapping[str, Any], source: str) -> str:
-    """What set the value: the place of its key in a file, or an option."""
-    value: Any = mapping
-    for key in _key_path(detail, mapping).split("."):
-        source = getattr(value, "places", {}).get(key, source)
-        if isinstance(value, Mapping):
-            value = value.get(key)
-        elif isinstance(value, list) and key in map(str, range(len(value))):
-            value = value[int(key)]
-    return source
-
-
-def _sentence(detail: ErrorDetails, document: Any, model: type[BaseModel]) -> str:
+def _sentence(detail: ErrorDetails, path: str, model: type[BaseModel]) -> str:
     """The sentence for one error of pydantic."""
-    path = abridged(_key_path(detail, document))
     kind, context = detail["type"], detail.get("ctx", {})
     if kind == "extra_forbidden":
         return _unknown_key(path, model)
@@ -204,8 +191,9 @@ def _unknown_key(path: str, model: type[BaseModel]) -> str:
     return f"{path} is not a known key{meant(key, known)}{all_known}"
 
 
-def _key_path(detail: ErrorDetails, document: Any) -> str:
-    """The dotted path of the key that an error of pydantic is about.
+def _key_path(detail: ErrorDetails, document: Any, source: str) -> tuple[str, str]:
+    """The dotted path of the key that an error of pydantic is about, and what set it: the place of
+    its key in a file, or an option.
 
     pydantic's location also holds the names of union members; these are no keys of `document`.
     """
@@ -215,11 +203,12 @@ def _key_path(detail: ErrorDetails, document: Any) -> str:
         has_key = isinstance(value, Mapping) and part in value
         has_index = isinstance(value, list) and isinstance(part, int) and part < len(value)
         if has_key or has_index:
+            source = getattr(value, "places", {}).get(part, source)
             value = value[part]
             keys.append(str(part))
     if detail["type"] == "missing":
         keys.append(str(detail["loc"][-1]))
-    return ".".join(keys)
+    return ".".join(keys), source
 
 
 def _loaded(text: str, source: str) -> Any:
