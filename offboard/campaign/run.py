@@ -25,7 +25,7 @@ from offboard.campaign.workers import Flyer, OpenFlyer
 from offboard.documents.errors import DocumentError, UserError, counted, naming
 from offboard.link import clock
 from offboard.link.stop import StopRequests
-from offboard.run.configuration import build_controller, build_track
+from offboard.run.flight import build
 from offboard.run.sitl import check_scenario
 
 TABLES = ("campaign.csv", "campaign.html", "worst.csv")  # that are replaced as flights end
@@ -305,6 +305,4 @@ def _check_one(case: Case) -> None:
     if text := case.scenario_text:
         check_scenario(text, f"scenario {case.scenario}")
     case.simulated(None if text or case.link else case.scenario).check()
-    config = case.load()
-    build_track(config)
-    build_controller(config)
+    build(case.load())

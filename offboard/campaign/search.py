@@ -14,12 +14,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from offboard.campaign.cases import SEED, Case, Values, rounded
+from offboard.campaign.cases import DIGITS, SEED, Case, Values
 from offboard.campaign.document import Ends
 from offboard.campaign.results import Record
 from offboard.campaign.run import Campaign, Runner, check
 from offboard.campaign.table import as_csv as csv_of
-from offboard.documents.errors import DocumentError, UserError, install, naming
+from offboard.documents.errors import DocumentError, UserError, install, naming, plain
 
 if TYPE_CHECKING:
     import optuna
@@ -50,7 +50,8 @@ def ask(study: optuna.Study, ranges: Mapping[str, Ends]) -> tuple[optuna.Trial, 
     """The next values to try within `ranges` (key -> lowest, highest), and the trial that is to be
     told what they cost."""
     trial = study.ask()
-    return trial, {key: rounded(trial.suggest_float(key, *ends)) for key, ends in ranges.items()}
+    asked = {key: trial.suggest_float(key, *ends) for key, ends in ranges.items()}
+    return trial, plain(asked, DIGITS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,9 +91,9 @@ class FailureSearch:
         ranges, seed = self._search.ranges, self._search.seed
         # all before the first flight: a study needs a package
         self._studies = [study_of(seed + 1000 * n) for n in range(ROUNDS)]
-        middle = {key: rounded((low + high) / 2) for key, (low, high) in ranges.items()}
+        middle = {key: (low + high) / 2 for key, (low, high) in ranges.items()}
         with naming(source):
-            check([self._case(middle)])
+            check([self._case(plain(middle, DIGITS))])
 
     def find(self, count: int, runner: Runner) -> list[Failure]:
         """The `count` worst failures that differ; writes worst.csv, and table and page of all

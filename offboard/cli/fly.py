@@ -35,7 +35,6 @@ from offboard.documents.errors import UserError, plain
 if TYPE_CHECKING:
     from offboard.analysis.score import Requirement
     from offboard.flight.flight import Flight, Outcome
-    from offboard.live.lines import JsonLines, Terminal
 
 INTERRUPTED = "interrupted before anything was sent"
 LABEL_WIDTH = 15
@@ -78,13 +77,16 @@ def fly(
     simulated.check(options)
     try:
         from offboard.link.stop import StopRequests
+        from offboard.live.lines import JsonLines, Terminal
         from offboard.live.process import LiveProcess
         from offboard.run.sitl import SimulatorProcess
 
         with (
             StopRequests(_exit_at_once) as stops,
             SimulatorProcess() if simulated.sitl else nullcontext() as simulator,
-            closing(_lines(json_lines=json_lines)) as lines,
+            closing(
+                JsonLines(write) if json_lines else Terminal(out, partial(say, indent=12))
+            ) as lines,
             closing(LiveProcess("--live", live)) if live else nullcontext() as shown,
         ):
             from offboard.link import clock
@@ -134,12 +136,6 @@ def _exit_at_once() -> None:
     """Exit although code may be compiling; the simulator ends when the pipe to it closes."""
     os.write(2, f"{INTERRUPTED}\n".encode())
     os._exit(INTERRUPT)
-
-
-def _lines(*, json_lines: bool) -> JsonLines | Terminal:
-    from offboard.live.lines import JsonLines, Terminal
-
-    return JsonLines(write) if json_lines else Terminal(out, partial(say, indent=12))
 
 
 def _conclude(

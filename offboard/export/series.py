@@ -82,7 +82,19 @@ def events_of(flown: History) -> list[Event]:
 def values_of(rows: Rows) -> Array:
     """Values (N, columns), in the order of COLUMNS."""
     names = [name for name in rows.dtype.names or () if name not in ("time_s", "unix_s")]
-    return np.column_stack([rows[name] for name in names])
+    return np.column_stack([rows[name] for name in names]).astype(np.float64)
+
+
+def samples(name: str, rows: Rows) -> Iterator[tuple[float, float, dict[str, Any]]]:
+    """Both times of each sample, and what is known of it, by column; a phase by its name."""
+    times = rows["time_s"].tolist(), rows["unix_s"].tolist()
+    for time_s, unix_s, values in zip(*times, values_of(rows).tolist(), strict=True):
+        known = {
+            column: PHASES[int(value)] if column == PHASE else value
+            for column, value in zip(COLUMNS[name], values, strict=True)
+            if math.isfinite(value)
+        }
+        yield time_s, unix_s, known
 
 
 def write_csv(flown: History, path: Path) -> None:
@@ -106,18 +118,9 @@ def write_csv(flown: History, path: Path) -> None:
 
 def _csv_rows(name: str, rows: Rows) -> Iterator[dict[str, Any]]:
     """One for each sample, in the order of time."""
-    rows = rows[np.argsort(rows["time_s"], kind="stable")]
-    times = rows["time_s"].tolist(), rows["unix_s"].tolist()
-    for time_s, unix_s, values in zip(*times, values_of(rows).tolist(), strict=True):
-        cells = map(_cell, COLUMNS[name], values)
-        yield _row(time_s, unix_s, name, dict(zip(COLUMNS[name], cells, strict=True)))
+    for time_s, unix_s, known in samples(name, rows[np.argsort(rows["time_s"], kind="stable")]):
+        yield _row(time_s, unix_s, name, known)
 
 
 def _row(time_s: float, unix_s: float, source: str, cells: dict[str, Any]) -> dict[str, Any]:
     return {"vehicle_time_s": time_s, "unix_time_s": unix_s, "source": source, **cells}
-
-
-def _cell(column: str, value: float) -> float | str:
-    if math.isnan(value):
-        return ""
-    return PHASES[int(value)] if column == PHASE else value

@@ -111,7 +111,7 @@ def compare(expected: Iterable[Sent], actual: Iterable[Sent]) -> Comparison:
     """Compare the payloads of setpoints and commands. A message is compared with the one of the
     same kind and stamp that was sent at the same vehicle time."""
     first, second = _by_key(expected), _by_key(actual)
-    keys = sorted(first.keys() | second.keys(), key=lambda key: key[0])
+    keys = sorted(first.keys() | second.keys())
     differences = tuple(
         Difference(first.get(key), second.get(key))
         for key in keys
