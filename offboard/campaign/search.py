@@ -10,21 +10,20 @@ changed. The first K kinds are flown at more seeds.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from offboard.campaign.cases import DIGITS, SEED, Case, Values
 from offboard.campaign.document import Ends
 from offboard.campaign.results import Record
-from offboard.campaign.run import Campaign, Runner, check
+from offboard.campaign.run import Campaign, Fly, check
 from offboard.campaign.table import as_csv as csv_of
 from offboard.documents.errors import DocumentError, UserError, install, naming, plain
 
 if TYPE_CHECKING:
     import optuna
 
-Fly = Callable[[Sequence[Case]], list[Record]]  # `Runner.fly`
 Point = Mapping[str, float]  # a value within each range
 BATCH = 20  # flights between two answers of the study
 ROUNDS = 4
@@ -95,15 +94,20 @@ class FailureSearch:
         with naming(source):
             check([self._case(plain(middle, DIGITS))])
 
-    def find(self, count: int, runner: Runner) -> list[Failure]:
+    def find(self, count: int, fly_cases: Fly) -> list[Failure]:
         """The `count` worst failures that differ; writes worst.csv, and table and page of all
         flights. Raises Incomplete, or UserError."""
-        fly, campaign = runner.fly, self._campaign
+        campaign, flown = self._campaign, dict[str, Case]()
+
+        def fly(cases: Sequence[Case]) -> list[Record]:
+            flown.update((case.key, case) for case in cases)
+            return fly_cases(cases)
+
         failures: dict[tuple[str, tuple[str, ...]], Failure] = {}
         for failure in self._reduced(self._worst(self._flown(fly), CANDIDATES * count), fly):
             failures.setdefault(failure.kind, failure)
         found = self._at_seeds(list(failures.values())[:count], fly)
-        campaign.cases = list(runner.flown.values())
+        campaign.cases = list(flown.values())
         campaign.write(campaign.rows())
         campaign.results.write(campaign.directory / "worst.csv", as_csv(found))
         return found

@@ -22,8 +22,8 @@ from scipy import stats
 
 from offboard.campaign.cases import DIGITS, SCENARIO, Case, Values, expand
 from offboard.campaign.document import CampaignFile, Firmware, Name, Names, Ranges, Seed, Seeds
-from offboard.campaign.run import check
-from offboard.campaign.search import Fly, ask, study_of
+from offboard.campaign.run import Fly, check
+from offboard.campaign.search import ask, study_of
 from offboard.campaign.table import CONFIDENCE, METRIC_COLUMNS
 from offboard.documents.errors import DocumentError, naming, plain
 from offboard.documents.parameters import Parameters
