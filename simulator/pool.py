@@ -14,13 +14,11 @@ import select
 import signal
 import sys
 import traceback
-from functools import partial
 from io import FileIO
 from typing import NoReturn
 
 from offboard.compiled import prepare
 from offboard.documents.command_line import run
-from simulator.command import app
 
 
 def serve(requests: FileIO) -> None:
@@ -54,7 +52,7 @@ def _run(options: list[str]) -> NoReturn:
     os.dup2(null, 1)
     code = 1
     try:
-        run(lambda: partial(app, options))
+        run("simulator.command", options)
     except SystemExit as ended:
         code = int(ended.code or 0)
     except BaseException:
@@ -65,11 +63,12 @@ def _run(options: list[str]) -> NoReturn:
 
 def _load() -> None:
     """Import all modules of the simulator and load its compiled functions."""
-    from simulator import config, launch
+    from simulator import command, config, launch
     from simulator.firmware.catalogue import FIRMWARES
     from simulator.instance import Instance
     from simulator.vehicle.conditions import Conditions
 
+    assert command
     assert launch
     prepare()
     for firmware in FIRMWARES.values():

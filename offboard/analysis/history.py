@@ -102,6 +102,11 @@ class Event:
     unix_s: float = math.nan
 
     @property
+    def stamp(self) -> str:
+        """Its vehicle time, empty before telemetry."""
+        return "" if math.isnan(self.time_s) else f"{self.time_s:.2f}"
+
+    @property
     def reason(self) -> str:
         """Why its phase begins."""
         return self.what.removeprefix(f"{self.phase}: ")
@@ -400,6 +405,7 @@ class _Collector:
         rows = {name: found[False, name] for name in _THEIRS}
         ours = {name: found[True, name] for name in _OURS}
         heartbeat, battery = rows["HEARTBEAT"], rows["SYS_STATUS"]
+        heartbeat["armed"] = heartbeat["armed"] & ARMED > 0
         voltage, remaining = (battery[name].astype(np.float32) for name in _THEIRS["SYS_STATUS"])
         voltage[voltage == _NO_VOLTAGE] = remaining[remaining == _NO_PERCENTAGE] = math.nan
         position = _plausible(
@@ -435,11 +441,7 @@ class _Collector:
             records=ours[_RECORDS],
             identified=ours[_IDENTIFIED],
             link_delay=_link_delay(ours["TIMESYNC"], rows["TIMESYNC"]),
-            heartbeat=table(
-                heartbeat,
-                armed=(heartbeat["armed"] & ARMED > 0).astype(np.float32),
-                system_status=heartbeat["system_status"].astype(np.float32),
-            ),
+            heartbeat=heartbeat,
             battery=table(battery, voltage_mv=voltage, remaining=remaining),
             landed=rows["EXTENDED_SYS_STATE"],
             phases=tuple(event for event in events if event.phase),

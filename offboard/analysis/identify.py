@@ -59,20 +59,14 @@ def _trace(history: History) -> Trace:
     thrust = setpoint["thrust"].astype(np.float64)
     if history.dialect and history.dialect.thrust_rule is ThrustRule.TILT_COMPENSATED:
         thrust = thrust / np.maximum(commanded[:, 2], 0.3)
+    commanded_rad, heading_rad = (
+        heading_from_quaternion(rows["quaternion"]) for rows in (setpoint, attitude)
+    )
     trace = clean(
+        np.column_stack((setpoint["time_s"], commanded[:, :2], thrust, commanded_rad)),
+        np.column_stack((attitude["time_s"], direction[:, :2], heading_rad)),
         np.column_stack(
-            (
-                setpoint["time_s"],
-                commanded[:, :2],
-                thrust,
-                heading_from_quaternion(setpoint["quaternion"]),
-            )
-        ),
-        np.column_stack(
-            (attitude["time_s"], direction[:, :2], heading_from_quaternion(attitude["quaternion"]))
-        ),
-        np.column_stack(
-            (position["time_s"], position["position_ned_m"], position["velocity_ned_mps"])
+            [position[name] for name in ("time_s", "position_ned_m", "velocity_ned_mps")]
         ),
     )
     return trace.between(*_flown(history))

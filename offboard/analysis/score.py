@@ -251,6 +251,8 @@ class Requirement:
 
 # ---------------------------------------------------------------------- decisions and link
 
+_PERCENT = {"p50": 50, "median": 50, "p99": 99, "max": 100}
+
 
 def decision_metrics(flown: History) -> dict[str, float]:
     """Values of a Score; empty without decisions."""
@@ -264,11 +266,6 @@ def decision_metrics(flown: History) -> dict[str, float]:
         values = columns[name].astype(np.float64)
         return values[np.isfinite(values)]
 
-    def refusals(flag: int) -> float:
-        return float(((refused & flag) != 0).sum())
-
-    answer_ms, age_ms = 1e3 * known("answer_s"), 1e3 * known("age_s")
-    solve_ms, gap = 1e3 * known("solve_time_s"), known("gap")
     # A setpoint without certificate was changed by the gate, in EXCITE perhaps by a step
     changed = np.isnan(columns["at_bound"]) & np.isfinite(columns["thrust_mps2"])
     limited = changed & (columns["phase"] != Phase.EXCITE.code)
@@ -277,26 +274,21 @@ def decision_metrics(flown: History) -> dict[str, float]:
     return {
         "decisions": float(len(refused)),
         "failed_decisions": failed,
-        "answer_p50_ms": _percentile(answer_ms, 50),
-        "answer_p99_ms": _percentile(answer_ms, 99),
-        "answer_max_ms": _percentile(answer_ms, 100),
-        "setpoint_age_p99_ms": _percentile(age_ms, 99),
-        "setpoint_age_max_ms": _percentile(age_ms, 100),
+        **_named("answer_{}_ms", "p50 p99 max", 1e3 * known("answer_s")),
+        **_named("setpoint_age_{}_ms", "p99 max", 1e3 * known("age_s")),
         "missed_ticks": float(known("missed_ticks").sum()),
         "skipped_ticks": float(skipped.sum(dtype=np.float64)),
         "pause_max_s": float(columns["pause_s"].max()),
         "refused_setpoints": float((refused != 0).sum()),
-        "refused_late": refusals(Refusal.LATE),
-        "refused_stale": refusals(Refusal.STALE),
-        "refused_not_ours": refusals(Refusal.NOT_OURS),
-        "refused_unusable": refusals(Refusal.UNUSABLE),
+        **{
+            f"refused_{name.lower()}": float((refused & flag != 0).sum())
+            for name, flag in Refusal.__members__.items()
+        },
         "other_datagrams": float(known("other_datagrams").sum()),
-        "solve_time_p50_ms": _percentile(solve_ms, 50),
-        "solve_time_p99_ms": _percentile(solve_ms, 99),
-        "certified_share": len(gap) / len(refused),
-        "gap_median": _percentile(gap, 50),
-        "gap_max": _percentile(gap, 100),
-        "spread_median": _percentile(known("spread"), 50),
+        **_named("solve_time_{}_ms", "p50 p99", 1e3 * known("solve_time_s")),
+        "certified_share": len(known("gap")) / len(refused),
+        **_named("gap_{}", "median max", known("gap")),
+        **_named("spread_{}", "median", known("spread")),
         "at_bound_share": _mean(at_bound[np.isfinite(at_bound)]),
         "cut_short_share": _mean(known("cut_short")),
         "hover_thrust": float(columns["hover_thrust"][-1]),
@@ -315,10 +307,7 @@ def link_metrics(flown: History, window: tuple[float, float] | None) -> dict[str
         values["setpoint_hz"] = (len(sent) - 1) / span_s if span_s > 0.0 else math.nan
         values["setpoint_gap_max_s"] = float(np.diff(sent["time_s"]).max(initial=0.0))
         values["setpoint_gap_wall_max_s"] = float(np.diff(sent["unix_s"]).max(initial=0.0))
-    if len(flown.link_delay):
-        link_ms = 1e3 * flown.link_delay["delay_s"]
-        values["link_delay_p50_ms"] = _percentile(link_ms, 50)
-        values["link_delay_p99_ms"] = _percentile(link_ms, 99)
+    values |= _named("link_delay_{}_ms", "p50 p99", 1e3 * flown.link_delay["delay_s"])
     delay_s = flown.identified["tilt_delay_s"]
     if len(delay_s := delay_s[np.isfinite(delay_s[:, 0])]):
         values["delay_ms"], values["delay_sd_ms"] = (1e3 * delay_s[-1].astype(float)).tolist()
@@ -337,8 +326,11 @@ def link_metrics(flown: History, window: tuple[float, float] | None) -> dict[str
     return values
 
 
-def _percentile(values: Array, share: float) -> float:
-    return float(np.percentile(values, share)) if len(values) else math.nan
+def _named(pattern: str, kinds: str, values: Array) -> dict[str, float]:
+    """Percentiles of the values by name: `pattern` with each of `kinds` in it; empty without
+    values."""
+    known = kinds.split() if len(values) else ()
+    return {pattern.format(kind): float(np.percentile(values, _PERCENT[kind])) for kind in known}
 
 
 def _mean(values: NDArray[Any]) -> float:

@@ -94,8 +94,7 @@ def show(console: Console, score: Score, history: History) -> None:
     story.add_column("who")
     story.add_column("what")
     for event in history.events():
-        stamp = "" if math.isnan(event.time_s) else f"{event.time_s:.2f}"
-        story.add_row(stamp, event.who, Text(event.what))
+        story.add_row(event.stamp, event.who, Text(event.what))
     if story.rows:
         console.print(story)
     known = {name: value for name, value in score.metrics().items() if not math.isnan(value)}

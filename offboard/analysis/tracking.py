@@ -1,6 +1,6 @@
 """Metrics of the phase TRACK: errors, fitness, activity, truth.
 
-Errors and motion are weighted by the time of the reference (see `weighted`): a metric depends
+Errors and motion are weighted by the time of the reference (see `_Clock`): a metric depends
 neither on the rate of the telemetry nor on jumps of the vehicle's clock. Sums of the paper's
 fitness are over the control ticks, as in its Eq. 32.
 """
@@ -8,7 +8,6 @@ fitness are over the control ticks, as in its Eq. 32.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -63,12 +62,12 @@ def tracking_metrics(flown: History, window: tuple[float, float]) -> dict[str, f
     """Values of a Score, of the samples in the window."""
     reference, clock = Reference(flown.reference), _Clock(flown)
 
-    def away(rows: Rows, column: str, derivative: int = 0) -> Weighted:
+    def away(rows: Rows, column: str, derivative: int = 0) -> tuple[Array, Array]:
         def size(part: Rows) -> Array:
             errors = part[column] - reference.position(part["time_s"], derivative)
             return np.asarray(np.linalg.norm(errors, axis=1))
 
-        return weighted(in_parts(size, rows), clock.shares(rows["time_s"]))
+        return in_parts(size, rows), clock.shares(rows["time_s"])
 
     def turned_deg(part: Rows) -> Array:
         turn = heading_from_quaternion(part["quaternion"]) - reference.heading(part["time_s"])
@@ -79,41 +78,26 @@ def tracking_metrics(flown: History, window: tuple[float, float]) -> dict[str, f
         return np.degrees(np.arccos(np.clip(down, -1.0, 1.0)))
 
     fitness = _fitness(flown, reference, window)
+    found = fitness | {"mu_e": sum(fitness.values()), "tracked_s": passed_s(flown, window)[0]}
     rows = _within(flown.position, window)
-    position, velocity = away(rows, "position_ned_m"), away(rows, "velocity_ned_mps", 1)
-    true = away(_within(flown.truth, window), "position_ned_m")
+    found |= _named("{}_position_m", "rmse mean p95 max", *away(rows, "position_ned_m"))
+    found |= _named("{}_velocity_mps", "rmse p95 max", *away(rows, "velocity_ned_mps", 1))
+    rows = _within(flown.truth, window)
+    found |= _named("{}_truth_m", "rmse max", *away(rows, "position_ned_m"))
     rows = _within(flown.setpoint, window)
-    steps = _length(np.diff(thrust_direction_from_quaternion(rows["quaternion"]), axis=0))
-    thrust = weighted(rows["thrust"].astype(np.float64), clock.shares(rows["time_s"]))
+    thrust = rows["thrust"].astype(np.float64)
+    found |= _named("thrust_{}", "sd", thrust, clock.shares(rows["time_s"]))
+    directions = thrust_direction_from_quaternion(rows["quaternion"])
+    steps = np.linalg.norm(np.diff(directions, axis=0), axis=1)
+    if len(steps):
+        found["tilt_command_step_deg"] = math.degrees(math.sqrt((steps**2).mean()))
     rows = _within(flown.attitude, window)
     weights = clock.shares(rows["time_s"])
-    heading = weighted(in_parts(turned_deg, rows), weights)
-    tilt = weighted(in_parts(tilted_deg, rows), weights)
-    rates = rows["rates_radps"]
-    return {
-        "rmse_position_m": position.rms,
-        "mean_position_m": position.mean,
-        "p95_position_m": position.p95,
-        "max_position_m": position.max,
-        "rmse_truth_m": true.rms,
-        "max_truth_m": true.max,
-        "rmse_velocity_mps": velocity.rms,
-        "p95_velocity_mps": velocity.p95,
-        "max_velocity_mps": velocity.max,
-        "rmse_heading_deg": heading.rms,
-        "max_heading_deg": heading.max,
-        **fitness,
-        "mu_e": sum(fitness.values()),
-        "tracked_s": passed_s(flown, window)[0],
-        "thrust_sd": thrust.sd,
-        "tilt_command_step_deg": math.degrees(math.sqrt((steps**2).mean()))
-        if len(steps)
-        else math.nan,
-        "tilt_max_deg": tilt.max,
-        "roll_rate_sd_radps": weighted(rates[:, 0].astype(np.float64), weights).sd,
-        "pitch_rate_sd_radps": weighted(rates[:, 1].astype(np.float64), weights).sd,
-        **_agitation(reference, rows, weights),
-    }
+    found |= _named("{}_heading_deg", "rmse max", in_parts(turned_deg, rows), weights)
+    found |= _named("tilt_{}_deg", "max", in_parts(tilted_deg, rows), weights)
+    for axis, pattern in enumerate(("roll_rate_{}_radps", "pitch_rate_{}_radps")):
+        found |= _named(pattern, "sd", rows["rates_radps"][:, axis].astype(np.float64), weights)
+    return found | _agitation(reference, rows, weights)
 
 
 def _fitness(flown: History, reference: Reference, window: tuple[float, float]) -> dict[str, float]:
@@ -231,10 +215,6 @@ def _in_track(flown: History) -> NDArray[np.bool_]:
     return chosen
 
 
-def _length(vectors: Array) -> Array:
-    return np.asarray(np.linalg.norm(vectors, axis=1))
-
-
 def _nearest(stamps: Array, times: Array) -> NDArray[np.intp]:
     right = np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1)
     nearest: NDArray[np.intp] = right - (times - stamps[right - 1] < stamps[right] - times)
@@ -244,31 +224,22 @@ def _nearest(stamps: Array, times: Array) -> NDArray[np.intp]:
 # ---------------------------------------------------------------------- metrics by time
 
 
-@dataclass(frozen=True, slots=True)
-class Weighted:
-    """Metrics of one signal; `p95` is not exceeded for 95 % of the time. NaN without samples."""
-
-    mean: float = math.nan
-    rms: float = math.nan
-    sd: float = math.nan
-    max: float = math.nan
-    p95: float = math.nan
-
-
-def weighted(values: Array, weights: Array) -> Weighted:
-    """Metrics of samples (N,) with the time (N,) for which each stands; those that stand for none
-    do not count."""
+def _named(pattern: str, kinds: str, values: Array, weights: Array) -> dict[str, float]:
+    """Metrics of samples (N,) with the time (N,) for which each stands, by name: `pattern` with
+    each of `kinds` in it. `p95` is not exceeded for 95 % of the time. Samples that stand for no
+    time do not count; empty without others."""
     total = float(weights.sum())
     if not total:
-        return Weighted()
+        return {}
     mean = float(weights @ values / total)
     square = float(np.einsum("i,i,i", weights, values, values) / total)
     order = np.argsort(values)
     upto = np.searchsorted(np.cumsum(weights[order]), 0.95 * total)
-    return Weighted(
-        mean=mean,
-        rms=math.sqrt(square),
-        sd=math.sqrt(max(square - mean**2, 0.0)),
-        max=float(np.max(values, where=weights > 0.0, initial=-math.inf)),
-        p95=float(values[order[upto]]),
-    )
+    found = {
+        "mean": mean,
+        "rmse": math.sqrt(square),
+        "sd": math.sqrt(max(square - mean**2, 0.0)),
+        "max": float(np.max(values, where=weights > 0.0, initial=-math.inf)),
+        "p95": float(values[order[upto]]),
+    }
+    return {pattern.format(kind): found[kind] for kind in kinds.split()}

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.analysis.history import Event, History
+from offboard.analysis.history import Event, History, parts
 from offboard.flight.estimates import PositionJumps
 from offboard.flight.ground_contact import Touchdown
 from offboard.flight.phases import RESTS
@@ -26,7 +26,6 @@ Array = NDArray[np.float64]
 
 REFERENCE_OVER = "reference over"
 NO_FLIGHT = "no flight of offboard in this log"
-_BLOCK = 10_000  # positions
 _ON_GROUND = 1  # MAV_LANDED_STATE
 _LANDING_ENDS = {"disarmed", "failed", "yielded"}
 
@@ -56,8 +55,8 @@ def landing(flown: History) -> tuple[str, float]:
 def _positions(flown: History) -> Iterator[LocalPosition]:
     """In the order of time."""
     order = np.argsort(flown.position["time_s"], kind="stable")
-    for first in range(0, len(order), _BLOCK):
-        for time_s, _, place, velocity in flown.position[order[first : first + _BLOCK]].tolist():
+    for part in parts(order):
+        for time_s, _, place, velocity in flown.position[part].tolist():
             yield LocalPosition(time_s, tuple(place.tolist()), tuple(velocity.tolist()))
 
 

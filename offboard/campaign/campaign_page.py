@@ -55,7 +55,7 @@ def page(
         metrics=TABLE_METRICS,
         groups=groups,
         best=BEST if any(group.best for group in groups) else "",
-        worst=sorted(rows, key=lambda row: row.severity)[:WORST_SHOWN],
+        worst=sorted(rows, key=lambda row: (row.record.margin, row.case.key))[:WORST_SHOWN],
         links=links,
         described=described,
         number=digits,

@@ -23,7 +23,7 @@ from scipy.stats import qmc
 from offboard.campaign.document import CASES_MOST, CampaignFile, Sample
 from offboard.control import catalogue
 from offboard.documents import shipped
-from offboard.documents.errors import DocumentError
+from offboard.documents.errors import DocumentError, plain
 from offboard.documents.reading import override, read
 from offboard.run.configuration import FlightConfig, load
 from offboard.run.flight import Simulated
@@ -33,6 +33,7 @@ SCENARIO = "scenario."  # of a key of the scenario
 CONNECTED = "connected"  # the scenario of the vehicle at a link
 OWN_SCENARIOS = {"px4": "px4_like", "ardupilot": "ardupilot_like"}  # where a file names none
 FILES = ("config", "controller", "reference", "vehicle", "sim_vehicle", "scenario")
+DIGITS = 5  # of a drawn or searched value, so that files and commands stay short
 Values = tuple[tuple[str, Any], ...]
 
 
@@ -173,14 +174,9 @@ def drawn(sample: Sample) -> list[Values]:
     unit = qmc.LatinHypercube(len(sample.ranges), rng=np.random.default_rng(sample.seed))
     low, high = np.array(list(sample.ranges.values())).T
     return [
-        tuple(zip(sample.ranges, map(rounded, point), strict=True))
+        tuple(zip(sample.ranges, plain(point, DIGITS), strict=True))
         for point in (low + unit.random(sample.draws) * (high - low)).tolist()
     ]
-
-
-def rounded(value: float) -> float:
-    """A value with five significant digits, so that files and commands stay short."""
-    return float(f"{value:.5g}")
 
 
 def _place(name: str) -> str:

@@ -1,15 +1,14 @@
 """A campaign flown: plan, fly what is not finished, write table and page from the folder of results
 alone, in the order of the plan. `compare`, `--worst` and `tune` fly their cases in the same way
-(`Runner`)."""
+(`flying`)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Self
 
 from rich.console import Console
 from rich.status import Status
@@ -25,7 +24,7 @@ from offboard.campaign.workers import Flyer, OpenFlyer
 from offboard.documents.errors import DocumentError, UserError, counted, naming
 from offboard.link import clock
 from offboard.link.stop import StopRequests
-from offboard.run.configuration import build_controller, build_track
+from offboard.run.flight import build
 from offboard.run.sitl import check_scenario
 
 TABLES = ("campaign.csv", "campaign.html", "worst.csv")  # that are replaced as flights end
@@ -35,6 +34,7 @@ TABLE_S = 5.0  # at least, from one table to the next
 TABLE_SHARE = 0.02  # of the time is for tables while it flies
 INTERRUPTED = "interrupted: flights in the air are finished; interrupt again to exit at once"
 LINES = 20
+Fly = Callable[[Sequence[Case]], list[Record]]  # see `flying`
 
 
 class Incomplete(Exception):
@@ -92,80 +92,58 @@ def remaining(seconds: float) -> str:
     return f"{minutes:.0f} min" if minutes < 100.0 else f"{minutes / 60.0:.1f} h"
 
 
-class Runner(ExitStack):
-    """Context manager that flies cases: what is in the folder of results is not flown again.
+@contextmanager
+def flying(
+    results: Results,
+    promises: Promises,
+    open_flyer: OpenFlyer,
+    progress: Progress,
+    *,
+    keep: Path | None = None,
+    written: Callable[[], None] = lambda: None,
+) -> Iterator[Fly]:
+    """A function that flies cases: what is in the folder of results is not flown again.
 
-    `open_flyer` is entered when the first case is missing. With `keep`, a directory, the log of
-    each flight is kept in it. `written` is called after each flight.
+    It returns their records in their order. It raises Incomplete when one is missing, and UserError
+    where no flight can begin. `open_flyer` is entered when the first case is missing. With `keep`,
+    a directory, the log of each flight is kept in it. `written` is called after each flight.
     """
+    folder = keep.absolute() if keep else None
+    opened: list[Flyer] = []
+    seen: set[str] = set()  # keys
 
-    def __init__(
-        self,
-        results: Results,
-        promises: Promises,
-        open_flyer: OpenFlyer,
-        progress: Progress,
-        *,
-        keep: Path | None = None,
-        written: Callable[[], None] = lambda: None,
-    ) -> None:
-        super().__init__()
-        self._results = results
-        self._promises = promises
-        self._open_flyer = open_flyer
-        self._progress = progress
-        self._keep = keep
-        self._written = written
-        self._flyer: Flyer | None = None
-        self.flown: dict[str, Case] = {}  # by key, in order
-
-    def __enter__(self) -> Self:
-        self._ending = partial(self._progress.ending, self.enter_context(StopRequests()))
-        self.enter_context(self._progress)
-        return self
-
-    def fly(self, cases: Sequence[Case]) -> list[Record]:
-        """The records of these cases, in their order. Raises Incomplete when one is missing, and
-        UserError where no flight can begin."""
-        known = {case.key: self._results.get(case.key) for case in cases}
-        missing = [case for case in cases if not self._is_done(case, known[case.key])]
-        new = {case.key: case for case in cases if case.key not in self.flown}
-        self._progress.begin(len(new.keys() - {case.key for case in missing}))
-        for job, record in self._fly(missing):
-            known[job.case.key] = record
-            try:
-                self._results.put(job.case.key, record)
-                self._written()
-            except UserError as error:
-                raise Incomplete(str(error)) from None
-            self._progress.flight_ended()
-        found = [known[case.key] for case in cases]
-        records = [record for record in found if record is not None]
-        if len(records) < len(found):
-            raise Incomplete
-        self.flown |= new
-        return records
-
-    def _is_done(self, case: Case, record: Record | None) -> bool:
-        """Flown, with its log where logs are kept; the same seed gives the same flight again."""
-        if record is None or self._keep is None or not record.figures:
+    def is_done(case: Case, record: Record | None) -> bool:
+        """With its log where logs are kept; the same seed gives the same flight again."""
+        if record is None or folder is None or not record.figures:
             return record is not None
-        return (self._keep / case.folder).exists()
+        return (folder / case.folder).exists()
 
-    def _fly(self, cases: Sequence[Case]) -> Iterator[tuple[Job, Record]]:
-        if not cases:
-            return
-        if self._flyer is None:
-            self._flyer = self.enter_context(self._open_flyer())
-        folder = self._keep.absolute() if self._keep else None
+    def fly(cases: Sequence[Case]) -> list[Record]:
+        known = {case.key: results.get(case.key) for case in cases}
+        missing = [case for case in cases if not is_done(case, known[case.key])]
+        progress.begin(len(known.keys() - seen - {case.key for case in missing}))
+        if missing and not opened:
+            opened.append(stack.enter_context(open_flyer()))
         jobs = [
-            Job(case, self._promises, code_hash(), folder / case.folder if folder else None)
-            for case in cases
+            Job(case, promises, code_hash(), folder / case.folder if folder else None)
+            for case in missing
         ]
         try:
-            yield from self._flyer.fly(jobs, self._ending)
+            for job, record in opened[0].fly(jobs, partial(progress.ending, stops)) if jobs else ():
+                known[job.case.key] = record
+                results.put(job.case.key, record)
+                written()
+                progress.flight_ended()
         except UserError as error:
             raise Incomplete(str(error)) from None
+        records = [found for case in cases if (found := known[case.key]) is not None]
+        if len(records) < len(cases):
+            raise Incomplete
+        seen.update(known)
+        return records
+
+    with StopRequests() as stops, progress, ExitStack() as stack:
+        yield fly
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,10 +196,10 @@ class Campaign:
         self._requirements = [Requirement.parse(text) for text in file.require]
         self._next_table_s = 0.0
 
-    def runner(self, open_flyer: OpenFlyer, progress: Progress) -> Runner:
-        """What flies the cases of this campaign, and writes table and page while it does."""
+    def flying(self, open_flyer: OpenFlyer, progress: Progress) -> AbstractContextManager[Fly]:
+        """What flies cases for this campaign, and writes table and page while it does."""
         keep = self.directory / KEPT if self.file.keep else None
-        return Runner(
+        return flying(
             self.results, self.file.promises, open_flyer, progress, keep=keep, written=self._written
         )
 
@@ -231,8 +209,8 @@ class Campaign:
         mine = self.cases[shard]
         stopped = ""
         try:
-            with self.runner(open_flyer, Progress(console, len(mine))) as runner:
-                runner.fly(mine)
+            with self.flying(open_flyer, Progress(console, len(mine))) as fly:
+                fly(mine)
         except Incomplete as reason:
             stopped = str(reason)
         except KeyboardInterrupt:
@@ -296,9 +274,8 @@ def check(cases: Sequence[Case]) -> None:
     cannot is no error: it becomes a row with its reason."""
     distinct: dict[object, Case] = {}
     for case in cases:
-        names = (case.config, case.controller, case.reference, case.vehicle, case.firmware)
-        keys = tuple(key for key, _ in case.values)
-        distinct.setdefault((*names, case.sim_vehicle, case.scenario, keys), case)
+        names = replace(case, values=(), seed=0)
+        distinct.setdefault((names, *dict(case.values)), case)
     problems: list[str] = []
     for case in distinct.values():
         try:
@@ -314,6 +291,4 @@ def _check_one(case: Case) -> None:
     if text := case.scenario_text:
         check_scenario(text, f"scenario {case.scenario}")
     case.simulated(None if text or case.link else case.scenario).check()
-    config = case.load()
-    build_track(config)
-    build_controller(config)
+    build(case.load())

@@ -10,21 +10,21 @@ changed. The first K kinds are flown at more seeds.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from offboard.campaign.cases import SEED, Case, Values, rounded
+from offboard.campaign.cases import DIGITS, SEED, Case, Values
 from offboard.campaign.document import Ends
 from offboard.campaign.results import Record
-from offboard.campaign.run import Campaign, Runner, check
+from offboard.campaign.run import Campaign, Fly, check
 from offboard.campaign.table import as_csv as csv_of
-from offboard.documents.errors import DocumentError, UserError, install, naming
+from offboard.documents.errors import DocumentError, UserError, install, naming, plain
 
 if TYPE_CHECKING:
     import optuna
 
-Fly = Callable[[Sequence[Case]], list[Record]]  # `Runner.fly`
+Point = Mapping[str, float]  # a value within each range
 BATCH = 20  # flights between two answers of the study
 ROUNDS = 4
 AVOIDED = 6  # failures that a round is kept away from
@@ -45,12 +45,12 @@ def study_of(seed: int) -> optuna.Study:
     return optuna.create_study(sampler=sampler)
 
 
-def ask(study: optuna.Study, ranges: Mapping[str, Ends]) -> tuple[optuna.Trial, Values]:
+def ask(study: optuna.Study, ranges: Mapping[str, Ends]) -> tuple[optuna.Trial, dict[str, float]]:
     """The next values to try within `ranges` (key -> lowest, highest), and the trial that is to be
     told what they cost."""
     trial = study.ask()
-    asked = ((key, trial.suggest_float(key, *ends)) for key, ends in ranges.items())
-    return trial, tuple((key, rounded(value)) for key, value in asked)
+    asked = {key: trial.suggest_float(key, *ends) for key, ends in ranges.items()}
+    return trial, plain(asked, DIGITS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,19 +90,24 @@ class FailureSearch:
         ranges, seed = self._search.ranges, self._search.seed
         # all before the first flight: a study needs a package
         self._studies = [study_of(seed + 1000 * n) for n in range(ROUNDS)]
-        middle = {key: rounded((low + high) / 2) for key, (low, high) in ranges.items()}
+        middle = {key: (low + high) / 2 for key, (low, high) in ranges.items()}
         with naming(source):
-            check([self._case(middle)])
+            check([self._case(plain(middle, DIGITS))])
 
-    def find(self, count: int, runner: Runner) -> list[Failure]:
+    def find(self, count: int, fly_cases: Fly) -> list[Failure]:
         """The `count` worst failures that differ; writes worst.csv, and table and page of all
         flights. Raises Incomplete, or UserError."""
-        fly, campaign = runner.fly, self._campaign
+        campaign, flown = self._campaign, dict[str, Case]()
+
+        def fly(cases: Sequence[Case]) -> list[Record]:
+            flown.update((case.key, case) for case in cases)
+            return fly_cases(cases)
+
         failures: dict[tuple[str, tuple[str, ...]], Failure] = {}
         for failure in self._reduced(self._worst(self._flown(fly), CANDIDATES * count), fly):
             failures.setdefault(failure.kind, failure)
         found = self._at_seeds(list(failures.values())[:count], fly)
-        campaign.cases = list(runner.flown.values())
+        campaign.cases = list(flown.values())
         campaign.write(campaign.rows())
         campaign.results.write(campaign.directory / "worst.csv", as_csv(found))
         return found
@@ -112,24 +117,24 @@ class FailureSearch:
         ranges, seeds = len(self._search.ranges), self._search.seeds
         return self._search.flights + count * (CANDIDATES * (1 + ranges) + seeds)
 
-    def _flown(self, fly: Fly) -> list[tuple[Values, Record]]:
+    def _flown(self, fly: Fly) -> list[tuple[Point, Record]]:
         """All values that are flown, with their records. Each round has a study of its own and is
         kept away from the failures of the rounds before it."""
-        flown: list[tuple[Values, Record]] = []
+        flown: list[tuple[Point, Record]] = []
         for study in self._studies:
             failures = self._worst(flown, AVOIDED)
             for _ in range(self._search.flights // (ROUNDS * BATCH)):
                 asked = [ask(study, self._search.ranges) for _ in range(BATCH)]
-                records = fly([self._case(dict(values)) for _, values in asked])
+                records = fly([self._case(values) for _, values in asked])
                 for (trial, values), record in zip(asked, records, strict=True):
                     cost = NO_FAILURE if record.infeasible else record.margin
                     study.tell(trial, cost + self._penalty(values, failures))
                     flown.append((values, record))
         return flown
 
-    def _worst(self, flown: Sequence[tuple[Values, Record]], count: int) -> list[Values]:
+    def _worst(self, flown: Sequence[tuple[Point, Record]], count: int) -> list[Point]:
         """The worst failures that are not near each other."""
-        chosen: list[tuple[Values, Record]] = []
+        chosen: list[tuple[Point, Record]] = []
         for values, record in sorted(flown, key=lambda each: each[1].margin):
             near = any(
                 self._distance(values, other) < NEAR and record.weakest == known.weakest
@@ -139,31 +144,29 @@ class FailureSearch:
                 chosen.append((values, record))
         return [values for values, _ in chosen]
 
-    def _distance(self, values: Values, other: Values) -> float:
+    def _share(self, key: str, change: float) -> float:
+        """A change of a value as a share of its range."""
+        low, high = self._search.ranges[key]
+        return change / (high - low)
+
+    def _distance(self, values: Point, other: Point) -> float:
         """Root mean square of the differences, as shares of the ranges."""
-        shares = [
-            (value - second) / (high - low)
-            for (_, value), (_, second), (low, high) in zip(
-                values, other, self._search.ranges.values(), strict=True
-            )
-        ]
+        shares = [self._share(key, value - other[key]) for key, value in values.items()]
         return math.hypot(*shares) / math.sqrt(len(shares))
 
-    def _penalty(self, values: Values, failures: Sequence[Values]) -> float:
+    def _penalty(self, values: Point, failures: Sequence[Point]) -> float:
         nearest = min((self._distance(values, other) for other in failures), default=NEAR)
         return PENALTY * max(0.0, 1.0 - nearest / NEAR)
 
-    def _reduced(self, points: Sequence[Values], fly: Fly) -> list[Failure]:
+    def _reduced(self, points: Sequence[Point], fly: Fly) -> list[Failure]:
         """The failures at `points`, reduced side by side: values return to their defaults, those
         that are nearest to them first, as long as the flight still fails."""
-        defaults, ranges = self._defaults(), self._search.ranges
+        defaults, reduced = self._defaults(), [*points]
 
-        def change(value: tuple[str, float]) -> float:
-            low, high = ranges[value[0]]
-            return abs(value[1] - defaults[value[0]]) / (high - low)
+        def order(point: Point) -> list[str]:
+            return sorted(point, key=lambda key: abs(self._share(key, point[key] - defaults[key])))
 
-        reduced = [dict(point) for point in points]
-        orders = [[key for key, _ in sorted(point, key=change)] for point in points]
+        orders = [order(point) for point in points]
         records = fly([self._case(values) for values in reduced])
         for keys in zip(*orders, strict=True):
             trials = [
@@ -199,7 +202,7 @@ class FailureSearch:
             middle[SEED] = float(self._base.seed)
         return middle | self._search.defaults
 
-    def _case(self, values: Mapping[str, float]) -> Case:
+    def _case(self, values: Point) -> Case:
         seed = round(values.get(SEED, self._base.seed))
         own = tuple((key, value) for key, value in values.items() if key != SEED)
         return replace(self._base, values=(*self._base.values, *own), seed=seed)

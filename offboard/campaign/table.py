@@ -68,11 +68,6 @@ class Row:
     record: Record
     failed: str
 
-    @property
-    def severity(self) -> tuple[float, str]:
-        """Sorts the worst flight first."""
-        return self.record.margin, self.case.key
-
 
 def row_of(case: Case, record: Record, requirements: Sequence[Requirement]) -> Row:
     """The row of a finished flight: completed, with all requirements met, or why not."""

@@ -20,12 +20,12 @@ import yaml
 from pydantic import AfterValidator, Field
 from scipy import stats
 
-from offboard.campaign.cases import SCENARIO, Case, Values, expand, rounded
+from offboard.campaign.cases import DIGITS, SCENARIO, Case, Values, expand
 from offboard.campaign.document import CampaignFile, Firmware, Name, Names, Ranges, Seed, Seeds
-from offboard.campaign.run import check
-from offboard.campaign.search import Fly, ask, study_of
+from offboard.campaign.run import Fly, check
+from offboard.campaign.search import ask, study_of
 from offboard.campaign.table import CONFIDENCE, METRIC_COLUMNS
-from offboard.documents.errors import DocumentError, naming
+from offboard.documents.errors import DocumentError, naming, plain
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import override, parse, read
 from offboard.documents.shipped import PARTS, locate, read_text
@@ -131,10 +131,10 @@ class Tuning:
         study.enqueue_trial(within)  # the present values first
         for number in range(1, self.file.trials + 1):
             trial, values = ask(study, ranges)
-            costs = self._costs(fly, self._training, values)
+            costs = self._costs(fly, self._training, tuple(values.items()))
             study.tell(trial, sum(costs) / len(costs))
             progress(number, study.best_value)
-        best = tuple((key, rounded(study.best_params[key])) for key in ranges)
+        best = tuple((key, plain(study.best_params[key], DIGITS)) for key in ranges)
         before = self._costs(fly, self._validation, ())
         return judge(before, self._costs(fly, self._validation, best), best)
 

@@ -58,15 +58,15 @@ OpenFlyer = Callable[[], AbstractContextManager[Flyer]]
 class Workers:
     """An open set of `width` workers.
 
-    `open_pool` makes their executor when the first flight begins, and a new one after a worker has
-    died. `lost`: the sentence for a cluster that is gone.
+    `open_pool` makes their executor, and a new one after a worker has died. `lost`: the sentence
+    for a cluster that is gone.
     """
 
     def __init__(self, width: int, open_pool: Callable[[], Executor], lost: str = "") -> None:
         self._width = width
         self._open_pool = open_pool
         self._lost = lost
-        self._pool: Executor | None = None
+        self._pool = open_pool()
 
     def fly(self, jobs: Sequence[Job], ending: Callable[[], bool]) -> Iterator[tuple[Job, Record]]:
         """Fly jobs, as a `Flyer` does, in any order.
@@ -100,8 +100,6 @@ class Workers:
                 yield busy.pop(done), self._record(done)
 
     def _submit(self, job: Job) -> Future[Record]:
-        if self._pool is None:
-            self._pool = self._open_pool()
         try:
             return _masked(self._pool, job)
         except BrokenExecutor:

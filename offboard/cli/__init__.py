@@ -8,15 +8,7 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import NoReturn
 
-    from typer import Typer
-
 
 def main() -> NoReturn:
     """Run the command in `sys.argv` and exit. Errors of the user are printed as sentences."""
-    run(_app)
-
-
-def _app() -> Typer:
-    from offboard.cli.commands import app
-
-    return app
+    run("offboard.cli.commands")

@@ -145,8 +145,8 @@ def _search(flown: Campaign, source: str, count: int, open_workers: OpenFlyer) -
 
     search = FailureSearch(flown, source)
     progress = Progress(out, search.flights_most(count))
-    with resumable(), flown.runner(open_workers, progress) as runner:
-        failures = search.find(count, runner)
+    with resumable(), flown.flying(open_workers, progress) as fly:
+        failures = search.find(count, fly)
     unflown = sum(row.record.infeasible for row in flown.rows())
     cannot = f", {unflown} cannot be flown (the table says why)" if unflown else ""
     say(f"{len(flown.cases)} flights{cannot}, {len(failures)} failures that differ")
@@ -265,7 +265,7 @@ def tune(
     with out.status("planning"):
         from offboard.campaign.document import Promises
         from offboard.campaign.results import Results, code_hash
-        from offboard.campaign.run import Progress, Runner
+        from offboard.campaign.run import Progress, flying
         from offboard.campaign.tune import Tuning, read_tune
         from offboard.campaign.tune import profile as text_of
         from offboard.campaign.workers import local_workers
@@ -275,10 +275,10 @@ def tune(
     progress = Progress(out, tuning.flights)
     with (
         resumable(),
-        Runner(results, Promises(), partial(local_workers, workers), progress) as runner,
+        flying(results, Promises(), partial(local_workers, workers), progress) as fly,
     ):
         tuned = tuning.run(
-            runner.fly,
+            fly,
             lambda number, cost: say(f"{number} of {tuning.file.trials} trials, best {cost:.4g}"),
         )
     for key, value in tuned.values:

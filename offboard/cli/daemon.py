@@ -12,6 +12,7 @@ import typer
 
 from offboard.cli.shared import (
     FLIGHTS,
+    REFUSED,
     FlightOptions,
     Report,
     grouped,
@@ -25,7 +26,6 @@ from offboard.documents.errors import UserError
 from offboard.documents.shipped import is_file
 
 STATE = Path("/var/lib/offboard")  # of the unit
-REFUSED = 3
 OUT = f"Directory of the flights' directories.  [default: {FLIGHTS}]"
 
 

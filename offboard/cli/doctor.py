@@ -10,6 +10,7 @@ import typer
 
 from offboard.cli.shared import (
     FLIGHTS,
+    REFUSED,
     FlightOptions,
     err,
     grouped,
@@ -20,8 +21,6 @@ from offboard.cli.shared import (
 
 if TYPE_CHECKING:
     from offboard.doctor.run import Row
-
-REFUSED = 3
 
 
 @grouped

@@ -184,7 +184,7 @@ def identify(
     the log cannot be read. If the flight with --connect or --sitl fails: those of `offboard
     fly`.
     """
-    from offboard.analysis import history, tlog
+    from offboard.analysis import tlog
     from offboard.analysis.identify import identify_flight, vehicle_file
     from offboard.link import clock
     from offboard.report.fits import fits
@@ -207,20 +207,14 @@ def identify(
         raise UserError(
             "a log needs no --system, --out or other options of a flight; --vehicle may be given"
         )
-    path = tlog.find(flight)
-    log = tlog.read(path)
-    configuration = history.configuration(log)
-    if options.vehicle is None and configuration is not None:
-        prior = flown(configuration).vehicle
-    else:
-        prior = options.load().vehicle
     recorded = read(flight)
+    known = None if options.vehicle else recorded.configuration
+    prior = (flown(known) if known is not None else options.load()).vehicle
     if recorded.history.damage:
         complain(recorded.history.damage)
     found, trace = identify_flight(recorded.history, prior)
-    name = flight.name or flight.resolve().name
-    text = vehicle_file(found, prior, name)
-    shown = free_name((output or path).with_name("identify.html"))
+    text = vehicle_file(found, prior, recorded.name)
+    shown = free_name((output or tlog.find(flight)).with_name("identify.html"))
     write_new(shown, page([recorded], fits(found, trace, prior)))
     if not found.supported:
         raise UserError(f"nothing could be identified from this flight; {shown} says why", 1)

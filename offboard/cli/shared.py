@@ -41,6 +41,7 @@ out = Output(highlight=False)
 err = Console(stderr=True, highlight=False)
 
 DEFAULT_CONNECTION = "udpin:127.0.0.1:14540"
+REFUSED = 3  # exit code
 FLIGHTS = Path("flights")  # parent of the flight directories that have no --out
 
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 import errno
 import os
 import sys
+from importlib import import_module
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from typing import NoReturn, TextIO
 
 USAGE, INTERRUPT, CLOSED_PIPE = 2, 130, 141  # exit codes; the last two as of SIGINT and SIGPIPE
@@ -20,8 +20,9 @@ INTERRUPTED = "interrupted"
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 
-def run(load: Callable[[], Callable[[], object]]) -> NoReturn:
-    """Import a command with `load`, call it, and exit.
+def run(module: str, arguments: list[str] | None = None) -> NoReturn:
+    """Import the `app` of a module, call it with these arguments, by default those of this process,
+    and exit.
 
     A UserError is printed without a traceback and exits with its `code`; a lack of memory, and an
     error of a file or of the output, with 2; an interrupt with 130. Where nobody reads the output
@@ -33,7 +34,7 @@ def run(load: Callable[[], Callable[[], object]]) -> NoReturn:
     # text that the encoding of the output does not have is escaped
     sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     try:
-        load()()
+        import_module(module).app(arguments)
         sentence, code = "", 0
     except SystemExit as ended:
         sentence, code = "", ended.code if isinstance(ended.code, int) else 0

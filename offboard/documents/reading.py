@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
 M = TypeVar("M", bound=BaseModel)
-Json = dict[str, Any]
 DESCRIPTION_SIZE = 200
 PROBLEMS_MOST = 10
 
@@ -56,7 +55,9 @@ _WORDS: dict[str, Any] = {
 
 class Section(dict[str, Any]):
     """A mapping of a file. `places`: where each of its keys stands, or the option that set it, for
-    errors."""
+    errors; `description`: of the whole file."""
+
+    description = ""
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         super().__init__(values)
@@ -78,14 +79,24 @@ def parse(text: str, model: type[M], source: str, kind: str = "") -> M:
     return validate(raw, model, source)
 
 
-def read(text: str, source: str) -> Json:
+def read(text: str, source: str) -> Section:
     """YAML `text` -> the raw mapping, not yet validated. An empty document is an empty mapping.
 
     Every file may have a `description`: one line for people, which `offboard list` prints. It
-    describes the file and is no part of the configuration: left out here, so that it is not
+    describes the file and is no part of the configuration: taken out here, so that it is not
     recorded with values that --set has changed since.
     """
-    return _document(text, source)[0]
+    value = _loaded(text, source)
+    value = Section({}) if value is None else value
+    if not isinstance(value, Section):
+        raise DocumentError(f"{source}: expected a mapping of keys to values, not {shown(value)}")
+    line = value.description = value.pop("description", "")
+    if not isinstance(line, str) or len(line) > DESCRIPTION_SIZE:
+        raise DocumentError(
+            f"{source}: description: {shown(line)} should be text of at most {DESCRIPTION_SIZE} "
+            "characters"
+        )
+    return value
 
 
 def kind_of(raw: Mapping[str, Any]) -> str:
@@ -100,27 +111,7 @@ def check_kind(raw: Mapping[str, Any], wanted: str, source: str) -> None:
         raise DocumentError(f"{source} is a {found} file; a {wanted} file is needed here")
 
 
-def description(text: str, source: str) -> str:
-    """The `description` of a YAML file, empty without one. Raises DocumentError."""
-    return _document(text, source)[1]
-
-
-def _document(text: str, source: str) -> tuple[Json, str]:
-    value = _loaded(text, source)
-    if value is None:
-        return {}, ""
-    if not isinstance(value, dict):
-        raise DocumentError(f"{source}: expected a mapping of keys to values, not {shown(value)}")
-    line = value.pop("description", "")
-    if not isinstance(line, str) or len(line) > DESCRIPTION_SIZE:
-        raise DocumentError(
-            f"{source}: description: {shown(line)} should be text of at most {DESCRIPTION_SIZE} "
-            "characters"
-        )
-    return value, line
-
-
-def override(mapping: Mapping[str, Any], assignment: str, option: str = "") -> Json:
+def override(mapping: Mapping[str, Any], assignment: str, option: str = "") -> Section:
     """A copy of the raw `mapping` with one `key.path=value` of the command line applied.
 
     The value is YAML; a number in the path indexes a list. Keys are not checked here but in
@@ -132,7 +123,7 @@ def override(mapping: Mapping[str, Any], assignment: str, option: str = "") -> J
     keys = [key.strip() for key in path.split(".")]
     if not separator or not all(keys):
         raise DocumentError(f"{option}: expected key.path=value")
-    changed: Json = _with(mapping, keys, _loaded(text, option), option)
+    changed: Section = _with(mapping, keys, _loaded(text, option), option)
     return changed
 
 
@@ -150,30 +141,17 @@ def validate(
         return model.model_validate_json(json.dumps(mapping), strict=True, extra=extra)
     except ValidationError as error:
         details = error.errors(include_url=False)
-        problems = [
-            f"{_origin(detail, mapping, source)}: {_sentence(detail, mapping, model)}"
-            for detail in details[:PROBLEMS_MOST]
-        ]
+        problems = []
+        for detail in details[:PROBLEMS_MOST]:
+            path, origin = _key_path(detail, mapping, source)
+            problems.append(f"{origin}: {_sentence(detail, abridged(path), model)}")
         if len(details) > PROBLEMS_MOST:
             problems.append(f"{source}: and {len(details) - PROBLEMS_MOST} more problems")
         raise DocumentError(*problems) from None
 
 
-def _origin(detail: ErrorDetails, mapping: Mapping[str, Any], source: str) -> str:
-    """What set the value: the place of its key in a file, or an option."""
-    value: Any = mapping
-    for key in _key_path(detail, mapping).split("."):
-        source = getattr(value, "places", {}).get(key, source)
-        if isinstance(value, Mapping):
-            value = value.get(key)
-        elif isinstance(value, list) and key in map(str, range(len(value))):
-            value = value[int(key)]
-    return source
-
-
-def _sentence(detail: ErrorDetails, document: Any, model: type[BaseModel]) -> str:
+def _sentence(detail: ErrorDetails, path: str, model: type[BaseModel]) -> str:
     """The sentence for one error of pydantic."""
-    path = abridged(_key_path(detail, document))
     kind, context = detail["type"], detail.get("ctx", {})
     if kind == "extra_forbidden":
         return _unknown_key(path, model)
@@ -204,8 +182,9 @@ def _unknown_key(path: str, model: type[BaseModel]) -> str:
     return f"{path} is not a known key{meant(key, known)}{all_known}"
 
 
-def _key_path(detail: ErrorDetails, document: Any) -> str:
-    """The dotted path of the key that an error of pydantic is about.
+def _key_path(detail: ErrorDetails, document: Any, source: str) -> tuple[str, str]:
+    """The dotted path of the key that an error of pydantic is about, and what set it: the place of
+    its key in a file, or an option.
 
     pydantic's location also holds the names of union members; these are no keys of `document`.
     """
@@ -215,11 +194,12 @@ def _key_path(detail: ErrorDetails, document: Any) -> str:
         has_key = isinstance(value, Mapping) and part in value
         has_index = isinstance(value, list) and isinstance(part, int) and part < len(value)
         if has_key or has_index:
+            source = getattr(value, "places", {}).get(part, source)
             value = value[part]
             keys.append(str(part))
     if detail["type"] == "missing":
         keys.append(str(detail["loc"][-1]))
-    return ".".join(keys)
+    return ".".join(keys), source
 
 
 def _loaded(text: str, source: str) -> Any:

@@ -40,10 +40,10 @@ def names(kind: str) -> list[str]:
 
 def descriptions(kind: str) -> dict[str, str]:
     """Name -> description of the files of one kind."""
-    from offboard.documents.reading import description  # late: --help needs no YAML
+    from offboard.documents.reading import read  # late: --help needs no YAML
 
     paths = {name: directory() / FOLDERS[kind] / f"{name}.yaml" for name in names(kind)}
-    return {name: description(read_text(path), str(path)) for name, path in paths.items()}
+    return {name: read(read_text(path), str(path)).description for name, path in paths.items()}
 
 
 def overview(*kinds: str) -> str:

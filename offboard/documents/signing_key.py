@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import secrets
 import stat
 from functools import partial
@@ -23,6 +24,10 @@ KEY_BYTES = 32
 PASSPHRASE_MIN = 16  # characters
 FILE_BYTES_MAX = 4096
 _OTHERS = stat.S_IRWXG | stat.S_IRWXO
+_KEY = re.compile(
+    rb"passphrase:\s*(?P<passphrase>\S.{%d,})|key:\s*(?P<key>[0-9a-fA-F]{%d})"
+    % (PASSPHRASE_MIN - 1, 2 * KEY_BYTES)
+)
 _EXPECTED = (
     f"expected one line, 'passphrase: TEXT' with at least {PASSPHRASE_MIN} characters or "
     "'key: ' and 64 hexadecimal digits; `offboard key` makes a file"
@@ -73,15 +78,9 @@ def _key_in(content: bytes, shown: str) -> bytes:
     """The key that the file's content gives."""
     rows = [row.strip() for row in content.splitlines()]
     rows = [row for row in rows if row and not row.startswith(b"#")]
-    kind, _, value = rows[0].partition(b":") if len(rows) == 1 else (b"", b"", b"")
-    value = value.strip()
-    if kind == b"passphrase" and len(value) >= PASSPHRASE_MIN:
-        return hashlib.sha256(value).digest()
-    if kind == b"key" and len(value) == 2 * KEY_BYTES:
-        try:
-            key = bytes.fromhex(value.decode("ascii"))
-        except ValueError:
-            key = b""
-        if len(key) == KEY_BYTES and any(key):  # all zero means no signing
-            return key
+    found = _KEY.fullmatch(rows[0]) if len(rows) == 1 else None
+    if found and found["passphrase"]:
+        return hashlib.sha256(found["passphrase"]).digest()
+    if found and any(key := bytes.fromhex(found["key"].decode())):  # all zero means no signing
+        return key
     raise UserError(f"{shown} is too short or no key file: {_EXPECTED}")

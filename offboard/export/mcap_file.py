@@ -15,15 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from offboard.analysis.history import PHASES, History, Rows
+from offboard.analysis.history import History, Rows
 from offboard.documents.errors import UserError, install
 from offboard.export.series import (
     COLUMNS,
     PHASE,
     Array,
     events_of,
+    samples,
     series_of,
-    values_of,
 )
 from offboard.link.log import new_file
 from offboard.model.frames import enu, flu_in_enu
@@ -105,16 +105,9 @@ def _channel(writer: Any, register: Any, topic: str, message: Any) -> int:
 
 
 def _rows(name: str, rows: Rows, stamps: Stamps) -> Iterator[Stamped]:
-    """JSON has no NaN: what is not known is left out."""
-    times = rows["time_s"]
-    for stamp_ns, time_s, row in zip(
-        stamps(times), times.tolist(), values_of(rows).tolist(), strict=True
+    for stamp_ns, (time_s, _, known) in zip(
+        stamps(rows["time_s"]), samples(name, rows), strict=True
     ):
-        known = {
-            column: PHASES[int(value)] if column == PHASE else value
-            for column, value in zip(COLUMNS[name], row, strict=True)
-            if math.isfinite(value)
-        }
         yield stamp_ns, f"/table/{name}", {"vehicle_time_s": time_s, **known}
 
 

@@ -11,6 +11,7 @@ import heapq
 import io
 import math
 from collections.abc import Iterator
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -81,7 +82,19 @@ def events_of(flown: History) -> list[Event]:
 def values_of(rows: Rows) -> Array:
     """Values (N, columns), in the order of COLUMNS."""
     names = [name for name in rows.dtype.names or () if name not in ("time_s", "unix_s")]
-    return np.column_stack([rows[name] for name in names])
+    return np.column_stack([rows[name] for name in names]).astype(np.float64)
+
+
+def samples(name: str, rows: Rows) -> Iterator[tuple[float, float, dict[str, Any]]]:
+    """Both times of each sample, and what is known of it, by column; a phase by its name."""
+    times = rows["time_s"].tolist(), rows["unix_s"].tolist()
+    for time_s, unix_s, values in zip(*times, values_of(rows).tolist(), strict=True):
+        known = {
+            column: PHASES[int(value)] if column == PHASE else value
+            for column, value in zip(COLUMNS[name], values, strict=True)
+            if math.isfinite(value)
+        }
+        yield time_s, unix_s, known
 
 
 def write_csv(flown: History, path: Path) -> None:
@@ -93,34 +106,21 @@ def write_csv(flown: History, path: Path) -> None:
     """
     found = series_of(flown)
     columns = [column for name in found for column in COLUMNS[name]]
-    rows = [_csv_rows(name, each, columns) for name, each in found.items()]
-    blank = [""] * len(columns)
-    events: Iterator[list[Any]] = (
-        [e.time_s, e.unix_s, EVENT, *blank, f"{e.who}: {e.what}"] for e in events_of(flown)
+    events = (
+        _row(e.time_s, e.unix_s, EVENT, {EVENT: f"{e.who}: {e.what}"}) for e in events_of(flown)
     )
+    rows = [_csv_rows(name, each) for name, each in found.items()]
     with new_file(path) as file, io.TextIOWrapper(file, "utf-8", newline="") as text:
-        writer = csv.writer(text)
-        writer.writerow(["vehicle_time_s", "unix_time_s", "source", *columns, EVENT])
-        writer.writerows(heapq.merge(*rows, events, key=_time_s))
+        writer = csv.DictWriter(text, (*_row(0.0, 0.0, "", {}), *columns, EVENT))
+        writer.writeheader()
+        writer.writerows(heapq.merge(*rows, events, key=itemgetter("vehicle_time_s")))
 
 
-def _csv_rows(name: str, rows: Rows, columns: list[str]) -> Iterator[list[Any]]:
-    """One for each sample, with the columns of all series, in the order of time."""
-    rows = rows[np.argsort(rows["time_s"], kind="stable")]
-    before = columns.index(COLUMNS[name][0])
-    after = len(columns) - before - len(COLUMNS[name]) + 1  # and no event
-    for time_s, unix_s, values in zip(
-        rows["time_s"].tolist(), rows["unix_s"].tolist(), values_of(rows).tolist(), strict=True
-    ):
-        cells = [_cell(*each) for each in zip(COLUMNS[name], values, strict=True)]
-        yield [time_s, unix_s, name, *[""] * before, *cells, *[""] * after]
+def _csv_rows(name: str, rows: Rows) -> Iterator[dict[str, Any]]:
+    """One for each sample, in the order of time."""
+    for time_s, unix_s, known in samples(name, rows[np.argsort(rows["time_s"], kind="stable")]):
+        yield _row(time_s, unix_s, name, known)
 
 
-def _time_s(row: Any) -> float:
-    return float(row[0])
-
-
-def _cell(column: str, value: float) -> float | str:
-    if math.isnan(value):
-        return ""
-    return PHASES[int(value)] if column == PHASE else value
+def _row(time_s: float, unix_s: float, source: str, cells: dict[str, Any]) -> dict[str, Any]:
+    return {"vehicle_time_s": time_s, "unix_time_s": unix_s, "source": source, **cells}

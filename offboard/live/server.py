@@ -18,7 +18,7 @@ from contextlib import suppress
 from typing import Any
 
 from aiohttp import web
-from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Metric, generate_latest
+from prometheus_client import CONTENT_TYPE_LATEST, Metric, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
 from prometheus_client.registry import Collector
 
@@ -42,21 +42,17 @@ _NICENESS = 5
 _TRACE = ("time_s", "position_ned_m", "reference_ned_m", "position_error_m", "telemetry_age_s")
 
 
-class Metrics(Collector):
-    """What a monitor reads. `show` hands over a snapshot as it is in JSON, the `newest`."""
+class Broadcast(Collector):
+    """Passes each snapshot on to all clients, and keeps what the curves of the page and a monitor
+    need: the `newest` is as it is in JSON."""
 
     def __init__(self) -> None:
         self.newest: dict[str, Any] = {}
         self._shown_s = -math.inf
-        self._registry = CollectorRegistry(auto_describe=False)
-        self._registry.register(self)
-
-    def show(self, snapshot: dict[str, Any]) -> None:
-        self.newest, self._shown_s = snapshot, clock.monotonic_s()
-
-    def text(self) -> bytes:
-        """The metrics in the text format of Prometheus."""
-        return generate_latest(self._registry)
+        self._clients: dict[asyncio.Queue[str | None], web.RequestHandler] = {}
+        self._kept: deque[dict[str, Any]] = deque(maxlen=KEPT)
+        self._texts: deque[dict[str, Any]] = deque(maxlen=TEXTS_KEPT)
+        self._flight: dict[str, Any] = {}
 
     def health(self) -> dict[str, Any]:
         """`healthy` if the loop runs and the vehicle is heard, else the `reason`; the snapshot."""
@@ -82,22 +78,11 @@ class Metrics(Collector):
         states = {name: str(now[name]) for name in STATES}
         yield InfoMetricFamily("offboard_state", "State of the present flight.", states)
 
-
-class Broadcast:
-    """Passes each snapshot on to all clients, and keeps what the curves of the page need."""
-
-    def __init__(self) -> None:
-        self.metrics = Metrics()
-        self._clients: dict[asyncio.Queue[str | None], web.RequestHandler] = {}
-        self._kept: deque[dict[str, Any]] = deque(maxlen=KEPT)
-        self._texts: deque[dict[str, Any]] = deque(maxlen=TEXTS_KEPT)
-        self._flight: dict[str, Any] = {}
-
     def publish(self, text: str) -> None:
         """A snapshot, an announcement, or what is known of the flight, as JSON text."""
         message = json.loads(text)
         if message["type"] == "snapshot":
-            self.metrics.show(message)
+            self.newest, self._shown_s = message, clock.monotonic_s()
             self._kept.append({name: message[name] for name in _TRACE})
         elif message["type"] == "announcement":
             self._texts.append(message)
@@ -124,7 +109,7 @@ class Broadcast:
         )
         queue: asyncio.Queue[str | None] = asyncio.Queue(CLIENT_QUEUE)
         known = {"rows": list(self._kept), "texts": list(self._texts), "flight": self._flight}
-        queue.put_nowait(line("history", newest=self.metrics.newest or None, **known))
+        queue.put_nowait(line("history", newest=self.newest or None, **known))
         self._clients[queue] = request.protocol
         with suppress(ConnectionError, TimeoutError, asyncio.TimeoutError):
             await response.prepare(request)
@@ -163,11 +148,11 @@ def application(broadcast: Broadcast) -> web.Application:
         return web.Response(text=shown, content_type="text/html")
 
     async def metrics(request: web.Request) -> web.Response:
-        text = broadcast.metrics.text()
+        text = generate_latest(broadcast)
         return web.Response(body=text, headers={"Content-Type": CONTENT_TYPE_LATEST})
 
     async def health(request: web.Request) -> web.Response:
-        answer = broadcast.metrics.health()
+        answer = broadcast.health()
         return web.json_response(answer, status=200 if answer["healthy"] else 503)
 
     made = web.Application()

@@ -299,10 +299,10 @@ def damped(damping: float, **swarm: float) -> PaperSettings:
 
 
 class Flights:
-    """The flights of one run of the study, each flown once; `on_flight` is called before each.
-    `seeds`: flights per row of a table."""
+    """The flights of one run of the study, each flown once; `on_flight` is called after each with
+    their number. `seeds`: flights per row of a table."""
 
-    def __init__(self, seeds: int = 1, on_flight: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, seeds: int = 1, on_flight: Callable[[int], None] = lambda _: None) -> None:
         self.seeds = seeds
         self._on_flight = on_flight
         self._flown: dict[FlightTask, Flight] = {}
@@ -310,8 +310,8 @@ class Flights:
     def __call__(self, task: FlightTask) -> Flight:
         """The flight of `task`."""
         if task not in self._flown:
-            self._on_flight()
             self._flown[task] = fly(task)
+            self._on_flight(len(self._flown))
         return self._flown[task]
 
     def by_seed(

@@ -12,7 +12,6 @@ from importlib import metadata
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from offboard.analysis.page import Figure, render
 from offboard.documents.errors import UserError
@@ -71,37 +70,31 @@ def reproduce(
         raise UserError(f"{out} cannot be written: {error.strerror or error}") from None
     labels = list(dict.fromkeys(labels)) or sorted(MAKERS, key=lambda label: label[0] == "f")
     made: dict[str, Table | Figure] = {}
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
-    progress = Progress(*columns, TimeElapsedColumn(), console=console)
-    bar = progress.add_task("paper", total=len(labels))
-    count = 0
-
-    def on_flight() -> None:
-        nonlocal count
-        count += 1
-        progress.update(bar, description=f"{label}: flight {count}")
-
-    flights = Flights(seeds, on_flight)
-    with progress:
+    with console.status("") as status:
+        flights = Flights(
+            seeds,
+            lambda flown: status.update(
+                f"{len(made)} of {len(labels)} are made; {label}: flight {flown}"
+            ),
+        )
         for label in labels:
-            progress.update(bar, description=label)
             made[label] = piece = MAKERS[label](flights)
             text, end = (
                 (piece.to_csv(), "csv") if isinstance(piece, Table) else (piece.to_json(), "json")
             )
             (out / f"{label.replace(' ', '_')}.{end}").write_text(text, encoding="utf-8")
-            progress.advance(bar)
     facts = {"pso-offboard": metadata.version("pso-offboard"), "seeds per row": str(seeds)}
     sections = {
-        title: {label: made[label] for label in pieces if label in made}
+        title: found
         for title, pieces in SECTIONS.items()
+        if (found := {label: made[label] for label in pieces if label in made})
     }
     page = render(
         "paper/page.html",
         title=TITLE,
         doi=DOI,
         facts=facts,
-        sections={title: pieces for title, pieces in sections.items() if pieces},
+        sections=sections,
         shown=shown,
     )
     (out / PAGE).write_text(page, encoding="utf-8")

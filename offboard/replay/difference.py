@@ -6,16 +6,17 @@ from __future__ import annotations
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from offboard.analysis.tlog import layout, name_of
+from offboard.analysis.tlog import LoggedMessage, layout, name_of
 from offboard.documents.errors import UserError
+from offboard.flight.record import TurnInput
 from offboard.mavlink.framing import SETPOINTS
 from offboard.mavlink.senders import COMMANDS
-from offboard.replay.replaying import Recording, Replay, Sent, Turn
+from offboard.replay.replaying import Recording, Replay, Sent
 
 # Of a field, relative to its value or to 1: another processor or library rounds differently, by up
 # to 1e-8 rad and 6e-8 of thrust between two x86-64 processors
@@ -110,7 +111,7 @@ def compare(expected: Iterable[Sent], actual: Iterable[Sent]) -> Comparison:
     """Compare the payloads of setpoints and commands. A message is compared with the one of the
     same kind and stamp that was sent at the same vehicle time."""
     first, second = _by_key(expected), _by_key(actual)
-    keys = sorted(first.keys() | second.keys(), key=lambda key: key[0])
+    keys = sorted(first.keys() | second.keys())
     differences = tuple(
         Difference(first.get(key), second.get(key))
         for key in keys
@@ -149,8 +150,8 @@ def _fields(sent: Sent) -> dict[str, float]:
 def verdict(replay: Replay, tell: Callable[[str], object] = str) -> Comparison:
     """Replay a flight to its end and compare it with its log. `tell` is called with sentences about
     the progress. Raises UserError if nothing can be compared."""
-    for turn in replay.turns():
-        if turn.number % TOLD_EVERY == 0:
+    for _ in replay.turns():
+        if replay.count % TOLD_EVERY == 0:
             tell(f"replayed up to {replay.ended_s:.0f} s of vehicle time")
     comparison = compare(replay.recorded, replay.replayed)
     if not comparison.compared.total():
@@ -180,21 +181,21 @@ def _input(recording: Recording, difference: Difference) -> list[str]:
     replay = Replay(recording)
     number = difference.actual.turn if difference.actual else None
     for turn in replay.turns():
-        due = replay.ended_s >= difference.time_s if number is None else turn.number == number
+        due = replay.ended_s >= difference.time_s if number is None else replay.count == number
         if due:
             tick = int(replay.ended_s / replay.config.period_s + 1e-6)
-            lines = [f"decided in turn {turn.number}, tick {tick}, which was given:"]
-            rows = _received(turn) or [("nothing", "no message had arrived")]
+            lines = [f"decided in turn {replay.count}, tick {tick}, which was given:"]
+            rows = _received(*turn) or [("nothing", "no message had arrived")]
             return lines + [f"  {when}: {names}" for when, names in rows]
     return []
 
 
-def _received(turn: Turn) -> list[tuple[str, str]]:
+def _received(given: TurnInput, received: Sequence[LoggedMessage]) -> list[tuple[str, str]]:
     """The messages that a turn was given, and how long before it they arrived."""
-    frames = iter(turn.received)
+    frames = iter(received)
     rows: list[tuple[str, str]] = []
-    for chunk in turn.given.chunks:
+    for chunk in given.chunks:
         names = [next(frames).name for _ in range(chunk.frames)]
-        age_ms = 1e3 * (turn.given.now_s - chunk.arrived_s)
+        age_ms = 1e3 * (given.now_s - chunk.arrived_s)
         rows.append((f"{age_ms:.3f} ms before", ", ".join(names) or "nothing that was used"))
     return rows

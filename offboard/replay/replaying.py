@@ -98,13 +98,7 @@ class Sent:
     turn: int | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Turn:
-    """One turn: its number, and what it was given."""
-
-    number: int
-    given: TurnInput
-    received: tuple[LoggedMessage, ...]
+Turn = tuple[TurnInput, list[LoggedMessage]]  # what it was given, and the messages in that
 
 
 class Accepted(Signing):
@@ -214,7 +208,7 @@ class Replay:
         if frames is not None:
             self._leaving = [self._sent(frame) for frame in frames]
             self.companion.finish_turn(math.nan)  # it was not sent
-        return Turn(self.count, given, tuple(received))
+        return given, received
 
     def _frames(self, chunks: list[Chunk], now_s: float) -> tuple[bytes, ...] | None:
         try:

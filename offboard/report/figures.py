@@ -97,20 +97,15 @@ def figures(flights: Sequence[Flight]) -> dict[str, Figure]:
 
 
 def _path(drawn: Sequence[DrawnFlight]) -> Figure | None:
-    figure = go.Figure()
-    for one in drawn:
-        flown = one.flight.history
-        alone = not one.label
-        parts = [("estimated", flown.position, one.colour, "solid")]
-        if alone:
-            parts.append(("true (simulator)", flown.truth, ORANGE, "solid"))
-        if alone or one is drawn[0]:
-            parts.append(("reference", flown.reference, INK, "dash"))
-        for name, rows, colour, dash in parts:
-            if not len(rows):
-                continue
-            label = one.label if one.label and name == "estimated" else name
-            figure.add_trace(_path_of(rows, label, colour, dash))
+    first = drawn[0].flight.history
+    lines = [
+        (one.label or "estimated", one.flight.history.position, one.colour, "solid")
+        for one in drawn
+    ]
+    lines.insert(1, ("reference", first.reference, INK, "dash"))
+    if len(drawn) == 1:
+        lines.insert(1, ("true (simulator)", first.truth, ORANGE, "solid"))
+    figure = go.Figure([_path_of(*line) for line in lines if len(line[1])])
     if not figure.data:
         return None
     scene = {
@@ -126,7 +121,7 @@ def _path(drawn: Sequence[DrawnFlight]) -> Figure | None:
     return Figure("Path", figure, caption)
 
 
-def _path_of(rows: Rows, name: str, colour: str, dash: str) -> go.Scatter3d:
+def _path_of(name: str, rows: Rows, colour: str, dash: str) -> go.Scatter3d:
     chosen = rows[np.linspace(0, len(rows) - 1, min(len(rows), PATH_POINTS)).astype(int)]
     north, east, down = chosen["position_ned_m"].T
     return go.Scatter3d(  # east, north, up: right-handed, as plotly draws them

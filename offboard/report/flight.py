@@ -32,13 +32,14 @@ _TELEMETRY = (
 @dataclass(frozen=True, slots=True)
 class Flight:
     """One log. `facts` are name and value; `missing` has a sentence for each thing that the log
-    lacks."""
+    lacks; `configuration`: see `history.configuration`."""
 
     name: str
     history: History
     score: Score
     facts: dict[str, str]
     missing: tuple[str, ...]
+    configuration: str | None
 
     @property
     def track_s(self) -> float:
@@ -79,15 +80,16 @@ def read(path: Path) -> Flight:
         missing.append(
             f"the log ends within an entry, at byte {log.path.stat().st_size - log.truncated}"
         )
+    configuration = history.configuration(log)
     facts = {
         "log": str(log.path),
         "begun": f"{np.datetime64(next(iter(log)).unix_us, 'us').item():%Y-%m-%d %H:%M:%S} UTC",
         "autopilot": flown.dialect.name if flown.dialect else "unknown",
-        **_configured(history.configuration(log)),
+        **_configured(configuration),
         "messages": f"{flown.messages.total()} in {flown.wall_s:.1f} s of computer time",
     }
     name = path.name or path.resolve().name
-    return Flight(name, flown, score(flown), facts, tuple(missing))
+    return Flight(name, flown, score(flown), facts, tuple(missing), configuration)
 
 
 def _configured(text: str | None) -> dict[str, str]:

@@ -48,7 +48,7 @@ class Panel:
 # ---------------------------------------------------------------------- sources
 
 
-def _column(array: str, column: str, axis: int | None = None, scale: float = 1.0) -> Source:
+def _column(array: str, column: str, scale: float = 1.0, axis: int | None = None) -> Source:
     def samples(flown: History) -> Points:
         rows = getattr(flown, array)
         values = rows[column] if axis is None else rows[column][:, axis]
@@ -58,7 +58,7 @@ def _column(array: str, column: str, axis: int | None = None, scale: float = 1.0
 
 
 def _recorded(field: str, scale: float = 1.0) -> Source:
-    return _column("records", field, None, scale)
+    return _column("records", field, scale)
 
 
 def _away(array: str, axis: int | None = None) -> Source:
@@ -124,10 +124,10 @@ GROUPS: dict[str, tuple[str, tuple[Panel, ...]]] = {
             for axis, (name, colour, dash) in enumerate(AXES)
         )),
         Panel("height, m", (
-            Curve(ESTIMATED, _column("position", "position_ned_m", 2, -1.0), BLUE),
-            Curve(TRUE, _column("truth", "position_ned_m", 2, -1.0), ORANGE, main=False),
-            Curve("reference", _column("reference", "position_ned_m", 2, -1.0), INK, main=False,
-                  dash="dash"),
+            Curve(ESTIMATED, _column("position", "position_ned_m", -1.0, axis=2), BLUE),
+            Curve(TRUE, _column("truth", "position_ned_m", -1.0, axis=2), ORANGE, main=False),
+            Curve("reference", _column("reference", "position_ned_m", -1.0, axis=2), INK,
+                  main=False, dash="dash"),
         )),
         Panel("speed, m/s", (Curve(ESTIMATED, _speed, BLUE),)),
     )),
@@ -146,7 +146,7 @@ GROUPS: dict[str, tuple[str, tuple[Panel, ...]]] = {
         )),
         Panel("battery, %", (Curve("remaining", _column("battery", "remaining"), BLUE, "steps"),)),
         Panel("battery, V", (
-            Curve("voltage", _column("battery", "voltage_mv", None, 1e-3), BLUE, "steps"),
+            Curve("voltage", _column("battery", "voltage_mv", 1e-3), BLUE, "steps"),
         )),
     )),
     "decisions": ("Decisions", (
@@ -164,7 +164,7 @@ GROUPS: dict[str, tuple[str, tuple[Panel, ...]]] = {
     "link": ("Link", (
         Panel("age and delay, ms", (
             Curve("telemetry at its setpoint", _recorded("age_s", 1e3), BLUE, "dots"),
-            Curve("delay of the link (TIMESYNC)", _column("link_delay", "delay_s", None, 1e3),
+            Curve("delay of the link (TIMESYNC)", _column("link_delay", "delay_s", 1e3),
                   ORANGE, main=False),
             Curve("telemetry in to setpoint out (host time)", _recorded("answer_s", 1e3), GREEN,
                   "dots", main=False),

@@ -29,12 +29,7 @@ def page(flights: Sequence[Flight], fits: Mapping[str, Any] | None = None) -> st
         rows=rows(flights),
         metrics=METRICS,
         letters=[] if alone else [letter(place) for place in range(len(flights))],
-        events=[
-            (f"{e.time_s:.2f}" if math.isfinite(e.time_s) else "", e.who, e.what)
-            for e in flights[0].history.events()
-        ]
-        if alone
-        else [],
+        events=flights[0].history.events() if alone else [],
     )
 
 

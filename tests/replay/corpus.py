@@ -90,14 +90,14 @@ def add(flight: Path, name: str) -> None:
     """Keep what a replay needs of a flight, compressed."""
     recording = read(flight)
     replay = Replay(recording)
-    turns = {turn.number: turn.received for turn in replay.turns()}
+    turns = {number: received for number, (_, received) in enumerate(replay.turns(), 1)}
     packed = lzma.compress(thinned(recording, turns), preset=9 | lzma.PRESET_EXTREME)
     (FLIGHTS / f"{name}.tlog.xz").write_bytes(packed)
     write_expected(name, replay.recorded)
     print(f"{name}: {len(packed)} bytes, {len(replay.recorded)} frames sent")
 
 
-def thinned(recording: Recording, turns: dict[int, tuple[LoggedMessage, ...]]) -> bytes:
+def thinned(recording: Recording, turns: dict[int, list[LoggedMessage]]) -> bytes:
     """A log with the configuration, the messages that are used or compared, and the inputs."""
     received = {message.frame.raw for turn in turns.values() for message in turn}
     kept: list[bytes] = []
@@ -112,7 +112,7 @@ def thinned(recording: Recording, turns: dict[int, tuple[LoggedMessage, ...]]) -
 
 
 def inputs_of(
-    recording: Recording, turns: dict[int, tuple[LoggedMessage, ...]]
+    recording: Recording, turns: dict[int, list[LoggedMessage]]
 ) -> list[ConfigurationRecord]:
     """The inputs as recorded, for the messages that are kept."""
     recorder = InputRecorder(SessionSettings(**recording.settings))  # type: ignore[arg-type]

@@ -14,7 +14,6 @@ from pydantic import Field, model_validator
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import (
     DocumentError,
-    description,
     override,
     parse,
     read,
@@ -113,8 +112,8 @@ def test_a_problem_names_line_and_column_of_its_key() -> None:
 def test_a_description_is_read_and_is_no_part_of_the_value() -> None:
     text = "description: a drawing\ntitle: x"
     assert parse(text, Drawing, "d.yaml") == Drawing(title="x")
-    assert description(text, "d.yaml") == "a drawing"
-    assert description("title: x", "d.yaml") == ""
+    assert read(text, "d.yaml").description == "a drawing"
+    assert read("title: x", "d.yaml").description == ""
     for wrong in ("3", "[a, b]", "x" * 201):
         (problem,) = problems(f"description: {wrong}\ntitle: x")
         assert problem.startswith("d.yaml: description: ")

@@ -6,7 +6,7 @@ import io
 import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ from offboard.campaign.cases import Case
 from offboard.campaign.document import Promises, read_campaign
 from offboard.campaign.flight import Job
 from offboard.campaign.results import Record, Results
-from offboard.campaign.run import Campaign, Incomplete, Progress, Runner
+from offboard.campaign.run import Campaign, Fly, Incomplete, Progress, flying
 from offboard.campaign.search import Failure, FailureSearch, as_csv
 from offboard.campaign.tune import Tuned, Tuning, judge, profile, read_tune
 from offboard.documents.errors import DocumentError, UserError
@@ -56,9 +56,9 @@ class Known:
                 yield job, self._record(job.case)
 
 
-def runner(results: Results, flyer: Known) -> Runner:
+def known(results: Results, flyer: Known) -> AbstractContextManager[Fly]:
     progress = Progress(Console(file=io.StringIO()))
-    return Runner(results, Promises(), lambda: nullcontext(flyer), progress)
+    return flying(results, Promises(), lambda: nullcontext(flyer), progress)
 
 
 def two_regions(case: Case) -> Record:
@@ -79,8 +79,8 @@ def searched(
     file = directory / "c.yaml"
     file.write_text(SEARCH)
     campaign = Campaign(*read_campaign(str(file)), directory / "out")
-    with runner(campaign.results, Known(record, most)) as flown:
-        return campaign, FailureSearch(campaign, "c.yaml").find(2, flown)
+    with known(campaign.results, Known(record, most)) as fly:
+        return campaign, FailureSearch(campaign, "c.yaml").find(2, fly)
 
 
 @pytest.fixture(scope="module")
@@ -165,8 +165,8 @@ def tuned(
     directory.mkdir(exist_ok=True)
     (directory / "tune.yaml").write_text(text)
     tuning = Tuning(*read_tune(str(directory / "tune.yaml")))
-    with runner(Results(directory / "study", "0123456789ab"), Known(bowl, most)) as flown:
-        return tuning.run(flown.fly, told)
+    with known(Results(directory / "study", "0123456789ab"), Known(bowl, most)) as fly:
+        return tuning.run(fly, told)
 
 
 @pytest.fixture(scope="module")
