@@ -16,7 +16,7 @@ from collections.abc import Hashable
 from contextlib import suppress
 
 from offboard.link import clock
-from offboard.link.interface import Chunk, LinkReport
+from offboard.link.interface import Chunk, Link
 from offboard.mavlink.framing import TIMESYNC, frame_size
 from offboard.mavlink.senders import PEER_SILENT_S, same_host
 
@@ -83,15 +83,11 @@ def _stamp_s(ancillary: list[tuple[int, int, bytes]]) -> float:
     return 0.0
 
 
-class UdpLink:
+class UdpLink(Link):
     """`listening` hears every sender, `vehicle` is connected to the vehicle; one may be missing."""
 
-    is_stream = False
-    capacity_bytes_ps: float | None = None
-
     def __init__(self, listening: socket.socket | None, vehicle: socket.socket | None) -> None:
-        self.opened = 0
-        self.report = LinkReport()
+        super().__init__()
         self._listening = _Inbox(listening) if listening else None
         self._vehicle = _Inbox(vehicle) if vehicle else None
         self._peer: Hashable = vehicle.getpeername() if vehicle else None

@@ -24,7 +24,7 @@ from offboard.link.after_flight import begin
 from offboard.link.background import BackgroundWriter
 from offboard.link.interface import Link
 from offboard.link.log import append, entry
-from offboard.link.stream import Listener, Source, Stream, StreamLink
+from offboard.link.stream import ListeningLink, Stream, StreamLink
 from offboard.link.udp import UdpLink
 from offboard.mavlink import event_record, texts
 from offboard.mavlink.dialects.base import SetpointLoss
@@ -211,14 +211,13 @@ def _link(descriptors: list[int], stream: str) -> Link:
 def _stream_link(descriptors: list[int], name: str) -> StreamLink:
     """A link with at most one stream, and at most one socket that listens for the next one. Without
     a stream nothing can be asked of the vehicle until it connects again."""
-    source = Source()
-    stream = None
+    listening = stream = None
     for descriptor in descriptors:
         if _listens(descriptor):
-            source = Listener(socket.socket(fileno=descriptor))
+            listening = socket.socket(fileno=descriptor)
         else:
             stream = Stream(descriptor, partial(os.close, descriptor))
-    return StreamLink(stream, name, source)
+    return ListeningLink(listening, name, stream) if listening else StreamLink(stream, name)
 
 
 def _listens(descriptor: int) -> bool:
