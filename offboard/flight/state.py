@@ -35,7 +35,7 @@ from offboard.flight.record import Decided
 from offboard.flight.timing import Busyness, LinkGrowth, VehicleClock
 from offboard.flight.vehicle_state import VehicleState
 from offboard.identification.learner import Learner
-from offboard.mavlink.dialects.base import Dialect, Takeoff
+from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.events import Heartbeat, Landed, TimesyncReply, Triple
 from offboard.mavlink.outgoing import CommandLong, Outgoing, Record
 from offboard.mavlink.session import Session
@@ -277,7 +277,7 @@ class FlightState:
     @property
     def takes_off_by_command(self) -> bool:
         """The autopilot takes off on a command, without setpoints."""
-        return self.dialect is not None and self.dialect.takeoff is Takeoff.COMMAND
+        return self.dialect is not None and self.dialect.takes_off_by_command
 
     @property
     def unreached_s(self) -> float:

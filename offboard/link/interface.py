@@ -103,5 +103,10 @@ class Link:
         """The open file descriptors, with which another process can continue the link."""
         return ()
 
+    @property
+    def listens(self) -> bool:
+        """Whether the first of these listens for others than the vehicle."""
+        return False
+
     def close(self) -> None:
         """Close all of them."""

@@ -273,6 +273,10 @@ class ListeningLink(StreamLink):
     def descriptors(self) -> tuple[int, ...]:
         return (self._listening.fileno(), *super().descriptors())
 
+    @property
+    def listens(self) -> bool:
+        return True
+
     def close(self) -> None:
         super().close()
         self._listening.close()

@@ -164,6 +164,10 @@ class UdpLink(Link):
         self.opened += 1
         self._heard_s = clock.monotonic_s()
 
+    @property
+    def listens(self) -> bool:
+        return self._listening is not None
+
     def descriptors(self) -> tuple[int, ...]:
         return tuple(i.socket.fileno() for i in (self._listening, self._vehicle) if i)
 

@@ -259,7 +259,7 @@ class Session:
         """
         vehicle, dialect, target = self.vehicle, self.dialect, None
         if vehicle and dialect:
-            target = Target(vehicle.system_id, vehicle.component_id, dialect.thrust_rule)
+            target = Target(vehicle.system_id, vehicle.component_id, dialect.divides_by_tilt)
         message = outgoing.encode(target)
         sender = self._sending
         if isinstance(outgoing, Record):
