@@ -183,7 +183,7 @@ def _fit_telemetry(flight: FlightState) -> None:
         return
     if link.value > limits.link_delay_s or link.sd > limits.link_jitter_s:
         flight.thinned_s = in_phase_s
-        if flight.session.thin_telemetry():
+        if flight.session.telemetry.thin():
             flight.clock.measure_delay_again()
             delay = f"{1e3 * link.value:.0f} +- {1e3 * link.sd:.0f} ms"
             outbox.announce(flight, f"the link delays by {delay}: less telemetry is requested")

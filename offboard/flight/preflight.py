@@ -200,7 +200,7 @@ def _unguarded(ground: Ground) -> str:
 
 
 def _slow(ground: Ground) -> str:
-    rates_hz = ground.session.rates_hz
+    rates_hz = ground.session.telemetry.rates_hz
     if not (ground.rates_requested and ground.vehicle.has_state):
         return ""
     for name in TELEMETRY:

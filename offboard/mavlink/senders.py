@@ -32,7 +32,7 @@ from offboard.mavlink.events import (
     OtherSender,
     VehicleFound,
 )
-from offboard.mavlink.framing import HEARTBEAT, SETPOINTS, TIMESYNC, Frame
+from offboard.mavlink.framing import COMMAND_ACK, HEARTBEAT, SETPOINTS, TIMESYNC, Frame
 
 DIALECTS: Mapping[str, Dialect] = MappingProxyType({d.name: d for d in (PX4, ARDUPILOT)})
 AUTOPILOT_COMPONENT = 1
@@ -104,7 +104,7 @@ class Senders:
             return self._find(frame, heard, peer, events)
         sender = Address(frame.system_id, frame.component_id)
         if self._controls(frame):
-            events.append(OtherSender(*sender, frame.message_id))
+            events.append(OtherSender(*sender))
         if frame.message_id in COMMANDS and sender != self.own:
             if _receiver(frame) != self.own:
                 return DropReason.NOT_FOR_US
@@ -114,6 +114,10 @@ class Senders:
             return None if heard is self.dialect else DropReason.FOREIGN_COMPONENT
         if heard and self._is_companion(frame):
             events.append(OtherCompanion(*sender, frame.message.custom_mode))
+        if frame.message_id == COMMAND_ACK and not heard:
+            pairs = zip(_receiver(frame), self.own, strict=True)
+            ours = all(to in (0, own) for to, own in pairs)  # 0: for all
+            return None if ours else DropReason.NOT_FOR_US
         return heard
 
     def _whose(self, frame: Frame, now_s: float) -> Dialect | DropReason | None:
@@ -208,11 +212,6 @@ class Senders:
             assert isinstance(beat, Heartbeat)
             self.clock_behind, self.peer = True, peer
             events.append(ClockBehind(frame.system_id, beat.armed))
-
-    def is_for_us(self, ack: Frame) -> bool:
-        """Whether a COMMAND_ACK is for us, or for all."""
-        system_id, component_id = _receiver(ack)
-        return system_id in (0, self.own.system_id) and component_id in (0, self.own.component_id)
 
     # --- what to say ---
 
