@@ -176,13 +176,6 @@ class UdpLink(Link):
             if inbox:
                 inbox.socket.close()
 
-    @property
-    def port(self) -> int:
-        """The local port."""
-        inbox = self._listening or self._vehicle
-        assert inbox is not None
-        return int(inbox.socket.getsockname()[1])
-
 
 def _second_socket(listening: socket.socket, peer: tuple[str | int, ...]) -> socket.socket:
     """A socket on the port of `listening`, connected to `peer`. Raises OSError."""

@@ -98,6 +98,7 @@ class Session:
         self._splitter = framing.FrameSplitter(settings.stream, self.counters)
         self._sending = mavlink.MAVLink(None, srcComponent=settings.component_id)
         self._recording = mavlink.MAVLink(None, srcComponent=RECORD_COMPONENT_ID)
+        self._components = (settings.component_id, RECORD_COMPONENT_ID)
         self._sent: deque[bytes] = deque(maxlen=_ECHOES)
         self.telemetry = Telemetry(settings.capacity_bytes_ps, lockstep=settings.lockstep)
         self.time = self.telemetry.time
@@ -137,7 +138,8 @@ class Session:
             self.counters.count(why)
             if (why and why in _NOT_LOGGED) or frame.message_id == framing.SETUP_SIGNING:
                 continue  # the latter holds the key
-            if self._has_our_ids(frame):
+            ours = frame.component_id in self._components
+            if ours and frame.system_id == self.senders.own.system_id:
                 unlogged.append((len(frames), frame.raw))
             else:
                 frames.append(frame.raw)
@@ -179,11 +181,6 @@ class Session:
         elif self.vehicle is not None:
             wrapped_ns = round(self.time.wrapped_s(tc1_ns / 1e9) * 1e9)
             arrival.events.append(TimesyncReply(ts1_ns, tc1_ns + wrapped_ns))
-
-    def _has_our_ids(self, frame: framing.Frame) -> bool:
-        """Whether it has the ids of what we send, or of our records."""
-        ours = (self.settings.component_id, RECORD_COMPONENT_ID)
-        return frame.system_id == self.senders.own.system_id and frame.component_id in ours
 
     # --- the vehicle ---
 
