@@ -87,7 +87,6 @@ class StreamLink(Link):
         self.capacity_bytes_ps = capacity_bytes_ps
         self._stream = stream
         self._name = name
-        self._connected = stream is not None  # at any time before
         self._empty_s = self._heard_s = clock.monotonic_s()  # all that is waiting arrived later
         self._begun = b""
         self._queued: list[bytes] = []
@@ -110,9 +109,9 @@ class StreamLink(Link):
             return
         if self._stream:
             self._drop()
-        if self._connected:
+        if self.opened:  # and broken since
             self.report.tell(RENEWED)
-        self._stream, self._connected = stream, True
+        self._stream = stream
         self._empty_s = self._heard_s = clock.monotonic_s()
         self.opened += 1
 
