@@ -213,6 +213,7 @@ class LockstepLink(UdpLink):
 
     def __init__(self, sock: socket.socket) -> None:
         super().__init__(sock, None)
+        self.port: int = sock.getsockname()[1]
         self._block: list[Chunk] = []  # since the newest barrier
         self._barrier = b""
         self._simulator: Hashable | None = None  # the sender of the barriers
