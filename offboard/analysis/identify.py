@@ -21,7 +21,6 @@ from offboard.identification.learner import LIFTED_OFF_S
 from offboard.identification.trace import NORTH, POSITION, STAMP, VELOCITY, Trace, clean
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_fit import AXES, Identified, identify
-from offboard.mavlink.outgoing import ThrustRule
 from offboard.model.frames import heading_from_quaternion, thrust_direction_from_quaternion
 from offboard.model.vehicle import Vehicle
 
@@ -57,7 +56,7 @@ def _trace(history: History) -> Trace:
     commanded = thrust_direction_from_quaternion(setpoint["quaternion"])
     direction = thrust_direction_from_quaternion(attitude["quaternion"])
     thrust = setpoint["thrust"].astype(np.float64)
-    if history.dialect and history.dialect.thrust_rule is ThrustRule.TILT_COMPENSATED:
+    if history.dialect and history.dialect.divides_by_tilt:
         thrust = thrust / np.maximum(commanded[:, 2], 0.3)
     commanded_rad, heading_rad = (
         heading_from_quaternion(rows["quaternion"]) for rows in (setpoint, attitude)

@@ -167,7 +167,7 @@ def bandwidth(seen: Observation) -> Iterable[Finding]:
 
 def rates(seen: Observation) -> Iterable[Finding]:
     """Rates of the telemetry that a flight needs."""
-    rates_hz = seen.heard.session.rates_hz
+    rates_hz = seen.heard.session.telemetry.rates_hz
     figures = ", ".join(f"{name} {rates_hz.get(name, 0.0):.0f} Hz" for name in TELEMETRY)
     slow = [
         f"{each.name} {rates_hz.get(each.name, 0.0):.1f} of {each.rate_hz:g} Hz"

@@ -271,7 +271,7 @@ class Listening:
 
     def slow(self, wanted_hz: Callable[[WantedMessage], float]) -> list[WantedMessage]:
         """Telemetry that a flight needs and that arrives at much less than a rate."""
-        dialect, rates_hz = self.session.dialect, self.session.rates_hz
+        dialect, rates_hz = self.session.dialect, self.session.telemetry.rates_hz
         return [
             each
             for each in (dialect.wanted if dialect else ())

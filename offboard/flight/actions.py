@@ -187,7 +187,7 @@ def _fit_telemetry(flight: FlightState) -> None:
     if link is None or flight.host_s - flight.clock.began_s < FIT_EVERY_S:
         return
     late = link.value > limits.link_delay_s or link.sd > limits.link_jitter_s
-    if late and flight.session.thin_telemetry():
+    if late and flight.session.telemetry.thin():
         flight.clock.measure_delay_again()
         delay = f"{1e3 * link.value:.0f} +- {1e3 * link.sd:.0f} ms"
         outbox.announce(flight, f"the link delays by {delay}: less telemetry is requested")

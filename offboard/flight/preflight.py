@@ -15,7 +15,7 @@ from offboard.flight.phases import Limits, ServiceOptions
 from offboard.flight.timing import VehicleClock
 from offboard.flight.vehicle_state import ARMED_KNOWN_S, VehicleState
 from offboard.mavlink import senders
-from offboard.mavlink.dialects.base import Dialect, Takeoff
+from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.events import GpsFix, Heartbeat, NoFix
 from offboard.mavlink.outgoing import ParamRead
 from offboard.mavlink.session import Session
@@ -247,7 +247,7 @@ def _unguarded(ground: Ground) -> str:
 
 
 def _slow(ground: Ground) -> str:
-    rates_hz = ground.session.rates_hz
+    rates_hz = ground.session.telemetry.rates_hz
     if not (ground.rates_requested and ground.vehicle.has_state):
         return ""
     for name in TELEMETRY:
@@ -290,7 +290,7 @@ def _prearm(ground: Ground) -> str:
 def _needs_setpoints(ground: Ground) -> str:
     """PX4 in OFFBOARD refuses to arm while no setpoints arrive, whatever the vehicle's state."""
     vehicle, dialect = ground.vehicle, ground.dialect
-    if dialect is None or dialect.takeoff is not Takeoff.SETPOINT or vehicle.health is None:
+    if dialect is None or dialect.takes_off_by_command or vehicle.health is None:
         return ""
     if vehicle.mode != dialect.engage_mode or vehicle.prearm_ok or vehicle.armed:
         return ""

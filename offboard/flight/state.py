@@ -32,7 +32,6 @@ from offboard.flight.preflight import Ground
 from offboard.flight.record import Decided
 from offboard.flight.timing import Busyness, LinkGrowth
 from offboard.identification.learner import Learner
-from offboard.mavlink.dialects.base import Takeoff
 from offboard.mavlink.events import Heartbeat, Landed, TimesyncReply, Triple
 from offboard.mavlink.outgoing import (
     AttitudeTarget,
@@ -273,7 +272,7 @@ class FlightState(Ground):
     @property
     def takes_off_by_command(self) -> bool:
         """The autopilot takes off on a command, without setpoints."""
-        return self.dialect is not None and self.dialect.takeoff is Takeoff.COMMAND
+        return self.dialect is not None and self.dialect.takes_off_by_command
 
     @property
     def unreached_s(self) -> float:

@@ -41,7 +41,7 @@ from offboard.mavlink.events import (
     VehicleFound,
     VehicleIdentity,
 )
-from offboard.mavlink.outgoing import CommandResult, ThrustRule
+from offboard.mavlink.outgoing import CommandResult
 
 START, PAUSE_CONTINUE, SET_MODE = 300, 193, 176  # MAV_CMD
 ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED = range(4)  # MAV_RESULT
@@ -106,7 +106,7 @@ def _is_of_others(flight: FlightState, thrust: float) -> bool:
 
 def _reports_thrust(flight: FlightState) -> bool:
     """Whether the autopilot reports the thrust of the setpoint; ArduCopter does not."""
-    return flight.dialect is not None and flight.dialect.thrust_rule is ThrustRule.COLLECTIVE
+    return flight.dialect is not None and not flight.dialect.divides_by_tilt
 
 
 def _lifting_share(flight: FlightState) -> float:

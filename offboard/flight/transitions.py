@@ -141,7 +141,8 @@ def _enter(flight: FlightState, row: Transition) -> None:
         flight.clock.settle()
         dialect = flight.dialect
         assert dialect is not None
-        flight.positioning.begin(flight.vehicle, flight.session.rates_hz, dialect.estimator_message)
+        rates_hz = flight.session.telemetry.rates_hz
+        flight.positioning.begin(flight.vehicle, rates_hz, dialect.estimator_message)
         if flight.identification:
             flight.identification.on_link_delay(flight.clock.delay)
         if source is Phase.ARM:  # on the ground the time that it takes does no harm

@@ -34,7 +34,6 @@ from offboard.mavlink.events import (
     SystemHealth,
     VehicleIdentity,
 )
-from offboard.mavlink.framing import HEARTBEAT
 from offboard.mavlink.session import COMPONENT_ID
 from offboard.model.frames import heading_from_quaternion, thrust_direction_from_quaternion
 
@@ -181,7 +180,7 @@ class VehicleState:
             case OtherCompanion(system, component, phase):
                 self.other_companion = event
                 if component == COMPONENT_ID and phase in CONTROLLING:
-                    self.other_sender = OtherSender(system, component, HEARTBEAT)
+                    self.other_sender = OtherSender(system, component)
                     self.heard_s[OtherSender] = now_s
             case LocalPosition():
                 self.position = event

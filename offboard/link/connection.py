@@ -19,7 +19,7 @@ from typing import Any
 
 from offboard.documents.errors import shown
 from offboard.link.interface import Link, LinkError, LinkUnavailable
-from offboard.link.stream import Listener, Redial, StreamLink, connect, open_port
+from offboard.link.stream import ListeningLink, RedialingLink, connect, open_port
 from offboard.link.udp import LockstepLink, UdpLink, udp_socket
 
 FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or serial:DEVICE:BAUD"
@@ -46,8 +46,7 @@ def open_link(address: str) -> Link:
     if kind == "serial":
         if not 0 < number <= BAUD_MAX:
             raise LinkError(f"connection {shown(address)}: {number} baud is no rate of a port")
-        redial = Redial(lambda: open_port(host, number))
-        return StreamLink(open_port(host, number), "serial", redial, number / BITS_OF_A_BYTE)
+        return RedialingLink(lambda: open_port(host, number), "serial", number / BITS_OF_A_BYTE)
     least = 0 if kind in LISTENS else 1  # 0: any free port
     if not least <= number <= PORT_MAX:
         raise LinkError(
@@ -72,8 +71,7 @@ def open_link(address: str) -> Link:
 def _network_link(kind: str, host: str, port: int) -> Link:
     """Raises OSError or UnicodeError."""
     if kind == "tcp":
-        redial = Redial(lambda: connect(host, port))
-        return StreamLink(connect(host, port), "tcp", redial)
+        return RedialingLink(lambda: connect(host, port), "tcp")
     family, place = _resolved(host, port)
     sock = socket.socket(family, socket.SOCK_STREAM) if kind == "tcpin" else udp_socket(family)
     try:
@@ -86,7 +84,7 @@ def _network_link(kind: str, host: str, port: int) -> Link:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         sock.bind(place)
         sock.listen()
-        return StreamLink(None, "tcp", Listener(sock))
+        return ListeningLink(sock, "tcp")
     except OSError:
         sock.close()
         raise

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Hashable
 from dataclasses import dataclass
-from typing import Protocol
 
 from offboard.documents.errors import UserError
 
@@ -73,35 +72,41 @@ class LinkReport:
         return news
 
 
-class Link(Protocol):
+class Link:
     """Non-blocking byte channel. `is_stream`: received chunks may end within a frame.
     `capacity_bytes_ps` of each direction; None: unknown. `opened` changes when the descriptors
     do."""
 
-    is_stream: bool
-    opened: int
-    capacity_bytes_ps: float | None
-    report: LinkReport
+    is_stream = False
+    opened = 0
+    capacity_bytes_ps: float | None = None
+
+    def __init__(self) -> None:
+        self.report = LinkReport()
 
     def wait(self, timeout_s: float) -> None:
         """Wait at most `timeout_s` until something has arrived. Reads nothing."""
-        ...
 
     def receive(self) -> list[Chunk]:
         """What has arrived, oldest first and bounded. Never waits."""
-        ...
+        raise NotImplementedError
 
     def send(self, data: bytes, peer: Hashable | None) -> None:
         """Send one frame to `peer` (UDP) or to the other end. Never waits: a frame that does not
         fit into the buffer is dropped (UDP) or queued (streams)."""
-        ...
+        raise NotImplementedError
 
     def follow(self, peer: Hashable) -> None:
         """The vehicle sends from `peer`: from now on other senders cannot displace it."""
-        ...
 
     def descriptors(self) -> tuple[int, ...]:
         """The open file descriptors, with which another process can continue the link."""
-        ...
+        return ()
 
-    def close(self) -> None: ...
+    @property
+    def listens(self) -> bool:
+        """Whether the first of these listens for others than the vehicle."""
+        return False
+
+    def close(self) -> None:
+        """Close all of them."""

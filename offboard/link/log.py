@@ -30,16 +30,18 @@ class LogError(UserError):
 
 
 class FlightLog:
-    """Context manager that writes DIR/flight.tlog, and the configuration to DIR/flight.yaml.
+    """Writes DIR/flight.tlog, and the configuration to DIR/flight.yaml. Never overwrites a flight.
 
-    Never overwrites a flight. Entering raises LogError. With `real_time` an entry that does not fit
-    into the queue is dropped; otherwise `write` waits for the disk.
+    As a context manager it opens them on entering, or raises LogError; after `start` alone the
+    writing thread does, with the first entries. With `real_time` an entry that does not fit into
+    the queue is dropped; otherwise `write` waits for the disk. `descriptor` is -1 until it is open.
     """
 
     def __init__(self, directory: Path, configuration: str, *, real_time: bool = False) -> None:
         self.directory = directory
         self.path = directory / "flight.tlog"
         self.configuration = configuration
+        self.descriptor = -1
         self._real_time = real_time
         self._closed = False
 
@@ -57,26 +59,31 @@ class FlightLog:
 
     def __enter__(self) -> FlightLog:
         try:
-            self.directory.mkdir(parents=True, exist_ok=True)
             self._open()
         except FileExistsError as error:
             raise self._taken(Path(error.filename).name) from None
         except OSError as error:
             raise self._unwritable(error) from None
-        self._writer = BackgroundWriter[bytes](self._append, QUEUED_MAX, waits=not self._real_time)
+        self.start()
         return self
 
+    def start(self) -> None:
+        """Begin to write what is queued."""
+        self._writer = BackgroundWriter[bytes](self._append, QUEUED_MAX, waits=not self._real_time)
+
     def _open(self) -> None:
+        self.directory.mkdir(parents=True, exist_ok=True)
         # appended to, since another process may continue the log
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND
-        self.descriptor = os.open(self.path, flags, 0o666)
+        descriptor = os.open(self.path, flags, 0o666)
         try:
             with (self.directory / "flight.yaml").open("x", encoding="utf-8") as file:
                 file.write(self.configuration)
         except OSError:
-            os.close(self.descriptor)
+            os.close(descriptor)
             self.path.unlink()  # the empty log of a flight that does not begin
             raise
+        self.descriptor = descriptor
 
     def _taken(self, name: str) -> LogError:
         return LogError(
@@ -99,11 +106,8 @@ class FlightLog:
             return
         self._closed = True
         self._writer.close(CLOSE_S)
-        if self._writer.is_free():  # else the descriptor is still in use
-            self._close_file()
-
-    def _close_file(self) -> None:
-        os.close(self.descriptor)
+        if self._writer.is_free() and self.descriptor >= 0:  # else it is still in use
+            os.close(self.descriptor)
 
     @property
     def problem(self) -> str:
@@ -131,6 +135,8 @@ class FlightLog:
         self._writer.put(entry(unix_us, frame))
 
     def _append(self, entries: list[bytes]) -> None:
+        if self.descriptor < 0:
+            self._open()
         append(self.descriptor, entries)
 
 

@@ -1,10 +1,10 @@
-"""TCP and serial links: streams of bytes through a file descriptor. One that breaks is replaced by
-the next one that its source gives: `Redial` opens the same address again, `Listener` accepts the
-next client."""
+"""TCP and serial links: streams of bytes through a file descriptor. In place of one that breaks
+`RedialingLink` opens the same address again, and `ListeningLink` accepts the next client."""
 
 from __future__ import annotations
 
 import errno
+import math
 import os
 import select
 import socket
@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from offboard.link import clock
-from offboard.link.interface import Chunk, LinkError, LinkReport, LinkUnavailable
+from offboard.link.interface import Chunk, Link, LinkError, LinkUnavailable
 from offboard.mavlink.framing import SETPOINTS
 from offboard.mavlink.senders import PEER_SILENT_S
 
@@ -73,145 +73,45 @@ def open_port(device: str, baud: int) -> Stream:
     return Stream(port.fileno(), port.close)
 
 
-class Source:
-    """Where streams come from; this one has none: a stream that breaks is lost. Nothing waits but
-    `wait`."""
-
-    def __init__(self) -> None:
-        self.report = LinkReport()
-
-    def seek(self) -> None:
-        """A new stream is needed."""
-
-    def offer(self, silent_s: float) -> Stream | None:
-        """A new stream, if there is one. `silent_s`: how long the present one has been silent;
-        infinite without one."""
-        return None
-
-    def wait(self, timeout_s: float) -> None:
-        """Wait at most `timeout_s` for a new stream."""
-        select.select(self.descriptors(), [], [], max(0.0, timeout_s))
-
-    def keep_to(self, host: str) -> None:
-        """The vehicle is at `host`: take no stream from elsewhere."""
-
-    def descriptors(self) -> tuple[int, ...]:
-        """Its own descriptors, with which another process can continue it."""
-        return ()
-
-    def close(self) -> None: ...
-
-
-class Redial(Source):
-    """Calls `open_stream` in a thread until it succeeds. It may wait, and raise OSError or
-    LinkError."""
-
-    def __init__(self, open_stream: Callable[[], Stream]) -> None:
-        super().__init__()
-        self._open_stream = open_stream
-        self._found: list[Stream] = []  # at most one
-        self._closing = threading.Event()
-
-    def seek(self) -> None:
-        # always: the thread before has found its stream, although it may not have ended yet
-        threading.Thread(target=self._dial, daemon=True).start()
-
-    def _dial(self) -> None:
-        while not self._closing.wait(RETRY_S):
-            with suppress(OSError, LinkError):
-                stream = self._open_stream()
-                self._found.append(stream)
-                if self._closing.is_set():
-                    self._discard()
-                return
-
-    def offer(self, silent_s: float) -> Stream | None:
-        return self._found.pop() if self._found else None
-
-    def wait(self, timeout_s: float) -> None:
-        self._closing.wait(max(0.0, timeout_s))
-
-    def close(self) -> None:
-        self._closing.set()
-        self._discard()
-
-    def _discard(self) -> None:
-        with suppress(IndexError):
-            self._found.pop().close()
-
-
-class Listener(Source):
-    """Accepts one client on `sock`. Another one takes its place when it has been silent; once the
-    vehicle was found, only from the vehicle's host."""
-
-    def __init__(self, sock: socket.socket) -> None:
-        super().__init__()
-        sock.setblocking(False)
-        self._socket = sock
-        self._host = ""  # of the vehicle, once it was found
-
-    def offer(self, silent_s: float) -> Stream | None:
-        try:
-            client, address = self._socket.accept()
-        except OSError:  # nobody
-            return None
-        host, port = address[:2]
-        if silent_s <= PEER_SILENT_S or self._host not in ("", host):
-            client.close()
-            self.report.count(f"{host}:{port}", 1, "connection")
-            return None
-        return tcp_stream(client, host)
-
-    def keep_to(self, host: str) -> None:
-        self._host = host
-
-    def descriptors(self) -> tuple[int, ...]:
-        return (self._socket.fileno(),)
-
-    def close(self) -> None:
-        self._socket.close()
-
-
-class StreamLink:
-    """`stream`, and after it those of `source`; without it, the first one of `source`. Frames are
-    queued while the buffer is full: a new setpoint replaces a queued one, and of too many frames
-    the oldest are dropped. What was queued for a broken stream is dropped."""
+class StreamLink(Link):
+    """A link through `stream`; one that breaks is lost. Frames are queued while the buffer is full:
+    a new setpoint replaces a queued one, and of too many frames the oldest are dropped. What was
+    queued for a broken stream is dropped."""
 
     is_stream = True
 
     def __init__(
-        self,
-        stream: Stream | None,
-        name: str,
-        source: Source,
-        capacity_bytes_ps: float | None = None,
+        self, stream: Stream | None, name: str, capacity_bytes_ps: float | None = None
     ) -> None:
+        super().__init__()
         self.capacity_bytes_ps = capacity_bytes_ps
-        self.opened = 0  # how often a stream began or broke
-        self.report = source.report
         self._stream = stream
         self._name = name
-        self._source = source
-        self._connected = stream is not None  # at any time before
         self._empty_s = self._heard_s = clock.monotonic_s()  # all that is waiting arrived later
         self._begun = b""
         self._queued: list[bytes] = []
-        if stream is None:
-            source.seek()
 
     # --- the stream ---
 
+    def _seek(self) -> None:
+        """A new stream is needed. Does not wait."""
+
+    def _offered(self, silent_s: float) -> Stream | None:
+        """A new stream, if there is one. `silent_s`: how long the present one has been silent;
+        infinite without one."""
+        return None
+
     def _renew(self) -> None:
         """Take a new stream, if there is one."""
-        silent_s = clock.monotonic_s() - self._heard_s if self._stream else float("inf")
-        stream = self._source.offer(silent_s)
+        silent_s = clock.monotonic_s() - self._heard_s if self._stream else math.inf
+        stream = self._offered(silent_s)
         if stream is None:
             return
         if self._stream:
             self._drop()
-        if self._connected:
+        if self.opened:  # and broken since
             self.report.tell(RENEWED)
-        self._stream, self._connected = stream, True
+        self._stream = stream
         self._empty_s = self._heard_s = clock.monotonic_s()
         self.opened += 1
 
@@ -226,13 +126,13 @@ class StreamLink:
     def _break(self) -> None:
         self._drop()
         self.report.tell(BROKEN)
-        self._source.seek()
+        self._seek()
 
     # --- in ---
 
     def wait(self, timeout_s: float) -> None:
         if self._stream is None:
-            self._source.wait(timeout_s)
+            select.select(self.descriptors(), [], [], max(0.0, timeout_s))
         elif not self._readable(0.0):
             self._readable(timeout_s)
 
@@ -297,20 +197,88 @@ class StreamLink:
         except OSError:
             self._break()
 
-    # --- the vehicle ---
-
-    def follow(self, peer: Hashable) -> None:
-        if self._stream:
-            self._source.keep_to(self._stream.host)
+    # --- the descriptors ---
 
     def descriptors(self) -> tuple[int, ...]:
-        own = (self._stream.descriptor,) if self._stream else ()
-        return (*self._source.descriptors(), *own)
+        return (self._stream.descriptor,) if self._stream else ()
 
     def close(self) -> None:
         if self._stream:
             self._drop()
-        self._source.close()
+
+
+class RedialingLink(StreamLink):
+    """Calls `open_stream`, and after a break in a thread until it succeeds. It may wait, and raise
+    OSError or LinkError."""
+
+    def __init__(
+        self, open_stream: Callable[[], Stream], name: str, capacity_bytes_ps: float | None = None
+    ) -> None:
+        super().__init__(open_stream(), name, capacity_bytes_ps)
+        self._open_stream = open_stream
+        self._found: list[Stream] = []  # at most one
+        self._closing = threading.Event()
+
+    def _seek(self) -> None:
+        # always: the thread before has found its stream, although it may not have ended yet
+        threading.Thread(target=self._dial, daemon=True).start()
+
+    def _dial(self) -> None:
+        while not self._closing.wait(RETRY_S):
+            with suppress(OSError, LinkError):
+                self._found.append(self._open_stream())
+                if self._closing.is_set():
+                    self._discard()
+                return
+
+    def _offered(self, silent_s: float) -> Stream | None:
+        return self._found.pop() if self._found else None
+
+    def close(self) -> None:
+        super().close()
+        self._closing.set()
+        self._discard()
+
+    def _discard(self) -> None:
+        with suppress(IndexError):
+            self._found.pop().close()
+
+
+class ListeningLink(StreamLink):
+    """Accepts one client on `listening`. Another one takes its place when it has been silent; once
+    the vehicle was found, only from the vehicle's host."""
+
+    def __init__(self, listening: socket.socket, name: str, stream: Stream | None = None) -> None:
+        super().__init__(stream, name)
+        listening.setblocking(False)
+        self._listening = listening
+        self._host = ""  # of the vehicle, once it was found
+
+    def _offered(self, silent_s: float) -> Stream | None:
+        try:
+            client, address = self._listening.accept()
+        except OSError:  # nobody
+            return None
+        host, port = address[:2]
+        if silent_s <= PEER_SILENT_S or self._host not in ("", host):
+            client.close()
+            self.report.count(f"{host}:{port}", 1, "connection")
+            return None
+        return tcp_stream(client, host)
+
+    def follow(self, peer: Hashable) -> None:
+        self._host = self._stream.host if self._stream else self._host
+
+    def descriptors(self) -> tuple[int, ...]:
+        return (self._listening.fileno(), *super().descriptors())
+
+    @property
+    def listens(self) -> bool:
+        return True
+
+    def close(self) -> None:
+        super().close()
+        self._listening.close()
 
 
 def _is_setpoint(frame: bytes) -> bool:

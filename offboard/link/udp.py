@@ -16,7 +16,7 @@ from collections.abc import Hashable
 from contextlib import suppress
 
 from offboard.link import clock
-from offboard.link.interface import Chunk, LinkReport
+from offboard.link.interface import Chunk, Link
 from offboard.mavlink.framing import TIMESYNC, frame_size
 from offboard.mavlink.senders import PEER_SILENT_S, same_host
 
@@ -83,15 +83,11 @@ def _stamp_s(ancillary: list[tuple[int, int, bytes]]) -> float:
     return 0.0
 
 
-class UdpLink:
+class UdpLink(Link):
     """`listening` hears every sender, `vehicle` is connected to the vehicle; one may be missing."""
 
-    is_stream = False
-    capacity_bytes_ps: float | None = None
-
     def __init__(self, listening: socket.socket | None, vehicle: socket.socket | None) -> None:
-        self.opened = 0
-        self.report = LinkReport()
+        super().__init__()
         self._listening = _Inbox(listening) if listening else None
         self._vehicle = _Inbox(vehicle) if vehicle else None
         self._peer: Hashable = vehicle.getpeername() if vehicle else None
@@ -168,6 +164,10 @@ class UdpLink:
         self.opened += 1
         self._heard_s = clock.monotonic_s()
 
+    @property
+    def listens(self) -> bool:
+        return self._listening is not None
+
     def descriptors(self) -> tuple[int, ...]:
         return tuple(i.socket.fileno() for i in (self._listening, self._vehicle) if i)
 
@@ -175,13 +175,6 @@ class UdpLink:
         for inbox in (self._listening, self._vehicle):
             if inbox:
                 inbox.socket.close()
-
-    @property
-    def port(self) -> int:
-        """The local port."""
-        inbox = self._listening or self._vehicle
-        assert inbox is not None
-        return int(inbox.socket.getsockname()[1])
 
 
 def _second_socket(listening: socket.socket, peer: tuple[str | int, ...]) -> socket.socket:
@@ -220,6 +213,7 @@ class LockstepLink(UdpLink):
 
     def __init__(self, sock: socket.socket) -> None:
         super().__init__(sock, None)
+        self.port: int = sock.getsockname()[1]
         self._block: list[Chunk] = []  # since the newest barrier
         self._barrier = b""
         self._simulator: Hashable | None = None  # the sender of the barriers

@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from offboard.mavlink import events
 from offboard.mavlink.counters import DropReason
-from offboard.mavlink.dialects.base import Dialect, ParameterEncoding
+from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.framing import Frame, payload_of
 
 POSITION_LIMIT_M = 1e5
@@ -173,7 +173,7 @@ def _parameter(message: Any, dialect: Dialect) -> events.Event | DropReason | No
     name, value, kind = message.param_id, message.param_value, message.param_type
     if all(name != watched.name for watched in dialect.watched_parameters):
         return None  # a ground station reads them all
-    if dialect.parameter_encoding is ParameterEncoding.BYTEWISE and kind != _REAL32:
+    if dialect.integers_bytewise and kind != _REAL32:
         if kind not in _UNSIGNED_TYPES + _SIGNED_TYPES:
             return DropReason.IMPLAUSIBLE
         # from the bytes: as a float they may be a signalling NaN, which Python changes

@@ -58,7 +58,6 @@ class OtherSender(Event):
 
     system_id: int
     component_id: int
-    message_id: int
 
 
 @dataclass(frozen=True, slots=True)

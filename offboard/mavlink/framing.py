@@ -129,9 +129,10 @@ def frame_size(data: bytes, at: int) -> int | None:
     """Frame length given by the header at `at`; None if the header is incomplete."""
     if at + 3 > len(data):
         return None
-    signed = data[at] == V2 and data[at + 2] & _SIGNED
-    signature_bytes = _SIGNATURE_BYTES if signed else 0
-    return _header_bytes(data, at) + data[at + 1] + _CRC_BYTES + signature_bytes
+    if data[at] == V1:
+        return _HEADER_BYTES_V1 + data[at + 1] + _CRC_BYTES
+    signature_bytes = _SIGNATURE_BYTES if data[at + 2] & _SIGNED else 0
+    return _HEADER_BYTES_V2 + data[at + 1] + _CRC_BYTES + signature_bytes
 
 
 def parse(data: bytes, at: int, end: int) -> Frame | DropReason:
@@ -153,9 +154,5 @@ def parse(data: bytes, at: int, end: int) -> Frame | DropReason:
 
 def payload_of(raw: bytes) -> bytes:
     """The payload of a frame, as in `Frame`."""
-    at = _header_bytes(raw)
+    at = _HEADER_BYTES_V1 if raw[0] == V1 else _HEADER_BYTES_V2
     return raw[at : at + raw[1]]
-
-
-def _header_bytes(data: bytes, at: int = 0) -> int:
-    return _HEADER_BYTES_V1 if data[at] == V1 else _HEADER_BYTES_V2

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from enum import Enum
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,19 +27,12 @@ _LOCAL_NED = 1  # MAV_FRAME_LOCAL_NED
 _ATTITUDE_AND_THRUST = 7
 
 
-class ThrustRule(Enum):
-    """What the autopilot does with the normalised thrust of a setpoint."""
-
-    COLLECTIVE = "applies it unchanged along the body axis"
-    TILT_COMPENSATED = "divides it by the cosine of the body's tilt"
-
-
 class Target(NamedTuple):
     """The vehicle that a message is for."""
 
     system_id: int
     component_id: int
-    thrust_rule: ThrustRule
+    divides_by_tilt: bool  # see `Dialect`
 
 
 class Outgoing:
@@ -86,7 +78,7 @@ class AttitudeTarget(Outgoing):
             body_roll_rate=0.0,
             body_pitch_rate=0.0,
             body_yaw_rate=0.0,
-            thrust=self.normalised_thrust(vehicle.thrust_rule),
+            thrust=self.normalised_thrust(divides_by_tilt=vehicle.divides_by_tilt),
         )
 
     def attitude(self) -> Quaternion:
@@ -104,7 +96,7 @@ class AttitudeTarget(Outgoing):
         _finite("attitude", w, x, y, z)
         return w, x, y, z
 
-    def normalised_thrust(self, rule: ThrustRule) -> float:
+    def normalised_thrust(self, *, divides_by_tilt: bool) -> float:
         """Thrust 0 .. 1: u = u_h T / g, times the body's b_z if the autopilot divides by it."""
         command = self.command
         _finite("thrust", command.thrust_mps2, self.hover_thrust, self.gravity_mps2)
@@ -114,7 +106,7 @@ class AttitudeTarget(Outgoing):
                 f"not {self.hover_thrust!r} and {self.gravity_mps2!r}"
             )
         thrust = self.hover_thrust * command.thrust_mps2 / self.gravity_mps2
-        if rule is ThrustRule.TILT_COMPENSATED:
+        if divides_by_tilt:
             down = self.body_z_down
             down = command.thrust_direction_ned[2] if down is None else down
             _finite("body_z_down", down)

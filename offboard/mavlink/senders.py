@@ -32,11 +32,12 @@ from offboard.mavlink.events import (
     OtherSender,
     VehicleFound,
 )
-from offboard.mavlink.framing import HEARTBEAT, SETPOINTS, TIMESYNC, Frame
+from offboard.mavlink.framing import COMMAND_ACK, HEARTBEAT, SETPOINTS, TIMESYNC, Frame
 
 DIALECTS: Mapping[str, Dialect] = MappingProxyType({d.name: d for d in (PX4, ARDUPILOT)})
 AUTOPILOT_COMPONENT = 1
 COMMANDS = COMMAND_INT, COMMAND_LONG = 75, 76
+_ORDERS = SETPOINTS | set(COMMANDS)
 # MAV_CMD: return, land, take off, set the mode, go to a place, begin a mission, arm or disarm
 _MODE_COMMANDS = frozenset({20, 21, 22, 176, 192, 300, 400})
 PEER_SILENT_S = 0.5  # half of `Limits.silence_s`, so that the flight can continue
@@ -102,24 +103,23 @@ class Senders:
         heard = self._whose(frame, now_s)
         if self.vehicle is None:
             return self._find(frame, heard, peer, events)
-        sender = Address(frame.system_id, frame.component_id)
-        if self._controls(frame):
-            events.append(OtherSender(*sender, frame.message_id))
-        if frame.message_id in COMMANDS and sender != self.own:
-            if _receiver(frame) != self.own:
-                return DropReason.NOT_FOR_US
-            events.append(CommandRequest(frame.message.command, _parameters(frame), *sender))
-            return None
+        if frame.message_id in _ORDERS:
+            return self._judge_order(frame, heard, events)
         if isinstance(heard, Dialect):
             return None if heard is self.dialect else DropReason.FOREIGN_COMPONENT
         if heard and self._is_companion(frame):
-            events.append(OtherCompanion(*sender, frame.message.custom_mode))
+            ids = frame.system_id, frame.component_id
+            events.append(OtherCompanion(*ids, frame.message.custom_mode))
+        if frame.message_id == COMMAND_ACK and not heard:
+            pairs = zip(_receiver(frame), self.own, strict=True)
+            ours = all(to in (0, own) for to, own in pairs)  # 0: for all
+            return None if ours else DropReason.NOT_FOR_US
         return heard
 
     def _whose(self, frame: Frame, now_s: float) -> Dialect | DropReason | None:
         """Why a frame is not of a vehicle that may be ours; the autopilot that a HEARTBEAT of it
         shows, None for another message."""
-        heard = self.note(frame, now_s)
+        heard = self.note(frame, now_s) if frame.message_id == HEARTBEAT else None
         if (frame.system_id, frame.component_id) == self.own:
             return DropReason.SAME_IDS
         if frame.component_id != AUTOPILOT_COMPONENT:
@@ -146,14 +146,29 @@ class Senders:
         events.append(vehicle)
         return None
 
+    def _judge_order(
+        self, frame: Frame, heard: Dialect | DropReason | None, events: list[Event]
+    ) -> DropReason | None:
+        """As `judge`, for a setpoint or a command; `heard` of `_whose`."""
+        sender = Address(frame.system_id, frame.component_id)
+        if self._controls(frame):
+            events.append(OtherSender(*sender))
+        if frame.message_id in SETPOINTS or sender == self.own:
+            assert not isinstance(heard, Dialect)  # which a HEARTBEAT shows
+            return heard
+        if _receiver(frame) != self.own:
+            return DropReason.NOT_FOR_US
+        events.append(CommandRequest(frame.message.command, _parameters(frame), *sender))
+        return None
+
     def _controls(self, frame: Frame) -> bool:
         """Whether it is a setpoint for our vehicle or for all (routers forward those of others), or
         commands the mode from the vehicle's own system, as we do: that of a ground station is the
         pilot's."""
-        if frame.message_id not in SETPOINTS:
-            commands = frame.message_id in COMMANDS and frame.message.command in _MODE_COMMANDS
+        if frame.message_id in COMMANDS:
             companion = frame.component_id != AUTOPILOT_COMPONENT
-            if not (commands and companion and frame.system_id == self.own.system_id):
+            ours = companion and frame.system_id == self.own.system_id
+            if not (ours and frame.message.command in _MODE_COMMANDS):
                 return False
             if _receiver(frame) == self.own:
                 return False
@@ -208,11 +223,6 @@ class Senders:
             assert isinstance(beat, Heartbeat)
             self.clock_behind, self.peer = True, peer
             events.append(ClockBehind(frame.system_id, beat.armed))
-
-    def is_for_us(self, ack: Frame) -> bool:
-        """Whether a COMMAND_ACK is for us, or for all."""
-        system_id, component_id = _receiver(ack)
-        return system_id in (0, self.own.system_id) and component_id in (0, self.own.component_id)
 
     # --- what to say ---
 

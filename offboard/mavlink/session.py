@@ -98,6 +98,7 @@ class Session:
         self._splitter = framing.FrameSplitter(settings.stream, self.counters)
         self._sending = mavlink.MAVLink(None, srcComponent=settings.component_id)
         self._recording = mavlink.MAVLink(None, srcComponent=RECORD_COMPONENT_ID)
+        self._components = (settings.component_id, RECORD_COMPONENT_ID)
         self._sent: deque[bytes] = deque(maxlen=_ECHOES)
         self.telemetry = Telemetry(settings.capacity_bytes_ps, lockstep=settings.lockstep)
         self.time = self.telemetry.time
@@ -135,9 +136,10 @@ class Session:
         for frame in self._splitter.split(datagram):
             why = self._accept(frame, arrival)
             self.counters.count(why)
-            if why in _NOT_LOGGED or frame.message_id == framing.SETUP_SIGNING:
+            if (why and why in _NOT_LOGGED) or frame.message_id == framing.SETUP_SIGNING:
                 continue  # the latter holds the key
-            if self._has_our_ids(frame):
+            ours = frame.component_id in self._components
+            if ours and frame.system_id == self.senders.own.system_id:
                 unlogged.append((len(frames), frame.raw))
             else:
                 frames.append(frame.raw)
@@ -157,9 +159,9 @@ class Session:
                 )
             return forged
         was_found = self.vehicle is not None
-        foreign = self.senders.judge(frame, arrival.peer, self.link_time_s, arrival.events)
-        if foreign or frame.message_id in COMMANDS:
-            return foreign
+        why = self.senders.judge(frame, arrival.peer, self.link_time_s, arrival.events)
+        if why or frame.message_id in COMMANDS:
+            return why
         if self.vehicle is not None:
             self.senders.heard_s = arrival.now_s
             if not was_found:
@@ -167,7 +169,7 @@ class Session:
         if frame.message_id == framing.TIMESYNC:
             self._synchronise(frame, arrival)
             return None
-        return self._interpret(frame, arrival)
+        return self.telemetry.interpret(frame, arrival.now_s, arrival.events)
 
     def _synchronise(self, frame: framing.Frame, arrival: _Arrival) -> None:
         """TIMESYNC: tc1 is 0 in a request."""
@@ -180,22 +182,6 @@ class Session:
             wrapped_ns = round(self.time.wrapped_s(tc1_ns / 1e9) * 1e9)
             arrival.events.append(TimesyncReply(ts1_ns, tc1_ns + wrapped_ns))
 
-    def _interpret(self, frame: framing.Frame, arrival: _Arrival) -> DropReason | None:
-        """Turn a frame of the vehicle into events."""
-        assert self.dialect is not None
-        if frame.message_id == framing.COMMAND_ACK and not self.senders.is_for_us(frame):
-            return DropReason.NOT_FOR_US
-        found = self.telemetry.interpret(frame, self.dialect, arrival.now_s)
-        if isinstance(found, DropReason):
-            return found
-        arrival.events.extend(found)
-        return None
-
-    def _has_our_ids(self, frame: framing.Frame) -> bool:
-        """Whether it has the ids of what we send, or of our records."""
-        ours = (self.settings.component_id, RECORD_COMPONENT_ID)
-        return frame.system_id == self.senders.own.system_id and frame.component_id in ours
-
     # --- the vehicle ---
 
     def set_vehicle(self, vehicle: VehicleFound, peer: Hashable) -> None:
@@ -206,7 +192,7 @@ class Session:
     def _begin(self) -> None:
         assert self.dialect is not None
         self._heartbeat_sent = None  # send it at once, with the vehicle's system id
-        self.telemetry.request_from(self.dialect)
+        self.telemetry.begin(self.dialect)
 
     def overhear(self, datagram: bytes) -> list[int]:
         """Systems with an autopilot that this datagram, from another address than the vehicle's,
@@ -218,12 +204,6 @@ class Session:
         for frame in framing.FrameSplitter(False, Counters()).split(datagram):
             if not (self._signing and self._signing.refusal(frame, note=False)):
                 yield frame
-
-    def thin_telemetry(self) -> bool:
-        """Request half of the telemetry from now on: the link is saturated. False if the rates are
-        the lowest already."""
-        assert self.dialect is not None
-        return self.telemetry.thin(self.dialect)
 
     # --- out ---
 
@@ -259,7 +239,7 @@ class Session:
         """
         vehicle, dialect, target = self.vehicle, self.dialect, None
         if vehicle and dialect:
-            target = Target(vehicle.system_id, vehicle.component_id, dialect.thrust_rule)
+            target = Target(vehicle.system_id, vehicle.component_id, dialect.divides_by_tilt)
         message = outgoing.encode(target)
         sender = self._sending
         if isinstance(outgoing, Record):
@@ -286,8 +266,3 @@ class Session:
     def link_time_s(self) -> float:
         """Monotonic seconds that follow vehicle time, or host time while telemetry is missing."""
         return self.time.seconds
-
-    @property
-    def rates_hz(self) -> dict[str, float]:
-        """Measured rate of each wanted message over the last two seconds of `link_time_s`."""
-        return self.telemetry.rates_hz

@@ -50,32 +50,38 @@ class Telemetry:
     def __init__(self, capacity_bytes_ps: float | None, *, lockstep: bool) -> None:
         self.time = VehicleTime(lockstep)
         self.texts = TextAssembler()
+        self._dialect: Dialect | None = None
         self._streams: dict[int, _Stream] = {}  # those that are wanted, by message id
         self._capacity_bytes_ps = capacity_bytes_ps
         self._frames = 0  # sent by the vehicle, as the sequence numbers show; modulo 256 the newest
         self._heard_s = -math.inf  # when the newest frame arrived
         self._mode_report = (0, -math.inf)  # number of the newest, and when it arrived
 
-    def interpret(
-        self, frame: Frame, dialect: Dialect, now_s: float
-    ) -> tuple[Event, ...] | DropReason:
-        """The events of a frame of the vehicle, or why it is dropped. `now_s`: its arrival."""
+    def interpret(self, frame: Frame, now_s: float, events: list[Event]) -> DropReason | None:
+        """Add to `events` what a frame of the vehicle says; why it is dropped. `now_s`: its
+        arrival."""
         number = self._number(frame, now_s)
         if frame.message_id == STATUSTEXT:
-            return tuple(self.texts.add(frame.payload, now_s))
-        event = decode(frame, dialect)
+            events += self.texts.add(frame.payload, now_s)
+            return None
+        assert self._dialect is not None
+        event = decode(frame, self._dialect)
+        if event is None:  # nobody reads it
+            self._count(frame.message_id)
+            return None
         if isinstance(event, DropReason):
             return event
         if isinstance(event, (LocalPosition, Attitude)):
-            return self._stamped(event, frame.message_id, dialect, now_s)
+            return self._on_stamped(event, frame.message_id, now_s, events)
         if isinstance(event, (Heartbeat, ModeReport)) and self._overtaken(number, now_s):
             return DropReason.STALE
         self._count(frame.message_id)
-        return () if event is None else (event,)
+        events.append(event)
+        return None
 
-    def _stamped(
-        self, event: LocalPosition | Attitude, message_id: int, dialect: Dialect, now_s: float
-    ) -> tuple[Event, ...] | DropReason:
+    def _on_stamped(
+        self, event: LocalPosition | Attitude, message_id: int, now_s: float, events: list[Event]
+    ) -> DropReason | None:
         wrapped_s = self.time.wrapped_s(event.time_s)
         if wrapped_s:
             event = replace(event, time_s=event.time_s + wrapped_s)
@@ -86,9 +92,11 @@ class Telemetry:
         self._count(message_id)
         if age is Age.REBOOTED:
             self._mode_report = (0, -math.inf)  # it counts anew
-            self.request_from(dialect)  # a rebooted vehicle has its default rates
+            self._request()  # a rebooted vehicle has its default rates
+            events.append(Rebooted(event.time_s))
         self.time.on_telemetry(event.time_s, now_s)
-        return (Rebooted(event.time_s), event) if age is Age.REBOOTED else (event,)
+        events.append(event)
+        return None
 
     def _number(self, frame: Frame, now_s: float) -> int:
         """The number of the frame in the order of sending, by its 8-bit sequence number."""
@@ -108,18 +116,23 @@ class Telemetry:
 
     # --- rates ---
 
-    def request_from(self, dialect: Dialect) -> None:
-        """Request all messages that are wanted of this autopilot."""
-        wanted = dialect.wanted
+    def begin(self, dialect: Dialect) -> None:
+        """The vehicle has this autopilot: request all messages that are wanted of it."""
+        self._dialect = dialect
+        self._request()
+
+    def _request(self) -> None:
+        wanted = self._dialect.wanted if self._dialect else ()
         if self._capacity_bytes_ps is not None:
             wanted = fitted(wanted, self._capacity_bytes_ps)
         self._streams = {each.message_id: _Stream(each, self.time.seconds) for each in wanted}
 
-    def thin(self, dialect: Dialect) -> bool:
-        """Request half of it from now on. False if the rates are the lowest already."""
+    def thin(self) -> bool:
+        """Request half of it from now on: the link is saturated. False if the rates are the lowest
+        already."""
         before = self.bytes_ps
         self._capacity_bytes_ps = 0.5 * before / SHARE
-        self.request_from(dialect)
+        self._request()
         return self.bytes_ps < 0.99 * before
 
     def due(self) -> list[WantedMessage]:
@@ -140,8 +153,9 @@ class Telemetry:
 
     def _count(self, message_id: int) -> None:
         """A message has arrived."""
-        if message_id in self._streams:
-            self._streams[message_id].arrivals_s.append(self.time.seconds)
+        stream = self._streams.get(message_id)
+        if stream:
+            stream.arrivals_s.append(self.time.seconds)
 
 
 def fitted(wanted: Iterable[WantedMessage], bytes_ps: float) -> tuple[WantedMessage, ...]:
@@ -186,9 +200,10 @@ class _Stream:
         return True
 
     def _again(self, waited_s: float, now_s: float) -> bool:
+        if waited_s < _FIRST_WAIT_S:
+            return False
         rate_hz, enough_hz = self.rate_hz(now_s), _ENOUGH * self.wanted.arrives_hz
-        lost_hz = min(_UNHEARD * self.wanted.rate_hz, enough_hz)
-        if waited_s >= _FIRST_WAIT_S and 0.0 < rate_hz < lost_hz:
+        if 0.0 < rate_hz < min(_UNHEARD * self.wanted.rate_hz, enough_hz):
             return True  # the link has lost the requests
         if waited_s < self.wait_s:
             return False

@@ -24,7 +24,7 @@ from typing import Any, Protocol
 from offboard.documents import shipped
 from offboard.documents.errors import UserError
 from offboard.link import clock
-from offboard.link.interface import Chunk, LinkReport
+from offboard.link.interface import Chunk, Link
 
 OWN_VEHICLES = {"px4": "px4_sih", "ardupilot": "arducopter"}  # the simulator's default vehicles
 STOP_S = 2.0
@@ -145,20 +145,14 @@ class InMemoryVehicle(Protocol):
     def exchange(self, frames: Sequence[bytes]) -> list[tuple[int, bytes]]: ...
 
 
-class InMemoryLink:
-    """The `Link` to a vehicle in this process. `problem`: the exception that ended the vehicle."""
-
-    is_stream = False
-    capacity_bytes_ps: float | None = None
-    opened = 0
+class InMemoryLink(Link):
+    """The link to a vehicle in this process. `problem`: the exception that ended the vehicle."""
 
     def __init__(self, vehicle: InMemoryVehicle) -> None:
-        self.report = LinkReport()
+        super().__init__()
         self.problem: Exception | None = None
         self._vehicle = vehicle
         self._sent: list[bytes] = []
-
-    def wait(self, timeout_s: float) -> None: ...
 
     def receive(self) -> list[Chunk]:
         """All datagrams up to the next barrier. Never waits."""
@@ -175,15 +169,6 @@ class InMemoryLink:
 
     def send(self, data: bytes, peer: Hashable | None) -> None:
         self._sent.append(data)
-
-    def follow(self, peer: Hashable) -> None:
-        pass
-
-    def descriptors(self) -> tuple[int, ...]:
-        return ()
-
-    def close(self) -> None:
-        pass
 
 
 class InMemorySimulator:

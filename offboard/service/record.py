@@ -60,8 +60,8 @@ class RollingLog:
         """The file that is written."""
         return self._descriptors[0]
 
-    def write(self, record: bytes) -> None:
-        self._writer.put(record)
+    def write(self, unix_us: int, frame: bytes) -> None:
+        self._writer.put(entry(unix_us, frame))
 
     def _append(self, records: list[bytes]) -> None:
         size = sum(map(len, records))
@@ -81,30 +81,16 @@ class RollingLog:
 
 
 class FlightRecord(FlightLog):
-    """The log of one flight of `vehicle`. The writing thread makes its directory when it has the
-    first entries: the loop waits for no disk."""
+    """The log of one flight of `vehicle`, with its file `engaged`. The loop waits for no disk."""
 
     def __init__(self, directory: Path, configuration: str, vehicle: str) -> None:
         super().__init__(directory, configuration, real_time=True)
         self.vehicle = vehicle
-        self.opened = False
-        self._writer = BackgroundWriter[bytes](self._append, QUEUED_MAX)
+        self.start()
 
-    def put(self, record: bytes) -> None:
-        """Queue an entry."""
-        self._writer.put(record)
-
-    def _append(self, entries: list[bytes]) -> None:
-        if not self.opened:
-            self.directory.mkdir(parents=True)
-            (self.directory / ENGAGED).write_text(self.vehicle, encoding="utf-8")
-            self._open()
-            self.opened = True
-        super()._append(entries)
-
-    def _close_file(self) -> None:
-        if self.opened:
-            super()._close_file()
+    def _open(self) -> None:
+        super()._open()
+        (self.directory / ENGAGED).write_text(self.vehicle, encoding="utf-8")
 
 
 class Recorder:
@@ -126,7 +112,7 @@ class Recorder:
         self._rolling = RollingLog(directory, rolling_bytes)
         self._flight: FlightRecord | None = None
         self._before: deque[tuple[int, bytes]] = deque(maxlen=BEFORE_MAX)
-        self._once: dict[tuple[int, bytes], bytes] = {}
+        self._once: dict[tuple[int, bytes], tuple[int, bytes]] = {}
         self._clerk = ThreadPoolExecutor(max_workers=1, thread_name_prefix="record")
         self._closed = False
         self._engaged = sorted(path.parent for path in directory.glob(f"*/{ENGAGED}"))
@@ -142,7 +128,7 @@ class Recorder:
     def descriptor(self) -> int:
         """The file that is written now."""
         flight = self._flight
-        return flight.descriptor if flight and flight.opened else self._rolling.descriptor
+        return flight.descriptor if flight and flight.descriptor >= 0 else self._rolling.descriptor
 
     @property
     def problem(self) -> str:
@@ -155,19 +141,18 @@ class Recorder:
 
     def write(self, unix_us: int, frame: bytes) -> None:
         """Queue one frame and its Unix time."""
-        record = entry(unix_us, frame)
         if self._flight:
-            self._flight.put(record)
+            self._flight.write(unix_us, frame)
             return
-        self._rolling.write(record)
-        self._before.append((unix_us, record))
+        self._rolling.write(unix_us, frame)
+        self._before.append((unix_us, frame))
         while not 0 <= unix_us - self._before[0][0] <= BEFORE_US:  # the wall clock may be set
             self._before.popleft()
         message = int.from_bytes(frame[7:10], "little")
         if message in SENT_ONCE:
             name = message, frame[PARAM_ID] if message == PARAM_VALUE else b""
             if message != PARAM_VALUE or name in self._once or len(self._once) < KEPT_MAX:
-                self._once[name] = record
+                self._once[name] = unix_us, frame
 
     # ------------------------------------------------------------------ flights
 
@@ -182,12 +167,10 @@ class Recorder:
         found = vehicle_record(session.vehicle)
         for piece in (*configuration_pieces(configuration), found):
             flight.write(now_us, session.encode(piece))
-        earlier = {record for _, record in self._before}
-        for record in self._once.values():
-            if record not in earlier:
-                flight.put(record)
-        for _, record in self._before:
-            flight.put(record)
+        newest = set(self._before)
+        earlier = [each for each in self._once.values() if each not in newest]
+        for sent_us, frame in (*earlier, *self._before):
+            flight.write(sent_us, frame)
         self._before.clear()
         return str(directory)
 
@@ -216,7 +199,7 @@ class Recorder:
 
     def _finish(self, flight: FlightRecord) -> None:
         flight.close()
-        if flight.opened:
+        if flight.path.exists():
             self._score(flight.directory)
 
     @property

@@ -11,7 +11,6 @@ import os
 import select
 import signal
 import socket
-import stat
 import sys
 from collections.abc import Hashable, Mapping
 from contextlib import suppress
@@ -24,7 +23,7 @@ from offboard.link.after_flight import begin
 from offboard.link.background import BackgroundWriter
 from offboard.link.interface import Link
 from offboard.link.log import append, entry
-from offboard.link.stream import Listener, Source, Stream, StreamLink
+from offboard.link.stream import ListeningLink, Stream, StreamLink
 from offboard.link.udp import UdpLink
 from offboard.mavlink import event_record, texts
 from offboard.mavlink.dialects.base import SetpointLoss
@@ -109,7 +108,8 @@ class TakeOver:
         self._tell = tell
         # JSON has no tuples
         peer: Hashable = tuple(beat["peer"]) if isinstance(beat["peer"], list) else beat["peer"]
-        self._link = _link(watch.descriptors[:-1], str(peer) if beat["stream"] else "")
+        name = str(peer) if beat["stream"] else ""
+        self._link = _link(watch.descriptors[:-1], name, listens=beat["listens"])
         self._log = BackgroundWriter[bytes](
             lambda entries: append(watch.descriptors[-1], entries), 100_000
         )
@@ -194,39 +194,16 @@ def _known(vehicle: Mapping[str, Any], setpoint_loss: Mapping[str, Any], **more:
     )
 
 
-def _link(descriptors: list[int], stream: str) -> Link:
-    """The link that has these descriptors; `stream` is the name of a stream, empty for UDP."""
-    if stream:
-        return _stream_link(descriptors, stream)
-    listening = vehicle = None
-    for sock in (socket.socket(fileno=descriptor) for descriptor in descriptors):
-        try:
-            sock.getpeername()
-            vehicle = sock
-        except OSError:  # not connected
-            listening = sock
-    return UdpLink(listening, vehicle)
-
-
-def _stream_link(descriptors: list[int], name: str) -> StreamLink:
-    """A link with at most one stream, and at most one socket that listens for the next one. Without
-    a stream nothing can be asked of the vehicle until it connects again."""
-    source = Source()
-    stream = None
-    for descriptor in descriptors:
-        if _listens(descriptor):
-            source = Listener(socket.socket(fileno=descriptor))
-        else:
-            stream = Stream(descriptor, partial(os.close, descriptor))
-    return StreamLink(stream, name, source)
-
-
-def _listens(descriptor: int) -> bool:
-    if not stat.S_ISSOCK(os.fstat(descriptor).st_mode):
-        return False
-    sock = socket.socket(fileno=os.dup(descriptor))
-    with sock:
-        return bool(sock.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN))
+def _link(descriptors: list[int], stream: str, *, listens: bool) -> Link:
+    """The link that has these descriptors, of which the first one may listen for others than the
+    vehicle. `stream`: the name of a stream, empty for UDP. Without the vehicle's own descriptor
+    nothing can be asked of it until it connects again."""
+    listening = socket.socket(fileno=descriptors[0]) if listens else None
+    vehicle = descriptors[listens] if len(descriptors) > listens else None
+    if not stream:
+        return UdpLink(listening, None if vehicle is None else socket.socket(fileno=vehicle))
+    begun = None if vehicle is None else Stream(vehicle, partial(os.close, vehicle))
+    return ListeningLink(listening, stream, begun) if listening else StreamLink(begun, stream)
 
 
 def main() -> None:

@@ -111,6 +111,7 @@ class Supervisor:
             "sent_s": now_s,
             "peer": peer,
             "stream": link.is_stream,
+            "listens": link.listens,
             "signing": self._signing.state() if self._signing else None,
         }
         line = json.dumps(beat).encode() + b"\n"

@@ -103,7 +103,7 @@ Measure = Callable[[Any, Any], object]
 
 
 def hears_another(flight: FlightState, since_s: float) -> None:
-    flight.vehicle.update(OtherSender(1, 190, 82), NOW_S - since_s)
+    flight.vehicle.update(OtherSender(1, 190), NOW_S - since_s)
     flight.vehicle.now_s = NOW_S
 
 
@@ -275,7 +275,7 @@ def test_every_row_at_its_limit() -> None:
 def test_another_program_may_be_allowed() -> None:
     for name in ("second sender", "other setpoints"):
         flight = uneventful()
-        hear(flight, OtherSender(1, 190, 82))
+        hear(flight, OtherSender(1, 190))
         follows(flight, "OFFBOARD")
         assert BY_NAME[name].condition(flight)
         flight.limits = Limits(begin_with_other_sender=True)

@@ -65,6 +65,11 @@ def plugged(ends: ExitStack) -> tuple[int, str, Callable[[], object]]:
     return ours, os.ttyname(theirs), unplugs.close
 
 
+def port(link: Link) -> int:
+    with socket.socket(fileno=os.dup(link.descriptors()[0])) as ours:
+        return int(ours.getsockname()[1])
+
+
 def turns(link: Link, until: Callable[[bytes], object]) -> bytes:
     """Turns of the loop until `until` holds for all that was received; none of them may wait."""
     received, deadline_s = b"", time.monotonic() + LONG_S
@@ -101,7 +106,7 @@ def udp() -> Iterator[Udp]:
     ):
         for one in (vehicle, other):
             one.settimeout(5.0)
-            one.connect((LOCAL, link.port))
+            one.connect((LOCAL, port(link)))
         yield link, vehicle, other
     link.close()
 
@@ -189,7 +194,7 @@ def test_frames_reach_the_vehicle_before_and_after_it_is_followed(udp: Udp) -> N
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
                 other.setsockopt(socket.SOL_SOCKET, option, 1)
                 with pytest.raises(OSError, match="in use"):
-                    other.bind(("0.0.0.0", link.port))
+                    other.bind(("0.0.0.0", port(link)))
         link.follow(vehicle.getsockname())
 
 
@@ -328,7 +333,7 @@ def test_a_tcp_peer_that_goes_and_returns_is_connected_again(ends: ExitStack) ->
 
 def test_tcpin_takes_one_client_and_the_next_one_when_it_is_silent(ends: ExitStack) -> None:
     link = opened("tcpin:127.0.0.1:0", ends)
-    place = socket.socket(fileno=os.dup(link.descriptors()[0])).getsockname()
+    place = LOCAL, port(link)
     assert link.receive() == []
     link.send(b"to nobody", None)
     vehicle = ends.enter_context(socket.create_connection(place))
@@ -414,7 +419,7 @@ def joined(kind: str, ends: ExitStack) -> tuple[Link, Callable[[bytes], object]]
     link = opened("udpin:127.0.0.1:0", ends)
     other = ends.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
     assert isinstance(link, UdpLink)
-    other.connect(("127.0.0.1", link.port))
+    other.connect(("127.0.0.1", port(link)))
     return link, other.send
 
 
@@ -429,14 +434,14 @@ def test_ipv6_addresses(ends: ExitStack) -> None:
     assert isinstance(link, UdpLink)
     other = ends.enter_context(socket.socket(socket.AF_INET6, socket.SOCK_DGRAM))
     other.settimeout(LONG_S)
-    other.sendto(b"hello", ("::1", link.port))
+    other.sendto(b"hello", ("::1", port(link)))
     turns(link, lambda data: data == b"hello")
     peer = ("::1", other.getsockname()[1], 0, 0)
     link.follow(peer)
     link.send(b"answer", peer)
     assert other.recv(100) == b"answer"
     with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as third:
-        third.sendto(b"x", ("::1", link.port))
+        third.sendto(b"x", ("::1", port(link)))
         turns(link, lambda _: link.report.ignored)
     assert "1 datagram from [::1]:" in link.report.news()[0]
     server = ends.enter_context(socket.create_server(("::1", 0), family=socket.AF_INET6))

@@ -165,7 +165,7 @@ EVENTS: dict[str, Setup] = {
     "at_full_speed": _track_for(TRACK.track_start_s),
     "track_over": _track_for(TRACK.track_end_s),
     "at_rest": _track_for(TRACK.duration_s + 0.5),
-    "other_sender": lambda flight: hear(flight, OtherSender(1, 190, 82)),
+    "other_sender": lambda flight: hear(flight, OtherSender(1, 190)),
     "other_vehicle": lambda flight: vars(flight.session.senders).update(
         candidates=lambda now_s: "1 and 2"
     ),

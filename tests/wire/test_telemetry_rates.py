@@ -50,7 +50,7 @@ class Vehicle:
             if every_ticks and self.ticks % every_ticks == 0:
                 self.session.receive(self.sender.position(10 * self.ticks), PEER, now_s)
             self._obey(self.session.poll(now_s))
-        return self.session.rates_hz["LOCAL_POSITION_NED"]
+        return self.session.telemetry.rates_hz["LOCAL_POSITION_NED"]
 
 
 @pytest.mark.parametrize(("speed", "every_ticks"), [(0.3, 1), (50.0, 10)])
@@ -137,7 +137,7 @@ def test_rates_fit_a_serial_line(baud: int, attitude_hz: float) -> None:
 def test_telemetry_of_a_saturated_link_is_halved_until_it_is_slow() -> None:
     session, rates_hz = started(), []
     session.poll(0.0)
-    while session.thin_telemetry():
+    while session.telemetry.thin():
         rates_hz.append(asked_hz(session)[31])
     assert rates_hz[0] == pytest.approx(47.0, abs=4.0)
     assert rates_hz[-1] == pytest.approx(20.0, abs=0.5)

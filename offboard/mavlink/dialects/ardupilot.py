@@ -11,13 +11,10 @@ from offboard.mavlink.dialects.base import (
     CUSTOM_MODE_ENABLED,
     TRACKING_TELEMETRY,
     Dialect,
-    ParameterEncoding,
-    Takeoff,
     Valid,
     WantedMessage,
     WatchedParameter,
 )
-from offboard.mavlink.outgoing import ThrustRule
 
 
 def _mode_parameters(custom_mode: int) -> tuple[float, float, float]:
@@ -40,10 +37,10 @@ ARDUPILOT = Dialect(
     hold_mode="BRAKE",
     land_mode="LAND",
     return_mode="RTL",
-    takeoff=Takeoff.COMMAND,
+    takes_off_by_command=True,
     unused_parameter=0.0,  # NaN stops its SITL with a floating point exception
-    thrust_rule=ThrustRule.TILT_COMPENSATED,  # ATC_ANGLE_BOOST 1
-    parameter_encoding=ParameterEncoding.CAST,
+    divides_by_tilt=True,  # ATC_ANGLE_BOOST 1
+    integers_bytewise=False,
     watched_parameters=(
         WatchedParameter(
             "GUID_OPTIONS",

@@ -8,12 +8,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from enum import Enum
 from typing import NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from offboard.mavlink.outgoing import CommandLong, ThrustRule
+from offboard.mavlink.outgoing import CommandLong
 
 SET_MODE, TAKEOFF = 176, 22  # MAV_CMD
 CUSTOM_MODE_ENABLED = 1.0  # MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
@@ -24,20 +23,6 @@ FRAME_BYTES = 12  # of a MAVLink 2 frame besides its payload
 def id_of(message: str) -> int:
     """The id of a message, by its name."""
     return int(getattr(mavlink, f"MAVLink_{message.lower()}_message").id)
-
-
-class ParameterEncoding(Enum):
-    """How PARAM_VALUE holds an integer in its float field."""
-
-    BYTEWISE = "the integer's four bytes"
-    CAST = "the integer's value"
-
-
-class Takeoff(Enum):
-    """How the autopilot leaves the ground."""
-
-    SETPOINT = "setpoints lift it off"
-    COMMAND = "MAV_CMD_NAV_TAKEOFF lifts it off, altitude above home"
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,10 +150,10 @@ class Dialect:
     hold_mode: str
     land_mode: str
     return_mode: str
-    takeoff: Takeoff
+    takes_off_by_command: bool  # MAV_CMD_NAV_TAKEOFF lifts it off; else setpoints do
     unused_parameter: float  # of a COMMAND_LONG: "not given" to this autopilot
-    thrust_rule: ThrustRule
-    parameter_encoding: ParameterEncoding
+    divides_by_tilt: bool  # the thrust of a setpoint, by the cosine of the body's tilt
+    integers_bytewise: bool  # PARAM_VALUE holds an integer's four bytes; else its value
     watched_parameters: tuple[WatchedParameter, ...]
     wanted: tuple[WantedMessage, ...]
     hover_parameter: str  # normalised thrust that holds the weight

@@ -11,13 +11,10 @@ from offboard.mavlink.dialects.base import (
     TRACKING_TELEMETRY,
     Defect,
     Dialect,
-    ParameterEncoding,
-    Takeoff,
     Valid,
     WantedMessage,
     WatchedParameter,
 )
-from offboard.mavlink.outgoing import ThrustRule
 
 
 def _custom_mode(main: int, sub: int = 0) -> int:
@@ -65,10 +62,10 @@ PX4 = Dialect(
     hold_mode="AUTO.LOITER",
     land_mode="AUTO.LAND",
     return_mode="AUTO.RTL",
-    takeoff=Takeoff.SETPOINT,
+    takes_off_by_command=False,
     unused_parameter=float("nan"),  # 0 would be a latitude
-    thrust_rule=ThrustRule.COLLECTIVE,
-    parameter_encoding=ParameterEncoding.BYTEWISE,
+    divides_by_tilt=False,
+    integers_bytewise=True,
     watched_parameters=(
         WatchedParameter("MPC_THR_HOVER", "normalised thrust that holds the weight"),
         WatchedParameter(
