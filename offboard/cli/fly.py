@@ -34,7 +34,8 @@ from offboard.documents.errors import UserError, plain
 
 if TYPE_CHECKING:
     from offboard.analysis.score import Requirement
-    from offboard.flight.flight import Flight, Outcome
+    from offboard.flight.flight import Outcome
+    from offboard.live.process import Displays
 
 INTERRUPTED = "interrupted before anything was sent"
 LABEL_WIDTH = 15
@@ -77,17 +78,12 @@ def fly(
     simulated.check(options)
     try:
         from offboard.link.stop import StopRequests
-        from offboard.live.lines import JsonLines, Terminal
-        from offboard.live.process import LiveProcess
         from offboard.run.sitl import SimulatorProcess
 
         with (
             StopRequests(_exit_at_once) as stops,
             SimulatorProcess() if simulated.sitl else nullcontext() as simulator,
-            closing(
-                JsonLines(write) if json_lines else Terminal(out, partial(say, indent=12))
-            ) as lines,
-            closing(LiveProcess("--live", live)) if live else nullcontext() as shown,
+            closing(_displays(live, json_lines=json_lines)) as displays,
         ):
             from offboard.link import clock
             from offboard.run.flight import fly as fly_once
@@ -96,35 +92,24 @@ def fly(
             directory = out_directory or FLIGHTS / clock.local_stamp()
             flown = simulated.vehicle(options)
             flight = options.load(seed, flown.known_vehicle)
-            if shown:
-                lines.tell(f"live: {shown.await_ready()}")
-                title = f"{directory.name}: {flight.reference.shape} by {flight.controller.law}"
-                shown.tell(title=title)
-            displays = [lines, shown] if shown else [lines]
-
-            def show(companion: Flight) -> None:
-                for display in displays:
-                    display.show(companion)
-
+            displays.begin(f"{directory.name}: {flight.reference.shape} by {flight.controller.law}")
             outcome = fly_once(
                 flight,
                 directory,
                 flown,
                 simulator=simulator,
                 stops=stops,
-                progress=show,
-                tell=lines.tell,
+                progress=displays.show,
+                tell=displays.tell,
             )
             page = str(directory / "report.html") if report and not outcome.log_problem else ""
-            if shown:
-                shown.tell(verdict=outcome.sentence, report=page)
+            displays.conclude(outcome.sentence, page)
     except KeyboardInterrupt:  # before the flight; in flight an interrupt lands the vehicle
         raise UserError(INTERRUPTED, INTERRUPT) from None
     if outcome.exit_code == 2:
         raise UserError(outcome.sentence)
     try:
-        lost = [each.lost for each in displays if each.lost]
-        _conclude(outcome, directory, requirements, lost, page=page, json_lines=json_lines)
+        _conclude(outcome, directory, requirements, displays.lost, page=page, json_lines=json_lines)
     finally:
         if report:
             from offboard.link.after_flight import begin_report
@@ -136,6 +121,15 @@ def _exit_at_once() -> None:
     """Exit although code may be compiling; the simulator ends when the pipe to it closes."""
     os.write(2, f"{INTERRUPTED}\n".encode())
     os._exit(INTERRUPT)
+
+
+def _displays(live: str | None, *, json_lines: bool) -> Displays:
+    """What shows the flight: lines, and a server of the page at the address `live`."""
+    from offboard.live.lines import JsonLines, Terminal
+    from offboard.live.process import Displays, LiveProcess
+
+    lines = JsonLines(write) if json_lines else Terminal(out, partial(say, indent=12))
+    return Displays(lines, [LiveProcess("--live", live)] if live else [])
 
 
 def _conclude(

@@ -6,13 +6,19 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
+from typing import TYPE_CHECKING
 
 from offboard.documents.arguments import split_address
 from offboard.documents.errors import UserError
 from offboard.flight.display import Snapshot
 from offboard.link import clock
 from offboard.live.display import Display, Shown, json_lines, line
+
+if TYPE_CHECKING:
+    from offboard.flight.flight import Flight
+    from offboard.live.lines import JsonLines, Terminal
 
 SERVER = "offboard.live.server"
 PERIOD_S = 0.1  # between two snapshots, host time
@@ -88,3 +94,46 @@ class LiveProcess(Display):
         data = memoryview(json_lines(items).encode())
         while data:
             data = data[self._process.stdin.write(data) :]
+
+
+class Displays:
+    """The lines of a flight, and the processes that serve clients. Their `show` is called in every
+    turn of the loop and must not wait; one whose `show` raises is not called again."""
+
+    def __init__(self, lines: Terminal | JsonLines, pages: Sequence[LiveProcess] = ()) -> None:
+        self._lines, self._pages = lines, pages
+        self._parts: list[Display] = [lines, *pages]
+        self._working = list(self._parts)
+
+    def tell(self, sentence: str) -> None:
+        """A sentence about the preparation."""
+        self._lines.tell(sentence)
+
+    def begin(self, title: str) -> None:
+        """Wait until the pages are served, tell where, and give them their title: what is flown.
+        Raises UserError."""
+        for page in self._pages:
+            self.tell(f"live: {page.await_ready()}")
+            page.tell(title=title)
+
+    def conclude(self, verdict: str, report: str) -> None:
+        """How the flight ended, and where its report will be, for the pages."""
+        for page in self._pages:
+            page.tell(verdict=verdict, report=report)
+
+    def show(self, companion: Flight) -> None:
+        for part in tuple(self._working):
+            try:
+                part.show(companion)
+            except (Exception, SystemExit):  # rich ends the program on a closed pipe
+                self._working.remove(part)
+
+    def close(self) -> None:
+        for part in self._parts:
+            with suppress(Exception, SystemExit):
+                part.close()
+
+    @property
+    def lost(self) -> list[str]:
+        """Sentences on what was not shown."""
+        return [part.lost for part in self._parts if part.lost]

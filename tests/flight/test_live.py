@@ -30,7 +30,7 @@ from offboard.documents.errors import UserError
 from offboard.flight.display import Snapshot
 from offboard.flight.phases import Phase
 from offboard.live.lines import JsonLines, Terminal, status
-from offboard.live.process import LiveProcess
+from offboard.live.process import Displays, LiveProcess
 
 FLOOD = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n" * 200
 EVENTS = b"GET /events HTTP/1.1\r\nHost: x\r\n\r\n"
@@ -156,6 +156,16 @@ def test_an_address_that_cannot_be_served_is_refused() -> None:
 # --- one flight, shown in every way ---------------------------------------------------------------
 
 
+class Broken:
+    lost = "broken"
+
+    def show(self, _: object) -> None:
+        raise SystemExit(1)
+
+    def close(self) -> None:
+        raise OSError
+
+
 @dataclass
 class Shown:
     pair: Pair
@@ -169,7 +179,7 @@ class Shown:
 @pytest.fixture(scope="module")
 def shown() -> Iterator[Shown]:
     written: list[str] = []
-    displays: list[JsonLines | Terminal] = [JsonLines(written.append)]
+    displays = [Displays(JsonLines(written.append), [Broken()])]  # type: ignore[list-item]
     files = io.StringIO(), io.StringIO()
     seen: list[tuple[float, Snapshot]] = []
     with (
@@ -181,7 +191,7 @@ def shown() -> Iterator[Shown]:
         patch.setenv("TERM", "xterm")
         for file in files:
             console = Console(file=file, force_terminal=file is files[0], width=80)
-            displays.append(Terminal(console, partial(console.print, soft_wrap=True)))
+            displays.append(Displays(Terminal(console, partial(console.print, soft_wrap=True))))
 
         def show(flying: Pair) -> None:
             for display in displays:
@@ -197,7 +207,7 @@ def shown() -> Iterator[Shown]:
         pair.fly()
         for display in displays:
             display.close()
-        assert [display.lost for display in displays] == ["", "", ""]
+        assert [display.lost for display in displays] == [["broken"], [], []]
         process.tell(title="a flight: lemniscate by pso")
         process.show(pair.companion)
         process.tell(verdict="flown and landed", report="flights/a/report.html")
