@@ -206,13 +206,6 @@ class Serving(Pair):
         """A setpoint that another program sends, as a router shows it to us."""
         self.forwarded.append(level_setpoint(0.5, 42, 190))
 
-    def flown_by_other(self, seconds: float) -> None:
-        """Another computer sends setpoints, on a link that we do not hear."""
-        end_s = self.time_s + seconds
-        while self.time_s < end_s:
-            self.instance.feed_ground(level_setpoint(HOVER[self.firmware], 1, 194))
-            self.run(0.1)
-
     def restart(self) -> None:
         """Restart the process of the service."""
         self.companion = self.again(self.logs)  # type: ignore[misc,assignment]

@@ -9,10 +9,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from pair import Pair, make, on_arducopter
 from watch import scenario_of, watched
 
@@ -64,23 +61,6 @@ VEHICLE = Vehicle.model_validate(
     simulated.vehicle("arducopter").model_dump()
     | {"hover_thrust": 0.4, "thrust_delay_s": 0.0, "thrust_lag_s": 0.0}
 )
-
-
-@settings(max_examples=20, derandomize=True, deadline=None)
-@given(st.floats(0.2, 0.7), st.floats(-1.0, 3.3))
-def test_estimate_of_an_accelerated_climb(true: float, climb_mps: float) -> None:
-    """Against the closed-form speed v(t) under constant thrust and linear drag."""
-    gravity, drag = VEHICLE.gravity_mps2, VEHICLE.drag_per_mass_ps
-    thrust = 1.15 * true
-    final = (gravity - gravity * thrust / true) / drag  # down
-    hover, rng = HoverEstimate(), np.random.default_rng(5)
-    for step in range(101):
-        time_s = 0.01 * step
-        speed = final + (-climb_mps - final) * math.exp(-drag * time_s)
-        hover.on_position(time_s, 1.0, speed + rng.normal(0.0, 0.01))
-        if step % 10 == 0:
-            hover.on_thrust(time_s, thrust, thrust)
-    assert hover.hover_thrust(VEHICLE, 1.0) == pytest.approx(true, rel=0.02)
 
 
 def test_no_estimate_from_too_little_or_on_the_ground_or_while_it_falls() -> None:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import random
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from itertools import chain, repeat
 from typing import Any
 
 import numpy as np
@@ -127,18 +131,6 @@ def test_engaged_handed_back_and_engaged_again(served: Served, on: str) -> None:
     assert pair.mode == HOLD[on]
     assert pair.service.current.outcome is not None
     assert pair.service.current.outcome.exit_code == 0
-
-
-def test_a_pilot_may_take_a_vehicle_that_is_handed_back(served: Served) -> None:
-    """The service was stopped, and the vehicle has not shown hold yet."""
-    pair = served.engaged()
-    pair.service.request_stop()
-    pair.until(lambda: pair.phase is Phase.HAND_BACK, 0.5)
-    pair.instance.autopilot.commander.switch("POSCTL")
-    pair.until(pair.service.has_ended, 3.0)
-    outcome = pair.service.current.outcome
-    assert outcome is not None
-    assert (outcome.exit_code, pair.service.current.taken) == (0, True)
 
 
 def fly_north(pair: Serving, speed_mps: float) -> None:
@@ -611,20 +603,77 @@ def test_a_plane_is_left_alone(served: Served) -> None:
     assert pair.mode == "GUIDED"
 
 
-def test_what_is_heard_after_a_silence_in_health_may_be_another_vehicle_too(served: Served) -> None:
-    """A third one passes by, which prevents standby for 10 s. It was ready with the parameters of
-    the one before."""
-    pair = served("ardupilot")
-    codec = mavlink.MAVLink(None, srcSystem=9, srcComponent=1)
-    pair.run(0.5)
-    pair.forwarded.append(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3).pack(codec))
-    pair.run(3.0)
-    assert pair.state.vehicle.parameters["GUID_OPTIONS"] == 8.0
-    pair.lost_down = pair.lost_up = True
-    pair.run(6.0)
-    pair.instance.autopilot.parameters.set("GUID_OPTIONS", 0.0)
-    pair.lost_down = pair.lost_up = False
-    pair.run(6.0)
-    assert pair.phase is Phase.HEALTH
-    assert said(pair, "waiting: GUID_OPTIONS is 0: without bit 3")
-    assert sum("health: no telemetry for 5" in text for text in announced(pair)) == 1
+# --- anything, in any order -----------------------------------------------------------------------
+
+
+def up(pair: Serving, _: float) -> None:
+    if pair.place[2] > -0.5 and not pair.armed:
+        with suppress(AssertionError):  # a vehicle that does not arm now
+            pair.fly_up()
+        pair.switch("pilot")
+
+
+def lose(direction: str) -> Callable[[Serving, float], None]:
+    def lost(pair: Serving, for_s: float) -> None:
+        setattr(pair, direction, True)
+        pair.run(for_s)
+        setattr(pair, direction, False)
+
+    return lost
+
+
+def stop(pair: Serving, _: float) -> None:
+    """SIGTERM, and started again by the service manager."""
+    pair.service.request_stop()
+    end_s = pair.time_s + 10.0
+    while not pair.service.has_ended() and pair.time_s < end_s:
+        pair.advance()
+    pair.service.close()
+    pair.restart()
+
+
+def reboot(pair: Serving, _: float) -> None:
+    """With another battery."""
+    if not pair.armed:
+        pair.instance.autopilot.plant.set_battery(1.0)
+        pair.instance.reboot(1.0)
+
+
+EVENTS: dict[str, Callable[[Serving, float], object]] = {
+    "engage": lambda pair, _: pair.switch("engage"),
+    "freeze": lambda pair, for_s: pair.pause(0.4 * for_s),
+    "up lost": lose("lost_up"),
+    "kill": lambda pair, _: pair.restart(),
+    "second sender": lambda pair, _: pair.other_setpoint(),
+    "switch": lambda pair, _: pair.switch("pilot"),
+    "stop": stop,
+    "down lost": lose("lost_down"),
+    "hand back": lambda pair, _: pair.command(SET_MODE, 1, 4, 3),
+    "land": lambda pair, _: pair.switch("land"),
+    "arm": lambda pair, _: pair.ground(ARM, 1),
+    "up": up,
+    "start": lambda pair, _: pair.command(START),
+    "pause": lambda pair, _: pair.command(PAUSE_CONTINUE, 0),
+    "continue": lambda pair, _: pair.command(PAUSE_CONTINUE, 1),
+    "reboot": reboot,
+}
+
+
+@BOTH
+@pytest.mark.slow
+@pytest.mark.timeout(0)
+def test_nothing_unsafe_in_a_day(served: Served, on: str) -> None:
+    """Of OFFBOARD_DAY_S seconds: every event once, then any, engaged again and again."""
+    pair = served(on)
+    chance = random.Random(int(os.environ.get("OFFBOARD_DAY_SEED", "1")))
+    drawn = (chance.choice([*EVENTS, *["up", "switch", "engage"] * 3]) for _ in repeat(None))
+    for name in chain(EVENTS, drawn):
+        for_s = chance.uniform(1.0, 8.0)
+        EVENTS[name](pair, for_s)
+        pair.run(for_s)
+        assert served.wires[0].unsafe == [], name
+        for kept in (pair.sent, pair.logged, pair.phases):
+            kept.clear()
+        if pair.time_s > float(os.environ.get("OFFBOARD_DAY_S", "120")):
+            break
+    assert pair.logs.begun

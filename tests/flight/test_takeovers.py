@@ -16,9 +16,9 @@ from typing import Any
 
 import pytest
 from faults import CURRENT_MODE, HEARTBEAT, frame_id, losing, without
-from pair import HOST_EPOCH_S, STEP_S, Pair, decode, frames_of, hover, in_phase
+from pair import HOST_EPOCH_S, STEP_S, Pair, decode, frames_of, in_phase
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from watch import SET_MESSAGE_INTERVAL, Vehicle, aborted, begun_s, copter, flown, px4
+from watch import SET_MESSAGE_INTERVAL, Vehicle, aborted, begun_s, copter, px4
 
 from offboard.flight.authority import Standing
 from offboard.flight.phases import ENDS, ExitCode, Phase
@@ -166,11 +166,6 @@ def test_nothing_leaves_after_a_take_over(seed: int) -> None:
     assert judge.wrong == []
     if judge.gone_s is not None and acted:
         assert pair.companion.authority.standing is Standing.LOST or mode is None
-
-
-def test_leaving_the_landing_mode_as_it_disarms_is_no_take_over() -> None:
-    """PX4 returns to OFFBOARD, which CURRENT_MODE shows before HEARTBEAT shows it disarmed."""
-    flown(hover("reference.duration_s=3.3", aloft=True))
 
 
 def test_a_hold_that_was_asked_for_on_the_ground_is_asked_for_again_in_flight() -> None:
