@@ -175,6 +175,16 @@ class Pair:
             if not self.dead:
                 self.instance.feed(frame)
 
+    def every(self, steps: int, see: Callable[[Pair], object]) -> None:
+        """Show the flight to `see` at each of so many steps."""
+
+        def look(pair: Pair) -> bool:
+            if pair.steps % steps == 0:
+                see(pair)
+            return False
+
+        self.at.append((look, lambda _: None))
+
     # -- what a test may do to the vehicle ------------------------------------------------------
 
     def ground(self, number: int, *params: float) -> None:

@@ -59,13 +59,12 @@ def test_unseen_vehicle_is_identified_in_flight_and_from_its_log(
     pair = learning(reference="identify", flies=true, aloft=False)
     away_m: list[float] = []
 
-    def look(now: Pair) -> bool:
+    def look(now: Pair) -> None:
         if now.companion.phase is Phase.EXCITE:
             place = now.companion.vehicle.position.position_ned_m
             away_m.append(float(np.linalg.norm(np.subtract(place, [0.0, 0.0, -3.0]))))
-        return False
 
-    pair.at.append((look, lambda _: None))
+    pair.every(1, look)
     pair.track()
     assert len(away_m) > 500
     assert max(away_m) < IDENTIFY.box_m
