@@ -269,6 +269,19 @@ def test_a_stopped_controller_leaves_the_answers_to_the_supervisor(tmp_path: Pat
     assert link.read == 2
 
 
+def test_a_supervisor_that_has_taken_over_is_not_called_silent(tmp_path: Path) -> None:
+    """The controller was stopped at the end of a turn."""
+
+    def stopped(sent_s: float) -> Sequence[bytes]:
+        watcher.taken, watcher.answers = True, False
+        return ()
+
+    flight, watcher = Brief(5), Watcher()
+    flight.finish_turn = stopped  # type: ignore[method-assign]
+    assert fly(flight, tmp_path, supervisor=watcher).exit_code == 4
+    assert UNANSWERED not in flight.announced
+
+
 def test_a_supervisor_that_does_not_answer_is_announced_once_and_when_it_does(
     tmp_path: Path,
 ) -> None:

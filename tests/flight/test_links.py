@@ -24,7 +24,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from offboard.link import clock
 from offboard.link.connection import open_link
-from offboard.link.interface import Chunk, Link, LinkError, LinkUnavailable
+from offboard.link.interface import Chunk, Link, LinkError, LinkReport, LinkUnavailable
 from offboard.link.stream import BROKEN, RENEWED
 from offboard.link.udp import LOOK_EVERY_S, UdpLink
 from offboard.mavlink.counters import Counters
@@ -240,6 +240,20 @@ def test_udpout_hears_only_its_peer() -> None:
 
 
 # --- streams ---
+
+
+def test_senders_are_named_at_powers_of_ten_and_bounded_in_number() -> None:
+    report = LinkReport()
+    for _ in range(100):
+        report.count("a:1", 1)
+    named = [sentence.partition(" from")[0] for sentence in report.news()]
+    assert named == ["1 datagram", "10 datagrams", "100 datagrams"]
+    report.count("b:2", 78_000)
+    assert report.news() == ["78,000 datagrams from b:2, which is not the vehicle, were ignored"]
+    for port in range(1000):
+        report.count(f"c:{port}", 1)
+    assert len(report.news()) == 6 + 3  # six more names, then 1, 10 and 100 others
+    assert report.ignored == 100 + 78_000 + 1000
 
 
 @pytest.mark.parametrize(

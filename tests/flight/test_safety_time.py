@@ -24,6 +24,7 @@ from watch import (
     Watch,
     aborted,
     alternately,
+    announced,
     begun_s,
     copter,
     early,
@@ -249,6 +250,23 @@ def test_after_a_pause_one_setpoint_leaves(seconds: float, on: Vehicle, tmp_path
     for busy in (told["computer"], pair.companion.snapshot().computer):
         assert busy.startswith(f"this computer was too busy: {skipped} of ")
         assert busy.endswith(f" ticks were skipped, pauses up to {seconds:.2f} s")
+
+
+def test_what_happens_often_is_told_once_a_second_and_summed_up() -> None:
+    """Ten times within 1.3 s messages are dropped, and this process pauses three times."""
+    pair = px4.hover("reference.duration_s=5", deadline_s=DEADLINE_S)
+    for number in range(10):
+        when = in_phase(Phase.TRACK, 2.0 + 0.13 * number)
+        pair.at.append((when, lambda pair: pair.companion.on_dropped(2)))
+    for number in range(3):
+        pair.at.append((in_phase(Phase.TRACK, 2.0 + 0.4 * number), lambda pair: pair.pause(0.32)))
+    flown(pair)
+    dropped = [each for each in announced(pair) if "our messages to the vehicle dropped" in each]
+    pauses = [each for each in announced(pair) if each.startswith("this computer paused")]
+    assert sum(int(each.split()[0]) for each in dropped) == 20
+    assert len(dropped) <= 3
+    assert len(pauses) == 2
+    assert "(the longest of 2)" in pauses[1]
 
 
 def test_after_three_seconds_a_px4_in_its_failsafe_is_landed_without_a_setpoint() -> None:

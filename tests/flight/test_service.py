@@ -133,6 +133,18 @@ def test_engaged_handed_back_and_engaged_again(served: Served, on: str) -> None:
     assert pair.service.current.outcome.exit_code == 0
 
 
+def test_a_pilot_may_take_a_vehicle_that_is_handed_back(served: Served) -> None:
+    """The service was stopped, and the vehicle has not shown hold yet."""
+    pair = served.engaged()
+    pair.service.request_stop()
+    pair.until(lambda: pair.phase is Phase.HAND_BACK, 0.5)
+    pair.instance.autopilot.commander.switch("POSCTL")
+    pair.until(pair.service.has_ended, 3.0)
+    outcome = pair.service.current.outcome
+    assert outcome is not None
+    assert (outcome.exit_code, pair.service.current.taken) == (0, True)
+
+
 def fly_north(pair: Serving, speed_mps: float) -> None:
     """The pilot flies north, faster than `speed_mps`; with ArduCopter by the sticks."""
 
@@ -677,3 +689,22 @@ def test_nothing_unsafe_in_a_day(served: Served, on: str) -> None:
         if pair.time_s > float(os.environ.get("OFFBOARD_DAY_S", "120")):
             break
     assert pair.logs.begun
+
+
+def test_what_is_heard_after_a_silence_in_health_may_be_another_vehicle_too(served: Served) -> None:
+    """A third one passes by, which prevents standby for 10 s. It was ready with the parameters of
+    the one before."""
+    pair = served("ardupilot")
+    codec = mavlink.MAVLink(None, srcSystem=9, srcComponent=1)
+    pair.run(0.5)
+    pair.forwarded.append(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3).pack(codec))
+    pair.run(3.0)
+    assert pair.state.vehicle.parameters["GUID_OPTIONS"] == 8.0
+    pair.lost_down = pair.lost_up = True
+    pair.run(6.0)
+    pair.instance.autopilot.parameters.set("GUID_OPTIONS", 0.0)
+    pair.lost_down = pair.lost_up = False
+    pair.run(6.0)
+    assert pair.phase is Phase.HEALTH
+    assert said(pair, "waiting: GUID_OPTIONS is 0: without bit 3")
+    assert sum("health: no telemetry for 5" in text for text in announced(pair)) == 1

@@ -23,12 +23,13 @@ import pytest
 from processes import CONFIG, SHORT, Called, Spawn, children, ended, eventually
 from rich.console import Console
 
-from offboard.campaign import workers
+from offboard.campaign import flight, workers
 from offboard.campaign.cases import Case, base_cases
 from offboard.campaign.document import CampaignFile, Promises, read_campaign
 from offboard.campaign.flight import Job
 from offboard.campaign.results import Record, Results, code_hash
 from offboard.campaign.run import Campaign, Summary
+from offboard.campaign.tune import Tuned, Tuning
 from offboard.campaign.workers import Workers, cluster_workers, local_workers
 from offboard.documents.errors import DocumentError, UserError
 
@@ -262,6 +263,16 @@ def test_a_file_that_a_file_names_decides_the_case(
     assert len(keys) == 2
 
 
+def test_a_lack_of_memory_is_no_record_of_the_case(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*parts: object, **options: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(flight, "fly", full)
+    case = Case("flight", "lqr", "hover", None, None, "px4", "calm", 1)
+    with pytest.raises(UserError, match="no flight can be flown here: out of memory"):
+        flight.fly_job(Job(case, Promises(), code_hash()))
+
+
 def test_results_of_other_code_are_refused_and_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -278,6 +289,16 @@ def test_a_table_of_somebody_else_is_not_replaced(tmp_path: Path, name: str) -> 
     with pytest.raises(UserError, match=f"{name} exists, without results of a campaign"):
         campaign(FILE, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_a_profile_may_have_any_name(
+    called: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The folder of its flights had this one's, so that nothing could be written in the end."""
+    better = Tuned((("controller.bandwidth_radps", 5.0),), 5, 2.0, 1.0, 0.01)
+    monkeypatch.setattr(Tuning, "run", lambda *_: better)
+    assert called("offboard tune tracking --out x.tune")[0] == 0
+    assert "bandwidth_radps: 5.0" in (tmp_path / "x.tune").read_text()
 
 
 def test_what_is_finished_on_a_full_disk_is_kept_and_a_worker_of_its_own_flies_the_rest(
@@ -331,6 +352,28 @@ def test_a_flight_whose_worker_dies_twice_is_a_row(
     assert (tmp_path / "deaths").read_text() == "died\n" * 2
     assert ended[1].exit_code == 0
     assert (ended[2].exit_code, ended[2].sentence) == (4, "the process that flew it ended, twice")
+
+
+@pytest.mark.slow
+def test_a_kept_flight_appears_when_it_is_complete(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that ends before leaves no directory that looks like a kept flight."""
+    case = campaign(FILE, tmp_path / "out").cases[0]
+    kept = tmp_path / "flights" / case.key
+    job = Job(case, Promises(), code_hash(), kept)
+
+    def ends(directory: Path, *score: object) -> None:
+        assert (directory / "flight.tlog").is_file()
+        raise SystemExit
+
+    with monkeypatch.context() as ending:
+        ending.setattr(flight, "keep_score", ends)
+        with pytest.raises(SystemExit):
+            flight.fly_job(job)
+    assert not kept.exists()
+    assert flight.fly_job(job).completed
+    assert {path.name for path in kept.iterdir()} >= {"flight.tlog", "flight.yaml", "score.json"}
 
 
 @pytest.mark.slow

@@ -165,6 +165,27 @@ def test_json_lines_end_with_the_result_and_the_live_page_is_announced(
 
 # --- a process that ends as its console script does ---
 
+
+@pytest.mark.usefixtures("in_memory")
+@pytest.mark.parametrize(
+    ("scenario", "sentence"),
+    [
+        ("pilot_disarms", "the vehicle was disarmed just after it had armed"),
+        ("clock_jump_35s", "the clock of the vehicle jumped by 3"),
+    ],
+)
+def test_in_lockstep_it_is_said_what_has_happened(
+    called: Called, scenario: str, sentence: str
+) -> None:
+    """And not that the vehicle did not arm, or that its mode was not reported for 36 s: answers
+    come at the same vehicle time, and nothing but the clock has jumped."""
+    code, _, said = called(
+        "offboard fly --sitl --reference lemniscate --set reference.laps=2 --controller lqr "
+        "--set identify.online=false --out x --no-report --scenario", scenario,
+    )  # fmt: skip
+    assert (code, said.startswith(sentence)) == (4 if "clock" in scenario else 3, True), said
+
+
 IMPORTS = """
 import builtins, signal
 signal.signal(signal.SIGINT, signal.default_int_handler)

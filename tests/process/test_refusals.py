@@ -195,6 +195,24 @@ def test_of_many_errors_the_first_ten_are_printed(called: Called, tmp_path: Path
     assert lines[0].startswith("x.yaml, line 2, column 1: key_0 is not a known key")
 
 
+FILES: dict[str, Callable[[Path], object]] = {
+    "a FIFO": os.mkfifo,
+    "/dev/zero": lambda path: path.symlink_to("/dev/zero"),
+    "a directory": Path.mkdir,
+    "larger than 500 kB": lambda path: path.write_text("# comment\n" * 60_000),
+}
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_only_regular_files_of_a_bounded_size_are_read(
+    kind: str, refused: Refused, tmp_path: Path
+) -> None:
+    FILES[kind](tmp_path / "x.yaml")
+    reason = kind if kind.startswith("larger") else "not a regular file"
+    for command in ("offboard check", "simulator --vehicle"):
+        assert f"x.yaml cannot be read: {reason}" in refused(command, "x.yaml")
+
+
 def test_a_directory_with_a_flight_is_left_as_it_is(refused: Refused, tmp_path: Path) -> None:
     for name in ("flight.yaml", "flight.tlog", "score.json"):
         (tmp_path / name).mkdir()
