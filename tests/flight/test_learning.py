@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from faults import TIMESYNC, delivering, without
-from pair import Pair, in_phase, make
+from pair import Pair, in_phase, make, on_arducopter
+from watch import scenario_of, watched
 
 from offboard.analysis import history
 from offboard.analysis.identify import identify_flight, vehicle_file
 from offboard.documents.reading import parse
-from offboard.flight.phases import Phase
+from offboard.flight.estimates import HoverEstimate
+from offboard.flight.phases import FLYING, Phase
 from offboard.flight.record import IDENTIFIED_ID
 from offboard.identification.learner import LENGTH_S, IdentifySettings
 from offboard.model.vehicle import AxisResponse, Vehicle
@@ -187,3 +191,38 @@ def test_steps_are_repeated_while_the_delay_is_uncertain() -> None:
     pair.track()
     sentence = "repeating the steps, tilt not identified: its delay is uncertain: "
     assert any(line.startswith(sentence) for line in pair.companion.announced)
+
+
+# -- hover thrust, before the take-over ------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "fly", [on_arducopter, partial(make, vehicle="px4_sih", aloft=True)], ids=["ardupilot", "px4"]
+)
+def test_twice_the_thrust_of_the_file_is_found_before_the_take_over(
+    fly: Callable[..., Pair],
+) -> None:
+    """While it climbs. Without, ArduCopter is 8 m too high with four times the thrust. A PX4 that
+    is found in the air has not found its own hover thrust yet, and climbs until it is taken over.
+    """
+    scenario = scenario_of(conditions={"estimator": "perfect", "thrust_scale": 2.0})
+    hover = ("reference.height_m=3.0", "reference.duration_s=3.0")
+    pair = fly(*hover, reference="hover", scenario=scenario, learning=IDENTIFY, seed=1)
+    true = pair.companion.model.hover_thrust / 2.0
+    watch = watched(pair)
+    pair.track()
+    first_m, *heights_m = (-moment.position_ned_m[2] for moment in watch.during(*FLYING))
+    assert min(first_m, 3.0) - 0.5 < min(heights_m) < max(heights_m) < max(first_m, 3.0) + 0.5
+    said = next(line for line in pair.companion.announced if "before the take-over" in line)
+    assert float(said.split()[2]) == pytest.approx(true, rel=0.03)
+
+
+def test_no_hover_thrust_from_too_little_or_on_the_ground_or_while_it_falls() -> None:
+    for height_m, fall_mps2, thrust in ((1.0, 9.0, 0.05), (0.0, 0.0, 0.1)):
+        hover = HoverEstimate()
+        assert hover.hover_thrust(TRUE, 0.0) is None
+        for step in range(60):
+            hover.on_position(0.01 * step, height_m, fall_mps2 * 0.01 * step)
+            hover.on_thrust(0.01 * step, thrust, thrust)
+        assert hover.hover_thrust(TRUE, 0.59) is None
+        assert hover.hover_thrust(TRUE, 2.0) is None  # reported too long ago
