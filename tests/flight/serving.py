@@ -26,7 +26,6 @@ from offboard.run import configuration as config
 from offboard.run.flight import Prepared, build
 from offboard.service.flights import Flights
 from simulator import config as simulated
-from simulator.firmware.base import Firmware
 from simulator.instance import Instance
 from simulator.start import Start
 
@@ -225,13 +224,8 @@ def serve(
     then: Then = "hold",
     anchor: Anchor = "here",
     arms: bool = False,
-    scenario: str = "calm",
-    seed: int = 7,
     memory: Remembered | None = None,
-    firmware: Firmware | None = None,
-    record: Any = None,
     aloft: bool = False,
-    **options: Any,
 ) -> Serving:
     """A service with a vehicle that stands on the ground, and boots; with `aloft` one that its
     pilot holds at 3 m."""
@@ -239,7 +233,7 @@ def serve(
     clock = HostClock()
     short = SHORT if reference == "hover" else ()
     source = Settings(prepared(*short, *assignments, reference=reference, vehicle=vehicle))
-    logs, memory = record or Logs(clock), memory or Remembered()
+    logs, memory = Logs(clock), memory or Remembered()
 
     def again(logs: Any) -> Flights:
         return Flights(
@@ -251,19 +245,18 @@ def serve(
             stopwatch=lambda: 0.0,
         )
 
-    flown = simulated.scenario(scenario)
-    firmware = firmware or (LEAN if on == "px4" else LEAN_COPTER)
+    conditions = simulated.scenario("calm").conditions
+    firmware = LEAN if on == "px4" else LEAN_COPTER
     instance = Instance(
         firmware,
         simulated.vehicle(firmware.vehicle),
-        flown.conditions.model_copy(update={"boot_scale": 1.0 if on == "px4" else 0.1}),
-        seed,
-        faults=flown.faults,
-        start=Start(height_m=3.0) if aloft else flown.start,
+        conditions.model_copy(update={"boot_scale": 1.0 if on == "px4" else 0.1}),
+        seed=7,
+        start=Start(height_m=3.0) if aloft else None,
     )
     if on == "ardupilot":
         instance.autopilot.parameters.set("GUID_OPTIONS", 8.0)
     pair = Serving(again(logs), instance, clock, firmware=on, source=source, logs=logs,
-                   memory=memory, again=again, **options)  # fmt: skip
+                   memory=memory, again=again)  # fmt: skip
     pair.down, pair.up = pair.deliver, pair.send_up
     return pair

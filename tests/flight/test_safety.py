@@ -20,7 +20,6 @@ from watch import (
     Check,
     Row,
     Vehicle,
-    aborted,
     aborts,
     alternately,
     begun_s,
@@ -33,6 +32,7 @@ from watch import (
     judged,
     landed,
     px4,
+    refusal,
     refused,
     said,
     scenario_of,
@@ -87,8 +87,6 @@ SILENT_GPS = {"fault": "silent_message", "message": "GPS_RAW_INT", "after": "eng
 OTHER = another_companion(after="engaged", at_s=7.0, setpoint_rate_hz=10, thrust=0.5)
 AWAY = "the attitude is [0-9]+ deg away from every recent command"
 NAMED = "; another companion computer, system 1 component 194, may send setpoints, too"
-
-
 RARE = "another companion that is not heard, on PX4"
 
 
@@ -149,6 +147,39 @@ def one_wrong_heartbeat(on: Vehicle, phase: Phase) -> Row:
     return flies(fly=on.hop, aloft=phase is not Phase.TAKEOFF, at=wrong)
 
 
+def taken(on: Vehicle, scenario: Any, says: str = "", **more: Any) -> Row:
+    """Another takes it, and is not overridden."""
+    says = f"the vehicle left (OFFBOARD|GUIDED) for{says}"
+    return aborts(
+        Phase.YIELDED, says, not_overridden, fly=on.lap, armed=True, scenario=scenario, **more
+    )
+
+
+def not_overridden(pair: Pair) -> None:
+    """Nothing leaves after the report of the other mode, and ours was asked for once."""
+    left_s = pair.down.left_s(engage_mode(pair))  # type: ignore[attr-defined]
+    assert len(pair.modes) == 1
+    assert pair.landings == []
+    assert sent_after(pair, left_s + REACTION_S) == []
+    assert sent_after(pair, left_s - 0.5) != []
+
+
+def of_another(on: Vehicle, scenario: Any, says: str) -> Row:
+    """A vehicle that another has."""
+    return refusal(says, nothing_sent, fly=on.lap, armed=True, scenario=scenario)
+
+
+def nothing_sent(pair: Pair) -> None:
+    assert sent_after(pair, 0.0) == []
+
+
+STREAMED = {"fault": "second_sender", "setpoint_rate_hz": 10.0, "thrust": 0.49}
+OFFBOARD, GUIDED = {"height_m": 8.0, "mode": "OFFBOARD"}, {"height_m": 8.0, "mode": "GUIDED"}
+FAILSAFE, IDS, ENGAGED = (
+    r".*limits\.begin_in_failsafe=true",
+    r".*system 1 component 191 \(limits\.begin_with_other_sender=true",
+    r"the vehicle is armed and in (OFFBOARD|GUIDED) already: another.*limits\.begin_engaged=true",
+)
 NO_GPS = scenario_of({"fault": "silent_message", "message": "GPS_RAW_INT"})
 WAITS = another_companion(setpoint_rate_hz=0, custom_mode=Phase.HEALTH.code)
 FLIES_ANOTHER = another_companion(system=2, setpoint_rate_hz=0)
@@ -218,6 +249,20 @@ ROWS = {
         "stop requested by the operator", fly=copter.lap, scenario="in_failsafe",
         limits={"begin_in_failsafe": True}, at=then(Phase.CLIMB, 1.0, stop),
     ),
+    # whose it is
+    "a pilot just after engaging": taken(px4, "pilot_refuses", ended_by="pilot"),
+    "a pilot in track, who is back after 0.6 s, too late": taken(
+        copter, early("pilot_comes_back"), ended_by="pilot"
+    ),
+    "a pilot whom CURRENT_MODE shows": taken(px4, early("lost_heartbeat")),
+    # the HEARTBEAT that shows a failsafe comes after CURRENT_MODE
+    "a failsafe": taken(
+        px4, early("empty_battery"), ".*; a failsafe of the vehicle has it", ended_by="failsafe"
+    ),
+    "it is in a failsafe": of_another(copter, "in_failsafe", FAILSAFE),
+    "another offboard tracks": of_another(px4, another_companion(setpoint_rate_hz=0), IDS),
+    "another program streams": of_another(px4, scenario_of(STREAMED, start=OFFBOARD), ENGAGED),
+    "it is engaged already": of_another(copter, scenario_of(start=GUIDED), ENGAGED),
     # flights that go on
     "a load that is only believed": flies(fly=heavy, failsafes=()),
     "one wrong heartbeat in track": one_wrong_heartbeat(px4, Phase.TRACK),
@@ -287,57 +332,6 @@ def test_resets_of_the_estimate_move_its_place_and_the_ground(resets: list[dict[
     watch = flown(pair, ended_by="reference over", top_m=2.2)
     assert max(math.hypot(*m.position_ned_m[:2]) for m in watch.moments) < 0.3
     assert pair.companion.contact.height_m == pytest.approx(0.0, abs=0.1)
-
-
-# -- whose it is -----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("scenario", "on", "says", "ended_by"),
-    [
-        ("pilot_refuses", px4, "", "pilot"),  # just after engaging
-        (early("pilot_comes_back"), copter, "", "pilot"),  # in track; back after 0.6 s, too late
-        (early("lost_heartbeat"), px4, "", ""),  # CURRENT_MODE shows him
-        # the HEARTBEAT that shows a failsafe comes after CURRENT_MODE
-        (early("empty_battery"), px4, ".*; a failsafe of the vehicle has it", "failsafe"),
-    ],
-)
-def test_who_takes_it_is_not_overridden(
-    scenario: Any, on: Vehicle, says: str, ended_by: str
-) -> None:
-    """Nothing leaves after the report of the other mode, and ours is asked for once."""
-    pair = on.lap(scenario=scenario)
-    watch = aborted(pair, f"the vehicle left (OFFBOARD|GUIDED) for{says}", ended_by=ended_by)
-    left_s = watch.left_s(engage_mode(pair))
-    assert len(pair.modes) == 1
-    assert pair.landings == []
-    assert pair.companion.phase is Phase.YIELDED
-    assert pair.armed
-    assert sent_after(pair, left_s + REACTION_S) == []
-    assert sent_after(pair, left_s - 0.5) != []
-
-
-STREAMED = {"fault": "second_sender", "setpoint_rate_hz": 10.0, "thrust": 0.49}
-FAILSAFE, IDS, ENGAGED = (
-    r".*limits\.begin_in_failsafe=true",
-    r".*system 1 component 191 \(limits\.begin_with_other_sender=true",
-    r"the vehicle is armed and in (OFFBOARD|GUIDED) already: another.*limits\.begin_engaged=true",
-)
-
-
-@pytest.mark.parametrize(
-    ("on", "scenario", "says"),
-    [
-        (copter, "in_failsafe", FAILSAFE),
-        (px4, another_companion(setpoint_rate_hz=0), IDS),
-        (px4, scenario_of(STREAMED, start={"height_m": 8.0, "mode": "OFFBOARD"}), ENGAGED),
-        (copter, scenario_of(start={"height_m": 8.0, "mode": "GUIDED"}), ENGAGED),
-    ],
-)
-def test_a_vehicle_that_another_has_is_refused(on: Vehicle, scenario: Any, says: str) -> None:
-    pair = on.lap(scenario=scenario)
-    refused(pair, says)
-    assert sent_after(pair, 0.0) == []
 
 
 @BOTH

@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import count
-from pathlib import Path
 from typing import Any
 
 import control
@@ -233,7 +232,7 @@ def paused(
 
 
 @pytest.mark.parametrize(("seconds", "on"), [(0.9, px4), (3.0, copter)])
-def test_after_a_pause_one_setpoint_leaves(seconds: float, on: Vehicle, tmp_path: Path) -> None:
+def test_after_a_pause_one_setpoint_leaves(seconds: float, on: Vehicle) -> None:
     """From the newest telemetry; the pause is announced and counted. After 3 s the supervisor would
     have taken over; this is without it."""
     pair, watch, end_s = paused(on, seconds)
@@ -242,7 +241,7 @@ def test_after_a_pause_one_setpoint_leaves(seconds: float, on: Vehicle, tmp_path
     assert oldest_s(pair) < 0.03
     assert said(pair, f"this computer paused for {seconds:.2f} s")
     assert watch.error_m < 0.8 or seconds > 1.0  # the last attitude is kept meanwhile
-    logged = pair.history(tmp_path)
+    logged = pair.history()
     skipped = round(seconds / PERIOD_S) - 1
     assert score(logged).missed_ticks == skipped
     told = summary(replace(score(logged), at_bound_share=0.5), logged)
