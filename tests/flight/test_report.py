@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import lzma
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -229,6 +230,32 @@ def test_a_home_position_is_the_origin_only_without_another(
     log.write_bytes(b"".join(STAMP + each.pack(codec) for each in messages))
     (row,) = read(log).history.truth
     assert row["position_ned_m"] == pytest.approx([north_m, 0.0, 0.0], abs=0.01)
+
+
+def test_a_damaged_log_is_shown_with_the_place_of_the_damage(
+    tmp_path: Path, recorded: Flight
+) -> None:
+    data = bytearray(PX4.read_bytes())
+    at = len(data) // 2
+    data[at : at + 500] = bytes(500)
+    damaged = tmp_path / "damaged.tlog"
+    damaged.write_bytes(data[:-5])
+    flight = read(damaged)
+    (said,) = (each for each in flight.missing if each.startswith("damaged log"))
+    found = re.search(r"the first at byte (\d+), at ([0-9.]+) s", said)
+    assert found
+    assert at - 300 < int(found[1]) <= at
+    before = tmp_path / "before.tlog"
+    before.write_bytes(data[: int(found[1])])
+    expected_s = next(
+        entry.message.time_boot_ms / 1e3
+        for entry in reversed(list(tlog.read(before)))
+        if entry.name in ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED")
+    )
+    assert float(found[2]) == pytest.approx(expected_s, abs=0.01)
+    last_s, whole_s = (each.history.position["time_s"][-1] for each in (flight, recorded))
+    assert last_s == pytest.approx(whole_s, abs=0.1)
+    assert any(each.startswith("the log ends within an entry, at byte") for each in flight.missing)
 
 
 @given(
