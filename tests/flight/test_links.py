@@ -239,9 +239,6 @@ def test_udpout_hears_only_its_peer() -> None:
     link.close()
 
 
-# --- streams ---
-
-
 def test_senders_are_named_at_powers_of_ten_and_bounded_in_number() -> None:
     report = LinkReport()
     for _ in range(100):
@@ -254,6 +251,9 @@ def test_senders_are_named_at_powers_of_ten_and_bounded_in_number() -> None:
         report.count(f"c:{port}", 1)
     assert len(report.news()) == 6 + 3  # six more names, then 1, 10 and 100 others
     assert report.ignored == 100 + 78_000 + 1000
+
+
+# --- streams ---
 
 
 @pytest.mark.parametrize(

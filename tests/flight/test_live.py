@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import urlsplit
 from urllib.request import urlopen
@@ -23,10 +24,12 @@ import pytest
 from browser import Opened, opening
 from pair import Pair, calm_hover, hover
 from rich.console import Console
+from uneventful import heartbeat, uneventful
 
 from offboard.documents.errors import UserError
 from offboard.flight.display import Snapshot
-from offboard.live.lines import JsonLines, Terminal
+from offboard.flight.phases import Phase
+from offboard.live.lines import JsonLines, Terminal, status
 from offboard.live.process import Displays, LiveProcess
 
 FLOOD = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n" * 200
@@ -266,3 +269,18 @@ def test_snapshots_agree_with_the_wire(shown: Shown) -> None:
     followed = {now.phase for _, now in shown.seen if now.reference_ned_m is not None}
     assert followed == {"climb", "track", "hover"}
     assert last.texts[-1] == shown.pair.companion.announced[-1]
+
+
+def test_a_status_leaves_out_what_is_not_known() -> None:
+    now = hover().companion.snapshot()
+    assert status(now).strip() == "-- s  connect  unknown"
+    shown = {"phase": "track", "position_error_m": 12.3456}
+    vars(now).update(shown, failsafe="hold", failsafe_row="link")
+    assert status(now).strip() == "-- s  track  error 12.346 m  unknown  hold: link"
+
+
+def test_the_mode_of_a_pilot_is_shown_with_who_has_authority() -> None:
+    state: Any = uneventful(Phase.TRACK)
+    state.session.counters = SimpleNamespace(forged=0)
+    heartbeat(state, armed=True, mode="AUTO.LOITER")
+    assert (Snapshot(state).authority, Snapshot(state).mode) == ("lost", "AUTO.LOITER")

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
-from faults import CURRENT_MODE, HEARTBEAT, cut, late, lost
+from faults import CURRENT_MODE, HEARTBEAT, POSITION, cut, late, lost, without
 from pair import Pair, hover, in_phase, on_arducopter
 from watch import aborted, begun_s, flown, said, sent_after
 
@@ -42,6 +42,18 @@ def test_after_an_outage_the_vehicle_is_landed(vehicle: str, outage_s: float) ->
     assert not pair.armed
     assert pair.instance.autopilot.state.truth.position_ned_m[2] > -0.1
     assert said(pair, "waiting for the link, then landing is asked again") is (outage_s > 2.0)
+
+
+def test_a_message_that_has_just_begun_to_arrive_is_not_called_slow() -> None:
+    """Its rate is that of two seconds. A booting ArduCopter sends no position for 40 s."""
+    pair, rest = hover(), without(POSITION)
+    begins_s = pair.time_s + 12.0
+    pair.down = lambda time_s, frames: frames if time_s >= begins_s else rest(time_s, frames)
+    flown(pair)
+    waiting = [each for each in pair.companion.announced if each.startswith("waiting: ")]
+    assert waiting == [
+        "waiting: no LOCAL_POSITION_NED arrives", "waiting: the delay of the link is being measured"
+    ]  # fmt: skip
 
 
 def test_a_gap_of_telemetry_on_a_late_link_is_no_loss_of_setpoints() -> None:

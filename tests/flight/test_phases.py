@@ -316,6 +316,13 @@ def test_what_prevents_a_take_over_prevents_each_kind_of_it() -> None:
             assert not condition(flight), name
 
 
+def test_reasons_against_an_engagement_are_apart() -> None:
+    flight = uneventful(Phase.STANDBY, SERVICES["hold"])
+    for name in ("engaged_but_unfit", "refused"):
+        EVENTS[name](flight)
+    assert starting.engaged_but_unfit(flight) == "not engaged: no multirotor; not yet"
+
+
 @BOTH
 def test_no_way_out_of_the_air_leaves_the_vehicle_unasked(service: ServiceOptions | None) -> None:
     """Each row that ends a flight in the air is in a phase that asks for hold or land, or leads to

@@ -138,6 +138,18 @@ def of_phases(flight: Flight, *names: str) -> Flight:
     return replace(flight, history=replace(flight.history, phases=phases))
 
 
+def test_a_pause_makes_two_bands_and_giving_back_is_no_failsafe(flown: Flown) -> None:
+    begun_s = flown.flight.begin_s
+    phases = ("ready", "track", "pause", "track", "hover", "hand back", "yielded")
+    paused = of_phases(flown.flight, *phases)
+    assert paused.track_s == begun_s + 2.0
+    shapes = figures([paused])["tracking"].drawing.layout.shapes
+    spans = [(shape.x0, shape.x1) for shape in shapes if shape.type == "rect"]
+    assert spans == [(begun_s + 2.0, begun_s + 4.0), (begun_s + 6.0, begun_s + 8.0)]
+    for flight in (paused, of_phases(flown.flight, "ready", "track", "hover", "yielded")):
+        assert not [mark for mark in marks(flight) if mark.row == "failsafe"]
+
+
 def test_the_track_ends_where_the_supervisor_takes_over(flown: Flown) -> None:
     tracking, begun_s = of_phases(flown.flight, "ready", "track"), flown.flight.begin_s
     said = [

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from processes import RECORDING
 from pymavlink.dialects.v20 import common as mavlink
 
 from offboard.analysis import tlog
@@ -187,6 +188,21 @@ def test_it_takes_over_when_the_beats_stop_and_says_so_first(rig: Rig) -> None:
         pass
     assert rig.supervisor.said[-1] == "the vehicle is disarmed"
     assert not rig.supervisor.lost
+
+
+def test_a_controller_that_hangs_and_is_then_killed_is_scored(rig: Rig) -> None:
+    """As by the watchdog of a service manager."""
+    for entry in tlog.read(RECORDING):
+        rig.log.write(entry.unix_us, entry.frame.raw)
+    rig.beat(OURS)
+    assert rig.next_message().command == 176
+    rig.abandon()
+    rig.disarm()
+    rig.await_end()
+    kept, began_s = rig.log.path.with_name("score.json"), clock.monotonic_s()
+    while not kept.exists():
+        assert clock.monotonic_s() < began_s + LONG_S
+        time.sleep(0.05)
 
 
 def beat_until(rig: Rig, guards: bool, guard: Supervised) -> float:

@@ -206,6 +206,13 @@ def test_a_scheduler_that_is_lost_is_one_sentence_and_keeps_what_is_finished(
     assert 1 <= len(rows(tmp_path / "out")) < 6
 
 
+@pytest.mark.slow
+def test_no_scheduler_is_a_sentence_at_once(called: Called) -> None:
+    for address in ("udp://127.0.0.1:9", "tcp://127.0.0.1:9"):
+        code, _, said = called("offboard campaign quick --out x --scheduler", address)
+        assert (code, said.count("\n"), address in said) == (2, 1, True), said
+
+
 def test_an_infeasible_case_is_a_row_with_its_reason(tmp_path: Path) -> None:
     flown = campaign(INFEASIBLE, tmp_path / "out")
     fly(flown, shard=slice(1, None, 2))  # the one at 400 m

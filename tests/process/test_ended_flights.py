@@ -163,9 +163,6 @@ def test_json_lines_end_with_the_result_and_the_live_page_is_announced(
     assert times[1:] == [float(second) for second in range(1, len(times))]
 
 
-# --- a process that ends as its console script does ---
-
-
 @pytest.mark.usefixtures("in_memory")
 @pytest.mark.parametrize(
     ("scenario", "sentence"),
@@ -185,6 +182,8 @@ def test_in_lockstep_it_is_said_what_has_happened(
     )  # fmt: skip
     assert (code, said.startswith(sentence)) == (4 if "clock" in scenario else 3, True), said
 
+
+# --- a process that ends as its console script does ---
 
 IMPORTS = """
 import builtins, signal
