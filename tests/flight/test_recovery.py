@@ -203,7 +203,9 @@ def in_failsafe(fallback: int, *reports: Timed) -> tuple[list[float], str]:
     known = replace(OURS, setpoint_loss=loss)
     assert known.silent_s == pytest.approx(0.6)
     (mode, *_) = loss.modes
-    shown = [(0.8 + n, Heartbeat(mode, True, 5, 2)) for n in range(12)]
+    seconds = range(12)  # CURRENT_MODE shows it before HEARTBEAT does
+    shown: list[Timed] = [(0.8 + n, ModeReport(mode)) for n in seconds]
+    shown += [(0.9 + n, Heartbeat(mode, True, 5, 2)) for n in seconds]
     down = beats(mode, 12.8, 12.8, armed=False)
     commands, ended = asked(PX4, *shown, *reports, *down, shown=PX4.engage_mode, known=known)
     assert {command for _, command in commands} <= {HOLD, LAND}
@@ -215,7 +217,7 @@ def test_it_is_watched_and_landed_if_it_does_not_sink(fallback: int, sinks: bool
     """The supervisor took its mode for a pilot's and gave up. POSCTL without sticks sinks."""
     falling = LocalPosition(0.0, (0.0, 0.0, -4.0), (0.0, 0.0, 0.7))
     places = [(0.9 + 0.5 * n, falling) for n in range(24)] if sinks else []
-    landings_s, ended = in_failsafe(fallback, *places)
+    landings_s, ended = in_failsafe(fallback, *places, (7.6, CommandAck(LAND, "ACCEPTED")))
     assert ended == DISARMED
     assert bool(landings_s) is not sinks
     assert all(at_s > 5.0 for at_s in landings_s)
