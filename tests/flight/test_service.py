@@ -625,6 +625,16 @@ def up(pair: Serving, _: float) -> None:
         pair.switch("pilot")
 
 
+def engage(pair: Serving, for_s: float) -> None:
+    """The pilot switches from a mode of his own, as one who looks does."""
+    up(pair, for_s)
+    if pair.phase not in TRACKING:
+        pair.switch("pilot")
+        pair.run(1.5)
+        pair.switch("engage")
+    pair.run(3.0 * for_s)
+
+
 def lose(direction: str) -> Callable[[Serving, float], None]:
     def lost(pair: Serving, for_s: float) -> None:
         setattr(pair, direction, True)
@@ -652,7 +662,8 @@ def reboot(pair: Serving, _: float) -> None:
 
 
 EVENTS: dict[str, Callable[[Serving, float], object]] = {
-    "engage": lambda pair, _: pair.switch("engage"),
+    "engage on ground": lambda pair, _: pair.switch("engage"),
+    "engage": engage,
     "freeze": lambda pair, for_s: pair.pause(0.4 * for_s),
     "up lost": lose("lost_up"),
     "kill": lambda pair, _: pair.restart(),
@@ -678,17 +689,17 @@ def test_nothing_unsafe_in_a_day(served: Served, on: str) -> None:
     """Of OFFBOARD_DAY_S seconds: every event once, then any, engaged again and again."""
     pair = served(on)
     chance = random.Random(int(os.environ.get("OFFBOARD_DAY_SEED", "1")))
-    drawn = (chance.choice([*EVENTS, *["up", "switch", "engage"] * 3]) for _ in repeat(None))
-    for name in chain(EVENTS, drawn):
+    drawn = (chance.choice(["engage", *EVENTS]) for _ in repeat(None))
+    for number, name in enumerate(chain(EVENTS, drawn)):
         for_s = chance.uniform(1.0, 8.0)
         EVENTS[name](pair, for_s)
         pair.run(for_s)
         assert served.wires[0].unsafe == [], name
         for kept in (pair.sent, pair.logged, pair.phases):
             kept.clear()
-        if pair.time_s > float(os.environ.get("OFFBOARD_DAY_S", "120")):
+        if number >= len(EVENTS) and pair.time_s > float(os.environ.get("OFFBOARD_DAY_S", "45")):
             break
-    assert pair.logs.begun
+    assert len(pair.logs.begun) > pair.time_s / 200.0
 
 
 def test_what_is_heard_after_a_silence_in_health_may_be_another_vehicle_too(served: Served) -> None:
