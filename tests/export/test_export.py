@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import math
-import resource
 import sys
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from pair import PX4, hover
+from processes import full_disk
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from pyulog import ULog
@@ -234,11 +234,7 @@ def test_refusals(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 def test_a_full_disk_leaves_nothing(kind: str, flight: Path, tmp_path: Path) -> None:
     """The last byte does not fit, which is written when the file is closed."""
     size = exported(flight, kind, tmp_path / "whole").stat().st_size
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size - 1, limits[1]))
-    try:
+    with full_disk(size - 1):
         result = run(flight, kind, tmp_path / "cut")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert str(result.exception) == f"{tmp_path / 'cut'} cannot be written (File too large)"
     assert [path.name for path in tmp_path.iterdir()] == ["whole"]

@@ -19,7 +19,7 @@ from simulator.firmware.base import Firmware, Rule
 from simulator.firmware.values import Result, Severity, StatusText
 from simulator.instance import Instance
 
-HEARTBEAT, ATTITUDE, POSITION, PARAM_VALUE, TIMESYNC, TARGET = 0, 31, 32, 22, 111, 83
+HEARTBEAT, ATTITUDE, POSITION, PARAM_VALUE, TIMESYNC = 0, 31, 32, 22, 111
 EXTENDED_SYS_STATE, CURRENT_MODE = 245, 436
 Action = Callable[[Pair], None]
 
@@ -194,6 +194,27 @@ def downlink(fault: Filter) -> Action:
         pair.down = fault
 
     return change
+
+
+def lost(pair: Pair, for_s: float, *kinds: int) -> Filter:
+    """From now on nothing passes for so long, or nothing of these kinds."""
+    ends_s, rest = pair.time_s + for_s, without(*kinds)
+
+    def passing(time_s: float, datagrams: Bytes) -> Bytes:
+        if time_s >= ends_s:
+            return datagrams
+        return rest(time_s, datagrams) if kinds else []
+
+    return passing
+
+
+def cut(for_s: float) -> Action:
+    """From now on nothing passes in either direction for so long."""
+
+    def both(pair: Pair) -> None:
+        pair.down = pair.up = lost(pair, for_s)
+
+    return both
 
 
 # --- laws -----------------------------------------------------------------------------------------

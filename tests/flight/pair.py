@@ -175,6 +175,16 @@ class Pair:
             if not self.dead:
                 self.instance.feed(frame)
 
+    def every(self, steps: int, see: Callable[[Pair], object]) -> None:
+        """Show the flight to `see` at each of so many steps."""
+
+        def look(pair: Pair) -> bool:
+            if pair.steps % steps == 0:
+                see(pair)
+            return False
+
+        self.at.append((look, lambda _: None))
+
     # -- what a test may do to the vehicle ------------------------------------------------------
 
     def ground(self, number: int, *params: float) -> None:
@@ -254,16 +264,14 @@ class Pair:
                 log.write(UNIX_EPOCH_US + 100 * index, frame)
         return tlog.read(log.path)
 
-    def history(self, directory: Path | None = None) -> History:
-        """What the log holds. Without a directory, in one that is gone afterwards."""
-        if directory is not None:
-            return history.gather(self.log(directory))
+    def history(self) -> History:
+        """What that log holds."""
         with TemporaryDirectory() as temporary:
             return history.gather(self.log(Path(temporary)))
 
-    def score(self, directory: Path | None = None) -> Score:
+    def score(self) -> Score:
         """The score of `history`."""
-        return score(self.history(directory))
+        return score(self.history())
 
 
 def decode(frame: bytes) -> Any:

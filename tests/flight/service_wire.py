@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
+from faults import frame_id
 from pair import decode, frames_of
 from serving import ARM, HOVER, LAND, MODES, SET_MODE, START, TAKEOFF, Serving
 
@@ -41,11 +42,6 @@ LEAST_SHARE, FALLING_MPS = 0.32, 3.5
 UNFLOWN_S = 2.5
 
 
-def number_of(frame: bytes) -> int:
-    """Of its message."""
-    return int.from_bytes(frame[7:10], "little")
-
-
 class Report(NamedTuple):
     """The vehicle's mode as it left the vehicle."""
 
@@ -62,7 +58,6 @@ class Wire:
     pair: Serving
     arms: bool = False
     unsafe: list[str] = field(default_factory=list)
-    switches: int = 0  # by the pilot, in the air
     mode: str = ""  # of the vehicle
     changed_s: float = -math.inf  # when the vehicle took it
     engaged: bool = False  # by the pilot, and the mode was not left since
@@ -106,7 +101,7 @@ class Wire:
 
     def _asked(self, frame: bytes) -> None:
         """What the pilot asks of the vehicle."""
-        if number_of(frame) == COMMAND_LONG:
+        if frame_id(frame) == COMMAND_LONG:
             message = decode(frame)
             asked = (message.command, message.param1, message.param2, message.param3)
             if asked == (SET_MODE, *MODES[self.pair.firmware]["engage"]):
@@ -118,7 +113,7 @@ class Wire:
         self._look(time_s)
         arriving = self._deliver(time_s, datagrams)
         for frame in (frame for datagram in arriving for frame in frames_of(datagram)):
-            number = number_of(frame)
+            number = frame_id(frame)
             if number in (HEARTBEAT, CURRENT_MODE) and (frame[5], frame[6]) == VEHICLE:
                 failsafe = self.known is not None and self.known.failsafe
                 if self._sent:
@@ -137,7 +132,6 @@ class Wire:
                 self.asked.clear()
                 alone = time_s - self._other_s > OTHER_S  # else it is switched for the other
                 self.engaged = alone and time_s - self._wish_s < ANSWERED_S and self._off_ground
-                self.switches += self.engaged
             else:
                 self.engaged = False
                 if mode not in self.asked:
@@ -170,7 +164,7 @@ class Wire:
     def _take(self, datagram: bytes) -> None:
         """What the service gets."""
         for frame in frames_of(datagram):
-            number, sender = number_of(frame), (frame[5], frame[6])
+            number, sender = frame_id(frame), (frame[5], frame[6])
             if sender == VEHICLE and number in (HEARTBEAT, CURRENT_MODE):
                 if self._sent:
                     self.known = self._sent.popleft()
@@ -185,7 +179,7 @@ class Wire:
     # ------------------------------------------------------------------ from the service
 
     def _judge(self, frame: bytes) -> None:
-        number = number_of(frame)
+        number = frame_id(frame)
         if number in SETPOINTS | COMMANDS:
             if (frame[5], frame[6]) != US:
                 self._note(f"message {number} of {frame[5]}/{frame[6]}")

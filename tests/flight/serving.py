@@ -26,7 +26,6 @@ from offboard.run import configuration as config
 from offboard.run.flight import Prepared, build
 from offboard.service.flights import Flights
 from simulator import config as simulated
-from simulator.firmware.base import Firmware
 from simulator.instance import Instance
 from simulator.start import Start
 
@@ -206,13 +205,6 @@ class Serving(Pair):
         """A setpoint that another program sends, as a router shows it to us."""
         self.forwarded.append(level_setpoint(0.5, 42, 190))
 
-    def flown_by_other(self, seconds: float) -> None:
-        """Another computer sends setpoints, on a link that we do not hear."""
-        end_s = self.time_s + seconds
-        while self.time_s < end_s:
-            self.instance.feed_ground(level_setpoint(HOVER[self.firmware], 1, 194))
-            self.run(0.1)
-
     def restart(self) -> None:
         """Restart the process of the service."""
         self.companion = self.again(self.logs)  # type: ignore[misc,assignment]
@@ -232,13 +224,8 @@ def serve(
     then: Then = "hold",
     anchor: Anchor = "here",
     arms: bool = False,
-    scenario: str = "calm",
-    seed: int = 7,
     memory: Remembered | None = None,
-    firmware: Firmware | None = None,
-    record: Any = None,
     aloft: bool = False,
-    **options: Any,
 ) -> Serving:
     """A service with a vehicle that stands on the ground, and boots; with `aloft` one that its
     pilot holds at 3 m."""
@@ -246,7 +233,7 @@ def serve(
     clock = HostClock()
     short = SHORT if reference == "hover" else ()
     source = Settings(prepared(*short, *assignments, reference=reference, vehicle=vehicle))
-    logs, memory = record or Logs(clock), memory or Remembered()
+    logs, memory = Logs(clock), memory or Remembered()
 
     def again(logs: Any) -> Flights:
         return Flights(
@@ -258,19 +245,18 @@ def serve(
             stopwatch=lambda: 0.0,
         )
 
-    flown = simulated.scenario(scenario)
-    firmware = firmware or (LEAN if on == "px4" else LEAN_COPTER)
+    conditions = simulated.scenario("calm").conditions
+    firmware = LEAN if on == "px4" else LEAN_COPTER
     instance = Instance(
         firmware,
         simulated.vehicle(firmware.vehicle),
-        flown.conditions.model_copy(update={"boot_scale": 1.0 if on == "px4" else 0.1}),
-        seed,
-        faults=flown.faults,
-        start=Start(height_m=3.0) if aloft else flown.start,
+        conditions.model_copy(update={"boot_scale": 1.0 if on == "px4" else 0.1}),
+        seed=7,
+        start=Start(height_m=3.0) if aloft else None,
     )
     if on == "ardupilot":
         instance.autopilot.parameters.set("GUID_OPTIONS", 8.0)
     pair = Serving(again(logs), instance, clock, firmware=on, source=source, logs=logs,
-                   memory=memory, again=again, **options)  # fmt: skip
+                   memory=memory, again=again)  # fmt: skip
     pair.down, pair.up = pair.deliver, pair.send_up
     return pair

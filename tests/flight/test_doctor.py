@@ -7,31 +7,40 @@ import random
 import re
 import threading
 import time
-from dataclasses import replace
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-from doctor_bench import PARAMETER, bench, from_others, said
-from pair import OBEDIENT, Bytes, decode, frames_of
+from pair import HOST_EPOCH_S, OBEDIENT, Bytes, decode, frames_of
 from processes import register
+from pydantic import TypeAdapter
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.doctor import computer, run
 from offboard.doctor.listening import LONGEST_S, NOTHING_S, Listening, Observation
-from offboard.doctor.run import verdict
+from offboard.doctor.run import OF_COMPUTER, Row, examine, verdict
 from offboard.flight.phases import Limits
-from offboard.flight.preflight import Ground, Level, findings
+from offboard.flight.preflight import Finding, Ground, Level, findings
 from offboard.flight.vehicle_state import VehicleState
+from offboard.link import clock
+from offboard.link.interface import Chunk
 from offboard.mavlink.events import ESTIMATE, Attitude, EstimatorReport, GpsFix
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.signing import UNITS_PER_S, Signing
-from offboard.run.configuration import load
+from offboard.run.configuration import FlightConfig, load
 from offboard.run.flight import Connection
+from simulator import config as simulated
+from simulator.faults import Fault
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
+from simulator.instance import Instance
 from simulator.start import Start
+from simulator.steps import STEP_S
+from simulator.vehicle.battery import Battery
+from simulator.vehicle.conditions import Conditions
 
 README = Path(__file__).parents[2] / "offboard" / "doctor" / "README.md"
 OK, WARN, WAIT, BLOCKS = Level.OK, Level.WARN, Level.WAIT, Level.BLOCKS
@@ -41,10 +50,148 @@ UNKNOWN_HEARTBEAT = mavlink.MAVLink_heartbeat_message(2, 4, 0, 0, 3, 3)
 CAMERA_HEARTBEAT = mavlink.MAVLink_heartbeat_message(30, 8, 0, 0, 4, 3)
 SETPOINT = mavlink.MAVLink_set_attitude_target_message(0, 1, 1, 7, (1, 0, 0, 0), 0, 0, 0, 0.5)
 TIME = mavlink.MAVLink_timesync_message(0, 12345)
+ELSEWHERE = ("127.0.0.1", 14999)
 SAME_PLACE = ("127.0.0.1", 14580)
 COUNTED = mavlink.MAVLink(None, srcSystem=1)
 KEY = bytes(range(32))
+BOOT_S = {PX4.name: 6.0, ARDUPILOT.name: 5.0}
+BOOT_SCALE = {PX4.name: 1.0, ARDUPILOT.name: 0.1}
+# What a vehicle has that was set up as the doctor advises
+GOOD = {
+    PX4.name: {"COM_OBL_RC_ACT": 4.0, "COM_RCL_EXCEPT": 4.0},
+    ARDUPILOT.name: {
+        "GUID_OPTIONS": 8.0, "GUID_TIMEOUT": 1.0, "PSC_JERK_XY": 10.0,
+    },
+}  # fmt: skip
+PARAMETER = re.compile(r"param set (\w+) (\S+)")
+PERMITTED = {"TIMESYNC", "PARAM_REQUEST_READ", "COMMAND_LONG"}
+DOCTOR_ID = 193  # not that of a flight
+COMMANDS = {401, 511, 512}  # RUN_PREARM_CHECKS, SET_MESSAGE_INTERVAL, REQUEST_MESSAGE
+BUSY = {check.__name__ for check in OF_COMPUTER}  # with other tests
 REJECTED = {"fault": "velocity_error", "offset_ned_mps": (3.0, 0.0, 0.0), "for_s": 12.0}
+
+
+@dataclass
+class Bench:
+    """`before` is called with the vehicle time at each step and returns further chunks; `down` and
+    `up` see the datagrams of each direction."""
+
+    instance: Instance
+    config: FlightConfig
+    capacity_bytes_ps: float | None = None
+    before: Callable[[float], list[Chunk]] = lambda time_s: []
+    down: Callable[[Bytes], Bytes] = lambda datagrams: datagrams
+    up: Callable[[Bytes], Bytes] = lambda frames: frames
+    has_vehicle: bool = True
+    signing: Signing | None = None
+    system_id: int | None = None
+    sent: list[Any] = field(default_factory=list)
+
+    @property
+    def now_s(self) -> float:
+        return HOST_EPOCH_S + self.instance.time_s
+
+    def step(self) -> list[Chunk]:
+        datagrams = self.down(self.instance.step())
+        heard = [Chunk(datagram, ("127.0.0.1", 14580), self.now_s) for datagram in datagrams]
+        return (heard if self.has_vehicle else []) + self.before(self.instance.time_s)
+
+    def run_to(self, time_s: float) -> None:
+        """Nobody listens meanwhile."""
+        while self.instance.time_s < time_s:
+            self.step()
+
+    def listen(self) -> Observation:
+        settings = SessionSettings(self.system_id, capacity_bytes_ps=self.capacity_bytes_ps)
+        listening = Listening(self.now_s, settings, self.signing)
+        while not listening.complete(self.now_s):
+            for chunk in self.step():
+                listening.take(chunk)
+            if self.instance.steps % 5 == 0:
+                for frame in self.up(listening.due(self.now_s)):
+                    self.sent.append(decode(frame))
+                    self.instance.feed(frame)
+        address, began_s = "udpin:127.0.0.1:14540", clock.monotonic_s()
+        return Observation(self.config, listening, address, Path("."), began_s)
+
+    def check(self, *names: str) -> dict[str, Row]:
+        """The rows of a check now, by name."""
+        seen = self.listen()
+        assert_read_only(self.sent)
+        chosen = [name for name in run.names(names) if name not in BUSY]
+        return {row.check: row for row in examine(chosen, seen)}
+
+    def follow(self, row: Row) -> None:
+        """Do what the hints of a row say: set the parameters that they name."""
+        lines = [line for finding in row.findings for line in PARAMETER.findall(finding.hint)]
+        assert lines, row
+        for name, value in lines:
+            self.instance.autopilot.parameters.set(name, float(value))
+
+
+def assert_read_only(sent: Sequence[Any]) -> None:
+    """Nothing but what the command's help promises."""
+    assert {message.get_type() for message in sent} <= PERMITTED
+    assert {message.get_srcComponent() for message in sent} <= {DOCTOR_ID}
+    commands = {message.command for message in sent if message.get_type() == "COMMAND_LONG"}
+    assert commands <= COMMANDS
+
+
+def bench(
+    firmware: Firmware = OBEDIENT,
+    faults: Sequence[dict[str, Any]] = (),
+    start: Start | None = None,
+    charge: float = 1.0,
+    choices: dict[str, str] | None = None,
+    assignments: Sequence[str] = (),
+    parameters: dict[str, float] | None = None,
+    mode: str = "",
+    boot_s: float = 0.0,
+    **options: Any,
+) -> Bench:
+    """A vehicle that has booted and that nothing is wrong with, but for what is given. Times of
+    `faults` count from the boot, see BOOT_S."""
+    conditions = Conditions(boot_scale=BOOT_SCALE[firmware.name], battery=Battery(remaining=charge))
+    instance = Instance(
+        firmware,
+        simulated.vehicle(firmware.vehicle),
+        conditions,
+        seed=7,
+        parameters=GOOD[firmware.name] | (parameters or {}),
+        faults=TypeAdapter(list[Fault]).validate_python(list(faults)),
+        start=start,
+    )
+    config = load("flight", choices=choices or {}, assignments=assignments)
+    made = Bench(instance, config, **options)
+    made.run_to(boot_s or BOOT_S[firmware.name])
+    if mode:
+        instance.autopilot.commander.switch(mode)
+    return made
+
+
+def said(rows: dict[str, Row]) -> dict[str, tuple[Finding, ...]]:
+    """The findings that are not ok, by check."""
+    return {
+        name: tuple(finding for finding in row.findings if finding.level is not Level.OK)
+        for name, row in rows.items()
+        if row.level is not Level.OK
+    }
+
+
+def from_others(
+    message: Any, system: int, component: int, rate_hz: float = 10.0, place: Hashable = ELSEWHERE
+) -> Callable[[float], list[Chunk]]:
+    """For `Bench.before`: another sender on the link."""
+    codec = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
+    every = round(1.0 / (rate_hz * STEP_S))
+
+    def before(time_s: float) -> list[Chunk]:
+        if round(time_s / STEP_S) % every:
+            return []
+        data = message.pack(codec) if not isinstance(message, bytes) else message
+        return [Chunk(data, place, HOST_EPOCH_S + time_s)]
+
+    return before
 
 
 def link(**fault: Any) -> dict[str, Any]:
@@ -101,6 +248,7 @@ def test_nothing_is_said_of_a_good_vehicle(firmware: Firmware) -> None:
          "configuration", WARN, "param set MPC_TILTMAX_AIR "),
         ({"assignments": ["vehicle.hover_thrust=0.3"], "choices": {"vehicle": "px4_sih"}},
          "configuration", WARN, "hover_thrust 0.3, the autopilot has MPC_THR_HOVER 0.5"),
+        ({"up": lambda _: []}, "parameters", WARN, "no reply for MPC_THR_HOVER, "),
         # the vehicle
         ({"assignments": ["reference.period_s=1.2"]}, "configuration", BLOCKS, "reference"),
         ({"charge": 0.08}, "battery", BLOCKS, "its battery has 8% left"),
@@ -109,6 +257,9 @@ def test_nothing_is_said_of_a_good_vehicle(firmware: Firmware) -> None:
          r"px4 1.13.3 \(release\) is older than 1.14"),
         ({"firmware": replace(OBEDIENT, version=0x01110000)}, "firmware", WARN,
          r"px4 1.17.0 \(development\) is no release"),
+        ({"firmware": ARDUPILOT, "mode": "GUIDED", "boot_s": 9.0,
+          "faults": [{"fault": "gps_loss", "at_s": 0.1, "for_s": 30.0}]}, "prearm", WAIT,
+         "do not pass in GUIDED; the vehicle said: PreArm: Need Position"),  # as 4.6.3 says it
         ({"start": Start(height_m=5.0, mode="AUTO.LOITER", by_failsafe=True)}, "state", BLOCKS,
          "a failsafe flies the vehicle, in AUTO.LOITER"),
         # which is not blamed on the radio, which nobody needs
@@ -146,6 +297,10 @@ def test_nothing_is_said_of_a_good_vehicle(firmware: Firmware) -> None:
          "the vehicle's clock jumped by 30.0 s"),
         ({"faults": [{"fault": "reboot", "at_s": 7.0, "for_s": 0.5}]}, "clock", BLOCKS,
          "the vehicle restarted while it was observed"),
+        ({"up": lambda _: []}, "uplink", BLOCKS, ""),
+        ({"up": lambda _: []}, "delay", WAIT, ""),
+        ({"firmware": PX4} | link(loss=0.2, direction="down"), "loss", WARN,
+         r"^(1[7-9]|2[0-3])\.[0-9]% of the frames"),
         # no vehicle
         (alone(random.Random(1).randbytes(300), 0, 0, 20.0), "vehicle", BLOCKS,
          "bytes are heard that are not"),
@@ -196,16 +351,6 @@ def test_gps_that_is_lost_waits_and_comes_back() -> None:
     assert "no valid horizontal velocity, horizontal position" in found.found
     tested.run_to(15.0)
     assert said(tested.check()) == {}
-
-
-def test_arducopter_says_itself_why_it_cannot_arm() -> None:
-    """Before it has a position; the texts are those of 4.6.3."""
-    lost = {"fault": "gps_loss", "at_s": 0.1, "for_s": 30.0}
-    tested = bench(ARDUPILOT, faults=[lost], mode="GUIDED")
-    tested.run_to(9.0)
-    (finding,) = tested.check()["prearm"].findings
-    assert "do not pass in GUIDED; the vehicle said: PreArm: Need Position" in finding.found
-    assert finding.level is WAIT
 
 
 def test_armed_vehicle_is_left_alone() -> None:
@@ -291,24 +436,6 @@ def test_delay_is_measured_and_lowers_the_bandwidth() -> None:
     assert 1.0 <= float(possible) < 7.0
     again = bench(**link(latency_s=0.2), assignments=[f"controller.bandwidth_radps={possible}"])
     assert again.check("configuration")["configuration"].level is OK
-
-
-def test_loss_is_counted() -> None:
-    tested = bench(PX4, **link(loss=0.2, direction="down", for_s=9.0))
-    row = tested.check("loss")["loss"]
-    assert row.level is WARN
-    share = float(row.findings[0].found.partition("%")[0])
-    assert share == pytest.approx(20.0, abs=3.0)
-    tested.run_to(16.0)
-    assert tested.check("loss")["loss"].level is OK
-
-
-def test_what_we_send_does_not_arrive() -> None:
-    rows = bench(up=lambda _: []).check()
-    assert rows["uplink"].level is BLOCKS
-    assert rows["delay"].level is WAIT
-    assert rows["parameters"].level is WARN  # PX4 has none that must be answered
-    assert rows["parameters"].findings[0].found.startswith("no reply for MPC_THR_HOVER, ")
 
 
 def test_flood_of_addresses_and_ids_is_bounded() -> None:

@@ -117,15 +117,13 @@ def test_volumes_are_kept_clear_of(volumes: list[dict[str, Any]], tmp_path: Path
     times: list[float] = []
     places: list[np.ndarray] = []
 
-    def look(flying: Pair) -> bool:
-        phase = flying.companion.phase
-        if flying.steps % 5 == 0 and phase in (Phase.CLIMB, Phase.JOIN, Phase.TRACK, Phase.HOVER):
+    def look(flying: Pair) -> None:
+        if flying.companion.phase in (Phase.CLIMB, Phase.JOIN, Phase.TRACK, Phase.HOVER):
             times.append(plan.track_time_s(flying.companion.time_s))
             truth = np.array(flying.instance.autopilot.state.truth.position_ned_m)
             places.append(truth - plan.origin_ned_m)
-        return False
 
-    pair.at.append((look, lambda _: None))
+    pair.every(5, look)
     pair.track()
     assert nearest_m(volumes, times, places) > 0.3  # clearance_m
     assert pair.score().rmse_position_m < 0.4  # and back to the reference behind them

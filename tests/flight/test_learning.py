@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import math
 import random
-from pathlib import Path
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 from faults import TIMESYNC, delivering, without
-from pair import Pair, in_phase, make
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pair import Pair, in_phase, make, on_arducopter
+from watch import scenario_of, watched
 
-from offboard.analysis import history
 from offboard.analysis.identify import identify_flight, vehicle_file
 from offboard.documents.reading import parse
-from offboard.flight.phases import Phase
+from offboard.flight.estimates import HoverEstimate
+from offboard.flight.phases import FLYING, Phase
 from offboard.flight.record import IDENTIFIED_ID
 from offboard.identification.learner import LENGTH_S, IdentifySettings
 from offboard.model.vehicle import AxisResponse, Vehicle
@@ -29,10 +34,10 @@ QUICK = {"delay_s": 0.03, "natural_frequency_radps": 8.0, "damping": 0.5}
 SLOW = {"delay_s": 0.09, "natural_frequency_radps": 14.0, "damping": 1.1}
 
 
-def learning(*assignments: str, settings: IdentifySettings = IDENTIFY, **options: Any) -> Pair:
+def learning(*assignments: str, **options: Any) -> Pair:
     """A flight with identification, of PX4's vehicle with the vehicle file `neutral`."""
     usual = {"vehicle": "neutral", "scenario": "px4_like", "aloft": True}
-    return make(*assignments, learning=settings, **usual | options)
+    return make(*assignments, learning=IDENTIFY, **usual | options)
 
 
 def unseen(tilt: dict[str, float], drag_ps: float, hover: float) -> Vehicle:
@@ -52,20 +57,17 @@ def unseen(tilt: dict[str, float], drag_ps: float, hover: float) -> Vehicle:
         pytest.param(unseen(SLOW, 1.2, 0.6), marks=pytest.mark.slow),
     ],
 )
-def test_unseen_vehicle_is_identified_in_flight_and_from_its_log(
-    true: Vehicle, tmp_path: Path
-) -> None:
+def test_unseen_vehicle_is_identified_in_flight_and_from_its_log(true: Vehicle) -> None:
     """The steps stay in their box, and what they show is announced and recorded."""
     pair = learning(reference="identify", flies=true, aloft=False)
     away_m: list[float] = []
 
-    def look(now: Pair) -> bool:
+    def look(now: Pair) -> None:
         if now.companion.phase is Phase.EXCITE:
             place = now.companion.vehicle.position.position_ned_m
             away_m.append(float(np.linalg.norm(np.subtract(place, [0.0, 0.0, -3.0]))))
-        return False
 
-    pair.at.append((look, lambda _: None))
+    pair.every(1, look)
     pair.track()
     assert len(away_m) > 500
     assert max(away_m) < IDENTIFY.box_m
@@ -80,7 +82,7 @@ def test_unseen_vehicle_is_identified_in_flight_and_from_its_log(
     identified = IDENTIFIED_ID.to_bytes(2, "little")
     assert sum(frame[18:20] == identified for frame in records) == len(announced)
 
-    found, _ = identify_flight(history.gather(pair.log(tmp_path)), NEUTRAL)
+    found, _ = identify_flight(pair.history(), NEUTRAL)
     values = {name: each.value for name, each in found.estimates.items() if each is not None}
     for name, expected in {
         "tilt_delay_s": pytest.approx(true.tilt.delay_s, abs=0.010),
@@ -96,23 +98,23 @@ def test_unseen_vehicle_is_identified_in_flight_and_from_its_log(
 
 
 @pytest.mark.slow
-def test_slow_thrust_is_identified(tmp_path: Path) -> None:
+def test_slow_thrust_is_identified() -> None:
     """From the steps, though they leave it uncertain. Otherwise it is 0.5 to 1.2 m off."""
     flies = TRUE.model_copy(update={"thrust_lag_s": 0.5})
     pair = learning(ONE_LAP, flies=flies, seed=3, aloft=False)
     pair.track()
-    assert pair.score(tmp_path).rmse_position_m < 0.06
+    assert pair.score().rmse_position_m < 0.06
     model = pair.companion.model
     effect_s = model.thrust_delay_s + model.thrust_lag_s
     assert effect_s == pytest.approx(flies.thrust_delay_s + 0.5, abs=0.1)
 
 
-def test_slow_attitude_is_identified(tmp_path: Path) -> None:
+def test_slow_attitude_is_identified() -> None:
     """Before the reference, though the steps leave its delay uncertain. Otherwise 0.27 m."""
     slow = AxisResponse(delay_s=0.057, natural_frequency_radps=3.0, damping=0.8)
     pair = learning(ONE_LAP, flies=TRUE.model_copy(update={"tilt": slow}), seed=3, aloft=False)
     pair.track()
-    assert pair.score(tmp_path).rmse_position_m < 0.07
+    assert pair.score().rmse_position_m < 0.07
     tilt = pair.companion.model.tilt
     assert tilt.natural_frequency_radps == pytest.approx(3.0, rel=0.1)
     assert tilt.delay_s == pytest.approx(0.057, abs=0.02)
@@ -120,11 +122,11 @@ def test_slow_attitude_is_identified(tmp_path: Path) -> None:
     assert "(configured 9.0): the vehicle's delay is not identified yet" in said
 
 
-def test_white_noise_of_positions_is_no_delay_of_the_thrust(tmp_path: Path) -> None:
+def test_white_noise_of_positions_is_no_delay_of_the_thrust() -> None:
     """Noise of 2 cm; 0.07 m where the identification does not allow for it."""
     pair = learning(ONE_LAP, scenario="noise", seed=1, aloft=False)
     pair.track()
-    assert pair.score(tmp_path).rmse_position_m < 0.05
+    assert pair.score().rmse_position_m < 0.05
 
 
 def test_vehicle_file_that_telemetry_contradicts_ends_the_flight() -> None:
@@ -141,7 +143,7 @@ def test_vehicle_file_that_telemetry_contradicts_ends_the_flight() -> None:
 
 
 @pytest.mark.slow
-def test_attitude_loop_that_slows_is_noticed_and_flown(tmp_path: Path):
+def test_attitude_loop_that_slows_is_noticed_and_flown() -> None:
     """From 11.4 to 5 rad/s with the same delay. Unnoticed, it is 0.98 m off."""
     pair = learning()
     slow = TRUE.tilt.model_copy(update={"natural_frequency_radps": 5.0})
@@ -160,7 +162,7 @@ def test_attitude_loop_that_slows_is_noticed_and_flown(tmp_path: Path):
     assert float(said[7]) == pytest.approx(5.0, rel=0.05)
     assert "bandwidth 9.0 rad/s as configured" in " ".join(said)
     assert "contradicts" not in said
-    assert pair.score(tmp_path).max_position_m < 0.65
+    assert pair.score().max_position_m < 0.65
 
 
 def test_mass_that_changes_in_flight_is_followed() -> None:
@@ -188,3 +190,60 @@ def test_steps_are_repeated_while_the_delay_is_uncertain() -> None:
     pair.track()
     sentence = "repeating the steps, tilt not identified: its delay is uncertain: "
     assert any(line.startswith(sentence) for line in pair.companion.announced)
+
+
+# -- hover thrust, before the take-over ------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "fly", [on_arducopter, partial(make, vehicle="px4_sih", aloft=True)], ids=["ardupilot", "px4"]
+)
+def test_twice_the_thrust_of_the_file_is_found_before_the_take_over(
+    fly: Callable[..., Pair],
+) -> None:
+    """While it climbs. Without, ArduCopter is 8 m too high with four times the thrust. A PX4 that
+    is found in the air has not found its own hover thrust yet, and climbs until it is taken over.
+    """
+    scenario = scenario_of(conditions={"estimator": "perfect", "thrust_scale": 2.0})
+    hover = ("reference.height_m=3.0", "reference.duration_s=3.0")
+    pair = fly(*hover, reference="hover", scenario=scenario, learning=IDENTIFY, seed=1)
+    true = pair.companion.model.hover_thrust / 2.0
+    watch = watched(pair)
+    pair.track()
+    first_m, *heights_m = (-moment.position_ned_m[2] for moment in watch.during(*FLYING))
+    assert min(first_m, 3.0) - 0.5 < min(heights_m) < max(heights_m) < max(first_m, 3.0) + 0.5
+    said = next(line for line in pair.companion.announced if "before the take-over" in line)
+    assert float(said.split()[2]) == pytest.approx(true, rel=0.03)
+
+
+VEHICLE = simulated.vehicle("arducopter").model_copy(
+    update={"hover_thrust": 0.4, "thrust_delay_s": 0.0, "thrust_lag_s": 0.0}
+)
+
+
+@settings(max_examples=20, derandomize=True, deadline=None)
+@given(st.floats(0.2, 0.7), st.floats(-1.0, 3.3))
+def test_hover_thrust_of_an_accelerated_climb(true: float, climb_mps: float) -> None:
+    """Against the closed-form speed v(t) under constant thrust and linear drag."""
+    gravity, drag = VEHICLE.gravity_mps2, VEHICLE.drag_per_mass_ps
+    thrust = 1.15 * true
+    final = (gravity - gravity * thrust / true) / drag  # down
+    hover, rng = HoverEstimate(), np.random.default_rng(5)
+    for step in range(101):
+        time_s = 0.01 * step
+        speed = final + (-climb_mps - final) * math.exp(-drag * time_s)
+        hover.on_position(time_s, 1.0, speed + rng.normal(0.0, 0.01))
+        if step % 10 == 0:
+            hover.on_thrust(time_s, thrust, thrust)
+    assert hover.hover_thrust(VEHICLE, 1.0) == pytest.approx(true, rel=0.02)
+
+
+def test_no_hover_thrust_from_too_little_or_on_the_ground_or_while_it_falls() -> None:
+    for height_m, fall_mps2, thrust in ((1.0, 9.0, 0.05), (0.0, 0.0, 0.1)):
+        hover = HoverEstimate()
+        assert hover.hover_thrust(TRUE, 0.0) is None
+        for step in range(60):
+            hover.on_position(0.01 * step, height_m, fall_mps2 * 0.01 * step)
+            hover.on_thrust(0.01 * step, thrust, thrust)
+        assert hover.hover_thrust(TRUE, 0.59) is None
+        assert hover.hover_thrust(TRUE, 2.0) is None  # reported too long ago

@@ -85,16 +85,15 @@ def test_late_link_is_noticed_and_flown(direction: str, most_m: float) -> None:
     pair = over(through, "reference.height_m=3.0", slower, aloft=False, boot_scale=1.0)
     limits: list[tuple[float, float]] = []  # of the bandwidth, and since when
 
-    def note(flying: Pair) -> bool:
+    def note(flying: Pair) -> None:
         limit = flying.companion.controller.bandwidth_radps
         if in_phase(Phase.TRACK, CHANGED_S)(flying) and limit not in [x for _, x in limits[-1:]]:
             limits.append((flying.time_s, limit))
-        return False
 
     for at_s, link in ((CHANGED_S, late(0.2)), (BACK_S, through)):
         change = lambda flying, link=link: setattr(flying, direction, link)  # noqa: E731
         pair.at.append((in_phase(Phase.TRACK, at_s), change))
-    pair.at.append((note, lambda _: None))
+    pair.every(1, note)
     pair.track()
     (changed_s, configured), (lowered_s, lowered), *_ = limits
     assert configured == CONFIGURED_RADPS

@@ -45,13 +45,7 @@ def serving() -> Iterator[tuple[LiveProcess, str]]:
 def shown_by(show: Callable[[Pair], object], every: int = 1) -> Pair:
     """A flight that is shown at every step, as the loop does at every turn, or at fewer."""
     pair = hover()
-
-    def look(flying: Pair) -> bool:
-        if flying.steps % every == 0:
-            show(flying)
-        return False
-
-    pair.at.append((look, lambda _: None))
+    pair.every(every, show)
     return pair
 
 

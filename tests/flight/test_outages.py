@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
-from faults import CURRENT_MODE, HEARTBEAT, POSITION, late, without
-from pair import Bytes, Filter, Pair, hover, in_phase, on_arducopter
-from watch import aborted, begun_s, flown, refused, said, sent_after
+from faults import CURRENT_MODE, HEARTBEAT, POSITION, cut, late, lost, without
+from pair import Pair, hover, in_phase, on_arducopter
+from watch import aborted, begun_s, flown, said, sent_after
 
 from offboard.flight.phases import Phase
 from offboard.mavlink.events import Heartbeat
@@ -29,25 +29,6 @@ def make(vehicle: str, when: Callable[[Pair], object]) -> Pair:
     return pair
 
 
-def lost(pair: Pair, for_s: float, *kinds: int) -> Filter:
-    """From now on nothing passes for so long, or nothing of these kinds."""
-    ends_s, rest = pair.time_s + for_s, without(*kinds)
-
-    def passing(time_s: float, datagrams: Bytes) -> Bytes:
-        if time_s >= ends_s:
-            return datagrams
-        return rest(time_s, datagrams) if kinds else []
-
-    return passing
-
-
-def cut(for_s: float) -> Callable[[Pair], object]:
-    def both(pair: Pair) -> None:
-        pair.down = pair.up = lost(pair, for_s)
-
-    return both
-
-
 @pytest.mark.parametrize(
     ("vehicle", "outage_s"),
     [("arducopter", 0.8), ("px4", 1.6), ("px4, which holds", 4.0), ("arducopter", 10.0)],
@@ -62,13 +43,6 @@ def test_after_an_outage_the_vehicle_is_landed(vehicle: str, outage_s: float) ->
     assert not pair.armed
     assert pair.instance.autopilot.state.truth.position_ned_m[2] > -0.1
     assert said(pair, "waiting for the link, then landing is asked again") is (outage_s > 2.0)
-
-
-def test_after_an_outage_as_it_arms_the_vehicle_is_disarmed() -> None:
-    """A HEARTBEAT from before the outage said that it was, and it was left armed."""
-    pair = hover(at=[(lambda pair: pair.armed, cut(2.3))])
-    refused(pair, "no telemetry for 1.0 s$")
-    assert not pair.armed
 
 
 def test_a_message_that_has_just_begun_to_arrive_is_not_called_slow() -> None:

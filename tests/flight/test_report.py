@@ -57,7 +57,8 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
     pair = hover(at=[(in_phase(Phase.HOVER), Pair.pilot_takes_over)])
     pair.fly()
     directory = tmp_path_factory.mktemp("flights") / "a <b>"
-    return Flown(pair, directory, pair.score(directory), read(directory))
+    pair.log(directory)
+    return Flown(pair, directory, pair.score(), read(directory))
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import count
-from pathlib import Path
 from typing import Any
 
 import control
@@ -116,11 +115,6 @@ def test_telemetry_that_repeats_itself_is_none(case: str, on: Vehicle) -> None:
     assert max(-m.position_ned_m[2] for m in watch.moments if m.time_s > lands_s) < seen_m[0] + 3.0
     assert all(m.armed for m in watch.during(Phase.LAND) if m.position_ned_m[2] < -0.1)
     assert pair.armings == ([1.0] if on_the_ground else [])
-
-
-def test_thin_telemetry_is_flown() -> None:
-    """Every tenth position, on a vehicle that is heavier meanwhile."""
-    flown(copter.lap(scenario=early("thin_telemetry", 5.0)), failsafes=(), error_m=0.3)
 
 
 # -- this computer ---------------------------------------------------------------------------------
@@ -238,7 +232,7 @@ def paused(
 
 
 @pytest.mark.parametrize(("seconds", "on"), [(0.9, px4), (3.0, copter)])
-def test_after_a_pause_one_setpoint_leaves(seconds: float, on: Vehicle, tmp_path: Path) -> None:
+def test_after_a_pause_one_setpoint_leaves(seconds: float, on: Vehicle) -> None:
     """From the newest telemetry; the pause is announced and counted. After 3 s the supervisor would
     have taken over; this is without it."""
     pair, watch, end_s = paused(on, seconds)
@@ -247,7 +241,7 @@ def test_after_a_pause_one_setpoint_leaves(seconds: float, on: Vehicle, tmp_path
     assert oldest_s(pair) < 0.03
     assert said(pair, f"this computer paused for {seconds:.2f} s")
     assert watch.error_m < 0.8 or seconds > 1.0  # the last attitude is kept meanwhile
-    logged = pair.history(tmp_path)
+    logged = pair.history()
     skipped = round(seconds / PERIOD_S) - 1
     assert score(logged).missed_ticks == skipped
     told = summary(replace(score(logged), at_bound_share=0.5), logged)
@@ -352,16 +346,6 @@ def test_after_a_pause_telemetry_of_a_stream_is_not_late() -> None:
 # -- the vehicle's clock ---------------------------------------------------------------------------
 
 
-def test_a_jump_of_the_clock_lands() -> None:
-    """By 35 s, which is beyond the end of the reference."""
-    pair = copter.lap(scenario=early("clock_jump_35s"), deadline_s=DEADLINE_S)
-    aborted(pair, "the clock of the vehicle jumped by 35.0 s$")
-    assert pair.phases[-1][1] is Phase.DISARMED
-    assert pair.score().completed == 0.0
-    level = [m for _, phase, m in pair.setpoints if phase is Phase.LAND]
-    assert all(abs(m.q[1]) + abs(m.q[2]) < 1e-6 for m in level)
-
-
 def test_a_clock_that_wraps_is_flown() -> None:
     """`time_boot_ms` begins again at zero in the middle of the track: for the flight, and for the
     score."""
@@ -380,6 +364,3 @@ def test_a_clock_that_wraps_is_flown() -> None:
         assert max(rows["time_s"][1:] - rows["time_s"][:-1]) < 1.0
     assert score(logged).rmse_position_m < 0.05
     assert score(logged).link_delay_p50_ms == pytest.approx(0.0, abs=5.0)
-
-
-# -- no false alarms -------------------------------------------------------------------------------

@@ -13,19 +13,40 @@ from typing import Any
 
 import faults
 import pytest
-from pair import Pair, in_phase
-from watch import HIGH, LANDED, announced, begun_s, copter, flown, px4, scenario_of, sent_after
+from pair import Pair
+from watch import (
+    HIGH,
+    Check,
+    Row,
+    aborts,
+    announced,
+    begun_s,
+    copter,
+    early,
+    ends,
+    flies,
+    in_track,
+    judged,
+    landed,
+    px4,
+    refusal,
+    said,
+    scenario_of,
+    sent_after,
+    then,
+    tracking,
+)
 
 from offboard.analysis.score_table import summary
-from offboard.flight.phases import TRACKING, ExitCode, Phase
+from offboard.flight.phases import TRACKING, Phase
 from simulator import config
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Rule
 from simulator.firmware.values import Result
 
 TAKEOFF = 22  # MAV_CMD
-
-Checks = Callable[[Pair], object]
+STILL_ARMED = "it has stood still for 15 s and is armed: its land detector reports that it flies"
+EARLIER = {"fault": "clock_jump", "jump_s": -3, "after": "landing", "at_s": 0.5}
 
 
 # --- checks after the flight ---
@@ -74,11 +95,6 @@ def stayed_down(pair: Pair) -> None:
     assert pair.time_s - begun_s(pair, Phase.STAND_DOWN) < 2.5
 
 
-def landed(pair: Pair) -> None:
-    assert pair.instance.autopilot.position_controller.landed
-    assert pair.landings
-
-
 def whole(pair: Pair) -> None:
     landed(pair)
     assert pair.went_through(Phase.TRACK)
@@ -111,6 +127,10 @@ def soft_landing(pair: Pair) -> None:
     after = [setpoint for _, phase, setpoint in pair.setpoints if phase is Phase.LAND]
     assert after
     assert level(after)
+
+
+def not_completed(pair: Pair) -> None:
+    assert pair.score().completed == 0.0
 
 
 def held_then_silent(pair: Pair) -> None:
@@ -178,35 +198,17 @@ def stayed_down_without_a_setpoint(pair: Pair) -> None:
     assert pair.setpoints == []
 
 
+def asked_to_disarm_without_force(pair: Pair) -> None:
+    assert [(m.param1, m.param2) for m in pair.commands(400)] == [(0.0, 0.0)]
+    assert said(pair, "15 s without motion on the ground, and the vehicle does not disarm")
+
+
+def left_to_the_user(pair: Pair) -> None:
+    assert said(pair, STILL_ARMED)
+    assert pair.armings == []
+
+
 # --- the rows ---
-
-
-Row = tuple[Phase, bool, Checks | None, Callable[[], Pair], dict[str, Any]]
-
-
-def row(
-    code: int, end: Phase, says: str, checks: Checks | None, fly: Callable[..., Pair] = px4.hop,
-    armed: bool = False, ended_by: str = "", **options: Any,
-) -> Row:  # fmt: skip
-    """`armed`: at the end, by the vehicle itself."""
-    outcome = {"code": code, "says": says, "ended_by": ended_by}
-    return end, armed, checks, partial(fly, **options), outcome
-
-
-refusal = partial(row, ExitCode.REFUSED, Phase.FAILED)
-flies = partial(row, ExitCode.FLOWN, Phase.DISARMED, LANDED)
-aborts = partial(row, ExitCode.ABORTED)
-ends = partial(aborts, Phase.DISARMED)
-in_track = partial(ends, fly=px4.lap)
-
-
-def then(phase: Phase, for_s: float, act: Callable[[Pair], object]) -> list[Any]:
-    """This happens to the flight once it has been in `phase` for so long."""
-    return [(in_phase(phase, for_s), act)]
-
-
-def tracking(act: Callable[[Pair], object]) -> list[Any]:
-    return then(Phase.TRACK, 1.0, act)
 
 
 def arm(pair: Pair) -> None:
@@ -218,7 +220,7 @@ def engage(pair: Pair) -> None:
     pair.ground(176, 1, 6)
 
 
-def lost(*message_ids: int) -> Callable[[Pair], object]:
+def silent(*message_ids: int) -> Callable[[Pair], object]:
     return faults.downlink(faults.without(*message_ids))
 
 
@@ -231,8 +233,14 @@ def stop_unheard(pair: Pair) -> None:
     pair.up = pair.down = lambda *_: []
 
 
-def of_type(kind: int, says: str, checks: Checks = nothing_sent, **options: Any) -> Row:
+def of_type(kind: int, says: str, checks: Check = nothing_sent, **options: Any) -> Row:
     return refusal(says, checks, down=faults.heartbeats(type=kind), **options)
+
+
+def hover_without_disarming() -> Pair:
+    pair = px4.hover()
+    pair.instance.autopilot.parameters.set("COM_DISARM_LAND", 0.0)
+    return pair
 
 
 def signed_by_another() -> Pair:
@@ -250,7 +258,7 @@ ROWS = {
     "armed by another": flies(whole, at=then(Phase.STREAM, 0.5, arm)),
     # the operator
     "stop in arm, and it cannot be disarmed": aborts(
-        Phase.FAILED, f"{STOPPED}; still armed after 5 s", None, armed=True,
+        Phase.FAILED, f"{STOPPED}; still armed after 5 s", armed=True,
         firmware=faults.refusing("disarm", "Disarming denied"),
         at=then(Phase.ARM, 0.3, faults.stop),
     ),
@@ -262,6 +270,9 @@ ROWS = {
     ),
     # its land detector reports flight before it lifts off
     "stop as it lifts off": ends(STOPPED, landed, at=then(Phase.TAKEOFF, 0.5, faults.stop)),
+    "stop after the reference": ends(
+        STOPPED, fly=px4.hover, ended_by="operator", at=then(Phase.HOVER, 0.1, faults.stop)
+    ),
     "stop after the pilot has engaged it in the air, before we ask": ends(
         STOPPED, landed, fly=px4.hover, ended_by="operator",
         at=[
@@ -284,13 +295,13 @@ ROWS = {
     ),
     "no HEARTBEAT on the ground": refusal(
         "not ready: no HEARTBEAT arrives", nothing_sent, boot_scale=1.0, limits={"health_s": 9.0},
-        at=then(Phase.HEALTH, 0.2, lost(faults.HEARTBEAT)),
+        at=then(Phase.HEALTH, 0.2, silent(faults.HEARTBEAT)),
     ),
     "no HEARTBEAT from the request for the mode on": aborts(
         Phase.FAILED,
         ".*it is not known whether the vehicle has armed; "
         "no HEARTBEAT shows whether it is armed after 5 s",
-        disarmed_by_us, at=then(Phase.ENGAGE, 0.0, lost(faults.HEARTBEAT)),
+        disarmed_by_us, at=then(Phase.ENGAGE, 0.0, silent(faults.HEARTBEAT)),
     ),
     "arming refused": refusal(
         "the vehicle did not arm in 15 s" + REJECTED.format(400), on_the_ground,
@@ -338,7 +349,22 @@ ROWS = {
     ),
     "landing refused": ends(
         "the vehicle's own failsafe flew it, in POSCTL; the vehicle said: ",
-        landed_by_its_failsafe, firmware=faults.refusing("land", "No."),
+        landed_by_its_failsafe, ended_by="link", firmware=faults.refusing("land", "No."),
+    ),
+    "it does not show that it armed": refusal(
+        "", asked_to_disarm, at=then(Phase.ARM, 0.0, faults.downlink(faults.disarmed()))
+    ),
+    "its land detector knows the ground, and it does not disarm by itself": flies(
+        asked_to_disarm_without_force, fly=hover_without_disarming
+    ),
+    # only its land detector says whether it flies: it is not disarmed, and the user is told
+    "its land detector does not see the ground": aborts(
+        Phase.FAILED, f".*not landed and disarmed after 24 s; {STILL_ARMED}", left_to_the_user,
+        fly=copter.hover, armed=True, scenario="never_landed", limits={"land_s": 24.0},
+    ),
+    # PX4 returns to OFFBOARD, which CURRENT_MODE shows before HEARTBEAT shows it disarmed
+    "the landing mode is left as it disarms": flies(
+        fly=partial(px4.hover, "reference.duration_s=3.3")
     ),
     "take-off by command": flies(took_off_by_command, fly=copter.hop),
     "take-off refused": ends(
@@ -359,7 +385,7 @@ ROWS = {
         armed=True, at=then(Phase.ARM, 0.0, faults.take_over),
     ),
     "motors cut in flight": ends(
-        "the vehicle disarmed in flight", None, fly=px4.hover,
+        "the vehicle disarmed in flight", fly=px4.hover,
         ended_by="disarmed in flight", at=tracking(faults.kill_motors),
     ),
     # the link
@@ -374,7 +400,11 @@ ROWS = {
     ),
     "restart in flight": aborts(
         Phase.FAILED, "the vehicle restarted in flight; the vehicle restarted and is disarmed",
-        None, fly=px4.lap, at=tracking(faults.restart),
+        fly=px4.lap, at=tracking(faults.restart),
+    ),
+    "restart while landing": ends(
+        "the vehicle restarted while landing", fly=px4.hover, ended_by="restart",
+        scenario=scenario_of(EARLIER),
     ),
     "restart in flight of a vehicle that stays armed": in_track(
         "the vehicle restarted in flight", soft_landing,
@@ -382,7 +412,21 @@ ROWS = {
     ),
     "position and attitude stop, heartbeats go on": aborts(
         Phase.FAILED, "no telemetry for 1.0 s .*; disarmed, landing not confirmed: ",
-        landing_requested, fly=px4.lap, at=tracking(lost(faults.POSITION, faults.ATTITUDE)),
+        landing_requested, fly=px4.lap, at=tracking(silent(faults.POSITION, faults.ATTITUDE)),
+    ),
+    # a HEARTBEAT from before the outage said that it was disarmed, and it was left armed
+    "an outage as it arms": refusal(
+        "no telemetry for 1.0 s$", at=[(lambda pair: pair.armed, faults.cut(2.3))]
+    ),
+    # by 35 s, which is beyond the end of the reference
+    "a jump of its clock": ends(
+        "the clock of the vehicle jumped by 35.0 s$", soft_landing, not_completed,
+        fly=copter.lap,
+        scenario=early("clock_jump_35s"), deadline_s=0.05,
+    ),
+    # a vehicle that is heavier meanwhile
+    "every tenth position": flies(
+        fly=copter.lap, scenario=early("thin_telemetry", 5.0), failsafes=(), error_m=0.3
     ),
     # the law
     "a law that raises": in_track(
@@ -400,9 +444,4 @@ ROWS = {
 
 @pytest.mark.parametrize("title", ROWS)
 def test_flight(title: str) -> None:
-    end, armed, checks, fly, expected = ROWS[title]
-    pair = fly()
-    flown(pair, **expected)
-    assert (pair.companion.phase, pair.armed) == (end, armed)
-    if checks:
-        checks(pair)
+    judged(ROWS[title])

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import random
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from itertools import chain, repeat
 from typing import Any
 
 import numpy as np
@@ -610,6 +614,93 @@ def test_a_plane_is_left_alone(served: Served) -> None:
     assert pair.phase is Phase.HEALTH
     assert said(pair, "waiting: the vehicle is a FIXED_WING; offboard flies multirotors")
     assert pair.mode == "GUIDED"
+
+
+# --- anything, in any order -----------------------------------------------------------------------
+
+
+def up(pair: Serving, _: float) -> None:
+    if pair.place[2] > -0.5 and not pair.armed:
+        with suppress(AssertionError):  # a vehicle that does not arm now
+            pair.fly_up()
+        pair.switch("pilot")
+
+
+def engage(pair: Serving, for_s: float) -> None:
+    """The pilot switches from a mode of his own, as one who looks does."""
+    up(pair, for_s)
+    if pair.phase not in TRACKING:
+        pair.switch("pilot")
+        pair.run(1.5)
+        pair.switch("engage")
+    pair.run(3.0 * for_s)
+
+
+def lose(direction: str) -> Callable[[Serving, float], None]:
+    def lost(pair: Serving, for_s: float) -> None:
+        setattr(pair, direction, True)
+        pair.run(for_s)
+        setattr(pair, direction, False)
+
+    return lost
+
+
+def stop(pair: Serving, _: float) -> None:
+    """SIGTERM, and started again by the service manager."""
+    pair.service.request_stop()
+    end_s = pair.time_s + 10.0
+    while not pair.service.has_ended() and pair.time_s < end_s:
+        pair.advance()
+    pair.service.close()
+    pair.restart()
+
+
+def reboot(pair: Serving, _: float) -> None:
+    """With another battery."""
+    if not pair.armed:
+        pair.instance.autopilot.plant.set_battery(1.0)
+        pair.instance.reboot(1.0)
+
+
+EVENTS: dict[str, Callable[[Serving, float], object]] = {
+    "engage on ground": lambda pair, _: pair.switch("engage"),
+    "engage": engage,
+    "freeze": lambda pair, for_s: pair.pause(0.4 * for_s),
+    "up lost": lose("lost_up"),
+    "kill": lambda pair, _: pair.restart(),
+    "second sender": lambda pair, _: pair.other_setpoint(),
+    "switch": lambda pair, _: pair.switch("pilot"),
+    "stop": stop,
+    "down lost": lose("lost_down"),
+    "hand back": lambda pair, _: pair.command(SET_MODE, 1, 4, 3),
+    "land": lambda pair, _: pair.switch("land"),
+    "arm": lambda pair, _: pair.ground(ARM, 1),
+    "up": up,
+    "start": lambda pair, _: pair.command(START),
+    "pause": lambda pair, _: pair.command(PAUSE_CONTINUE, 0),
+    "continue": lambda pair, _: pair.command(PAUSE_CONTINUE, 1),
+    "reboot": reboot,
+}
+
+
+@BOTH
+@pytest.mark.slow
+@pytest.mark.timeout(0)
+def test_nothing_unsafe_in_a_day(served: Served, on: str) -> None:
+    """Of OFFBOARD_DAY_S seconds: every event once, then any, engaged again and again."""
+    pair = served(on)
+    chance = random.Random(int(os.environ.get("OFFBOARD_DAY_SEED", "1")))
+    drawn = (chance.choice(["engage", *EVENTS]) for _ in repeat(None))
+    for number, name in enumerate(chain(EVENTS, drawn)):
+        for_s = chance.uniform(1.0, 8.0)
+        EVENTS[name](pair, for_s)
+        pair.run(for_s)
+        assert served.wires[0].unsafe == [], name
+        for kept in (pair.sent, pair.logged, pair.phases):
+            kept.clear()
+        if number >= len(EVENTS) and pair.time_s > float(os.environ.get("OFFBOARD_DAY_S", "45")):
+            break
+    assert len(pair.logs.begun) > pair.time_s / 200.0
 
 
 def test_what_is_heard_after_a_silence_in_health_may_be_another_vehicle_too(served: Served) -> None:

@@ -8,15 +8,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from faults import ATTITUDE, POSITION, frame_id, refusing, rewritten, setting, stop
+from faults import ATTITUDE, POSITION, frame_id, rewritten, setting
 from pair import PX4, UNIX_EPOCH_US, Pair, calm_hover, frames_of, hover, in_phase, make
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from typer.testing import CliRunner
-from watch import aborted, scenario_of, watched
+from watch import scenario_of, watched
 
 from offboard.analysis.history import History
 from offboard.analysis.score import Score, judged, score
@@ -127,29 +126,6 @@ def test_a_flight_is_not_completed_that_is_not_tracked_landed_and_disarmed(flown
     ):
         scored = score(replace(flown, **changed))
         assert (scored.completed, scored.ended_by.startswith(why)) == (0.0, True), scored.ended_by
-
-
-def test_a_flight_that_is_stopped_after_its_reference_is_not_completed() -> None:
-    """Its exit code was 4, and by its score it was completed."""
-    pair = hover(aloft=True, at=[(in_phase(Phase.HOVER, 0.1), stop)])
-    aborted(pair, "stop requested", ended_by="operator")
-
-
-EARLIER = {"fault": "clock_jump", "jump_s": -3, "after": "landing", "at_s": 0.5}
-
-
-@pytest.mark.parametrize(
-    ("options", "says", "ended_by"),
-    [
-        ({"firmware": refusing("land", "No.")}, "the vehicle's own failsafe flew it", "link"),
-        ({"scenario": scenario_of(EARLIER)}, "the vehicle restarted while landing", "restart"),
-    ],
-)
-def test_a_landing_that_was_not_ours_to_the_end_is_not_completed(
-    options: dict[str, Any], says: str, ended_by: str
-) -> None:
-    """The exit code was 4, and nothing in the log said so."""
-    aborted(hover(aloft=True, **options), says, ended_by=ended_by)
 
 
 def test_a_restart_before_the_flight_is_none_of_it() -> None:

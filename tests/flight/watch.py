@@ -6,13 +6,14 @@ import math
 import re
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from pair import SHORT, Bytes, Filter, Pair, decode, make, on_arducopter, through
+from pair import SHORT, Bytes, Filter, Pair, decode, in_phase, make, on_arducopter, through
 
 from offboard.analysis.history import OUR_COMPONENTS
 from offboard.analysis.score import score
@@ -262,3 +263,54 @@ def early(name: str, at_s: float = 7.0) -> Scenario:
         each.model_copy(update={"at_s": each.at_s - first_s + at_s}) for each in scenario.faults
     ]
     return scenario.model_copy(update={"faults": earlier})
+
+
+# --- rows: one flight each ------------------------------------------------------------------------
+
+Check = Callable[[Pair], object]
+Row = tuple[Callable[[], Pair], Phase, bool, tuple[Check, ...], dict[str, Any]]
+JUDGED = {"ended_by", "failsafes", "error_m", "top_m", "fall_mps"}  # by `flown`
+
+
+def row(
+    code: int | None, end: Phase, says: str, *checks: Check, fly: Callable[..., Pair] = px4.hop,
+    armed: bool = False, **options: Any,
+) -> Row:  # fmt: skip
+    """A flight by `fly` with these options, and what `flown` demands of it. It ends in the phase
+    `end`; then the vehicle is `armed`, and the checks hold."""
+    expected = {name: options.pop(name) for name in JUDGED & options.keys()}
+    return partial(fly, **options), end, armed, checks, {"code": code, "says": says, **expected}
+
+
+refusal = partial(row, ExitCode.REFUSED, Phase.FAILED)
+flies = partial(row, ExitCode.FLOWN, Phase.DISARMED, LANDED)
+aborts = partial(row, ExitCode.ABORTED)
+ends = partial(aborts, Phase.DISARMED)
+in_track = partial(ends, fly=px4.lap)
+
+
+def judged(flight: Row) -> None:
+    """Fly a row. All that was to happen to it has happened."""
+    fly, end, armed, checks, expected = flight
+    pair = fly()
+    flown(pair, **expected)
+    ended = (pair.companion.phase, pair.armed)
+    assert ended == (end, armed), ended
+    assert pair.at == []
+    for check in checks:
+        check(pair)
+
+
+def then(phase: Phase, for_s: float, act: Callable[[Pair], object]) -> list[Any]:
+    """This happens to the flight once it has been in `phase` for so long."""
+    return [(in_phase(phase, for_s), act)]
+
+
+def tracking(act: Callable[[Pair], object]) -> list[Any]:
+    return then(Phase.TRACK, 1.0, act)
+
+
+def landed(pair: Pair) -> None:
+    """On the ground, by a landing that was asked for."""
+    assert pair.instance.autopilot.position_controller.landed
+    assert pair.landings

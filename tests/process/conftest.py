@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from pathlib import Path
 
 import pytest
-from processes import Called, Spawn, free_port, spawning
+from processes import Called, Spawn, children, free_port
 
 from offboard import cli
 from offboard.cli.shared import out
@@ -21,8 +23,37 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # which commands handl
 
 @pytest.fixture
 def spawn(tmp_path: Path) -> Iterator[Spawn]:
-    with spawning(tmp_path) as spawn:
+    """`spawn("offboard", ...)` starts a command in `tmp_path`, `more` environment added. The
+    directory has modules that end every process that imports them."""
+    running: list[subprocess.Popen[str]] = []
+    for module in ("json", "pickle"):
+        (tmp_path / f"{module}.py").write_text("import os\nos._exit(99)\n")
+
+    def spawn(
+        program: str, *arguments: object, terminal: int | None = None, **more: str
+    ) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [sys.executable, "-P", "-m", program, *map(str, arguments)],
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONUNBUFFERED": "1", "COLUMNS": "200", **more},
+            stdin=subprocess.DEVNULL if terminal is None else terminal,
+            stdout=subprocess.PIPE if terminal is None else terminal,
+            stderr=subprocess.PIPE if terminal is None else terminal,
+            text=True,
+            start_new_session=True,
+        )
+        running.append(process)
+        return process
+
+    try:
         yield spawn
+    finally:
+        for process in running:
+            if process.poll() is None:
+                for pid in (*children(process.pid), process.pid):
+                    with suppress(ProcessLookupError):
+                        os.kill(pid, signal.SIGKILL)
+            process.communicate()
 
 
 @pytest.fixture

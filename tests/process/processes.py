@@ -5,10 +5,8 @@ from __future__ import annotations
 import itertools
 import os
 import resource
-import signal
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -48,41 +46,6 @@ def free_port() -> int:
             stream.bind(("127.0.0.1", port))
             return port
     raise AssertionError("unreachable")
-
-
-@contextmanager
-def spawning(directory: Path) -> Iterator[Spawn]:
-    """`spawn("offboard", ...)` starts a command in `directory`, `more` environment added. The
-    directory has modules that end every process that imports them."""
-    running: list[subprocess.Popen[str]] = []
-    for module in ("json", "pickle"):
-        (directory / f"{module}.py").write_text("import os\nos._exit(99)\n")
-
-    def spawn(
-        program: str, *arguments: object, terminal: int | None = None, **more: str
-    ) -> subprocess.Popen[str]:
-        process = subprocess.Popen(
-            [sys.executable, "-P", "-m", program, *map(str, arguments)],
-            cwd=directory,
-            env={**os.environ, "PYTHONUNBUFFERED": "1", "COLUMNS": "200", **more},
-            stdin=subprocess.DEVNULL if terminal is None else terminal,
-            stdout=subprocess.PIPE if terminal is None else terminal,
-            stderr=subprocess.PIPE if terminal is None else terminal,
-            text=True,
-            start_new_session=True,
-        )
-        running.append(process)
-        return process
-
-    try:
-        yield spawn
-    finally:
-        for process in running:
-            if process.poll() is None:
-                for pid in (*children(process.pid), process.pid):
-                    with suppress(ProcessLookupError):
-                        os.kill(pid, signal.SIGKILL)
-            process.communicate()
 
 
 def register(site: Path, package: str, group: str, **points: str) -> None:

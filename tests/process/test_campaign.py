@@ -419,18 +419,3 @@ def test_a_killed_or_interrupted_comparison_keeps_what_landed_and_goes_on(
     again = rows(tmp_path / "x")
     assert len(again) == 8
     assert all(row in again for row in flown)
-
-
-@pytest.mark.slow
-def test_interrupted_while_its_processes_load_it_ends_in_order(
-    spawn: Spawn, tmp_path: Path
-) -> None:
-    (tmp_path / "c.yaml").write_text(FILE.replace("draws: 1", "draws: 9"))
-    process = spawn("offboard", "campaign", "c.yaml", "--out", "out", "--workers", 2)
-    while process.poll() is None and len(children(process.pid)) < 3:  # a tracker, two of ours
-        time.sleep(0.01)
-    os.killpg(process.pid, signal.SIGINT)
-    output, errors = process.communicate(timeout=60)
-    assert (process.returncode, errors.count("\n")) == (4, 1), errors
-    assert "the process that flew it ended" not in output
-    assert "flights are missing" in errors

@@ -58,8 +58,8 @@ def mode(pilot: Peer, number: int) -> Callable[[], bool]:
 
 
 def engage(pilot: Peer) -> None:
-    """Switch to OFFBOARD, again every second until the vehicle shows it."""
-    pilot.listen(mode(pilot, OFFBOARD), each=lambda: pilot.command(SET_MODE, 1, 6), period_s=1.0)
+    """Switch to OFFBOARD, again at every HEARTBEAT until the vehicle shows it."""
+    pilot.listen(mode(pilot, OFFBOARD), each=lambda: pilot.command(SET_MODE, 1, 6))
 
 
 def scraped(port: int) -> dict[str, Any]:

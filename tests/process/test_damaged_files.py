@@ -120,29 +120,27 @@ def test_an_incomplete_score_is_not_kept(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_a_page_on_a_full_disk_leaves_no_file(called: Called, tmp_path: Path) -> None:
-    with full_disk(100):
-        code, _, said = called("offboard identify -o x.yaml", RECORDING)
-    assert (code, said.count("\n")) == (2, 1)
-    assert said.startswith("identify.html cannot be written (File")
-    assert not list(tmp_path.iterdir())
+LINK = "--connect udpin:127.0.0.1:PORT --signing-key key --out x"
 
 
 @pytest.mark.parametrize(
-    ("command", "holds_bytes", "code"),
-    [("fly", 0, 2), ("daemon", 10, 3)],
-    ids=["fly", "daemon's signing time"],
+    ("command", "holds_bytes", "code", "kept"),
+    [
+        (f"fly {LINK}", 0, 2, {"key", "state"}),
+        # the service manager starts it again, and it waits for room
+        (f"daemon {LINK}", 10, 3, {"key", "state", "x"}),
+        (f"identify -o x.yaml {RECORDING}", 100, 2, {"key"}),
+    ],
 )
-def test_nothing_is_sent_where_a_disk_is_full(
-    command: str, holds_bytes: int, code: int, called: Called
+def test_where_a_disk_is_full_nothing_is_sent_and_no_file_is_cut(
+    command: str, holds_bytes: int, code: int, kept: set[str], called: Called, tmp_path: Path
 ) -> None:
-    """The service manager starts a daemon again, which waits for room."""
     called("offboard key key")
     with full_disk(holds_bytes):
-        link = "--connect udpin:127.0.0.1:PORT --signing-key key --out x"
-        ended, _, said = called(f"offboard {command} {link}")
+        ended, _, said = called(f"offboard {command}")
     assert (ended, said.count("\n")) == (code, 1)
     assert "File too large" in said
+    assert {path.name for path in tmp_path.iterdir()} == kept
 
 
 # --- an output that takes nothing ---
