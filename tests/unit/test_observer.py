@@ -24,7 +24,13 @@ from offboard.model.frames import quaternion_from_thrust_direction
 Array = NDArray[np.float64]
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 STILL = (0.0, 0.0, 0.0)
-NO_DELAY = PX4.model_copy(update={"tilt": PX4.tilt.model_copy(update={"delay_s": 0.0})})
+NO_DELAY = PX4.model_copy(
+    update={
+        "thrust_delay_s": 0.0,
+        "thrust_lag_s": 0.0,
+        "tilt": PX4.tilt.model_copy(update={"delay_s": 0.0}),
+    }
+)
 
 
 def command(north: float, east: float, thrust: float = G, heading: float = 0.0) -> Command:
@@ -364,13 +370,6 @@ def test_state_is_finite_under_any_telemetry() -> None:
 
 
 DRAG = PX4.drag_per_mass_ps
-VEHICLE = PX4.model_copy(
-    update={
-        "thrust_delay_s": 0.0,
-        "thrust_lag_s": 0.0,
-        "tilt": PX4.tilt.model_copy(update={"delay_s": 0.0}),
-    }
-)
 NOISE = Noise()
 FIXED_DRIFT = Noise(disturbance_limit_mps2=NOISE.disturbance_mps2)
 
@@ -410,11 +409,11 @@ def observe(
     """An observer after telemetry of `flown` with white noise on position and velocity; estimated
     positions and disturbances (N, 3)."""
     rng = np.random.default_rng(99)
-    observer = Observer(VEHICLE, noise)
+    observer = Observer(NO_DELAY, noise)
     observer.on_command(0.0, LEVEL)
     positions, disturbances = np.empty_like(flown.positions), np.empty_like(flown.positions)
     if adopted:
-        observer.set_vehicle(VEHICLE)
+        observer.set_vehicle(NO_DELAY)
     for i, time_s in enumerate(flown.times.tolist()):
         position = flown.positions[i] + white[0] * rng.standard_normal(3)
         velocity = flown.velocities[i] + white[1] * rng.standard_normal(3)
@@ -500,7 +499,7 @@ def test_estimates_are_bounded_and_cleared_by_a_reset() -> None:
 
 def test_positions_that_an_attitude_has_overtaken_leave_the_noise_finite() -> None:
     """Two of them arrive after a newer attitude: the state has the same time at both."""
-    observer = Observer(VEHICLE, NOISE)
+    observer = Observer(NO_DELAY, NOISE)
     observer.on_command(0.0, LEVEL)
     for i in range(200):
         time_s = 0.04 * i

@@ -18,6 +18,7 @@ from offboard.reference.transfer import Limits, transfer
 
 
 def peaks(flown: Track) -> tuple[float, float, float]:
+    """Greatest speed, acceleration and rate of the heading."""
     sample = flown.sample(np.linspace(0.0, flown.duration_s, 2001))
     return (
         float(np.linalg.norm(sample.velocity_ned_mps, axis=-1).max()),

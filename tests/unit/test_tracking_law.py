@@ -5,20 +5,19 @@ that is true; figures in brackets are those measured on PX4 itself.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from attitude_plant import Truth, fly, lemniscate
-from laws import LEVEL, PX4, G, at, lqr, pso, state_of
-from scipy.integrate import solve_ivp
+from laws import LEVEL, PX4, G, lqr, pso, state_of
 from scipy.linalg import expm
 
 from offboard.control.base import DecisionError, Situation
 from offboard.model.axes import lateral_model, vertical_model
 from offboard.model.command import PredictedState
 from offboard.model.vehicle import Vehicle
-from offboard.reference.base import FlatSample, Reference
+from offboard.reference.base import Reference
 
 
 def test_gains_are_those_flown_on_px4() -> None:
@@ -173,59 +172,6 @@ def test_a_vehicle_that_leans_by_39_degrees_comes_to_rest() -> None:
     storm, still = Truth(PX4, wind_force_ned_mps2=(7.9, 0.0, 0.0)), lemniscate(1e6)
     start = {"offset_ned_m": (0.5, 0.5, 0.0), "score_from_s": 14.0}
     assert fly(storm, lqr(7.0), PX4, still, 20.0, **start) < 0.002
-
-
-# --- the ripple of held commands ------------------------------------------------------------------
-
-
-PERIOD_S = 0.1
-HOLDS = 60
-
-
-def _after(held: bool) -> np.ndarray:
-    """[b, b', T] (3,) after HOLDS of the ramp u = t, or of the staircase through its middles."""
-    wn, z, lag = PX4.tilt.natural_frequency_radps, PX4.tilt.damping, PX4.thrust_lag_s
-    x = np.zeros(3)
-    for k in range(HOLDS):
-        middle = (k + 0.5) * PERIOD_S
-
-        def motion(t: float, x: np.ndarray, middle: float = middle) -> list[float]:
-            u = middle if held else t
-            return [x[1], wn**2 * (u - x[0]) - 2 * z * wn * x[1], (u - x[2]) / lag]
-
-        x = solve_ivp(motion, (k * PERIOD_S, (k + 1) * PERIOD_S), x, rtol=1e-10, atol=1e-12).y[
-            :, -1
-        ]
-    return x
-
-
-@dataclass
-class Jerking:
-    """At rest, level and unaccelerated at 0.057 s, with a constant jerk, NED."""
-
-    jerk_ned_mps3: tuple[float, float, float]
-    duration_s = 3600.0
-
-    def sample(self, time_s: float | np.ndarray) -> FlatSample:
-        time = np.asarray(time_s, dtype=np.float64)[..., None] - 0.057
-        jerk = np.array(self.jerk_ned_mps3) + 0.0 * time
-        none, still = np.zeros_like(jerk), np.zeros_like(time[..., 0])
-        position, velocity = time**3 / 6.0 * jerk, 0.5 * time**2 * jerk
-        return FlatSample(position, velocity, time * jerk, jerk, none, still, still, still)
-
-
-def test_the_target_ripples_as_the_staircase_does() -> None:
-    """At a jerk of 1 m/s^3 b_c is a ramp of -1 / g per second, T one of -1 m/s^2 per second."""
-    without_drag = PX4.model_copy(update={"drag_translation_npmps": (0.0,) * 3})
-    law = lqr(vehicle=without_drag)
-    off = _after(held=True) - _after(held=False)
-    level = at((0.0, 0.0, 0.0), 0.0)
-    target = law.target(Jerking((1.0, -1.0, 0.0)), 0.0, level)
-    assert target.lateral[2] == pytest.approx(np.array([-1.0, 1.0]) / G * off[0], rel=1e-3)
-    leaning = np.array([-1.0, 1.0]) / G
-    assert target.lateral[3] == pytest.approx(leaning * (1.0 + off[1]), rel=1e-3)
-    climbing = law.target(Jerking((0.0, 0.0, 1.0)), 0.0, level)
-    assert climbing.vertical[2] - G == pytest.approx(-off[2], rel=1e-3)
 
 
 @pytest.mark.parametrize(("vertical_m", "most_m"), [(0.0, 0.0002), (0.4, 0.0008)])

@@ -245,8 +245,9 @@ def seen(bench: Bench) -> tuple[int, ...]:
     return tuple(getattr(channels, f"chan{i}_raw") for i in range(1, 9))
 
 
-def test_the_throttle_is_a_climb_rate_and_an_override_lasts_three_seconds() -> None:
-    """Then the throttle of the feigned remote control, at its lower end, descends."""
+def test_sticks_are_speeds_and_an_override_lasts_three_seconds() -> None:
+    """As the real one: throttle is a climb rate, pitch accelerates second by second and is braked
+    by letting go. Then the throttle of the feigned remote control, at its lower end, descends."""
     bench = loitering()
     for width, climb in ((1700, 0.63), (1300, -0.68), (1580, 0.0)):
         push(bench, 3.0, 1500, 1500, width, 1500)
@@ -254,46 +255,24 @@ def test_the_throttle_is_a_climb_rate_and_an_override_lasts_three_seconds() -> N
         height_m = bench.height_m
         push(bench, 4.0, *MIDDLE)
         assert bench.height_m == pytest.approx(height_m + 0.35 * climb, abs=0.35)
+    for pitch, ahead_mps, near in (
+        (1400, 0.43, 0.2), (1400, 0.85, 0.2), (1400, 1.15, 0.2), (1400, 1.36, 0.2),
+        (1500, 1.0, 0.35), (1500, 0.3, 0.35), (1500, 0.0, 0.2),
+    ):  # fmt: skip
+        push(bench, 1.0, 1500, pitch, 1500, 1500)
+        assert bench.velocity[0] == pytest.approx(ahead_mps, abs=near)
+    push(bench, 3.0, 1700, 1500, 1500, 1500)
+    assert bench.velocity[1] == pytest.approx(2.65, abs=0.4)
+    push(bench, 3.0, *MIDDLE)
     assert seen(bench) == (*MIDDLE, *FEIGNED[4:])
     bench.run(4.5)
     assert seen(bench) == FEIGNED
     assert climb_mps(bench) == pytest.approx(-2.4, abs=0.3)
 
 
-def test_a_stick_accelerates_and_the_vehicle_stops_when_it_is_centred() -> None:
-    """Pitch 1400: 0.43, 0.85, 1.15 and 1.36 m/s ahead second by second; released after five it
-    went on at 1.1 m/s for a second and stood after two."""
-    bench = loitering()
-    speeds = []
-    for _ in range(4):
-        push(bench, 1.0, 1500, 1400, 1500, 1500)
-        speeds.append(bench.velocity[0])
-    assert speeds == pytest.approx([0.43, 0.85, 1.15, 1.36], abs=0.2)
-    push(bench, 1.0, 1500, 1400, 1500, 1500)
-    push(bench, 1.0, *MIDDLE)
-    assert bench.velocity[0] == pytest.approx(1.14, abs=0.25)
-    push(bench, 2.0, *MIDDLE)
-    assert bench.velocity[:2] == pytest.approx((0.0, 0.0), abs=0.2)
-
-
-def test_roll_flies_sideways_also_by_manual_control_of_the_ground_station_alone() -> None:
-    bench = loitering()
-    push(bench, 3.0, 1700, 1500, 1500, 1500)
-    assert bench.velocity[1] == pytest.approx(2.65, abs=0.4)
-    joystick = mavlink.MAVLink_manual_control_message(1, 0, 0, 700, 0, 0)
-    bench.run(3.0, lambda: bench.send(joystick), 0.2)
-    assert seen(bench)[:4] == (1500, 1500, 1700, 1500)
-    assert climb_mps(bench) == pytest.approx(0.63, abs=0.1)
-    bench.codec.srcSystem = 42
-    push(bench, 0.02, 1100, 1100, 1100, 1100)
-    assert seen(bench)[:4] == (1500, 1500, 1700, 1500)
-    bench.codec.srcSystem = 255
-    push(bench, 0.02, 0, KEEP, 0, KEEP)  # zero releases
-    assert seen(bench) == (1500, 1500, 1000, 1500, *FEIGNED[4:])
-
-
-def test_manual_control_releases_axes_and_keeps_the_ground_station_present() -> None:
-    """32767 is an axis that is not used; a negative throttle or another target changes nothing."""
+def test_manual_control_of_the_ground_station_alone_is_an_override_and_keeps_it_present() -> None:
+    """32767 is an axis that is not used; a negative throttle, another target or sender changes
+    nothing. A width of zero releases a channel."""
     bench = loitering()
     for target, throttle, roll_axis, widths in (
         (1, 700, 0, (1500, 1500, 1700, 1500)),
@@ -305,10 +284,17 @@ def test_manual_control_releases_axes_and_keeps_the_ground_station_present() -> 
         bench.send(mavlink.MAVLink_manual_control_message(target, 0, roll_axis, throttle, 0, 0))
         bench.run(0.02)
         assert seen(bench)[:4] == widths
+    bench.codec.srcSystem = 42
+    push(bench, 0.02, 1100, 1100, 1100, 1100)
+    assert seen(bench)[:4] == widths
+    bench.codec.srcSystem = 255
+    push(bench, 0.02, 0, KEEP, 0, KEEP)
+    assert seen(bench) == (1500, 1500, 1000, 1500, *FEIGNED[4:])
     bench.set("FS_GCS_ENABLE", 1)
     bench.heartbeat_type = None
-    joystick = mavlink.MAVLink_manual_control_message(1, 0, 0, 500, 0, 0)
+    joystick = mavlink.MAVLink_manual_control_message(1, 0, 0, 700, 0, 0)
     bench.run(7.0, lambda: bench.send(joystick), 0.5)
+    assert climb_mps(bench) == pytest.approx(0.63, abs=0.1)
     assert not [text for text in bench.texts() if text.startswith("GCS Failsafe")]
     bench.run(6.0)
     assert [text for text in bench.texts() if text.startswith("GCS Failsafe")]
