@@ -1,5 +1,5 @@
-"""What a decision and a second of the simulated vehicle cost: run with `--benchmark-enable`. Nothing
-here asserts on time.
+"""What a decision and a second of the simulated vehicle cost: run with `--benchmark-enable`.
+Nothing here asserts on time.
 
 The vehicle: in memory, default rates of PX4's companion link, PX4's estimator. 1000 / (milliseconds
 per second of flight) is the ratio to real time.

@@ -61,23 +61,25 @@ def mean_spread(flights: list[Flight]) -> float:
 
 
 def test_the_cost_is_eq_21() -> None:
-    """The quadratic that the swarm gets, against Eq. 21 as printed."""
+    """The quadratic that the swarm gets, against Eq. 21 as printed; a reset forgets u(k-1)."""
     a, b = paper_model()
     rng = np.random.default_rng(1)
     for keep_constant in (True, False):
         law = PaperLaw(a, b, FINAL.model_copy(update={"keep_constant": keep_constant}))
-        previous = law.move(0.1 * rng.normal(size=12), np.zeros(12)).inputs
-        x, target = rng.normal(size=12), rng.normal(size=12)
-        problem = law.move(x, target).problem
+        applied = law.move(0.1 * rng.normal(size=12), np.zeros(12)).inputs
+        for previous in (applied, np.zeros(4)):
+            x, target = rng.normal(size=12), rng.normal(size=12)
+            problem = law.move(x, target).problem
+            law.reset()
 
-        def eq_21(u: Array) -> float:
-            e = target - (a @ x + b @ u)  # noqa: B023
-            change = u - previous  # noqa: B023
-            return float(e @ Q @ e + u @ R @ u + change @ RATE @ change)
+            def eq_21(u: Array) -> float:
+                e = target - (a @ x + b @ u)  # noqa: B023
+                change = u - previous  # noqa: B023
+                return float(e @ Q @ e + u @ R @ u + change @ RATE @ change)
 
-        lost = 0.0 if keep_constant else eq_21(np.zeros(4))
-        for u in rng.normal(size=(20, 4)):
-            assert float(problem(u)) == pytest.approx(eq_21(u) - lost, rel=1e-10)
+            lost = 0.0 if keep_constant else eq_21(np.zeros(4))
+            for u in rng.normal(size=(20, 4)):
+                assert float(problem(u)) == pytest.approx(eq_21(u) - lost, rel=1e-10)
 
 
 def test_the_cost_to_go_makes_one_step_the_lqr() -> None:
