@@ -9,8 +9,6 @@ import numba
 import numpy as np
 import pytest
 from scipy import stats
-from scipy.integrate import quad_vec
-from scipy.linalg import expm, solve_continuous_lyapunov
 from scipy.signal import welch
 from scipy.spatial.transform import Rotation
 from sim_hover import attitude, estimate_of, hovering, load
@@ -20,7 +18,6 @@ from simulator.vehicle.attitude import Demand
 from simulator.vehicle.conditions import Conditions
 from simulator.vehicle.noise import (
     advance_process,
-    discretise,
     fill_normals,
     seed_word,
 )
@@ -186,25 +183,6 @@ def test_normals_are_standard_and_independent():
     assert np.abs(correlation).max() < 4.5 / math.sqrt(len(values))
     for lag in (1, 2, 3):
         assert abs(np.mean(values[lag:] * values[:-lag])) < 4.0 / math.sqrt(values.size)
-
-
-def test_discretisation_is_exact():
-    """Against the definition: F = expm(A h), Q = integral of expm(A s) B B' expm(A s)' ds."""
-    drift = np.array([[-0.34, 0.30, -0.78], [-0.28, -0.06, -4.5], [-0.014, 0.026, 0.008]])
-    densities = np.array([0.0225, 0.097, 0.012])
-    for step_s in (0.004, 0.5):
-        process = discretise(drift, densities, step_s)
-
-        def growth(s):
-            half = expm(drift * s) * densities
-            return half @ half.T
-
-        covariance = quad_vec(growth, 0.0, step_s, epsrel=1e-12)[0]
-        assert process.transition == pytest.approx(expm(drift * step_s), rel=1e-10, abs=1e-14)
-        assert process.scale @ process.scale.T == pytest.approx(covariance, rel=1e-6, abs=1e-16)
-        stationary = solve_continuous_lyapunov(drift, -np.diag(densities**2))
-        found = process.stationary_scale @ process.stationary_scale.T
-        assert found == pytest.approx(stationary, rel=1e-6)
 
 
 GUSTS = Gusts(

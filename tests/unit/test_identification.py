@@ -16,7 +16,6 @@ from offboard.analysis.identify import estimator_noise
 from offboard.identification import attitude_fit
 from offboard.identification.attitude_fit import ResponseFit
 from offboard.identification.motion_fit import Noise, PositionFilter
-from offboard.identification.response import second_order
 from offboard.identification.trace import Rows, Trace, clean
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_fit import completed, identify
@@ -47,19 +46,6 @@ def steps(seed, count=60):
 
 def fit_response(*measured, **options) -> ResponseFit:
     return completed(attitude_fit.fit_response(*measured, **options))
-
-
-@pytest.mark.parametrize("damping", [0.3, 1.0, 1.7])
-def test_second_order_response_equals_scipys_simulation(damping):
-    """At any time since a command, which acts when its delay is over and not before."""
-    sent_at, values = steps(3)
-    times = 0.3 + np.cumsum(np.random.default_rng(4).choice([0.008, 0.016, 0.004], 500))
-    ours = second_order(times, sent_at, values[:, None], 0.057, 11.4, damping)[:, 0]
-    theirs = simulated(values, sent_at, 0.057, 11.4, damping, times)
-    assert np.abs(ours - theirs).max() < 2e-5
-    assert np.abs(theirs).max() > 0.02
-    before = times < sent_at[np.flatnonzero(values)[0]] + 0.057
-    assert np.abs(ours[before]).max() == 0.0
 
 
 def test_innovations_of_a_matching_motion_are_white_and_of_unit_variance():

@@ -51,7 +51,6 @@ TRACKS = {shape: track_of(shape, "along_velocity") for shape in SHAPES} | {
     "table-table": track_of("table", "table"),
     "waypoints-jerk": track_of("waypoints", "along_velocity", minimise="jerk"),
 }
-every_track = pytest.mark.parametrize("track", TRACKS.values(), ids=TRACKS.keys())
 
 
 def orders(sample: FlatSample) -> tuple[Array, Array]:
@@ -59,9 +58,10 @@ def orders(sample: FlatSample) -> tuple[Array, Array]:
     return np.stack(sample[:5]), np.stack(sample[5:])
 
 
-@every_track
-def test_derivatives_are_those_of_the_position_and_none_jumps(track: Track) -> None:
-    """By central differences, each order from the one below it."""
+@pytest.mark.parametrize("track", TRACKS.values(), ids=TRACKS.keys())
+def test_derivatives_rest_and_arrays_of_every_track(track: Track) -> None:
+    """By central differences, each order from the one below it; none jumps; at rest outside; arrays
+    equal loops."""
     drawn = np.random.default_rng(3).uniform(0.12, track.duration_s - 0.12, 60)
     here, after, before = (orders(track.sample(drawn + by)) for by in (0.0, 1e-5, -1e-5))
     grid = orders(track.sample(np.linspace(-0.5, track.duration_s + 0.5, 20_001)))
@@ -69,20 +69,13 @@ def test_derivatives_are_those_of_the_position_and_none_jumps(track: Track) -> N
         numeric = (after[kind] - before[kind]) / 2e-5
         np.testing.assert_allclose(here[kind][1:], numeric[:-1], rtol=1e-6, atol=2e-4)
         assert np.abs(np.diff(grid[kind], axis=1)).max() < 0.3  # of a jump, at any step
-
-
-@every_track
-def test_rests_outside_and_arrays_equal_loops(track: Track) -> None:
-    for inside, outside in ((0.0, -3.0), (track.duration_s, track.duration_s + 100.0)):
-        for rest, edge in zip(
-            orders(track.sample(outside)), orders(track.sample(inside)), strict=True
-        ):
+        for inside, outside in ((0.0, -3.0), (track.duration_s, track.duration_s + 100.0)):
+            rest, edge = (orders(track.sample(each))[kind] for each in (outside, inside))
             assert np.all(rest[1:] == 0.0)
             np.testing.assert_allclose(edge, rest, atol=1e-9)
     times = np.linspace(-1.0, track.duration_s + 1.0, 6).reshape(1, 2, 3)
     batch = track.sample(times)
-    assert batch.position_ned_m.shape == (1, 2, 3, 3)
-    assert batch.heading_rad.shape == (1, 2, 3)
+    assert (batch.position_ned_m.shape, batch.heading_rad.shape) == ((1, 2, 3, 3), (1, 2, 3))
     for index in np.ndindex(times.shape):
         single = track.sample(float(times[index]))
         assert single.heading_rad.shape == ()

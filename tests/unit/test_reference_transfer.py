@@ -27,16 +27,6 @@ def peaks(flown: Track) -> tuple[float, float, float]:
     )
 
 
-def test_rest_to_rest_is_the_smoothstep_of_degree_nine() -> None:
-    flown = transfer((1.0, 2.0, 0.0), (1.0, 2.0, -3.0), 0.3, 0.3)
-    x = np.linspace(0.0, 1.0, 21)
-    smoothstep = 126 * x**5 - 420 * x**6 + 540 * x**7 - 315 * x**8 + 70 * x**9
-    sample = flown.sample(x * flown.duration_s)
-    np.testing.assert_allclose(sample.position_ned_m[:, 2], -3.0 * smoothstep, atol=1e-10)
-    np.testing.assert_allclose(sample.position_ned_m[:, :2], [[1.0, 2.0]] * 21, atol=1e-12)
-    np.testing.assert_allclose(sample.heading_rad, 0.3, atol=1e-12)
-
-
 @pytest.mark.parametrize("distance_m", [0.0, 0.2, 3.0, 10.0])
 def test_as_fast_as_the_limits_allow(distance_m: float) -> None:
     limits = Limits(speed_mps=2.0, acceleration_mps2=1.5, heading_rate_radps=0.5)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -22,6 +23,13 @@ AUTO, GUIDED, LAND, THROW = 3, 4, 9, 18
 ACCEPTED, DENIED, UNSUPPORTED, FAILED = 0, 2, 3, 4
 HOVER = 0.3655
 LEVEL = (1.0, 0.0, 0.0, 0.0)
+
+
+def booted(**more: Any) -> Bench:
+    """On the ground, ready to arm."""
+    bench = Bench(firmware=ARDUPILOT, boot_scale=0.1, **more)
+    bench.run(4.5)
+    return bench
 
 
 def guided(**options: float) -> Bench:
@@ -69,21 +77,10 @@ def test_the_heartbeat_after_a_mode_change_shows_it_also_in_the_step_of_the_last
     assert [m.custom_mode for _, m in vehicle.of("HEARTBEAT", since_s)] == [GUIDED, LAND]
 
 
-def test_gps_raw_int_shows_no_fix_before_the_first_one() -> None:
-    """At 10.2 s."""
-    vehicle = Bench(firmware=ARDUPILOT)
-    vehicle.command(511, 24, 200_000)
-    vehicle.run(11.0)
-    fixes = vehicle.of("GPS_RAW_INT")
-    assert {m.fix_type for at_s, m in fixes if at_s < 10.1} == {1}
-    assert {m.fix_type for at_s, m in fixes if at_s > 10.3} == {3}
-
-
 @pytest.mark.parametrize(("thrust", "lifts"), [(0.45, True), (0.05, False)])
 def test_takeoff_by_setpoints_alone(thrust: float, lifts: bool) -> None:
     """.3 m after 3.3-3.9 s; any thrust is flight, even if it cannot lift."""
-    vehicle = Bench(firmware=ARDUPILOT, boot_scale=0.1)
-    vehicle.run(4.5)
+    vehicle = booted()
     vehicle.set("GUID_OPTIONS", 8)
     vehicle.command(176, 1, GUIDED)
     assert vehicle.command(400, 1) == [ACCEPTED]
@@ -116,8 +113,7 @@ def test_without_guid_options_thrust_is_a_climb_rate() -> None:
 
 def test_a_request_of_the_present_mode_changes_nothing_and_disarming_ends_a_takeoff() -> None:
     """Scripts ask for GUIDED until HEARTBEAT shows it; set_mode returns at once in that mode."""
-    vehicle = Bench(firmware=ARDUPILOT, boot_scale=0.1)
-    vehicle.run(4.5)
+    vehicle = booted()
 
     def take_off(up_m: float) -> None:
         assert vehicle.command(176, 1, GUIDED) == [ACCEPTED]
@@ -151,8 +147,7 @@ def test_modes_that_do_not_start_while_armed() -> None:
     assert vehicle.command(300) == [FAILED]
     mission.store(tuple(MissionItem(3, 16, (0.0,) * 4, 0, 0, up_m) for up_m in (0.0, 5.0)))
     assert vehicle.command(300) == [ACCEPTED]
-    ground = Bench(firmware=ARDUPILOT, boot_scale=0.1)
-    ground.run(4.5)
+    ground = booted()
     ground.instance.autopilot.mission.store(mission.items)
     for number in (THROW, AUTO, GUIDED):
         assert ground.command(176, 1, number) == [ACCEPTED]
@@ -169,10 +164,10 @@ def test_a_lost_ground_station_disarms_on_the_ground_and_leaves_the_pilot_his_mo
     vehicle.run(6.0)
     assert (vehicle.mode, vehicle.system_status) == (5, 4)
     assert "GCS Failsafe - Continuing Pilot Control" in vehicle.texts()
-    ground = Bench(firmware=ARDUPILOT, boot_scale=0.1)
+    ground = booted()
     ground.codec.srcSystem = 255
     ground.set("FS_GCS_ENABLE", 1)
-    ground.run(4.5)
+    ground.run(1.0)
     assert ground.command(176, 1, GUIDED) == [ACCEPTED]
     ground.heartbeat_type = None
     assert ground.command(400, 1) == [ACCEPTED]
@@ -306,8 +301,10 @@ POSITION_ALONE, VELOCITY_ALONE = 0xDF8, 0xDC7
 RELATIVE, ABSOLUTE = 6, 5  # MAV_FRAME
 
 
-def copter() -> Bench:
-    bench = aloft(firmware=ARDUPILOT, height_m=5.0, mode="GUIDED")
+def flying(firmware: Firmware = ARDUPILOT) -> Bench:
+    """5 m up, in GUIDED or AUTO.LOITER."""
+    mode = "GUIDED" if firmware is ARDUPILOT else None
+    bench = aloft(firmware=firmware, height_m=5.0, mode=mode)
     bench.run(1.0)
     return bench
 
@@ -345,7 +342,7 @@ def fastest_mps(bench: Bench, duration_s: float) -> float:
 
 
 def test_a_turn_has_the_requested_rate() -> None:
-    bench = copter()
+    bench = flying()
     for params, wanted_deg, took_s in (((90, 25, 1), 90.0, 4.0), ((45, 10, -1, 1), 45.0, 4.5)):
         begun_s = bench.time_s
         assert bench.command(115, *params) == [ACCEPTED]
@@ -356,7 +353,7 @@ def test_a_turn_has_the_requested_rate() -> None:
 
 def test_a_requested_speed_holds_until_a_setpoint_of_another_kind() -> None:
     """4 m/s asked on the way, 4.1 flown."""
-    bench = copter()
+    bench = flying()
 
     def go(north: float) -> None:
         bench.position(north, 0.0, -5.0, POSITION_ALONE)
@@ -375,7 +372,7 @@ def test_a_requested_speed_holds_until_a_setpoint_of_another_kind() -> None:
 
 def test_reposition_of_arducopter_accelerates_and_brakes_as_the_real_one() -> None:
     """Metres from the start, second by second. It takes it as COMMAND_INT alone."""
-    bench = copter()
+    bench = flying()
     assert bench.command(192, -1, 1, 0, NAN, 0, 0, 10) == [UNSUPPORTED]
     assert reposition(bench, 40.0, 0.0, 5.0, RELATIVE) == ACCEPTED
     flown, speeds = [], []
@@ -399,8 +396,7 @@ def test_reposition_of_arducopter_accelerates_and_brakes_as_the_real_one() -> No
 def test_a_reposition_without_a_place_flies_nowhere(
     firmware: Firmware, x: int, frame: int, result: int
 ) -> None:
-    bench = aloft(firmware=firmware, height_m=5.0, mode="GUIDED" if firmware is ARDUPILOT else None)
-    bench.run(1.0)
+    bench = flying(firmware)
     up_m = 5.0 + (bench.instance.autopilot.firmware.origin[2] if frame == ABSOLUTE else 0.0)
     assert command_int(bench, frame, 192, -1.0, 1, 0, NAN, x, x, up_m) == result
     bench.run(3.0)
@@ -412,7 +408,7 @@ def test_a_reposition_without_a_place_flies_nowhere(
 def test_a_climb_speed_is_one_across_for_px4_alone(
     firmware: Firmware, obeys: bool, item: bool
 ) -> None:
-    bench = aloft(firmware=firmware, height_m=5.0, mode="GUIDED" if firmware is ARDUPILOT else None)
+    bench = flying(firmware)
     autopilot = bench.instance.autopilot
     x, y = (round(value * 1e7) for value in degrees(bench, 30.0, 0.0))
     up_m = autopilot.firmware.origin[2] + 5.0
@@ -450,7 +446,7 @@ def test_what_arducopter_refuses(
 @pytest.mark.parametrize("kind", ["", "_int"])
 def test_arducopter_flies_to_a_guided_mission_item_at_once(kind: str) -> None:
     """As DroneKit's simple_goto asks."""
-    bench = copter()
+    bench = flying()
     x, y = degrees(bench, 0.0, 20.0)
     where = (round(x * 1e7), round(y * 1e7)) if kind else (x, y)
     pack = getattr(mavlink, f"MAVLink_mission_item{kind}_message")
@@ -495,7 +491,7 @@ def test_a_terminated_flight_falls_and_only_px4_does_not_arm_again(
     firmware: Firmware, beats: tuple[int, ...], later: int, said: list[str]
 ) -> None:
     """MAV_CMD_DO_FLIGHTTERMINATION. PX4 stays in its mode until it is started again."""
-    bench = aloft(firmware=firmware, height_m=5.0, mode="GUIDED" if firmware is ARDUPILOT else None)
+    bench = flying(firmware)
     assert bench.command(185, 0) == [2 if firmware is PX4 else 4]
     assert bench.armed
     begun_s = bench.time_s

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 from sim_bench import HOVER, LAND, LOITER, NAN, OFFBOARD, Bench, aloft, engaged, hold
 
-from offboard.documents import shipped
 from offboard.documents.errors import DocumentError
 from simulator import config
 from simulator.config import Scenario
@@ -305,8 +304,3 @@ def test_faults_that_run_go_on_after_a_reboot_and_end_as_they_should() -> None:
     assert autopilot.state.estimate.velocity_ned_mps[1] == pytest.approx(0.0, abs=0.1)
     assert bench.command(400, 1) == [0]
     assert bench.of("ATTITUDE")[-1][1].time_boot_ms == pytest.approx(7540, abs=60)
-
-
-def test_every_shipped_scenario_is_valid() -> None:
-    names = shipped.names("scenario")
-    assert [config.scenario(name).name for name in names] == list(names)
