@@ -1,4 +1,4 @@
-"""Plans over N decisions: the quadratic, the roll-outs against SciPy, what the searches find;
+"""Plans over N decisions: the quadratic, the roll-outs against the plant, what the searches find;
 volumes to keep out of: distances in numbers, what is refused."""
 
 from __future__ import annotations
@@ -8,17 +8,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from attitude_plant import lemniscate
+from attitude_plant import Plant, Truth, lemniscate
 from laws import LEVEL, PX4, G, at, lqr, on_target, state_of
 from pydantic import TypeAdapter
-from scipy.integrate import solve_ivp
 
 from offboard.control.base import Situation
 from offboard.control.horizon import STEPS_AROUND, HorizonLaw, HorizonSettings, Plan
 from offboard.control.keep_out import KeepOut, clearances, refusal
 from offboard.control.mpc import MpcLaw, MpcSettings
 from offboard.control.roll_out import STATE_SIZE, B, P, T, V, W, Z
-from offboard.model.command import PredictedState
+from offboard.model.command import Command
 from offboard.reference.path import Fixed
 from offboard.reference.track import Track, hold
 
@@ -105,31 +104,7 @@ def test_the_quadratic_leaves_the_cost_to_go_and_has_the_bounds_of_one_decision(
 PUSHED_MPS2 = np.array([2.0, -1.5, 0.0])  # a disturbance, which the reference leans into
 
 
-def _flown(state: PredictedState, plan: np.ndarray) -> np.ndarray:
-    """[p, v, b, b', T] (11,) after the plan from the leaning hover, by SciPy in absolute terms."""
-    wn, z, c = PX4.tilt.natural_frequency_radps, PX4.tilt.damping, PX4.drag_per_mass_ps
-    pull = np.array([0.0, 0.0, G]) + PUSHED_MPS2
-    leaning = pull / np.linalg.norm(pull)
-
-    def motion(_: float, x: np.ndarray, tilt: np.ndarray, thrust: float) -> np.ndarray:
-        b_z = math.sqrt(1.0 - x[6] ** 2 - x[7] ** 2)
-        acceleration = pull - x[10] * np.array([x[6], x[7], b_z]) - c * x[3:6]
-        twist = wn**2 * (tilt - x[6:8]) - 2.0 * z * wn * x[8:10]
-        lag = (thrust - x[10]) / PX4.thrust_lag_s
-        return np.concatenate((x[3:6], acceleration, x[8:10], twist, [lag]))
-
-    x = np.concatenate(
-        (state.position_ned_m, state.velocity_ned_mps, state.thrust_direction_ned[:2],
-         state.thrust_direction_rate_ned_ps[:2], [state.thrust_mps2])
-    )  # fmt: skip
-    for north, east, down in plan:
-        thrust = (pull[2] + down) / math.sqrt(1.0 - x[6] ** 2 - x[7] ** 2)
-        held = (leaning[:2] + np.array([north, east]), thrust)
-        x = solve_ivp(motion, (0, PERIOD_S), x, args=held, rtol=1e-9, atol=1e-10).y[:, -1]
-    return x
-
-
-def test_nonlinear_roll_outs_fly_as_scipy_does() -> None:
+def test_nonlinear_roll_outs_fly_as_the_plant_does() -> None:
     """Tilts and thrusts 0.2 and 3 m/s^2 about a hover that leans by 15 degrees: 1 s later within
     4 mm and 10 mm/s."""
     state = replace(
@@ -141,16 +116,28 @@ def test_nonlinear_roll_outs_fly_as_scipy_does() -> None:
         thrust_mps2=G + 0.5,
         disturbance_ned_mps2=PUSHED_MPS2,
     )
-    plan = np.random.default_rng(3).uniform([-0.1, -0.2, -3.0], [0.2, 0.1, 3.0], (STEPS, 3))
-    true, law = _flown(state, plan), horizon()
-    law.prepare(Situation(5.0, state, hold((0.0, 0.0, -3.0), 0.0), LEVEL))
-    rolled = law.fly(plan).plan(0).states[-1]
-    assert np.abs(rolled[[P, P + 1, Z]] - [0.0, 0.0, 3.0] - true[:3]).max() < 0.004
-    assert np.abs(rolled[[V, V + 1, W]] - true[3:6]).max() < 0.01
+    tilt = PX4.tilt.model_copy(update={"delay_s": 0.0})
+    prompt = PX4.model_copy(update={"tilt": tilt, "thrust_delay_s": 0.0})
+    plant = Plant(Truth(prompt, wind_force_ned_mps2=tuple(PUSHED_MPS2)))
+    plant.x[:3], plant.x[3:6] = state.position_ned_m, state.velocity_ned_mps
+    plant.x[6:8], plant.x[8:10] = (0.2, -0.1), (0.1, -0.2)
+    plant.x[10] = state.thrust_mps2
     pull = np.array([0.0, 0.0, G]) + PUSHED_MPS2
     leaning = pull[:2] / np.linalg.norm(pull)
-    assert rolled[B : B + 2] + leaning == pytest.approx(true[6:8], abs=1e-6)
-    assert rolled[T] + np.linalg.norm(pull) == pytest.approx(true[10], abs=1e-3)
+    plan = np.random.default_rng(3).uniform([-0.1, -0.2, -3.0], [0.2, 0.1, 3.0], (STEPS, 3))
+    for *off, down in plan:
+        north, east = leaning + off
+        thrust = (pull[2] + down) / math.sqrt(1.0 - plant.x[6:8] @ plant.x[6:8])
+        direction = (north, east, math.sqrt(1.0 - north**2 - east**2))
+        plant.command(Command(thrust, direction, 0.0))
+        plant.advance(PERIOD_S)
+    law = horizon()
+    law.prepare(Situation(5.0, state, hold((0.0, 0.0, -3.0), 0.0), LEVEL))
+    rolled = law.fly(plan).plan(0).states[-1]
+    assert np.abs(rolled[[P, P + 1, Z]] - [0.0, 0.0, 3.0] - plant.x[:3]).max() < 0.004
+    assert np.abs(rolled[[V, V + 1, W]] - plant.x[3:6]).max() < 0.01
+    assert rolled[B : B + 2] + leaning == pytest.approx(plant.x[6:8], abs=2e-3)
+    assert rolled[T] + np.linalg.norm(pull) == pytest.approx(plant.x[10], abs=1e-3)
 
 
 def test_a_plan_of_zeros_flies_the_reference() -> None:
