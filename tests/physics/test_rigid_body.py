@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
-from sim_hover import load
 
 from offboard.model.rigid_body import (
     PHI,
@@ -44,6 +43,7 @@ from offboard.model.rigid_body import (
 )
 from offboard.model.vehicle import Vehicle
 from offboard.paper.closed_loop import follow
+from simulator.config import vehicle as load
 
 Array = NDArray[np.float64]
 

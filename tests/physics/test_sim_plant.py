@@ -7,9 +7,10 @@ import math
 
 import numpy as np
 import pytest
-from sim_hover import attitude, crossing, estimate_of, euler_deg, hovering, load, response
+from sim_hover import attitude, crossing, estimate_of, euler_deg, hovering, response
 
 from offboard.model.frames import euler_from_quaternion, thrust_direction_from_quaternion
+from simulator.config import vehicle as load
 from simulator.steps import STEP_S
 from simulator.vehicle.attitude import Demand
 from simulator.vehicle.battery import Battery
@@ -213,19 +214,12 @@ ROUGH = Conditions(
 )
 
 
-def _bytes(plant: Plant) -> bytes:
-    """Truth and estimate."""
-    names = ("position_ned_m", "velocity_ned_mps", "attitude", "rates_frd_radps")
-    parts = [getattr(each, name) for each in (plant.truth, estimate_of(plant)) for name in names]
-    return b"".join(np.array(part).tobytes() for part in (*parts, plant.wind_ned_mps))
-
-
 def _fly(seed: int, cut: int) -> bytes:
     plant = Plant(PX4, ROUGH, seed)
     for thrust, angles in ((0.7, (0, 0, 0)), (0.45, (8, -4, 30)), (0.5, (-8, 4, -30))):
         for _ in range(240 // cut):
             plant.advance(cut * STEP_S, Demand(True, thrust, attitude(*angles)))
-    return _bytes(plant)
+    return plant.report().tobytes() + plant.wind_ned_mps.tobytes()
 
 
 def test_gusts_reach_the_vehicle_on_all_axes_whatever_way_the_wind_blows():

@@ -11,8 +11,9 @@ import pytest
 from scipy import stats
 from scipy.signal import welch
 from scipy.spatial.transform import Rotation
-from sim_hover import attitude, estimate_of, hovering, load
+from sim_hover import attitude, estimate_of, hovering
 
+from simulator.config import vehicle as load
 from simulator.steps import STEP_S
 from simulator.vehicle.attitude import Demand
 from simulator.vehicle.conditions import Conditions

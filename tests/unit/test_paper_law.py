@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from offboard.control.base import DecisionError, Situation
-from offboard.documents.reading import parse
+from offboard.documents import shipped
 from offboard.model.command import Command, PredictedState
 from offboard.model.rigid_body import hover_matrices, sampled_matrices
 from offboard.model.vehicle import Vehicle
@@ -26,11 +25,11 @@ from offboard.paper.controller import (
 )
 from offboard.paper.law import IntegralSettings
 from offboard.reference.base import FlatSample
+from simulator import config
 
 Array = NDArray[np.float64]
 
-FILES = sorted((Path(__file__).parents[2] / "config" / "vehicles").glob("*.yaml"))
-VEHICLES = {path.stem: parse(path.read_text(), Vehicle, path.stem) for path in FILES}
+VEHICLES = {name: config.vehicle(name) for name in shipped.names("vehicle")}
 PAPER = VEHICLES["paper"]
 
 
