@@ -75,6 +75,26 @@ def test_a_message_at_its_rate_is_requested_once_until_another_program_changes_i
     assert len(vehicle.requested_s) >= 2
 
 
+def test_link_time_follows_the_vehicle_or_host_time() -> None:
+    link = VehicleTime()
+    for i in range(11):  # 50 times faster, with a second stream that lags by 3 ms
+        link.on_telemetry(100.0 + 0.1 * i, 0.002 * i)
+        link.on_telemetry(99.997 + 0.1 * i, 0.002 * i)
+        link.on_host(0.002 * i)
+    assert link.seconds == pytest.approx(1.0)
+    for i in range(1, 51):
+        link.on_host(0.02 + 0.1 * i)
+    before_s = link.seconds
+    assert before_s == pytest.approx(6.0, abs=0.01)  # all of the silence, once it is one
+    link.on_telemetry(0.5, 5.1)  # a reboot
+    link.on_telemetry(0.7, 5.2)
+    assert link.seconds - before_s == pytest.approx(0.2)
+    link.on_host(65.0)
+    assert link.seconds - before_s == pytest.approx(0.2 + 59.8)
+    link.on_telemetry(60.7, 65.2)  # host time has counted the minute without telemetry
+    assert link.seconds - before_s == pytest.approx(60.0)
+
+
 def test_two_clocks_by_turns_are_two_vehicles_and_a_reboot_is_one() -> None:
     """At 100 Hz each, of two messages. The twin is 5 s older."""
 
