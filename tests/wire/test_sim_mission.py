@@ -85,9 +85,15 @@ def test_a_mission_is_downloaded_as_uploaded_and_cleared() -> None:
         given, kept = item(seq, row), bench.of("MISSION_ITEM_INT")[-1][1]
         for name in ("seq", "frame", "command", "x", "y", "z", "param1", "param2"):
             assert getattr(kept, name) == pytest.approx(getattr(given, name), nan_ok=True)
-    send(bench, mavlink.MAVLink_mission_clear_all_message(1, 1))
-    send(bench, mavlink.MAVLink_mission_request_list_message(1, 1))
-    assert bench.of("MISSION_COUNT")[-1][1].count == 0
+    for emptying in (
+        mavlink.MAVLink_mission_clear_all_message(1, 1),
+        mavlink.MAVLink_mission_count_message(1, 1, 0),
+    ):
+        assert upload(bench, ROUND[2:]) == 0
+        send(bench, emptying)
+        assert acks(bench)[-1] == 0
+        send(bench, mavlink.MAVLink_mission_request_list_message(1, 1))
+        assert bench.of("MISSION_COUNT")[-1][1].count == 0
 
 
 def test_missing_items_are_requested_again_until_a_timeout_or_cancelled() -> None:
