@@ -1,14 +1,12 @@
-"""Flights the simulator tests start from: vehicle files, a settled hover, a recorded response."""
+"""Flights the simulator tests start from: a settled hover, a recorded response."""
 
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 
-from offboard.documents.reading import parse
 from offboard.model.frames import euler_from_quaternion, quaternion_from_euler
 from offboard.model.vehicle import Vehicle
 from simulator.steps import STEP_S
@@ -17,12 +15,7 @@ from simulator.vehicle.conditions import Conditions
 from simulator.vehicle.plant import Plant
 from simulator.vehicle.sensors import ATTITUDE, POSITION, RATES, VELOCITY
 
-VEHICLES = Path(__file__).parents[2] / "config" / "vehicles"
 CALM = Conditions()
-
-
-def load(name: str) -> Vehicle:
-    return parse((VEHICLES / f"{name}.yaml").read_text(), Vehicle, name)
 
 
 def attitude(roll_deg: float = 0.0, pitch_deg: float = 0.0, yaw_deg: float = 0.0):

@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
-from sim_hover import load
 
 from offboard.model.rigid_body import (
     PHI,
@@ -44,6 +43,7 @@ from offboard.model.rigid_body import (
 )
 from offboard.model.vehicle import Vehicle
 from offboard.paper.closed_loop import follow
+from simulator.config import vehicle as load
 
 Array = NDArray[np.float64]
 
@@ -227,16 +227,13 @@ EQ_16 = {
 }
 
 
-def test_zero_order_hold_is_the_exponential_of_the_augmented_matrix() -> None:
+def test_the_sampled_model_is_the_exponential_and_eq_16_to_four_digits() -> None:
+    """By zero-order hold, of the augmented matrix; at a tenth of a second."""
     a, b = hover_matrices(PAPER)
     augmented = expm(0.1 * np.block([[a, b], [np.zeros((4, 16))]]))
     sampled_a, sampled_b = sampled_matrices(PAPER, 0.1)
     assert_allclose(sampled_a, augmented[:12, :12], atol=1e-13)
     assert_allclose(sampled_b, augmented[:12, 12:], atol=1e-13)
-
-
-def test_eq_16_is_reproduced_to_four_digits_at_a_tenth_of_a_second() -> None:
-    _, sampled_b = sampled_matrices(PAPER, 0.1)
     for place, printed in EQ_16.items():
         assert sampled_b[place] == pytest.approx(printed, abs=0.5e-4), place
     others = np.ones_like(sampled_b, dtype=bool)

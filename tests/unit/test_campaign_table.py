@@ -61,14 +61,12 @@ def flown() -> list[Group]:
 def test_best_is_the_lowest_median_of_those_that_all_flew_and_its_equals(
     flown: list[Group],
 ) -> None:
+    """Median and range are of the flights that landed."""
     best = {(group.name, group.block.rpartition(" ")[2]) for group in flown if group.best}
     assert best == {(law, scenario) for law in ("pso", "lqr") for scenario in SCENARIOS}
-
-
-def test_median_and_range_are_of_the_flights_that_landed(flown: list[Group]) -> None:
     calm = {group.name: group for group in flown if group.block == "lemniscate, calm"}
-    lqr, lost = calm["lqr"], calm["lost"]
-    assert lqr.spread("rmse_position_m") == (0.0109, 0.0119, 0.0121)
+    assert calm["lqr"].spread("rmse_position_m") == (0.0109, 0.0119, 0.0121)
+    lost = calm["lost"]
     assert (lost.successes, lost.spread("rmse_position_m")[1]) == (2, 0.001)
     assert lost.reasons == {WHY: [3]}
 
@@ -192,17 +190,13 @@ def test_margin(changes: dict[str, float], expected: tuple[str, float]) -> None:
     assert (weakest, found[weakest]) == (expected[0], pytest.approx(expected[1]))
 
 
-def test_a_connected_flight_begins_disarmed_unless_told_otherwise() -> None:
+def test_a_case_has_a_directory_of_its_own_and_if_connected_begins_disarmed() -> None:
+    """Also of two files with one name; and unless told otherwise."""
     case = Case("flight", "lqr", "hover", None, None, "px4", "connected", 1, link="udpin::0")
-    assert not case.load().limits.begin_armed
     armed = replace(case, values=(("limits.begin_armed", True),))
-    assert armed.load().limits.begin_armed
-    assert replace(case, link=None).load().limits.begin_armed
-
-
-def test_flights_of_files_with_one_name_have_directories_of_their_own() -> None:
-    names = ("a/fast.yaml", "b/fast.yaml")
-    cases = [Case("flight", name, "hover", None, None, "px4", "calm", 1) for name in names]
-    folders = {case.folder for case in cases}
+    begins = [each.load().limits.begin_armed for each in (case, armed, replace(case, link=None))]
+    assert begins == [False, True, True]
+    cases = [replace(case, controller=name) for name in ("a/fast.yaml", "b/fast.yaml")]
+    folders = {each.folder for each in cases}
     assert len(folders) == 2
-    assert all(folder.startswith("fast-hover-calm-1-") for folder in folders)
+    assert all(folder.startswith("fast-hover-connected-1-") for folder in folders)

@@ -1,16 +1,21 @@
-"""Configuration files: accepted values, and the exact sentence for each error."""
+"""Configuration files: accepted values, and the exact sentence for each error; key files: what is
+made, what is refused, and that nothing shows the key."""
 
 from __future__ import annotations
 
-import re
+import hashlib
+import os
 from enum import Enum
+from pathlib import Path
 from typing import Annotated, Literal
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from processes import full_disk
 from pydantic import Field, model_validator
 
+from offboard.documents.errors import UserError
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import (
     DocumentError,
@@ -19,6 +24,7 @@ from offboard.documents.reading import (
     read,
     validate,
 )
+from offboard.documents.signing_key import FILE_BYTES_MAX, create_key, read_key
 
 
 class Colour(Enum):
@@ -75,38 +81,57 @@ KEYS = "circles, colour, corner, named, scale, shape, tilt_rad, title, visible"
 
 
 @pytest.mark.parametrize(
-    ("text", "sentences"),
+    ("text", "sentence"),
     [
-        ("scale: -1", ["scale: -1 should be greater than 0"]),
-        ("scale:", ["scale: an empty value should be a valid number"]),
-        ("tilt_rad: 1e999", ["tilt_rad: inf should be a finite number"]),
-        ("colour: green", ["colour: 'green' should be 'red' or 'blue'"]),
-        ("shape: {kind: square}", ["shape.kind: 'square' is not one of 'circle', 'line'"]),
-        (
-            "shape: {kind: line, point: 3}",
-            ["shape.points is missing", "shape.point is not a known key"],
-        ),
-        ("zzz: 3", [f"zzz is not a known key (known keys: {KEYS})"]),
-        ("colour: blue\ntilt_rad: 1", ["a blue drawing is not tilted"]),
-    ],
-)
-def test_each_problem_is_one_sentence(text: str, sentences: list[str]) -> None:
-    found = [re.sub(", line [0-9]+, column [0-9]+", "", e) for e in problems(f"title: x\n{text}")]
-    assert found == [f"d.yaml: {each}" for each in sentences]
-
-
-def test_a_problem_names_line_and_column_of_its_key() -> None:
-    for text, place in (
-        ("title: x\ncorner: [1, x]", "d.yaml, line 2, column 1: corner.1"),
+        # values, with line and column of their keys
+        ("scale: 2", "d.yaml: title is missing"),
+        ("title: x\nscale: -1", "line 2, column 1: scale: -1 should be greater than 0"),
+        ("title: x\nscale:", "line 2, column 1: scale: an empty value should be a valid number"),
+        ("title: x\ntilt_rad: 1e999", "line 2, column 1: tilt_rad: inf should be a finite number"),
+        ("title: x\ncolour: green", "line 2, column 1: colour: 'green' should be 'red' or 'blue'"),
+        ("title: x\ncorner: [1, x]", "line 2, column 1: corner.1: 'x' should be a valid number"),
         (
             "title: x\ncircles: [{kind: circle, radius_m: 0}]",
-            "d.yaml, line 2, column 26: circles.0",
+            "line 2, column 26: circles.0.radius_m: 0 should be greater than 0",
         ),
-        ("title: x\nnamed:\n  sun: {kind: circle}", "d.yaml, line 3, column 3: named.sun.radius_m"),
-        ("scale: 2", "d.yaml: title is missing"),
-    ):
-        (problem,) = problems(text)
-        assert problem.startswith(place)
+        (
+            "title: x\nnamed:\n  sun: {kind: circle}",
+            "line 3, column 3: named.sun.radius_m is missing",
+        ),
+        (
+            "title: x\nshape: {kind: square}",
+            "line 2, column 1: shape.kind: 'square' is not one of 'circle', 'line'",
+        ),
+        ("title: x\nzzz: 3", f"line 2, column 1: zzz is not a known key (known keys: {KEYS})"),
+        ("title: x\ncolour: blue\ntilt_rad: 1", "d.yaml: a blue drawing is not tilted"),
+        # what is no YAML of ours
+        (
+            "title: [1",
+            "line 1, column 10: expected ',' or ']', but got '<stream end>'"
+            "; check indentation, colons and quotes",
+        ),
+        ("title: x\ntitle: y", "line 2, column 1: the key 'title' is given twice"),
+        ("- a\n- b", "d.yaml: expected a mapping of keys to values, not ['a', 'b']"),
+        (
+            "title: &t x\ncolour: *t",
+            "line 1, column 8: a value is used twice: aliases are not allowed",
+        ),
+        ("title: !!python/name:os.system x", "line 1, column 8: tags are not allowed"),
+        ("? [1, 2]\n: 3", "line 1, column 3: a key must be a single word"),
+        ("a: 1\n---\nb: 2", "line 2, column 1: but found another document"),
+        ("[" * 5000, "d.yaml: nested too deeply"),
+    ],
+)
+def test_each_problem_is_one_sentence_with_its_place(text: str, sentence: str) -> None:
+    expected = sentence if sentence.startswith("d.yaml") else f"d.yaml, {sentence}"
+    assert problems(text) == (expected,)
+
+
+def test_of_several_problems_each_is_told() -> None:
+    found = problems("title: x\nshape: {kind: line, point: 3}")
+    assert [each.rpartition(": ")[2] for each in found] == [
+        "shape.points is missing", "shape.point is not a known key"
+    ]  # fmt: skip
 
 
 def test_a_description_is_read_and_is_no_part_of_the_value() -> None:
@@ -118,30 +143,6 @@ def test_a_description_is_read_and_is_no_part_of_the_value() -> None:
         (problem,) = problems(f"description: {wrong}\ntitle: x")
         assert problem.startswith("d.yaml: description: ")
         assert problem.endswith("should be text of at most 200 characters")
-
-
-@pytest.mark.parametrize(
-    ("text", "sentence"),
-    [
-        (
-            "title: [1",
-            "d.yaml, line 1, column 10: expected ',' or ']', but got '<stream end>'"
-            "; check indentation, colons and quotes",
-        ),
-        ("title: x\ntitle: y", "d.yaml, line 2, column 1: the key 'title' is given twice"),
-        ("- a\n- b", "d.yaml: expected a mapping of keys to values, not ['a', 'b']"),
-        (
-            "title: &t x\ncolour: *t",
-            "d.yaml, line 1, column 8: a value is used twice: aliases are not allowed",
-        ),
-        ("title: !!python/name:os.system x", "d.yaml, line 1, column 8: tags are not allowed"),
-        ("? [1, 2]\n: 3", "d.yaml, line 1, column 3: a key must be a single word"),
-        ("a: 1\n---\nb: 2", "d.yaml, line 2, column 1: but found another document"),
-        ("[" * 5000, "d.yaml: nested too deeply"),
-    ],
-)
-def test_invalid_yaml_is_refused_with_line_and_column(text: str, sentence: str) -> None:
-    assert problems(text) == (sentence,)
 
 
 def test_override_sets_a_copy() -> None:
@@ -184,3 +185,91 @@ def test_every_text_is_read_or_raises_document_error(text: str) -> None:
         refused = error.problems
     assert bool(refused) != bool(title)
     assert all(problem.startswith("fuzz") for problem in refused)
+
+
+# --- key files of MAVLink 2 signing ---------------------------------------------------------------
+
+
+SECRET = "0123456789abcdef" * 4
+
+
+def written(path: Path, text: str, mode: int = 0o600) -> Path:
+    path.write_text(text)
+    path.chmod(mode)
+    return path
+
+
+def test_a_new_key_is_private_random_and_the_hash_of_its_passphrase(tmp_path: Path) -> None:
+    before = os.umask(0o777)  # as far as a umask can go
+    try:
+        passphrases = [create_key(tmp_path / name) for name in "ab"]
+    finally:
+        os.umask(before)
+    assert (tmp_path / "a").stat().st_mode & 0o777 == 0o600
+    assert passphrases[0] != passphrases[1]
+    assert all(len(bytes.fromhex(each)) == 32 for each in passphrases)
+    key = hashlib.sha256(passphrases[0].encode()).digest()
+    assert read_key(tmp_path / "a") == key
+    with pytest.raises(UserError, match="exists and is not replaced"):
+        create_key(tmp_path / "a")
+    assert read_key(tmp_path / "a") == key
+
+
+def test_a_file_that_cannot_be_written_whole_is_not_left(tmp_path: Path) -> None:
+    with full_disk(20), pytest.raises(UserError, match="cannot be created: File too large"):
+        create_key(tmp_path / "key")
+    assert not (tmp_path / "key").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "key"),
+    [
+        (f"# mine\n\nkey: {SECRET}\n", bytes.fromhex(SECRET)),
+        (f"key:{SECRET.upper()}", bytes.fromhex(SECRET)),
+        ("passphrase: sixteen letters!", hashlib.sha256(b"sixteen letters!").digest()),
+        ("passphrase: a: b, c and d: e\r\n", hashlib.sha256(b"a: b, c and d: e").digest()),
+    ],
+)
+def test_both_forms_are_read(text: str, key: bytes, tmp_path: Path) -> None:
+    assert read_key(written(tmp_path / "key", text)) == key
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        SECRET,
+        f"key: {SECRET[:-1]}",
+        f"key: {SECRET}0",
+        f"key: {SECRET[:-1]}g",
+        f"key: {'0' * 64}",
+        f"key: {SECRET}\nkey: {SECRET}",
+        "passphrase: fifteen letters",
+        f"secret: {SECRET}",
+        "key: \xff",
+    ],
+)
+def test_what_is_no_key_is_refused_without_showing_it(text: str, tmp_path: Path) -> None:
+    with pytest.raises(UserError) as refused:
+        read_key(written(tmp_path / "key", text))
+    sentence = str(refused.value)
+    assert "too short or no key file" in sentence
+    assert len(sentence.splitlines()) == 1
+    assert not any(each in sentence for each in (SECRET, SECRET[:-1], "fifteen letters"))
+
+
+def test_what_is_no_private_file_is_refused_without_waiting(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo", 0o600)
+    large = written(tmp_path / "large", "#" * (FILE_BYTES_MAX + 1))
+    modes = (0o640, 0o604, 0o620, 0o601)
+    shared = [written(tmp_path / f"{mode:o}", f"key: {SECRET}", mode) for mode in modes]
+    for path, reason in (
+        *((path, "by other users: chmod 600 it") for path in shared),
+        (tmp_path, "is not a file"),
+        (tmp_path / "fifo", "is not a file"),
+        (tmp_path / "none", "No such file"),
+        (large, "4,097 bytes: that is no key file"),
+        (Path("a\0b"), "cannot be read"),
+    ):
+        with pytest.raises(UserError, match=reason):
+            read_key(path)

@@ -7,19 +7,20 @@ from functools import cache
 
 import numpy as np
 import pytest
+from attitude_plant import Plant, Truth
 from laws import PX4, G
 from scipy import signal
-from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from offboard.analysis.identify import estimator_noise
 from offboard.identification import attitude_fit
 from offboard.identification.attitude_fit import ResponseFit
 from offboard.identification.motion_fit import Noise, PositionFilter
-from offboard.identification.response import second_order
 from offboard.identification.trace import Rows, Trace, clean
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_fit import completed, identify
+from offboard.model.command import Command
+from offboard.model.vehicle import AxisResponse
 
 VEHICLE_FILE = PX4.model_copy(
     update={"hover_thrust": 0.42, "drag_translation_npmps": (0.6, 0.6, 0.6), "thrust_lag_s": 0.0}
@@ -47,19 +48,6 @@ def steps(seed, count=60):
 
 def fit_response(*measured, **options) -> ResponseFit:
     return completed(attitude_fit.fit_response(*measured, **options))
-
-
-@pytest.mark.parametrize("damping", [0.3, 1.0, 1.7])
-def test_second_order_response_equals_scipys_simulation(damping):
-    """At any time since a command, which acts when its delay is over and not before."""
-    sent_at, values = steps(3)
-    times = 0.3 + np.cumsum(np.random.default_rng(4).choice([0.008, 0.016, 0.004], 500))
-    ours = second_order(times, sent_at, values[:, None], 0.057, 11.4, damping)[:, 0]
-    theirs = simulated(values, sent_at, 0.057, 11.4, damping, times)
-    assert np.abs(ours - theirs).max() < 2e-5
-    assert np.abs(theirs).max() > 0.02
-    before = times < sent_at[np.flatnonzero(values)[0]] + 0.057
-    assert np.abs(ours[before]).max() == 0.0
 
 
 def test_innovations_of_a_matching_motion_are_white_and_of_unit_variance():
@@ -159,46 +147,35 @@ def test_delay_known_beforehand_counts_by_its_uncertainty():
 
 @cache
 def flown(
-    *,
-    tilt=0.25,
-    heading=0.1,
-    thrust_step=0.06,
-    hover=0.5,
-    drag=0.8,
-    noise=0.0,
-    seconds=12.0,
-    seed=1,
+    *, tilt=0.25, heading=0.1, thrust_step=0.06, hover=0.5, drag=0.8, noise=0.0, seconds=12.0
 ) -> Trace:
-    """A vehicle that swings under open-loop commands, integrated by SciPy. Delay, natural frequency
-    and damping: tilt .06, 12, .7, heading .1, 4, .6; thrust: delay .02, lag .05."""
-    sent_at = np.arange(0.0, seconds, 0.1)
-    generator = np.random.default_rng(seed)
+    """The plant of the other tests, swinging under open-loop commands."""
+    true = PX4.model_copy(
+        update={
+            "drag_translation_npmps": (drag,) * 3,
+            "thrust_delay_s": 0.02,
+            "thrust_lag_s": 0.05,
+            "tilt": AxisResponse(delay_s=0.06, natural_frequency_radps=12.0, damping=0.7),
+            "yaw": AxisResponse(delay_s=0.1, natural_frequency_radps=4.0, damping=0.6),
+        }
+    )
+    sent_at, generator = np.arange(0.0, seconds, 0.1), np.random.default_rng(1)
     swing = tilt * np.sin(1.6 * sent_at), tilt * np.cos(2.3 * sent_at)
     tilts = [each + 0.1 * tilt * generator.choice([-1, 0, 1], len(sent_at)) for each in swing]
     thrust = hover * (1.0 + thrust_step * np.sign(np.sin(2.0 * sent_at)))
     headings = heading * np.sign(np.sin(1.1 * sent_at))
-    grid = np.arange(0.0, seconds, 0.01)
-    b = [simulated(each, sent_at, 0.06, 12.0, 0.7, grid) for each in tilts]
-    turned = simulated(headings, sent_at, 0.1, 4.0, 0.6, grid)
-
-    def rate(t, x):
-        row = max(int(np.searchsorted(sent_at + 0.02, t + 1e-12, side="right")) - 1, 0)
-        push = G / hover * x[6]
-        north, east = (np.interp(t, grid, each) for each in b)
-        down = G - push * math.sqrt(1.0 - north**2 - east**2)
-        pulls = np.array([-push * north, -push * east, down])
-        return np.concatenate((x[3:6], pulls - drag * x[3:6], [(thrust[row] - x[6]) / 0.05]))
-
-    start = np.array([0, 0, 0, 0, 0, 0, hover], float)
-    solved = solve_ivp(rate, (0.0, seconds), start, t_eval=grid, max_step=0.01, rtol=1e-7)
-    position = solved.y[:3].T + noise * generator.normal(size=(len(grid), 3))
-    velocity = solved.y[3:6].T
-    direction = np.array(b).T + 0.2 * noise * generator.normal(size=(len(grid), 2))
-    whole = Trace(
-        np.column_stack((sent_at, *tilts, thrust, headings)),
-        np.column_stack((grid, direction, turned)),
-        np.column_stack((grid, position, velocity)),
-    )
+    commands = np.column_stack((sent_at, *tilts, thrust, headings))
+    plant, rows = Plant(Truth(true)), []
+    for _, north, east, share, heading_rad in commands:
+        down = math.sqrt(1.0 - north**2 - east**2)
+        plant.command(Command(G * share / hover, (north, east, down), heading_rad))
+        for _ in range(10):
+            rows.append((plant.time_s, *plant.x))
+            plant.advance(0.01)
+    seen = np.array(rows)
+    seen[:, 1:4] += noise * generator.normal(size=(len(seen), 3))
+    seen[:, 7:9] += 0.2 * noise * generator.normal(size=(len(seen), 2))
+    whole = Trace(commands, seen[:, [0, 7, 8, 12]], seen[:, :7])
     return whole.between(0.5, seconds)  # what was commanded before is known
 
 

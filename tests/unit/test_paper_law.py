@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from offboard.control.base import DecisionError, Situation
-from offboard.documents.reading import parse
+from offboard.documents import shipped
 from offboard.model.command import Command, PredictedState
 from offboard.model.rigid_body import hover_matrices, sampled_matrices
 from offboard.model.vehicle import Vehicle
@@ -24,13 +23,13 @@ from offboard.paper.controller import (
     heading_frame,
     input_scale,
 )
-from offboard.paper.law import IntegralSettings, Move
+from offboard.paper.law import IntegralSettings
 from offboard.reference.base import FlatSample
+from simulator import config
 
 Array = NDArray[np.float64]
 
-FILES = sorted((Path(__file__).parents[2] / "config" / "vehicles").glob("*.yaml"))
-VEHICLES = {path.stem: parse(path.read_text(), Vehicle, path.stem) for path in FILES}
+VEHICLES = {name: config.vehicle(name) for name in shipped.names("vehicle")}
 PAPER = VEHICLES["paper"]
 
 
@@ -80,29 +79,12 @@ def tilted(heading: float) -> tuple[PredictedState, Straight]:
     return state, Straight(turn.apply([1.5, -1.0, 0.2]), velocity, float(goal_rad))
 
 
-def test_the_input_applied_last_is_what_r_du_holds_on_to() -> None:
-    """Eq. 21's last term: its slope is -2 R_du u(k-1); a reset forgets u(k-1)."""
-    settings = PaperSettings(rate=(1.0, 2.0, 3.0, 4.0))
-    law = PaperLaw(*sampled_matrices(PAPER, 0.1), settings)
-    state = np.linspace(-0.05, 0.06, 12)
-    first, second = law.move(state, np.zeros(12)), law.move(state, np.zeros(12))
-    change = second.problem.gradient - first.problem.gradient
-    assert np.abs(first.inputs).min() > 1e-3
-    assert change == pytest.approx(-2 * np.array([1, 2, 3, 4]) * first.inputs, rel=1e-9)
-    law.reset()
-    again = law.move(state, np.zeros(12))
-    assert np.array_equal(again.problem.gradient, first.problem.gradient)
-
-
-# ---------------------------------------------------------------- over attitude setpoints
-
-
 def test_the_heading_frame_is_eq_5_at_heading_north() -> None:
     state, reference = tilted(0.0)
     vector, target = heading_frame(state, reference.sample(0.1))
     expected = [0.08, -0.05, -0.1, 0.1, -0.2, 0.05, 0.8, 0.3, -0.2]
-    assert vector[:9] == pytest.approx(expected, abs=1e-12)
-    assert vector[9:] == pytest.approx([1 - 1.6, -2 + 0.95, 0.5 - 0.19], abs=1e-12)
+    expected += [1 - 1.6, -2 + 0.95, 0.5 - 0.19]
+    assert vector == pytest.approx(expected, abs=1e-12)
     assert target == pytest.approx([0] * 6 + [1.0, 0.5, -0.1] + [0] * 3, abs=1e-12)
 
 
@@ -129,24 +111,20 @@ def test_the_law_is_the_same_at_every_heading(settings: PaperSettings) -> None:
     assert abs(turned.heading_rad) <= np.pi
 
 
-def moved(state: PredictedState, reference: Straight) -> Move:
-    """What the law decides on the paper's plant; the next state is `following`."""
-    settings = PaperSettings()
-    law = PaperLaw(*sampled_matrices(PAPER, 0.1), settings, *flyable_box(PAPER, settings))
-    return law.move(*heading_frame(state, reference.sample(0.1)))
-
-
 def test_what_is_sent_is_the_attitude_of_the_next_state() -> None:
+    """On the paper's plant, by what the law decides there."""
     state, reference = tilted(0.4)
     command = PaperController(PAPER).decide(Situation(0.0, state, reference, HOVER)).command
-    dynamics, inputs = sampled_matrices(PAPER, 0.1)
-    move = moved(state, reference)
-    following = dynamics @ heading_frame(state, reference.sample(0.1))[0] + inputs @ move.inputs
+    (dynamics, inputs), settings = sampled_matrices(PAPER, 0.1), PaperSettings()
+    law = PaperLaw(dynamics, inputs, settings, *flyable_box(PAPER, settings))
+    vector, target = heading_frame(state, reference.sample(0.1))
+    applied = law.move(vector, target).inputs
+    following = dynamics @ vector + inputs @ applied
     phi, theta, psi = following[:3] + np.array([0.0, 0.0, reference.heading])
     attitude = Rotation.from_euler("ZYX", [psi, theta, phi]).as_matrix()
     assert command.thrust_direction_ned == pytest.approx(attitude[:, 2], abs=1e-9)
     assert command.heading_rad == pytest.approx(psi, abs=1e-9)
-    assert command.thrust_mps2 == pytest.approx(9.81 + move.inputs[0] / 0.4, abs=1e-9)
+    assert command.thrust_mps2 == pytest.approx(9.81 + applied[0] / 0.4, abs=1e-9)
 
 
 @pytest.mark.parametrize("vehicle", VEHICLES.values(), ids=VEHICLES.keys())
@@ -190,28 +168,22 @@ def test_a_deadline_is_kept() -> None:
     assert (certificate.cut_short, certificate.iterations) == (True, 75)
 
 
-def test_the_summed_error_stays_within_its_limits() -> None:
+def test_the_summed_error_has_limits_and_waits_while_an_input_is_at_its_bound() -> None:
     """The sum acts on the slope of the cost; at its limits a further error changes nothing."""
     narrow = SUMMED.model_copy(update={"limits": (0.1, 0.1, 0.1, 0.1)})
-    settings = PaperSettings(rate=(0, 0, 0, 0), integral=narrow)
-    law = PaperLaw(*sampled_matrices(PAPER, 0.1), settings)
-    slopes = [
-        law.move(np.zeros(12), np.zeros(12), error=np.full(4, error)).problem.gradient
-        for error in (0.05, 0.96, 5.0, np.nan, -0.5)
-    ]
-    assert np.allclose(20 * slopes[0], slopes[1], rtol=1e-9)  # 0.005, then 0.1
-    assert np.array_equal(slopes[1], slopes[2])
-    assert np.array_equal(slopes[2], slopes[3])
-    assert np.allclose(0.5 * slopes[3], slopes[4], rtol=1e-9)  # down to 0.05
 
+    def slopes(summed: IntegralSettings, down_m: float, *errors: float) -> list[Array]:
+        settings = PaperSettings(rate=(0, 0, 0, 0), integral=summed)
+        law = PaperLaw(*sampled_matrices(PAPER, 0.1), settings)
+        target = np.append(np.zeros(11), down_m)
+        moves = [law.move(np.zeros(12), target, error=np.full(4, each)) for each in errors]
+        return [move.problem.gradient for move in moves]
 
-def test_the_error_is_not_summed_while_an_input_is_at_its_bound() -> None:
-    settings = PaperSettings(rate=(0, 0, 0, 0), integral=SUMMED)
-    law = PaperLaw(*sampled_matrices(PAPER, 0.1), settings)
+    rising, full, more, unknown, less = slopes(narrow, 0.0, 0.05, 0.96, 5.0, np.nan, -0.5)
+    assert np.allclose(20 * rising, full, rtol=1e-9)  # 0.005, then 0.1
+    assert np.array_equal(full, more)
+    assert np.array_equal(more, unknown)
+    assert np.allclose(0.5 * unknown, less, rtol=1e-9)  # down to 0.05
     for down_m, held in ((1000.0, True), (0.01, False)):
-        law.reset()
-        target = np.zeros(12)
-        target[11] = down_m
-        moves = [law.move(np.zeros(12), target, error=np.full(4, 1e-3)) for _ in range(2)]
-        first, second = (move.problem.gradient for move in moves)
+        first, second = slopes(SUMMED, down_m, 1e-3, 1e-3)
         assert np.array_equal(first, second) == held

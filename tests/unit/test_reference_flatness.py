@@ -93,22 +93,6 @@ def test_rates_turn_the_attitude(shape: str, heading: str) -> None:
     np.testing.assert_allclose(turn.as_rotvec() / (2 * half), middle.rates_frd_radps, atol=2e-6)
 
 
-@every_shape
-def test_derivatives_of_thrust_and_direction(shape: str) -> None:
-    """By central differences, each from the one below it."""
-    track, h = track_of(shape, "fixed"), 1e-4
-    times = np.linspace(0.1, track.duration_s - 0.1, 400)
-    before, here, after = (state_of(track, times + k * h) for k in (-1, 0, 1))
-    for name, derivative, near in (
-        ("thrust_direction_ned", "thrust_direction_rate_ned_ps", 1e-6),
-        ("thrust_direction_rate_ned_ps", "thrust_direction_acceleration_ned_ps2", 1e-4),
-        ("thrust_mps2", "thrust_rate_mps3", 1e-6),
-    ):
-        slope = (getattr(after, name) - getattr(before, name)) / (2 * h)
-        np.testing.assert_allclose(getattr(here, derivative), slope, atol=near)
-    assert np.abs(here.thrust_direction_acceleration_ned_ps2).max() > 0.05  # it does move
-
-
 def test_free_fall_and_knife_edge_stay_finite() -> None:
     zero = np.zeros(3)
     for acceleration in ([0, 0, GRAVITY], [GRAVITY, 0, GRAVITY], [0, 9.0, GRAVITY], [0, 0, 30.0]):

@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from offboard.documents.reading import parse, read
-from offboard.model.vehicle import Vehicle
+from offboard.documents import shipped
 from offboard.reference.base import FlatSample
 from offboard.reference.fastest import PathLimits, fastest_times
 from offboard.reference.feasibility import check
 from offboard.reference.path import AlongVelocity, Harmonic, Sine, Smoothness, Spline, through
 from offboard.reference.shapes import SHAPES, Line
 from offboard.reference.track import STOP_S, Moved, Track
+from offboard.run.configuration import load
+from simulator import config
 
 Array = NDArray[np.float64]
 
-CONFIG = Path(__file__).parents[2] / "config"
 TABLE = "time_s,north_m,east_m,altitude_m,course_deg\n" + "".join(
     f"{0.5 * k},{math.sin(0.4 * k)},{math.cos(0.3 * k)},{2 + 0.1 * k},{(340 + 20 * k) % 360}\n"
     for k in range(25)
@@ -31,7 +30,6 @@ NEEDED: dict[str, dict[str, object]] = {
     "waypoints": {"points_m": POINTS, "speed_mps": 1.2},
     "table": {"file": "flown.csv", "text": TABLE},
 }
-SHIPPED = sorted(path.stem for path in (CONFIG / "references").glob("*.yaml"))
 
 
 def track_of(shape: str, heading: str, **settings: object) -> Track:
@@ -39,11 +37,8 @@ def track_of(shape: str, heading: str, **settings: object) -> Track:
     return SHAPES[shape](**values | NEEDED.get(shape, {}) | settings).track()
 
 
-def shipped(name: str) -> Track:
-    settings = read((CONFIG / "references" / f"{name}.yaml").read_text(), name)
-    if settings["shape"] == "table":
-        settings["text"] = (CONFIG / "references" / settings["file"]).read_text()
-    return SHAPES[settings["shape"]](**settings).track()
+def shipped_track(name: str) -> Track:
+    return load("flight", choices={"reference": name}).reference.track()
 
 
 TRACKS = {shape: track_of(shape, "along_velocity") for shape in SHAPES} | {
@@ -51,7 +46,6 @@ TRACKS = {shape: track_of(shape, "along_velocity") for shape in SHAPES} | {
     "table-table": track_of("table", "table"),
     "waypoints-jerk": track_of("waypoints", "along_velocity", minimise="jerk"),
 }
-every_track = pytest.mark.parametrize("track", TRACKS.values(), ids=TRACKS.keys())
 
 
 def orders(sample: FlatSample) -> tuple[Array, Array]:
@@ -59,9 +53,10 @@ def orders(sample: FlatSample) -> tuple[Array, Array]:
     return np.stack(sample[:5]), np.stack(sample[5:])
 
 
-@every_track
-def test_derivatives_are_those_of_the_position_and_none_jumps(track: Track) -> None:
-    """By central differences, each order from the one below it."""
+@pytest.mark.parametrize("track", TRACKS.values(), ids=TRACKS.keys())
+def test_derivatives_rest_and_arrays_of_every_track(track: Track) -> None:
+    """By central differences, each order from the one below it; none jumps; at rest outside; arrays
+    equal loops."""
     drawn = np.random.default_rng(3).uniform(0.12, track.duration_s - 0.12, 60)
     here, after, before = (orders(track.sample(drawn + by)) for by in (0.0, 1e-5, -1e-5))
     grid = orders(track.sample(np.linspace(-0.5, track.duration_s + 0.5, 20_001)))
@@ -69,20 +64,13 @@ def test_derivatives_are_those_of_the_position_and_none_jumps(track: Track) -> N
         numeric = (after[kind] - before[kind]) / 2e-5
         np.testing.assert_allclose(here[kind][1:], numeric[:-1], rtol=1e-6, atol=2e-4)
         assert np.abs(np.diff(grid[kind], axis=1)).max() < 0.3  # of a jump, at any step
-
-
-@every_track
-def test_rests_outside_and_arrays_equal_loops(track: Track) -> None:
-    for inside, outside in ((0.0, -3.0), (track.duration_s, track.duration_s + 100.0)):
-        for rest, edge in zip(
-            orders(track.sample(outside)), orders(track.sample(inside)), strict=True
-        ):
+        for inside, outside in ((0.0, -3.0), (track.duration_s, track.duration_s + 100.0)):
+            rest, edge = (orders(track.sample(each))[kind] for each in (outside, inside))
             assert np.all(rest[1:] == 0.0)
             np.testing.assert_allclose(edge, rest, atol=1e-9)
     times = np.linspace(-1.0, track.duration_s + 1.0, 6).reshape(1, 2, 3)
     batch = track.sample(times)
-    assert batch.position_ned_m.shape == (1, 2, 3, 3)
-    assert batch.heading_rad.shape == (1, 2, 3)
+    assert (batch.position_ned_m.shape, batch.heading_rad.shape) == ((1, 2, 3, 3), (1, 2, 3))
     for index in np.ndindex(times.shape):
         single = track.sample(float(times[index]))
         assert single.heading_rad.shape == ()
@@ -97,7 +85,7 @@ def test_rests_outside_and_arrays_equal_loops(track: Track) -> None:
 
 def test_a_paused_reference_rests_on_its_path_and_continues_from_there() -> None:
     began_s, paused_s, resumed_s = 100.0, 108.3, 115.0
-    track = shipped("lemniscate_course")
+    track = shipped_track("lemniscate_course")
     paused = Moved(track, began_s, (10.0, -5.0, 2.0), paused_s).resumed(resumed_s)
     times_s = np.linspace(105.0, 125.0, 20_001)
     for jet in orders(paused.sample(times_s)):
@@ -124,17 +112,16 @@ def test_a_paused_reference_rests_on_its_path_and_continues_from_there() -> None
 
 
 def test_shipped_references_are_feasible_and_have_their_peak_speeds() -> None:
-    fleet = [
-        parse(path.read_text(), Vehicle, path.stem) for path in (CONFIG / "vehicles").glob("*.yaml")
-    ]
+    fleet = [config.vehicle(name) for name in shipped.names("vehicle")]
+    names = shipped.names("reference")
     peaks_mps = {"lemniscate_4mps": 4.0, "lemniscate_15s": 1.18, "circle": 1.57, "helix": 1.024}
     lowest_m = {"lemniscate_4mps": 5.0, "circle_vertical": 2.65, "trefoil": 1.5, "spiral": 1.5}
     lowest_m["racing"] = 3.72
-    assert peaks_mps.keys() | lowest_m.keys() < set(SHIPPED)
-    for name in SHIPPED:
+    assert peaks_mps.keys() | lowest_m.keys() < set(names)
+    for name in names:
         for vehicle in fleet:
-            assert check(shipped(name), vehicle).tilt_rad < 0.62
-        track = shipped(name)
+            assert check(shipped_track(name), vehicle).tilt_rad < 0.62
+        track = shipped_track(name)
         sample = track.sample(np.arange(0.0, track.duration_s, 0.01))
         lowest = -sample.position_ned_m[:, 2].max()
         assert lowest == pytest.approx(lowest_m.get(name, 3.0), abs=0.005)
@@ -146,16 +133,16 @@ def test_shipped_references_are_feasible_and_have_their_peak_speeds() -> None:
 def test_published_curves_are_as_their_definitions() -> None:
     """Those of quad_trajectories, and ours: (north, east, height) by the time at full speed."""
     s = np.linspace(3.0, 50.0, 400)
-    trefoil, w = shipped("trefoil"), math.tau * s / 25.0
+    trefoil, w = shipped_track("trefoil"), math.tau * s / 25.0
     height_m, progress = 2.25 + 0.75 * np.sin(3 * w), 0.5 - 0.5 * np.cos(math.tau * s / 55.0)
-    spiral, turned = shipped("spiral"), 6.0 * math.pi * progress
-    circle, v, u = shipped("circle_vertical"), math.tau * s / 13.0, math.tau * s / 8.0
+    spiral, turned = shipped_track("spiral"), 6.0 * math.pi * progress
+    circle, v, u = shipped_track("circle_vertical"), math.tau * s / 13.0, math.tau * s / 8.0
     published = (
         (trefoil, 0.6 * (np.sin(w) + 2 * np.sin(2 * w)), 0.6 * (np.cos(w) - 2 * np.cos(2 * w)),
          height_m),
         (spiral, 1.5 * np.cos(turned), 1.5 * np.sin(turned), 1.5 + 1.5 * progress),
         (circle, 0.35 * np.cos(v), 0.0 * v, 3.0 + 0.35 * np.sin(v)),
-        (shipped("lemniscate"), 2.0 * np.sin(u), np.sin(2.0 * u), 3.0 + 0.0 * u),
+        (shipped_track("lemniscate"), 2.0 * np.sin(u), np.sin(2.0 * u), 3.0 + 0.0 * u),
     )  # fmt: skip
     for track, north_m, east_m, up_m in published:
         flown_m = track.sample(s + 0.5 * track.run_in_s).position_ned_m

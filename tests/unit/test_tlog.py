@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -46,67 +47,57 @@ def test_the_layout_of_every_message_is_pymavlinks(path: Path) -> None:
     assert len(seen) > 20
 
 
-def damaged(path: Path, data: bytes) -> tlog.Tlog:
-    path.write_bytes(data)
-    return tlog.read(path)
-
-
-@pytest.mark.parametrize(
-    ("offset", "byte"),
-    [
-        (8 + 12, 0x40),  # payload
-        (0, 0x7F),  # time stamp
-        (8, 0x55),  # first byte of the frame
-        (9, 0xFF),  # length: the frame seems to reach into the next entries
-        (9, 0x01),
-    ],
+DAMAGES = (
+    (8 + 12, 0x40),  # payload
+    (0, 0x7F),  # time stamp
+    (8, 0x55),  # first byte of the frame
+    (9, 0xFF),  # length: the frame seems to reach into the next entries
+    (9, 0x01),
 )
-def test_a_damaged_entry_is_skipped_and_counted(offset: int, byte: int, tmp_path: Path) -> None:
-    """The first entry, one in the middle, and the last but one."""
+
+
+def damaged_logs() -> Iterator[tuple[bytes, set[int], int, int | None, int]]:
+    """Bytes, which messages are lost, how many damages, where the first one is, and the bytes of an
+    entry that is cut at the end."""
     data, messages, at = recorded()
-    for number in (0, len(messages) // 2, len(messages) - 2):
+    last, size = len(messages) - 1, at[-1] - at[-2]
+
+    def flipped(number: int, offset: int, byte: int) -> bytes:
         changed = bytearray(data)
         changed[at[number] + offset] ^= byte
-        log = damaged(tmp_path / "x.tlog", bytes(changed))
-        assert tuple(log) == (*messages[:number], *messages[number + 1 :])
-        assert (log.damaged, log.first_damage, log.truncated) == (1, at[number], 0)
-        assert log.damage.endswith(f"1 damaged entry was skipped, the first at byte {at[number]}")
+        return bytes(changed)
 
-
-def test_entries_after_garbage_and_holes_are_read(tmp_path: Path) -> None:
-    """Garbage between entries, a hole that cuts two, and one that cuts the last: 4000 random bytes
-    hold about 30 that could begin a frame."""
-    data, messages, at = recorded()
+    for number in (0, len(messages) // 2, last - 1):
+        for damage in DAMAGES:
+            yield flipped(number, *damage), {number}, 1, at[number], 0
+    yield flipped(last, size - 1, 1), {last}, 1, at[-2], 0  # checksum
+    yield data[:-3], {last}, 0, None, size - 3
+    yield data + bytes(5000), set(), 1, at[-1], 0
+    # garbage between entries, which holds about 30 bytes that could begin a frame, a hole that cuts
+    # two, and one that cuts the last
     garbage = np.random.default_rng(3).bytes(4000)
     parts = data[: at[100]], garbage, data[at[100] : at[200] + 7], data[at[203] + 5 : -7]
-    log = damaged(tmp_path / "x.tlog", b"".join(parts))
-    assert tuple(log) == (*messages[:200], *messages[204:-1])
-    assert (log.damaged, log.first_damage) == (2, at[100])
-    assert log.truncated == at[-1] - at[-2] - 7
-    assert "2 damaged entries were skipped" in log.damage
+    yield b"".join(parts), {200, 201, 202, 203, last}, 2, at[100], size - 7
+    for short in range(12):  # an entry at the border of a block
+        yield bytes(1000 - short) + data, set(), 1, 0, 0
 
 
-def test_damage_at_the_end_is_reported_and_a_cut_entry_is_none(tmp_path: Path) -> None:
-    """Garbage behind the last entry, a last entry with a wrong checksum, and one that is cut."""
-    data, messages, at = recorded()
-    wrong = bytearray(data)
-    wrong[-1] ^= 1
-    for changed, kept, damage in ((data + bytes(5000), 0, at[-1]), (bytes(wrong), 1, at[-2])):
-        log = damaged(tmp_path / "x.tlog", changed)
-        assert tuple(log) == messages[: len(messages) - kept]
-        assert (log.damaged, log.first_damage, log.truncated) == (1, damage, 0)
-    log = damaged(tmp_path / "x.tlog", data[:-3])
-    assert tuple(log) == messages[:-1]
-    assert (log.damaged, log.truncated) == (0, at[-1] - at[-2] - 3)
-
-
-def test_a_log_is_read_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An entry at the border of one is found, also behind garbage."""
-    data, messages, _ = recorded()
-    monkeypatch.setattr(tlog, "_BLOCK", 1000)
-    for short in range(12):
-        log = damaged(tmp_path / "x.tlog", bytes(1000 - short) + data)
-        assert tuple(log) == messages
+@pytest.mark.parametrize("block", [1000, tlog._BLOCK])
+def test_damaged_entries_are_skipped_and_counted(
+    block: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tlog, "_BLOCK", block)
+    _, messages, _ = recorded()
+    for data, lost, damages, first, truncated in damaged_logs():
+        (tmp_path / "x.tlog").write_bytes(data)
+        log = tlog.read(tmp_path / "x.tlog")
+        assert tuple(log) == tuple(m for n, m in enumerate(messages) if n not in lost)
+        assert (log.damaged, log.truncated) == (damages, truncated)
+        if damages:
+            assert log.first_damage == first
+            words = "entries were" if damages > 1 else "entry was"
+            told = f"{damages} damaged {words} skipped, the first at byte {first}"
+            assert told in log.damage
 
 
 def test_a_story_is_told_in_vehicle_time() -> None:

@@ -142,13 +142,6 @@ def test_a_jump_forward_is_measured(jump_s: float, shown_s: float) -> None:
         assert clock.age_s(newest[0], newest[1] + 0.2) == pytest.approx(0.2, abs=1e-6)
 
 
-def test_the_freshest_of_several_counts() -> None:
-    clock = VehicleClock()
-    clock.on_telemetry(1.00, 7001.05)
-    clock.on_telemetry(1.01, 7001.10)  # 40 ms longer on its way
-    assert clock.age_s(1.01, 7001.10) == pytest.approx(0.04)
-
-
 def test_a_clock_that_becomes_slower_is_no_late_link() -> None:
     """The load of the computer changes in flight. What remains is the change within one reply."""
 

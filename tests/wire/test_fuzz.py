@@ -1,20 +1,115 @@
-"""No received bytes raise, exhaust the memory, or remain uncounted."""
+"""Arbitrary input: the session counts every byte, and the simulated vehicle keeps running, sends
+well-formed frames only, and flies afterwards.
+
+`FUZZ_DATAGRAMS=1000000 pytest tests/wire/test_fuzz.py` sends half a million to each firmware
+and half a million more in flight, before a normal one. The same seed gives the same ones.
+"""
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterator
+import os
+import random
+import struct
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
 
-import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from vehicle_frames import ARDUPILOT, PEER, PX4, PX4_RECORDING, Sender, framed, pinned, recorded
+from sim_bench import LOITER, NAN, Bench
+from vehicle_frames import (
+    ARDUCOPTER_RECORDING,
+    ARDUPILOT,
+    PEER,
+    PX4,
+    PX4_RECORDING,
+    Sender,
+    framed,
+    pinned,
+    recorded,
+)
 
 from offboard.mavlink import events
 from offboard.mavlink.counters import DropReason
 from offboard.mavlink.session import Session
+from simulator import config
+from simulator.firmware.base import Firmware
+from simulator.firmware.catalogue import FIRMWARES
+from simulator.instance import Instance
+from simulator.mavlink.codec import Decoder
+from simulator.vehicle.conditions import Conditions
+
+COUNT = int(os.environ.get("FUZZ_DATAGRAMS", "5000"))
+PER_STEP = 20
+# What a vehicle answers or obeys, and missions; what we read of one
+OBEYED = (0, 4, 11, 20, 21, 23, 66, 75, 76, 82, 84, 86, 110, 111, 39, 40, 41, 43, 44, 45, 51, 73)
+READ = (0, 1, 2, 22, 24, 31, 32, 75, 76, 77, 83, 111, 148, 193, 230, 245, 253)
+COMMANDS = (20, 21, 22, 176, 224, 300, 400, 410, 510, 511, 512, 520)
+FLOATS = (math.nan, math.inf, -math.inf, 3.4e38, -3.4e38, 0.0, 1e-42, -1.0, 1.0, 6.0, 493.0)
+WORDS = (
+    *(struct.pack("<f", value) for value in FLOATS),
+    *(struct.pack("<HBB", number, 1, 1) for number in COMMANDS),
+    *(bytes((value,)) * 4 for value in (0, 1, 2, 255)),
+    *(b"COM_", b"OF_L", b"OSS_", b"T\0\0\0"),
+)
+
+
+def datagrams(seed: int, ids: tuple[int, ...]) -> Iterator[bytes]:
+    """Random bytes, mutated recordings, hostile values and lengths, MAVLink 1, by turns."""
+    rng = random.Random(seed)
+    frames = samples(PX4_RECORDING, ARDUCOPTER_RECORDING)
+    makers: tuple[Callable[[], bytes], ...] = (
+        lambda: garbage(rng),
+        lambda: mutated(rng, rng.choice(frames)),
+        lambda: hostile(rng, rng.choice(list(mavlink.mavlink_map))),
+        lambda: hostile(rng, rng.choice(ids), version_1=True),
+        lambda: b"".join(hostile(rng, rng.choice(ids)) for _ in range(rng.randrange(1, 5))),
+        lambda: hostile(rng, rng.choice(ids)) + garbage(rng),
+    )
+    while True:
+        yield rng.choice(makers)()
+
+
+@cache
+def samples(*recordings: Path) -> list[bytes]:
+    """Frames of recordings, some of each kind."""
+    kinds: dict[tuple[str, int], list[bytes]] = {}
+    for path in recordings:
+        for message in itertools.islice(recorded(path), 4000):
+            key = (message.get_type(), message.get_srcComponent())
+            kinds.setdefault(key, []).append(bytes(message.get_msgbuf()))
+    return [frame for found in kinds.values() for frame in found[:20]]
+
+
+def garbage(rng: random.Random) -> bytes:
+    data = bytearray(rng.randbytes(rng.choice((0, 1, 11, 12, 60, 300, 2000))))
+    for _ in range(rng.randrange(3) if data else 0):
+        data[rng.randrange(len(data))] = rng.choice((0xFD, 0xFE))
+    return bytes(data)
+
+
+def mutated(rng: random.Random, frame: bytes) -> bytes:
+    """Bytes changed, left out and put in."""
+    data = bytearray(frame)
+    for _ in range(rng.randrange(1, 4)):
+        at = rng.randrange(len(data))
+        inserted = rng.randbytes(rng.choice((1, 1, 8)))
+        data[at : rng.choice((at, at + 1, at + 1, len(data)))] = inserted
+    return bytes(data)
+
+
+def hostile(rng: random.Random, message_id: int, *, version_1: bool = False) -> bytes:
+    """Wrong values under a right checksum; every fourth has the length of a later MAVLink."""
+    kind = mavlink.mavlink_map[message_id]
+    words = [rng.choice(WORDS) if rng.random() < 0.8 else rng.randbytes(4) for _ in range(64)]
+    length = rng.randrange(256) if rng.random() < 0.25 else kind.unpacker.size
+    return framed(message_id, b"".join(words)[:length], version_1=version_1 and message_id < 256)
+
+
+# --- the session ---
+
 
 LONGEST_FRAME = 10 + 255 + 2 + 13
 
@@ -43,65 +138,29 @@ def floats(value: object) -> Iterator[float]:
             yield from floats(part)
 
 
-@pytest.fixture(scope="module")
-def traffic() -> list[bytes]:
-    """Real frames of every kind that PX4 sends."""
-    kinds: dict[str, list[bytes]] = {}
-    for message in recorded(PX4_RECORDING):
-        kinds.setdefault(message.get_type(), []).append(bytes(message.get_msgbuf()))
-    found = [frame for frames in kinds.values() for frame in frames[:8]]
-    return [each for each in found if int.from_bytes(each[7:10], "little") in mavlink.mavlink_map]
-
-
-@given(
-    st.lists(st.binary(max_size=400), max_size=8), st.booleans(), st.sampled_from([PX4, ARDUPILOT])
-)
-@settings(max_examples=100, deadline=None, derandomize=True)
-def test_any_bytes(portions: list[bytes], stream: bool, autopilot: int) -> None:
-    session = pinned(Sender(), autopilot, stream=stream)
-    for portion in portions:
-        receive(session, portion)
-
-
-DECODED = [0, 1, 2, 22, 24, 31, 32, 75, 76, 77, 83, 111, 148, 193, 230, 245, 253]
-IDS = st.sampled_from(DECODED) | st.sampled_from(sorted(mavlink.mavlink_map))
-
-
-@given(st.binary(max_size=255), IDS, st.booleans())
-@settings(max_examples=700, deadline=None, derandomize=True)
-def test_any_payload_with_a_correct_checksum(payload: bytes, message_id: int, px4: bool) -> None:
-    """Any length: a shorter payload is padded, a longer one belongs to a later MAVLink version."""
-    session = pinned(Sender(), PX4 if px4 else ARDUPILOT)
-    frame = framed(message_id, payload)
-    logged = message_id != 256  # SETUP_SIGNING, which holds a key
-    assert receive(session, frame) == ((frame,) if logged else ())
-
-
+@pytest.mark.parametrize("autopilot", [PX4, ARDUPILOT])
 @pytest.mark.parametrize("stream", [False, True])
-def test_damaged_frames(traffic: list[bytes], stream: bool) -> None:
-    generator = np.random.default_rng(0)
-    session = pinned(Sender(7), PX4, stream=stream)
-    for frame in traffic * 4:
-        damaged = bytearray(frame)
-        for _ in range(generator.integers(0, 4)):
-            damaged[generator.integers(len(damaged))] = generator.integers(256)
-        if generator.random() < 0.2:
-            del damaged[generator.integers(len(damaged)) :]
-        if generator.random() < 0.2:
-            damaged += generator.bytes(generator.integers(1, 50))
-        receive(session, bytes(damaged))
-    assert session.counters.dropped[DropReason.BAD_CRC] > 50
-    assert session.counters.frames > 200  # a fifth goes undamaged
+def test_hostile_datagrams(autopilot: int, stream: bool) -> None:
+    """A frame of any length under a right checksum is one: a shorter payload is padded, a longer
+    one belongs to a later version of MAVLink. SETUP_SIGNING (256) holds a key and is not logged."""
+    session = pinned(Sender(), autopilot, stream=stream)
+    for datagram in itertools.islice(datagrams(3, READ), 2000):
+        receive(session, datagram)
+    dropped, generator = session.counters.dropped, random.Random(3)
+    assert min(dropped[DropReason.BAD_CRC], dropped[DropReason.IMPLAUSIBLE]) > 50
+    for message_id in sorted(mavlink.mavlink_map):
+        frame = hostile(generator, message_id)
+        session = pinned(Sender(), autopilot, stream=stream)
+        assert receive(session, frame) == ((frame,) if message_id != 256 else ())
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_good_frames_survive_garbage_between_them(traffic: list[bytes], seed: int) -> None:
+def test_good_frames_survive_garbage_between_them() -> None:
     """Also behind garbage that begins like a long frame."""
-    generator = np.random.default_rng(seed)
-    session = pinned(Sender(7), PX4, stream=True)
-    data = b""
+    chance, session, data = random.Random(0), pinned(Sender(7), PX4, stream=True), b""
+    known = mavlink.mavlink_map.keys()
+    traffic = [f for f in samples(PX4_RECORDING) if int.from_bytes(f[7:10], "little") in known]
     for frame in traffic:
-        data += generator.bytes(generator.integers(0, 40)) + b"\xfd\xff" + frame
+        data += chance.randbytes(chance.randrange(40)) + b"\xfd\xff" + frame
     found: list[bytes] = []
     for at in range(0, len(data), 100):
         found += receive(session, data[at : at + 100])
@@ -145,3 +204,53 @@ def test_many_start_bytes_use_bounded_time_and_memory() -> None:
         receive(session, b"\xfd" * 10_000)
         receive(session, b"\xfe" * 10_000)
     assert session.counters.bytes_skipped > 90_000
+
+
+# --- the simulated vehicle ---
+
+
+def assault(instance: Instance, seed: int, count: int) -> None:
+    """Feed both links, let time pass between; everything that is sent is well formed."""
+    reader = Decoder()
+    for index, datagram in enumerate(itertools.islice(datagrams(seed, OBEYED), count)):
+        (instance.feed if index % 4 else instance.feed_ground)(datagram)
+        if index % PER_STEP == 0:
+            instance.advance()
+            for datagram_out in (*instance.drain(), *instance.drain_ground()):
+                for m in reader.read(datagram_out):
+                    assert m.get_type() != "LOCAL_POSITION_NED" or math.isfinite(m.x + m.y + m.z)
+    assert not reader.dropped
+
+
+@pytest.mark.timeout(3000)
+@pytest.mark.parametrize("firmware", FIRMWARES.values(), ids=FIRMWARES)
+def test_nothing_raises_and_every_answer_is_well_formed(firmware: Firmware) -> None:
+    vehicle = config.vehicle(firmware.vehicle)
+    instance = Instance(firmware, vehicle, Conditions(), 1)
+    assault(instance, 5, COUNT // 2)
+    reasons = {"checksum", "truncated", "not a frame", "unknown message", "incompatible flags"}
+    assert reasons <= set(instance.companion.decoder.dropped)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3000)
+def test_a_normal_flight_afterwards() -> None:
+    bench = Bench(ground_link=True)
+    bench.fly_offboard()
+    assault(bench.instance, 6, COUNT // 2)
+    autopilot = bench.instance.autopilot
+    bench.command(21)
+    bench.run_until(lambda: autopilot.position_controller.landed, 1000.0)
+    bench.command(400, 0, 21196)
+    for spec in FIRMWARES["px4"].parameters:
+        autopilot.parameters.set(spec.name, spec.default)
+    begun_s = bench.time_s
+    assert bench.ask_mode(LOITER) == [0, 0]
+    assert bench.command(400, 1) == [0]
+    assert bench.command(22, *(NAN,) * 7) == [0]
+    bench.run_until(lambda: bench.mode == LOITER, 15.0)
+    bench.run(2.0)
+    assert bench.height_m == pytest.approx(2.5, abs=0.3)
+    assert bench.command(21) == [0]
+    bench.run_until(lambda: not bench.armed, 20.0)
+    assert bench.texts(begun_s)[-1] == "Disarmed by landing"

@@ -11,7 +11,7 @@ from vehicle_frames import ARDUPILOT, OFFBOARD, PEER, PX4, Sender, dropped, pinn
 
 from offboard.mavlink import events
 from offboard.mavlink.counters import DropReason
-from offboard.mavlink.outgoing import CommandLong, Heartbeat
+from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings
 
 STRANGER = ("10.0.0.9", 4000)
@@ -21,9 +21,19 @@ RESTARTED = (PEER[0], 50123)
 # --- which sender is the vehicle ---
 
 
-def test_the_first_autopilot_heard_is_the_vehicle() -> None:
-    session = Session(SessionSettings())
-    others = (
+def drops(session: Session, *frames: tuple[bytes, DropReason]) -> None:
+    """Each frame is no event, is logged, and is counted under its reason."""
+    for frame, reason in frames:
+        before = dropped(session, reason)
+        reception = session.receive(frame, PEER, 0.0)
+        assert (reception.events, reception.frames) == ((), (frame,))
+        assert dropped(session, reason) == before + 1
+
+
+def test_the_first_autopilot_heard_is_the_vehicle_and_no_other_one_is() -> None:
+    session, vehicle = Session(SessionSettings()), Sender(42)
+    drops(
+        session,
         (Sender().position(1000), DropReason.NO_VEHICLE),
         (Sender(255, 190).heartbeat(8, vehicle_type=6), DropReason.FOREIGN_COMPONENT),
         (Sender(255, 1).heartbeat(8, vehicle_type=6), DropReason.NO_VEHICLE),
@@ -31,13 +41,8 @@ def test_the_first_autopilot_heard_is_the_vehicle() -> None:
         (Sender(1, 154).heartbeat(8, vehicle_type=26), DropReason.FOREIGN_COMPONENT),
         (Sender().heartbeat(0), DropReason.UNSUPPORTED_AUTOPILOT),
     )
-    for frame, reason in others:
-        before = dropped(session, reason)
-        reception = session.receive(frame, PEER, 0.0)
-        assert (reception.events, reception.frames) == ((), (frame,))
-        assert dropped(session, reason) == before + 1
-        assert session.poll(0.0) == ()  # nothing is sent before a vehicle is found
-    reception = session.receive(Sender(42).heartbeat(), PEER, 0.0)
+    assert session.poll(0.0) == ()  # nothing is sent before a vehicle is found
+    reception = session.receive(vehicle.heartbeat(), PEER, 0.0)
     assert reception.events == (
         events.VehicleFound(42, 1, "px4"),
         events.Heartbeat("OFFBOARD", False, 3, 2),
@@ -46,20 +51,13 @@ def test_the_first_autopilot_heard_is_the_vehicle() -> None:
     assert ours[5:7] == bytes([42, 191])
     echo = session.receive(ours, PEER, 0.0)  # neither heard nor logged
     assert (echo.frames, echo.events, dropped(session, DropReason.ECHO)) == ((), (), 1)
-
-
-def test_others_are_dropped_once_the_vehicle_is_found() -> None:
-    vehicle = Sender(1)
-    session = pinned(vehicle)
-    for frame, reason in (
+    drops(
+        session,
         (Sender(2).position(1000), DropReason.FOREIGN_SYSTEM),
-        (Sender(1, 154).position(1000), DropReason.FOREIGN_COMPONENT),
+        (Sender(42, 154).position(1000), DropReason.FOREIGN_COMPONENT),
         (vehicle.heartbeat(ARDUPILOT), DropReason.FOREIGN_COMPONENT),
         (vehicle.heartbeat(8), DropReason.NO_VEHICLE),
-    ):
-        before = dropped(session, reason)
-        assert session.receive(frame, PEER, 0.0).events == ()
-        assert dropped(session, reason) == before + 1
+    )
     assert len(session.receive(vehicle.position(1000), PEER, 0.0).events) == 1
 
 
@@ -201,23 +199,19 @@ def test_every_report_of_the_mode_counts_after_outages_and_restarts(seed: int) -
     assert isinstance(event, events.Heartbeat)
 
 
-@pytest.mark.parametrize(
-    ("ids", "vehicle_type", "autopilot", "seen"),
-    [
+def test_another_companion_computer_is_seen() -> None:
+    session = pinned(Sender(1))
+    for ids, vehicle_type, autopilot, seen in (
         ((1, 192), 18, 8, True),
         ((7, 191), 18, 8, False),  # of another vehicle
         ((1, 192), 6, 8, True),  # as a companion of PX4 calls itself
         ((255, 190), 6, 8, False),
         ((1, 154), 26, 8, False),
         ((2, 1), 2, PX4, False),
-    ],
-)
-def test_another_companion_computer_is_seen(
-    ids: tuple[int, int], vehicle_type: int, autopilot: int, seen: bool
-) -> None:
-    beat = Sender(*ids).heartbeat(autopilot, vehicle_type=vehicle_type)
-    found = pinned(Sender(1)).receive(beat, PEER, 1.0).events
-    assert found == ((events.OtherCompanion(*ids, OFFBOARD),) if seen else ())
+    ):
+        beat = Sender(*ids).heartbeat(autopilot, vehicle_type=vehicle_type)
+        expected = (events.OtherCompanion(*ids, OFFBOARD),) if seen else ()
+        assert session.receive(beat, PEER, 1.0).events == expected, ids
 
 
 def test_acks_for_others_are_not_ours() -> None:
@@ -264,18 +258,6 @@ def test_heartbeats_at_1_hz_of_host_or_vehicle_time_whichever_is_faster() -> Non
         session.receive(vehicle.position(10 * tick), PEER, 10.5 + 0.0002 * tick)
         beats += Heartbeat(18) in session.poll(10.5 + 0.0002 * tick)
     assert beats == 10
-
-
-def test_intervals_are_requested_at_once() -> None:
-    session = Session(SessionSettings())
-    session.receive(Sender().heartbeat(), PEER, 0.0)
-    heartbeat, *requests = session.poll(0.0)
-    assert heartbeat == Heartbeat(18)
-    asked = [request for request in requests if isinstance(request, CommandLong)]
-    assert {request.command for request in asked} == {511}
-    rates_hz = {int(number): 1e6 / us for number, us in (each.parameters for each in asked)}
-    assert rates_hz == {31: 100, 32: 100, 245: 5, 1: 2, 24: 5, 230: 2, 436: 50, 83: 8, 115: 50}
-    assert session.poll(0.01) == ()
 
 
 def test_mavlink_1_frames_are_decoded() -> None:

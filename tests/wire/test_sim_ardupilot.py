@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -22,6 +23,13 @@ AUTO, GUIDED, LAND, THROW = 3, 4, 9, 18
 ACCEPTED, DENIED, UNSUPPORTED, FAILED = 0, 2, 3, 4
 HOVER = 0.3655
 LEVEL = (1.0, 0.0, 0.0, 0.0)
+
+
+def booted(**more: Any) -> Bench:
+    """On the ground, ready to arm."""
+    bench = Bench(firmware=ARDUPILOT, boot_scale=0.1, **more)
+    bench.run(4.5)
+    return bench
 
 
 def guided(**options: float) -> Bench:
@@ -69,21 +77,10 @@ def test_the_heartbeat_after_a_mode_change_shows_it_also_in_the_step_of_the_last
     assert [m.custom_mode for _, m in vehicle.of("HEARTBEAT", since_s)] == [GUIDED, LAND]
 
 
-def test_gps_raw_int_shows_no_fix_before_the_first_one() -> None:
-    """At 10.2 s."""
-    vehicle = Bench(firmware=ARDUPILOT)
-    vehicle.command(511, 24, 200_000)
-    vehicle.run(11.0)
-    fixes = vehicle.of("GPS_RAW_INT")
-    assert {m.fix_type for at_s, m in fixes if at_s < 10.1} == {1}
-    assert {m.fix_type for at_s, m in fixes if at_s > 10.3} == {3}
-
-
 @pytest.mark.parametrize(("thrust", "lifts"), [(0.45, True), (0.05, False)])
 def test_takeoff_by_setpoints_alone(thrust: float, lifts: bool) -> None:
     """.3 m after 3.3-3.9 s; any thrust is flight, even if it cannot lift."""
-    vehicle = Bench(firmware=ARDUPILOT, boot_scale=0.1)
-    vehicle.run(4.5)
+    vehicle = booted()
     vehicle.set("GUID_OPTIONS", 8)
     vehicle.command(176, 1, GUIDED)
     assert vehicle.command(400, 1) == [ACCEPTED]
@@ -116,8 +113,7 @@ def test_without_guid_options_thrust_is_a_climb_rate() -> None:
 
 def test_a_request_of_the_present_mode_changes_nothing_and_disarming_ends_a_takeoff() -> None:
     """Scripts ask for GUIDED until HEARTBEAT shows it; set_mode returns at once in that mode."""
-    vehicle = Bench(firmware=ARDUPILOT, boot_scale=0.1)
-    vehicle.run(4.5)
+    vehicle = booted()
 
     def take_off(up_m: float) -> None:
         assert vehicle.command(176, 1, GUIDED) == [ACCEPTED]
@@ -151,8 +147,7 @@ def test_modes_that_do_not_start_while_armed() -> None:
     assert vehicle.command(300) == [FAILED]
     mission.store(tuple(MissionItem(3, 16, (0.0,) * 4, 0, 0, up_m) for up_m in (0.0, 5.0)))
     assert vehicle.command(300) == [ACCEPTED]
-    ground = Bench(firmware=ARDUPILOT, boot_scale=0.1)
-    ground.run(4.5)
+    ground = booted()
     ground.instance.autopilot.mission.store(mission.items)
     for number in (THROW, AUTO, GUIDED):
         assert ground.command(176, 1, number) == [ACCEPTED]
@@ -169,10 +164,10 @@ def test_a_lost_ground_station_disarms_on_the_ground_and_leaves_the_pilot_his_mo
     vehicle.run(6.0)
     assert (vehicle.mode, vehicle.system_status) == (5, 4)
     assert "GCS Failsafe - Continuing Pilot Control" in vehicle.texts()
-    ground = Bench(firmware=ARDUPILOT, boot_scale=0.1)
+    ground = booted()
     ground.codec.srcSystem = 255
     ground.set("FS_GCS_ENABLE", 1)
-    ground.run(4.5)
+    ground.run(1.0)
     assert ground.command(176, 1, GUIDED) == [ACCEPTED]
     ground.heartbeat_type = None
     assert ground.command(400, 1) == [ACCEPTED]
@@ -245,8 +240,9 @@ def seen(bench: Bench) -> tuple[int, ...]:
     return tuple(getattr(channels, f"chan{i}_raw") for i in range(1, 9))
 
 
-def test_the_throttle_is_a_climb_rate_and_an_override_lasts_three_seconds() -> None:
-    """Then the throttle of the feigned remote control, at its lower end, descends."""
+def test_sticks_are_speeds_and_an_override_lasts_three_seconds() -> None:
+    """As the real one: throttle is a climb rate, pitch accelerates second by second and is braked
+    by letting go. Then the throttle of the feigned remote control, at its lower end, descends."""
     bench = loitering()
     for width, climb in ((1700, 0.63), (1300, -0.68), (1580, 0.0)):
         push(bench, 3.0, 1500, 1500, width, 1500)
@@ -254,46 +250,24 @@ def test_the_throttle_is_a_climb_rate_and_an_override_lasts_three_seconds() -> N
         height_m = bench.height_m
         push(bench, 4.0, *MIDDLE)
         assert bench.height_m == pytest.approx(height_m + 0.35 * climb, abs=0.35)
+    for pitch, ahead_mps, near in (
+        (1400, 0.43, 0.2), (1400, 0.85, 0.2), (1400, 1.15, 0.2), (1400, 1.36, 0.2),
+        (1500, 1.0, 0.35), (1500, 0.3, 0.35), (1500, 0.0, 0.2),
+    ):  # fmt: skip
+        push(bench, 1.0, 1500, pitch, 1500, 1500)
+        assert bench.velocity[0] == pytest.approx(ahead_mps, abs=near)
+    push(bench, 3.0, 1700, 1500, 1500, 1500)
+    assert bench.velocity[1] == pytest.approx(2.65, abs=0.4)
+    push(bench, 3.0, *MIDDLE)
     assert seen(bench) == (*MIDDLE, *FEIGNED[4:])
     bench.run(4.5)
     assert seen(bench) == FEIGNED
     assert climb_mps(bench) == pytest.approx(-2.4, abs=0.3)
 
 
-def test_a_stick_accelerates_and_the_vehicle_stops_when_it_is_centred() -> None:
-    """Pitch 1400: 0.43, 0.85, 1.15 and 1.36 m/s ahead second by second; released after five it
-    went on at 1.1 m/s for a second and stood after two."""
-    bench = loitering()
-    speeds = []
-    for _ in range(4):
-        push(bench, 1.0, 1500, 1400, 1500, 1500)
-        speeds.append(bench.velocity[0])
-    assert speeds == pytest.approx([0.43, 0.85, 1.15, 1.36], abs=0.2)
-    push(bench, 1.0, 1500, 1400, 1500, 1500)
-    push(bench, 1.0, *MIDDLE)
-    assert bench.velocity[0] == pytest.approx(1.14, abs=0.25)
-    push(bench, 2.0, *MIDDLE)
-    assert bench.velocity[:2] == pytest.approx((0.0, 0.0), abs=0.2)
-
-
-def test_roll_flies_sideways_also_by_manual_control_of_the_ground_station_alone() -> None:
-    bench = loitering()
-    push(bench, 3.0, 1700, 1500, 1500, 1500)
-    assert bench.velocity[1] == pytest.approx(2.65, abs=0.4)
-    joystick = mavlink.MAVLink_manual_control_message(1, 0, 0, 700, 0, 0)
-    bench.run(3.0, lambda: bench.send(joystick), 0.2)
-    assert seen(bench)[:4] == (1500, 1500, 1700, 1500)
-    assert climb_mps(bench) == pytest.approx(0.63, abs=0.1)
-    bench.codec.srcSystem = 42
-    push(bench, 0.02, 1100, 1100, 1100, 1100)
-    assert seen(bench)[:4] == (1500, 1500, 1700, 1500)
-    bench.codec.srcSystem = 255
-    push(bench, 0.02, 0, KEEP, 0, KEEP)  # zero releases
-    assert seen(bench) == (1500, 1500, 1000, 1500, *FEIGNED[4:])
-
-
-def test_manual_control_releases_axes_and_keeps_the_ground_station_present() -> None:
-    """32767 is an axis that is not used; a negative throttle or another target changes nothing."""
+def test_manual_control_of_the_ground_station_alone_is_an_override_and_keeps_it_present() -> None:
+    """32767 is an axis that is not used; a negative throttle, another target or sender changes
+    nothing. A width of zero releases a channel."""
     bench = loitering()
     for target, throttle, roll_axis, widths in (
         (1, 700, 0, (1500, 1500, 1700, 1500)),
@@ -305,10 +279,17 @@ def test_manual_control_releases_axes_and_keeps_the_ground_station_present() -> 
         bench.send(mavlink.MAVLink_manual_control_message(target, 0, roll_axis, throttle, 0, 0))
         bench.run(0.02)
         assert seen(bench)[:4] == widths
+    bench.codec.srcSystem = 42
+    push(bench, 0.02, 1100, 1100, 1100, 1100)
+    assert seen(bench)[:4] == widths
+    bench.codec.srcSystem = 255
+    push(bench, 0.02, 0, KEEP, 0, KEEP)
+    assert seen(bench) == (1500, 1500, 1000, 1500, *FEIGNED[4:])
     bench.set("FS_GCS_ENABLE", 1)
     bench.heartbeat_type = None
-    joystick = mavlink.MAVLink_manual_control_message(1, 0, 0, 500, 0, 0)
+    joystick = mavlink.MAVLink_manual_control_message(1, 0, 0, 700, 0, 0)
     bench.run(7.0, lambda: bench.send(joystick), 0.5)
+    assert climb_mps(bench) == pytest.approx(0.63, abs=0.1)
     assert not [text for text in bench.texts() if text.startswith("GCS Failsafe")]
     bench.run(6.0)
     assert [text for text in bench.texts() if text.startswith("GCS Failsafe")]
@@ -320,8 +301,10 @@ POSITION_ALONE, VELOCITY_ALONE = 0xDF8, 0xDC7
 RELATIVE, ABSOLUTE = 6, 5  # MAV_FRAME
 
 
-def copter() -> Bench:
-    bench = aloft(firmware=ARDUPILOT, height_m=5.0, mode="GUIDED")
+def flying(firmware: Firmware = ARDUPILOT) -> Bench:
+    """5 m up, in GUIDED or AUTO.LOITER."""
+    mode = "GUIDED" if firmware is ARDUPILOT else None
+    bench = aloft(firmware=firmware, height_m=5.0, mode=mode)
     bench.run(1.0)
     return bench
 
@@ -359,7 +342,7 @@ def fastest_mps(bench: Bench, duration_s: float) -> float:
 
 
 def test_a_turn_has_the_requested_rate() -> None:
-    bench = copter()
+    bench = flying()
     for params, wanted_deg, took_s in (((90, 25, 1), 90.0, 4.0), ((45, 10, -1, 1), 45.0, 4.5)):
         begun_s = bench.time_s
         assert bench.command(115, *params) == [ACCEPTED]
@@ -370,7 +353,7 @@ def test_a_turn_has_the_requested_rate() -> None:
 
 def test_a_requested_speed_holds_until_a_setpoint_of_another_kind() -> None:
     """4 m/s asked on the way, 4.1 flown."""
-    bench = copter()
+    bench = flying()
 
     def go(north: float) -> None:
         bench.position(north, 0.0, -5.0, POSITION_ALONE)
@@ -389,7 +372,7 @@ def test_a_requested_speed_holds_until_a_setpoint_of_another_kind() -> None:
 
 def test_reposition_of_arducopter_accelerates_and_brakes_as_the_real_one() -> None:
     """Metres from the start, second by second. It takes it as COMMAND_INT alone."""
-    bench = copter()
+    bench = flying()
     assert bench.command(192, -1, 1, 0, NAN, 0, 0, 10) == [UNSUPPORTED]
     assert reposition(bench, 40.0, 0.0, 5.0, RELATIVE) == ACCEPTED
     flown, speeds = [], []
@@ -413,8 +396,7 @@ def test_reposition_of_arducopter_accelerates_and_brakes_as_the_real_one() -> No
 def test_a_reposition_without_a_place_flies_nowhere(
     firmware: Firmware, x: int, frame: int, result: int
 ) -> None:
-    bench = aloft(firmware=firmware, height_m=5.0, mode="GUIDED" if firmware is ARDUPILOT else None)
-    bench.run(1.0)
+    bench = flying(firmware)
     up_m = 5.0 + (bench.instance.autopilot.firmware.origin[2] if frame == ABSOLUTE else 0.0)
     assert command_int(bench, frame, 192, -1.0, 1, 0, NAN, x, x, up_m) == result
     bench.run(3.0)
@@ -426,7 +408,7 @@ def test_a_reposition_without_a_place_flies_nowhere(
 def test_a_climb_speed_is_one_across_for_px4_alone(
     firmware: Firmware, obeys: bool, item: bool
 ) -> None:
-    bench = aloft(firmware=firmware, height_m=5.0, mode="GUIDED" if firmware is ARDUPILOT else None)
+    bench = flying(firmware)
     autopilot = bench.instance.autopilot
     x, y = (round(value * 1e7) for value in degrees(bench, 30.0, 0.0))
     up_m = autopilot.firmware.origin[2] + 5.0
@@ -464,7 +446,7 @@ def test_what_arducopter_refuses(
 @pytest.mark.parametrize("kind", ["", "_int"])
 def test_arducopter_flies_to_a_guided_mission_item_at_once(kind: str) -> None:
     """As DroneKit's simple_goto asks."""
-    bench = copter()
+    bench = flying()
     x, y = degrees(bench, 0.0, 20.0)
     where = (round(x * 1e7), round(y * 1e7)) if kind else (x, y)
     pack = getattr(mavlink, f"MAVLink_mission_item{kind}_message")
@@ -509,7 +491,7 @@ def test_a_terminated_flight_falls_and_only_px4_does_not_arm_again(
     firmware: Firmware, beats: tuple[int, ...], later: int, said: list[str]
 ) -> None:
     """MAV_CMD_DO_FLIGHTTERMINATION. PX4 stays in its mode until it is started again."""
-    bench = aloft(firmware=firmware, height_m=5.0, mode="GUIDED" if firmware is ARDUPILOT else None)
+    bench = flying(firmware)
     assert bench.command(185, 0) == [2 if firmware is PX4 else 4]
     assert bench.armed
     begun_s = bench.time_s

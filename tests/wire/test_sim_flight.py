@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 from sim_bench import HOVER, LAND, LOITER, NAN, OFFBOARD, Bench, aloft, engaged, hold
 
-from offboard.documents import shipped
 from offboard.documents.errors import DocumentError
 from simulator import config
 from simulator.config import Scenario
@@ -41,12 +40,18 @@ def test_without_position_automatic_flight_lands_and_attitude_setpoints_continue
     assert (bench.mode, bench.system_status) == (OFFBOARD, 4)
 
 
-@pytest.mark.parametrize("hover_thrust", [0.15, 0.8])
-def test_vehicles_far_from_the_believed_hover_thrust_hold_and_land(hover_thrust: float) -> None:
-    """MPC_THR_HOVER is 0.5; the integral, of up to g, makes up for the rest."""
+def hovering_at(hover_thrust: float) -> Bench:
+    """Another vehicle than MPC_THR_HOVER, 0.5, tells PX4; 2 m up."""
     believed = config.vehicle("px4_sih")
     bench = Bench(vehicle=believed.model_copy(update={"hover_thrust": hover_thrust}))
     bench.fly_offboard(2.0)
+    return bench
+
+
+@pytest.mark.parametrize("hover_thrust", [0.15, 0.8])
+def test_vehicles_far_from_the_believed_hover_thrust_hold_and_land(hover_thrust: float) -> None:
+    """The integral, of up to g, makes up for the rest."""
+    bench = hovering_at(hover_thrust)
     hold(bench, 8.0, 2.0)
     assert bench.height_m == pytest.approx(2.0, abs=0.02)
     bench.command(21)
@@ -55,9 +60,7 @@ def test_vehicles_far_from_the_believed_hover_thrust_hold_and_land(hover_thrust:
 
 def test_a_least_thrust_that_lifts_never_lands() -> None:
     """PX4 1.16.1's SIH that hovers at 0.1 climbed in AUTO.LAND at 1.7 .. 2.3 m/s."""
-    believed = config.vehicle("px4_sih")
-    bench = Bench(vehicle=believed.model_copy(update={"hover_thrust": 0.1}))
-    bench.fly_offboard(2.0)
+    bench = hovering_at(0.1)
     bench.command(21)
     bench.run(4.0)
     assert climb_mps(bench) == pytest.approx(2.0, abs=0.3)
@@ -197,21 +200,18 @@ def test_gps_loss_drifts_and_jumps_back_and_px4_loses_the_position(
     assert found.reset_counter == 1
 
 
-def strange(**fault: Any) -> list[bytes]:
-    bench = Bench(scenario=scenario({"fault": "stranger", "at_s": 1.0, **fault}))
-    bench.run(2.0)
-    (queue,) = bench.instance.strangers
-    return queue
-
-
 def test_a_stranger_sends_noise_or_a_spoof_with_the_ids_of_the_vehicle() -> None:
-    sent = strange(rate_hz=1000.0, size_bytes=40)
+    noise = {"fault": "stranger", "at_s": 1.0, "rate_hz": 1000.0, "size_bytes": 40}
+    spoof = {"fault": "stranger", "at_s": 1.0, "rate_hz": 20, "sends": "heartbeat"}
+    bench, decoder = Bench(scenario=scenario(noise, spoof)), Decoder()
+    bench.run(2.0)
+    sent, spoofs = bench.instance.strangers
     assert len(set(sent)) == len(sent) == pytest.approx(1000, abs=4)
     assert {len(datagram) for datagram in sent} == {40}
-    decoder = Decoder()
-    spoofs = [m for each in strange(sends="heartbeat", rate_hz=20) for m in decoder.read(each)]
-    assert {(m.get_type(), *sender_of(m), m.autopilot) for m in spoofs} == {("HEARTBEAT", 1, 1, 12)}
-    assert len(spoofs) == pytest.approx(20, abs=1)
+    messages = [m for each in spoofs for m in decoder.read(each)]
+    told = {(m.get_type(), *sender_of(m), m.autopilot) for m in messages}
+    assert told == {("HEARTBEAT", 1, 1, 12)}
+    assert len(messages) == pytest.approx(20, abs=1)
 
 
 @pytest.mark.parametrize("firmware", [PX4, ARDUPILOT], ids=lambda firmware: firmware.name)
@@ -304,8 +304,3 @@ def test_faults_that_run_go_on_after_a_reboot_and_end_as_they_should() -> None:
     assert autopilot.state.estimate.velocity_ned_mps[1] == pytest.approx(0.0, abs=0.1)
     assert bench.command(400, 1) == [0]
     assert bench.of("ATTITUDE")[-1][1].time_boot_ms == pytest.approx(7540, abs=60)
-
-
-def test_every_shipped_scenario_is_valid() -> None:
-    names = shipped.names("scenario")
-    assert [config.scenario(name).name for name in names] == list(names)

@@ -85,22 +85,19 @@ def test_a_mission_is_downloaded_as_uploaded_and_cleared() -> None:
         given, kept = item(seq, row), bench.of("MISSION_ITEM_INT")[-1][1]
         for name in ("seq", "frame", "command", "x", "y", "z", "param1", "param2"):
             assert getattr(kept, name) == pytest.approx(getattr(given, name), nan_ok=True)
-    send(bench, mavlink.MAVLink_mission_clear_all_message(1, 1))
-    send(bench, mavlink.MAVLink_mission_request_list_message(1, 1))
-    assert bench.of("MISSION_COUNT")[-1][1].count == 0
+    for emptying in (
+        mavlink.MAVLink_mission_clear_all_message(1, 1),
+        mavlink.MAVLink_mission_count_message(1, 1, 0),
+    ):
+        assert upload(bench, ROUND[2:]) == 0
+        send(bench, emptying)
+        assert acks(bench)[-1] == 0
+        send(bench, mavlink.MAVLink_mission_request_list_message(1, 1))
+        assert bench.of("MISSION_COUNT")[-1][1].count == 0
 
 
-def test_a_client_may_ask_for_the_int_messages_and_may_cancel() -> None:
-    bench = Bench()
-    send(bench, mavlink.MAVLink_mission_count_message(1, 1, 2))
-    send(bench, mavlink.MAVLink_mission_ack_message(1, 1, 3))  # unsupported
-    assert [m.seq for _, m in bench.of("MISSION_REQUEST")] == [0]
-    assert [m.seq for _, m in bench.of("MISSION_REQUEST_INT")] == [0]
-    send(bench, mavlink.MAVLink_mission_ack_message(1, 1, 15), 1.0)  # cancelled
-    assert asked(bench) == [0, 0]
-
-
-def test_missing_items_are_requested_again_until_a_timeout() -> None:
+def test_missing_items_are_requested_again_until_a_timeout_or_cancelled() -> None:
+    """A client may ask for the INT messages instead."""
     bench = Bench()
     send(bench, mavlink.MAVLink_mission_count_message(1, 1, 2), 1.0)
     assert asked(bench) == [0] * len(asked(bench))
@@ -109,6 +106,12 @@ def test_missing_items_are_requested_again_until_a_timeout() -> None:
     assert acks(bench) == [15]
     send(bench, item(0, ROUND[0]))
     assert acks(bench) == [15, 1]
+    begun_s = bench.time_s
+    send(bench, mavlink.MAVLink_mission_count_message(1, 1, 2))
+    send(bench, mavlink.MAVLink_mission_ack_message(1, 1, 3))  # unsupported
+    send(bench, mavlink.MAVLink_mission_ack_message(1, 1, 15), 1.0)  # cancelled
+    for kind in ("MISSION_REQUEST", "MISSION_REQUEST_INT"):
+        assert [m.seq for _, m in bench.of(kind, begun_s)] == [0]
 
 
 @pytest.mark.parametrize("firmware", [PX4, ARDUPILOT], ids=["px4", "ardupilot"])

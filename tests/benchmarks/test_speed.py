@@ -1,8 +1,15 @@
-"""What a decision over a horizon costs: run with `--benchmark-enable`. Nothing asserts on time."""
+"""What a decision and a second of the simulated vehicle cost: run with `--benchmark-enable`.
+Nothing here asserts on time.
+
+The vehicle: in memory, default rates of PX4's companion link, PX4's estimator. 1000 / (milliseconds
+per second of flight) is the ratio to real time.
+"""
 
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 from dataclasses import replace
 from itertools import cycle
 from typing import Any
@@ -15,6 +22,12 @@ from offboard.control.base import Situation
 from offboard.control.catalogue import settings_of
 from offboard.reference.transfer import transfer
 from offboard.run.configuration import load
+from simulator import config
+from simulator.firmware.px4 import PX4
+from simulator.instance import Instance
+from simulator.start import Start
+from simulator.vehicle.conditions import Conditions
+from simulator.vehicle.sensors import EstimatorName
 
 pytestmark = pytest.mark.slow
 SPHERES = [
@@ -65,3 +78,38 @@ def test_decision(law: str, steps: int | None, volumes: int, benchmark: Any) -> 
         p99_ms = 1e3 * float(np.percentile(benchmark.stats.stats.data, 99))
         benchmark.extra_info["p99_ms"] = p99_ms
         print(f"99th percentile {p99_ms:.2f} ms")
+
+
+def _fly(instance: Instance, duration_s: float) -> int:
+    """Bytes sent at the barriers of so much flight."""
+    end_s, sent = instance.time_s + duration_s, 0
+    while instance.advance_to_barrier(end_s):
+        sent += sum(map(len, instance.barrier()[1]))
+    return sent
+
+
+@pytest.mark.benchmark(group="a second of the simulator")
+@pytest.mark.parametrize(
+    "start", [None, Start(height_m=3.0)], ids=["on the ground", "holding position"]
+)
+def test_a_second_in_memory(benchmark: Any, start: Start | None) -> None:
+    vehicle, conditions = config.vehicle(PX4.vehicle), Conditions(estimator=EstimatorName.PX4_LIKE)
+    instance = Instance(PX4, vehicle, conditions, 1, lockstep=True, ground_link=False, start=start)
+    _fly(instance, 6.0)
+    sent = benchmark(_fly, instance, 1.0)
+    assert 20_000 < sent < 60_000
+
+
+@pytest.mark.benchmark(group="twenty vehicles in real time")
+def test_instances(benchmark: Any) -> None:
+    """The last line says how many steps ended later than the next one was due."""
+    command = [sys.executable, "-m", "simulator", "--instances", "20", "--gcs", "none",
+               "--connect", "udpout:127.0.0.1:24540", "--duration", "5"]  # fmt: skip
+
+    def run() -> str:
+        output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+        return output.splitlines()[-1]
+
+    output = benchmark.pedantic(run, rounds=1)
+    print(f"\n{output}")
+    assert "of 1250 deadlines missed" in output
