@@ -85,7 +85,7 @@ class TrackingSettings(ControllerSettings):
     limit cycle. `thrust_floor` is the least thrust as a fraction of g.
     """
 
-    bandwidth_radps: float = Field(default=9.0, ge=0.5, le=20)
+    bandwidth_radps: float = Field(default=7.0, ge=0.5, le=20)
     feedback_limit: float = Field(default=0.3, gt=0, le=1)
     thrust_floor: float = Field(default=0.2, ge=0, le=0.9)
 

@@ -119,7 +119,7 @@ def test_slow_attitude_is_identified() -> None:
     assert tilt.natural_frequency_radps == pytest.approx(3.0, rel=0.1)
     assert tilt.delay_s == pytest.approx(0.057, abs=0.02)
     said = " | ".join(pair.companion.announced)
-    assert "(configured 9.0): the vehicle's delay is not identified yet" in said
+    assert "(configured 7.0): the vehicle's delay is not identified yet" in said
 
 
 def test_white_noise_of_positions_is_no_delay_of_the_thrust() -> None:
@@ -160,7 +160,7 @@ def test_attitude_loop_that_slows_is_noticed_and_flown() -> None:
     assert "bandwidth limited to 3.0 rad/s" in text[doubt:known]  # the lowest, until it is known
     said = text[known:].split()
     assert float(said[7]) == pytest.approx(5.0, rel=0.05)
-    assert "bandwidth 9.0 rad/s as configured" in " ".join(said)
+    assert "bandwidth 7.0 rad/s as configured" in " ".join(said)
     assert "contradicts" not in said
     assert pair.score().max_position_m < 0.65
 

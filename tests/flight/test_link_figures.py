@@ -81,8 +81,7 @@ CONFIGURED_RADPS = 7.0
 def test_late_link_is_noticed_and_flown(direction: str, most_m: float) -> None:
     """It becomes late in flight, and prompt again. With its delay taken for that at take-off, 0.2 s
     more take the vehicle 2.1 m off."""
-    slower = f"controller.bandwidth_radps={CONFIGURED_RADPS}"  # which both delays allow
-    pair = over(through, "reference.height_m=3.0", slower, aloft=False, boot_scale=1.0)
+    pair = over(through, "reference.height_m=3.0", aloft=False, boot_scale=1.0)
     limits: list[tuple[float, float]] = []  # of the bandwidth, and since when
 
     def note(flying: Pair) -> None:
