@@ -20,18 +20,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from offboard.control.base import Certificate, Decision, DecisionError, Situation
-from offboard.control.keep_out import (
-    CENTRE,
-    HALF,
-    RADIUS,
-    ROUND,
-    VELOCITY,
-    KeepOut,
-    distance,
-    pack,
-    placed_at,
-    refusal,
-)
+from offboard.control.keep_out import CENTRE, HALF, RADIUS, ROUND, KeepOut, pack, placed_at, refusal
 from offboard.control.law import TrackingLaw, TrackingProblem, TrackingSettings, decision
 from offboard.control.mpc import MOST_STEPS, OUTLOOK, HorizonQuadratic, look_ahead
 from offboard.control.quadratic import ExactMinimum
@@ -50,7 +39,6 @@ from offboard.control.roll_out import (
 )
 from offboard.control.swarm import Swarm, SwarmSettings
 from offboard.model.axes import b_z_of
-from offboard.model.command import PredictedState
 from offboard.model.vehicle import Vehicle
 from offboard.reference.base import Reference
 
@@ -162,7 +150,6 @@ class HorizonLaw(TrackingLaw):
 
     def decide(self, situation: Situation) -> Decision:
         problem = self.prepare(situation)
-        self._check_outside(situation.state)
         own, others = self._own_plan(situation.time_s), self._other_plans(problem)
         rivals = sorted((plan for plan in others if plan.cost < own.cost), key=COST)
         bases = [own, *rivals[:RIVALS]]
@@ -195,14 +182,6 @@ class HorizonLaw(TrackingLaw):
         thrust, b_z = ahead["thrusts_vertical"][0], ahead["b_z"][0]
         self._start[T] = (thrust * b_z + self._start[F]) / (b_z + leant) - thrust
         return problem
-
-    def _check_outside(self, state: PredictedState) -> None:
-        """The volumes are a cost of a plan: where no way round one is found, it is flown into.
-        Raises DecisionError for a position inside one, so that the flight is landed."""
-        for number, volume in enumerate(self._placed.tolist()):
-            outside_m = distance(volume, *volume[CENTRE:VELOCITY], *state.position_ned_m.tolist())
-            if outside_m < 0.0:
-                raise DecisionError(f"the vehicle is {-outside_m:.2f} m inside keep_out[{number}]")
 
     def fly(
         self, inputs: Array, states: Array | None = None, knots: Array | None = None

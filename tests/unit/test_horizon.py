@@ -11,7 +11,7 @@ from attitude_plant import lemniscate
 from laws import LEVEL, PX4, G, at, lqr, on_target, state_of
 from scipy.integrate import solve_ivp
 
-from offboard.control.base import DecisionError, Situation
+from offboard.control.base import Situation
 from offboard.control.horizon import STEPS_AROUND, HorizonLaw, HorizonSettings, Plan
 from offboard.control.mpc import MpcLaw, MpcSettings
 from offboard.control.roll_out import STATE_SIZE, B, P, T, V, W, Z
@@ -228,15 +228,3 @@ def test_speed_limit_slows_the_plan() -> None:
         fastest[limit] = float(np.linalg.norm(node + np.array([last[V], last[V + 1], last[W]])))
     assert fastest[None] > 1.4
     assert fastest[1.0] < 1.1
-
-
-@pytest.mark.parametrize(("east_m", "inside"), [(-0.39, False), (-0.41, True)])
-def test_inside_a_volume_there_is_no_decision(east_m: float, inside: bool) -> None:
-    """Its east side is 0.4 m west of the origin."""
-    law = horizon(keep_out=[IN_THE_WAY])
-    situation = Situation(5.0, at(np.array([0.6, east_m, -3.0]), 0.0), lemniscate(8.0), LEVEL)
-    if inside:
-        with pytest.raises(DecisionError, match=r"0.01 m inside keep_out\[0\]"):
-            law.decide(situation)
-    else:
-        law.decide(situation)
