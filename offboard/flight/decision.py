@@ -31,7 +31,7 @@ from offboard.model.command import Command
 # How the texts of missed decisions begin. One that raised an error has no record of its tick: the
 # analysis counts the texts
 DECISION_FAILED, DECISION_MISSED = "decision failed: ", "decision missed: "
-NOTICEABLE_RADPS = 1.0  # a smaller change, as by the jitter of a link, is not announced
+NOTICEABLE_RADPS = 0.5  # a smaller change of the bandwidth is not announced
 # in a word -> what a missed decision is ascribed to
 _BY = {
     "controller": "the controller failed",
@@ -167,11 +167,13 @@ def _with_bandwidth(
 ) -> tuple[str, ...]:
     """The sentences for the user, and the bandwidth in use if it has changed noticeably."""
     used_radps, configured_radps = controller.bandwidth_radps, controller.configured_radps
-    if abs(used_radps - flight.announced_radps) < NOTICEABLE_RADPS:
+    changed_radps = abs(used_radps - flight.announced_radps)
+    as_configured = used_radps == configured_radps
+    if not changed_radps or (changed_radps < NOTICEABLE_RADPS and not as_configured):
         return update.sentences
     flight.announced_radps = used_radps
     text = f"bandwidth limited to {used_radps:.1f} rad/s (configured {configured_radps:.1f})"
-    if used_radps == configured_radps:
+    if as_configured:
         text = f"bandwidth {used_radps:.1f} rad/s as configured"
     if update.cause:
         return (*update.sentences, f"{text}: {update.cause}")
