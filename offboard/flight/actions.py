@@ -17,7 +17,8 @@ from offboard.mavlink.outgoing import CommandLong
 from offboard.model.command import Command
 
 HEARTBEAT, AUTOPILOT_VERSION = 0, 148  # message ids
-HEARTBEAT_DUE_S = 1.5  # PX4 sends one a second; a lossy link may lose several, mode and arming too
+# PX4 sends one a second; a link that loses several may lose all reports of mode and arming
+HEARTBEAT_DUE_S, HEARTBEAT_EVERY_S = 1.3, 0.15
 FIT_EVERY_S = 4.0  # between two reductions of the telemetry: a backlog must drain first
 SPOOL_UP_PER_S = 0.7  # thrust ramp before lift-off, in units of gravity
 SPOOL_MAX = 2.0
@@ -50,10 +51,18 @@ def act(flight: FlightState) -> None:
         act_without_telemetry(flight, time_s)
     elif flight.authority.permits_setpoint(flight.now_s) and not decision.decide(flight):
         outbox.send_level(flight, time_s, _level(flight))
-    airborne = flight.phase in FLYING or flight.phase is Phase.LAND
-    if airborne and flight.vehicle.age_s(Heartbeat) > HEARTBEAT_DUE_S:
-        outbox.send(flight, CommandLong.message(HEARTBEAT))
+    if flight.phase in FLYING or flight.phase is Phase.LAND:
+        _request_heartbeat(flight)
     outbox.send(flight, flight.clock.request(time_s, flight.host_s))
+
+
+def _request_heartbeat(flight: FlightState) -> None:
+    """Request a HEARTBEAT that is missing. It changes nothing on the vehicle, whoever has it."""
+    request = CommandLong.message(HEARTBEAT)
+    waited_s = flight.now_s - flight.requested_s.get(request, -math.inf)
+    if flight.vehicle.age_s(Heartbeat) > HEARTBEAT_DUE_S and waited_s > HEARTBEAT_EVERY_S:
+        flight.requested_s[request] = flight.now_s
+        outbox.send(flight, request)
 
 
 def act_without_telemetry(flight: FlightState, time_s: float) -> None:

@@ -255,7 +255,7 @@ class Flight(FlightState):
     def on_dropped(self, frames: int) -> None:
         """The last frames of the newest turn were not sent: they became too old."""
         self._inputs.note(DROPPED, frames)
-        self.setpoint_s = self._setpoint_before_s
+        self.setpoint_s, self.newest_setpoint = self._setpoint_before_s, None
         self._news.dropped.add(frames)
 
     def overhear(self, datagrams: Sequence[bytes]) -> None:

@@ -4,6 +4,7 @@ taken, and begins its phase. `actions` has what is sent in a phase.
 
 from __future__ import annotations
 
+import math
 from functools import cache
 
 import numpy as np
@@ -161,6 +162,8 @@ def _enter(flight: FlightState, row: Transition) -> None:
         position = flight.vehicle.position
         assert position is not None
         flight.home_ned_m, flight.took_off = flight.jumps.without(position.position_ned_m), True
+        if flight.takes_off_by_command:  # a level setpoint would cancel it
+            flight.setpoint_s = math.inf
     elif row.target is Phase.CLIMB:
         _begin_climb(flight, source)
     elif row.target is Phase.JOIN:

@@ -44,7 +44,8 @@ REPEATED_S = 0.05  # PX4 and ArduCopter repeat a component of the position for 0
 OUTAGE_S = 0.3  # a longer gap of all telemetry is an outage of the link
 OTHER_SENDER_S = 5.0  # a second sender is there for so long after its newest frame
 MESSAGES_MAX = 12  # texts and refusals kept for the sentence that explains a failure
-SET_MESSAGE_INTERVAL = 511  # MAV_CMD: a refused rate explains no failure
+# MAV_CMD SET_MESSAGE_INTERVAL, REQUEST_MESSAGE: a message that is refused explains no failure
+MESSAGE_COMMANDS = frozenset({511, 512})
 
 
 @dataclass(slots=True)
@@ -198,7 +199,7 @@ class VehicleState:
                 self.parameters[name] = value
             case StatusText(severity, text) if severity <= WARNING:
                 self.texts.append(text)
-            case CommandAck(command, result) if command != SET_MESSAGE_INTERVAL:
+            case CommandAck(command, result) if command not in MESSAGE_COMMANDS:
                 self.results[command], self.answered_s[command] = result, now_s
                 if result not in GOOD_RESULTS:
                     self.refusals.append(f"command {command} {result}")

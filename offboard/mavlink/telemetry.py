@@ -122,18 +122,22 @@ class Telemetry:
         self._request()
 
     def _request(self) -> None:
-        wanted = self._dialect.wanted if self._dialect else ()
-        if self._capacity_bytes_ps is not None:
-            wanted = fitted(wanted, self._capacity_bytes_ps)
+        wanted = self._fitted(self._capacity_bytes_ps)
         self._streams = {each.message_id: _Stream(each, self.time.seconds) for each in wanted}
 
+    def _fitted(self, bytes_ps: float | None) -> tuple[WantedMessage, ...]:
+        wanted = self._dialect.wanted if self._dialect else ()
+        return wanted if bytes_ps is None else fitted(wanted, bytes_ps)
+
     def thin(self) -> bool:
-        """Request half of it from now on: the link is saturated. False if the rates are the lowest
-        already."""
-        before = self.bytes_ps
-        self._capacity_bytes_ps = 0.5 * before / SHARE
+        """Request half of it from now on: the link is saturated. False, and nothing is requested
+        anew, if the rates are the lowest already."""
+        half_bytes_ps = 0.5 * self.bytes_ps / SHARE
+        if sum(each.bytes_ps for each in self._fitted(half_bytes_ps)) >= 0.99 * self.bytes_ps:
+            return False
+        self._capacity_bytes_ps = half_bytes_ps
         self._request()
-        return self.bytes_ps < 0.99 * before
+        return True
 
     def due(self) -> list[WantedMessage]:
         """Messages to request now; they count as requested."""

@@ -89,8 +89,9 @@ class FlightRecord(FlightLog):
         self.start()
 
     def _open(self) -> None:
+        self.directory.mkdir(parents=True, exist_ok=True)
+        (self.directory / ENGAGED).write_text(self.vehicle, encoding="utf-8")  # whatever fails then
         super()._open()
-        (self.directory / ENGAGED).write_text(self.vehicle, encoding="utf-8")
 
 
 class Recorder:

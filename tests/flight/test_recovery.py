@@ -1,26 +1,30 @@
-"""Recovery: what the supervisor asks of a vehicle without controller, against scripts of what the
-vehicle shows. The process and its sockets are in `test_supervisor.py`."""
+"""Recovery: what the supervisor asks of a vehicle without controller.
+
+First against scripts of what the vehicle shows, then of a simulated PX4, whose own failsafe for
+missing setpoints acts, too. The process and its sockets are in `test_supervisor.py`.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 
 import pytest
+from pair import LEAN, QUICK_LANDING
+from watch import scenario_of
 
 from offboard.mavlink.dialects.ardupilot import ARDUPILOT
 from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.dialects.px4 import PX4
-from offboard.mavlink.events import (
-    CommandAck,
-    Event,
-    Heartbeat,
-    LocalPosition,
-    ModeReport,
-    SystemHealth,
-    VehicleFound,
-)
+from offboard.mavlink.events import CommandAck, Event, Heartbeat, ModeReport, VehicleFound
+from offboard.mavlink.outgoing import AttitudeTarget, CommandLong
+from offboard.mavlink.session import Session, SessionSettings
+from offboard.model.command import Command
 from offboard.supervisor.recovery import LONGEST_S, Recovery, Supervised
+from simulator import config
+from simulator.instance import Instance
+from simulator.steps import STEP_S
 
 HOLD, LAND = 176, 21  # MAV_CMD_DO_SET_MODE, MAV_CMD_NAV_LAND
 FIRMWARES = pytest.mark.parametrize("dialect", [PX4, ARDUPILOT], ids=["px4", "ardupilot"])
@@ -191,46 +195,99 @@ def test_a_refusal_is_kept_to_be_said() -> None:
         assert recovery.news == said
 
 
-# -- in the failsafe for missing setpoints ---------------------------------------------------------
+# -- against the failsafe for missing setpoints ----------------------------------------------------
 
 POSCTL, RETURN, LANDS, LOITER = 0, 3, 4, 5  # COM_OBL_RC_ACT
+STREAM_S = 1.5
 
 
-def in_failsafe(fallback: int, *reports: Timed) -> tuple[list[float], str]:
-    """When landing is asked for, and how it ends, of a PX4 whose failsafe acts at 0.8 s, 0.2 s late
-    for our request to hold, and which reports this, too."""
+@dataclass
+class Recovered:
+    """How a recovery ended, and what was asked until then: time, command, height."""
+
+    ended: str = ""
+    armed: bool = True
+    asked: list[tuple[float, int, float]] = field(default_factory=list)
+
+
+def recovered(
+    fallback: int,
+    silent_s: float,
+    arrives: Callable[[int], bool] = lambda command: True,
+    pilot: tuple[float, str] = (math.inf, ""),
+) -> Recovered:
+    """A PX4 that hovers at 4 m in OFFBOARD; its newest setpoint leaves at 0 s, and the supervisor
+    acts at `silent_s`. Its commands arrive if `arrives` says so; a `pilot` switches the mode."""
+    start = scenario_of(start={"height_m": 4.0, "mode": "OFFBOARD"})
+    vehicle, conditions = config.vehicle("px4_sih"), start.conditions
+    instance = Instance(LEAN, vehicle, conditions, 3, ground_link=False, start=start.start)
+    autopilot, commander = instance.autopilot, instance.autopilot.commander
+    for name, value in {"COM_OBL_RC_ACT": fallback, **QUICK_LANDING}.items():
+        autopilot.parameters.set(name, value)
+    session, result = Session(SessionSettings()), Recovered()
+    session.set_vehicle(VEHICLE, "vehicle")
+    instance.feed(session.encode(CommandLong.message_interval(436, 50.0)))  # CURRENT_MODE
+    level = session.encode(AttitudeTarget(0.0, Command(9.81, (0.0, 0.0, 1.0), 0.0), 0.489, 9.81))
     loss = PX4.setpoint_loss({"COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": fallback})
-    known = replace(OURS, setpoint_loss=loss)
-    assert known.silent_s == pytest.approx(0.6)
-    (mode, *_) = loss.modes
-    seconds = range(12)  # CURRENT_MODE shows it before HEARTBEAT does
-    shown: list[Timed] = [(0.8 + n, ModeReport(mode)) for n in seconds]
-    shown += [(0.9 + n, Heartbeat(mode, True, 5, 2)) for n in seconds]
-    down = beats(mode, 12.8, 12.8, armed=False)
-    commands, ended = asked(PX4, *shown, *reports, *down, shown=PX4.engage_mode, known=known)
-    assert {command for _, command in commands} <= {HOLD, LAND}
-    return [at_s for at_s, command in commands if command == LAND], ended
+    known = Supervised(VEHICLE, ours=True, flying=True, reported_s=0.0, setpoint_loss=loss)
+    recovery: Recovery | None = None
+    for step in range(round(90.0 / STEP_S)):
+        now_s = step * STEP_S - STREAM_S
+        if now_s < 1e-9 and step % 25 == 0:
+            instance.feed(level)
+        if recovery is None and now_s >= silent_s:
+            recovery = Recovery(PX4, known, now_s, 0.0)
+        if now_s >= pilot[0]:
+            commander.switch(pilot[1])
+            pilot = (math.inf, "")
+        for datagram in instance.step():
+            for event in session.receive(datagram, "vehicle", 100.0 + now_s).events:
+                if recovery:
+                    recovery.see(event, now_s)
+        request = recovery.due(now_s) if recovery else None
+        if request:
+            command, height_m = request.command, -autopilot.state.truth.position_ned_m[2]
+            result.asked.append((now_s, command, height_m))
+            if arrives(command):
+                instance.feed(session.encode(request))
+        if recovery and recovery.end_reason:
+            result.ended, result.armed = recovery.end_reason, commander.armed
+            return result
+    raise AssertionError(result)
 
 
-@pytest.mark.parametrize(("fallback", "sinks"), [(POSCTL, True), (POSCTL, False), (LOITER, False)])
-def test_it_is_watched_and_landed_if_it_does_not_sink(fallback: int, sinks: bool) -> None:
-    """The supervisor took its mode for a pilot's and gave up. POSCTL without sticks sinks."""
-    falling = LocalPosition(0.0, (0.0, 0.0, -4.0), (0.0, 0.0, 0.7))
-    places = [(0.9 + 0.5 * n, falling) for n in range(24)] if sinks else []
-    landings_s, ended = in_failsafe(fallback, *places, (7.6, CommandAck(LAND, "ACCEPTED")))
-    assert ended == DISARMED
-    assert bool(landings_s) is not sinks
-    assert all(at_s > 5.0 for at_s in landings_s)
-    assert sinks or landings_s[0] < 7.5
+@pytest.mark.parametrize(
+    ("after_s", "fallback"),
+    [(-0.4, POSCTL), (-0.004, POSCTL), (0.0, LOITER), (0.004, RETURN), (0.02, LANDS)],
+)
+def test_before_the_failsafe_and_in_a_race_with_it_it_is_landed(
+    after_s: float, fallback: int
+) -> None:
+    """The supervisor acts so long after the failsafe, by itself 0.4 s before it; it took that mode
+    for a pilot's and gave up."""
+    loss = PX4.setpoint_loss({"COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": fallback})
+    assert replace(OURS, setpoint_loss=loss).silent_s == pytest.approx(0.6)
+    result = recovered(fallback, 1.0 + after_s)
+    assert (result.ended, result.armed) == (DISARMED, False)
 
 
-def test_it_lands_by_itself_in_the_modes_that_do() -> None:
-    for fallback in (RETURN, LANDS):
-        assert in_failsafe(fallback) == ([], DISARMED)
+@pytest.mark.parametrize(("fallback", "silent_s"), [(POSCTL, 1.2), (LOITER, 0.6)])
+def test_in_the_failsafe_it_is_watched_and_landed_if_it_does_not(
+    fallback: int, silent_s: float
+) -> None:
+    """Every request to hold is lost. POSCTL without sticks sinks by itself."""
+    result = recovered(fallback, silent_s, arrives=lambda command: command != HOLD)
+    assert (result.ended, result.armed) == (DISARMED, False)
+    landings_s = [at_s for at_s, command, height_m in result.asked
+                  if command == LAND and height_m > 0.1]  # fmt: skip
+    assert bool(landings_s) is (fallback == LOITER)
+    assert all(5.0 < at_s < 7.5 for at_s in landings_s)
 
 
-def test_with_a_pilots_sticks_it_is_his() -> None:
-    landings_s, ended = in_failsafe(POSCTL, (0.5, SystemHealth(True, 0.9, radio_ok=True)))
-    assert (landings_s, ended) == (
-        [], "the vehicle shows POSCTL: its pilot or its failsafe has it"
-    )  # fmt: skip
+@pytest.mark.parametrize(("mode", "pilot_s"), [("POSCTL", 0.5), ("POSCTL", 3.0), ("ALTCTL", 1.3)])
+def test_a_pilots_choice_is_final_before_the_failsafe_and_in_it(mode: str, pilot_s: float) -> None:
+    """POSCTL is also the mode of the failsafe: HEARTBEAT shows none once it was chosen. Nothing
+    that is asked arrives."""
+    result = recovered(POSCTL, 1.2, arrives=lambda command: False, pilot=(pilot_s, mode))
+    assert result.ended == f"the vehicle shows {mode}: its pilot or its failsafe has it"
+    assert all(at_s < max(pilot_s, 1.2) + 1.1 for at_s, _, _ in result.asked)

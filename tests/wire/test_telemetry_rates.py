@@ -142,3 +142,4 @@ def test_telemetry_of_a_saturated_link_is_halved_until_it_is_slow() -> None:
     assert rates_hz[0] == pytest.approx(47.0, abs=4.0)
     assert rates_hz[-1] == pytest.approx(20.0, abs=0.5)
     assert len(rates_hz) <= 3
+    assert asked_hz(session) == {}  # nothing anew, which would load the link further
