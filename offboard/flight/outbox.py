@@ -14,6 +14,7 @@ from enum import IntFlag
 
 from offboard.flight.phases import TRACKING
 from offboard.flight.state import LEVEL_DIRECTION, FlightState
+from offboard.flight.timing import LOSSY
 from offboard.mavlink import event_record
 from offboard.mavlink.event_record import EventRecord
 from offboard.mavlink.events import GOOD_RESULTS, WARNING
@@ -33,6 +34,7 @@ INFO = 6  # MAV_SEVERITY
 TEXT_ID_MAX = 65535  # STATUSTEXT.id; 0 is for texts of one chunk
 ANNOUNCED_KEPT = 200
 REPEAT_S = 1.0  # after this a request that was refused, or not answered, is sent again
+LOSES = f"the link loses more than {LOSSY:.0%} of what is sent: each setpoint is sent twice"
 _LENGTH_TOLERANCE = 0.01
 
 
@@ -171,6 +173,7 @@ def repeat_setpoint(flight: FlightState) -> None:
     flight.newest_setpoint = None
     ours = flight.phase in TRACKING and flight.authority.permits_setpoint(flight.now_s)
     if ours and flight.clock.loses(flight.host_s):
+        announce(flight, LOSES, once=True)
         send(flight, newest)
 
 

@@ -67,6 +67,8 @@ def test_setpoints_are_sent_twice_where_some_are_lost(
     assert len(times) == pytest.approx((times[-1] - times[0]) / 0.1 * sent, rel=0.1)
     assert median(gaps) == pytest.approx(0.1 / sent, abs=0.011)  # telemetry comes every 20 ms
     assert pair.score().rmse_position_m < most_m
+    said = sum("each setpoint is sent twice" in line for line in pair.companion.announced)
+    assert said == (lost > 0.0)
 
 
 # -- a link that becomes later in flight: TIMESYNC and the age of telemetry show it ----------------
