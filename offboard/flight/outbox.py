@@ -34,7 +34,7 @@ INFO = 6  # MAV_SEVERITY
 TEXT_ID_MAX = 65535  # STATUSTEXT.id; 0 is for texts of one chunk
 ANNOUNCED_KEPT = 200
 REPEAT_S = 1.0  # after this a request that was refused, or not answered, is sent again
-LOSES = f"the link loses more than {LOSSY:.0%} of what is sent: each setpoint is sent twice"
+LOSES = f"more than {LOSSY:.0%} of TIMESYNC requests have no reply: each setpoint is sent twice"
 _LENGTH_TOLERANCE = 0.01
 
 
