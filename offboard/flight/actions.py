@@ -41,7 +41,7 @@ def act(flight: FlightState) -> None:
     of a HEARTBEAT that is missing."""
     if flight.in_end_phase:
         return
-    time_s = flight.time_s
+    time_s, flight.newest_setpoint = flight.time_s, None  # an older one is not repeated
     if flight.phase in BEFORE_FLIGHT:
         flight.observer.freeze(True)
         _prepare(flight, time_s)
