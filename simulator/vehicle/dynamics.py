@@ -12,6 +12,7 @@ import numpy as np
 
 from offboard.compiled import entry, kernel
 from offboard.model.rigid_body import QUATERNION, RK4_SCRATCH_ROWS
+from simulator.steps import STEP_S
 from simulator.vehicle.airframe import ROTOR_SIZE, advance_airframe
 from simulator.vehicle.attitude import ROW_WIDTH, angular_acceleration, delayed_thrust
 from simulator.vehicle.noise import advance_process, fill_normals
@@ -41,7 +42,7 @@ RECORD = np.dtype(
         ("motors_on", "i8"),
         ("substeps", "i8"),
         ("gusty", "i8"),
-        ("noisy", "i8"),
+        ("erring", "i8"),
         # the truth
         ("body", "f8", QUATERNION.size),
         ("rotor", "f8", ROTOR_SIZE),
@@ -52,6 +53,7 @@ RECORD = np.dtype(
         ("offset", "f8", 3),
         ("velocity_error", "f8", 3),
         ("lag_s", "f8"),
+        ("pull_ps2", "f8"),
         ("white_sds", "f8", WHITE_COUNT),
         # the satellite receiver: position NED and velocity NE
         ("fix_sds", "f8", 5),
@@ -146,7 +148,7 @@ def advance_steps(count: int, plants: Any) -> None:
         _move_air(plant, step)
         _control_attitude(plant, step)
         advance_airframe(plant, delayed_thrust(plant, step) if plant.motors_on else 0.0)
-        if plant.noisy:
+        if plant.erring:
             _move_errors(plant, step)
         plant.step = step + 1
 
@@ -192,3 +194,5 @@ def _move_errors(plant: Any, step: int) -> None:
         plant.error[:],
         plant.work[:],
     )
+    for axis in range(2):
+        plant.error[AXIS_STRIDE * axis + 3] += STEP_S * plant.pull_ps2 * plant.body[7 + axis]
