@@ -6,15 +6,15 @@ from __future__ import annotations
 
 import difflib
 import math
-import sysconfig
+import sys
 import traceback
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 EVERY_S = 1.0  # at most one sentence of a `Repeated`
-_PACKAGE, _STANDARD = str(Path(__file__).parents[1]), sysconfig.get_path("stdlib")
+# packages that a mistake from outside is not in; the backport calls entry points, too
+_OURS = {"offboard", "importlib_metadata", *sys.stdlib_module_names}
 
 
 class UserError(Exception):
@@ -41,28 +41,20 @@ class DocumentError(UserError):
 
 def located(error: BaseException) -> str:
     """An exception of code from outside, such as a controller, in one sentence with file and line
-    of the mistake: of the innermost call in the package that was called from here, a folder or a
-    single module. Reads no file. Never raises an exception of its own."""
-    walked = traceback.walk_tb(error.__traceback__)
-    calls = [(frame.f_code.co_filename, line) for frame, line in walked]
-    calls = [(file, line) for file, line in calls if _is_file(file)]
-    outside = [(file, line) for file, line in calls if not file.startswith(_PACKAGE)]
-    own = Path(outside[0][0]) if outside else Path()
-    is_module = own.parent.name.endswith("-packages")  # site-packages has those of others, too
-    folder = str(own if is_module else own.parent) if outside else ""
-    theirs = [(file, line) for file, line in outside if file.startswith(folder)] or calls
+    of the mistake: of the innermost call in the package that was called from here. Reads no file.
+    Never raises an exception of its own."""
+    calls = [
+        (str(frame.f_globals.get("__name__")).partition(".")[0], frame.f_code.co_filename, line)
+        for frame, line in traceback.walk_tb(error.__traceback__)
+    ]
+    called = next((package for package, *_ in calls if package not in _OURS), "offboard")
+    theirs = [place for package, *place in calls if package == called]
     place = " ({}:{})".format(*theirs[-1]) if theirs else ""
     try:
         said = str(error)
     except Exception:
         said = "it cannot be printed"
     return " ".join(f"{type(error).__name__}: {said}{place}".split())
-
-
-def _is_file(name: str) -> bool:
-    """Whether it is neither of the standard library, or of its backport, nor of no file."""
-    standard = name.startswith(_STANDARD) and "site-packages" not in name
-    return not (standard or name.startswith("<") or "importlib_metadata" in name)
 
 
 @contextmanager
