@@ -23,7 +23,7 @@ from offboard.cli.shared import (
 )
 from offboard.documents.command_line import DISK_ERRORS, complain, explained
 from offboard.documents.errors import UserError
-from offboard.documents.shipped import is_file
+from offboard.documents.shipped import absolute
 
 STATE = Path("/var/lib/offboard")  # of the unit
 OUT = f"Directory of the flights' directories.  [default: {FLIGHTS}]"
@@ -149,6 +149,6 @@ def _without(option: str, words: list[str]) -> list[str]:
 def _absolute(word: str) -> str:
     """A file is named by its whole path: the unit runs in another directory."""
     option, equals, value = word.partition("=") if word.startswith("--") else ("", "", word)
-    if not (is_file(value) and Path(value).exists()):
+    if not Path(value).exists():
         return word
-    return f"{option}{equals}{Path(value).absolute()}"
+    return f"{option}{equals}{absolute(value)}"

@@ -56,6 +56,11 @@ def is_file(name: str) -> bool:
     return "/" in name or name.lower().endswith((".yaml", ".yml", ".csv"))
 
 
+def absolute(name: str) -> str:
+    """A name, or the absolute path of a file."""
+    return str(Path(name).absolute()) if is_file(name) else name
+
+
 def locate(name: str, kind: str, others: Sequence[str] = ()) -> Path:
     """The file with a shipped name, or the file itself where `name` is one. Raises DocumentError
     with the known names, `others` among them."""
@@ -84,4 +89,4 @@ def read_text(path: Path) -> str:
     except OSError as error:
         raise DocumentError(f"{abridged(path)} cannot be read: {error.strerror}") from None
     except ValueError:  # also a name that no file can have
-        raise DocumentError(f"{shown(str(path))} cannot be read: not UTF-8 text") from None
+        raise DocumentError(f"{abridged(path)} cannot be read: not UTF-8 text") from None
