@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from pathlib import Path
 from typing import Annotated
@@ -34,17 +35,28 @@ def check(
 
 
 def _checked(path: Path) -> str:
-    """Validate a file; what it is. Raises DocumentError."""
+    """Validate a file; what it is. A reference must be flyable by the default flight's vehicle, a
+    flight's by its own. Raises DocumentError."""
     from offboard.campaign.cases import base_cases
     from offboard.campaign.document import read_campaign
     from offboard.campaign.tune import planned, read_tune
     from offboard.documents.reading import kind_of, read
-    from offboard.documents.shipped import read_text
-    from offboard.run.configuration import check_file
+    from offboard.run.configuration import build_track, load, read_part
+    from offboard.run.sitl import check_scenario
 
     table = path.suffix.lower() == ".csv"
-    kind = "" if table else kind_of(read(read_text(path), str(path)))
-    if kind == "tuning":
+    text = "" if table else shipped.read_text(path)
+    kind = "reference" if table else kind_of(read(text, str(path)))
+    name = str(path) if table else os.path.join(".", path)  # not the name of a shipped file
+    if kind == "configuration":
+        build_track(load(name))
+    elif kind == "reference":
+        build_track(load("flight", choices={kind: name}))
+    elif kind in shipped.PARTS:
+        read_part(kind, name)
+    elif kind == "scenario":
+        check_scenario(text, str(path))
+    elif kind == "tuning":
         tuning, source = read_tune(path)
         with naming(source):
             planned(tuning)
@@ -53,7 +65,11 @@ def _checked(path: Path) -> str:
         with naming(source):
             list(base_cases(campaign))
     else:
-        return check_file(path)
+        raise DocumentError(
+            f"{path}: no key says what it is: a vehicle has mass_kg, a controller law, a reference "
+            "shape, a scenario conditions or faults, a configuration these three: "
+            f"{', '.join(shipped.PARTS)}"
+        )
     return kind
 
 

@@ -73,14 +73,12 @@ def parse(text: str, model: type[M], source: str, kind: str = "") -> M:
 
     Raises DocumentError with the problems found.
     """
-    raw = read(text, source)
-    if kind:
-        check_kind(raw, kind, source)
-    return validate(raw, model, source)
+    return validate(read(text, source, kind), model, source)
 
 
-def read(text: str, source: str) -> Section:
+def read(text: str, source: str, kind: str = "") -> Section:
     """YAML `text` -> the raw mapping, not yet validated. An empty document is an empty mapping.
+    Raises DocumentError, also for a file that is certainly of another kind.
 
     Every file may have a `description`: one line for people, which `offboard list` prints. It
     describes the file and is no part of the configuration: taken out here, so that it is not
@@ -96,19 +94,15 @@ def read(text: str, source: str) -> Section:
             f"{source}: description: {shown(line)} should be text of at most {DESCRIPTION_SIZE} "
             "characters"
         )
+    found = kind_of(value)
+    if kind and found and found != kind:
+        raise DocumentError(f"{source} is a {found} file; a {kind} file is needed here")
     return value
 
 
 def kind_of(raw: Mapping[str, Any]) -> str:
     """The kind of file that a mapping is, by keys that only this kind has; empty if it has none."""
     return next((kind for kind, keys in KINDS.items() if keys & raw.keys()), "")
-
-
-def check_kind(raw: Mapping[str, Any], wanted: str, source: str) -> None:
-    """Raise DocumentError where the file is certainly of another kind than the `wanted` one."""
-    found = kind_of(raw)
-    if found and found != wanted:
-        raise DocumentError(f"{source} is a {found} file; a {wanted} file is needed here")
 
 
 def override(mapping: Mapping[str, Any], assignment: str, option: str = "") -> Section:
