@@ -20,14 +20,14 @@ from offboard.cli.shared import (
     System,
     Vehicle,
     Workers,
-    check_new,
+    absent,
     known_port,
-    option,
     out,
     say,
     write_new,
 )
 from offboard.documents import shipped
+from offboard.documents.arguments import option
 from offboard.documents.errors import UserError, counted
 
 if TYPE_CHECKING:
@@ -38,6 +38,7 @@ NAME = typer.Argument(metavar="NAME|FILE", help="Campaign: a shipped name or a f
 TUNING = typer.Argument(metavar="NAME|FILE", help="Tuning: a shipped name or a file.")
 NAMES = "Names or files, separated by commas"
 SCENARIOS = "calm,px4_like"
+PROFILE = ("-o", "--out")  # the option
 GROUPS_SHOWN = 30  # of a table in the terminal
 
 
@@ -248,7 +249,8 @@ def _names(name: str, text: str, known: Sequence[str] = ()) -> list[str]:
 def tune(
     file: Annotated[str, TUNING],
     profile: Annotated[
-        Path, option("FILE", "Flight configuration to write; a new file.", "-o", "--out")
+        Path,
+        option("FILE", "Flight configuration to write; a new file.", *PROFILE, callback=absent),
     ] = Path("profile.yaml"),
     workers: Workers = None,
 ) -> None:
@@ -261,7 +263,6 @@ def tune(
     Exit codes: 0 a better configuration is written; 1 none is better; 2 usage or configuration
     error; 4 interrupted: the same command goes on.
     """
-    check_new(profile, "--out")
     with out.status("planning"):
         from offboard.campaign.document import Promises
         from offboard.campaign.results import Results, code_hash

@@ -15,12 +15,11 @@ from offboard.cli.shared import (
     REFUSED,
     FlightOptions,
     Report,
-    grouped,
-    option,
     out,
     say,
     write,
 )
+from offboard.documents.arguments import option
 from offboard.documents.command_line import DISK_ERRORS, complain, explained
 from offboard.documents.errors import UserError
 from offboard.documents.shipped import absolute
@@ -29,7 +28,6 @@ STATE = Path("/var/lib/offboard")  # of the unit
 OUT = f"Directory of the flights' directories.  [default: {FLIGHTS}]"
 
 
-@grouped
 def daemon(
     options: FlightOptions,
     anchor: Annotated[

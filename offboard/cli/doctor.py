@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,17 +12,16 @@ from offboard.cli.shared import (
     REFUSED,
     FlightOptions,
     err,
-    grouped,
-    option,
     out,
     say,
+    write,
 )
+from offboard.documents.arguments import option
 
 if TYPE_CHECKING:
     from offboard.doctor.run import Row
 
 
-@grouped
 def doctor(
     options: FlightOptions,
     names: Annotated[
@@ -65,7 +63,7 @@ def doctor(
         rows = run.examine(chosen, seen)
     sentence = run.verdict(rows, complete=not names)
     if as_json:
-        sys.stdout.write(run.as_json(rows, seen, sentence))
+        write(run.as_json(rows, seen, sentence))
     else:
         _show(rows, sentence)
     if run.worst(rows) is Level.BLOCKS:

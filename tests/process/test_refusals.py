@@ -226,7 +226,7 @@ def test_a_directory_with_a_flight_is_left_as_it_is(refused: Refused, tmp_path: 
     [
         ("offboard paper --quick --table 2 --out x", "is not empty; choose another"),
         (f"offboard identify {RECORDING} -o x/old", "x/old exists already; choose another"),
-        (f"offboard identify {RECORDING} -o y/new", "-o y/new: there is no directory y"),
+        (f"offboard identify {RECORDING} -o y/new", "y/new: there is no directory y"),
         (f"offboard identify {RECORDING} --out x", "a log needs no --system, --out or other"),
         (f"{SIMULATOR} --log x/old --duration 0.1", "--log x/old cannot be written: File"),
     ],
