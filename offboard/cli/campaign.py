@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Sequence
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -27,15 +27,13 @@ from offboard.cli.shared import (
     write_new,
 )
 from offboard.documents import shipped
-from offboard.documents.arguments import option
+from offboard.documents.arguments import FILE, option
 from offboard.documents.errors import UserError, counted
 
 if TYPE_CHECKING:
     from offboard.campaign.run import Campaign, Summary
     from offboard.campaign.workers import OpenFlyer
 
-NAME = typer.Argument(metavar="NAME|FILE", help="Campaign: a shipped name or a file.")
-TUNING = typer.Argument(metavar="NAME|FILE", help="Tuning: a shipped name or a file.")
 NAMES = "Names or files, separated by commas"
 SCENARIOS = "calm,px4_like"
 PROFILE = ("-o", "--out")  # the option
@@ -43,7 +41,7 @@ GROUPS_SHOWN = 30  # of a table in the terminal
 
 
 def campaign(
-    file: Annotated[str, NAME],
+    file: Annotated[str, typer.Argument(metavar=FILE, help="Campaign: a shipped name or a file.")],
     out_directory: Annotated[
         Path,
         option("DIR", "Directory of table, page and results; continued if it exists.", "--out"),
@@ -102,18 +100,6 @@ def _shard(text: str | None) -> slice:
     return slice(int(matched[1]) - 1, None, int(matched[2]))
 
 
-@contextmanager
-def resumable() -> Iterator[None]:
-    """Exit with 4 where the same command may go on: interrupted, a full disk for example."""
-    from offboard.campaign.run import Incomplete
-
-    try:
-        yield
-    except (Incomplete, KeyboardInterrupt) as reason:
-        ended = str(reason) or "interrupted; finished flights are kept"
-        raise UserError(f"{ended}: run the same command again to go on", 4) from None
-
-
 def conclude(summary: Summary, flown: Campaign) -> None:
     """Print what was flown; exits with 1 if a flight failed, 4 if some are missing."""
     from offboard.campaign.table import groups, show
@@ -146,7 +132,7 @@ def _search(flown: Campaign, source: str, count: int, open_workers: OpenFlyer) -
 
     search = FailureSearch(flown, source)
     progress = Progress(out, search.flights_most(count))
-    with resumable(), flown.flying(open_workers, progress) as fly:
+    with flown.flying(open_workers, progress) as fly:
         failures = search.find(count, fly)
     unflown = sum(row.record.infeasible for row in flown.rows())
     cannot = f", {unflown} cannot be flown (the table says why)" if unflown else ""
@@ -207,6 +193,7 @@ def compare(
         from offboard.campaign.document import CampaignFile
         from offboard.campaign.run import Campaign
         from offboard.campaign.workers import ConnectedVehicle, local_workers
+        from offboard.documents.reading import assigned
         from offboard.link import clock
 
         file = CampaignFile(
@@ -214,7 +201,7 @@ def compare(
             references=tuple(references),
             scenarios=None if connect else tuple(scenarios),
             vehicles=(vehicle,) if vehicle else None,
-            parameters=dict(map(_parameter, assignments or ())),
+            parameters={key: (value,) for key, value in map(assigned, assignments or ())},
             seeds=tuple(range(1, seeds + 1)),
             keep=True,
         )
@@ -227,17 +214,6 @@ def compare(
     conclude(flown.fly(open_flyer, out), flown)
 
 
-def _parameter(assignment: str) -> tuple[str, tuple[Any]]:
-    """Key and value of `key.path=value`, as a campaign's parameter. Raises DocumentError."""
-    from offboard.documents.reading import override
-
-    value: Any = override({}, assignment)
-    key = assignment.partition("=")[0]
-    for part in key.split("."):
-        value = value[part.strip()]
-    return key, (value,)
-
-
 def _names(name: str, text: str, known: Sequence[str] = ()) -> list[str]:
     """Comma-separated names, each once; 'all' stands for every known one."""
     parts = [part.strip() for part in text.split(",") if part.strip()]
@@ -247,7 +223,7 @@ def _names(name: str, text: str, known: Sequence[str] = ()) -> list[str]:
 
 
 def tune(
-    file: Annotated[str, TUNING],
+    file: Annotated[str, typer.Argument(metavar=FILE, help="Tuning: a shipped name or a file.")],
     profile: Annotated[
         Path,
         option("FILE", "Flight configuration to write; a new file.", *PROFILE, callback=absent),
@@ -274,10 +250,7 @@ def tune(
         tuning = Tuning(*read_tune(file))
         results = Results(profile.with_name(f"{profile.name}.tune"), code_hash())
     progress = Progress(out, tuning.flights)
-    with (
-        resumable(),
-        flying(results, Promises(), partial(local_workers, workers), progress) as fly,
-    ):
+    with flying(results, Promises(), partial(local_workers, workers), progress) as fly:
         tuned = tuning.run(
             fly,
             lambda number, cost: say(f"{number} of {tuning.file.trials} trials, best {cost:.4g}"),

@@ -123,25 +123,19 @@ def _print_unit(options: FlightOptions, out_directory: Path | None) -> None:
         )
     if options.signing_key:
         read_key(options.signing_key)
-    words = [word for word in sys.argv[sys.argv.index("daemon") + 1 :] if word != "--print-unit"]
-    arguments = [_absolute(word) for word in _without("--signing-key", words)]
-    sys.stdout.write(unit(arguments, options.connection().address, options.signing_key))
+    arguments = [
+        _absolute(word)
+        for word in sys.argv[sys.argv.index("daemon") + 1 :]
+        if word.partition("=")[0] not in ("--print-unit", "--signing-key")
+        and Path(word) != options.signing_key
+    ]
+    write(unit(arguments, options.connection().address, options.signing_key))
     installed = [Path(sys.executable), Path(offboard.__path__[0])]
     files = (options.config, options.controller, options.reference, options.vehicle)
     named = [Path(file) for file in files if file and Path(file).is_file()]
     for path in (*installed, *named):
         if hidden := unreadable(path):
             complain(hidden)
-
-
-def _without(option: str, words: list[str]) -> list[str]:
-    """The words without an option and its value."""
-    before = ["", *words]
-    return [
-        word
-        for word, previous in zip(words, before, strict=False)
-        if option not in (word, previous) and not word.startswith(f"{option}=")
-    ]
 
 
 def _absolute(word: str) -> str:

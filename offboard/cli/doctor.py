@@ -14,6 +14,7 @@ from offboard.cli.shared import (
     err,
     out,
     say,
+    say_each,
     write,
 )
 from offboard.documents.arguments import option
@@ -50,9 +51,7 @@ def doctor(
 
     chosen = run.names(names or ())
     if listing:
-        width = max(map(len, chosen))
-        for name in chosen:
-            say(f"{name:<{width}}  {run.summary(name)}", indent=width + 2)
+        say_each({name: run.summary(name) for name in chosen}, margin=0)
         return
     flight = options.load()
     with err.status("opening the link") as status:  # a line on a terminal, nothing elsewhere

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from offboard.cli.shared import out, say
+from offboard.cli.shared import out, say, say_each
 from offboard.documents import shipped
 from offboard.documents.errors import DocumentError, UserError, naming
 
@@ -77,15 +77,13 @@ def list_files() -> None:
     """List the shipped files by name, with one line each."""
     from offboard.control import catalogue
 
-    for number, kind in enumerate(shipped.FOLDERS):
+    for number, kind in enumerate(shipped.KINDS):
         described = shipped.descriptions(kind)
         if kind == "controller":
             for law in catalogue.names():
                 described.setdefault(law, "law of an installed package")
-        width = max(map(len, described))
         out.print("\n" * (number > 0) + f"{kind}s", style="bold")
-        for name, text in described.items():
-            say(f"  {name:<{width}}  {text}", indent=width + 4)
+        say_each(described)
 
 
 DEFAULT = Path("offboard.key")

@@ -21,6 +21,7 @@ from offboard.cli.shared import (
     SitlOptions,
     out,
     say,
+    say_each,
     scored,
     write,
 )
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     from offboard.flight.flight import Outcome
 
 INTERRUPTED = "interrupted before anything was sent"
-LABEL_WIDTH = 15
 
 
 def fly(
@@ -177,8 +177,7 @@ def _conclude(
             rows |= {"log": log, "all metrics": shlex.join(["offboard", "score", str(directory)])}
         if page:
             rows["report"] = f"{page}, in some seconds"
-        for label, text in rows.items():
-            say(f"  {label:<{LABEL_WIDTH}}{text}", indent=2 + LABEL_WIDTH)
+        say_each(rows)
         sys.stdout.flush()
     except OSError as error:  # the exit code stays that of the flight
         drop(sys.stdout)

@@ -10,7 +10,7 @@ import functools
 import inspect
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -64,15 +64,10 @@ def absent(path: Path | None) -> Path | None:
 NEW_DIRECTORY = "Directory of the results.  [default: a new one in flights]"
 FLIGHT = typer.Argument(metavar="FLIGHT", help="Flight directory or .tlog file.")
 Directory = Annotated[Path | None, option("DIR", NEW_DIRECTORY, "--out")]
-Connect = Annotated[
-    str | None,
-    option(
-        "LINK",
-        "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or serial:DEVICE:BAUD; "
-        f"IPv6 in brackets.  [default: {DEFAULT_CONNECTION}]",
-        callback=known_port,
-    ),
-]
+LINK = (
+    "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or serial:DEVICE:BAUD; "
+    f"IPv6 in brackets.  [default: {DEFAULT_CONNECTION}]"
+)
 Vehicle = Annotated[str | None, option(FILE, "Vehicle.")]
 System = Annotated[
     int | None,
@@ -107,7 +102,7 @@ Assignments = Annotated[
 class FlightOptions:
     """The options of a flight, the same for every command that flies or checks one."""
 
-    connect: Connect = None
+    connect: Annotated[str | None, option("LINK", LINK, callback=known_port)] = None
     system: System = None
     signing_key: SigningKey = None
     config: Annotated[str, option(FILE, "Configuration.")] = "flight"
@@ -193,6 +188,13 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
 def say(text: str, indent: int = 0) -> None:
     """Print a line to stdout, wrapped at words to the width; further lines are indented."""
     out.print(wrapped(text, out.width, indent), markup=False, soft_wrap=True)
+
+
+def say_each(texts: Mapping[str, str], margin: int = 2) -> None:
+    """Print a line for each name: the name, then its text, both aligned."""
+    width = max(map(len, texts), default=0) + 2
+    for name, text in texts.items():
+        say(f"{'':{margin}}{name:{width}}{text}", indent=margin + width)
 
 
 def write(text: str) -> None:

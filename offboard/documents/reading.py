@@ -21,6 +21,7 @@ from pydantic import BaseModel, ValidationError
 from yaml.representer import SafeRepresenter
 
 from offboard.documents.errors import DocumentError, abridged, counted, meant, shown
+from offboard.documents.shipped import KINDS
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -28,20 +29,6 @@ if TYPE_CHECKING:
 M = TypeVar("M", bound=BaseModel)
 DESCRIPTION_SIZE = 200
 PROBLEMS_MOST = 10
-
-# kind of file -> keys that no kind below has
-KINDS = {
-    "tuning": {"training", "validation"},
-    "campaign": {
-        "controllers", "references", "vehicles", "sim_vehicles", "firmwares", "scenarios",
-        "parameters", "sample", "search", "seeds", "require", "promises", "keep",
-    },
-    "scenario": {"conditions", "faults"},
-    "reference": {"shape"},
-    "controller": {"law"},
-    "vehicle": {"mass_kg"},
-    "configuration": {"vehicle", "controller", "reference"},
-}  # fmt: skip
 
 _INTEGER = re.compile(r"[-+]?[0-9]{1,400}")
 _HEXADECIMAL = re.compile(r"0x[0-9a-fA-F]{1,300}")
@@ -102,23 +89,29 @@ def read(text: str, source: str, kind: str = "") -> Section:
 
 def kind_of(raw: Mapping[str, Any]) -> str:
     """The kind of file that a mapping is, by keys that only this kind has; empty if it has none."""
-    return next((kind for kind, keys in KINDS.items() if keys & raw.keys()), "")
+    return next((kind for kind, (_, keys) in KINDS.items() if keys & raw.keys()), "")
 
 
 def override(mapping: Mapping[str, Any], assignment: str, option: str = "") -> Section:
     """A copy of the raw `mapping` with one `key.path=value` of the command line applied.
 
     The value is YAML; a number in the path indexes a list. Keys are not checked here but in
-    `validate`, whose errors name `option`, by default --set. Raises DocumentError where
-    `key.path=` is missing or the value is no YAML.
+    `validate`, whose errors name `option`, by default --set. Raises DocumentError as `assigned`.
     """
-    path, separator, text = assignment.partition("=")
     option = option or f"--set {abridged(assignment)}"
+    path, value = assigned(assignment, option)
+    changed: Section = _with(mapping, path.split("."), value, option)
+    return changed
+
+
+def assigned(assignment: str, option: str = "--set") -> tuple[str, Any]:
+    """The key.path and the value of `key.path=value`. Raises DocumentError, which names `option`,
+    where one of them is missing or the value is no YAML."""
+    path, separator, text = assignment.partition("=")
     keys = [key.strip() for key in path.split(".")]
     if not separator or not all(keys):
         raise DocumentError(f"{option}: expected key.path=value")
-    changed: Section = _with(mapping, keys, _loaded(text, option), option)
-    return changed
+    return ".".join(keys), _loaded(text, option)
 
 
 def validate(

@@ -14,16 +14,22 @@ from offboard.documents.errors import DocumentError, abridged, meant, shown
 SIZE_MOST = 500_000  # characters of a file: a table of 10,000 rows, or 5 s to parse as YAML
 
 PARTS = ("vehicle", "controller", "reference")  # of a flight, each a file of its own
-# kind of file -> its folder
-FOLDERS = {
-    "reference": "references",
-    "controller": "controllers",
-    "vehicle": "vehicles",
-    "scenario": "scenarios",
-    "campaign": "campaigns",
-    "tuning": "tunings",
-    "configuration": "",
-}
+# kind of file -> its folder, and keys that no kind above has
+KINDS = {
+    "reference": ("references", {"shape"}),
+    "controller": ("controllers", {"law"}),
+    "vehicle": ("vehicles", {"mass_kg"}),
+    "scenario": ("scenarios", {"conditions", "faults"}),
+    "campaign": (
+        "campaigns",
+        {
+            "controllers", "references", "vehicles", "sim_vehicles", "firmwares", "scenarios",
+            "parameters", "sample", "search", "seeds", "require", "promises", "keep",
+        },
+    ),
+    "tuning": ("tunings", {"training", "validation"}),
+    "configuration": ("", set(PARTS)),
+}  # fmt: skip
 
 
 def directory() -> Path:
@@ -33,16 +39,21 @@ def directory() -> Path:
     return inside if inside.is_dir() else package.parent / "config"
 
 
+def folder(kind: str) -> Path:
+    """The folder of the files of one kind, for example `scenario`."""
+    return directory() / KINDS[kind][0]
+
+
 def names(kind: str) -> list[str]:
-    """The names of the files of one kind, for example `scenario`, sorted."""
-    return sorted(path.stem for path in (directory() / FOLDERS[kind]).glob("*.yaml"))
+    """The names of the files of one kind, sorted."""
+    return sorted(path.stem for path in folder(kind).glob("*.yaml"))
 
 
 def descriptions(kind: str) -> dict[str, str]:
     """Name -> description of the files of one kind."""
     from offboard.documents.reading import read  # late: --help needs no YAML
 
-    paths = {name: directory() / FOLDERS[kind] / f"{name}.yaml" for name in names(kind)}
+    paths = {name: locate(name, kind) for name in names(kind)}
     return {name: read(read_text(path), str(path)).description for name, path in paths.items()}
 
 
@@ -67,7 +78,7 @@ def locate(name: str, kind: str, others: Sequence[str] = ()) -> Path:
     if is_file(name):
         return Path(name)
     if name in names(kind):
-        return directory() / FOLDERS[kind] / f"{name}.yaml"
+        return folder(kind) / f"{name}.yaml"
     known = sorted({*names(kind), *others})
     near = meant(name, known) or ";"
     raise DocumentError(

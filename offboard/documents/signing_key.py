@@ -18,7 +18,7 @@ import stat
 from functools import partial
 from pathlib import Path
 
-from offboard.documents.errors import UserError, abridged, naming
+from offboard.documents.errors import DocumentError, UserError, abridged
 from offboard.documents.shipped import read_text
 
 KEY_BYTES = 32
@@ -37,8 +37,10 @@ _EXPECTED = (
 def read_key(path: Path) -> bytes:
     """The 32 bytes of the key in the file at `path`. Raises UserError."""
     shown = f"signing key {abridged(path)}"
-    with naming("signing key"):
+    try:
         content = read_text(path).encode()
+    except DocumentError as error:  # not of a configuration
+        raise UserError(f"signing key {error}") from None
     if path.stat().st_mode & _OTHERS:
         raise UserError(f"{shown} can be read or changed by other users: chmod 600 it")
     rows = [row.strip() for row in content.splitlines()]

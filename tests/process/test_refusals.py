@@ -65,7 +65,7 @@ def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
         ("--connect", "udpin:127.0.0.1:0", "give the port that the vehicle sends to"),
         ("--connect", "udpin:127.0.0.1", "is not understood; use udpin:HOST:PORT"),
         ("--connect", "udpin:::1:14540", "an IPv6 address stands in brackets, as in udpin:[::1]"),
-        ("--signing-key", "/dev/null", "signing key: /dev/null cannot be read: not a regular file"),
+        ("--signing-key", "/dev/null", "signing key /dev/null cannot be read: not a regular file"),
         ("--out", "/proc/nowhere", "choose a directory that can be written with --out"),
         ("--firmware", "px4", "--firmware are options of --sitl: add it"),
         ("--vehicle", CONFIG / "campaigns" / "quick.yaml", "is a campaign file; a vehicle file is"),
