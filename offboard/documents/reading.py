@@ -11,7 +11,6 @@ column of its key, the value and what is allowed, in pydantic's words:
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
@@ -29,15 +28,6 @@ if TYPE_CHECKING:
 M = TypeVar("M", bound=BaseModel)
 DESCRIPTION_SIZE = 200
 PROBLEMS_MOST = 10
-
-_INTEGER = re.compile(r"[-+]?[0-9]{1,400}")
-_HEXADECIMAL = re.compile(r"0x[0-9a-fA-F]{1,300}")
-_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
-_WORDS: dict[str, Any] = {
-    "": None, "~": None, "null": None, "Null": None, "NULL": None,
-    "true": True, "True": True, "TRUE": True, "false": False, "False": False, "FALSE": False,
-    ".inf": math.inf, "+.inf": math.inf, "-.inf": -math.inf, ".nan": math.nan,
-}  # fmt: skip
 
 
 class Section(dict[str, Any]):
@@ -104,9 +94,10 @@ def override(mapping: Mapping[str, Any], assignment: str, option: str = "") -> S
     return changed
 
 
-def assigned(assignment: str, option: str = "--set") -> tuple[str, Any]:
-    """The key.path and the value of `key.path=value`. Raises DocumentError, which names `option`,
-    where one of them is missing or the value is no YAML."""
+def assigned(assignment: str, option: str = "") -> tuple[str, Any]:
+    """The key.path and the value of `key.path=value`. Raises DocumentError, which names `option`
+    (by default --set), where one of them is missing or the value is no YAML."""
+    option = option or f"--set {abridged(assignment)}"
     path, separator, text = assignment.partition("=")
     keys = [key.strip() for key in path.split(".")]
     if not separator or not all(keys):
@@ -189,13 +180,52 @@ def _key_path(detail: ErrorDetails, document: Any, source: str) -> tuple[str, st
     return ".".join(keys), source
 
 
+class _Loader(yaml.SafeLoader):
+    """With the scalars of YAML 1.2. Mappings become Sections; aliases, tags and keys that are given
+    twice are errors."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        event: Any = self.peek_event()  # type: ignore[no-untyped-call]
+        if isinstance(event, yaml.AliasEvent) or event.tag is not None:
+            raise _refusal("aliases and tags are not allowed", event)
+        return super().compose_node(parent, index)
+
+    def section(self, node: yaml.MappingNode) -> Section:
+        section = Section({})
+        for key, value in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                raise _refusal("a key must be a single word", key)
+            if key.value in section:
+                raise _refusal(f"the key {key.value!r} is given twice", key)
+            section[key.value] = self.construct_object(value, deep=True)
+            section.places[key.value] = _place(key.start_mark)
+        return section
+
+    def integer(self, node: yaml.ScalarNode) -> int:
+        return int(node.value, 16 if "x" in node.value else 10)
+
+
+_TAG = "tag:yaml.org,2002:"
+_Loader.yaml_implicit_resolvers = {}  # without those of YAML 1.1
+for _kind, _pattern in {
+    "null": "(~|null|Null|NULL|)$",
+    "bool": "(true|True|TRUE|false|False|FALSE)$",
+    "int": "([-+]?[0-9]{1,400}|0x[0-9a-fA-F]{1,300})$",
+    "float": r"([-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.inf|\.nan)$",
+}.items():
+    _Loader.add_implicit_resolver(_TAG + _kind, re.compile(_pattern), None)
+_Loader.add_constructor(f"{_TAG}map", _Loader.section)
+_Loader.add_constructor(f"{_TAG}int", _Loader.integer)
+
+
 def _loaded(text: str, source: str) -> Any:
     try:
-        root = yaml.compose(text, Loader=yaml.BaseLoader)
-        return None if root is None else _value(root, set(), source)
+        loader = _Loader(text)
+        loader.name = source
+        return loader.get_single_data()
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
-        place = _at(mark, source) if mark else source
+        place = _place(mark) if mark else source
         problem = getattr(error, "problem", None) or " ".join(str(error).split())
         wrong = isinstance(error, yaml.scanner.ScannerError | yaml.parser.ParserError)
         hint = "; check indentation, colons and quotes" if wrong else ""
@@ -204,48 +234,12 @@ def _loaded(text: str, source: str) -> Any:
         raise DocumentError(f"{source}: nested too deeply") from None
 
 
-def _at(mark: yaml.Mark, source: str) -> str:
-    return f"{source}, line {mark.line + 1}, column {mark.column + 1}"
+def _place(mark: yaml.Mark) -> str:
+    return f"{mark.name}, line {mark.line + 1}, column {mark.column + 1}"
 
 
-def _value(node: yaml.Node, seen: set[int], source: str) -> Any:
-    """A YAML node -> plain Python, with the scalars of YAML 1.2."""
-    if id(node) in seen:
-        raise _refusal("a value is used twice: aliases are not allowed", node)
-    seen.add(id(node))
-    if node.tag not in _PLAIN_TAGS:
-        raise _refusal("tags are not allowed", node)
-    if isinstance(node, yaml.MappingNode):
-        mapping = Section({})
-        for key, value in node.value:
-            if not isinstance(key, yaml.ScalarNode):
-                raise _refusal("a key must be a single word", key)
-            if key.value in mapping:
-                raise _refusal(f"the key {key.value!r} is given twice", key)
-            mapping[key.value] = _value(value, seen, source)
-            mapping.places[key.value] = _at(key.start_mark, source)
-        return mapping
-    if isinstance(node, yaml.SequenceNode):
-        return [_value(item, seen, source) for item in node.value]
-    plain = getattr(node, "style", None) is None
-    return _scalar(node.value) if plain else node.value
-
-
-_PLAIN_TAGS = {f"tag:yaml.org,2002:{kind}" for kind in ("str", "seq", "map")}
-
-
-def _scalar(text: str) -> Any:
-    if text in _WORDS:
-        return _WORDS[text]
-    if _INTEGER.fullmatch(text):
-        return int(text)
-    if _HEXADECIMAL.fullmatch(text):
-        return int(text, 16)
-    return float(text) if _FLOAT.fullmatch(text) else text
-
-
-def _refusal(problem: str, node: yaml.Node) -> yaml.YAMLError:
-    return yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
+def _refusal(problem: str, where: Any) -> yaml.YAMLError:
+    return yaml.MarkedYAMLError(problem=problem, problem_mark=where.start_mark)
 
 
 def _with(value: Any, keys: list[str], new: Any, option: str) -> Any:
