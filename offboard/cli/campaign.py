@@ -184,11 +184,7 @@ def compare(
         raise UserError("--scenario and --workers are options of the simulator: omit them")
     laws = _names("--controllers", controllers, shipped.names("controller"))
     references = _names("--reference", reference)
-    scenarios = ["connected"] if connect else _names("--scenario", scenario or SCENARIOS)
-    say(
-        f"controllers: {len(laws)}, references: {len(references)}, scenarios: {len(scenarios)}, "
-        f"seeds: {seeds}"
-    )
+    scenarios = _names("--scenario", scenario or SCENARIOS)
     with out.status("checking that all of them can be flown"):
         from offboard.campaign.document import CampaignFile
         from offboard.campaign.run import Campaign

@@ -1,19 +1,20 @@
 """Running a command, `offboard` or `simulator`: what ends it is one sentence and an exit code.
 
-The console scripts import this before anything else, so it imports little: an interrupt during the
-imports of the command is answered too.
+The console scripts import this first, and it imports the command: an interrupt meanwhile is
+answered, too.
 """
 
 from __future__ import annotations
 
 import errno
 import os
+import shutil
 import sys
+import textwrap
 from importlib import import_module
+from typing import Any, NoReturn, TextIO
 
-TYPE_CHECKING = False
-if TYPE_CHECKING:
-    from typing import Any, NoReturn, TextIO
+from offboard.documents.errors import UserError, abridged
 
 USAGE, INTERRUPT, CLOSED_PIPE = 2, 130, 141  # exit codes; the last two as of SIGINT and SIGPIPE
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
@@ -67,12 +68,10 @@ def _told(error: BaseException) -> tuple[str, int]:
         return "not enough memory", USAGE
     if isinstance(error, OSError):
         return explained(error), USAGE
-    from typer import BadParameter, Exit
-
-    from offboard.documents.errors import UserError
-
     if isinstance(error, UserError):
         return str(error), error.code
+    from typer import BadParameter, Exit
+
     if isinstance(error, Exit):
         return "", error.exit_code
     usage_error: Any = BadParameter.__base__  # an unknown option, too; typer does not export it
@@ -95,8 +94,6 @@ def complain(text: str) -> None:
 def tell(text: str, file: TextIO) -> None:
     """Print to a file at once; on a terminal each line is wrapped at words to its width."""
     if file.isatty():
-        import shutil
-
         width = shutil.get_terminal_size().columns
         text = "\n".join(wrapped(line, width, 2) for line in text.splitlines())
     print(text, file=file, flush=True)
@@ -105,8 +102,6 @@ def tell(text: str, file: TextIO) -> None:
 def wrapped(text: str, width: int, indent: int) -> str:
     """A line wrapped at words, further lines indented. Paths and other long words stay whole, so
     that they can be copied."""
-    import textwrap
-
     return textwrap.fill(
         text,
         max(width, 1),  # COLUMNS=0
@@ -120,8 +115,6 @@ def explained(error: OSError) -> str:
     """A sentence for an error of the operating system."""
     reason = error.strerror or str(error)
     if error.filename is not None:
-        from offboard.documents.errors import abridged
-
         return f"{abridged(error.filename)}: {reason}"
     if error.errno in DISK_ERRORS:
         return f"the output cannot be written: {reason}"
