@@ -21,7 +21,6 @@ from offboard.cli.shared import (
     Vehicle,
     Workers,
     absent,
-    known_port,
     out,
     say,
     write_new,
@@ -158,10 +157,7 @@ def compare(
     ] = 3,
     vehicle: Vehicle = None,
     connect: Annotated[
-        str | None,
-        option(
-            "LINK", "Fly the vehicle at this link instead of the simulator.", callback=known_port
-        ),
+        str | None, option("LINK", "Fly the vehicle at this link instead of the simulator.")
     ] = None,
     system: System = None,
     signing_key: SigningKey = None,

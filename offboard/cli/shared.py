@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import inspect
-import re
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from rich.console import Console
 
 from offboard.documents.arguments import FILE, option
 from offboard.documents.command_line import complain, wrapped
-from offboard.documents.errors import UserError, shown
+from offboard.documents.errors import UserError
 from offboard.documents.shipped import PARTS
 from offboard.link.log import new_file
 
@@ -43,13 +42,6 @@ out, err = Output(highlight=False), Output(highlight=False, stderr=True)
 DEFAULT_CONNECTION = "udpin:127.0.0.1:14540"
 REFUSED = 3  # exit code
 FLIGHTS = Path("flights")  # parent of the flight directories that have no --out
-
-
-def known_port(address: str | None) -> str | None:
-    """Refuse to listen on any free port, to which nobody sends."""
-    if address and re.fullmatch(r"(udp|tcp)in:.*:0+", address):
-        raise UserError(f"--connect {shown(address)}: give the port that the vehicle sends to")
-    return address
 
 
 def absent(path: Path | None) -> Path | None:
@@ -102,7 +94,7 @@ Assignments = Annotated[
 class FlightOptions:
     """The options of a flight, the same for every command that flies or checks one."""
 
-    connect: Annotated[str | None, option("LINK", LINK, callback=known_port)] = None
+    connect: Annotated[str | None, option("LINK", LINK)] = None
     system: System = None
     signing_key: SigningKey = None
     config: Annotated[str, option(FILE, "Configuration.")] = "flight"
