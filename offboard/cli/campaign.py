@@ -80,9 +80,9 @@ def campaign(
         part = _shard(shard)
         content, source = read_campaign(file)
         flown = Campaign(content, source, out_directory)
-    open_workers: OpenFlyer = (
-        partial(cluster_workers, scheduler) if scheduler else partial(local_workers, workers)
-    )
+    open_workers: OpenFlyer = partial(local_workers, workers)
+    if scheduler:
+        open_workers = partial(cluster_workers, scheduler)
     if worst is None:
         conclude(flown.fly(open_workers, out, part), flown)
     else:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -18,9 +18,6 @@ from offboard.cli.shared import (
     write,
 )
 from offboard.documents.arguments import option
-
-if TYPE_CHECKING:
-    from offboard.doctor.run import Row
 
 
 def doctor(
@@ -64,27 +61,18 @@ def doctor(
     if as_json:
         write(run.as_json(rows, seen, sentence))
     else:
-        _show(rows, sentence)
+        levels = max(map(len, Level.__members__))
+        width = max((len(row.check) for row in rows), default=0)
+        indent = levels + width + 4
+        for row in rows:
+            # of one with something to say only that
+            said = [f for f in row.findings if f.level is not Level.OK] or row.findings[:1]
+            for finding in said:
+                level = finding.level.name.lower()
+                say(f"{level:<{levels}}  {row.check:<{width}}  {finding.found}", indent)
+                if finding.hint:
+                    say(f"{'':<{indent}}fix: {finding.hint}", indent + 5)
+        out.print()
+        say(sentence)
     if run.worst(rows) is Level.BLOCKS:
         raise typer.Exit(REFUSED)
-
-
-def _show(rows: list[Row], verdict: str) -> None:
-    """One line for each finding, the hint below it; of a row with something to say only that. At
-    the end the verdict."""
-    from offboard.flight.preflight import Level
-
-    levels = max(len(level.name) for level in Level)
-    width = max((len(row.check) for row in rows), default=0)
-    indent = levels + width + 4
-    for row in rows:
-        said = [f for f in row.findings if f.level is not Level.OK] or row.findings[:1]
-        for finding in said:
-            say(
-                f"{finding.level.name.lower():<{levels}}  {row.check:<{width}}  {finding.found}",
-                indent,
-            )
-            if finding.hint:
-                say(f"{'':<{indent}}fix: {finding.hint}", indent + 5)
-    out.print()
-    say(verdict)

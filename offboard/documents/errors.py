@@ -5,6 +5,7 @@ them, and sentences on what happens again and again.
 from __future__ import annotations
 
 import difflib
+import json
 import math
 import sys
 import traceback
@@ -94,15 +95,11 @@ def counted(number: int, noun: str) -> str:
 def plain(value: Any, digits: int | None = None) -> Any:
     """The value for JSON, which has no NaN and no infinity: None for each float that is not finite,
     and lists for tuples; the other floats with `digits` significant digits."""
-    if isinstance(value, dict):
-        return {key: plain(each, digits) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(each, digits) for each in value]
-    if isinstance(value, float):
-        if not math.isfinite(value):
-            return None
-        return float(f"{value:.{digits}g}") if digits else value
-    return value
+
+    def number(text: str) -> float:
+        return float(f"{float(text):.{digits}g}" if digits else text)
+
+    return json.loads(json.dumps(value), parse_float=number, parse_constant=lambda _: None)
 
 
 def install(extra: str) -> str:

@@ -53,8 +53,8 @@ def descriptions(kind: str) -> dict[str, str]:
     """Name -> description of the files of one kind."""
     from offboard.documents.reading import read  # late: --help needs no YAML
 
-    paths = {name: locate(name, kind) for name in names(kind)}
-    return {name: read(read_text(path), str(path)).description for name, path in paths.items()}
+    paths = sorted(folder(kind).glob("*.yaml"))
+    return {path.stem: read(read_text(path), str(path)).description for path in paths}
 
 
 def overview(*kinds: str) -> str:
