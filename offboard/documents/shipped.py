@@ -6,7 +6,6 @@ In an installed package `config/` lies inside the package, in a checkout beside 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib import resources
 from pathlib import Path
 
 from offboard.documents.errors import DocumentError, abridged, meant, shown
@@ -34,7 +33,7 @@ KINDS = {
 
 def directory() -> Path:
     """The folder of the shipped configuration."""
-    package = Path(str(resources.files("offboard")))
+    package = Path(__file__).parents[1]
     inside = package / "_config"
     return inside if inside.is_dir() else package.parent / "config"
 

@@ -85,6 +85,7 @@ def test_what_cannot_be_flown_is_refused(
 @pytest.mark.parametrize(
     ("command", "says"),
     [
+        ("offboard flyy", "No such command 'flyy'"),
         ("offboard doctor gsp", "there is no check named 'gsp'; known are port, vehicle,"),
         ("offboard daemon --print-unit --out here", "can write below /var/lib/offboard alone"),
         ("offboard paper --quick --seeds 20 --table none", "--quick is --seeds 1: use one of them"),
