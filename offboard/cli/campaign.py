@@ -39,6 +39,14 @@ PROFILE = ("-o", "--out")  # the option
 GROUPS_SHOWN = 30  # of a table in the terminal
 
 
+def shard_of(text: str) -> slice:
+    """The cases of shard I/N: every N-th."""
+    matched = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
+    if not matched or not 1 <= int(matched[1]) <= int(matched[2]):
+        raise typer.BadParameter(f"{text!r}: give I/N with I from 1 to N, for example 2/4")
+    return slice(int(matched[1]) - 1, None, int(matched[2]))
+
+
 def campaign(
     file: Annotated[str, typer.Argument(metavar=FILE, help="Campaign: a shipped name or a file.")],
     out_directory: Annotated[
@@ -50,7 +58,8 @@ def campaign(
         str | None, option("ADDRESS", "Fly on a dask cluster, for example tcp://HOST:8786.")
     ] = None,
     shard: Annotated[
-        str | None, option("I/N", "Fly part I of N; the same --out, or copied together.")
+        slice | None,
+        option("I/N", "Fly part I of N; the same --out, or copied together.", parser=shard_of),
     ] = None,
     worst: Annotated[
         int | None, option("K", "Search for K failures that differ instead.", min=1, max=100)
@@ -77,26 +86,15 @@ def campaign(
         from offboard.campaign.run import Campaign
         from offboard.campaign.workers import cluster_workers, local_workers
 
-        part = _shard(shard)
         content, source = read_campaign(file)
         flown = Campaign(content, source, out_directory)
     open_workers: OpenFlyer = partial(local_workers, workers)
     if scheduler:
         open_workers = partial(cluster_workers, scheduler)
     if worst is None:
-        conclude(flown.fly(open_workers, out, part), flown)
+        conclude(flown.fly(open_workers, out, shard or slice(None)), flown)
     else:
         _search(flown, source, worst, open_workers)
-
-
-def _shard(text: str | None) -> slice:
-    """The cases of shard I/N: every N-th."""
-    if text is None:
-        return slice(None)
-    matched = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
-    if not matched or not 1 <= int(matched[1]) <= int(matched[2]):
-        raise UserError(f"--shard {text}: give I/N with I from 1 to N, for example 2/4")
-    return slice(int(matched[1]) - 1, None, int(matched[2]))
 
 
 def conclude(summary: Summary, flown: Campaign) -> None:

@@ -63,9 +63,7 @@ LINK = (
 Vehicle = Annotated[str | None, option(FILE, "Vehicle.")]
 System = Annotated[
     int | None,
-    typer.Option(
-        metavar="N", min=1, max=255, help="System id of the vehicle, where several are heard."
-    ),
+    option("N", "System id of the vehicle, where several are heard.", min=1, max=255),
 ]
 SigningKey = Annotated[
     Path | None,
@@ -75,8 +73,7 @@ Report = Annotated[
     bool, typer.Option(envvar="OFFBOARD_REPORT", help="Write report.html after each flight.")
 ]
 Workers = Annotated[
-    int | None,
-    typer.Option(metavar="N", min=1, max=256, help="Processes.  [default: one per processor]"),
+    int | None, option("N", "Processes.  [default: one per processor]", min=1, max=256)
 ]
 Requirements = Annotated[
     list[str] | None,
