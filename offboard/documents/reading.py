@@ -1,9 +1,9 @@
 """Reads configuration: YAML text -> validated value, or sentences that say what is wrong in it.
 
-Every configuration file goes through `parse`: text in, frozen pydantic value out. Scalars follow
-YAML 1.2 (`1e-3` is a number, `no` and `12:30` are text) and are checked strictly (no text for
-numbers, no true for 1); duplicate keys, aliases and tags are refused. A problem names the line and
-column of its key, the value and what is allowed, in pydantic's words:
+Every configuration file goes through `read` and `validate`: text in, frozen pydantic value out.
+Scalars follow YAML 1.2 (`1e-3` is a number, `no` and `12:30` are text) and are checked strictly (no
+text for numbers, no true for 1); duplicate keys, aliases and tags are refused. A problem names the
+line and column of its key, the value and what is allowed, in pydantic's words:
 
     flight.yaml, line 4, column 1: period_s: 7 should be less than or equal to 0.5
 """
@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import yaml
@@ -20,7 +21,7 @@ from pydantic import BaseModel, ValidationError
 from yaml.representer import SafeRepresenter
 
 from offboard.documents.errors import DocumentError, abridged, counted, meant, shown
-from offboard.documents.shipped import KINDS
+from offboard.documents.shipped import KINDS, locate, read_text
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -42,6 +43,13 @@ class Section(dict[str, Any]):
 
 
 yaml.add_representer(Section, SafeRepresenter.represent_dict, Dumper=yaml.SafeDumper)
+
+
+def load_document(name: str | Path, kind: str, model: type[M]) -> tuple[M, str]:
+    """The value of a shipped file by name, or of a file, and its path for errors. Raises
+    DocumentError."""
+    path = name if isinstance(name, Path) else locate(name, kind)
+    return parse(read_text(path), model, str(path), kind), str(path)
 
 
 def parse(text: str, model: type[M], source: str, kind: str = "") -> M:
