@@ -182,4 +182,5 @@ def _conclude(
     except OSError as error:  # the exit code stays that of the flight
         drop(sys.stdout)
         complain(f"{outcome.sentence}; {explained(error)}")
-    raise typer.Exit(code)
+    if code:
+        raise typer.Exit(code)
