@@ -7,6 +7,7 @@ from __future__ import annotations
 import difflib
 import json
 import math
+import os
 import sys
 import traceback
 from collections.abc import Iterable, Iterator
@@ -42,15 +43,16 @@ class DocumentError(UserError):
 
 def located(error: BaseException) -> str:
     """An exception of code from outside, such as a controller, in one sentence with file and line
-    of the mistake: of the innermost call in the package that was called from here. Reads no file.
-    Never raises an exception of its own."""
-    calls = [
-        (str(frame.f_globals.get("__name__")).partition(".")[0], frame.f_code.co_filename, line)
-        for frame, line in traceback.walk_tb(error.__traceback__)
-    ]
-    called = next((package for package, *_ in calls if package not in _OURS), "offboard")
-    theirs = [place for package, *place in calls if package == called]
-    place = " ({}:{})".format(*theirs[-1]) if theirs else ""
+    of the mistake: of the innermost call in the package or folder that was called from here. Reads
+    no file. Never raises an exception of its own."""
+    calls = []  # package, folder, place
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        package = str(frame.f_globals.get("__name__")).partition(".")[0]
+        file = frame.f_code.co_filename
+        calls.append((package, os.path.dirname(file), f" ({file}:{line})"))
+    called = next((each for each in calls if each[0] not in _OURS), ("offboard", None))
+    theirs = [each[2] for each in calls if each[0] == called[0] or each[1] == called[1]]
+    place = theirs[-1] if theirs else ""
     try:
         said = str(error)
     except Exception:
