@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from offboard.documents.command_line import run
+from typing import NoReturn
 
-TYPE_CHECKING = False
-if TYPE_CHECKING:
-    from typing import NoReturn
+from offboard.documents.command_line import run
 
 
 def main() -> NoReturn:

@@ -6,19 +6,18 @@ import math
 import sys
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, NoReturn
 
 import typer
 
 from offboard.documents import shipped
-from offboard.documents.arguments import Command
+from offboard.documents.arguments import FILE, Command, option
 from offboard.documents.command_line import tell
 from offboard.documents.errors import UserError
 from simulator.options import COMPANION_PORT, NO_LINK, Options, Stop
 
 GROUND_PORT = 14550
 SYSTEM_MAX = 250
-FILE = "NAME|FILE"  # the name of a shipped file, or a path
 
 GROUND_LINK = f"udpout:127.0.0.1:{GROUND_PORT}"
 LINKS = (
@@ -33,48 +32,43 @@ EXIT_CODES = (
     "(--lockstep)."
 )
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
-
-
-def _option(metavar: str, text: str, **limits: Any) -> Any:
-    """A command-line option with a value, named as its parameter."""
-    return typer.Option(metavar=metavar, help=text, **limits)
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
 @app.command(cls=Command, epilog=f"{shipped.overview('vehicle', 'scenario')}\n\n{EXIT_CODES}")
 def simulate(
-    connect: Annotated[str | None, _option("LINK", LINKS)] = None,
-    gcs: Annotated[str, _option("LINK", f"Ground station link, or {NO_LINK}.")] = GROUND_LINK,
-    firmware: Annotated[str, _option("NAME", "px4 or ardupilot.")] = "px4",
+    connect: Annotated[str | None, option("LINK", LINKS)] = None,
+    gcs: Annotated[str, option("LINK", f"Ground station link, or {NO_LINK}.")] = GROUND_LINK,
+    firmware: Annotated[str, option("NAME", "px4 or ardupilot.")] = "px4",
     speed: Annotated[
-        float | None, _option("FACTOR", "Multiple of real time, 0.1 .. 1000.  [default: 1]")
+        float | None, option("FACTOR", "Multiple of real time, 0.1 .. 1000.  [default: 1]")
     ] = None,
     lockstep: Annotated[
         bool, typer.Option("--lockstep", help="Virtual time that waits for the companion.")
     ] = False,
-    seed: Annotated[int, _option("N", "Random seed.", min=0, max=2**32 - 1)] = 7,
+    seed: Annotated[int, option("N", "Random seed.", min=0, max=2**32 - 1)] = 7,
     scenario: Annotated[
-        str | None, _option(FILE, "Scenario.  [default: estimator errors of the firmware]")
+        str | None, option(FILE, "Scenario.  [default: estimator errors of the firmware]")
     ] = None,
     vehicle: Annotated[
-        str | None, _option(FILE, "Vehicle.  [default: SITL vehicle of the firmware]")
+        str | None, option(FILE, "Vehicle.  [default: SITL vehicle of the firmware]")
     ] = None,
     param: Annotated[
-        list[str] | None, _option("NAME=VALUE", "Set a parameter of the autopilot; repeatable.")
+        list[str] | None, option("NAME=VALUE", "Set a parameter of the autopilot; repeatable.")
     ] = None,
     duration: Annotated[
-        float | None, _option("SECONDS", "Stop after this vehicle time.", min=0.0)
+        float | None, option("SECONDS", "Stop after this vehicle time.", min=0.0)
     ] = None,
-    instance: Annotated[int, _option("N", "Added to ports and system id.", min=0, max=249)] = 0,
-    instances: Annotated[int, _option("N", "Number of vehicles.", min=1, max=100)] = 1,
-    patience: Annotated[float | None, _option("SECONDS", PATIENCE, min=0.1, max=600.0)] = None,
+    instance: Annotated[int, option("N", "Added to ports and system id.", min=0, max=249)] = 0,
+    instances: Annotated[int, option("N", "Number of vehicles.", min=1, max=100)] = 1,
+    patience: Annotated[float | None, option("SECONDS", PATIENCE, min=0.1, max=600.0)] = None,
     signing_key: Annotated[
-        Path | None, _option("FILE", "Sign and require signatures, see `offboard key`.")
+        Path | None, option("FILE", "Sign and require signatures, see `offboard key`.")
     ] = None,
     log: Annotated[
-        Path | None, _option("FILE", "Record the companion link as a .tlog; a new file.")
+        Path | None, option("FILE", "Record the companion link as a .tlog; a new file.")
     ] = None,
-    check: Annotated[Path | None, _option("FILE", "Check a scenario file and exit.")] = None,
+    check: Annotated[Path | None, option("FILE", "Check a scenario file and exit.")] = None,
     show_version: Annotated[
         bool, typer.Option("--version", help="Print the version and exit.")
     ] = False,
@@ -97,9 +91,9 @@ def simulate(
         _list_scenarios()
     if check is not None:
         _check(check)
-    for seconds, option in ((duration, "--duration"), (patience, "--patience")):
+    for seconds, name in ((duration, "--duration"), (patience, "--patience")):
         if seconds is not None and math.isnan(seconds):
-            raise UserError(f"{option} nan: must be a number")
+            raise UserError(f"{name} nan: must be a number")
     _check_speed(speed, lockstep=lockstep)
     _check_numbers(instance, instances, lockstep=lockstep)
     stopping = Stop()

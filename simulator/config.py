@@ -6,8 +6,7 @@ from pydantic import Field
 
 from offboard.documents.errors import DocumentError
 from offboard.documents.parameters import Parameters
-from offboard.documents.reading import M, parse
-from offboard.documents.shipped import locate, read_text
+from offboard.documents.reading import load_document
 from offboard.model.vehicle import Vehicle
 from simulator.faults import Fault
 from simulator.faults.link import Stranger
@@ -31,7 +30,7 @@ class Scenario(Parameters):
 
 def scenario(name: str) -> Scenario:
     """A shipped scenario or a file. Raises DocumentError."""
-    return _load(name, "scenario", Scenario)
+    return load_document(name, "scenario", Scenario)[0]
 
 
 def check_for(flown: Scenario, firmware: Firmware, *, lockstep: bool) -> None:
@@ -51,9 +50,4 @@ def check_for(flown: Scenario, firmware: Firmware, *, lockstep: bool) -> None:
 
 def vehicle(name: str) -> Vehicle:
     """A shipped vehicle or a file. Raises DocumentError."""
-    return _load(name, "vehicle", Vehicle)
-
-
-def _load(name: str, kind: str, model: type[M]) -> M:
-    path = locate(name, kind)
-    return parse(read_text(path), model, str(path), kind)
+    return load_document(name, "vehicle", Vehicle)[0]

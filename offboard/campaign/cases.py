@@ -106,9 +106,9 @@ class Case:
         }
         words = ["offboard", "fly", *(("--connect", self.link) if self.link else ("--sitl",))]
         for option, name in named.items():
-            words += [f"--{option}", _place(name)] if name else []
+            words += [f"--{option}", shipped.absolute(name)] if name else []
         if not self.link:
-            words += ["--scenario", self.scenario_file or _place(self.scenario)]
+            words += ["--scenario", self.scenario_file or shipped.absolute(self.scenario)]
         for assignment in self.assignments:
             words += ["--set", assignment]
         return shlex.join([*words, "--seed", str(self.seed)])
@@ -177,11 +177,6 @@ def drawn(sample: Sample) -> list[Values]:
         tuple(zip(sample.ranges, plain(point, DIGITS), strict=True))
         for point in (low + unit.random(sample.draws) * (high - low)).tolist()
     ]
-
-
-def _place(name: str) -> str:
-    """A name, or the absolute path of a file."""
-    return str(Path(name).absolute()) if shipped.is_file(name) else name
 
 
 def _digests(case: Case) -> tuple[tuple[str, str], ...]:

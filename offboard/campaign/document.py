@@ -17,10 +17,9 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from offboard.analysis.score import Requirement
-from offboard.documents import shipped
 from offboard.documents.errors import UserError
 from offboard.documents.parameters import Parameters
-from offboard.documents.reading import parse
+from offboard.documents.reading import load_document
 
 CASES_MOST, SEEDS_MOST = 1_000_000, 100_000
 
@@ -136,5 +135,4 @@ class CampaignFile(Parameters):
 
 def read_campaign(name: str | Path) -> tuple[CampaignFile, str]:
     """A shipped campaign or a file, and its path for errors. Raises DocumentError."""
-    path = name if isinstance(name, Path) else shipped.locate(name, "campaign")
-    return parse(shipped.read_text(path), CampaignFile, str(path), "campaign"), str(path)
+    return load_document(name, "campaign", CampaignFile)

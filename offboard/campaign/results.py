@@ -18,7 +18,7 @@ from offboard.link.log import replace_file
 from offboard.run.sitl import registered
 
 # of plans, whose flights are hashed case by case
-PLANS = {shipped.FOLDERS["campaign"], shipped.FOLDERS["tuning"]}
+PLANS = {shipped.folder(kind).name for kind in ("campaign", "tuning")}
 PACKAGES = ("numpy", "scipy", "numba", "pymavlink", "daqp", "control")
 INFEASIBLE = "infeasible"
 

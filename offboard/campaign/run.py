@@ -37,8 +37,14 @@ LINES = 20
 Fly = Callable[[Sequence[Case]], list[Record]]  # see `flying`
 
 
-class Incomplete(Exception):
-    """No further flight begins. `str()` says why, empty by request."""
+class Incomplete(UserError):
+    """No further flight begins, for this `reason`, and the same command may go on."""
+
+    code = 4
+
+    def __init__(self, reason: str = "interrupted") -> None:
+        super().__init__(f"{reason}: run the same command again to go on")
+        self.reason = reason
 
 
 class Progress(Status):
@@ -142,14 +148,17 @@ def flying(
         seen.update(known)
         return records
 
-    with StopRequests() as stops, progress, ExitStack() as stack:
-        yield fly
+    try:
+        with StopRequests() as stops, progress, ExitStack() as stack:
+            yield fly
+    except KeyboardInterrupt:
+        raise Incomplete from None
 
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """The state of a campaign. `mine_missing` of this shard; `stopped`: why flights are missing, if
-    not by request; `kept`: the directories of the flights whose logs are kept."""
+    """The state of a campaign. `mine_missing` of this shard; `stopped`: why no further flight
+    began, empty if all did; `kept`: the directories of the flights whose logs are kept."""
 
     planned: int
     rows: Sequence[Row]
@@ -211,10 +220,8 @@ class Campaign:
         try:
             with self.flying(open_flyer, Progress(console, len(mine))) as fly:
                 fly(mine)
-        except Incomplete as reason:
-            stopped = str(reason)
-        except KeyboardInterrupt:
-            pass
+        except Incomplete as error:
+            stopped = error.reason
         finished = -1
         try:
             while finished != self.results.finished():  # another shard may have ended meanwhile

@@ -27,7 +27,7 @@ from offboard.campaign.search import ask, study_of
 from offboard.campaign.table import CONFIDENCE, METRIC_COLUMNS
 from offboard.documents.errors import DocumentError, naming, plain
 from offboard.documents.parameters import Parameters
-from offboard.documents.reading import override, parse, read
+from offboard.documents.reading import load_document, override, read
 from offboard.documents.shipped import PARTS, locate, read_text
 from offboard.run.configuration import read_part
 
@@ -97,12 +97,11 @@ def judge(base: Sequence[float], candidate: Sequence[float], values: Values = ()
 
 def read_tune(name: str | Path) -> tuple[TuneFile, str]:
     """A shipped tuning or a file, and its path for errors. Raises DocumentError."""
-    path = name if isinstance(name, Path) else locate(name, "tuning")
-    file = parse(read_text(path), TuneFile, str(path), "tuning")
+    file, source = load_document(name, "tuning", TuneFile)
     for key in file.ranges:
         if key.startswith((SCENARIO, "vehicle.")):
-            raise DocumentError(f"{path}: ranges.{key}: no scenario and no vehicle is tuned")
-    return file, str(path)
+            raise DocumentError(f"{source}: ranges.{key}: no scenario and no vehicle is tuned")
+    return file, source
 
 
 class Tuning:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Sequence
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -20,29 +20,35 @@ from offboard.cli.shared import (
     System,
     Vehicle,
     Workers,
-    check_new,
-    known_port,
-    option,
+    absent,
     out,
     say,
     write_new,
 )
 from offboard.documents import shipped
+from offboard.documents.arguments import FILE, option
 from offboard.documents.errors import UserError, counted
 
 if TYPE_CHECKING:
     from offboard.campaign.run import Campaign, Summary
     from offboard.campaign.workers import OpenFlyer
 
-NAME = typer.Argument(metavar="NAME|FILE", help="Campaign: a shipped name or a file.")
-TUNING = typer.Argument(metavar="NAME|FILE", help="Tuning: a shipped name or a file.")
 NAMES = "Names or files, separated by commas"
 SCENARIOS = "calm,px4_like"
+PROFILE = ("-o", "--out")  # the option
 GROUPS_SHOWN = 30  # of a table in the terminal
 
 
+def shard_of(text: str) -> slice:
+    """The cases of shard I/N: every N-th."""
+    matched = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
+    if not matched or not 1 <= int(matched[1]) <= int(matched[2]):
+        raise typer.BadParameter(f"{text!r}: give I/N with I from 1 to N, for example 2/4")
+    return slice(int(matched[1]) - 1, None, int(matched[2]))
+
+
 def campaign(
-    file: Annotated[str, NAME],
+    file: Annotated[str, typer.Argument(metavar=FILE, help="Campaign: a shipped name or a file.")],
     out_directory: Annotated[
         Path,
         option("DIR", "Directory of table, page and results; continued if it exists.", "--out"),
@@ -52,7 +58,8 @@ def campaign(
         str | None, option("ADDRESS", "Fly on a dask cluster, for example tcp://HOST:8786.")
     ] = None,
     shard: Annotated[
-        str | None, option("I/N", "Fly part I of N; the same --out, or copied together.")
+        slice | None,
+        option("I/N", "Fly part I of N; the same --out, or copied together.", parser=shard_of),
     ] = None,
     worst: Annotated[
         int | None, option("K", "Search for K failures that differ instead.", min=1, max=100)
@@ -79,38 +86,15 @@ def campaign(
         from offboard.campaign.run import Campaign
         from offboard.campaign.workers import cluster_workers, local_workers
 
-        part = _shard(shard)
         content, source = read_campaign(file)
         flown = Campaign(content, source, out_directory)
-    open_workers: OpenFlyer = (
-        partial(cluster_workers, scheduler) if scheduler else partial(local_workers, workers)
-    )
+    open_workers: OpenFlyer = partial(local_workers, workers)
+    if scheduler:
+        open_workers = partial(cluster_workers, scheduler)
     if worst is None:
-        conclude(flown.fly(open_workers, out, part), flown)
+        conclude(flown.fly(open_workers, out, shard or slice(None)), flown)
     else:
         _search(flown, source, worst, open_workers)
-
-
-def _shard(text: str | None) -> slice:
-    """The cases of shard I/N: every N-th."""
-    if text is None:
-        return slice(None)
-    matched = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
-    if not matched or not 1 <= int(matched[1]) <= int(matched[2]):
-        raise UserError(f"--shard {text}: give I/N with I from 1 to N, for example 2/4")
-    return slice(int(matched[1]) - 1, None, int(matched[2]))
-
-
-@contextmanager
-def resumable() -> Iterator[None]:
-    """Exit with 4 where the same command may go on: interrupted, a full disk for example."""
-    from offboard.campaign.run import Incomplete
-
-    try:
-        yield
-    except (Incomplete, KeyboardInterrupt) as reason:
-        ended = str(reason) or "interrupted; finished flights are kept"
-        raise UserError(f"{ended}: run the same command again to go on", 4) from None
 
 
 def conclude(summary: Summary, flown: Campaign) -> None:
@@ -145,7 +129,7 @@ def _search(flown: Campaign, source: str, count: int, open_workers: OpenFlyer) -
 
     search = FailureSearch(flown, source)
     progress = Progress(out, search.flights_most(count))
-    with resumable(), flown.flying(open_workers, progress) as fly:
+    with flown.flying(open_workers, progress) as fly:
         failures = search.find(count, fly)
     unflown = sum(row.record.infeasible for row in flown.rows())
     cannot = f", {unflown} cannot be flown (the table says why)" if unflown else ""
@@ -171,10 +155,7 @@ def compare(
     ] = 3,
     vehicle: Vehicle = None,
     connect: Annotated[
-        str | None,
-        option(
-            "LINK", "Fly the vehicle at this link instead of the simulator.", callback=known_port
-        ),
+        str | None, option("LINK", "Fly the vehicle at this link instead of the simulator.")
     ] = None,
     system: System = None,
     signing_key: SigningKey = None,
@@ -197,15 +178,12 @@ def compare(
         raise UserError("--scenario and --workers are options of the simulator: omit them")
     laws = _names("--controllers", controllers, shipped.names("controller"))
     references = _names("--reference", reference)
-    scenarios = ["connected"] if connect else _names("--scenario", scenario or SCENARIOS)
-    say(
-        f"controllers: {len(laws)}, references: {len(references)}, scenarios: {len(scenarios)}, "
-        f"seeds: {seeds}"
-    )
+    scenarios = _names("--scenario", scenario or SCENARIOS)
     with out.status("checking that all of them can be flown"):
         from offboard.campaign.document import CampaignFile
         from offboard.campaign.run import Campaign
         from offboard.campaign.workers import ConnectedVehicle, local_workers
+        from offboard.documents.reading import assigned
         from offboard.link import clock
 
         file = CampaignFile(
@@ -213,7 +191,7 @@ def compare(
             references=tuple(references),
             scenarios=None if connect else tuple(scenarios),
             vehicles=(vehicle,) if vehicle else None,
-            parameters=dict(map(_parameter, assignments or ())),
+            parameters={key: (value,) for key, value in map(assigned, assignments or ())},
             seeds=tuple(range(1, seeds + 1)),
             keep=True,
         )
@@ -226,17 +204,6 @@ def compare(
     conclude(flown.fly(open_flyer, out), flown)
 
 
-def _parameter(assignment: str) -> tuple[str, tuple[Any]]:
-    """Key and value of `key.path=value`, as a campaign's parameter. Raises DocumentError."""
-    from offboard.documents.reading import override
-
-    value: Any = override({}, assignment)
-    key = assignment.partition("=")[0]
-    for part in key.split("."):
-        value = value[part.strip()]
-    return key, (value,)
-
-
 def _names(name: str, text: str, known: Sequence[str] = ()) -> list[str]:
     """Comma-separated names, each once; 'all' stands for every known one."""
     parts = [part.strip() for part in text.split(",") if part.strip()]
@@ -246,9 +213,10 @@ def _names(name: str, text: str, known: Sequence[str] = ()) -> list[str]:
 
 
 def tune(
-    file: Annotated[str, TUNING],
+    file: Annotated[str, typer.Argument(metavar=FILE, help="Tuning: a shipped name or a file.")],
     profile: Annotated[
-        Path, option("FILE", "Flight configuration to write; a new file.", "-o", "--out")
+        Path,
+        option("FILE", "Flight configuration to write; a new file.", *PROFILE, callback=absent),
     ] = Path("profile.yaml"),
     workers: Workers = None,
 ) -> None:
@@ -261,7 +229,6 @@ def tune(
     Exit codes: 0 a better configuration is written; 1 none is better; 2 usage or configuration
     error; 4 interrupted: the same command goes on.
     """
-    check_new(profile, "--out")
     with out.status("planning"):
         from offboard.campaign.document import Promises
         from offboard.campaign.results import Results, code_hash
@@ -273,10 +240,7 @@ def tune(
         tuning = Tuning(*read_tune(file))
         results = Results(profile.with_name(f"{profile.name}.tune"), code_hash())
     progress = Progress(out, tuning.flights)
-    with (
-        resumable(),
-        flying(results, Promises(), partial(local_workers, workers), progress) as fly,
-    ):
+    with flying(results, Promises(), partial(local_workers, workers), progress) as fly:
         tuned = tuning.run(
             fly,
             lambda number, cost: say(f"{number} of {tuning.file.trials} trials, best {cost:.4g}"),

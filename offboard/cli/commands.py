@@ -8,43 +8,37 @@ from typing import Annotated
 import typer
 
 from offboard.cli import campaign, daemon, doctor, files, fly, logs, paper
-from offboard.cli.shared import out
+from offboard.cli.shared import grouped, out, write
 from offboard.documents import shipped
 from offboard.documents.arguments import Command
+from offboard.documents.command_line import USAGE
 
-app = typer.Typer(
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-)
-
-
-def _version(wanted: bool) -> None:
-    if wanted:
-        out.print(f"pso-offboard {version('pso-offboard')}")
-        raise typer.Exit
+app = typer.Typer(invoke_without_command=True, add_completion=False, rich_markup_mode=None)
 
 
 @app.callback()
 def offboard(
-    show_version: Annotated[
-        bool,
-        typer.Option("--version", callback=_version, is_eager=True, help="Print the version."),
-    ] = False,
+    context: typer.Context,
+    show_version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
 ) -> None:
     """Fly a trajectory over MAVLink with a particle-swarm receding-horizon law, and score it."""
+    if show_version:
+        out.print(f"pso-offboard {version('pso-offboard')}")
+        raise typer.Exit
+    if context.invoked_subcommand is None:
+        write(f"{context.get_help()}\n")
+        raise typer.Exit(USAGE)
 
 
 # the commands in the order of --help, and the kinds of shipped files that theirs names
 for command, kinds in (
-    (fly.fly, (*shipped.PARTS, "scenario")),
-    (daemon.daemon, shipped.PARTS),
-    (doctor.doctor, ()),
+    (grouped(fly.fly), (*shipped.PARTS, "scenario")),
+    (grouped(daemon.daemon), shipped.PARTS),
+    (grouped(doctor.doctor), ()),
     (logs.score, ()),
     (logs.report, ()),
     (files.check, ()),
-    (logs.identify, (*shipped.PARTS, "scenario")),
+    (grouped(logs.identify), (*shipped.PARTS, "scenario")),
     (campaign.compare, (*shipped.PARTS, "scenario")),
     (campaign.campaign, ("campaign",)),
     (campaign.tune, ("tuning",)),

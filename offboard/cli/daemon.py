@@ -15,21 +15,19 @@ from offboard.cli.shared import (
     REFUSED,
     FlightOptions,
     Report,
-    grouped,
-    option,
     out,
     say,
     write,
 )
+from offboard.documents.arguments import option
 from offboard.documents.command_line import DISK_ERRORS, complain, explained
 from offboard.documents.errors import UserError
-from offboard.documents.shipped import is_file
+from offboard.documents.shipped import absolute
 
 STATE = Path("/var/lib/offboard")  # of the unit
 OUT = f"Directory of the flights' directories.  [default: {FLIGHTS}]"
 
 
-@grouped
 def daemon(
     options: FlightOptions,
     anchor: Annotated[
@@ -125,9 +123,13 @@ def _print_unit(options: FlightOptions, out_directory: Path | None) -> None:
         )
     if options.signing_key:
         read_key(options.signing_key)
-    words = [word for word in sys.argv[sys.argv.index("daemon") + 1 :] if word != "--print-unit"]
-    arguments = [_absolute(word) for word in _without("--signing-key", words)]
-    sys.stdout.write(unit(arguments, options.connection().address, options.signing_key))
+    arguments = [
+        _absolute(word)
+        for word in sys.argv[sys.argv.index("daemon") + 1 :]
+        if word.partition("=")[0] not in ("--print-unit", "--signing-key")
+        and Path(word) != options.signing_key
+    ]
+    write(unit(arguments, options.connection().address, options.signing_key))
     installed = [Path(sys.executable), Path(offboard.__path__[0])]
     files = (options.config, options.controller, options.reference, options.vehicle)
     named = [Path(file) for file in files if file and Path(file).is_file()]
@@ -136,19 +138,9 @@ def _print_unit(options: FlightOptions, out_directory: Path | None) -> None:
             complain(hidden)
 
 
-def _without(option: str, words: list[str]) -> list[str]:
-    """The words without an option and its value."""
-    before = ["", *words]
-    return [
-        word
-        for word, previous in zip(words, before, strict=False)
-        if option not in (word, previous) and not word.startswith(f"{option}=")
-    ]
-
-
 def _absolute(word: str) -> str:
     """A file is named by its whole path: the unit runs in another directory."""
     option, equals, value = word.partition("=") if word.startswith("--") else ("", "", word)
-    if not (is_file(value) and Path(value).exists()):
+    if not Path(value).exists():
         return word
-    return f"{option}{equals}{Path(value).absolute()}"
+    return f"{option}{equals}{absolute(value)}"

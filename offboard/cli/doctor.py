@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -13,17 +12,14 @@ from offboard.cli.shared import (
     REFUSED,
     FlightOptions,
     err,
-    grouped,
-    option,
     out,
     say,
+    say_each,
+    write,
 )
-
-if TYPE_CHECKING:
-    from offboard.doctor.run import Row
+from offboard.documents.arguments import option
 
 
-@grouped
 def doctor(
     options: FlightOptions,
     names: Annotated[
@@ -52,9 +48,7 @@ def doctor(
 
     chosen = run.names(names or ())
     if listing:
-        width = max(map(len, chosen))
-        for name in chosen:
-            say(f"{name:<{width}}  {run.summary(name)}", indent=width + 2)
+        say_each({name: run.summary(name) for name in chosen}, margin=0)
         return
     flight = options.load()
     with err.status("opening the link") as status:  # a line on a terminal, nothing elsewhere
@@ -65,29 +59,20 @@ def doctor(
         rows = run.examine(chosen, seen)
     sentence = run.verdict(rows, complete=not names)
     if as_json:
-        sys.stdout.write(run.as_json(rows, seen, sentence))
+        write(run.as_json(rows, seen, sentence))
     else:
-        _show(rows, sentence)
+        levels = max(map(len, Level.__members__))
+        width = max((len(row.check) for row in rows), default=0)
+        indent = levels + width + 4
+        for row in rows:
+            # of one with something to say only that
+            said = [f for f in row.findings if f.level is not Level.OK] or row.findings[:1]
+            for finding in said:
+                level = finding.level.name.lower()
+                say(f"{level:<{levels}}  {row.check:<{width}}  {finding.found}", indent)
+                if finding.hint:
+                    say(f"{'':<{indent}}fix: {finding.hint}", indent + 5)
+        out.print()
+        say(sentence)
     if run.worst(rows) is Level.BLOCKS:
         raise typer.Exit(REFUSED)
-
-
-def _show(rows: list[Row], verdict: str) -> None:
-    """One line for each finding, the hint below it; of a row with something to say only that. At
-    the end the verdict."""
-    from offboard.flight.preflight import Level
-
-    levels = max(len(level.name) for level in Level)
-    width = max((len(row.check) for row in rows), default=0)
-    indent = levels + width + 4
-    for row in rows:
-        said = [f for f in row.findings if f.level is not Level.OK] or row.findings[:1]
-        for finding in said:
-            say(
-                f"{finding.level.name.lower():<{levels}}  {row.check:<{width}}  {finding.found}",
-                indent,
-            )
-            if finding.hint:
-                say(f"{'':<{indent}}fix: {finding.hint}", indent + 5)
-    out.print()
-    say(verdict)

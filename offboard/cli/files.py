@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from offboard.cli.shared import out, say
+from offboard.cli.shared import out, say, say_each
 from offboard.documents import shipped
 from offboard.documents.errors import DocumentError, UserError, naming
 
@@ -34,17 +35,28 @@ def check(
 
 
 def _checked(path: Path) -> str:
-    """Validate a file; what it is. Raises DocumentError."""
+    """Validate a file; what it is. A reference must be flyable by the default flight's vehicle, a
+    flight's by its own. Raises DocumentError."""
     from offboard.campaign.cases import base_cases
     from offboard.campaign.document import read_campaign
     from offboard.campaign.tune import planned, read_tune
     from offboard.documents.reading import kind_of, read
-    from offboard.documents.shipped import read_text
-    from offboard.run.configuration import check_file
+    from offboard.run.configuration import build_track, load, read_part
+    from offboard.run.sitl import check_scenario
 
     table = path.suffix.lower() == ".csv"
-    kind = "" if table else kind_of(read(read_text(path), str(path)))
-    if kind == "tuning":
+    text = "" if table else shipped.read_text(path)
+    kind = "reference" if table else kind_of(read(text, str(path)))
+    name = str(path) if table else os.path.join(".", path)  # not the name of a shipped file
+    if kind == "configuration":
+        build_track(load(name))
+    elif kind == "reference":
+        build_track(load("flight", choices={kind: name}))
+    elif kind in shipped.PARTS:
+        read_part(kind, name)
+    elif kind == "scenario":
+        check_scenario(text, str(path))
+    elif kind == "tuning":
         tuning, source = read_tune(path)
         with naming(source):
             planned(tuning)
@@ -53,7 +65,11 @@ def _checked(path: Path) -> str:
         with naming(source):
             list(base_cases(campaign))
     else:
-        return check_file(path)
+        raise DocumentError(
+            f"{path}: no key says what it is: a vehicle has mass_kg, a controller law, a reference "
+            "shape, a scenario conditions or faults, a configuration these three: "
+            f"{', '.join(shipped.PARTS)}"
+        )
     return kind
 
 
@@ -61,15 +77,13 @@ def list_files() -> None:
     """List the shipped files by name, with one line each."""
     from offboard.control import catalogue
 
-    for number, kind in enumerate(shipped.FOLDERS):
+    for number, kind in enumerate(shipped.KINDS):
         described = shipped.descriptions(kind)
         if kind == "controller":
             for law in catalogue.names():
                 described.setdefault(law, "law of an installed package")
-        width = max(map(len, described))
         out.print("\n" * (number > 0) + f"{kind}s", style="bold")
-        for name, text in described.items():
-            say(f"  {name:<{width}}  {text}", indent=width + 4)
+        say_each(described)
 
 
 DEFAULT = Path("offboard.key")

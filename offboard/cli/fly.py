@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import sys
-from contextlib import closing, nullcontext
+from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,35 +16,28 @@ import typer
 from offboard.cli.shared import (
     FLIGHTS,
     Directory,
-    FlightOptions,
     Report,
     Requirements,
-    SimulatorOptions,
-    grouped,
-    option,
+    SitlOptions,
     out,
-    requirements_of,
     say,
+    say_each,
     scored,
     write,
 )
-from offboard.documents.arguments import LIVE_PAGE
+from offboard.documents.arguments import LIVE_PAGE, option
 from offboard.documents.command_line import INTERRUPT, complain, drop, explained
 from offboard.documents.errors import UserError, plain
 
 if TYPE_CHECKING:
     from offboard.analysis.score import Requirement
     from offboard.flight.flight import Outcome
-    from offboard.live.process import Displays
 
 INTERRUPTED = "interrupted before anything was sent"
-LABEL_WIDTH = 15
 
 
-@grouped
 def fly(
-    options: FlightOptions,
-    simulated: SimulatorOptions,
+    options: SitlOptions,
     seed: Annotated[int | None, option("N", "Random seed, also of the simulator.")] = None,
     out_directory: Directory = None,
     require: Requirements = None,
@@ -75,22 +68,27 @@ def fly(
     refused, or stopped on the ground; 4 aborted in flight, or left armed; 130 interrupted before
     anything was sent; 141 nobody reads the output.
     """
-    simulated.check(options)
     try:
         from offboard.link.stop import StopRequests
         from offboard.run.sitl import SimulatorProcess
 
         with (
             StopRequests(_exit_at_once) as stops,
-            SimulatorProcess() if simulated.sitl else nullcontext() as simulator,
-            closing(_displays(live, json_lines=json_lines)) as displays,
+            SimulatorProcess() if options.sitl else nullcontext() as simulator,
+            ExitStack() as stack,
         ):
+            from offboard.analysis.score import Requirement
             from offboard.link import clock
+            from offboard.live.lines import JsonLines, Terminal
+            from offboard.live.process import Displays, LiveProcess
             from offboard.run.flight import fly as fly_once
 
-            requirements = requirements_of(require)
+            lines = JsonLines(write) if json_lines else Terminal(out, partial(say, indent=12))
+            displays = Displays(lines, [LiveProcess("--live", live)] if live else [])
+            stack.callback(displays.close)
+            requirements = [Requirement.parse(text) for text in require or ()]
             directory = out_directory or FLIGHTS / clock.local_stamp()
-            flown = simulated.vehicle(options)
+            flown = options.flown()
             flight = options.load(seed, flown.known_vehicle)
             displays.begin(f"{directory.name}: {flight.reference.shape} by {flight.controller.law}")
             outcome = fly_once(
@@ -123,15 +121,6 @@ def _exit_at_once() -> None:
     os._exit(INTERRUPT)
 
 
-def _displays(live: str | None, *, json_lines: bool) -> Displays:
-    """What shows the flight: lines, and a server of the page at the address `live`."""
-    from offboard.live.lines import JsonLines, Terminal
-    from offboard.live.process import Displays, LiveProcess
-
-    lines = JsonLines(write) if json_lines else Terminal(out, partial(say, indent=12))
-    return Displays(lines, [LiveProcess("--live", live)] if live else [])
-
-
 def _conclude(
     outcome: Outcome,
     directory: Path,
@@ -148,51 +137,47 @@ def _conclude(
     from offboard.analysis.score_table import summary
     from offboard.live.display import DIGITS, line
 
-    rows: dict[str, str] = {}
     try:
         score, history = scored(directory)
-    except UserError as error:
-        score = Score(ended_by=f"it cannot be scored: {error}")
-        outcome, page = replace(outcome, sentence=f"{outcome.sentence}; {score.ended_by}"), ""
-    else:
         outcome, rows = judged(outcome, score), summary(score, history)
+    except UserError as error:
+        score, rows, page = Score(ended_by=f"it cannot be scored: {error}"), {}, ""
+        outcome = replace(outcome, sentence=f"{outcome.sentence}; {score.ended_by}")
+    metrics = score.metrics()
     checked = [] if outcome.exit_code else requirements
-    missed = [each for each in checked if not each.met(score.metrics())]
-    results = "; ".join(each.sentence(score.metrics()) for each in missed or checked)
+    missed = [each for each in checked if not each.met(metrics)]
+    results = "; ".join(each.sentence(metrics) for each in missed or checked)
     code = outcome.exit_code or int(bool(missed))
     try:
         if json_lines:
-            write(
-                line(
-                    "result",
-                    exit_code=code,
-                    sentence=outcome.sentence,
-                    requirements=results,
-                    completed=score.completed == 1.0,
-                    ended_by=score.ended_by,
-                    directory=str(directory),
-                    lost=lost,
-                    figures=plain(score.metrics(), DIGITS),
-                )
-                + "\n"
+            result = line(
+                "result",
+                exit_code=code,
+                sentence=outcome.sentence,
+                requirements=results,
+                completed=score.completed == 1.0,
+                ended_by=score.ended_by,
+                directory=str(directory),
+                lost=lost,
+                figures=plain(metrics, DIGITS),
             )
+            write(f"{result}\n")
             raise typer.Exit(code)
         out.print()
         for sentence in lost:
             say(sentence)
+        log = str(directory / "flight.tlog")
+        verdict = outcome.sentence
         if outcome.exit_code:
-            complain(f"{outcome.sentence} (log: {directory / 'flight.tlog'})")
-        elif missed:
-            complain(f"{outcome.sentence}; requirement missed: {results}")
-        else:
-            say(f"{outcome.sentence}{'; requirement met: ' if results else ''}{results}")
+            verdict += f" (log: {log})"
+        elif results:
+            verdict += f"; requirement {'missed' if missed else 'met'}: {results}"
+        (complain if code else say)(verdict)
         if rows:
-            rows["log"] = str(directory / "flight.tlog")
-            rows["all metrics"] = shlex.join(["offboard", "score", str(directory)])
+            rows |= {"log": log, "all metrics": shlex.join(["offboard", "score", str(directory)])}
         if page:
             rows["report"] = f"{page}, in some seconds"
-        for label, text in rows.items():
-            say(f"  {label:<{LABEL_WIDTH}}{text}", indent=2 + LABEL_WIDTH)
+        say_each(rows)
         sys.stdout.flush()
     except OSError as error:  # the exit code stays that of the flight
         drop(sys.stdout)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,23 +13,24 @@ from offboard.cli.shared import (
     FLIGHT,
     FLIGHTS,
     Directory,
-    FlightOptions,
     Requirements,
-    SimulatorOptions,
-    check_new,
+    SitlOptions,
+    absent,
     err,
-    grouped,
     keep,
-    option,
     out,
-    requirements_of,
     say,
     scored,
+    write,
     write_new,
 )
+from offboard.documents.arguments import option
 from offboard.documents.command_line import complain
 from offboard.documents.errors import UserError
 from offboard.link.log import free_name
+
+OUTPUT = ("-o", "--output")  # the option
+PAGE = "report.html"
 
 
 def score(
@@ -47,13 +47,13 @@ def score(
     Exit codes: 0 scored and all requirements met; 1 a requirement missed; 2 usage error, or the
     log cannot be read.
     """
-    from offboard.analysis.score import as_text
+    from offboard.analysis.score import Requirement, as_text
     from offboard.analysis.score_table import show, verdict
 
-    requirements = requirements_of(require)
+    requirements = [Requirement.parse(text) for text in require or ()]
     result, history = scored(flight)
     if as_json:
-        sys.stdout.write(as_text(result, history))
+        write(as_text(result, history))
     else:
         show(out, result, history)
     if history.damage:
@@ -73,7 +73,7 @@ def report(
     ],
     output: Annotated[
         Path | None,
-        option("FILE", "Page.  [default: report.html beside the first log]", "-o", "--output"),
+        option("FILE", f"Page.  [default: {PAGE} beside the first log]", *OUTPUT, callback=absent),
     ] = None,
 ) -> None:
     """Show flights on one HTML page, from their .tlog alone.
@@ -89,9 +89,7 @@ def report(
     from offboard.report.flight import read
     from offboard.report.report_page import page
 
-    if output is not None:
-        check_new(output, "-o")
-    path = output or free_name(tlog.find(flights[0]).with_name("report.html"))
+    path = output or free_name(tlog.find(flights[0]).with_name(PAGE))
     shown = [read(flight) for flight in flights]
     for place, flight in zip(flights, shown, strict=True):
         if not (place / "score.json").exists():
@@ -135,7 +133,7 @@ def replay(flight: Annotated[Path, FLIGHT]) -> None:
 def export(
     flight: Annotated[Path, FLIGHT],
     to: Annotated[Literal["mcap", "csv", "ulog"], option("FORMAT", "mcap, csv or ulog.", "--to")],
-    output: Annotated[Path, option("FILE", "File to write, a new one.", "-o", "--output")],
+    output: Annotated[Path, option("FILE", "File to write, a new one.", *OUTPUT, callback=absent)],
 ) -> None:
     """Write a flight in the format of another tool.
 
@@ -151,7 +149,6 @@ def export(
     from offboard.export.series import events_of, read, series_of, write_csv
     from offboard.export.ulog import write_ulog
 
-    check_new(output, "-o")
     found = read(flight)
     write = {"mcap": write_mcap, "csv": write_csv, "ulog": write_ulog}[to]
     write(found, output)
@@ -161,13 +158,11 @@ def export(
     say(f"{output}: samples: {held}; {len(events_of(found))} events")
 
 
-@grouped
 def identify(
-    options: FlightOptions,
-    simulated: SimulatorOptions,
+    options: SitlOptions,
     flight: Annotated[Path | None, FLIGHT] = None,
     output: Annotated[
-        Path | None, option("FILE", "Vehicle file to write.", "-o", "--output")
+        Path | None, option("FILE", "Vehicle file to write.", *OUTPUT, callback=absent)
     ] = None,
     out_directory: Directory = None,
 ) -> None:
@@ -192,18 +187,13 @@ def identify(
     from offboard.report.report_page import page
     from offboard.run.configuration import flown
 
-    if (flight is None) == (options.connect is None and not simulated.sitl):
+    if (flight is None) == (options.connect is None and not options.sitl):
         raise UserError("name a FLIGHT, or fly one first with --connect or --sitl; not both")
-    if output is not None:
-        check_new(output, "-o")
     if flight is None:
         flight = out_directory or FLIGHTS / f"identify-{clock.local_stamp()}"
-        reference = options.reference or "identify"
-        given = asdict(options) | asdict(simulated) | {"reference": reference}
-        fly(**given, out_directory=flight, report=False)
-    elif out_directory or (options, simulated) != (
-        FlightOptions(vehicle=options.vehicle), SimulatorOptions()
-    ):  # fmt: skip
+        along = replace(options, reference=options.reference or "identify")
+        fly(along, out_directory=flight, report=False)
+    elif out_directory or options != SitlOptions(vehicle=options.vehicle):
         raise UserError(
             "a log needs no --system, --out or other options of a flight; --vehicle may be given"
         )

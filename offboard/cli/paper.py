@@ -6,7 +6,8 @@ from typing import Annotated
 
 import typer
 
-from offboard.cli.shared import FLIGHTS, Directory, err, option, say
+from offboard.cli.shared import FLIGHTS, Directory, err, say
+from offboard.documents.arguments import option
 from offboard.documents.errors import UserError
 
 

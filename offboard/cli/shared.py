@@ -8,24 +8,24 @@ from __future__ import annotations
 
 import functools
 import inspect
-import re
 import sys
-from collections.abc import Callable
-from dataclasses import dataclass, is_dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 
+from offboard.documents.arguments import FILE, option
 from offboard.documents.command_line import complain, wrapped
-from offboard.documents.errors import UserError, shown
+from offboard.documents.errors import UserError
 from offboard.documents.shipped import PARTS
 from offboard.link.log import new_file
 
 if TYPE_CHECKING:
     from offboard.analysis.history import History
-    from offboard.analysis.score import Requirement, Score
+    from offboard.analysis.score import Score
     from offboard.run.configuration import FlightConfig
     from offboard.run.flight import Connection, Simulated
 
@@ -37,45 +37,33 @@ class Output(Console):
         raise
 
 
-out = Output(highlight=False)
-err = Console(stderr=True, highlight=False)
+out, err = Output(highlight=False), Output(highlight=False, stderr=True)
 
 DEFAULT_CONNECTION = "udpin:127.0.0.1:14540"
 REFUSED = 3  # exit code
 FLIGHTS = Path("flights")  # parent of the flight directories that have no --out
 
 
-def option(metavar: str, text: str, *names: str, **more: Any) -> Any:
-    """A command-line option with a value, by default named as its parameter."""
-    return typer.Option(*names, metavar=metavar, help=text, **more)
-
-
-def known_port(address: str | None) -> str | None:
-    """Refuse to listen on any free port, to which nobody sends."""
-    if address and re.fullmatch(r"(udp|tcp)in:.*:0+", address):
-        raise UserError(f"--connect {shown(address)}: give the port that the vehicle sends to")
-    return address
+def absent(path: Path | None) -> Path | None:
+    """Refuse a file that is there, or has no directory, before anything is done for it."""
+    if path and (path.exists() or path.is_symlink()):
+        raise typer.BadParameter(f"{path} exists already; choose another file")
+    if path and not path.parent.is_dir():
+        raise typer.BadParameter(f"{path}: there is no directory {path.parent}")
+    return path
 
 
 NEW_DIRECTORY = "Directory of the results.  [default: a new one in flights]"
-FILE = "NAME|FILE"  # the name of a shipped file, or a path
 FLIGHT = typer.Argument(metavar="FLIGHT", help="Flight directory or .tlog file.")
 Directory = Annotated[Path | None, option("DIR", NEW_DIRECTORY, "--out")]
-Connect = Annotated[
-    str | None,
-    option(
-        "LINK",
-        "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or serial:DEVICE:BAUD; "
-        f"IPv6 in brackets.  [default: {DEFAULT_CONNECTION}]",
-        callback=known_port,
-    ),
-]
+LINK = (
+    "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or serial:DEVICE:BAUD; "
+    f"IPv6 in brackets.  [default: {DEFAULT_CONNECTION}]"
+)
 Vehicle = Annotated[str | None, option(FILE, "Vehicle.")]
 System = Annotated[
     int | None,
-    typer.Option(
-        metavar="N", min=1, max=255, help="System id of the vehicle, where several are heard."
-    ),
+    option("N", "System id of the vehicle, where several are heard.", min=1, max=255),
 ]
 SigningKey = Annotated[
     Path | None,
@@ -85,8 +73,7 @@ Report = Annotated[
     bool, typer.Option(envvar="OFFBOARD_REPORT", help="Write report.html after each flight.")
 ]
 Workers = Annotated[
-    int | None,
-    typer.Option(metavar="N", min=1, max=256, help="Processes.  [default: one per processor]"),
+    int | None, option("N", "Processes.  [default: one per processor]", min=1, max=256)
 ]
 Requirements = Annotated[
     list[str] | None,
@@ -104,7 +91,7 @@ Assignments = Annotated[
 class FlightOptions:
     """The options of a flight, the same for every command that flies or checks one."""
 
-    connect: Connect = None
+    connect: Annotated[str | None, option("LINK", LINK)] = None
     system: System = None
     signing_key: SigningKey = None
     config: Annotated[str, option(FILE, "Configuration.")] = "flight"
@@ -133,8 +120,9 @@ class FlightOptions:
 
 
 @dataclass(frozen=True, slots=True)
-class SimulatorOptions:
-    """The options of the simulator that `fly` and `identify` start."""
+class SitlOptions(FlightOptions):
+    """Those of a command that flies the bundled simulator, too. Raises UserError where they name
+    another vehicle beside it, or it is not flown."""
 
     sitl: Annotated[bool, typer.Option("--sitl", help="Fly the bundled simulator.")] = False
     firmware: Annotated[
@@ -147,47 +135,39 @@ class SimulatorOptions:
         str | None, option(FILE, "With --sitl: simulated vehicle; may differ from --vehicle.")
     ] = None
 
-    def check(self, options: FlightOptions) -> None:
-        """Raise UserError where both name a vehicle to fly, or the simulator is not flown."""
-        if self.sitl and options.connect:
+    def __post_init__(self) -> None:
+        if self.sitl and self.connect:
             raise UserError("--sitl starts its own simulator: use --sitl or --connect, not both")
-        if self.sitl and options.system:
+        if self.sitl and self.system:
             raise UserError("--system is an option of --connect: --sitl has one vehicle")
-        if not self.sitl and self != SimulatorOptions():
+        if not self.sitl and (self.firmware or self.scenario or self.sim_vehicle):
             raise UserError(
                 "--scenario, --sim-vehicle and --firmware are options of --sitl: add it"
             )
 
-    def vehicle(self, options: FlightOptions) -> Connection | Simulated:
-        """What is flown: the simulator, or the vehicle at a link. Raises DocumentError."""
+    def flown(self) -> Connection | Simulated:
+        """The simulator, or the vehicle at a link. Raises DocumentError."""
         if not self.sitl:
-            return options.connection()
+            return self.connection()
         from offboard.run.flight import Simulated
 
         firmware = self.firmware or "px4"
-        simulated = Simulated(firmware, self.scenario, self.sim_vehicle, options.signing_key)
+        simulated = Simulated(firmware, self.scenario, self.sim_vehicle, self.signing_key)
         simulated.check()
         return simulated
 
 
 def grouped(command: Callable[..., None]) -> Callable[..., None]:
-    """A command in whose signature the options of a group replace each parameter that is one, a
-    dataclass such as `FlightOptions`."""
-    groups: dict[str, type] = {}
-    options: list[inspect.Parameter] = []
-    for each in inspect.signature(command, eval_str=True).parameters.values():
-        if is_dataclass(each.annotation):
-            groups[each.name] = group = cast(type, each.annotation)
-            options += inspect.signature(group, eval_str=True).parameters.values()
-        else:
-            options.append(each)
+    """A command whose first parameter is a group of options, a dataclass: in its signature the
+    fields of the group stand for it."""
+    first, *others = inspect.signature(command, eval_str=True).parameters.values()
+    group: type = first.annotation
+    fields = inspect.signature(group, eval_str=True).parameters
+    options = [*fields.values(), *others]
 
     @functools.wraps(command)
     def run(**given: Any) -> None:
-        for name, group in groups.items():
-            own = [each for each in inspect.signature(group).parameters if each in given]
-            given[name] = group(**{each: given.pop(each) for each in own})
-        command(**given)
+        command(group(**{name: given.pop(name) for name in fields}), **given)
 
     run.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
     run.__annotations__ = {each.name: each.annotation for each in options}
@@ -199,31 +179,23 @@ def say(text: str, indent: int = 0) -> None:
     out.print(wrapped(text, out.width, indent), markup=False, soft_wrap=True)
 
 
+def say_each(texts: Mapping[str, str], margin: int = 2) -> None:
+    """Print a line for each name: the name, then its text, both aligned."""
+    width = max(map(len, texts), default=0) + 2
+    for name, text in texts.items():
+        say(f"{'':{margin}}{name:{width}}{text}", indent=margin + width)
+
+
 def write(text: str) -> None:
     """Print text as it is, at once."""
     sys.stdout.write(text)
     sys.stdout.flush()
 
 
-def check_new(path: Path, option_name: str) -> None:
-    """Raise UserError if the file chosen by an option exists, or has no directory."""
-    if path.exists() or path.is_symlink():
-        raise UserError(f"{path} exists already; choose another file with {option_name}")
-    if not path.parent.is_dir():
-        raise UserError(f"{option_name} {path}: there is no directory {path.parent}")
-
-
 def write_new(path: Path, text: str) -> None:
     """Write a file that must not exist. It appears when it is complete. Raises UserError."""
     with new_file(path) as file:
         file.write(text.encode())
-
-
-def requirements_of(texts: list[str] | None) -> list[Requirement]:
-    """The requirements of --require. Raises UserError."""
-    from offboard.analysis.score import Requirement
-
-    return [Requirement.parse(text) for text in texts or ()]
 
 
 def scored(flight: Path) -> tuple[Score, History]:

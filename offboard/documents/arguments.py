@@ -1,41 +1,38 @@
-"""The arguments of a command, checked before they are converted."""
+"""The options and arguments of a command, checked before they are converted; HOST:PORT."""
 
 from __future__ import annotations
 
-import re
 from typing import Any
+from urllib.parse import urlsplit
 
-from typer import BadParameter
+import typer
 from typer.core import TyperCommand
 
-from offboard.documents.command_line import INTERRUPT, INTERRUPTED
 from offboard.documents.errors import UserError, shown
 
-UsageError: Any = BadParameter.__base__  # an unknown option, too; typer does not export it
-LIVE_PAGE = "127.0.0.1:8014"
-# options whose value may be omitted, and what they then have
-OPTIONAL_VALUES = {"--live": LIVE_PAGE}
-PORT_MAX = 65535
+FILE = "NAME|FILE"  # the name of a shipped file, or a path
+LIVE_PAGE = "127.0.0.1:8014"  # of --live without a value
 LOCAL = "127.0.0.1"
-_ADDRESS = re.compile(r"(?:\[([0-9A-Fa-f:.]+)\]|([^:\[\]]*)):(\d{1,9})", re.ASCII)
 
 
-def split_address(option: str, address: str) -> tuple[str, int]:
-    """Host and port of HOST:PORT, the value of `option`; an IPv6 address stands in brackets, no
-    host means this computer. Raises UserError."""
-    matched = _ADDRESS.fullmatch(address)
-    if matched is None or int(matched[3]) > PORT_MAX or not _is_host(matched[2] or LOCAL):
-        example = f"give HOST:PORT, for example {LIVE_PAGE}"
-        raise UserError(f"{option} {shown(address)}: {example}")
-    return matched[1] or matched[2] or LOCAL, int(matched[3])
+def option(metavar: str, text: str, *names: str, **more: Any) -> Any:
+    """A command-line option with a value, by default named as its parameter."""
+    return typer.Option(*names, metavar=metavar, help=text, **more)
 
 
-def _is_host(name: str) -> bool:
-    """Whether the name service takes it: no part of it is empty or too long."""
+def split_address(name: str, address: str) -> tuple[str, int]:
+    """Host and port of HOST:PORT, the value of the option `name`; an IPv6 address stands in
+    brackets, no host means this computer. Raises UserError."""
     try:
-        return bool(name.encode("idna"))
-    except UnicodeError:
-        return False
+        parts = urlsplit(f"//{address}")
+        host, port = parts.hostname or LOCAL, parts.port
+        host.encode("idna")  # no part of it is empty or too long
+    except ValueError:
+        port = None
+    if port is None or parts.netloc != address:
+        example = f"give HOST:PORT, for example {LIVE_PAGE}"
+        raise UserError(f"{name} {shown(address)}: {example}")
+    return host, port
 
 
 def join_address(host: str, port: int) -> str:
@@ -51,42 +48,19 @@ class Command(TyperCommand):
     """
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        try:
-            return self._parsed(ctx, _completed(args))
-        except UsageError as error:
-            words = error.format_message().replace("Value error, ", "").split()
-            sentence = " ".join(words).rstrip(".")
-            raise UserError(f"{sentence}; see `{ctx.command_path} --help`") from None
-
-    def _parsed(self, ctx: Any, args: list[str]) -> list[str]:
+        following = [*args[1:], "-"]
+        args = [  # typer has no option whose value may be omitted
+            f"--live={LIVE_PAGE}" if arg == "--live" and after.startswith("-") else arg
+            for arg, after in zip(args, following, strict=False)
+        ]
         given, _, parameters = self.make_parser(ctx).parse_args(list(args))
         for parameter in parameters:
+            is_option = parameter.param_type_name == "option"
             values = given.get(parameter.name)
-            for value in values if isinstance(values, (list, tuple)) else [values]:
+            for value in values if isinstance(values, list | tuple) else [values]:
                 if isinstance(value, str):
-                    _check(_label(parameter), value)
+                    _check(str(parameter.opts[-1] if is_option else parameter.metavar), value)
         return super().parse_args(ctx, args)
-
-    def invoke(self, ctx: Any) -> Any:
-        try:
-            return super().invoke(ctx)
-        except KeyboardInterrupt:
-            raise UserError(INTERRUPTED, INTERRUPT) from None
-
-
-def _completed(args: list[str]) -> list[str]:
-    """The arguments with the values that were omitted."""
-    completed: list[str] = []
-    for arg, following in zip(args, [*args, "-"][1:], strict=True):
-        completed.append(arg)
-        if arg in OPTIONAL_VALUES and following.startswith("-"):
-            completed.append(OPTIONAL_VALUES[arg])
-    return completed
-
-
-def _label(parameter: Any) -> str:
-    """`--connect`, `FLIGHT`."""
-    return str(parameter.opts[-1] if parameter.param_type_name == "option" else parameter.metavar)
 
 
 def _check(label: str, value: str) -> None:

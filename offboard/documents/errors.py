@@ -5,16 +5,18 @@ them, and sentences on what happens again and again.
 from __future__ import annotations
 
 import difflib
+import json
 import math
-import sysconfig
+import os
+import sys
 import traceback
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 EVERY_S = 1.0  # at most one sentence of a `Repeated`
-_PACKAGE, _STANDARD = str(Path(__file__).parents[1]), sysconfig.get_path("stdlib")
+# packages that a mistake from outside is not in; the backport calls entry points, too
+_OURS = {"offboard", "importlib_metadata", *sys.stdlib_module_names}
 
 
 class UserError(Exception):
@@ -41,28 +43,21 @@ class DocumentError(UserError):
 
 def located(error: BaseException) -> str:
     """An exception of code from outside, such as a controller, in one sentence with file and line
-    of the mistake: of the innermost call in the package that was called from here, a folder or a
-    single module. Reads no file. Never raises an exception of its own."""
-    walked = traceback.walk_tb(error.__traceback__)
-    calls = [(frame.f_code.co_filename, line) for frame, line in walked]
-    calls = [(file, line) for file, line in calls if _is_file(file)]
-    outside = [(file, line) for file, line in calls if not file.startswith(_PACKAGE)]
-    own = Path(outside[0][0]) if outside else Path()
-    is_module = own.parent.name.endswith("-packages")  # site-packages has those of others, too
-    folder = str(own if is_module else own.parent) if outside else ""
-    theirs = [(file, line) for file, line in outside if file.startswith(folder)] or calls
-    place = " ({}:{})".format(*theirs[-1]) if theirs else ""
+    of the mistake: of the innermost call in the package or folder that was called from here. Reads
+    no file. Never raises an exception of its own."""
+    calls = []  # package, folder, place
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        package = str(frame.f_globals.get("__name__")).partition(".")[0]
+        file = frame.f_code.co_filename
+        calls.append((package, os.path.dirname(file), f" ({file}:{line})"))
+    called = next((each for each in calls if each[0] not in _OURS), ("offboard", None))
+    theirs = [each[2] for each in calls if each[0] == called[0] or each[1] == called[1]]
+    place = theirs[-1] if theirs else ""
     try:
         said = str(error)
     except Exception:
         said = "it cannot be printed"
     return " ".join(f"{type(error).__name__}: {said}{place}".split())
-
-
-def _is_file(name: str) -> bool:
-    """Whether it is neither of the standard library, or of its backport, nor of no file."""
-    standard = name.startswith(_STANDARD) and "site-packages" not in name
-    return not (standard or name.startswith("<") or "importlib_metadata" in name)
 
 
 @contextmanager
@@ -102,15 +97,11 @@ def counted(number: int, noun: str) -> str:
 def plain(value: Any, digits: int | None = None) -> Any:
     """The value for JSON, which has no NaN and no infinity: None for each float that is not finite,
     and lists for tuples; the other floats with `digits` significant digits."""
-    if isinstance(value, dict):
-        return {key: plain(each, digits) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(each, digits) for each in value]
-    if isinstance(value, float):
-        if not math.isfinite(value):
-            return None
-        return float(f"{value:.{digits}g}") if digits else value
-    return value
+
+    def number(text: str) -> float:
+        return float(f"{float(text):.{digits}g}" if digits else text)
+
+    return json.loads(json.dumps(value), parse_float=number, parse_constant=lambda _: None)
 
 
 def install(extra: str) -> str:

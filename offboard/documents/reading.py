@@ -1,9 +1,9 @@
 """Reads configuration: YAML text -> validated value, or sentences that say what is wrong in it.
 
-Every configuration file goes through `parse`: text in, frozen pydantic value out. Scalars follow
-YAML 1.2 (`1e-3` is a number, `no` and `12:30` are text) and are checked strictly (no text for
-numbers, no true for 1); duplicate keys, aliases and tags are refused. A problem names the line and
-column of its key, the value and what is allowed, in pydantic's words:
+Every configuration file goes through `read` and `validate`: text in, frozen pydantic value out.
+Scalars follow YAML 1.2 (`1e-3` is a number, `no` and `12:30` are text) and are checked strictly (no
+text for numbers, no true for 1); duplicate keys, aliases and tags are refused. A problem names the
+line and column of its key, the value and what is allowed, in pydantic's words:
 
     flight.yaml, line 4, column 1: period_s: 7 should be less than or equal to 0.5
 """
@@ -11,9 +11,9 @@ column of its key, the value and what is allowed, in pydantic's words:
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import yaml
@@ -21,6 +21,7 @@ from pydantic import BaseModel, ValidationError
 from yaml.representer import SafeRepresenter
 
 from offboard.documents.errors import DocumentError, abridged, counted, meant, shown
+from offboard.documents.shipped import KINDS, locate, read_text
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -28,29 +29,6 @@ if TYPE_CHECKING:
 M = TypeVar("M", bound=BaseModel)
 DESCRIPTION_SIZE = 200
 PROBLEMS_MOST = 10
-
-# kind of file -> keys that no kind below has
-KINDS = {
-    "tuning": {"training", "validation"},
-    "campaign": {
-        "controllers", "references", "vehicles", "sim_vehicles", "firmwares", "scenarios",
-        "parameters", "sample", "search", "seeds", "require", "promises", "keep",
-    },
-    "scenario": {"conditions", "faults"},
-    "reference": {"shape"},
-    "controller": {"law"},
-    "vehicle": {"mass_kg"},
-    "configuration": {"vehicle", "controller", "reference"},
-}  # fmt: skip
-
-_INTEGER = re.compile(r"[-+]?[0-9]{1,400}")
-_HEXADECIMAL = re.compile(r"0x[0-9a-fA-F]{1,300}")
-_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
-_WORDS: dict[str, Any] = {
-    "": None, "~": None, "null": None, "Null": None, "NULL": None,
-    "true": True, "True": True, "TRUE": True, "false": False, "False": False, "FALSE": False,
-    ".inf": math.inf, "+.inf": math.inf, "-.inf": -math.inf, ".nan": math.nan,
-}  # fmt: skip
 
 
 class Section(dict[str, Any]):
@@ -67,20 +45,25 @@ class Section(dict[str, Any]):
 yaml.add_representer(Section, SafeRepresenter.represent_dict, Dumper=yaml.SafeDumper)
 
 
+def load_document(name: str | Path, kind: str, model: type[M]) -> tuple[M, str]:
+    """The value of a shipped file by name, or of a file, and its path for errors. Raises
+    DocumentError."""
+    path = name if isinstance(name, Path) else locate(name, kind)
+    return parse(read_text(path), model, str(path), kind), str(path)
+
+
 def parse(text: str, model: type[M], source: str, kind: str = "") -> M:
     """YAML `text` -> an instance of `model`. `source` names the text in errors (a file's name),
     `kind` is the kind of file, one of KINDS; without one it is not checked.
 
     Raises DocumentError with the problems found.
     """
-    raw = read(text, source)
-    if kind:
-        check_kind(raw, kind, source)
-    return validate(raw, model, source)
+    return validate(read(text, source, kind), model, source)
 
 
-def read(text: str, source: str) -> Section:
+def read(text: str, source: str, kind: str = "") -> Section:
     """YAML `text` -> the raw mapping, not yet validated. An empty document is an empty mapping.
+    Raises DocumentError, also for a file that is certainly of another kind.
 
     Every file may have a `description`: one line for people, which `offboard list` prints. It
     describes the file and is no part of the configuration: taken out here, so that it is not
@@ -96,35 +79,38 @@ def read(text: str, source: str) -> Section:
             f"{source}: description: {shown(line)} should be text of at most {DESCRIPTION_SIZE} "
             "characters"
         )
+    found = kind_of(value)
+    if kind and found and found != kind:
+        raise DocumentError(f"{source} is a {found} file; a {kind} file is needed here")
     return value
 
 
 def kind_of(raw: Mapping[str, Any]) -> str:
     """The kind of file that a mapping is, by keys that only this kind has; empty if it has none."""
-    return next((kind for kind, keys in KINDS.items() if keys & raw.keys()), "")
-
-
-def check_kind(raw: Mapping[str, Any], wanted: str, source: str) -> None:
-    """Raise DocumentError where the file is certainly of another kind than the `wanted` one."""
-    found = kind_of(raw)
-    if found and found != wanted:
-        raise DocumentError(f"{source} is a {found} file; a {wanted} file is needed here")
+    return next((kind for kind, (_, keys) in KINDS.items() if keys & raw.keys()), "")
 
 
 def override(mapping: Mapping[str, Any], assignment: str, option: str = "") -> Section:
     """A copy of the raw `mapping` with one `key.path=value` of the command line applied.
 
     The value is YAML; a number in the path indexes a list. Keys are not checked here but in
-    `validate`, whose errors name `option`, by default --set. Raises DocumentError where
-    `key.path=` is missing or the value is no YAML.
+    `validate`, whose errors name `option`, by default --set. Raises DocumentError as `assigned`.
     """
-    path, separator, text = assignment.partition("=")
     option = option or f"--set {abridged(assignment)}"
+    path, value = assigned(assignment, option)
+    changed: Section = _with(mapping, path.split("."), value, option)
+    return changed
+
+
+def assigned(assignment: str, option: str = "") -> tuple[str, Any]:
+    """The key.path and the value of `key.path=value`. Raises DocumentError, which names `option`
+    (by default --set), where one of them is missing or the value is no YAML."""
+    option = option or f"--set {abridged(assignment)}"
+    path, separator, text = assignment.partition("=")
     keys = [key.strip() for key in path.split(".")]
     if not separator or not all(keys):
         raise DocumentError(f"{option}: expected key.path=value")
-    changed: Section = _with(mapping, keys, _loaded(text, option), option)
-    return changed
+    return ".".join(keys), _loaded(text, option)
 
 
 def validate(
@@ -202,13 +188,52 @@ def _key_path(detail: ErrorDetails, document: Any, source: str) -> tuple[str, st
     return ".".join(keys), source
 
 
+class _Loader(yaml.SafeLoader):
+    """With the scalars of YAML 1.2. Mappings become Sections; aliases, tags and keys that are given
+    twice are errors."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        event: Any = self.peek_event()  # type: ignore[no-untyped-call]
+        if isinstance(event, yaml.AliasEvent) or event.tag is not None:
+            raise _refusal("aliases and tags are not allowed", event)
+        return super().compose_node(parent, index)
+
+    def section(self, node: yaml.MappingNode) -> Section:
+        section = Section({})
+        for key, value in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                raise _refusal("a key must be a single word", key)
+            if key.value in section:
+                raise _refusal(f"the key {key.value!r} is given twice", key)
+            section[key.value] = self.construct_object(value, deep=True)
+            section.places[key.value] = _place(key.start_mark)
+        return section
+
+    def integer(self, node: yaml.ScalarNode) -> int:
+        return int(node.value, 16 if "x" in node.value else 10)
+
+
+_TAG = "tag:yaml.org,2002:"
+_Loader.yaml_implicit_resolvers = {}  # without those of YAML 1.1
+for _kind, _pattern in {
+    "null": "(~|null|Null|NULL|)$",
+    "bool": "(true|True|TRUE|false|False|FALSE)$",
+    "int": "([-+]?[0-9]{1,400}|0x[0-9a-fA-F]{1,300})$",
+    "float": r"([-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.inf|\.nan)$",
+}.items():
+    _Loader.add_implicit_resolver(_TAG + _kind, re.compile(_pattern), None)
+_Loader.add_constructor(f"{_TAG}map", _Loader.section)
+_Loader.add_constructor(f"{_TAG}int", _Loader.integer)
+
+
 def _loaded(text: str, source: str) -> Any:
     try:
-        root = yaml.compose(text, Loader=yaml.BaseLoader)
-        return None if root is None else _value(root, set(), source)
+        loader = _Loader(text)
+        loader.name = source
+        return loader.get_single_data()
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
-        place = _at(mark, source) if mark else source
+        place = _place(mark) if mark else source
         problem = getattr(error, "problem", None) or " ".join(str(error).split())
         wrong = isinstance(error, yaml.scanner.ScannerError | yaml.parser.ParserError)
         hint = "; check indentation, colons and quotes" if wrong else ""
@@ -217,48 +242,12 @@ def _loaded(text: str, source: str) -> Any:
         raise DocumentError(f"{source}: nested too deeply") from None
 
 
-def _at(mark: yaml.Mark, source: str) -> str:
-    return f"{source}, line {mark.line + 1}, column {mark.column + 1}"
+def _place(mark: yaml.Mark) -> str:
+    return f"{mark.name}, line {mark.line + 1}, column {mark.column + 1}"
 
 
-def _value(node: yaml.Node, seen: set[int], source: str) -> Any:
-    """A YAML node -> plain Python, with the scalars of YAML 1.2."""
-    if id(node) in seen:
-        raise _refusal("a value is used twice: aliases are not allowed", node)
-    seen.add(id(node))
-    if node.tag not in _PLAIN_TAGS:
-        raise _refusal("tags are not allowed", node)
-    if isinstance(node, yaml.MappingNode):
-        mapping = Section({})
-        for key, value in node.value:
-            if not isinstance(key, yaml.ScalarNode):
-                raise _refusal("a key must be a single word", key)
-            if key.value in mapping:
-                raise _refusal(f"the key {key.value!r} is given twice", key)
-            mapping[key.value] = _value(value, seen, source)
-            mapping.places[key.value] = _at(key.start_mark, source)
-        return mapping
-    if isinstance(node, yaml.SequenceNode):
-        return [_value(item, seen, source) for item in node.value]
-    plain = getattr(node, "style", None) is None
-    return _scalar(node.value) if plain else node.value
-
-
-_PLAIN_TAGS = {f"tag:yaml.org,2002:{kind}" for kind in ("str", "seq", "map")}
-
-
-def _scalar(text: str) -> Any:
-    if text in _WORDS:
-        return _WORDS[text]
-    if _INTEGER.fullmatch(text):
-        return int(text)
-    if _HEXADECIMAL.fullmatch(text):
-        return int(text, 16)
-    return float(text) if _FLOAT.fullmatch(text) else text
-
-
-def _refusal(problem: str, node: yaml.Node) -> yaml.YAMLError:
-    return yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
+def _refusal(problem: str, where: Any) -> yaml.YAMLError:
+    return yaml.MarkedYAMLError(problem=problem, problem_mark=where.start_mark)
 
 
 def _with(value: Any, keys: list[str], new: Any, option: str) -> Any:

@@ -6,7 +6,6 @@ In an installed package `config/` lies inside the package, in a checkout beside 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib import resources
 from pathlib import Path
 
 from offboard.documents.errors import DocumentError, abridged, meant, shown
@@ -14,36 +13,47 @@ from offboard.documents.errors import DocumentError, abridged, meant, shown
 SIZE_MOST = 500_000  # characters of a file: a table of 10,000 rows, or 5 s to parse as YAML
 
 PARTS = ("vehicle", "controller", "reference")  # of a flight, each a file of its own
-# kind of file -> its folder
-FOLDERS = {
-    "reference": "references",
-    "controller": "controllers",
-    "vehicle": "vehicles",
-    "scenario": "scenarios",
-    "campaign": "campaigns",
-    "tuning": "tunings",
-    "configuration": "",
-}
+# kind of file -> its folder, and keys that no kind above has
+KINDS = {
+    "reference": ("references", {"shape"}),
+    "controller": ("controllers", {"law"}),
+    "vehicle": ("vehicles", {"mass_kg"}),
+    "scenario": ("scenarios", {"conditions", "faults"}),
+    "campaign": (
+        "campaigns",
+        {
+            "controllers", "references", "vehicles", "sim_vehicles", "firmwares", "scenarios",
+            "parameters", "sample", "search", "seeds", "require", "promises", "keep",
+        },
+    ),
+    "tuning": ("tunings", {"training", "validation"}),
+    "configuration": ("", set(PARTS)),
+}  # fmt: skip
 
 
 def directory() -> Path:
     """The folder of the shipped configuration."""
-    package = Path(str(resources.files("offboard")))
+    package = Path(__file__).parents[1]
     inside = package / "_config"
     return inside if inside.is_dir() else package.parent / "config"
 
 
+def folder(kind: str) -> Path:
+    """The folder of the files of one kind, for example `scenario`."""
+    return directory() / KINDS[kind][0]
+
+
 def names(kind: str) -> list[str]:
-    """The names of the files of one kind, for example `scenario`, sorted."""
-    return sorted(path.stem for path in (directory() / FOLDERS[kind]).glob("*.yaml"))
+    """The names of the files of one kind, sorted."""
+    return sorted(path.stem for path in folder(kind).glob("*.yaml"))
 
 
 def descriptions(kind: str) -> dict[str, str]:
     """Name -> description of the files of one kind."""
     from offboard.documents.reading import read  # late: --help needs no YAML
 
-    paths = {name: directory() / FOLDERS[kind] / f"{name}.yaml" for name in names(kind)}
-    return {name: read(read_text(path), str(path)).description for name, path in paths.items()}
+    paths = sorted(folder(kind).glob("*.yaml"))
+    return {path.stem: read(read_text(path), str(path)).description for path in paths}
 
 
 def overview(*kinds: str) -> str:
@@ -56,13 +66,18 @@ def is_file(name: str) -> bool:
     return "/" in name or name.lower().endswith((".yaml", ".yml", ".csv"))
 
 
+def absolute(name: str) -> str:
+    """A name, or the absolute path of a file."""
+    return str(Path(name).absolute()) if is_file(name) else name
+
+
 def locate(name: str, kind: str, others: Sequence[str] = ()) -> Path:
     """The file with a shipped name, or the file itself where `name` is one. Raises DocumentError
     with the known names, `others` among them."""
     if is_file(name):
         return Path(name)
     if name in names(kind):
-        return directory() / FOLDERS[kind] / f"{name}.yaml"
+        return folder(kind) / f"{name}.yaml"
     known = sorted({*names(kind), *others})
     near = meant(name, known) or ";"
     raise DocumentError(
@@ -84,4 +99,4 @@ def read_text(path: Path) -> str:
     except OSError as error:
         raise DocumentError(f"{abridged(path)} cannot be read: {error.strerror}") from None
     except ValueError:  # also a name that no file can have
-        raise DocumentError(f"{shown(str(path))} cannot be read: not UTF-8 text") from None
+        raise DocumentError(f"{abridged(path)} cannot be read: not UTF-8 text") from None

@@ -18,11 +18,11 @@ import stat
 from functools import partial
 from pathlib import Path
 
-from offboard.documents.errors import UserError, abridged
+from offboard.documents.errors import DocumentError, UserError, abridged
+from offboard.documents.shipped import read_text
 
 KEY_BYTES = 32
 PASSPHRASE_MIN = 16  # characters
-FILE_BYTES_MAX = 4096
 _OTHERS = stat.S_IRWXG | stat.S_IRWXO
 _KEY = re.compile(
     rb"passphrase:\s*(?P<passphrase>\S.{%d,})|key:\s*(?P<key>[0-9a-fA-F]{%d})"
@@ -38,18 +38,19 @@ def read_key(path: Path) -> bytes:
     """The 32 bytes of the key in the file at `path`. Raises UserError."""
     shown = f"signing key {abridged(path)}"
     try:
-        found = path.stat()
-        if not stat.S_ISREG(found.st_mode):
-            raise UserError(f"{shown} is not a file")
-        if found.st_mode & _OTHERS:
-            raise UserError(f"{shown} can be read or changed by other users: chmod 600 it")
-        if found.st_size > FILE_BYTES_MAX:
-            raise UserError(f"{shown} has {found.st_size:,} bytes: that is no key file")
-        content = path.read_bytes()
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
-        reason = getattr(error, "strerror", None) or error
-        raise UserError(f"{shown} cannot be read: {reason}") from None
-    return _key_in(content, shown)
+        content = read_text(path).encode()
+    except DocumentError as error:  # not of a configuration
+        raise UserError(f"signing key {error}") from None
+    if path.stat().st_mode & _OTHERS:
+        raise UserError(f"{shown} can be read or changed by other users: chmod 600 it")
+    rows = [row.strip() for row in content.splitlines()]
+    rows = [row for row in rows if row and not row.startswith(b"#")]
+    found = _KEY.fullmatch(rows[0]) if len(rows) == 1 else None
+    if found and found["passphrase"]:
+        return hashlib.sha256(found["passphrase"]).digest()
+    if found and any(key := bytes.fromhex(found["key"].decode())):  # all zero means no signing
+        return key
+    raise UserError(f"{shown} is too short or no key file: {_EXPECTED}")
 
 
 def create_key(path: Path) -> str:
@@ -72,15 +73,3 @@ def create_key(path: Path) -> str:
         reason = getattr(error, "strerror", None) or error
         raise UserError(f"{abridged(path)} cannot be created: {reason}") from None
     return passphrase
-
-
-def _key_in(content: bytes, shown: str) -> bytes:
-    """The key that the file's content gives."""
-    rows = [row.strip() for row in content.splitlines()]
-    rows = [row for row in rows if row and not row.startswith(b"#")]
-    found = _KEY.fullmatch(rows[0]) if len(rows) == 1 else None
-    if found and found["passphrase"]:
-        return hashlib.sha256(found["passphrase"]).digest()
-    if found and any(key := bytes.fromhex(found["key"].decode())):  # all zero means no signing
-        return key
-    raise UserError(f"{shown} is too short or no key file: {_EXPECTED}")

@@ -25,7 +25,6 @@ from offboard.link.udp import LockstepLink, UdpLink, udp_socket
 FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or serial:DEVICE:BAUD"
 PORT_MAX, BAUD_MAX = 65535, 100_000_000
 BITS_OF_A_BYTE = 10  # on a serial line: start, eight bits, stop
-LISTENS = ("udpin", "tcpin")
 _ADDRESS = re.compile(r"(udpin|udpout|tcp|tcpin|serial):(.+):([0-9]{1,9})", re.ASCII)
 
 
@@ -47,11 +46,8 @@ def open_link(address: str) -> Link:
         if not 0 < number <= BAUD_MAX:
             raise LinkError(f"connection {shown(address)}: {number} baud is no rate of a port")
         return RedialingLink(lambda: open_port(host, number), "serial", number / BITS_OF_A_BYTE)
-    least = 0 if kind in LISTENS else 1  # 0: any free port
-    if not least <= number <= PORT_MAX:
-        raise LinkError(
-            f"connection {shown(address)}: port {number} is not within {least} .. {PORT_MAX}"
-        )
+    if not 1 <= number <= PORT_MAX:
+        raise LinkError(f"connection {shown(address)}: port {number} is not within 1 .. {PORT_MAX}")
     if ":" in host and not (host.startswith("[") and host.endswith("]")):
         raise LinkError(
             f"connection {shown(address)} is not understood; an IPv6 address stands in brackets, "

@@ -25,13 +25,7 @@ from offboard.control.base import Controller, ControllerSettings
 from offboard.documents import shipped
 from offboard.documents.errors import DocumentError, located
 from offboard.documents.parameters import Parameters
-from offboard.documents.reading import (
-    check_kind,
-    kind_of,
-    override,
-    read,
-    validate,
-)
+from offboard.documents.reading import override, read, validate
 from offboard.documents.shipped import PARTS, locate, read_text
 from offboard.flight.phases import Limits
 from offboard.identification.learner import IdentifySettings
@@ -39,7 +33,6 @@ from offboard.model.vehicle import Vehicle
 from offboard.reference.feasibility import check
 from offboard.reference.shapes import SHAPES, FromTable, Shape, Waypoints
 from offboard.reference.track import Track
-from offboard.run.sitl import check_scenario
 
 Raw = dict[str, Any]
 RECORDED_VERSIONS = ("pso-offboard", "pymavlink", "numpy", "scipy", "numba")
@@ -80,8 +73,7 @@ def load(
     `known_vehicle` stands in for the file's `neutral`, of which nothing is known.
     """
     path = locate(name, "configuration")
-    raw = read(read_text(path), str(path))
-    check_kind(raw, "configuration", str(path))
+    raw = read(read_text(path), str(path), "configuration")
     if known_vehicle and raw.get("vehicle") == UNKNOWN_VEHICLE:
         raw["vehicle"] = known_vehicle
     for part in PARTS:
@@ -152,38 +144,6 @@ def build_controller(config: FlightConfig) -> Controller:
         raise DocumentError(f"controller {settings.law}: {why}") from error
 
 
-def check_file(path: Path) -> str:
-    """Validate one file of any kind that a flight may be given; return what it is.
-
-    A reference is built and must be flyable by the default flight's vehicle, a flight's by its
-    own. Scenarios are the simulator's. Raises DocumentError.
-    """
-    if path.suffix.lower() == ".csv":
-        build_track(load("flight", choices={"reference": str(path)}))
-        return "reference"
-    text = read_text(path)
-    raw = read(text, str(path))
-    if not raw:
-        raise DocumentError(f"{path} is empty")
-    name = str(path if shipped.is_file(str(path)) else path.absolute())
-    kind = kind_of(raw)
-    if not kind:
-        raise DocumentError(
-            f"{path}: no key says what it is: a vehicle has mass_kg, a controller law, a reference "
-            "shape, a scenario conditions or faults, a configuration these three: "
-            f"{', '.join(PARTS)}"
-        )
-    if kind == "scenario":
-        check_scenario(text, str(path))
-    elif kind in PARTS:
-        validate(raw, _model(kind, raw, str(path)), str(path))
-    if kind == "reference":
-        build_track(load("flight", choices={kind: name}))
-    elif kind == "configuration":
-        build_track(load(name))
-    return kind
-
-
 def dump(config: FlightConfig) -> str:
     """The resolved configuration as YAML that `load` accepts, headed by what it is flown with."""
     packages = " ".join(f"{name} {version(name)}" for name in RECORDED_VERSIONS)
@@ -241,8 +201,7 @@ def read_part(part: str, name: str) -> Raw:
     if name in laws:
         return {"law": name}
     path = locate(name, part, laws)
-    raw = read(read_text(path), str(path))
-    check_kind(raw, part, str(path))
+    raw = read(read_text(path), str(path), part)
     validate(raw, _model(part, raw, str(path)), str(path))
     if raw.get("shape") == "table":
         raw["file"] = str(path.parent / raw["file"])

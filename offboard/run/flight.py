@@ -18,7 +18,7 @@ import numpy as np
 from offboard.compiled import prepare
 from offboard.control.base import Adaptive, Controller, Situation
 from offboard.documents.errors import DocumentError, located
-from offboard.documents.shipped import is_file
+from offboard.documents.shipped import absolute
 from offboard.documents.signing_key import read_key
 from offboard.estimation.observer import Observer
 from offboard.flight.flight import Flight, Outcome
@@ -140,8 +140,8 @@ class Simulated:
             *("--connect", f"udpout:127.0.0.1:{port}", "--gcs", "none", "--lockstep"),
             *("--patience", f"{SITL_TIMEOUT_S:g}"),
             *("--seed", str(seed), "--firmware", self.firmware),
-            *(("--scenario", _placed(self.scenario)) if self.scenario else ()),
-            *(("--vehicle", _placed(self.vehicle)) if self.vehicle else ()),
+            *(("--scenario", absolute(self.scenario)) if self.scenario else ()),
+            *(("--vehicle", absolute(self.vehicle)) if self.vehicle else ()),
             *(("--signing-key", str(self.signing_key.absolute())) if self.signing_key else ()),
             *(f"--param={name}={value:g}" for name, value in self._parameters().items()),
         ]
@@ -150,11 +150,6 @@ class Simulated:
         """Parameters that a user must set once on this autopilot."""
         watched = DIALECTS[self.firmware].watched_parameters
         return {p.name: float(p.required.bits) for p in watched if p.required.bits}
-
-
-def _placed(name: str) -> str:
-    """A name, or a file for a process that was started in another directory."""
-    return str(Path(name).absolute()) if is_file(name) else name
 
 
 # --- a configuration made ready ---

@@ -19,7 +19,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field
 
 from offboard.documents.errors import DocumentError
-from offboard.documents.reading import read, validate
+from offboard.documents.reading import parse
 from offboard.documents.shipped import read_text
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_estimate import IdentifiedVehicle
@@ -153,7 +153,7 @@ class VehicleFiles:
 
 
 def _load(path: Path) -> tuple[str, IdentifiedVehicle]:
-    document = validate(read(read_text(path), str(path)), Document, str(path))
+    document = parse(read_text(path), Document, str(path))
     delay = Estimate(document.tilt_delay_s, document.tilt_delay_sd_s)
     return document.identified_from, IdentifiedVehicle(
         document.vehicle, delay, document.link_delay_s

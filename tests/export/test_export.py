@@ -219,10 +219,10 @@ def test_our_announcements_and_a_second_vehicle(flight: Path, tmp_path: Path) ->
 def test_refusals(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     taken = tmp_path / "taken.csv"
     taken.write_text("mine")
-    assert "exists already" in str(run(flight, "csv", taken).exception)
+    assert "exists already" in run(flight, "csv", taken).output
     assert taken.read_text() == "mine"
     nowhere = tmp_path / "none" / "flight.csv"
-    assert "there is no directory" in str(run(flight, "csv", nowhere).exception)
+    assert "there is no directory" in run(flight, "csv", nowhere).output
     monkeypatch.setitem(sys.modules, "mcap.writer", None)
     reason = str(run(flight, "mcap", tmp_path / "a.mcap").exception)
     assert "'mcap>=1.2'" in reason

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from processes import free_port
 from pymavlink.dialects.v20 import common as mavlink
 
 from offboard.link import clock
@@ -98,7 +99,7 @@ def run_until_it_breaks(link: Link) -> None:
 @pytest.fixture
 def udp() -> Iterator[Udp]:
     """A link that listens, the socket of a vehicle, and that of another program."""
-    link = open_link(f"udpin:{LOCAL}:0")
+    link = open_link(f"udpin:{LOCAL}:{free_port()}")
     assert isinstance(link, UdpLink)
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle,
@@ -332,7 +333,7 @@ def test_a_tcp_peer_that_goes_and_returns_is_connected_again(ends: ExitStack) ->
 
 
 def test_tcpin_takes_one_client_and_the_next_one_when_it_is_silent(ends: ExitStack) -> None:
-    link = opened("tcpin:127.0.0.1:0", ends)
+    link = opened(f"tcpin:127.0.0.1:{free_port()}", ends)
     place = LOCAL, port(link)
     assert link.receive() == []
     link.send(b"to nobody", None)
@@ -416,7 +417,7 @@ def joined(kind: str, ends: ExitStack) -> tuple[Link, Callable[[bytes], object]]
         server = listening(ends)
         link = opened(f"tcp:127.0.0.1:{server.getsockname()[1]}", ends)
         return link, ends.enter_context(server.accept()[0]).sendall
-    link = opened("udpin:127.0.0.1:0", ends)
+    link = opened(f"udpin:127.0.0.1:{free_port()}", ends)
     other = ends.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
     assert isinstance(link, UdpLink)
     other.connect(("127.0.0.1", port(link)))
@@ -430,7 +431,7 @@ def waiting_bytes(descriptor: int) -> int:
 
 @pytest.mark.skipif(not IPV6, reason="this computer has no IPv6")
 def test_ipv6_addresses(ends: ExitStack) -> None:
-    link = opened("udpin:[::1]:0", ends)
+    link = opened(f"udpin:[::1]:{free_port()}", ends)
     assert isinstance(link, UdpLink)
     other = ends.enter_context(socket.socket(socket.AF_INET6, socket.SOCK_DGRAM))
     other.settimeout(LONG_S)

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from processes import RECORDING
+from processes import RECORDING, free_port
 from pymavlink.dialects.v20 import common as mavlink
 
 from offboard.analysis import tlog
@@ -67,7 +67,8 @@ class Rig:
         self.vehicle.settimeout(LONG_S)
         self.vehicle.bind(("127.0.0.1", 0))
         self.peer: Any = "tcp" if stream else self.vehicle.getsockname()
-        self.link: Any = open_link(f"{kind}:127.0.0.1:{self.peer[1] if kind == 'udpout' else 0}")
+        port = self.peer[1] if kind == "udpout" else free_port()
+        self.link: Any = open_link(f"{kind}:127.0.0.1:{port}")
         self.link.follow(self.peer)
         with socket.socket(fileno=os.dup(self.link.descriptors()[0])) as ours:
             self.place = ours.getsockname()

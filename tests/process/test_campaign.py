@@ -226,7 +226,7 @@ def test_a_comparison_whose_link_does_not_open_goes_on_when_it_does(
 ) -> None:
     """The key is made and the vehicle plugged in after the first attempts."""
     command = "offboard compare --controllers lqr --seeds 2 --out x --connect serial:usb:57600"
-    for more, why in (("--signing-key none", "signing key none"), ("", "usb")):
+    for more, why in (("--signing-key none", "signing key none cannot"), ("", "usb")):
         code, output, errors = called(f"{command} {more}")
         assert (code, "already flown" in output) == (4, False), output
         assert why in errors

@@ -90,6 +90,16 @@ def test_a_log_with_attitude_as_angles_is_identified(called: Called, tmp_path: P
     assert found["tilt"]["natural_frequency_radps"] == pytest.approx(11.4, abs=1.0)
 
 
+@pytest.mark.usefixtures("in_memory")
+def test_a_vehicle_is_flown_and_then_identified(called: Called, tmp_path: Path) -> None:
+    command = "offboard identify --sitl --scenario calm --set reference.laps=1 --out x -o mine.yaml"
+    assert called(command)[::2] == (0, "")
+    assert read(tmp_path / "x").facts["reference"] == "lemniscate"  # of `identify`, by its shape
+    found = yaml.safe_load((tmp_path / "mine.yaml").read_text())
+    assert found["hover_thrust"] == pytest.approx(0.5, abs=0.02)
+    assert (tmp_path / "identify.html").exists()
+
+
 def test_the_page_of_a_second_identification_has_a_name_of_its_own(
     called: Called, tmp_path: Path
 ) -> None:

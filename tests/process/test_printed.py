@@ -38,6 +38,12 @@ def test_help_has_the_exit_codes_and_the_shipped_files() -> None:
             assert {path.stem for path in shipped(folder)} <= named
 
 
+def test_without_a_command_the_commands_are_shown(called: Called) -> None:
+    code, shown, said = called("offboard")
+    assert (code, said) == (2, "")
+    assert all(f"\n  {command} " in shown for command in COMMANDS)
+
+
 def test_every_shipped_file_is_listed_with_what_it_is(called: Called) -> None:
     lines = CliRunner().invoke(offboard, ["list"]).output.splitlines()
     assert max(map(len, lines)) <= 80

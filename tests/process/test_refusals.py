@@ -62,10 +62,10 @@ def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
         ("--set", "vehicle.hover_thrust=0.92", "0.92 exceeds limits.hover_thrust (0.9)"),
         ("--set", SWARM, "particles x iterations must be at most 500000, not 1000000000"),
         ("--require", "rmse_position<1", "'rmse_position', did you mean rmse_position_m? there"),
-        ("--connect", "udpin:127.0.0.1:0", "give the port that the vehicle sends to"),
+        ("--connect", "udpin:127.0.0.1:0", "port 0 is not within 1 .. 65535"),
         ("--connect", "udpin:127.0.0.1", "is not understood; use udpin:HOST:PORT"),
         ("--connect", "udpin:::1:14540", "an IPv6 address stands in brackets, as in udpin:[::1]"),
-        ("--signing-key", "/dev/null", "signing key /dev/null is not a file"),
+        ("--signing-key", "/dev/null", "signing key /dev/null cannot be read: not a regular file"),
         ("--out", "/proc/nowhere", "choose a directory that can be written with --out"),
         ("--firmware", "px4", "--firmware are options of --sitl: add it"),
         ("--vehicle", CONFIG / "campaigns" / "quick.yaml", "is a campaign file; a vehicle file is"),
@@ -85,6 +85,7 @@ def test_what_cannot_be_flown_is_refused(
 @pytest.mark.parametrize(
     ("command", "says"),
     [
+        ("offboard flyy", "No such command 'flyy'"),
         ("offboard doctor gsp", "there is no check named 'gsp'; known are port, vehicle,"),
         ("offboard daemon --print-unit --out here", "can write below /var/lib/offboard alone"),
         ("offboard paper --quick --seeds 20 --table none", "--quick is --seeds 1: use one of them"),
@@ -156,7 +157,7 @@ CSV = "time_s,north_m,east_m,altitude_m\n0,0,0,3\n3,2,0,3\n6,2,{east},4\n9,0,0,3
         ("flight.yaml", "vehicle: px4_sih", "flight.yaml: controller is missing"),
         ("flight.yaml", "vehicle: px4_sih\ncontroler: pso",
          "controller is missing (is it meant by controler?); give a name, a file or a"),
-        ("flight.yaml", "# nothing yet", "flight.yaml is empty"),
+        ("flight.yaml", "# nothing yet", "flight.yaml: no key says what it is"),
         ("mine.yaml", "mass_kg: 1\nhover_trust: 1", "did you mean hover_thrust?"),
         ("mine.yaml", "hover_thrust: 0.5", "no key says what it is: a vehicle has mass_kg, a"),
         ("path.csv", CSV.format(east=90), "reference path.csv: the reference asks for"),
@@ -226,7 +227,7 @@ def test_a_directory_with_a_flight_is_left_as_it_is(refused: Refused, tmp_path: 
     [
         ("offboard paper --quick --table 2 --out x", "is not empty; choose another"),
         (f"offboard identify {RECORDING} -o x/old", "x/old exists already; choose another"),
-        (f"offboard identify {RECORDING} -o y/new", "-o y/new: there is no directory y"),
+        (f"offboard identify {RECORDING} -o y/new", "y/new: there is no directory y"),
         (f"offboard identify {RECORDING} --out x", "a log needs no --system, --out or other"),
         (f"{SIMULATOR} --log x/old --duration 0.1", "--log x/old cannot be written: File"),
     ],
