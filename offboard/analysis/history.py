@@ -12,7 +12,6 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -274,9 +273,9 @@ def parts(values: NDArray[Any]) -> list[NDArray[Any]]:
     return np.array_split(values, 1 + len(values) // 8192)
 
 
-def in_parts(function: Callable[[Rows], Array], rows: Rows) -> Array:
-    """`function` of all rows, (N, ...)."""
-    return np.concatenate([function(part) for part in parts(rows)])
+def in_parts(function: Callable[..., Array], rows: Rows, *more: Any) -> Array:
+    """`function` of all rows, (N, ...), and of `more`."""
+    return np.concatenate([function(part, *more) for part in parts(rows)])
 
 
 class _Collector:
@@ -453,13 +452,13 @@ class _Collector:
 def _truth(rows: Mapping[str, Rows], origin: Geodetic | None) -> Rows:
     for name, unit in _TRUTH.items():
         if origin is not None and len(rows[name]):
-            position = partial(_true_position, unit=unit, origin=origin)
-            return table(rows[name], position_ned_m=in_parts(position, rows[name]))
+            position = in_parts(_true_position, rows[name], unit, origin)
+            return table(rows[name], position_ned_m=position)
     none = {"time_s": np.zeros(0), "unix_s": np.zeros(0)}
     return table(none, position_ned_m=np.zeros((0, 3), np.float32))
 
 
-def _true_position(rows: Rows, *, unit: float, origin: Geodetic) -> Array:
+def _true_position(rows: Rows, unit: float, origin: Geodetic) -> Array:
     """NED in m (N, 3), as float32. `unit` of the altitude in a metre."""
     places = np.column_stack((rows["place"] / 1e7, rows["altitude"] / unit))
     return position_ned_m(places, origin).astype(np.float32)

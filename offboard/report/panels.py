@@ -18,7 +18,6 @@ Points = tuple[Array, ...]  # times and values (N,), and their standard deviatio
 Source = Callable[[History], Points]
 
 BINS = 1500  # of a curve, see `thinned`
-REFERENCE_GAP_S = 0.5  # without a record of the reference for longer there is none
 LEAST_SHOWN = 1e-16  # of a logarithmic axis: zero is drawn there
 ESTIMATED, TRUE, COMMANDED = "estimated", "true (simulator)", "commanded"
 AXES = (("north", GREEN, "solid"), ("east", PINK, "dash"), ("down", INK, "dot"))
@@ -65,13 +64,12 @@ def _away(array: str, axis: int | None = None) -> Source:
     """Distance from the reference, or its component along an axis; NaN where there is none."""
 
     def samples(flown: History) -> Points:
-        rows = each_once(getattr(flown, array))
-        if len(np.unique(np.maximum.accumulate(flown.reference["time_s"]))) < 2:
+        rows, reference = each_once(getattr(flown, array)), Reference.of(flown)
+        if reference is None:
             return np.zeros(0), np.zeros(0)
-        near = near_reference(flown, rows["time_s"])
-        expected = Reference(flown.reference).position(rows["time_s"][near])
+        near = reference.is_near(rows["time_s"])
         errors = np.full((len(rows), 3), np.nan)
-        errors[near] = rows["position_ned_m"][near] - expected
+        errors[near] = rows["position_ned_m"][near] - reference.position(rows["time_s"][near])
         values = np.linalg.norm(errors, axis=1) if axis is None else errors[:, axis]
         return rows["time_s"], np.asarray(values)
 
@@ -209,13 +207,3 @@ def thinned(values: Array, bins: int = BINS) -> NDArray[np.intp]:
     least, greatest = order[edges], order[edges + np.maximum(finite, 1) - 1]
     gaps = order[(edges + finite)[finite < np.diff(np.append(edges, count))]]
     return np.unique(np.concatenate(([0, count - 1], least, greatest, gaps)))
-
-
-def near_reference(flown: History, times: Array) -> NDArray[np.bool_]:
-    """Whether a record of the reference is near each of the times (N,)."""
-    stamps = np.sort(flown.reference["time_s"])
-    place = np.searchsorted(stamps, times)
-    inside = (place > 0) & (place < len(stamps))
-    before, after = np.clip(place - 1, 0, None), np.clip(place, None, len(stamps) - 1)
-    near: NDArray[np.bool_] = inside & (stamps[after] - stamps[before] <= REFERENCE_GAP_S)
-    return near
