@@ -12,7 +12,7 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,7 @@ from offboard.model.geodesy import Geodetic, origin_of, position_ned_m
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.void]
+Kind = TypeVar("Kind", bound=np.generic)
 OUR_COMPONENTS = (COMPONENT_ID, RECORD_COMPONENT_ID)
 TELEMETRY = (31, 32)  # ATTITUDE_QUATERNION, LOCAL_POSITION_NED
 _SUBSTITUTES = (30, 33)  # ATTITUDE, GLOBAL_POSITION_INT: the clock of logs without these
@@ -82,6 +83,11 @@ _OURS: dict[str, Columns] = {
     _RECORDS: {name: ("data", 1, place) for place, name in enumerate(FIELDS)},
     _IDENTIFIED: {name: ("data", 2, 2 * place) for place, name in enumerate(RECORDED)},
 }  # fmt: skip
+_LIMITS = {
+    "position_ned_m": POSITION_LIMIT_M,
+    "velocity_ned_mps": VELOCITY_LIMIT_MPS,
+    "rates_radps": RATE_LIMIT_RADPS,
+}
 _NO_ATTITUDE = struct.pack("<8f", *(math.nan,) * 8)  # of a setpoint, after its stamp
 _TIMES = struct.Struct("<2d")  # time_s, unix_s
 
@@ -273,7 +279,7 @@ def parts(values: NDArray[Any]) -> list[NDArray[Any]]:
     return np.array_split(values, 1 + len(values) // 8192)
 
 
-def in_parts(function: Callable[..., Array], rows: Rows, *more: Any) -> Array:
+def in_parts(function: Callable[..., NDArray[Kind]], rows: Rows, *more: Any) -> NDArray[Kind]:
     """`function` of all rows, (N, ...), and of `more`."""
     return np.concatenate([function(part, *more) for part in parts(rows)])
 
@@ -399,14 +405,8 @@ class _Collector:
         heartbeat["armed"] = heartbeat["armed"] & ARMED > 0
         voltage, remaining = (battery[name].astype(np.float32) for name in _THEIRS["SYS_STATUS"])
         voltage[voltage == _NO_VOLTAGE] = remaining[remaining == _NO_PERCENTAGE] = math.nan
-        position = _plausible(
-            rows["LOCAL_POSITION_NED"],
-            position_ned_m=POSITION_LIMIT_M,
-            velocity_ned_mps=VELOCITY_LIMIT_MPS,
-        )
-        attitude = _plausible(rows["ATTITUDE_QUATERNION"], rates_radps=RATE_LIMIT_RADPS)
-        lengths = np.linalg.norm(attitude["quaternion"], axis=1)
-        attitude = _where(attitude, lengths > UNIT_LENGTHS[0], lengths < UNIT_LENGTHS[1])
+        position = _plausible(rows["LOCAL_POSITION_NED"])
+        attitude = _plausible(rows["ATTITUDE_QUATERNION"])
         setpoint = ours["SET_ATTITUDE_TARGET"]
         substitutes = []
         if not len(position) and not len(ours["POSITION_TARGET_LOCAL_NED"]):  # of another origin
@@ -489,17 +489,20 @@ def _link_delay(requests: Rows, replies: Rows) -> Rows:
     return table(times, delay_s=1e-9 * (replies["answered_ns"] - replies["asked_ns"]))
 
 
-def _plausible(rows: Rows, **limits: float) -> Rows:
-    """The rows whose columns are within these limits, as the flight refuses the others."""
-    return _where(
-        rows, *((np.abs(rows[name]) < limit).all(axis=1) for name, limit in limits.items())
-    )
-
-
-def _where(rows: Rows, *conditions: NDArray[np.bool_]) -> Rows:
-    """The rows where all conditions (N,) hold; without a copy if that is everywhere."""
-    kept = np.all(conditions, axis=0)
+def _plausible(rows: Rows) -> Rows:
+    """Without those that the flight refuses, too; without a copy if there are none."""
+    kept = in_parts(_within_limits, rows)
     return rows if kept.all() else rows[kept]
+
+
+def _within_limits(rows: Rows) -> NDArray[np.bool_]:
+    known = rows.dtype.names or ()
+    kept = [(np.abs(rows[name]) < _LIMITS[name]).all(axis=1) for name in _LIMITS if name in known]
+    if "quaternion" in known:
+        lengths = np.linalg.norm(rows["quaternion"], axis=1)
+        kept += [lengths > UNIT_LENGTHS[0], lengths < UNIT_LENGTHS[1]]
+    within: NDArray[np.bool_] = np.logical_and.reduce(kept)
+    return within
 
 
 def _vehicle(log: Tlog) -> tuple[Address | None, Dialect | None]:

@@ -37,6 +37,7 @@ _QUINTIC = np.linalg.inv(
         for order in range(3)
     ]
 )
+_DERIVATIVES = ("position_ned_m", "velocity_ned_mps", "acceleration_ned_mps2")
 _FITNESS = ("e_u", "e_v", "e_w", "e_x", "e_y", "e_z", "e_psi")
 
 
@@ -104,12 +105,9 @@ class Reference:
     def __init__(self, rows: Rows) -> None:
         self._times = rows["time_s"]
         self._heading = np.unwrap(rows["heading_rad"].astype(np.float64))
-        derivatives = ("position_ned_m", "velocity_ned_mps", "acceleration_ned_mps2")
-        known = np.stack([rows[name].astype(np.float64) for name in derivatives], axis=1)
-        length_s = np.diff(self._times)[:, None, None]
-        scaled = known[:-1] * length_s**_ORDERS, known[1:] * length_s**_ORDERS
-        coefficients = _QUINTIC @ np.concatenate(scaled, axis=1) / length_s**_POWERS
-        self._position = PPoly(coefficients.swapaxes(0, 1), self._times)
+        intervals = parts(np.arange(len(rows) - 1))
+        coefficients = [_quintics(rows[part[0] : part[-1] + 2]) for part in intervals]
+        self._position = PPoly(np.concatenate(coefficients, axis=1), self._times)
 
     @classmethod
     def of(cls, flown: History) -> Reference | None:
@@ -131,6 +129,14 @@ class Reference:
         gaps_s = np.diff(self._times, prepend=-math.inf, append=math.inf)
         near: NDArray[np.bool_] = gaps_s[place] <= GAP_S
         return near
+
+
+def _quintics(rows: Rows) -> Array:
+    """Coefficients (6, N - 1, 3) of the powers of the time since each row."""
+    known = np.stack([rows[name].astype(np.float64) for name in _DERIVATIVES], axis=1)
+    length_s = np.diff(rows["time_s"])[:, None, None]
+    ends = np.concatenate((known[:-1] * length_s**_ORDERS, known[1:] * length_s**_ORDERS), axis=1)
+    return (_QUINTIC @ ends / length_s**_POWERS).swapaxes(0, 1)
 
 
 def each_once(rows: Rows) -> Rows:
@@ -260,13 +266,15 @@ def _named(pattern: str, kinds: str, values: Array, weights: Array) -> dict[str,
         return {}
     mean = float(weights @ values / total)
     square = float(np.einsum("i,i,i", weights, values, values) / total)
-    order = np.argsort(values)
-    upto = np.searchsorted(np.cumsum(weights[order]), 0.95 * total)
     found = {
         "mean": mean,
         "rmse": math.sqrt(square),
         "sd": math.sqrt(max(square - mean**2, 0.0)),
         "max": float(np.max(values, where=weights > 0.0, initial=-math.inf)),
-        "p95": float(values[order[upto]]),
     }
+    if "p95" in kinds:
+        order = np.argsort(values)
+        upto_s = weights[order]
+        np.cumsum(upto_s, out=upto_s)
+        found["p95"] = float(values[order[np.searchsorted(upto_s, 0.95 * total)]])
     return {pattern.format(kind): found[kind] for kind in kinds.split()}
