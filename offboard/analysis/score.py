@@ -161,7 +161,7 @@ def score_flight(flight: Path) -> tuple[Score, History]:
         score, history = score_flight(Path("flights/20261121-093000"))
         print(score.rmse_position_m, history.phases)
     """
-    flown = gather(tlog.read(tlog.find(flight)))
+    flown = gather(tlog.read(flight))
     return score(flown), flown
 
 

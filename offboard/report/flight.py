@@ -74,7 +74,7 @@ class Flight:
 
 def read(path: Path) -> Flight:
     """Read a flight directory or a .tlog file. Raises UserError."""
-    log = tlog.read(tlog.find(path))
+    log = tlog.read(path)
     flown = history.gather(log)
     missing = [_NO_HEARTBEAT] if flown.vehicle is None else []
     if not len(flown.records):
