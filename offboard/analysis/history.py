@@ -226,14 +226,7 @@ class Samples:
             }
         )
         self._stamps = layout(message).names or ()
-        self._data = bytearray()
-
-    @property
-    def empty(self) -> bool:
-        return not self._data
-
-    def clear(self) -> None:
-        self._data.clear()
+        self.data = bytearray()
 
     def stamp_ms(self, payload: bytes) -> float | None:
         """The stamp of a message, None without one."""
@@ -245,12 +238,12 @@ class Samples:
 
     def add(self, payload: bytes, time_s: float, unix_s: float) -> None:
         """A message with its vehicle time, and that of its entry in the log."""
-        self._data += _TIMES.pack(time_s, unix_s)
-        self._data += payload[self._begin : self._end].ljust(self._end - self._begin, b"\0")
+        self.data += _TIMES.pack(time_s, unix_s)
+        self.data += payload[self._begin : self._end].ljust(self._end - self._begin, b"\0")
 
     def rows(self) -> Rows:
         """All rows. Nothing can be added after."""
-        return np.frombuffer(self._data, self._dtype)
+        return np.frombuffer(self.data, self._dtype)
 
 
 def _place(message: str, field: str, count: int, first: int = 0) -> tuple[int, np.dtype[Any]]:
@@ -289,12 +282,10 @@ class _Collector:
 
     def __init__(self, vehicle: Address | None, dialect: Dialect | None) -> None:
         self._vehicle, self._dialect = vehicle, dialect
-        tables = ((True, _OURS), (False, _THEIRS))
-        self._samples = {
-            (ours, name): Samples(name.partition(" ")[0], columns)
-            for ours, table in tables
-            for name, columns in table.items()
-        }
+        self._ours, self._theirs = (
+            {name: Samples(name.partition(" ")[0], columns) for name, columns in table.items()}
+            for table in (_OURS, _THEIRS)
+        )
         self._origin: Geodetic | None = None  # of the local frame
         self._assembler = TextAssembler()
         self._texts: list[Event] = []  # of the vehicle
@@ -321,11 +312,12 @@ class _Collector:
             return
         if name == "TIMESYNC" and ours == any(payload[:8]):  # tc1 is 0 in a request
             return  # the delay of the link is that of our requests and their replies
-        samples = self._samples.get((ours, name))
-        usual = self._samples.get((ours, _INSTEAD_OF.get(name, "")))
-        if samples is not None and (usual is None or usual.empty):  # else only memory
-            self._keep(samples, payload, entry.unix_us / 1e6)
-        (self._add_ours if ours else self._add_theirs)(entry, payload, entry.unix_us / 1e6)
+        unix_s = entry.unix_us / 1e6
+        samples = (self._ours if ours else self._theirs).get(name)
+        usual = self._theirs.get(_INSTEAD_OF.get(name, ""))
+        if samples and not (usual and usual.data):  # else only memory
+            self._keep(samples, payload, unix_s)
+        (self._add_ours if ours else self._add_theirs)(entry, payload, unix_s)
 
     def _keep(self, samples: Samples, payload: bytes, unix_s: float) -> None:
         """A message without a stamp has that of the telemetry before it."""
@@ -358,7 +350,7 @@ class _Collector:
     def _add_ours(self, entry: LoggedMessage, payload: bytes, unix_s: float) -> None:
         if entry.name == "SET_POSITION_TARGET_LOCAL_NED":
             setpoint = payload[:4] + _NO_ATTITUDE
-            self._keep(self._samples[True, "SET_ATTITUDE_TARGET"], setpoint, unix_s)
+            self._keep(self._ours["SET_ATTITUDE_TARGET"], setpoint, unix_s)
         elif record_type(entry) == event_record.EVENT_TYPE:
             self._event_records.append((self.now_s, unix_s, entry.tunnelled))
 
@@ -382,10 +374,9 @@ class _Collector:
     def _forget_before_flight(self) -> None:
         """The vehicle was rebooted, and its time begins anew: if no setpoint was sent yet, what it
         reported before does not belong to the flight."""
-        if self._samples[True, "SET_ATTITUDE_TARGET"].empty:
-            for (ours, _), samples in self._samples.items():
-                if not ours:
-                    samples.clear()
+        if not self._ours["SET_ATTITUDE_TARGET"].data:
+            for samples in self._theirs.values():
+                samples.data.clear()
 
     def _add_origin(self, entry: LoggedMessage) -> None:
         """HOME_POSITION gives one point in both frames."""
@@ -398,9 +389,8 @@ class _Collector:
 
     def history(self, damage: str) -> History:
         """All that was added."""
-        found = {key: samples.rows() for key, samples in self._samples.items()}
-        rows = {name: found[False, name] for name in _THEIRS}
-        ours = {name: found[True, name] for name in _OURS}
+        rows = {name: samples.rows() for name, samples in self._theirs.items()}
+        ours = {name: samples.rows() for name, samples in self._ours.items()}
         heartbeat, battery = rows["HEARTBEAT"], rows["SYS_STATUS"]
         heartbeat["armed"] = heartbeat["armed"] & ARMED > 0
         voltage, remaining = (battery[name].astype(np.float32) for name in _THEIRS["SYS_STATUS"])

@@ -56,10 +56,6 @@ def _column(array: str, column: str, scale: float = 1.0, axis: int | None = None
     return samples
 
 
-def _recorded(field: str, scale: float = 1.0) -> Source:
-    return _column("records", field, scale)
-
-
 def _away(array: str, axis: int | None = None) -> Source:
     """Distance from the reference, or its component along an axis; NaN where there is none."""
 
@@ -139,7 +135,7 @@ GROUPS: dict[str, tuple[str, tuple[Panel, ...]]] = {
     "thrust": ("Thrust and battery", (
         Panel("thrust, 0 to 1", (
             Curve(COMMANDED, _column("commanded", "thrust"), ORANGE, "steps"),
-            Curve("hover thrust, estimated", _recorded("hover_thrust"), INK, main=False,
+            Curve("hover thrust, estimated", _column("records", "hover_thrust"), INK, main=False,
                   dash="dash"),
         )),
         Panel("battery, %", (Curve("remaining", _column("battery", "remaining"), BLUE, "steps"),)),
@@ -149,23 +145,23 @@ GROUPS: dict[str, tuple[str, tuple[Panel, ...]]] = {
     )),
     "decisions": ("Decisions", (
         Panel("gap: cost above the exact optimum", (
-            Curve("gap", _recorded("gap"), BLUE, "dots"),
+            Curve("gap", _column("records", "gap"), BLUE, "dots"),
         ), logarithmic=True, caption="Zero is drawn at 1e-16. Only decisions that were sent as "
               "certified have a gap."),
         Panel("spread of the swarm (ε, Eq. 29)", (
-            Curve("spread", _recorded("spread"), BLUE, "dots"),
+            Curve("spread", _column("records", "spread"), BLUE, "dots"),
         ), logarithmic=True),
         Panel("solve time, ms", (
-            Curve("solve time", _recorded("solve_time_s", 1e3), BLUE, "dots"),
+            Curve("solve time", _column("records", "solve_time_s", 1e3), BLUE, "dots"),
         )),
     )),
     "link": ("Link", (
         Panel("age and delay, ms", (
-            Curve("telemetry at its setpoint", _recorded("age_s", 1e3), BLUE, "dots"),
+            Curve("telemetry at its setpoint", _column("records", "age_s", 1e3), BLUE, "dots"),
             Curve("delay of the link (TIMESYNC)", _column("link_delay", "delay_s", 1e3),
                   ORANGE, main=False),
-            Curve("telemetry in to setpoint out (host time)", _recorded("answer_s", 1e3), GREEN,
-                  "dots", main=False),
+            Curve("telemetry in to setpoint out (host time)",
+                  _column("records", "answer_s", 1e3), GREEN, "dots", main=False),
         )),
         Panel("interval between positions, ms", (
             Curve("positions", _intervals_ms, BLUE, "dots"),
@@ -182,11 +178,12 @@ GROUPS: dict[str, tuple[str, tuple[Panel, ...]]] = {
         )),
         Panel("hover thrust, 0 to 1", (
             Curve("identified", _identified("hover_thrust"), INK, "dots"),
-            Curve(ESTIMATED, _recorded("hover_thrust"), PURPLE, main=False),
+            Curve(ESTIMATED, _column("records", "hover_thrust"), PURPLE, main=False),
         )),
         Panel("identified drag, 1/s", (Curve("drag", _identified("drag_ps"), BLUE, "dots"),)),
         Panel("estimated disturbance, m/s²", tuple(
-            Curve(name, _recorded(f"disturbance_{name}_mps2"), colour, main=False, dash=dash)
+            Curve(name, _column("records", f"disturbance_{name}_mps2"), colour, main=False,
+                  dash=dash)
             for name, colour, dash in AXES
         )),
     )),
