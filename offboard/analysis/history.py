@@ -225,14 +225,14 @@ class Samples:
                 "itemsize": away + self._end,
             }
         )
-        self._stamps = layout(message).names or ()
+        self._stamp = (layout(message).names or ("",))[0]
         self.data = bytearray()
 
     def stamp_ms(self, payload: bytes) -> float | None:
         """The stamp of a message, None without one."""
-        if "time_boot_ms" in self._stamps:  # the first field, as is the next
+        if self._stamp == "time_boot_ms":
             return int.from_bytes(payload[:4], "little")
-        if "time_usec" in self._stamps and any(payload[:8]):
+        if self._stamp == "time_usec" and any(payload[:8]):
             return 1e-3 * int.from_bytes(payload[:8], "little")
         return None
 
@@ -302,17 +302,19 @@ class _Collector:
         return Event(self.now_s, "vehicle", what, unix_s=unix_s)
 
     def add(self, entry: LoggedMessage) -> None:
-        self._counts[entry.name] += 1
+        frame, vehicle, name = entry.frame, self._vehicle, entry.name
+        payload, unix_s = frame.payload, entry.unix_us / 1e6
+        self._counts[name] += 1
         self._unix_us = (self._unix_us[0] or entry.unix_us, entry.unix_us)
-        payload, vehicle, name = entry.frame.payload, self._vehicle, entry.name
-        ours = entry.component_id in OUR_COMPONENTS
-        if ours and (vehicle is None or entry.system_id == vehicle.system_id):
-            name = f"{name} {entry.message.array_id}" if name == _ARRAY else name
-        elif ours or (entry.system_id, entry.component_id) != vehicle or not self._follow(entry):
+        ours = frame.component_id in OUR_COMPONENTS
+        if ours and (vehicle is None or frame.system_id == vehicle.system_id):
+            name = f"{name} {frame.message.array_id}" if name == _ARRAY else name
+        elif ours or (frame.system_id, frame.component_id) != vehicle:
+            return
+        if not ours and not self._follow(frame.message_id, payload):
             return
         if name == "TIMESYNC" and ours == any(payload[:8]):  # tc1 is 0 in a request
             return  # the delay of the link is that of our requests and their replies
-        unix_s = entry.unix_us / 1e6
         samples = (self._ours if ours else self._theirs).get(name)
         usual = self._theirs.get(_INSTEAD_OF.get(name, ""))
         if samples and not (usual and usual.data):  # else only memory
@@ -330,15 +332,14 @@ class _Collector:
         are put on the same clock."""
         return (stamp_ms + 1e3 * self._time.wrapped_s(stamp_ms / 1e3)) / 1e3
 
-    def _follow(self, entry: LoggedMessage) -> bool:
+    def _follow(self, kind: int, payload: bytes) -> bool:
         """Follow the vehicle's clock, also to its beginning after a restart. False for telemetry
         with a stamp so far ahead that the flight has refused it, too."""
-        kind = entry.frame.message_id
         if kind not in self._clocks:
             return True
         if kind in TELEMETRY:
             self._clocks = TELEMETRY
-        time_s = self._continued_s(int.from_bytes(entry.frame.payload[:4], "little"))
+        time_s = self._continued_s(int.from_bytes(payload[:4], "little"))
         age = self._time.check(kind, time_s)
         if age is Age.REBOOTED and self._event_records:
             self._forget_before_flight()
