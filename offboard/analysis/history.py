@@ -71,7 +71,11 @@ _THEIRS: dict[str, Columns] = {
     "ATTITUDE_TARGET": _SETPOINT,
 }
 _TRUTH = {"HIL_STATE_QUATERNION": 1e3, "SIM_STATE": 1.0}  # units of the altitude in a metre
-_INSTEAD_OF = {"ATTITUDE": "ATTITUDE_QUATERNION", "GLOBAL_POSITION_INT": "LOCAL_POSITION_NED"}
+_INSTEAD_OF = {
+    "ATTITUDE": "ATTITUDE_QUATERNION",
+    "GLOBAL_POSITION_INT": "LOCAL_POSITION_NED",
+    "ATTITUDE_TARGET": "SET_ATTITUDE_TARGET",
+}
 _ARRAY = "DEBUG_FLOAT_ARRAY"  # those of ours, with their array_id
 _RECORDS, _IDENTIFIED = f"{_ARRAY} {RECORD_ID}", f"{_ARRAY} {IDENTIFIED_ID}"
 _OURS: dict[str, Columns] = {
@@ -309,14 +313,17 @@ class _Collector:
         ours = frame.component_id in OUR_COMPONENTS
         if ours and (vehicle is None or frame.system_id == vehicle.system_id):
             name = f"{name} {frame.message.array_id}" if name == _ARRAY else name
-        elif ours or (frame.system_id, frame.component_id) != vehicle:
-            return
-        if not ours and not self._follow(frame.message_id, payload):
+        elif (
+            ours
+            or (frame.system_id, frame.component_id) != vehicle
+            or not self._follow(frame.message_id, payload)
+        ):
             return
         if name == "TIMESYNC" and ours == any(payload[:8]):  # tc1 is 0 in a request
             return  # the delay of the link is that of our requests and their replies
         samples = (self._ours if ours else self._theirs).get(name)
-        usual = self._theirs.get(_INSTEAD_OF.get(name, ""))
+        instead = _INSTEAD_OF.get(name, "")
+        usual = self._theirs.get(instead) or self._ours.get(instead)
         if samples and not (usual and usual.data):  # else only memory
             self._keep(samples, payload, unix_s)
         (self._add_ours if ours else self._add_theirs)(entry, payload, unix_s)
