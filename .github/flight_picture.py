@@ -32,7 +32,7 @@ LABELS = ("offboard", "the autopilot's own position loop")
 
 def tracked(flight: Path) -> tuple[Array, Array, Array]:
     """Time since the start of TRACK (N,), reference and flown position (N, 3), NED in metres."""
-    flown = history.gather(tlog.read(tlog.find(flight)))
+    flown = history.gather(tlog.read(flight))
     track = flown.records["phase"] == Phase.TRACK.code
     begin_s, end_s = flown.records["time_s"][track][[0, -1]]
     times = np.arange(begin_s, end_s, SAMPLE_S)

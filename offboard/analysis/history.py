@@ -12,8 +12,7 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,12 +43,12 @@ from offboard.model.geodesy import Geodetic, origin_of, position_ned_m
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.void]
+Kind = TypeVar("Kind", bound=np.generic)
 OUR_COMPONENTS = (COMPONENT_ID, RECORD_COMPONENT_ID)
 TELEMETRY = (31, 32)  # ATTITUDE_QUATERNION, LOCAL_POSITION_NED
 _SUBSTITUTES = (30, 33)  # ATTITUDE, GLOBAL_POSITION_INT: the clock of logs without these
 _TUNNEL = 385  # message id
 _NO_VOLTAGE, _NO_PERCENTAGE = 0xFFFF, -1  # of SYS_STATUS
-_WRAP_MS = 2**32
 PHASES: dict[int | None, str] = {phase.code: phase.value for phase in Phase}
 # Columns of a message: name -> the first of its fields and how many values, in an array from where
 Columns = Mapping[str, tuple[str, int] | tuple[str, int, int]]
@@ -71,7 +70,12 @@ _THEIRS: dict[str, Columns] = {
     "GLOBAL_POSITION_INT": {"place": ("lat", 3), "velocity": ("vx", 3)},
     "ATTITUDE_TARGET": _SETPOINT,
 }
-_INSTEAD_OF = {"ATTITUDE": "ATTITUDE_QUATERNION", "GLOBAL_POSITION_INT": "LOCAL_POSITION_NED"}
+_TRUTH = {"HIL_STATE_QUATERNION": 1e3, "SIM_STATE": 1.0}  # units of the altitude in a metre
+_INSTEAD_OF = {
+    "ATTITUDE": "ATTITUDE_QUATERNION",
+    "GLOBAL_POSITION_INT": "LOCAL_POSITION_NED",
+    "ATTITUDE_TARGET": "SET_ATTITUDE_TARGET",
+}
 _ARRAY = "DEBUG_FLOAT_ARRAY"  # those of ours, with their array_id
 _RECORDS, _IDENTIFIED = f"{_ARRAY} {RECORD_ID}", f"{_ARRAY} {IDENTIFIED_ID}"
 _OURS: dict[str, Columns] = {
@@ -83,7 +87,11 @@ _OURS: dict[str, Columns] = {
     _RECORDS: {name: ("data", 1, place) for place, name in enumerate(FIELDS)},
     _IDENTIFIED: {name: ("data", 2, 2 * place) for place, name in enumerate(RECORDED)},
 }  # fmt: skip
-_TRUTH = {"HIL_STATE_QUATERNION": 1e3, "SIM_STATE": 1.0}  # units of the altitude in a metre
+_LIMITS = {
+    "position_ned_m": POSITION_LIMIT_M,
+    "velocity_ned_mps": VELOCITY_LIMIT_MPS,
+    "rates_radps": RATE_LIMIT_RADPS,
+}
 _NO_ATTITUDE = struct.pack("<8f", *(math.nan,) * 8)  # of a setpoint, after its stamp
 _TIMES = struct.Struct("<2d")  # time_s, unix_s
 
@@ -201,7 +209,7 @@ def record_type(entry: LoggedMessage) -> int | None:
 
 class Samples:
     """Rows of the messages of one kind, in the order of arrival: their time, and the bytes of their
-    payloads that hold the columns. A message without a stamp has that of the telemetry before it.
+    payloads that hold the columns.
 
     Args:
         message: name in pymavlink.
@@ -221,32 +229,25 @@ class Samples:
                 "itemsize": away + self._end,
             }
         )
-        self._stamps = layout(message).names or ()
-        self._data = bytearray()
+        self._stamp = (layout(message).names or ("",))[0]
+        self.data = bytearray()
 
-    @property
-    def empty(self) -> bool:
-        return not self._data
+    def stamp_ms(self, payload: bytes) -> float | None:
+        """The stamp of a message, None without one."""
+        if self._stamp == "time_boot_ms":
+            return int.from_bytes(payload[:4], "little")
+        if self._stamp == "time_usec" and any(payload[:8]):
+            return 1e-3 * int.from_bytes(payload[:8], "little")
+        return None
 
-    def clear(self) -> None:
-        self._data.clear()
+    def add(self, payload: bytes, time_s: float, unix_s: float) -> None:
+        """A message with its vehicle time, and that of its entry in the log."""
+        self.data += _TIMES.pack(time_s, unix_s)
+        self.data += payload[self._begin : self._end].ljust(self._end - self._begin, b"\0")
 
-    def add(self, payload: bytes, now_ms: float, unix_s: float) -> None:
-        """A message. `now_ms`: stamp of the telemetry before it, NaN without. `unix_s`: of its
-        entry in the log."""
-        stamp_ms = now_ms
-        if "time_boot_ms" in self._stamps:  # the first field, as is the next
-            stamp_ms = int.from_bytes(payload[:4], "little")
-        elif "time_usec" in self._stamps and any(payload[:8]):
-            stamp_ms = 1e-3 * int.from_bytes(payload[:8], "little")
-        self._data += _TIMES.pack(stamp_ms, unix_s)
-        self._data += payload[self._begin : self._end].ljust(self._end - self._begin, b"\0")
-
-    def rows(self, anchor_ms: float) -> Rows:
-        """All rows, their times continued (see `continuous_s`). Nothing can be added after."""
-        rows: Rows = np.frombuffer(self._data, self._dtype)
-        rows["time_s"] = continuous_s(rows["time_s"], anchor_ms)
-        return rows
+    def rows(self) -> Rows:
+        """All rows. Nothing can be added after."""
+        return np.frombuffer(self.data, self._dtype)
 
 
 def _place(message: str, field: str, count: int, first: int = 0) -> tuple[int, np.dtype[Any]]:
@@ -275,21 +276,9 @@ def parts(values: NDArray[Any]) -> list[NDArray[Any]]:
     return np.array_split(values, 1 + len(values) // 8192)
 
 
-def in_parts(function: Callable[[Rows], Array], rows: Rows) -> Array:
-    """`function` of all rows, (N, ...)."""
-    return np.concatenate([function(part) for part in parts(rows)])
-
-
-def continuous_s(stamps_ms: Any, anchor_ms: float) -> Any:
-    """Vehicle time in s from `time_boot_ms`, which begins again at zero after 2^32 ms.
-
-    The result is within 24 days of `anchor_ms`, any stamp of the same log. Stamps that do not wrap
-    are put on the same clock.
-    """
-    if math.isnan(anchor_ms):
-        return stamps_ms / 1e3
-    away_ms = (stamps_ms - anchor_ms + _WRAP_MS / 2) % _WRAP_MS - _WRAP_MS / 2
-    return (anchor_ms + away_ms) / 1e3
+def in_parts(function: Callable[..., NDArray[Kind]], rows: Rows, *more: Any) -> NDArray[Kind]:
+    """`function` of all rows, (N, ...), and of `more`."""
+    return np.concatenate([function(part, *more) for part in parts(rows)])
 
 
 class _Collector:
@@ -297,12 +286,10 @@ class _Collector:
 
     def __init__(self, vehicle: Address | None, dialect: Dialect | None) -> None:
         self._vehicle, self._dialect = vehicle, dialect
-        tables = ((True, _OURS), (False, _THEIRS))
-        self._samples = {
-            (ours, name): Samples(name.partition(" ")[0], columns)
-            for ours, table in tables
-            for name, columns in table.items()
-        }
+        self._ours, self._theirs = (
+            {name: Samples(name.partition(" ")[0], columns) for name, columns in table.items()}
+            for table in (_OURS, _THEIRS)
+        )
         self._origin: Geodetic | None = None  # of the local frame
         self._assembler = TextAssembler()
         self._texts: list[Event] = []  # of the vehicle
@@ -310,40 +297,68 @@ class _Collector:
         self._event_records: list[tuple[float, float, bytes]] = []
         self._counts: Counter[str] = Counter()
         self._unix_us = (0, 0)
-        self._anchor_ms = math.nan
         self._clocks: tuple[int, ...] = TELEMETRY + _SUBSTITUTES
         self._time = VehicleTime()
-        self._now_ms = math.nan  # stamp of the newest telemetry
+        self.now_s = math.nan  # vehicle time of the newest telemetry
         self.damage_s = math.nan  # time of the newest one before the first damage
-
-    @property
-    def now_s(self) -> float:
-        """Vehicle time of the newest telemetry, NaN before it."""
-        return float(continuous_s(self._now_ms, self._anchor_ms))
 
     def _said(self, what: str, unix_s: float) -> Event:
         return Event(self.now_s, "vehicle", what, unix_s=unix_s)
 
     def add(self, entry: LoggedMessage) -> None:
-        self._counts[entry.name] += 1
+        frame, vehicle, name = entry.frame, self._vehicle, entry.name
+        payload, unix_s = frame.payload, entry.unix_us / 1e6
+        self._counts[name] += 1
         self._unix_us = (self._unix_us[0] or entry.unix_us, entry.unix_us)
-        payload, vehicle, name = entry.frame.payload, self._vehicle, entry.name
-        ours = entry.component_id in OUR_COMPONENTS
-        if ours and (vehicle is None or entry.system_id == vehicle.system_id):
-            name = f"{name} {entry.message.array_id}" if name == _ARRAY else name
-        elif ours or (entry.system_id, entry.component_id) != vehicle or not self._accept(entry):
+        ours = frame.component_id in OUR_COMPONENTS
+        if ours and (vehicle is None or frame.system_id == vehicle.system_id):
+            name = f"{name} {frame.message.array_id}" if name == _ARRAY else name
+        elif (
+            ours
+            or (frame.system_id, frame.component_id) != vehicle
+            or not self._follow(frame.message_id, payload)
+        ):
             return
         if name == "TIMESYNC" and ours == any(payload[:8]):  # tc1 is 0 in a request
             return  # the delay of the link is that of our requests and their replies
-        usual = self._samples.get((ours, _INSTEAD_OF.get(name, "")))
-        if (ours, name) in self._samples and (usual is None or usual.empty):  # else only memory
-            self._samples[ours, name].add(payload, self._now_ms, entry.unix_us / 1e6)
-        (self._add_ours if ours else self._add_theirs)(entry, payload, entry.unix_us / 1e6)
+        samples = (self._ours if ours else self._theirs).get(name)
+        instead = _INSTEAD_OF.get(name, "")
+        usual = self._theirs.get(instead) or self._ours.get(instead)
+        if samples and not (usual and usual.data):  # else only memory
+            self._keep(samples, payload, unix_s)
+        (self._add_ours if ours else self._add_theirs)(entry, payload, unix_s)
+
+    def _keep(self, samples: Samples, payload: bytes, unix_s: float) -> None:
+        """A message without a stamp has that of the telemetry before it."""
+        stamp_ms = samples.stamp_ms(payload)
+        time_s = self.now_s if stamp_ms is None else self._continued_s(stamp_ms)
+        samples.add(payload, time_s, unix_s)
+
+    def _continued_s(self, stamp_ms: float) -> float:
+        """Vehicle time of a stamp, which begins again at zero after 2^32 ms. Those that do not
+        are put on the same clock."""
+        return (stamp_ms + 1e3 * self._time.wrapped_s(stamp_ms / 1e3)) / 1e3
+
+    def _follow(self, kind: int, payload: bytes) -> bool:
+        """Follow the vehicle's clock, also to its beginning after a restart. False for telemetry
+        with a stamp so far ahead that the flight has refused it, too."""
+        if kind not in self._clocks:
+            return True
+        if kind in TELEMETRY:
+            self._clocks = TELEMETRY
+        time_s = self._continued_s(int.from_bytes(payload[:4], "little"))
+        age = self._time.check(kind, time_s)
+        if age is Age.REBOOTED and self._event_records:
+            self._forget_before_flight()
+        if age is Age.STALE and time_s > self._time.newest_s:
+            return False
+        self.now_s = time_s
+        return True
 
     def _add_ours(self, entry: LoggedMessage, payload: bytes, unix_s: float) -> None:
         if entry.name == "SET_POSITION_TARGET_LOCAL_NED":
             setpoint = payload[:4] + _NO_ATTITUDE
-            self._samples[True, "SET_ATTITUDE_TARGET"].add(setpoint, self._now_ms, unix_s)
+            self._keep(self._ours["SET_ATTITUDE_TARGET"], setpoint, unix_s)
         elif record_type(entry) == event_record.EVENT_TYPE:
             self._event_records.append((self.now_s, unix_s, entry.tunnelled))
 
@@ -363,32 +378,13 @@ class _Collector:
             mode = self._dialect.mode_name(int.from_bytes(payload[:4], "little"))
             if not self._modes or mode != self._modes[-1].what:
                 self._modes.append(self._said(mode, unix_s))
-        if entry.frame.message_id in self._clocks:
-            if entry.frame.message_id in TELEMETRY:
-                self._clocks = TELEMETRY
-            self._now_ms = float(int.from_bytes(payload[:4], "little"))
-            if math.isnan(self._anchor_ms):
-                self._anchor_ms = self._now_ms
-
-    def _accept(self, entry: LoggedMessage) -> bool:
-        """Follow the vehicle's clock, also to its beginning after a restart. False for telemetry
-        with a stamp so far ahead that the flight has refused it, too."""
-        if entry.frame.message_id not in TELEMETRY:
-            return True
-        time_s = int.from_bytes(entry.frame.payload[:4], "little") / 1e3
-        time_s += self._time.wrapped_s(time_s)
-        age = self._time.check(entry.frame.message_id, time_s)
-        if age is Age.REBOOTED and self._event_records:
-            self._forget_before_flight()
-        return age is not Age.STALE or time_s <= self._time.newest_s
 
     def _forget_before_flight(self) -> None:
         """The vehicle was rebooted, and its time begins anew: if no setpoint was sent yet, what it
         reported before does not belong to the flight."""
-        if self._samples[True, "SET_ATTITUDE_TARGET"].empty:
-            for (ours, _), samples in self._samples.items():
-                if not ours:
-                    samples.clear()
+        if not self._ours["SET_ATTITUDE_TARGET"].data:
+            for samples in self._theirs.values():
+                samples.data.clear()
 
     def _add_origin(self, entry: LoggedMessage) -> None:
         """HOME_POSITION gives one point in both frames."""
@@ -401,21 +397,14 @@ class _Collector:
 
     def history(self, damage: str) -> History:
         """All that was added."""
-        found = {key: samples.rows(self._anchor_ms) for key, samples in self._samples.items()}
-        rows = {name: found[False, name] for name in _THEIRS}
-        ours = {name: found[True, name] for name in _OURS}
+        rows = {name: samples.rows() for name, samples in self._theirs.items()}
+        ours = {name: samples.rows() for name, samples in self._ours.items()}
         heartbeat, battery = rows["HEARTBEAT"], rows["SYS_STATUS"]
         heartbeat["armed"] = heartbeat["armed"] & ARMED > 0
         voltage, remaining = (battery[name].astype(np.float32) for name in _THEIRS["SYS_STATUS"])
         voltage[voltage == _NO_VOLTAGE] = remaining[remaining == _NO_PERCENTAGE] = math.nan
-        position = _plausible(
-            rows["LOCAL_POSITION_NED"],
-            position_ned_m=POSITION_LIMIT_M,
-            velocity_ned_mps=VELOCITY_LIMIT_MPS,
-        )
-        attitude = _plausible(rows["ATTITUDE_QUATERNION"], rates_radps=RATE_LIMIT_RADPS)
-        lengths = np.linalg.norm(attitude["quaternion"], axis=1)
-        attitude = _where(attitude, lengths > UNIT_LENGTHS[0], lengths < UNIT_LENGTHS[1])
+        position = _plausible(rows["LOCAL_POSITION_NED"])
+        attitude = _plausible(rows["ATTITUDE_QUATERNION"])
         setpoint = ours["SET_ATTITUDE_TARGET"]
         substitutes = []
         if not len(position) and not len(ours["POSITION_TARGET_LOCAL_NED"]):  # of another origin
@@ -461,13 +450,13 @@ class _Collector:
 def _truth(rows: Mapping[str, Rows], origin: Geodetic | None) -> Rows:
     for name, unit in _TRUTH.items():
         if origin is not None and len(rows[name]):
-            position = partial(_true_position, unit=unit, origin=origin)
-            return table(rows[name], position_ned_m=in_parts(position, rows[name]))
+            position = in_parts(_true_position, rows[name], unit, origin)
+            return table(rows[name], position_ned_m=position)
     none = {"time_s": np.zeros(0), "unix_s": np.zeros(0)}
     return table(none, position_ned_m=np.zeros((0, 3), np.float32))
 
 
-def _true_position(rows: Rows, *, unit: float, origin: Geodetic) -> Array:
+def _true_position(rows: Rows, unit: float, origin: Geodetic) -> Array:
     """NED in m (N, 3), as float32. `unit` of the altitude in a metre."""
     places = np.column_stack((rows["place"] / 1e7, rows["altitude"] / unit))
     return position_ned_m(places, origin).astype(np.float32)
@@ -498,17 +487,20 @@ def _link_delay(requests: Rows, replies: Rows) -> Rows:
     return table(times, delay_s=1e-9 * (replies["answered_ns"] - replies["asked_ns"]))
 
 
-def _plausible(rows: Rows, **limits: float) -> Rows:
-    """The rows whose columns are within these limits, as the flight refuses the others."""
-    return _where(
-        rows, *((np.abs(rows[name]) < limit).all(axis=1) for name, limit in limits.items())
-    )
-
-
-def _where(rows: Rows, *conditions: NDArray[np.bool_]) -> Rows:
-    """The rows where all conditions (N,) hold; without a copy if that is everywhere."""
-    kept = np.all(conditions, axis=0)
+def _plausible(rows: Rows) -> Rows:
+    """Without those that the flight refuses, too; without a copy if there are none."""
+    kept = in_parts(_within_limits, rows)
     return rows if kept.all() else rows[kept]
+
+
+def _within_limits(rows: Rows) -> NDArray[np.bool_]:
+    known = rows.dtype.names or ()
+    kept = [(np.abs(rows[name]) < _LIMITS[name]).all(axis=1) for name in _LIMITS if name in known]
+    if "quaternion" in known:
+        lengths = np.linalg.norm(rows["quaternion"], axis=1)
+        kept += [lengths > UNIT_LENGTHS[0], lengths < UNIT_LENGTHS[1]]
+    within: NDArray[np.bool_] = np.logical_and.reduce(kept)
+    return within
 
 
 def _vehicle(log: Tlog) -> tuple[Address | None, Dialect | None]:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from offboard.analysis import tlog
 from offboard.analysis.history import History, gather
-from offboard.analysis.tracking import passed_s, tracking_metrics, window_of
+from offboard.analysis.tracking import Track, tracking_metrics
 from offboard.analysis.verdict import begin_times, verdict_metrics
 from offboard.documents.errors import UserError, meant, plain
 from offboard.flight.decision import DECISION_FAILED
@@ -140,12 +140,11 @@ METRICS = {each.name: each.metadata for each in fields(Score) if each.metadata}
 
 def score(flown: History) -> Score:
     """Compute all values of a flight from its columns."""
-    window = window_of(flown)
-    skipped_s = passed_s(flown, window)[1] if window else 0.0
-    values: dict[str, Any] = verdict_metrics(flown, skipped_s)
-    values |= link_metrics(flown, window) | decision_metrics(flown)
-    if window:
-        values |= tracking_metrics(flown, window)
+    track = Track.of(flown)
+    values: dict[str, Any] = verdict_metrics(flown, track.skipped_s if track else 0.0)
+    values |= link_metrics(flown, track) | decision_metrics(flown)
+    if track:
+        values |= tracking_metrics(flown, track)
     elif values["completed"] == 1.0:
         values |= {"completed": 0.0, "ended_by": "too short at full speed to be scored"}
     return Score(**values)
@@ -162,7 +161,7 @@ def score_flight(flight: Path) -> tuple[Score, History]:
         score, history = score_flight(Path("flights/20261121-093000"))
         print(score.rmse_position_m, history.phases)
     """
-    flown = gather(tlog.read(tlog.find(flight)))
+    flown = gather(tlog.read(flight))
     return score(flown), flown
 
 
@@ -295,9 +294,8 @@ def decision_metrics(flown: History) -> dict[str, float]:
     }
 
 
-def link_metrics(flown: History, window: tuple[float, float] | None) -> dict[str, float]:
-    """Values of a Score. `window`: first and last vehicle time of TRACK; None:
-    rates and gaps of the telemetry stay NaN."""
+def link_metrics(flown: History, track: Track | None) -> dict[str, float]:
+    """Values of a Score. Without `track` rates and gaps of the telemetry stay NaN."""
     begun = begin_times(flown.phases)
     last_s = float(flown.position["time_s"][-1]) if len(flown.position) else math.nan
     sent = flown.setpoint[flown.setpoint["time_s"] < begun.get("land", math.inf)]
@@ -311,11 +309,10 @@ def link_metrics(flown: History, window: tuple[float, float] | None) -> dict[str
     delay_s = flown.identified["tilt_delay_s"]
     if len(delay_s := delay_s[np.isfinite(delay_s[:, 0])]):
         values["delay_ms"], values["delay_sd_ms"] = (1e3 * delay_s[-1].astype(float)).tolist()
-    if window is None:
+    if track is None:
         return values
     for name, rows in (("position", flown.position), ("attitude", flown.attitude)):
-        stamps = rows["time_s"]
-        stamps = stamps[(stamps >= window[0]) & (stamps <= window[1])]
+        stamps = rows["time_s"][track.holds(rows["time_s"])]
         intervals = np.diff(np.maximum.accumulate(stamps))  # repeated and late ones: zero
         span_s = float(np.ptp(stamps)) if len(stamps) else 0.0
         count = len(np.unique(stamps))

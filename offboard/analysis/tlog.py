@@ -158,9 +158,10 @@ def find(flight: Path) -> Path:
     return path
 
 
-def read(path: Path) -> Tlog:
-    """A log to iterate over. Raises UserError where the file is no .tlog or cannot be read."""
-    log = Tlog(path)
+def read(flight: Path) -> Tlog:
+    """The log of a flight to iterate over, given as for `find`. Raises UserError, also where the
+    file is no .tlog or cannot be read."""
+    log = Tlog(find(flight))
     next(iter(log))
     return log
 

@@ -1,6 +1,6 @@
 """Metrics of the phase TRACK: errors, fitness, activity, truth.
 
-Errors and motion are weighted by the time of the reference (see `_Clock`): a metric depends
+Errors and motion are weighted by the time of the reference (see `Track.shares`): a metric depends
 neither on the rate of the telemetry nor on jumps of the vehicle's clock. Sums of the paper's
 fitness are over the control ticks, as in its Eq. 32.
 """
@@ -8,6 +8,7 @@ fitness are over the control ticks, as in its Eq. 32.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from offboard.model.frames import (
 
 Array = NDArray[np.float64]
 
+GAP_S = 0.5  # without a record of the reference for longer there is none
 SKIPPED_S = 1.5  # without a decision for longer, the reference was not tracked meanwhile
 _ORDERS, _POWERS = np.arange(3)[:, None], np.arange(5, -1, -1)[:, None]
 # coefficients of s^5 .. s^0 from position, velocity and acceleration at s = 0, then at s = 1
@@ -35,74 +37,181 @@ _QUINTIC = np.linalg.inv(
         for order in range(3)
     ]
 )
+_DERIVATIVES = ("position_ned_m", "velocity_ned_mps", "acceleration_ned_mps2")
 _FITNESS = ("e_u", "e_v", "e_w", "e_x", "e_y", "e_z", "e_psi")
 
 
-def window_of(flown: History) -> tuple[float, float] | None:
-    """First and last vehicle time of TRACK; None where a signal has less than two samples in it."""
-    times = flown.records["time_s"][_in_track(flown)]
-    if len(times) < 2 or len(np.unique(np.maximum.accumulate(flown.reference["time_s"]))) < 2:
-        return None
-    begin_s, end_s = float(times[0]), float(times[-1])
-    stamps = (rows["time_s"] for rows in (flown.position, flown.attitude, flown.setpoint))
-    inside = (((each >= begin_s) & (each <= end_s)).sum() for each in stamps)
-    return (begin_s, end_s) if min(inside) >= 2 else None
+class Track:
+    """The phase TRACK of a flight: the times of its control ticks, and the reference.
+
+    Time of the reference passes from tick to tick, `tracked_s` in all, and `skipped_s` without a
+    decision. It stands still from the end of the reference to where it is flown again from its
+    start.
+    """
+
+    def __init__(self, times: Array, track_s: Array, reference: Reference) -> None:
+        self.begin_s, self.end_s = float(times[0]), float(times[-1])
+        self.reference = reference
+        inside = self.holds(times)
+        self.times, first = np.unique(times[inside], return_index=True)
+        intervals = np.maximum(np.diff(track_s[inside][first]), 0.0)
+        self._passed_s: Array = np.cumsum(np.concatenate(([0.0], intervals)))
+        self.tracked_s = float(intervals[intervals <= SKIPPED_S].sum())
+        self.skipped_s = float(intervals[intervals > SKIPPED_S].sum())
+
+    @classmethod
+    def of(cls, flown: History) -> Track | None:
+        """None where the reference or a signal has less than two samples in it."""
+        ticks = flown.records["phase"] == Phase.TRACK.code
+        reference = Reference.of(flown)
+        if ticks.sum() < 2 or reference is None:
+            return None
+        track_s = flown.records["track_time_s"][ticks].astype(np.float64)
+        track = cls(flown.records["time_s"][ticks], track_s, reference)
+        signals = (flown.position, flown.attitude, flown.setpoint)
+        return track if all(track.holds(each["time_s"]).sum() > 1 for each in signals) else None
+
+    def holds(self, times: Array) -> NDArray[np.bool_]:
+        """Which of the times (N,) are in it."""
+        inside: NDArray[np.bool_] = (times >= self.begin_s) & (times <= self.end_s)
+        return inside
+
+    def within(self, rows: Rows) -> Rows:
+        """The rows in it, sorted, each time once."""
+        once = each_once(rows)
+        ends = self.begin_s, np.nextafter(self.end_s, math.inf)
+        begin, end = np.searchsorted(once["time_s"], ends)
+        return once[begin:end]
+
+    def shares(self, times: Array) -> Array:
+        """Time (N,) in s for which each sample stands; `times` (N,) must not decrease.
+
+        Between two samples a signal is taken to change linearly: each stands for half of the
+        interval before it and half of the one after it (the trapezoidal rule). So a metric does not
+        depend on how often the signal was sampled, and a gap counts with its length.
+        """
+        halves = np.diff(np.interp(times, self.times, self._passed_s))
+        halves *= 0.5
+        weights = np.zeros(len(times))
+        weights[:-1] += halves
+        weights[1:] += halves
+        return weights
 
 
-def passed_s(flown: History, window: tuple[float, float]) -> tuple[float, float]:
-    """Time of the reference that was tracked, and that for which nothing was decided, in s."""
-    track_s = flown.records["track_time_s"][_ticks(flown, window)].astype(np.float64)
-    intervals = np.diff(track_s)
-    intervals = np.maximum(intervals[np.isfinite(intervals)], 0.0)  # flown again from its start
-    flowing = intervals <= SKIPPED_S
-    return float(intervals[flowing].sum()), float(intervals[~flowing].sum())
+class Reference:
+    """The reference as a function of vehicle time (N,): between two records the quintic through
+    their positions, velocities and accelerations."""
+
+    def __init__(self, rows: Rows) -> None:
+        self._times = rows["time_s"]
+        self._heading = np.unwrap(rows["heading_rad"].astype(np.float64))
+        intervals = parts(np.arange(len(rows) - 1))
+        coefficients = [_quintics(rows[part[0] : part[-1] + 2]) for part in intervals]
+        self._position = PPoly(np.concatenate(coefficients, axis=1), self._times)
+
+    @classmethod
+    def of(cls, flown: History) -> Reference | None:
+        """None without two records, later ones with later stamps."""
+        newest = np.maximum.accumulate(flown.reference["time_s"])
+        rows = flown.reference[np.diff(newest, prepend=-math.inf) > 0.0]
+        return cls(rows) if len(rows) > 1 else None
+
+    def position(self, times: Array, derivative: int = 0) -> Array:
+        """(N, 3) position NED in m, or a derivative of it."""
+        return np.asarray(self._position(times, derivative))
+
+    def heading(self, times: Array) -> Array:
+        return np.interp(times, self._times, self._heading)
+
+    def is_near(self, times: Array) -> NDArray[np.bool_]:
+        """Whether each of the times (N,) is between two records that follow each other."""
+        place = np.searchsorted(self._times, times)
+        gaps_s = np.diff(self._times, prepend=-math.inf, append=math.inf)
+        near: NDArray[np.bool_] = gaps_s[place] <= GAP_S
+        return near
 
 
-def tracking_metrics(flown: History, window: tuple[float, float]) -> dict[str, float]:
-    """Values of a Score, of the samples in the window."""
-    reference, clock = Reference(flown.reference), _Clock(flown)
+def _quintics(rows: Rows) -> Array:
+    """Coefficients (6, N - 1, 3) of the powers of the time since each row."""
+    known = np.stack([rows[name].astype(np.float64) for name in _DERIVATIVES], axis=1)
+    length_s = np.diff(rows["time_s"])[:, None, None]
+    ends = np.concatenate((known[:-1] * length_s**_ORDERS, known[1:] * length_s**_ORDERS), axis=1)
+    return (_QUINTIC @ ends / length_s**_POWERS).swapaxes(0, 1)
 
-    def away(rows: Rows, column: str, derivative: int = 0) -> tuple[Array, Array]:
-        def size(part: Rows) -> Array:
-            errors = part[column] - reference.position(part["time_s"], derivative)
-            return np.asarray(np.linalg.norm(errors, axis=1))
 
-        return in_parts(size, rows), clock.shares(rows["time_s"])
+def each_once(rows: Rows) -> Rows:
+    """Rows sorted by time, the first one of equal times."""
+    if (np.diff(rows["time_s"]) > 0.0).all():
+        return rows
+    return rows[np.unique(rows["time_s"], return_index=True)[1]]
 
-    def turned_deg(part: Rows) -> Array:
-        turn = heading_from_quaternion(part["quaternion"]) - reference.heading(part["time_s"])
-        return np.asarray(np.abs(np.degrees(wrap_pi(turn))))
 
-    def tilted_deg(part: Rows) -> Array:
-        down = thrust_direction_from_quaternion(part["quaternion"])[:, 2]
-        return np.degrees(np.arccos(np.clip(down, -1.0, 1.0)))
+# ---------------------------------------------------------------------- the metrics
 
-    fitness = _fitness(flown, reference, window)
-    found = fitness | {"mu_e": sum(fitness.values()), "tracked_s": passed_s(flown, window)[0]}
-    rows = _within(flown.position, window)
-    found |= _named("{}_position_m", "rmse mean p95 max", *away(rows, "position_ned_m"))
-    found |= _named("{}_velocity_mps", "rmse p95 max", *away(rows, "velocity_ned_mps", 1))
-    rows = _within(flown.truth, window)
-    found |= _named("{}_truth_m", "rmse max", *away(rows, "position_ned_m"))
-    rows = _within(flown.setpoint, window)
-    thrust = rows["thrust"].astype(np.float64)
-    found |= _named("thrust_{}", "sd", thrust, clock.shares(rows["time_s"]))
-    directions = thrust_direction_from_quaternion(rows["quaternion"])
+Measure = Callable[[Rows, Reference], Array]
+
+
+def _away(column: str, derivative: int = 0) -> Measure:
+    """Distance from the reference, or from a derivative of it."""
+
+    def distances(rows: Rows, reference: Reference) -> Array:
+        errors = rows[column] - reference.position(rows["time_s"], derivative)
+        return np.asarray(np.linalg.norm(errors, axis=1))
+
+    return distances
+
+
+def _turned_deg(rows: Rows, reference: Reference) -> Array:
+    turn = heading_from_quaternion(rows["quaternion"]) - reference.heading(rows["time_s"])
+    return np.asarray(np.abs(np.degrees(wrap_pi(turn))))
+
+
+def _tilted_deg(rows: Rows, _: Reference) -> Array:
+    down = thrust_direction_from_quaternion(rows["quaternion"])[:, 2]
+    return np.degrees(np.arccos(np.clip(down, -1.0, 1.0)))
+
+
+def _rate(axis: int) -> Measure:
+    return lambda rows, _: rows["rates_radps"][:, axis].astype(np.float64)
+
+
+# by array of History: pattern of the names, the kinds that take its place, and what is measured
+_MEASURED: dict[str, tuple[tuple[str, str, Measure], ...]] = {
+    "position": (
+        ("{}_position_m", "rmse mean p95 max", _away("position_ned_m")),
+        ("{}_velocity_mps", "rmse p95 max", _away("velocity_ned_mps", 1)),
+    ),
+    "truth": (("{}_truth_m", "rmse max", _away("position_ned_m")),),
+    "setpoint": (("thrust_{}", "sd", lambda rows, _: rows["thrust"].astype(np.float64)),),
+    "attitude": (
+        ("{}_heading_deg", "rmse max", _turned_deg),
+        ("tilt_{}_deg", "max", _tilted_deg),
+        ("roll_rate_{}_radps", "sd", _rate(0)),
+        ("pitch_rate_{}_radps", "sd", _rate(1)),
+    ),
+}
+
+
+def tracking_metrics(flown: History, track: Track) -> dict[str, float]:
+    """Values of a Score, of the samples in TRACK."""
+    fitness = _fitness(flown, track)
+    found = fitness | {"mu_e": sum(fitness.values()), "tracked_s": track.tracked_s}
+    for array, metrics in _MEASURED.items():
+        rows = track.within(getattr(flown, array))
+        weights = track.shares(rows["time_s"])
+        for pattern, kinds, measure in metrics:
+            values = in_parts(measure, rows, track.reference)
+            found |= _named(pattern, kinds, values, weights)
+    directions = thrust_direction_from_quaternion(track.within(flown.setpoint)["quaternion"])
     steps = np.linalg.norm(np.diff(directions, axis=0), axis=1)
     if len(steps):
         found["tilt_command_step_deg"] = math.degrees(math.sqrt((steps**2).mean()))
-    rows = _within(flown.attitude, window)
-    weights = clock.shares(rows["time_s"])
-    found |= _named("{}_heading_deg", "rmse max", in_parts(turned_deg, rows), weights)
-    found |= _named("tilt_{}_deg", "max", in_parts(tilted_deg, rows), weights)
-    for axis, pattern in enumerate(("roll_rate_{}_radps", "pitch_rate_{}_radps")):
-        found |= _named(pattern, "sd", rows["rates_radps"][:, axis].astype(np.float64), weights)
-    return found | _agitation(reference, rows, weights)
+    return found | _agitation(flown, track)
 
 
-def _fitness(flown: History, reference: Reference, window: tuple[float, float]) -> dict[str, float]:
+def _fitness(flown: History, track: Track) -> dict[str, float]:
     """Eqs. 31-32: velocities in the body frame, heading in degrees."""
-    ticks = flown.records["time_s"][_ticks(flown, window)]
+    ticks, reference = track.times, track.reference
     quaternion = flown.attitude["quaternion"][_nearest(flown.attitude["time_s"], ticks)]
     body = rotation_from_quaternion(quaternion).swapaxes(-1, -2)
     stamps = flown.position["time_s"]
@@ -116,12 +225,14 @@ def _fitness(flown: History, reference: Reference, window: tuple[float, float]) 
     return dict(zip(_FITNESS, (errors**2).sum(axis=0).tolist(), strict=True))
 
 
-def _agitation(reference: Reference, attitude: Rows, weights: Array) -> dict[str, float]:
+def _agitation(flown: History, track: Track) -> dict[str, float]:
     """Motion beside that of the reference: thrust direction and rates minus their linear fit by
     the reference's velocity, acceleration and jerk. The fit needs no model of drag and lag.
 
     The factor R of the samples has their residuals.
     """
+    attitude, reference = track.within(flown.attitude), track.reference
+    weights = track.shares(attitude["time_s"])
     factor: Any = np.zeros((0, 11))
     shares = parts(np.sqrt(weights / weights.sum())[:, None])
     for rows, share in zip(parts(attitude), shares, strict=True):
@@ -140,88 +251,10 @@ def _agitation(reference: Reference, attitude: Rows, weights: Array) -> dict[str
     }
 
 
-def _ticks(flown: History, window: tuple[float, float]) -> NDArray[np.bool_]:
-    """The ticks of TRACK in the window."""
-    times = flown.records["time_s"]
-    chosen: NDArray[np.bool_] = _in_track(flown) & (times >= window[0]) & (times <= window[1])
-    return chosen
-
-
-class _Clock:
-    """Time of the reference that has passed until a vehicle time, by the ticks of TRACK. It stands
-    still from the end of the reference to where it is flown again from its start."""
-
-    def __init__(self, flown: History) -> None:
-        chosen = _in_track(flown)
-        self._times, first = np.unique(flown.records["time_s"][chosen], return_index=True)
-        track_s = flown.records["track_time_s"][chosen][first].astype(np.float64)
-        self._passed_s: Array = np.cumsum(np.maximum(np.diff(track_s, prepend=track_s[:1]), 0.0))
-
-    def shares(self, times: Array) -> Array:
-        """Time (N,) in s for which each sample stands; `times` (N,) must not decrease.
-
-        Between two samples a signal is taken to change linearly: each stands for half of the
-        interval before it and half of the one after it (the trapezoidal rule). So a metric does not
-        depend on how often the signal was sampled, and a gap counts with its length.
-        """
-        halves = np.diff(np.interp(times, self._times, self._passed_s))
-        halves *= 0.5
-        weights = np.zeros(len(times))
-        weights[:-1] += halves
-        weights[1:] += halves
-        return weights
-
-
-class Reference:
-    """The reference as a function of vehicle time (N,): between two records the quintic through
-    their positions, velocities and accelerations."""
-
-    def __init__(self, rows: Rows) -> None:
-        newest = np.maximum.accumulate(rows["time_s"])
-        rows = rows[np.concatenate(([True], rows["time_s"][1:] > newest[:-1]))]
-        self._times = rows["time_s"]
-        self._heading = np.unwrap(rows["heading_rad"].astype(np.float64))
-        derivatives = ("position_ned_m", "velocity_ned_mps", "acceleration_ned_mps2")
-        known = np.stack([rows[name].astype(np.float64) for name in derivatives], axis=1)
-        length_s = np.diff(self._times)[:, None, None]
-        scaled = known[:-1] * length_s**_ORDERS, known[1:] * length_s**_ORDERS
-        coefficients = _QUINTIC @ np.concatenate(scaled, axis=1) / length_s**_POWERS
-        self._position = PPoly(coefficients.swapaxes(0, 1), self._times)
-
-    def position(self, times: Array, derivative: int = 0) -> Array:
-        """(N, 3) position NED in m, or a derivative of it."""
-        return np.asarray(self._position(times, derivative))
-
-    def heading(self, times: Array) -> Array:
-        return np.interp(times, self._times, self._heading)
-
-
-def _within(rows: Rows, window: tuple[float, float]) -> Rows:
-    """Rows of a window, sorted, each time once."""
-    once = each_once(rows)
-    begin, end = np.searchsorted(once["time_s"], (window[0], np.nextafter(window[1], math.inf)))
-    return once[begin:end]
-
-
-def each_once(rows: Rows) -> Rows:
-    """Rows sorted by time, the first one of equal times."""
-    if (np.diff(rows["time_s"]) > 0.0).all():
-        return rows
-    return rows[np.unique(rows["time_s"], return_index=True)[1]]
-
-
-def _in_track(flown: History) -> NDArray[np.bool_]:
-    chosen: NDArray[np.bool_] = flown.records["phase"] == Phase.TRACK.code
-    return chosen
-
-
 def _nearest(stamps: Array, times: Array) -> NDArray[np.intp]:
     right = np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1)
     nearest: NDArray[np.intp] = right - (times - stamps[right - 1] < stamps[right] - times)
     return nearest
-
-
-# ---------------------------------------------------------------------- metrics by time
 
 
 def _named(pattern: str, kinds: str, values: Array, weights: Array) -> dict[str, float]:
@@ -233,13 +266,15 @@ def _named(pattern: str, kinds: str, values: Array, weights: Array) -> dict[str,
         return {}
     mean = float(weights @ values / total)
     square = float(np.einsum("i,i,i", weights, values, values) / total)
-    order = np.argsort(values)
-    upto = np.searchsorted(np.cumsum(weights[order]), 0.95 * total)
     found = {
         "mean": mean,
         "rmse": math.sqrt(square),
         "sd": math.sqrt(max(square - mean**2, 0.0)),
         "max": float(np.max(values, where=weights > 0.0, initial=-math.inf)),
-        "p95": float(values[order[upto]]),
     }
+    if "p95" in kinds:
+        order = np.argsort(values)
+        upto_s = weights[order]
+        np.cumsum(upto_s, out=upto_s)
+        found["p95"] = float(values[order[np.searchsorted(upto_s, 0.95 * total)]])
     return {pattern.format(kind): found[kind] for kind in kinds.split()}

@@ -67,10 +67,8 @@ def _messages(flown: History, stamps: Stamps) -> Iterator[Stamped]:
     found = series_of(flown)
     for name, rows in found.items():
         yield from _rows(name, rows, stamps)
-    if "position" in found and "attitude" in found:
-        yield from _poses(found["position"], found["attitude"], stamps)
     if "position" in found:
-        yield from _velocities(found["position"], stamps)
+        yield from _motion(found["position"], found.get("attitude", flown.attitude[:0]), stamps)
     for name, topic in (("position", "flown"), ("reference", "reference")):
         if name in found:
             yield from _path(found[name], topic, stamps)
@@ -111,36 +109,31 @@ def _rows(name: str, rows: Rows, stamps: Stamps) -> Iterator[Stamped]:
         yield stamp_ns, f"/table/{name}", {"vehicle_time_s": time_s, **known}
 
 
-def _poses(position: Rows, attitude: Rows, stamps: Stamps) -> Iterator[Stamped]:
-    """At each position, with the newest attitude."""
-    pose_in_frame, transform = _message("PoseInFrame"), _message("FrameTransform")
+def _motion(position: Rows, attitude: Rows, stamps: Stamps) -> Iterator[Stamped]:
+    """At each position the velocity, and the pose with the newest attitude."""
+    vector, pose_in_frame = _message("Vector3"), _message("PoseInFrame")
+    transform = _message("FrameTransform")
     newest = np.searchsorted(attitude["time_s"], position["time_s"], side="right") - 1
-    quaternions = flu_in_enu(attitude["quaternion"][np.maximum(newest, 0)]).tolist()
-    places = enu(position["position_ned_m"]).tolist()
-    for stamp_ns, place, quaternion, index in zip(
-        stamps(position["time_s"]), places, quaternions, newest.tolist(), strict=True
+    quaternions = flu_in_enu(attitude["quaternion"]).tolist()
+    columns = (position[name] for name in ("position_ned_m", "velocity_ned_mps"))
+    places, velocities = (enu(column).tolist() for column in columns)
+    for stamp_ns, place, velocity, index in zip(
+        stamps(position["time_s"]), places, velocities, newest.tolist(), strict=True
     ):
+        yield stamp_ns, "/velocity", vector(**dict(zip("xyz", velocity, strict=True)))
         if index < 0:
             continue
         pose = pose_in_frame(frame_id=MAP)
         frame = transform(parent_frame_id=MAP, child_frame_id=BODY)
-        for timestamp, vector, rotation in (
+        for timestamp, vector_of, rotation in (
             (pose.timestamp, pose.pose.position, pose.pose.orientation),
             (frame.timestamp, frame.translation, frame.rotation),
         ):
             timestamp.FromNanoseconds(stamp_ns)
-            vector.x, vector.y, vector.z = place
-            rotation.w, rotation.x, rotation.y, rotation.z = quaternion
+            vector_of.x, vector_of.y, vector_of.z = place
+            rotation.w, rotation.x, rotation.y, rotation.z = quaternions[index]
         yield stamp_ns, "/pose", pose
         yield stamp_ns, "/tf", frame
-
-
-def _velocities(position: Rows, stamps: Stamps) -> Iterator[Stamped]:
-    vector = _message("Vector3")
-    for stamp_ns, (x, y, z) in zip(
-        stamps(position["time_s"]), enu(position["velocity_ned_mps"]).tolist(), strict=True
-    ):
-        yield stamp_ns, "/velocity", vector(x=x, y=y, z=z)
 
 
 def _path(rows: Rows, topic: str, stamps: Stamps) -> Iterator[Stamped]:

@@ -59,7 +59,7 @@ PHASE = "decision_phase"  # whose numbers tables show as names
 
 def read(path: Path) -> History:
     """The flight in a directory or .tlog. Raises UserError, also without telemetry."""
-    log = tlog.read(tlog.find(path))
+    log = tlog.read(path)
     flown = gather(log)
     if not any(map(len, (flown.position, flown.attitude))):
         raise UserError(f"{log.path} holds no telemetry with a time stamp: nothing to export")

@@ -45,14 +45,19 @@ class Display:
         flight = shown.current
         new, self._seen = flight.announcements - self._seen, flight.announcements
         for sentence in flight.announced[-new:] if new else []:
-            self._writer.put(self.announcement(shown, sentence))
+            self._writer.put(self.text(sentence, flight))
         if self.is_due(shown):
             self._writer.put(shown.snapshot())
 
-    def announcement(self, shown: Shown, sentence: str) -> str:
-        """What is written of an announcement."""
-        time_s = round(shown.current.time_s, 3)
-        return line("announcement", time_s=time_s, text=sentence)
+    def tell(self, sentence: str) -> None:
+        """A sentence about the preparation, or the service."""
+        self._writer.put(self.text(sentence))
+
+    def text(self, sentence: str, flight: Flight | None = None) -> str:
+        """What is written of a sentence, which `flight` may have announced."""
+        if flight is None:
+            return line("preparation", text=sentence)
+        return line("announcement", time_s=round(flight.time_s, 3), text=sentence)
 
     def is_due(self, shown: Shown) -> bool:
         """Whether to write a snapshot now; the next one is then due later."""

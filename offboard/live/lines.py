@@ -12,8 +12,9 @@ from rich.live import Live
 from rich.text import Text
 
 from offboard.flight.display import Snapshot
+from offboard.flight.flight import Flight
 from offboard.link import clock
-from offboard.live.display import Display, Shown, json_lines, line
+from offboard.live.display import Display, Shown, json_lines
 
 LINES_MAX = 1000  # that wait to be written
 STATUS_S = 0.2  # between two status lines, host time
@@ -37,12 +38,8 @@ class Terminal(Display):
         self._waits = False  # a status is queued: no second one
         super().__init__(self._write, LINES_MAX)
 
-    def tell(self, sentence: str) -> None:
-        """A sentence about the preparation."""
-        self._writer.put(sentence)
-
-    def announcement(self, shown: Shown, sentence: str) -> str:
-        return f"{_stamp(shown.current.time_s)}  {sentence}"
+    def text(self, sentence: str, flight: Flight | None = None) -> str:
+        return f"{_stamp(flight.time_s)}  {sentence}" if flight else sentence
 
     def is_due(self, shown: Shown) -> bool:
         now_s = clock.monotonic_s()
@@ -95,10 +92,6 @@ class JsonLines(Display):
     def __init__(self, write: Callable[[str], object]) -> None:
         super().__init__(lambda items: write(json_lines(items)), LINES_MAX)
 
-    def tell(self, sentence: str) -> None:
-        """A sentence about the preparation."""
-        self._writer.put(line("preparation", text=sentence))
-
     def is_due(self, shown: Shown) -> bool:
         time_s = shown.current.time_s
         if self._due_s - SNAPSHOT_S <= time_s < self._due_s:  # else the clock may have jumped back
@@ -110,17 +103,12 @@ class JsonLines(Display):
 class JsonLog(JsonLines):
     """Writes one JSON object a line, as log collectors read them: sentences with their UTC."""
 
-    def tell(self, sentence: str) -> None:
-        """A sentence about the service."""
-        self._writer.put(_logged("service", sentence))
-
-    def announcement(self, shown: Shown, sentence: str) -> str:
-        return _logged(shown.current.phase.value, sentence, vehicle_time_s=shown.current.time_s)
+    def text(self, sentence: str, flight: Flight | None = None) -> str:
+        entry: dict[str, object] = {"time": clock.utc(), "level": "info", "phase": "service"}
+        entry |= {"event": sentence}
+        if flight:
+            entry |= {"phase": flight.phase.value, "vehicle_time_s": flight.time_s}
+        return json.dumps(entry)
 
     def is_due(self, shown: Shown) -> bool:
         return False
-
-
-def _logged(phase: str, sentence: str, **more: float) -> str:
-    entry = {"time": clock.utc(), "level": "info", "phase": phase, "event": sentence, **more}
-    return json.dumps(entry)

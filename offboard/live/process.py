@@ -60,7 +60,7 @@ class LiveProcess(Display):
             raise NotServed(f"{self._option}: {answer['error']}")
         return str(answer["url"])
 
-    def tell(self, **values: str) -> None:
+    def head(self, **values: str) -> None:
         """What the page says above its values: `title`, or at the end `verdict` and `report`."""
         self._writer.put(line("flight", **values))
 
@@ -114,12 +114,12 @@ class Displays:
         Raises UserError."""
         for page in self._pages:
             self.tell(f"live: {page.await_ready()}")
-            page.tell(title=title)
+            page.head(title=title)
 
     def conclude(self, verdict: str, report: str) -> None:
         """How the flight ended, and where its report will be, for the pages."""
         for page in self._pages:
-            page.tell(verdict=verdict, report=report)
+            page.head(verdict=verdict, report=report)
 
     def show(self, companion: Flight) -> None:
         for part in tuple(self._working):

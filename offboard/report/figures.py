@@ -56,54 +56,43 @@ _ENDED_EARLY = {"hold", "stand down", "yielded", "failed", SUPERVISOR}
 _CUT = "Single values far from all others are outside; two clicks on the figure show them."
 
 
-@dataclass(frozen=True, slots=True)
-class DrawnFlight:
-    """A flight as a report draws it: letter and name, colour and dash, and the vehicle time that is
-    zero on its axis."""
-
-    flight: Flight
-    label: str
-    colour: str
-    dash: str
-    zero_s: float
-
-
-def drawn_flights(flights: Sequence[Flight]) -> list[DrawnFlight]:
-    """One flight keeps its vehicle time; several begin their tracks at zero."""
+def side_by_side(flights: Sequence[Flight]) -> Sequence[Flight]:
+    """One flight keeps its vehicle time. Several have a letter (A, B ... Z, then numbers), a colour
+    and a dash, and begin their tracks at zero."""
     if len(flights) == 1:
-        return [DrawnFlight(flights[0], "", BLUE, "solid", 0.0)]
+        return flights
     styles = itertools.cycle(zip(COLOURS, itertools.cycle(DASHES), strict=False))
     return [
-        DrawnFlight(flight, f"{letter(place)}: {flight.name}", *style, flight.track_s)
-        for place, (flight, style) in enumerate(zip(flights, styles, strict=False))
+        replace(
+            flight,
+            letter=chr(ord("A") + place) if place < 26 else str(place + 1),
+            colour=colour,
+            dash=dash,
+            zero_s=flight.track_s,
+        )
+        for place, (flight, (colour, dash)) in enumerate(zip(flights, styles, strict=False))
     ]
 
 
-def letter(place: int) -> str:
-    """A, B ... Z, then numbers."""
-    return chr(ord("A") + place) if place < 26 else str(place + 1)
-
-
 def figures(flights: Sequence[Flight]) -> dict[str, Figure]:
-    """All figures that the logs have data for, by name: path, timeline, and those of GROUPS."""
-    drawn = drawn_flights(flights)
-    found = {"path": _path(drawn), "timeline": _timeline(drawn)}
+    """All figures that the logs have data for, by name: path, timeline, and those of GROUPS.
+    `flights`: of `side_by_side`."""
+    found = {"path": _path(flights), "timeline": _timeline(flights)}
     for name, (title, group) in GROUPS.items():
-        found[name] = _panels(title, group, drawn)
+        found[name] = _panels(title, group, flights)
     return {name: figure for name, figure in found.items() if figure is not None}
 
 
 # ---------------------------------------------------------------------- path
 
 
-def _path(drawn: Sequence[DrawnFlight]) -> Figure | None:
-    first = drawn[0].flight.history
+def _path(flights: Sequence[Flight]) -> Figure | None:
+    first = flights[0].history
     lines = [
-        (one.label or "estimated", one.flight.history.position, one.colour, "solid")
-        for one in drawn
+        (one.label or "estimated", one.history.position, one.colour, "solid") for one in flights
     ]
     lines.insert(1, ("reference", first.reference, INK, "dash"))
-    if len(drawn) == 1:
+    if len(flights) == 1:
         lines.insert(1, ("true (simulator)", first.truth, ORANGE, "solid"))
     figure = go.Figure([_path_of(*line) for line in lines if len(line[1])])
     if not figure.data:
@@ -117,7 +106,7 @@ def _path(drawn: Sequence[DrawnFlight]) -> Figure | None:
         template=STYLE, height=520, scene=scene, margin={"l": 0, "r": 0, "t": 36, "b": 40},
         showlegend=True,
     )  # fmt: skip
-    caption = "" if len(drawn) == 1 else f"The reference is that of flight {drawn[0].label}."
+    caption = "" if len(flights) == 1 else f"The reference is that of flight {flights[0].label}."
     return Figure("Path", figure, caption)
 
 
@@ -197,12 +186,12 @@ def _colour(phase: str) -> str:
     return ORANGE_BAND if phase in _ENDED_EARLY else GREY_BAND
 
 
-def _timeline(drawn: Sequence[DrawnFlight]) -> Figure | None:
+def _timeline(flights: Sequence[Flight]) -> Figure | None:
     figure = go.Figure()
     rows: list[str] = []
-    for one in drawn:
-        prefix = f"{one.label.partition(':')[0]} " if one.label else ""
-        entries = [*bands(one.flight), *marks(one.flight)]
+    for one in flights:
+        prefix = f"{one.letter} " if one.letter else ""
+        entries = [*bands(one), *marks(one)]
         if one.label:  # of several flights only what differs most
             entries = [each for each in entries if each.row in ("phase", "failsafe")]
         for row in dict.fromkeys(each.row for each in entries):
@@ -220,7 +209,7 @@ def _timeline(drawn: Sequence[DrawnFlight]) -> Figure | None:
         categoryorder="array", categoryarray=rows[::-1], fixedrange=True, showgrid=False,
         range=[-0.6, len(rows) - 0.4], automargin=False,
     )  # fmt: skip
-    figure.update_xaxes(title_text=_axis_title(drawn), range=_extent(drawn))
+    figure.update_xaxes(title_text=_axis_title(flights), range=_extent(flights))
     return Figure("Timeline", figure, "Point at a band or a mark to read its text.")
 
 
@@ -253,12 +242,12 @@ def _marks(marks: Sequence[Entry], row: str, zero_s: float) -> go.Scatter:
 # ---------------------------------------------------------------------- panels
 
 
-def _panels(title: str, group: Sequence[Panel], drawn: Sequence[DrawnFlight]) -> Figure | None:
+def _panels(title: str, group: Sequence[Panel], flights: Sequence[Flight]) -> Figure | None:
     """A group of panels, in each the curves that the flights have."""
-    shown = [(panel, curves) for panel in group if (curves := _known(panel, drawn))]
+    shown = [(panel, curves) for panel in group if (curves := _known(panel, flights))]
     if not shown:
         return None
-    figure = panels([panel.title for panel, _ in shown], _axis_title(drawn), PANEL_PX)
+    figure = panels([panel.title for panel, _ in shown], _axis_title(flights), PANEL_PX)
     captions, cut = [], False
     for place, (panel, curves) in enumerate(shown, 1):
         alone = len(curves) == 1 and not curves[0][0].label
@@ -271,20 +260,20 @@ def _panels(title: str, group: Sequence[Panel], drawn: Sequence[DrawnFlight]) ->
         elif inner := without_outliers(values):
             figure.update_yaxes(range=inner, row=place)
             cut = True
-    if not drawn[0].label:
-        figure.update_layout(shapes=_phase_shapes(drawn[0].flight))
-    figure.update_xaxes(range=_extent(drawn))
+    if not flights[0].label:
+        figure.update_layout(shapes=_phase_shapes(flights[0]))
+    figure.update_xaxes(range=_extent(flights))
     figure.update_yaxes(automargin=False, exponentformat="e")
     figure.update_layout(margin_l=LEFT_PX)
     return Figure(title, figure, " ".join(captions + [_CUT] * cut))
 
 
-def _known(panel: Panel, drawn: Sequence[DrawnFlight]) -> list[tuple[DrawnFlight, Curve, Points]]:
+def _known(panel: Panel, flights: Sequence[Flight]) -> list[tuple[Flight, Curve, Points]]:
     """The curves of a panel that have values; of several flights only the main ones."""
-    shown = ((one, each) for one in drawn for each in panel.curves if each.main or not one.label)
+    shown = ((one, each) for one in flights for each in panel.curves if each.main or not one.label)
     found = []
     for one, each in shown:
-        times, values, *sd = each.source(one.flight.history)
+        times, values, *sd = each.source(one.history)
         if np.isfinite(values).any():
             least = LEAST_SHOWN if panel.logarithmic else -math.inf
             found.append((one, each, (times, np.maximum(values, least), *sd)))
@@ -292,7 +281,7 @@ def _known(panel: Panel, drawn: Sequence[DrawnFlight]) -> list[tuple[DrawnFlight
 
 
 def _draw(
-    figure: go.Figure, place: int, each: Curve, points: Points, one: DrawnFlight, *, named: bool
+    figure: go.Figure, place: int, each: Curve, points: Points, one: Flight, *, named: bool
 ) -> None:
     times, values, *sd = points
     chosen = thinned(values)
@@ -325,12 +314,12 @@ def _phase_shapes(flight: Flight) -> list[dict[str, Any]]:
     return shapes
 
 
-def _axis_title(drawn: Sequence[DrawnFlight]) -> str:
-    return "time since the track began, s" if len(drawn) > 1 else "vehicle time, s"
+def _axis_title(flights: Sequence[Flight]) -> str:
+    return "time since the track began, s" if len(flights) > 1 else "vehicle time, s"
 
 
-def _extent(drawn: Sequence[DrawnFlight]) -> list[float]:
+def _extent(flights: Sequence[Flight]) -> list[float]:
     """From the first sample of all flights to the last one."""
-    begin = min(one.flight.begin_s - one.zero_s for one in drawn)
-    end = max(one.flight.end_s - one.zero_s for one in drawn)
+    begin = min(one.begin_s - one.zero_s for one in flights)
+    end = max(one.end_s - one.zero_s for one in flights)
     return [round(begin, 2), round(end, 2)]

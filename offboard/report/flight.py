@@ -12,6 +12,7 @@ import yaml
 
 from offboard.analysis import history, tlog
 from offboard.analysis.history import History, Rows
+from offboard.analysis.page import BLUE
 from offboard.analysis.score import Score, score
 from offboard.analysis.verdict import begin_times
 
@@ -32,7 +33,8 @@ _TELEMETRY = (
 @dataclass(frozen=True, slots=True)
 class Flight:
     """One log. `facts` are name and value; `missing` has a sentence for each thing that the log
-    lacks; `configuration`: see `history.configuration`."""
+    lacks; `configuration`: see `history.configuration`. Beside others it is drawn with a letter, a
+    colour and a dash, and `zero_s` is the vehicle time that is zero on its axis."""
 
     name: str
     history: History
@@ -40,6 +42,15 @@ class Flight:
     facts: dict[str, str]
     missing: tuple[str, ...]
     configuration: str | None
+    letter: str = ""
+    colour: str = BLUE
+    dash: str = "solid"
+    zero_s: float = 0.0
+
+    @property
+    def label(self) -> str:
+        """Letter and name, empty for a flight alone."""
+        return f"{self.letter}: {self.name}" if self.letter else ""
 
     @property
     def track_s(self) -> float:
@@ -63,7 +74,7 @@ class Flight:
 
 def read(path: Path) -> Flight:
     """Read a flight directory or a .tlog file. Raises UserError."""
-    log = tlog.read(tlog.find(path))
+    log = tlog.read(path)
     flown = history.gather(log)
     missing = [_NO_HEARTBEAT] if flown.vehicle is None else []
     if not len(flown.records):

@@ -18,7 +18,6 @@ Points = tuple[Array, ...]  # times and values (N,), and their standard deviatio
 Source = Callable[[History], Points]
 
 BINS = 1500  # of a curve, see `thinned`
-REFERENCE_GAP_S = 0.5  # without a record of the reference for longer there is none
 LEAST_SHOWN = 1e-16  # of a logarithmic axis: zero is drawn there
 ESTIMATED, TRUE, COMMANDED = "estimated", "true (simulator)", "commanded"
 AXES = (("north", GREEN, "solid"), ("east", PINK, "dash"), ("down", INK, "dot"))
@@ -57,21 +56,16 @@ def _column(array: str, column: str, scale: float = 1.0, axis: int | None = None
     return samples
 
 
-def _recorded(field: str, scale: float = 1.0) -> Source:
-    return _column("records", field, scale)
-
-
 def _away(array: str, axis: int | None = None) -> Source:
     """Distance from the reference, or its component along an axis; NaN where there is none."""
 
     def samples(flown: History) -> Points:
-        rows = each_once(getattr(flown, array))
-        if len(np.unique(np.maximum.accumulate(flown.reference["time_s"]))) < 2:
+        rows, reference = each_once(getattr(flown, array)), Reference.of(flown)
+        if reference is None:
             return np.zeros(0), np.zeros(0)
-        near = near_reference(flown, rows["time_s"])
-        expected = Reference(flown.reference).position(rows["time_s"][near])
+        near = reference.is_near(rows["time_s"])
         errors = np.full((len(rows), 3), np.nan)
-        errors[near] = rows["position_ned_m"][near] - expected
+        errors[near] = rows["position_ned_m"][near] - reference.position(rows["time_s"][near])
         values = np.linalg.norm(errors, axis=1) if axis is None else errors[:, axis]
         return rows["time_s"], np.asarray(values)
 
@@ -141,7 +135,7 @@ GROUPS: dict[str, tuple[str, tuple[Panel, ...]]] = {
     "thrust": ("Thrust and battery", (
         Panel("thrust, 0 to 1", (
             Curve(COMMANDED, _column("commanded", "thrust"), ORANGE, "steps"),
-            Curve("hover thrust, estimated", _recorded("hover_thrust"), INK, main=False,
+            Curve("hover thrust, estimated", _column("records", "hover_thrust"), INK, main=False,
                   dash="dash"),
         )),
         Panel("battery, %", (Curve("remaining", _column("battery", "remaining"), BLUE, "steps"),)),
@@ -151,23 +145,23 @@ GROUPS: dict[str, tuple[str, tuple[Panel, ...]]] = {
     )),
     "decisions": ("Decisions", (
         Panel("gap: cost above the exact optimum", (
-            Curve("gap", _recorded("gap"), BLUE, "dots"),
+            Curve("gap", _column("records", "gap"), BLUE, "dots"),
         ), logarithmic=True, caption="Zero is drawn at 1e-16. Only decisions that were sent as "
               "certified have a gap."),
         Panel("spread of the swarm (ε, Eq. 29)", (
-            Curve("spread", _recorded("spread"), BLUE, "dots"),
+            Curve("spread", _column("records", "spread"), BLUE, "dots"),
         ), logarithmic=True),
         Panel("solve time, ms", (
-            Curve("solve time", _recorded("solve_time_s", 1e3), BLUE, "dots"),
+            Curve("solve time", _column("records", "solve_time_s", 1e3), BLUE, "dots"),
         )),
     )),
     "link": ("Link", (
         Panel("age and delay, ms", (
-            Curve("telemetry at its setpoint", _recorded("age_s", 1e3), BLUE, "dots"),
+            Curve("telemetry at its setpoint", _column("records", "age_s", 1e3), BLUE, "dots"),
             Curve("delay of the link (TIMESYNC)", _column("link_delay", "delay_s", 1e3),
                   ORANGE, main=False),
-            Curve("telemetry in to setpoint out (host time)", _recorded("answer_s", 1e3), GREEN,
-                  "dots", main=False),
+            Curve("telemetry in to setpoint out (host time)",
+                  _column("records", "answer_s", 1e3), GREEN, "dots", main=False),
         )),
         Panel("interval between positions, ms", (
             Curve("positions", _intervals_ms, BLUE, "dots"),
@@ -184,11 +178,12 @@ GROUPS: dict[str, tuple[str, tuple[Panel, ...]]] = {
         )),
         Panel("hover thrust, 0 to 1", (
             Curve("identified", _identified("hover_thrust"), INK, "dots"),
-            Curve(ESTIMATED, _recorded("hover_thrust"), PURPLE, main=False),
+            Curve(ESTIMATED, _column("records", "hover_thrust"), PURPLE, main=False),
         )),
         Panel("identified drag, 1/s", (Curve("drag", _identified("drag_ps"), BLUE, "dots"),)),
         Panel("estimated disturbance, m/s²", tuple(
-            Curve(name, _recorded(f"disturbance_{name}_mps2"), colour, main=False, dash=dash)
+            Curve(name, _column("records", f"disturbance_{name}_mps2"), colour, main=False,
+                  dash=dash)
             for name, colour, dash in AXES
         )),
     )),
@@ -209,13 +204,3 @@ def thinned(values: Array, bins: int = BINS) -> NDArray[np.intp]:
     least, greatest = order[edges], order[edges + np.maximum(finite, 1) - 1]
     gaps = order[(edges + finite)[finite < np.diff(np.append(edges, count))]]
     return np.unique(np.concatenate(([0, count - 1], least, greatest, gaps)))
-
-
-def near_reference(flown: History, times: Array) -> NDArray[np.bool_]:
-    """Whether a record of the reference is near each of the times (N,)."""
-    stamps = np.sort(flown.reference["time_s"])
-    place = np.searchsorted(stamps, times)
-    inside = (place > 0) & (place < len(stamps))
-    before, after = np.clip(place - 1, 0, None), np.clip(place, None, len(stamps) - 1)
-    near: NDArray[np.bool_] = inside & (stamps[after] - stamps[before] <= REFERENCE_GAP_S)
-    return near

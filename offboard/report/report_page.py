@@ -9,7 +9,7 @@ from typing import Any
 from offboard.analysis.page import render
 from offboard.analysis.score import METRICS
 from offboard.analysis.score_table import summary, verdict
-from offboard.report.figures import figures, letter
+from offboard.report.figures import figures, side_by_side
 from offboard.report.flight import Flight
 
 _SIGNS = {1.0: ("good", "✓"), 0.0: ("bad", "✗")}
@@ -18,28 +18,28 @@ _SIGNS = {1.0: ("good", "✓"), 0.0: ("bad", "✗")}
 def page(flights: Sequence[Flight], fits: Mapping[str, Any] | None = None) -> str:
     """The page of one flight or of several, as the text of an HTML file. `fits`: what was
     identified from the flight, by `fits.fits`."""
-    alone = len(flights) == 1
+    flights, alone = side_by_side(flights), len(flights) == 1
     title = f"Flight {flights[0].name}" if alone else f"{len(flights)} flights side by side"
     return render(
         "report/templates/report.html",
         title=title,
-        verdicts=[_verdict(place, flight, alone) for place, flight in enumerate(flights)],
+        verdicts=[_verdict(flight) for flight in flights],
         figures=figures(flights),
         fits=fits,
         rows=rows(flights),
         metrics=METRICS,
-        letters=[] if alone else [letter(place) for place in range(len(flights))],
+        letters=[] if alone else [flight.letter for flight in flights],
         events=flights[0].history.events() if alone else [],
     )
 
 
-def _verdict(place: int, flight: Flight, alone: bool) -> dict[str, object]:
+def _verdict(flight: Flight) -> dict[str, object]:
     kind, sign = _SIGNS.get(flight.score.completed, ("unknown", "–"))
     return {
         "kind": kind,
         "sign": sign,
         "sentence": verdict(flight.score),
-        "name": "" if alone else f"{letter(place)}: {flight.name}",
+        "name": flight.label,
         "rows": summary(flight.score, flight.history) | flight.facts,
         "missing": flight.missing,
     }

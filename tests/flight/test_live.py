@@ -202,9 +202,9 @@ def shown() -> Iterator[Shown]:
         for display in displays:
             display.close()
         assert [display.lost for display in displays] == [["broken"], [], []]
-        process.tell(title="a flight: lemniscate by pso")
+        process.head(title="a flight: lemniscate by pso")
         process.show(pair.companion)
-        process.tell(verdict="flown and landed", report="flights/a/report.html")
+        process.head(verdict="flown and landed", report="flights/a/report.html")
         objects = [json.loads(each) for each in "".join(written).splitlines()]
         yield Shown(pair, objects, files[0].getvalue(), files[1].getvalue(), seen, page)
 
