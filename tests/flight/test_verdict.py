@@ -123,6 +123,8 @@ def test_a_flight_is_not_completed_that_is_not_tracked_landed_and_disarmed(flown
         ({"records": records[~tracked | (since_s < 0.05)]}, "too short at full speed to be scored"),
         ({"landed": flown.landed[:0]}, "the land detector does not report the ground"),
         ({"heartbeat": heartbeat}, "not disarmed"),
+        ({"phases": flown.phases + flown.phases}, "the log holds several flights"),
+        ({"phases": flown.phases[:-3] + flown.phases}, "the log holds several flights"),
     ):
         scored = score(replace(flown, **changed))
         assert (scored.completed, scored.ended_by.startswith(why)) == (0.0, True), scored.ended_by
