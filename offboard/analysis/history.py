@@ -371,8 +371,12 @@ class _Collector:
                 self._anchor_ms = self._now_ms
 
     def _accept(self, entry: LoggedMessage) -> bool:
-        """Follow the vehicle's clock, also to its beginning after a restart. False for telemetry
-        with a stamp so far ahead that the flight has refused it, too."""
+        """Follow the vehicle's clock, also to its beginning after a restart. False for what the
+        flight has refused, too: telemetry with a stamp so far ahead, and the HEARTBEAT of another
+        program with the vehicle's ids."""
+        if entry.frame.message_id == HEARTBEAT and self._dialect:
+            own = entry.message.autopilot == self._dialect.mav_autopilot
+            return own and is_vehicle(entry.message)
         if entry.frame.message_id not in TELEMETRY:
             return True
         time_s = int.from_bytes(entry.frame.payload[:4], "little") / 1e3
