@@ -151,8 +151,8 @@ def _conclude(
     rows: dict[str, str] = {}
     try:
         score, history = scored(directory)
-    except UserError as error:
-        score = Score(ended_by=f"it cannot be scored: {error}")
+    except (UserError, KeyboardInterrupt) as error:
+        score = Score(ended_by=f"it cannot be scored: {str(error) or 'interrupted'}")
         outcome, page = replace(outcome, sentence=f"{outcome.sentence}; {score.ended_by}"), ""
     else:
         outcome, rows = judged(outcome, score), summary(score, history)
