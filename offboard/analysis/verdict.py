@@ -105,7 +105,9 @@ def _ended_early(flown: History) -> tuple[str, str]:
     took_over = [event.what for event in flown.announcements if event.cause == SUPERVISOR]
     if took_over:
         return SUPERVISOR, took_over[0]
-    if "health" in names[1:] or not _LANDING_ENDS.isdisjoint(names[:-1]):
+    # what a service has waited for comes before its flight
+    flight = names[names.index("climb") :] if "climb" in names else []
+    if "health" in flight or not _LANDING_ENDS.isdisjoint(flight[:-1]):
         return "the log holds several flights", ""
     if names[-1] not in _LANDING_ENDS:
         return f"the log ends in the phase {names[-1]}", ""
