@@ -316,6 +316,7 @@ class _Collector:
         elif (
             ours
             or (frame.system_id, frame.component_id) != vehicle
+            or self._is_of_another(entry)
             or not self._follow(frame.message_id, payload)
         ):
             return
@@ -327,6 +328,13 @@ class _Collector:
         if samples and not (usual and usual.data):  # else only memory
             self._keep(samples, payload, unix_s)
         (self._add_ours if ours else self._add_theirs)(entry, payload, unix_s)
+
+    def _is_of_another(self, entry: LoggedMessage) -> bool:
+        """The HEARTBEAT of another program with the vehicle's ids, which the flight has ignored."""
+        if entry.frame.message_id != HEARTBEAT or not self._dialect:
+            return False
+        own = entry.message.autopilot == self._dialect.mav_autopilot
+        return not (own and is_vehicle(entry.message))
 
     def _keep(self, samples: Samples, payload: bytes, unix_s: float) -> None:
         """A message without a stamp has that of the telemetry before it."""

@@ -23,7 +23,7 @@ from offboard.mavlink.counters import DropReason
 from offboard.mavlink.framing import V1, V2, Frame, frame_size, parse
 
 _STAMP = struct.Struct(">Q")
-_YEAR_2000_US, _YEAR_2100_US = 946_684_800_000_000, 4_102_444_800_000_000
+_YEAR_2100_US = 4_102_444_800_000_000  # a computer without a clock begins in 1970
 _MARKER = re.compile(rb"[\xfd\xfe]")  # the first byte of a frame
 _LONGEST = 8 + 280  # bytes of an entry: a signed MAVLink 2 frame
 _BLOCK = 1 << 20
@@ -146,7 +146,7 @@ def _begins(data: bytes, at: int) -> bool:
     if at + 9 > len(data):
         return True
     (stamp,) = _STAMP.unpack_from(data, at)
-    return data[at + 8] in (V1, V2) and _YEAR_2000_US < stamp < _YEAR_2100_US
+    return data[at + 8] in (V1, V2) and stamp < _YEAR_2100_US
 
 
 def find(flight: Path) -> Path:

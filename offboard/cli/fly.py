@@ -140,8 +140,9 @@ def _conclude(
     try:
         score, history = scored(directory)
         outcome, rows = judged(outcome, score), summary(score, history)
-    except UserError as error:
-        score, rows, page = Score(ended_by=f"it cannot be scored: {error}"), {}, ""
+    except (UserError, KeyboardInterrupt) as error:
+        score = Score(ended_by=f"it cannot be scored: {str(error) or 'interrupted'}")
+        rows, page = {}, ""
         outcome = replace(outcome, sentence=f"{outcome.sentence}; {score.ended_by}")
     metrics = score.metrics()
     checked = [] if outcome.exit_code else requirements

@@ -90,7 +90,7 @@ def samples(name: str, rows: Rows) -> Iterator[tuple[float, float, dict[str, Any
     times = rows["time_s"].tolist(), rows["unix_s"].tolist()
     for time_s, unix_s, values in zip(*times, values_of(rows).tolist(), strict=True):
         known = {
-            column: PHASES[int(value)] if column == PHASE else value
+            column: PHASES.get(int(value), value) if column == PHASE else value
             for column, value in zip(COLUMNS[name], values, strict=True)
             if math.isfinite(value)
         }

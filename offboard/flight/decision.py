@@ -54,8 +54,11 @@ def decide(flight: FlightState) -> bool:
 
     Returns False, and increases `missed`, if the decision failed or was refused; then
     nothing is sent. Telemetry that was too old before the decision began does not count: the
-    failsafe has a row for it.
+    failsafe has a row for it. Nor does an observer that has not got any yet: a service may be
+    engaged at once after the flight before.
     """
+    if not flight.observer.ready:
+        return False
     was_old = failsafe.telemetry_old(flight)
     try:
         decided = _decided(flight)

@@ -138,18 +138,24 @@ def frame_size(data: bytes, at: int) -> int | None:
 def parse(data: bytes, at: int, end: int) -> Frame | DropReason:
     """The frame in data[at:end], which `frame_size` has measured, or why there is none."""
     raw = data[at:end]
+    message_id = message_id_of(raw)
     if raw[0] == V1:
-        header = raw[5], raw[3], raw[4], raw[2]
+        header = raw[3], raw[4], raw[2]
         crc_at = _HEADER_BYTES_V1 + raw[1]
     elif raw[2] & ~_SIGNED:
         return DropReason.INCOMPATIBLE  # cannot be understood without a later version of MAVLink
     else:
-        header = raw[7] | raw[8] << 8 | raw[9] << 16, raw[5], raw[6], raw[4]
+        header = raw[5], raw[6], raw[4]
         crc_at = _HEADER_BYTES_V2 + raw[1]
-    extra = _CRC_EXTRA.get(header[0])
+    extra = _CRC_EXTRA.get(message_id)
     if extra is not None and _crc(extra, _crc(raw[1:crc_at])) != raw[crc_at] | raw[crc_at + 1] << 8:
         return DropReason.BAD_CRC
-    return Frame(raw, *header, extra is not None)
+    return Frame(raw, message_id, *header, extra is not None)
+
+
+def message_id_of(raw: bytes) -> int:
+    """The message id of a frame, as in `Frame`."""
+    return raw[5] if raw[0] == V1 else raw[7] | raw[8] << 8 | raw[9] << 16
 
 
 def payload_of(raw: bytes) -> bytes:

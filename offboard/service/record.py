@@ -23,6 +23,7 @@ from offboard.flight.record import configuration_pieces, vehicle_record
 from offboard.link import clock
 from offboard.link.background import BackgroundWriter
 from offboard.link.log import CLOSE_S, QUEUED_MAX, FlightLog, LogError, append, entry
+from offboard.mavlink.framing import message_id_of, payload_of
 from offboard.mavlink.session import Session
 
 ROLLING_BYTES = 16 * 2**20
@@ -31,7 +32,7 @@ BEFORE_US = 5_000_000  # of the time before a flight that its log holds
 BEFORE_MAX = 20_000  # frames of it
 PARAM_VALUE = 22
 SENT_ONCE = {PARAM_VALUE, 49, 148, 242}  # GPS_GLOBAL_ORIGIN, AUTOPILOT_VERSION, HOME_POSITION
-PARAM_ID = slice(18, 34)  # in a frame of PARAM_VALUE: 10 bytes of header, 8 of payload before it
+PARAM_ID = slice(8, 24)  # in the payload of PARAM_VALUE
 KEPT_MAX = 100
 ENGAGED = "engaged"  # file of a flight, see the module
 ENGAGED_MAX_S = 600.0  # after the end of its log: a vehicle that was left longer ago has landed
@@ -149,9 +150,9 @@ class Recorder:
         self._before.append((unix_us, frame))
         while not 0 <= unix_us - self._before[0][0] <= BEFORE_US:  # the wall clock may be set
             self._before.popleft()
-        message = int.from_bytes(frame[7:10], "little")
+        message = message_id_of(frame)
         if message in SENT_ONCE:
-            name = message, frame[PARAM_ID] if message == PARAM_VALUE else b""
+            name = message, payload_of(frame)[PARAM_ID] if message == PARAM_VALUE else b""
             if message != PARAM_VALUE or name in self._once or len(self._once) < KEPT_MAX:
                 self._once[name] = unix_us, frame
 

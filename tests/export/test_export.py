@@ -21,7 +21,9 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner, Result
 
 from offboard.analysis import tlog
+from offboard.analysis.history import gather
 from offboard.cli.commands import app
+from offboard.export.series import samples
 from offboard.flight.phases import Phase
 from offboard.flight.record import RECORD_ID
 from offboard.link.log import entry
@@ -214,6 +216,13 @@ def test_our_announcements_and_a_second_vehicle(flight: Path, tmp_path: Path) ->
     assert [line for line in after if line != more] == before
     assert any(line.endswith(",vehicle: mode OFFBOARD") for line in after)
     assert "bandwidth 5.0 rad/s" in CliRunner().invoke(app, ["score", str(two)]).output
+
+
+def test_a_phase_of_another_version_keeps_its_number(flight: Path) -> None:
+    rows = gather(tlog.read(flight)).records[:1].copy()
+    rows["phase"] = 99.0
+    ((*_, known),) = samples("decision", rows)
+    assert known["decision_phase"] == 99.0
 
 
 def test_refusals(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -168,6 +168,22 @@ def fly_north(pair: Serving, speed_mps: float) -> None:
 
 
 @BOTH
+def test_engaged_again_at_once(served: Served, on: str) -> None:
+    """The next flight has not got a position yet: it took the vehicle to be at the origin, and
+    demanded full thrust."""
+    pair = served.engaged(on)
+    since_s = pair.time_s
+    pair.switch("pilot")
+    pair.run(0.1)
+    pair.switch("engage")
+    pair.until(lambda: pair.service.engagements == 2)
+    pair.run(1.0)
+    shares = np.array(thrusts(pair, since_s)) / HOVER[on]
+    assert len(shares) > 8
+    assert 0.7 < shares.min() < shares.max() < 1.4
+
+
+@BOTH
 def test_engaged_in_motion(served: Served, on: str) -> None:
     """What the thrust lifts, and the position, are continuous; the tilt is that of the motion."""
     pair = served.aloft(on)

@@ -123,9 +123,17 @@ def test_a_flight_is_not_completed_that_is_not_tracked_landed_and_disarmed(flown
         ({"records": records[~tracked | (since_s < 0.05)]}, "too short at full speed to be scored"),
         ({"landed": flown.landed[:0]}, "the land detector does not report the ground"),
         ({"heartbeat": heartbeat}, "not disarmed"),
+        ({"phases": flown.phases + flown.phases}, "the log holds several flights"),
+        ({"phases": flown.phases[:-3] + flown.phases}, "the log holds several flights"),
     ):
         scored = score(replace(flown, **changed))
         assert (scored.completed, scored.ended_by.startswith(why)) == (0.0, True), scored.ended_by
+
+
+def test_what_a_service_waited_for_is_none_of_its_flight(flown: History) -> None:
+    """Its log begins five seconds before."""
+    waited = (replace(flown.phases[0], phase="failed"), *flown.phases)
+    assert score(replace(flown, phases=waited)).completed == 1.0
 
 
 def test_a_restart_before_the_flight_is_none_of_it() -> None:
@@ -152,14 +160,15 @@ def test_a_log_with_parts_missing_is_scored_as_far_as_it_goes(flown: History) ->
 
 
 def test_others_on_the_link_have_no_effect(flown: History) -> None:
-    """Another autopilot, heard first, its companion with our component id, and a camera of the same
-    system: none of them is what `--system 1` flies."""
+    """Another autopilot, heard first, its companion with our component id, a ground station with
+    the vehicle's ids, and a camera of the same system: none of them is what `--system 1` flies."""
     text = mavlink.MAVLink_statustext_message(4, b"offboard: land: the battery holds 9 %")
     place = mavlink.MAVLink_local_position_ned_message(10, 9, 9, -9, 9, 9, 9)
     others = [
         (2, 1, mavlink.MAVLink_heartbeat_message(2, 3, 0, 4, 4, 3)),
         (2, 1, place),
         (2, 191, text),
+        (1, 1, mavlink.MAVLink_heartbeat_message(6, 8, 128, 0, 5, 3)),  # armed, in a failsafe
         (1, 100, text),
         (1, 100, mavlink.MAVLink_heartbeat_message(30, 8, 128, 0, 5, 3)),
         (1, 100, place),
@@ -180,6 +189,7 @@ def test_others_on_the_link_have_no_effect(flown: History) -> None:
     scored, alone = pair.score(), score(flown)
     assert (scored.completed, scored.ended_by) == (1.0, "reference over")
     assert scored.rmse_position_m == alone.rmse_position_m
+    assert [event.what for event in pair.history().modes] == [event.what for event in flown.modes]
 
 
 def test_a_requirement_on_a_cut_log_is_missed(tmp_path: Path) -> None:

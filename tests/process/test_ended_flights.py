@@ -13,6 +13,7 @@ import sys
 import time
 from contextlib import suppress
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from processes import RECORDING, SHORT, Called, Spawn, children, ended, eventually, full_disk
@@ -132,6 +133,18 @@ def test_a_flight_whose_log_is_gone_keeps_its_outcome(
     found, shown, _ = called("offboard fly --sitl --json-lines --out x", *options)
     result = json.loads(shown.splitlines()[-1])
     assert (found, result["exit_code"], result["completed"]) == (code, code, False)
+
+
+@pytest.mark.usefixtures("in_memory")
+def test_interrupted_while_it_is_scored_it_was_flown(
+    called: Called, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """130 says that nothing was sent."""
+    monkeypatch.setattr(run, "fly", lambda *_, **__: Outcome(0, "flown and landed"))
+    monkeypatch.setattr("offboard.cli.fly.scored", Mock(side_effect=KeyboardInterrupt))
+    code, *printed = called("offboard fly --sitl --out x")
+    assert code == 0
+    assert "flown and landed; it cannot be scored: interrupted" in "".join(printed)
 
 
 @pytest.mark.usefixtures("in_memory")

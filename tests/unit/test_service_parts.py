@@ -54,17 +54,18 @@ def recorded(directory: Path, **options: Any) -> tuple[Recorder, list[Path]]:
     return Recorder(directory, score=scored.append, **options), scored
 
 
-def test_a_flight_log_begins_with_what_came_before(tmp_path: Path) -> None:
+@pytest.mark.parametrize("version_1", [False, True])
+def test_a_flight_log_begins_with_what_came_before(version_1: bool, tmp_path: Path) -> None:
     """With the home position from long ago, the last five seconds and the configuration."""
     recorder, scored = recorded(tmp_path, stamp=lambda: "now")
     talk, began_us = session(), clock.unix_us() - 20_000_000
     codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
-    home = mavlink.MAVLink_gps_global_origin_message(1, 2, 3).pack(codec)
+    home = mavlink.MAVLink_gps_global_origin_message(1, 2, 3).pack(codec, version_1)
     recorder.write(began_us + 10**10, talk.encode(Heartbeat(30)))  # then the clock is set back
     for number in range(150):  # a ground station reads all parameters
         name = f"P{number}".encode()
         parameter = mavlink.MAVLink_param_value_message(name, number, 9, 150, number)
-        recorder.write(began_us, parameter.pack(codec))
+        recorder.write(began_us, parameter.pack(codec, version_1))
     recorder.write(began_us, home)
     for second in range(2, 20):
         recorder.write(began_us + second * 1_000_000, talk.encode(Heartbeat(6)))

@@ -14,6 +14,7 @@ import pytest
 from pymavlink import mavutil
 
 from offboard.analysis import history, tlog
+from offboard.link.log import entry as written
 
 RECORDINGS = Path(__file__).parents[1] / "wire" / "recordings"
 PX4, ARDUCOPTER = (
@@ -98,6 +99,15 @@ def test_damaged_entries_are_skipped_and_counted(
             words = "entries were" if damages > 1 else "entry was"
             told = f"{damages} damaged {words} skipped, the first at byte {first}"
             assert told in log.damage
+
+
+def test_a_log_of_a_computer_without_a_clock_is_read(tmp_path: Path) -> None:
+    """Such a computer counts from 1970: its flights could not be scored."""
+    _, messages, _ = recorded()
+    log = tmp_path / "1970.tlog"
+    since_us = messages[0].unix_us
+    log.write_bytes(b"".join(written(m.unix_us - since_us, m.frame.raw) for m in messages))
+    assert [m.frame for m in tlog.read(log)] == [m.frame for m in messages]
 
 
 def test_a_story_is_told_in_vehicle_time() -> None:
