@@ -80,6 +80,10 @@ class Bench:
         return self.instance.autopilot.state.truth.velocity_ned_mps
 
     @property
+    def climb_mps(self) -> float:
+        return -self.velocity[2]
+
+    @property
     def heading_deg(self) -> float:
         return math.degrees(self.instance.autopilot.state.estimate.yaw_rad)
 

@@ -50,10 +50,6 @@ def roll_deg(vehicle: Bench) -> float:
     return math.degrees(math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)))
 
 
-def climb_mps(vehicle: Bench) -> float:
-    return -vehicle.velocity[2]
-
-
 def test_without_requests_it_sends_heartbeat_timesync_and_home() -> None:
     """And texts, once somebody spoke; origin and home when the filter has found them."""
     vehicle = Bench(firmware=ARDUPILOT, boot_scale=0.1, heartbeat_type=18)
@@ -108,7 +104,7 @@ def test_without_guid_options_thrust_is_a_climb_rate() -> None:
     vehicle = guided(GUID_OPTIONS=0)
     for thrust, climb in ((0.5, 0.0), (1.0, 2.5), (0.75, 1.25), (0.0, -1.5), (2.0, 2.5)):
         vehicle.run(3.0, lambda u=thrust: vehicle.attitude(LEVEL, u))
-        assert climb_mps(vehicle) == pytest.approx(climb, abs=0.1)
+        assert vehicle.climb_mps == pytest.approx(climb, abs=0.1)
 
 
 def test_a_request_of_the_present_mode_changes_nothing_and_disarming_ends_a_takeoff() -> None:
@@ -179,7 +175,7 @@ def test_a_lost_ground_station_disarms_on_the_ground_and_leaves_the_pilot_his_mo
 def test_a_nan_thrust_is_zero_and_prevents_arming_until_reboot() -> None:
     vehicle = guided()
     vehicle.run(0.5, lambda: vehicle.attitude(LEVEL, NAN))
-    assert climb_mps(vehicle) < -2.0
+    assert vehicle.climb_mps < -2.0
     assert vehicle.system_status == 5
     vehicle.command(400, 0, 21196)
     vehicle.run(3.0)
@@ -246,7 +242,7 @@ def test_sticks_are_speeds_and_an_override_lasts_three_seconds() -> None:
     bench = loitering()
     for width, climb in ((1700, 0.63), (1300, -0.68), (1580, 0.0)):
         push(bench, 3.0, 1500, 1500, width, 1500)
-        assert climb_mps(bench) == pytest.approx(climb, abs=0.08)
+        assert bench.climb_mps == pytest.approx(climb, abs=0.08)
         height_m = bench.height_m
         push(bench, 4.0, *MIDDLE)
         assert bench.height_m == pytest.approx(height_m + 0.35 * climb, abs=0.35)
@@ -262,7 +258,7 @@ def test_sticks_are_speeds_and_an_override_lasts_three_seconds() -> None:
     assert seen(bench) == (*MIDDLE, *FEIGNED[4:])
     bench.run(4.5)
     assert seen(bench) == FEIGNED
-    assert climb_mps(bench) == pytest.approx(-2.4, abs=0.3)
+    assert bench.climb_mps == pytest.approx(-2.4, abs=0.3)
 
 
 def test_manual_control_of_the_ground_station_alone_is_an_override_and_keeps_it_present() -> None:
@@ -289,7 +285,7 @@ def test_manual_control_of_the_ground_station_alone_is_an_override_and_keeps_it_
     bench.heartbeat_type = None
     joystick = mavlink.MAVLink_manual_control_message(1, 0, 0, 700, 0, 0)
     bench.run(7.0, lambda: bench.send(joystick), 0.5)
-    assert climb_mps(bench) == pytest.approx(0.63, abs=0.1)
+    assert bench.climb_mps == pytest.approx(0.63, abs=0.1)
     assert not [text for text in bench.texts() if text.startswith("GCS Failsafe")]
     bench.run(6.0)
     assert [text for text in bench.texts() if text.startswith("GCS Failsafe")]
