@@ -11,13 +11,12 @@ from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from sim_bench import NAN, Bench, aloft
+from sim_bench import NAN, Bench, aloft, degrees
 
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
 from simulator.firmware.values import MissionItem
-from simulator.geodesy import EARTH_RADIUS_M
 
 AUTO, GUIDED, LAND, THROW = 3, 4, 9, 18
 ACCEPTED, DENIED, UNSUPPORTED, FAILED = 0, 2, 3, 4
@@ -303,14 +302,6 @@ def flying(firmware: Firmware = ARDUPILOT) -> Bench:
     bench = aloft(firmware=firmware, height_m=5.0, mode=mode)
     bench.run(1.0)
     return bench
-
-
-def degrees(bench: Bench, north: float, east: float) -> tuple[float, float]:
-    """Latitude and longitude, so many metres from the origin of the local frame."""
-    latitude, longitude, _ = bench.instance.autopilot.firmware.origin
-    shrink = math.cos(math.radians(latitude))
-    north_deg, east_deg = (math.degrees(way / EARTH_RADIUS_M) for way in (north, east))
-    return latitude + north_deg, longitude + east_deg / shrink
 
 
 def reposition(

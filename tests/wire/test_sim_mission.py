@@ -6,7 +6,7 @@ import math
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from sim_bench import NAN, RTL, Bench, aloft
+from sim_bench import NAN, RTL, Bench, aloft, degrees
 
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Firmware
@@ -26,13 +26,11 @@ def act(command: int, *params: float) -> Row:
     return command, (*params, *(0.0,) * (4 - len(params))), NAN, NAN, NAN
 
 
-def item(seq: int, row: Row, origin: tuple[float, float, float] = PX4.origin) -> object:
+def item(bench: Bench, seq: int, row: Row) -> object:
     command, params, north, east, up = row
     x = y = 0
     if not math.isnan(north):
-        x = round((origin[0] + math.degrees(north / 6_371_000)) * 1e7)
-        shrink = math.cos(math.radians(origin[0]))
-        y = round((origin[1] + math.degrees(east / 6_371_000 / shrink)) * 1e7)
+        x, y = (round(value * 1e7) for value in degrees(bench, north, east))
     frame, z = (COMMAND_FRAME, 0.0) if math.isnan(up) else (RELATIVE_INT, up)
     return mavlink.MAVLink_mission_item_int_message(
         1, 1, seq, frame, command, 0, 1, *params, x, y, z
@@ -53,7 +51,7 @@ def upload(bench: Bench, rows: list[Row]) -> int:
     send(bench, mavlink.MAVLink_mission_count_message(1, 1, len(rows)))
     for seq, row in enumerate(rows):
         assert asked(bench)[-1] == seq
-        send(bench, item(seq, row, bench.instance.autopilot.firmware.origin))
+        send(bench, item(bench, seq, row))
     return acks(bench)[-1]
 
 
@@ -75,13 +73,13 @@ def test_a_mission_is_downloaded_as_uploaded_and_cleared() -> None:
     """A repeated last item is acknowledged again."""
     bench = Bench()
     assert upload(bench, ROUND) == 0
-    send(bench, item(len(ROUND) - 1, ROUND[-1]))
+    send(bench, item(bench, len(ROUND) - 1, ROUND[-1]))
     assert acks(bench) == [0, 0]
     send(bench, mavlink.MAVLink_mission_request_list_message(1, 1))
     assert bench.of("MISSION_COUNT")[-1][1].count == len(ROUND)
     for seq, row in enumerate(ROUND):
         send(bench, mavlink.MAVLink_mission_request_int_message(1, 1, seq))
-        given, kept = item(seq, row), bench.of("MISSION_ITEM_INT")[-1][1]
+        given, kept = item(bench, seq, row), bench.of("MISSION_ITEM_INT")[-1][1]
         for name in ("seq", "frame", "command", "x", "y", "z", "param1", "param2"):
             assert getattr(kept, name) == pytest.approx(getattr(given, name), nan_ok=True)
     for emptying in (
@@ -103,7 +101,7 @@ def test_missing_items_are_requested_again_until_a_timeout_or_cancelled() -> Non
     assert 3 <= len(asked(bench)) <= 5
     bench.run(5.0)
     assert acks(bench) == [15]
-    send(bench, item(0, ROUND[0]))
+    send(bench, item(bench, 0, ROUND[0]))
     assert acks(bench) == [15, 1]
     begun_s = bench.time_s
     send(bench, mavlink.MAVLink_mission_count_message(1, 1, 2))
