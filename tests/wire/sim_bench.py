@@ -13,6 +13,7 @@ from simulator import config
 from simulator.config import Scenario
 from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
+from simulator.geodesy import EARTH_RADIUS_M
 from simulator.instance import Instance
 from simulator.steps import STEP_S
 from simulator.vehicle.conditions import Conditions
@@ -78,6 +79,10 @@ class Bench:
     @property
     def velocity(self) -> tuple[float, ...]:
         return self.instance.autopilot.state.truth.velocity_ned_mps
+
+    @property
+    def climb_mps(self) -> float:
+        return -self.velocity[2]
 
     @property
     def heading_deg(self) -> float:
@@ -207,6 +212,14 @@ class Bench:
         while abs(self.height_m - height_m) > 0.1:
             assert self.time_s < limit_s
             self.run(0.2, lambda: self.position(0, 0, -height_m))
+
+
+def degrees(bench: Bench, north_m: float, east_m: float) -> tuple[float, float]:
+    """Latitude and longitude, so many metres from the origin of the local frame."""
+    latitude, longitude, _ = bench.instance.autopilot.firmware.origin
+    shrink = math.cos(math.radians(latitude))
+    north_deg, east_deg = (math.degrees(way / EARTH_RADIUS_M) for way in (north_m, east_m))
+    return latitude + north_deg, longitude + east_deg / shrink
 
 
 def aloft(

@@ -4,7 +4,6 @@ equal, different and late rows."""
 from __future__ import annotations
 
 import difflib
-import lzma
 import re
 import struct
 from collections.abc import Callable, Iterable
@@ -12,8 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_bench import Bench
+from vehicle_frames import recorded
 
 COMPANION_COMPONENT = 191
 # HEARTBEAT, PARAM_VALUE, LOCAL_POSITION_NED, MISSION_..., COMMAND_ACK, EKF_STATUS_REPORT,
@@ -123,22 +122,6 @@ def _without_figures(text: str) -> str:
     return re.sub(r"\d+(\.\d+)?", "#", text).strip() if estimated else text.strip()
 
 
-def recorded_frames(recording: Path) -> list[tuple[float, bytes, Any]]:
-    """Host seconds since the first, frame, and the message if pymavlink knows it."""
-    data, frames, at = recording.read_bytes(), [], 0
-    if recording.suffix == ".xz":
-        data = lzma.decompress(data)
-    parser = mavlink.MAVLink(None)
-    parser.robust_parsing = True
-    first_us = struct.unpack_from(">Q", data)[0]
-    while at < len(data):
-        (stamp_us,) = struct.unpack_from(">Q", data, at)
-        frame = data[at + 8 : at + 20 + data[at + 9]]
-        frames.append(((stamp_us - first_us) * 1e-6, frame, parser.parse_char(frame)))
-        at += 8 + len(frame)
-    return frames
-
-
 def ask_again(
     recording: Path,
     bench: Bench,
@@ -154,7 +137,7 @@ def ask_again(
     """
     system = bench.system
     offset_s = 0.0  # vehicle time minus host time, from the newest stamp
-    for host_s, frame, message in recorded_frames(recording):
+    for host_s, frame, message in recorded(recording):
         if message is None:
             continue
         source = (message.get_srcSystem(), message.get_srcComponent())

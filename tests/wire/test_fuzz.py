@@ -77,9 +77,8 @@ def samples(*recordings: Path) -> list[bytes]:
     """Frames of recordings, some of each kind."""
     kinds: dict[tuple[str, int], list[bytes]] = {}
     for path in recordings:
-        for message in itertools.islice(recorded(path), 4000):
-            key = (message.get_type(), message.get_srcComponent())
-            kinds.setdefault(key, []).append(bytes(message.get_msgbuf()))
+        for _, frame, message in recorded(path)[:4000]:
+            kinds.setdefault((message.get_type(), message.get_srcComponent()), []).append(frame)
     return [frame for found in kinds.values() for frame in found[:20]]
 
 

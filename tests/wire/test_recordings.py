@@ -21,14 +21,13 @@ class Replay:
     """A recording, received by a session frame by frame."""
 
     def __init__(self, path: Path) -> None:
-        self.messages = list(recorded(path))
+        frames = recorded(path)
+        self.messages = [message for _, _, message in frames]
         self.session = Session(SessionSettings())
         self.events: list[tuple[float, events.Event]] = []
         self.logged: list[bytes] = []
-        start_s = self.messages[0]._timestamp
-        for message in self.messages:
-            time_s = message._timestamp - start_s
-            reception = self.session.receive(bytes(message.get_msgbuf()), PEER, time_s)
+        for time_s, frame, _ in frames:
+            reception = self.session.receive(frame, PEER, time_s)
             self.events += [(time_s, event) for event in reception.events]
             self.logged += reception.frames
 

@@ -11,13 +11,12 @@ from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from sim_bench import NAN, Bench, aloft
+from sim_bench import NAN, Bench, aloft, degrees
 
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
 from simulator.firmware.values import MissionItem
-from simulator.geodesy import EARTH_RADIUS_M
 
 AUTO, GUIDED, LAND, THROW = 3, 4, 9, 18
 ACCEPTED, DENIED, UNSUPPORTED, FAILED = 0, 2, 3, 4
@@ -48,10 +47,6 @@ def roll(degrees: float, length: float = 1.0) -> tuple[float, float, float, floa
 def roll_deg(vehicle: Bench) -> float:
     w, x, y, z = vehicle.instance.autopilot.state.truth.attitude
     return math.degrees(math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)))
-
-
-def climb_mps(vehicle: Bench) -> float:
-    return -vehicle.velocity[2]
 
 
 def test_without_requests_it_sends_heartbeat_timesync_and_home() -> None:
@@ -108,7 +103,7 @@ def test_without_guid_options_thrust_is_a_climb_rate() -> None:
     vehicle = guided(GUID_OPTIONS=0)
     for thrust, climb in ((0.5, 0.0), (1.0, 2.5), (0.75, 1.25), (0.0, -1.5), (2.0, 2.5)):
         vehicle.run(3.0, lambda u=thrust: vehicle.attitude(LEVEL, u))
-        assert climb_mps(vehicle) == pytest.approx(climb, abs=0.1)
+        assert vehicle.climb_mps == pytest.approx(climb, abs=0.1)
 
 
 def test_a_request_of_the_present_mode_changes_nothing_and_disarming_ends_a_takeoff() -> None:
@@ -179,7 +174,7 @@ def test_a_lost_ground_station_disarms_on_the_ground_and_leaves_the_pilot_his_mo
 def test_a_nan_thrust_is_zero_and_prevents_arming_until_reboot() -> None:
     vehicle = guided()
     vehicle.run(0.5, lambda: vehicle.attitude(LEVEL, NAN))
-    assert climb_mps(vehicle) < -2.0
+    assert vehicle.climb_mps < -2.0
     assert vehicle.system_status == 5
     vehicle.command(400, 0, 21196)
     vehicle.run(3.0)
@@ -246,7 +241,7 @@ def test_sticks_are_speeds_and_an_override_lasts_three_seconds() -> None:
     bench = loitering()
     for width, climb in ((1700, 0.63), (1300, -0.68), (1580, 0.0)):
         push(bench, 3.0, 1500, 1500, width, 1500)
-        assert climb_mps(bench) == pytest.approx(climb, abs=0.08)
+        assert bench.climb_mps == pytest.approx(climb, abs=0.08)
         height_m = bench.height_m
         push(bench, 4.0, *MIDDLE)
         assert bench.height_m == pytest.approx(height_m + 0.35 * climb, abs=0.35)
@@ -262,7 +257,7 @@ def test_sticks_are_speeds_and_an_override_lasts_three_seconds() -> None:
     assert seen(bench) == (*MIDDLE, *FEIGNED[4:])
     bench.run(4.5)
     assert seen(bench) == FEIGNED
-    assert climb_mps(bench) == pytest.approx(-2.4, abs=0.3)
+    assert bench.climb_mps == pytest.approx(-2.4, abs=0.3)
 
 
 def test_manual_control_of_the_ground_station_alone_is_an_override_and_keeps_it_present() -> None:
@@ -289,7 +284,7 @@ def test_manual_control_of_the_ground_station_alone_is_an_override_and_keeps_it_
     bench.heartbeat_type = None
     joystick = mavlink.MAVLink_manual_control_message(1, 0, 0, 700, 0, 0)
     bench.run(7.0, lambda: bench.send(joystick), 0.5)
-    assert climb_mps(bench) == pytest.approx(0.63, abs=0.1)
+    assert bench.climb_mps == pytest.approx(0.63, abs=0.1)
     assert not [text for text in bench.texts() if text.startswith("GCS Failsafe")]
     bench.run(6.0)
     assert [text for text in bench.texts() if text.startswith("GCS Failsafe")]
@@ -307,14 +302,6 @@ def flying(firmware: Firmware = ARDUPILOT) -> Bench:
     bench = aloft(firmware=firmware, height_m=5.0, mode=mode)
     bench.run(1.0)
     return bench
-
-
-def degrees(bench: Bench, north: float, east: float) -> tuple[float, float]:
-    """Latitude and longitude, so many metres from the origin of the local frame."""
-    latitude, longitude, _ = bench.instance.autopilot.firmware.origin
-    shrink = math.cos(math.radians(latitude))
-    north_deg, east_deg = (math.degrees(way / EARTH_RADIUS_M) for way in (north, east))
-    return latitude + north_deg, longitude + east_deg / shrink
 
 
 def reposition(

@@ -18,10 +18,6 @@ from simulator.firmware.px4 import PX4
 from simulator.mavlink.codec import Decoder, sender_of
 
 
-def climb_mps(bench: Bench) -> float:
-    return -bench.velocity[2]
-
-
 def test_without_position_automatic_flight_lands_and_attitude_setpoints_continue() -> None:
     bench = aloft()
     autopilot = bench.instance.autopilot
@@ -63,7 +59,7 @@ def test_a_least_thrust_that_lifts_never_lands() -> None:
     bench = hovering_at(0.1)
     bench.command(21)
     bench.run(4.0)
-    assert climb_mps(bench) == pytest.approx(2.0, abs=0.3)
+    assert bench.climb_mps == pytest.approx(2.0, abs=0.3)
     bench.set("MPC_THR_MIN", 0.05)
     bench.run_until(lambda: not bench.armed, 60.0)
 
@@ -82,9 +78,9 @@ def test_thrust_outside_its_range_is_clipped_or_zero_and_quaternions_are_not_che
     bench = engaged()
     for setpoint, low, high in setpoints:
         hold(bench, 3.0)
-        before_mps = climb_mps(bench)
+        before_mps = bench.climb_mps
         bench.run(0.6, lambda given=setpoint: bench.attitude(**given))
-        assert low < climb_mps(bench) - before_mps < high
+        assert low < bench.climb_mps - before_mps < high
 
 
 def test_the_least_rate_until_which_the_last_attitude_continues() -> None:

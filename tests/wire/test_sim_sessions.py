@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from sim_bench import Bench
-from sim_rows import Rows, ask_again, compare, recorded_frames
+from sim_rows import Rows, ask_again, compare
+from vehicle_frames import RECORDINGS, recorded
 
 from simulator.firmware.catalogue import FIRMWARES
 from simulator.vehicle.battery import Battery
 from simulator.vehicle.sensors import EstimatorName
 
-RECORDINGS = Path(__file__).parent / "recordings"
 NOT_OURS = (
     "[logger]",  # its log file
     "GPS Vertical Pos Drift",  # while it stands, which the simulator has not
@@ -251,7 +251,7 @@ SESSIONS = [
 
 
 def _system(recording: Path) -> int:
-    messages = (message for _, _, message in recorded_frames(recording) if message is not None)
+    messages = (message for _, _, message in recorded(recording) if message is not None)
     return next(m.get_srcSystem() for m in messages if m.get_srcComponent() == 1)
 
 
@@ -300,13 +300,19 @@ def named(name: str, firmware: str) -> Session:
 
 @pytest.mark.parametrize(
     ("name", "firmware", "equal"),
-    [("talk", "ardupilot", 39), ("failsafes", "ardupilot", 33), ("failsafes", "px4", 11)],
+    [
+        ("talk", "ardupilot", 39),
+        ("failsafes", "ardupilot", 33),
+        ("failsafes", "px4", 11),
+        ("ground", "px4", 71),  # also out of range, NaN, of another type and unknown
+    ],
 )
 def test_parameters_are_told_as_the_real_autopilot_tells_them(
     name: str, firmware: str, equal: int
 ) -> None:
-    """Read, listed and set, with their types; of those that the simulator has."""
-    compared = compare(*heard(named(name, firmware)), ("param",), NOT_OURS)
+    """Read, listed and set, with their types; of those that the simulator has, but for the ids of
+    its sensors."""
+    compared = compare(*heard(named(name, firmware)), ("param",), (*NOT_OURS, "CAL_"))
     assert [row for row in compared.differing if row.startswith("ours")] == []
     assert compared.equal == equal
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+import lzma
 import struct
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.mavlink.counters import DropReason
@@ -93,11 +92,17 @@ def understood(frame: bytes) -> Any:
     return mavlink.MAVLink(None).decode(bytearray(frame))
 
 
-def recorded(path: Path) -> Iterator[Any]:
-    """Messages of a .tlog as pymavlink reads them, with `_timestamp`."""
-    log = mavutil.mavlink_connection(str(path), dialect="ardupilotmega")
-    try:
-        while (message := log.recv_msg()) is not None:
-            yield message
-    finally:
-        log.close()
+def recorded(path: Path) -> list[tuple[float, bytes, Any]]:
+    """Of a .tlog or .tlog.xz: host seconds since the first frame, frame, message by pymavlink."""
+    data, frames, at = path.read_bytes(), [], 0
+    if path.suffix == ".xz":
+        data = lzma.decompress(data)
+    parser = mavlink.MAVLink(None)
+    parser.robust_parsing = True
+    first_us = struct.unpack_from(">Q", data)[0]
+    while at < len(data):
+        (stamp_us,) = struct.unpack_from(">Q", data, at)
+        frame = data[at + 8 : at + 20 + data[at + 9]]
+        frames.append(((stamp_us - first_us) * 1e-6, frame, parser.parse_char(frame)))
+        at += 8 + len(frame)
+    return frames
