@@ -248,7 +248,7 @@ class Observer:
         disturbance += slowed * state[VELOCITY : VELOCITY + 3]
         np.clip(disturbance, -DISTURBANCE_LIMIT_MPS2, DISTURBANCE_LIMIT_MPS2, out=disturbance)
         self._set_vehicle(vehicle)
-        self.estimated.on_new_model()
+        self.estimated.permit_vertical_drift()
 
     @property
     def ready(self) -> bool:
