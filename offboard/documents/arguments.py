@@ -13,6 +13,7 @@ from offboard.documents.errors import UserError, shown
 FILE = "NAME|FILE"  # the name of a shipped file, or a path
 LIVE_PAGE = "127.0.0.1:8014"  # of --live without a value
 LOCAL = "127.0.0.1"
+USAGE_ERROR: Any = typer.BadParameter.__base__  # an unknown option, too; typer does not export it
 
 
 def option(metavar: str, text: str, *names: str, **more: Any) -> Any:
@@ -53,7 +54,11 @@ class Command(TyperCommand):
             f"--live={LIVE_PAGE}" if arg == "--live" and after.startswith("-") else arg
             for arg, after in zip(args, following, strict=False)
         ]
-        given, _, parameters = self.make_parser(ctx).parse_args(list(args))
+        try:
+            given, _, parameters = self.make_parser(ctx).parse_args(list(args))
+        except USAGE_ERROR as error:  # of the last option without its value: it names no command
+            error.ctx = error.ctx or ctx
+            raise
         for parameter in parameters:
             is_option = parameter.param_type_name == "option"
             values = given.get(parameter.name)

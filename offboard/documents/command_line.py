@@ -12,7 +12,7 @@ import shutil
 import sys
 import textwrap
 from importlib import import_module
-from typing import Any, NoReturn, TextIO
+from typing import NoReturn, TextIO
 
 from offboard.documents.errors import UserError, abridged
 
@@ -70,12 +70,13 @@ def _told(error: BaseException) -> tuple[str, int]:
         return explained(error), USAGE
     if isinstance(error, UserError):
         return str(error), error.code
-    from typer import BadParameter, Exit
+    from typer import Exit
+
+    from offboard.documents.arguments import USAGE_ERROR
 
     if isinstance(error, Exit):
         return "", error.exit_code
-    usage_error: Any = BadParameter.__base__  # an unknown option, too; typer does not export it
-    if isinstance(error, usage_error):
+    if isinstance(error, USAGE_ERROR):
         words = error.format_message().replace("Value error, ", "").split()
         sentence = " ".join(words).rstrip(".")
         return f"{sentence}; see `{error.ctx.command_path} --help`", USAGE

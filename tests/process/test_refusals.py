@@ -108,10 +108,11 @@ def test_other_commands_refuse_alike(command: str, says: str, refused: Refused) 
     assert says in refused(command if command.startswith("offboard") else f"{SIMULATOR} {command}")
 
 
-def test_an_unknown_option_is_named(called: Called) -> None:
+def test_an_unknown_option_and_one_without_its_value_are_named(called: Called) -> None:
     for command in (FLY, SIMULATOR):
-        code, _, said = called(command, "--no-such-option")
-        assert (code, said.count("\n"), "No such option" in said) == (2, 1, True)
+        for option, says in (("--no-such-option", "No such"), ("--seed", "requires an argument")):
+            code, _, said = called(command, option)
+            assert (code, said.count("\n"), says in said) == (2, 1, True)
 
 
 @pytest.mark.parametrize(
