@@ -130,17 +130,16 @@ def data(chunks: list[Chunk]) -> list[bytes]:
 
 
 def test_a_datagram_has_the_time_of_its_arrival_not_of_its_reading(udp: Udp) -> None:
-    """On a busy machine the time may be some milliseconds too old."""
+    """On a busy machine the time may be too old by as long as this process is interrupted."""
     link, vehicle, _ = udp
     before_s = time.monotonic()
     vehicle.send(b"first")
-    between_s = time.monotonic()
     time.sleep(0.1)
     vehicle.send(b"second")
     time.sleep(0.1)
     first, second = received(link)
-    assert before_s - 0.05 <= first.arrived_s <= between_s + 1e-4
-    assert between_s + 0.05 <= second.arrived_s <= time.monotonic() - 0.1
+    assert before_s - 0.5 <= first.arrived_s <= second.arrived_s - 0.05
+    assert second.arrived_s <= time.monotonic() - 0.05
     assert (first.peer, second.peer) == (vehicle.getsockname(), vehicle.getsockname())
 
 
