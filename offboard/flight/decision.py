@@ -54,8 +54,8 @@ def decide(flight: FlightState) -> bool:
 
     Returns False, and increases `missed`, if the decision failed or was refused; then
     nothing is sent. Telemetry that was too old before the decision began does not count: the
-    failsafe has a row for it. Nor does an observer that has not got any yet: a service may be
-    engaged at once after the flight before.
+    failsafe has a row for it. Nothing is missed either while the observer has no position or no
+    attitude yet: a service may be engaged again at once after a flight.
     """
     if not flight.observer.ready:
         return False

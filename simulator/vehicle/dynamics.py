@@ -42,7 +42,7 @@ RECORD = np.dtype(
         ("motors_on", "i8"),
         ("substeps", "i8"),
         ("gusty", "i8"),
-        ("erring", "i8"),
+        ("noisy", "i8"),
         # the truth
         ("body", "f8", QUATERNION.size),
         ("rotor", "f8", ROTOR_SIZE),
@@ -53,7 +53,7 @@ RECORD = np.dtype(
         ("offset", "f8", 3),
         ("velocity_error", "f8", 3),
         ("lag_s", "f8"),
-        ("pull_ps2", "f8"),
+        ("late_gps_ps", "f8"),
         ("white_sds", "f8", WHITE_COUNT),
         # the satellite receiver: position NED and velocity NE
         ("fix_sds", "f8", 5),
@@ -148,7 +148,7 @@ def advance_steps(count: int, plants: Any) -> None:
         _move_air(plant, step)
         _control_attitude(plant, step)
         advance_airframe(plant, delayed_thrust(plant, step) if plant.motors_on else 0.0)
-        if plant.erring:
+        if plant.noisy:
             _move_errors(plant, step)
         plant.step = step + 1
 
@@ -184,7 +184,7 @@ def _control_attitude(plant: Any, step: int) -> None:
 
 @kernel
 def _move_errors(plant: Any, step: int) -> None:
-    """Next errors of the estimator."""
+    """Next errors of the estimator, which follow a process and the true velocity."""
     fill_normals(plant.seed, _ERROR_LANE, step, plant.normals[:])
     advance_process(
         plant.error_transition[:],
@@ -195,4 +195,4 @@ def _move_errors(plant: Any, step: int) -> None:
         plant.work[:],
     )
     for axis in range(2):
-        plant.error[AXIS_STRIDE * axis + 3] += STEP_S * plant.pull_ps2 * plant.body[7 + axis]
+        plant.error[AXIS_STRIDE * axis + 3] += STEP_S * plant.late_gps_ps * plant.body[7 + axis]

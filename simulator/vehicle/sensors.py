@@ -1,9 +1,10 @@
 """Estimator: error models identified on autopilots, and the estimate made from truth and errors.
 
 The error of an estimator is a linear process per NED axis, e = [e_p, e_v, e_b, e_r] with
-e' = A e + w, plus white noise. e_p and e_v are estimated minus true position and velocity; e_b is
-estimated minus true thrust direction; e_r is the rate of e_p where e_p is smooth. PX4's process
-reproduces a velocity that is *not* the derivative of the position, and a smooth position, which
+e' = A e + w, plus white noise; where the GPS is later than the estimator assumes, e_r' has a term
+of the true velocity. e_p and e_v are estimated minus true position and velocity; e_b is estimated
+minus true thrust direction; e_r is the rate of e_p where e_p is smooth. PX4's process reproduces a
+velocity that is *not* the derivative of the position, and a smooth position, which
 white noise alone does not. Knows no vehicle and no MAVLink.
 """
 
@@ -76,7 +77,8 @@ class ErrorModel:
     yaw_time_s: float
     white: WhiteNoise
     lag_s: float  # of position and velocity behind their time stamp
-    pull_ps2: float = 0.0  # of north and east e_r' per true velocity: of a GPS later than assumed
+    # e_r' of north and east per true velocity, 1/s: of a GPS later than the estimator assumes
+    late_gps_ps: float = 0.0
     receiver: tuple[float, ...] = (0.0,) * 5  # GPS fix, new at each: position NED, velocity N, E
 
 
@@ -183,9 +185,9 @@ ARDUPILOT_LIKE = ErrorModel(
 
 # ArduCopter 4.6 SITL as shipped, whose sensors have no noise: its GPS is later than its EKF3
 # assumes, so that e_p follows minus that time times the true velocity, as a filter of second order.
-# Fitted to estimate minus truth of nine flights (1.3 to 1.8 rad/s, damping 0.37 to 0.69, 23 to 31
-# ms; residual 0.01 m); within that range, and with this noise, the tracking errors of hover and of
-# lemniscates of 15 and 8 s are 0.0010, 0.0016 and 0.0057 m, there 0.0009, 0.0018 and 0.0047.
+# Fits to estimate minus truth of nine flights give 1.3 to 1.8 rad/s, damping 0.37 to 0.69, 23 to
+# 31 ms, and leave 0.01 m. With the values here the tracking errors of hover and of lemniscates of
+# 15 and 8 s are 0.0010, 0.0016 and 0.0057 m; on the real autopilot 0.0009, 0.0018 and 0.0047 m.
 _SITL_RADPS, _SITL_DAMPING, _SITL_LATE_S = 1.6, 0.55, 0.0225
 _SITL_LATERAL = AxisError(
     drift=(
@@ -197,7 +199,7 @@ _SITL_LATERAL = AxisError(
     noise=((), (), (), (0.005,)),
 )
 ARDUPILOT_SITL = replace(
-    PERFECT, north=_SITL_LATERAL, east=_SITL_LATERAL, pull_ps2=-(_SITL_RADPS**2) * _SITL_LATE_S
+    PERFECT, north=_SITL_LATERAL, east=_SITL_LATERAL, late_gps_ps=-(_SITL_RADPS**2) * _SITL_LATE_S
 )
 
 
