@@ -12,13 +12,15 @@ from offboard.flight.phases import BEFORE_FLIGHT, FLYING, TRACKING, Phase
 from offboard.flight.preflight import other_sender
 from offboard.flight.state import LEVEL_DIRECTION, FlightState
 from offboard.mavlink.dialects.base import Dialect
-from offboard.mavlink.events import Heartbeat, VehicleIdentity
+from offboard.mavlink.events import Heartbeat, ModeReport, VehicleIdentity
 from offboard.mavlink.outgoing import CommandLong
 from offboard.model.command import Command
 
 HEARTBEAT, AUTOPILOT_VERSION = 0, 148  # message ids
-# PX4 sends one a second; a link that loses several may lose all reports of mode and arming
-HEARTBEAT_DUE_S, HEARTBEAT_EVERY_S = 1.3, 0.15
+# PX4 sends one a second; a link that loses several may lose all reports of mode and arming. Where
+# no CURRENT_MODE shows the mode (PX4 1.14), a pilot might leave and return between two of them
+HEARTBEAT_DUE_S, HEARTBEAT_ALONE_DUE_S, HEARTBEAT_EVERY_S = 1.3, 0.2, 0.15
+MODE_REPORTED_S = 3.0  # PX4 sends CURRENT_MODE every 2 s, and when it changes
 FIT_EVERY_S = 4.0  # between two reductions of the telemetry: a backlog must drain first
 SPOOL_UP_PER_S = 0.7  # thrust ramp before lift-off, in units of gravity
 SPOOL_MAX = 2.0
@@ -57,10 +59,12 @@ def act(flight: FlightState) -> None:
 
 
 def _request_heartbeat(flight: FlightState) -> None:
-    """Request a HEARTBEAT that is missing. It changes nothing on the vehicle, whoever has it."""
+    """Request a HEARTBEAT that is due. It changes nothing on the vehicle, whoever has it."""
     request = CommandLong.message(HEARTBEAT)
+    alone = flight.vehicle.age_s(ModeReport) > MODE_REPORTED_S
+    due_s = HEARTBEAT_ALONE_DUE_S if alone else HEARTBEAT_DUE_S
     waited_s = flight.now_s - flight.requested_s.get(request, -math.inf)
-    if flight.vehicle.age_s(Heartbeat) > HEARTBEAT_DUE_S and waited_s > HEARTBEAT_EVERY_S:
+    if flight.vehicle.age_s(Heartbeat) > due_s and waited_s > HEARTBEAT_EVERY_S:
         flight.requested_s[request] = flight.now_s
         outbox.send(flight, request)
 

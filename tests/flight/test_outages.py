@@ -158,3 +158,26 @@ def test_a_heartbeat_that_is_missing_is_requested() -> None:
 
     pair = make("px4", after_the_next)
     flown(pair)
+
+
+def test_where_heartbeat_alone_shows_the_mode_a_short_switch_is_seen() -> None:
+    """PX4 1.14 has no CURRENT_MODE, and one HEARTBEAT a second: a pilot leaves after one, and has
+    returned before the next."""
+
+    def leave(pair: Pair) -> None:
+        pair.instance.autopilot.commander.switch("POSCTL")
+        pair.at.append(
+            (in_phase(Phase.TRACK, pair.time_s - begun_s(pair, Phase.TRACK) + 0.6), back)
+        )
+
+    def back(pair: Pair) -> None:
+        pair.instance.autopilot.commander.switch("OFFBOARD")
+
+    def just_after_a_beat(pair: Pair) -> bool:
+        heartbeat_s = pair.companion.vehicle.age_s(Heartbeat)
+        return pair.companion.phase is Phase.TRACK and heartbeat_s < 0.1
+
+    pair = hover(*LONG, aloft=True, at=[(just_after_a_beat, leave)])
+    pair.down = without(CURRENT_MODE)
+    aborted(pair, "the vehicle left OFFBOARD for POSCTL")
+    assert pair.companion.phase is Phase.YIELDED
