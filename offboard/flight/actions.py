@@ -20,7 +20,7 @@ HEARTBEAT, AUTOPILOT_VERSION = 0, 148  # message ids
 # PX4 sends one a second; a link that loses several may lose all reports of mode and arming. Where
 # no CURRENT_MODE shows the mode (PX4 1.14), a pilot might leave and return between two of them
 HEARTBEAT_DUE_S, HEARTBEAT_ALONE_DUE_S, HEARTBEAT_EVERY_S = 1.3, 0.2, 0.15
-MODE_REPORTED_S = 3.0  # PX4 sends CURRENT_MODE every 2 s, and when it changes
+MODE_REPORTED_S = 3.0  # PX4 1.15 sends CURRENT_MODE twice a second, and when it changes
 FIT_EVERY_S = 4.0  # between two reductions of the telemetry: a backlog must drain first
 SPOOL_UP_PER_S = 0.7  # thrust ramp before lift-off, in units of gravity
 SPOOL_MAX = 2.0
@@ -53,7 +53,8 @@ def act(flight: FlightState) -> None:
         act_without_telemetry(flight, time_s)
     elif flight.authority.permits_setpoint(flight.now_s) and not decision.decide(flight):
         outbox.send_level(flight, time_s, _level(flight))
-    if flight.phase in FLYING or flight.phase is Phase.LAND:
+    waits_aloft = flight.phase is Phase.STANDBY and flight.in_the_air
+    if flight.phase in FLYING or flight.phase is Phase.LAND or waits_aloft:
         _request_heartbeat(flight)
     outbox.send(flight, flight.clock.request(time_s, flight.host_s))
 

@@ -521,6 +521,21 @@ def test_a_pilot_takes_a_vehicle_whose_own_failsafe_acts_soon(served: Served) ->
     assert pair.landings == []
 
 
+def test_where_heartbeat_alone_shows_the_mode_a_switch_is_seen_soon(served: Served) -> None:
+    """PX4 1.14 has no CURRENT_MODE and one HEARTBEAT a second, in which it would fly setpoints that
+    only repeat its attitude."""
+    pair = served.aloft()
+    pair.instance.view.silent["CURRENT_MODE"] = 0
+    pair.run(3.5)
+    for _ in range(3):
+        pair.switch("engage")
+        pair.until(lambda: pair.phase is Phase.CLIMB, 0.4)
+        pair.run(0.6)
+        pair.switch("pilot")
+        pair.until(lambda: pair.phase is Phase.YIELDED, 0.4)
+        pair.run(1.7)
+
+
 def test_what_is_heard_after_a_silence_may_be_another_vehicle(served: Served) -> None:
     """With the same system id, on the same radio, switched on earlier: parameters
     and hardware number are read again. It was flown with those of the one before, its thrust taken
