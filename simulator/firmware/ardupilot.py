@@ -43,8 +43,8 @@ _NOT_ENTERED = {
     28: "TURTLE failed: init failed",
 }
 # MAV_CMD accepted without an effect that the simulator shows, and failed without their devices
-_TAKEN = (181, 195, 197, 203, 206, 207, 208, 2001, 5300, 42001, 42003, 42424)
-_FAILED = (84, 183, 184, 189, 193, 205, 211, 218, 500, 2000, 2500)
+_TAKEN = (181, 197, 203, 206, 207, 208, 209, 2001, 5300, 42001, 42003, 42424, 42428)
+_FAILED = (84, 184, 189, 193, 205, 211, 218, 500, 2000, 2500)
 
 _CENTI = 0.01
 _RATES_IGNORED, _THRUST_IGNORED, _ATTITUDE_IGNORED = 0b111, 64, 128  # type_mask
@@ -256,6 +256,7 @@ ARDUPILOT = ArduCopter(
     command_answers={
         **dict.fromkeys(_TAKEN, Result.ACCEPTED),
         **dict.fromkeys(_FAILED, Result.FAILED),
+        245: Result.DENIED,
         532: Result.DENIED,
     },
     global_frames=frozenset({0, 3, 5, 6, 10, 11}),
@@ -270,11 +271,13 @@ ARDUPILOT = ArduCopter(
     ground_rates_hz=telemetry.GROUND_RATES_HZ,
     messages=telemetry,
     ground_station_parameter="SYSID_MYGCS",
+    ignored=frozenset({"PING", "SET_GPS_GLOBAL_ORIGIN"}),  # it has an origin
     withheld_until={
         "LOCAL_POSITION_NED": "position",
         "GPS_GLOBAL_ORIGIN": "origin",
         "HOME_POSITION": "origin",
     },
+    estimates_airspeed=True,
     position_grid_steps=1,
     fixed_streams=frozenset({"TIMESYNC"}),
     not_on_request=frozenset({"TIMESYNC"}),

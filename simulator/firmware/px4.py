@@ -40,7 +40,7 @@ _CUSTOM_MODE_ENABLED = 1
 _NO_AUTO_MODE = critical("Unsupported auto mode")
 
 # MAV_CMD accepted without an effect that the simulator shows, and not acknowledged at all
-_TAKEN = (80, 187, 191, 195, 197, 201, 519, 525, 528)
+_TAKEN = (80, 187, 191, 195, 197, 201, 245, 519, 525, 528)
 _UNANSWERED = (
     1, 93, 203, 204, 205, 206, 214, 220, 242, 243, 260, 310, 420, 500, 521, 530, 531, 532, 3000
 )  # fmt: skip

@@ -17,6 +17,8 @@ from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
 from simulator.mavlink.codec import Decoder, sender_of
 
+PREARM_CHECK = 1 << 28  # MAV_SYS_STATUS_SENSOR
+
 
 def test_without_position_automatic_flight_lands_and_attitude_setpoints_continue() -> None:
     bench = aloft()
@@ -108,9 +110,12 @@ def test_arming_needs_a_battery_and_with_nav_dll_act_a_ground_station() -> None:
 
 
 def test_a_landing_goes_on_without_a_ground_station() -> None:
+    """Its pre-arm checks pass, though it could not be armed in this mode."""
     bench = aloft(height_m=30.0)
     bench.set("NAV_DLL_ACT", 2)
     bench.command(21)
+    bench.run(0.5)
+    assert bench.of("SYS_STATUS")[-1][1].onboard_control_sensors_health & PREARM_CHECK
     bench.heartbeat_type = None
     bench.run(14.0)
     assert (bench.mode, bench.system_status) == (LAND, 4)

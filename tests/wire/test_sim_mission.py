@@ -6,7 +6,7 @@ import math
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from sim_bench import NAN, RTL, Bench, aloft, degrees
+from sim_bench import LOITER, NAN, RTL, Bench, aloft, degrees
 
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Firmware
@@ -91,6 +91,17 @@ def test_a_mission_is_downloaded_as_uploaded_and_cleared() -> None:
         assert acks(bench)[-1] == 0
         send(bench, mavlink.MAVLink_mission_request_list_message(1, 1))
         assert bench.of("MISSION_COUNT")[-1][1].count == 0
+
+
+def test_px4_holds_when_its_mission_is_cleared() -> None:
+    bench = aloft(height_m=5.0)
+    assert upload(bench, ROUND) == 0
+    assert bench.command(300) == [0]
+    bench.run(1.0)
+    send(bench, mavlink.MAVLink_mission_clear_all_message(1, 1))
+    bench.run(1.0)
+    assert bench.mode == LOITER
+    assert "No valid mission available, loitering" in bench.texts()
 
 
 def test_missing_items_are_requested_again_until_a_timeout_or_cancelled() -> None:
