@@ -263,6 +263,7 @@ ARDUPILOT = ArduCopter(
     setpoints_as_automatic=True,
     setpoints_imply_flight=True,
     setpoint_spool_s=2.8,
+    item_frames=({2: 0, 5: 0, 6: 3, 11: 10},) * 2,
     home_item_first=True,
     takeoff_items_climb=True,
     guided_items=True,

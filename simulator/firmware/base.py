@@ -160,6 +160,8 @@ class Firmware(ABC):
 
     # missions
     requests_kind_of_peer: bool = False  # items of a mission in the kind that came last
+    # MAV_FRAME of a downloaded item, by the uploaded one: in MISSION_ITEM, in MISSION_ITEM_INT
+    item_frames: tuple[Mapping[int, int], Mapping[int, int]]
     home_item_first: bool = False  # item 0 of a mission is home
     takeoff_items_climb: bool = False  # and never descend
     guided_items: bool = False  # an item with current = 2 is a place to fly to now

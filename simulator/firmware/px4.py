@@ -263,6 +263,7 @@ PX4 = Px4(
     setpoints_outlive_modes=True,
     stream_reaction_s=0.036,
     requests_kind_of_peer=True,
+    item_frames=({5: 0, 6: 3}, {0: 5, 3: 6}),
     reached_above_landing=True,
     turning_items=frozenset({16, 17, 19, 21}),
     companion_rates_hz=telemetry.COMPANION_RATES_HZ,

@@ -93,6 +93,19 @@ def test_a_mission_is_downloaded_as_uploaded_and_cleared() -> None:
         assert bench.of("MISSION_COUNT")[-1][1].count == 0
 
 
+@pytest.mark.parametrize(("firmware", "frame"), [(PX4, 6), (ARDUPILOT, 3)])
+def test_the_frame_of_a_downloaded_item_is_that_of_its_message(
+    firmware: Firmware, frame: int
+) -> None:
+    """Uploaded in frame 6: 6 in MISSION_ITEM_INT of PX4 alone, 3 in MISSION_ITEM."""
+    bench = Bench(firmware=firmware)
+    assert upload(bench, ROUND) == 0
+    send(bench, mavlink.MAVLink_mission_request_int_message(1, 1, 1))
+    send(bench, mavlink.MAVLink_mission_request_message(1, 1, 1))
+    frames = [bench.of(kind)[-1][1].frame for kind in ("MISSION_ITEM_INT", "MISSION_ITEM")]
+    assert frames == [frame, 3]
+
+
 def test_px4_holds_when_its_mission_is_cleared() -> None:
     bench = aloft(height_m=5.0)
     assert upload(bench, ROUND) == 0
