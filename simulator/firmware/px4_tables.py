@@ -134,7 +134,6 @@ PARAMETERS = (
     _real("RTL_MIN_DIST", 10.0, 0.5, 100),  # m from home, within which RTL_CONE_ANG applies
     _real("RTL_RETURN_ALT", 30.0, 0, 150),  # m above home while returning
     _int("RTL_TYPE", 0, 0, 5),  # 0 home or rally point
-    _int("SDLOG_MODE", 0, -1, 4),  # there is no log: without effect
     _int("SYS_AUTOCONFIG", 0, 0, 1),  # set up the airframe at start
     _int("SYS_AUTOSTART", 10040, 0, 9999999),  # airframe
     _int("SYS_HAS_GPS", 1, 0, 1),  # 1: has GPS

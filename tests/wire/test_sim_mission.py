@@ -18,7 +18,7 @@ Row = tuple[int, tuple[float, float, float, float], float, float, float]  # nort
 
 
 def place(command: int, north: float, east: float, up: float, *params: float) -> Row:
-    filled = (*params, *(NAN,) * (4 - len(params)))
+    filled = (*params, *(0.0, 0.0, 0.0, NAN)[len(params) :])
     return command, filled, north, east, up
 
 
@@ -104,6 +104,14 @@ def test_the_frame_of_a_downloaded_item_is_that_of_its_message(
     send(bench, mavlink.MAVLink_mission_request_message(1, 1, 1))
     frames = [bench.of(kind)[-1][1].frame for kind in ("MISSION_ITEM_INT", "MISSION_ITEM")]
     assert frames == [frame, 3]
+
+
+def test_arducopter_refuses_an_item_with_nan_or_an_unknown_command() -> None:
+    bench = Bench(firmware=ARDUPILOT)
+    assert upload(bench, [place(WAYPOINT, 12, 0, 4, NAN)]) == 6
+    assert upload(bench, [act(SPEED, 1, 2, 0, NAN)]) == 9
+    assert upload(bench, [act(31_000)]) == 3
+    assert upload(bench, [place(WAYPOINT, 12, 0, 4)]) == 0
 
 
 def test_px4_holds_when_its_mission_is_cleared() -> None:
