@@ -7,7 +7,7 @@ import math
 from typing import Any
 
 import pytest
-from sim_bench import HOVER, LAND, LOITER, NAN, OFFBOARD, Bench, aloft, engaged, hold
+from sim_bench import HOVER, LAND, LOITER, NAN, OFFBOARD, POSCTL, Bench, aloft, engaged, hold
 
 from offboard.documents.errors import DocumentError
 from simulator import config
@@ -107,6 +107,16 @@ def test_arming_needs_a_battery_and_with_nav_dll_act_a_ground_station() -> None:
         bench.instance.autopilot.plant.set_battery(remaining)
         bench.run(1.1)
         assert bench.command(400, 1) == [result]
+
+
+@pytest.mark.parametrize(
+    ("base_mode", "mode"),
+    [(4, 0x04040000), (64, 0x00010000), (80, 0x00070000), (72, POSCTL), (16, LOITER)],
+)
+def test_the_flags_of_a_base_mode_alone_name_a_mode_of_px4(base_mode: int, mode: int) -> None:
+    bench = Bench()
+    assert bench.command(176, base_mode) == [0, 0]
+    assert bench.mode == mode
 
 
 def test_a_landing_goes_on_without_a_ground_station() -> None:
