@@ -26,7 +26,8 @@ README = ROOT / "simulator" / "README.md"
 # Of every firmware; `Firmware.boot_events_s` has those of the start
 EVENTS = frozenset({
     # requests: commands, messages, faults that act for a pilot
-    "mode", "takeoff", "land", "return", "loiter", "turn", "mission", "reboot", "terminate",
+    "mode", "takeoff", "land", "return", "loiter", "turn", "home", "speed", "servo", "mission",
+    "reboot", "terminate",
     "arm", "disarm", "force arm", "force disarm", "checks", "thrust not a number",
     # monitoring
     "stream lost", "stream found", "position lost", "position found",
@@ -34,7 +35,7 @@ EVENTS = frozenset({
     "battery low", "battery critical", "battery emergency",
     # flight
     "took off", "landed", "settled", "idle", "climbed", "already higher", "item reached",
-    "mission progress", "mission return", "mission finished",
+    "mission progress", "mission return", "mission cleared", "mission finished",
 })  # fmt: skip
 HEAD = ("event", "in mode", "if", "next mode", "answer and texts")
 

@@ -45,6 +45,7 @@ class Autopilot:
         boot_scale: float = 1.0,
     ) -> None:
         self.firmware, self.plant = firmware, plant
+        self.outputs_us = [0] * 16  # pulse widths that a client asked for
         self.parameters = parameters or ParameterTable(firmware)
         self.mission = mission or Mission(firmware, self.parameters)
         self.state = VehicleState(plant)

@@ -172,11 +172,15 @@ class Guidance:
         if self.behaviour is Behaviour.SETPOINT:
             self.follow(self.hold)
 
-    def turn_to(self, yaw_rad: float, turn_radps: float) -> None:
+    def turn_to(self, yaw_rad: float, turn_radps: float, sense: float) -> None:
         """Keep this yaw while holding a place or following a setpoint."""
-        self.hold = MotionSetpoint(self.hold_ned_m, yaw_rad=yaw_rad, turn_radps=turn_radps)
+
+        def turned(setpoint: MotionSetpoint) -> MotionSetpoint:
+            return replace(setpoint, yaw_rad=yaw_rad, turn_radps=turn_radps, turn_sense=sense)
+
+        self.hold = turned(MotionSetpoint(self.hold_ned_m))
         if isinstance(self.newest, MotionSetpoint):
-            self.newest = replace(self.newest, yaw_rad=yaw_rad, turn_radps=turn_radps)
+            self.newest = turned(self.newest)
 
     @property
     def speed_limit_mps(self) -> float:

@@ -140,7 +140,7 @@ class Health:
         """GPS has found its first fix; a fault may take it away."""
         return now_s >= self._firmware.first_fix_s * self.boot_scale
 
-    def passes(self, mode: Mode, now_s: float, *, latched: bool) -> bool:
+    def passes(self, mode: Mode, now_s: float, *, latched: bool, armed: bool) -> bool:
         """The pre-arm checks pass for this mode. `latched`: a failure that only a reboot clears."""
         firmware = self._firmware
         after_s = firmware.passes_without_position_after_s
@@ -150,7 +150,7 @@ class Health:
             after_s = firmware.passes_after_s
         if latched or now_s < after_s * self.boot_scale:
             return False
-        if firmware.fails_where_unarmable and not mode.arms:
+        if firmware.fails_where_unarmable and not (mode.arms or armed):
             return False
         heard = not (self.ground_station_lost or math.isnan(self._heartbeat_s))
         if self._parameters.role("ground_station_needed") > 0 and not heard:

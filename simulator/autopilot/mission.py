@@ -76,6 +76,8 @@ class Mission:
 
     def store(self, items: tuple[MissionItem, ...]) -> None:
         """Replace the items; the mission starts from its beginning."""
+        if self.under_way and not items:
+            self.events.append("mission cleared")
         self.items = items
         self.parameters.set("MIS_TOTAL", len(items))  # which PX4 has not
         self.current, self.reached, self.finished = self.first, -1, False

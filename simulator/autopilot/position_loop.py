@@ -180,11 +180,13 @@ class PositionLoop:
             self._integral_mps2[i] = min(most, max(-most, integral))
 
     def _turn(self, motion: MotionSetpoint, limits: Limits, demanded: Triple) -> None:
-        """Turn to the demanded yaw the shorter way, else by the demanded yaw rate."""
+        """Turn to the demanded yaw, else by the demanded yaw rate."""
         yaw_rad = self._yaw_demanded(motion, demanded)
         if math.isfinite(yaw_rad):
             most_rad = limits.turn_radps * LOOP_S
             error_rad = wrap_pi(yaw_rad - self.yaw_rad)
+            if error_rad * motion.turn_sense < 0.0:
+                error_rad += math.copysign(math.tau, motion.turn_sense)
             if abs(error_rad) > most_rad:
                 yaw_rad = wrap_pi(self.yaw_rad + math.copysign(most_rad, error_rad))
             self.yaw_rad = yaw_rad

@@ -43,8 +43,8 @@ _NOT_ENTERED = {
     28: "TURTLE failed: init failed",
 }
 # MAV_CMD accepted without an effect that the simulator shows, and failed without their devices
-_TAKEN = (181, 195, 197, 203, 206, 207, 208, 2001, 5300, 42001, 42003, 42424)
-_FAILED = (84, 183, 184, 189, 193, 205, 211, 218, 500, 2000, 2500)
+_TAKEN = (181, 197, 203, 206, 207, 208, 209, 2001, 5300, 42001, 42003, 42424, 42428)
+_FAILED = (84, 184, 189, 193, 205, 211, 218, 500, 2000, 2500)
 
 _CENTI = 0.01
 _RATES_IGNORED, _THRUST_IGNORED, _ATTITUDE_IGNORED = 0b111, 64, 128  # type_mask
@@ -57,9 +57,15 @@ _LOCAL_NED, _LOCAL_OFFSET_NED, _BODY_NED, _BODY_OFFSET_NED = 1, 7, 8, 9  # MAV_F
 _OFFSET = frozenset({_LOCAL_OFFSET_NED, _BODY_NED, _BODY_OFFSET_NED})
 _BODY = frozenset({_BODY_NED, _BODY_OFFSET_NED})
 
-_UNSUPPORTED_FRAME = 2  # MAV_MISSION_RESULT
+_UNSUPPORTED_FRAME, _UNSUPPORTED, _INVALID_PARAM1 = 2, 3, 6  # MAV_MISSION_RESULT
 _PLACE_FRAMES = frozenset({0, 3, 5, 6, 10, 11})
 _PLACES = frozenset({16, 17, 18, 19, 21, 22, 31, 82, 201})  # MAV_CMD of missions that have a place
+_YAWED = frozenset({16, 17, 21, 22})  # their fourth parameter may be NaN
+_ACTS = frozenset({
+    20, 30, 83, 84, 85, 92, 93, 94, 112, 114, 115, 177, 178, 179, 181, 182, 183, 184, 188, 189,
+    191, 193, 194, 195, 197, 202, 203, 205, 206, 207, 208, 210, 211, 212, 213, 215, 216, 217, 218,
+    222, 223, 531, 532, 534, 600, 601, 1000, 2000, 2001, 2500, 2501, 3000, 42600, 42702, 42703,
+})  # fmt: skip
 
 _RETURN_LEAST_M = 2.0  # RTL_ALT_MIN
 
@@ -175,6 +181,12 @@ class ArduCopter(Firmware):
         return local
 
     def mission_refusal(self, item: MissionItem) -> tuple[int, StatusText | None] | None:
+        for number, value in enumerate(item.params):
+            may_be_nan = number == 3 and item.command in _YAWED and math.isnan(value)
+            if not (math.isfinite(value) or may_be_nan):
+                return _INVALID_PARAM1 + number, None
+        if item.command not in _PLACES | _ACTS:
+            return _UNSUPPORTED, None
         if item.command in _PLACES and not (item.frame in _PLACE_FRAMES and math.isfinite(item.z)):
             return _UNSUPPORTED_FRAME, None
         return None
@@ -256,12 +268,14 @@ ARDUPILOT = ArduCopter(
     command_answers={
         **dict.fromkeys(_TAKEN, Result.ACCEPTED),
         **dict.fromkeys(_FAILED, Result.FAILED),
+        245: Result.DENIED,
         532: Result.DENIED,
     },
     global_frames=frozenset({0, 3, 5, 6, 10, 11}),
     setpoints_as_automatic=True,
     setpoints_imply_flight=True,
     setpoint_spool_s=2.8,
+    item_frames=({2: 0, 5: 0, 6: 3, 11: 10},) * 2,
     home_item_first=True,
     takeoff_items_climb=True,
     guided_items=True,
@@ -270,11 +284,13 @@ ARDUPILOT = ArduCopter(
     ground_rates_hz=telemetry.GROUND_RATES_HZ,
     messages=telemetry,
     ground_station_parameter="SYSID_MYGCS",
+    ignored=frozenset({"PING", "SET_GPS_GLOBAL_ORIGIN"}),  # it has an origin
     withheld_until={
         "LOCAL_POSITION_NED": "position",
         "GPS_GLOBAL_ORIGIN": "origin",
         "HOME_POSITION": "origin",
     },
+    estimates_airspeed=True,
     position_grid_steps=1,
     fixed_streams=frozenset({"TIMESYNC"}),
     not_on_request=frozenset({"TIMESYNC"}),

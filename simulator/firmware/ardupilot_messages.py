@@ -2,28 +2,33 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
 from offboard.model.frames import euler_from_quaternion
 from simulator.firmware.ardupilot_tables import BY_HAND, BY_POSITION
 from simulator.firmware.values import AttitudeSetpoint
-from simulator.mavlink.view import View
+from simulator.geodesy import GRAVITY_MPS2
+from simulator.mavlink.view import View, fit
 
 COMPANION_RATES_HZ = GROUND_RATES_HZ = {"HEARTBEAT": 1.0, "TIMESYNC": 0.1}
 
 # MAV_DATA_STREAM
 GROUPS = {
-    1: ("SCALED_PRESSURE",),
-    2: ("SYS_STATUS", "MISSION_CURRENT", "GPS_RAW_INT"),
-    3: ("RC_CHANNELS",),
+    1: ("RAW_IMU", "SCALED_PRESSURE"),
+    2: (
+        "SYS_STATUS", "MISSION_CURRENT", "GPS_RAW_INT", "NAV_CONTROLLER_OUTPUT",
+        "POSITION_TARGET_GLOBAL_INT",
+    ),
+    3: ("RC_CHANNELS", "SERVO_OUTPUT_RAW"),
     6: ("GLOBAL_POSITION_INT", "LOCAL_POSITION_NED"),
     10: ("ATTITUDE",),
     11: ("VFR_HUD",),
     12: ("SYSTEM_TIME", "BATTERY_STATUS", "EKF_STATUS_REPORT", "VIBRATION"),
-}
+}  # fmt: skip
 NEVER_SENT = frozenset({
-    22, 26, 27, 34, 35, 36, 62, 87, 100, 105, 116, 124, 125, 127, 128, 129, 132, 133, 136, 137,
+    22, 26, 34, 35, 100, 105, 116, 124, 125, 127, 128, 129, 132, 133, 136, 137,
     143, 152, 162, 163, 164, 165, 168, 173, 178, 180, 191, 192, 194, 195, 225, 226, 235, 246,
     259, 260, 262, 269, 271, 277, 280, 281, 285, 286, 295, 301, 373, 376, 9005,
 })  # fmt: skip
@@ -83,6 +88,42 @@ def rc_channels(view: View) -> Sequence[Any]:
     assert sticks is not None
     widths_us = sticks.pulses_us(view.autopilot.state.time_s)
     return (view.time_ms, len(widths_us), *widths_us, *(0,) * (18 - len(widths_us)), 255)
+
+
+def raw_imu(view: View) -> Sequence[Any]:
+    """True specific force in mg, estimated rates in mrad/s, magnetic field of SITL in mgauss."""
+    force = (fit(value / GRAVITY_MPS2 * 1e3, 16) for value in view.specific_force)
+    rates = (fit(value * 1e3, 16) for value in view.autopilot.state.estimate.rates_frd_radps)
+    return (view.time_us, *force, *rates, 224, 80, -528, 0, 2500)
+
+
+def servo_output_raw(view: View) -> Sequence[Any]:
+    """Four equal motors: MOT_THST_EXPO and MOT_SPIN_MIN to MOT_SPIN_MAX (0.15 to 0.95)."""
+    demand = view.autopilot.position_controller.demand
+    bend = max(1e-3, view.autopilot.parameters["MOT_THST_EXPO"])
+    root = math.sqrt(max(0.0, (1.0 - bend) ** 2 + 4.0 * bend * demand.thrust))
+    width_us = 1150 + 800 * (bend - 1.0 + root) / (2.0 * bend) if demand.motors_on else 1000
+    width_us = fit(width_us, 16, signed=False)
+    return (view.time_us & 0xFFFFFFFF, 0, *(width_us,) * 4, *view.autopilot.outputs_us[4:])
+
+
+def nav_controller_output(view: View) -> Sequence[Any]:
+    """Demanded attitude and the way to the place that is flown to; 0 where there is none."""
+    autopilot = view.autopilot
+    motion, here = autopilot.position_controller.motion, autopilot.state.estimate.position_ned_m
+    north, east, down = (
+        there - at if math.isfinite(there) else 0.0
+        for there, at in zip(motion.position_ned_m, here, strict=True)
+    )
+    attitude = autopilot.position_controller.demand.attitude or (1.0, 0.0, 0.0, 0.0)
+    roll, pitch, _ = euler_from_quaternion(attitude).tolist()
+    distance_m = math.hypot(north, east)
+    bearing_deg = round(math.degrees(math.atan2(east, north))) if distance_m >= 1.0 else 0
+    return (
+        math.degrees(roll), math.degrees(pitch),
+        round(math.degrees(autopilot.state.estimate.yaw_rad)), bearing_deg % 360,
+        fit(distance_m, 16, signed=False), -down, 0.0, 0.0,
+    )  # fmt: skip
 
 
 _NO_MISSION, _NOT_STARTED, _ACTIVE, _PAUSED, _COMPLETE = range(1, 6)  # MISSION_STATE

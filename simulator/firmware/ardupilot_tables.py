@@ -64,6 +64,7 @@ def _int32(name: str, default: int) -> ParameterSpec:
 
 
 PARAMETERS = (
+    _int8("AHRS_EKF_TYPE", 3),  # estimator, 3 EKF3; without effect
     ParameterSpec("ANGLE_MAX", "int16", 3000, 1000, 8000),  # cdeg, greatest tilt it flies by itself
     _int32("ARMING_CHECK", 1),  # pre-arm checks, 1 all
     _real("ATC_ACCEL_P_MAX", 110000.0),  # cdeg/s^2 of pitch
@@ -82,7 +83,11 @@ PARAMETERS = (
     _int8("BATT_LOW_TIMER", 10),  # s below the limit until the failsafe acts
     _real("BATT_LOW_VOLT", 10.5),  # V below which it is low, 0 off
     _int8("BATT_MONITOR", 4),  # battery monitor, 4 voltage and current
+    _real("CIRCLE_RADIUS", 1000.0),  # cm; without effect
+    _int8("COMPASS_USE", 1),  # without effect
     _int8("DISARM_DELAY", 10),  # s armed on the ground until disarming, 0 never
+    _int8("EK3_ENABLE", 1),  # without effect
+    _int8("FENCE_ENABLE", 0),  # there is no fence: without effect
     _int8("FLTMODE_CH", 5),  # channel of the mode switch
     _int8("FRAME_CLASS", 1),  # 1 quadrotor
     _int8("FRAME_TYPE", 0),  # 0 plus
@@ -97,11 +102,14 @@ PARAMETERS = (
     _int16("LAND_ALT_LOW", 1000),  # cm below which it lands with LAND_SPEED
     _int16("LAND_SPEED", 50),  # cm/s near the ground
     _int16("LAND_SPEED_HIGH", 0),  # cm/s higher up, 0 WPNAV_SPEED_DN
+    _int32("LOG_BITMASK", 180222),  # there is no log: without effect
+    _real("LOIT_SPEED", 1250.0),  # cm/s of stick flight; without effect
     _int8("MIS_RESTART", 0),  # AUTO: 0 resumes the mission, 1 restarts it
     _int16("MIS_TOTAL", 0),  # items of the mission
     _int8("MOT_HOVER_LEARN", 2),  # learn the hover thrust: 1 until reboot, 2 saved
     _real("MOT_THST_EXPO", 0.65),  # curvature of thrust over throttle, 0 linear
     _real("MOT_THST_HOVER", 0.39),  # hover thrust, normalised
+    _int16("PILOT_SPEED_UP", 250),  # cm/s of stick flight; without effect
     _real("PSC_JERK_XY", 5.0),  # m/s^3 across the ground; without effect
     _real("PSC_POSXY_P", 1.0),  # 1/s
     _real("PSC_POSZ_P", 1.0),  # 1/s
@@ -111,6 +119,7 @@ PARAMETERS = (
     _real("RTL_CONE_SLOPE", 3.0),  # slope of the cone that limits the height of RTL, 0 off
     _int32("RTL_LOIT_TIME", 5000),  # ms of loiter above home before RTL lands
     _int16("SCHED_LOOP_RATE", 400),  # Hz
+    _real("SIM_SPEEDUP", 1.0),  # without effect, see `--speed`
     _int8("SYSID_ENFORCE", 0),  # 1: obey SYSID_MYGCS only
     _int16("SYSID_MYGCS", 255),  # system id of the ground station
     _int16("SYSID_THISMAV", 1),  # system id
@@ -262,6 +271,10 @@ RULES = (
     # A heartbeat follows a mode change at once
     *_entries("mode"),
     Rule("turn"),
+    Rule("home", send=("HOME_POSITION",)),
+    *(Rule("speed", mode) for mode in ("GUIDED", "AUTO", "RTL")),
+    Rule("speed", result=_FAILED),
+    Rule("servo"),
     Rule("loiter", when=("not position missing",), to="LOITER", send=_HEARTBEAT),
     Rule("loiter", result=_FAILED),
     *_entries("mission"),

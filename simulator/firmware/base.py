@@ -160,6 +160,8 @@ class Firmware(ABC):
 
     # missions
     requests_kind_of_peer: bool = False  # items of a mission in the kind that came last
+    # MAV_FRAME of a downloaded item, by the uploaded one: in MISSION_ITEM, in MISSION_ITEM_INT
+    item_frames: tuple[Mapping[int, int], Mapping[int, int]]
     home_item_first: bool = False  # item 0 of a mission is home
     takeoff_items_climb: bool = False  # and never descend
     guided_items: bool = False  # an item with current = 2 is a place to fly to now
@@ -174,6 +176,7 @@ class Firmware(ABC):
     withheld_until: Mapping[str, str] = field(default_factory=dict)  # by message: boot event
     # message -> version of its content: a message that is due waits until it is a new one
     message_versions: Mapping[str, Callable[[Any], Hashable]] = field(default_factory=dict)
+    estimates_airspeed: bool = False  # in VFR_HUD, without wind
     position_grid_steps: int  # the estimator's position is new at every such step
     fixed_streams: frozenset[str]  # messages whose interval cannot be changed
     not_on_request: frozenset[str]
@@ -189,6 +192,7 @@ class Firmware(ABC):
     ground_station_stays_s: float = 0.0  # after its last heartbeat
     ground_station_parameter: str = ""  # its system id; "": known by its MAV_TYPE
     target_component_checked: bool = False
+    ignored: frozenset[str] = frozenset()  # messages
     # kinds of messages, as their names begin, that are ignored if they are sent to all systems (0)
     never_to_all: frozenset[str] = frozenset()
     text_suffix: str = ""
@@ -205,7 +209,7 @@ class Firmware(ABC):
     first_fix_s: float  # of GPS
     passes_after_s: float  # boot until the pre-arm checks pass
     passes_without_position_after_s: float  # the same for modes that need none
-    fails_where_unarmable: bool = False  # pre-arm checks fail in a mode that does not arm
+    fails_where_unarmable: bool = False  # disarmed in a mode that does not arm, its checks fail
     velocity_ratio_squared: bool = False  # as it reports the innovation ratio of the velocity
     battery_events: tuple[str, ...]  # of battery levels 1 on
 

@@ -37,10 +37,12 @@ _BY_NUMBER = {
 }
 _AUTO = 4  # main mode
 _CUSTOM_MODE_ENABLED = 1
+# By MAV_MODE_FLAG, where the base mode alone is asked for; the first that fits
+_BY_FLAGS = ((4, "AUTO.MISSION"), (64 | 8, "POSCTL"), (64 | 16, "STABILIZED"), (64, "MANUAL"))
 _NO_AUTO_MODE = critical("Unsupported auto mode")
 
 # MAV_CMD accepted without an effect that the simulator shows, and not acknowledged at all
-_TAKEN = (80, 187, 191, 195, 197, 201, 519, 525, 528)
+_TAKEN = (80, 187, 191, 195, 197, 201, 245, 519, 525, 528)
 _UNANSWERED = (
     1, 93, 203, 204, 205, 206, 214, 220, 242, 243, 260, 310, 420, 500, 521, 530, 531, 532, 3000
 )  # fmt: skip
@@ -69,11 +71,12 @@ class Px4(Firmware):
     def command_mode(self, params: tuple[float, ...]) -> Asked:
         """MAV_CMD_DO_SET_MODE (176): param1 base mode, param2 main mode, param3 sub mode of AUTO.
 
-        An unknown main mode, or a base mode alone, is accepted and changes nothing.
+        An unknown main mode, or a base mode without flags, is accepted and changes nothing.
         """
         base, main, sub = (int(p) if math.isfinite(p) else 0 for p in params[:3])
         if not base & _CUSTOM_MODE_ENABLED:
-            return Asked(refusal=Result.ACCEPTED)
+            named = (mode for flags, mode in _BY_FLAGS if base & flags == flags)
+            return Asked(next(named, ""), Result.ACCEPTED)
         if main == _AUTO:
             known = _BY_NUMBER.get((main, sub), "")
             return Asked(known, Result.TEMPORARILY_REJECTED, _NO_AUTO_MODE)
@@ -263,6 +266,7 @@ PX4 = Px4(
     setpoints_outlive_modes=True,
     stream_reaction_s=0.036,
     requests_kind_of_peer=True,
+    item_frames=({5: 0, 6: 3}, {0: 5, 3: 6}),
     reached_above_landing=True,
     turning_items=frozenset({16, 17, 19, 21}),
     companion_rates_hz=telemetry.COMPANION_RATES_HZ,

@@ -61,7 +61,7 @@ GROUND_RATES_HZ = {
 
 ON_EVENT = frozenset({"MISSION_CURRENT", "MISSION_ITEM_REACHED"})
 NEVER_SENT = frozenset({
-    8, 25, 26, 36, 62, 65, 69, 76, 87, 93, 106, 112, 116, 124, 129, 132, 137, 143, 149,
+    8, 25, 26, 62, 65, 69, 76, 93, 106, 112, 116, 124, 129, 137, 143, 149,
     192, 225, 231, 233, 235, 246, 250, 251, 253, 254, 261, 263, 264, 265, 280, 281, 283,
     284, 285, 286, 290, 291, 300, 330, 339, 350, 360, 361, 371, 372, 375, 380, 395, 397, 435,
     12900, 12901, 12904, 12918, 12920,
@@ -123,11 +123,25 @@ def altitude(view: View) -> Sequence[Any]:
     down = view.autopilot.state.estimate.position_ned_m[2]
     amsl = view.altitude_mm(down) / 1e3
     relative = view.autopilot.guidance.home_ned_m[2] - down
-    return (view.time_us, amsl, amsl, -down, relative, math.nan, math.nan)
+    ground_m = view.autopilot.state.estimate.ground_m
+    return (view.time_us, amsl, amsl, -down, relative, -down - ground_m, ground_m)
+
+
+def distance_sensor(view: View) -> Sequence[Any]:
+    """The range finder of SIH, which looks down, in cm."""
+    range_cm = fit(view.autopilot.state.estimate.ground_m * 100.0, 16, signed=False)
+    return (view.time_ms, 0, 10_000, range_cm, 0, 0, 25, 0)
+
+
+def servo_output_raw(view: View) -> Sequence[Any]:
+    """Four equal motors; 900 us for those that stand."""
+    demand = view.autopilot.position_controller.demand
+    width_us = fit(1000.0 + 1000.0 * demand.thrust if demand.motors_on else 900, 16, signed=False)
+    return (view.time_us & 0xFFFFFFFF, 0, *(width_us,) * 4, *(900,) * 12)
 
 
 def highres_imu(view: View) -> Sequence[Any]:
-    """True specific force in body axes, estimated rates."""
+    """True specific force in body axes, estimated rates; pressure in Pa, as PX4 sends it."""
     nav = view.autopilot.state.estimate
     height = view.autopilot.firmware.origin[2] + view.autopilot.plant.height_m
     return (
@@ -135,7 +149,7 @@ def highres_imu(view: View) -> Sequence[Any]:
         *view.specific_force,
         *nav.rates_frd_radps,
         *(0.21, 0.0, 0.43),
-        pressure_hpa(height),
+        pressure_hpa(height) * 100.0,
         0.0,
         height,
         15.0,

@@ -39,7 +39,7 @@ MODES = {
         _ends("AUTO.LAND", "Land", 0x06040000, Behaviour.LAND),
         _ends("AUTO.RTL", "Return", 0x05040000, Behaviour.RETURN),
         Mode("AUTO.MISSION", "Mission", 0x04040000, AUTO, Behaviour.MISSION),
-        Mode("AUTO.FOLLOW", "Follow Target", 0x08040000, AUTO, Behaviour.HOLD),
+        Mode("AUTO.FOLLOW", "Follow Target", 0x08040000, OFFBOARD, Behaviour.HOLD),
         _ends("AUTO.PRECLAND", "Precision Land", 0x09040000, Behaviour.LAND),
         Mode("TERMINATION", "Termination", 0x000A0000, RATES, Behaviour.HOLD, arms=False),
         Mode("OFFBOARD", "Offboard", 0x00060000, OFFBOARD, Behaviour.SETPOINT),
@@ -68,6 +68,7 @@ PARAMETERS = (
     _int("CAL_ACC0_ID", 1310988, 0, 2147483647),  # calibrated accelerometer
     _int("CAL_GYRO0_ID", 1310988, 0, 2147483647),  # calibrated gyroscope
     _int("CAL_MAG0_ID", 197388, 0, 2147483647),  # calibrated magnetometer
+    _int("CBRK_SUPPLY_CHK", 0, 0, 894281),  # without effect
     _int("COM_ARM_WO_GPS", 1, 0, 2),  # arm without GPS: 1 with a warning
     _real("COM_DISARM_LAND", 2.0, -1, 20),  # s from landing to disarming, < 0 never
     _real("COM_DISARM_PRFLT", 10.0, -1, 100),  # s armed without takeoff until disarming, < 0 never
@@ -78,13 +79,17 @@ PARAMETERS = (
     _real("COM_OF_LOSS_T", 1.0, 0, 60),  # s without setpoint until offboard is lost
     _int("COM_RCL_EXCEPT", 0, 0, 31),  # modes without failsafe when sticks are lost, bit 2 offboard
     _int("COM_RC_IN_MODE", 1, 0, 4),  # manual input: 0 RC, 1 joystick, 4 none
+    _real("COM_RC_LOSS_T", 0.5, 0, 35),  # s without sticks until they are lost; without effect
     _real("COM_SPOOLUP_TIME", 1.0, 0, 30),  # s from arming until takeoff may begin
     _int("COM_TAKEOFF_ACT", 0, 0, 1),  # after takeoff: 0 hold
     _int("EKF2_NOAID_TOUT", 5000000, 500000, 10000000),  # us without aiding until position is lost
     _int("GF_ACTION", 2, 0, 5),  # geofence: 2 hold
+    _real("GF_MAX_HOR_DIST", 0.0, 0, 10000),  # m, geofence; without effect
+    _real("GF_MAX_VER_DIST", 0.0, 0, 10000),  # m, geofence; without effect
     _real("LNDMC_TRIG_TIME", 1.0, 0.1, 10),  # s of each of three stages of land detection
     _int("MAV_SYS_ID", 1, 1, 250),  # system id; read at start
     _int("MAV_TYPE", 2, 0, 22),  # MAV_TYPE
+    _real("MIS_DIST_1WP", 10000.0, -1, 100000),  # m to the first waypoint; without effect
     _real("MIS_TAKEOFF_ALT", 2.5, 0, 80),  # m, takeoff height
     _int("MIS_TKO_LAND_REQ", 0, 0, 4),  # what a mission must have
     _real("MPC_ACC_DOWN_MAX", 3.0, 2, 15),  # m/s^2 downwards of automatic flight
@@ -176,6 +181,7 @@ _LOST = critical("Failsafe activated")
 _NOT_AVAILABLE = critical("Switching to {mode} is currently not available")
 
 _NO_MISSION = critical("Mission start denied! No valid mission")
+_CLEARED = critical("No valid mission available, loitering")
 _RTL, _LAND, _MISSION = "AUTO.RTL", "AUTO.LAND", "AUTO.MISSION"
 _LANDED = ("landed",)
 _REGAINED = info("GCS connection regained")
@@ -303,8 +309,11 @@ RULES = (
     Rule("mission progress", send=("MISSION_CURRENT",)),
     Rule("item reached", send=("MISSION_ITEM_REACHED",)),
     Rule("mission return", "AUTO.MISSION", to="AUTO.RTL", texts=(info("Returning to launch"),)),
+    Rule("mission cleared", "AUTO.MISSION", to="AUTO.LOITER", texts=(_CLEARED,)),
     _disarms("mission finished", "Mission finished, landed", "Disarmed by landing", when=_LANDED),
     Rule("mission finished", texts=(info("Mission finished, loitering"),)),
+    Rule("home"),
+    Rule("speed"),
     Rule("reboot", result=Result.DENIED),  # as SITL does, which cannot
     Rule("took off", texts=(info("Takeoff detected"),)),
     Rule("landed", texts=(info("Landing detected"),)),

@@ -78,6 +78,7 @@ class MotionSetpoint:
     yaw_rate_radps: float = math.nan
     faces_way: bool = False  # without yaw and yaw rate: face the direction of flight
     turn_radps: float = math.inf  # yaw rate limit
+    turn_sense: float = 0.0  # to the yaw: > 0 clockwise, < 0 against it, 0 the shorter way
 
 
 class Behaviour(Enum):

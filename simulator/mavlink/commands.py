@@ -19,10 +19,12 @@ from simulator.geodesy import down_m, to_metres
 from simulator.mavlink.codec import id_of, name_of
 from simulator.mavlink.outbox import Outbox
 from simulator.mavlink.telemetry import Schedule
+from simulator.mavlink.view import fit
 
 _HEIGHT_MAX_M = 83_000.0  # of home: ArduPilot's LOCATION_ALT_MAX_M
 _RELATIVE = 3  # MAV_FRAME
 _CHANGE_MODE = 1.0  # MAV_DO_REPOSITION_FLAGS
+_MOTORS = 4
 _MISSION_PLANNER = 190  # MAV_COMPONENT, as ground stations call themselves
 
 
@@ -121,7 +123,7 @@ class Commands:
             autopilot.guidance.home_ned_m = (north, east, autopilot.firmware.origin[2] - height_m)
         else:
             return Result.DENIED
-        return Result.ACCEPTED
+        return autopilot.handle("home")
 
     def _reposition(self, autopilot: Autopilot, command: Command) -> Result:
         """MAV_CMD_DO_REPOSITION: fly to a place and hold there. Coordinates that are not finite
@@ -174,6 +176,9 @@ class Commands:
         A speed that is not positive restores the default.
         """
         kind, speed_mps = command.params[:2]
+        result = autopilot.handle("speed")
+        if result is not Result.ACCEPTED:
+            return result
         if speed_mps > 0.0 and kind in autopilot.firmware.vertical_speeds:
             return Result.ACCEPTED
         known = 0.0 < speed_mps < math.inf
@@ -188,11 +193,31 @@ class Commands:
             if not (0.0 <= yaw_deg <= 360.0 and relative in (0.0, 1.0)):
                 return Result.FAILED
             from_rad = autopilot.state.estimate.yaw_rad if relative else 0.0
-            turn_rad = math.radians(yaw_deg) * (-1.0 if relative and sense < 0 else 1.0)
+            if relative:
+                sense = -1.0 if sense < 0.0 else 1.0
+            turn_rad = math.radians(yaw_deg) * (sense if relative else 1.0)
             turn_radps = math.radians(speed_dps) if speed_dps > 0.0 else math.inf
             yaw_rad = wrap_pi(from_rad + turn_rad)
-            autopilot.guidance.turn_to(yaw_rad, turn_radps)
+            autopilot.guidance.turn_to(yaw_rad, turn_radps, sense)
         return result
+
+    def _set_servo(self, autopilot: Autopilot, command: Command) -> Result:
+        """MAV_CMD_DO_SET_SERVO: an output that is no motor."""
+        (number, width_us), result = command.params[:2], autopilot.handle("servo")
+        if result is Result.ACCEPTED:
+            if not _MOTORS < number <= len(autopilot.outputs_us):
+                return Result.FAILED
+            autopilot.outputs_us[int(number) - 1] = fit(width_us, 16, signed=False)
+        return result
+
+    def _face(self, autopilot: Autopilot, command: Command) -> Result:
+        """MAV_CMD_DO_SET_ROI and DO_SET_ROI_LOCATION: turn to a place; 0, 0 is none."""
+        latitude, longitude = command.params[4:6]
+        if latitude or longitude:
+            north, east = to_metres(autopilot.firmware.origin, latitude, longitude)
+            x, y, _ = autopilot.state.estimate.position_ned_m
+            autopilot.guidance.turn_to(math.atan2(east - y, north - x), math.inf, 0.0)
+        return Result.ACCEPTED
 
     def _terminate(self, autopilot: Autopilot, command: Command) -> Result:
         """MAV_CMD_DO_FLIGHTTERMINATION: the motors stop; it cannot be withdrawn."""
@@ -269,8 +294,11 @@ HANDLERS: dict[int, Callable[[Commands, Autopilot, Command], Result | None]] = {
     176: Commands._set_mode,  # DO_SET_MODE
     178: Commands._change_speed,  # DO_CHANGE_SPEED
     179: Commands._set_home,  # DO_SET_HOME
+    183: Commands._set_servo,  # DO_SET_SERVO
     185: Commands._terminate,  # DO_FLIGHTTERMINATION
     192: Commands._reposition,  # DO_REPOSITION
+    195: Commands._face,  # DO_SET_ROI_LOCATION
+    201: Commands._face,  # DO_SET_ROI
     224: Commands._set_current_item,  # DO_SET_MISSION_CURRENT
     246: Commands._reboot,  # PREFLIGHT_REBOOT_SHUTDOWN
     300: Commands._start_mission,  # MISSION_START

@@ -66,7 +66,7 @@ def vfr_hud(view: View) -> Sequence[Any]:
     nav = autopilot.state.estimate
     north, east, down = nav.velocity_ned_mps
     return (
-        0.0,
+        math.hypot(north, east, down) if autopilot.firmware.estimates_airspeed else 0.0,
         math.hypot(north, east),
         heading_cdeg(nav.yaw_rad) // 100,
         fit(autopilot.position_controller.demand.thrust * 100, 16, signed=False),
@@ -111,6 +111,16 @@ def position_target_local_ned(view: View) -> Sequence[Any]:
     )  # fmt: skip
 
 
+def position_target_global_int(view: View) -> Sequence[Any]:
+    """The place that is flown to, AMSL; its bits of the type_mask are set where there is none."""
+    place = view.autopilot.position_controller.motion.position_ned_m
+    known = all(map(math.isfinite, place))
+    north, east, down = place if known else (0.0, 0.0, 0.0)
+    frame, mask = 0, 0xFDF8 if known else 0xFDFF
+    height_m = view.altitude_mm(down) * 1e-3
+    return (view.time_ms, frame, mask, *view.geodetic(north, east), height_m, *(0.0,) * 8)
+
+
 # -- state, clock, home, mission ---------------------------------------------------------------
 
 
@@ -130,8 +140,8 @@ def battery_status(view: View) -> Sequence[Any]:
     battery = view.autopilot.plant.battery
     voltage = fit(battery.voltage_v * 1e3, 16, signed=False)
     return (
-        0, 1, 1, 32767, (voltage, *(65535,) * 9), fit(battery.current_a * 100, 16), 0, -1,
-        fit(battery.remaining * 100, 8), 0, 1, (0, 0, 0, 0), 0, 0,
+        0, 1, 1, 32767, (voltage, *(65535,) * 9), fit(battery.current_a * 100, 16),
+        fit(battery.used_mah, 32), -1, fit(battery.remaining * 100, 8), 0, 1, (0, 0, 0, 0), 0, 0,
     )  # fmt: skip
 
 

@@ -67,6 +67,8 @@ class Server:
             **self._missions.handlers,
             **dict.fromkeys(("MISSION_ITEM", "MISSION_ITEM_INT"), self._mission_item),
             "TIMESYNC": self._timesync,
+            "PING": self._ping,
+            "SET_GPS_GLOBAL_ORIGIN": self._set_origin,
             **self._parameters.handlers,
             "RC_CHANNELS_OVERRIDE": self._rc_channels_override,
             "MANUAL_CONTROL": self._manual_control,
@@ -99,7 +101,8 @@ class Server:
         """Handle all messages of one datagram; no bytes make this raise."""
         for message in self.decoder.read(datagram):
             self.outbox.connected = True
-            handler = self._handlers.get(message.get_type())
+            ignored = message.get_type() in self.view.autopilot.firmware.ignored
+            handler = None if ignored else self._handlers.get(message.get_type())
             if handler is not None and self._is_for_us(message):
                 handler(message)
 
@@ -156,6 +159,15 @@ class Server:
             self.outbox.send("TIMESYNC", self.view.time_us * 1000, message.ts1)
         else:
             self.answered_ns = message.ts1
+
+    def _ping(self, message: Message) -> None:
+        """Answer a request; those with a target are answers."""
+        if not message.target_system:
+            self.outbox.send("PING", message.time_usec, message.seq, *sender_of(message))
+
+    def _set_origin(self, _: Message) -> None:
+        """There is an origin; it is sent."""
+        self.outbox.send_now("GPS_GLOBAL_ORIGIN")
 
     def _rc_channels_override(self, message: Message) -> None:
         self._sticks(message, [getattr(message, f"chan{i}_raw") for i in range(1, 9)])

@@ -230,7 +230,8 @@ class MissionTransfer:
         item = self._home() if is_home else items[message.seq]
         places = (item.x, item.y) if whole else (item.x * 1e-7, item.y * 1e-7)
         current = int(message.seq == self.mission.current)
-        head = (*peer, message.seq, item.frame, item.command)
+        frame = self._firmware.item_frames[whole].get(item.frame, item.frame)
+        head = (*peer, message.seq, frame, item.command)
         name = "MISSION_ITEM_INT" if whole else "MISSION_ITEM"
         self.outbox.send(name, *head, current, 1, *item.params, *places, item.z, 0)
 

@@ -328,14 +328,48 @@ def fastest_mps(bench: Bench, duration_s: float) -> float:
     return max(speeds)
 
 
-def test_a_turn_has_the_requested_rate() -> None:
+def test_a_turn_has_the_requested_rate_and_direction() -> None:
+    """Also to a heading, so that it may be the longer way."""
     bench = flying()
-    for params, wanted_deg, took_s in (((90, 25, 1), 90.0, 4.0), ((45, 10, -1, 1), 45.0, 4.5)):
+    for params, wanted_deg, took_s in (
+        ((90, 25, 1), 90.0, 4.0),
+        ((45, 10, -1, 1), 45.0, 4.5),
+        ((60, 50, -1), 60.0, 7.1),
+    ):
         begun_s = bench.time_s
         assert bench.command(115, *params) == [ACCEPTED]
         done_s = bench.run_until(lambda to=wanted_deg: off_deg(bench, to) < 3.0, 12.0)
         assert done_s - begun_s == pytest.approx(took_s, abs=0.6)
         bench.run(2.0)
+
+
+def test_streams_show_the_goal_and_the_outputs_and_a_region_of_interest_is_faced() -> None:
+    bench = flying()
+    bench.send(mavlink.MAVLink_request_data_stream_message(1, 1, 0, 4, 1))
+    (north, _), (_, east) = degrees(bench, 40.0, 0.0), degrees(bench, 0.0, 40.0)
+    home = degrees(bench, 0.0, 0.0)
+    assert bench.command(201, 0, 0, 0, 0, home[0], east) == [ACCEPTED]
+    bench.run(4.0)
+    assert off_deg(bench, 90.0) < 3.0
+    assert reposition(bench, 40.0, 0.0, 5.0, RELATIVE) == ACCEPTED
+    assert bench.command(183, 9, 1700) == [ACCEPTED]
+    assert bench.command(179, 1) == [ACCEPTED]
+    bench.run(2.0)
+
+    def newest(kind: str) -> Any:
+        return bench.of(kind)[-1][1]
+
+    away_m = 40.0 - bench.place[0]
+    assert newest("NAV_CONTROLLER_OUTPUT").wp_dist == pytest.approx(away_m, abs=1.5)
+    assert newest("NAV_CONTROLLER_OUTPUT").target_bearing in (359, 0, 1)
+    goal, home = newest("POSITION_TARGET_GLOBAL_INT"), newest("HOME_POSITION")
+    assert (goal.lat_int * 1e-7, goal.type_mask) == (pytest.approx(north, abs=1e-6), 0xFDF8)
+    assert goal.alt == pytest.approx(ARDUPILOT.origin[2] + 5.0, abs=0.1)
+    assert (home.x, home.z) == pytest.approx((0.0, -5.0), abs=0.3)
+    outputs = newest("SERVO_OUTPUT_RAW")
+    assert (outputs.servo1_raw, outputs.servo9_raw) == (pytest.approx(1580, abs=60), 1700)
+    assert newest("VFR_HUD").airspeed == pytest.approx(math.hypot(*bench.velocity), abs=0.5)
+    assert newest("RAW_IMU").zacc == pytest.approx(-980, abs=60)
 
 
 def test_a_requested_speed_holds_until_a_setpoint_of_another_kind() -> None:
@@ -420,6 +454,9 @@ def test_a_climb_speed_is_one_across_for_px4_alone(
         ("GUIDED", 192, RELATIVE, (-1.0, 0.0, 0.0, NAN), ACCEPTED),
         ("LOITER", 192, RELATIVE, (-1.0, 0.0, 0.0, NAN), DENIED),
         ("GUIDED", 510, RELATIVE, (60_000.0, 0.0, 0.0, 0.0), 4),
+        ("GUIDED", 178, RELATIVE, (1.0, 3.0, 0.0, 0.0), ACCEPTED),
+        ("LOITER", 178, RELATIVE, (1.0, 3.0, 0.0, 0.0), FAILED),
+        ("GUIDED", 183, RELATIVE, (4.0, 1700.0, 0.0, 0.0), FAILED),
     ],
 )
 def test_what_arducopter_refuses(

@@ -7,7 +7,7 @@ import math
 from typing import Any
 
 import pytest
-from sim_bench import HOVER, LAND, LOITER, NAN, OFFBOARD, Bench, aloft, engaged, hold
+from sim_bench import HOVER, LAND, LOITER, NAN, OFFBOARD, POSCTL, Bench, aloft, engaged, hold
 
 from offboard.documents.errors import DocumentError
 from simulator import config
@@ -16,6 +16,8 @@ from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
 from simulator.mavlink.codec import Decoder, sender_of
+
+PREARM_CHECK = 1 << 28  # MAV_SYS_STATUS_SENSOR
 
 
 def test_without_position_automatic_flight_lands_and_attitude_setpoints_continue() -> None:
@@ -107,10 +109,23 @@ def test_arming_needs_a_battery_and_with_nav_dll_act_a_ground_station() -> None:
         assert bench.command(400, 1) == [result]
 
 
+@pytest.mark.parametrize(
+    ("base_mode", "mode"),
+    [(4, 0x04040000), (64, 0x00010000), (80, 0x00070000), (72, POSCTL), (16, LOITER)],
+)
+def test_the_flags_of_a_base_mode_alone_name_a_mode_of_px4(base_mode: int, mode: int) -> None:
+    bench = Bench()
+    assert bench.command(176, base_mode) == [0, 0]
+    assert bench.mode == mode
+
+
 def test_a_landing_goes_on_without_a_ground_station() -> None:
+    """Its pre-arm checks pass, though it could not be armed in this mode."""
     bench = aloft(height_m=30.0)
     bench.set("NAV_DLL_ACT", 2)
     bench.command(21)
+    bench.run(0.5)
+    assert bench.of("SYS_STATUS")[-1][1].onboard_control_sensors_health & PREARM_CHECK
     bench.heartbeat_type = None
     bench.run(14.0)
     assert (bench.mode, bench.system_status) == (LAND, 4)

@@ -107,7 +107,14 @@ def test_an_interval_can_be_stopped_restored_and_read() -> None:
 # -- time, files -----------------------------------------------------------------------------
 
 
-def test_timesync_is_answered_with_vehicle_time_and_file_transfer_is_refused() -> None:
+def test_timesync_and_px4_s_ping_are_answered_and_file_transfer_is_refused() -> None:
+    """A ping with a target is an answer."""
+    for firmware, answered in (FIRMWARES["px4"], [7]), (FIRMWARES["ardupilot"], []):
+        bench = Bench(firmware=firmware)
+        bench.send(mavlink.MAVLink_ping_message(5, 7, 0, 0))
+        bench.send(mavlink.MAVLink_ping_message(5, 8, 1, 1))
+        bench.run(0.02)
+        assert [m.seq for _, m in bench.of("PING") if m.target_component == 191] == answered
     bench = Bench()
     bench.run(2.0)
     bench.send(mavlink.MAVLink_timesync_message(0, 123456789))

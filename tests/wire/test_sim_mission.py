@@ -6,7 +6,7 @@ import math
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from sim_bench import NAN, RTL, Bench, aloft, degrees
+from sim_bench import LOITER, NAN, RTL, Bench, aloft, degrees
 
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Firmware
@@ -18,7 +18,7 @@ Row = tuple[int, tuple[float, float, float, float], float, float, float]  # nort
 
 
 def place(command: int, north: float, east: float, up: float, *params: float) -> Row:
-    filled = (*params, *(NAN,) * (4 - len(params)))
+    filled = (*params, *(0.0, 0.0, 0.0, NAN)[len(params) :])
     return command, filled, north, east, up
 
 
@@ -91,6 +91,38 @@ def test_a_mission_is_downloaded_as_uploaded_and_cleared() -> None:
         assert acks(bench)[-1] == 0
         send(bench, mavlink.MAVLink_mission_request_list_message(1, 1))
         assert bench.of("MISSION_COUNT")[-1][1].count == 0
+
+
+@pytest.mark.parametrize(("firmware", "frame"), [(PX4, 6), (ARDUPILOT, 3)])
+def test_the_frame_of_a_downloaded_item_is_that_of_its_message(
+    firmware: Firmware, frame: int
+) -> None:
+    """Uploaded in frame 6: 6 in MISSION_ITEM_INT of PX4 alone, 3 in MISSION_ITEM."""
+    bench = Bench(firmware=firmware)
+    assert upload(bench, ROUND) == 0
+    send(bench, mavlink.MAVLink_mission_request_int_message(1, 1, 1))
+    send(bench, mavlink.MAVLink_mission_request_message(1, 1, 1))
+    frames = [bench.of(kind)[-1][1].frame for kind in ("MISSION_ITEM_INT", "MISSION_ITEM")]
+    assert frames == [frame, 3]
+
+
+def test_arducopter_refuses_an_item_with_nan_or_an_unknown_command() -> None:
+    bench = Bench(firmware=ARDUPILOT)
+    assert upload(bench, [place(WAYPOINT, 12, 0, 4, NAN)]) == 6
+    assert upload(bench, [act(SPEED, 1, 2, 0, NAN)]) == 9
+    assert upload(bench, [act(31_000)]) == 3
+    assert upload(bench, [place(WAYPOINT, 12, 0, 4)]) == 0
+
+
+def test_px4_holds_when_its_mission_is_cleared() -> None:
+    bench = aloft(height_m=5.0)
+    assert upload(bench, ROUND) == 0
+    assert bench.command(300) == [0]
+    bench.run(1.0)
+    send(bench, mavlink.MAVLink_mission_clear_all_message(1, 1))
+    bench.run(1.0)
+    assert bench.mode == LOITER
+    assert "No valid mission available, loitering" in bench.texts()
 
 
 def test_missing_items_are_requested_again_until_a_timeout_or_cancelled() -> None:
