@@ -12,7 +12,7 @@ from offboard.flight.preflight import TELEMETRY, Finding, Level
 from offboard.flight.timing import REAL_TIME
 from offboard.link.connection import BITS_OF_A_BYTE
 from offboard.mavlink.events import CommandAck
-from offboard.mavlink.senders import DIALECTS
+from offboard.mavlink.senders import AUTOPILOT_COMPONENT, DIALECTS
 from offboard.mavlink.telemetry import SHARE
 
 BAUDS = (57600, 115200, 230400, 460800, 921600)
@@ -63,7 +63,8 @@ def vehicle(seen: Observation) -> Iterable[Finding]:
         yield ok(f"{found.autopilot}, system {found.system_id}")
     elif autopilots := [sender for sender in senders if sender.is_autopilot]:
         why, first = heard.session.senders.why_none(heard.session.counters), autopilots[0]
-        if not why and first.heartbeat.autopilot in {each.mav_autopilot for each in known}:
+        other = first.component_id != AUTOPILOT_COMPONENT
+        if other and first.heartbeat.autopilot in {each.mav_autopilot for each in known}:
             hint = "set its component id to 1 (PX4: MAV_COMP_ID)"
             yield blocks(f"{first.name} is heard, but only component 1 is flown", hint)
         else:

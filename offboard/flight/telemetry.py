@@ -50,6 +50,7 @@ OTHER_COMPANION = (
     "another companion computer is on the link: system {system} component {component}; only one of "
     "them may send setpoints"
 )
+DISARMED_SHOWN = "a HEARTBEAT shows the vehicle disarmed: it is wrong, or its motors have stopped"
 
 
 def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: float) -> bool:
@@ -169,6 +170,8 @@ def _on_mode(
         setpoints_missing=flight.setpoints_missing,
         sticks=vehicle.sticks,
     )
+    if isinstance(event, Heartbeat) and not event.armed and flight.phase in FLYING:
+        outbox.announce(flight, DISARMED_SHOWN, once=True)  # one ends no flight
     switched = flight.pilot is PilotSwitch.READY and flight.in_engage_mode
     in_the_air, flies, why = flight.in_the_air, flight.contact.flies, ""
     flight.pilot = flight.pilot.after(

@@ -67,6 +67,7 @@ class Senders:
         self.dialect: Dialect | None = None
         self.clock_behind = False  # an autopilot whose clock is behind ours was heard
         self.systems: dict[int, float] = {}
+        self._other_component = 0  # of the newest autopilot that is not AUTOPILOT_COMPONENT
         self.heard_s = 0.0
         self._wanted = wanted
         self._has_key = has_key
@@ -185,7 +186,11 @@ class Senders:
     def note(self, frame: Frame, now_s: float) -> Dialect | DropReason | None:
         """The autopilot that a frame shows, why it is none, or None if it is no HEARTBEAT of an
         autopilot's component."""
-        if frame.message_id != HEARTBEAT or frame.component_id != AUTOPILOT_COMPONENT:
+        if frame.message_id != HEARTBEAT:
+            return None
+        if frame.component_id != AUTOPILOT_COMPONENT:
+            if is_vehicle(frame.message):
+                self._other_component = frame.component_id
             return None
         if not is_vehicle(frame.message):
             return DropReason.NO_VEHICLE
@@ -248,6 +253,11 @@ class Senders:
             return "the vehicle signs its messages: give its key with --signing-key"
         if self._wanted is not None and self.systems:
             return f"system {self._wanted} is not heard, but {_listed(self.systems)}; see --system"
+        if self._other_component:
+            return (
+                f"an autopilot is heard as component {self._other_component}, but only component "
+                f"{AUTOPILOT_COMPONENT} is flown: set its component id to 1 (PX4: MAV_COMP_ID)"
+            )
         return ""
 
 

@@ -39,6 +39,7 @@ _WINDOW_S = 2.0
 _ENOUGH = 0.7  # of the rate wanted; a window holds few samples of a slow message
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 3.0, 30.0
 _OPTIONAL_TRIES = 2
+_STOPPED_S = 0.2  # a fast message that is missing for so long was stopped, or lost with the others
 _UNHEARD = 0.1  # of the rate wanted: what arrives more rarely has its default rate
 _ARRIVALS_MAX = 4096  # limits the memory used when a link is flooded
 
@@ -206,6 +207,9 @@ class _Stream:
     def _again(self, waited_s: float, now_s: float) -> bool:
         if waited_s < _FIRST_WAIT_S:
             return False
+        fast = bool(self.arrivals_s) and self.wanted.arrives_hz > SLOW_HZ
+        if fast and now_s - self.arrivals_s[-1] > _STOPPED_S:
+            return True  # before a flight ends for it
         rate_hz, enough_hz = self.rate_hz(now_s), _ENOUGH * self.wanted.arrives_hz
         if 0.0 < rate_hz < min(_UNHEARD * self.wanted.rate_hz, enough_hz):
             return True  # the link has lost the requests

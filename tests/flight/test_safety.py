@@ -41,7 +41,7 @@ from watch import (
     tracking,
 )
 
-from offboard.flight.phases import Action, Phase
+from offboard.flight.phases import FLYING, Action, Phase
 from offboard.identification.learner import IdentifySettings
 from simulator import config as simulated
 from simulator.firmware.px4 import PX4
@@ -144,7 +144,11 @@ def heavy() -> Pair:
 def one_wrong_heartbeat(on: Vehicle, phase: Phase) -> Row:
     """It shows it disarmed: it was left in the air, or in its own take-off."""
     wrong = then(phase, 0.3, downlink(disarmed(most=1)))
-    return flies(fly=on.hop, aloft=phase is not Phase.TAKEOFF, at=wrong)
+
+    def told(pair: Pair) -> None:
+        assert said(pair, "a HEARTBEAT shows the vehicle disarmed") == (phase in FLYING)
+
+    return flies(told, fly=on.hop, aloft=phase is not Phase.TAKEOFF, at=wrong)
 
 
 def taken(on: Vehicle, scenario: Any, says: str = "", **more: Any) -> Row:

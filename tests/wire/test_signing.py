@@ -127,6 +127,9 @@ def test_why_no_vehicle_was_found() -> None:
     ):
         assert ours.receive(signer(key).heartbeat(), PEER, 0.0).events == ()
         assert sentence in ours.senders.why_none(ours.counters)
+    ours = Session(SessionSettings())
+    assert ours.receive(Sender(1, 7).heartbeat(12), PEER, 0.0).events == ()
+    assert "an autopilot is heard as component 7" in ours.senders.why_none(ours.counters)
 
 
 def test_a_vehicle_whose_clock_is_behind_hears_ours_and_is_found() -> None:

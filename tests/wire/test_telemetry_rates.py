@@ -49,6 +49,7 @@ class Vehicle:
             now_s = 0.01 * self.ticks / self.speed
             if every_ticks and self.ticks % every_ticks == 0:
                 self.session.receive(self.sender.position(10 * self.ticks), PEER, now_s)
+            self.session.receive(self.sender.attitude(10 * self.ticks), PEER, now_s)
             self._obey(self.session.poll(now_s))
         return self.session.telemetry.rates_hz["LOCAL_POSITION_NED"]
 
@@ -70,9 +71,11 @@ def test_a_message_at_its_rate_is_requested_once_until_another_program_changes_i
     vehicle.requested_s.clear()
     vehicle.run(8.0, 4)
     assert [t - 165.0 for t in vehicle.requested_s] == pytest.approx([1.0, 4.0], abs=0.7)
+    vehicle.run(10.0, 1)
     vehicle.requested_s.clear()
-    assert vehicle.run(40.0, 0) == 0.0  # host time counts
+    assert vehicle.run(40.0, 0) == 0.0  # one has stopped it: a flight ends after 0.5 s without
     assert len(vehicle.requested_s) >= 2
+    assert vehicle.requested_s[0] - 183.0 == pytest.approx(0.2, abs=0.03)
 
 
 def test_link_time_follows_the_vehicle_or_host_time() -> None:
