@@ -50,10 +50,11 @@ class Score:
     SIM_STATE). RMSE, mean, sd and percentiles of errors and motion are weighted by the time of the
     reference: each sample stands for half of the interval before it and half of the one after it,
     so that telemetry which is thinned or lost counts with the mean of what surrounds it
-    (`analysis.tracking`). `position_gap_max_s` is the longest gap in it. The metrics of the certificate
-    are of the decisions that were sent as they were certified, a share `certified_share` of all.
-    A tick counts as one of `decisions`, `failed_decisions` or `missed_ticks`; `refused_setpoints`
-    are among `decisions`. Times are vehicle time. A metric that the log does not hold is NaN.
+    (`analysis.tracking`). Rates and gaps of the telemetry are of TRACK, too. The metrics of the
+    certificate are of the decisions that were sent as they were certified, a share
+    `certified_share` of all. A tick counts as one of `decisions`, `failed_decisions` or
+    `missed_ticks`; `refused_setpoints` are among `decisions`. Times are vehicle time. A metric that
+    the log does not hold is NaN.
 
     Example, with the pytest fixture `fly`:
 
