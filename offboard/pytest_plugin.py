@@ -95,6 +95,7 @@ def fly(
     ) -> Flight:
         from offboard.analysis.score import judged, score_flight
         from offboard.documents.errors import UserError
+        from offboard.link.stop import StopRequests
         from offboard.run.configuration import load
         from offboard.run.flight import Simulated, fly
 
@@ -112,7 +113,9 @@ def fly(
                 seed=seed,
                 known_vehicle=simulated.known_vehicle,
             )
-            outcome = fly(flown_config, directory, simulated, simulator=_simulator)
+            with StopRequests() as stops:
+                outcome = fly(flown_config, directory, simulated, simulator=_simulator, stops=stops)
+            stops.check()  # Ctrl-C ends pytest, too
         except UserError as error:
             problem = str(error)
         if outcome is None:

@@ -50,10 +50,11 @@ class Score:
     SIM_STATE). RMSE, mean, sd and percentiles of errors and motion are weighted by the time of the
     reference: each sample stands for half of the interval before it and half of the one after it,
     so that telemetry which is thinned or lost counts with the mean of what surrounds it
-    (`analysis.tracking`). `position_gap_max_s` is the longest gap. The metrics of the certificate
-    are of the decisions that were sent as they were certified, a share `certified_share` of all.
-    A tick counts as one of `decisions`, `failed_decisions` or `missed_ticks`; `refused_setpoints`
-    are among `decisions`. Times are vehicle time. A metric that the log does not hold is NaN.
+    (`analysis.tracking`). Rates and gaps of the telemetry are of TRACK, too. The metrics of the
+    certificate are of the decisions that were sent as they were certified, a share
+    `certified_share` of all. A tick counts as one of `decisions`, `failed_decisions` or
+    `missed_ticks`; `refused_setpoints` are among `decisions`. Times are vehicle time. A metric that
+    the log does not hold is NaN.
 
     Example, with the pytest fixture `fly`:
 
@@ -118,10 +119,10 @@ class Score:
     at_bound_share: float = _metric("share of decisions at a limit")
     cut_short_share: float = _metric("share of decisions cut by deadline")
     other_datagrams: float = _metric("datagrams of others, frames refused")
-    position_hz: float = _metric("LOCAL_POSITION_NED received", "Hz")
-    attitude_hz: float = _metric("ATTITUDE_QUATERNION received", "Hz")
-    position_gap_max_s: float = _metric("longest gap of positions", "s")
-    attitude_gap_max_s: float = _metric("longest gap of attitudes", "s")
+    position_hz: float = _metric("LOCAL_POSITION_NED while tracking", "Hz")
+    attitude_hz: float = _metric("ATTITUDE_QUATERNION while tracking", "Hz")
+    position_gap_max_s: float = _metric("longest gap of positions in tracking", "s")
+    attitude_gap_max_s: float = _metric("longest gap of attitudes in tracking", "s")
     stale_share: float = _metric("share of repeated or late positions")
     link_delay_p50_ms: float = _metric("round trip of the link, median", "ms")
     link_delay_p99_ms: float = _metric("round trip of the link, 99th perc.", "ms")

@@ -239,7 +239,10 @@ def rehearse(prepared: Prepared, *, keeps_deadline: bool) -> float:
         cut_short = replace(situation, remaining_s=lambda: 0.0)
         least_s = _check_deadline(controller, cut_short, config.budget_s)
     prepared.track.sample(np.array([0.0, 1.0]))
-    controller.reset()
+    try:
+        controller.reset()
+    except Exception as error:
+        raise DocumentError(f"controller: {located(error)}") from error
     return least_s
 
 

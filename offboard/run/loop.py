@@ -193,12 +193,13 @@ class Loop:
     # --- what may go wrong ---
 
     def _hand_back(self, error: BaseException) -> None:
-        """Land, if the companion still can. Otherwise end: silence, and the supervisor."""
+        """Land, if the companion still can. Otherwise end: silence, and the supervisor. The bundled
+        simulator waits for the answer that this turn did not give."""
         sentence = f"internal error: {located(error)}"
         self._error = self._error or sentence
         with suppress(BaseException):
             self._companion.request_stop(self._error)
-        if clock.monotonic_s() - self._succeeded_s > FAILING_S:
+        if self._simulator or clock.monotonic_s() - self._succeeded_s > FAILING_S:
             self._ended_early = Outcome(ExitCode.ABORTED, f"{self._error}; setpoints stopped")
 
     def _check_log(self) -> None:

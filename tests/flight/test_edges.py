@@ -134,11 +134,18 @@ def fly(
     *,
     link: Any = None,
     supervisor: Any = None,
+    simulator: Any = None,
     **options: Any,
 ) -> Outcome:
     with FlightLog(directory / "flight", "", **options) as log, StopRequests() as stops:
         return Loop(
-            flight, link or Wire(), log, stops=stops, progress=progress, supervisor=supervisor
+            flight,
+            link or Wire(),
+            log,
+            stops=stops,
+            progress=progress,
+            supervisor=supervisor,
+            simulator=simulator,
         ).run()
 
 
@@ -370,14 +377,19 @@ def test_an_exception_lands_and_ends_with_4(
         assert outcome.sentence.endswith("; flown and landed")
 
 
-def test_an_exception_in_every_turn_ends_in_silence(tmp_path: Path, now_s: list[float]) -> None:
+@pytest.mark.parametrize(("simulator", "turns"), [(None, 8), (Silent(), 1)])  # 0.3 s
+def test_an_exception_in_every_turn_ends_in_silence(
+    simulator: object, turns: int, tmp_path: Path, now_s: list[float]
+) -> None:
+    """At once with the simulator: in lockstep it waits for the answer to that turn."""
+
     def fails(left: int) -> None:
         now_s[0] += 0.04
         raise ValueError("again")
 
     flight = Brief(1000, fails)
-    outcome = fly(flight, tmp_path)
-    assert (1000 - flight.turns, outcome.exit_code) == (8, 4)  # 0.3 s
+    outcome = fly(flight, tmp_path, simulator=simulator)
+    assert (1000 - flight.turns, outcome.exit_code) == (turns, 4)
     assert outcome.sentence.endswith("; setpoints stopped")
 
 

@@ -73,6 +73,13 @@ def test_a_law_that_fails_is_found_before_the_flight(fail: Any, says: str) -> No
         rehearse(replace(prepared, controller=law), keeps_deadline=False)
 
 
+def test_a_reset_that_fails_is_found_before_the_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+    prepared = build(config.load("flight", known_vehicle="px4_sih"))
+    monkeypatch.setattr(type(prepared.controller), "reset", raises)
+    with pytest.raises(DocumentError, match="controller: ZeroDivisionError"):
+        rehearse(prepared, keeps_deadline=False)
+
+
 def test_a_law_that_other_programs_make_late_may_be_flown_later(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

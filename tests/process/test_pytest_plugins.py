@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import os
 import re
+import signal
+import threading
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+
+from offboard.pytest_plugin import Flight
 
 # pytester moves the home directory, where it would be compiled anew
 CACHE = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
@@ -89,6 +95,17 @@ def test_the_fixtures_as_the_readme_shows_them(workers: int, pytester: pytest.Py
         "*pytest.mark.sitl: name the option 'wind_2mps'; there is scenario, firmware*",
     ):
         result.stdout.fnmatch_lines(line)
+
+
+def test_ctrl_c_in_a_flight_ends_pytest(fly: Callable[..., Flight], tmp_path: Path) -> None:
+    def press() -> None:
+        while not (tmp_path / "flight-1" / "flight.tlog").exists():
+            time.sleep(0.01)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=press, daemon=True).start()
+    with pytest.raises(KeyboardInterrupt):
+        fly(must_succeed=False)
 
 
 def test_other_test_suites_import_nothing(pytester: pytest.Pytester) -> None:
