@@ -38,12 +38,12 @@ def simulated(commands, sent_at, delay_s, frequency, damping, times):
     return np.interp(times, grid, signal.lfilter(numerator[0], denominator, held))
 
 
-def steps(seed, count=60):
+def steps(seed):
     """Random steps, at rest for the first half second."""
     generator = np.random.default_rng(seed)
-    values = 0.035 * generator.choice([-1.0, 0.0, 1.0], count)
+    values = 0.035 * generator.choice([-1.0, 0.0, 1.0], 60)
     values[:5] = 0.0
-    return np.arange(count) * 0.1, values
+    return np.arange(60) * 0.1, values
 
 
 def fit_response(*measured, **options) -> ResponseFit:

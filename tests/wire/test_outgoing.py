@@ -32,8 +32,8 @@ MOTION = ((1.0, 2.0, -3.0), (0.1, 0.2, 0.3), (0.4, 0.5, 0.6), 0.5, 0.25)
 POSITION = PositionTarget(1.0, PositionCommand(*MOTION))
 
 
-def sent(value: Outgoing, autopilot: int = PX4, system_id: int = 7) -> Any:
-    return understood(pinned(Sender(system_id), autopilot).encode(value))
+def sent(value: Outgoing, autopilot: int = PX4) -> Any:
+    return understood(pinned(Sender(7), autopilot).encode(value))
 
 
 # --- attitude and thrust ---
