@@ -145,17 +145,12 @@ def attitude(time_s: float) -> Attitude:
     return Attitude(time_s, (1.0, 0.0, 0.0, 0.0), (0.0,) * 3)
 
 
-def hovering() -> VehicleState:
-    """Both streams at 10 Hz until 10 s."""
+def test_an_outage_of_the_whole_link_does_not_count_as_age() -> None:
+    """After both streams at 10 Hz until 10 s."""
     state = VehicleState()
     for time_s in np.arange(1, 101) / 10.0:
         state.update(position(time_s), time_s)
         state.update(attitude(time_s), time_s)
-    return state
-
-
-def test_an_outage_of_the_whole_link_does_not_count_as_age() -> None:
-    state = hovering()
     state.update(position(10.9), 10.9)
     assert state.attitude_age_s == pytest.approx(0.0)
     state.update(position(11.0), 11.0)
