@@ -80,10 +80,10 @@ def repeating(again_s: float) -> Filter:
     return delivering(lambda *_: [0.0, 0.0, again_s])
 
 
-def shuffling(seed: int = 5) -> Filter:
+def shuffling() -> Filter:
     """A link that delays one datagram in five by 20 ms, some that have a time stamp by 2.5 s, and
     duplicates another one in five."""
-    chance = random.Random(seed)
+    chance = random.Random(5)
 
     def delays_s(_: float, datagram: bytes) -> Sequence[float]:
         draw = chance.random()

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from uneventful import NOW_S, hear, uneventful
 
-from offboard.flight.failsafe import ROWS, Row, judge
+from offboard.flight.failsafe import ROWS, judge
 from offboard.flight.phases import Action, Limits, Phase
 from offboard.flight.state import FlightState
 from offboard.flight.timing import REPLIES_MIN
@@ -35,10 +35,10 @@ STEP_S = 0.125
 BY_NAME = {row.name: row for row in ROWS}
 
 
-def actions(*moments: Sequence[str], rows: Sequence[Row] = ROWS) -> list[Action]:
+def actions(*moments: Sequence[str]) -> list[Action]:
     """The action at each moment, of which each has the names of the rows whose condition holds."""
     holding: set[str] = set()
-    driven = [replace(row, condition=lambda _, name=row.name: name in holding) for row in rows]
+    driven = [replace(row, condition=lambda _, name=row.name: name in holding) for row in ROWS]
     flight, seen = uneventful(), []
     for number, names in enumerate(moments):
         holding.clear()

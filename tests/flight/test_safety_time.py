@@ -349,23 +349,3 @@ def test_after_a_pause_telemetry_of_a_stream_is_not_late() -> None:
 
 
 # -- the vehicle's clock ---------------------------------------------------------------------------
-
-
-def test_a_clock_that_wraps_is_flown() -> None:
-    """`time_boot_ms` begins again at zero in the middle of the track: for the flight, and for the
-    score."""
-    wraps = simulated.scenario("clock_wrap")
-    before_s = 2.0**32 / 1e3 - 22.0  # it has hovered for a while when its links open
-    conditions = wraps.conditions.model_copy(update={"clock_start_s": before_s})
-    scenario = wraps.model_copy(update={"conditions": conditions})
-    pair = copter.lap(scenario=scenario, deadline_s=DEADLINE_S)
-    flown(pair, failsafes=(), error_m=0.05, ended_by="reference over")
-    stamps_ms = [m.time_boot_ms for _, _, m in pair.setpoints]
-    assert max(stamps_ms) > 2**32 - 1000
-    assert min(stamps_ms) < 1000
-    logged = pair.history()
-    for rows in (logged.position, logged.reference, logged.setpoint):
-        assert min(rows["time_s"][1:] - rows["time_s"][:-1]) >= 0.0
-        assert max(rows["time_s"][1:] - rows["time_s"][:-1]) < 1.0
-    assert score(logged).rmse_position_m < 0.05
-    assert score(logged).link_delay_p50_ms == pytest.approx(0.0, abs=5.0)

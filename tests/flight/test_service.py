@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from faults import heartbeats
 from pair import STEP_S, decode
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from service_wire import Wire
@@ -631,20 +630,6 @@ def test_the_reference_is_repeated_with_the_newest_configuration(served: Served)
     assert pair.service.current.limits.log_lost == "go_on"
     ticks = thrusts(pair, pair.time_s - 1.0)
     assert len(ticks) == 5  # by the new period, which counts from another tick
-
-
-def test_a_plane_is_left_alone(served: Served) -> None:
-    """Its modes have other numbers: what looks like OFFBOARD or GUIDED is none."""
-    pair, plane = served.aloft("ardupilot"), heartbeats(type=1)
-    deliver = pair.down
-    pair.down = lambda time_s, datagrams: plane(time_s, deliver(time_s, datagrams))
-    pair.restart()
-    pair.run(5.0)
-    pair.switch("engage")
-    pair.run(2.0)
-    assert pair.phase is Phase.HEALTH
-    assert said(pair, "waiting: the vehicle is a FIXED_WING; offboard flies multirotors")
-    assert pair.mode == "GUIDED"
 
 
 # --- anything, in any order -----------------------------------------------------------------------

@@ -69,7 +69,6 @@ def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
         ("--out", "/proc/nowhere", "choose a directory that can be written with --out"),
         ("--firmware", "px4", "--firmware are options of --sitl: add it"),
         ("--vehicle", CONFIG / "campaigns" / "quick.yaml", "is a campaign file; a vehicle file is"),
-        ("--reference", "", "--reference: the value is empty; is a variable unset?"),
         ("--out", "--sitl", "--out: '--sitl' is an option, not a value; is a variable unset?"),
         ("--controller horizon --set", f"controller.keep_out={json.dumps([SPHERE])}",
          "keep_out[0] (sphere) contains the start of the reference"),

@@ -37,9 +37,8 @@ def lqr(bandwidth: float = 5.0, vehicle: Vehicle = PX4, **more: object) -> LqrLa
     return LqrLaw(vehicle, LqrSettings.model_validate({"bandwidth_radps": bandwidth, **more}))
 
 
-def pso(bandwidth: float = 5.0, vehicle: Vehicle = PX4, seed: int = 0, **more: object) -> PsoLaw:
-    settings = PsoSettings.model_validate({"bandwidth_radps": bandwidth, **more})
-    return PsoLaw(vehicle, settings, seed=seed)
+def pso() -> PsoLaw:
+    return PsoLaw(PX4, PsoSettings(bandwidth_radps=5.0), seed=0)
 
 
 def state_of(rng: np.random.Generator, reference: Reference, size: float) -> PredictedState:

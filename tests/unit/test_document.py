@@ -61,9 +61,9 @@ class Drawing(Parameters):
         return self
 
 
-def problems(text: str, model: type[Parameters] = Drawing) -> tuple[str, ...]:
+def problems(text: str) -> tuple[str, ...]:
     with pytest.raises(DocumentError) as caught:
-        parse(text, model, "d.yaml")
+        parse(text, Drawing, "d.yaml")
     assert str(caught.value) == "\n".join(caught.value.problems)
     return caught.value.problems
 

@@ -135,14 +135,10 @@ def test_the_deadline_cuts_the_swarm_short() -> None:
 # ---------------------------------------------------------------- flights
 
 
-def rmse_m(bandwidth: float, truth: Truth, vehicle: Vehicle = PX4, **more: object) -> float:
-    return fly(truth, lqr(bandwidth, vehicle), vehicle, lemniscate(15.0), 23.0, **more)
-
-
 def test_wind_and_a_wrong_hover_thrust_are_absorbed_with_position_at_thirty_hertz() -> None:
     """On real PX4, whose estimate wanders, .032 to .037."""
     truth = Truth(PX4, thrust_scale=0.85, wind_force_ned_mps2=(2.04, 2.04, 0.0))
-    assert rmse_m(5.0, truth, gaps_s=(0.033,)) < 0.006
+    assert fly(truth, lqr(), PX4, lemniscate(15.0), 23.0, gaps_s=(0.033,)) < 0.006
 
 
 def test_a_vehicle_that_leans_by_39_degrees_comes_to_rest() -> None:

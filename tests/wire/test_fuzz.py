@@ -153,22 +153,6 @@ def test_hostile_datagrams(autopilot: int, stream: bool) -> None:
         assert receive(session, frame) == ((frame,) if message_id != 256 else ())
 
 
-def test_good_frames_survive_garbage_between_them() -> None:
-    """Also behind garbage that begins like a long frame."""
-    chance, session, data = random.Random(0), pinned(Sender(7), PX4, stream=True), b""
-    known = mavlink.mavlink_map.keys()
-    traffic = [f for f in samples(PX4_RECORDING) if int.from_bytes(f[7:10], "little") in known]
-    for frame in traffic:
-        data += chance.randbytes(chance.randrange(40)) + b"\xfd\xff" + frame
-    found: list[bytes] = []
-    for at in range(0, len(data), 100):
-        found += receive(session, data[at : at + 100])
-    found += receive(session, bytes(LONGEST_FRAME))
-    ours = [frame for frame in traffic if frame[6] == 191]
-    assert found == [frame for frame in traffic if frame not in ours]
-    assert session.counters.dropped[DropReason.SAME_IDS] == len(ours)
-
-
 def test_a_length_in_garbage_hides_no_frame_of_the_next_read() -> None:
     """A false start with an unknown id, whose length covers three good frames of two reads; or the
     third but for a byte, at the end of the first read, where a frame could begin."""

@@ -61,20 +61,6 @@ def test_the_first_autopilot_heard_is_the_vehicle_and_no_other_one_is() -> None:
     assert len(session.receive(vehicle.position(1000), PEER, 0.0).events) == 1
 
 
-def test_the_vehicle_may_move_to_another_port_after_a_silence() -> None:
-    vehicle = Sender(1)
-    session = pinned(vehicle)
-    session.receive(vehicle.position(1000), PEER, 10.0)
-    assert session.receive(vehicle.position(1020), RESTARTED, 10.5).events == ()
-    assert dropped(session, DropReason.FOREIGN_PEER) == 1
-    reception = session.receive(vehicle.position(1040), RESTARTED, 10.51)
-    moved, position = reception.events
-    assert moved == events.PeerChanged(RESTARTED)
-    assert isinstance(position, events.LocalPosition)
-    assert Heartbeat(18) in session.poll(10.51)  # at once, 0.51 s after the last one
-    assert session.receive(vehicle.position(1060), PEER, 10.53).events == ()  # the old one is back
-
-
 @pytest.mark.parametrize(
     ("sender", "place", "silence_s"),
     [

@@ -202,13 +202,13 @@ def test_links_that_are_refused_and_instances_ten_ports_apart(server: TcpLink) -
 STEP_US = 4000
 
 
-def carried(count: int = 2000, seed: int = 5, **settings: Any) -> list[tuple[int, bytes]]:
-    """(time, datagram) of numbered datagrams of 32 bytes sent one per step of 4 ms."""
-    channel = Channel(Impairment(**settings), Random(seed))
+def carried(**settings: Any) -> list[tuple[int, bytes]]:
+    """(time, datagram) of 2000 numbered datagrams of 32 bytes, one per step of 4 ms."""
+    channel = Channel(Impairment(**settings), Random(5))
     arrived: list[tuple[int, bytes]] = []
-    for step in range(count + 1000):
+    for step in range(3000):
         now_us = step * STEP_US
-        if step < count:
+        if step < 2000:
             channel.put(step.to_bytes(4, "big") * 8, now_us)
         arrived += [(now_us, datagram) for datagram in channel.take(now_us)]
     return arrived
