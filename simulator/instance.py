@@ -85,7 +85,13 @@ class Instance:
         if start is not None:
             take_off(self.autopilot, start)
         clock_us = round(conditions.clock_start_s * 1e6)
-        self.view = View(self.autopilot, system, epoch_us - clock_us, builders(firmware))
+        self.view = View(
+            self.autopilot,
+            system,
+            epoch_us - clock_us,
+            builders(firmware),
+            conditions.clock_rate,
+        )
         self.view.clock_offset_us = clock_us
         self.keyring = Keyring(
             firmware.accepted_unsigned,

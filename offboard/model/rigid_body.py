@@ -63,8 +63,9 @@ _STILL_AIR = np.zeros(3)
 
 
 def pack(vehicle: Vehicle) -> Array:
-    """Vehicle -> (12,) parameters of the compiled functions, SI:
-    [mass, gravity, I_x, I_y, I_z, arm, D_t (3), D_r (3)]."""
+    """Vehicle -> (13,) parameters of the compiled functions, SI:
+    [mass, gravity, I_x, I_y, I_z, arm, D_t (3), D_r (3), quadratic drag (0, and the simulator's)].
+    """
     return np.array(
         [
             vehicle.mass_kg,
@@ -73,6 +74,7 @@ def pack(vehicle: Vehicle) -> Array:
             vehicle.arm_m,
             *vehicle.drag_translation_npmps,
             *vehicle.drag_rotation_nmpradps,
+            0.0,
         ]
     )
 
@@ -109,15 +111,15 @@ def body_accelerations(air_velocity: Any, rates: Any, inputs: Any, parameters: A
     `air_velocity` is the velocity relative to the air in body axes, (u, v, w); `rates` (p, q, r).
     Returns six scalars: specific force (what an accelerometer feels, m/s^2) and angular
     acceleration (rad/s^2). Lift acts along -z, drag D_t (Eq. 3) on the velocity relative to the
-    air, D_r (Eq. 4) on the rates.
+    air, D_r (Eq. 4) on the rates; quadratic drag acts on each axis by itself.
     """
     u, v, w = air_velocity
     p, q, r = rates
     mass, arm = parameters[0], parameters[5]
     inertia_x, inertia_y, inertia_z = parameters[2], parameters[3], parameters[4]
-    force_x = -parameters[6] * u
-    force_y = -parameters[7] * v
-    force_z = -parameters[8] * w - inputs[0]
+    force_x = -(parameters[6] + parameters[12] * abs(u)) * u
+    force_y = -(parameters[7] + parameters[12] * abs(v)) * v
+    force_z = -(parameters[8] + parameters[12] * abs(w)) * w - inputs[0]
     torque_x = arm * inputs[1] - parameters[9] * p - (inertia_z - inertia_y) * q * r
     torque_y = arm * inputs[2] - parameters[10] * q - (inertia_x - inertia_z) * r * p
     torque_z = inputs[3] - parameters[11] * r - (inertia_y - inertia_x) * p * q

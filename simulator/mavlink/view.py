@@ -42,6 +42,7 @@ class View:
     system: int
     epoch_us: int  # Unix time of boot
     builders: dict[str, Callable[[View], Sequence[Any]]]  # fields by message
+    clock_rate: float = 1.0
     # changed by faults
     clock_offset_us: int = 0
     silent: dict[str, int] = field(default_factory=dict)
@@ -111,7 +112,7 @@ class View:
     @property
     def time_us(self) -> int:
         """Vehicle time of the time stamps, microseconds."""
-        return max(0, self.autopilot.state.time_us + self.clock_offset_us)
+        return max(0, int(self.autopilot.state.time_us * self.clock_rate) + self.clock_offset_us)
 
     def geodetic(self, north_m: float, east_m: float) -> tuple[int, int]:
         """Latitude and longitude in 1e-7 deg of a point near the origin (spherical Earth)."""

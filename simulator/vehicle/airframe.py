@@ -58,6 +58,7 @@ def build_airframe(vehicle: Vehicle, conditions: Conditions) -> tuple[Array, Arr
         ]
     )
     body[0] *= conditions.mass_scale
+    body[12] = conditions.quadratic_drag_npmps2
     stiffness = max(body[6:9].max() / body[0], (body[9:12] / body[2:5]).max())
     substeps = max(1, math.ceil(STEP_S * stiffness / _STIFFNESS_LIMIT))
     return body, rotor, substeps

@@ -23,8 +23,12 @@ class Conditions(Parameters):
     gusts: Gusts = Gusts()
     thrust_scale: float = Field(default=1.0, ge=0.1, le=3)  # 0.85: 15 % less than the model
     mass_scale: float = Field(default=1.0, ge=0.1, le=5)
+    # of each body axis by itself, q |u| u beside the vehicle's linear drag, as ArduPilot SITL's
+    # Frame::calculate_forces has it
+    quadratic_drag_npmps2: float = Field(default=0.0, ge=0, le=10)
     ground_effect: bool = False
     battery: Battery = Battery()
     # vehicle clock at the start; its 32-bit milliseconds wrap at 4294967.296 s
     clock_start_s: float = Field(default=0.0, ge=0, le=1e8)
+    clock_rate: float = Field(default=1.0, ge=0.9, le=1.1)  # of the vehicle clock per second
     boot_scale: float = Field(default=1.0, ge=0.02, le=10)  # on the times of the autopilot's start

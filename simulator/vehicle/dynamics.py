@@ -63,7 +63,7 @@ RECORD = np.dtype(
         ("delays", "i8", 5),
         ("gains", "f8", (3, 3)),
         # constants
-        ("body_constants", "f8", 12),
+        ("body_constants", "f8", 13),
         ("rotor_constants", "f8", 6),
         ("air", "f8", 5),
         ("error_transition", "f8", (ERROR_COUNT, ERROR_COUNT)),

@@ -186,8 +186,10 @@ ARDUPILOT_LIKE = ErrorModel(
 # ArduCopter 4.6 SITL as shipped, whose sensors have no noise: its GPS is later than its EKF3
 # assumes, so that e_p follows minus that time times the true velocity, as a filter of second order.
 # Fits to estimate minus truth of nine flights give 1.3 to 1.8 rad/s, damping 0.37 to 0.69, 23 to
-# 31 ms, and leave 0.01 m. With the values here the tracking errors of hover and of lemniscates of
-# 15 and 8 s are 0.0010, 0.0016 and 0.0057 m; on the real autopilot 0.0009, 0.0018 and 0.0047 m.
+# 31 ms, and leave 0.01 m. In the scenario of this name the tracking errors of hover, of lemniscates
+# of 15 and 8 s, of the latter 120 ms later each way and in wind of 0.65 m/s, and of a circle of
+# 8 m/s are 0.0009, 0.0016, 0.0050, 0.017, 0.0038 and 0.021 m; on the real autopilot 0.0009, 0.0018,
+# 0.0046, 0.014, 0.0044 and 0.018 m.
 _SITL_RADPS, _SITL_DAMPING, _SITL_LATE_S = 1.6, 0.55, 0.0225
 _SITL_LATERAL = AxisError(
     drift=(

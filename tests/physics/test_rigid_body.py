@@ -128,14 +128,17 @@ def test_free_spin_keeps_energy_and_angular_momentum(dragless: Vehicle) -> None:
 
 
 def test_acceleration_is_newtons_in_the_inertial_frame(lopsided: Vehicle) -> None:
-    """m a = m g + R (lift along -z) - R D R^T (v - wind), with SciPy's rotation."""
+    """m a = m g + R (lift along -z - (D + q |u|) u), u = R^T (v - wind), with SciPy's rotation."""
     wind, inputs = np.array([2.0, -1.0, 0.5]), np.array([15.0, 0.1, -0.2, 0.05])
+    parameters = pack(lopsided)
+    parameters[12] = 0.3
     for state in quaternion_state(random_states(5, 0)):
         turn = rotation(state).as_matrix()
-        drag = turn @ np.diag(lopsided.drag_translation_npmps) @ turn.T
-        force = turn @ [0, 0, -15.0] - drag @ (state[VELOCITY] - wind)
+        through_air = turn.T @ (state[VELOCITY] - wind)
+        drag = (lopsided.drag_translation_npmps + 0.3 * np.abs(through_air)) * through_air
+        force = turn @ ([0, 0, -15.0] - drag)
         expected = force / lopsided.mass_kg + [0, 0, lopsided.gravity_mps2]
-        slope = derivative(state, inputs, pack(lopsided), wind)
+        slope = derivative(state, inputs, parameters, wind)
         assert_allclose(slope[VELOCITY], expected, rtol=1e-12)
         assert_allclose(slope[POSITION], state[VELOCITY])
 

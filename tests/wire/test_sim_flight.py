@@ -16,6 +16,7 @@ from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
 from simulator.mavlink.codec import Decoder, sender_of
+from simulator.vehicle.conditions import Conditions
 
 PREARM_CHECK = 1 << 28  # MAV_SYS_STATUS_SENSOR
 
@@ -294,6 +295,14 @@ def test_disarmed_by_the_pilot_or_by_a_reboot_it_falls() -> None:
     assert beats[0][0] == pytest.approx(1.5, abs=0.05)
     assert not any(m.base_mode & 128 for _, m in beats)
     assert bench.of("ATTITUDE", 1.01)[0][1].time_boot_ms < 50
+
+
+def test_a_clock_that_is_slow_shows_in_stamps_cut_to_milliseconds() -> None:
+    bench = Bench(scenario=Scenario(name="slow", conditions=Conditions(clock_rate=0.9996)))
+    bench.run(6.0)
+    told = [(m.time_boot_ms, math.floor(at_s * 999.6 + 1e-6)) for at_s, m in bench.of("ATTITUDE")]
+    assert all(stamp == expected for stamp, expected in told)
+    assert told[-1][0] >= 5980
 
 
 def test_faults_that_run_go_on_after_a_reboot_and_end_as_they_should() -> None:
