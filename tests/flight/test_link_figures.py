@@ -54,11 +54,12 @@ def test_the_delay_of_the_link_is_measured_before_lift_off() -> None:
     assert answered.score().rmse_position_m < 0.15
 
 
-@pytest.mark.parametrize(("lost", "sent", "most_m"), [(0.0, 1.0, 0.04), (0.3, 2.0, 0.04)])
+@pytest.mark.parametrize(("lost", "sent", "most_m"), [(0.0, 1.0, 0.04), (0.3, 2.0, 0.06)])
 def test_setpoints_are_sent_twice_where_some_are_lost(
     lost: float, sent: float, most_m: float
 ) -> None:
-    """Each once more after half a period. Sent once, this lap has 0.20 m."""
+    """Each once more after half a period. Sent once, this lap has 0.20 m; of ten seeds nine have
+    0.035 to 0.049 m."""
     pair = over(through)
     pair.up = losing(lost, seed=5)
     pair.track()
