@@ -207,10 +207,10 @@ class _Stream:
     def _again(self, waited_s: float, now_s: float) -> bool:
         if waited_s < _FIRST_WAIT_S:
             return False
-        fast = bool(self.arrivals_s) and self.wanted.arrives_hz > SLOW_HZ
+        rate_hz, enough_hz = self.rate_hz(now_s), _ENOUGH * self.wanted.arrives_hz
+        fast = rate_hz > 0.0 and self.wanted.arrives_hz > SLOW_HZ
         if fast and now_s - self.arrivals_s[-1] > _STOPPED_S:
             return True  # before a flight ends for it
-        rate_hz, enough_hz = self.rate_hz(now_s), _ENOUGH * self.wanted.arrives_hz
         if 0.0 < rate_hz < min(_UNHEARD * self.wanted.rate_hz, enough_hz):
             return True  # the link has lost the requests
         if waited_s < self.wait_s:

@@ -108,7 +108,7 @@ def servo_output_raw(view: View) -> Sequence[Any]:
 
 
 def nav_controller_output(view: View) -> Sequence[Any]:
-    """Demanded attitude and the way to the place that is flown to; 0 where there is none."""
+    """Demanded roll and pitch, yaw, and the way to the place that is flown to, 0 without one."""
     autopilot = view.autopilot
     motion, here = autopilot.position_controller.motion, autopilot.state.estimate.position_ned_m
     north, east, down = (

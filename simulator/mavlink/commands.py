@@ -205,7 +205,7 @@ class Commands:
         """MAV_CMD_DO_SET_SERVO: an output that is no motor."""
         (number, width_us), result = command.params[:2], autopilot.handle("servo")
         if result is Result.ACCEPTED:
-            if not _MOTORS < number <= len(autopilot.outputs_us):
+            if not _MOTORS + 1 <= number <= len(autopilot.outputs_us):
                 return Result.FAILED
             autopilot.outputs_us[int(number) - 1] = fit(width_us, 16, signed=False)
         return result

@@ -346,6 +346,3 @@ def test_after_a_pause_telemetry_of_a_stream_is_not_late() -> None:
     pair.companion.turn = as_read_from_a_stream  # type: ignore[assignment]
     flown(pair)
     assert said(pair, "paused for 0.4")
-
-
-# -- the vehicle's clock ---------------------------------------------------------------------------

@@ -141,7 +141,7 @@ BODY = "0,0,0,-2\n1,1,0,-2\n2,2,1,-2\n"
         (HEAD + BODY + "3,x,0,-2\n", r"a\.csv, row 5, column north_m: 'x' is not a finite number"),
         (HEAD + BODY + "\n2,0,0,-2\n", r"row 6, column time_s: 2 does not come after 2"),
         (HEAD + BODY + "3,0,0\n", r"row 5: 3 cells for 4 columns"),
-        ("t,x,y,z\n" + BODY, r"row 1: unknown column 't'; known are, separated by commas, time_s"),
+        ("t,x,y,z\n" + BODY, r"row 1: unknown column 't'; known, separated by commas, are time_s"),
         ("time_s,x,y\n" + BODY, r"row 1: column altitude_m is missing"),
         ("time_s,x,y,z,altitude_m\n" + BODY, r"down_m and altitude_m exclude each other"),
         ("time_s,x,z\n" + BODY, r"row 1: column east_m is missing"),
