@@ -85,8 +85,8 @@ def _header(cells: list[str], name: str, number: int) -> list[str]:
         column = _NAMES.get(cell.strip().lower())
         if column is None:
             raise ValueError(
-                f"{name}, row {number}: unknown column {cell.strip()!r}; known, "
-                "separated by commas, are time_s, north_m, east_m, down_m (or altitude_m), course_deg"
+                f"{name}, row {number}: unknown column {cell.strip()!r}; known, separated "
+                "by commas, are time_s, north_m, east_m, down_m (or altitude_m), course_deg"
             )
         if column in columns:
             raise ValueError(f"{name}, row {number}: column {column} is given twice")
