@@ -84,8 +84,9 @@ class Commander:
         battery, read = self._state.plant.battery, self._parameters.__getitem__
         if self.rejects_velocity or self._firmware.battery_level(battery, read) >= _CRITICAL:
             return False
-        latched, now_s = bool(self.latched), self._state.time_s
-        return self._health.passes(self.intended, now_s, latched=latched, armed=self.armed)
+        return self._health.passes(
+            self.intended, self._state.time_s, latched=bool(self.latched), armed=self.armed
+        )
 
     @property
     def has_fix(self) -> bool:

@@ -19,7 +19,7 @@ from simulator.steps import LOOP_S
 
 # The vertical integral may carry any vehicle; m/s^2 of north, east and down
 _INTEGRAL_MAX_MPS2 = (4.0, 4.0, GRAVITY_MPS2)
-REACHED_RAD = 0.05  # of a yaw: the rest is turned the shorter way
+_REACHED_RAD = 0.05  # of a yaw: the rest is turned the shorter way
 _TILT_COSINE_MIN = 0.1  # least divisor of the thrust
 # The derivative of the velocity through a first-order low-pass of 5 Hz: share of the newest
 _TIMES_CUTOFF = LOOP_S * 2.0 * math.pi * 5.0
@@ -181,12 +181,12 @@ class PositionLoop:
             self._integral_mps2[i] = min(most, max(-most, integral))
 
     def _turn(self, motion: MotionSetpoint, limits: Limits, demanded: Triple) -> None:
-        """Turn to the demanded yaw, else by the demanded yaw rate."""
+        """Turn to the demanded yaw, in its sense of turn, else by the demanded yaw rate."""
         yaw_rad = self._yaw_demanded(motion, demanded)
         if math.isfinite(yaw_rad):
             most_rad = limits.turn_radps * LOOP_S
             error_rad = wrap_pi(yaw_rad - self.yaw_rad)
-            if error_rad * motion.turn_sense < 0.0 and abs(error_rad) > REACHED_RAD:
+            if error_rad * motion.turn_sense < 0.0 and abs(error_rad) > _REACHED_RAD:
                 error_rad += math.copysign(math.tau, motion.turn_sense)
             if abs(error_rad) > most_rad:
                 yaw_rad = wrap_pi(self.yaw_rad + math.copysign(most_rad, error_rad))
