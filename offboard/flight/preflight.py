@@ -203,7 +203,7 @@ def _several_vehicles(ground: Ground) -> str:
     """Several vehicles are heard, and none was chosen."""
     session = ground.session
     systems = session.senders.candidates(session.link_time_s)
-    return systems and f"several vehicles are heard, systems {systems}: choose one with --system"
+    return systems and f"several vehicles are heard, systems {systems}"
 
 
 def other_sender(ground: Ground) -> str:
@@ -351,7 +351,7 @@ def _late(ground: Ground) -> str:
 _ESTIMATOR = "wait for a GPS fix, keep the vehicle still and away from metal; then calibrate"
 _UNFIT = "fly it with its own autopilot; is MAV_TYPE or FRAME_CLASS right?"
 _FAILSAFE = "let the pilot take over first"
-_PORTS = "or give each vehicle its own port"
+_CHOOSE = "choose one with --system, or give each vehicle its own port"
 _SAME_ID = "switch one off, or change its system id"
 
 
@@ -366,7 +366,7 @@ PREFLIGHT = (
     Row("state", BLOCKS, _flown_by_failsafe, _FAILSAFE, at_once=True, fly_only=True),
     Row("state", BLOCKS, armed_already, "disarm it", at_once=True, fly_only=True),
     Row("senders", BLOCKS, other_sender, "stop it", at_once=True, fly_only=True),
-    Row("senders", BLOCKS, _several_vehicles, _PORTS, at_once=True),
+    Row("senders", BLOCKS, _several_vehicles, _CHOOSE, at_once=True),
     Row("senders", BLOCKS, _same_system_id, _SAME_ID, at_once=True),
     Row("rates", WAIT, _no_telemetry),
     Row("supervisor", WAIT, _unguarded),

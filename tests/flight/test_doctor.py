@@ -420,7 +420,7 @@ def test_second_vehicle_on_the_link() -> None:
     assert said(rows).keys() == {"senders"}
     several, heard = rows["senders"].findings
     assert several.level is BLOCKS
-    assert several.found == "several vehicles are heard, systems 1 and 2: choose one with --system"
+    assert several.found == "several vehicles are heard, systems 1 and 2"
     assert heard.found == "besides the vehicle: autopilot 2/1, from 127.0.0.1:14999"
     tested.system_id = 1
     assert tested.check("senders")["senders"].level is OK

@@ -352,7 +352,7 @@ def test_without_arms_it_stays_on_the_ground(served: Served) -> None:
     pair.forwarded.append(mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 3, 3).pack(codec))
     pair.run(9.8)
     assert pair.phase is Phase.HEALTH
-    assert said(pair, "several vehicles are heard, systems 1 and 9: choose one with --system")
+    assert said(pair, "several vehicles are heard, systems 1 and 9. Fix: choose one")
     pair.until(lambda: pair.phase is Phase.STANDBY, 1.0)
     pair.command(START)
     pair.run(3.0)
