@@ -113,11 +113,11 @@ def battery(seen: Observation) -> Iterable[Finding]:
 def parameters(seen: Observation) -> Iterable[Finding]:
     """Parameters of the autopilot, with the line that sets each."""
     known, health = seen.vehicle.parameters, seen.vehicle.health
-    radio, good, unanswered = health is not None and health.radio_ok, [], []
+    radio, good = health is not None and health.radio_ok, []
+    unanswered = [parameter.name for parameter in seen.dialect.unanswered(known)]
     for parameter in seen.dialect.watched_parameters:
         name, value = parameter.name, known.get(parameter.name)
         if value is None:
-            unanswered.append(name)
             continue
         advised = parameter.advised(value, known, radio)
         if parameter.fault(value) is None and advised:

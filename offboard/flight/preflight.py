@@ -79,8 +79,8 @@ class ParameterReading:
         return timeout or not self._missing(dialect, vehicle)
 
     def _missing(self, dialect: Dialect, vehicle: VehicleState) -> list[str]:
-        watched = (p.name for p in dialect.watched_parameters if self._advice or not p.advice_only)
-        return [name for name in watched if name not in vehicle.parameters]
+        unanswered = dialect.unanswered(vehicle.parameters)
+        return [each.name for each in unanswered if self._advice or not each.advice_only]
 
 
 @dataclass(slots=True, kw_only=True)

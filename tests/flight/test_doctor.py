@@ -27,6 +27,7 @@ from offboard.flight.vehicle_state import VehicleState
 from offboard.link import clock
 from offboard.link.interface import Chunk
 from offboard.mavlink.events import ESTIMATE, Attitude, EstimatorReport, GpsFix
+from offboard.mavlink.senders import DIALECTS
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.signing import UNITS_PER_S, Signing
 from offboard.run.configuration import FlightConfig, load
@@ -228,6 +229,22 @@ def test_nothing_is_said_of_a_good_vehicle(firmware: Firmware) -> None:
     assert said(rows) == {}
     assert len(rows) == 17
     assert tested.instance.time_s - began_s < 6.0  # 8 s with what comes before and after
+
+
+@pytest.mark.parametrize(
+    "replies",
+    [
+        ("SYSID_MYGCS", "SYSID_ENFORCE", "PSC_JERK_XY", "ARMING_CHECK"),  # ArduCopter 4.6
+        ("MAV_GCS_SYSID", "MAV_OPTIONS", "PSC_JERK_NE", "ARMING_SKIPCHK"),  # 4.7
+    ],
+)
+def test_parameters_of_another_release_are_not_awaited(replies: tuple[str, ...]) -> None:
+    known = dict.fromkeys(replies, 1.0)
+    missing = {each.name for each in DIALECTS["ardupilot"].unanswered(known)}
+    assert missing == {
+        "GUID_OPTIONS", "GUID_TIMEOUT", "MOT_THST_HOVER", "ATC_ANGLE_BOOST", "FS_GCS_ENABLE",
+        "FS_THR_ENABLE", "ANGLE_MAX",
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import MappingProxyType
 
 from pymavlink.dialects.v20.all import enums
@@ -27,6 +28,23 @@ _MODES = {
     if not mode.name.endswith("ENUM_END")
 }
 
+_STATION = WatchedParameter("SYSID_MYGCS", "system id of its ground station")
+_JERK = WatchedParameter(
+    "PSC_JERK_XY",
+    "how soon BRAKE, which is asked for hold, stops the vehicle",
+    # BRAKE slows down by the jerk / 7.5 of the speed per second
+    advice=(
+        Valid(
+            "BRAKE, which is asked for hold, takes 7.5 m divided by this to stop for each m/s",
+            10.0,
+            lowest=10.0,
+        ),
+    ),
+    advice_only=True,
+)
+_UNCHECKED = Valid("the vehicle arms without all of its checks", 1.0, 1.0, 1.0)
+
+# Parameters that replace another one: since ArduCopter 4.7
 ARDUPILOT = Dialect(
     name="ardupilot",
     mav_autopilot=3,
@@ -76,29 +94,27 @@ ARDUPILOT = Dialect(
         ),
         WatchedParameter(
             "FS_GCS_ENABLE",
-            "what the vehicle does when the heartbeat of SYSID_MYGCS is lost",
+            "what the vehicle does when the heartbeat of its ground station is lost",
         ),
-        WatchedParameter("SYSID_MYGCS", "system id of the heartbeat that FS_GCS_ENABLE watches"),
-        WatchedParameter(
-            "PSC_JERK_XY",
-            "how soon BRAKE, which is asked for hold, stops the vehicle",
-            # BRAKE slows down by PSC_JERK_XY / 7.5 of the speed per second
-            advice=(
-                Valid(
-                    "BRAKE, which is asked for hold, takes 7.5 / PSC_JERK_XY metres to stop for "
-                    "each m/s",
-                    10.0,
-                    lowest=10.0,
-                ),
-            ),
-            advice_only=True,
-        ),
+        _STATION,
+        replace(_STATION, name="MAV_GCS_SYSID", replaces=_STATION.name),
+        _JERK,
+        replace(_JERK, name="PSC_JERK_NE", replaces=_JERK.name),
         WatchedParameter("FS_THR_ENABLE", "what the vehicle does when the radio is lost"),
         WatchedParameter("SYSID_ENFORCE", "whether commands are accepted only from SYSID_MYGCS"),
         WatchedParameter(
-            "ARMING_CHECK",
-            "pre-arm checks that the vehicle makes; 1 is all",
-            advice=(Valid("the vehicle arms without checking its sensors", 1.0, 1.0, 1.0),),
+            "MAV_OPTIONS",
+            "1: commands are accepted only from MAV_GCS_SYSID",
+            replaces="SYSID_ENFORCE",
+        ),
+        WatchedParameter(
+            "ARMING_CHECK", "pre-arm checks that the vehicle makes; 1 is all", advice=(_UNCHECKED,)
+        ),
+        WatchedParameter(
+            "ARMING_SKIPCHK",
+            "pre-arm checks that the vehicle does not make",
+            advice=(replace(_UNCHECKED, set_to=0.0, lowest=0.0, highest=0.0),),
+            replaces="ARMING_CHECK",
         ),
         WatchedParameter("ANGLE_MAX", "greatest tilt of its own modes, hundredths of a degree"),
     ),

@@ -81,7 +81,8 @@ class WatchedParameter:
 
     A flight is refused where a value is not as `required`, and without a reply to a parameter that
     `must_answer`. `advice` is for `offboard doctor`, and so is the whole parameter if it is
-    `advice_only`. `values` explains the values of an enumeration.
+    `advice_only`. `values` explains the values of an enumeration. `replaces`: the parameter of
+    older releases that it takes the place of.
     """
 
     name: str
@@ -91,6 +92,7 @@ class WatchedParameter:
     advice: tuple[Valid, ...] = ()
     advice_only: bool = False
     values: tuple[str, ...] = ()
+    replaces: str = ""
 
     def fault(self, value: float) -> ParameterFault | None:
         """Why a vehicle with this `value` is not flown, or None if it is."""
@@ -172,6 +174,15 @@ class Dialect:
 
     def mode_name(self, custom_mode: int) -> str:
         return self.modes.get(custom_mode) or f"UNKNOWN(0x{custom_mode:08x})"
+
+    def unanswered(self, known: Mapping[str, float]) -> list[WatchedParameter]:
+        """The watched parameters without a reply, but for those of another release."""
+        older = {each.replaces for each in self.watched_parameters if each.name in known}
+        return [
+            each
+            for each in self.watched_parameters
+            if each.name not in {*known, *older} and each.replaces not in known
+        ]
 
     def set_mode(self, name: str) -> CommandLong:
         """MAV_CMD_DO_SET_MODE. Raises KeyError for an unknown mode."""
