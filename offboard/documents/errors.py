@@ -22,14 +22,13 @@ _OURS = {"offboard", "importlib_metadata", *sys.stdlib_module_names}
 class UserError(Exception):
     """An error that the user can fix. `str()` says what is wrong and what to do, without a
     traceback; a command that it ends prints it and exits with `code`. `is_usage`: what was asked
-    for is wrong; otherwise it may work another time."""
+    for is wrong (2, unless another is given); otherwise it may work another time (3)."""
 
     is_usage = True
-    code = 2
 
     def __init__(self, sentence: str, code: int | None = None) -> None:
         super().__init__(sentence)
-        self.code = self.code if code is None else code
+        self.code = code or (2 if self.is_usage else 3)
 
 
 class DocumentError(UserError):

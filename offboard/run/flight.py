@@ -159,7 +159,6 @@ class BusyComputer(DocumentError):
     """A decision is late because other programs have the processor."""
 
     is_usage = False
-    code = 3
 
 
 @dataclass(frozen=True, slots=True)

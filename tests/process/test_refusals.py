@@ -308,6 +308,11 @@ def test_a_port_in_use_is_refused(called: Called, refused: Refused) -> None:
     assert (code, said.count("\n")) == (3, 1)
     assert f"'{link}' cannot be opened" in said
     assert "another program uses the port" in said
+    with socket.create_server(("127.0.0.1", 0)) as served:
+        page = f"127.0.0.1:{served.getsockname()[1]}"
+        code, _, said = called(f"{FLY} --live", page)
+    assert (code, said.count("\n")) == (3, 1)
+    assert said.startswith(f"--live: {page} cannot be listened on (Address already in use)")
 
 
 def test_a_vehicle_that_cannot_come_down_is_told(called: Called, tmp_path: Path) -> None:
