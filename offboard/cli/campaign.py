@@ -185,7 +185,10 @@ def compare(
         from offboard.campaign.workers import ConnectedVehicle, local_workers
         from offboard.documents.reading import assigned
         from offboard.link import clock
+        from offboard.link.connection import parsed
 
+        if connect:
+            parsed(connect)  # a wrong address is refused before anything starts
         file = CampaignFile(
             controllers=tuple(laws),
             references=tuple(references),

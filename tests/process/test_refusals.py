@@ -90,6 +90,7 @@ def test_what_cannot_be_flown_is_refused(
         ("offboard paper --quick --seeds 20 --table none", "--quick is --seeds 1: use one of them"),
         ("offboard compare --system 3", "are options of --connect"),
         ("offboard compare --connect tcp:1:1 --workers 2", "options of the simulator"),
+        ("offboard compare --connect tcp:1 --out x", "is not understood; use udpin:HOST:PORT"),
         ("offboard compare --scenario ,", "--scenario is an empty list of names"),
         ("offboard identify x.tlog --system 3", "a log needs no --system,"),
         ("offboard identify --sitl --system 3", "--system is an option of --connect"),
