@@ -8,10 +8,12 @@ import difflib
 import json
 import math
 import os
+import shlex
 import sys
 import traceback
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 EVERY_S = 1.0  # at most one sentence of a `Repeated`
@@ -80,6 +82,16 @@ def abridged(name: object) -> str:
     """A name or path for a message: at most 100 characters, without what is no text."""
     text = str(name).encode(errors="backslashreplace").decode()
     return text if len(text) <= 100 else f"{text[:97]}..."
+
+
+def typed(*words: str | Path) -> str:
+    """Words of a command as they are typed in a shell; a path that begins with - is no option."""
+
+    def plainly(word: str | Path) -> str:
+        is_dashed = isinstance(word, Path) and str(word).startswith("-")
+        return f"./{word}" if is_dashed else str(word)
+
+    return shlex.join(map(plainly, words))
 
 
 def meant(name: str, known: Iterable[str]) -> str:

@@ -268,7 +268,8 @@ def test_a_key_is_made_once_and_explained_without_showing_it(
     assert code == 0
     assert "signing setup PASSPHRASE" in said
     assert "offboard fly --signing-key my.key" in said
-    assert "offboard fly --signing-key 'my key'" in called("offboard key", "my key")[1]
+    for name, typed in (("my key", "'my key'"), ("./-b x", "'./-b x'")):
+        assert f"offboard fly --signing-key {typed}\n" in called("offboard key", name)[1]
     assert (tmp_path / "my.key").read_text().split()[-1] not in said
     assert "my.key exists and is not replaced" in refused("offboard key my.key")
     (tmp_path / "state").write_text("a file")
