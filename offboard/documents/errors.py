@@ -70,6 +70,18 @@ def naming(source: str) -> Iterator[None]:
         raise DocumentError(*(f"{source}: {each}" for each in error.problems)) from None
 
 
+@contextmanager
+def outside(what: str) -> Iterator[None]:
+    """Code from outside is called in the block: whatever it raises, also to end the program, is a
+    DocumentError after `what`, with file and line. A UserError stays one."""
+    try:
+        yield
+    except UserError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise DocumentError(f"{what}: {located(error)}") from error
+
+
 def shown(value: Any) -> str:
     """A value as text for a message: short, strings in quotes."""
     if value is None:

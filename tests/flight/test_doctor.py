@@ -456,16 +456,20 @@ def test_flood_of_addresses_and_ids_is_bounded() -> None:
 def test_checks_of_other_packages_are_rows_and_broken_ones_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The one that the README shows; one that cannot be imported; one named as one of ours."""
+    """The one that the README shows; one that cannot be imported, and two that end the program; one
+    named as one of ours."""
     (code,) = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
     (tmp_path / "site_checks.py").write_text(code)
-    checks = {"ceiling": "site_checks:ceiling", "gone": "no_such_module:check", "gps": "json:loads"}
+    (tmp_path / "exiting.py").write_text("raise SystemExit(3)\n")
+    checks = {"ceiling": "site_checks:ceiling", "gone": "no_such_module:check", "gps": "json:loads",
+              "imported": "exiting:check", "called": "sys:exit"}  # fmt: skip
     register(tmp_path, "site_checks", run.GROUP, **checks)
     monkeypatch.syspath_prepend(tmp_path)
     seen = bench().listen()
-    rows = {row.check: row for row in run.examine(run.names(["ceiling", "gone", "gps"]), seen)}
+    rows = {row.check: row for row in run.examine(run.names(list(checks)), seen)}
     assert rows["ceiling"].findings[0].hint == "--set limits.ceiling_m=6"
-    assert "ModuleNotFoundError" in rows["gone"].findings[0].found
+    for name, error in (("gone", "ModuleNotFound"), ("imported", "System"), ("called", "System")):
+        assert f"failed: {error}" in rows[name].findings[0].found
     assert rows["gps"].level is Level.OK
 
 
