@@ -42,7 +42,7 @@ from offboard.flight.phases import TRACKING, Phase
 from simulator import config
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Rule
-from simulator.firmware.values import Result
+from simulator.firmware.values import Result, Severity, StatusText
 
 TAKEOFF = 22  # MAV_CMD
 STILL_ARMED = "it has stood still for 15 s and is armed: its land detector reports that it flies"
@@ -249,6 +249,10 @@ def signed_by_another() -> Pair:
     return pair
 
 
+def complain(pair: Pair) -> None:
+    pair.instance.autopilot.commander.texts.append(StatusText(Severity.CRITICAL, "No GPS"))
+
+
 STOPPED = "stop requested by the operator"
 HELICOPTER = config.vehicle("px4_sih").model_copy(update={"airframe": "helicopter"})
 SOON, LATER = {"health_s": 5.0}, {"health_s": 8.0}
@@ -343,6 +347,11 @@ ROWS = {
     "no position": refusal(
         "not ready: no LOCAL_POSITION_NED arrives", says_what_it_waits_for,
         down=faults.without(faults.POSITION), limits=LATER,
+    ),
+    "no position, and the vehicle says why": refusal(
+        "not ready: no LOCAL_POSITION_NED arrives; the vehicle said: No GPS$", nothing_sent,
+        fly=copter.hop, down=faults.without(faults.POSITION), limits=SOON,
+        at=then(Phase.HEALTH, 2.0, complain),
     ),
     "restart on the ground": refusal(
         "the vehicle restarted", on_the_ground, at=then(Phase.STREAM, 0.5, faults.restart)
