@@ -306,10 +306,11 @@ def test_nothing_is_said_of_a_good_vehicle(firmware: Firmware) -> None:
          "bytes are heard that are not"),
         (alone(GCS_HEARTBEAT, 255, 190, 1.0), "vehicle", BLOCKS,
          "but no autopilot: ground station 255/190"),
-        (alone(UNKNOWN_HEARTBEAT, 1, 1, 1.0), "vehicle", BLOCKS,
-         "autopilot 1/1 is neither PX4 nor ArduCopter"),
+        (alone(UNKNOWN_HEARTBEAT, 1, 50, 1.0), "vehicle", BLOCKS,
+         "autopilot 1/50 is neither PX4 nor ArduCopter"),
+        # as `fly` says it
         (alone(AUTOPILOT_HEARTBEAT, 1, 50, 1.0), "vehicle", BLOCKS,
-         "autopilot 1/50 is heard, but only"),
+         "heard as component 50, but only component 1 is flown: set its component id to 1"),
     ],
 )  # fmt: skip
 def test_what_is_found_and_what_mends_it(
