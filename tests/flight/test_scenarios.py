@@ -14,6 +14,7 @@ from typing import Any
 import faults
 import pytest
 from pair import Pair
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from watch import (
     HIGH,
     Check,
@@ -59,6 +60,11 @@ def nothing_sent(pair: Pair) -> None:
 def says_once_that_nothing_is_heard(pair: Pair) -> None:
     nothing_sent(pair)
     assert list(announced(pair))[:-1] == ["waiting: nothing is heard on this link"]
+
+
+def says_the_change(pair: Pair) -> None:
+    said = [each for each in announced(pair) if "COM_OF_LOSS_T" in each]
+    assert said == ["COM_OF_LOSS_T was changed from 1 to 2"]
 
 
 def says_what_it_waits_for(pair: Pair) -> None:
@@ -249,6 +255,13 @@ def signed_by_another() -> Pair:
     return pair
 
 
+def set_parameter(pair: Pair) -> None:
+    codec = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
+    message = mavlink.MAVLink_param_set_message(1, 1, b"COM_OF_LOSS_T", 2.0, 9)
+    for _ in range(2):
+        pair.instance.feed(message.pack(codec))
+
+
 def complain(pair: Pair) -> None:
     pair.instance.autopilot.commander.texts.append(StatusText(Severity.CRITICAL, "No GPS"))
 
@@ -374,6 +387,9 @@ ROWS = {
     # PX4 returns to OFFBOARD, which CURRENT_MODE shows before HEARTBEAT shows it disarmed
     "the landing mode is left as it disarms": flies(
         fly=partial(px4.hover, "reference.duration_s=3.3")
+    ),
+    "a ground station sets a parameter in flight, twice": flies(
+        says_the_change, fly=px4.hover, at=tracking(set_parameter),
     ),
     "take-off by command": flies(took_off_by_command, fly=copter.hop),
     "take-off refused": ends(
