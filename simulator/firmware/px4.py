@@ -239,7 +239,7 @@ PX4 = Px4(
     version=0x011001FF,  # 1.16.1, release
     # float parameters, missions and commands in integers, bytewise parameters, targets of attitude,
     # local and global position, MAVLink 2
-    capabilities=0xE1DE,
+    capabilities=0xE8DF,  # of 1.16.1, without FTP
     origin=(47.397742, 8.545594, 489.4),
     modes=MODES,
     boot_mode="AUTO.LOITER",
