@@ -53,8 +53,9 @@ class Score:
     (`analysis.tracking`). Rates and gaps of the telemetry are of TRACK, too. The metrics of the
     certificate are of the decisions that were sent as they were certified, a share
     `certified_share` of all. A tick counts as one of `decisions`, `failed_decisions` or
-    `missed_ticks`; `refused_setpoints` are among `decisions`. Times are vehicle time. A metric that
-    the log does not hold is NaN.
+    `missed_ticks`; `refused_setpoints` are among `decisions`. The distance to keep-out volumes is
+    no metric, but the margin `clearance` of a campaign. Times are vehicle time. A metric that the
+    log does not hold is NaN.
 
     Example, with the pytest fixture `fly`:
 
@@ -92,7 +93,7 @@ class Score:
     rate_agitation_radps: float = _metric("rates not due to the reference, RMS", "rad/s")
     roll_rate_sd_radps: float = _metric("roll rate, sd", "rad/s")
     pitch_rate_sd_radps: float = _metric("pitch rate, sd", "rad/s")
-    setpoint_hz: float = _metric("setpoints sent", "Hz")
+    setpoint_hz: float = _metric("setpoints sent, each repeat counts", "Hz")
     setpoint_gap_max_s: float = _metric("longest gap of setpoints", "s")
     setpoint_gap_wall_max_s: float = _metric("longest gap of setpoints, wall time", "s")
     answer_p50_ms: float = _metric("telemetry to setpoint, median", "ms")

@@ -40,10 +40,8 @@ Fly = Callable[[Sequence[Case]], list[Record]]  # see `flying`
 class Incomplete(UserError):
     """No further flight begins, for this `reason`, and the same command may go on."""
 
-    code = 4
-
     def __init__(self, reason: str = "interrupted") -> None:
-        super().__init__(f"{reason}: run the same command again to go on")
+        super().__init__(f"{reason}: run the same command again to go on", 4)
         self.reason = reason
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shlex
 from collections.abc import Sequence
 from contextlib import nullcontext
 from functools import partial
@@ -27,7 +26,7 @@ from offboard.cli.shared import (
 )
 from offboard.documents import shipped
 from offboard.documents.arguments import FILE, option
-from offboard.documents.errors import UserError, counted
+from offboard.documents.errors import UserError, counted, typed
 
 if TYPE_CHECKING:
     from offboard.campaign.run import Campaign, Summary
@@ -110,11 +109,11 @@ def conclude(summary: Summary, flown: Campaign) -> None:
     say(f"{flights}, {summary.missing} not flown yet" if summary.missing else flights)
     if summary.kept:
         kept = counted(len(summary.kept), "flight")
-        say(f"kept: {kept}; `{shlex.join(['offboard', 'report', str(summary.kept[0])])}` shows one")
+        say(f"kept: {kept}; `{typed('offboard', 'report', summary.kept[0])}` shows one")
     say(f"written: {directory / 'campaign.csv'} and campaign.html")
     if summary.stopped or summary.mine_missing:
         why = summary.stopped or "interrupted"
-        again = shlex.join(["--out", str(directory)])
+        again = typed("--out", directory)
         are = "is" if summary.mine_missing == 1 else "are"
         missing = f"{summary.mine_missing} of {counted(summary.planned, 'flight')} {are} missing"
         raise UserError(f"{why}: {missing}; go on with the same command and {again}", 4)
@@ -185,7 +184,10 @@ def compare(
         from offboard.campaign.workers import ConnectedVehicle, local_workers
         from offboard.documents.reading import assigned
         from offboard.link import clock
+        from offboard.link.connection import parsed
 
+        if connect:
+            parsed(connect)  # a wrong address is refused before anything starts
         file = CampaignFile(
             controllers=tuple(laws),
             references=tuple(references),

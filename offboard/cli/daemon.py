@@ -94,7 +94,7 @@ def daemon(
                 show=lines.show,
             )
         except (UserError, OSError) as error:
-            if not may_pass(error):
+            if not disk_is_full(error):
                 raise
             sentence = explained(error) if isinstance(error, OSError) else str(error)
             raise UserError(sentence, REFUSED) from None
@@ -102,12 +102,10 @@ def daemon(
         raise UserError(outcome.sentence, outcome.exit_code)
 
 
-def may_pass(error: UserError | OSError) -> bool:
-    """Whether it may work another time: nothing is wrong with what was asked for, or the disk is
-    full."""
+def disk_is_full(error: UserError | OSError) -> bool:
+    """Whether a full disk is the cause: then it may work another time."""
     cause = error if isinstance(error, OSError) else error.__context__
-    full = isinstance(cause, OSError) and cause.errno in DISK_ERRORS
-    return full or (isinstance(error, UserError) and not error.is_usage)
+    return isinstance(cause, OSError) and cause.errno in DISK_ERRORS
 
 
 def _print_unit(options: FlightOptions, out_directory: Path | None) -> None:

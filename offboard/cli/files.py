@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +10,7 @@ import typer
 
 from offboard.cli.shared import out, say, say_each
 from offboard.documents import shipped
-from offboard.documents.errors import DocumentError, UserError, naming
+from offboard.documents.errors import DocumentError, UserError, naming, typed
 
 
 def check(
@@ -110,6 +109,6 @@ def key(
     say("  QGroundControl, Mission Planner: their page on MAVLink signing", indent=4)
     say("  It needs ArduPilot, or PX4 1.17 or later.", indent=4)
     say("")
-    option = shlex.join(["--signing-key", str(file)])
+    option = typed("--signing-key", file)
     say(f"Then: offboard fly {option}")
     say(f"or, without a vehicle: simulator {option}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
 import sys
 from contextlib import ExitStack, nullcontext
 from dataclasses import replace
@@ -27,7 +26,7 @@ from offboard.cli.shared import (
 )
 from offboard.documents.arguments import LIVE_PAGE, option
 from offboard.documents.command_line import INTERRUPT, complain, drop, explained
-from offboard.documents.errors import UserError, plain
+from offboard.documents.errors import UserError, plain, typed
 
 if TYPE_CHECKING:
     from offboard.analysis.score import Requirement
@@ -175,7 +174,7 @@ def _conclude(
             verdict += f"; requirement {'missed' if missed else 'met'}: {results}"
         (complain if code else say)(verdict)
         if rows:
-            rows |= {"log": log, "all metrics": shlex.join(["offboard", "score", str(directory)])}
+            rows |= {"log": log, "all metrics": typed("offboard", "score", directory)}
         if page:
             rows["report"] = f"{page}, in some seconds"
         say_each(rows)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from importlib.metadata import EntryPoint, EntryPoints, entry_points
 
 from offboard.control.base import ControllerSettings
-from offboard.documents.errors import DocumentError, located
+from offboard.documents.errors import DocumentError, outside
 
 GROUP = "pso_offboard.controllers"
 
@@ -46,18 +46,13 @@ def settings_of(law: str) -> type[ControllerSettings]:
         which = " and ".join(sorted(_described(entry) for entry in found))
         raise DocumentError(f"law {law} is defined twice, by {which}; uninstall one of them")
     (entry,) = found
-    try:
+    unusable = f"law {entry.name} of {_described(entry)} cannot be used"
+    with outside(unusable):
         loaded = entry.load()
-    except Exception as error:  # whatever another package raises while it is imported
-        raise _unusable(entry, located(error)) from error
     if not (isinstance(loaded, type) and issubclass(loaded, ControllerSettings)):
-        raise _unusable(entry, f"{loaded!r} is not a subclass of ControllerSettings")
+        sentence = f"{unusable}: {loaded!r} is not a subclass of ControllerSettings"
+        raise DocumentError(" ".join(sentence.split()))
     return loaded
-
-
-def _unusable(entry: EntryPoint, reason: str) -> DocumentError:
-    sentence = " ".join(f"law {entry.name} of {_described(entry)} cannot be used: {reason}".split())
-    return DocumentError(sentence)
 
 
 def _described(entry: EntryPoint) -> str:

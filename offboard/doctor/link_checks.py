@@ -12,7 +12,6 @@ from offboard.flight.preflight import TELEMETRY, Finding, Level
 from offboard.flight.timing import REAL_TIME
 from offboard.link.connection import BITS_OF_A_BYTE
 from offboard.mavlink.events import CommandAck
-from offboard.mavlink.senders import AUTOPILOT_COMPONENT, DIALECTS
 from offboard.mavlink.telemetry import SHARE
 
 BAUDS = (57600, 115200, 230400, 460800, 921600)
@@ -55,20 +54,15 @@ def port(seen: Observation) -> Iterable[Finding]:
 
 def vehicle(seen: Observation) -> Iterable[Finding]:
     """Whether an autopilot that can be flown is heard, and what is heard if none is."""
-    found, heard, kind, known = seen.found, seen.heard, _kind(seen), DIALECTS.values()
+    found, heard, kind = seen.found, seen.heard, _kind(seen)
     senders, received = heard.senders.found, heard.senders.counters.bytes_received
     if seen.link_error:
         return
     if found:
         yield ok(f"{found.autopilot}, system {found.system_id}")
     elif autopilots := [sender for sender in senders if sender.is_autopilot]:
-        why, first = heard.session.senders.why_none(heard.session.counters), autopilots[0]
-        other = first.component_id != AUTOPILOT_COMPONENT
-        if other and first.heartbeat.autopilot in {each.mav_autopilot for each in known}:
-            hint = "set its component id to 1 (PX4: MAV_COMP_ID)"
-            yield blocks(f"{first.name} is heard, but only component 1 is flown", hint)
-        else:
-            yield blocks(why or f"{first.name} is neither PX4 nor ArduCopter")
+        why = heard.session.senders.why_none(heard.session.counters)
+        yield blocks(why or f"{autopilots[0].name} is neither PX4 nor ArduCopter")
     elif senders:
         names = ", ".join(sender.name for sender in senders[:4])
         hint = "let the autopilot, or the router before it, send to this port"

@@ -91,7 +91,7 @@ def _installed(point: EntryPoint) -> Check:
 
     try:
         loaded: Check = point.load()
-    except Exception as error:  # whatever another package raises while it is imported
+    except (Exception, SystemExit) as error:  # of another package while it is imported
         failure = error
 
         def loaded(_: Observation) -> Iterable[Finding]:
@@ -212,7 +212,7 @@ def _judged(check: Check, seen: Observation, most_s: float) -> list[Finding]:
     except TimeoutError:
         hint = "close other programs and check again, or `offboard check` the configuration"
         return [wait("this was not examined in time", hint)]
-    except Exception as error:  # whatever a check of another package raises
+    except (Exception, SystemExit) as error:  # whatever a check of another package raises
         sentence = f"the check itself failed: {type(error).__name__}: {error}"
         return [Finding(Level.WARN, sentence, AUTHOR)]
 

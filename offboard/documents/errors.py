@@ -8,10 +8,12 @@ import difflib
 import json
 import math
 import os
+import shlex
 import sys
 import traceback
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 EVERY_S = 1.0  # at most one sentence of a `Repeated`
@@ -22,14 +24,13 @@ _OURS = {"offboard", "importlib_metadata", *sys.stdlib_module_names}
 class UserError(Exception):
     """An error that the user can fix. `str()` says what is wrong and what to do, without a
     traceback; a command that it ends prints it and exits with `code`. `is_usage`: what was asked
-    for is wrong; otherwise it may work another time."""
+    for is wrong (2, unless another is given); otherwise it may work another time (3)."""
 
     is_usage = True
-    code = 2
 
     def __init__(self, sentence: str, code: int | None = None) -> None:
         super().__init__(sentence)
-        self.code = self.code if code is None else code
+        self.code = code or (2 if self.is_usage else 3)
 
 
 class DocumentError(UserError):
@@ -69,6 +70,18 @@ def naming(source: str) -> Iterator[None]:
         raise DocumentError(*(f"{source}: {each}" for each in error.problems)) from None
 
 
+@contextmanager
+def outside(what: str) -> Iterator[None]:
+    """Code from outside is called in the block: whatever it raises, also to end the program, is a
+    DocumentError after `what`, with file and line. A UserError stays one."""
+    try:
+        yield
+    except UserError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise DocumentError(f"{what}: {located(error)}") from error
+
+
 def shown(value: Any) -> str:
     """A value as text for a message: short, strings in quotes."""
     if value is None:
@@ -81,6 +94,16 @@ def abridged(name: object) -> str:
     """A name or path for a message: at most 100 characters, without what is no text."""
     text = str(name).encode(errors="backslashreplace").decode()
     return text if len(text) <= 100 else f"{text[:97]}..."
+
+
+def typed(*words: str | Path) -> str:
+    """Words of a command as they are typed in a shell; a path that begins with - is no option."""
+
+    def plainly(word: str | Path) -> str:
+        is_dashed = isinstance(word, Path) and str(word).startswith("-")
+        return f"./{word}" if is_dashed else str(word)
+
+    return shlex.join(map(plainly, words))
 
 
 def meant(name: str, known: Iterable[str]) -> str:

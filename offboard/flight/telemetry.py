@@ -34,6 +34,7 @@ from offboard.mavlink.events import (
     LocalPosition,
     ModeReport,
     OtherCompanion,
+    Parameter,
     PeerChanged,
     Rebooted,
     ThrustReport,
@@ -56,6 +57,11 @@ DISARMED_SHOWN = "a HEARTBEAT shows the vehicle disarmed: it is wrong, or its mo
 def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: float) -> bool:
     """`arrived_s` is the host time of the event's arrival, `turned_s` that of the turn. False if
     the event is no news (see `VehicleState.update`)."""
+    if isinstance(event, Parameter):
+        known = flight.vehicle.parameters.get(event.name, event.value)
+        if known != event.value:  # a ground station has set it
+            sentence = f"{event.name} was changed from {known:g} to {event.value:g}"
+            outbox.announce(flight, sentence)
     if not flight.vehicle.update(event, flight.session.link_time_s):
         return False
     match event:

@@ -180,7 +180,9 @@ def _conclude(flight: FlightState, row: Transition, reason: str) -> None:
     """The most severe exit code counts; later reasons are added to the first sentence."""
     if row.exit_code is not None:
         if flight.outcome is None:
-            flight.outcome = Outcome(row.exit_code, reason + _explanation(flight))
+            said = _explanation(flight)
+            sentence = reason if said in reason else reason + said
+            flight.outcome = Outcome(row.exit_code, sentence)
         else:
             sentence = f"{flight.outcome.sentence}; {reason}"
             flight.outcome = Outcome(max(flight.outcome.exit_code, row.exit_code), sentence)

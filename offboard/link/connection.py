@@ -35,9 +35,9 @@ def open_lockstep_link() -> LockstepLink:
     return LockstepLink(sock)
 
 
-def open_link(address: str) -> Link:
-    """Open the link at `address`, for example "udpin:127.0.0.1:14540" (see the module). Raises
-    LinkError, which says what to change, and LinkUnavailable where it may open later."""
+def parsed(address: str) -> tuple[str, str, int]:
+    """Kind, host or device, and port or baud rate of an address. Raises LinkError, which says what
+    to change."""
     matched = _ADDRESS.fullmatch(address)
     if matched is None:
         raise LinkError(f"connection {shown(address)} is not understood; use {FORMS}")
@@ -45,7 +45,7 @@ def open_link(address: str) -> Link:
     if kind == "serial":
         if not 0 < number <= BAUD_MAX:
             raise LinkError(f"connection {shown(address)}: {number} baud is no rate of a port")
-        return RedialingLink(lambda: open_port(host, number), "serial", number / BITS_OF_A_BYTE)
+        return kind, host, number
     if not 1 <= number <= PORT_MAX:
         raise LinkError(f"connection {shown(address)}: port {number} is not within 1 .. {PORT_MAX}")
     if ":" in host and not (host.startswith("[") and host.endswith("]")):
@@ -53,8 +53,17 @@ def open_link(address: str) -> Link:
             f"connection {shown(address)} is not understood; an IPv6 address stands in brackets, "
             f"as in {kind}:[::1]:{number}"
         )
+    return kind, host.strip("[]"), number
+
+
+def open_link(address: str) -> Link:
+    """Open the link at `address`, for example "udpin:127.0.0.1:14540" (see the module). Raises
+    LinkError, which says what to change, and LinkUnavailable where it may open later."""
+    kind, host, number = parsed(address)
+    if kind == "serial":
+        return RedialingLink(lambda: open_port(host, number), "serial", number / BITS_OF_A_BYTE)
     try:
-        return _network_link(kind, host.strip("[]"), number)
+        return _network_link(kind, host, number)
     except UnicodeError as error:  # of a host name that is too long
         raise LinkError(f"connection {shown(address)} cannot be opened: {error}") from None
     except OSError as error:

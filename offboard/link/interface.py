@@ -20,7 +20,6 @@ class LinkUnavailable(LinkError):
     """A link whose address is right and that cannot be opened now: no vehicle."""
 
     is_usage = False
-    code = 3
 
 
 @dataclass(frozen=True, slots=True)

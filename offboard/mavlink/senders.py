@@ -188,17 +188,18 @@ class Senders:
         autopilot's component."""
         if frame.message_id != HEARTBEAT:
             return None
+        kinds = {dialect.mav_autopilot: dialect for dialect in DIALECTS.values()}
+        dialect = kinds.get(frame.message.autopilot)
         if frame.component_id != AUTOPILOT_COMPONENT:
-            if is_vehicle(frame.message):
+            if dialect and is_vehicle(frame.message):
                 self._other_component = frame.component_id
             return None
         if not is_vehicle(frame.message):
             return DropReason.NO_VEHICLE
-        for dialect in DIALECTS.values():
-            if dialect.mav_autopilot == frame.message.autopilot:
-                self.hear(frame.system_id, now_s)
-                return dialect
-        return DropReason.UNSUPPORTED_AUTOPILOT
+        if dialect is None:
+            return DropReason.UNSUPPORTED_AUTOPILOT
+        self.hear(frame.system_id, now_s)
+        return dialect
 
     def overhear(self, frames: Iterable[Frame], now_s: float) -> list[int]:
         """Systems with an autopilot that these frames show, each once a second."""

@@ -62,9 +62,10 @@ _COMPLEX_STEP = 1e-30
 _STILL_AIR = np.zeros(3)
 
 
-def pack(vehicle: Vehicle) -> Array:
+def pack(vehicle: Vehicle, quadratic_drag_npmps2: float = 0.0) -> Array:
     """Vehicle -> (13,) parameters of the compiled functions, SI:
-    [mass, gravity, I_x, I_y, I_z, arm, D_t (3), D_r (3), quadratic drag (0, and the simulator's)].
+    [mass, gravity, I_x, I_y, I_z, arm, D_t (3), D_r (3), quadratic drag], the last of each body
+    axis by itself, beside the linear D_t.
     """
     return np.array(
         [
@@ -74,7 +75,7 @@ def pack(vehicle: Vehicle) -> Array:
             vehicle.arm_m,
             *vehicle.drag_translation_npmps,
             *vehicle.drag_rotation_nmpradps,
-            0.0,
+            quadratic_drag_npmps2,
         ]
     )
 

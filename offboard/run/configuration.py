@@ -23,7 +23,7 @@ from pydantic import BaseModel, Field, SerializeAsAny, create_model
 from offboard.control import catalogue
 from offboard.control.base import Controller, ControllerSettings
 from offboard.documents import shipped
-from offboard.documents.errors import DocumentError, located
+from offboard.documents.errors import DocumentError, outside
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import override, read, validate
 from offboard.documents.shipped import PARTS, locate, read_text
@@ -128,7 +128,8 @@ def build_track(config: FlightConfig) -> Track:
                 f"reference {config.reference.title}: it goes {reached_m:.4g} m {where} the "
                 f"take-off point, beyond {limit} ({limit_m:g} m); fly nearer or raise the limit"
             )
-    refused = config.controller.refusal(track)
+    with outside("controller"):
+        refused = config.controller.refusal(track)
     if refused:
         raise DocumentError(f"controller: {refused}")
     return track
@@ -137,11 +138,11 @@ def build_track(config: FlightConfig) -> Track:
 def build_controller(config: FlightConfig) -> Controller:
     """The configured controller. Raises DocumentError where the vehicle cannot be flown so."""
     settings = config.controller
-    try:
-        return settings.build(config.vehicle, period_s=config.period_s, seed=config.seed)
-    except Exception as error:  # of a controller from outside, anything
-        why = str(error) if isinstance(error, ValueError) else located(error)
-        raise DocumentError(f"controller {settings.law}: {why}") from error
+    with outside(f"controller {settings.law}"):
+        try:
+            return settings.build(config.vehicle, period_s=config.period_s, seed=config.seed)
+        except ValueError as error:
+            raise DocumentError(f"controller {settings.law}: {error}") from error
 
 
 def dump(config: FlightConfig) -> str:

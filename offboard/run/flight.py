@@ -17,7 +17,7 @@ import numpy as np
 
 from offboard.compiled import prepare
 from offboard.control.base import Adaptive, Controller, Situation
-from offboard.documents.errors import DocumentError, located
+from offboard.documents.errors import DocumentError, outside
 from offboard.documents.shipped import absolute
 from offboard.documents.signing_key import read_key
 from offboard.estimation.observer import Observer
@@ -159,7 +159,6 @@ class BusyComputer(DocumentError):
     """A decision is late because other programs have the processor."""
 
     is_usage = False
-    code = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,10 +238,8 @@ def rehearse(prepared: Prepared, *, keeps_deadline: bool) -> float:
         cut_short = replace(situation, remaining_s=lambda: 0.0)
         least_s = _check_deadline(controller, cut_short, config.budget_s)
     prepared.track.sample(np.array([0.0, 1.0]))
-    try:
+    with outside("controller"):
         controller.reset()
-    except Exception as error:
-        raise DocumentError(f"controller: {located(error)}") from error
     return least_s
 
 
@@ -250,13 +247,11 @@ def _decided(controller: Controller, situation: Situation) -> Command | Position
     """The command of a decision. Raises DocumentError if the law fails: better here than in
     flight."""
     given = deepcopy(situation.state)
-    try:
+    with outside("controller"):
         decision = controller.decide(situation)
         command = decision.command
         [float(figure) for figure in astuple(decision.certificate)]  # as the log will have them
         may_be_sent = usable(command)
-    except Exception as error:
-        raise DocumentError(f"controller: {located(error)}") from error
     if not may_be_sent:
         raise DocumentError(
             f"controller: it decides {command}, which cannot be sent: all values must be finite, "

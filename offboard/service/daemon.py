@@ -17,6 +17,7 @@ from jinja2 import Environment, StrictUndefined
 from sdnotify import SystemdNotifier
 
 from offboard import compiled
+from offboard.documents.errors import typed
 from offboard.flight.flight import Outcome
 from offboard.flight.phases import WAITING, ExitCode, ServiceOptions
 from offboard.link import clock
@@ -44,7 +45,7 @@ TEMPLATE = Path(__file__).with_name("offboard.service.j2")
 PRIVATE = (Path("/tmp"), Path("/var/tmp"))  # the unit has its own
 OTHERS_READ, OTHERS_ENTER = 0o4, 0o1
 STOPPED_EARLY = "stopped before the link was open"
-UNSCORED = "{number} of the earlier flights without a score: `offboard score {newest}` makes it"
+UNSCORED = "{number} of the earlier flights without a score: `{command}` makes it"
 
 
 def run(
@@ -84,7 +85,8 @@ def run(
         recorder = Recorder(directory, score=scoring.add)
         stack.callback(recorder.close)
         if recorder.unscored:
-            tell(UNSCORED.format(number=len(recorder.unscored), newest=recorder.unscored[-1]))
+            command = typed("offboard", "score", recorder.unscored[-1])
+            tell(UNSCORED.format(number=len(recorder.unscored), command=command))
         memory = stack.enter_context(closing(VehicleFiles(directory / "vehicles", tell)))
         manager = stack.enter_context(closing(Manager()))
         manager.tell("READY=1")

@@ -94,6 +94,7 @@ class Guidance:
         self.home_ned_m = ORIGIN
         self.home_yaw_rad = 0.0
         self.cruise_mps = math.inf  # requested for automatic flight; inf: none
+        self.region_ned_m: tuple[float, float] | None = None  # of interest, faced where no yaw is
         self._behaviours = behaviours
         self.behaviour = Behaviour.HOLD
         self.active = behaviours[Behaviour.HOLD](self)
@@ -111,6 +112,7 @@ class Guidance:
             self.hold = MotionSetpoint(stopping_place_ned_m(estimate))
         if behaviour is not self.behaviour:
             self.cruise_mps = math.inf
+        self.region_ned_m = None
         self.active.leave()
         self.behaviour, self.active = behaviour, self._behaviours[behaviour](self)
         self._entered, self._place_ned_m = False, place_ned_m
@@ -139,7 +141,12 @@ class Guidance:
         if not self._entered:
             self._entered = True
             self.active.enter(estimate, self._place_ned_m, landed=landed)
-        return self.active.motion(estimate, landed=landed)
+        motion = self.active.motion(estimate, landed=landed)
+        turns = not math.isnan(motion.yaw_rad) or not math.isnan(motion.yaw_rate_radps)
+        if self.region_ned_m is None or turns or motion not in (self.hold, self.newest):
+            return motion
+        (north, east), (x, y, _) = self.region_ned_m, estimate.position_ned_m
+        return replace(motion, yaw_rad=math.atan2(east - y, north - x))
 
     # -- setpoint, place and speed -----------------------------------------------------------
 
@@ -174,6 +181,7 @@ class Guidance:
 
     def turn_to(self, yaw_rad: float, turn_radps: float, sense: float) -> None:
         """Keep this yaw while holding a place or following a setpoint."""
+        self.region_ned_m = None
 
         def turned(setpoint: MotionSetpoint) -> MotionSetpoint:
             return replace(setpoint, yaw_rad=yaw_rad, turn_radps=turn_radps, turn_sense=sense)

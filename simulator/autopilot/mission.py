@@ -45,7 +45,10 @@ class Mission:
 
     firmware: Firmware
     parameters: ParameterTable
-    items: tuple[MissionItem, ...] = ()
+    # by MAV_MISSION_TYPE: the mission, and fences and rally points, which have no effect
+    stored: dict[int, tuple[MissionItem, ...]] = field(
+        default_factory=lambda: {0: (), 1: (), 2: ()}
+    )
     current: int = 0
     reached: int = -1
     finished: bool = False
@@ -56,6 +59,11 @@ class Mission:
     _since_s: float = math.nan  # when the current place was reached
     _target_ned_m: Triple = NAN3
     _approaching: bool = False  # a place that was not near at once
+
+    @property
+    def items(self) -> tuple[MissionItem, ...]:
+        """Those of the mission."""
+        return self.stored[0]
 
     @property
     def first(self) -> int:
@@ -74,11 +82,13 @@ class Mission:
         places = (item.command for item in self.items[self.first :] if item.command in _PLACES)
         return next(places, None) == Kind.TAKEOFF
 
-    def store(self, items: tuple[MissionItem, ...]) -> None:
-        """Replace the items; the mission starts from its beginning."""
+    def store(self, items: tuple[MissionItem, ...], kind: int = 0) -> None:
+        """Replace the items of a kind; the mission starts from its beginning."""
+        self.stored[kind] = items
+        if kind:
+            return
         if self.under_way and not items:
             self.events.append("mission cleared")
-        self.items = items
         self.parameters.set("MIS_TOTAL", len(items))  # which PX4 has not
         self.current, self.reached, self.finished = self.first, -1, False
         self.speed_mps, self._since_s = math.inf, math.nan

@@ -59,6 +59,7 @@ _BODY = frozenset({_BODY_NED, _BODY_OFFSET_NED})
 
 _UNSUPPORTED_FRAME, _UNSUPPORTED, _INVALID_PARAM1 = 2, 3, 6  # MAV_MISSION_RESULT
 _PLACE_FRAMES = frozenset({0, 3, 5, 6, 10, 11})
+_ITEM_FRAMES = {2: 0, 5: 0, 6: 3, 11: 10}  # of a downloaded item, by the uploaded one
 _PLACES = frozenset({16, 17, 18, 19, 21, 22, 31, 82, 201})  # MAV_CMD of missions that have a place
 _YAWED = frozenset({16, 17, 21, 22})  # their fourth parameter may be NaN
 _ACTS = frozenset({
@@ -275,11 +276,15 @@ ARDUPILOT = ArduCopter(
     setpoints_as_automatic=True,
     setpoints_imply_flight=True,
     setpoint_spool_s=2.8,
-    item_frames=({2: 0, 5: 0, 6: 3, 11: 10},) * 2,
+    item_frames={"MISSION_ITEM": _ITEM_FRAMES, "MISSION_ITEM_INT": _ITEM_FRAMES},
     home_item_first=True,
     takeoff_items_climb=True,
     guided_items=True,
-    mission_text=info("Flight plan received"),
+    stored_texts={
+        0: info("Flight plan received"),
+        1: info("Fence received"),
+        2: info("Rally points received"),
+    },
     companion_rates_hz=telemetry.COMPANION_RATES_HZ,
     ground_rates_hz=telemetry.GROUND_RATES_HZ,
     messages=telemetry,

@@ -160,12 +160,13 @@ class Firmware(ABC):
 
     # missions
     requests_kind_of_peer: bool = False  # items of a mission in the kind that came last
-    # MAV_FRAME of a downloaded item, by the uploaded one: in MISSION_ITEM, in MISSION_ITEM_INT
-    item_frames: tuple[Mapping[int, int], Mapping[int, int]]
+    # MAV_FRAME of a downloaded item, by its message and the uploaded one
+    item_frames: Mapping[str, Mapping[int, int]]
     home_item_first: bool = False  # item 0 of a mission is home
     takeoff_items_climb: bool = False  # and never descend
     guided_items: bool = False  # an item with current = 2 is a place to fly to now
-    mission_text: StatusText | None = None  # after an upload
+    # after an upload, by MAV_MISSION_TYPE
+    stored_texts: Mapping[int, StatusText] = field(default_factory=dict)
     reached_above_landing: bool = False  # a landing is "item reached" above its place, too
     turning_items: frozenset[int] = frozenset()  # MAV_CMD whose fourth parameter is a yaw
 

@@ -239,7 +239,7 @@ PX4 = Px4(
     version=0x011001FF,  # 1.16.1, release
     # float parameters, missions and commands in integers, bytewise parameters, targets of attitude,
     # local and global position, MAVLink 2
-    capabilities=0x21DE,
+    capabilities=0xE8DF,  # of 1.16.1, without FTP
     origin=(47.397742, 8.545594, 489.4),
     modes=MODES,
     boot_mode="AUTO.LOITER",
@@ -266,7 +266,7 @@ PX4 = Px4(
     setpoints_outlive_modes=True,
     stream_reaction_s=0.036,
     requests_kind_of_peer=True,
-    item_frames=({5: 0, 6: 3}, {0: 5, 3: 6}),
+    item_frames={"MISSION_ITEM": {5: 0, 6: 3}, "MISSION_ITEM_INT": {0: 5, 3: 6}},
     reached_above_landing=True,
     turning_items=frozenset({16, 17, 19, 21}),
     companion_rates_hz=telemetry.COMPANION_RATES_HZ,

@@ -211,12 +211,11 @@ class Commands:
         return result
 
     def _face(self, autopilot: Autopilot, command: Command) -> Result:
-        """MAV_CMD_DO_SET_ROI and DO_SET_ROI_LOCATION: turn to a place; 0, 0 is none."""
+        """MAV_CMD_DO_SET_ROI and DO_SET_ROI_LOCATION: face a place; 0, 0 is none."""
         latitude, longitude = command.params[4:6]
-        if latitude or longitude:
-            north, east = to_metres(autopilot.firmware.origin, latitude, longitude)
-            x, y, _ = autopilot.state.estimate.position_ned_m
-            autopilot.guidance.turn_to(math.atan2(east - y, north - x), math.inf, 0.0)
+        place = to_metres(autopilot.firmware.origin, latitude, longitude)
+        autopilot.guidance.turn_to(math.nan, math.inf, 0.0)
+        autopilot.guidance.region_ned_m = place if latitude or longitude else None
         return Result.ACCEPTED
 
     def _terminate(self, autopilot: Autopilot, command: Command) -> Result:

@@ -1,8 +1,8 @@
 """Parameter and mission protocol of one link.
 
 Knows messages; values and their ranges are in `simulator.autopilot.parameters`, the flight of a
-mission in `simulator.autopilot.mission`, and which items a firmware takes in its
-`mission_refusal`. Fences and rally points are refused; there are none to download.
+mission in `simulator.autopilot.mission`, and which items of a mission a firmware takes in its
+`mission_refusal`. Fences and rally points are kept as they are, without effect.
 """
 
 from __future__ import annotations
@@ -83,6 +83,7 @@ class ParameterTransfer:
 
 
 REPEAT_S, GIVE_UP_S = 0.25, 5.0
+ALL_KINDS = 255  # MAV_MISSION_TYPE
 
 
 class Ack(IntEnum):
@@ -98,9 +99,11 @@ class Ack(IntEnum):
 
 @dataclass(slots=True)
 class Upload:
-    """An upload in progress: sender, items received, times of the last progress and request."""
+    """An upload in progress: sender, what of (MAV_MISSION_TYPE), items received, times of the last
+    progress and request."""
 
     peer: Peer
+    kind: int
     count: int
     items: list[MissionItem]
     begun_s: float
@@ -115,7 +118,7 @@ class MissionTransfer:
         autopilot = outbox.view.autopilot
         self.mission, self._firmware = autopilot.mission, autopilot.firmware
         self._upload: Upload | None = None
-        self._taken = 0  # count of the last upload
+        self._taken = (0, 0)  # kind and count of the last upload
         self._whole = False  # the peer uses the _INT messages, in 1e-7 degrees
 
     @property
@@ -152,36 +155,37 @@ class MissionTransfer:
     # -- up ----------------------------------------------------------------------------------
 
     def _count(self, message: Message) -> None:
-        peer = sender_of(message)
-        if message.mission_type:
-            self._acknowledge(peer, Ack.UNSUPPORTED, message.mission_type)
+        peer, kind = sender_of(message), message.mission_type
+        if kind not in self.mission.stored:
+            self._acknowledge(peer, Ack.UNSUPPORTED, kind)
         elif message.count > ITEMS_MAX:
-            self._acknowledge(peer, Ack.NO_SPACE)
+            self._acknowledge(peer, Ack.NO_SPACE, kind)
         elif message.count == 0:
-            self.mission.store(())
-            self._acknowledge(peer, Ack.ACCEPTED)
+            self.mission.store((), kind)
+            self._acknowledge(peer, Ack.ACCEPTED, kind)
         else:
-            self._upload = Upload(peer, message.count, [], self._now_s, self._now_s)
+            self._upload = Upload(peer, kind, message.count, [], self._now_s, self._now_s)
             self._request_item(self._upload)
 
     def _request_item(self, upload: Upload) -> None:
         upload.requested_s = self._now_s
         whole = self._whole and self._firmware.requests_kind_of_peer
         name = "MISSION_REQUEST_INT" if whole else "MISSION_REQUEST"
-        self.outbox.send(name, *upload.peer, len(upload.items), 0)
+        self.outbox.send(name, *upload.peer, len(upload.items), upload.kind)
 
     def item(self, message: Message) -> None:
         """MISSION_ITEM or MISSION_ITEM_INT of an upload."""
         self._whole = message.get_type() == "MISSION_ITEM_INT"
-        upload, peer = self._upload, sender_of(message)
+        upload, peer, kind = self._upload, sender_of(message), message.mission_type
         if upload is None:  # the last one again, whose answer was lost, or one without an upload
-            last = message.seq + 1 == self._taken and not message.mission_type
-            self._acknowledge(peer, Ack.ACCEPTED if last else Ack.ERROR, message.mission_type)
+            last = (kind, message.seq + 1) == self._taken
+            self._acknowledge(peer, Ack.ACCEPTED if last else Ack.ERROR, kind)
             return
-        if upload.peer != peer or message.seq != len(upload.items):  # a duplicate
+        expected = (upload.peer, upload.kind, len(upload.items))
+        if (peer, kind, message.seq) != expected:  # a duplicate
             return
         item = _read(message)
-        refused = self._firmware.mission_refusal(item)
+        refused = None if kind else self._firmware.mission_refusal(item)
         if refused is not None:
             result, text = refused
             self._acknowledge(upload.peer, result)
@@ -194,11 +198,11 @@ class MissionTransfer:
         if len(upload.items) < upload.count:
             self._request_item(upload)
             return
-        self.mission.store(tuple(upload.items))
-        self._upload, self._taken = None, upload.count
-        self._acknowledge(upload.peer, Ack.ACCEPTED)
-        if self._firmware.mission_text is not None:
-            self.outbox.send_text(self._firmware.mission_text)
+        self.mission.store(tuple(upload.items), kind)
+        self._upload, self._taken = None, (kind, upload.count)
+        self._acknowledge(upload.peer, Ack.ACCEPTED, kind)
+        if kind in self._firmware.stored_texts:
+            self.outbox.send_text(self._firmware.stored_texts[kind])
 
     def _ack(self, message: Message) -> None:
         """MISSION_ACK of the peer: it wants the other kind of request, or cancels."""
@@ -217,23 +221,25 @@ class MissionTransfer:
     # -- down, and the rest ------------------------------------------------------------------
 
     def _list(self, message: Message) -> None:
-        count = 0 if message.mission_type else len(self.mission.items)
-        self.outbox.send("MISSION_COUNT", *sender_of(message), count, message.mission_type)
+        kind = message.mission_type
+        count = len(self.mission.stored.get(kind, ()))
+        self.outbox.send("MISSION_COUNT", *sender_of(message), count, kind)
 
     def _request(self, message: Message) -> None:
-        peer, items = sender_of(message), self.mission.items
+        peer, kind = sender_of(message), message.mission_type
+        items = self.mission.stored.get(kind, ())
         self._whole = whole = message.get_type() == "MISSION_REQUEST_INT"
-        is_home = self._firmware.home_item_first and message.seq == 0
-        if message.mission_type or not (is_home or message.seq < len(items)):
-            self._acknowledge(peer, Ack.INVALID_SEQUENCE, message.mission_type)
+        is_home = self._firmware.home_item_first and message.seq == kind == 0
+        if not (is_home or message.seq < len(items)):
+            self._acknowledge(peer, Ack.INVALID_SEQUENCE, kind)
             return
         item = self._home() if is_home else items[message.seq]
         places = (item.x, item.y) if whole else (item.x * 1e-7, item.y * 1e-7)
-        current = int(message.seq == self.mission.current)
-        frame = self._firmware.item_frames[whole].get(item.frame, item.frame)
-        head = (*peer, message.seq, frame, item.command)
+        current = int(not kind and message.seq == self.mission.current)
         name = "MISSION_ITEM_INT" if whole else "MISSION_ITEM"
-        self.outbox.send(name, *head, current, 1, *item.params, *places, item.z, 0)
+        frame = self._firmware.item_frames[name].get(item.frame, item.frame)
+        head = (*peer, message.seq, frame, item.command)
+        self.outbox.send(name, *head, current, 1, *item.params, *places, item.z, kind)
 
     def _home(self) -> MissionItem:
         """Home as an item of a mission."""
@@ -243,8 +249,9 @@ class MissionTransfer:
         return MissionItem(0, Kind.WAYPOINT, (0.0,) * 4, *place, view.altitude_mm(down_m) * 1e-3)
 
     def _clear(self, message: Message) -> None:
-        if message.mission_type in (0, 255):  # the mission, or all
-            self.mission.store(())
+        for kind in self.mission.stored:
+            if message.mission_type in (kind, ALL_KINDS):
+                self.mission.store((), kind)
         self._acknowledge(sender_of(message), Ack.ACCEPTED, message.mission_type)
 
     def _set_current(self, message: Message) -> None:

@@ -45,7 +45,7 @@ def build_airframe(vehicle: Vehicle, conditions: Conditions) -> tuple[Array, Arr
     at full throttle N, factor of the lag in a step, thrust above which torques are full, hover
     thrust, hover current A, ground effect 0/1; and the substeps of a step.
     """
-    body = pack(vehicle)
+    body = pack(vehicle, conditions.quadratic_drag_npmps2)
     lag_s = vehicle.thrust_lag_s
     rotor = np.array(
         [
@@ -58,7 +58,6 @@ def build_airframe(vehicle: Vehicle, conditions: Conditions) -> tuple[Array, Arr
         ]
     )
     body[0] *= conditions.mass_scale
-    body[12] = conditions.quadratic_drag_npmps2
     stiffness = max(body[6:9].max() / body[0], (body[9:12] / body[2:5]).max())
     substeps = max(1, math.ceil(STEP_S * stiffness / _STIFFNESS_LIMIT))
     return body, rotor, substeps

@@ -323,10 +323,11 @@ def test_parameters_of_another_release_are_not_awaited(replies: tuple[str, ...])
          "bytes are heard that are not"),
         (alone(GCS_HEARTBEAT, 255, 190, 1.0), "vehicle", BLOCKS,
          "but no autopilot: ground station 255/190"),
-        (alone(UNKNOWN_HEARTBEAT, 1, 1, 1.0), "vehicle", BLOCKS,
-         "autopilot 1/1 is neither PX4 nor ArduCopter"),
+        (alone(UNKNOWN_HEARTBEAT, 1, 50, 1.0), "vehicle", BLOCKS,
+         "autopilot 1/50 is neither PX4 nor ArduCopter"),
+        # as `fly` says it
         (alone(AUTOPILOT_HEARTBEAT, 1, 50, 1.0), "vehicle", BLOCKS,
-         "autopilot 1/50 is heard, but only"),
+         "heard as component 50, but only component 1 is flown: set its component id to 1"),
     ],
 )  # fmt: skip
 def test_what_is_found_and_what_mends_it(
@@ -473,16 +474,20 @@ def test_flood_of_addresses_and_ids_is_bounded() -> None:
 def test_checks_of_other_packages_are_rows_and_broken_ones_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The one that the README shows; one that cannot be imported; one named as one of ours."""
+    """The one that the README shows; one that cannot be imported, and two that end the program; one
+    named as one of ours."""
     (code,) = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
     (tmp_path / "site_checks.py").write_text(code)
-    checks = {"ceiling": "site_checks:ceiling", "gone": "no_such_module:check", "gps": "json:loads"}
+    (tmp_path / "exiting.py").write_text("raise SystemExit(3)\n")
+    checks = {"ceiling": "site_checks:ceiling", "gone": "no_such_module:check", "gps": "json:loads",
+              "imported": "exiting:check", "called": "sys:exit"}  # fmt: skip
     register(tmp_path, "site_checks", run.GROUP, **checks)
     monkeypatch.syspath_prepend(tmp_path)
     seen = bench().listen()
-    rows = {row.check: row for row in run.examine(run.names(["ceiling", "gone", "gps"]), seen)}
+    rows = {row.check: row for row in run.examine(run.names(list(checks)), seen)}
     assert rows["ceiling"].findings[0].hint == "--set limits.ceiling_m=6"
-    assert "ModuleNotFoundError" in rows["gone"].findings[0].found
+    for name, error in (("gone", "ModuleNotFound"), ("imported", "System"), ("called", "System")):
+        assert f"failed: {error}" in rows[name].findings[0].found
     assert rows["gps"].level is Level.OK
 
 

@@ -73,11 +73,19 @@ def test_a_law_that_fails_is_found_before_the_flight(fail: Any, says: str) -> No
         rehearse(replace(prepared, controller=law), keeps_deadline=False)
 
 
-def test_a_reset_that_fails_is_found_before_the_flight(monkeypatch: pytest.MonkeyPatch) -> None:
-    prepared = build(config.load("flight", known_vehicle="px4_sih"))
-    monkeypatch.setattr(type(prepared.controller), "reset", raises)
-    with pytest.raises(DocumentError, match="controller: ZeroDivisionError"):
-        rehearse(prepared, keeps_deadline=False)
+@pytest.mark.parametrize("part", ["build", "refusal", "reset"])
+def test_a_law_that_ends_the_program_is_found_before_the_flight(
+    part: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def exits(*_: object, **__: object) -> None:
+        raise SystemExit(3)
+
+    resolved = config.load("flight", known_vehicle="px4_sih")
+    law = build(resolved).controller if part == "reset" else resolved.controller
+    monkeypatch.setattr(type(law), part, exits)
+    says = r"controller.*: SystemExit: 3 \(.*test_parts\.py:\d+\)"
+    with pytest.raises(DocumentError, match=says):
+        rehearse(build(resolved), keeps_deadline=False)
 
 
 def test_a_law_that_other_programs_make_late_may_be_flown_later(

@@ -14,6 +14,7 @@ from typing import Any
 import faults
 import pytest
 from pair import Pair
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from watch import (
     HIGH,
     Check,
@@ -42,7 +43,7 @@ from offboard.flight.phases import TRACKING, Phase
 from simulator import config
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Rule
-from simulator.firmware.values import Result
+from simulator.firmware.values import Result, Severity, StatusText
 
 TAKEOFF = 22  # MAV_CMD
 STILL_ARMED = "it has stood still for 15 s and is armed: its land detector reports that it flies"
@@ -59,6 +60,11 @@ def nothing_sent(pair: Pair) -> None:
 def says_once_that_nothing_is_heard(pair: Pair) -> None:
     nothing_sent(pair)
     assert list(announced(pair))[:-1] == ["waiting: nothing is heard on this link"]
+
+
+def says_the_change(pair: Pair) -> None:
+    said = [each for each in announced(pair) if "COM_OF_LOSS_T" in each]
+    assert said == ["COM_OF_LOSS_T was changed from 1 to 2"]
 
 
 def says_what_it_waits_for(pair: Pair) -> None:
@@ -249,6 +255,17 @@ def signed_by_another() -> Pair:
     return pair
 
 
+def set_parameter(pair: Pair) -> None:
+    codec = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
+    message = mavlink.MAVLink_param_set_message(1, 1, b"COM_OF_LOSS_T", 2.0, 9)
+    for _ in range(2):
+        pair.instance.feed(message.pack(codec))
+
+
+def complain(pair: Pair) -> None:
+    pair.instance.autopilot.commander.texts.append(StatusText(Severity.CRITICAL, "No GPS"))
+
+
 STOPPED = "stop requested by the operator"
 HELICOPTER = config.vehicle("px4_sih").model_copy(update={"airframe": "helicopter"})
 SOON, LATER = {"health_s": 5.0}, {"health_s": 8.0}
@@ -344,6 +361,11 @@ ROWS = {
         "not ready: no LOCAL_POSITION_NED arrives", says_what_it_waits_for,
         down=faults.without(faults.POSITION), limits=LATER,
     ),
+    "no position, and the vehicle says why": refusal(
+        "not ready: no LOCAL_POSITION_NED arrives; the vehicle said: No GPS$", nothing_sent,
+        fly=copter.hop, down=faults.without(faults.POSITION), limits=SOON,
+        at=then(Phase.HEALTH, 2.0, complain),
+    ),
     "restart on the ground": refusal(
         "the vehicle restarted", on_the_ground, at=then(Phase.STREAM, 0.5, faults.restart)
     ),
@@ -365,6 +387,9 @@ ROWS = {
     # PX4 returns to OFFBOARD, which CURRENT_MODE shows before HEARTBEAT shows it disarmed
     "the landing mode is left as it disarms": flies(
         fly=partial(px4.hover, "reference.duration_s=3.3")
+    ),
+    "a ground station sets a parameter in flight, twice": flies(
+        says_the_change, fly=px4.hover, at=tracking(set_parameter),
     ),
     "take-off by command": flies(took_off_by_command, fly=copter.hop),
     "take-off refused": ends(

@@ -319,8 +319,9 @@ def test_a_supervisor_that_cannot_be_started_is_said(monkeypatch: pytest.MonkeyP
     supervisor = Supervisor()
     before = os.listdir("/proc/self/fd")
     with (
-        pytest.raises(SupervisorError, match="does not start: No such file or directory"),
+        pytest.raises(SupervisorError, match="does not start: No such file") as refused,
         supervisor,
     ):
         pass
+    assert refused.value.code == 3
     assert os.listdir("/proc/self/fd") == before

@@ -88,9 +88,10 @@ def test_settings_of_any_key_are_read_back_from_a_log(
                  "No module named 'no_such_module'"),
         ("raises", "law raises of first 1.0 (raising:Law) cannot be used: ZeroDivisionError: "
                    "division by zero ("),
+        ("exits", "law exits of first 1.0 (exiting:Law) cannot be used: SystemExit: 3 ("),
         ("function", "law function of first 1.0 (json:loads) cannot be used: <function loads at"),
         ("twice", "law twice is defined twice, by first 1.0 (json:loads) and second 1.0"),
-        ("nowhere", "there is no controller named 'nowhere'; known are autopilot, function,"),
+        ("nowhere", "there is no controller named 'nowhere'; known are autopilot, exits,"),
     ],
 )  # fmt: skip
 def test_broken_controller_is_refused_only_when_it_is_asked_for(
@@ -99,10 +100,11 @@ def test_broken_controller_is_refused_only_when_it_is_asked_for(
     site = tmp_path / "site-packages"
     site.mkdir()
     (site / "raising.py").write_text("1 / 0\n")
+    (site / "exiting.py").write_text("raise SystemExit(3)\n")
     laws = "pso_offboard.controllers"
     register(
         site, "first", laws, gone="no_such_module:Law", raises="raising:Law", function="json:loads",
-        twice="json:loads", pso="no_such_module:Law",
+        twice="json:loads", pso="no_such_module:Law", exits="exiting:Law",
     )  # fmt: skip
     register(site, "second", laws, twice="json:dumps")
     monkeypatch.syspath_prepend(site)
@@ -111,6 +113,6 @@ def test_broken_controller_is_refused_only_when_it_is_asked_for(
     (sentence,) = refused.value.problems
     assert sentence.startswith(says)
     assert "\n" not in sentence
-    assert law != "raises" or sentence.endswith("raising.py:1)")
+    assert not law.endswith("s") or sentence.endswith("ing.py:1)")
     for name in ("pso", "paper"):  # built in, and the paper's
         assert load("flight", choices={"controller": name}).controller.law == name

@@ -90,6 +90,7 @@ def test_what_cannot_be_flown_is_refused(
         ("offboard paper --quick --seeds 20 --table none", "--quick is --seeds 1: use one of them"),
         ("offboard compare --system 3", "are options of --connect"),
         ("offboard compare --connect tcp:1:1 --workers 2", "options of the simulator"),
+        ("offboard compare --connect tcp:1 --out x", "is not understood; use udpin:HOST:PORT"),
         ("offboard compare --scenario ,", "--scenario is an empty list of names"),
         ("offboard identify x.tlog --system 3", "a log needs no --system,"),
         ("offboard identify --sitl --system 3", "--system is an option of --connect"),
@@ -267,7 +268,8 @@ def test_a_key_is_made_once_and_explained_without_showing_it(
     assert code == 0
     assert "signing setup PASSPHRASE" in said
     assert "offboard fly --signing-key my.key" in said
-    assert "offboard fly --signing-key 'my key'" in called("offboard key", "my key")[1]
+    for name, typed in (("my key", "'my key'"), ("./-b x", "'./-b x'")):
+        assert f"offboard fly --signing-key {typed}\n" in called("offboard key", name)[1]
     assert (tmp_path / "my.key").read_text().split()[-1] not in said
     assert "my.key exists and is not replaced" in refused("offboard key my.key")
     (tmp_path / "state").write_text("a file")
@@ -308,6 +310,11 @@ def test_a_port_in_use_is_refused(called: Called, refused: Refused) -> None:
     assert (code, said.count("\n")) == (3, 1)
     assert f"'{link}' cannot be opened" in said
     assert "another program uses the port" in said
+    with socket.create_server(("127.0.0.1", 0)) as served:
+        page = f"127.0.0.1:{served.getsockname()[1]}"
+        code, _, said = called(f"{FLY} --live", page)
+    assert (code, said.count("\n")) == (3, 1)
+    assert said.startswith(f"--live: {page} cannot be listened on (Address already in use)")
 
 
 def test_a_vehicle_that_cannot_come_down_is_told(called: Called, tmp_path: Path) -> None:

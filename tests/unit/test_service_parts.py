@@ -17,7 +17,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.analysis import tlog
-from offboard.cli.daemon import may_pass
+from offboard.cli.daemon import disk_is_full
 from offboard.flight.authority import PilotSwitch
 from offboard.flight.flight_plan import CLEAR_M, FlightPlan
 from offboard.flight.record import joined_configuration
@@ -214,7 +214,7 @@ def test_a_full_disk_is_no_wrong_option(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(os, "open", full)
     with pytest.raises(LogError) as passing:
         recorded(tmp_path)
-    assert [may_pass(each.value) for each in (wrong, passing)] == [False, True]
+    assert [disk_is_full(each.value) for each in (wrong, passing)] == [False, True]
 
 
 def test_what_the_user_of_the_unit_cannot_read(

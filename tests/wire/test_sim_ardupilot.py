@@ -343,10 +343,10 @@ def test_a_turn_has_the_requested_rate_and_direction() -> None:
         bench.run(2.0)
 
 
-def test_streams_show_the_goal_and_the_outputs_and_a_region_of_interest_is_faced() -> None:
+def test_streams_show_the_goal_and_the_outputs_and_a_region_of_interest_is_followed() -> None:
     bench = flying()
     bench.send(mavlink.MAVLink_request_data_stream_message(1, 1, 0, 4, 1))
-    (north, _), (_, east) = degrees(bench, 40.0, 0.0), degrees(bench, 0.0, 40.0)
+    (north, _), (_, east) = degrees(bench, 40.0, 0.0), degrees(bench, 0.0, 10.0)
     home = degrees(bench, 0.0, 0.0)
     assert bench.command(201, 0, 0, 0, 0, home[0], east) == [ACCEPTED]
     bench.run(4.0)
@@ -360,6 +360,9 @@ def test_streams_show_the_goal_and_the_outputs_and_a_region_of_interest_is_faced
         return bench.of(kind)[-1][1]
 
     away_m = 40.0 - bench.place[0]
+    towards_deg = math.degrees(math.atan2(10.0 - bench.place[1], -bench.place[0]))
+    assert towards_deg > 105.0
+    assert off_deg(bench, towards_deg) < 8.0  # behind by what it turns in 0.2 s
     assert newest("NAV_CONTROLLER_OUTPUT").wp_dist == pytest.approx(away_m, abs=1.5)
     assert newest("NAV_CONTROLLER_OUTPUT").target_bearing in (359, 0, 1)
     goal, home = newest("POSITION_TARGET_GLOBAL_INT"), newest("HOME_POSITION")

@@ -26,14 +26,14 @@ def act(command: int, *params: float) -> Row:
     return command, (*params, *(0.0,) * (4 - len(params))), NAN, NAN, NAN
 
 
-def item(bench: Bench, seq: int, row: Row) -> object:
+def item(bench: Bench, seq: int, row: Row, kind: int = 0) -> object:
     command, params, north, east, up = row
     x = y = 0
     if not math.isnan(north):
         x, y = (round(value * 1e7) for value in degrees(bench, north, east))
     frame, z = (COMMAND_FRAME, 0.0) if math.isnan(up) else (RELATIVE_INT, up)
     return mavlink.MAVLink_mission_item_int_message(
-        1, 1, seq, frame, command, 0, 1, *params, x, y, z
+        1, 1, seq, frame, command, 0, 1, *params, x, y, z, kind
     )
 
 
@@ -46,12 +46,12 @@ def acks(bench: Bench) -> list[int]:
     return [m.type for _, m in bench.of("MISSION_ACK")]
 
 
-def upload(bench: Bench, rows: list[Row]) -> int:
+def upload(bench: Bench, rows: list[Row], kind: int = 0) -> int:
     """The answer to a whole upload, item by item as it is asked for."""
-    send(bench, mavlink.MAVLink_mission_count_message(1, 1, len(rows)))
+    send(bench, mavlink.MAVLink_mission_count_message(1, 1, len(rows), kind))
     for seq, row in enumerate(rows):
         assert asked(bench)[-1] == seq
-        send(bench, item(bench, seq, row))
+        send(bench, item(bench, seq, row, kind))
     return acks(bench)[-1]
 
 
@@ -144,15 +144,26 @@ def test_missing_items_are_requested_again_until_a_timeout_or_cancelled() -> Non
 
 
 @pytest.mark.parametrize("firmware", [PX4, ARDUPILOT], ids=["px4", "ardupilot"])
-def test_fences_and_rally_points_are_refused_and_there_are_none(firmware: Firmware) -> None:
+def test_fences_and_rally_points_are_kept_beside_the_mission(firmware: Firmware) -> None:
+    """A fence to stay in, and a rally point: as the mission, and without effect on it."""
     bench = Bench(firmware=firmware)
-    for kind in (1, 2):
-        send(bench, mavlink.MAVLink_mission_count_message(1, 1, 1, kind))
+    assert upload(bench, ROUND) == 0
+    kept = {1: [place(5001, n, e, 0, 3) for n, e in ((9, 9), (9, -9), (-9, 0))],
+            2: [place(5100, 3, 4, 5)]}  # fmt: skip
+    for kind, rows in kept.items():
+        assert upload(bench, rows, kind) == 0
+    for kind, rows in {0: ROUND, **kept}.items():
         send(bench, mavlink.MAVLink_mission_request_list_message(1, 1, kind))
-    answers = [(m.type, m.mission_type) for _, m in bench.of("MISSION_ACK")]
-    assert answers == [(3, 1), (3, 2)]
-    counts = [(m.count, m.mission_type) for _, m in bench.of("MISSION_COUNT")]
-    assert counts == [(0, 1), (0, 2)]
+        send(bench, mavlink.MAVLink_mission_request_int_message(1, 1, len(rows) - 1, kind))
+        listed, last = bench.of("MISSION_COUNT")[-1][1], bench.of("MISSION_ITEM_INT")[-1][1]
+        assert (listed.count, listed.mission_type) == (len(rows), kind)
+        assert (last.command, last.mission_type) == (rows[-1][0], kind)
+    send(bench, mavlink.MAVLink_mission_clear_all_message(1, 1, 1))
+    for kind, count in enumerate((len(ROUND), 0, 1)):
+        send(bench, mavlink.MAVLink_mission_request_list_message(1, 1, kind))
+        assert bench.of("MISSION_COUNT")[-1][1].count == count
+    send(bench, mavlink.MAVLink_mission_count_message(1, 1, 1, 3))
+    assert [(m.type, m.mission_type) for _, m in bench.of("MISSION_ACK")][-2:] == [(0, 1), (3, 3)]
 
 
 @pytest.mark.parametrize(
