@@ -280,11 +280,7 @@ ARDUPILOT = ArduCopter(
     home_item_first=True,
     takeoff_items_climb=True,
     guided_items=True,
-    stored_texts={
-        0: info("Flight plan received"),
-        1: info("Fence received"),
-        2: info("Rally points received"),
-    },
+    mission_text=info("Flight plan received"),
     companion_rates_hz=telemetry.COMPANION_RATES_HZ,
     ground_rates_hz=telemetry.GROUND_RATES_HZ,
     messages=telemetry,

@@ -165,8 +165,7 @@ class Firmware(ABC):
     home_item_first: bool = False  # item 0 of a mission is home
     takeoff_items_climb: bool = False  # and never descend
     guided_items: bool = False  # an item with current = 2 is a place to fly to now
-    # after an upload, by MAV_MISSION_TYPE
-    stored_texts: Mapping[int, StatusText] = field(default_factory=dict)
+    mission_text: StatusText | None = None  # after an upload
     reached_above_landing: bool = False  # a landing is "item reached" above its place, too
     turning_items: frozenset[int] = frozenset()  # MAV_CMD whose fourth parameter is a yaw
 

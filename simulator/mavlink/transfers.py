@@ -201,8 +201,8 @@ class MissionTransfer:
         self.mission.store(tuple(upload.items), kind)
         self._upload, self._taken = None, (kind, upload.count)
         self._acknowledge(upload.peer, Ack.ACCEPTED, kind)
-        if kind in self._firmware.stored_texts:
-            self.outbox.send_text(self._firmware.stored_texts[kind])
+        if not kind and self._firmware.mission_text is not None:
+            self.outbox.send_text(self._firmware.mission_text)
 
     def _ack(self, message: Message) -> None:
         """MISSION_ACK of the peer: it wants the other kind of request, or cancels."""
