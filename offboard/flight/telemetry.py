@@ -59,9 +59,9 @@ def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: flo
     the event is no news (see `VehicleState.update`)."""
     if isinstance(event, Parameter):
         known = flight.vehicle.parameters.get(event.name, event.value)
-        if known != event.value:  # a ground station has set it
+        if known != event.value:
             sentence = f"{event.name} was changed from {known:g} to {event.value:g}"
-            outbox.announce(flight, sentence)
+            outbox.announce(flight, sentence, once=True)
     if not flight.vehicle.update(event, flight.session.link_time_s):
         return False
     match event:
