@@ -138,7 +138,8 @@ def prepare(tell: Callable[[str], None] = lambda sentence: None) -> None:
 @functools.cache
 def directory() -> Path:
     """Where machine code is kept: below the first of NUMBA_CACHE_DIR, XDG_CACHE_HOME and ~/.cache
-    that is absolute (as the XDG standard requires) and can be written, or in a temporary directory.
+    that is absolute (as the XDG standard requires) and can be written, or in the directory for
+    temporary files.
 
     It is named after this installation and version of numba, and after the sources with compiled
     functions and the modules that these import, because numba compiles an entry again when its own
@@ -153,11 +154,19 @@ def directory() -> Path:
         used.update({root / f"{module}.py" for module in modules} & texts.keys())
     compiler = f"{root} {sys.implementation.cache_tag} {version('numba')}".encode()
     hashed = hashlib.sha256(b"\0".join((compiler, *(texts[path] for path in sorted(used)))))
-    given = (os.environ.get(name, "") for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"))
+    name = hashed.hexdigest()[:16]
+    given = (os.environ.get(key, "") for key in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"))
     for cache in filter(os.path.isabs, (*given, os.path.expanduser("~/.cache"))):
-        place = Path(cache) / "pso-offboard" / hashed.hexdigest()[:16]
-        with suppress(OSError):
-            place.mkdir(mode=0o700, parents=True, exist_ok=True)
-            tempfile.TemporaryFile(dir=place).close()
+        if _usable(place := Path(cache) / "pso-offboard" / name):
             return place
-    return Path(tempfile.mkdtemp())
+    place = Path(tempfile.gettempdir()) / f"pso-offboard-{os.getuid()}-{name}"
+    return place if _usable(place) else Path(tempfile.mkdtemp())
+
+
+def _usable(place: Path) -> bool:
+    """Whether the directory can be written and is ours: machine code of others is not run."""
+    with suppress(OSError):
+        place.mkdir(mode=0o700, parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=place).close()
+        return place.lstat().st_uid == os.getuid()
+    return False

@@ -7,6 +7,7 @@ answered, too.
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import shutil
 import sys
@@ -31,6 +32,8 @@ def run(module: str, arguments: list[str] | None = None) -> NoReturn:
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # whoever started it has closed it
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
+    # python-control imports it; it would warn of a HOME that cannot be written
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     # text that the encoding of the output does not have is escaped
     sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     sentence, code = "", 0

@@ -97,6 +97,9 @@ def _network_link(kind: str, host: str, port: int) -> Link:
 
 def _resolved(host: str, port: int) -> tuple[int, tuple[Any, ...]]:
     """Address family and socket address of a host, IPv4 if it has both. Raises OSError."""
-    found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
-    family, _, _, _, place = min(found, key=lambda each: each[0] != socket.AF_INET)
+    try:  # asked for IPv6 too, a `localhost` that is ::1 alone has no 127.0.0.1
+        found = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)
+    except socket.gaierror:
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
+    family, _, _, _, place = found[0]
     return family, tuple(place)

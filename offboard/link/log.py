@@ -162,8 +162,8 @@ def new_file(path: Path) -> Iterator[BinaryIO]:
             yield file
         try:
             os.link(incomplete, path)  # unlike a rename, refuses to replace a file
-        except PermissionError:  # a file system without links
-            if path.exists():
+        except OSError:  # a file system without links
+            if os.path.lexists(path):
                 raise FileExistsError(EEXIST, os.strerror(EEXIST)) from None
             incomplete.rename(path)
     except OSError as error:

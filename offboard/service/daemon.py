@@ -191,8 +191,8 @@ def unit(arguments: Sequence[str], connection: str, signing_key: Path | None = N
     words = [quoted(word) for word in command]
     if not any(word.startswith("--out") for word in arguments):
         words += ["--out", "%S/offboard"]
-    if signing_key:
-        words += ["--signing-key", "%d/signing-key"]
+    if signing_key:  # not %d, which systemd knows from 251 on
+        words += ["--signing-key", "${CREDENTIALS_DIRECTORY}/signing-key"]
     return template.render(
         command=" ".join(words),
         connection=connection.replace("%", "%%"),

@@ -428,6 +428,23 @@ def waiting_bytes(descriptor: int) -> int:
     return int.from_bytes(fcntl.ioctl(descriptor, termios.FIONREAD, bytes(4)), sys.byteorder)
 
 
+def test_localhost_is_the_same_for_link_and_vehicle(
+    ends: ExitStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where /etc/hosts has ::1 alone, glibc tells 127.0.0.1 who asks for IPv4."""
+    asked = socket.getaddrinfo
+
+    def told(host: str, port: int, family: int = 0, type: int = 0) -> Any:
+        name = LOCAL if family == socket.AF_INET else "::1"
+        return asked(name if host == "localhost" else host, port, family, type)
+
+    monkeypatch.setattr(socket, "getaddrinfo", told)
+    link = opened(f"udpin:localhost:{free_port()}", ends)
+    vehicle = ends.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+    vehicle.sendto(b"hello", (LOCAL, port(link)))
+    assert data(received(link)) == [b"hello"]
+
+
 @pytest.mark.skipif(not IPV6, reason="this computer has no IPv6")
 def test_ipv6_addresses(ends: ExitStack) -> None:
     link = opened(f"udpin:[::1]:{free_port()}", ends)

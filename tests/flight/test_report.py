@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import lzma
 import math
+import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -301,7 +303,9 @@ def invoke(*arguments: object) -> tuple[int, str]:
     return answer.exit_code, str(said)
 
 
-def test_the_command_replaces_nothing_and_refuses_what_is_no_log(tmp_path: Path) -> None:
+def test_the_command_replaces_nothing_and_refuses_what_is_no_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     log = tmp_path / "x.tlog"
     with lzma.open(RECORDINGS / "px4-1.16.1-ground.tlog.xz") as recording:
         log.write_bytes(recording.read())
@@ -311,6 +315,13 @@ def test_the_command_replaces_nothing_and_refuses_what_is_no_log(tmp_path: Path)
     assert (tmp_path / "report.html").read_text() == "precious"
     assert "<html" in (tmp_path / "report-2.html").read_text(encoding="utf-8")
     assert "exists already; choose another file" in invoke(log, "-o", log)[1]
+
+    def no_links(*_: object) -> None:  # as exFAT on macOS
+        raise OSError(errno.ENOTSUP, os.strerror(errno.ENOTSUP))
+
+    monkeypatch.setattr(os, "link", no_links)
+    (tmp_path / "report-2.html").unlink()
+    assert invoke(log)[0] == 0
     for content in (b"", b"no log" * 100):
         (tmp_path / "y.tlog").write_bytes(content)
         assert "is not a .tlog, or empty" in invoke(tmp_path / "y.tlog")[1]

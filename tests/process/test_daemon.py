@@ -213,7 +213,8 @@ def test_the_unit_is_valid(called: Called, tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
     (line,) = [each for each in printed.splitlines() if each.startswith("ExecStart=")]
     escaped = str(tmp_path / "my $ %.yaml").replace("%", "%%").replace("$", "$$")
-    assert f'--config "{escaped}" --out %S/offboard --signing-key %d/signing-key' in line
+    key = "${CREDENTIALS_DIRECTORY}/signing-key"
+    assert f'--config "{escaped}" --out %S/offboard --signing-key {key}' in line
     assert f"LoadCredential=signing-key:{tmp_path}/my %%.key" in printed
     assert "Type=notify" in printed
     assert "SupplementaryGroups=dialout" in printed

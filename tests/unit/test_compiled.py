@@ -123,8 +123,16 @@ def test_the_directory_is_below_the_first_usable_one(package: Path, tmp_path: Pa
     given["XDG_CACHE_HOME"] = "here"
     assert Path(answer(package, code, **given)).parent == home / ".cache/pso-offboard"
     assert not list(package.rglob("here"))
-    nowhere = dict.fromkeys(given, str(first))  # a file: compiled, and kept in no directory
-    assert answer(package, **nowhere).startswith("68.0\n")
+    nowhere = dict.fromkeys(given, str(first))  # a file: kept in the temporary directory
+    nowhere["TMPDIR"] = str(tmp_path)
+    assert answer(package, **nowhere) == "68.0\n1 [2, 10] 1"
+    assert answer(package, **nowhere) == "68.0\n1 [2, 10] 0"
+    (kept,) = tmp_path.glob("pso-offboard-*")
+    shutil.rmtree(kept)
+    kept.symlink_to(home)  # a link is not followed to a directory of somebody else
+    if os.getuid() == 0:
+        os.chown(kept, 65534, 65534, follow_symlinks=False)
+        assert Path(answer(package, code, **nowhere)) != kept
 
 
 def test_importing_a_flight_does_not_import_numba() -> None:
