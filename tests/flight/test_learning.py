@@ -31,6 +31,7 @@ NEUTRAL = simulated.vehicle("neutral")
 TRUE = simulated.vehicle("px4_sih")
 FIVE_S, ONE_LAP = "reference.duration_s=5.0", "reference.laps=1"
 QUICK = {"delay_s": 0.03, "natural_frequency_radps": 8.0, "damping": 0.5}
+SLUGGISH = {"delay_s": 0.04, "natural_frequency_radps": 3.5, "damping": 1.05}
 SLOW = {"delay_s": 0.09, "natural_frequency_radps": 14.0, "damping": 1.1}
 
 
@@ -107,6 +108,36 @@ def test_slow_thrust_is_identified() -> None:
     model = pair.companion.model
     effect_s = model.thrust_delay_s + model.thrust_lag_s
     assert effect_s == pytest.approx(flies.thrust_delay_s + 0.5, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    "true",
+    [
+        pytest.param({"thrust_lag_s": 0.3, "thrust_delay_s": 0.06}, id="thrust"),
+        pytest.param({"tilt": AxisResponse(**SLUGGISH), "thrust_lag_s": 0.1}, id="attitude"),
+    ],
+)
+def test_vehicle_of_unknown_delays_is_held_until_they_are_identified(true: dict[str, Any]) -> None:
+    """Otherwise its height oscillates by 1 m, or it is lost at 5 m, before the steps."""
+    flies = unseen(QUICK, 0.15, 0.5).model_copy(update=true)
+    pair = learning(ONE_LAP, flies=flies, seed=3, aloft=False)
+    pair.track()
+    assert pair.score().rmse_position_m < 0.15
+
+
+def test_thrust_that_gusts_leave_uncertain_is_adopted_as_such() -> None:
+    """Otherwise that of the file counts as known, and the height oscillates: 0.5 m."""
+    gusts = {"intensity_mps": 4.0, "speed_mps": 12.0}
+    windy = {"estimator": "px4_like", "wind_ned_mps": (12.0, 0.0, 0.0), "gusts": gusts}
+    tilt = {"delay_s": 0.016, "natural_frequency_radps": 11.7, "damping": 0.48}
+    slower = {"thrust_lag_s": 0.131, "thrust_delay_s": 0.019}
+    flies = unseen(tilt, 0.14, 0.51).model_copy(update=slower)
+    pair = learning(
+        ONE_LAP, flies=flies, seed=3, aloft=False, scenario=scenario_of(conditions=windy)
+    )
+    pair.track()
+    assert pair.score().rmse_position_m < 0.2
+    assert pair.companion.model.thrust_lag_s == pytest.approx(0.13, abs=0.07)
 
 
 def test_slow_attitude_is_identified() -> None:
