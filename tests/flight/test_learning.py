@@ -253,9 +253,9 @@ VEHICLE = simulated.vehicle("arducopter").model_copy(
 
 
 @settings(max_examples=20, derandomize=True, deadline=None)
-@given(st.floats(0.2, 0.7), st.floats(-1.0, 3.3))
-def test_hover_thrust_of_an_accelerated_climb(true: float, climb_mps: float) -> None:
-    """Against the closed-form speed v(t) under constant thrust and linear drag."""
+@given(st.floats(0.2, 0.7), st.floats(-1.0, 3.3), st.sampled_from((1, 10)))
+def test_hover_thrust_of_an_accelerated_climb(true: float, climb_mps: float, every: int) -> None:
+    """Against the closed-form speed v(t) under constant thrust and linear drag; at 100, 10 Hz."""
     gravity, drag = VEHICLE.gravity_mps2, VEHICLE.drag_per_mass_ps
     thrust = 1.15 * true
     final = (gravity - gravity * thrust / true) / drag  # down
@@ -263,7 +263,8 @@ def test_hover_thrust_of_an_accelerated_climb(true: float, climb_mps: float) -> 
     for step in range(101):
         time_s = 0.01 * step
         speed = final + (-climb_mps - final) * math.exp(-drag * time_s)
-        hover.on_position(time_s, 1.0, speed + rng.normal(0.0, 0.01))
+        if step % every == 0:
+            hover.on_position(time_s, 1.0, speed + rng.normal(0.0, 0.01))
         if step % 10 == 0:
             hover.on_thrust(time_s, thrust, thrust)
     assert hover.hover_thrust(VEHICLE, 1.0) == pytest.approx(true, rel=0.02)
