@@ -168,7 +168,7 @@ class PositionJumps:
 
 WINDOW_S, KEPT_S = 0.5, 1.5
 GROUND_M = 0.2  # lower, the ground may carry it
-LEAST_THRUSTS, LEAST_SPEEDS, LEAST_S = 3, 8, 0.25  # in the window
+LEAST_THRUSTS, LEAST_SPEEDS, LEAST_S = 3, 4, 0.25  # in the window; 10 Hz must suffice
 LEAST_LIFT = 0.3  # of the weight: less shows too little of the thrust
 
 

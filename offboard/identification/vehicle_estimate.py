@@ -25,8 +25,9 @@ from offboard.identification.vehicle_fit import (
 )
 from offboard.model.vehicle import DelayUncertainty, Vehicle
 
-# What a delay may be wrong by: of a vehicle file in general; of one that is flown as it is
-UNKNOWN_DELAY_S, FILE_DELAY_S = 0.28, 0.13
+# What a delay may be wrong by: of a vehicle file in general, where a response that is slower counts
+# as a delay, too; of one that is flown as it is; of an identified one that telemetry contradicts
+UNKNOWN_DELAY_S, FILE_DELAY_S, DOUBTED_DELAY_S = 0.4, 0.13, 0.28
 # Standard deviations by which an identified delay of tilt or thrust may be wrong: with an error of
 # the thrust's the height oscillates, with one of the tilt's the vehicle may crash
 SDS, THRUST_SDS = 3.0, 2.0
@@ -97,7 +98,9 @@ class VehicleEstimate:
         """What is not known of the delays of `vehicle`."""
         added_s, changed_s = self._link
         known_s = SDS * self.delay.sd if self.delay else self._unknown_s
-        thrust_s = THRUST_SDS * self._thrust.sd if self._thrust else 0.0
+        thrust_s = 0.0 if self.delay else self._unknown_s
+        if self._thrust:
+            thrust_s = THRUST_SDS * self._thrust.sd
         tilt_s = max(known_s, self._doubt_s, changed_s)
         return DelayUncertainty(tilt_s=tilt_s, thrust_s=thrust_s, link_s=added_s)
 
@@ -267,7 +270,7 @@ class VehicleEstimate:
         """The tilt does not respond as predicted: its delay may be anything. `now` and `before` are
         what the constants in use and the ones before them leave unexplained; the latter are used
         again if they explain more."""
-        self._doubt_s, self.cause = max(self._doubt_s, self._unknown_s), ""
+        self._doubt_s, self.cause = max(self._doubt_s, DOUBTED_DELAY_S), ""
         self._contradictions += 1
         self._calm_from_s = time_s
         vehicle = "identified vehicle" if self.vehicle != self.file else "vehicle file"

@@ -39,8 +39,7 @@ LEAST_SECONDS = 2.0
 # Least motion: horizontal speed, rms; change of thrust, rms, as a fraction of the hover thrust.
 LEAST_SPEED_MPS, LEAST_THRUST_CHANGE = 0.4, 0.015
 # Greatest accepted standard deviations; of the hover thrust as a fraction of it.
-DRAG_SD_PS, HOVER_SD, EFFECT_SD_S = 0.2, 0.02, 0.03
-EFFECT_SD = 0.2  # or this fraction of a thrust's long delay and lag
+DRAG_SD_PS, HOVER_SD, EFFECT_SD_S = 0.2, 0.02, 0.1
 DRAG_PRIOR_PS = Estimate(0.6, 0.4)
 THRUST_EFFECT = ("thrust_lag_s", "thrust_delay_s", "thrust_effect_s")  # accepted together
 # A link adds the same to all delays. These are the sd of what remains of the delays of yaw and
@@ -245,15 +244,15 @@ def _accepted_vertical(
             f"the hover thrust {hover.value:.3g} is uncertain: sd {hover.sd:.2g}"
         )
     moved = float(np.std(_thrust(motion, fit))) / hover.value
-    most_s = max(EFFECT_SD_S, EFFECT_SD * effect.value)
     if moved < LEAST_THRUST_CHANGE:
         refusals["thrust_lag_s"] = (
             f"the thrust changed by {100.0 * moved:.1f} % rms, {100.0 * LEAST_THRUST_CHANGE:.1f} % "
             "are needed: its lag shows in a climb"
         )
-    elif not effect.sd <= most_s:
+    elif not effect.sd <= EFFECT_SD_S:
         refusals["thrust_lag_s"] = (
-            f"delay and lag of the thrust are uncertain: sd {effect.sd:.2g} s, limit {most_s:.2g} s"
+            f"delay and lag of the thrust are uncertain: sd {effect.sd:.2g} s, "
+            f"limit {EFFECT_SD_S} s"
         )
     else:
         accepted |= {name: fit[name] for name in THRUST_EFFECT}

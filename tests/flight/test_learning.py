@@ -31,6 +31,7 @@ NEUTRAL = simulated.vehicle("neutral")
 TRUE = simulated.vehicle("px4_sih")
 FIVE_S, ONE_LAP = "reference.duration_s=5.0", "reference.laps=1"
 QUICK = {"delay_s": 0.03, "natural_frequency_radps": 8.0, "damping": 0.5}
+SLUGGISH = {"delay_s": 0.04, "natural_frequency_radps": 3.5, "damping": 1.05}
 SLOW = {"delay_s": 0.09, "natural_frequency_radps": 14.0, "damping": 1.1}
 
 
@@ -99,14 +100,45 @@ def test_unseen_vehicle_is_identified_in_flight_and_from_its_log(true: Vehicle) 
 
 @pytest.mark.slow
 def test_slow_thrust_is_identified() -> None:
-    """From the steps, though they leave it uncertain. Otherwise it is 0.5 to 1.2 m off."""
+    """From the steps, though they leave it uncertain, nearer to what is expected than it is, and
+    with less bandwidth. Otherwise it is 0.5 to 1.2 m off."""
     flies = TRUE.model_copy(update={"thrust_lag_s": 0.5})
     pair = learning(ONE_LAP, flies=flies, seed=3, aloft=False)
     pair.track()
-    assert pair.score().rmse_position_m < 0.06
+    assert pair.score().rmse_position_m < 0.08
     model = pair.companion.model
     effect_s = model.thrust_delay_s + model.thrust_lag_s
-    assert effect_s == pytest.approx(flies.thrust_delay_s + 0.5, abs=0.1)
+    assert 0.2 < effect_s < flies.thrust_delay_s + 0.6
+
+
+@pytest.mark.parametrize(
+    "true",
+    [
+        pytest.param({"thrust_lag_s": 0.3, "thrust_delay_s": 0.06}, id="thrust"),
+        pytest.param({"tilt": AxisResponse(**SLUGGISH), "thrust_lag_s": 0.1}, id="attitude"),
+    ],
+)
+def test_vehicle_of_unknown_delays_is_held_until_they_are_identified(true: dict[str, Any]) -> None:
+    """Otherwise its height oscillates by 1 m, or it is lost at 5 m, before the steps."""
+    flies = unseen(QUICK, 0.15, 0.5).model_copy(update=true)
+    pair = learning(ONE_LAP, flies=flies, seed=3, aloft=False)
+    pair.track()
+    assert pair.score().rmse_position_m < 0.15
+
+
+def test_thrust_that_gusts_leave_uncertain_is_adopted_as_such() -> None:
+    """Otherwise that of the file counts as known, and the height oscillates: 0.5 m."""
+    gusts = {"intensity_mps": 4.0, "speed_mps": 12.0}
+    windy = {"estimator": "px4_like", "wind_ned_mps": (12.0, 0.0, 0.0), "gusts": gusts}
+    tilt = {"delay_s": 0.016, "natural_frequency_radps": 11.7, "damping": 0.48}
+    slower = {"thrust_lag_s": 0.131, "thrust_delay_s": 0.019}
+    flies = unseen(tilt, 0.14, 0.51).model_copy(update=slower)
+    pair = learning(
+        ONE_LAP, flies=flies, seed=3, aloft=False, scenario=scenario_of(conditions=windy)
+    )
+    pair.track()
+    assert pair.score().rmse_position_m < 0.2
+    assert pair.companion.model.thrust_lag_s == pytest.approx(0.13, abs=0.07)
 
 
 def test_slow_attitude_is_identified() -> None:
@@ -222,9 +254,9 @@ VEHICLE = simulated.vehicle("arducopter").model_copy(
 
 
 @settings(max_examples=20, derandomize=True, deadline=None)
-@given(st.floats(0.2, 0.7), st.floats(-1.0, 3.3))
-def test_hover_thrust_of_an_accelerated_climb(true: float, climb_mps: float) -> None:
-    """Against the closed-form speed v(t) under constant thrust and linear drag."""
+@given(st.floats(0.2, 0.7), st.floats(-1.0, 3.3), st.sampled_from((1, 10)))
+def test_hover_thrust_of_an_accelerated_climb(true: float, climb_mps: float, every: int) -> None:
+    """Against the closed-form speed v(t) under constant thrust and linear drag; at 100, 10 Hz."""
     gravity, drag = VEHICLE.gravity_mps2, VEHICLE.drag_per_mass_ps
     thrust = 1.15 * true
     final = (gravity - gravity * thrust / true) / drag  # down
@@ -232,7 +264,8 @@ def test_hover_thrust_of_an_accelerated_climb(true: float, climb_mps: float) -> 
     for step in range(101):
         time_s = 0.01 * step
         speed = final + (-climb_mps - final) * math.exp(-drag * time_s)
-        hover.on_position(time_s, 1.0, speed + rng.normal(0.0, 0.01))
+        if step % every == 0:
+            hover.on_position(time_s, 1.0, speed + rng.normal(0.0, 0.01))
         if step % 10 == 0:
             hover.on_thrust(time_s, thrust, thrust)
     assert hover.hover_thrust(VEHICLE, 1.0) == pytest.approx(true, rel=0.02)

@@ -12,6 +12,7 @@ from offboard.identification.attitude_fit import ResponseFit, Unexplained
 from offboard.identification.learner import IdentifySettings, Learner, Stage
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_estimate import (
+    DOUBTED_DELAY_S,
     FILE_DELAY_S,
     UNKNOWN_DELAY_S,
     IdentifiedVehicle,
@@ -68,10 +69,12 @@ def test_what_a_file_may_have_is_adopted_and_nothing_else() -> None:
 def test_doubt_ends_with_what_explains_the_flight() -> None:
     """The delay is the same; the first fit leaves too much unexplained, the second does not. Where
     the constants explain the flight again, a fit that explains no more is not adopted."""
+    unknown = VehicleEstimate(FILE, delay_error_s=UNKNOWN_DELAY_S).uncertainty
+    assert (unknown.tilt_s, unknown.thrust_s) == (UNKNOWN_DELAY_S, UNKNOWN_DELAY_S)
     estimate = estimate_with(fit(0.05))
     assert estimate.uncertainty.tilt_s == pytest.approx(KNOWN_S)
     estimate.on_contradiction(CONTRADICTS, CONTRADICTS, 10.0)
-    assert estimate.uncertainty.tilt_s == UNKNOWN_DELAY_S
+    assert estimate.uncertainty.tilt_s == DOUBTED_DELAY_S
     estimate.review_tilt(fit(0.05, 5.0, left=0.04), CONTRADICTS, 12.0)
     assert estimate.in_doubt
     assert len(estimate.sentences) == 1
@@ -116,7 +119,7 @@ def test_after_two_contradictions_the_delay_is_unknown_for_20_s_of_calm() -> Non
     for time_s in range(24, 58, 2):
         now = CONTRADICTS if time_s == 38 else AGREES
         estimate.review_tilt(fit(delay_s), now, time_s)
-        assert estimate.uncertainty.tilt_s == UNKNOWN_DELAY_S
+        assert estimate.uncertainty.tilt_s == DOUBTED_DELAY_S
     assert estimate.vehicle.tilt.delay_s == delay_s
     estimate.review_tilt(fit(delay_s), AGREES, 58.0)
     assert estimate.uncertainty.tilt_s == pytest.approx(KNOWN_S)
@@ -196,7 +199,7 @@ def test_learner_announces_what_is_new_in_motion(monkeypatch: pytest.MonkeyPatch
     contradictions = [sentence for sentence in said if "contradicts telemetry" in sentence]
     assert len(contradictions) == 2
     assert contradictions[1].endswith("until nothing contradicts for 20 s")
-    assert learner.uncertainty.tilt_s == UNKNOWN_DELAY_S
+    assert learner.uncertainty.tilt_s == DOUBTED_DELAY_S
     for shown, used in ((0.42, 0.42), (0.44, 0.42), (0.53, 0.53), (0.3, 0.3), (0.97, 0.42)):
         learner, said = flown(AGREES, shown)
         assert learner.vehicle.hover_thrust == pytest.approx(used, abs=0.002)
