@@ -14,11 +14,13 @@ crossings near 1, it is up to 60 % too long: it is not used.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from offboard.control.base import Bandwidth
 from offboard.control.gains import lateral_gain, vertical_gain
 from offboard.estimation.noise import Noise
 from offboard.model.axes import LinearModel, lateral_model, vertical_model
@@ -40,7 +42,7 @@ VERTICAL_SDS = ((0, NOISE.position_sd_m),)
 
 def supported_bandwidth(
     vehicle: Vehicle, uncertainty: DelayUncertainty, period_s: float, most_radps: float
-) -> float:
+) -> Bandwidth:
     """`most_radps`, or the highest bandwidth below it, in steps of STEP_RADPS, with which the
     lateral loop bears a longer delay of the tilt, and the vertical loop a longer or a shorter one
     of the thrust (a modelled delay that is too long makes it unstable, too); never below
@@ -52,21 +54,25 @@ def supported_bandwidth(
     tilt_s = max(LEAST_MARGIN_S, SHARE_OF_DELAY * vehicle.tilt.delay_s, uncertainty.tilt_s)
     thrust_s = max(LEAST_MARGIN_S, uncertainty.thrust_s)
 
-    def bears(bandwidth_radps: float) -> bool:
-        lateral = lateral_gain(vehicle, bandwidth_radps, period_s).gain
-        vertical = vertical_gain(vehicle, bandwidth_radps, period_s).gain
-        tilt = _Loop(
-            lateral_model(vehicle), lateral, LATERAL_DENSITIES, LATERAL_SDS,
-            vehicle.tilt.delay_s, period_s,
+    def lateral_bears(bandwidth_radps: float) -> bool:
+        loop = _Loop(
+            lateral_model(vehicle), lateral_gain(vehicle, bandwidth_radps, period_s).gain,
+            LATERAL_DENSITIES, LATERAL_SDS, vehicle.tilt.delay_s, period_s,
         )  # fmt: skip
-        thrust = _Loop(
-            vertical_model(vehicle), vertical, VERTICAL_DENSITIES, VERTICAL_SDS,
-            vehicle.thrust_delay_s, period_s,
-        )  # fmt: skip
-        return all(map(tilt.is_stable, np.linspace(0.0, tilt_s, 4))) and all(
-            map(thrust.is_stable, np.linspace(-thrust_s, thrust_s, 4))
-        )
+        return all(map(loop.is_stable, np.linspace(0.0, tilt_s, 4)))
 
+    def vertical_bears(bandwidth_radps: float) -> bool:
+        loop = _Loop(
+            vertical_model(vehicle), vertical_gain(vehicle, bandwidth_radps, period_s).gain,
+            VERTICAL_DENSITIES, VERTICAL_SDS, vehicle.thrust_delay_s, period_s,
+        )  # fmt: skip
+        return all(map(loop.is_stable, np.linspace(-thrust_s, thrust_s, 4)))
+
+    return Bandwidth(_highest(lateral_bears, most_radps), _highest(vertical_bears, most_radps))
+
+
+def _highest(bears: Callable[[float], bool], most_radps: float) -> float:
+    """The highest bandwidth that is borne."""
     if most_radps <= LEAST_RADPS or bears(most_radps):
         return most_radps
     low, high = 0, math.ceil((most_radps - LEAST_RADPS) / STEP_RADPS)

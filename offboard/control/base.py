@@ -10,7 +10,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from offboard.documents.parameters import Parameters
 from offboard.model.command import Command, PositionCommand, PredictedState
@@ -139,6 +139,18 @@ class ControllerSettings(Parameters, ABC):
         return None
 
 
+class Bandwidth(NamedTuple):
+    """Of the lateral axes, and of the height, whose delay is that of the thrust."""
+
+    lateral_radps: float
+    vertical_radps: float
+
+    def __str__(self) -> str:
+        both = f"{self.lateral_radps:.1f} rad/s"
+        same = self.lateral_radps == self.vertical_radps
+        return both if same else f"{both}, of the height {self.vertical_radps:.1f} rad/s"
+
+
 @runtime_checkable
 class Adaptive(Protocol):
     """A controller that can continue with the constants identified in flight. Optional."""
@@ -149,8 +161,8 @@ class Adaptive(Protocol):
         ...
 
     @property
-    def bandwidth_radps(self) -> float:
-        """The bandwidth in use, rad/s: at most the configured one."""
+    def bandwidth(self) -> Bandwidth:
+        """The bandwidth in use: at most the configured one."""
         ...
 
     def set_vehicle(self, vehicle: Vehicle, uncertainty: DelayUncertainty) -> None:

@@ -141,8 +141,8 @@ class HorizonLaw(TrackingLaw):
         self.previous = None
         self._rng = np.random.default_rng(self._seed)
 
-    def _use_gains(self, bandwidth_radps: float) -> None:
-        super()._use_gains(bandwidth_radps)
+    def _use_gains(self) -> None:
+        super()._use_gains()
         settings = self._settings
         self.quadratic = HorizonQuadratic(self, settings.planned)
         speed_limit_mps = settings.speed_limit_mps or math.inf

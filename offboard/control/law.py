@@ -42,6 +42,7 @@ from pydantic import Field
 
 from offboard.control.bandwidth import supported_bandwidth
 from offboard.control.base import (
+    Bandwidth,
     Certificate,
     ControllerSettings,
     Decision,
@@ -138,7 +139,8 @@ class TrackingLaw:
 
     def __init__(self, vehicle: Vehicle, settings: TrackingSettings, period_s: float = 0.1) -> None:
         self.period_s = period_s
-        self.configured_radps = self.bandwidth_radps = settings.bandwidth_radps
+        self.configured_radps = settings.bandwidth_radps
+        self.bandwidth = Bandwidth(self.configured_radps, self.configured_radps)
         self.settings, self._vehicle_file = settings, vehicle
         self._bandwidth_found_for: object = None  # delays and their uncertainty
         self.set_vehicle(vehicle)
@@ -153,19 +155,18 @@ class TrackingLaw:
         self._tilt_ripple = tilt_ripple(vehicle, self.period_s)
         self._thrust_ripple = thrust_ripple(vehicle, self.period_s)
         delays = vehicle.tilt, vehicle.thrust_delay_s, vehicle.thrust_lag_s, uncertainty
-        bandwidth = self.bandwidth_radps
+        configured = self.configured_radps
         if uncertainty is None:
-            bandwidth = self.configured_radps
+            self.bandwidth = Bandwidth(configured, configured)
         elif delays != self._bandwidth_found_for:  # another drag alone changes no bandwidth
-            configured = self.configured_radps
-            bandwidth = supported_bandwidth(vehicle, uncertainty, self.period_s, configured)
+            self.bandwidth = supported_bandwidth(vehicle, uncertainty, self.period_s, configured)
         self._bandwidth_found_for = delays
-        self._use_gains(bandwidth)
+        self._use_gains()
 
-    def _use_gains(self, bandwidth_radps: float) -> None:
-        self.bandwidth_radps = bandwidth_radps
-        self.lateral = lateral_gain(self.vehicle, bandwidth_radps, self.period_s)
-        self.vertical = vertical_gain(self.vehicle, bandwidth_radps, self.period_s)
+    def _use_gains(self) -> None:
+        lateral_radps, vertical_radps = self.bandwidth
+        self.lateral = lateral_gain(self.vehicle, lateral_radps, self.period_s)
+        self.vertical = vertical_gain(self.vehicle, vertical_radps, self.period_s)
 
     def problem(self, situation: Situation) -> TrackingProblem:
         """The problem of this tick. Raises DecisionError where its cost is not finite."""

@@ -177,6 +177,6 @@ class MpcLaw(TrackingLaw):
         inputs = problem.inputs(self._quadratic.plan(best)[0])
         return decision(problem.quadratic.clip(inputs), certificate)
 
-    def _use_gains(self, bandwidth_radps: float) -> None:
-        super()._use_gains(bandwidth_radps)
+    def _use_gains(self) -> None:
+        super()._use_gains()
         self._quadratic = HorizonQuadratic(self, self._steps)

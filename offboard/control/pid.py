@@ -52,13 +52,14 @@ class PidLaw(TrackingLaw):
         self._integral = np.zeros(3)  # m/s^2, NED
 
     def decide(self, situation: Situation) -> Decision:
-        problem, gains, slower = self.problem(situation), self._gains, self._slower
+        problem, gains = self.problem(situation), self._gains
+        slower, _, slower_climb = self._slower
         lateral, vertical = problem.at_hover, problem.vertical
         north_east_mps = lateral[1] + slower * gains.position_gain_ps * lateral[0]
-        climb_mps = vertical[1] + slower * gains.height_gain_ps * vertical[0]
+        climb_mps = vertical[1] + slower_climb * gains.height_gain_ps * vertical[0]
         asked = np.empty(3)  # acceleration against the error, m/s^2, NED; lateral as in hover
         asked[:2] = slower * gains.velocity_gain_ps * north_east_mps
-        asked[2] = slower * gains.climb_gain_ps * climb_mps
+        asked[2] = slower_climb * gains.climb_gain_ps * climb_mps
         asked[:2] += self._integral[:2] @ problem.target.to_hover
         asked[2] += self._integral[2]
         asked[:2] /= self.vehicle.gravity_mps2  # as tilt
@@ -73,9 +74,10 @@ class PidLaw(TrackingLaw):
         self._integral = np.zeros(3)
 
     @property
-    def _slower(self) -> float:
-        """Factor on the gains, for the delay."""
-        return self.bandwidth_radps / self.configured_radps
+    def _slower(self) -> Array:
+        """Factors (3,) on the gains, NED, for the delay."""
+        lateral_radps, vertical_radps = self.bandwidth
+        return np.array((lateral_radps, lateral_radps, vertical_radps)) / self.configured_radps
 
     def _integrate(self, off_ned_m: Array, free: NDArray[np.bool_]) -> None:
         """Add the error of the axes whose command is not at its bound: no wind-up."""

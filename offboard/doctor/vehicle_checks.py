@@ -174,7 +174,7 @@ def _bandwidth(seen: Observation) -> Iterable[Finding]:
     if wanted is None or delay is None:
         return
     uncertainty = DelayUncertainty(SDS * delay.sd, SDS * delay.sd, link_s=delay.value)
-    possible = supported_bandwidth(config.vehicle, uncertainty, config.period_s, wanted)
+    possible = min(supported_bandwidth(config.vehicle, uncertainty, config.period_s, wanted))
     if possible < wanted:
         yield warn(
             f"with a delay of {1e3 * delay.value:.0f} +- {1e3 * delay.sd:.0f} ms the link bears a "

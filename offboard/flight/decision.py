@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import astuple
+from operator import sub
 
 from offboard.control.base import Adaptive, Situation
 from offboard.documents.errors import located
@@ -46,7 +47,7 @@ def begin(flight: FlightState) -> None:
     """Before the first decision: the vehicle is not identified yet."""
     if flight.identification and isinstance(flight.controller, Adaptive):
         flight.controller.set_vehicle(flight.model, flight.identification.uncertainty)
-        flight.announced_radps = flight.controller.configured_radps
+        flight.told_radps = 2 * (flight.controller.configured_radps,)
 
 
 def decide(flight: FlightState) -> bool:
@@ -169,15 +170,15 @@ def _with_bandwidth(
     flight: FlightState, update: VehicleUpdate, controller: Adaptive
 ) -> tuple[str, ...]:
     """The sentences for the user, and the bandwidth in use if it has changed noticeably."""
-    used_radps, configured_radps = controller.bandwidth_radps, controller.configured_radps
-    changed_radps = abs(used_radps - flight.announced_radps)
-    as_configured = used_radps == configured_radps
+    used, configured_radps = controller.bandwidth, controller.configured_radps
+    changed_radps = max(map(abs, map(sub, used, flight.told_radps)))
+    as_configured = set(used) == {configured_radps}
     if not changed_radps or (changed_radps < NOTICEABLE_RADPS and not as_configured):
         return update.sentences
-    flight.announced_radps = used_radps
-    text = f"bandwidth limited to {used_radps:.1f} rad/s (configured {configured_radps:.1f})"
+    flight.told_radps = used
+    text = f"bandwidth limited to {used} (configured {configured_radps:.1f})"
     if as_configured:
-        text = f"bandwidth {used_radps:.1f} rad/s as configured"
+        text = f"bandwidth {used} as configured"
     if update.cause:
         return (*update.sentences, f"{text}: {update.cause}")
     return ("; ".join((*update.sentences, text)),)

@@ -131,7 +131,7 @@ class FlightState(Ground):
     command: Command = field(default_factory=lambda: Command(0.0, LEVEL_DIRECTION, 0.0))  # in force
     newest_setpoint: AttitudeTarget | PositionTarget | None = None  # until it is repeated
     decided: Decided | None = None  # in this turn
-    announced_radps: float = math.nan  # bandwidth in use, as the user knows it
+    told_radps: tuple[float, ...] = (math.nan, math.nan)  # bandwidth, as the user knows it
     missed: int = 0  # decisions in a row that were not sent
     failure: str = ""  # what prevented the newest of them
     failure_cause: str = ""  # in a word: controller, link or computer

@@ -88,7 +88,7 @@ def test_late_link_is_noticed_and_flown(direction: str, most_m: float) -> None:
     limits: list[tuple[float, float]] = []  # of the bandwidth, and since when
 
     def note(flying: Pair) -> None:
-        limit = flying.companion.controller.bandwidth_radps
+        limit = flying.companion.controller.bandwidth.lateral_radps
         if in_phase(Phase.TRACK, CHANGED_S)(flying) and limit not in [x for _, x in limits[-1:]]:
             limits.append((flying.time_s, limit))
 
