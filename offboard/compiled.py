@@ -157,16 +157,17 @@ def directory() -> Path:
     name = hashed.hexdigest()[:16]
     given = (os.environ.get(key, "") for key in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"))
     for cache in filter(os.path.isabs, (*given, os.path.expanduser("~/.cache"))):
-        if _usable(place := Path(cache) / "pso-offboard" / name):
+        if _writable(place := Path(cache) / "pso-offboard" / name):
             return place
     place = Path(tempfile.gettempdir()) / f"pso-offboard-{os.getuid()}-{name}"
-    return place if _usable(place) else Path(tempfile.mkdtemp())
+    # everybody writes there: machine code of others is not run
+    ours = _writable(place) and place.lstat().st_uid == os.getuid()
+    return place if ours else Path(tempfile.mkdtemp())
 
 
-def _usable(place: Path) -> bool:
-    """Whether the directory can be written and is ours: machine code of others is not run."""
+def _writable(place: Path) -> bool:
     with suppress(OSError):
         place.mkdir(mode=0o700, parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=place).close()
-        return place.lstat().st_uid == os.getuid()
+        return True
     return False

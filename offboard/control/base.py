@@ -146,9 +146,8 @@ class Bandwidth(NamedTuple):
     vertical_radps: float
 
     def __str__(self) -> str:
-        both = f"{self.lateral_radps:.1f} rad/s"
-        same = self.lateral_radps == self.vertical_radps
-        return both if same else f"{both}, of the height {self.vertical_radps:.1f} rad/s"
+        lateral, vertical = (f"{each:.1f} rad/s" for each in self)
+        return lateral if lateral == vertical else f"{lateral} laterally, {vertical} in height"
 
 
 @runtime_checkable

@@ -157,15 +157,15 @@ def _hover(seen: Observation) -> Iterable[Finding]:
 
 
 def _tilt(seen: Observation, needed_rad: float) -> Iterable[Finding]:
-    name, unit = seen.dialect.tilt_parameter
-    value = seen.vehicle.parameters.get(name)
-    if value is not None and needed_rad > value * unit:
-        enough = math.ceil(math.degrees(needed_rad) + 1.0) * math.radians(1.0) / unit
-        yield warn(
-            f"the reference tilts by {math.degrees(needed_rad):.0f} deg, the autopilot's own modes "
-            f"by at most {math.degrees(value * unit):.0f} deg ({name})",
-            f"fly slower, or param set {name} {enough:g}",
-        )
+    for name, unit in seen.dialect.tilt_parameters.items():
+        value = seen.vehicle.parameters.get(name)
+        if value is not None and needed_rad > value * unit:
+            enough = math.ceil(math.degrees(needed_rad) + 1.0) * math.radians(1.0) / unit
+            yield warn(
+                f"the reference tilts by {math.degrees(needed_rad):.0f} deg, the autopilot's own "
+                f"modes by at most {math.degrees(value * unit):.0f} deg ({name})",
+                f"fly slower, or param set {name} {enough:g}",
+            )
 
 
 def _bandwidth(seen: Observation) -> Iterable[Finding]:

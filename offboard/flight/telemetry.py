@@ -58,10 +58,7 @@ def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: flo
     """`arrived_s` is the host time of the event's arrival, `turned_s` that of the turn. False if
     the event is no news (see `VehicleState.update`)."""
     if isinstance(event, Parameter):
-        known = flight.vehicle.parameters.get(event.name, event.value)
-        if known != event.value:
-            sentence = f"{event.name} was changed from {known:g} to {event.value:g}"
-            outbox.announce(flight, sentence, once=True)
+        _announce_change(flight, event)
     if not flight.vehicle.update(event, flight.session.link_time_s):
         return False
     match event:
@@ -95,6 +92,18 @@ def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: flo
         case Rebooted():
             _on_reboot(flight)
     return True
+
+
+def _announce_change(flight: FlightState, parameter: Parameter) -> None:
+    """A watched parameter has changed; the hover thrust that ArduCopter learns does not count."""
+    name, now, dialect = parameter.name, parameter.value, flight.dialect
+    before = flight.vehicle.parameters.get(name, now)
+    if before == now or dialect is None or name == dialect.hover_parameter:
+        return
+    watched = next(each for each in dialect.watched_parameters if each.name == name)
+    fault = watched.fault(now)
+    why = f": {fault.found}. Fix: {fault.fix}" if fault else ""
+    outbox.announce(flight, f"{name} was changed from {before:g} to {now:g}{why}")
 
 
 def is_of_another(flight: FlightState, event: Event) -> bool:

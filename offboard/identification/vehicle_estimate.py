@@ -17,6 +17,8 @@ from offboard.identification.attitude_fit import ResponseFit, Unexplained
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_fit import (
     LINK_S,
+    THRUST_DELAY_SD_S,
+    THRUST_LAG_SD_S,
     Identified,
     log_record,
     summary,
@@ -26,11 +28,14 @@ from offboard.identification.vehicle_fit import (
 from offboard.model.vehicle import DelayUncertainty, Vehicle
 
 # What a delay may be wrong by: of a vehicle file in general, where a response that is slower counts
-# as a delay, too; of one that is flown as it is; of an identified one that telemetry contradicts
-UNKNOWN_DELAY_S, FILE_DELAY_S, DOUBTED_DELAY_S = 0.4, 0.13, 0.28
+# as a delay, too
+UNKNOWN_DELAY_S = 0.4
+FILE_DELAY_S = 0.13  # of a vehicle file that is flown as it is
+DOUBTED_DELAY_S = 0.28  # of a tilt that was fitted or flown, and that telemetry contradicts
 # Standard deviations by which an identified delay of tilt or thrust may be wrong: with an error of
 # the thrust's the height oscillates, with one of the tilt's the vehicle may crash
 SDS, THRUST_SDS = 3.0, 2.0
+THRUST_SD_S = math.hypot(THRUST_DELAY_SD_S, THRUST_LAG_SD_S)  # before a fit
 DIRECT_LINK_S = 0.004  # link delay without a slow link: age of telemetry
 LINK_DIGITS = 2  # of seconds: a smaller change of the link is ignored
 # After so many contradictions the delay stays uncertain until nothing contradicts for CALM_S
@@ -49,11 +54,13 @@ LINKED = ("yaw", "thrust_delay_s")  # changed with the tilt's delay where not id
 class IdentifiedVehicle:
     """What a flight has identified, for the next one of the same vehicle. The delays of `vehicle`
     contain the link's delay of then, `link_s` (telemetry and setpoint together; 0 if it was not
-    measured). `delay` is the delay of the tilt and its standard deviation, s."""
+    measured). `delay` is the delay of the tilt and its standard deviation, s; `thrust` delay and
+    lag of the thrust together, None where no fit was adopted."""
 
     vehicle: Vehicle
     delay: Estimate
     link_s: float
+    thrust: Estimate | None = None
 
 
 class VehicleEstimate:
@@ -83,7 +90,7 @@ class VehicleEstimate:
         self.adopted_s = -math.inf
         self._recalled = known
         self._unknown_s = delay_error_s
-        self._thrust: Estimate | None = None  # delay and lag of the thrust, once identified
+        self._thrust = known.thrust if known else None  # delay and lag, once identified
         self._link_s = 0.0  # the link's delay before the flight
         self._link = (0.0, 0.0)  # added since take-off, and changed lately
         self._doubt_s = 0.0  # what the delay may be wrong by because telemetry contradicts it
@@ -98,7 +105,7 @@ class VehicleEstimate:
         """What is not known of the delays of `vehicle`."""
         added_s, changed_s = self._link
         known_s = SDS * self.delay.sd if self.delay else self._unknown_s
-        thrust_s = 0.0 if self.delay else self._unknown_s
+        thrust_s = THRUST_SDS * THRUST_SD_S if self.delay else self._unknown_s
         if self._thrust:
             thrust_s = THRUST_SDS * self._thrust.sd
         tilt_s = max(known_s, self._doubt_s, changed_s)
@@ -124,7 +131,7 @@ class VehicleEstimate:
         """What the next flight may begin with; None if nothing was identified, or in doubt."""
         if self.delay is None or self.contradicted:
             return None
-        return IdentifiedVehicle(self.vehicle, self.delay, self._link_s)
+        return IdentifiedVehicle(self.vehicle, self.delay, self._link_s, self._thrust)
 
     @property
     def previous(self) -> Vehicle:

@@ -97,7 +97,7 @@ def _network_link(kind: str, host: str, port: int) -> Link:
 
 def _resolved(host: str, port: int) -> tuple[int, tuple[Any, ...]]:
     """Address family and socket address of a host, IPv4 if it has both. Raises OSError."""
-    try:  # asked for IPv6 too, a `localhost` that is ::1 alone has no 127.0.0.1
+    try:  # of a `localhost` that is ::1 alone, glibc gives 127.0.0.1 only where IPv4 is asked for
         found = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)
     except socket.gaierror:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)

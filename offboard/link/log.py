@@ -162,7 +162,7 @@ def new_file(path: Path) -> Iterator[BinaryIO]:
             yield file
         try:
             os.link(incomplete, path)  # unlike a rename, refuses to replace a file
-        except OSError:  # a file system without links
+        except OSError:  # the file exists, or the file system has no links
             if os.path.lexists(path):
                 raise FileExistsError(EEXIST, os.strerror(EEXIST)) from None
             incomplete.rename(path)

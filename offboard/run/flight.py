@@ -236,7 +236,8 @@ def rehearse(prepared: Prepared, *, keeps_deadline: bool) -> float:
     least_s = math.nan
     if keeps_deadline:
         cut_short = replace(situation, remaining_s=lambda: 0.0)
-        least_s = _check_deadline(controller, cut_short, config.budget_s)
+        with outside("controller"):
+            least_s = _check_deadline(controller, cut_short, config.budget_s)
     prepared.track.sample(np.array([0.0, 1.0]))
     with outside("controller"):
         controller.reset()

@@ -101,6 +101,7 @@ class Document(BaseModel):
     tilt_delay_s: float = Field(ge=0, le=1)
     tilt_delay_sd_s: float = Field(gt=0, le=1)
     link_delay_s: float = Field(ge=0, le=10)
+    thrust_delay_sd_s: float | None = Field(default=None, gt=0, le=1)  # of delay and lag together
     vehicle: Vehicle
 
 
@@ -141,6 +142,7 @@ class VehicleFiles:
             "tilt_delay_s": identified.delay.value,
             "tilt_delay_sd_s": identified.delay.sd,
             "link_delay_s": identified.link_s,
+            "thrust_delay_sd_s": identified.thrust.sd if identified.thrust else None,
             "vehicle": identified.vehicle.model_dump(mode="json"),
         }
         path = self._directory / f"{key}.yaml"
@@ -155,9 +157,10 @@ class VehicleFiles:
 def _load(path: Path) -> tuple[str, IdentifiedVehicle]:
     document = parse(read_text(path), Document, str(path))
     delay = Estimate(document.tilt_delay_s, document.tilt_delay_sd_s)
-    return document.identified_from, IdentifiedVehicle(
-        document.vehicle, delay, document.link_delay_s
-    )
+    vehicle, sd_s = document.vehicle, document.thrust_delay_sd_s
+    thrust = Estimate(vehicle.thrust_delay_s + vehicle.thrust_lag_s, sd_s) if sd_s else None
+    identified = IdentifiedVehicle(vehicle, delay, document.link_delay_s, thrust)
+    return document.identified_from, identified
 
 
 def _digest(vehicle: Vehicle) -> str:

@@ -94,7 +94,9 @@ class Guidance:
         self.home_ned_m = ORIGIN
         self.home_yaw_rad = 0.0
         self.cruise_mps = math.inf  # requested for automatic flight; inf: none
-        self.region_ned_m: tuple[float, float] | None = None  # of interest, faced where no yaw is
+        self.region_ned_m: tuple[float, float] | None = (
+            None  # of interest, faced while it holds a place or follows setpoints without a yaw
+        )
         self._behaviours = behaviours
         self.behaviour = Behaviour.HOLD
         self.active = behaviours[Behaviour.HOLD](self)

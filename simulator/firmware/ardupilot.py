@@ -43,7 +43,7 @@ _NOT_ENTERED = {
     28: "TURTLE failed: init failed",
 }
 # MAV_CMD accepted without an effect that the simulator shows, and failed without their devices
-_TAKEN = (181, 197, 203, 206, 207, 208, 209, 2001, 5300, 42001, 42003, 42424, 42428)
+_TAKEN = (181, 203, 206, 207, 208, 209, 2001, 5300, 42001, 42003, 42424, 42428)
 _FAILED = (84, 184, 189, 193, 205, 211, 218, 500, 2000, 2500)
 
 _CENTI = 0.01

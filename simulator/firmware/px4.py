@@ -237,8 +237,8 @@ PX4 = Px4(
     scenario="px4_like",
     mav_autopilot=12,
     version=0x011001FF,  # 1.16.1, release
-    # float parameters, missions and commands in integers, bytewise parameters, targets of attitude,
-    # local and global position, MAVLink 2
+    # float parameters, missions and commands in integers, bytewise parameters, targets of attitude
+    # and local position, termination, MAVLink 2, fences, rally points
     capabilities=0xE8DF,  # of 1.16.1, without FTP
     origin=(47.397742, 8.545594, 489.4),
     modes=MODES,

@@ -211,7 +211,7 @@ class Commands:
         return result
 
     def _face(self, autopilot: Autopilot, command: Command) -> Result:
-        """MAV_CMD_DO_SET_ROI and DO_SET_ROI_LOCATION: face a place; 0, 0 is none."""
+        """MAV_CMD_DO_SET_ROI and its kinds: face a place; 0, 0 is none."""
         latitude, longitude = command.params[4:6]
         place = to_metres(autopilot.firmware.origin, latitude, longitude)
         autopilot.guidance.turn_to(math.nan, math.inf, 0.0)
@@ -297,6 +297,7 @@ HANDLERS: dict[int, Callable[[Commands, Autopilot, Command], Result | None]] = {
     185: Commands._terminate,  # DO_FLIGHTTERMINATION
     192: Commands._reposition,  # DO_REPOSITION
     195: Commands._face,  # DO_SET_ROI_LOCATION
+    197: Commands._face,  # DO_SET_ROI_NONE
     201: Commands._face,  # DO_SET_ROI
     224: Commands._set_current_item,  # DO_SET_MISSION_CURRENT
     246: Commands._reboot,  # PREFLIGHT_REBOOT_SHUTDOWN

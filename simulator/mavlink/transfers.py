@@ -147,7 +147,7 @@ class MissionTransfer:
             return
         now_s = self._now_s
         if now_s - upload.begun_s > GIVE_UP_S:
-            self._acknowledge(upload.peer, Ack.CANCELLED)
+            self._acknowledge(upload.peer, Ack.CANCELLED, upload.kind)
             self._upload = None
         elif now_s - upload.requested_s > REPEAT_S:
             self._request_item(upload)
@@ -188,7 +188,7 @@ class MissionTransfer:
         refused = None if kind else self._firmware.mission_refusal(item)
         if refused is not None:
             result, text = refused
-            self._acknowledge(upload.peer, result)
+            self._acknowledge(upload.peer, result, upload.kind)
             if text is not None:
                 self.outbox.send_text(text)
             self._upload = None
@@ -215,7 +215,7 @@ class MissionTransfer:
         elif message.type == Ack.CANCELLED:
             self._upload = None
 
-    def _acknowledge(self, peer: Peer, ack: int, mission_type: int = 0) -> None:
+    def _acknowledge(self, peer: Peer, ack: int, mission_type: int) -> None:
         self.outbox.send("MISSION_ACK", *peer, int(ack), mission_type)
 
     # -- down, and the rest ------------------------------------------------------------------

@@ -234,8 +234,10 @@ def test_nothing_is_said_of_a_good_vehicle(firmware: Firmware) -> None:
 @pytest.mark.parametrize(
     "replies",
     [
-        ("SYSID_MYGCS", "SYSID_ENFORCE", "PSC_JERK_XY", "ARMING_CHECK"),  # ArduCopter 4.6
-        ("MAV_GCS_SYSID", "MAV_OPTIONS", "PSC_JERK_NE", "ARMING_SKIPCHK"),  # 4.7
+        # ArduCopter 4.6, 4.7.0 and 4.7.1
+        ("SYSID_MYGCS", "SYSID_ENFORCE", "PSC_JERK_XY", "ARMING_CHECK", "ANGLE_MAX"),
+        ("MAV_GCS_SYSID", "MAV_OPTIONS", "PSC_JERK_NE", "ARMING_SKIPCHK", "ATC_ANGLE_MAX"),
+        ("MAV_GCS_SYSID", "MAV_OPTIONS", "PSC_NE_JERK", "ARMING_SKIPCHK", "ATC_ANGLE_MAX"),
     ],
 )
 def test_parameters_of_another_release_are_not_awaited(replies: tuple[str, ...]) -> None:
@@ -243,7 +245,7 @@ def test_parameters_of_another_release_are_not_awaited(replies: tuple[str, ...])
     missing = {each.name for each in DIALECTS["ardupilot"].unanswered(known)}
     assert missing == {
         "GUID_OPTIONS", "GUID_TIMEOUT", "MOT_THST_HOVER", "ATC_ANGLE_BOOST", "FS_GCS_ENABLE",
-        "FS_THR_ENABLE", "ANGLE_MAX",
+        "FS_THR_ENABLE",
     }  # fmt: skip
 
 

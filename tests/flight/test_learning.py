@@ -100,8 +100,8 @@ def test_unseen_vehicle_is_identified_in_flight_and_from_its_log(true: Vehicle) 
 
 @pytest.mark.slow
 def test_slow_thrust_is_identified() -> None:
-    """From the steps, though they leave it uncertain, nearer to what is expected than it is, and
-    with less bandwidth. Otherwise it is 0.5 to 1.2 m off."""
+    """From the steps, which leave it uncertain: it is found shorter than it is, and the height is
+    flown with less bandwidth. Otherwise it is 0.5 to 1.2 m off."""
     flies = TRUE.model_copy(update={"thrust_lag_s": 0.5})
     pair = learning(ONE_LAP, flies=flies, seed=3, aloft=False)
     pair.track()

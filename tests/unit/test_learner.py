@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from laws import PX4
@@ -73,6 +76,8 @@ def test_doubt_ends_with_what_explains_the_flight() -> None:
     assert (unknown.tilt_s, unknown.thrust_s) == (UNKNOWN_DELAY_S, UNKNOWN_DELAY_S)
     estimate = estimate_with(fit(0.05))
     assert estimate.uncertainty.tilt_s == pytest.approx(KNOWN_S)
+    # two sd of what a fit of the thrust begins with, 30 ms of delay and 50 ms of lag
+    assert estimate.uncertainty.thrust_s == pytest.approx(2.0 * math.hypot(0.03, 0.05))
     estimate.on_contradiction(CONTRADICTS, CONTRADICTS, 10.0)
     assert estimate.uncertainty.tilt_s == DOUBTED_DELAY_S
     estimate.review_tilt(fit(0.05, 5.0, left=0.04), CONTRADICTS, 12.0)
@@ -234,5 +239,7 @@ def test_without_identification_the_file_is_flown_and_nothing_is_recalled() -> N
         told += [learner.learn(since_s + 0.1 * tick, 0.53) for tick in range(50)]
     (update,) = filter(None, told)
     assert (update.vehicle, update.uncertainty.tilt_s) == (FILE, FILE_DELAY_S)
+    again = Learner(FILE, IdentifySettings(), known=replace(recalled, thrust=Estimate(0.1, 0.09)))
+    assert again.uncertainty.thrust_s == pytest.approx(0.18)
     assert update.cause.endswith("the vehicle file's delay may be wrong by 130 ms")
     assert (update.sentences, learner.result) == ((), None)

@@ -226,6 +226,8 @@ def test_bandwidth_allows_for_an_uncertain_delay_of_the_thrust(wrong_s):
     lateral, lowered = supported(believed, 9.0, 0.003, thrust_sd_s=0.03)
     assert 4.0 < lowered < 7.0
     assert lateral == supported(believed, 9.0, 0.003).lateral_radps > 7.0
+    assert str(Bandwidth(7.0, 7.0)) == "7.0 rad/s"
+    assert str(Bandwidth(7.0, 3.25)) == "7.0 rad/s laterally, 3.2 rad/s in height"
     truth = believed.model_copy(update={"thrust_delay_s": 0.196 + wrong_s})
     assert settled_rmse_m(truth, believed, lowered) < 0.05
     assert settled_rmse_m(truth, believed, 14.0) > 0.1

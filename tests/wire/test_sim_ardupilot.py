@@ -373,6 +373,10 @@ def test_streams_show_the_goal_and_the_outputs_and_a_region_of_interest_is_follo
     assert (outputs.servo1_raw, outputs.servo9_raw) == (pytest.approx(1580, abs=60), 1700)
     assert newest("VFR_HUD").airspeed == pytest.approx(math.hypot(*bench.velocity), abs=0.5)
     assert newest("RAW_IMU").zacc == pytest.approx(-980, abs=60)
+    assert bench.command(197) == [ACCEPTED]
+    assert reposition(bench, 40.0, 0.0, 5.0, RELATIVE) == ACCEPTED
+    bench.run(4.0)
+    assert off_deg(bench, 0.0) < 20.0  # it turns to the place again
 
 
 def test_a_requested_speed_holds_until_a_setpoint_of_another_kind() -> None:

@@ -35,7 +35,7 @@ _JERK = WatchedParameter(
     # BRAKE slows down by the jerk / 7.5 of the speed per second
     advice=(
         Valid(
-            "BRAKE, which is asked for hold, takes 7.5 m divided by this to stop for each m/s",
+            "hold is BRAKE, which stops within 7.5 m, divided by this value, for each m/s of speed",
             10.0,
             lowest=10.0,
         ),
@@ -100,11 +100,12 @@ ARDUPILOT = Dialect(
         replace(_STATION, name="MAV_GCS_SYSID", replaces=_STATION.name),
         _JERK,
         replace(_JERK, name="PSC_JERK_NE", replaces=_JERK.name),
+        replace(_JERK, name="PSC_NE_JERK", replaces=_JERK.name),
         WatchedParameter("FS_THR_ENABLE", "what the vehicle does when the radio is lost"),
         WatchedParameter("SYSID_ENFORCE", "whether commands are accepted only from SYSID_MYGCS"),
         WatchedParameter(
             "MAV_OPTIONS",
-            "1: commands are accepted only from MAV_GCS_SYSID",
+            "bit 0 (value 1): commands are accepted only from MAV_GCS_SYSID",
             replaces="SYSID_ENFORCE",
         ),
         WatchedParameter(
@@ -117,9 +118,14 @@ ARDUPILOT = Dialect(
             replaces="ARMING_CHECK",
         ),
         WatchedParameter("ANGLE_MAX", "greatest tilt of its own modes, hundredths of a degree"),
+        WatchedParameter(
+            "ATC_ANGLE_MAX", "greatest tilt of its own modes, degrees", replaces="ANGLE_MAX"
+        ),
     ),
     hover_parameter="MOT_THST_HOVER",
-    tilt_parameter=("ANGLE_MAX", math.radians(0.01)),
+    tilt_parameters=MappingProxyType(
+        {"ANGLE_MAX": math.radians(0.01), "ATC_ANGLE_MAX": math.radians(1.0)}
+    ),
     estimator_message="EKF_STATUS_REPORT",
     slow_hint="another ground station may set the rates (MAVProxy: `set streamrate -1`), or the "
     "link is full",

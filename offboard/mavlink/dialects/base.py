@@ -81,8 +81,8 @@ class WatchedParameter:
 
     A flight is refused where a value is not as `required`, and without a reply to a parameter that
     `must_answer`. `advice` is for `offboard doctor`, and so is the whole parameter if it is
-    `advice_only`. `values` explains the values of an enumeration. `replaces`: the parameter of
-    older releases that it takes the place of.
+    `advice_only`. `values` explains the values of an enumeration. `replaces`: its name in the
+    oldest release.
     """
 
     name: str
@@ -93,6 +93,11 @@ class WatchedParameter:
     advice_only: bool = False
     values: tuple[str, ...] = ()
     replaces: str = ""
+
+    @property
+    def oldest(self) -> str:
+        """Its name in the oldest release."""
+        return self.replaces or self.name
 
     def fault(self, value: float) -> ParameterFault | None:
         """Why a vehicle with this `value` is not flown, or None if it is."""
@@ -159,7 +164,7 @@ class Dialect:
     watched_parameters: tuple[WatchedParameter, ...]
     wanted: tuple[WantedMessage, ...]
     hover_parameter: str  # normalised thrust that holds the weight
-    tilt_parameter: tuple[str, float]  # greatest tilt of its own modes, and its unit in rad
+    tilt_parameters: Mapping[str, float]  # greatest tilt of its own modes: its unit in rad
     estimator_message: str  # the message that becomes an EstimatorReport
     slow_hint: str  # what to do where telemetry comes slower than it was requested
     unsaid: str  # where a reason is found that no STATUSTEXT tells us
@@ -176,13 +181,9 @@ class Dialect:
         return self.modes.get(custom_mode) or f"UNKNOWN(0x{custom_mode:08x})"
 
     def unanswered(self, known: Mapping[str, float]) -> list[WatchedParameter]:
-        """The watched parameters without a reply, but for those of another release."""
-        older = {each.replaces for each in self.watched_parameters if each.name in known}
-        return [
-            each
-            for each in self.watched_parameters
-            if each.name not in {*known, *older} and each.replaces not in known
-        ]
+        """The watched parameters without a reply, under this name or that of another release."""
+        replied = {each.oldest for each in self.watched_parameters if each.name in known}
+        return [each for each in self.watched_parameters if each.oldest not in replied]
 
     def set_mode(self, name: str) -> CommandLong:
         """MAV_CMD_DO_SET_MODE. Raises KeyError for an unknown mode."""

@@ -127,7 +127,7 @@ PX4 = Dialect(
         WatchedParameter("MPC_TILTMAX_AIR", "greatest tilt of its own modes, degrees"),
     ),
     hover_parameter="MPC_THR_HOVER",
-    tilt_parameter=("MPC_TILTMAX_AIR", math.radians(1.0)),
+    tilt_parameters=MappingProxyType({"MPC_TILTMAX_AIR": math.radians(1.0)}),
     estimator_message="ESTIMATOR_STATUS",
     slow_hint="raise MAV_x_RATE of this link, in bytes/s: PX4 slows all messages down to it",
     # PX4 sends these texts only on a link on which a HEARTBEAT of type GCS arrives. Ours is not:
