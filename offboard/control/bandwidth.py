@@ -43,10 +43,10 @@ VERTICAL_SDS = ((0, NOISE.position_sd_m),)
 def supported_bandwidth(
     vehicle: Vehicle, uncertainty: DelayUncertainty, period_s: float, most_radps: float
 ) -> Bandwidth:
-    """Of each loop `most_radps`, or the highest bandwidth below it, in steps of STEP_RADPS, with
-    which it is stable: the lateral one with a longer delay of the tilt, the vertical one with a
-    longer or a shorter one of the thrust (a modelled delay that is too long makes it unstable,
-    too); never below LEAST_RADPS.
+    """The bandwidth that each loop bears: `most_radps`, or the highest below it, in steps of
+    STEP_RADPS, with which the lateral loop is stable for a longer delay of the tilt, and the
+    vertical one for a longer or a shorter delay of the thrust (a modelled delay that is too long
+    makes it unstable, too); never below LEAST_RADPS.
 
     The delay differs by `uncertainty`, at least 40 ms, and for the tilt 15 % of its delay.
     """

@@ -140,7 +140,8 @@ class ControllerSettings(Parameters, ABC):
 
 
 class Bandwidth(NamedTuple):
-    """Of the lateral axes, and of the height, whose delay is that of the thrust."""
+    """Bandwidth of the lateral axes, limited by the delay of the tilt, and of the height, limited
+    by that of the thrust."""
 
     lateral_radps: float
     vertical_radps: float
