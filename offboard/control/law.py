@@ -140,7 +140,6 @@ class TrackingLaw:
     def __init__(self, vehicle: Vehicle, settings: TrackingSettings, period_s: float = 0.1) -> None:
         self.period_s = period_s
         self.configured_radps = settings.bandwidth_radps
-        self.bandwidth = Bandwidth(self.configured_radps, self.configured_radps)
         self.settings, self._vehicle_file = settings, vehicle
         self._bandwidth_found_for: object = None  # delays and their uncertainty
         self.set_vehicle(vehicle)

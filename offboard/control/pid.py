@@ -53,7 +53,7 @@ class PidLaw(TrackingLaw):
 
     def decide(self, situation: Situation) -> Decision:
         problem, gains = self.problem(situation), self._gains
-        slower, _, slower_climb = self._slower
+        slower, slower_climb = self._slower
         lateral, vertical = problem.at_hover, problem.vertical
         north_east_mps = lateral[1] + slower * gains.position_gain_ps * lateral[0]
         climb_mps = vertical[1] + slower_climb * gains.height_gain_ps * vertical[0]
@@ -74,16 +74,17 @@ class PidLaw(TrackingLaw):
         self._integral = np.zeros(3)
 
     @property
-    def _slower(self) -> Array:
-        """Factors (3,) on the gains, NED, for the delay."""
+    def _slower(self) -> tuple[float, float]:
+        """Factors on the lateral gains and on those of the height, for the delay."""
         lateral_radps, vertical_radps = self.bandwidth
-        return np.array((lateral_radps, lateral_radps, vertical_radps)) / self.configured_radps
+        return lateral_radps / self.configured_radps, vertical_radps / self.configured_radps
 
     def _integrate(self, off_ned_m: Array, free: NDArray[np.bool_]) -> None:
         """Add the error of the axes whose command is not at its bound: no wind-up."""
-        gains = self._gains
-        rates = np.array([gains.integral_gain_ps3] * 2 + [gains.height_integral_gain_ps3])
-        step = self._slower**3 * self.period_s * rates * off_ned_m
+        gains, (slower, slower_climb) = self._gains, self._slower
+        lateral = slower**3 * gains.integral_gain_ps3
+        rates = np.array((lateral, lateral, slower_climb**3 * gains.height_integral_gain_ps3))
+        step = self.period_s * rates * off_ned_m
         limit = gains.integral_limit_mps2
         self._integral = np.clip(
             np.where(free, self._integral + step, self._integral), -limit, limit

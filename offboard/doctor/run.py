@@ -21,7 +21,7 @@ from offboard.doctor import computer, link_checks, vehicle_checks
 from offboard.doctor.computer import holders
 from offboard.doctor.link_checks import wait
 from offboard.doctor.listening import LONGEST_S, Listening, Observation
-from offboard.documents.errors import UserError, shown
+from offboard.documents.errors import UserError, located, shown
 from offboard.flight import preflight
 from offboard.flight.preflight import Finding, Level
 from offboard.link import clock
@@ -213,7 +213,7 @@ def _judged(check: Check, seen: Observation, most_s: float) -> list[Finding]:
         hint = "close other programs and check again, or `offboard check` the configuration"
         return [wait("this was not examined in time", hint)]
     except (Exception, SystemExit) as error:  # whatever a check of another package raises
-        sentence = f"the check itself failed: {type(error).__name__}: {error}"
+        sentence = f"the check itself failed: {located(error)}"
         return [Finding(Level.WARN, sentence, AUTHOR)]
 
 

@@ -88,6 +88,21 @@ def test_a_law_that_ends_the_program_is_found_before_the_flight(
         rehearse(build(resolved), keeps_deadline=False)
 
 
+def test_a_law_that_fails_when_it_is_cut_short_is_found_before_the_flight(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    prepared = build(config.load("flight", known_vehicle="px4_sih"))
+    decide = type(prepared.controller).decide
+
+    def hasty(law: Any, situation: Situation) -> Decision:
+        assert situation.remaining_s is None or situation.remaining_s() > 0.0, "no time left"
+        return decide(law, situation)
+
+    monkeypatch.setattr(type(prepared.controller), "decide", hasty)
+    with pytest.raises(DocumentError, match="controller: AssertionError: no time left"):
+        rehearse(prepared, keeps_deadline=True)
+
+
 def test_a_law_that_other_programs_make_late_may_be_flown_later(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -49,7 +49,7 @@ def test_a_pure_wheel_flies_in_two_terminals_and_in_one(spawn: Spawn, tmp_path: 
     assert score["rmse_position_m"] < 0.1
     simulator.kill()
 
-    places["HOME"] = "/dev/null"  # no directory: no concern of who flies
+    places["HOME"] = "/dev/null"  # no directory: nothing is said about it
     again = spawn("offboard", "fly", "--sitl", "--out", "y", *HOVER, **places)
     shown, errors = again.communicate(timeout=150)
     assert (again.returncode, errors) == (0, "")
