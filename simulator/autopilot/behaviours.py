@@ -182,7 +182,7 @@ class FlyBySticks(ActiveBehaviour):
     def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
         """The velocity demanded; an axis without a demand holds its place."""
         guidance = self.guidance
-        descend = descent(guidance.hold_ned_m, guidance.firmware.descend_speed_mps)
+        descend = descent(guidance.hold_ned_m, guidance.parameters.role("descend_speed_mps"))
         if guidance.sticks is None:
             return descend
         demand = guidance.sticks.demand(estimate.time_s, estimate.yaw_rad)

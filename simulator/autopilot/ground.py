@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 from simulator.autopilot.parameters import ParameterTable
 from simulator.autopilot.state import StateEstimate
-from simulator.firmware.base import Landing
 from simulator.geodesy import GRAVITY_MPS2
 from simulator.steps import LOOP_S
 
@@ -61,13 +60,14 @@ class TakeoffRamp:
             self._ramp_s += LOOP_S
             self.flying = self._ramp_s >= self.parameters.role("takeoff_ramp_s")
 
-    def climb_limit_mps(self, velocity_p_ps: float) -> float:
+    def climb_limit_mps(self) -> float:
         """Allowed climb rate; negative, a descent, at first."""
         if self.flying:
             return math.inf
-        start_mps = -GRAVITY_MPS2 / velocity_p_ps
-        share = min(1.0, self._ramp_s / max(self.parameters.role("takeoff_ramp_s"), 1e-3))
-        return start_mps + share * (self.parameters.role("ramp_ends_mps") - start_mps)
+        role = self.parameters.role
+        start_mps = -GRAVITY_MPS2 / role("velocity_z_p")
+        share = min(1.0, self._ramp_s / max(role("takeoff_ramp_s"), 1e-3))
+        return start_mps + share * (role("ramp_ends_mps") - start_mps)
 
 
 @dataclass(slots=True)
@@ -77,7 +77,6 @@ class LandDetector:
     It uses the estimate, so a drifting one delays it. With ground contact the motors idle.
     """
 
-    limits: Landing
     parameters: ParameterTable
     landed: bool = True
     _contact_s: float = 0.0  # how long there is contact, no motion, no ground
@@ -112,19 +111,20 @@ class LandDetector:
             self.reset()
             return
         self._smooth(estimate)
-        least = self.parameters.role("thrust_least" if by_motion else "stick_thrust_least")
-        span = self.parameters.role("hover_thrust") - least
-        low = thrust <= least + self.limits.low_thrust_share * span
+        role = self.parameters.role
+        least = role("thrust_least" if by_motion else "stick_thrust_least")
+        span = role("hover_thrust") - least
+        low = thrust <= least + role("low_thrust_share") * span
         may_land = descends or not by_motion or self.landed or self._still_s > 0.0
         stands = estimate.on_ground and low and may_land and not self._moves(estimate)
         self._contact_s = self._contact_s + LOOP_S if stands else 0.0
-        idle = thrust <= least + self.limits.idle_thrust_share * span
+        idle = thrust <= least + role("idle_thrust_share") * span
         still = self.contact and idle and not self._rotates(estimate)
         self._still_s = self._still_s + LOOP_S if still else 0.0
         if self.landed:
             self.landed = self._air_s < _AIRBORNE_S and idle
         else:
-            self.landed = self._still_s >= self.parameters.role("settled_s")
+            self.landed = self._still_s >= role("settled_s")
 
     def _smooth(self, estimate: StateEstimate) -> None:
         down_m, velocity_mps = estimate.position_ned_m[2], estimate.velocity_ned_mps[2]
@@ -139,13 +139,13 @@ class LandDetector:
         return _LANDED_FACTOR if self.landed else 1.0
 
     def _moves(self, estimate: StateEstimate) -> bool:
+        role = self.parameters.role
         north, east, _ = estimate.velocity_ned_mps
         vertical_mps = min(abs(self._velocity_mps), abs(self._slope_mps))
-        return (
-            vertical_mps > self._factor * self.limits.speed_down_mps
-            or math.hypot(north, east) > self.limits.speed_across_mps
-        )
+        return vertical_mps > self._factor * role("still_down_mps") or math.hypot(
+            north, east
+        ) > role("still_across_mps")
 
     def _rotates(self, estimate: StateEstimate) -> bool:
         p, q, _ = estimate.rates_frd_radps
-        return math.hypot(p, q) > self._factor * self.limits.rate_radps
+        return math.hypot(p, q) > self._factor * self.parameters.role("still_radps")

@@ -104,8 +104,8 @@ class Health:
 
     def _ground_station(self, now_s: float) -> Iterator[str]:
         """A ground station that was never heard is not lost."""
-        timeout_s = self._parameters.role("ground_station_timeout_s")
-        timeout_s += self._firmware.ground_station_stays_s
+        role = self._parameters.role
+        timeout_s = role("ground_station_timeout_s") + role("ground_station_stays_s")
         lost = now_s - self._heartbeat_s > timeout_s
         if lost != self.ground_station_lost:
             self.ground_station_lost = lost

@@ -19,15 +19,15 @@ _FLOAT, _INT, _UNSIGNED = struct.Struct("<f"), struct.Struct("<i"), struct.Struc
 
 
 class ParameterTable:
-    """Parameter values by name, in the firmware's order; `changes` counts them."""
+    """Parameter values by name, in the firmware's order."""
 
     def __init__(self, firmware: Firmware) -> None:
         self._specs = {spec.name: spec for spec in firmware.parameters}
         self._values = {spec.name: spec.default for spec in firmware.parameters}
-        self._roles: Mapping[str, Role] = firmware.parameter_roles
+        self._sources: Mapping[str, Role] = firmware.parameter_roles
         self._bytewise = firmware.parameters_bytewise
         self.names = tuple(self._specs)
-        self.changes = 0
+        self._take_roles()
 
     def __contains__(self, name: object) -> bool:
         return name in self._specs
@@ -41,12 +41,18 @@ class ParameterTable:
 
     def role(self, role: str) -> float:
         """The value that this firmware has for `role`, in SI units."""
-        source = self._roles[role]
+        return self._roles[role]
+
+    def _take_roles(self) -> None:
+        """Read the roles anew: parameters change seldom, and each step reads many roles."""
+        self._roles = {role: self._read(source) for role, source in self._sources.items()}
+
+    def _read(self, source: Role) -> float:
         if isinstance(source, str):
             return self[source]
         if isinstance(source, tuple):
             return self[source[0]] * source[1]
-        return source
+        return source(self.__getitem__) if callable(source) else source
 
     def set(self, name: str, value: float) -> bool:
         """Set one; False (and unchanged) where it is unknown, not finite or out of range."""
@@ -91,12 +97,12 @@ class ParameterTable:
         return number
 
     def _store(self, spec: ParameterSpec, value: float) -> None:
-        self.changes += 1
         if spec.kind == "real32":
             self._values[spec.name] = value
         elif math.isfinite(value):
             low, high = RANGES[spec.kind]
             self._values[spec.name] = float(min(high, max(low, int(value))))
+        self._take_roles()
 
     def _is_bytewise(self, spec: ParameterSpec) -> bool:
         return self._bytewise and spec.kind != "real32"

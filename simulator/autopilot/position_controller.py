@@ -29,9 +29,8 @@ class PositionController:
         firmware, parameters = guidance.firmware, guidance.parameters
         self._firmware, self._parameters = firmware, parameters
         self._guidance, self._state = guidance, state
-        self._tuned = parameters.changes
-        self.loop = PositionLoop(firmware.gains(parameters.__getitem__))
-        self.detector = LandDetector(firmware.landing, parameters)
+        self.loop = PositionLoop(parameters)
+        self.detector = LandDetector(parameters)
         self._ramp = TakeoffRamp(parameters)
         self.demand = OFF  # in force
         self.thrust_demanded = 0.0  # before it is raised for the tilt
@@ -90,9 +89,6 @@ class PositionController:
 
     def _run_loop(self, setpoint: AttitudeSetpoint | None, estimate: StateEstimate) -> None:
         """One period of the position loop."""
-        if self._tuned != self._parameters.changes:
-            self._tuned = self._parameters.changes
-            self.loop.tune(self._firmware.gains(self._parameters.__getitem__))
         behaviour = self._guidance.behaviour
         if behaviour is Behaviour.LEVEL:
             thrust = self._parameters.role("stick_thrust_least")
@@ -129,7 +125,7 @@ class PositionController:
     def _fly_attitude(self, setpoint: AttitudeSetpoint) -> None:
         """Its attitude or rates, and its thrust, raised for the tilt where the firmware does so."""
         thrust = setpoint.thrust if setpoint.climb_mps is None else self._climb_thrust
-        if self._armed_for_s < self._firmware.setpoint_spool_s:
+        if self._armed_for_s < self._parameters.role("setpoint_spool_s"):
             thrust = 0.0
         self.thrust_demanded = thrust
         if self._boosts_thrust:
@@ -141,9 +137,8 @@ class PositionController:
     def _control_climb(self, climb_mps: float, estimate: StateEstimate) -> None:
         """Thrust for a climb rate."""
         motion = MotionSetpoint(velocity_ned_mps=(math.nan, math.nan, -climb_mps))
-        limits = Limits(self._parameters.role("hover_thrust"))
         integrate = not estimate.on_ground
-        _, self._climb_thrust, _ = self.loop.step(motion, limits, estimate, integrate=integrate)
+        _, self._climb_thrust, _ = self.loop.step(motion, Limits(), estimate, integrate=integrate)
         if self.landed and climb_mps <= 0.0:
             self._climb_thrust = 0.0
 
@@ -176,18 +171,17 @@ class PositionController:
     @property
     def _limits(self) -> Limits:
         """Limits of the motion by behaviour and takeoff ramp."""
-        role, guidance, gains = self._parameters.role, self._guidance, self.loop.gains
+        role, guidance = self._parameters.role, self._guidance
         automatic = guidance.active.automatic
-        up_mps = self._ramp.climb_limit_mps(gains.velocity_z[0])
+        up_mps = self._ramp.climb_limit_mps()
         if guidance.active.climbing:
             up_mps = min(up_mps, role("takeoff_speed_mps"))
         turn_radps = self.motion.turn_radps
         return Limits(
-            hover_thrust=role("hover_thrust"),
             thrust_least=0.0 if self._ramp.lifting else role("thrust_least"),
             across_mps=guidance.speed_limit_mps,
             up_mps=up_mps,
-            turn_radps=min(turn_radps, gains.turn_radps) if automatic else turn_radps,
+            turn_radps=min(turn_radps, role("turn_radps")) if automatic else turn_radps,
             smooth=automatic,
         )
 
@@ -221,7 +215,7 @@ class PositionController:
     @property
     def _descent_demanded(self) -> bool:
         """A descent is demanded, or a place below where that counts as one."""
-        landing = self._firmware.landing
-        if self.motion.velocity_ned_mps[2] >= landing.sinking_mps:
+        sinking_mps = self._parameters.role("sinking_mps")
+        if self.motion.velocity_ned_mps[2] >= sinking_mps:
             return True
-        return landing.place_below_is_descent and self._velocity_down_mps > landing.sinking_mps
+        return self._firmware.place_below_is_descent and self._velocity_down_mps > sinking_mps

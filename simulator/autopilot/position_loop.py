@@ -11,12 +11,13 @@ import math
 from dataclasses import dataclass
 
 from offboard.model.frames import quaternion_from_euler, wrap_pi
+from simulator.autopilot.parameters import ParameterTable
 from simulator.autopilot.state import StateEstimate
-from simulator.firmware.base import PositionGains
 from simulator.firmware.values import NAN3, MotionSetpoint, Quaternion, Triple
 from simulator.geodesy import GRAVITY_MPS2
 from simulator.steps import LOOP_S
 
+_AXES = ("xy", "xy", "z")  # as in the names of the gains
 # The vertical integral may carry any vehicle; m/s^2 of north, east and down
 _INTEGRAL_MAX_MPS2 = (4.0, 4.0, GRAVITY_MPS2)
 _REACHED_RAD = 0.05  # of a yaw: the rest is turned the shorter way
@@ -28,9 +29,8 @@ _FILTER_SHARE = _TIMES_CUTOFF / (1.0 + _TIMES_CUTOFF)
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Limits of a motion; the speeds can only lower those of the gains."""
+    """Limits of a motion beside those of the parameters; the lower one counts."""
 
-    hover_thrust: float  # normalised, as the autopilot assumes it
     thrust_least: float = 0.0
     across_mps: float = math.inf
     up_mps: float = math.inf  # below 0 it is a descent
@@ -41,15 +41,9 @@ class Limits:
 class PositionLoop:
     """Position loop with its integrators, one period of LOOP_S per `step`."""
 
-    def __init__(self, gains: PositionGains) -> None:
-        self.tune(gains)
+    def __init__(self, parameters: ParameterTable) -> None:
+        self._role = parameters.role
         self.reset(0.0)
-
-    def tune(self, gains: PositionGains) -> None:
-        """Use these gains from now on."""
-        self.gains = gains
-        self._position_p = (gains.position_xy_ps, gains.position_xy_ps, gains.position_z_ps)
-        self._velocity_pid = (gains.velocity_xy, gains.velocity_xy, gains.velocity_z)
 
     def reset(self, yaw_rad: float) -> None:
         """Clear the integrators and the filter; hold this yaw."""
@@ -85,10 +79,10 @@ class PositionLoop:
         setpoint = self._limit_speed(demanded, motion, limits, velocity)
         acceleration = self._acceleration(motion, setpoint, velocity)
         self._turn(motion, limits, demanded)
-        direction = thrust_direction(acceleration, self.gains.tilt_max_rad)
-        thrust = limits.hover_thrust * (1.0 - acceleration[2] / GRAVITY_MPS2)
+        direction = thrust_direction(acceleration, self._role("tilt_max_rad"))
+        thrust = self._role("hover_thrust") * (1.0 - acceleration[2] / GRAVITY_MPS2)
         thrust = thrust / max(direction[2], _TILT_COSINE_MIN)
-        thrust = min(self.gains.thrust_max, max(limits.thrust_least, thrust))
+        thrust = min(self._role("thrust_max"), max(limits.thrust_least, thrust))
         if integrate:
             self._integrate(setpoint, velocity, thrust, limits.thrust_least)
         return attitude(direction, self.yaw_rad), thrust, setpoint
@@ -105,22 +99,22 @@ class PositionLoop:
 
     def _velocity_demanded(self, motion: MotionSetpoint, position: Triple) -> Triple:
         """P on the position error plus the demanded velocity, before any limit."""
-        goal, speed, gain = motion.position_ned_m, motion.velocity_ned_mps, self._position_p
+        goal, speed = motion.position_ned_m, motion.velocity_ned_mps
         north, east, down = (
             speed[i]
             if math.isnan(goal[i] - position[i])
-            else gain[i] * (goal[i] - position[i]) + _or_zero(speed[i])
-            for i in range(3)
+            else self._role(f"position_{axis}_p") * (goal[i] - position[i]) + _or_zero(speed[i])
+            for i, axis in enumerate(_AXES)
         )
         return north, east, down
 
     def _limit_speed(
         self, demanded: Triple, motion: MotionSetpoint, limits: Limits, velocity: Triple
     ) -> Triple:
-        gains = self.gains
+        role = self._role
         north, east, down = demanded
         speed = math.hypot(_or_zero(north), _or_zero(east))
-        most = min(limits.across_mps, gains.speed_xy_mps)
+        most = min(limits.across_mps, role("speed_xy_mps"))
         if limits.smooth:
             most = min(most, self._smooth_mps(speed, motion, velocity))
             self._across_mps = min(speed, most)
@@ -129,8 +123,8 @@ class PositionLoop:
         if not math.isnan(down):
             if limits.smooth:
                 down = self._smooth_down_mps(down, velocity[2])
-            up_mps = min(limits.up_mps, gains.speed_up_mps)
-            down = max(-up_mps, min(gains.speed_down_mps, down))
+            up_mps = min(limits.up_mps, role("speed_up_mps"))
+            down = max(-up_mps, min(role("speed_down_mps"), down))
             self._down_mps = down if limits.smooth else math.nan
         return north, east, down
 
@@ -140,26 +134,26 @@ class PositionLoop:
         before_mps = self._across_mps
         if math.isnan(before_mps):
             before_mps = math.hypot(velocity[0], velocity[1])
-        most = before_mps + self.gains.speeding_mps2 * LOOP_S
-        gain_ps = self.gains.position_xy_ps
+        most = before_mps + self._role("speeding_mps2") * LOOP_S
+        gain_ps = self._role("position_xy_p")
         if math.isnan(motion.velocity_ned_mps[0]) and gain_ps > 0.0:
-            squared = 2.0 * self.gains.braking_mps2 * speed_mps / gain_ps
+            squared = 2.0 * self._role("braking_mps2") * speed_mps / gain_ps
             most = min(most, math.sqrt(squared)) if squared >= 0.0 else most
         return most
 
     def _smooth_down_mps(self, down_mps: float, velocity_mps: float) -> float:
         """The vertical speed with limited acceleration since the last period."""
         before_mps = velocity_mps if math.isnan(self._down_mps) else self._down_mps
-        most = self.gains.vertical_mps2 * LOOP_S
+        most = self._role("vertical_mps2") * LOOP_S
         return min(before_mps + most, max(before_mps - most, down_mps))
 
     def _acceleration(self, motion: MotionSetpoint, setpoint: Triple, velocity: Triple) -> Triple:
         """PID on the velocity error plus the demanded acceleration; D acts on the estimate."""
         total = [0.0, 0.0, 0.0]
-        for i in range(3):
+        for i, axis in enumerate(_AXES):
             total[i] = _or_zero(motion.acceleration_ned_mps2[i])
             if not math.isnan(setpoint[i]):
-                p, _, d = self._velocity_pid[i]
+                p, d = self._role(f"velocity_{axis}_p"), self._role(f"velocity_{axis}_d")
                 error = setpoint[i] - velocity[i]
                 total[i] += p * error + self._integral_mps2[i] - d * self._acceleration_mps2[i]
         return total[0], total[1], total[2]
@@ -168,16 +162,17 @@ class PositionLoop:
         self, setpoint: Triple, velocity: Triple, thrust: float, thrust_least: float
     ) -> None:
         """Integrate the velocity errors; the vertical one not into a saturated thrust."""
-        for i in range(3):
+        for i, axis in enumerate(_AXES):
             error = setpoint[i] - velocity[i]
             saturated = i == 2 and (
                 (thrust <= thrust_least and error > 0.0)
-                or (thrust >= self.gains.thrust_max and error < 0.0)
+                or (thrust >= self._role("thrust_max") and error < 0.0)
             )
             if math.isnan(error) or saturated:
                 continue
             most = _INTEGRAL_MAX_MPS2[i]
-            integral = self._integral_mps2[i] + self._velocity_pid[i][1] * error * LOOP_S
+            gain = self._role(f"velocity_{axis}_i")
+            integral = self._integral_mps2[i] + gain * error * LOOP_S
             self._integral_mps2[i] = min(most, max(-most, integral))
 
     def _turn(self, motion: MotionSetpoint, limits: Limits, demanded: Triple) -> None:
@@ -198,7 +193,7 @@ class PositionLoop:
         """The demanded yaw or that of the demanded velocity; not finite: keep the present one."""
         if math.isfinite(motion.yaw_rad) or not motion.faces_way:
             return motion.yaw_rad
-        if not math.hypot(demanded[0], demanded[1]) > self.gains.facing_mps:
+        if not math.hypot(demanded[0], demanded[1]) > self._role("facing_mps"):
             return math.nan
         return math.atan2(demanded[1], demanded[0])
 

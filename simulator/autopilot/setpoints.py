@@ -31,8 +31,9 @@ class SetpointStream:
 
     def alive(self, now_s: float) -> bool:
         """The stream is not lost; the firmware notices a loss some time after its time-out."""
-        age_s = now_s - self.newest_s - self.firmware.stream_reaction_s
-        return age_s <= self.parameters.role("stream_timeout_s")
+        role = self.parameters.role
+        age_s = now_s - self.newest_s - role("stream_reaction_s")
+        return age_s <= role("stream_timeout_s")
 
     def read(
         self, message: str, values: Mapping[str, Any], estimate: StateEstimate, home_down_m: float

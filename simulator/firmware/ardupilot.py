@@ -14,7 +14,7 @@ from typing import Any
 from simulator.autopilot.state import StateEstimate
 from simulator.firmware import ardupilot_messages as telemetry
 from simulator.firmware.ardupilot_tables import MODES, PARAMETERS, ROLES, RULES
-from simulator.firmware.base import Firmware, Landing, PositionGains
+from simulator.firmware.base import Firmware
 from simulator.firmware.values import (
     NAN3,
     Asked,
@@ -206,26 +206,6 @@ class ArduCopter(Firmware):
 
         return 2 if below("CRT") else int(below("LOW"))
 
-    def gains(self, parameter: ReadParameter) -> PositionGains:
-        """Gains and limits of the position loop."""
-        speed_mps = parameter("WPNAV_SPEED") * 0.01
-        return PositionGains(
-            position_xy_ps=parameter("PSC_POSXY_P"),
-            position_z_ps=parameter("PSC_POSZ_P"),
-            velocity_xy=(parameter("PSC_VELXY_P"), 1.0, 0.25),
-            velocity_z=(5.0, 10.0, 0.0),
-            speed_xy_mps=speed_mps,
-            speed_up_mps=2.5,
-            speed_down_mps=2.5,
-            tilt_max_rad=math.radians(parameter("ANGLE_MAX") * 0.01),
-            thrust_max=1.0,
-            turn_radps=math.radians(parameter("ATC_SLEW_YAW") * 0.01),
-            speeding_mps2=parameter("WPNAV_ACCEL") * 0.01,
-            braking_mps2=0.5 * parameter("WPNAV_ACCEL") * 0.01,  # as the jerk is limited
-            vertical_mps2=2.5,
-            facing_mps=0.05 * speed_mps if parameter("WP_YAW_BEHAVIOR") else math.inf,
-        )
-
     def return_height_m(self, distance_m: float, parameter: ReadParameter) -> float:
         """Height of a return above home: under a cone near home (RTL_CONE_SLOPE)."""
         highest_m, slope = parameter("RTL_ALT") * 0.01, parameter("RTL_CONE_SLOPE")
@@ -275,7 +255,6 @@ ARDUPILOT = ArduCopter(
     global_frames=frozenset({0, 3, 5, 6, 10, 11}),
     setpoints_as_automatic=True,
     setpoints_imply_flight=True,
-    setpoint_spool_s=2.8,
     item_frames={"MISSION_ITEM": _ITEM_FRAMES, "MISSION_ITEM_INT": _ITEM_FRAMES},
     home_item_first=True,
     takeoff_items_climb=True,
@@ -322,15 +301,6 @@ ARDUPILOT = ArduCopter(
     passes_after_s=42.5,
     passes_without_position_after_s=24.0,
     battery_events=("battery low", "battery critical"),
-    landing=Landing(
-        low_thrust_share=1.0,
-        idle_thrust_share=math.inf,
-        sinking_mps=0.1,
-        speed_down_mps=math.inf,
-        speed_across_mps=math.inf,
-        rate_radps=math.inf,
-        place_below_is_descent=True,
-    ),
-    descend_speed_mps=2.4,
+    place_below_is_descent=True,
     flown_by_sticks=True,
 )

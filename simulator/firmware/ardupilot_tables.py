@@ -166,6 +166,39 @@ ROLES: dict[str, Role] = {
     "position_without_fix_s": 8.0,
     "return_waits_s": ("RTL_LOIT_TIME", 1e-3),
     "return_settles_s": 1.8,  # brakes and turns before
+    # position loop: P on position, PID on velocity (acceleration out), and limits
+    "position_xy_p": "PSC_POSXY_P",
+    "position_z_p": "PSC_POSZ_P",
+    "velocity_xy_p": "PSC_VELXY_P",
+    "velocity_xy_i": 1.0,
+    "velocity_xy_d": 0.25,
+    "velocity_z_p": 5.0,
+    "velocity_z_i": 10.0,
+    "velocity_z_d": 0.0,
+    "speed_xy_mps": ("WPNAV_SPEED", _CENTI),
+    "speed_up_mps": 2.5,
+    "speed_down_mps": 2.5,
+    "tilt_max_rad": lambda parameter: math.radians(parameter("ANGLE_MAX") * _CENTI),
+    "thrust_max": 1.0,
+    # of automatic flight; braking is lower, as the jerk is limited
+    "turn_radps": lambda parameter: math.radians(parameter("ATC_SLEW_YAW") * _CENTI),
+    "speeding_mps2": ("WPNAV_ACCEL", _CENTI),
+    "braking_mps2": ("WPNAV_ACCEL", 0.5 * _CENTI),
+    "vertical_mps2": 2.5,
+    "facing_mps": lambda parameter: (
+        0.05 * (parameter("WPNAV_SPEED") * _CENTI) if parameter("WP_YAW_BEHAVIOR") else math.inf
+    ),
+    # land detector; shares are between the least and the hover thrust
+    "low_thrust_share": 1.0,
+    "idle_thrust_share": math.inf,
+    "sinking_mps": 0.1,
+    "still_down_mps": math.inf,
+    "still_across_mps": math.inf,
+    "still_radps": math.inf,
+    "descend_speed_mps": 2.4,
+    "setpoint_spool_s": 2.8,
+    "stream_reaction_s": 0.0,
+    "ground_station_stays_s": 0.0,
 }
 
 

@@ -29,8 +29,9 @@ from simulator.firmware.values import (
 from simulator.vehicle.battery import BatteryState
 
 _MAV_TYPE_GCS = 6
-Role = str | float | tuple[str, float]
-"""Where a value comes from: a parameter, a constant, or a parameter and the factor to SI."""
+Role = str | float | tuple[str, float] | Callable[[ReadParameter], float]
+"""Where a value comes from: a parameter, a constant, a parameter and the factor to SI, or a
+function of parameters."""
 
 
 RANGES = {"int8": (-128, 127), "int16": (-32768, 32767), "int32": (-(2**31), 2**31 - 1)}
@@ -80,40 +81,6 @@ class Rule:
     send: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class PositionGains:
-    """Cascaded position loop: P on position, PID on velocity (acceleration out), and limits."""
-
-    position_xy_ps: float
-    position_z_ps: float
-    velocity_xy: Triple  # P 1/s, I 1/s^2, D -
-    velocity_z: Triple
-    speed_xy_mps: float
-    speed_up_mps: float
-    speed_down_mps: float
-    tilt_max_rad: float
-    thrust_max: float
-    # of automatic flight
-    turn_radps: float
-    speeding_mps2: float
-    braking_mps2: float
-    vertical_mps2: float
-    facing_mps: float  # wanted across the ground, from which on it faces the direction of flight
-
-
-@dataclass(frozen=True, slots=True)
-class Landing:
-    """Land detector. Shares are between the least and the hover thrust."""
-
-    low_thrust_share: float  # no more than this can be a landing
-    idle_thrust_share: float  # more than this is a takeoff
-    sinking_mps: float  # a demand to descend at this speed is one to land
-    speed_down_mps: float  # estimated, of a vehicle that stands
-    speed_across_mps: float
-    rate_radps: float  # roll and pitch together
-    place_below_is_descent: bool
-
-
 @dataclass(frozen=True, kw_only=True)
 class Firmware(ABC):
     """One firmware. A method's `parameter` reads a parameter by name."""
@@ -155,8 +122,6 @@ class Firmware(ABC):
     setpoints_as_automatic: bool = False  # flown with the speeds and turn rates of automatic flight
     setpoints_outlive_modes: bool = False  # taken in any mode; else in the setpoint mode only
     setpoints_imply_flight: bool = False  # any thrust is flight: no land detector
-    setpoint_spool_s: float = 0.0  # from arming until the thrust of a setpoint acts
-    stream_reaction_s: float = 0.0  # from the time-out of the stream until it counts as lost
 
     # missions
     requests_kind_of_peer: bool = False  # items of a mission in the kind that came last
@@ -189,7 +154,6 @@ class Firmware(ABC):
     request_refusal: Result  # of MAV_CMD_REQUEST_MESSAGE, and a termination that terminates nothing
 
     # link
-    ground_station_stays_s: float = 0.0  # after its last heartbeat
     ground_station_parameter: str = ""  # its system id; "": known by its MAV_TYPE
     target_component_checked: bool = False
     ignored: frozenset[str] = frozenset()  # messages
@@ -216,8 +180,7 @@ class Firmware(ABC):
     # flight
     return_faces_way: bool = False  # a return faces the direction of flight
     integrates_on_ramp: bool = False  # position loop, in a takeoff that still stands on the ground
-    landing: Landing
-    descend_speed_mps: float  # in a manual mode without stick input
+    place_below_is_descent: bool = False  # land detector: a place below is a demand to descend
     flown_by_sticks: bool = False
 
     def mode_named(self, name: str) -> Mode | None:
@@ -272,10 +235,6 @@ class Firmware(ABC):
     @abstractmethod
     def battery_level(self, battery: BatteryState, parameter: ReadParameter) -> int:
         """0: good; each further level has an event in `battery_events`."""
-
-    @abstractmethod
-    def gains(self, parameter: ReadParameter) -> PositionGains:
-        """Gains and limits of the position loop."""
 
     @abstractmethod
     def return_height_m(self, distance_m: float, parameter: ReadParameter) -> float:

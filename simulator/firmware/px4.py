@@ -14,7 +14,7 @@ from typing import Any
 from offboard.model.frames import rotation_from_quaternion
 from simulator.autopilot.state import StateEstimate
 from simulator.firmware import px4_messages as telemetry
-from simulator.firmware.base import Firmware, Landing, PositionGains
+from simulator.firmware.base import Firmware
 from simulator.firmware.px4_tables import MODES, PARAMETERS, ROLES, RULES
 from simulator.firmware.values import (
     Asked,
@@ -197,28 +197,6 @@ class Px4(Firmware):
         """By the remaining share."""
         return sum(battery.remaining < parameter(name) for name in _BATTERY_THRESHOLDS)
 
-    def gains(self, parameter: ReadParameter) -> PositionGains:
-        """Gains and limits of the position loop."""
-        across = tuple(parameter(f"MPC_XY_VEL_{term}_ACC") for term in "PID")
-        up = tuple(parameter(f"MPC_Z_VEL_{term}_ACC") for term in "PID")
-        return PositionGains(
-            position_xy_ps=parameter("MPC_XY_P"),
-            position_z_ps=parameter("MPC_Z_P"),
-            velocity_xy=(across[0], across[1], across[2]),
-            velocity_z=(up[0], up[1], up[2]),
-            speed_xy_mps=parameter("MPC_XY_VEL_MAX"),
-            speed_up_mps=parameter("MPC_Z_VEL_MAX_UP"),
-            speed_down_mps=parameter("MPC_Z_VEL_MAX_DN"),
-            tilt_max_rad=math.radians(parameter("MPC_TILTMAX_AIR")),
-            thrust_max=parameter("MPC_THR_MAX"),
-            turn_radps=math.radians(parameter("MPC_YAWRAUTO_MAX")),
-            # jerk is limited in the real one (MPC_JERK_AUTO), which lowers both on average
-            speeding_mps2=0.7 * parameter("MPC_ACC_HOR"),
-            braking_mps2=0.5 * parameter("MPC_ACC_HOR"),
-            vertical_mps2=0.5 * parameter("MPC_ACC_DOWN_MAX"),
-            facing_mps=parameter("MPC_XY_P") * parameter("NAV_ACC_RAD"),
-        )
-
     def return_height_m(self, distance_m: float, parameter: ReadParameter) -> float:
         """Height of a return above home: under a cone near home (RTL_CONE_ANG)."""
         highest_m, accepted_m = parameter("RTL_RETURN_ALT"), parameter("NAV_ACC_RAD")
@@ -264,7 +242,6 @@ PX4 = Px4(
     global_frames=frozenset({5, 6, 11}),
     setpoint_mode_needs_stream=True,
     setpoints_outlive_modes=True,
-    stream_reaction_s=0.036,
     requests_kind_of_peer=True,
     item_frames={"MISSION_ITEM": {5: 0, 6: 3}, "MISSION_ITEM_INT": {0: 5, 3: 6}},
     reached_above_landing=True,
@@ -279,7 +256,6 @@ PX4 = Px4(
     never_sent=telemetry.NEVER_SENT,
     interval_refusal=Result.FAILED,
     request_refusal=Result.DENIED,
-    ground_station_stays_s=2.5,
     target_component_checked=True,
     never_to_all=frozenset({"COMMAND", "MISSION", "PARAM"}),
     text_suffix="\t",
@@ -300,14 +276,4 @@ PX4 = Px4(
     battery_events=("battery low", "battery critical", "battery emergency"),
     return_faces_way=True,
     integrates_on_ramp=True,
-    landing=Landing(
-        low_thrust_share=0.95,  # of estimates that wander on the ground, too
-        idle_thrust_share=0.1,
-        sinking_mps=0.09,
-        speed_down_mps=0.2,
-        speed_across_mps=1.5,  # LNDMC_XY_VEL_MAX
-        rate_radps=math.radians(20.0),  # LNDMC_ROT_MAX
-        place_below_is_descent=False,
-    ),
-    descend_speed_mps=0.6,
 )

@@ -4,6 +4,7 @@ and its state table: events, and what follows from them.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 from simulator.firmware.base import AFTER_DELAY, ParameterSpec, Role, Rule
@@ -173,6 +174,38 @@ ROLES: dict[str, Role] = {
     "position_without_fix_s": ("EKF2_NOAID_TOUT", 1e-6),
     "return_waits_s": "RTL_LAND_DELAY",
     "return_settles_s": 0.0,
+    # position loop: P on position, PID on velocity (acceleration out), and limits
+    "position_xy_p": "MPC_XY_P",
+    "position_z_p": "MPC_Z_P",
+    "velocity_xy_p": "MPC_XY_VEL_P_ACC",
+    "velocity_xy_i": "MPC_XY_VEL_I_ACC",
+    "velocity_xy_d": "MPC_XY_VEL_D_ACC",
+    "velocity_z_p": "MPC_Z_VEL_P_ACC",
+    "velocity_z_i": "MPC_Z_VEL_I_ACC",
+    "velocity_z_d": "MPC_Z_VEL_D_ACC",
+    "speed_xy_mps": "MPC_XY_VEL_MAX",
+    "speed_up_mps": "MPC_Z_VEL_MAX_UP",
+    "speed_down_mps": "MPC_Z_VEL_MAX_DN",
+    "tilt_max_rad": ("MPC_TILTMAX_AIR", math.radians(1.0)),
+    "thrust_max": "MPC_THR_MAX",
+    # of automatic flight; jerk is limited in the real one (MPC_JERK_AUTO), which lowers both
+    # horizontal accelerations on average
+    "turn_radps": ("MPC_YAWRAUTO_MAX", math.radians(1.0)),
+    "speeding_mps2": ("MPC_ACC_HOR", 0.7),
+    "braking_mps2": ("MPC_ACC_HOR", 0.5),
+    "vertical_mps2": ("MPC_ACC_DOWN_MAX", 0.5),
+    "facing_mps": lambda parameter: parameter("MPC_XY_P") * parameter("NAV_ACC_RAD"),
+    # land detector; shares are between the least and the hover thrust
+    "low_thrust_share": 0.95,  # of estimates that wander on the ground, too
+    "idle_thrust_share": 0.1,
+    "sinking_mps": 0.09,
+    "still_down_mps": 0.2,
+    "still_across_mps": 1.5,  # LNDMC_XY_VEL_MAX
+    "still_radps": math.radians(20.0),  # LNDMC_ROT_MAX
+    "descend_speed_mps": 0.6,
+    "setpoint_spool_s": 0.0,
+    "stream_reaction_s": 0.036,
+    "ground_station_stays_s": 2.5,
 }
 
 

@@ -100,7 +100,7 @@ class Outbox:
 
     @property
     def _has_ground_station(self) -> bool:
-        stays_us = self.view.autopilot.firmware.ground_station_stays_s * 1e6
+        stays_us = self.view.autopilot.parameters.role("ground_station_stays_s") * 1e6
         return self._now_us - self._ground_station_us <= stays_us
 
     @property
