@@ -104,7 +104,7 @@ class Instance:
         if ground_link:
             self.links.append(Server(self.view, firmware.ground_rates_hz, self.keyring, number=1))
         self.steps = 0
-        self._injection = prepare(faults, seed)
+        self._faults = prepare(faults, seed)
         self._arrived: list[bytes] = []
         self._barrier_at_step = 0
         self._back_at_step = 0
@@ -127,13 +127,16 @@ class Instance:
     def strangers(self) -> list[list[bytes]]:
         """Datagrams for the companion that others send, a list for each of their ports; the caller
         sends and clears them."""
-        return [] if self._injection is None else self._injection.strangers
+        return self._faults.strangers
 
     def advance(self) -> None:
         """Simulate one step of STEP_S; telemetry waits in the links until `drain`."""
         self.steps += 1
-        if self._injection is not None:
-            self._inject()
+        if self._faults.waiting:
+            self._faults.step(self.time_s, self)
+            self.autopilot.state.invalidate()
+        for datagram in carry(self._faults.up, [], self._now_us):
+            self._handle(datagram)
         if self.steps <= self._back_at_step:
             self.autopilot.plant.advance(STEP_S, OFF)
             return
@@ -145,10 +148,8 @@ class Instance:
             self._send_texts()
         for link in self.links:
             link.step()
-        if self._injection is not None:
-            self._arrived += carry(
-                self._injection.down, self.companion.outbox.drain(), self._now_us
-            )
+        if self._faults.down:
+            self._arrived = self.drain()
 
     def advance_to_barrier(self, end_s: float = math.inf) -> bool:
         """`advance` until `barrier_due` (True) or `end_s` (False)."""
@@ -167,9 +168,7 @@ class Instance:
 
     def drain(self) -> list[bytes]:
         """Datagrams that have arrived at the companion since the last call."""
-        if self._injection is None:
-            return self.companion.outbox.drain()
-        sent = carry(self._injection.down, self.companion.outbox.drain(), self._now_us)
+        sent = carry(self._faults.down, self.companion.outbox.drain(), self._now_us)
         arrived, self._arrived = self._arrived + sent, []
         return arrived
 
@@ -179,11 +178,8 @@ class Instance:
 
     def feed(self, datagram: bytes) -> None:
         """Receive one datagram of the companion at the present vehicle time."""
-        if self._injection is None:
-            self._handle(datagram)
-            return
         for piece in self._without_clock(datagram):
-            for arrived in carry(self._injection.up, [piece], self._now_us):
+            for arrived in carry(self._faults.up, [piece], self._now_us):
                 self._handle(arrived)
 
     def feed_ground(self, datagram: bytes) -> None:
@@ -214,10 +210,7 @@ class Instance:
             Its time stamp in nanoseconds, and all datagrams for the companion.
         """
         stamp_ns = self._now_us * 1000
-        if self._injection is None:
-            self.companion.send_barrier(stamp_ns)
-            return stamp_ns, self.companion.outbox.drain()
-        datagrams = self.drain()
+        datagrams = self.drain() if self._faults.down else []
         self.companion.send_barrier(stamp_ns)
         return stamp_ns, datagrams + self.companion.outbox.drain()
 
@@ -239,36 +232,23 @@ class Instance:
     def _now_us(self) -> int:
         return self.steps * STEP_US
 
-    def _inject(self) -> None:
-        assert self._injection is not None
-        self._injection.step(self.time_s, self)
-        self.autopilot.state.invalidate()
-        for datagram in carry(self._injection.up, [], self._now_us):
-            self._handle(datagram)
-
     def _handle(self, datagram: bytes) -> None:
-        if self.steps < self._back_at_step and not self._is_clock(datagram):
-            return
-        self.companion.receive(datagram)
-        self._send_texts()
+        if self.steps >= self._back_at_step:
+            self.companion.receive(datagram)
+            self._send_texts()
 
     def _without_clock(self, datagram: bytes) -> list[bytes]:
-        """Handle lockstep's TIMESYNC answer at once; the rest is subject to link faults."""
-        pieces = [frame for _, frame in frames(datagram)]
-        if not (self.companion.barrier and any(map(self._is_clock, pieces))):
+        """Handle lockstep's TIMESYNC answers (tc1 is not 0) at once; the rest is subject to link
+        faults and to the silence of a restart."""
+        if not self.companion.barrier:
             return [datagram]
         rest: list[bytes] = []
-        for piece in pieces:
-            if self._is_clock(piece):
-                self._handle(piece)
+        for message_id, frame in frames(datagram):
+            if message_id == _TIMESYNC and any(frame[10:18]):
+                self.companion.receive(frame)
             else:
-                rest.append(piece)
+                rest.append(frame)
         return rest
-
-    def _is_clock(self, frame: bytes) -> bool:
-        """Whether it is a TIMESYNC answer (tc1 is not 0) in lockstep."""
-        is_timesync = frames(frame)[0][0] == _TIMESYNC if frame else False
-        return self.companion.barrier and is_timesync and any(frame[10:18])
 
     def _send_texts(self) -> None:
         """Queue new texts and announced messages on every link."""

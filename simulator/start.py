@@ -34,7 +34,7 @@ def take_off(autopilot: Autopilot, start: Start) -> None:
     Raises:
         DocumentError: the vehicle does not reach the height.
     """
-    ready_s = autopilot.firmware.passes_after_s * autopilot.health.boot_scale + SETTLE_S
+    ready_s = autopilot.firmware.boot_events_s["ready"] * autopilot.health.boot_scale + SETTLE_S
     while autopilot.state.time_s < ready_s:
         autopilot.step()
     # as a pilot with a ground station does, in a mode in which the firmware takes off

@@ -91,7 +91,7 @@ class Commander:
     @property
     def has_fix(self) -> bool:
         """GPS has a fix: its first one, and no fault takes it away."""
-        return self._health.first_fix(self._state.time_s) and self._state.plant.gps_healthy
+        return "fix" in self._health.reached and self._state.plant.gps_healthy
 
     @property
     def velocity_ratio(self) -> float:

@@ -136,19 +136,11 @@ class Health:
         """Time since the last GPS fix."""
         return now_s - self._fix_s
 
-    def first_fix(self, now_s: float) -> bool:
-        """GPS has found its first fix; a fault may take it away."""
-        return now_s >= self._firmware.first_fix_s * self.boot_scale
-
     def passes(self, mode: Mode, now_s: float, *, latched: bool, armed: bool) -> bool:
         """The pre-arm checks pass for this mode. `latched`: a failure that only a reboot clears."""
         firmware = self._firmware
-        after_s = firmware.passes_without_position_after_s
-        if mode.needs_position:
-            if self.position_lost:
-                return False
-            after_s = firmware.passes_after_s
-        if latched or now_s < after_s * self.boot_scale:
+        ready = "ready" if mode.needs_position else "ready without position"
+        if latched or ready not in self.reached or (mode.needs_position and self.position_lost):
             return False
         if firmware.fails_where_unarmable and not (mode.arms or armed):
             return False

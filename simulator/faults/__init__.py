@@ -41,10 +41,8 @@ Fault = Annotated[
 ]
 
 
-def prepare(scenario: Sequence[Fault], seed: int) -> Injection | None:
-    """Faults of one flight, none begun; None when the scenario has none."""
-    if not scenario:
-        return None
+def prepare(scenario: Sequence[Fault], seed: int) -> Injection:
+    """Faults of one flight, none begun."""
     paths: dict[str, list[Channel]] = {"down": [], "up": []}
     waiting: list[Running] = []
     for number, fault in enumerate(scenario):

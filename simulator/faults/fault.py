@@ -105,14 +105,14 @@ class Injection:
     down: list[Channel]
     up: list[Channel]
     strangers: list[list[bytes]]
-    _waiting: list[Running]
+    waiting: list[Running]
     _moments: dict[Moment, float] = field(default_factory=dict)
     _flown: bool = False
 
     def step(self, now_s: float, vehicle: Vehicle) -> None:
         """Begin and end the faults due at `now_s`, seconds since the start."""
         self._note_moments(now_s, vehicle.autopilot)
-        self._waiting = [one for one in self._waiting if self._goes_on(one, now_s + 1e-6, vehicle)]
+        self.waiting = [one for one in self.waiting if self._goes_on(one, now_s + 1e-6, vehicle)]
 
     def _note_moments(self, now_s: float, autopilot: Autopilot) -> None:
         landed = autopilot.position_controller.landed

@@ -104,10 +104,9 @@ class Firmware(ABC):
     mode_acked_twice: bool = False  # by the receiver before the commander does
     set_mode_acked_as: int | None = None  # MAV_CMD in the answer to SET_MODE; None: no answer
     force_codes: Mapping[str, float]  # param2 of MAV_CMD_COMPONENT_ARM_DISARM: arm, disarm
-    takeoff_above_home: bool = False  # height of MAV_CMD_NAV_TAKEOFF; else above mean sea level
     reposition_mode: str  # mode for MAV_CMD_DO_REPOSITION
     # MAV_CMD_DO_REPOSITION needs a frame and a place, and its yaw and speed are ignored; a takeoff
-    # needs a height above home; MAV_CMD_MISSION_START names no item
+    # is to a height above home, else above mean sea level; MAV_CMD_MISSION_START names no item
     strict_places: bool = False
     empty_refusal: Result  # of a MAV_CMD_DO_CHANGE_SPEED without a speed, an interval of no message
     vertical_speeds: tuple[float, ...] = ()  # SPEED_TYPE of climb and descent; others are across
@@ -168,11 +167,10 @@ class Firmware(ABC):
     stamps_follow_clock: bool = False  # else they only count, and follow those of others
 
     # health
-    boot_events_s: Mapping[str, float] = field(default_factory=dict)  # events of the start
+    # events of the start: "fix" of GPS, "ready" and "ready without position" (from then on the
+    # pre-arm checks pass, the latter in modes that need none), and those of the firmware
+    boot_events_s: Mapping[str, float]
     sensor_bits: tuple[int, int, int]  # SYS_STATUS with a fix: present, enabled, healthy
-    first_fix_s: float  # of GPS
-    passes_after_s: float  # boot until the pre-arm checks pass
-    passes_without_position_after_s: float  # the same for modes that need none
     fails_where_unarmable: bool = False  # disarmed in a mode that does not arm, its checks fail
     velocity_ratio_squared: bool = False  # as it reports the innovation ratio of the velocity
     battery_events: tuple[str, ...]  # of battery levels 1 on

@@ -268,9 +268,7 @@ PX4 = Px4(
     # gyro, accelerometer, magnetometer, absolute pressure, GPS; battery, AHRS; the health bits
     # include the geofence, or MAVProxy reports a breach
     sensor_bits=(0x0300402F, 0x0301402F, 0x0330C83F),
-    first_fix_s=3.0,
-    passes_after_s=4.0,
-    passes_without_position_after_s=4.0,
+    boot_events_s={"fix": 3.0, "ready": 4.0, "ready without position": 4.0},
     fails_where_unarmable=True,
     velocity_ratio_squared=True,
     battery_events=("battery low", "battery critical", "battery emergency"),

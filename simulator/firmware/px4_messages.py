@@ -179,7 +179,7 @@ def hil_state_quaternion(view: View) -> Sequence[Any]:
 
 def estimator_status(view: View) -> Sequence[Any]:
     autopilot = view.autopilot
-    flags = 895 if autopilot.health.first_fix(autopilot.state.time_s) else 1024
+    flags = 895 if "fix" in autopilot.health.reached else 1024
     if autopilot.health.position_lost:
         flags = 229
     velocity_ratio = max(0.12, autopilot.commander.velocity_ratio)

@@ -100,12 +100,11 @@ class Commands:
         return autopilot.handle(f"force {asked.name}" if forced else asked.name)
 
     def _takeoff(self, autopilot: Autopilot, command: Command) -> Result:
-        if autopilot.firmware.strict_places and command.frame not in (None, _RELATIVE):
-            return Result.DENIED
         height_m = command.params[6]
-        home_down_m = autopilot.guidance.home_ned_m[2]
-        if autopilot.firmware.takeoff_above_home:
-            down_m = home_down_m - height_m
+        if autopilot.firmware.strict_places:
+            if command.frame not in (None, _RELATIVE):
+                return Result.DENIED
+            down_m = autopilot.guidance.home_ned_m[2] - height_m
             return autopilot.handle("takeoff", Request(takeoff_ned_m=(math.nan, math.nan, down_m)))
         place = to_metres(autopilot.firmware.origin, *command.params[4:6])
         down_m = autopilot.firmware.origin[2] - height_m

@@ -76,7 +76,7 @@ class View:
         """MAV_SYS_STATUS_SENSOR: present, enabled, healthy."""
         autopilot = self.autopilot
         present, enabled, health = autopilot.firmware.sensor_bits
-        if not autopilot.health.first_fix(autopilot.state.time_s):
+        if "fix" not in autopilot.health.reached:
             present, enabled, health = present & ~_GPS, enabled & ~_GPS, health & ~_GPS
         elif not autopilot.commander.has_fix:
             health &= ~_GPS
