@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from offboard.compiled import prepare
 from offboard.documents.reading import parse
 from simulator import config
-from simulator.firmware.catalogue import FIRMWARES
+from simulator.firmware import FIRMWARES
 from simulator.instance import Instance
 
 VEHICLE = 0  # sender of the vehicle's datagrams; others count up from it

@@ -12,16 +12,16 @@ from collections.abc import Mapping, Sequence
 
 from offboard.model.vehicle import Vehicle
 from simulator.autopilot.autopilot import Autopilot
+from simulator.autopilot.firmware import Firmware
 from simulator.autopilot.position_controller import OFF
+from simulator.config import Start, take_off
 from simulator.faults import Fault, prepare
-from simulator.firmware.base import Firmware
 from simulator.link.framing import frames
 from simulator.link.impairment import carry
 from simulator.mavlink.codec import Keyring
 from simulator.mavlink.server import Server
 from simulator.mavlink.telemetry import builders
 from simulator.mavlink.view import View
-from simulator.start import Start, take_off
 from simulator.steps import STEP_S, STEP_US
 from simulator.vehicle.conditions import Conditions
 from simulator.vehicle.plant import Plant

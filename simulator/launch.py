@@ -10,8 +10,8 @@ from offboard.documents.errors import UserError
 from offboard.documents.signing_key import read_key
 from offboard.link.clock import unix_us
 from simulator import config
-from simulator.firmware.base import Firmware
-from simulator.firmware.catalogue import FIRMWARES
+from simulator.autopilot.firmware import Firmware
+from simulator.firmware import FIRMWARES
 from simulator.instance import VIRTUAL_EPOCH_US, Instance
 from simulator.link.framing import Recorder
 from simulator.link.sockets import Link, open_beside, open_link, shifted

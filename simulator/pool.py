@@ -64,7 +64,7 @@ def _run(options: list[str]) -> NoReturn:
 def _load() -> None:
     """Import all modules of the simulator and load its compiled functions."""
     from simulator import command, config, launch
-    from simulator.firmware.catalogue import FIRMWARES
+    from simulator.firmware import FIRMWARES
     from simulator.instance import Instance
     from simulator.vehicle.conditions import Conditions
 

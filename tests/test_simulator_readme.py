@@ -15,11 +15,11 @@ import pytest
 
 from simulator import config
 from simulator.autopilot.commander import ACTIONS, CONDITIONS, TEXT_VALUES
+from simulator.autopilot.firmware import AFTER_DELAY, Firmware, Rule
+from simulator.autopilot.values import Result
 from simulator.faults import Fault
 from simulator.faults.fault import Timed
-from simulator.firmware.base import AFTER_DELAY, Firmware, Rule
-from simulator.firmware.catalogue import FIRMWARES
-from simulator.firmware.values import Result
+from simulator.firmware import FIRMWARES
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "simulator" / "README.md"

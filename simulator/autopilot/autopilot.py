@@ -12,6 +12,7 @@ from typing import Any
 
 from simulator.autopilot.behaviours import BEHAVIOURS
 from simulator.autopilot.commander import NO_REQUEST, Commander, Request
+from simulator.autopilot.firmware import Firmware
 from simulator.autopilot.guidance import Guidance
 from simulator.autopilot.health import MONITOR_STEPS, Health
 from simulator.autopilot.mission import Mission
@@ -19,8 +20,7 @@ from simulator.autopilot.parameters import ParameterTable
 from simulator.autopilot.position_controller import PositionController
 from simulator.autopilot.setpoints import ATTITUDE, SetpointStream
 from simulator.autopilot.state import VehicleState
-from simulator.firmware.base import Firmware
-from simulator.firmware.values import AttitudeSetpoint, Behaviour, Result, Triple
+from simulator.autopilot.values import AttitudeSetpoint, Behaviour, Result, Triple
 from simulator.steps import STEP_S
 from simulator.vehicle.plant import Plant
 

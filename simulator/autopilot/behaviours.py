@@ -1,8 +1,8 @@
 """What the vehicle does in its modes: one class per behaviour, and the table of them.
 
 A behaviour demands a motion in each period and answers a few questions about itself. To add one: a
-member of `simulator.firmware.values.Behaviour`, a class here, a row in BEHAVIOURS, and a row in the
-mode table of a firmware. NED, SI.
+member of `simulator.autopilot.values.Behaviour`, a class here, a row in BEHAVIOURS, and a row in
+the mode table of a firmware. NED, SI.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from enum import Enum
 
 from simulator.autopilot.guidance import ActiveBehaviour, Guidance, stopping_place_ned_m
 from simulator.autopilot.state import StateEstimate
-from simulator.firmware.values import Behaviour, MotionSetpoint, Triple
+from simulator.autopilot.values import Behaviour, MotionSetpoint, Triple
 
 _FLATTEST = 1000.0  # takeoff: m across per m of climb
 _STILL_MPS = 0.05  # sticks: a slower demand holds the place

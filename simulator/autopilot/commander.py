@@ -11,12 +11,12 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
+from simulator.autopilot.firmware import AFTER_DELAY, Rule
 from simulator.autopilot.guidance import Guidance
 from simulator.autopilot.health import FlightTime, Health
 from simulator.autopilot.position_controller import PositionController
 from simulator.autopilot.state import VehicleState
-from simulator.firmware.base import AFTER_DELAY, Rule
-from simulator.firmware.values import (
+from simulator.autopilot.values import (
     NAN3,
     Behaviour,
     Mode,

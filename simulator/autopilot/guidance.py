@@ -12,13 +12,13 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar
 
+from simulator.autopilot.firmware import Firmware
 from simulator.autopilot.mission import Mission
 from simulator.autopilot.parameters import ParameterTable
 from simulator.autopilot.position_loop import level
 from simulator.autopilot.state import StateEstimate
 from simulator.autopilot.sticks import Sticks
-from simulator.firmware.base import Firmware
-from simulator.firmware.values import NAN3, AttitudeSetpoint, Behaviour, MotionSetpoint, Triple
+from simulator.autopilot.values import NAN3, AttitudeSetpoint, Behaviour, MotionSetpoint, Triple
 
 ORIGIN: Triple = (0.0, 0.0, 0.0)
 Setpoint = AttitudeSetpoint | MotionSetpoint

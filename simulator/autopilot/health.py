@@ -10,12 +10,12 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from simulator.autopilot.firmware import Firmware
 from simulator.autopilot.mission import Mission
 from simulator.autopilot.parameters import ParameterTable
 from simulator.autopilot.setpoints import SetpointStream
-from simulator.firmware.base import Firmware
-from simulator.firmware.values import Behaviour, Mode
-from simulator.vehicle.battery import BatteryState
+from simulator.autopilot.values import Behaviour, Mode
+from simulator.vehicle.conditions import BatteryState
 
 MONITOR_STEPS = 25  # 0.1 s
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 
 from offboard.model.frames import wrap_pi
+from simulator.autopilot.firmware import Firmware
 from simulator.autopilot.parameters import ParameterTable
 from simulator.autopilot.state import StateEstimate
-from simulator.firmware.base import Firmware
-from simulator.firmware.values import NAN3, MissionItem, MotionSetpoint, Triple
+from simulator.autopilot.values import NAN3, MissionItem, MotionSetpoint, Triple
 from simulator.geodesy import down_m, to_metres
 
 ITEMS_MAX = 500

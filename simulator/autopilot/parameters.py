@@ -10,7 +10,7 @@ import struct
 import zlib
 from collections.abc import Mapping
 
-from simulator.firmware.base import RANGES, Firmware, ParameterSpec, Role
+from simulator.autopilot.firmware import RANGES, Firmware, ParameterSpec, Role
 
 HASH = "_HASH_CHECK"  # name under which the checksum of all values is read
 MAV_PARAM_TYPE_UINT32 = 5

@@ -13,7 +13,7 @@ from simulator.autopilot.ground import LandDetector, TakeoffRamp
 from simulator.autopilot.guidance import Guidance
 from simulator.autopilot.position_loop import Limits, PositionLoop, level
 from simulator.autopilot.state import StateEstimate, VehicleState
-from simulator.firmware.values import NAN3, AttitudeSetpoint, Behaviour, MotionSetpoint, Triple
+from simulator.autopilot.values import NAN3, AttitudeSetpoint, Behaviour, MotionSetpoint, Triple
 from simulator.steps import LOOP_S
 from simulator.vehicle.attitude import Demand
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from offboard.model.frames import quaternion_from_euler, wrap_pi
 from simulator.autopilot.parameters import ParameterTable
 from simulator.autopilot.state import StateEstimate
-from simulator.firmware.values import NAN3, MotionSetpoint, Quaternion, Triple
+from simulator.autopilot.values import NAN3, MotionSetpoint, Quaternion, Triple
 from simulator.geodesy import GRAVITY_MPS2
 from simulator.steps import LOOP_S
 

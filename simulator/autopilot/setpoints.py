@@ -10,10 +10,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from simulator.autopilot.firmware import Firmware
 from simulator.autopilot.parameters import ParameterTable
 from simulator.autopilot.state import StateEstimate
-from simulator.firmware.base import Firmware
-from simulator.firmware.values import AttitudeSetpoint, MotionSetpoint, StatusText
+from simulator.autopilot.values import AttitudeSetpoint, MotionSetpoint, StatusText
 from simulator.geodesy import TERRAIN_FRAMES, down_m, to_metres
 
 ATTITUDE = "SET_ATTITUDE_TARGET"

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from simulator.firmware.values import Quaternion, Triple
+from simulator.autopilot.values import Quaternion, Triple
 from simulator.steps import STEP_S, STEP_US
 from simulator.vehicle.plant import Plant, Truth
 

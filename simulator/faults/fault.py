@@ -18,8 +18,8 @@ from pydantic import AfterValidator, Field
 
 from offboard.documents.parameters import Parameters
 from simulator.autopilot.autopilot import Autopilot
-from simulator.firmware.catalogue import FIRMWARES
-from simulator.firmware.values import Behaviour
+from simulator.autopilot.values import Behaviour
+from simulator.firmware import FIRMWARES
 from simulator.link.impairment import Channel
 from simulator.mavlink.codec import id_of
 from simulator.mavlink.server import Server

@@ -7,8 +7,8 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
+from simulator.autopilot.firmware import Firmware
 from simulator.faults.fault import Effect, MessageName, Running, Timed, Vehicle, until_the_end
-from simulator.firmware.base import Firmware
 from simulator.link.impairment import Impairment
 from simulator.mavlink.codec import Encoder, fields_of
 from simulator.mavlink.outbox import MAV_COMP_ID_AUTOPILOT

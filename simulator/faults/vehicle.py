@@ -10,8 +10,8 @@ from pydantic import Field
 
 from offboard.model.vehicle import Triple
 from simulator.autopilot.commander import Request
+from simulator.autopilot.values import critical
 from simulator.faults.fault import Effect, ModeName, Running, Timed, Vehicle, until_the_end
-from simulator.firmware.values import critical
 from simulator.steps import STEP_S
 
 _NO_THRUST = 1e-9  # a factor that can be undone

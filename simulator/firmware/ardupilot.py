@@ -11,11 +11,9 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from simulator.autopilot.firmware import Firmware
 from simulator.autopilot.state import StateEstimate
-from simulator.firmware import ardupilot_messages as telemetry
-from simulator.firmware.ardupilot_tables import MODES, PARAMETERS, ROLES, RULES
-from simulator.firmware.base import Firmware
-from simulator.firmware.values import (
+from simulator.autopilot.values import (
     NAN3,
     Asked,
     AttitudeSetpoint,
@@ -28,7 +26,9 @@ from simulator.firmware.values import (
     info,
     warning,
 )
-from simulator.vehicle.battery import BatteryState
+from simulator.firmware import ardupilot_messages as telemetry
+from simulator.firmware.ardupilot_tables import MODES, PARAMETERS, ROLES, RULES
+from simulator.vehicle.conditions import BatteryState
 
 _CUSTOM_MODE_ENABLED = 1
 _BY_NUMBER = {mode.custom_mode: mode.name for mode in MODES.values()}

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from offboard.model.frames import euler_from_quaternion
+from simulator.autopilot.values import AttitudeSetpoint
 from simulator.firmware.ardupilot_tables import BY_HAND, BY_POSITION
-from simulator.firmware.values import AttitudeSetpoint
 from simulator.geodesy import GRAVITY_MPS2
 from simulator.mavlink.view import View, fit
 

@@ -11,8 +11,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 
-from simulator.firmware.base import RANGES, ParameterSpec, Role, Rule
-from simulator.firmware.values import Behaviour, Mode, Result, StatusText, critical, info, warning
+from simulator.autopilot.firmware import RANGES, ParameterSpec, Role, Rule
+from simulator.autopilot.values import Behaviour, Mode, Result, StatusText, critical, info, warning
 
 # MAV_MODE_FLAG: 1 custom mode, 8 guided, 16 stabilise, 64 manual input. "Guided" shows whether
 # the position controller runs, not the mode.

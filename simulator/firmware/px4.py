@@ -12,11 +12,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from offboard.model.frames import rotation_from_quaternion
+from simulator.autopilot.firmware import Firmware
 from simulator.autopilot.state import StateEstimate
-from simulator.firmware import px4_messages as telemetry
-from simulator.firmware.base import Firmware
-from simulator.firmware.px4_tables import MODES, PARAMETERS, ROLES, RULES
-from simulator.firmware.values import (
+from simulator.autopilot.values import (
     Asked,
     AttitudeSetpoint,
     MissionItem,
@@ -27,7 +25,9 @@ from simulator.firmware.values import (
     Triple,
     critical,
 )
-from simulator.vehicle.battery import BatteryState
+from simulator.firmware import px4_messages as telemetry
+from simulator.firmware.px4_tables import MODES, PARAMETERS, ROLES, RULES
+from simulator.vehicle.conditions import BatteryState
 
 # By PX4_CUSTOM_MAIN_MODE and PX4_CUSTOM_SUB_MODE_AUTO
 _BY_NUMBER = {

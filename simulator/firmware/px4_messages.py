@@ -6,8 +6,8 @@ import math
 from collections.abc import Hashable, Sequence
 from typing import Any
 
+from simulator.autopilot.values import AttitudeSetpoint, Behaviour
 from simulator.firmware.px4_tables import OFFBOARD, RATES
-from simulator.firmware.values import AttitudeSetpoint, Behaviour
 from simulator.geodesy import GRAVITY_MPS2
 from simulator.mavlink.view import View, centi, fit, pressure_hpa
 

@@ -7,8 +7,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from simulator.firmware.base import AFTER_DELAY, ParameterSpec, Role, Rule
-from simulator.firmware.values import (
+from simulator.autopilot.firmware import AFTER_DELAY, ParameterSpec, Role, Rule
+from simulator.autopilot.values import (
     Behaviour,
     Mode,
     Result,

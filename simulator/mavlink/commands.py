@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from offboard.model.frames import wrap_pi
 from simulator.autopilot.autopilot import Autopilot
 from simulator.autopilot.commander import Request
-from simulator.firmware.values import Asked, Behaviour, Result, Triple, info
+from simulator.autopilot.values import Asked, Behaviour, Result, Triple, info
 from simulator.geodesy import down_m, to_metres
 from simulator.mavlink.codec import id_of, name_of
 from simulator.mavlink.outbox import Outbox

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 
-from simulator.firmware.values import StatusText
+from simulator.autopilot.values import StatusText
 from simulator.mavlink.codec import Encoder, Keyring
 from simulator.mavlink.view import View
 

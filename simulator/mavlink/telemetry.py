@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from types import ModuleType
 from typing import Any
 
-from simulator.firmware.base import Firmware
+from simulator.autopilot.firmware import Firmware
 from simulator.mavlink import messages
 from simulator.mavlink.view import View
 from simulator.steps import STEP_US

@@ -13,7 +13,7 @@ from enum import IntEnum
 
 from simulator.autopilot.mission import ITEMS_MAX, Kind
 from simulator.autopilot.parameters import HASH, MAV_PARAM_TYPE_UINT32
-from simulator.firmware.values import MissionItem
+from simulator.autopilot.values import MissionItem
 from simulator.mavlink.codec import Message, Peer, sender_of
 from simulator.mavlink.outbox import Outbox
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from offboard.model.frames import rotation_from_quaternion
 from simulator.autopilot.autopilot import Autopilot
-from simulator.firmware.values import Triple
+from simulator.autopilot.values import Triple
 from simulator.geodesy import GRAVITY_MPS2, to_degrees
 
 _GPS, _PREARM = 0x20, 0x10000000  # MAV_SYS_STATUS_SENSOR

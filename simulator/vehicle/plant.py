@@ -15,8 +15,7 @@ from offboard.model.vehicle import Triple, Vehicle
 from simulator.steps import STEP_S
 from simulator.vehicle.airframe import CHARGE, CONTACT, THRUST, build_airframe
 from simulator.vehicle.attitude import Demand, Quaternion, build_loop, encode
-from simulator.vehicle.battery import BatteryState
-from simulator.vehicle.conditions import Conditions
+from simulator.vehicle.conditions import BatteryState, Conditions
 from simulator.vehicle.dynamics import RECORD, advance_steps, draw_gusts, receive_fix, report_state
 from simulator.vehicle.noise import seed_word
 from simulator.vehicle.sensors import error_model, error_process, white_sds

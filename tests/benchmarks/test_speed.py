@@ -23,9 +23,9 @@ from offboard.control.catalogue import settings_of
 from offboard.reference.transfer import transfer
 from offboard.run.configuration import load
 from simulator import config
+from simulator.config import Start
 from simulator.firmware.px4 import PX4
 from simulator.instance import Instance
-from simulator.start import Start
 from simulator.vehicle.conditions import Conditions
 from simulator.vehicle.sensors import EstimatorName
 

@@ -15,8 +15,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from offboard.control.base import Controller, Decision, Situation
 from offboard.model.command import Command
 from simulator import config
-from simulator.firmware.base import Firmware, Rule
-from simulator.firmware.values import Result, Severity, StatusText
+from simulator.autopilot.firmware import Firmware, Rule
+from simulator.autopilot.values import Result, Severity, StatusText
 from simulator.instance import Instance
 
 HEARTBEAT, ATTITUDE, POSITION, PARAM_VALUE, TIMESYNC = 0, 31, 32, 22, 111

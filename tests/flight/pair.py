@@ -36,12 +36,11 @@ from offboard.mavlink.signing import Signing
 from offboard.model.vehicle import Vehicle
 from offboard.run import configuration as config
 from simulator import config as simulated
-from simulator.config import Scenario
+from simulator.autopilot.firmware import Firmware
+from simulator.config import Scenario, Start
 from simulator.firmware.ardupilot import ARDUPILOT
-from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
 from simulator.instance import Instance
-from simulator.start import Start
 from simulator.steps import STEP_S
 
 HOST_EPOCH_S = 5000.0

@@ -26,8 +26,8 @@ from offboard.run import configuration as config
 from offboard.run.flight import Prepared, build
 from offboard.service.flights import Flights
 from simulator import config as simulated
+from simulator.config import Start
 from simulator.instance import Instance
-from simulator.start import Start
 
 ARM, TAKEOFF, SET_MODE, LAND = 400, 22, 176, 21  # MAV_CMD
 START, PAUSE_CONTINUE = 300, 193

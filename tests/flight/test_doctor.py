@@ -33,15 +33,14 @@ from offboard.mavlink.signing import UNITS_PER_S, Signing
 from offboard.run.configuration import FlightConfig, load
 from offboard.run.flight import Connection
 from simulator import config as simulated
+from simulator.autopilot.firmware import Firmware
+from simulator.config import Start
 from simulator.faults import Fault
 from simulator.firmware.ardupilot import ARDUPILOT
-from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
 from simulator.instance import Instance
-from simulator.start import Start
 from simulator.steps import STEP_S
-from simulator.vehicle.battery import Battery
-from simulator.vehicle.conditions import Conditions
+from simulator.vehicle.conditions import Battery, Conditions
 
 README = Path(__file__).parents[2] / "offboard" / "doctor" / "README.md"
 OK, WARN, WAIT, BLOCKS = Level.OK, Level.WARN, Level.WAIT, Level.BLOCKS

@@ -44,8 +44,8 @@ from watch import (
 from offboard.flight.phases import FLYING, Action, Phase
 from offboard.identification.learner import IdentifySettings
 from simulator import config as simulated
+from simulator.config import Start
 from simulator.firmware.px4 import PX4
-from simulator.start import Start
 
 WITH_GPS = with_rate(PX4, 50.0, "GPS_RAW_INT", "ESTIMATOR_STATUS")
 

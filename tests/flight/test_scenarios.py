@@ -41,9 +41,9 @@ from watch import (
 from offboard.analysis.score_table import summary
 from offboard.flight.phases import TRACKING, Phase
 from simulator import config
+from simulator.autopilot.firmware import Rule
+from simulator.autopilot.values import Result, Severity, StatusText
 from simulator.firmware.ardupilot import ARDUPILOT
-from simulator.firmware.base import Rule
-from simulator.firmware.values import Result, Severity, StatusText
 
 TAKEOFF = 22  # MAV_CMD
 STILL_ARMED = "it has stood still for 15 s and is armed: its land detector reports that it flies"

@@ -14,8 +14,7 @@ from simulator.config import scenario
 from simulator.config import vehicle as load
 from simulator.steps import STEP_S
 from simulator.vehicle.attitude import Demand
-from simulator.vehicle.battery import Battery
-from simulator.vehicle.conditions import Conditions
+from simulator.vehicle.conditions import Battery, Conditions
 from simulator.vehicle.plant import Plant
 
 AXES = {"roll": 0, "pitch": 1, "yaw": 2}

@@ -10,8 +10,8 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from offboard.model.vehicle import Vehicle
 from simulator import config
+from simulator.autopilot.firmware import Firmware
 from simulator.config import Scenario
-from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
 from simulator.geodesy import EARTH_RADIUS_M
 from simulator.instance import Instance

@@ -35,8 +35,8 @@ from offboard.mavlink import events
 from offboard.mavlink.counters import DropReason
 from offboard.mavlink.session import Session
 from simulator import config
-from simulator.firmware.base import Firmware
-from simulator.firmware.catalogue import FIRMWARES
+from simulator.autopilot.firmware import Firmware
+from simulator.firmware import FIRMWARES
 from simulator.instance import Instance
 from simulator.mavlink.codec import Decoder
 from simulator.vehicle.conditions import Conditions

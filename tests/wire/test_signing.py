@@ -20,8 +20,8 @@ from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.signing import RESERVED, UNITS_PER_S, Signing, stamp_of_unix
 from simulator import config
+from simulator.autopilot.firmware import Firmware
 from simulator.firmware.ardupilot import ARDUPILOT
-from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
 from simulator.instance import VIRTUAL_EPOCH_US, Instance
 from simulator.vehicle.conditions import Conditions

@@ -13,10 +13,10 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_bench import NAN, Bench, aloft, degrees
 
+from simulator.autopilot.firmware import Firmware
+from simulator.autopilot.values import MissionItem
 from simulator.firmware.ardupilot import ARDUPILOT
-from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
-from simulator.firmware.values import MissionItem
 
 AUTO, GUIDED, LAND, THROW = 3, 4, 9, 18
 ACCEPTED, DENIED, UNSUPPORTED, FAILED = 0, 2, 3, 4

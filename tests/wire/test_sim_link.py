@@ -14,8 +14,8 @@ from pymavlink.dialects.v20 import all as mavlink
 from sim_bench import NAN, Bench
 
 from simulator import config
-from simulator.firmware.base import Firmware
-from simulator.firmware.catalogue import FIRMWARES
+from simulator.autopilot.firmware import Firmware
+from simulator.firmware import FIRMWARES
 from simulator.firmware.px4 import PX4
 from simulator.firmware.px4_messages import COMPANION_RATES_HZ, GROUND_RATES_HZ
 from simulator.instance import Instance

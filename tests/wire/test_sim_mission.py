@@ -8,8 +8,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_bench import LOITER, NAN, RTL, Bench, aloft, degrees
 
+from simulator.autopilot.firmware import Firmware
 from simulator.firmware.ardupilot import ARDUPILOT
-from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
 
 WAYPOINT, LOITER_TIME, RETURN, TAKEOFF, SPEED = 16, 19, 20, 22, 178

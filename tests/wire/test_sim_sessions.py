@@ -18,8 +18,8 @@ from sim_bench import Bench
 from sim_rows import Rows, ask_again, compare
 from vehicle_frames import RECORDINGS, recorded
 
-from simulator.firmware.catalogue import FIRMWARES
-from simulator.vehicle.battery import Battery
+from simulator.firmware import FIRMWARES
+from simulator.vehicle.conditions import Battery
 from simulator.vehicle.sensors import EstimatorName
 
 NOT_OURS = (

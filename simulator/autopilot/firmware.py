@@ -15,7 +15,7 @@ from types import ModuleType
 from typing import Any, Literal
 
 from simulator.autopilot.state import StateEstimate
-from simulator.firmware.values import (
+from simulator.autopilot.values import (
     Asked,
     AttitudeSetpoint,
     MissionItem,
@@ -26,7 +26,7 @@ from simulator.firmware.values import (
     StatusText,
     Triple,
 )
-from simulator.vehicle.battery import BatteryState
+from simulator.vehicle.conditions import BatteryState
 
 _MAV_TYPE_GCS = 6
 Role = str | float | tuple[str, float] | Callable[[ReadParameter], float]
