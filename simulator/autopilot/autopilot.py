@@ -18,11 +18,23 @@ from simulator.autopilot.health import MONITOR_STEPS, Health
 from simulator.autopilot.mission import Mission
 from simulator.autopilot.parameters import ParameterTable
 from simulator.autopilot.position_controller import PositionController
-from simulator.autopilot.setpoints import ATTITUDE, SetpointStream
 from simulator.autopilot.state import VehicleState
-from simulator.autopilot.values import AttitudeSetpoint, Behaviour, Result, Triple
+from simulator.autopilot.values import (
+    AttitudeSetpoint,
+    Behaviour,
+    MotionSetpoint,
+    Result,
+    StatusText,
+    Triple,
+)
+from simulator.geodesy import TERRAIN_FRAMES, down_m, to_metres
 from simulator.steps import STEP_S
 from simulator.vehicle.plant import Plant
+
+# Setpoint messages
+ATTITUDE = "SET_ATTITUDE_TARGET"
+LOCAL, GLOBAL = "SET_POSITION_TARGET_LOCAL_NED", "SET_POSITION_TARGET_GLOBAL_INT"
+_POSITION_IGNORED, _LOCAL_NED = 0b111, 1  # type_mask; MAV_FRAME
 
 
 class Autopilot:
@@ -49,9 +61,8 @@ class Autopilot:
         self.parameters = parameters or ParameterTable(firmware)
         self.mission = mission or Mission(firmware, self.parameters)
         self.state = VehicleState(plant)
-        self.stream = SetpointStream(firmware, self.parameters)
         self.guidance = Guidance(firmware, self.parameters, self.mission, BEHAVIOURS)
-        self.health = Health(firmware, self.parameters, self.mission, self.stream, boot_scale)
+        self.health = Health(self.guidance, boot_scale)
         self.position_controller = PositionController(self.guidance, self.state)
         self.commander = Commander(self.guidance, self.position_controller, self.state, self.health)
 
@@ -60,24 +71,54 @@ class Autopilot:
         return self.commander.handle(event, request)
 
     def take_setpoint(self, message: str, values: Mapping[str, Any]) -> None:
-        """Take a setpoint message, by its name in `simulator.autopilot.setpoints` and its fields,
-        where the firmware accepts it in the present mode."""
+        """Take a setpoint message (ATTITUDE, LOCAL or GLOBAL) and its fields, which may be relative
+        to the vehicle, where the firmware accepts it in the present mode."""
         mode = self.commander.mode
         accepted = mode.behaviour is Behaviour.SETPOINT
         if message != ATTITUDE:
             accepted = accepted and mode.needs_position
         if not (accepted or self.firmware.setpoints_outlive_modes):
             return
-        home_down_m = self.guidance.home_ned_m[2]
-        setpoint, refusal = self.stream.read(message, values, self.state.estimate, home_down_m)
+        setpoint, refusal = self._read_setpoint(message, values)
         self.commander.texts += () if refusal is None else (refusal,)
         if setpoint is None:
             return
-        self.stream.newest_s = self.state.time_s
+        self.guidance.newest_s = self.state.time_s
         self.guidance.follow(setpoint)
         self._end_takeoff()
         if isinstance(setpoint, AttitudeSetpoint) and setpoint.event:
             self.handle(setpoint.event)
+
+    def _read_setpoint(
+        self, message: str, values: Mapping[str, Any]
+    ) -> tuple[AttitudeSetpoint | MotionSetpoint | None, StatusText | None]:
+        """Setpoint of a message, or a text about its refusal."""
+        firmware = self.firmware
+        if message == ATTITUDE:
+            return firmware.attitude_setpoint(values, self.parameters), None
+        frame = values["coordinate_frame"]
+        if message == LOCAL:
+            local = firmware.in_local_frame(values, self.state.estimate)
+        elif _has_position(values) and frame not in firmware.global_frames:
+            return None, firmware.setpoint_rejection(message, frame)
+        else:
+            local = self._in_metres(values)
+        setpoint = firmware.motion_setpoint(local)
+        if setpoint is not None:
+            return setpoint, None
+        frame = local["coordinate_frame"]
+        return None, firmware.setpoint_rejection(message, None if frame == _LOCAL_NED else frame)
+
+    def _in_metres(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Fields of GLOBAL as those of LOCAL in MAV_FRAME 1; a position is whole or ignored."""
+        origin, frame, mask = self.firmware.origin, values["coordinate_frame"], values["type_mask"]
+        x, y = to_metres(origin, values["lat_int"] * 1e-7, values["lon_int"] * 1e-7)
+        z = down_m(values["alt"], frame, origin, self.guidance.home_ned_m[2])
+        if frame in TERRAIN_FRAMES:
+            z = -values["alt"]
+        mask |= 0 if _has_position(values) else _POSITION_IGNORED
+        place = {"coordinate_frame": _LOCAL_NED, "x": x, "y": y, "z": z, "type_mask": mask}
+        return {**values, **place}
 
     def go_to(self, place_ned_m: Triple, yaw_rad: float) -> None:
         """Hold this place, in a mode that holds or follows setpoints; a NaN yaw faces the
@@ -106,18 +147,22 @@ class Autopilot:
         yield from self.health.boot_events(now_s)
         follows = commander.mode.behaviour is Behaviour.SETPOINT
         if commander.failsafe or follows:
-            alive = self.stream.alive(now_s)
+            alive = self.guidance.stream_alive(now_s)
             if commander.failsafe and alive:
                 yield "stream found"
             elif commander.armed and follows and not alive:
                 yield "stream lost"
         if commander.armed:
-            yield from commander.flight_time.step(now_s, was_landed, controller.landed)
+            yield from self.health.flight(now_s, was_landed, controller.landed)
             while self.guidance.events:
                 yield self.guidance.events.pop(0)
         if commander.armed:
-            yield from commander.flight_time.timeout(now_s, controller.landed)
+            yield from self.health.timeout(now_s, controller.landed)
         if self.state.steps % MONITOR_STEPS == 0:
             battery, has_fix = self.plant.battery, self.plant.gps_healthy
             yield from self.health.monitor(now_s, commander.armed, battery, has_fix)
             yield from commander.due_events()
+
+
+def _has_position(values: Mapping[str, Any]) -> bool:
+    return not values["type_mask"] & _POSITION_IGNORED

@@ -102,8 +102,8 @@ class Return(ActiveBehaviour):
     def enter(self, estimate: StateEstimate, place_ned_m: Triple, *, landed: bool) -> None:
         """Choose the height of the return."""
         guidance, (x, y, z) = self.guidance, estimate.position_ned_m
-        read, distance_m = guidance.parameters.__getitem__, self._distance_home_m(estimate)
-        height_m = guidance.firmware.return_height_m(distance_m, read)
+        distance_m = self._distance_home_m(estimate)
+        height_m = guidance.firmware.return_height_m(distance_m, guidance.parameters)
         guidance.hold = MotionSetpoint((x, y, min(z, guidance.home_ned_m[2] - height_m)))
 
     @property

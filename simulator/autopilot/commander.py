@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from simulator.autopilot.firmware import AFTER_DELAY, Rule
 from simulator.autopilot.guidance import Guidance
-from simulator.autopilot.health import FlightTime, Health
+from simulator.autopilot.health import Health
 from simulator.autopilot.position_controller import PositionController
 from simulator.autopilot.state import VehicleState
 from simulator.autopilot.values import (
@@ -63,7 +63,6 @@ class Commander:
         self._rows: dict[str, list[Rule]] = {}
         for rule in firmware.rules:
             self._rows.setdefault(rule.event, []).append(rule)
-        self.flight_time = FlightTime(self._parameters)
         self.mode: Mode = firmware.modes[firmware.boot_mode]
         self._intended = self._remembered = firmware.boot_mode
         self.armed = self.failsafe = False
@@ -81,8 +80,8 @@ class Commander:
     @property
     def healthy(self) -> bool:
         """The pre-arm checks pass in the intended mode."""
-        battery, read = self._state.plant.battery, self._parameters.__getitem__
-        if self.rejects_velocity or self._firmware.battery_level(battery, read) >= _CRITICAL:
+        level = self._firmware.battery_level(self._state.plant.battery, self._parameters)
+        if self.rejects_velocity or level >= _CRITICAL:
             return False
         return self._health.passes(
             self.intended, self._state.time_s, latched=bool(self.latched), armed=self.armed
@@ -195,7 +194,7 @@ class Commander:
 
     def _arm(self) -> None:
         self.armed = True
-        self.flight_time.arm(self._state.time_s, self._controller.landed)
+        self._health.arm(self._state.time_s, self._controller.landed)
         self._controller.arm()
 
     def _disarm(self) -> None:

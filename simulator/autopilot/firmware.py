@@ -21,7 +21,7 @@ from simulator.autopilot.values import (
     MissionItem,
     Mode,
     MotionSetpoint,
-    ReadParameter,
+    ParameterValues,
     Result,
     StatusText,
     Triple,
@@ -29,7 +29,7 @@ from simulator.autopilot.values import (
 from simulator.vehicle.conditions import BatteryState
 
 _MAV_TYPE_GCS = 6
-Role = str | float | tuple[str, float] | Callable[[ReadParameter], float]
+Role = str | float | tuple[str, float] | Callable[[ParameterValues], float]
 """Where a value comes from: a parameter, a constant, a parameter and the factor to SI, or a
 function of parameters."""
 
@@ -83,7 +83,7 @@ class Rule:
 
 @dataclass(frozen=True, kw_only=True)
 class Firmware(ABC):
-    """One firmware. A method's `parameter` reads a parameter by name."""
+    """One firmware."""
 
     name: str
     vehicle: str  # default vehicle and scenario
@@ -199,7 +199,7 @@ class Firmware(ABC):
 
     @abstractmethod
     def attitude_setpoint(
-        self, values: Mapping[str, Any], parameter: ReadParameter
+        self, values: Mapping[str, Any], parameters: ParameterValues
     ) -> AttitudeSetpoint | MotionSetpoint | None:
         """SET_ATTITUDE_TARGET as the firmware reads it; None: ignored without an answer."""
 
@@ -221,19 +221,19 @@ class Firmware(ABC):
     def mission_refusal(self, item: MissionItem) -> tuple[int, StatusText | None] | None:
         """MAV_MISSION_RESULT and text with which an item is refused; None: it is taken."""
 
-    def is_ground_station(self, kind: int, system: int, parameter: ReadParameter) -> bool:
+    def is_ground_station(self, kind: int, system: int, parameters: ParameterValues) -> bool:
         """Whether a heartbeat with this MAV_TYPE and system id is a ground station's."""
         name = self.ground_station_parameter
-        return system == parameter(name) if name else kind == _MAV_TYPE_GCS
+        return system == parameters[name] if name else kind == _MAV_TYPE_GCS
 
-    def obeys_system(self, sender: int, own: int, parameter: ReadParameter) -> bool:
+    def obeys_system(self, sender: int, own: int, parameters: ParameterValues) -> bool:
         """Whether messages of this system id are handled."""
         return True
 
     @abstractmethod
-    def battery_level(self, battery: BatteryState, parameter: ReadParameter) -> int:
+    def battery_level(self, battery: BatteryState, parameters: ParameterValues) -> int:
         """0: good; each further level has an event in `battery_events`."""
 
     @abstractmethod
-    def return_height_m(self, distance_m: float, parameter: ReadParameter) -> float:
+    def return_height_m(self, distance_m: float, parameters: ParameterValues) -> float:
         """Height of a return above home, by the distance to it."""

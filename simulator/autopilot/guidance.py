@@ -90,6 +90,7 @@ class Guidance:
         self.events = mission.events
         self.sticks = Sticks() if firmware.flown_by_sticks else None
         self.newest: Setpoint | None = None  # setpoint of a client
+        self.newest_s = -math.inf  # time of the last one that was accepted
         self.hold = MotionSetpoint(ORIGIN)
         self.home_ned_m = ORIGIN
         self.home_yaw_rad = 0.0
@@ -151,6 +152,12 @@ class Guidance:
         return replace(motion, yaw_rad=math.atan2(east - y, north - x))
 
     # -- setpoint, place and speed -----------------------------------------------------------
+
+    def stream_alive(self, now_s: float) -> bool:
+        """The stream of setpoints is not lost; that is noticed some time after its time-out."""
+        role = self.parameters.role
+        age_s = now_s - self.newest_s - role("stream_reaction_s")
+        return age_s <= role("stream_timeout_s")
 
     @property
     def setpoint(self) -> Setpoint | None:

@@ -8,49 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 
-from simulator.autopilot.firmware import Firmware
-from simulator.autopilot.mission import Mission
-from simulator.autopilot.parameters import ParameterTable
-from simulator.autopilot.setpoints import SetpointStream
+from simulator.autopilot.guidance import Guidance
 from simulator.autopilot.values import Behaviour, Mode
 from simulator.vehicle.conditions import BatteryState
 
 MONITOR_STEPS = 25  # 0.1 s
-
-
-@dataclass(slots=True)
-class FlightTime:
-    """Takeoff and landing of an armed vehicle, and when it disarms by itself."""
-
-    parameters: ParameterTable
-    _flown: bool = False
-    _armed_s: float = -math.inf
-    _landed_s: float = -math.inf
-
-    def arm(self, now_s: float, landed: bool) -> None:
-        self._flown, self._armed_s = not landed, now_s
-
-    def step(self, now_s: float, was_landed: bool, landed: bool) -> Iterator[str]:
-        """The event of leaving or reaching the ground."""
-        if was_landed and not landed:
-            self._flown = True
-            yield "took off"
-        if landed and not was_landed:
-            self._landed_s = now_s
-            yield "landed"
-
-    def timeout(self, now_s: float, landed: bool) -> Iterator[str]:
-        """The event of a vehicle that stays on the ground, after a flight or without one."""
-        if not landed:
-            return
-        event, since_s, role = "idle", self._armed_s, "disarm_idle_s"
-        if self._flown:
-            event, since_s, role = "settled", self._landed_s, "disarm_landed_s"
-        limit_s = self.parameters.role(role)
-        if limit_s > 0 and now_s - since_s >= limit_s - 1e-6:
-            yield event
 
 
 class Health:
@@ -59,16 +22,9 @@ class Health:
     Ground station, battery and position are monitored; each event is reported once.
     """
 
-    def __init__(
-        self,
-        firmware: Firmware,
-        parameters: ParameterTable,
-        mission: Mission,
-        stream: SetpointStream,
-        boot_scale: float,
-    ) -> None:
-        self._firmware, self._parameters = firmware, parameters
-        self._mission, self._stream = mission, stream
+    def __init__(self, guidance: Guidance, boot_scale: float) -> None:
+        self._firmware = firmware = guidance.firmware
+        self._guidance, self._parameters = guidance, guidance.parameters
         self.boot_scale = boot_scale
         self.reached: frozenset[str] = frozenset()  # boot events so far
         times_s = firmware.boot_events_s.items()
@@ -79,6 +35,8 @@ class Health:
         self._battery_level = 0  # reported; of `firmware.battery_events`
         self._worse_s = math.nan  # since when the level is above that
         self._fix_s = -math.inf  # last one
+        self._flown = False  # since arming
+        self._armed_s = self._landed_s = -math.inf
 
     # -- events ------------------------------------------------------------------------------
 
@@ -115,7 +73,7 @@ class Health:
         """A level is reported when it lasts; in flight it only gets worse."""
         level = 0
         if armed:
-            level = self._firmware.battery_level(battery, self._parameters.__getitem__)
+            level = self._firmware.battery_level(battery, self._parameters)
         else:
             self._battery_level = 0
         if level <= self._battery_level:
@@ -126,6 +84,29 @@ class Health:
         if now_s - self._worse_s >= self._parameters.role("battery_patience_s"):
             self._battery_level, self._worse_s = level, math.nan
             yield self._firmware.battery_events[level - 1]
+
+    def arm(self, now_s: float, landed: bool) -> None:
+        self._flown, self._armed_s = not landed, now_s
+
+    def flight(self, now_s: float, was_landed: bool, landed: bool) -> Iterator[str]:
+        """The event of leaving or reaching the ground, armed."""
+        if was_landed and not landed:
+            self._flown = True
+            yield "took off"
+        if landed and not was_landed:
+            self._landed_s = now_s
+            yield "landed"
+
+    def timeout(self, now_s: float, landed: bool) -> Iterator[str]:
+        """The event of an armed vehicle that stays on the ground, after a flight or without one."""
+        if not landed:
+            return
+        event, since_s, role = "idle", self._armed_s, "disarm_idle_s"
+        if self._flown:
+            event, since_s, role = "settled", self._landed_s, "disarm_landed_s"
+        limit_s = self._parameters.role(role)
+        if limit_s > 0 and now_s - since_s >= limit_s - 1e-6:
+            yield event
 
     # -- state -------------------------------------------------------------------------------
 
@@ -148,14 +129,14 @@ class Health:
         if self._parameters.role("ground_station_needed") > 0 and not heard:
             return False
         if mode.behaviour is Behaviour.MISSION:
-            return self._mission.flyable
+            return self._guidance.mission.flyable
         needs_stream = mode.behaviour is Behaviour.SETPOINT and firmware.setpoint_mode_needs_stream
-        return not needs_stream or self._stream.alive(now_s)
+        return not needs_stream or self._guidance.stream_alive(now_s)
 
     def can_run(self, mode: Mode, now_s: float) -> bool:
         """A vehicle in the air may enter this mode."""
         if mode.behaviour is Behaviour.SETPOINT:
-            return self._stream.alive(now_s)
+            return self._guidance.stream_alive(now_s)
         if mode.behaviour is Behaviour.MISSION:
-            return self._mission.flyable
+            return self._guidance.mission.flyable
         return not mode.needs_sticks

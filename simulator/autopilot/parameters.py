@@ -52,7 +52,7 @@ class ParameterTable:
             return self[source]
         if isinstance(source, tuple):
             return self[source[0]] * source[1]
-        return source(self.__getitem__) if callable(source) else source
+        return source(self) if callable(source) else source
 
     def set(self, name: str, value: float) -> bool:
         """Set one; False (and unchanged) where it is unknown, not finite or out of range."""

@@ -6,14 +6,19 @@ Knows no firmware and no message builder.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum, IntEnum
+from typing import Protocol
 
 Triple = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]  # w, x, y, z; FRD -> NED
-ReadParameter = Callable[[str], float]
 NAN3: Triple = (math.nan, math.nan, math.nan)
+
+
+class ParameterValues(Protocol):
+    """Values of the parameters by name."""
+
+    def __getitem__(self, name: str) -> float: ...
 
 
 class Result(IntEnum):

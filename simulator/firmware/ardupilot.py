@@ -19,7 +19,7 @@ from simulator.autopilot.values import (
     AttitudeSetpoint,
     MissionItem,
     MotionSetpoint,
-    ReadParameter,
+    ParameterValues,
     Result,
     StatusText,
     Triple,
@@ -95,7 +95,7 @@ class ArduCopter(Firmware):
         return Asked(refusal=Result.UNSUPPORTED)
 
     def attitude_setpoint(
-        self, values: Mapping[str, Any], parameter: ReadParameter
+        self, values: Mapping[str, Any], parameters: ParameterValues
     ) -> AttitudeSetpoint | MotionSetpoint | None:
         """SET_ATTITUDE_TARGET as ArduCopter reads it; None: ignored without an answer.
 
@@ -114,7 +114,7 @@ class ArduCopter(Firmware):
         rates: Triple = (0.0, 0.0, 0.0) if ignored else given
         if not all(map(math.isfinite, rates)):
             return None
-        thrust, climb_mps, event = _vertical(values["thrust"], parameter)
+        thrust, climb_mps, event = _vertical(values["thrust"], parameters)
         if mask & _ATTITUDE_IGNORED:
             return AttitudeSetpoint(None, rates, thrust, climb_mps, event)
         w, x, y, z = values["q"]
@@ -192,36 +192,36 @@ class ArduCopter(Firmware):
             return _UNSUPPORTED_FRAME, None
         return None
 
-    def obeys_system(self, sender: int, own: int, parameter: ReadParameter) -> bool:
+    def obeys_system(self, sender: int, own: int, parameters: ParameterValues) -> bool:
         """All systems; with SYSID_ENFORCE the ground station and its own components only."""
-        return not parameter("SYSID_ENFORCE") or sender in (own, parameter("SYSID_MYGCS"))
+        return not parameters["SYSID_ENFORCE"] or sender in (own, parameters["SYSID_MYGCS"])
 
-    def battery_level(self, battery: BatteryState, parameter: ReadParameter) -> int:
+    def battery_level(self, battery: BatteryState, parameters: ParameterValues) -> int:
         """By voltage or by remaining charge; a threshold of 0 disables the check."""
 
         def below(kind: str) -> bool:
-            left_mah = battery.remaining * parameter("BATT_CAPACITY")
-            by_voltage = battery.voltage_v < parameter(f"BATT_{kind}_VOLT")
-            return by_voltage or left_mah < parameter(f"BATT_{kind}_MAH")
+            left_mah = battery.remaining * parameters["BATT_CAPACITY"]
+            by_voltage = battery.voltage_v < parameters[f"BATT_{kind}_VOLT"]
+            return by_voltage or left_mah < parameters[f"BATT_{kind}_MAH"]
 
         return 2 if below("CRT") else int(below("LOW"))
 
-    def return_height_m(self, distance_m: float, parameter: ReadParameter) -> float:
+    def return_height_m(self, distance_m: float, parameters: ParameterValues) -> float:
         """Height of a return above home: under a cone near home (RTL_CONE_SLOPE)."""
-        highest_m, slope = parameter("RTL_ALT") * 0.01, parameter("RTL_CONE_SLOPE")
+        highest_m, slope = parameters["RTL_ALT"] * 0.01, parameters["RTL_CONE_SLOPE"]
         return min(highest_m, max(distance_m * slope, _RETURN_LEAST_M)) if slope > 0 else highest_m
 
 
-def _vertical(thrust: float, parameter: ReadParameter) -> tuple[float, float | None, str]:
+def _vertical(thrust: float, parameters: ParameterValues) -> tuple[float, float | None, str]:
     """Thrust, climb rate (None: the field is a thrust) and the event of a NaN."""
-    by_thrust = int(parameter("GUID_OPTIONS")) & _THRUST_IS_THRUST
+    by_thrust = int(parameters["GUID_OPTIONS"]) & _THRUST_IS_THRUST
     event = ""
     if math.isnan(thrust):
         thrust, event = 0.0 if by_thrust else 0.5, "thrust not a number"
     thrust = min(1.0, max(-1.0, thrust))
     if by_thrust:
         return max(0.0, thrust), None, event
-    up = parameter("WPNAV_SPEED_UP") if thrust > 0.5 else parameter("WPNAV_SPEED_DN")
+    up = parameters["WPNAV_SPEED_UP"] if thrust > 0.5 else parameters["WPNAV_SPEED_DN"]
     return 0.0, (max(0.0, thrust) - 0.5) / 0.5 * up * _CENTI, event
 
 

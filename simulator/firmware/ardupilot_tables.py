@@ -178,15 +178,15 @@ ROLES: dict[str, Role] = {
     "speed_xy_mps": ("WPNAV_SPEED", _CENTI),
     "speed_up_mps": 2.5,
     "speed_down_mps": 2.5,
-    "tilt_max_rad": lambda parameter: math.radians(parameter("ANGLE_MAX") * _CENTI),
+    "tilt_max_rad": lambda parameters: math.radians(parameters["ANGLE_MAX"] * _CENTI),
     "thrust_max": 1.0,
     # of automatic flight; braking is lower, as the jerk is limited
-    "turn_radps": lambda parameter: math.radians(parameter("ATC_SLEW_YAW") * _CENTI),
+    "turn_radps": lambda parameters: math.radians(parameters["ATC_SLEW_YAW"] * _CENTI),
     "speeding_mps2": ("WPNAV_ACCEL", _CENTI),
     "braking_mps2": ("WPNAV_ACCEL", 0.5 * _CENTI),
     "vertical_mps2": 2.5,
-    "facing_mps": lambda parameter: (
-        0.05 * (parameter("WPNAV_SPEED") * _CENTI) if parameter("WP_YAW_BEHAVIOR") else math.inf
+    "facing_mps": lambda parameters: (
+        0.05 * (parameters["WPNAV_SPEED"] * _CENTI) if parameters["WP_YAW_BEHAVIOR"] else math.inf
     ),
     # land detector; shares are between the least and the hover thrust
     "low_thrust_share": 1.0,

@@ -19,7 +19,7 @@ from simulator.autopilot.values import (
     AttitudeSetpoint,
     MissionItem,
     MotionSetpoint,
-    ReadParameter,
+    ParameterValues,
     Result,
     StatusText,
     Triple,
@@ -95,7 +95,7 @@ class Px4(Firmware):
         return Asked(text=critical(text))
 
     def attitude_setpoint(
-        self, values: Mapping[str, Any], parameter: ReadParameter
+        self, values: Mapping[str, Any], parameters: ParameterValues
     ) -> AttitudeSetpoint | None:
         """SET_ATTITUDE_TARGET as PX4 reads it; None when it demands nothing (mask 135).
 
@@ -193,18 +193,18 @@ class Px4(Firmware):
             return _UNSUPPORTED_FRAME, _INVALID
         return None
 
-    def battery_level(self, battery: BatteryState, parameter: ReadParameter) -> int:
+    def battery_level(self, battery: BatteryState, parameters: ParameterValues) -> int:
         """By the remaining share."""
-        return sum(battery.remaining < parameter(name) for name in _BATTERY_THRESHOLDS)
+        return sum(battery.remaining < parameters[name] for name in _BATTERY_THRESHOLDS)
 
-    def return_height_m(self, distance_m: float, parameter: ReadParameter) -> float:
+    def return_height_m(self, distance_m: float, parameters: ParameterValues) -> float:
         """Height of a return above home: under a cone near home (RTL_CONE_ANG)."""
-        highest_m, accepted_m = parameter("RTL_RETURN_ALT"), parameter("NAV_ACC_RAD")
+        highest_m, accepted_m = parameters["RTL_RETURN_ALT"], parameters["NAV_ACC_RAD"]
         if distance_m <= accepted_m:
             return min(2.0 * distance_m, highest_m)
         height_m = highest_m
-        if distance_m <= parameter("RTL_MIN_DIST"):
-            cone_rad = math.radians(min(89.0, max(1.0, parameter("RTL_CONE_ANG"))))
+        if distance_m <= parameters["RTL_MIN_DIST"]:
+            cone_rad = math.radians(min(89.0, max(1.0, parameters["RTL_CONE_ANG"])))
             height_m = min(distance_m / math.tan(cone_rad), highest_m)
         return min(max(height_m, 2.0 * accepted_m), highest_m)
 

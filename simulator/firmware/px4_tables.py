@@ -194,7 +194,7 @@ ROLES: dict[str, Role] = {
     "speeding_mps2": ("MPC_ACC_HOR", 0.7),
     "braking_mps2": ("MPC_ACC_HOR", 0.5),
     "vertical_mps2": ("MPC_ACC_DOWN_MAX", 0.5),
-    "facing_mps": lambda parameter: parameter("MPC_XY_P") * parameter("NAV_ACC_RAD"),
+    "facing_mps": lambda parameters: parameters["MPC_XY_P"] * parameters["NAV_ACC_RAD"],
     # land detector; shares are between the least and the hover thrust
     "low_thrust_share": 0.95,  # of estimates that wander on the ground, too
     "idle_thrust_share": 0.1,

@@ -126,10 +126,6 @@ class Encoder:
         self._mavlink = dialect.MAVLink(None, system, component)
         self._mavlink.signing.link_id = link
 
-    def restart(self) -> None:
-        """The next frame has sequence number 0."""
-        self._mavlink.seq = 0
-
     def frame(self, name: str, values: Sequence[object]) -> bytes:
         """A message as one MAVLink 2 frame with the next sequence number; `values` in the field
         order of the XML, extensions may be left out.

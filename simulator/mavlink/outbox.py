@@ -31,12 +31,12 @@ class Outbox:
         self.view, self.connected = view, False
         self._frames: list[bytes] = []
         self._suppressed: Counter[str] = Counter()
-        self._encoder = Encoder(view.system, MAV_COMP_ID_AUTOPILOT, keyring, link)
+        self._keyring, self._link = keyring, link
         self.restart()
 
     def restart(self) -> None:
         """As after boot: frames are numbered from 0; texts already sent are not repeated."""
-        self._encoder.restart()
+        self._encoder = Encoder(self.view.system, MAV_COMP_ID_AUTOPILOT, self._keyring, self._link)
         self._ground_station_us = -math.inf  # its last heartbeat
         self._held: list[tuple[int, StatusText]] = []
         self._text_number = 0

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from simulator.autopilot.setpoints import ATTITUDE, GLOBAL, LOCAL
+from simulator.autopilot.autopilot import ATTITUDE, GLOBAL, LOCAL
 from simulator.autopilot.sticks import RELEASE
 from simulator.mavlink.codec import Decoder, Keyring, Message, sender_of
 from simulator.mavlink.commands import Command, Commands
@@ -50,12 +50,13 @@ class Server:
         self.answered_ns = -1  # ts1 of the newest TIMESYNC answer
         self.outbox = Outbox(view, keyring, number)
         clock = ("TIMESYNC",) if barrier else ()
-        rates_hz = {name: hz for name, hz in rates_hz.items() if name not in clock}
-        self.schedule = Schedule(view, rates_hz)
-        self._commands = Commands(self.outbox, self.schedule)
-        self._begin_transfers()
+        self._rates_hz = {name: hz for name, hz in rates_hz.items() if name not in clock}
+        self._begin()
 
-    def _begin_transfers(self) -> None:
+    def _begin(self) -> None:
+        """As after boot: default rates, nothing under way."""
+        self.schedule = Schedule(self.view, self._rates_hz)
+        self._commands = Commands(self.outbox, self.schedule)
         self._parameters = ParameterTransfer(self.outbox)
         self._missions = MissionTransfer(self.outbox)
         self._handlers: Handlers = {  # by message
@@ -81,8 +82,7 @@ class Server:
     def restart(self) -> None:
         """Reset as after boot: default rates, no known client."""
         self.outbox.restart()
-        self.schedule.restart()
-        self._begin_transfers()
+        self._begin()
 
     def step(self) -> None:
         """Queue what is due at this step: missions, lists of parameters, telemetry."""
@@ -115,14 +115,13 @@ class Server:
         to_all = kind not in firmware.never_to_all or getattr(message, "command", 0) in _OF_ALL
         for_autopilot = component in (0, MAV_COMP_ID_AUTOPILOT)
         for_autopilot |= not firmware.target_component_checked
-        read = self.view.autopilot.parameters.__getitem__
-        obeyed = firmware.obeys_system(message.get_srcSystem(), ours, read)
+        parameters = self.view.autopilot.parameters
+        obeyed = firmware.obeys_system(message.get_srcSystem(), ours, parameters)
         return (system == ours or (to_all and system == 0)) and for_autopilot and obeyed
 
     def _heartbeat(self, message: Message) -> None:
-        autopilot = self.view.autopilot
-        read = autopilot.parameters.__getitem__
-        if autopilot.firmware.is_ground_station(message.type, message.get_srcSystem(), read):
+        autopilot, system = self.view.autopilot, message.get_srcSystem()
+        if autopilot.firmware.is_ground_station(message.type, system, autopilot.parameters):
             autopilot.health.ground_station_heard(autopilot.state.time_s)
             self.outbox.note_ground_station()
 
@@ -192,11 +191,10 @@ class Server:
 
     def _sticks(self, message: Message, widths_us: Sequence[int]) -> None:
         """Stick positions; only the ground station may send them, and is heard by them."""
-        autopilot = self.view.autopilot
-        read = autopilot.parameters.__getitem__
+        autopilot, system = self.view.autopilot, message.get_srcSystem()
         if autopilot.guidance.sticks is None:
             return
-        if autopilot.firmware.is_ground_station(0, message.get_srcSystem(), read):
+        if autopilot.firmware.is_ground_station(0, system, autopilot.parameters):
             autopilot.guidance.sticks.override(widths_us, autopilot.state.time_s)
             autopilot.health.ground_station_heard(autopilot.state.time_s)
 

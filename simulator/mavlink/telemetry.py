@@ -74,11 +74,6 @@ class Schedule:
     _next_us: float = 0.0  # no stream is due before
 
     def __post_init__(self) -> None:
-        self.restart()
-
-    def restart(self) -> None:
-        """As after boot."""
-        self.streams.clear()
         for name, rate_hz in self.rates_hz.items():
             self._start(name, round(1e6 / rate_hz)).due_at(STEP_US)
 
