@@ -64,8 +64,7 @@ class Land(ActiveBehaviour):
     landing = True
 
     def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
-        guidance = self.guidance
-        return descent(guidance.hold_ned_m, land_speed_mps(estimate, guidance))
+        return touch_down(self.guidance.hold_ned_m, estimate, self.guidance)
 
 
 def descent(place_ned_m: Triple, speed_mps: float) -> MotionSetpoint:
@@ -73,18 +72,18 @@ def descent(place_ned_m: Triple, speed_mps: float) -> MotionSetpoint:
     return MotionSetpoint((*place_ned_m[:2], math.nan), (math.nan, math.nan, speed_mps))
 
 
-def land_speed_mps(estimate: StateEstimate, guidance: Guidance) -> float:
-    """Descent speed: slower towards home's height, slowest where the range finder sees the ground
-    (PX4 MPC_LAND_SPEED, MPC_LAND_CRWL; ArduCopter LAND_SPEED)."""
+def touch_down(place_ned_m: Triple, estimate: StateEstimate, guidance: Guidance) -> MotionSetpoint:
+    """Down to the ground: slower towards home's height, slowest where the range finder sees the
+    ground (PX4 MPC_LAND_SPEED, MPC_LAND_CRWL; ArduCopter LAND_SPEED)."""
     role = guidance.parameters.role
     slow = role("land_speed_mps")
     if estimate.ground_m <= role("crawl_below_m"):
-        return min(slow, role("crawl_speed_mps"))
+        return descent(place_ned_m, min(slow, role("crawl_speed_mps")))
     fast = max(slow, role("descent_speed_mps"))
     slow_below_m, fast_above_m = role("slow_below_m"), role("fast_above_m")
     height_m = guidance.home_ned_m[2] - estimate.position_ned_m[2]
     share = (height_m - slow_below_m) / max(fast_above_m - slow_below_m, 1e-3)
-    return slow + min(1.0, max(0.0, share)) * (fast - slow)
+    return descent(place_ned_m, slow + min(1.0, max(0.0, share)) * (fast - slow))
 
 
 class Stage(Enum):
@@ -114,7 +113,7 @@ class Return(ActiveBehaviour):
         self._advance(estimate)
         guidance = self.guidance
         if self._stage is Stage.LAND:
-            return descent(guidance.hold_ned_m, land_speed_mps(estimate, guidance))
+            return touch_down(guidance.hold_ned_m, estimate, guidance)
         return MotionSetpoint(guidance.hold_ned_m, faces_way=guidance.firmware.return_faces_way)
 
     def _advance(self, estimate: StateEstimate) -> None:
@@ -152,9 +151,7 @@ class FlyMission(ActiveBehaviour):
     def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
         guidance = self.guidance
         motion = guidance.mission.fly(estimate, guidance.home_ned_m, landed=landed)
-        if not self.landing:
-            return motion
-        return descent(motion.position_ned_m, land_speed_mps(estimate, guidance))
+        return touch_down(motion.position_ned_m, estimate, guidance) if self.landing else motion
 
     @property
     def landing(self) -> bool:

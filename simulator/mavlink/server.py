@@ -7,7 +7,7 @@ the `outbox`. Knows no socket and no clock: time is the autopilot's.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from simulator.autopilot.autopilot import ATTITUDE, GLOBAL, LOCAL
 from simulator.autopilot.sticks import RELEASE
@@ -15,7 +15,7 @@ from simulator.mavlink.codec import Decoder, Keyring, Message, sender_of
 from simulator.mavlink.commands import Command, Commands
 from simulator.mavlink.outbox import MAV_COMP_ID_AUTOPILOT, Outbox
 from simulator.mavlink.telemetry import Schedule
-from simulator.mavlink.transfers import Handlers, MissionTransfer, ParameterTransfer
+from simulator.mavlink.transfers import MissionTransfer, ParameterTransfer
 from simulator.mavlink.view import View
 
 _GUIDED = 2  # `current` of a mission item that is a place to fly to now
@@ -59,25 +59,6 @@ class Server:
         self._commands = Commands(self.outbox, self.schedule)
         self._parameters = ParameterTransfer(self.outbox)
         self._missions = MissionTransfer(self.outbox)
-        self._handlers: Handlers = {  # by message
-            "HEARTBEAT": self._heartbeat,
-            "COMMAND_LONG": self._command_long,
-            "COMMAND_INT": self._command_int,
-            "SET_MODE": self._set_mode,
-            **dict.fromkeys((ATTITUDE, LOCAL, GLOBAL), self._setpoint),
-            **self._missions.handlers,
-            **dict.fromkeys(("MISSION_ITEM", "MISSION_ITEM_INT"), self._mission_item),
-            "TIMESYNC": self._timesync,
-            "PING": self._ping,
-            "SET_GPS_GLOBAL_ORIGIN": self._set_origin,
-            **self._parameters.handlers,
-            "RC_CHANNELS_OVERRIDE": self._rc_channels_override,
-            "MANUAL_CONTROL": self._manual_control,
-            "SETUP_SIGNING": self._setup_signing,
-            "LOG_REQUEST_LIST": self._log_request_list,
-            "REQUEST_DATA_STREAM": self._request_data_stream,
-            "FILE_TRANSFER_PROTOCOL": self._file_transfer,
-        }
 
     def restart(self) -> None:
         """Reset as after boot: default rates, no known client."""
@@ -102,9 +83,9 @@ class Server:
         for message in self.decoder.read(datagram):
             self.outbox.connected = True
             ignored = message.get_type() in self.view.autopilot.firmware.ignored
-            handler = None if ignored else self._handlers.get(message.get_type())
+            handler = None if ignored else HANDLERS.get(message.get_type())
             if handler is not None and self._is_for_us(message):
-                handler(message)
+                handler(self, message)
 
     def _is_for_us(self, message: Message) -> bool:
         """Whether its target is this system and its autopilot, or all."""
@@ -218,3 +199,34 @@ class Server:
         answer = head + (0,) * 6 + (_FTP_ERROR_NOT_FOUND,)
         padded = answer + (0,) * (len(request) - len(answer))
         self.outbox.send("FILE_TRANSFER_PROTOCOL", 0, *sender_of(message), padded)
+
+
+# By message; those with a target only if it is this vehicle
+HANDLERS: dict[str, Callable[[Server, Message], None]] = {
+    "HEARTBEAT": Server._heartbeat,
+    "COMMAND_LONG": Server._command_long,
+    "COMMAND_INT": Server._command_int,
+    "SET_MODE": Server._set_mode,
+    **dict.fromkeys((ATTITUDE, LOCAL, GLOBAL), Server._setpoint),
+    "MISSION_ACK": lambda server, message: server._missions.ack(message),
+    "MISSION_COUNT": lambda server, message: server._missions.count(message),
+    "MISSION_ITEM": Server._mission_item,
+    "MISSION_ITEM_INT": Server._mission_item,
+    "MISSION_REQUEST_LIST": lambda server, message: server._missions.request_list(message),
+    "MISSION_REQUEST": lambda server, message: server._missions.request(message),
+    "MISSION_REQUEST_INT": lambda server, message: server._missions.request(message),
+    "MISSION_CLEAR_ALL": lambda server, message: server._missions.clear_all(message),
+    "MISSION_SET_CURRENT": lambda server, message: server._missions.set_current(message),
+    "TIMESYNC": Server._timesync,
+    "PING": Server._ping,
+    "SET_GPS_GLOBAL_ORIGIN": Server._set_origin,
+    "PARAM_REQUEST_READ": lambda server, message: server._parameters.request_read(message),
+    "PARAM_REQUEST_LIST": lambda server, message: server._parameters.request_list(message),
+    "PARAM_SET": lambda server, message: server._parameters.set(message),
+    "RC_CHANNELS_OVERRIDE": Server._rc_channels_override,
+    "MANUAL_CONTROL": Server._manual_control,
+    "SETUP_SIGNING": Server._setup_signing,
+    "LOG_REQUEST_LIST": Server._log_request_list,
+    "REQUEST_DATA_STREAM": Server._request_data_stream,
+    "FILE_TRANSFER_PROTOCOL": Server._file_transfer,
+}

@@ -7,7 +7,6 @@ mission in `simulator.autopilot.mission`, and which items of a mission a firmwar
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import IntEnum
 
@@ -19,7 +18,6 @@ from simulator.mavlink.outbox import Outbox
 
 PER_STEP = 4  # parameters of a list
 NO_INDEX = 65535  # PARAM_VALUE.param_index of an answer without one
-Handlers = dict[str, Callable[[Message], None]]
 
 
 @dataclass(slots=True)
@@ -28,15 +26,6 @@ class ParameterTransfer:
 
     outbox: Outbox
     _due: list[str] = field(default_factory=list)
-
-    @property
-    def handlers(self) -> Handlers:
-        """By message: what handles it, if it is addressed to this vehicle."""
-        return {
-            "PARAM_REQUEST_READ": self._read,
-            "PARAM_REQUEST_LIST": self._list,
-            "PARAM_SET": self._set,
-        }
 
     def step(self) -> None:
         """Queue the next parameters of a requested list."""
@@ -59,7 +48,8 @@ class ParameterTransfer:
         index = names.index(name) if numbered else NO_INDEX
         self.outbox.send("PARAM_VALUE", name.encode(), value, kind, len(names), index)
 
-    def _read(self, message: Message) -> None:
+    def request_read(self, message: Message) -> None:
+        """PARAM_REQUEST_READ, by index or by name."""
         names = self.outbox.view.autopilot.parameters.names
         if message.param_index >= 0:
             if message.param_index < len(names):
@@ -70,11 +60,13 @@ class ParameterTransfer:
     def _is_hash(self, name: str) -> bool:
         return name == HASH and self.outbox.view.autopilot.firmware.parameters_hashed
 
-    def _list(self, _: Message) -> None:
+    def request_list(self, _: Message) -> None:
+        """PARAM_REQUEST_LIST; during a list it begins anew, without the hash."""
         hashed = (HASH,) if self._is_hash(HASH) and not self._due else ()
         self._due = [*hashed, *self.outbox.view.autopilot.parameters.names]
 
-    def _set(self, message: Message) -> None:
+    def set(self, message: Message) -> None:
+        """PARAM_SET, answered with the value that it has now."""
         table = self.outbox.view.autopilot.parameters
         if self._is_hash(message.param_id):  # the client has the whole list already
             self._due = []
@@ -122,21 +114,6 @@ class MissionTransfer:
         self._whole = False  # the peer uses the _INT messages, in 1e-7 degrees
 
     @property
-    def handlers(self) -> Handlers:
-        """By message: what handles it, if it is addressed to this vehicle."""
-        return {
-            "MISSION_ACK": self._ack,
-            "MISSION_COUNT": self._count,
-            "MISSION_ITEM": self.item,
-            "MISSION_ITEM_INT": self.item,
-            "MISSION_REQUEST_LIST": self._list,
-            "MISSION_REQUEST": self._request,
-            "MISSION_REQUEST_INT": self._request,
-            "MISSION_CLEAR_ALL": self._clear,
-            "MISSION_SET_CURRENT": self._set_current,
-        }
-
-    @property
     def _now_s(self) -> float:
         return self.outbox.view.autopilot.state.time_us * 1e-6
 
@@ -154,7 +131,8 @@ class MissionTransfer:
 
     # -- up ----------------------------------------------------------------------------------
 
-    def _count(self, message: Message) -> None:
+    def count(self, message: Message) -> None:
+        """MISSION_COUNT: an upload begins."""
         peer, kind = sender_of(message), message.mission_type
         if kind not in self.mission.stored:
             self._acknowledge(peer, Ack.UNSUPPORTED, kind)
@@ -204,7 +182,7 @@ class MissionTransfer:
         if not kind and self._firmware.mission_text is not None:
             self.outbox.send_text(self._firmware.mission_text)
 
-    def _ack(self, message: Message) -> None:
+    def ack(self, message: Message) -> None:
         """MISSION_ACK of the peer: it wants the other kind of request, or cancels."""
         upload = self._upload
         if upload is None or upload.peer != sender_of(message):
@@ -220,12 +198,14 @@ class MissionTransfer:
 
     # -- down, and the rest ------------------------------------------------------------------
 
-    def _list(self, message: Message) -> None:
+    def request_list(self, message: Message) -> None:
+        """MISSION_REQUEST_LIST."""
         kind = message.mission_type
         count = len(self.mission.stored.get(kind, ()))
         self.outbox.send("MISSION_COUNT", *sender_of(message), count, kind)
 
-    def _request(self, message: Message) -> None:
+    def request(self, message: Message) -> None:
+        """MISSION_REQUEST or MISSION_REQUEST_INT of a download."""
         peer, kind = sender_of(message), message.mission_type
         items = self.mission.stored.get(kind, ())
         self._whole = whole = message.get_type() == "MISSION_REQUEST_INT"
@@ -248,13 +228,15 @@ class MissionTransfer:
         place = view.geodetic(north_m, east_m)
         return MissionItem(0, Kind.WAYPOINT, (0.0,) * 4, *place, view.altitude_mm(down_m) * 1e-3)
 
-    def _clear(self, message: Message) -> None:
+    def clear_all(self, message: Message) -> None:
+        """MISSION_CLEAR_ALL."""
         for kind in self.mission.stored:
             if message.mission_type in (kind, ALL_KINDS):
                 self.mission.store((), kind)
         self._acknowledge(sender_of(message), Ack.ACCEPTED, message.mission_type)
 
-    def _set_current(self, message: Message) -> None:
+    def set_current(self, message: Message) -> None:
+        """MISSION_SET_CURRENT."""
         if self.mission.go_to(message.seq):
             self.outbox.send_now("MISSION_CURRENT")
 
