@@ -52,13 +52,20 @@ class TakeoffRamp:
         """The vehicle is in the air without a ramp."""
         self._spool_left_s, self.flying = 0.0, True
 
-    def step(self, climb_demanded: bool) -> None:
+    @property
+    def over(self) -> bool:
+        """The allowed climb rate has its final value; a heavy vehicle may still stand."""
+        return self._ramp_s >= self.parameters.role("takeoff_ramp_s")
+
+    def step(self, *, climb_demanded: bool, landed: bool) -> None:
         """One period of LOOP_S."""
         if self.spooling:
             self._spool_left_s -= LOOP_S
         elif not self.flying and (climb_demanded or self._ramp_s > 0.0):
             self._ramp_s += LOOP_S
-            self.flying = self._ramp_s >= self.parameters.role("takeoff_ramp_s")
+            self.flying = self.over and not landed
+            if self.over and landed and not climb_demanded:
+                self.land()
 
     def climb_limit_mps(self) -> float:
         """Allowed climb rate; negative, a descent, at first."""

@@ -150,9 +150,10 @@ class PositionController:
         if self.landed and ramp.spooling and lifts_off:
             guidance.hold = MotionSetpoint(estimate.position_ned_m)
         self.motion = guidance.motion(estimate, landed=self.landed)
-        ramp.step(climb_demanded=lifts_off and self._climb_demanded(estimate))
+        climb_demanded = lifts_off and self._climb_demanded(estimate)
+        ramp.step(climb_demanded=climb_demanded, landed=self.landed)
         still = estimate.on_ground and (ramp.lifting or self.landed)
-        on_ramp = ramp.lifting and self._firmware.integrates_on_ramp
+        on_ramp = ramp.lifting and (self._firmware.integrates_on_ramp or ramp.over)
         attitude, thrust, velocity_ned_mps = self.loop.step(
             self.motion, self._limits, estimate, integrate=not still or on_ramp
         )

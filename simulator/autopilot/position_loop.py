@@ -18,8 +18,7 @@ from simulator.geodesy import GRAVITY_MPS2
 from simulator.steps import LOOP_S
 
 _AXES = ("xy", "xy", "z")  # as in the names of the gains
-# The vertical integral may carry any vehicle; m/s^2 of north, east and down
-_INTEGRAL_MAX_MPS2 = (4.0, 4.0, GRAVITY_MPS2)
+_INTEGRAL_XY_MAX_MPS2 = 4.0
 _REACHED_RAD = 0.05  # of a yaw: the rest is turned the shorter way
 _TILT_COSINE_MIN = 0.1  # least divisor of the thrust
 # The derivative of the velocity through a first-order low-pass of 5 Hz: share of the newest
@@ -170,7 +169,7 @@ class PositionLoop:
             )
             if math.isnan(error) or saturated:
                 continue
-            most = _INTEGRAL_MAX_MPS2[i]
+            most = self._role("integral_z_max_mps2") if i == 2 else _INTEGRAL_XY_MAX_MPS2
             gain = self._role(f"velocity_{axis}_i")
             integral = self._integral_mps2[i] + gain * error * LOOP_S
             self._integral_mps2[i] = min(most, max(-most, integral))

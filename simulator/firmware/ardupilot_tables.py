@@ -13,6 +13,7 @@ from dataclasses import replace
 
 from simulator.autopilot.firmware import RANGES, ParameterSpec, Role, Rule
 from simulator.autopilot.values import Behaviour, Mode, Result, StatusText, critical, info, warning
+from simulator.geodesy import GRAVITY_MPS2
 
 # MAV_MODE_FLAG: 1 custom mode, 8 guided, 16 stabilise, 64 manual input. "Guided" shows whether
 # the position controller runs, not the mode.
@@ -175,6 +176,10 @@ ROLES: dict[str, Role] = {
     "velocity_z_p": 5.0,
     "velocity_z_i": 10.0,
     "velocity_z_d": 0.0,
+    # PSC_ACCZ_IMAX, a throttle of 0.8: enough for any vehicle, whatever MOT_THST_HOVER says
+    "integral_z_max_mps2": lambda parameters: (
+        0.8 * GRAVITY_MPS2 / max(parameters["MOT_THST_HOVER"], 1e-3)
+    ),
     "speed_xy_mps": ("WPNAV_SPEED", _CENTI),
     "speed_up_mps": 2.5,
     "speed_down_mps": 2.5,

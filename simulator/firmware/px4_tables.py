@@ -18,6 +18,7 @@ from simulator.autopilot.values import (
     info,
     warning,
 )
+from simulator.geodesy import GRAVITY_MPS2
 
 # MAV_MODE_FLAG: 1 custom mode, 4 auto, 8 guided, 16 stabilise, 64 manual input
 AUTO, OFFBOARD, RATES, MANUAL = 29, 17, 1, 81
@@ -183,6 +184,7 @@ ROLES: dict[str, Role] = {
     "velocity_z_p": "MPC_Z_VEL_P_ACC",
     "velocity_z_i": "MPC_Z_VEL_I_ACC",
     "velocity_z_d": "MPC_Z_VEL_D_ACC",
+    "integral_z_max_mps2": GRAVITY_MPS2,
     "speed_xy_mps": "MPC_XY_VEL_MAX",
     "speed_up_mps": "MPC_Z_VEL_MAX_UP",
     "speed_down_mps": "MPC_Z_VEL_MAX_DN",

@@ -15,10 +15,11 @@ from sim_bench import NAN, Bench, aloft, degrees
 
 from simulator.autopilot.firmware import Firmware
 from simulator.autopilot.values import MissionItem
+from simulator.config import Scenario
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.px4 import PX4
 
-AUTO, GUIDED, LAND, THROW = 3, 4, 9, 18
+AUTO, GUIDED, LAND, BRAKE, THROW = 3, 4, 9, 17, 18
 ACCEPTED, DENIED, UNSUPPORTED, FAILED = 0, 2, 3, 4
 HOVER = 0.3655
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -84,6 +85,23 @@ def test_takeoff_by_setpoints_alone(thrust: float, lifts: bool) -> None:
     vehicle.run(0.7, lambda: vehicle.attitude(thrust=thrust))
     assert (vehicle.height_m > 0.3) is lifts
     assert (vehicle.armed, vehicle.instance.view.landed_state) == (True, 2)
+
+
+def test_a_heavy_vehicle_takes_off_also_after_a_takeoff_that_ended_on_the_ground() -> None:
+    """Hover thrust 0.85: its altitude controller is limited by full throttle alone."""
+    heavy = {"name": "heavy", "conditions": {"thrust_scale": 0.43, "boot_scale": 0.1}}
+    vehicle = booted(scenario=Scenario.model_validate(heavy))
+    vehicle.command(176, 1, GUIDED)
+    assert vehicle.command(400, 1) == [ACCEPTED]
+    assert vehicle.command(22, 0, 0, 0, 0, 0, 0, 5.0) == [ACCEPTED]
+    vehicle.run(2.8)
+    vehicle.command(176, 1, BRAKE)  # while the throttle rises
+    vehicle.run(2.0)
+    vehicle.command(176, 1, GUIDED)
+    assert vehicle.height_m == pytest.approx(0.0, abs=0.01)
+    assert vehicle.command(22, 0, 0, 0, 0, 0, 0, 6.0) == [ACCEPTED]
+    vehicle.run(12.0)
+    assert vehicle.height_m == pytest.approx(6.0, abs=0.5)
 
 
 def test_which_attitude_setpoints_are_flown() -> None:
