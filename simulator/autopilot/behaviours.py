@@ -19,10 +19,6 @@ _FLATTEST = 1000.0  # takeoff: m across per m of climb
 _STILL_MPS = 0.05  # sticks: a slower demand holds the place
 
 
-class Hold(ActiveBehaviour):
-    """PX4 AUTO.LOITER; ArduCopter BRAKE and CIRCLE: stay, or fly to the place a client named."""
-
-
 class Takeoff(ActiveBehaviour):
     """PX4 AUTO.TAKEOFF; ArduCopter GUIDED after MAV_CMD_NAV_TAKEOFF. Reports "climbed"."""
 
@@ -219,7 +215,8 @@ class FollowSetpoint(ActiveBehaviour):
 
 
 BEHAVIOURS: Mapping[Behaviour, type[ActiveBehaviour]] = {
-    Behaviour.HOLD: Hold,
+    # stay, or fly to the place a client named: PX4 AUTO.LOITER; ArduCopter BRAKE and CIRCLE
+    Behaviour.HOLD: ActiveBehaviour,
     Behaviour.TAKEOFF: Takeoff,
     Behaviour.LAND: Land,
     Behaviour.RETURN: Return,
