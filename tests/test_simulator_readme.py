@@ -15,7 +15,7 @@ import pytest
 
 from simulator import config
 from simulator.autopilot.commander import ACTIONS, CONDITIONS, TEXT_VALUES
-from simulator.autopilot.firmware import AFTER_DELAY, Firmware, Rule
+from simulator.autopilot.firmware import AFTER_DELAY, ByParameter, Firmware, Rule
 from simulator.autopilot.values import Result
 from simulator.faults import Fault
 from simulator.faults.fault import Timed
@@ -44,11 +44,19 @@ def table(firmware: Firmware) -> str:
     """The state table of one firmware in Markdown."""
     rows = [HEAD, ("---",) * len(HEAD)]
     for rule in firmware.rules:
-        mode, to = ("any" if rule.mode == "*" else rule.mode), rule.to.replace("*", "")
+        mode, to = ("any" if rule.mode == "*" else rule.mode), target(rule)
         answer = () if rule.result is Result.ACCEPTED else (rule.result.name,)
         texts = (f'"{text.text}"' for text in rule.texts)
         rows.append((rule.event, mode, " and ".join(rule.when), to, " ".join((*answer, *texts))))
     return "\n".join("| " + " | ".join(row) + " |" for row in rows)
+
+
+def target(rule: Rule) -> str:
+    """The next mode of a row as the table shows it."""
+    if isinstance(rule.to, ByParameter):
+        modes = ", ".join(f"{value} {mode}" for value, mode in rule.to.modes.items())
+        return f"by {rule.to.parameter}: {modes}"
+    return rule.to.replace("*", "")
 
 
 def with_tables(text: str) -> str:
@@ -86,8 +94,12 @@ def unknown(firmware: Firmware, rule: Rule) -> Iterator[str]:
     """What a row names that does not exist."""
     known = EVENTS.union((event + AFTER_DELAY for event in EVENTS), firmware.boot_events_s)
     yield from {rule.event} - known
-    yield from {rule.mode} - {*firmware.modes, "*"}
-    yield from {rule.to} - {*firmware.modes, "*", "requested", "remembered"}
+    yield from set(rule.mode.split()) - {*firmware.modes, "*"}
+    if isinstance(rule.to, ByParameter):
+        yield from set(rule.to.modes.values()) - firmware.modes.keys()
+        yield from {rule.to.parameter} - {spec.name for spec in firmware.parameters}
+    else:
+        yield from {rule.to} - {*firmware.modes, "*", "requested", "remembered"}
     yield from set(rule.do) - ACTIONS.keys()
     yield from (name for name in rule.when if not exists(firmware, name.removeprefix("not ")))
     fields = (name for text in rule.texts for _, name, _, _ in Formatter().parse(text.text))
@@ -98,7 +110,7 @@ def exists(firmware: Firmware, condition: str) -> bool:
     name, compares, value = condition.partition("=")
     if compares:
         known = any(name == spec.name for spec in firmware.parameters)
-        return known and value.lstrip("-").isdecimal()
+        return known and value.replace(",", "").isdecimal()
     kind, _, event = condition.partition(" ")
     if kind in ("since", "latched"):
         return event in EVENTS

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from simulator.autopilot.firmware import AFTER_DELAY, Rule
+from simulator.autopilot.firmware import AFTER_DELAY, ByParameter, Rule
 from simulator.autopilot.guidance import Guidance
 from simulator.autopilot.health import Health
 from simulator.autopilot.position_controller import PositionController
@@ -146,9 +146,17 @@ class Commander:
     def _row(self, event: str) -> Rule | None:
         """The row that decides about an event; None: nothing happens."""
         for rule in self._rows.get(event, ()):
-            if rule.mode in ("*", self.mode.name) and all(map(self._holds, rule.when)):
+            in_mode = rule.mode == "*" or self.mode.name in rule.mode.split()
+            if in_mode and all(map(self._holds, rule.when)) and self._target(rule) is not None:
                 return rule
         return None
+
+    def _target(self, rule: Rule) -> str | None:
+        """Its next mode by name, "*" for none; None where no mode belongs to the parameter."""
+        if isinstance(rule.to, ByParameter):
+            return rule.to.modes.get(int(self._parameters[rule.to.parameter]))
+        chosen = {"requested": self._request.mode, "remembered": self._remembered}
+        return chosen.get(rule.to, rule.to)
 
     def _holds(self, condition: str) -> bool:
         if condition.startswith("not "):
@@ -163,15 +171,15 @@ class Commander:
             return condition[8:] in self.latched
         name, compares, value = condition.partition("=")
         if compares:
-            return self._parameters[name] == float(value)
+            return self._parameters[name] in map(float, value.split(","))
         return CONDITIONS[condition](self)
 
     def _apply(self, rule: Rule) -> None:
         for action in rule.do:
             ACTIONS[action](self)
-        target = {"requested": self._request.mode, "remembered": self._remembered}
-        if rule.to != "*":
-            self._enter(target.get(rule.to, rule.to), by_failsafe="failsafe" in rule.do)
+        target = self._target(rule)
+        if target is not None and target != "*":
+            self._enter(target, by_failsafe="failsafe" in rule.do)
         for text in rule.texts:
             values = {name: value(self) for name, value in TEXT_VALUES.items()}
             self.texts.append(StatusText(text.severity, text.text.format(**values)))

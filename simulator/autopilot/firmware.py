@@ -54,17 +54,26 @@ AFTER_DELAY = " after delay"
 
 
 @dataclass(frozen=True, slots=True)
+class ByParameter:
+    """The next mode by the value of a parameter."""
+
+    parameter: str
+    modes: Mapping[int, str]
+
+
+@dataclass(frozen=True, slots=True)
 class Rule:
     """One row of the state table: the first row that fits an event decides.
 
     Args:
         event: its name; those of the start are in `Firmware.boot_events_s`.
-        mode: name of the mode in which it happened, or "*".
+        mode: names of the modes in which it happened, with spaces between, or "*".
         when: conditions that must all hold (`simulator.autopilot.commander.CONDITIONS`). "not X"
-            negates, "NAME=2" compares a parameter, "since X" is a failsafe because of event X,
+            negates, "NAME=1,2" compares a parameter, "since X" is a failsafe because of event X,
             "reached X" a boot event that has come, "latched X" an event that only a reboot clears,
             "requests X" a request of mode X.
-        to: next mode by name, "*" none, "requested" by the command, "remembered" the last chosen.
+        to: next mode by name, "*" none, "requested" by the command, "remembered" the last chosen;
+            or by a parameter, and then the row fits only the values that are named.
         do: actions (`simulator.autopilot.commander.ACTIONS`).
         result: acknowledgement of a command.
         texts: STATUSTEXTs; they may name {mode} and `simulator.autopilot.commander.TEXT_VALUES`.
@@ -74,7 +83,7 @@ class Rule:
     event: str
     mode: str = "*"
     when: tuple[str, ...] = ()
-    to: str = "*"
+    to: str | ByParameter = "*"
     do: tuple[str, ...] = ()
     result: Result = Result.ACCEPTED
     texts: tuple[StatusText, ...] = ()

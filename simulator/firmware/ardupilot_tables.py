@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 
-from simulator.autopilot.firmware import RANGES, ParameterSpec, Role, Rule
+from simulator.autopilot.firmware import RANGES, ByParameter, ParameterSpec, Role, Rule
 from simulator.autopilot.values import Behaviour, Mode, Result, StatusText, critical, info, warning
 from simulator.geodesy import GRAVITY_MPS2
 
@@ -231,23 +231,14 @@ _FAILSAFE = {
 
 def _failsafe(
     event: str, parameter: str, modes: Mapping[int, str], do: tuple[str, ...] = ("failsafe",)
-) -> list[Rule]:
-    """Rows of a failsafe without delay: to the mode that the parameter selects, when armed."""
-    return [
-        Rule(
-            event,
-            when=("armed", f"{parameter}={value}"),
-            to=mode,
-            do=do,
-            texts=_FAILSAFE[event],
-            send=_HEARTBEAT,
-        )
-        for value, mode in modes.items()
-    ]
+) -> Rule:
+    """A failsafe without delay: to the mode that the parameter selects, when armed."""
+    to, texts = ByParameter(parameter, modes), _FAILSAFE[event]
+    return Rule(event, when=("armed",), to=to, do=do, texts=texts, send=_HEARTBEAT)
 
 
 # Modes that FS_OPTIONS bit 4 leaves to the pilot
-_PILOTED = ("STABILIZE", "ACRO", "ALT_HOLD", "LOITER", "DRIFT", "POSHOLD", "BRAKE", "THROW")
+_PILOTED = "STABILIZE ACRO ALT_HOLD LOITER DRIFT POSHOLD BRAKE THROW"
 _BATTERY_MODES = {1: "LAND", 2: "RTL", 3: "SMART_RTL", 4: "SMART_RTL", 7: "BRAKE"}
 _GROUND_MODES = {**_BATTERY_MODES, 1: "RTL", 5: "LAND"}
 
@@ -310,7 +301,7 @@ RULES = (
     *_entries("mode"),
     Rule("turn"),
     Rule("home", send=("HOME_POSITION",)),
-    *(Rule("speed", mode) for mode in ("GUIDED", "AUTO", "RTL")),
+    Rule("speed", "GUIDED AUTO RTL"),
     Rule("speed", result=_FAILED),
     Rule("servo"),
     Rule("loiter", when=("not position missing",), to="LOITER", send=_HEARTBEAT),
@@ -351,16 +342,13 @@ RULES = (
         do=("disarm",),
         texts=(_DISARMING, warning("GCS Failsafe - Disarming")),
     ),
-    *(
-        Rule(
-            "ground station lost",
-            mode,
-            when=("armed", "not FS_GCS_ENABLE=0", "FS_OPTIONS=16"),
-            texts=(warning("GCS Failsafe - Continuing Pilot Control"),),
-        )
-        for mode in _PILOTED
+    Rule(
+        "ground station lost",
+        _PILOTED,
+        when=("armed", "not FS_GCS_ENABLE=0", "FS_OPTIONS=16"),
+        texts=(warning("GCS Failsafe - Continuing Pilot Control"),),
     ),
-    *_failsafe("ground station lost", "FS_GCS_ENABLE", _GROUND_MODES),
+    _failsafe("ground station lost", "FS_GCS_ENABLE", _GROUND_MODES),
     Rule(  # it looks for a landing sequence in the mission first
         "ground station lost",
         when=("armed", "FS_GCS_ENABLE=6"),
@@ -380,20 +368,17 @@ RULES = (
         do=("recover",),
         texts=(warning("GCS Failsafe Cleared"),),
     ),
-    *_failsafe("battery low", "BATT_FS_LOW_ACT", _BATTERY_MODES, _UNTIL_REBOOT),
-    *_failsafe("battery critical", "BATT_FS_CRT_ACT", _BATTERY_MODES, _UNTIL_REBOOT),
+    _failsafe("battery low", "BATT_FS_LOW_ACT", _BATTERY_MODES, _UNTIL_REBOOT),
+    _failsafe("battery critical", "BATT_FS_CRT_ACT", _BATTERY_MODES, _UNTIL_REBOOT),
     Rule("battery low", texts=(_FAILSAFE["battery low"][0],)),
     Rule("battery critical", texts=(_FAILSAFE["battery critical"][0],)),
-    *(
-        Rule(
-            "position lost",
-            when=("armed", "not landed", "mode needs position", f"FS_EKF_ACTION={value}"),
-            to=mode,
-            do=("failsafe",),
-            texts=(critical("EKF variance"), critical(f"EKF Failsafe: changed to {mode} Mode")),
-            send=_HEARTBEAT,
-        )
-        for value, mode in ((1, "LAND"), (2, "ALT_HOLD"), (3, "LAND"))
+    Rule(
+        "position lost",
+        when=("armed", "not landed", "mode needs position"),
+        to=ByParameter("FS_EKF_ACTION", {1: "LAND", 2: "ALT_HOLD", 3: "LAND"}),
+        do=("failsafe",),
+        texts=(critical("EKF variance"), critical("EKF Failsafe: changed to {mode} Mode")),
+        send=_HEARTBEAT,
     ),
     Rule(
         "position found",

@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from simulator.autopilot.firmware import AFTER_DELAY, ParameterSpec, Role, Rule
+from simulator.autopilot.firmware import AFTER_DELAY, ByParameter, ParameterSpec, Role, Rule
 from simulator.autopilot.values import (
     Behaviour,
     Mode,
@@ -219,6 +219,7 @@ _NO_MISSION = critical("Mission start denied! No valid mission")
 _CLEARED = critical("No valid mission available, loitering")
 _RTL, _LAND, _MISSION = "AUTO.RTL", "AUTO.LAND", "AUTO.MISSION"
 _LANDED = ("landed",)
+_WITHOUT_STREAM = {0: "POSCTL", 1: "ALTCTL", 2: "STABILIZED", 3: _RTL, 4: _LAND, 5: "AUTO.LOITER"}
 _REGAINED = info("GCS connection regained")
 _WARNINGS = {
     "battery low": StatusText(Severity.EMERGENCY, "Low battery"),
@@ -228,36 +229,28 @@ _WARNINGS = {
 }
 
 
-def _delayed(event: str, parameter: str, modes: Mapping[int, str]) -> list[Rule]:
+def _delayed(event: str, parameter: str, modes: Mapping[int, str]) -> tuple[Rule, ...]:
     """Rows of a failsafe with delay: Hold first, so that a pilot can take over, then the mode that
     the parameter selects. A second failsafe during the delay changes that mode only."""
-    chosen = [(f"{parameter}={value}", mode) for value, mode in modes.items()]
-    return [
+    values = ",".join(map(str, modes))
+    hold = critical("Failsafe activated: entering Hold for {delay_s:.0f} seconds")
+    return (
         Rule(event, when=("action delayed",), do=("failsafe", "delay"), texts=(_WARNINGS[event],)),
-        *(
-            Rule(
-                event,
-                when=("armed", "not landed", value),
-                to="AUTO.LOITER",
-                do=("failsafe", "delay"),
-                texts=(
-                    _WARNINGS[event],
-                    critical("Failsafe activated: entering Hold for {delay_s:.0f} seconds"),
-                ),
-            )
-            for value, _ in chosen
+        Rule(
+            event,
+            when=("armed", "not landed", f"{parameter}={values}"),
+            to="AUTO.LOITER",
+            do=("failsafe", "delay"),
+            texts=(_WARNINGS[event], hold),
         ),
-        *(
-            Rule(
-                event + AFTER_DELAY,
-                when=(f"since {event}", value),
-                to=mode,
-                do=("failsafe",),
-                texts=(_LOST,),
-            )
-            for value, mode in chosen
+        Rule(
+            event + AFTER_DELAY,
+            when=(f"since {event}",),
+            to=ByParameter(parameter, modes),
+            do=("failsafe",),
+            texts=(_LOST,),
         ),
-    ]
+    )
 
 
 def _says(
@@ -301,25 +294,20 @@ RULES = (
     _disarms("force disarm", "Disarmed by external command"),
     Rule("terminate", when=("not armed",), result=Result.DENIED),
     Rule("terminate", to="TERMINATION", do=("disarm", "latch"), texts=(_LOST,)),
-    *(
-        Rule(
-            "stream lost",
-            "OFFBOARD",
-            when=("armed", f"COM_OBL_RC_ACT={action}"),
-            to=fallback,
-            do=("failsafe",),
-            texts=(_LOST,),
-        )
-        for action, fallback in enumerate(
-            ("POSCTL", "ALTCTL", "STABILIZED", "AUTO.RTL", "AUTO.LAND", "AUTO.LOITER")
-        )
+    Rule(
+        "stream lost",
+        "OFFBOARD",
+        when=("armed",),
+        to=ByParameter("COM_OBL_RC_ACT", _WITHOUT_STREAM),
+        do=("failsafe",),
+        texts=(_LOST,),
     ),
     Rule("stream found", when=("since stream lost",), to="remembered", do=("recover",)),
     *_delayed("battery critical", "COM_LOW_BAT_ACT", {1: _RTL, 2: _LAND, 3: _RTL}),
     *_delayed("battery emergency", "COM_LOW_BAT_ACT", {1: _RTL, 2: _LAND, 3: _LAND}),
-    *(
-        Rule("ground station lost", mode, texts=(_WARNINGS["ground station lost"],))
-        for mode in (_LAND, "AUTO.PRECLAND")  # a landing goes on
+    # a landing goes on
+    Rule(
+        "ground station lost", "AUTO.LAND AUTO.PRECLAND", texts=(_WARNINGS["ground station lost"],)
     ),
     *_delayed("ground station lost", "NAV_DLL_ACT", {2: _RTL, 3: _LAND}),
     Rule(
