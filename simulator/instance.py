@@ -105,6 +105,7 @@ class Instance:
             self.links.append(Server(self.view, firmware.ground_rates_hz, self.keyring, number=1))
         self.steps = 0
         self._faults = prepare(faults, seed)
+        self._by_step = bool(faults)  # link faults act on the datagrams of each step
         self._arrived: list[bytes] = []
         self._barrier_at_step = 0
         self._back_at_step = 0
@@ -148,7 +149,7 @@ class Instance:
             self._send_texts()
         for link in self.links:
             link.step()
-        if self._faults.down:
+        if self._by_step:
             self._arrived = self.drain()
 
     def advance_to_barrier(self, end_s: float = math.inf) -> bool:
@@ -210,7 +211,7 @@ class Instance:
             Its time stamp in nanoseconds, and all datagrams for the companion.
         """
         stamp_ns = self._now_us * 1000
-        datagrams = self.drain() if self._faults.down else []
+        datagrams = self.drain() if self._by_step else []
         self.companion.send_barrier(stamp_ns)
         return stamp_ns, datagrams + self.companion.outbox.drain()
 
