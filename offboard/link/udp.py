@@ -242,6 +242,6 @@ def _is_barrier(datagram: bytes) -> bool:
     """Whether the last frame is a TIMESYNC request, which has tc1 = 0."""
     at = last = 0
     while at < len(datagram):
-        last, at = at, at + (frame_size(datagram, at) or len(datagram))
+        last, at = at, at + frame_size(datagram, at)
     frame = datagram[last:]
     return int.from_bytes(frame[7:10], "little") == TIMESYNC and not any(frame[10:18])

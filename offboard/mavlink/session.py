@@ -10,17 +10,16 @@ components.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Hashable, Iterator
+from collections.abc import Hashable
 from dataclasses import dataclass, field
 
 from pymavlink.dialects.v20 import all as mavlink
 
 from offboard.mavlink import framing
-from offboard.mavlink.counters import FORGED, Counters, DropReason
 from offboard.mavlink.dialects.base import TYPE_ONBOARD_CONTROLLER, Dialect
 from offboard.mavlink.events import Event, PeerChanged, TimesyncReply, VehicleFound
 from offboard.mavlink.outgoing import CommandLong, Heartbeat, Outgoing, Record, Target, Timesync
-from offboard.mavlink.senders import COMMANDS, Senders
+from offboard.mavlink.senders import Senders
 from offboard.mavlink.signing import Signing
 from offboard.mavlink.telemetry import Telemetry
 
@@ -30,7 +29,6 @@ COMPONENT_ID = 191  # MAV_COMP_ID_ONBOARD_COMPUTER: the sender of frames
 # numbers leave no gap in those of the frames that the vehicle counts.
 RECORD_COMPONENT_ID = 192
 
-_NOT_LOGGED = (DropReason.ECHO, *FORGED)
 _ECHOES = 256  # newest frames of ours that are recognised when they come back
 _HEARTBEAT_PERIOD_S = 0.999  # 1 Hz; below 1 s, so that no rounding error delays it by a cycle
 
@@ -54,7 +52,7 @@ class SessionSettings:
     lockstep: bool = False
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Reception:
     """Result of one portion of bytes.
 
@@ -66,20 +64,10 @@ class Reception:
     reply is applied one barrier later.
     """
 
-    frames: tuple[bytes, ...] = ()
-    events: tuple[Event, ...] = ()
-    replies: tuple[Outgoing, ...] = ()
-    unlogged: tuple[tuple[int, bytes], ...] = ()
-
-
-@dataclass(slots=True)
-class _Arrival:
-    """A datagram, or a portion of a stream, and what is found in it."""
-
-    peer: Hashable
-    now_s: float
+    frames: list[bytes] = field(default_factory=list)
     events: list[Event] = field(default_factory=list)
     replies: list[Outgoing] = field(default_factory=list)
+    unlogged: list[tuple[int, bytes]] = field(default_factory=list)
 
 
 class Session:
@@ -89,13 +77,10 @@ class Session:
 
     def __init__(self, settings: SessionSettings, signing: Signing | None = None) -> None:
         self.settings = settings
-        self.senders = Senders(
-            settings.system_id, settings.component_id, has_key=signing is not None
-        )
-        self.counters = Counters()
+        self.senders = Senders(settings.system_id, settings.component_id, signing)
+        self.splitter = framing.FrameSplitter(settings.stream)
         self.status = (ACTIVE, 0)
         self._signing = signing
-        self._splitter = framing.FrameSplitter(settings.stream, self.counters)
         self._sending = mavlink.MAVLink(None, srcComponent=settings.component_id)
         self._recording = mavlink.MAVLink(None, srcComponent=RECORD_COMPONENT_ID)
         self._components = (settings.component_id, RECORD_COMPONENT_ID)
@@ -123,87 +108,54 @@ class Session:
     def receive(self, datagram: bytes, peer: Hashable, now_s: float) -> Reception:
         """Process a datagram, or any portion of a stream, that came from `peer`. Never raises."""
         self.time.on_datagram()
-        arrival = _Arrival(peer, self.time.now_s(now_s))
+        now_s = self.time.now_s(now_s)
+        found = Reception()
         if self.vehicle is not None and peer != self.peer:
-            if not self.senders.moves_to(peer, arrival.now_s, self._genuine(datagram)):
-                self.counters.dropped[DropReason.FOREIGN_PEER] += 1
-                return Reception()
+            if not self.senders.moves_to(peer, now_s, datagram):
+                return found
             self._heartbeat_sent = None  # a router learns our address from it
-            arrival.events.append(PeerChanged(peer))
-        frames: list[bytes] = []
-        unlogged: list[tuple[int, bytes]] = []
-        arrival.events.extend(self.telemetry.texts.expire(arrival.now_s))
-        for frame in self._splitter.split(datagram):
-            why = self._accept(frame, arrival)
-            self.counters.count(why)
-            if (why and why in _NOT_LOGGED) or frame.message_id == framing.SETUP_SIGNING:
-                continue  # the latter holds the key
-            ours = frame.component_id in self._components
-            if ours and frame.system_id == self.senders.own.system_id:
-                unlogged.append((len(frames), frame.raw))
-            else:
-                frames.append(frame.raw)
-        return Reception(
-            tuple(frames), tuple(arrival.events), tuple(arrival.replies), tuple(unlogged)
-        )
+            found.events.append(PeerChanged(peer))
+        found.events += self.telemetry.texts.expire(now_s)
+        for frame in self.splitter.split(datagram):
+            echo = frame.component_id == self.settings.component_id and frame.raw in self._sent
+            if echo or self.senders.refuse(frame, peer, self.link_time_s, found.events):
+                continue
+            self._log(frame, found)
+            if self.senders.judge(frame, peer, self.link_time_s, found.events):
+                self._interpret(frame, now_s, found)
+        return found
 
-    def _accept(self, frame: framing.Frame, arrival: _Arrival) -> DropReason | None:
-        """Add to `arrival` what a frame says; why it was dropped."""
-        if frame.component_id == self.settings.component_id and frame.raw in self._sent:
-            return DropReason.ECHO
-        forged = self._signing.refusal(frame) if self._signing else None
-        if forged:
-            if forged is DropReason.OLD_STAMP and self.vehicle is None:
-                self.senders.note_clock_behind(
-                    frame, arrival.peer, self.link_time_s, arrival.events
-                )
-            return forged
-        was_found = self.vehicle is not None
-        why = self.senders.judge(frame, arrival.peer, self.link_time_s, arrival.events)
-        if why or frame.message_id in COMMANDS:
-            return why
-        if self.vehicle is not None:
-            self.senders.heard_s = arrival.now_s
-            if not was_found:
-                self._begin()
+    def _log(self, frame: framing.Frame, found: Reception) -> None:
+        if frame.message_id == framing.SETUP_SIGNING:
+            return  # it holds the key
+        ours = frame.component_id in self._components
+        if ours and frame.system_id == self.senders.own.system_id:
+            found.unlogged.append((len(found.frames), frame.raw))
+        else:
+            found.frames.append(frame.raw)
+
+    def _interpret(self, frame: framing.Frame, now_s: float, found: Reception) -> None:
+        """Add to `found` what a frame of the vehicle says, or asks for before it is found."""
+        if self.dialect is not None:
+            self.senders.heard_s = now_s
+            if self.telemetry.dialect is None:
+                self._heartbeat_sent = None  # send it at once, with the vehicle's system id
+                self.telemetry.begin(self.dialect)
         if frame.message_id == framing.TIMESYNC:
-            self._synchronise(frame, arrival)
-            return None
-        return self.telemetry.interpret(frame, arrival.now_s, arrival.events)
+            self._synchronise(frame, now_s, found)
+        else:
+            self.telemetry.interpret(frame, now_s, found.events)
 
-    def _synchronise(self, frame: framing.Frame, arrival: _Arrival) -> None:
+    def _synchronise(self, frame: framing.Frame, now_s: float, found: Reception) -> None:
         """TIMESYNC: tc1 is 0 in a request."""
         tc1_ns, ts1_ns = frame.message.tc1, frame.message.ts1
         if tc1_ns == 0:
             self.time.on_request(ts1_ns * 1e-9)
             # a reply at time 0 would look like a request
-            arrival.replies.append(Timesync(max(1, int(arrival.now_s * 1e9)), ts1_ns))
+            found.replies.append(Timesync(max(1, int(now_s * 1e9)), ts1_ns))
         elif self.vehicle is not None:
             wrapped_ns = round(self.time.wrapped_s(tc1_ns / 1e9) * 1e9)
-            arrival.events.append(TimesyncReply(ts1_ns, tc1_ns + wrapped_ns))
-
-    # --- the vehicle ---
-
-    def set_vehicle(self, vehicle: VehicleFound, peer: Hashable) -> None:
-        """Take this vehicle, which sends from `peer`, as ours."""
-        self.senders.set_vehicle(vehicle, peer)
-        self._begin()
-
-    def _begin(self) -> None:
-        assert self.dialect is not None
-        self._heartbeat_sent = None  # send it at once, with the vehicle's system id
-        self.telemetry.begin(self.dialect)
-
-    def overhear(self, datagram: bytes) -> list[int]:
-        """Systems with an autopilot that this datagram, from another address than the vehicle's,
-        shows, each once a second."""
-        return self.senders.overhear(self._genuine(datagram), self.link_time_s)
-
-    def _genuine(self, datagram: bytes) -> Iterator[framing.Frame]:
-        """The frames of a datagram that signing would accept. Counts nothing, uses up no stamp."""
-        for frame in framing.FrameSplitter(False, Counters()).split(datagram):
-            if not (self._signing and self._signing.refusal(frame, note=False)):
-                yield frame
+            found.events.append(TimesyncReply(ts1_ns, tc1_ns + wrapped_ns))
 
     # --- out ---
 

@@ -115,7 +115,7 @@ class TakeOver:
         )
         signing = watch.key and Signing.resumed(watch.key, clock.monotonic_s, beat["signing"])
         self._session = Session(SessionSettings(stream=beat["stream"]), signing or None)
-        self._session.set_vehicle(known.vehicle, peer)
+        self._session.senders.set_vehicle(known.vehicle, peer)
         self._session.status = ACTIVE, LANDING
         assert self._session.dialect is not None
         self._dialect = self._session.dialect

@@ -28,7 +28,6 @@ from offboard.link.connection import open_link
 from offboard.link.interface import Chunk, Link, LinkError, LinkReport, LinkUnavailable
 from offboard.link.stream import BROKEN, RENEWED
 from offboard.link.udp import LOOK_EVERY_S, UdpLink
-from offboard.mavlink.counters import Counters
 from offboard.mavlink.framing import FrameSplitter
 from offboard.mavlink.senders import PEER_SILENT_S
 
@@ -290,7 +289,7 @@ def test_a_full_stream_does_not_block_and_sends_the_newest_setpoint(
         link.send(each, None)
     link.send(heartbeat, None)
     link.send(setpoints[-1], None)
-    splitter, frames = FrameSplitter(True, Counters()), list[Any]()
+    splitter, frames = FrameSplitter(stream=True), list[Any]()
     while not frames or frames[-1].raw != setpoints[-1]:
         link.receive()
         assert select.select([theirs], [], [], 10.0)[0], "silent"

@@ -157,7 +157,7 @@ def test_it_asks_the_vehicle_that_connected_last(rig: Rig) -> None:
 @over("signed")
 def test_it_signs_with_stamps_that_follow_ours(rig: Rig) -> None:
     ours = Session(SessionSettings(), rig.signing)
-    ours.set_vehicle(VEHICLE, "tcp")
+    ours.senders.set_vehicle(VEHICLE, "tcp")
     for _ in range(3):
         rig.beat(OURS)
         newest = ours.encode(Heartbeat(6))

@@ -44,7 +44,7 @@ REST = (0.0, 0.0, 0.0)  # velocity
 
 def session() -> Session:
     made = Session(SessionSettings())
-    made.set_vehicle(VehicleFound(1, 1, "px4"), "vehicle")
+    made.senders.set_vehicle(VehicleFound(1, 1, "px4"), "vehicle")
     return made
 
 
