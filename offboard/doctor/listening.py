@@ -15,11 +15,10 @@ from typing import Any
 
 from pymavlink.dialects.v20.all import mavlink_map
 
-from offboard.documents.arguments import join_address
 from offboard.flight.preflight import Ground, ParameterReading
 from offboard.flight.timing import VehicleClock
 from offboard.flight.vehicle_state import VehicleState
-from offboard.link.interface import Chunk
+from offboard.link.interface import Chunk, peer_name
 from offboard.mavlink.decode import FIX_3D
 from offboard.mavlink.dialects.base import TYPE_GCS, Dialect, WantedMessage, id_of
 from offboard.mavlink.events import (
@@ -109,7 +108,7 @@ class Senders:
         self.message_bytes[message.msgname if message else str(frame.message_id)] += len(frame.raw)
         sender.frames += 1
         if len(sender.peers) < _PEERS_MAX:
-            sender.peers.add(join_address(*peer[:2]) if isinstance(peer, tuple) else str(peer))
+            sender.peers.add(peer_name(peer))
         sender.times += frame.message_id in _TIMES
         if frame.message_id == HEARTBEAT:
             sender.heartbeat = frame.message

@@ -131,8 +131,7 @@ class Snapshot:
         self.computer = state.busyness.sentence  # that it is too busy; empty if it keeps up
         self.battery = math.nan if charge is None else charge  # remaining, of 1
         self.other_datagrams = state.other_datagrams  # of other senders, since the start
-        self.forged = (
-            state.session.senders.forged.total()
-        )  # frames that signing refused since the start
+        # frames that signing refused, since the start
+        self.forged = state.session.senders.forged.total()
         self.texts = tuple(state.announced[-TEXTS_KEPT:])  # the newest announcements, oldest first
         self.flights = flights

@@ -145,8 +145,7 @@ class Flight(FlightState):
         news = session.senders.news()
         if news:
             outbox.announce(self, news)
-        session.status = self._status()
-        due = session.poll(host_now_s)
+        due = session.poll(host_now_s, self._status())
         self.vehicle.now_s = session.link_time_s
         if self.phase is Phase.LAND and self.unreached_s:
             self.began_s += self.now_s - before_s  # a landing that is not seen takes no time

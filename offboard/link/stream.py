@@ -259,10 +259,10 @@ class ListeningLink(StreamLink):
             client, address = self._listening.accept()
         except OSError:  # nobody
             return None
-        host, port = address[:2]
+        host = address[0]
         if silent_s <= PEER_SILENT_S or self._host not in ("", host):
             client.close()
-            self.report.count(f"{host}:{port}", 1, "connection")
+            self.report.count(address, 1, "connection")
             return None
         return tcp_stream(client, host)
 

@@ -126,7 +126,7 @@ class UdpLink(Link):
         elif silent:
             ours = [chunk for chunk in others if same_host(chunk.peer, self._peer)]
             others = [chunk for chunk in others if not same_host(chunk.peer, self._peer)]
-        for sender, number in Counter(_name(chunk.peer) for chunk in others).items():
+        for sender, number in Counter(chunk.peer for chunk in others).items():
             self.report.count(sender, number)
         if others:
             self.report.overheard = [chunk.data for chunk in others]
@@ -194,14 +194,6 @@ def _second_socket(listening: socket.socket, peer: tuple[str | int, ...]) -> soc
             if one.fileno() >= 0:
                 one.setsockopt(socket.SOL_SOCKET, _SHARE_PORT, 0)
     return sock
-
-
-def _name(peer: Hashable) -> str:
-    """An address as the user writes it, 127.0.0.1:14540 or [::1]:14540."""
-    if not isinstance(peer, tuple):
-        return str(peer)
-    host, port = peer[:2]
-    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
 class LockstepLink(UdpLink):

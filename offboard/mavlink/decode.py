@@ -109,9 +109,7 @@ def _thrust_report(message: Any, _: Dialect) -> events.Event | None:
 
 
 def _gps_fix(message: Any, _: Dialect) -> events.Event:
-    if message.fix_type < FIX_3D:
-        return events.NoFix(message.fix_type)
-    return events.GpsFix(message.h_acc * 1e-3 if message.h_acc else None)
+    return events.GpsFix() if message.fix_type >= FIX_3D else events.NoFix(message.fix_type)
 
 
 def _system_health(message: Any, _: Dialect) -> events.Event:

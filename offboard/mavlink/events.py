@@ -110,8 +110,6 @@ class ThrustReport(Event):
 class GpsFix(Event):
     """GPS_RAW_INT with a position fix in three dimensions."""
 
-    accuracy_m: float | None  # horizontal, as the receiver reports it
-
 
 @dataclass(frozen=True, slots=True)
 class NoFix(Event):

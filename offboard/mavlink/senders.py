@@ -40,6 +40,7 @@ from offboard.mavlink.framing import (
     Frame,
     FrameSplitter,
 )
+from offboard.mavlink.outgoing import Target
 from offboard.mavlink.signing import Forgery, Signing
 
 DIALECTS: Mapping[str, Dialect] = MappingProxyType({d.name: d for d in (PX4, ARDUPILOT)})
@@ -74,6 +75,7 @@ class Senders:
         self.own = Address(1, component_id)
         self.vehicle: VehicleFound | None = None
         self.dialect: Dialect | None = None
+        self.target: Target | None = None  # of our messages: the vehicle
         self.clock_behind = False  # an autopilot whose clock is behind ours was heard
         self.systems: dict[int, float] = {}
         self.forged: Counter[Forgery] = Counter()
@@ -90,6 +92,8 @@ class Senders:
         """Take this vehicle, which sends from `peer`, as ours."""
         self.vehicle, self.dialect, self.peer = vehicle, DIALECTS[vehicle.autopilot], peer
         self.own = Address(vehicle.system_id, self.own.component_id)
+        divides = self.dialect.divides_by_tilt
+        self.target = Target(vehicle.system_id, vehicle.component_id, divides)
 
     # --- datagrams from another address ---
 
@@ -210,9 +214,7 @@ class Senders:
 
     def note(self, frame: Frame, now_s: float) -> Dialect | None:
         """The autopilot that a frame shows, None if it is no HEARTBEAT of one that can be flown."""
-        if frame.message_id != HEARTBEAT or not is_vehicle(frame.message):
-            return None
-        dialect = _BY_AUTOPILOT.get(frame.message.autopilot)
+        dialect = dialect_of(frame.message) if frame.message_id == HEARTBEAT else None
         if dialect is None:
             return None
         if frame.component_id != AUTOPILOT_COMPONENT:
@@ -285,6 +287,11 @@ def same_host(peer: Hashable, other: Hashable) -> bool:
 def is_vehicle(heartbeat: Any) -> bool:
     """Whether this HEARTBEAT is of a vehicle with an autopilot, of any kind."""
     return heartbeat.type not in _NO_VEHICLES and heartbeat.autopilot != _NO_AUTOPILOT
+
+
+def dialect_of(heartbeat: Any) -> Dialect | None:
+    """The dialect of the vehicle that sends this HEARTBEAT; None without one, or a vehicle."""
+    return _BY_AUTOPILOT.get(heartbeat.autopilot) if is_vehicle(heartbeat) else None
 
 
 def unfit_type(vehicle_type: int, *, helicopter: bool) -> str:

@@ -18,7 +18,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from offboard.mavlink import framing
 from offboard.mavlink.dialects.base import TYPE_ONBOARD_CONTROLLER, Dialect
 from offboard.mavlink.events import Event, PeerChanged, TimesyncReply, VehicleFound
-from offboard.mavlink.outgoing import CommandLong, Heartbeat, Outgoing, Record, Target, Timesync
+from offboard.mavlink.outgoing import CommandLong, Heartbeat, Outgoing, Record, Timesync
 from offboard.mavlink.senders import Senders
 from offboard.mavlink.signing import Signing
 from offboard.mavlink.telemetry import Telemetry
@@ -72,14 +72,12 @@ class Reception:
 
 class Session:
     """See the module. `vehicle` and `dialect` are None until an autopilot was heard. With `signing`
-    all frames are signed, and those without its signature are dropped. `status` is system_status
-    and custom_mode of our heartbeat."""
+    all frames are signed, and those without its signature are dropped."""
 
     def __init__(self, settings: SessionSettings, signing: Signing | None = None) -> None:
         self.settings = settings
         self.senders = Senders(settings.system_id, settings.component_id, signing)
         self.splitter = framing.FrameSplitter(settings.stream)
-        self.status = (ACTIVE, 0)
         self._signing = signing
         self._sending = mavlink.MAVLink(None, srcComponent=settings.component_id)
         self._recording = mavlink.MAVLink(None, srcComponent=RECORD_COMPONENT_ID)
@@ -88,7 +86,7 @@ class Session:
         self.telemetry = Telemetry(settings.capacity_bytes_ps, lockstep=settings.lockstep)
         self.time = self.telemetry.time
         self._heartbeat_sent: tuple[float, float] | None = None  # host time, link time
-        self._status_sent = self.status
+        self._custom_mode_sent = 0
 
     @property
     def vehicle(self) -> VehicleFound | None:
@@ -159,12 +157,12 @@ class Session:
 
     # --- out ---
 
-    def poll(self, now_s: float) -> tuple[Outgoing, ...]:
+    def poll(self, now_s: float, status: tuple[int, int] = (ACTIVE, 0)) -> tuple[Outgoing, ...]:
         """Messages that are due at `now_s`; call it at least every 50 ms.
 
-        They are our heartbeat, at 1 Hz of host or vehicle time, whichever is faster, and where its
-        custom_mode has changed, so that another program learns at once who flies; and requests for
-        telemetry that is missing or too slow.
+        They are our heartbeat with `status`, system_status and custom_mode, at 1 Hz of host or
+        vehicle time, whichever is faster, and where custom_mode has changed, so that another
+        program learns at once who flies; and requests for telemetry that is missing or too slow.
         """
         now_s = self.time.now_s(now_s)
         self.time.on_host(now_s)
@@ -174,12 +172,12 @@ class Session:
         link_s = self.link_time_s
         if (
             self._heartbeat_sent is None
-            or self.status[1] != self._status_sent[1]
+            or status[1] != self._custom_mode_sent
             or max(now_s - self._heartbeat_sent[0], link_s - self._heartbeat_sent[1])
             >= _HEARTBEAT_PERIOD_S
         ):
-            self._heartbeat_sent, self._status_sent = (now_s, link_s), self.status
-            due.append(Heartbeat(TYPE_ONBOARD_CONTROLLER, *self.status))
+            self._heartbeat_sent, self._custom_mode_sent = (now_s, link_s), status[1]
+            due.append(Heartbeat(TYPE_ONBOARD_CONTROLLER, *status))
         requests = self.telemetry.due()
         return (*due, *(CommandLong.message_interval(w.message_id, w.rate_hz) for w in requests))
 
@@ -189,10 +187,7 @@ class Session:
         Raises ValueError if a value is not finite or out of range, or if the message is for the
         vehicle and none was found.
         """
-        vehicle, dialect, target = self.vehicle, self.dialect, None
-        if vehicle and dialect:
-            target = Target(vehicle.system_id, vehicle.component_id, dialect.divides_by_tilt)
-        message = outgoing.encode(target)
+        message = outgoing.encode(self.senders.target)
         sender = self._sending
         if isinstance(outgoing, Record):
             sender = self._recording
