@@ -6,20 +6,8 @@ from collections import Counter
 from collections.abc import Hashable
 from dataclasses import dataclass
 
-from offboard.documents.errors import UserError
-
 NAMED_MAX = 8  # addresses that are counted one by one
 OTHERS = "other addresses"
-
-
-class LinkError(UserError):
-    """A link that cannot be opened: one sentence for the user."""
-
-
-class LinkUnavailable(LinkError):
-    """A link whose address is right and that cannot be opened now: no vehicle."""
-
-    is_usage = False
 
 
 @dataclass(frozen=True, slots=True)

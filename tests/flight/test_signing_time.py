@@ -11,9 +11,10 @@ from pair import Pair, calm_hover, hover, in_phase
 
 from offboard.analysis import history
 from offboard.analysis.score import score
+from offboard.documents.errors import UserError
 from offboard.flight.phases import ExitCode, Phase
 from offboard.link import clock
-from offboard.link.signing_time import SigningTime, SigningTimeError, state_directory
+from offboard.link.signing_time import SigningTime, state_directory
 from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.signing import RESERVED
@@ -68,12 +69,12 @@ def test_a_damaged_file_and_a_directory_that_cannot_be_written_are_refused(home:
     (file,) = home.iterdir()
     for content in ("", "soon", "9" * 30, "\xff"):
         file.write_text(content, encoding="latin-1")
-        with pytest.raises(SigningTimeError, match="if this computer's clock is right, delete"):
+        with pytest.raises(UserError, match="if this computer's clock is right, delete"):
             SigningTime(KEY).__enter__()
     file.unlink()
     home.rmdir()
     home.write_text("a file")
-    with pytest.raises(SigningTimeError, match="set XDG_STATE_HOME"):
+    with pytest.raises(UserError, match="set XDG_STATE_HOME"):
         SigningTime(KEY).__enter__()
 
 
