@@ -40,22 +40,25 @@ _RESULTS = {
 }
 # which pymavlink's `all` lacks
 _RESULTS |= {6: "CANCELLED", 9: "COMMAND_UNSUPPORTED_MAV_FRAME", 10: "NOT_IN_CONTROL"}
-# innovation ratios of the estimator's messages
-_PX4_RATIOS = {
-    "GPS velocity": "vel_ratio",
-    "GPS position": "pos_horiz_ratio",
-    "height": "pos_vert_ratio",
-    "heading": "mag_ratio",
-    "height above ground": "hagl_ratio",
-    "airspeed": "tas_ratio",
-}
-_ARDUPILOT_RATIOS = {
-    "GPS velocity": "velocity_variance",
-    "GPS position": "pos_horiz_variance",
-    "height": "pos_vert_variance",
-    "compass": "compass_variance",
-    "terrain": "terrain_alt_variance",
-    "air": "airspeed_variance",
+# innovation ratios of ESTIMATOR_STATUS, and of EKF_STATUS_REPORT: what is measured, and the field
+_PX4_ESTIMATOR, _ARDUPILOT_ESTIMATOR = 230, 193
+_RATIOS = {
+    _PX4_ESTIMATOR: {
+        "GPS velocity": "vel_ratio",
+        "GPS position": "pos_horiz_ratio",
+        "height": "pos_vert_ratio",
+        "heading": "mag_ratio",
+        "height above ground": "hagl_ratio",
+        "airspeed": "tas_ratio",
+    },
+    _ARDUPILOT_ESTIMATOR: {
+        "GPS velocity": "velocity_variance",
+        "GPS position": "pos_horiz_variance",
+        "height": "pos_vert_variance",
+        "compass": "compass_variance",
+        "terrain": "terrain_alt_variance",
+        "air": "airspeed_variance",
+    },
 }
 
 
@@ -123,23 +126,14 @@ def _system_health(message: Any, _: Dialect) -> events.Event:
     )
 
 
-def _px4_estimator(message: Any, _: Dialect) -> events.Event:
-    accuracy_m = message.pos_horiz_accuracy
-    return _estimator(message, _PX4_RATIOS, accuracy_m if math.isfinite(accuracy_m) else None)
-
-
-def _ardupilot_estimator(message: Any, _: Dialect) -> events.Event:
-    return _estimator(message, _ARDUPILOT_RATIOS)
-
-
-def _estimator(
-    message: Any, names: Mapping[str, str], accuracy_m: float | None = None
-) -> events.EstimatorReport:
-    ratios = ((name, getattr(message, field)) for name, field in names.items())
+def _estimator(message: Any, _: Dialect) -> events.Event:
+    names = _RATIOS[message.get_msgId()].items()
+    ratios = ((name, getattr(message, field)) for name, field in names)
+    accuracy_m = getattr(message, "pos_horiz_accuracy", math.nan)  # ArduPilot has none
     return events.EstimatorReport(
         valid=frozenset(part for part, bit in _EKF_BITS.items() if message.flags & bit),
         ratios=tuple((name, ratio) for name, ratio in ratios if math.isfinite(ratio)),
-        accuracy_m=accuracy_m,
+        accuracy_m=accuracy_m if math.isfinite(accuracy_m) else None,
     )
 
 
@@ -191,8 +185,8 @@ DECODERS: Mapping[int, Callable[[Any, Dialect], events.Event | None]] = {
     77: _command_ack,
     83: _thrust_report,
     148: _version,
-    193: _ardupilot_estimator,
-    230: _px4_estimator,
+    _ARDUPILOT_ESTIMATOR: _estimator,
+    _PX4_ESTIMATOR: _estimator,
     245: _landed,
     436: _current_mode,
 }
