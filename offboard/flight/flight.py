@@ -121,7 +121,7 @@ class Flight(FlightState):
         for event in reception.events:
             if telemetry.is_of_another(self, event):
                 outbox.announce(self, "another vehicle answers, with the same system id")
-                self._take(Rebooted(self.time_s), arrived_s, host_now_s)
+                self._take(Rebooted(), arrived_s, host_now_s)
             self._take(event, arrived_s, host_now_s)
         return reception.replies
 

@@ -234,5 +234,3 @@ class TimesyncReply(Event):
 @dataclass(frozen=True, slots=True)
 class Rebooted(Event):
     """Several stamps in a row are of a new epoch: the vehicle was rebooted."""
-
-    time_s: float

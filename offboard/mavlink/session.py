@@ -40,8 +40,8 @@ class SessionSettings:
     `system_id` is the only system that may be the vehicle; None: the first autopilot heard.
     `stream`: serial or TCP, bytes arrive in any portions. `sends_first`: send heartbeats before an
     autopilot was heard. `capacity_bytes_ps` of the link limits the rates of telemetry that are
-    requested; None: unknown. `lockstep`: the host times given to `receive` and `poll` are ignored,
-    see `VehicleTime`.
+    requested; None: unknown. `lockstep`: simulated time takes the place of host time, see
+    `Session.elapsed_s`.
     """
 
     system_id: int | None = None
@@ -83,8 +83,11 @@ class Session:
         self._recording = mavlink.MAVLink(None, srcComponent=RECORD_COMPONENT_ID)
         self._components = (settings.component_id, RECORD_COMPONENT_ID)
         self._sent: deque[bytes] = deque(maxlen=_ECHOES)
-        self.telemetry = Telemetry(settings.capacity_bytes_ps, lockstep=settings.lockstep)
+        self.telemetry = Telemetry(settings.capacity_bytes_ps)
         self.time = self.telemetry.time
+        self._requested_s: tuple[float, float] | None = (
+            None  # stamp of the first and newest request
+        )
         self._heartbeat_sent: tuple[float, float] | None = None  # host time, link time
         self._custom_mode_sent = 0
 
@@ -105,8 +108,7 @@ class Session:
 
     def receive(self, datagram: bytes, peer: Hashable, now_s: float) -> Reception:
         """Process a datagram, or any portion of a stream, that came from `peer`. Never raises."""
-        self.time.on_datagram()
-        now_s = self.time.now_s(now_s)
+        now_s = self.elapsed_s(now_s)
         found = Reception()
         if self.vehicle is not None and peer != self.peer:
             if not self.senders.moves_to(peer, now_s, datagram):
@@ -148,7 +150,8 @@ class Session:
         """TIMESYNC: tc1 is 0 in a request."""
         tc1_ns, ts1_ns = frame.message.tc1, frame.message.ts1
         if tc1_ns == 0:
-            self.time.on_request(ts1_ns * 1e-9)
+            first_s = self._requested_s[0] if self._requested_s else ts1_ns * 1e-9
+            self._requested_s = first_s, ts1_ns * 1e-9
             # a reply at time 0 would look like a request
             found.replies.append(Timesync(max(1, int(now_s * 1e9)), ts1_ns))
         elif self.vehicle is not None:
@@ -164,7 +167,7 @@ class Session:
         vehicle time, whichever is faster, and where custom_mode has changed, so that another
         program learns at once who flies; and requests for telemetry that is missing or too slow.
         """
-        now_s = self.time.now_s(now_s)
+        now_s = self.elapsed_s(now_s)
         self.time.on_host(now_s)
         if not (self.dialect or self.senders.clock_behind or self.settings.sends_first):
             return ()
@@ -202,8 +205,11 @@ class Session:
     # --- time and rates ---
 
     def elapsed_s(self, host_s: float) -> float:
-        """Host time; in lockstep the simulated time, which goes on while telemetry is missing."""
-        return self.time.lockstep_s if self.settings.lockstep else host_s
+        """Host time; in lockstep, where it must decide nothing, simulated time since the first of
+        the TIMESYNC requests whose replies the vehicle waits for."""
+        if not self.settings.lockstep:
+            return host_s
+        return self._requested_s[1] - self._requested_s[0] if self._requested_s else 0.0
 
     def clock_s(self, host_s: float) -> float:
         """Host time; in lockstep, where host time must decide nothing, the link's own seconds."""

@@ -47,8 +47,8 @@ class Telemetry:
     """Telemetry of one vehicle. `capacity_bytes_ps` of the link limits the rates that are
     requested; None: unknown. `time.seconds` are the session's. `dialect` is None before `begin`."""
 
-    def __init__(self, capacity_bytes_ps: float | None, *, lockstep: bool) -> None:
-        self.time = VehicleTime(lockstep)
+    def __init__(self, capacity_bytes_ps: float | None) -> None:
+        self.time = VehicleTime()
         self.texts = TextAssembler()
         self.dialect: Dialect | None = None
         self._streams: dict[int, _Stream] = {}  # those that are wanted, by message id
@@ -91,7 +91,7 @@ class Telemetry:
         if age is Age.REBOOTED:
             self._mode_report = (0, -math.inf)  # it counts anew
             self._request()  # a rebooted vehicle has its default rates
-            events.append(Rebooted(event.time_s))
+            events.append(Rebooted())
         self.time.on_telemetry(event.time_s, now_s)
         events.append(event)
 
