@@ -47,7 +47,6 @@ DIALECTS: Mapping[str, Dialect] = MappingProxyType({d.name: d for d in (PX4, ARD
 _BY_AUTOPILOT = {dialect.mav_autopilot: dialect for dialect in DIALECTS.values()}
 AUTOPILOT_COMPONENT = 1
 COMMANDS = COMMAND_INT, COMMAND_LONG = 75, 76
-_ORDERS = SETPOINTS | set(COMMANDS)
 # MAV_CMD: return, land, take off, set the mode, go to a place, begin a mission, arm or disarm
 _MODE_COMMANDS = frozenset({20, 21, 22, 176, 192, 300, 400})
 PEER_SILENT_S = 0.5  # half of `Limits.silence_s`, so that the flight can continue
@@ -148,7 +147,7 @@ class Senders:
         """Whether it is a frame of our vehicle, and no command. Adds to `events` the vehicle when
         it is found, commands to us, and others that control the vehicle."""
         vehicle, message_id = self.vehicle, frame.message_id
-        heard = self.note(frame, now_s) if message_id == HEARTBEAT else None
+        heard = self.note(frame, now_s)
         system_id = vehicle.system_id if vehicle else self._wanted
         theirs = frame.component_id == AUTOPILOT_COMPONENT and system_id in (None, frame.system_id)
         if vehicle is None:
@@ -158,9 +157,12 @@ class Senders:
                 ids = frame.system_id, frame.component_id
                 events.append(OtherCompanion(*ids, frame.message.custom_mode))
             return theirs and heard is self.dialect
-        if message_id in _ORDERS:
-            self._note_order(frame, events)
-            return theirs and message_id in SETPOINTS
+        if message_id in COMMANDS:
+            self._note_command(frame, events)
+            return False
+        # for all or for our vehicle: routers forward those for others
+        if message_id in SETPOINTS and frame.message.target_system in (0, vehicle.system_id):
+            events.append(OtherSender(frame.system_id, frame.component_id))
         if message_id == COMMAND_ACK:
             pairs = zip(_receiver(frame), self.own, strict=True)
             return theirs and all(to in (0, own) for to, own in pairs)  # 0: for all
@@ -182,35 +184,26 @@ class Senders:
         events.append(vehicle)
         return True
 
-    def _note_order(self, frame: Frame, events: list[Event]) -> None:
-        """Add to `events` what a setpoint or a command shows or asks of us."""
-        sender = Address(frame.system_id, frame.component_id)
-        if self._controls(frame):
+    def _note_command(self, frame: Frame, events: list[Event]) -> None:
+        """Add to `events` a command to us, or one for the mode from the vehicle's own system, as
+        ours are: that of a ground station is the pilot's."""
+        sender, receiver = Address(frame.system_id, frame.component_id), _receiver(frame)
+        if receiver == self.own:
+            if sender != self.own:
+                events.append(CommandRequest(frame.message.command, _parameters(frame), *sender))
+            return
+        system_id = self.own.system_id
+        companion = sender.system_id == system_id and sender.component_id != AUTOPILOT_COMPONENT
+        controls = companion and frame.message.command in _MODE_COMMANDS
+        if controls and receiver.system_id in (0, system_id):
             events.append(OtherSender(*sender))
-        asks = frame.message_id in COMMANDS and sender != self.own
-        if asks and _receiver(frame) == self.own:
-            events.append(CommandRequest(frame.message.command, _parameters(frame), *sender))
-
-    def _controls(self, frame: Frame) -> bool:
-        """Whether it is a setpoint for our vehicle or for all (routers forward those of others), or
-        commands the mode from the vehicle's own system, as we do: that of a ground station is the
-        pilot's."""
-        if frame.message_id in COMMANDS:
-            companion = frame.component_id != AUTOPILOT_COMPONENT
-            ours = companion and frame.system_id == self.own.system_id
-            if not (ours and frame.message.command in _MODE_COMMANDS):
-                return False
-            if _receiver(frame) == self.own:
-                return False
-        return frame.message.target_system in (0, self.own.system_id)
 
     def _is_companion(self, frame: Frame) -> bool:
-        """Whether it is the HEARTBEAT of another companion computer of our vehicle, with the
+        """Whether a HEARTBEAT is of another companion computer of our vehicle, with the
         vehicle's system id as ours. On PX4 some call themselves a ground station."""
-        if frame.message_id != HEARTBEAT or frame.message.autopilot != _NO_AUTOPILOT:
-            return False
+        unflown = frame.message.autopilot == _NO_AUTOPILOT
         on_vehicle = frame.system_id == self.own.system_id
-        return on_vehicle and frame.message.type in (TYPE_ONBOARD_CONTROLLER, TYPE_GCS)
+        return unflown and on_vehicle and frame.message.type in (TYPE_ONBOARD_CONTROLLER, TYPE_GCS)
 
     def note(self, frame: Frame, now_s: float) -> Dialect | None:
         """The autopilot that a frame shows, None if it is no HEARTBEAT of one that can be flown."""
