@@ -85,9 +85,8 @@ class Session:
         self._sent: deque[bytes] = deque(maxlen=_ECHOES)
         self.telemetry = Telemetry(settings.capacity_bytes_ps)
         self.time = self.telemetry.time
-        self._requested_s: tuple[float, float] | None = (
-            None  # stamp of the first and newest request
-        )
+        self._began_s: float | None = None  # stamp of the first TIMESYNC request
+        self._simulated_s = 0.0  # from it to the newest
         self._heartbeat_sent: tuple[float, float] | None = None  # host time, link time
         self._custom_mode_sent = 0
 
@@ -150,8 +149,8 @@ class Session:
         """TIMESYNC: tc1 is 0 in a request."""
         tc1_ns, ts1_ns = frame.message.tc1, frame.message.ts1
         if tc1_ns == 0:
-            first_s = self._requested_s[0] if self._requested_s else ts1_ns * 1e-9
-            self._requested_s = first_s, ts1_ns * 1e-9
+            self._began_s = ts1_ns * 1e-9 if self._began_s is None else self._began_s
+            self._simulated_s = ts1_ns * 1e-9 - self._began_s
             # a reply at time 0 would look like a request
             found.replies.append(Timesync(max(1, int(now_s * 1e9)), ts1_ns))
         elif self.vehicle is not None:
@@ -207,9 +206,7 @@ class Session:
     def elapsed_s(self, host_s: float) -> float:
         """Host time; in lockstep, where it must decide nothing, simulated time since the first of
         the TIMESYNC requests whose replies the vehicle waits for."""
-        if not self.settings.lockstep:
-            return host_s
-        return self._requested_s[1] - self._requested_s[0] if self._requested_s else 0.0
+        return self._simulated_s if self.settings.lockstep else host_s
 
     def clock_s(self, host_s: float) -> float:
         """Host time; in lockstep, where host time must decide nothing, the link's own seconds."""
