@@ -34,7 +34,7 @@ from offboard.mavlink.decode import (
 )
 from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.framing import HEARTBEAT
-from offboard.mavlink.senders import DIALECTS, is_vehicle
+from offboard.mavlink.senders import DIALECTS, dialect_of, is_vehicle
 from offboard.mavlink.session import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.mavlink.texts import TextAssembler
 from offboard.mavlink.vehicle_time import Age, VehicleTime
@@ -333,8 +333,7 @@ class _Collector:
         """The HEARTBEAT of another program with the vehicle's ids, which the flight has ignored."""
         if entry.frame.message_id != HEARTBEAT or not self._dialect:
             return False
-        own = entry.message.autopilot == self._dialect.mav_autopilot
-        return not (own and is_vehicle(entry.message))
+        return dialect_of(entry.message) is not self._dialect
 
     def _keep(self, samples: Samples, payload: bytes, unix_s: float) -> None:
         """A message without a stamp has that of the telemetry before it."""
@@ -513,14 +512,13 @@ def _within_limits(rows: Rows) -> NDArray[np.bool_]:
 
 def _vehicle(log: Tlog) -> tuple[Address | None, Dialect | None]:
     """The vehicle that its record in the log names, else the first autopilot that was heard."""
-    known = {dialect.mav_autopilot: dialect for dialect in DIALECTS.values()}
     first: tuple[Address | None, Dialect | None] = (None, None)
     for entry in log:
         kind = entry.frame.message_id
         if kind == HEARTBEAT and first[0] is None:
             if is_vehicle(entry.message):
                 heard = Address(entry.system_id, entry.component_id)
-                first = heard, known.get(entry.message.autopilot)
+                first = heard, dialect_of(entry.message)
         elif record_type(entry) == record.VEHICLE_TYPE:
             flown = record.vehicle_of(entry.tunnelled)
             if flown and flown.system_id == entry.system_id:

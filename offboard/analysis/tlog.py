@@ -19,7 +19,6 @@ import numpy as np
 from pymavlink.dialects.v20 import all as dialect
 
 from offboard.documents.errors import UserError, abridged
-from offboard.mavlink.counters import DropReason
 from offboard.mavlink.framing import V1, V2, Frame, frame_size, parse
 
 _STAMP = struct.Struct(">Q")
@@ -101,8 +100,7 @@ class Tlog:
             entry = _entry(data, at, certain=lost is not None)
             if entry is None:
                 if lost is None:
-                    size = frame_size(data, at + 8)
-                    cut = _begins(data, at) and (size is None or at + 8 + size > len(data))
+                    cut = _begins(data, at) and _end(data, at) > len(data)
                     lost = before + at
                 marker = _MARKER.search(data, at + 9)
                 at = marker.start() - 8 if marker else len(data) - 8
@@ -129,16 +127,18 @@ class Tlog:
 def _entry(data: bytes, at: int, *, certain: bool) -> LoggedMessage | None:
     """The entry that begins at `at`, None without. `certain`: its checksum must be known; else a
     message that pymavlink does not know is taken if an entry follows."""
-    size = frame_size(data, at + 8) if _begins(data, at) else None
-    end = at + 8 + (size or 0)
-    if size is None or end > len(data):
+    end = _end(data, at)
+    if not _begins(data, at) or end > len(data):
         return None
     frame = parse(data, at + 8, end)
-    if isinstance(frame, DropReason):
-        return None
-    if not frame.verified and (certain or not _begins(data, end)):
+    if frame is None or not (frame.verified or (_begins(data, end) and not certain)):
         return None
     return LoggedMessage(_STAMP.unpack_from(data, at)[0], frame)
+
+
+def _end(data: bytes, at: int) -> int:
+    """Where the entry that begins at `at` ends; behind the data if they end within it."""
+    return at + 8 + frame_size(data, at + 8)
 
 
 def _begins(data: bytes, at: int) -> bool:

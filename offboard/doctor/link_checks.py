@@ -55,13 +55,13 @@ def port(seen: Observation) -> Iterable[Finding]:
 def vehicle(seen: Observation) -> Iterable[Finding]:
     """Whether an autopilot that can be flown is heard, and what is heard if none is."""
     found, heard, kind = seen.found, seen.heard, _kind(seen)
-    senders, received = heard.senders.found, heard.senders.counters.bytes_received
+    senders, received = heard.senders.found, heard.senders.splitter.bytes_received
     if seen.link_error:
         return
     if found:
         yield ok(f"{found.autopilot}, system {found.system_id}")
     elif autopilots := [sender for sender in senders if sender.is_autopilot]:
-        why = heard.session.senders.why_none(heard.session.counters)
+        why = heard.session.senders.why_none()
         yield blocks(why or f"{autopilots[0].name} is neither PX4 nor ArduCopter")
     elif senders:
         names = ", ".join(sender.name for sender in senders[:4])
@@ -126,9 +126,9 @@ def loss(seen: Observation) -> Iterable[Finding]:
     sender = next((each for each in senders.found if each.ids == _ids(seen)), None)
     if sender is None:
         return
-    lost, counters = senders.lost(sender), senders.counters
+    lost, received = senders.lost(sender), senders.splitter
     share = lost / (sender.frames + lost)
-    damaged = counters.bytes_skipped / max(counters.bytes_received, 1)
+    damaged = received.bytes_skipped / max(received.bytes_received, 1)
     figures = f"{share:.1%} of the frames lost, {damaged:.1%} of the bytes damaged"
     if share > LOST_SHARE or damaged > LOST_SHARE:
         yield warn(figures, "move closer, or use another channel, a cable or a better radio")

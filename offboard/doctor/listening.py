@@ -15,12 +15,10 @@ from typing import Any
 
 from pymavlink.dialects.v20.all import mavlink_map
 
-from offboard.documents.arguments import join_address
 from offboard.flight.preflight import Ground, ParameterReading
 from offboard.flight.timing import VehicleClock
 from offboard.flight.vehicle_state import VehicleState
-from offboard.link.interface import Chunk
-from offboard.mavlink.counters import Counters
+from offboard.link.interface import Chunk, peer_name
 from offboard.mavlink.decode import FIX_3D
 from offboard.mavlink.dialects.base import TYPE_GCS, Dialect, WantedMessage, id_of
 from offboard.mavlink.events import (
@@ -90,22 +88,15 @@ class Senders:
     arrive in any portions."""
 
     def __init__(self, stream: bool) -> None:
-        self._stream = stream
-        self._splitters: dict[Hashable, FrameSplitter] = {}
+        self.splitter = FrameSplitter(stream)
         self._senders: dict[tuple[int, int], Sender] = {}
         self._sequences: dict[tuple[int, ...], int] = {}
         self._lost: Counter[tuple[int, ...]] = Counter()  # by sender, and by system
-        self.counters = Counters()
         self.message_bytes: Counter[str] = Counter()
 
     def receive(self, data: bytes, peer: Hashable) -> None:
         """Count the frames in `data`, which came from `peer`."""
-        if peer not in self._splitters and len(self._splitters) >= _PEERS_MAX:
-            peer = None
-        splitter = self._splitters.get(peer)
-        if splitter is None:
-            splitter = self._splitters[peer] = FrameSplitter(self._stream, self.counters)
-        for frame in splitter.split(data):
+        for frame in self.splitter.split(data):
             self._count(frame, peer)
 
     def _count(self, frame: Frame, peer: Hashable) -> None:
@@ -116,7 +107,8 @@ class Senders:
         message = mavlink_map.get(frame.message_id)
         self.message_bytes[message.msgname if message else str(frame.message_id)] += len(frame.raw)
         sender.frames += 1
-        sender.peers.add(join_address(*peer[:2]) if isinstance(peer, tuple) else str(peer))
+        if len(sender.peers) < _PEERS_MAX:
+            sender.peers.add(peer_name(peer))
         sender.times += frame.message_id in _TIMES
         if frame.message_id == HEARTBEAT:
             sender.heartbeat = frame.message
@@ -170,7 +162,7 @@ class Listening:
         """Process received bytes."""
         self.senders.receive(chunk.data, chunk.peer)
         if self.session.peer not in (None, chunk.peer):  # another vehicle, perhaps
-            self.session.overhear(chunk.data)
+            self.session.senders.overhear(chunk.data, self.session.link_time_s)
         reception = self.session.receive(chunk.data, chunk.peer, chunk.arrived_s)
         for event in reception.events:
             if not self._found_s and self.session.vehicle is not None:
@@ -286,7 +278,7 @@ class Listening:
     def bytes_ps(self) -> float:
         """Received since the vehicle was found."""
         passed_s = max(self.now_s - (self._found_s or self._began_s), 1e-3)
-        return self.senders.counters.bytes_received / passed_s
+        return self.senders.splitter.bytes_received / passed_s
 
     @property
     def has_asked(self) -> bool:

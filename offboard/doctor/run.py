@@ -21,12 +21,12 @@ from offboard.doctor import computer, link_checks, vehicle_checks
 from offboard.doctor.computer import holders
 from offboard.doctor.link_checks import wait
 from offboard.doctor.listening import LONGEST_S, Listening, Observation
-from offboard.documents.errors import UserError, located, shown
+from offboard.documents.errors import Unavailable, UserError, located, shown
 from offboard.flight import preflight
 from offboard.flight.preflight import Finding, Level
 from offboard.link import clock
 from offboard.link.connection import open_link
-from offboard.link.interface import Link, LinkUnavailable
+from offboard.link.interface import Link
 from offboard.mavlink.session import SessionSettings
 from offboard.mavlink.signing import Signing
 from offboard.run.configuration import FlightConfig
@@ -131,7 +131,7 @@ def observe(
     `directory`. Sends nothing that changes the vehicle. `tell` is called with sentences about the
     progress.
 
-    Raises LinkError for an address that is no address, and UserError for a signing key.
+    Raises UserError for an address that is no address, and for a signing key.
     """
     began_s = clock.monotonic_s()
     connection, others, error = vehicle.address, holders(vehicle.address), ""
@@ -142,7 +142,7 @@ def observe(
             link = _within(OPEN_S, lambda: open_link(connection))
         except TimeoutError:
             error = f"connection {shown(connection)} cannot be opened in {OPEN_S:g} s"
-        except LinkUnavailable as failure:
+        except Unavailable as failure:
             error = str(failure)
         else:
             stack.callback(link.close)

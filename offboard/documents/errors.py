@@ -33,6 +33,12 @@ class UserError(Exception):
         self.code = code or (2 if self.is_usage else 3)
 
 
+class Unavailable(UserError):
+    """What was asked for is right, and cannot be had now: a link, a lock, a process."""
+
+    is_usage = False
+
+
 class DocumentError(UserError):
     """A configuration that cannot be used. `problems` holds one sentence for each problem; `str()`
     joins them with line breaks."""

@@ -71,12 +71,12 @@ def _left_alone(state: FlightState) -> str:
 
 def _unheard(state: FlightState) -> str:
     """What is heard instead of a vehicle."""
-    session, counters = state.session, state.session.counters
-    if not counters.bytes_received:
+    session, received = state.session, state.session.splitter
+    if not received.bytes_received:
         return "nothing is heard on this link"
-    if not counters.frames:
-        return f"{counters.bytes_received} bytes are heard that are not MAVLink"
-    known = session.senders.why_none(counters)
+    if not received.frames:
+        return f"{received.bytes_received} bytes are heard that are not MAVLink"
+    known = session.senders.why_none()
     return known or "MAVLink is heard, but no heartbeat of an autopilot"
 
 
@@ -131,6 +131,7 @@ class Snapshot:
         self.computer = state.busyness.sentence  # that it is too busy; empty if it keeps up
         self.battery = math.nan if charge is None else charge  # remaining, of 1
         self.other_datagrams = state.other_datagrams  # of other senders, since the start
-        self.forged = state.session.counters.forged  # frames that signing refused since the start
+        # frames that signing refused, since the start
+        self.forged = state.session.senders.forged.total()
         self.texts = tuple(state.announced[-TEXTS_KEPT:])  # the newest announcements, oldest first
         self.flights = flights

@@ -121,7 +121,7 @@ class Flight(FlightState):
         for event in reception.events:
             if telemetry.is_of_another(self, event):
                 outbox.announce(self, "another vehicle answers, with the same system id")
-                self._take(Rebooted(self.time_s), arrived_s, host_now_s)
+                self._take(Rebooted(), arrived_s, host_now_s)
             self._take(event, arrived_s, host_now_s)
         return reception.replies
 
@@ -142,11 +142,10 @@ class Flight(FlightState):
     def _poll(self, host_now_s: float, before_s: float) -> Sequence[Outgoing]:
         """The time at which this turn acts; returns what the session sends by itself."""
         session = self.session
-        news = session.counters.news()
+        news = session.senders.news()
         if news:
             outbox.announce(self, news)
-        session.status = self._status()
-        due = session.poll(host_now_s)
+        due = session.poll(host_now_s, self._status())
         self.vehicle.now_s = session.link_time_s
         if self.phase is Phase.LAND and self.unreached_s:
             self.began_s += self.now_s - before_s  # a landing that is not seen takes no time
@@ -166,7 +165,7 @@ class Flight(FlightState):
         missed = number - self._tick - 1 if self._tick >= 0 else 0
         self._tick, self._ticked = number, True
         self.busyness.on_tick(missed, flying=self.phase in FLYING)
-        ignored = self.other_datagrams + self.session.counters.forged
+        ignored = self.other_datagrams + self.session.senders.forged.total()
         self.ignored, self._recorded_others = ignored - self._recorded_others, ignored
         return True
 
@@ -261,9 +260,10 @@ class Flight(FlightState):
     def overhear(self, datagrams: Sequence[bytes]) -> None:
         """Datagrams from other addresses than the vehicle's: on the ground, they may show that
         several vehicles send to us."""
+        senders = self.session.senders
         if self.phase in BEFORE_FLIGHT:
             for datagram in datagrams:
-                for system_id in self.session.overhear(datagram):
+                for system_id in senders.overhear(datagram, self.session.link_time_s):
                     self._inputs.call("note_autopilot", system_id)
 
     def note_autopilot(self, system_id: int) -> None:

@@ -36,8 +36,7 @@ def vehicle_found(flight: FlightState) -> str:
 def not_found(flight: FlightState) -> str:
     if not silent_on_ground(flight):
         return ""
-    senders, counters = flight.session.senders, flight.session.counters
-    why = senders.why_none(counters) or "is it running, and sending to this port?"
+    why = flight.session.senders.why_none() or "is it running, and sending to this port?"
     return f"no vehicle heard in {flight.silence_s:.0f} s; {why}"
 
 

@@ -56,16 +56,12 @@ class BackgroundWriter(Generic[Item]):
     def _run(self) -> None:
         while not self._closing.wait(PERIOD_S) or self._queue:
             batch = [self._queue.popleft() for _ in range(len(self._queue))]
-            if batch:
-                self._try(batch)
-
-    def _try(self, batch: list[Item]) -> None:
-        self._writing = len(batch)
-        try:
-            if self.error is None:
-                self._write(batch)
-                self._writing = 0
-        except (Exception, SystemExit) as error:  # rich ends the program on a closed pipe
-            self.error = error
-        self.dropped += self._writing
-        self._writing = 0
+            self._writing = len(batch)
+            try:
+                if batch and self.error is None:
+                    self._write(batch)
+                    self._writing = 0
+            except (Exception, SystemExit) as error:  # rich ends the program on a closed pipe
+                self.error = error
+            self.dropped += self._writing
+            self._writing = 0

@@ -17,8 +17,8 @@ import socket
 from errno import EADDRINUSE
 from typing import Any
 
-from offboard.documents.errors import shown
-from offboard.link.interface import Link, LinkError, LinkUnavailable
+from offboard.documents.errors import Unavailable, UserError, shown
+from offboard.link.interface import Link
 from offboard.link.stream import ListeningLink, RedialingLink, connect, open_port
 from offboard.link.udp import LockstepLink, UdpLink, udp_socket
 
@@ -36,20 +36,20 @@ def open_lockstep_link() -> LockstepLink:
 
 
 def parsed(address: str) -> tuple[str, str, int]:
-    """Kind, host or device, and port or baud rate of an address. Raises LinkError, which says what
+    """Kind, host or device, and port or baud rate of an address. Raises UserError, which says what
     to change."""
     matched = _ADDRESS.fullmatch(address)
     if matched is None:
-        raise LinkError(f"connection {shown(address)} is not understood; use {FORMS}")
+        raise UserError(f"connection {shown(address)} is not understood; use {FORMS}")
     kind, host, number = matched[1], matched[2], int(matched[3])
     if kind == "serial":
         if not 0 < number <= BAUD_MAX:
-            raise LinkError(f"connection {shown(address)}: {number} baud is no rate of a port")
+            raise UserError(f"connection {shown(address)}: {number} baud is no rate of a port")
         return kind, host, number
     if not 1 <= number <= PORT_MAX:
-        raise LinkError(f"connection {shown(address)}: port {number} is not within 1 .. {PORT_MAX}")
+        raise UserError(f"connection {shown(address)}: port {number} is not within 1 .. {PORT_MAX}")
     if ":" in host and not (host.startswith("[") and host.endswith("]")):
-        raise LinkError(
+        raise UserError(
             f"connection {shown(address)} is not understood; an IPv6 address stands in brackets, "
             f"as in {kind}:[::1]:{number}"
         )
@@ -58,16 +58,16 @@ def parsed(address: str) -> tuple[str, str, int]:
 
 def open_link(address: str) -> Link:
     """Open the link at `address`, for example "udpin:127.0.0.1:14540" (see the module). Raises
-    LinkError, which says what to change, and LinkUnavailable where it may open later."""
+    UserError, which says what to change, and Unavailable where it may open later."""
     kind, host, number = parsed(address)
     if kind == "serial":
         return RedialingLink(lambda: open_port(host, number), "serial", number / BITS_OF_A_BYTE)
     try:
         return _network_link(kind, host, number)
     except UnicodeError as error:  # of a host name that is too long
-        raise LinkError(f"connection {shown(address)} cannot be opened: {error}") from None
+        raise UserError(f"connection {shown(address)} cannot be opened: {error}") from None
     except OSError as error:
-        raise LinkUnavailable(
+        raise Unavailable(
             f"connection {shown(address)} cannot be opened: {error.strerror or error}"
             + ("; another program uses the port" if error.errno == EADDRINUSE else "")
         ) from None

@@ -6,20 +6,8 @@ from collections import Counter
 from collections.abc import Hashable
 from dataclasses import dataclass
 
-from offboard.documents.errors import UserError
-
 NAMED_MAX = 8  # addresses that are counted one by one
 OTHERS = "other addresses"
-
-
-class LinkError(UserError):
-    """A link that cannot be opened: one sentence for the user."""
-
-
-class LinkUnavailable(LinkError):
-    """A link whose address is right and that cannot be opened now: no vehicle."""
-
-    is_usage = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +24,14 @@ class Chunk:
     arrived_s: float
 
 
+def peer_name(peer: Hashable) -> str:
+    """An address as the user writes it, 127.0.0.1:14540 or [::1]:14540."""
+    if not isinstance(peer, tuple):
+        return str(peer)
+    host, port = peer[:2]
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
 class LinkReport:
     """What a link tells: what other addresses than the vehicle's send, counted, and breaks.
     `overheard`: some of these datagrams, until the loop has taken them."""
@@ -50,8 +46,9 @@ class LinkReport:
         """Datagrams and connections of others."""
         return self._counts.total()
 
-    def count(self, sender: str, number: int, noun: str = "datagram") -> None:
-        """Add `number` ignored datagrams, or connections, of `sender`."""
+    def count(self, peer: Hashable, number: int, noun: str = "datagram") -> None:
+        """Add `number` ignored datagrams, or connections, from `peer`."""
+        sender = peer_name(peer)
         if sender not in self._counts and len(self._counts) >= NAMED_MAX:
             sender = OTHERS
         before = self._counts[sender]

@@ -15,40 +15,32 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 
-from offboard.documents.errors import UserError
+from offboard.documents.errors import Unavailable, UserError
 
 _LINUX = sys.platform == "linux"
 _NAME_MAX = 90  # of 107 characters of an abstract address
 _REFUSED_MAX = 4096  # services that are told who holds a lock
 
 
-class LockError(UserError):
-    """A lock file that cannot be opened: one sentence for the user."""
-
-
-class Locked(LockError):
-    """Another service has it: one sentence that says which process."""
-
-    is_usage = False
-
-    def __init__(self, what: str, holder: int | str) -> None:
-        super().__init__(f"another service has the {what}: process {holder or 'unknown'}")
+def _held(what: str, holder: int | str) -> Unavailable:
+    """Another service has it."""
+    return Unavailable(f"another service has the {what}: process {holder or 'unknown'}")
 
 
 @contextmanager
 def file_lock(path: Path, what: str) -> Iterator[None]:
     """The file stays, with the number of the last process: the kernel releases the lock with the
-    process. `what` the lock is for, for the sentence. Raises LockError."""
+    process. `what` the lock is for, for the sentence. Raises UserError."""
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     except OSError as error:
-        raise LockError(f"the lock {path} cannot be opened: {error.strerror}") from None
+        raise UserError(f"the lock {path} cannot be opened: {error.strerror}") from None
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             holder = os.read(descriptor, 20).decode(errors="replace").strip()
-            raise Locked(what, holder) from None
+            raise _held(what, holder) from None
         os.ftruncate(descriptor, 0)
         os.write(descriptor, f"{os.getpid()}\n".encode())
         yield
@@ -59,13 +51,13 @@ def file_lock(path: Path, what: str) -> Iterator[None]:
 @contextmanager
 def name_lock(name: str, what: str) -> Iterator[None]:
     """As `file_lock`, but by an abstract Unix address (Linux), which all users and units see, and
-    which belongs to a network namespace as ports do. Raises Locked."""
+    which belongs to a network namespace as ports do. Raises Unavailable."""
     with socket.socket(socket.AF_UNIX) as held:
         try:
             held.bind(f"\0{name}")
             held.listen(_REFUSED_MAX)
         except OSError:
-            raise Locked(what, _holder(held, f"\0{name}")) from None
+            raise _held(what, _holder(held, f"\0{name}")) from None
         yield
 
 

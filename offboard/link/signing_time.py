@@ -22,10 +22,6 @@ QUEUED_MAX = 1000
 CONTENT_MAX = 20  # bytes of a decimal stamp and a line end
 
 
-class SigningTimeError(UserError):
-    """The time stamp cannot be kept: one sentence for the user."""
-
-
 def state_directory() -> Path:
     """Where this user's time stamps are kept."""
     if named := os.environ.get("STATE_DIRECTORY"):
@@ -37,7 +33,7 @@ def state_directory() -> Path:
 class SigningTime:
     """Context manager that gives the `Signing` of a key and keeps its time stamps.
 
-    Entering raises SigningTimeError. A disk that fails later stops no flight: the stamps then go on
+    Entering raises UserError. A disk that fails later stops no flight: the stamps then go on
     without being kept.
     """
 
@@ -53,7 +49,7 @@ class SigningTime:
             self._path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
             self._write([reserved])
         except OSError as error:
-            raise SigningTimeError(
+            raise UserError(
                 f"the time stamp of the signing key cannot be kept in {self._path.parent}: "
                 f"{error.strerror}; set XDG_STATE_HOME to a directory that can be written"
             ) from None
@@ -81,7 +77,7 @@ class SigningTime:
             reason = error.strerror
         except ValueError:
             reason = "it holds no time stamp"
-        raise SigningTimeError(
+        raise UserError(
             f"the time stamp of the signing key in {self._path} cannot be read ({reason}); if this "
             "computer's clock is right, delete the file"
         )
@@ -89,6 +85,6 @@ class SigningTime:
     def _write(self, stamps: list[int]) -> None:
         """Keep the newest stamp, unless a newer one is kept by another process. Raises OSError."""
         newest = stamps[-1]
-        with suppress(SigningTimeError):
+        with suppress(UserError):
             newest = max(newest, self._kept())
         replace_file(self._path, f"{newest}\n")

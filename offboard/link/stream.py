@@ -14,8 +14,9 @@ from collections.abc import Callable, Hashable
 from contextlib import suppress
 from dataclasses import dataclass
 
+from offboard.documents.errors import Unavailable
 from offboard.link import clock
-from offboard.link.interface import Chunk, Link, LinkError, LinkUnavailable
+from offboard.link.interface import Chunk, Link
 from offboard.mavlink.framing import SETPOINTS
 from offboard.mavlink.senders import PEER_SILENT_S
 
@@ -58,7 +59,7 @@ def tcp_stream(connection: socket.socket, host: str) -> Stream:
 
 def open_port(device: str, baud: int) -> Stream:
     """Open a serial port with pyserial, for this process and its supervisor alone: of two readers
-    each would get a part of the bytes. Raises LinkUnavailable."""
+    each would get a part of the bytes. Raises Unavailable."""
     import serial
 
     try:
@@ -67,7 +68,7 @@ def open_port(device: str, baud: int) -> Stream:
         number = getattr(error, "errno", None)  # pyserial's text has it and the device twice
         reason = os.strerror(number) if number else error
         reason = "another program has it open" if number == errno.EAGAIN else reason
-        raise LinkUnavailable(
+        raise Unavailable(
             f"serial port {device} at {baud} baud cannot be opened: {reason}"
         ) from None
     return Stream(port.fileno(), port.close)
@@ -209,7 +210,7 @@ class StreamLink(Link):
 
 class RedialingLink(StreamLink):
     """Calls `open_stream`, and after a break in a thread until it succeeds. It may wait, and raise
-    OSError or LinkError."""
+    OSError or Unavailable."""
 
     def __init__(
         self, open_stream: Callable[[], Stream], name: str, capacity_bytes_ps: float | None = None
@@ -225,7 +226,7 @@ class RedialingLink(StreamLink):
 
     def _dial(self) -> None:
         while not self._closing.wait(RETRY_S):
-            with suppress(OSError, LinkError):
+            with suppress(OSError, Unavailable):
                 self._found.append(self._open_stream())
                 if self._closing.is_set():
                     self._discard()
@@ -259,10 +260,10 @@ class ListeningLink(StreamLink):
             client, address = self._listening.accept()
         except OSError:  # nobody
             return None
-        host, port = address[:2]
+        host = address[0]
         if silent_s <= PEER_SILENT_S or self._host not in ("", host):
             client.close()
-            self.report.count(f"{host}:{port}", 1, "connection")
+            self.report.count(address, 1, "connection")
             return None
         return tcp_stream(client, host)
 

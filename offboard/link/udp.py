@@ -126,7 +126,7 @@ class UdpLink(Link):
         elif silent:
             ours = [chunk for chunk in others if same_host(chunk.peer, self._peer)]
             others = [chunk for chunk in others if not same_host(chunk.peer, self._peer)]
-        for sender, number in Counter(_name(chunk.peer) for chunk in others).items():
+        for sender, number in Counter(chunk.peer for chunk in others).items():
             self.report.count(sender, number)
         if others:
             self.report.overheard = [chunk.data for chunk in others]
@@ -196,14 +196,6 @@ def _second_socket(listening: socket.socket, peer: tuple[str | int, ...]) -> soc
     return sock
 
 
-def _name(peer: Hashable) -> str:
-    """An address as the user writes it, 127.0.0.1:14540 or [::1]:14540."""
-    if not isinstance(peer, tuple):
-        return str(peer)
-    host, port = peer[:2]
-    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-
-
 class LockstepLink(UdpLink):
     """UDP to a simulator in lockstep: returns all datagrams up to a barrier at once, and only once.
 
@@ -242,6 +234,6 @@ def _is_barrier(datagram: bytes) -> bool:
     """Whether the last frame is a TIMESYNC request, which has tc1 = 0."""
     at = last = 0
     while at < len(datagram):
-        last, at = at, at + (frame_size(datagram, at) or len(datagram))
+        last, at = at, at + frame_size(datagram, at)
     frame = datagram[last:]
     return int.from_bytes(frame[7:10], "little") == TIMESYNC and not any(frame[10:18])

@@ -11,7 +11,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from offboard.documents.arguments import split_address
-from offboard.documents.errors import UserError
+from offboard.documents.errors import Unavailable
 from offboard.flight.display import Snapshot
 from offboard.link import clock
 from offboard.live.display import Display, Shown, json_lines, line
@@ -24,12 +24,6 @@ SERVER = "offboard.live.server"
 PERIOD_S = 0.1  # between two snapshots, host time
 QUEUED_MAX = 50  # snapshots that wait for the pipe, which holds about as many
 CLOSE_S = 1.0  # for what is queued, and again for the end of the process
-
-
-class NotServed(UserError):
-    """The address cannot be served now: another program has it, for example."""
-
-    is_usage = False
 
 
 class LiveProcess(Display):
@@ -51,13 +45,13 @@ class LiveProcess(Display):
         super().__init__(self._write, QUEUED_MAX)
 
     def await_ready(self) -> str:
-        """Wait until it listens; where. Raises NotServed."""
+        """Wait until it listens; where. Raises Unavailable."""
         assert self._process.stdout is not None
         with self._process.stdout as output:
             said = output.readline()
         answer = json.loads(said) if said else {"error": "its process does not start"}
         if "error" in answer:
-            raise NotServed(f"{self._option}: {answer['error']}")
+            raise Unavailable(f"{self._option}: {answer['error']}")
         return str(answer["url"])
 
     def head(self, **values: str) -> None:

@@ -1,6 +1,6 @@
 """Decoding: messages, as pymavlink has decoded them, become events in NED, FRD and SI.
 
-Every field is checked here to be finite and in range, else the message is refused. `_DECODERS` is
+Every field is checked here to be finite and in range, else the message is no event. `DECODERS` is
 the table by message id. Knows no sequence numbers, no addresses and no clock.
 """
 
@@ -13,9 +13,8 @@ from typing import Any, NamedTuple
 from pymavlink.dialects.v20 import all as mavlink
 
 from offboard.mavlink import events
-from offboard.mavlink.counters import DropReason
 from offboard.mavlink.dialects.base import Dialect
-from offboard.mavlink.framing import Frame, payload_of
+from offboard.mavlink.framing import payload_of
 
 POSITION_LIMIT_M = 1e5
 VELOCITY_LIMIT_MPS = 200.0
@@ -41,22 +40,25 @@ _RESULTS = {
 }
 # which pymavlink's `all` lacks
 _RESULTS |= {6: "CANCELLED", 9: "COMMAND_UNSUPPORTED_MAV_FRAME", 10: "NOT_IN_CONTROL"}
-# innovation ratios of the estimator's messages
-_PX4_RATIOS = {
-    "GPS velocity": "vel_ratio",
-    "GPS position": "pos_horiz_ratio",
-    "height": "pos_vert_ratio",
-    "heading": "mag_ratio",
-    "height above ground": "hagl_ratio",
-    "airspeed": "tas_ratio",
-}
-_ARDUPILOT_RATIOS = {
-    "GPS velocity": "velocity_variance",
-    "GPS position": "pos_horiz_variance",
-    "height": "pos_vert_variance",
-    "compass": "compass_variance",
-    "terrain": "terrain_alt_variance",
-    "air": "airspeed_variance",
+# innovation ratios of ESTIMATOR_STATUS, and of EKF_STATUS_REPORT: what is measured, and the field
+_PX4_ESTIMATOR, _ARDUPILOT_ESTIMATOR = 230, 193
+_RATIOS = {
+    _PX4_ESTIMATOR: {
+        "GPS velocity": "vel_ratio",
+        "GPS position": "pos_horiz_ratio",
+        "height": "pos_vert_ratio",
+        "heading": "mag_ratio",
+        "height above ground": "hagl_ratio",
+        "airspeed": "tas_ratio",
+    },
+    _ARDUPILOT_ESTIMATOR: {
+        "GPS velocity": "velocity_variance",
+        "GPS position": "pos_horiz_variance",
+        "height": "pos_vert_variance",
+        "compass": "compass_variance",
+        "terrain": "terrain_alt_variance",
+        "air": "airspeed_variance",
+    },
 }
 
 
@@ -65,12 +67,6 @@ class Address(NamedTuple):
 
     system_id: int
     component_id: int
-
-
-def decode(frame: Frame, dialect: Dialect) -> events.Event | DropReason | None:
-    """The event in a verified frame, IMPLAUSIBLE, or None for a message without decoder."""
-    decoder = _DECODERS.get(frame.message_id)
-    return None if decoder is None else decoder(frame.message, dialect)
 
 
 def _heartbeat(message: Any, dialect: Dialect) -> events.Event:
@@ -83,42 +79,40 @@ def _current_mode(message: Any, dialect: Dialect) -> events.Event:
     return events.ModeReport(dialect.mode_name(message.custom_mode))
 
 
-def _local_position(message: Any, _: Dialect) -> events.Event | DropReason:
+def _local_position(message: Any, _: Dialect) -> events.Event | None:
     x, y, z = position = message.x, message.y, message.z
     vx, vy, vz = velocity = message.vx, message.vy, message.vz
     far, fast = POSITION_LIMIT_M, VELOCITY_LIMIT_MPS
     # comparisons with NaN are false: these refuse what is not finite, too
     if not (-far < x < far and -far < y < far and -far < z < far):
-        return DropReason.IMPLAUSIBLE
+        return None
     if not (-fast < vx < fast and -fast < vy < fast and -fast < vz < fast):
-        return DropReason.IMPLAUSIBLE
+        return None
     return events.LocalPosition(message.time_boot_ms / 1000.0, position, velocity)
 
 
-def _attitude(message: Any, _: Dialect) -> events.Event | DropReason:
+def _attitude(message: Any, _: Dialect) -> events.Event | None:
     w, x, y, z = message.q1, message.q2, message.q3, message.q4
     p, q, r = rates = message.rollspeed, message.pitchspeed, message.yawspeed
     norm = math.sqrt(w * w + x * x + y * y + z * z)
     if not UNIT_LENGTHS[0] < norm < UNIT_LENGTHS[1]:
-        return DropReason.IMPLAUSIBLE
+        return None
     limit = RATE_LIMIT_RADPS
     if not (-limit < p < limit and -limit < q < limit and -limit < r < limit):
-        return DropReason.IMPLAUSIBLE
+        return None
     unit = (w / norm, x / norm, y / norm, z / norm)
     return events.Attitude(message.time_boot_ms / 1000.0, unit, rates)
 
 
-def _thrust_report(message: Any, _: Dialect) -> events.Event | DropReason:
+def _thrust_report(message: Any, _: Dialect) -> events.Event | None:
     if not math.isfinite(message.thrust):
-        return DropReason.IMPLAUSIBLE
+        return None
     # ArduCopter's falls to -0.2 on landing
     return events.ThrustReport(min(max(message.thrust, 0.0), 1.0))
 
 
 def _gps_fix(message: Any, _: Dialect) -> events.Event:
-    if message.fix_type < FIX_3D:
-        return events.NoFix(message.fix_type)
-    return events.GpsFix(message.h_acc * 1e-3 if message.h_acc else None)
+    return events.GpsFix() if message.fix_type >= FIX_3D else events.NoFix(message.fix_type)
 
 
 def _system_health(message: Any, _: Dialect) -> events.Event:
@@ -132,23 +126,14 @@ def _system_health(message: Any, _: Dialect) -> events.Event:
     )
 
 
-def _px4_estimator(message: Any, _: Dialect) -> events.Event:
-    accuracy_m = message.pos_horiz_accuracy
-    return _estimator(message, _PX4_RATIOS, accuracy_m if math.isfinite(accuracy_m) else None)
-
-
-def _ardupilot_estimator(message: Any, _: Dialect) -> events.Event:
-    return _estimator(message, _ARDUPILOT_RATIOS)
-
-
-def _estimator(
-    message: Any, names: Mapping[str, str], accuracy_m: float | None = None
-) -> events.EstimatorReport:
-    ratios = ((name, getattr(message, field)) for name, field in names.items())
+def _estimator(message: Any, _: Dialect) -> events.Event:
+    names = _RATIOS[message.get_msgId()].items()
+    ratios = ((name, getattr(message, field)) for name, field in names)
+    accuracy_m = getattr(message, "pos_horiz_accuracy", math.nan)  # ArduPilot has none
     return events.EstimatorReport(
         valid=frozenset(part for part, bit in _EKF_BITS.items() if message.flags & bit),
         ratios=tuple((name, ratio) for name, ratio in ratios if math.isfinite(ratio)),
-        accuracy_m=accuracy_m,
+        accuracy_m=accuracy_m if math.isfinite(accuracy_m) else None,
     )
 
 
@@ -169,18 +154,18 @@ def _command_ack(message: Any, _: Dialect) -> events.Event:
     return events.CommandAck(message.command, _RESULTS.get(result, f"UNKNOWN({result})"))
 
 
-def _parameter(message: Any, dialect: Dialect) -> events.Event | DropReason | None:
+def _parameter(message: Any, dialect: Dialect) -> events.Event | None:
     name, value, kind = message.param_id, message.param_value, message.param_type
     if all(name != watched.name for watched in dialect.watched_parameters):
         return None  # a ground station reads them all
     if dialect.integers_bytewise and kind != _REAL32:
         if kind not in _UNSIGNED_TYPES + _SIGNED_TYPES:
-            return DropReason.IMPLAUSIBLE
+            return None
         # from the bytes: as a float they may be a signalling NaN, which Python changes
         first = payload_of(bytes(message.get_msgbuf()))[:4].ljust(4, b"\0")
         value = int.from_bytes(first, "little", signed=kind in _SIGNED_TYPES)
     if not math.isfinite(value):
-        return DropReason.IMPLAUSIBLE
+        return None
     return events.Parameter(name, float(value))
 
 
@@ -190,7 +175,7 @@ def printable(data: bytes) -> str:
     return "".join(c if c.isprintable() else " " for c in text).strip()
 
 
-_DECODERS: Mapping[int, Callable[[Any, Dialect], events.Event | DropReason | None]] = {
+DECODERS: Mapping[int, Callable[[Any, Dialect], events.Event | None]] = {
     0: _heartbeat,
     1: _system_health,
     22: _parameter,
@@ -200,8 +185,8 @@ _DECODERS: Mapping[int, Callable[[Any, Dialect], events.Event | DropReason | Non
     77: _command_ack,
     83: _thrust_report,
     148: _version,
-    193: _ardupilot_estimator,
-    230: _px4_estimator,
+    _ARDUPILOT_ESTIMATOR: _estimator,
+    _PX4_ESTIMATOR: _estimator,
     245: _landed,
     436: _current_mode,
 }

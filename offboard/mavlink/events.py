@@ -110,8 +110,6 @@ class ThrustReport(Event):
 class GpsFix(Event):
     """GPS_RAW_INT with a position fix in three dimensions."""
 
-    accuracy_m: float | None  # horizontal, as the receiver reports it
-
 
 @dataclass(frozen=True, slots=True)
 class NoFix(Event):
@@ -236,5 +234,3 @@ class TimesyncReply(Event):
 @dataclass(frozen=True, slots=True)
 class Rebooted(Event):
     """Several stamps in a row are of a new epoch: the vehicle was rebooted."""
-
-    time_s: float

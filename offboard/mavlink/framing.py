@@ -17,8 +17,6 @@ from fastcrc import crc16
 # `all` also holds CURRENT_MODE, which PX4 sends and `ardupilotmega` lacks
 from pymavlink.dialects.v20 import all as mavlink
 
-from offboard.mavlink.counters import Counters, DropReason
-
 mavlink.MAVLINK_IGNORE_CRC = 0  # MAV_IGNORE_CRC of the environment must not switch checksums off
 
 V2, V1 = 0xFD, 0xFE  # first byte of a frame of MAVLink 2 and 1
@@ -63,39 +61,40 @@ class Frame:
 
 class FrameSplitter:
     """Finds frames. A datagram holds whole frames. A stream (serial, TCP) may end within a frame,
-    which is kept for the next call."""
+    which is kept for the next call. `frames` counts also those whose id is not known,
+    `bytes_skipped` what is in no frame."""
 
-    def __init__(self, stream: bool, counters: Counters) -> None:
+    def __init__(self, stream: bool) -> None:
+        self.bytes_received = self.bytes_skipped = self.frames = 0
         self._stream = stream
-        self._counters = counters
         self._rest = b""
         self._behind = 0  # where in the next data the frame before ends; -1: further back
 
     def split(self, data: bytes) -> list[Frame]:
-        """The verified frames in `data`; what is not returned is counted."""
-        counters = self._counters
-        counters.bytes_received += len(data)
+        """The verified frames in `data`."""
+        self.bytes_received += len(data)
         data = self._rest + data
         frames: list[Frame] = []
         at, end, behind = self._next_marker(data, 0), len(data), self._behind
         while at < end:
-            found = self._frame_at(data, at, adjoins=at == behind)
-            if found is None:
-                break
-            if isinstance(found, DropReason):
-                counters.dropped[found] += 1
-                counters.bytes_skipped += 1
+            stop = at + frame_size(data, at)
+            frame = parse(data, at, stop) if stop <= end else None
+            unsure, adjoins = frame is not None and not frame.verified, at == behind
+            if self._stream and (stop > end or (unsure and adjoins and stop == end)):
+                break  # what decides is still to come
+            # without a known checksum a frame must fill the space between two others
+            if unsure and not (adjoins and (stop == end or data[stop] in (V2, V1))):
+                frame = None
+            if frame is None:
+                self.bytes_skipped += 1
                 at = self._next_marker(data, at + 1)
                 continue
-            counters.bytes_framed += len(found.raw)
-            if found.verified:
-                frames.append(found)
-            else:
-                counters.count(DropReason.UNKNOWN_ID)
-            behind = at + len(found.raw)
+            self.frames += 1
+            if frame.verified:
+                frames.append(frame)
+            behind = stop
             at = self._next_marker(data, behind)
-        self._rest, self._behind = data[at:], 0 if at == behind else -1
-        counters.bytes_pending = end - at
+        self._rest, self._behind = data[at:], 0 if at == behind or not self._stream else -1
         return frames
 
     def _next_marker(self, data: bytes, at: int) -> int:
@@ -105,51 +104,37 @@ class FrameSplitter:
             return at  # as nearly always
         candidates = [i for i in (data.find(V2, at), data.find(V1, at)) if i >= 0]
         found = min(candidates, default=len(data))
-        self._counters.bytes_skipped += found - at
+        self.bytes_skipped += found - at
         return found
 
-    def _frame_at(self, data: bytes, at: int, *, adjoins: bool) -> Frame | DropReason | None:
-        """The frame at `at`, why there is none, or None if more bytes are needed. `adjoins`: the
-        frame before it ends there."""
-        size = frame_size(data, at)
-        if size is None or at + size > len(data):
-            return None if self._stream else DropReason.TRUNCATED
-        frame = parse(data, at, at + size)
-        if isinstance(frame, DropReason) or frame.verified:
-            return frame
-        # without a known checksum a frame must fill the space between two others
-        following = data[at + size : at + size + 1]
-        if adjoins and self._stream and not following:
-            return None
-        fills = adjoins and (not following or following[0] in (V2, V1))
-        return frame if fills else DropReason.BAD_CRC
 
-
-def frame_size(data: bytes, at: int) -> int | None:
-    """Frame length given by the header at `at`; None if the header is incomplete."""
+def frame_size(data: bytes, at: int) -> int:
+    """Frame length given by the header at `at`; where the data end within this, that of the
+    shortest frame, which ends behind them, too."""
     if at + 3 > len(data):
-        return None
+        return _HEADER_BYTES_V1 + _CRC_BYTES
     if data[at] == V1:
         return _HEADER_BYTES_V1 + data[at + 1] + _CRC_BYTES
     signature_bytes = _SIGNATURE_BYTES if data[at + 2] & _SIGNED else 0
     return _HEADER_BYTES_V2 + data[at + 1] + _CRC_BYTES + signature_bytes
 
 
-def parse(data: bytes, at: int, end: int) -> Frame | DropReason:
-    """The frame in data[at:end], which `frame_size` has measured, or why there is none."""
+def parse(data: bytes, at: int, end: int) -> Frame | None:
+    """The frame in data[at:end], which `frame_size` has measured; None if its checksum is wrong, or
+    if it cannot be understood without a later version of MAVLink."""
     raw = data[at:end]
     message_id = message_id_of(raw)
     if raw[0] == V1:
         header = raw[3], raw[4], raw[2]
         crc_at = _HEADER_BYTES_V1 + raw[1]
     elif raw[2] & ~_SIGNED:
-        return DropReason.INCOMPATIBLE  # cannot be understood without a later version of MAVLink
+        return None
     else:
         header = raw[5], raw[6], raw[4]
         crc_at = _HEADER_BYTES_V2 + raw[1]
     extra = _CRC_EXTRA.get(message_id)
     if extra is not None and _crc(extra, _crc(raw[1:crc_at])) != raw[crc_at] | raw[crc_at + 1] << 8:
-        return DropReason.BAD_CRC
+        return None
     return Frame(raw, message_id, *header, extra is not None)
 
 

@@ -1,25 +1,26 @@
 """Who sends on the link: which sender is the vehicle, who else controls it, and who may be ignored.
 
 The first autopilot heard is the vehicle, known by system id, component id and network address. From
-then on every other sender is dropped and counted; setpoints and modes that another one sends to our
-vehicle are reported, as are other companion computers. mavlink-router and MAVProxy send from
-another port after a restart: the address changes to another port of its host that sends the
-vehicle's frames, after the known one was silent. The link hands over datagrams of another address
-only after it has checked that the silence was neither an overflow of the socket's buffer nor a
-pause of this process.
+then on every other sender is ignored, and with a key all that is not signed with it; setpoints and
+modes that another one sends to our vehicle are reported, as are other companion computers.
+
+mavlink-router and MAVProxy send from another port after a restart: the address changes to another
+port of its host that sends the vehicle's frames, after the known one was silent. The link hands
+over datagrams of another address only after it has checked that the silence was neither an overflow
+of the socket's buffer nor a pause of this process.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Hashable, Iterable, Mapping
+from collections import Counter
+from collections.abc import Collection, Hashable, Iterator, Mapping
 from types import MappingProxyType
 from typing import Any
 
 from pymavlink.dialects.v20.all import enums
 
-from offboard.mavlink.counters import Counters, DropReason
-from offboard.mavlink.decode import Address, decode
+from offboard.mavlink.decode import ARMED, Address
 from offboard.mavlink.dialects.ardupilot import ARDUPILOT
 from offboard.mavlink.dialects.base import TYPE_GCS, TYPE_ONBOARD_CONTROLLER, Dialect
 from offboard.mavlink.dialects.px4 import PX4
@@ -27,17 +28,25 @@ from offboard.mavlink.events import (
     ClockBehind,
     CommandRequest,
     Event,
-    Heartbeat,
     OtherCompanion,
     OtherSender,
     VehicleFound,
 )
-from offboard.mavlink.framing import COMMAND_ACK, HEARTBEAT, SETPOINTS, TIMESYNC, Frame
+from offboard.mavlink.framing import (
+    COMMAND_ACK,
+    HEARTBEAT,
+    SETPOINTS,
+    TIMESYNC,
+    Frame,
+    FrameSplitter,
+)
+from offboard.mavlink.outgoing import Target
+from offboard.mavlink.signing import Forgery, Signing
 
 DIALECTS: Mapping[str, Dialect] = MappingProxyType({d.name: d for d in (PX4, ARDUPILOT)})
+_BY_AUTOPILOT = {dialect.mav_autopilot: dialect for dialect in DIALECTS.values()}
 AUTOPILOT_COMPONENT = 1
 COMMANDS = COMMAND_INT, COMMAND_LONG = 75, 76
-_ORDERS = SETPOINTS | set(COMMANDS)
 # MAV_CMD: return, land, take off, set the mode, go to a place, begin a mission, arm or disarm
 _MODE_COMMANDS = frozenset({20, 21, 22, 176, 192, 300, 400})
 PEER_SILENT_S = 0.5  # half of `Limits.silence_s`, so that the flight can continue
@@ -55,22 +64,26 @@ _NO_VEHICLES = frozenset({5, 6, 18, 26, 27, 30, 31, 32, 33, 34, *range(36, 43), 
 
 class Senders:
     """See the module. `vehicle` and `dialect` are None until the vehicle was found; `wanted` is the
-    only system that may be the vehicle, None: any; without `has_key` it must not sign. `own` are
+    only system that may be the vehicle, None: any; without `signing` it must not sign. `own` are
     our ids, of which the system is the vehicle's. `systems` has when each autopilot was heard, to a
-    second. Times are `Session.link_time_s` but for `heard_s`, host time of the vehicle's newest
-    frame.
+    second; `forged` counts what signing refused. Times are `Session.link_time_s` but for `heard_s`,
+    host time of the vehicle's newest frame.
     """
 
-    def __init__(self, wanted: int | None, component_id: int, *, has_key: bool) -> None:
+    def __init__(self, wanted: int | None, component_id: int, signing: Signing | None) -> None:
         self.own = Address(1, component_id)
         self.vehicle: VehicleFound | None = None
         self.dialect: Dialect | None = None
+        self.target: Target | None = None  # of our messages: the vehicle
         self.clock_behind = False  # an autopilot whose clock is behind ours was heard
         self.systems: dict[int, float] = {}
+        self.forged: Counter[Forgery] = Counter()
+        self._news_at = 1  # number of forged frames
+        self._signs = False  # an autopilot that signs was heard, and we have no key
         self._other_component = 0  # of the newest autopilot that is not AUTOPILOT_COMPONENT
         self.heard_s = 0.0
         self._wanted = wanted
-        self._has_key = has_key
+        self._signing = signing
         # address of the vehicle, or of one that awaits our clock
         self.peer: Hashable | None = None
 
@@ -78,135 +91,130 @@ class Senders:
         """Take this vehicle, which sends from `peer`, as ours."""
         self.vehicle, self.dialect, self.peer = vehicle, DIALECTS[vehicle.autopilot], peer
         self.own = Address(vehicle.system_id, self.own.component_id)
+        divides = self.dialect.divides_by_tilt
+        self.target = Target(vehicle.system_id, vehicle.component_id, divides)
 
-    # --- addresses ---
+    # --- datagrams from another address ---
 
-    def moves_to(self, peer: Hashable, now_s: float, genuine: Iterable[Frame]) -> bool:
-        """Take `peer` as the vehicle's address if one of the `genuine` frames from it shows that
-        the vehicle sends from there now."""
+    def moves_to(self, peer: Hashable, now_s: float, datagram: bytes) -> bool:
+        """Take `peer` as the vehicle's address if `datagram`, from there, shows that the vehicle
+        sends from there now."""
         if now_s - self.heard_s <= PEER_SILENT_S or not same_host(peer, self.peer):
             return False
         vehicle = self.vehicle
         assert vehicle is not None
         ids = vehicle.system_id, vehicle.component_id
+        genuine = self._genuine(datagram)
         moves = any((frame.system_id, frame.component_id) == ids for frame in genuine)
         if moves:
             self.peer = peer
         return moves
 
+    def overhear(self, datagram: bytes, now_s: float) -> list[int]:
+        """Systems with an autopilot that a datagram shows, each once a second."""
+        known = dict(self.systems)
+        for frame in self._genuine(datagram):
+            self.note(frame, now_s)
+        return [each for each, _ in self.systems.items() - known.items()]
+
+    def _genuine(self, datagram: bytes) -> Iterator[Frame]:
+        """The frames of a datagram that signing would accept. Counts nothing, uses up no stamp."""
+        for frame in FrameSplitter(stream=False).split(datagram):
+            if not (self._signing and self._signing.refusal(frame, note=False)):
+                yield frame
+
     # --- frames ---
 
-    def judge(
-        self, frame: Frame, peer: Hashable, now_s: float, events: list[Event]
-    ) -> DropReason | None:
-        """Why this frame is not one of our vehicle, nor a command to us. Adds to `events` the
-        vehicle when it is found, commands to us, and others that control the vehicle."""
-        heard = self._whose(frame, now_s)
-        if self.vehicle is None:
-            return self._find(frame, heard, peer, events)
-        if frame.message_id in _ORDERS:
-            return self._judge_order(frame, heard, events)
-        if isinstance(heard, Dialect):
-            return None if heard is self.dialect else DropReason.FOREIGN_COMPONENT
-        if heard and self._is_companion(frame):
-            ids = frame.system_id, frame.component_id
-            events.append(OtherCompanion(*ids, frame.message.custom_mode))
-        if frame.message_id == COMMAND_ACK and not heard:
-            pairs = zip(_receiver(frame), self.own, strict=True)
-            ours = all(to in (0, own) for to, own in pairs)  # 0: for all
-            return None if ours else DropReason.NOT_FOR_US
-        return heard
+    def refuse(self, frame: Frame, peer: Hashable, now_s: float, events: list[Event]) -> bool:
+        """Whether signing refuses a frame.
 
-    def _whose(self, frame: Frame, now_s: float) -> Dialect | DropReason | None:
-        """Why a frame is not of a vehicle that may be ours; the autopilot that a HEARTBEAT of it
-        shows, None for another message."""
-        heard = self.note(frame, now_s) if frame.message_id == HEARTBEAT else None
-        if (frame.system_id, frame.component_id) == self.own:
-            return DropReason.SAME_IDS
-        if frame.component_id != AUTOPILOT_COMPONENT:
-            return DropReason.FOREIGN_COMPONENT
-        system_id = self.vehicle.system_id if self.vehicle else self._wanted
-        return heard if system_id in (None, frame.system_id) else DropReason.FOREIGN_SYSTEM
+        Adds to `events` an autopilot whose signature is right and whose clock is behind, where no
+        vehicle was found: its clock follows ours with our heartbeat. The frame may be a replay:
+        nothing else is believed.
+        """
+        forgery = self._signing.refusal(frame) if self._signing else None
+        if forgery is None:
+            return False
+        self.forged[forgery] += 1
+        behind = forgery is Forgery.OLD_STAMP and self.vehicle is None
+        if behind and self.note(frame, now_s) and self._wanted in (None, frame.system_id):
+            self.clock_behind, self.peer = True, peer
+            armed = bool(frame.message.base_mode & ARMED)
+            events.append(ClockBehind(frame.system_id, armed))
+        return True
+
+    def judge(self, frame: Frame, peer: Hashable, now_s: float, events: list[Event]) -> bool:
+        """Whether it is a frame of our vehicle, and no command. Adds to `events` the vehicle when
+        it is found, commands to us, and others that control the vehicle."""
+        vehicle, message_id = self.vehicle, frame.message_id
+        heard = self.note(frame, now_s)
+        system_id = vehicle.system_id if vehicle else self._wanted
+        theirs = frame.component_id == AUTOPILOT_COMPONENT and system_id in (None, frame.system_id)
+        if vehicle is None:
+            return theirs and self._find(frame, heard, peer, events)
+        if message_id == HEARTBEAT:
+            if self._is_companion(frame):
+                ids = frame.system_id, frame.component_id
+                events.append(OtherCompanion(*ids, frame.message.custom_mode))
+            return theirs and heard is self.dialect
+        if message_id in COMMANDS:
+            self._note_command(frame, events)
+            return False
+        # for all or for our vehicle: routers forward those for others
+        if message_id in SETPOINTS and frame.message.target_system in (0, vehicle.system_id):
+            events.append(OtherSender(frame.system_id, frame.component_id))
+        if message_id == COMMAND_ACK:
+            pairs = zip(_receiver(frame), self.own, strict=True)
+            return theirs and all(to in (0, own) for to, own in pairs)  # 0: for all
+        return theirs
 
     def _find(
-        self,
-        frame: Frame,
-        heard: Dialect | DropReason | None,
-        peer: Hashable,
-        events: list[Event],
-    ) -> DropReason | None:
+        self, frame: Frame, heard: Dialect | None, peer: Hashable, events: list[Event]
+    ) -> bool:
         """The first heartbeat of an autopilot makes it the vehicle."""
-        if heard is None and frame.message_id == TIMESYNC:
-            return None  # a simulator in lockstep may need the reply before its first heartbeat
-        if not isinstance(heard, Dialect):
-            return heard or DropReason.NO_VEHICLE
-        if frame.signed and not self._has_key:
-            return DropReason.NO_KEY
+        if frame.message_id == TIMESYNC:
+            return True  # a simulator in lockstep may need the reply before its first heartbeat
+        if heard is None:
+            return False
+        if frame.signed and self._signing is None:
+            self._signs = True
+            return False
         vehicle = VehicleFound(frame.system_id, frame.component_id, heard.name)
         self.set_vehicle(vehicle, peer)
         events.append(vehicle)
-        return None
+        return True
 
-    def _judge_order(
-        self, frame: Frame, heard: Dialect | DropReason | None, events: list[Event]
-    ) -> DropReason | None:
-        """As `judge`, for a setpoint or a command; `heard` of `_whose`."""
-        sender = Address(frame.system_id, frame.component_id)
-        if self._controls(frame):
+    def _note_command(self, frame: Frame, events: list[Event]) -> None:
+        """Add to `events` a command to us, or one for the mode from the vehicle's own system, as
+        ours are: that of a ground station is the pilot's."""
+        sender, receiver = Address(frame.system_id, frame.component_id), _receiver(frame)
+        if receiver == self.own:
+            if sender != self.own:
+                events.append(CommandRequest(frame.message.command, _parameters(frame), *sender))
+            return
+        system_id = self.own.system_id
+        companion = sender.system_id == system_id and sender.component_id != AUTOPILOT_COMPONENT
+        controls = companion and frame.message.command in _MODE_COMMANDS
+        if controls and receiver.system_id in (0, system_id):
             events.append(OtherSender(*sender))
-        if frame.message_id in SETPOINTS or sender == self.own:
-            assert not isinstance(heard, Dialect)  # which a HEARTBEAT shows
-            return heard
-        if _receiver(frame) != self.own:
-            return DropReason.NOT_FOR_US
-        events.append(CommandRequest(frame.message.command, _parameters(frame), *sender))
-        return None
-
-    def _controls(self, frame: Frame) -> bool:
-        """Whether it is a setpoint for our vehicle or for all (routers forward those of others), or
-        commands the mode from the vehicle's own system, as we do: that of a ground station is the
-        pilot's."""
-        if frame.message_id in COMMANDS:
-            companion = frame.component_id != AUTOPILOT_COMPONENT
-            ours = companion and frame.system_id == self.own.system_id
-            if not (ours and frame.message.command in _MODE_COMMANDS):
-                return False
-            if _receiver(frame) == self.own:
-                return False
-        return frame.message.target_system in (0, self.own.system_id)
 
     def _is_companion(self, frame: Frame) -> bool:
-        """Whether it is the HEARTBEAT of another companion computer of our vehicle, with the
+        """Whether a HEARTBEAT is of another companion computer of our vehicle, with the
         vehicle's system id as ours. On PX4 some call themselves a ground station."""
-        if frame.message_id != HEARTBEAT or frame.message.autopilot != _NO_AUTOPILOT:
-            return False
+        unflown = frame.message.autopilot == _NO_AUTOPILOT
         on_vehicle = frame.system_id == self.own.system_id
-        return on_vehicle and frame.message.type in (TYPE_ONBOARD_CONTROLLER, TYPE_GCS)
+        return unflown and on_vehicle and frame.message.type in (TYPE_ONBOARD_CONTROLLER, TYPE_GCS)
 
-    def note(self, frame: Frame, now_s: float) -> Dialect | DropReason | None:
-        """The autopilot that a frame shows, why it is none, or None if it is no HEARTBEAT of an
-        autopilot's component."""
-        if frame.message_id != HEARTBEAT:
-            return None
-        kinds = {dialect.mav_autopilot: dialect for dialect in DIALECTS.values()}
-        dialect = kinds.get(frame.message.autopilot)
-        if frame.component_id != AUTOPILOT_COMPONENT:
-            if dialect and is_vehicle(frame.message):
-                self._other_component = frame.component_id
-            return None
-        if not is_vehicle(frame.message):
-            return DropReason.NO_VEHICLE
+    def note(self, frame: Frame, now_s: float) -> Dialect | None:
+        """The autopilot that a frame shows, None if it is no HEARTBEAT of one that can be flown."""
+        dialect = dialect_of(frame.message) if frame.message_id == HEARTBEAT else None
         if dialect is None:
-            return DropReason.UNSUPPORTED_AUTOPILOT
+            return None
+        if frame.component_id != AUTOPILOT_COMPONENT:
+            self._other_component = frame.component_id
+            return None
         self.hear(frame.system_id, now_s)
         return dialect
-
-    def overhear(self, frames: Iterable[Frame], now_s: float) -> list[int]:
-        """Systems with an autopilot that these frames show, each once a second."""
-        known = dict(self.systems)
-        for frame in frames:
-            self.note(frame, now_s)
-        return [each for each, _ in self.systems.items() - known.items()]
 
     def hear(self, system_id: int, now_s: float) -> None:
         """This system has an autopilot."""
@@ -217,19 +225,6 @@ class Senders:
         if len(self.systems) > SYSTEMS_MAX:
             del self.systems[next(iter(self.systems))]
 
-    def note_clock_behind(
-        self, frame: Frame, peer: Hashable, now_s: float, events: list[Event]
-    ) -> None:
-        """Note the autopilot whose frame has a right signature and a clock that is behind: its
-        clock follows ours with our heartbeat. The frame may be a replay: nothing else is
-        believed."""
-        heard = self.note(frame, now_s)
-        if isinstance(heard, Dialect) and self._wanted in (None, frame.system_id):
-            beat = decode(frame, heard)
-            assert isinstance(beat, Heartbeat)
-            self.clock_behind, self.peer = True, peer
-            events.append(ClockBehind(frame.system_id, beat.armed))
-
     # --- what to say ---
 
     def candidates(self, now_s: float) -> str:
@@ -238,19 +233,29 @@ class Senders:
         present = [each for each, at_s in self.systems.items() if now_s - at_s <= HEARD_S]
         return _listed(present) if self._wanted is None and len(present) > 1 else ""
 
-    def why_none(self, counters: Counters) -> str:
-        """Why no vehicle was found, as far as the frames that were dropped tell; else empty."""
-        dropped = counters.dropped
-        if dropped[DropReason.BAD_SIGNATURE]:
+    def news(self) -> str:
+        """What signing refused, on the 1st, 10th, 100th ... frame; else empty."""
+        total = self.forged.total()
+        if total < self._news_at:
+            return ""
+        self._news_at = 10 ** len(str(total))
+        counted = ((each, self.forged[each]) for each in Forgery)
+        named = (f"{number:,} x {each.value}" for each, number in counted if number)
+        return f"frames refused by signing: {', '.join(named)}"
+
+    def why_none(self) -> str:
+        """Why no vehicle was found, as far as the frames that were refused tell; else empty."""
+        forged = self.forged
+        if forged[Forgery.BAD_SIGNATURE]:
             return "frames arrive, but their signature does not match: it is another key's"
-        if dropped[DropReason.OLD_STAMP] or dropped[DropReason.REPLAYED]:
+        if forged[Forgery.OLD_STAMP] or forged[Forgery.REPLAYED]:
             return (
                 "signed frames arrive, but their time stamps are too old: the vehicle does not "
                 "take ours; is the link one-way?"
             )
-        if dropped[DropReason.UNSIGNED]:
+        if forged[Forgery.UNSIGNED]:
             return "frames arrive unsigned: set the key on the vehicle, or omit --signing-key"
-        if dropped[DropReason.NO_KEY]:
+        if self._signs:
             return "the vehicle signs its messages: give its key with --signing-key"
         if self._wanted is not None and self.systems:
             return f"system {self._wanted} is not heard, but {_listed(self.systems)}; see --system"
@@ -275,6 +280,11 @@ def same_host(peer: Hashable, other: Hashable) -> bool:
 def is_vehicle(heartbeat: Any) -> bool:
     """Whether this HEARTBEAT is of a vehicle with an autopilot, of any kind."""
     return heartbeat.type not in _NO_VEHICLES and heartbeat.autopilot != _NO_AUTOPILOT
+
+
+def dialect_of(heartbeat: Any) -> Dialect | None:
+    """The dialect of the vehicle that sends this HEARTBEAT; None without one, or a vehicle."""
+    return _BY_AUTOPILOT.get(heartbeat.autopilot) if is_vehicle(heartbeat) else None
 
 
 def unfit_type(vehicle_type: int, *, helicopter: bool) -> str:

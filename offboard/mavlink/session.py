@@ -10,17 +10,16 @@ components.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Hashable, Iterator
+from collections.abc import Hashable
 from dataclasses import dataclass, field
 
 from pymavlink.dialects.v20 import all as mavlink
 
 from offboard.mavlink import framing
-from offboard.mavlink.counters import FORGED, Counters, DropReason
 from offboard.mavlink.dialects.base import TYPE_ONBOARD_CONTROLLER, Dialect
 from offboard.mavlink.events import Event, PeerChanged, TimesyncReply, VehicleFound
-from offboard.mavlink.outgoing import CommandLong, Heartbeat, Outgoing, Record, Target, Timesync
-from offboard.mavlink.senders import COMMANDS, Senders
+from offboard.mavlink.outgoing import CommandLong, Heartbeat, Outgoing, Record, Timesync
+from offboard.mavlink.senders import Senders
 from offboard.mavlink.signing import Signing
 from offboard.mavlink.telemetry import Telemetry
 
@@ -30,7 +29,6 @@ COMPONENT_ID = 191  # MAV_COMP_ID_ONBOARD_COMPUTER: the sender of frames
 # numbers leave no gap in those of the frames that the vehicle counts.
 RECORD_COMPONENT_ID = 192
 
-_NOT_LOGGED = (DropReason.ECHO, *FORGED)
 _ECHOES = 256  # newest frames of ours that are recognised when they come back
 _HEARTBEAT_PERIOD_S = 0.999  # 1 Hz; below 1 s, so that no rounding error delays it by a cycle
 
@@ -42,8 +40,8 @@ class SessionSettings:
     `system_id` is the only system that may be the vehicle; None: the first autopilot heard.
     `stream`: serial or TCP, bytes arrive in any portions. `sends_first`: send heartbeats before an
     autopilot was heard. `capacity_bytes_ps` of the link limits the rates of telemetry that are
-    requested; None: unknown. `lockstep`: the host times given to `receive` and `poll` are ignored,
-    see `VehicleTime`.
+    requested; None: unknown. `lockstep`: simulated time takes the place of host time, see
+    `Session.elapsed_s`.
     """
 
     system_id: int | None = None
@@ -54,7 +52,7 @@ class SessionSettings:
     lockstep: bool = False
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Reception:
     """Result of one portion of bytes.
 
@@ -66,44 +64,31 @@ class Reception:
     reply is applied one barrier later.
     """
 
-    frames: tuple[bytes, ...] = ()
-    events: tuple[Event, ...] = ()
-    replies: tuple[Outgoing, ...] = ()
-    unlogged: tuple[tuple[int, bytes], ...] = ()
-
-
-@dataclass(slots=True)
-class _Arrival:
-    """A datagram, or a portion of a stream, and what is found in it."""
-
-    peer: Hashable
-    now_s: float
+    frames: list[bytes] = field(default_factory=list)
     events: list[Event] = field(default_factory=list)
     replies: list[Outgoing] = field(default_factory=list)
+    unlogged: list[tuple[int, bytes]] = field(default_factory=list)
 
 
 class Session:
     """See the module. `vehicle` and `dialect` are None until an autopilot was heard. With `signing`
-    all frames are signed, and those without its signature are dropped. `status` is system_status
-    and custom_mode of our heartbeat."""
+    all frames are signed, and those without its signature are dropped."""
 
     def __init__(self, settings: SessionSettings, signing: Signing | None = None) -> None:
         self.settings = settings
-        self.senders = Senders(
-            settings.system_id, settings.component_id, has_key=signing is not None
-        )
-        self.counters = Counters()
-        self.status = (ACTIVE, 0)
+        self.senders = Senders(settings.system_id, settings.component_id, signing)
+        self.splitter = framing.FrameSplitter(settings.stream)
         self._signing = signing
-        self._splitter = framing.FrameSplitter(settings.stream, self.counters)
         self._sending = mavlink.MAVLink(None, srcComponent=settings.component_id)
         self._recording = mavlink.MAVLink(None, srcComponent=RECORD_COMPONENT_ID)
         self._components = (settings.component_id, RECORD_COMPONENT_ID)
         self._sent: deque[bytes] = deque(maxlen=_ECHOES)
-        self.telemetry = Telemetry(settings.capacity_bytes_ps, lockstep=settings.lockstep)
+        self.telemetry = Telemetry(settings.capacity_bytes_ps)
         self.time = self.telemetry.time
+        self._began_s: float | None = None  # stamp of the first TIMESYNC request
+        self._simulated_s = 0.0  # from it to the newest
         self._heartbeat_sent: tuple[float, float] | None = None  # host time, link time
-        self._status_sent = self.status
+        self._custom_mode_sent = 0
 
     @property
     def vehicle(self) -> VehicleFound | None:
@@ -122,99 +107,66 @@ class Session:
 
     def receive(self, datagram: bytes, peer: Hashable, now_s: float) -> Reception:
         """Process a datagram, or any portion of a stream, that came from `peer`. Never raises."""
-        self.time.on_datagram()
-        arrival = _Arrival(peer, self.time.now_s(now_s))
+        now_s = self.elapsed_s(now_s)
+        found = Reception()
         if self.vehicle is not None and peer != self.peer:
-            if not self.senders.moves_to(peer, arrival.now_s, self._genuine(datagram)):
-                self.counters.dropped[DropReason.FOREIGN_PEER] += 1
-                return Reception()
+            if not self.senders.moves_to(peer, now_s, datagram):
+                return found
             self._heartbeat_sent = None  # a router learns our address from it
-            arrival.events.append(PeerChanged(peer))
-        frames: list[bytes] = []
-        unlogged: list[tuple[int, bytes]] = []
-        arrival.events.extend(self.telemetry.texts.expire(arrival.now_s))
-        for frame in self._splitter.split(datagram):
-            why = self._accept(frame, arrival)
-            self.counters.count(why)
-            if (why and why in _NOT_LOGGED) or frame.message_id == framing.SETUP_SIGNING:
-                continue  # the latter holds the key
-            ours = frame.component_id in self._components
-            if ours and frame.system_id == self.senders.own.system_id:
-                unlogged.append((len(frames), frame.raw))
-            else:
-                frames.append(frame.raw)
-        return Reception(
-            tuple(frames), tuple(arrival.events), tuple(arrival.replies), tuple(unlogged)
-        )
+            found.events.append(PeerChanged(peer))
+        found.events += self.telemetry.texts.expire(now_s)
+        for frame in self.splitter.split(datagram):
+            echo = frame.component_id == self.settings.component_id and frame.raw in self._sent
+            if echo or self.senders.refuse(frame, peer, self.link_time_s, found.events):
+                continue
+            self._log(frame, found)
+            if self.senders.judge(frame, peer, self.link_time_s, found.events):
+                self._interpret(frame, now_s, found)
+        return found
 
-    def _accept(self, frame: framing.Frame, arrival: _Arrival) -> DropReason | None:
-        """Add to `arrival` what a frame says; why it was dropped."""
-        if frame.component_id == self.settings.component_id and frame.raw in self._sent:
-            return DropReason.ECHO
-        forged = self._signing.refusal(frame) if self._signing else None
-        if forged:
-            if forged is DropReason.OLD_STAMP and self.vehicle is None:
-                self.senders.note_clock_behind(
-                    frame, arrival.peer, self.link_time_s, arrival.events
-                )
-            return forged
-        was_found = self.vehicle is not None
-        why = self.senders.judge(frame, arrival.peer, self.link_time_s, arrival.events)
-        if why or frame.message_id in COMMANDS:
-            return why
-        if self.vehicle is not None:
-            self.senders.heard_s = arrival.now_s
-            if not was_found:
-                self._begin()
+    def _log(self, frame: framing.Frame, found: Reception) -> None:
+        if frame.message_id == framing.SETUP_SIGNING:
+            return  # it holds the key
+        ours = frame.component_id in self._components
+        if ours and frame.system_id == self.senders.own.system_id:
+            found.unlogged.append((len(found.frames), frame.raw))
+        else:
+            found.frames.append(frame.raw)
+
+    def _interpret(self, frame: framing.Frame, now_s: float, found: Reception) -> None:
+        """Add to `found` what a frame of the vehicle says, or asks for before it is found."""
+        if self.dialect is not None:
+            self.senders.heard_s = now_s
+            if self.telemetry.dialect is None:
+                self._heartbeat_sent = None  # send it at once, with the vehicle's system id
+                self.telemetry.begin(self.dialect)
         if frame.message_id == framing.TIMESYNC:
-            self._synchronise(frame, arrival)
-            return None
-        return self.telemetry.interpret(frame, arrival.now_s, arrival.events)
+            self._synchronise(frame, now_s, found)
+        else:
+            self.telemetry.interpret(frame, now_s, found.events)
 
-    def _synchronise(self, frame: framing.Frame, arrival: _Arrival) -> None:
+    def _synchronise(self, frame: framing.Frame, now_s: float, found: Reception) -> None:
         """TIMESYNC: tc1 is 0 in a request."""
         tc1_ns, ts1_ns = frame.message.tc1, frame.message.ts1
         if tc1_ns == 0:
-            self.time.on_request(ts1_ns * 1e-9)
+            self._began_s = ts1_ns * 1e-9 if self._began_s is None else self._began_s
+            self._simulated_s = ts1_ns * 1e-9 - self._began_s
             # a reply at time 0 would look like a request
-            arrival.replies.append(Timesync(max(1, int(arrival.now_s * 1e9)), ts1_ns))
+            found.replies.append(Timesync(max(1, int(now_s * 1e9)), ts1_ns))
         elif self.vehicle is not None:
             wrapped_ns = round(self.time.wrapped_s(tc1_ns / 1e9) * 1e9)
-            arrival.events.append(TimesyncReply(ts1_ns, tc1_ns + wrapped_ns))
-
-    # --- the vehicle ---
-
-    def set_vehicle(self, vehicle: VehicleFound, peer: Hashable) -> None:
-        """Take this vehicle, which sends from `peer`, as ours."""
-        self.senders.set_vehicle(vehicle, peer)
-        self._begin()
-
-    def _begin(self) -> None:
-        assert self.dialect is not None
-        self._heartbeat_sent = None  # send it at once, with the vehicle's system id
-        self.telemetry.begin(self.dialect)
-
-    def overhear(self, datagram: bytes) -> list[int]:
-        """Systems with an autopilot that this datagram, from another address than the vehicle's,
-        shows, each once a second."""
-        return self.senders.overhear(self._genuine(datagram), self.link_time_s)
-
-    def _genuine(self, datagram: bytes) -> Iterator[framing.Frame]:
-        """The frames of a datagram that signing would accept. Counts nothing, uses up no stamp."""
-        for frame in framing.FrameSplitter(False, Counters()).split(datagram):
-            if not (self._signing and self._signing.refusal(frame, note=False)):
-                yield frame
+            found.events.append(TimesyncReply(ts1_ns, tc1_ns + wrapped_ns))
 
     # --- out ---
 
-    def poll(self, now_s: float) -> tuple[Outgoing, ...]:
+    def poll(self, now_s: float, status: tuple[int, int] = (ACTIVE, 0)) -> tuple[Outgoing, ...]:
         """Messages that are due at `now_s`; call it at least every 50 ms.
 
-        They are our heartbeat, at 1 Hz of host or vehicle time, whichever is faster, and where its
-        custom_mode has changed, so that another program learns at once who flies; and requests for
-        telemetry that is missing or too slow.
+        They are our heartbeat with `status`, system_status and custom_mode, at 1 Hz of host or
+        vehicle time, whichever is faster, and where custom_mode has changed, so that another
+        program learns at once who flies; and requests for telemetry that is missing or too slow.
         """
-        now_s = self.time.now_s(now_s)
+        now_s = self.elapsed_s(now_s)
         self.time.on_host(now_s)
         if not (self.dialect or self.senders.clock_behind or self.settings.sends_first):
             return ()
@@ -222,12 +174,12 @@ class Session:
         link_s = self.link_time_s
         if (
             self._heartbeat_sent is None
-            or self.status[1] != self._status_sent[1]
+            or status[1] != self._custom_mode_sent
             or max(now_s - self._heartbeat_sent[0], link_s - self._heartbeat_sent[1])
             >= _HEARTBEAT_PERIOD_S
         ):
-            self._heartbeat_sent, self._status_sent = (now_s, link_s), self.status
-            due.append(Heartbeat(TYPE_ONBOARD_CONTROLLER, *self.status))
+            self._heartbeat_sent, self._custom_mode_sent = (now_s, link_s), status[1]
+            due.append(Heartbeat(TYPE_ONBOARD_CONTROLLER, *status))
         requests = self.telemetry.due()
         return (*due, *(CommandLong.message_interval(w.message_id, w.rate_hz) for w in requests))
 
@@ -237,10 +189,7 @@ class Session:
         Raises ValueError if a value is not finite or out of range, or if the message is for the
         vehicle and none was found.
         """
-        vehicle, dialect, target = self.vehicle, self.dialect, None
-        if vehicle and dialect:
-            target = Target(vehicle.system_id, vehicle.component_id, dialect.divides_by_tilt)
-        message = outgoing.encode(target)
+        message = outgoing.encode(self.senders.target)
         sender = self._sending
         if isinstance(outgoing, Record):
             sender = self._recording
@@ -255,8 +204,9 @@ class Session:
     # --- time and rates ---
 
     def elapsed_s(self, host_s: float) -> float:
-        """Host time; in lockstep the simulated time, which goes on while telemetry is missing."""
-        return self.time.lockstep_s if self.settings.lockstep else host_s
+        """Host time; in lockstep, where it must decide nothing, simulated time since the first of
+        the TIMESYNC requests whose replies the vehicle waits for."""
+        return self._simulated_s if self.settings.lockstep else host_s
 
     def clock_s(self, host_s: float) -> float:
         """Host time; in lockstep, where host time must decide nothing, the link's own seconds."""

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from enum import Enum
 from hashlib import sha256
 from hmac import compare_digest
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from offboard.mavlink.counters import DropReason
 from offboard.mavlink.framing import Frame
 
 UNITS_PER_S = 100_000
@@ -27,6 +27,15 @@ _HASH_BYTES = 6
 
 # Offset of our clock, newest stamp, and link id, system, component and newest stamp of each stream
 State = tuple[int, int, list[tuple[int, int, int, int]]]
+
+
+class Forgery(Enum):
+    """Why signing refuses a frame, for a sentence."""
+
+    UNSIGNED = "no signature"
+    BAD_SIGNATURE = "a signature of another key"
+    REPLAYED = "a signature whose time stamp is not newer than the last one of its sender"
+    OLD_STAMP = "a signature whose time stamp is more than a minute behind"
 
 
 def stamp_of_unix(unix_us: int) -> int:
@@ -68,21 +77,21 @@ class Signing:
             self._reserved = stamp + RESERVED
             self._reserve(stamp + RESERVED)
 
-    def refusal(self, frame: Frame, *, note: bool = True) -> DropReason | None:
+    def refusal(self, frame: Frame, *, note: bool = True) -> Forgery | None:
         """Why a frame must not be used; notes the time stamp of one that may, if `note`."""
         raw = frame.raw
         if not frame.signed:
-            return None if frame.message_id in ALLOWED_UNSIGNED else DropReason.UNSIGNED
+            return None if frame.message_id in ALLOWED_UNSIGNED else Forgery.UNSIGNED
         digest = sha256(self.key + raw[:-_HASH_BYTES]).digest()
         if not compare_digest(digest[:_HASH_BYTES], raw[-_HASH_BYTES:]):
-            return DropReason.BAD_SIGNATURE
+            return Forgery.BAD_SIGNATURE
         stream = raw[-13], frame.system_id, frame.component_id
         stamp = int.from_bytes(raw[-12:-6], "little")
         before = self._signing.stream_timestamps.get(stream)
         if before is None and stamp < self._now() - RESERVED:
-            return DropReason.OLD_STAMP
+            return Forgery.OLD_STAMP
         if before is not None and stamp <= before:
-            return DropReason.REPLAYED
+            return Forgery.REPLAYED
         if note:
             self._signing.stream_timestamps[stream] = stamp
             self._signing.timestamp = max(self._signing.timestamp, stamp)

@@ -13,8 +13,7 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
-from offboard.mavlink.counters import DropReason
-from offboard.mavlink.decode import decode
+from offboard.mavlink.decode import DECODERS
 from offboard.mavlink.dialects.base import Dialect, WantedMessage
 from offboard.mavlink.events import (
     Attitude,
@@ -46,58 +45,55 @@ _ARRIVALS_MAX = 4096  # limits the memory used when a link is flooded
 
 class Telemetry:
     """Telemetry of one vehicle. `capacity_bytes_ps` of the link limits the rates that are
-    requested; None: unknown. `time.seconds` are the session's."""
+    requested; None: unknown. `time.seconds` are the session's. `dialect` is None before `begin`."""
 
-    def __init__(self, capacity_bytes_ps: float | None, *, lockstep: bool) -> None:
-        self.time = VehicleTime(lockstep)
+    def __init__(self, capacity_bytes_ps: float | None) -> None:
+        self.time = VehicleTime()
         self.texts = TextAssembler()
-        self._dialect: Dialect | None = None
+        self.dialect: Dialect | None = None
         self._streams: dict[int, _Stream] = {}  # those that are wanted, by message id
         self._capacity_bytes_ps = capacity_bytes_ps
         self._frames = 0  # sent by the vehicle, as the sequence numbers show; modulo 256 the newest
         self._heard_s = -math.inf  # when the newest frame arrived
         self._mode_report = (0, -math.inf)  # number of the newest, and when it arrived
 
-    def interpret(self, frame: Frame, now_s: float, events: list[Event]) -> DropReason | None:
-        """Add to `events` what a frame of the vehicle says; why it is dropped. `now_s`: its
-        arrival."""
+    def interpret(self, frame: Frame, now_s: float, events: list[Event]) -> None:
+        """Add to `events` what a frame of the vehicle says that arrived at `now_s`."""
         number = self._number(frame, now_s)
         if frame.message_id == STATUSTEXT:
             events += self.texts.add(frame.payload, now_s)
-            return None
-        assert self._dialect is not None
-        event = decode(frame, self._dialect)
-        if event is None:  # nobody reads it
+            return
+        decoder = DECODERS.get(frame.message_id)
+        if decoder is None:  # nobody reads it
             self._count(frame.message_id)
-            return None
-        if isinstance(event, DropReason):
-            return event
+            return
+        assert self.dialect is not None
+        event = decoder(frame.message, self.dialect)
         if isinstance(event, (LocalPosition, Attitude)):
-            return self._on_stamped(event, frame.message_id, now_s, events)
-        if isinstance(event, (Heartbeat, ModeReport)) and self._overtaken(number, now_s):
-            return DropReason.STALE
-        self._count(frame.message_id)
-        events.append(event)
-        return None
+            self._on_stamped(event, frame.message_id, now_s, events)
+        elif isinstance(event, (Heartbeat, ModeReport)) and self._overtaken(number, now_s):
+            return
+        elif event is not None:
+            self._count(frame.message_id)
+            events.append(event)
 
     def _on_stamped(
         self, event: LocalPosition | Attitude, message_id: int, now_s: float, events: list[Event]
-    ) -> DropReason | None:
+    ) -> None:
         wrapped_s = self.time.wrapped_s(event.time_s)
         if wrapped_s:
             event = replace(event, time_s=event.time_s + wrapped_s)
         age = self.time.check(message_id, event.time_s)
         if age is Age.STALE:
-            return DropReason.STALE
+            return
         # after the check of the stamp: duplicates must not raise the measured rate
         self._count(message_id)
         if age is Age.REBOOTED:
             self._mode_report = (0, -math.inf)  # it counts anew
             self._request()  # a rebooted vehicle has its default rates
-            events.append(Rebooted(event.time_s))
+            events.append(Rebooted())
         self.time.on_telemetry(event.time_s, now_s)
         events.append(event)
-        return None
 
     def _number(self, frame: Frame, now_s: float) -> int:
         """The number of the frame in the order of sending, by its 8-bit sequence number."""
@@ -119,7 +115,7 @@ class Telemetry:
 
     def begin(self, dialect: Dialect) -> None:
         """The vehicle has this autopilot: request all messages that are wanted of it."""
-        self._dialect = dialect
+        self.dialect = dialect
         self._request()
 
     def _request(self) -> None:
@@ -127,7 +123,7 @@ class Telemetry:
         self._streams = {each.message_id: _Stream(each, self.time.seconds) for each in wanted}
 
     def _fitted(self, bytes_ps: float | None) -> tuple[WantedMessage, ...]:
-        wanted = self._dialect.wanted if self._dialect else ()
+        wanted = self.dialect.wanted if self.dialect else ()
         return wanted if bytes_ps is None else fitted(wanted, bytes_ps)
 
     def thin(self) -> bool:

@@ -37,18 +37,9 @@ class VehicleTime:
 
     `newest_s` is the newest stamp of any message. `seconds` are monotonic and follow vehicle time,
     or host time while telemetry is missing.
-
-    With `lockstep` the vehicle waits for our replies to its TIMESYNC requests, and nothing that is
-    sent may depend on host time: vehicle time replaces it, and while telemetry is missing, the
-    requests count on. `lockstep_s` is simulated time since the first request.
     """
 
-    def __init__(self, lockstep: bool = False) -> None:
-        self.lockstep_s = 0.0
-        self._lockstep = lockstep
-        self._began_s: float | None = None  # stamp of the first request
-        self._telemetry_s = 0.0  # `lockstep_s` when the newest telemetry arrived
-        self._arrival_s = 0.0  # vehicle time when the newest datagram arrived
+    def __init__(self) -> None:
         self.newest_s = 0.0
         self.seconds = 0.0
         self._last_s: dict[int, float] = {}
@@ -110,9 +101,7 @@ class VehicleTime:
     def on_telemetry(self, time_s: float, now_s: float) -> None:
         """Telemetry with the valid stamp `time_s` arrived at host time `now_s`. A stamp older than
         the newest adds nothing: messages of several streams may arrive out of order."""
-        # in lockstep it is the time now, which a jump of the clock has moved
-        self._received_s = self.newest_s if self._lockstep else now_s
-        self._telemetry_s = self.lockstep_s
+        self._received_s = now_s
         step_s = 0.0 if self._counted_s is None else time_s - self._counted_s
         if self._counted_s is None or step_s > 0.0 or step_s < -_REBOOT_S:
             self.seconds += max(min(step_s, SILENCE_S) - self._bridged_s, 0.0)
@@ -128,20 +117,3 @@ class VehicleTime:
         if self._counted_s is None or silent_s > SILENCE_S:
             self.seconds += max(silent_s - self._bridged_s, 0.0)
             self._bridged_s = max(silent_s, self._bridged_s)
-
-    # --- in lockstep ---
-
-    def on_datagram(self) -> None:
-        self._arrival_s = self.newest_s
-
-    def on_request(self, stamp_s: float) -> None:
-        """A TIMESYNC request with this stamp."""
-        self._began_s = stamp_s if self._began_s is None else self._began_s
-        self.lockstep_s = stamp_s - self._began_s
-
-    def now_s(self, host_s: float) -> float:
-        """Host time, or what replaces it."""
-        if not self._lockstep:
-            return host_s
-        silent_s = self.lockstep_s - self._telemetry_s
-        return self._arrival_s + (silent_s if silent_s > SILENCE_S else 0.0)

@@ -30,7 +30,7 @@ from offboard.flight.record import (
     TurnInput,
 )
 from offboard.link.interface import Chunk
-from offboard.mavlink.framing import Frame
+from offboard.mavlink.framing import Frame, message_id_of, payload_of
 from offboard.mavlink.session import COMPONENT_ID, RECORD_COMPONENT_ID, Session, SessionSettings
 from offboard.mavlink.signing import Signing
 from offboard.run.configuration import flown
@@ -222,8 +222,8 @@ class Replay:
         return self._read_s
 
     def _sent(self, frame: bytes) -> Sent:
-        message_id = int.from_bytes(frame[7:10], "little")
-        return Sent(self.companion.time_s, message_id, frame[10 : 10 + frame[1]], self.count)
+        kind, payload = message_id_of(frame), payload_of(frame)
+        return Sent(self.companion.time_s, kind, payload, self.count)
 
     def _leave(self) -> None:
         self.replayed += self._leaving

@@ -8,14 +8,14 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any, Protocol
 
-from offboard.documents.errors import located
+from offboard.documents.errors import Unavailable, located
 from offboard.flight.flight import Flight, Outcome
 from offboard.flight.phases import BEFORE_FLIGHT, WAITING, ExitCode
 from offboard.link import clock
 from offboard.link.interface import Chunk, Link
 from offboard.link.stop import StopRequests
 from offboard.run.sitl import Ending, InMemorySimulator, SimulatorProcess
-from offboard.supervisor.supervisor import Supervisor, SupervisorError
+from offboard.supervisor.supervisor import Supervisor
 
 POLL_S = 0.02
 SEND_WITHIN_S = 0.2  # from the beginning of a turn: what it decided does not leave later
@@ -173,7 +173,7 @@ class Loop:
         waits = current.phase in WAITING and now_s - self._restarted_s >= RESTART_S
         if supervisor.lost and waits:
             self._restarted_s = now_s
-            with suppress(SupervisorError):
+            with suppress(Unavailable):
                 supervisor.restart()
 
     def _taken_over(self) -> bool:

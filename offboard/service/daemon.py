@@ -17,14 +17,14 @@ from jinja2 import Environment, StrictUndefined
 from sdnotify import SystemdNotifier
 
 from offboard import compiled
-from offboard.documents.errors import typed
+from offboard.documents.errors import Unavailable, typed
 from offboard.flight.flight import Outcome
 from offboard.flight.phases import WAITING, ExitCode, ServiceOptions
 from offboard.link import clock
 from offboard.link.after_flight import OneByOne
 from offboard.link.background import BackgroundWriter
 from offboard.link.connection import open_link
-from offboard.link.interface import Link, LinkError
+from offboard.link.interface import Link
 from offboard.link.lock import connection_lock, directory_lock
 from offboard.link.stop import StopRequests
 from offboard.live.process import LiveProcess
@@ -65,8 +65,7 @@ def run(
     `load` resolves the configuration, which is read again between flights; `directory` holds those
     of the flights. `metrics`: HOST:PORT; `report`: write one after each flight. `tell` is called
     with sentences about the preparation, `show` often, to show what the flights announce; neither
-    may wait. Raises LockError, NotServed, DocumentError, SupervisorError or LogError, all before
-    anything is sent.
+    may wait. Raises UserError before anything is sent.
     """
     with ExitStack() as stack:
         stack.enter_context(connection_lock(vehicle.address))
@@ -131,15 +130,13 @@ def opened(
     connection: str, stops: StopRequests, tell: Callable[[str], None], manager: Manager
 ) -> Link | None:
     """The link, when it can be opened: a port may be in use, a device not plugged in yet. None if a
-    stop was requested before. Raises LinkError for an address that nothing can be."""
+    stop was requested before. Raises UserError for an address that nothing can be."""
     told = ""
     pause = threading.Event()
     while not stops.requested:
         try:
             return open_link(connection)
-        except LinkError as error:
-            if error.is_usage:
-                raise
+        except Unavailable as error:
             if str(error) != told:
                 told = str(error)
                 tell(f"{error}; trying again")

@@ -115,8 +115,7 @@ class TakeOver:
         )
         signing = watch.key and Signing.resumed(watch.key, clock.monotonic_s, beat["signing"])
         self._session = Session(SessionSettings(stream=beat["stream"]), signing or None)
-        self._session.set_vehicle(known.vehicle, peer)
-        self._session.status = ACTIVE, LANDING
+        self._session.senders.set_vehicle(known.vehicle, peer)
         assert self._session.dialect is not None
         self._dialect = self._session.dialect
         self._recovery = Recovery(self._dialect, known, clock.monotonic_s(), beat["sent_s"])
@@ -146,7 +145,7 @@ class TakeOver:
             for event in reception.events:
                 self._recovery.see(event, at_s)
             self._send(*reception.replies)
-        due = self._session.poll(clock.monotonic_s())
+        due = self._session.poll(clock.monotonic_s(), (ACTIVE, LANDING))
         self._send(*(message for message in due if isinstance(message, Heartbeat)))
         return bool(chunks)
 

@@ -17,7 +17,7 @@ from collections.abc import Hashable
 from contextlib import suppress
 from dataclasses import asdict
 
-from offboard.documents.errors import UserError
+from offboard.documents.errors import Unavailable
 from offboard.link import clock
 from offboard.link.interface import Link
 from offboard.mavlink.signing import Signing
@@ -28,12 +28,6 @@ END_S = 1.0
 ANSWER_S = 1.0  # a beat that was not answered for so long: it is stopped
 READY = "ready"
 NOT_STARTED = "the supervisor, which lands the vehicle if this process dies, does not start"
-
-
-class SupervisorError(UserError):
-    """The supervisor cannot be started: one sentence for the user."""
-
-    is_usage = False
 
 
 class Supervisor:
@@ -63,7 +57,7 @@ class Supervisor:
                 )
             except OSError as error:  # for example no memory, or too many processes
                 self._channel.close()
-                raise SupervisorError(f"{NOT_STARTED}: {error.strerror}") from None
+                raise Unavailable(f"{NOT_STARTED}: {error.strerror}") from None
         if self._signing:  # not in arguments or environment, which others can read
             self._channel.send(json.dumps({"key": self._signing.key.hex()}).encode() + b"\n")
         return self
@@ -85,7 +79,7 @@ class Supervisor:
         return bool(self._lines) and not self.lost and waited_s < ANSWER_S
 
     def restart(self) -> None:
-        """Start another process in place of one that has ended. Raises SupervisorError."""
+        """Start another process in place of one that has ended. Raises Unavailable."""
         self._channel.close()
         self.process.poll()
         self._received, self._lines = b"", []
@@ -95,11 +89,11 @@ class Supervisor:
         self.lost = False
 
     def await_ready(self) -> None:
-        """Wait until the process has loaded. Raises SupervisorError."""
+        """Wait until the process has loaded. Raises Unavailable."""
         while not self._lines:
             select.select([self._channel], [], [], START_S)
             if not self._receive():
-                raise SupervisorError(NOT_STARTED)
+                raise Unavailable(NOT_STARTED)
 
     def beat(self, vehicle: Supervised, peer: Hashable, link: Link, log_descriptor: int) -> None:
         """Show that the controller lives. The vehicle sends from `peer`. Never waits."""

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
+from offboard.documents.errors import Unavailable
 from offboard.flight.flight import Outcome
 from offboard.flight.phases import Limits, Phase
 from offboard.link import clock
@@ -22,7 +23,6 @@ from offboard.link.interface import LinkReport
 from offboard.link.log import FlightLog
 from offboard.link.stop import StopRequests
 from offboard.run.loop import ANSWERS, UNANSWERED, UNGUARDED, Loop
-from offboard.supervisor.supervisor import SupervisorError
 
 FLOWN = Outcome(0, "flown and landed")
 
@@ -118,7 +118,7 @@ class Watcher(Silent):
         self.restarts += 1
         self.lost = self.restarts < 2
         if self.lost:
-            raise SupervisorError("no memory")
+            raise Unavailable("no memory")
 
     def has_taken_over(self) -> bool:
         return self.taken

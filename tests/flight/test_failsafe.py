@@ -179,7 +179,7 @@ def accuracy(flight: FlightState, accuracies_m: tuple[float | None, float | None
 
 
 def no_fix(flight: FlightState, for_s: float) -> None:
-    hear(flight, GpsFix(1.0))
+    hear(flight, GpsFix())
     flight.positioning.begin(flight.vehicle, {"GPS_RAW_INT": 5.0}, "")
     flight.vehicle.heard_s[GpsFix] = NOW_S - for_s
 

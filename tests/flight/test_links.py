@@ -23,12 +23,12 @@ import pytest
 from processes import free_port
 from pymavlink.dialects.v20 import common as mavlink
 
+from offboard.documents.errors import Unavailable, UserError
 from offboard.link import clock
 from offboard.link.connection import open_link
-from offboard.link.interface import Chunk, Link, LinkError, LinkReport, LinkUnavailable
+from offboard.link.interface import Chunk, Link, LinkReport
 from offboard.link.stream import BROKEN, RENEWED
 from offboard.link.udp import LOOK_EVERY_S, UdpLink
-from offboard.mavlink.counters import Counters
 from offboard.mavlink.framing import FrameSplitter
 from offboard.mavlink.senders import PEER_SILENT_S
 
@@ -290,7 +290,7 @@ def test_a_full_stream_does_not_block_and_sends_the_newest_setpoint(
         link.send(each, None)
     link.send(heartbeat, None)
     link.send(setpoints[-1], None)
-    splitter, frames = FrameSplitter(True, Counters()), list[Any]()
+    splitter, frames = FrameSplitter(stream=True), list[Any]()
     while not frames or frames[-1].raw != setpoints[-1]:
         link.receive()
         assert select.select([theirs], [], [], 10.0)[0], "silent"
@@ -367,7 +367,7 @@ def test_a_serial_device_that_is_unplugged_and_back(tmp_path: Path, ends: ExitSt
     link = opened(f"serial:{device}:57600", ends)
     os.write(other_end, b"first")
     turns(link, lambda data: data == b"first")
-    with pytest.raises(LinkUnavailable, match="another program has it open"):
+    with pytest.raises(Unavailable, match="another program has it open"):
         open_link(f"serial:{device}:57600")
     unplug()
     device.unlink()
@@ -468,5 +468,5 @@ def test_ipv6_addresses(ends: ExitStack) -> None:
     connection.settimeout(LONG_S)
     stream.send(b"answer", None)
     assert connection.recv(100) == b"answer"
-    with pytest.raises(LinkError, match=r"stands in brackets, as in udpin:\[::1\]:14540"):
+    with pytest.raises(UserError, match=r"stands in brackets, as in udpin:\[::1\]:14540"):
         open_link("udpin:::1:14540")

@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
-from types import SimpleNamespace
 from typing import Any
 from urllib.parse import urlsplit
 from urllib.request import urlopen
@@ -281,6 +280,5 @@ def test_a_status_leaves_out_what_is_not_known() -> None:
 
 def test_the_mode_of_a_pilot_is_shown_with_who_has_authority() -> None:
     state: Any = uneventful(Phase.TRACK)
-    state.session.counters = SimpleNamespace(forged=0)
     heartbeat(state, armed=True, mode="AUTO.LOITER")
     assert (Snapshot(state).authority, Snapshot(state).mode) == ("lost", "AUTO.LOITER")

@@ -335,7 +335,7 @@ def test_a_vehicle_that_reboots_as_it_arms_counts_as_unheard_from_then_on() -> N
     flight = uneventful(Phase.ARM)
     flight.identification = None
     flight.session.link_time_s, flight.observer.reset = NOW_S, lambda: None  # type: ignore[misc]
-    telemetry.update(flight, Rebooted(0.0), NOW_S, turned_s=NOW_S)
+    telemetry.update(flight, Rebooted(), NOW_S, turned_s=NOW_S)
     flight.vehicle.now_s += 4.0
     assert flight.unreached_s == pytest.approx(4.0)
 

@@ -225,7 +225,7 @@ def recovered(
     for name, value in {"COM_OBL_RC_ACT": fallback, **QUICK_LANDING}.items():
         autopilot.parameters.set(name, value)
     session, result = Session(SessionSettings()), Recovered()
-    session.set_vehicle(VEHICLE, "vehicle")
+    session.senders.set_vehicle(VEHICLE, "vehicle")
     instance.feed(session.encode(CommandLong.message_interval(436, 50.0)))  # CURRENT_MODE
     level = session.encode(AttitudeTarget(0.0, Command(9.81, (0.0, 0.0, 1.0), 0.0), 0.489, 9.81))
     loss = PX4.setpoint_loss({"COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": fallback})

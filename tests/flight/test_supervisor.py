@@ -22,6 +22,7 @@ from processes import RECORDING, free_port
 from pymavlink.dialects.v20 import common as mavlink
 
 from offboard.analysis import tlog
+from offboard.documents.errors import Unavailable
 from offboard.link import clock
 from offboard.link.connection import open_link
 from offboard.link.log import FlightLog
@@ -32,7 +33,7 @@ from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.signing import Signing
 from offboard.supervisor.recovery import Supervised
-from offboard.supervisor.supervisor import Supervisor, SupervisorError
+from offboard.supervisor.supervisor import Supervisor
 
 LONG_S = 20.0
 OFFBOARD, POSCTL, LOITER, LANDING = (
@@ -157,7 +158,7 @@ def test_it_asks_the_vehicle_that_connected_last(rig: Rig) -> None:
 @over("signed")
 def test_it_signs_with_stamps_that_follow_ours(rig: Rig) -> None:
     ours = Session(SessionSettings(), rig.signing)
-    ours.set_vehicle(VEHICLE, "tcp")
+    ours.senders.set_vehicle(VEHICLE, "tcp")
     for _ in range(3):
         rig.beat(OURS)
         newest = ours.encode(Heartbeat(6))
@@ -319,7 +320,7 @@ def test_a_supervisor_that_cannot_be_started_is_said(monkeypatch: pytest.MonkeyP
     supervisor = Supervisor()
     before = os.listdir("/proc/self/fd")
     with (
-        pytest.raises(SupervisorError, match="does not start: No such file") as refused,
+        pytest.raises(Unavailable, match="does not start: No such file") as refused,
         supervisor,
     ):
         pass

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from types import SimpleNamespace
 from typing import Any
 
@@ -56,8 +57,9 @@ def uneventful(phase: Phase = Phase.TRACK, service: ServiceOptions | None = None
     """In `phase`, which has just begun. A vehicle that stands on the ground, so that it can lift
     off, land or be taken over."""
     session: Any = SimpleNamespace(
-        senders=SimpleNamespace(candidates=lambda now_s: "", why_none=lambda counted: ""),
-        counters=None,
+        senders=SimpleNamespace(
+            candidates=lambda now_s: "", why_none=lambda: "", forged=Counter[Any]()
+        ),
         link_time_s=NOW_S,
         time=SimpleNamespace(mixed=False),
         vehicle=None,

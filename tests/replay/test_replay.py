@@ -309,7 +309,7 @@ def recorded(turns: int) -> list[bytes]:
         now_s = 100.0 + 0.01 * number + 1e-6 * (number * 7919 % 1000)
         recorder.begin(now_s, 0)
         frame = (number * 104729 % 2**24).to_bytes(3, "big")
-        recorder.chunk(Chunk(b"", "tcp", now_s), Reception((), unlogged=((0, frame),)))
+        recorder.chunk(Chunk(b"", "tcp", now_s), Reception([], unlogged=[(0, frame)]))
         recorder.end()
     return [piece.data for piece in recorder.pieces(all_of_it=True)]
 
@@ -344,7 +344,7 @@ def test_in_real_time_each_input_is_recorded() -> None:
         assert recorder.begin(turn_s + 2e-7, others) == turn_s
         for peer in (("::1", 14580, 0, 0), "serial"):
             chunk = Chunk(b"", peer, turn_s - 0.004_7)
-            recorder.chunk(chunk, Reception((b"a", b"b"), unlogged=((1, b"ours"),)))
+            recorder.chunk(chunk, Reception([b"a", b"b"], unlogged=[(1, b"ours")]))
         assert read() == clock_s[0]
         recorder.end()
         pieces += recorder.pieces(all_of_it=False)
@@ -368,7 +368,7 @@ def test_in_lockstep_no_host_time_is_recorded() -> None:
             now_s = offset_s * number
             recorder.begin(now_s, 0)
             if number % 3:  # the machine was busy: a turn in which nothing had arrived
-                recorder.chunk(Chunk(b"", ("127.0.0.1", port), now_s), Reception((b"frame",)))
+                recorder.chunk(Chunk(b"", ("127.0.0.1", port), now_s), Reception([b"frame"]))
             read()
             recorder.end()
         return [piece.data for piece in recorder.pieces(all_of_it=True)]

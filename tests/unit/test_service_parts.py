@@ -18,14 +18,14 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.analysis import tlog
 from offboard.cli.daemon import disk_is_full
+from offboard.documents.errors import Unavailable, UserError
 from offboard.flight.authority import PilotSwitch
 from offboard.flight.flight_plan import CLEAR_M, FlightPlan
 from offboard.flight.record import joined_configuration
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from offboard.link import clock
-from offboard.link.interface import LinkError
-from offboard.link.lock import Locked, connection_lock, directory_lock
+from offboard.link.lock import connection_lock, directory_lock
 from offboard.link.log import LogError
 from offboard.link.stop import StopRequests
 from offboard.mavlink.events import VehicleFound
@@ -44,7 +44,7 @@ REST = (0.0, 0.0, 0.0)  # velocity
 
 def session() -> Session:
     made = Session(SessionSettings())
-    made.set_vehicle(VehicleFound(1, 1, "px4"), "vehicle")
+    made.senders.set_vehicle(VehicleFound(1, 1, "px4"), "vehicle")
     return made
 
 
@@ -195,14 +195,14 @@ def test_the_lock_names_its_holder_and_dies_with_it(tmp_path: Path) -> None:
         pass
     for _ in range(3):
         again = connection_lock("udpin:127.0.0.1:1")
-        with pytest.raises(Locked, match=f"process {holder.pid}$"), again:
+        with pytest.raises(Unavailable, match=f"process {holder.pid}$"), again:
             pass
     holder.kill()
     holder.wait()
     with connection_lock("udpin:127.0.0.1:1"):
         pass
     ours = f"has the directory {tmp_path}/new.*: process {os.getpid()}$"
-    with directory_lock(tmp_path / "new"), pytest.raises(Locked, match=ours):
+    with directory_lock(tmp_path / "new"), pytest.raises(Unavailable, match=ours):
         directory_lock(tmp_path / "new").__enter__()
 
 
@@ -254,7 +254,7 @@ def test_the_link_is_opened_when_it_can_be(monkeypatch: pytest.MonkeyPatch) -> N
             "uses the port; trying again"
         ]
         for wrong in ("udpin:127.0.0.1", f"udpin:{'x' * 300}:14540"):
-            with pytest.raises(LinkError):
+            with pytest.raises(UserError):
                 daemon.opened(wrong, stops, told.append, Watching())
 
 

@@ -9,10 +9,9 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from pymavlink.dialects.v20 import development
-from vehicle_frames import ARDUPILOT, PEER, PX4, Sender, dropped, framed, pinned
+from vehicle_frames import ARDUPILOT, PEER, PX4, Sender, framed, pinned
 
 from offboard.mavlink import events
-from offboard.mavlink.counters import DropReason
 from offboard.mavlink.session import Session
 
 NAN, INF = math.nan, math.inf
@@ -46,8 +45,7 @@ def test_implausible_contents_are_dropped_but_logged() -> None:
         frames.append(vehicle.frame(parameter))
     for frame in frames:
         reception = session.receive(frame, PEER, 0.0)
-        assert (reception.events, reception.frames) == ((), (frame,))
-    assert dropped(session, DropReason.IMPLAUSIBLE) == len(frames)
+        assert (reception.events, reception.frames) == ([], [frame])
 
 
 FIX = {"time_usec": 0, "lat": 473977435, "lon": 85455941, "alt": 489277, "eph": 70, "epv": 110,
@@ -76,12 +74,8 @@ def version(number: int) -> Any:
             development.MAVLink_current_mode_message(0, 6 << 16, 3 << 16),
             events.ModeReport("OFFBOARD"),
         ),
-        (
-            mavlink.MAVLink_gps_raw_int_message(**FIX, fix_type=3, h_acc=900),
-            events.GpsFix(pytest.approx(0.9)),
-        ),
-        (mavlink.MAVLink_gps_raw_int_message(**FIX, fix_type=3), events.GpsFix(None)),
-        (mavlink.MAVLink_gps_raw_int_message(**FIX, fix_type=2, h_acc=900), events.NoFix(2)),
+        (mavlink.MAVLink_gps_raw_int_message(**FIX, fix_type=3), events.GpsFix()),
+        (mavlink.MAVLink_gps_raw_int_message(**FIX, fix_type=2), events.NoFix(2)),
         (status(RADIO, PREARM | RADIO, 87), events.SystemHealth(True, 0.87, True)),
         (status(RADIO, PREARM, 100), events.SystemHealth(True, 1.0, False)),
         (status(0, ~PREARM & 0xFFFFFFFF, -1), events.SystemHealth(False, None, False)),
@@ -118,7 +112,7 @@ def test_parameters_that_nothing_of_ours_reads_are_no_events() -> None:
     for name, events_of_it in ((b"", 0), (b"CAL_ACC0_ID", 0), (b"COM_OF_LOSS_T", 1)):
         frame = vehicle.frame(mavlink.MAVLink_param_value_message(name, 1.0, 9, 1, 0))
         reception = session.receive(frame, PEER, 1.0)
-        assert (len(reception.events), reception.frames) == (events_of_it, (frame,))
+        assert (len(reception.events), reception.frames) == (events_of_it, [frame])
 
 
 def test_estimator_reports() -> None:
@@ -173,7 +167,7 @@ def test_a_jump_back_is_a_reboot(session: Session, vehicle: Sender) -> None:
     assert times(session, vehicle.position(500), vehicle.attitude(510)) == []
     assert session.poll(0.0) == ()
     reboot, position = session.receive(vehicle.position(650), PEER, 0.0).events
-    assert reboot == events.Rebooted(0.65)
+    assert reboot == events.Rebooted()
     assert isinstance(position, events.LocalPosition)
     assert len(session.poll(0.0)) > 4
     assert times(session, vehicle.attitude(660), vehicle.position(660)) == [0.66, 0.66]
@@ -185,7 +179,7 @@ def test_stamps_that_are_late_far_ahead_or_stuck_are_dropped(
     """Per message; however many come between those of the present. Several far ahead that follow
     each other are a clock that jumped."""
     late = vehicle.position(50000) + vehicle.attitude(50001) + vehicle.position(50010)
-    assert session.receive(late, PEER, 0.0).events == ()
+    assert session.receive(late, PEER, 0.0).events == []
     for later_ms in range(10, 500, 10):
         frames = [
             vehicle.position(60000 + later_ms),
@@ -194,7 +188,6 @@ def test_stamps_that_are_late_far_ahead_or_stuck_are_dropped(
             vehicle.attitude(60000),
         ]
         assert times(session, *frames) == [60.0 + later_ms / 1e3]
-    assert dropped(session, DropReason.STALE) == 3 + 3 * 49
     assert times(session, vehicle.attitude(60480), vehicle.position(60490)) == [60.48]
     jumped = [vehicle.position(2000000 + later_ms) for later_ms in range(0, 200, 60)]
     assert times(session, *jumped) == [2000.12, 2000.18]

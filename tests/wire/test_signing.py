@@ -15,10 +15,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from vehicle_frames import PEER, Sender
 
 from offboard.mavlink import events
-from offboard.mavlink.counters import FORGED, DropReason
 from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings
-from offboard.mavlink.signing import RESERVED, UNITS_PER_S, Signing, stamp_of_unix
+from offboard.mavlink.signing import RESERVED, UNITS_PER_S, Forgery, Signing, stamp_of_unix
 from simulator import config
 from simulator.autopilot.firmware import Firmware
 from simulator.firmware.ardupilot import ARDUPILOT
@@ -81,10 +80,10 @@ def test_none_of_many_forged_and_replayed_frames_is_accepted() -> None:
     )
     for _ in range(COUNT):
         reception = ours.receive(chance.choice(forgeries)(), PEER, 0.2)
-        assert (reception.events, reception.frames, reception.replies) == ((), (), ())
+        assert (reception.events, reception.frames, reception.replies) == ([], [], [])
     # a part of the altered frames is the original, by chance: then it is a replay
-    assert ours.counters.forged == COUNT
-    assert all(ours.counters.dropped[each] for each in FORGED if each is not DropReason.OLD_STAMP)
+    assert ours.senders.forged.total() == COUNT
+    assert {*Forgery} - {*ours.senders.forged} == {Forgery.OLD_STAMP}
     assert ours.receive(vehicle.position(3000), PEER, 0.3).events  # and the vehicle still is
 
 
@@ -93,13 +92,13 @@ def test_only_radio_status_is_accepted_unsigned() -> None:
     ours, _ = paired()
     radio = mavlink.MAVLink_radio_status_message(1, 1, 100, 0, 0, 0, 0)
     ours.receive(Sender(ord("3"), ord("D")).frame(radio), PEER, 0.0)
-    assert ours.counters.forged == 0
+    assert ours.senders.forged.total() == 0
     position = mavlink.MAVLink_local_position_ned_message(1000, *(0,) * 6)
     setpoint = mavlink.MAVLink_set_attitude_target_message(0, 1, 1, 7, [1, 0, 0, 0], 0, 0, 0, 0.5)
     version_1 = signer(b"").frame(position, mavlink1=True)
     for frame in (signer(b"").frame(position), version_1, signer(b"", 191).frame(setpoint)):
-        assert ours.receive(frame, PEER, 0.0).events == ()
-    assert ours.counters.dropped[DropReason.UNSIGNED] == 3
+        assert ours.receive(frame, PEER, 0.0).events == []
+    assert ours.senders.forged[Forgery.UNSIGNED] == 3
     (seen,) = ours.receive(signer(component=191).frame(setpoint), PEER, 0.0).events
     assert isinstance(seen, events.OtherSender)
 
@@ -110,11 +109,11 @@ def test_why_no_vehicle_was_found() -> None:
         (session(), b"", "arrive unsigned: set the key on the vehicle, or omit --signing-key"),
         (Session(SessionSettings()), KEY, "give its key with --signing-key"),
     ):
-        assert ours.receive(signer(key).heartbeat(), PEER, 0.0).events == ()
-        assert sentence in ours.senders.why_none(ours.counters)
+        assert ours.receive(signer(key).heartbeat(), PEER, 0.0).events == []
+        assert sentence in ours.senders.why_none()
     ours = Session(SessionSettings())
-    assert ours.receive(Sender(1, 7).heartbeat(12), PEER, 0.0).events == ()
-    assert "an autopilot is heard as component 7" in ours.senders.why_none(ours.counters)
+    assert ours.receive(Sender(1, 7).heartbeat(12), PEER, 0.0).events == []
+    assert "an autopilot is heard as component 7" in ours.senders.why_none()
 
 
 def test_a_vehicle_whose_clock_is_behind_hears_ours_and_is_found() -> None:
@@ -122,7 +121,7 @@ def test_a_vehicle_whose_clock_is_behind_hears_ours_and_is_found() -> None:
     that is ahead."""
     ours, vehicle = session(), signer(stamp=NOW - TEN_MINUTES)
     reception = ours.receive(vehicle.heartbeat(), PEER, 0.0)
-    assert reception.events == (events.ClockBehind(1, armed=False),)
+    assert reception.events == [events.ClockBehind(1, armed=False)]
     assert ours.vehicle is None
     (heartbeat,) = ours.poll(0.0)
     assert vehicle.codec.decode(bytearray(ours.encode(heartbeat))).type == 18
@@ -137,7 +136,7 @@ def test_another_port_needs_the_signature() -> None:
     ours, vehicle = paired()
     other = (PEER[0], PEER[1] + 1)
     for key in (b"", OTHER_KEY):
-        assert ours.receive(signer(key).position(2000), other, 5.0).events == ()
+        assert ours.receive(signer(key).position(2000), other, 5.0).events == []
     moved = ours.receive(vehicle.position(2000), other, 5.0).events
     assert moved[0] == events.PeerChanged(other)
     assert len(moved) == 2  # its check did not use up the time stamp
@@ -163,9 +162,9 @@ def test_what_continues_has_later_stamps_and_refuses_older_ones() -> None:
     assert ours._signing is not None
     signing = Signing.resumed(KEY, lambda: 0.0, ours._signing.state())
     later = Session(SessionSettings(), signing)
-    later.set_vehicle(events.VehicleFound(1, 1, "px4"), PEER)
-    assert later.receive(frame, PEER, 0.0).events == ()
-    assert later.counters.dropped[DropReason.REPLAYED] == 1
+    later.senders.set_vehicle(events.VehicleFound(1, 1, "px4"), PEER)
+    assert later.receive(frame, PEER, 0.0).events == []
+    assert later.senders.forged[Forgery.REPLAYED] == 1
     assert later.receive(vehicle.position(1020), PEER, 0.0).events
     assert stamp_of(ours.encode(Heartbeat(6))) < stamp_of(later.encode(Heartbeat(6)))
 
@@ -173,7 +172,7 @@ def test_what_continues_has_later_stamps_and_refuses_older_ones() -> None:
 def test_the_key_is_not_logged_or_shown() -> None:
     setup = mavlink.MAVLink_setup_signing_message(1, 1, list(KEY), NOW)
     reception = Session(SessionSettings()).receive(Sender(255, 190).frame(setup), PEER, 0.0)
-    assert reception.frames == ()
+    assert reception.frames == []
     assert repr(KEY)[2:-1] not in repr(Signing(KEY))
 
 

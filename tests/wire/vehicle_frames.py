@@ -9,7 +9,6 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from offboard.mavlink.counters import DropReason
 from offboard.mavlink.session import Session, SessionSettings
 
 RECORDINGS = Path(__file__).parent / "recordings"
@@ -81,10 +80,6 @@ def pinned(vehicle: Sender, autopilot: int = PX4, **settings: Any) -> Session:
     assert len(reception.events) == 2
     session.poll(0.0)
     return session
-
-
-def dropped(session: Session, reason: DropReason) -> int:
-    return session.counters.dropped[reason]
 
 
 def understood(frame: bytes) -> Any:

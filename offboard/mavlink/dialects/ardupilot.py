@@ -12,6 +12,7 @@ from offboard.mavlink.dialects.base import (
     CUSTOM_MODE_ENABLED,
     TRACKING_TELEMETRY,
     Dialect,
+    SetpointLoss,
     Valid,
     WantedMessage,
     WatchedParameter,
@@ -131,7 +132,7 @@ ARDUPILOT = Dialect(
     "link is full",
     unsaid="see the ground station",
     oldest=(4, 3),
-    loss_time=("GUID_TIMEOUT", 3.0),
+    setpoint_loss=lambda parameters: SetpointLoss(parameters.get("GUID_TIMEOUT", 3.0)),
     wanted=(
         *TRACKING_TELEMETRY,
         WantedMessage("HEARTBEAT", 10.0, optional=True),  # the only report of the mode

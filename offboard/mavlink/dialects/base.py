@@ -169,12 +169,8 @@ class Dialect:
     slow_hint: str  # what to do where telemetry comes slower than it was requested
     unsaid: str  # where a reason is found that no STATUSTEXT tells us
     oldest: tuple[int, int]  # version that this dialect is made for
-    # what follows when setpoints stop: the parameter of the time, its default, the parameter of the
-    # mode, and the modes by its value
-    loss_time: tuple[str, float]
-    loss_action: str = ""
-    loss_modes: tuple[str, ...] = ()  # by the value of `loss_action`
-    loss_order: tuple[str, ...] = ()  # if it cannot enter the chosen one, it enters one behind it
+    # of a vehicle with these parameters; what is not known of it may be any
+    setpoint_loss: Callable[[Mapping[str, float]], SetpointLoss]
     defects: tuple[Defect, ...] = ()
 
     def mode_name(self, custom_mode: int) -> str:
@@ -189,16 +185,6 @@ class Dialect:
         """MAV_CMD_DO_SET_MODE. Raises KeyError for an unknown mode."""
         numbers = {known: custom_mode for custom_mode, known in self.modes.items()}
         return CommandLong(SET_MODE, self.mode_parameters(numbers[name]))
-
-    def setpoint_loss(self, parameters: Mapping[str, float]) -> SetpointLoss:
-        """What the vehicle with these `parameters` does; without one, any of its modes."""
-        name, usual_s = self.loss_time
-        action = parameters.get(self.loss_action)
-        modes = self.loss_modes
-        if action is not None:
-            chosen = modes[int(action) : int(action) + 1] if action >= 0 else ()
-            modes = self.loss_order[self.loss_order.index(chosen[0]) :] if chosen else ()
-        return SetpointLoss(parameters.get(name, usual_s), modes)
 
     def engage(self) -> CommandLong:
         return self.set_mode(self.engage_mode)

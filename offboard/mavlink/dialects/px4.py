@@ -11,6 +11,7 @@ from offboard.mavlink.dialects.base import (
     TRACKING_TELEMETRY,
     Defect,
     Dialect,
+    SetpointLoss,
     Valid,
     WantedMessage,
     WatchedParameter,
@@ -31,6 +32,21 @@ _NO_STICKS = 4.0  # COM_RC_IN_MODE
 
 def _misses_sticks(known: Mapping[str, float], radio: bool) -> bool:
     return not radio and known.get("COM_RC_IN_MODE", _NO_STICKS) != _NO_STICKS
+
+
+# by the value of COM_OBL_RC_ACT; if it cannot enter the chosen one, it enters one behind it
+_LOSS_MODES = ("POSCTL", "ALTCTL", "STABILIZED", "AUTO.RTL", "AUTO.LAND", "AUTO.LOITER")
+_LOSS_ORDER = ("POSCTL", "ALTCTL", "STABILIZED", "AUTO.LOITER", "AUTO.RTL", "AUTO.LAND")
+
+
+def _setpoint_loss(parameters: Mapping[str, float]) -> SetpointLoss:
+    after_s, action = parameters.get("COM_OF_LOSS_T", 1.0), parameters.get("COM_OBL_RC_ACT")
+    if action is None:
+        return SetpointLoss(after_s, _LOSS_MODES)
+    if not 0.0 <= action < len(_LOSS_MODES):
+        return SetpointLoss(after_s)
+    chosen = _LOSS_ORDER.index(_LOSS_MODES[int(action)])
+    return SetpointLoss(after_s, _LOSS_ORDER[chosen:])
 
 
 _MODES = {
@@ -134,10 +150,7 @@ PX4 = Dialect(
     # PX4 would not notice any more that its real ground station is lost (NAV_DLL_ACT)
     unsaid="PX4 says why to ground stations alone: see QGroundControl",
     oldest=(1, 14),
-    loss_time=("COM_OF_LOSS_T", 1.0),
-    loss_action="COM_OBL_RC_ACT",
-    loss_modes=("POSCTL", "ALTCTL", "STABILIZED", "AUTO.RTL", "AUTO.LAND", "AUTO.LOITER"),
-    loss_order=("POSCTL", "ALTCTL", "STABILIZED", "AUTO.LOITER", "AUTO.RTL", "AUTO.LAND"),
+    setpoint_loss=_setpoint_loss,
     defects=(
         Defect((1, 17), "setpoints without thrust keep OFFBOARD alive; ours always have thrust"),
         Defect((1, 17), "COM_OBL_RC_ACT 0 to 2 is obeyed without a radio"),
