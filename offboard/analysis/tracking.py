@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import PPoly
 
-from offboard.analysis.history import History, Rows, in_parts, parts
+from offboard.analysis.columns import Rows, in_parts, parts
+from offboard.analysis.history import History
 from offboard.flight.phases import Phase
 from offboard.model.frames import (
     heading_from_quaternion,
@@ -28,13 +28,15 @@ Array = NDArray[np.float64]
 
 GAP_S = 0.5  # without a record of the reference for longer there is none
 SKIPPED_S = 1.5  # without a decision for longer, the reference was not tracked meanwhile
-_ORDERS, _POWERS = np.arange(3)[:, None], np.arange(5, -1, -1)[:, None]
-# coefficients of s^5 .. s^0 from position, velocity and acceleration at s = 0, then at s = 1
+_KNOWN = [(end, order) for end in (0, 1) for order in range(3)]  # of a quintic over 0 .. 1
+# coefficients of s^5 .. s^0 from the derivatives of these orders at these ends
 _QUINTIC = np.linalg.inv(
     [
-        [math.perm(power, order) * float(s) ** max(power - order, 0) for power in range(5, -1, -1)]
-        for s in (0, 1)
-        for order in range(3)
+        [
+            math.perm(power, order) * float(end) ** max(power - order, 0)
+            for power in range(5, -1, -1)
+        ]
+        for end, order in _KNOWN
     ]
 )
 _DERIVATIVES = ("position_ned_m", "velocity_ned_mps", "acceleration_ned_mps2")
@@ -103,11 +105,8 @@ class Reference:
     their positions, velocities and accelerations."""
 
     def __init__(self, rows: Rows) -> None:
-        self._times = rows["time_s"]
+        self._rows, self._times = rows, rows["time_s"]
         self._heading = np.unwrap(rows["heading_rad"].astype(np.float64))
-        intervals = parts(np.arange(len(rows) - 1))
-        coefficients = [_quintics(rows[part[0] : part[-1] + 2]) for part in intervals]
-        self._position = PPoly(np.concatenate(coefficients, axis=1), self._times)
 
     @classmethod
     def of(cls, flown: History) -> Reference | None:
@@ -118,7 +117,15 @@ class Reference:
 
     def position(self, times: Array, derivative: int = 0) -> Array:
         """(N, 3) position NED in m, or a derivative of it."""
-        return np.asarray(self._position(times, derivative))
+        begins = np.clip(np.searchsorted(self._times, times, "right"), 1, len(self._times) - 1) - 1
+        length_s = self._times[begins + 1] - self._times[begins]
+        share = (times - self._times[begins]) / length_s
+        found = np.zeros((len(times), 3))
+        for place, (end, order) in enumerate(_KNOWN):
+            weight = np.polyval(np.polyder(_QUINTIC[:, place], derivative), share)
+            weight *= length_s ** (order - derivative)
+            found += weight[:, None] * self._rows[_DERIVATIVES[order]][begins + end]
+        return found
 
     def heading(self, times: Array) -> Array:
         return np.interp(times, self._times, self._heading)
@@ -129,14 +136,6 @@ class Reference:
         gaps_s = np.diff(self._times, prepend=-math.inf, append=math.inf)
         near: NDArray[np.bool_] = gaps_s[place] <= GAP_S
         return near
-
-
-def _quintics(rows: Rows) -> Array:
-    """Coefficients (6, N - 1, 3) of the powers of the time since each row."""
-    known = np.stack([rows[name].astype(np.float64) for name in _DERIVATIVES], axis=1)
-    length_s = np.diff(rows["time_s"])[:, None, None]
-    ends = np.concatenate((known[:-1] * length_s**_ORDERS, known[1:] * length_s**_ORDERS), axis=1)
-    return (_QUINTIC @ ends / length_s**_POWERS).swapaxes(0, 1)
 
 
 def each_once(rows: Rows) -> Rows:
@@ -242,7 +241,7 @@ def _agitation(flown: History, track: Track) -> dict[str, float]:
         samples = share * np.hstack((*explained, np.ones((len(rows), 1)), *motion))
         factor = np.linalg.qr(np.vstack((factor, samples)), mode="r")
     explained, motion = factor[:, :7], factor[:, 7:]
-    fit, *_ = np.linalg.lstsq(explained, motion, rcond=None)
+    fit, *_ = np.linalg.lstsq(explained, motion, rcond=1e-9)  # an axis without motion is noise
     squares = ((motion - explained @ fit) ** 2).sum(axis=0)
     tilt, rate = np.sqrt([squares[:2].sum(), squares[2:].sum()])
     return {
