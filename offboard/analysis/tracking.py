@@ -8,7 +8,7 @@ fitness are over the control ticks, as in its Eq. 32.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -148,6 +148,7 @@ def each_once(rows: Rows) -> Rows:
 # ---------------------------------------------------------------------- the metrics
 
 Measure = Callable[[Rows, Reference], Array]
+Measured = tuple[str, str, Measure]  # pattern of the names, the kinds that take its place
 
 
 def _away(column: str, derivative: int = 0) -> Measure:
@@ -174,8 +175,8 @@ def _rate(axis: int) -> Measure:
     return lambda rows, _: rows["rates_radps"][:, axis].astype(np.float64)
 
 
-# by array of History: pattern of the names, the kinds that take its place, and what is measured
-_MEASURED: dict[str, tuple[tuple[str, str, Measure], ...]] = {
+# by array of History
+_MEASURED: dict[str, tuple[Measured, ...]] = {
     "position": (
         ("{}_position_m", "rmse mean p95 max", _away("position_ned_m")),
         ("{}_velocity_mps", "rmse p95 max", _away("velocity_ned_mps", 1)),
@@ -195,17 +196,21 @@ def tracking_metrics(flown: History, track: Track) -> dict[str, float]:
     """Values of a Score, of the samples in TRACK."""
     fitness = _fitness(flown, track)
     found = fitness | {"mu_e": sum(fitness.values()), "tracked_s": track.tracked_s}
-    for array, metrics in _MEASURED.items():
-        rows = track.within(getattr(flown, array))
-        weights = track.shares(rows["time_s"])
-        for pattern, kinds, measure in metrics:
-            values = in_parts(measure, rows, track.reference)
-            found |= _named(pattern, kinds, values, weights)
+    for array, measures in _MEASURED.items():
+        found |= _measured(track.within(getattr(flown, array)), track, measures)
     directions = thrust_direction_from_quaternion(track.within(flown.setpoint)["quaternion"])
     steps = np.linalg.norm(np.diff(directions, axis=0), axis=1)
     if len(steps):
         found["tilt_command_step_deg"] = math.degrees(math.sqrt((steps**2).mean()))
     return found | _agitation(flown, track)
+
+
+def _measured(rows: Rows, track: Track, measures: Iterable[Measured]) -> dict[str, float]:
+    found: dict[str, float] = {}
+    weights = track.shares(rows["time_s"])
+    for pattern, kinds, measure in measures:
+        found |= _named(pattern, kinds, in_parts(measure, rows, track.reference), weights)
+    return found
 
 
 def _fitness(flown: History, track: Track) -> dict[str, float]:
@@ -232,16 +237,17 @@ def _agitation(flown: History, track: Track) -> dict[str, float]:
     """
     attitude, reference = track.within(flown.attitude), track.reference
     weights = track.shares(attitude["time_s"])
+    weights /= weights.sum()
     factor: Any = np.zeros((0, 11))
-    shares = parts(np.sqrt(weights / weights.sum())[:, None])
-    for rows, share in zip(parts(attitude), shares, strict=True):
+    for rows, shares in zip(parts(attitude), parts(weights), strict=True):
         explained = [reference.position(rows["time_s"], order)[:, :2] for order in (1, 2, 3)]
         direction = thrust_direction_from_quaternion(rows["quaternion"])[:, :2]
         motion = direction, rows["rates_radps"][:, :2]
-        samples = share * np.hstack((*explained, np.ones((len(rows), 1)), *motion))
+        samples = np.hstack((*explained, np.ones((len(rows), 1)), *motion))
+        samples *= np.sqrt(shares)[:, None]
         factor = np.linalg.qr(np.vstack((factor, samples)), mode="r")
     explained, motion = factor[:, :7], factor[:, 7:]
-    fit, *_ = np.linalg.lstsq(explained, motion, rcond=1e-9)  # an axis without motion is noise
+    fit, *_ = np.linalg.lstsq(explained, motion, rcond=None)
     squares = ((motion - explained @ fit) ** 2).sum(axis=0)
     tilt, rate = np.sqrt([squares[:2].sum(), squares[2:].sum()])
     return {

@@ -90,27 +90,29 @@ def kind_of(raw: Mapping[str, Any]) -> str:
     return next((kind for kind, (_, keys) in KINDS.items() if keys & raw.keys()), "")
 
 
-def override(mapping: Mapping[str, Any], assignment: str, option: str = "") -> Section:
-    """A copy of the raw `mapping` with one `key.path=value` of the command line applied.
+def override(mapping: Mapping[str, Any], assignment: str) -> Section:
+    """A copy of the raw `mapping` with one `key.path=value` of --set applied.
 
     The value is YAML; a number in the path indexes a list. Keys are not checked here but in
-    `validate`, whose errors name `option`, by default --set. Raises DocumentError as `assigned`.
+    `validate`, whose errors name the option. Raises DocumentError as `assigned`.
     """
-    option = option or f"--set {abridged(assignment)}"
-    path, value = assigned(assignment, option)
-    changed: Section = _with(mapping, path.split("."), value, option)
+    path, value = assigned(assignment)
+    changed: Section = _with(mapping, path.split("."), value, _option(assignment))
     return changed
 
 
-def assigned(assignment: str, option: str = "") -> tuple[str, Any]:
-    """The key.path and the value of `key.path=value`. Raises DocumentError, which names `option`
-    (by default --set), where one of them is missing or the value is no YAML."""
-    option = option or f"--set {abridged(assignment)}"
+def assigned(assignment: str) -> tuple[str, Any]:
+    """The key.path and the value of `key.path=value`. Raises DocumentError where one of them is
+    missing or the value is no YAML."""
     path, separator, text = assignment.partition("=")
     keys = [key.strip() for key in path.split(".")]
     if not separator or not all(keys):
-        raise DocumentError(f"{option}: expected key.path=value")
-    return ".".join(keys), _loaded(text, option)
+        raise DocumentError(f"{_option(assignment)}: expected key.path=value")
+    return ".".join(keys), _loaded(text, _option(assignment))
+
+
+def _option(assignment: str) -> str:
+    return f"--set {abridged(assignment)}"
 
 
 def validate(
