@@ -13,7 +13,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import yaml
@@ -45,10 +44,10 @@ class Section(dict[str, Any]):
 yaml.add_representer(Section, SafeRepresenter.represent_dict, Dumper=yaml.SafeDumper)
 
 
-def load_document(name: str | Path, kind: str, model: type[M]) -> tuple[M, str]:
+def load_document(name: str, kind: str, model: type[M]) -> tuple[M, str]:
     """The value of a shipped file by name, or of a file, and its path for errors. Raises
     DocumentError."""
-    path = name if isinstance(name, Path) else locate(name, kind)
+    path = locate(name, kind)
     return parse(read_text(path), model, str(path), kind), str(path)
 
 
