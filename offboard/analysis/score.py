@@ -32,8 +32,10 @@ from offboard.link.log import LogError, replace_file
 Array = NDArray[np.float64]
 
 
-def _metric(meaning: str, unit: str = "") -> float:
-    value: float = field(default=math.nan, metadata={"meaning": meaning, "unit": unit})
+def _metric(meaning: str, unit: str = "", *, wall: bool = False) -> float:
+    """`wall`: this computer's clock decides it, so that it differs between runs of one flight."""
+    about = {"meaning": meaning, "unit": unit, "wall": wall}
+    value: float = field(default=math.nan, metadata=about)
     return value
 
 
@@ -95,10 +97,10 @@ class Score:
     pitch_rate_sd_radps: float = _metric("pitch rate, sd", "rad/s")
     setpoint_hz: float = _metric("setpoints sent, each repeat counts", "Hz")
     setpoint_gap_max_s: float = _metric("longest gap of setpoints", "s")
-    setpoint_gap_wall_max_s: float = _metric("longest gap of setpoints, wall time", "s")
-    answer_p50_ms: float = _metric("telemetry to setpoint, median", "ms")
-    answer_p99_ms: float = _metric("telemetry to setpoint, 99th perc.", "ms")
-    answer_max_ms: float = _metric("telemetry to setpoint, maximum", "ms")
+    setpoint_gap_wall_max_s: float = _metric("longest gap of setpoints, wall time", "s", wall=True)
+    answer_p50_ms: float = _metric("telemetry to setpoint, median", "ms", wall=True)
+    answer_p99_ms: float = _metric("telemetry to setpoint, 99th perc.", "ms", wall=True)
+    answer_max_ms: float = _metric("telemetry to setpoint, maximum", "ms", wall=True)
     setpoint_age_p99_ms: float = _metric("telemetry age at setpoint, 99th perc.", "ms")
     setpoint_age_max_ms: float = _metric("telemetry age at setpoint, maximum", "ms")
     missed_ticks: float = _metric("control periods without telemetry")
@@ -111,8 +113,8 @@ class Score:
     refused_unusable: float = _metric("setpoints not finite or beyond limits")
     decisions: float = _metric("decisions")
     failed_decisions: float = _metric("decisions that raised an error")
-    solve_time_p50_ms: float = _metric("time of a decision, median", "ms")
-    solve_time_p99_ms: float = _metric("time of a decision, 99th perc.", "ms")
+    solve_time_p50_ms: float = _metric("time of a decision, median", "ms", wall=True)
+    solve_time_p99_ms: float = _metric("time of a decision, 99th perc.", "ms", wall=True)
     certified_share: float = _metric("share of decisions sent as certified")
     gap_median: float = _metric("cost above the exact optimum, median")
     gap_max: float = _metric("cost above the optimum, maximum")

@@ -8,14 +8,14 @@ fitness are over the control ticks, as in its Eq. 32.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import PPoly
 
-from offboard.analysis.history import History, Rows, in_parts, parts
+from offboard.analysis.columns import Rows, in_parts, parts
+from offboard.analysis.history import History
 from offboard.flight.phases import Phase
 from offboard.model.frames import (
     heading_from_quaternion,
@@ -28,13 +28,15 @@ Array = NDArray[np.float64]
 
 GAP_S = 0.5  # without a record of the reference for longer there is none
 SKIPPED_S = 1.5  # without a decision for longer, the reference was not tracked meanwhile
-_ORDERS, _POWERS = np.arange(3)[:, None], np.arange(5, -1, -1)[:, None]
-# coefficients of s^5 .. s^0 from position, velocity and acceleration at s = 0, then at s = 1
+_KNOWN = [(end, order) for end in (0, 1) for order in range(3)]  # of a quintic over 0 .. 1
+# coefficients of s^5 .. s^0 from the derivatives of these orders at these ends
 _QUINTIC = np.linalg.inv(
     [
-        [math.perm(power, order) * float(s) ** max(power - order, 0) for power in range(5, -1, -1)]
-        for s in (0, 1)
-        for order in range(3)
+        [
+            math.perm(power, order) * float(end) ** max(power - order, 0)
+            for power in range(5, -1, -1)
+        ]
+        for end, order in _KNOWN
     ]
 )
 _DERIVATIVES = ("position_ned_m", "velocity_ned_mps", "acceleration_ned_mps2")
@@ -103,11 +105,8 @@ class Reference:
     their positions, velocities and accelerations."""
 
     def __init__(self, rows: Rows) -> None:
-        self._times = rows["time_s"]
+        self._rows, self._times = rows, rows["time_s"]
         self._heading = np.unwrap(rows["heading_rad"].astype(np.float64))
-        intervals = parts(np.arange(len(rows) - 1))
-        coefficients = [_quintics(rows[part[0] : part[-1] + 2]) for part in intervals]
-        self._position = PPoly(np.concatenate(coefficients, axis=1), self._times)
 
     @classmethod
     def of(cls, flown: History) -> Reference | None:
@@ -118,7 +117,15 @@ class Reference:
 
     def position(self, times: Array, derivative: int = 0) -> Array:
         """(N, 3) position NED in m, or a derivative of it."""
-        return np.asarray(self._position(times, derivative))
+        begins = np.clip(np.searchsorted(self._times, times, "right"), 1, len(self._times) - 1) - 1
+        length_s = self._times[begins + 1] - self._times[begins]
+        share = (times - self._times[begins]) / length_s
+        found = np.zeros((len(times), 3))
+        for place, (end, order) in enumerate(_KNOWN):
+            weight = np.polyval(np.polyder(_QUINTIC[:, place], derivative), share)
+            weight *= length_s ** (order - derivative)
+            found += weight[:, None] * self._rows[_DERIVATIVES[order]][begins + end]
+        return found
 
     def heading(self, times: Array) -> Array:
         return np.interp(times, self._times, self._heading)
@@ -131,14 +138,6 @@ class Reference:
         return near
 
 
-def _quintics(rows: Rows) -> Array:
-    """Coefficients (6, N - 1, 3) of the powers of the time since each row."""
-    known = np.stack([rows[name].astype(np.float64) for name in _DERIVATIVES], axis=1)
-    length_s = np.diff(rows["time_s"])[:, None, None]
-    ends = np.concatenate((known[:-1] * length_s**_ORDERS, known[1:] * length_s**_ORDERS), axis=1)
-    return (_QUINTIC @ ends / length_s**_POWERS).swapaxes(0, 1)
-
-
 def each_once(rows: Rows) -> Rows:
     """Rows sorted by time, the first one of equal times."""
     if (np.diff(rows["time_s"]) > 0.0).all():
@@ -149,6 +148,7 @@ def each_once(rows: Rows) -> Rows:
 # ---------------------------------------------------------------------- the metrics
 
 Measure = Callable[[Rows, Reference], Array]
+Measured = tuple[str, str, Measure]  # pattern of the names, the kinds that take its place
 
 
 def _away(column: str, derivative: int = 0) -> Measure:
@@ -175,8 +175,8 @@ def _rate(axis: int) -> Measure:
     return lambda rows, _: rows["rates_radps"][:, axis].astype(np.float64)
 
 
-# by array of History: pattern of the names, the kinds that take its place, and what is measured
-_MEASURED: dict[str, tuple[tuple[str, str, Measure], ...]] = {
+# by array of History
+_MEASURED: dict[str, tuple[Measured, ...]] = {
     "position": (
         ("{}_position_m", "rmse mean p95 max", _away("position_ned_m")),
         ("{}_velocity_mps", "rmse p95 max", _away("velocity_ned_mps", 1)),
@@ -196,17 +196,21 @@ def tracking_metrics(flown: History, track: Track) -> dict[str, float]:
     """Values of a Score, of the samples in TRACK."""
     fitness = _fitness(flown, track)
     found = fitness | {"mu_e": sum(fitness.values()), "tracked_s": track.tracked_s}
-    for array, metrics in _MEASURED.items():
-        rows = track.within(getattr(flown, array))
-        weights = track.shares(rows["time_s"])
-        for pattern, kinds, measure in metrics:
-            values = in_parts(measure, rows, track.reference)
-            found |= _named(pattern, kinds, values, weights)
+    for array, measures in _MEASURED.items():
+        found |= _measured(track.within(getattr(flown, array)), track, measures)
     directions = thrust_direction_from_quaternion(track.within(flown.setpoint)["quaternion"])
     steps = np.linalg.norm(np.diff(directions, axis=0), axis=1)
     if len(steps):
         found["tilt_command_step_deg"] = math.degrees(math.sqrt((steps**2).mean()))
     return found | _agitation(flown, track)
+
+
+def _measured(rows: Rows, track: Track, measures: Iterable[Measured]) -> dict[str, float]:
+    found: dict[str, float] = {}
+    weights = track.shares(rows["time_s"])
+    for pattern, kinds, measure in measures:
+        found |= _named(pattern, kinds, in_parts(measure, rows, track.reference), weights)
+    return found
 
 
 def _fitness(flown: History, track: Track) -> dict[str, float]:
@@ -233,13 +237,14 @@ def _agitation(flown: History, track: Track) -> dict[str, float]:
     """
     attitude, reference = track.within(flown.attitude), track.reference
     weights = track.shares(attitude["time_s"])
+    weights /= weights.sum()
     factor: Any = np.zeros((0, 11))
-    shares = parts(np.sqrt(weights / weights.sum())[:, None])
-    for rows, share in zip(parts(attitude), shares, strict=True):
+    for rows, shares in zip(parts(attitude), parts(weights), strict=True):
         explained = [reference.position(rows["time_s"], order)[:, :2] for order in (1, 2, 3)]
         direction = thrust_direction_from_quaternion(rows["quaternion"])[:, :2]
         motion = direction, rows["rates_radps"][:, :2]
-        samples = share * np.hstack((*explained, np.ones((len(rows), 1)), *motion))
+        samples = np.hstack((*explained, np.ones((len(rows), 1)), *motion))
+        samples *= np.sqrt(shares)[:, None]
         factor = np.linalg.qr(np.vstack((factor, samples)), mode="r")
     explained, motion = factor[:, :7], factor[:, 7:]
     fit, *_ = np.linalg.lstsq(explained, motion, rcond=None)

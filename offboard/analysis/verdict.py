@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.analysis.history import Event, History, parts
+from offboard.analysis.columns import parts
+from offboard.analysis.history import Event, History
 from offboard.flight.estimates import PositionJumps
 from offboard.flight.ground_contact import Touchdown
 from offboard.flight.phases import RESTS
@@ -56,7 +57,7 @@ def _positions(flown: History) -> Iterator[LocalPosition]:
     """In the order of time."""
     order = np.argsort(flown.position["time_s"], kind="stable")
     for part in parts(order):
-        for time_s, _, place, velocity in flown.position[part].tolist():
+        for time_s, *_, place, velocity in flown.position[part].tolist():
             yield LocalPosition(time_s, tuple(place.tolist()), tuple(velocity.tolist()))
 
 

@@ -171,12 +171,9 @@ def base_cases(file: CampaignFile, link: str | None = None) -> Iterator[Case]:
 
 def drawn(sample: Sample) -> list[Values]:
     """The points of a sample."""
-    unit = qmc.LatinHypercube(len(sample.ranges), rng=np.random.default_rng(sample.seed))
-    low, high = np.array(list(sample.ranges.values())).T
-    return [
-        tuple(zip(sample.ranges, plain(point, DIGITS), strict=True))
-        for point in (low + unit.random(sample.draws) * (high - low)).tolist()
-    ]
+    cube = qmc.LatinHypercube(len(sample.ranges), rng=np.random.default_rng(sample.seed))
+    points = qmc.scale(cube.random(sample.draws), *zip(*sample.ranges.values(), strict=True))
+    return [tuple(zip(sample.ranges, plain(each, DIGITS), strict=True)) for each in points.tolist()]
 
 
 def _digests(case: Case) -> tuple[tuple[str, str], ...]:

@@ -11,7 +11,6 @@ scenario.
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
@@ -19,7 +18,6 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from offboard.analysis.score import Requirement
 from offboard.documents.errors import UserError
 from offboard.documents.parameters import Parameters
-from offboard.documents.reading import load_document
 
 CASES_MOST, SEEDS_MOST = 1_000_000, 100_000
 
@@ -131,8 +129,3 @@ class CampaignFile(Parameters):
     require: tuple[Annotated[str, AfterValidator(_requirement)], ...] = ()
     promises: Promises = Promises()
     keep: bool = False
-
-
-def read_campaign(name: str | Path) -> tuple[CampaignFile, str]:
-    """A shipped campaign or a file, and its path for errors. Raises DocumentError."""
-    return load_document(name, "campaign", CampaignFile)

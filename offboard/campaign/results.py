@@ -59,15 +59,12 @@ class Results:
         self.directory = directory
         self._folder = directory / "results" / code
         try:
-            others = [p.name for p in (directory / "results").glob("*/") if p.name != code]
-        except OSError:
-            others = []
-        if others:
-            raise UserError(
-                f"{directory} holds results of other code ({others[0]}, this is {code}); choose "
-                "another --out, or delete its folder results"
-            )
-        try:
+            for other in (directory / "results").glob("*/"):
+                if other.name != code:
+                    raise UserError(
+                        f"{directory} holds results of other code ({other.name}, this is {code}); "
+                        "choose another --out, or delete its folder results"
+                    )
             self._folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise UserError(

@@ -26,17 +26,8 @@ from offboard.analysis.score import METRICS, Requirement
 from offboard.campaign.cases import Case
 from offboard.campaign.results import Record
 
-# metrics that this computer's clock decides: they differ between two runs of one flight
-WALL_TIMES = (
-    "setpoint_gap_wall_max_s",
-    "answer_p50_ms",
-    "answer_p99_ms",
-    "answer_max_ms",
-    "solve_time_p50_ms",
-    "solve_time_p99_ms",
-)
 CASE_COLUMNS = ("controller", "reference", "scenario", "vehicle", "sim_vehicle", "firmware")
-METRIC_COLUMNS = tuple(name for name in METRICS if name not in WALL_TIMES)
+METRIC_COLUMNS = tuple(name for name, about in METRICS.items() if not about["wall"])
 CONFIDENCE = 0.95
 ERROR = "rmse_position_m"
 EQUAL_SHARE = 0.01  # medians that are closer than this share of the best are equal

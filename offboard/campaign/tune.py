@@ -12,7 +12,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -95,7 +94,7 @@ def judge(base: Sequence[float], candidate: Sequence[float], values: Values = ()
     return Tuned(values, len(before), float(before.mean()), float(after.mean()), p_value)
 
 
-def read_tune(name: str | Path) -> tuple[TuneFile, str]:
+def read_tune(name: str) -> tuple[TuneFile, str]:
     """A shipped tuning or a file, and its path for errors. Raises DocumentError."""
     file, source = load_document(name, "tuning", TuneFile)
     for key in file.ranges:

@@ -81,11 +81,12 @@ def campaign(
     if scheduler and workers:
         raise UserError("--scheduler has its own workers: use it or --workers, not both")
     with out.status("planning"):
-        from offboard.campaign.document import read_campaign
+        from offboard.campaign.document import CampaignFile
         from offboard.campaign.run import Campaign
         from offboard.campaign.workers import cluster_workers, local_workers
+        from offboard.documents.reading import load_document
 
-        content, source = read_campaign(file)
+        content, source = load_document(file, "campaign", CampaignFile)
         flown = Campaign(content, source, out_directory)
     open_workers: OpenFlyer = partial(local_workers, workers)
     if scheduler:

@@ -37,9 +37,9 @@ def _checked(path: Path) -> str:
     """Validate a file; what it is. A reference must be flyable by the default flight's vehicle, a
     flight's by its own. Raises DocumentError."""
     from offboard.campaign.cases import base_cases
-    from offboard.campaign.document import read_campaign
+    from offboard.campaign.document import CampaignFile
     from offboard.campaign.tune import planned, read_tune
-    from offboard.documents.reading import kind_of, read
+    from offboard.documents.reading import kind_of, load_document, read
     from offboard.run.configuration import build_track, load, read_part
     from offboard.run.sitl import check_scenario
 
@@ -56,11 +56,11 @@ def _checked(path: Path) -> str:
     elif kind == "scenario":
         check_scenario(text, str(path))
     elif kind == "tuning":
-        tuning, source = read_tune(path)
+        tuning, source = read_tune(name)
         with naming(source):
             planned(tuning)
     elif kind == "campaign":
-        campaign, source = read_campaign(path)
+        campaign, source = load_document(name, "campaign", CampaignFile)
         with naming(source):
             list(base_cases(campaign))
     else:

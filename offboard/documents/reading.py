@@ -13,7 +13,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import yaml
@@ -45,10 +44,10 @@ class Section(dict[str, Any]):
 yaml.add_representer(Section, SafeRepresenter.represent_dict, Dumper=yaml.SafeDumper)
 
 
-def load_document(name: str | Path, kind: str, model: type[M]) -> tuple[M, str]:
+def load_document(name: str, kind: str, model: type[M]) -> tuple[M, str]:
     """The value of a shipped file by name, or of a file, and its path for errors. Raises
     DocumentError."""
-    path = name if isinstance(name, Path) else locate(name, kind)
+    path = locate(name, kind)
     return parse(read_text(path), model, str(path), kind), str(path)
 
 
@@ -90,27 +89,29 @@ def kind_of(raw: Mapping[str, Any]) -> str:
     return next((kind for kind, (_, keys) in KINDS.items() if keys & raw.keys()), "")
 
 
-def override(mapping: Mapping[str, Any], assignment: str, option: str = "") -> Section:
-    """A copy of the raw `mapping` with one `key.path=value` of the command line applied.
+def override(mapping: Mapping[str, Any], assignment: str) -> Section:
+    """A copy of the raw `mapping` with one `key.path=value` of --set applied.
 
     The value is YAML; a number in the path indexes a list. Keys are not checked here but in
-    `validate`, whose errors name `option`, by default --set. Raises DocumentError as `assigned`.
+    `validate`, whose errors name the option. Raises DocumentError as `assigned`.
     """
-    option = option or f"--set {abridged(assignment)}"
-    path, value = assigned(assignment, option)
-    changed: Section = _with(mapping, path.split("."), value, option)
+    path, value = assigned(assignment)
+    changed: Section = _with(mapping, path.split("."), value, _option(assignment))
     return changed
 
 
-def assigned(assignment: str, option: str = "") -> tuple[str, Any]:
-    """The key.path and the value of `key.path=value`. Raises DocumentError, which names `option`
-    (by default --set), where one of them is missing or the value is no YAML."""
-    option = option or f"--set {abridged(assignment)}"
+def assigned(assignment: str) -> tuple[str, Any]:
+    """The key.path and the value of `key.path=value`. Raises DocumentError where one of them is
+    missing or the value is no YAML."""
     path, separator, text = assignment.partition("=")
     keys = [key.strip() for key in path.split(".")]
     if not separator or not all(keys):
-        raise DocumentError(f"{option}: expected key.path=value")
-    return ".".join(keys), _loaded(text, option)
+        raise DocumentError(f"{_option(assignment)}: expected key.path=value")
+    return ".".join(keys), _loaded(text, _option(assignment))
+
+
+def _option(assignment: str) -> str:
+    return f"--set {abridged(assignment)}"
 
 
 def validate(

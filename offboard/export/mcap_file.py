@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from offboard.analysis.history import History, Rows
+from offboard.analysis.columns import Rows
+from offboard.analysis.history import History
 from offboard.documents.errors import UserError, install
 from offboard.export.series import (
     COLUMNS,

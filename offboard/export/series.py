@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.analysis import tlog
-from offboard.analysis.history import PHASES, Event, History, Rows, gather
+from offboard.analysis.columns import Rows
+from offboard.analysis.history import PHASES, Event, History, gather
 from offboard.documents.errors import UserError
 from offboard.flight.record import FIELDS
 from offboard.link.log import new_file
@@ -60,7 +61,7 @@ PHASE = "decision_phase"  # whose numbers tables show as names
 def read(path: Path) -> History:
     """The flight in a directory or .tlog. Raises UserError, also without telemetry."""
     log = tlog.read(path)
-    flown = gather(log)
+    flown = gather(log, unix_times=True)
     if not any(map(len, (flown.position, flown.attitude))):
         raise UserError(f"{log.path} holds no telemetry with a time stamp: nothing to export")
     return flown

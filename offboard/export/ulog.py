@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from offboard.analysis.history import History, Rows
+from offboard.analysis.columns import Rows
+from offboard.analysis.history import History
 from offboard.export.series import Array, events_of, series_of, values_of
 from offboard.flight.record import FIELDS
 from offboard.link.log import new_file

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import plotly.graph_objects as go
 
-from offboard.analysis.history import Event, Rows
+from offboard.analysis.columns import Rows
+from offboard.analysis.history import Event
 from offboard.analysis.page import (
     BLUE,
     BLUE_BAND,

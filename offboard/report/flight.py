@@ -11,7 +11,8 @@ import numpy as np
 import yaml
 
 from offboard.analysis import history, tlog
-from offboard.analysis.history import History, Rows
+from offboard.analysis.columns import Rows
+from offboard.analysis.history import History
 from offboard.analysis.page import BLUE
 from offboard.analysis.score import Score, score
 from offboard.analysis.verdict import begin_times

@@ -89,7 +89,7 @@ def load(
     if missing:
         raise DocumentError(*(f"{path}: {sentence}" for sentence in missing))
     if seed is not None:
-        raw = override(raw, f"seed={seed}", f"--seed {seed}")
+        raw["seed"], raw.places["seed"] = seed, f"--seed {seed}"
     return _complete(_validated(raw, str(path)))
 
 

@@ -21,9 +21,8 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner, Result
 
 from offboard.analysis import tlog
-from offboard.analysis.history import gather
 from offboard.cli.commands import app
-from offboard.export.series import samples
+from offboard.export.series import read, samples
 from offboard.flight.phases import Phase
 from offboard.flight.record import RECORD_ID
 from offboard.link.log import entry
@@ -219,7 +218,7 @@ def test_our_announcements_and_a_second_vehicle(flight: Path, tmp_path: Path) ->
 
 
 def test_a_phase_of_another_version_keeps_its_number(flight: Path) -> None:
-    rows = gather(tlog.read(flight)).records[:1].copy()
+    rows = read(flight).records[:1].copy()
     rows["phase"] = 99.0
     ((*_, known),) = samples("decision", rows)
     assert known["decision_phase"] == 99.0

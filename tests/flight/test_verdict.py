@@ -159,6 +159,14 @@ def test_a_log_with_parts_missing_is_scored_as_far_as_it_goes(flown: History) ->
     assert score(replace(flown, reference=twice)).rmse_position_m == whole.rmse_position_m
 
 
+def test_a_reference_that_stands_still_explains_no_motion(flown: History) -> None:
+    """Rounding of its derivatives had: by an amount that depended on where it stood."""
+    moved = flown.reference.copy()
+    moved["position_ned_m"] += 1 / 3
+    told = [score(each).tilt_agitation_deg for each in (flown, replace(flown, reference=moved))]
+    assert told[0] == told[1] > 0.0
+
+
 def test_others_on_the_link_have_no_effect(flown: History) -> None:
     """Another autopilot, heard first, its companion with our component id, a ground station with
     the vehicle's ids, and a camera of the same system: none of them is what `--system 1` flies."""

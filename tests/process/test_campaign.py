@@ -25,13 +25,14 @@ from rich.console import Console
 
 from offboard.campaign import flight, workers
 from offboard.campaign.cases import Case, base_cases
-from offboard.campaign.document import CampaignFile, Promises, read_campaign
+from offboard.campaign.document import CampaignFile, Promises
 from offboard.campaign.flight import Job
 from offboard.campaign.results import Record, Results, code_hash
 from offboard.campaign.run import Campaign, Summary
 from offboard.campaign.tune import Tuned, Tuning
 from offboard.campaign.workers import Workers, cluster_workers, local_workers
 from offboard.documents.errors import DocumentError, UserError
+from offboard.documents.reading import load_document
 
 # Two flights of a few seconds
 FILE = """
@@ -59,7 +60,7 @@ INFEASIBLE = FILE.replace("scenarios: [calm, px4_like]", "scenarios: [calm]").re
 def campaign(text: str, directory: Path) -> Campaign:
     file = directory.parent / f"{directory.name}.yaml"
     file.write_text(text)
-    return Campaign(*read_campaign(str(file)), directory)
+    return Campaign(*load_document(str(file), "campaign", CampaignFile), directory)
 
 
 @contextmanager

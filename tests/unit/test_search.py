@@ -14,13 +14,14 @@ import pytest
 from rich.console import Console
 
 from offboard.campaign.cases import Case
-from offboard.campaign.document import Promises, read_campaign
+from offboard.campaign.document import CampaignFile, Promises
 from offboard.campaign.flight import Job
 from offboard.campaign.results import Record, Results
 from offboard.campaign.run import Campaign, Fly, Incomplete, Progress, flying
 from offboard.campaign.search import Failure, FailureSearch, as_csv
 from offboard.campaign.tune import Tuned, Tuning, judge, profile, read_tune
 from offboard.documents.errors import DocumentError, UserError
+from offboard.documents.reading import load_document
 from offboard.run.configuration import load
 
 SEARCH = """
@@ -78,7 +79,7 @@ def searched(
     directory.mkdir(exist_ok=True)
     file = directory / "c.yaml"
     file.write_text(SEARCH)
-    campaign = Campaign(*read_campaign(str(file)), directory / "out")
+    campaign = Campaign(*load_document(str(file), "campaign", CampaignFile), directory / "out")
     with known(campaign.results, Known(record, most)) as fly:
         return campaign, FailureSearch(campaign, "c.yaml").find(2, fly)
 

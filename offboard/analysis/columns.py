@@ -1,0 +1,222 @@
+"""Columns of a log: which values of which messages are kept, as arrays of rows, and what is
+computed of them.
+
+The rows of a message are the bytes of its payloads as they are in the log, after their times; only
+those that are used are kept.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offboard.analysis.tlog import layout
+from offboard.flight.record import FIELDS, IDENTIFIED_ID, RECORD_ID
+from offboard.identification.vehicle_fit import RECORDED
+from offboard.mavlink.decode import (
+    POSITION_LIMIT_M,
+    RATE_LIMIT_RADPS,
+    UNIT_LENGTHS,
+    VELOCITY_LIMIT_MPS,
+)
+from offboard.model.frames import quaternion_from_euler
+from offboard.model.geodesy import Geodetic, position_ned_m
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.void]
+Kind = TypeVar("Kind", bound=np.generic)
+# Columns of a message: name -> the first of its fields and how many values, in an array from where
+Columns = Mapping[str, tuple[str, int] | tuple[str, int, int]]
+
+ARRAY = "DEBUG_FLOAT_ARRAY"  # those of ours, with their array_id
+RECORDS, IDENTIFIED = f"{ARRAY} {RECORD_ID}", f"{ARRAY} {IDENTIFIED_ID}"
+_MOTION: Columns = {"position_ned_m": ("x", 3), "velocity_ned_mps": ("vx", 3)}
+_SETPOINT: Columns = {"quaternion": ("q", 4), "thrust": ("thrust", 1)}
+_TIMESYNC: Columns = {"answered_ns": ("tc1", 1), "asked_ns": ("ts1", 1)}
+THEIRS: dict[str, Columns] = {
+    "TIMESYNC": _TIMESYNC,
+    "LOCAL_POSITION_NED": _MOTION,
+    "ATTITUDE_QUATERNION": {"quaternion": ("q1", 4), "rates_radps": ("rollspeed", 3)},
+    "HEARTBEAT": {"armed": ("base_mode", 1), "system_status": ("system_status", 1)},
+    "SYS_STATUS": {"voltage": ("voltage_battery", 1), "remaining": ("battery_remaining", 1)},
+    "EXTENDED_SYS_STATE": {"state": ("landed_state", 1)},
+    # true positions of a simulated vehicle
+    "HIL_STATE_QUATERNION": {"place": ("lat", 2), "altitude": ("alt", 1)},
+    "SIM_STATE": {"place": ("lat_int", 2), "altitude": ("alt", 1)},
+    # what ground stations record instead
+    "ATTITUDE": {"angles": ("roll", 3), "rates_radps": ("rollspeed", 3)},
+    "GLOBAL_POSITION_INT": {"place": ("lat", 3), "velocity": ("vx", 3)},
+    "ATTITUDE_TARGET": _SETPOINT,
+}
+OURS: dict[str, Columns] = {
+    "POSITION_TARGET_LOCAL_NED": {
+        **_MOTION, "acceleration_ned_mps2": ("afx", 3), "heading_rad": ("yaw", 1)
+    },
+    "SET_ATTITUDE_TARGET": _SETPOINT,
+    "TIMESYNC": _TIMESYNC,
+    RECORDS: {name: ("data", 1, place) for place, name in enumerate(FIELDS)},
+    IDENTIFIED: {name: ("data", 2, 2 * place) for place, name in enumerate(RECORDED)},
+}  # fmt: skip
+_TIMES = ("time_s", "unix_s")
+_TRUTH = {"HIL_STATE_QUATERNION": 1e3, "SIM_STATE": 1.0}  # units of the altitude in a metre
+_NO_VOLTAGE, _NO_PERCENTAGE = 0xFFFF, -1  # of SYS_STATUS
+_LIMITS = {
+    "position_ned_m": POSITION_LIMIT_M,
+    "velocity_ned_mps": VELOCITY_LIMIT_MPS,
+    "rates_radps": RATE_LIMIT_RADPS,
+}
+
+
+class Samples:
+    """Rows of the messages of one kind, in the order of arrival.
+
+    Args:
+        kind: name of the message in pymavlink; what follows a space is of no account.
+        columns: what is kept of it.
+        unix_times: whether the time of its entry in the log is kept, too.
+    """
+
+    def __init__(self, kind: str, columns: Columns, *, unix_times: bool) -> None:
+        message = layout(kind.partition(" ")[0])
+        places = {column: _place(message, *fields) for column, fields in columns.items()}
+        times = _TIMES[: 1 + unix_times]
+        self._stamp = (message.names or ("",))[0]
+        self._begin = min(at for at, _ in places.values())
+        self._end = max(at + values.itemsize for at, values in places.values())
+        self._times_size = 8 * len(times)
+        away = self._times_size - self._begin
+        self._dtype = np.dtype(
+            {
+                "names": [*times, *places],
+                "formats": [*("f8" for _ in times), *(values for _, values in places.values())],
+                "offsets": [
+                    *range(0, self._times_size, 8),
+                    *(away + at for at, _ in places.values()),
+                ],
+                "itemsize": away + self._end,
+            }
+        )
+        self.data = bytearray()
+
+    def stamp_ms(self, payload: bytes) -> float | None:
+        """The stamp of a message, None without one."""
+        if self._stamp == "time_boot_ms":
+            return int.from_bytes(payload[:4], "little")
+        if self._stamp == "time_usec" and any(payload[:8]):
+            return 1e-3 * int.from_bytes(payload[:8], "little")
+        return None
+
+    def add(self, payload: bytes, time_s: float, unix_s: float) -> None:
+        """A message with its vehicle time, and that of its entry in the log."""
+        self.data += struct.pack("<2d", time_s, unix_s)[: self._times_size]
+        self.data += payload[self._begin : self._end].ljust(self._end - self._begin, b"\0")
+
+    def rows(self) -> Rows:
+        """All rows. Nothing can be added after."""
+        return np.frombuffer(self.data, self._dtype)
+
+
+def _place(
+    message: np.dtype[np.void], field: str, count: int, first: int = 0
+) -> tuple[int, np.dtype[Any]]:
+    """Where in the payload values begin, and their type."""
+    assert message.fields is not None
+    kind, at = message.fields[field][:2]
+    base = kind.base
+    return at + first * base.itemsize, np.dtype((base, (count,))) if count > 1 else base
+
+
+def table(rows: Rows, **columns: Any) -> Rows:
+    """Rows with these columns (N, ...) and the times of other `rows`."""
+    times = {name: rows[name] for name in _TIMES if name in (rows.dtype.names or ())}
+    values = {name: np.asarray(column) for name, column in (times | columns).items()}
+    made = np.empty(
+        len(rows), [(name, each.dtype, each.shape[1:]) for name, each in values.items()]
+    )
+    for name, each in values.items():
+        made[name] = each
+    return made
+
+
+def parts(values: NDArray[Any]) -> list[NDArray[Any]]:
+    """Parts of about 8192 rows. What is computed of a part needs little memory: a log may last
+    many hours."""
+    return np.array_split(values, 1 + len(values) // 8192)
+
+
+def in_parts(function: Callable[..., NDArray[Kind]], rows: Rows, *more: Any) -> NDArray[Kind]:
+    """`function` of all rows, (N, ...), and of `more`."""
+    return np.concatenate([function(part, *more) for part in parts(rows)])
+
+
+# ---------------------------------------------------------------------- of rows of messages
+
+
+def truth(rows: Mapping[str, Rows], origin: Geodetic | None) -> Rows:
+    """True positions of a simulated vehicle; empty without those, or without an origin."""
+    kind, unit = next((each for each in _TRUTH.items() if len(rows[each[0]])), ("SIM_STATE", 1.0))
+    known = rows[kind] if origin else rows[kind][:0]
+    return table(
+        known, position_ned_m=in_parts(_true_position, known, unit, origin or Geodetic(0, 0))
+    )
+
+
+def _true_position(rows: Rows, unit: float, origin: Geodetic) -> Array:
+    """NED in m (N, 3), as float32. `unit` of the altitude in a metre."""
+    places = np.column_stack((rows["place"] / 1e7, rows["altitude"] / unit))
+    return position_ned_m(places, origin).astype(np.float32)
+
+
+def position_of_global(rows: Rows) -> Rows:
+    """Positions of GLOBAL_POSITION_INT relative to the first. 1e-7 deg, mm, cm/s."""
+    places = rows["place"] / (1e7, 1e7, 1e3)
+    position = position_ned_m(places, Geodetic(*places[0].tolist())) if len(rows) else places
+    return table(
+        rows,
+        position_ned_m=position.astype(np.float32),
+        velocity_ned_mps=(rows["velocity"] / 100.0).astype(np.float32),
+    )
+
+
+def attitude_of_angles(rows: Rows) -> Rows:
+    """Attitudes from the Euler angles of ATTITUDE."""
+    quaternion = quaternion_from_euler(*rows["angles"].astype(np.float64).T)
+    rates = rows["rates_radps"]
+    return table(rows, quaternion=np.asarray(quaternion, np.float32), rates_radps=rates)
+
+
+def battery(rows: Rows) -> Rows:
+    """Of SYS_STATUS; NaN for what the vehicle does not know."""
+    voltage, remaining = (rows[name].astype(np.float32) for name in THEIRS["SYS_STATUS"])
+    voltage[voltage == _NO_VOLTAGE] = remaining[remaining == _NO_PERCENTAGE] = math.nan
+    return table(rows, voltage_mv=voltage, remaining=remaining)
+
+
+def link_delay(ours: Rows, theirs: Rows) -> Rows:
+    """From the vehicle's replies to our requests: TIMESYNC messages, tc1 of a request is 0."""
+    replies = theirs[theirs["answered_ns"] != 0]
+    asked_ns = ours["asked_ns"][ours["answered_ns"] == 0]
+    replies = replies[np.isin(replies["asked_ns"], asked_ns)]
+    delay_s = 1e-9 * (replies["answered_ns"] - replies["asked_ns"])
+    return table(replies, time_s=1e-9 * replies["asked_ns"], delay_s=delay_s)
+
+
+def plausible(rows: Rows) -> Rows:
+    """Without those that the flight refuses, too; without a copy if there are none."""
+    kept = in_parts(_within_limits, rows)
+    return rows if kept.all() else rows[kept]
+
+
+def _within_limits(rows: Rows) -> NDArray[np.bool_]:
+    known = rows.dtype.names or ()
+    kept = [(np.abs(rows[name]) < _LIMITS[name]).all(axis=1) for name in _LIMITS if name in known]
+    if "quaternion" in known:
+        lengths = np.linalg.norm(rows["quaternion"], axis=1)
+        kept += [lengths > UNIT_LENGTHS[0], lengths < UNIT_LENGTHS[1]]
+    within: NDArray[np.bool_] = np.logical_and.reduce(kept)
+    return within
