@@ -100,12 +100,15 @@ def build_track(config: FlightConfig) -> Track:
     Raises DocumentError naming time, value and limit where it cannot be flown.
     """
     vehicle, limits = config.vehicle, config.limits
-    if vehicle.hover_thrust > limits.hover_thrust:
-        raise DocumentError(
-            f"vehicle {vehicle.name}: hover_thrust {vehicle.hover_thrust:g} exceeds "
-            f"limits.hover_thrust ({limits.hover_thrust:g}), beyond which a flight is ended; carry "
-            "less or raise the limit"
-        )
+    for name, value, limit, bound, instead in (
+        ("hover_thrust", vehicle.hover_thrust, "hover_thrust", limits.hover_thrust, "carry less"),
+        ("tilt_max_rad", vehicle.tilt_max_rad, "tilt_rad", limits.tilt_rad, "tilt less"),
+    ):
+        if value > bound:
+            raise DocumentError(
+                f"vehicle {vehicle.name}: {name} {value:g} exceeds limits.{limit} ({bound:g}), "
+                f"beyond which a flight is ended; {instead} or raise the limit"
+            )
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # what overflows is beyond a limit
             track = config.reference.track()
