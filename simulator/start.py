@@ -12,7 +12,7 @@ from simulator.autopilot.autopilot import Autopilot
 from simulator.autopilot.commander import Request
 from simulator.faults.fault import ModeName
 
-CLIMB_S = 60.0  # for the climb
+CLIMB_S = 120.0  # for the climb: 100 m at 1.5 m/s, and until estimate and truth agree
 SETTLE_S = 2.0
 REACHED_M, STILL_MPS = 0.3, 0.1
 

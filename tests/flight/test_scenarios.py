@@ -340,9 +340,9 @@ ROWS = {
         down=faults.without(faults.PARAM_VALUE), limits=LATER,
     ),
     "battery too low": refusal(
-        "not ready: its battery has 50% left, limits.battery is 100%", nothing_sent,
+        "not ready: its battery has 50% left, limits.battery is 90%", nothing_sent,
         scenario=scenario_of(conditions={"battery": {"remaining": 0.5}}),
-        limits=SOON | {"battery": 0.999},
+        limits=SOON | {"battery": 0.9},
     ),
     # which vehicles are flown, by the MAV_TYPE in their HEARTBEAT
     "a plane": of_type(1, "the vehicle is a FIXED_WING; offboard flies multirotors"),
