@@ -167,6 +167,8 @@ CSV = "time_s,north_m,east_m,altitude_m\n0,0,0,3\n3,2,0,3\n6,2,{east},4\n9,0,0,3
         ("circle.yaml", "shape: circle\nperiod_s: 0", "circle.yaml, line 2, column 1: period_s: 0"),
         ("storm.yaml", "name: s\nconditions: {thrust_scale: 9}",
          "storm.yaml, line 2, column 14: conditions.thrust_scale: 9 should be less"),
+        ("storm.yaml", "name: s\nconditions: {white_noise: {position_m: 0}}",
+         "position_m: 0 should be greater than or equal to 0.00005"),
         ("storm.yaml", "name: s\nfaults: [{fault: frogs}]", "column 1: faults.0.fault: 'frogs' is"),
         ("storm.yaml", "name: s\nfaults: [{fault: silent_message, message: NOPE}]",
          "'NOPE' is not a MAVLink message"),
