@@ -37,6 +37,7 @@ from offboard.reference.track import Track
 Raw = dict[str, Any]
 RECORDED_VERSIONS = ("pso-offboard", "pymavlink", "numpy", "scipy", "numba")
 UNKNOWN_VEHICLE = "neutral"
+PERIODS_LEAST = 3  # of the reference at full speed: two decisions, and one that may be lost
 DESCENT_MPS = 0.5  # slowest default near the ground: ArduCopter LAND_SPEED; MPC_LAND_SPEED is 0.7
 
 
@@ -115,6 +116,13 @@ def build_track(config: FlightConfig) -> Track:
             _, height_m, radius_m = check(track, vehicle)
     except ValueError as error:
         raise DocumentError(f"reference {config.reference.title}: {error}") from None
+    least_s = PERIODS_LEAST * config.period_s
+    if track.track_end_s - track.track_start_s < least_s:
+        raise DocumentError(
+            f"reference {config.reference.title}: it is flown at full speed for "
+            f"{track.track_end_s - track.track_start_s:.2g} s; a score needs {least_s:.2g} s, "
+            f"{PERIODS_LEAST} periods"
+        )
     landing_s = height_m / DESCENT_MPS
     if landing_s > limits.land_s:
         raise DocumentError(

@@ -348,7 +348,8 @@ ROWS = {
     "a plane": of_type(1, "the vehicle is a FIXED_WING; offboard flies multirotors"),
     "a helicopter": of_type(4, r".*\(airframe: helicopter in its vehicle file flies it\)"),
     "a hexarotor that is no helicopter": of_type(
-        13, "the vehicle is a HEXAROTOR; its vehicle file says airframe", believed=HELICOPTER
+        13, "the vehicle is a HEXAROTOR; its vehicle file says .*Fix: are .* and airframe in",
+        believed=HELICOPTER,
     ),
     "a helicopter by its file": of_type(
         4, STOPPED, on_the_ground, believed=HELICOPTER, at=then(Phase.STREAM, 0.1, faults.stop)
