@@ -363,7 +363,7 @@ ROWS = {
         down=faults.without(faults.POSITION), limits=LATER,
     ),
     "no position, and the vehicle says why": refusal(
-        "not ready: no LOCAL_POSITION_NED arrives; the vehicle said: No GPS$", nothing_sent,
+        "not ready: no LOCAL_POSITION_NED arrives; the vehicle said: No GPS .limits", nothing_sent,
         fly=copter.hop, down=faults.without(faults.POSITION), limits=SOON,
         at=then(Phase.HEALTH, 2.0, complain),
     ),
