@@ -24,7 +24,7 @@ from simulator.vehicle.conditions import Conditions
 LOCKSTEP_STRANGER_HZ = 5000.0
 
 # A start in the air
-CLIMB_S = 60.0  # for the climb
+CLIMB_S = 120.0  # for the climb: 100 m at 1.5 m/s, and until estimate and truth agree
 SETTLE_S = 2.0
 REACHED_M, STILL_MPS = 0.3, 0.1
 

@@ -83,12 +83,11 @@ class TrackingSettings(ControllerSettings):
 
     `feedback_limit` bounds each lateral component of b_c about its feed-forward: a swing from one
     tilt limit to the other would run into the acceleration limit of the attitude loop and end in a
-    limit cycle. `thrust_floor` is the least thrust as a fraction of g.
+    limit cycle.
     """
 
     bandwidth_radps: float = Field(default=7.0, ge=0.5, le=20)
-    feedback_limit: float = Field(default=0.3, gt=0, le=1)
-    thrust_floor: float = Field(default=0.2, ge=0, le=0.9)
+    feedback_limit: float = Field(default=0.3, ge=0.02, le=1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,7 +239,7 @@ class TrackingLaw:
         self, target: Target, lateral: Array, vertical: Array, b_z: float
     ) -> TrackingProblem:
         """The problem of these deviations: J, and the bounds of u to which the law clips."""
-        settings, vehicle = self.settings, self.vehicle
+        vehicle = self.vehicle
         curvature = np.array(
             [
                 self.vertical.curvature * b_z**2,
@@ -261,8 +260,7 @@ class TrackingLaw:
         constant = 0.5 * rest + nominal @ (0.5 * curvature * nominal - slope)
         low, high = self.tilt_bounds(nominal[1:3])
         heading = target.heading_rad
-        least_mps2 = settings.thrust_floor * vehicle.gravity_mps2
-        lower = np.array([least_mps2, *low, heading - HEADING_BOX_RAD])
+        lower = np.array([vehicle.thrust_min_mps2, *low, heading - HEADING_BOX_RAD])
         upper = np.array([vehicle.thrust_max_mps2, *high, heading + HEADING_BOX_RAD])
         quadratic = BoxQuadratic(np.diag(curvature), gradient, float(constant), lower, upper)
         return TrackingProblem(target, lateral, at_hover, vertical, b_z, quadratic)

@@ -76,7 +76,7 @@ def plant_of(law: TrackingLaw, *, speed_limit_mps: float, clearance_m: float) ->
         "gravity_mps2": vehicle.gravity_mps2,
         "lag_half": math.exp(-0.5 * period_s / lag_s),
         "lag_full": math.exp(-period_s / lag_s),
-        "thrust_least_mps2": law.settings.thrust_floor * vehicle.gravity_mps2,
+        "thrust_least_mps2": vehicle.thrust_min_mps2,
         "thrust_most_mps2": vehicle.thrust_max_mps2,
         "tilt_most": math.sin(vehicle.tilt_max_rad),
         "speed_most_mps": speed_limit_mps,

@@ -28,6 +28,12 @@ if TYPE_CHECKING:
 M = TypeVar("M", bound=BaseModel)
 DESCRIPTION_SIZE = 200
 PROBLEMS_MOST = 10
+# of pydantic's sentences, and what a file of YAML calls it
+WORDS = {
+    " after validation": "",
+    "an object": "a mapping of keys to values",
+    "a valid array": "a list",
+}
 
 
 class Section(dict[str, Any]):
@@ -128,6 +134,9 @@ def validate(
         return model.model_validate_json(json.dumps(mapping), strict=True, extra=extra)
     except ValidationError as error:
         details = error.errors(include_url=False)
+        # pydantic counts the items without those that it refuses
+        outer = {each["loc"][:n] for each in details for n in range(len(each["loc"]))}
+        details = [d for d in details if d["type"] != "too_short" or d["loc"] not in outer]
         problems = []
         for detail in details[:PROBLEMS_MOST]:
             path, origin = _key_path(detail, mapping, source)
@@ -153,7 +162,9 @@ def _sentence(detail: ErrorDetails, path: str, model: type[BaseModel]) -> str:
     where = f"{path}: " if path else ""
     if separator:
         value = shown(detail["input"])
-        return f"{where}{value} should {allowed.replace(' after validation', '')}"
+        for words, ours in WORDS.items():
+            allowed = allowed.replace(words, ours)
+        return f"{where}{value} should {allowed}"
     return f"{where}{detail['msg'].removeprefix('Value error, ')}"
 
 

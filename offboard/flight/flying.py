@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from offboard.control.base import Adaptive
 from offboard.flight.authority import Standing
 from offboard.flight.failsafe import (
     OPERATOR,
@@ -37,6 +38,7 @@ from offboard.flight.vehicle_state import DISARMED_S
 TAKE_OVER_HEIGHT_M = 1.0  # where setpoints replace the autopilot's own take-off
 DETECTOR_S = 1.0  # EXTENDED_SYS_STATE is requested at 5 Hz
 REST_S = 0.5  # after the end of the reference
+WRONG_THRUST = 0.1  # of the hover thrust: less is not what keeps a vehicle from its place
 
 
 def lifted_off(flight: FlightState) -> bool:
@@ -63,11 +65,26 @@ def at_start_to_excite(flight: FlightState) -> bool:
 def too_late_at_start(flight: FlightState) -> str:
     if not flight.plan.overdue_s(flight.time_s) > flight.limits.overdue_s:
         return ""
-    return (
+    observer, model = flight.observer, flight.model
+    sentence = (
         f"the start of the reference was not reached: {flight.position_error_m:.1f} m away, "
-        f"{flight.plan.overdue_s(flight.time_s):.0f} s late; is hover_thrust in the vehicle file "
-        "right, and is the vehicle fast enough for controller.bandwidth_radps?"
+        f"{flight.plan.overdue_s(flight.time_s):.0f} s late"
     )
+    if abs(observer.hover_thrust_estimate / model.hover_thrust - 1.0) > WRONG_THRUST:
+        return (
+            f"{sentence}; the flight shows a hover thrust of {observer.hover_thrust_estimate:.2f}, "
+            f"hover_thrust of vehicle {model.name} is {model.hover_thrust:.2f}"
+        )
+    if isinstance(flight.controller, Adaptive):
+        return f"{sentence}; is the vehicle fast enough for controller.bandwidth_radps?"
+    return sentence
+
+
+def no_lift_off(flight: FlightState) -> str:
+    sentence = f"no lift-off in {flight.in_phase_s:.0f} s"
+    if flight.takes_off_by_command:
+        return f"{sentence}, by the autopilot's own take-off"
+    return f"{sentence}; is hover_thrust in the vehicle file right?"
 
 
 def identified(flight: FlightState) -> bool:
@@ -174,7 +191,6 @@ def requested(request: Request) -> Condition:
 FLOWN, REFUSED, ABORTED = ExitCode.FLOWN, ExitCode.REFUSED, ExitCode.ABORTED
 FAILSAFE = "{flight.failsafe.cause}", "{flight.failsafe.reason}"
 AT_START = "hovers at the start of the reference"
-NO_LIFT_OFF = "no lift-off in {flight.in_phase_s:.0f} s; is hover_thrust in the vehicle file right?"
 NOT_IDENTIFIED = "identification did not converge in {flight.in_phase_s:.0f} s"
 HELD = "the autopilot held for {flight.in_phase_s:.0f} s"
 DID_NOT_HOLD = "the vehicle did not hold in {flight.in_phase_s:.0f} s"
@@ -206,7 +222,7 @@ def ends_early(*, serves: bool) -> tuple[Transition, ...]:
 
 TO_THE_END = (
     Transition({TAKEOFF}, lifted_off, CLIMB, reason="lifted off"),
-    Transition({TAKEOFF}, longer_than("lift_off_s"), LAND, ABORTED, reason=NO_LIFT_OFF),
+    Transition({TAKEOFF}, longer_than("lift_off_s"), LAND, ABORTED, reason=no_lift_off),
     Transition({CLIMB}, at_start_to_excite, EXCITE, reason="identification steps"),
     Transition({CLIMB}, at_start, JOIN, reason=AT_START),
     Transition({CLIMB}, too_late_at_start, LAND, ABORTED),

@@ -349,7 +349,10 @@ def _late(ground: Ground) -> str:
 
 
 _ESTIMATOR = "wait for a GPS fix, keep the vehicle still and away from metal; then calibrate"
-_UNFIT = "fly it with its own autopilot; is MAV_TYPE or FRAME_CLASS right?"
+_UNFIT = (
+    "are MAV_TYPE or FRAME_CLASS, and airframe in the vehicle file, right? Else fly it with its "
+    "own autopilot"
+)
 _FAILSAFE = "let the pilot take over first"
 _CHOOSE = "choose one with --system, or give each vehicle its own port"
 _SAME_ID = "switch one off, or change its system id"

@@ -65,7 +65,7 @@ def usable(flight: FlightState) -> bool:
 
 
 def not_ready(flight: FlightState) -> str:
-    return f"not ready: {unfit(flight)}"
+    return f"not ready: {unfit(flight)} (limits.health_s is {flight.limits.health_s:g})"
 
 
 # ---------------------------------------------------------------------- the service waits

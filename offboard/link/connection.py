@@ -29,9 +29,19 @@ _ADDRESS = re.compile(r"(udpin|udpout|tcp|tcpin|serial):(.+):([0-9]{1,9})", re.A
 
 
 def open_lockstep_link() -> LockstepLink:
-    """Open a link on a free port of this computer, for a simulator in lockstep."""
+    """Open a link on a free port of this computer, for a simulator in lockstep. Raises
+    Unavailable where nothing can be sent to it."""
     sock = udp_socket()
-    sock.bind(("127.0.0.1", 0))
+    try:
+        sock.bind(("127.0.0.1", 0))
+        with udp_socket() as probe:  # sends nothing, and fails without a loopback interface
+            probe.connect(sock.getsockname())
+    except OSError as error:
+        sock.close()
+        raise Unavailable(
+            f"the bundled simulator needs UDP on 127.0.0.1 ({error.strerror or error}): is the "
+            "loopback interface up?"
+        ) from None
     return LockstepLink(sock)
 
 

@@ -37,6 +37,7 @@ from offboard.reference.track import Track
 Raw = dict[str, Any]
 RECORDED_VERSIONS = ("pso-offboard", "pymavlink", "numpy", "scipy", "numba")
 UNKNOWN_VEHICLE = "neutral"
+PERIODS_LEAST = 3  # of the reference at full speed: two decisions, and one that may be lost
 DESCENT_MPS = 0.5  # slowest default near the ground: ArduCopter LAND_SPEED; MPC_LAND_SPEED is 0.7
 
 
@@ -100,18 +101,28 @@ def build_track(config: FlightConfig) -> Track:
     Raises DocumentError naming time, value and limit where it cannot be flown.
     """
     vehicle, limits = config.vehicle, config.limits
-    if vehicle.hover_thrust > limits.hover_thrust:
-        raise DocumentError(
-            f"vehicle {vehicle.name}: hover_thrust {vehicle.hover_thrust:g} exceeds "
-            f"limits.hover_thrust ({limits.hover_thrust:g}), beyond which a flight is ended; carry "
-            "less or raise the limit"
-        )
+    for name, value, limit, bound, instead in (
+        ("hover_thrust", vehicle.hover_thrust, "hover_thrust", limits.hover_thrust, "carry less"),
+        ("tilt_max_rad", vehicle.tilt_max_rad, "tilt_rad", limits.tilt_rad, "tilt less"),
+    ):
+        if value > bound:
+            raise DocumentError(
+                f"vehicle {vehicle.name}: {name} {value:g} exceeds limits.{limit} ({bound:g}), "
+                f"beyond which a flight is ended; {instead} or raise the limit"
+            )
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # what overflows is beyond a limit
             track = config.reference.track()
             _, height_m, radius_m = check(track, vehicle)
     except ValueError as error:
         raise DocumentError(f"reference {config.reference.title}: {error}") from None
+    least_s = PERIODS_LEAST * config.period_s
+    if track.track_end_s - track.track_start_s < least_s:
+        raise DocumentError(
+            f"reference {config.reference.title}: it is flown at full speed for "
+            f"{track.track_end_s - track.track_start_s:.2g} s; a score needs {least_s:.2g} s, "
+            f"{PERIODS_LEAST} periods"
+        )
     landing_s = height_m / DESCENT_MPS
     if landing_s > limits.land_s:
         raise DocumentError(

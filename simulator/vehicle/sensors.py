@@ -47,11 +47,12 @@ class EstimatorName(StrEnum):
 
 
 class WhiteNoise(Parameters):
-    """Standard deviations of the `white` estimator, the same on each axis; new at each sample."""
+    """Standard deviations of the `white` estimator, the same on each axis; new at each sample. The
+    least are those of `perfect`: an estimate that repeats itself counts as none."""
 
-    position_m: float = Field(default=0.02, ge=0, le=10)
-    velocity_mps: float = Field(default=0.02, ge=0, le=10)
-    attitude_rad: float = Field(default=0.001, ge=0, le=0.3)
+    position_m: float = Field(default=0.02, ge=0.00005, le=10)
+    velocity_mps: float = Field(default=0.02, ge=0.00005, le=10)
+    attitude_rad: float = Field(default=0.001, ge=0.000001, le=0.3)
     rates_radps: NonNegativeTriple = (0.07, 0.035, 0.014)
 
 

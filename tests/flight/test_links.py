@@ -15,6 +15,7 @@ import time
 import tty
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
+from errno import ENETUNREACH
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from offboard.documents.errors import Unavailable, UserError
 from offboard.link import clock
-from offboard.link.connection import open_link
+from offboard.link.connection import open_link, open_lockstep_link
 from offboard.link.interface import Chunk, Link, LinkReport
 from offboard.link.stream import BROKEN, RENEWED
 from offboard.link.udp import LOOK_EVERY_S, UdpLink
@@ -470,3 +471,15 @@ def test_ipv6_addresses(ends: ExitStack) -> None:
     assert connection.recv(100) == b"answer"
     with pytest.raises(UserError, match=r"stands in brackets, as in udpin:\[::1\]:14540"):
         open_link("udpin:::1:14540")
+
+
+def test_a_simulator_without_a_loopback_interface(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A socket can be bound there, and nothing arrives: it is not waited for."""
+
+    class Unreachable(socket.socket):
+        def connect(self, _address: object, /) -> None:
+            raise OSError(ENETUNREACH, "Network is unreachable")
+
+    monkeypatch.setattr(socket, "socket", Unreachable)
+    with pytest.raises(Unavailable, match="is the loopback interface up"):
+        open_lockstep_link()

@@ -12,7 +12,7 @@ import pytest
 from flight_tables import IN_THE_AIR, README, asked, exits, with_tables
 from uneventful import NOW_S, TRACK, hear, heartbeat, lift, position, uneventful
 
-from offboard.flight import preflight, starting, telemetry
+from offboard.flight import flying, preflight, starting, telemetry
 from offboard.flight.authority import PilotSwitch, Standing
 from offboard.flight.phases import (
     ENDS,
@@ -37,6 +37,7 @@ from offboard.mavlink.events import (
     Rebooted,
     VehicleFound,
 )
+from offboard.run import configuration
 
 ON_TRACK = (Phase.JOIN, Phase.TRACK, Phase.HOVER)
 SERVICES = {
@@ -328,6 +329,22 @@ def test_no_way_out_of_the_air_leaves_the_vehicle_unasked(service: ServiceOption
             taken = next_row(flight)
             assert taken is not None
             assert taken.target in IN_THE_AIR
+
+
+def test_a_vehicle_that_does_not_climb_is_told_of_settings_that_it_has() -> None:
+    """Of the hover thrust where the flight shows another one; a law without bandwidth, of none."""
+    bandwidth = "; is the vehicle fast enough for controller.bandwidth_radps?"
+    for law, shown, hint in (
+        ("pso", 0.7, "; the flight shows a hover thrust of 0.70, hover_thrust of vehicle neutral"),
+        ("pso", 0.42, bandwidth),
+        ("autopilot", 0.42, ""),
+    ):
+        flight = uneventful(Phase.CLIMB)
+        _climb_late(flight)
+        vars(flight.observer)["hover_thrust_estimate"] = shown
+        config = configuration.load("flight", choices={"controller": law})
+        flight.controller = configuration.build_controller(config)
+        assert flying.too_late_at_start(flight).partition("late")[2][: len(hint) or None] == hint
 
 
 def test_a_vehicle_that_reboots_as_it_arms_counts_as_unheard_from_then_on() -> None:

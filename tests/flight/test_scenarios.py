@@ -340,15 +340,16 @@ ROWS = {
         down=faults.without(faults.PARAM_VALUE), limits=LATER,
     ),
     "battery too low": refusal(
-        "not ready: its battery has 50% left, limits.battery is 100%", nothing_sent,
+        "not ready: its battery has 50% left, limits.battery is 90%", nothing_sent,
         scenario=scenario_of(conditions={"battery": {"remaining": 0.5}}),
-        limits=SOON | {"battery": 0.999},
+        limits=SOON | {"battery": 0.9},
     ),
     # which vehicles are flown, by the MAV_TYPE in their HEARTBEAT
     "a plane": of_type(1, "the vehicle is a FIXED_WING; offboard flies multirotors"),
     "a helicopter": of_type(4, r".*\(airframe: helicopter in its vehicle file flies it\)"),
     "a hexarotor that is no helicopter": of_type(
-        13, "the vehicle is a HEXAROTOR; its vehicle file says airframe", believed=HELICOPTER
+        13, "the vehicle is a HEXAROTOR; its vehicle file says .*Fix: are .* and airframe in",
+        believed=HELICOPTER,
     ),
     "a helicopter by its file": of_type(
         4, STOPPED, on_the_ground, believed=HELICOPTER, at=then(Phase.STREAM, 0.1, faults.stop)
@@ -362,7 +363,7 @@ ROWS = {
         down=faults.without(faults.POSITION), limits=LATER,
     ),
     "no position, and the vehicle says why": refusal(
-        "not ready: no LOCAL_POSITION_NED arrives; the vehicle said: No GPS$", nothing_sent,
+        "not ready: no LOCAL_POSITION_NED arrives; the vehicle said: No GPS .limits", nothing_sent,
         fly=copter.hop, down=faults.without(faults.POSITION), limits=SOON,
         at=then(Phase.HEALTH, 2.0, complain),
     ),
@@ -393,7 +394,8 @@ ROWS = {
     ),
     "take-off by command": flies(took_off_by_command, fly=copter.hop),
     "take-off refused": ends(
-        ".*no lift-off", stayed_down_without_a_setpoint, fly=copter.hop,
+        ".*no lift-off in 8 s, by the autopilot's own take-off", stayed_down_without_a_setpoint,
+        fly=copter.hop,
         firmware=replace(ARDUPILOT, rules=(NO_TAKEOFF, *ARDUPILOT.rules)),
     ),
     # the pilot

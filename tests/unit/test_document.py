@@ -43,6 +43,10 @@ class Line(Parameters):
     points: int = Field(ge=2, le=9)
 
 
+class Polygon(Parameters):
+    corners: Annotated[tuple[tuple[float, float], ...], Field(min_length=2)]
+
+
 class Drawing(Parameters):
     title: str = Field(min_length=1, max_length=5)
     scale: float = Field(default=1.0, gt=0, lt=10)
@@ -81,6 +85,14 @@ def test_scalars_are_those_of_yaml_1_2() -> None:
 KEYS = "circles, colour, corner, named, scale, shape, tilt_rad, title, visible"
 
 
+def test_a_list_of_wrong_items_is_not_too_short_as_well() -> None:
+    with pytest.raises(DocumentError) as refused:
+        parse("corners: [[0, 0], [1]]", Polygon, "p.yaml")
+    assert refused.value.problems == ("p.yaml, line 1, column 1: corners.1.1 is missing",)
+    with pytest.raises(DocumentError, match="should have at least 2 items, not 1"):
+        parse("corners: [[0, 0]]", Polygon, "p.yaml")
+
+
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
@@ -103,6 +115,11 @@ KEYS = "circles, colour, corner, named, scale, shape, tilt_rad, title, visible"
             "title: x\nshape: {kind: square}",
             "line 2, column 1: shape.kind: 'square' is not one of 'circle', 'line'",
         ),
+        (
+            "title: x\nnamed:",
+            "line 2, column 1: named: an empty value should be a mapping of keys to values",
+        ),
+        ("title: x\ncircles: circle", "line 2, column 1: circles: 'circle' should be a list"),
         ("title: x\nzzz: 3", f"line 2, column 1: zzz is not a known key (known keys: {KEYS})"),
         ("title: x\ncolour: blue\ntilt_rad: 1", "d.yaml: a blue drawing is not tilted"),
         # what is no YAML of ours

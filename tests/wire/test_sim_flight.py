@@ -16,6 +16,7 @@ from simulator.config import Scenario
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.px4 import PX4
 from simulator.mavlink.codec import Decoder, sender_of
+from simulator.start import Start
 from simulator.vehicle.conditions import Conditions
 
 PREARM_CHECK = 1 << 28  # MAV_SYS_STATUS_SENSOR
@@ -324,3 +325,9 @@ def test_faults_that_run_go_on_after_a_reboot_and_end_as_they_should() -> None:
     assert autopilot.state.estimate.velocity_ned_mps[1] == pytest.approx(0.0, abs=0.1)
     assert bench.command(400, 1) == [0]
     assert bench.of("ATTITUDE")[-1][1].time_boot_ms == pytest.approx(7540, abs=60)
+
+
+def test_a_flight_may_start_as_high_as_a_scenario_says() -> None:
+    """At MPC_TKO_SPEED, 1.5 m/s, that takes PX4 more than a minute."""
+    bench = Bench(scenario=Scenario(name="high", start=Start(height_m=100.0)))
+    assert bench.instance.autopilot.plant.height_m > 99.0
