@@ -16,9 +16,10 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum, auto
+from typing import Any
 
 import numpy as np
 from pydantic import Field
@@ -184,10 +185,10 @@ class Learner(VehicleEstimate):
         share = command.thrust_mps2 / self._told.vehicle.thrust_max_mps2
         self._commands.add(time_s, north, east, share, command.heading_rad)
 
-    def on_hover_thrust(self, hover_thrust: float) -> None:
-        """The hover thrust that the vehicle showed before the take-over, with which it is flown."""
-        super().on_hover_thrust(hover_thrust)
-        flown = self._told.vehicle.model_copy(update={"hover_thrust": hover_thrust})
+    def on_shown(self, constants: Mapping[str, Any]) -> None:
+        """Constants that the vehicle showed before the take-over, with which it is flown."""
+        super().on_shown(constants)
+        flown = self._told.vehicle.model_copy(update=constants)
         self._told = replace(self._told, vehicle=flown)
 
     def on_stage(self, stage: Stage, time_s: float) -> None:

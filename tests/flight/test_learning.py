@@ -22,6 +22,7 @@ from offboard.flight.estimates import HoverEstimate
 from offboard.flight.phases import FLYING, Phase
 from offboard.flight.record import IDENTIFIED_ID
 from offboard.identification.learner import LENGTH_S, IdentifySettings
+from offboard.mavlink.senders import DIALECTS
 from offboard.model.vehicle import AxisResponse, Vehicle
 from simulator import config as simulated
 from simulator.vehicle.attitude import build_loop
@@ -152,6 +153,25 @@ def test_slow_attitude_is_identified() -> None:
     assert tilt.delay_s == pytest.approx(0.057, abs=0.02)
     said = " | ".join(pair.companion.announced)
     assert "(configured 7.0): the vehicle's delay is not identified yet" in said
+
+
+def test_tilt_that_the_autopilot_accelerates_slowly_is_flown() -> None:
+    """Otherwise feedback asks for more of it than there is, and the vehicle is lost at 5 m."""
+    cdeg = 13000.0
+    slow = (math.radians(0.01 * cdeg),) * 2 + (2.2,)
+    copter = simulated.vehicle("arducopter")
+    pair = on_arducopter(
+        ONE_LAP, reference="lemniscate_4mps", believed=NEUTRAL, learning=IDENTIFY, seed=3,
+        flies=copter.model_copy(update={"angular_acceleration_limit_radps2": slow}),
+        scenario=scenario_of({"fault": "link", "latency_s": 0.095}),
+    )  # fmt: skip
+    for name in DIALECTS["ardupilot"].acceleration_parameters:
+        pair.instance.autopilot.parameters.set(name, cdeg)
+    pair.track()
+    assert pair.score().rmse_position_m < 0.2
+    said = " | ".join(pair.companion.announced)
+    assert "bandwidth limited to 2.8 rad/s laterally" in said
+    assert "its tilt is accelerated by at most 2.3 rad/s^2; identified delay" in said
 
 
 def test_white_noise_of_positions_is_no_delay_of_the_thrust() -> None:
