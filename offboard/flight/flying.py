@@ -45,6 +45,17 @@ def lifted_off(flight: FlightState) -> bool:
     return flight.contact.lifted_off
 
 
+def no_lift_off(flight: FlightState) -> str:
+    after = f"no lift-off in {flight.in_phase_s:.0f} s"
+    dialect = flight.dialect
+    if dialect is None or not dialect.takes_off_by_command:
+        return f"{after}; is hover_thrust in the vehicle file right?"
+    return (
+        f"{after} by the autopilot's own take-off; does full thrust carry the vehicle, and is "
+        f"{dialect.hover_parameter} right?"
+    )
+
+
 def at_start(flight: FlightState) -> bool:
     """The vehicle hovers at the start of the reference."""
     position, time_s = flight.vehicle.position, flight.time_s
@@ -174,7 +185,6 @@ def requested(request: Request) -> Condition:
 FLOWN, REFUSED, ABORTED = ExitCode.FLOWN, ExitCode.REFUSED, ExitCode.ABORTED
 FAILSAFE = "{flight.failsafe.cause}", "{flight.failsafe.reason}"
 AT_START = "hovers at the start of the reference"
-NO_LIFT_OFF = "no lift-off in {flight.in_phase_s:.0f} s; is hover_thrust in the vehicle file right?"
 NOT_IDENTIFIED = "identification did not converge in {flight.in_phase_s:.0f} s"
 HELD = "the autopilot held for {flight.in_phase_s:.0f} s"
 DID_NOT_HOLD = "the vehicle did not hold in {flight.in_phase_s:.0f} s"
@@ -206,7 +216,7 @@ def ends_early(*, serves: bool) -> tuple[Transition, ...]:
 
 TO_THE_END = (
     Transition({TAKEOFF}, lifted_off, CLIMB, reason="lifted off"),
-    Transition({TAKEOFF}, longer_than("lift_off_s"), LAND, ABORTED, reason=NO_LIFT_OFF),
+    Transition({TAKEOFF}, longer_than("lift_off_s"), LAND, ABORTED, reason=no_lift_off),
     Transition({CLIMB}, at_start_to_excite, EXCITE, reason="identification steps"),
     Transition({CLIMB}, at_start, JOIN, reason=AT_START),
     Transition({CLIMB}, too_late_at_start, LAND, ABORTED),
