@@ -25,7 +25,7 @@ import numpy as np
 from pydantic import Field
 
 from offboard.documents.parameters import Parameters
-from offboard.identification.attitude_fit import TILT, fit_axis, unexplained
+from offboard.identification.attitude_fit import FLY_STEPS, TILT, fit_axis, unexplained
 from offboard.identification.trace import (
     ATTITUDE_WIDTH,
     COMMAND_WIDTH,
@@ -293,6 +293,8 @@ class Learner(VehicleEstimate):
         refusal = found.refusals.get("tilt")
         if found.tilt and found.tilt.delay_s.sd > CERTAIN_S:
             refusal = f"its delay is uncertain: {in_ms(found.tilt.delay_s)}"
+        if refusal and self._settings.excite:  # it does
+            refusal = refusal.removesuffix(FLY_STEPS)
         may_repeat = self._stage is Stage.STEPS and self._rounds < MOST_ROUNDS
         if refusal is not None and may_repeat and not self._left_box:
             self._rounds += 1
@@ -302,6 +304,9 @@ class Learner(VehicleEstimate):
         self.identified = True
         self.adopt(found, self._time_s)
         self.explain(refusal or "it is out of bounds")
+        if self.delay is None:
+            self.sentences.append(self.cause)
+            self.cause = ""
 
     def _identify_drag(self) -> Work:
         trace = self._flown_since(max(self.motion_s, self._time_s - DRAG_OVER_S))
