@@ -6,6 +6,9 @@ the vertical one is built with such a difference: a decision every period on the
 replaying the commands sent, and an observer updated by position and attitude. It is stable if the
 eigenvalues of its transition matrix over one period are within the unit circle.
 
+An attitude loop whose angular acceleration is limited answers later the larger the command: the
+lateral bandwidth is also at most that at which the largest feedback asks for no more of it.
+
 The phase margin of the loop's frequency response (`control.stability_margins`) agrees with this to
 10 % for delays below 60 ms, but at 10 Hz and 90 to 310 ms, where the loop gain has several
 crossings near 1, it is up to 60 % too long: it is not used.
@@ -33,6 +36,7 @@ LEAST_MARGIN_S, SHARE_OF_DELAY = 0.04, 0.15  # jitter, which grows with the dela
 STEP_RADPS, LEAST_RADPS = 0.25, 1.0
 SUBSTEPS = 10  # of a period, at which the observer is corrected
 STABLE = 1.0 - 1e-6
+FEEDBACK_LIMIT = 0.3  # the default of `feedback_limit`
 # The observer: noise densities of [p v b b' d] and [z v f d], sds of measurements by index
 _Q = NOISE.acceleration_mps, 1e-5, NOISE.tilt_radps, NOISE.disturbance_mps2
 LATERAL_DENSITIES, VERTICAL_DENSITIES = (1e-5, *_Q), (1e-5, *_Q[:2], _Q[3])
@@ -48,7 +52,8 @@ def supported_bandwidth(
     vertical one for a longer or a shorter delay of the thrust (a modelled delay that is too long
     makes it unstable, too); never below LEAST_RADPS.
 
-    The delay differs by `uncertainty`, at least 40 ms, and for the tilt 15 % of its delay.
+    The delay differs by `uncertainty`, at least 40 ms, and for the tilt 15 % of its delay. The
+    lateral one is at most `tilting_bandwidth`.
     """
     vehicle = vehicle.later_by(uncertainty.link_s)
     tilt_s = max(LEAST_MARGIN_S, SHARE_OF_DELAY * vehicle.tilt.delay_s, uncertainty.tilt_s)
@@ -68,7 +73,15 @@ def supported_bandwidth(
         )  # fmt: skip
         return all(map(loop.is_stable, np.linspace(-thrust_s, thrust_s, 4)))
 
-    return Bandwidth(_highest(lateral_bears, most_radps), _highest(vertical_bears, most_radps))
+    lateral_radps = _highest(lateral_bears, min(most_radps, tilting_bandwidth(vehicle)))
+    return Bandwidth(lateral_radps, _highest(vertical_bears, most_radps))
+
+
+def tilting_bandwidth(vehicle: Vehicle) -> float:
+    """The bandwidth at which feedback of FEEDBACK_LIMIT asks for the greatest angular acceleration
+    of the tilt."""
+    most_radps2 = min(vehicle.angular_acceleration_limit_radps2[:2])
+    return max(LEAST_RADPS, math.sqrt(most_radps2 / FEEDBACK_LIMIT))
 
 
 def _highest(bears: Callable[[float], bool], most_radps: float) -> float:

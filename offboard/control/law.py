@@ -40,7 +40,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from offboard.control.bandwidth import supported_bandwidth
+from offboard.control.bandwidth import FEEDBACK_LIMIT, supported_bandwidth
 from offboard.control.base import (
     Bandwidth,
     Certificate,
@@ -87,7 +87,7 @@ class TrackingSettings(ControllerSettings):
     """
 
     bandwidth_radps: float = Field(default=7.0, ge=0.5, le=20)
-    feedback_limit: float = Field(default=0.3, ge=0.02, le=1)
+    feedback_limit: float = Field(default=FEEDBACK_LIMIT, ge=0.02, le=1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +140,7 @@ class TrackingLaw:
         self.period_s = period_s
         self.configured_radps = settings.bandwidth_radps
         self.settings, self._vehicle_file = settings, vehicle
-        self._bandwidth_found_for: object = None  # delays and their uncertainty
+        self._bandwidth_found_for: object = None  # delays, their uncertainty, and limits
         self.set_vehicle(vehicle)
 
     def reset(self) -> None:
@@ -153,12 +153,13 @@ class TrackingLaw:
         self._tilt_ripple = tilt_ripple(vehicle, self.period_s)
         self._thrust_ripple = thrust_ripple(vehicle, self.period_s)
         delays = vehicle.tilt, vehicle.thrust_delay_s, vehicle.thrust_lag_s, uncertainty
+        limits = *delays, vehicle.angular_acceleration_limit_radps2
         configured = self.configured_radps
         if uncertainty is None:
             self.bandwidth = Bandwidth(configured, configured)
-        elif delays != self._bandwidth_found_for:  # another drag alone changes no bandwidth
+        elif limits != self._bandwidth_found_for:  # another drag alone changes no bandwidth
             self.bandwidth = supported_bandwidth(vehicle, uncertainty, self.period_s, configured)
-        self._bandwidth_found_for = delays
+        self._bandwidth_found_for = limits
         self._use_gains()
 
     def _use_gains(self) -> None:

@@ -10,6 +10,7 @@ import math
 from dataclasses import astuple
 from operator import sub
 
+from offboard.control.bandwidth import tilting_bandwidth
 from offboard.control.base import Adaptive, Situation
 from offboard.documents.errors import located
 from offboard.flight import failsafe, outbox
@@ -179,8 +180,12 @@ def _with_bandwidth(
     text = f"bandwidth limited to {used} (configured {configured_radps:.1f})"
     if as_configured:
         text = f"bandwidth {used} as configured"
-    if update.cause:
-        return (*update.sentences, f"{text}: {update.cause}")
+    causes = [update.cause] if update.cause else []
+    if used.lateral_radps == tilting_bandwidth(update.vehicle):
+        most_radps2 = min(update.vehicle.angular_acceleration_limit_radps2[:2])
+        causes.insert(0, f"its tilt is accelerated by at most {most_radps2:.1f} rad/s^2")
+    if causes:
+        return (*update.sentences, f"{text}: {'; '.join(causes)}")
     return ("; ".join((*update.sentences, text)),)
 
 

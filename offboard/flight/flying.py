@@ -81,10 +81,13 @@ def too_late_at_start(flight: FlightState) -> str:
 
 
 def no_lift_off(flight: FlightState) -> str:
-    sentence = f"no lift-off in {flight.in_phase_s:.0f} s"
-    if flight.takes_off_by_command:
-        return f"{sentence}, by the autopilot's own take-off"
-    return f"{sentence}; is hover_thrust in the vehicle file right?"
+    after = f"no lift-off in {flight.in_phase_s:.0f} s"
+    if flight.dialect is None or not flight.takes_off_by_command:
+        return f"{after}; is hover_thrust in the vehicle file right?"
+    return (
+        f"{after} by the autopilot's own take-off; does full thrust carry the vehicle, and is "
+        f"{flight.dialect.hover_parameter} right?"
+    )
 
 
 def identified(flight: FlightState) -> bool:

@@ -5,6 +5,7 @@ taken, and begins its phase. `actions` has what is sent in a phase.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from functools import cache
 
 import numpy as np
@@ -24,7 +25,7 @@ from offboard.flight.phases import (
 )
 from offboard.flight.preflight import ParameterReading
 from offboard.flight.state import FlightState, Outcome
-from offboard.identification.learner import Stage
+from offboard.identification.learner import Learner, Stage
 from offboard.mavlink.events import LocalPosition
 
 DIFFERENT = 0.1  # of the hover thrust: a smaller difference is left to the observer
@@ -146,6 +147,7 @@ def _enter(flight: FlightState, row: Transition) -> None:
         flight.positioning.begin(flight.vehicle, rates_hz, dialect.estimator_message)
         if flight.identification:
             flight.identification.on_link_delay(flight.clock.delay)
+            _set_acceleration(flight, flight.identification, dialect.acceleration_parameters)
         if source is Phase.ARM:  # on the ground the time that it takes does no harm
             decision.begin(flight)
     if flight.identification:
@@ -244,6 +246,16 @@ def _place_reference(flight: FlightState, position: LocalPosition) -> None:
         flight.plan.origin_ned_m = from_rest or jumps.reported(flight.home_ned_m)
 
 
+def _set_acceleration(flight: FlightState, learner: Learner, units: Mapping[str, float]) -> None:
+    """Fly with the angular acceleration to which the autopilot's parameters limit the tilt."""
+    shown = [flight.vehicle.parameters.get(name, 0.0) * unit for name, unit in units.items()]
+    least = min((each for each in shown if each > 0.0), default=math.inf)
+    *tilt, yaw = flight.model.angular_acceleration_limit_radps2
+    limits = {"angular_acceleration_limit_radps2": (*(min(each, least) for each in tilt), yaw)}
+    flight.model = flight.model.model_copy(update=limits)
+    learner.on_shown(limits)
+
+
 def _set_hover_thrust(flight: FlightState, least: float = DIFFERENT) -> None:
     """Fly with the hover thrust measured before the take-over, if it differs from the model's."""
     model = flight.model
@@ -253,7 +265,7 @@ def _set_hover_thrust(flight: FlightState, least: float = DIFFERENT) -> None:
     flight.model = model.model_copy(update={"hover_thrust": shown})
     flight.observer.set_vehicle(flight.model)
     if flight.identification:
-        flight.identification.on_hover_thrust(shown)
+        flight.identification.on_shown({"hover_thrust": shown})
     outbox.announce(
         flight,
         f"hover thrust {shown:.3f} by thrust and acceleration before the take-over, "

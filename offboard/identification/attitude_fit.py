@@ -68,6 +68,7 @@ MODEL_SDS = (0.002, 0.025, 0.025)
 UNEXPLAINED, UNEXPLAINED_SHARE = 0.008, 0.3
 
 
+FLY_STEPS = "; fly steps"
 EXPLAINED = 0.6  # least share of the commanded motion that the fitted response must explain
 
 
@@ -183,7 +184,7 @@ def _refusal(fit: ResponseFit, sd_limits: tuple[float, float, float]) -> str:
         if at_lower or estimate.value > UPPER[index] - margin:
             return f"its {name} is at the limit of the search, {estimate.value:.3g}"
         if not estimate.sd <= limit:
-            return f"its {name} is uncertain: sd {estimate.sd:.2g}, limit {limit:.2g}; fly steps"
+            return f"its {name} is uncertain: sd {estimate.sd:.2g}, limit {limit:.2g}{FLY_STEPS}"
     return ""
 
 

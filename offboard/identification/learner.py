@@ -16,15 +16,16 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum, auto
+from typing import Any
 
 import numpy as np
 from pydantic import Field
 
 from offboard.documents.parameters import Parameters
-from offboard.identification.attitude_fit import TILT, fit_axis, unexplained
+from offboard.identification.attitude_fit import FLY_STEPS, TILT, fit_axis, unexplained
 from offboard.identification.trace import (
     ATTITUDE_WIDTH,
     COMMAND_WIDTH,
@@ -184,10 +185,10 @@ class Learner(VehicleEstimate):
         share = command.thrust_mps2 / self._told.vehicle.thrust_max_mps2
         self._commands.add(time_s, north, east, share, command.heading_rad)
 
-    def on_hover_thrust(self, hover_thrust: float) -> None:
-        """The hover thrust that the vehicle showed before the take-over, with which it is flown."""
-        super().on_hover_thrust(hover_thrust)
-        flown = self._told.vehicle.model_copy(update={"hover_thrust": hover_thrust})
+    def on_shown(self, constants: Mapping[str, Any]) -> None:
+        """Constants that the vehicle showed before the take-over, with which it is flown."""
+        super().on_shown(constants)
+        flown = self._told.vehicle.model_copy(update=constants)
         self._told = replace(self._told, vehicle=flown)
 
     def on_stage(self, stage: Stage, time_s: float) -> None:
@@ -292,6 +293,8 @@ class Learner(VehicleEstimate):
         refusal = found.refusals.get("tilt")
         if found.tilt and found.tilt.delay_s.sd > CERTAIN_S:
             refusal = f"its delay is uncertain: {in_ms(found.tilt.delay_s)}"
+        if refusal and self._settings.excite:  # it does
+            refusal = refusal.removesuffix(FLY_STEPS)
         may_repeat = self._stage is Stage.STEPS and self._rounds < MOST_ROUNDS
         if refusal is not None and may_repeat and not self._left_box:
             self._rounds += 1
@@ -301,6 +304,9 @@ class Learner(VehicleEstimate):
         self.identified = True
         self.adopt(found, self._time_s)
         self.explain(refusal or "it is out of bounds")
+        if self.delay is None:
+            self.sentences.append(self.cause)
+            self.cause = ""
 
     def _identify_drag(self) -> Work:
         trace = self._flown_since(max(self.motion_s, self._time_s - DRAG_OVER_S))

@@ -10,6 +10,7 @@ vehicle time.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -182,9 +183,9 @@ class VehicleEstimate:
         of_tilt = f"is {in_ms(self.delay)}" if self.delay else "is not identified yet"
         self.cause = f"the link's delay {of_link}, the tilt's {of_tilt}"
 
-    def on_hover_thrust(self, hover_thrust: float) -> None:
-        """The hover thrust that the vehicle showed before the take-over, with which it is flown."""
-        self.vehicle = self.vehicle.model_copy(update={"hover_thrust": hover_thrust})
+    def on_shown(self, constants: Mapping[str, Any]) -> None:
+        """Constants that the vehicle showed before the take-over, with which it is flown."""
+        self.vehicle = self.vehicle.model_copy(update=constants)
 
     # ------------------------------------------------------------------ fits
 

@@ -244,7 +244,7 @@ def test_parameters_of_another_release_are_not_awaited(replies: tuple[str, ...])
     missing = {each.name for each in DIALECTS["ardupilot"].unanswered(known)}
     assert missing == {
         "GUID_OPTIONS", "GUID_TIMEOUT", "MOT_THST_HOVER", "ATC_ANGLE_BOOST", "FS_GCS_ENABLE",
-        "FS_THR_ENABLE",
+        "FS_THR_ENABLE", "ATC_ACCEL_R_MAX", "ATC_ACCEL_P_MAX",
     }  # fmt: skip
 
 

@@ -394,7 +394,7 @@ ROWS = {
     ),
     "take-off by command": flies(took_off_by_command, fly=copter.hop),
     "take-off refused": ends(
-        ".*no lift-off in 8 s, by the autopilot's own take-off", stayed_down_without_a_setpoint,
+        ".*no lift-off in 8 s by the .* is MOT_THST_HOVER right", stayed_down_without_a_setpoint,
         fly=copter.hop,
         firmware=replace(ARDUPILOT, rules=(NO_TAKEOFF, *ARDUPILOT.rules)),
     ),

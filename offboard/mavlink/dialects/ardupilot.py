@@ -43,6 +43,7 @@ _JERK = WatchedParameter(
     ),
     advice_only=True,
 )
+_ACCELERATIONS = "ATC_ACCEL_R_MAX", "ATC_ACCEL_P_MAX"
 _UNCHECKED = Valid("the vehicle arms without all of its checks", 1.0, 1.0, 1.0)
 
 # Parameters that replace another one: since ArduCopter 4.7
@@ -122,11 +123,16 @@ ARDUPILOT = Dialect(
         WatchedParameter(
             "ATC_ANGLE_MAX", "greatest tilt of its own modes, degrees", replaces="ANGLE_MAX"
         ),
+        *(
+            WatchedParameter(name, "greatest angular acceleration, hundredths of a degree/s^2")
+            for name in _ACCELERATIONS
+        ),
     ),
     hover_parameter="MOT_THST_HOVER",
     tilt_parameters=MappingProxyType(
         {"ANGLE_MAX": math.radians(0.01), "ATC_ANGLE_MAX": math.radians(1.0)}
     ),
+    acceleration_parameters=MappingProxyType(dict.fromkeys(_ACCELERATIONS, math.radians(0.01))),
     estimator_message="EKF_STATUS_REPORT",
     slow_hint="another ground station may set the rates (MAVProxy: `set streamrate -1`), or the "
     "link is full",

@@ -144,6 +144,7 @@ PX4 = Dialect(
     ),
     hover_parameter="MPC_THR_HOVER",
     tilt_parameters=MappingProxyType({"MPC_TILTMAX_AIR": math.radians(1.0)}),
+    acceleration_parameters=MappingProxyType({}),
     estimator_message="ESTIMATOR_STATUS",
     slow_hint="raise MAV_x_RATE of this link, in bytes/s: PX4 slows all messages down to it",
     # PX4 sends these texts only on a link on which a HEARTBEAT of type GCS arrives. Ours is not:
