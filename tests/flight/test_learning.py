@@ -32,6 +32,7 @@ TRUE = simulated.vehicle("px4_sih")
 FIVE_S, ONE_LAP = "reference.duration_s=5.0", "reference.laps=1"
 QUICK = {"delay_s": 0.03, "natural_frequency_radps": 8.0, "damping": 0.5}
 SLUGGISH = {"delay_s": 0.04, "natural_frequency_radps": 3.5, "damping": 1.05}
+LATE = {"delay_s": 0.265, "natural_frequency_radps": 5.4, "damping": 0.51}
 SLOW = {"delay_s": 0.09, "natural_frequency_radps": 14.0, "damping": 1.1}
 
 
@@ -116,10 +117,15 @@ def test_slow_thrust_is_identified() -> None:
     [
         pytest.param({"thrust_lag_s": 0.3, "thrust_delay_s": 0.06}, id="thrust"),
         pytest.param({"tilt": AxisResponse(**SLUGGISH), "thrust_lag_s": 0.1}, id="attitude"),
+        pytest.param(
+            {"tilt": AxisResponse(**LATE), "thrust_lag_s": 0.15, "thrust_delay_s": 0.13},
+            id="swings",
+        ),
     ],
 )
 def test_vehicle_of_unknown_delays_is_held_until_they_are_identified(true: dict[str, Any]) -> None:
-    """Otherwise its height oscillates by 1 m, or it is lost at 5 m, before the steps."""
+    """Otherwise its height oscillates by 1 m, or it is lost at 5 m, before the steps. One that
+    swings there is identified from that."""
     flies = unseen(QUICK, 0.15, 0.5).model_copy(update=true)
     pair = learning(ONE_LAP, flies=flies, seed=3, aloft=False)
     pair.track()
