@@ -48,7 +48,9 @@ def summary(score: Score, history: History) -> dict[str, str]:
         rows["computer"] = busy
     elif score.at_bound_share >= AT_LIMIT_SHARE:
         share = f"{100.0 * score.at_bound_share:.0f} % of the decisions"
-        rows["at a limit"] = f"{share}: fly slower, or in less wind"
+        rows["at a limit"] = (
+            f"{share}: fly slower, in less wind, or with a lower controller.bandwidth_radps"
+        )
     if score.other_datagrams > 0:
         rows["ignored"] = (
             f"{score.other_datagrams:,.0f} datagrams of others or frames without signature"
