@@ -26,7 +26,6 @@ SECTIONS = {
 }
 
 AT_LIMIT_SHARE = 0.2  # of the decisions, from which a summary says so
-AT_REST_MPS = 0.1  # a reference that is not faster most of the time does not cause it
 
 
 def summary(score: Score, history: History) -> dict[str, str]:
@@ -49,10 +48,9 @@ def summary(score: Score, history: History) -> dict[str, str]:
         rows["computer"] = busy
     elif score.at_bound_share >= AT_LIMIT_SHARE:
         share = f"{100.0 * score.at_bound_share:.0f} % of the decisions"
-        velocity_mps = history.reference["velocity_ned_mps"]
-        moves = len(velocity_mps) and np.median(np.linalg.norm(velocity_mps, axis=1)) > AT_REST_MPS
-        instead = "fly slower, or in less wind" if moves else "fly with less bandwidth or wind"
-        rows["at a limit"] = f"{share}: {instead}"
+        rows["at a limit"] = (
+            f"{share}: fly slower, in less wind, or with a lower controller.bandwidth_radps"
+        )
     if score.other_datagrams > 0:
         rows["ignored"] = (
             f"{score.other_datagrams:,.0f} datagrams of others or frames without signature"

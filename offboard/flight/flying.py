@@ -37,6 +37,8 @@ from offboard.flight.vehicle_state import DISARMED_S
 
 TAKE_OVER_HEIGHT_M = 1.0  # where setpoints replace the autopilot's own take-off
 DETECTOR_S = 1.0  # EXTENDED_SYS_STATE is requested at 5 Hz
+RESTLESS_S = 5.0  # after the planned end of the climb: it swings, or there are gusts
+NEAR_M = 0.6  # the start
 REST_S = 0.5  # after the end of the reference
 WRONG_THRUST = 0.1  # of the hover thrust: less is not what keeps a vehicle from its place
 
@@ -57,9 +59,11 @@ def at_start(flight: FlightState) -> bool:
 
 
 def at_start_to_excite(flight: FlightState) -> bool:
+    """The vehicle hovers there, or does not come to rest: its swings show its response, too."""
     identification = flight.identification
     wanted = identification is not None and identification.wants_excitation
-    return wanted and at_start(flight)
+    restless = flight.plan.overdue_s(flight.time_s) > RESTLESS_S
+    return wanted and (restless or at_start(flight))
 
 
 def too_late_at_start(flight: FlightState) -> str:
@@ -91,7 +95,10 @@ def no_lift_off(flight: FlightState) -> str:
 
 
 def identified(flight: FlightState) -> bool:
-    return flight.identification is not None and flight.identification.finished(flight.time_s)
+    """And near the start again, if it was away from it meanwhile."""
+    identification = flight.identification
+    finished = identification is not None and identification.finished(flight.time_s)
+    return finished and flight.position_error_m < NEAR_M
 
 
 def at_full_speed(flight: FlightState) -> bool:

@@ -42,7 +42,12 @@ from offboard.identification.vehicle_estimate import (
     VehicleEstimate,
     in_ms,
 )
-from offboard.identification.vehicle_fit import Identified, identify_drag, identify_in_pieces
+from offboard.identification.vehicle_fit import (
+    Identified,
+    identify_drag,
+    identify_in_pieces,
+    identify_thrust,
+)
 from offboard.model.command import Command
 from offboard.model.frames import (
     heading_from_quaternion,
@@ -73,6 +78,8 @@ HOVER_EVERY_S, HOVER_OVER_S, HOVER_NEWS, HOVER_SDS = 1.0, 6.0, 0.06, 3.0
 HOVER_RELATED_S = 2.0  # time over which its errors are autocorrelated
 # Tilt: identified again while its delay is in doubt or its sd is greater than this
 WELL_KNOWN_S, TILT_EVERY_S, TILT_OVER_S = 0.004, 2.0, 12.0
+# Thrust: when it is identified again first, how often, over as much flight as the tilt
+THRUST_FIRST_S, THRUST_EVERY_S = 6.0, 2.0
 # Prediction: how often and over how much flight it is compared with the tilt, and after how many
 # contradictions in a row the vehicle is in doubt
 COMPARE_EVERY_S, COMPARE_OVER_S, COMPARE_TIMES = 0.5, 2.0, 2
@@ -269,8 +276,11 @@ class Learner(VehicleEstimate):
             return self._identify_tilt()
         if self.in_doubt:
             return None
-        if self._time_s >= self.motion_s + DRAG_FIRST_S and self._is_due("drag", DRAG_EVERY_S):
+        moved_s = self._time_s - self.motion_s
+        if moved_s >= DRAG_FIRST_S and self._is_due("drag", DRAG_EVERY_S):
             return self._identify_drag()
+        if moved_s >= THRUST_FIRST_S and self._is_due("thrust", THRUST_EVERY_S):
+            return self._identify_thrust()
         if self._is_due("hover", HOVER_EVERY_S):
             self._review_hover()
         return None
@@ -311,6 +321,12 @@ class Learner(VehicleEstimate):
     def _identify_drag(self) -> Work:
         trace = self._flown_since(max(self.motion_s, self._time_s - DRAG_OVER_S))
         self.review_drag(identify_drag(trace, self.vehicle), DRAG_NEWS_PS, self._time_s)
+        yield
+
+    def _identify_thrust(self) -> Work:
+        trace = self._flown_since(max(self.motion_s, self._time_s - TILT_OVER_S))
+        found = identify_thrust(trace, self.vehicle, self.added, self.file)
+        self.review_thrust(found, self._time_s)
         yield
 
     def _identify_tilt(self) -> Work:

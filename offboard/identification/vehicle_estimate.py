@@ -18,6 +18,7 @@ from offboard.identification.attitude_fit import ResponseFit, Unexplained
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_fit import (
     LINK_S,
+    LINK_SD_S,
     THRUST_DELAY_SD_S,
     THRUST_LAG_SD_S,
     Identified,
@@ -222,6 +223,25 @@ class VehicleEstimate:
         drag = found.drag_ps
         if drag and all(abs(drag.value - each) > max(least_ps, drag.sd) for each in known):
             self.adopt(found, time_s)
+
+    @property
+    def added(self) -> Estimate:
+        """What the link adds to the delays of the vehicle file, by that of the tilt."""
+        sd_s = self.delay.sd if self.delay else LINK_SD_S
+        return Estimate(self.vehicle.tilt.delay_s - self.file.tilt.delay_s, sd_s)
+
+    def review_thrust(self, found: Identified, time_s: float) -> None:
+        """Adopt a later fit of the thrust if it is more certain or another. The estimate of the
+        height wanders, and feedback answers that: in the steps it hides what they show."""
+        new, known = found.thrust_effect_s, self._thrust
+        if new is None or self.within_bounds(found)[1]:
+            return
+        least_s = max(LEAST_JUMP_S, THRUST_SDS * new.sd)
+        agrees = known is not None and abs(new.value - known.value) <= least_s
+        if known is None or not agrees or new.sd < BETTER * known.sd:
+            self.adopt(found, time_s)
+            if self.delay:
+                self.explain()
 
     def review_tilt(self, found: Identified, now: Unexplained, time_s: float) -> None:
         """Compare a later fit of the tilt with the constants in use, and adopt it if it is better.

@@ -162,11 +162,7 @@ def identify_in_pieces(trace: Trace, vehicle: Vehicle) -> Pieces[Identified]:
         reason = f"{motion.counts} are too few"
         refusals |= dict.fromkeys(("hover_thrust", "thrust_lag_s", "drag_ps"), reason)
         return found
-    known = {
-        "delay_s": _with_link(vehicle.thrust_delay_s, THRUST_DELAY_SD_S, link),
-        "lag_s": Estimate(vehicle.thrust_lag_s, THRUST_LAG_SD_S),
-        "drag_ps": DRAG_PRIOR_PS,
-    }
+    known = _known_thrust(vehicle, link) | {"drag_ps": DRAG_PRIOR_PS}
     vertical = fit_vertical(motion, vehicle.gravity_mps2, vehicle.hover_thrust, **known)
     if motion.speed_mps >= LEAST_SPEED_MPS:
         yield
@@ -175,7 +171,7 @@ def identify_in_pieces(trace: Trace, vehicle: Vehicle) -> Pieces[Identified]:
     drag = _drag(motion, thrust_mps2, DRAG_PRIOR_PS.value, refusals)
     if drag is not None:
         yield
-        known["drag_ps"] = Estimate(drag.value, max(drag.sd, 0.2 * drag.value, 0.05))
+        known["drag_ps"] = _known_drag(drag.value, drag.sd)
         vertical = fit_vertical(motion, vehicle.gravity_mps2, hover, **known)
     return replace(found, drag_ps=drag, **_accepted_vertical(motion, vertical, refusals))
 
@@ -197,6 +193,31 @@ def identify_drag(trace: Trace, vehicle: Vehicle) -> Identified:
         start_ps = vehicle.drag_per_mass_ps
         drag = _drag(motion, vehicle.thrust_max_mps2 * thrust, start_ps, refusals)
     return Identified(trace.seconds, drag_ps=drag, refusals=refusals)
+
+
+def identify_thrust(trace: Trace, vehicle: Vehicle, link: Estimate, file: Vehicle) -> Identified:
+    """Delay and lag of the thrust alone, given the other constants of `vehicle`. `link`: what the
+    link adds to the delays of the vehicle `file`."""
+    refusals: dict[str, str] = {}
+    found = Identified(trace.seconds, refusals=refusals)
+    enough = trace.seconds >= LEAST_SECONDS
+    if not enough or not (motion := Motion(trace, DRAG_SPACING_S)).sufficient:
+        return found
+    known = _known_thrust(file, link) | {"drag_ps": _known_drag(vehicle.drag_per_mass_ps)}
+    vertical = fit_vertical(motion, vehicle.gravity_mps2, vehicle.hover_thrust, **known)
+    accepted = _accepted_vertical(motion, vertical, refusals) | {"hover_thrust": None}
+    return replace(found, **accepted)
+
+
+def _known_thrust(vehicle_file: Vehicle, link: Estimate) -> dict[str, Estimate]:
+    return {
+        "delay_s": _with_link(vehicle_file.thrust_delay_s, THRUST_DELAY_SD_S, link),
+        "lag_s": Estimate(vehicle_file.thrust_lag_s, THRUST_LAG_SD_S),
+    }
+
+
+def _known_drag(drag_ps: float, sd_ps: float = 0.0) -> Estimate:
+    return Estimate(drag_ps, max(sd_ps, 0.2 * drag_ps, 0.05))
 
 
 def _link_delay(tilt: ResponseFit | None, vehicle: Vehicle) -> Estimate:
@@ -323,8 +344,9 @@ def summary(found: Identified) -> str:
             )
     if found.hover_thrust is not None:
         parts.append(f"hover thrust {found.hover_thrust.value:.3f}")
-    if found.thrust_lag_s is not None:
-        parts.append(f"thrust lag {1e3 * found.thrust_lag_s.value:.0f} ms")
+    if found.thrust_lag_s is not None and found.thrust_delay_s is not None:
+        lag_ms, delay_ms = 1e3 * found.thrust_lag_s.value, 1e3 * found.thrust_delay_s.value
+        parts.append(f"thrust lag {lag_ms:.0f} ms, delay {delay_ms:.0f} ms")
     if found.drag_ps is not None:
         parts.append(f"drag {found.drag_ps.value:.2f} +- {found.drag_ps.sd:.2f} 1/s")
     return "identified " + "; ".join(parts)

@@ -95,6 +95,26 @@ def test_doubt_ends_with_what_explains_the_flight() -> None:
         assert each.uncertainty.tilt_s == pytest.approx(KNOWN_S)
 
 
+def test_a_later_fit_of_the_thrust_is_adopted_if_it_is_more_certain_or_another() -> None:
+    def thrust(effect_s: float, sd_s: float) -> Identified:
+        parts = {"thrust_delay_s": Estimate(effect_s - 0.05, 0.02)}
+        parts |= {"thrust_lag_s": Estimate(0.05, 0.02), "thrust_effect_s": Estimate(effect_s, sd_s)}
+        return replace(fit(0.05), tilt=None, **parts)
+
+    estimate = estimate_with(fit(0.05))
+    for effect_s, sd_s, used_s, used_sd_s in (
+        (0.10, 0.02, 0.10, 0.02),  # the first
+        (0.12, 0.02, 0.10, 0.02),  # agrees, as uncertain
+        (0.11, 0.01, 0.11, 0.01),  # more certain
+        (0.17, 0.02, 0.17, 0.02),  # another
+        (0.80, 0.01, 0.17, 0.02),  # out of bounds
+    ):
+        estimate.review_thrust(thrust(effect_s, sd_s), 10.0)
+        vehicle = estimate.vehicle
+        assert vehicle.thrust_delay_s + vehicle.thrust_lag_s == pytest.approx(used_s)
+        assert estimate.uncertainty.thrust_s == pytest.approx(2.0 * used_sd_s)
+
+
 def test_another_delay_is_adopted_once_something_else_shows_it_too() -> None:
     """A second fit, or a contradiction that this one explains; not one that it does not explain."""
     estimate = estimate_with(fit(0.05))

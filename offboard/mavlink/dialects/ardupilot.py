@@ -43,7 +43,8 @@ _JERK = WatchedParameter(
     ),
     advice_only=True,
 )
-_ACCELERATIONS = "ATC_ACCEL_R_MAX", "ATC_ACCEL_P_MAX"
+# Their names until 4.6, and since 4.7
+_ACCELERATIONS = {"ATC_ACCEL_R_MAX": "ATC_ACC_R_MAX", "ATC_ACCEL_P_MAX": "ATC_ACC_P_MAX"}
 _UNCHECKED = Valid("the vehicle arms without all of its checks", 1.0, 1.0, 1.0)
 
 # Parameters that replace another one: since ArduCopter 4.7
@@ -124,15 +125,22 @@ ARDUPILOT = Dialect(
             "ATC_ANGLE_MAX", "greatest tilt of its own modes, degrees", replaces="ANGLE_MAX"
         ),
         *(
-            WatchedParameter(name, "greatest angular acceleration, hundredths of a degree/s^2")
-            for name in _ACCELERATIONS
+            each
+            for old, new in _ACCELERATIONS.items()
+            for each in (
+                WatchedParameter(old, "greatest angular acceleration, 0.01 degree/s^2"),
+                WatchedParameter(new, "greatest angular acceleration, degree/s^2", replaces=old),
+            )
         ),
     ),
     hover_parameter="MOT_THST_HOVER",
     tilt_parameters=MappingProxyType(
         {"ANGLE_MAX": math.radians(0.01), "ATC_ANGLE_MAX": math.radians(1.0)}
     ),
-    acceleration_parameters=MappingProxyType(dict.fromkeys(_ACCELERATIONS, math.radians(0.01))),
+    acceleration_parameters=MappingProxyType(
+        dict.fromkeys(_ACCELERATIONS, math.radians(0.01))
+        | dict.fromkeys(_ACCELERATIONS.values(), math.radians(1.0))
+    ),
     estimator_message="EKF_STATUS_REPORT",
     slow_hint="another ground station may set the rates (MAVProxy: `set streamrate -1`), or the "
     "link is full",
