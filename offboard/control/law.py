@@ -69,6 +69,9 @@ Array = NDArray[np.float64]
 
 HEADING_BOX_RAD = 0.5  # about the feed-forward: the autopilot closes the yaw loop
 HEADING_CURVATURE = 1.0
+# What the lead of the heading follows: more, as of noisy rows, would saturate motors, which then
+# lift more than they are told to
+HEADING_ACCELERATION_RADPS2 = -5.0, 5.0
 # Times at which `TrackingLaw.target` samples the reference: when the command begins to act on the
 # tilt, and half a period later, in the middle of its hold; the same of the thrust and the heading
 TILT_BEGINS, TILT_HELD, THRUST_BEGINS, THRUST_HELD, HEADING_HELD = range(5)
@@ -225,7 +228,7 @@ class TrackingLaw:
         heading_rad = lead(
             sample.heading_rad[HEADING_HELD],
             sample.heading_rate_radps[HEADING_HELD],
-            sample.heading_acceleration_radps2[HEADING_HELD],
+            np.clip(sample.heading_acceleration_radps2[HEADING_HELD], *HEADING_ACCELERATION_RADPS2),
             vehicle.yaw,
         )
         return Target(

@@ -35,6 +35,7 @@ class Truth:
     acceleration_ned_mps2: Triple
     attitude: Quaternion
     rates_frd_radps: Triple
+    thrust: float  # normalised collective thrust after the rotor lag
 
 
 class Plant:
@@ -121,13 +122,14 @@ class Plant:
     def truth(self) -> Truth:
         """The true state."""
         w, x, y, z, p, q, r, v_north, v_east, v_down, north, east, down = self._body.tolist()
-        _, _, _, a_north, a_east, a_down = self._rotor.tolist()
+        thrust, _, _, a_north, a_east, a_down = self._rotor.tolist()
         return Truth(
             (north, east, down),
             (v_north, v_east, v_down),
             (a_north, a_east, a_down),
             (w, x, y, z),
             (p, q, r),
+            thrust,
         )
 
     @property

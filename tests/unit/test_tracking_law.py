@@ -8,6 +8,8 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -93,6 +95,25 @@ def test_bounds_hold_and_the_feedback_is_limited(size: float, least: int, most: 
         assert G / 3.0 - 1e-12 <= decision.command.thrust_mps2 <= G / 0.4895
         touched += decision.certificate.at_bound
     assert least <= touched <= most
+
+
+def test_heading_that_jumps_is_not_led_by_all_of_it() -> None:
+    """As noisy rows do. Otherwise it is commanded 80 degrees off, which saturates motors."""
+    law, smooth = lqr(), lemniscate(15.0)
+    state = state_of(np.random.default_rng(1), smooth, 0.0)
+
+    def led_rad(acceleration_radps2: float) -> float:
+        sample = smooth.sample(np.full(5, 5.0))._replace(
+            heading_acceleration_radps2=np.full(5, acceleration_radps2)
+        )
+        reference = SimpleNamespace(sample=lambda _: sample)
+        return law.target(cast(Reference, reference), 5.0, state).heading_rad
+
+    assert led_rad(4.0) - led_rad(0.0) == pytest.approx(
+        4.0 / law.vehicle.yaw.natural_frequency_radps**2
+    )
+    assert led_rad(30.0) == led_rad(5.0)
+    assert led_rad(-30.0) == led_rad(-5.0)
 
 
 def test_swarm_finds_the_closed_form() -> None:
