@@ -12,11 +12,10 @@ from sim_bench import HOVER, LAND, LOITER, NAN, OFFBOARD, POSCTL, Bench, aloft, 
 from offboard.documents.errors import DocumentError
 from simulator import config
 from simulator.autopilot.firmware import Firmware
-from simulator.config import Scenario
+from simulator.config import Scenario, Start
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.px4 import PX4
 from simulator.mavlink.codec import Decoder, sender_of
-from simulator.start import Start
 from simulator.vehicle.conditions import Conditions
 
 PREARM_CHECK = 1 << 28  # MAV_SYS_STATUS_SENSOR
