@@ -104,6 +104,11 @@ def test_another_program_with_our_ids_and_a_strange_setpoint_are_seen() -> None:
         assert session.receive(sender.frame(land), PEER, 0.0).events[:1] == seen
         assert session.receive(sender.frame(rate) + sender.frame(read), PEER, 0.0).events == []
     assert session.receive(Sender(255, 190).frame(land), PEER, 0.0).events == []  # the pilot's
+    elsewhere, to_us = (
+        mavlink.MAVLink_command_long_message(*ids, 21, 0, *[0] * 7) for ids in ((2, 1), (1, 191))
+    )
+    assert session.receive(other.frame(elsewhere), PEER, 0.0).events == []
+    assert session.receive(twin.frame(to_us), PEER, 0.0).events == []  # our own ids
     assert session.receive(other.frame(level_setpoint(1)), PEER, 0.0).events == [
         events.OtherSender(1, 195)
     ]
