@@ -181,7 +181,7 @@ def _with_bandwidth(
     if as_configured:
         text = f"bandwidth {used} as configured"
     causes = [update.cause] if update.cause else []
-    if used.lateral_radps == tilting_bandwidth(update.vehicle):
+    if used.lateral_radps == tilting_bandwidth(update.vehicle) and not as_configured:
         most_radps2 = min(update.vehicle.angular_acceleration_limit_radps2[:2])
         causes.insert(0, f"its tilt is accelerated by at most {most_radps2:.1f} rad/s^2")
     if causes:

@@ -38,7 +38,6 @@ from offboard.flight.vehicle_state import DISARMED_S
 TAKE_OVER_HEIGHT_M = 1.0  # where setpoints replace the autopilot's own take-off
 DETECTOR_S = 1.0  # EXTENDED_SYS_STATE is requested at 5 Hz
 RESTLESS_S = 5.0  # after the planned end of the climb: it swings, or there are gusts
-NEAR_M = 0.6  # the start
 REST_S = 0.5  # after the end of the reference
 WRONG_THRUST = 0.1  # of the hover thrust: less is not what keeps a vehicle from its place
 
@@ -59,11 +58,19 @@ def at_start(flight: FlightState) -> bool:
 
 
 def at_start_to_excite(flight: FlightState) -> bool:
-    """The vehicle hovers there, or does not come to rest: its swings show its response, too."""
     identification = flight.identification
     wanted = identification is not None and identification.wants_excitation
-    restless = flight.plan.overdue_s(flight.time_s) > RESTLESS_S
-    return wanted and (restless or at_start(flight))
+    return wanted and at_start(flight)
+
+
+def restless(flight: FlightState) -> str:
+    """The vehicle did not come to rest at the start in time; its oscillation also shows the
+    response."""
+    identification, overdue_s = flight.identification, flight.plan.overdue_s(flight.time_s)
+    wanted = identification is not None and identification.wants_excitation
+    if not (wanted and overdue_s > RESTLESS_S):
+        return ""
+    return f"not at rest at the start of the reference in {overdue_s:.0f} s: identified in motion"
 
 
 def too_late_at_start(flight: FlightState) -> str:
@@ -77,7 +84,7 @@ def too_late_at_start(flight: FlightState) -> str:
     if abs(observer.hover_thrust_estimate / model.hover_thrust - 1.0) > WRONG_THRUST:
         return (
             f"{sentence}; the flight shows a hover thrust of {observer.hover_thrust_estimate:.2f}, "
-            f"hover_thrust of vehicle {model.name} is {model.hover_thrust:.2f}"
+            f"it is flown with {model.hover_thrust:.2f}"
         )
     if isinstance(flight.controller, Adaptive):
         return f"{sentence}; is the vehicle fast enough for controller.bandwidth_radps?"
@@ -95,10 +102,21 @@ def no_lift_off(flight: FlightState) -> str:
 
 
 def identified(flight: FlightState) -> bool:
-    """And near the start again, if it was away from it meanwhile."""
+    """The identification has finished and the vehicle is near the start, or hovers there if its
+    delay is still not known."""
     identification = flight.identification
+    if identification is None or not identification.finished(flight.time_s):
+        return False
+    near = flight.position_error_m < identification.box_m
+    return near and (identification.delay is not None or at_start(flight))
+
+
+def not_identified(flight: FlightState) -> str:
+    identification, in_phase_s = flight.identification, flight.in_phase_s
     finished = identification is not None and identification.finished(flight.time_s)
-    return finished and flight.position_error_m < NEAR_M
+    if finished or in_phase_s <= flight.limits.excite_s:
+        return ""
+    return f"identification did not converge in {in_phase_s:.0f} s"
 
 
 def at_full_speed(flight: FlightState) -> bool:
@@ -201,7 +219,6 @@ def requested(request: Request) -> Condition:
 FLOWN, REFUSED, ABORTED = ExitCode.FLOWN, ExitCode.REFUSED, ExitCode.ABORTED
 FAILSAFE = "{flight.failsafe.cause}", "{flight.failsafe.reason}"
 AT_START = "hovers at the start of the reference"
-NOT_IDENTIFIED = "identification did not converge in {flight.in_phase_s:.0f} s"
 HELD = "the autopilot held for {flight.in_phase_s:.0f} s"
 DID_NOT_HOLD = "the vehicle did not hold in {flight.in_phase_s:.0f} s"
 UNHEARD = "it stands on the ground, and no HEARTBEAT shows whether it is disarmed"
@@ -235,9 +252,10 @@ TO_THE_END = (
     Transition({TAKEOFF}, longer_than("lift_off_s"), LAND, ABORTED, reason=no_lift_off),
     Transition({CLIMB}, at_start_to_excite, EXCITE, reason="identification steps"),
     Transition({CLIMB}, at_start, JOIN, reason=AT_START),
-    Transition({CLIMB}, too_late_at_start, LAND, ABORTED),
-    Transition({EXCITE}, identified, JOIN, reason=AT_START),
-    Transition({EXCITE}, longer_than("excite_s"), LAND, ABORTED, reason=NOT_IDENTIFIED),
+    Transition({CLIMB}, restless, EXCITE),
+    Transition({CLIMB, EXCITE}, too_late_at_start, LAND, ABORTED),
+    Transition({EXCITE}, identified, JOIN, reason="identified, at the start of the reference"),
+    Transition({EXCITE}, not_identified, LAND, ABORTED),
     Transition({JOIN}, at_full_speed, TRACK, reason="on the reference at full speed"),
     Transition({TRACK}, track_over, HOVER, reason="the reference was flown"),
     Transition({HOLD}, longer_than("hold_s"), LAND, ABORTED, reason=HELD),

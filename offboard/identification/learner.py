@@ -225,6 +225,11 @@ class Learner(VehicleEstimate):
         self._left_box = self._left_box or error_m > self._settings.box_m
         return command if self._left_box else excited(command, time_s - self._steps_s)
 
+    @property
+    def box_m(self) -> float:
+        """How far from the start of the reference the steps may be flown."""
+        return self._settings.box_m
+
     def finished(self, time_s: float) -> bool:
         """Whether the steps are over and the observer has settled on what they showed."""
         settled = time_s >= self.adopted_s + SETTLE_S
@@ -261,27 +266,29 @@ class Learner(VehicleEstimate):
         return None
 
     def _due(self) -> Work | None:
-        """The work to begin now."""
+        """The work to begin now, if it has several pieces; a single piece is done at once."""
         if not self.identified:
             flown = self._stage is Stage.MOTION and not self._settings.excite
             if self._stage is Stage.STEPS:
-                flown = self._left_box or self._time_s >= self._steps_s + LENGTH_S
+                at_once = self._left_box and self._rounds == 1
+                flown = at_once or self._time_s >= self._steps_s + LENGTH_S
             return self._identify_all() if flown else None
         if self._stage is not Stage.MOTION:
             return None
         certain = self.delay is not None and self.delay.sd <= WELL_KNOWN_S
         if not self.in_doubt and self._is_due("compare", COMPARE_EVERY_S):
-            return self._compare_with_prediction()
+            self._compare_with_prediction()
+            return None
         if (self.in_doubt or not certain) and self._is_due("tilt", TILT_EVERY_S):
             return self._identify_tilt()
         if self.in_doubt:
             return None
         moved_s = self._time_s - self.motion_s
         if moved_s >= DRAG_FIRST_S and self._is_due("drag", DRAG_EVERY_S):
-            return self._identify_drag()
-        if moved_s >= THRUST_FIRST_S and self._is_due("thrust", THRUST_EVERY_S):
-            return self._identify_thrust()
-        if self._is_due("hover", HOVER_EVERY_S):
+            self._identify_drag()
+        elif moved_s >= THRUST_FIRST_S and self._is_due("thrust", THRUST_EVERY_S):
+            self._identify_thrust()
+        elif self._is_due("hover", HOVER_EVERY_S):
             self._review_hover()
         return None
 
@@ -306,10 +313,11 @@ class Learner(VehicleEstimate):
         if refusal and self._settings.excite:  # it does
             refusal = refusal.removesuffix(FLY_STEPS)
         may_repeat = self._stage is Stage.STEPS and self._rounds < MOST_ROUNDS
-        if refusal is not None and may_repeat and not self._left_box:
+        if refusal is not None and may_repeat:
             self._rounds += 1
             self._steps_s = self._time_s
-            self.sentences.append(f"repeating the steps, tilt not identified: {refusal}")
+            again = "more flight is awaited" if self._left_box else "repeating the steps"
+            self.sentences.append(f"{again}, tilt not identified: {refusal}")
             return
         self.identified = True
         self.adopt(found, self._time_s)
@@ -318,16 +326,14 @@ class Learner(VehicleEstimate):
             self.sentences.append(self.cause)
             self.cause = ""
 
-    def _identify_drag(self) -> Work:
+    def _identify_drag(self) -> None:
         trace = self._flown_since(max(self.motion_s, self._time_s - DRAG_OVER_S))
         self.review_drag(identify_drag(trace, self.vehicle), DRAG_NEWS_PS, self._time_s)
-        yield
 
-    def _identify_thrust(self) -> Work:
+    def _identify_thrust(self) -> None:
         trace = self._flown_since(max(self.motion_s, self._time_s - TILT_OVER_S))
         found = identify_thrust(trace, self.vehicle, self.added, self.file)
         self.review_thrust(found, self._time_s)
-        yield
 
     def _identify_tilt(self) -> Work:
         """Identify the tilt from the last seconds, without the lift-off and what came before a
@@ -338,7 +344,7 @@ class Learner(VehicleEstimate):
         found = Identified(trace.seconds, tilt=tilt)
         self.review_tilt(found, unexplained(trace, self.vehicle.tilt), self._time_s)
 
-    def _compare_with_prediction(self) -> Work:
+    def _compare_with_prediction(self) -> None:
         """Compare the tilt of the last seconds with what the constants predict."""
         begin_s = self._time_s - COMPARE_OVER_S
         trace = self._flown_since(begin_s)
@@ -348,7 +354,6 @@ class Learner(VehicleEstimate):
         if self._in_a_row >= COMPARE_TIMES:
             self._in_a_row, self._doubted_from_s = 0, begin_s
             self.on_contradiction(now, unexplained(trace, self.previous.tilt), self._time_s)
-        yield
 
     def _review_hover(self) -> None:
         """Adopt the mean of the observer's hover thrust if it differs from the one in use twice in

@@ -99,6 +99,7 @@ class VehicleEstimate:
         self._contradictions = 0
         self._calm_from_s = -math.inf  # the time of the last
         self._other_delay: Estimate | None = None  # seen once, contradicts the one in use
+        self._other_thrust = False  # seen once, differs from the one in use
         self._replaced: dict[str, Any] = {}  # tilt constants before the last adoption
         self._rejected_drag_ps = math.inf
 
@@ -200,14 +201,16 @@ class VehicleEstimate:
         if any(getattr(found, name) and not getattr(within, name) for name in DECISIVE):
             self.contradiction = "; ".join(sentences)
         applied = within.applied_to(self.vehicle)
-        vehicle = with_link_delay(within, applied, self.file)
+        if within.thrust_delay_s is not None:
+            self._thrust = within.thrust_effect_s
+            self._replaced.pop("thrust_delay_s", None)
+        known = {"thrust_delay_s"} if self._thrust else set()
+        vehicle = with_link_delay(within, applied, self.file, known)
         if within.tilt is not None:
             moved = [name for name in LINKED if getattr(vehicle, name) != getattr(applied, name)]
             self._replaced = {name: getattr(self.vehicle, name) for name in ("tilt", *moved)}
             self.delay = within.tilt.delay_s
             self._other_delay = None
-        if within.thrust_delay_s is not None:
-            self._thrust = within.thrust_effect_s
         if vehicle != self.vehicle:
             self.vehicle, self.adopted_s = vehicle, time_s
             sentences.insert(0, summary(within))
@@ -231,14 +234,21 @@ class VehicleEstimate:
         return Estimate(self.vehicle.tilt.delay_s - self.file.tilt.delay_s, sd_s)
 
     def review_thrust(self, found: Identified, time_s: float) -> None:
-        """Adopt a later fit of the thrust if it is more certain or another. The estimate of the
-        height wanders, and feedback answers that: in the steps it hides what they show."""
+        """Adopt a later fit of the thrust that is clearly more certain, or the second in a row that
+        differs from the one in use. During the steps the estimated height drifts, and feedback
+        against it hides a part of the response."""
         new, known = found.thrust_effect_s, self._thrust
         if new is None or self.within_bounds(found)[1]:
             return
-        least_s = max(LEAST_JUMP_S, THRUST_SDS * new.sd)
-        agrees = known is not None and abs(new.value - known.value) <= least_s
-        if known is None or not agrees or new.sd < BETTER * known.sd:
+        differs, seen_before = False, self._other_thrust
+        if known is not None:
+            used_s = self.vehicle.thrust_delay_s + self.vehicle.thrust_lag_s
+            allowed_s = max(LEAST_JUMP_S, THRUST_SDS * math.hypot(new.sd, known.sd))
+            differs = abs(new.value - used_s) > allowed_s
+        better = known is None or new.sd < BETTER * known.sd
+        self._other_thrust = differs and not better
+        if better or (differs and seen_before):
+            self._other_thrust = False
             self.adopt(found, time_s)
             if self.delay:
                 self.explain()

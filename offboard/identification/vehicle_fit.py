@@ -8,7 +8,7 @@ run in pieces of some milliseconds, so that each can be done between two control
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Mapping, Set
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
@@ -196,8 +196,8 @@ def identify_drag(trace: Trace, vehicle: Vehicle) -> Identified:
 
 
 def identify_thrust(trace: Trace, vehicle: Vehicle, link: Estimate, file: Vehicle) -> Identified:
-    """Delay and lag of the thrust alone, given the other constants of `vehicle`. `link`: what the
-    link adds to the delays of the vehicle `file`."""
+    """Delay and lag of the thrust alone, given the drag of `vehicle`; the hover thrust is fitted
+    with them, and not returned. `link`: what the link adds to the delays of the vehicle `file`."""
     refusals: dict[str, str] = {}
     found = Identified(trace.seconds, refusals=refusals)
     enough = trace.seconds >= LEAST_SECONDS
@@ -314,9 +314,11 @@ def _in_words(name: str) -> str:
     return " ".join(word for word in name.split("_") if word not in ("natural", "radps", "s", "ps"))
 
 
-def with_link_delay(found: Identified, target: Vehicle, vehicle_file: Vehicle) -> Vehicle:
+def with_link_delay(
+    found: Identified, target: Vehicle, vehicle_file: Vehicle, known: Set[str]
+) -> Vehicle:
     """`target`, its delays of thrust and heading increased by what the link adds to the tilt's,
-    unless they were identified themselves."""
+    unless they were identified themselves: now, or before (`known`: "thrust_delay_s")."""
     if found.tilt is None:
         return target
     added_s = found.tilt.delay_s.value - vehicle_file.tilt.delay_s
@@ -324,7 +326,8 @@ def with_link_delay(found: Identified, target: Vehicle, vehicle_file: Vehicle) -
         return target
     update: dict[str, Any] = {}
     thrust_delay_s = vehicle_file.thrust_delay_s + added_s
-    if target.thrust_delay_s < thrust_delay_s - LINK_S and found.thrust_delay_s is None:
+    unknown = found.thrust_delay_s is None and "thrust_delay_s" not in known
+    if unknown and target.thrust_delay_s < thrust_delay_s - LINK_S:
         update["thrust_delay_s"] = thrust_delay_s
     yaw_delay_s = vehicle_file.yaw.delay_s + added_s
     if found.yaw is None and target.yaw.delay_s < yaw_delay_s - LINK_S:

@@ -131,7 +131,7 @@ class Flights:
         """The present flight has ended, or the service does."""
         if self._recording:
             self._recording = False
-            self._keep_identified()
+            self._keep_identified(ended=True)
             self._record.end(engaged=self.current.ends_engaged)
 
     def _look_for_left(self) -> None:
@@ -159,7 +159,9 @@ class Flights:
     def _remembered(self, prepared: Prepared) -> IdentifiedVehicle | None:
         return self._memory.get(self._key, prepared) if self._key else None
 
-    def _keep_identified(self) -> None:
+    def _keep_identified(self, *, ended: bool = False) -> None:
+        """What the first flight identifies is kept at once, what a later one improves at its
+        end."""
         identification = self.current.identification
         if identification is None or not self._key:
             return
@@ -170,6 +172,6 @@ class Flights:
                 "what was identified of this vehicle is contradicted, and discarded: the next "
                 "flight identifies it again"
             )
-        elif not identification.contradicted and self._known is None and identification.result:
-            self._memory.keep(self._key, self._prepared, identification.result)
+        elif (result := identification.result) and (self._known is None or ended):
+            self._memory.keep(self._key, self._prepared, result)
             self._known = self._remembered(self._prepared)

@@ -230,6 +230,14 @@ def test_nothing_is_said_of_a_good_vehicle(firmware: Firmware) -> None:
     assert tested.instance.time_s - began_s < 6.0  # 8 s with what comes before and after
 
 
+def test_limits_of_the_angular_acceleration_have_their_units() -> None:
+    """Hundredths of a degree/s^2 until ArduCopter 4.6, degree/s^2 since 4.7."""
+    units = DIALECTS["ardupilot"].acceleration_parameters
+    shown = {"ATC_ACCEL_R_MAX": 11e4, "ATC_ACCEL_P_MAX": 11e4, "ATC_ACC_R_MAX": 1100.0}
+    for name, value in (shown | {"ATC_ACC_P_MAX": 1100.0}).items():
+        assert value * units[name] == pytest.approx(19.2, abs=0.01)
+
+
 @pytest.mark.parametrize(
     "replies",
     [

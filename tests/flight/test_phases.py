@@ -29,6 +29,7 @@ from offboard.flight.phases import (
 )
 from offboard.flight.state import FlightState
 from offboard.flight.transitions import next_row, table
+from offboard.identification.uncertainty import Estimate
 from offboard.mavlink.events import (
     Attitude,
     CommandAck,
@@ -162,7 +163,9 @@ EVENTS: dict[str, Setup] = {
     "lifted_off": _lift_off,
     "at_start": _reach_start,
     "at_start_to_excite": _all(_reach_start, _identify(wants_excitation=True)),
-    "identified": _identify(finished=lambda time_s: True),
+    "restless": _all(_climb(5.1, False), _identify(wants_excitation=True)),
+    "identified": _identify(finished=lambda time_s: True, delay=Estimate(0.1, 0.01)),
+    "not_identified": _since(Limits.excite_s + 0.1),
     "at_full_speed": _track_for(TRACK.track_start_s),
     "track_over": _track_for(TRACK.track_end_s),
     "at_rest": _track_for(TRACK.duration_s + 0.5),
@@ -335,7 +338,7 @@ def test_a_vehicle_that_does_not_climb_is_told_of_settings_that_it_has() -> None
     """Of the hover thrust where the flight shows another one; a law without bandwidth, of none."""
     bandwidth = "; is the vehicle fast enough for controller.bandwidth_radps?"
     for law, shown, hint in (
-        ("pso", 0.7, "; the flight shows a hover thrust of 0.70, hover_thrust of vehicle neutral"),
+        ("pso", 0.7, "; the flight shows a hover thrust of 0.70, it is flown with"),
         ("pso", 0.42, bandwidth),
         ("autopilot", 0.42, ""),
     ):

@@ -108,11 +108,13 @@ def test_engaged_handed_back_and_engaged_again(served: Served, on: str) -> None:
         if flight == 1:
             pair.pause(0.52)
             pair.run(1.0)
-        left_s = pair.time_s
+        left_s, flown = pair.time_s, pair.service.current.model
         pair.switch("pilot")
         pair.run(2.0)
         assert pair.phase is Phase.STANDBY
         assert commanded(pair, left_s) == []
+        # the next flight begins with what was found in motion, too
+        assert pair.service.current.model.drag_translation_npmps == flown.drag_translation_npmps
         if flight == 1:
             ticks = round((left_s - began_s) / 0.1)
             score = pair.score()

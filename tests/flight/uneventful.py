@@ -71,7 +71,11 @@ def uneventful(phase: Phase = Phase.TRACK, service: ServiceOptions | None = None
         predict=lambda time_s: SimpleNamespace(velocity_ned_mps=np.zeros(3)),
     )
     identification: Any = SimpleNamespace(
-        contradiction="", wants_excitation=False, finished=lambda time_s: False
+        contradiction="",
+        wants_excitation=False,
+        finished=lambda time_s: False,
+        delay=None,
+        box_m=0.6,
     )
     controller: Any = None
     flight = FlightState(

@@ -95,24 +95,45 @@ def test_doubt_ends_with_what_explains_the_flight() -> None:
         assert each.uncertainty.tilt_s == pytest.approx(KNOWN_S)
 
 
-def test_a_later_fit_of_the_thrust_is_adopted_if_it_is_more_certain_or_another() -> None:
-    def thrust(effect_s: float, sd_s: float) -> Identified:
-        parts = {"thrust_delay_s": Estimate(effect_s - 0.05, 0.02)}
-        parts |= {"thrust_lag_s": Estimate(0.05, 0.02), "thrust_effect_s": Estimate(effect_s, sd_s)}
-        return replace(fit(0.05), tilt=None, **parts)
+def thrust_fit(effect_s: float, sd_s: float = 0.02) -> Identified:
+    parts = {"thrust_delay_s": Estimate(effect_s - 0.05, 0.02)}
+    parts |= {"thrust_lag_s": Estimate(0.05, 0.02), "thrust_effect_s": Estimate(effect_s, sd_s)}
+    return replace(fit(0.05), tilt=None, **parts)
 
+
+def effect_s(vehicle: Vehicle) -> float:
+    return vehicle.thrust_delay_s + vehicle.thrust_lag_s
+
+
+def test_a_later_fit_of_the_thrust_is_adopted_if_it_is_more_certain_or_twice_another() -> None:
     estimate = estimate_with(fit(0.05))
-    for effect_s, sd_s, used_s, used_sd_s in (
+    for found_s, sd_s, used_s, used_sd_s in (
         (0.10, 0.02, 0.10, 0.02),  # the first
         (0.12, 0.02, 0.10, 0.02),  # agrees, as uncertain
         (0.11, 0.01, 0.11, 0.01),  # more certain
-        (0.17, 0.02, 0.17, 0.02),  # another
-        (0.80, 0.01, 0.17, 0.02),  # out of bounds
+        (0.17, 0.02, 0.11, 0.01),  # another, seen once
+        (0.12, 0.02, 0.11, 0.01),  # agrees
+        (0.17, 0.02, 0.11, 0.01),
+        (0.18, 0.02, 0.18, 0.02),  # another, twice in a row
+        (0.25, 0.09, 0.18, 0.02),  # too uncertain to be another
+        (0.25, 0.09, 0.18, 0.02),
+        (0.80, 0.01, 0.18, 0.02),  # out of bounds
     ):
-        estimate.review_thrust(thrust(effect_s, sd_s), 10.0)
-        vehicle = estimate.vehicle
-        assert vehicle.thrust_delay_s + vehicle.thrust_lag_s == pytest.approx(used_s)
+        estimate.review_thrust(thrust_fit(found_s, sd_s), 10.0)
+        assert effect_s(estimate.vehicle) == pytest.approx(used_s)
         assert estimate.uncertainty.thrust_s == pytest.approx(2.0 * used_sd_s)
+
+
+def test_neither_tilt_nor_contradiction_changes_an_identified_thrust() -> None:
+    estimate = estimate_with(fit(0.24))
+    assert estimate.vehicle.thrust_delay_s == pytest.approx(FILE.thrust_delay_s + 0.2)
+    estimate.review_thrust(thrust_fit(0.30), 5.0)
+    estimate.on_contradiction(CONTRADICTS, AGREES, 10.0)  # what was flown before explains more
+    assert estimate.vehicle.tilt == FILE.tilt
+    assert effect_s(estimate.vehicle) == pytest.approx(0.30)
+    estimate.review_tilt(fit(0.45), CONTRADICTS, 12.0)
+    assert estimate.vehicle.tilt.delay_s == 0.45
+    assert effect_s(estimate.vehicle) == pytest.approx(0.30)
 
 
 def test_another_delay_is_adopted_once_something_else_shows_it_too() -> None:
