@@ -37,10 +37,12 @@ from offboard.flight.vehicle_state import DISARMED_S
 
 TAKE_OVER_HEIGHT_M = 1.0  # where setpoints replace the autopilot's own take-off
 DETECTOR_S = 1.0  # EXTENDED_SYS_STATE is requested at 5 Hz
-RESTLESS_S = 5.0  # after the planned end of the climb: it swings, or there are gusts
-NEAR_M = 0.6  # the start
+# s after the planned end of the climb at which the steps begin, though the vehicle is not at rest
+RESTLESS_S = 5.0
+NEAR_M = 0.6  # from the start
 REST_S = 0.5  # after the end of the reference
-WRONG_THRUST = 0.1  # of the hover thrust: less is not what keeps a vehicle from its place
+# Relative error of hover_thrust; a smaller one does not keep a vehicle from the start
+WRONG_THRUST = 0.1
 
 
 def lifted_off(flight: FlightState) -> bool:
@@ -59,7 +61,8 @@ def at_start(flight: FlightState) -> bool:
 
 
 def at_start_to_excite(flight: FlightState) -> bool:
-    """The vehicle hovers there, or does not come to rest: its swings show its response, too."""
+    """The vehicle hovers at the start, or did not come to rest in time; its oscillation also shows
+    the response."""
     identification = flight.identification
     wanted = identification is not None and identification.wants_excitation
     restless = flight.plan.overdue_s(flight.time_s) > RESTLESS_S
@@ -95,7 +98,7 @@ def no_lift_off(flight: FlightState) -> str:
 
 
 def identified(flight: FlightState) -> bool:
-    """And near the start again, if it was away from it meanwhile."""
+    """The identification has finished and the vehicle is near the start."""
     identification = flight.identification
     finished = identification is not None and identification.finished(flight.time_s)
     return finished and flight.position_error_m < NEAR_M
