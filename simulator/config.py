@@ -1,9 +1,6 @@
-"""Scenarios and vehicles of the simulator, by shipped name or by file; a scenario that starts in
-the air."""
+"""Scenarios and vehicles of the simulator, by shipped name or by file."""
 
 from __future__ import annotations
-
-import math
 
 from pydantic import Field
 
@@ -11,8 +8,6 @@ from offboard.documents.errors import DocumentError
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import load_document
 from offboard.model.vehicle import Vehicle
-from simulator.autopilot.autopilot import Autopilot
-from simulator.autopilot.commander import Request
 from simulator.autopilot.firmware import Firmware
 from simulator.faults import Fault
 from simulator.faults.fault import ModeName
@@ -22,11 +17,6 @@ from simulator.vehicle.conditions import Conditions
 
 # Between two barriers (20 ms) more would fill a socket's buffer, so that barriers are lost
 LOCKSTEP_STRANGER_HZ = 5000.0
-
-# A start in the air
-CLIMB_S = 120.0  # for the climb: 100 m at 1.5 m/s, and until estimate and truth agree
-SETTLE_S = 2.0
-REACHED_M, STILL_MPS = 0.3, 0.1
 
 
 class Start(Parameters):
@@ -72,33 +62,3 @@ def check_for(flown: Scenario, firmware: Firmware, *, lockstep: bool) -> None:
 def vehicle(name: str) -> Vehicle:
     """A shipped vehicle or a file. Raises DocumentError."""
     return load_document(name, "vehicle", Vehicle)[0]
-
-
-def take_off(autopilot: Autopilot, start: Start) -> None:
-    """Boot, climb and enter the mode of `start`.
-
-    Raises:
-        DocumentError: the vehicle does not reach the height.
-    """
-    ready_s = autopilot.firmware.boot_events_s["ready"] * autopilot.health.boot_scale + SETTLE_S
-    while autopilot.state.time_s < ready_s:
-        autopilot.step()
-    # as a pilot with a ground station does, in a mode in which the firmware takes off
-    autopilot.handle("mode", Request(autopilot.firmware.reposition_mode))
-    autopilot.handle("arm")
-    autopilot.handle("takeoff", Request(takeoff_ned_m=(math.nan, math.nan, -start.height_m)))
-    end_s = ready_s + CLIMB_S
-    while not (hovers := _hovers(autopilot, start.height_m)) and autopilot.state.time_s < end_s:
-        autopilot.step()
-    if not hovers:
-        raise DocumentError(f"start.height_m: the vehicle does not hover at {start.height_m:g} m")
-    named = autopilot.firmware.mode_named(start.mode or autopilot.firmware.hold_mode)
-    assert named is not None
-    autopilot.commander.switch(named.name, by_failsafe=start.by_failsafe)
-    autopilot.commander.texts.clear()
-    autopilot.commander.announcements.clear()
-
-
-def _hovers(autopilot: Autopilot, height_m: float) -> bool:
-    off_m = abs(autopilot.plant.height_m - height_m)
-    return off_m < REACHED_M and abs(autopilot.state.estimate.velocity_ned_mps[2]) < STILL_MPS

@@ -10,11 +10,13 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
+from offboard.documents.errors import DocumentError
 from offboard.model.vehicle import Vehicle
 from simulator.autopilot.autopilot import Autopilot
+from simulator.autopilot.commander import Request
 from simulator.autopilot.firmware import Firmware
 from simulator.autopilot.position_controller import OFF
-from simulator.config import Start, take_off
+from simulator.config import Start
 from simulator.faults import Fault, prepare
 from simulator.link.framing import frames
 from simulator.link.impairment import carry
@@ -30,6 +32,10 @@ VIRTUAL_EPOCH_US = 1_767_225_600_000_000  # 2026-01-01, where virtual time begin
 BARRIER_STEPS = 5  # 20 ms
 RESTART_S = 1.0  # duration of a reboot by command
 _TIMESYNC = 111
+# A start in the air
+_CLIMB_S = 120.0  # for the climb: 100 m at 1.5 m/s, and until estimate and truth agree
+_SETTLE_S = 2.0
+_REACHED_M, _STILL_MPS = 0.3, 0.1
 
 
 class Instance:
@@ -83,7 +89,7 @@ class Instance:
         for name, value in (parameters or {}).items():
             self.autopilot.parameters.set(name, value)
         if start is not None:
-            take_off(self.autopilot, start)
+            _take_off(self.autopilot, start)
         clock_us = round(conditions.clock_start_s * 1e6)
         self.view = View(
             self.autopilot,
@@ -133,7 +139,7 @@ class Instance:
     def advance(self) -> None:
         """Simulate one step of STEP_S; telemetry waits in the links until `drain`."""
         self.steps += 1
-        if self._faults.waiting:
+        if self._faults.unfinished:
             self._faults.step(self.time_s, self)
             self.autopilot.state.invalidate()
         for datagram in carry(self._faults.up, [], self._now_us):
@@ -262,3 +268,33 @@ class Instance:
             for link in self.links:
                 link.outbox.send_now(name)
         commander.announcements.clear()
+
+
+def _take_off(autopilot: Autopilot, start: Start) -> None:
+    """Boot, climb and enter the mode of `start`.
+
+    Raises:
+        DocumentError: the vehicle does not reach the height.
+    """
+    ready_s = autopilot.firmware.boot_events_s["ready"] * autopilot.health.boot_scale + _SETTLE_S
+    while autopilot.state.time_s < ready_s:
+        autopilot.step()
+    # as a pilot with a ground station does, in a mode in which the firmware takes off
+    autopilot.handle("mode", Request(autopilot.firmware.reposition_mode))
+    autopilot.handle("arm")
+    autopilot.handle("takeoff", Request(takeoff_ned_m=(math.nan, math.nan, -start.height_m)))
+    end_s = ready_s + _CLIMB_S
+    while not (hovers := _hovers(autopilot, start.height_m)) and autopilot.state.time_s < end_s:
+        autopilot.step()
+    if not hovers:
+        raise DocumentError(f"start.height_m: the vehicle does not hover at {start.height_m:g} m")
+    named = autopilot.firmware.mode_named(start.mode or autopilot.firmware.hold_mode)
+    assert named is not None
+    autopilot.commander.switch(named.name, by_failsafe=start.by_failsafe)
+    autopilot.commander.texts.clear()
+    autopilot.commander.announcements.clear()
+
+
+def _hovers(autopilot: Autopilot, height_m: float) -> bool:
+    off_m = abs(autopilot.plant.height_m - height_m)
+    return off_m < _REACHED_M and abs(autopilot.state.estimate.velocity_ned_mps[2]) < _STILL_MPS

@@ -54,7 +54,7 @@ def table(firmware: Firmware) -> str:
 def target(rule: Rule) -> str:
     """The next mode of a row as the table shows it."""
     if isinstance(rule.to, ByParameter):
-        modes = ", ".join(f"{value} {mode}" for value, mode in rule.to.modes.items())
+        modes = ", ".join(f"{value} {mode}" for value, mode in sorted(rule.to.modes.items()))
         return f"by {rule.to.parameter}: {modes}"
     return rule.to.replace("*", "")
 
@@ -110,7 +110,7 @@ def exists(firmware: Firmware, condition: str) -> bool:
     name, compares, value = condition.partition("=")
     if compares:
         known = any(name == spec.name for spec in firmware.parameters)
-        return known and value.replace(",", "").isdecimal()
+        return known and all(map(str.isdecimal, value.split(",")))
     kind, _, event = condition.partition(" ")
     if kind in ("since", "latched"):
         return event in EVENTS
@@ -125,6 +125,15 @@ def test_rows_name_only_what_exists(firmware: Firmware) -> None:
     assert len(firmware.rules) > 50
     wrong = Rule("arm", when=("not amred", "COM_X=1"), to="LND")
     assert list(unknown(firmware, wrong)) == ["LND", "not amred", "COM_X=1"]
+    wrong = Rule("arm", f"{firmware.boot_mode} LND", to=ByParameter("COM_X", {1: "DRFT"}))
+    assert list(unknown(firmware, wrong)) == ["LND", "DRFT", "COM_X"]
+    known = firmware.system_parameter
+    assert [exists(firmware, f"{known}={values}") for values in ("1,2", "1,,2")] == [True, False]
+
+
+def test_both_firmwares_have_the_same_roles() -> None:
+    px4, ardupilot = (firmware.parameter_roles.keys() for firmware in FIRMWARES.values())
+    assert px4 == ardupilot
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
 """Columns of a log: which values of which messages are kept, as arrays of rows, and what is
-computed of them.
+computed from them.
 
 The rows of a message are the bytes of its payloads as they are in the log, after their times; only
 those that are used are kept.
@@ -30,7 +30,8 @@ from offboard.model.geodesy import Geodetic, position_ned_m
 Array = NDArray[np.float64]
 Rows = NDArray[np.void]
 Kind = TypeVar("Kind", bound=np.generic)
-# Columns of a message: name -> the first of its fields and how many values, in an array from where
+# Columns of a message: name -> the first of its fields, number of values, and in an array the index
+# of the first
 Columns = Mapping[str, tuple[str, int] | tuple[str, int, int]]
 
 ARRAY = "DEBUG_FLOAT_ARRAY"  # those of ours, with their array_id
@@ -63,7 +64,7 @@ OURS: dict[str, Columns] = {
     IDENTIFIED: {name: ("data", 2, 2 * place) for place, name in enumerate(RECORDED)},
 }  # fmt: skip
 _TIMES = ("time_s", "unix_s")
-_TRUTH = {"HIL_STATE_QUATERNION": 1e3, "SIM_STATE": 1.0}  # units of the altitude in a metre
+_TRUTH = {"HIL_STATE_QUATERNION": 1e3, "SIM_STATE": 1.0}  # altitude units per metre
 _NO_VOLTAGE, _NO_PERCENTAGE = 0xFFFF, -1  # of SYS_STATUS
 _LIMITS = {
     "position_ned_m": POSITION_LIMIT_M,
@@ -76,7 +77,7 @@ class Samples:
     """Rows of the messages of one kind, in the order of arrival.
 
     Args:
-        kind: name of the message in pymavlink; what follows a space is of no account.
+        kind: name of the message in pymavlink; what follows a space is ignored.
         columns: what is kept of it.
         unix_times: whether the time of its entry in the log is kept, too.
     """

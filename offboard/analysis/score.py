@@ -33,7 +33,8 @@ Array = NDArray[np.float64]
 
 
 def _metric(meaning: str, unit: str = "", *, wall: bool = False) -> float:
-    """`wall`: this computer's clock decides it, so that it differs between runs of one flight."""
+    """`wall`: measured with this computer's clock, so that it differs between runs of the same
+    flight."""
     about = {"meaning": meaning, "unit": unit, "wall": wall}
     value: float = field(default=math.nan, metadata=about)
     return value

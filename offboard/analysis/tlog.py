@@ -137,7 +137,8 @@ def _entry(data: bytes, at: int, *, certain: bool) -> LoggedMessage | None:
 
 
 def _end(data: bytes, at: int) -> int:
-    """Where the entry that begins at `at` ends; behind the data if they end within it."""
+    """Where the entry that begins at `at` ends; beyond the end of `data` if the entry is
+    incomplete."""
     return at + 8 + frame_size(data, at + 8)
 
 

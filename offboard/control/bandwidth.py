@@ -6,8 +6,8 @@ the vertical one is built with such a difference: a decision every period on the
 replaying the commands sent, and an observer updated by position and attitude. It is stable if the
 eigenvalues of its transition matrix over one period are within the unit circle.
 
-An attitude loop whose angular acceleration is limited answers later the larger the command: the
-lateral bandwidth is also at most that at which the largest feedback asks for no more of it.
+An attitude loop with limited angular acceleration follows large commands more slowly. The lateral
+bandwidth is therefore at most the one at which the largest feedback stays within that limit.
 
 The phase margin of the loop's frequency response (`control.stability_margins`) agrees with this to
 10 % for delays below 60 ms, but at 10 Hz and 90 to 310 ms, where the loop gain has several

@@ -69,8 +69,8 @@ Array = NDArray[np.float64]
 
 HEADING_BOX_RAD = 0.5  # about the feed-forward: the autopilot closes the yaw loop
 HEADING_CURVATURE = 1.0
-# What the lead of the heading follows: more, as of noisy rows, would saturate motors, which then
-# lift more than they are told to
+# Limits of the heading acceleration in the feed-forward. Noisy rows ask for more, which saturates
+# motors, so that thrust exceeds the command
 HEADING_ACCELERATION_RADPS2 = -5.0, 5.0
 # Times at which `TrackingLaw.target` samples the reference: when the command begins to act on the
 # tilt, and half a period later, in the middle of its hold; the same of the thrust and the heading

@@ -34,7 +34,7 @@ class UserError(Exception):
 
 
 class Unavailable(UserError):
-    """What was asked for is right, and cannot be had now: a link, a lock, a process."""
+    """The request is valid but cannot be met now: a link, lock or process is not available."""
 
     is_usage = False
 

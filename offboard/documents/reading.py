@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 M = TypeVar("M", bound=BaseModel)
 DESCRIPTION_SIZE = 200
 PROBLEMS_MOST = 10
-# of pydantic's sentences, and what a file of YAML calls it
+# pydantic's words, and YAML's words for them
 WORDS = {
     " after validation": "",
     "an object": "a mapping of keys to values",

@@ -183,7 +183,11 @@ def _with_bandwidth(
     causes = [update.cause] if update.cause else []
     if used.lateral_radps == tilting_bandwidth(update.vehicle) and not as_configured:
         most_radps2 = min(update.vehicle.angular_acceleration_limit_radps2[:2])
-        causes.insert(0, f"its tilt is accelerated by at most {most_radps2:.1f} rad/s^2")
+        causes.insert(
+            0,
+            "the autopilot limits the angular acceleration of the tilt to "
+            f"{most_radps2:.1f} rad/s^2",
+        )
     if causes:
         return (*update.sentences, f"{text}: {'; '.join(causes)}")
     return ("; ".join((*update.sentences, text)),)

@@ -37,9 +37,11 @@ from offboard.flight.vehicle_state import DISARMED_S
 
 TAKE_OVER_HEIGHT_M = 1.0  # where setpoints replace the autopilot's own take-off
 DETECTOR_S = 1.0  # EXTENDED_SYS_STATE is requested at 5 Hz
-RESTLESS_S = 5.0  # after the planned end of the climb: it swings, or there are gusts
+# s after the planned end of the climb, when the vehicle is identified though it is not at rest
+RESTLESS_S = 5.0
 REST_S = 0.5  # after the end of the reference
-WRONG_THRUST = 0.1  # of the hover thrust: less is not what keeps a vehicle from its place
+# Relative error of hover_thrust; a smaller one does not keep a vehicle from the start
+WRONG_THRUST = 0.1
 
 
 def lifted_off(flight: FlightState) -> bool:

@@ -181,5 +181,6 @@ class Limits(Parameters):
     tilt_error_rad: float = Field(default=0.5, ge=0.1, le=3.2)  # from every recent command
     ceiling_m: float = Field(default=120.0, gt=0, le=10000)  # above the take-off point
     radius_m: float = Field(default=1000.0, gt=0, le=100000)  # from the take-off point
-    battery: float = Field(default=0.1, ge=0, le=0.9)  # remaining, of 1; 1 lands at once
+    # remaining charge, 0 .. 1; with 1 the vehicle would land at once
+    battery: float = Field(default=0.1, ge=0, le=0.9)
     log_lost: Literal["land", "go_on"] = "land"  # the log cannot be written

@@ -350,8 +350,8 @@ def _late(ground: Ground) -> str:
 
 _ESTIMATOR = "wait for a GPS fix, keep the vehicle still and away from metal; then calibrate"
 _UNFIT = (
-    "are MAV_TYPE or FRAME_CLASS, and airframe in the vehicle file, right? Else fly it with its "
-    "own autopilot"
+    "check MAV_TYPE or FRAME_CLASS, and airframe in the vehicle file; if they are right, fly it "
+    "with its own autopilot"
 )
 _FAILSAFE = "let the pilot take over first"
 _CHOOSE = "choose one with --system, or give each vehicle its own port"

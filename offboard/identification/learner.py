@@ -78,7 +78,7 @@ HOVER_EVERY_S, HOVER_OVER_S, HOVER_NEWS, HOVER_SDS = 1.0, 6.0, 0.06, 3.0
 HOVER_RELATED_S = 2.0  # time over which its errors are autocorrelated
 # Tilt: identified again while its delay is in doubt or its sd is greater than this
 WELL_KNOWN_S, TILT_EVERY_S, TILT_OVER_S = 0.004, 2.0, 12.0
-# Thrust: when it is identified again first, how often, over as much flight as the tilt
+# Thrust: first fit after the reference begins, interval; over TILT_OVER_S of flight
 THRUST_FIRST_S, THRUST_EVERY_S = 6.0, 2.0
 # Prediction: how often and over how much flight it is compared with the tilt, and after how many
 # contradictions in a row the vehicle is in doubt
@@ -193,7 +193,7 @@ class Learner(VehicleEstimate):
         self._commands.add(time_s, north, east, share, command.heading_rad)
 
     def on_shown(self, constants: Mapping[str, Any]) -> None:
-        """Constants that the vehicle showed before the take-over, with which it is flown."""
+        """Use constants that the vehicle reported before the take-over."""
         super().on_shown(constants)
         flown = self._told.vehicle.model_copy(update=constants)
         self._told = replace(self._told, vehicle=flown)
@@ -310,7 +310,7 @@ class Learner(VehicleEstimate):
         refusal = found.refusals.get("tilt")
         if found.tilt and found.tilt.delay_s.sd > CERTAIN_S:
             refusal = f"its delay is uncertain: {in_ms(found.tilt.delay_s)}"
-        if refusal and self._settings.excite:  # it does
+        if refusal and self._settings.excite:  # steps are flown already
             refusal = refusal.removesuffix(FLY_STEPS)
         may_repeat = self._stage is Stage.STEPS and self._rounds < MOST_ROUNDS
         if refusal is not None and may_repeat:

@@ -186,7 +186,7 @@ class VehicleEstimate:
         self.cause = f"the link's delay {of_link}, the tilt's {of_tilt}"
 
     def on_shown(self, constants: Mapping[str, Any]) -> None:
-        """Constants that the vehicle showed before the take-over, with which it is flown."""
+        """Use constants that the vehicle reported before the take-over."""
         self.vehicle = self.vehicle.model_copy(update=constants)
 
     # ------------------------------------------------------------------ fits
@@ -229,7 +229,7 @@ class VehicleEstimate:
 
     @property
     def added(self) -> Estimate:
-        """What the link adds to the delays of the vehicle file, by that of the tilt."""
+        """Delay that the link adds to those in the vehicle file, as identified on the tilt."""
         sd_s = self.delay.sd if self.delay else LINK_SD_S
         return Estimate(self.vehicle.tilt.delay_s - self.file.tilt.delay_s, sd_s)
 

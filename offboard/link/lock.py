@@ -30,7 +30,7 @@ def _held(what: str, holder: int | str) -> Unavailable:
 @contextmanager
 def file_lock(path: Path, what: str) -> Iterator[None]:
     """The file stays, with the number of the last process: the kernel releases the lock with the
-    process. `what` the lock is for, for the sentence. Raises UserError."""
+    process. `what`: what the lock protects, named in the error. Raises UserError."""
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     except OSError as error:

@@ -45,7 +45,7 @@ class LiveProcess(Display):
         super().__init__(self._write, QUEUED_MAX)
 
     def await_ready(self) -> str:
-        """Wait until it listens; where. Raises Unavailable."""
+        """Wait until it listens; return its address. Raises Unavailable."""
         assert self._process.stdout is not None
         with self._process.stdout as output:
             said = output.readline()

@@ -62,7 +62,7 @@ class Frame:
 class FrameSplitter:
     """Finds frames. A datagram holds whole frames. A stream (serial, TCP) may end within a frame,
     which is kept for the next call. `frames` counts also those whose id is not known,
-    `bytes_skipped` what is in no frame."""
+    `bytes_skipped` bytes outside frames."""
 
     def __init__(self, stream: bool) -> None:
         self.bytes_received = self.bytes_skipped = self.frames = 0
@@ -81,7 +81,7 @@ class FrameSplitter:
             frame = parse(data, at, stop) if stop <= end else None
             unsure, adjoins = frame is not None and not frame.verified, at == behind
             if self._stream and (stop > end or (unsure and adjoins and stop == end)):
-                break  # what decides is still to come
+                break  # the bytes that decide have not arrived
             # without a known checksum a frame must fill the space between two others
             if unsure and not (adjoins and (stop == end or data[stop] in (V2, V1))):
                 frame = None
@@ -109,8 +109,8 @@ class FrameSplitter:
 
 
 def frame_size(data: bytes, at: int) -> int:
-    """Frame length given by the header at `at`; where the data end within this, that of the
-    shortest frame, which ends behind them, too."""
+    """Frame length given by the header at `at`; if the header is incomplete, the length of the
+    shortest frame, which also ends beyond the data."""
     if at + 3 > len(data):
         return _HEADER_BYTES_V1 + _CRC_BYTES
     if data[at] == V1:
@@ -121,7 +121,7 @@ def frame_size(data: bytes, at: int) -> int:
 
 def parse(data: bytes, at: int, end: int) -> Frame | None:
     """The frame in data[at:end], which `frame_size` has measured; None if its checksum is wrong, or
-    if it cannot be understood without a later version of MAVLink."""
+    if it has incompatibility flags of a later MAVLink version."""
     raw = data[at:end]
     message_id = message_id_of(raw)
     if raw[0] == V1:

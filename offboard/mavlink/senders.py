@@ -41,7 +41,7 @@ from offboard.mavlink.framing import (
     FrameSplitter,
 )
 from offboard.mavlink.outgoing import Target
-from offboard.mavlink.signing import Forgery, Signing
+from offboard.mavlink.signing import Refusal, Signing
 
 DIALECTS: Mapping[str, Dialect] = MappingProxyType({d.name: d for d in (PX4, ARDUPILOT)})
 _BY_AUTOPILOT = {dialect.mav_autopilot: dialect for dialect in DIALECTS.values()}
@@ -77,7 +77,7 @@ class Senders:
         self.target: Target | None = None  # of our messages: the vehicle
         self.clock_behind = False  # an autopilot whose clock is behind ours was heard
         self.systems: dict[int, float] = {}
-        self.forged: Counter[Forgery] = Counter()
+        self.forged: Counter[Refusal] = Counter()
         self._news_at = 1  # number of forged frames
         self._signs = False  # an autopilot that signs was heard, and we have no key
         self._other_component = 0  # of the newest autopilot that is not AUTOPILOT_COMPONENT
@@ -118,7 +118,8 @@ class Senders:
         return [each for each, _ in self.systems.items() - known.items()]
 
     def _genuine(self, datagram: bytes) -> Iterator[Frame]:
-        """The frames of a datagram that signing would accept. Counts nothing, uses up no stamp."""
+        """The frames of a datagram that signing would accept. Neither counts them nor stores their
+        time stamps."""
         for frame in FrameSplitter(stream=False).split(datagram):
             if not (self._signing and self._signing.refusal(frame, note=False)):
                 yield frame
@@ -132,11 +133,11 @@ class Senders:
         vehicle was found: its clock follows ours with our heartbeat. The frame may be a replay:
         nothing else is believed.
         """
-        forgery = self._signing.refusal(frame) if self._signing else None
-        if forgery is None:
+        refusal = self._signing.refusal(frame) if self._signing else None
+        if refusal is None:
             return False
-        self.forged[forgery] += 1
-        behind = forgery is Forgery.OLD_STAMP and self.vehicle is None
+        self.forged[refusal] += 1
+        behind = refusal is Refusal.OLD_STAMP and self.vehicle is None
         if behind and self.note(frame, now_s) and self._wanted in (None, frame.system_id):
             self.clock_behind, self.peer = True, peer
             armed = bool(frame.message.base_mode & ARMED)
@@ -144,8 +145,8 @@ class Senders:
         return True
 
     def judge(self, frame: Frame, peer: Hashable, now_s: float, events: list[Event]) -> bool:
-        """Whether it is a frame of our vehicle, and no command. Adds to `events` the vehicle when
-        it is found, commands to us, and others that control the vehicle."""
+        """Whether a frame comes from our vehicle and is no command. Adds to `events` the vehicle
+        when it is found, commands to us, and others that control the vehicle."""
         vehicle, message_id = self.vehicle, frame.message_id
         heard = self.note(frame, now_s)
         system_id = vehicle.system_id if vehicle else self._wanted
@@ -185,8 +186,8 @@ class Senders:
         return True
 
     def _note_command(self, frame: Frame, events: list[Event]) -> None:
-        """Add to `events` a command to us, or one for the mode from the vehicle's own system, as
-        ours are: that of a ground station is the pilot's."""
+        """Add to `events` a command to us, and a mode command from another companion computer of
+        the vehicle's system. A ground station's mode command is the pilot's and no event."""
         sender, receiver = Address(frame.system_id, frame.component_id), _receiver(frame)
         if receiver == self.own:
             if sender != self.own:
@@ -201,9 +202,10 @@ class Senders:
     def _is_companion(self, frame: Frame) -> bool:
         """Whether a HEARTBEAT is of another companion computer of our vehicle, with the
         vehicle's system id as ours. On PX4 some call themselves a ground station."""
-        unflown = frame.message.autopilot == _NO_AUTOPILOT
+        no_autopilot = frame.message.autopilot == _NO_AUTOPILOT
         on_vehicle = frame.system_id == self.own.system_id
-        return unflown and on_vehicle and frame.message.type in (TYPE_ONBOARD_CONTROLLER, TYPE_GCS)
+        is_type = frame.message.type in (TYPE_ONBOARD_CONTROLLER, TYPE_GCS)
+        return no_autopilot and on_vehicle and is_type
 
     def note(self, frame: Frame, now_s: float) -> Dialect | None:
         """The autopilot that a frame shows, None if it is no HEARTBEAT of one that can be flown."""
@@ -239,21 +241,21 @@ class Senders:
         if total < self._news_at:
             return ""
         self._news_at = 10 ** len(str(total))
-        counted = ((each, self.forged[each]) for each in Forgery)
+        counted = ((each, self.forged[each]) for each in Refusal)
         named = (f"{number:,} x {each.value}" for each, number in counted if number)
         return f"frames refused by signing: {', '.join(named)}"
 
     def why_none(self) -> str:
         """Why no vehicle was found, as far as the frames that were refused tell; else empty."""
         forged = self.forged
-        if forged[Forgery.BAD_SIGNATURE]:
+        if forged[Refusal.BAD_SIGNATURE]:
             return "frames arrive, but their signature does not match: it is another key's"
-        if forged[Forgery.OLD_STAMP] or forged[Forgery.REPLAYED]:
+        if forged[Refusal.OLD_STAMP] or forged[Refusal.REPLAYED]:
             return (
                 "signed frames arrive, but their time stamps are too old: the vehicle does not "
                 "take ours; is the link one-way?"
             )
-        if forged[Forgery.UNSIGNED]:
+        if forged[Refusal.UNSIGNED]:
             return "frames arrive unsigned: set the key on the vehicle, or omit --signing-key"
         if self._signs:
             return "the vehicle signs its messages: give its key with --signing-key"
@@ -283,7 +285,8 @@ def is_vehicle(heartbeat: Any) -> bool:
 
 
 def dialect_of(heartbeat: Any) -> Dialect | None:
-    """The dialect of the vehicle that sends this HEARTBEAT; None without one, or a vehicle."""
+    """The dialect of the vehicle that sends this HEARTBEAT; None if it has no dialect or is no
+    vehicle."""
     return _BY_AUTOPILOT.get(heartbeat.autopilot) if is_vehicle(heartbeat) else None
 
 

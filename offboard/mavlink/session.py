@@ -134,7 +134,8 @@ class Session:
             found.frames.append(frame.raw)
 
     def _interpret(self, frame: framing.Frame, now_s: float, found: Reception) -> None:
-        """Add to `found` what a frame of the vehicle says, or asks for before it is found."""
+        """Add to `found` the event in a frame of the vehicle, or the reply to its TIMESYNC request
+        (which may come before the vehicle is found)."""
         if self.dialect is not None:
             self.senders.heard_s = now_s
             if self.telemetry.dialect is None:
@@ -204,8 +205,8 @@ class Session:
     # --- time and rates ---
 
     def elapsed_s(self, host_s: float) -> float:
-        """Host time; in lockstep, where it must decide nothing, simulated time since the first of
-        the TIMESYNC requests whose replies the vehicle waits for."""
+        """Host time; in lockstep, where nothing may depend on host time, the simulated time since
+        the simulator's first TIMESYNC request."""
         return self._simulated_s if self.settings.lockstep else host_s
 
     def clock_s(self, host_s: float) -> float:

@@ -29,8 +29,8 @@ _HASH_BYTES = 6
 State = tuple[int, int, list[tuple[int, int, int, int]]]
 
 
-class Forgery(Enum):
-    """Why signing refuses a frame, for a sentence."""
+class Refusal(Enum):
+    """Reasons for which signing refuses a frame; the value is the text for the user."""
 
     UNSIGNED = "no signature"
     BAD_SIGNATURE = "a signature of another key"
@@ -77,21 +77,21 @@ class Signing:
             self._reserved = stamp + RESERVED
             self._reserve(stamp + RESERVED)
 
-    def refusal(self, frame: Frame, *, note: bool = True) -> Forgery | None:
+    def refusal(self, frame: Frame, *, note: bool = True) -> Refusal | None:
         """Why a frame must not be used; notes the time stamp of one that may, if `note`."""
         raw = frame.raw
         if not frame.signed:
-            return None if frame.message_id in ALLOWED_UNSIGNED else Forgery.UNSIGNED
+            return None if frame.message_id in ALLOWED_UNSIGNED else Refusal.UNSIGNED
         digest = sha256(self.key + raw[:-_HASH_BYTES]).digest()
         if not compare_digest(digest[:_HASH_BYTES], raw[-_HASH_BYTES:]):
-            return Forgery.BAD_SIGNATURE
+            return Refusal.BAD_SIGNATURE
         stream = raw[-13], frame.system_id, frame.component_id
         stamp = int.from_bytes(raw[-12:-6], "little")
         before = self._signing.stream_timestamps.get(stream)
         if before is None and stamp < self._now() - RESERVED:
-            return Forgery.OLD_STAMP
+            return Refusal.OLD_STAMP
         if before is not None and stamp <= before:
-            return Forgery.REPLAYED
+            return Refusal.REPLAYED
         if note:
             self._signing.stream_timestamps[stream] = stamp
             self._signing.timestamp = max(self._signing.timestamp, stamp)

@@ -34,7 +34,7 @@ class PathLimits(Parameters):
     beyond them is left to feedback."""
 
     speed_mps: float = Field(default=10.0, ge=0.1, le=30)
-    thrust_mps2: float = Field(default=14.0, ge=10, le=100)  # just above g it takes for ever
+    thrust_mps2: float = Field(default=14.0, ge=10, le=100)  # just above g a path takes hours
     tilt_deg: float = Field(default=35.0, ge=1, le=80)
     tilt_rate_dps: float = Field(default=150.0, ge=5, le=1000)
     drag_per_mass_ps: float = Field(default=0.3, ge=0, le=2)

@@ -103,7 +103,7 @@ def build_track(config: FlightConfig) -> Track:
     vehicle, limits = config.vehicle, config.limits
     for name, value, limit, bound, instead in (
         ("hover_thrust", vehicle.hover_thrust, "hover_thrust", limits.hover_thrust, "carry less"),
-        ("tilt_max_rad", vehicle.tilt_max_rad, "tilt_rad", limits.tilt_rad, "tilt less"),
+        ("tilt_max_rad", vehicle.tilt_max_rad, "tilt_rad", limits.tilt_rad, "lower tilt_max_rad"),
     ):
         if value > bound:
             raise DocumentError(
@@ -120,8 +120,8 @@ def build_track(config: FlightConfig) -> Track:
     if track.track_end_s - track.track_start_s < least_s * (1.0 - 1e-9):
         raise DocumentError(
             f"reference {config.reference.title}: it is flown at full speed for "
-            f"{track.track_end_s - track.track_start_s:.2g} s; a score needs {least_s:.2g} s, "
-            f"{PERIODS_LEAST} periods"
+            f"{track.track_end_s - track.track_start_s:.2g} s; a score needs {least_s:.2g} s "
+            f"({PERIODS_LEAST} periods)"
         )
     landing_s = height_m / DESCENT_MPS
     if landing_s > limits.land_s:

@@ -71,8 +71,8 @@ class Autopilot:
         return self.commander.handle(event, request)
 
     def take_setpoint(self, message: str, values: Mapping[str, Any]) -> None:
-        """Take a setpoint message (ATTITUDE, LOCAL or GLOBAL) and its fields, which may be relative
-        to the vehicle, where the firmware accepts it in the present mode."""
+        """Take a setpoint message (ATTITUDE, LOCAL or GLOBAL) if the firmware accepts it in the
+        present mode. Its fields may be relative to the vehicle."""
         mode = self.commander.mode
         accepted = mode.behaviour is Behaviour.SETPOINT
         if message != ATTITUDE:

@@ -1,4 +1,4 @@
-"""What the vehicle does in its modes: one class per behaviour, and the table of them.
+"""What the vehicle does in its modes: the classes of behaviours, and the table of them.
 
 A behaviour demands a motion in each period and answers a few questions about itself. To add one: a
 member of `simulator.autopilot.values.Behaviour`, a class here, a row in BEHAVIOURS, and a row in
@@ -60,7 +60,7 @@ class Land(ActiveBehaviour):
     landing = True
 
     def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
-        return touch_down(self.guidance.hold_ned_m, estimate, self.guidance)
+        return landing_motion(self.guidance.hold_ned_m, estimate, self.guidance)
 
 
 def descent(place_ned_m: Triple, speed_mps: float) -> MotionSetpoint:
@@ -68,8 +68,10 @@ def descent(place_ned_m: Triple, speed_mps: float) -> MotionSetpoint:
     return MotionSetpoint((*place_ned_m[:2], math.nan), (math.nan, math.nan, speed_mps))
 
 
-def touch_down(place_ned_m: Triple, estimate: StateEstimate, guidance: Guidance) -> MotionSetpoint:
-    """Down to the ground: slower towards home's height, slowest where the range finder sees the
+def landing_motion(
+    place_ned_m: Triple, estimate: StateEstimate, guidance: Guidance
+) -> MotionSetpoint:
+    """Descent to the ground: slower near home's height, slowest where the range finder sees the
     ground (PX4 MPC_LAND_SPEED, MPC_LAND_CRWL; ArduCopter LAND_SPEED)."""
     role = guidance.parameters.role
     slow = role("land_speed_mps")
@@ -109,7 +111,7 @@ class Return(ActiveBehaviour):
         self._advance(estimate)
         guidance = self.guidance
         if self._stage is Stage.LAND:
-            return touch_down(guidance.hold_ned_m, estimate, guidance)
+            return landing_motion(guidance.hold_ned_m, estimate, guidance)
         return MotionSetpoint(guidance.hold_ned_m, faces_way=guidance.firmware.return_faces_way)
 
     def _advance(self, estimate: StateEstimate) -> None:
@@ -147,7 +149,7 @@ class FlyMission(ActiveBehaviour):
     def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
         guidance = self.guidance
         motion = guidance.mission.fly(estimate, guidance.home_ned_m, landed=landed)
-        return touch_down(motion.position_ned_m, estimate, guidance) if self.landing else motion
+        return landing_motion(motion.position_ned_m, estimate, guidance) if self.landing else motion
 
     @property
     def landing(self) -> bool:
@@ -175,7 +177,7 @@ class FlyBySticks(ActiveBehaviour):
     def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
         """The velocity demanded; an axis without a demand holds its place."""
         guidance = self.guidance
-        descend = descent(guidance.hold_ned_m, guidance.parameters.role("descend_speed_mps"))
+        descend = descent(guidance.hold_ned_m, guidance.parameters.role("stick_descent_mps"))
         if guidance.sticks is None:
             return descend
         demand = guidance.sticks.demand(estimate.time_s, estimate.yaw_rad)

@@ -119,11 +119,11 @@ class Commander:
         if self.refused and (text := self.refused.get("offboard" if offboard else event)):
             self.texts.append(text)
             return Result.TEMPORARILY_REJECTED
-        rule = self._row(event)
-        if rule is None:
+        found = self._row(event)
+        if found is None:
             return Result.ACCEPTED if event in self._rows else Result.UNSUPPORTED
-        self._apply(rule)
-        return rule.result
+        self._apply(*found)
+        return found[0].result
 
     def switch(self, mode: str, *, by_failsafe: bool = False) -> None:
         """Enter a mode anew, also one that no command may request: by a pilot's switch, or by a
@@ -143,16 +143,19 @@ class Commander:
         """The requested mode, or the present one."""
         return self._firmware.modes[self._request.mode] if self._request.mode else self.mode
 
-    def _row(self, event: str) -> Rule | None:
-        """The row that decides about an event; None: nothing happens."""
+    def _row(self, event: str) -> tuple[Rule, str] | None:
+        """The row that decides about an event, and its next mode; None: nothing happens."""
         for rule in self._rows.get(event, ()):
             in_mode = rule.mode == "*" or self.mode.name in rule.mode.split()
-            if in_mode and all(map(self._holds, rule.when)) and self._target(rule) is not None:
-                return rule
+            if in_mode and all(map(self._holds, rule.when)):
+                target = self._target(rule)
+                if target is not None:
+                    return rule, target
         return None
 
     def _target(self, rule: Rule) -> str | None:
-        """Its next mode by name, "*" for none; None where no mode belongs to the parameter."""
+        """The row's next mode by name, "*" to keep the present one; None if the parameter's value
+        selects no mode."""
         if isinstance(rule.to, ByParameter):
             return rule.to.modes.get(int(self._parameters[rule.to.parameter]))
         chosen = {"requested": self._request.mode, "remembered": self._remembered}
@@ -174,11 +177,10 @@ class Commander:
             return self._parameters[name] in map(float, value.split(","))
         return CONDITIONS[condition](self)
 
-    def _apply(self, rule: Rule) -> None:
+    def _apply(self, rule: Rule, target: str) -> None:
         for action in rule.do:
             ACTIONS[action](self)
-        target = self._target(rule)
-        if target is not None and target != "*":
+        if target != "*":
             self._enter(target, by_failsafe="failsafe" in rule.do)
         for text in rule.texts:
             values = {name: value(self) for name, value in TEXT_VALUES.items()}

@@ -30,8 +30,8 @@ from simulator.vehicle.conditions import BatteryState
 
 _MAV_TYPE_GCS = 6
 Role = str | float | tuple[str, float] | Callable[[ParameterValues], float]
-"""Where a value comes from: a parameter, a constant, a parameter and the factor to SI, or a
-function of parameters."""
+"""Where a value comes from: a parameter, a constant, a parameter and a factor, or a function of
+parameters. `simulator.firmware.px4_tables.ROLES` says what each role means."""
 
 
 RANGES = {"int8": (-128, 127), "int16": (-32768, 32767), "int32": (-(2**31), 2**31 - 1)}
@@ -69,11 +69,11 @@ class Rule:
         event: its name; those of the start are in `Firmware.boot_events_s`.
         mode: names of the modes in which it happened, with spaces between, or "*".
         when: conditions that must all hold (`simulator.autopilot.commander.CONDITIONS`). "not X"
-            negates, "NAME=1,2" compares a parameter, "since X" is a failsafe because of event X,
-            "reached X" a boot event that has come, "latched X" an event that only a reboot clears,
-            "requests X" a request of mode X.
+            negates, "NAME=1,2" holds if parameter NAME is 1 or 2, "since X" is a failsafe because
+            of event X, "reached X" a boot event that has come, "latched X" an event that only a
+            reboot clears, "requests X" a request of mode X.
         to: next mode by name, "*" none, "requested" by the command, "remembered" the last chosen;
-            or by a parameter, and then the row fits only the values that are named.
+            or `ByParameter`; then the row fits only the values listed there.
         do: actions (`simulator.autopilot.commander.ACTIONS`).
         result: acknowledgement of a command.
         texts: STATUSTEXTs; they may name {mode} and `simulator.autopilot.commander.TEXT_VALUES`.
@@ -114,8 +114,9 @@ class Firmware(ABC):
     set_mode_acked_as: int | None = None  # MAV_CMD in the answer to SET_MODE; None: no answer
     force_codes: Mapping[str, float]  # param2 of MAV_CMD_COMPONENT_ARM_DISARM: arm, disarm
     reposition_mode: str  # mode for MAV_CMD_DO_REPOSITION
-    # MAV_CMD_DO_REPOSITION needs a frame and a place, and its yaw and speed are ignored; a takeoff
-    # is to a height above home, else above mean sea level; MAV_CMD_MISSION_START names no item
+    # True: MAV_CMD_DO_REPOSITION needs a frame and a place, and its yaw and speed are ignored; the
+    # height of MAV_CMD_NAV_TAKEOFF is above home; MAV_CMD_MISSION_START must not name an item.
+    # False: that height is above mean sea level
     strict_places: bool = False
     empty_refusal: Result  # of a MAV_CMD_DO_CHANGE_SPEED without a speed, an interval of no message
     vertical_speeds: tuple[float, ...] = ()  # SPEED_TYPE of climb and descent; others are across
@@ -176,8 +177,9 @@ class Firmware(ABC):
     stamps_follow_clock: bool = False  # else they only count, and follow those of others
 
     # health
-    # events of the start: "fix" of GPS, "ready" and "ready without position" (from then on the
-    # pre-arm checks pass, the latter in modes that need none), and those of the firmware
+    # Seconds after boot, by event: "fix" (first GPS fix), "ready" and "ready without position"
+    # (from then on the pre-arm checks pass, in modes with and without need of a position), and
+    # events in this firmware's rules
     boot_events_s: Mapping[str, float]
     sensor_bits: tuple[int, int, int]  # SYS_STATUS with a fix: present, enabled, healthy
     fails_where_unarmable: bool = False  # disarmed in a mode that does not arm, its checks fail
@@ -186,7 +188,8 @@ class Firmware(ABC):
 
     # flight
     return_faces_way: bool = False  # a return faces the direction of flight
-    integrates_on_ramp: bool = False  # position loop, in a takeoff that still stands on the ground
+    # the position loop integrates during the takeoff ramp; else on the ground only after it
+    integrates_on_ramp: bool = False
     place_below_is_descent: bool = False  # land detector: a place below is a demand to descend
     flown_by_sticks: bool = False
 

@@ -26,7 +26,7 @@ class TakeoffRamp:
     """
 
     parameters: ParameterTable
-    flying: bool = False  # the takeoff is over
+    flying: bool = False  # in the air, the ramp has ended
     _spool_left_s: float = 0.0
     _ramp_s: float = 0.0
 
@@ -53,7 +53,7 @@ class TakeoffRamp:
         self._spool_left_s, self.flying = 0.0, True
 
     @property
-    def over(self) -> bool:
+    def ramp_ended(self) -> bool:
         """The allowed climb rate has its final value; a heavy vehicle may still stand."""
         return self._ramp_s >= self.parameters.role("takeoff_ramp_s")
 
@@ -63,8 +63,8 @@ class TakeoffRamp:
             self._spool_left_s -= LOOP_S
         elif not self.flying and (climb_demanded or self._ramp_s > 0.0):
             self._ramp_s += LOOP_S
-            self.flying = self.over and not landed
-            if self.over and landed and not climb_demanded:
+            self.flying = self.ramp_ended and not landed
+            if self.ramp_ended and landed and not climb_demanded:
                 self.land()
 
     def climb_limit_mps(self) -> float:

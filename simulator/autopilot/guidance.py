@@ -25,9 +25,10 @@ Setpoint = AttitudeSetpoint | MotionSetpoint
 
 
 class ActiveBehaviour:
-    """One behaviour; a new object each time that its mode is entered.
+    """Holds position (`guidance.hold`); the base class of the other behaviours.
 
-    The defaults are those of automatic flight that starts in the air and does not end by itself.
+    There is a new object each time that its mode is entered. The defaults are those of automatic
+    flight that starts in the air and does not end by itself.
     """
 
     lifts_off: ClassVar[bool] = False  # may leave the ground
@@ -154,7 +155,7 @@ class Guidance:
     # -- setpoint, place and speed -----------------------------------------------------------
 
     def stream_alive(self, now_s: float) -> bool:
-        """The stream of setpoints is not lost; that is noticed some time after its time-out."""
+        """Whether setpoints still arrive. A loss counts `stream_reaction_s` after the time-out."""
         role = self.parameters.role
         age_s = now_s - self.newest_s - role("stream_reaction_s")
         return age_s <= role("stream_timeout_s")

@@ -19,7 +19,8 @@ MONITOR_STEPS = 25  # 0.1 s
 class Health:
     """Health of one vehicle from boot on; `boot_scale` multiplies the times of its start.
 
-    Ground station, battery and position are monitored; each event is reported once.
+    Ground station, battery and position are monitored; each event is reported once. It also
+    reports take-off, landing and an armed vehicle that stays on the ground.
     """
 
     def __init__(self, guidance: Guidance, boot_scale: float) -> None:
@@ -86,6 +87,7 @@ class Health:
             yield self._firmware.battery_events[level - 1]
 
     def arm(self, now_s: float, landed: bool) -> None:
+        """The motors start, on the ground or in the air."""
         self._flown, self._armed_s = not landed, now_s
 
     def flight(self, now_s: float, was_landed: bool, landed: bool) -> Iterator[str]:

@@ -44,7 +44,7 @@ class ParameterTable:
         return self._roles[role]
 
     def _take_roles(self) -> None:
-        """Read the roles anew: parameters change seldom, and each step reads many roles."""
+        """Compute all roles; called when a parameter changes, because each step reads many."""
         self._roles = {role: self._read(source) for role, source in self._sources.items()}
 
     def _read(self, source: Role) -> float:

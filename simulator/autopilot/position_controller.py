@@ -153,7 +153,7 @@ class PositionController:
         climb_demanded = lifts_off and self._climb_demanded(estimate)
         ramp.step(climb_demanded=climb_demanded, landed=self.landed)
         still = estimate.on_ground and (ramp.lifting or self.landed)
-        on_ramp = ramp.lifting and (self._firmware.integrates_on_ramp or ramp.over)
+        on_ramp = ramp.lifting and (self._firmware.integrates_on_ramp or ramp.ramp_ended)
         attitude, thrust, velocity_ned_mps = self.loop.step(
             self.motion, self._limits, estimate, integrate=not still or on_ramp
         )

@@ -17,7 +17,11 @@ from simulator.autopilot.values import NAN3, MotionSetpoint, Quaternion, Triple
 from simulator.geodesy import GRAVITY_MPS2
 from simulator.steps import LOOP_S
 
-_AXES = ("xy", "xy", "z")  # as in the names of the gains
+# Gains of the axes north, east and down
+_POSITION_P = ("position_xy_p", "position_xy_p", "position_z_p")
+_VELOCITY_P = ("velocity_xy_p", "velocity_xy_p", "velocity_z_p")
+_VELOCITY_I = ("velocity_xy_i", "velocity_xy_i", "velocity_z_i")
+_VELOCITY_D = ("velocity_xy_d", "velocity_xy_d", "velocity_z_d")
 _INTEGRAL_XY_MAX_MPS2 = 4.0
 _REACHED_RAD = 0.05  # of a yaw: the rest is turned the shorter way
 _TILT_COSINE_MIN = 0.1  # least divisor of the thrust
@@ -28,7 +32,7 @@ _FILTER_SHARE = _TIMES_CUTOFF / (1.0 + _TIMES_CUTOFF)
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Limits of a motion beside those of the parameters; the lower one counts."""
+    """Limits of a motion. A speed limit only lowers that of the parameters."""
 
     thrust_least: float = 0.0
     across_mps: float = math.inf
@@ -102,8 +106,8 @@ class PositionLoop:
         north, east, down = (
             speed[i]
             if math.isnan(goal[i] - position[i])
-            else self._role(f"position_{axis}_p") * (goal[i] - position[i]) + _or_zero(speed[i])
-            for i, axis in enumerate(_AXES)
+            else self._role(_POSITION_P[i]) * (goal[i] - position[i]) + _or_zero(speed[i])
+            for i in range(3)
         )
         return north, east, down
 
@@ -149,10 +153,10 @@ class PositionLoop:
     def _acceleration(self, motion: MotionSetpoint, setpoint: Triple, velocity: Triple) -> Triple:
         """PID on the velocity error plus the demanded acceleration; D acts on the estimate."""
         total = [0.0, 0.0, 0.0]
-        for i, axis in enumerate(_AXES):
+        for i in range(3):
             total[i] = _or_zero(motion.acceleration_ned_mps2[i])
             if not math.isnan(setpoint[i]):
-                p, d = self._role(f"velocity_{axis}_p"), self._role(f"velocity_{axis}_d")
+                p, d = self._role(_VELOCITY_P[i]), self._role(_VELOCITY_D[i])
                 error = setpoint[i] - velocity[i]
                 total[i] += p * error + self._integral_mps2[i] - d * self._acceleration_mps2[i]
         return total[0], total[1], total[2]
@@ -161,7 +165,7 @@ class PositionLoop:
         self, setpoint: Triple, velocity: Triple, thrust: float, thrust_least: float
     ) -> None:
         """Integrate the velocity errors; the vertical one not into a saturated thrust."""
-        for i, axis in enumerate(_AXES):
+        for i in range(3):
             error = setpoint[i] - velocity[i]
             saturated = i == 2 and (
                 (thrust <= thrust_least and error > 0.0)
@@ -170,7 +174,7 @@ class PositionLoop:
             if math.isnan(error) or saturated:
                 continue
             most = self._role("integral_z_max_mps2") if i == 2 else _INTEGRAL_XY_MAX_MPS2
-            gain = self._role(f"velocity_{axis}_i")
+            gain = self._role(_VELOCITY_I[i])
             integral = self._integral_mps2[i] + gain * error * LOOP_S
             self._integral_mps2[i] = min(most, max(-most, integral))
 

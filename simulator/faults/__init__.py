@@ -44,7 +44,7 @@ Fault = Annotated[
 def prepare(scenario: Sequence[Fault], seed: int) -> Injection:
     """Faults of one flight, none begun."""
     paths: dict[str, list[Channel]] = {"down": [], "up": []}
-    waiting: list[Running] = []
+    unfinished: list[Running] = []
     for number, fault in enumerate(scenario):
         channels = []
         for direction, path in paths.items():
@@ -52,6 +52,6 @@ def prepare(scenario: Sequence[Fault], seed: int) -> Injection:
                 channels.append(Channel(fault, Random(f"{seed} {number} {direction}")))
                 channels[-1].on = False
                 path.append(channels[-1])
-        waiting.append(Running(fault, channels, Random(f"{seed} {number}")))
-    strangers = [one.datagrams for one in waiting if isinstance(one.fault, link.Stranger)]
-    return Injection(paths["down"], paths["up"], strangers, waiting)
+        unfinished.append(Running(fault, channels, Random(f"{seed} {number}")))
+    strangers = [one.datagrams for one in unfinished if isinstance(one.fault, link.Stranger)]
+    return Injection(paths["down"], paths["up"], strangers, unfinished)

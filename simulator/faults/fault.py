@@ -99,20 +99,23 @@ def until_the_end() -> Effect:
 @dataclass(slots=True)
 class Injection:
     """All faults of one flight. `down` and `up`: channels of the companion link's directions;
-    `strangers`: datagrams that wait to be sent to the companion, each list from a port of its own.
+    `strangers`: datagrams that wait to be sent to the companion, each list from a port of its own;
+    `unfinished`: faults that have not begun or not ended.
     """
 
     down: list[Channel]
     up: list[Channel]
     strangers: list[list[bytes]]
-    waiting: list[Running]
+    unfinished: list[Running]
     _moments: dict[Moment, float] = field(default_factory=dict)
     _flown: bool = False
 
     def step(self, now_s: float, vehicle: Vehicle) -> None:
         """Begin and end the faults due at `now_s`, seconds since the start."""
         self._note_moments(now_s, vehicle.autopilot)
-        self.waiting = [one for one in self.waiting if self._goes_on(one, now_s + 1e-6, vehicle)]
+        self.unfinished = [
+            one for one in self.unfinished if self._goes_on(one, now_s + 1e-6, vehicle)
+        ]
 
     def _note_moments(self, now_s: float, autopilot: Autopilot) -> None:
         landed = autopilot.position_controller.landed

@@ -133,6 +133,7 @@ PARAMETERS = (
 )
 
 _CENTI = 0.01
+# What they mean is said in `simulator.firmware.px4_tables`
 ROLES: dict[str, Role] = {
     "stream_timeout_s": "GUID_TIMEOUT",
     "velocity_ratio_most": "FS_EKF_THRESH",  # to arm, as the failsafe in flight; 0: not checked
@@ -176,7 +177,7 @@ ROLES: dict[str, Role] = {
     "velocity_z_p": 5.0,
     "velocity_z_i": 10.0,
     "velocity_z_d": 0.0,
-    # PSC_ACCZ_IMAX, a throttle of 0.8: enough for any vehicle, whatever MOT_THST_HOVER says
+    # PSC_ACCZ_IMAX: the integral adds at most 0.8 of full throttle to MOT_THST_HOVER
     "integral_z_max_mps2": lambda parameters: (
         0.8 * GRAVITY_MPS2 / max(parameters["MOT_THST_HOVER"], 1e-3)
     ),
@@ -200,7 +201,7 @@ ROLES: dict[str, Role] = {
     "still_down_mps": math.inf,
     "still_across_mps": math.inf,
     "still_radps": math.inf,
-    "descend_speed_mps": 2.4,
+    "stick_descent_mps": 2.4,
     "setpoint_spool_s": 2.8,
     "stream_reaction_s": 0.0,
     "ground_station_stays_s": 0.0,

@@ -141,21 +141,23 @@ PARAMETERS = (
     _int("SYS_HAS_GPS", 1, 0, 1),  # 1: has GPS
 )
 
+# Names end with the unit. What is not clear by name is said here, for both firmwares
 ROLES: dict[str, Role] = {
     "stream_timeout_s": "COM_OF_LOSS_T",
-    "velocity_ratio_most": 0.5,  # EKF2's limit before take-off
+    # innovation ratio of the velocity from which it does not arm, 0 any: EKF2's before take-off
+    "velocity_ratio_most": 0.5,
     "disarm_landed_s": "COM_DISARM_LAND",
     "disarm_idle_s": "COM_DISARM_PRFLT",
     "takeoff_height_m": "MIS_TAKEOFF_ALT",
     "takeoff_speed_mps": "MPC_TKO_SPEED",
     "land_speed_mps": "MPC_LAND_SPEED",
-    "descent_speed_mps": "MPC_Z_V_AUTO_DN",
+    "descent_speed_mps": "MPC_Z_V_AUTO_DN",  # of a landing, far from the ground
     "cruise_speed_mps": "MPC_XY_CRUISE",
     "hover_thrust": "MPC_THR_HOVER",
-    "tilt_boost": 0.0,
+    "tilt_boost": 0.0,  # not 0: the thrust of a setpoint is divided by the cosine of the tilt
     "ground_station_timeout_s": "COM_DL_LOSS_T",
     "ground_station_needed": "NAV_DLL_ACT",  # to arm
-    "battery_patience_s": 0.0,
+    "battery_patience_s": 0.0,  # that a worse level lasts until it is reported
     "failsafe_delay_s": "COM_FAIL_ACT_T",
     "spool_up_s": "COM_SPOOLUP_TIME",
     "takeoff_ramp_s": "MPC_TKO_RAMP_T",
@@ -175,7 +177,8 @@ ROLES: dict[str, Role] = {
     "position_without_fix_s": ("EKF2_NOAID_TOUT", 1e-6),
     "return_waits_s": "RTL_LAND_DELAY",
     "return_settles_s": 0.0,
-    # position loop: P on position, PID on velocity (acceleration out), and limits
+    # position loop: P on position (1/s), PID on velocity (acceleration out; P 1/s, I 1/s^2, D
+    # without unit), and limits
     "position_xy_p": "MPC_XY_P",
     "position_z_p": "MPC_Z_P",
     "velocity_xy_p": "MPC_XY_VEL_P_ACC",
@@ -196,18 +199,21 @@ ROLES: dict[str, Role] = {
     "speeding_mps2": ("MPC_ACC_HOR", 0.7),
     "braking_mps2": ("MPC_ACC_HOR", 0.5),
     "vertical_mps2": ("MPC_ACC_DOWN_MAX", 0.5),
+    # demanded speed from which it faces the direction of flight
     "facing_mps": lambda parameters: parameters["MPC_XY_P"] * parameters["NAV_ACC_RAD"],
     # land detector; shares are between the least and the hover thrust
-    "low_thrust_share": 0.95,  # of estimates that wander on the ground, too
-    "idle_thrust_share": 0.1,
-    "sinking_mps": 0.09,
+    # no more than this can be a landing, also where estimates drift on the ground
+    "low_thrust_share": 0.95,
+    "idle_thrust_share": 0.1,  # more than this is a take-off
+    "sinking_mps": 0.09,  # a demand to descend at this speed is one to land
+    # still_*: greatest estimated motion of a vehicle that stands
     "still_down_mps": 0.2,
     "still_across_mps": 1.5,  # LNDMC_XY_VEL_MAX
     "still_radps": math.radians(20.0),  # LNDMC_ROT_MAX
-    "descend_speed_mps": 0.6,
-    "setpoint_spool_s": 0.0,
-    "stream_reaction_s": 0.036,
-    "ground_station_stays_s": 2.5,
+    "stick_descent_mps": 0.6,  # in a manual mode without stick input
+    "setpoint_spool_s": 0.0,  # from arming until the thrust of a setpoint acts
+    "stream_reaction_s": 0.036,  # from the time-out of the stream until it counts as lost
+    "ground_station_stays_s": 2.5,  # the same of a ground station, whose HEARTBEATs are missing
 }
 
 

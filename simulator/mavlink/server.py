@@ -201,7 +201,7 @@ class Server:
         self.outbox.send("FILE_TRANSFER_PROTOCOL", 0, *sender_of(message), padded)
 
 
-# By message; those with a target only if it is this vehicle
+# Handler by message name. A message with a target is handled only if that is this vehicle, or all
 HANDLERS: dict[str, Callable[[Server, Message], None]] = {
     "HEARTBEAT": Server._heartbeat,
     "COMMAND_LONG": Server._command_long,

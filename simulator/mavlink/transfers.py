@@ -61,12 +61,12 @@ class ParameterTransfer:
         return name == HASH and self.outbox.view.autopilot.firmware.parameters_hashed
 
     def request_list(self, _: Message) -> None:
-        """PARAM_REQUEST_LIST; during a list it begins anew, without the hash."""
+        """PARAM_REQUEST_LIST; if a list is being sent, it starts again, without _HASH_CHECK."""
         hashed = (HASH,) if self._is_hash(HASH) and not self._due else ()
         self._due = [*hashed, *self.outbox.view.autopilot.parameters.names]
 
     def set(self, message: Message) -> None:
-        """PARAM_SET, answered with the value that it has now."""
+        """PARAM_SET; the answer holds the parameter's present value."""
         table = self.outbox.view.autopilot.parameters
         if self._is_hash(message.param_id):  # the client has the whole list already
             self._due = []

@@ -48,7 +48,7 @@ class EstimatorName(StrEnum):
 
 class WhiteNoise(Parameters):
     """Standard deviations of the `white` estimator, the same on each axis; new at each sample. The
-    least are those of `perfect`: an estimate that repeats itself counts as none."""
+    minima are those of `perfect`: a position that does not change counts as none."""
 
     position_m: float = Field(default=0.02, ge=0.00005, le=10)
     velocity_mps: float = Field(default=0.02, ge=0.00005, le=10)

@@ -150,8 +150,8 @@ def test_thrust_that_gusts_leave_uncertain_is_adopted_as_such() -> None:
 
 
 def test_thrust_that_the_steps_do_not_show_is_identified_in_motion() -> None:
-    """There its delay and lag of 0.27 s look like 0.14 +- 0.02 s, as the height wanders; flown with
-    that, the height is off: 0.09 m."""
+    """In the steps, delay plus lag of 0.27 s look like 0.14 +- 0.02 s, as the estimated height
+    drifts; flown with that, the height is off: 0.09 m."""
     slow = AxisResponse(delay_s=0.17, natural_frequency_radps=4.8, damping=0.57)
     thrust = {"thrust_lag_s": 0.163, "thrust_delay_s": 0.11, "hover_thrust": 0.6}
     flies = TRUE.model_copy(update={"tilt": slow} | thrust)
@@ -176,7 +176,8 @@ def test_slow_attitude_is_identified() -> None:
 
 
 def test_tilt_that_the_autopilot_accelerates_slowly_is_flown() -> None:
-    """Otherwise feedback asks for more of it than there is, and the vehicle is lost at 5 m."""
+    """Without the limit, feedback needs more angular acceleration than the autopilot allows, and
+    the vehicle is lost at 5 m."""
     cdeg = 13000.0
     slow = (math.radians(0.01 * cdeg),) * 2 + (2.2,)
     copter = simulated.vehicle("arducopter")
@@ -191,7 +192,8 @@ def test_tilt_that_the_autopilot_accelerates_slowly_is_flown() -> None:
     assert pair.score().rmse_position_m < 0.2
     said = " | ".join(pair.companion.announced)
     assert "bandwidth limited to 2.8 rad/s laterally" in said
-    assert "its tilt is accelerated by at most 2.3 rad/s^2; identified delay" in said
+    limited = "the autopilot limits the angular acceleration of the tilt to 2.3 rad/s^2"
+    assert f"{limited}; identified delay" in said
 
 
 def test_white_noise_of_positions_is_no_delay_of_the_thrust() -> None:

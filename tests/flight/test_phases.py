@@ -335,7 +335,8 @@ def test_no_way_out_of_the_air_leaves_the_vehicle_unasked(service: ServiceOption
 
 
 def test_a_vehicle_that_does_not_climb_is_told_of_settings_that_it_has() -> None:
-    """Of the hover thrust where the flight shows another one; a law without bandwidth, of none."""
+    """The hint names hover_thrust if the flight shows another value, else the bandwidth; a law
+    without bandwidth gets no hint."""
     bandwidth = "; is the vehicle fast enough for controller.bandwidth_radps?"
     for law, shown, hint in (
         ("pso", 0.7, "; the flight shows a hover thrust of 0.70, it is flown with"),

@@ -348,7 +348,7 @@ ROWS = {
     "a plane": of_type(1, "the vehicle is a FIXED_WING; offboard flies multirotors"),
     "a helicopter": of_type(4, r".*\(airframe: helicopter in its vehicle file flies it\)"),
     "a hexarotor that is no helicopter": of_type(
-        13, "the vehicle is a HEXAROTOR; its vehicle file says .*Fix: are .* and airframe in",
+        13, "the vehicle is a HEXAROTOR; its vehicle file says .*Fix: check .* and airframe in",
         believed=HELICOPTER,
     ),
     "a helicopter by its file": of_type(

@@ -161,7 +161,7 @@ def test_a_log_with_parts_missing_is_scored_as_far_as_it_goes(flown: History) ->
 
 
 def test_a_reference_that_stands_still_explains_no_motion(flown: History) -> None:
-    """Rounding of its derivatives had: by an amount that depended on where it stood."""
+    """Before, rounding in its derivatives explained some, depending on its position."""
     moved = flown.reference.copy()
     moved["position_ned_m"] += 1 / 3
     told = [score(each).tilt_agitation_deg for each in (flown, replace(flown, reference=moved))]

@@ -58,7 +58,7 @@ def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
         ("--set", "controller.law=frog", "controller: law: 'frog' is not one of pso, lqr,"),
         ("--set", "vehicle.drag_translation_npmps=[0, 0, 1e9]", "must be at most 100 per kg"),
         ("--set", "reference.height_m=100", "from 100 m takes 200 s at 0.5 m/s, longer than"),
-        ("--reference hover --set", "reference.duration_s=0.2", "a score needs 0.3 s, 3 periods"),
+        ("--reference hover --set", "reference.duration_s=0.2", "a score needs 0.3 s (3 periods)"),
         ("--reference racing --set", "reference.fastest.thrust_mps2=9.9", "than or equal to 10"),
         ("--set", "limits.radius_m=1.5", "it goes 2 m away from the take-off point, beyond limits"),
         ("--set", "vehicle.hover_thrust=0.92", "0.92 exceeds limits.hover_thrust (0.9)"),

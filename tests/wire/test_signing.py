@@ -17,7 +17,7 @@ from vehicle_frames import PEER, Sender
 from offboard.mavlink import events
 from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings
-from offboard.mavlink.signing import RESERVED, UNITS_PER_S, Forgery, Signing, stamp_of_unix
+from offboard.mavlink.signing import RESERVED, UNITS_PER_S, Refusal, Signing, stamp_of_unix
 from simulator import config
 from simulator.autopilot.firmware import Firmware
 from simulator.firmware.ardupilot import ARDUPILOT
@@ -83,7 +83,7 @@ def test_none_of_many_forged_and_replayed_frames_is_accepted() -> None:
         assert (reception.events, reception.frames, reception.replies) == ([], [], [])
     # a part of the altered frames is the original, by chance: then it is a replay
     assert ours.senders.forged.total() == COUNT
-    assert {*Forgery} - {*ours.senders.forged} == {Forgery.OLD_STAMP}
+    assert {*Refusal} - {*ours.senders.forged} == {Refusal.OLD_STAMP}
     assert ours.receive(vehicle.position(3000), PEER, 0.3).events  # and the vehicle still is
 
 
@@ -98,7 +98,7 @@ def test_only_radio_status_is_accepted_unsigned() -> None:
     version_1 = signer(b"").frame(position, mavlink1=True)
     for frame in (signer(b"").frame(position), version_1, signer(b"", 191).frame(setpoint)):
         assert ours.receive(frame, PEER, 0.0).events == []
-    assert ours.senders.forged[Forgery.UNSIGNED] == 3
+    assert ours.senders.forged[Refusal.UNSIGNED] == 3
     (seen,) = ours.receive(signer(component=191).frame(setpoint), PEER, 0.0).events
     assert isinstance(seen, events.OtherSender)
 
@@ -164,7 +164,7 @@ def test_what_continues_has_later_stamps_and_refuses_older_ones() -> None:
     later = Session(SessionSettings(), signing)
     later.senders.set_vehicle(events.VehicleFound(1, 1, "px4"), PEER)
     assert later.receive(frame, PEER, 0.0).events == []
-    assert later.senders.forged[Forgery.REPLAYED] == 1
+    assert later.senders.forged[Refusal.REPLAYED] == 1
     assert later.receive(vehicle.position(1020), PEER, 0.0).events
     assert stamp_of(ours.encode(Heartbeat(6))) < stamp_of(later.encode(Heartbeat(6)))
 

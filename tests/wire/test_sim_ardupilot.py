@@ -88,7 +88,8 @@ def test_takeoff_by_setpoints_alone(thrust: float, lifts: bool) -> None:
 
 
 def test_a_heavy_vehicle_takes_off_also_after_a_takeoff_that_ended_on_the_ground() -> None:
-    """Hover thrust 0.85: its altitude controller is limited by full throttle alone."""
+    """The vehicle hovers at a thrust of 0.85. Only full throttle limits ArduCopter's altitude
+    controller."""
     heavy = {"name": "heavy", "conditions": {"thrust_scale": 0.43, "boot_scale": 0.1}}
     vehicle = booted(scenario=Scenario.model_validate(heavy))
     vehicle.command(176, 1, GUIDED)

@@ -165,13 +165,14 @@ class Dialect:
     wanted: tuple[WantedMessage, ...]
     hover_parameter: str  # normalised thrust that holds the weight
     tilt_parameters: Mapping[str, float]  # greatest tilt of its own modes: its unit in rad
-    # greatest angular acceleration of roll and pitch: its unit in rad/s^2; 0 is no limit
+    # parameter of the greatest angular acceleration of roll or pitch -> its unit in rad/s^2; a
+    # value of 0 is no limit
     acceleration_parameters: Mapping[str, float]
     estimator_message: str  # the message that becomes an EstimatorReport
     slow_hint: str  # what to do where telemetry comes slower than it was requested
     unsaid: str  # where a reason is found that no STATUSTEXT tells us
     oldest: tuple[int, int]  # version that this dialect is made for
-    # of a vehicle with these parameters; what is not known of it may be any
+    # what the vehicle does when setpoints stop, by its parameters; a missing one may have any value
     setpoint_loss: Callable[[Mapping[str, float]], SetpointLoss]
     defects: tuple[Defect, ...] = ()
 

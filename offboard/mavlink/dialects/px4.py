@@ -34,7 +34,8 @@ def _misses_sticks(known: Mapping[str, float], radio: bool) -> bool:
     return not radio and known.get("COM_RC_IN_MODE", _NO_STICKS) != _NO_STICKS
 
 
-# by the value of COM_OBL_RC_ACT; if it cannot enter the chosen one, it enters one behind it
+# by the value of COM_OBL_RC_ACT; if PX4 cannot enter the chosen mode, it enters a later one of
+# _LOSS_ORDER
 _LOSS_MODES = ("POSCTL", "ALTCTL", "STABILIZED", "AUTO.RTL", "AUTO.LAND", "AUTO.LOITER")
 _LOSS_ORDER = ("POSCTL", "ALTCTL", "STABILIZED", "AUTO.LOITER", "AUTO.RTL", "AUTO.LAND")
 
