@@ -135,7 +135,7 @@ def test_a_datagram_has_the_time_of_its_arrival_not_of_its_reading(udp: Udp) -> 
     link, vehicle, _ = udp
     before_s = time.monotonic()
     vehicle.send(b"first")
-    time.sleep(0.1)
+    time.sleep(0.5)
     vehicle.send(b"second")
     time.sleep(0.1)
     first, second = received(link)
