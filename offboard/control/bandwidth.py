@@ -78,8 +78,8 @@ def supported_bandwidth(
 
 
 def tilting_bandwidth(vehicle: Vehicle) -> float:
-    """The bandwidth at which feedback of FEEDBACK_LIMIT asks for the greatest angular acceleration
-    of the tilt."""
+    """The bandwidth at which feedback of FEEDBACK_LIMIT needs the greatest angular acceleration of
+    the tilt."""
     most_radps2 = min(vehicle.angular_acceleration_limit_radps2[:2])
     return max(LEAST_RADPS, math.sqrt(most_radps2 / FEEDBACK_LIMIT))
 

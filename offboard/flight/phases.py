@@ -150,7 +150,7 @@ class Limits(Parameters):
     arm_s: ClassVar[float] = 15.0  # refusals are asked again: checks may still be running
     lift_off_s: ClassVar[float] = 8.0  # setpoints ramp to hover thrust in less than 2 s
     disarm_s: ClassVar[float] = 5.0  # asked for again each second
-    overdue_s: ClassVar[float] = 90.0  # after the planned end of the climb: a strong head wind
+    overdue_s: ClassVar[float] = 90.0  # at the start, after the planned end of the climb: head wind
     excite_s: ClassVar[float] = 30.0  # three rounds of identification steps end within it
     hold_s: ClassVar[float] = 2.0  # from hold to land
     hand_back_s: ClassVar[float] = 3.0  # from the request to hold, to land

@@ -234,6 +234,17 @@ def test_what_is_identified_in_motion_is_remembered(served: Served) -> None:
     assert remembered.drag_per_mass_ps == pytest.approx(true.drag_per_mass_ps, rel=0.1)
 
 
+def test_a_limit_of_the_autopilot_is_read_anew(served: Served) -> None:
+    """The vehicle was remembered with a lower angular acceleration than is allowed now."""
+    copter = simulated.vehicle("arducopter")
+    slow = copter.model_copy(update={"angular_acceleration_limit_radps2": (2.3, 2.3, 2.2)})
+    memory = Remembered({"ardupilot-1-1": IdentifiedVehicle(slow, Estimate(0.01, 0.002), 0.008)})
+    pair = served.engaged("ardupilot", memory=memory)
+    pair.run(1.0)
+    assert said(pair, "this vehicle was identified before")
+    assert pair.service.current.model.angular_acceleration_limit_radps2[0] > 19.0
+
+
 # --- who may engage, and when ---------------------------------------------------------------------
 
 
