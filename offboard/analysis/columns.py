@@ -192,7 +192,7 @@ def attitude_of_angles(rows: Rows) -> Rows:
 
 
 def battery(rows: Rows) -> Rows:
-    """Of SYS_STATUS; NaN for what the vehicle does not know."""
+    """Values of SYS_STATUS; NaN for what the vehicle does not know."""
     voltage, remaining = (rows[name].astype(np.float32) for name in THEIRS["SYS_STATUS"])
     voltage[voltage == _NO_VOLTAGE] = remaining[remaining == _NO_PERCENTAGE] = math.nan
     return table(rows, voltage_mv=voltage, remaining=remaining)
