@@ -39,6 +39,7 @@ TAKE_OVER_HEIGHT_M = 1.0  # where setpoints replace the autopilot's own take-off
 DETECTOR_S = 1.0  # EXTENDED_SYS_STATE is requested at 5 Hz
 # s after the planned end of the climb, when the vehicle is identified though it is not at rest
 RESTLESS_S = 5.0
+NEAR_M = 0.6  # from the start
 REST_S = 0.5  # after the end of the reference
 # Relative error of hover_thrust; a smaller one does not keep a vehicle from the start
 WRONG_THRUST = 0.1
@@ -72,7 +73,7 @@ def restless(flight: FlightState) -> str:
     wanted = identification is not None and identification.wants_excitation
     if not (wanted and overdue_s > RESTLESS_S):
         return ""
-    return f"not at rest at the start of the reference in {overdue_s:.0f} s: identified in motion"
+    return f"not at rest at the start in {overdue_s:.0f} s: the vehicle is identified in motion"
 
 
 def too_late_at_start(flight: FlightState) -> str:
@@ -109,8 +110,8 @@ def identified(flight: FlightState) -> bool:
     identification = flight.identification
     if identification is None or not identification.finished(flight.time_s):
         return False
-    near = flight.position_error_m < identification.box_m
-    return near and (identification.delay is not None or at_start(flight))
+    near = flight.position_error_m < NEAR_M
+    return (near and identification.delay is not None) or at_start(flight)
 
 
 def not_identified(flight: FlightState) -> str:

@@ -249,7 +249,10 @@ def _place_reference(flight: FlightState, position: LocalPosition) -> None:
 def _set_acceleration(flight: FlightState, learner: Learner, units: Mapping[str, float]) -> None:
     """Fly with the angular acceleration of the vehicle file, or that to which the autopilot's
     parameters limit the tilt."""
-    shown = [flight.vehicle.parameters.get(name, 0.0) * unit for name, unit in units.items()]
+    read = flight.vehicle.parameters
+    if not units.keys() & read.keys():
+        return
+    shown = [read.get(name, 0.0) * unit for name, unit in units.items()]
     least = min((each for each in shown if each > 0.0), default=math.inf)
     *tilt, yaw = learner.file.angular_acceleration_limit_radps2
     limits = {"angular_acceleration_limit_radps2": (*(min(each, least) for each in tilt), yaw)}

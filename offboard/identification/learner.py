@@ -225,11 +225,6 @@ class Learner(VehicleEstimate):
         self._left_box = self._left_box or error_m > self._settings.box_m
         return command if self._left_box else excited(command, time_s - self._steps_s)
 
-    @property
-    def box_m(self) -> float:
-        """How far from the start of the reference the steps may be flown."""
-        return self._settings.box_m
-
     def finished(self, time_s: float) -> bool:
         """Whether the steps are over and the observer has settled on what they showed."""
         settled = time_s >= self.adopted_s + SETTLE_S

@@ -93,7 +93,7 @@ class VehicleEstimate:
         self._recalled = known
         self._unknown_s = delay_error_s
         self._thrust = known.thrust if known else None  # delay and lag, once identified
-        self._link_s = 0.0  # the link's delay before the flight
+        self._link_s = known.link_s if known else 0.0  # the link's, which `vehicle` contains
         self._link = (0.0, 0.0)  # added since take-off, and changed lately
         self._doubt_s = 0.0  # what the delay may be wrong by because telemetry contradicts it
         self._contradictions = 0
@@ -149,10 +149,10 @@ class VehicleEstimate:
         scatter."""
         if link is None:
             return
-        self._link_s = link.value
         if self.delay is not None and self._recalled is not None:
             self._on_other_link(self._recalled, self.delay, link)
             return
+        self._link_s = link.value
         added_s = link.value - DIRECT_LINK_S
         if added_s >= LINK_S:
             self.vehicle = self.vehicle.later_by(added_s)
@@ -161,12 +161,15 @@ class VehicleEstimate:
 
     def _on_other_link(self, recalled: IdentifiedVehicle, delay: Estimate, link: Estimate) -> None:
         """Adapt delays of an earlier flight to the present delay of the link."""
-        changed_s = link.value - max(recalled.link_s, DIRECT_LINK_S)
+        link_s = max(recalled.link_s, DIRECT_LINK_S)
+        changed_s = link.value - link_s
         changed_s = max(changed_s, -self.vehicle.tilt.delay_s, -self.vehicle.yaw.delay_s)
         if abs(changed_s) < LINK_S:
             return
-        self.vehicle = self.vehicle.later_by(changed_s)
+        self.vehicle, self._link_s = self.vehicle.later_by(changed_s), link_s + changed_s
         self.delay = Estimate(delay.value + changed_s, math.hypot(delay.sd, link.sd))
+        if self._thrust:
+            self._thrust = Estimate(self._thrust.value + changed_s, self._thrust.sd)
         self.sentences.append(
             f"the link delays by {1e3 * changed_s:+.0f} ms since the vehicle was identified"
         )

@@ -7,6 +7,7 @@ vehicle and link stays. Nothing in it waits: `Recorder` and `VehicleFiles` write
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 from offboard.flight.authority import PilotSwitch
@@ -160,7 +161,7 @@ class Flights:
         return self._memory.get(self._key, prepared) if self._key else None
 
     def _keep_identified(self, *, ended: bool = False) -> None:
-        """What the first flight identifies is kept at once, what a later one improves at its
+        """What the first flight identifies is kept at once, what a flight improves later at its
         end."""
         identification = self.current.identification
         if identification is None or not self._key:
@@ -172,6 +173,8 @@ class Flights:
                 "what was identified of this vehicle is contradicted, and discarded: the next "
                 "flight identifies it again"
             )
-        elif (result := identification.result) and (self._known is None or ended):
+            return
+        improved = ended and identification.adopted_s > -math.inf
+        if (result := identification.result) and (self._known is None or improved):
             self._memory.keep(self._key, self._prepared, result)
             self._known = self._remembered(self._prepared)

@@ -75,7 +75,6 @@ def uneventful(phase: Phase = Phase.TRACK, service: ServiceOptions | None = None
         wants_excitation=False,
         finished=lambda time_s: False,
         delay=None,
-        box_m=0.6,
     )
     controller: Any = None
     flight = FlightState(

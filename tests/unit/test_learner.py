@@ -215,6 +215,27 @@ def test_a_link_is_in_every_delay_and_its_changes_make_them_uncertain() -> None:
     assert estimate.uncertainty.tilt_s == pytest.approx(KNOWN_S)
 
 
+def test_delays_of_a_remembered_vehicle_follow_the_link_over_many_flights() -> None:
+    """From 204 to 108 ms in steps of 24, below the 30 ms that count as a change; one flight ends
+    before the link is measured. The vehicle's own delays stay what they are."""
+    own_s, at_s = 0.053, 0.204
+    known = IdentifiedVehicle(
+        FILE.model_copy(update={"tilt": FILE.tilt.model_copy(update={"delay_s": own_s + at_s})}),
+        Estimate(own_s + at_s, 0.002), at_s, Estimate(0.3, 0.02),
+    )  # fmt: skip
+    for link_s in (0.204, 0.180, None, 0.156, 0.132, 0.108):
+        estimate = VehicleEstimate(FILE, delay_error_s=UNKNOWN_DELAY_S, known=known)
+        if link_s is not None:
+            at_s = link_s
+            estimate.on_link_delay(Estimate(at_s, 0.002))
+        assert estimate.result is not None
+        known = estimate.result
+        assert known.vehicle.tilt.delay_s - known.link_s == pytest.approx(own_s)
+        assert abs(known.link_s - at_s) < 0.03
+        assert known.thrust is not None
+        assert known.thrust.value == pytest.approx(0.3 + known.link_s - 0.204)
+
+
 def test_learner_announces_what_is_new_in_motion(monkeypatch: pytest.MonkeyPatch) -> None:
     """A lasting contradiction twice, though every new fit seems to explain the flight; another
     hover thrust of the observer, if it differs by more than 6 % and is within bounds."""
