@@ -207,8 +207,8 @@ class VehicleEstimate:
         if within.thrust_delay_s is not None:
             self._thrust = within.thrust_effect_s
             self._replaced.pop("thrust_delay_s", None)
-        known = {"thrust_delay_s"} if self._thrust else set()
-        vehicle = with_link_delay(within, applied, self.file, known)
+        thrust_known = self._thrust is not None
+        vehicle = with_link_delay(within, applied, self.file, thrust_known=thrust_known)
         if within.tilt is not None:
             moved = [name for name in LINKED if getattr(vehicle, name) != getattr(applied, name)]
             self._replaced = {name: getattr(self.vehicle, name) for name in ("tilt", *moved)}

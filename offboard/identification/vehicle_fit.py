@@ -8,7 +8,7 @@ run in pieces of some milliseconds, so that each can be done between two control
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Mapping, Set
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
@@ -315,10 +315,10 @@ def _in_words(name: str) -> str:
 
 
 def with_link_delay(
-    found: Identified, target: Vehicle, vehicle_file: Vehicle, known: Set[str]
+    found: Identified, target: Vehicle, vehicle_file: Vehicle, *, thrust_known: bool
 ) -> Vehicle:
     """`target`, its delays of thrust and heading increased by what the link adds to the tilt's,
-    unless they were identified themselves: now, or before (`known`: "thrust_delay_s")."""
+    unless they were identified themselves. `thrust_known`: that of the thrust was."""
     if found.tilt is None:
         return target
     added_s = found.tilt.delay_s.value - vehicle_file.tilt.delay_s
@@ -326,8 +326,7 @@ def with_link_delay(
         return target
     update: dict[str, Any] = {}
     thrust_delay_s = vehicle_file.thrust_delay_s + added_s
-    unknown = found.thrust_delay_s is None and "thrust_delay_s" not in known
-    if unknown and target.thrust_delay_s < thrust_delay_s - LINK_S:
+    if not thrust_known and target.thrust_delay_s < thrust_delay_s - LINK_S:
         update["thrust_delay_s"] = thrust_delay_s
     yaw_delay_s = vehicle_file.yaw.delay_s + added_s
     if found.yaw is None and target.yaw.delay_s < yaw_delay_s - LINK_S:
