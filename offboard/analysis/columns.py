@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.analysis.tlog import layout
-from offboard.flight.record import FIELDS, IDENTIFIED_ID, RECORD_ID
-from offboard.identification.vehicle_fit import RECORDED
+from offboard.flight import record
+from offboard.flight.record import FIELDS
 from offboard.mavlink.decode import (
     POSITION_LIMIT_M,
     RATE_LIMIT_RADPS,
@@ -35,7 +35,7 @@ Kind = TypeVar("Kind", bound=np.generic)
 Columns = Mapping[str, tuple[str, int] | tuple[str, int, int]]
 
 ARRAY = "DEBUG_FLOAT_ARRAY"  # those of ours, with their array_id
-RECORDS, IDENTIFIED = f"{ARRAY} {RECORD_ID}", f"{ARRAY} {IDENTIFIED_ID}"
+RECORDS, IDENTIFIED = f"{ARRAY} {record.RECORD_ID}", f"{ARRAY} {record.IDENTIFIED_ID}"
 _MOTION: Columns = {"position_ned_m": ("x", 3), "velocity_ned_mps": ("vx", 3)}
 _SETPOINT: Columns = {"quaternion": ("q", 4), "thrust": ("thrust", 1)}
 _TIMESYNC: Columns = {"answered_ns": ("tc1", 1), "asked_ns": ("ts1", 1)}
@@ -61,7 +61,7 @@ OURS: dict[str, Columns] = {
     "SET_ATTITUDE_TARGET": _SETPOINT,
     "TIMESYNC": _TIMESYNC,
     RECORDS: {name: ("data", 1, place) for place, name in enumerate(FIELDS)},
-    IDENTIFIED: {name: ("data", 2, 2 * place) for place, name in enumerate(RECORDED)},
+    IDENTIFIED: {name: ("data", 2, 2 * place) for place, name in enumerate(record.IDENTIFIED)},
 }  # fmt: skip
 _TIMES = ("time_s", "unix_s")
 _TRUTH = {"HIL_STATE_QUATERNION": 1e3, "SIM_STATE": 1.0}  # altitude units per metre

@@ -77,7 +77,7 @@ class History:
     setpoint: quaternion, thrust (SET_ATTITUDE_TARGET); the last two NaN for a setpoint of
         the autopilot's own position loop (SET_POSITION_TARGET_LOCAL_NED)
     commanded: the same, or in a log without ours what the vehicle reports (ATTITUDE_TARGET)
-    identified: value and sd of each constant of `identification.vehicle_fit.RECORDED`
+    identified: value and sd of each constant of `flight.record.IDENTIFIED`
     link_delay: delay_s, at the telemetry that a TIMESYNC request followed
     heartbeat: armed (1 or 0), system_status (MAV_STATE)
     battery: voltage_mv, remaining in percent; NaN where it is not known (SYS_STATUS)

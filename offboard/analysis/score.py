@@ -23,10 +23,8 @@ from offboard.analysis.history import History, gather
 from offboard.analysis.tracking import Track, tracking_metrics
 from offboard.analysis.verdict import begin_times, verdict_metrics
 from offboard.documents.errors import UserError, meant, plain
-from offboard.flight.decision import DECISION_FAILED
-from offboard.flight.flight import Outcome
-from offboard.flight.outbox import Refusal
-from offboard.flight.phases import ExitCode, Phase
+from offboard.flight.phases import ExitCode, Outcome, Phase
+from offboard.flight.record import DECISION_FAILED, Refusal
 from offboard.link.log import LogError, replace_file
 
 Array = NDArray[np.float64]

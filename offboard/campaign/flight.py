@@ -38,8 +38,7 @@ from offboard.campaign.results import INFEASIBLE, Record, code_hash
 from offboard.control.base import ControllerSettings
 from offboard.control.keep_out import clearances
 from offboard.documents.errors import DocumentError, UserError
-from offboard.flight.flight import Outcome
-from offboard.flight.phases import ExitCode
+from offboard.flight.phases import ExitCode, Outcome
 from offboard.link.log import LogError
 from offboard.link.stop import StopRequests
 from offboard.run.configuration import FlightConfig

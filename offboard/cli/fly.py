@@ -30,7 +30,7 @@ from offboard.documents.errors import UserError, plain, typed
 
 if TYPE_CHECKING:
     from offboard.analysis.score import Requirement
-    from offboard.flight.flight import Outcome
+    from offboard.flight.phases import Outcome
 
 INTERRUPTED = "interrupted before anything was sent"
 

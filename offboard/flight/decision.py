@@ -14,25 +14,24 @@ from offboard.control.bandwidth import tilting_bandwidth
 from offboard.control.base import Adaptive, Situation
 from offboard.documents.errors import located
 from offboard.flight import failsafe, outbox
-from offboard.flight.outbox import Refusal, Refused
+from offboard.flight.outbox import Refused
 from offboard.flight.phases import Phase
 from offboard.flight.record import (
     CERTIFIED,
-    IDENTIFIED_ID,
-    IDENTIFIED_NAME,
+    DECISION_FAILED,
     RECORD_ID,
     RECORD_NAME,
     Decided,
+    Refusal,
     TickRecord,
+    identified_record,
 )
 from offboard.flight.state import FlightState
 from offboard.identification.learner import Learner, VehicleUpdate
 from offboard.mavlink.outgoing import ReferenceRecord, SolverRecord
 from offboard.model.command import Command
 
-# How the texts of missed decisions begin. One that raised an error has no record of its tick: the
-# analysis counts the texts
-DECISION_FAILED, DECISION_MISSED = "decision failed: ", "decision missed: "
+DECISION_MISSED = "decision missed: "
 NOTICEABLE_RADPS = 0.5  # a smaller change of the bandwidth is not announced
 # in a word -> what a missed decision is ascribed to
 _BY = {
@@ -161,8 +160,7 @@ def _set_vehicle(flight: FlightState, update: VehicleUpdate) -> None:
         flight.observer.set_vehicle(update.vehicle)
         flight.model = update.vehicle
     if update.record:
-        record = SolverRecord(flight.time_s, update.record, IDENTIFIED_ID, IDENTIFIED_NAME)
-        outbox.send(flight, record)
+        outbox.send(flight, identified_record(flight.time_s, update.record))
     for sentence in _with_bandwidth(flight, update, flight.controller):
         outbox.announce(flight, sentence)
 

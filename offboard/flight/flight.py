@@ -18,15 +18,13 @@ from offboard.flight.phases import (
     Phase,
 )
 from offboard.flight.record import DROPPED, InputRecorder
-from offboard.flight.state import FlightState, Outcome
+from offboard.flight.state import FlightState
 from offboard.flight.timing import PAUSE_S
 from offboard.link.interface import Chunk
 from offboard.mavlink.events import CRITICAL, Attitude, ClockBehind, Event, LocalPosition, Rebooted
 from offboard.mavlink.outgoing import Outgoing
 from offboard.mavlink.session import ACTIVE
 from offboard.supervisor.recovery import Supervised
-
-__all__ = ["Flight", "Outcome"]
 
 STATE_STANDBY = 3  # MAV_STATE
 BRIDGED_SHARE = 0.3  # of `Limits.silence_s`; after it, level setpoints replace the control law

@@ -81,7 +81,7 @@ def too_late_at_start(flight: FlightState) -> str:
         return ""
     observer, model = flight.observer, flight.model
     sentence = (
-        f"the start of the reference was not reached: {flight.position_error_m:.1f} m away, "
+        f"not at rest at the start of the reference: {flight.position_error_m:.1f} m away, "
         f"{flight.plan.overdue_s(flight.time_s):.0f} s late"
     )
     if abs(observer.hover_thrust_estimate / model.hover_thrust - 1.0) > WRONG_THRUST:

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from enum import IntFlag
 
 from offboard.flight.phases import TRACKING
+from offboard.flight.record import Refusal
 from offboard.flight.state import LEVEL_DIRECTION, FlightState
 from offboard.flight.timing import LOSSY
 from offboard.mavlink import event_record
@@ -36,15 +36,6 @@ ANNOUNCED_KEPT = 200
 REPEAT_S = 1.0  # after this a request that was refused, or not answered, is sent again
 LOSES = f"more than {LOSSY:.0%} of TIMESYNC requests have no reply: each setpoint is sent twice"
 _LENGTH_TOLERANCE = 0.01
-
-
-class Refusal(IntFlag):
-    """Why a setpoint was not sent, as the log has it."""
-
-    LATE = 1  # decided after its deadline
-    STALE = 2  # the telemetry that it was made for is too old
-    NOT_OURS = 4  # the vehicle does not, or may not, follow us
-    UNUSABLE = 8  # not finite, or beyond the numbers of the wire
 
 
 class Refused(Exception):

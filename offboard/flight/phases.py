@@ -95,6 +95,16 @@ class ExitCode:
     ABORTED = 4
 
 
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How a flight ended: an exit code of `ExitCode`, and one sentence. `log_problem`: what of its
+    log is lost; empty if nothing is."""
+
+    exit_code: int
+    sentence: str
+    log_problem: str = ""
+
+
 # A function of the flight that changes nothing: false (or an empty text) while it does not hold; a
 # text says why it holds
 Condition = Callable[["FlightState"], str | bool]

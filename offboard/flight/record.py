@@ -15,24 +15,44 @@ own time.
 from __future__ import annotations
 
 import json
+import math
 import struct
 import zlib
-from collections.abc import Callable, Hashable, Iterable, Iterator
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
+from enum import IntFlag
 from typing import Any, NamedTuple
 
 from offboard.control.base import Certificate, Decision
 from offboard.flight.phases import Phase
+from offboard.identification.uncertainty import Estimate
 from offboard.link.interface import Chunk
 from offboard.mavlink.event_record import numbered
 from offboard.mavlink.events import VehicleFound
-from offboard.mavlink.outgoing import PIECE_BYTES, ConfigurationRecord
+from offboard.mavlink.outgoing import PIECE_BYTES, ConfigurationRecord, SolverRecord
 from offboard.mavlink.session import Reception, SessionSettings
 from offboard.model.command import Command, PositionCommand, PredictedState
 
 RECORD_NAME = "pso"
 CERTIFIED = len(fields(Certificate))
 IDENTIFIED_NAME, IDENTIFIED_ID = "identified", 2  # of the other DEBUG_FLOAT_ARRAY in the log
+IDENTIFIED = (  # value and standard deviation of each, in this order
+    *("tilt_delay_s", "tilt_natural_frequency_radps", "tilt_damping"),
+    *("yaw_delay_s", "yaw_natural_frequency_radps", "yaw_damping"),
+    *("hover_thrust", "thrust_lag_s", "thrust_delay_s", "drag_ps"),
+)
+# How the text of a decision that raised an error begins. It has no record of its tick: the analysis
+# counts the texts
+DECISION_FAILED = "decision failed: "
+
+
+class Refusal(IntFlag):
+    """Why a setpoint was not sent, as the log has it."""
+
+    LATE = 1  # decided after its deadline
+    STALE = 2  # the telemetry that it was made for is too old
+    NOT_OURS = 4  # the vehicle does not, or may not, follow us
+    UNUSABLE = 8  # not finite, or beyond the numbers of the wire
 
 
 class TickRecord(NamedTuple):
@@ -72,7 +92,7 @@ class TickRecord(NamedTuple):
     track_time_s: float  # time since the start of the track; NaN before it
     seed_cost: float  # cost of the best plan that the search started from
     age_s: float  # of the telemetry when the setpoint was sent, vehicle time
-    refused: float  # flags of `outbox.Refusal`; 0 for a setpoint that was sent
+    refused: float  # flags of `Refusal`; 0 for a setpoint that was sent
     other_datagrams: float  # datagrams of other senders since the previous record
     pause_s: float  # longest pause of this process since the previous tick; 0 below a period
 
@@ -91,8 +111,16 @@ class Decided:
     solve_time_s: float
     sent: Command | PositionCommand | None = None
     age_s: float = 0.0  # of its telemetry, when it was checked
-    refused: int = 0  # flags of `outbox.Refusal`
+    refused: int = 0  # flags of `Refusal`
     failure: str = ""  # why it was refused
+
+
+def identified_record(time_s: float, found: Mapping[str, Estimate | None]) -> SolverRecord:
+    """The record of what was identified; NaN for what was not."""
+    numbers: list[float] = []
+    for each in map(found.get, IDENTIFIED):
+        numbers += (each.value, each.sd) if each else (math.nan, math.nan)
+    return SolverRecord(time_s, tuple(numbers), IDENTIFIED_ID, IDENTIFIED_NAME)
 
 
 # ---------------------------------------------------------------------- configuration and vehicle

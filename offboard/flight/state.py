@@ -25,6 +25,7 @@ from offboard.flight.phases import (
     ENDS,
     OPERATOR_STOP,
     Action,
+    Outcome,
     Phase,
     Request,
 )
@@ -50,16 +51,6 @@ THRUSTS_KEPT = 40  # as long as a setpoint may be on its way, or the next ones b
 MISSING_EARLY_S = 0.3
 HEARTBEAT_AWAITED_S = 1.2  # HEARTBEAT comes at 1 Hz
 MISSING_KNOWN_S = 3.0  # HEARTBEAT, at 1 Hz, shows the failsafe
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """How a flight ended: an exit code of `phases.ExitCode`, and one sentence. `log_problem`: what
-    of its log is lost; empty if nothing is."""
-
-    exit_code: int
-    sentence: str
-    log_problem: str = ""
 
 
 # of the flight before, with the same vehicle

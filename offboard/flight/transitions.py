@@ -18,13 +18,14 @@ from offboard.flight.phases import (
     FLYING,
     TRACKING,
     ExitCode,
+    Outcome,
     Phase,
     Request,
     ServiceOptions,
     Transition,
 )
 from offboard.flight.preflight import ParameterReading
-from offboard.flight.state import FlightState, Outcome
+from offboard.flight.state import FlightState
 from offboard.identification.learner import Learner, Stage
 from offboard.mavlink.events import LocalPosition
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Generator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum, auto
 from typing import Any
 
@@ -116,7 +116,7 @@ class VehicleUpdate:
     uncertainty: DelayUncertainty
     cause: str = ""
     sentences: tuple[str, ...] = ()
-    record: tuple[float, ...] = ()
+    record: Mapping[str, Estimate | None] = field(default_factory=dict)
 
 
 class Learner(VehicleEstimate):
@@ -248,7 +248,7 @@ class Learner(VehicleEstimate):
         if not self._has_told and (self.sentences or self.record or told != self._told):
             self._has_told, self._told = True, told
             update = replace(told, sentences=tuple(self.sentences), record=self.record)
-            self.sentences, self.record = [], ()
+            self.sentences, self.record = [], {}
             return update
         self._has_told = False
         self._time_s = time_s

@@ -22,7 +22,6 @@ from offboard.identification.vehicle_fit import (
     THRUST_DELAY_SD_S,
     THRUST_LAG_SD_S,
     Identified,
-    log_record,
     summary,
     with_link_delay,
     within_bounds,
@@ -87,7 +86,7 @@ class VehicleEstimate:
         self.vehicle = known.vehicle if known else file
         self.delay: Estimate | None = known.delay if known else None
         self.sentences: list[str] = []
-        self.record: tuple[float, ...] = ()
+        self.record: dict[str, Estimate | None] = {}
         self.cause = self.contradiction = ""
         self.adopted_s = -math.inf
         self._recalled = known
@@ -220,7 +219,7 @@ class VehicleEstimate:
         if within.drag_ps is None and found.drag_ps is not None:
             self._rejected_drag_ps = found.drag_ps.value
         self.sentences += sentences
-        self.record = log_record(found)
+        self.record = found.estimates
 
     def review_drag(self, found: Identified, least_ps: float, time_s: float) -> None:
         """Adopt a drag that differs, by its sd and by `least_ps`, from the one in use and from the

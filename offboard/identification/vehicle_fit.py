@@ -61,7 +61,6 @@ BOUNDS = {f"{axis}_{name}": AXIS_BOUNDS[name] for axis in AXES for name in AXIS_
     "thrust_delay_s": ((0.0, 0.5), DELAY_SLACK_S),
     "drag_ps": ((0.02, 3.0), 0.0),
 }
-RECORDED = tuple(BOUNDS)  # in the log, in this order
 
 
 def _constant(of: Any, name: str) -> Any:
@@ -94,7 +93,7 @@ class Identified:
 
     @property
     def estimates(self) -> dict[str, Estimate | None]:
-        """By the names of `BOUNDS`, in the order of the log's records."""
+        """By the names of `BOUNDS`."""
         return {name: _constant(self, name) for name in BOUNDS}
 
     @property
@@ -352,11 +351,3 @@ def summary(found: Identified) -> str:
     if found.drag_ps is not None:
         parts.append(f"drag {found.drag_ps.value:.2f} +- {found.drag_ps.sd:.2f} 1/s")
     return "identified " + "; ".join(parts)
-
-
-def log_record(found: Identified) -> tuple[float, ...]:
-    """Value and sd of each constant of RECORDED, for the log; NaN for what was not identified."""
-    numbers: list[float] = []
-    for each in found.estimates.values():
-        numbers += (each.value, each.sd) if each else (math.nan, math.nan)
-    return tuple(numbers)

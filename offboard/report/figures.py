@@ -39,8 +39,8 @@ from offboard.analysis.page import (
     without_outliers,
 )
 from offboard.analysis.verdict import irregular
-from offboard.flight.outbox import Refusal
 from offboard.flight.phases import Phase
+from offboard.flight.record import Refusal
 from offboard.mavlink.event_record import SUPERVISOR
 from offboard.report.flight import Flight
 from offboard.report.panels import GROUPS, LEAST_SHOWN, Curve, Panel, Points, thinned

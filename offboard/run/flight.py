@@ -21,10 +21,10 @@ from offboard.documents.errors import DocumentError, outside
 from offboard.documents.shipped import absolute
 from offboard.documents.signing_key import read_key
 from offboard.estimation.observer import Observer
-from offboard.flight.flight import Flight, Outcome
+from offboard.flight.flight import Flight
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.outbox import usable
-from offboard.flight.phases import ServiceOptions
+from offboard.flight.phases import Outcome, ServiceOptions
 from offboard.flight.record import configuration_pieces
 from offboard.identification.learner import Learner
 from offboard.identification.vehicle_estimate import IdentifiedVehicle

@@ -9,8 +9,8 @@ from contextlib import suppress
 from typing import Any, Protocol
 
 from offboard.documents.errors import Unavailable, located
-from offboard.flight.flight import Flight, Outcome
-from offboard.flight.phases import BEFORE_FLIGHT, WAITING, ExitCode
+from offboard.flight.flight import Flight
+from offboard.flight.phases import BEFORE_FLIGHT, WAITING, ExitCode, Outcome
 from offboard.link import clock
 from offboard.link.interface import Chunk, Link
 from offboard.link.stop import StopRequests

@@ -18,8 +18,7 @@ from sdnotify import SystemdNotifier
 
 from offboard import compiled
 from offboard.documents.errors import Unavailable, typed
-from offboard.flight.flight import Outcome
-from offboard.flight.phases import WAITING, ExitCode, ServiceOptions
+from offboard.flight.phases import WAITING, ExitCode, Outcome, ServiceOptions
 from offboard.link import clock
 from offboard.link.after_flight import OneByOne
 from offboard.link.background import BackgroundWriter

@@ -170,8 +170,8 @@ class Flights:
             self._known = None
             self._memory.discard(self._key)
             self.current.announce(
-                "what was identified of this vehicle is contradicted, and discarded: the next "
-                "flight identifies it again"
+                "what was identified of this vehicle is contradicted, and discarded: it is "
+                "identified again, in this flight or in the next one"
             )
             return
         improved = ended and identification.adopted_s > -math.inf

@@ -25,9 +25,9 @@ from offboard.analysis.history import History
 from offboard.analysis.score import Score, score
 from offboard.control.base import Adaptive, Controller
 from offboard.estimation.observer import Observer
-from offboard.flight.flight import Flight, Outcome
+from offboard.flight.flight import Flight
 from offboard.flight.flight_plan import FlightPlan
-from offboard.flight.phases import Action, Phase
+from offboard.flight.phases import Action, Outcome, Phase
 from offboard.identification.learner import IdentifySettings, Learner
 from offboard.link.interface import Chunk
 from offboard.link.log import FlightLog

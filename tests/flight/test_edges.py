@@ -15,8 +15,7 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from offboard.documents.errors import Unavailable
-from offboard.flight.flight import Outcome
-from offboard.flight.phases import Limits, Phase
+from offboard.flight.phases import Limits, Outcome, Phase
 from offboard.link import clock
 from offboard.link import log as log_module
 from offboard.link.interface import LinkReport

@@ -22,7 +22,8 @@ from hypothesis import strategies as st
 
 from offboard.flight import authority as module
 from offboard.flight.authority import Authority, Standing
-from offboard.flight.outbox import Refusal, Refused, admit
+from offboard.flight.outbox import Refused, admit
+from offboard.flight.record import Refusal
 from offboard.mavlink.dialects.base import SetpointLoss
 from offboard.model.command import Command, PositionCommand
 from simulator import config

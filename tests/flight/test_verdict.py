@@ -21,9 +21,8 @@ from offboard.analysis.history import History
 from offboard.analysis.score import Score, judged, score
 from offboard.analysis.score_table import summary, verdict
 from offboard.cli.commands import app
-from offboard.flight.flight import Outcome
 from offboard.flight.ground_contact import Touchdown
-from offboard.flight.phases import Action, Phase
+from offboard.flight.phases import Action, Outcome, Phase
 from offboard.identification.learner import IdentifySettings
 from offboard.link.log import FlightLog
 from offboard.model.frames import thrust_direction_from_quaternion

@@ -19,7 +19,7 @@ import pytest
 from processes import RECORDING, SHORT, Called, Spawn, children, ended, eventually, full_disk
 
 from offboard.analysis import history, tlog
-from offboard.flight.flight import Outcome
+from offboard.flight.phases import Outcome
 from offboard.link import after_flight
 from offboard.run import flight as run
 

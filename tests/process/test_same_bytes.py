@@ -16,8 +16,8 @@ import pytest
 import yaml
 
 from offboard.analysis import tlog
-from offboard.flight.flight import Flight, Outcome
-from offboard.flight.phases import Phase
+from offboard.flight.flight import Flight
+from offboard.flight.phases import Outcome, Phase
 from offboard.flight.record import RECORD_ID, TickRecord
 from offboard.link.stop import StopRequests
 from offboard.mavlink.session import COMPONENT_ID, RECORD_COMPONENT_ID
