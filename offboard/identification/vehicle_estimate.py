@@ -33,9 +33,7 @@ from offboard.model.vehicle import DelayUncertainty, Vehicle
 UNKNOWN_DELAY_S = 0.4
 FILE_DELAY_S = 0.13  # of a vehicle file that is flown as it is
 DOUBTED_DELAY_S = 0.28  # of a tilt that was fitted or flown, and that telemetry contradicts
-# Standard deviations by which an identified delay of tilt or thrust may be wrong: with an error of
-# the thrust's the height oscillates, with one of the tilt's the vehicle may crash
-SDS, THRUST_SDS = 3.0, 2.0
+SDS = 3.0  # standard deviations by which an identified delay may be wrong
 THRUST_SD_S = math.hypot(THRUST_DELAY_SD_S, THRUST_LAG_SD_S)  # before a fit
 DIRECT_LINK_S = 0.004  # link delay without a slow link: age of telemetry
 LINK_DIGITS = 2  # of seconds: a smaller change of the link is ignored
@@ -107,9 +105,9 @@ class VehicleEstimate:
         """What is not known of the delays of `vehicle`."""
         added_s, changed_s = self._link
         known_s = SDS * self.delay.sd if self.delay else self._unknown_s
-        thrust_s = THRUST_SDS * THRUST_SD_S if self.delay else self._unknown_s
+        thrust_s = SDS * THRUST_SD_S if self.delay else self._unknown_s
         if self._thrust:
-            thrust_s = THRUST_SDS * self._thrust.sd
+            thrust_s = SDS * self._thrust.sd
         tilt_s = max(known_s, self._doubt_s, changed_s)
         return DelayUncertainty(tilt_s=tilt_s, thrust_s=thrust_s, link_s=added_s)
 
@@ -245,7 +243,7 @@ class VehicleEstimate:
         differs, seen_before = False, self._other_thrust
         if known is not None:
             used_s = self.vehicle.thrust_delay_s + self.vehicle.thrust_lag_s
-            allowed_s = max(LEAST_JUMP_S, THRUST_SDS * math.hypot(new.sd, known.sd))
+            allowed_s = max(LEAST_JUMP_S, SDS * math.hypot(new.sd, known.sd))
             differs = abs(new.value - used_s) > allowed_s
         better = known is None or new.sd < BETTER * known.sd
         self._other_thrust = differs and not better
