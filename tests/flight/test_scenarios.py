@@ -437,6 +437,11 @@ ROWS = {
         "the vehicle restarted in flight", soft_landing,
         at=tracking(faults.downlink(faults.restamped(10.0))),
     ),
+    "heartbeats stop while it lands, position and mode go on": aborts(
+        Phase.FAILED, "it stands on the ground, and no HEARTBEAT shows whether it is disarmed",
+        fly=px4.hover, limits={"land_s": 20.0},
+        at=then(Phase.LAND, 0.0, silent(faults.HEARTBEAT)),
+    ),
     "position and attitude stop, heartbeats go on": aborts(
         Phase.FAILED, "no telemetry for 1.0 s .*; disarmed, landing not confirmed: ",
         landing_requested, fly=px4.lap, at=tracking(silent(faults.POSITION, faults.ATTITUDE)),
