@@ -209,6 +209,12 @@ def asked_to_disarm_without_force(pair: Pair) -> None:
     assert said(pair, "15 s without motion on the ground, and the vehicle does not disarm")
 
 
+def disarmed_by_itself(pair: Pair) -> None:
+    """It has stood for 15 s soon after it is asked to land."""
+    assert pair.armings[1:] == []
+    assert not said(pair, "15 s")
+
+
 def left_to_the_user(pair: Pair) -> None:
     assert said(pair, STILL_ARMED)
     assert pair.armings == []
@@ -397,6 +403,11 @@ ROWS = {
         ".*no lift-off in 8 s by the .* is MOT_THST_HOVER right", stayed_down_without_a_setpoint,
         fly=copter.hop,
         firmware=replace(ARDUPILOT, rules=(NO_TAKEOFF, *ARDUPILOT.rules)),
+    ),
+    "too weak to lift off": ends(
+        "no lift-off in 8 s; is hover_thrust in the vehicle file right", disarmed_by_itself,
+        fly=px4.hop, boot_scale=1.0,
+        scenario=scenario_of({"fault": "thrust_change", "thrust_scale": 0.4}),
     ),
     # the pilot
     "pilot takes over the landing while a failsafe shows": aborts(
