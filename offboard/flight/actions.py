@@ -125,9 +125,9 @@ def _await_link(flight: FlightState) -> None:
 def _disarm_if_standing(flight: FlightState) -> None:
     """Ask a vehicle that stands on the ground and stays armed to disarm; never by force, so that
     the autopilot refuses in the air. While its land detector reports flight, it must be disarmed
-    by the user, who is told so."""
+    by the user, who is told so. It may have stood before the landing, as without a lift-off."""
     contact = flight.contact
-    if not contact.stands:
+    if not contact.stands or flight.in_phase_s < STANDING_S:
         return
     if contact.detects_flight:
         outbox.announce(flight, STILL_ARMED, once=True)

@@ -103,11 +103,11 @@ def _miss(flight: FlightState, failure: str, cause: str, begins: str = DECISION_
 
 def _send(flight: FlightState, decided: Decided) -> None:
     """Send the command, if it is admitted; age and lateness are measured now, in host time."""
-    command, late_s = decided.decision.command, 0.0
+    command, host_s, late_s = decided.decision.command, flight.host_s, 0.0
     if flight.deadline_s is not None:
         host_s = flight.stopwatch()
-        decided.age_s = flight.telemetry_age_s(host_s)
         late_s = host_s - flight.telemetry_arrived_s - flight.period_s
+    decided.age_s = flight.telemetry_age_s(host_s)
     if flight.identification and flight.phase is Phase.EXCITE and isinstance(command, Command):
         command = flight.identification.excited(command, flight.time_s, flight.position_error_m)
     body_z_down = float(decided.state.thrust_direction_ned[2])

@@ -96,12 +96,11 @@ class Flight(FlightState):
 
     def _begin_turn(self, host_now_s: float) -> None:
         session = self.session
-        elapsed_s, before_s = session.elapsed_s(host_now_s), self.host_s
-        self.host_s = session.clock_s(host_now_s)
+        before_s, self.host_s = self.host_s, session.elapsed_s(host_now_s)
         if math.isnan(before_s):
-            before_s, self.heard_s = self.host_s, elapsed_s
+            before_s = self.heard_s = self.host_s
         paused_s = self.host_s - before_s
-        self.silence_s = elapsed_s - self.heard_s
+        self.silence_s = self.host_s - self.heard_s
         self.note_missing_setpoints()
         if session.settings.lockstep:
             return
@@ -147,7 +146,6 @@ class Flight(FlightState):
         self.vehicle.now_s = session.link_time_s
         if self.phase is Phase.LAND and self.unreached_s:
             self.began_s += self.now_s - before_s  # a landing that is not seen takes no time
-        self.host_s = session.clock_s(host_now_s)
         if self._heard:
             self.heard_s = session.elapsed_s(host_now_s)
             self.silence_s = self.bridged_s = 0.0

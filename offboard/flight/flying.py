@@ -33,7 +33,8 @@ from offboard.flight.phases import (
     Transition,
 )
 from offboard.flight.state import FlightState
-from offboard.flight.vehicle_state import DISARMED_S
+from offboard.flight.vehicle_state import ARMED_KNOWN_S, DISARMED_S
+from offboard.mavlink.events import Heartbeat
 
 TAKE_OVER_HEIGHT_M = 1.0  # where setpoints replace the autopilot's own take-off
 DETECTOR_S = 1.0  # EXTENDED_SYS_STATE is requested at 5 Hz
@@ -199,6 +200,8 @@ def out_of_reach(flight: FlightState) -> str:
 
 def not_disarmed(flight: FlightState) -> str:
     contact = flight.contact
+    if flight.vehicle.age_s(Heartbeat) > ARMED_KNOWN_S and not flight.not_landed():
+        return UNHEARD
     shows = contact.stands and contact.detects_flight and flight.vehicle.armed
     return f"not landed and disarmed after {flight.in_phase_s:.0f} s" + (
         f"; {STILL_ARMED}" if shows else ""

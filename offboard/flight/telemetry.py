@@ -137,7 +137,7 @@ def _on_telemetry(flight: FlightState, stamp_s: float, arrived_s: float, turned_
     flight.telemetry_arrived_s = arrived_s
     # Of a stream only the earliest time of arrival is known, which is wrong after a pause of ours
     host_s = turned_s if flight.session.settings.stream else arrived_s
-    flight.clock.on_telemetry(stamp_s, flight.session.clock_s(host_s))
+    flight.clock.on_telemetry(stamp_s, flight.session.elapsed_s(host_s))
 
 
 def _on_position(flight: FlightState, event: LocalPosition) -> None:

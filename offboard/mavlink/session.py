@@ -209,10 +209,6 @@ class Session:
         the simulator's first TIMESYNC request."""
         return self._simulated_s if self.settings.lockstep else host_s
 
-    def clock_s(self, host_s: float) -> float:
-        """Host time; in lockstep, where host time must decide nothing, the link's own seconds."""
-        return self.link_time_s if self.settings.lockstep else host_s
-
     @property
     def link_time_s(self) -> float:
         """Monotonic seconds that follow vehicle time, or host time while telemetry is missing."""

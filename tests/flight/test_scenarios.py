@@ -209,6 +209,12 @@ def asked_to_disarm_without_force(pair: Pair) -> None:
     assert said(pair, "15 s without motion on the ground, and the vehicle does not disarm")
 
 
+def disarmed_by_itself(pair: Pair) -> None:
+    """It has stood for 15 s soon after it is asked to land."""
+    assert pair.armings[1:] == []
+    assert not said(pair, "15 s")
+
+
 def left_to_the_user(pair: Pair) -> None:
     assert said(pair, STILL_ARMED)
     assert pair.armings == []
@@ -398,6 +404,11 @@ ROWS = {
         fly=copter.hop,
         firmware=replace(ARDUPILOT, rules=(NO_TAKEOFF, *ARDUPILOT.rules)),
     ),
+    "too weak to lift off": ends(
+        "no lift-off in 8 s; is hover_thrust in the vehicle file right", disarmed_by_itself,
+        fly=px4.hop, boot_scale=1.0,
+        scenario=scenario_of({"fault": "thrust_change", "thrust_scale": 0.4}),
+    ),
     # the pilot
     "pilot takes over the landing while a failsafe shows": aborts(
         Phase.FAILED, "not landed and disarmed after 20 s", the_pilots_while_landing, armed=True,
@@ -436,6 +447,11 @@ ROWS = {
     "restart in flight of a vehicle that stays armed": in_track(
         "the vehicle restarted in flight", soft_landing,
         at=tracking(faults.downlink(faults.restamped(10.0))),
+    ),
+    "heartbeats stop while it lands, position and mode go on": aborts(
+        Phase.FAILED, "it stands on the ground, and no HEARTBEAT shows whether it is disarmed",
+        fly=px4.hover, limits={"land_s": 20.0},
+        at=then(Phase.LAND, 0.0, silent(faults.HEARTBEAT)),
     ),
     "position and attitude stop, heartbeats go on": aborts(
         Phase.FAILED, "no telemetry for 1.0 s .*; disarmed, landing not confirmed: ",
