@@ -3,6 +3,7 @@ drift that it estimates, against motions and noises made with NumPy."""
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 from dataclasses import dataclass, replace
@@ -70,8 +71,10 @@ def test_steady_gains_are_those_of_the_riccati_equation() -> None:
     covariance = solve_discrete_are(f.T, h.T, q, r)
     expected = covariance @ h.T @ np.linalg.inv(h @ covariance @ h.T + r)
 
+    converged = hovering(noise, until_s=40.0)
+
     def after(position: float, tilt: float) -> np.ndarray:
-        observer = hovering(noise, until_s=40.0)
+        observer = copy.deepcopy(converged)
         direction = np.array([tilt, 0.0, math.sqrt(1 - tilt**2)])
         attitude = quaternion_from_thrust_direction(direction, 0.0)
         feed(observer, 40.01, (position, 0.0, 0.0), attitude=attitude)
