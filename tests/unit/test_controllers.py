@@ -95,7 +95,7 @@ def test_a_state_that_is_not_finite_gives_no_decision(law: str, field: str) -> N
     state = state_of(np.random.default_rng(0), reference, 0.1)
     for broken in (math.nan, math.inf):
         wrong = replace(state, **{field: np.array([0.0, broken, 1.0])})
-        with np.errstate(invalid="ignore"), pytest.raises(DecisionError, match="finite|solution"):
+        with np.errstate(invalid="ignore"), pytest.raises(DecisionError, match=r"finite|solution"):
             law_named(law).decide(Situation(5.0, wrong, reference, LEVEL))
 
 
