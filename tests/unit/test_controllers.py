@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import re
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +13,7 @@ import pytest
 from attitude_plant import lemniscate
 from laws import LEVEL, G, at, law_named, state_of
 
-from offboard.control.base import Controller, Situation
+from offboard.control.base import Controller, DecisionError, Situation
 from offboard.control.catalogue import names, settings_of
 from offboard.documents import shipped
 from offboard.documents.errors import DocumentError
@@ -84,6 +86,27 @@ def test_reset_gives_the_decisions_of_a_new_controller(law: str) -> None:
     first = decisions(controller)
     controller.reset()
     assert decisions(controller) == first == decisions(law_named(law))
+
+
+@pytest.mark.parametrize("law", [law for law in names() if law != "autopilot"])
+@pytest.mark.parametrize("field", ["position_ned_m", "velocity_ned_mps", "thrust_direction_ned"])
+def test_a_state_that_is_not_finite_gives_no_decision(law: str, field: str) -> None:
+    reference = lemniscate(8.0)
+    state = state_of(np.random.default_rng(0), reference, 0.1)
+    for broken in (math.nan, math.inf):
+        wrong = replace(state, **{field: np.array([0.0, broken, 1.0])})
+        with np.errstate(invalid="ignore"), pytest.raises(DecisionError, match=r"finite|solution"):
+            law_named(law).decide(Situation(5.0, wrong, reference, LEVEL))
+
+
+@pytest.mark.parametrize("law", ["pso", "paper"])
+def test_the_deadline_cuts_the_swarm_short(law: str) -> None:
+    """The time left is asked for after every 25 iterations."""
+    remaining_s, reference = iter((0.002, 0.001, 0.0)), lemniscate(8.0)
+    state = state_of(np.random.default_rng(0), reference, 0.1)
+    situation = Situation(5.0, state, reference, LEVEL, lambda: next(remaining_s))
+    certificate = law_named(law).decide(situation).certificate
+    assert (certificate.cut_short, certificate.iterations) == (True, 75)
 
 
 def test_an_error_that_stays_is_answered_ever_more_by_the_integral() -> None:

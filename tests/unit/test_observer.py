@@ -3,6 +3,7 @@ drift that it estimates, against motions and noises made with NumPy."""
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 from dataclasses import dataclass, replace
@@ -70,8 +71,10 @@ def test_steady_gains_are_those_of_the_riccati_equation() -> None:
     covariance = solve_discrete_are(f.T, h.T, q, r)
     expected = covariance @ h.T @ np.linalg.inv(h @ covariance @ h.T + r)
 
+    converged = hovering(noise, until_s=40.0)
+
     def after(position: float, tilt: float) -> np.ndarray:
-        observer = hovering(noise, until_s=40.0)
+        observer = copy.deepcopy(converged)
         direction = np.array([tilt, 0.0, math.sqrt(1 - tilt**2)])
         attitude = quaternion_from_thrust_direction(direction, 0.0)
         feed(observer, 40.01, (position, 0.0, 0.0), attitude=attitude)
@@ -364,13 +367,6 @@ def test_state_is_finite_under_any_telemetry() -> None:
 
 
 DRAG = PX4.drag_per_mass_ps
-VEHICLE = PX4.model_copy(
-    update={
-        "thrust_delay_s": 0.0,
-        "thrust_lag_s": 0.0,
-        "tilt": PX4.tilt.model_copy(update={"delay_s": 0.0}),
-    }
-)
 NOISE = Noise()
 FIXED_DRIFT = Noise(disturbance_limit_mps2=NOISE.disturbance_mps2)
 
@@ -410,16 +406,15 @@ def observe(
     """An observer after telemetry of `flown` with white noise on position and velocity; estimated
     positions and disturbances (N, 3)."""
     rng = np.random.default_rng(99)
-    observer = Observer(VEHICLE, noise)
+    observer = Observer(NO_DELAY, noise)
     observer.on_command(0.0, LEVEL)
     positions, disturbances = np.empty_like(flown.positions), np.empty_like(flown.positions)
     if adopted:
-        observer.set_vehicle(VEHICLE)
+        observer.set_vehicle(NO_DELAY)
     for i, time_s in enumerate(flown.times.tolist()):
         position = flown.positions[i] + white[0] * rng.standard_normal(3)
         velocity = flown.velocities[i] + white[1] * rng.standard_normal(3)
-        observer.on_attitude(time_s, UPRIGHT, STILL)
-        observer.on_position(time_s, tuple(position), tuple(velocity))
+        feed(observer, time_s, position, velocity)
         state = observer.predict(time_s)
         positions[i] = state.position_ned_m
         disturbances[i] = state.disturbance_ned_mps2
@@ -473,9 +468,7 @@ def test_gusts_are_followed_faster() -> None:
     assert min(observer.estimated.drift_mps2) > 0.5
     assert rms(adapted - flown.disturbances) < 0.7 * rms(fixed - flown.disturbances)
     for i in range(2000):
-        time_s = 20.0 + 0.01 * i
-        observer.on_attitude(time_s, UPRIGHT, STILL)
-        observer.on_position(time_s, tuple(flown.positions[-1]), STILL)
+        feed(observer, 20.0 + 0.01 * i, flown.positions[-1])
     assert observer.estimated.drift_mps2 == pytest.approx([0.15, 0.15])
 
 
@@ -500,7 +493,7 @@ def test_estimates_are_bounded_and_cleared_by_a_reset() -> None:
 
 def test_positions_that_an_attitude_has_overtaken_leave_the_noise_finite() -> None:
     """Two of them arrive after a newer attitude: the state has the same time at both."""
-    observer = Observer(VEHICLE, NOISE)
+    observer = Observer(NO_DELAY, NOISE)
     observer.on_command(0.0, LEVEL)
     for i in range(200):
         time_s = 0.04 * i

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast
 
@@ -17,7 +16,7 @@ from attitude_plant import Truth, fly, lemniscate
 from laws import LEVEL, PX4, G, lqr, pso, state_of
 
 from offboard.control.bandwidth import LEAST_MARGIN_S, SHARE_OF_DELAY, supported_bandwidth
-from offboard.control.base import Bandwidth, DecisionError, Situation
+from offboard.control.base import Bandwidth, Situation
 from offboard.control.law import LqrLaw, LqrSettings
 from offboard.estimation.noise import Noise
 from offboard.model.command import PredictedState
@@ -132,26 +131,6 @@ def test_swarm_finds_the_closed_form() -> None:
             assert found == pytest.approx(best, abs=near)
         assert ours.certificate.gap < 1e-6
         assert ours.certificate.optimal_cost == pytest.approx(exact.certificate.cost, rel=1e-6)
-
-
-def test_what_is_not_finite_is_no_decision() -> None:
-    reference = lemniscate(8.0)
-    for law in (pso(), lqr()):
-        state = state_of(np.random.default_rng(0), reference, 0.1)
-        for broken in (math.nan, math.inf):
-            wrong = replace(state, velocity_ned_mps=np.array([0.0, broken, 0.0]))
-            with np.errstate(invalid="ignore"), pytest.raises(DecisionError, match="not finite"):
-                law.decide(Situation(5.0, wrong, reference, LEVEL))
-
-
-def test_the_deadline_cuts_the_swarm_short() -> None:
-    remaining_s = iter((0.02, 0.0))
-    reference = lemniscate(8.0)
-    state = state_of(np.random.default_rng(0), reference, 0.1)
-    situation = Situation(5.0, state, reference, LEVEL, lambda: next(remaining_s))
-    certificate = pso().decide(situation).certificate
-    assert certificate.cut_short
-    assert certificate.iterations == 50
 
 
 # ---------------------------------------------------------------- flights

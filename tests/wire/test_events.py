@@ -105,16 +105,6 @@ def test_px4_sends_integer_parameters_as_bytes(value: int) -> None:
     assert event.value == value  # type: ignore[union-attr]
 
 
-def test_parameters_that_nothing_of_ours_reads_are_no_events() -> None:
-    """A ground station reads all on the same link, and names may be any."""
-    vehicle = Sender()
-    session = pinned(vehicle)
-    for name, events_of_it in ((b"", 0), (b"CAL_ACC0_ID", 0), (b"COM_OF_LOSS_T", 1)):
-        frame = vehicle.frame(mavlink.MAVLink_param_value_message(name, 1.0, 9, 1, 0))
-        reception = session.receive(frame, PEER, 1.0)
-        assert (len(reception.events), reception.frames) == (events_of_it, [frame])
-
-
 def test_estimator_reports() -> None:
     """Flags of recordings of PX4 1.16.1 and ArduCopter 4.6.3, before GPS and in flight."""
     waiting, flying, wrong = (0.0, NAN, 0.02, NAN, 0.003), (0.04, 0.03, 0.02, 0.07), (1.3, 0.1)

@@ -93,19 +93,6 @@ def test_a_mission_is_downloaded_as_uploaded_and_cleared() -> None:
         assert bench.of("MISSION_COUNT")[-1][1].count == 0
 
 
-@pytest.mark.parametrize(("firmware", "frame"), [(PX4, 6), (ARDUPILOT, 3)])
-def test_the_frame_of_a_downloaded_item_is_that_of_its_message(
-    firmware: Firmware, frame: int
-) -> None:
-    """Uploaded in frame 6: 6 in MISSION_ITEM_INT of PX4 alone, 3 in MISSION_ITEM."""
-    bench = Bench(firmware=firmware)
-    assert upload(bench, ROUND) == 0
-    send(bench, mavlink.MAVLink_mission_request_int_message(1, 1, 1))
-    send(bench, mavlink.MAVLink_mission_request_message(1, 1, 1))
-    frames = [bench.of(kind)[-1][1].frame for kind in ("MISSION_ITEM_INT", "MISSION_ITEM")]
-    assert frames == [frame, 3]
-
-
 def test_arducopter_refuses_an_item_with_nan_or_an_unknown_command() -> None:
     bench = Bench(firmware=ARDUPILOT)
     assert upload(bench, [place(WAYPOINT, 12, 0, 4, NAN)]) == 6
@@ -145,7 +132,8 @@ def test_missing_items_are_requested_again_until_a_timeout_or_cancelled() -> Non
 
 @pytest.mark.parametrize("firmware", [PX4, ARDUPILOT], ids=["px4", "ardupilot"])
 def test_fences_and_rally_points_are_kept_beside_the_mission(firmware: Firmware) -> None:
-    """A fence to stay in, and a rally point: as the mission, and without effect on it."""
+    """A fence to stay in, and a rally point: as the mission, and without effect on it. An item of
+    frame 6 is downloaded in it as MISSION_ITEM_INT of PX4 alone."""
     bench = Bench(firmware=firmware)
     assert upload(bench, ROUND) == 0
     kept = {1: [place(5001, n, e, 0, 3) for n, e in ((9, 9), (9, -9), (-9, 0))],
@@ -158,6 +146,10 @@ def test_fences_and_rally_points_are_kept_beside_the_mission(firmware: Firmware)
         listed, last = bench.of("MISSION_COUNT")[-1][1], bench.of("MISSION_ITEM_INT")[-1][1]
         assert (listed.count, listed.mission_type) == (len(rows), kind)
         assert (last.command, last.mission_type) == (rows[-1][0], kind)
+    send(bench, mavlink.MAVLink_mission_request_int_message(1, 1, 1))
+    send(bench, mavlink.MAVLink_mission_request_message(1, 1, 1))
+    frames = [bench.of(kind)[-1][1].frame for kind in ("MISSION_ITEM_INT", "MISSION_ITEM")]
+    assert frames == [6 if firmware is PX4 else 3, 3]
     send(bench, mavlink.MAVLink_mission_clear_all_message(1, 1, 1))
     for kind, count in enumerate((len(ROUND), 0, 1)):
         send(bench, mavlink.MAVLink_mission_request_list_message(1, 1, kind))
