@@ -118,7 +118,7 @@ def _await_link(flight: FlightState) -> None:
             "then landing is asked again",
         )
     elif waited and not flight.awaits_link:
-        flight.requested_s.clear()  # every request may be sent once more
+        flight.vehicle.results.clear()  # every request may be sent once more
         outbox.announce(flight, f"heard again: the vehicle shows {flight.vehicle.mode}")
 
 

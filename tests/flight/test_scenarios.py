@@ -418,6 +418,14 @@ ROWS = {
             *then(Phase.LAND, 1.5, faults.take_over),
         ],
     ),
+    "pilot takes over the landing behind a link that has become 4 s late": aborts(
+        Phase.YIELDED, "no telemetry for 1.0 s .*; the vehicle left AUTO.LAND for AUTO.LOITER",
+        the_pilots, fly=partial(px4.hover, HIGH), armed=True,
+        at=[
+            *then(Phase.HOVER, 0.2, faults.downlink(faults.late(4.0))),
+            *then(Phase.LAND, 1.5, faults.take_over),
+        ],
+    ),
     "pilot takes over as it arms": aborts(
         Phase.YIELDED, "the vehicle left OFFBOARD for AUTO.LOITER as it armed", the_pilots,
         armed=True, at=then(Phase.ARM, 0.0, faults.take_over),
