@@ -26,6 +26,7 @@ from offboard.flight.record import vehicle_record
 from offboard.flight.state import FlightState
 from offboard.flight.timing import VehicleClock
 from offboard.mavlink.events import (
+    BOOTS,
     Attitude,
     ClockBehind,
     CommandRequest,
@@ -172,6 +173,8 @@ def _on_mode(
 ) -> None:
     dialect = flight.dialect
     assert dialect is not None
+    if isinstance(event, Heartbeat) and event.system_status == BOOTS and flight.phase in FLYING:
+        _on_reboot(flight)  # before the mode that it shows counts as a pilot's
     if not flight.authority.engage_mode:
         flight.authority = Authority(dialect.engage_mode)
     vehicle, authority = flight.vehicle, flight.authority
