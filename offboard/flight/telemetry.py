@@ -76,6 +76,10 @@ def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: flo
             flight.follows_others = _is_of_others(flight, thrust)
         case Heartbeat(mode) | ModeReport(mode):
             _on_mode(flight, event, mode, arrived_s)
+        case Parameter() if flight.identification and flight.phase in FLYING:
+            flight.identification.on_changed(
+                transitions.shown_limits(flight, flight.identification)
+            )
         case TimesyncReply():
             flight.clock.on_reply(event)
         case CommandRequest():
