@@ -29,7 +29,7 @@ Row = tuple[str, Estimate | None, str, str]  # name, estimate, unit, reason with
 
 _KEPT = (
     "mass_kg", "inertia_kgm2", "arm_m", "drag_rotation_nmpradps",
-    "angular_acceleration_limit_radps2",
+    "angular_acceleration_limit_radps2", "angular_rate_limit_radps",
 )  # fmt: skip
 _UNITS = {"s": "s", "radps": "rad/s", "ps": "1/s"}  # by the end of a constant's name
 _KEYS = {"drag_ps": "drag_translation_npmps"}  # in a vehicle file, where they differ

@@ -6,8 +6,8 @@ the vertical one is built with such a difference: a decision every period on the
 replaying the commands sent, and an observer updated by position and attitude. It is stable if the
 eigenvalues of its transition matrix over one period are within the unit circle.
 
-An attitude loop with limited angular acceleration follows large commands more slowly. The lateral
-bandwidth is therefore at most the one at which the largest feedback stays within that limit.
+An attitude loop with limited angular acceleration or rate follows large commands more slowly. The
+lateral bandwidth is therefore at most the one at which the largest feedback stays within them.
 
 The phase margin of the loop's frequency response (`control.stability_margins`) agrees with this to
 10 % for delays below 60 ms, but at 10 Hz and 90 to 310 ms, where the loop gain has several
@@ -73,15 +73,22 @@ def supported_bandwidth(
         )  # fmt: skip
         return all(map(loop.is_stable, np.linspace(-thrust_s, thrust_s, 4)))
 
-    lateral_radps = _highest(lateral_bears, min(most_radps, tilting_bandwidth(vehicle)))
+    lateral_radps = _highest(lateral_bears, min(most_radps, tilting_bandwidth(vehicle)[0]))
     return Bandwidth(lateral_radps, _highest(vertical_bears, most_radps))
 
 
-def tilting_bandwidth(vehicle: Vehicle) -> float:
-    """The bandwidth at which feedback of FEEDBACK_LIMIT needs the greatest angular acceleration of
-    the tilt."""
+def tilting_bandwidth(vehicle: Vehicle) -> tuple[float, str]:
+    """The bandwidth at which feedback of FEEDBACK_LIMIT needs the greatest angular acceleration, or
+    the greatest angular rate, of the tilt, and the sentence that says which."""
     most_radps2 = min(vehicle.angular_acceleration_limit_radps2[:2])
-    return max(LEAST_RADPS, math.sqrt(most_radps2 / FEEDBACK_LIMIT))
+    most_radps = min(vehicle.angular_rate_limit_radps[:2])
+    acceleration = f"the autopilot limits the angular acceleration of the tilt to {most_radps2:.1f}"
+    rate = f"the autopilot limits the angular rate of the tilt to {most_radps:.1f}"
+    lowest, why = min(
+        (math.sqrt(most_radps2 / FEEDBACK_LIMIT), f"{acceleration} rad/s^2"),
+        (most_radps / FEEDBACK_LIMIT, f"{rate} rad/s"),
+    )
+    return max(LEAST_RADPS, lowest), why
 
 
 def _highest(bears: Callable[[float], bool], most_radps: float) -> float:

@@ -156,7 +156,9 @@ class TrackingLaw:
         self._tilt_ripple = tilt_ripple(vehicle, self.period_s)
         self._thrust_ripple = thrust_ripple(vehicle, self.period_s)
         delays = vehicle.tilt, vehicle.thrust_delay_s, vehicle.thrust_lag_s, uncertainty
-        limits = *delays, vehicle.angular_acceleration_limit_radps2
+        limits = (
+            *delays, vehicle.angular_acceleration_limit_radps2, vehicle.angular_rate_limit_radps,
+        )  # fmt: skip
         configured = self.configured_radps
         if uncertainty is None:
             self.bandwidth = Bandwidth(configured, configured)

@@ -64,10 +64,9 @@ def _request_heartbeat(flight: FlightState) -> None:
     request = CommandLong.message(HEARTBEAT)
     alone = flight.vehicle.age_s(ModeReport) > MODE_REPORTED_S
     due_s = HEARTBEAT_ALONE_DUE_S if alone else HEARTBEAT_DUE_S
-    waited_s = flight.now_s - flight.requested_s.get(request, -math.inf)
+    waited_s = flight.now_s - flight.requested_s.get(request, outbox.NEVER)[0]
     if flight.vehicle.age_s(Heartbeat) > due_s and waited_s > HEARTBEAT_EVERY_S:
-        flight.requested_s[request] = flight.now_s
-        outbox.send(flight, request)
+        outbox.send_request(flight, request)
 
 
 def act_without_telemetry(flight: FlightState, time_s: float) -> None:

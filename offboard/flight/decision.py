@@ -179,13 +179,9 @@ def _with_bandwidth(
     if as_configured:
         text = f"bandwidth {used} as configured"
     causes = [update.cause] if update.cause else []
-    if used.lateral_radps == tilting_bandwidth(update.vehicle) and not as_configured:
-        most_radps2 = min(update.vehicle.angular_acceleration_limit_radps2[:2])
-        causes.insert(
-            0,
-            "the autopilot limits the angular acceleration of the tilt to "
-            f"{most_radps2:.1f} rad/s^2",
-        )
+    tilting_radps, slow = tilting_bandwidth(update.vehicle)
+    if used.lateral_radps == tilting_radps and not as_configured:
+        causes.insert(0, slow)
     if causes:
         return (*update.sentences, f"{text}: {'; '.join(causes)}")
     return ("; ".join((*update.sentences, text)),)

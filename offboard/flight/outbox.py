@@ -33,6 +33,7 @@ from offboard.model.vehicle import Vehicle
 INFO = 6  # MAV_SEVERITY
 TEXT_ID_MAX = 65535  # STATUSTEXT.id; 0 is for texts of one chunk
 ANNOUNCED_KEPT = 200
+NEVER = -math.inf, -math.inf
 REPEAT_S = 1.0  # after this a request that was refused, or not answered, is sent again
 LOSES = f"more than {LOSSY:.0%} of TIMESYNC requests have no reply: each setpoint is sent twice"
 _LENGTH_TOLERANCE = 0.01
@@ -213,18 +214,26 @@ def request(flight: FlightState, request: CommandLong) -> bool:
     """Send a command if the vehicle is ours; returns whether it was sent.
 
     In one phase it is sent once. Only one that was refused, or that nothing has answered, is
-    sent again, after a second and a new report of the mode: a pilot may have changed it.
+    sent again, after a second and a report of the mode that the vehicle has sent since: a pilot may
+    have changed it. While telemetry with stamps is missing, one that has arrived since.
     """
     result = flight.vehicle.results.get(request.command)
-    requested_s = flight.requested_s.get(request, -math.inf)
+    requested_s, vehicle_s = flight.requested_s.get(request, NEVER)
     waits = flight.now_s - requested_s < REPEAT_S - 1e-6 or flight.authority.heard_s < requested_s
+    stamped = flight.silence_s < flight.limits.silence_s
+    waits = waits or (stamped and flight.reported_s < vehicle_s)
     done = math.isfinite(requested_s) and result in GOOD_RESULTS
     if waits or done or not flight.authority.permits_command(flight.now_s):
         return False
-    flight.requested_s[request] = flight.now_s
     flight.vehicle.results.pop(request.command, None)
-    send(flight, request)
+    send_request(flight, request)
     return True
+
+
+def send_request(flight: FlightState, request: CommandLong) -> None:
+    """Send it, and note when."""
+    flight.requested_s[request] = flight.now_s, flight.clock.now_s(flight.host_s)
+    send(flight, request)
 
 
 def announce(flight: FlightState, sentence: str, *, once: bool = False) -> None:

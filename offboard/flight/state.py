@@ -117,6 +117,7 @@ class FlightState(Ground):
     busyness: Busyness = field(init=False)  # of this computer
     heard_s: float = math.nan  # host time of the newest telemetry, as `Session.elapsed_s`
     telemetry_arrived_s: float = 0.0  # host time at which it arrived
+    reported_s: float = -math.inf  # stamp of the newest telemetry when the newest mode was reported
     bridged_s: float = 0.0  # `silence_s` at the newest setpoint that was sent without telemetry
     ignored: int = 0  # datagrams of others and forged frames between the two newest ticks
     command: Command = field(default_factory=lambda: Command(0.0, LEVEL_DIRECTION, 0.0))  # in force
@@ -133,7 +134,8 @@ class FlightState(Ground):
     told: set[str] = field(default_factory=set)  # of those that are announced once in a flight
     queue: list[Outgoing] = field(default_factory=list)  # to be sent
     records: list[Record] = field(default_factory=list)  # to be logged
-    requested_s: dict[CommandLong, float] = field(default_factory=dict)  # in this phase
+    # requests of this phase: when they were sent, also in vehicle time
+    requested_s: dict[CommandLong, tuple[float, float]] = field(default_factory=dict)
     text_id: int = 0
     awaits_link: bool = False  # while landing
     follows_others: bool = False  # the newest ThrustReport is of none of `thrusts`

@@ -26,6 +26,7 @@ from offboard.flight.record import vehicle_record
 from offboard.flight.state import FlightState
 from offboard.flight.timing import VehicleClock
 from offboard.mavlink.events import (
+    BOOTS,
     Attitude,
     ClockBehind,
     CommandRequest,
@@ -75,6 +76,10 @@ def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: flo
             flight.follows_others = _is_of_others(flight, thrust)
         case Heartbeat(mode) | ModeReport(mode):
             _on_mode(flight, event, mode, arrived_s)
+        case Parameter() if flight.identification and flight.phase in FLYING:
+            flight.identification.on_changed(
+                transitions.shown_limits(flight, flight.identification)
+            )
         case TimesyncReply():
             flight.clock.on_reply(event)
         case CommandRequest():
@@ -172,10 +177,13 @@ def _on_mode(
 ) -> None:
     dialect = flight.dialect
     assert dialect is not None
+    if isinstance(event, Heartbeat) and event.system_status == BOOTS and flight.phase in FLYING:
+        _on_reboot(flight)  # before the mode that it shows counts as a pilot's
     if not flight.authority.engage_mode:
         flight.authority = Authority(dialect.engage_mode)
     vehicle, authority = flight.vehicle, flight.authority
     authority.setpoint_loss = dialect.setpoint_loss(vehicle.parameters)
+    flight.reported_s = flight.time_s
     authority.on_mode(
         mode,
         flight.now_s,
@@ -211,6 +219,7 @@ def _on_reboot(flight: FlightState) -> None:
     flight.contact, flight.clock = GroundContact(flight.vehicle), VehicleClock()
     flight.hover, flight.jumps = HoverEstimate(), PositionJumps()
     flight.reading = ParameterReading()
+    flight.requested_s.clear()
     flight.took_off = False  # the local frame begins elsewhere
     if flight.phase in BEFORE_FLIGHT:
         flight.authority = Authority()

@@ -169,10 +169,12 @@ class VehicleClock:
 
     def loses(self, host_s: float) -> bool:
         """Whether more than LOSSY of the newest requests have no reply at host time `host_s`,
-        although it was due."""
+        although it was due, and one that was sent later has been answered: on a link that has
+        become later, replies come in their order."""
         if len(self._asked_s) <= LOSS_OVER:
             return False
-        return self._unanswered(self._asked_s[0], host_s) > LOSSY * LOSS_OVER
+        lost = self._unanswered(self._asked_s[0], host_s) - self.overdue(host_s)
+        return lost > LOSSY * LOSS_OVER
 
     def _unanswered(self, since_s: float, host_s: float) -> int:
         """Number of requests sent after `since_s` whose reply was due at `host_s`."""

@@ -5,7 +5,7 @@ taken, and begins its phase. `actions` has what is sent in a phase.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections import defaultdict
 from functools import cache
 
 import numpy as np
@@ -148,7 +148,9 @@ def _enter(flight: FlightState, row: Transition) -> None:
         flight.positioning.begin(flight.vehicle, rates_hz, dialect.estimator_message)
         if flight.identification:
             flight.identification.on_link_delay(flight.clock.delay)
-            _set_acceleration(flight, flight.identification, dialect.acceleration_parameters)
+            if limits := shown_limits(flight, flight.identification):
+                flight.model = flight.model.model_copy(update=limits)
+                flight.identification.on_shown(limits)
         if source is Phase.ARM:  # on the ground the time that it takes does no harm
             decision.begin(flight)
     if flight.identification:
@@ -247,18 +249,18 @@ def _place_reference(flight: FlightState, position: LocalPosition) -> None:
         flight.plan.origin_ned_m = from_rest or jumps.reported(flight.home_ned_m)
 
 
-def _set_acceleration(flight: FlightState, learner: Learner, units: Mapping[str, float]) -> None:
-    """Fly with the angular acceleration of the vehicle file, or that to which the autopilot's
-    parameters limit the tilt."""
-    read = flight.vehicle.parameters
-    if not units.keys() & read.keys():
-        return
-    shown = [read.get(name, 0.0) * unit for name, unit in units.items()]
-    least = min((each for each in shown if each > 0.0), default=math.inf)
-    *tilt, yaw = learner.file.angular_acceleration_limit_radps2
-    limits = {"angular_acceleration_limit_radps2": (*(min(each, least) for each in tilt), yaw)}
-    flight.model = flight.model.model_copy(update=limits)
-    learner.on_shown(limits)
+def shown_limits(flight: FlightState, learner: Learner) -> dict[str, tuple[float, ...]]:
+    """The angular acceleration and rate of the vehicle file, or those to which the autopilot's
+    parameters limit the tilt; those without a parameter are missing."""
+    read, shown = flight.vehicle.parameters, defaultdict[str, list[float]](list)
+    for name, (limit, unit) in flight.dialect.tilting_parameters.items() if flight.dialect else ():
+        if name in read:
+            shown[limit].append(read[name] * unit if read[name] > 0.0 else math.inf)
+    limits = {}
+    for limit, values in shown.items():
+        *tilt, yaw = getattr(learner.file, limit)
+        limits[limit] = (*(min(each, *values) for each in tilt), yaw)
+    return limits
 
 
 def _set_hover_thrust(flight: FlightState, least: float = DIFFERENT) -> None:

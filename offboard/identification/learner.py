@@ -198,6 +198,10 @@ class Learner(VehicleEstimate):
         flown = self._told.vehicle.model_copy(update=constants)
         self._told = replace(self._told, vehicle=flown)
 
+    def on_changed(self, constants: Mapping[str, Any]) -> None:
+        """Fly with constants that the vehicle reports in flight, from the next tick on."""
+        super().on_shown(constants)
+
     def on_stage(self, stage: Stage, time_s: float) -> None:
         """The flight has entered `stage`."""
         self._stage = stage

@@ -46,8 +46,8 @@ THRUST_EFFECT = ("thrust_lag_s", "thrust_delay_s", "thrust_effect_s")  # accepte
 # thrust, of the thrust's lag, and of the link's delay while the tilt is not identified.
 YAW_DELAY_SD_S, THRUST_DELAY_SD_S, THRUST_LAG_SD_S, LINK_SD_S = 0.1, 0.03, 0.05, 0.15
 
-# Allowed in addition to the factor: a link may be slow, and heavy vehicles have little drag
-DELAY_SLACK_S, DRAG_SLACK_PS = 0.4, 0.15
+DELAY_SLACK_S = 0.4  # allowed in addition to the factor: a link may be slow
+DRAG_SLACK_PS = 0.3  # a heavy vehicle may have next to none
 LINK_S = 0.03  # a smaller difference of delays is the vehicle's own, not the link's
 AXES = ("tilt", "yaw")
 AXIS_BOUNDS = {
@@ -60,7 +60,7 @@ BOUNDS = {f"{axis}_{name}": AXIS_BOUNDS[name] for axis in AXES for name in AXIS_
     "hover_thrust": (HOVER_THRUST_LIMITS, 0.0),
     "thrust_lag_s": ((0.0, 0.4), DELAY_SLACK_S),
     "thrust_delay_s": ((0.0, 0.5), DELAY_SLACK_S),
-    "drag_ps": ((0.02, 3.0), DRAG_SLACK_PS),
+    "drag_ps": ((0.0, 3.0), DRAG_SLACK_PS),
 }
 
 

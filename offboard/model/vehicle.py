@@ -69,6 +69,7 @@ class Vehicle(Parameters):
     tilt: AxisResponse
     yaw: AxisResponse
     angular_acceleration_limit_radps2: PositiveTriple = (50.0, 50.0, 20.0)
+    angular_rate_limit_radps: PositiveTriple = (3.84, 3.84, 3.49)  # PX4: 220, 220, 200 deg/s
     tilt_max_rad: float = Field(default=0.7, ge=0.05, le=1.4)
 
     def later_by(self, delay_s: float) -> Vehicle:

@@ -23,9 +23,6 @@ Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
-# PX4's defaults of MC_ROLLRATE_MAX, MC_PITCHRATE_MAX (220 deg/s) and MC_YAWRATE_MAX (200 deg/s)
-RATE_LIMIT_RADPS: Triple = (3.84, 3.84, 3.49)
-
 # A rate demand bypasses the attitude part of the cascade. Half the identified delay reproduces
 # PX4's measured rate steps (t63: roll 0.10-0.11 s, yaw 0.45 s).
 _RATE_DELAY_SHARE = 0.5
@@ -53,7 +50,8 @@ class Demand:
 def build_loop(vehicle: Vehicle) -> tuple[Array, NDArray[np.int64]]:
     """Constants of the compiled loop.
 
-    Gains (3, 3): rows attitude gain wn / 2z 1/s, rate gain 2 z wn 1/s, acceleration limit rad/s^2.
+    Gains (4, 3): rows attitude gain wn / 2z 1/s, rate gain 2 z wn 1/s, acceleration limit rad/s^2,
+    rate limit rad/s.
     Delays (5,) of tilt, yaw, thrust, tilt rate and yaw rate, in steps, shortened by half a step, by
     which holding a demand for a step delays it.
     """
@@ -63,6 +61,7 @@ def build_loop(vehicle: Vehicle) -> tuple[Array, NDArray[np.int64]]:
             [axis.natural_frequency_radps / (2.0 * axis.damping) for axis in axes],
             [2.0 * axis.damping * axis.natural_frequency_radps for axis in axes],
             vehicle.angular_acceleration_limit_radps2,
+            vehicle.angular_rate_limit_radps,
         ]
     )
     delays_s = np.array(
@@ -78,7 +77,7 @@ def build_loop(vehicle: Vehicle) -> tuple[Array, NDArray[np.int64]]:
 
 
 def encode(demand: Demand, row: Array) -> None:
-    """Write a demand into a history row (ROW_WIDTH,), limited and with finite numbers only."""
+    """Write a demand into a history row (ROW_WIDTH,), without NaN."""
     row[:] = 0.0
     thrust = demand.thrust if demand.motors_on else 0.0
     if not math.isnan(thrust):
@@ -86,7 +85,7 @@ def encode(demand: Demand, row: Array) -> None:
     if demand.attitude is not None:
         _encode_attitude(demand.attitude, row)
     elif demand.rates_frd_radps is not None:
-        row[_RATES:_THRUST] = [*map(_within, demand.rates_frd_radps, RATE_LIMIT_RADPS)]
+        row[_RATES:_THRUST] = [0.0 if math.isnan(each) else each for each in demand.rates_frd_radps]
 
 
 def _encode_attitude(attitude: Quaternion, row: Array) -> None:
@@ -98,10 +97,6 @@ def _encode_attitude(attitude: Quaternion, row: Array) -> None:
     w, x, y, z = w / largest, x / largest, y / largest, z / largest
     norm = math.sqrt(w * w + x * x + y * y + z * z)
     row[_IS_ATTITUDE:_RATES] = (1.0, w / norm, x / norm, y / norm, z / norm)
-
-
-def _within(rate: float, limit: float) -> float:
-    return 0.0 if math.isnan(rate) else min(max(rate, -limit), limit)
 
 
 @kernel
@@ -163,7 +158,6 @@ def angular_acceleration(plant: Any, step: int) -> None:
             _attitude_error(plant.estimated, row, error)
         for i in range(first, last):
             rate = gains[0, i] * error[i] if by_attitude else row[_RATES + i]
-            limit = RATE_LIMIT_RADPS[i]
-            rate = min(max(rate, -limit), limit)
+            rate = min(max(rate, -gains[3, i]), gains[3, i])
             demand = gains[1, i] * (rate - plant.body[4 + i])
             out[i] = min(max(demand, -gains[2, i]), gains[2, i])

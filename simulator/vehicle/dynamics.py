@@ -61,7 +61,7 @@ RECORD = np.dtype(
         ("row", "f8", ROW_WIDTH),
         ("history", "f8", (_HISTORY_ROWS, ROW_WIDTH)),
         ("delays", "i8", 5),
-        ("gains", "f8", (3, 3)),
+        ("gains", "f8", (4, 3)),
         # constants
         ("body_constants", "f8", 13),
         ("rotor_constants", "f8", 6),

@@ -232,10 +232,10 @@ def test_nothing_is_said_of_a_good_vehicle(firmware: Firmware) -> None:
 
 def test_limits_of_the_angular_acceleration_have_their_units() -> None:
     """Hundredths of a degree/s^2 until ArduCopter 4.6, degree/s^2 since 4.7."""
-    units = DIALECTS["ardupilot"].acceleration_parameters
+    parameters = DIALECTS["ardupilot"].tilting_parameters
     shown = {"ATC_ACCEL_R_MAX": 11e4, "ATC_ACCEL_P_MAX": 11e4, "ATC_ACC_R_MAX": 1100.0}
     for name, value in (shown | {"ATC_ACC_P_MAX": 1100.0}).items():
-        assert value * units[name] == pytest.approx(19.2, abs=0.01)
+        assert value * parameters[name][1] == pytest.approx(19.2, abs=0.01)
 
 
 @pytest.mark.parametrize(
@@ -255,7 +255,7 @@ def test_parameters_of_another_release_are_not_awaited(replies: str) -> None:
     missing = {each.name for each in DIALECTS["ardupilot"].unanswered(known)}
     assert missing == {
         "GUID_OPTIONS", "GUID_TIMEOUT", "MOT_THST_HOVER", "ATC_ANGLE_BOOST", "FS_GCS_ENABLE",
-        "FS_THR_ENABLE",
+        "FS_THR_ENABLE", "ATC_RATE_R_MAX", "ATC_RATE_P_MAX",
     }  # fmt: skip
 
 

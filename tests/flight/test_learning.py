@@ -15,6 +15,7 @@ from faults import TIMESYNC, delivering, without
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pair import Pair, in_phase, make, on_arducopter
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from watch import scenario_of, watched
 
 from offboard.analysis.identify import identify_flight, vehicle_file
@@ -186,14 +187,40 @@ def test_tilt_that_the_autopilot_accelerates_slowly_is_flown() -> None:
         flies=copter.model_copy(update={"angular_acceleration_limit_radps2": slow}),
         scenario=scenario_of({"fault": "link", "latency_s": 0.095}),
     )  # fmt: skip
-    for name in DIALECTS["ardupilot"].acceleration_parameters:
-        pair.instance.autopilot.parameters.set(name, cdeg)
+    for name, (limit, _) in DIALECTS["ardupilot"].tilting_parameters.items():
+        if "acceleration" in limit:
+            pair.instance.autopilot.parameters.set(name, cdeg)
     pair.track()
     assert pair.score().rmse_position_m < 0.2
     said = " | ".join(pair.companion.announced)
     assert "bandwidth limited to 2.8 rad/s laterally" in said
     limited = "the autopilot limits the angular acceleration of the tilt to 2.3 rad/s^2"
     assert f"{limited}; identified delay" in said
+
+
+@pytest.mark.parametrize("when", [Phase.CONNECT, Phase.EXCITE])
+def test_tilt_that_the_autopilot_turns_slowly_is_flown(when: Phase) -> None:
+    """PX4 with 60 instead of 220 deg/s, behind a link of 120 ms each way; also where somebody
+    changes its parameters in flight. Without the limit of the bandwidth 0.33 m."""
+    slow, noise = (math.radians(60.0),) * 2 + (3.49,), {"estimator": "px4_like"}
+    pair = learning(
+        ONE_LAP, seed=3, aloft=False,
+        flies=TRUE.model_copy(update={"angular_rate_limit_radps": slow}),
+        scenario=scenario_of({"fault": "link", "latency_s": 0.12}, conditions=noise),
+    )  # fmt: skip
+
+    def change(flying: Pair) -> None:
+        station = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
+        for name in DIALECTS["px4"].tilting_parameters:
+            message = mavlink.MAVLink_param_set_message(1, 1, name.encode(), 60.0, 9)
+            flying.instance.feed(message.pack(station))
+
+    pair.at.append((in_phase(when), change))
+    pair.track()
+    assert pair.score().rmse_position_m < 0.12
+    said = " | ".join(pair.companion.announced)
+    assert "bandwidth limited to 3.5 rad/s laterally" in said
+    assert "the autopilot limits the angular rate of the tilt to 1.0 rad/s" in said
 
 
 def test_white_noise_of_positions_is_no_delay_of_the_thrust() -> None:

@@ -226,13 +226,18 @@ def test_a_flight_of_ours_is_not_shown_in_the_frame_of_another_message(
     assert (len(history.position), history.substitutes) == (0, ())
 
 
-@pytest.mark.parametrize(("origin", "north_m"), [(True, 111.195), (False, 0.0)])
+@pytest.mark.parametrize(
+    ("origin", "moved", "north_m"),
+    [(True, False, 111.195), (False, False, 0.0), (True, True, 111.195)],
+)
 def test_a_home_position_is_the_origin_only_without_another(
-    tmp_path: Path, origin: bool, north_m: float
+    tmp_path: Path, origin: bool, moved: bool, north_m: float
 ) -> None:
     """ArduCopter's HOME_POSITION has zeros for the local frame wherever home is. A thousandth of a
-    degree of latitude is 111.195 m on a sphere of 6371 km."""
+    degree of latitude is 111.195 m on a sphere of 6371 km. An origin that a ground station moves in
+    flight counts from then on alone."""
     codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    ours = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
     home = 470_010_000, 80_000_000
     messages = [
         mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3),
@@ -241,8 +246,13 @@ def test_a_home_position_is_the_origin_only_without_another(
         codec.local_position_ned_encode(1000, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
         codec.sim_state_encode(1.0, *[0.0] * 14, 500.0, *[0.0] * 5, *home),
     ]
+    setpoint = ours.set_attitude_target_encode(1000, 1, 1, 7, [1.0, 0.0, 0.0, 0.0], 0, 0, 0, 0.5)
+    elsewhere = codec.gps_global_origin_encode(480_000_000, 80_000_000, 500_000)
+    frames = [each.pack(codec) for each in messages]
+    if moved:
+        frames += [setpoint.pack(ours), elsewhere.pack(codec)]
     log = tmp_path / "x.tlog"
-    log.write_bytes(b"".join(STAMP + each.pack(codec) for each in messages))
+    log.write_bytes(b"".join(STAMP + each for each in frames))
     (row,) = read(log).history.truth
     assert row["position_ned_m"] == pytest.approx([north_m, 0.0, 0.0], abs=0.01)
 

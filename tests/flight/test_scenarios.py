@@ -273,6 +273,7 @@ def complain(pair: Pair) -> None:
 
 
 STOPPED = "stop requested by the operator"
+BOOTING = faults.heartbeats(system_status=1, base_mode=81, custom_mode=0)  # in STABILIZE
 HELICOPTER = config.vehicle("px4_sih").model_copy(update={"airframe": "helicopter"})
 SOON, LATER = {"health_s": 5.0}, {"health_s": 8.0}
 NO_TAKEOFF = Rule("takeoff", result=Result.FAILED)
@@ -447,6 +448,12 @@ ROWS = {
     "restart in flight": aborts(
         Phase.FAILED, "the vehicle restarted in flight; the vehicle restarted and is disarmed",
         fly=px4.lap, at=tracking(faults.restart),
+    ),
+    # its first HEARTBEAT shows another mode, and is heard before any of its time stamps
+    "restart in flight of ArduCopter": aborts(
+        Phase.FAILED, "the vehicle restarted in flight; the vehicle restarted and is disarmed",
+        fly=copter.lap, armed=True, ended_by="restart",
+        at=tracking(faults.downlink(BOOTING)),
     ),
     "restart while landing": ends(
         "the vehicle restarted while landing", fly=px4.hover, ended_by="restart",

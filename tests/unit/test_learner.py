@@ -59,6 +59,8 @@ def test_what_a_file_may_have_is_adopted_and_nothing_else() -> None:
         hover = Estimate(hover_thrust, 1e-3)
         found = Identified(10.0, ResponseFit(*values, 0.004, 0.1), hover_thrust=hover)
         assert within_bounds(found, file, 4.0) == (found, [])
+    without_drag = Identified(10.0, drag_ps=Estimate(0.01, 0.02))
+    assert within_bounds(without_drag, FILE, 4.0) == (without_drag, [])
     for wrong in (0.0199, 0.9501):
         with pytest.raises(ValidationError, match="hover_thrust"):
             Vehicle.model_validate(FILE.model_dump() | {"hover_thrust": wrong})

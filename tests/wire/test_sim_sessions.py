@@ -301,10 +301,10 @@ def named(name: str, firmware: str) -> Session:
 @pytest.mark.parametrize(
     ("name", "firmware", "equal"),
     [
-        ("talk", "ardupilot", 47),
+        ("talk", "ardupilot", 48),
         ("failsafes", "ardupilot", 33),
         ("failsafes", "px4", 11),
-        ("ground", "px4", 73),  # also out of range, NaN, of another type and unknown
+        ("ground", "px4", 75),  # also out of range, NaN, of another type and unknown
     ],
 )
 def test_parameters_are_told_as_the_real_autopilot_tells_them(

@@ -9,7 +9,9 @@ from types import MappingProxyType
 from pymavlink.dialects.v20.all import enums
 
 from offboard.mavlink.dialects.base import (
+    ACCELERATION_LIMIT,
     CUSTOM_MODE_ENABLED,
+    RATE_LIMIT,
     TRACKING_TELEMETRY,
     Dialect,
     SetpointLoss,
@@ -45,6 +47,7 @@ _JERK = WatchedParameter(
 )
 # Their names until 4.6, and since 4.7
 _ACCELERATIONS = {"ATC_ACCEL_R_MAX": "ATC_ACC_R_MAX", "ATC_ACCEL_P_MAX": "ATC_ACC_P_MAX"}
+_RATES = "ATC_RATE_R_MAX", "ATC_RATE_P_MAX"
 _UNCHECKED = Valid("the vehicle arms without all of its checks", 1.0, 1.0, 1.0)
 
 # Parameters that replace another one: since ArduCopter 4.7
@@ -132,14 +135,19 @@ ARDUPILOT = Dialect(
                 WatchedParameter(new, "greatest angular acceleration, degree/s^2", replaces=old),
             )
         ),
+        *(
+            WatchedParameter(each, "greatest angular rate, degree/s; 0 is no limit")
+            for each in _RATES
+        ),
     ),
     hover_parameter="MOT_THST_HOVER",
     tilt_parameters=MappingProxyType(
         {"ANGLE_MAX": math.radians(0.01), "ATC_ANGLE_MAX": math.radians(1.0)}
     ),
-    acceleration_parameters=MappingProxyType(
-        dict.fromkeys(_ACCELERATIONS, math.radians(0.01))
-        | dict.fromkeys(_ACCELERATIONS.values(), math.radians(1.0))
+    tilting_parameters=MappingProxyType(
+        dict.fromkeys(_ACCELERATIONS, (ACCELERATION_LIMIT, math.radians(0.01)))
+        | dict.fromkeys(_ACCELERATIONS.values(), (ACCELERATION_LIMIT, math.radians(1.0)))
+        | dict.fromkeys(_RATES, (RATE_LIMIT, math.radians(1.0)))
     ),
     estimator_message="EKF_STATUS_REPORT",
     slow_hint="another ground station may set the rates (MAVProxy: `set streamrate -1`), or the "

@@ -16,6 +16,8 @@ from offboard.mavlink.outgoing import CommandLong
 
 SET_MODE, TAKEOFF = 176, 22  # MAV_CMD
 CUSTOM_MODE_ENABLED = 1.0  # MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+# limits of a `Vehicle`
+ACCELERATION_LIMIT, RATE_LIMIT = "angular_acceleration_limit_radps2", "angular_rate_limit_radps"
 TYPE_ONBOARD_CONTROLLER, TYPE_GCS = 18, 6  # MAV_TYPE
 FRAME_BYTES = 12  # of a MAVLink 2 frame besides its payload
 
@@ -165,9 +167,9 @@ class Dialect:
     wanted: tuple[WantedMessage, ...]
     hover_parameter: str  # normalised thrust that holds the weight
     tilt_parameters: Mapping[str, float]  # greatest tilt of its own modes: its unit in rad
-    # parameter of the greatest angular acceleration of roll or pitch -> its unit in rad/s^2; a
-    # value of 0 is no limit
-    acceleration_parameters: Mapping[str, float]
+    # parameter of the greatest angular acceleration or rate of roll or pitch -> the limit's name
+    # in a `Vehicle`, and its unit in rad/s^2 or rad/s; a value of 0 is no limit
+    tilting_parameters: Mapping[str, tuple[str, float]]
     estimator_message: str  # the message that becomes an EstimatorReport
     slow_hint: str  # what to do where telemetry comes slower than it was requested
     unsaid: str  # where a reason is found that no STATUSTEXT tells us

@@ -8,6 +8,7 @@ from types import MappingProxyType
 
 from offboard.mavlink.dialects.base import (
     CUSTOM_MODE_ENABLED,
+    RATE_LIMIT,
     TRACKING_TELEMETRY,
     Defect,
     Dialect,
@@ -50,6 +51,7 @@ def _setpoint_loss(parameters: Mapping[str, float]) -> SetpointLoss:
     return SetpointLoss(after_s, _LOSS_ORDER[chosen:])
 
 
+_RATES = "MC_ROLLRATE_MAX", "MC_PITCHRATE_MAX"
 _MODES = {
     _custom_mode(1): "MANUAL",
     _custom_mode(2): "ALTCTL",
@@ -142,10 +144,11 @@ PX4 = Dialect(
         WatchedParameter("NAV_RCL_ACT", "what the vehicle does when the radio is lost"),
         WatchedParameter("NAV_DLL_ACT", "what the vehicle does when the ground station is lost"),
         WatchedParameter("MPC_TILTMAX_AIR", "greatest tilt of its own modes, degrees"),
+        *(WatchedParameter(each, "greatest angular rate, degree/s") for each in _RATES),
     ),
     hover_parameter="MPC_THR_HOVER",
     tilt_parameters=MappingProxyType({"MPC_TILTMAX_AIR": math.radians(1.0)}),
-    acceleration_parameters=MappingProxyType({}),
+    tilting_parameters=MappingProxyType(dict.fromkeys(_RATES, (RATE_LIMIT, math.radians(1.0)))),
     estimator_message="ESTIMATOR_STATUS",
     slow_hint="raise MAV_x_RATE of this link, in bytes/s: PX4 slows all messages down to it",
     # PX4 sends these texts only on a link on which a HEARTBEAT of type GCS arrives. Ours is not:
