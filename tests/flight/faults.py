@@ -208,13 +208,14 @@ def lost(pair: Pair, for_s: float, *kinds: int) -> Filter:
     return passing
 
 
-def cut(for_s: float) -> Action:
-    """From now on nothing passes in either direction for so long."""
+def cut(for_s: float, *kinds: int, ways: Sequence[str] = ("down", "up")) -> Action:
+    """From now on nothing passes for so long, or nothing of these kinds, in these directions."""
 
-    def both(pair: Pair) -> None:
-        pair.down = pair.up = lost(pair, for_s)
+    def change(pair: Pair) -> None:
+        for way in ways:
+            setattr(pair, way, both(getattr(pair, way), lost(pair, for_s, *kinds)))
 
-    return both
+    return change
 
 
 # --- laws -----------------------------------------------------------------------------------------

@@ -116,6 +116,8 @@ class Pair:
     logged: Bytes = field(default_factory=list)
     phases: list[tuple[float, Phase]] = field(default_factory=list)
     failsafes: dict[str, Action] = field(default_factory=dict)  # rows that were active
+    looks: list[tuple[int, Callable[[Pair], object]]] = field(default_factory=list)
+    watch: Any = None  # what `watch.watched` has noted
     waiting: list[Chunk] = field(default_factory=list)  # that the companion has not read yet
     leaving: Bytes = field(default_factory=list)  # what the turn in progress sends at its end
 
@@ -154,6 +156,9 @@ class Pair:
             moment[1](self)
         if not self.phases or self.phases[-1][1] is not self.companion.phase:
             self.phases.append((self.time_s, self.companion.phase))
+        for steps, see in self.looks:
+            if self.steps % steps == 0:
+                see(self)
 
     def _take(self, frames: tuple[bytes, ...]) -> None:
         self.sent.extend((self.time_s, self.companion.phase, frame) for frame in frames)
@@ -175,14 +180,8 @@ class Pair:
                 self.instance.feed(frame)
 
     def every(self, steps: int, see: Callable[[Pair], object]) -> None:
-        """Show the flight to `see` at each of so many steps."""
-
-        def look(pair: Pair) -> bool:
-            if pair.steps % steps == 0:
-                see(pair)
-            return False
-
-        self.at.append((look, lambda _: None))
+        """Show the flight to `see` once in so many steps."""
+        self.looks.append((steps, see))
 
     # -- what a test may do to the vehicle ------------------------------------------------------
 

@@ -161,7 +161,7 @@ def taken(on: Vehicle, scenario: Any, says: str = "", **more: Any) -> Row:
 
 def not_overridden(pair: Pair) -> None:
     """Nothing leaves after the report of the other mode, and ours was asked for once."""
-    left_s = pair.down.left_s(engage_mode(pair))  # type: ignore[attr-defined]
+    left_s = pair.watch.left_s(engage_mode(pair))
     assert len(pair.modes) == 1
     assert pair.landings == []
     assert sent_after(pair, left_s + REACTION_S) == []

@@ -61,7 +61,7 @@ def achieves(pair: Pair, most_m: float) -> None:
     assert max(pair.failsafes.values(), default=Action.FLY) <= Action.LEVEL
     assert abs(pair.instance.autopilot.state.truth.position_ned_m[2]) < 0.05
     assert not pair.armed
-    true_m = max(moment.error_m for moment in pair.down.during(Phase.TRACK))  # type: ignore[attr-defined]
+    true_m = max(moment.error_m for moment in pair.watch.during(Phase.TRACK))
     assert scored.max_truth_m == pytest.approx(true_m, abs=0.01)  # a step at 2 m/s
 
 
