@@ -9,7 +9,7 @@ from dataclasses import replace
 from itertools import count
 from typing import Any
 
-from pair import LEAN, Bytes, Filter, Pair, decode, frames_of
+from pair import LEAN, Bytes, Filter, Pair, decode, frame_id, frames_of
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.control.base import Controller, Decision, Situation
@@ -110,10 +110,6 @@ def without(*message_ids: int) -> Filter:
         b"".join(frame for frame in frames_of(d) if frame_id(frame) not in message_ids)
         for d in datagrams
     ]
-
-
-def frame_id(frame: bytes) -> int:
-    return int.from_bytes(frame[7:10], "little")
 
 
 def rewritten(change: Callable[[Any], object], *kinds: int) -> Filter:

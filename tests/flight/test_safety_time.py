@@ -14,8 +14,8 @@ from typing import Any
 
 import control
 import pytest
-from faults import CURRENT_MODE, HEARTBEAT, frame_id, late, without
-from pair import OBEDIENT, Bytes, HostClock, Pair, decode, frames_of, hover, in_phase
+from faults import CURRENT_MODE, HEARTBEAT, late, without
+from pair import OBEDIENT, Bytes, HostClock, Pair, decode, frame_id, frames_of, hover, in_phase
 from watch import (
     HIGH,
     LANDED,

@@ -11,8 +11,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from faults import ATTITUDE, POSITION, frame_id, rewritten, setting
-from pair import PX4, UNIX_EPOCH_US, Pair, calm_hover, frames_of, hover, in_phase, make
+from faults import ATTITUDE, POSITION, rewritten, setting
+from pair import (
+    PX4,
+    UNIX_EPOCH_US,
+    Pair,
+    calm_hover,
+    frame_id,
+    frames_of,
+    hover,
+    in_phase,
+    make,
+)
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from typer.testing import CliRunner
 from watch import scenario_of, watched
