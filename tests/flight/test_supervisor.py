@@ -1,7 +1,7 @@
 """The supervisor on a real link to a vehicle that only listens: when it acts, and when not.
 
 What it asks for is in test_recovery.py; a flight that it saves in
-tests/process/test_controller_lost.py; what the loop makes of it in test_edges.py.
+tests/process/test_ended_flights.py; what the loop makes of it in test_edges.py.
 """
 
 from __future__ import annotations
