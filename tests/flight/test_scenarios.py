@@ -26,7 +26,6 @@ from watch import (
     early,
     ends,
     flies,
-    in_track,
     judged,
     landed,
     px4,
@@ -66,13 +65,6 @@ def says_once_that_nothing_is_heard(pair: Pair) -> None:
 def says_the_change(pair: Pair) -> None:
     said = [each for each in announced(pair) if "COM_OF_LOSS_T" in each]
     assert said == ["COM_OF_LOSS_T was changed from 1 to 2"]
-
-
-def says_what_it_waits_for(pair: Pair) -> None:
-    nothing_sent(pair)
-    waiting = [each for each in announced(pair) if each.startswith("waiting:")]
-    assert "waiting: no LOCAL_POSITION_NED arrives" in waiting
-    assert len(waiting) <= 3
 
 
 def names_the_key_soon(pair: Pair) -> None:
@@ -384,10 +376,6 @@ ROWS = {
         "not ready: TIMESYNC is not answered for 5 s: does the vehicle receive what is sent?",
         nothing_sent, at=then(Phase.HEALTH, 0.2, deafen), limits=SOON,
     ),
-    "no HEARTBEAT on the ground": refusal(
-        "not ready: no HEARTBEAT arrives", nothing_sent, boot_scale=1.0, limits={"health_s": 9.0},
-        at=then(Phase.HEALTH, 0.2, silent(faults.HEARTBEAT)),
-    ),
     "no HEARTBEAT from the request for the mode on": aborts(
         Phase.FAILED,
         ".*it is not known whether the vehicle has armed; "
@@ -413,11 +401,6 @@ ROWS = {
         "not ready: no reply for parameter GUID_OPTIONS", nothing_sent, fly=copter.hop,
         down=faults.without(faults.PARAM_VALUE), limits=LATER,
     ),
-    "battery too low": refusal(
-        "not ready: its battery has 50% left, limits.battery is 90%", nothing_sent,
-        scenario=scenario_of(conditions={"battery": {"remaining": 0.5}}),
-        limits=SOON | {"battery": 0.9},
-    ),
     # which vehicles are flown, by the MAV_TYPE in their HEARTBEAT
     "a plane": of_type(1, "the vehicle is a FIXED_WING; offboard flies multirotors"),
     "a helicopter": of_type(4, r".*\(airframe: helicopter in its vehicle file flies it\)"),
@@ -431,10 +414,6 @@ ROWS = {
     "a signed link with another key": refusal(
         ".*their signature does not match: it is another key's", names_the_key_soon,
         fly=signed_by_another,
-    ),
-    "no position": refusal(
-        "not ready: no LOCAL_POSITION_NED arrives", says_what_it_waits_for,
-        down=faults.without(faults.POSITION), limits=LATER,
     ),
     "no position, and the vehicle says why": refusal(
         "not ready: no LOCAL_POSITION_NED arrives; the vehicle said: No GPS .limits", nothing_sent,
@@ -507,8 +486,8 @@ ROWS = {
         "the vehicle restarted while landing", fly=px4.hover, ended_by="restart",
         scenario=scenario_of(EARLIER),
     ),
-    "restart in flight of a vehicle that stays armed": in_track(
-        "the vehicle restarted in flight", soft_landing,
+    "restart in flight of a vehicle that stays armed": ends(
+        "the vehicle restarted in flight", soft_landing, fly=px4.lap,
         at=tracking(faults.downlink(faults.restamped(10.0))),
     ),
     "position and attitude stop, heartbeats go on": aborts(
@@ -585,10 +564,6 @@ ROWS = {
         fly=copter.lap, scenario=early("thin_telemetry", 5.0), failsafes=(), error_m=0.3
     ),
     # the law
-    "a law that raises": in_track(
-        "the controller failed: ZeroDivisionError: nothing to divide by", soft_landing,
-        wrap=faults.failing(faults.raises),
-    ),
     "a law that fails twice, twice, and once overturns": flies(
         bridged, fly=px4.lap,
         wrap=lambda law: faults.failing(faults.overturns, 1, 38)(

@@ -166,17 +166,3 @@ def test_a_pilot_who_switches_back_between_two_heartbeats_is_not_asked_again() -
     assert outcome.exit_code == ExitCode.REFUSED
     assert len(pair.modes) == 1
     assert not any(pair.armings) or "left OFFBOARD" in outcome.sentence
-
-
-@pytest.mark.parametrize(("on", "after_s"), [(px4, 0.02), (copter, 0.7)])
-def test_a_vehicle_that_is_disarmed_just_after_arming_is_not_armed_again(
-    on: Vehicle, after_s: float
-) -> None:
-    pair = on.hop()
-    judge = Judge(pair, on)
-    pair.at.append((asked(judge, ARM, after_s), lambda pair: pair.ground(ARM, 0, 21196)))
-    outcome = pair.fly()
-    assert outcome.exit_code in (ExitCode.REFUSED, ExitCode.ABORTED)
-    assert "disarmed" in outcome.sentence
-    assert pair.armings.count(1.0) == 1
-    assert not pair.armed

@@ -141,12 +141,6 @@ def test_a_flight_is_not_completed_that_is_not_tracked_landed_and_disarmed(flown
         assert (scored.completed, scored.ended_by.startswith(why)) == (0.0, True), scored.ended_by
 
 
-def test_what_a_service_waited_for_is_none_of_its_flight(flown: History) -> None:
-    """Its log begins five seconds before."""
-    waited = (replace(flown.phases[0], phase="failed"), *flown.phases)
-    assert score(replace(flown, phases=waited)).completed == 1.0
-
-
 def test_a_restart_before_the_flight_is_none_of_it() -> None:
     """What it had reported before, in the air, has stamps that come again in the flight: both were
     mixed, and by its score a flight was 3.3 m above the take-off point in the end."""

@@ -57,15 +57,6 @@ px4, copter = Vehicle("px4", make), Vehicle("ardupilot", on_arducopter)
 BOTH = pytest.mark.parametrize("on", [px4, copter], ids=str)
 
 
-def alternately(*cases: Any) -> list[Any]:
-    """Arguments (case, on): each case is flown on one of the firmwares, in turn."""
-    vehicles = ((px4, copter)[index % 2] for index in range(len(cases)))
-    return [
-        pytest.param(case, on, id=f"{index}-{on}")
-        for index, (case, on) in enumerate(zip(cases, vehicles, strict=True))
-    ]
-
-
 @dataclass(frozen=True)
 class Moment:
     """The truth. `error_m` is the distance from the reference while it is tracked, else NaN."""
@@ -280,7 +271,6 @@ refusal = partial(row, ExitCode.REFUSED, Phase.FAILED)
 flies = partial(row, ExitCode.FLOWN, Phase.DISARMED, LANDED)
 aborts = partial(row, ExitCode.ABORTED)
 ends = partial(aborts, Phase.DISARMED)
-in_track = partial(ends, fly=px4.lap)
 
 
 def judged(flight: Row) -> None:

@@ -80,16 +80,13 @@ def health(port: int) -> tuple[int, dict[str, Any]]:
 
 
 def await_phase(service: subprocess.Popen[str], port: int, *phases: str) -> None:
-    deadline_s = time.monotonic() + LONG_S
-    while True:
+    def begun() -> bool:
         assert service.poll() is None, service.communicate()
-        try:
-            if scraped(port)["phase"] in phases:
-                return
-        except (OSError, ValueError):
-            pass  # not served yet
-        assert time.monotonic() < deadline_s, f"never in {phases}"
-        time.sleep(0.1)
+        with suppress(OSError, ValueError):  # not served yet
+            return scraped(port)["phase"] in phases
+        return False
+
+    eventually(begun)
 
 
 def many_clients(port: int, service: int) -> list[socket.socket]:

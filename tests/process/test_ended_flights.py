@@ -17,6 +17,7 @@ from unittest.mock import Mock
 
 import pytest
 from processes import (
+    NO_VEHICLE,
     RECORDING,
     SHORT,
     Called,
@@ -33,8 +34,6 @@ from offboard.analysis import history, tlog
 from offboard.flight.flight import Outcome
 from offboard.link import after_flight
 from offboard.run import flight as run
-
-NO_VEHICLE = "offboard fly --connect udpin:127.0.0.1:PORT --set limits.connect_s=0.3 --out x"
 
 
 def flown(directory: Path) -> history.History:
