@@ -84,7 +84,6 @@ class Bench:
     up: Callable[[Bytes], Bytes] = lambda frames: frames
     has_vehicle: bool = True
     signing: Signing | None = None
-    system_id: int | None = None
     sent: list[Any] = field(default_factory=list)
 
     @property
@@ -102,7 +101,7 @@ class Bench:
             self.step()
 
     def listen(self) -> Observation:
-        settings = SessionSettings(self.system_id, capacity_bytes_ps=self.capacity_bytes_ps)
+        settings = SessionSettings(capacity_bytes_ps=self.capacity_bytes_ps)
         listening = Listening(self.now_s, settings, self.signing)
         while not listening.complete(self.now_s):
             for chunk in self.step():

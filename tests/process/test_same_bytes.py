@@ -13,6 +13,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import yaml
 
 from offboard.analysis import tlog
 from offboard.flight.flight import Flight, Outcome
@@ -126,9 +127,24 @@ def test_a_vehicle_that_fails_or_hangs_ends_the_flight_with_a_sentence(
     assert outcome.sentence.startswith(says)
 
 
-def test_time_goes_on_without_telemetry(tmp_path: Path) -> None:
-    """The autopilot sends none after its restart on the ground until it is asked again."""
+LINK_LOST = {"fault": "link", "direction": "down", "loss": 1.0, "after": "engaged", "at_s": 8.0}
+SILENT = "no telemetry for 1.0 s (limits.silence_s is 1); not heard for 300 s while landing; "
+
+
+@pytest.mark.parametrize(
+    ("fault", "code", "sentence"),
+    [
+        # the autopilot sends no telemetry after its restart until it is asked again
+        ({"fault": "reboot", "at_s": 30.0}, 0, "flown and landed"),
+        pytest.param(LINK_LOST, 4, SILENT, marks=pytest.mark.slow),
+    ],
+    ids=["restart on the ground", "telemetry lost"],
+)
+def test_time_goes_on_without_telemetry(
+    fault: dict[str, object], code: int, sentence: str, tmp_path: Path
+) -> None:
     file = tmp_path / "faulty.yaml"
-    file.write_text("name: faulty\nfaults: [{fault: reboot, at_s: 30}]\n")
+    file.write_text(yaml.safe_dump({"name": "faulty", "faults": [fault]}))
     outcome = flown(tmp_path / "flight", Simulated("ardupilot", str(file)), InMemorySimulator())
-    assert (outcome.exit_code, outcome.sentence) == (0, "flown and landed")
+    assert outcome.exit_code == code
+    assert outcome.sentence.startswith(sentence)
