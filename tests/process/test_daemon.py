@@ -80,13 +80,16 @@ def health(port: int) -> tuple[int, dict[str, Any]]:
 
 
 def await_phase(service: subprocess.Popen[str], port: int, *phases: str) -> None:
-    def begun() -> bool:
+    deadline_s = time.monotonic() + LONG_S
+    while True:
         assert service.poll() is None, service.communicate()
-        with suppress(OSError, ValueError):  # not served yet
-            return scraped(port)["phase"] in phases
-        return False
-
-    eventually(begun)
+        try:
+            if scraped(port)["phase"] in phases:
+                return
+        except (OSError, ValueError):
+            pass  # not served yet
+        assert time.monotonic() < deadline_s, f"never in {phases}"
+        time.sleep(0.1)
 
 
 def many_clients(port: int, service: int) -> list[socket.socket]:
