@@ -10,6 +10,7 @@ import shlex
 import shutil
 import signal
 import subprocess
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
@@ -137,10 +138,12 @@ def test_the_command_of_a_row_flies_it_again(whole: Path, tmp_path: Path, called
 
 def await_flights(process: subprocess.Popen[str], directory: Path, count: int) -> list[Path]:
     """The results below `directory` when there are `count` of them."""
-    results = lambda: list(directory.glob("*/results/*/*.json"))  # noqa: E731
-    eventually(lambda: len(results()) >= count or process.poll() is not None)
-    assert process.poll() is None, process.communicate()
-    return results()
+    deadline_s = time.monotonic() + 120.0
+    while len(found := list(directory.glob("*/results/*/*.json"))) < count:
+        assert time.monotonic() < deadline_s
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.02)
+    return found
 
 
 @pytest.fixture(scope="module")
