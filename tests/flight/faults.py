@@ -9,7 +9,7 @@ from dataclasses import replace
 from itertools import count
 from typing import Any
 
-from pair import LEAN, Bytes, Filter, Pair, decode, frames_of
+from pair import LEAN, Bytes, Filter, Pair, decode, frame_id, frames_of
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.control.base import Controller, Decision, Situation
@@ -112,10 +112,6 @@ def without(*message_ids: int) -> Filter:
     ]
 
 
-def frame_id(frame: bytes) -> int:
-    return int.from_bytes(frame[7:10], "little")
-
-
 def rewritten(change: Callable[[Any], object], *kinds: int) -> Filter:
     """A link on which `change` edits every message with one of these ids."""
     codec = mavlink.MAVLink(None)
@@ -208,13 +204,14 @@ def lost(pair: Pair, for_s: float, *kinds: int) -> Filter:
     return passing
 
 
-def cut(for_s: float) -> Action:
-    """From now on nothing passes in either direction for so long."""
+def cut(for_s: float, *kinds: int, ways: Sequence[str] = ("down", "up")) -> Action:
+    """From now on nothing passes for so long, or nothing of these kinds, in these directions."""
 
-    def both(pair: Pair) -> None:
-        pair.down = pair.up = lost(pair, for_s)
+    def change(pair: Pair) -> None:
+        for way in ways:
+            setattr(pair, way, both(getattr(pair, way), lost(pair, for_s, *kinds)))
 
-    return both
+    return change
 
 
 # --- laws -----------------------------------------------------------------------------------------

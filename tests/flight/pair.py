@@ -49,6 +49,7 @@ UNIX_EPOCH_US = 1_767_225_600_000_000
 LONGEST_S = 350.0  # of which a vehicle that is not heard any more is awaited for 300 s
 QUICK_LANDING = {"MPC_LAND_SPEED": 1.2, "MPC_LAND_CRWL": 0.7, "COM_DISARM_LAND": 0.5}
 LOITER = 3  # sub mode of PX4's AUTO
+COMMAND_LONG, ATTITUDE_TARGET = 76, 82  # message ids
 
 Bytes = list[bytes]
 Filter = Callable[[float, Bytes], Bytes]
@@ -116,6 +117,8 @@ class Pair:
     logged: Bytes = field(default_factory=list)
     phases: list[tuple[float, Phase]] = field(default_factory=list)
     failsafes: dict[str, Action] = field(default_factory=dict)  # rows that were active
+    looks: list[tuple[int, Callable[[Pair], object]]] = field(default_factory=list)
+    watch: Any = None  # what `watch.watched` has noted
     waiting: list[Chunk] = field(default_factory=list)  # that the companion has not read yet
     leaving: Bytes = field(default_factory=list)  # what the turn in progress sends at its end
 
@@ -154,6 +157,9 @@ class Pair:
             moment[1](self)
         if not self.phases or self.phases[-1][1] is not self.companion.phase:
             self.phases.append((self.time_s, self.companion.phase))
+        for steps, see in self.looks:
+            if self.steps % steps == 0:
+                see(self)
 
     def _take(self, frames: tuple[bytes, ...]) -> None:
         self.sent.extend((self.time_s, self.companion.phase, frame) for frame in frames)
@@ -175,23 +181,14 @@ class Pair:
                 self.instance.feed(frame)
 
     def every(self, steps: int, see: Callable[[Pair], object]) -> None:
-        """Show the flight to `see` at each of so many steps."""
-
-        def look(pair: Pair) -> bool:
-            if pair.steps % steps == 0:
-                see(pair)
-            return False
-
-        self.at.append((look, lambda _: None))
+        """Show the flight to `see` once in so many steps."""
+        self.looks.append((steps, see))
 
     # -- what a test may do to the vehicle ------------------------------------------------------
 
     def ground(self, number: int, *params: float) -> None:
         """A command of the ground station, on its own link."""
-        codec = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
-        filled = (*params, *(0.0,) * (7 - len(params)))
-        message = mavlink.MAVLink_command_long_message(1, 1, number, 0, *filled)
-        self.instance.feed_ground(message.pack(codec))
+        self.instance.feed_ground(command_of_ground(1, number, *params))
 
     def pilot_takes_over(self) -> None:
         self.ground(176, 1, 4, LOITER)
@@ -215,18 +212,21 @@ class Pair:
     @property
     def setpoints(self) -> list[tuple[float, Phase, Any]]:
         """Time, phase and decoded SET_ATTITUDE_TARGET."""
-        decoded = ((at_s, phase, decode(frame)) for at_s, phase, frame in self.sent)
-        return [row for row in decoded if row[2].get_type() == "SET_ATTITUDE_TARGET"]
+        return [
+            (at_s, phase, decode(frame))
+            for at_s, phase, frame in self.sent
+            if frame_id(frame) == ATTITUDE_TARGET
+        ]
 
     @property
     def payloads(self) -> Bytes:
         """The payload of every SET_ATTITUDE_TARGET, as on the wire."""
-        return [frame[10:-2] for _, _, frame in self.sent if frame[7:10] == b"\x52\0\0"]
+        return [frame[10:-2] for _, _, frame in self.sent if frame_id(frame) == ATTITUDE_TARGET]
 
     def commands(self, number: int) -> list[Any]:
         """Every COMMAND_LONG with this MAV_CMD."""
-        decoded = (decode(frame) for _, _, frame in self.sent)
-        return [m for m in decoded if m.get_type() == "COMMAND_LONG" and m.command == number]
+        decoded = (decode(frame) for *_, frame in self.sent if frame_id(frame) == COMMAND_LONG)
+        return [message for message in decoded if message.command == number]
 
     @property
     def modes(self) -> list[Any]:
@@ -273,8 +273,34 @@ class Pair:
         return score(self.history())
 
 
+def command_of_ground(component: int, number: int, *params: float) -> bytes:
+    """A ground station's command to a component of the vehicle's system."""
+    codec = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
+    filled = (*params, *(0.0,) * (7 - len(params)))
+    message = mavlink.MAVLink_command_long_message(1, component, number, 0, *filled)
+    return bytes(message.pack(codec))
+
+
+def level_setpoint(thrust: float, system: int, component: int) -> bytes:
+    """The setpoint of another program."""
+    codec = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
+    level = (1.0, 0.0, 0.0, 0.0)
+    message = mavlink.MAVLink_set_attitude_target_message(0, 1, 1, 7, level, 0, 0, 0, thrust)
+    return bytes(message.pack(codec))
+
+
+def another_vehicle(system: int) -> bytes:
+    """A HEARTBEAT of another vehicle."""
+    codec = mavlink.MAVLink(None, srcSystem=system, srcComponent=1)
+    return bytes(mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 3, 3).pack(codec))
+
+
 def decode(frame: bytes) -> Any:
     return mavlink.MAVLink(None).decode(bytearray(frame))
+
+
+def frame_id(frame: bytes) -> int:
+    return int.from_bytes(frame[7:10], "little")
 
 
 def frames_of(datagram: bytes) -> Iterable[bytes]:

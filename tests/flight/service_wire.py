@@ -13,13 +13,12 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-from faults import frame_id
-from pair import decode, frames_of
+from pair import ATTITUDE_TARGET, COMMAND_LONG, decode, frame_id, frames_of
 from serving import ARM, HOVER, LAND, MODES, SET_MODE, START, TAKEOFF, Serving
 
 from offboard.link.interface import Chunk
 
-HEARTBEAT, COMMAND_LONG, ATTITUDE_TARGET, CURRENT_MODE = 0, 76, 82, 436
+HEARTBEAT, CURRENT_MODE = 0, 436
 COMMANDS, SETPOINTS = {75, COMMAND_LONG}, {ATTITUDE_TARGET, 84, 86}
 # HEARTBEAT, PARAM_REQUEST_READ, COMMAND_ACK, TIMESYNC, STATUSTEXT
 HARMLESS = {HEARTBEAT, 20, 77, 111, 253}

@@ -15,9 +15,10 @@ from pair import (
     SHORT,
     HostClock,
     Pair,
+    command_of_ground,
     decode,
+    level_setpoint,
 )
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.flight.phases import TRACKING, Anchor, Phase, ServiceOptions, Then
 from offboard.identification.vehicle_estimate import IdentifiedVehicle
@@ -37,13 +38,6 @@ MODES = {  # parameters of MAV_CMD_DO_SET_MODE
     "px4": {"engage": (1, 6, 0), "pilot": (1, 4, LOITER), "land": (1, 4, 6)},
     "ardupilot": {"engage": (1, 4, 0), "pilot": (1, 17, 0), "land": (1, 9, 0)},
 }
-
-
-def level_setpoint(thrust: float, system: int, component: int) -> bytes:
-    codec = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
-    level = (1.0, 0.0, 0.0, 0.0)
-    message = mavlink.MAVLink_set_attitude_target_message(0, 1, 1, 7, level, 0, 0, 0, thrust)
-    return bytes(message.pack(codec))
 
 
 @dataclass
@@ -184,10 +178,7 @@ class Serving(Pair):
 
     def command(self, number: int, *params: float) -> None:
         """A command to our component, which the vehicle forwards on our link."""
-        codec = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
-        filled = (*params, *(0.0,) * (7 - len(params)))
-        message = mavlink.MAVLink_command_long_message(1, 191, number, 0, *filled)
-        self.forwarded.append(message.pack(codec))
+        self.forwarded.append(command_of_ground(191, number, *params))
 
     forwarded: list[bytes] = field(default_factory=list)
     lost_down: bool = False

@@ -1,5 +1,5 @@
-"""Laws in whole flights: every one of the table, volumes that are kept clear of, every heading, a
-step of the reference, and the ranking that was measured on a real PX4."""
+"""Laws in whole flights: every one of the table, volumes that are kept clear of, every heading, and
+the ranking that was measured on a real PX4."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from faults import rewritten
-from pair import ARDUPILOT, OBEDIENT, Pair, decode, in_phase, make, on_arducopter
+from pair import ARDUPILOT, OBEDIENT, Pair, decode, make, on_arducopter
 from pydantic import TypeAdapter
 from scipy.spatial.transform import Rotation
 
@@ -168,42 +168,6 @@ def test_a_swapped_heading_is_scored() -> None:
     pair.up = rewritten(edit, SET_ATTITUDE_TARGET)
     pair.track()
     assert pair.score().rmse_heading_deg > 60.0
-
-
-# -- a step of the reference -----------------------------------------------------------------------
-
-SETTLED_S, END_S = 15.0, 19.0
-
-
-def test_settles_after_a_step_of_the_reference() -> None:
-    """ArduCopter's vehicle, whose attitude loop limits its angular acceleration (1100 deg/s2), in
-    hover at 7 rad/s: the reference jumps by 2.4 m and returns slowly. Afterwards it is as quiet as
-    without the jump, where only the telemetry's noise moves it."""
-    assert _turning_after(2.4) == pytest.approx(_turning_after(0.0), abs=0.002)
-
-
-def _turning_after(jump_m: float) -> float:
-    """The greatest roll or pitch rate (rad/s) when it should have settled."""
-    hover = (f"reference.duration_s={END_S}", "controller.bandwidth_radps=7")
-    pair = on_arducopter(*hover, reference="hover", seed=2, aloft=True)
-
-    def step(flying: Pair) -> None:
-        state = flying.companion
-        state.plan.follow_jump(state.time_s, np.array([jump_m, 0.0, 0.0]))
-
-    pair.at.append((in_phase(Phase.TRACK, 2.0), step))
-    pair.track()
-    logged = pair.history()
-    begin_s = next(event.time_s for event in logged.phases if event.phase == "track")
-
-    def settled(rows: np.ndarray) -> np.ndarray:
-        passed_s = rows["time_s"] - begin_s
-        return rows[(passed_s > SETTLED_S) & (passed_s < END_S)]
-
-    away_m = settled(logged.position)["position_ned_m"]
-    away_m = away_m - settled(logged.reference)["position_ned_m"][0]
-    assert np.linalg.norm(away_m, axis=1).max() < 0.005
-    return float(np.abs(settled(logged.attitude)["rates_radps"][:, :2]).max())
 
 
 # -- the ranking -----------------------------------------------------------------------------------

@@ -48,12 +48,6 @@ def test_delay_and_duplicates_are_measured(
     assert score.position_gap_max_s == pytest.approx(1.0 / SENT_HZ, abs=0.007)
 
 
-def test_the_delay_of_the_link_is_measured_before_lift_off() -> None:
-    answered = over(late(0.3), aloft=False)
-    answered.track()
-    assert answered.score().rmse_position_m < 0.15
-
-
 @pytest.mark.parametrize(("lost", "sent", "most_m"), [(0.0, 1.0, 0.04), (0.3, 2.0, 0.06)])
 def test_setpoints_are_sent_twice_where_some_are_lost(
     lost: float, sent: float, most_m: float

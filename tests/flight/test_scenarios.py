@@ -13,7 +13,7 @@ from typing import Any
 
 import faults
 import pytest
-from pair import Pair
+from pair import Filter, Pair
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from watch import (
     HIGH,
@@ -26,7 +26,6 @@ from watch import (
     early,
     ends,
     flies,
-    in_track,
     judged,
     landed,
     px4,
@@ -40,6 +39,7 @@ from watch import (
 
 from offboard.analysis.score_table import summary
 from offboard.flight.phases import TRACKING, Phase
+from offboard.mavlink.events import Heartbeat
 from simulator import config
 from simulator.autopilot.firmware import Rule
 from simulator.autopilot.values import Result, Severity, StatusText
@@ -65,13 +65,6 @@ def says_once_that_nothing_is_heard(pair: Pair) -> None:
 def says_the_change(pair: Pair) -> None:
     said = [each for each in announced(pair) if "COM_OF_LOSS_T" in each]
     assert said == ["COM_OF_LOSS_T was changed from 1 to 2"]
-
-
-def says_what_it_waits_for(pair: Pair) -> None:
-    nothing_sent(pair)
-    waiting = [each for each in announced(pair) if each.startswith("waiting:")]
-    assert "waiting: no LOCAL_POSITION_NED arrives" in waiting
-    assert len(waiting) <= 3
 
 
 def names_the_key_soon(pair: Pair) -> None:
@@ -204,6 +197,43 @@ def stayed_down_without_a_setpoint(pair: Pair) -> None:
     assert pair.setpoints == []
 
 
+def asks_again(pair: Pair) -> None:
+    assert said(pair, "waiting for the link, then landing is asked again")
+
+
+def asks_once(pair: Pair) -> None:
+    assert not said(pair, "waiting for the link")
+
+
+def waits_for_position_and_delay(pair: Pair) -> None:
+    waiting = [each for each in pair.companion.announced if each.startswith("waiting: ")]
+    assert waiting == [
+        "waiting: no LOCAL_POSITION_NED arrives", "waiting: the delay of the link is being measured"
+    ]  # fmt: skip
+
+
+def not_asked_again(pair: Pair) -> None:
+    assert len(pair.landings) == 1
+    assert pair.mode == "LOITER"
+
+
+def keeps_posctl(pair: Pair) -> None:
+    assert pair.mode == "POSCTL"
+    assert sent_after(pair, pair.phases[-1][0]) == []
+
+
+def listens(pair: Pair) -> None:
+    """From 2.5 s without a report of the mode until it is reported again nothing is sent; then a
+    landing is asked for, unless a pilot has it."""
+    lost_s = begun_s(pair, Phase.TRACK) + 1.0
+    assert sent_after(pair, lost_s + 2.6) == sent_after(pair, lost_s + 8.99)
+    assert bool(pair.landings) is not pair.armed
+
+
+def held_soon(pair: Pair) -> None:
+    assert begun_s(pair, Phase.HOLD) - begun_s(pair, Phase.TRACK) < 2.8
+
+
 def asked_to_disarm_without_force(pair: Pair) -> None:
     assert [(m.param1, m.param2) for m in pair.commands(400)] == [(0.0, 0.0)]
     assert said(pair, "15 s without motion on the ground, and the vehicle does not disarm")
@@ -249,6 +279,37 @@ def of_type(kind: int, says: str, checks: Check = nothing_sent, **options: Any) 
     return refusal(says, checks, down=faults.heartbeats(type=kind), **options)
 
 
+def switches(mode: str) -> Callable[[Pair], object]:
+    """A pilot takes it."""
+    return lambda pair: pair.instance.autopilot.commander.switch(mode)
+
+
+def begins_to_arrive(kind: int, at_s: float) -> Filter:
+    rest = faults.without(kind)
+    return lambda time_s, datagrams: datagrams if time_s >= at_s else rest(time_s, datagrams)
+
+
+def lose_two_heartbeats(pair: Pair) -> None:
+    """And CURRENT_MODE for good, from the next HEARTBEAT on."""
+    pair.down = faults.without(faults.CURRENT_MODE)
+    pair.at.append((just_after_a_beat, faults.cut(2.2, faults.HEARTBEAT, ways=["down"])))
+
+
+def just_after_a_beat(pair: Pair) -> bool:
+    return pair.companion.phase is Phase.TRACK and pair.companion.vehicle.age_s(Heartbeat) == 0.0
+
+
+def leave_for_a_moment(pair: Pair) -> None:
+    back_s = pair.time_s + 0.6
+    switches("POSCTL")(pair)
+
+    def back(pair: Pair) -> None:  # unless the flight has ended before
+        if pair.time_s >= back_s and pair.mode == "POSCTL":
+            switches("OFFBOARD")(pair)
+
+    pair.every(1, back)
+
+
 def hover_without_disarming() -> Pair:
     pair = px4.hover()
     pair.instance.autopilot.parameters.set("COM_DISARM_LAND", 0.0)
@@ -277,6 +338,11 @@ BOOTING = faults.heartbeats(system_status=1, base_mode=81, custom_mode=0)  # in 
 HELICOPTER = config.vehicle("px4_sih").model_copy(update={"airframe": "helicopter"})
 SOON, LATER = {"health_s": 5.0}, {"health_s": 8.0}
 NO_TAKEOFF = Rule("takeoff", result=Result.FAILED)
+LONG = (HIGH, "reference.duration_s=6.0")
+PX4_HOVERS, COPTER_HOVERS = partial(px4.hover, *LONG), partial(copter.hover, *LONG)
+HOLDS = faults.with_default("COM_OBL_RC_ACT", 5.0)  # AUTO.LOITER without setpoints, not POSCTL
+SILENT = r"no telemetry for 1.0 s \(limits.silence_s is 1\)$"  # no pilot is named
+MODES = (faults.HEARTBEAT, faults.CURRENT_MODE)
 REJECTED = r"; the vehicle said: command {} TEMPORARILY_REJECTED; unhealthy by SYS_STATUS: RC_"
 ROWS = {
     "armed by another": flies(whole, at=then(Phase.STREAM, 0.5, arm)),
@@ -317,10 +383,6 @@ ROWS = {
         "not ready: TIMESYNC is not answered for 5 s: does the vehicle receive what is sent?",
         nothing_sent, at=then(Phase.HEALTH, 0.2, deafen), limits=SOON,
     ),
-    "no HEARTBEAT on the ground": refusal(
-        "not ready: no HEARTBEAT arrives", nothing_sent, boot_scale=1.0, limits={"health_s": 9.0},
-        at=then(Phase.HEALTH, 0.2, silent(faults.HEARTBEAT)),
-    ),
     "no HEARTBEAT from the request for the mode on": aborts(
         Phase.FAILED,
         ".*it is not known whether the vehicle has armed; "
@@ -346,11 +408,6 @@ ROWS = {
         "not ready: no reply for parameter GUID_OPTIONS", nothing_sent, fly=copter.hop,
         down=faults.without(faults.PARAM_VALUE), limits=LATER,
     ),
-    "battery too low": refusal(
-        "not ready: its battery has 50% left, limits.battery is 90%", nothing_sent,
-        scenario=scenario_of(conditions={"battery": {"remaining": 0.5}}),
-        limits=SOON | {"battery": 0.9},
-    ),
     # which vehicles are flown, by the MAV_TYPE in their HEARTBEAT
     "a plane": of_type(1, "the vehicle is a FIXED_WING; offboard flies multirotors"),
     "a helicopter": of_type(4, r".*\(airframe: helicopter in its vehicle file flies it\)"),
@@ -364,10 +421,6 @@ ROWS = {
     "a signed link with another key": refusal(
         ".*their signature does not match: it is another key's", names_the_key_soon,
         fly=signed_by_another,
-    ),
-    "no position": refusal(
-        "not ready: no LOCAL_POSITION_NED arrives", says_what_it_waits_for,
-        down=faults.without(faults.POSITION), limits=LATER,
     ),
     "no position, and the vehicle says why": refusal(
         "not ready: no LOCAL_POSITION_NED arrives; the vehicle said: No GPS .limits", nothing_sent,
@@ -459,8 +512,8 @@ ROWS = {
         "the vehicle restarted while landing", fly=px4.hover, ended_by="restart",
         scenario=scenario_of(EARLIER),
     ),
-    "restart in flight of a vehicle that stays armed": in_track(
-        "the vehicle restarted in flight", soft_landing,
+    "restart in flight of a vehicle that stays armed": ends(
+        "the vehicle restarted in flight", soft_landing, fly=px4.lap,
         at=tracking(faults.downlink(faults.restamped(10.0))),
     ),
     "heartbeats stop while it lands, position and mode go on": aborts(
@@ -471,6 +524,61 @@ ROWS = {
     "position and attitude stop, heartbeats go on": aborts(
         Phase.FAILED, "no telemetry for 1.0 s .*; disarmed, landing not confirmed: ",
         landing_requested, fly=px4.lap, at=tracking(silent(faults.POSITION, faults.ATTITUDE)),
+    ),
+    # outages: nothing passes for a time. PX4's own failsafe comes meanwhile, after 1.0 s
+    "an outage of 0.8 s": flies(asks_once, fly=COPTER_HOVERS, at=tracking(faults.cut(0.8))),
+    "an outage of 1.6 s": ends(
+        SILENT, landed, asks_once, fly=PX4_HOVERS, at=tracking(faults.cut(1.6))
+    ),
+    "an outage of 4 s": ends(
+        SILENT, landed, asks_again, fly=PX4_HOVERS, firmware=HOLDS, at=tracking(faults.cut(4.0))
+    ),
+    "an outage of 10 s": ends(
+        SILENT, landed, asks_again, fly=COPTER_HOVERS, at=tracking(faults.cut(10.0))
+    ),
+    # its rate is that of two seconds. A booting ArduCopter sends no position for 40 s
+    "a message that has just begun to arrive is not called slow": flies(
+        waits_for_position_and_delay, down=begins_to_arrive(faults.POSITION, 12.0)
+    ),
+    # 0.36 s there and back. While nothing is heard nothing is asked, and no answer is missing
+    "a gap of telemetry on a late link": flies(
+        fly=partial(COPTER_HOVERS, "controller.bandwidth_radps=1.5"), error_m=2.0,
+        down=faults.late(0.18), up=faults.late(0.18), at=tracking(faults.cut(0.98, ways=["down"])),
+    ),
+    # in the mode of PX4's own failsafe, which HEARTBEAT does not show then
+    "a pilot takes over in an outage": aborts(
+        Phase.YIELDED, ".*for POSCTL", keeps_posctl, fly=PX4_HOVERS, armed=True,
+        at=[*tracking(faults.cut(4.0)), *then(Phase.LAND, 1.5, switches("POSCTL"))],
+    ),
+    # what it sends is lost, and a pilot takes it after the first request
+    "landing is not asked again of a vehicle that is not heard": aborts(
+        Phase.YIELDED, ".*left GUIDED for LOITER", not_asked_again, fly=COPTER_HOVERS, armed=True,
+        at=[*tracking(faults.cut(4.0, ways=["down"])), *then(Phase.LAND, 0.6, switches("LOITER"))],
+    ),
+    "no report of the mode for 9 s": ends(
+        "no report of the mode for 2.", listens, fly=PX4_HOVERS, firmware=HOLDS,
+        at=tracking(faults.cut(9.0, *MODES, ways=["down"])),
+    ),
+    "no report of the mode for 9 s, in which a pilot takes it": aborts(
+        Phase.YIELDED, "no report of the mode for 2.", listens, fly=COPTER_HOVERS, armed=True,
+        at=[*tracking(faults.cut(9.0, *MODES, ways=["down"])),
+            *then(Phase.LAND, 1.0, switches("BRAKE"))],
+    ),
+    # ArduCopter shows nothing: what was commanded meanwhile would have dropped it as it received it
+    "it does not receive setpoints": ends(
+        "15 requests of TIMESYNC are not answered: does it receive setpoints", held_soon,
+        fly=COPTER_HOVERS, failsafes=["uplink"], fall_mps=1.6, top_m=3.5,
+        at=tracking(faults.cut(3.0, ways=["up"])),
+    ),
+    # a HEARTBEAT that is missing is requested: the next one, 3 s after the newest, is too late
+    "two heartbeats are lost and no CURRENT_MODE arrives": flies(
+        fly=PX4_HOVERS, at=tracking(lose_two_heartbeats)
+    ),
+    # PX4 1.14 has no CURRENT_MODE, and one HEARTBEAT a second: a pilot leaves after one, and has
+    # returned before the next
+    "a short switch where HEARTBEAT alone shows the mode": aborts(
+        Phase.YIELDED, "the vehicle left OFFBOARD for POSCTL", fly=PX4_HOVERS, armed=True,
+        down=faults.without(faults.CURRENT_MODE), at=[(just_after_a_beat, leave_for_a_moment)],
     ),
     # a HEARTBEAT from before the outage said that it was disarmed, and it was left armed
     "an outage as it arms": refusal(
@@ -487,10 +595,6 @@ ROWS = {
         fly=copter.lap, scenario=early("thin_telemetry", 5.0), failsafes=(), error_m=0.3
     ),
     # the law
-    "a law that raises": in_track(
-        "the controller failed: ZeroDivisionError: nothing to divide by", soft_landing,
-        wrap=faults.failing(faults.raises),
-    ),
     "a law that fails twice, twice, and once overturns": flies(
         bridged, fly=px4.lap,
         wrap=lambda law: faults.failing(faults.overturns, 1, 38)(

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pair import STEP_S, decode
+from pair import STEP_S, another_vehicle, decode
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from service_wire import Wire
+from service_wire import HOLD, Wire
 from serving import (
     ARM,
     HOVER,
@@ -35,7 +35,6 @@ from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from simulator import config as simulated
 
 BOTH = pytest.mark.parametrize("on", ["px4", "ardupilot"])
-HOLD = {"px4": "AUTO.LOITER", "ardupilot": "BRAKE"}
 REPOSITION, LOITER = 192, 5  # MAV_CMD; ArduCopter's mode
 ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED = range(4)  # MAV_RESULT
 
@@ -189,18 +188,21 @@ def test_engaged_in_motion(served: Served, on: str) -> None:
     fly_north(pair, 3.8)
     began_s = pair.time_s
     pair.switch("engage")
-    lifts, off_m = [], []
+    tilt_cosines, off_m = dict[float, float](), list[float]()
     while pair.phase in (Phase.STANDBY, Phase.CLIMB):
         pair.advance()
         if pair.phase is not Phase.CLIMB:
             continue
-        state, tilt_cosine = pair.state, 1.0
-        if on == "px4":  # ArduCopter divides by it
-            tilt_cosine = pair.instance.autopilot.state.estimate.tilt_cosine
-        lifts += [u * tilt_cosine / HOVER[on] for u in thrusts(pair, pair.time_s - 1e-6)]
+        state = pair.state
+        tilt_cosines[pair.time_s] = pair.instance.autopilot.state.estimate.tilt_cosine
         place = np.array(state.vehicle.position.position_ned_m)
         off_m.append(float(np.linalg.norm(place - state.plan.sample(state.time_s).position_ned_m)))
         assert pair.time_s < began_s + 10.0
+    lifts = [  # ArduCopter divides by the cosine
+        setpoint.thrust / HOVER[on] * (tilt_cosines[at_s] if on == "px4" else 1.0)
+        for at_s, _, setpoint in pair.setpoints
+        if at_s in tilt_cosines
+    ]
     assert len(lifts) > 8
     assert max(abs(lift - 1.0) for lift in lifts) < 0.03
     assert max(off_m) < 0.1
@@ -372,9 +374,8 @@ def test_without_arms_it_stays_on_the_ground(served: Served) -> None:
     OFFBOARD it is not lifted. A flight that was cut short counts as ended there: who engages the
     vehicle later is another."""
     pair = served()
-    codec = mavlink.MAVLink(None, srcSystem=9, srcComponent=1)
     pair.run(0.5)
-    pair.forwarded.append(mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 3, 3).pack(codec))
+    pair.forwarded.append(another_vehicle(9))
     pair.run(9.8)
     assert pair.phase is Phase.HEALTH
     assert said(pair, "several vehicles are heard, systems 1 and 9. Fix: choose one")
@@ -560,6 +561,18 @@ def test_where_heartbeat_alone_shows_the_mode_a_switch_is_seen_soon(served: Serv
         pair.run(1.7)
 
 
+def silence(pair: Serving, options: float) -> None:
+    """After which the vehicle has these GUID_OPTIONS."""
+    asked = len(pair.commands(512))
+    pair.lost_down = pair.lost_up = True
+    pair.run(6.0)
+    assert pair.phase is Phase.HEALTH
+    pair.instance.autopilot.parameters.set("GUID_OPTIONS", options)
+    pair.lost_down = pair.lost_up = False
+    pair.run(4.0)
+    assert len(pair.commands(512)) > asked
+
+
 def test_what_is_heard_after_a_silence_may_be_another_vehicle(served: Served) -> None:
     """With the same system id, on the same radio, switched on earlier: parameters
     and hardware number are read again. It was flown with those of the one before, its thrust taken
@@ -568,26 +581,15 @@ def test_what_is_heard_after_a_silence_may_be_another_vehicle(served: Served) ->
     pair.switch("pilot")
     pair.run(2.0)
 
-    def silence(options: float) -> None:
-        """After which the vehicle has these GUID_OPTIONS."""
-        asked = len(pair.commands(512))
-        pair.lost_down = pair.lost_up = True
-        pair.run(6.0)
-        assert pair.phase is Phase.HEALTH
-        pair.instance.autopilot.parameters.set("GUID_OPTIONS", options)
-        pair.lost_down = pair.lost_up = False
-        pair.run(4.0)
-        assert len(pair.commands(512)) > asked
-
     assert pair.state.vehicle.uid == 1
-    silence(0.0)
+    silence(pair, 0.0)
     assert not said(pair, "another vehicle answers")
     pair.switch("engage")
     pair.until(lambda: pair.mode == "BRAKE", 3.0)
     assert said(pair, "not engaged: GUID_OPTIONS is 0: without bit 3")
     pair.run(2.0)
     pair.state.vehicle.uid = 7  # of the one that was heard until now
-    silence(8.0)
+    silence(pair, 8.0)
     pair.until(lambda: pair.phase is Phase.STANDBY, 5.0)
     assert said(pair, "another vehicle answers")
     assert pair.state.vehicle.uid == 1
@@ -748,16 +750,12 @@ def test_what_is_heard_after_a_silence_in_health_may_be_another_vehicle_too(serv
     """A third one passes by, which prevents standby for 10 s. It was ready with the parameters of
     the one before."""
     pair = served("ardupilot")
-    codec = mavlink.MAVLink(None, srcSystem=9, srcComponent=1)
     pair.run(0.5)
-    pair.forwarded.append(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3).pack(codec))
+    pair.forwarded.append(another_vehicle(9))
     pair.run(3.0)
     assert pair.state.vehicle.parameters["GUID_OPTIONS"] == 8.0
-    pair.lost_down = pair.lost_up = True
-    pair.run(6.0)
-    pair.instance.autopilot.parameters.set("GUID_OPTIONS", 0.0)
-    pair.lost_down = pair.lost_up = False
-    pair.run(6.0)
+    silence(pair, 0.0)
+    pair.run(2.0)
     assert pair.phase is Phase.HEALTH
     assert said(pair, "waiting: GUID_OPTIONS is 0: without bit 3")
     assert sum("health: no telemetry for 5" in text for text in announced(pair)) == 1

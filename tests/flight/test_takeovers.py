@@ -13,9 +13,17 @@ import random
 from collections.abc import Callable
 
 import pytest
-from faults import CURRENT_MODE, HEARTBEAT, frame_id, losing, without
-from pair import HOST_EPOCH_S, STEP_S, Pair, decode, frames_of, in_phase
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from faults import CURRENT_MODE, HEARTBEAT, losing, without
+from pair import (
+    HOST_EPOCH_S,
+    STEP_S,
+    Pair,
+    decode,
+    frame_id,
+    frames_of,
+    in_phase,
+    level_setpoint,
+)
 from watch import SET_MESSAGE_INTERVAL, Vehicle, aborted, begun_s, copter, px4
 
 from offboard.flight.authority import Standing
@@ -137,12 +145,9 @@ def test_nothing_leaves_after_a_take_over(seed: int) -> None:
 def test_a_hold_that_was_asked_for_on_the_ground_is_asked_for_again_in_flight() -> None:
     """PX4 in OFFBOARD since its last landing; in flight another program sends setpoints."""
     pair = px4.hop()
-    codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=195)
-    setpoint = mavlink.MAVLink_set_attitude_target_message(0, 1, 1, 7, (1, 0, 0, 0), 0, 0, 0, 0.5)
+    setpoint = level_setpoint(0.5, 1, 195)
     tracking, switch = in_phase(Phase.TRACK, 1.0), pair.instance.autopilot.commander.switch
-    pair.down = lambda _, datagrams: (
-        [*datagrams, setpoint.pack(codec)] if tracking(pair) else datagrams
-    )
+    pair.down = lambda _, datagrams: [*datagrams, setpoint] if tracking(pair) else datagrams
     pair.at.append((lambda pair: pair.time_s > 0.1, lambda _: switch("OFFBOARD")))
     aborted(pair)
     assert [(m.param2, m.param3) for m in pair.modes] == [(4.0, 3.0), (6.0, 0.0), (4.0, 3.0)]
@@ -161,17 +166,3 @@ def test_a_pilot_who_switches_back_between_two_heartbeats_is_not_asked_again() -
     assert outcome.exit_code == ExitCode.REFUSED
     assert len(pair.modes) == 1
     assert not any(pair.armings) or "left OFFBOARD" in outcome.sentence
-
-
-@pytest.mark.parametrize(("on", "after_s"), [(px4, 0.02), (copter, 0.7)])
-def test_a_vehicle_that_is_disarmed_just_after_arming_is_not_armed_again(
-    on: Vehicle, after_s: float
-) -> None:
-    pair = on.hop()
-    judge = Judge(pair, on)
-    pair.at.append((asked(judge, ARM, after_s), lambda pair: pair.ground(ARM, 0, 21196)))
-    outcome = pair.fly()
-    assert outcome.exit_code in (ExitCode.REFUSED, ExitCode.ABORTED)
-    assert "disarmed" in outcome.sentence
-    assert pair.armings.count(1.0) == 1
-    assert not pair.armed

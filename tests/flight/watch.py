@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from pair import SHORT, Bytes, Filter, Pair, decode, in_phase, make, on_arducopter, through
+from pair import SHORT, Pair, decode, in_phase, make, on_arducopter
 
 from offboard.analysis.history import OUR_COMPONENTS
 from offboard.analysis.score import score
@@ -57,15 +57,6 @@ px4, copter = Vehicle("px4", make), Vehicle("ardupilot", on_arducopter)
 BOTH = pytest.mark.parametrize("on", [px4, copter], ids=str)
 
 
-def alternately(*cases: Any) -> list[Any]:
-    """Arguments (case, on): each case is flown on one of the firmwares, in turn."""
-    vehicles = ((px4, copter)[index % 2] for index in range(len(cases)))
-    return [
-        pytest.param(case, on, id=f"{index}-{on}")
-        for index, (case, on) in enumerate(zip(cases, vehicles, strict=True))
-    ]
-
-
 @dataclass(frozen=True)
 class Moment:
     """The truth. `error_m` is the distance from the reference while it is tracked, else NaN."""
@@ -81,29 +72,23 @@ class Moment:
 
 @dataclass
 class Watch:
-    """A downlink that notes the truth every 20 ms, and has the fault `link`."""
+    """Notes the truth every 20 ms."""
 
-    pair: Pair
-    link: Filter = through
     moments: list[Moment] = field(default_factory=list)
 
-    def __call__(self, time_s: float, datagrams: Bytes) -> Bytes:
-        if self.pair.steps % WATCHED_STEPS == 0:
-            self.moments.append(self._now(time_s))
-        return self.link(time_s, datagrams)
-
-    def _now(self, time_s: float) -> Moment:
-        autopilot, companion = self.pair.instance.autopilot, self.pair.companion
-        truth, commander = autopilot.state.truth, autopilot.commander
+    def __call__(self, pair: Pair) -> None:
+        autopilot, companion = pair.instance.autopilot, pair.companion
+        truth = autopilot.state.truth
         position = np.array(truth.position_ned_m)
-        vehicle_s = autopilot.state.time_s + 1e-6 * self.pair.instance.view.clock_offset_us
+        vehicle_s = autopilot.state.time_s + 1e-6 * pair.instance.view.clock_offset_us
         tracked = companion.phase in TRACKING
         wanted = companion.current.plan.sample(vehicle_s) if tracked else None
         error = np.nan if wanted is None else np.linalg.norm(position - wanted.position_ned_m)
-        mode, down_mps = commander.mode.name, float(truth.velocity_ned_mps[2])
-        return Moment(
-            time_s, companion.phase, mode, commander.armed, position, down_mps, float(error)
-        )
+        down_mps = float(truth.velocity_ned_mps[2])
+        self.moments.append(
+            Moment(pair.time_s, companion.phase, pair.mode, pair.armed, position, down_mps,
+                   float(error))
+        )  # fmt: skip
 
     def during(self, *phases: Phase) -> list[Moment]:
         return [moment for moment in self.moments if moment.phase in phases]
@@ -134,10 +119,10 @@ class Watch:
 
 
 def watched(pair: Pair) -> Watch:
-    """Watch `pair`; its present downlink stays."""
-    watch = Watch(pair, pair.down)
-    pair.down = watch
-    return watch
+    """Watch `pair` from now on."""
+    pair.watch = Watch()
+    pair.every(WATCHED_STEPS, pair.watch)
+    return pair.watch
 
 
 def flown(
@@ -286,7 +271,6 @@ refusal = partial(row, ExitCode.REFUSED, Phase.FAILED)
 flies = partial(row, ExitCode.FLOWN, Phase.DISARMED, LANDED)
 aborts = partial(row, ExitCode.ABORTED)
 ends = partial(aborts, Phase.DISARMED)
-in_track = partial(ends, fly=px4.lap)
 
 
 def judged(flight: Row) -> None:

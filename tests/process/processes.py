@@ -20,6 +20,7 @@ SHORT = ("--reference", "hover", "--set", "reference.duration_s=1", "--set", "re
 RECORDING = Path(__file__).parents[1] / "wire" / "recordings" / "px4-1.16.1-offboard.tlog"
 CONFIG = Path(__file__).parents[2] / "config"
 SIGNING_EPOCH_S = 1_420_070_400  # 2015-01-01
+NO_VEHICLE = "offboard fly --connect udpin:127.0.0.1:PORT --set limits.connect_s=0.3 --out x"
 LONG_S = 60.0  # for what takes a moment on an idle machine
 HOVERS = """name: hovers
 description: A vehicle that hovers when its links open, and is healthy a second later.

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from processes import RECORDING, Called, full_disk
+from processes import NO_VEHICLE, RECORDING, Called, full_disk
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from offboard.analysis import history, tlog
@@ -24,7 +24,6 @@ from offboard.report.flight import read
 from offboard.run import configuration as config
 
 NOW_US = 1_790_000_000_000_000  # of an entry of a log
-NO_VEHICLE = "offboard fly --connect udpin:127.0.0.1:PORT --set limits.connect_s=0.3 --out x"
 
 
 def gigabytes() -> bytes:

@@ -1,4 +1,5 @@
-"""The `simulator` process: its links, how it ends, several vehicles.
+"""The `simulator` process: its links, how it ends, several vehicles; and that of `--sitl`, which
+flies one vehicle after another and ends each of them.
 
 A companion that is late or silent in lockstep: `wire/test_sim_sockets.py`, `test_same_bytes.py`.
 Several clients of a link: `wire/test_sim_sockets.py`, `wire/test_sim_link.py`.
@@ -6,13 +7,23 @@ Several clients of a link: `wire/test_sim_sockets.py`, `wire/test_sim_link.py`.
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 import socket
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
 
-from processes import Called, free_port
+from processes import Called, children, ended, eventually, free_port
 from sim_peer import Peer, simulator
+
+from offboard.analysis import tlog
+from offboard.flight.flight import Flight
+from offboard.flight.phases import Phase
+from offboard.run.configuration import load
+from offboard.run.flight import Simulated, fly
+from offboard.run.sitl import Ending, SimulatorProcess
 
 QUIET = ("--gcs", "none")
 
@@ -63,3 +74,65 @@ def test_instances_have_ports_and_systems_of_their_own_and_keep_time() -> None:
     assert (process.returncode, errors) == (0, "")
     assert re.findall(r"seed (\d+)", output) == ["7", "8", "9"]
     assert re.search(r"3 vehicles: \d+ of 250 deadlines missed, at worst .* ms late", output)
+
+
+# --- the process of `--sitl` ---
+
+KILLED = Ending("the bundled simulator ended (signal 9)", unusable=False)
+SHORT = ("reference.height_m=1", "identify.excite=false")
+
+
+@contextmanager
+def flying(pool: SimulatorProcess) -> Iterator[int]:
+    """A vehicle in lockstep that has sent something: its process id."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ours:
+        ours.bind(("127.0.0.1", 0))
+        ours.settimeout(30.0)
+        port = ours.getsockname()[1]
+        pool.launch(["--connect", f"udpout:127.0.0.1:{port}", "--gcs", "none", "--lockstep"])
+        assert ours.recv(65535)
+        (vehicle,) = children(pool.process.pid)
+        yield vehicle
+
+
+def test_how_each_vehicle_ends_is_reported_and_the_next_one_flies() -> None:
+    with SimulatorProcess() as pool:
+        pid = pool.process.pid
+        for options, says in (
+            (["--scenario", "storm"], "there is no scenario named 'storm'; known are"),
+            (["--firmware", "betaflight"], "--firmware betaflight: unknown"),
+        ):
+            pool.launch(options)
+            ending = pool.ending(10.0)
+            assert ending is not None
+            assert (ending.unusable, ending.sentence.startswith(says)) == (True, True)
+            with flying(pool) as vehicle:
+                os.kill(vehicle, signal.SIGKILL)
+                assert pool.ending(10.0) == KILLED  # not the words before
+        with flying(pool):
+            assert pool.ending() is None
+        pool.recall()
+        assert (children(pool.process.pid), pool.process.pid) == ([], pid)
+
+
+def test_one_that_dies_in_flight_ends_it_and_is_replaced(tmp_path: Path) -> None:
+    lost: list[int] = []
+
+    def kill(companion: Flight) -> None:
+        if companion.phase is Phase.TRACK and not lost:
+            lost.extend((*children(pool.process.pid), pool.process.pid))
+            os.kill(pool.process.pid, signal.SIGKILL)
+
+    config = load("flight", choices={"reference": "hover"}, assignments=SHORT)
+    with SimulatorProcess() as pool:
+        outcome = fly(
+            config, tmp_path / "x", Simulated(scenario="calm"), simulator=pool, progress=kill
+        )
+        assert (outcome.exit_code, outcome.sentence) == (4, KILLED.sentence)
+        log = tlog.read(tmp_path / "x" / "flight.tlog")
+        assert sum(entry.name == "SET_ATTITUDE_TARGET" for entry in log) > 50
+        orphan, first = lost
+        eventually(lambda: ended(orphan))
+        with flying(pool):
+            assert pool.process.pid != first
+    assert ended(pool.process.pid)
