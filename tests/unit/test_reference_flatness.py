@@ -62,7 +62,8 @@ def test_thrust_along_b_flies_the_trajectory(flown: Track) -> None:
 
 @pytest.mark.parametrize("flown", TRACKS)
 def test_rates_turn_the_attitude(flown: Track) -> None:
-    """Body rates are the rotation vector from one attitude to the next, by SciPy; b is its z."""
+    """Body rates are the rotation vector from one attitude to the next, by SciPy; b is its z. The
+    rate of the thrust is its central difference."""
     times = np.linspace(0.1, flown.duration_s - 0.1, 400)
     half = 1e-4
     middle, before, after = (state_of(flown, times + shift) for shift in (0.0, -half, half))
@@ -77,6 +78,8 @@ def test_rates_turn_the_attitude(flown: Track) -> None:
     np.testing.assert_allclose(
         attitude.apply([0.0, 0.0, 1.0]), middle.thrust_direction_ned, atol=1e-12
     )
+    rise = (after.thrust_mps2 - before.thrust_mps2) / (2 * half)
+    np.testing.assert_allclose(rise, middle.thrust_rate_mps3, atol=2e-6)
     turn = earlier.inv() * later
     np.testing.assert_allclose(turn.as_rotvec() / (2 * half), middle.rates_frd_radps, atol=2e-6)
 

@@ -9,6 +9,7 @@ import math
 from collections import Counter
 from typing import Any
 
+import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_bench import NAN, Bench, aloft, degrees
@@ -38,11 +39,6 @@ def guided(**options: float) -> Bench:
     for name, value in {"GUID_OPTIONS": 8, **options}.items():
         bench.set(name, value)
     return bench
-
-
-def roll(degrees: float, length: float = 1.0) -> tuple[float, float, float, float]:
-    half = math.radians(degrees) / 2.0
-    return length * math.cos(half), length * math.sin(half), 0.0, 0.0
 
 
 def roll_deg(vehicle: Bench) -> float:
@@ -107,13 +103,22 @@ def test_a_heavy_vehicle_takes_off_also_after_a_takeoff_that_ended_on_the_ground
 
 def test_which_attitude_setpoints_are_flown() -> None:
     """A quaternion's sign is of no account; its length is, and so are bits of the mask."""
-    vehicle = guided()
-    for mask, length, rolls in (
+    vehicle, tilts_deg = guided(), np.array([6.0, 6.0])  # roll and pitch, small
+
+    def tilted() -> bool:
+        w, *axis, _ = vehicle.instance.autopilot.state.truth.attitude
+        return bool((abs(np.degrees(2.0 * np.array(axis) / w) - tilts_deg) < 1.0).all())
+
+    def tilt(length: float) -> tuple[float, ...]:
+        x, y = np.radians(tilts_deg) / 2.0
+        return tuple(length * np.array((math.sqrt(1.0 - x * x - y * y), x, y, 0.0)))
+
+    for mask, length, flown in (
         (7, 1.0, True), (7, -1.0, True), (7, 1.0006, False), (7, 2.0, False), (7, NAN, False),
         (71, 1.0, False), (199, 1.0, False),
     ):  # fmt: skip
-        vehicle.run(0.6, lambda m=mask, n=length: vehicle.attitude(roll(8.0, n), HOVER, m))
-        assert (abs(roll_deg(vehicle) - 8.0) < 1.0) == rolls
+        vehicle.run(0.6, lambda m=mask, n=length: vehicle.attitude(tilt(n), HOVER, m))
+        assert tilted() == flown
         vehicle.run(1.2, lambda: vehicle.attitude(LEVEL, HOVER))
         assert abs(roll_deg(vehicle)) < 1.0
 
