@@ -268,12 +268,12 @@ class _Collector:
                 samples.data.clear()
 
     def _add_origin(self, entry: LoggedMessage) -> None:
-        """HOME_POSITION gives one point in both frames. An origin that is moved in flight is not
-        the one of the positions until then."""
+        """HOME_POSITION gives one point in both frames. An origin that is moved after the first
+        decision is not the one of the positions until then."""
         at = entry.message
         place = Geodetic(at.latitude / 1e7, at.longitude / 1e7, at.altitude / 1e3)
         if entry.name == "GPS_GLOBAL_ORIGIN":
-            if self._origin is None or not self._ours["SET_ATTITUDE_TARGET"].data:
+            if self._origin is None or not self._ours[columns.RECORDS].data:
                 self._origin = place
         elif self._origin is None:  # else of no use: ArduCopter's x, y and z are zero
             self._origin = origin_of(place, (at.x, at.y, at.z))

@@ -126,7 +126,7 @@ def _disarm_if_standing(flight: FlightState) -> None:
     the autopilot refuses in the air. While its land detector reports flight, it must be disarmed
     by the user, who is told so. It may have stood before the landing, as without a lift-off."""
     contact = flight.contact
-    if not contact.stands or flight.in_phase_s < STANDING_S:
+    if not contact.stands or flight.in_phase_s < min(STANDING_S, 0.5 * flight.limits.land_s):
         return
     if contact.detects_flight:
         outbox.announce(flight, STILL_ARMED, once=True)

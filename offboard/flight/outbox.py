@@ -34,6 +34,7 @@ INFO = 6  # MAV_SEVERITY
 TEXT_ID_MAX = 65535  # STATUSTEXT.id; 0 is for texts of one chunk
 ANNOUNCED_KEPT = 200
 NEVER = -math.inf, -math.inf
+ANSWERS_S = 10.0  # since the newest reply of TIMESYNC: after this none is awaited
 REPEAT_S = 1.0  # after this a request that was refused, or not answered, is sent again
 LOSES = f"more than {LOSSY:.0%} of TIMESYNC requests have no reply: each setpoint is sent twice"
 _LENGTH_TOLERANCE = 0.01
@@ -215,13 +216,15 @@ def request(flight: FlightState, request: CommandLong) -> bool:
 
     In one phase it is sent once. Only one that was refused, or that nothing has answered, is
     sent again, after a second and a report of the mode that the vehicle has sent since: a pilot may
-    have changed it. While telemetry with stamps is missing, one that has arrived since.
+    have changed it, and the link may be late both ways. That is one after the reply to a request of
+    TIMESYNC that was sent with this one or later; without such replies, one that arrived since.
     """
     result = flight.vehicle.results.get(request.command)
-    requested_s, vehicle_s = flight.requested_s.get(request, NEVER)
+    requested_s, host_s = flight.requested_s.get(request, NEVER)
     waits = flight.now_s - requested_s < REPEAT_S - 1e-6 or flight.authority.heard_s < requested_s
-    stamped = flight.silence_s < flight.limits.silence_s
-    waits = waits or (stamped and flight.reported_s < vehicle_s)
+    # Requests of TIMESYNC have the stamp of the newest telemetry: without it all are the same
+    answers = flight.silence_s < REPEAT_S and flight.clock.unanswered_s(flight.host_s) < ANSWERS_S
+    waits = waits or (answers and flight.reported_s < host_s)
     done = math.isfinite(requested_s) and result in GOOD_RESULTS
     if waits or done or not flight.authority.permits_command(flight.now_s):
         return False
@@ -232,7 +235,7 @@ def request(flight: FlightState, request: CommandLong) -> bool:
 
 def send_request(flight: FlightState, request: CommandLong) -> None:
     """Send it, and note when."""
-    flight.requested_s[request] = flight.now_s, flight.clock.now_s(flight.host_s)
+    flight.requested_s[request] = flight.now_s, flight.host_s
     send(flight, request)
 
 

@@ -1,5 +1,5 @@
-"""Phases of a flight and what a row of the phase table is, actions of the failsafe, exit codes,
-limits, and options of the service."""
+"""Phases of a flight and what a row of the phase table is, actions of the failsafe, exit codes and
+outcome, limits, and options of the service."""
 
 from __future__ import annotations
 

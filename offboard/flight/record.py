@@ -118,7 +118,7 @@ class Decided:
 def identified_record(time_s: float, found: Mapping[str, Estimate | None]) -> SolverRecord:
     """The record of what was identified; NaN for what was not."""
     numbers: list[float] = []
-    for each in map(found.get, IDENTIFIED):
+    for each in map(found.__getitem__, IDENTIFIED):
         numbers += (each.value, each.sd) if each else (math.nan, math.nan)
     return SolverRecord(time_s, tuple(numbers), IDENTIFIED_ID, IDENTIFIED_NAME)
 

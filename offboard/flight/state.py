@@ -76,7 +76,7 @@ class Failsafe:
 @dataclass(slots=True, kw_only=True)
 class FlightState(Ground):
     """One flight. `stopwatch` reads host time. `deadline_s` is the wall time that one decision may
-    take, None where the vehicle waits for each decision, so that nothing can be late or old.
+    take, None where the vehicle waits for each decision, so that none is late.
     `identification` is None with a controller that cannot use it, `service` in a flight of `fly`.
     """
 
@@ -117,7 +117,7 @@ class FlightState(Ground):
     busyness: Busyness = field(init=False)  # of this computer
     heard_s: float = math.nan  # host time of the newest telemetry, as `Session.elapsed_s`
     telemetry_arrived_s: float = 0.0  # host time at which it arrived
-    reported_s: float = -math.inf  # stamp of the newest telemetry when the newest mode was reported
+    reported_s: float = -math.inf  # `clock.answered_s` when the newest mode was reported
     bridged_s: float = 0.0  # `silence_s` at the newest setpoint that was sent without telemetry
     ignored: int = 0  # datagrams of others and forged frames between the two newest ticks
     command: Command = field(default_factory=lambda: Command(0.0, LEVEL_DIRECTION, 0.0))  # in force
@@ -134,7 +134,7 @@ class FlightState(Ground):
     told: set[str] = field(default_factory=set)  # of those that are announced once in a flight
     queue: list[Outgoing] = field(default_factory=list)  # to be sent
     records: list[Record] = field(default_factory=list)  # to be logged
-    # requests of this phase: when they were sent, also in vehicle time
+    # requests of this phase: when they were sent, also in host time
     requested_s: dict[CommandLong, tuple[float, float]] = field(default_factory=dict)
     text_id: int = 0
     awaits_link: bool = False  # while landing

@@ -177,13 +177,14 @@ def _on_mode(
 ) -> None:
     dialect = flight.dialect
     assert dialect is not None
-    if isinstance(event, Heartbeat) and event.system_status == BOOTS and flight.phase in FLYING:
+    boots = isinstance(event, Heartbeat) and event.system_status == BOOTS
+    if boots and not flight.rebooted and flight.phase in FLYING | {Phase.LAND}:
         _on_reboot(flight)  # before the mode that it shows counts as a pilot's
     if not flight.authority.engage_mode:
         flight.authority = Authority(dialect.engage_mode)
     vehicle, authority = flight.vehicle, flight.authority
     authority.setpoint_loss = dialect.setpoint_loss(vehicle.parameters)
-    flight.reported_s = flight.time_s
+    flight.reported_s = flight.clock.answered_s
     authority.on_mode(
         mode,
         flight.now_s,
@@ -219,7 +220,6 @@ def _on_reboot(flight: FlightState) -> None:
     flight.contact, flight.clock = GroundContact(flight.vehicle), VehicleClock()
     flight.hover, flight.jumps = HoverEstimate(), PositionJumps()
     flight.reading = ParameterReading()
-    flight.requested_s.clear()
     flight.took_off = False  # the local frame begins elsewhere
     if flight.phase in BEFORE_FLIGHT:
         flight.authority = Authority()

@@ -37,7 +37,8 @@ class VehicleClock:
     """See the module. All stamps are vehicle time, all `host_s` monotonic time of this computer.
 
     `jumped_s` is by how much the clock has jumped forward since `settle`; `growth` is what the link
-    has added to its delay since then.
+    has added to its delay since then. `answered_s` is the host time of the newest request with a
+    reply.
     """
 
     def __init__(self) -> None:
@@ -60,7 +61,7 @@ class VehicleClock:
         self._asked_s: deque[float] = deque(maxlen=LOSS_OVER + 1)  # host times of the newest
         self._delays_s: deque[float] = deque(maxlen=REPLIES_MAX)
         self.began_s = math.inf  # host time of the first request
-        self._answered_s = -math.inf  # host time of the newest request with a reply
+        self.answered_s = -math.inf
         self._settled_delay_s = math.nan
 
     def settle(self) -> None:
@@ -102,8 +103,8 @@ class VehicleClock:
         if asked is None:
             return False
         self._requests.remove(asked)  # a duplicate must not count again
-        self._answered_s = max(self._answered_s, asked[1])
-        while self._requests and self._requests[0][1] < self._answered_s - DELAY_MAX_S:
+        self.answered_s = max(self.answered_s, asked[1])
+        while self._requests and self._requests[0][1] < self.answered_s - DELAY_MAX_S:
             self._requests.popleft()  # lost
         delay_s = (reply.vehicle_ns - reply.request_ns) * 1e-9
         if 0.0 <= delay_s <= DELAY_MAX_S:
@@ -160,12 +161,12 @@ class VehicleClock:
 
     def unanswered_s(self, host_s: float) -> float:
         """For how long at host time `host_s` no request has been answered; 0 before the first."""
-        return max(host_s - max(self.began_s, self._answered_s), 0.0)
+        return max(host_s - max(self.began_s, self.answered_s), 0.0)
 
     def overdue(self, host_s: float) -> int:
         """Number of requests since the newest one with a reply that should have one at host time
         `host_s`: a reply takes at most one way more than `delay`. 0 while no delay is known."""
-        return self._unanswered(self._answered_s, host_s)
+        return self._unanswered(self.answered_s, host_s)
 
     def loses(self, host_s: float) -> bool:
         """Whether more than LOSSY of the newest requests have no reply at host time `host_s`,

@@ -246,8 +246,6 @@ class Learner(VehicleEstimate):
 
         While the link's delay changes with each tick, every other call does a piece of work.
         """
-        if self._gave_up:
-            return None
         told = VehicleUpdate(self.vehicle, self.uncertainty, self.cause)
         if not self._has_told and (self.sentences or self.record or told != self._told):
             self._has_told, self._told = True, told
@@ -255,6 +253,8 @@ class Learner(VehicleEstimate):
             self.sentences, self.record = [], {}
             return update
         self._has_told = False
+        if self._gave_up:
+            return None
         self._time_s = time_s
         if self.identified and self._stage is Stage.MOTION and not self.in_doubt:
             self._hover.append((time_s, hover_thrust))

@@ -115,7 +115,7 @@ class DelayUncertainty:
     """What is not known of a vehicle's delays, s.
 
     `tilt_s` and `thrust_s`: by how much the true delay may differ, of an identified one three
-    (tilt) and two (thrust) standard deviations. `link_s`: what the link adds to all delays since
+    standard deviations. `link_s`: what the link adds to all delays since
     take-off, which is known and compensated by prediction.
     """
 

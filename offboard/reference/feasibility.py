@@ -18,8 +18,6 @@ Array = NDArray[np.float64]
 HEIGHT_MIN_M, DISTANCE_MAX_M, SPEED_MAX_MPS = 0.3, 2000.0, 12.0
 # shares of the vehicle's limits; the rest is reserved for feedback
 THRUST_SHARE_MIN, THRUST_SHARE_MAX, TILT_SHARE_MAX = 0.05, 0.95, 0.9
-# PX4's defaults MC_ROLLRATE_MAX and MC_PITCHRATE_MAX (220 deg/s), MC_YAWRATE_MAX (200 deg/s)
-RATES_MAX_FRD_RADPS = 3.84, 3.84, 3.49
 _STEP_S = 0.01
 _CHUNK = 20_000
 
@@ -88,7 +86,7 @@ def _demands(
     sample: FlatSample, state: FlatState, tilt: Array, vehicle: Vehicle
 ) -> tuple[_Demand, ...]:
     thrust_max = vehicle.thrust_max_mps2
-    rates = np.abs(state.rates_frd_radps)
+    rates, most = np.abs(state.rates_frd_radps), vehicle.angular_rate_limit_radps
     speed = np.linalg.norm(sample.velocity_ned_mps, axis=-1)
     height = 0.0 - sample.position_ned_m[:, 2]  # no -0
     distance = np.linalg.norm(sample.position_ned_m, axis=-1)
@@ -98,9 +96,9 @@ def _demands(
         _Demand("a thrust of", "m/s^2", thrust, thrust_min, -1.0),
         _Demand("a thrust of", "m/s^2", thrust, THRUST_SHARE_MAX * thrust_max),
         _Demand("a tilt of", "rad", tilt, TILT_SHARE_MAX * vehicle.tilt_max_rad),
-        _Demand("a roll rate of", "rad/s", rates[:, 0], RATES_MAX_FRD_RADPS[0]),
-        _Demand("a pitch rate of", "rad/s", rates[:, 1], RATES_MAX_FRD_RADPS[1]),
-        _Demand("a yaw rate of", "rad/s", rates[:, 2], RATES_MAX_FRD_RADPS[2]),
+        _Demand("a roll rate of", "rad/s", rates[:, 0], most[0]),
+        _Demand("a pitch rate of", "rad/s", rates[:, 1], most[1]),
+        _Demand("a yaw rate of", "rad/s", rates[:, 2], most[2]),
         _Demand("a speed of", "m/s", speed, SPEED_MAX_MPS),
         _Demand("a height of", "m", height, HEIGHT_MIN_M, -1.0, of_path=True),
         _Demand("a distance of", "m", distance, DISTANCE_MAX_M, of_path=True),

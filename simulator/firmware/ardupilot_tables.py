@@ -72,8 +72,8 @@ PARAMETERS = (
     _real("ATC_ACCEL_R_MAX", 110000.0),  # cdeg/s^2 of roll
     _int8("ATC_ANGLE_BOOST", 1),  # divide thrust by the cosine of the tilt
     _real("ATC_INPUT_TC", 0.15),  # s, shaping of demanded attitudes
-    _real("ATC_RATE_P_MAX", 0.0),  # deg/s of pitch, 0 no limit
-    _real("ATC_RATE_R_MAX", 0.0),  # deg/s of roll, 0 no limit
+    _real("ATC_RATE_P_MAX", 0.0),  # deg/s of pitch, 0 no limit; without effect
+    _real("ATC_RATE_R_MAX", 0.0),  # deg/s of roll, 0 no limit; without effect
     _real("ATC_SLEW_YAW", 6000.0),  # cdeg/s, largest yaw rate
     _int32("AUTO_OPTIONS", 0),  # bit 0 arms in AUTO
     _real("BATT_ARM_VOLT", 0.0),  # V below which arming is refused, 0 off

@@ -91,8 +91,8 @@ PARAMETERS = (
     _real("LNDMC_TRIG_TIME", 1.0, 0.1, 10),  # s of each of three stages of land detection
     _int("MAV_SYS_ID", 1, 1, 250),  # system id; read at start
     _int("MAV_TYPE", 2, 0, 22),  # MAV_TYPE
-    _real("MC_PITCHRATE_MAX", 220.0, 0, 1800),  # deg/s
-    _real("MC_ROLLRATE_MAX", 220.0, 0, 1800),  # deg/s
+    _real("MC_PITCHRATE_MAX", 220.0, 0, 1800),  # deg/s; without effect
+    _real("MC_ROLLRATE_MAX", 220.0, 0, 1800),  # deg/s; without effect
     _real("MIS_DIST_1WP", 10000.0, -1, 100000),  # m to the first waypoint; without effect
     _real("MIS_TAKEOFF_ALT", 2.5, 0, 80),  # m, takeoff height
     _int("MIS_TKO_LAND_REQ", 0, 0, 4),  # what a mission must have

@@ -50,6 +50,26 @@ STILL_ARMED = "it has stood still for 15 s and is armed: its land detector repor
 EARLIER = {"fault": "clock_jump", "jump_s": -3, "after": "landing", "at_s": 0.5}
 
 
+def late_both_ways(pair: Pair) -> None:
+    pair.down, pair.up = faults.late(4.0), faults.late(4.0)
+
+
+def in_turn(*acts: Callable[[Pair], object]) -> Callable[[Pair], None]:
+    def change(pair: Pair) -> None:
+        for act in acts:
+            act(pair)
+
+    return change
+
+
+def never_disarms(pair: Pair) -> None:
+    pair.instance.autopilot.parameters.set("COM_DISARM_LAND", -1.0)
+
+
+def loses_commands(for_s: float) -> Callable[[Pair], None]:
+    return faults.cut(for_s, mavlink.MAVLINK_MSG_ID_COMMAND_LONG, ways=["up"])
+
+
 # --- checks after the flight ---
 
 
@@ -199,6 +219,11 @@ def stayed_down_without_a_setpoint(pair: Pair) -> None:
 
 def asks_again(pair: Pair) -> None:
     assert said(pair, "waiting for the link, then landing is asked again")
+
+
+def asks_each_second(pair: Pair) -> None:
+    """The first requests to land are lost for 2.5 s; one that was accepted is not repeated."""
+    assert len(pair.landings) == 4
 
 
 def asks_once(pair: Pair) -> None:
@@ -463,6 +488,12 @@ ROWS = {
         fly=px4.hop, boot_scale=1.0,
         scenario=scenario_of({"fault": "thrust_change", "thrust_scale": 0.4}),
     ),
+    "too weak to lift off, and it does not disarm by itself": ends(
+        "no lift-off in 8 s; is hover_thrust in the vehicle file right", asked_to_disarm,
+        fly=px4.hop, boot_scale=1.0, limits={"land_s": 12.0},
+        at=then(Phase.TAKEOFF, 0.1, never_disarms),
+        scenario=scenario_of({"fault": "thrust_change", "thrust_scale": 0.4}),
+    ),
     # the pilot
     "pilot takes over the landing while a failsafe shows": aborts(
         Phase.FAILED, "not landed and disarmed after 20 s", the_pilots_while_landing, armed=True,
@@ -475,10 +506,7 @@ ROWS = {
     "pilot takes over the landing behind a link that has become 4 s late": aborts(
         Phase.YIELDED, "no telemetry for 1.0 s .*; the vehicle left AUTO.LAND for AUTO.LOITER",
         the_pilots, fly=partial(px4.hover, HIGH), armed=True,
-        at=[
-            *then(Phase.HOVER, 0.2, faults.downlink(faults.late(4.0))),
-            *then(Phase.LAND, 1.5, faults.take_over),
-        ],
+        at=[*then(Phase.HOVER, 0.2, late_both_ways), *then(Phase.LAND, 5.5, faults.take_over)],
     ),
     "pilot takes over as it arms": aborts(
         Phase.YIELDED, "the vehicle left OFFBOARD for AUTO.LOITER as it armed", the_pilots,
@@ -508,6 +536,11 @@ ROWS = {
         fly=copter.lap, armed=True, ended_by="restart",
         at=tracking(faults.downlink(BOOTING)),
     ),
+    "restart of ArduCopter while landing": aborts(
+        Phase.FAILED, "the vehicle restarted while landing", fly=copter.hover, armed=True,
+        ended_by="restart",
+        at=then(Phase.LAND, 0.5, faults.downlink(BOOTING)),
+    ),
     "restart while landing": ends(
         "the vehicle restarted while landing", fly=px4.hover, ended_by="restart",
         scenario=scenario_of(EARLIER),
@@ -524,6 +557,18 @@ ROWS = {
     "position and attitude stop, heartbeats go on": aborts(
         Phase.FAILED, "no telemetry for 1.0 s .*; disarmed, landing not confirmed: ",
         landing_requested, fly=px4.lap, at=tracking(silent(faults.POSITION, faults.ATTITUDE)),
+    ),
+    "position and attitude stop, the requests to land are lost for 3.5 s": aborts(
+        Phase.FAILED, "no telemetry for 1.0 s .*; disarmed, landing not confirmed: ",
+        landing_requested, asks_each_second, fly=copter.lap,
+        at=tracking(in_turn(silent(faults.POSITION, faults.ATTITUDE), loses_commands(3.5))),
+    ),
+    "restart while landing, the requests to land are lost for 2 s": ends(
+        "the vehicle restarted while landing", landed, fly=px4.hover,
+        at=[
+            *then(Phase.HOVER, 0.0, loses_commands(6.0)),
+            *then(Phase.LAND, 0.5, faults.downlink(faults.restamped(8.0))),
+        ],
     ),
     # outages: nothing passes for a time. PX4's own failsafe comes meanwhile, after 1.0 s
     "an outage of 0.8 s": flies(asks_once, fly=COPTER_HOVERS, at=tracking(faults.cut(0.8))),

@@ -303,6 +303,12 @@ def test_without_identification_the_file_is_flown_and_nothing_is_recalled() -> N
         told += [learner.learn(since_s + 0.1 * tick, 0.53) for tick in range(50)]
     (update,) = filter(None, told)
     assert (update.vehicle, update.uncertainty.tilt_s) == (FILE, FILE_DELAY_S)
+    learner.give_up()  # what the vehicle reports is used all the same
+    slower = {"angular_rate_limit_radps": (1.0, 1.0, 3.0)}
+    learner.on_changed(slower)
+    changed = learner.learn(15.0, 0.53)
+    assert changed is not None
+    assert changed.vehicle == FILE.model_copy(update=slower)
     again = Learner(FILE, IdentifySettings(), known=replace(recalled, thrust=Estimate(0.1, 0.09)))
     assert again.uncertainty.thrust_s == pytest.approx(0.27)
     assert update.cause.endswith("the vehicle file's delay may be wrong by 130 ms")

@@ -114,6 +114,8 @@ def test_a_circle_by_hand() -> None:
     reached = math.atan2(inward, 9.8), 3.0, 2.0
     assert check(flown, vehicle()) == pytest.approx(reached, rel=1e-3)
     thrust_mps2 = math.hypot(9.8, inward)
+    with pytest.raises(ValueError, match=r"rate of .* beyond the limit of 0.05 rad/s"):
+        check(flown, vehicle(angular_rate_limit_radps=(0.05, 0.05, 0.05)))
     with pytest.raises(ValueError, match=f"a thrust of {thrust_mps2:.3g} m"):
         check(flown, vehicle(hover_thrust=0.95 * 9.8 / (0.999 * thrust_mps2)))
 

@@ -168,7 +168,7 @@ class Dialect:
     hover_parameter: str  # normalised thrust that holds the weight
     tilt_parameters: Mapping[str, float]  # greatest tilt of its own modes: its unit in rad
     # parameter of the greatest angular acceleration or rate of roll or pitch -> the limit's name
-    # in a `Vehicle`, and its unit in rad/s^2 or rad/s; a value of 0 is no limit
+    # in a `Vehicle`, and its unit in rad/s^2 or rad/s; 0 counts as no limit
     tilting_parameters: Mapping[str, tuple[str, float]]
     estimator_message: str  # the message that becomes an EstimatorReport
     slow_hint: str  # what to do where telemetry comes slower than it was requested
