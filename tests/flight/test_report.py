@@ -27,6 +27,7 @@ from offboard.analysis.score import Score, score
 from offboard.cli.commands import app
 from offboard.documents.errors import UserError
 from offboard.flight.phases import Phase
+from offboard.flight.record import RECORD_ID
 from offboard.report import report_page
 from offboard.report.figures import bands, figures, marks
 from offboard.report.flight import Flight, read
@@ -246,11 +247,11 @@ def test_a_home_position_is_the_origin_only_without_another(
         codec.local_position_ned_encode(1000, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
         codec.sim_state_encode(1.0, *[0.0] * 14, 500.0, *[0.0] * 5, *home),
     ]
-    setpoint = ours.set_attitude_target_encode(1000, 1, 1, 7, [1.0, 0.0, 0.0, 0.0], 0, 0, 0, 0.5)
+    decided = ours.debug_float_array_encode(10**6, b"pso", RECORD_ID, [0.0] * 58)
     elsewhere = codec.gps_global_origin_encode(480_000_000, 80_000_000, 500_000)
     frames = [each.pack(codec) for each in messages]
     if moved:
-        frames += [setpoint.pack(ours), elsewhere.pack(codec)]
+        frames += [decided.pack(ours), elsewhere.pack(codec)]
     log = tmp_path / "x.tlog"
     log.write_bytes(b"".join(STAMP + each for each in frames))
     (row,) = read(log).history.truth
