@@ -106,7 +106,7 @@ class Authority:
             ):
                 self._on_failsafe(before, now_s, failsafe, heartbeat=heartbeat, sticks=sticks)
             else:
-                self.lose(f"the vehicle left {self.engage_mode} for {mode}", now_s, heartbeat)
+                self.lose(f"the vehicle left {before} for {mode}", now_s, heartbeat)
         elif self.standing is Standing.HANDED:
             if mode in self._requested:
                 self._hand_over(mode)

@@ -217,13 +217,15 @@ def request(flight: FlightState, request: CommandLong) -> bool:
     In one phase it is sent once. Only one that was refused, or that nothing has answered, is
     sent again, after a second and a report of the mode that the vehicle has sent since: a pilot may
     have changed it, and the link may be late both ways. That is one after the reply to a request of
-    TIMESYNC that was sent with this one or later; without such replies, one that arrived since.
+    TIMESYNC that was sent with this one or later; without telemetry for a second, or such replies
+    for ANSWERS_S, one that arrived since.
     """
     result = flight.vehicle.results.get(request.command)
     requested_s, host_s = flight.requested_s.get(request, NEVER)
     waits = flight.now_s - requested_s < REPEAT_S - 1e-6 or flight.authority.heard_s < requested_s
-    # Requests of TIMESYNC have the stamp of the newest telemetry: without it all are the same
-    answers = flight.silence_s < REPEAT_S and flight.clock.unanswered_s(flight.host_s) < ANSWERS_S
+    # TIMESYNC is requested at each tick: not without telemetry
+    ticks = flight.vehicle.has_state and flight.silence_s < REPEAT_S
+    answers = ticks and flight.clock.unanswered_s(flight.host_s) < ANSWERS_S
     waits = waits or (answers and flight.reported_s < host_s)
     done = math.isfinite(requested_s) and result in GOOD_RESULTS
     if waits or done or not flight.authority.permits_command(flight.now_s):

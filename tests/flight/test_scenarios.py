@@ -360,6 +360,7 @@ def complain(pair: Pair) -> None:
 
 STOPPED = "stop requested by the operator"
 BOOTING = faults.heartbeats(system_status=1, base_mode=81, custom_mode=0)  # in STABILIZE
+BOOTING_ARMED = faults.heartbeats(system_status=1, base_mode=209, custom_mode=0)
 HELICOPTER = config.vehicle("px4_sih").model_copy(update={"airframe": "helicopter"})
 SOON, LATER = {"health_s": 5.0}, {"health_s": 8.0}
 NO_TAKEOFF = Rule("takeoff", result=Result.FAILED)
@@ -537,9 +538,15 @@ ROWS = {
         at=tracking(faults.downlink(BOOTING)),
     ),
     "restart of ArduCopter while landing": aborts(
-        Phase.FAILED, "the vehicle restarted while landing", fly=copter.hover, armed=True,
+        Phase.FAILED, "the vehicle restarted while landing; the vehicle restarted and is disarmed",
+        fly=copter.hover, armed=True,
         ended_by="restart",
         at=then(Phase.LAND, 0.5, faults.downlink(BOOTING)),
+    ),
+    "restart of an ArduCopter while landing that stays armed": aborts(
+        Phase.YIELDED, "the vehicle restarted while landing; the vehicle left LAND for STABILIZE",
+        fly=copter.hover, armed=True, ended_by="restart",
+        at=then(Phase.LAND, 0.5, faults.downlink(BOOTING_ARMED)),
     ),
     "restart while landing": ends(
         "the vehicle restarted while landing", fly=px4.hover, ended_by="restart",
