@@ -78,8 +78,9 @@ def supported_bandwidth(
 
 
 def tilting_bandwidth(vehicle: Vehicle) -> tuple[float, str]:
-    """The bandwidth at which feedback of FEEDBACK_LIMIT needs the greatest angular acceleration, or
-    the greatest angular rate, of the tilt, and the sentence that says which."""
+    """The lateral bandwidth, rad/s, at which feedback of FEEDBACK_LIMIT needs the greatest angular
+    acceleration or the greatest angular rate of the tilt, whichever is lower, and the sentence that
+    says which it is. The limits are those of the vehicle file or of the autopilot's parameters."""
     most_radps2 = min(vehicle.angular_acceleration_limit_radps2[:2])
     most_radps = min(vehicle.angular_rate_limit_radps[:2])
     acceleration = f"the autopilot limits the angular acceleration of the tilt to {most_radps2:.1f}"

@@ -104,8 +104,8 @@ def _end(flight: FlightState) -> None:
 
 
 def _await_link(flight: FlightState) -> None:
-    """Say once that the link is awaited; when the vehicle is heard again, allow every request to be
-    sent once more."""
+    """Say once that the link is awaited; when the vehicle is heard again, an answer from before
+    does not count any more."""
     unreached_s, limits = flight.unreached_s, flight.limits
     waited, flight.awaits_link = flight.awaits_link, unreached_s > 2.0 * limits.silence_s
     if flight.awaits_link and not waited:
@@ -117,7 +117,7 @@ def _await_link(flight: FlightState) -> None:
             "then landing is asked again",
         )
     elif waited and not flight.awaits_link:
-        flight.vehicle.results.clear()  # every request may be sent once more
+        flight.vehicle.results.clear()
         outbox.announce(flight, f"heard again: the vehicle shows {flight.vehicle.mode}")
 
 

@@ -214,19 +214,19 @@ def hover_mps2(flight: FlightState) -> float:
 def request(flight: FlightState, request: CommandLong) -> bool:
     """Send a command if the vehicle is ours; returns whether it was sent.
 
-    In one phase it is sent once. Only one that was refused, or that nothing has answered, is
-    sent again, after a second and a report of the mode that the vehicle has sent since: a pilot may
-    have changed it, and the link may be late both ways. That is one after the reply to a request of
-    TIMESYNC that was sent with this one or later; without telemetry for a second, or such replies
-    for ANSWERS_S, one that arrived since.
+    Each command is sent once in a phase. It is sent again only if it was refused or not answered
+    for REPEAT_S, and the vehicle has reported its mode since: a pilot may have changed it. The link
+    may be late in both directions, so that a report counts only if it arrives after the reply to
+    the TIMESYNC request that left with the command, or to a later one. Without telemetry for a
+    second, or without such a reply for ANSWERS_S, every report that has arrived since counts.
     """
     result = flight.vehicle.results.get(request.command)
     requested_s, host_s = flight.requested_s.get(request, NEVER)
     waits = flight.now_s - requested_s < REPEAT_S - 1e-6 or flight.authority.heard_s < requested_s
-    # TIMESYNC is requested at each tick: not without telemetry
-    ticks = flight.vehicle.has_state and flight.silence_s < REPEAT_S
-    answers = ticks and flight.clock.unanswered_s(flight.host_s) < ANSWERS_S
-    waits = waits or (answers and flight.reported_s < host_s)
+    # A TIMESYNC request leaves at each tick, and without telemetry there is none
+    has_ticks = flight.vehicle.has_state and flight.silence_s < REPEAT_S
+    is_answered = has_ticks and flight.clock.unanswered_s(flight.host_s) < ANSWERS_S
+    waits = waits or (is_answered and flight.reported_s < host_s)
     done = math.isfinite(requested_s) and result in GOOD_RESULTS
     if waits or done or not flight.authority.permits_command(flight.now_s):
         return False
@@ -236,7 +236,7 @@ def request(flight: FlightState, request: CommandLong) -> bool:
 
 
 def send_request(flight: FlightState, request: CommandLong) -> None:
-    """Send it, and note when."""
+    """Send a request, and note when: in link time and in host time, s."""
     flight.requested_s[request] = flight.now_s, flight.host_s
     send(flight, request)
 

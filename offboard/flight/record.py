@@ -116,7 +116,8 @@ class Decided:
 
 
 def identified_record(time_s: float, found: Mapping[str, Estimate | None]) -> SolverRecord:
-    """The record of what was identified; NaN for what was not."""
+    """DEBUG_FLOAT_ARRAY with value and standard deviation of each constant of IDENTIFIED, in the
+    units of their names; NaN for what was not identified. `time_s`: vehicle time."""
     numbers: list[float] = []
     for each in map(found.__getitem__, IDENTIFIED):
         numbers += (each.value, each.sd) if each else (math.nan, math.nan)

@@ -134,7 +134,7 @@ class FlightState(Ground):
     told: set[str] = field(default_factory=set)  # of those that are announced once in a flight
     queue: list[Outgoing] = field(default_factory=list)  # to be sent
     records: list[Record] = field(default_factory=list)  # to be logged
-    # requests of this phase: when they were sent, also in host time
+    # requests of this phase: link time (`now_s`) and host time at which each was sent
     requested_s: dict[CommandLong, tuple[float, float]] = field(default_factory=dict)
     text_id: int = 0
     awaits_link: bool = False  # while landing

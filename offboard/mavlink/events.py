@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 Triple = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]  # w, x, y, z; FRD -> NED
-BOOTS = 1  # MAV_STATE: ArduCopter starts
+BOOTS = 1  # MAV_STATE_BOOT: an ArduCopter that starts sends it
 CRITICAL = 5  # MAV_STATE: a failsafe; 6 is an emergency
 WARNING = 4  # MAV_SEVERITY; more severe is a lower number
 # longest age of a report of the mode that allows a setpoint or a command; HEARTBEAT comes at 1 Hz

@@ -115,8 +115,8 @@ class DelayUncertainty:
     """What is not known of a vehicle's delays, s.
 
     `tilt_s` and `thrust_s`: by how much the true delay may differ, of an identified one three
-    standard deviations. `link_s`: what the link adds to all delays since
-    take-off, which is known and compensated by prediction.
+    standard deviations. `link_s`: what the link adds to all delays since take-off, which is known
+    and compensated by prediction.
     """
 
     tilt_s: float = 0.0
