@@ -127,7 +127,9 @@ def _check(path: Path) -> NoReturn:
 
 
 def _list_scenarios() -> NoReturn:
-    for name, text in shipped.descriptions("scenario").items():
+    from offboard.documents.reading import descriptions
+
+    for name, text in descriptions("scenario").items():
         tell(f"{name:16}  {text}", sys.stdout)
     raise typer.Exit(0)
 

@@ -75,9 +75,10 @@ def _checked(path: Path) -> str:
 def list_files() -> None:
     """List the shipped files by name, with one line each."""
     from offboard.control import catalogue
+    from offboard.documents.reading import descriptions
 
     for number, kind in enumerate(shipped.KINDS):
-        described = shipped.descriptions(kind)
+        described = descriptions(kind)
         if kind == "controller":
             for law in catalogue.names():
                 described.setdefault(law, "law of an installed package")

@@ -20,7 +20,7 @@ from pydantic import BaseModel, ValidationError
 from yaml.representer import SafeRepresenter
 
 from offboard.documents.errors import DocumentError, abridged, counted, meant, shown
-from offboard.documents.shipped import KINDS, locate, read_text
+from offboard.documents.shipped import KINDS, folder, locate, read_text
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -48,6 +48,12 @@ class Section(dict[str, Any]):
 
 
 yaml.add_representer(Section, SafeRepresenter.represent_dict, Dumper=yaml.SafeDumper)
+
+
+def descriptions(kind: str) -> dict[str, str]:
+    """Name -> description of the shipped files of one kind."""
+    paths = sorted(folder(kind).glob("*.yaml"))
+    return {path.stem: read(read_text(path), str(path)).description for path in paths}
 
 
 def load_document(name: str, kind: str, model: type[M]) -> tuple[M, str]:

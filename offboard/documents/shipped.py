@@ -1,4 +1,4 @@
-"""Files of the shipped configuration: where they are, their names and descriptions.
+"""Files of the shipped configuration: where they are, and their names.
 
 In an installed package `config/` lies inside the package, in a checkout beside it.
 """
@@ -46,14 +46,6 @@ def folder(kind: str) -> Path:
 def names(kind: str) -> list[str]:
     """The names of the files of one kind, sorted."""
     return sorted(path.stem for path in folder(kind).glob("*.yaml"))
-
-
-def descriptions(kind: str) -> dict[str, str]:
-    """Name -> description of the files of one kind."""
-    from offboard.documents.reading import read  # late: --help needs no YAML
-
-    paths = sorted(folder(kind).glob("*.yaml"))
-    return {path.stem: read(read_text(path), str(path)).description for path in paths}
 
 
 def overview(*kinds: str) -> str:

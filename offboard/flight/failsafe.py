@@ -1,7 +1,4 @@
-"""Failsafe: what follows when a limit is exceeded in flight. One row for each condition.
-
-The first conditions below are used by the phase table too.
-"""
+"""Failsafe: what follows when a limit is exceeded in flight. One row for each condition."""
 
 from __future__ import annotations
 
@@ -12,92 +9,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from offboard.flight.authority import Standing
+from offboard.flight.conditions import Condition, blind, mode_unknown, silent
 from offboard.flight.ground_contact import STOOD_S
-from offboard.flight.phases import TRACKING, Action, Condition, Limits, Phase
+from offboard.flight.phases import TRACKING, Action, Limits, Phase
 from offboard.flight.preflight import other_sender
 from offboard.flight.state import COMMANDS_KEPT, FlightState
 from offboard.flight.timing import JUMP_S
 from offboard.mavlink.events import MODE_KNOWN_S, ThrustReport
 
-OPERATOR = "{flight.stop_cause}"  # the cause of a row for `stop_requested`
-REBOOTED = "the vehicle restarted"
 RECOVERY = 0.25  # seconds by which a held time decreases in one without the condition
 STEP_MAX_S = 0.2  # what one sample counts for, also after a gap of telemetry
 SINK_MPS = 0.3  # that full thrust stops within the delay, on a vehicle that can be flown
 FULL_THRUST = 0.99
 STANDS_BELOW_M = 0.25  # references are at least 0.5 m above the take-off point
 THRUST_REPORT_S = 1.0  # age of a ThrustReport that counts
-
-
-# ---------------------------------------------------------------------- what is heard
-
-
-def silent(flight: FlightState) -> str:
-    """Time since the newest position or attitude arrived, by the clock of this computer."""
-    return silent_for(flight, flight.limits.silence_s)
-
-
-def silent_for(flight: FlightState, limit_s: float) -> str:
-    return f"no telemetry for {flight.silence_s:.1f} s" if flight.silence_s > limit_s else ""
-
-
-def blind(flight: FlightState) -> str:
-    """Age of the older of position and attitude, by vehicle time."""
-    vehicle = flight.vehicle
-    age_s, name = max(
-        (vehicle.position_age_s, "LOCAL_POSITION_NED"),
-        (vehicle.attitude_age_s, "ATTITUDE_QUATERNION"),
-        key=lambda each: each[0],
-    )
-    return f"no new {name} for {age_s:.1f} s" if age_s > flight.limits.blind_s else ""
-
-
-def mode_unknown(flight: FlightState) -> str:
-    if flight.authority.heard(flight.now_s):
-        return ""
-    return f"no report of the mode for {flight.now_s - flight.authority.heard_s:.1f} s"
-
-
-# ---------------------------------------------------------------------- who has the vehicle
-
-
-def rebooted(flight: FlightState) -> str:
-    return REBOOTED if flight.rebooted else ""
-
-
-def authority_lost(flight: FlightState) -> str:
-    """Another has taken control of the vehicle."""
-    if flight.authority.standing is not Standing.LOST:
-        return ""
-    return flight.authority.lost_reason or Standing.LOST.value
-
-
-def authority_lost_armed(flight: FlightState) -> str:
-    """A pilot has changed the mode of a vehicle that stays armed."""
-    return authority_lost(flight) if flight.shown_since_lost and flight.vehicle.armed else ""
-
-
-def in_own_failsafe(flight: FlightState) -> str:
-    """Setpoints were missing, and the autopilot's failsafe flies the vehicle."""
-    if flight.authority.standing is not Standing.FAILSAFE:
-        return ""
-    mode = flight.vehicle.mode
-    return f"setpoints did not arrive, and the vehicle's own failsafe flies it, in {mode}"
-
-
-def stop_requested(flight: FlightState) -> str:
-    return flight.stop_reason
-
-
-def longer_than(limit: str) -> Condition:
-    """Holds once the phase has lasted longer than the limit of this name."""
-
-    def too_long(flight: FlightState) -> bool:
-        return flight.in_phase_s > float(getattr(flight.limits, limit))
-
-    too_long.__name__ = f"longer_than_{limit}"
-    return too_long
 
 
 # ---------------------------------------------------------------------- conditions of the failsafe
@@ -294,7 +219,7 @@ def contradicted(flight: FlightState) -> str:
 @dataclass(frozen=True, slots=True)
 class Row:
     """`action` is taken when `condition` has held for `held_s`. `cause` and `reason` are as in
-    `phases.Transition`. `limit`: the settings that have it, or its value. The first line of the
+    `conditions.Transition`. `limit`: the settings that have it, or its value. The first line of the
     condition's docstring says in the documentation what is measured."""
 
     name: str

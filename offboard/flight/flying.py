@@ -6,9 +6,11 @@ import numpy as np
 
 from offboard.control.base import Adaptive
 from offboard.flight.authority import Standing
-from offboard.flight.failsafe import (
+from offboard.flight.conditions import (
     OPERATOR,
     REBOOTED,
+    Condition,
+    Transition,
     authority_lost,
     authority_lost_armed,
     in_own_failsafe,
@@ -26,11 +28,9 @@ from offboard.flight.phases import (
     SERVICE_ONLY,
     TRACKING,
     Action,
-    Condition,
     ExitCode,
     Phase,
     Request,
-    Transition,
 )
 from offboard.flight.state import FlightState
 from offboard.flight.vehicle_state import ARMED_KNOWN_S, DISARMED_S

@@ -1,19 +1,15 @@
-"""Phases of a flight and what a row of the phase table is, actions of the failsafe, exit codes and
-outcome, limits, and options of the service."""
+"""Phases of a flight, actions of the failsafe, exit codes and outcome, limits, and options of the
+service."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Set
 from dataclasses import dataclass
 from enum import Enum, IntEnum
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
 from offboard.documents.parameters import Parameters
-
-if TYPE_CHECKING:
-    from offboard.flight.state import FlightState
 
 
 class Phase(Enum):
@@ -103,35 +99,6 @@ class Outcome:
     exit_code: int
     sentence: str
     log_problem: str = ""
-
-
-# A function of the flight that changes nothing: false (or an empty text) while it does not hold; a
-# text says why it holds
-Condition = Callable[["FlightState"], str | bool]
-
-
-@dataclass(frozen=True, slots=True)
-class Transition:
-    """A row of the phase table: from each of `phases`, when `condition` holds, to `target`.
-
-    `exit_code` is set if this row decides the result; a later row can only make it more severe.
-    `cause` is a word for what ended a flight that the row ends (see `analysis.verdict`). `reason`
-    is the sentence, or a function that says it, where the condition does not. Texts may have values
-    of the flight in braces.
-    """
-
-    phases: Set[Phase]
-    condition: Condition
-    target: Phase
-    exit_code: int | None = None
-    cause: str = ""
-    reason: str | Callable[[FlightState], str] = ""
-
-    def why(self, flight: FlightState) -> str:
-        """The sentence that says why the row is taken, while its condition holds."""
-        if callable(self.reason):
-            return self.reason(flight)
-        return self.reason.format(flight=flight) or str(self.condition(flight))
 
 
 Anchor = Literal["here", "origin"]

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from offboard.flight import preflight
 from offboard.flight.authority import PilotSwitch
-from offboard.flight.failsafe import (
+from offboard.flight.conditions import (
     OPERATOR,
+    Transition,
     authority_lost,
     authority_lost_armed,
     blind,
@@ -17,7 +18,7 @@ from offboard.flight.failsafe import (
     silent_for,
     stop_requested,
 )
-from offboard.flight.phases import ExitCode, Phase, Request, Transition
+from offboard.flight.phases import ExitCode, Phase, Request
 from offboard.flight.preflight import armed_already, other_sender, other_vehicle, unfit_type
 from offboard.flight.state import FlightState
 from offboard.flight.vehicle_state import ARMED_KNOWN_S, DISARMED_S

@@ -11,7 +11,7 @@ from functools import cache
 import numpy as np
 
 from offboard.flight import decision, failsafe, flying, outbox, starting
-from offboard.flight.failsafe import REBOOTED, in_own_failsafe
+from offboard.flight.conditions import REBOOTED, Transition, in_own_failsafe
 from offboard.flight.ground_contact import Touchdown
 from offboard.flight.phases import (
     BEFORE_FLIGHT,
@@ -22,7 +22,6 @@ from offboard.flight.phases import (
     Phase,
     Request,
     ServiceOptions,
-    Transition,
 )
 from offboard.flight.preflight import ParameterReading
 from offboard.flight.state import FlightState

@@ -9,8 +9,9 @@ import re
 from pathlib import Path
 
 from offboard.flight import flying
+from offboard.flight.conditions import Transition
 from offboard.flight.failsafe import ROWS
-from offboard.flight.phases import ENDS, FLYING, Limits, Phase, ServiceOptions, Transition
+from offboard.flight.phases import ENDS, FLYING, Limits, Phase, ServiceOptions
 from offboard.flight.transitions import table
 
 README = Path(__file__).parents[2] / "offboard" / "flight" / "README.md"

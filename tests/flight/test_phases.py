@@ -14,6 +14,7 @@ from uneventful import NOW_S, TRACK, hear, heartbeat, lift, position, uneventful
 
 from offboard.flight import flying, preflight, starting, telemetry
 from offboard.flight.authority import PilotSwitch, Standing
+from offboard.flight.conditions import Transition
 from offboard.flight.phases import (
     ENDS,
     FLYING,
@@ -25,7 +26,6 @@ from offboard.flight.phases import (
     Phase,
     Request,
     ServiceOptions,
-    Transition,
 )
 from offboard.flight.state import FlightState
 from offboard.flight.transitions import next_row, table

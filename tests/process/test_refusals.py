@@ -18,8 +18,8 @@ from processes import CONFIG, RECORDING, Called
 from typer.testing import CliRunner
 
 from offboard.cli.commands import app as offboard
-from offboard.documents import shipped as documents
 from offboard.documents.errors import UserError
+from offboard.documents.reading import descriptions
 from offboard.run import flight as run
 from simulator.command import app as simulator
 
@@ -378,6 +378,6 @@ def test_every_shipped_file_is_listed_with_what_it_is(called: Called) -> None:
     code, output, errors = called("simulator --list-scenarios")
     assert (code, errors) == (0, "")
     scenarios = dict(re.split(r"\s+", line, maxsplit=1) for line in output.splitlines())
-    assert scenarios == documents.descriptions("scenario")
+    assert scenarios == descriptions("scenario")
     code, output, _ = called("offboard doctor --list gps")
     assert (code, output.startswith("gps  GPS fix.")) == (0, True)

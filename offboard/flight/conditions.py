@@ -1,0 +1,110 @@
+"""What a row of the phase table is, and the conditions that several tables share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Set
+from dataclasses import dataclass
+
+from offboard.flight.authority import Standing
+from offboard.flight.phases import Phase
+from offboard.flight.state import FlightState
+
+OPERATOR = "{flight.stop_cause}"  # the cause of a row for `stop_requested`
+REBOOTED = "the vehicle restarted"
+# A function of the flight that changes nothing: false (or an empty text) while it does not hold; a
+# text says why it holds
+Condition = Callable[[FlightState], str | bool]
+
+
+@dataclass(frozen=True, slots=True)
+class Transition:
+    """A row of the phase table: from each of `phases`, when `condition` holds, to `target`.
+
+    `exit_code` is set if this row decides the result; a later row can only make it more severe.
+    `cause` is a word for what ended a flight that the row ends (see `analysis.verdict`). `reason`
+    is the sentence, or a function that says it, where the condition does not. Texts may have values
+    of the flight in braces.
+    """
+
+    phases: Set[Phase]
+    condition: Condition
+    target: Phase
+    exit_code: int | None = None
+    cause: str = ""
+    reason: str | Callable[[FlightState], str] = ""
+
+    def why(self, flight: FlightState) -> str:
+        """The sentence that says why the row is taken, while its condition holds."""
+        if callable(self.reason):
+            return self.reason(flight)
+        return self.reason.format(flight=flight) or str(self.condition(flight))
+
+
+# ---------------------------------------------------------------------- what is heard
+
+
+def silent(flight: FlightState) -> str:
+    """Time since the newest position or attitude arrived, by the clock of this computer."""
+    return silent_for(flight, flight.limits.silence_s)
+
+
+def silent_for(flight: FlightState, limit_s: float) -> str:
+    return f"no telemetry for {flight.silence_s:.1f} s" if flight.silence_s > limit_s else ""
+
+
+def blind(flight: FlightState) -> str:
+    """Age of the older of position and attitude, by vehicle time."""
+    vehicle = flight.vehicle
+    age_s, name = max(
+        (vehicle.position_age_s, "LOCAL_POSITION_NED"),
+        (vehicle.attitude_age_s, "ATTITUDE_QUATERNION"),
+        key=lambda each: each[0],
+    )
+    return f"no new {name} for {age_s:.1f} s" if age_s > flight.limits.blind_s else ""
+
+
+def mode_unknown(flight: FlightState) -> str:
+    if flight.authority.heard(flight.now_s):
+        return ""
+    return f"no report of the mode for {flight.now_s - flight.authority.heard_s:.1f} s"
+
+
+# ---------------------------------------------------------------------- who has the vehicle
+
+
+def rebooted(flight: FlightState) -> str:
+    return REBOOTED if flight.rebooted else ""
+
+
+def authority_lost(flight: FlightState) -> str:
+    """Another has taken control of the vehicle."""
+    if flight.authority.standing is not Standing.LOST:
+        return ""
+    return flight.authority.lost_reason or Standing.LOST.value
+
+
+def authority_lost_armed(flight: FlightState) -> str:
+    """A pilot has changed the mode of a vehicle that stays armed."""
+    return authority_lost(flight) if flight.shown_since_lost and flight.vehicle.armed else ""
+
+
+def in_own_failsafe(flight: FlightState) -> str:
+    """Setpoints were missing, and the autopilot's failsafe flies the vehicle."""
+    if flight.authority.standing is not Standing.FAILSAFE:
+        return ""
+    mode = flight.vehicle.mode
+    return f"setpoints did not arrive, and the vehicle's own failsafe flies it, in {mode}"
+
+
+def stop_requested(flight: FlightState) -> str:
+    return flight.stop_reason
+
+
+def longer_than(limit: str) -> Condition:
+    """Holds once the phase has lasted longer than the limit of this name."""
+
+    def too_long(flight: FlightState) -> bool:
+        return flight.in_phase_s > float(getattr(flight.limits, limit))
+
+    too_long.__name__ = f"longer_than_{limit}"
+    return too_long
