@@ -101,7 +101,7 @@ def _ended_early(flown: History) -> tuple[str, str]:
     they were all gone through."""
     names = [event.phase for event in flown.phases]
     for event in irregular(flown.phases):
-        taken = event.cause == "pilot" and _critical(flown)
+        taken = event.cause == "mode change" and _critical(flown)
         return "failsafe" if taken else event.cause or event.reason, event.reason
     took_over = [event.what for event in flown.announcements if event.cause == SUPERVISOR]
     if took_over:

@@ -35,7 +35,7 @@ def asked(row: Transition, source: Phase) -> str:
     nothing, and without a reason."""
     if row.target in _ASKED:
         return _ASKED[row.target]
-    if row.cause == "pilot":
+    if row.cause == "mode change":
         return "nothing: a pilot or a failsafe has it"
     if row.condition in _DISARMED:
         return "nothing: it is disarmed"

@@ -238,9 +238,9 @@ ROWS = {
         limits={"begin_in_failsafe": True}, at=then(Phase.CLIMB, 1.0, stop),
     ),
     # whose it is
-    "a pilot just after engaging": taken(px4, "pilot_refuses", ended_by="pilot"),
+    "a pilot just after engaging": taken(px4, "pilot_refuses", ended_by="mode change"),
     "a pilot in track, who is back after 0.6 s, too late": taken(
-        copter, early("pilot_comes_back"), ended_by="pilot"
+        copter, early("pilot_comes_back"), ended_by="mode change"
     ),
     "a pilot whom CURRENT_MODE shows": taken(px4, early("lost_heartbeat")),
     # the HEARTBEAT that shows a failsafe comes after CURRENT_MODE

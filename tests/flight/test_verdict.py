@@ -274,8 +274,8 @@ def test_the_outcome_follows_the_log(flown: History) -> None:
     sentence = "flown and landed, but not completed: fell at up to 5.1 m/s"
     assert judged(landed, fallen) == Outcome(4, sentence)
     assert judged(refused, fallen) == refused
-    ended = replace(fallen, ended_by="pilot", reason="the vehicle left OFFBOARD")
-    assert verdict(ended) == "not completed (pilot): the vehicle left OFFBOARD"
+    ended = replace(fallen, ended_by="mode change", reason="the vehicle left OFFBOARD")
+    assert verdict(ended) == "not completed (mode change): the vehicle left OFFBOARD"
 
 
 def test_a_record_says_what_was_sent(px4_like: Pair) -> None:
