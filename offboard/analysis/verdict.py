@@ -1,8 +1,8 @@
 """The verdict on a flight, from its log alone: was all of it flown, and what ended it.
 
-A flight is completed if the whole reference was tracked, nothing else ended it, the vehicle landed,
-and it was disarmed; one that the pilot engaged in the air also if the vehicle was given back while
-it hovered at the end of the reference.
+A flight is completed if the whole reference was tracked and the vehicle stayed above the ground
+meanwhile, nothing else ended it, the vehicle landed, and it was disarmed; one that the pilot
+engaged in the air also if it was given back while it hovered at the end of the reference.
 """
 
 from __future__ import annotations
@@ -28,19 +28,24 @@ Array = NDArray[np.float64]
 REFERENCE_OVER = "reference over"
 NO_FLIGHT = "no flight of offboard in this log"
 _ON_GROUND = 1  # MAV_LANDED_STATE
+_LOWEST_M = 0.1  # above the take-off point; references are at least 0.5 m above it
 _LANDING_ENDS = {"disarmed", "failed", "yielded"}
 
 
 def landing(flown: History) -> tuple[str, float]:
-    """Why the vehicle has not landed, empty if it has; and the downward speed at touch-down."""
+    """Why the vehicle has not landed, or that it was at the ground before that while it tracked,
+    empty for neither; and the downward speed at touch-down."""
     begun = begin_times(flown.phases)
-    takes_off_s, lands_s = (begun.get(phase, math.inf) for phase in ("takeoff", "land"))
-    jumps, takeoff, touchdown = PositionJumps(), None, None
+    phases = "takeoff", "track", "land"
+    takes_off_s, tracks_s, lands_s = (begun.get(phase, math.inf) for phase in phases)
+    jumps, takeoff, touchdown, lowest_m = PositionJumps(), None, None, math.inf
     for position in _positions(flown):
         jumps.on_position(position)
         place = jumps.without(position.position_ned_m)
         if position.time_s <= takes_off_s:
             takeoff = place
+        elif takeoff and tracks_s <= position.time_s <= lands_s:
+            lowest_m = min(lowest_m, takeoff[2] - place[2])
         if position.time_s <= lands_s:
             continue
         if touchdown is None:
@@ -48,6 +53,8 @@ def landing(flown: History) -> tuple[str, float]:
         touchdown.on_position(position.time_s, place, position.velocity_ned_mps[2])
     if touchdown is None:
         return "not landed", math.nan
+    if lowest_m < _LOWEST_M:
+        return f"{lowest_m:.1f} m above the take-off point while tracking", touchdown.speed_mps
     since = flown.landed[flown.landed["time_s"] >= begun["land"]]
     on_ground = bool(len(since)) and bool(since["state"][-1] == _ON_GROUND)
     return touchdown.not_landed(on_ground=on_ground), touchdown.speed_mps

@@ -140,6 +140,18 @@ def test_a_flight_is_not_completed_that_is_not_tracked_landed_and_disarmed(flown
         assert (scored.completed, scored.ended_by.startswith(why)) == (0.0, True), scored.ended_by
 
 
+def test_a_flight_that_was_at_the_ground_in_between_is_not_completed() -> None:
+    """Without thrust for 0.9 s it falls 3 m, bounces, and flies on: no row of the failsafe acts in
+    so short a time, and it was "flown and landed"."""
+    for cut_s, why in ((0.6, "reference over"), (0.9, "0.0 m above the take-off point while")):
+        fault = {"fault": "motors_cut", "after": "engaged", "at_s": 10.0, "for_s": cut_s}
+        pair = hover("reference.height_m=3", "reference.duration_s=8", scenario=scenario_of(fault))
+        assert pair.fly() == Outcome(0, "flown and landed")
+        scored = pair.score()
+        assert scored.ended_by.startswith(why), scored.ended_by
+        assert scored.completed == float(cut_s == 0.6)
+
+
 def test_a_restart_before_the_flight_is_none_of_it() -> None:
     """What it had reported before, in the air, has stamps that come again in the flight: both were
     mixed, and by its score a flight was 3.3 m above the take-off point in the end."""
