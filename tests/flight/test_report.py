@@ -92,7 +92,7 @@ def test_the_page_is_readable_in_both_schemes_and_widths(opened: Opened) -> None
     assert len(opened.page.content().encode()) < MOST_BYTES
     shown = opened.page.inner_text("main").splitlines()
     assert shown[0] == "Flight a <b>"
-    assert "✗ not completed (pilot): the vehicle left OFFBOARD for AUTO.LOITER" in shown[1:4]
+    assert "✗ not completed (mode change): the vehicle left OFFBOARD for AUTO.LOITER" in shown[1:4]
 
 
 def test_the_curves_are_those_of_the_score(opened: Opened, flown: Flown) -> None:
