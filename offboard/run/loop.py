@@ -149,8 +149,7 @@ class Loop:
             self._companion.current.on_dropped(len(dropped))
         if peer is not None:
             self._link.follow(peer)
-            supervised = self._companion.current.supervised
-            if self._supervisor and supervised:
+            if self._supervisor and (supervised := self._companion.current.supervised):
                 self._supervisor.beat(supervised, peer, self._link, self._log.descriptor)
         return dropped
 
