@@ -54,12 +54,13 @@ class IdentifiedVehicle:
     """What a flight has identified, for the next one of the same vehicle. The delays of `vehicle`
     contain the link's delay of then, `link_s` (telemetry and setpoint together; 0 if it was not
     measured). `delay` is the delay of the tilt and its standard deviation, s; `thrust` delay and
-    lag of the thrust together, None where no fit was adopted."""
+    lag of the thrust together, s, and `drag` 1/s, None where no fit was adopted."""
 
     vehicle: Vehicle
     delay: Estimate
     link_s: float
     thrust: Estimate | None = None
+    drag: Estimate | None = None
 
 
 class VehicleEstimate:
@@ -90,13 +91,14 @@ class VehicleEstimate:
         self._recalled = known
         self._unknown_s = delay_error_s
         self._thrust = known.thrust if known else None  # delay and lag, once identified
+        self._drag = known.drag if known else None
         self._link_s = known.link_s if known else 0.0  # the link's, which `vehicle` contains
         self._link = (0.0, 0.0)  # added since take-off, and changed lately
         self._doubt_s = 0.0  # what the delay may be wrong by because telemetry contradicts it
         self._contradictions = 0
         self._calm_from_s = -math.inf  # the time of the last
         self._other_delay: Estimate | None = None  # seen once, contradicts the one in use
-        self._other_thrust = False  # seen once, differs from the one in use
+        self._differed: set[str] = set()  # constants whose newest fit differs from the one in use
         self._replaced: dict[str, Any] = {}  # tilt constants before the last adoption
         self._rejected_drag_ps = math.inf
 
@@ -131,7 +133,7 @@ class VehicleEstimate:
         """What the next flight may begin with; None if nothing was identified, or in doubt."""
         if self.delay is None or self.contradicted:
             return None
-        return IdentifiedVehicle(self.vehicle, self.delay, self._link_s, self._thrust)
+        return IdentifiedVehicle(self.vehicle, self.delay, self._link_s, self._thrust, self._drag)
 
     @property
     def previous(self) -> Vehicle:
@@ -214,6 +216,7 @@ class VehicleEstimate:
         if vehicle != self.vehicle:
             self.vehicle, self.adopted_s = vehicle, time_s
             sentences.insert(0, summary(within))
+        self._drag = within.drag_ps or self._drag
         if within.drag_ps is None and found.drag_ps is not None:
             self._rejected_drag_ps = found.drag_ps.value
         self.sentences += sentences
@@ -221,11 +224,29 @@ class VehicleEstimate:
 
     def review_drag(self, found: Identified, least_ps: float, time_s: float) -> None:
         """Adopt a drag that differs, by its sd and by `least_ps`, from the one in use and from the
-        one that was out of bounds."""
-        known = (self.vehicle.drag_per_mass_ps, self._rejected_drag_ps)
-        drag = found.drag_ps
-        if drag and all(abs(drag.value - each) > max(least_ps, drag.sd) for each in known):
+        one that was out of bounds: one that is more certain than that in use, or the second in a
+        row that contradicts it."""
+        new, known, used_ps = found.drag_ps, self._drag, self.vehicle.drag_per_mass_ps
+        if new is None:
+            return
+        better = known is None or new.sd < known.sd
+        contradicts = known is not None and abs(new.value - used_ps) > SDS * math.hypot(
+            new.sd, known.sd
+        )
+        again = self._again("drag", contradicts and not better)
+        others_ps = used_ps, self._rejected_drag_ps
+        is_news = all(abs(new.value - each) > max(least_ps, new.sd) for each in others_ps)
+        if is_news and (better or again):
             self.adopt(found, time_s)
+
+    def _again(self, constant: str, differs: bool) -> bool:
+        """Whether this fit of a constant `differs` from the one in use, and the one before did."""
+        again = differs and constant in self._differed
+        if differs and not again:
+            self._differed.add(constant)
+        else:
+            self._differed.discard(constant)
+        return again
 
     @property
     def added(self) -> Estimate:
@@ -240,15 +261,13 @@ class VehicleEstimate:
         new, known = found.thrust_effect_s, self._thrust
         if new is None or self.within_bounds(found)[1]:
             return
-        differs, seen_before = False, self._other_thrust
+        better = known is None or new.sd < BETTER * known.sd
+        differs = False
         if known is not None:
             used_s = self.vehicle.thrust_delay_s + self.vehicle.thrust_lag_s
             allowed_s = max(LEAST_JUMP_S, SDS * math.hypot(new.sd, known.sd))
             differs = abs(new.value - used_s) > allowed_s
-        better = known is None or new.sd < BETTER * known.sd
-        self._other_thrust = differs and not better
-        if better or (differs and seen_before):
-            self._other_thrust = False
+        if self._again("thrust", differs and not better) or better:
             self.adopt(found, time_s)
             if self.delay:
                 self.explain()
