@@ -42,6 +42,7 @@ MOST_CONTRADICTIONS, CALM_S = 2, 20.0
 # A new tilt fit replaces the old one if its delay's sd, or in doubt the tilt that it leaves
 # unexplained, is less than this share of the old one's
 BETTER = 0.7
+VAGUE = 2.0  # an sd is itself known to within this factor
 LINK_CHANGE_S = 0.1  # a link that changed by more explains a tilt that is not as predicted
 LEAST_JUMP_S, JUMP_SDS = 0.015, 4.0  # delays that differ by more contradict each other
 FACTOR = 4.0  # greatest ratio, either way, of an identified constant to the vehicle file's
@@ -224,19 +225,19 @@ class VehicleEstimate:
 
     def review_drag(self, found: Identified, least_ps: float, time_s: float) -> None:
         """Adopt a drag that differs, by its sd and by `least_ps`, from the one in use and from the
-        one that was out of bounds: one that is more certain than that in use, or the second in a
-        row that contradicts it."""
+        one that was out of bounds, unless it is clearly less certain than that in use: then the
+        second in a row that contradicts it."""
         new, known, used_ps = found.drag_ps, self._drag, self.vehicle.drag_per_mass_ps
         if new is None:
             return
-        better = known is None or new.sd < known.sd
-        contradicts = known is not None and abs(new.value - used_ps) > SDS * math.hypot(
-            new.sd, known.sd
-        )
-        again = self._again("drag", contradicts and not better)
+        vague = contradicts = False
+        if known is not None:
+            vague = new.sd > VAGUE * known.sd
+            contradicts = abs(new.value - used_ps) > SDS * math.hypot(new.sd, known.sd)
+        again = self._again("drag", contradicts and vague)
         others_ps = used_ps, self._rejected_drag_ps
         is_news = all(abs(new.value - each) > max(least_ps, new.sd) for each in others_ps)
-        if is_news and (better or again):
+        if is_news and (again or not vague):
             self.adopt(found, time_s)
 
     def _again(self, constant: str, differs: bool) -> bool:
