@@ -235,7 +235,8 @@ def _no_telemetry(ground: Ground) -> str:
         missing.append("HEARTBEAT")
     if not missing:
         return ""
-    problem = vehicle.estimator.problem if vehicle.estimator else ""
+    silent = "HEARTBEAT" in missing  # then what it has reported before explains nothing
+    problem = vehicle.estimator.problem if vehicle.estimator and not silent else ""
     why = (problem and f": {problem}") + vehicle.explanation(dialect.unsaid if dialect else "")
     return f"no {' and no '.join(missing)} arrives{why}"
 

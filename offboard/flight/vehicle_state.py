@@ -16,7 +16,7 @@ from offboard.flight.phases import CONTROLLING
 from offboard.mavlink.events import (
     CRITICAL,
     GOOD_RESULTS,
-    WARNING,
+    NOTICE,
     Attitude,
     CommandAck,
     EstimatorReport,
@@ -197,7 +197,7 @@ class VehicleState:
                 self.uid, self.version = uid, version
             case Parameter(name, value):
                 self.parameters[name] = value
-            case StatusText(severity, text) if severity <= WARNING:
+            case StatusText(severity, text) if severity <= NOTICE:  # of a fence, ArduCopter
                 self.texts.append(text)
             case CommandAck(command, result) if command not in MESSAGE_COMMANDS:
                 self.results[command], self.answered_s[command] = result, now_s

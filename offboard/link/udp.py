@@ -92,6 +92,9 @@ class UdpLink(Link):
         self._vehicle = _Inbox(vehicle) if vehicle else None
         self._peer: Hashable = vehicle.getpeername() if vehicle else None
         self._heard_s = clock.monotonic_s()  # when we last found a datagram of the vehicle
+        # addresses on its host: those that were heard before it, and those heard since it was
+        self._beside: set[Hashable] = set()
+        self._newer: set[Hashable] = set()
         self._look_s = 0.0  # when other senders are read next
 
     # --- in ---
@@ -113,7 +116,8 @@ class UdpLink(Link):
     def _look(self, listening: _Inbox, heard: bool) -> list[Chunk]:
         """What other senders sent: nearly all is only counted. Returned is what the vehicle sent
         before its socket was connected or to a broadcast address, and after a silence that we
-        observed ourselves (not one of our own pauses) what may come from its new port."""
+        observed ourselves (not one of our own pauses) what may come from its new port. A port that
+        has sent beside the vehicle's is another's, though it may have the same system id."""
         now_s = clock.monotonic_s()
         found = listening.drain(LOOK_MAX) if now_s >= self._look_s else []
         ours = [chunk for chunk in found if chunk.peer == self._peer]
@@ -121,11 +125,16 @@ class UdpLink(Link):
         silent = now_s - self._heard_s > PEER_SILENT_S
         if others:
             self._look_s = now_s + LOOK_EVERY_S
+        near = {chunk.peer for chunk in others if same_host(chunk.peer, self._peer)}
         if heard or ours:
             self._heard_s = now_s
+            self._beside |= self._newer
+            self._newer.clear()
         elif silent:
-            ours = [chunk for chunk in others if same_host(chunk.peer, self._peer)]
-            others = [chunk for chunk in others if not same_host(chunk.peer, self._peer)]
+            near -= self._beside
+            ours = [chunk for chunk in others if chunk.peer in near]
+            others = [chunk for chunk in others if chunk.peer not in near]
+        self._newer |= near
         for sender, number in Counter(chunk.peer for chunk in others).items():
             self.report.count(sender, number)
         if others:

@@ -117,11 +117,14 @@ def _gps_fix(message: Any, _: Dialect) -> events.Event:
 
 def _system_health(message: Any, _: Dialect) -> events.Event:
     health, percent = message.onboard_control_sensors_health, message.battery_remaining
-    failed = message.onboard_control_sensors_enabled & ~health & ~_PREARM_CHECK
+    present = message.onboard_control_sensors_present
+    enabled = message.onboard_control_sensors_enabled
+    failed = enabled & ~health & ~_PREARM_CHECK
     return events.SystemHealth(
-        prearm_ok=bool(health & _PREARM_CHECK),
+        # ArduPilot with ARMING_CHECK 0 has the check, and does not enable it
+        prearm_ok=bool((health | present & ~enabled) & _PREARM_CHECK),
         battery_remaining=percent * 1e-2 if 0 <= percent <= 100 else None,
-        radio_ok=bool(message.onboard_control_sensors_present & health & _RADIO),
+        radio_ok=bool(present & health & _RADIO),
         unhealthy=tuple(name for bit, name in _SENSORS.items() if failed & bit),
     )
 

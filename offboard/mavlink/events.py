@@ -13,7 +13,7 @@ Triple = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]  # w, x, y, z; FRD -> NED
 BOOTS = 1  # MAV_STATE_BOOT: an ArduCopter that starts sends it
 CRITICAL = 5  # MAV_STATE: a failsafe; 6 is an emergency
-WARNING = 4  # MAV_SEVERITY; more severe is a lower number
+WARNING, NOTICE = 4, 5  # MAV_SEVERITY; more severe is a lower number
 # longest age of a report of the mode that allows a setpoint or a command; HEARTBEAT comes at 1 Hz
 MODE_KNOWN_S = 2.5
 GOOD_RESULTS = ("ACCEPTED", "IN_PROGRESS")  # MAV_RESULT

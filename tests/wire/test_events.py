@@ -53,8 +53,8 @@ FIX = {"time_usec": 0, "lat": 473977435, "lon": 85455941, "alt": 489277, "eph": 
 PREARM, RADIO = 0x10000000, 0x10000
 
 
-def status(present: int, health: int, percent: int) -> Any:
-    fields = (present, 0, health, 0, 15800, -1, percent, *(0,) * 6)
+def status(present: int, health: int, percent: int, enabled: int = 0) -> Any:
+    fields = (present, enabled, health, 0, 15800, -1, percent, *(0,) * 6)
     return mavlink.MAVLink_sys_status_message(*fields)
 
 
@@ -78,6 +78,8 @@ def version(number: int) -> Any:
         (mavlink.MAVLink_gps_raw_int_message(**FIX, fix_type=2), events.NoFix(2)),
         (status(RADIO, PREARM | RADIO, 87), events.SystemHealth(True, 0.87, True)),
         (status(RADIO, PREARM, 100), events.SystemHealth(True, 1.0, False)),
+        (status(PREARM, 0, -1, PREARM), events.SystemHealth(False, None, False)),
+        (status(PREARM, 0, -1), events.SystemHealth(True, None, False)),  # ARMING_CHECK 0
         (status(0, ~PREARM & 0xFFFFFFFF, -1), events.SystemHealth(False, None, False)),
         (mavlink.MAVLink_extended_sys_state_message(0, 3), events.Landed("takeoff")),
         (mavlink.MAVLink_extended_sys_state_message(0, 4), events.Landed("landing")),

@@ -153,7 +153,10 @@ PX4 = Dialect(
     slow_hint="raise MAV_x_RATE of this link, in bytes/s: PX4 slows all messages down to it",
     # PX4 sends these texts only on a link on which a HEARTBEAT of type GCS arrives. Ours is not:
     # PX4 would not notice any more that its real ground station is lost (NAV_DLL_ACT)
-    unsaid="PX4 says why to ground stations alone: see QGroundControl",
+    unsaid=(
+        "PX4 says why to ground stations alone: see QGroundControl; unless NAV_DLL_ACT is 0, PX4 "
+        "needs one"
+    ),
     oldest=(1, 14),
     setpoint_loss=_setpoint_loss,
     defects=(
