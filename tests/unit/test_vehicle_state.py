@@ -10,7 +10,7 @@ import pytest
 from offboard.flight.estimates import PositionJumps
 from offboard.flight.ground_contact import GroundContact
 from offboard.flight.vehicle_state import VehicleState
-from offboard.mavlink.events import Attitude, Heartbeat, Landed, LocalPosition
+from offboard.mavlink.events import Attitude, Heartbeat, Landed, LocalPosition, StatusText
 
 
 class Standing:
@@ -158,3 +158,12 @@ def test_an_outage_of_the_whole_link_does_not_count_as_age() -> None:
     state.update(attitude(11.0), 11.0)
     state.update(attitude(11.9), 11.9)  # a second one
     assert state.position_age_s == pytest.approx(0.0)
+
+
+def test_what_the_vehicle_says_ends_a_sentence_down_to_a_notice() -> None:
+    """ArduCopter says of a fence by NOTICE alone why it leaves the mode: it was a change of mode
+    without a reason."""
+    vehicle = VehicleState()
+    for severity, text in ((6, "EKF3 IMU0 is using GPS"), (5, "Circle fence breached")):
+        vehicle.update(StatusText(severity, text), 1.0)
+    assert vehicle.explanation("") == "; the vehicle said: Circle fence breached"
