@@ -1,7 +1,7 @@
 """The verdict on a flight, from its log alone: was all of it flown, and what ended it.
 
-A flight is completed if the whole reference was tracked and the vehicle stayed above the ground
-meanwhile, nothing else ended it, the vehicle landed, and it was disarmed; one that the pilot
+A flight is completed if the whole reference was tracked and the vehicle did not come down to the
+ground meanwhile, nothing else ended it, the vehicle landed, and it was disarmed; one that the pilot
 engaged in the air also if it was given back while it hovered at the end of the reference.
 """
 
@@ -28,24 +28,26 @@ Array = NDArray[np.float64]
 REFERENCE_OVER = "reference over"
 NO_FLIGHT = "no flight of offboard in this log"
 _ON_GROUND = 1  # MAV_LANDED_STATE
-_LOWEST_M = 0.1  # above the take-off point; references are at least 0.5 m above it
+_LOWEST_M = 0.1  # above the take-off point; references are at least 0.3 m above it
 _LANDING_ENDS = {"disarmed", "failed", "yielded"}
 
 
 def landing(flown: History) -> tuple[str, float]:
-    """Why the vehicle has not landed, or that it was at the ground before that while it tracked,
-    empty for neither; and the downward speed at touch-down."""
-    begun = begin_times(flown.phases)
-    phases = "takeoff", "track", "land"
-    takes_off_s, tracks_s, lands_s = (begun.get(phase, math.inf) for phase in phases)
-    jumps, takeoff, touchdown, lowest_m = PositionJumps(), None, None, math.inf
+    """Why the vehicle has not landed, or that it came down to the ground before that, after the
+    climb of a flight with a take-off; empty for neither. And the downward speed at touch-down."""
+    begun, first = begin_times(flown.phases), begin_times(flown.phases[::-1])
+    takes_off_s, lands_s = (begun.get(phase, math.inf) for phase in ("takeoff", "land"))
+    climbed_s = first.get("join", math.inf)
+    jumps, takeoff, touchdown = PositionJumps(), None, None
+    from_down_m = lowest_m = math.inf
     for position in _positions(flown):
         jumps.on_position(position)
-        place = jumps.without(position.position_ned_m)
+        place, down_m = jumps.without(position.position_ned_m), position.position_ned_m[2]
         if position.time_s <= takes_off_s:
-            takeoff = place
-        elif takeoff and tracks_s <= position.time_s <= lands_s:
-            lowest_m = min(lowest_m, takeoff[2] - place[2])
+            takeoff, from_down_m = place, down_m
+        elif takeoff and climbed_s <= position.time_s <= lands_s:
+            # a jump may be an error of the estimate, or its correction: the higher one counts
+            lowest_m = min(lowest_m, max(takeoff[2] - place[2], from_down_m - down_m))
         if position.time_s <= lands_s:
             continue
         if touchdown is None:
@@ -54,7 +56,7 @@ def landing(flown: History) -> tuple[str, float]:
     if touchdown is None:
         return "not landed", math.nan
     if lowest_m < _LOWEST_M:
-        return f"{lowest_m:.1f} m above the take-off point while tracking", touchdown.speed_mps
+        return "it came down to the ground before its landing", touchdown.speed_mps
     since = flown.landed[flown.landed["time_s"] >= begun["land"]]
     on_ground = bool(len(since)) and bool(since["state"][-1] == _ON_GROUND)
     return touchdown.not_landed(on_ground=on_ground), touchdown.speed_mps

@@ -131,7 +131,8 @@ def _masked(pool: Executor, job: Job) -> Future[Record]:
 @dataclass(frozen=True, slots=True)
 class ConnectedVehicle:
     """The vehicle at the link of its cases, a real one perhaps. Its flights follow each other in
-    this process; after one that was refused, aborted or ended by the pilot, nothing more is flown.
+    this process; after one that was refused, aborted or ended by a change of mode, nothing more is
+    flown.
     """
 
     system_id: int | None = None

@@ -84,7 +84,7 @@ def authority_lost(flight: FlightState) -> str:
 
 
 def authority_lost_armed(flight: FlightState) -> str:
-    """A pilot has changed the mode of a vehicle that stays armed."""
+    """Another has changed the mode of a vehicle that stays armed."""
     return authority_lost(flight) if flight.shown_since_lost and flight.vehicle.armed else ""
 
 

@@ -195,7 +195,6 @@ class Flight(FlightState):
         found, health, authority = self.session.vehicle, self.vehicle.health, self.authority
         if found is None:
             return None
-        delay = self.clock.delay
         return Supervised(
             found,
             ours=self.phase not in BEFORE_FLIGHT | ENDS and authority.is_ours,
@@ -206,7 +205,6 @@ class Flight(FlightState):
             setpoint_loss=authority.setpoint_loss,
             sticks=health is not None and health.radio_ok,
             setpoints_missing=self.setpoints_missing or authority.standing is Standing.FAILSAFE,
-            round_trip_s=delay.value if delay else 0.0,
         )
 
     def _status(self) -> tuple[int, int]:

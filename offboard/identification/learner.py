@@ -166,7 +166,6 @@ class Learner(VehicleEstimate):
         self._in_a_row = 0  # contradictions of the comparison
         self._doubted_from_s = -math.inf
         self._hover: deque[tuple[float, float]] = deque()
-        self._other_hover = False  # seen once, differs from the one in use
 
     # ------------------------------------------------------------------ events
 
@@ -364,14 +363,9 @@ class Learner(VehicleEstimate):
         shares, known = np.array(self._hover)[:, 1], self.vehicle.hover_thrust
         sd = float(np.std(shares)) / math.sqrt(HOVER_OVER_S / HOVER_RELATED_S)
         hover = Estimate(float(np.mean(shares)), sd)
-        seen_before, self._other_hover = self._other_hover, False
         found = Identified(HOVER_OVER_S, hover_thrust=hover)
-        if abs(hover.value - known) <= max(HOVER_NEWS * known, HOVER_SDS * sd):
-            return
-        if self.within_bounds(found)[1]:
-            return
-        self._other_hover = not seen_before
-        if seen_before:
+        differs = abs(hover.value - known) > max(HOVER_NEWS * known, HOVER_SDS * sd)
+        if self._again("hover", differs and not self.within_bounds(found)[1]):
             self.adopt(found, self._time_s)
 
 

@@ -1,10 +1,10 @@
 """What one vehicle is, and how sure of its delays: the estimate that fits and the link change.
 
 It begins with the vehicle file, or with what an earlier flight has identified. A fit is adopted if
-it is within bounds, and more certain than the value in use or confirmed to differ from it.
-Telemetry that contradicts the constants in use makes the delay uncertain at once, until a fit
-explains the flight. `vehicle` and `uncertainty` are the result. It knows no control law. Times are
-vehicle time.
+it is within bounds, and more certain than the value in use or confirmed to differ from it; of the
+drag also one that is nearly as certain. Telemetry that contradicts the constants in use makes the
+delay uncertain at once, until a fit explains the flight. `vehicle` and `uncertainty` are the
+result. It knows no control law. Times are vehicle time.
 """
 
 from __future__ import annotations
@@ -55,13 +55,12 @@ class IdentifiedVehicle:
     """What a flight has identified, for the next one of the same vehicle. The delays of `vehicle`
     contain the link's delay of then, `link_s` (telemetry and setpoint together; 0 if it was not
     measured). `delay` is the delay of the tilt and its standard deviation, s; `thrust` delay and
-    lag of the thrust together, s, and `drag` 1/s, None where no fit was adopted."""
+    lag of the thrust together, None where no fit was adopted."""
 
     vehicle: Vehicle
     delay: Estimate
     link_s: float
     thrust: Estimate | None = None
-    drag: Estimate | None = None
 
 
 class VehicleEstimate:
@@ -92,7 +91,7 @@ class VehicleEstimate:
         self._recalled = known
         self._unknown_s = delay_error_s
         self._thrust = known.thrust if known else None  # delay and lag, once identified
-        self._drag = known.drag if known else None
+        self._drag_sd_ps = math.inf  # least sd of a fit that agrees with the drag in use
         self._link_s = known.link_s if known else 0.0  # the link's, which `vehicle` contains
         self._link = (0.0, 0.0)  # added since take-off, and changed lately
         self._doubt_s = 0.0  # what the delay may be wrong by because telemetry contradicts it
@@ -134,7 +133,7 @@ class VehicleEstimate:
         """What the next flight may begin with; None if nothing was identified, or in doubt."""
         if self.delay is None or self.contradicted:
             return None
-        return IdentifiedVehicle(self.vehicle, self.delay, self._link_s, self._thrust, self._drag)
+        return IdentifiedVehicle(self.vehicle, self.delay, self._link_s, self._thrust)
 
     @property
     def previous(self) -> Vehicle:
@@ -217,7 +216,8 @@ class VehicleEstimate:
         if vehicle != self.vehicle:
             self.vehicle, self.adopted_s = vehicle, time_s
             sentences.insert(0, summary(within))
-        self._drag = within.drag_ps or self._drag
+        if within.drag_ps is not None:
+            self._drag_sd_ps = min(self._drag_sd_ps, within.drag_ps.sd)
         if within.drag_ps is None and found.drag_ps is not None:
             self._rejected_drag_ps = found.drag_ps.value
         self.sentences += sentences
@@ -225,19 +225,24 @@ class VehicleEstimate:
 
     def review_drag(self, found: Identified, least_ps: float, time_s: float) -> None:
         """Adopt a drag that differs, by its sd and by `least_ps`, from the one in use and from the
-        one that was out of bounds, unless it is clearly less certain than that in use: then the
-        second in a row that contradicts it."""
-        new, known, used_ps = found.drag_ps, self._drag, self.vehicle.drag_per_mass_ps
+        one that was out of bounds; where it is clearly less certain than fits that agreed with the
+        one in use, only the second in a row that contradicts it."""
+        new = found.drag_ps
         if new is None:
             return
-        vague = contradicts = False
-        if known is not None:
-            vague = new.sd > VAGUE * known.sd
-            contradicts = abs(new.value - used_ps) > SDS * math.hypot(new.sd, known.sd)
+        used_ps, sd_ps = self.vehicle.drag_per_mass_ps, self._drag_sd_ps
+        vague = new.sd > VAGUE * sd_ps
+        contradicts = abs(new.value - used_ps) > SDS * math.hypot(new.sd, sd_ps)
         again = self._again("drag", contradicts and vague)
-        others_ps = used_ps, self._rejected_drag_ps
-        is_news = all(abs(new.value - each) > max(least_ps, new.sd) for each in others_ps)
-        if is_news and (again or not vague):
+        differs, is_other = (
+            abs(new.value - each) > max(least_ps, new.sd)
+            for each in (used_ps, self._rejected_drag_ps)
+        )
+        if not differs:
+            self._drag_sd_ps = min(sd_ps, new.sd)
+        elif is_other and (again or not vague):
+            if again:
+                self._drag_sd_ps = new.sd
             self.adopt(found, time_s)
 
     def _again(self, constant: str, differs: bool) -> bool:

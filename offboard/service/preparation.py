@@ -102,7 +102,6 @@ class Document(BaseModel):
     tilt_delay_sd_s: float = Field(gt=0, le=1)
     link_delay_s: float = Field(ge=0, le=10)
     thrust_delay_sd_s: float | None = Field(default=None, gt=0, le=1)  # of delay and lag together
-    drag_sd_ps: float | None = Field(default=None, gt=0, le=10)
     vehicle: Vehicle
 
 
@@ -144,7 +143,6 @@ class VehicleFiles:
             "tilt_delay_sd_s": identified.delay.sd,
             "link_delay_s": identified.link_s,
             "thrust_delay_sd_s": identified.thrust.sd if identified.thrust else None,
-            "drag_sd_ps": identified.drag.sd if identified.drag else None,
             "vehicle": identified.vehicle.model_dump(mode="json"),
         }
         path = self._directory / f"{key}.yaml"
@@ -161,9 +159,7 @@ def _load(path: Path) -> tuple[str, IdentifiedVehicle]:
     delay = Estimate(document.tilt_delay_s, document.tilt_delay_sd_s)
     vehicle, sd_s = document.vehicle, document.thrust_delay_sd_s
     thrust = Estimate(vehicle.thrust_delay_s + vehicle.thrust_lag_s, sd_s) if sd_s else None
-    sd_ps = document.drag_sd_ps
-    drag = Estimate(vehicle.drag_per_mass_ps, sd_ps) if sd_ps else None
-    identified = IdentifiedVehicle(vehicle, delay, document.link_delay_s, thrust, drag)
+    identified = IdentifiedVehicle(vehicle, delay, document.link_delay_s, thrust)
     return document.identified_from, identified
 
 

@@ -47,8 +47,7 @@ class Supervised:
     that arrived at `reported_s` (`clock.monotonic_s`), whose age the supervisor judges. `flying`:
     it is armed. `holding`: it was asked to hold, so that this mode is ours, too; `landing`: to
     land. `setpoint_loss`: what its autopilot does without setpoints; `sticks`: it receives those of
-    a pilot; `setpoints_missing`: they were missing already, or its failsafe for that flies it.
-    `round_trip_s`: the link's delay in both directions together."""
+    a pilot; `setpoints_missing`: they were missing already, or its failsafe for that flies it."""
 
     vehicle: VehicleFound
     ours: bool
@@ -59,7 +58,6 @@ class Supervised:
     setpoint_loss: SetpointLoss = NEVER
     sticks: bool = False
     setpoints_missing: bool = False
-    round_trip_s: float = 0.0
 
     @property
     def silent_s(self) -> float:
@@ -193,8 +191,7 @@ class Recovery:
         known = now_s - self._reported_s <= MODE_KNOWN_S
         if self._mode is None:
             return first if known and self._requests < UNHEARD_MAX else None
-        # the vehicle has sent the newest report after it has received the request
-        answered = self._reported_s > self._asked_s + self._known.round_trip_s and known
+        answered = self._reported_s > self._asked_s and known
         if self._fallen_s < math.inf:
             lands = self._mode == self._dialect.return_mode or now_s - self._sank_s < SINK_S
             due = self._fallen_shown and now_s - self._fallen_s >= HOLD_S

@@ -103,20 +103,6 @@ def test_only_what_is_ours_is_asked_for_more(dialect: Dialect) -> None:
 
 
 @FIRMWARES
-def test_a_late_link_repeats_nothing_on_reports_that_were_sent_before(dialect: Dialect) -> None:
-    """A round trip of 3 s: reports of the mode that arrive within it are older than the request.
-    A pilot may have switched since, whom a repeated request would overrule."""
-    engaged = [(0.5 * number, ModeReport(dialect.engage_mode)) for number in range(1, 9)]
-    times_s = {}
-    for round_trip_s in (0.0, 3.0):
-        known = replace(OURS, round_trip_s=round_trip_s)
-        commands, _ = asked(dialect, *engaged, shown=dialect.engage_mode, known=known)
-        times_s[round_trip_s] = [at_s for at_s, _ in commands if at_s < 3.0]
-    assert times_s[3.0] == [0.0]
-    assert len(times_s[0.0]) == 6
-
-
-@FIRMWARES
 def test_a_landing_goes_on(dialect: Dialect) -> None:
     """It was interrupted for 5 s of hold, and a hold that a pilot chose was taken for an answer."""
     landing = replace(OURS, landing=True)

@@ -156,8 +156,7 @@ def test_an_identified_vehicle_is_kept_and_used_for_the_same_file_alone(tmp_path
     known = build(load("flight", choices={"vehicle": "px4_sih"}))
     found = known.config.vehicle.model_copy(update={"hover_thrust": 0.51})
     thrust = Estimate(found.thrust_delay_s + found.thrust_lag_s, 0.04)
-    drag = Estimate(found.drag_per_mass_ps, 0.02)
-    identified = IdentifiedVehicle(found, Estimate(0.056, 0.002), 0.008, thrust, drag)
+    identified = IdentifiedVehicle(found, Estimate(0.056, 0.002), 0.008, thrust)
     files = VehicleFiles(tmp_path / "vehicles", print)
     files.keep("px4-1-1", known, identified)
     assert files.get("px4-1-1", known) is identified
