@@ -170,6 +170,7 @@ class UdpLink(Link):
                 listening.socket.connect(peer)
             self._listening, sock = None, listening.socket
         self._vehicle, self._peer = _Inbox(sock), peer
+        self._newer.discard(peer)
         self.opened += 1
         self._heard_s = clock.monotonic_s()
 

@@ -223,6 +223,20 @@ def test_another_port_is_heard_after_a_silence_that_was_observed(
         vehicle.send(b"of another now")
         restarted.send(b"v")
         assert data(received(link)) == [b"v"]
+        # once more, to a new port and back
+        for _ in range(2):
+            now_s[0] += 0.1
+            restarted.send(b"v")
+            assert data(received(link)) == [b"v"]
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as again:
+            again.connect(other.getpeername())
+            for sender in (again, restarted):
+                now_s[0] += 1.1 * PEER_SILENT_S
+                sender.send(b"moved")
+                assert data(link.receive()) == [b"moved"]
+                link.follow(sender.getsockname())
+                sender.send(b"v")
+                assert data(received(link)) == [b"v"]
 
 
 def test_udpout_hears_only_its_peer() -> None:
