@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 REFERENCE_OVER = "reference over"
 NO_FLIGHT = "no flight of offboard in this log"
 _ON_GROUND = 1  # MAV_LANDED_STATE
-_LOWEST_M = 0.1  # above the take-off point; references are at least 0.3 m above it
+_LOWEST_M = 0.05  # above the take-off point; references are at least 0.3 m above it
 _LANDING_ENDS = {"disarmed", "failed", "yielded"}
 
 

@@ -217,7 +217,7 @@ class VehicleEstimate:
             self.vehicle, self.adopted_s = vehicle, time_s
             sentences.insert(0, summary(within))
         if within.drag_ps is not None:
-            self._drag_sd_ps = min(self._drag_sd_ps, within.drag_ps.sd)
+            self._drag_sd_ps = within.drag_ps.sd
         if within.drag_ps is None and found.drag_ps is not None:
             self._rejected_drag_ps = found.drag_ps.value
         self.sentences += sentences
@@ -241,8 +241,6 @@ class VehicleEstimate:
         if not differs:
             self._drag_sd_ps = min(sd_ps, new.sd)
         elif is_other and (again or not vague):
-            if again:
-                self._drag_sd_ps = new.sd
             self.adopt(found, time_s)
 
     def _again(self, constant: str, differs: bool) -> bool:

@@ -24,6 +24,7 @@ DATAGRAM_SIZE = 65535
 BUFFER_BYTES = 1 << 20
 BATCH_MAX = 512  # datagrams of one call
 LOOK_MAX, LOOK_EVERY_S = 64, 0.02  # of other senders, while the vehicle is known
+BESIDE_S = 60.0  # so long a port that was heard beside the vehicle's cannot be its new one
 _LINUX = sys.platform == "linux"
 _SHARE_PORT = socket.SO_REUSEADDR if _LINUX else socket.SO_REUSEPORT
 # Options that the socket module does not name: SO_TIMESTAMPNS on Linux, SO_TIMESTAMP on macOS
@@ -92,8 +93,9 @@ class UdpLink(Link):
         self._vehicle = _Inbox(vehicle) if vehicle else None
         self._peer: Hashable = vehicle.getpeername() if vehicle else None
         self._heard_s = clock.monotonic_s()  # when we last found a datagram of the vehicle
-        # addresses on its host: those that were heard before it, and those heard since it was
-        self._beside: set[Hashable] = set()
+        # other ports of its host: until when those heard before it are another's, and those heard
+        # since it was
+        self._beside: dict[Hashable, float] = {}
         self._newer: set[Hashable] = set()
         self._look_s = 0.0  # when other senders are read next
 
@@ -110,14 +112,17 @@ class UdpLink(Link):
         if self._listening:
             if self._vehicle is None:
                 return self._listening.drain(BATCH_MAX)
-            chunks += self._look(self._listening, bool(chunks))
+            if len(chunks) < BATCH_MAX:
+                chunks += self._look(self._listening, bool(chunks))
+            else:  # what waits is older than what others have sent
+                self._heard_s = clock.monotonic_s()
         return sorted(chunks, key=lambda chunk: chunk.arrived_s)
 
     def _look(self, listening: _Inbox, heard: bool) -> list[Chunk]:
         """What other senders sent: nearly all is only counted. Returned is what the vehicle sent
         before its socket was connected or to a broadcast address, and after a silence that we
         observed ourselves (not one of our own pauses) what may come from its new port. A port that
-        has sent beside the vehicle's is another's, though it may have the same system id."""
+        has sent beside the vehicle's lately is another's, though it may have the same system id."""
         now_s = clock.monotonic_s()
         found = listening.drain(LOOK_MAX) if now_s >= self._look_s else []
         ours = [chunk for chunk in found if chunk.peer == self._peer]
@@ -128,10 +133,12 @@ class UdpLink(Link):
         near = {chunk.peer for chunk in others if same_host(chunk.peer, self._peer)}
         if heard or ours:
             self._heard_s = now_s
-            self._beside |= self._newer
-            self._newer.clear()
+            if self._newer:
+                known = {port: end_s for port, end_s in self._beside.items() if end_s > now_s}
+                self._beside = known | dict.fromkeys(self._newer, now_s + BESIDE_S)
+                self._newer.clear()
         elif silent:
-            near -= self._beside
+            near = {port for port in near if self._beside.get(port, now_s) <= now_s}
             ours = [chunk for chunk in others if chunk.peer in near]
             others = [chunk for chunk in others if chunk.peer not in near]
         self._newer |= near
@@ -170,7 +177,7 @@ class UdpLink(Link):
                 listening.socket.connect(peer)
             self._listening, sock = None, listening.socket
         self._vehicle, self._peer = _Inbox(sock), peer
-        self._newer.discard(peer)
+        self._newer.clear()
         self.opened += 1
         self._heard_s = clock.monotonic_s()
 

@@ -237,6 +237,11 @@ def test_another_port_is_heard_after_a_silence_that_was_observed(
                 link.follow(sender.getsockname())
                 sender.send(b"v")
                 assert data(received(link)) == [b"v"]
+        # two that have overlapped: the later one is heard in the end
+        for passed_s, heard in ((50.0, []), (15.0, [b"late"])):
+            now_s[0] += passed_s
+            other.send(b"late")
+            assert data(link.receive()) == heard
 
 
 def test_udpout_hears_only_its_peer() -> None:

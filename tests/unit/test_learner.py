@@ -139,13 +139,13 @@ def test_a_drag_is_replaced_by_a_vague_one_only_if_that_contradicts_it_twice() -
         (1.19, 0.15, 1.03),  # vague
         (1.19, 0.15, 1.03),
         (1.08, 0.03, 1.08),  # nearly as certain
-        (1.15, 0.05, 1.08),  # vague, though less so than the one in use
+        (1.16, 0.07, 1.08),  # vague
         (1.50, 0.10, 1.08),  # vague, contradicts
         (1.10, 0.10, 1.08),
         (1.50, 0.10, 1.08),
         (1.48, 0.10, 1.48),  # contradicts twice in a row
         (1.30, 0.15, 1.30),
-        (9.00, 0.01, 1.30),  # out of bounds
+        (9.00, 0.01, 1.30),  # out of bounds: says nothing of the one in use
         (9.00, 0.01, 1.30),
         (1.50, 0.10, 1.50),
     ):
