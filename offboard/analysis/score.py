@@ -42,9 +42,9 @@ def _metric(meaning: str, unit: str = "", *, wall: bool = False) -> float:
 class Score:
     """All metrics of a flight, by the names that --require takes, and what ended it.
 
-    `completed` is 1 if the whole reference was tracked, not at the ground, the vehicle landed by
-    its land detector, height and speed, and it was disarmed; else 0, and `ended_by` says why not
-    in a word or a few, `reason` in the sentence that the flight announced, if it announced one.
+    `completed` is 1 if the whole reference was tracked in the air, the vehicle landed by its land
+    detector, height and speed, and it was disarmed; else 0, and `ended_by` says why not in a word
+    or a few, `reason` in the sentence that the flight announced, if it announced one.
 
     Errors are relative to the reference, during the phase TRACK: `position` as the vehicle
     estimates it (LOCAL_POSITION_NED), `truth` as it is in the simulator (HIL_STATE_QUATERNION or

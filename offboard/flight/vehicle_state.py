@@ -197,7 +197,7 @@ class VehicleState:
                 self.uid, self.version = uid, version
             case Parameter(name, value):
                 self.parameters[name] = value
-            case StatusText(severity, text) if severity <= NOTICE:  # of a fence, ArduCopter
+            case StatusText(severity, text) if severity <= NOTICE:  # as a fence breach
                 self.texts.append(text)
             case CommandAck(command, result) if command not in MESSAGE_COMMANDS:
                 self.results[command], self.answered_s[command] = result, now_s

@@ -91,7 +91,7 @@ class VehicleEstimate:
         self._recalled = known
         self._unknown_s = delay_error_s
         self._thrust = known.thrust if known else None  # delay and lag, once identified
-        self._drag_sd_ps = math.inf  # least sd of a fit that agrees with the drag in use
+        self._drag_sd_ps = math.inf  # sd of the drag in use, by the surest fit of it
         self._link_s = known.link_s if known else 0.0  # the link's, which `vehicle` contains
         self._link = (0.0, 0.0)  # added since take-off, and changed lately
         self._doubt_s = 0.0  # what the delay may be wrong by because telemetry contradicts it
@@ -224,9 +224,10 @@ class VehicleEstimate:
         self.record = found.estimates
 
     def review_drag(self, found: Identified, least_ps: float, time_s: float) -> None:
-        """Adopt a drag that differs, by its sd and by `least_ps`, from the one in use and from the
-        one that was out of bounds; where it is clearly less certain than fits that agreed with the
-        one in use, only the second in a row that contradicts it."""
+        """Adopt a drag (1/s) that differs from the one in use, and from the one that was out of
+        bounds, by more than its sd and `least_ps`. One that is clearly less certain than the drag
+        in use is adopted only if it contradicts that, and the fit before did. `time_s`: vehicle
+        time."""
         new = found.drag_ps
         if new is None:
             return

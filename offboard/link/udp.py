@@ -93,8 +93,8 @@ class UdpLink(Link):
         self._vehicle = _Inbox(vehicle) if vehicle else None
         self._peer: Hashable = vehicle.getpeername() if vehicle else None
         self._heard_s = clock.monotonic_s()  # when we last found a datagram of the vehicle
-        # other ports of its host: until when those heard before it are another's, and those heard
-        # since it was
+        # Ports of the vehicle's host. `_beside`: those heard beside the vehicle's own, and until
+        # when they belong to another; `_newer`: those heard since the vehicle's own was
         self._beside: dict[Hashable, float] = {}
         self._newer: set[Hashable] = set()
         self._look_s = 0.0  # when other senders are read next
