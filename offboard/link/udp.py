@@ -54,8 +54,8 @@ class _Inbox:
         self._empty_s = clock.monotonic_s()  # all that is waiting arrived later
 
     def drain(self, most: int) -> list[Chunk]:
-        """At most `most` datagrams that are waiting."""
-        chunks: list[Chunk] = []
+        """At most `most` datagrams that are waiting, in the order of their arrival."""
+        read: list[tuple[bytes, Hashable, float]] = []
         offset_s = clock.monotonic_less_unix_s()
         for _ in range(most):
             now_s = clock.monotonic_s()
@@ -68,11 +68,15 @@ class _Inbox:
             except OSError:  # nothing left, or the network interface is down
                 self._empty_s = now_s
                 break
-            # a clock that was set meanwhile must not move the arrival
-            stamp_s = min(_stamp_s(ancillary) + offset_s, clock.monotonic_s())
-            arrived_s = max(self._empty_s, stamp_s)
-            chunks.append(Chunk(bytes(self._buffer[:size]), peer, arrived_s))
-        return chunks
+            arrived_s = max(self._empty_s, _stamp_s(ancillary) + offset_s)
+            read.append((bytes(self._buffer[:size]), peer, arrived_s))
+        # a clock that was set meanwhile must not move an arrival, or change the order
+        latest_s = clock.monotonic_s()
+        chunks: list[Chunk] = []
+        for data, peer, arrived_s in reversed(read):
+            latest_s = min(arrived_s, latest_s)
+            chunks.append(Chunk(data, peer, latest_s))
+        return chunks[::-1]
 
 
 def _stamp_s(ancillary: list[tuple[int, int, bytes]]) -> float:
