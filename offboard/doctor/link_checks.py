@@ -81,14 +81,9 @@ def senders(seen: Observation) -> Iterable[Finding]:
     """Other vehicles, ground stations and controllers on the link."""
     others = []
     for sender in seen.heard.senders.found:
-        peers = ", ".join(sorted(sender.peers))
-        if sender.ids != _ids(seen):
-            others.append(f"{sender.name}, from {peers}" if sender.is_autopilot else sender.name)
-        elif len(sender.peers) > 1:
-            yield warn(
-                f"two programs send as vehicle {sender.system_id}/{sender.component_id}: {peers}",
-                "give each vehicle its own system id (MAV_SYS_ID, SYSID_THISMAV) and port",
-            )
+        if sender.ids != _ids(seen) or len(sender.peers) > 1:
+            peers = f", from {', '.join(sorted(sender.peers))}" if sender.is_autopilot else ""
+            others.append(f"{sender.name}{peers}")
     yield ok("besides the vehicle: " + ("; ".join(others) or "nobody"))
 
 

@@ -264,4 +264,4 @@ class Flight(FlightState):
 
     def note_autopilot(self, system_id: int) -> None:
         """Another address shows the autopilot of this system, for a replay."""
-        self.session.senders.hear(system_id, self.session.link_time_s)
+        self.session.senders.hear_elsewhere(system_id, self.session.link_time_s)

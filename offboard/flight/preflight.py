@@ -222,6 +222,11 @@ def _same_system_id(ground: Ground) -> str:
     )
 
 
+def _twin(ground: Ground) -> str:
+    """The vehicle, or one with its system id, is heard from a second address."""
+    return ground.session.senders.twin(ground.session.link_time_s)
+
+
 def other_vehicle(ground: Ground) -> str:
     """Several vehicles are heard, and none was chosen with --system, or none can be."""
     return _same_system_id(ground) or _several_vehicles(ground)
@@ -357,6 +362,7 @@ _UNFIT = (
 _FAILSAFE = "let the pilot take over first"
 _CHOOSE = "choose one with --system, or give each vehicle its own port"
 _SAME_ID = "switch one off, or change its system id"
+_ONE_WAY = f"{_SAME_ID}; let the telemetry of one vehicle come one way"
 
 
 def _slow_hint(ground: Ground) -> str:
@@ -372,6 +378,7 @@ PREFLIGHT = (
     Row("senders", BLOCKS, other_sender, "stop it", at_once=True, fly_only=True),
     Row("senders", BLOCKS, _several_vehicles, _CHOOSE, at_once=True),
     Row("senders", BLOCKS, _same_system_id, _SAME_ID, at_once=True),
+    Row("senders", BLOCKS, _twin, _ONE_WAY),
     Row("rates", WAIT, _no_telemetry),
     Row("supervisor", WAIT, _unguarded),
     Row("rates", BLOCKS, _slow, _slow_hint),

@@ -66,8 +66,9 @@ class Senders:
     """See the module. `vehicle` and `dialect` are None until the vehicle was found; `wanted` is the
     only system that may be the vehicle, None: any; without `signing` it must not sign. `own` are
     our ids, of which the system is the vehicle's. `systems` has when each autopilot was heard, to a
-    second; `forged` counts what signing refused. Times are `Session.link_time_s` but for `heard_s`,
-    host time of the vehicle's newest frame.
+    second, `twin_s` when one with the vehicle's system id was, from another address; `forged`
+    counts what signing refused. Times are `Session.link_time_s` but for `heard_s`, host time of the
+    vehicle's newest frame.
     """
 
     def __init__(self, wanted: int | None, component_id: int, signing: Signing | None) -> None:
@@ -77,6 +78,7 @@ class Senders:
         self.target: Target | None = None  # of our messages: the vehicle
         self.clock_behind = False  # an autopilot whose clock is behind ours was heard
         self.systems: dict[int, float] = {}
+        self.twin_s = -math.inf
         self.forged: Counter[Refusal] = Counter()
         self._news_at = 1  # number of forged frames
         self._signs = False  # an autopilot that signs was heard, and we have no key
@@ -111,11 +113,18 @@ class Senders:
         return moves
 
     def overhear(self, datagram: bytes, now_s: float) -> list[int]:
-        """Systems with an autopilot that a datagram shows, each once a second."""
-        known = dict(self.systems)
-        for frame in self._genuine(datagram):
-            self.note(frame, now_s)
-        return [each for each, _ in self.systems.items() - known.items()]
+        """Systems with an autopilot that a datagram from another address shows, each once a
+        second."""
+        shown = {each.system_id for each in self._genuine(datagram) if self._autopilot(each)}
+        return [each for each in sorted(shown) if self.hear_elsewhere(each, now_s)]
+
+    def hear_elsewhere(self, system_id: int, now_s: float) -> bool:
+        """An autopilot of this system sends from another address; whether that is news."""
+        if self.vehicle is None or system_id != self.vehicle.system_id:
+            return self._hear(system_id, now_s)
+        news = now_s - self.twin_s >= NOTED_EVERY_S
+        self.twin_s = now_s if news else self.twin_s
+        return news
 
     def _genuine(self, datagram: bytes) -> Iterator[Frame]:
         """The frames of a datagram that signing would accept. Neither counts them nor stores their
@@ -209,23 +218,27 @@ class Senders:
 
     def note(self, frame: Frame, now_s: float) -> Dialect | None:
         """The autopilot that a frame shows, None if it is no HEARTBEAT of one that can be flown."""
-        dialect = dialect_of(frame.message) if frame.message_id == HEARTBEAT else None
-        if dialect is None:
-            return None
-        if frame.component_id != AUTOPILOT_COMPONENT:
-            self._other_component = frame.component_id
-            return None
-        self.hear(frame.system_id, now_s)
+        dialect = self._autopilot(frame)
+        if dialect:
+            self._hear(frame.system_id, now_s)
         return dialect
 
-    def hear(self, system_id: int, now_s: float) -> None:
-        """This system has an autopilot."""
+    def _autopilot(self, frame: Frame) -> Dialect | None:
+        dialect = dialect_of(frame.message) if frame.message_id == HEARTBEAT else None
+        if dialect and frame.component_id != AUTOPILOT_COMPONENT:
+            self._other_component = frame.component_id
+            return None
+        return dialect
+
+    def _hear(self, system_id: int, now_s: float) -> bool:
+        """This system has an autopilot; whether that is news."""
         if now_s - self.systems.get(system_id, -math.inf) < NOTED_EVERY_S:
-            return
+            return False
         self.systems.pop(system_id, None)  # the newest is the last
         self.systems[system_id] = now_s
         if len(self.systems) > SYSTEMS_MAX:
             del self.systems[next(iter(self.systems))]
+        return True
 
     # --- what to say ---
 
@@ -234,6 +247,13 @@ class Senders:
         was chosen; else empty."""
         present = [each for each, at_s in self.systems.items() if now_s - at_s <= HEARD_S]
         return _listed(present) if self._wanted is None and len(present) > 1 else ""
+
+    def twin(self, now_s: float) -> str:
+        """Who sends with the vehicle's system id from another address, in a sentence; else
+        empty."""
+        if self.vehicle is None or now_s - self.twin_s > HEARD_S:
+            return ""
+        return f"an autopilot sends as system {self.vehicle.system_id} from another address, too"
 
     def news(self) -> str:
         """What signing refused, on the 1st, 10th, 100th ... frame; else empty."""

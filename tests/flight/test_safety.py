@@ -42,6 +42,7 @@ from watch import (
 
 from offboard.flight.phases import FLYING, Action, Phase
 from offboard.identification.learner import IdentifySettings
+from offboard.mavlink.senders import HEARD_S
 from simulator import config as simulated
 from simulator.config import Start
 from simulator.firmware.px4 import PX4
@@ -320,6 +321,22 @@ def test_resets_of_the_estimate_move_its_place_and_the_ground(resets: list[dict[
     watch = flown(pair, ended_by="reference over", top_m=2.2)
     assert max(math.hypot(*m.position_ned_m[:2]) for m in watch.moments) < 0.3
     assert pair.companion.contact.height_m == pytest.approx(0.0, abs=0.1)
+
+
+@BOTH
+def test_while_another_address_sends_with_its_ids_a_vehicle_is_not_armed(on: Vehicle) -> None:
+    """The first one heard was flown, whichever was meant. It flies once the other has gone."""
+    pair, twin = on.hop(), on.hop(seed=8).instance
+
+    def beside(time_s: float, datagrams: Bytes) -> Bytes:
+        if time_s < 20.0:
+            pair.companion.overhear(twin.step())
+        return datagrams
+
+    pair.down = beside
+    flown(pair)
+    assert said(pair, "an autopilot sends as system 1 from another address, too. Fix: switch one")
+    assert begun_s(pair, Phase.ARM) > 20.0 + HEARD_S - 1.1
 
 
 @BOTH
