@@ -145,6 +145,7 @@ class TakeOver:
             for event in reception.events:
                 self._recovery.see(event, at_s)
             self._send(*reception.replies)
+        self._link.follow(self._session.peer)
         due = self._session.poll(clock.monotonic_s(), (ACTIVE, LANDING))
         self._send(*(message for message in due if isinstance(message, Heartbeat)))
         return bool(chunks)

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -137,6 +138,27 @@ def test_it_asks_the_vehicle_that_connected_last(rig: Rig) -> None:
     rig.vehicle = socket.create_connection(rig.place)
     assert rig.next_message().command == 176
     rig.disarm()
+
+
+@over("udpin")
+def test_it_asks_a_vehicle_that_sends_from_a_new_port(rig: Rig) -> None:
+    """A router restarts as the controller dies."""
+    rig.beat(OURS)
+    rig.vehicle.close()
+    rig.abandon()
+    rig.vehicle = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    rig.vehicle.settimeout(0.2)
+    rig.vehicle.connect(rig.place)
+
+    def is_asked() -> bool:
+        rig.report(OFFBOARD)
+        with suppress(TimeoutError):
+            return bool(rig.next_message().command == 176)
+        return False
+
+    eventually(is_asked)
+    rig.disarm()
+    rig.await_end()
 
 
 @over("signed")
