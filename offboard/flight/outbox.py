@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from contextlib import suppress
 
-from offboard.flight.phases import TRACKING
+from offboard.flight.phases import TRACKING, ExitCode, Phase
 from offboard.flight.record import Refusal
 from offboard.flight.state import LEVEL_DIRECTION, FlightState
 from offboard.flight.timing import LOSSY
@@ -253,7 +253,9 @@ def announce(flight: FlightState, sentence: str, *, once: bool = False) -> None:
 
 def announce_phase(flight: FlightState, reason: str, cause: str) -> None:
     """Report that the phase begins; `cause` is a word for the log, empty without one."""
-    sentence = f"{flight.phase.value}: {reason}"
+    served = flight.outcome is not None and flight.outcome.exit_code == ExitCode.FLOWN
+    name = "ended" if flight.phase is Phase.FAILED and served else flight.phase.value
+    sentence = f"{name}: {reason}"
     _show(flight, sentence)
     _say(flight, INFO, EventRecord(sentence, flight.phase.code, cause), title="offboard: ")
 

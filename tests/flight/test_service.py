@@ -397,6 +397,9 @@ def test_without_arms_it_stays_on_the_ground(served: Served) -> None:
     assert pair.phase is Phase.STANDBY
     assert set(thrusts(pair, armed_s)) == {0.0}
     assert -pair.place[2] < 0.05
+    pair.service.request_stop()
+    pair.until(pair.service.has_ended, 1.0)
+    assert said(pair, "ended: stop requested by the operator")
 
 
 def test_with_arms_a_start_takes_off_and_flies(served: Served) -> None:
