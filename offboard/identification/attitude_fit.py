@@ -173,10 +173,14 @@ def _refusal(fit: ResponseFit, sd_limits: tuple[float, float, float]) -> str:
             f"{1e3 * fit.commanded_rms:.1f} commanded are unexplained"
         )
     frequency = fit.natural_frequency_radps
+    # An overdamped response is a lag of 2 z / wn and one of 1 / (2 z wn), which is hardly told from
+    # a delay: the more it is damped, the less counts how wn and z share their ratio
+    z = max(1.0, fit.damping.value)
+    delay_sd_s, frequency_sd, damping_sd = sd_limits
     estimates = (
-        ("delay (s)", fit.delay_s, sd_limits[DELAY]),
-        ("natural frequency (rad/s)", frequency, sd_limits[FREQUENCY] * frequency.value),
-        ("damping", fit.damping, sd_limits[DAMPING]),
+        ("delay (s)", fit.delay_s, delay_sd_s * z),
+        ("natural frequency (rad/s)", frequency, frequency_sd * frequency.value * z**2),
+        ("damping", fit.damping, damping_sd * z**3),
     )
     for index, (name, estimate, limit) in enumerate(estimates):
         margin = 1e-3 * (UPPER[index] - LOWER[index])

@@ -53,7 +53,7 @@ AXES = ("tilt", "yaw")
 AXIS_BOUNDS = {
     "delay_s": (DELAY_LIMITS_S, DELAY_SLACK_S),
     "natural_frequency_radps": (FREQUENCY_LIMITS_RADPS, 0.0),
-    "damping": (DAMPING_LIMITS, 0.0),
+    "damping": (DAMPING_LIMITS, DAMPING_LIMITS[1]),
 }
 # Least and greatest value of each constant, whatever the vehicle file says; (limits, slack)
 BOUNDS = {f"{axis}_{name}": AXIS_BOUNDS[name] for axis in AXES for name in AXIS_BOUNDS} | {

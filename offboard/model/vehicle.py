@@ -25,7 +25,7 @@ NonNegativeTriple = tuple[
 HOVER_THRUST_LIMITS = (0.02, 0.95)
 DELAY_LIMITS_S = (0.0, 0.5)
 FREQUENCY_LIMITS_RADPS = (0.5, 60.0)
-DAMPING_LIMITS = (0.1, 3.0)
+DAMPING_LIMITS = (0.1, 6.0)
 DRAG_PER_MASS_MOST_PS = 100.0  # falls at 0.1 m/s: nothing is left to control
 
 

@@ -51,7 +51,7 @@ def estimate_with(found: Identified) -> VehicleEstimate:
 
 
 def test_what_a_file_may_have_is_adopted_and_nothing_else() -> None:
-    for frequency, damping, hover_thrust in ((0.5, 3.0, 0.02), (60.0, 0.1, 0.95)):
+    for frequency, damping, hover_thrust in ((0.5, 6.0, 0.02), (60.0, 0.1, 0.95)):
         tilt = AxisResponse(delay_s=0.5, natural_frequency_radps=frequency, damping=damping)
         constants = {"hover_thrust": hover_thrust, "tilt": tilt}
         file = Vehicle.model_validate(FILE.model_dump() | constants)
