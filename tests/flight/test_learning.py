@@ -164,7 +164,8 @@ def test_thrust_that_the_steps_do_not_show_is_identified_in_motion() -> None:
 
 
 @pytest.mark.parametrize(
-    ("frequency_radps", "damping", "error_m"), [(3.0, 0.8, 0.07), (6.8, 2.5, 0.06), (6.8, 3.4, 0.06)]
+    ("frequency_radps", "damping", "error_m"),
+    [(3.0, 0.8, 0.07), (6.8, 2.5, 0.06), (6.8, 3.4, 0.06)],
 )
 def test_slow_attitude_is_identified(
     frequency_radps: float, damping: float, error_m: float
