@@ -162,6 +162,8 @@ def truth(rows: Mapping[str, Rows], origin: Geodetic | None) -> Rows:
     """True positions of a simulated vehicle; empty without those, or without an origin."""
     kind, unit = next((each for each in _TRUTH.items() if len(rows[each[0]])), ("SIM_STATE", 1.0))
     known = rows[kind] if origin else rows[kind][:0]
+    placed = known["place"].any(axis=1)  # in MAVLink 1 SIM_STATE has no lat_int and lon_int
+    known = known if placed.all() else known[placed]
     return table(
         known, position_ned_m=in_parts(_true_position, known, unit, origin or Geodetic(0, 0))
     )

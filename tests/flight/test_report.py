@@ -246,6 +246,7 @@ def test_a_home_position_is_the_origin_only_without_another(
         codec.home_position_encode(*home, 500_000, 0.0, 0.0, 0.0, [1.0, 0.0, 0.0, 0.0], 0, 0, 0),
         codec.local_position_ned_encode(1000, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
         codec.sim_state_encode(1.0, *[0.0] * 14, 500.0, *[0.0] * 5, *home),
+        codec.sim_state_encode(1.0, *[0.0] * 14, 500.0, *[0.0] * 5, 0, 0),  # of MAVLink 1
     ]
     decided = ours.debug_float_array_encode(10**6, b"pso", RECORD_ID, [0.0] * 58)
     elsewhere = codec.gps_global_origin_encode(480_000_000, 80_000_000, 500_000)
