@@ -17,6 +17,7 @@ from offboard.mavlink.decode import DECODERS
 from offboard.mavlink.dialects.base import Dialect, WantedMessage
 from offboard.mavlink.events import (
     Attitude,
+    CommandAck,
     Event,
     Heartbeat,
     LocalPosition,
@@ -40,6 +41,8 @@ _FIRST_WAIT_S, _LONGEST_WAIT_S = 3.0, 30.0
 _OPTIONAL_TRIES = 2
 _STOPPED_S = 0.2  # a fast message that is missing for so long was stopped, or lost with the others
 _UNHEARD = 0.1  # of the rate wanted: what arrives more rarely has its default rate
+# ArduCopter denies a rate that its main loop (SCHED_LOOP_RATE) does not exceed; it does not say which
+RATE_DENIED = CommandAck(511, "DENIED")
 _ARRIVALS_MAX = 4096  # limits the memory used when a link is flooded
 
 
@@ -56,6 +59,7 @@ class Telemetry:
         self._frames = 0  # sent by the vehicle, as the sequence numbers show; modulo 256 the newest
         self._heard_s = -math.inf  # when the newest frame arrived
         self._mode_report = (0, -math.inf)  # number of the newest, and when it arrived
+        self._denied = False  # a request of a rate was
 
     def interpret(self, frame: Frame, now_s: float, events: list[Event]) -> None:
         """Add to `events` what a frame of the vehicle says that arrived at `now_s`."""
@@ -74,6 +78,7 @@ class Telemetry:
         elif isinstance(event, (Heartbeat, ModeReport)) and self._overtaken(number, now_s):
             return
         elif event is not None:
+            self._denied |= event == RATE_DENIED
             self._count(frame.message_id)
             events.append(event)
 
@@ -138,8 +143,8 @@ class Telemetry:
 
     def due(self) -> list[WantedMessage]:
         """Messages to request now; they count as requested."""
-        now_s = self.time.seconds
-        return [each.wanted for each in self._streams.values() if each.request(now_s)]
+        now_s, denied = self.time.seconds, self._denied
+        return [each.wanted for each in self._streams.values() if each.request(now_s, denied)]
 
     @property
     def rates_hz(self) -> dict[str, float]:
@@ -190,12 +195,16 @@ class _Stream:
         measured_s = min(_WINDOW_S, now_s - self.began_s)
         return len(self.arrivals_s) / measured_s if measured_s > 0.0 else 0.0
 
-    def request(self, now_s: float) -> bool:
-        """Whether to request it now; then it counts as requested."""
+    def request(self, now_s: float, denied: bool) -> bool:
+        """Whether to request it now; then it counts as requested. Where the vehicle has `denied` a
+        request, what does not arrive is requested at half its rate."""
         if self.requested_s is not None and not self._again(now_s - self.requested_s, now_s):
             return False
         if self.requests:
             self.wait_s = min(2.0 * self.wait_s, _LONGEST_WAIT_S)
+        if self.requests and denied and not self.arrivals_s and self.wanted.rate_hz > SLOW_HZ:
+            slower_hz = max(0.5 * self.wanted.rate_hz, SLOW_HZ)
+            self.wanted = replace(self.wanted, rate_hz=slower_hz)
         self.requested_s = now_s
         self.requests += 1
         return True

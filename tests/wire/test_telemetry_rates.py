@@ -78,6 +78,24 @@ def test_a_message_at_its_rate_is_requested_once_until_another_program_changes_i
     assert vehicle.requested_s[0] - 183.0 == pytest.approx(0.2, abs=0.03)
 
 
+def test_a_message_whose_rate_is_denied_is_requested_at_half_of_it() -> None:
+    """As by an ArduCopter with SCHED_LOOP_RATE 50, which was not flown. Without a denial a request
+    was lost."""
+    for denied, last_hz in ((True, 25.0), (False, 100.0)):
+        session = started()
+        sender, rates_hz = Sender(), []
+        for tick in range(1, 1200):
+            now_s = 0.01 * tick
+            requested = [m for m in session.poll(now_s) if isinstance(m, CommandLong)]
+            rates_hz += [1e6 / m.parameters[1] for m in requested if m.parameters[0] == POSITION]
+            if requested and denied:
+                session.receive(sender.ack(511, 2), PEER, now_s)
+            session.receive(sender.attitude(10 * tick), PEER, now_s)
+        assert rates_hz[0] == pytest.approx(100.0)
+        assert rates_hz[-1] == pytest.approx(last_hz)
+        assert len(rates_hz) == 3
+
+
 def test_link_time_follows_the_vehicle_or_host_time() -> None:
     link = VehicleTime()
     for i in range(11):  # 50 times faster, with a second stream that lags by 3 ms
