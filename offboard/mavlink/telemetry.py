@@ -41,7 +41,7 @@ _FIRST_WAIT_S, _LONGEST_WAIT_S = 3.0, 30.0
 _OPTIONAL_TRIES = 2
 _STOPPED_S = 0.2  # a fast message that is missing for so long was stopped, or lost with the others
 _UNHEARD = 0.1  # of the rate wanted: what arrives more rarely has its default rate
-# ArduCopter denies a rate that its main loop (SCHED_LOOP_RATE) does not exceed; it does not say which
+# ArduCopter denies a rate that its main loop, SCHED_LOOP_RATE, does not exceed, and not which one
 RATE_DENIED = CommandAck(511, "DENIED")
 _ARRIVALS_MAX = 4096  # limits the memory used when a link is flooded
 
