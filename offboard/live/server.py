@@ -17,11 +17,13 @@ from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
 
+import plotly.graph_objects as go
 from aiohttp import web
 from prometheus_client import CONTENT_TYPE_LATEST, Metric, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
 from prometheus_client.registry import Collector
 
+from offboard.analysis.page import BLUE, INK, STYLE, Figure, curve, panels, render
 from offboard.documents.arguments import join_address
 from offboard.link import clock
 from offboard.live.display import line
@@ -138,10 +140,46 @@ class _Refused(asyncio.Protocol):
         transport.abort()
 
 
+def page() -> str:
+    """The live page as text: figures without points, which its script fills from the events."""
+    return render(
+        "live/templates/live.html", title="Live flight",
+        figures={"plan": _plan(), "curves": _curves()},
+    )  # fmt: skip
+
+
+def _plan() -> Figure:
+    figure = go.Figure()
+    lines: tuple[tuple[str, dict[str, Any]], ...] = (
+        ("reference", {"color": INK, "dash": "dash", "width": 1.4}),
+        ("estimated", {"color": BLUE, "width": 2}),
+    )
+    for name, style in lines:
+        figure.add_trace(go.Scatter(x=[], y=[], mode="lines", name=name, line=style))
+    figure.add_trace(
+        go.Scatter(x=[], y=[], mode="markers", showlegend=False, marker={"color": BLUE, "size": 10})
+    )
+    # a vehicle at rest has no axis of millimetres
+    unseen = {"mode": "markers", "opacity": 0, "hoverinfo": "skip", "showlegend": False}
+    figure.add_trace(go.Scatter(x=[-1, 1], y=[-1, 1], **unseen))
+    figure.update_layout(template=STYLE, height=560)
+    figure.update_xaxes(title_text="east, m")
+    figure.update_yaxes(title_text="north, m", scaleanchor="x")
+    return Figure("Path from above", figure)
+
+
+def _curves() -> Figure:
+    figure = panels(
+        ("height, m", "distance from the reference, m", "link age, ms"), "vehicle time, s"
+    )
+    for place in (1, 2, 3):
+        curve(figure, place, [], [], "estimated", BLUE, showlegend=False)
+    figure.update_yaxes(rangemode="tozero", row=3)
+    return Figure("Curves", figure)
+
+
 def application(broadcast: Broadcast) -> web.Application:
     """The pages by their paths."""
-    from offboard.live.live_page import page
-
     shown = page()
 
     async def index(request: web.Request) -> web.Response:
