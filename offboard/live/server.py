@@ -39,7 +39,6 @@ CLIENT_QUEUE = 50  # snapshots that a client may be late
 CLIENT_S = 10.0  # in which a client must take one
 CONNECTIONS_MAX = 60  # those of clients that watch included
 CONNECTION_S = 5.0  # from its beginning to its end, unless the client watches
-LINE_MAX = 1 << 20
 _NICENESS = 5
 _TRACE = ("time_s", "position_ned_m", "reference_ned_m", "position_error_m", "telemetry_age_s")
 
@@ -218,7 +217,8 @@ async def serve(host: str, port: int) -> None:
         )
         bound = server.sockets[0].getsockname()[1]
         print(json.dumps({"url": f"http://{join_address(host, bound)}"}), flush=True)
-        await _read(broadcast)
+        while text := await asyncio.to_thread(sys.stdin.readline):
+            broadcast.publish(text.rstrip("\n"))
         server.close()
         broadcast.end()
         await asyncio.sleep(0.1)  # the clients take their last event
@@ -229,15 +229,6 @@ async def serve(host: str, port: int) -> None:
         print(json.dumps({"error": f"{reason}; choose another address"}), flush=True)
     finally:
         await runner.cleanup()
-
-
-async def _read(broadcast: Broadcast) -> None:
-    reader = asyncio.StreamReader(LINE_MAX)
-    await asyncio.get_running_loop().connect_read_pipe(
-        lambda: asyncio.StreamReaderProtocol(reader), sys.stdin
-    )
-    while text := await reader.readline():
-        broadcast.publish(text.decode().rstrip("\n"))
 
 
 if __name__ == "__main__":
