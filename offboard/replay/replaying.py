@@ -127,7 +127,6 @@ class Replay:
         self.count = 0
         self.recording = recording
         self._messages = iter(recording.log)
-        self._pieces = 0  # of the inputs, found among the messages
         self._crc, self._checked_s = 0, 0.0
         self._readings: Iterator[float] = iter(())
         self._read_s = 0.0
@@ -240,7 +239,6 @@ class Replay:
         if message.system_id != self.companion.session.senders.own.system_id:
             return False
         if message.component_id == RECORD_COMPONENT_ID:
-            self._pieces += record_type(message) == INPUTS_TYPE
             return True
         if message.component_id != COMPONENT_ID:
             return False
@@ -258,10 +256,9 @@ class Replay:
             thrusts.clear()
 
     def _drain(self) -> None:
-        """Note what was sent by the turns that the last piece of the inputs ends."""
-        while self._pieces < len(self.recording.inputs):
-            message = next(self._messages, None)
-            if message is None or not self._note(message):
+        """Note what the last turns have sent."""
+        for message in self._messages:
+            if not self._note(message):
                 return
 
     def _cut(self) -> None:
