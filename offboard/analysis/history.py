@@ -11,8 +11,10 @@ import struct
 from collections import Counter
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from offboard.analysis import columns
-from offboard.analysis.columns import OURS, THEIRS, Rows, Samples
+from offboard.analysis.columns import OURS, THEIRS, Array, Rows, Samples
 from offboard.analysis.tlog import LoggedMessage, Tlog
 from offboard.documents.errors import UserError
 from offboard.flight import record
@@ -115,6 +117,11 @@ class History:
     substitutes: tuple[str, ...] = ()
     damage: str = ""
     damage_s: float = math.nan
+
+    def estimates(self, constant: str) -> tuple[Array, Array]:
+        """Times (N,) at which a constant was identified, and its value and sd (N, 2)."""
+        known = self.identified[np.isfinite(self.identified[constant][:, 0])]
+        return known["time_s"], known[constant].astype(np.float64)
 
     def events(self) -> list[Event]:
         """Phases, announcements, modes and messages of the vehicle in the order of time; what came

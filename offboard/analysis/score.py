@@ -309,9 +309,9 @@ def link_metrics(flown: History, track: Track | None) -> dict[str, float]:
         values["setpoint_gap_max_s"] = float(np.diff(sent["time_s"]).max(initial=0.0))
         values["setpoint_gap_wall_max_s"] = float(np.diff(sent["unix_s"]).max(initial=0.0))
     values |= _named("link_delay_{}_ms", "p50 p99", 1e3 * flown.link_delay["delay_s"])
-    delay_s = flown.identified["tilt_delay_s"]
-    if len(delay_s := delay_s[np.isfinite(delay_s[:, 0])]):
-        values["delay_ms"], values["delay_sd_ms"] = (1e3 * delay_s[-1].astype(float)).tolist()
+    _, delays_s = flown.estimates("tilt_delay_s")
+    if len(delays_s):
+        values["delay_ms"], values["delay_sd_ms"] = (1e3 * delays_s[-1]).tolist()
     if track is None:
         return values
     for name, rows in (("position", flown.position), ("attitude", flown.attitude)):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -81,10 +80,9 @@ def _identified(history: History) -> str:
         ("hover_thrust", "hover thrust {:.3f}"),
         ("drag_ps", "drag {:.2f} 1/s"),
     ):
-        values = history.identified[constant][:, 0]
-        values = values[np.isfinite(values)]
-        if len(values):
-            texts.append(text.format(values[-1] * (1e3 if "ms" in text else 1.0)))
+        _, estimates = history.estimates(constant)
+        if len(estimates):
+            texts.append(text.format(estimates[-1, 0] * (1e3 if "ms" in text else 1.0)))
     return ", ".join(texts)
 
 

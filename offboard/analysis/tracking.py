@@ -127,6 +127,11 @@ class Reference:
             found += weight[:, None] * self._rows[_DERIVATIVES[order]][begins + end]
         return found
 
+    def errors(self, rows: Rows, column: str, derivative: int = 0) -> Array:
+        """(N, 3) of a column of `rows`: how far it is from the position or a derivative of it."""
+        errors: Array = rows[column] - self.position(rows["time_s"], derivative)
+        return errors
+
     def heading(self, times: Array) -> Array:
         return np.interp(times, self._times, self._heading)
 
@@ -153,12 +158,9 @@ Measured = tuple[str, str, Measure]  # pattern of the names, the kinds that take
 
 def _away(column: str, derivative: int = 0) -> Measure:
     """Distance from the reference, or from a derivative of it."""
-
-    def distances(rows: Rows, reference: Reference) -> Array:
-        errors = rows[column] - reference.position(rows["time_s"], derivative)
-        return np.asarray(np.linalg.norm(errors, axis=1))
-
-    return distances
+    return lambda rows, reference: np.asarray(
+        np.linalg.norm(reference.errors(rows, column, derivative), axis=1)
+    )
 
 
 def _turned_deg(rows: Rows, reference: Reference) -> Array:

@@ -14,12 +14,11 @@ from rich.console import Console
 from rich.status import Status
 
 from offboard.analysis.score import Requirement
-from offboard.campaign.campaign_page import page
 from offboard.campaign.cases import Case, expand
 from offboard.campaign.document import CampaignFile, Promises
 from offboard.campaign.flight import Job
 from offboard.campaign.results import Record, Results, code_hash
-from offboard.campaign.table import Row, as_csv, columns, groups, row_of
+from offboard.campaign.table import Row, as_csv, columns, groups, page, row_of
 from offboard.campaign.workers import Flyer, OpenFlyer
 from offboard.documents.errors import DocumentError, UserError, counted, naming
 from offboard.link import clock

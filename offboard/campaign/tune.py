@@ -20,13 +20,13 @@ from pydantic import AfterValidator, Field
 from scipy import stats
 
 from offboard.campaign.cases import DIGITS, SCENARIO, Case, Values, expand
-from offboard.campaign.document import CampaignFile, Firmware, Name, Names, Ranges, Seed, Seeds
+from offboard.campaign.document import CampaignFile, Ends, Firmware, Key, Name, Names, Seed, Seeds
 from offboard.campaign.run import Fly, check
 from offboard.campaign.search import ask, study_of
 from offboard.campaign.table import CONFIDENCE, METRIC_COLUMNS
 from offboard.documents.errors import DocumentError, naming, plain
 from offboard.documents.parameters import Parameters
-from offboard.documents.reading import load_document, override, read
+from offboard.documents.reading import override, read
 from offboard.documents.shipped import PARTS, locate, read_text
 from offboard.run.configuration import read_part
 
@@ -36,6 +36,12 @@ def _metric(name: str) -> str:
         known = ", ".join(METRIC_COLUMNS)
         raise ValueError(f"{name!r} is no metric of a lockstep flight; there are {known}")
     return name
+
+
+def _tuned(key: str) -> str:
+    if key.startswith((SCENARIO, "vehicle.")):
+        raise ValueError("no scenario and no vehicle is tuned")
+    return key
 
 
 class Flights(Parameters):
@@ -53,7 +59,7 @@ class TuneFile(Parameters):
     config: Name = "flight"
     controller: Name | None = None
     firmware: Firmware = "px4"
-    ranges: Ranges
+    ranges: Annotated[dict[Annotated[Key, AfterValidator(_tuned)], Ends], Field(min_length=1)]
     training: Flights
     validation: Flights
     objective: Annotated[str, AfterValidator(_metric)] = "rmse_position_m"
@@ -92,15 +98,6 @@ def judge(base: Sequence[float], candidate: Sequence[float], values: Values = ()
     if np.any(after != before):
         p_value = float(stats.wilcoxon(after, before, alternative="less").pvalue)
     return Tuned(values, len(before), float(before.mean()), float(after.mean()), p_value)
-
-
-def read_tune(name: str) -> tuple[TuneFile, str]:
-    """A shipped tuning or a file, and its path for errors. Raises DocumentError."""
-    file, source = load_document(name, "tuning", TuneFile)
-    for key in file.ranges:
-        if key.startswith((SCENARIO, "vehicle.")):
-            raise DocumentError(f"{source}: ranges.{key}: no scenario and no vehicle is tuned")
-    return file, source
 
 
 class Tuning:

@@ -236,11 +236,12 @@ def tune(
         from offboard.campaign.document import Promises
         from offboard.campaign.results import Results, code_hash
         from offboard.campaign.run import Progress, flying
-        from offboard.campaign.tune import Tuning, read_tune
+        from offboard.campaign.tune import TuneFile, Tuning
         from offboard.campaign.tune import profile as text_of
         from offboard.campaign.workers import local_workers
+        from offboard.documents.reading import load_document
 
-        tuning = Tuning(*read_tune(file))
+        tuning = Tuning(*load_document(file, "tuning", TuneFile))
         results = Results(profile.with_name(f"{profile.name}.tune"), code_hash())
     progress = Progress(out, tuning.flights)
     with flying(results, Promises(), partial(local_workers, workers), progress) as fly:

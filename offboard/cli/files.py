@@ -38,7 +38,7 @@ def _checked(path: Path) -> str:
     flight's by its own. Raises DocumentError."""
     from offboard.campaign.cases import base_cases
     from offboard.campaign.document import CampaignFile
-    from offboard.campaign.tune import planned, read_tune
+    from offboard.campaign.tune import TuneFile, planned
     from offboard.documents.reading import kind_of, load_document, read
     from offboard.run.configuration import build_track, load, read_part
     from offboard.run.sitl import check_scenario
@@ -56,7 +56,7 @@ def _checked(path: Path) -> str:
     elif kind == "scenario":
         check_scenario(text, str(path))
     elif kind == "tuning":
-        tuning, source = read_tune(name)
+        tuning, source = load_document(name, "tuning", TuneFile)
         with naming(source):
             planned(tuning)
     elif kind == "campaign":

@@ -14,7 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from offboard import compiled as compilation
-from offboard.doctor.link_checks import blocks, ok, warn
+from offboard.doctor.checks import Check, blocks, ok, warn
 from offboard.doctor.listening import Observation
 from offboard.documents.errors import DocumentError
 from offboard.flight.preflight import Finding
@@ -142,3 +142,6 @@ def _sleep() -> float:
     began_s = clock.monotonic_s()
     threading.Event().wait(SLEEP_S)
     return clock.monotonic_s() - began_s - SLEEP_S
+
+
+OF_COMPUTER: tuple[Check, ...] = (disk, compiled, computer)

@@ -17,9 +17,8 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import TypeVar
 
-from offboard.doctor import computer, link_checks, vehicle_checks
-from offboard.doctor.computer import holders
-from offboard.doctor.link_checks import wait
+from offboard.doctor.checks import OF_FLIGHT, OF_LINK, OF_VEHICLE, Check, wait
+from offboard.doctor.computer import OF_COMPUTER, holders
 from offboard.doctor.listening import LONGEST_S, Listening, Observation
 from offboard.documents.errors import Unavailable, UserError, located, shown
 from offboard.flight import preflight
@@ -33,36 +32,13 @@ from offboard.run.configuration import FlightConfig
 from offboard.run.flight import Connection
 
 Result = TypeVar("Result")
-Check = Callable[[Observation], Iterable[Finding]]
 POLL_S = 0.02
 # The command ends within 15 s: what takes longer is left out, and a row says so
 OPEN_S = 2.0  # to open the link, before listening
 LOOK_S = 12.5  # from the beginning to the end of the checks
 LEAST_S = 0.1  # for a check, however late it is
 
-# In the order of a signal: link, vehicle, flight, computer
-OF_LINK: tuple[Check, ...] = (link_checks.port, link_checks.vehicle)
-OF_VEHICLE: tuple[Check, ...] = (
-    link_checks.senders,
-    link_checks.uplink,
-    link_checks.delay,
-    link_checks.loss,
-    link_checks.bandwidth,
-    link_checks.rates,
-    link_checks.clock,
-    vehicle_checks.firmware,
-    vehicle_checks.state,
-    vehicle_checks.estimator,
-    vehicle_checks.gps,
-    vehicle_checks.prearm,
-    vehicle_checks.battery,
-    vehicle_checks.parameters,
-)
-OF_COMPUTER: tuple[Check, ...] = (computer.disk, computer.compiled, computer.computer)
-CHECKS = {
-    check.__name__: check
-    for check in (*OF_LINK, *OF_VEHICLE, vehicle_checks.configuration, *OF_COMPUTER)
-}
+CHECKS = {each.__name__: each for each in (*OF_LINK, *OF_VEHICLE, *OF_FLIGHT, *OF_COMPUTER)}
 
 GROUP = "pso_offboard.checks"  # entry points of other packages: name and function of a check
 AUTHOR = "report this to whoever wrote the check"

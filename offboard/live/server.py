@@ -17,11 +17,13 @@ from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
 
+import plotly.graph_objects as go
 from aiohttp import web
 from prometheus_client import CONTENT_TYPE_LATEST, Metric, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
 from prometheus_client.registry import Collector
 
+from offboard.analysis.page import BLUE, INK, STYLE, Figure, curve, panels, render
 from offboard.documents.arguments import join_address
 from offboard.link import clock
 from offboard.live.display import line
@@ -37,7 +39,6 @@ CLIENT_QUEUE = 50  # snapshots that a client may be late
 CLIENT_S = 10.0  # in which a client must take one
 CONNECTIONS_MAX = 60  # those of clients that watch included
 CONNECTION_S = 5.0  # from its beginning to its end, unless the client watches
-LINE_MAX = 1 << 20
 _NICENESS = 5
 _TRACE = ("time_s", "position_ned_m", "reference_ned_m", "position_error_m", "telemetry_age_s")
 
@@ -138,10 +139,46 @@ class _Refused(asyncio.Protocol):
         transport.abort()
 
 
+def page() -> str:
+    """The live page as text: figures without points, which its script fills from the events."""
+    return render(
+        "live/templates/live.html", title="Live flight",
+        figures={"plan": _plan(), "curves": _curves()},
+    )  # fmt: skip
+
+
+def _plan() -> Figure:
+    figure = go.Figure()
+    lines: tuple[tuple[str, dict[str, Any]], ...] = (
+        ("reference", {"color": INK, "dash": "dash", "width": 1.4}),
+        ("estimated", {"color": BLUE, "width": 2}),
+    )
+    for name, style in lines:
+        figure.add_trace(go.Scatter(x=[], y=[], mode="lines", name=name, line=style))
+    figure.add_trace(
+        go.Scatter(x=[], y=[], mode="markers", showlegend=False, marker={"color": BLUE, "size": 10})
+    )
+    # a vehicle at rest has no axis of millimetres
+    unseen = {"mode": "markers", "opacity": 0, "hoverinfo": "skip", "showlegend": False}
+    figure.add_trace(go.Scatter(x=[-1, 1], y=[-1, 1], **unseen))
+    figure.update_layout(template=STYLE, height=560)
+    figure.update_xaxes(title_text="east, m")
+    figure.update_yaxes(title_text="north, m", scaleanchor="x")
+    return Figure("Path from above", figure)
+
+
+def _curves() -> Figure:
+    figure = panels(
+        ("height, m", "distance from the reference, m", "link age, ms"), "vehicle time, s"
+    )
+    for place in (1, 2, 3):
+        curve(figure, place, [], [], "estimated", BLUE, showlegend=False)
+    figure.update_yaxes(rangemode="tozero", row=3)
+    return Figure("Curves", figure)
+
+
 def application(broadcast: Broadcast) -> web.Application:
     """The pages by their paths."""
-    from offboard.live.live_page import page
-
     shown = page()
 
     async def index(request: web.Request) -> web.Response:
@@ -180,7 +217,8 @@ async def serve(host: str, port: int) -> None:
         )
         bound = server.sockets[0].getsockname()[1]
         print(json.dumps({"url": f"http://{join_address(host, bound)}"}), flush=True)
-        await _read(broadcast)
+        while text := await asyncio.to_thread(sys.stdin.readline):
+            broadcast.publish(text.rstrip("\n"))
         server.close()
         broadcast.end()
         await asyncio.sleep(0.1)  # the clients take their last event
@@ -191,15 +229,6 @@ async def serve(host: str, port: int) -> None:
         print(json.dumps({"error": f"{reason}; choose another address"}), flush=True)
     finally:
         await runner.cleanup()
-
-
-async def _read(broadcast: Broadcast) -> None:
-    reader = asyncio.StreamReader(LINE_MAX)
-    await asyncio.get_running_loop().connect_read_pipe(
-        lambda: asyncio.StreamReaderProtocol(reader), sys.stdin
-    )
-    while text := await reader.readline():
-        broadcast.publish(text.decode().rstrip("\n"))
 
 
 if __name__ == "__main__":

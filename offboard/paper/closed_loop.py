@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 from offboard.compiled import array, entry
 from offboard.control.quadratic import ExactMinimum
 from offboard.control.swarm import certify
-from offboard.documents import shipped
-from offboard.documents.reading import parse
 from offboard.link.clock import monotonic_s
 from offboard.model.axes import LinearModel
 from offboard.model.command import PredictedState
@@ -45,8 +43,7 @@ from offboard.model.rigid_body import (
     rk4_into,
     sampled_matrices,
 )
-from offboard.model.vehicle import Vehicle
-from offboard.paper.controller import flyable_box, heading_frame
+from offboard.paper.controller import flyable_box, heading_frame, paper_vehicle
 from offboard.paper.law import INTEGRATED, PAPER_STEP_S, PaperLaw, PaperSettings
 from offboard.reference.base import FlatSample
 from offboard.reference.path import Smoothness
@@ -83,13 +80,6 @@ def reference_states(hover: bool, steps: int) -> Array:
 
 
 # ---------------------------------------------------------------------- plants
-
-
-@cache
-def paper_vehicle() -> Vehicle:
-    """Table 1 and the arm that Eq. 16 requires: the shipped vehicle file `paper`."""
-    file = shipped.directory() / "vehicles" / "paper.yaml"
-    return parse(file.read_text(encoding="utf-8"), Vehicle, str(file))
 
 
 @cache

@@ -7,6 +7,7 @@ the attitude that the model predicts for k+1 is sent; the autopilot's attitude l
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Literal
 
 import numpy as np
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from offboard.control.base import ControllerSettings, Decision, DecisionError, Situation
 from offboard.control.quadratic import ExactMinimum
 from offboard.control.swarm import certify
+from offboard.documents.reading import load_document
 from offboard.model.command import Command, PredictedState
 from offboard.model.frames import (
     quaternion_from_euler,
@@ -23,15 +25,7 @@ from offboard.model.frames import (
 )
 from offboard.model.rigid_body import PHI, PSI, THETA, THRUST, P, R, U, W, X, Z, sampled_matrices
 from offboard.model.vehicle import Vehicle
-from offboard.paper.law import (
-    PAPER_ARM_M,
-    PAPER_INERTIA_KGM2,
-    PAPER_MASS_KG,
-    PAPER_STEP_S,
-    Move,
-    PaperLaw,
-    PaperSettings,
-)
+from offboard.paper.law import PAPER_STEP_S, Move, PaperLaw, PaperSettings
 from offboard.reference.base import FlatSample
 
 Array = NDArray[np.float64]
@@ -97,7 +91,7 @@ class PaperController:
 
     def _command(self, move: Move, target_heading_rad: float) -> Command:
         gravity, limit = self._vehicle.gravity_mps2, self._vehicle.thrust_max_mps2
-        thrust = gravity + float(move.inputs[THRUST]) / PAPER_MASS_KG
+        thrust = gravity + float(move.inputs[THRUST]) / paper_vehicle().mass_kg
         phi, theta, psi = move.following[PHI : PSI + 1].tolist()
         heading = target_heading_rad + psi
         attitude = quaternion_from_euler(phi, theta, heading)
@@ -105,21 +99,28 @@ class PaperController:
         return Command(min(max(thrust, 0.0), limit), (north, east, down), wrap_pi(heading))
 
 
+@cache
+def paper_vehicle() -> Vehicle:
+    """Table 1 and the arm that Eq. 16 requires: the shipped vehicle file `paper`."""
+    return load_document("paper", "vehicle", Vehicle)[0]
+
+
 def input_scale(vehicle: Vehicle) -> Array:
     """Factor (4,) from inputs of the paper's vehicle (Eq. 6) to those of `vehicle` that cause the
     same accelerations, in translation and in rotation."""
-    arms = np.array([vehicle.arm_m / PAPER_ARM_M, vehicle.arm_m / PAPER_ARM_M, 1.0])
-    inertia = np.array(vehicle.inertia_kgm2) / np.array(PAPER_INERTIA_KGM2)
-    return np.concatenate([[vehicle.mass_kg / PAPER_MASS_KG], inertia / arms])
+    paper = paper_vehicle()
+    arms = np.array([vehicle.arm_m / paper.arm_m, vehicle.arm_m / paper.arm_m, 1.0])
+    inertia = np.array(vehicle.inertia_kgm2) / np.array(paper.inertia_kgm2)
+    return np.concatenate([[vehicle.mass_kg / paper.mass_kg], inertia / arms])
 
 
 def flyable_box(vehicle: Vehicle, settings: PaperSettings) -> tuple[Array, Array]:
     """Lower and upper (4,) of the settings, with f_t limited to a total thrust between 0 and the
     vehicle's maximum (cf. Eq. 26)."""
     lower, upper = np.array(settings.lower), np.array(settings.upper)
-    hover = vehicle.gravity_mps2
-    lower[THRUST] = max(lower[THRUST], -PAPER_MASS_KG * hover)
-    upper[THRUST] = min(upper[THRUST], PAPER_MASS_KG * (vehicle.thrust_max_mps2 - hover))
+    hover, mass_kg = vehicle.gravity_mps2, paper_vehicle().mass_kg
+    lower[THRUST] = max(lower[THRUST], -mass_kg * hover)
+    upper[THRUST] = min(upper[THRUST], mass_kg * (vehicle.thrust_max_mps2 - hover))
     return lower, upper
 
 

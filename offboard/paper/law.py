@@ -34,9 +34,6 @@ TwelveWeights = tuple[
 ]
 
 PAPER_STEP_S = 0.1  # with which Eq. 16 is reproduced; the paper prints 0.05
-PAPER_MASS_KG = 0.4  # Table 1
-PAPER_INERTIA_KGM2 = (0.0196, 0.0196, 0.0264)  # Table 1
-PAPER_ARM_M = 0.225  # not in Table 1; Eq. 16 is reproduced only with it
 
 INTEGRATED = (X, X + 1, Z, PSI)  # indices in Eq. 5
 _MOVING = [PHI, THETA, P, Q, R, U, V, W]  # in the hover model independent of position and heading

@@ -15,13 +15,8 @@ from numpy.typing import NDArray
 
 from offboard.model.rigid_body import sampled_matrices
 from offboard.paper import printed
-from offboard.paper.closed_loop import (
-    Flight,
-    Flights,
-    PlantKind,
-    damped,
-    paper_vehicle,
-)
+from offboard.paper.closed_loop import Flight, Flights, PlantKind, damped
+from offboard.paper.controller import paper_vehicle
 from offboard.paper.law import PaperSettings
 
 Array = NDArray[np.float64]

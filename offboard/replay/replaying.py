@@ -127,8 +127,6 @@ class Replay:
         self.count = 0
         self.recording = recording
         self._messages = iter(recording.log)
-        self._pieces = 0  # of the inputs, found among the messages
-        self._leaving: list[Sent] = []  # by the newest turn
         self._crc, self._checked_s = 0, 0.0
         self._readings: Iterator[float] = iter(())
         self._read_s = 0.0
@@ -157,7 +155,6 @@ class Replay:
             for entry in self.recording.entries():
                 match entry:
                     case TurnInput():
-                        self._leave()
                         turn = self._turn(entry)
                         if turn is None:
                             break
@@ -166,7 +163,6 @@ class Replay:
                         self._obey(kind, *values)
         except InputsError as error:
             self.stopped = str(error)
-        self._leave()
         self._drain()
         if self.stopped or not self.companion.has_ended():
             self._cut()
@@ -174,7 +170,7 @@ class Replay:
     def _obey(self, kind: str, value: Any, *arguments: Any) -> None:
         """What came between two turns."""
         if kind == DROPPED:
-            del self._leaving[len(self._leaving) - value :]
+            del self.replayed[len(self.replayed) - value :]  # they are of the newest turn
             self.companion.on_dropped(value)
         elif kind == OTHERS:
             self.companion.other_datagrams = value
@@ -206,7 +202,7 @@ class Replay:
         frames = self._frames(chunks, given.now_s)
         self.ended_s = self.companion.time_s
         if frames is not None:
-            self._leaving = [self._sent(frame) for frame in frames]
+            self.replayed += map(self._sent, frames)
             self.companion.finish_turn(math.nan)  # it was not sent
         return given, received
 
@@ -224,10 +220,6 @@ class Replay:
     def _sent(self, frame: bytes) -> Sent:
         kind, payload = message_id_of(frame), payload_of(frame)
         return Sent(self.companion.time_s, kind, payload, self.count)
-
-    def _leave(self) -> None:
-        self.replayed += self._leaving
-        self._leaving = []
 
     # ------------------------------------------------------------------ the log
 
@@ -247,7 +239,6 @@ class Replay:
         if message.system_id != self.companion.session.senders.own.system_id:
             return False
         if message.component_id == RECORD_COMPONENT_ID:
-            self._pieces += record_type(message) == INPUTS_TYPE
             return True
         if message.component_id != COMPONENT_ID:
             return False
@@ -265,10 +256,9 @@ class Replay:
             thrusts.clear()
 
     def _drain(self) -> None:
-        """Note what was sent by the turns that the last piece of the inputs ends."""
-        while self._pieces < len(self.recording.inputs):
-            message = next(self._messages, None)
-            if message is None or not self._note(message):
+        """Note what the last turns have sent."""
+        for message in self._messages:
+            if not self._note(message):
                 return
 
     def _cut(self) -> None:

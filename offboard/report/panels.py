@@ -63,9 +63,8 @@ def _away(array: str, axis: int | None = None) -> Source:
         rows, reference = each_once(getattr(flown, array)), Reference.of(flown)
         if reference is None:
             return np.zeros(0), np.zeros(0)
-        near = reference.is_near(rows["time_s"])
-        errors = np.full((len(rows), 3), np.nan)
-        errors[near] = rows["position_ned_m"][near] - reference.position(rows["time_s"][near])
+        errors = reference.errors(rows, "position_ned_m")
+        errors[~reference.is_near(rows["time_s"])] = np.nan
         values = np.linalg.norm(errors, axis=1) if axis is None else errors[:, axis]
         return rows["time_s"], np.asarray(values)
 
@@ -97,9 +96,9 @@ def _intervals_ms(flown: History) -> Points:
 
 def _identified(constant: str, scale: float = 1.0) -> Source:
     def samples(flown: History) -> Points:
-        known = flown.identified[np.isfinite(flown.identified[constant][:, 0])]
-        value, sd = scale * known[constant].T
-        return known["time_s"], value, sd
+        times, estimates = flown.estimates(constant)
+        value, sd = scale * estimates.T
+        return times, value, sd
 
     return samples
 

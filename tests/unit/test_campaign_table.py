@@ -16,13 +16,12 @@ from browser import opening
 from rich.console import Console
 
 from offboard.campaign import workers
-from offboard.campaign.campaign_page import TABLE_METRICS, page
 from offboard.campaign.cases import Case
 from offboard.campaign.document import CampaignFile, Promises
 from offboard.campaign.flight import LOWEST, Job, terms
 from offboard.campaign.results import Record
 from offboard.campaign.run import Campaign
-from offboard.campaign.table import Group, groups, row_of, show
+from offboard.campaign.table import TABLE_METRICS, Group, groups, page, row_of, show
 from offboard.campaign.workers import ConnectedVehicle
 
 LAWS = ("pso", "lqr", "an/uncommonly/long/name.yaml", "lost")

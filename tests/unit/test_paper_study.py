@@ -30,8 +30,8 @@ from offboard.paper.closed_loop import (
     linear_plant,
     nonlinear_plant,
     paper_model,
-    paper_vehicle,
 )
+from offboard.paper.controller import paper_vehicle
 from offboard.paper.extensions import receding
 from offboard.paper.law import LimitedBox, PaperLaw, PaperSettings, StateLimits
 from offboard.paper.study import MAKERS, PAGE, reproduce

@@ -19,7 +19,7 @@ from offboard.campaign.flight import Job
 from offboard.campaign.results import Record, Results
 from offboard.campaign.run import Campaign, Fly, Incomplete, Progress, flying
 from offboard.campaign.search import Failure, FailureSearch, as_csv
-from offboard.campaign.tune import Tuned, Tuning, judge, profile, read_tune
+from offboard.campaign.tune import Tuned, TuneFile, Tuning, judge, profile
 from offboard.documents.errors import DocumentError, UserError
 from offboard.documents.reading import load_document
 from offboard.run.configuration import load
@@ -165,7 +165,7 @@ def tuned(
 ) -> Tuned:
     directory.mkdir(exist_ok=True)
     (directory / "tune.yaml").write_text(text)
-    tuning = Tuning(*read_tune(str(directory / "tune.yaml")))
+    tuning = Tuning(*load_document(str(directory / "tune.yaml"), "tuning", TuneFile))
     with known(Results(directory / "study", "0123456789ab"), Known(bowl, most)) as fly:
         return tuning.run(fly, told)
 
@@ -184,7 +184,7 @@ def test_the_minimum_is_found_and_confirmed_and_its_profile_is_a_configuration(
     assert found.flights == 12
     assert found.better, str(found)
     file = tmp_path / "profile.yaml"
-    file.write_text(profile(read_tune(str(tuning))[0], found))
+    file.write_text(profile(load_document(str(tuning), "tuning", TuneFile)[0], found))
     config = load(str(file), known_vehicle="px4_sih").model_dump()
     shipped = load("flight", known_vehicle="px4_sih").model_dump()
     assert config["controller"]["bandwidth_radps"] == dict(found.values)[BANDWIDTH]
