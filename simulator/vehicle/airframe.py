@@ -1,8 +1,8 @@
 """Airframe: rotors, ground contact and battery charge around the rigid body.
 
 The rigid body (mass, drag relative to the air) is `offboard.model.rigid_body`. This module adds
-what the controller's model does not have: rotor lag, loss of torque at low thrust, ground, ground
-effect, charge consumed. Compiled. Knows no autopilot, no estimate and no randomness.
+what the controller's model does not have: rotor lag, loss of torque at low thrust, ground, charge
+consumed. Compiled. Knows no autopilot, no estimate and no randomness.
 """
 
 from __future__ import annotations
@@ -30,9 +30,6 @@ _AUTHORITY_SHARE = 0.2
 # Landing gear: friction, so that wind does not move a landed vehicle, and levelling.
 _FRICTION = 1.5
 _LEVELLING_TIME_S = 0.1
-# Ground effect (Cheeseman and Bennett 1955): rotor radius, height of the rotors when landed.
-_ROTOR_RADIUS_M = 0.12
-_ROTOR_HEIGHT_M = 0.10
 # Rate times substep: explicit Runge-Kutta is stable to 2.78, and every vehicle file stays below.
 _STIFFNESS_LIMIT = 0.5
 
@@ -43,7 +40,7 @@ def build_airframe(vehicle: Vehicle, conditions: Conditions) -> tuple[Array, Arr
 
     Returns those of the body, as `offboard.model.rigid_body.pack` has them; of the rotors: thrust
     at full throttle N, factor of the lag in a step, thrust above which torques are full, hover
-    thrust, hover current A, ground effect 0/1; and the substeps of a step.
+    thrust, hover current A; and the substeps of a step.
     """
     body = pack(vehicle, conditions.quadratic_drag_npmps2)
     lag_s = vehicle.thrust_lag_s
@@ -54,7 +51,6 @@ def build_airframe(vehicle: Vehicle, conditions: Conditions) -> tuple[Array, Arr
             _AUTHORITY_SHARE * vehicle.hover_thrust,
             vehicle.hover_thrust,
             conditions.battery.hover_current_a,
-            float(conditions.ground_effect),
         ]
     )
     body[0] *= conditions.mass_scale
@@ -73,7 +69,7 @@ def advance_airframe(plant: Any, thrust_demand: float) -> None:
     rotor[THRUST] = thrust_demand + (before - thrust_demand) * rotor_constants[1]
     mean = 0.5 * (before + rotor[THRUST])
     north, east, down = body[7], body[8], body[9]
-    inputs[0] = rotor_constants[0] * mean * _ground_gain(body[12], rotor_constants[5])
+    inputs[0] = rotor_constants[0] * mean
     # On the ground it does not rotate
     authority = 0.0 if rotor[CONTACT] > 0.5 else min(mean / rotor_constants[2], 1.0)
     _torques(body, plant.turn, authority, body_constants, inputs)
@@ -97,13 +93,6 @@ def advance_airframe(plant: Any, thrust_demand: float) -> None:
     rotor[4] = (body[8] - east) / STEP_S
     rotor[5] = (body[9] - down) / STEP_S
     rotor[CHARGE] += rotor_constants[4] * (mean / rotor_constants[3]) ** 1.5 * STEP_S
-
-
-@kernel
-def _ground_gain(down_m: float, enabled: float) -> float:
-    height = _ROTOR_HEIGHT_M + max(-down_m, 0.0)
-    gain: float = 1.0 / (1.0 - enabled * (_ROTOR_RADIUS_M / (4.0 * height)) ** 2)
-    return gain
 
 
 @kernel

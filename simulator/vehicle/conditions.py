@@ -59,7 +59,6 @@ class Conditions(Parameters):
     # of each body axis by itself, q |u| u beside the vehicle's linear drag, as ArduPilot SITL's
     # Frame::calculate_forces has it
     quadratic_drag_npmps2: float = Field(default=0.0, ge=0, le=1)
-    ground_effect: bool = False
     battery: Battery = Battery()
     # vehicle clock at the start; its 32-bit milliseconds wrap at 4294967.296 s
     clock_start_s: float = Field(default=0.0, ge=0, le=1e8)

@@ -64,7 +64,7 @@ RECORD = np.dtype(
         ("gains", "f8", (4, 3)),
         # constants
         ("body_constants", "f8", 13),
-        ("rotor_constants", "f8", 6),
+        ("rotor_constants", "f8", 5),
         ("air", "f8", 5),
         ("error_transition", "f8", (ERROR_COUNT, ERROR_COUNT)),
         ("error_scale", "f8", (ERROR_COUNT, ERROR_COUNT)),

@@ -94,12 +94,6 @@ def _down_velocity(truth) -> float:
     return truth.velocity_ned_mps[2]
 
 
-def _climbing(thrust: float, duration_s: float, **more) -> Plant:
-    plant = Plant(PX4, Conditions(**more), 1)
-    plant.advance(duration_s, Demand(True, thrust, LEVEL))
-    return plant
-
-
 # Mean vertical acceleration, up, in m/s^2 from so many seconds after a step of the thrust to so
 # many. PX4: the means of its steps up and down; ArduCopter: with its drag
 @pytest.mark.parametrize(
@@ -170,7 +164,8 @@ def test_vehicle_stays_on_the_ground_below_its_weight(share):
 
 
 def test_crash_upside_down_at_speed_is_survived_and_ends_level():
-    plant = _climbing(0.9, 4.0)
+    plant = Plant(PX4, Conditions(), 1)
+    plant.advance(4.0, Demand(True, 0.9, LEVEL))
     plant.advance(0.8, Demand(True, 0.5, attitude(roll_deg=180.0, yaw_deg=40.0)))
     assert thrust_direction_from_quaternion(plant.truth.attitude)[2] < 0.0
     _, heights = response(plant, Demand(False), 6.0, lambda t: -t.position_ned_m[2])
@@ -181,14 +176,6 @@ def test_crash_upside_down_at_speed_is_survived_and_ends_level():
     assert thrust_direction_from_quaternion(truth.attitude) == pytest.approx([0, 0, 1], abs=1e-9)
     assert np.linalg.norm(truth.attitude) == pytest.approx(1.0, abs=1e-12)
     assert np.abs(truth.velocity_ned_mps).max() < 1e-12
-
-
-def test_ground_effect_lifts_near_the_ground_only():
-    share = 0.96  # of hover thrust: flies in ground effect and not without it
-    assert not _climbing(share * PX4.hover_thrust, 2.0, ground_effect=True).on_ground
-    assert _climbing(share * PX4.hover_thrust, 2.0).on_ground
-    high = _climbing(share * PX4.hover_thrust, 60.0, ground_effect=True).truth
-    assert 0.0 < -high.position_ned_m[2] < 0.3
 
 
 def test_battery_empties_by_the_current_and_sags_under_load():
@@ -219,7 +206,6 @@ ROUGH = Conditions(
     estimator="px4_like",
     wind_ned_mps=(3.0, 1.0, 0.0),
     gusts={"intensity_mps": 1.5},
-    ground_effect=True,
 )
 
 
