@@ -17,9 +17,11 @@ from simulator.autopilot.commander import Request
 from simulator.autopilot.firmware import Firmware
 from simulator.autopilot.position_controller import OFF
 from simulator.config import Start
-from simulator.faults import Fault, prepare
+from simulator.faults import Fault
+from simulator.faults.fault import Injection
+from simulator.faults.link import Stranger
 from simulator.link.framing import frames
-from simulator.link.impairment import carry
+from simulator.link.impairment import Channel, carry
 from simulator.mavlink.codec import Keyring
 from simulator.mavlink.server import Server
 from simulator.mavlink.telemetry import builders
@@ -110,7 +112,14 @@ class Instance:
         if ground_link:
             self.links.append(Server(self.view, firmware.ground_rates_hz, self.keyring, number=1))
         self.steps = 0
-        self._faults = prepare(faults, seed)
+        self._faults = Injection(faults, seed)
+        self.down: list[Channel] = []  # of link faults: telemetry
+        self.up: list[Channel] = []
+        # Datagrams for the companion that others send, a list for each of their ports; the caller
+        # sends and clears them
+        self.strangers = [
+            one.datagrams for one in self._faults.unfinished if isinstance(one.fault, Stranger)
+        ]
         self._by_step = bool(faults)  # link faults act on the datagrams of each step
         self._arrived: list[bytes] = []
         self._barrier_at_step = 0
@@ -130,19 +139,13 @@ class Instance:
         """The vehicle's clock, as in SYSTEM_TIME."""
         return self.view.epoch_us + self.view.time_us
 
-    @property
-    def strangers(self) -> list[list[bytes]]:
-        """Datagrams for the companion that others send, a list for each of their ports; the caller
-        sends and clears them."""
-        return self._faults.strangers
-
     def advance(self) -> None:
         """Simulate one step of STEP_S; telemetry waits in the links until `drain`."""
         self.steps += 1
         if self._faults.unfinished:
             self._faults.step(self.time_s, self)
             self.autopilot.state.invalidate()
-        for datagram in carry(self._faults.up, [], self._now_us):
+        for datagram in carry(self.up, [], self._now_us):
             self._handle(datagram)
         if self.steps <= self._back_at_step:
             self.autopilot.plant.advance(STEP_S, OFF)
@@ -175,7 +178,7 @@ class Instance:
 
     def drain(self) -> list[bytes]:
         """Datagrams that have arrived at the companion since the last call."""
-        sent = carry(self._faults.down, self.companion.outbox.drain(), self._now_us)
+        sent = carry(self.down, self.companion.outbox.drain(), self._now_us)
         arrived, self._arrived = self._arrived + sent, []
         return arrived
 
@@ -186,7 +189,7 @@ class Instance:
     def feed(self, datagram: bytes) -> None:
         """Receive one datagram of the companion at the present vehicle time."""
         for piece in self._without_clock(datagram):
-            for arrived in carry(self._faults.up, [piece], self._now_us):
+            for arrived in carry(self.up, [piece], self._now_us):
                 self._handle(arrived)
 
     def feed_ground(self, datagram: bytes) -> None:

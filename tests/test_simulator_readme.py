@@ -85,7 +85,7 @@ def test_every_fault_is_in_the_table_with_its_keys_and_scenarios_that_have_it() 
             keys.setdefault(name, set()).update(cells[1])
         for name in cells[-1]:
             assert {fault.fault for fault in config.scenario(name).faults} & cells[0], row
-    assert (keys.keys(), len(named)) == (named.keys(), 21)
+    assert (keys.keys(), len(named)) == (named.keys(), 20)
     for name, fault in named.items():
         assert fault.model_fields.keys() - Timed.model_fields - {"fault"} <= keys[name], name
 

@@ -1,5 +1,5 @@
-"""What every fault has: when it begins, how long it lasts, and an effect on the vehicle; and the
-injection, which begins and ends each fault of a scenario at its time.
+"""What every fault has: when it begins, how long it lasts, and an effect on the vehicle; and those
+of a flight, each of which begins and ends at its time.
 
 An effect is a generator: it begins, then yields until its end. Each yield returns True at a step of
 the vehicle, the step of its beginning among them, and False when the fault ends.
@@ -8,10 +8,9 @@ the vehicle, the step of its beginning among them, and False when the fault ends
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
-from random import Random
 from typing import Annotated, Protocol
 
 from pydantic import AfterValidator, Field
@@ -61,6 +60,8 @@ class Vehicle(Protocol):
     autopilot: Autopilot
     view: View
     companion: Server
+    down: list[Channel]  # of the companion link's directions: telemetry, commands
+    up: list[Channel]
 
     def reboot(self, silent_s: float) -> None: ...
 
@@ -82,12 +83,10 @@ class Running:
     """One fault of a flight and its progress."""
 
     fault: Timed
-    channels: list[Channel]  # of a link fault
-    random: Random
+    seed: str  # of its random numbers
     datagrams: list[bytes] = field(default_factory=list)  # of a stranger, to be sent
     begins_s: float | None = None  # None until the event that starts its delay
     effect: Effect | None = None  # once it has begun
-    step: int = -1  # of those in which it has run, from 0
 
 
 def until_the_end() -> Effect:
@@ -96,19 +95,13 @@ def until_the_end() -> Effect:
         pass
 
 
-@dataclass(slots=True)
 class Injection:
-    """All faults of one flight. `down` and `up`: channels of the companion link's directions;
-    `strangers`: datagrams that wait to be sent to the companion, each list from a port of its own;
-    `unfinished`: faults that have not begun or not ended.
-    """
+    """The faults of one flight, none begun; `unfinished` have not begun or not ended."""
 
-    down: list[Channel]
-    up: list[Channel]
-    strangers: list[list[bytes]]
-    unfinished: list[Running]
-    _moments: dict[Moment, float] = field(default_factory=dict)
-    _flown: bool = False
+    def __init__(self, faults: Sequence[Timed], seed: int) -> None:
+        self.unfinished = [Running(fault, f"{seed} {at}") for at, fault in enumerate(faults)]
+        self._moments: dict[Moment, float] = {}
+        self._flown = False
 
     def step(self, now_s: float, vehicle: Vehicle) -> None:
         """Begin and end the faults due at `now_s`, seconds since the start."""
@@ -147,7 +140,6 @@ class Injection:
                 running.effect = fault.effect(vehicle, running)
                 next(running.effect)
             lasts = fault.for_s is None or now_s < running.begins_s + fault.for_s
-            running.step += 1
             running.effect.send(lasts)
         except StopIteration:
             return False

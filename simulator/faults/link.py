@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from itertools import count
+from random import Random
 from typing import Literal
 
 from pydantic import Field, model_validator
 
 from simulator.autopilot.firmware import Firmware
 from simulator.faults.fault import Effect, MessageName, Running, Timed, Vehicle, until_the_end
-from simulator.link.impairment import Impairment
+from simulator.link.impairment import Channel, Impairment
 from simulator.mavlink.codec import Encoder, fields_of
 from simulator.mavlink.outbox import MAV_COMP_ID_AUTOPILOT
 from simulator.mavlink.view import Stuck
@@ -32,11 +34,14 @@ class LinkFault(Timed, Impairment):
         return self
 
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
-        for channel in running.channels:
-            channel.on = True
+        channels = []
+        for direction, path in (("down", vehicle.down), ("up", vehicle.up)):
+            if self.direction in (direction, "both"):
+                channels.append(Channel(self, Random(f"{running.seed} {direction}")))
+                path.append(channels[-1])
         yield from until_the_end()
-        for channel in running.channels:
-            channel.on = False
+        for channel in channels:
+            channel.on = False  # what is under way still arrives
 
 
 class SilentMessage(Timed):
@@ -137,10 +142,12 @@ class SecondSender(Timed):
             vehicle.companion.receive(command)
         level = (0, *target, _ATTITUDE_AND_THRUST, (1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0, self.thrust)
         heartbeat = (_ONBOARD_CONTROLLER, _NO_AUTOPILOT, 0, self.custom_mode, _ACTIVE, _MAVLINK)
-        while (yield):
-            for _ in due(self.setpoint_rate_hz, running.step):
+        for step in count():
+            if not (yield):
+                return
+            for _ in due(self.setpoint_rate_hz, step):
                 vehicle.companion.receive(sender.frame("SET_ATTITUDE_TARGET", level))
-            for _ in due(_HEARTBEAT_HZ, running.step):
+            for _ in due(_HEARTBEAT_HZ, step):
                 vehicle.companion.outbox.forward(sender.frame("HEARTBEAT", heartbeat))
 
 
@@ -154,8 +161,10 @@ class SecondVehicle(Timed):
 
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
         sender = Encoder(self.system, self.component)
-        while (yield):
-            for _ in due(self.rate_hz, running.step):
+        for step in count():
+            if not (yield):
+                return
+            for _ in due(self.rate_hz, step):
                 heartbeat = _autopilot_heartbeat(sender, vehicle.autopilot.firmware)
                 vehicle.companion.outbox.forward(heartbeat)
 
@@ -174,10 +183,13 @@ class Stranger(Timed):
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
         """At most _DATAGRAMS_MAX datagrams wait to be sent; older ones are dropped."""
         sender = Encoder(self.system or vehicle.view.system, self.component)
-        while (yield):
-            for _ in due(self.rate_hz, running.step):
+        random = Random(running.seed)
+        for step in count():
+            if not (yield):
+                return
+            for _ in due(self.rate_hz, step):
                 if self.sends == "noise":
-                    running.datagrams.append(running.random.randbytes(self.size_bytes))
+                    running.datagrams.append(random.randbytes(self.size_bytes))
                 else:
                     heartbeat = _autopilot_heartbeat(sender, vehicle.autopilot.firmware)
                     running.datagrams.append(heartbeat)

@@ -17,22 +17,6 @@ from simulator.steps import STEP_S
 _NO_THRUST = 1e-9  # a factor that can be undone
 
 
-def _scaled_thrust(vehicle: Vehicle, factor: float) -> Effect:
-    vehicle.autopilot.plant.scale_thrust(factor)
-    yield from until_the_end()
-    vehicle.autopilot.plant.scale_thrust(1.0 / factor)
-
-
-class WeakMotor(Timed):
-    """One of four motors has `motor_scale` of its thrust; the mixer keeps the torques."""
-
-    fault: Literal["weak_motor"]
-    motor_scale: float = Field(ge=0, le=1)
-
-    def effect(self, vehicle: Vehicle, running: Running) -> Effect:
-        return _scaled_thrust(vehicle, (3.0 + self.motor_scale) / 4.0)
-
-
 class ThrustChange(Timed):
     """Thrust of all motors multiplied by `thrust_scale`."""
 
@@ -40,7 +24,9 @@ class ThrustChange(Timed):
     thrust_scale: float = Field(ge=0.1, le=3)
 
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
-        return _scaled_thrust(vehicle, self.thrust_scale)
+        vehicle.autopilot.plant.scale_thrust(self.thrust_scale)
+        yield from until_the_end()
+        vehicle.autopilot.plant.scale_thrust(1.0 / self.thrust_scale)
 
 
 class MotorsCut(Timed):
