@@ -8,6 +8,7 @@ projected out. A link loses commands, which makes outliers, so residuals are tak
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from functools import partial
@@ -75,13 +76,15 @@ EXPLAINED = 0.6  # least share of the commanded motion that the fitted response 
 @dataclass(frozen=True, slots=True)
 class ResponseFit:
     """An identified axis. `residual_rms`: of the residuals without outliers; `commanded_rms`: of
-    the command about its mean; both in the unit of the signal."""
+    the command about its mean; both in the unit of the signal. `lag_sd_s`: sd of the lag
+    2 z / wn."""
 
     delay_s: Estimate
     natural_frequency_radps: Estimate
     damping: Estimate
     residual_rms: float
     commanded_rms: float
+    lag_sd_s: float = 0.0
 
     @property
     def response(self) -> AxisResponse:
@@ -172,23 +175,26 @@ def _refusal(fit: ResponseFit, sd_limits: tuple[float, float, float]) -> str:
             f"it does not follow its command: {1e3 * fit.residual_rms:.1f} mrad rms of "
             f"{1e3 * fit.commanded_rms:.1f} commanded are unexplained"
         )
-    frequency = fit.natural_frequency_radps
-    # An overdamped response is a lag of 2 z / wn and one of 1 / (2 z wn), which is hardly told from
-    # a delay: the more it is damped, the less counts how wn and z share their ratio
-    z = max(1.0, fit.damping.value)
+    frequency, damping = fit.natural_frequency_radps, fit.damping
     delay_sd_s, frequency_sd, damping_sd = sd_limits
-    estimates = (
-        ("delay (s)", fit.delay_s, delay_sd_s * z),
-        ("natural frequency (rad/s)", frequency, frequency_sd * frequency.value * z**2),
-        ("damping", fit.damping, damping_sd * z**3),
+    least, most = LOWER + 1e-3 * (UPPER - LOWER), UPPER - 1e-3 * (UPPER - LOWER)
+    least[DELAY] = -math.inf
+    certain = frequency
+    if damping.value > 1.0:
+        # Lags of 2 z / wn and of 1 / (2 z wn), which is hardly told from a delay: of wn and z
+        # little but the ratio shows
+        certain = Estimate(2.0 * damping.value / frequency.value, fit.lag_sd_s)
+        delay_sd_s, damping_sd, most[FREQUENCY] = delay_sd_s * damping.value, math.inf, math.inf
+    checks = (
+        ("delay (s)", fit.delay_s, fit.delay_s, delay_sd_s),
+        ("natural frequency (rad/s)", frequency, certain, frequency_sd * certain.value),
+        ("damping", damping, damping, damping_sd),
     )
-    for index, (name, estimate, limit) in enumerate(estimates):
-        margin = 1e-3 * (UPPER[index] - LOWER[index])
-        at_lower = index != DELAY and estimate.value < LOWER[index] + margin
-        if at_lower or estimate.value > UPPER[index] - margin:
+    for index, (name, estimate, known, limit) in enumerate(checks):
+        if not least[index] <= estimate.value <= most[index]:
             return f"its {name} is at the limit of the search, {estimate.value:.3g}"
-        if not estimate.sd <= limit:
-            return f"its {name} is uncertain: sd {estimate.sd:.2g}, limit {limit:.2g}{FLY_STEPS}"
+        if not known.sd <= limit:
+            return f"its {name} is uncertain: sd {known.sd:.2g}, limit {limit:.2g}{FLY_STEPS}"
     return ""
 
 
@@ -234,11 +240,13 @@ def fit_response(
         best = np.clip(best + gain * (delay.value - best[DELAY]), LOWER, UPPER)
         covariance = covariance - np.outer(gain, covariance[DELAY])
     sds = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    lag_slope = 2.0 / best[FREQUENCY] * np.array((0.0, -best[DAMPING] / best[FREQUENCY], 1.0))
+    lag_sd_s = math.sqrt(max(lag_slope @ covariance @ lag_slope, 0.0))
     found = (Estimate(float(value), float(sd)) for value, sd in zip(best, sds, strict=True))
     delay_s, frequency, damping = found
     moved = commanded_rms(times, sent_at, commands)
     left = problem.unexplained(best) if wanders else scale
-    return ResponseFit(delay_s, frequency, damping, residual_rms=left, commanded_rms=moved)
+    return ResponseFit(delay_s, frequency, damping, left, moved, lag_sd_s)
 
 
 # ---------------------------------------------------------------------- least squares

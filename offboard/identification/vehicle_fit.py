@@ -300,7 +300,11 @@ def within_bounds(
         expected = vehicle_file.drag_per_mass_ps if of_drag else _constant(vehicle_file, name)
         low = max(least, expected / factor - slack)
         high = min(greatest, expected * factor + slack)
-        if not low <= estimate.value <= high:
+        lowest = estimate.value
+        if name.endswith("frequency_radps"):
+            # of an overdamped response little but the ratio to the damping is known
+            lowest /= max(1.0, _constant(found, f"{axis}_damping").value)
+        if estimate.value < low or lowest > high:
             rejected[field] = None
             sentences.append(
                 f"{_in_words(name)} {estimate.value:.3g} contradicts the {expected:.3g} of vehicle "
