@@ -18,6 +18,7 @@ def _tree(path: Path) -> ast.Module:
     return ast.parse(path.read_text())
 
 
+@cache
 def _names(path: Path) -> set[str]:
     """Modules imported by a file, as dotted names."""
     names: set[str] = set()

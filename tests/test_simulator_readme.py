@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,20 +24,14 @@ from simulator.firmware import FIRMWARES
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "simulator" / "README.md"
-# Of every firmware; `Firmware.boot_events_s` has those of the start
-EVENTS = frozenset({
-    # requests: commands, messages, faults that act for a pilot
-    "mode", "takeoff", "land", "return", "loiter", "turn", "home", "speed", "servo", "mission",
-    "reboot", "terminate",
-    "arm", "disarm", "force arm", "force disarm", "checks", "thrust not a number",
-    # monitoring
-    "stream lost", "stream found", "position lost", "position found",
-    "ground station lost", "ground station found",
-    "battery low", "battery critical", "battery emergency",
-    # flight
-    "took off", "landed", "settled", "idle", "climbed", "already higher", "item reached",
-    "mission progress", "mission return", "mission cleared", "mission finished",
-})  # fmt: skip
+# What the code names outside the tables: among it the events that it raises
+NAMED = frozenset(
+    node.value
+    for path in (ROOT / "simulator").rglob("*.py")
+    if not path.name.endswith("_tables.py")
+    for node in ast.walk(ast.parse(path.read_text()))
+    if isinstance(node, ast.Constant) and isinstance(node.value, str)
+)
 HEAD = ("event", "in mode", "if", "next mode", "answer and texts")
 
 
@@ -92,7 +87,7 @@ def test_every_fault_is_in_the_table_with_its_keys_and_scenarios_that_have_it() 
 
 def unknown(firmware: Firmware, rule: Rule) -> Iterator[str]:
     """What a row names that does not exist."""
-    known = EVENTS.union((event + AFTER_DELAY for event in EVENTS), firmware.boot_events_s)
+    known = NAMED.union((event + AFTER_DELAY for event in NAMED), firmware.boot_events_s)
     yield from {rule.event} - known
     yield from set(rule.mode.split()) - {*firmware.modes, "*"}
     if isinstance(rule.to, ByParameter):
@@ -113,7 +108,7 @@ def exists(firmware: Firmware, condition: str) -> bool:
         return known and all(map(str.isdecimal, value.split(",")))
     kind, _, event = condition.partition(" ")
     if kind in ("since", "latched"):
-        return event in EVENTS
+        return event in NAMED
     if kind == "requests":
         return event in firmware.modes
     return event in firmware.boot_events_s if kind == "reached" else condition in CONDITIONS

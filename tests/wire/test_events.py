@@ -18,11 +18,18 @@ NAN, INF = math.nan, math.inf
 
 
 def received(message: Any, autopilot: int = PX4) -> Any:
-    """The event of a message of the vehicle."""
-    vehicle = Sender()
-    session = pinned(vehicle, autopilot)
-    (event,) = session.receive(vehicle.frame(message), PEER, 0.0).events
-    return event
+    """The event of a message of the vehicle; it is the same in a frame of MAVLink 1, before another
+    one."""
+    found = []
+    for version_1 in (False, True)[: 1 + (message.id < 256)]:
+        vehicle = Sender(7)
+        session, frame = pinned(vehicle, autopilot), vehicle.frame(message, version_1)
+        reception = session.receive(frame + vehicle.text(b"behind"), PEER, 0.0)
+        assert reception.frames[0] == frame
+        event, _ = reception.events
+        found.append(event)
+    assert found[-1] == found[0]
+    return found[0]
 
 
 # --- contents ---

@@ -98,16 +98,13 @@ def test_what_is_not_finite_or_out_of_range_is_refused() -> None:
 @pytest.mark.parametrize(
     ("command", "number", "leading"),
     [
-        (CommandLong.arm(), 400, [1.0]),
-        (CommandLong.message_interval(31, 100.0), 511, [31.0, 10000.0]),
-        (PX4_DIALECT.engage(), 176, [1.0, 6.0]),
         (PX4_DIALECT.set_mode("AUTO.LAND"), 176, [1.0, 4.0, 6.0]),
         (PX4_DIALECT.take_off(500.0), 22, [0.0, 0.0, 0.0, *(math.nan,) * 3, 500.0]),
         (ARDUPILOT_DIALECT.hold(), 176, [1.0, 17.0]),
-        (ARDUPILOT_DIALECT.take_off(5.0), 22, [*(0.0,) * 6, 5.0]),
     ],
 )
 def test_commands(command: CommandLong, number: int, leading: list[float]) -> None:
+    """Those that no flight of tests/replay has sent to a real autopilot."""
     message = sent(command)
     assert (message.target_system, message.target_component, message.command) == (7, 1, number)
     parameters = [getattr(message, f"param{i}") for i in range(1, 8)]

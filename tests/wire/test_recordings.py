@@ -112,11 +112,6 @@ def test_modes_answers_and_texts_are_what_pymavlink_reads(replay: Replay) -> Non
     assert len(texts) >= 10
 
 
-def test_which_vehicle_is_found(px4: Replay, arducopter: Replay) -> None:
-    assert px4.session.vehicle == events.VehicleFound(7, 1, "px4")
-    assert arducopter.session.vehicle == events.VehicleFound(1, 1, "ardupilot")
-
-
 def test_parameters_are_bytewise_on_px4_and_cast_on_arducopter(
     px4: Replay, arducopter: Replay
 ) -> None:

@@ -244,13 +244,3 @@ def test_heartbeats_at_1_hz_of_host_or_vehicle_time_whichever_is_faster() -> Non
         session.receive(vehicle.position(10 * tick), PEER, 10.5 + 0.0002 * tick)
         beats += Heartbeat(18) in session.poll(10.5 + 0.0002 * tick)
     assert beats == 10
-
-
-def test_mavlink_1_frames_are_decoded() -> None:
-    vehicle = Sender()
-    session = pinned(vehicle)
-    message = mavlink.MAVLink_attitude_quaternion_message(1000, 1, 0, 0, 0, 0.1, 0.2, 0.3)
-    frame = vehicle.frame(message, mavlink1=True)
-    reception = session.receive(frame + vehicle.position(1000), PEER, 0.0)
-    assert [type(e).__name__ for e in reception.events] == ["Attitude", "LocalPosition"]
-    assert reception.frames[0] == frame
