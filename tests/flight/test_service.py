@@ -250,41 +250,33 @@ def test_a_limit_of_the_autopilot_is_read_anew(served: Served) -> None:
 # --- who may engage, and when ---------------------------------------------------------------------
 
 
-def test_a_restarted_service_asks_for_hold_and_waits_for_the_pilot(served: Served) -> None:
-    """PX4's own failsafe is later."""
-    pair = served.engaged()
-    pair.instance.autopilot.parameters.set("COM_OF_LOSS_T", 5.0)
-    pair.run(2.0)
-    pair.restart()
-    began_s, hold = pair.time_s, pair.mode
-    pair.until(lambda: pair.mode != hold, 4.0)
-    assert pair.mode == "AUTO.LOITER"
-    pair.run(4.0)
-    assert pair.phase is Phase.STANDBY
-    assert pair.logs.begun[-1] > began_s or len(pair.logs.begun) == 1
-    pair.engage()
-
-
-@pytest.mark.parametrize(("on", "left"), [("px4", "px4-1-ff"), ("ardupilot", "")])
-def test_a_vehicle_that_the_service_has_not_engaged_is_left_alone(
+@pytest.mark.parametrize(
+    ("on", "left"), [("px4", "px4-1-1"), ("px4", "px4-1-ff"), ("ardupilot", "")]
+)
+def test_a_restarted_service_holds_what_it_has_engaged_and_nothing_else(
     served: Served, on: str, left: str
 ) -> None:
-    """Another companion computer flies it, on a link that we do not hear; or a flight with another
-    vehicle was cut short."""
+    """Then it waits for the pilot. Else another companion computer flies the vehicle, on a link
+    that we do not hear; or a flight with another vehicle was cut short."""
     pair = served.engaged(on)
-    if on == "px4":
+    if on == "px4":  # its own failsafe is later
         pair.instance.autopilot.parameters.set("COM_OF_LOSS_T", 5.0)
+    assert pair.logs.left == f"{on}-1-1"
     pair.logs.left = left
     pair.restart()
     began_s = pair.time_s
     pair.run(4.0)
-    assert pair.mode in ("OFFBOARD", "GUIDED")
-    assert sent_after(pair, began_s) == []
-    assert said(pair, "in the air, and this service has not engaged it: it is left alone")
-    assert len(pair.logs.begun) == 1
-    pair.switch("pilot")
-    pair.run(2.0)
-    assert pair.logs.left == left
+    if left == "px4-1-1":
+        assert pair.mode == "AUTO.LOITER"
+    else:
+        assert pair.mode in ("OFFBOARD", "GUIDED")
+        assert sent_after(pair, began_s) == []
+        assert said(pair, "in the air, and this service has not engaged it: it is left alone")
+        assert len(pair.logs.begun) == 1
+        pair.switch("pilot")
+        pair.run(2.0)
+        assert pair.logs.left == left
+    assert pair.phase is Phase.STANDBY
     pair.engage()
 
 
