@@ -165,18 +165,6 @@ def stop(pair: Pair) -> None:
     pair.companion.request_stop()
 
 
-def take_over(pair: Pair) -> None:
-    pair.pilot_takes_over()
-
-
-def die(pair: Pair) -> None:
-    pair.dead = True
-
-
-def kill_motors(pair: Pair) -> None:
-    pair.ground(400, 0, 21196)
-
-
 def restart(pair: Pair) -> None:
     """The vehicle boots: on the ground, disarmed, its time from zero."""
     conditions = config.scenario("calm").conditions

@@ -169,7 +169,7 @@ def landing_requested(pair: Pair) -> None:
 
 
 def landed_by_its_failsafe(pair: Pair) -> None:
-    """After a refused landing the setpoints faults.stop, so that the vehicle's failsafe acts."""
+    """After a refused landing the setpoints stop, so that the vehicle's failsafe acts."""
     assert pair.went_through(Phase.HOVER)
     assert 45 <= sum(phase is Phase.LAND for _, phase, _ in pair.setpoints) <= 52
     assert len(pair.landings) > 3
@@ -501,21 +501,21 @@ ROWS = {
         fly=partial(px4.hover, HIGH), limits={"land_s": 20.0},
         at=[
             *then(Phase.HOVER, 0.2, faults.downlink(faults.heartbeats(system_status=5))),
-            *then(Phase.LAND, 1.5, faults.take_over),
+            *then(Phase.LAND, 1.5, Pair.pilot_takes_over),
         ],
     ),
     "pilot takes over the landing behind a link that has become 4 s late": aborts(
         Phase.YIELDED, "no telemetry for 1.0 s .*; the vehicle left AUTO.LAND for AUTO.LOITER",
         the_pilots, fly=partial(px4.hover, HIGH), armed=True,
-        at=[*then(Phase.HOVER, 0.2, late_both_ways), *then(Phase.LAND, 5.5, faults.take_over)],
+        at=[*then(Phase.HOVER, 0.2, late_both_ways), *then(Phase.LAND, 5.5, Pair.pilot_takes_over)],
     ),
     "pilot takes over as it arms": aborts(
         Phase.YIELDED, "the vehicle left OFFBOARD for AUTO.LOITER as it armed", the_pilots,
-        armed=True, at=then(Phase.ARM, 0.0, faults.take_over),
+        armed=True, at=then(Phase.ARM, 0.0, Pair.pilot_takes_over),
     ),
     "motors cut in flight": ends(
         "the vehicle disarmed in flight", fly=px4.hover,
-        ended_by="disarmed in flight", at=tracking(faults.kill_motors),
+        ended_by="disarmed in flight", at=tracking(lambda pair: pair.ground(400, 0, 21196)),
     ),
     # the link
     "a fifth is lost, duplicated, reordered, some 2.5 s late, with garbage between": flies(
@@ -525,7 +525,8 @@ ROWS = {
     "dies in flight": aborts(
         Phase.FAILED,
         "no telemetry for 1.0 s .*; not heard for 300 s while landing; last known: armed in ",
-        held_then_silent, fly=px4.lap, armed=True, ended_by="link", at=tracking(faults.die),
+        held_then_silent, fly=px4.lap, armed=True, ended_by="link",
+        at=tracking(lambda pair: setattr(pair, "dead", True)),
     ),
     "restart in flight": aborts(
         Phase.FAILED, "the vehicle restarted in flight; the vehicle restarted and is disarmed",
