@@ -183,14 +183,21 @@ def test_a_flight_whose_result_cannot_be_printed_keeps_its_exit_code(
 
 
 @pytest.mark.usefixtures("in_memory")
-def test_the_log_alone_holds_what_was_flown(called: Called, tmp_path: Path) -> None:
-    """Along a table whose file is gone."""
+def test_the_log_alone_holds_what_was_flown(
+    called: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Along a table whose file is gone, by a command whose output closes, which ends no flight."""
+    reads, writes = os.pipe()
+    os.close(reads)
+    monkeypatch.setattr(sys, "stdout", os.fdopen(writes, "w"))
     rows = "".join(f"{t},{0.5 * t},0,-1\n" for t in range(9))
     (tmp_path / "line.csv").write_text("time_s,north_m,east_m,down_m\n" + rows)
     command = "offboard fly --sitl --controller lqr --reference line.csv --seed 7 --out x"
     assert called(command)[0] == 0
     (tmp_path / "line.csv").unlink()
-    text = history.configuration(tlog.read(tmp_path / "x" / "flight.tlog"))
+    log = tlog.read(tmp_path / "x" / "flight.tlog")
+    assert history.gather(log).phases[-1].what.startswith("disarmed")
+    text = history.configuration(log)
     assert text is not None
     flown = config.flown(text)
     assert flown == config.load(str(tmp_path / "x" / "flight.yaml"))

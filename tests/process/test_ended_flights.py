@@ -158,17 +158,6 @@ def test_interrupted_while_it_is_scored_it_was_flown(
 
 
 @pytest.mark.usefixtures("in_memory")
-def test_a_pipe_that_closes_ends_no_flight(
-    called: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    reads, writes = os.pipe()
-    os.close(reads)
-    monkeypatch.setattr(sys, "stdout", os.fdopen(writes, "w"))
-    assert called("offboard fly --sitl --out x", *SHORT)[0] == 0
-    assert flown(tmp_path).phases[-1].what.startswith("disarmed")
-
-
-@pytest.mark.usefixtures("in_memory")
 def test_json_lines_end_with_the_result_and_the_live_page_is_announced(
     called: Called, tmp_path: Path
 ) -> None:
