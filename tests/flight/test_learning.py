@@ -119,7 +119,11 @@ def test_slow_thrust_is_identified() -> None:
     "true",
     [
         pytest.param({"thrust_lag_s": 0.3, "thrust_delay_s": 0.06}, id="thrust"),
-        pytest.param({"tilt": AxisResponse(**SLUGGISH), "thrust_lag_s": 0.1}, id="attitude"),
+        pytest.param(
+            {"tilt": AxisResponse(**SLUGGISH), "thrust_lag_s": 0.1},
+            id="attitude",
+            marks=pytest.mark.slow,
+        ),
         pytest.param(
             {"tilt": AxisResponse(**LATE), "thrust_lag_s": 0.15, "thrust_delay_s": 0.13},
             id="swings",
