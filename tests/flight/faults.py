@@ -165,18 +165,6 @@ def stop(pair: Pair) -> None:
     pair.companion.request_stop()
 
 
-def take_over(pair: Pair) -> None:
-    pair.pilot_takes_over()
-
-
-def die(pair: Pair) -> None:
-    pair.dead = True
-
-
-def kill_motors(pair: Pair) -> None:
-    pair.ground(400, 0, 21196)
-
-
 def restart(pair: Pair) -> None:
     """The vehicle boots: on the ground, disarmed, its time from zero."""
     conditions = config.scenario("calm").conditions
@@ -192,24 +180,19 @@ def downlink(fault: Filter) -> Action:
     return change
 
 
-def lost(pair: Pair, for_s: float, *kinds: int) -> Filter:
-    """From now on nothing passes for so long, or nothing of these kinds."""
-    ends_s, rest = pair.time_s + for_s, without(*kinds)
-
-    def passing(time_s: float, datagrams: Bytes) -> Bytes:
-        if time_s >= ends_s:
-            return datagrams
-        return rest(time_s, datagrams) if kinds else []
-
-    return passing
-
-
 def cut(for_s: float, *kinds: int, ways: Sequence[str] = ("down", "up")) -> Action:
     """From now on nothing passes for so long, or nothing of these kinds, in these directions."""
 
     def change(pair: Pair) -> None:
+        ends_s, rest = pair.time_s + for_s, without(*kinds)
+
+        def passing(time_s: float, datagrams: Bytes) -> Bytes:
+            if time_s >= ends_s:
+                return datagrams
+            return rest(time_s, datagrams) if kinds else []
+
         for way in ways:
-            setattr(pair, way, both(getattr(pair, way), lost(pair, for_s, *kinds)))
+            setattr(pair, way, both(getattr(pair, way), passing))
 
     return change
 

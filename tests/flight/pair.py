@@ -121,6 +121,7 @@ class Pair:
     watch: Any = None  # what `watch.watched` has noted
     waiting: list[Chunk] = field(default_factory=list)  # that the companion has not read yet
     leaving: Bytes = field(default_factory=list)  # what the turn in progress sends at its end
+    lingers: bool = False  # the companion is kept alive after the end of its flight
 
     def fly(self, longest_s: float = LONGEST_S) -> Outcome:
         """To the end of the flight, which must come within `longest_s`."""
@@ -149,7 +150,7 @@ class Pair:
             self.clock.now_s = now_s
             self._feed()
             due = self.waiting or self.steps - self.turned >= POLL_STEPS
-            if due and not self.companion.has_ended():
+            if due and (self.lingers or not self.companion.has_ended()):
                 chunks, self.waiting, self.turned = self.waiting, [], self.steps
                 self._take(self.companion.turn(chunks, now_s))
         for moment in [moment for moment in self.at if moment[0](self)]:

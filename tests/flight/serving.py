@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from offboard.mavlink.session import Session, SessionSettings
 from offboard.run import configuration as config
 from offboard.run.flight import Prepared, build
 from offboard.service.flights import Flights
+from offboard.service.preparation import VehicleFiles
 from simulator import config as simulated
 from simulator.config import Start
 from simulator.instance import Instance
@@ -77,24 +79,6 @@ class Logs:
         self.left = ""
 
 
-@dataclass
-class Remembered:
-    """`VehicleFiles` without files."""
-
-    known: dict[str, IdentifiedVehicle] = field(default_factory=dict)
-    discarded: list[str] = field(default_factory=list)
-
-    def get(self, key: str, prepared: Prepared) -> IdentifiedVehicle | None:
-        return self.known.get(key)
-
-    def keep(self, key: str, prepared: Prepared, identified: IdentifiedVehicle) -> None:
-        self.known[key] = identified
-
-    def discard(self, key: str) -> None:
-        self.known.pop(key, None)
-        self.discarded.append(key)
-
-
 def prepared(*assignments: str, **choices: str) -> Prepared:
     resolved = config.load("flight", choices=choices, assignments=assignments, seed=7)
     return build(resolved)
@@ -107,13 +91,21 @@ class Serving(Pair):
     firmware: str = "px4"
     source: Any = None
     logs: Any = None
-    memory: Any = None
+    memory: Any = None  # its `VehicleFiles`
     again: Callable[[Any], Flights] | None = None
     restarted: Callable[[], object] = lambda: None  # of an observer
 
     @property
     def state(self) -> Any:
         return self.service.current
+
+    @property
+    def remembered(self) -> IdentifiedVehicle | None:
+        """What the service knows of the vehicle."""
+        known: IdentifiedVehicle | None = self.memory.get(
+            f"{self.firmware}-1-1", self.source.prepared
+        )
+        return known
 
     @property
     def service(self) -> Flights:
@@ -215,16 +207,18 @@ def serve(
     then: Then = "hold",
     anchor: Anchor = "here",
     arms: bool = False,
-    memory: Remembered | None = None,
+    known: IdentifiedVehicle | None = None,
     aloft: bool = False,
 ) -> Serving:
     """A service with a vehicle that stands on the ground, and boots; with `aloft` one that its
-    pilot holds at 3 m."""
+    pilot holds at 3 m. What is `known` of it was identified before."""
     vehicle = "px4_sih" if on == "px4" else "arducopter"
     clock = HostClock()
     short = SHORT if reference == "hover" else ()
     source = Settings(prepared(*short, *assignments, reference=reference, vehicle=vehicle))
-    logs, memory = Logs(clock), memory or Remembered()
+    logs, memory = Logs(clock), VehicleFiles(Path("/dev/null"), print)  # of which none is written
+    if known:
+        memory.keep(f"{on}-1-1", source.prepared, known)
 
     def again(logs: Any) -> Flights:
         return Flights(

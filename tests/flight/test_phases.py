@@ -259,6 +259,11 @@ def test_the_service_waits_for_ever() -> None:
             flight = uneventful(phase, service)
             flight.began_s, flight.silence_s = -1e6, 2e6 if silent else 0.0
             assert next_row(flight) is None
+        heard = uneventful(Phase.HEALTH, service)  # and then nothing: it may be another vehicle
+        EVENTS["silent_for_another"](heard)
+        row = next_row(heard)
+        assert row is not None
+        assert row.target is Phase.HEALTH
     targets: dict[str, Phase | None] = {}
     for then, service in SERVICES.items():
         flight = uneventful(Phase.HOVER, service)

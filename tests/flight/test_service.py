@@ -21,12 +21,11 @@ from serving import (
     PAUSE_CONTINUE,
     SET_MODE,
     START,
-    Remembered,
     Serving,
     prepared,
     serve,
 )
-from watch import announced, said, sent_after
+from watch import announced, begun_s, said, sent_after
 
 from offboard.flight.authority import PilotSwitch
 from offboard.flight.phases import TRACKING, Phase
@@ -213,12 +212,12 @@ def test_a_contradicted_vehicle_is_identified_again(served: Served) -> None:
     true = simulated.vehicle("px4_sih")
     late = {"delay_s": 0.2, "natural_frequency_radps": 6.0}
     wrong = true.model_copy(update={"tilt": true.tilt.model_copy(update=late)})
-    memory = Remembered({"px4-1-1": IdentifiedVehicle(wrong, Estimate(0.2, 0.002), 0.008)})
-    pair = served.engaged(reference="lemniscate", memory=memory)
+    known = IdentifiedVehicle(wrong, Estimate(0.2, 0.002), 0.008)
+    pair = served.engaged(reference="lemniscate", known=known)
     pair.run(14.0)
     pair.switch("pilot")
     pair.run(1.0)
-    assert memory.discarded == ["px4-1-1"]
+    assert pair.remembered is None
     assert said(pair, "contradicted, and discarded")
 
 
@@ -226,22 +225,21 @@ def test_what_is_identified_in_motion_is_remembered(served: Served) -> None:
     """Also of a vehicle that was known: its drag is 2.5 times what was remembered."""
     true = simulated.vehicle("px4_sih")
     known = true.model_copy(update={"drag_translation_npmps": (0.4 * true.mass_kg,) * 3})
-    memory = Remembered({"px4-1-1": IdentifiedVehicle(known, Estimate(0.048, 0.002), 0.008)})
-    pair = served.engaged(reference="lemniscate", memory=memory)
+    before = IdentifiedVehicle(known, Estimate(0.048, 0.002), 0.008)
+    pair = served.engaged(reference="lemniscate", known=before)
     pair.until(lambda: pair.phase is Phase.HOVER, 40.0)
-    assert memory.known["px4-1-1"].vehicle.drag_per_mass_ps == pytest.approx(0.4)
+    assert pair.remembered == before
     pair.switch("pilot")
     pair.run(1.0)
-    remembered = memory.known["px4-1-1"].vehicle
-    assert remembered.drag_per_mass_ps == pytest.approx(true.drag_per_mass_ps, rel=0.1)
+    assert pair.remembered.vehicle.drag_per_mass_ps == pytest.approx(true.drag_per_mass_ps, rel=0.1)
 
 
 def test_a_limit_of_the_autopilot_is_read_anew(served: Served) -> None:
     """The vehicle was remembered with a lower angular acceleration than is allowed now."""
     copter = simulated.vehicle("arducopter")
     slow = copter.model_copy(update={"angular_acceleration_limit_radps2": (2.3, 2.3, 2.2)})
-    memory = Remembered({"ardupilot-1-1": IdentifiedVehicle(slow, Estimate(0.01, 0.002), 0.008)})
-    pair = served.engaged("ardupilot", memory=memory)
+    known = IdentifiedVehicle(slow, Estimate(0.01, 0.002), 0.008)
+    pair = served.engaged("ardupilot", known=known)
     pair.run(1.0)
     assert said(pair, "this vehicle was identified before")
     assert pair.service.current.model.angular_acceleration_limit_radps2[0] > 19.0
@@ -250,41 +248,33 @@ def test_a_limit_of_the_autopilot_is_read_anew(served: Served) -> None:
 # --- who may engage, and when ---------------------------------------------------------------------
 
 
-def test_a_restarted_service_asks_for_hold_and_waits_for_the_pilot(served: Served) -> None:
-    """PX4's own failsafe is later."""
-    pair = served.engaged()
-    pair.instance.autopilot.parameters.set("COM_OF_LOSS_T", 5.0)
-    pair.run(2.0)
-    pair.restart()
-    began_s, hold = pair.time_s, pair.mode
-    pair.until(lambda: pair.mode != hold, 4.0)
-    assert pair.mode == "AUTO.LOITER"
-    pair.run(4.0)
-    assert pair.phase is Phase.STANDBY
-    assert pair.logs.begun[-1] > began_s or len(pair.logs.begun) == 1
-    pair.engage()
-
-
-@pytest.mark.parametrize(("on", "left"), [("px4", "px4-1-ff"), ("ardupilot", "")])
-def test_a_vehicle_that_the_service_has_not_engaged_is_left_alone(
+@pytest.mark.parametrize(
+    ("on", "left"), [("px4", "px4-1-1"), ("px4", "px4-1-ff"), ("ardupilot", "")]
+)
+def test_a_restarted_service_holds_what_it_has_engaged_and_nothing_else(
     served: Served, on: str, left: str
 ) -> None:
-    """Another companion computer flies it, on a link that we do not hear; or a flight with another
-    vehicle was cut short."""
+    """Then it waits for the pilot. Else another companion computer flies the vehicle, on a link
+    that we do not hear; or a flight with another vehicle was cut short."""
     pair = served.engaged(on)
-    if on == "px4":
+    if on == "px4":  # its own failsafe is later
         pair.instance.autopilot.parameters.set("COM_OF_LOSS_T", 5.0)
+    assert pair.logs.left == f"{on}-1-1"
     pair.logs.left = left
     pair.restart()
     began_s = pair.time_s
     pair.run(4.0)
-    assert pair.mode in ("OFFBOARD", "GUIDED")
-    assert sent_after(pair, began_s) == []
-    assert said(pair, "in the air, and this service has not engaged it: it is left alone")
-    assert len(pair.logs.begun) == 1
-    pair.switch("pilot")
-    pair.run(2.0)
-    assert pair.logs.left == left
+    if left == "px4-1-1":
+        assert pair.mode == "AUTO.LOITER"
+    else:
+        assert pair.mode in ("OFFBOARD", "GUIDED")
+        assert sent_after(pair, began_s) == []
+        assert said(pair, "in the air, and this service has not engaged it: it is left alone")
+        assert len(pair.logs.begun) == 1
+        pair.switch("pilot")
+        pair.run(2.0)
+        assert pair.logs.left == left
+    assert pair.phase is Phase.STANDBY
     pair.engage()
 
 
@@ -608,8 +598,9 @@ def test_a_request_in_the_tick_of_a_transition_is_obeyed(served: Served) -> None
         pair.until(lambda: pair.phase is phase, 120.0)
         return pair
 
+    undisturbed = begun(Phase.HOVER)
     for before, after in ((Phase.ARM, Phase.TAKEOFF), (Phase.TRACK, Phase.HOVER)):
-        changed_s = begun(after).time_s
+        changed_s = begun_s(undisturbed, after)
         pair = begun(before)
         pair.until(lambda at_s=changed_s, on=pair: on.time_s > at_s - 1.5 * STEP_S, 90.0)
         assert pair.phase is before
@@ -747,18 +738,3 @@ def test_nothing_unsafe_in_a_day(served: Served, on: str) -> None:
         if number >= len(EVENTS) and pair.time_s > float(os.environ.get("OFFBOARD_DAY_S", "45")):
             break
     assert len(pair.logs.begun) > pair.time_s / 200.0
-
-
-def test_what_is_heard_after_a_silence_in_health_may_be_another_vehicle_too(served: Served) -> None:
-    """A third one passes by, which prevents standby for 10 s. It was ready with the parameters of
-    the one before."""
-    pair = served("ardupilot")
-    pair.run(0.5)
-    pair.forwarded.append(another_vehicle(9))
-    pair.run(3.0)
-    assert pair.state.vehicle.parameters["GUID_OPTIONS"] == 8.0
-    silence(pair, 0.0)
-    pair.run(2.0)
-    assert pair.phase is Phase.HEALTH
-    assert said(pair, "waiting: GUID_OPTIONS is 0: without bit 3")
-    assert sum("health: no telemetry for 5" in text for text in announced(pair)) == 1

@@ -14,16 +14,7 @@ from collections.abc import Callable
 
 import pytest
 from faults import CURRENT_MODE, HEARTBEAT, losing, without
-from pair import (
-    HOST_EPOCH_S,
-    STEP_S,
-    Pair,
-    decode,
-    frame_id,
-    frames_of,
-    in_phase,
-    level_setpoint,
-)
+from pair import Pair, decode, frame_id, frames_of, in_phase, level_setpoint
 from watch import SET_MESSAGE_INTERVAL, Vehicle, aborted, begun_s, copter, px4
 
 from offboard.flight.authority import Standing
@@ -84,19 +75,6 @@ def asked(judge: Judge, command: int, after_s: float) -> Callable[[Pair], bool]:
     return lambda pair: pair.time_s >= judge.asked_s.get(command, 1e9) + after_s
 
 
-def linger(pair: Pair) -> None:
-    """Time goes on after the end of the flight, and so does the companion."""
-    end_s = pair.time_s + LINGER_S
-    while pair.time_s < end_s:
-        pair.time_s += STEP_S
-        now_s = HOST_EPOCH_S + pair.time_s
-        for datagram in pair.down(pair.time_s, pair.instance.step()):
-            pair.companion.turn([Chunk(datagram, "vehicle", now_s)], now_s)
-        for moment in [moment for moment in pair.at if moment[0](pair)]:
-            pair.at.remove(moment)
-            moment[1](pair)
-
-
 @pytest.mark.parametrize(
     "seed",
     [*range(QUICK), *(pytest.param(n, marks=pytest.mark.slow) for n in range(QUICK, FLIGHTS))],
@@ -134,7 +112,9 @@ def test_nothing_leaves_after_a_take_over(seed: int) -> None:
 
     pair.at.append((due, switch))
     pair.fly()
-    linger(pair)
+    pair.lingers, end_s = True, pair.time_s + LINGER_S
+    while pair.time_s < end_s:
+        pair.advance()
     print(acted)
     assert pair.companion.phase in ENDS
     assert judge.wrong == []

@@ -82,11 +82,19 @@ def test_nothing_identified_is_no_vehicle_file(called: Called, tmp_path: Path) -
 
 
 def test_a_log_with_attitude_as_angles_is_identified(called: Called, tmp_path: Path) -> None:
+    """A page that is there is kept. The title of the new one is the name of the flight directory,
+    also of the working directory."""
     log = RECORDING.with_name("arducopter-4.6.3-guided.tlog")  # has no ATTITUDE_QUATERNION
-    assert called("offboard identify -o mine.yaml", log)[0] == 0
+    (tmp_path / "flight.tlog").write_bytes(log.read_bytes())
+    (tmp_path / "identify.html").write_text("precious")
+    assert called("offboard identify -o mine.yaml .")[::2] == (0, "")
     found = yaml.safe_load((tmp_path / "mine.yaml").read_text())
     assert found["hover_thrust"] == pytest.approx(0.365, abs=0.01)
     assert found["tilt"]["natural_frequency_radps"] == pytest.approx(11.4, abs=1.0)
+    assert (tmp_path / "identify.html").read_text() == "precious"
+    page = (tmp_path / "identify-2.html").read_text()
+    assert f"<title>Flight {tmp_path.name}</title>" in page
+    assert page.count(' id="fit_') == 2 * 2  # tilt and heading, with their data
 
 
 @pytest.mark.usefixtures("in_memory")
@@ -97,19 +105,6 @@ def test_a_vehicle_is_flown_and_then_identified(called: Called, tmp_path: Path) 
     found = yaml.safe_load((tmp_path / "mine.yaml").read_text())
     assert found["hover_thrust"] == pytest.approx(0.5, abs=0.02)
     assert (tmp_path / "identify.html").exists()
-
-
-def test_the_page_of_a_second_identification_has_a_name_of_its_own(
-    called: Called, tmp_path: Path
-) -> None:
-    """Its title is the name of the flight directory, also of the working directory."""
-    (tmp_path / "flight.tlog").write_bytes(RECORDING.read_bytes())
-    (tmp_path / "identify.html").write_text("precious")
-    assert called("offboard identify .")[::2] == (0, "")
-    assert (tmp_path / "identify.html").read_text() == "precious"
-    page = (tmp_path / "identify-2.html").read_text()
-    assert f"<title>Flight {tmp_path.name}</title>" in page
-    assert page.count(' id="fit_') == 2 * 2  # tilt and heading, with their data
 
 
 def test_a_score_that_cannot_be_written_is_reported(called: Called, tmp_path: Path) -> None:
@@ -183,14 +178,21 @@ def test_a_flight_whose_result_cannot_be_printed_keeps_its_exit_code(
 
 
 @pytest.mark.usefixtures("in_memory")
-def test_the_log_alone_holds_what_was_flown(called: Called, tmp_path: Path) -> None:
-    """Along a table whose file is gone."""
+def test_the_log_alone_holds_what_was_flown(
+    called: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Along a table whose file is gone, by a command whose output closes, which ends no flight."""
+    reads, writes = os.pipe()
+    os.close(reads)
+    monkeypatch.setattr(sys, "stdout", os.fdopen(writes, "w"))
     rows = "".join(f"{t},{0.5 * t},0,-1\n" for t in range(9))
     (tmp_path / "line.csv").write_text("time_s,north_m,east_m,down_m\n" + rows)
     command = "offboard fly --sitl --controller lqr --reference line.csv --seed 7 --out x"
     assert called(command)[0] == 0
     (tmp_path / "line.csv").unlink()
-    text = history.configuration(tlog.read(tmp_path / "x" / "flight.tlog"))
+    log = tlog.read(tmp_path / "x" / "flight.tlog")
+    assert history.gather(log).phases[-1].what.startswith("disarmed")
+    text = history.configuration(log)
     assert text is not None
     flown = config.flown(text)
     assert flown == config.load(str(tmp_path / "x" / "flight.yaml"))

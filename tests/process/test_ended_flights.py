@@ -119,7 +119,7 @@ def test_a_full_disk_lands(called: Called, tmp_path: Path, monkeypatch: pytest.M
 
 
 @pytest.mark.usefixtures("in_memory")
-@pytest.mark.parametrize("log", [None, "of another"], ids=["deleted", "replaced"])
+@pytest.mark.parametrize("why", ["deleted", "replaced", "interrupted"])
 @pytest.mark.parametrize(
     ("outcome", "options", "code"),
     [
@@ -128,44 +128,26 @@ def test_a_full_disk_lands(called: Called, tmp_path: Path, monkeypatch: pytest.M
         (Outcome(4, "not disarmed"), ("--require", "rmse_position_m<9"), 4),
     ],
 )
-def test_a_flight_whose_log_is_gone_keeps_its_outcome(
+def test_a_flight_that_cannot_be_scored_keeps_its_outcome(
     called: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    log: str | None, outcome: Outcome, options: tuple[str, ...], code: int,
+    why: str, outcome: Outcome, options: tuple[str, ...], code: int,
 ) -> None:  # fmt: skip
-    if log:
+    """Its log is gone, or the scoring is interrupted: 130 says that nothing was sent."""
+    if why == "replaced":
         (tmp_path / "x").mkdir()
-        (tmp_path / "x" / "flight.tlog").write_text(log)
+        (tmp_path / "x" / "flight.tlog").write_text("of another")
+    elif why == "interrupted":
+        monkeypatch.setattr("offboard.cli.fly.scored", Mock(side_effect=KeyboardInterrupt))
     monkeypatch.setattr(run, "fly", lambda *_, **__: outcome)
+    reason = "interrupted" if why == "interrupted" else "x"
+    says = f"{outcome.sentence}; it cannot be scored: {reason}"
     found, *printed = called("offboard fly --sitl --out x", *options)
     text = " ".join("".join(printed).split())
-    assert (found, f"{outcome.sentence}; it cannot be scored: x" in text) == (code, True), text
+    assert (found, says in text) == (code, True), text
     assert ("requirement missed: rmse_position_m is not in this log" in text) == (code == 1)
     found, shown, _ = called("offboard fly --sitl --json-lines --out x", *options)
     result = json.loads(shown.splitlines()[-1])
     assert (found, result["exit_code"], result["completed"]) == (code, code, False)
-
-
-@pytest.mark.usefixtures("in_memory")
-def test_interrupted_while_it_is_scored_it_was_flown(
-    called: Called, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """130 says that nothing was sent."""
-    monkeypatch.setattr(run, "fly", lambda *_, **__: Outcome(0, "flown and landed"))
-    monkeypatch.setattr("offboard.cli.fly.scored", Mock(side_effect=KeyboardInterrupt))
-    code, *printed = called("offboard fly --sitl --out x")
-    assert code == 0
-    assert "flown and landed; it cannot be scored: interrupted" in "".join(printed)
-
-
-@pytest.mark.usefixtures("in_memory")
-def test_a_pipe_that_closes_ends_no_flight(
-    called: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    reads, writes = os.pipe()
-    os.close(reads)
-    monkeypatch.setattr(sys, "stdout", os.fdopen(writes, "w"))
-    assert called("offboard fly --sitl --out x", *SHORT)[0] == 0
-    assert flown(tmp_path).phases[-1].what.startswith("disarmed")
 
 
 @pytest.mark.usefixtures("in_memory")
