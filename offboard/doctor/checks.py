@@ -17,6 +17,7 @@ from offboard.flight.preflight import TELEMETRY, Finding, Level
 from offboard.flight.timing import REAL_TIME
 from offboard.identification.vehicle_estimate import SDS
 from offboard.link.connection import BITS_OF_A_BYTE
+from offboard.link.interface import peer_name
 from offboard.mavlink.decode import FIX_3D
 from offboard.mavlink.events import CommandAck
 from offboard.mavlink.telemetry import SHARE
@@ -99,9 +100,12 @@ def senders(seen: Observation) -> Iterable[Finding]:
     """Other vehicles, ground stations and controllers on the link."""
     others = []
     for sender in seen.heard.senders.found:
-        if sender.ids != _ids(seen) or len(sender.peers) > 1:
-            peers = f", from {', '.join(sorted(sender.peers))}" if sender.is_autopilot else ""
-            others.append(f"{sender.name}{peers}")
+        peers = sender.peers
+        if sender.ids == _ids(seen):
+            peers = peers - {peer_name(seen.heard.session.peer)}
+        if peers:
+            places = f", from {', '.join(sorted(peers))}" if sender.is_autopilot else ""
+            others.append(f"{sender.name}{places}")
     yield ok("besides the vehicle: " + ("; ".join(others) or "nobody"))
 
 

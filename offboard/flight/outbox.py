@@ -253,8 +253,8 @@ def announce(flight: FlightState, sentence: str, *, once: bool = False) -> None:
 
 def announce_phase(flight: FlightState, reason: str, cause: str) -> None:
     """Report that the phase begins; `cause` is a word for the log, empty without one."""
-    served = flight.outcome is not None and flight.outcome.exit_code == ExitCode.FLOWN
-    name = "ended" if flight.phase is Phase.FAILED and served else flight.phase.value
+    flown = flight.outcome is not None and flight.outcome.exit_code == ExitCode.FLOWN
+    name = "ended" if flight.phase is Phase.FAILED and flown else flight.phase.value
     sentence = f"{name}: {reason}"
     _show(flight, sentence)
     _say(flight, INFO, EventRecord(sentence, flight.phase.code, cause), title="offboard: ")

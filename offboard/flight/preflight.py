@@ -222,7 +222,7 @@ def _same_system_id(ground: Ground) -> str:
     )
 
 
-def _twin(ground: Ground) -> str:
+def twin(ground: Ground) -> str:
     """The vehicle, or one with its system id, is heard from a second address."""
     return ground.session.senders.twin(ground.session.link_time_s)
 
@@ -378,7 +378,7 @@ PREFLIGHT = (
     Row("senders", BLOCKS, other_sender, "stop it", at_once=True, fly_only=True),
     Row("senders", BLOCKS, _several_vehicles, _CHOOSE, at_once=True),
     Row("senders", BLOCKS, _same_system_id, _SAME_ID, at_once=True),
-    Row("senders", BLOCKS, _twin, _ONE_WAY),
+    Row("senders", BLOCKS, twin, _ONE_WAY),
     Row("rates", WAIT, _no_telemetry),
     Row("supervisor", WAIT, _unguarded),
     Row("rates", BLOCKS, _slow, _slow_hint),

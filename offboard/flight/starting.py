@@ -19,7 +19,7 @@ from offboard.flight.conditions import (
     stop_requested,
 )
 from offboard.flight.phases import ExitCode, Phase, Request
-from offboard.flight.preflight import armed_already, other_sender, other_vehicle, unfit_type
+from offboard.flight.preflight import armed_already, other_sender, other_vehicle, twin, unfit_type
 from offboard.flight.state import FlightState
 from offboard.flight.vehicle_state import ARMED_KNOWN_S, DISARMED_S
 from offboard.mavlink.events import Heartbeat
@@ -263,6 +263,7 @@ STARTING = (
     Transition(STREAMING, stop_requested, FAILED, REFUSED, OPERATOR, BEFORE_TAKEOFF),
     Transition(STREAMING, other_sender, FAILED, REFUSED, "second sender"),
     Transition(STREAMING, other_vehicle, FAILED, REFUSED),
+    Transition(STREAMING, twin, FAILED, REFUSED),
     Transition(STREAMING, blind, FAILED, REFUSED, "link"),
     Transition(STREAMING, mode_unknown, FAILED, REFUSED, "link"),
     Transition(STREAMING, authority_lost, FAILED, REFUSED, "mode change"),

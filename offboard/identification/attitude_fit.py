@@ -67,6 +67,8 @@ RELATED_S = 0.3  # time over which an attitude estimator's errors are autocorrel
 MODEL_SDS = (0.002, 0.025, 0.025)
 # Limits on the motion that the current estimate leaves unexplained: rad, share of the commanded.
 UNEXPLAINED, UNEXPLAINED_SHARE = 0.008, 0.3
+# At most, for overdamped responses: three sd stay below the 0.4 s of a delay that is unknown
+DELAY_SD_FACTOR = 4.0
 
 
 FLY_STEPS = "; fly steps"
@@ -84,7 +86,19 @@ class ResponseFit:
     damping: Estimate
     residual_rms: float
     commanded_rms: float
-    lag_sd_s: float = 0.0
+    lag_sd_s: float
+
+    @property
+    def overdamped(self) -> bool:
+        """Whether it is two lags, of 2 z / wn and of about 1 / (2 z wn)."""
+        return self.damping.value > 1.0
+
+    @property
+    def lag_s(self) -> Estimate:
+        """2 z / wn."""
+        return Estimate(
+            2.0 * self.damping.value / self.natural_frequency_radps.value, self.lag_sd_s
+        )
 
     @property
     def response(self) -> AxisResponse:
@@ -130,7 +144,8 @@ def yaw_signals(trace: Trace) -> tuple[Array, Array, Array, Array]:
 @dataclass(frozen=True, slots=True)
 class Axis:
     """Least commanded motion (rad rms), and the greatest accepted sd of delay (s), natural
-    frequency (relative) and damping."""
+    frequency (relative) and damping. Of an overdamped response the delay's times the damping; and
+    that of the frequency is of the lag 2 z / wn (relative)."""
 
     name: str
     signals: Callable[[Trace], tuple[Array, Array, Array, Array]]
@@ -175,26 +190,29 @@ def _refusal(fit: ResponseFit, sd_limits: tuple[float, float, float]) -> str:
             f"it does not follow its command: {1e3 * fit.residual_rms:.1f} mrad rms of "
             f"{1e3 * fit.commanded_rms:.1f} commanded are unexplained"
         )
-    frequency, damping = fit.natural_frequency_radps, fit.damping
     delay_sd_s, frequency_sd, damping_sd = sd_limits
-    least, most = LOWER + 1e-3 * (UPPER - LOWER), UPPER - 1e-3 * (UPPER - LOWER)
-    least[DELAY] = -math.inf
-    certain = frequency
-    if damping.value > 1.0:
-        # Lags of 2 z / wn and of 1 / (2 z wn), which is hardly told from a delay: of wn and z
-        # little but the ratio shows
-        certain = Estimate(2.0 * damping.value / frequency.value, fit.lag_sd_s)
-        delay_sd_s, damping_sd, most[FREQUENCY] = delay_sd_s * damping.value, math.inf, math.inf
-    checks = (
-        ("delay (s)", fit.delay_s, fit.delay_s, delay_sd_s),
-        ("natural frequency (rad/s)", frequency, certain, frequency_sd * certain.value),
-        ("damping", damping, damping, damping_sd),
-    )
-    for index, (name, estimate, known, limit) in enumerate(checks):
-        if not least[index] <= estimate.value <= most[index]:
+    margins = 1e-3 * (UPPER - LOWER)
+    ends = list(zip((LOWER + margins).tolist(), (UPPER - margins).tolist(), strict=True))
+    ends[DELAY] = (-math.inf, ends[DELAY][1])
+    frequency, lag_s = fit.natural_frequency_radps, fit.lag_s
+    checks = [
+        ("delay (s)", fit.delay_s, delay_sd_s, ends[DELAY]),
+        ("natural frequency (rad/s)", frequency, frequency_sd * frequency.value, ends[FREQUENCY]),
+        ("damping", fit.damping, damping_sd, ends[DAMPING]),
+    ]
+    if fit.overdamped:
+        # wn and z may be at the limits of the search, as little but their ratio shows; the delay is
+        # hardly told from the lag of 1 / (2 z wn)
+        delay_sd_s *= min(fit.damping.value, DELAY_SD_FACTOR)
+        checks = [
+            ("delay (s)", fit.delay_s, delay_sd_s, ends[DELAY]),
+            ("lag (s)", lag_s, frequency_sd * lag_s.value, (0.0, math.inf)),
+        ]
+    for name, estimate, limit, (least, most) in checks:
+        if not least <= estimate.value <= most:
             return f"its {name} is at the limit of the search, {estimate.value:.3g}"
-        if not known.sd <= limit:
-            return f"its {name} is uncertain: sd {known.sd:.2g}, limit {limit:.2g}{FLY_STEPS}"
+        if not estimate.sd <= limit:
+            return f"its {name} is uncertain: sd {estimate.sd:.2g}, limit {limit:.2g}{FLY_STEPS}"
     return ""
 
 

@@ -46,6 +46,7 @@ THRUST_EFFECT = ("thrust_lag_s", "thrust_delay_s", "thrust_effect_s")  # accepte
 # thrust, of the thrust's lag, and of the link's delay while the tilt is not identified.
 YAW_DELAY_SD_S, THRUST_DELAY_SD_S, THRUST_LAG_SD_S, LINK_SD_S = 0.1, 0.03, 0.05, 0.15
 
+LAG_MOST_S = 1.5  # of an overdamped response, or the factor; ArduCopter with ATC_INPUT_TC 1 has 1 s
 DELAY_SLACK_S = 0.4  # allowed in addition to the factor: a link may be slow
 DRAG_SLACK_PS = 0.3  # a heavy vehicle may have next to none
 LINK_S = 0.03  # a smaller difference of delays is the vehicle's own, not the link's
@@ -53,7 +54,7 @@ AXES = ("tilt", "yaw")
 AXIS_BOUNDS = {
     "delay_s": (DELAY_LIMITS_S, DELAY_SLACK_S),
     "natural_frequency_radps": (FREQUENCY_LIMITS_RADPS, 0.0),
-    "damping": (DAMPING_LIMITS, DAMPING_LIMITS[1]),
+    "damping": (DAMPING_LIMITS, 0.0),
 }
 # Least and greatest value of each constant, whatever the vehicle file says; (limits, slack)
 BOUNDS = {f"{axis}_{name}": AXIS_BOUNDS[name] for axis in AXES for name in AXIS_BOUNDS} | {
@@ -300,11 +301,14 @@ def within_bounds(
         expected = vehicle_file.drag_per_mass_ps if of_drag else _constant(vehicle_file, name)
         low = max(least, expected / factor - slack)
         high = min(greatest, expected * factor + slack)
-        lowest = estimate.value
-        if name.endswith("frequency_radps"):
-            # of an overdamped response little but the ratio to the damping is known
-            lowest /= max(1.0, _constant(found, f"{axis}_damping").value)
-        if estimate.value < low or lowest > high:
+        response = getattr(found, axis) if axis in AXES else None
+        if response and response.overdamped and not name.endswith("delay_s"):
+            # little but the ratio of frequency and damping shows
+            file = getattr(vehicle_file, axis)
+            name, estimate = f"{axis}_lag_s", response.lag_s
+            expected = 2.0 * file.damping / file.natural_frequency_radps
+            low, high = 0.0, max(LAG_MOST_S, expected * factor)
+        if not low <= estimate.value <= high:
             rejected[field] = None
             sentences.append(
                 f"{_in_words(name)} {estimate.value:.3g} contradicts the {expected:.3g} of vehicle "

@@ -70,7 +70,8 @@ class _Inbox:
                 break
             arrived_s = max(self._empty_s, _stamp_s(ancillary) + offset_s)
             read.append((bytes(self._buffer[:size]), peer, arrived_s))
-        # a clock that was set meanwhile must not move an arrival, or change the order
+        # a clock that is set meanwhile moves an arrival at most to the beginning of the waiting or
+        # to now, and does not change the order
         latest_s = clock.monotonic_s()
         chunks: list[Chunk] = []
         for data, peer, arrived_s in reversed(read):

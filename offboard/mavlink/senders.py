@@ -108,8 +108,8 @@ class Senders:
         ids = vehicle.system_id, vehicle.component_id
         genuine = self._genuine(datagram)
         moves = any((frame.system_id, frame.component_id) == ids for frame in genuine)
-        if moves:
-            self.peer = peer
+        if moves:  # then it was itself that was heard from there
+            self.peer, self.twin_s = peer, -math.inf
         return moves
 
     def overhear(self, datagram: bytes, now_s: float) -> list[int]:

@@ -82,7 +82,8 @@ class Watch:
         self.ended = not data
         if descriptors:
             for descriptor in self.descriptors:
-                os.close(descriptor)
+                with suppress(OSError):  # that of the vehicle, if it has changed its port
+                    os.close(descriptor)
             self.descriptors = descriptors
         *lines, self._received = (self._received + data).split(b"\n")
         for line in lines:

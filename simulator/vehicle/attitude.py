@@ -59,7 +59,8 @@ def build_loop(vehicle: Vehicle) -> tuple[Array, NDArray[np.int64]]:
     gains = np.array(
         [
             [axis.natural_frequency_radps / (2.0 * axis.damping) for axis in axes],
-            [2.0 * axis.damping * axis.natural_frequency_radps for axis in axes],
+            # a faster loop would not be stable in steps of STEP_S
+            [min(2.0 * axis.damping * axis.natural_frequency_radps, 1.0 / STEP_S) for axis in axes],
             vehicle.angular_acceleration_limit_radps2,
             vehicle.angular_rate_limit_radps,
         ]

@@ -183,6 +183,8 @@ def test_slow_attitude_is_identified(
     tilt = pair.companion.model.tilt
     lag_s, slow_lag_s = (2.0 * each.damping / each.natural_frequency_radps for each in (tilt, slow))
     assert lag_s == pytest.approx(slow_lag_s, rel=0.1)
+    if damping < 1.0:
+        assert tilt.natural_frequency_radps == pytest.approx(frequency_radps, rel=0.1)
     assert tilt.delay_s == pytest.approx(0.057, abs=0.02)
     said = " | ".join(pair.companion.announced)
     assert "(configured 7.0): the vehicle's delay is not identified yet" in said

@@ -173,6 +173,7 @@ EVENTS: dict[str, Setup] = {
     "other_vehicle": lambda flight: vars(flight.session.senders).update(
         candidates=lambda now_s: "1 and 2"
     ),
+    "twin": lambda flight: vars(flight.session.senders).update(twin=lambda now_s: "another, too"),
     "disarmed": _disarm,
     "disarmed_again": _refuse_arming,
     "disarmed_for_good": _disarm,

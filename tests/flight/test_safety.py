@@ -339,6 +339,20 @@ def test_while_another_address_sends_with_its_ids_a_vehicle_is_not_armed(on: Veh
     assert begun_s(pair, Phase.ARM) > 20.0 + HEARD_S - 1.1
 
 
+def test_another_address_that_sends_with_its_ids_before_it_is_armed_ends_the_start() -> None:
+    pair, twin = px4.hop(), px4.hop(seed=8).instance
+
+    def beside(_: float, datagrams: Bytes) -> Bytes:
+        heard = twin.step()
+        if pair.went_through(Phase.STREAM):
+            pair.companion.overhear(heard)
+        return datagrams
+
+    pair.down = beside
+    refused(pair, "an autopilot sends as system 1 from another address, too")
+    assert not pair.armings
+
+
 @BOTH
 def test_of_two_vehicles_with_the_same_ids_on_one_radio_none_is_armed(on: Vehicle) -> None:
     """Both obey: the other one was flown too, by setpoints that were not made for it."""

@@ -58,7 +58,10 @@ def uneventful(phase: Phase = Phase.TRACK, service: ServiceOptions | None = None
     off, land or be taken over."""
     session: Any = SimpleNamespace(
         senders=SimpleNamespace(
-            candidates=lambda now_s: "", why_none=lambda: "", forged=Counter[Any]()
+            candidates=lambda now_s: "",
+            twin=lambda now_s: "",
+            why_none=lambda: "",
+            forged=Counter[Any](),
         ),
         link_time_s=NOW_S,
         time=SimpleNamespace(mixed=False),

@@ -58,6 +58,17 @@ def test_the_first_autopilot_heard_is_the_vehicle_and_no_other_one_is() -> None:
     assert len(session.receive(vehicle.position(1000), PEER, 0.0).events) == 1
 
 
+def test_a_vehicle_that_goes_on_from_another_port_is_no_second_one() -> None:
+    """Its HEARTBEAT came from there before the old port had been silent for long enough."""
+    vehicle = Sender(1)
+    session = pinned(vehicle)
+    session.receive(vehicle.position(1000), PEER, 10.0)
+    assert session.senders.overhear(vehicle.heartbeat(), session.link_time_s) == [1]
+    assert "system 1 from another address" in session.senders.twin(session.link_time_s)
+    session.receive(vehicle.position(1020), RESTARTED, 10.6)
+    assert (session.peer, session.senders.twin(session.link_time_s)) == (RESTARTED, "")
+
+
 @pytest.mark.parametrize(
     ("sender", "place", "silence_s"),
     [

@@ -78,22 +78,42 @@ def test_a_message_at_its_rate_is_requested_once_until_another_program_changes_i
     assert vehicle.requested_s[0] - 183.0 == pytest.approx(0.2, abs=0.03)
 
 
-def test_a_message_whose_rate_is_denied_is_requested_at_half_of_it() -> None:
-    """As by an ArduCopter with SCHED_LOOP_RATE 50, which was not flown. Without a denial a request
-    was lost."""
-    for denied, last_hz in ((True, 25.0), (False, 100.0)):
-        session = started()
-        sender, rates_hz = Sender(), []
-        for tick in range(1, 1200):
-            now_s = 0.01 * tick
-            requested = [m for m in session.poll(now_s) if isinstance(m, CommandLong)]
-            rates_hz += [1e6 / m.parameters[1] for m in requested if m.parameters[0] == POSITION]
-            if requested and denied:
-                session.receive(sender.ack(511, 2), PEER, now_s)
-            session.receive(sender.attitude(10 * tick), PEER, now_s)
-        assert rates_hz[0] == pytest.approx(100.0)
-        assert rates_hz[-1] == pytest.approx(last_hz)
-        assert len(rates_hz) == 3
+@pytest.mark.parametrize(
+    ("loop_hz", "default_hz", "position_from_s", "asked_hz", "rate_hz"),
+    [
+        (100, 0, 0.0, [100, 50], 50),  # was not flown
+        (100, 4, 0.0, [100, 50], 50),  # a ground station has set 4 Hz
+        (100, 0, 25.0, [100, 50], 50),  # its estimator has no origin yet
+        (400, 0, 25.0, [100], 100),  # it denies SIM_STATE alone, which no real vehicle has
+    ],
+)
+def test_a_rate_that_arducopter_denies_is_halved(
+    loop_hz: int, default_hz: int, position_from_s: float, asked_hz: list[int], rate_hz: int
+) -> None:
+    """It denies what is above 0.8 of SCHED_LOOP_RATE, and messages that it does not know."""
+    sender, session = Sender(), Session(SessionSettings())
+    session.receive(sender.heartbeat(autopilot=3), PEER, 0.0)
+    granted_hz, asked = {30: default_hz, 31: default_hz, POSITION: default_hz}, []
+    for tick in range(1, 6000):
+        now_s = 0.01 * tick
+        for message in session.poll(now_s):
+            if isinstance(message, CommandLong):
+                kind, asks_hz = int(message.parameters[0]), round(1e6 / message.parameters[1])
+                denied = asks_hz > 0.8 * loop_hz or kind == 108
+                session.receive(sender.ack(511, 2 if denied else 0), PEER, now_s)
+                if not denied:
+                    granted_hz[kind] = asks_hz
+                if kind == POSITION:
+                    asked.append(asks_hz)
+        for kind, send in ((31, sender.attitude), (POSITION, sender.position)):
+            every = 100 // granted_hz[kind] if granted_hz[kind] else 0
+            silent = kind == POSITION and now_s < position_from_s
+            if every and tick % every == 0 and not silent:
+                session.receive(send(10 * tick), PEER, now_s)
+        if tick % 10 == 0:
+            session.receive(sender.heartbeat(autopilot=3), PEER, now_s)
+    assert sorted(set(asked), reverse=True) == asked_hz
+    assert session.telemetry.rates_hz["LOCAL_POSITION_NED"] == pytest.approx(rate_hz, rel=0.05)
 
 
 def test_link_time_follows_the_vehicle_or_host_time() -> None:
