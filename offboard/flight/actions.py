@@ -8,7 +8,7 @@ from offboard.flight import decision, outbox
 from offboard.flight.authority import PilotSwitch, Standing
 from offboard.flight.failsafe import telemetry_old
 from offboard.flight.ground_contact import STANDING_S, STILL_ARMED
-from offboard.flight.phases import BEFORE_FLIGHT, FLYING, TRACKING, Phase
+from offboard.flight.phases import BEFORE_FLIGHT, FLYING, OUTAGE_MAX_S, TRACKING, Phase
 from offboard.flight.preflight import other_sender
 from offboard.flight.state import LEVEL_DIRECTION, FlightState
 from offboard.mavlink.dialects.base import Dialect
@@ -113,8 +113,8 @@ def _await_link(flight: FlightState) -> None:
         missing = "telemetry" if silent else "report of the mode"
         outbox.announce(
             flight,
-            f"no {missing} for {unreached_s:.1f} s: waiting for the link, "
-            "then landing is asked again",
+            f"no {missing} for {unreached_s:.1f} s: waiting for the link for at most "
+            f"{OUTAGE_MAX_S:.0f} s, then landing is asked again",
         )
     elif waited and not flight.awaits_link:
         flight.vehicle.results.clear()

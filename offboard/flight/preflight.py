@@ -362,7 +362,7 @@ _UNFIT = (
 _FAILSAFE = "let the pilot take over first"
 _CHOOSE = "choose one with --system, or give each vehicle its own port"
 _SAME_ID = "switch one off, or change its system id"
-_ONE_WAY = f"{_SAME_ID}; let the telemetry of one vehicle come one way"
+_ONE_WAY = f"{_SAME_ID}; send the telemetry of one vehicle over one link only"
 
 
 def _slow_hint(ground: Ground) -> str:
