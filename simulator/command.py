@@ -59,10 +59,7 @@ def simulate(
     duration: Annotated[
         float | None, option("SECONDS", "Stop after this vehicle time.", min=0.0)
     ] = None,
-    instance: Annotated[
-        int,
-        option("N", "Added to the system id, and to ports that no option gives.", min=0, max=249),
-    ] = 0,
+    instance: Annotated[int, option("N", "Added to system id, default ports.", min=0, max=249)] = 0,
     instances: Annotated[int, option("N", "Number of vehicles.", min=1, max=100)] = 1,
     patience: Annotated[float | None, option("SECONDS", PATIENCE, min=0.1, max=600.0)] = None,
     signing_key: Annotated[
