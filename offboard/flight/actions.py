@@ -114,7 +114,7 @@ def _await_link(flight: FlightState) -> None:
         outbox.announce(
             flight,
             f"no {missing} for {unreached_s:.1f} s: waiting for the link for at most "
-            f"{OUTAGE_MAX_S:.0f} s, then landing is asked again",
+            f"{OUTAGE_MAX_S:.0f} s; landing is asked again once the vehicle is heard",
         )
     elif waited and not flight.awaits_link:
         flight.vehicle.results.clear()

@@ -67,8 +67,9 @@ RELATED_S = 0.3  # time over which an attitude estimator's errors are autocorrel
 MODEL_SDS = (0.002, 0.025, 0.025)
 # Limits on the motion that the current estimate leaves unexplained: rad, share of the commanded.
 UNEXPLAINED, UNEXPLAINED_SHARE = 0.008, 0.3
-# At most, for overdamped responses: three sd stay below the 0.4 s of a delay that is unknown
-DELAY_SD_FACTOR = 4.0
+OVERDAMPED = 1.5  # least damping
+# Of the delay of an overdamped response: three sd stay below the 0.4 s of a delay that is unknown
+DELAY_SD_MOST_S = 0.13
 
 
 FLY_STEPS = "; fly steps"
@@ -91,7 +92,7 @@ class ResponseFit:
     @property
     def overdamped(self) -> bool:
         """Whether it is two lags, of 2 z / wn and of about 1 / (2 z wn)."""
-        return self.damping.value > 1.0
+        return self.damping.value > OVERDAMPED
 
     @property
     def lag_s(self) -> Estimate:
@@ -144,8 +145,9 @@ def yaw_signals(trace: Trace) -> tuple[Array, Array, Array, Array]:
 @dataclass(frozen=True, slots=True)
 class Axis:
     """Least commanded motion (rad rms), and the greatest accepted sd of delay (s), natural
-    frequency (relative) and damping. Of an overdamped response the delay's times the damping; and
-    that of the frequency is of the lag 2 z / wn (relative)."""
+    frequency (relative) and damping. Where the response is overdamped, the limit of the delay is
+    multiplied by the damping, up to DELAY_SD_MOST_S, the second limit is of the lag 2 z / wn, and
+    the third is not used."""
 
     name: str
     signals: Callable[[Trace], tuple[Array, Array, Array, Array]]
@@ -203,7 +205,7 @@ def _refusal(fit: ResponseFit, sd_limits: tuple[float, float, float]) -> str:
     if fit.overdamped:
         # wn and z may be at the limits of the search, as little but their ratio shows; the delay is
         # hardly told from the lag of 1 / (2 z wn)
-        delay_sd_s *= min(fit.damping.value, DELAY_SD_FACTOR)
+        delay_sd_s = min(delay_sd_s * fit.damping.value, DELAY_SD_MOST_S)
         checks = [
             ("delay (s)", fit.delay_s, delay_sd_s, ends[DELAY]),
             ("lag (s)", lag_s, frequency_sd * lag_s.value, (0.0, math.inf)),

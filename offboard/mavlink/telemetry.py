@@ -9,6 +9,7 @@ requested: therefore they are measured, and requested again. They are per second
 from __future__ import annotations
 
 import math
+import re
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
@@ -17,7 +18,6 @@ from offboard.mavlink.decode import DECODERS
 from offboard.mavlink.dialects.base import Dialect, WantedMessage
 from offboard.mavlink.events import (
     Attitude,
-    CommandAck,
     Event,
     Heartbeat,
     LocalPosition,
@@ -41,8 +41,9 @@ _FIRST_WAIT_S, _LONGEST_WAIT_S = 3.0, 30.0
 _OPTIONAL_TRIES = 2
 _STOPPED_S = 0.2  # a fast message that is missing for so long was stopped, or lost with the others
 _UNHEARD = 0.1  # of the rate wanted: what arrives more rarely has its default rate
-# ArduCopter denies rates above 0.8 SCHED_LOOP_RATE; its COMMAND_ACK does not name the message
-RATE_DENIED = CommandAck(511, "DENIED")
+# ArduCopter denies rates above 0.8 SCHED_LOOP_RATE. Its COMMAND_ACK does not name the message, and
+# denies unknown messages in the same way; this text does
+TOO_FAST = re.compile(r"message ID (\d{1,8}) too fast")
 _ARRIVALS_MAX = 4096  # limits the memory used when a link is flooded
 
 
@@ -59,13 +60,15 @@ class Telemetry:
         self._frames = 0  # sent by the vehicle, as the sequence numbers show; modulo 256 the newest
         self._heard_s = -math.inf  # when the newest frame arrived
         self._mode_report = (0, -math.inf)  # number of the newest, and when it arrived
-        self._denied = False  # whether the vehicle has denied a rate
 
     def interpret(self, frame: Frame, now_s: float, events: list[Event]) -> None:
         """Add to `events` what a frame of the vehicle says that arrived at `now_s`."""
         number = self._number(frame, now_s)
         if frame.message_id == STATUSTEXT:
-            events += self.texts.add(frame.payload, now_s)
+            texts = self.texts.add(frame.payload, now_s)
+            for each in texts:
+                self._on_text(each.text)
+            events += texts
             return
         decoder = DECODERS.get(frame.message_id)
         if decoder is None:  # nobody reads it
@@ -78,7 +81,6 @@ class Telemetry:
         elif isinstance(event, (Heartbeat, ModeReport)) and self._overtaken(number, now_s):
             return
         elif event is not None:
-            self._denied |= event == RATE_DENIED
             self._count(frame.message_id)
             events.append(event)
 
@@ -143,11 +145,14 @@ class Telemetry:
 
     def due(self) -> list[WantedMessage]:
         """Messages to request now; they count as requested."""
-        now_s, streams = self.time.seconds, self._streams.values()
-        granted_hz = math.inf
-        if self._denied:  # what another message has is granted to all
-            granted_hz = max((each.rate_hz(now_s) for each in streams), default=0.0)
-        return [each.wanted for each in streams if each.request(now_s, granted_hz)]
+        now_s = self.time.seconds
+        return [each.wanted for each in self._streams.values() if each.request(now_s)]
+
+    def _on_text(self, text: str) -> None:
+        named = TOO_FAST.search(text)
+        stream = self._streams.get(int(named[1])) if named else None
+        if stream:
+            stream.too_fast = True
 
     @property
     def rates_hz(self) -> dict[str, float]:
@@ -191,7 +196,7 @@ class _Stream:
     requested_s: float | None = None
     requests: int = 0
     wait_s: float = _FIRST_WAIT_S
-    served: bool = False  # it has arrived at its rate
+    too_fast: bool = False  # the vehicle has denied its rate
 
     def rate_hz(self, now_s: float) -> float:
         while self.arrivals_s and self.arrivals_s[0] <= now_s - _WINDOW_S:
@@ -199,17 +204,15 @@ class _Stream:
         measured_s = min(_WINDOW_S, now_s - self.began_s)
         return len(self.arrivals_s) / measured_s if measured_s > 0.0 else 0.0
 
-    def request(self, now_s: float, granted_hz: float) -> bool:
-        """Whether to request it now; then it counts as requested: at half its rate where neither it
-        nor another message has ever arrived at that, but some at `granted_hz`."""
+    def request(self, now_s: float) -> bool:
+        """Whether to request it now; then it counts as requested."""
         if self.requested_s is not None and not self._again(now_s - self.requested_s, now_s):
             return False
         if self.requests:
             self.wait_s = min(2.0 * self.wait_s, _LONGEST_WAIT_S)
-            too_fast = 0.0 < granted_hz < _ENOUGH * self.wanted.rate_hz
-            if too_fast and not self.served and self.wanted.rate_hz > SLOW_HZ:
-                slower_hz = max(0.5 * self.wanted.rate_hz, SLOW_HZ)
-                self.wanted = replace(self.wanted, rate_hz=slower_hz)
+        if self.too_fast:
+            slower_hz = min(self.wanted.rate_hz, max(0.5 * self.wanted.rate_hz, SLOW_HZ))
+            self.wanted, self.too_fast = replace(self.wanted, rate_hz=slower_hz), False
         self.requested_s = now_s
         self.requests += 1
         return True
@@ -218,7 +221,6 @@ class _Stream:
         if waited_s < _FIRST_WAIT_S:
             return False
         rate_hz, enough_hz = self.rate_hz(now_s), _ENOUGH * self.wanted.arrives_hz
-        self.served |= rate_hz >= enough_hz
         fast = rate_hz > 0.0 and self.wanted.arrives_hz > SLOW_HZ
         if fast and now_s - self.arrivals_s[-1] > _STOPPED_S:
             return True  # before a flight ends for it

@@ -82,8 +82,7 @@ class Watch:
         self.ended = not data
         if descriptors:
             for descriptor in self.descriptors:
-                with suppress(OSError):  # that of the vehicle, if it has changed its port
-                    os.close(descriptor)
+                os.close(descriptor)
             self.descriptors = descriptors
         *lines, self._received = (self._received + data).split(b"\n")
         for line in lines:
@@ -228,9 +227,10 @@ def main() -> None:
             tell.put(f"taking over: {reason}")
         TakeOver(watch, watch.known, tell).run(reason)
         tell.close(CLOSE_S)
+        log, watch.descriptors = watch.descriptors[-1], []  # those of the link are closed
         watch.turn(0.0)  # it may have been killed in the meantime
         if watch.ended:
-            _score(watch.descriptors[-1])
+            _score(log)
 
 
 def _score(log: int) -> None:

@@ -218,7 +218,7 @@ def stayed_down_without_a_setpoint(pair: Pair) -> None:
 
 
 def asks_again(pair: Pair) -> None:
-    assert said(pair, "waiting for the link for at most 300 s, then landing is asked again")
+    assert said(pair, "waiting for the link for at most 300 s; landing is asked again once")
 
 
 def asks_each_second(pair: Pair) -> None:
