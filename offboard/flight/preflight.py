@@ -223,7 +223,7 @@ def _same_system_id(ground: Ground) -> str:
 
 
 def twin(ground: Ground) -> str:
-    """The vehicle, or one with its system id, is heard from a second address."""
+    """An autopilot with the vehicle's system id is heard from a second address."""
     return ground.session.senders.twin(ground.session.link_time_s)
 
 
