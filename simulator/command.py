@@ -79,10 +79,6 @@ def simulate(
     """Simulate vehicles that speak MAVLink as PX4 or ArduCopter does.
 
     Every option applies to each of --instances vehicles; seed, ports and system id count up.
-
-    Forwards nothing between its two links, as PX4 without MAV_x_FORWARD; PX4's own SITL and
-    ArduPilot forward. A ground station that commands component 191 (`offboard daemon`) needs a
-    router on the companion link, for example mavlink-router.
     """
     if show_version:
         print(f"pso-offboard {version('pso-offboard')}")

@@ -110,7 +110,9 @@ class Instance:
         self.companion = Server(self.view, rates_hz, self.keyring, number=0, barrier=lockstep)
         self.links = [self.companion]
         if ground_link:
-            self.links.append(Server(self.view, firmware.ground_rates_hz, self.keyring, number=1))
+            ground = Server(self.view, firmware.ground_rates_hz, self.keyring, number=1)
+            ground.others, self.companion.others = (self.companion,), (ground,)
+            self.links.append(ground)
         self.steps = 0
         self._faults = Injection(faults, seed)
         self.down: list[Channel] = []  # of link faults: telemetry

@@ -99,6 +99,11 @@ def sender_of(message: Message) -> Peer:
     return message.get_srcSystem(), message.get_srcComponent()
 
 
+def target_of(message: Message) -> Peer:
+    """Whom a message is for; 0 is all, also for a message without such a field."""
+    return getattr(message, "target_system", 0), getattr(message, "target_component", 0)
+
+
 def id_of(name: str) -> int | None:
     """Id of the message called `name`, or None when the dialect has none."""
     return _BY_NAME[name].id if name in _BY_NAME else None

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from simulator.autopilot.autopilot import ATTITUDE, GLOBAL, LOCAL
 from simulator.autopilot.sticks import RELEASE
-from simulator.mavlink.codec import Decoder, Keyring, Message, sender_of
+from simulator.mavlink.codec import Decoder, Keyring, Message, Peer, sender_of, target_of
 from simulator.mavlink.commands import Command, Commands
 from simulator.mavlink.outbox import MAV_COMP_ID_AUTOPILOT, Outbox
 from simulator.mavlink.telemetry import Schedule
@@ -22,6 +22,7 @@ _GUIDED = 2  # `current` of a mission item that is a place to fly to now
 _AXIS_NOT_USED = 2**15 - 1  # of MANUAL_CONTROL
 _NO_PLACE = 2**31 - 1  # in x and y of COMMAND_INT
 _OF_ALL = (519, 520)  # MAV_CMD: requests of the protocol and the version, which all systems answer
+_SEEN_MAX = 16  # MAX_REMOTE_COMPONENTS of PX4
 _FTP_NAK, _FTP_ERROR_NOT_FOUND = 128 + 1, 10
 
 
@@ -34,6 +35,8 @@ class Server:
         keyring: signing, of the vehicle.
         number: of the link.
         barrier: leave TIMESYNC requests to `send_barrier`: in lockstep they are the clock.
+
+    `others`: the vehicle's other links, to which messages for others are forwarded.
     """
 
     def __init__(
@@ -49,6 +52,7 @@ class Server:
         self.decoder = Decoder(keyring)
         self.answered_ns = -1  # ts1 of the newest TIMESYNC answer
         self.outbox = Outbox(view, keyring, number)
+        self.others: tuple[Server, ...] = ()
         clock = ("TIMESYNC",) if barrier else ()
         self._rates_hz = {name: hz for name, hz in rates_hz.items() if name not in clock}
         self._begin()
@@ -56,6 +60,7 @@ class Server:
     def _begin(self) -> None:
         """As after boot: default rates, nothing under way."""
         self.schedule = Schedule(self.view, self._rates_hz)
+        self._seen: list[Peer] = []
         self._commands = Commands(self.outbox, self.schedule)
         self._parameters = ParameterTransfer(self.outbox)
         self._missions = MissionTransfer(self.outbox)
@@ -82,16 +87,29 @@ class Server:
         """Handle all messages of one datagram; no bytes make this raise."""
         for message in self.decoder.read(datagram):
             self.outbox.connected = True
+            self._forward(message)
             ignored = message.get_type() in self.view.autopilot.firmware.ignored
             handler = None if ignored else HANDLERS.get(message.get_type())
             if handler is not None and self._is_for_us(message):
                 handler(self, message)
 
+    def _forward(self, message: Message) -> None:
+        """Forward a message, unless it is for the autopilot alone, to each other link on which its
+        target was seen, or anybody where it is for all: as PX4's SITL and ArduPilot do. Not
+        TIMESYNC, which is the clock of lockstep."""
+        sender, target = sender_of(message), target_of(message)
+        if sender not in self._seen and len(self._seen) < _SEEN_MAX:
+            self._seen.append(sender)
+        if target == (self.view.system, MAV_COMP_ID_AUTOPILOT) or message.get_type() == "TIMESYNC":
+            return
+        for link in self.others:
+            if any(_matches(target, peer) for peer in link._seen):
+                link.outbox.forward(bytes(message.get_msgbuf()))
+
     def _is_for_us(self, message: Message) -> bool:
         """Whether its target is this system and its autopilot, or all."""
         firmware, ours = self.view.autopilot.firmware, self.view.system
-        system = getattr(message, "target_system", 0)
-        component = getattr(message, "target_component", 0)
+        system, component = target_of(message)
         kind = message.get_type().partition("_")[0]
         to_all = kind not in firmware.never_to_all or getattr(message, "command", 0) in _OF_ALL
         for_autopilot = component in (0, MAV_COMP_ID_AUTOPILOT)
@@ -199,6 +217,11 @@ class Server:
         answer = head + (0,) * 6 + (_FTP_ERROR_NOT_FOUND,)
         padded = answer + (0,) * (len(request) - len(answer))
         self.outbox.send("FILE_TRANSFER_PROTOCOL", 0, *sender_of(message), padded)
+
+
+def _matches(target: Peer, peer: Peer) -> bool:
+    system, component = target
+    return system == 0 or (system == peer[0] and component in (0, peer[1]))
 
 
 # Handler by message name. A message with a target is handled only if that is this vehicle, or all

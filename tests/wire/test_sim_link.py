@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import struct
 from collections import Counter
+from typing import Any
 
 import numpy as np
 import pytest
@@ -56,6 +57,31 @@ def test_whether_what_is_sent_to_all_systems_is_obeyed(name: str, obeyed: bool) 
     bench.run(0.1)
     assert (ask_version, set_home) == ([0], [0] if obeyed else [])
     assert len(bench.of("PARAM_VALUE")) == len(bench.of("MISSION_COUNT")) == obeyed
+
+
+def test_messages_for_others_are_forwarded_between_the_links() -> None:
+    """As `Mavlink::forward_message` of PX4 1.16 does: to a component that was seen on the other
+    link, or to anybody there if it is for all."""
+    bench = Bench(ground_link=True)
+    ground = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
+
+    def command(system: int, component: int) -> Any:
+        return mavlink.MAVLink_command_long_message(system, component, 300, 0, *(0.0,) * 7)
+
+    heartbeat = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4, 3)
+    clock = mavlink.MAVLink_timesync_message(0, 1)
+    for message in (heartbeat, clock, *(command(1, each) for each in (1, 191, 190)), command(2, 0)):
+        bench.instance.feed_ground(message.pack(ground))
+    bench.run(0.1)
+    forwarded = [each for _, each in bench.received if each.get_srcSystem() == 255]
+    assert [each.get_type() for each in forwarded] == ["HEARTBEAT", "COMMAND_LONG"]
+    assert forwarded[1].target_component == 191
+
+    bench.instance.drain_ground()
+    bench.send(mavlink.MAVLink_command_ack_message(300, 0, 0, 0, 255, 190))
+    (datagram,) = bench.instance.drain_ground()
+    (answer,) = mavlink.MAVLink(None).parse_buffer(datagram)
+    assert (answer.get_srcComponent(), answer.command) == (191, 300)
 
 
 # -- rates -----------------------------------------------------------------------------------
