@@ -252,6 +252,7 @@ MEASURED: list[tuple[str, Measure, Any, Any]] = [
     ("thrust reserve", hovers, 0.9, 0.91),
     ("full thrust", sinks, 0.3, 0.31),
     ("ground", stands, 0.31, 0.29),
+    ("carried", lambda flight, share: hovers(flight, share * flight.model.hover_thrust), 0.51, 0.49),
     ("second sender", hears_another, 5.0, 4.9),
     ("other setpoints", follows, "POSCTL", "OFFBOARD"),
     ("clock", clock(jumped_s=float), 0.0, 0.6),

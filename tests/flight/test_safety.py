@@ -196,6 +196,13 @@ ROWS = {
         soon(Phase.TRACK, 4.0), fly=copter.hover, at=tracking(too_heavy), failsafes=["ground"],
         ended_by="ground contact",
     ),
+    # "flown and landed" before: by its estimate it was 3 m high
+    "it has sunk to the ground, and its estimate has not": ends(
+        r"the vehicle stands on something: [0-9]+ % of its thrust keeps it there", landed,
+        fly=partial(copter.hover, "reference.duration_s=8.0"), learning=IdentifySettings(),
+        at=tracking(lambda pair: pair.instance.autopilot.plant.reset_estimate((0.0, 0.0, -1.9))),
+        failsafes=["carried"], ended_by="ground contact",
+    ),
     # the autopilot brakes the climb with 2.5 m/s2 after it was asked to land
     "above the ceiling": ends(
         "2 m above and 0 m from the take-off point", landed, fly=partial(px4.hop, HIGH),
