@@ -77,7 +77,7 @@ def admit(
     if not age_s <= age_limit_s:
         raise Refused(Refusal.STALE, f"decided on telemetry that is {age_s:.2f} s old")
     if not late_s <= 0.0:
-        raise Refused(Refusal.LATE, f"decided {late_s:.2f} s too late")
+        raise Refused(Refusal.LATE, f"decided {1e3 * late_s:.1f} ms too late")
     if not usable(command):
         raise Refused(Refusal.UNUSABLE, f"unusable {command}")
     if isinstance(command, PositionCommand):
