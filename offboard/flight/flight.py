@@ -235,6 +235,8 @@ class Flight(FlightState):
         if not self.stop_reason:
             self._inputs.call("request_stop", why)
             self.stop_reason = why
+            if self.phase is Phase.LAND:
+                outbox.announce(self, f"{why}: it lands already")
 
     def announce(self, sentence: str) -> None:
         """Report a sentence to the user, the ground station and the log."""

@@ -141,6 +141,10 @@ def one_wrong_heartbeat(on: Vehicle, phase: Phase) -> Row:
     return flies(told, fly=on.hop, aloft=phase is not Phase.TAKEOFF, at=wrong)
 
 
+def says_that_it_lands(pair: Pair) -> None:
+    assert said(pair, "stop requested by the operator: it lands already")
+
+
 def taken(on: Vehicle, scenario: Any, says: str = "", **more: Any) -> Row:
     """Another takes it, and is not overridden."""
     says = f"the vehicle left (OFFBOARD|GUIDED) for{says}"
@@ -268,6 +272,9 @@ ROWS = {
     "all disturbances together": flies(
         fly=px4.lap, aloft=False, scenario="all_together", seed=1, deadline_s=0.05,
         believed=simulated.vehicle("neutral"), learning=IdentifySettings(),
+    ),
+    "stopped while it lands": flies(
+        says_that_it_lands, fly=copter.hover, at=then(Phase.LAND, 0.3, stop), failsafes=()
     ),
     "no GPS from the beginning, by motion capture": flies(
         fly=px4.hover, firmware=WITH_GPS, scenario=NO_GPS, failsafes=()

@@ -164,7 +164,11 @@ def test_a_law_that_needs_most_of_the_period_is_flown_and_a_slower_one_landed(
             r"telemetry was too old for a setpoint: .* telemetry that is 0\.2[89] s old \(limits",
             "link",
         ),
-        (0.16, r"this computer was too busy: decided [67][0-9]\.[0-9] ms too late \(limits", "computer"),
+        (
+            0.16,
+            r"this computer was too busy: decided [67][0-9]\.[0-9] ms too late \(limits",
+            "computer",
+        ),
     ],
 )
 def test_a_slow_prediction_is_no_failure_of_the_law(
