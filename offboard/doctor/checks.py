@@ -185,7 +185,7 @@ def rates(seen: Observation) -> Iterable[Finding]:
         f"{each.name} {rates_hz.get(each.name, 0.0):.1f} of {each.rate_hz:g} Hz"
         for each in seen.heard.slow(lambda each: each.rate_hz)
     ]
-    if not seen.heard.requested:
+    if not seen.heard.rates_requested:
         yield ok(f"{figures}; not requested, since the vehicle is armed")
     elif slow:
         yield warn(f"slower than requested: {', '.join(slow)}", seen.dialect.slow_hint)

@@ -111,7 +111,7 @@ def observe(
     """
     began_s = clock.monotonic_s()
     connection, others, error = vehicle.address, holders(vehicle.address), ""
-    heard = Listening(began_s, SessionSettings())
+    heard = Listening(config, began_s, SessionSettings())
     with ExitStack() as stack:
         signing = vehicle.signing(stack)
         try:
@@ -122,7 +122,7 @@ def observe(
             error = str(failure)
         else:
             stack.callback(link.close)
-            heard = _listen(link, vehicle.settings(link), signing, tell)
+            heard = _listen(config, link, vehicle.settings(link), signing, tell)
     return Observation(
         config,
         heard,
@@ -135,9 +135,13 @@ def observe(
 
 
 def _listen(
-    link: Link, settings: SessionSettings, signing: Signing | None, tell: Callable[[str], None]
+    config: FlightConfig,
+    link: Link,
+    settings: SessionSettings,
+    signing: Signing | None,
+    tell: Callable[[str], None],
 ) -> Listening:
-    heard = Listening(clock.monotonic_s(), settings, signing)
+    heard = Listening(config, clock.monotonic_s(), settings, signing)
     while not heard.complete(clock.monotonic_s()):
         link.wait(POLL_S)
         for chunk in link.receive():
@@ -171,7 +175,7 @@ def _within(seconds: float, call: Callable[[], Result]) -> Result:
 def examine(chosen: Iterable[str], seen: Observation) -> list[Row]:
     """One row for each of the checks that has something to say."""
     found = seen.found is not None
-    blocking = list(preflight.findings(seen.ground)) if found else []
+    blocking = list(preflight.findings(seen.heard)) if found else []
     rows, known = [], checks()
     for name in chosen:
         findings = [each for check, _, each in blocking if check == name]

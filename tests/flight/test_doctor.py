@@ -102,7 +102,7 @@ class Bench:
 
     def listen(self) -> Observation:
         settings = SessionSettings(capacity_bytes_ps=self.capacity_bytes_ps)
-        listening = Listening(self.now_s, settings, self.signing)
+        listening = Listening(self.config, self.now_s, settings, self.signing)
         while not listening.complete(self.now_s):
             for chunk in self.step():
                 listening.take(chunk)
@@ -511,7 +511,7 @@ def test_what_is_wrong_with_this_computer(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(computer, "_not_compiled", lambda: 0)
     monkeypatch.setattr(computer, "rehearse", lambda prepared, keeps_deadline: 0.04)
     monkeypatch.setattr(computer, "_sleep", lambda: 0.03)
-    heard = Listening(0.0, SessionSettings())
+    heard = Listening(load("flight"), 0.0, SessionSettings())
     seen = Observation(load("flight"), heard, "udpin:127.0.0.1:1", Path(), time.monotonic())
     rows = run.examine(["disk", "compiled", "computer"], seen)
     levels = {row.check: [finding.level for finding in row.findings] for row in rows}
