@@ -12,7 +12,6 @@ import threading
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack
-from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import TypeVar
@@ -32,6 +31,7 @@ from offboard.run.configuration import FlightConfig
 from offboard.run.flight import Connection
 
 Result = TypeVar("Result")
+Rows = dict[str, list[Finding]]  # what each check has found, the worst first
 POLL_S = 0.02
 # The command ends within 15 s: what takes longer is left out, and a row says so
 OPEN_S = 2.0  # to open the link, before listening
@@ -42,18 +42,6 @@ CHECKS = {each.__name__: each for each in (*OF_LINK, *OF_VEHICLE, *OF_FLIGHT, *O
 
 GROUP = "pso_offboard.checks"  # entry points of other packages: name and function of a check
 AUTHOR = "report this to whoever wrote the check"
-
-
-@dataclass(frozen=True, slots=True)
-class Row:
-    """The findings of one check, the worst first."""
-
-    check: str
-    findings: tuple[Finding, ...]
-
-    @property
-    def level(self) -> Level:
-        return self.findings[0].level
 
 
 def checks() -> dict[str, Check]:
@@ -172,17 +160,18 @@ def _within(seconds: float, call: Callable[[], Result]) -> Result:
 # --- judging ---
 
 
-def examine(chosen: Iterable[str], seen: Observation) -> list[Row]:
-    """One row for each of the checks that has something to say."""
+def examine(chosen: Iterable[str], seen: Observation) -> Rows:
+    """A row for each of the checks that has something to say."""
     found = seen.found is not None
     blocking = list(preflight.findings(seen.heard)) if found else []
-    rows, known = [], checks()
+    rows: Rows = {}
+    known = checks()
     for name in chosen:
         findings = [each for check, _, each in blocking if check == name]
         if found or known[name] not in OF_VEHICLE:
             findings += _judged(known[name], seen, seen.began_s + LOOK_S - clock.monotonic_s())
         if findings:
-            rows.append(Row(name, tuple(sorted(findings, key=lambda each: -each.level))))
+            rows[name] = sorted(findings, key=lambda each: -each.level)
     return rows
 
 
@@ -197,14 +186,14 @@ def _judged(check: Check, seen: Observation, most_s: float) -> list[Finding]:
         return [Finding(Level.WARN, sentence, AUTHOR)]
 
 
-def worst(rows: Iterable[Row]) -> Level:
+def worst(rows: Rows) -> Level:
     """The worst level of all."""
-    return max((row.level for row in rows), default=Level.OK)
+    return max((found[0].level for found in rows.values()), default=Level.OK)
 
 
-def verdict(rows: Iterable[Row], *, complete: bool) -> str:
+def verdict(rows: Rows, *, complete: bool) -> str:
     """One sentence: whether this vehicle can be flown now. `complete`: all checks were made."""
-    found = [(each.level, each.about or row.check) for row in rows for each in row.findings]
+    found = [(each.level, each.about or name) for name, row in rows.items() for each in row]
 
     def named(level: Level) -> list[str]:
         return list(dict.fromkeys(name for at, name in found if at is level))
@@ -218,7 +207,7 @@ def verdict(rows: Iterable[Row], *, complete: bool) -> str:
     return f"{ready}; warnings: {', '.join(warning)}" if warning else ready
 
 
-def as_json(rows: Sequence[Row], seen: Observation, sentence: str) -> str:
+def as_json(rows: Rows, seen: Observation, sentence: str) -> str:
     """One object with the worst level, the verdict, what was observed where, and a list of rows."""
     found, version = seen.found, seen.vehicle.version
     document = {
@@ -230,14 +219,14 @@ def as_json(rows: Sequence[Row], seen: Observation, sentence: str) -> str:
         "version": version and [version.major, version.minor, version.patch],
         "rows": [
             {
-                "check": row.check,
-                "level": row.level.name.lower(),
+                "check": name,
+                "level": row[0].level.name.lower(),
                 "findings": [
                     {"level": each.level.name.lower(), "found": each.found, "hint": each.hint}
-                    for each in row.findings
+                    for each in row
                 ],
             }
-            for row in rows
+            for name, row in rows.items()
         ],
     }
     return json.dumps(document, indent=2, ensure_ascii=False) + "\n"
