@@ -281,7 +281,7 @@ def test_a_changed_configuration_is_used_and_a_bad_one_refused(
     text = "vehicle: px4_sih\ncontroller: lqr\nreference: {shape: hover, height_m: %s}\n"
     file.write_text(text % 2)
     watched = Preparation(partial(load, str(file)))
-    first = watched.newest()
+    first = watched.newest
 
     def news(height: object) -> list[str]:
         file.write_text(text % height)
@@ -293,14 +293,14 @@ def test_a_changed_configuration_is_used_and_a_bad_one_refused(
     (refused,) = news("high")
     assert refused.startswith("the configuration is refused, the old one is kept: ")
     assert "height_m" in refused
-    assert watched.newest() is first
+    assert watched.newest is first
     for _ in range(2):
         (refused,) = news(200)  # is read, but cannot be flown
         assert "landing from 200 m" in refused
-        assert watched.newest() is first
+        assert watched.newest is first
         assert news(2) == []
     assert news(3) == ["the configuration has changed: used from the next flight on"]
-    assert "height_m: 3" in watched.newest().text
+    assert "height_m: 3" in watched.newest.text
 
 
 def test_a_switch_counts_in_the_air_from_a_mode_without_failsafe() -> None:
