@@ -54,7 +54,6 @@ class Watch:
         self._silent_s = 0.0
         self.newest: dict[str, Any] = {}  # beat
         self.known: Supervised | None = None  # as it says
-        self.key: bytes | None = None  # of signing
         self.descriptors: list[int] = []  # of the link, then of the log
         self.ended = False
 
@@ -94,10 +93,7 @@ class Watch:
         except ValueError:  # only a part of it did fit into the buffer
             return
         self._silent_s = 0.0
-        if "key" in message:
-            self.key = bytes.fromhex(message["key"])
-        else:
-            self.newest, self.known = message, _known(**message["known"])
+        self.newest, self.known = message, _known(**message["known"])
 
 
 class TakeOver:
@@ -113,8 +109,8 @@ class TakeOver:
         self._log = BackgroundWriter[bytes](
             lambda entries: append(watch.descriptors[-1], entries), 100_000
         )
-        signing = watch.key and Signing.resumed(watch.key, clock.monotonic_s, beat["signing"])
-        self._session = Session(SessionSettings(stream=beat["stream"]), signing or None)
+        signing = beat["signing"] and Signing.resumed(clock.monotonic_s, beat["signing"])
+        self._session = Session(SessionSettings(stream=beat["stream"]), signing)
         self._session.senders.set_vehicle(known.vehicle, peer)
         assert self._session.dialect is not None
         self._dialect = self._session.dialect

@@ -58,8 +58,6 @@ class Supervisor:
             except OSError as error:  # for example no memory, or too many processes
                 self._channel.close()
                 raise Unavailable(f"{NOT_STARTED}: {error.strerror}") from None
-        if self._signing:  # not in arguments or environment, which others can read
-            self._channel.send(json.dumps({"key": self._signing.key.hex()}).encode() + b"\n")
         return self
 
     @property
@@ -106,6 +104,7 @@ class Supervisor:
             "peer": peer,
             "stream": link.is_stream,
             "listens": link.listens,
+            # the key, too: not in arguments or environment, which others can read
             "signing": self._signing.state() if self._signing else None,
         }
         line = json.dumps(beat).encode() + b"\n"
