@@ -26,7 +26,6 @@ from offboard.link import clock
 from offboard.link.connection import open_link
 from offboard.link.interface import Link
 from offboard.mavlink.session import SessionSettings
-from offboard.mavlink.signing import Signing
 from offboard.run.configuration import FlightConfig
 from offboard.run.flight import Connection
 
@@ -110,26 +109,12 @@ def observe(
             error = str(failure)
         else:
             stack.callback(link.close)
-            heard = _listen(config, link, vehicle.settings(link), signing, tell)
-    return Observation(
-        config,
-        heard,
-        connection,
-        directory,
-        began_s,
-        link_error=error,
-        holders=others,
-    )
+            heard = Listening(config, clock.monotonic_s(), vehicle.settings(link), signing)
+            _listen(heard, link, tell)
+    return Observation(config, heard, connection, directory, began_s, error, others)
 
 
-def _listen(
-    config: FlightConfig,
-    link: Link,
-    settings: SessionSettings,
-    signing: Signing | None,
-    tell: Callable[[str], None],
-) -> Listening:
-    heard = Listening(config, clock.monotonic_s(), settings, signing)
+def _listen(heard: Listening, link: Link, tell: Callable[[str], None]) -> None:
     while not heard.complete(clock.monotonic_s()):
         link.wait(POLL_S)
         for chunk in link.receive():
@@ -139,7 +124,6 @@ def _listen(
         vehicle = heard.session.vehicle
         found = vehicle.autopilot if vehicle else "no vehicle yet"
         tell(f"listening, {heard.listened_s:.0f} s of at most {LONGEST_S:.0f} s: {found}")
-    return heard
 
 
 def _within(seconds: float, call: Callable[[], Result]) -> Result:
