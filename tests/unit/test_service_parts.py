@@ -10,7 +10,6 @@ import sys
 import time
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -34,7 +33,7 @@ from offboard.mavlink.session import Session, SessionSettings
 from offboard.reference.track import STOP_S
 from offboard.run.configuration import load
 from offboard.run.flight import build
-from offboard.service import daemon, preparation
+from offboard.service import daemon, preparation, record
 from offboard.service.daemon import Manager
 from offboard.service.preparation import Preparation, VehicleFiles
 from offboard.service.record import ROLLING_NAMES, Recorder
@@ -48,16 +47,19 @@ def session() -> Session:
     return made
 
 
-def recorded(directory: Path, **options: Any) -> tuple[Recorder, list[Path]]:
+def recorded(directory: Path) -> tuple[Recorder, list[Path]]:
     """A recorder, and the flights that it has scored."""
     scored: list[Path] = []
-    return Recorder(directory, score=scored.append, **options), scored
+    return Recorder(directory, score=scored.append), scored
 
 
 @pytest.mark.parametrize("version_1", [False, True])
-def test_a_flight_log_begins_with_what_came_before(version_1: bool, tmp_path: Path) -> None:
+def test_a_flight_log_begins_with_what_came_before(
+    version_1: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """With the home position from long ago, the last five seconds and the configuration."""
-    recorder, scored = recorded(tmp_path, stamp=lambda: "now")
+    monkeypatch.setattr(clock, "local_stamp", lambda: "now")
+    recorder, scored = recorded(tmp_path)
     talk, began_us = session(), clock.unix_us() - 20_000_000
     codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     home = mavlink.MAVLink_gps_global_origin_message(1, 2, 3).pack(codec, version_1)
@@ -121,8 +123,9 @@ def test_a_vehicle_is_left_engaged_until_it_was_handed_back(tmp_path: Path) -> N
     again.close()
 
 
-def test_the_rolling_log_is_bounded(tmp_path: Path) -> None:
-    recorder, _ = recorded(tmp_path, rolling_bytes=20_000)
+def test_the_rolling_log_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(record, "ROLLING_BYTES", 20_000)
+    recorder, _ = recorded(tmp_path)
     frame = session().encode(Heartbeat(6))
     for number in range(4000):
         recorder.write(number * 1000, frame)
@@ -135,9 +138,11 @@ def test_the_rolling_log_is_bounded(tmp_path: Path) -> None:
     assert sum(sizes) > 10_000
 
 
-def test_a_flight_that_cannot_be_recorded_says_so_and_the_next_one_is(tmp_path: Path) -> None:
-    names = iter([f"{ROLLING_NAMES[0]}/x", "later"])
-    recorder, scored = recorded(tmp_path, stamp=lambda: next(names))
+def test_a_flight_that_cannot_be_recorded_says_so_and_the_next_one_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(clock, "local_stamp", iter([f"{ROLLING_NAMES[0]}/x", "later"]).__next__)
+    recorder, scored = recorded(tmp_path)
     talk = session()
     recorder.begin(talk, "", "")
     deadline_s = time.monotonic() + 10.0
