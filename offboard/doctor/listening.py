@@ -38,6 +38,7 @@ from offboard.mavlink.outgoing import CommandLong, Outgoing, Timesync
 from offboard.mavlink.senders import is_vehicle
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.signing import Signing
+from offboard.mavlink.telemetry import ENOUGH
 from offboard.run.configuration import FlightConfig
 
 DOCTOR_ID = 193  # MAV_COMP_ID_ONBOARD_COMPUTER3
@@ -48,7 +49,6 @@ ASK_EVERY_S = 1.0
 TIMESYNC_EVERY_S = 0.1
 PREARM_AFTER_S = 1.0  # what is asked before may be lost: the link has just been opened
 TEXTS_S = 1.0  # for the texts after the acknowledgement
-ENOUGH = 0.7  # of a rate, measured over two seconds
 SETTLE_S = 1.0  # until jumps of the vehicle's clock count
 RUN_PREARM_CHECKS = 401  # MAV_CMD
 VERSION, GPS = 148, 24  # message ids
