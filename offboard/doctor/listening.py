@@ -1,5 +1,4 @@
-"""The listening pass: who sends, what is received and what is asked, until enough is known; and
-`Observation`, all that is known then.
+"""The listening pass: who sends, what is received and what is asked, until enough is known.
 
 Sans-I/O: received chunks and host times in, frames out. It only asks, see README.md.
 """
@@ -17,7 +16,6 @@ from pymavlink.dialects.v20.all import mavlink_map
 
 from offboard.flight.preflight import Ground, ParameterReading
 from offboard.flight.timing import VehicleClock
-from offboard.flight.vehicle_state import VehicleState
 from offboard.link.interface import Chunk, peer_name
 from offboard.mavlink.decode import FIX_3D
 from offboard.mavlink.dialects.base import TYPE_GCS, Dialect, WantedMessage, id_of
@@ -128,20 +126,24 @@ class Senders:
         return sorted(self._senders.values(), key=lambda sender: -sender.frames)
 
 
-class Listening(Ground):
-    """One pass over one link, for a flight of `config`, from host time `began_s` to `host_s`.
-    `settings`: of the session of that flight.
+class Observation(Ground):
+    """What checks judge: a flight of `config` that is recorded in `directory`, and what one pass
+    over the link `connection` finds for it, from host time `now_s` to `host_s`. `settings`: of the
+    session of that flight.
 
     What the preflight list judges is in it, as in a flight; `senders` has all that sends.
-    `fix_type` is the vehicle's GPS_FIX_TYPE, at most FIX_3D; `late_s` the greatest age of its
-    telemetry beyond the least; `foreign_replies` the number of its replies to requests of TIMESYNC
-    that are not ours.
+    `began_s`: host time when the whole check began; `link_error`: why the link cannot be opened;
+    `holders`: other processes that have its port. `fix_type` is the vehicle's GPS_FIX_TYPE, at most
+    FIX_3D; `late_s` the greatest age of its telemetry beyond the least; `foreign_replies` the
+    number of its replies to requests of TIMESYNC that are not ours.
     """
 
     def __init__(
         self,
         config: FlightConfig,
-        began_s: float,
+        connection: str,
+        directory: Path,
+        now_s: float,
         settings: SessionSettings,
         signing: Signing | None = None,
     ) -> None:
@@ -149,16 +151,19 @@ class Listening(Ground):
             limits=config.limits,
             session=Session(replace(settings, component_id=DOCTOR_ID), signing),
             model=config.vehicle,
-            host_s=began_s,
+            host_s=now_s,
             rates_requested=False,
             reading=ParameterReading(advice=True),
         )
+        self.config, self.connection, self.directory = config, connection, directory
+        self.began_s = self._listens_s = now_s
+        self.link_error = ""
+        self.holders: tuple[str, ...] = ()
         self.senders = Senders(settings.stream)
         self.rebooted = False  # in this pass
         self.fix_type: int | None = None
         self.late_s = 0.0
         self.foreign_replies = 0
-        self._began_s = began_s
         self._found_s = 0.0
         self._asked_s: dict[int, float] = {}  # message or command: when it was asked last
         self._settled = False
@@ -212,7 +217,7 @@ class Listening(Ground):
     def _questions(self, now_s: float) -> Iterable[Outgoing]:
         yield from filter(self._permitted, self.session.poll(now_s))
         self.vehicle.now_s = self.session.link_time_s  # also while nothing is heard
-        dialect, state = self.dialect, self.vehicle
+        dialect, state = self.session.dialect, self.vehicle
         if dialect is None:
             greets = self.session.settings.sends_first or self._may_greet
             if greets and self._may_ask(TIMESYNC, now_s):
@@ -252,9 +257,19 @@ class Listening(Ground):
 
     # --- what it has found ---
 
+    @property
+    def found(self) -> VehicleFound | None:
+        return self.session.vehicle
+
+    @property
+    def dialect(self) -> Dialect:
+        """Dialect of the vehicle that was found."""
+        assert self.session.dialect is not None
+        return self.session.dialect
+
     def complete(self, now_s: float) -> bool:
         """Everything was answered, or it takes too long."""
-        state, dialect, passed_s = self.vehicle, self.dialect, now_s - self._began_s
+        state, dialect, passed_s = self.vehicle, self.session.dialect, now_s - self._listens_s
         if dialect is None:
             return passed_s >= NOTHING_S
         if now_s - self._found_s < LEAST_S or passed_s >= LONGEST_S:
@@ -271,7 +286,7 @@ class Listening(Ground):
 
     def slow(self, wanted_hz: Callable[[WantedMessage], float]) -> list[WantedMessage]:
         """Telemetry that a flight needs and that arrives at much less than a rate."""
-        dialect, rates_hz = self.dialect, self.session.telemetry.rates_hz
+        dialect, rates_hz = self.session.dialect, self.session.telemetry.rates_hz
         return [
             each
             for each in (dialect.wanted if dialect else ())
@@ -280,45 +295,15 @@ class Listening(Ground):
 
     @property
     def listened_s(self) -> float:
-        return self.host_s - self._began_s
+        return self.host_s - self._listens_s
 
     @property
     def bytes_ps(self) -> float:
         """Received since the vehicle was found."""
-        passed_s = max(self.host_s - (self._found_s or self._began_s), 1e-3)
+        passed_s = max(self.host_s - (self._found_s or self._listens_s), 1e-3)
         return self.senders.splitter.bytes_received / passed_s
 
     @property
     def has_asked(self) -> bool:
         """Whether a command was sent to which an acknowledgement is due."""
         return bool(self._asked_s.keys() - {TIMESYNC})
-
-
-@dataclass(frozen=True, slots=True)
-class Observation:
-    """What checks judge: a flight of `config` that is recorded in `directory`, on `connection`.
-
-    `link_error`: why this cannot be opened; `holders`: other processes that have its port;
-    `began_s`: host time when the check began."""
-
-    config: FlightConfig
-    heard: Listening
-    connection: str
-    directory: Path
-    began_s: float
-    link_error: str = ""
-    holders: tuple[str, ...] = ()
-
-    @property
-    def found(self) -> VehicleFound | None:
-        return self.heard.session.vehicle
-
-    @property
-    def vehicle(self) -> VehicleState:
-        return self.heard.vehicle
-
-    @property
-    def dialect(self) -> Dialect:
-        """Dialect of the vehicle that was found."""
-        assert self.heard.session.dialect is not None
-        return self.heard.session.dialect

@@ -18,7 +18,7 @@ from typing import TypeVar
 
 from offboard.doctor.checks import OF_FLIGHT, OF_LINK, OF_VEHICLE, Check, wait
 from offboard.doctor.computer import OF_COMPUTER, holders
-from offboard.doctor.listening import LONGEST_S, Listening, Observation
+from offboard.doctor.listening import LONGEST_S, Observation
 from offboard.documents.errors import Unavailable, UserError, located, shown
 from offboard.flight import preflight
 from offboard.flight.preflight import Finding, Level
@@ -96,34 +96,36 @@ def observe(
 
     Raises UserError for an address that is no address, and for a signing key.
     """
-    began_s = clock.monotonic_s()
-    connection, others, error = vehicle.address, holders(vehicle.address), ""
-    heard = Listening(config, began_s, SessionSettings())
+    began_s, others = clock.monotonic_s(), holders(vehicle.address)
+    link, settings, error = None, SessionSettings(), ""
     with ExitStack() as stack:
         signing = vehicle.signing(stack)
         try:
-            link = _within(OPEN_S, lambda: open_link(connection))
+            link = _within(OPEN_S, lambda: open_link(vehicle.address))
         except TimeoutError:
-            error = f"connection {shown(connection)} cannot be opened in {OPEN_S:g} s"
+            error = f"connection {shown(vehicle.address)} cannot be opened in {OPEN_S:g} s"
         except Unavailable as failure:
             error = str(failure)
         else:
             stack.callback(link.close)
-            heard = Listening(config, clock.monotonic_s(), vehicle.settings(link), signing)
-            _listen(heard, link, tell)
-    return Observation(config, heard, connection, directory, began_s, error, others)
+            settings = vehicle.settings(link)
+        now_s = clock.monotonic_s()
+        seen = Observation(config, vehicle.address, directory, now_s, settings, signing)
+        seen.began_s, seen.link_error, seen.holders = began_s, error, others
+        if link:
+            _listen(seen, link, tell)
+    return seen
 
 
-def _listen(heard: Listening, link: Link, tell: Callable[[str], None]) -> None:
-    while not heard.complete(clock.monotonic_s()):
+def _listen(seen: Observation, link: Link, tell: Callable[[str], None]) -> None:
+    while not seen.complete(clock.monotonic_s()):
         link.wait(POLL_S)
         for chunk in link.receive():
-            heard.take(chunk)
-        for frame in heard.due(clock.monotonic_s()):
-            link.send(frame, heard.session.peer)
-        vehicle = heard.session.vehicle
-        found = vehicle.autopilot if vehicle else "no vehicle yet"
-        tell(f"listening, {heard.listened_s:.0f} s of at most {LONGEST_S:.0f} s: {found}")
+            seen.take(chunk)
+        for frame in seen.due(clock.monotonic_s()):
+            link.send(frame, seen.session.peer)
+        found = seen.found.autopilot if seen.found else "no vehicle yet"
+        tell(f"listening, {seen.listened_s:.0f} s of at most {LONGEST_S:.0f} s: {found}")
 
 
 def _within(seconds: float, call: Callable[[], Result]) -> Result:
@@ -147,7 +149,7 @@ def _within(seconds: float, call: Callable[[], Result]) -> Result:
 def examine(chosen: Iterable[str], seen: Observation) -> Rows:
     """A row for each of the checks that has something to say."""
     found = seen.found is not None
-    blocking = list(preflight.findings(seen.heard)) if found else []
+    blocking = list(preflight.findings(seen)) if found else []
     rows: Rows = {}
     known = checks()
     for name in chosen:
@@ -198,7 +200,7 @@ def as_json(rows: Rows, seen: Observation, sentence: str) -> str:
         "level": worst(rows).name.lower(),
         "verdict": sentence,
         "connection": seen.connection,
-        "listened_s": round(seen.heard.listened_s, 2),
+        "listened_s": round(seen.listened_s, 2),
         "vehicle": found and {"autopilot": found.autopilot, "system_id": found.system_id},
         "version": version and [version.major, version.minor, version.patch],
         "rows": [

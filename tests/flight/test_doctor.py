@@ -19,7 +19,7 @@ from pydantic import TypeAdapter
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.doctor import computer, run
-from offboard.doctor.listening import LONGEST_S, NOTHING_S, Listening, Observation
+from offboard.doctor.listening import LONGEST_S, NOTHING_S, Observation
 from offboard.doctor.run import OF_COMPUTER, Rows, examine, verdict
 from offboard.flight.phases import Limits
 from offboard.flight.preflight import Finding, Ground, Level, findings
@@ -102,16 +102,17 @@ class Bench:
 
     def listen(self) -> Observation:
         settings = SessionSettings(capacity_bytes_ps=self.capacity_bytes_ps)
-        listening = Listening(self.config, self.now_s, settings, self.signing)
-        while not listening.complete(self.now_s):
+        link = "udpin:127.0.0.1:14540"
+        seen = Observation(self.config, link, Path("."), self.now_s, settings, self.signing)
+        while not seen.complete(self.now_s):
             for chunk in self.step():
-                listening.take(chunk)
+                seen.take(chunk)
             if self.instance.steps % 5 == 0:
-                for frame in self.up(listening.due(self.now_s)):
+                for frame in self.up(seen.due(self.now_s)):
                     self.sent.append(decode(frame))
                     self.instance.feed(frame)
-        address, began_s = "udpin:127.0.0.1:14540", clock.monotonic_s()
-        return Observation(self.config, listening, address, Path("."), began_s)
+        seen.began_s = clock.monotonic_s()
+        return seen
 
     def check(self, *names: str) -> Rows:
         """The rows of a check now, by name."""
@@ -460,7 +461,7 @@ def test_flood_of_addresses_and_ids_is_bounded() -> None:
         return from_others(GCS_HEARTBEAT, *ids, 250.0, ("10.0.0.1", port))(time_s)
 
     seen = bench(before=before).listen()
-    assert len(seen.heard.senders.found) == 64
+    assert len(seen.senders.found) == 64
     assert seen.found is not None
 
 
@@ -511,8 +512,8 @@ def test_what_is_wrong_with_this_computer(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(computer, "_not_compiled", lambda: 0)
     monkeypatch.setattr(computer, "rehearse", lambda prepared, keeps_deadline: 0.04)
     monkeypatch.setattr(computer, "_sleep", lambda: 0.03)
-    heard = Listening(load("flight"), 0.0, SessionSettings())
-    seen = Observation(load("flight"), heard, "udpin:127.0.0.1:1", Path(), time.monotonic())
+    now_s = time.monotonic()
+    seen = Observation(load("flight"), "udpin:127.0.0.1:1", Path(), now_s, SessionSettings())
     rows = run.examine(["disk", "compiled", "computer"], seen)
     levels = {name: [finding.level for finding in row] for name, row in rows.items()}
     assert levels == {"disk": [Level.WARN], "compiled": [Level.OK], "computer": [Level.WARN] * 2}
