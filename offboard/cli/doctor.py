@@ -46,9 +46,9 @@ def doctor(
     from offboard.doctor import run
     from offboard.flight.preflight import Level
 
-    chosen = run.names(names or ())
+    chosen = run.chosen(names or ())
     if listing:
-        say_each({name: run.summary(name) for name in chosen}, margin=0)
+        say_each({name: run.summary(check) for name, check in chosen.items()}, margin=0)
         return
     flight = options.load()
     with err.status("opening the link") as status:  # a line on a terminal, nothing elsewhere

@@ -9,7 +9,7 @@ from __future__ import annotations
 import inspect
 import json
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack
 from importlib.metadata import EntryPoint, entry_points
@@ -64,19 +64,19 @@ def _installed(point: EntryPoint) -> Check:
     return loaded
 
 
-def names(chosen: Sequence[str] = ()) -> list[str]:
-    """The chosen checks in the order of the table; all if none is. Raises UserError."""
+def chosen(names: Sequence[str] = ()) -> dict[str, Check]:
+    """The checks of these names in the order of the table; all without names. Raises UserError."""
     known = checks()
-    for name in chosen:
+    for name in names:
         if name not in known:
             listed = ", ".join(known)
             raise UserError(f"there is no check named {shown(name)}; known are {listed}")
-    return [name for name in known if not chosen or name in chosen]
+    return {name: check for name, check in known.items() if not names or name in names}
 
 
-def summary(name: str) -> str:
+def summary(check: Check) -> str:
     """What a check is about."""
-    text = (inspect.getdoc(checks()[name]) or "").partition("\n\n")[0]
+    text = (inspect.getdoc(check) or "").partition("\n\n")[0]
     return " ".join(text.split())
 
 
@@ -146,16 +146,15 @@ def _within(seconds: float, call: Callable[[], Result]) -> Result:
 # --- judging ---
 
 
-def examine(chosen: Iterable[str], seen: Observation) -> Rows:
+def examine(asked: Mapping[str, Check], seen: Observation) -> Rows:
     """A row for each of the checks that has something to say."""
     found = seen.found is not None
     blocking = list(preflight.findings(seen)) if found else []
     rows: Rows = {}
-    known = checks()
-    for name in chosen:
-        findings = [each for check, _, each in blocking if check == name]
-        if found or known[name] not in OF_VEHICLE:
-            findings += _judged(known[name], seen, seen.began_s + LOOK_S - clock.monotonic_s())
+    for name, check in asked.items():
+        findings = [each for about, _, each in blocking if about == name]
+        if found or check not in OF_VEHICLE:
+            findings += _judged(check, seen, seen.began_s + LOOK_S - clock.monotonic_s())
         if findings:
             rows[name] = sorted(findings, key=lambda each: -each.level)
     return rows

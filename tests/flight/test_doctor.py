@@ -118,8 +118,8 @@ class Bench:
         """The rows of a check now, by name."""
         seen = self.listen()
         assert_read_only(self.sent)
-        chosen = [name for name in run.names(names) if name not in BUSY]
-        return examine(chosen, seen)
+        chosen = run.chosen(names).items()
+        return examine({name: check for name, check in chosen if name not in BUSY}, seen)
 
     def follow(self, row: list[Finding]) -> None:
         """Do what the hints of a row say: set the parameters that they name."""
@@ -481,7 +481,7 @@ def test_checks_of_other_packages_are_rows_and_broken_ones_too(
     register(tmp_path, "site_checks", run.GROUP, **checks)
     monkeypatch.syspath_prepend(tmp_path)
     seen = bench().listen()
-    rows = run.examine(run.names(list(checks)), seen)
+    rows = run.examine(run.chosen(list(checks)), seen)
     assert rows["ceiling"][0].hint == "--set limits.ceiling_m=6"
     for name, error in (("gone", "ModuleNotFound"), ("imported", "System"), ("called", "System")):
         assert f"failed: {error}" in rows[name][0].found
@@ -500,7 +500,7 @@ def test_the_command_ends_in_time_although_nothing_of_it_does(
     monkeypatch.setattr(computer, "_not_compiled", lambda: 0)
     began_s = time.monotonic()
     seen = run.observe(Connection("tcp:10.0.0.1:5760"), load("flight"), tmp_path)
-    rows = run.examine(["port", "computer"], seen)
+    rows = run.examine(run.chosen(["port", "computer"]), seen)
     assert time.monotonic() - began_s < 2.0
     assert "cannot be opened in 0.1 s" in rows["port"][0].found
     assert rows["computer"][0].level is Level.WAIT
@@ -514,7 +514,7 @@ def test_what_is_wrong_with_this_computer(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(computer, "_sleep", lambda: 0.03)
     now_s = time.monotonic()
     seen = Observation(load("flight"), "udpin:127.0.0.1:1", Path(), now_s, SessionSettings())
-    rows = run.examine(["disk", "compiled", "computer"], seen)
+    rows = run.examine(run.chosen(["disk", "compiled", "computer"]), seen)
     levels = {name: [finding.level for finding in row] for name, row in rows.items()}
     assert levels == {"disk": [Level.WARN], "compiled": [Level.OK], "computer": [Level.WARN] * 2}
     found = " ".join(finding.found for finding in rows["computer"])
