@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from offboard.mavlink.outgoing import CommandLong
 
 SET_MODE, TAKEOFF = 176, 22  # MAV_CMD
-CUSTOM_MODE_ENABLED = 1.0  # MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+_CUSTOM_MODE_ENABLED = 1.0  # MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 # limits of a `Vehicle`
 ACCELERATION_LIMIT, RATE_LIMIT = "angular_acceleration_limit_radps2", "angular_rate_limit_radps"
 TYPE_ONBOARD_CONTROLLER, TYPE_GCS = 18, 6  # MAV_TYPE
@@ -154,7 +154,7 @@ class Dialect:
     name: str
     mav_autopilot: int
     modes: Mapping[int, str]
-    mode_parameters: Callable[[int], tuple[float, float, float]]  # custom_mode -> MAV_CMD 176
+    mode_parameters: Callable[[int], tuple[float, ...]]  # custom_mode -> MAV_CMD 176, from 2 on
     engage_mode: str
     hold_mode: str
     land_mode: str
@@ -189,7 +189,7 @@ class Dialect:
     def set_mode(self, name: str) -> CommandLong:
         """MAV_CMD_DO_SET_MODE. Raises KeyError for an unknown mode."""
         numbers = {known: custom_mode for custom_mode, known in self.modes.items()}
-        return CommandLong(SET_MODE, self.mode_parameters(numbers[name]))
+        return CommandLong(SET_MODE, (_CUSTOM_MODE_ENABLED, *self.mode_parameters(numbers[name])))
 
     def engage(self) -> CommandLong:
         return self.set_mode(self.engage_mode)

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from offboard.mavlink.dialects.base import (
-    CUSTOM_MODE_ENABLED,
     RATE_LIMIT,
     TRACKING_TELEMETRY,
     Defect,
@@ -24,8 +23,8 @@ def _custom_mode(main: int, sub: int = 0) -> int:
 
 
 # PX4 acknowledges it twice: on receipt, and up to 12 ms later with the commander's result
-def _mode_parameters(custom_mode: int) -> tuple[float, float, float]:
-    return CUSTOM_MODE_ENABLED, float(custom_mode >> 16 & 0xFF), float(custom_mode >> 24)
+def _mode_parameters(custom_mode: int) -> tuple[float, ...]:
+    return float(custom_mode >> 16 & 0xFF), float(custom_mode >> 24)
 
 
 _NO_STICKS = 4.0  # COM_RC_IN_MODE
