@@ -227,7 +227,7 @@ def firmware(seen: Observation) -> Iterable[Finding]:
         yield warn(f"{name} is older than {oldest}, which nobody has tested", "update the firmware")
     elif version.kind != RELEASE:
         yield warn(f"{name} is no release", "install a release")
-    defects = [each.what for each in dialect.defects if number < each.fixed_in]
+    defects = [what for what, fixed_in in dialect.defects.items() if number < fixed_in]
     yield ok("; ".join((name, *(f"known defect: {each}" for each in defects))))
 
 

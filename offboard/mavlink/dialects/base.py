@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
@@ -139,14 +139,6 @@ class SetpointLoss:
 NEVER = SetpointLoss(math.inf)
 
 
-@dataclass(frozen=True, slots=True)
-class Defect:
-    """A defect of an autopilot's firmware before version `fixed_in`, as (major, minor)."""
-
-    fixed_in: tuple[int, int]
-    what: str
-
-
 @dataclass(frozen=True)
 class Dialect:
     """One autopilot. Modes are given by name; `modes` maps HEARTBEAT.custom_mode to the name."""
@@ -176,7 +168,8 @@ class Dialect:
     oldest: tuple[int, int]  # version that this dialect is made for
     # what the vehicle does when setpoints stop, by its parameters; a missing one may have any value
     setpoint_loss: Callable[[Mapping[str, float]], SetpointLoss]
-    defects: tuple[Defect, ...] = ()
+    # known defects of its firmware, each with the version that mends it, as (major, minor)
+    defects: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
     def mode_name(self, custom_mode: int) -> str:
         return self.modes.get(custom_mode) or f"UNKNOWN(0x{custom_mode:08x})"

@@ -9,7 +9,6 @@ from types import MappingProxyType
 from offboard.mavlink.dialects.base import (
     RATE_LIMIT,
     TRACKING_TELEMETRY,
-    Defect,
     Dialect,
     SetpointLoss,
     Valid,
@@ -158,9 +157,11 @@ PX4 = Dialect(
     ),
     oldest=(1, 14),
     setpoint_loss=_setpoint_loss,
-    defects=(
-        Defect((1, 17), "setpoints without thrust keep OFFBOARD alive; ours always have thrust"),
-        Defect((1, 17), "COM_OBL_RC_ACT 0 to 2 is obeyed without a radio"),
+    defects=MappingProxyType(
+        {
+            "setpoints without thrust keep OFFBOARD alive; ours always have thrust": (1, 17),
+            "COM_OBL_RC_ACT 0 to 2 is obeyed without a radio": (1, 17),
+        }
     ),
     wanted=(
         *TRACKING_TELEMETRY,
