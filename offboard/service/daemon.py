@@ -37,7 +37,6 @@ from offboard.supervisor.supervisor import Supervisor
 
 LINK_EVERY_S = 2.0  # between two attempts to open the link
 WATCHDOG_EVERY_S = 1.0
-WATCHDOG_S = 10
 TEMPLATE = Path(__file__).with_name("offboard.service.j2")
 PRIVATE = (Path("/tmp"), Path("/var/tmp"))  # the unit has its own
 OTHERS_READ, OTHERS_ENTER = 0o4, 0o1
@@ -186,7 +185,6 @@ def unit(arguments: Sequence[str], connection: str, signing_key: Path | None = N
         connection=connection.replace("%", "%%"),
         serial=connection.startswith("serial:"),
         signing_key=str(signing_key.absolute()).replace("%", "%%") if signing_key else "",
-        watchdog_s=WATCHDOG_S,
     )
 
 
