@@ -53,7 +53,6 @@ class Watch:
         self._received = b""
         self._silent_s = 0.0
         self.newest: dict[str, Any] = {}  # beat
-        self.known: Supervised | None = None  # as it says
         self.descriptors: list[int] = []  # of the link, then of the log
         self.ended = False
 
@@ -66,12 +65,18 @@ class Watch:
         if not self._silent_s:
             with suppress(OSError):  # it is stopped, or has ended
                 self._channel.send(b'""\n')
-        if not (self.known and self.known.ours and self.known.flying):
+        known = self.known
+        if not (known and known.ours and known.flying):
             return ""
         if self.ended:
             return DIED
-        silent_s = self.known.silent_s
+        silent_s = known.silent_s
         return HANGS.format(silent_s=silent_s) if self._silent_s >= silent_s else ""
+
+    @property
+    def known(self) -> Supervised | None:
+        """What the newest beat says; None before the first."""
+        return _known(**self.newest["known"]) if self.newest else None
 
     def _read(self) -> None:
         data = b""
@@ -85,15 +90,8 @@ class Watch:
             self.descriptors = descriptors
         *lines, self._received = (self._received + data).split(b"\n")
         for line in lines:
-            self._take(line)
-
-    def _take(self, line: bytes) -> None:
-        try:
-            message = json.loads(line)
-        except ValueError:  # only a part of it did fit into the buffer
-            return
-        self._silent_s = 0.0
-        self.newest, self.known = message, _known(**message["known"])
+            with suppress(ValueError):  # only a part of it did fit into the buffer
+                self.newest, self._silent_s = json.loads(line), 0.0
 
 
 class TakeOver:
