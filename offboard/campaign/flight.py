@@ -97,7 +97,7 @@ def recorded(job: Job, directory: Path, fly: Callable[[FlightConfig, Path], Outc
     except (OSError, MemoryError) as error:
         raise UserError(f"no flight can be flown here: {str(error) or 'out of memory'}") from None
     except UserError as error:
-        if not (isinstance(error, DocumentError) and error.is_usage):
+        if not (isinstance(error, DocumentError) and error.code == DocumentError.code):
             raise  # it is not the case that is wrong
         sentence = " ".join(str(error).split())
         return Record(ExitCode.USAGE, sentence, NOT_FLOWN, INFEASIBLE)

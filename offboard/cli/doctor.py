@@ -46,9 +46,9 @@ def doctor(
     from offboard.doctor import run
     from offboard.flight.preflight import Level
 
-    chosen = run.names(names or ())
+    chosen = run.chosen(names or ())
     if listing:
-        say_each({name: run.summary(name) for name in chosen}, margin=0)
+        say_each({name: run.summary(check) for name, check in chosen.items()}, margin=0)
         return
     flight = options.load()
     with err.status("opening the link") as status:  # a line on a terminal, nothing elsewhere
@@ -62,14 +62,13 @@ def doctor(
         write(run.as_json(rows, seen, sentence))
     else:
         levels = max(map(len, Level.__members__))
-        width = max((len(row.check) for row in rows), default=0)
+        width = max(map(len, rows), default=0)
         indent = levels + width + 4
-        for row in rows:
+        for check, findings in rows.items():
             # of one with something to say only that
-            said = [f for f in row.findings if f.level is not Level.OK] or row.findings[:1]
-            for finding in said:
+            for finding in [f for f in findings if f.level is not Level.OK] or findings[:1]:
                 level = finding.level.name.lower()
-                say(f"{level:<{levels}}  {row.check:<{width}}  {finding.found}", indent)
+                say(f"{level:<{levels}}  {check:<{width}}  {finding.found}", indent)
                 if finding.hint:
                     say(f"{'':<{indent}}fix: {finding.hint}", indent + 5)
         out.print()

@@ -73,14 +73,14 @@ def port(seen: Observation) -> Iterable[Finding]:
 
 def vehicle(seen: Observation) -> Iterable[Finding]:
     """Whether an autopilot that can be flown is heard, and what is heard if none is."""
-    found, heard, kind = seen.found, seen.heard, _kind(seen)
-    senders, received = heard.senders.found, heard.senders.splitter.bytes_received
+    found, senders, kind = seen.found, seen.senders.found, _kind(seen)
+    received = seen.senders.splitter.bytes_received
     if seen.link_error:
         return
     if found:
         yield ok(f"{found.autopilot}, system {found.system_id}")
     elif autopilots := [sender for sender in senders if sender.is_autopilot]:
-        why = heard.session.senders.why_none()
+        why = seen.session.senders.why_none()
         yield blocks(why or f"{autopilots[0].name} is neither PX4 nor ArduCopter")
     elif senders:
         names = ", ".join(sender.name for sender in senders[:4])
@@ -93,16 +93,16 @@ def vehicle(seen: Observation) -> Iterable[Finding]:
         hint = SILENT.get(kind, STARTED)
         if "127.0.0.1" in seen.connection and kind == "udpin":
             hint += f"; {ELSEWHERE}"
-        yield blocks(f"nothing is heard in {heard.listened_s:.0f} s", hint)
+        yield blocks(f"nothing is heard in {seen.listened_s:.0f} s", hint)
 
 
 def senders(seen: Observation) -> Iterable[Finding]:
     """Other vehicles, ground stations and controllers on the link."""
     others = []
-    for sender in seen.heard.senders.found:
+    for sender in seen.senders.found:
         peers = sender.peers
         if sender.ids == _ids(seen):
-            peers = peers - {peer_name(seen.heard.session.peer)}
+            peers = peers - {peer_name(seen.session.peer)}
         if peers:
             places = f", from {', '.join(sorted(peers))}" if sender.is_autopilot else ""
             others.append(f"{sender.name}{places}")
@@ -111,7 +111,7 @@ def senders(seen: Observation) -> Iterable[Finding]:
 
 def uplink(seen: Observation) -> Iterable[Finding]:
     """Whether what we send reaches the vehicle: it acknowledges commands without effect."""
-    if not seen.heard.has_asked:
+    if not seen.has_asked:
         return
     if CommandAck in seen.vehicle.heard_s:
         yield ok("the vehicle acknowledges our commands, so that heartbeat and texts reach it")
@@ -127,7 +127,7 @@ def uplink(seen: Observation) -> Iterable[Finding]:
 
 def delay(seen: Observation) -> Iterable[Finding]:
     """Delay and jitter of the link by TIMESYNC, and telemetry that comes late."""
-    delay, late_s = seen.heard.clock.delay, seen.heard.late_s
+    delay, late_s = seen.clock.delay, seen.late_s
     if delay is None:
         return
     figures = f"delay {1e3 * delay.value:.0f} +- {1e3 * delay.sd:.0f} ms"
@@ -139,7 +139,7 @@ def delay(seen: Observation) -> Iterable[Finding]:
 
 def loss(seen: Observation) -> Iterable[Finding]:
     """Frames that are lost, and bytes that are damaged."""
-    senders = seen.heard.senders
+    senders = seen.senders
     sender = next((each for each in senders.found if each.ids == _ids(seen)), None)
     if sender is None:
         return
@@ -155,8 +155,8 @@ def loss(seen: Observation) -> Iterable[Finding]:
 
 def bandwidth(seen: Observation) -> Iterable[Finding]:
     """Whether the link carries the telemetry that a flight requests."""
-    heard, session = seen.heard, seen.heard.session
-    figures = f"{heard.bytes_ps / 1e3:.1f} kB/s received"
+    session = seen.session
+    figures = f"{seen.bytes_ps / 1e3:.1f} kB/s received"
     most, wanted = session.settings.capacity_bytes_ps, session.telemetry.bytes_ps
     if most is None:
         yield ok(figures)
@@ -169,8 +169,8 @@ def bandwidth(seen: Observation) -> Iterable[Finding]:
             f"{figures}; the telemetry of a flight needs {needed / 1e3:.1f} kB/s",
             f"use at least {baud} baud",
         )
-    elif heard.bytes_ps > FULL_SHARE * most:
-        first = ", ".join(name for name, _ in heard.senders.message_bytes.most_common(4))
+    elif seen.bytes_ps > FULL_SHARE * most:
+        first = ", ".join(name for name, _ in seen.senders.message_bytes.most_common(4))
         hint = "lower the rates of messages that nobody needs (PX4: MAV_x_RATE, ArduPilot: SRx_*)"
         yield warn(f"{figures}; most of it is {first}", hint)
     else:
@@ -179,13 +179,13 @@ def bandwidth(seen: Observation) -> Iterable[Finding]:
 
 def rates(seen: Observation) -> Iterable[Finding]:
     """Rates of the telemetry that a flight needs."""
-    rates_hz = seen.heard.session.telemetry.rates_hz
+    rates_hz = seen.session.telemetry.rates_hz
     figures = ", ".join(f"{name} {rates_hz.get(name, 0.0):.0f} Hz" for name in TELEMETRY)
     slow = [
         f"{each.name} {rates_hz.get(each.name, 0.0):.1f} of {each.rate_hz:g} Hz"
-        for each in seen.heard.slow(lambda each: each.rate_hz)
+        for each in seen.slow(lambda each: each.rate_hz)
     ]
-    if not seen.heard.requested:
+    if not seen.rates_requested:
         yield ok(f"{figures}; not requested, since the vehicle is armed")
     elif slow:
         yield warn(f"slower than requested: {', '.join(slow)}", seen.dialect.slow_hint)
@@ -195,19 +195,19 @@ def rates(seen: Observation) -> Iterable[Finding]:
 
 def clock(seen: Observation) -> Iterable[Finding]:
     """The vehicle's clock, and whether somebody else sets it."""
-    heard, (system_id, _) = seen.heard, _ids(seen)
-    if heard.rebooted:
+    system_id, _ = _ids(seen)
+    if seen.rebooted:
         hint = "find out why, then check again"
         yield blocks("the vehicle restarted while it was observed", hint)
-    if heard.clock.jumped_s:
-        yield blocks(f"the vehicle's clock jumped by {heard.clock.jumped_s:.1f} s")
-    masters = [s.name for s in heard.senders.found if s.times and s.system_id != system_id]
-    if heard.foreign_replies > FOREIGN_TIMES:
-        masters.append(f"the sender of {heard.foreign_replies} requests that are answered here")
+    if seen.clock.jumped_s:
+        yield blocks(f"the vehicle's clock jumped by {seen.clock.jumped_s:.1f} s")
+    masters = [s.name for s in seen.senders.found if s.times and s.system_id != system_id]
+    if seen.foreign_replies > FOREIGN_TIMES:
+        masters.append(f"the sender of {seen.foreign_replies} requests that are answered here")
     if masters:
         hint = "let one program alone exchange TIMESYNC with the vehicle"
         yield warn(f"another time master: {', '.join(masters)}", hint)
-    rate = heard.clock.telemetry_rate
+    rate = seen.clock.telemetry_rate
     if rate is not None:
         figures = f"the vehicle's clock runs {rate:.3f} times as fast as this computer's"
         yield warn(figures) if abs(rate - 1.0) > REAL_TIME else ok(figures)
@@ -227,7 +227,7 @@ def firmware(seen: Observation) -> Iterable[Finding]:
         yield warn(f"{name} is older than {oldest}, which nobody has tested", "update the firmware")
     elif version.kind != RELEASE:
         yield warn(f"{name} is no release", "install a release")
-    defects = [each.what for each in dialect.defects if number < each.fixed_in]
+    defects = [what for what, fixed_in in dialect.defects.items() if number < fixed_in]
     yield ok("; ".join((name, *(f"known defect: {each}" for each in defects))))
 
 
@@ -258,7 +258,7 @@ def estimator(seen: Observation) -> Iterable[Finding]:
 
 def gps(seen: Observation) -> Iterable[Finding]:
     """GPS fix."""
-    fix_type = seen.heard.fix_type
+    fix_type = seen.fix_type
     if fix_type == FIX_3D:
         yield ok("3D fix")
         return
@@ -357,7 +357,7 @@ def _tilt(seen: Observation, needed_rad: float) -> Iterable[Finding]:
 
 
 def _bandwidth(seen: Observation) -> Iterable[Finding]:
-    config, delay = seen.config, seen.heard.clock.delay
+    config, delay = seen.config, seen.clock.delay
     wanted = getattr(config.controller, "bandwidth_radps", None)
     if wanted is None or delay is None:
         return

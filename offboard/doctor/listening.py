@@ -1,5 +1,4 @@
-"""The listening pass: who sends, what is received and what is asked, until enough is known; and
-`Observation`, all that is known then.
+"""The listening pass: who sends, what is received and what is asked, until enough is known.
 
 Sans-I/O: received chunks and host times in, frames out. It only asks, see README.md.
 """
@@ -17,7 +16,6 @@ from pymavlink.dialects.v20.all import mavlink_map
 
 from offboard.flight.preflight import Ground, ParameterReading
 from offboard.flight.timing import VehicleClock
-from offboard.flight.vehicle_state import VehicleState
 from offboard.link.interface import Chunk, peer_name
 from offboard.mavlink.decode import FIX_3D
 from offboard.mavlink.dialects.base import TYPE_GCS, Dialect, WantedMessage, id_of
@@ -38,17 +36,17 @@ from offboard.mavlink.outgoing import CommandLong, Outgoing, Timesync
 from offboard.mavlink.senders import is_vehicle
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.signing import Signing
+from offboard.mavlink.telemetry import ENOUGH
 from offboard.run.configuration import FlightConfig
 
 DOCTOR_ID = 193  # MAV_COMP_ID_ONBOARD_COMPUTER3
 NOTHING_S = 6.0  # without an autopilot
 LEAST_S = 4.0  # with one, from when it was heard
 LONGEST_S = 9.0
-ASK_EVERY_S, TRIES = 1.0, 8
+ASK_EVERY_S = 1.0
 TIMESYNC_EVERY_S = 0.1
 PREARM_AFTER_S = 1.0  # what is asked before may be lost: the link has just been opened
 TEXTS_S = 1.0  # for the texts after the acknowledgement
-ENOUGH = 0.7  # of a rate, measured over two seconds
 SETTLE_S = 1.0  # until jumps of the vehicle's clock count
 RUN_PREARM_CHECKS = 401  # MAV_CMD
 VERSION, GPS = 148, 24  # message ids
@@ -128,30 +126,46 @@ class Senders:
         return sorted(self._senders.values(), key=lambda sender: -sender.frames)
 
 
-class Listening:
-    """One pass over one link, from host time `began_s`. `settings`: of the session of a flight.
+class Observation(Ground):
+    """What checks judge: a flight of `config` that is recorded in `directory`, and what one pass
+    over the link `connection` finds for it, from host time `now_s` to `host_s`. `settings`: of the
+    session of that flight.
 
-    `vehicle`, `clock` and `session` are those of a flight, with the newest telemetry; `senders` has
-    all that sends. `fix_type` is the vehicle's GPS_FIX_TYPE, at most FIX_3D; `late_s` the greatest
-    age of its telemetry beyond the least; `foreign_replies` the number of its replies to requests
-    of TIMESYNC that are not ours.
+    What the preflight list judges is in it, as in a flight; `senders` has all that sends.
+    `began_s`: host time when the whole check began; `link_error`: why the link cannot be opened;
+    `holders`: other processes that have its port. `fix_type` is the vehicle's GPS_FIX_TYPE, at most
+    FIX_3D; `late_s` the greatest age of its telemetry beyond the least; `foreign_replies` the
+    number of its replies to requests of TIMESYNC that are not ours.
     """
 
     def __init__(
-        self, began_s: float, settings: SessionSettings, signing: Signing | None = None
+        self,
+        config: FlightConfig,
+        connection: str,
+        directory: Path,
+        now_s: float,
+        settings: SessionSettings,
+        signing: Signing | None = None,
     ) -> None:
-        self.session = Session(replace(settings, component_id=DOCTOR_ID), signing)
-        self.vehicle = VehicleState()
-        self.clock = VehicleClock()
+        super().__init__(
+            limits=config.limits,
+            session=Session(replace(settings, component_id=DOCTOR_ID), signing),
+            model=config.vehicle,
+            host_s=now_s,
+            rates_requested=False,
+            reading=ParameterReading(advice=True),
+        )
+        self.config, self.connection, self.directory = config, connection, directory
+        self.began_s = self._listens_s = now_s
+        self.link_error = ""
+        self.holders: tuple[str, ...] = ()
         self.senders = Senders(settings.stream)
-        self.requested = self.rebooted = False  # the rates of telemetry; in this pass
+        self.rebooted = False  # in this pass
         self.fix_type: int | None = None
         self.late_s = 0.0
         self.foreign_replies = 0
-        self.now_s = self._began_s = began_s  # `now_s`: until when it has listened
         self._found_s = 0.0
-        self.parameters = ParameterReading(advice=True)
-        self._asked: dict[int, tuple[int, float]] = {}  # message or command: tries, when
+        self._asked_s: dict[int, float] = {}  # message or command: when it was asked last
         self._settled = False
         self._may_greet = False  # a disarmed vehicle, whose signing time is behind ours
         self._timesync_s = 0.0
@@ -197,7 +211,7 @@ class Listening:
 
     def due(self, now_s: float) -> list[bytes]:
         """The frames to send at host time `now_s`; call it at least every 50 ms."""
-        self.now_s = now_s
+        self.host_s = now_s
         return [self.session.encode(each) for each in self._questions(now_s)]
 
     def _questions(self, now_s: float) -> Iterable[Outgoing]:
@@ -209,7 +223,7 @@ class Listening:
             if greets and self._may_ask(TIMESYNC, now_s):
                 yield Timesync(0, round(now_s * 1e9))
             return
-        yield from self.parameters.due(dialect, state)
+        yield from self.reading.due(dialect, state)
         fix_age_s = min(state.age_s(NoFix), state.age_s(GpsFix))
         unknown = {
             VERSION: state.version is None,
@@ -232,21 +246,30 @@ class Listening:
         """No heartbeats, and no rates for an armed vehicle, or before it is known."""
         known = self.vehicle.heartbeat is not None
         permitted = known and not self.vehicle.armed and isinstance(outgoing, CommandLong)
-        self.requested |= permitted
+        self.rates_requested |= permitted
         return permitted
 
     def _may_ask(self, number: int, now_s: float) -> bool:
-        tries, asked_s = self._asked.get(number, (0, now_s - ASK_EVERY_S))
-        if tries >= TRIES or now_s - asked_s < ASK_EVERY_S:
+        if now_s - self._asked_s.get(number, -math.inf) < ASK_EVERY_S:
             return False
-        self._asked[number] = tries + 1, now_s
+        self._asked_s[number] = now_s
         return True
 
     # --- what it has found ---
 
+    @property
+    def found(self) -> VehicleFound | None:
+        return self.session.vehicle
+
+    @property
+    def dialect(self) -> Dialect:
+        """Dialect of the vehicle that was found."""
+        assert self.session.dialect is not None
+        return self.session.dialect
+
     def complete(self, now_s: float) -> bool:
         """Everything was answered, or it takes too long."""
-        state, dialect, passed_s = self.vehicle, self.session.dialect, now_s - self._began_s
+        state, dialect, passed_s = self.vehicle, self.session.dialect, now_s - self._listens_s
         if dialect is None:
             return passed_s >= NOTHING_S
         if now_s - self._found_s < LEAST_S or passed_s >= LONGEST_S:
@@ -257,7 +280,7 @@ class Listening:
             checked
             and state.version is not None
             and self.clock.delay is not None
-            and self.parameters.complete(dialect, state)
+            and self.reading.complete(dialect, state)
             and not self.slow(lambda each: each.arrives_hz)
         )
 
@@ -272,60 +295,15 @@ class Listening:
 
     @property
     def listened_s(self) -> float:
-        return self.now_s - self._began_s
+        return self.host_s - self._listens_s
 
     @property
     def bytes_ps(self) -> float:
         """Received since the vehicle was found."""
-        passed_s = max(self.now_s - (self._found_s or self._began_s), 1e-3)
+        passed_s = max(self.host_s - (self._found_s or self._listens_s), 1e-3)
         return self.senders.splitter.bytes_received / passed_s
 
     @property
     def has_asked(self) -> bool:
         """Whether a command was sent to which an acknowledgement is due."""
-        return bool(self._asked.keys() - {TIMESYNC})
-
-
-@dataclass(frozen=True, slots=True)
-class Observation:
-    """What checks judge: a flight of `config` that is recorded in `directory`, on `connection`.
-
-    `link_error`: why this cannot be opened; `holders`: other processes that have its port;
-    `began_s`: host time when the check began."""
-
-    config: FlightConfig
-    heard: Listening
-    connection: str
-    directory: Path
-    began_s: float
-    link_error: str = ""
-    holders: tuple[str, ...] = ()
-
-    @property
-    def found(self) -> VehicleFound | None:
-        return self.heard.session.vehicle
-
-    @property
-    def vehicle(self) -> VehicleState:
-        return self.heard.vehicle
-
-    @property
-    def dialect(self) -> Dialect:
-        """Dialect of the vehicle that was found."""
-        assert self.heard.session.dialect is not None
-        return self.heard.session.dialect
-
-    @property
-    def ground(self) -> Ground:
-        """What the preflight list judges."""
-        heard = self.heard
-        return Ground(
-            limits=self.config.limits,
-            session=heard.session,
-            model=self.config.vehicle,
-            vehicle=self.vehicle,
-            clock=heard.clock,
-            host_s=heard.now_s,
-            rates_requested=heard.requested,
-            reading=heard.parameters,
-        )
+        return bool(self._asked_s.keys() - {TIMESYNC})

@@ -9,17 +9,16 @@ from __future__ import annotations
 import inspect
 import json
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack
-from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import TypeVar
 
 from offboard.doctor.checks import OF_FLIGHT, OF_LINK, OF_VEHICLE, Check, wait
 from offboard.doctor.computer import OF_COMPUTER, holders
-from offboard.doctor.listening import LONGEST_S, Listening, Observation
+from offboard.doctor.listening import LONGEST_S, Observation
 from offboard.documents.errors import Unavailable, UserError, located, shown
 from offboard.flight import preflight
 from offboard.flight.preflight import Finding, Level
@@ -27,11 +26,11 @@ from offboard.link import clock
 from offboard.link.connection import open_link
 from offboard.link.interface import Link
 from offboard.mavlink.session import SessionSettings
-from offboard.mavlink.signing import Signing
 from offboard.run.configuration import FlightConfig
 from offboard.run.flight import Connection
 
 Result = TypeVar("Result")
+Rows = dict[str, list[Finding]]  # what each check has found, the worst first
 POLL_S = 0.02
 # The command ends within 15 s: what takes longer is left out, and a row says so
 OPEN_S = 2.0  # to open the link, before listening
@@ -42,18 +41,6 @@ CHECKS = {each.__name__: each for each in (*OF_LINK, *OF_VEHICLE, *OF_FLIGHT, *O
 
 GROUP = "pso_offboard.checks"  # entry points of other packages: name and function of a check
 AUTHOR = "report this to whoever wrote the check"
-
-
-@dataclass(frozen=True, slots=True)
-class Row:
-    """The findings of one check, the worst first."""
-
-    check: str
-    findings: tuple[Finding, ...]
-
-    @property
-    def level(self) -> Level:
-        return self.findings[0].level
 
 
 def checks() -> dict[str, Check]:
@@ -77,19 +64,19 @@ def _installed(point: EntryPoint) -> Check:
     return loaded
 
 
-def names(chosen: Sequence[str] = ()) -> list[str]:
-    """The chosen checks in the order of the table; all if none is. Raises UserError."""
+def chosen(names: Sequence[str] = ()) -> dict[str, Check]:
+    """The checks of these names in the order of the table; all without names. Raises UserError."""
     known = checks()
-    for name in chosen:
+    for name in names:
         if name not in known:
             listed = ", ".join(known)
             raise UserError(f"there is no check named {shown(name)}; known are {listed}")
-    return [name for name in known if not chosen or name in chosen]
+    return {name: check for name, check in known.items() if not names or name in names}
 
 
-def summary(name: str) -> str:
+def summary(check: Check) -> str:
     """What a check is about."""
-    text = (inspect.getdoc(checks()[name]) or "").partition("\n\n")[0]
+    text = (inspect.getdoc(check) or "").partition("\n\n")[0]
     return " ".join(text.split())
 
 
@@ -109,45 +96,36 @@ def observe(
 
     Raises UserError for an address that is no address, and for a signing key.
     """
-    began_s = clock.monotonic_s()
-    connection, others, error = vehicle.address, holders(vehicle.address), ""
-    heard = Listening(began_s, SessionSettings())
+    began_s, others = clock.monotonic_s(), holders(vehicle.address)
+    link, settings, error = None, SessionSettings(), ""
     with ExitStack() as stack:
         signing = vehicle.signing(stack)
         try:
-            link = _within(OPEN_S, lambda: open_link(connection))
+            link = _within(OPEN_S, lambda: open_link(vehicle.address))
         except TimeoutError:
-            error = f"connection {shown(connection)} cannot be opened in {OPEN_S:g} s"
+            error = f"connection {shown(vehicle.address)} cannot be opened in {OPEN_S:g} s"
         except Unavailable as failure:
             error = str(failure)
         else:
             stack.callback(link.close)
-            heard = _listen(link, vehicle.settings(link), signing, tell)
-    return Observation(
-        config,
-        heard,
-        connection,
-        directory,
-        began_s,
-        link_error=error,
-        holders=others,
-    )
+            settings = vehicle.settings(link)
+        now_s = clock.monotonic_s()
+        seen = Observation(config, vehicle.address, directory, now_s, settings, signing)
+        seen.began_s, seen.link_error, seen.holders = began_s, error, others
+        if link:
+            _listen(seen, link, tell)
+    return seen
 
 
-def _listen(
-    link: Link, settings: SessionSettings, signing: Signing | None, tell: Callable[[str], None]
-) -> Listening:
-    heard = Listening(clock.monotonic_s(), settings, signing)
-    while not heard.complete(clock.monotonic_s()):
+def _listen(seen: Observation, link: Link, tell: Callable[[str], None]) -> None:
+    while not seen.complete(clock.monotonic_s()):
         link.wait(POLL_S)
         for chunk in link.receive():
-            heard.take(chunk)
-        for frame in heard.due(clock.monotonic_s()):
-            link.send(frame, heard.session.peer)
-        vehicle = heard.session.vehicle
-        found = vehicle.autopilot if vehicle else "no vehicle yet"
-        tell(f"listening, {heard.listened_s:.0f} s of at most {LONGEST_S:.0f} s: {found}")
-    return heard
+            seen.take(chunk)
+        for frame in seen.due(clock.monotonic_s()):
+            link.send(frame, seen.session.peer)
+        found = seen.found.autopilot if seen.found else "no vehicle yet"
+        tell(f"listening, {seen.listened_s:.0f} s of at most {LONGEST_S:.0f} s: {found}")
 
 
 def _within(seconds: float, call: Callable[[], Result]) -> Result:
@@ -168,17 +146,17 @@ def _within(seconds: float, call: Callable[[], Result]) -> Result:
 # --- judging ---
 
 
-def examine(chosen: Iterable[str], seen: Observation) -> list[Row]:
-    """One row for each of the checks that has something to say."""
+def examine(asked: Mapping[str, Check], seen: Observation) -> Rows:
+    """A row for each of the checks that has something to say."""
     found = seen.found is not None
-    blocking = list(preflight.findings(seen.ground)) if found else []
-    rows, known = [], checks()
-    for name in chosen:
-        findings = [each for check, _, each in blocking if check == name]
-        if found or known[name] not in OF_VEHICLE:
-            findings += _judged(known[name], seen, seen.began_s + LOOK_S - clock.monotonic_s())
+    blocking = list(preflight.findings(seen)) if found else []
+    rows: Rows = {}
+    for name, check in asked.items():
+        findings = [each for about, _, each in blocking if about == name]
+        if found or check not in OF_VEHICLE:
+            findings += _judged(check, seen, seen.began_s + LOOK_S - clock.monotonic_s())
         if findings:
-            rows.append(Row(name, tuple(sorted(findings, key=lambda each: -each.level))))
+            rows[name] = sorted(findings, key=lambda each: -each.level)
     return rows
 
 
@@ -193,14 +171,14 @@ def _judged(check: Check, seen: Observation, most_s: float) -> list[Finding]:
         return [Finding(Level.WARN, sentence, AUTHOR)]
 
 
-def worst(rows: Iterable[Row]) -> Level:
+def worst(rows: Rows) -> Level:
     """The worst level of all."""
-    return max((row.level for row in rows), default=Level.OK)
+    return max((found[0].level for found in rows.values()), default=Level.OK)
 
 
-def verdict(rows: Iterable[Row], *, complete: bool) -> str:
+def verdict(rows: Rows, *, complete: bool) -> str:
     """One sentence: whether this vehicle can be flown now. `complete`: all checks were made."""
-    found = [(each.level, each.about or row.check) for row in rows for each in row.findings]
+    found = [(each.level, each.about or name) for name, row in rows.items() for each in row]
 
     def named(level: Level) -> list[str]:
         return list(dict.fromkeys(name for at, name in found if at is level))
@@ -214,26 +192,26 @@ def verdict(rows: Iterable[Row], *, complete: bool) -> str:
     return f"{ready}; warnings: {', '.join(warning)}" if warning else ready
 
 
-def as_json(rows: Sequence[Row], seen: Observation, sentence: str) -> str:
+def as_json(rows: Rows, seen: Observation, sentence: str) -> str:
     """One object with the worst level, the verdict, what was observed where, and a list of rows."""
     found, version = seen.found, seen.vehicle.version
     document = {
         "level": worst(rows).name.lower(),
         "verdict": sentence,
         "connection": seen.connection,
-        "listened_s": round(seen.heard.listened_s, 2),
+        "listened_s": round(seen.listened_s, 2),
         "vehicle": found and {"autopilot": found.autopilot, "system_id": found.system_id},
         "version": version and [version.major, version.minor, version.patch],
         "rows": [
             {
-                "check": row.check,
-                "level": row.level.name.lower(),
+                "check": name,
+                "level": row[0].level.name.lower(),
                 "findings": [
                     {"level": each.level.name.lower(), "found": each.found, "hint": each.hint}
-                    for each in row.findings
+                    for each in row
                 ],
             }
-            for row in rows
+            for name, row in rows.items()
         ],
     }
     return json.dumps(document, indent=2, ensure_ascii=False) + "\n"

@@ -36,11 +36,6 @@ def split_address(name: str, address: str) -> tuple[str, int]:
     return host, port
 
 
-def join_address(host: str, port: int) -> str:
-    """HOST:PORT, as a URL has it."""
-    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-
-
 class Command(TyperCommand):
     """A command whose values are neither empty nor options nor bytes that are no text.
 

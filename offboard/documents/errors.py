@@ -23,20 +23,20 @@ _OURS = {"offboard", "importlib_metadata", *sys.stdlib_module_names}
 
 class UserError(Exception):
     """An error that the user can fix. `str()` says what is wrong and what to do, without a
-    traceback; a command that it ends prints it and exits with `code`. `is_usage`: what was asked
-    for is wrong (2, unless another is given); otherwise it may work another time (3)."""
+    traceback; a command that it ends prints it and exits with `code`: that of its class, unless
+    another is given."""
 
-    is_usage = True
+    code = 2  # what was asked for is wrong
 
     def __init__(self, sentence: str, code: int | None = None) -> None:
         super().__init__(sentence)
-        self.code = code or (2 if self.is_usage else 3)
+        self.code = code or self.code
 
 
 class Unavailable(UserError):
     """The request is valid but cannot be met now: a link, lock or process is not available."""
 
-    is_usage = False
+    code = 3  # it may work another time
 
 
 class DocumentError(UserError):

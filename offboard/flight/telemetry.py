@@ -25,6 +25,7 @@ from offboard.flight.preflight import ParameterReading, other_sender
 from offboard.flight.record import vehicle_record
 from offboard.flight.state import FlightState
 from offboard.flight.timing import VehicleClock
+from offboard.link.interface import peer_name
 from offboard.mavlink.events import (
     BOOTS,
     Attitude,
@@ -87,7 +88,7 @@ def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: flo
         case VehicleFound():
             outbox.send(flight, vehicle_record(event))
         case PeerChanged(peer):
-            outbox.announce(flight, f"the vehicle now sends from another port: {peer}")
+            outbox.announce(flight, f"the vehicle now sends from another port: {peer_name(peer)}")
         case OtherCompanion(system, component):
             sentence = OTHER_COMPANION.format(system=system, component=component)
             outbox.announce(flight, sentence, once=True)

@@ -24,8 +24,8 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoM
 from prometheus_client.registry import Collector
 
 from offboard.analysis.page import BLUE, INK, STYLE, Figure, curve, panels, render
-from offboard.documents.arguments import join_address
 from offboard.link import clock
+from offboard.link.interface import peer_name
 from offboard.live.display import line
 
 STALE_S = 2.0  # the loop hands over ten snapshots a second
@@ -216,7 +216,7 @@ async def serve(host: str, port: int) -> None:
             lambda: broadcast.connection(serves), host, port, backlog=CONNECTIONS_MAX
         )
         bound = server.sockets[0].getsockname()[1]
-        print(json.dumps({"url": f"http://{join_address(host, bound)}"}), flush=True)
+        print(json.dumps({"url": f"http://{peer_name((host, bound))}"}), flush=True)
         while text := await asyncio.to_thread(sys.stdin.readline):
             broadcast.publish(text.rstrip("\n"))
         server.close()
@@ -225,7 +225,7 @@ async def serve(host: str, port: int) -> None:
     except OSError as error:
         number = error.errno or 0  # negative: of the name service
         why = os.strerror(number) if number >= 0 else error.strerror
-        reason = f"{join_address(host, port)} cannot be listened on ({why})"
+        reason = f"{peer_name((host, port))} cannot be listened on ({why})"
         print(json.dumps({"error": f"{reason}; choose another address"}), flush=True)
     finally:
         await runner.cleanup()

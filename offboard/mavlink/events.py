@@ -1,7 +1,7 @@
 """What the session reports to the flight: one frozen value per received message or change.
 
 NED, FRD, SI and vehicle time (`time_boot_ms` in seconds) everywhere. All fields are finite and in
-range; a message with any other value is dropped and counted.
+range; a message with any other value is dropped.
 """
 
 from __future__ import annotations

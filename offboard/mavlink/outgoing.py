@@ -183,8 +183,6 @@ class CommandLong(Outgoing):
 
     def encode(self, target: Target | None) -> Message:
         parameters = self.parameters + (0.0,) * (7 - len(self.parameters))
-        if len(parameters) != 7:
-            raise ValueError(f"COMMAND_LONG has seven parameters, not {len(parameters)}")
         _finite("a command parameter", *(p for p in parameters if not math.isnan(p)))
         return mavlink.MAVLink_command_long_message(*_ids(target), self.command, 0, *parameters)
 

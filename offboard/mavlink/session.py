@@ -9,6 +9,7 @@ components.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Hashable
 from dataclasses import dataclass, field
@@ -81,14 +82,12 @@ class Session:
         self._signing = signing
         self._sending = mavlink.MAVLink(None, srcComponent=settings.component_id)
         self._recording = mavlink.MAVLink(None, srcComponent=RECORD_COMPONENT_ID)
-        self._components = (settings.component_id, RECORD_COMPONENT_ID)
         self._sent: deque[bytes] = deque(maxlen=_ECHOES)
         self.telemetry = Telemetry(settings.capacity_bytes_ps)
         self.time = self.telemetry.time
         self._began_s: float | None = None  # stamp of the first TIMESYNC request
         self._simulated_s = 0.0  # from it to the newest
-        self._heartbeat_sent: tuple[float, float] | None = None  # host time, link time
-        self._custom_mode_sent = 0
+        self._heartbeat_sent: tuple[float, float, int] | None = None  # host, link time, custom_mode
 
     @property
     def vehicle(self) -> VehicleFound | None:
@@ -127,7 +126,7 @@ class Session:
     def _log(self, frame: framing.Frame, found: Reception) -> None:
         if frame.message_id == framing.SETUP_SIGNING:
             return  # it holds the key
-        ours = frame.component_id in self._components
+        ours = frame.component_id in (self.settings.component_id, RECORD_COMPONENT_ID)
         if ours and frame.system_id == self.senders.own.system_id:
             found.unlogged.append((len(found.frames), frame.raw))
         else:
@@ -173,13 +172,10 @@ class Session:
             return ()
         due: list[Outgoing] = []
         link_s = self.link_time_s
-        if (
-            self._heartbeat_sent is None
-            or status[1] != self._custom_mode_sent
-            or max(now_s - self._heartbeat_sent[0], link_s - self._heartbeat_sent[1])
-            >= _HEARTBEAT_PERIOD_S
-        ):
-            self._heartbeat_sent, self._custom_mode_sent = (now_s, link_s), status[1]
+        sent = self._heartbeat_sent
+        passed_s = max(now_s - sent[0], link_s - sent[1]) if sent else math.inf
+        if passed_s >= _HEARTBEAT_PERIOD_S or (sent and sent[2] != status[1]):
+            self._heartbeat_sent = now_s, link_s, status[1]
             due.append(Heartbeat(TYPE_ONBOARD_CONTROLLER, *status))
         requests = self.telemetry.due()
         return (*due, *(CommandLong.message_interval(w.message_id, w.rate_hz) for w in requests))

@@ -25,8 +25,9 @@ RESERVED = 60 * UNITS_PER_S  # so far the reservation is ahead when it is made
 _STAMP_MAX = (1 << 48) - 1
 _HASH_BYTES = 6
 
-# Offset of our clock, newest stamp, and link id, system, component and newest stamp of each stream
-State = tuple[int, int, list[tuple[int, int, int, int]]]
+# Key, offset of our clock, newest stamp, and link id, system, component and newest stamp of each
+# stream
+State = tuple[str, int, int, list[tuple[int, int, int, int]]]
 
 
 class Refusal(Enum):
@@ -105,15 +106,15 @@ class Signing:
     # --- for another process that continues ---
 
     def state(self) -> State:
-        """What another process needs to continue, without the key."""
-        streams = self._signing.stream_timestamps
-        return self.offset, self._signing.timestamp, [(*key, at) for key, at in streams.items()]
+        """What another process needs to continue."""
+        streams = [(*key, at) for key, at in self._signing.stream_timestamps.items()]
+        return self.key.hex(), self.offset, self._signing.timestamp, streams
 
     @classmethod
-    def resumed(cls, key: bytes, clock: Callable[[], float], state: State) -> Signing:
+    def resumed(cls, clock: Callable[[], float], state: State) -> Signing:
         """Continues `state`, with stamps that are a second ahead: more may have been sent since."""
-        offset, newest, streams = state
-        signing = cls(key, offset + UNITS_PER_S, clock)
+        key, offset, newest, streams = state
+        signing = cls(bytes.fromhex(key), offset + UNITS_PER_S, clock)
         signing._signing.timestamp = newest + UNITS_PER_S
         signing._signing.stream_timestamps = {(a, b, c): at for a, b, c, at in streams}
         return signing

@@ -36,7 +36,7 @@ _GAP_S = 0.25  # without any frame, half a turn may have been lost
 SLOW_HZ = 20.0
 SHARE = 0.68  # of a link's capacity; the rest is for what is not requested
 _WINDOW_S = 2.0
-_ENOUGH = 0.7  # of the rate wanted; a window holds few samples of a slow message
+ENOUGH = 0.7  # of the rate wanted; a window holds few samples of a slow message
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 3.0, 30.0
 _OPTIONAL_TRIES = 2
 _STOPPED_S = 0.2  # a fast message that is missing for so long was stopped, or lost with the others
@@ -220,7 +220,7 @@ class _Stream:
     def _again(self, waited_s: float, now_s: float) -> bool:
         if waited_s < _FIRST_WAIT_S:
             return False
-        rate_hz, enough_hz = self.rate_hz(now_s), _ENOUGH * self.wanted.arrives_hz
+        rate_hz, enough_hz = self.rate_hz(now_s), ENOUGH * self.wanted.arrives_hz
         fast = rate_hz > 0.0 and self.wanted.arrives_hz > SLOW_HZ
         if fast and now_s - self.arrivals_s[-1] > _STOPPED_S:
             return True  # before a flight ends for it

@@ -17,7 +17,7 @@ import numpy as np
 
 from offboard.compiled import prepare
 from offboard.control.base import Adaptive, Controller, Situation
-from offboard.documents.errors import DocumentError, outside
+from offboard.documents.errors import DocumentError, Unavailable, outside
 from offboard.documents.shipped import absolute
 from offboard.documents.signing_key import read_key
 from offboard.estimation.observer import Observer
@@ -158,7 +158,7 @@ class Simulated:
 class BusyComputer(DocumentError):
     """A decision is late because other programs have the processor."""
 
-    is_usage = False
+    code = Unavailable.code
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,6 @@ from offboard.documents.errors import Unavailable, typed
 from offboard.flight.phases import WAITING, ExitCode, Outcome, ServiceOptions
 from offboard.link import clock
 from offboard.link.after_flight import OneByOne
-from offboard.link.background import BackgroundWriter
 from offboard.link.connection import open_link
 from offboard.link.interface import Link
 from offboard.link.lock import connection_lock, directory_lock
@@ -38,8 +37,6 @@ from offboard.supervisor.supervisor import Supervisor
 
 LINK_EVERY_S = 2.0  # between two attempts to open the link
 WATCHDOG_EVERY_S = 1.0
-NOTICES_MAX, NOTICES_S = 100, 1.0  # that wait for the service manager; for them, at the end
-WATCHDOG_S = 10
 TEMPLATE = Path(__file__).with_name("offboard.service.j2")
 PRIVATE = (Path("/tmp"), Path("/var/tmp"))  # the unit has its own
 OTHERS_READ, OTHERS_ENTER = 0o4, 0o1
@@ -86,7 +83,7 @@ def run(
             command = typed("offboard", "score", recorder.unscored[-1])
             tell(UNSCORED.format(number=len(recorder.unscored), command=command))
         memory = stack.enter_context(closing(VehicleFiles(directory / "vehicles", tell)))
-        manager = stack.enter_context(closing(Manager()))
+        manager = Manager()
         manager.tell("READY=1")
         link = opened(vehicle.address, stops, tell, manager)
         if link is None:
@@ -147,31 +144,25 @@ def opened(
 
 
 class Manager:
-    """The service manager (systemd), if there is one. Only a thread waits for it."""
+    """The service manager (systemd), if there is one. Does not wait for it: a notice for which it
+    has no room is dropped; watchdog and status are told again a second later."""
 
     def __init__(self) -> None:
-        notifier = SystemdNotifier()
-        self._writer = BackgroundWriter[str](
-            lambda notices: [notifier.notify(each) for each in notices], NOTICES_MAX
-        )
+        self._notifier = SystemdNotifier()  # raises nothing
+        if self._notifier.socket:
+            self._notifier.socket.setblocking(False)
         self._told_s = 0.0
         self._status = ""
 
     def tell(self, notice: str) -> None:
         """Tell systemd, by the protocol of sd_notify(3)."""
-        self._writer.put(notice)
-
-    def close(self) -> None:
-        self._writer.close(NOTICES_S)
+        self._notifier.notify(notice)
 
     def alive(self, now_s: float, status: str = "") -> None:
-        """The loop runs; at most once a second to the watchdog."""
-        if now_s - self._told_s >= WATCHDOG_EVERY_S:
-            self._told_s = now_s
-            self._writer.put("WATCHDOG=1")
-        if status != self._status:
-            self._status = status
-            self._writer.put(f"STATUS={status}")
+        """The loop runs: once a second, and with a new status, to watchdog and status."""
+        if now_s - self._told_s >= WATCHDOG_EVERY_S or status != self._status:
+            self._told_s, self._status = now_s, status
+            self.tell(f"WATCHDOG=1\nSTATUS={status}")
 
 
 # --- the unit of systemd ---
@@ -194,7 +185,6 @@ def unit(arguments: Sequence[str], connection: str, signing_key: Path | None = N
         connection=connection.replace("%", "%%"),
         serial=connection.startswith("serial:"),
         signing_key=str(signing_key.absolute()).replace("%", "%%") if signing_key else "",
-        watchdog_s=WATCHDOG_S,
     )
 
 

@@ -47,7 +47,7 @@ class Flights:
         self._stopping = False
         self._recording = False
         self.engagements = 0
-        self._prepared = source.newest()
+        self._prepared = source.newest
         self._known: IdentifiedVehicle | None = None  # that the present flight began with
         self.current = self._companion(None)
 
@@ -77,7 +77,7 @@ class Flights:
         """Process all that has arrived; begin the next flight where the last one has ended."""
         if self.current.has_ended() and not self._stopping:
             self.close()
-            self._follow(self._source.newest())
+            self._follow(self._source.newest)
         if self.phase in WAITING:
             self._renew_if_changed()
             self._look_for_left()
@@ -93,7 +93,7 @@ class Flights:
 
     def _renew_if_changed(self) -> None:
         """Continue to wait with a changed configuration or a remembered vehicle."""
-        newest = self._source.newest()
+        newest = self._source.newest
         changed = newest is not self._prepared or self._remembered(newest) is not self._known
         if changed and not self._stopping:
             self._follow(newest)

@@ -16,9 +16,10 @@ from contextlib import suppress
 from pathlib import Path
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from offboard.documents.errors import DocumentError
+from offboard.documents.parameters import Parameters
 from offboard.documents.reading import parse
 from offboard.documents.shipped import read_text
 from offboard.identification.uncertainty import Estimate
@@ -32,14 +33,14 @@ EVERY_S = 2.0
 
 
 class Preparation:
-    """The newest usable configuration of those that `load` returns. A thread calls it every
-    `EVERY_S` while it is `allowed`: not while the vehicle is armed. One that has changed is built
-    and called once, so that nothing is compiled in flight. Raises DocumentError if the first
+    """`newest`: the newest usable configuration of those that `load` returns. A thread calls it
+    every `EVERY_S` while it is `allowed`: not while the vehicle is armed. One that has changed is
+    built and called once, so that nothing is compiled in flight. Raises DocumentError if the first
     configuration cannot be used."""
 
     def __init__(self, load: Callable[[], FlightConfig]) -> None:
         self._load = load
-        self._newest = self._ready(load())
+        self.newest = self._ready(load())
         self._refused = ""  # the text of the newest that was refused, or why it has none
         self._news: deque[str] = deque()
         self.allowed = True
@@ -52,9 +53,6 @@ class Preparation:
 
     def close(self) -> None:
         self._ended.set()
-
-    def newest(self) -> Prepared:
-        return self._newest
 
     def news(self) -> list[str]:
         """Sentences about configurations since the last call."""
@@ -72,8 +70,8 @@ class Preparation:
         try:
             config = self._load()
             text = dump(config)
-            if text != self._newest.text:
-                self._newest = self._ready(config)
+            if text != self.newest.text:
+                self.newest = self._ready(config)
                 self._news.append("the configuration has changed: used from the next flight on")
             self._refused = ""
         except Exception as error:  # whatever a controller raises, the old configuration is kept
@@ -92,10 +90,8 @@ class Preparation:
 # --- identified vehicles ---
 
 
-class Document(BaseModel):
+class Document(Parameters):
     """The content of a file."""
-
-    model_config = ConfigDict(extra="forbid")
 
     identified_from: str  # digest of the vehicle file
     tilt_delay_s: float = Field(ge=0, le=1)

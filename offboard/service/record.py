@@ -42,7 +42,7 @@ class RollingLog:
     """Two files in `directory` that are never closed, so that another process may have their
     descriptors. Raises LogError."""
 
-    def __init__(self, directory: Path, most_bytes: int = ROLLING_BYTES) -> None:
+    def __init__(self, directory: Path) -> None:
         flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND
         try:
             directory.mkdir(parents=True, exist_ok=True)
@@ -52,7 +52,6 @@ class RollingLog:
                 f"the service cannot record in {directory}: {error.strerror}; choose a directory "
                 "that can be written with --out"
             ) from None
-        self._most_bytes = most_bytes
         self._written = 0
         self._writer = BackgroundWriter[bytes](self._append, QUEUED_MAX)
 
@@ -66,7 +65,7 @@ class RollingLog:
 
     def _append(self, records: list[bytes]) -> None:
         size = sum(map(len, records))
-        if self._written + size > self._most_bytes:
+        if self._written + size > ROLLING_BYTES:
             self._descriptors.reverse()
             os.ftruncate(self._descriptors[0], 0)
             self._written = 0
@@ -100,18 +99,10 @@ class Recorder:
     `close` waits. `score` hands a flight to the process that scores it, and outlives this one; a
     failure is ignored. `unscored`: the flights of earlier services that have no score."""
 
-    def __init__(
-        self,
-        directory: Path,
-        *,
-        score: Callable[[Path], object],
-        stamp: Callable[[], str] = clock.local_stamp,
-        rolling_bytes: int = ROLLING_BYTES,
-    ) -> None:
+    def __init__(self, directory: Path, *, score: Callable[[Path], object]) -> None:
         self._directory = directory
-        self._stamp = stamp
         self._score = score
-        self._rolling = RollingLog(directory, rolling_bytes)
+        self._rolling = RollingLog(directory)
         self._flight: FlightRecord | None = None
         self._before: deque[tuple[int, bytes]] = deque(maxlen=BEFORE_MAX)
         self._once: dict[tuple[int, bytes], tuple[int, bytes]] = {}
@@ -178,7 +169,7 @@ class Recorder:
 
     def _new_directory(self) -> Path:
         """Two flights of one second have different names; a directory that is there is left."""
-        stamp = self._stamp()
+        stamp = clock.local_stamp()
         names = chain([stamp], (f"{stamp}-{number}" for number in count(2)))
         name = next(each for each in names if each not in self._taken)
         self._taken.add(name)

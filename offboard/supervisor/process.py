@@ -53,8 +53,6 @@ class Watch:
         self._received = b""
         self._silent_s = 0.0
         self.newest: dict[str, Any] = {}  # beat
-        self.known: Supervised | None = None  # as it says
-        self.key: bytes | None = None  # of signing
         self.descriptors: list[int] = []  # of the link, then of the log
         self.ended = False
 
@@ -67,12 +65,18 @@ class Watch:
         if not self._silent_s:
             with suppress(OSError):  # it is stopped, or has ended
                 self._channel.send(b'""\n')
-        if not (self.known and self.known.ours and self.known.flying):
+        known = self.known
+        if not (known and known.ours and known.flying):
             return ""
         if self.ended:
             return DIED
-        silent_s = self.known.silent_s
+        silent_s = known.silent_s
         return HANGS.format(silent_s=silent_s) if self._silent_s >= silent_s else ""
+
+    @property
+    def known(self) -> Supervised | None:
+        """What the newest beat says; None before the first."""
+        return _known(**self.newest["known"]) if self.newest else None
 
     def _read(self) -> None:
         data = b""
@@ -86,18 +90,8 @@ class Watch:
             self.descriptors = descriptors
         *lines, self._received = (self._received + data).split(b"\n")
         for line in lines:
-            self._take(line)
-
-    def _take(self, line: bytes) -> None:
-        try:
-            message = json.loads(line)
-        except ValueError:  # only a part of it did fit into the buffer
-            return
-        self._silent_s = 0.0
-        if "key" in message:
-            self.key = bytes.fromhex(message["key"])
-        else:
-            self.newest, self.known = message, _known(**message["known"])
+            with suppress(ValueError):  # only a part of it did fit into the buffer
+                self.newest, self._silent_s = json.loads(line), 0.0
 
 
 class TakeOver:
@@ -113,8 +107,8 @@ class TakeOver:
         self._log = BackgroundWriter[bytes](
             lambda entries: append(watch.descriptors[-1], entries), 100_000
         )
-        signing = watch.key and Signing.resumed(watch.key, clock.monotonic_s, beat["signing"])
-        self._session = Session(SessionSettings(stream=beat["stream"]), signing or None)
+        signing = beat["signing"] and Signing.resumed(clock.monotonic_s, beat["signing"])
+        self._session = Session(SessionSettings(stream=beat["stream"]), signing)
         self._session.senders.set_vehicle(known.vehicle, peer)
         assert self._session.dialect is not None
         self._dialect = self._session.dialect

@@ -39,12 +39,12 @@ class Supervisor:
     def __init__(self, signing: Signing | None = None) -> None:
         self.lost = False
         self._signing = signing
+
+    def __enter__(self) -> Supervisor:
         self._received = b""
         self._lines: list[str] = []  # first READY, then why it took over and what it did
         self._passed: object = None  # the descriptors that it has
         self._unanswered_s = math.inf  # time of the first beat since the newest answer
-
-    def __enter__(self) -> Supervisor:
         self._channel, theirs = socket.socketpair()
         self._channel.setblocking(False)
         with theirs:
@@ -58,8 +58,7 @@ class Supervisor:
             except OSError as error:  # for example no memory, or too many processes
                 self._channel.close()
                 raise Unavailable(f"{NOT_STARTED}: {error.strerror}") from None
-        if self._signing:  # not in arguments or environment, which others can read
-            self._channel.send(json.dumps({"key": self._signing.key.hex()}).encode() + b"\n")
+        self.lost = False
         return self
 
     @property
@@ -82,11 +81,7 @@ class Supervisor:
         """Start another process in place of one that has ended. Raises Unavailable."""
         self._channel.close()
         self.process.poll()
-        self._received, self._lines = b"", []
-        self._passed = None
-        self._unanswered_s = math.inf
         self.__enter__()
-        self.lost = False
 
     def await_ready(self) -> None:
         """Wait until the process has loaded. Raises Unavailable."""
@@ -106,6 +101,7 @@ class Supervisor:
             "peer": peer,
             "stream": link.is_stream,
             "listens": link.listens,
+            # the key, too: not in arguments or environment, which others can read
             "signing": self._signing.state() if self._signing else None,
         }
         line = json.dumps(beat).encode() + b"\n"

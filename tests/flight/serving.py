@@ -46,11 +46,8 @@ MODES = {  # parameters of MAV_CMD_DO_SET_MODE
 class Settings:
     """A `Preparation` whose configuration a test may replace."""
 
-    prepared: Prepared
+    newest: Prepared
     sentences: list[str] = field(default_factory=list)
-
-    def newest(self) -> Prepared:
-        return self.prepared
 
     def news(self) -> list[str]:
         told, self.sentences = self.sentences, []
@@ -103,7 +100,7 @@ class Serving(Pair):
     def remembered(self) -> IdentifiedVehicle | None:
         """What the service knows of the vehicle."""
         known: IdentifiedVehicle | None = self.memory.get(
-            f"{self.firmware}-1-1", self.source.prepared
+            f"{self.firmware}-1-1", self.source.newest
         )
         return known
 
@@ -218,7 +215,7 @@ def serve(
     source = Settings(prepared(*short, *assignments, reference=reference, vehicle=vehicle))
     logs, memory = Logs(clock), VehicleFiles(Path("/dev/null"), print)  # of which none is written
     if known:
-        memory.keep(f"{on}-1-1", source.prepared, known)
+        memory.keep(f"{on}-1-1", source.newest, known)
 
     def again(logs: Any) -> Flights:
         return Flights(

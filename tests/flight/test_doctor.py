@@ -19,8 +19,8 @@ from pydantic import TypeAdapter
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.doctor import computer, run
-from offboard.doctor.listening import LONGEST_S, NOTHING_S, Listening, Observation
-from offboard.doctor.run import OF_COMPUTER, Row, examine, verdict
+from offboard.doctor.listening import LONGEST_S, NOTHING_S, Observation
+from offboard.doctor.run import OF_COMPUTER, Rows, examine, verdict
 from offboard.flight.phases import Limits
 from offboard.flight.preflight import Finding, Ground, Level, findings
 from offboard.flight.vehicle_state import VehicleState
@@ -102,27 +102,28 @@ class Bench:
 
     def listen(self) -> Observation:
         settings = SessionSettings(capacity_bytes_ps=self.capacity_bytes_ps)
-        listening = Listening(self.now_s, settings, self.signing)
-        while not listening.complete(self.now_s):
+        link = "udpin:127.0.0.1:14540"
+        seen = Observation(self.config, link, Path("."), self.now_s, settings, self.signing)
+        while not seen.complete(self.now_s):
             for chunk in self.step():
-                listening.take(chunk)
+                seen.take(chunk)
             if self.instance.steps % 5 == 0:
-                for frame in self.up(listening.due(self.now_s)):
+                for frame in self.up(seen.due(self.now_s)):
                     self.sent.append(decode(frame))
                     self.instance.feed(frame)
-        address, began_s = "udpin:127.0.0.1:14540", clock.monotonic_s()
-        return Observation(self.config, listening, address, Path("."), began_s)
+        seen.began_s = clock.monotonic_s()
+        return seen
 
-    def check(self, *names: str) -> dict[str, Row]:
+    def check(self, *names: str) -> Rows:
         """The rows of a check now, by name."""
         seen = self.listen()
         assert_read_only(self.sent)
-        chosen = [name for name in run.names(names) if name not in BUSY]
-        return {row.check: row for row in examine(chosen, seen)}
+        chosen = run.chosen(names).items()
+        return examine({name: check for name, check in chosen if name not in BUSY}, seen)
 
-    def follow(self, row: Row) -> None:
+    def follow(self, row: list[Finding]) -> None:
         """Do what the hints of a row say: set the parameters that they name."""
-        lines = [line for finding in row.findings for line in PARAMETER.findall(finding.hint)]
+        lines = [line for finding in row for line in PARAMETER.findall(finding.hint)]
         assert lines, row
         for name, value in lines:
             self.instance.autopilot.parameters.set(name, float(value))
@@ -168,12 +169,12 @@ def bench(
     return made
 
 
-def said(rows: dict[str, Row]) -> dict[str, tuple[Finding, ...]]:
+def said(rows: Rows) -> dict[str, tuple[Finding, ...]]:
     """The findings that are not ok, by check."""
     return {
-        name: tuple(finding for finding in row.findings if finding.level is not Level.OK)
+        name: tuple(finding for finding in row if finding.level is not Level.OK)
         for name, row in rows.items()
-        if row.level is not Level.OK
+        if row[0].level is not Level.OK
     }
 
 
@@ -351,15 +352,15 @@ def test_what_is_found_and_what_mends_it(case: tuple[Any, ...]) -> None:
     assert tested.instance.time_s - began_s < LONGEST_S + 1.1  # 15 s with the rest
     for check, level, found in expected:
         row = rows[check]
-        assert row.level is level
-        assert any(re.search(found, each.sentence) for each in row.findings if each.level is level)
-        about = row.findings[0].about or check
+        assert row[0].level is level
+        assert any(re.search(found, each.sentence) for each in row if each.level is level)
+        about = row[0].about or check
         said_at_last = {BLOCKS: f"1 blocks: {about}", WARN: "ready to fly; warnings: "}
-        if len(row.findings) == 1:
-            assert verdict([row], complete=True).startswith(said_at_last.get(level, ""))
-        if PARAMETER.search(row.findings[0].hint):
+        if len(row) == 1:
+            assert verdict({check: row}, complete=True).startswith(said_at_last.get(level, ""))
+        if PARAMETER.search(row[0].hint):
             tested.follow(row)
-            assert tested.check(check)[check].level is OK
+            assert tested.check(check)[check][0].level is OK
 
 
 # --- the vehicle ----------------------------------------------------------------------------------
@@ -371,16 +372,16 @@ def test_a_vehicle_that_falls_silent_is_not_ready_to_fly(start: Start | None) ->
     heard_until_s = tested.instance.time_s + 2.5
     tested.down = lambda datagrams: datagrams if tested.instance.time_s < heard_until_s else []
     rates = tested.check()["rates"]
-    assert "no HEARTBEAT arrives" in [finding.found for finding in rates.findings]
-    assert not verdict([rates], complete=True).startswith("ready to fly")
+    assert "no HEARTBEAT arrives" in [finding.found for finding in rates]
+    assert not verdict({"rates": rates}, complete=True).startswith("ready to fly")
 
 
 def test_gps_that_is_lost_waits_and_comes_back() -> None:
     tested = bench(faults=[{"fault": "gps_loss", "at_s": 0.5, "for_s": 12.0, "drift_mps": 0.1}])
     rows = tested.check()
-    levels = {name: row.level for name, row in rows.items() if row.level}
+    levels = {name: row[0].level for name, row in rows.items() if row[0].level}
     assert levels == {"estimator": WAIT, "gps": WAIT}
-    (found, *_) = rows["estimator"].findings
+    (found, *_) = rows["estimator"]
     assert "no valid horizontal velocity, horizontal position" in found.found
     tested.run_to(15.0)
     assert said(tested.check()) == {}
@@ -394,7 +395,7 @@ def test_armed_vehicle_is_left_alone() -> None:
     commands = {m.command for m in flying.sent if m.get_type() == "COMMAND_LONG"}
     assert kinds == {"TIMESYNC", "PARAM_REQUEST_READ", "COMMAND_LONG"}
     assert commands == {512}
-    assert rows["state"].findings[0].found.startswith("armed, in AUTO.LOITER")
+    assert rows["state"][0].found.startswith("armed, in AUTO.LOITER")
     assert said(rows) == {}
 
 
@@ -421,10 +422,10 @@ def test_nothing_is_heard() -> None:
     rows = tested.check()
     assert tested.instance.time_s - began_s == pytest.approx(NOTHING_S, abs=0.1)
     assert said(rows).keys() == {"vehicle"}
-    assert rows["vehicle"].findings[0].found == "nothing is heard in 6 s"
-    assert rows["vehicle"].level is BLOCKS
+    assert rows["vehicle"][0].found == "nothing is heard in 6 s"
+    assert rows["vehicle"][0].level is BLOCKS
     for hint in ("--connect udpin:0.0.0.0", "-p PORT:PORT/udp", "hostname -I"):
-        assert hint in rows["vehicle"].findings[0].hint
+        assert hint in rows["vehicle"][0].hint
     assert tested.sent == []
     tested.has_vehicle = True
     assert said(tested.check()) == {}
@@ -435,21 +436,21 @@ def test_an_armed_vehicle_whose_signing_time_is_behind_does_not_hear_ours() -> N
     tested = bench(signing=Signing(KEY, 100 * 60 * UNITS_PER_S), start=Start(height_m=5.0))
     tested.instance.keyring.set_up(KEY, 90 * 60 * UNITS_PER_S)
     rows = tested.check()
-    assert rows["vehicle"].level is BLOCKS
-    assert "their time stamps are too old" in rows["vehicle"].findings[0].found
+    assert rows["vehicle"][0].level is BLOCKS
+    assert "their time stamps are too old" in rows["vehicle"][0].found
     assert tested.sent == []
 
 
 def test_delay_is_measured_and_lowers_the_bandwidth() -> None:
     tested = bench(**link(latency_s=0.2))
     row = tested.check("configuration")["configuration"]
-    assert row.level is WARN
-    measured_ms = float(row.findings[0].found.removeprefix("with a delay of ").split()[0])
+    assert row[0].level is WARN
+    measured_ms = float(row[0].found.removeprefix("with a delay of ").split()[0])
     assert measured_ms == pytest.approx(400.0, abs=30.0)  # both directions
-    possible = row.findings[0].hint.rpartition("=")[2]
+    possible = row[0].hint.rpartition("=")[2]
     assert 1.0 <= float(possible) < 7.0
     again = bench(**link(latency_s=0.2), assignments=[f"controller.bandwidth_radps={possible}"])
-    assert again.check("configuration")["configuration"].level is OK
+    assert again.check("configuration")["configuration"][0].level is OK
 
 
 def test_flood_of_addresses_and_ids_is_bounded() -> None:
@@ -460,7 +461,7 @@ def test_flood_of_addresses_and_ids_is_bounded() -> None:
         return from_others(GCS_HEARTBEAT, *ids, 250.0, ("10.0.0.1", port))(time_s)
 
     seen = bench(before=before).listen()
-    assert len(seen.heard.senders.found) == 64
+    assert len(seen.senders.found) == 64
     assert seen.found is not None
 
 
@@ -480,11 +481,11 @@ def test_checks_of_other_packages_are_rows_and_broken_ones_too(
     register(tmp_path, "site_checks", run.GROUP, **checks)
     monkeypatch.syspath_prepend(tmp_path)
     seen = bench().listen()
-    rows = {row.check: row for row in run.examine(run.names(list(checks)), seen)}
-    assert rows["ceiling"].findings[0].hint == "--set limits.ceiling_m=6"
+    rows = run.examine(run.chosen(list(checks)), seen)
+    assert rows["ceiling"][0].hint == "--set limits.ceiling_m=6"
     for name, error in (("gone", "ModuleNotFound"), ("imported", "System"), ("called", "System")):
-        assert f"failed: {error}" in rows[name].findings[0].found
-    assert rows["gps"].level is Level.OK
+        assert f"failed: {error}" in rows[name][0].found
+    assert rows["gps"][0].level is Level.OK
 
 
 def test_the_command_ends_in_time_although_nothing_of_it_does(
@@ -499,10 +500,10 @@ def test_the_command_ends_in_time_although_nothing_of_it_does(
     monkeypatch.setattr(computer, "_not_compiled", lambda: 0)
     began_s = time.monotonic()
     seen = run.observe(Connection("tcp:10.0.0.1:5760"), load("flight"), tmp_path)
-    rows = {row.check: row for row in run.examine(["port", "computer"], seen)}
+    rows = run.examine(run.chosen(["port", "computer"]), seen)
     assert time.monotonic() - began_s < 2.0
-    assert "cannot be opened in 0.1 s" in rows["port"].findings[0].found
-    assert rows["computer"].level is Level.WAIT
+    assert "cannot be opened in 0.1 s" in rows["port"][0].found
+    assert rows["computer"][0].level is Level.WAIT
 
 
 def test_what_is_wrong_with_this_computer(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -511,11 +512,11 @@ def test_what_is_wrong_with_this_computer(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(computer, "_not_compiled", lambda: 0)
     monkeypatch.setattr(computer, "rehearse", lambda prepared, keeps_deadline: 0.04)
     monkeypatch.setattr(computer, "_sleep", lambda: 0.03)
-    heard = Listening(0.0, SessionSettings())
-    seen = Observation(load("flight"), heard, "udpin:127.0.0.1:1", Path(), time.monotonic())
-    rows = run.examine(["disk", "compiled", "computer"], seen)
-    levels = {row.check: [finding.level for finding in row.findings] for row in rows}
+    now_s = time.monotonic()
+    seen = Observation(load("flight"), "udpin:127.0.0.1:1", Path(), now_s, SessionSettings())
+    rows = run.examine(run.chosen(["disk", "compiled", "computer"]), seen)
+    levels = {name: [finding.level for finding in row] for name, row in rows.items()}
     assert levels == {"disk": [Level.WARN], "compiled": [Level.OK], "computer": [Level.WARN] * 2}
-    found = " ".join(finding.found for finding in rows[-1].findings)
+    found = " ".join(finding.found for finding in rows["computer"])
     assert "a decision takes 40.0 ms of 50 ms" in found
     assert "wakes up at most 30.0 ms late" in found

@@ -23,13 +23,16 @@ from typing import Any
 import pytest
 from processes import free_port
 from pymavlink.dialects.v20 import common as mavlink
+from uneventful import uneventful
 
 from offboard.documents.errors import Unavailable
+from offboard.flight import telemetry
 from offboard.link import clock
 from offboard.link.connection import open_link, open_lockstep_link
 from offboard.link.interface import Chunk, Link, LinkReport
 from offboard.link.stream import BROKEN, RENEWED
 from offboard.link.udp import LOOK_EVERY_S, UdpLink
+from offboard.mavlink.events import PeerChanged
 from offboard.mavlink.framing import FrameSplitter
 from offboard.mavlink.senders import PEER_SILENT_S
 
@@ -215,6 +218,14 @@ def test_frames_reach_the_vehicle_before_and_after_it_is_followed(udp: Udp) -> N
                 with pytest.raises(OSError, match="in use"):
                     other.bind(("0.0.0.0", port(link)))
         link.follow(vehicle.getsockname())
+
+
+def test_another_port_is_said_as_the_user_writes_it() -> None:
+    flight = uneventful()
+    for peer in (("127.0.0.1", 14581), ("::1", 14582, 0, 0)):
+        telemetry.update(flight, PeerChanged(peer), 0.0, turned_s=0.0)
+    places = [sentence.rpartition(" port: ")[2] for sentence in flight.announced]
+    assert places == ["127.0.0.1:14581", "[::1]:14582"]
 
 
 def test_another_port_is_heard_after_a_silence_that_was_observed(

@@ -625,7 +625,7 @@ def test_the_reference_is_repeated_with_the_newest_configuration(served: Served)
     pair = served.engaged(then="repeat")
     model = pair.service.current
     assert model.limits.log_lost == "land"
-    pair.source.prepared = prepared(
+    pair.source.newest = prepared(
         "reference.height_m=1.5", "limits.log_lost=go_on", "period_s=0.2",
         reference="hover", vehicle="px4_sih",
     )  # fmt: skip

@@ -10,7 +10,6 @@ import sys
 import time
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -34,7 +33,7 @@ from offboard.mavlink.session import Session, SessionSettings
 from offboard.reference.track import STOP_S
 from offboard.run.configuration import load
 from offboard.run.flight import build
-from offboard.service import daemon, preparation
+from offboard.service import daemon, preparation, record
 from offboard.service.daemon import Manager
 from offboard.service.preparation import Preparation, VehicleFiles
 from offboard.service.record import ROLLING_NAMES, Recorder
@@ -48,16 +47,19 @@ def session() -> Session:
     return made
 
 
-def recorded(directory: Path, **options: Any) -> tuple[Recorder, list[Path]]:
+def recorded(directory: Path) -> tuple[Recorder, list[Path]]:
     """A recorder, and the flights that it has scored."""
     scored: list[Path] = []
-    return Recorder(directory, score=scored.append, **options), scored
+    return Recorder(directory, score=scored.append), scored
 
 
 @pytest.mark.parametrize("version_1", [False, True])
-def test_a_flight_log_begins_with_what_came_before(version_1: bool, tmp_path: Path) -> None:
+def test_a_flight_log_begins_with_what_came_before(
+    version_1: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """With the home position from long ago, the last five seconds and the configuration."""
-    recorder, scored = recorded(tmp_path, stamp=lambda: "now")
+    monkeypatch.setattr(clock, "local_stamp", lambda: "now")
+    recorder, scored = recorded(tmp_path)
     talk, began_us = session(), clock.unix_us() - 20_000_000
     codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     home = mavlink.MAVLink_gps_global_origin_message(1, 2, 3).pack(codec, version_1)
@@ -121,8 +123,9 @@ def test_a_vehicle_is_left_engaged_until_it_was_handed_back(tmp_path: Path) -> N
     again.close()
 
 
-def test_the_rolling_log_is_bounded(tmp_path: Path) -> None:
-    recorder, _ = recorded(tmp_path, rolling_bytes=20_000)
+def test_the_rolling_log_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(record, "ROLLING_BYTES", 20_000)
+    recorder, _ = recorded(tmp_path)
     frame = session().encode(Heartbeat(6))
     for number in range(4000):
         recorder.write(number * 1000, frame)
@@ -135,9 +138,11 @@ def test_the_rolling_log_is_bounded(tmp_path: Path) -> None:
     assert sum(sizes) > 10_000
 
 
-def test_a_flight_that_cannot_be_recorded_says_so_and_the_next_one_is(tmp_path: Path) -> None:
-    names = iter([f"{ROLLING_NAMES[0]}/x", "later"])
-    recorder, scored = recorded(tmp_path, stamp=lambda: next(names))
+def test_a_flight_that_cannot_be_recorded_says_so_and_the_next_one_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(clock, "local_stamp", iter([f"{ROLLING_NAMES[0]}/x", "later"]).__next__)
+    recorder, scored = recorded(tmp_path)
     talk = session()
     recorder.begin(talk, "", "")
     deadline_s = time.monotonic() + 10.0
@@ -269,9 +274,8 @@ def test_the_service_manager_is_told_and_not_waited_for(monkeypatch: pytest.Monk
         for second in range(1, 1000):  # net.unix.max_dgram_qlen is 512 at most
             manager.alive(float(second), f"{second}")
         systemd.settimeout(10.0)
-        heard = [systemd.recv(100) for _ in range(4)]
-        assert heard == [b"READY=1", b"WATCHDOG=1", b"STATUS=1", b"WATCHDOG=1"]
-        manager.close()
+        heard = [systemd.recv(100) for _ in range(3)]
+        assert heard == [b"READY=1", b"WATCHDOG=1\nSTATUS=1", b"WATCHDOG=1\nSTATUS=2"]
 
 
 def test_a_changed_configuration_is_used_and_a_bad_one_refused(
@@ -282,7 +286,7 @@ def test_a_changed_configuration_is_used_and_a_bad_one_refused(
     text = "vehicle: px4_sih\ncontroller: lqr\nreference: {shape: hover, height_m: %s}\n"
     file.write_text(text % 2)
     watched = Preparation(partial(load, str(file)))
-    first = watched.newest()
+    first = watched.newest
 
     def news(height: object) -> list[str]:
         file.write_text(text % height)
@@ -294,14 +298,14 @@ def test_a_changed_configuration_is_used_and_a_bad_one_refused(
     (refused,) = news("high")
     assert refused.startswith("the configuration is refused, the old one is kept: ")
     assert "height_m" in refused
-    assert watched.newest() is first
+    assert watched.newest is first
     for _ in range(2):
         (refused,) = news(200)  # is read, but cannot be flown
         assert "landing from 200 m" in refused
-        assert watched.newest() is first
+        assert watched.newest is first
         assert news(2) == []
     assert news(3) == ["the configuration has changed: used from the next flight on"]
-    assert "height_m: 3" in watched.newest().text
+    assert "height_m: 3" in watched.newest.text
 
 
 def test_a_switch_counts_in_the_air_from_a_mode_without_failsafe() -> None:

@@ -255,3 +255,17 @@ def test_heartbeats_at_1_hz_of_host_or_vehicle_time_whichever_is_faster() -> Non
         session.receive(vehicle.position(10 * tick), PEER, 10.5 + 0.0002 * tick)
         beats += Heartbeat(18) in session.poll(10.5 + 0.0002 * tick)
     assert beats == 10
+
+
+def test_a_heartbeat_comes_at_once_with_another_custom_mode() -> None:
+    session = Session(SessionSettings(sends_first=True))
+    status = [(3, 1), (3, 1), (4, 1), (4, 6), (4, 6), (4, 1)]
+    sent = [session.poll(0.01 * i, each) for i, each in enumerate(status)]
+    assert sent == [
+        (Heartbeat(18, 3, 1),),
+        (),
+        (),
+        (Heartbeat(18, 4, 6),),
+        (),
+        (Heartbeat(18, 4, 1),),
+    ]

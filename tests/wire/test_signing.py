@@ -160,7 +160,7 @@ def test_what_continues_has_later_stamps_and_refuses_older_ones() -> None:
     frame = vehicle.position(1000)
     ours.receive(frame, PEER, 0.0)
     assert ours._signing is not None
-    signing = Signing.resumed(KEY, lambda: 0.0, ours._signing.state())
+    signing = Signing.resumed(lambda: 0.0, ours._signing.state())
     later = Session(SessionSettings(), signing)
     later.senders.set_vehicle(events.VehicleFound(1, 1, "px4"), PEER)
     assert later.receive(frame, PEER, 0.0).events == []

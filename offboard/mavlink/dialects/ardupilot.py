@@ -10,7 +10,6 @@ from pymavlink.dialects.v20.all import enums
 
 from offboard.mavlink.dialects.base import (
     ACCELERATION_LIMIT,
-    CUSTOM_MODE_ENABLED,
     RATE_LIMIT,
     TRACKING_TELEMETRY,
     Dialect,
@@ -19,11 +18,6 @@ from offboard.mavlink.dialects.base import (
     WantedMessage,
     WatchedParameter,
 )
-
-
-def _mode_parameters(custom_mode: int) -> tuple[float, float, float]:
-    return CUSTOM_MODE_ENABLED, float(custom_mode), 0.0
-
 
 _MODES = {
     number: mode.name.removeprefix("COPTER_MODE_")
@@ -55,7 +49,7 @@ ARDUPILOT = Dialect(
     name="ardupilot",
     mav_autopilot=3,
     modes=MappingProxyType(_MODES),
-    mode_parameters=_mode_parameters,
+    mode_parameters=lambda custom_mode: (float(custom_mode),),
     engage_mode="GUIDED",
     # in LOITER the throttle stick sets the climb rate: without a radio the vehicle descends
     hold_mode="BRAKE",

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from offboard.mavlink.outgoing import CommandLong
 
 SET_MODE, TAKEOFF = 176, 22  # MAV_CMD
-CUSTOM_MODE_ENABLED = 1.0  # MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+_CUSTOM_MODE_ENABLED = 1.0  # MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 # limits of a `Vehicle`
 ACCELERATION_LIMIT, RATE_LIMIT = "angular_acceleration_limit_radps2", "angular_rate_limit_radps"
 TYPE_ONBOARD_CONTROLLER, TYPE_GCS = 18, 6  # MAV_TYPE
@@ -139,14 +139,6 @@ class SetpointLoss:
 NEVER = SetpointLoss(math.inf)
 
 
-@dataclass(frozen=True, slots=True)
-class Defect:
-    """A defect of an autopilot's firmware before version `fixed_in`, as (major, minor)."""
-
-    fixed_in: tuple[int, int]
-    what: str
-
-
 @dataclass(frozen=True)
 class Dialect:
     """One autopilot. Modes are given by name; `modes` maps HEARTBEAT.custom_mode to the name."""
@@ -154,7 +146,7 @@ class Dialect:
     name: str
     mav_autopilot: int
     modes: Mapping[int, str]
-    mode_parameters: Callable[[int], tuple[float, float, float]]  # custom_mode -> MAV_CMD 176
+    mode_parameters: Callable[[int], tuple[float, ...]]  # custom_mode -> MAV_CMD 176, from 2 on
     engage_mode: str
     hold_mode: str
     land_mode: str
@@ -176,7 +168,8 @@ class Dialect:
     oldest: tuple[int, int]  # version that this dialect is made for
     # what the vehicle does when setpoints stop, by its parameters; a missing one may have any value
     setpoint_loss: Callable[[Mapping[str, float]], SetpointLoss]
-    defects: tuple[Defect, ...] = ()
+    # known defects of its firmware, each with the version that mends it, as (major, minor)
+    defects: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
     def mode_name(self, custom_mode: int) -> str:
         return self.modes.get(custom_mode) or f"UNKNOWN(0x{custom_mode:08x})"
@@ -189,7 +182,7 @@ class Dialect:
     def set_mode(self, name: str) -> CommandLong:
         """MAV_CMD_DO_SET_MODE. Raises KeyError for an unknown mode."""
         numbers = {known: custom_mode for custom_mode, known in self.modes.items()}
-        return CommandLong(SET_MODE, self.mode_parameters(numbers[name]))
+        return CommandLong(SET_MODE, (_CUSTOM_MODE_ENABLED, *self.mode_parameters(numbers[name])))
 
     def engage(self) -> CommandLong:
         return self.set_mode(self.engage_mode)

@@ -7,10 +7,8 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from offboard.mavlink.dialects.base import (
-    CUSTOM_MODE_ENABLED,
     RATE_LIMIT,
     TRACKING_TELEMETRY,
-    Defect,
     Dialect,
     SetpointLoss,
     Valid,
@@ -24,8 +22,8 @@ def _custom_mode(main: int, sub: int = 0) -> int:
 
 
 # PX4 acknowledges it twice: on receipt, and up to 12 ms later with the commander's result
-def _mode_parameters(custom_mode: int) -> tuple[float, float, float]:
-    return CUSTOM_MODE_ENABLED, float(custom_mode >> 16 & 0xFF), float(custom_mode >> 24)
+def _mode_parameters(custom_mode: int) -> tuple[float, ...]:
+    return float(custom_mode >> 16 & 0xFF), float(custom_mode >> 24)
 
 
 _NO_STICKS = 4.0  # COM_RC_IN_MODE
@@ -159,9 +157,11 @@ PX4 = Dialect(
     ),
     oldest=(1, 14),
     setpoint_loss=_setpoint_loss,
-    defects=(
-        Defect((1, 17), "setpoints without thrust keep OFFBOARD alive; ours always have thrust"),
-        Defect((1, 17), "COM_OBL_RC_ACT 0 to 2 is obeyed without a radio"),
+    defects=MappingProxyType(
+        {
+            "setpoints without thrust keep OFFBOARD alive; ours always have thrust": (1, 17),
+            "COM_OBL_RC_ACT 0 to 2 is obeyed without a radio": (1, 17),
+        }
     ),
     wanted=(
         *TRACKING_TELEMETRY,
