@@ -302,7 +302,8 @@ FOUND: list[tuple[Any, ...]] = [
     # other programs on the link
     (beside(AUTOPILOT_HEARTBEAT, 1, 1, 1.0, ("::1", 14999, 0, 0)),
      ("senders", BLOCKS,
-      "an autopilot sends as system 1 from another address, too. Fix: switch one off")),
+      "an autopilot sends as system 1 from another address, too. Fix: switch one off"),
+     ("loss", OK, "0.0% of the frames lost")),
     (beside(SETPOINT, 1, 194, place=SAME_PLACE), ("senders", BLOCKS, "component 194")),
     (beside(SETPOINT, 1, 191, place=SAME_PLACE), ("senders", BLOCKS, "component 191")),
     (beside(GCS_HEARTBEAT, 255, 190, 1.0),
