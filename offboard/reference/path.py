@@ -1,4 +1,4 @@
-"""Geometric paths, and where the nose points along them.
+"""Geometric paths, and the heading along their velocity.
 
 A path maps its own time s (seconds at full speed) to a position and its derivatives with respect
 to s: `Harmonic`, or a `Spline` of SciPy through points. Starting and stopping is added by `track`.
@@ -175,35 +175,6 @@ def interpolate(times_s: Array, values: Array, knot_spacing_s: float = 0.0) -> S
     return Spline(make_lsq_spline(times_s, values, np.pad(knots, _DEGREE, "edge"), k=_DEGREE))
 
 
-class Heading(Protocol):
-    """Where the nose points along a path."""
-
-    def jet(self, path_time_s: Array, path_jet: Array) -> Array:
-        """Heading (unwrapped), its first and second derivative by s, shape (3, N), rad and s.
-
-        path_time_s (N,); path_jet (5, N, 3 or 4) is the path at the same times."""
-        ...
-
-
-@dataclass(frozen=True, slots=True)
-class Fixed:
-    """A constant heading."""
-
-    heading_rad: float
-
-    def jet(self, path_time_s: Array, path_jet: Array) -> Array:
-        """See `Heading`."""
-        return np.multiply.outer((self.heading_rad, 0.0, 0.0), np.ones(path_time_s.size))
-
-
-class Column:
-    """The fourth column of the path."""
-
-    def jet(self, path_time_s: Array, path_jet: Array) -> Array:
-        """See `Heading`."""
-        return path_jet[:3, :, HEADING]
-
-
 class AlongVelocity:
     """The direction of the horizontal velocity, unwrapped from the start of the path, for s in
     [0, length_s]; a path that never moves horizontally has the heading `standstill_rad`.
@@ -237,7 +208,9 @@ class AlongVelocity:
         self._across = joined(self._edges_s, jet[:, edges].T[:, :, np.newaxis])
 
     def jet(self, path_time_s: Array, path_jet: Array) -> Array:
-        """See `Heading`."""
+        """Heading (unwrapped), its first and second derivative by s, shape (3, N), rad and s.
+
+        path_time_s (N,); path_jet (5, N, 3) is the path at the same times."""
         jet = direction_jet(path_jet)
         node = np.rint(path_time_s / self._step_s).astype(np.intp)
         nearest_rad = self._nodes_rad[np.clip(node, 0, self._nodes_rad.size - 1)]
