@@ -81,26 +81,16 @@ def _solved(dynamics: bytes, input_map: bytes, effort: float, period_s: float) -
     )
 
 
-def tilt_ripple(vehicle: Vehicle, period_s: float) -> Array:
-    """`hold_ripple` (2,) of [b, b'] for a slope of b_c of 1 per second."""
-    whole = lateral_model(vehicle)
-    return hold_ripple(LinearModel(whole.dynamics[2:, 2:], whole.input_map[2:]), period_s)
-
-
-def thrust_ripple(vehicle: Vehicle, period_s: float) -> float:
-    """`hold_ripple` of T b_z for a slope of f_c of 1 m/s^3."""
-    whole = vertical_model(vehicle)
-    return float(hold_ripple(LinearModel(whole.dynamics[2:, 2:], whole.input_map[2:]), period_s)[0])
-
-
-def hold_ripple(model: LinearModel, period_s: float) -> Array:
-    """How much the state (n,) of a stable model driven by held inputs differs from its response to
-    the ramp u = t, at the times when the input changes.
+def hold_ripple(axis: LinearModel, period_s: float) -> Array:
+    """How much the response behind an input that is held differs from that to the ramp u = t, at
+    the times when the input changes: [b, b'] of a lateral axis, [T b_z] of the vertical one, which
+    are all states but position and velocity.
 
     The held inputs equal the ramp in the middle of each hold. A sampled law decides exactly at
     these times: without this difference in its target it would try to remove the ripple of its own
     hold, which no held input can.
     """
+    model = LinearModel(axis.dynamics[2:, 2:], axis.input_map[2:])
     held = model.sampled(period_s)
     # Response to the ramp: slope t + smooth; to held inputs, when they change: slope t + stepped
     slope = -np.linalg.solve(model.dynamics, model.input_map[:, 0])

@@ -49,16 +49,10 @@ from offboard.control.base import (
     DecisionError,
     Situation,
 )
-from offboard.control.gains import (
-    held_lead,
-    lateral_gain,
-    thrust_ripple,
-    tilt_ripple,
-    vertical_gain,
-)
+from offboard.control.gains import held_lead, hold_ripple, lateral_gain, vertical_gain
 from offboard.control.quadratic import BoxQuadratic, ExactMinimum, at_bound, closed_form
 from offboard.control.swarm import SwarmSettings, certify, minimise
-from offboard.model.axes import lead
+from offboard.model.axes import lateral_model, lead, vertical_model
 from offboard.model.command import Command, PredictedState, PredictedVertical
 from offboard.model.frames import wrap_pi
 from offboard.model.vehicle import DelayUncertainty, Vehicle
@@ -153,8 +147,8 @@ class TrackingLaw:
     def set_vehicle(self, vehicle: Vehicle, uncertainty: DelayUncertainty | None = None) -> None:
         """See `base.Adaptive`; without an uncertainty the bandwidth is the configured one."""
         self.vehicle = vehicle
-        self._tilt_ripple = tilt_ripple(vehicle, self.period_s)
-        self._thrust_ripple = thrust_ripple(vehicle, self.period_s)
+        self._tilt_ripple = hold_ripple(lateral_model(vehicle), self.period_s)
+        (self._thrust_ripple,) = hold_ripple(vertical_model(vehicle), self.period_s)
         delays = vehicle.tilt, vehicle.thrust_delay_s, vehicle.thrust_lag_s, uncertainty
         limits = (
             *delays, vehicle.angular_acceleration_limit_radps2, vehicle.angular_rate_limit_radps,
