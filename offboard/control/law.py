@@ -34,7 +34,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,7 +57,7 @@ from offboard.model.command import Command, PredictedState, PredictedVertical
 from offboard.model.frames import wrap_pi
 from offboard.model.vehicle import DelayUncertainty, Vehicle
 from offboard.reference.base import Reference
-from offboard.reference.flatness import flat_state
+from offboard.reference.flatness import FlatState, flat_state
 
 Array = NDArray[np.float64]
 
@@ -191,8 +191,7 @@ class TrackingLaw:
     def target(self, reference: Reference, time_s: float, state: PredictedState) -> Target:
         """The target of a decision at `time_s`, for the state predicted to the time when its tilt
         begins to act. The estimated disturbance is compensated in it."""
-        vehicle, period_s = self.vehicle, self.period_s
-        half_s = 0.5 * period_s
+        vehicle, half_s = self.vehicle, 0.5 * self.period_s
         vertical_s = vertical_of(state).time_s
         heading_s = time_s + vehicle.yaw.delay_s + half_s
         times = [state.time_s, state.time_s + half_s, vertical_s, vertical_s + half_s, heading_s]
@@ -217,10 +216,6 @@ class TrackingLaw:
             sample.velocity_ned_mps[at, 2],
             thrust[at] * b[at, 2] + self._thrust_ripple * thrust_slope,
         )
-        at = TILT_HELD
-        led_tilt = held_lead(b[at], b1[at], b2[at], vehicle.tilt, period_s)
-        # T lags, b_z does not
-        led_thrust = thrust[THRUST_HELD] + vehicle.thrust_lag_s * thrust_rate[THRUST_HELD]
         heading_rad = lead(
             sample.heading_rad[HEADING_HELD],
             sample.heading_rate_radps[HEADING_HELD],
@@ -230,10 +225,25 @@ class TrackingLaw:
         return Target(
             lateral=lateral[:, :2],
             vertical=np.array(vertical),
-            feedforward=np.array((led_tilt[0], led_tilt[1], led_thrust * b[THRUST_HELD, 2])),
+            feedforward=self.feedforward(flat, TILT_HELD, THRUST_HELD),
             heading_rad=float(heading_rad),
             to_hover=to_hover(b[TILT_BEGINS], thrust[TILT_BEGINS], state, vehicle),
         )
+
+    def feedforward(self, flat: FlatState, tilt: Any, thrust: Any) -> Array:
+        """b_c north, b_c east and T b_z (..., 3) that follow a reference: of the samples `tilt` and
+        `thrust` of `flat`, in the middle of a hold, led through the responses of the vehicle."""
+        led_tilt = held_lead(
+            flat.thrust_direction_ned[tilt, :2],
+            flat.thrust_direction_rate_ned_ps[tilt, :2],
+            flat.thrust_direction_acceleration_ned_ps2[tilt, :2],
+            self.vehicle.tilt,
+            self.period_s,
+        )
+        # T lags, b_z does not
+        led_thrust = flat.thrust_mps2 + self.vehicle.thrust_lag_s * flat.thrust_rate_mps3
+        down = (led_thrust * flat.thrust_direction_ned[:, 2])[thrust]
+        return np.concatenate((led_tilt, down[..., np.newaxis]), axis=-1)
 
     def _problem_of(
         self, target: Target, lateral: Array, vertical: Array, b_z: float
