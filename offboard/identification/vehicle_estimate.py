@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from offboard.identification.attitude_fit import ResponseFit, Unexplained
@@ -295,11 +295,11 @@ class VehicleEstimate:
                 self._doubt(tilt.delay_s, self.delay)
                 return
         else:
-            clearer = self.in_doubt and tilt.residual_rms < BETTER * now.rms
+            clearer = self.in_doubt and tilt.left.rms < BETTER * now.rms
             better = clearer or tilt.delay_s.sd < BETTER * self.delay.sd
         if better:
             self.adopt(found, time_s)
-        left = replace(now, rms=tilt.residual_rms) if better else now
+        left = tilt.left if better else now
         explained = not left.contradicts if self.in_doubt else better
         if explained and self._contradictions < MOST_CONTRADICTIONS:
             self._doubt_s = 0.0
@@ -319,9 +319,8 @@ class VehicleEstimate:
         if self._other_delay is not None:
             return not _apart(tilt.delay_s, self._other_delay)
         once = 0 < self._contradictions < MOST_CONTRADICTIONS
-        explains = tilt.residual_rms < BETTER * now.rms
-        left = replace(now, rms=tilt.residual_rms)
-        return self.in_doubt and once and explains and not left.contradicts
+        explains = tilt.left.rms < BETTER * now.rms
+        return self.in_doubt and once and explains and not tilt.left.contradicts
 
     def _doubt(self, seen: Estimate, known: Estimate) -> None:
         self._other_delay, self.cause = seen, ""

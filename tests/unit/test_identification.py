@@ -46,8 +46,9 @@ def steps(seed):
     return np.arange(60) * 0.1, values
 
 
-def fit_response(*measured, **options) -> ResponseFit:
-    return completed(attitude_fit.fit_response(*measured, **options))
+def fit_response(*measured, delay: Estimate | None = None, wanders=False) -> ResponseFit:
+    problem = attitude_fit.ResponseProblem(*measured, wanders=wanders)
+    return completed(attitude_fit.fit_response(problem, delay))
 
 
 def test_innovations_of_a_matching_motion_are_white_and_of_unit_variance():
@@ -117,7 +118,7 @@ def test_delay_known_beforehand_counts_by_its_uncertainty():
     noise = 0.004 * np.random.default_rng(1).normal(size=len(times))
     signals = (simulated(values, sent_at, 0.123, 7.0, 1.2, times) + noise)[:, None]
     alone, uncertain, certain = (
-        fit_response(times, signals, sent_at, values[:, None], delay)
+        fit_response(times, signals, sent_at, values[:, None], delay=delay)
         for delay in (None, Estimate(0.3, 10.0), Estimate(0.123, 1e-5))
     )
     assert uncertain.delay_s.value == pytest.approx(alone.delay_s.value, abs=1e-6)

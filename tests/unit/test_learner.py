@@ -40,7 +40,8 @@ KNOWN_S = 3.0 * 0.002  # what a delay of `fit` may be wrong by
 
 def fit(delay_s: float, frequency: float = 12.0, left: float = 0.004) -> Identified:
     values = Estimate(delay_s, 0.002), Estimate(frequency, 0.3), Estimate(0.7, 0.03)
-    return Identified(10.0, tilt=ResponseFit(*values, left, 0.1, 0.005))
+    lag_s = Estimate(1.4 / frequency, 0.005)
+    return Identified(10.0, tilt=ResponseFit(*values, lag_s, Unexplained(left, 0.1)))
 
 
 def estimate_with(found: Identified) -> VehicleEstimate:
@@ -57,7 +58,8 @@ def test_what_a_file_may_have_is_adopted_and_nothing_else() -> None:
         file = Vehicle.model_validate(FILE.model_dump() | constants)
         values = [Estimate(value, 1e-3) for value in (0.5, frequency, damping)]
         hover = Estimate(hover_thrust, 1e-3)
-        found = Identified(10.0, ResponseFit(*values, 0.004, 0.1, 0.005), hover_thrust=hover)
+        fitted = ResponseFit(*values, Estimate(2.0 * damping / frequency, 0.005), AGREES)
+        found = Identified(10.0, fitted, hover_thrust=hover)
         assert within_bounds(found, file, 4.0) == (found, [])
     without_drag = Identified(10.0, drag_ps=Estimate(0.01, 0.02))
     assert within_bounds(without_drag, FILE, 4.0) == (without_drag, [])
