@@ -80,9 +80,9 @@ HOVER_RELATED_S = 2.0  # time over which its errors are autocorrelated
 WELL_KNOWN_S, TILT_EVERY_S, TILT_OVER_S = 0.004, 2.0, 12.0
 # Thrust: first fit after the reference begins, interval; over TILT_OVER_S of flight
 THRUST_FIRST_S, THRUST_EVERY_S = 6.0, 2.0
-# Prediction: how often and over how much flight it is compared with the tilt, and after how many
+# Prediction: how often and over how much flight it is compared with the tilt. After two
 # contradictions in a row the vehicle is in doubt
-COMPARE_EVERY_S, COMPARE_OVER_S, COMPARE_TIMES = 0.5, 2.0, 2
+COMPARE_EVERY_S, COMPARE_OVER_S = 0.5, 2.0
 
 Work = Generator[None, None, None]
 
@@ -163,7 +163,6 @@ class Learner(VehicleEstimate):
         self._left_box = self._gave_up = False
         self._work: Work | None = None
         self._due_s: dict[str, float] = {}  # when each piece of work is due again
-        self._in_a_row = 0  # contradictions of the comparison
         self._doubted_from_s = -math.inf
         self._hover: deque[tuple[float, float]] = deque()
 
@@ -218,11 +217,6 @@ class Learner(VehicleEstimate):
         """Whether the flight should go through the steps."""
         return self._settings.online and self._settings.excite and not self.identified
 
-    @property
-    def result(self) -> IdentifiedVehicle | None:
-        """What the next flight of this vehicle may begin with; None if nothing is known."""
-        return super().result if self.identified else None
-
     def excited(self, command: Command, time_s: float, error_m: float) -> Command:
         """In the steps: `command` with its step, until the vehicle leaves the box."""
         self._left_box = self._left_box or error_m > self._settings.box_m
@@ -273,7 +267,7 @@ class Learner(VehicleEstimate):
             return self._identify_all() if flown else None
         if self._stage is not Stage.MOTION:
             return None
-        certain = self.delay is not None and self.delay.sd <= WELL_KNOWN_S
+        certain = self.delay.sd <= WELL_KNOWN_S
         if not self.in_doubt and self._is_due("compare", COMPARE_EVERY_S):
             self._compare_with_prediction()
             return None
@@ -320,7 +314,7 @@ class Learner(VehicleEstimate):
         self.identified = True
         self.adopt(found, self._time_s)
         self.explain(refusal or "it is out of bounds")
-        if self.delay is None:
+        if not self.delay.known:
             self.sentences.append(self.cause)
             self.cause = ""
 
@@ -347,10 +341,8 @@ class Learner(VehicleEstimate):
         begin_s = self._time_s - COMPARE_OVER_S
         trace = self._flown_since(begin_s)
         now = unexplained(trace, self.vehicle.tilt)
-        contradicts = now.contradicts and not self.link_changed
-        self._in_a_row = self._in_a_row + 1 if contradicts else 0
-        if self._in_a_row >= COMPARE_TIMES:
-            self._in_a_row, self._doubted_from_s = 0, begin_s
+        if self._again("tilt", now.contradicts and not self.link_changed):
+            self._doubted_from_s = begin_s
             self.on_contradiction(now, unexplained(trace, self.previous.tilt), self._time_s)
 
     def _review_hover(self) -> None:

@@ -252,8 +252,9 @@ def test_delays_of_a_remembered_vehicle_follow_the_link_over_many_flights() -> N
     own_s, at_s = 0.053, 0.204
     known = IdentifiedVehicle(
         FILE.model_copy(update={"tilt": FILE.tilt.model_copy(update={"delay_s": own_s + at_s})}),
-        Estimate(own_s + at_s, 0.002), at_s, Estimate(0.3, 0.02),
+        0.002, at_s, 0.02,
     )  # fmt: skip
+    thrust_s = effect_s(known.vehicle) - at_s
     for link_s in (0.204, 0.180, None, 0.156, 0.132, 0.108):
         estimate = VehicleEstimate(FILE, delay_error_s=UNKNOWN_DELAY_S, known=known)
         if link_s is not None:
@@ -263,8 +264,8 @@ def test_delays_of_a_remembered_vehicle_follow_the_link_over_many_flights() -> N
         known = estimate.result
         assert known.vehicle.tilt.delay_s - known.link_s == pytest.approx(own_s)
         assert abs(known.link_s - at_s) < 0.03
-        assert known.thrust is not None
-        assert known.thrust.value == pytest.approx(0.3 + known.link_s - 0.204)
+        assert effect_s(known.vehicle) - known.link_s == pytest.approx(thrust_s)
+        assert estimate.uncertainty.thrust_s == pytest.approx(0.06)
 
 
 def test_learner_announces_what_is_new_in_motion(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -323,7 +324,7 @@ def test_steps_end_where_they_began_and_outside_the_box() -> None:
 
 
 def test_without_identification_the_file_is_flown_and_nothing_is_recalled() -> None:
-    recalled = IdentifiedVehicle(PX4, Estimate(0.04, 0.002), 0.0)
+    recalled = IdentifiedVehicle(PX4, 0.002, 0.0)
     learner = Learner(FILE, IdentifySettings(online=False), known=recalled)
     assert not learner.wants_excitation
     told = []
@@ -338,7 +339,7 @@ def test_without_identification_the_file_is_flown_and_nothing_is_recalled() -> N
     changed = learner.learn(15.0, 0.53)
     assert changed is not None
     assert changed.vehicle == FILE.model_copy(update=slower)
-    again = Learner(FILE, IdentifySettings(), known=replace(recalled, thrust=Estimate(0.1, 0.09)))
+    again = Learner(FILE, IdentifySettings(), known=replace(recalled, thrust_sd_s=0.09))
     assert again.uncertainty.thrust_s == pytest.approx(0.27)
     assert update.cause.endswith("the vehicle file's delay may be wrong by 130 ms")
     assert (update.sentences, learner.result) == ((), None)
