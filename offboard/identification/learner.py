@@ -324,7 +324,7 @@ class Learner(VehicleEstimate):
 
     def _identify_thrust(self) -> None:
         trace = self._flown_since(max(self.motion_s, self._time_s - TILT_OVER_S))
-        found = identify_thrust(trace, self.vehicle, self.added, self.file)
+        found = identify_thrust(trace, self.vehicle, self.delay, self.file)
         self.review_thrust(found, self._time_s)
 
     def _identify_tilt(self) -> Work:

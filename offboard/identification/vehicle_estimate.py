@@ -18,7 +18,6 @@ from offboard.identification.attitude_fit import ResponseFit, Unexplained
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_fit import (
     LINK_S,
-    LINK_SD_S,
     THRUST_DELAY_SD_S,
     THRUST_LAG_SD_S,
     Identified,
@@ -261,12 +260,6 @@ class VehicleEstimate:
         else:
             self._differed.discard(constant)
         return again
-
-    @property
-    def added(self) -> Estimate:
-        """Delay that the link adds to those in the vehicle file, as identified on the tilt."""
-        sd_s = self._delay_sd_s if self.delay.known else LINK_SD_S
-        return Estimate(self.vehicle.tilt.delay_s - self.file.tilt.delay_s, sd_s)
 
     def review_thrust(self, found: Identified, time_s: float) -> None:
         """Adopt a later fit of the thrust that is clearly more certain, or the second in a row that
