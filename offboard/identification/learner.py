@@ -19,7 +19,6 @@ from collections import deque
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum, auto
-from typing import Any
 
 import numpy as np
 from pydantic import Field
@@ -184,21 +183,10 @@ class Learner(VehicleEstimate):
         if time_s >= self._climb_s:
             self._positions.add(time_s, *position_ned_m, *velocity_ned_mps)
 
-    def on_command(self, time_s: float, command: Command) -> None:
-        """A command sent; its thrust was scaled with the newest vehicle that was told."""
+    def on_command(self, time_s: float, command: Command, thrust: float) -> None:
+        """A command sent, and its thrust as a fraction of full throttle."""
         north, east, _ = command.thrust_direction_ned
-        share = command.thrust_mps2 / self._told.vehicle.thrust_max_mps2
-        self._commands.add(time_s, north, east, share, command.heading_rad)
-
-    def on_shown(self, constants: Mapping[str, Any]) -> None:
-        """Use constants that the vehicle reported before the take-over."""
-        super().on_shown(constants)
-        flown = self._told.vehicle.model_copy(update=constants)
-        self._told = replace(self._told, vehicle=flown)
-
-    def on_changed(self, constants: Mapping[str, Any]) -> None:
-        """Fly with constants that the vehicle reports in flight, from the next tick on."""
-        super().on_shown(constants)
+        self._commands.add(time_s, north, east, thrust, command.heading_rad)
 
     def on_stage(self, stage: Stage, time_s: float) -> None:
         """The flight has entered `stage`."""

@@ -197,7 +197,7 @@ class VehicleEstimate:
         self.cause = f"the link's delay {of_link}, the tilt's {of_tilt}"
 
     def on_shown(self, constants: Mapping[str, Any]) -> None:
-        """Use constants that the vehicle reported before the take-over."""
+        """Use constants that the vehicle reports."""
         self.vehicle = self.vehicle.model_copy(update=constants)
 
     # ------------------------------------------------------------------ fits

@@ -335,7 +335,7 @@ def test_without_identification_the_file_is_flown_and_nothing_is_recalled() -> N
     assert (update.vehicle, update.uncertainty.tilt_s) == (FILE, FILE_DELAY_S)
     learner.give_up()  # what the vehicle reports is used all the same
     slower = {"angular_rate_limit_radps": (1.0, 1.0, 3.0)}
-    learner.on_changed(slower)
+    learner.on_shown(slower)
     changed = learner.learn(15.0, 0.53)
     assert changed is not None
     assert changed.vehicle == FILE.model_copy(update=slower)
