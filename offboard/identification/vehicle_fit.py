@@ -335,14 +335,11 @@ def with_link_delay(
     added_s = found.tilt.delay_s.value - vehicle_file.tilt.delay_s
     if added_s < LINK_S:
         return target
-    update: dict[str, Any] = {}
-    thrust_delay_s = vehicle_file.thrust_delay_s + added_s
-    if not thrust_known and target.thrust_delay_s < thrust_delay_s - LINK_S:
-        update["thrust_delay_s"] = thrust_delay_s
-    yaw_delay_s = vehicle_file.yaw.delay_s + added_s
-    if found.yaw is None and target.yaw.delay_s < yaw_delay_s - LINK_S:
-        delay_s = min(yaw_delay_s, DELAY_LIMITS_S[1])
-        update["yaw"] = target.yaw.model_copy(update={"delay_s": delay_s})
+    later, update = vehicle_file.later_by(added_s), dict[str, Any]()
+    if not thrust_known and target.thrust_delay_s < later.thrust_delay_s - LINK_S:
+        update["thrust_delay_s"] = later.thrust_delay_s
+    if found.yaw is None and target.yaw.delay_s < later.yaw.delay_s - LINK_S:
+        update["yaw"] = target.yaw.model_copy(update={"delay_s": later.yaw.delay_s})
     return target.model_copy(update=update)
 
 

@@ -250,10 +250,9 @@ def test_delays_of_a_remembered_vehicle_follow_the_link_over_many_flights() -> N
     """From 204 to 108 ms in steps of 24, below the 30 ms that count as a change; one flight ends
     before the link is measured. The vehicle's own delays stay what they are."""
     own_s, at_s = 0.053, 0.204
-    known = IdentifiedVehicle(
-        FILE.model_copy(update={"tilt": FILE.tilt.model_copy(update={"delay_s": own_s + at_s})}),
-        0.002, at_s, 0.02,
-    )  # fmt: skip
+    tilt = FILE.tilt.model_copy(update={"delay_s": own_s + at_s})
+    delays = {"tilt": tilt, "thrust_delay_s": 0.06 + at_s}
+    known = IdentifiedVehicle(FILE.model_copy(update=delays), 0.002, at_s, 0.02)
     thrust_s = effect_s(known.vehicle) - at_s
     for link_s in (0.204, 0.180, None, 0.156, 0.132, 0.108):
         estimate = VehicleEstimate(FILE, delay_error_s=UNKNOWN_DELAY_S, known=known)
@@ -266,6 +265,22 @@ def test_delays_of_a_remembered_vehicle_follow_the_link_over_many_flights() -> N
         assert abs(known.link_s - at_s) < 0.03
         assert effect_s(known.vehicle) - known.link_s == pytest.approx(thrust_s)
         assert estimate.uncertainty.thrust_s == pytest.approx(0.06)
+
+
+@pytest.mark.parametrize(("from_s", "to_s"), [(0.2, 0.004), (0.004, 0.6)])
+def test_no_link_moves_a_delay_out_of_its_limits(from_s: float, to_s: float) -> None:
+    """An identified thrust delay of 190 ms behind a link of 200 ms that is gone; a file whose
+    thrust acts later than its tilt, behind a link of 600 ms. Later fits are adopted."""
+    slow = FILE.model_copy(update={"thrust_delay_s": 0.1})
+    recalled = slow.later_by(from_s).model_copy(update={"thrust_delay_s": 0.19})
+    known = IdentifiedVehicle(recalled, 0.002, from_s, 0.02)
+    estimate = VehicleEstimate(slow, delay_error_s=UNKNOWN_DELAY_S, known=known)
+    estimate.on_link_delay(Estimate(to_s, 0.002))
+    for each in (estimate, estimate_with(fit(0.48)), VehicleEstimate(slow, delay_error_s=0.1)):
+        each.adopt(replace(fit(0.48), drag_ps=Estimate(0.7, 0.01)), 10.0)
+        each.adopt(Identified(10.0, drag_ps=Estimate(0.5, 0.01)), 12.0)
+        assert each.vehicle.drag_per_mass_ps == pytest.approx(0.5)
+        Vehicle.model_validate(each.vehicle.model_dump())
 
 
 def test_learner_announces_what_is_new_in_motion(monkeypatch: pytest.MonkeyPatch) -> None:
