@@ -144,13 +144,9 @@ def through(points_ned_m: Array, times_s: Array, smoothness: Smoothness) -> Spli
     N >= 2: with clamped ends the minimiser of the integral of the squared m-th derivative is the
     interpolating spline of degree 2 m - 1.
 
-    Raises ValueError unless the times are finite, start at 0 and increase."""
-    if len(points_ned_m) < 2:
-        raise ValueError(f"a path needs at least 2 points, not {len(points_ned_m)}")
+    Raises ValueError unless there are as many times, which start at 0 and increase."""
     if len(times_s) != len(points_ned_m):
         raise ValueError(f"{len(points_ned_m)} points need as many times, not {len(times_s)}")
-    if not np.all(np.isfinite(points_ned_m)) or not np.all(np.isfinite(times_s)):
-        raise ValueError("points and times must be finite")
     if times_s[0] != 0.0 or np.any(np.diff(times_s) <= 0.0):
         raise ValueError("the times of the points must start at 0 and increase")
     order = 3 if smoothness is Smoothness.JERK else 4
