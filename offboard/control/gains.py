@@ -23,10 +23,9 @@ Array = NDArray[np.float64]
 class CostToGo:
     """One sampled axis, its gain, and the cost of one held input with all that follows it.
 
-    J(u; x) = T x_0^2 + effort u^2 + x(k+1)' P x(k+1)
-            = 1/2 curvature u^2 + (coupling x) u + 1/2 x' state_cost x, minimal at u = -gain x,
-    in deviations from the reference, for a period T. transition A (n, n), input_map B (n, 1);
-    terminal P (n, n); coupling and gain K (n,).
+    J(u; x) = T x_0^2 + effort u^2 + x(k+1)' P x(k+1) = 1/2 curvature (u + K x)^2 + x' P x
+    in deviations from the reference, for a period T, by the Riccati equation that P solves.
+    transition A (n, n), input_map B (n, 1); terminal P (n, n); gain K (n,).
     """
 
     transition: Array
@@ -34,8 +33,6 @@ class CostToGo:
     effort: float
     terminal: Array
     curvature: float
-    coupling: Array
-    state_cost: Array
     gain: Array
 
 
@@ -75,8 +72,6 @@ def _solved(dynamics: bytes, input_map: bytes, effort: float, period_s: float) -
         effort=period_s * effort,
         terminal=terminal,
         curvature=2.0 * float((r + b.T @ terminal @ b)[0, 0]),
-        coupling=2.0 * (b.T @ terminal @ a)[0],
-        state_cost=2.0 * (q + a.T @ terminal @ a),
         gain=gain[0],
     )
 

@@ -23,11 +23,12 @@ kept, it accelerates by T (1 + b b^T/b_z^2): position and velocity enter as what
 hover, for the same answer (`Target.to_hover`). Otherwise the loop gain at 45 degrees is 2.8 times
 that of hover, and ends in a limit cycle.
 
-    J(u) = x'Qx + u'Ru + x(k+1)'P x(k+1) = 1/2 u'Hu + f'u + c,  lower <= u <= upper
+    J(u) = x'Qx + u'Ru + x(k+1)'P x(k+1) = 1/2 (u - u*)'H(u - u*) + x'P x,  lower <= u <= upper
 
-H is diagonal, so that u = clip(-f / H) is its exact minimum. `lqr` computes just that; `pso` lets
-the swarm search, which needs neither a diagonal nor a quadratic; `mpc` and `horizon` minimise the
-sum over N decisions; `pid` replaces K by the gains of two cascades. Knows no autopilot, no clock.
+with u* = u_ff - K x. H is diagonal, so that u = clip(u*) is its exact minimum. `lqr` computes just
+that; `pso` lets the swarm search, which needs neither a diagonal nor a quadratic; `mpc` and
+`horizon` minimise the sum over N decisions; `pid` replaces K by the gains of two cascades. Knows no
+autopilot, no clock.
 """
 
 from __future__ import annotations
@@ -248,7 +249,8 @@ class TrackingLaw:
     def _problem_of(
         self, target: Target, lateral: Array, vertical: Array, b_z: float
     ) -> TrackingProblem:
-        """The problem of these deviations: J, and the bounds of u to which the law clips."""
+        """The problem of these deviations: J, which is least at u_ff - K x, where x'P x are left to
+        pay, and the bounds of u to which the law clips."""
         vehicle = self.vehicle
         curvature = np.array(
             [
@@ -258,17 +260,14 @@ class TrackingLaw:
                 HEADING_CURVATURE,
             ]
         )
-        slope = np.zeros(4)  # of J at the feed-forward
-        slope[0] = b_z * (self.vertical.coupling @ vertical)
         at_hover = np.vstack((lateral[:2] @ target.to_hover, lateral[2:]))
-        slope[1:3] = self.lateral.coupling @ at_hover
-        rest = vertical @ self.vertical.state_cost @ vertical
-        rest += np.sum(at_hover * (self.lateral.state_cost @ at_hover))
-        thrust = target.feedforward[2] / b_z
-        nominal = np.array([thrust, *target.feedforward[:2], target.heading_rad])
-        gradient = slope - curvature * nominal
-        constant = 0.5 * rest + nominal @ (0.5 * curvature * nominal - slope)
-        low, high = self.tilt_bounds(nominal[1:3])
+        feedback = np.append(self.lateral.gain @ at_hover, self.vertical.gain @ vertical)
+        north, east, down_mps2 = target.feedforward - feedback
+        least = np.array([down_mps2 / b_z, north, east, target.heading_rad])
+        rest = vertical @ self.vertical.terminal @ vertical
+        rest += np.sum(at_hover * (self.lateral.terminal @ at_hover))
+        gradient, constant = -curvature * least, rest + 0.5 * (curvature * least) @ least
+        low, high = self.tilt_bounds(target.feedforward[:2])
         heading = target.heading_rad
         lower = np.array([vehicle.thrust_min_mps2, *low, heading - HEADING_BOX_RAD])
         upper = np.array([vehicle.thrust_max_mps2, *high, heading + HEADING_BOX_RAD])
