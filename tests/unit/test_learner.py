@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -216,6 +217,7 @@ def test_doubt_about_the_tilt_leaves_the_other_constants() -> None:
     assert estimate.vehicle.thrust_delay_s == pytest.approx(0.12)
     assert estimate.vehicle.yaw.delay_s == pytest.approx(0.31)
     estimate.on_contradiction(CONTRADICTS, AGREES, 20.0)
+    assert estimate.uncertainty.tilt_s == UNKNOWN_DELAY_S
     identified = {
         "hover_thrust": 0.62,
         "thrust_lag_s": 0.04,
@@ -276,6 +278,7 @@ def test_no_link_moves_a_delay_out_of_its_limits(from_s: float, to_s: float) -> 
     known = IdentifiedVehicle(recalled, 0.002, from_s, 0.02)
     estimate = VehicleEstimate(slow, delay_error_s=UNKNOWN_DELAY_S, known=known)
     estimate.on_link_delay(Estimate(to_s, 0.002))
+    assert estimate.uncertainty.tilt_s == pytest.approx(3.0 * math.hypot(0.002, 0.002))
     for each in (estimate, estimate_with(fit(0.48)), VehicleEstimate(slow, delay_error_s=0.1)):
         each.adopt(replace(fit(0.48), drag_ps=Estimate(0.7, 0.01)), 10.0)
         each.adopt(Identified(10.0, drag_ps=Estimate(0.5, 0.01)), 12.0)
@@ -284,8 +287,9 @@ def test_no_link_moves_a_delay_out_of_its_limits(from_s: float, to_s: float) -> 
 
 
 def test_learner_announces_what_is_new_in_motion(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A lasting contradiction twice, though every new fit seems to explain the flight; another
-    hover thrust of the observer, if it differs by more than 6 % and is within bounds."""
+    """A lasting contradiction twice, though every new fit seems to explain the flight, and one that
+    does not last not at all; another hover thrust of the observer, if it differs by more than 6 %
+    and is within bounds."""
 
     def in_pieces(*_):
         yield
@@ -299,8 +303,9 @@ def test_learner_announces_what_is_new_in_motion(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(learning, "fit_axis", tilt_in_pieces)
     monkeypatch.setattr(learning, "identify_drag", lambda trace, vehicle: Identified(10.0))
 
-    def flown(left: Unexplained, shown: float) -> tuple[Learner, list[str]]:
-        monkeypatch.setattr(learning, "unexplained", lambda trace, response: left)
+    def flown(*left: Unexplained, shown: float) -> tuple[Learner, list[str]]:
+        lefts = itertools.cycle(left)
+        monkeypatch.setattr(learning, "unexplained", lambda trace, response: next(lefts))
         learner, said = Learner(FILE, IdentifySettings(excite=False)), []
         learner.on_stage(Stage.CLIMB, 0.0)
         learner.on_stage(Stage.MOTION, 5.0)
@@ -309,13 +314,14 @@ def test_learner_announces_what_is_new_in_motion(monkeypatch: pytest.MonkeyPatch
             said += update.sentences if update else ()
         return learner, said
 
-    learner, said = flown(CONTRADICTS, 0.42)
+    assert not flown(CONTRADICTS, AGREES, shown=0.42)[0].contradicted
+    learner, said = flown(CONTRADICTS, shown=0.42)
     contradictions = [sentence for sentence in said if "contradicts telemetry" in sentence]
     assert len(contradictions) == 2
     assert contradictions[1].endswith("until nothing contradicts for 20 s")
     assert learner.uncertainty.tilt_s == DOUBTED_DELAY_S
     for shown, used in ((0.42, 0.42), (0.44, 0.42), (0.53, 0.53), (0.3, 0.3), (0.97, 0.42)):
-        learner, said = flown(AGREES, shown)
+        learner, said = flown(AGREES, shown=shown)
         assert learner.vehicle.hover_thrust == pytest.approx(used, abs=0.002)
         assert sum(line.startswith("identified hover thrust") for line in said) == (used != 0.42)
 
