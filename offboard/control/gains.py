@@ -13,8 +13,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.model.axes import LinearModel, lateral_model, lead, vertical_model
-from offboard.model.vehicle import AxisResponse, Vehicle
+from offboard.model.axes import LinearModel, lateral_model, vertical_model
+from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
 
@@ -93,12 +93,3 @@ def hold_ripple(axis: LinearModel, period_s: float) -> Array:
     pushed = (0.5 * held.input_map[:, 0] - slope) * period_s
     stepped = np.linalg.solve(np.eye(len(pushed)) - held.dynamics, pushed)
     return np.asarray(stepped - smooth, np.float64)
-
-
-def held_lead(
-    value: Array, rate: Array, acceleration: Array, response: AxisResponse, period_s: float
-) -> Array:
-    """`axes.lead` in the middle of a hold, less the second-order difference between a curved
-    command and its mean over the hold. Arguments and result have one common shape."""
-    led: Array = lead(value, rate, acceleration, response) - period_s**2 / 24.0 * acceleration
-    return led

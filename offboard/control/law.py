@@ -50,8 +50,8 @@ from offboard.control.base import (
     DecisionError,
     Situation,
 )
-from offboard.control.gains import held_lead, hold_ripple, lateral_gain, vertical_gain
-from offboard.control.quadratic import BoxQuadratic, ExactMinimum, at_bound, closed_form
+from offboard.control.gains import hold_ripple, lateral_gain, vertical_gain
+from offboard.control.quadratic import BoxQuadratic, ExactMinimum, at_bound
 from offboard.control.swarm import SwarmSettings, certify, minimise
 from offboard.model.axes import lateral_model, lead, vertical_model
 from offboard.model.command import Command, PredictedState, PredictedVertical
@@ -233,14 +233,11 @@ class TrackingLaw:
 
     def feedforward(self, flat: FlatState, tilt: Any, thrust: Any) -> Array:
         """b_c north, b_c east and T b_z (..., 3) that follow a reference: of the samples `tilt` and
-        `thrust` of `flat`, in the middle of a hold, led through the responses of the vehicle."""
-        led_tilt = held_lead(
-            flat.thrust_direction_ned[tilt, :2],
-            flat.thrust_direction_rate_ned_ps[tilt, :2],
-            flat.thrust_direction_acceleration_ned_ps2[tilt, :2],
-            self.vehicle.tilt,
-            self.period_s,
-        )
+        `thrust` of `flat`, in the middle of a hold, led through the responses of the vehicle, less
+        the second-order difference between a curved command and its mean over the hold."""
+        b, rate = flat.thrust_direction_ned[tilt, :2], flat.thrust_direction_rate_ned_ps[tilt, :2]
+        bend = flat.thrust_direction_acceleration_ned_ps2[tilt, :2]
+        led_tilt = lead(b, rate, bend, self.vehicle.tilt) - self.period_s**2 / 24.0 * bend
         # T lags, b_z does not
         led_thrust = flat.thrust_mps2 + self.vehicle.thrust_lag_s * flat.thrust_rate_mps3
         down = (led_thrust * flat.thrust_direction_ned[:, 2])[thrust]
@@ -324,11 +321,11 @@ class LqrSettings(TrackingSettings):
 
 
 class LqrLaw(TrackingLaw):
-    """The exact minimum, clip(-f / H)."""
+    """The exact minimum of a cost whose H is diagonal, clip(-f / H)."""
 
     def decide(self, situation: Situation) -> Decision:
         problem = self.problem(situation).quadratic
-        inputs = closed_form(problem)
+        inputs = problem.clip(-problem.gradient / np.diag(problem.hessian))
         cost = float(problem(inputs))
         on_bound = at_bound(problem, inputs)
         return decision(inputs, Certificate(cost, optimal_cost=cost, gap=0.0, at_bound=on_bound))
