@@ -141,12 +141,12 @@ class Learner(VehicleEstimate):
             delay_error_s=UNKNOWN_DELAY_S if settings.online else FILE_DELAY_S,
             known=known,
         )
-        self.identified = known is not None
+        self.identified = self.delay.known
         self._settings = settings
         # What to fly with as was told last, and whether that was in the turn before
         self._told = VehicleUpdate(self.vehicle, self.uncertainty)
         self._has_told = False
-        if known is None:
+        if not self.identified:
             self.cause = "the vehicle's delay is not identified yet"
         if not settings.online:
             self.cause = (

@@ -80,8 +80,8 @@ class VehicleEstimate:
     def __init__(
         self, file: Vehicle, *, delay_error_s: float, known: IdentifiedVehicle | None = None
     ) -> None:
-        self.file = file
-        self.vehicle = known.vehicle if known else file
+        known = known or IdentifiedVehicle(file, delay_sd_s=math.inf, link_s=0.0)
+        self.file, self.vehicle = file, known.vehicle
         self.sentences: list[str] = []
         self.record: dict[str, Estimate | None] = {}
         self.cause = self.contradiction = ""
@@ -89,10 +89,9 @@ class VehicleEstimate:
         self._unknown_s = delay_error_s
         # Standard deviations of what is in use, infinite until it is identified: the tilt's delay,
         # the thrust's delay and lag together, and the drag by the surest fit of it
-        self._delay_sd_s = known.delay_sd_s if known else math.inf
-        self._thrust_sd_s = known.thrust_sd_s if known else math.inf
+        self._delay_sd_s, self._thrust_sd_s = known.delay_sd_s, known.thrust_sd_s
         self._drag_sd_ps = math.inf
-        self._link_s = known.link_s if known else 0.0  # the link's, which `vehicle` contains
+        self._link_s = known.link_s  # the link's, which `vehicle` contains
         self._link = (0.0, 0.0)  # added since take-off, and changed lately
         self._doubt_s = 0.0  # what the delay may be wrong by because telemetry contradicts it
         self._contradictions = 0
