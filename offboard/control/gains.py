@@ -13,8 +13,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.model.axes import LinearModel, lateral_model, lead, vertical_model
-from offboard.model.vehicle import AxisResponse, Vehicle
+from offboard.model.axes import LinearModel, lateral_model, vertical_model
+from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
 
@@ -23,10 +23,9 @@ Array = NDArray[np.float64]
 class CostToGo:
     """One sampled axis, its gain, and the cost of one held input with all that follows it.
 
-    J(u; x) = T x_0^2 + effort u^2 + x(k+1)' P x(k+1)
-            = 1/2 curvature u^2 + (coupling x) u + 1/2 x' state_cost x, minimal at u = -gain x,
-    in deviations from the reference, for a period T. transition A (n, n), input_map B (n, 1);
-    terminal P (n, n); coupling and gain K (n,).
+    J(u; x) = T x_0^2 + effort u^2 + x(k+1)' P x(k+1) = 1/2 curvature (u + K x)^2 + x' P x
+    in deviations from the reference, for a period T, by the Riccati equation that P solves.
+    transition A (n, n), input_map B (n, 1); terminal P (n, n); gain K (n,).
     """
 
     transition: Array
@@ -34,8 +33,6 @@ class CostToGo:
     effort: float
     terminal: Array
     curvature: float
-    coupling: Array
-    state_cost: Array
     gain: Array
 
 
@@ -75,32 +72,20 @@ def _solved(dynamics: bytes, input_map: bytes, effort: float, period_s: float) -
         effort=period_s * effort,
         terminal=terminal,
         curvature=2.0 * float((r + b.T @ terminal @ b)[0, 0]),
-        coupling=2.0 * (b.T @ terminal @ a)[0],
-        state_cost=2.0 * (q + a.T @ terminal @ a),
         gain=gain[0],
     )
 
 
-def tilt_ripple(vehicle: Vehicle, period_s: float) -> Array:
-    """`hold_ripple` (2,) of [b, b'] for a slope of b_c of 1 per second."""
-    whole = lateral_model(vehicle)
-    return hold_ripple(LinearModel(whole.dynamics[2:, 2:], whole.input_map[2:]), period_s)
-
-
-def thrust_ripple(vehicle: Vehicle, period_s: float) -> float:
-    """`hold_ripple` of T b_z for a slope of f_c of 1 m/s^3."""
-    whole = vertical_model(vehicle)
-    return float(hold_ripple(LinearModel(whole.dynamics[2:, 2:], whole.input_map[2:]), period_s)[0])
-
-
-def hold_ripple(model: LinearModel, period_s: float) -> Array:
-    """How much the state (n,) of a stable model driven by held inputs differs from its response to
-    the ramp u = t, at the times when the input changes.
+def hold_ripple(axis: LinearModel, period_s: float) -> Array:
+    """How much the response behind an input that is held differs from that to the ramp u = t, at
+    the times when the input changes: [b, b'] of a lateral axis, [T b_z] of the vertical one, which
+    are all states but position and velocity.
 
     The held inputs equal the ramp in the middle of each hold. A sampled law decides exactly at
     these times: without this difference in its target it would try to remove the ripple of its own
     hold, which no held input can.
     """
+    model = LinearModel(axis.dynamics[2:, 2:], axis.input_map[2:])
     held = model.sampled(period_s)
     # Response to the ramp: slope t + smooth; to held inputs, when they change: slope t + stepped
     slope = -np.linalg.solve(model.dynamics, model.input_map[:, 0])
@@ -108,12 +93,3 @@ def hold_ripple(model: LinearModel, period_s: float) -> Array:
     pushed = (0.5 * held.input_map[:, 0] - slope) * period_s
     stepped = np.linalg.solve(np.eye(len(pushed)) - held.dynamics, pushed)
     return np.asarray(stepped - smooth, np.float64)
-
-
-def held_lead(
-    value: Array, rate: Array, acceleration: Array, response: AxisResponse, period_s: float
-) -> Array:
-    """`axes.lead` in the middle of a hold, less the second-order difference between a curved
-    command and its mean over the hold. Arguments and result have one common shape."""
-    led: Array = lead(value, rate, acceleration, response) - period_s**2 / 24.0 * acceleration
-    return led

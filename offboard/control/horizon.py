@@ -99,19 +99,6 @@ class Plan:
     cost: float
 
 
-@dataclass(frozen=True, slots=True)
-class RollOuts:
-    """The fields of `Plan` for n plans: (n, ...)."""
-
-    inputs: Array
-    states: Array
-    costs: Array
-
-    def plan(self, index: int) -> Plan:
-        """One of them."""
-        return Plan(self.inputs[index], self.states[index], float(self.costs[index]))
-
-
 class HorizonLaw(TrackingLaw):
     """Particle swarm over the knots of a plan. `previous` is the last plan and the vehicle time of
     its decision."""
@@ -185,38 +172,37 @@ class HorizonLaw(TrackingLaw):
 
     def fly(
         self, inputs: Array, states: Array | None = None, knots: Array | None = None
-    ) -> RollOuts:
+    ) -> tuple[Plan, Array]:
         """Roll out n plans: inputs (N, 3), plus the closed form's feedback towards `states`
-        (N + 1, STATE_SIZE) unless None, plus knots (n, M, 3); n is 1 without knots."""
+        (N + 1, STATE_SIZE) unless None, plus knots (n, M, 3); n is 1 without knots. Returns the
+        cheapest and the costs (n,) of all."""
         steps = self._settings.planned
         if knots is None:
             knots = np.zeros((1, *self.reach.shape))
-        flown = RollOuts(
-            np.empty((len(knots), steps, INPUTS)),
-            np.empty((len(knots), steps + 1, STATE_SIZE)),
-            np.empty(len(knots)),
-        )
+        chosen = np.empty((len(knots), steps, INPUTS))
+        flown, costs = np.empty((len(knots), steps + 1, STATE_SIZE)), np.empty(len(knots))
         feedback, towards = (0.0, self._nowhere) if states is None else (1.0, states)
         roll_out(
             self._plant, self.outlook, self._placed, self._floor_down_m, self._start,
             np.ascontiguousarray(inputs), np.ascontiguousarray(towards), feedback,
             self._weights, np.ascontiguousarray(knots),
-            flown.states, flown.inputs, flown.costs,
+            flown, chosen, costs,
         )  # fmt: skip
-        return flown
+        first = int(np.argmin(costs))
+        return Plan(chosen[first], flown[first], float(costs[first])), costs
 
     def _own_plan(self, time_s: float) -> Plan:
         """The cheaper of the plan of the closed form and what remains of the previous plan."""
         steps = self._settings.planned
         inputs, states = np.zeros((steps, INPUTS)), self._nowhere.copy()
-        plan = self.fly(inputs, states).plan(0)
+        plan, _ = self.fly(inputs, states)
         if self.previous is not None:
             decided_s, before = self.previous
             gone = round((time_s - decided_s) / self.period_s)
             if 0 <= gone < steps:
                 inputs[: steps - gone] = before.inputs[gone:]
                 states[: steps - gone + 1] = before.states[gone:]
-                plan = min(plan, self.fly(inputs, states).plan(0), key=COST)
+                plan = min(plan, self.fly(inputs, states)[0], key=COST)
         return plan
 
     def _other_plans(self, problem: TrackingProblem) -> list[Plan]:
@@ -224,9 +210,9 @@ class HorizonLaw(TrackingLaw):
         exact = self._exact.minimise(self.quadratic.over(problem, self.outlook))
         plans = []
         if np.isfinite(exact).all():
-            plans.append(self.fly(self.quadratic.plan(exact)).plan(0))
+            plans.append(self.fly(self.quadratic.plan(exact))[0])
         nothing = np.zeros((self._settings.planned, INPUTS))
-        plans.extend(self.fly(nothing, way).plan(0) for way in (*self._detours(), *self._slower()))
+        plans.extend(self.fly(nothing, way)[0] for way in (*self._detours(), *self._slower()))
         return plans
 
     def _detours(self) -> list[Array]:
@@ -276,28 +262,22 @@ class HorizonLaw(TrackingLaw):
         settings = self._settings.swarm
         share = max(1, settings.iterations // len(bases))
         each = settings.model_copy(update={"iterations": share})
-        answers = [self.search(base, each, self._rng, remaining_s) for base in bases]
+        answers = [self._search(base, each, remaining_s) for base in bases]
         return min(answers, key=lambda answer: answer[0].cost)
 
-    def search(
-        self,
-        base: Plan,
-        settings: SwarmSettings,
-        rng: np.random.Generator,
-        remaining_s: Callable[[], float] | None = None,
+    def _search(
+        self, base: Plan, settings: SwarmSettings, remaining_s: Callable[[], float] | None
     ) -> tuple[Plan, Certificate]:
         """The best plan whose knots are within +-`reach` (M, 3) about `base`. The first particle
         starts at the base, so the answer is never worse."""
         limit = self.reach.ravel()
-        swarm = Swarm(settings, -limit, limit, rng, self._starts)
+        swarm = Swarm(settings, -limit, limit, self._rng, self._starts)
         best, late = base, False
         for iteration in range(settings.iterations):
             knots = swarm.ask().reshape(-1, *self.reach.shape)
-            flown = self.fly(base.inputs, base.states, knots)
-            first = int(np.argmin(flown.costs))
-            if flown.costs[first] < best.cost:
-                best = flown.plan(first)
-            swarm.tell(flown.costs)
+            cheapest, costs = self.fly(base.inputs, base.states, knots)
+            best = min(best, cheapest, key=COST)
+            swarm.tell(costs)
             if remaining_s is not None and remaining_s() <= 0:
                 late = iteration + 1 < settings.iterations
                 break

@@ -98,19 +98,10 @@ def pack(volumes: Sequence[Volume]) -> Array:
 
 
 @kernel
-def distance(
-    volume: Any,
-    centre_north: float,
-    centre_east: float,
-    centre_down: float,
-    north: float,
-    east: float,
-    down: float,
-) -> float:
-    """Distance of a point from the surface of a packed volume with this centre, negative inside."""
-    off_n = abs(north - centre_north)
-    off_e = abs(east - centre_east)
-    off_d = abs(down - centre_down) - volume[HALF + 2]
+def distance(volume: Any, north: float, east: float, down: float) -> float:
+    """Distance of a point, given relative to the centre of a packed volume, from its surface,
+    negative inside."""
+    off_n, off_e, off_d = abs(north), abs(east), abs(down) - volume[HALF + 2]
     if volume[RADIUS] > 0.0:
         flat = math.sqrt(off_n * off_n + off_e * off_e) - volume[RADIUS]
         deepest = max(flat, off_d)
@@ -139,7 +130,8 @@ def clearances(volumes: Sequence[Volume], times_s: Array, positions_ned_m: Array
     nearest = np.full(len(times_s), np.inf)
     for i, (time_s, position) in enumerate(zip(times_s, positions_ned_m, strict=True)):
         for row in placed_at(packed, origin, float(time_s)).tolist():
-            nearest[i] = min(nearest[i], distance(row, *row[CENTRE:VELOCITY], *position))
+            away = distance(row, *(position - row[CENTRE:VELOCITY]))
+            nearest[i] = min(nearest[i], away)
     return nearest
 
 

@@ -23,18 +23,19 @@ kept, it accelerates by T (1 + b b^T/b_z^2): position and velocity enter as what
 hover, for the same answer (`Target.to_hover`). Otherwise the loop gain at 45 degrees is 2.8 times
 that of hover, and ends in a limit cycle.
 
-    J(u) = x'Qx + u'Ru + x(k+1)'P x(k+1) = 1/2 u'Hu + f'u + c,  lower <= u <= upper
+    J(u) = x'Qx + u'Ru + x(k+1)'P x(k+1) = 1/2 (u - u*)'H(u - u*) + x'P x,  lower <= u <= upper
 
-H is diagonal, so that u = clip(-f / H) is its exact minimum. `lqr` computes just that; `pso` lets
-the swarm search, which needs neither a diagonal nor a quadratic; `mpc` and `horizon` minimise the
-sum over N decisions; `pid` replaces K by the gains of two cascades. Knows no autopilot, no clock.
+with u* = u_ff - K x. H is diagonal, so that u = clip(u*) is its exact minimum. `lqr` computes just
+that; `pso` lets the swarm search, which needs neither a diagonal nor a quadratic; `mpc` and
+`horizon` minimise the sum over N decisions; `pid` replaces K by the gains of two cascades. Knows no
+autopilot, no clock.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,21 +50,15 @@ from offboard.control.base import (
     DecisionError,
     Situation,
 )
-from offboard.control.gains import (
-    held_lead,
-    lateral_gain,
-    thrust_ripple,
-    tilt_ripple,
-    vertical_gain,
-)
-from offboard.control.quadratic import BoxQuadratic, ExactMinimum, at_bound, closed_form
+from offboard.control.gains import hold_ripple, lateral_gain, vertical_gain
+from offboard.control.quadratic import BoxQuadratic, ExactMinimum, at_bound
 from offboard.control.swarm import SwarmSettings, certify, minimise
-from offboard.model.axes import lead
+from offboard.model.axes import lateral_model, lead, vertical_model
 from offboard.model.command import Command, PredictedState, PredictedVertical
 from offboard.model.frames import wrap_pi
 from offboard.model.vehicle import DelayUncertainty, Vehicle
 from offboard.reference.base import Reference
-from offboard.reference.flatness import flat_state
+from offboard.reference.flatness import FlatState, flat_state
 
 Array = NDArray[np.float64]
 
@@ -153,8 +148,8 @@ class TrackingLaw:
     def set_vehicle(self, vehicle: Vehicle, uncertainty: DelayUncertainty | None = None) -> None:
         """See `base.Adaptive`; without an uncertainty the bandwidth is the configured one."""
         self.vehicle = vehicle
-        self._tilt_ripple = tilt_ripple(vehicle, self.period_s)
-        self._thrust_ripple = thrust_ripple(vehicle, self.period_s)
+        self._tilt_ripple = hold_ripple(lateral_model(vehicle), self.period_s)
+        (self._thrust_ripple,) = hold_ripple(vertical_model(vehicle), self.period_s)
         delays = vehicle.tilt, vehicle.thrust_delay_s, vehicle.thrust_lag_s, uncertainty
         limits = (
             *delays, vehicle.angular_acceleration_limit_radps2, vehicle.angular_rate_limit_radps,
@@ -197,8 +192,7 @@ class TrackingLaw:
     def target(self, reference: Reference, time_s: float, state: PredictedState) -> Target:
         """The target of a decision at `time_s`, for the state predicted to the time when its tilt
         begins to act. The estimated disturbance is compensated in it."""
-        vehicle, period_s = self.vehicle, self.period_s
-        half_s = 0.5 * period_s
+        vehicle, half_s = self.vehicle, 0.5 * self.period_s
         vertical_s = vertical_of(state).time_s
         heading_s = time_s + vehicle.yaw.delay_s + half_s
         times = [state.time_s, state.time_s + half_s, vertical_s, vertical_s + half_s, heading_s]
@@ -223,10 +217,6 @@ class TrackingLaw:
             sample.velocity_ned_mps[at, 2],
             thrust[at] * b[at, 2] + self._thrust_ripple * thrust_slope,
         )
-        at = TILT_HELD
-        led_tilt = held_lead(b[at], b1[at], b2[at], vehicle.tilt, period_s)
-        # T lags, b_z does not
-        led_thrust = thrust[THRUST_HELD] + vehicle.thrust_lag_s * thrust_rate[THRUST_HELD]
         heading_rad = lead(
             sample.heading_rad[HEADING_HELD],
             sample.heading_rate_radps[HEADING_HELD],
@@ -236,15 +226,28 @@ class TrackingLaw:
         return Target(
             lateral=lateral[:, :2],
             vertical=np.array(vertical),
-            feedforward=np.array((led_tilt[0], led_tilt[1], led_thrust * b[THRUST_HELD, 2])),
+            feedforward=self.feedforward(flat, TILT_HELD, THRUST_HELD),
             heading_rad=float(heading_rad),
             to_hover=to_hover(b[TILT_BEGINS], thrust[TILT_BEGINS], state, vehicle),
         )
 
+    def feedforward(self, flat: FlatState, tilt: Any, thrust: Any) -> Array:
+        """b_c north, b_c east and T b_z (..., 3) that follow a reference: of the samples `tilt` and
+        `thrust` of `flat`, in the middle of a hold, led through the responses of the vehicle, less
+        the second-order difference between a curved command and its mean over the hold."""
+        b, rate = flat.thrust_direction_ned[tilt, :2], flat.thrust_direction_rate_ned_ps[tilt, :2]
+        bend = flat.thrust_direction_acceleration_ned_ps2[tilt, :2]
+        led_tilt = lead(b, rate, bend, self.vehicle.tilt) - self.period_s**2 / 24.0 * bend
+        # T lags, b_z does not
+        led_thrust = flat.thrust_mps2 + self.vehicle.thrust_lag_s * flat.thrust_rate_mps3
+        down = (led_thrust * flat.thrust_direction_ned[:, 2])[thrust]
+        return np.concatenate((led_tilt, down[..., np.newaxis]), axis=-1)
+
     def _problem_of(
         self, target: Target, lateral: Array, vertical: Array, b_z: float
     ) -> TrackingProblem:
-        """The problem of these deviations: J, and the bounds of u to which the law clips."""
+        """The problem of these deviations: J, which is least at u_ff - K x, where x'P x are left to
+        pay, and the bounds of u to which the law clips."""
         vehicle = self.vehicle
         curvature = np.array(
             [
@@ -254,17 +257,14 @@ class TrackingLaw:
                 HEADING_CURVATURE,
             ]
         )
-        slope = np.zeros(4)  # of J at the feed-forward
-        slope[0] = b_z * (self.vertical.coupling @ vertical)
         at_hover = np.vstack((lateral[:2] @ target.to_hover, lateral[2:]))
-        slope[1:3] = self.lateral.coupling @ at_hover
-        rest = vertical @ self.vertical.state_cost @ vertical
-        rest += np.sum(at_hover * (self.lateral.state_cost @ at_hover))
-        thrust = target.feedforward[2] / b_z
-        nominal = np.array([thrust, *target.feedforward[:2], target.heading_rad])
-        gradient = slope - curvature * nominal
-        constant = 0.5 * rest + nominal @ (0.5 * curvature * nominal - slope)
-        low, high = self.tilt_bounds(nominal[1:3])
+        feedback = np.append(self.lateral.gain @ at_hover, self.vertical.gain @ vertical)
+        north, east, down_mps2 = target.feedforward - feedback
+        least = np.array([down_mps2 / b_z, north, east, target.heading_rad])
+        rest = vertical @ self.vertical.terminal @ vertical
+        rest += np.sum(at_hover * (self.lateral.terminal @ at_hover))
+        gradient, constant = -curvature * least, rest + 0.5 * (curvature * least) @ least
+        low, high = self.tilt_bounds(target.feedforward[:2])
         heading = target.heading_rad
         lower = np.array([vehicle.thrust_min_mps2, *low, heading - HEADING_BOX_RAD])
         upper = np.array([vehicle.thrust_max_mps2, *high, heading + HEADING_BOX_RAD])
@@ -321,11 +321,11 @@ class LqrSettings(TrackingSettings):
 
 
 class LqrLaw(TrackingLaw):
-    """The exact minimum, clip(-f / H)."""
+    """The exact minimum of a cost whose H is diagonal, clip(-f / H)."""
 
     def decide(self, situation: Situation) -> Decision:
         problem = self.problem(situation).quadratic
-        inputs = closed_form(problem)
+        inputs = problem.clip(-problem.gradient / np.diag(problem.hessian))
         cost = float(problem(inputs))
         on_bound = at_bound(problem, inputs)
         return decision(inputs, Certificate(cost, optimal_cost=cost, gap=0.0, at_bound=on_bound))

@@ -15,7 +15,7 @@ from pydantic import Field
 from scipy.linalg import block_diag
 
 from offboard.control.base import Certificate, Decision, DecisionError, Situation
-from offboard.control.gains import CostToGo, held_lead
+from offboard.control.gains import CostToGo
 from offboard.control.law import (
     TrackingLaw,
     TrackingProblem,
@@ -74,7 +74,6 @@ def look_ahead(
     )
     tilt, vertical = np.split(np.arange(len(times)), 2)
     b, down = flat.thrust_direction_ned, flat.thrust_direction_ned[vertical, 2]
-    middles = tilt[1::2]
     outlook = np.zeros(1, OUTLOOK)
     one = outlook[0]
     for name, values in (
@@ -88,17 +87,9 @@ def look_ahead(
     one["b_z"][: len(tilt)] = down
     starts = tilt[:-1:2]
     one["to_hover"][:steps] = to_hover(b[starts], flat.thrust_mps2[starts], state, vehicle)
-    led_tilt = held_lead(
-        b[middles, :2],
-        flat.thrust_direction_rate_ned_ps[middles, :2],
-        flat.thrust_direction_acceleration_ned_ps2[middles, :2],
-        vehicle.tilt,
-        period_s,
-    )
-    led_thrust = flat.thrust_mps2 + vehicle.thrust_lag_s * flat.thrust_rate_mps3
-    nominal = np.column_stack((led_tilt, (led_thrust * b[:, 2])[vertical][1::2]))
+    nominal = law.feedforward(flat, tilt[1::2], vertical[1::2])
     one["feedforward"][:steps] = nominal
-    low, high = law.tilt_bounds(led_tilt)
+    low, high = law.tilt_bounds(nominal[:, :2])
     down = down[:-1:2].copy()
     down[0] = problem.b_z
     thrusts = problem.quadratic.lower[0] * down, problem.quadratic.upper[0] * down

@@ -1,7 +1,7 @@
 """A quadratic cost within bounds, which the laws minimise, and its exact minimum.
 
-Without coupling the minimum has a closed form; otherwise daqp finds it, a dual active-set method
-that shares no code with the swarm. Knows not what the inputs mean.
+daqp finds the minimum, a dual active-set method that shares no code with the swarm. Knows not what
+the inputs mean.
 """
 
 from __future__ import annotations
@@ -40,11 +40,6 @@ class BoxQuadratic:
         """The nearest inputs (..., n) within the bounds."""
         clipped: Array = np.clip(inputs, self.lower, self.upper)
         return clipped
-
-
-def closed_form(problem: BoxQuadratic) -> Array:
-    """The exact minimiser (n,) of a quadratic whose Hessian is diagonal."""
-    return problem.clip(-problem.gradient / np.diag(problem.hessian))
 
 
 def at_bound(problem: BoxQuadratic, inputs: Array) -> bool:

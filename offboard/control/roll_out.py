@@ -268,12 +268,9 @@ def _penalties(
             at, since_s = ahead.positions[node], 0.5 * hold * node
             away = distance(
                 volume,
-                volume[CENTRE] + since_s * volume[VELOCITY],
-                volume[CENTRE + 1] + since_s * volume[VELOCITY + 1],
-                volume[CENTRE + 2] + since_s * volume[VELOCITY + 2],
-                at[0] + n,
-                at[1] + e,
-                at[2] + d,
+                at[0] + n - (volume[CENTRE] + since_s * volume[VELOCITY]),
+                at[1] + e - (volume[CENTRE + 1] + since_s * volume[VELOCITY + 1]),
+                at[2] + d - (volume[CENTRE + 2] + since_s * volume[VELOCITY + 2]),
             )
             paid += 0.5 * hold * _penalty(plant.clearance_m - away)
     return float(paid)

@@ -112,7 +112,7 @@ def identified(flight: FlightState) -> bool:
     if identification is None or not identification.finished(flight.time_s):
         return False
     near = flight.position_error_m < NEAR_M
-    return (near and identification.delay is not None) or at_start(flight)
+    return (near and identification.delay.known) or at_start(flight)
 
 
 def not_identified(flight: FlightState) -> str:

@@ -182,9 +182,10 @@ def _send_attitude(
     model = flight.model
     set_command(flight, time_s, command)
     flight.commands.append(command)
-    flight.thrusts.append(min(command.thrust_mps2 / model.thrust_max_mps2, 1.0))
+    thrust = command.thrust_mps2 / model.thrust_max_mps2
+    flight.thrusts.append(min(thrust, 1.0))
     if flight.identification:
-        flight.identification.on_command(flight.delays_begin_s(time_s), command)
+        flight.identification.on_command(flight.delays_begin_s(time_s), command, thrust)
     flight.newest_setpoint = AttitudeTarget(
         time_s, command, model.hover_thrust, model.gravity_mps2, body_z_down
     )

@@ -78,9 +78,7 @@ def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: flo
         case Heartbeat(mode) | ModeReport(mode):
             _on_mode(flight, event, mode, arrived_s)
         case Parameter() if flight.identification and flight.phase in FLYING:
-            flight.identification.on_changed(
-                transitions.shown_limits(flight, flight.identification)
-            )
+            flight.identification.on_shown(transitions.shown_limits(flight, flight.identification))
         case TimesyncReply():
             flight.clock.on_reply(event)
         case CommandRequest():

@@ -77,43 +77,9 @@ EXPLAINED = 0.6  # least share of the commanded motion that the fitted response 
 
 
 @dataclass(frozen=True, slots=True)
-class ResponseFit:
-    """An identified axis. `residual_rms`: of the residuals without outliers; `commanded_rms`: of
-    the command about its mean; both in the unit of the signal. `lag_sd_s`: sd of the lag
-    2 z / wn."""
-
-    delay_s: Estimate
-    natural_frequency_radps: Estimate
-    damping: Estimate
-    residual_rms: float
-    commanded_rms: float
-    lag_sd_s: float
-
-    @property
-    def overdamped(self) -> bool:
-        """Whether it is two lags, of 2 z / wn and of about 1 / (2 z wn)."""
-        return self.damping.value > OVERDAMPED
-
-    @property
-    def lag_s(self) -> Estimate:
-        """2 z / wn."""
-        return Estimate(
-            2.0 * self.damping.value / self.natural_frequency_radps.value, self.lag_sd_s
-        )
-
-    @property
-    def response(self) -> AxisResponse:
-        return AxisResponse(
-            delay_s=self.delay_s.value,
-            natural_frequency_radps=self.natural_frequency_radps.value,
-            damping=self.damping.value,
-        )
-
-
-@dataclass(frozen=True, slots=True)
 class Unexplained:
-    """Tilt that a response leaves unexplained: rms without outliers, and rms of the command; parts
-    of a unit vector."""
+    """What a response leaves unexplained: rms without outliers, and rms of the command about its
+    mean; both in the unit of the signal."""
 
     rms: float
     commanded_rms: float
@@ -124,8 +90,44 @@ class Unexplained:
 
     @property
     def contradicts(self) -> bool:
-        """Whether telemetry contradicts the response."""
+        """Whether telemetry contradicts the response, of the tilt."""
         return self.rms > self.limit
+
+
+@dataclass(frozen=True, slots=True)
+class ResponseFit:
+    """An identified axis, its lag 2 z / wn, and what it leaves unexplained."""
+
+    delay_s: Estimate
+    natural_frequency_radps: Estimate
+    damping: Estimate
+    lag_s: Estimate
+    left: Unexplained
+
+    @property
+    def overdamped(self) -> bool:
+        """Whether it is two lags, of 2 z / wn and of about 1 / (2 z wn)."""
+        return self.damping.value > OVERDAMPED
+
+    @property
+    def shown(self) -> dict[str, Estimate]:
+        """The constants that the flight shows, by name. Of an overdamped response natural frequency
+        and damping may be at the limits of the search, as little but their ratio shows."""
+        if self.overdamped:
+            return {"delay_s": self.delay_s, "lag_s": self.lag_s}
+        return {
+            "delay_s": self.delay_s,
+            "natural_frequency_radps": self.natural_frequency_radps,
+            "damping": self.damping,
+        }
+
+    @property
+    def response(self) -> AxisResponse:
+        return AxisResponse(
+            delay_s=self.delay_s.value,
+            natural_frequency_radps=self.natural_frequency_radps.value,
+            damping=self.damping.value,
+        )
 
 
 def tilt_signals(trace: Trace) -> tuple[Array, Array, Array, Array]:
@@ -166,18 +168,18 @@ def fit_axis(
     """The response of TILT (both components of the thrust direction) or YAW, in pieces of some
     milliseconds. Returns None, and the reason in `refusals` under the axis's name, if `trace` does
     not determine it. `delay` is what is known of the delay beforehand."""
-    measured = times, _, sent_at, commands = axis.signals(trace)
-    if len(times) < 50 or len(sent_at) < 3:
-        refusals[axis.name] = f"{len(times)} attitudes and {len(sent_at)} commands are too few"
+    attitudes, commands = len(trace.attitude), len(trace.commands)
+    if attitudes < 50 or commands < 3:
+        refusals[axis.name] = f"{attitudes} attitudes and {commands} commands are too few"
         return None
-    moved = commanded_rms(times, sent_at, commands)
-    if moved < axis.least_command_rad:
+    problem = ResponseProblem(*axis.signals(trace), wanders=axis.wanders)
+    if problem.commanded_rms < axis.least_command_rad:
         refusals[axis.name] = (
-            f"its command moved by {1e3 * moved:.1f} mrad rms, "
+            f"its command moved by {1e3 * problem.commanded_rms:.1f} mrad rms, "
             f"{1e3 * axis.least_command_rad:.0f} mrad are needed: fly steps"
         )
         return None
-    fit = yield from fit_response(*measured, delay, wanders=axis.wanders)
+    fit = yield from fit_response(problem, delay)
     refusal = _refusal(fit, axis.sd_limits)
     if refusal:
         refusals[axis.name] = refusal
@@ -187,31 +189,30 @@ def fit_axis(
 
 def _refusal(fit: ResponseFit, sd_limits: tuple[float, float, float]) -> str:
     """Why a fit is rejected, or empty."""
-    if fit.residual_rms > (1.0 - EXPLAINED) * fit.commanded_rms:
+    left = fit.left
+    if left.rms > (1.0 - EXPLAINED) * left.commanded_rms:
         return (
-            f"it does not follow its command: {1e3 * fit.residual_rms:.1f} mrad rms of "
-            f"{1e3 * fit.commanded_rms:.1f} commanded are unexplained"
+            f"it does not follow its command: {1e3 * left.rms:.1f} mrad rms of "
+            f"{1e3 * left.commanded_rms:.1f} commanded are unexplained"
         )
     delay_sd_s, frequency_sd, damping_sd = sd_limits
-    margins = 1e-3 * (UPPER - LOWER)
-    ends = list(zip((LOWER + margins).tolist(), (UPPER - margins).tolist(), strict=True))
-    ends[DELAY] = (-math.inf, ends[DELAY][1])
-    frequency, lag_s = fit.natural_frequency_radps, fit.lag_s
-    checks = [
-        ("delay (s)", fit.delay_s, delay_sd_s, ends[DELAY]),
-        ("natural frequency (rad/s)", frequency, frequency_sd * frequency.value, ends[FREQUENCY]),
-        ("damping", fit.damping, damping_sd, ends[DAMPING]),
-    ]
-    if fit.overdamped:
-        # wn and z may be at the limits of the search, as little but their ratio shows; the delay is
-        # hardly told from the lag of 1 / (2 z wn)
+    if fit.overdamped:  # the delay is hardly told from the lag of 1 / (2 z wn)
         delay_sd_s = min(delay_sd_s * fit.damping.value, DELAY_SD_MOST_S)
-        checks = [
-            ("delay (s)", fit.delay_s, delay_sd_s, ends[DELAY]),
-            ("lag (s)", lag_s, frequency_sd * lag_s.value, (0.0, math.inf)),
-        ]
-    for name, estimate, limit, (least, most) in checks:
-        if not least <= estimate.value <= most:
+    margins = 1e-3 * (UPPER - LOWER)
+    least, most = (LOWER + margins).tolist(), (UPPER - margins).tolist()
+    # name, limit of the sd, least and greatest value
+    checks = {
+        "delay_s": ("delay (s)", delay_sd_s, -math.inf, most[DELAY]),
+        "natural_frequency_radps": (
+            "natural frequency (rad/s)", frequency_sd * fit.natural_frequency_radps.value,
+            least[FREQUENCY], most[FREQUENCY],
+        ),
+        "damping": ("damping", damping_sd, least[DAMPING], most[DAMPING]),
+        "lag_s": ("lag (s)", frequency_sd * fit.lag_s.value, 0.0, math.inf),
+    }  # fmt: skip
+    for key, estimate in fit.shown.items():
+        name, limit, lowest, highest = checks[key]
+        if not lowest <= estimate.value <= highest:
             return f"its {name} is at the limit of the search, {estimate.value:.3g}"
         if not estimate.sd <= limit:
             return f"its {name} is uncertain: sd {estimate.sd:.2g}, limit {limit:.2g}{FLY_STEPS}"
@@ -220,36 +221,17 @@ def _refusal(fit: ResponseFit, sd_limits: tuple[float, float, float]) -> str:
 
 def unexplained(trace: Trace, response: AxisResponse) -> Unexplained:
     """Tilt in `trace` that `response` does not explain."""
-    times, signals, sent_at, commands = tilt_signals(trace)
-    if len(times) < 20 or len(sent_at) < 3:
+    if len(trace.attitude) < 20 or len(trace.commands) < 3:
         return Unexplained(0.0, 0.0)
     parameters = (response.delay_s, response.natural_frequency_radps, response.damping)
-    problem = ResponseProblem(times, signals, sent_at, commands)
-    left = problem.residual(np.array(parameters), problem.even_weights)
-    return Unexplained(scale_of(left), commanded_rms(times, sent_at, commands))
-
-
-def commanded_rms(times: Array, sent_at: Array, commands: Array) -> float:
-    """Rms about their mean of the commands that acted within `times`."""
-    within = (sent_at >= times[0] - UPPER[DELAY]) & (sent_at <= times[-1])
-    if not within.any():
-        return 0.0
-    return float(np.sqrt(np.mean((commands[within] - commands[within].mean(axis=0)) ** 2)))
+    return ResponseProblem(*tilt_signals(trace)).unexplained(np.array(parameters))
 
 
 def fit_response(
-    times: Array,
-    signals: Array,
-    sent_at: Array,
-    commands: Array,
-    delay: Estimate | None = None,
-    *,
-    wanders: bool = False,
+    problem: ResponseProblem, delay: Estimate | None = None
 ) -> Generator[None, None, ResponseFit]:
-    """The response that explains `signals` (N, axes) at `times` (N,) under `commands` (M, axes)
-    sent at `sent_at` (M,), in two pieces; at least 50 samples and 3 commands. `delay` is what is
-    known of the delay beforehand; `wanders`: see `ResponseProblem`."""
-    problem = ResponseProblem(times, signals, sent_at, commands, wanders=wanders)
+    """The response that explains the signals, at least 50, in two pieces. `delay` is what is known
+    of the delay beforehand."""
     start = problem.search()
     yield
     best, weights, scale = problem.refine(start)
@@ -264,16 +246,20 @@ def fit_response(
     lag_sd_s = math.sqrt(max(lag_slope @ covariance @ lag_slope, 0.0))
     found = (Estimate(float(value), float(sd)) for value, sd in zip(best, sds, strict=True))
     delay_s, frequency, damping = found
-    moved = commanded_rms(times, sent_at, commands)
-    left = problem.unexplained(best) if wanders else scale
-    return ResponseFit(delay_s, frequency, damping, left, moved, lag_sd_s)
+    lag_s = Estimate(2.0 * damping.value / frequency.value, lag_sd_s)
+    left = (
+        problem.unexplained(best) if problem.wanders else Unexplained(scale, problem.commanded_rms)
+    )
+    return ResponseFit(delay_s, frequency, damping, lag_s, left)
 
 
 # ---------------------------------------------------------------------- least squares
 
 
 class ResponseProblem:
-    """Least-squares problem of the measured `signals` (N, axes) under `commands` (M, axes).
+    """Least-squares problem of the measured `signals` (N, axes) at `times` (N,) under `commands`
+    (M, axes) sent at `sent_at` (M,). `commanded_rms`: of the commands that acted within these
+    times, about their mean.
 
     With `wanders` the errors of the measurement are a random walk, as those of an estimated heading
     are: their steps are independent, and take the place of the residuals.
@@ -291,24 +277,28 @@ class ResponseProblem:
         kept = thinned(times, SPACING_S)
         self._times, self._signals = times[kept], signals[kept]
         self._sent_at, self._commands = sent_at, commands
-        self._wanders = wanders
+        self.wanders = wanders
         steps_s = np.diff(self._times)
         self._root_steps = np.sqrt(steps_s / steps_s.mean())[:, None]
         self.even_weights = np.ones(len(kept) - wanders)
+        acted = commands[(sent_at >= times[0] - UPPER[DELAY]) & (sent_at <= times[-1])]
+        away = acted - acted.mean(axis=0) if len(acted) else np.zeros(1)
+        self.commanded_rms = float(np.sqrt(np.mean(away**2)))
 
     def residual(self, parameters: Array, weights: Array) -> Array:
         """Signals less response (N, axes), with free motion and a constant offset projected out
         under `weights` (N,); or their N - 1 steps."""
         left, basis = self._left_and_basis(parameters)
-        if self._wanders:
+        if self.wanders:
             left = np.diff(left, axis=0) / self._root_steps
             basis = np.diff(basis[:, :2], axis=0) / self._root_steps
         return _projected(left, basis, weights)
 
-    def unexplained(self, parameters: Array) -> float:
-        """Sd without outliers of what the response leaves of the signals."""
+    def unexplained(self, parameters: Array) -> Unexplained:
+        """What the response leaves of the signals."""
         left, basis = self._left_and_basis(parameters)
-        return scale_of(_projected(left, basis, np.ones(len(left))))
+        rms = scale_of(_projected(left, basis, np.ones(len(left))))
+        return Unexplained(rms, self.commanded_rms)
 
     def _left_and_basis(self, parameters: Array) -> tuple[Array, Array]:
         """Signals less response (N, axes); free motion and a constant (N, 3)."""
@@ -358,7 +348,7 @@ class ResponseProblem:
         slopes = approx_fprime(
             best, lambda tried: self.residual(tried, weights).ravel(), 1e-3 * STEP_SCALES
         )
-        if self._wanders:
+        if self.wanders:
             variance = np.sum(left**2) / (left.size - FITTED * axes)
             least_squares_covariance: Array = variance * np.linalg.pinv(slopes.T @ slopes)
             return least_squares_covariance

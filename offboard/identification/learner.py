@@ -19,7 +19,6 @@ from collections import deque
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum, auto
-from typing import Any
 
 import numpy as np
 from pydantic import Field
@@ -80,9 +79,9 @@ HOVER_RELATED_S = 2.0  # time over which its errors are autocorrelated
 WELL_KNOWN_S, TILT_EVERY_S, TILT_OVER_S = 0.004, 2.0, 12.0
 # Thrust: first fit after the reference begins, interval; over TILT_OVER_S of flight
 THRUST_FIRST_S, THRUST_EVERY_S = 6.0, 2.0
-# Prediction: how often and over how much flight it is compared with the tilt, and after how many
+# Prediction: how often and over how much flight it is compared with the tilt. After two
 # contradictions in a row the vehicle is in doubt
-COMPARE_EVERY_S, COMPARE_OVER_S, COMPARE_TIMES = 0.5, 2.0, 2
+COMPARE_EVERY_S, COMPARE_OVER_S = 0.5, 2.0
 
 Work = Generator[None, None, None]
 
@@ -142,12 +141,12 @@ class Learner(VehicleEstimate):
             delay_error_s=UNKNOWN_DELAY_S if settings.online else FILE_DELAY_S,
             known=known,
         )
-        self.identified = known is not None
+        self.identified = self.delay.known
         self._settings = settings
         # What to fly with as was told last, and whether that was in the turn before
         self._told = VehicleUpdate(self.vehicle, self.uncertainty)
         self._has_told = False
-        if known is None:
+        if not self.identified:
             self.cause = "the vehicle's delay is not identified yet"
         if not settings.online:
             self.cause = (
@@ -163,7 +162,6 @@ class Learner(VehicleEstimate):
         self._left_box = self._gave_up = False
         self._work: Work | None = None
         self._due_s: dict[str, float] = {}  # when each piece of work is due again
-        self._in_a_row = 0  # contradictions of the comparison
         self._doubted_from_s = -math.inf
         self._hover: deque[tuple[float, float]] = deque()
 
@@ -185,21 +183,10 @@ class Learner(VehicleEstimate):
         if time_s >= self._climb_s:
             self._positions.add(time_s, *position_ned_m, *velocity_ned_mps)
 
-    def on_command(self, time_s: float, command: Command) -> None:
-        """A command sent; its thrust was scaled with the newest vehicle that was told."""
+    def on_command(self, time_s: float, command: Command, thrust: float) -> None:
+        """A command sent, and its thrust as a fraction of full throttle."""
         north, east, _ = command.thrust_direction_ned
-        share = command.thrust_mps2 / self._told.vehicle.thrust_max_mps2
-        self._commands.add(time_s, north, east, share, command.heading_rad)
-
-    def on_shown(self, constants: Mapping[str, Any]) -> None:
-        """Use constants that the vehicle reported before the take-over."""
-        super().on_shown(constants)
-        flown = self._told.vehicle.model_copy(update=constants)
-        self._told = replace(self._told, vehicle=flown)
-
-    def on_changed(self, constants: Mapping[str, Any]) -> None:
-        """Fly with constants that the vehicle reports in flight, from the next tick on."""
-        super().on_shown(constants)
+        self._commands.add(time_s, north, east, thrust, command.heading_rad)
 
     def on_stage(self, stage: Stage, time_s: float) -> None:
         """The flight has entered `stage`."""
@@ -217,11 +204,6 @@ class Learner(VehicleEstimate):
     def wants_excitation(self) -> bool:
         """Whether the flight should go through the steps."""
         return self._settings.online and self._settings.excite and not self.identified
-
-    @property
-    def result(self) -> IdentifiedVehicle | None:
-        """What the next flight of this vehicle may begin with; None if nothing is known."""
-        return super().result if self.identified else None
 
     def excited(self, command: Command, time_s: float, error_m: float) -> Command:
         """In the steps: `command` with its step, until the vehicle leaves the box."""
@@ -273,7 +255,7 @@ class Learner(VehicleEstimate):
             return self._identify_all() if flown else None
         if self._stage is not Stage.MOTION:
             return None
-        certain = self.delay is not None and self.delay.sd <= WELL_KNOWN_S
+        certain = self.delay.sd <= WELL_KNOWN_S
         if not self.in_doubt and self._is_due("compare", COMPARE_EVERY_S):
             self._compare_with_prediction()
             return None
@@ -320,7 +302,7 @@ class Learner(VehicleEstimate):
         self.identified = True
         self.adopt(found, self._time_s)
         self.explain(refusal or "it is out of bounds")
-        if self.delay is None:
+        if not self.delay.known:
             self.sentences.append(self.cause)
             self.cause = ""
 
@@ -330,7 +312,7 @@ class Learner(VehicleEstimate):
 
     def _identify_thrust(self) -> None:
         trace = self._flown_since(max(self.motion_s, self._time_s - TILT_OVER_S))
-        found = identify_thrust(trace, self.vehicle, self.added, self.file)
+        found = identify_thrust(trace, self.vehicle, self.delay, self.file)
         self.review_thrust(found, self._time_s)
 
     def _identify_tilt(self) -> Work:
@@ -347,10 +329,8 @@ class Learner(VehicleEstimate):
         begin_s = self._time_s - COMPARE_OVER_S
         trace = self._flown_since(begin_s)
         now = unexplained(trace, self.vehicle.tilt)
-        contradicts = now.contradicts and not self.link_changed
-        self._in_a_row = self._in_a_row + 1 if contradicts else 0
-        if self._in_a_row >= COMPARE_TIMES:
-            self._in_a_row, self._doubted_from_s = 0, begin_s
+        if self._again("tilt", now.contradicts and not self.link_changed):
+            self._doubted_from_s = begin_s
             self.on_contradiction(now, unexplained(trace, self.previous.tilt), self._time_s)
 
     def _review_hover(self) -> None:

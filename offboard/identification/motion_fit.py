@@ -10,7 +10,6 @@ is not the derivative of the reported position. SI, NED.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +36,8 @@ from offboard.identification.uncertainty import (
 
 Array = NDArray[np.float64]
 
-DRAG_SPACING_S = 0.036  # in place of SPACING_S where only the drag is sought
+LEAST_NOISE_M = 0.001
+COARSE_SPACING_S = 0.036  # in place of SPACING_S in flight
 SPEED_OVER_S = 0.5  # time over which a speed is measured
 RELATED_S = 2.0  # time over which innovations of a wandering estimator are autocorrelated
 # Time constant of the rate at which the estimated position wanders: estimators smooth it. Taken for
@@ -93,9 +93,11 @@ class Motion:
         ]
         return float(np.sqrt(np.mean(np.sum(np.square(moved), axis=0)))) / SPEED_OVER_S
 
-    def noise(self, axes: slice) -> float:
-        """Sd of the white noise of positions, m, by third differences, in which motion cancels."""
-        return scale_of(np.diff(self.positions[axes], n=3)) / math.sqrt(20.0)
+    def noise_m(self, axes: slice) -> float:
+        """Sd of the white noise of positions, by third differences, in which motion cancels; at
+        least LEAST_NOISE_M."""
+        third = np.diff(self.positions[axes], n=3)
+        return max(scale_of(third) / math.sqrt(20.0), LEAST_NOISE_M)
 
     @property
     def sufficient(self) -> bool:
@@ -110,24 +112,12 @@ class Motion:
 # ---------------------------------------------------------------------- Kalman filter
 
 
-@dataclass(frozen=True, slots=True)
-class Noise:
-    """What the filter allows for along an axis. Per root second: wander of the position over times
-    longer than WANDER_S (m), acceleration that is not modelled (m/s) and drift of the disturbance
-    (m/s^2; PX4: tilt error times g, 0.1). Noise of positions (m), and sd of velocity (m/s) and
-    disturbance (m/s^2) at the start."""
-
-    position: float
-    velocity: float
-    disturbance: float
-    measured: float
-    start_velocity: float
-    start_disturbance: float
-
-
-LATERAL = Noise(0.12, 0.1, 0.08, 0.001, 3.0, 0.5)
-# The vertical disturbance is a part of the hover thrust that is sought.
-VERTICAL = Noise(0.12, 0.1, 0.03, 0.001, 3.0, 0.001)
+# What the filter allows for: wander of the position over times longer than WANDER_S (m) and
+# acceleration that is not modelled (m/s), per root second; sd of the velocity at the start (m/s)
+WANDER_M, ACCELERATION_MPS, START_VELOCITY_MPS = 0.12, 0.1, 3.0
+# Disturbance: drift per root second (m/s^2; PX4: tilt error times g, 0.1), and sd at the start
+# (m/s^2). The vertical one is a part of the hover thrust that is sought.
+LATERAL, VERTICAL = (0.08, 0.5), (0.03, 0.001)
 
 
 class PositionFilter:
@@ -136,18 +126,18 @@ class PositionFilter:
 
     Its gains are those for `drag_ps`, where a search begins; they hardly depend on it. With fixed
     gains the variance of the innovations is fixed too, so their sum of squares is a likelihood.
+    `noise_m`: sd of the white noise of positions; `disturbance`: LATERAL or VERTICAL.
     """
 
-    def __init__(self, times: Array, drag_ps: float, noise: Noise) -> None:
+    def __init__(
+        self, times: Array, drag_ps: float, noise_m: float, disturbance: tuple[float, float]
+    ) -> None:
         self._steps_s = np.diff(times)
-        wander = noise.position / WANDER_S
-        densities = np.array((0.0, noise.velocity, noise.disturbance, wander))
-        growth = np.diag(densities**2)
-        variance = noise.measured**2
+        wander, (drift, start_disturbance) = WANDER_M / WANDER_S, disturbance
+        growth = np.diag(np.square((0.0, ACCELERATION_MPS, drift, wander)))
+        variance = noise_m**2
         start_wander = wander**2 * WANDER_S / 2.0  # as it is in the long run
-        covariance = np.diag(
-            (variance, noise.start_velocity**2, noise.start_disturbance**2, start_wander)
-        )
+        covariance = np.diag((variance, START_VELOCITY_MPS**2, start_disturbance**2, start_wander))
         self._gains = np.empty((len(self._steps_s), 4))
         self._sds = np.empty(len(self._steps_s))
         steps = zip(self._steps_s, motion_transitions(self._steps_s, drag_ps), strict=True)
@@ -193,17 +183,12 @@ def motion_transitions(steps_s: Array, drag_ps: float) -> Array:
 # ---------------------------------------------------------------------- fits
 
 
-def _with_noise(noise: Noise, motion: Motion, axes: slice) -> Noise:
-    """`noise` with that of the positions, where it is greater."""
-    return replace(noise, measured=max(noise.measured, motion.noise(axes)))
-
-
 def fit_drag(motion: Motion, thrust_mps2: Array, start_ps: float) -> Estimate:
     """Lateral drag per unit of mass, 1/s, searched from `start_ps`; `thrust_mps2` (N,) at the
     motion's times."""
     start_ps = min(max(start_ps, STARTED_FROM[3]), 0.9 * DRAG_UPPER_PS)
     accelerations = -thrust_mps2 * motion.direction_ne
-    lateral = PositionFilter(motion.times, start_ps, _with_noise(LATERAL, motion, slice(2)))
+    lateral = PositionFilter(motion.times, start_ps, motion.noise_m(slice(2)), LATERAL)
     found = least_squares(
         lambda drag: lateral.innovations(motion.positions[:2], accelerations, drag[0]).ravel(),
         [start_ps],
@@ -231,15 +216,15 @@ def fit_vertical(
     lag_s: Estimate,
     drag_ps: Estimate,
 ) -> dict[str, Estimate]:
-    """Hover thrust, delay and lag of the thrust, and vertical drag, given where the search for the
-    hover thrust begins and what is known of the others beforehand. By name; `thrust_effect_s`, the
-    sum of delay and lag, is better known than its parts."""
+    """Hover thrust, and delay and lag of the thrust, given where the search for the hover thrust
+    begins and what is known of the others and of the vertical drag beforehand. By name;
+    `thrust_effect_s`, the sum of delay and lag, is better known than its parts."""
     known = (delay_s, lag_s, drag_ps)
     means = np.array([each.value for each in known])
     sds = np.array([each.sd for each in known])
     upper = np.array((50.0, THRUST_DELAY_UPPER_S, LAG_UPPER_S, DRAG_UPPER_PS))
     start = np.clip([1.0 / hover_thrust, *means], STARTED_FROM, upper - 1e-3)
-    vertical = PositionFilter(motion.times, start[3], _with_noise(VERTICAL, motion, slice(2, 3)))
+    vertical = PositionFilter(motion.times, start[3], motion.noise_m(slice(2, 3)), VERTICAL)
 
     def innovations(parameters: Array) -> Array:
         inverse, delay, lag, drag = parameters
@@ -260,7 +245,7 @@ def fit_vertical(
         ftol=1e-6,
         max_nfev=12,
     )
-    inverse, delay, lag, drag = found.x.tolist()
+    inverse, delay, lag, _ = found.x.tolist()
     rows = len(motion.times) - 1
     lags = lag_count(RELATED_S, motion.spacing_s, rows)
     scores_covariance = long_run_covariance(found.jac[:rows] * found.fun[:rows, None], lags)
@@ -273,5 +258,4 @@ def fit_vertical(
         "thrust_delay_s": Estimate(delay, sd[1]),
         "thrust_lag_s": Estimate(lag, sd[2]),
         "thrust_effect_s": Estimate(delay + lag, effect_sd_s),
-        "drag_ps": Estimate(drag, sd[3]),
     }

@@ -8,6 +8,7 @@ Little and Taylor, 1989), with one weight for all axes of a sample.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,10 +22,16 @@ LEAST_SCALE = 2e-4  # of residuals: smaller ones all have the same weight
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A value and its standard deviation, both in the unit that the field's name ends with."""
+    """A value and its standard deviation, both in the unit that the field's name ends with; the
+    latter is infinite where nothing is known."""
 
     value: float
     sd: float
+
+    @property
+    def known(self) -> bool:
+        """Whether it is known at all."""
+        return math.isfinite(self.sd)
 
 
 def lag_count(related_s: float, spacing_s: float, samples: int) -> int:

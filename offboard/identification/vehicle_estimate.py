@@ -11,14 +11,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from offboard.identification.attitude_fit import ResponseFit, Unexplained
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_fit import (
     LINK_S,
-    LINK_SD_S,
     THRUST_DELAY_SD_S,
     THRUST_LAG_SD_S,
     Identified,
@@ -54,13 +53,13 @@ LINKED = ("yaw", "thrust_delay_s")  # changed with the tilt's delay where not id
 class IdentifiedVehicle:
     """What a flight has identified, for the next one of the same vehicle. The delays of `vehicle`
     contain the link's delay of then, `link_s` (telemetry and setpoint together; 0 if it was not
-    measured). `delay` is the delay of the tilt and its standard deviation, s; `thrust` delay and
-    lag of the thrust together, None where no fit was adopted."""
+    measured). `delay_sd_s` is the standard deviation of the tilt's delay; `thrust_sd_s` that of
+    delay and lag of the thrust together, infinite where no fit was adopted."""
 
     vehicle: Vehicle
-    delay: Estimate
+    delay_sd_s: float
     link_s: float
-    thrust: Estimate | None = None
+    thrust_sd_s: float = math.inf
 
 
 class VehicleEstimate:
@@ -71,7 +70,7 @@ class VehicleEstimate:
         delay_error_s: what its delays may be wrong by.
         known: what an earlier flight has identified.
 
-    `vehicle` are the constants to fly with. `delay` is that of the tilt once identified.
+    `vehicle` are the constants to fly with.
     `sentences` for the user and `record` for the log are what is new; who reads them empties them.
     `cause` is why the uncertainty of the delay is what it is; empty where a sentence says it.
     `contradiction` says why the vehicle file must not be flown with, or is empty. `adopted_s`: time
@@ -81,18 +80,18 @@ class VehicleEstimate:
     def __init__(
         self, file: Vehicle, *, delay_error_s: float, known: IdentifiedVehicle | None = None
     ) -> None:
-        self.file = file
-        self.vehicle = known.vehicle if known else file
-        self.delay: Estimate | None = known.delay if known else None
+        known = known or IdentifiedVehicle(file, delay_sd_s=math.inf, link_s=0.0)
+        self.file, self.vehicle = file, known.vehicle
         self.sentences: list[str] = []
         self.record: dict[str, Estimate | None] = {}
         self.cause = self.contradiction = ""
         self.adopted_s = -math.inf
-        self._recalled = known
         self._unknown_s = delay_error_s
-        self._thrust = known.thrust if known else None  # delay and lag, once identified
-        self._drag_sd_ps = math.inf  # sd of the drag in use, by the surest fit of it
-        self._link_s = known.link_s if known else 0.0  # the link's, which `vehicle` contains
+        # Standard deviations of what is in use, infinite until it is identified: the tilt's delay,
+        # the thrust's delay and lag together, and the drag by the surest fit of it
+        self._delay_sd_s, self._thrust_sd_s = known.delay_sd_s, known.thrust_sd_s
+        self._drag_sd_ps = math.inf
+        self._link_s = known.link_s  # the link's, which `vehicle` contains
         self._link = (0.0, 0.0)  # added since take-off, and changed lately
         self._doubt_s = 0.0  # what the delay may be wrong by because telemetry contradicts it
         self._contradictions = 0
@@ -106,12 +105,23 @@ class VehicleEstimate:
     def uncertainty(self) -> DelayUncertainty:
         """What is not known of the delays of `vehicle`."""
         added_s, changed_s = self._link
-        known_s = SDS * self.delay.sd if self.delay else self._unknown_s
-        thrust_s = SDS * THRUST_SD_S if self.delay else self._unknown_s
-        if self._thrust:
-            thrust_s = SDS * self._thrust.sd
+        known_s = SDS * self._delay_sd_s if self.delay.known else self._unknown_s
+        thrust_s = SDS * THRUST_SD_S if self.delay.known else self._unknown_s
+        if self._thrust.known:
+            thrust_s = SDS * self._thrust_sd_s
         tilt_s = max(known_s, self._doubt_s, changed_s)
         return DelayUncertainty(tilt_s=tilt_s, thrust_s=thrust_s, link_s=added_s)
+
+    @property
+    def delay(self) -> Estimate:
+        """Delay of the tilt."""
+        return Estimate(self.vehicle.tilt.delay_s, self._delay_sd_s)
+
+    @property
+    def _thrust(self) -> Estimate:
+        """Delay and lag of the thrust together."""
+        effect_s = self.vehicle.thrust_delay_s + self.vehicle.thrust_lag_s
+        return Estimate(effect_s, self._thrust_sd_s)
 
     @property
     def in_doubt(self) -> bool:
@@ -131,9 +141,9 @@ class VehicleEstimate:
     @property
     def result(self) -> IdentifiedVehicle | None:
         """What the next flight may begin with; None if nothing was identified, or in doubt."""
-        if self.delay is None or self.contradicted:
+        if not self.delay.known or self.contradicted:
             return None
-        return IdentifiedVehicle(self.vehicle, self.delay, self._link_s, self._thrust)
+        return IdentifiedVehicle(self.vehicle, self._delay_sd_s, self._link_s, self._thrust_sd_s)
 
     @property
     def previous(self) -> Vehicle:
@@ -148,8 +158,8 @@ class VehicleEstimate:
         scatter."""
         if link is None:
             return
-        if self.delay is not None and self._recalled is not None:
-            self._on_other_link(self._recalled, self.delay, link)
+        if self.delay.known:
+            self._on_other_link(link)
             return
         self._link_s = link.value
         added_s = link.value - DIRECT_LINK_S
@@ -158,17 +168,15 @@ class VehicleEstimate:
             self.sentences.append(f"link delay {in_ms(link)}, telemetry and setpoint together")
         self._unknown_s += JUMP_SDS * link.sd
 
-    def _on_other_link(self, recalled: IdentifiedVehicle, delay: Estimate, link: Estimate) -> None:
+    def _on_other_link(self, link: Estimate) -> None:
         """Adapt delays of an earlier flight to the present delay of the link."""
-        link_s = max(recalled.link_s, DIRECT_LINK_S)
+        link_s = max(self._link_s, DIRECT_LINK_S)
         changed_s = link.value - link_s
         changed_s = max(changed_s, -self.vehicle.tilt.delay_s, -self.vehicle.yaw.delay_s)
         if abs(changed_s) < LINK_S:
             return
         self.vehicle, self._link_s = self.vehicle.later_by(changed_s), link_s + changed_s
-        self.delay = Estimate(delay.value + changed_s, math.hypot(delay.sd, link.sd))
-        if self._thrust:
-            self._thrust = Estimate(self._thrust.value + changed_s, self._thrust.sd)
+        self._delay_sd_s = math.hypot(self._delay_sd_s, link.sd)
         self.sentences.append(
             f"the link delays by {1e3 * changed_s:+.0f} ms since the vehicle was identified"
         )
@@ -184,11 +192,11 @@ class VehicleEstimate:
         of_link = f"has changed by {lately_ms} ms lately" if lately_ms else "is that of take-off"
         if grown_ms > 0:
             of_link = f"has grown by {grown_ms} ms"
-        of_tilt = f"is {in_ms(self.delay)}" if self.delay else "is not identified yet"
+        of_tilt = f"is {in_ms(self.delay)}" if self.delay.known else "is not identified yet"
         self.cause = f"the link's delay {of_link}, the tilt's {of_tilt}"
 
     def on_shown(self, constants: Mapping[str, Any]) -> None:
-        """Use constants that the vehicle reported before the take-over."""
+        """Use constants that the vehicle reports."""
         self.vehicle = self.vehicle.model_copy(update=constants)
 
     # ------------------------------------------------------------------ fits
@@ -203,15 +211,14 @@ class VehicleEstimate:
         if any(getattr(found, name) and not getattr(within, name) for name in DECISIVE):
             self.contradiction = "; ".join(sentences)
         applied = within.applied_to(self.vehicle)
-        if within.thrust_delay_s is not None:
-            self._thrust = within.thrust_effect_s
+        if within.thrust_delay_s and within.thrust_effect_s:
+            self._thrust_sd_s = within.thrust_effect_s.sd
             self._replaced.pop("thrust_delay_s", None)
-        thrust_known = self._thrust is not None
-        vehicle = with_link_delay(within, applied, self.file, thrust_known=thrust_known)
+        vehicle = with_link_delay(within, applied, self.file, thrust_known=self._thrust.known)
         if within.tilt is not None:
             moved = [name for name in LINKED if getattr(vehicle, name) != getattr(applied, name)]
             self._replaced = {name: getattr(self.vehicle, name) for name in ("tilt", *moved)}
-            self.delay = within.tilt.delay_s
+            self._delay_sd_s = within.tilt.delay_s.sd
             self._other_delay = None
         if vehicle != self.vehicle:
             self.vehicle, self.adopted_s = vehicle, time_s
@@ -253,12 +260,6 @@ class VehicleEstimate:
             self._differed.discard(constant)
         return again
 
-    @property
-    def added(self) -> Estimate:
-        """Delay that the link adds to those in the vehicle file, as identified on the tilt."""
-        sd_s = self.delay.sd if self.delay else LINK_SD_S
-        return Estimate(self.vehicle.tilt.delay_s - self.file.tilt.delay_s, sd_s)
-
     def review_thrust(self, found: Identified, time_s: float) -> None:
         """Adopt a later fit of the thrust that is clearly more certain, or the second in a row that
         differs from the one in use. During the steps the estimated height drifts, and feedback
@@ -266,15 +267,11 @@ class VehicleEstimate:
         new, known = found.thrust_effect_s, self._thrust
         if new is None or self.within_bounds(found)[1]:
             return
-        better = known is None or new.sd < BETTER * known.sd
-        differs = False
-        if known is not None:
-            used_s = self.vehicle.thrust_delay_s + self.vehicle.thrust_lag_s
-            allowed_s = max(LEAST_JUMP_S, SDS * math.hypot(new.sd, known.sd))
-            differs = abs(new.value - used_s) > allowed_s
+        better = new.sd < BETTER * known.sd
+        differs = _apart(new, known, SDS)
         if self._again("thrust", differs and not better) or better:
             self.adopt(found, time_s)
-            if self.delay:
+            if self.delay.known:
                 self.explain()
 
     def review_tilt(self, found: Identified, now: Unexplained, time_s: float) -> None:
@@ -287,19 +284,17 @@ class VehicleEstimate:
             self._contradictions = 0
         if tilt is None or self.within_bounds(found)[1]:
             return
-        if self.delay is None:
-            better = True
-        elif _apart(tilt.delay_s, self.delay):
+        if _apart(tilt.delay_s, self.delay, JUMP_SDS):
             better = self._confirmed(tilt, now)
             if not better:
                 self._doubt(tilt.delay_s, self.delay)
                 return
         else:
-            clearer = self.in_doubt and tilt.residual_rms < BETTER * now.rms
+            clearer = self.in_doubt and tilt.left.rms < BETTER * now.rms
             better = clearer or tilt.delay_s.sd < BETTER * self.delay.sd
         if better:
             self.adopt(found, time_s)
-        left = replace(now, rms=tilt.residual_rms) if better else now
+        left = tilt.left if better else now
         explained = not left.contradicts if self.in_doubt else better
         if explained and self._contradictions < MOST_CONTRADICTIONS:
             self._doubt_s = 0.0
@@ -307,21 +302,20 @@ class VehicleEstimate:
 
     def explain(self, refusal: str = "") -> None:
         """Set `cause` for the delay as identified so far; `refusal`: why it was not identified."""
-        if self.delay is None:
+        if not self.delay.known:
             self.cause = f"tilt response not identified, {refusal}"
             return
-        thrust = f", of the thrust with its lag {in_ms(self._thrust)}" if self._thrust else ""
+        thrust = f", of the thrust with its lag {in_ms(self._thrust)}" if self._thrust.known else ""
         self.cause = f"identified delay, {in_ms(self.delay)}{thrust}"
 
     def _confirmed(self, tilt: ResponseFit, now: Unexplained) -> bool:
         """Whether something besides this fit shows a changed delay: an earlier fit that agrees, or
         a contradiction that this fit explains."""
         if self._other_delay is not None:
-            return not _apart(tilt.delay_s, self._other_delay)
+            return not _apart(tilt.delay_s, self._other_delay, JUMP_SDS)
         once = 0 < self._contradictions < MOST_CONTRADICTIONS
-        explains = tilt.residual_rms < BETTER * now.rms
-        left = replace(now, rms=tilt.residual_rms)
-        return self.in_doubt and once and explains and not left.contradicts
+        explains = tilt.left.rms < BETTER * now.rms
+        return self.in_doubt and once and explains and not tilt.left.contradicts
 
     def _doubt(self, seen: Estimate, known: Estimate) -> None:
         self._other_delay, self.cause = seen, ""
@@ -341,7 +335,7 @@ class VehicleEstimate:
             f"(limit {1e3 * now.limit:.0f}, commanded {1e3 * now.commanded_rms:.0f})"
         )
         if before.rms < BETTER * now.rms:
-            self.delay = None
+            self._delay_sd_s = math.inf
             self.vehicle = self.previous
             sentence += f"; the previous estimate, with {1e3 * before.rms:.0f} mrad, is used again"
         if self._contradictions >= MOST_CONTRADICTIONS:
@@ -349,9 +343,9 @@ class VehicleEstimate:
         self.sentences.append(sentence)
 
 
-def _apart(one: Estimate, other: Estimate) -> bool:
-    """Whether two delays contradict each other."""
-    allowed_s = max(LEAST_JUMP_S, JUMP_SDS * math.hypot(one.sd, other.sd))
+def _apart(one: Estimate, other: Estimate, sds: float) -> bool:
+    """Whether two delays contradict each other, by so many standard deviations."""
+    allowed_s = max(LEAST_JUMP_S, sds * math.hypot(one.sd, other.sd))
     return abs(one.value - other.value) > allowed_s
 
 

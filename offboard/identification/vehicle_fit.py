@@ -16,7 +16,7 @@ import numpy as np
 
 from offboard.identification.attitude_fit import TILT, YAW, ResponseFit, fit_axis
 from offboard.identification.motion_fit import (
-    DRAG_SPACING_S,
+    COARSE_SPACING_S,
     DRAG_UPPER_PS,
     Motion,
     fit_drag,
@@ -153,7 +153,8 @@ def identify_in_pieces(trace: Trace, vehicle: Vehicle) -> Pieces[Identified]:
         return Identified(0.0, refusals=dict.fromkeys(names, reason))
     tilt = yield from fit_axis(TILT, trace, refusals)
     yield
-    link = _link_delay(tilt, vehicle)
+    unknown = Estimate(vehicle.tilt.delay_s, math.inf)
+    link = _of_link(tilt.delay_s if tilt else unknown, vehicle)
     yaw_delay = _with_link(vehicle.yaw.delay_s, YAW_DELAY_SD_S, link)
     yaw = yield from fit_axis(YAW, trace, refusals, yaw_delay)
     yield
@@ -184,30 +185,33 @@ def _thrust(motion: Motion, vertical: dict[str, Estimate]) -> Array:
 def identify_drag(trace: Trace, vehicle: Vehicle) -> Identified:
     """The drag alone, given the other constants of `vehicle`; some milliseconds for 25 s of
     flight."""
-    refusals: dict[str, str] = {}
-    drag: Estimate | None = None
-    enough = trace.seconds >= LEAST_SECONDS
-    if not enough or not (motion := Motion(trace, DRAG_SPACING_S)).sufficient:
-        refusals["drag_ps"] = "too few positions and commands"
-    else:
-        thrust = motion.thrust(vehicle.thrust_delay_s, vehicle.thrust_lag_s)
-        start_ps = vehicle.drag_per_mass_ps
-        drag = _drag(motion, vehicle.thrust_max_mps2 * thrust, start_ps, refusals)
-    return Identified(trace.seconds, drag_ps=drag, refusals=refusals)
-
-
-def identify_thrust(trace: Trace, vehicle: Vehicle, link: Estimate, file: Vehicle) -> Identified:
-    """Delay and lag of the thrust alone, given the drag of `vehicle`; the hover thrust is fitted
-    with them, and not returned. `link`: what the link adds to the delays of the vehicle `file`."""
-    refusals: dict[str, str] = {}
-    found = Identified(trace.seconds, refusals=refusals)
-    enough = trace.seconds >= LEAST_SECONDS
-    if not enough or not (motion := Motion(trace, DRAG_SPACING_S)).sufficient:
+    motion, found = _coarse_motion(trace), Identified(trace.seconds)
+    if motion is None:
         return found
-    known = _known_thrust(file, link) | {"drag_ps": _known_drag(vehicle.drag_per_mass_ps)}
+    thrust = motion.thrust(vehicle.thrust_delay_s, vehicle.thrust_lag_s)
+    thrust_mps2, start_ps = vehicle.thrust_max_mps2 * thrust, vehicle.drag_per_mass_ps
+    return replace(found, drag_ps=_drag(motion, thrust_mps2, start_ps, {}))
+
+
+def identify_thrust(trace: Trace, vehicle: Vehicle, delay: Estimate, file: Vehicle) -> Identified:
+    """Delay and lag of the thrust alone, given the drag of `vehicle`; the hover thrust is fitted
+    with them, and not returned. `delay`: that of the tilt, which shows what the link adds to the
+    delays of the vehicle `file`."""
+    motion, found = _coarse_motion(trace), Identified(trace.seconds)
+    if motion is None:
+        return found
+    known = _known_thrust(file, _of_link(delay, file))
+    known["drag_ps"] = _known_drag(vehicle.drag_per_mass_ps)
     vertical = fit_vertical(motion, vehicle.gravity_mps2, vehicle.hover_thrust, **known)
-    accepted = _accepted_vertical(motion, vertical, refusals) | {"hover_thrust": None}
-    return replace(found, **accepted)
+    return replace(found, **_accepted_vertical(motion, vertical, {}) | {"hover_thrust": None})
+
+
+def _coarse_motion(trace: Trace) -> Motion | None:
+    """The motion of a stretch of flight; None where it is too short for a fit."""
+    if trace.seconds < LEAST_SECONDS:
+        return None
+    motion = Motion(trace, COARSE_SPACING_S)
+    return motion if motion.sufficient else None
 
 
 def _known_thrust(vehicle_file: Vehicle, link: Estimate) -> dict[str, Estimate]:
@@ -221,11 +225,10 @@ def _known_drag(drag_ps: float, sd_ps: float = 0.0) -> Estimate:
     return Estimate(drag_ps, max(sd_ps, 0.2 * drag_ps, 0.05))
 
 
-def _link_delay(tilt: ResponseFit | None, vehicle: Vehicle) -> Estimate:
+def _of_link(delay: Estimate, vehicle_file: Vehicle) -> Estimate:
     """Delay that the link adds to those of the vehicle file, by the tilt's delay."""
-    if tilt is None:
-        return Estimate(0.0, LINK_SD_S)
-    return Estimate(tilt.delay_s.value - vehicle.tilt.delay_s, tilt.delay_s.sd)
+    sd_s = delay.sd if delay.known else LINK_SD_S
+    return Estimate(delay.value - vehicle_file.tilt.delay_s, sd_s)
 
 
 def _with_link(delay_s: float, own_sd_s: float, link: Estimate) -> Estimate:
@@ -332,14 +335,11 @@ def with_link_delay(
     added_s = found.tilt.delay_s.value - vehicle_file.tilt.delay_s
     if added_s < LINK_S:
         return target
-    update: dict[str, Any] = {}
-    thrust_delay_s = vehicle_file.thrust_delay_s + added_s
-    if not thrust_known and target.thrust_delay_s < thrust_delay_s - LINK_S:
-        update["thrust_delay_s"] = thrust_delay_s
-    yaw_delay_s = vehicle_file.yaw.delay_s + added_s
-    if found.yaw is None and target.yaw.delay_s < yaw_delay_s - LINK_S:
-        delay_s = min(yaw_delay_s, DELAY_LIMITS_S[1])
-        update["yaw"] = target.yaw.model_copy(update={"delay_s": delay_s})
+    later, update = vehicle_file.later_by(added_s), dict[str, Any]()
+    if not thrust_known and target.thrust_delay_s < later.thrust_delay_s - LINK_S:
+        update["thrust_delay_s"] = later.thrust_delay_s
+    if found.yaw is None and target.yaw.delay_s < later.yaw.delay_s - LINK_S:
+        update["yaw"] = target.yaw.model_copy(update={"delay_s": later.yaw.delay_s})
     return target.model_copy(update=update)
 
 

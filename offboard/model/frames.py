@@ -82,25 +82,19 @@ def thrust_direction_from_quaternion(quaternion: ArrayLike) -> Array:
     return _stack(2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y))
 
 
-def quaternion_from_thrust_direction(direction_ned: ArrayLike, heading_rad: ArrayLike) -> Array:
+def quaternion_from_thrust_direction(direction_ned: ArrayLike, heading_rad: Any) -> Array:
     """Third body axis b (..., 3) of any length and heading psi (...) -> quaternion (..., 4).
 
     The body y axis is normal to the plane of b and the heading, hence Euler psi is the heading
-    (also upside down). Defined for every input: for b along the y axis of the heading the roll is
-    +-pi/2, b zero or not finite counts as level, a heading that is not finite as north.
+    (also upside down); for b along the y axis of the heading the roll is +-pi/2.
     """
     north, east, down = _components(direction_ned)
-    heading: Any = np.where(np.isfinite(heading_rad), heading_rad, 0.0)[()]
-    usable = np.isfinite(north + east + down)
-    north, east = np.where(usable, north, 0.0)[()], np.where(usable, east, 0.0)[()]
-    level = ~usable | ((north == 0.0) & (east == 0.0) & (down == 0.0))
-    down = np.where(level, 1.0, down)[()]
-    ahead = north * np.cos(heading) + east * np.sin(heading)
-    right = east * np.cos(heading) - north * np.sin(heading)
+    ahead = north * np.cos(heading_rad) + east * np.sin(heading_rad)
+    right = east * np.cos(heading_rad) - north * np.sin(heading_rad)
     sign = np.copysign(1.0, down)
     phi = np.arctan2(-right, sign * np.hypot(ahead, down))
     theta = np.arctan2(sign * ahead, sign * down)
-    return quaternion_from_euler(phi, theta, heading)
+    return quaternion_from_euler(phi, theta, heading_rad)
 
 
 def enu(ned: ArrayLike) -> Array:

@@ -23,11 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from offboard.compiled import kernel
 from offboard.model.axes import LinearModel
-from offboard.model.frames import (
-    euler_from_quaternion,
-    quaternion_from_euler,
-    rotation_from_quaternion,
-)
+from offboard.model.frames import quaternion_from_euler, rotation_from_quaternion
 from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
@@ -278,24 +274,5 @@ def quaternion_state(euler_state: Array) -> Array:
     )
     return np.concatenate(
         (quaternion, euler_state[..., EULER.rates], velocity_ned, euler_state[..., EULER.position]),
-        axis=-1,
-    )
-
-
-def euler_state(quaternion_state: Array) -> Array:
-    """Quaternion state (..., 13) -> Eq. 5 state (..., 12); velocity from NED to body axes."""
-    quaternion = quaternion_state[..., QUATERNION.attitude]
-    velocity_body = np.einsum(
-        "...ji,...j->...i",
-        rotation_from_quaternion(quaternion),
-        quaternion_state[..., QUATERNION.velocity],
-    )
-    return np.concatenate(
-        (
-            euler_from_quaternion(quaternion),
-            quaternion_state[..., QUATERNION.rates],
-            velocity_body,
-            quaternion_state[..., QUATERNION.position],
-        ),
         axis=-1,
     )

@@ -73,16 +73,18 @@ class Vehicle(Parameters):
     tilt_max_rad: float = Field(default=0.7, ge=0.05, le=1.4)
 
     def later_by(self, delay_s: float) -> Vehicle:
-        """This vehicle behind a link that adds `delay_s` to each of its delays."""
-        most_s = DELAY_LIMITS_S[1]
+        """This vehicle behind a link that adds `delay_s` to each of its delays, within their
+        limits."""
+        least_s, most_s = DELAY_LIMITS_S
+
+        def later(own_s: float) -> float:
+            return min(max(own_s + delay_s, least_s), most_s)
 
         def axis(response: AxisResponse) -> AxisResponse:
-            later_s = min(response.delay_s + delay_s, most_s)
-            return response.model_copy(update={"delay_s": later_s})
+            return response.model_copy(update={"delay_s": later(response.delay_s)})
 
-        thrust_delay_s = min(self.thrust_delay_s + delay_s, most_s)
         axes = {"tilt": axis(self.tilt), "yaw": axis(self.yaw)}
-        return self.model_copy(update={**axes, "thrust_delay_s": thrust_delay_s})
+        return self.model_copy(update={**axes, "thrust_delay_s": later(self.thrust_delay_s)})
 
     @property
     def drag_per_mass_ps(self) -> float:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from offboard.model.vehicle import Vehicle
 from offboard.reference.base import FlatSample, Reference
-from offboard.reference.flatness import FlatState, flat_state
+from offboard.reference.flatness import FlatState, body_rates, flat_state
 from offboard.reference.track import Track
 
 Array = NDArray[np.float64]
@@ -86,7 +86,7 @@ def _demands(
     sample: FlatSample, state: FlatState, tilt: Array, vehicle: Vehicle
 ) -> tuple[_Demand, ...]:
     thrust_max = vehicle.thrust_max_mps2
-    rates, most = np.abs(state.rates_frd_radps), vehicle.angular_rate_limit_radps
+    rates, most = np.abs(body_rates(sample, state)), vehicle.angular_rate_limit_radps
     speed = np.linalg.norm(sample.velocity_ned_mps, axis=-1)
     height = 0.0 - sample.position_ned_m[:, 2]  # no -0
     distance = np.linalg.norm(sample.position_ned_m, axis=-1)

@@ -28,8 +28,7 @@ class FlatState:
     """State and input that fly a `FlatSample`; leading shape (...) is the sample's.
 
     thrust_mps2, thrust_rate_mps3 (...): T and T'. thrust_direction_ned, _rate_ned_ps,
-    _acceleration_ned_ps2 (..., 3): b, b', b''; without thrust b is (0, 0, 1). heading_rad,
-    heading_rate_radps (...): equal to the Euler yaw and its rate.
+    _acceleration_ned_ps2 (..., 3): b, b', b''; without thrust b is (0, 0, 1).
     """
 
     thrust_mps2: Array
@@ -37,14 +36,6 @@ class FlatState:
     thrust_direction_ned: Array
     thrust_direction_rate_ned_ps: Array
     thrust_direction_acceleration_ned_ps2: Array
-    heading_rad: Array
-    heading_rate_radps: Array
-
-    @property
-    def rates_frd_radps(self) -> Array:
-        """Body rates p, q, r, shape (..., 3); computed at each call."""
-        b, b1 = self.thrust_direction_ned, self.thrust_direction_rate_ned_ps
-        return _body_rates(b, b1, self.heading_rad, self.heading_rate_radps)
 
 
 def flat_state(
@@ -76,8 +67,6 @@ def flat_state(
         thrust_direction_ned=b,
         thrust_direction_rate_ned_ps=b1,
         thrust_direction_acceleration_ned_ps2=b2,
-        heading_rad=sample.heading_rad,
-        heading_rate_radps=sample.heading_rate_radps,
     )
 
 
@@ -87,16 +76,17 @@ def _dot(left: Array, right: Array) -> Array:
     return product
 
 
-def _body_rates(b: Array, b1: Array, heading: Array, heading_rate: Array) -> Array:
-    """p, q, r (..., 3) of a body whose third axis is b, moving as b1, and whose Euler yaw is the
-    heading: b' = R (omega x e3) gives p and q, the yaw's kinematics psi' = (q sin phi + r cos phi)
-    / cos theta give r."""
-    cosine, sine, down = np.cos(heading), np.sin(heading), b[..., 2]
+def body_rates(sample: FlatSample, state: FlatState) -> Array:
+    """Body rates p, q, r (..., 3), rad/s, of a body whose third axis is b and whose Euler yaw is
+    the heading: b' = R (omega x e3) gives p and q, the yaw's kinematics psi' = (q sin phi +
+    r cos phi) / cos theta give r."""
+    b, b1 = state.thrust_direction_ned, state.thrust_direction_rate_ned_ps
+    cosine, sine, down = np.cos(sample.heading_rad), np.sin(sample.heading_rad), b[..., 2]
     x = np.stack([cosine * down, sine * down, -cosine * b[..., 0] - sine * b[..., 1]], axis=-1)
     # y_C x b, y_C = (-sin, cos, 0); the nose leads, upside down too
     x /= np.copysign(np.maximum(np.sqrt(_dot(x, x)), _LEVEL_FLOOR), b[..., 2:])
     y = np.cross(b, x)
     p, q = -_dot(y, b1)[..., 0], _dot(x, b1)[..., 0]
     level = np.where(np.abs(down) > _LEVEL_FLOOR, down, _LEVEL_FLOOR)
-    r = (heading_rate * (1.0 - x[..., 2] ** 2) - q * y[..., 2]) / level
+    r = (sample.heading_rate_radps * (1.0 - x[..., 2] ** 2) - q * y[..., 2]) / level
     return np.stack([p, q, r], axis=-1)

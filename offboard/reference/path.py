@@ -1,4 +1,4 @@
-"""Geometric paths, and where the nose points along them.
+"""Geometric paths, and the heading along their velocity.
 
 A path maps its own time s (seconds at full speed) to a position and its derivatives with respect
 to s: `Harmonic`, or a `Spline` of SciPy through points. Starting and stopping is added by `track`.
@@ -144,13 +144,9 @@ def through(points_ned_m: Array, times_s: Array, smoothness: Smoothness) -> Spli
     N >= 2: with clamped ends the minimiser of the integral of the squared m-th derivative is the
     interpolating spline of degree 2 m - 1.
 
-    Raises ValueError unless the times are finite, start at 0 and increase."""
-    if len(points_ned_m) < 2:
-        raise ValueError(f"a path needs at least 2 points, not {len(points_ned_m)}")
+    Raises ValueError unless there are as many times, which start at 0 and increase."""
     if len(times_s) != len(points_ned_m):
         raise ValueError(f"{len(points_ned_m)} points need as many times, not {len(times_s)}")
-    if not np.all(np.isfinite(points_ned_m)) or not np.all(np.isfinite(times_s)):
-        raise ValueError("points and times must be finite")
     if times_s[0] != 0.0 or np.any(np.diff(times_s) <= 0.0):
         raise ValueError("the times of the points must start at 0 and increase")
     order = 3 if smoothness is Smoothness.JERK else 4
@@ -173,35 +169,6 @@ def interpolate(times_s: Array, values: Array, knot_spacing_s: float = 0.0) -> S
     # knots on rows, equally many rows apart: every span has data (Schoenberg-Whitney)
     knots = times_s[np.rint(np.linspace(0, rows - 1, intervals + 1)).astype(np.int64)]
     return Spline(make_lsq_spline(times_s, values, np.pad(knots, _DEGREE, "edge"), k=_DEGREE))
-
-
-class Heading(Protocol):
-    """Where the nose points along a path."""
-
-    def jet(self, path_time_s: Array, path_jet: Array) -> Array:
-        """Heading (unwrapped), its first and second derivative by s, shape (3, N), rad and s.
-
-        path_time_s (N,); path_jet (5, N, 3 or 4) is the path at the same times."""
-        ...
-
-
-@dataclass(frozen=True, slots=True)
-class Fixed:
-    """A constant heading."""
-
-    heading_rad: float
-
-    def jet(self, path_time_s: Array, path_jet: Array) -> Array:
-        """See `Heading`."""
-        return np.multiply.outer((self.heading_rad, 0.0, 0.0), np.ones(path_time_s.size))
-
-
-class Column:
-    """The fourth column of the path."""
-
-    def jet(self, path_time_s: Array, path_jet: Array) -> Array:
-        """See `Heading`."""
-        return path_jet[:3, :, HEADING]
 
 
 class AlongVelocity:
@@ -237,7 +204,9 @@ class AlongVelocity:
         self._across = joined(self._edges_s, jet[:, edges].T[:, :, np.newaxis])
 
     def jet(self, path_time_s: Array, path_jet: Array) -> Array:
-        """See `Heading`."""
+        """Heading (unwrapped), its first and second derivative by s, shape (3, N), rad and s.
+
+        path_time_s (N,); path_jet (5, N, 3) is the path at the same times."""
         jet = direction_jet(path_jet)
         node = np.rint(path_time_s / self._step_s).astype(np.intp)
         nearest_rad = self._nodes_rad[np.clip(node, 0, self._nodes_rad.size - 1)]

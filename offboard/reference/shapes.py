@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Annotated, Literal, Self
 
 import numpy as np
@@ -21,10 +22,7 @@ from offboard.reference import table
 from offboard.reference.fastest import PathLimits, fastest_times
 from offboard.reference.path import (
     AlongVelocity,
-    Column,
-    Fixed,
     Harmonic,
-    Heading,
     Path,
     Sine,
     Smoothness,
@@ -32,7 +30,7 @@ from offboard.reference.path import (
     through,
     times_from_speed,
 )
-from offboard.reference.track import Track, path_end_s
+from offboard.reference.track import Track
 
 Seconds = Annotated[float, Field(ge=0, le=60)]
 Period = Annotated[float, Field(ge=1, le=600)]
@@ -75,22 +73,18 @@ class Shape(Parameters, ABC):
     def track(self) -> Track:
         """The reference, NED relative to the take-off point. Raises ValueError like `path`, and
         where the runs do not fit (see `Track`)."""
-        path = self.path()
+        path, fixed_rad = self.path(), math.radians(self.course_deg)
         origin_ned_m = (self.origin_north_m, self.origin_east_m, -float(self.height_m))
-        track = Track(path, self._heading(path), self.run_in_s, self.run_out_s, origin_ned_m)
+        track = Track(path, fixed_rad, self.run_in_s, self.run_out_s, origin_ned_m)
         track.check_runs()
+        if self.course == "along_velocity":
+            track = replace(track, heading=AlongVelocity(path, track.path_end_s, fixed_rad))
         return track
 
     @property
     def title(self) -> str:
         """What errors call it."""
         return self.shape
-
-    def _heading(self, path: Path) -> Heading:
-        fixed_rad = math.radians(self.course_deg)
-        if self.course == "along_velocity":
-            return AlongVelocity(path, path_end_s(path, self.run_in_s, self.run_out_s), fixed_rad)
-        return Fixed(fixed_rad)
 
 
 class Hover(Shape):
@@ -260,21 +254,13 @@ class FromTable(Shape):
         return self.file
 
     def path(self) -> Path:
-        rows = self._rows()
+        if self.text is None:
+            raise ValueError(f"the table {self.file} has not been read")
+        rows = table.parse(self.text, self.file)
         values = rows.points_ned_m
         if self.course == "table" and rows.heading_rad is not None:
             values = np.column_stack((values, rows.heading_rad))
         return interpolate(rows.times_s, values, self.knot_spacing_s)
-
-    def _heading(self, path: Path) -> Heading:
-        if self.course == "table" and self._rows().heading_rad is not None:
-            return Column()
-        return super()._heading(path)
-
-    def _rows(self) -> table.Table:
-        if self.text is None:
-            raise ValueError(f"the table {self.file} has not been read")
-        return table.parse(self.text, self.file)
 
 
 SHAPES: Mapping[str, type[Shape]] = {

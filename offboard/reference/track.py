@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.reference.base import FlatSample, Reference
-from offboard.reference.path import HEADING, Fixed, Harmonic, Heading, Path, Triple
+from offboard.reference.path import HEADING, AlongVelocity, Harmonic, Path, Triple
 
 Array = NDArray[np.float64]
 
@@ -90,11 +90,12 @@ class Track:
     """A `Reference` from rest to rest, continuous to snap in position and to acceleration in
     heading (without a run, at that end, as continuous as the path is there).
 
-    Time 0 is the start of the run-in; positions are NED relative to the take-off point.
+    Time 0 is the start of the run-in; positions are NED relative to the take-off point. `heading`
+    is a constant one, rad, or along the velocity; a path with a fourth column has its own.
     """
 
     path: Path
-    heading: Heading
+    heading: float | AlongVelocity = 0.0
     run_in_s: float = 0.0
     run_out_s: float = 0.0
     origin_ned_m: Triple = (0.0, 0.0, 0.0)
@@ -129,7 +130,9 @@ class Track:
     @property
     def path_end_s(self) -> float:
         """The path's own time at which the track comes to rest."""
-        return path_end_s(self.path, self.run_in_s, self.run_out_s)
+        if self.path.bounded:
+            return self.path.length_s
+        return self.path.length_s + 0.5 * (self.run_in_s + self.run_out_s)
 
     @property
     def track_start_s(self) -> float:
@@ -156,26 +159,21 @@ class Track:
         clock = self._clock(time.reshape(-1))
         jet = np.zeros((5, time.size, 4))
         path = self.path.jet(clock[0])
-        jet[..., :HEADING] = path[..., :HEADING]
+        jet[..., : path.shape[-1]] = path
         jet[0, :, :HEADING] += self.origin_ned_m
-        jet[:3, :, HEADING] = self.heading.jet(clock[0], path)
+        if isinstance(self.heading, AlongVelocity):
+            jet[:3, :, HEADING] = self.heading.jet(clock[0], path)
+        elif path.shape[-1] == HEADING:
+            jet[0, :, HEADING] = self.heading
         return _composed(clock, jet, time.shape)
 
     def _clock(self, time_s: Array) -> Array:
         return warp(time_s, self.run_in_s, self.cruise_s, self.run_out_s)
 
 
-def path_end_s(path: Path, run_in_s: float, run_out_s: float) -> float:
-    """The path's own time at which a track along it comes to rest, in seconds."""
-    if path.bounded:
-        return path.length_s
-    return path.length_s + 0.5 * (run_in_s + run_out_s)
-
-
 def hold(position_ned_m: Triple, heading_rad: float) -> Track:
     """Rest at a point (NED, m) with a heading (rad)."""
-    at_rest = Harmonic(0.0, bounded=True, offset_ned_m=position_ned_m)
-    return Track(at_rest, Fixed(heading_rad))
+    return Track(Harmonic(0.0, bounded=True, offset_ned_m=position_ned_m), heading_rad)
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.reference.path import Column, Spline, joined
+from offboard.reference.path import Spline, joined
 from offboard.reference.track import Track
 
 Array = NDArray[np.float64]
@@ -84,7 +84,7 @@ def transfer(
     if _moves_well(begin, end, limits):
         hop = _shortest(begin, end, limits)
         if hop.length_s <= _CRUISE_FROM_S:
-            return Track(hop, Column())
+            return Track(hop)
     times_s, jets = [0.0], [begin]
     if velocity.any():
         brake_s = max(_brake_s(velocity, limits), _BRAKE_MIN_S)
@@ -98,7 +98,7 @@ def transfer(
     for leg_s, jet in legs:
         times_s.append(times_s[-1] + leg_s)
         jets.append(jet)
-    return Track(joined(times_s, jets), Column())
+    return Track(joined(times_s, jets))
 
 
 def _moves_well(begin: Array, end: Array, limits: Limits) -> bool:

@@ -123,8 +123,9 @@ class Flights:
         directory = self._record.begin(self._session, self._prepared.text, self._identity)
         self.current.announce(f"flight {self.engagements}, recorded in {directory}")
         if known := self._known:
+            delay_ms = 1e3 * known.vehicle.tilt.delay_s
             self.current.announce(
-                f"this vehicle was identified before: tilt delay {1e3 * known.delay.value:.0f} ms; "
+                f"this vehicle was identified before: tilt delay {delay_ms:.0f} ms; "
                 "no identification steps"
             )
 

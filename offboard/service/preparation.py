@@ -8,6 +8,7 @@ that it was identified from: for another vehicle file it is not used.
 from __future__ import annotations
 
 import hashlib
+import math
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -22,7 +23,6 @@ from offboard.documents.errors import DocumentError
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import parse
 from offboard.documents.shipped import read_text
-from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from offboard.link.log import replace_file
 from offboard.model.vehicle import Vehicle
@@ -133,12 +133,13 @@ class VehicleFiles:
         self._clerk.shutdown(wait=True)
 
     def _write(self, key: str, source: str, identified: IdentifiedVehicle) -> None:
+        thrust_sd_s = identified.thrust_sd_s
         document = {
             "identified_from": source,
-            "tilt_delay_s": identified.delay.value,
-            "tilt_delay_sd_s": identified.delay.sd,
+            "tilt_delay_s": identified.vehicle.tilt.delay_s,
+            "tilt_delay_sd_s": identified.delay_sd_s,
             "link_delay_s": identified.link_s,
-            "thrust_delay_sd_s": identified.thrust.sd if identified.thrust else None,
+            "thrust_delay_sd_s": thrust_sd_s if math.isfinite(thrust_sd_s) else None,
             "vehicle": identified.vehicle.model_dump(mode="json"),
         }
         path = self._directory / f"{key}.yaml"
@@ -152,10 +153,12 @@ class VehicleFiles:
 
 def _load(path: Path) -> tuple[str, IdentifiedVehicle]:
     document = parse(read_text(path), Document, str(path))
-    delay = Estimate(document.tilt_delay_s, document.tilt_delay_sd_s)
-    vehicle, sd_s = document.vehicle, document.thrust_delay_sd_s
-    thrust = Estimate(vehicle.thrust_delay_s + vehicle.thrust_lag_s, sd_s) if sd_s else None
-    identified = IdentifiedVehicle(vehicle, delay, document.link_delay_s, thrust)
+    identified = IdentifiedVehicle(
+        document.vehicle,
+        document.tilt_delay_sd_s,
+        document.link_delay_s,
+        document.thrust_delay_sd_s or math.inf,
+    )
     return document.identified_from, identified
 
 

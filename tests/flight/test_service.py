@@ -29,7 +29,6 @@ from watch import announced, begun_s, said, sent_after
 
 from offboard.flight.authority import PilotSwitch
 from offboard.flight.phases import TRACKING, Phase
-from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from simulator import config as simulated
 
@@ -212,7 +211,7 @@ def test_a_contradicted_vehicle_is_identified_again(served: Served) -> None:
     true = simulated.vehicle("px4_sih")
     late = {"delay_s": 0.2, "natural_frequency_radps": 6.0}
     wrong = true.model_copy(update={"tilt": true.tilt.model_copy(update=late)})
-    known = IdentifiedVehicle(wrong, Estimate(0.2, 0.002), 0.008)
+    known = IdentifiedVehicle(wrong, 0.002, 0.008)
     pair = served.engaged(reference="lemniscate", known=known)
     pair.run(14.0)
     pair.switch("pilot")
@@ -225,7 +224,7 @@ def test_what_is_identified_in_motion_is_remembered(served: Served) -> None:
     """Also of a vehicle that was known: its drag is 2.5 times what was remembered."""
     true = simulated.vehicle("px4_sih")
     known = true.model_copy(update={"drag_translation_npmps": (0.4 * true.mass_kg,) * 3})
-    before = IdentifiedVehicle(known, Estimate(0.048, 0.002), 0.008)
+    before = IdentifiedVehicle(known, 0.002, 0.008)
     pair = served.engaged(reference="lemniscate", known=before)
     pair.until(lambda: pair.phase is Phase.HOVER, 40.0)
     assert pair.remembered == before
@@ -238,7 +237,7 @@ def test_a_limit_of_the_autopilot_is_read_anew(served: Served) -> None:
     """The vehicle was remembered with a lower angular acceleration than is allowed now."""
     copter = simulated.vehicle("arducopter")
     slow = copter.model_copy(update={"angular_acceleration_limit_radps2": (2.3, 2.3, 2.2)})
-    known = IdentifiedVehicle(slow, Estimate(0.01, 0.002), 0.008)
+    known = IdentifiedVehicle(slow, 0.002, 0.008)
     pair = served.engaged("ardupilot", known=known)
     pair.run(1.0)
     assert said(pair, "this vehicle was identified before")

@@ -19,7 +19,7 @@ from offboard.model.command import Command
 from offboard.model.frames import quaternion_from_thrust_direction
 from offboard.model.vehicle import Vehicle
 from offboard.reference.base import Reference
-from offboard.reference.path import Fixed, Harmonic, Sine
+from offboard.reference.path import Harmonic, Sine
 from offboard.reference.track import Track
 
 STEP_S = 1e-3
@@ -118,7 +118,7 @@ def lemniscate(period_s: float, *, heading_rad: float = 0.0, vertical_m: float =
     omega = math.tau / period_s
     sine = Sine((2.0, 1.0, vertical_m), (omega, 2.0 * omega, 3.0 * omega))
     path = Harmonic(3600.0, sines=(sine,))
-    return Track(path, Fixed(heading_rad), run_in_s=4.0, origin_ned_m=(0.0, 0.0, -3.0))
+    return Track(path, heading_rad, run_in_s=4.0, origin_ned_m=(0.0, 0.0, -3.0))
 
 
 def fly(

@@ -59,7 +59,7 @@ def left_to_pay(law: HorizonLaw, situation: Situation) -> float:
 
 def closed_form(law: HorizonLaw) -> Plan:
     steps = law.quadratic.steps
-    return law.fly(np.zeros((steps, 3)), np.zeros((steps + 1, STATE_SIZE))).plan(0)
+    return law.fly(np.zeros((steps, 3)), np.zeros((steps + 1, STATE_SIZE)))[0]
 
 
 def test_near_a_hover_quadratic_roll_outs_and_closed_form_cost_the_same() -> None:
@@ -68,7 +68,7 @@ def test_near_a_hover_quadratic_roll_outs_and_closed_form_cost_the_same() -> Non
         problem = law.quadratic.over(law.prepare(situation), law.outlook)
         for _ in range(4):
             tried = 1e-4 * rng.uniform(problem.lower, problem.upper)
-            flown = law.fly(law.quadratic.plan(tried)).plan(0)
+            flown = law.fly(law.quadratic.plan(tried))[0]
             assert flown.cost == pytest.approx(problem(tried), rel=1e-3)
         assert closed_form(law).cost == pytest.approx(left_to_pay(law, situation), rel=1e-3)
 
@@ -78,7 +78,7 @@ def test_a_plan_whose_cost_is_not_finite_never_wins() -> None:
     law.prepare(situations(1, 0.3)[0])
     knots = np.zeros((2, *law.reach.shape))
     knots[0, 0] = np.nan
-    costs = law.fly(np.zeros((STEPS, 3)), knots=knots).costs
+    _, costs = law.fly(np.zeros((STEPS, 3)), knots=knots)
     assert (int(np.argmin(costs)), costs[0]) == (1, math.inf)
 
 
@@ -140,7 +140,7 @@ def test_nonlinear_roll_outs_fly_as_scipy_does() -> None:
     plan = np.random.default_rng(3).uniform([-0.1, -0.2, -3.0], [0.2, 0.1, 3.0], (STEPS, 3))
     true, law = _flown(state, plan), horizon()
     law.prepare(Situation(5.0, state, hold((0.0, 0.0, -3.0), 0.0), LEVEL))
-    rolled = law.fly(plan).plan(0).states[-1]
+    rolled = law.fly(plan)[0].states[-1]
     assert np.abs(rolled[[P, P + 1, Z]] - [0.0, 0.0, 3.0] - true[:3]).max() < 0.004
     assert np.abs(rolled[[V, V + 1, W]] - true[3:6]).max() < 0.01
     pull = np.array([0.0, 0.0, G]) + PUSHED_MPS2
@@ -154,7 +154,7 @@ def test_a_plan_of_zeros_flies_the_reference() -> None:
     start = state_of(np.random.default_rng(0), reference, 0.0)
     state = on_target(start, law.target(reference, 5.0, start))
     law.prepare(Situation(5.0, state, reference, LEVEL))
-    plan = law.fly(np.zeros((STEPS, 3))).plan(0)
+    plan = law.fly(np.zeros((STEPS, 3)))[0]
     assert np.abs(plan.states).max() < 1e-9
     assert plan.cost < 1e-12
 
@@ -183,7 +183,7 @@ def test_law_finds_cheaper_plans_than_a_random_search() -> None:
         law.previous = None
         ours, base = law.decide(situation).certificate.cost, closed_form(law)
         knots = law.reach * rng.uniform(-1.0, 1.0, (2800, *law.reach.shape))
-        paid.append((ours, law.fly(base.inputs, base.states, knots).costs.min()))
+        paid.append((ours, law.fly(base.inputs, base.states, knots)[1].min()))
     ours, drawn = np.array(paid).T
     assert (ours < drawn).all()
     assert np.median(ours / drawn) < 0.5
@@ -196,7 +196,7 @@ def test_a_way_below_the_clearance_to_the_ground_costs() -> None:
     law.prepare(Situation(5.0, at((5.0, 5.0, -0.8), 0.0), hold((5.0, 5.0, -0.8), 0.0), LEVEL))
     down = np.zeros((STEPS_AROUND, 3))
     down[:5, 2] = -3.0
-    low, high = law.fly(down).plan(0), law.fly(-down).plan(0)
+    low, high = law.fly(down)[0], law.fly(-down)[0]
     assert low.states[:, Z] == pytest.approx(-high.states[:, Z], abs=1e-9)
     over = np.maximum(low.states[1:, Z] - 0.5, 0.0)
     assert over.max() > 0.1

@@ -15,7 +15,12 @@ from scipy.linalg import expm
 from offboard.analysis.identify import estimator_noise
 from offboard.identification import attitude_fit
 from offboard.identification.attitude_fit import ResponseFit
-from offboard.identification.motion_fit import Noise, PositionFilter
+from offboard.identification.motion_fit import (
+    ACCELERATION_MPS,
+    WANDER_M,
+    WANDER_S,
+    PositionFilter,
+)
 from offboard.identification.trace import Rows, Trace, clean
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_fit import completed, identify
@@ -46,8 +51,9 @@ def steps(seed):
     return np.arange(60) * 0.1, values
 
 
-def fit_response(*measured, **options) -> ResponseFit:
-    return completed(attitude_fit.fit_response(*measured, **options))
+def fit_response(*measured, delay: Estimate | None = None, wanders=False) -> ResponseFit:
+    problem = attitude_fit.ResponseProblem(*measured, wanders=wanders)
+    return completed(attitude_fit.fit_response(problem, delay))
 
 
 def test_innovations_of_a_matching_motion_are_white_and_of_unit_variance():
@@ -55,17 +61,17 @@ def test_innovations_of_a_matching_motion_are_white_and_of_unit_variance():
     assumes."""
     generator = np.random.default_rng(11)
     step_s, count, drag = 0.02, 20000, 0.7
-    wander, *densities = 0.02, 0.3, 0.5
-    rates = [[0.0, 1.0, 0.0, 1.0], [0.0, -drag, 1.0, 0.0], [0.0] * 4, [0.0, 0.0, 0.0, -2.5]]
+    rate = 1.0 / WANDER_S
+    rates = [[0.0, 1.0, 0.0, 1.0], [0.0, -drag, 1.0, 0.0], [0.0] * 4, [0.0, 0.0, 0.0, -rate]]
     drift = expm(np.array(rates) * step_s)
-    driven = np.array([0.0, *densities, 2.5 * wander]) * math.sqrt(step_s)
+    driven = np.array([0.0, ACCELERATION_MPS, 0.5, rate * WANDER_M]) * math.sqrt(step_s)
     kicks = generator.normal(size=(count, 4)) * driven
     state, positions = np.zeros(4), np.empty(count)
     for i in range(count):
         positions[i] = state[0] + 0.01 * generator.normal()
         state = drift @ state + kicks[i]
     times = step_s * np.arange(count)
-    position_filter = PositionFilter(times, drag, Noise(wander, *densities, 0.01, 1.0, 1.0))
+    position_filter = PositionFilter(times, drag, 0.01, (0.5, 1.0))
     white = position_filter.innovations(positions[None], np.zeros((1, count)), drag)[0, 200:]
     assert np.mean(white**2) == pytest.approx(1.0, abs=0.03)
     assert abs(np.mean(white[1:] * white[:-1])) < 0.02
@@ -117,7 +123,7 @@ def test_delay_known_beforehand_counts_by_its_uncertainty():
     noise = 0.004 * np.random.default_rng(1).normal(size=len(times))
     signals = (simulated(values, sent_at, 0.123, 7.0, 1.2, times) + noise)[:, None]
     alone, uncertain, certain = (
-        fit_response(times, signals, sent_at, values[:, None], delay)
+        fit_response(times, signals, sent_at, values[:, None], delay=delay)
         for delay in (None, Estimate(0.3, 10.0), Estimate(0.123, 1e-5))
     )
     assert uncertain.delay_s.value == pytest.approx(alone.delay_s.value, abs=1e-6)

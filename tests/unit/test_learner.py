@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -40,7 +41,8 @@ KNOWN_S = 3.0 * 0.002  # what a delay of `fit` may be wrong by
 
 def fit(delay_s: float, frequency: float = 12.0, left: float = 0.004) -> Identified:
     values = Estimate(delay_s, 0.002), Estimate(frequency, 0.3), Estimate(0.7, 0.03)
-    return Identified(10.0, tilt=ResponseFit(*values, left, 0.1, 0.005))
+    lag_s = Estimate(1.4 / frequency, 0.005)
+    return Identified(10.0, tilt=ResponseFit(*values, lag_s, Unexplained(left, 0.1)))
 
 
 def estimate_with(found: Identified) -> VehicleEstimate:
@@ -57,7 +59,8 @@ def test_what_a_file_may_have_is_adopted_and_nothing_else() -> None:
         file = Vehicle.model_validate(FILE.model_dump() | constants)
         values = [Estimate(value, 1e-3) for value in (0.5, frequency, damping)]
         hover = Estimate(hover_thrust, 1e-3)
-        found = Identified(10.0, ResponseFit(*values, 0.004, 0.1, 0.005), hover_thrust=hover)
+        fitted = ResponseFit(*values, Estimate(2.0 * damping / frequency, 0.005), AGREES)
+        found = Identified(10.0, fitted, hover_thrust=hover)
         assert within_bounds(found, file, 4.0) == (found, [])
     without_drag = Identified(10.0, drag_ps=Estimate(0.01, 0.02))
     assert within_bounds(without_drag, FILE, 4.0) == (without_drag, [])
@@ -214,6 +217,7 @@ def test_doubt_about_the_tilt_leaves_the_other_constants() -> None:
     assert estimate.vehicle.thrust_delay_s == pytest.approx(0.12)
     assert estimate.vehicle.yaw.delay_s == pytest.approx(0.31)
     estimate.on_contradiction(CONTRADICTS, AGREES, 20.0)
+    assert estimate.uncertainty.tilt_s == UNKNOWN_DELAY_S
     identified = {
         "hover_thrust": 0.62,
         "thrust_lag_s": 0.04,
@@ -248,10 +252,10 @@ def test_delays_of_a_remembered_vehicle_follow_the_link_over_many_flights() -> N
     """From 204 to 108 ms in steps of 24, below the 30 ms that count as a change; one flight ends
     before the link is measured. The vehicle's own delays stay what they are."""
     own_s, at_s = 0.053, 0.204
-    known = IdentifiedVehicle(
-        FILE.model_copy(update={"tilt": FILE.tilt.model_copy(update={"delay_s": own_s + at_s})}),
-        Estimate(own_s + at_s, 0.002), at_s, Estimate(0.3, 0.02),
-    )  # fmt: skip
+    tilt = FILE.tilt.model_copy(update={"delay_s": own_s + at_s})
+    delays = {"tilt": tilt, "thrust_delay_s": 0.06 + at_s}
+    known = IdentifiedVehicle(FILE.model_copy(update=delays), 0.002, at_s, 0.02)
+    thrust_s = effect_s(known.vehicle) - at_s
     for link_s in (0.204, 0.180, None, 0.156, 0.132, 0.108):
         estimate = VehicleEstimate(FILE, delay_error_s=UNKNOWN_DELAY_S, known=known)
         if link_s is not None:
@@ -261,13 +265,31 @@ def test_delays_of_a_remembered_vehicle_follow_the_link_over_many_flights() -> N
         known = estimate.result
         assert known.vehicle.tilt.delay_s - known.link_s == pytest.approx(own_s)
         assert abs(known.link_s - at_s) < 0.03
-        assert known.thrust is not None
-        assert known.thrust.value == pytest.approx(0.3 + known.link_s - 0.204)
+        assert effect_s(known.vehicle) - known.link_s == pytest.approx(thrust_s)
+        assert estimate.uncertainty.thrust_s == pytest.approx(0.06)
+
+
+@pytest.mark.parametrize(("from_s", "to_s"), [(0.2, 0.004), (0.004, 0.6)])
+def test_no_link_moves_a_delay_out_of_its_limits(from_s: float, to_s: float) -> None:
+    """An identified thrust delay of 190 ms behind a link of 200 ms that is gone; a file whose
+    thrust acts later than its tilt, behind a link of 600 ms. Later fits are adopted."""
+    slow = FILE.model_copy(update={"thrust_delay_s": 0.1})
+    recalled = slow.later_by(from_s).model_copy(update={"thrust_delay_s": 0.19})
+    known = IdentifiedVehicle(recalled, 0.002, from_s, 0.02)
+    estimate = VehicleEstimate(slow, delay_error_s=UNKNOWN_DELAY_S, known=known)
+    estimate.on_link_delay(Estimate(to_s, 0.002))
+    assert estimate.uncertainty.tilt_s == pytest.approx(3.0 * math.hypot(0.002, 0.002))
+    for each in (estimate, estimate_with(fit(0.48)), VehicleEstimate(slow, delay_error_s=0.1)):
+        each.adopt(replace(fit(0.48), drag_ps=Estimate(0.7, 0.01)), 10.0)
+        each.adopt(Identified(10.0, drag_ps=Estimate(0.5, 0.01)), 12.0)
+        assert each.vehicle.drag_per_mass_ps == pytest.approx(0.5)
+        Vehicle.model_validate(each.vehicle.model_dump())
 
 
 def test_learner_announces_what_is_new_in_motion(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A lasting contradiction twice, though every new fit seems to explain the flight; another
-    hover thrust of the observer, if it differs by more than 6 % and is within bounds."""
+    """A lasting contradiction twice, though every new fit seems to explain the flight, and one that
+    does not last not at all; another hover thrust of the observer, if it differs by more than 6 %
+    and is within bounds."""
 
     def in_pieces(*_):
         yield
@@ -281,8 +303,9 @@ def test_learner_announces_what_is_new_in_motion(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(learning, "fit_axis", tilt_in_pieces)
     monkeypatch.setattr(learning, "identify_drag", lambda trace, vehicle: Identified(10.0))
 
-    def flown(left: Unexplained, shown: float) -> tuple[Learner, list[str]]:
-        monkeypatch.setattr(learning, "unexplained", lambda trace, response: left)
+    def flown(*left: Unexplained, shown: float) -> tuple[Learner, list[str]]:
+        lefts = itertools.cycle(left)
+        monkeypatch.setattr(learning, "unexplained", lambda trace, response: next(lefts))
         learner, said = Learner(FILE, IdentifySettings(excite=False)), []
         learner.on_stage(Stage.CLIMB, 0.0)
         learner.on_stage(Stage.MOTION, 5.0)
@@ -291,13 +314,14 @@ def test_learner_announces_what_is_new_in_motion(monkeypatch: pytest.MonkeyPatch
             said += update.sentences if update else ()
         return learner, said
 
-    learner, said = flown(CONTRADICTS, 0.42)
+    assert not flown(CONTRADICTS, AGREES, shown=0.42)[0].contradicted
+    learner, said = flown(CONTRADICTS, shown=0.42)
     contradictions = [sentence for sentence in said if "contradicts telemetry" in sentence]
     assert len(contradictions) == 2
     assert contradictions[1].endswith("until nothing contradicts for 20 s")
     assert learner.uncertainty.tilt_s == DOUBTED_DELAY_S
     for shown, used in ((0.42, 0.42), (0.44, 0.42), (0.53, 0.53), (0.3, 0.3), (0.97, 0.42)):
-        learner, said = flown(AGREES, shown)
+        learner, said = flown(AGREES, shown=shown)
         assert learner.vehicle.hover_thrust == pytest.approx(used, abs=0.002)
         assert sum(line.startswith("identified hover thrust") for line in said) == (used != 0.42)
 
@@ -321,7 +345,7 @@ def test_steps_end_where_they_began_and_outside_the_box() -> None:
 
 
 def test_without_identification_the_file_is_flown_and_nothing_is_recalled() -> None:
-    recalled = IdentifiedVehicle(PX4, Estimate(0.04, 0.002), 0.0)
+    recalled = IdentifiedVehicle(PX4, 0.002, 0.0)
     learner = Learner(FILE, IdentifySettings(online=False), known=recalled)
     assert not learner.wants_excitation
     told = []
@@ -332,11 +356,11 @@ def test_without_identification_the_file_is_flown_and_nothing_is_recalled() -> N
     assert (update.vehicle, update.uncertainty.tilt_s) == (FILE, FILE_DELAY_S)
     learner.give_up()  # what the vehicle reports is used all the same
     slower = {"angular_rate_limit_radps": (1.0, 1.0, 3.0)}
-    learner.on_changed(slower)
+    learner.on_shown(slower)
     changed = learner.learn(15.0, 0.53)
     assert changed is not None
     assert changed.vehicle == FILE.model_copy(update=slower)
-    again = Learner(FILE, IdentifySettings(), known=replace(recalled, thrust=Estimate(0.1, 0.09)))
+    again = Learner(FILE, IdentifySettings(), known=replace(recalled, thrust_sd_s=0.09))
     assert again.uncertainty.thrust_s == pytest.approx(0.27)
     assert update.cause.endswith("the vehicle file's delay may be wrong by 130 ms")
     assert (update.sentences, learner.result) == ((), None)

@@ -21,7 +21,6 @@ from offboard.documents.errors import Unavailable, UserError
 from offboard.flight.authority import PilotSwitch
 from offboard.flight.flight_plan import CLEAR_M, FlightPlan
 from offboard.flight.record import joined_configuration
-from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from offboard.link import clock
 from offboard.link.lock import connection_lock, directory_lock
@@ -160,8 +159,7 @@ def test_a_flight_that_cannot_be_recorded_says_so_and_the_next_one_is(
 def test_an_identified_vehicle_is_kept_and_used_for_the_same_file_alone(tmp_path: Path) -> None:
     known = build(load("flight", choices={"vehicle": "px4_sih"}))
     found = known.config.vehicle.model_copy(update={"hover_thrust": 0.51})
-    thrust = Estimate(found.thrust_delay_s + found.thrust_lag_s, 0.04)
-    identified = IdentifiedVehicle(found, Estimate(0.056, 0.002), 0.008, thrust)
+    identified = IdentifiedVehicle(found, 0.002, 0.008, 0.04)
     files = VehicleFiles(tmp_path / "vehicles", print)
     files.keep("px4-1-1", known, identified)
     assert files.get("px4-1-1", known) is identified
