@@ -94,7 +94,6 @@ class Document(Parameters):
     """The content of a file."""
 
     identified_from: str  # digest of the vehicle file
-    tilt_delay_s: float = Field(ge=0, le=1)
     tilt_delay_sd_s: float = Field(gt=0, le=1)
     link_delay_s: float = Field(ge=0, le=10)
     thrust_delay_sd_s: float | None = Field(default=None, gt=0, le=1)  # of delay and lag together
@@ -136,7 +135,6 @@ class VehicleFiles:
         thrust_sd_s = identified.thrust_sd_s
         document = {
             "identified_from": source,
-            "tilt_delay_s": identified.vehicle.tilt.delay_s,
             "tilt_delay_sd_s": identified.delay_sd_s,
             "link_delay_s": identified.link_s,
             "thrust_delay_sd_s": thrust_sd_s if math.isfinite(thrust_sd_s) else None,
