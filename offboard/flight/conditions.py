@@ -78,9 +78,7 @@ def rebooted(flight: FlightState) -> str:
 
 def authority_lost(flight: FlightState) -> str:
     """Another has taken control of the vehicle."""
-    if flight.authority.standing is not Standing.LOST:
-        return ""
-    return flight.authority.lost_reason or Standing.LOST.value
+    return flight.authority.lost_reason
 
 
 def authority_lost_armed(flight: FlightState) -> str:

@@ -57,14 +57,14 @@ def unanswered(flight: FlightState) -> str:
     return f"{requests} requests of TIMESYNC are not answered: does it receive setpoints?"
 
 
-def decision_missed(flight: FlightState) -> bool:
+def decision_missed(flight: FlightState) -> str:
     """A decision failed, came too late, or was not fit to be sent."""
-    return flight.missed > 0
+    return flight.failure if flight.missed else ""
 
 
-def decisions_missed(flight: FlightState) -> bool:
+def decisions_missed(flight: FlightState) -> str:
     """Decisions missed in a row."""
-    return flight.missed >= flight.limits.missed_decisions
+    return flight.failure if flight.missed >= flight.limits.missed_decisions else ""
 
 
 def tilted(flight: FlightState) -> str:
@@ -233,9 +233,9 @@ def contradicted(flight: FlightState) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """`action` is taken when `condition` has held for `held_s`. `cause` and `reason` are as in
-    `conditions.Transition`. `limit`: the settings that have it, or its value. The first line of the
-    condition's docstring says in the documentation what is measured."""
+    """`action` is taken when `condition`, which says why it holds, has held for `held_s`. `cause`
+    is as in `conditions.Transition`. `limit`: the settings that have it, or its value. The first
+    line of the condition's docstring says in the documentation what is measured."""
 
     name: str
     condition: Condition
@@ -243,7 +243,6 @@ class Row:
     action: Action
     held_s: float = 0.0
     cause: str = "limit"
-    reason: str = ""
 
     def settings(self, limits: Limits) -> str:
         """The end of the sentence: which settings have the limit, and their values."""
@@ -253,7 +252,7 @@ class Row:
 
 
 LEVEL, HOLD, LAND = Action.LEVEL, Action.HOLD, Action.LAND
-MISSED = "{flight.failure_cause}", "{flight.failure}"
+MISSED = "{flight.failure_cause}"
 LATE = "limits.link_growth_s, limits.setpoint_age_s"
 UNIDENTIFIED = "BOUNDS of identification"
 ROWS = (
@@ -264,8 +263,8 @@ ROWS = (
     Row("age", telemetry_old, "limits.setpoint_age_s", LEVEL, cause="link"),
     Row("link", late_link, LATE, HOLD, 0.5, "link"),
     Row("uplink", unanswered, "limits.silence_s", HOLD, 0.5, "link"),
-    Row("decision", decision_missed, "one", LEVEL, 0.0, *MISSED),
-    Row("decisions", decisions_missed, "limits.missed_decisions", LAND, 0.0, *MISSED),
+    Row("decision", decision_missed, "one", LEVEL, cause=MISSED),
+    Row("decisions", decisions_missed, "limits.missed_decisions", LAND, cause=MISSED),
     Row("tilt", tilted, "limits.tilt_rad", LAND),
     Row("tilt error", away_from_commands, "limits.tilt_error_rad", LAND, 0.5),
     Row("position error", away_from_reference, "limits.position_error_m", LAND),
@@ -304,6 +303,5 @@ def judge(flight: FlightState, rows: Sequence[Row] = ROWS) -> None:
         known.held_s[row.name] = held_s
         if holds and held_s >= row.held_s and row.action > known.action:
             known.action, known.row = row.action, row.name
-            sentence = row.reason.format(flight=flight) or str(holds)
-            known.reason = sentence + row.settings(flight.limits)
+            known.reason = f"{holds}{row.settings(flight.limits)}"
             known.cause = row.cause.format(flight=flight)

@@ -100,7 +100,6 @@ class Flight(FlightState):
         if math.isnan(before_s):
             before_s = self.heard_s = self.host_s
         paused_s = self.host_s - before_s
-        self.silence_s = self.host_s - self.heard_s
         self.note_missing_setpoints()
         if session.settings.lockstep:
             return
@@ -148,7 +147,7 @@ class Flight(FlightState):
             self.began_s += self.now_s - before_s  # a landing that is not seen takes no time
         if self._heard:
             self.heard_s = session.elapsed_s(host_now_s)
-            self.silence_s = self.bridged_s = 0.0
+            self.bridged_s = 0.0
         return due
 
     def _begin_tick(self) -> bool:
@@ -167,8 +166,8 @@ class Flight(FlightState):
 
     def _follow_link(self) -> None:
         """The link may have become later: prediction and bandwidth take that into account."""
-        growth = self.clock.growth
-        changed = self.phase in FLYING and growth.step(self.time_s, self.link_growth_s)
+        growth, growth_s = self.clock.growth, max(self.clock.delay_growth_s, self.age_s)
+        changed = self.phase in FLYING and growth.step(self.time_s, growth_s)
         if changed and self.identification:
             self.identification.on_link_growth(growth.added_s, growth.changed_s)
 

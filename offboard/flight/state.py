@@ -56,7 +56,7 @@ MISSING_KNOWN_S = 3.0  # HEARTBEAT, at 1 Hz, shows the failsafe
 # of the flight before, with the same vehicle
 KEPT = (
     "vehicle", "contact", "clock", "hover", "jumps", "reading", "other_datagrams", "host_s",
-    "silence_s", "heard_s", "guarded", "announced", "announcements",
+    "heard_s", "guarded", "announced", "announcements",
 )  # fmt: skip
 
 
@@ -103,7 +103,6 @@ class FlightState(Ground):
 
     phase: Phase = Phase.CONNECT
     began_s: float = 0.0  # of the phase, on `Session.link_time_s`
-    silence_s: float = 0.0  # host time since the newest telemetry
     setpoint_s: float = math.inf  # when the newest setpoint left; infinite before the first
     setpoints_missed_s: float = -math.inf  # when setpoints may have been missing for long
     rebooted: bool = False
@@ -176,6 +175,12 @@ class FlightState(Ground):
     def now_s(self) -> float:
         """`Session.link_time_s` at the newest event, or at the present turn."""
         return self.vehicle.now_s
+
+    @property
+    def silence_s(self) -> float:
+        """Host time since the newest telemetry; 0 before the first turn. In lockstep the turn in
+        which some arrives is later than `host_s`, its beginning."""
+        return max(0.0, self.host_s - self.heard_s)
 
     @property
     def in_the_air(self) -> bool:
@@ -300,11 +305,6 @@ class FlightState(Ground):
             return "no LOCAL_POSITION_NED shows it"
         on_ground = vehicle.landed == "on_ground" and vehicle.age_s(Landed) < DETECTOR_KNOWN_S
         return self.touchdown.not_landed(on_ground=on_ground)
-
-    @property
-    def link_growth_s(self) -> float:
-        """Growth of the link's delay since take-off, or the age of telemetry if that is more."""
-        return max(self.clock.delay_growth_s, self.age_s)
 
     def delays_begin_s(self, time_s: float) -> float:
         """The vehicle time at which the vehicle model's delays begin for a command of the tick

@@ -67,6 +67,7 @@ def _stand(standing: Standing, armed: bool | None = None) -> Setup:
         if armed is not None:
             heartbeat(flight, armed=armed)
         flight.authority.standing, flight.authority.lost_s = standing, NOW_S - 1.0
+        flight.authority.lost_reason = standing.value if standing is Standing.LOST else ""
 
     return apply
 
@@ -183,13 +184,13 @@ EVENTS: dict[str, Setup] = {
     "authority_lost_armed": _stand(Standing.LOST, armed=True),
     "authority_lost_disarmed": _stand(Standing.LOST, armed=False),
     "mode_unknown": _unhear_mode,
-    "silent": _set(silence_s=1.01),
+    "silent": _set(heard_s=-1.01),
     "in_own_failsafe": _stand(Standing.FAILSAFE),
     "unheard_on_ground": _unhear_mode,
-    "out_of_reach": _set(silence_s=OUTAGE_MAX_S + 0.1),
-    "silent_on_ground": _set(silence_s=20.1),
-    "silent_for_another": _all(_since(5.2), _set(silence_s=5.1)),
-    "not_found": _set(silence_s=20.1),
+    "out_of_reach": _set(heard_s=-OUTAGE_MAX_S - 0.1),
+    "silent_on_ground": _set(heard_s=-20.1),
+    "silent_for_another": _all(_since(5.2), _set(heard_s=-5.1)),
+    "not_found": _set(heard_s=-20.1),
     "blind": _age_attitude,
     "stop_requested": _stop,
     "stop_requested_on_ground": _all(_rest, _set(stop_reason="stop requested")),
@@ -248,7 +249,7 @@ def test_every_wait_is_limited() -> None:
         if phase is Phase.CLIMB:
             later = _climb_late  # after the way that was planned
         if phase is Phase.CONNECT:
-            later = _set(silence_s=1e4)  # only the wall clock runs before there is telemetry
+            later = _set(heard_s=-1e4)  # only the wall clock runs before there is telemetry
         later(flight)
         assert next_row(flight) is not None
 
@@ -258,7 +259,7 @@ def test_the_service_waits_for_ever() -> None:
         for phase in (Phase.CONNECT, Phase.HEALTH, Phase.STANDBY, Phase.PAUSE):
             silent = phase in (Phase.CONNECT, Phase.HEALTH)
             flight = uneventful(phase, service)
-            flight.began_s, flight.silence_s = -1e6, 2e6 if silent else 0.0
+            flight.began_s, flight.heard_s = -1e6, -2e6 if silent else 0.0
             assert next_row(flight) is None
         heard = uneventful(Phase.HEALTH, service)  # and then nothing: it may be another vehicle
         EVENTS["silent_for_another"](heard)
