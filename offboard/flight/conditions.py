@@ -22,8 +22,8 @@ class Transition:
 
     `exit_code` is set if this row decides the result; a later row can only make it more severe.
     `cause` is a word for what ended a flight that the row ends (see `analysis.verdict`). `reason`
-    is the sentence, or a function that says it, where the condition does not. Texts may have values
-    of the flight in braces.
+    is the sentence, where the condition does not say it. Texts may have values of the flight in
+    braces.
     """
 
     phases: Set[Phase]
@@ -31,12 +31,10 @@ class Transition:
     target: Phase
     exit_code: int | None = None
     cause: str = ""
-    reason: str | Callable[[FlightState], str] = ""
+    reason: str = ""
 
     def why(self, flight: FlightState) -> str:
         """The sentence that says why the row is taken, while its condition holds."""
-        if callable(self.reason):
-            return self.reason(flight)
         return self.reason.format(flight=flight) or str(self.condition(flight))
 
 
@@ -98,11 +96,11 @@ def stop_requested(flight: FlightState) -> str:
     return flight.stop_reason
 
 
-def longer_than(limit: str) -> Condition:
-    """Holds once the phase has lasted longer than the limit of this name."""
+def longer_than(limit: str, says: Condition = lambda flight: True) -> Condition:
+    """Holds once the phase has lasted longer than the limit of this name; `says` why then."""
 
-    def too_long(flight: FlightState) -> bool:
-        return flight.in_phase_s > float(getattr(flight.limits, limit))
+    def too_long(flight: FlightState) -> str | bool:
+        return flight.in_phase_s > getattr(flight.limits, limit) and says(flight)
 
     too_long.__name__ = f"longer_than_{limit}"
     return too_long

@@ -14,8 +14,6 @@ from offboard.reference.track import Moved, Track
 from offboard.reference.transfer import Limits, stopping_place, transfer
 
 Array = NDArray[np.float64]
-SETTLED_DISTANCE_M = 0.3
-SETTLED_SPEED_MPS = 0.3
 # after a jump of the estimate
 RETURN = Limits(speed_mps=0.5, acceleration_mps2=0.5, cruise_mps=0.5, cruise_vertical_mps=0.5)
 CLEAR_M = 0.5  # above the ground, of a track that is placed in the air
@@ -135,17 +133,6 @@ class FlightPlan:
     def overdue_s(self, time_s: float) -> float:
         """Time since the planned end of the climb, s; negative before it, NaN without a climb."""
         return time_s - self._arrival_s
-
-    def at_start(self, time_s: float, position_ned_m: Array, velocity_ned_mps: Array) -> bool:
-        """Whether the planned climb is over and a vehicle at this position, with this velocity
-        (3,), hovers at its end."""
-        if not time_s >= self._arrival_s or self.reference is None:
-            return False
-        target = self.reference.sample(time_s)
-        return bool(
-            np.linalg.norm(position_ned_m - target.position_ned_m) < SETTLED_DISTANCE_M
-            and np.linalg.norm(velocity_ned_mps) < SETTLED_SPEED_MPS
-        )
 
     def sample(self, time_s: float) -> FlatSample | None:
         """The reference at a vehicle time; None on the ground."""

@@ -40,6 +40,7 @@ TAKE_OVER_HEIGHT_M = 1.0  # where setpoints replace the autopilot's own take-off
 DETECTOR_S = 1.0  # EXTENDED_SYS_STATE is requested at 5 Hz
 # s after the planned end of the climb, when the vehicle is identified though it is not at rest
 RESTLESS_S = 5.0
+SETTLED_DISTANCE_M, SETTLED_SPEED_MPS = 0.3, 0.3  # at the start
 NEAR_M = 0.6  # from the start
 REST_S = 0.5  # after the end of the reference
 # Relative error of hover_thrust; a smaller one does not keep a vehicle from the start
@@ -53,12 +54,12 @@ def lifted_off(flight: FlightState) -> bool:
 
 
 def at_start(flight: FlightState) -> bool:
-    """The vehicle hovers at the start of the reference."""
-    position, time_s = flight.vehicle.position, flight.time_s
-    if position is None or not flight.plan.overdue_s(time_s) >= 0.0:
+    """The planned climb is over, and the vehicle hovers at its end."""
+    near = flight.position_error_m < SETTLED_DISTANCE_M
+    if not (near and flight.plan.overdue_s(flight.time_s) >= 0.0):
         return False
-    velocity_ned_mps = flight.observer.predict(time_s).velocity_ned_mps
-    return flight.plan.at_start(time_s, np.array(position.position_ned_m), velocity_ned_mps)
+    speed_mps = np.linalg.norm(flight.observer.predict(flight.time_s).velocity_ned_mps)
+    return bool(speed_mps < SETTLED_SPEED_MPS)
 
 
 def at_start_to_excite(flight: FlightState) -> bool:
@@ -255,7 +256,7 @@ def ends_early(*, serves: bool) -> tuple[Transition, ...]:
 
 TO_THE_END = (
     Transition({TAKEOFF}, lifted_off, CLIMB, reason="lifted off"),
-    Transition({TAKEOFF}, longer_than("lift_off_s"), LAND, ABORTED, reason=no_lift_off),
+    Transition({TAKEOFF}, longer_than("lift_off_s", no_lift_off), LAND, ABORTED),
     Transition({CLIMB}, at_start_to_excite, EXCITE, reason="identification steps"),
     Transition({CLIMB}, at_start, JOIN, reason=AT_START),
     Transition({CLIMB}, restless, EXCITE),
@@ -271,7 +272,7 @@ TO_THE_END = (
     Transition({LAND}, authority_lost_armed, YIELDED, ABORTED, "mode change"),
     Transition({LAND}, unheard_on_ground, FAILED, ABORTED, reason=UNHEARD),
     Transition({LAND}, out_of_reach, FAILED, ABORTED),
-    Transition({LAND}, longer_than("land_s"), FAILED, ABORTED, reason=not_disarmed),
+    Transition({LAND}, longer_than("land_s", not_disarmed), FAILED, ABORTED),
 )
 HANDED_BACK, NOT_BEGUN = "handed back on request", "stopped on request"
 hand_back, start = requested(Request.HAND_BACK), requested(Request.START)

@@ -238,7 +238,7 @@ FLY_BEGINS = (
     Transition({HEALTH}, stop_requested, FAILED, REFUSED, OPERATOR, BEFORE_TAKEOFF),
     Transition({HEALTH}, refused, FAILED, REFUSED),
     Transition({HEALTH}, usable, STREAM, reason="telemetry flows and the vehicle can arm"),
-    Transition({HEALTH}, longer_than("health_s"), FAILED, REFUSED, reason=not_ready),
+    Transition({HEALTH}, longer_than("health_s", not_ready), FAILED, REFUSED),
 )
 SERVICE_BEGINS = (
     Transition({CONNECT}, stop_requested, FAILED, FLOWN, OPERATOR),
@@ -269,7 +269,7 @@ STARTING = (
     Transition(STREAMING, authority_lost, FAILED, REFUSED, "mode change"),
     Transition({STREAM}, streamed, ENGAGE),
     Transition({ENGAGE}, engaged, ARM),
-    Transition({ENGAGE}, longer_than("engage_s"), FAILED, REFUSED, reason=not_engaged),
+    Transition({ENGAGE}, longer_than("engage_s", not_engaged), FAILED, REFUSED),
     Transition({ARM}, rebooted, STAND_DOWN, REFUSED, "restart"),
     Transition({ARM}, authority_lost_armed, YIELDED, ABORTED, "mode change", LOST_AS_IT_ARMED),
     Transition({ARM}, authority_lost_disarmed, FAILED, REFUSED, "mode change"),
@@ -279,9 +279,9 @@ STARTING = (
     Transition({ARM}, stop_requested, STAND_DOWN, REFUSED, OPERATOR),
     Transition({ARM}, armed, TAKEOFF),
     Transition({ARM}, disarmed_again, STAND_DOWN, REFUSED, reason=DISARMED_AGAIN),
-    Transition({ARM}, longer_than("arm_s"), STAND_DOWN, REFUSED, reason=not_armed),
+    Transition({ARM}, longer_than("arm_s", not_armed), STAND_DOWN, REFUSED),
     Transition({TAKEOFF}, stop_requested_on_ground, STAND_DOWN, REFUSED, OPERATOR),
     Transition({STAND_DOWN}, rises, LAND, ABORTED, reason=FLIGHT_DETECTED),
     Transition({STAND_DOWN}, disarmed_for_good, FAILED, reason="disarmed on the ground"),
-    Transition({STAND_DOWN}, longer_than("disarm_s"), FAILED, ABORTED, reason=still_armed),
+    Transition({STAND_DOWN}, longer_than("disarm_s", still_armed), FAILED, ABORTED),
 )

@@ -8,6 +8,7 @@ from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from flight_tables import IN_THE_AIR, README, asked, exits, with_tables
 from uneventful import NOW_S, TRACK, hear, heartbeat, lift, position, uneventful
@@ -94,15 +95,16 @@ def _age_attitude(flight: FlightState) -> None:
     flight.vehicle.attitude = Attitude(NOW_S - 0.51, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
 
-def _climb(overdue_s: float, at_start: bool) -> Setup:
+def _climb(overdue_s: float, away_m: float) -> Setup:
+    start = SimpleNamespace(position_ned_m=np.array([0.0, 0.0, away_m]))
     plan: Any = SimpleNamespace(
-        overdue_s=lambda time_s: overdue_s, at_start=lambda *_: at_start, track=TRACK,
-        sample=lambda time_s: None, reference=None, track_time_s=lambda time_s: math.nan,
+        overdue_s=lambda time_s: overdue_s, track=TRACK, sample=lambda time_s: start,
+        reference=None, track_time_s=lambda time_s: math.nan,
     )  # fmt: skip
     return _set(plan=plan)
 
 
-_reach_start, _climb_late = _climb(1.0, True), _climb(90.1, False)
+_reach_start, _climb_late = _climb(1.0, 0.29), _climb(90.1, 0.31)
 
 
 def _refuse_arming(flight: FlightState) -> None:
@@ -164,7 +166,7 @@ EVENTS: dict[str, Setup] = {
     "lifted_off": _lift_off,
     "at_start": _reach_start,
     "at_start_to_excite": _all(_reach_start, _identify(wants_excitation=True)),
-    "restless": _all(_climb(5.1, False), _identify(wants_excitation=True)),
+    "restless": _all(_climb(5.1, 0.31), _identify(wants_excitation=True)),
     "identified": _identify(finished=lambda time_s: True, delay=Estimate(0.1, 0.01)),
     "not_identified": _since(Limits.excite_s + 0.1),
     "at_full_speed": _track_for(TRACK.track_start_s),
