@@ -82,10 +82,15 @@ class GroundContact:
         return self.position_known and self.stood_for(STANDING_S)
 
     @property
+    def detected(self) -> str:
+        """What the land detector reports (`Landed`); "unknown" without a recent report."""
+        known = self.vehicle.age_s(Landed) <= DETECTOR_KNOWN_S
+        return self.vehicle.landed if known else "unknown"
+
+    @property
     def detects_flight(self) -> bool:
         """The land detector reports that the vehicle is not on the ground."""
-        known = self.vehicle.age_s(Landed) <= DETECTOR_KNOWN_S
-        return known and self.vehicle.landed not in ("on_ground", "unknown")
+        return self.detected not in ("on_ground", "unknown")
 
     @property
     def flies(self) -> bool:
@@ -97,14 +102,12 @@ class GroundContact:
     @property
     def on_ground(self) -> bool:
         """Disarmed, or land detector, height and vertical speed all say that it stands."""
-        vehicle = self.vehicle
-        if vehicle.disarmed:
+        if self.vehicle.disarmed:
             return True
-        if vehicle.landed != "on_ground" or vehicle.age_s(Landed) > DETECTOR_KNOWN_S:
-            return False
-        position = vehicle.position
+        position = self.vehicle.position
         return (
-            position is not None
+            self.detected == "on_ground"
+            and position is not None
             and abs(self.height_m) < RESTING_HEIGHT_M
             and abs(position.velocity_ned_mps[2]) < GROUND_SPEED_MPS
         )

@@ -20,7 +20,7 @@ from offboard.estimation.observer import Observer
 from offboard.flight.authority import Authority, PilotSwitch, Standing
 from offboard.flight.estimates import HoverEstimate, Positioning, PositionJumps
 from offboard.flight.flight_plan import FlightPlan
-from offboard.flight.ground_contact import DETECTOR_KNOWN_S, GroundContact, Touchdown
+from offboard.flight.ground_contact import GroundContact, Touchdown
 from offboard.flight.phases import (
     ENDS,
     OPERATOR_STOP,
@@ -33,7 +33,7 @@ from offboard.flight.preflight import Ground
 from offboard.flight.record import Decided
 from offboard.flight.timing import Busyness, LinkGrowth
 from offboard.identification.learner import Learner
-from offboard.mavlink.events import Heartbeat, Landed, TimesyncReply, Triple
+from offboard.mavlink.events import Heartbeat, TimesyncReply, Triple
 from offboard.mavlink.outgoing import (
     AttitudeTarget,
     CommandLong,
@@ -298,13 +298,11 @@ class FlightState(Ground):
 
     def not_landed(self) -> str:
         """Why the vehicle has not landed; empty if it has."""
-        vehicle = self.vehicle
         if self.touchdown is None:
             return "it was not told to land"
         if not self.contact.position_known:
             return "no LOCAL_POSITION_NED shows it"
-        on_ground = vehicle.landed == "on_ground" and vehicle.age_s(Landed) < DETECTOR_KNOWN_S
-        return self.touchdown.not_landed(on_ground=on_ground)
+        return self.touchdown.not_landed(on_ground=self.contact.detected == "on_ground")
 
     def delays_begin_s(self, time_s: float) -> float:
         """The vehicle time at which the vehicle model's delays begin for a command of the tick
