@@ -141,8 +141,8 @@ def loss(seen: Observation) -> Iterable[Finding]:
     """Frames that are lost, and bytes that are damaged."""
     senders = seen.senders
     sender = next((each for each in senders.found if each.ids == _ids(seen)), None)
-    if sender is None:
-        return
+    if sender is None or len(sender.peers) > 1:  # of two that send with its ids, or of a new port,
+        return  # sequence numbers show nothing
     lost, received = senders.lost(sender), senders.splitter
     share = lost / (sender.frames + lost)
     damaged = received.bytes_skipped / max(received.bytes_received, 1)

@@ -88,7 +88,7 @@ class Senders:
     def __init__(self, stream: bool) -> None:
         self.splitter = FrameSplitter(stream)
         self._senders: dict[tuple[int, int], Sender] = {}
-        self._sequences: dict[tuple[int | str, ...], int] = {}
+        self._sequences: dict[tuple[int, ...], int] = {}
         self._lost: Counter[tuple[int, ...]] = Counter()  # by sender, and by system
         self.message_bytes: Counter[str] = Counter()
 
@@ -105,17 +105,15 @@ class Senders:
         message = mavlink_map.get(frame.message_id)
         self.message_bytes[message.msgname if message else str(frame.message_id)] += len(frame.raw)
         sender.frames += 1
-        place = peer_name(peer)
         if len(sender.peers) < _PEERS_MAX:
-            sender.peers.add(place)
+            sender.peers.add(peer_name(peer))
         sender.times += frame.message_id in _TIMES
         if frame.message_id == HEARTBEAT:
             sender.heartbeat = frame.message
         for key in (ids, ids[:1]):
-            counted = *key, place  # two that have the same ids send from two addresses
-            gap = (frame.sequence - self._sequences.get(counted, frame.sequence - 1) - 1) % 256
+            gap = (frame.sequence - self._sequences.get(key, frame.sequence - 1) - 1) % 256
             self._lost[key] += gap if gap < 128 else 0  # more: out of order
-            self._sequences[counted] = frame.sequence
+            self._sequences[key] = frame.sequence
 
     def lost(self, sender: Sender) -> int:
         """Frames of a sender that are missing by the gaps of its sequence numbers. Components that

@@ -21,7 +21,7 @@ RECOVERY = 0.25  # seconds by which a held time decreases in one without the con
 STEP_MAX_S = 0.2  # what one sample counts for, also after a gap of telemetry
 SINK_MPS = 0.3  # that full thrust stops within the delay, on a vehicle that can be flown
 FULL_THRUST = 0.99
-CARRIED = 0.5  # of the hover thrust: no updraft, and no payload that is dropped, is as large
+CARRIED = 0.5  # of the hover thrust: no updraft, and hardly a payload, makes such a difference
 STANDS_BELOW_M = 0.25  # references are at least 0.5 m above the take-off point
 THRUST_REPORT_S = 1.0  # age of a ThrustReport that counts
 
@@ -182,16 +182,16 @@ def stands_on_ground(flight: FlightState) -> str:
 
 
 def carried_by_ground(flight: FlightState) -> str:
-    """Normalised thrust that hovers now, divided by the identified one.
+    """Normalised thrust that hovers now, divided by the one that hovered when the reference began.
 
     The vehicle stands on something, also where its estimated height is wrong."""
-    thrust, identified = flight.observer.hover_thrust_estimate, flight.model.hover_thrust
-    known = flight.identification and flight.phase in TRACKING - {Phase.CLIMB, Phase.EXCITE}
-    if not known or not thrust < CARRIED * identified:
+    thrust, before = flight.observer.hover_thrust_estimate, flight.joined_thrust
+    begun = flight.phase in TRACKING - {Phase.CLIMB, Phase.EXCITE}
+    if not begun or not thrust < CARRIED * before:
         return ""
     return (
-        f"the vehicle stands on something: {100.0 * thrust:.0f} % of its thrust keeps it there, "
-        f"and {100.0 * identified:.0f} % hovers"
+        f"the vehicle needs {100.0 * thrust:.0f} % of its thrust instead of {100.0 * before:.0f} %:"
+        " it stands on something, or has lost half of its weight"
     )
 
 

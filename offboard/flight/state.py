@@ -138,6 +138,7 @@ class FlightState(Ground):
     text_id: int = 0
     awaits_link: bool = False  # while landing
     follows_others: bool = False  # the newest ThrustReport is of none of `thrusts`
+    joined_thrust: float = math.nan  # normalised, that hovered when the reference began
     predictions: deque[PredictedState] = field(default_factory=lambda: deque(maxlen=8))
 
     def __post_init__(self, before: FlightState | None) -> None:
@@ -228,11 +229,11 @@ class FlightState(Ground):
 
     @property
     def position_error_m(self) -> float:
-        """Distance of the reported position from the reference; 0 without a reference."""
+        """Distance of the reported position from the reference; NaN without one of them."""
         position = self.vehicle.position
         sample = self.plan.sample(position.time_s) if position else None
         if position is None or sample is None:
-            return 0.0
+            return math.nan
         return float(np.linalg.norm(np.array(position.position_ned_m) - sample.position_ned_m))
 
     @property

@@ -171,6 +171,7 @@ def _enter(flight: FlightState, row: Transition) -> None:
     elif row.target is Phase.CLIMB:
         _begin_climb(flight, source)
     elif row.target is Phase.JOIN:
+        flight.joined_thrust = flight.observer.hover_thrust_estimate
         flight.plan.start_track(flight.time_s)
     elif row.target is Phase.PAUSE:
         flight.plan.pause(flight.time_s)

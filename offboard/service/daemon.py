@@ -84,7 +84,6 @@ def run(
             tell(UNSCORED.format(number=len(recorder.unscored), command=command))
         memory = stack.enter_context(closing(VehicleFiles(directory / "vehicles", tell)))
         manager = Manager()
-        manager.tell("READY=1")
         link = opened(vehicle.address, stops, tell, manager)
         if link is None:
             tell(STOPPED_EARLY)
@@ -145,7 +144,7 @@ def opened(
 
 class Manager:
     """The service manager (systemd), if there is one. Does not wait for it: a notice for which it
-    has no room is dropped; watchdog and status are told again a second later."""
+    has no room is dropped; that the service is ready, watchdog and status are told every second."""
 
     def __init__(self) -> None:
         self._notifier = SystemdNotifier()  # raises nothing
@@ -162,7 +161,7 @@ class Manager:
         """The loop runs: once a second, and with a new status, to watchdog and status."""
         if now_s - self._told_s >= WATCHDOG_EVERY_S or status != self._status:
             self._told_s, self._status = now_s, status
-            self.tell(f"WATCHDOG=1\nSTATUS={status}")
+            self.tell(f"READY=1\nWATCHDOG=1\nSTATUS={status}")
 
 
 # --- the unit of systemd ---

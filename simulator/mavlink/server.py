@@ -23,6 +23,7 @@ _AXIS_NOT_USED = 2**15 - 1  # of MANUAL_CONTROL
 _NO_PLACE = 2**31 - 1  # in x and y of COMMAND_INT
 _OF_ALL = (519, 520)  # MAV_CMD: requests of the protocol and the version, which all systems answer
 _SEEN_MAX = 16  # MAX_REMOTE_COMPONENTS of PX4
+_NOT_FORWARDED = ("TIMESYNC", "SETUP_SIGNING")  # the clock of lockstep; it holds the key
 _FTP_NAK, _FTP_ERROR_NOT_FOUND = 128 + 1, 10
 
 
@@ -95,15 +96,18 @@ class Server:
 
     def _forward(self, message: Message) -> None:
         """Forward a message, unless it is for the autopilot alone, to each other link on which its
-        target was seen, or anybody where it is for all: as PX4's SITL and ArduPilot do. Not
-        TIMESYNC, which is the clock of lockstep."""
+        target was seen, or anybody where it is for all: as PX4's SITL and ArduPilot do. Not what
+        comes back, as through a router that has both links."""
         sender, target = sender_of(message), target_of(message)
+        ours = self.view.system, MAV_COMP_ID_AUTOPILOT
+        if sender == ours:
+            return
         if sender not in self._seen and len(self._seen) < _SEEN_MAX:
             self._seen.append(sender)
-        if target == (self.view.system, MAV_COMP_ID_AUTOPILOT) or message.get_type() == "TIMESYNC":
+        if target == ours or message.get_type() in _NOT_FORWARDED:
             return
         for link in self.others:
-            if any(_matches(target, peer) for peer in link._seen):
+            if sender not in link._seen and any(_matches(target, peer) for peer in link._seen):
                 link.outbox.forward(bytes(message.get_msgbuf()))
 
     def _is_for_us(self, message: Message) -> bool:

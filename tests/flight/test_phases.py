@@ -167,7 +167,9 @@ EVENTS: dict[str, Setup] = {
     "at_start": _reach_start,
     "at_start_to_excite": _all(_reach_start, _identify(wants_excitation=True)),
     "restless": _all(_climb(5.1, 0.31), _identify(wants_excitation=True)),
-    "identified": _identify(finished=lambda time_s: True, delay=Estimate(0.1, 0.01)),
+    "identified": _all(
+        _reach_start, _identify(finished=lambda time_s: True, delay=Estimate(0.1, 0.01))
+    ),
     "not_identified": _since(Limits.excite_s + 0.1),
     "at_full_speed": _track_for(TRACK.track_start_s),
     "track_over": _track_for(TRACK.track_end_s),
@@ -242,6 +244,19 @@ def test_every_row_is_taken_when_its_condition_holds(service: ServiceOptions | N
             assert next_row(flight) is row, (phase, row.condition.__name__)
             assert row.why(flight) not in ("", "True")
             assert "{" not in row.why(flight) + row.cause.format(flight=flight)
+
+
+def test_the_start_is_reached_by_a_vehicle_that_is_seen_to_rest_there() -> None:
+    for there, changed in (
+        (True, _set()),
+        (False, lambda flight: setattr(flight.vehicle, "position", None)),
+        (False, lambda flight: vars(flight.observer).update(
+            predict=lambda time_s: SimpleNamespace(velocity_ned_mps=np.array([0.0, 0.0, 0.5])))),
+    ):  # fmt: skip
+        flight = uneventful(Phase.CLIMB)
+        _reach_start(flight)
+        changed(flight)
+        assert flying.at_start(flight) is there
 
 
 def test_every_wait_is_limited() -> None:

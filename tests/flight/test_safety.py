@@ -202,8 +202,8 @@ ROWS = {
     ),
     # "flown and landed" before: by its estimate it was 3 m high
     "it has sunk to the ground, and its estimate has not": ends(
-        r"the vehicle stands on something: [0-9]+ % of its thrust keeps it there", landed,
-        fly=partial(copter.hover, "reference.duration_s=8.0"), learning=IdentifySettings(),
+        r"the vehicle needs [0-9]+ % of its thrust instead of [0-9]+ %: it stands on", landed,
+        fly=partial(copter.hover, "reference.duration_s=10.0"),
         at=tracking(lambda pair: pair.instance.autopilot.plant.reset_estimate((0.0, 0.0, -1.9))),
         failsafes=["carried"], ended_by="ground contact",
     ),
