@@ -88,7 +88,10 @@ def _links(options: Options, number: int) -> tuple[Link, Link | None]:
     The local ports of PX4 SITL only by default: a real PX4 beside us may use them.
     """
     port = ANY_PORT if options.connect else LOCAL_COMPANION_PORT + number
-    companion = open_link(shifted(_companion_link(options), number - options.numbers[0]), port)
+    url = shifted(_companion_link(options), number - options.numbers[0])
+    companion = open_link(url, port)
+    if port not in (ANY_PORT, companion.port):
+        _warn(f"port {port} is in use: another simulator or PX4 may send to {url}, too")
     if options.gcs == NO_LINK:
         return companion, None
     return companion, open_link(options.gcs, LOCAL_GROUND_PORT + number)

@@ -42,13 +42,13 @@ def summary(score: Score, history: History) -> dict[str, str]:
     if math.isfinite(score.answer_p99_ms):
         answer = f"{score.answer_p50_ms:.1f} ms (p99 {score.answer_p99_ms:.1f} ms)"
         missed = f"{undecided + score.refused_setpoints:.0f} of {ticks:.0f} ticks missed"
-        rows["timing"] = f"setpoint after {answer}, {missed}"
+        rows["timing"] = f"setpoint {answer} after its telemetry, {missed}"
     if busy := too_busy(score.skipped_ticks, ticks, score.pause_max_s):
         rows["computer"] = busy
     elif score.at_bound_share >= AT_LIMIT_SHARE:
         share = f"{100.0 * score.at_bound_share:.0f} % of the decisions"
         rows["at a limit"] = (
-            f"{share}: fly slower, in less wind, or with a lower controller.bandwidth_radps"
+            f"{share}: fly slower, in less wind, or with a lower bandwidth of the controller"
         )
     if score.other_datagrams > 0:
         rows["ignored"] = (

@@ -19,14 +19,15 @@ def check(
     """Check configuration files without flying.
 
     Accepts flight configurations, vehicles, controllers, scenarios, references (.yaml or .csv),
-    campaigns and tunings. A reference must also be within the limits of the vehicle.
+    campaigns and tunings. A reference must also be within the limits of the
+    default vehicle, or of that of its configuration.
 
     Exit codes: 0 all files are valid; 2 one is not, or usage error.
     """
     problems = []
     for path in files:
         try:
-            say(f"{path}: {_checked(path)}, valid", indent=2)
+            say(f"{path}: {_checked(path)}", indent=2)
         except DocumentError as error:
             problems.append(str(error))
     if problems:
@@ -34,8 +35,8 @@ def check(
 
 
 def _checked(path: Path) -> str:
-    """Validate a file; what it is. A reference must be flyable by the default flight's vehicle, a
-    flight's by its own. Raises DocumentError."""
+    """Validate a file; what is said of a valid one. A reference must be flyable by the default
+    flight's vehicle, a flight's by its own. Raises DocumentError."""
     from offboard.campaign.cases import base_cases
     from offboard.campaign.document import CampaignFile
     from offboard.campaign.tune import TuneFile, planned
@@ -50,7 +51,9 @@ def _checked(path: Path) -> str:
     if kind == "configuration":
         build_track(load(name))
     elif kind == "reference":
-        build_track(load("flight", choices={kind: name}))
+        flown = load("flight", choices={kind: name})
+        build_track(flown)
+        return f"{kind}, valid for the vehicle {flown.vehicle.name}"
     elif kind in shipped.PARTS:
         read_part(kind, name)
     elif kind == "scenario":
@@ -69,7 +72,7 @@ def _checked(path: Path) -> str:
             "shape, a scenario conditions or faults, a configuration these three: "
             f"{', '.join(shipped.PARTS)}"
         )
-    return kind
+    return f"{kind}, valid"
 
 
 def list_files() -> None:

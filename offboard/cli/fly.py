@@ -136,12 +136,13 @@ def _conclude(
     from offboard.analysis.score_table import summary
     from offboard.live.display import DIGITS, line
 
+    log = str(directory / "flight.tlog")
     try:
         score, history = scored(directory)
         outcome, rows = judged(outcome, score), summary(score, history)
     except (UserError, KeyboardInterrupt) as error:
         score = Score(ended_by=f"it cannot be scored: {str(error) or 'interrupted'}")
-        rows, page = {}, ""
+        rows, page = {"log": log} if isinstance(error, KeyboardInterrupt) else {}, ""
         outcome = replace(outcome, sentence=f"{outcome.sentence}; {score.ended_by}")
     metrics = score.metrics()
     checked = [] if outcome.exit_code else requirements
@@ -166,7 +167,6 @@ def _conclude(
         out.print()
         for sentence in lost:
             say(sentence)
-        log = str(directory / "flight.tlog")
         verdict = outcome.sentence
         if outcome.exit_code:
             verdict += f" (log: {log})"

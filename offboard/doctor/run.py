@@ -185,7 +185,7 @@ def verdict(rows: Rows, *, complete: bool) -> str:
 
     blocking, waiting, warning = map(named, (Level.BLOCKS, Level.WAIT, Level.WARN))
     if blocking:
-        return f"{len(blocking)} block{'s' * (len(blocking) == 1)}: {', '.join(blocking)}"
+        return f"not ready to fly, blocked by: {', '.join(blocking)}"
     if waiting:
         return f"not ready yet: {', '.join(waiting)}"
     ready = "ready to fly" if complete else "nothing blocks in these checks"

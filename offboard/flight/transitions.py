@@ -30,6 +30,7 @@ from offboard.mavlink.events import LocalPosition
 
 DIFFERENT = 0.1  # of the hover thrust: a smaller difference is left to the observer
 REFUSALS_EVERY_S = 1.0
+RAISED_M = 0.05  # a reference that starts less high is no news
 SETTLED = 0.02  # the same, of a vehicle that has flown by itself for long
 TAKEN = "a failsafe of the vehicle has it, as its HEARTBEAT shows"
 STAGES = {
@@ -238,7 +239,7 @@ def _place_reference(flight: FlightState, position: LocalPosition) -> None:
         above_m = flight.plan.place_start(
             position.position_ned_m, position.velocity_ned_mps, rest[2] if rest else None
         )
-        if above_m:
+        if above_m >= RAISED_M:
             outbox.announce(
                 flight,
                 f"the reference starts {above_m:.1f} m higher: from here it would "

@@ -180,8 +180,8 @@ class Sines(Shape):
     m, cycles per period, phase in deg] adds amplitude sin(2 pi cycles s / period + phase)."""
 
     shape: Literal["sines"] = "sines"
-    north: Annotated[tuple[Term, ...], Field(max_length=10)] = ((1.0, 1, 90.0),)
-    east: Annotated[tuple[Term, ...], Field(max_length=10)] = ((1.0, 1, 0.0),)
+    north: Annotated[tuple[Term, ...], Field(max_length=10)] = ()
+    east: Annotated[tuple[Term, ...], Field(max_length=10)] = ()
     up: Annotated[tuple[Term, ...], Field(max_length=10)] = ()
     period_s: Period = 8.0
     laps: Laps = 2

@@ -240,7 +240,9 @@ class Loop:
     def _outcome(self) -> Outcome:
         """The result; closes the log, so that all that it lost is known."""
         self._log.close()
-        outcome = self._ended_early or self._companion.current.outcome or self._interrupted()
+        outcome = self._ended_early or self._companion.current.outcome
+        if outcome is None or not (self._ended_early or self._companion.has_ended()):
+            outcome = self._interrupted(outcome)
         code, sentence = outcome.exit_code, outcome.sentence
         if self._error:
             code = ExitCode.ABORTED
@@ -254,6 +256,8 @@ class Loop:
             sentence = lost + (sentence.removeprefix(problem) if named else f"; {sentence}")
         return Outcome(code, sentence, self._log.problem)
 
-    def _interrupted(self) -> Outcome:
+    def _interrupted(self, before: Outcome | None) -> Outcome:
         follows = "the supervisor lands the vehicle" if self._supervisor else "the simulation ends"
-        return Outcome(ExitCode.ABORTED, f"interrupted twice: setpoints stopped, {follows}")
+        sentence = f"interrupted twice: setpoints stopped, {follows}"
+        said = f"{before.sentence}; {sentence}" if before else sentence
+        return Outcome(ExitCode.ABORTED, said)

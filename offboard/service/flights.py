@@ -78,6 +78,8 @@ class Flights:
         if self.current.has_ended() and not self._stopping:
             self.close()
             self._follow(self._source.newest)
+            if self.phase is Phase.STANDBY:
+                self.current.announce("waits for the pilot again")
         if self.phase in WAITING:
             self._renew_if_changed()
             self._look_for_left()

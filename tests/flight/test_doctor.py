@@ -355,7 +355,10 @@ def test_what_is_found_and_what_mends_it(case: tuple[Any, ...]) -> None:
         assert row[0].level is level
         assert any(re.search(found, each.sentence) for each in row if each.level is level)
         about = row[0].about or check
-        said_at_last = {BLOCKS: f"1 blocks: {about}", WARN: "ready to fly; warnings: "}
+        said_at_last = {
+            BLOCKS: f"not ready to fly, blocked by: {about}",
+            WARN: "ready to fly; warnings: ",
+        }
         if len(row) == 1:
             assert verdict({check: row}, complete=True).startswith(said_at_last.get(level, ""))
         if PARAMETER.search(row[0].hint):

@@ -17,7 +17,7 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from offboard.documents.errors import Unavailable
-from offboard.flight.phases import Limits, Outcome, Phase
+from offboard.flight.phases import ExitCode, Limits, Outcome, Phase
 from offboard.link import clock
 from offboard.link import log as log_module
 from offboard.link.background import BackgroundWriter
@@ -201,6 +201,22 @@ def test_two_signals(
     assert flight.turns == turns_left
     assert flight.stops
     assert (outcome.exit_code == 0) is (turns_left == 0)
+
+
+def test_an_interrupted_landing_is_no_result(tmp_path: Path, now_s: list[float]) -> None:
+    class Landing(Brief):
+        outcome = Outcome(ExitCode.FLOWN, "stop requested")
+
+        def has_ended(self) -> bool:
+            return self.turns == 0
+
+    def signalled(left: int) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        now_s[0] += 1.1
+
+    outcome = fly(Landing(5, signalled), tmp_path)
+    assert outcome.exit_code == ExitCode.ABORTED
+    assert outcome.sentence.startswith("stop requested; interrupted twice: setpoints stopped")
 
 
 def test_a_third_signal_interrupts_a_law_that_hangs(

@@ -524,9 +524,9 @@ def test_a_pilot_takes_a_vehicle_whose_own_failsafe_acts_soon(served: Served) ->
     pair.run(0.3)  # CURRENT_MODE shows it first, which does not tell a pilot from a failsafe
     pair.switch("pilot")
     pair.until(lambda: pair.phase is Phase.STANDBY, 2.0)
-    assert pair.service.current.announced[-1].startswith(
-        "yielded: the vehicle left OFFBOARD for AUTO.LOITER"
-    )
+    yielded, waits = pair.service.current.announced[-2:]
+    assert yielded.startswith("yielded: the vehicle left OFFBOARD for AUTO.LOITER")
+    assert waits == "waits for the pilot again"
     pair.run(0.1)
     pair.engage()
     pair.run(0.1)

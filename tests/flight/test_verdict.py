@@ -110,7 +110,7 @@ def test_decisions_at_the_tilt_limit_are_counted_and_reported() -> None:
     scored = score(flown)
     assert scored.at_bound_share >= limited.sum() / scored.decisions > 0.1
     texts = summary(scored, flown)
-    fixes = "fly slower, in less wind, or with a lower controller.bandwidth_radps"
+    fixes = "fly slower, in less wind, or with a lower bandwidth of the controller"
     assert texts["at a limit"].endswith(f"% of the decisions: {fixes}")
 
 

@@ -304,7 +304,7 @@ def test_a_vehicle_that_cannot_be_reached_is_the_same_to_every_command(
     assert (code, said.count("\n")) == (3, 1)
     assert says in said
     code, told, _ = called("offboard doctor port --connect", address)
-    assert (code, told.endswith("\n1 blocks: port\n")) == (3, True)
+    assert (code, told.endswith("\nnot ready to fly, blocked by: port\n")) == (3, True)
     assert says in " ".join(told.split())
     assert "refused" not in says or "fix: start the vehicle, or the router" in told
 

@@ -32,7 +32,7 @@ _JERK = WatchedParameter(
     # BRAKE slows down by the jerk / 7.5 of the speed per second
     advice=(
         Valid(
-            "hold is BRAKE, which stops within 7.5 m, divided by this value, for each m/s of speed",
+            "hold is BRAKE, which stops within 7.5 m divided by this value, for each m/s of speed",
             10.0,
             lowest=10.0,
         ),
@@ -72,9 +72,9 @@ ARDUPILOT = Dialect(
             Valid(lowest=0.3, highest=5.0, set_to=1.0),  # not ArduCopter's 3, see the advice
             advice=(
                 Valid(
-                    "where setpoints stop, as with a lost link, the last tilt is flown for so "
-                    "long; then the vehicle levels, holds its height and drifts: it does not land, "
-                    "and does not say so",
+                    "where setpoints stop, as with a lost link, the last tilt is flown for "
+                    "this many seconds; then the vehicle levels, holds its height and drifts: it "
+                    "does not land, and does not say so",
                     1.0,
                     highest=1.5,
                 ),

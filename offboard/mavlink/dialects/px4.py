@@ -160,7 +160,10 @@ PX4 = Dialect(
     defects=MappingProxyType(
         {
             "setpoints without thrust keep OFFBOARD alive; ours always have thrust": (1, 17),
-            "COM_OBL_RC_ACT 0 to 2 is obeyed without a radio": (1, 17),
+            "with COM_OBL_RC_ACT 0 to 2 it enters a mode of sticks though no radio is there": (
+                1,
+                17,
+            ),
         }
     ),
     wanted=(
