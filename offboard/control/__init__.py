@@ -62,7 +62,9 @@ After `pip install` of this package:
     offboard compare --controllers pd,pso,pid
 
 A YAML file with `law: pd` and other values is given as `--controller my.yaml`. `Situation`,
-`PredictedState` and `Command` say what each value means, with frames and units.
+`PredictedState` and `Command` say what each value means, with frames and units. A law like this one
+is flown with the vehicle file (`--vehicle`), without identification steps; one that shall use the
+vehicle that is identified in flight also has what `Adaptive` says.
 """
 
 from offboard.control.base import (
