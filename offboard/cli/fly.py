@@ -142,7 +142,8 @@ def _conclude(
         outcome, rows = judged(outcome, score), summary(score, history)
     except (UserError, KeyboardInterrupt) as error:
         score = Score(ended_by=f"it cannot be scored: {str(error) or 'interrupted'}")
-        rows, page = {"log": log} if isinstance(error, KeyboardInterrupt) else {}, ""
+        rows = {"log": log} if isinstance(error, KeyboardInterrupt) else {}
+        page = page if rows else ""
         outcome = replace(outcome, sentence=f"{outcome.sentence}; {score.ended_by}")
     metrics = score.metrics()
     checked = [] if outcome.exit_code else requirements

@@ -141,12 +141,14 @@ def loss(seen: Observation) -> Iterable[Finding]:
     """Frames that are lost, and bytes that are damaged."""
     senders = seen.senders
     sender = next((each for each in senders.found if each.ids == _ids(seen)), None)
-    if sender is None or len(sender.peers) > 1:  # of two that send with its ids, or of a new port,
-        return  # sequence numbers show nothing
-    lost, received = senders.lost(sender), senders.splitter
+    if sender is None:
+        return
+    # of two that send with its ids, or of a new port, sequence numbers show nothing
+    lost, received = senders.lost(sender) if len(sender.peers) == 1 else 0, senders.splitter
     share = lost / (sender.frames + lost)
     damaged = received.bytes_skipped / max(received.bytes_received, 1)
-    figures = f"{share:.1%} of the frames lost, {damaged:.1%} of the bytes damaged"
+    missing = f"{share:.1%} of the frames" if len(sender.peers) == 1 else "an unknown share"
+    figures = f"{missing} lost, {damaged:.1%} of the bytes damaged"
     if share > LOST_SHARE or damaged > LOST_SHARE:
         yield warn(figures, "move closer, or use another channel, a cable or a better radio")
     else:

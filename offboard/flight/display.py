@@ -116,7 +116,7 @@ class Snapshot:
         self.attitude = attitude.attitude if attitude else None  # (w, x, y, z), NED to FRD
         # from the climb to the landing, as is the error
         self.reference_ned_m = sample.position_ned_m.tolist() if sample else None
-        self.position_error_m = state.position_error_m
+        self.position_error_m = state.position_error_m if sample else math.nan
         self.thrust_mps2 = command.thrust_mps2  # of the command in force, as are the next two
         self.thrust_direction_ned = command.thrust_direction_ned
         self.heading_rad = command.heading_rad

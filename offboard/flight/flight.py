@@ -234,7 +234,7 @@ class Flight(FlightState):
         if not self.stop_reason:
             self._inputs.call("request_stop", why)
             self.stop_reason = why
-            if self.phase is Phase.LAND and why == OPERATOR_STOP:
+            if self.phase is Phase.LAND:
                 outbox.announce(self, f"{why}: it lands already")
 
     def announce(self, sentence: str) -> None:

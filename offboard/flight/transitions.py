@@ -172,7 +172,9 @@ def _enter(flight: FlightState, row: Transition) -> None:
     elif row.target is Phase.CLIMB:
         _begin_climb(flight, source)
     elif row.target is Phase.JOIN:
-        flight.joined_thrust = flight.observer.hover_thrust_estimate
+        # of several the greatest: in a later climb the vehicle may have come to stand on something
+        shown = flight.observer.hover_thrust_estimate
+        flight.joined_thrust = float(np.fmax(shown, flight.joined_thrust))
         flight.plan.start_track(flight.time_s)
     elif row.target is Phase.PAUSE:
         flight.plan.pause(flight.time_s)

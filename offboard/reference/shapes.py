@@ -186,6 +186,12 @@ class Sines(Shape):
     period_s: Period = 8.0
     laps: Laps = 2
 
+    @model_validator(mode="after")
+    def _moves(self) -> Self:
+        if not (self.north or self.east or self.up):
+            raise ValueError("north, east or up needs a sine")
+        return self
+
     def path(self) -> Path:
         omega = 2.0 * math.pi / self.period_s
         terms = zip(np.diag((1.0, 1.0, -1.0)), (self.north, self.east, self.up), strict=True)

@@ -241,7 +241,8 @@ class Loop:
         """The result; closes the log, so that all that it lost is known."""
         self._log.close()
         outcome = self._ended_early or self._companion.current.outcome
-        if outcome is None or not (self._ended_early or self._companion.has_ended()):
+        ended = self._companion.has_ended() or self._companion.current.in_end_phase
+        if outcome is None or not (self._ended_early or ended):
             outcome = self._interrupted(outcome)
         code, sentence = outcome.exit_code, outcome.sentence
         if self._error:

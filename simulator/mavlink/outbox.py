@@ -7,7 +7,7 @@ heard on this link; knows no client and no rate.
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, deque
 
 from simulator.autopilot.values import StatusText
 from simulator.mavlink.codec import Encoder, Keyring
@@ -16,6 +16,7 @@ from simulator.mavlink.view import View
 MAV_COMP_ID_AUTOPILOT = 1
 DATAGRAM_MAX = 1400
 HELD_US = 5_000_000
+FORWARDED_KEPT = 64  # frames, by which one that comes back is recognised
 TEXT_LENGTH = 50  # STATUSTEXT.text
 
 
@@ -30,6 +31,7 @@ class Outbox:
     def __init__(self, view: View, keyring: Keyring, link: int) -> None:
         self.view, self.connected = view, False
         self._frames: list[bytes] = []
+        self.forwarded: deque[bytes] = deque(maxlen=FORWARDED_KEPT)
         self._suppressed: Counter[str] = Counter()
         self._keyring, self._link = keyring, link
         self.restart()
@@ -52,6 +54,7 @@ class Outbox:
 
     def forward(self, frame: bytes) -> None:
         """Queue a frame of another sender."""
+        self.forwarded.append(frame)
         self._frames.append(frame)
 
     def _passes(self, name: str) -> bool:

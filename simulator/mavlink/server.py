@@ -98,17 +98,17 @@ class Server:
         """Forward a message, unless it is for the autopilot alone, to each other link on which its
         target was seen, or anybody where it is for all: as PX4's SITL and ArduPilot do. Not what
         comes back, as through a router that has both links."""
-        sender, target = sender_of(message), target_of(message)
+        sender, target, frame = sender_of(message), target_of(message), bytes(message.get_msgbuf())
         ours = self.view.system, MAV_COMP_ID_AUTOPILOT
-        if sender == ours:
+        if sender == ours or frame in self.outbox.forwarded:
             return
         if sender not in self._seen and len(self._seen) < _SEEN_MAX:
             self._seen.append(sender)
         if target == ours or message.get_type() in _NOT_FORWARDED:
             return
         for link in self.others:
-            if sender not in link._seen and any(_matches(target, peer) for peer in link._seen):
-                link.outbox.forward(bytes(message.get_msgbuf()))
+            if any(_matches(target, peer) for peer in link._seen):
+                link.outbox.forward(frame)
 
     def _is_for_us(self, message: Message) -> bool:
         """Whether its target is this system and its autopilot, or all."""

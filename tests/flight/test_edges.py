@@ -65,6 +65,7 @@ class Brief(Silent):
     stop requests. `sends` are the frames of the turn in progress, `log` what it logs."""
 
     session, outcome = SimpleNamespace(peer=None), None
+    in_end_phase = False
     ends_with = FLOWN
     guarded = True
     limits = Limits()

@@ -13,7 +13,7 @@ import pytest
 from flight_tables import IN_THE_AIR, README, asked, exits, with_tables
 from uneventful import NOW_S, TRACK, hear, heartbeat, lift, position, uneventful
 
-from offboard.flight import flying, preflight, starting, telemetry
+from offboard.flight import failsafe, flying, preflight, starting, telemetry, transitions
 from offboard.flight.authority import PilotSwitch, Standing
 from offboard.flight.conditions import Transition
 from offboard.flight.phases import (
@@ -257,6 +257,18 @@ def test_the_start_is_reached_by_a_vehicle_that_is_seen_to_rest_there() -> None:
         _reach_start(flight)
         changed(flight)
         assert flying.at_start(flight) is there
+
+
+def test_a_later_climb_does_not_hide_that_something_carries_the_vehicle() -> None:
+    flight = uneventful(Phase.CLIMB)
+    flight.identification = None
+    for flight.phase, thrust in ((Phase.CLIMB, 0.4), (Phase.CLIMB, 0.19)):
+        vars(flight.observer).update(hover_thrust_estimate=thrust)
+        _reach_start(flight)
+        vars(flight.plan).update(start_track=lambda time_s: None)
+        transitions.advance(flight)
+        assert flight.phase is Phase.JOIN
+    assert failsafe.carried_by_ground(flight)
 
 
 def test_every_wait_is_limited() -> None:

@@ -27,6 +27,7 @@ TABLE = "time_s,north_m,east_m,altitude_m,course_deg\n" + "".join(
 )
 POINTS = [[0, 0, 0], [3, 1, 0.5], [4, 4, 1], [1, 5, 0.5], [0, 2, 0]]
 NEEDED: dict[str, dict[str, object]] = {
+    "sines": {"north": ((1.0, 1, 90.0),), "east": ((1.0, 1, 0.0),)},
     "waypoints": {"points_m": POINTS, "speed_mps": 1.2},
     "table": {"file": "flown.csv", "text": TABLE},
 }

@@ -70,14 +70,22 @@ def test_messages_for_others_are_forwarded_between_the_links() -> None:
 
     heartbeat = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4, 3)
     clock = mavlink.MAVLink_timesync_message(0, 1)
-    for message in (heartbeat, clock, *(command(1, each) for each in (1, 191, 190)), command(2, 0)):
+    key = mavlink.MAVLink_setup_signing_message(1, 191, bytes(32), 1)
+    for message in (
+        heartbeat, clock, key, *(command(1, each) for each in (1, 191, 190)), command(2, 0),
+    ):  # fmt: skip
         bench.instance.feed_ground(message.pack(ground))
+    bench.instance.feed_ground(heartbeat.pack(mavlink.MAVLink(None, 1, 1)))  # the vehicle's own
     bench.run(0.1)
     forwarded = [each for _, each in bench.received if each.get_srcSystem() == 255]
     assert [each.get_type() for each in forwarded] == ["HEARTBEAT", "COMMAND_LONG"]
     assert forwarded[1].target_component == 191
+    assert not [each for _, each in bench.of("HEARTBEAT") if each.type == mavlink.MAV_TYPE_GCS][1:]
 
     bench.instance.drain_ground()
+    for each in forwarded:  # through a router that has both links
+        bench.instance.feed(bytes(each.get_msgbuf()))
+    assert bench.instance.drain_ground() == []
     bench.send(mavlink.MAVLink_command_ack_message(300, 0, 0, 0, 255, 190))
     (datagram,) = bench.instance.drain_ground()
     (answer,) = mavlink.MAVLink(None).parse_buffer(datagram)
