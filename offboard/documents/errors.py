@@ -113,8 +113,12 @@ def typed(*words: str | Path) -> str:
 
 
 def meant(name: str, known: Iterable[str]) -> str:
-    """ ", did you mean NAME?" with the nearest of the known names, empty where none is near."""
-    near = difflib.get_close_matches(name, known, n=1)
+    """ ", did you mean NAME?" with the nearest of the known names, or the first that contains it;
+    empty where there is none."""
+    names = list(known)
+    near = difflib.get_close_matches(name, names, n=1)
+    if len(name) >= 3:
+        near += [each for each in names if name in each]
     return f", did you mean {near[0]}?" if near else ""
 
 

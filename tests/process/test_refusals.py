@@ -68,6 +68,7 @@ def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
         ("--set", "vehicle.hover_thrust=0.92", "0.92 exceeds limits.hover_thrust (0.9)"),
         ("--set", "limits.tilt_rad=0.5", "tilt_max_rad 0.785 exceeds limits.tilt_rad (0.5)"),
         ("--set", SWARM, "particles x iterations must be at most 500000, not 1000000000"),
+        ("--require", "rmse<1", "'rmse', did you mean rmse_position_m? there"),
         ("--require", "rmse_position<1", "'rmse_position', did you mean rmse_position_m? there"),
         ("--connect", "udpin:127.0.0.1:0", "port 0 is not within 1 .. 65535"),
         ("--connect", "udpin:127.0.0.1", "is not understood; use udpin:HOST:PORT"),
