@@ -246,8 +246,8 @@ class TrackingLaw:
     def _problem_of(
         self, target: Target, lateral: Array, vertical: Array, b_z: float
     ) -> TrackingProblem:
-        """The problem of these deviations: J, which is least at u_ff - K x, where x'P x are left to
-        pay, and the bounds of u to which the law clips."""
+        """The problem of these deviations: J, whose minimum is x'P x at u_ff - K x, and the bounds
+        of u to which the law clips."""
         vehicle = self.vehicle
         curvature = np.array(
             [

@@ -143,12 +143,13 @@ def loss(seen: Observation) -> Iterable[Finding]:
     sender = next((each for each in senders.found if each.ids == _ids(seen)), None)
     if sender is None:
         return
-    # of two that send with its ids, or of a new port, sequence numbers show nothing
-    lost, received = senders.lost(sender) if len(sender.peers) == 1 else 0, senders.splitter
-    share = lost / (sender.frames + lost)
+    received, share = senders.splitter, 0.0
     damaged = received.bytes_skipped / max(received.bytes_received, 1)
-    missing = f"{share:.1%} of the frames" if len(sender.peers) == 1 else "an unknown share"
-    figures = f"{missing} lost, {damaged:.1%} of the bytes damaged"
+    figures = f"{damaged:.1%} of the bytes damaged"
+    if len(sender.peers) == 1:  # else two vehicles may count, or one that has changed its port
+        lost = senders.lost(sender)
+        share = lost / (sender.frames + lost)
+        figures = f"{share:.1%} of the frames lost, {figures}"
     if share > LOST_SHARE or damaged > LOST_SHARE:
         yield warn(figures, "move closer, or use another channel, a cable or a better radio")
     else:

@@ -21,7 +21,7 @@ RECOVERY = 0.25  # seconds by which a held time decreases in one without the con
 STEP_MAX_S = 0.2  # what one sample counts for, also after a gap of telemetry
 SINK_MPS = 0.3  # that full thrust stops within the delay, on a vehicle that can be flown
 FULL_THRUST = 0.99
-CARRIED = 0.5  # of the hover thrust: no updraft, and hardly a payload, makes such a difference
+LOW_THRUST = 0.5  # of the hover thrust: no updraft, and hardly a payload, makes such a difference
 STANDS_BELOW_M = 0.25  # references are at least 0.5 m above the take-off point
 THRUST_REPORT_S = 1.0  # age of a ThrustReport that counts
 
@@ -181,17 +181,17 @@ def stands_on_ground(flight: FlightState) -> str:
     return f"the vehicle stands on the ground, {above_m:.1f} m below the reference"
 
 
-def carried_by_ground(flight: FlightState) -> str:
-    """Normalised thrust that hovers now, divided by the one that hovered when the reference began.
+def low_thrust(flight: FlightState) -> str:
+    """Normalised hover thrust, divided by that at the start of the reference.
 
-    The vehicle stands on something, also where its estimated height is wrong."""
-    thrust, before = flight.observer.hover_thrust_estimate, flight.joined_thrust
+    The vehicle stands on something, though its estimated height says that it flies."""
+    thrust, before = flight.observer.hover_thrust_estimate, flight.start_hover_thrust
     begun = flight.phase in TRACKING - {Phase.CLIMB, Phase.EXCITE}
-    if not begun or not thrust < CARRIED * before:
+    if not begun or not thrust < LOW_THRUST * before:
         return ""
     return (
         f"the vehicle needs {100.0 * thrust:.0f} % of its thrust instead of {100.0 * before:.0f} %:"
-        " it stands on something, or has lost half of its weight"
+        " it stands on something, or has lost half of its mass"
     )
 
 
@@ -278,7 +278,7 @@ ROWS = (
     Row("thrust reserve", no_thrust_reserve, "limits.hover_thrust", LAND, 2.0),
     Row("full thrust", sinks_with_full_thrust, f"{SINK_MPS:g} m/s", LAND, 1.0),
     Row("ground", stands_on_ground, f"{STANDS_BELOW_M:g} m", LAND, cause="ground contact"),
-    Row("carried", carried_by_ground, f"{CARRIED:g}", LAND, 1.0, "ground contact"),
+    Row("low thrust", low_thrust, f"{LOW_THRUST:g}", LAND, 1.0, "ground contact"),
     Row("second sender", other_sender, "one message", HOLD, cause="second sender"),
     # within this time a pilot's change of the mode is seen, or the row "authority" acts
     Row("other setpoints", follows_others, "1e-5", HOLD, MODE_KNOWN_S, "second sender"),

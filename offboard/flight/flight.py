@@ -235,7 +235,7 @@ class Flight(FlightState):
             self._inputs.call("request_stop", why)
             self.stop_reason = why
             if self.phase is Phase.LAND:
-                outbox.announce(self, f"{why}: it lands already")
+                outbox.announce(self, f"{why}: the vehicle is landing already")
 
     def announce(self, sentence: str) -> None:
         """Report a sentence to the user, the ground station and the log."""

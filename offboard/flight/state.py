@@ -138,7 +138,7 @@ class FlightState(Ground):
     text_id: int = 0
     awaits_link: bool = False  # while landing
     follows_others: bool = False  # the newest ThrustReport is of none of `thrusts`
-    joined_thrust: float = math.nan  # the greatest that hovered when a reference began
+    start_hover_thrust: float = math.nan  # normalised; the greatest at a start of the reference
     predictions: deque[PredictedState] = field(default_factory=lambda: deque(maxlen=8))
 
     def __post_init__(self, before: FlightState | None) -> None:

@@ -30,7 +30,7 @@ from offboard.mavlink.events import LocalPosition
 
 DIFFERENT = 0.1  # of the hover thrust: a smaller difference is left to the observer
 REFUSALS_EVERY_S = 1.0
-RAISED_M = 0.05  # a reference that starts less high is no news
+RAISED_M = 0.05  # a reference that is raised by less is not announced
 SETTLED = 0.02  # the same, of a vehicle that has flown by itself for long
 TAKEN = "a failsafe of the vehicle has it, as its HEARTBEAT shows"
 STAGES = {
@@ -172,9 +172,9 @@ def _enter(flight: FlightState, row: Transition) -> None:
     elif row.target is Phase.CLIMB:
         _begin_climb(flight, source)
     elif row.target is Phase.JOIN:
-        # of several the greatest: in a later climb the vehicle may have come to stand on something
+        # the greatest: before a later start the vehicle may have come to stand on something
         shown = flight.observer.hover_thrust_estimate
-        flight.joined_thrust = float(np.fmax(shown, flight.joined_thrust))
+        flight.start_hover_thrust = float(np.fmax(shown, flight.start_hover_thrust))
         flight.plan.start_track(flight.time_s)
     elif row.target is Phase.PAUSE:
         flight.plan.pause(flight.time_s)

@@ -79,7 +79,7 @@ class Flights:
             self.close()
             self._follow(self._source.newest)
             if self.phase is Phase.STANDBY:
-                self.current.announce("waits for the pilot again")
+                self.current.announce("waiting for the pilot")
         if self.phase in WAITING:
             self._renew_if_changed()
             self._look_for_left()

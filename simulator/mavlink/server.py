@@ -23,7 +23,7 @@ _AXIS_NOT_USED = 2**15 - 1  # of MANUAL_CONTROL
 _NO_PLACE = 2**31 - 1  # in x and y of COMMAND_INT
 _OF_ALL = (519, 520)  # MAV_CMD: requests of the protocol and the version, which all systems answer
 _SEEN_MAX = 16  # MAX_REMOTE_COMPONENTS of PX4
-_NOT_FORWARDED = ("TIMESYNC", "SETUP_SIGNING")  # the clock of lockstep; it holds the key
+_NOT_FORWARDED = ("TIMESYNC", "SETUP_SIGNING")  # the clock of lockstep; a key
 _FTP_NAK, _FTP_ERROR_NOT_FOUND = 128 + 1, 10
 
 

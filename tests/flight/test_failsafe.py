@@ -208,9 +208,9 @@ def jumps(recent_m: float, drift_m: float) -> SimpleNamespace:
 
 AGE_S = Limits().setpoint_age_s
 aged = clock(age_s=lambda age_s: lambda *_: age_s)
-joined = holding(
+at_start = holding(
     observer=lambda share: SimpleNamespace(hover_thrust_estimate=share),
-    joined_thrust=lambda _: 0.4,
+    start_hover_thrust=lambda _: 0.4,
 )
 hovers = holding(observer=lambda share: SimpleNamespace(hover_thrust_estimate=share))
 
@@ -256,7 +256,7 @@ MEASURED: list[tuple[str, Measure, Any, Any]] = [
     ("thrust reserve", hovers, 0.9, 0.91),
     ("full thrust", sinks, 0.3, 0.31),
     ("ground", stands, 0.31, 0.29),
-    ("carried", joined, 0.21, 0.19),
+    ("low thrust", at_start, 0.21, 0.19),
     ("second sender", hears_another, 5.0, 4.9),
     ("other setpoints", follows, "POSCTL", "OFFBOARD"),
     ("clock", clock(jumped_s=float), 0.0, 0.6),

@@ -259,7 +259,7 @@ def test_the_start_is_reached_by_a_vehicle_that_is_seen_to_rest_there() -> None:
         assert flying.at_start(flight) is there
 
 
-def test_a_later_climb_does_not_hide_that_something_carries_the_vehicle() -> None:
+def test_a_later_start_does_not_lower_the_hover_thrust_of_the_first() -> None:
     flight = uneventful(Phase.CLIMB)
     flight.identification = None
     for flight.phase, thrust in ((Phase.CLIMB, 0.4), (Phase.CLIMB, 0.19)):
@@ -268,7 +268,7 @@ def test_a_later_climb_does_not_hide_that_something_carries_the_vehicle() -> Non
         vars(flight.plan).update(start_track=lambda time_s: None)
         transitions.advance(flight)
         assert flight.phase is Phase.JOIN
-    assert failsafe.carried_by_ground(flight)
+    assert failsafe.low_thrust(flight)
 
 
 def test_every_wait_is_limited() -> None:

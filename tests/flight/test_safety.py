@@ -142,7 +142,7 @@ def one_wrong_heartbeat(on: Vehicle, phase: Phase) -> Row:
 
 
 def says_that_it_lands(pair: Pair) -> None:
-    assert said(pair, "stop requested by the operator: it lands already")
+    assert said(pair, "stop requested by the operator: the vehicle is landing already")
 
 
 def taken(on: Vehicle, scenario: Any, says: str = "", **more: Any) -> Row:
@@ -205,7 +205,7 @@ ROWS = {
         r"the vehicle needs [0-9]+ % of its thrust instead of [0-9]+ %: it stands on", landed,
         fly=partial(copter.hover, "reference.duration_s=10.0"),
         at=tracking(lambda pair: pair.instance.autopilot.plant.reset_estimate((0.0, 0.0, -1.9))),
-        failsafes=["carried"], ended_by="ground contact",
+        failsafes=["low thrust"], ended_by="ground contact",
     ),
     # the autopilot brakes the climb with 2.5 m/s2 after it was asked to land
     "above the ceiling": ends(

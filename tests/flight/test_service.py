@@ -526,7 +526,7 @@ def test_a_pilot_takes_a_vehicle_whose_own_failsafe_acts_soon(served: Served) ->
     pair.until(lambda: pair.phase is Phase.STANDBY, 2.0)
     yielded, waits = pair.service.current.announced[-2:]
     assert yielded.startswith("yielded: the vehicle left OFFBOARD for AUTO.LOITER")
-    assert waits == "waits for the pilot again"
+    assert waits == "waiting for the pilot"
     pair.run(0.1)
     pair.engage()
     pair.run(0.1)

@@ -160,10 +160,7 @@ PX4 = Dialect(
     defects=MappingProxyType(
         {
             "setpoints without thrust keep OFFBOARD alive; ours always have thrust": (1, 17),
-            "with COM_OBL_RC_ACT 0 to 2 it enters a mode of sticks though no radio is there": (
-                1,
-                17,
-            ),
+            "COM_OBL_RC_ACT 0 to 2 selects a mode with sticks, also without RC": (1, 17),
         }
     ),
     wanted=(
