@@ -1,1 +1,1 @@
-"""A flight by name: configuration, parts, simulator, loop."""
+"""Configuration, preparation, simulator and loop of a flight."""

@@ -1,9 +1,8 @@
-"""From names, files and --set to one validated `FlightConfig`, and from that to what flies.
+"""Resolves names, files and --set to one validated `FlightConfig`; builds controller and reference.
 
-A configuration refers to its vehicle, controller and reference by name, by file, or holds their
-values. A name is that of a shipped file (`config/`); a controller's may also be the name of a law,
-which is flown with its defaults. Packaged, `config/` lies inside the package; in a checkout beside
-it.
+A configuration names its vehicle, controller and reference, gives their files, or holds their
+values. A name is that of a shipped file (`config/`). The name of a controller may also be that of a
+control law, which is then flown with its defaults.
 """
 
 from __future__ import annotations
@@ -37,12 +36,12 @@ from offboard.reference.track import Track
 Raw = dict[str, Any]
 RECORDED_VERSIONS = ("pso-offboard", "pymavlink", "numpy", "scipy", "numba")
 UNKNOWN_VEHICLE = "neutral"
-PERIODS_LEAST = 3  # of the reference at full speed: two decisions, and one that may be lost
+PERIODS_LEAST = 3  # control periods at full speed: two decisions, and one that may be lost
 DESCENT_MPS = 0.5  # slowest default near the ground: ArduCopter LAND_SPEED; MPC_LAND_SPEED is 0.7
 
 
 class FlightConfig(Parameters):
-    """Everything that decides a flight, resolved. `flight.yaml` of a flight directory is one."""
+    """Resolved configuration of a flight, as recorded in `flight.yaml` of its directory."""
 
     vehicle: Vehicle
     controller: SerializeAsAny[ControllerSettings]  # the settings class of its `law`
@@ -55,7 +54,8 @@ class FlightConfig(Parameters):
 
     @property
     def budget_s(self) -> float:
-        """Wall time for one decision: a setpoint that is later than a period is not sent."""
+        """Wall time for one decision in seconds, at most one control period: a later setpoint is
+        not sent."""
         return min(self.deadline_s, self.period_s)
 
 
@@ -69,9 +69,10 @@ def load(
 ) -> FlightConfig:
     """Resolve a flight configuration. Raises DocumentError with every problem found.
 
-    `name` is a shipped configuration or a file; `choices` replaces its vehicle, controller or
-    reference by another name or file (None: does not); `assignments` are `key.path=value` of --set.
-    `known_vehicle` stands in for the file's `neutral`, of which nothing is known.
+    `name` is a shipped configuration or a file. `choices` replaces its vehicle, controller or
+    reference by another name or file (None: no replacement). `assignments` are the
+    `key.path=value` of --set. `known_vehicle` names the vehicle file that replaces `neutral`, the
+    vehicle of which nothing is known, where the configuration names that.
     """
     path = locate(name, "configuration")
     raw = read(read_text(path), str(path), "configuration")
@@ -95,10 +96,10 @@ def load(
 
 
 def build_track(config: FlightConfig) -> Track:
-    """The configured reference, checked against the vehicle, the limits of a flight and the
-    controller's keep-out volumes before anything is sent.
+    """Build the configured reference, and check it against the vehicle, the limits of the flight
+    and the controller's keep-out volumes.
 
-    Raises DocumentError naming time, value and limit where it cannot be flown.
+    Raises DocumentError if it cannot be flown; the sentence names time, value and limit.
     """
     vehicle, limits = config.vehicle, config.limits
     for name, value, limit, bound, instead in (
@@ -111,7 +112,7 @@ def build_track(config: FlightConfig) -> Track:
                 f"beyond which a flight is ended; {instead} or raise the limit"
             )
     try:
-        with np.errstate(over="ignore", invalid="ignore"):  # what overflows is beyond a limit
+        with np.errstate(over="ignore", invalid="ignore"):  # a value that overflows exceeds a limit
             track = config.reference.track()
             _, height_m, radius_m = check(track, vehicle)
     except ValueError as error:
@@ -134,7 +135,7 @@ def build_track(config: FlightConfig) -> Track:
         (height_m, "above", "limits.ceiling_m", limits.ceiling_m),
         (radius_m, "away from", "limits.radius_m", limits.radius_m),
     ):
-        if reached_m > limit_m:  # beyond, a flight is ended
+        if reached_m > limit_m:  # the failsafe would end the flight there
             raise DocumentError(
                 f"reference {config.reference.title}: it goes {reached_m:.4g} m {where} the "
                 f"take-off point, beyond {limit} ({limit_m:g} m); fly nearer or raise the limit"
@@ -147,7 +148,8 @@ def build_track(config: FlightConfig) -> Track:
 
 
 def build_controller(config: FlightConfig) -> Controller:
-    """The configured controller. Raises DocumentError where the vehicle cannot be flown so."""
+    """Build the configured controller. Raises DocumentError if it cannot fly the vehicle with these
+    settings."""
     settings = config.controller
     with outside(f"controller {settings.law}"):
         try:
@@ -157,7 +159,8 @@ def build_controller(config: FlightConfig) -> Controller:
 
 
 def dump(config: FlightConfig) -> str:
-    """The resolved configuration as YAML that `load` accepts, headed by what it is flown with."""
+    """The resolved configuration as YAML that `load` accepts. A comment at the top names the
+    versions of Python and of the packages that affect a flight."""
     packages = " ".join(f"{name} {version(name)}" for name in RECORDED_VERSIONS)
     heading = f"# Resolved configuration. {packages}, Python {platform.python_version()}\n"
     document = config.model_dump(mode="json", exclude_none=True)
@@ -165,8 +168,8 @@ def dump(config: FlightConfig) -> str:
 
 
 def flown(text: str) -> FlightConfig:
-    """The configuration in a log (`dump`ed then), without settings that no longer exist, if there
-    are such. Raises DocumentError."""
+    """The configuration in a log, written there by `dump`. Settings that this version does not have
+    are ignored. Raises DocumentError."""
     source = "the log's configuration"
     raw = read(text, source)
     with suppress(DocumentError):
@@ -175,8 +178,8 @@ def flown(text: str) -> FlightConfig:
 
 
 def _validated(raw: Raw, source: str, extra: Literal["ignore"] | None = None) -> FlightConfig:
-    """`raw` as a FlightConfig whose parts have the classes that they name; `extra` as in
-    `validate`."""
+    """Validate `raw` as a FlightConfig. Its `law` and `shape` select the classes of controller and
+    reference; for `extra` see `validate`."""
     models = {part: _model(part, raw.get(part), f"{source}: {part}") for part in PARTS}
     parts: dict[str, Any] = {part: (model, ...) for part, model in models.items()}
     model = create_model("FlightConfig", __base__=FlightConfig, **parts)
@@ -184,8 +187,9 @@ def _validated(raw: Raw, source: str, extra: Literal["ignore"] | None = None) ->
 
 
 def _complete(config: FlightConfig) -> FlightConfig:
-    """With what its reference is computed from, so that it is the same everywhere: the content of
-    the table that it names, the times that were found."""
+    """Store in the configuration the content of the reference's table, or the optimised times of
+    its waypoints. Then the recorded reference needs no other file and is the same on every
+    computer."""
     reference = config.reference
     if isinstance(reference, FromTable) and reference.text is None:
         found: dict[str, Any] = {"text": read_text(Path(reference.file))}
@@ -203,8 +207,8 @@ def _missing(part: str, raw: Raw) -> str:
 
 
 def read_part(part: str, name: str) -> Raw:
-    """A vehicle, controller or reference by shipped name or file, valid; the table that a reference
-    names is beside it. Raises DocumentError."""
+    """Read and validate a vehicle, controller or reference by shipped name or file. The path of a
+    reference's table is relative to the file that names it. Raises DocumentError."""
     if part == "reference" and name.lower().endswith(".csv"):
         return {"shape": "table", "file": name}
     laws = []
@@ -221,8 +225,8 @@ def read_part(part: str, name: str) -> Raw:
 
 
 def _model(part: str, raw: object, source: str) -> type[BaseModel]:
-    """The class of a vehicle, or of the controller or reference that `raw` names. Raises
-    DocumentError."""
+    """The class of `Parameters` for a vehicle, for a controller with the `law` of `raw`, or for a
+    reference with its `shape`. Raises DocumentError."""
     if part == "vehicle":
         return Vehicle
     key, known = ("law", catalogue.names()) if part == "controller" else ("shape", list(SHAPES))

@@ -1,4 +1,4 @@
-"""One flight: a `FlightConfig` made ready, a vehicle to connect to, a directory for the log.
+"""`fly` flies one `FlightConfig` with one vehicle and logs the flight in a directory.
 
 Everything slow (compilation, start of a simulator) happens before telemetry is read.
 """
@@ -55,20 +55,21 @@ from offboard.run.sitl import (
 )
 from offboard.supervisor.supervisor import Supervisor
 
-REHEARSED_DECISIONS = 5  # the fastest counts: the machine may be busy
-DISCARDED_MAX = 20  # batches of a link
-SITL_TIMEOUT_S = 180.0  # for simulator and companion in lockstep: either may compile, or be slow
+REHEARSED_DECISIONS = 5  # the fastest is compared with the deadline: the computer may be busy
+DISCARDED_MAX = 20  # calls of `Link.receive`
+SITL_TIMEOUT_S = 180.0  # either side of lockstep waits this long for the other, which may compile
 
 
 @dataclass(frozen=True, slots=True)
 class Connection:
-    """A vehicle at a link. `system_id`: its own, where several send; `signing_key`: a key file."""
+    """A vehicle that is reached by a link. `system_id` selects it if several send on the link
+    (None: only one does); `signing_key` is the file of the MAVLink signing key."""
 
     address: str
     system_id: int | None = None
     signing_key: Path | None = None
 
-    known_vehicle: ClassVar[None] = None  # which vehicle it is, nobody has said
+    known_vehicle: ClassVar[None] = None  # no vehicle file is known to describe it
 
     def settings(self, link: Link) -> SessionSettings:
         """Settings of the session over `link`."""
@@ -76,12 +77,12 @@ class Connection:
             system_id=self.system_id,
             stream=link.is_stream,
             capacity_bytes_ps=link.capacity_bytes_ps,
-            # else the vehicle learns our address from what we send
+            # except with udpin, the vehicle learns our address only from what we send
             sends_first=not self.address.startswith("udpin"),
         )
 
     def signing(self, stack: ExitStack) -> Signing | None:
-        """Signing with the kept time; closed with `stack`. Raises UserError."""
+        """Signing whose time stamps are kept on disk until `stack` closes. Raises UserError."""
         if self.signing_key is None:
             return None
         return stack.enter_context(SigningTime(read_key(self.signing_key)))
@@ -89,8 +90,8 @@ class Connection:
 
 @dataclass(frozen=True, slots=True)
 class Simulated:
-    """A vehicle of the bundled simulator, in lockstep. `scenario` and `vehicle` None: the defaults
-    of the firmware."""
+    """A vehicle of the bundled simulator, in lockstep. `scenario` and `vehicle` are names or files;
+    None: the defaults of the firmware."""
 
     firmware: str = "px4"
     scenario: str | None = None
@@ -109,11 +110,13 @@ class Simulated:
 
     @property
     def known_vehicle(self) -> str:
-        """The vehicle file of the firmware's default vehicle, for `configuration.load`."""
+        """Name of the vehicle file that describes the firmware's default vehicle, for
+        `configuration.load`."""
         return OWN_VEHICLES[self.firmware]
 
     def signing(self, stack: ExitStack) -> Signing | None:
-        """Without a kept time: in lockstep no stamp depends on the clock."""
+        """Signing whose time stamps are not kept on disk: in lockstep they do not depend on the
+        clock. Raises UserError."""
         return Signing(read_key(self.signing_key)) if self.signing_key else None
 
     def settings(self, link: Link) -> SessionSettings:
@@ -135,7 +138,7 @@ class Simulated:
         return link
 
     def options(self, port: int, seed: int) -> list[str]:
-        """Options of the `simulator` command, for a vehicle that sends to our local `port`."""
+        """Options of the `simulator` command for a vehicle that sends to the local UDP `port`."""
         return [
             *("--connect", f"udpout:127.0.0.1:{port}", "--gcs", "none", "--lockstep"),
             *("--patience", f"{SITL_TIMEOUT_S:g}"),
@@ -147,7 +150,7 @@ class Simulated:
         ]
 
     def _parameters(self) -> dict[str, float]:
-        """Parameters that a user must set once on this autopilot."""
+        """Parameters that a user must set once on a real autopilot of this firmware."""
         watched = DIALECTS[self.firmware].watched_parameters
         return {p.name: float(p.required.bits) for p in watched if p.required.bits}
 
@@ -156,14 +159,15 @@ class Simulated:
 
 
 class BusyComputer(DocumentError):
-    """A decision is late because other programs have the processor."""
+    """A decision misses its deadline only because other programs use the processor."""
 
     code = Unavailable.code
 
 
 @dataclass(frozen=True, slots=True)
 class Prepared:
-    """A configuration with what it builds; `text` is that of flight.yaml."""
+    """A configuration, and the controller and the reference built from it; `text` is the content of
+    flight.yaml."""
 
     config: FlightConfig
     controller: Controller
@@ -179,13 +183,13 @@ class Prepared:
         service: ServiceOptions | None = None,
         before: Flight | None = None,
     ) -> Flight:
-        """The companion of a flight over `session`. `stopwatch` reads host time; `known` is what an
-        earlier flight has identified of the vehicle; `before`: see `Flight`."""
+        """Build the `Flight` that uses `session`. `stopwatch` returns host time in seconds; `known`
+        is what an earlier flight has identified about the vehicle; `before`: see `Flight`."""
         config, controller = self.config, self.controller
         observer, identification = Observer(config.vehicle), None
         if known:
             observer.set_vehicle(known.vehicle)
-        if isinstance(controller, Adaptive):  # else it cannot use another vehicle model
+        if isinstance(controller, Adaptive):  # others cannot use an identified vehicle model
             identification = Learner(config.vehicle, config.identify, known=known)
         return Flight(
             limits=config.limits,
@@ -204,16 +208,18 @@ class Prepared:
 
 
 def build(config: FlightConfig) -> Prepared:
-    """Build the controller and the reference. Raises DocumentError if it cannot be flown."""
+    """Build the controller and the reference of `config`. Raises DocumentError if they cannot be
+    flown."""
     return Prepared(config, build_controller(config), build_track(config), dump(config))
 
 
 def rehearse(prepared: Prepared, *, keeps_deadline: bool) -> float:
-    """Call every code path of observer and controller, so that nothing is compiled in flight.
+    """Call every code path of observer and controller, so that nothing is compiled in flight: a
+    pause of seconds at the first decision in flight would crash the vehicle.
 
-    A pause of seconds at the first decision in flight is a crash. Returns the wall time of the
-    shortest possible decision, measured with `keeps_deadline`. Raises DocumentError if the control
-    law fails or, with `keeps_deadline`, if a decision cannot meet the deadline.
+    Returns the wall time of the shortest possible decision in seconds, NaN without
+    `keeps_deadline`. Raises DocumentError if the control law fails or, with `keeps_deadline`, if
+    a decision cannot meet the deadline.
     """
     config, controller = prepared.config, prepared.controller
     observer = Observer(config.vehicle)
@@ -245,8 +251,8 @@ def rehearse(prepared: Prepared, *, keeps_deadline: bool) -> float:
 
 
 def _decided(controller: Controller, situation: Situation) -> Command | PositionCommand:
-    """The command of a decision. Raises DocumentError if the law fails: better here than in
-    flight."""
+    """Let the controller decide and return its command. Raises DocumentError if it raises, returns
+    a command that cannot be sent, or changes the given state."""
     given = deepcopy(situation.state)
     with outside("controller"):
         decision = controller.decide(situation)
@@ -258,14 +264,15 @@ def _decided(controller: Controller, situation: Situation) -> Command | Position
             f"controller: it decides {command}, which cannot be sent: all values must be finite, "
             "the thrust direction a tuple of length 1"
         )
-    # the flight compares it with what the vehicle does then
+    # the flight compares the given state with the motion that follows
     if not all(map(np.array_equal, astuple(situation.state), astuple(given))):
         raise DocumentError("controller: it changes the state that it is given; let it use a copy")
     return command
 
 
 def _check_deadline(controller: Controller, cut_short: Situation, budget_s: float) -> float:
-    """The shortest possible decision must meet the deadline; returns its time."""
+    """Return the wall time of the shortest possible decision in seconds. Raises DocumentError if it
+    exceeds `budget_s`, BusyComputer if only the wall time does and not the CPU time."""
     least_s = needed_s = math.inf
     for _ in range(REHEARSED_DECISIONS):
         began_s, computed_s = clock.monotonic_s(), clock.thread_s()
@@ -298,16 +305,18 @@ def fly(
     progress: Callable[[Flight], None] = lambda companion: None,
     tell: Callable[[str], None] = lambda sentence: None,
 ) -> Outcome:
-    """Fly once, and log it in `directory`.
+    """Fly `config` once with `vehicle` and log the flight in `directory`.
 
-    `progress` is called often in flight, `tell` with sentences about the preparation. `simulator`
-    and `stops` may be shared by several flights; without them this flight makes its own.
+    `progress` is called often during the flight; `tell` is called with sentences about the
+    preparation. `simulator` and `stops` may be shared by several flights; without them this flight
+    makes its own.
 
-    Example: `fly(load("flight"), Path("flights/1"), Simulated()).exit_code` is 0 if the flight was
-    flown and landed.
+    Example: `fly(load("flight"), Path("flights/1"), Simulated()).exit_code` is 0 if the vehicle has
+    flown the reference and landed.
 
-    Raises UserError before anything is sent, and KeyboardInterrupt if a stop was requested
-    meanwhile. The log is created last: a flight that cannot begin leaves no directory.
+    During the preparation, before anything is sent, it raises UserError if the flight cannot begin,
+    and KeyboardInterrupt if a stop is requested. The log is created last: a flight that cannot
+    begin leaves no directory.
     """
     simulated = isinstance(vehicle, Simulated)
     with ExitStack() as stack:

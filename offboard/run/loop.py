@@ -17,17 +17,17 @@ from offboard.link.stop import StopRequests
 from offboard.run.sitl import Ending, InMemorySimulator, SimulatorProcess
 from offboard.supervisor.supervisor import Supervisor
 
-POLL_S = 0.02
-SEND_WITHIN_S = 0.2  # from the beginning of a turn: what it decided does not leave later
-FAILING_S = 0.3  # without a turn that succeeds: give up
+POLL_S = 0.02  # longest wait for telemetry in a turn
+SEND_WITHIN_S = 0.2  # after the beginning of a turn; later its frames are dropped
+FAILING_S = 0.3  # the loop ends after this time without a successful turn
 UNGUARDED = "the supervisor ended: nobody lands the vehicle if this process dies"
 UNANSWERED = "the supervisor does not answer: nobody lands the vehicle if this process dies"
 ANSWERS = "the supervisor answers again"
-RESTART_S = 10.0  # between two attempts to start another one
+RESTART_S = 10.0  # between two attempts to start another supervisor
 
 
 class Flown(Protocol):
-    """A flight, or the flights of a service, of which `current` waits or flies."""
+    """A flight, or the flights of a service; `current` is the one that waits or flies."""
 
     @property
     def current(self) -> Flight: ...
@@ -37,7 +37,7 @@ class Flown(Protocol):
 
 
 class Log(Protocol):
-    """What the loop needs of a log; nothing of it waits but `close`."""
+    """What the loop needs from a log. Only `close` may wait."""
 
     @property
     def problem(self) -> str: ...
@@ -53,8 +53,8 @@ class Loop:
     """Moves bytes between one link, one companion and one log until the flight ends.
 
     `progress` is called often, to show the companion's announcements to the user; it must not wait.
-    With the bundled `simulator` `patience_s` is the wall time without a datagram after which the
-    flight ends; on any other vehicle there is a `supervisor`, which outlives us.
+    A flight in the bundled `simulator` ends after `patience_s` of wall time without a datagram. All
+    other vehicles have a `supervisor`, a process that outlives this one.
     """
 
     def __init__(
@@ -78,17 +78,18 @@ class Loop:
         self._patience_s = patience_s
         self._supervisor = supervisor
         self._warned: set[str] = set()
-        self._unguarded = ""  # why nobody would land the vehicle, as the user knows it
-        self._error = ""  # the first exception of this flight
+        self._unguarded = ""  # UNGUARDED or UNANSWERED once announced; empty while it guards
+        self._error = ""  # the first exception of this flight, as a sentence
         self._restarted_s = -RESTART_S
         self._succeeded_s = self._heard_s = clock.monotonic_s()
         self._ended_early: Outcome | None = None
 
     def run(self) -> Outcome:
-        """Fly to the end. The first stop request lands, a second one exits immediately."""
+        """Run until the flight ends. The first stop request lands the vehicle, the second one ends
+        the loop immediately."""
         self._stops.in_flight = self._stops.interruptible = True
         gc.collect()
-        if not gc.get_freeze_count():  # by an earlier flight in this process
+        if not gc.get_freeze_count():  # an earlier flight in this process may have done this
             gc.freeze()
         self._succeeded_s = self._heard_s = clock.monotonic_s()
         while not (self._companion.has_ended() or self._stops.repeated or self._ended_early):
@@ -96,17 +97,21 @@ class Loop:
                 self._turn()
                 self._succeeded_s = clock.monotonic_s()
                 if self._companion.current.phase in WAITING:
-                    self._error = ""  # the flight that it ended is over
-            except BaseException as error:  # a law may even end the program
-                if not self._stops.repeated:  # else it interrupts a law that hangs
+                    self._error = ""  # the flight that the error ended is over
+            except BaseException as error:  # a control law may even raise SystemExit
+                if not self._stops.repeated:  # a third signal interrupts a law that hangs
                     self._hand_back(error)
-        self._stops.interruptible = False  # log and outcome are not lost to another signal
+        self._stops.interruptible = False  # another signal must not lose log and outcome
         self._show()
         return self._outcome()
 
     def _turn(self) -> None:
-        """This process may have been stopped at any time, most likely while it waited: nothing is
-        read before it knows whether the supervisor, which reads the same link, has the vehicle."""
+        """Receive, decide, send and log once.
+
+        The operating system may have stopped this process, most likely while it waited. Therefore
+        nothing is read before it is known whether the supervisor, which reads the same link, has
+        taken over.
+        """
         self._link.wait(POLL_S)
         if self._taken_over():
             return
@@ -136,8 +141,8 @@ class Loop:
         self._check_simulator(began_s - self._heard_s)
 
     def _send(self, frames: Sequence[bytes], began_s: float) -> list[bytes]:
-        """Send what a turn has decided. This process may have been stopped since the turn began:
-        then it is dropped, and returned."""
+        """Send the frames of a turn that began at host time `began_s`. With a supervisor, drop and
+        return those that are more than SEND_WITHIN_S late, because this process was stopped."""
         peer = self._companion.current.session.peer
         dropped: list[bytes] = []
         for frame in frames:
@@ -156,10 +161,10 @@ class Loop:
     # --- the supervisor ---
 
     def _check_supervisor(self) -> None:
-        """Say whether it guards the flight. Start another one in place of one that has ended, while
-        no flight needs this loop: it waits some milliseconds for the new process."""
+        """Announce whether the supervisor guards the flight. Restart one that has ended, but only
+        in a phase in `WAITING`: a restart blocks the loop for some milliseconds."""
         supervisor, current = self._supervisor, self._companion.current
-        if supervisor is None or supervisor.has_taken_over():  # while this process was stopped
+        if supervisor is None or supervisor.has_taken_over():  # it may have during this turn
             return
         guards = supervisor.guards
         current.guard(guards)
@@ -176,7 +181,7 @@ class Loop:
                 supervisor.restart()
 
     def _taken_over(self) -> bool:
-        """Whether the supervisor has the vehicle; then wait until it is done with it."""
+        """Whether the supervisor has taken over; if so, wait until it has finished."""
         supervisor = self._supervisor
         if supervisor is None or not supervisor.has_taken_over():
             return False
@@ -192,8 +197,9 @@ class Loop:
     # --- what may go wrong ---
 
     def _hand_back(self, error: BaseException) -> None:
-        """Land, if the companion still can. Otherwise end: silence, and the supervisor. The bundled
-        simulator waits for the answer that this turn did not give."""
+        """Request a landing after an exception in a turn. End the loop if turns keep failing: then
+        setpoints stop and the supervisor takes over. With the bundled simulator end it at once,
+        because the simulator waits for the reply that this turn did not send."""
         sentence = f"internal error: {located(error)}"
         self._error = self._error or sentence
         with suppress(BaseException):
@@ -209,20 +215,20 @@ class Loop:
                 self._companion.request_stop(problem)
 
     def _warn(self, sentence: str) -> None:
-        """Announce it once."""
+        """Announce `sentence`, once in the life of this loop."""
         if sentence not in self._warned:
             self._warned.add(sentence)
             self._companion.current.announce(sentence)
 
     def _show(self) -> None:
-        """Show the progress. A failure does not end the flight."""
+        """Call `progress`. If it fails, it is not called again, and the flight goes on."""
         try:
             self._progress(self._companion)
         except (Exception, SystemExit):
             self._progress = lambda companion: None
 
     def _check_simulator(self, silent_s: float) -> None:
-        """End the flight if the bundled simulator has ended."""
+        """End the flight if the bundled simulator has ended, or has not sent for `patience_s`."""
         if self._simulator is None or self._companion.has_ended():
             return
         ending = self._simulator.ending()
@@ -238,7 +244,7 @@ class Loop:
     # --- the end ---
 
     def _outcome(self) -> Outcome:
-        """The result; closes the log, so that all that it lost is known."""
+        """Close the log, so that the number of lost entries is final, and return the outcome."""
         self._log.close()
         outcome = self._ended_early or self._companion.current.outcome
         ended = self._companion.has_ended() or self._companion.current.in_end_phase
@@ -253,7 +259,7 @@ class Loop:
             code = code or (ExitCode.ABORTED if lands else ExitCode.FLOWN)
             problem = self._log.problem
             lost = f"{problem}: {self._log.lost} entries lost"
-            named = sentence.startswith(problem)  # the flight was landed for it
+            named = sentence.startswith(problem)  # the log's problem was the reason to land
             sentence = lost + (sentence.removeprefix(problem) if named else f"; {sentence}")
         return Outcome(code, sentence, self._log.problem)
 

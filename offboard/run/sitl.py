@@ -1,8 +1,8 @@
-"""The bundled simulator: as a process, started, watched and always stopped; or in this process, for
-campaigns, without socket. A flight is the same with either, byte for byte.
+"""Runs the bundled simulator, either as a process that is watched and always stopped, or in this
+process without a socket (for campaigns). A flight is the same with either, byte for byte.
 
-`offboard` never imports `simulator`. They exchange MAVLink, and on a pipe the simulator's options;
-in memory it is found by entry point.
+`offboard` never imports `simulator`. They exchange MAVLink; a pipe carries the simulator's options.
+The simulator in this process is found by its entry point.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from offboard.link import clock
 from offboard.link.interface import Chunk, Link
 
 OWN_VEHICLES = {"px4": "px4_sih", "ardupilot": "arducopter"}  # the simulator's default vehicles
-STOP_S = 2.0
-ERRORS_BYTES = 65536
+STOP_S = 2.0  # for the vehicle's process to end, before it is killed
+ERRORS_BYTES = 65536  # read from stderr of a simulator that has ended
 USAGE = 2  # the simulator's exit code for options and files that it cannot use
-GROUP, NAME = "pso_offboard.simulators", "bundled"  # its entry point
+GROUP, NAME = "pso_offboard.simulators", "bundled"  # the simulator's entry point
 
 
 @dataclass(frozen=True, slots=True)
 class Ending:
-    """How a simulator ended: one sentence. `unusable`: its options or files were wrong."""
+    """How a simulator ended. `unusable`: whether its options or files were wrong."""
 
     sentence: str
     unusable: bool
@@ -43,22 +43,23 @@ class Ending:
 
 @cache
 def check_scenario_named(name: str) -> None:
-    """Check the scenario of flights, by name or path; shipped ones are valid. Raises
-    DocumentError."""
+    """Check a scenario that is given by name or path. Shipped scenarios are valid and are not
+    checked. Raises DocumentError."""
     path = shipped.locate(name, "scenario")
     if shipped.directory() not in path.parents:
         check_scenario(shipped.read_text(path), str(path))
 
 
 def check_scenario(text: str, source: str) -> None:
-    """Let the simulator validate the YAML of a scenario, which errors call `source`. Raises
+    """Let the simulator validate the YAML `text` of a scenario; errors name it `source`. Raises
     DocumentError."""
     registered().load().check_scenario(text, source)
 
 
 class SimulatorProcess:
-    """Context manager around `python -m simulator.pool`, which loads once and then starts vehicles,
-    one after the other, each as a child of `process`. Leaving it ends all processes."""
+    """Context manager for `python -m simulator.pool`. The pool loads the simulator once, then
+    starts one vehicle after the other, each as its child process. Leaving the context ends all
+    processes."""
 
     def __init__(self) -> None:
         self._ending: Ending | None = None
@@ -81,7 +82,7 @@ class SimulatorProcess:
 
     def launch(self, options: Sequence[str]) -> None:
         """Start a vehicle with `options` of the `simulator` command."""
-        if self.process.poll() is not None:  # it died in an earlier flight
+        if self.process.poll() is not None:  # the pool died in an earlier flight
             self.close()
             self._open()
         self._errors_before = os.fstat(self._errors.fileno()).st_size
@@ -138,9 +139,12 @@ class SimulatorProcess:
 
 
 class InMemoryVehicle(Protocol):
-    """A vehicle in lockstep, made of a firmware, the names of a scenario and a vehicle file (None:
-    the firmware's), a seed and parameters. `exchange` takes frames of the companion and returns
-    sender and bytes of the datagrams up to the next barrier; nothing until it is answered."""
+    """A simulated vehicle in lockstep. Its constructor has the arguments `firmware`, `scenario` and
+    `vehicle` (name or file; None: the firmware's default), `seed` and `parameters`.
+
+    `exchange` takes frames of the companion and returns sender and bytes of all datagrams up to the
+    next barrier; it returns nothing until the companion has replied to the previous barrier.
+    """
 
     def exchange(self, frames: Sequence[bytes]) -> list[tuple[int, bytes]]: ...
 
@@ -155,7 +159,7 @@ class InMemoryLink(Link):
         self._sent: list[bytes] = []
 
     def receive(self) -> list[Chunk]:
-        """All datagrams up to the next barrier. Never waits."""
+        """All datagrams up to the next barrier; the simulator computes them in this call."""
         frames, self._sent = self._sent, []
         if self.problem is not None:
             return []
@@ -172,7 +176,7 @@ class InMemoryLink(Link):
 
 
 class InMemorySimulator:
-    """Takes the place of a `SimulatorProcess`: one vehicle after the other, each in memory."""
+    """Replaces a `SimulatorProcess`: runs one vehicle after the other in this process."""
 
     def __init__(self) -> None:
         self._link: InMemoryLink | None = None
@@ -185,7 +189,7 @@ class InMemorySimulator:
         return self._link
 
     def ending(self, timeout_s: float = 0.0) -> Ending | None:
-        """How the vehicle ended, None while it runs."""
+        """How the vehicle ended, or None while it runs."""
         problem = self._link.problem if self._link else None
         if problem is None:
             return None
@@ -198,7 +202,7 @@ class InMemorySimulator:
 
 @cache
 def registered() -> EntryPoint:
-    """The entry point of the bundled simulator. Raises UserError where it is not installed."""
+    """The entry point of the bundled simulator. Raises UserError if it is not installed."""
     for point in entry_points(group=GROUP):
         if point.name == NAME:
             return point
