@@ -1,4 +1,4 @@
-"""The `offboard` command: one module for each of its commands, and what they share in `shared`."""
+"""The `offboard` command: modules with its commands, and `shared` with what several of them use."""
 
 from __future__ import annotations
 
@@ -8,5 +8,5 @@ from offboard.documents.command_line import run
 
 
 def main() -> NoReturn:
-    """Run the command in `sys.argv` and exit. Errors of the user are printed as sentences."""
+    """Run the command in `sys.argv` and exit. An error that the user can fix is one sentence."""
     run("offboard.cli.commands")

@@ -34,12 +34,13 @@ if TYPE_CHECKING:
 
 NAMES = "Names or files, separated by commas"
 SCENARIOS = "calm,px4_like"
-PROFILE = ("-o", "--out")  # the option
-GROUPS_SHOWN = 30  # of a table in the terminal
+PROFILE = ("-o", "--out")  # names of the option
+GROUPS_SHOWN = 30  # a table with more rows is not printed in the terminal
 
 
 def shard_of(text: str) -> slice:
-    """The cases of shard I/N: every N-th."""
+    """The slice of all cases that selects shard I/N: every N-th case, beginning with case I.
+    Raises BadParameter."""
     matched = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
     if not matched or not 1 <= int(matched[1]) <= int(matched[2]):
         raise typer.BadParameter(f"{text!r}: give I/N with I from 1 to N, for example 2/4")
@@ -98,7 +99,8 @@ def campaign(
 
 
 def conclude(summary: Summary, flown: Campaign) -> None:
-    """Print what was flown; exits with 1 if a flight failed, 4 if some are missing."""
+    """Print the results. Raises UserError, which exits with 1 if a flight failed, with 4 if flights
+    are missing."""
     from offboard.campaign.table import groups, show
 
     directory = flown.directory
@@ -123,7 +125,8 @@ def conclude(summary: Summary, flown: Campaign) -> None:
 
 
 def _search(flown: Campaign, source: str, count: int, open_workers: OpenFlyer) -> None:
-    """Search for failures and print them; exits with 1 if there is one."""
+    """Search for flights that fail and print them. Raises UserError, which exits with 1, if there
+    is one."""
     from offboard.campaign.run import Progress
     from offboard.campaign.search import FailureSearch
 
@@ -208,7 +211,8 @@ def compare(
 
 
 def _names(name: str, text: str, known: Sequence[str] = ()) -> list[str]:
-    """Comma-separated names, each once; 'all' stands for every known one."""
+    """The comma-separated names in `text`, each once; 'all' means all `known` names. `name` is the
+    option. Raises UserError for an empty list."""
     parts = [part.strip() for part in text.split(",") if part.strip()]
     if not parts:
         raise UserError(f"{name} is an empty list of names; give at least one")

@@ -1,4 +1,4 @@
-"""The application: the commands of `offboard` and the options before them."""
+"""The typer application: registers all commands of `offboard`, and has the option `--version`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def offboard(
         raise typer.Exit(USAGE)
 
 
-# the commands in the order of --help, and the kinds of shipped files that theirs names
+# the commands in the order of --help; the help of each lists the shipped files of these kinds
 for command, kinds in (
     (grouped(fly.fly), (*shipped.PARTS, "scenario")),
     (grouped(daemon.daemon), shipped.PARTS),

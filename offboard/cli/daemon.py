@@ -24,7 +24,7 @@ from offboard.documents.command_line import DISK_ERRORS, complain, explained
 from offboard.documents.errors import UserError
 from offboard.documents.shipped import absolute
 
-STATE = Path("/var/lib/offboard")  # of the unit
+STATE = Path("/var/lib/offboard")  # state directory of the systemd unit
 OUT = f"Directory of the flights' directories.  [default: {FLIGHTS}]"
 
 
@@ -103,13 +103,14 @@ def daemon(
 
 
 def disk_is_full(error: UserError | OSError) -> bool:
-    """Whether a full disk is the cause: then it may work another time."""
+    """Whether the cause is a disk error, such as a full disk: then a later attempt may succeed."""
     cause = error if isinstance(error, OSError) else error.__context__
     return isinstance(cause, OSError) and cause.errno in DISK_ERRORS
 
 
 def _print_unit(options: FlightOptions, out_directory: Path | None) -> None:
-    """Print the unit, and on stderr what its user cannot read. Raises UserError."""
+    """Print the systemd unit, and on stderr a sentence for each file that the unit's user cannot
+    read. Raises UserError."""
     import offboard
     from offboard.documents.signing_key import read_key
     from offboard.service.daemon import unit, unreadable
@@ -137,7 +138,8 @@ def _print_unit(options: FlightOptions, out_directory: Path | None) -> None:
 
 
 def _absolute(word: str) -> str:
-    """A file is named by its whole path: the unit runs in another directory."""
+    """A word of the command line, in which the path of an existing file is made absolute: the unit
+    runs in another directory."""
     option, equals, value = word.partition("=") if word.startswith("--") else ("", "", word)
     if not Path(value).exists():
         return word

@@ -1,4 +1,4 @@
-"""`offboard doctor`: a read-only check of a vehicle, its link and this computer."""
+"""`offboard doctor`: checks a vehicle, its link and this computer before a flight."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def doctor(
         width = max(map(len, rows), default=0)
         indent = levels + width + 4
         for check, findings in rows.items():
-            # of one with something to say only that
+            # findings that are ok are printed only if the check has no others, and only the first
             for finding in [f for f in findings if f.level is not Level.OK] or findings[:1]:
                 level = finding.level.name.lower()
                 say(f"{level:<{levels}}  {check:<{width}}  {finding.found}", indent)

@@ -35,8 +35,9 @@ def check(
 
 
 def _checked(path: Path) -> str:
-    """Validate a file; what is said of a valid one. A reference must be flyable by the default
-    flight's vehicle, a flight's by its own. Raises DocumentError."""
+    """Validate a file and return the sentence for a valid one. The vehicle of the default
+    configuration must be able to fly a reference; that of a configuration must be able to fly its
+    reference. Raises DocumentError."""
     from offboard.campaign.cases import base_cases
     from offboard.campaign.document import CampaignFile
     from offboard.campaign.tune import TuneFile, planned
@@ -47,7 +48,7 @@ def _checked(path: Path) -> str:
     table = path.suffix.lower() == ".csv"
     text = "" if table else shipped.read_text(path)
     kind = "reference" if table else kind_of(read(text, str(path)))
-    name = str(path) if table else os.path.join(".", path)  # not the name of a shipped file
+    name = str(path) if table else os.path.join(".", path)  # never the name of a shipped file
     if kind == "configuration":
         build_track(load(name))
     elif kind == "reference":

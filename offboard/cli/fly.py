@@ -1,4 +1,4 @@
-"""`offboard fly`: one flight, printed while it happens, and its result in ten lines."""
+"""`offboard fly`: one flight, whose phases are printed as they happen, and its result."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def fly(
 
 
 def _exit_at_once() -> None:
-    """Exit although code may be compiling; the simulator ends when the pipe to it closes."""
+    """Exit at once, even while functions are compiled. The simulator ends as its pipe closes."""
     os.write(2, f"{INTERRUPTED}\n".encode())
     os._exit(INTERRUPT)
 
@@ -129,9 +129,12 @@ def _conclude(
     page: str,
     json_lines: bool,
 ) -> None:
-    """Print verdict and result. Exits with the code of the verdict, also if the log was deleted
-    or replaced meanwhile; then every requirement is missed. `lost`: sentences on what was not shown
-    of the flight. `page`: where the report will be, empty without one."""
+    """Print verdict and result, and exit with the code of the verdict.
+
+    If the flight cannot be scored, for example because its log was deleted meanwhile, every
+    requirement is missed. `lost` are sentences about the parts of the flight that were not shown;
+    `page` is the path of the report that is about to be written, empty without one.
+    """
     from offboard.analysis.score import Score, judged
     from offboard.analysis.score_table import summary
     from offboard.live.display import DIGITS, line

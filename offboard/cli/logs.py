@@ -29,7 +29,7 @@ from offboard.documents.command_line import complain
 from offboard.documents.errors import UserError
 from offboard.link.log import free_name
 
-OUTPUT = ("-o", "--output")  # the option
+OUTPUT = ("-o", "--output")  # names of the option
 PAGE = "report.html"
 
 

@@ -1,4 +1,4 @@
-"""`offboard paper`: the tables and figures of the paper, ours beside theirs."""
+"""`offboard paper`: the tables and figures of the paper, with ours beside them."""
 
 from __future__ import annotations
 

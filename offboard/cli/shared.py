@@ -1,7 +1,7 @@
-"""What the commands share: output that fits the terminal, and options.
+"""Options and terminal output that several commands use.
 
-The module of a command imports the rest of the package when the command runs, so that `--help` and
-wrong options are answered at once.
+The module of a command imports the rest of the package only when the command runs, so that `--help`
+and wrong options are answered at once.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ if TYPE_CHECKING:
 
 
 class Output(Console):
-    """A console that raises where nobody reads it any more: rich would exit with 1."""
+    """A console that raises BrokenPipeError if the reader has closed the pipe. rich alone would
+    exit with code 1."""
 
     def on_broken_pipe(self) -> None:
         raise
@@ -41,11 +42,12 @@ out, err = Output(highlight=False), Output(highlight=False, stderr=True)
 
 DEFAULT_CONNECTION = "udpin:127.0.0.1:14540"
 REFUSED = 3  # exit code
-FLIGHTS = Path("flights")  # parent of the flight directories that have no --out
+FLIGHTS = Path("flights")  # flight directories are created here if --out is not given
 
 
 def absent(path: Path | None) -> Path | None:
-    """Refuse a file that is there, or has no directory, before anything is done for it."""
+    """Check an output path before the command does any work, and return it. Raises BadParameter if
+    it exists, or if its directory does not exist."""
     if path and (path.exists() or path.is_symlink()):
         raise typer.BadParameter(f"{path} exists already; choose another file")
     if path and not path.parent.is_dir():
@@ -89,7 +91,7 @@ Assignments = Annotated[
 
 @dataclass(frozen=True, slots=True)
 class FlightOptions:
-    """The options of a flight, the same for every command that flies or checks one."""
+    """The options of every command that flies or checks a flight."""
 
     connect: Annotated[str | None, option("LINK", LINK)] = None
     system: System = None
@@ -101,7 +103,7 @@ class FlightOptions:
     assignments: Assignments = None
 
     def load(self, seed: int | None = None, known_vehicle: str | None = None) -> FlightConfig:
-        """The configuration, see `configuration.load`. Raises DocumentError."""
+        """Load the configuration, see `configuration.load`. Raises DocumentError."""
         from offboard.run.configuration import load
 
         return load(
@@ -113,7 +115,7 @@ class FlightOptions:
         )
 
     def connection(self) -> Connection:
-        """The vehicle at a link."""
+        """The vehicle that --connect, --system and --signing-key describe."""
         from offboard.run.flight import Connection
 
         return Connection(self.connect or DEFAULT_CONNECTION, self.system, self.signing_key)
@@ -121,8 +123,8 @@ class FlightOptions:
 
 @dataclass(frozen=True, slots=True)
 class SitlOptions(FlightOptions):
-    """Those of a command that flies the bundled simulator, too. Raises UserError where they name
-    another vehicle beside it, or it is not flown."""
+    """The options of a command that can also fly the bundled simulator. Raises UserError if
+    --sitl is combined with --connect or --system, or if options of --sitl are given without it."""
 
     sitl: Annotated[bool, typer.Option("--sitl", help="Fly the bundled simulator.")] = False
     firmware: Annotated[
@@ -146,7 +148,7 @@ class SitlOptions(FlightOptions):
             )
 
     def flown(self) -> Connection | Simulated:
-        """The simulator, or the vehicle at a link. Raises DocumentError."""
+        """The simulated vehicle with --sitl, else the vehicle at a link. Raises DocumentError."""
         if not self.sitl:
             return self.connection()
         from offboard.run.flight import Simulated
@@ -158,8 +160,9 @@ class SitlOptions(FlightOptions):
 
 
 def grouped(command: Callable[..., None]) -> Callable[..., None]:
-    """A command whose first parameter is a group of options, a dataclass: in its signature the
-    fields of the group stand for it."""
+    """Return a function for typer that calls `command`, whose first parameter is a dataclass of
+    options. In the signature of that function the fields of the dataclass replace the parameter.
+    """
     first, *others = inspect.signature(command, eval_str=True).parameters.values()
     group: type = first.annotation
     fields = inspect.signature(group, eval_str=True).parameters
@@ -175,31 +178,33 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def say(text: str, indent: int = 0) -> None:
-    """Print a line to stdout, wrapped at words to the width; further lines are indented."""
+    """Print a line to stdout, wrapped between words to the width of the terminal; continuation
+    lines are indented by `indent` columns."""
     out.print(wrapped(text, out.width, indent), markup=False, soft_wrap=True)
 
 
 def say_each(texts: Mapping[str, str], margin: int = 2) -> None:
-    """Print a line for each name: the name, then its text, both aligned."""
+    """Print one line for each entry of `texts`: its name, then its text, in two columns."""
     width = max(map(len, texts), default=0) + 2
     for name, text in texts.items():
         say(f"{'':{margin}}{name:{width}}{text}", indent=margin + width)
 
 
 def write(text: str) -> None:
-    """Print text as it is, at once."""
+    """Print `text` unchanged and flush stdout."""
     sys.stdout.write(text)
     sys.stdout.flush()
 
 
 def write_new(path: Path, text: str) -> None:
-    """Write a file that must not exist. It appears when it is complete. Raises UserError."""
+    """Write a new file, which appears only once it is complete. Raises UserError if it exists or
+    cannot be written."""
     with new_file(path) as file:
         file.write(text.encode())
 
 
 def scored(flight: Path) -> tuple[Score, History]:
-    """Score a flight and keep the score in its directory. Raises UserError."""
+    """Score a flight and write score.json into its directory. Raises UserError."""
     from offboard.analysis.score import score_flight
 
     result, history = score_flight(flight)
@@ -208,7 +213,7 @@ def scored(flight: Path) -> tuple[Score, History]:
 
 
 def keep(flight: Path, result: Score, history: History) -> None:
-    """Write score.json if `flight` is a directory. Where it cannot be written, say so."""
+    """Write score.json if `flight` is a directory. Print a sentence if it cannot be written."""
     from offboard.analysis.score import keep_score
     from offboard.link.log import LogError
 
