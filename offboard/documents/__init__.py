@@ -1,1 +1,1 @@
-"""Strict YAML documents: the shipped files, reading, validation, and errors as sentences."""
+"""Strict YAML documents: shipped files, reading and validation. Also the errors of all commands."""

@@ -1,4 +1,4 @@
-"""The options and arguments of a command, checked before they are converted; HOST:PORT."""
+"""Options and arguments of a command, checked before typer converts them; HOST:PORT addresses."""
 
 from __future__ import annotations
 
@@ -11,23 +11,24 @@ from typer.core import TyperCommand
 from offboard.documents.errors import UserError, shown
 
 FILE = "NAME|FILE"  # the name of a shipped file, or a path
-LIVE_PAGE = "127.0.0.1:8014"  # of --live without a value
+LIVE_PAGE = "127.0.0.1:8014"  # HOST:PORT for --live without a value
 LOCAL = "127.0.0.1"
-USAGE_ERROR: Any = typer.BadParameter.__base__  # an unknown option, too; typer does not export it
+USAGE_ERROR: Any = typer.BadParameter.__base__  # base of all usage errors; typer does not export it
 
 
 def option(metavar: str, text: str, *names: str, **more: Any) -> Any:
-    """A command-line option with a value, by default named as its parameter."""
+    """Declare a command-line option that has a value. Without `names` it is named as its
+    parameter."""
     return typer.Option(*names, metavar=metavar, help=text, **more)
 
 
 def split_address(name: str, address: str) -> tuple[str, int]:
-    """Host and port of HOST:PORT, the value of the option `name`; an IPv6 address stands in
-    brackets, no host means this computer. Raises UserError."""
+    """Host and port of `address`, HOST:PORT, which is the value of the option `name`. An IPv6
+    address is in brackets; without a host it is this computer. Raises UserError."""
     try:
         parts = urlsplit(f"//{address}")
         host, port = parts.hostname or LOCAL, parts.port
-        host.encode("idna")  # no part of it is empty or too long
+        host.encode("idna")  # fails if a label of the host name is empty or too long
     except ValueError:
         port = None
     if port is None or parts.netloc != address:
@@ -37,21 +38,21 @@ def split_address(name: str, address: str) -> tuple[str, int]:
 
 
 class Command(TyperCommand):
-    """A command whose values are neither empty nor options nor bytes that are no text.
+    """A command that refuses values which are empty, begin with `--`, or are not UTF-8.
 
-    `--connect "$LINK"` of an unset variable is empty, `--out $DIR --sitl` of one takes the next
-    option as its value: neither may mean something else.
+    If a shell variable is unset, `--connect "$LINK"` has an empty value, and `--out $DIR --sitl`
+    takes the next option as its value: both must be errors.
     """
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         following = [*args[1:], "-"]
-        args = [  # typer has no option whose value may be omitted
+        args = [  # typer does not support an option whose value may be omitted
             f"--live={LIVE_PAGE}" if arg == "--live" and after.startswith("-") else arg
             for arg, after in zip(args, following, strict=False)
         ]
         try:
             given, _, parameters = self.make_parser(ctx).parse_args(list(args))
-        except USAGE_ERROR as error:  # of the last option without its value: it names no command
+        except USAGE_ERROR as error:  # if the last option lacks its value, the error has no context
             error.ctx = error.ctx or ctx
             raise
         for parameter in parameters:

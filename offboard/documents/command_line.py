@@ -1,7 +1,7 @@
-"""Running a command, `offboard` or `simulator`: what ends it is one sentence and an exit code.
+"""Runs the command `offboard` or `simulator`, and prints the error that ends it as one sentence.
 
-The console scripts import this first, and it imports the command: an interrupt meanwhile is
-answered, too.
+The console scripts import this module first, and this module imports the command. So an interrupt
+during that import is handled, too.
 """
 
 from __future__ import annotations
@@ -17,24 +17,25 @@ from typing import NoReturn, TextIO
 
 from offboard.documents.errors import UserError, abridged
 
-USAGE, INTERRUPT, CLOSED_PIPE = 2, 130, 141  # exit codes; the last two as of SIGINT and SIGPIPE
+USAGE, INTERRUPT, CLOSED_PIPE = 2, 130, 141  # exit codes; the last two are 128 + the signal
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 
 def run(module: str, arguments: list[str] | None = None) -> NoReturn:
-    """Import the `app` of a module, call it with these arguments, by default those of this process,
-    and exit.
+    """Import `app` from `module`, call it with `arguments` (default: those of this process), and
+    exit.
 
-    A UserError is printed without a traceback and exits with its `code`; wrong options, a lack of
-    memory, and an error of a file or of the output, with 2; an interrupt with 130. Where nobody
-    reads the output any more (`| head -1`), the exit code is 141 without a sentence.
+    An error is printed as a sentence without a traceback. The exit code is `code` for a UserError;
+    2 for wrong options, a lack of memory, and errors of files or of the output; 130 for an
+    interrupt. If the reader of the output has closed the pipe (`| head -1`), the exit code is 141
+    and nothing is printed.
     """
     for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:  # whoever started it has closed it
+        if getattr(sys, name) is None:  # the parent process has closed it
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
-    # python-control imports it; it would warn of a HOME that cannot be written
+    # python-control imports matplotlib, which would warn about a HOME that cannot be written
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
-    # text that the encoding of the output does not have is escaped
+    # escape characters that the encoding of the output does not have
     sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     sentence, code = "", 0
     try:
@@ -53,7 +54,7 @@ def run(module: str, arguments: list[str] | None = None) -> NoReturn:
 
 
 def _call(module: str, arguments: list[str]) -> None:
-    """Not by the `app` itself, which would print errors of its own and exit."""
+    """Invoke the command, but not by calling `app`, which would print errors itself and exit."""
     from typer.main import get_command
 
     command = get_command(import_module(module).app)
@@ -62,7 +63,8 @@ def _call(module: str, arguments: list[str]) -> None:
 
 
 def _told(error: BaseException) -> tuple[str, int]:
-    """Sentence and exit code of what ended a command; a bug is raised again."""
+    """Sentence and exit code for the error that ended a command. Any other exception is a bug and
+    is raised again."""
     if isinstance(error, KeyboardInterrupt):
         return "interrupted", INTERRUPT
     if isinstance(error, BrokenPipeError):
@@ -87,8 +89,8 @@ def _told(error: BaseException) -> tuple[str, int]:
 
 
 def complain(text: str) -> None:
-    """Print to stderr at once; on a terminal each line is wrapped at words to its width. If nobody
-    can read it, exit codes stay as they are."""
+    """Print `text` to stderr, as `tell` does. An error of stderr is ignored, so that it does not
+    change the exit code."""
     try:
         tell(text, sys.stderr)
     except OSError:
@@ -96,7 +98,7 @@ def complain(text: str) -> None:
 
 
 def tell(text: str, file: TextIO) -> None:
-    """Print to a file at once; on a terminal each line is wrapped at words to its width."""
+    """Print `text` to `file` and flush. On a terminal, lines are wrapped between words."""
     if file.isatty():
         width = shutil.get_terminal_size().columns
         text = "\n".join(wrapped(line, width, 2) for line in text.splitlines())
@@ -104,8 +106,8 @@ def tell(text: str, file: TextIO) -> None:
 
 
 def wrapped(text: str, width: int, indent: int) -> str:
-    """A line wrapped at words, further lines indented. Paths and other long words stay whole, so
-    that they can be copied."""
+    """`text` wrapped between words to `width` columns; continuation lines are indented by `indent`.
+    Paths and other long words are not broken, so that they can be copied."""
     return textwrap.fill(
         text,
         max(width, 1),  # COLUMNS=0
@@ -116,7 +118,7 @@ def wrapped(text: str, width: int, indent: int) -> str:
 
 
 def explained(error: OSError) -> str:
-    """A sentence for an error of the operating system."""
+    """The sentence for an error of the operating system."""
     reason = error.strerror or str(error)
     if error.filename is not None:
         return f"{abridged(error.filename)}: {reason}"
@@ -126,5 +128,5 @@ def explained(error: OSError) -> str:
 
 
 def drop(output: TextIO) -> None:
-    """Send what is printed there to /dev/null from now on, after an error of it."""
+    """Redirect `output`, on which an error has occurred, to /dev/null."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), output.fileno())

@@ -1,5 +1,5 @@
-"""What a user is told: errors that the user can fix, values and names as a sentence or JSON shows
-them, and sentences on what happens again and again.
+"""Errors that the user can fix; values, names and exceptions formatted for messages and JSON; and
+sentences about recurring events.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-EVERY_S = 1.0  # at most one sentence of a `Repeated`
-# packages that a mistake from outside is not in; the backport calls entry points, too
+EVERY_S = 1.0  # shortest time between two sentences of a `Repeated`
+# packages in which `located` does not look for a mistake; importlib_metadata loads entry points
 _OURS = {"offboard", "importlib_metadata", *sys.stdlib_module_names}
 
 
 class UserError(Exception):
-    """An error that the user can fix. `str()` says what is wrong and what to do, without a
-    traceback; a command that it ends prints it and exits with `code`: that of its class, unless
-    another is given."""
+    """An error that the user can fix. `str()` says what is wrong and what to do. A command that
+    ends with it prints that text without a traceback and exits with `code` (default: that of the
+    class)."""
 
-    code = 2  # what was asked for is wrong
+    code = 2  # the request itself is wrong
 
     def __init__(self, sentence: str, code: int | None = None) -> None:
         super().__init__(sentence)
@@ -36,11 +36,11 @@ class UserError(Exception):
 class Unavailable(UserError):
     """The request is valid but cannot be met now: a link, lock or process is not available."""
 
-    code = 3  # it may work another time
+    code = 3  # the same request may succeed later
 
 
 class DocumentError(UserError):
-    """A configuration that cannot be used. `problems` holds one sentence for each problem; `str()`
+    """A configuration cannot be used. `problems` holds one sentence for each problem; `str()`
     joins them with line breaks."""
 
     def __init__(self, *problems: str) -> None:
@@ -49,9 +49,9 @@ class DocumentError(UserError):
 
 
 def located(error: BaseException) -> str:
-    """An exception of code from outside, such as a controller, in one sentence with file and line
-    of the mistake: of the innermost call in the package or folder that was called from here. Reads
-    no file. Never raises an exception of its own."""
+    """Format an exception of external code, such as a controller, as one sentence with the file and
+    line of the mistake. That is the innermost call inside the package or folder that our code
+    called. Reads no file and never raises."""
     calls = []  # package, folder, place
     for frame, line in traceback.walk_tb(error.__traceback__):
         package = str(frame.f_globals.get("__name__")).partition(".")[0]
@@ -69,7 +69,7 @@ def located(error: BaseException) -> str:
 
 @contextmanager
 def naming(source: str) -> Iterator[None]:
-    """Put `source`, a file's name, before every problem of a DocumentError raised in the block."""
+    """Prefix every problem of a DocumentError that the block raises with `source`, a file name."""
     try:
         yield
     except DocumentError as error:
@@ -78,8 +78,8 @@ def naming(source: str) -> Iterator[None]:
 
 @contextmanager
 def outside(what: str) -> Iterator[None]:
-    """Code from outside is called in the block: whatever it raises, also to end the program, is a
-    DocumentError after `what`, with file and line. A UserError stays one."""
+    """Convert any exception of external code in the block, also SystemExit, to a DocumentError that
+    begins with `what` and has file and line. A UserError is not converted."""
     try:
         yield
     except UserError:
@@ -89,7 +89,7 @@ def outside(what: str) -> Iterator[None]:
 
 
 def shown(value: Any) -> str:
-    """A value as text for a message: short, strings in quotes."""
+    """A value as text for a message: at most 60 characters, strings in quotes."""
     if value is None:
         return "an empty value"
     text = str(value).lower() if isinstance(value, bool) else repr(value)
@@ -97,13 +97,14 @@ def shown(value: Any) -> str:
 
 
 def abridged(name: object) -> str:
-    """A name or path for a message: at most 100 characters, without what is no text."""
+    """A name or path for a message: at most 100 characters; bytes that are not text are escaped."""
     text = str(name).encode(errors="backslashreplace").decode()
     return text if len(text) <= 100 else f"{text[:97]}..."
 
 
 def typed(*words: str | Path) -> str:
-    """Words of a command as they are typed in a shell; a path that begins with - is no option."""
+    """The words of a command, quoted for a shell. A path that begins with - gets a leading ./, so
+    that it is not taken for an option."""
 
     def plainly(word: str | Path) -> str:
         is_dashed = isinstance(word, Path) and str(word).startswith("-")
@@ -113,8 +114,8 @@ def typed(*words: str | Path) -> str:
 
 
 def meant(name: str, known: Iterable[str]) -> str:
-    """ ", did you mean NAME?" with the nearest of the known names, or the first that contains it;
-    empty where there is none."""
+    """Return ", did you mean NAME?" with the closest known name, or with the first one that
+    contains `name`; empty if there is neither."""
     names = list(known)
     near = difflib.get_close_matches(name, names, n=1)
     if len(name) >= 3:
@@ -123,13 +124,13 @@ def meant(name: str, known: Iterable[str]) -> str:
 
 
 def counted(number: int, noun: str) -> str:
-    """ "1 flight", "2 flights"."""
+    """A number and its noun, for example "1 flight" or "2 flights"."""
     return f"{number} {noun}{'s' * (number != 1)}"
 
 
 def plain(value: Any, digits: int | None = None) -> Any:
-    """The value for JSON, which has no NaN and no infinity: None for each float that is not finite,
-    and lists for tuples; the other floats with `digits` significant digits."""
+    """Convert a value for JSON, which has no NaN and no infinity: a float that is not finite
+    becomes None, other floats are rounded to `digits` significant digits, tuples become lists."""
 
     def number(text: str) -> float:
         return float(f"{float(text):.{digits}g}" if digits else text)
@@ -138,8 +139,8 @@ def plain(value: Any, digits: int | None = None) -> Any:
 
 
 def install(extra: str) -> str:
-    """The line that installs the libraries of an extra. It names them and not this package, which
-    was installed from a checkout or a wheel, and is on no index."""
+    """The pip command that installs the libraries of an extra. It names the libraries, because this
+    package itself is on no index: it was installed from a checkout or a wheel."""
     from importlib.metadata import requires
 
     marked = (each.partition(";") for each in requires("pso-offboard") or ())
@@ -148,10 +149,12 @@ def install(extra: str) -> str:
 
 
 class Repeated:
-    """One sentence for the user. `add` what happened, with a figure, and ask `news` for it.
+    """A sentence for the user about an event that recurs. `add` each event with its figure; `news`
+    returns the sentence, at most once a second.
 
-    `text` is a format of `most` (the greatest figure since the last sentence), `total` (their sum)
-    and `times` (" (the longest of 4)", empty for a single one). Times are seconds of any clock.
+    `text` is a format string with `most` (the greatest figure since the last sentence), `total`
+    (the sum of these figures) and `times` (for example " (the longest of 4)"; empty for a single
+    event). Times are seconds of any clock.
     """
 
     def __init__(self, text: str) -> None:
@@ -163,7 +166,8 @@ class Repeated:
         self._figures.append(figure)
 
     def news(self, now_s: float) -> str:
-        """What to say now; empty if nothing happened, or within a second of the last time."""
+        """The sentence about the events since the last one; empty if there were none, or if the
+        last sentence is less than EVERY_S old."""
         figures = self._figures
         if not figures or now_s - self._said_s < EVERY_S:
             return ""

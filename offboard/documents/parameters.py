@@ -6,7 +6,7 @@ from pydantic import BaseModel, ConfigDict
 
 
 class Parameters(BaseModel):
-    """Base of every configuration value: frozen, strict, unknown keys and non-finite refused."""
+    """Base of every configuration value: frozen; refuses unknown keys, NaN and infinity."""
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True

@@ -1,9 +1,9 @@
-"""Reads configuration: YAML text -> validated value, or sentences that say what is wrong in it.
+"""Reads configuration files: converts YAML text to a validated value, or reports what is wrong.
 
-Every configuration file goes through `read` and `validate`: text in, frozen pydantic value out.
+`read` and `validate` convert the text of every configuration file to a frozen pydantic value.
 Scalars follow YAML 1.2 (`1e-3` is a number, `no` and `12:30` are text) and are checked strictly (no
-text for numbers, no true for 1); duplicate keys, aliases and tags are refused. A problem names the
-line and column of its key, the value and what is allowed, in pydantic's words:
+text for numbers, no true for 1); duplicate keys, aliases and tags are refused. The sentence for a
+problem has the line and column of the key, the value, and what is allowed, as pydantic words it:
 
     flight.yaml, line 4, column 1: period_s: 7 should be less than or equal to 0.5
 """
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 M = TypeVar("M", bound=BaseModel)
 DESCRIPTION_SIZE = 200
 PROBLEMS_MOST = 10
-# pydantic's words, and YAML's words for them
+# words in messages of pydantic -> the terms of YAML that replace them
 WORDS = {
     " after validation": "",
     "an object": "a mapping of keys to values",
@@ -37,8 +37,8 @@ WORDS = {
 
 
 class Section(dict[str, Any]):
-    """A mapping of a file. `places`: where each of its keys stands, or the option that set it, for
-    errors; `description`: of the whole file."""
+    """A mapping in a file. `places` has, for error messages, file, line and column of each key, or
+    the option that set it; `description` is that of the whole file."""
 
     description = ""
 
@@ -51,21 +51,21 @@ yaml.add_representer(Section, SafeRepresenter.represent_dict, Dumper=yaml.SafeDu
 
 
 def descriptions(kind: str) -> dict[str, str]:
-    """Name -> description of the shipped files of one kind."""
+    """The description of each shipped file of one kind, by name."""
     paths = sorted(folder(kind).glob("*.yaml"))
     return {path.stem: read(read_text(path), str(path)).description for path in paths}
 
 
 def load_document(name: str, kind: str, model: type[M]) -> tuple[M, str]:
-    """The value of a shipped file by name, or of a file, and its path for errors. Raises
-    DocumentError."""
+    """Load and validate a file, given by shipped name or path. Returns the value, and the path for
+    error messages. Raises DocumentError."""
     path = locate(name, kind)
     return parse(read_text(path), model, str(path), kind), str(path)
 
 
 def parse(text: str, model: type[M], source: str, kind: str = "") -> M:
-    """YAML `text` -> an instance of `model`. `source` names the text in errors (a file's name),
-    `kind` is the kind of file, one of KINDS; without one it is not checked.
+    """Convert YAML `text` to an instance of `model`. `source` names the text in errors (a file
+    name). `kind`, one of KINDS, is the kind of file that is expected; empty: any.
 
     Raises DocumentError with the problems found.
     """
@@ -73,12 +73,12 @@ def parse(text: str, model: type[M], source: str, kind: str = "") -> M:
 
 
 def read(text: str, source: str, kind: str = "") -> Section:
-    """YAML `text` -> the raw mapping, not yet validated. An empty document is an empty mapping.
-    Raises DocumentError, also for a file that is certainly of another kind.
+    """Convert YAML `text` to a raw mapping, which is not validated yet. An empty document is an
+    empty mapping. Raises DocumentError, also if a key shows that the file is of another kind.
 
-    Every file may have a `description`: one line for people, which `offboard list` prints. It
-    describes the file and is no part of the configuration: taken out here, so that it is not
-    recorded with values that --set has changed since.
+    Every file may have a `description`, a line that `offboard list` prints. It describes the file
+    and not the value: it is removed here, so that it is not recorded beside values that --set has
+    changed.
     """
     value = _loaded(text, source)
     value = Section({}) if value is None else value
@@ -97,15 +97,16 @@ def read(text: str, source: str, kind: str = "") -> Section:
 
 
 def kind_of(raw: Mapping[str, Any]) -> str:
-    """The kind of file that a mapping is, by keys that only this kind has; empty if it has none."""
+    """The kind of a file, recognised by a key that only this kind has; empty if there is none."""
     return next((kind for kind, (_, keys) in KINDS.items() if keys & raw.keys()), "")
 
 
 def override(mapping: Mapping[str, Any], assignment: str) -> Section:
-    """A copy of the raw `mapping` with one `key.path=value` of --set applied.
+    """Return a copy of the raw `mapping` with one `key.path=value` of --set applied.
 
-    The value is YAML; a number in the path indexes a list. Keys are not checked here but in
-    `validate`, whose errors name the option. Raises DocumentError as `assigned`.
+    The value is YAML; a number in the path indexes a list. `validate` checks the keys, and its
+    errors name the option. Raises DocumentError as `assigned` does, and for an index that the list
+    does not have.
     """
     path, value = assigned(assignment)
     changed: Section = _with(mapping, path.split("."), value, _option(assignment))
@@ -113,8 +114,8 @@ def override(mapping: Mapping[str, Any], assignment: str) -> Section:
 
 
 def assigned(assignment: str) -> tuple[str, Any]:
-    """The key.path and the value of `key.path=value`. Raises DocumentError where one of them is
-    missing or the value is no YAML."""
+    """Split `key.path=value` into path and parsed value. Raises DocumentError if the path or the
+    `=` is missing, or if the value is not YAML."""
     path, separator, text = assignment.partition("=")
     keys = [key.strip() for key in path.split(".")]
     if not separator or not all(keys):
@@ -129,18 +130,18 @@ def _option(assignment: str) -> str:
 def validate(
     mapping: Mapping[str, Any], model: type[M], source: str, extra: Literal["ignore"] | None = None
 ) -> M:
-    """Raw mapping -> an instance of `model`. Raises DocumentError with the problems
+    """Convert a raw mapping to an instance of `model`. Raises DocumentError with the problems
     found, at most PROBLEMS_MOST of them.
 
-    `source` names the file in errors about what has no place in it; with `extra` the keys that
-    `model` does not have are ignored.
+    `source` names the file in errors about values whose place in it is not known. With `extra`,
+    keys that `model` does not have are ignored.
     """
     try:
-        # as JSON: strict about scalars, yet a list may become a tuple and text an enum
+        # JSON mode is strict about scalars, but allows a list for a tuple and text for an enum
         return model.model_validate_json(json.dumps(mapping), strict=True, extra=extra)
     except ValidationError as error:
         details = error.errors(include_url=False)
-        # pydantic counts the items without those that it refuses
+        # pydantic does not count refused items: drop the "too short" error that follows from them
         outer = {each["loc"][:n] for each in details for n in range(len(each["loc"]))}
         details = [d for d in details if d["type"] != "too_short" or d["loc"] not in outer]
         problems = []
@@ -175,7 +176,7 @@ def _sentence(detail: ErrorDetails, path: str, model: type[BaseModel]) -> str:
 
 
 def _unknown_key(path: str, model: type[BaseModel]) -> str:
-    """The sentence for an unknown key, with those that its section knows if it is of one class."""
+    """The sentence for an unknown key. It lists the known keys if the section has one class."""
     *sections, key = path.split(".")
     section: Any = model
     for name in sections:
@@ -187,10 +188,11 @@ def _unknown_key(path: str, model: type[BaseModel]) -> str:
 
 
 def _key_path(detail: ErrorDetails, document: Any, source: str) -> tuple[str, str]:
-    """The dotted path of the key that an error of pydantic is about, and what set it: the place of
-    its key in a file, or an option.
+    """The dotted path of the key that an error of pydantic is about, and its origin: the place of
+    the key in a file, or the option that set it.
 
-    pydantic's location also holds the names of union members; these are no keys of `document`.
+    The location that pydantic gives also has names of union members, which are no keys of
+    `document`.
     """
     keys: list[str] = []
     value = document
@@ -207,8 +209,8 @@ def _key_path(detail: ErrorDetails, document: Any, source: str) -> tuple[str, st
 
 
 class _Loader(yaml.SafeLoader):
-    """With the scalars of YAML 1.2. Mappings become Sections; aliases, tags and keys that are given
-    twice are errors."""
+    """Loads YAML with the scalars of YAML 1.2. Mappings become Sections; aliases, tags and
+    duplicate keys are errors."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         event: Any = self.peek_event()  # type: ignore[no-untyped-call]
@@ -232,7 +234,7 @@ class _Loader(yaml.SafeLoader):
 
 
 _TAG = "tag:yaml.org,2002:"
-_Loader.yaml_implicit_resolvers = {}  # without those of YAML 1.1
+_Loader.yaml_implicit_resolvers = {}  # remove those of YAML 1.1
 for _kind, _pattern in {
     "null": "(~|null|Null|NULL|)$",
     "bool": "(true|True|TRUE|false|False|FALSE)$",
@@ -269,8 +271,8 @@ def _refusal(problem: str, where: Any) -> yaml.YAMLError:
 
 
 def _with(value: Any, keys: list[str], new: Any, option: str) -> Any:
-    """A copy of `value` in which the entry at `keys` is `new`, set by `option`; missing sections
-    are created."""
+    """Return a copy of `value` in which the entry at the path `keys` is `new`; missing sections are
+    created. `option` is recorded as the origin of the entry."""
     if not keys:
         return new
     key, rest = keys[0], keys[1:]
@@ -284,6 +286,6 @@ def _with(value: Any, keys: list[str], new: Any, option: str) -> Any:
     section = Section(value if isinstance(value, Mapping) else {})
     before = section.get(key)
     section[key] = _with(before, rest, new, option)
-    if not rest or not isinstance(before, Mapping):  # not of the file any more
+    if not rest or not isinstance(before, Mapping):  # the value no longer comes from the file
         section.places[key] = option
     return section

@@ -1,6 +1,6 @@
-"""Files of the shipped configuration: where they are, and their names.
+"""Names and paths of the shipped configuration files.
 
-In an installed package `config/` lies inside the package, in a checkout beside it.
+The directory `config/` is inside an installed package; in a checkout it is beside the package.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from offboard.documents.errors import DocumentError, abridged, meant, shown
 
 SIZE_MOST = 500_000  # characters of a file: a table of 10,000 rows, or 5 s to parse as YAML
 
-PARTS = ("vehicle", "controller", "reference")  # of a flight, each a file of its own
-# kind of file -> its folder, and keys that no kind above has
+PARTS = ("vehicle", "controller", "reference")  # parts of a flight configuration, one file each
+# kind of file -> its folder, and keys that show the kind unless a kind above has matched
 KINDS = {
     "reference": ("references", {"shape"}),
     "controller": ("controllers", {"law"}),
@@ -49,23 +49,23 @@ def names(kind: str) -> list[str]:
 
 
 def overview(*kinds: str) -> str:
-    """The names of the shipped files, a paragraph for each kind: for the end of `--help`."""
+    """The names of the shipped files, one paragraph for each kind, for the end of `--help`."""
     return "\n\n".join(f"Shipped {kind}s: {', '.join(names(kind))}." for kind in kinds)
 
 
 def is_file(name: str) -> bool:
-    """Whether a name is a file's, and not that of a shipped file."""
+    """Whether `name` is the path of a file, and not the name of a shipped file."""
     return "/" in name or name.lower().endswith((".yaml", ".yml", ".csv"))
 
 
 def absolute(name: str) -> str:
-    """A name, or the absolute path of a file."""
+    """The absolute path if `name` is a path; a shipped name unchanged."""
     return str(Path(name).absolute()) if is_file(name) else name
 
 
 def locate(name: str, kind: str, others: Sequence[str] = ()) -> Path:
-    """The file with a shipped name, or the file itself where `name` is one. Raises DocumentError
-    with the known names, `others` among them."""
+    """The path of the shipped file called `name`, or `name` itself if it is a path. Raises
+    DocumentError, which lists the known names and `others`."""
     if is_file(name):
         return Path(name)
     if name in names(kind):
@@ -81,7 +81,7 @@ def read_text(path: Path) -> str:
     """The content of a UTF-8 file of at most SIZE_MOST characters. Raises DocumentError."""
     try:
         if not path.is_file():
-            path.stat()  # says why there is none
+            path.stat()  # raises an OSError with the reason if there is no file
             raise DocumentError(f"{path} cannot be read: not a regular file")
         with path.open(encoding="utf-8") as file:
             text = file.read(SIZE_MOST + 1)
@@ -90,5 +90,5 @@ def read_text(path: Path) -> str:
         return text
     except OSError as error:
         raise DocumentError(f"{abridged(path)} cannot be read: {error.strerror}") from None
-    except ValueError:  # also a name that no file can have
+    except ValueError:  # also raised for a path that contains a NUL character
         raise DocumentError(f"{abridged(path)} cannot be read: not UTF-8 text") from None

@@ -1,11 +1,11 @@
-"""Key files of MAVLink 2 signing: one line, with the key or with the passphrase that it comes from.
+"""Key files of MAVLink 2 signing: one line with the key, or with a passphrase that gives the key.
 
     passphrase: TEXT      the key is the SHA-256 of the text, as in MAVProxy, QGroundControl and
                           Mission Planner, which can set it on a vehicle
     key: 64 hex digits    the 32 bytes of the key themselves
 
-Lines that begin with # are comments. The file must be readable by its owner alone. No error shows
-any of its contents.
+Lines that begin with # are comments. Only the owner of the file may have access to it. No error
+message shows any of its contents.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def read_key(path: Path) -> bytes:
     shown = f"signing key {abridged(path)}"
     try:
         content = read_text(path).encode()
-    except DocumentError as error:  # not of a configuration
+    except DocumentError as error:  # a key file is not a configuration
         raise UserError(f"signing key {error}") from None
     if path.stat().st_mode & _OTHERS:
         raise UserError(f"{shown} can be read or changed by other users: chmod 600 it")
@@ -48,14 +48,14 @@ def read_key(path: Path) -> bytes:
     found = _KEY.fullmatch(rows[0]) if len(rows) == 1 else None
     if found and found["passphrase"]:
         return hashlib.sha256(found["passphrase"]).digest()
-    if found and any(key := bytes.fromhex(found["key"].decode())):  # all zero means no signing
+    if found and any(key := bytes.fromhex(found["key"].decode())):  # 0 disables MAVLink signing
         return key
     raise UserError(f"{shown} is too short or no key file: {_EXPECTED}")
 
 
 def create_key(path: Path) -> str:
-    """Create a key file at `path` with a random passphrase, which is returned. Never replaces a
-    file. Raises UserError."""
+    """Create a key file at `path` with a random passphrase, and return the passphrase. Never
+    replaces a file. Raises UserError."""
     passphrase = secrets.token_hex(KEY_BYTES)
     try:
         with open(path, "x", encoding="ascii", opener=partial(os.open, mode=0o600)) as file:
@@ -65,7 +65,7 @@ def create_key(path: Path) -> str:
                 file.flush()
                 os.fsync(file.fileno())
             except OSError:
-                path.unlink(missing_ok=True)  # half a key is none
+                path.unlink(missing_ok=True)  # an incomplete key file is useless
                 raise
     except FileExistsError:
         raise UserError(f"{abridged(path)} exists and is not replaced: name another") from None
