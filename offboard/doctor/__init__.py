@@ -1,1 +1,1 @@
-"""A read-only check of a vehicle, its link and this computer before a flight."""
+"""Checks of a vehicle, its link and this computer before a flight."""

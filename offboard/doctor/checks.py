@@ -1,7 +1,7 @@
-"""What is said beside the preflight list, of the link, the vehicle and the planned flight.
+"""Checks of the link, the vehicle and the planned flight, in addition to the preflight list.
 
-A check is a function of an `Observation`; it returns nothing where there is nothing to say. Those
-of OF_VEHICLE need a vehicle that was found.
+A check is a function of an `Observation`; it returns nothing if there is nothing to report. Those
+in OF_VEHICLE run only if a vehicle was found. The docstring of a check is its line in `--list`.
 """
 
 from __future__ import annotations
@@ -28,32 +28,32 @@ from offboard.run.configuration import UNKNOWN_VEHICLE, build_track
 Check = Callable[[Observation], Iterable[Finding]]
 
 BAUDS = (57600, 115200, 230400, 460800, 921600)
-LOST_SHARE, FULL_SHARE = 0.02, 0.9
-LATE_S = 0.25
-FOREIGN_TIMES = 3
+LOST_SHARE, FULL_SHARE = 0.02, 0.9  # share of frames or bytes, share of the link's capacity
+LATE_S = 0.25  # age of telemetry beyond the least
+FOREIGN_TIMES = 3  # replies to TIMESYNC requests of another program; more are a warning
 ELSEWHERE = (
     "if it runs elsewhere, listen on all addresses (--connect udpin:0.0.0.0:PORT); into a "
     "container publish the port (-p PORT:PORT/udp), from Windows send to the address that "
     "`hostname -I` prints in WSL"
 )
 STARTED = "start the vehicle, or the router before it, and let it send to this port"
-SILENT = {  # by kind of connection: what to do when nothing is heard
+SILENT = {  # what to do when nothing is heard, by kind of connection
     "udpout": "start the vehicle, and check the address",
     "tcp": "check which program listens there: it sends nothing",
     "tcpin": STARTED,
     "serial": "check baud rate and TX wire, and that the autopilot's port speaks MAVLink (PX4: "
     "MAV_x_CONFIG, ArduPilot: SERIALx_PROTOCOL 2)",
 }
-CLOSED = {  # why it cannot be opened
+CLOSED = {  # what to do when it cannot be opened, by kind of connection
     "tcp": "start the vehicle, or the router, that listens there; ArduPilot's SITL listens on 5760",
     "serial": "plug it in, and see `ls /dev/serial/by-id`; may this user read it (group dialout)?",
 }
-LOW_BATTERY = 0.3
-SUSPICIOUS_RATIO = 0.5
+LOW_BATTERY = 0.3  # remaining charge, 0 .. 1
+SUSPICIOUS_RATIO = 0.5  # innovation ratio; the estimator rejects a measurement above 1
 RELEASE = 255  # FIRMWARE_VERSION_TYPE
 KINDS = {0: "development", 64: "alpha", 128: "beta", 192: "release candidate", RELEASE: "release"}
-TEXTS = 2  # of the vehicle that are shown
-HOVER_FACTOR = 1.3
+TEXTS = 2  # newest STATUSTEXT of the vehicle that are shown
+HOVER_FACTOR = 1.3  # largest ratio of the hover thrusts in vehicle file and autopilot, either way
 ok, warn = partial(Finding, Level.OK), partial(Finding, Level.WARN)
 wait, blocks = partial(Finding, Level.WAIT), partial(Finding, Level.BLOCKS)
 
@@ -146,7 +146,7 @@ def loss(seen: Observation) -> Iterable[Finding]:
     received, share = senders.splitter, 0.0
     damaged = received.bytes_skipped / max(received.bytes_received, 1)
     figures = f"{damaged:.1%} of the bytes damaged"
-    if len(sender.peers) == 1:  # else two vehicles may count, or one that has changed its port
+    if len(sender.peers) == 1:  # two addresses may be two vehicles, or a vehicle that changed port
         lost = senders.lost(sender)
         share = lost / (sender.frames + lost)
         figures = f"{share:.1%} of the frames lost, {figures}"
@@ -379,13 +379,13 @@ def _kind(seen: Observation) -> str:
 
 
 def _ids(seen: Observation) -> tuple[int, int]:
-    """System and component of the vehicle."""
+    """System id and component id of the vehicle."""
     found = seen.found
     assert found is not None
     return found.system_id, found.component_id
 
 
-# In the order of a signal: link, vehicle, flight
+# In the order of the report: link, vehicle, flight
 OF_LINK: tuple[Check, ...] = (port, vehicle)
 OF_VEHICLE: tuple[Check, ...] = (
     senders, uplink, delay, loss, bandwidth, rates, clock,

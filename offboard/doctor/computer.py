@@ -1,7 +1,7 @@
-"""This computer: which other processes have a port or a serial device; and the checks of its disk,
-compiled functions, time of a decision and late waking up.
+"""Checks of this computer: its disk, compiled functions, decision time and wake-up latency; and
+which other processes use a port or a serial device.
 
-Without /proc (macOS) nothing is known of ports, and nothing is said.
+Without /proc (macOS) the users of a port are not known, and none are reported.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from offboard.run.flight import build, rehearse
 
 PROC = Path("/proc")
 TABLES = {"udpin": ("udp", "udp6"), "tcpin": ("tcp", "tcp6")}
-# States of a socket that has a port: UDP bound or connected, TCP listening
+# States in /proc/net of a socket that receives on a port: UDP bound or connected, TCP listening
 STATES = {"udp": ("07", "01"), "tcp": ("0A",)}
-SLEEPS, SLEEP_S = 40, 0.01
+SLEEPS, SLEEP_S = 40, 0.01  # number and length of the sleeps that measure the wake-up latency
 LEAST_FREE_BYTES = 500_000_000  # three hours of log
-OVERSHOOT_S = 0.02
-MARGIN = 0.5  # of the deadline
+OVERSHOOT_S = 0.02  # wake-up latency above which there is a warning
+MARGIN = 0.5  # share of the deadline that a decision may take without a warning
 
 
 def holders(connection: str) -> tuple[str, ...]:
-    """The other processes that listen on the port of `connection`, or have its serial device open,
-    as "program (pid 1234)". Those of other users are found as "a program of user 1000"."""
+    """The other processes that listen on the port of `connection` or have its serial device open,
+    each as "program (pid 1234)". Those of other users are "a program of user 1000" (ports only)."""
     kind, _, rest = connection.partition(":")
     with suppress(OSError, ValueError):
         if kind == "serial":
@@ -55,7 +55,7 @@ def _of_port(kind: str, port: int) -> Iterator[str]:
 
 
 def _sockets(kind: str, port: int) -> Iterator[tuple[str, str]]:
-    """Inode and user of each socket that listens on a port."""
+    """Inode and user id of each socket that listens on `port`."""
     for table in TABLES[kind]:
         with suppress(OSError):
             for line in (PROC / "net" / table).read_text().splitlines()[1:]:
@@ -66,7 +66,7 @@ def _sockets(kind: str, port: int) -> Iterator[tuple[str, str]]:
 
 
 def _descriptors() -> Iterator[tuple[int, str]]:
-    """Process id and target of each open descriptor that may be read, but those of this process."""
+    """Process id and target of each open descriptor of other processes that this user may read."""
     for process in PROC.iterdir():
         if process.name.isdigit() and int(process.name) != os.getpid():
             with suppress(OSError):
@@ -122,10 +122,10 @@ def _not_compiled() -> int:
 
 
 def _decision(config: FlightConfig) -> Iterable[Finding]:
-    """Whether the controller can be flown here, and decides in time."""
+    """Whether the controller works on this computer and decides in time."""
     try:
         prepared = build(config)
-    except DocumentError:  # a reference that cannot be flown is another check
+    except DocumentError:  # the check `configuration` reports it
         return
     try:
         took_s = rehearse(prepared, keeps_deadline=True)
@@ -138,7 +138,7 @@ def _decision(config: FlightConfig) -> Iterable[Finding]:
 
 
 def _sleep() -> float:
-    """By how much a short sleep was too long."""
+    """Wake-up latency: the time in seconds by which a sleep of SLEEP_S was too long."""
     began_s = clock.monotonic_s()
     threading.Event().wait(SLEEP_S)
     return clock.monotonic_s() - began_s - SLEEP_S

@@ -1,6 +1,7 @@
-"""The listening pass: who sends, what is received and what is asked, until enough is known.
+"""The listening pass: collects what is sent on the link, and requests what is missing, until enough
+is known.
 
-Sans-I/O: received chunks and host times in, frames out. It only asks, see README.md.
+Sans-I/O: received chunks and host times in, frames out. README.md lists what may be sent.
 """
 
 from __future__ import annotations
@@ -40,31 +41,31 @@ from offboard.mavlink.telemetry import ENOUGH
 from offboard.run.configuration import FlightConfig
 
 DOCTOR_ID = 193  # MAV_COMP_ID_ONBOARD_COMPUTER3
-NOTHING_S = 6.0  # without an autopilot
-LEAST_S = 4.0  # with one, from when it was heard
-LONGEST_S = 9.0
-ASK_EVERY_S = 1.0
+NOTHING_S = 6.0  # length of the pass if no autopilot is heard
+LEAST_S = 4.0  # least length after the autopilot is first heard
+LONGEST_S = 9.0  # greatest length of the pass
+ASK_EVERY_S = 1.0  # between two equal requests
 TIMESYNC_EVERY_S = 0.1
-PREARM_AFTER_S = 1.0  # what is asked before may be lost: the link has just been opened
-TEXTS_S = 1.0  # for the texts after the acknowledgement
-SETTLE_S = 1.0  # until jumps of the vehicle's clock count
+PREARM_AFTER_S = 1.0  # after the vehicle is found: earlier requests may be lost on a new link
+TEXTS_S = 1.0  # to wait for STATUSTEXT after RUN_PREARM_CHECKS is acknowledged
+SETTLE_S = 1.0  # after the vehicle is found, before age of telemetry and clock jumps are judged
 RUN_PREARM_CHECKS = 401  # MAV_CMD
 VERSION, GPS = 148, 24  # message ids
 _TIMES = frozenset({2, TIMESYNC})  # 2: SYSTEM_TIME
-_PEERS_MAX, _SENDERS_MAX = 16, 64  # a flood of addresses or ids must not use up the memory
+_PEERS_MAX, _SENDERS_MAX = 16, 64  # limits of memory if addresses or ids flood the link
 
 
 @dataclass(slots=True)
 class Sender:
-    """One MAVLink sender. `heartbeat` is its newest HEARTBEAT, None without one; `peers` are the
-    addresses that it sends from."""
+    """One MAVLink sender. `heartbeat` is its newest HEARTBEAT, or None; `peers` are the addresses
+    that it sends from, as text."""
 
     system_id: int
     component_id: int
     heartbeat: Any = None  # message of pymavlink
     peers: set[str] = field(default_factory=set)
     frames: int = 0
-    times: int = 0  # TIMESYNC and SYSTEM_TIME
+    times: int = 0  # number of TIMESYNC and SYSTEM_TIME messages
 
     @property
     def ids(self) -> tuple[int, int]:
@@ -82,14 +83,15 @@ class Sender:
 
 
 class Senders:
-    """Counts the frames of all senders, also of those that the session drops. `stream`: bytes
-    arrive in any portions."""
+    """Counts the frames of all senders, also those that the session drops. `stream`: whether a
+    frame may be split between two portions of received bytes."""
 
     def __init__(self, stream: bool) -> None:
         self.splitter = FrameSplitter(stream)
         self._senders: dict[tuple[int, int], Sender] = {}
         self._sequences: dict[tuple[int, ...], int] = {}
-        self._lost: Counter[tuple[int, ...]] = Counter()  # by sender, and by system
+        # by (system, component), and by (system,)
+        self._lost: Counter[tuple[int, ...]] = Counter()
         self.message_bytes: Counter[str] = Counter()
 
     def receive(self, data: bytes, peer: Hashable) -> None:
@@ -112,30 +114,30 @@ class Senders:
             sender.heartbeat = frame.message
         for key in (ids, ids[:1]):
             gap = (frame.sequence - self._sequences.get(key, frame.sequence - 1) - 1) % 256
-            self._lost[key] += gap if gap < 128 else 0  # more: out of order
+            self._lost[key] += gap if gap < 128 else 0  # a larger gap is a frame out of order
             self._sequences[key] = frame.sequence
 
     def lost(self, sender: Sender) -> int:
-        """Frames of a sender that are missing by the gaps of its sequence numbers. Components that
-        share a link of an autopilot may share its sequence numbers."""
+        """Number of lost frames of a sender: the gaps in its sequence numbers. Components of one
+        system may count their frames together: the smaller of both results is taken."""
         return min(self._lost[sender.ids], self._lost[sender.ids[:1]])
 
     @property
     def found(self) -> list[Sender]:
-        """All senders, the most talkative first."""
+        """All senders, the one with most frames first."""
         return sorted(self._senders.values(), key=lambda sender: -sender.frames)
 
 
 class Observation(Ground):
-    """What checks judge: a flight of `config` that is recorded in `directory`, and what one pass
-    over the link `connection` finds for it, from host time `now_s` to `host_s`. `settings`: of the
-    session of that flight.
+    """What the checks judge: the planned flight (`config`, recorded in `directory`) and what is
+    heard on the link `connection` from host time `now_s` to `host_s`.
 
-    What the preflight list judges is in it, as in a flight; `senders` has all that sends.
-    `began_s`: host time when the whole check began; `link_error`: why the link cannot be opened;
-    `holders`: other processes that have its port. `fix_type` is the vehicle's GPS_FIX_TYPE, at most
-    FIX_3D; `late_s` the greatest age of its telemetry beyond the least; `foreign_replies` the
-    number of its replies to requests of TIMESYNC that are not ours.
+    `settings` are those of the session of that flight. As a `Ground` it has all that the preflight
+    list judges. `began_s` is the host time at which the command began; `link_error` says why the
+    link cannot be opened; `holders` are other processes that use its port; `senders` has every
+    sender. `fix_type` is the vehicle's GPS_FIX_TYPE, at most FIX_3D; `late_s` the greatest age of
+    its telemetry beyond the least; `foreign_replies` the number of its replies to TIMESYNC requests
+    of other programs.
     """
 
     def __init__(
@@ -160,14 +162,14 @@ class Observation(Ground):
         self.link_error = ""
         self.holders: tuple[str, ...] = ()
         self.senders = Senders(settings.stream)
-        self.rebooted = False  # in this pass
+        self.rebooted = False  # whether the vehicle rebooted during this pass
         self.fix_type: int | None = None
         self.late_s = 0.0
         self.foreign_replies = 0
         self._found_s = 0.0
-        self._asked_s: dict[int, float] = {}  # message or command: when it was asked last
+        self._asked_s: dict[int, float] = {}  # message or command id: host time of the last request
         self._settled = False
-        self._may_greet = False  # a disarmed vehicle, whose signing time is behind ours
+        self._may_greet = False  # whether a disarmed vehicle was heard whose signing time is behind
         self._timesync_s = 0.0
 
     # --- in ---
@@ -175,7 +177,7 @@ class Observation(Ground):
     def take(self, chunk: Chunk) -> None:
         """Process received bytes."""
         self.senders.receive(chunk.data, chunk.peer)
-        if self.session.peer not in (None, chunk.peer):  # another vehicle, perhaps
+        if self.session.peer not in (None, chunk.peer):  # it may be from another vehicle
             self.session.senders.overhear(chunk.data, self.session.link_time_s)
         reception = self.session.receive(chunk.data, chunk.peer, chunk.arrived_s)
         for event in reception.events:
@@ -210,13 +212,13 @@ class Observation(Ground):
     # --- out ---
 
     def due(self, now_s: float) -> list[bytes]:
-        """The frames to send at host time `now_s`; call it at least every 50 ms."""
+        """The frames to send at host time `now_s`. Call it at least every 50 ms."""
         self.host_s = now_s
         return [self.session.encode(each) for each in self._questions(now_s)]
 
     def _questions(self, now_s: float) -> Iterable[Outgoing]:
         yield from filter(self._permitted, self.session.poll(now_s))
-        self.vehicle.now_s = self.session.link_time_s  # also while nothing is heard
+        self.vehicle.now_s = self.session.link_time_s  # ages must grow also while nothing is heard
         dialect, state = self.session.dialect, self.vehicle
         if dialect is None:
             greets = self.session.settings.sends_first or self._may_greet
@@ -243,7 +245,8 @@ class Observation(Ground):
             yield self.clock.request(state.time_s, now_s)
 
     def _permitted(self, outgoing: Outgoing) -> bool:
-        """No heartbeats, and no rates for an armed vehicle, or before it is known."""
+        """Whether a message of the session may be sent: rate requests to a vehicle that has
+        reported to be disarmed; no heartbeats."""
         known = self.vehicle.heartbeat is not None
         permitted = known and not self.vehicle.armed and isinstance(outgoing, CommandLong)
         self.rates_requested |= permitted
@@ -263,12 +266,12 @@ class Observation(Ground):
 
     @property
     def dialect(self) -> Dialect:
-        """Dialect of the vehicle that was found."""
+        """Dialect of the vehicle, which must have been found."""
         assert self.session.dialect is not None
         return self.session.dialect
 
     def complete(self, now_s: float) -> bool:
-        """Everything was answered, or it takes too long."""
+        """Whether the pass ends: all requests were answered, or its time is over."""
         state, dialect, passed_s = self.vehicle, self.session.dialect, now_s - self._listens_s
         if dialect is None:
             return passed_s >= NOTHING_S
@@ -285,7 +288,7 @@ class Observation(Ground):
         )
 
     def slow(self, wanted_hz: Callable[[WantedMessage], float]) -> list[WantedMessage]:
-        """Telemetry that a flight needs and that arrives at much less than a rate."""
+        """Required telemetry messages that arrive at less than ENOUGH of the rate `wanted_hz`."""
         dialect, rates_hz = self.session.dialect, self.session.telemetry.rates_hz
         return [
             each
@@ -299,7 +302,7 @@ class Observation(Ground):
 
     @property
     def bytes_ps(self) -> float:
-        """Received since the vehicle was found."""
+        """All received bytes per second since the vehicle was found."""
         passed_s = max(self.host_s - (self._found_s or self._listens_s), 1e-3)
         return self.senders.splitter.bytes_received / passed_s
 

@@ -1,7 +1,7 @@
-"""A whole check: open the link, listen, judge, report.
+"""Runs `offboard doctor`: opens the link, listens, runs the checks, and makes the report.
 
-A finding is of the preflight list, by which `fly` and `daemon` refuse a flight, or of a check of
-this or another package, which says what else is worth knowing. The worst finding wins.
+A finding comes from the preflight list, by which `fly` and `daemon` refuse a flight, or from a
+check of this or another package, which reports what else is worth knowing.
 """
 
 from __future__ import annotations
@@ -30,31 +30,31 @@ from offboard.run.configuration import FlightConfig
 from offboard.run.flight import Connection
 
 Result = TypeVar("Result")
-Rows = dict[str, list[Finding]]  # what each check has found, the worst first
+Rows = dict[str, list[Finding]]  # the findings of each check, the worst first
 POLL_S = 0.02
-# The command ends within 15 s: what takes longer is left out, and a row says so
+# The command ends within 15 s: a check that takes longer is left out, and its row says so
 OPEN_S = 2.0  # to open the link, before listening
-LOOK_S = 12.5  # from the beginning to the end of the checks
-LEAST_S = 0.1  # for a check, however late it is
+LOOK_S = 12.5  # from the beginning of the command to the end of the checks
+LEAST_S = 0.1  # each check gets at least this time
 
 CHECKS = {each.__name__: each for each in (*OF_LINK, *OF_VEHICLE, *OF_FLIGHT, *OF_COMPUTER)}
 
-GROUP = "pso_offboard.checks"  # entry points of other packages: name and function of a check
+GROUP = "pso_offboard.checks"  # entry points with checks of other packages
 AUTHOR = "report this to whoever wrote the check"
 
 
 def checks() -> dict[str, Check]:
-    """All checks by name; those of other packages last, which cannot replace one of this."""
+    """All checks by name. Those of other packages are last, and cannot replace one of ours."""
     others = sorted(entry_points(group=GROUP), key=lambda point: point.name)
     return CHECKS | {each.name: _installed(each) for each in others if each.name not in CHECKS}
 
 
 def _installed(point: EntryPoint) -> Check:
-    """A check of another package; one that cannot be imported fails when it is asked."""
+    """Load a check of another package. One that cannot be imported raises when it is called."""
 
     try:
         loaded: Check = point.load()
-    except (Exception, SystemExit) as error:  # of another package while it is imported
+    except (Exception, SystemExit) as error:  # the import runs code of the other package
         failure = error
 
         def loaded(_: Observation) -> Iterable[Finding]:
@@ -65,7 +65,8 @@ def _installed(point: EntryPoint) -> Check:
 
 
 def chosen(names: Sequence[str] = ()) -> dict[str, Check]:
-    """The checks of these names in the order of the table; all without names. Raises UserError."""
+    """The checks with these names, in the order of the table; without names all checks. Raises
+    UserError."""
     known = checks()
     for name in names:
         if name not in known:
@@ -75,7 +76,7 @@ def chosen(names: Sequence[str] = ()) -> dict[str, Check]:
 
 
 def summary(check: Check) -> str:
-    """What a check is about."""
+    """What a check examines: the first paragraph of its docstring, as one line."""
     text = (inspect.getdoc(check) or "").partition("\n\n")[0]
     return " ".join(text.split())
 
@@ -90,11 +91,11 @@ def observe(
     *,
     tell: Callable[[str], None] = lambda sentence: None,
 ) -> Observation:
-    """Observe the `vehicle` and the link to it, for a flight of `config` that is recorded in
-    `directory`. Sends nothing that changes the vehicle. `tell` is called with sentences about the
-    progress.
+    """Observe `vehicle` and the link to it, for a flight of `config` that is recorded in
+    `directory`. Changes nothing on the vehicle except telemetry rates (and signing time). `tell` is
+    called with sentences about the progress.
 
-    Raises UserError for an address that is no address, and for a signing key.
+    Raises UserError for an address that is not understood or a signing key that cannot be used.
     """
     began_s, others = clock.monotonic_s(), holders(vehicle.address)
     link, settings, error = None, SessionSettings(), ""
@@ -129,8 +130,8 @@ def _listen(seen: Observation, link: Link, tell: Callable[[str], None]) -> None:
 
 
 def _within(seconds: float, call: Callable[[], Result]) -> Result:
-    """What `call` returns or raises, from a thread of its own. Raises TimeoutError after `seconds`:
-    the thread is left alone, and the process does not wait for it at its end."""
+    """Call `call` in a new thread and return or raise what it does. Raises TimeoutError after
+    `seconds`; the thread then goes on, but the process does not wait for it when it exits."""
     future: Future[Result] = Future()
 
     def run() -> None:
@@ -147,7 +148,8 @@ def _within(seconds: float, call: Callable[[], Result]) -> Result:
 
 
 def examine(asked: Mapping[str, Check], seen: Observation) -> Rows:
-    """A row for each of the checks that has something to say."""
+    """Run the checks. Returns a row for each check that has findings, those of the preflight list
+    included."""
     found = seen.found is not None
     blocking = list(preflight.findings(seen)) if found else []
     rows: Rows = {}
@@ -166,18 +168,19 @@ def _judged(check: Check, seen: Observation, most_s: float) -> list[Finding]:
     except TimeoutError:
         hint = "close other programs and check again, or `offboard check` the configuration"
         return [wait("this was not examined in time", hint)]
-    except (Exception, SystemExit) as error:  # whatever a check of another package raises
+    except (Exception, SystemExit) as error:  # a check of another package may raise anything
         sentence = f"the check itself failed: {located(error)}"
         return [Finding(Level.WARN, sentence, AUTHOR)]
 
 
 def worst(rows: Rows) -> Level:
-    """The worst level of all."""
+    """The worst level in all rows."""
     return max((found[0].level for found in rows.values()), default=Level.OK)
 
 
 def verdict(rows: Rows, *, complete: bool) -> str:
-    """One sentence: whether this vehicle can be flown now. `complete`: all checks were made."""
+    """A sentence that says whether the vehicle can be flown now. `complete`: whether all checks
+    were run."""
     found = [(each.level, each.about or name) for name, row in rows.items() for each in row]
 
     def named(level: Level) -> list[str]:
@@ -193,7 +196,7 @@ def verdict(rows: Rows, *, complete: bool) -> str:
 
 
 def as_json(rows: Rows, seen: Observation, sentence: str) -> str:
-    """One object with the worst level, the verdict, what was observed where, and a list of rows."""
+    """The report as a JSON object: worst level, verdict, connection, vehicle and list of rows."""
     found, version = seen.found, seen.vehicle.version
     document = {
         "level": worst(rows).name.lower(),
