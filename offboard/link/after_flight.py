@@ -1,7 +1,8 @@
-"""The processes that work on a flight after its end: of low priority, without output.
+"""Processes of low priority that score a flight, or write its report, after its end.
 
-The service has one process of this module, which works on one flight after the other as it reads
-their directories, and ends with the last of them after the service has ended or was killed.
+The service starts this module as one process, which reads flight directories from its standard
+input and works on one after the other. When the service has ended or was killed, the process
+finishes the queued flights and ends.
 """
 
 from __future__ import annotations
@@ -17,35 +18,36 @@ _NICENESS = 10  # the next flight may begin meanwhile
 
 
 def begin(command: str, directory: Path) -> subprocess.Popen[bytes]:
-    """Start `offboard COMMAND` on a flight directory. It outlives this process. Raises OSError."""
+    """Start `offboard COMMAND` on a flight directory, as a process that outlives this one. Raises
+    OSError."""
     return _start("offboard", command, str(directory.absolute()))
 
 
 def begin_report(directory: Path) -> None:
-    """Start the report of a flight. Where it cannot be started there is none."""
+    """Start `offboard report` on a flight directory. If that fails, there is no report."""
     with suppress(OSError):
-        begin("report", directory).returncode = 0  # nobody waits for it: no warning at the exit
+        begin("report", directory).returncode = 0  # not waited for: Popen would warn at the exit
 
 
 class OneByOne:
-    """`offboard COMMAND` on flights, one at a time. Its process is started with the first one."""
+    """Runs `offboard COMMAND` on flights, one at a time, in a process that `add` starts."""
 
     def __init__(self, command: str) -> None:
         self._command = command
         self._process: subprocess.Popen[bytes] | None = None
 
     def add(self, directory: Path) -> None:
-        """Work on a flight when those before it are done. Raises OSError."""
+        """Queue a flight. Raises OSError."""
         if self._process is None or self._process.poll() is not None:
             self._process = _start(__name__, self._command, stdin=subprocess.PIPE)
         assert self._process.stdin is not None
         self._process.stdin.write(json.dumps(str(directory.absolute())).encode() + b"\n")
 
     def close(self) -> None:
-        """No flight follows. Does not wait for those that were added."""
+        """End the queue. Does not wait for the flights in it."""
         if self._process is not None and self._process.stdin is not None:
             self._process.stdin.close()
-            self._process.returncode = 0  # nobody waits for it: no warning at the exit
+            self._process.returncode = 0  # not waited for: Popen would warn at the exit
 
 
 def _start(

@@ -1,4 +1,4 @@
-"""Background writer: a thread does slow writing, so that the loop waits for no terminal or disk."""
+"""Background writer: a thread writes to terminal or disk, so that the loop need not wait."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from collections.abc import Callable
 from typing import Generic, TypeVar
 
 Item = TypeVar("Item")
-PERIOD_S = 0.02  # at most this long an item waits for a thread that is free
+PERIOD_S = 0.02  # the thread looks for new items this often
 
 
 class BackgroundWriter(Generic[Item]):
-    """Gives queued items to `write`, in order and in batches, from a thread of its own.
+    """Passes queued items to `write` in order and in batches, from its own thread.
 
-    At most `size` items wait; what does not fit is dropped, unless `waits`: then `put` waits for
-    room. After an exception of `write`, which is kept in `error`, all items are dropped. `dropped`
-    counts them.
+    At most `size` items are queued. If the queue is full, `put` drops the item, or with `waits`
+    waits for room. If `write` raises, `error` has the exception, and all items are dropped from
+    then on. `dropped` is the number of dropped items.
     """
 
     def __init__(
@@ -43,14 +43,14 @@ class BackgroundWriter(Generic[Item]):
             self._queue.append(item)
 
     def close(self, timeout_s: float) -> None:
-        """Write what is queued, for at most `timeout_s`; what is left then counts as dropped."""
+        """Wait at most `timeout_s` until the queue is written; the rest counts as dropped."""
         self._closing.set()
         self._thread.join(timeout_s)
         self.dropped += self._writing + len(self._queue)
         self._queue.clear()
 
     def is_free(self) -> bool:
-        """Whether the thread has ended, after `close`."""
+        """Whether the thread has ended; call it after `close`."""
         return not self._thread.is_alive()
 
     def _run(self) -> None:
@@ -61,7 +61,7 @@ class BackgroundWriter(Generic[Item]):
                 if batch and self.error is None:
                     self._write(batch)
                     self._writing = 0
-            except (Exception, SystemExit) as error:  # rich ends the program on a closed pipe
+            except (Exception, SystemExit) as error:  # rich raises SystemExit on a closed pipe
                 self.error = error
             self.dropped += self._writing
             self._writing = 0

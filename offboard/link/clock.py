@@ -1,4 +1,4 @@
-"""The only module that reads a clock. All other modules have the time as an argument."""
+"""The only module that reads a clock. All other modules call it or get the time as an argument."""
 
 from __future__ import annotations
 
@@ -6,18 +6,19 @@ import time
 
 
 def monotonic_s() -> float:
-    """Seconds of a clock that never jumps, from an arbitrary zero."""
+    """Host time: seconds of a clock that never jumps, since an arbitrary moment."""
     return time.monotonic()
 
 
 def thread_s() -> float:
-    """Seconds for which this thread has had a processor."""
+    """CPU time of this thread in seconds."""
     return time.thread_time()
 
 
 def monotonic_less_unix_s() -> float:
-    """What converts Unix seconds to `monotonic_s`. A pause between the two readings makes it too
-    small: a stamp converted with it is then too old, never too new."""
+    """The offset in seconds that converts Unix time to `monotonic_s`. If this process pauses
+    between the two readings, the offset is too small: a converted stamp is too old, never too new.
+    """
     return time.monotonic() - time.time()
 
 
@@ -27,11 +28,11 @@ def unix_us() -> int:
 
 
 def utc() -> str:
-    """Date and time, UTC, as 2026-11-21T09:30:00.123Z."""
+    """Date and time in UTC, for example 2026-11-21T09:30:00.123Z."""
     seconds, rest_ms = divmod(time.time_ns() // 1_000_000, 1000)
     return f"{time.strftime('%Y-%m-%dT%H:%M:%S', time.gmtime(seconds))}.{rest_ms:03d}Z"
 
 
 def local_stamp() -> str:
-    """Local date and time for names of files, as 20261121-093000."""
+    """Local date and time for file names, for example 20261121-093000."""
     return time.strftime("%Y%m%d-%H%M%S")

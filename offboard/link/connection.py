@@ -1,13 +1,13 @@
-"""Connections: the link that an address names.
+"""Connections: opens the link at an address.
 
 udpin:HOST:PORT    listen on a port, send to the address of the vehicle that the session found
-udpout:HOST:PORT   send to this address, and hear no other
+udpout:HOST:PORT   send to this address, and receive from no other
 tcp:HOST:PORT      connect to a listening autopilot (ArduPilot SITL)
 tcpin:HOST:PORT    listen for one client
 serial:DEVICE:BAUD
 
-An IPv6 address stands in brackets, as in udpin:[::1]:14540. A TCP connection or serial port that
-breaks is opened again, for as long as the link is used.
+An IPv6 address is in brackets, for example udpin:[::1]:14540. A TCP connection or serial port that
+breaks is opened again until the link is closed.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from offboard.link.udp import LockstepLink, UdpLink, udp_socket
 
 FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or serial:DEVICE:BAUD"
 PORT_MAX, BAUD_MAX = 65535, 100_000_000
-BITS_OF_A_BYTE = 10  # on a serial line: start, eight bits, stop
+BITS_OF_A_BYTE = 10  # on a serial line: start bit, eight data bits, stop bit
 _ADDRESS = re.compile(r"(udpin|udpout|tcp|tcpin|serial):(.+):([0-9]{1,9})", re.ASCII)
 
 
 def open_lockstep_link() -> LockstepLink:
     """Open a link on a free port of this computer, for a simulator in lockstep. Raises
-    Unavailable where nothing can be sent to it."""
+    Unavailable if nothing can be sent to that port."""
     sock = udp_socket()
     try:
         sock.bind(("127.0.0.1", 0))
@@ -46,8 +46,7 @@ def open_lockstep_link() -> LockstepLink:
 
 
 def parsed(address: str) -> tuple[str, str, int]:
-    """Kind, host or device, and port or baud rate of an address. Raises UserError, which says what
-    to change."""
+    """Split an address into kind, host or device, and port or baud rate. Raises UserError."""
     matched = _ADDRESS.fullmatch(address)
     if matched is None:
         raise UserError(f"connection {shown(address)} is not understood; use {FORMS}")
@@ -68,13 +67,13 @@ def parsed(address: str) -> tuple[str, str, int]:
 
 def open_link(address: str) -> Link:
     """Open the link at `address`, for example "udpin:127.0.0.1:14540" (see the module). Raises
-    UserError, which says what to change, and Unavailable where it may open later."""
+    UserError for a wrong address, and Unavailable if a later attempt may succeed."""
     kind, host, number = parsed(address)
     if kind == "serial":
         return RedialingLink(lambda: open_port(host, number), "serial", number / BITS_OF_A_BYTE)
     try:
         return _network_link(kind, host, number)
-    except UnicodeError as error:  # of a host name that is too long
+    except UnicodeError as error:  # a label of the host name is too long
         raise UserError(f"connection {shown(address)} cannot be opened: {error}") from None
     except OSError as error:
         raise Unavailable(
@@ -84,7 +83,7 @@ def open_link(address: str) -> Link:
 
 
 def _network_link(kind: str, host: str, port: int) -> Link:
-    """Raises OSError or UnicodeError."""
+    """Open a UDP or TCP link. Raises OSError or UnicodeError."""
     if kind == "tcp":
         return RedialingLink(lambda: connect(host, port), "tcp")
     family, place = _resolved(host, port)
@@ -106,8 +105,8 @@ def _network_link(kind: str, host: str, port: int) -> Link:
 
 
 def _resolved(host: str, port: int) -> tuple[int, tuple[Any, ...]]:
-    """Address family and socket address of a host, IPv4 if it has both. Raises OSError."""
-    try:  # of a `localhost` that is ::1 alone, glibc gives 127.0.0.1 only where IPv4 is asked for
+    """Address family and socket address of a host; IPv4 if it has both. Raises OSError."""
+    try:  # where `localhost` is only ::1, glibc returns 127.0.0.1 only to a request for IPv4
         found = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)
     except socket.gaierror:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Hashable
 from dataclasses import dataclass
 
-NAMED_MAX = 8  # addresses that are counted one by one
+NAMED_MAX = 8  # addresses that are counted separately; the rest are OTHERS
 OTHERS = "other addresses"
 
 
@@ -14,9 +14,9 @@ OTHERS = "other addresses"
 class Chunk:
     """Received bytes: a datagram, or any portion of a stream.
 
-    `arrived_s` is on the clock of `clock.monotonic_s`: the kernel's stamp of a datagram; for a
-    stream the end of the waiting for it, or if it was not awaited the last time when nothing had
-    arrived.
+    `arrived_s` is host time (`clock.monotonic_s`). For a datagram it is the kernel's time stamp.
+    For a stream it is the moment when `wait` returned because of the bytes; if they arrived
+    while nothing waited, it is the last moment at which none had arrived.
     """
 
     data: bytes
@@ -25,7 +25,7 @@ class Chunk:
 
 
 def peer_name(peer: Hashable) -> str:
-    """An address as the user writes it, 127.0.0.1:14540 or [::1]:14540."""
+    """An address as the user writes it: 127.0.0.1:14540 or [::1]:14540."""
     if not isinstance(peer, tuple):
         return str(peer)
     host, port = peer[:2]
@@ -33,8 +33,8 @@ def peer_name(peer: Hashable) -> str:
 
 
 class LinkReport:
-    """What a link tells: what other addresses than the vehicle's send, counted, and breaks.
-    `overheard`: some of these datagrams, until the loop has taken them."""
+    """Reports of a link: counts of datagrams that addresses other than the vehicle's have sent, and
+    breaks of the link. `overheard` has some of these datagrams until the loop takes them."""
 
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()
@@ -43,7 +43,7 @@ class LinkReport:
 
     @property
     def ignored(self) -> int:
-        """Datagrams and connections of others."""
+        """Number of ignored datagrams and connections."""
         return self._counts.total()
 
     def count(self, peer: Hashable, number: int, noun: str = "datagram") -> None:
@@ -59,19 +59,20 @@ class LinkReport:
             self._news.append(f"{count} from {sender}, which is not the vehicle, {verb} ignored")
 
     def tell(self, sentence: str) -> None:
-        """Something else that the user should know of the link."""
+        """Add another sentence for the user about the link."""
         self._news.append(sentence)
 
     def news(self) -> list[str]:
-        """Sentences since the last call, on the 1st, 10th, 100th ... datagram of a sender."""
+        """New sentences since the last call. Ignored datagrams of a sender are reported on the 1st,
+        10th, 100th ... datagram."""
         news, self._news = self._news, []
         return news
 
 
 class Link:
-    """Non-blocking byte channel. `is_stream`: received chunks may end within a frame.
-    `capacity_bytes_ps` of each direction; None: unknown. `opened` changes when the descriptors
-    do."""
+    """Non-blocking byte channel. `is_stream`: whether a received chunk may end within a frame.
+    `capacity_bytes_ps`: capacity of each direction in bytes per second; None: unknown. `opened`: a
+    counter that changes whenever the descriptors change."""
 
     is_stream = False
     opened = 0
@@ -84,25 +85,25 @@ class Link:
         """Wait at most `timeout_s` until something has arrived. Reads nothing."""
 
     def receive(self) -> list[Chunk]:
-        """What has arrived, oldest first and bounded. Never waits."""
+        """The chunks that have arrived, oldest first and limited in number. Never waits."""
         raise NotImplementedError
 
     def send(self, data: bytes, peer: Hashable | None) -> None:
-        """Send one frame to `peer` (UDP) or to the other end. Never waits: a frame that does not
-        fit into the buffer is dropped (UDP) or queued (streams)."""
+        """Send one frame to `peer` (UDP) or to the other end (streams). Never waits: a frame that
+        does not fit into the buffer is dropped (UDP) or queued (streams)."""
         raise NotImplementedError
 
     def follow(self, peer: Hashable) -> None:
-        """The vehicle sends from `peer`: from now on other senders cannot displace it."""
+        """Accept `peer` as the vehicle's address; other senders can no longer crowd it out."""
 
     def descriptors(self) -> tuple[int, ...]:
-        """The open file descriptors, with which another process can continue the link."""
+        """The open file descriptors. With them another process can continue the link."""
         return ()
 
     @property
     def listens(self) -> bool:
-        """Whether the first of these listens for others than the vehicle."""
+        """Whether the first of `descriptors` is a listening socket, which also hears others."""
         return False
 
     def close(self) -> None:
-        """Close all of them."""
+        """Close all descriptors."""

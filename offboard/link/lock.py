@@ -1,5 +1,6 @@
-"""One service for each connection and directory: locks that its process holds, whatever becomes of
-it.
+"""Locks that allow one service for each connection and for each directory.
+
+The kernel releases a lock when the process that holds it ends, also if it was killed.
 """
 
 from __future__ import annotations
@@ -18,19 +19,19 @@ from pathlib import Path
 from offboard.documents.errors import Unavailable, UserError
 
 _LINUX = sys.platform == "linux"
-_NAME_MAX = 90  # of 107 characters of an abstract address
-_REFUSED_MAX = 4096  # services that are told who holds a lock
+_NAME_MAX = 90  # characters; an abstract address has at most 107
+_REFUSED_MAX = 4096  # backlog: refused services that can still find out who holds a lock
 
 
 def _held(what: str, holder: int | str) -> Unavailable:
-    """Another service has it."""
+    """The error for a lock that another service holds."""
     return Unavailable(f"another service has the {what}: process {holder or 'unknown'}")
 
 
 @contextmanager
 def file_lock(path: Path, what: str) -> Iterator[None]:
-    """The file stays, with the number of the last process: the kernel releases the lock with the
-    process. `what`: what the lock protects, named in the error. Raises UserError."""
+    """Hold a lock on the file at `path`. The file is not removed: it keeps the id of the last
+    process that held the lock. `what` names in errors what the lock protects. Raises UserError."""
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     except OSError as error:
@@ -50,8 +51,8 @@ def file_lock(path: Path, what: str) -> Iterator[None]:
 
 @contextmanager
 def name_lock(name: str, what: str) -> Iterator[None]:
-    """As `file_lock`, but by an abstract Unix address (Linux), which all users and units see, and
-    which belongs to a network namespace as ports do. Raises Unavailable."""
+    """Hold a lock, as `file_lock`, but on an abstract Unix address (Linux only). All users and
+    units see it, and it belongs to a network namespace, as ports do. Raises Unavailable."""
     with socket.socket(socket.AF_UNIX) as held:
         try:
             held.bind(f"\0{name}")
@@ -62,7 +63,7 @@ def name_lock(name: str, what: str) -> Iterator[None]:
 
 
 def _holder(unbound: socket.socket, address: str) -> int:
-    """The process that has bound the address; 0 if it is not known."""
+    """Id of the process that has bound `address`; 0 if it is not known."""
     with suppress(OSError):
         unbound.setblocking(False)
         unbound.connect(address)
@@ -72,7 +73,7 @@ def _holder(unbound: socket.socket, address: str) -> int:
 
 
 def connection_lock(connection: str) -> AbstractContextManager[None]:
-    """One service for each connection, whoever has started it."""
+    """The lock that allows one service for each connection, whichever user has started it."""
     name = f"offboard-{re.sub(r'[^A-Za-z0-9.]+', '-', connection)}"[:_NAME_MAX]
     what = f"connection {connection}"
     if _LINUX:
@@ -81,7 +82,8 @@ def connection_lock(connection: str) -> AbstractContextManager[None]:
 
 
 def directory_lock(place: Path) -> AbstractContextManager[None]:
-    """One service for each directory of flights: two would overwrite each other's rolling log."""
-    with suppress(OSError):  # opening says why
+    """The lock that allows one service for each directory of flights, because two would overwrite
+    each other's rolling log."""
+    with suppress(OSError):  # if this fails, opening the lock reports why
         place.mkdir(parents=True, exist_ok=True)
     return file_lock(place / "service.lock", f"directory {place} (--out)")

@@ -1,8 +1,8 @@
-"""Files: the flight directory and its .tlog, which has every frame sent or received and our own
-records; and how all other files are written, whole or not at all.
+"""The flight directory and its .tlog, which has every frame sent or received and our own records.
+Also functions that write other files, completely or not at all.
 
-An entry of a .tlog is a big-endian uint64 of Unix microseconds, low two bits zero, and the frame
-unchanged. A crash loses the last hundredths of a second.
+An entry of a .tlog is the Unix time in microseconds as a big-endian uint64 whose low two bits are
+zero, then the unchanged frame. A crash loses the last hundredths of a second.
 """
 
 from __future__ import annotations
@@ -20,21 +20,22 @@ from offboard.documents.errors import UserError
 from offboard.link.background import BackgroundWriter
 
 _STAMP = struct.Struct(">Q")
-QUEUED_MAX = 100_000  # entries, minutes of a flight
-CLOSE_S = 10.0  # for what is queued when the flight ends
-FILES = ("flight.tlog", "flight.yaml", "score.json")  # of a flight directory
+QUEUED_MAX = 100_000  # entries: minutes of a flight
+CLOSE_S = 10.0  # longest time to write the queue when the flight ends
+FILES = ("flight.tlog", "flight.yaml", "score.json")  # in a flight directory
 
 
 class LogError(UserError):
-    """The flight directory cannot be written: one sentence for the user."""
+    """The flight directory cannot be written."""
 
 
 class FlightLog:
     """Writes DIR/flight.tlog, and the configuration to DIR/flight.yaml. Never overwrites a flight.
 
-    As a context manager it opens them on entering, or raises LogError; after `start` alone the
-    writing thread does, with the first entries. With `real_time` an entry that does not fit into
-    the queue is dropped; otherwise `write` waits for the disk. `descriptor` is -1 until it is open.
+    As a context manager it opens both files on entering, or raises LogError. After `start` alone,
+    the writing thread opens them with the first entries. With `real_time`, an entry that does not
+    fit into the queue is dropped; otherwise `write` waits for the disk. `descriptor` is the file
+    descriptor of the open log, or -1.
     """
 
     def __init__(self, directory: Path, configuration: str, *, real_time: bool = False) -> None:
@@ -46,7 +47,7 @@ class FlightLog:
         self._closed = False
 
     def check(self) -> None:
-        """Raise LogError if the directory cannot be used, without creating anything."""
+        """Raise LogError if the directory cannot be used. Creates nothing."""
         for name in FILES:
             if (self.directory / name).exists():
                 raise self._taken(name)
@@ -68,12 +69,12 @@ class FlightLog:
         return self
 
     def start(self) -> None:
-        """Begin to write what is queued."""
+        """Start the writing thread."""
         self._writer = BackgroundWriter[bytes](self._append, QUEUED_MAX, waits=not self._real_time)
 
     def _open(self) -> None:
         self.directory.mkdir(parents=True, exist_ok=True)
-        # appended to, since another process may continue the log
+        # O_APPEND, because another process may continue the log
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND
         descriptor = os.open(self.path, flags, 0o666)
         try:
@@ -81,7 +82,7 @@ class FlightLog:
                 file.write(self.configuration)
         except OSError:
             os.close(descriptor)
-            self.path.unlink()  # the empty log of a flight that does not begin
+            self.path.unlink()  # an empty log would remain although the flight does not begin
             raise
         self.descriptor = descriptor
 
@@ -101,17 +102,17 @@ class FlightLog:
         self.close()
 
     def close(self) -> None:
-        """Write what is queued, for a bounded time. `problem` says what was lost."""
+        """Write the queue, for at most CLOSE_S, and close the log. See `problem` afterwards."""
         if self._closed:
             return
         self._closed = True
         self._writer.close(CLOSE_S)
-        if self._writer.is_free() and self.descriptor >= 0:  # else it is still in use
+        if self._writer.is_free() and self.descriptor >= 0:  # not while the thread still writes
             os.close(self.descriptor)
 
     @property
     def problem(self) -> str:
-        """What of the log is lost, and why; empty if nothing is."""
+        """A sentence that says why entries were lost; empty if none were."""
         error, dropped = self._writer.error, self._writer.dropped
         if error is None and not dropped:
             return ""
@@ -124,7 +125,7 @@ class FlightLog:
         return self._writer.dropped
 
     def begin(self, unix_us: int, frame: bytes) -> None:
-        """Append a frame at once, before the flight. Raises LogError on a full disk."""
+        """Append a frame at once, before the flight. Raises LogError if the disk fails."""
         try:
             self._append([entry(unix_us, frame)])
         except OSError as error:
@@ -146,7 +147,8 @@ def entry(unix_us: int, frame: bytes) -> bytes:
 
 
 def append(descriptor: int, entries: list[bytes]) -> None:
-    """Write whole entries: a nearly full disk accepts a part, which would hide the next one."""
+    """Write entries completely. A nearly full disk may accept a part of an entry; a reader of the
+    log would then misread the next one."""
     rest = b"".join(entries)
     while rest:
         rest = rest[os.write(descriptor, rest) :]
@@ -154,15 +156,15 @@ def append(descriptor: int, entries: list[bytes]) -> None:
 
 @contextmanager
 def new_file(path: Path) -> Iterator[BinaryIO]:
-    """Write a file that must not exist. It appears at the end of the block, unless the block or the
-    disk fails. Raises UserError."""
+    """Write a file that must not exist. It appears, complete, at the end of the block; if the block
+    or the disk fails, it does not appear. Raises UserError."""
     incomplete = path.with_name(f".{os.getpid()}.part")
     try:
         with incomplete.open("xb") as file:
             yield file
         try:
-            os.link(incomplete, path)  # unlike a rename, refuses to replace a file
-        except OSError:  # the file exists, or the file system has no links
+            os.link(incomplete, path)  # unlike a rename, this fails if the file exists
+        except OSError:  # the file exists, or the file system has no hard links
             if os.path.lexists(path):
                 raise FileExistsError(EEXIST, os.strerror(EEXIST)) from None
             incomplete.rename(path)
@@ -174,7 +176,8 @@ def new_file(path: Path) -> Iterator[BinaryIO]:
 
 
 def replace_file(path: Path, text: str) -> None:
-    """Write a file, whole or not at all; one that is there stays until then. Raises OSError."""
+    """Write a file, or replace it once the new one is complete. Raises OSError; an existing file is
+    then unchanged."""
     incomplete = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,7 +1,7 @@
 """The time stamps of a signing key, kept on disk so that they never go back.
 
-One file for each key, whose name comes from a hash of the key. Its content is a stamp that no frame
-has had yet: about a minute ahead of the newest one, so that it holds after a crash, too.
+There is one file for each key; its name has a hash of the key. The file contains a stamp that is
+up to a minute ahead of the newest one, so that even after a crash no frame has had it yet.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from offboard.link.background import BackgroundWriter
 from offboard.link.log import replace_file
 from offboard.mavlink.signing import RESERVED, UNITS_PER_S, Signing, stamp_of_unix
 
-CLOSE_S = 2.0
-QUEUED_MAX = 1000
-CONTENT_MAX = 20  # bytes of a decimal stamp and a line end
+CLOSE_S = 2.0  # longest time to write the queue at the end
+QUEUED_MAX = 1000  # stamps
+CONTENT_MAX = 20  # bytes: a decimal stamp and a line end
 
 
 def state_directory() -> Path:
-    """Where this user's time stamps are kept."""
+    """The directory in which this user's time stamps are kept."""
     if named := os.environ.get("STATE_DIRECTORY"):
         return Path(named.split(":")[0])
     base = os.environ.get("XDG_STATE_HOME")
@@ -33,8 +33,8 @@ def state_directory() -> Path:
 class SigningTime:
     """Context manager that gives the `Signing` of a key and keeps its time stamps.
 
-    Entering raises UserError. A disk that fails later stops no flight: the stamps then go on
-    without being kept.
+    Entering raises UserError. If the disk fails later, the flight goes on, and stamps are no longer
+    kept.
     """
 
     def __init__(self, key: bytes) -> None:
@@ -66,7 +66,7 @@ class SigningTime:
         self._writer.close(CLOSE_S)
 
     def _kept(self) -> int:
-        """The stamp on disk, 0 without a file."""
+        """The stamp on disk; 0 if there is no file. Raises UserError."""
         try:
             with self._path.open("rb") as file:
                 content = file.read(CONTENT_MAX + 1)
@@ -83,7 +83,8 @@ class SigningTime:
         )
 
     def _write(self, stamps: list[int]) -> None:
-        """Keep the newest stamp, unless a newer one is kept by another process. Raises OSError."""
+        """Write the newest stamp to disk, unless another process has written a newer one. Raises
+        OSError."""
         newest = stamps[-1]
         with suppress(UserError):
             newest = max(newest, self._kept())

@@ -1,7 +1,7 @@
-"""Stop requests: signals of a terminal or a service manager are stored and never raised.
+"""Stop requests: a signal from a terminal or a service manager sets a flag.
 
 A KeyboardInterrupt during a compilation can be lost in a callback of the compiler, and the flight
-would begin. Therefore a signal sets a flag, which is checked at known places.
+would begin. Therefore the first signal only sets a flag, which is checked at known places.
 """
 
 from __future__ import annotations
@@ -12,20 +12,21 @@ from types import FrameType
 
 from offboard.link import clock
 
-AGAIN_S = 1.0  # `timeout` signals its child and the group: within this time it is one request
+AGAIN_S = 1.0  # signals within this time are one request: `timeout` signals child and group
 
 
 def interrupt() -> None:
-    """End at once."""
+    """Raise KeyboardInterrupt."""
     raise KeyboardInterrupt
 
 
 class StopRequests:
-    """Context manager that stores SIGINT, SIGTERM and, unless it is ignored (nohup), SIGHUP.
+    """Context manager that handles SIGINT, SIGTERM and, unless it is ignored (nohup), SIGHUP.
 
-    A second request, a second or more after the first, exits immediately: before the flight it
-    calls `at_once`, in flight the loop sees `repeated`. A third one interrupts a loop that hangs.
-    SIGHUP counts only as the first: a closing terminal may send it twice.
+    The first signal is a stop request. A second one, a second or more later, ends the program at
+    once: before the flight by calling `at_once`, in flight by `repeated`, which the loop checks. A
+    third one raises KeyboardInterrupt in a loop that hangs. SIGHUP counts only as the first,
+    because a closing terminal may send it twice.
     """
 
     def __init__(self, at_once: Callable[[], None] = interrupt) -> None:
@@ -33,7 +34,7 @@ class StopRequests:
         self._first_s: float | None = None
         self.repeated = False
         self.in_flight = False
-        self.interruptible = False  # the loop runs, and ends in order if it is interrupted
+        self.interruptible = False  # whether the loop runs, which can handle a KeyboardInterrupt
 
     @property
     def requested(self) -> bool:

@@ -1,5 +1,5 @@
-"""TCP and serial links: streams of bytes through a file descriptor. In place of one that breaks
-`RedialingLink` opens the same address again, and `ListeningLink` accepts the next client."""
+"""TCP and serial links: byte streams on a file descriptor. After a break `RedialingLink` opens the
+same address again, and `ListeningLink` accepts the next client."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from offboard.mavlink.framing import SETPOINTS
 from offboard.mavlink.senders import PEER_SILENT_S
 
 READ_BYTES = 65536
-BATCH_BYTES = 1 << 20  # of one call
+BATCH_BYTES = 1 << 20  # that one call of `receive` reads, about
 QUEUED_MAX = 50  # frames
 BROKEN, RENEWED = "the connection broke: connecting again", "connected again"
 CONNECT_S = 5.0
 RETRY_S = 0.5
-UNSENT_MAX_S = 5.0  # that nobody acknowledges: the other end is gone
-TCP_NOTSENT_LOWAT = 25  # Linux's option, which the socket module names since Python 3.12
+UNSENT_MAX_S = 5.0  # the connection is closed if sent bytes are not acknowledged for this time
+TCP_NOTSENT_LOWAT = 25  # option of Linux; the socket module has it since Python 3.12
 
 
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """An open connection or port, which does not block."""
+    """An open connection or port in non-blocking mode."""
 
     descriptor: int
     close: Callable[[], None]
@@ -49,7 +49,7 @@ def tcp_stream(connection: socket.socket, host: str) -> Stream:
     connection.setblocking(False)
     with suppress(OSError):
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        # queue here, where a setpoint can be replaced
+        # queue frames in this process instead of the kernel, so that a setpoint can be replaced
         connection.setsockopt(socket.IPPROTO_TCP, TCP_NOTSENT_LOWAT, 1)
         if sys.platform == "linux":
             unsent_ms = round(1000 * UNSENT_MAX_S)
@@ -58,14 +58,14 @@ def tcp_stream(connection: socket.socket, host: str) -> Stream:
 
 
 def open_port(device: str, baud: int) -> Stream:
-    """Open a serial port with pyserial, for this process and its supervisor alone: of two readers
-    each would get a part of the bytes. Raises Unavailable."""
+    """Open a serial port with pyserial, exclusively for this process and its supervisor, because
+    two readers would each get a part of the bytes. Raises Unavailable."""
     import serial
 
     try:
         port = serial.Serial(device, baud, timeout=0, exclusive=True)
     except (serial.SerialException, ValueError, OverflowError) as error:
-        number = getattr(error, "errno", None)  # pyserial's text has it and the device twice
+        number = getattr(error, "errno", None)  # pyserial's own text repeats number and device
         reason = os.strerror(number) if number else error
         reason = "another program has it open" if number == errno.EAGAIN else reason
         raise Unavailable(
@@ -75,9 +75,9 @@ def open_port(device: str, baud: int) -> Stream:
 
 
 class StreamLink(Link):
-    """A link through `stream`; one that breaks is lost. Frames are queued while the buffer is full:
-    a new setpoint replaces a queued one, and of too many frames the oldest are dropped. What was
-    queued for a broken stream is dropped."""
+    """A link on `stream`. Frames are queued while the buffer of the kernel is full; a new setpoint
+    replaces a queued one, and the oldest frames are dropped if there are too many. If the stream
+    breaks, the queue is dropped; this class does not open a new stream, its subclasses do."""
 
     is_stream = True
 
@@ -88,18 +88,18 @@ class StreamLink(Link):
         self.capacity_bytes_ps = capacity_bytes_ps
         self._stream = stream
         self._name = name
-        self._empty_s = self._heard_s = clock.monotonic_s()  # all that is waiting arrived later
+        self._empty_s = self._heard_s = clock.monotonic_s()  # bytes that wait arrived after this
         self._begun = b""
         self._queued: list[bytes] = []
 
     # --- the stream ---
 
     def _seek(self) -> None:
-        """A new stream is needed. Does not wait."""
+        """Start to look for a new stream. Does not wait."""
 
     def _offered(self, silent_s: float) -> Stream | None:
-        """A new stream, if there is one. `silent_s`: how long the present one has been silent;
-        infinite without one."""
+        """Return a new stream if there is one. `silent_s` is the time since the present stream was
+        heard; infinite without a stream."""
         return None
 
     def _renew(self) -> None:
@@ -110,14 +110,14 @@ class StreamLink(Link):
             return
         if self._stream:
             self._drop()
-        if self.opened:  # and broken since
+        if self.opened:  # this is not the first stream
             self.report.tell(RENEWED)
         self._stream = stream
         self._empty_s = self._heard_s = clock.monotonic_s()
         self.opened += 1
 
     def _drop(self) -> None:
-        """The stream is broken."""
+        """Close the stream and drop the queue."""
         assert self._stream is not None
         with suppress(OSError):
             self._stream.close()
@@ -140,7 +140,7 @@ class StreamLink(Link):
     def receive(self) -> list[Chunk]:
         self._renew()
         self._flush()
-        self._readable(0.0)  # where nothing is waiting, it notes when
+        self._readable(0.0)  # updates `_empty_s` if nothing has arrived
         arrived_s, data = self._empty_s, b""
         with suppress(BlockingIOError):
             while len(data) < BATCH_BYTES and self._readable(0.0) and (more := self._read()):
@@ -158,12 +158,13 @@ class StreamLink(Link):
         ended_s = clock.monotonic_s()
         if not readable:
             self._empty_s = began_s
-        elif 0.0 < timeout_s >= ended_s - began_s:  # it was awaited, and this process not stopped
+        elif 0.0 < timeout_s >= ended_s - began_s:  # select waited, and this process did not pause
             self._empty_s = ended_s
         return readable
 
     def _read(self) -> bytes:
-        """Bytes that are waiting; none where it is closed or unplugged, which drops the stream."""
+        """Read waiting bytes. Returns none, and drops the stream, if the other end has closed it or
+        the device is unplugged."""
         assert self._stream is not None
         try:
             data = os.read(self._stream.descriptor, READ_BYTES)
@@ -179,19 +180,19 @@ class StreamLink(Link):
 
     def send(self, data: bytes, peer: Hashable | None) -> None:
         if self._stream is None:
-            return  # a dead link shows as silence
+            return  # the flight notices a broken link as silence
         if _is_setpoint(data):
             self._queued = [other for other in self._queued if not _is_setpoint(other)]
         self._queued = [*self._queued, data][-QUEUED_MAX:]
         self._flush()
 
     def _flush(self) -> None:
-        """Send as much as possible."""
+        """Write as much of the queue as the kernel's buffer takes."""
         try:
             while self._stream and (self._begun or self._queued):
                 if not self._begun:
                     self._begun = self._queued.pop(0)
-                # not pyserial's write, which waits in a busy loop while the buffer is full
+                # not pyserial's write, which busy-waits while the buffer is full
                 self._begun = self._begun[os.write(self._stream.descriptor, self._begun) :]
         except BlockingIOError:
             return
@@ -209,8 +210,8 @@ class StreamLink(Link):
 
 
 class RedialingLink(StreamLink):
-    """Calls `open_stream`, and after a break in a thread until it succeeds. It may wait, and raise
-    OSError or Unavailable."""
+    """A link whose stream `open_stream` opens. After a break a thread calls `open_stream` until it
+    succeeds. `open_stream` may wait, and raise OSError or Unavailable."""
 
     def __init__(
         self, open_stream: Callable[[], Stream], name: str, capacity_bytes_ps: float | None = None
@@ -221,7 +222,7 @@ class RedialingLink(StreamLink):
         self._closing = threading.Event()
 
     def _seek(self) -> None:
-        # always: the thread before has found its stream, although it may not have ended yet
+        # no check for a running thread: the previous one has found its stream and is about to end
         threading.Thread(target=self._dial, daemon=True).start()
 
     def _dial(self) -> None:
@@ -246,19 +247,19 @@ class RedialingLink(StreamLink):
 
 
 class ListeningLink(StreamLink):
-    """Accepts one client on `listening`. Another one takes its place when it has been silent; once
-    the vehicle was found, only from the vehicle's host."""
+    """Accepts one client on `listening`. Another client can replace it once it is silent for
+    PEER_SILENT_S; after the vehicle was found, only a client from the vehicle's host."""
 
     def __init__(self, listening: socket.socket, name: str, stream: Stream | None = None) -> None:
         super().__init__(stream, name)
         listening.setblocking(False)
         self._listening = listening
-        self._host = ""  # of the vehicle, once it was found
+        self._host = ""  # host of the vehicle, once it was found
 
     def _offered(self, silent_s: float) -> Stream | None:
         try:
             client, address = self._listening.accept()
-        except OSError:  # nobody
+        except OSError:  # no client waits
             return None
         host = address[0]
         if silent_s <= PEER_SILENT_S or self._host not in ("", host):

@@ -1,8 +1,8 @@
-"""UDP links. The vehicle, once known, has a connected socket of its own on the same local port, so
-that nobody can fill its buffer or take our time.
+"""UDP links. Once the vehicle is known, a second socket on the same local port is connected to it.
+Then no other sender can fill its receive buffer or use up our time.
 
-Linux lets two sockets share a port with SO_REUSEADDR, macOS with SO_REUSEPORT; afterwards the
-option is cleared, so that no other program can join.
+Linux lets two sockets share a port with SO_REUSEADDR, macOS with SO_REUSEPORT. The option is
+cleared afterwards, so that no other program can share the port.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from offboard.mavlink.senders import PEER_SILENT_S, same_host
 
 DATAGRAM_SIZE = 65535
 BUFFER_BYTES = 1 << 20
-BATCH_MAX = 512  # datagrams of one call
-LOOK_MAX, LOOK_EVERY_S = 64, 0.02  # of other senders, while the vehicle is known
-BESIDE_S = 60.0  # so long a port that was heard beside the vehicle's cannot be its new one
+BATCH_MAX = 512  # datagrams that one call of `receive` reads from a socket
+LOOK_MAX, LOOK_EVERY_S = 64, 0.02  # datagrams of other senders that are read, and how often
+BESIDE_S = 60.0  # a port heard beside the vehicle's cannot become the vehicle's for this time
 _LINUX = sys.platform == "linux"
 _SHARE_PORT = socket.SO_REUSEADDR if _LINUX else socket.SO_REUSEPORT
 # Options that the socket module does not name: SO_TIMESTAMPNS on Linux, SO_TIMESTAMP on macOS
@@ -36,25 +36,25 @@ _ANCILLARY_BYTES = socket.CMSG_SPACE(_STAMP.size)
 
 
 def udp_socket(family: int = socket.AF_INET) -> socket.socket:
-    """A non-blocking socket with arrival stamps."""
+    """Create a non-blocking UDP socket with arrival time stamps."""
     sock = socket.socket(family, socket.SOCK_DGRAM)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
-    with suppress(OSError):  # without stamps the arrival is taken as early as it can have been
+    with suppress(OSError):  # without stamps, the earliest possible arrival is used
         sock.setsockopt(socket.SOL_SOCKET, _STAMP_OPTION, 1)
     sock.setblocking(False)
     return sock
 
 
 class _Inbox:
-    """Reads one socket."""
+    """Reads datagrams from one socket."""
 
     def __init__(self, sock: socket.socket) -> None:
         self.socket = sock
         self._buffer = bytearray(DATAGRAM_SIZE)
-        self._empty_s = clock.monotonic_s()  # all that is waiting arrived later
+        self._empty_s = clock.monotonic_s()  # datagrams that wait arrived after this
 
     def drain(self, most: int) -> list[Chunk]:
-        """At most `most` datagrams that are waiting, in the order of their arrival."""
+        """Read at most `most` waiting datagrams, in the order of their arrival."""
         read: list[tuple[bytes, Hashable, float]] = []
         offset_s = clock.monotonic_less_unix_s()
         for _ in range(most):
@@ -64,14 +64,14 @@ class _Inbox:
                     [self._buffer], _ANCILLARY_BYTES
                 )
             except ConnectionError:
-                continue  # ICMP: the peer's port was closed when an earlier datagram arrived
-            except OSError:  # nothing left, or the network interface is down
+                continue  # ICMP: the peer's port was closed when an earlier datagram reached it
+            except OSError:  # no datagram is left, or the network interface is down
                 self._empty_s = now_s
                 break
             arrived_s = max(self._empty_s, _stamp_s(ancillary) + offset_s)
             read.append((bytes(self._buffer[:size]), peer, arrived_s))
-        # a clock that is set meanwhile moves an arrival at most to the beginning of the waiting or
-        # to now, and does not change the order
+        # if the computer's clock was set meanwhile, arrivals are still limited to the time between
+        # `_empty_s` and now, and keep their order
         latest_s = clock.monotonic_s()
         chunks: list[Chunk] = []
         for data, peer, arrived_s in reversed(read):
@@ -81,7 +81,7 @@ class _Inbox:
 
 
 def _stamp_s(ancillary: list[tuple[int, int, bytes]]) -> float:
-    """Unix time of the arrival, 0 if there is no stamp."""
+    """Unix time of the arrival in seconds; 0 if there is no stamp."""
     for _, kind, data in ancillary:
         if kind == _STAMP_KIND and len(data) >= _STAMP.size:
             seconds, fraction = _STAMP.unpack_from(data)
@@ -90,24 +90,26 @@ def _stamp_s(ancillary: list[tuple[int, int, bytes]]) -> float:
 
 
 class UdpLink(Link):
-    """`listening` hears every sender, `vehicle` is connected to the vehicle; one may be missing."""
+    """A UDP link. The socket `listening` receives from every sender; `vehicle` is connected to the
+    vehicle. One of them may be None."""
 
     def __init__(self, listening: socket.socket | None, vehicle: socket.socket | None) -> None:
         super().__init__()
         self._listening = _Inbox(listening) if listening else None
         self._vehicle = _Inbox(vehicle) if vehicle else None
         self._peer: Hashable = vehicle.getpeername() if vehicle else None
-        self._heard_s = clock.monotonic_s()  # when we last found a datagram of the vehicle
-        # Ports of the vehicle's host. `_beside`: those heard beside the vehicle's own, and until
-        # when they belong to another; `_newer`: those heard since the vehicle's own was
+        self._heard_s = clock.monotonic_s()  # when a datagram of the vehicle was last read
+        # Other ports of the vehicle's host. `_beside`: ports that have sent while the vehicle's own
+        # did, and the host time until which they cannot be the vehicle's; `_newer`: ports heard
+        # since the last datagram of the vehicle
         self._beside: dict[Hashable, float] = {}
         self._newer: set[Hashable] = set()
-        self._look_s = 0.0  # when other senders are read next
+        self._look_s = 0.0  # host time at which other senders are read next
 
     # --- in ---
 
     def wait(self, timeout_s: float) -> None:
-        # a flood of other senders must not end the waiting
+        # datagrams of other senders must not end the wait before it is time to read them
         looks = self._vehicle is None or clock.monotonic_s() >= self._look_s
         awaited = (self._vehicle, self._listening if looks else None)
         select.select([i.socket for i in awaited if i], [], [], max(0.0, timeout_s))
@@ -119,15 +121,19 @@ class UdpLink(Link):
                 return self._listening.drain(BATCH_MAX)
             if len(chunks) < BATCH_MAX:
                 chunks += self._look(self._listening, bool(chunks))
-            else:  # what waits is older than what others have sent
+            else:  # the vehicle's socket may hold more, older than what others have sent
                 self._heard_s = clock.monotonic_s()
         return sorted(chunks, key=lambda chunk: chunk.arrived_s)
 
     def _look(self, listening: _Inbox, heard: bool) -> list[Chunk]:
-        """What other senders sent: nearly all is only counted. Returned is what the vehicle sent
-        before its socket was connected or to a broadcast address, and after a silence that we
-        observed ourselves (not one of our own pauses) what may come from its new port. A port that
-        has sent beside the vehicle's lately is another's, though it may have the same system id."""
+        """Read the listening socket. `heard`: whether the vehicle's own socket had datagrams.
+
+        Datagrams of other senders are counted, and returned only if they may come from a new port
+        of the vehicle: from its host, after a silence of PEER_SILENT_S in which this process did
+        not pause, and from a port that has not sent beside the vehicle's within BESIDE_S (such a
+        port belongs to another sender, even if it has the same system id). Datagrams of the vehicle
+        are returned, too: it sent them before its socket was connected, or to a broadcast address.
+        """
         now_s = clock.monotonic_s()
         found = listening.drain(LOOK_MAX) if now_s >= self._look_s else []
         ours = [chunk for chunk in found if chunk.peer == self._peer]
@@ -156,14 +162,14 @@ class UdpLink(Link):
     # --- out ---
 
     def send(self, data: bytes, peer: Hashable | None) -> None:
-        with suppress(OSError):  # a dead link shows as silence
+        with suppress(OSError):  # the flight notices a broken link as silence
             if self._vehicle is None:
                 if self._listening and isinstance(peer, tuple):
                     self._listening.socket.sendto(data, peer)
                 return
             try:
                 self._vehicle.socket.send(data)
-            except ConnectionError:  # reports an earlier ICMP, and has not sent
+            except ConnectionError:  # it reports an earlier ICMP error, and has sent nothing
                 self._vehicle.socket.send(data)
 
     # --- the vehicle ---
@@ -177,7 +183,7 @@ class UdpLink(Link):
             before.socket.close()
         try:
             sock = _second_socket(listening.socket, peer)
-        except OSError:  # then hear the vehicle alone
+        except OSError:  # then connect the only socket, and hear no other sender
             with suppress(OSError):
                 listening.socket.connect(peer)
             self._listening, sock = None, listening.socket
@@ -200,7 +206,7 @@ class UdpLink(Link):
 
 
 def _second_socket(listening: socket.socket, peer: tuple[str | int, ...]) -> socket.socket:
-    """A socket on the port of `listening`, connected to `peer`. Raises OSError."""
+    """Create a socket on the port of `listening` that is connected to `peer`. Raises OSError."""
     sock = udp_socket(listening.family)
     both = (listening, sock)
     try:
@@ -219,7 +225,8 @@ def _second_socket(listening: socket.socket, peer: tuple[str | int, ...]) -> soc
 
 
 class LockstepLink(UdpLink):
-    """UDP to a simulator in lockstep: returns all datagrams up to a barrier at once, and only once.
+    """UDP to a simulator in lockstep. `receive` returns all datagrams up to a barrier together, and
+    each only once.
 
     A barrier is a TIMESYNC request at the end of a datagram. The simulator waits for the reply and
     meanwhile repeats all datagrams since the previous barrier.
@@ -228,12 +235,13 @@ class LockstepLink(UdpLink):
     def __init__(self, sock: socket.socket) -> None:
         super().__init__(sock, None)
         self.port: int = sock.getsockname()[1]
-        self._block: list[Chunk] = []  # since the newest barrier
+        self._block: list[Chunk] = []  # datagrams since the newest barrier
         self._barrier = b""
         self._simulator: Hashable | None = None  # the sender of the barriers
 
     def follow(self, peer: Hashable) -> None:
-        """The simulator is ours, and a second socket would change the order of its datagrams."""
+        """Do nothing: only our simulator sends here, and a second socket would change the order of
+        its datagrams."""
 
     def receive(self) -> list[Chunk]:
         complete: list[Chunk] = []
@@ -247,13 +255,13 @@ class LockstepLink(UdpLink):
         return complete
 
     def send(self, data: bytes, peer: Hashable | None) -> None:
-        """Send to the simulator, also before it is known as the vehicle: with a late link its first
-        heartbeat comes only after answered barriers."""
+        """Send to the simulator, also before its vehicle is found: with a simulated link delay its
+        first HEARTBEAT arrives only after several barriers were answered."""
         super().send(data, self._simulator if peer is None else peer)
 
 
 def _is_barrier(datagram: bytes) -> bool:
-    """Whether the last frame is a TIMESYNC request, which has tc1 = 0."""
+    """Whether the last frame of `datagram` is a TIMESYNC request, which has tc1 = 0."""
     at = last = 0
     while at < len(datagram):
         last, at = at, at + frame_size(datagram, at)
