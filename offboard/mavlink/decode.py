@@ -1,7 +1,7 @@
-"""Decoding: messages, as pymavlink has decoded them, become events in NED, FRD and SI.
+"""Decoding: converts messages that pymavlink has decoded to events in NED, FRD and SI.
 
-Every field is checked here to be finite and in range, else the message is no event. `DECODERS` is
-the table by message id. Knows no sequence numbers, no addresses and no clock.
+A message becomes an event only if every field is finite and in range. `DECODERS` has the decoder of
+each message id. This module knows no sequence numbers, no addresses and no clock.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from offboard.mavlink.framing import payload_of
 POSITION_LIMIT_M = 1e5
 VELOCITY_LIMIT_MPS = 200.0
 RATE_LIMIT_RADPS = 100.0
-UNIT_LENGTHS = 0.9, 1.1  # of a quaternion
+UNIT_LENGTHS = 0.9, 1.1  # range of the length of a valid quaternion
 _PREARM_CHECK = 0x10000000  # MAV_SYS_STATUS_PREARM_CHECK
 _RADIO = 0x10000  # MAV_SYS_STATUS_SENSOR_RC_RECEIVER
 _SENSORS = {
@@ -38,9 +38,9 @@ _RESULTS = {
     number: result.name.removeprefix("MAV_RESULT_")
     for number, result in mavlink.enums["MAV_RESULT"].items()
 }
-# which pymavlink's `all` lacks
+# results that pymavlink's `all` lacks
 _RESULTS |= {6: "CANCELLED", 9: "COMMAND_UNSUPPORTED_MAV_FRAME", 10: "NOT_IN_CONTROL"}
-# innovation ratios of ESTIMATOR_STATUS, and of EKF_STATUS_REPORT: what is measured, and the field
+# innovation ratios in ESTIMATOR_STATUS and EKF_STATUS_REPORT: measurement -> field of the message
 _PX4_ESTIMATOR, _ARDUPILOT_ESTIMATOR = 230, 193
 _RATIOS = {
     _PX4_ESTIMATOR: {
@@ -83,7 +83,7 @@ def _local_position(message: Any, _: Dialect) -> events.Event | None:
     x, y, z = position = message.x, message.y, message.z
     vx, vy, vz = velocity = message.vx, message.vy, message.vz
     far, fast = POSITION_LIMIT_M, VELOCITY_LIMIT_MPS
-    # comparisons with NaN are false: these refuse what is not finite, too
+    # comparisons with NaN are false: these also refuse values that are not finite
     if not (-far < x < far and -far < y < far and -far < z < far):
         return None
     if not (-fast < vx < fast and -fast < vy < fast and -fast < vz < fast):
@@ -107,7 +107,7 @@ def _attitude(message: Any, _: Dialect) -> events.Event | None:
 def _thrust_report(message: Any, _: Dialect) -> events.Event | None:
     if not math.isfinite(message.thrust):
         return None
-    # ArduCopter's falls to -0.2 on landing
+    # ArduCopter reports down to -0.2 during landing
     return events.ThrustReport(min(max(message.thrust, 0.0), 1.0))
 
 
@@ -121,7 +121,7 @@ def _system_health(message: Any, _: Dialect) -> events.Event:
     enabled = message.onboard_control_sensors_enabled
     failed = enabled & ~health & ~_PREARM_CHECK
     return events.SystemHealth(
-        # ArduPilot with ARMING_CHECK 0 has the check, and does not enable it
+        # with ARMING_CHECK 0, ArduPilot reports the check as present but not enabled
         prearm_ok=bool((health | present & ~enabled) & _PREARM_CHECK),
         battery_remaining=percent * 1e-2 if 0 <= percent <= 100 else None,
         radio_ok=bool(present & health & _RADIO),
@@ -132,7 +132,7 @@ def _system_health(message: Any, _: Dialect) -> events.Event:
 def _estimator(message: Any, _: Dialect) -> events.Event:
     names = _RATIOS[message.get_msgId()].items()
     ratios = ((name, getattr(message, field)) for name, field in names)
-    accuracy_m = getattr(message, "pos_horiz_accuracy", math.nan)  # ArduPilot has none
+    accuracy_m = getattr(message, "pos_horiz_accuracy", math.nan)  # not in ArduPilot's message
     return events.EstimatorReport(
         valid=frozenset(part for part, bit in _EKF_BITS.items() if message.flags & bit),
         ratios=tuple((name, ratio) for name, ratio in ratios if math.isfinite(ratio)),
@@ -141,7 +141,7 @@ def _estimator(message: Any, _: Dialect) -> events.Event:
 
 
 def _version(message: Any, _: Dialect) -> events.Event:
-    # uid2 is the only one of ArduPilot
+    # ArduPilot sends only uid2
     uid = message.uid or int.from_bytes(bytes(message.uid2), "little")
     version = events.FirmwareVersion(*message.flight_sw_version.to_bytes(4, "big"))
     return events.VehicleIdentity(uid, version)
@@ -160,11 +160,11 @@ def _command_ack(message: Any, _: Dialect) -> events.Event:
 def _parameter(message: Any, dialect: Dialect) -> events.Event | None:
     name, value, kind = message.param_id, message.param_value, message.param_type
     if all(name != watched.name for watched in dialect.watched_parameters):
-        return None  # a ground station reads them all
+        return None  # a reply to a ground station that reads all parameters
     if dialect.integers_bytewise and kind != _REAL32:
         if kind not in _UNSIGNED_TYPES + _SIGNED_TYPES:
             return None
-        # from the bytes: as a float they may be a signalling NaN, which Python changes
+        # from the bytes: read as a float they may be a signalling NaN, which Python changes
         first = payload_of(bytes(message.get_msgbuf()))[:4].ljust(4, b"\0")
         value = int.from_bytes(first, "little", signed=kind in _SIGNED_TYPES)
     if not math.isfinite(value):
@@ -173,7 +173,7 @@ def _parameter(message: Any, dialect: Dialect) -> events.Event | None:
 
 
 def printable(data: bytes) -> str:
-    """Received text without control characters, safe to print on a terminal."""
+    """Received text with spaces for control characters, so that a terminal can print it."""
     text = data.decode("utf-8", errors="replace")
     return "".join(c if c.isprintable() else " " for c in text).strip()
 

@@ -1,7 +1,7 @@
-"""The log's record of an event: a phase that begins, or another sentence of ours.
+"""The log's record of an event: the beginning of a phase, or another announcement.
 
-An event is a JSON text in TUNNEL messages of our record component, in numbered pieces that follow
-each other. `pieces` splits an event, `join` restores all of a log.
+An event is logged as JSON text in consecutive, numbered TUNNEL messages of our record component.
+`pieces` splits one event; `join` restores all events of a log.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from typing import NamedTuple
 from offboard.mavlink.outgoing import PIECE_BYTES, ConfigurationRecord
 
 EVENT_TYPE = 0xC0F4  # TUNNEL.payload_type; numbers above 32767 need no registration
-SUPERVISOR = "supervisor"  # the cause of what the supervisor says
+SUPERVISOR = "supervisor"  # `cause` of the sentences of the supervisor
 _HEAD = struct.Struct("<BB")  # index of the piece, number of pieces
 _TEXT_MOST = 2000  # characters
 
 
 class EventRecord(NamedTuple):
-    """`phase`: number of the phase that begins (`flight.phases.Phase`), None for another
-    event. `cause`: a word for what caused it, empty without one."""
+    """An event. `phase` is the number of the phase that begins (`flight.phases.Phase`), None for
+    another event; `cause` is a word for the cause, or empty."""
 
     text: str
     phase: int | None = None
@@ -29,13 +29,13 @@ class EventRecord(NamedTuple):
 
 
 def pieces(event: EventRecord) -> list[ConfigurationRecord]:
-    """The messages that hold an event."""
+    """Split an event into records for the log; its text is cut at 2000 characters."""
     data = json.dumps(event._replace(text=event.text[:_TEXT_MOST])).encode()
     return numbered(data, _HEAD, EVENT_TYPE)
 
 
 def numbered(data: bytes, head: struct.Struct, payload_type: int) -> list[ConfigurationRecord]:
-    """Records that hold `data`, each piece after a `head` with its index and their number."""
+    """Split `data` into records. Each begins with a `head`: its index and the number of records."""
     size = PIECE_BYTES - head.size
     parts = [data[at : at + size] for at in range(0, len(data), size)]
     return [
@@ -45,8 +45,8 @@ def numbered(data: bytes, head: struct.Struct, payload_type: int) -> list[Config
 
 
 def join(payloads: Iterable[bytes]) -> Iterator[tuple[int, EventRecord]]:
-    """The events in the payloads of TUNNEL messages, each with the index of its last payload.
-    Those that are damaged, or of which a piece is missing, are left out."""
+    """Restore the events from the payloads of TUNNEL messages; each comes with the index of its
+    last payload. Events that are damaged or lack a piece are left out."""
     parts: list[bytes] = []
     for number, payload in enumerate(payloads):
         if len(payload) < _HEAD.size:

@@ -1,7 +1,7 @@
-"""What the session reports to the flight: one frozen value per received message or change.
+"""Events that the session reports to the flight: one frozen value per received message or change.
 
-NED, FRD, SI and vehicle time (`time_boot_ms` in seconds) everywhere. All fields are finite and in
-range; a message with any other value is dropped.
+All values are in NED, FRD, SI and vehicle time (`time_boot_ms` in seconds), finite and in range. A
+message with any other value is dropped.
 """
 
 from __future__ import annotations
@@ -11,17 +11,17 @@ from dataclasses import dataclass
 
 Triple = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]  # w, x, y, z; FRD -> NED
-BOOTS = 1  # MAV_STATE_BOOT: an ArduCopter that starts sends it
+BOOTS = 1  # MAV_STATE_BOOT: sent by an ArduCopter while it starts
 CRITICAL = 5  # MAV_STATE: a failsafe; 6 is an emergency
 WARNING, NOTICE = 4, 5  # MAV_SEVERITY; more severe is a lower number
 # longest age of a report of the mode that allows a setpoint or a command; HEARTBEAT comes at 1 Hz
 MODE_KNOWN_S = 2.5
 GOOD_RESULTS = ("ACCEPTED", "IN_PROGRESS")  # MAV_RESULT
-ESTIMATE = ("attitude", "horizontal velocity", "horizontal position", "height")  # its parts
+ESTIMATE = ("attitude", "horizontal velocity", "horizontal position", "height")  # parts needed
 
 
 class Event:
-    """One of the values below."""
+    """Base class of all events."""
 
     __slots__ = ()
 
@@ -55,7 +55,7 @@ class ModeReport(Event):
 @dataclass(frozen=True, slots=True)
 class OtherSender(Event):
     """A frame that shows a second controller of our vehicle on this link: a setpoint that is not
-    ours, or a command for its mode from its own system, as ours are."""
+    ours, or a mode command from another companion computer of the vehicle's system."""
 
     system_id: int
     component_id: int
@@ -67,17 +67,17 @@ class OtherCompanion(Event):
 
     system_id: int
     component_id: int
-    custom_mode: int  # of an `offboard` its phase
+    custom_mode: int  # if it is another `offboard`: the code of its phase
 
 
 @dataclass(frozen=True, slots=True)
 class CommandRequest(Event):
     """COMMAND_LONG or COMMAND_INT to our own component, forwarded by the vehicle or a router.
-    Parameters may be NaN; those of a COMMAND_INT are its first four."""
+    Parameters may be NaN; of a COMMAND_INT only the first four are used."""
 
     command: int
     parameters: tuple[float, ...]
-    system_id: int  # of the sender, as is the component
+    system_id: int  # ids of the sender
     component_id: int
 
 
@@ -101,8 +101,8 @@ class Attitude(Event):
 
 @dataclass(frozen=True, slots=True)
 class ThrustReport(Event):
-    """ATTITUDE_TARGET: the collective thrust that the autopilot demands of its motors, whatever
-    flies it. On ArduCopter before it is raised for the tilt."""
+    """ATTITUDE_TARGET: the collective thrust that the autopilot demands from its motors in any
+    mode; on ArduCopter before the tilt compensation (ATC_ANGLE_BOOST)."""
 
     thrust: float  # normalised, 0 .. 1
 
@@ -123,23 +123,23 @@ class NoFix(Event):
 class EstimatorReport(Event):
     """ESTIMATOR_STATUS (PX4) or EKF_STATUS_REPORT (ArduPilot).
 
-    `ratios`: innovation over its test limit, by measurement; above 1 the estimator rejects the
-    measurement. Measurements that are not in use are missing. PX4's are squared.
+    `ratios` has a pair (measurement, innovation divided by its test limit) for each measurement in
+    use; the estimator rejects a measurement whose ratio is above 1.
     """
 
-    valid: frozenset[str]  # of ESTIMATE; positions relative to the origin
+    valid: frozenset[str]  # parts of ESTIMATE; horizontal position: that relative to the origin
     ratios: tuple[tuple[str, float], ...]
-    # horizontal, one standard deviation; None: not reported, or not finite
+    # horizontal standard deviation; None: not reported, or not finite
     accuracy_m: float | None = None
 
     @property
     def worst(self) -> tuple[str, float]:
-        """The measurement with the largest ratio."""
+        """The measurement with the largest ratio, and that ratio; ("", 0.0) if there are none."""
         return max(self.ratios, key=lambda each: each[1], default=("", 0.0))
 
     @property
     def problem(self) -> str:
-        """Why nobody can fly by this estimate; empty if somebody can."""
+        """Why the vehicle cannot be flown with this estimate; empty if it can."""
         missing = [part for part in ESTIMATE if part not in self.valid]
         if missing:
             return f"its estimator has no valid {', '.join(missing)}"
@@ -161,7 +161,7 @@ class FirmwareVersion:
 
 @dataclass(frozen=True, slots=True)
 class VehicleIdentity(Event):
-    """AUTOPILOT_VERSION: the hardware's unique number, 0 where there is none, and the firmware."""
+    """AUTOPILOT_VERSION: the hardware's unique id, 0 if it has none, and the firmware version."""
 
     uid: int
     version: FirmwareVersion
@@ -218,7 +218,7 @@ class PeerChanged(Event):
 
 @dataclass(frozen=True, slots=True)
 class ClockBehind(Event):
-    """A correctly signed heartbeat whose time stamp is too old; no vehicle is found yet."""
+    """A HEARTBEAT with a valid signature but too old a time stamp, before a vehicle is found."""
 
     system_id: int
     armed: bool
@@ -226,7 +226,7 @@ class ClockBehind(Event):
 
 @dataclass(frozen=True, slots=True)
 class TimesyncReply(Event):
-    """TIMESYNC reply of the vehicle: the stamp of our request, and vehicle time on its arrival."""
+    """TIMESYNC reply: the stamp of our request, and the vehicle time when the request arrived."""
 
     request_ns: int
     vehicle_ns: int
@@ -234,4 +234,4 @@ class TimesyncReply(Event):
 
 @dataclass(frozen=True, slots=True)
 class Rebooted(Event):
-    """Several stamps in a row are of a new epoch: the vehicle was rebooted."""
+    """The vehicle was rebooted: several time stamps in a row are far behind the earlier ones."""

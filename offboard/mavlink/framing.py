@@ -1,9 +1,9 @@
-"""Framing: where frames are in received bytes. pymavlink decodes those whose message is read: half
-of an autopilot's telemetry never is.
+"""Framing: finds frames in received bytes. pymavlink decodes a frame only when its message is read;
+half of an autopilot's telemetry is never read.
 
-After bytes that are no frame the search continues one byte later, so that a damaged length cannot
-hide a good frame. Nothing here raises, whatever the input. MAVLink 1 frames (0xFE) are accepted:
-their payloads lack the extension fields, which are zero.
+If the bytes after a start byte are no frame, the search continues one byte later, so that a damaged
+length field cannot hide a good frame. Nothing here raises, whatever the input. MAVLink 1 frames
+(0xFE) are accepted; they have no extension fields, which are then zero.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pymavlink.dialects.v20 import all as mavlink
 mavlink.MAVLINK_IGNORE_CRC = 0  # MAV_IGNORE_CRC of the environment must not switch checksums off
 
 V2, V1 = 0xFD, 0xFE  # first byte of a frame of MAVLink 2 and 1
-# Ids of messages that are needed before they are decoded
+# Ids of messages that are recognised before they are decoded
 HEARTBEAT, COMMAND_ACK, TIMESYNC, STATUSTEXT, SETUP_SIGNING = 0, 77, 111, 253, 256
 # SET_ATTITUDE_TARGET, SET_POSITION_TARGET_LOCAL_NED and _GLOBAL_INT
 SETPOINTS = frozenset({82, 84, 86})
@@ -34,7 +34,8 @@ _pymavlink = mavlink.MAVLink(None)
 
 @dataclass
 class Frame:
-    """`verified`: the checksum is correct; False only if pymavlink does not know the id."""
+    """A received frame. `verified`: whether the checksum was checked and is correct; it is False
+    only if pymavlink does not know the message id."""
 
     raw: bytes
     message_id: int
@@ -50,25 +51,26 @@ class Frame:
 
     @cached_property
     def message(self) -> Any:
-        """The message, decoded by pymavlink. Cannot fail where the checksum is correct."""
+        """The message, decoded by pymavlink. Decoding a verified frame cannot fail."""
         return _pymavlink.decode(bytearray(self.raw))
 
     @property
     def signed(self) -> bool:
-        """It ends with a signature, whose key is not known here."""
+        """Whether the frame ends with a signature, which may be that of any key."""
         return self.raw[0] == V2 and self.raw[2] & _SIGNED != 0
 
 
 class FrameSplitter:
-    """Finds frames. A datagram holds whole frames. A stream (serial, TCP) may end within a frame,
-    which is kept for the next call. `frames` counts also those whose id is not known,
-    `bytes_skipped` bytes outside frames."""
+    """Finds frames. A datagram holds complete frames; the data of a `stream` (serial, TCP) may end
+    within a frame, which is kept for the next call. `frames` also counts frames with an unknown id,
+    `bytes_skipped` the bytes outside frames."""
 
     def __init__(self, stream: bool) -> None:
         self.bytes_received = self.bytes_skipped = self.frames = 0
         self._stream = stream
         self._rest = b""
-        self._behind = 0  # where in the next data the frame before ends; -1: further back
+        # index in the next data at which the last frame ends; -1: other bytes follow that frame
+        self._behind = 0
 
     def split(self, data: bytes) -> list[Frame]:
         """The verified frames in `data`."""
@@ -82,7 +84,7 @@ class FrameSplitter:
             unsure, adjoins = frame is not None and not frame.verified, at == behind
             if self._stream and (stop > end or (unsure and adjoins and stop == end)):
                 break  # the bytes that decide have not arrived
-            # without a known checksum a frame must fill the space between two others
+            # a frame whose checksum cannot be checked must fill the gap between two other frames
             if unsure and not (adjoins and (stop == end or data[stop] in (V2, V1))):
                 frame = None
             if frame is None:
@@ -98,10 +100,10 @@ class FrameSplitter:
         return frames
 
     def _next_marker(self, data: bytes, at: int) -> int:
-        """Index of the next first byte of a frame, or the length of `data`; what is before it is
-        counted as skipped."""
+        """Index of the next start byte at or after `at`, or the length of `data`. The bytes before
+        it are counted as skipped."""
         if data[at : at + 1] in (b"\xfd", b""):
-            return at  # as nearly always
+            return at  # the usual case
         candidates = [i for i in (data.find(V2, at), data.find(V1, at)) if i >= 0]
         found = min(candidates, default=len(data))
         self.bytes_skipped += found - at
@@ -109,7 +111,7 @@ class FrameSplitter:
 
 
 def frame_size(data: bytes, at: int) -> int:
-    """Frame length given by the header at `at`; if the header is incomplete, the length of the
+    """Length of the frame whose header is at `at`. If the header is incomplete, the length of the
     shortest frame, which also ends beyond the data."""
     if at + 3 > len(data):
         return _HEADER_BYTES_V1 + _CRC_BYTES
@@ -120,8 +122,8 @@ def frame_size(data: bytes, at: int) -> int:
 
 
 def parse(data: bytes, at: int, end: int) -> Frame | None:
-    """The frame in data[at:end], which `frame_size` has measured; None if its checksum is wrong, or
-    if it has incompatibility flags of a later MAVLink version."""
+    """The frame in data[at:end], where `end` comes from `frame_size`. None if its checksum is
+    wrong, or if it has incompatibility flags of a later MAVLink version."""
     raw = data[at:end]
     message_id = message_id_of(raw)
     if raw[0] == V1:

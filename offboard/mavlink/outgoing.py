@@ -1,8 +1,8 @@
-"""What is sent or recorded: one frozen value per message, which makes the message of pymavlink.
+"""Values that are sent or recorded: one frozen class per message, which makes pymavlink's message.
 
 Values are in NED, FRD, SI and vehicle time; `encode` converts to the units and frames of MAVLink.
-It is the last check before the vehicle: ValueError for what is not finite or out of range. Records
-are written to the flight log and never sent.
+It is the last check before the vehicle: it raises ValueError for a value that is not finite or out
+of range. Records are written to the flight log and never sent.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from offboard.mavlink.events import Quaternion
 from offboard.model import frames
 from offboard.model.command import Command, PositionCommand
 
-Message = Any  # of pymavlink, to be packed
+Message = Any  # a message of pymavlink, which is not packed yet
 FLOAT32_MAX = 3.4028234663852886e38
-PIECE_BYTES = 128  # of TUNNEL.payload
+PIECE_BYTES = 128  # length of TUNNEL.payload
 _LOCAL_NED = 1  # MAV_FRAME_LOCAL_NED
-# SET_ATTITUDE_TARGET.type_mask for attitude and thrust: the body rates are ignored. On ArduCopter
-# masks 1 to 6 hold the position, 71 and 199 make it ignore the message
+# SET_ATTITUDE_TARGET.type_mask for attitude and thrust: body rates are ignored. ArduCopter holds
+# its position with masks 1 to 6, and ignores the message with 71 and 199
 _ATTITUDE_AND_THRUST = 7
 
 
@@ -41,13 +41,13 @@ class Outgoing:
     __slots__ = ()
 
     def encode(self, target: Target | None) -> Message:
-        """The message, for the vehicle `target`. Raises ValueError for a value that is not finite
-        or out of range, and for a message to the vehicle while there is none."""
+        """Make the message for the vehicle `target`. Raises ValueError for a value that is not
+        finite or out of range, and for a message to the vehicle if `target` is None."""
         raise NotImplementedError
 
 
 class Record(Outgoing):
-    """A value that only our log holds."""
+    """A value that is written only to our log."""
 
     __slots__ = ()
 
@@ -56,9 +56,10 @@ class Record(Outgoing):
 class AttitudeTarget(Outgoing):
     """SET_ATTITUDE_TARGET, attitude and thrust.
 
-    `hover_thrust` is the normalised thrust that holds the weight. `body_z_down` is the third
-    component of the body's own third axis when the command acts, for autopilots that divide by it;
-    None: that of the commanded direction.
+    `hover_thrust` is the normalised thrust that holds the weight. `body_z_down` is the down
+    component of the vehicle's body z axis, which is the cosine of its tilt, at the time when the
+    command acts; None: that of the commanded attitude. It is used for autopilots that divide the
+    thrust by it.
     """
 
     time_s: float
@@ -82,7 +83,7 @@ class AttitudeTarget(Outgoing):
         )
 
     def attitude(self) -> Quaternion:
-        """The commanded attitude."""
+        """The commanded attitude, FRD -> NED."""
         direction = np.asarray(self.command.thrust_direction_ned, dtype=np.float64)
         heading_rad = self.command.heading_rad
         _finite("thrust direction and heading", *direction, heading_rad)
@@ -90,14 +91,15 @@ class AttitudeTarget(Outgoing):
         if not 0.9 < norm < 1.1:
             raise ValueError(f"thrust direction must be a unit vector; its length is {norm:g}")
         quaternion = frames.quaternion_from_thrust_direction(direction / norm, heading_rad)
-        # last of all: ArduCopter drops a quaternion whose length differs from 1 by 0.0005
+        # normalise again: ArduCopter drops a quaternion whose length differs from 1 by 0.0005
         quaternion = quaternion / np.linalg.norm(quaternion)
         w, x, y, z = (float(c) for c in (quaternion if quaternion[0] >= 0.0 else -quaternion))
         _finite("attitude", w, x, y, z)
         return w, x, y, z
 
     def normalised_thrust(self, *, divides_by_tilt: bool) -> float:
-        """Thrust 0 .. 1: u = u_h T / g, times the body's b_z if the autopilot divides by it."""
+        """Thrust 0 .. 1: hover_thrust * thrust_mps2 / gravity_mps2, multiplied by the cosine of the
+        vehicle's tilt if the autopilot divides by it."""
         command = self.command
         _finite("thrust", command.thrust_mps2, self.hover_thrust, self.gravity_mps2)
         if not (0.0 < self.hover_thrust < 1.0 and self.gravity_mps2 > 0.0):
@@ -120,7 +122,7 @@ class _Motion:
     command: PositionCommand
 
     def _fields(self) -> tuple[float, ...]:
-        """From coordinate_frame and type_mask, 0: all in use, to yaw_rate, in MAVLink's order."""
+        """The fields from coordinate_frame to yaw_rate; type_mask is 0, so that all are in use."""
         numbers = self.command.numbers()
         _finite("a position target", *numbers)
         return _LOCAL_NED, 0, *numbers
@@ -159,7 +161,8 @@ class CommandLong(Outgoing):
 
     @classmethod
     def disarm(cls) -> CommandLong:
-        """Refused by an autopilot whose own land detector says that it flies."""
+        """MAV_CMD_COMPONENT_ARM_DISARM; an autopilot refuses it while its land detector says that
+        it flies."""
         return cls(400, (0.0,))
 
     @classmethod
@@ -168,17 +171,17 @@ class CommandLong(Outgoing):
 
     @classmethod
     def message(cls, message_id: int) -> CommandLong:
-        """MAV_CMD_REQUEST_MESSAGE, once."""
+        """MAV_CMD_REQUEST_MESSAGE: request one message."""
         return cls(512, (float(message_id),))
 
     @classmethod
     def run_prearm_checks(cls) -> CommandLong:
-        """MAV_CMD_RUN_PREARM_CHECKS: the vehicle reports what fails by STATUSTEXT."""
+        """MAV_CMD_RUN_PREARM_CHECKS: the vehicle reports failed checks by STATUSTEXT."""
         return cls(401)
 
     @classmethod
     def message_interval(cls, message_id: int, rate_hz: float) -> CommandLong:
-        """MAV_CMD_SET_MESSAGE_INTERVAL; the interval is in whole microseconds."""
+        """MAV_CMD_SET_MESSAGE_INTERVAL; the interval is rounded to microseconds."""
         return cls(511, (float(message_id), float(round(1e6 / rate_hz))))
 
     def encode(self, target: Target | None) -> Message:
@@ -193,7 +196,7 @@ class CommandResult(Outgoing):
 
     command: int
     result: int
-    system_id: int  # of its sender, as is the component
+    system_id: int  # ids of the sender of the command
     component_id: int
 
     def encode(self, target: Target | None) -> Message:
@@ -239,7 +242,7 @@ class Heartbeat(Outgoing):
 
 @dataclass(frozen=True, slots=True)
 class Timesync(Outgoing):
-    """TIMESYNC. Request: tc1 = 0 and our stamp. Reply: our time and the stamp of the request."""
+    """TIMESYNC. A request has tc1 = 0 and our stamp; a reply our time and the request's stamp."""
 
     tc1_ns: int
     ts1_ns: int
@@ -250,8 +253,8 @@ class Timesync(Outgoing):
 
 @dataclass(frozen=True, slots=True)
 class StatusTextOut(Outgoing):
-    """STATUSTEXT, one chunk of at most 50 bytes (see `texts.chunks`); `text_id` 0: a text of one
-    chunk."""
+    """STATUSTEXT: one chunk of at most 50 bytes (see `texts.chunks`). `text_id` is 0 for a text
+    that has only one chunk."""
 
     severity: int
     data: bytes
@@ -266,8 +269,8 @@ class StatusTextOut(Outgoing):
 
 @dataclass(frozen=True, slots=True)
 class SolverRecord(Record):
-    """Numbers of one decision or identification, logged as DEBUG_FLOAT_ARRAY: at most 58, NaN
-    where there is none, infinity beyond the range of a float32."""
+    """Numbers of one decision or identification, logged as DEBUG_FLOAT_ARRAY: at most 58. NaN means
+    that there is no value; a number beyond the range of a float32 becomes infinity."""
 
     time_s: float
     data: tuple[float, ...]
@@ -288,7 +291,7 @@ class SolverRecord(Record):
 
 @dataclass(frozen=True, slots=True)
 class ConfigurationRecord(Record):
-    """One piece of the flight's configuration or of its inputs, logged as TUNNEL: at most 128
+    """One piece of the flight's configuration, inputs or events, logged as TUNNEL: at most 128
     bytes."""
 
     data: bytes
@@ -308,7 +311,7 @@ def _found(target: Target | None) -> Target:
 
 
 def _ids(target: Target | None) -> tuple[int, int]:
-    """target_system and target_component."""
+    """The fields target_system and target_component."""
     vehicle = _found(target)
     return vehicle.system_id, vehicle.component_id
 
@@ -326,7 +329,7 @@ def _finite(name: str, *values: float) -> None:
 
 
 def _capacity(kind: Any, field: str, count: int) -> int:
-    """Length of an array field, into which `count` values must fit."""
+    """Length of an array field. Raises ValueError if `count` values do not fit into it."""
     capacity: int = kind.array_lengths[kind.ordered_fieldnames.index(field)]
     if count > capacity:
         raise ValueError(f"{kind.msgname} holds {capacity} values, not {count}")

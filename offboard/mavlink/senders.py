@@ -1,13 +1,14 @@
-"""Who sends on the link: which sender is the vehicle, who else controls it, and who may be ignored.
+"""Senders on the link: which one is the vehicle, which others control it, and which are ignored.
 
-The first autopilot heard is the vehicle, known by system id, component id and network address. From
-then on every other sender is ignored, and with a key all that is not signed with it; setpoints and
-modes that another one sends to our vehicle are reported, as are other companion computers.
+The first autopilot heard is the vehicle, identified by system id, component id and network address.
+From then on other senders are ignored, and with a key all frames without its signature. Setpoints
+and mode commands that another sender sends to our vehicle, and other companion computers, are
+reported.
 
-mavlink-router and MAVProxy send from another port after a restart: the address changes to another
-port of its host that sends the vehicle's frames, after the known one was silent. The link hands
-over datagrams of another address only after it has checked that the silence was neither an overflow
-of the socket's buffer nor a pause of this process.
+After a restart mavlink-router and MAVProxy send from another port. Therefore another port of the
+same host becomes the vehicle's address if it sends the vehicle's frames after the known port was
+silent. The link passes on datagrams of another address only after it has checked that the silence
+was neither an overflow of the socket's buffer nor a pause of this process.
 """
 
 from __future__ import annotations
@@ -49,48 +50,50 @@ AUTOPILOT_COMPONENT = 1
 COMMANDS = COMMAND_INT, COMMAND_LONG = 75, 76
 # MAV_CMD: return, land, take off, set the mode, go to a place, begin a mission, arm or disarm
 _MODE_COMMANDS = frozenset({20, 21, 22, 176, 192, 300, 400})
-PEER_SILENT_S = 0.5  # half of `Limits.silence_s`, so that the flight can continue
-SYSTEMS_MAX = 8  # that are remembered
-HEARD_S = 10.0  # after its newest HEARTBEAT a system is gone
-NOTED_EVERY_S = 1.0
+PEER_SILENT_S = 0.5  # half of `Limits.silence_s`, so that the flight can continue on a new port
+SYSTEMS_MAX = 8  # systems that are remembered
+HEARD_S = 10.0  # a system counts as present for this time after its newest HEARTBEAT
+NOTED_EVERY_S = 1.0  # a system is noted again only after this time
 _NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
 # MAV_TYPE: quadrotor, coaxial, hexarotor, octorotor, tricopter, dodecarotor, decarotor, any number
 MULTIROTORS = frozenset({2, 3, 13, 14, 15, 29, 35, 43})
 HELICOPTER = 4
-# MAV_TYPE of what is no vehicle, whatever autopilot it names: antenna tracker, ground station,
-# onboard controller, gimbal, ADS-B, camera, and the peripherals from charging station to GPS
+# MAV_TYPEs that are no vehicle, even if the HEARTBEAT names an autopilot: antenna tracker, ground
+# station, onboard controller, gimbal, ADS-B, camera, and peripherals from charging station to GPS
 _NO_VEHICLES = frozenset({5, 6, 18, 26, 27, 30, 31, 32, 33, 34, *range(36, 43), 44})
 
 
 class Senders:
-    """See the module. `vehicle` and `dialect` are None until the vehicle was found; `wanted` is the
-    only system that may be the vehicle, None: any; without `signing` it must not sign. `own` are
-    our ids, of which the system is the vehicle's. `systems` has when each autopilot was heard, to a
-    second, `twin_s` when one with the vehicle's system id was, from another address; `forged`
-    counts what signing refused. Times are `Session.link_time_s` but for `heard_s`, host time of the
-    vehicle's newest frame.
+    """See the module. `wanted` is the only system id that the vehicle may have (None: any). Without
+    `signing` the vehicle must not sign.
+
+    `vehicle` and `dialect` are None until the vehicle was found. `own` are our ids; our system id
+    is that of the vehicle. `systems` has the time at which each autopilot was heard, to a second;
+    `twin_s` the time at which one with the vehicle's system id was heard from another address.
+    `forged` counts the frames that signing refused. Times are `Session.link_time_s`, except
+    `heard_s`: `Session.elapsed_s` of the vehicle's newest frame.
     """
 
     def __init__(self, wanted: int | None, component_id: int, signing: Signing | None) -> None:
         self.own = Address(1, component_id)
         self.vehicle: VehicleFound | None = None
         self.dialect: Dialect | None = None
-        self.target: Target | None = None  # of our messages: the vehicle
-        self.clock_behind = False  # an autopilot whose clock is behind ours was heard
+        self.target: Target | None = None  # the vehicle, as the receiver of our messages
+        self.clock_behind = False  # whether an autopilot was heard whose signing time is behind
         self.systems: dict[int, float] = {}
         self.twin_s = -math.inf
         self.forged: Counter[Refusal] = Counter()
-        self._news_at = 1  # number of forged frames
-        self._signs = False  # an autopilot that signs was heard, and we have no key
-        self._other_component = 0  # of the newest autopilot that is not AUTOPILOT_COMPONENT
+        self._news_at = 1  # number of forged frames at which `news` reports next
+        self._signs = False  # whether an autopilot that signs was heard although we have no key
+        self._other_component = 0  # newest component id of an autopilot with another one than 1
         self.heard_s = 0.0
         self._wanted = wanted
         self._signing = signing
-        # address of the vehicle, or of one that awaits our clock
+        # address of the vehicle, or of an autopilot whose signing time is behind
         self.peer: Hashable | None = None
 
     def set_vehicle(self, vehicle: VehicleFound, peer: Hashable) -> None:
-        """Take this vehicle, which sends from `peer`, as ours."""
+        """Use this vehicle, which sends from `peer`, as ours."""
         self.vehicle, self.dialect, self.peer = vehicle, DIALECTS[vehicle.autopilot], peer
         self.own = Address(vehicle.system_id, self.own.component_id)
         divides = self.dialect.divides_by_tilt
@@ -99,8 +102,8 @@ class Senders:
     # --- datagrams from another address ---
 
     def moves_to(self, peer: Hashable, now_s: float, datagram: bytes) -> bool:
-        """Take `peer` as the vehicle's address if `datagram`, from there, shows that the vehicle
-        sends from there now."""
+        """Make `peer` the vehicle's address if the known one is silent and `datagram`, from `peer`,
+        has a frame of the vehicle. Returns whether the address has changed."""
         if now_s - self.heard_s <= PEER_SILENT_S or not same_host(peer, self.peer):
             return False
         vehicle = self.vehicle
@@ -108,18 +111,19 @@ class Senders:
         ids = vehicle.system_id, vehicle.component_id
         genuine = self._genuine(datagram)
         moves = any((frame.system_id, frame.component_id) == ids for frame in genuine)
-        if moves:  # then it was itself that was heard from there
+        if moves:  # so the autopilot at the other address was the vehicle itself
             self.peer, self.twin_s = peer, -math.inf
         return moves
 
     def overhear(self, datagram: bytes, now_s: float) -> list[int]:
-        """Systems with an autopilot that a datagram from another address shows, each once a
-        second."""
+        """Note the autopilots in a datagram from another address. Returns their system ids, each
+        at most once a second."""
         shown = {each.system_id for each in self._genuine(datagram) if self._autopilot(each)}
         return [each for each in sorted(shown) if self.hear_elsewhere(each, now_s)]
 
     def hear_elsewhere(self, system_id: int, now_s: float) -> bool:
-        """An autopilot of this system sends from another address; whether that is news."""
+        """Note an autopilot of this system at another address. Returns whether it was not noted
+        within the last second."""
         if self.vehicle is None or system_id != self.vehicle.system_id:
             return self._hear(system_id, now_s)
         news = now_s - self.twin_s >= NOTED_EVERY_S
@@ -127,8 +131,8 @@ class Senders:
         return news
 
     def _genuine(self, datagram: bytes) -> Iterator[Frame]:
-        """The frames of a datagram that signing would accept. Neither counts them nor stores their
-        time stamps."""
+        """The frames of a datagram that signing would accept. Frames are not counted, and their
+        time stamps are not stored."""
         for frame in FrameSplitter(stream=False).split(datagram):
             if not (self._signing and self._signing.refusal(frame, note=False)):
                 yield frame
@@ -138,9 +142,9 @@ class Senders:
     def refuse(self, frame: Frame, peer: Hashable, now_s: float, events: list[Event]) -> bool:
         """Whether signing refuses a frame.
 
-        Adds to `events` an autopilot whose signature is right and whose clock is behind, where no
-        vehicle was found: its clock follows ours with our heartbeat. The frame may be a replay:
-        nothing else is believed.
+        Until a vehicle is found, adds ClockBehind to `events` for a HEARTBEAT of an autopilot with
+        a valid signature and too old a time stamp: that autopilot will take over the signing time
+        of our heartbeat. The frame may be a replay: nothing else in it is used.
         """
         refusal = self._signing.refusal(frame) if self._signing else None
         if refusal is None:
@@ -154,8 +158,9 @@ class Senders:
         return True
 
     def judge(self, frame: Frame, peer: Hashable, now_s: float, events: list[Event]) -> bool:
-        """Whether a frame comes from our vehicle and is no command. Adds to `events` the vehicle
-        when it is found, commands to us, and others that control the vehicle."""
+        """Whether a frame comes from our vehicle and is no command; before the vehicle is found,
+        also a TIMESYNC frame. Adds to `events` the vehicle when it is found, commands to us, other
+        companion computers, and senders that control the vehicle."""
         vehicle, message_id = self.vehicle, frame.message_id
         heard = self.note(frame, now_s)
         system_id = vehicle.system_id if vehicle else self._wanted
@@ -170,18 +175,18 @@ class Senders:
         if message_id in COMMANDS:
             self._note_command(frame, events)
             return False
-        # for all or for our vehicle: routers forward those for others
+        # only setpoints for all or for our vehicle: routers also forward those for other vehicles
         if message_id in SETPOINTS and frame.message.target_system in (0, vehicle.system_id):
             events.append(OtherSender(frame.system_id, frame.component_id))
         if message_id == COMMAND_ACK:
             pairs = zip(_receiver(frame), self.own, strict=True)
-            return theirs and all(to in (0, own) for to, own in pairs)  # 0: for all
+            return theirs and all(to in (0, own) for to, own in pairs)  # 0: broadcast
         return theirs
 
     def _find(
         self, frame: Frame, heard: Dialect | None, peer: Hashable, events: list[Event]
     ) -> bool:
-        """The first heartbeat of an autopilot makes it the vehicle."""
+        """Make the sender of the first HEARTBEAT of an autopilot the vehicle; return as `judge`."""
         if frame.message_id == TIMESYNC:
             return True  # a simulator in lockstep may need the reply before its first heartbeat
         if heard is None:
@@ -196,7 +201,7 @@ class Senders:
 
     def _note_command(self, frame: Frame, events: list[Event]) -> None:
         """Add to `events` a command to us, and a mode command from another companion computer of
-        the vehicle's system. A ground station's mode command is the pilot's and no event."""
+        the vehicle's system. A mode command of a ground station is the pilot's: no event."""
         sender, receiver = Address(frame.system_id, frame.component_id), _receiver(frame)
         if receiver == self.own:
             if sender != self.own:
@@ -209,15 +214,16 @@ class Senders:
             events.append(OtherSender(*sender))
 
     def _is_companion(self, frame: Frame) -> bool:
-        """Whether a HEARTBEAT is of another companion computer of our vehicle, with the
-        vehicle's system id as ours. On PX4 some call themselves a ground station."""
+        """Whether a HEARTBEAT is that of another companion computer, which has the vehicle's system
+        id as we do. With PX4, some companion computers send the type of a ground station."""
         no_autopilot = frame.message.autopilot == _NO_AUTOPILOT
         on_vehicle = frame.system_id == self.own.system_id
         is_type = frame.message.type in (TYPE_ONBOARD_CONTROLLER, TYPE_GCS)
         return no_autopilot and on_vehicle and is_type
 
     def note(self, frame: Frame, now_s: float) -> Dialect | None:
-        """The autopilot that a frame shows, None if it is no HEARTBEAT of one that can be flown."""
+        """Note the autopilot that sent a frame, and return its dialect; None if the frame is no
+        HEARTBEAT of a vehicle with a known autopilot and component id 1."""
         dialect = self._autopilot(frame)
         if dialect:
             self._hear(frame.system_id, now_s)
@@ -231,10 +237,11 @@ class Senders:
         return dialect
 
     def _hear(self, system_id: int, now_s: float) -> bool:
-        """This system has an autopilot; whether that is news."""
+        """Note that this system has an autopilot. Returns whether it was not noted within the last
+        second."""
         if now_s - self.systems.get(system_id, -math.inf) < NOTED_EVERY_S:
             return False
-        self.systems.pop(system_id, None)  # the newest is the last
+        self.systems.pop(system_id, None)  # so that the newest is the last
         self.systems[system_id] = now_s
         if len(self.systems) > SYSTEMS_MAX:
             del self.systems[next(iter(self.systems))]
@@ -243,20 +250,21 @@ class Senders:
     # --- what to say ---
 
     def candidates(self, now_s: float) -> str:
-        """The systems that could be the vehicle, for a sentence, where they are several and none
-        was chosen; else empty."""
+        """The system ids that could be the vehicle, as text, if there are several and `wanted` is
+        None; else empty."""
         present = [each for each, at_s in self.systems.items() if now_s - at_s <= HEARD_S]
         return _listed(present) if self._wanted is None and len(present) > 1 else ""
 
     def twin(self, now_s: float) -> str:
-        """Who sends with the vehicle's system id from another address, in a sentence; else
-        empty."""
+        """A sentence if another autopilot with the vehicle's system id sends from another address;
+        else empty."""
         if self.vehicle is None or now_s - self.twin_s > HEARD_S:
             return ""
         return f"an autopilot sends as system {self.vehicle.system_id} from another address, too"
 
     def news(self) -> str:
-        """What signing refused, on the 1st, 10th, 100th ... frame; else empty."""
+        """A sentence about the frames that signing refused, on the 1st, 10th, 100th ... of them;
+        else empty."""
         total = self.forged.total()
         if total < self._news_at:
             return ""
@@ -266,7 +274,7 @@ class Senders:
         return f"frames refused by signing: {', '.join(named)}"
 
     def why_none(self) -> str:
-        """Why no vehicle was found, as far as the frames that were refused tell; else empty."""
+        """Why no vehicle was found, if refused or unsuitable frames show a reason; else empty."""
         forged = self.forged
         if forged[Refusal.BAD_SIGNATURE]:
             return "frames arrive, but their signature does not match: it is another key's"
@@ -300,19 +308,19 @@ def same_host(peer: Hashable, other: Hashable) -> bool:
 
 
 def is_vehicle(heartbeat: Any) -> bool:
-    """Whether this HEARTBEAT is of a vehicle with an autopilot, of any kind."""
+    """Whether this HEARTBEAT comes from a vehicle with an autopilot of any kind."""
     return heartbeat.type not in _NO_VEHICLES and heartbeat.autopilot != _NO_AUTOPILOT
 
 
 def dialect_of(heartbeat: Any) -> Dialect | None:
-    """The dialect of the vehicle that sends this HEARTBEAT; None if it has no dialect or is no
-    vehicle."""
+    """The dialect of the vehicle that sends this HEARTBEAT; None if it is no vehicle, or has an
+    autopilot other than PX4 and ArduPilot."""
     return _BY_AUTOPILOT.get(heartbeat.autopilot) if is_vehicle(heartbeat) else None
 
 
 def unfit_type(vehicle_type: int, *, helicopter: bool) -> str:
-    """Why a vehicle of this MAV_TYPE is not flown, in one sentence; empty if it is. `helicopter`:
-    the vehicle file is that of a helicopter."""
+    """A sentence that says why a vehicle of this MAV_TYPE is not flown; empty if it can be.
+    `helicopter`: whether the vehicle file is that of a helicopter."""
     if vehicle_type in ({HELICOPTER} if helicopter else MULTIROTORS):
         return ""
     known = enums["MAV_TYPE"].get(vehicle_type)
@@ -331,6 +339,7 @@ def _receiver(frame: Frame) -> Address:
 
 
 def _parameters(command: Frame) -> tuple[float, ...]:
-    """Those of a COMMAND_LONG; of a COMMAND_INT without 5 to 7, which are a place."""
+    """All parameters of a COMMAND_LONG; the first four of a COMMAND_INT, since 5 to 7 are a
+    position."""
     given = 7 if command.message_id == COMMAND_LONG else 4
     return tuple(getattr(command.message, f"param{number + 1}") for number in range(given))

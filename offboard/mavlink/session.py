@@ -1,10 +1,10 @@
-"""The session with one autopilot, without I/O: identity, telemetry, and what must be sent to it.
+"""The session with one autopilot, without I/O: its identity, its telemetry, and messages to it.
 
-Bytes and `now_s` (monotonic host seconds) are arguments. Events, frames for the log and messages to
-send are returned. No socket, no file, no clock. Nothing that arrives can raise.
+Bytes and `now_s` (monotonic host time in seconds) are arguments. Events, frames for the log and
+messages to send are returned. No socket, no file, no clock. No received bytes can raise.
 
-`senders` says whose a frame is. Our system id is the vehicle's, which makes us one of its
-components.
+`senders` decides who has sent a frame. We use the system id of the vehicle, which makes us one of
+its components.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from offboard.mavlink.telemetry import Telemetry
 
 ACTIVE = 4  # MAV_STATE
 COMPONENT_ID = 191  # MAV_COMP_ID_ONBOARD_COMPUTER: the sender of frames
-# MAV_COMP_ID_ONBOARD_COMPUTER2: the sender of records, which only our log holds. Its own sequence
-# numbers leave no gap in those of the frames that the vehicle counts.
+# MAV_COMP_ID_ONBOARD_COMPUTER2: the sender of records, which are only in our log. Records have
+# their own sequence numbers, so that the vehicle sees no gaps in those of the frames.
 RECORD_COMPONENT_ID = 192
 
-_ECHOES = 256  # newest frames of ours that are recognised when they come back
-_HEARTBEAT_PERIOD_S = 0.999  # 1 Hz; below 1 s, so that no rounding error delays it by a cycle
+_ECHOES = 256  # our newest frames, which are recognised if a router sends them back
+_HEARTBEAT_PERIOD_S = 0.999  # 1 Hz; below 1 s, so that rounding does not delay it by a turn
 
 
 @dataclass(frozen=True, slots=True)
 class SessionSettings:
-    """How a session behaves.
+    """Settings of a session.
 
-    `system_id` is the only system that may be the vehicle; None: the first autopilot heard.
-    `stream`: serial or TCP, bytes arrive in any portions. `sends_first`: send heartbeats before an
-    autopilot was heard. `capacity_bytes_ps` of the link limits the rates of telemetry that are
-    requested; None: unknown. `lockstep`: simulated time takes the place of host time, see
-    `Session.elapsed_s`.
+    `system_id` is the only system id that the vehicle may have; None: that of the first autopilot
+    heard. `stream`: whether received bytes may end within a frame (serial, TCP). `sends_first`:
+    whether to send heartbeats before an autopilot is heard. `capacity_bytes_ps`, the capacity of
+    the link in bytes per second, limits the requested telemetry rates; None: unknown. `lockstep`:
+    whether simulated time replaces host time, see `Session.elapsed_s`.
     """
 
     system_id: int | None = None
@@ -55,14 +55,13 @@ class SessionSettings:
 
 @dataclass(slots=True)
 class Reception:
-    """Result of one portion of bytes.
+    """Result of receiving one datagram or one portion of a stream.
 
-    `frames` are all with a correct checksum, used or not, except those with our ids and those that
-    signing refused; they are for the log, in which our ids mean that we sent a frame. `unlogged`
-    are those that another program sent with our ids or those of our records, each after the number
-    of `frames` before it.
-    `replies` answer TIMESYNC requests. They must be sent last: in lockstep, what is sent after the
-    reply is applied one barrier later.
+    `frames` are for the log: all frames with a correct checksum, used or not, except those with our
+    ids (which in the log mean that we sent a frame) and those that signing refused. `unlogged` are
+    frames that another program sent with our ids or those of our records, each as a pair: the
+    number of `frames` before it, and the frame. `replies` answer TIMESYNC requests. They must be
+    sent last: in lockstep, a frame that is sent after the reply acts one barrier later.
     """
 
     frames: list[bytes] = field(default_factory=list)
@@ -72,8 +71,8 @@ class Reception:
 
 
 class Session:
-    """See the module. `vehicle` and `dialect` are None until an autopilot was heard. With `signing`
-    all frames are signed, and those without its signature are dropped."""
+    """See the module. `vehicle` and `dialect` are None until the vehicle was found. With `signing`
+    all frames that are sent are signed, and received frames without its signature are dropped."""
 
     def __init__(self, settings: SessionSettings, signing: Signing | None = None) -> None:
         self.settings = settings
@@ -86,8 +85,9 @@ class Session:
         self.telemetry = Telemetry(settings.capacity_bytes_ps)
         self.time = self.telemetry.time
         self._began_s: float | None = None  # stamp of the first TIMESYNC request
-        self._simulated_s = 0.0  # from it to the newest
-        self._heartbeat_sent: tuple[float, float, int] | None = None  # host, link time, custom_mode
+        self._simulated_s = 0.0  # from that request to the newest one
+        # `elapsed_s`, `link_time_s` and custom_mode of our newest heartbeat
+        self._heartbeat_sent: tuple[float, float, int] | None = None
 
     @property
     def vehicle(self) -> VehicleFound | None:
@@ -111,7 +111,7 @@ class Session:
         if self.vehicle is not None and peer != self.peer:
             if not self.senders.moves_to(peer, now_s, datagram):
                 return found
-            self._heartbeat_sent = None  # a router learns our address from it
+            self._heartbeat_sent = None  # send one at once: a router learns our address from it
             found.events.append(PeerChanged(peer))
         found.events += self.telemetry.texts.expire(now_s)
         for frame in self.splitter.split(datagram):
@@ -125,7 +125,7 @@ class Session:
 
     def _log(self, frame: framing.Frame, found: Reception) -> None:
         if frame.message_id == framing.SETUP_SIGNING:
-            return  # it holds the key
+            return  # it contains the key
         ours = frame.component_id in (self.settings.component_id, RECORD_COMPONENT_ID)
         if ours and frame.system_id == self.senders.own.system_id:
             found.unlogged.append((len(found.frames), frame.raw))
@@ -133,12 +133,12 @@ class Session:
             found.frames.append(frame.raw)
 
     def _interpret(self, frame: framing.Frame, now_s: float, found: Reception) -> None:
-        """Add to `found` the event in a frame of the vehicle, or the reply to its TIMESYNC request
-        (which may come before the vehicle is found)."""
+        """Add to `found` the event of a frame of the vehicle, or the reply to its TIMESYNC request
+        (which may arrive before the vehicle is found)."""
         if self.dialect is not None:
             self.senders.heard_s = now_s
             if self.telemetry.dialect is None:
-                self._heartbeat_sent = None  # send it at once, with the vehicle's system id
+                self._heartbeat_sent = None  # send one at once, with the vehicle's system id
                 self.telemetry.begin(self.dialect)
         if frame.message_id == framing.TIMESYNC:
             self._synchronise(frame, now_s, found)
@@ -146,12 +146,12 @@ class Session:
             self.telemetry.interpret(frame, now_s, found.events)
 
     def _synchronise(self, frame: framing.Frame, now_s: float, found: Reception) -> None:
-        """TIMESYNC: tc1 is 0 in a request."""
+        """Add to `found` the reply to a TIMESYNC request (tc1 is 0), or the event of a reply."""
         tc1_ns, ts1_ns = frame.message.tc1, frame.message.ts1
         if tc1_ns == 0:
             self._began_s = ts1_ns * 1e-9 if self._began_s is None else self._began_s
             self._simulated_s = ts1_ns * 1e-9 - self._began_s
-            # a reply at time 0 would look like a request
+            # not 0, because a reply with tc1 = 0 would be a request
             found.replies.append(Timesync(max(1, int(now_s * 1e9)), ts1_ns))
         elif self.vehicle is not None:
             wrapped_ns = round(self.time.wrapped_s(tc1_ns / 1e9) * 1e9)
@@ -160,11 +160,12 @@ class Session:
     # --- out ---
 
     def poll(self, now_s: float, status: tuple[int, int] = (ACTIVE, 0)) -> tuple[Outgoing, ...]:
-        """Messages that are due at `now_s`; call it at least every 50 ms.
+        """Messages that are due at `now_s`. Call it at least every 50 ms.
 
-        They are our heartbeat with `status`, system_status and custom_mode, at 1 Hz of host or
-        vehicle time, whichever is faster, and where custom_mode has changed, so that another
-        program learns at once who flies; and requests for telemetry that is missing or too slow.
+        They are our HEARTBEAT and requests for telemetry that is missing or too slow. `status` is
+        system_status and custom_mode of the HEARTBEAT. It is due at 1 Hz of host or vehicle time,
+        whichever is faster, and at once if custom_mode has changed, so that another program learns
+        who flies.
         """
         now_s = self.elapsed_s(now_s)
         self.time.on_host(now_s)
@@ -181,7 +182,7 @@ class Session:
         return (*due, *(CommandLong.message_interval(w.message_id, w.rate_hz) for w in requests))
 
     def encode(self, outgoing: Outgoing) -> bytes:
-        """The frame of a message, with the next sequence number of its component.
+        """Pack a message as a frame with the next sequence number of its component, and sign it.
 
         Raises ValueError if a value is not finite or out of range, or if the message is for the
         vehicle and none was found.
@@ -201,8 +202,8 @@ class Session:
     # --- time and rates ---
 
     def elapsed_s(self, host_s: float) -> float:
-        """Host time; in lockstep, where nothing may depend on host time, the simulated time since
-        the simulator's first TIMESYNC request."""
+        """Host time `host_s` in seconds. In lockstep, where nothing may depend on host time: the
+        simulated time since the simulator's first TIMESYNC request."""
         return self._simulated_s if self.settings.lockstep else host_s
 
     @property

@@ -1,8 +1,9 @@
-"""MAVLink 2 signing: pymavlink signs; here are our own time, the check and its reasons. No I/O.
+"""MAVLink 2 signing without I/O: our signing time, and the check of received signatures. pymavlink
+makes the signatures.
 
-A time stamp has 48 bits and counts 10 us since 2015-01-01 UTC; its stream is link id, system and
-component. A newer stamp than our own time becomes our own time, so that clocks agree that were
-never set.
+A time stamp has 48 bits and counts units of 10 us since 2015-01-01 UTC. Each stream (link id,
+system and component) has its own stamps. A received stamp that is newer than our signing time
+becomes our signing time, so that computers agree whose clocks were never set.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ UNITS_PER_S = 100_000
 EPOCH_UNIX_S = 1_420_070_400  # 2015-01-01 UTC
 ALLOWED_UNSIGNED = frozenset({109})  # RADIO_STATUS
 LINK_ID = 1
-RESERVED = 60 * UNITS_PER_S  # so far the reservation is ahead when it is made
+RESERVED = 60 * UNITS_PER_S  # stamps are reserved this far ahead
 _STAMP_MAX = (1 << 48) - 1
 _HASH_BYTES = 6
 
-# Key, offset of our clock, newest stamp, and link id, system, component and newest stamp of each
-# stream
+# Key in hex, offset of our clock, newest stamp, and (link id, system, component, newest stamp) of
+# each stream
 State = tuple[str, int, int, list[tuple[int, int, int, int]]]
 
 
@@ -47,9 +48,10 @@ def stamp_of_unix(unix_us: int) -> int:
 class Signing:
     """Signs what we send and checks what we receive, with one `key` of 32 bytes.
 
-    `clock` gives monotonic seconds, and `offset` added to it our time in units of 10 us.
-    `reserve` is called with a stamp that is about a minute ahead, before a stamp is used that was
-    not reserved: who keeps it knows after a crash which stamps were never used.
+    Our signing time is at least `offset`, in units of 10 us, plus `clock`, which returns monotonic
+    seconds. `reserve` is called with a stamp a minute ahead when less than half a minute of the
+    reservation (`reserved`) is left, and always before a stamp beyond it is used. So a caller that
+    keeps that stamp knows after a crash which stamps were never used.
     """
 
     def __init__(
@@ -71,7 +73,7 @@ class Signing:
         self._signing.link_id = LINK_ID
 
     def sign(self, sender: mavlink.MAVLink) -> None:
-        """Have the next frame that `sender` packs signed."""
+        """Prepare `sender` to sign the next frame that it packs."""
         sender.signing = self._signing
         self._signing.timestamp = stamp = min(self._now(), _STAMP_MAX)  # pymavlink then adds one
         if stamp > self._reserved - RESERVED // 2:
@@ -79,7 +81,8 @@ class Signing:
             self._reserve(stamp + RESERVED)
 
     def refusal(self, frame: Frame, *, note: bool = True) -> Refusal | None:
-        """Why a frame must not be used; notes the time stamp of one that may, if `note`."""
+        """Why a frame must not be used, or None. With `note`, store the time stamp of a frame that
+        may be used."""
         raw = frame.raw
         if not frame.signed:
             return None if frame.message_id in ALLOWED_UNSIGNED else Refusal.UNSIGNED
@@ -99,20 +102,21 @@ class Signing:
         return None
 
     def _now(self) -> int:
-        """Our own time."""
-        newest: int = self._signing.timestamp  # of ours, or accepted of others
+        """Our signing time."""
+        newest: int = self._signing.timestamp  # newest stamp that was sent or accepted
         return max(newest, self.offset + int(UNITS_PER_S * self.clock()))
 
-    # --- for another process that continues ---
+    # --- for another process, which continues the signatures ---
 
     def state(self) -> State:
-        """What another process needs to continue."""
+        """The state that another process needs to continue the signatures."""
         streams = [(*key, at) for key, at in self._signing.stream_timestamps.items()]
         return self.key.hex(), self.offset, self._signing.timestamp, streams
 
     @classmethod
     def resumed(cls, clock: Callable[[], float], state: State) -> Signing:
-        """Continues `state`, with stamps that are a second ahead: more may have been sent since."""
+        """Continue from `state`, with stamps a second ahead, because frames may have been sent
+        since."""
         key, offset, newest, streams = state
         signing = cls(bytes.fromhex(key), offset + UNITS_PER_S, clock)
         signing._signing.timestamp = newest + UNITS_PER_S

@@ -1,8 +1,7 @@
-"""Telemetry: frames of the vehicle become events, in order, and are requested at the rates that are
-needed.
+"""Telemetry: converts frames of the vehicle to events, in order, and requests the needed rates.
 
-What is late, repeated or implausible is refused. A ground station may change the rates that we
-requested: therefore they are measured, and requested again. They are per second of
+Messages that are late, repeated or implausible are dropped. A ground station may change the rates
+that we requested: therefore rates are measured, and requested again. They are per second of
 `Session.link_time_s`, so that they mean the same in real time, at higher speed and in lockstep.
 """
 
@@ -28,41 +27,42 @@ from offboard.mavlink.framing import STATUSTEXT, Frame
 from offboard.mavlink.texts import TextAssembler
 from offboard.mavlink.vehicle_time import Age, VehicleTime
 
-# A link may delay single frames: a report of the mode that was sent before one which arrived less
-# than this ago says nothing new. HEARTBEAT comes at 1 Hz.
+# A link may delay single frames. A report of the mode is dropped if it was sent before another one
+# that arrived less than this time ago. HEARTBEAT comes at 1 Hz.
 _REORDERED_S = 1.3
-_HALF_TURN = 128  # of the sequence number; further ahead is behind
-_GAP_S = 0.25  # without any frame, half a turn may have been lost
-SLOW_HZ = 20.0
-SHARE = 0.68  # of a link's capacity; the rest is for what is not requested
-_WINDOW_S = 2.0
-ENOUGH = 0.7  # of the rate wanted; a window holds few samples of a slow message
-_FIRST_WAIT_S, _LONGEST_WAIT_S = 3.0, 30.0
+_HALF_TURN = 128  # a sequence number that is this far ahead or more is taken as behind
+_GAP_S = 0.25  # after this time without any frame, half a turn may have been lost
+SLOW_HZ = 20.0  # lowest rate to which a message is thinned on a slow link
+SHARE = 0.68  # of a link's capacity for requested messages; the rest is for all others
+_WINDOW_S = 2.0  # over which rates are measured
+ENOUGH = 0.7  # of the wanted rate: the window has few samples of a slow message
+_FIRST_WAIT_S, _LONGEST_WAIT_S = 3.0, 30.0  # between two requests for a message
 _OPTIONAL_TRIES = 2
-_STOPPED_S = 0.2  # a fast message that is missing for so long was stopped, or lost with the others
-_UNHEARD = 0.1  # of the rate wanted: what arrives more rarely has its default rate
+_STOPPED_S = 0.2  # a fast message that is missing for this time was stopped, or all are lost
+_UNHEARD = 0.1  # of the wanted rate: a message that arrives more rarely has its default rate
 # ArduCopter denies rates above 0.8 SCHED_LOOP_RATE. Its COMMAND_ACK does not name the message, and
-# denies unknown messages in the same way; this text does
+# is the same for unknown messages; this STATUSTEXT names the message
 TOO_FAST = re.compile(r"message ID (\d{1,8}) too fast")
 _ARRIVALS_MAX = 4096  # limits the memory used when a link is flooded
 
 
 class Telemetry:
-    """Telemetry of one vehicle. `capacity_bytes_ps` of the link limits the rates that are
-    requested; None: unknown. `time.seconds` are the session's. `dialect` is None before `begin`."""
+    """Telemetry of one vehicle. `capacity_bytes_ps` of the link limits the requested rates; None:
+    unknown. `time.seconds` is `Session.link_time_s`. `dialect` is None before `begin`."""
 
     def __init__(self, capacity_bytes_ps: float | None) -> None:
         self.time = VehicleTime()
         self.texts = TextAssembler()
         self.dialect: Dialect | None = None
-        self._streams: dict[int, _Stream] = {}  # those that are wanted, by message id
+        self._streams: dict[int, _Stream] = {}  # wanted messages, by message id
         self._capacity_bytes_ps = capacity_bytes_ps
-        self._frames = 0  # sent by the vehicle, as the sequence numbers show; modulo 256 the newest
+        # number of the newest frame; modulo 256 it is the sequence number
+        self._frames = 0
         self._heard_s = -math.inf  # when the newest frame arrived
-        self._mode_report = (0, -math.inf)  # number of the newest, and when it arrived
+        self._mode_report = (0, -math.inf)  # frame number of the newest report, and its arrival
 
     def interpret(self, frame: Frame, now_s: float, events: list[Event]) -> None:
-        """Add to `events` what a frame of the vehicle says that arrived at `now_s`."""
+        """Add to `events` the events of a frame of the vehicle that arrived at `now_s`."""
         number = self._number(frame, now_s)
         if frame.message_id == STATUSTEXT:
             texts = self.texts.add(frame.payload, now_s)
@@ -71,7 +71,7 @@ class Telemetry:
             events += texts
             return
         decoder = DECODERS.get(frame.message_id)
-        if decoder is None:  # nobody reads it
+        if decoder is None:  # only its rate is measured
             self._count(frame.message_id)
             return
         assert self.dialect is not None
@@ -96,14 +96,14 @@ class Telemetry:
         # after the check of the stamp: duplicates must not raise the measured rate
         self._count(message_id)
         if age is Age.REBOOTED:
-            self._mode_report = (0, -math.inf)  # it counts anew
+            self._mode_report = (0, -math.inf)  # sequence numbers start again
             self._request()  # a rebooted vehicle has its default rates
             events.append(Rebooted())
         self.time.on_telemetry(event.time_s, now_s)
         events.append(event)
 
     def _number(self, frame: Frame, now_s: float) -> int:
-        """The number of the frame in the order of sending, by its 8-bit sequence number."""
+        """The number of the frame in the order of sending, from its 8-bit sequence number."""
         ahead = (frame.sequence - self._frames) % 256
         if ahead >= _HALF_TURN and now_s - self._heard_s < _GAP_S:
             return self._frames + ahead - 256
@@ -121,7 +121,7 @@ class Telemetry:
     # --- rates ---
 
     def begin(self, dialect: Dialect) -> None:
-        """The vehicle has this autopilot: request all messages that are wanted of it."""
+        """Request all messages that are wanted from an autopilot with this dialect."""
         self.dialect = dialect
         self._request()
 
@@ -134,8 +134,8 @@ class Telemetry:
         return wanted if bytes_ps is None else fitted(wanted, bytes_ps)
 
     def thin(self) -> bool:
-        """Request half of it from now on: the link is saturated. False, and nothing is requested
-        anew, if the rates are the lowest already."""
+        """Request half of the bytes per second, because the link is saturated. Returns False, and
+        changes nothing, if the rates are the lowest already."""
         half_bytes_ps = 0.5 * self.bytes_ps / SHARE
         if sum(each.bytes_ps for each in self._fitted(half_bytes_ps)) >= 0.99 * self.bytes_ps:
             return False
@@ -144,7 +144,7 @@ class Telemetry:
         return True
 
     def due(self) -> list[WantedMessage]:
-        """Messages to request now; they count as requested."""
+        """Messages to request now. The caller must request them: they count as requested."""
         now_s = self.time.seconds
         return [each.wanted for each in self._streams.values() if each.request(now_s)]
 
@@ -156,7 +156,7 @@ class Telemetry:
 
     @property
     def rates_hz(self) -> dict[str, float]:
-        """Measured rate of each wanted message over the last two seconds, by name."""
+        """Measured rate in Hz of each wanted message over the last two seconds, by name."""
         now_s = self.time.seconds
         return {each.wanted.name: each.rate_hz(now_s) for each in self._streams.values()}
 
@@ -166,17 +166,17 @@ class Telemetry:
         return sum(each.wanted.bytes_ps for each in self._streams.values())
 
     def _count(self, message_id: int) -> None:
-        """A message has arrived."""
+        """Count a message that has arrived, for its rate."""
         stream = self._streams.get(message_id)
         if stream:
             stream.arrivals_s.append(self.time.seconds)
 
 
 def fitted(wanted: Iterable[WantedMessage], bytes_ps: float) -> tuple[WantedMessage, ...]:
-    """`wanted` at rates that a link with a capacity of `bytes_ps` carries.
+    """`wanted` with rates that a link with a capacity of `bytes_ps` carries.
 
-    Messages at more than SLOW_HZ are thinned, all by the same factor, but not below SLOW_HZ: what
-    needs more than that is refused later, by the rates that arrive.
+    The rates of messages above SLOW_HZ are reduced by one common factor, but not below SLOW_HZ. If
+    the link is too slow even for that, the flight is refused later because of the measured rates.
     """
     slow = [each for each in wanted if each.arrives_hz <= SLOW_HZ]
     fast = [each for each in wanted if each.arrives_hz > SLOW_HZ]
@@ -196,7 +196,7 @@ class _Stream:
     requested_s: float | None = None
     requests: int = 0
     wait_s: float = _FIRST_WAIT_S
-    too_fast: bool = False  # the vehicle has denied its rate
+    too_fast: bool = False  # whether the vehicle has denied the requested rate
 
     def rate_hz(self, now_s: float) -> float:
         while self.arrivals_s and self.arrivals_s[0] <= now_s - _WINDOW_S:
@@ -205,7 +205,7 @@ class _Stream:
         return len(self.arrivals_s) / measured_s if measured_s > 0.0 else 0.0
 
     def request(self, now_s: float) -> bool:
-        """Whether to request it now; then it counts as requested."""
+        """Whether to request the message now; if so, it counts as requested."""
         if self.requested_s is not None and not self._again(now_s - self.requested_s, now_s):
             return False
         if self.requests:
@@ -223,9 +223,9 @@ class _Stream:
         rate_hz, enough_hz = self.rate_hz(now_s), ENOUGH * self.wanted.arrives_hz
         fast = rate_hz > 0.0 and self.wanted.arrives_hz > SLOW_HZ
         if fast and now_s - self.arrivals_s[-1] > _STOPPED_S:
-            return True  # before a flight ends for it
+            return True  # without waiting longer, so that the flight does not end because of it
         if 0.0 < rate_hz < min(_UNHEARD * self.wanted.rate_hz, enough_hz):
-            return True  # the link has lost the requests
+            return True  # it still has its default rate: the link has lost the requests
         if waited_s < self.wait_s:
             return False
         if rate_hz >= enough_hz:

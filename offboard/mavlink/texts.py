@@ -1,4 +1,4 @@
-"""STATUSTEXT: long texts are split into chunks of 50 bytes, and joined again on arrival."""
+"""STATUSTEXT: splits long texts into chunks of 50 bytes, and joins received chunks."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from offboard.mavlink.decode import printable
 from offboard.mavlink.events import StatusText
 from offboard.mavlink.outgoing import StatusTextOut
 
-_CHUNK_BYTES = 50  # a shorter chunk is the last one
+_CHUNK_BYTES = 50  # a shorter chunk is the last one of its text
 _CHUNKS_MAX, _PENDING_MAX = 20, 8
 _CHUNK_TIMEOUT_S = 1.0
-_GAP = b"[...]"
+_GAP = b"[...]"  # in place of a missing chunk
 
 
 def chunks(severity: int, text: str, text_id: int) -> list[StatusTextOut]:
-    """The messages that hold `text`, of which at most 999 bytes are kept.
+    """Split `text`, of which at most 999 bytes are sent, into messages.
 
-    `text_id`, 1 .. 65535, must differ between texts whose chunks may mix on the way.
+    `text_id`, 1 .. 65535, must differ between texts whose chunks may mix on the link.
     """
     data = text.encode("utf-8", "replace")[: _CHUNKS_MAX * _CHUNK_BYTES - 1]
     if len(data) <= _CHUNK_BYTES:
         return [StatusTextOut(severity, data)]
-    return [  # an empty one at the end if the last is full
+    return [  # if the last chunk is full, an empty one marks the end
         StatusTextOut(severity, data[at : at + _CHUNK_BYTES], text_id, at // _CHUNK_BYTES)
         for at in range(0, len(data) + 1, _CHUNK_BYTES)
     ]
@@ -44,14 +44,15 @@ class _Pending:
 
 
 class TextAssembler:
-    """Joins received chunks. Of too many incomplete texts the oldest is returned with gaps."""
+    """Joins received chunks. If too many texts are incomplete, the oldest is returned with gaps."""
 
     def __init__(self) -> None:
         self._pending: dict[int, _Pending] = {}
 
     def add(self, payload: bytes, now_s: float) -> list[StatusText]:
-        """Texts that the payload of a STATUSTEXT completes, and those whose time is over."""
-        # pymavlink's own decoding takes the text for ASCII
+        """Add the payload of a STATUSTEXT. Returns the texts that it completes, and those whose
+        time is over."""
+        # pymavlink would decode the text as ASCII
         layout = mavlink.MAVLink_statustext_message.unpacker
         severity, text, text_id, chunk = layout.unpack_from(payload.ljust(layout.size, b"\0"))
         data, terminator, _ = text.partition(b"\0")
@@ -71,6 +72,6 @@ class TextAssembler:
         return done
 
     def expire(self, now_s: float) -> list[StatusText]:
-        """Texts whose missing chunks have not arrived within a second."""
+        """Return, with gaps, the texts whose missing chunks have not arrived within a second."""
         old = [i for i, p in self._pending.items() if now_s - p.since_s > _CHUNK_TIMEOUT_S]
         return [self._pending.pop(i).text() for i in old]

@@ -1,8 +1,8 @@
-"""Vehicle time: which time stamps of telemetry are valid, and the seconds that the session counts.
+"""Vehicle time: checks the time stamps of telemetry, and counts the seconds of the session.
 
-Vehicle time is `time_boot_ms` in seconds, continued where its 32 bits begin again at zero, after
-49.7 days. Host time is any monotonic clock, given as an argument. How old telemetry is, and how
-late the link, is in `flight.timing`.
+Vehicle time is `time_boot_ms` in seconds, continued when its 32 bits wrap to zero after 49.7 days.
+Host time is any monotonic clock and an argument. The age of telemetry and the delay of the link are
+in `flight.timing`.
 """
 
 from __future__ import annotations
@@ -10,20 +10,22 @@ from __future__ import annotations
 from collections import deque
 from enum import Enum, auto
 
-# Stamps older than the newest by more than _REBOOT_S are late, and those ahead of it by more are
-# wrong, unless they go on so: so many in a row, over so long, each within _GAP_S of the one before,
-# are a new epoch
+# A stamp that is more than _REBOOT_S behind the newest one is late, and one that is more than
+# _REBOOT_S ahead is wrong. But at least _EPOCH_STAMPS of them in a row, over at least _EPOCH_S,
+# each within _GAP_S of the one before, are a new epoch of the vehicle's clock.
 _REBOOT_S = 2.0
 _EPOCH_STAMPS, _EPOCH_S, _GAP_S = 3, 0.1, 10.0
-# So often within this time a stamp of this epoch follows one of another: two clocks alternate
+# Two clocks alternate if stamps return to the present epoch this often within this time
 _TURNS, _TURNS_S = 10, 2.0
-SILENCE_S = 1.0
+SILENCE_S = 1.0  # without telemetry; then `seconds` follows host time
 _WRAP_S = 2**32 / 1e3
-_NEAR_S = 600.0  # a stamp this close to the newest, also but for the wrap, continues it
+_NEAR_S = (
+    600.0  # after correction for the wrap, a stamp within this time of the newest continues it
+)
 
 
 class Age(Enum):
-    """What the time stamp of a message means."""
+    """Whether the time stamp of a message is newer, late or wrong, or the first after a reboot."""
 
     FRESH = auto()
     STALE = auto()
@@ -31,11 +33,11 @@ class Age(Enum):
 
 
 class VehicleTime:
-    """Checks time stamps: those of one message id must increase. One that is far behind the newest
-    is late, one far ahead is wrong; several of them in a row that go on from each other are a new
-    epoch, a reboot if it is behind.
+    """Checks time stamps: the stamps of one message id must increase. A stamp far behind the newest
+    one is late, and one far ahead is wrong. Several of them in a row that continue each other are a
+    new epoch of the vehicle's clock: a reboot if it is behind the earlier one.
 
-    `newest_s` is the newest stamp of any message. `seconds` are monotonic and follow vehicle time,
+    `newest_s` is the newest stamp of any message. `seconds` is monotonic and follows vehicle time,
     or host time while telemetry is missing.
     """
 
@@ -43,20 +45,22 @@ class VehicleTime:
         self.newest_s = 0.0
         self.seconds = 0.0
         self._last_s: dict[int, float] = {}
-        self._other: list[tuple[int, float]] = []  # of another epoch, in a row: id and stamp
-        self._turns_s: deque[float] = deque(maxlen=_TURNS)  # when this epoch followed another
+        # message id and stamp of messages in a row that may be of a new epoch
+        self._other: list[tuple[int, float]] = []
+        self._turns_s: deque[float] = deque(maxlen=_TURNS)  # when stamps returned to this epoch
         self._counted_s: float | None = None  # the newest stamp that `seconds` has followed
-        self._received_s: float | None = None  # host time of the newest telemetry, or the first
-        self._bridged_s = 0.0  # counted since the newest telemetry
+        # host time of the newest telemetry; before any, of the first call of `on_host`
+        self._received_s: float | None = None
+        self._bridged_s = 0.0  # host time that `seconds` has counted since the newest telemetry
 
     # --- stamps ---
 
     def wrapped_s(self, time_s: float) -> float:
-        """Seconds to add to a stamp to continue the newest one across the wrap of `time_boot_ms`;
-        0 where it is no continuation, as after a reboot.
+        """Seconds to add to a stamp so that it continues the newest one across the wrap of
+        `time_boot_ms`; 0 if the stamp does not continue it, as after a reboot.
 
-        Also for clocks of the vehicle that do not wrap, as in TIMESYNC: puts them on that of the
-        stamps.
+        The same offset converts times of the vehicle that do not wrap, as in TIMESYNC, to the time
+        of the stamps.
         """
         if not self._last_s:
             return 0.0
@@ -64,7 +68,7 @@ class VehicleTime:
         return wrapped_s if abs(time_s + wrapped_s - self.newest_s) < _NEAR_S else 0.0
 
     def check(self, message_id: int, time_s: float) -> Age:
-        """`time_s`: the stamp, continued by `wrapped_s`."""
+        """Check and store the stamp `time_s`, to which `wrapped_s` was added already."""
         last_s = self._last_s.get(message_id)
         if self._last_s and abs(time_s - self.newest_s) > _REBOOT_S:
             stuck = time_s == last_s
@@ -93,14 +97,15 @@ class VehicleTime:
 
     @property
     def mixed(self) -> bool:
-        """Whether stamps of two clocks, more than _REBOOT_S apart, alternate."""
+        """Whether stamps of two clocks that are more than _REBOOT_S apart alternate."""
         return len(self._turns_s) == _TURNS and self.seconds - self._turns_s[0] < _TURNS_S
 
     # --- seconds ---
 
     def on_telemetry(self, time_s: float, now_s: float) -> None:
-        """Telemetry with the valid stamp `time_s` arrived at host time `now_s`. A stamp older than
-        the newest adds nothing: messages of several streams may arrive out of order."""
+        """Advance `seconds` for telemetry with the valid stamp `time_s` that arrived at host time
+        `now_s`. An older stamp than the newest adds nothing: different messages may arrive out of
+        order."""
         self._received_s = now_s
         step_s = 0.0 if self._counted_s is None else time_s - self._counted_s
         if self._counted_s is None or step_s > 0.0 or step_s < -_REBOOT_S:
@@ -109,8 +114,8 @@ class VehicleTime:
             self._counted_s = time_s
 
     def on_host(self, now_s: float) -> None:
-        """Host time is `now_s`; once no telemetry has arrived for a second, all the time since the
-        newest counts."""
+        """Advance `seconds` to host time `now_s` if no telemetry has arrived for SILENCE_S, or none
+        yet. All the time since the newest telemetry then counts."""
         if self._received_s is None:
             self._received_s = now_s
         silent_s = now_s - self._received_s

@@ -1,1 +1,1 @@
-"""What differs between autopilots: modes, parameters, setpoint conventions."""
+"""Differences between autopilots: modes, parameters, setpoint conventions."""

@@ -29,7 +29,7 @@ _STATION = WatchedParameter("SYSID_MYGCS", "system id of its ground station")
 _JERK = WatchedParameter(
     "PSC_JERK_XY",
     "how soon BRAKE, which is asked for hold, stops the vehicle",
-    # BRAKE slows down by the jerk / 7.5 of the speed per second
+    # BRAKE reduces the speed by the share (jerk / 7.5) per second
     advice=(
         Valid(
             "hold is BRAKE, which stops within 7.5 m divided by this value, for each m/s of speed",
@@ -39,24 +39,24 @@ _JERK = WatchedParameter(
     ),
     advice_only=True,
 )
-# Their names until 4.6, and since 4.7
+# Names of the parameters until 4.6 -> since 4.7
 _ACCELERATIONS = {"ATC_ACCEL_R_MAX": "ATC_ACC_R_MAX", "ATC_ACCEL_P_MAX": "ATC_ACC_P_MAX"}
 _RATES = "ATC_RATE_R_MAX", "ATC_RATE_P_MAX"
 _UNCHECKED = Valid("the vehicle arms without all of its checks", 1.0, 1.0, 1.0)
 
-# Parameters that replace another one: since ArduCopter 4.7
+# A parameter with `replaces` has this name since ArduCopter 4.7
 ARDUPILOT = Dialect(
     name="ardupilot",
     mav_autopilot=3,
     modes=MappingProxyType(_MODES),
     mode_parameters=lambda custom_mode: (float(custom_mode),),
     engage_mode="GUIDED",
-    # in LOITER the throttle stick sets the climb rate: without a radio the vehicle descends
+    # not LOITER: there the throttle stick sets the climb rate, and without a radio it descends
     hold_mode="BRAKE",
     land_mode="LAND",
     return_mode="RTL",
     takes_off_by_command=True,
-    unused_parameter=0.0,  # NaN stops its SITL with a floating point exception
+    unused_parameter=0.0,  # NaN ends its SITL with a floating point exception
     divides_by_tilt=True,  # ATC_ANGLE_BOOST 1
     integers_bytewise=False,
     watched_parameters=(
@@ -69,7 +69,7 @@ ARDUPILOT = Dialect(
         WatchedParameter(
             "GUID_TIMEOUT",
             "seconds without setpoints before the vehicle levels",
-            Valid(lowest=0.3, highest=5.0, set_to=1.0),  # not ArduCopter's 3, see the advice
+            Valid(lowest=0.3, highest=5.0, set_to=1.0),  # ArduCopter's default is 3, see the advice
             advice=(
                 Valid(
                     "where setpoints stop, as with a lost link, the last tilt is flown for "
@@ -153,6 +153,6 @@ ARDUPILOT = Dialect(
         *TRACKING_TELEMETRY,
         WantedMessage("HEARTBEAT", 10.0, optional=True),  # the only report of the mode
         WantedMessage("EKF_STATUS_REPORT", 2.0, optional=True),
-        WantedMessage("SIM_STATE", 50.0, optional=True),  # simulated truth
+        WantedMessage("SIM_STATE", 50.0, optional=True),  # true state, from a simulator
     ),
 )

@@ -1,6 +1,6 @@
-"""Dialect: what differs between autopilots at the MAVLink boundary, as data.
+"""`Dialect`: the differences between autopilots at the MAVLink boundary, as data.
 
-px4.py and ardupilot.py hold the instances. No other code branches on the name of the autopilot.
+px4.py and ardupilot.py have the instances. No other code branches on the name of the autopilot.
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ from offboard.mavlink.outgoing import CommandLong
 
 SET_MODE, TAKEOFF = 176, 22  # MAV_CMD
 _CUSTOM_MODE_ENABLED = 1.0  # MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
-# limits of a `Vehicle`
+# names of fields of `Vehicle`
 ACCELERATION_LIMIT, RATE_LIMIT = "angular_acceleration_limit_radps2", "angular_rate_limit_radps"
 TYPE_ONBOARD_CONTROLLER, TYPE_GCS = 18, 6  # MAV_TYPE
-FRAME_BYTES = 12  # of a MAVLink 2 frame besides its payload
+FRAME_BYTES = 12  # header and checksum of a MAVLink 2 frame
 
 
 def id_of(message: str) -> int:
-    """The id of a message, by its name."""
+    """The id of the message with this name."""
     return int(getattr(mavlink, f"MAVLink_{message.lower()}_message").id)
 
 
 @dataclass(frozen=True, slots=True)
 class WantedMessage:
-    """A telemetry message and the rate to request. An optional one that does not arrive, or has
-    another rate than its default, is requested at most twice. `unchanged_hz`: one that is sent at
-    `rate_hz` only when it changes arrives at this rate."""
+    """A telemetry message and the rate to request. An optional message that does not arrive, or
+    arrives too slowly although its rate was changed, is requested at most twice. `unchanged_hz` is
+    the rate of a message that is sent at `rate_hz` only while its content changes."""
 
     name: str
     rate_hz: float
@@ -44,12 +44,12 @@ class WantedMessage:
 
     @property
     def arrives_hz(self) -> float:
-        """Rate at which it arrives if it is sent as requested."""
+        """Lowest rate at which it arrives if the vehicle sends it as requested."""
         return self.rate_hz if self.unchanged_hz is None else self.unchanged_hz
 
     @property
     def bytes_ps(self) -> float:
-        """Bytes per second in which it arrives."""
+        """Bytes per second of its frames at `arrives_hz`."""
         payload_bytes: int = mavlink.mavlink_map[self.message_id].unpacker.size
         return self.arrives_hz * (FRAME_BYTES + payload_bytes)
 
@@ -65,12 +65,13 @@ class ParameterFault(NamedTuple):
 class Valid:
     """Valid values of a parameter: `lowest` to `highest`, with `bits` set.
 
-    `why` says what any other value means, if the meaning of the parameter does not; `set_to` is
-    suggested instead. `applies` is given all known parameters, and whether a radio is received.
+    `why` says what any other value means, if the meaning of the parameter does not say so. `set_to`
+    is the suggested value (with `bits`: the value with these bits set). `applies` gets all known
+    parameters and whether a radio is received, and returns whether the advice is given.
     """
 
     why: str = ""
-    set_to: float = math.nan  # without `bits`
+    set_to: float = math.nan
     lowest: float = -math.inf
     highest: float = math.inf
     bits: int = 0
@@ -81,10 +82,10 @@ class Valid:
 class WatchedParameter:
     """A parameter of the autopilot that is read before flight.
 
-    A flight is refused where a value is not as `required`, and without a reply to a parameter that
-    `must_answer`. `advice` is for `offboard doctor`, and so is the whole parameter if it is
-    `advice_only`. `values` explains the values of an enumeration. `replaces`: its name in the
-    oldest release.
+    A flight is refused if the value is not as `required`, or if a parameter with `must_answer` has
+    no reply. `advice` is for `offboard doctor`; a parameter with `advice_only` is read only there.
+    `values` names the values of an enumeration. `replaces` is the name of the parameter in the
+    oldest release, if it has changed.
     """
 
     name: str
@@ -98,7 +99,7 @@ class WatchedParameter:
 
     @property
     def oldest(self) -> str:
-        """Its name in the oldest release."""
+        """The name of the parameter in the oldest release."""
         return self.replaces or self.name
 
     def fault(self, value: float) -> ParameterFault | None:
@@ -108,13 +109,13 @@ class WatchedParameter:
     def advised(
         self, value: float, known: Mapping[str, float], radio: bool
     ) -> ParameterFault | None:
-        """What is not recommended about `value`, or None. `known`: all parameters; `radio`: one is
-        received."""
+        """Why `value` is not recommended, or None. `known` has all known parameters; `radio`:
+        whether a radio is received."""
         applying = (each for each in self.advice if each.applies(known, radio))
         return next(filter(None, (self._fault(value, each) for each in applying)), None)
 
     def shown(self, value: float) -> str:
-        """The value with its name, if it has one."""
+        """The value as text, with its name if it has one."""
         named = 0 <= value < len(self.values) and value == int(value)
         return f"{value:g} ({self.values[int(value)]})" if named else f"{value:g}"
 
@@ -129,8 +130,9 @@ class WatchedParameter:
 
 @dataclass(frozen=True, slots=True)
 class SetpointLoss:
-    """What an autopilot does by itself when setpoints stop: after `after_s` it shows one of
-    `modes` as a failsafe (HEARTBEAT.system_status). Without `modes` it levels in the same mode."""
+    """What an autopilot does by itself when setpoints stop: after `after_s` it enters one of
+    `modes` and reports a failsafe (HEARTBEAT.system_status). Without `modes` it levels and stays
+    in its mode."""
 
     after_s: float
     modes: tuple[str, ...] = ()
@@ -141,41 +143,42 @@ NEVER = SetpointLoss(math.inf)
 
 @dataclass(frozen=True)
 class Dialect:
-    """One autopilot. Modes are given by name; `modes` maps HEARTBEAT.custom_mode to the name."""
+    """One autopilot. Modes have names; `modes` maps HEARTBEAT.custom_mode to the name."""
 
     name: str
     mav_autopilot: int
     modes: Mapping[int, str]
-    mode_parameters: Callable[[int], tuple[float, ...]]  # custom_mode -> MAV_CMD 176, from 2 on
+    # custom_mode -> parameters 2 and on of MAV_CMD_DO_SET_MODE
+    mode_parameters: Callable[[int], tuple[float, ...]]
     engage_mode: str
     hold_mode: str
     land_mode: str
     return_mode: str
-    takes_off_by_command: bool  # MAV_CMD_NAV_TAKEOFF lifts it off; else setpoints do
-    unused_parameter: float  # of a COMMAND_LONG: "not given" to this autopilot
-    divides_by_tilt: bool  # the thrust of a setpoint, by the cosine of the body's tilt
-    integers_bytewise: bool  # PARAM_VALUE holds an integer's four bytes; else its value
+    takes_off_by_command: bool  # whether it takes off by MAV_CMD_NAV_TAKEOFF, else by setpoints
+    unused_parameter: float  # value of a COMMAND_LONG parameter that means "not given"
+    divides_by_tilt: bool  # whether it divides the thrust of a setpoint by the cosine of its tilt
+    integers_bytewise: bool  # whether PARAM_VALUE has the four bytes of an integer, else its value
     watched_parameters: tuple[WatchedParameter, ...]
     wanted: tuple[WantedMessage, ...]
     hover_parameter: str  # normalised thrust that holds the weight
-    tilt_parameters: Mapping[str, float]  # greatest tilt of its own modes: its unit in rad
-    # parameter of the greatest angular acceleration or rate of roll or pitch -> the limit's name
-    # in a `Vehicle`, and its unit in rad/s^2 or rad/s; 0 counts as no limit
+    tilt_parameters: Mapping[str, float]  # greatest tilt of its own modes -> its unit in rad
+    # parameter with the greatest angular acceleration or rate of roll or pitch -> field of
+    # `Vehicle`, and the parameter's unit in rad/s^2 or rad/s; a value of 0 means no limit
     tilting_parameters: Mapping[str, tuple[str, float]]
     estimator_message: str  # the message that becomes an EstimatorReport
-    slow_hint: str  # what to do where telemetry comes slower than it was requested
-    unsaid: str  # where a reason is found that no STATUSTEXT tells us
-    oldest: tuple[int, int]  # version that this dialect is made for
-    # what the vehicle does when setpoints stop, by its parameters; a missing one may have any value
+    slow_hint: str  # what to do if telemetry arrives more slowly than requested
+    unsaid: str  # where the user finds a reason that no STATUSTEXT tells us
+    oldest: tuple[int, int]  # oldest version that this dialect is made for
+    # parameters -> what the vehicle does when setpoints stop; a missing one may have any value
     setpoint_loss: Callable[[Mapping[str, float]], SetpointLoss]
-    # known defects of its firmware, each with the version that mends it, as (major, minor)
+    # known defects of its firmware -> the version that fixes each, as (major, minor)
     defects: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
     def mode_name(self, custom_mode: int) -> str:
         return self.modes.get(custom_mode) or f"UNKNOWN(0x{custom_mode:08x})"
 
     def unanswered(self, known: Mapping[str, float]) -> list[WatchedParameter]:
-        """The watched parameters without a reply, under this name or that of another release."""
+        """The watched parameters for which no name of any release has had a reply."""
         replied = {each.oldest for each in self.watched_parameters if each.name in known}
         return [each for each in self.watched_parameters if each.oldest not in replied]
 
@@ -191,7 +194,7 @@ class Dialect:
         return self.set_mode(self.hold_mode)
 
     def take_off(self, altitude_m: float) -> CommandLong:
-        """MAV_CMD_NAV_TAKEOFF at the present place. The altitude is above home on ArduCopter,
+        """MAV_CMD_NAV_TAKEOFF at the present position. `altitude_m` is above home on ArduCopter,
         above mean sea level on PX4."""
         unused = self.unused_parameter
         return CommandLong(TAKEOFF, (0.0, 0.0, 0.0, unused, unused, unused, altitude_m))
@@ -202,6 +205,6 @@ TRACKING_TELEMETRY = (
     WantedMessage("LOCAL_POSITION_NED", 100.0),
     WantedMessage("EXTENDED_SYS_STATE", 5.0),
     WantedMessage("SYS_STATUS", 2.0),
-    WantedMessage("ATTITUDE_TARGET", 8.0, optional=True),  # its own thrust, before ours
+    WantedMessage("ATTITUDE_TARGET", 8.0, optional=True),  # the autopilot's thrust, before ours
     WantedMessage("GPS_RAW_INT", 5.0, optional=True),
 )

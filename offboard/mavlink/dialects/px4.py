@@ -21,7 +21,7 @@ def _custom_mode(main: int, sub: int = 0) -> int:
     return main << 16 | sub << 24
 
 
-# PX4 acknowledges it twice: on receipt, and up to 12 ms later with the commander's result
+# PX4 acknowledges MAV_CMD_DO_SET_MODE twice: on receipt, and up to 12 ms later with the result
 def _mode_parameters(custom_mode: int) -> tuple[float, ...]:
     return float(custom_mode >> 16 & 0xFF), float(custom_mode >> 24)
 
@@ -33,8 +33,8 @@ def _misses_sticks(known: Mapping[str, float], radio: bool) -> bool:
     return not radio and known.get("COM_RC_IN_MODE", _NO_STICKS) != _NO_STICKS
 
 
-# by the value of COM_OBL_RC_ACT; if PX4 cannot enter the chosen mode, it enters a later one of
-# _LOSS_ORDER
+# modes in the order of the values of COM_OBL_RC_ACT; if PX4 cannot enter the chosen mode, it enters
+# a later one of _LOSS_ORDER
 _LOSS_MODES = ("POSCTL", "ALTCTL", "STABILIZED", "AUTO.RTL", "AUTO.LAND", "AUTO.LOITER")
 _LOSS_ORDER = ("POSCTL", "ALTCTL", "STABILIZED", "AUTO.LOITER", "AUTO.RTL", "AUTO.LAND")
 
@@ -80,7 +80,7 @@ PX4 = Dialect(
     land_mode="AUTO.LAND",
     return_mode="AUTO.RTL",
     takes_off_by_command=False,
-    unused_parameter=float("nan"),  # 0 would be a latitude
+    unused_parameter=float("nan"),  # 0 would be a valid latitude
     divides_by_tilt=False,
     integers_bytewise=True,
     watched_parameters=(
@@ -100,7 +100,7 @@ PX4 = Dialect(
         WatchedParameter(
             "COM_OBL_RC_ACT",
             "what the vehicle does when setpoints stop; 6 and 7 stop the motors",
-            Valid(lowest=0.0, highest=5.0, set_to=4.0),  # not PX4's 0, which needs sticks
+            Valid(lowest=0.0, highest=5.0, set_to=4.0),  # PX4's default 0 needs sticks
             values=(
                 "Position",
                 "Altitude",
@@ -149,8 +149,8 @@ PX4 = Dialect(
     tilting_parameters=MappingProxyType(dict.fromkeys(_RATES, (RATE_LIMIT, math.radians(1.0)))),
     estimator_message="ESTIMATOR_STATUS",
     slow_hint="raise MAV_x_RATE of this link, in bytes/s: PX4 slows all messages down to it",
-    # PX4 sends these texts only on a link on which a HEARTBEAT of type GCS arrives. Ours is not:
-    # PX4 would not notice any more that its real ground station is lost (NAV_DLL_ACT)
+    # PX4 sends these texts only on a link on which it receives a HEARTBEAT of type GCS. Ours has
+    # another type, since PX4 would not notice the loss of its real ground station (NAV_DLL_ACT)
     unsaid=(
         "PX4 says why to ground stations alone: see QGroundControl; unless NAV_DLL_ACT is 0, PX4 "
         "needs one"
@@ -165,9 +165,9 @@ PX4 = Dialect(
     ),
     wanted=(
         *TRACKING_TELEMETRY,
-        # shows a change of the mode within 0.02 s; the rate of HEARTBEAT, 1 Hz, cannot be changed
+        # shows a change of mode within 0.02 s; HEARTBEAT has a fixed rate of 1 Hz
         WantedMessage("CURRENT_MODE", 50.0, optional=True, unchanged_hz=2.0),
         WantedMessage("ESTIMATOR_STATUS", 2.0, optional=True),
-        WantedMessage("HIL_STATE_QUATERNION", 50.0, optional=True),  # simulated truth
+        WantedMessage("HIL_STATE_QUATERNION", 50.0, optional=True),  # true state, from a simulator
     ),
 )
