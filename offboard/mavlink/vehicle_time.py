@@ -19,9 +19,7 @@ _EPOCH_STAMPS, _EPOCH_S, _GAP_S = 3, 0.1, 10.0
 _TURNS, _TURNS_S = 10, 2.0
 SILENCE_S = 1.0  # without telemetry; then `seconds` follows host time
 _WRAP_S = 2**32 / 1e3
-_NEAR_S = (
-    600.0  # after correction for the wrap, a stamp within this time of the newest continues it
-)
+_NEAR_S = 600.0  # a stamp within this time of the newest one, corrected for the wrap, continues it
 
 
 class Age(Enum):
