@@ -1,1 +1,1 @@
-"""Links, log, clock and signals: everything of a flight that touches the outside."""
+"""Links, flight log, clock and stop signals: the input and output of a flight."""

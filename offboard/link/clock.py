@@ -23,7 +23,7 @@ def monotonic_less_unix_s() -> float:
 
 
 def unix_us() -> int:
-    """Microseconds since 1970-01-01 UTC, for time stamps in logs only."""
+    """Unix time in microseconds, for stamps of logs and signatures. The flight never uses it."""
     return time.time_ns() // 1000
 
 

@@ -94,7 +94,7 @@ class Link:
         raise NotImplementedError
 
     def follow(self, peer: Hashable) -> None:
-        """Accept `peer` as the vehicle's address; other senders can no longer crowd it out."""
+        """Use `peer` as the vehicle's address. Other senders cannot displace its bytes any more."""
 
     def descriptors(self) -> tuple[int, ...]:
         """The open file descriptors. With them another process can continue the link."""

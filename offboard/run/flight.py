@@ -56,14 +56,14 @@ from offboard.run.sitl import (
 from offboard.supervisor.supervisor import Supervisor
 
 REHEARSED_DECISIONS = 5  # the fastest is compared with the deadline: the computer may be busy
-DISCARDED_MAX = 20  # calls of `Link.receive`
+DISCARDED_MAX = 20  # calls of `Link.receive` that `discard` makes at most
 SITL_TIMEOUT_S = 180.0  # either side of lockstep waits this long for the other, which may compile
 
 
 @dataclass(frozen=True, slots=True)
 class Connection:
-    """A vehicle that is reached by a link. `system_id` selects it if several send on the link
-    (None: only one does); `signing_key` is the file of the MAVLink signing key."""
+    """A vehicle at the link `address`. `system_id` selects it if several send on the link (None:
+    the first autopilot heard); `signing_key` is the file with the MAVLink signing key."""
 
     address: str
     system_id: int | None = None

@@ -1,4 +1,5 @@
-"""The loop: link -> companion -> link and log, paced by the vehicle's telemetry."""
+"""The loop of a flight: passes received bytes to the companion (a `Flight`, or the flights of a
+service), and its frames to link and log. The telemetry of the vehicle paces it."""
 
 from __future__ import annotations
 
