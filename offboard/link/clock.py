@@ -23,7 +23,7 @@ def monotonic_less_unix_s() -> float:
 
 
 def unix_us() -> int:
-    """Unix time in microseconds, for stamps of logs and signatures. The flight never uses it."""
+    """Unix time in microseconds, for stamps of logs and signatures and for the age of files."""
     return time.time_ns() // 1000
 
 
