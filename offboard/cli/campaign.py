@@ -78,7 +78,7 @@ def campaign(
     on.
     """
     if worst and shard:
-        raise UserError("--worst takes no --shard: a search is one whole")
+        raise UserError("--worst takes no --shard: a search cannot be divided")
     if scheduler and workers:
         raise UserError("--scheduler has its own workers: use it or --workers, not both")
     with out.status("planning"):
@@ -146,7 +146,7 @@ def _search(flown: Campaign, source: str, count: int, open_workers: OpenFlyer) -
         say(f"    {failure.failing} of {failure.seeds} other seeds fail: {failure.case.line}", 4)
     say(f"written: {flown.directory / 'worst.csv'} and campaign.html")
     if failures:
-        raise UserError(f"{len(failures)} kinds of flights break a promise", 1)
+        raise UserError(f"{len(failures)} different failures found", 1)
 
 
 def compare(

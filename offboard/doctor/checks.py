@@ -59,7 +59,7 @@ wait, blocks = partial(Finding, Level.WAIT), partial(Finding, Level.BLOCKS)
 
 
 def port(seen: Observation) -> Iterable[Finding]:
-    """Whether the connection can be opened, and which other process has it."""
+    """Whether the connection can be opened, and which other processes use it."""
     others = ", ".join(seen.holders)
     if seen.link_error:
         known = CLOSED.get(_kind(seen), "check host and port, see `offboard doctor --help`")
@@ -72,7 +72,7 @@ def port(seen: Observation) -> Iterable[Finding]:
 
 
 def vehicle(seen: Observation) -> Iterable[Finding]:
-    """Whether an autopilot that can be flown is heard, and what is heard if none is."""
+    """Whether an autopilot that can be flown is heard; otherwise, what is received."""
     found, senders, kind = seen.found, seen.senders.found, _kind(seen)
     received = seen.senders.splitter.bytes_received
     if seen.link_error:
@@ -106,11 +106,11 @@ def senders(seen: Observation) -> Iterable[Finding]:
         if peers:
             places = f", from {', '.join(sorted(peers))}" if sender.is_autopilot else ""
             others.append(f"{sender.name}{places}")
-    yield ok("besides the vehicle: " + ("; ".join(others) or "nobody"))
+    yield ok("other senders: " + ("; ".join(others) or "none"))
 
 
 def uplink(seen: Observation) -> Iterable[Finding]:
-    """Whether what we send reaches the vehicle: it acknowledges commands without effect."""
+    """Whether our messages reach the vehicle: it must acknowledge commands that change nothing."""
     if not seen.has_asked:
         return
     if CommandAck in seen.vehicle.heard_s:
@@ -119,7 +119,7 @@ def uplink(seen: Observation) -> Iterable[Finding]:
         yield warn("parameters are answered, but no command is acknowledged")
     else:
         yield blocks(
-            "the vehicle answers nothing: what is sent to it does not arrive",
+            "the vehicle does not reply: our messages do not reach it",
             "check the direction to the vehicle: router, firewall, TX wire; or another program "
             "has taken the vehicle's answers",
         )
@@ -164,7 +164,7 @@ def bandwidth(seen: Observation) -> Iterable[Finding]:
     if most is None:
         yield ok(figures)
         return
-    figures += f", the link carries {most / 1e3:.1f} kB/s"
+    figures += f", the link can carry {most / 1e3:.1f} kB/s"
     if wanted > FULL_SHARE * most:
         needed = wanted / SHARE
         baud = next((each for each in BAUDS if each >= BITS_OF_A_BYTE * needed), BAUDS[-1])
@@ -197,7 +197,7 @@ def rates(seen: Observation) -> Iterable[Finding]:
 
 
 def clock(seen: Observation) -> Iterable[Finding]:
-    """The vehicle's clock, and whether somebody else sets it."""
+    """The vehicle's clock, and whether another program exchanges TIMESYNC with the vehicle."""
     system_id, _ = _ids(seen)
     if seen.rebooted:
         hint = "find out why, then check again"
@@ -368,9 +368,9 @@ def _bandwidth(seen: Observation) -> Iterable[Finding]:
     possible = min(supported_bandwidth(config.vehicle, uncertainty, config.period_s, wanted))
     if possible < wanted:
         yield warn(
-            f"with a delay of {1e3 * delay.value:.0f} +- {1e3 * delay.sd:.0f} ms the link bears a "
+            f"with a delay of {1e3 * delay.value:.0f} +- {1e3 * delay.sd:.0f} ms the link allows a "
             f"bandwidth of {possible:g} rad/s, {wanted:g} is configured",
-            f"the flight lowers it by itself; or --set controller.bandwidth_radps={possible:g}",
+            f"the flight lowers it automatically; or --set controller.bandwidth_radps={possible:g}",
         )
 
 

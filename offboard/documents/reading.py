@@ -279,7 +279,7 @@ def _with(value: Any, keys: list[str], new: Any, option: str) -> Any:
     if isinstance(value, list):
         if key not in map(str, range(len(value))):
             entries = f"a list of {counted(len(value), 'value')}, counted from 0"
-            raise DocumentError(f"{option}: {shown(key)} is no place in {entries}")
+            raise DocumentError(f"{option}: {shown(key)} is no index of {entries}")
         index = int(key)
         changed = _with(value[index], rest, new, option)
         return [*value[:index], changed, *value[index + 1 :]]

@@ -306,7 +306,7 @@ FOUND: list[tuple[Any, ...]] = [
     (beside(SETPOINT, 1, 194, place=SAME_PLACE), ("senders", BLOCKS, "component 194")),
     (beside(SETPOINT, 1, 191, place=SAME_PLACE), ("senders", BLOCKS, "component 191")),
     (beside(GCS_HEARTBEAT, 255, 190, 1.0),
-     ("senders", OK, "besides the vehicle: ground station 255/190")),
+     ("senders", OK, "other senders: ground station 255/190")),
     (beside(TIME, 255, 190, 2.0), ("clock", WARN, "another time master: component 255/190")),
     # the link
     (link(latency_s=0.3), ("delay", BLOCKS, "the link delays by")),
@@ -320,7 +320,7 @@ FOUND: list[tuple[Any, ...]] = [
      ("rates", BLOCKS, "at least 10 Hz are needed.*MAV_x_RATE")),
     # what it asks for is thinned to fit; 38400 baud do not carry the least of it
     ({"capacity_bytes_ps": 3840.0}, ("bandwidth", WARN, "use at least 115200 baud$")),
-    ({"capacity_bytes_ps": 11520.0}, ("bandwidth", OK, "the link carries")),
+    ({"capacity_bytes_ps": 11520.0}, ("bandwidth", OK, "the link can carry")),
     ({"faults": [{"fault": "clock_jump", "at_s": 9.0, "jump_s": 30.0}]},
      ("clock", BLOCKS, "the vehicle's clock jumped by 30.0 s")),
     ({"faults": [{"fault": "reboot", "at_s": 7.0, "for_s": 0.5}]},

@@ -174,7 +174,7 @@ def test_a_bad_override_is_refused_with_the_same_sentences() -> None:
             "scal=2",
             f"--set scal=2: scal is not a known key, did you mean scale? (known keys: {KEYS})",
         ),
-        ("corner.5=2", "--set corner.5=2: '5' is no place in a list of 2 values, counted from 0"),
+        ("corner.5=2", "--set corner.5=2: '5' is no index of a list of 2 values, counted from 0"),
         ("corner.0=x", "--set corner.0=x: corner.0: 'x' should be a valid number"),
         ("scale=12", "--set scale=12: scale: 12 should be less than 10"),
         ("scale", "--set scale: expected key.path=value"),

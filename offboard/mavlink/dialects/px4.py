@@ -152,8 +152,8 @@ PX4 = Dialect(
     # PX4 sends these texts only on a link on which it receives a HEARTBEAT of type GCS. Ours has
     # another type, since PX4 would not notice the loss of its real ground station (NAV_DLL_ACT)
     unsaid=(
-        "PX4 says why to ground stations alone: see QGroundControl; unless NAV_DLL_ACT is 0, PX4 "
-        "needs one"
+        "PX4 sends the reason to ground stations only: see QGroundControl; unless NAV_DLL_ACT is "
+        "0, PX4 needs one"
     ),
     oldest=(1, 14),
     setpoint_loss=_setpoint_loss,
