@@ -1,1 +1,1 @@
-"""A software-in-the-loop vehicle that behaves like an autopilot at its MAVLink boundary."""
+"""A simulated vehicle that behaves at its MAVLink interface like PX4 or ArduCopter (SITL)."""

@@ -8,5 +8,5 @@ from offboard.documents.command_line import run
 
 
 def main() -> NoReturn:
-    """Run the command in `sys.argv` and exit. Errors of the user are printed as sentences."""
+    """Run the command in `sys.argv` and exit. A UserError is printed as a sentence."""
     run("simulator.command")

@@ -78,7 +78,7 @@ def simulate(
 ) -> None:
     """Simulate vehicles that speak MAVLink as PX4 or ArduCopter does.
 
-    Every option applies to each of --instances vehicles; seed, ports and system id count up.
+    Every option applies to each of the --instances vehicles; seed, ports and system id count up.
     """
     if show_version:
         print(f"pso-offboard {version('pso-offboard')}")
@@ -109,7 +109,7 @@ def simulate(
         signing_key=signing_key,
         log=log,
     )
-    from simulator.launch import launch  # late, so that a wrong option is answered at once
+    from simulator.launch import launch  # imported late: a wrong option is reported at once
 
     raise typer.Exit(launch(options, stopping))
 

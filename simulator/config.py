@@ -15,19 +15,21 @@ from simulator.faults.link import Stranger
 from simulator.faults.vehicle import PilotTakesOver
 from simulator.vehicle.conditions import Conditions
 
-# Between two barriers (20 ms) more would fill a socket's buffer, so that barriers are lost
+# At a higher rate, the datagrams between two barriers (20 ms) overflow the buffer of the
+# companion's socket, and barriers are lost
 LOCKSTEP_STRANGER_HZ = 5000.0
 
 
 class Start(Parameters):
-    """The vehicle hovers `height_m` above the ground when its links open; faults count from there.
+    """A start in the air: the vehicle hovers `height_m` above the ground when its links open.
 
-    Its time stamps go on from the boot and the climb before.
+    The times of faults count from this moment; the vehicle's time stamps from the boot, before the
+    climb.
     """
 
     height_m: float = Field(ge=1, le=100)
-    mode: ModeName | None = None  # None: the one that holds position
-    by_failsafe: bool = False  # a failsafe chose the mode: system_status is 5
+    mode: ModeName | None = None  # None: the mode of the firmware that holds position
+    by_failsafe: bool = False  # whether a failsafe chose the mode: system_status is then 5
 
 
 class Scenario(Parameters):
@@ -40,12 +42,12 @@ class Scenario(Parameters):
 
 
 def scenario(name: str) -> Scenario:
-    """A shipped scenario or a file. Raises DocumentError."""
+    """Read a scenario by shipped name or file. Raises DocumentError."""
     return load_document(name, "scenario", Scenario)[0]
 
 
 def check_for(flown: Scenario, firmware: Firmware, *, lockstep: bool) -> None:
-    """Check what a scenario needs of a run. Raises DocumentError."""
+    """Check that a scenario can be flown with this firmware and clock. Raises DocumentError."""
     switches = [fault.mode for fault in flown.faults if isinstance(fault, PilotTakesOver)]
     named = switches if flown.start is None else [*switches, flown.start.mode]
     for mode in named:
@@ -60,5 +62,5 @@ def check_for(flown: Scenario, firmware: Firmware, *, lockstep: bool) -> None:
 
 
 def vehicle(name: str) -> Vehicle:
-    """A shipped vehicle or a file. Raises DocumentError."""
+    """Read a vehicle by shipped name or file. Raises DocumentError."""
     return load_document(name, "vehicle", Vehicle)[0]

@@ -1,7 +1,7 @@
-"""A simulated vehicle in the process of its companion: datagrams are handed over as bytes.
+"""A simulated vehicle in the companion's process: datagrams are passed as bytes, without sockets.
 
-`offboard` finds it as entry point `pso_offboard.simulators` and does not import this package. The
-same seed gives the same datagrams as `simulator --lockstep` over UDP.
+`offboard` finds it by the entry point `pso_offboard.simulators` and does not import this package.
+The same seed gives the same datagrams as `simulator --lockstep` over UDP.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from simulator import config
 from simulator.firmware import FIRMWARES
 from simulator.instance import Instance
 
-VEHICLE = 0  # sender of the vehicle's datagrams; others count up from it
+VEHICLE = 0  # number of the vehicle as a sender of datagrams; other senders have 1, 2, ...
 
 
 class InMemoryVehicle:
@@ -23,12 +23,12 @@ class InMemoryVehicle:
 
     Args:
         firmware: "px4" or "ardupilot".
-        scenario, vehicle: shipped names or files; None: the defaults of the firmware.
-        seed: of all noise.
-        parameters: of the autopilot, in place of its defaults.
+        scenario, vehicle: shipped name or file; None: the default of the firmware.
+        seed: seed of all noise.
+        parameters: values of autopilot parameters that replace the defaults.
 
     Raises:
-        DocumentError: scenario or vehicle cannot be used.
+        DocumentError: the scenario or the vehicle cannot be used.
     """
 
     def __init__(
@@ -57,21 +57,22 @@ class InMemoryVehicle:
             start=flown.start,
         )
         self._received: deque[bytes] = deque()
-        self._stamp_ns: int | None = None  # of the barrier that waits for its answer
+        self._stamp_ns: int | None = None  # time stamp of the barrier that is not answered yet
 
     @staticmethod
     def check_scenario(text: str, source: str) -> None:
-        """Check the YAML of a scenario, which errors call `source`. Raises DocumentError."""
+        """Check the YAML text of a scenario. `source` names it in errors. Raises DocumentError."""
         parse(text, config.Scenario, source)
 
     def exchange(self, frames: Sequence[bytes]) -> list[tuple[int, bytes]]:
-        """Receive frames of the companion and go on to the next barrier, if they answer this one.
+        """Handle frames of the companion; if they answer the present barrier, advance to the next.
 
-        What was sent after the answer is handled at the next barrier, as over UDP.
+        Frames after the answer are handled at the next barrier, as over UDP.
 
         Returns:
-            Sender (`VEHICLE`, or another one that a fault adds) and bytes of every datagram since
-            the last barrier, which is the last frame. Nothing while the answer is missing.
+            Sender (`VEHICLE`, or the number of a sender that a fault adds) and bytes of every
+            datagram since the last barrier; the last frame is the request of the new barrier. An
+            empty list while the answer is missing.
         """
         instance = self._instance
         self._received.extend(frames)
@@ -84,7 +85,7 @@ class InMemoryVehicle:
         return [*self._strange(), *((VEHICLE, datagram) for datagram in datagrams)]
 
     def _strange(self) -> list[tuple[int, bytes]]:
-        """Datagrams of senders that are not the vehicle."""
+        """Number and datagram of each sender that is not the vehicle, since the last call."""
         found: list[tuple[int, bytes]] = []
         for number, datagrams in enumerate(self._instance.strangers, VEHICLE + 1):
             found += [(number, datagram) for datagram in datagrams]

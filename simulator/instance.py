@@ -1,7 +1,7 @@
-"""One simulated vehicle with its two links, in memory: datagrams in, steps, datagrams out.
+"""One simulated vehicle with its two links, in memory: it takes and returns datagrams as bytes.
 
-Tests and campaigns drive it directly; `simulator.run` adds sockets and a clock. The same seed and
-the same datagrams at the same steps give the same datagrams out.
+Tests and campaigns call it directly; `simulator.run` adds sockets and a clock. The same seed and
+the same received datagrams at the same steps give the same sent datagrams.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from simulator.steps import STEP_S, STEP_US
 from simulator.vehicle.conditions import Conditions
 from simulator.vehicle.plant import Plant
 
-VIRTUAL_EPOCH_US = 1_767_225_600_000_000  # 2026-01-01, where virtual time begins
+VIRTUAL_EPOCH_US = 1_767_225_600_000_000  # 2026-01-01: Unix time at which virtual time begins
 BARRIER_STEPS = 5  # 20 ms
-RESTART_S = 1.0  # duration of a reboot by command
+RESTART_S = 1.0  # silence of the vehicle during a reboot by command
 _TIMESYNC = 111
 # A start in the air
-_CLIMB_S = 120.0  # for the climb: 100 m at 1.5 m/s, and until estimate and truth agree
-_SETTLE_S = 2.0
-_REACHED_M, _STILL_MPS = 0.3, 0.1
+_CLIMB_S = 120.0  # time-out: 100 m at 1.5 m/s, and then until estimate and truth agree
+_SETTLE_S = 2.0  # from the boot event "ready" until the vehicle is armed
+_REACHED_M, _STILL_MPS = 0.3, 0.1  # it hovers: true height error, estimated vertical speed
 
 
 class Instance:
@@ -46,16 +46,18 @@ class Instance:
     Args:
         firmware: `PX4` or `ARDUPILOT`.
         vehicle: physical parameters, as `simulator.config.vehicle` reads them.
-        conditions: wind, estimator errors, battery and other surroundings.
-        seed: of all noise.
+        conditions: wind, estimator errors, battery and other conditions of the flight.
+        seed: seed of all noise.
         system: MAVLink system id.
-        lockstep: replace the TIMESYNC stream of the companion link by barriers (`barrier_due`).
-        ground_link: has a link to a ground station too.
+        lockstep: whether barriers (`barrier_due`) replace the TIMESYNC stream of the companion
+            link.
+        ground_link: whether there is a link to a ground station.
         epoch_us: Unix time of boot in SYSTEM_TIME, microseconds.
-        parameters: of the autopilot, in place of its defaults.
+        parameters: values of autopilot parameters that replace the defaults.
         faults: what goes wrong, and when (`simulator.faults`).
-        start: the vehicle is in the air when its links open; None: it boots on the ground.
-        signing_key: 32 bytes; the vehicle signs what it sends, and accepts only what is signed.
+        start: how the vehicle hovers when its links open; None: it boots on the ground.
+        signing_key: 32 bytes, with which the vehicle signs what it sends and checks what it
+            receives; empty: no signing.
 
     Example:
         >>> from simulator import config
@@ -115,30 +117,30 @@ class Instance:
             self.links.append(ground)
         self.steps = 0
         self._faults = Injection(faults, seed)
-        self.down: list[Channel] = []  # of link faults: telemetry
-        self.up: list[Channel] = []
-        # Datagrams for the companion that others send, a list for each of their ports; the caller
-        # sends and clears them
+        self.down: list[Channel] = []  # link faults of the telemetry
+        self.up: list[Channel] = []  # link faults of what the companion sends
+        # Datagrams that other senders send to the companion, one list for each of their ports; the
+        # caller sends them and clears the lists
         self.strangers = [
             one.datagrams for one in self._faults.unfinished if isinstance(one.fault, Stranger)
         ]
-        self._by_step = bool(faults)  # link faults act on the datagrams of each step
+        self._by_step = bool(faults)  # link faults need the datagrams of each step by itself
         self._arrived: list[bytes] = []
         self._barrier_at_step = 0
-        self._back_at_step = 0
+        self._back_at_step = 0  # end of a reboot
 
     @property
     def time_s(self) -> float:
-        """Seconds since the start; a reboot does not reset it."""
+        """Seconds since the links opened; a reboot does not reset them."""
         return self.steps * STEP_S
 
     @property
     def complaints(self) -> Counter[str]:
-        """Number of messages that signing refused, by reason."""
+        """Number of received messages that were refused because of their signature, by reason."""
         return sum((link.decoder.refused for link in self.links), Counter())
 
     def _unix_us(self) -> int:
-        """The vehicle's clock, as in SYSTEM_TIME."""
+        """Unix time of the vehicle's clock in microseconds, as in SYSTEM_TIME."""
         return self.view.epoch_us + self.view.time_us
 
     def advance(self) -> None:
@@ -164,7 +166,8 @@ class Instance:
             self._arrived = self.drain()
 
     def advance_to_barrier(self, end_s: float = math.inf) -> bool:
-        """`advance` until `barrier_due` (True) or `end_s` (False)."""
+        """Advance to the next barrier, at most to vehicle time `end_s`; return whether a barrier
+        is due."""
         while self.time_s < end_s:
             self.advance()
             if self.barrier_due():
@@ -172,20 +175,20 @@ class Instance:
         return False
 
     def step(self) -> list[bytes]:
-        """`advance`, then the datagrams of the companion link; those of the ground link are
-        dropped."""
+        """Advance by one step and return the datagrams for the companion; those for the ground
+        station are dropped."""
         self.advance()
         self.drain_ground()
         return self.drain()
 
     def drain(self) -> list[bytes]:
-        """Datagrams that have arrived at the companion since the last call."""
+        """Return the datagrams that have arrived at the companion since the last call."""
         sent = carry(self.down, self.companion.outbox.drain(), self._now_us)
         arrived, self._arrived = self._arrived + sent, []
         return arrived
 
     def drain_ground(self) -> list[bytes]:
-        """Datagrams for the ground station since the last call."""
+        """Return the datagrams for the ground station since the last call."""
         return [datagram for link in self.links[1:] for datagram in link.outbox.drain()]
 
     def feed(self, datagram: bytes) -> None:
@@ -202,10 +205,10 @@ class Instance:
         self._send_texts()
 
     def barrier_due(self) -> bool:
-        """Whether lockstep waits here for the companion.
+        """Whether lockstep waits for the companion at this step.
 
-        True at the first step with a position at or after each multiple of 20 ms, so that a
-        command takes effect at the stamp of the newest position, as it nearly does in real time.
+        This is the first step with a new position at or after each multiple of 20 ms. So a command
+        takes effect at the time stamp of the newest position, nearly as in real time.
         """
         position_steps = self.autopilot.firmware.position_grid_steps
         if self.steps < self._barrier_at_step or self.steps % position_steps:
@@ -214,12 +217,12 @@ class Instance:
         return True
 
     def barrier(self) -> tuple[int, list[bytes]]:
-        """Send the TIMESYNC request of lockstep after all telemetry.
+        """Queue the TIMESYNC request of lockstep after all telemetry.
 
-        It is the clock of the simulation, so that link faults do not apply to it.
+        Link faults do not apply to the request, because it is the clock of the simulation.
 
         Returns:
-            Its time stamp in nanoseconds, and all datagrams for the companion.
+            The time stamp of the request in nanoseconds, and all datagrams for the companion.
         """
         stamp_ns = self._now_us * 1000
         datagrams = self.drain() if self._by_step else []
@@ -227,13 +230,14 @@ class Instance:
         return stamp_ns, datagrams + self.companion.outbox.drain()
 
     def reboot(self, silent_s: float) -> None:
-        """Restart the autopilot after `silent_s` without motors and messages; the vehicle falls."""
+        """Restart the autopilot. For `silent_s` the motors are off and no message is sent or
+        handled; a vehicle in the air falls."""
         old = self.autopilot
         self.autopilot = Autopilot(
             old.firmware, old.plant, old.parameters, old.mission, boot_scale=old.health.boot_scale
         )
         self.autopilot.position_controller.detector.set_landed(old.plant.on_ground)
-        self.autopilot.commander.refused = old.commander.refused  # faults that run go on
+        self.autopilot.commander.refused = old.commander.refused  # a `refusal` fault goes on
         self.view.restart(self.autopilot)
         self.keyring.restart()
         for link in self.links:
@@ -250,8 +254,8 @@ class Instance:
             self._send_texts()
 
     def _without_clock(self, datagram: bytes) -> list[bytes]:
-        """Handle lockstep's TIMESYNC answers (tc1 is not 0) at once; the rest is subject to link
-        faults and to the silence of a restart."""
+        """Handle the TIMESYNC answers of lockstep (tc1 is not 0) at once. Return the other frames,
+        to which link faults and the silence of a reboot apply."""
         if not self.companion.barrier:
             return [datagram]
         rest: list[bytes] = []
@@ -276,15 +280,15 @@ class Instance:
 
 
 def _take_off(autopilot: Autopilot, start: Start) -> None:
-    """Boot, climb and enter the mode of `start`.
+    """Boot, arm, climb to the height of `start` and enter its mode.
 
     Raises:
-        DocumentError: the vehicle does not reach the height.
+        DocumentError: the vehicle does not hover at the height within _CLIMB_S.
     """
     ready_s = autopilot.firmware.boot_events_s["ready"] * autopilot.health.boot_scale + _SETTLE_S
     while autopilot.state.time_s < ready_s:
         autopilot.step()
-    # as a pilot with a ground station does, in a mode in which the firmware takes off
+    # the commands of a ground station, in a mode in which the firmware accepts a takeoff
     autopilot.handle("mode", Request(autopilot.firmware.reposition_mode))
     autopilot.handle("arm")
     autopilot.handle("takeoff", Request(takeoff_ned_m=(math.nan, math.nan, -start.height_m)))

@@ -1,4 +1,4 @@
-"""A run of the `simulator` command: its vehicles, links and files, made from its options."""
+"""A run of the `simulator` command: makes vehicles, links and files from the options."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from simulator.link.sockets import Link, open_beside, open_link, shifted
 from simulator.options import COMPANION_PORT, NO_LINK, Options, Stop
 from simulator.run import Endpoint, Runner, warm_up
 
-LOCAL_COMPANION_PORT, LOCAL_GROUND_PORT = 14580, 18570  # as PX4 SITL
+LOCAL_COMPANION_PORT, LOCAL_GROUND_PORT = 14580, 18570  # local UDP ports of PX4 SITL
 ANY_PORT = 0
 
 
 def launch(options: Options, stopping: Stop) -> int:
-    """Run the vehicles until they are stopped; the exit code.
+    """Run the vehicles until they are stopped, and return the exit code.
 
     Raises:
         UserError: an option, a link or a file cannot be used.
@@ -78,14 +78,14 @@ def launch(options: Options, stopping: Stop) -> int:
 
 
 def _companion_link(options: Options) -> str:
-    """Ports of the first instance."""
+    """Return the URL of the companion link of the first instance."""
     return options.connect or f"udpout:127.0.0.1:{COMPANION_PORT + options.numbers[0]}"
 
 
 def _links(options: Options, number: int) -> tuple[Link, Link | None]:
-    """Companion and ground station link of an instance.
+    """Open the companion link and the ground station link of an instance.
 
-    The local ports of PX4 SITL only by default: a real PX4 beside us may use them.
+    With `--connect`, the local port is any free one: a real PX4 SITL may use its own beside ours.
     """
     port = ANY_PORT if options.connect else LOCAL_COMPANION_PORT + number
     url = shifted(_companion_link(options), number - options.numbers[0])
@@ -108,7 +108,7 @@ def _recorder(options: Options) -> Recorder | None:
 
 
 def _announce(options: Options, what: str, scenario: str) -> None:
-    """A line for each vehicle."""
+    """Print a line for each vehicle."""
     link, first = _companion_link(options), options.numbers[0]
     purpose = "waiting at" if link.startswith(("udpin:", "tcpin:")) else "sending to"
     for number in options.numbers:
@@ -121,7 +121,8 @@ def _announce(options: Options, what: str, scenario: str) -> None:
 
 
 def _parameters(firmware: Firmware, assignments: tuple[str, ...]) -> dict[str, float]:
-    """Values by parameter name. Exits where a name is unknown or a value out of range."""
+    """Return values by parameter name. Raises UserError for an unknown name or a value out of
+    range."""
     known = {spec.name: spec for spec in firmware.parameters}
     values: dict[str, float] = {}
     for text in assignments:
@@ -139,7 +140,7 @@ def _parameters(firmware: Firmware, assignments: tuple[str, ...]) -> dict[str, f
 
 
 def _warn_if_it_cannot_land(instance: Instance, hover_thrust: float) -> None:
-    """Warn where the lowest thrust of the autopilot exceeds the vehicle's weight."""
+    """Warn if the least thrust of the autopilot is at least the vehicle's hover thrust."""
     firmware, parameters = instance.autopilot.firmware, instance.autopilot.parameters
     least, name = parameters.role("thrust_least"), firmware.parameter_roles["thrust_least"]
     if least >= hover_thrust:

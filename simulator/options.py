@@ -1,4 +1,4 @@
-"""Options of a run of the `simulator` command, and its end by a signal."""
+"""The options of the `simulator` command, and the signals that stop it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ NO_LINK = "none"
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """The options of a run; `numbers` are those of its instances."""
+    """The options of one run; `numbers` are the numbers of its instances, from `--instance` on."""
 
     connect: str | None
     gcs: str
@@ -32,7 +32,7 @@ class Options:
 
 
 class Stop:
-    """Whether SIGTERM or SIGINT was received. While the simulator starts, they end the process."""
+    """Whether SIGTERM or SIGINT was received. Until `running` is set, they end the process."""
 
     def __init__(self) -> None:
         self.running = False
@@ -43,7 +43,7 @@ class Stop:
     def _note(self, number: int, frame: object) -> None:
         self._noted = True
         if not self.running:
-            os._exit(0)  # no file or flight has begun
+            os._exit(0)  # nothing was flown or recorded yet
 
     def __call__(self) -> bool:
         return self._noted

@@ -1,8 +1,8 @@
 """Runs vehicles one after the other, each in a fork of a process that has loaded all modules.
 
 A line of standard input, the options of the `simulator` command as a JSON list, starts a vehicle.
-An empty line, or the end of the input, ends it. Its exit code is then printed, negative for a
-signal. A fork takes milliseconds where a start takes a second; the vehicle sends the same bytes.
+An empty line, or the end of the input, ends it. Its exit code is then printed, negative if a signal
+ended it. A fork takes milliseconds, a new process a second; the vehicle sends the same bytes.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from offboard.documents.command_line import run
 
 
 def serve(requests: FileIO) -> None:
-    """Run a vehicle for each line of `requests`, which is unbuffered: `select` waits for it."""
+    """Run a vehicle for each line of `requests`: an unbuffered file, as `select` waits for it."""
     _load()
-    gc.freeze()  # what is not collected stays shared with the forks
+    gc.freeze()  # the garbage collector then leaves the memory alone that the forks share
     for line in requests:
         if line.strip():
             print(_exit_code(json.loads(line), requests), flush=True)

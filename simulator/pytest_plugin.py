@@ -23,7 +23,7 @@ from typing import Any
 import pytest
 
 STOP_S = 2.0
-OPTIONS = ("scenario", "firmware", "vehicle", "seed", "speed")  # of marker and command
+OPTIONS = ("scenario", "firmware", "vehicle", "seed", "speed")  # names in marker and command
 LOGS = pytest.StashKey[list[Path]]()
 
 
@@ -53,7 +53,7 @@ class Sitl:
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=errors,
-                start_new_session=True,  # Ctrl-C is pytest's business
+                start_new_session=True,  # Ctrl-C reaches pytest only
             )
 
     def __repr__(self) -> str:
@@ -77,7 +77,8 @@ class Sitl:
         return f"udpin://127.0.0.1:{self.port}"
 
     def wait_ready(self) -> None:
-        """Wait until the vehicle sends. Fails the test with its error message if it ended."""
+        """Wait until the vehicle sends. If its process ended, fail the test with its error
+        message."""
         assert self.process.stdout is not None
         if not self.process.stdout.readline():
             self.process.wait()

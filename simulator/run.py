@@ -1,9 +1,10 @@
 """Instances with sockets and a clock: real time, faster or slower, or lockstep with a companion.
 
 Lockstep uses MAVLink only: at each barrier the simulator sends a TIMESYNC request after the
-telemetry and waits for the answer. The companion answers in the order in which it reads: when the
-answer arrives, it has handled that telemetry, and everything it sent before the answer takes effect
-at that instant. Input is read at barriers only, so that a flight depends on nothing but its seed.
+telemetry and waits for the answer. The companion handles messages in the order in which it reads
+them. When its answer arrives, it has handled that telemetry, and everything that it sent before the
+answer takes effect at that vehicle time. The simulator reads input at barriers only, so that a
+flight depends on nothing but its seed.
 """
 
 from __future__ import annotations
@@ -20,15 +21,15 @@ from simulator.link.framing import Recorder
 from simulator.link.sockets import Link, wait
 from simulator.steps import STEP_S
 
-RESEND_S = 0.05  # of a barrier, until the companion first sends something
-RESEND_SILENT_S = 1.0
+RESEND_S = 0.05  # repeat an unanswered barrier this often until the companion has sent anything
+RESEND_SILENT_S = 1.0  # and this often later
 ANSWER_TIMEOUT_S = 5.0
-FIRST_ANSWER_TIMEOUT_S = 180.0  # a companion may compile first, on a busy machine
-WARM_UP_S = 0.2  # every fast message is due in it
-SPIN_S = 50e-6  # poll without sleeping: most answers arrive sooner than a core wakes up
-POLL_S = 0.05  # longest wait, so that a stop is noticed
+FIRST_ANSWER_TIMEOUT_S = 180.0  # a companion may compile first, perhaps on a busy machine
+WARM_UP_S = 0.2  # vehicle time in which every frequent message is sent at least once
+SPIN_S = 50e-6  # poll so long without sleeping: most answers come before a core would wake up
+POLL_S = 0.05  # longest wait in a system call, so that a request to stop is noticed
 BEHIND = "the simulator was {most:.1f} s behind real time{times}: not catching up"
-BEHIND_S = 0.5
+BEHIND_S = 0.5  # a greater lag behind real time is not caught up
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,9 +47,8 @@ class Endpoint:
         return [self.companion] if self.ground is None else [self.companion, self.ground]
 
     def send(self, datagrams: list[bytes] | None = None) -> None:
-        """Send these datagrams, by default what is queued for the companion; before them those of
-        senders that are not the vehicle, each from its own port; and what the ground link queued.
-        """
+        """Send the datagrams of other senders, each from its own port, then `datagrams` to the
+        companion (None: those that are queued), then those queued for the ground station."""
         datagrams = self.instance.drain() if datagrams is None else datagrams
         self._record(datagrams)
         for link, strange in zip(self.strangers, self.instance.strangers, strict=True):
@@ -62,13 +62,14 @@ class Endpoint:
             self.ground.send(self.instance.drain_ground())
 
     def send_barrier(self) -> tuple[int, list[bytes]]:
-        """Send everything queued and the barrier; return its time stamp and its datagrams."""
+        """Send everything queued and then the barrier; return the barrier's time stamp and all
+        datagrams that were sent to the companion."""
         stamp_ns, datagrams = self.instance.barrier()
         self.send(datagrams)
         return stamp_ns, datagrams
 
     def read(self) -> bool:
-        """Handle all datagrams that have arrived; whether the companion sent any."""
+        """Handle all datagrams that have arrived; return whether the companion sent any."""
         received = False
         while (datagram := self.companion.receive()) is not None:
             self.handle(datagram)
@@ -92,7 +93,7 @@ class Endpoint:
 
 @dataclass(slots=True)
 class Punctuality:
-    """Deadlines of a run in real time. Missed: a step ended after the next one was due."""
+    """Counts of steps that missed their deadline in real time: that ended when the next was due."""
 
     steps: int = 0
     missed: int = 0
@@ -111,17 +112,17 @@ class Punctuality:
 
 
 def warm_up(instance: Instance) -> None:
-    """Run all compiled code once with an instance that is not used later."""
+    """Run all compiled functions once, with an instance that is not used later."""
     while instance.time_s < WARM_UP_S:
         instance.advance()
 
 
 @dataclass(slots=True)
 class Runner:
-    """Runs instances with their sockets; lockstep takes one.
+    """Runs instances with their sockets; `lockstep` needs exactly one.
 
-    `stopping` is called often, and True ends the run; `report` takes sentences for the user;
-    `end_s`: vehicle time at which the run ends.
+    `stopping` is called often, and the run ends when it returns True. `report` receives sentences
+    for the user. `end_s` is the vehicle time at which the run ends.
     """
 
     endpoints: list[Endpoint]
@@ -136,7 +137,7 @@ class Runner:
     # -- real time ---------------------------------------------------------------------------
 
     def real_time(self, speed: float) -> None:
-        """Run at `speed` x real time by absolute deadlines; answers are sent at once."""
+        """Run at `speed` times real time, with absolute deadlines; answers are sent at once."""
         instance = self.endpoints[0].instance
         owners = {link: endpoint for endpoint in self.endpoints for link in endpoint.links}
         self._stagger()
@@ -152,21 +153,22 @@ class Runner:
                 endpoint.send()
             behind_s = monotonic_s() - deadline_s
             self.punctuality.note(behind_s, STEP_S / speed)
-            if behind_s > BEHIND_S:  # suspended or overloaded: do not catch up
+            if behind_s > BEHIND_S:  # the computer was suspended or is overloaded: do not catch up
                 behind.add(behind_s)
                 epoch_s += behind_s
             if news := behind.news(monotonic_s()):
                 self.report(news)
 
     def _stagger(self) -> None:
-        """Start each vehicle one step later, so that they do not all send in the same step."""
+        """Advance each vehicle by one step more than the one before, so that they do not all send
+        in the same step."""
         for ahead, endpoint in enumerate(self.endpoints):
             for _ in range(ahead):
                 endpoint.instance.advance()
                 endpoint.send()
 
     def _serve_until(self, deadline_s: float, owners: Mapping[Link, Endpoint]) -> None:
-        """Handle what arrives before the deadline; at least once."""
+        """Handle the datagrams that arrive before the deadline; look at least once."""
         while True:
             remaining_s = deadline_s - monotonic_s()
             ready = wait(owners, min(remaining_s, POLL_S))
@@ -181,14 +183,14 @@ class Runner:
     # -- lockstep ----------------------------------------------------------------------------
 
     def lockstep(self, timeout_s: float | None = None) -> str:
-        """Run in virtual time that waits for the companion at every barrier.
+        """Run in virtual time, which waits for the companion at every barrier.
 
         Args:
-            timeout_s: longest wait for an answer; default ANSWER_TIMEOUT_S, and
-                FIRST_ANSWER_TIMEOUT_S for the first one.
+            timeout_s: longest wait for an answer; None: FIRST_ANSWER_TIMEOUT_S until the companion
+                has sent anything, then ANSWER_TIMEOUT_S.
 
         Returns:
-            Why no companion answers; empty if the run was stopped.
+            A sentence that no companion answers; empty if the run ended or was stopped.
         """
         (endpoint,) = self.endpoints
         instance = endpoint.instance
@@ -214,7 +216,8 @@ class Runner:
     def _answered(
         self, endpoint: Endpoint, stamp_ns: int, datagrams: list[bytes], timeout_s: float
     ) -> bool:
-        """Wait for the answer to this barrier, applying all that comes before it."""
+        """Wait for the answer to this barrier, and handle all datagrams that come before it.
+        Return whether it came before `timeout_s` or a request to stop."""
         server, link = endpoint.instance.companion, endpoint.companion
         begun_s = sent_s = monotonic_s()
         while server.answered_ns != stamp_ns:
