@@ -1,1 +1,1 @@
-"""What the autopilot does with the vehicle: modes, guards, setpoints, loops. Knows no bytes."""
+"""The autopilot: modes, failsafes, setpoints and position loop. Knows no MAVLink frames."""

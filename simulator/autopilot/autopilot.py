@@ -1,8 +1,8 @@
-"""One autopilot on one plant, step by step: it controls the plant and then handles events.
+"""The autopilot of one plant: each step controls the plant and then handles events.
 
 The commander decides about modes, the guidance chooses the motion, the position controller flies
-it, health reports what changes without a request. Knows no MAVLink frames, sockets or
-clock: its time is the plant's.
+it, and health raises the events that nobody requests. Knows no MAVLink frames, sockets or clock:
+its time is counted in steps of the plant.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ _POSITION_IGNORED, _LOCAL_NED = 0b111, 1  # type_mask; MAV_FRAME
 
 
 class Autopilot:
-    """Autopilot of one vehicle; `step` moves it and its plant by STEP_S.
+    """Autopilot of one vehicle; `step` advances it and its plant by STEP_S.
 
     Args:
-        firmware: which autopilot is simulated.
+        firmware: the simulated firmware.
         plant: the vehicle.
-        parameters, mission: kept over a reboot; None: the firmware's defaults, no items.
-        boot_scale: factor on the times of the start.
+        parameters, mission: those from before a reboot; None: the firmware's defaults, no items.
+        boot_scale: factor on the times of the boot events.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class Autopilot:
         boot_scale: float = 1.0,
     ) -> None:
         self.firmware, self.plant = firmware, plant
-        self.outputs_us = [0] * 16  # pulse widths that a client asked for
+        self.outputs_us = [0] * 16  # pulse widths set by MAV_CMD_DO_SET_SERVO
         self.parameters = parameters or ParameterTable(firmware)
         self.mission = mission or Mission(firmware, self.parameters)
         self.state = VehicleState(plant)
@@ -67,12 +67,12 @@ class Autopilot:
         self.commander = Commander(self.guidance, self.position_controller, self.state, self.health)
 
     def handle(self, event: str, request: Request = NO_REQUEST) -> Result:
-        """Handle an event from outside; returns the acknowledgement."""
+        """Handle an event that a command or a fault raises; return the acknowledgement."""
         return self.commander.handle(event, request)
 
     def take_setpoint(self, message: str, values: Mapping[str, Any]) -> None:
-        """Take a setpoint message (ATTITUDE, LOCAL or GLOBAL) if the firmware accepts it in the
-        present mode. Its fields may be relative to the vehicle."""
+        """Take a setpoint message (ATTITUDE, LOCAL or GLOBAL, in any frame) if the firmware accepts
+        it in the present mode."""
         mode = self.commander.mode
         accepted = mode.behaviour is Behaviour.SETPOINT
         if message != ATTITUDE:
@@ -92,7 +92,7 @@ class Autopilot:
     def _read_setpoint(
         self, message: str, values: Mapping[str, Any]
     ) -> tuple[AttitudeSetpoint | MotionSetpoint | None, StatusText | None]:
-        """Setpoint of a message, or a text about its refusal."""
+        """Return the setpoint of a message, or the text about its refusal; both may be None."""
         firmware = self.firmware
         if message == ATTITUDE:
             return firmware.attitude_setpoint(values, self.parameters), None
@@ -110,7 +110,8 @@ class Autopilot:
         return None, firmware.setpoint_rejection(message, None if frame == _LOCAL_NED else frame)
 
     def _in_metres(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Fields of GLOBAL as those of LOCAL in MAV_FRAME 1; a position is whole or ignored."""
+        """Convert the fields of GLOBAL to those of LOCAL in MAV_FRAME 1. A position with an ignored
+        coordinate is ignored."""
         origin, frame, mask = self.firmware.origin, values["coordinate_frame"], values["type_mask"]
         x, y = to_metres(origin, values["lat_int"] * 1e-7, values["lon_int"] * 1e-7)
         z = down_m(values["alt"], frame, origin, self.guidance.home_ned_m[2])
@@ -121,19 +122,19 @@ class Autopilot:
         return {**values, **place}
 
     def go_to(self, place_ned_m: Triple, yaw_rad: float) -> None:
-        """Hold this place, in a mode that holds or follows setpoints; a NaN yaw faces the
-        direction of flight."""
+        """Fly to this place and hold it, in a mode that holds or follows setpoints. With a NaN yaw
+        the nose points in the direction of flight."""
         self._end_takeoff()
         self.guidance.hold_at(place_ned_m, yaw_rad)
 
     def _end_takeoff(self) -> None:
-        """End the takeoff of a mode that follows setpoints."""
+        """End a takeoff in a mode that follows setpoints (ArduCopter GUIDED)."""
         behaviour = self.commander.mode.behaviour
         if self.guidance.behaviour is not behaviour:
             self.position_controller.enter(behaviour)
 
     def step(self) -> None:
-        """Fly STEP_S, then handle the events of the step."""
+        """Control the plant for STEP_S, then handle the events of the step."""
         was_landed = self.position_controller.landed
         self.plant.advance(STEP_S, self.position_controller.step(self.commander.armed))
         self.state.step()
@@ -141,7 +142,7 @@ class Autopilot:
             self.commander.handle(event)
 
     def _events(self, was_landed: bool) -> Iterator[str]:
-        """Events of this step; each is handled before the next one is looked for."""
+        """Events of this step; each is handled before the next condition is checked."""
         commander, now_s = self.commander, self.state.time_s
         controller = self.position_controller
         yield from self.health.boot_events(now_s)

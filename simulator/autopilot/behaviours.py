@@ -1,8 +1,8 @@
-"""What the vehicle does in its modes: the classes of behaviours, and the table of them.
+"""What the vehicle does in its modes: the classes of behaviours, and their table.
 
-A behaviour demands a motion in each period and answers a few questions about itself. To add one: a
-member of `simulator.autopilot.values.Behaviour`, a class here, a row in BEHAVIOURS, and a row in
-the mode table of a firmware. NED, SI.
+A behaviour demands a motion in each period and has a few properties. A new one needs a member of
+`simulator.autopilot.values.Behaviour`, a class here, a row in BEHAVIOURS, and a row in the mode
+table of a firmware. NED, SI.
 """
 
 from __future__ import annotations
@@ -15,19 +15,20 @@ from simulator.autopilot.guidance import ActiveBehaviour, Guidance, stopping_pla
 from simulator.autopilot.state import StateEstimate
 from simulator.autopilot.values import Behaviour, MotionSetpoint, Triple
 
-_FLATTEST = 1000.0  # takeoff: m across per m of climb
-_STILL_MPS = 0.05  # sticks: a slower demand holds the place
+_FLATTEST = 1000.0  # limit of a takeoff from the ground: m horizontally per m of climb
+_STILL_MPS = 0.05  # sticks: with a lower velocity demand the vehicle holds its place
 
 
 class Takeoff(ActiveBehaviour):
-    """PX4 AUTO.TAKEOFF; ArduCopter GUIDED after MAV_CMD_NAV_TAKEOFF. Reports "climbed"."""
+    """PX4 AUTO.TAKEOFF; ArduCopter GUIDED after MAV_CMD_NAV_TAKEOFF. Raises event "climbed"."""
 
     lifts_off = True
     climbing = True
     _climbed = False
 
     def enter(self, estimate: StateEstimate, place_ned_m: Triple, *, landed: bool) -> None:
-        """Choose the height. Neither a descent nor, on the ground, a nearly flat leg is flown."""
+        """Choose the height. The vehicle does not descend to it, and does not leave the ground on a
+        nearly horizontal path."""
         (x, y, z), (north, east, target_z) = estimate.position_ned_m, place_ned_m
         if math.isnan(target_z):
             target_z = z - self.guidance.parameters.role("takeoff_height_m")
@@ -55,7 +56,7 @@ class Takeoff(ActiveBehaviour):
 
 
 class Land(ActiveBehaviour):
-    """PX4 AUTO.LAND; ArduCopter LAND: descend vertically, slower near the ground."""
+    """PX4 AUTO.LAND; ArduCopter LAND: a vertical descent, slower near the ground."""
 
     landing = True
 
@@ -64,15 +65,15 @@ class Land(ActiveBehaviour):
 
 
 def descent(place_ned_m: Triple, speed_mps: float) -> MotionSetpoint:
-    """Vertically down at this speed."""
+    """Vertical descent at this place and speed."""
     return MotionSetpoint((*place_ned_m[:2], math.nan), (math.nan, math.nan, speed_mps))
 
 
 def landing_motion(
     place_ned_m: Triple, estimate: StateEstimate, guidance: Guidance
 ) -> MotionSetpoint:
-    """Descent to the ground: slower near home's height, slowest where the range finder sees the
-    ground (PX4 MPC_LAND_SPEED, MPC_LAND_CRWL; ArduCopter LAND_SPEED)."""
+    """Descent to the ground: slower near the height of home (PX4 MPC_LAND_SPEED; ArduCopter
+    LAND_SPEED), slowest where the range finder measures a small distance (PX4 MPC_LAND_CRWL)."""
     role = guidance.parameters.role
     slow = role("land_speed_mps")
     if estimate.ground_m <= role("crawl_below_m"):
@@ -91,7 +92,7 @@ class Stage(Enum):
 
 
 class Return(ActiveBehaviour):
-    """PX4 AUTO.RTL; ArduCopter RTL: climb, fly home, descend, wait, land."""
+    """PX4 AUTO.RTL; ArduCopter RTL: the vehicle climbs, flies home, descends, waits, lands."""
 
     _stage = Stage.CLIMB
     _wait_until_s = math.inf
@@ -115,7 +116,7 @@ class Return(ActiveBehaviour):
         return MotionSetpoint(guidance.hold_ned_m, faces_way=guidance.firmware.return_faces_way)
 
     def _advance(self, estimate: StateEstimate) -> None:
-        """Go through the stages that are complete."""
+        """Go on to the next stages as far as stages are complete."""
         guidance, z = self.guidance, estimate.position_ned_m[2]
         home_x, home_y, home_z = guidance.home_ned_m
         role, target_z = guidance.parameters.role, guidance.hold_ned_m[2]
@@ -139,7 +140,7 @@ class Return(ActiveBehaviour):
 
 
 class FlyMission(ActiveBehaviour):
-    """PX4 AUTO.MISSION; ArduCopter AUTO: the items of `simulator.autopilot.mission`, in order."""
+    """PX4 AUTO.MISSION; ArduCopter AUTO: flies the items of `simulator.autopilot.mission`."""
 
     lifts_off = True
 
@@ -175,7 +176,8 @@ class FlyBySticks(ActiveBehaviour):
             self.guidance.sticks.begin()
 
     def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
-        """The velocity demanded; an axis without a demand holds its place."""
+        """Return the motion that the sticks demand; horizontally and vertically the place is held
+        if there is no demand."""
         guidance = self.guidance
         descend = descent(guidance.hold_ned_m, guidance.parameters.role("stick_descent_mps"))
         if guidance.sticks is None:
@@ -198,8 +200,8 @@ class FlyBySticks(ActiveBehaviour):
 
 
 class FollowSetpoint(ActiveBehaviour):
-    """PX4 OFFBOARD, ArduCopter GUIDED: follow a motion setpoint; hold where there is none. The
-    position controller flies an attitude setpoint without asking for a motion."""
+    """PX4 OFFBOARD, ArduCopter GUIDED: follows a motion setpoint; holds its place without one. The
+    position controller flies an attitude setpoint itself and then does not call `motion`."""
 
     lifts_off = True
 
@@ -208,7 +210,7 @@ class FollowSetpoint(ActiveBehaviour):
         if isinstance(setpoint, MotionSetpoint):
             self.cannot_climb = False
             return setpoint
-        self.cannot_climb = landed  # it stands until somebody asks for a climb
+        self.cannot_climb = landed  # a landed vehicle waits for a setpoint or a takeoff
         return self.guidance.hold
 
     @property
@@ -217,14 +219,14 @@ class FollowSetpoint(ActiveBehaviour):
 
 
 BEHAVIOURS: Mapping[Behaviour, type[ActiveBehaviour]] = {
-    # stay, or fly to the place a client named: PX4 AUTO.LOITER; ArduCopter BRAKE and CIRCLE
+    # hold, or fly to the place that a client named: PX4 AUTO.LOITER; ArduCopter BRAKE, CIRCLE
     Behaviour.HOLD: ActiveBehaviour,
     Behaviour.TAKEOFF: Takeoff,
     Behaviour.LAND: Land,
     Behaviour.RETURN: Return,
     Behaviour.MISSION: FlyMission,
     Behaviour.DESCEND: FlyBySticks,
-    # no motion: the position controller flies them
+    # the position controller flies these itself and does not call `motion`
     Behaviour.LEVEL: ActiveBehaviour,
     Behaviour.COAST: ActiveBehaviour,
     Behaviour.SETPOINT: FollowSetpoint,

@@ -1,8 +1,8 @@
-"""The commander: mode, arming and failsafe, and the texts about them.
+"""The commander: mode, arming and failsafe, and the STATUSTEXTs about them.
 
-Whatever happens (a command, a lost stream, a landing) is an event. A row of the firmware's table
-decides the next mode, the actions, the acknowledgement and the texts: the first row of the event
-whose mode and conditions fit. Knows no firmware by name, no MAVLink frames, sockets or clock.
+A command, a lost setpoint stream, a landing and so on are events. The first row of the firmware's
+state table whose event, mode and conditions fit decides the next mode, the actions, the
+acknowledgement and the texts. Knows no firmware by name, no MAVLink frames, sockets or clock.
 """
 
 from __future__ import annotations
@@ -27,26 +27,26 @@ from simulator.autopilot.values import (
 )
 
 _CRITICAL = 2  # battery level
-# EKF2_GPS_V_GATE standard deviations of EKF2_GPS_V_NOISE; EK3_VEL_I_GATE of EK3_VELNE_M_NSE
+# PX4: EKF2_GPS_V_GATE times EKF2_GPS_V_NOISE; ArduPilot: EK3_VEL_I_GATE times EK3_VELNE_M_NSE
 _GATE_MPS = 5.0 * 0.3
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What an event requests: a mode by name, a place (NED, m) to climb to; and who does."""
+    """What an event requests: a mode by name, or a place to climb to (NED)."""
 
     mode: str = ""
     takeoff_ned_m: Triple = NAN3
-    by_ground_station: bool = False  # the component of a ground station
+    by_ground_station: bool = False  # whether its sender has the component id of a ground station
 
 
 NO_REQUEST = Request()
 
 
 class Commander:
-    """Mode, arming and failsafe of one vehicle; only `handle` changes them.
+    """Mode, arming and failsafe of one vehicle; only `handle` and `switch` change them.
 
-    The link takes `texts`, and `announcements`: messages to send on every link.
+    The instance sends and clears `texts`, and `announcements`: names of messages for every link.
     """
 
     def __init__(
@@ -67,11 +67,11 @@ class Commander:
         self._intended = self._remembered = firmware.boot_mode
         self.armed = self.failsafe = False
         self.reboot_requested = False
-        self.refused: dict[str, StatusText] = {}  # by a fault: events, and "offboard"
+        self.refused: dict[str, StatusText] = {}  # events (and "offboard") that a fault refuses
         self.texts: list[StatusText] = []
         self.announcements: list[str] = []
         self._event, self._request = "", NO_REQUEST  # being handled
-        self._cause = ""  # event of the failsafe
+        self._cause = ""  # event that caused the failsafe
         self._delayed: tuple[float, str] | None = None  # time and event of a delayed failsafe
         self.latched: frozenset[str] = frozenset()  # events that only a reboot clears
 
@@ -79,7 +79,7 @@ class Commander:
 
     @property
     def healthy(self) -> bool:
-        """The pre-arm checks pass in the intended mode."""
+        """Whether the pre-arm checks pass in the intended mode."""
         level = self._firmware.battery_level(self._state.plant.battery, self._parameters)
         if self.rejects_velocity or level >= _CRITICAL:
             return False
@@ -89,31 +89,31 @@ class Commander:
 
     @property
     def has_fix(self) -> bool:
-        """GPS has a fix: its first one, and no fault takes it away."""
+        """Whether the GPS has a fix: it had its first one, and no fault takes it away."""
         return "fix" in self._health.reached and self._state.plant.gps_healthy
 
     @property
     def velocity_ratio(self) -> float:
-        """Innovation ratio of the velocity in the estimator, as the firmware reports it."""
+        """Innovation test ratio of the estimator's velocity, as the firmware reports it."""
         ratio = math.hypot(*self._state.plant.velocity_error_ned_mps) / _GATE_MPS
         return ratio**2 if self._firmware.velocity_ratio_squared else ratio
 
     @property
     def rejects_velocity(self) -> bool:
-        """The innovation ratio of the velocity is too large to arm."""
+        """Whether the innovation test ratio of the velocity is too large to arm."""
         most = self._parameters.role("velocity_ratio_most")
         return most > 0.0 and self.velocity_ratio >= most
 
     @property
     def intended(self) -> Mode:
-        """The mode that was chosen; in a failsafe the vehicle flies another one."""
+        """The mode chosen last by anything but a failsafe, which may fly another mode."""
         return self._firmware.modes[self._intended]
 
     # -- events ------------------------------------------------------------------------------
 
     def handle(self, event: str, request: Request = NO_REQUEST) -> Result:
-        """Apply the row of the state table that decides about an event; a firmware without rows
-        for it does not support it."""
+        """Apply the row of the state table that decides about an event; return the
+        acknowledgement, UNSUPPORTED if the table has no row of this event."""
         self._event, self._request = event, request
         offboard = event == "mode" and self._requested.behaviour is Behaviour.SETPOINT
         if self.refused and (text := self.refused.get("offboard" if offboard else event)):
@@ -126,25 +126,25 @@ class Commander:
         return found[0].result
 
     def switch(self, mode: str, *, by_failsafe: bool = False) -> None:
-        """Enter a mode anew, also one that no command may request: by a pilot's switch, or by a
-        failsafe."""
+        """Enter a mode, also one that no command may request, as a pilot's mode switch or a
+        failsafe does. If the vehicle is in this mode already, begin it again."""
         self._event, self._request = "", NO_REQUEST
         self._enter(mode, by_failsafe=by_failsafe)
         self.failsafe = by_failsafe
 
     def due_events(self) -> Iterator[str]:
-        """The event of a delayed failsafe, once its delay is over."""
+        """The event of a delayed failsafe, when its delay is over."""
         if self._delayed is not None and self._state.time_s >= self._delayed[0]:
             event, self._delayed = self._delayed[1], None
             yield event
 
     @property
     def _requested(self) -> Mode:
-        """The requested mode, or the present one."""
+        """The requested mode; without one, the present mode."""
         return self._firmware.modes[self._request.mode] if self._request.mode else self.mode
 
     def _row(self, event: str) -> tuple[Rule, str] | None:
-        """The row that decides about an event, and its next mode; None: nothing happens."""
+        """Return the first row that fits an event, and its next mode; None: no row fits."""
         for rule in self._rows.get(event, ()):
             in_mode = rule.mode == "*" or self.mode.name in rule.mode.split()
             if in_mode and all(map(self._holds, rule.when)):
@@ -154,8 +154,8 @@ class Commander:
         return None
 
     def _target(self, rule: Rule) -> str | None:
-        """The row's next mode by name, "*" to keep the present one; None if the parameter's value
-        selects no mode."""
+        """Return the name of a row's next mode, "*" to keep the present one; None if the value of
+        its parameter selects no mode."""
         if isinstance(rule.to, ByParameter):
             return rule.to.modes.get(int(self._parameters[rule.to.parameter]))
         chosen = {"requested": self._request.mode, "remembered": self._remembered}
@@ -196,7 +196,8 @@ class Commander:
                 self._remembered = name
         if mode is not self.mode and not self._firmware.setpoints_outlive_modes:
             self._guidance.newest = None
-        if mode is not self.mode or self._event in ("takeoff", ""):  # else the present one goes on
+        # a request of the present mode does not begin it again
+        if mode is not self.mode or self._event in ("takeoff", ""):
             self._controller.enter(mode.behaviour, self._request.takeoff_ned_m)
         self.mode = mode
 
@@ -209,15 +210,15 @@ class Commander:
 
     def _disarm(self) -> None:
         self.armed, self._delayed = False, None
-        self._controller.enter(self.mode.behaviour)  # anew, if it is armed again
+        self._controller.enter(self.mode.behaviour)  # begins again when the vehicle is armed again
 
     def _fail(self) -> None:
         self.failsafe = True
         self._cause = self._event.removesuffix(AFTER_DELAY)
 
     def _delay(self) -> None:
-        """Delay the action of a failsafe, so that a pilot can take over; a second failsafe does not
-        extend the delay."""
+        """Delay the action of a failsafe, so that a pilot can take over (PX4 COM_FAIL_ACT_T). A
+        second failsafe does not extend the delay."""
         at_s = self._state.time_s + self._parameters.role("failsafe_delay_s")
         if self._delayed is not None:
             at_s = self._delayed[0]

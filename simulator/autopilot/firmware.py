@@ -1,8 +1,9 @@
-"""What a firmware consists of: data as fields, and how it reads and answers as methods.
+"""What the simulator has to know of a firmware: data as fields; how it interprets messages as
+methods.
 
-The autopilot and the MAVLink server never ask which firmware they run; they read one `Firmware`.
-`simulator.firmware.px4` and `simulator.firmware.ardupilot` are its two subclasses. Knows
-the state estimate, but no autopilot, no message builder and no socket.
+The autopilot and the MAVLink server never compare firmware names; they read one `Firmware`. Its
+subclasses are in `simulator.firmware.px4` and `simulator.firmware.ardupilot`. Knows the state
+estimate, but no autopilot, no message builder and no socket.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ RANGES = {"int8": (-128, 127), "int16": (-32768, 32767), "int32": (-(2**31), 2**
 
 @dataclass(frozen=True, slots=True)
 class ParameterSpec:
-    """One parameter. PARAM_SET may set any value; the vehicle obeys [minimum, maximum]."""
+    """One parameter. PARAM_SET may store any value; the vehicle uses it limited to its range."""
 
     name: str
     kind: Literal["int8", "int16", "int32", "real32"]
@@ -55,7 +56,7 @@ AFTER_DELAY = " after delay"
 
 @dataclass(frozen=True, slots=True)
 class ByParameter:
-    """The next mode by the value of a parameter."""
+    """A next mode that the value of a parameter selects."""
 
     parameter: str
     modes: Mapping[int, str]
@@ -66,17 +67,17 @@ class Rule:
     """One row of the state table: the first row that fits an event decides.
 
     Args:
-        event: its name; those of the start are in `Firmware.boot_events_s`.
-        mode: names of the modes in which it happened, with spaces between, or "*".
+        event: name of the event; `Firmware.boot_events_s` has the events of the start.
+        mode: names of the modes in which the row applies, separated by spaces; "*": any mode.
         when: conditions that must all hold (`simulator.autopilot.commander.CONDITIONS`). "not X"
-            negates, "NAME=1,2" holds if parameter NAME is 1 or 2, "since X" is a failsafe because
-            of event X, "reached X" a boot event that has come, "latched X" an event that only a
-            reboot clears, "requests X" a request of mode X.
-        to: next mode by name, "*" none, "requested" by the command, "remembered" the last chosen;
-            or `ByParameter`; then the row fits only the values listed there.
+            negates X. "NAME=1,2" holds if parameter NAME is 1 or 2, "since X" in a failsafe that
+            event X caused, "reached X" after boot event X, "latched X" after event X until a
+            reboot, "requests X" if mode X is requested.
+        to: name of the next mode; "*": no change; "requested": the mode that the command names;
+            "remembered": the mode chosen last; `ByParameter`: the row fits only its values.
         do: actions (`simulator.autopilot.commander.ACTIONS`).
         result: acknowledgement of a command.
-        texts: STATUSTEXTs; they may name {mode} and `simulator.autopilot.commander.TEXT_VALUES`.
+        texts: STATUSTEXTs, in which {name} is one of `simulator.autopilot.commander.TEXT_VALUES`.
         send: messages to send on every link.
     """
 
@@ -92,160 +93,167 @@ class Rule:
 
 @dataclass(frozen=True, kw_only=True)
 class Firmware(ABC):
-    """One firmware."""
+    """One firmware. The comment of a bool says what holds if it is True."""
 
     name: str
-    vehicle: str  # default vehicle and scenario
-    scenario: str
+    vehicle: str  # default vehicle
+    scenario: str  # default scenario
     mav_autopilot: int
     version: int  # AUTOPILOT_VERSION.flight_sw_version
     capabilities: int  # MAV_PROTOCOL_CAPABILITY
     origin: Triple  # of the local frame: latitude, longitude deg, AMSL m
     modes: Mapping[str, Mode]
     boot_mode: str
-    hold_mode: str  # in which the vehicle stops and holds its position
+    hold_mode: str  # mode in which the vehicle stops and holds its position
     rules: tuple[Rule, ...]
     parameters: tuple[ParameterSpec, ...]
-    parameter_roles: Mapping[str, Role]  # what the simulator needs -> where it comes from
-    system_parameter: str  # holds the system id
+    parameter_roles: Mapping[str, Role]  # name of a value that the simulator needs -> its source
+    system_parameter: str  # parameter with the system id
 
     # commands
-    mode_acked_twice: bool = False  # by the receiver before the commander does
+    mode_acked_twice: bool = False  # the MAVLink receiver, too, acknowledges MAV_CMD_DO_SET_MODE
     set_mode_acked_as: int | None = None  # MAV_CMD in the answer to SET_MODE; None: no answer
-    force_codes: Mapping[str, float]  # param2 of MAV_CMD_COMPONENT_ARM_DISARM: arm, disarm
-    reposition_mode: str  # mode for MAV_CMD_DO_REPOSITION
+    force_codes: Mapping[str, float]  # param2 of MAV_CMD_COMPONENT_ARM_DISARM that forces it
+    reposition_mode: str  # mode that MAV_CMD_DO_REPOSITION enters
     # True: MAV_CMD_DO_REPOSITION needs a frame and a place, and its yaw and speed are ignored; the
     # height of MAV_CMD_NAV_TAKEOFF is above home; MAV_CMD_MISSION_START must not name an item.
-    # False: that height is above mean sea level
+    # False: the height of MAV_CMD_NAV_TAKEOFF is above mean sea level
     strict_places: bool = False
-    empty_refusal: Result  # of a MAV_CMD_DO_CHANGE_SPEED without a speed, an interval of no message
-    vertical_speeds: tuple[float, ...] = ()  # SPEED_TYPE of climb and descent; others are across
-    no_interval_us: int = -1  # MESSAGE_INTERVAL of a message that is not streamed
-    # MAV_CMD acknowledged and not carried out: result, None: no acknowledgement. Any other command
-    # without a handler is UNSUPPORTED
+    # of MAV_CMD_DO_CHANGE_SPEED without a speed, MAV_CMD_GET_MESSAGE_INTERVAL of an unknown message
+    empty_refusal: Result
+    vertical_speeds: tuple[float, ...] = ()  # SPEED_TYPEs of climb and descent; others: horizontal
+    no_interval_us: int = -1  # MESSAGE_INTERVAL.interval_us of a message that is not streamed
+    # Result of each MAV_CMD that is acknowledged without being carried out; None: no
+    # acknowledgement. Any other command without a handler is UNSUPPORTED
     command_answers: Mapping[int, Result | None]
 
     # setpoints
-    global_frames: frozenset[int]  # MAV_FRAME accepted in SET_POSITION_TARGET_GLOBAL_INT
-    setpoint_mode_needs_stream: bool = False  # its pre-arm checks fail without a stream
-    setpoints_as_automatic: bool = False  # flown with the speeds and turn rates of automatic flight
-    setpoints_outlive_modes: bool = False  # taken in any mode; else in the setpoint mode only
-    setpoints_imply_flight: bool = False  # any thrust is flight: no land detector
+    global_frames: frozenset[int]  # MAV_FRAMEs accepted in SET_POSITION_TARGET_GLOBAL_INT
+    setpoint_mode_needs_stream: bool = False  # without a stream, its pre-arm checks fail
+    setpoints_as_automatic: bool = False  # speed and turn rate limits are those of automatic flight
+    setpoints_outlive_modes: bool = False  # taken in any mode, and kept when the mode changes
+    setpoints_imply_flight: bool = False  # an attitude setpoint with thrust ends the landed state
 
     # missions
-    requests_kind_of_peer: bool = False  # items of a mission in the kind that came last
-    # MAV_FRAME of a downloaded item, by its message and the uploaded one
+    requests_kind_of_peer: bool = False  # items of an upload, with or without _INT as the peer
+    # MAV_FRAME of a downloaded item, by its message and the MAV_FRAME of the upload
     item_frames: Mapping[str, Mapping[int, int]]
     home_item_first: bool = False  # item 0 of a mission is home
-    takeoff_items_climb: bool = False  # and never descend
-    guided_items: bool = False  # an item with current = 2 is a place to fly to now
-    mission_text: StatusText | None = None  # after an upload
-    reached_above_landing: bool = False  # a landing is "item reached" above its place, too
-    turning_items: frozenset[int] = frozenset()  # MAV_CMD whose fourth parameter is a yaw
+    takeoff_items_climb: bool = False  # a takeoff item does not make the vehicle descend
+    guided_items: bool = False  # a MISSION_ITEM with current = 2 is a place to fly to at once
+    mission_text: StatusText | None = None  # text after an upload
+    reached_above_landing: bool = False  # "item reached" also when above the place of a landing
+    turning_items: frozenset[int] = frozenset()  # MAV_CMDs of items whose param4 is a yaw
 
     # telemetry
-    companion_rates_hz: Mapping[str, float]  # without a request, by link
+    companion_rates_hz: Mapping[str, float]  # of the messages sent without a request, by link
     ground_rates_hz: Mapping[str, float]
-    messages: ModuleType  # builders beside those of `simulator.mavlink.messages`, or in their place
-    withheld_until: Mapping[str, str] = field(default_factory=dict)  # by message: boot event
-    # message -> version of its content: a message that is due waits until it is a new one
+    messages: ModuleType  # builders that add to those of `simulator.mavlink.messages`, or replace
+    withheld_until: Mapping[str, str] = field(default_factory=dict)  # message -> boot event
+    # message -> function that returns the version of its content; a message that is due waits
+    # until the version is a new one
     message_versions: Mapping[str, Callable[[Any], Hashable]] = field(default_factory=dict)
-    estimates_airspeed: bool = False  # in VFR_HUD, without wind
-    position_grid_steps: int  # the estimator's position is new at every such step
+    estimates_airspeed: bool = False  # VFR_HUD has an airspeed: the speed over ground, without wind
+    position_grid_steps: int  # number of steps from one new position estimate to the next
     fixed_streams: frozenset[str]  # messages whose interval cannot be changed
-    not_on_request: frozenset[str]
-    never_sent: frozenset[int]  # ids of which an interval is accepted
+    not_on_request: frozenset[str]  # messages that MAV_CMD_REQUEST_MESSAGE refuses
+    never_sent: frozenset[
+        int
+    ]  # ids of messages that are never sent, but whose interval is settable
     stream_groups: Mapping[int, tuple[str, ...]] = field(default_factory=dict)  # by MAV_DATA_STREAM
     rate_max_hz: float = math.inf
     interval_refusal: Result
-    interval_refusal_text: str = ""  # may name {id}; "": none
-    too_fast_text: str = ""
-    request_refusal: Result  # of MAV_CMD_REQUEST_MESSAGE, and a termination that terminates nothing
+    interval_refusal_text: str = ""  # STATUSTEXT, may contain {id}; "": none
+    too_fast_text: str = ""  # the same for a rate above `rate_max_hz`
+    request_refusal: Result  # of MAV_CMD_REQUEST_MESSAGE; MAV_CMD_DO_FLIGHTTERMINATION with 0
 
     # link
-    ground_station_parameter: str = ""  # its system id; "": known by its MAV_TYPE
-    target_component_checked: bool = False
-    ignored: frozenset[str] = frozenset()  # messages
-    # kinds of messages, as their names begin, that are ignored if they are sent to all systems (0)
+    ground_station_parameter: str = ""  # has its system id; "": its MAV_TYPE identifies it
+    target_component_checked: bool = False  # messages for another component are not handled
+    ignored: frozenset[str] = frozenset()  # messages that are not handled
+    # first words of the names of messages that are ignored if their target is all systems (0)
     never_to_all: frozenset[str] = frozenset()
-    text_suffix: str = ""
-    text_to_ground_stations_only: bool = False
+    text_suffix: str = ""  # of each STATUSTEXT
+    text_to_ground_stations_only: bool = False  # STATUSTEXTs wait for a ground station
     parameters_bytewise: bool = False  # PARAM_VALUE holds the bytes of an integer, not its value
     parameters_hashed: bool = False  # a list begins with _HASH_CHECK
     parameters_numbered: bool = False  # PARAM_VALUE.param_index is set also outside a list
-    accepted_unsigned: frozenset[int]  # messages that need no signature
-    stamps_follow_clock: bool = False  # else they only count, and follow those of others
+    accepted_unsigned: frozenset[int]  # ids of messages that need no signature
+    stamps_follow_clock: bool = False  # False: they only count, from the newest that was received
 
     # health
     # Seconds after boot, by event: "fix" (first GPS fix), "ready" and "ready without position"
-    # (from then on the pre-arm checks pass, in modes with and without need of a position), and
+    # (from then on the pre-arm checks pass in modes that need a position, and in the others), and
     # events in this firmware's rules
     boot_events_s: Mapping[str, float]
     sensor_bits: tuple[int, int, int]  # SYS_STATUS with a fix: present, enabled, healthy
-    fails_where_unarmable: bool = False  # disarmed in a mode that does not arm, its checks fail
-    velocity_ratio_squared: bool = False  # as it reports the innovation ratio of the velocity
-    battery_events: tuple[str, ...]  # of battery levels 1 on
+    fails_where_unarmable: bool = False  # while disarmed, checks fail in a mode that does not arm
+    velocity_ratio_squared: bool = False  # the velocity innovation ratio is reported squared
+    battery_events: tuple[str, ...]  # events of the battery levels 1, 2, ...
 
     # flight
-    return_faces_way: bool = False  # a return faces the direction of flight
-    # the position loop integrates during the takeoff ramp; else on the ground only after it
+    return_faces_way: bool = False  # during a return the nose points in the direction of flight
+    # the position loop integrates on the ground during the takeoff ramp; False: only after it
     integrates_on_ramp: bool = False
     place_below_is_descent: bool = False  # land detector: a place below is a demand to descend
-    flown_by_sticks: bool = False
+    flown_by_sticks: bool = False  # stick input is simulated
 
     def mode_named(self, name: str) -> Mode | None:
-        """Mode by its name, of which "AUTO." may be left out; None where there is none."""
+        """Return the mode of this name, in which "AUTO." may be left out, or None."""
         return self.modes.get(name) or self.modes.get(f"AUTO.{name}")
 
     @abstractmethod
     def command_mode(self, params: tuple[float, ...]) -> Asked:
-        """The request of MAV_CMD_DO_SET_MODE (176)."""
+        """Return what MAV_CMD_DO_SET_MODE (176) with these param1 .. param7 requests."""
 
     @abstractmethod
     def set_mode(self, base_mode: int, custom_mode: int) -> Asked:
-        """The request of SET_MODE, the deprecated message."""
+        """Return what the deprecated message SET_MODE requests."""
 
     @abstractmethod
     def arm_request(self, param: float) -> Asked:
-        """The request of MAV_CMD_COMPONENT_ARM_DISARM with this param1."""
+        """Return what MAV_CMD_COMPONENT_ARM_DISARM with this param1 requests."""
 
     @abstractmethod
     def attitude_setpoint(
         self, values: Mapping[str, Any], parameters: ParameterValues
     ) -> AttitudeSetpoint | MotionSetpoint | None:
-        """SET_ATTITUDE_TARGET as the firmware reads it; None: ignored without an answer."""
+        """Return the setpoint of SET_ATTITUDE_TARGET; None: the message is ignored without an
+        answer."""
 
     @abstractmethod
     def motion_setpoint(self, values: Mapping[str, Any]) -> MotionSetpoint | None:
-        """SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME 1; None where nothing is demanded."""
+        """Return the setpoint of SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME 1; None: it demands
+        nothing."""
 
     @abstractmethod
     def in_local_frame(
         self, values: Mapping[str, Any], estimate: StateEstimate
     ) -> Mapping[str, Any]:
-        """Fields of SET_POSITION_TARGET_LOCAL_NED in another frame, as those in MAV_FRAME 1."""
+        """Convert fields of SET_POSITION_TARGET_LOCAL_NED from another frame to MAV_FRAME 1."""
 
     def setpoint_rejection(self, message: str, frame: int | None) -> StatusText | None:
-        """Text about this message in an unknown MAV_FRAME, or (None) without any demand."""
+        """Return the text about a setpoint message in an unknown MAV_FRAME, or (`frame` None) with
+        no demand."""
         return None
 
     @abstractmethod
     def mission_refusal(self, item: MissionItem) -> tuple[int, StatusText | None] | None:
-        """MAV_MISSION_RESULT and text with which an item is refused; None: it is taken."""
+        """Return MAV_MISSION_RESULT and text of the refusal of an item; None: it is accepted."""
 
     def is_ground_station(self, kind: int, system: int, parameters: ParameterValues) -> bool:
-        """Whether a heartbeat with this MAV_TYPE and system id is a ground station's."""
+        """Whether a heartbeat with this MAV_TYPE and system id comes from a ground station."""
         name = self.ground_station_parameter
         return system == parameters[name] if name else kind == _MAV_TYPE_GCS
 
     def obeys_system(self, sender: int, own: int, parameters: ParameterValues) -> bool:
-        """Whether messages of this system id are handled."""
+        """Whether messages from the system id `sender` are handled."""
         return True
 
     @abstractmethod
     def battery_level(self, battery: BatteryState, parameters: ParameterValues) -> int:
-        """0: good; each further level has an event in `battery_events`."""
+        """Return the battery level: 0 is good, each other one has an event in `battery_events`."""
 
     @abstractmethod
     def return_height_m(self, distance_m: float, parameters: ParameterValues) -> float:
-        """Height of a return above home, by the distance to it."""
+        """Return the height above home at which a return from this distance flies."""

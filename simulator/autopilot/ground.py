@@ -1,4 +1,4 @@
-"""Leaving the ground and reaching it: the takeoff ramp and the land detector.
+"""The takeoff ramp and the land detector.
 
 Both know time, thrust and parameters; neither knows a mode.
 """
@@ -13,20 +13,20 @@ from simulator.autopilot.state import StateEstimate
 from simulator.geodesy import GRAVITY_MPS2
 from simulator.steps import LOOP_S
 
-_AIRBORNE_S = 0.1  # off the ground until it is no longer landed
-_SMOOTHING_S = 0.2
-_LANDED_FACTOR = 2.5  # by which the limits are wider once landed
+_AIRBORNE_S = 0.1  # time off the ground after which the vehicle is no longer landed
+_SMOOTHING_S = 0.2  # time constant of the low-pass of the vertical speed
+_LANDED_FACTOR = 2.5  # factor on the motion limits while landed
 
 
 @dataclass(slots=True)
 class TakeoffRamp:
-    """The motors spool up, then the allowed climb rate rises until the vehicle lifts off.
+    """Takeoff ramp: the motors spool up, then the limit of the climb rate increases.
 
     The ramp begins at the climb rate for which the position loop demands no thrust.
     """
 
     parameters: ParameterTable
-    flying: bool = False  # in the air, the ramp has ended
+    flying: bool = False  # whether the vehicle is in the air and the ramp has ended
     _spool_left_s: float = 0.0
     _ramp_s: float = 0.0
 
@@ -36,29 +36,30 @@ class TakeoffRamp:
 
     @property
     def lifting(self) -> bool:
-        """On the ramp, on the ground or just off it."""
+        """Whether the ramp runs, with the vehicle on the ground or just above it."""
         return not self.flying and self._ramp_s > 0.0
 
     def arm(self) -> None:
-        """The motors start."""
+        """Begin to spool up the motors."""
         self.land()
         self._spool_left_s = self.parameters.role("spool_up_s")
 
     def land(self) -> None:
-        """On the ground with the motors running."""
+        """Reset the ramp: the vehicle is on the ground with the motors running."""
         self._ramp_s, self.flying = 0.0, False
 
     def skip(self) -> None:
-        """The vehicle is in the air without a ramp."""
+        """End spool-up and ramp: the vehicle is in the air already."""
         self._spool_left_s, self.flying = 0.0, True
 
     @property
     def ramp_ended(self) -> bool:
-        """The allowed climb rate has its final value; a heavy vehicle may still stand."""
+        """Whether the limit of the climb rate has its final value; a heavy vehicle may still be on
+        the ground then."""
         return self._ramp_s >= self.parameters.role("takeoff_ramp_s")
 
     def step(self, *, climb_demanded: bool, landed: bool) -> None:
-        """One period of LOOP_S."""
+        """Advance by one period of LOOP_S."""
         if self.spooling:
             self._spool_left_s -= LOOP_S
         elif not self.flying and (climb_demanded or self._ramp_s > 0.0):
@@ -68,7 +69,7 @@ class TakeoffRamp:
                 self.land()
 
     def climb_limit_mps(self) -> float:
-        """Allowed climb rate; negative, a descent, at first."""
+        """Limit of the climb rate; at first it is negative, a descent."""
         if self.flying:
             return math.inf
         role = self.parameters.role
@@ -79,40 +80,42 @@ class TakeoffRamp:
 
 @dataclass(slots=True)
 class LandDetector:
-    """Land detector: low thrust and no motion are ground contact, and later a landing.
+    """Land detector: low thrust without motion is ground contact; with idle thrust and without
+    rotation, lasting contact is a landing.
 
-    It uses the estimate, so a drifting one delays it. With ground contact the motors idle.
+    It uses the estimate, so a drifting estimate delays it. With ground contact the position
+    controller lets the motors idle.
     """
 
     parameters: ParameterTable
     landed: bool = True
-    _contact_s: float = 0.0  # how long there is contact, no motion, no ground
-    _still_s: float = 0.0
-    _air_s: float = 0.0
-    _velocity_mps: float = 0.0  # down, estimated, smoothed
-    _slope_mps: float = 0.0  # of the estimated height, smoothed
+    _contact_s: float = 0.0  # duration of low thrust on the ground without motion
+    _still_s: float = 0.0  # duration of contact with idle thrust and without rotation
+    _air_s: float = 0.0  # time off the ground
+    _velocity_mps: float = 0.0  # estimated velocity down, smoothed
+    _slope_mps: float = 0.0  # derivative of the estimated position down, smoothed
     _down_m: float = math.nan
 
     @property
     def contact(self) -> bool:
-        """The vehicle touches the ground and needs no thrust."""
+        """Whether ground contact is detected."""
         return self._contact_s >= self.parameters.role("contact_s")
 
     def set_landed(self, landed: bool) -> None:
-        """Landed or not, whatever was detected."""
+        """Set the landed state, whatever was detected before."""
         self.reset()
         self.landed, self._air_s = landed, 0.0
 
     def reset(self) -> None:
-        """No ground contact."""
+        """Forget the ground contact."""
         self._contact_s = self._still_s = self._velocity_mps = self._slope_mps = 0.0
         self._down_m = math.nan
 
     def step(
         self, estimate: StateEstimate, thrust: float, *, by_motion: bool, descends: bool
     ) -> None:
-        """One period of LOOP_S. `by_motion`: the vertical loop makes the thrust; `descends`: it
-        has a demand to descend."""
+        """Advance by one period of LOOP_S. `by_motion`: whether the position loop, not an attitude
+        setpoint, demands the thrust. `descends`: whether a descent is demanded."""
         self._air_s = 0.0 if estimate.on_ground else self._air_s + LOOP_S
         if not (estimate.on_ground or self.landed):
             self.reset()

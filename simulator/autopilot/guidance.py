@@ -1,6 +1,6 @@
-"""Guidance: which motion the vehicle flies, by the behaviour of its mode.
+"""Guidance: the motion that the vehicle flies, according to the behaviour of its mode.
 
-Home, the place to hold and a client's setpoint outlive a change of mode; every behaviour
+Home, the place to hold and a client's setpoint are kept when the mode changes; every behaviour
 (`simulator.autopilot.behaviours`) reads and changes them here. NED, SI. Knows no modes by name, no
 thrust and no attitude loop: the position controller flies the motion.
 """
@@ -27,44 +27,45 @@ Setpoint = AttitudeSetpoint | MotionSetpoint
 class ActiveBehaviour:
     """Holds position (`guidance.hold`); the base class of the other behaviours.
 
-    There is a new object each time that its mode is entered. The defaults are those of automatic
-    flight that starts in the air and does not end by itself.
+    A new object is made each time a mode is entered. The defaults are those of automatic flight
+    that starts in the air and does not end by itself.
     """
 
-    lifts_off: ClassVar[bool] = False  # may leave the ground
-    cannot_climb = False  # a takeoff whose target is not above the vehicle
+    lifts_off: ClassVar[bool] = False  # whether it may leave the ground
+    cannot_climb = False  # whether the vehicle stays on the ground, whatever motion is demanded
 
     def __init__(self, guidance: Guidance) -> None:
         self.guidance = guidance
 
     def enter(self, estimate: StateEstimate, place_ned_m: Triple, *, landed: bool) -> None:
-        """Begin, before the first `motion`. `place_ned_m`: where a takeoff climbs to; NaN where it
-        is not specified."""
+        """Begin; called before the first `motion`. `place_ned_m` is the place to which a takeoff
+        climbs, with NaN for coordinates that are not specified."""
 
     def leave(self) -> None:
-        """End: another behaviour begins."""
+        """End, because another behaviour begins."""
 
     def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
-        """Motion demanded in this period; by default `guidance.hold`."""
+        """Return the motion demanded in this period of the position loop."""
         return self.guidance.hold
 
     def keeps_place(self, following: Behaviour) -> bool:
-        """The behaviour that follows holds the same place; else it holds where it stops."""
+        """Whether the behaviour `following` holds the same place; otherwise it holds the place
+        where the vehicle stops."""
         return False
 
     @property
     def landing(self) -> bool:
-        """In the final descent."""
+        """Whether the vehicle is in the final descent of a landing."""
         return False
 
     @property
     def climbing(self) -> bool:
-        """In an automatic takeoff."""
+        """Whether the vehicle is in an automatic takeoff."""
         return False
 
     @property
     def automatic(self) -> bool:
-        """Speeds and turn rates are those of automatic flight."""
+        """Whether the speed and turn rate limits of automatic flight apply."""
         return True
 
     @property
@@ -76,8 +77,8 @@ class ActiveBehaviour:
 class Guidance:
     """Carries out one behaviour at a time.
 
-    `sticks` is None for a firmware whose sticks are not simulated (PX4). `events` are reported to
-    the commander at each step.
+    `sticks` is None for a firmware whose stick input is not simulated (PX4). The autopilot gives
+    `events` to the commander at each step.
     """
 
     def __init__(
@@ -91,27 +92,27 @@ class Guidance:
         self.events = mission.events
         self.sticks = Sticks() if firmware.flown_by_sticks else None
         self.newest: Setpoint | None = None  # setpoint of a client
-        self.newest_s = -math.inf  # time of the last one that was accepted
+        self.newest_s = -math.inf  # time since boot of the newest accepted setpoint message
         self.hold = MotionSetpoint(ORIGIN)
         self.home_ned_m = ORIGIN
         self.home_yaw_rad = 0.0
-        self.cruise_mps = math.inf  # requested for automatic flight; inf: none
+        self.cruise_mps = math.inf  # speed requested for automatic flight; inf: none
         self.region_ned_m: tuple[float, float] | None = (
-            None  # of interest, faced while it holds a place or follows setpoints without a yaw
+            None  # region of interest, faced while holding or following setpoints without a yaw
         )
         self._behaviours = behaviours
         self.behaviour = Behaviour.HOLD
         self.active = behaviours[Behaviour.HOLD](self)
-        self._entered = True  # `active.enter` was called
-        self._place_ned_m = NAN3  # for `active.enter`
-        self._level: AttitudeSetpoint | None = None  # the last of `level_off`
+        self._entered = True  # whether `active.enter` was called
+        self._place_ned_m = NAN3  # argument of `active.enter`
+        self._level: AttitudeSetpoint | None = None  # setpoint of the last `level_off`
 
     # -- what is flown -----------------------------------------------------------------------
 
     def enter(
         self, behaviour: Behaviour, estimate: StateEstimate, place_ned_m: Triple = NAN3
     ) -> None:
-        """Begin a behaviour. `place_ned_m`: where a takeoff climbs to."""
+        """Begin a behaviour. `place_ned_m` is the place to which a takeoff climbs."""
         if not self.active.keeps_place(behaviour):
             self.hold = MotionSetpoint(stopping_place_ned_m(estimate))
         if behaviour is not self.behaviour:
@@ -122,26 +123,26 @@ class Guidance:
         self._entered, self._place_ned_m = False, place_ned_m
 
     def arm(self, estimate: StateEstimate) -> None:
-        """The motors start: set home."""
+        """Set home and the place to hold, when the motors start."""
         self.home_ned_m, self.home_yaw_rad = estimate.position_ned_m, estimate.yaw_rad
         self.hold = MotionSetpoint(estimate.position_ned_m)
         self.mission.pause()
 
     def follow(self, setpoint: Setpoint) -> None:
-        """Take a client's setpoint. Where setpoints are flown as automatic flight (ArduCopter), a
-        setpoint of another kind resets the requested speed."""
+        """Follow a client's setpoint. Where setpoints are flown as automatic flight (ArduCopter), a
+        setpoint of another kind than the last one resets the requested speed."""
         if self.firmware.setpoints_as_automatic and _kind(setpoint) != _kind(self.newest):
             self.cruise_mps = math.inf
         self.newest = setpoint
 
     def level_off(self, estimate: StateEstimate) -> None:
-        """The stream of attitude setpoints is lost: level attitude, present yaw and height."""
+        """Keep a level attitude, the yaw and the height, after attitude setpoints were lost."""
         self.newest = self._level = AttitudeSetpoint(
             level(estimate.yaw_rad), None, 0.0, climb_mps=0.0
         )
 
     def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
-        """Motion of this period."""
+        """Return the motion of this period of the position loop."""
         if not self._entered:
             self._entered = True
             self.active.enter(estimate, self._place_ned_m, landed=landed)
@@ -155,24 +156,26 @@ class Guidance:
     # -- setpoint, place and speed -----------------------------------------------------------
 
     def stream_alive(self, now_s: float) -> bool:
-        """Whether setpoints still arrive. A loss counts `stream_reaction_s` after the time-out."""
+        """Whether setpoints still arrive. They count as lost `stream_reaction_s` after the
+        time-out."""
         role = self.parameters.role
         age_s = now_s - self.newest_s - role("stream_reaction_s")
         return age_s <= role("stream_timeout_s")
 
     @property
     def setpoint(self) -> Setpoint | None:
-        """The setpoint that is followed; None in other behaviours."""
+        """The setpoint that the vehicle follows; None in other behaviours."""
         return self.newest if self.behaviour is Behaviour.SETPOINT else None
 
     @property
     def follows_attitude(self) -> bool:
-        """A client's attitude setpoint is followed."""
+        """Whether the vehicle follows a client's attitude setpoint."""
         return isinstance(self.setpoint, AttitudeSetpoint) and self.setpoint is not self._level
 
     @property
     def follows_velocity(self) -> bool:
-        """A setpoint with a velocity or an acceleration is followed, which must be repeated."""
+        """Whether the vehicle follows a setpoint with a velocity or an acceleration, which a client
+        must repeat."""
         if not isinstance(self.setpoint, MotionSetpoint):
             return False
         rates = (*self.setpoint.velocity_ned_mps, *self.setpoint.acceleration_ned_mps2)
@@ -180,17 +183,19 @@ class Guidance:
 
     @property
     def hold_ned_m(self) -> Triple:
-        """The place to hold."""
+        """The place that the vehicle holds."""
         return self.hold.position_ned_m
 
     def hold_at(self, place_ned_m: Triple, yaw_rad: float) -> None:
-        """Hold a place that a client names; a NaN yaw faces the direction of flight."""
+        """Hold a place that a client names. With a NaN yaw the nose points in the direction of
+        flight."""
         self.hold = MotionSetpoint(place_ned_m, yaw_rad=yaw_rad, faces_way=True)
         if self.behaviour is Behaviour.SETPOINT:
             self.follow(self.hold)
 
     def turn_to(self, yaw_rad: float, turn_radps: float, sense: float) -> None:
-        """Keep this yaw while holding a place or following a setpoint."""
+        """Turn to this yaw and keep it while the vehicle holds a place or follows a setpoint.
+        `sense` is as in `MotionSetpoint.turn_sense`."""
         self.region_ned_m = None
 
         def turned(setpoint: MotionSetpoint) -> MotionSetpoint:
@@ -211,13 +216,13 @@ class Guidance:
 
 
 def stopping_place_ned_m(estimate: StateEstimate) -> Triple:
-    """Where the vehicle stops when it brakes now."""
+    """Place at which the vehicle stops if it brakes now."""
     (x, y, z), (vx, vy, vz) = estimate.position_ned_m, estimate.velocity_ned_mps
     return (x + 0.5 * vx, y + 0.5 * vy, z + 0.2 * vz)
 
 
 def _kind(setpoint: Setpoint | None) -> tuple[bool, ...]:
-    """What a setpoint demands: an attitude, or which of position and velocity."""
+    """Kind of a setpoint: whether there is one, or which of position and velocity it demands."""
     if not isinstance(setpoint, MotionSetpoint):
         return (setpoint is not None,)
     given = (setpoint.position_ned_m, setpoint.velocity_ned_mps)

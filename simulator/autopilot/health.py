@@ -1,7 +1,7 @@
-"""Start of the autopilot, its pre-arm checks, and events that nobody requests: ground station,
-battery, position, takeoff, landing, automatic disarming.
+"""Boot events, pre-arm checks, and the events that nobody requests: of ground station, battery,
+position, takeoff, landing and automatic disarming.
 
-Time limits are the firmware's; its state table decides what an event does and what is refused.
+The firmware defines time limits; its state table decides what an event does and what is refused.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ MONITOR_STEPS = 25  # 0.1 s
 
 
 class Health:
-    """Health of one vehicle from boot on; `boot_scale` multiplies the times of its start.
+    """Health of one vehicle from boot on; `boot_scale` multiplies the times of the boot events.
 
-    Ground station, battery and position are monitored; each event is reported once. It also
-    reports take-off, landing and an armed vehicle that stays on the ground.
+    It monitors ground station, battery and position, and reports each event once. It also reports
+    takeoff, landing, and an armed vehicle that stays on the ground. Times are seconds since boot.
     """
 
     def __init__(self, guidance: Guidance, boot_scale: float) -> None:
@@ -31,12 +31,12 @@ class Health:
         times_s = firmware.boot_events_s.items()
         self._ahead = sorted((at_s * boot_scale, event) for event, at_s in times_s)
         self.ground_station_lost = False
-        self.position_lost = False  # since a fault took the GPS fix away
-        self._heartbeat_s = math.nan  # last one of a ground station
-        self._battery_level = 0  # reported; of `firmware.battery_events`
-        self._worse_s = math.nan  # since when the level is above that
-        self._fix_s = -math.inf  # last one
-        self._flown = False  # since arming
+        self.position_lost = False  # for lack of a GPS fix
+        self._heartbeat_s = math.nan  # time of the last one from a ground station
+        self._battery_level = 0  # last level that was reported (`Firmware.battery_level`)
+        self._worse_s = math.nan  # time since which the level is greater than that
+        self._fix_s = -math.inf  # time of the last GPS fix
+        self._flown = False  # whether the vehicle was in the air since arming
         self._armed_s = self._landed_s = -math.inf
 
     # -- events ------------------------------------------------------------------------------
@@ -62,7 +62,7 @@ class Health:
             yield "position lost" if lost else "position found"
 
     def _ground_station(self, now_s: float) -> Iterator[str]:
-        """A ground station that was never heard is not lost."""
+        """Event of a lost or found ground station. One that was never heard is not lost."""
         role = self._parameters.role
         timeout_s = role("ground_station_timeout_s") + role("ground_station_stays_s")
         lost = now_s - self._heartbeat_s > timeout_s
@@ -71,7 +71,8 @@ class Health:
             yield "ground station lost" if lost else "ground station found"
 
     def _battery(self, now_s: float, armed: bool, battery: BatteryState) -> Iterator[str]:
-        """A level is reported when it lasts; in flight it only gets worse."""
+        """Event of a battery level, when it has lasted. While the vehicle is armed, only a level
+        greater than the last one is reported."""
         level = 0
         if armed:
             level = self._firmware.battery_level(battery, self._parameters)
@@ -87,11 +88,11 @@ class Health:
             yield self._firmware.battery_events[level - 1]
 
     def arm(self, now_s: float, landed: bool) -> None:
-        """The motors start, on the ground or in the air."""
+        """Note that the motors start, on the ground or in the air."""
         self._flown, self._armed_s = not landed, now_s
 
     def flight(self, now_s: float, was_landed: bool, landed: bool) -> Iterator[str]:
-        """The event of leaving or reaching the ground, armed."""
+        """Events of takeoff and landing of an armed vehicle."""
         if was_landed and not landed:
             self._flown = True
             yield "took off"
@@ -100,7 +101,8 @@ class Health:
             yield "landed"
 
     def timeout(self, now_s: float, landed: bool) -> Iterator[str]:
-        """The event of an armed vehicle that stays on the ground, after a flight or without one."""
+        """Event of an armed vehicle that stays on the ground: "settled" after a flight, otherwise
+        "idle"."""
         if not landed:
             return
         event, since_s, role = "idle", self._armed_s, "disarm_idle_s"
@@ -120,7 +122,8 @@ class Health:
         return now_s - self._fix_s
 
     def passes(self, mode: Mode, now_s: float, *, latched: bool, armed: bool) -> bool:
-        """The pre-arm checks pass for this mode. `latched`: a failure that only a reboot clears."""
+        """Whether the pre-arm checks pass in this mode. `latched`: whether there is a failure that
+        only a reboot clears."""
         firmware = self._firmware
         ready = "ready" if mode.needs_position else "ready without position"
         if latched or ready not in self.reached or (mode.needs_position and self.position_lost):
@@ -136,7 +139,7 @@ class Health:
         return not needs_stream or self._guidance.stream_alive(now_s)
 
     def can_run(self, mode: Mode, now_s: float) -> bool:
-        """A vehicle in the air may enter this mode."""
+        """Whether an armed vehicle may enter this mode."""
         if mode.behaviour is Behaviour.SETPOINT:
             return self._guidance.stream_alive(now_s)
         if mode.behaviour is Behaviour.MISSION:

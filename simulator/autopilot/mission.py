@@ -1,7 +1,7 @@
 """A mission: its items, its progress, and the place to fly to.
 
-What it reaches (an item, its end, an item that returns home) is an event. Knows positions and time;
-knows no modes, no links and no protocol (`simulator.mavlink.transfers`).
+It raises an event when it reaches an item, its end, or an item that returns home. Knows positions
+and time; knows no modes, no links and no protocol (`simulator.mavlink.transfers`).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ ITEMS_MAX = 500
 
 
 class Kind(IntEnum):
-    """MAV_CMD that are flown; every other item is passed over."""
+    """MAV_CMDs of items that are carried out; other items count as reached and are skipped."""
 
     WAYPOINT = 16
     LOITER_UNLIMITED = 17
@@ -36,16 +36,17 @@ class Kind(IntEnum):
 _PLACES = frozenset(
     {Kind.WAYPOINT, Kind.LOITER_UNLIMITED, Kind.LOITER_TIME, Kind.LAND, Kind.TAKEOFF}
 )
-_TIMED = frozenset({Kind.WAYPOINT, Kind.LOITER_TIME, Kind.DELAY})  # param1: s to stay
+_TIMED = frozenset({Kind.WAYPOINT, Kind.LOITER_TIME, Kind.DELAY})  # param1: duration of stay, s
 
 
 @dataclass(slots=True)
 class Mission:
-    """Items and progress of one vehicle's mission. The commander takes its `events`."""
+    """Items and progress of one vehicle's mission. The autopilot gives `events` to the
+    commander."""
 
     firmware: Firmware
     parameters: ParameterTable
-    # by MAV_MISSION_TYPE: the mission, and fences and rally points, which have no effect
+    # by MAV_MISSION_TYPE: items of the mission; fences and rally points, which have no effect
     stored: dict[int, tuple[MissionItem, ...]] = field(
         default_factory=lambda: {0: (), 1: (), 2: ()}
     )
@@ -55,47 +56,47 @@ class Mission:
     under_way: bool = False
     speed_mps: float = math.inf
     events: list[str] = field(default_factory=list)
-    _climb_down_m: float = math.nan  # on the ground: first climb vertically to this height
-    _since_s: float = math.nan  # when the current place was reached
+    _climb_down_m: float = math.nan  # NED down to which it climbs vertically from the ground first
+    _since_s: float = math.nan  # time at which the current place was reached
     _target_ned_m: Triple = NAN3
-    _approaching: bool = False  # a place that was not near at once
+    _approaching: bool = False  # whether the current place was not yet reached in the last call
 
     @property
     def items(self) -> tuple[MissionItem, ...]:
-        """Those of the mission."""
+        """Items of the mission itself."""
         return self.stored[0]
 
     @property
     def first(self) -> int:
-        """Number of the item with which it begins."""
+        """Number of the item with which the mission begins."""
         return int(self.firmware.home_item_first)
 
     @property
     def flyable(self) -> bool:
-        """There is a place or a return."""
+        """Whether the mission has a place or a return."""
         flown = _PLACES | {Kind.RETURN}
         return any(item.command in flown for item in self.items[self.first :])
 
     @property
     def takes_off(self) -> bool:
-        """Its first place is a takeoff."""
+        """Whether the first place of the mission is a takeoff."""
         places = (item.command for item in self.items[self.first :] if item.command in _PLACES)
         return next(places, None) == Kind.TAKEOFF
 
     def store(self, items: tuple[MissionItem, ...], kind: int = 0) -> None:
-        """Replace the items of a kind; the mission starts from its beginning."""
+        """Replace the items of a MAV_MISSION_TYPE. A new mission starts from its beginning."""
         self.stored[kind] = items
         if kind:
             return
         if self.under_way and not items:
             self.events.append("mission cleared")
-        self.parameters.set("MIS_TOTAL", len(items))  # which PX4 has not
+        self.parameters.set("MIS_TOTAL", len(items))  # PX4 has no such parameter
         self.current, self.reached, self.finished = self.first, -1, False
         self.speed_mps, self._since_s = math.inf, math.nan
 
     def go_to(self, number: int) -> bool:
-        """Continue with this item, for home (ArduCopter) with the first one; False where there is
-        none."""
+        """Continue with this item, or with the first one if `number` is home's (ArduCopter). Return
+        False if there is no such item."""
         item = max(number, self.first)
         if number < 0 or item >= len(self.items):
             return False
@@ -104,22 +105,22 @@ class Mission:
         return True
 
     def pause(self) -> None:
-        """Stop flying it; the next `fly` continues it."""
+        """Interrupt the mission; the next `fly` continues it."""
         self.under_way = False
 
     @property
     def climbing(self) -> bool:
-        """Climbing vertically from the ground."""
+        """Whether the vehicle climbs vertically from the ground."""
         return self.under_way and not math.isnan(self._climb_down_m)
 
     @property
     def landing(self) -> bool:
-        """Above the place of a landing item, descending."""
+        """Whether the vehicle has reached the place of a landing item and descends."""
         reached = not math.isnan(self._since_s) and self.current < len(self.items)
         return reached and self.items[self.current].command == Kind.LAND
 
     def fly(self, estimate: StateEstimate, home_ned_m: Triple, *, landed: bool) -> MotionSetpoint:
-        """The place to be at now; the descent of a landing is the caller's."""
+        """Return the place to fly to now; the caller replaces it in the descent of a landing."""
         if not self.under_way:
             self._begin(estimate.position_ned_m, home_ned_m, landed)
         if not math.isnan(self._climb_down_m):
@@ -139,7 +140,7 @@ class Mission:
         return MotionSetpoint(self._target_ned_m, yaw_rad=self._yaw_rad(item), faces_way=True)
 
     def _begin(self, here_ned_m: Triple, home_ned_m: Triple, landed: bool) -> None:
-        """Start, or continue where it was paused; a finished one starts again."""
+        """Start the mission, or continue it where it was paused. A finished one starts again."""
         self.under_way = True
         if self.finished:
             self.go_to(0)
@@ -154,11 +155,11 @@ class Mission:
 
     @property
     def _has_item(self) -> bool:
-        """There is an item to fly."""
+        """Whether there is an item left to fly."""
         return not self.finished and self.current < len(self.items)
 
     def _progress(self, item: MissionItem, estimate: StateEstimate, landed: bool) -> None:
-        """Check whether the place is reached, and whether the stay there is over."""
+        """Check whether the place of an item is reached, and whether the stay there is over."""
         lands = item.command == Kind.LAND
         if math.isnan(self._since_s) and self._near(item, estimate.position_ned_m):
             self._since_s = estimate.time_s
@@ -172,7 +173,7 @@ class Mission:
             self._advance()
 
     def _run_settings(self) -> None:
-        """Items that take no time; only the last of several is reported."""
+        """Carry out items that take no time; of several in a row, only the last is reported."""
         while self._has_item:
             item = self.items[self.current]
             if item.command in _PLACES or item.command == Kind.DELAY:
@@ -210,7 +211,7 @@ class Mission:
     # -- items -------------------------------------------------------------------------------
 
     def _position(self, item: MissionItem, home_ned_m: Triple) -> Triple:
-        """NED; an item without coordinates keeps the present ones."""
+        """NED position of an item. An item without coordinates has those of the last place."""
         north, east = to_metres(self.firmware.origin, item.x * 1e-7, item.y * 1e-7)
         if item.x == 0 and item.y == 0:
             north, east = self._target_ned_m[:2]
@@ -242,7 +243,7 @@ class Mission:
         return stay_s if math.isfinite(stay_s) else 0.0
 
     def _yaw_rad(self, item: MissionItem) -> float:
-        """NaN: face the direction of flight."""
+        """Yaw that an item demands; NaN: the nose points in the direction of flight."""
         yaw_deg = item.params[3]
         if item.command in self.firmware.turning_items and math.isfinite(yaw_deg):
             return wrap_pi(math.radians(yaw_deg))

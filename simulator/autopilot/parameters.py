@@ -1,6 +1,6 @@
-"""The vehicle's parameters: values, ranges, and their form on the wire.
+"""The vehicle's parameters: values, ranges, and their encoding in PARAM_VALUE and PARAM_SET.
 
-Names, types and ranges are the firmware's. Knows no socket.
+The firmware defines names, types and ranges. Knows no socket.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Mapping
 
 from simulator.autopilot.firmware import RANGES, Firmware, ParameterSpec, Role
 
-HASH = "_HASH_CHECK"  # name under which the checksum of all values is read
+HASH = "_HASH_CHECK"  # pseudo-parameter of PX4: checksum of all names and values
 MAV_PARAM_TYPE_UINT32 = 5
 MAV_PARAM_TYPE = {"int8": 2, "int16": 4, "int32": 6, "real32": 9}
 _FLOAT, _INT, _UNSIGNED = struct.Struct("<f"), struct.Struct("<i"), struct.Struct("<I")
@@ -33,18 +33,18 @@ class ParameterTable:
         return name in self._specs
 
     def __getitem__(self, name: str) -> float:
-        """The value in effect: limited to its range, the default in place of NaN."""
+        """The value that the vehicle uses: limited to its range; the default in place of NaN."""
         spec, value = self._specs[name], self._values[name]
         if math.isnan(value):
             return spec.default
         return min(spec.maximum, max(spec.minimum, value))
 
     def role(self, role: str) -> float:
-        """The value that this firmware has for `role`, in SI units."""
+        """The value of `role` in this firmware, in SI units."""
         return self._roles[role]
 
     def _take_roles(self) -> None:
-        """Compute all roles; called when a parameter changes, because each step reads many."""
+        """Compute the values of all roles; they are stored because each step reads many of them."""
         self._roles = {role: self._read(source) for role, source in self._sources.items()}
 
     def _read(self, source: Role) -> float:
@@ -55,7 +55,8 @@ class ParameterTable:
         return source(self) if callable(source) else source
 
     def set(self, name: str, value: float) -> bool:
-        """Set one; False (and unchanged) where it is unknown, not finite or out of range."""
+        """Set a parameter. Return False, without a change, if the name is unknown or the value is
+        not finite or out of range."""
         spec = self._specs.get(name)
         if spec is None or not spec.minimum <= value <= spec.maximum:
             return False
@@ -63,10 +64,11 @@ class ParameterTable:
         return True
 
     def set_from_wire(self, name: str, wire: float, kind: int) -> bool:
-        """Set from PARAM_SET, also out of range; False where it is not answered.
+        """Set a parameter from PARAM_SET, also out of range. Return False if the message is ignored
+        without an answer.
 
-        An integer is sent as its bytes, and then its type must fit, or as its value, and then any
-        type is accepted and NaN is not.
+        Where integers are sent as their bytes (PX4), a wrong type is ignored; where they are sent
+        as values (ArduPilot), any type is accepted and NaN is ignored.
         """
         spec = self._specs.get(name)
         if spec is None or (self._bytewise and kind != MAV_PARAM_TYPE[spec.kind]):
@@ -79,7 +81,7 @@ class ParameterTable:
         return True
 
     def to_wire(self, name: str) -> tuple[float, int]:
-        """param_value and param_type of PARAM_VALUE."""
+        """Return param_value and param_type of PARAM_VALUE."""
         spec, value = self._specs[name], self._values[name]
         if self._is_bytewise(spec):
             value = _FLOAT.unpack(_INT.pack(int(value)))[0]
@@ -87,7 +89,8 @@ class ParameterTable:
 
     @property
     def hash_on_wire(self) -> float:
-        """CRC-32 (no inversion) of names and values, by which clients recognise a known table."""
+        """CRC-32 (without inversion) of names and values, by which a client recognises a table that
+        it has stored."""
         crc = 0
         for name, spec in self._specs.items():
             value = self._values[name]

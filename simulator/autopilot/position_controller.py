@@ -1,8 +1,8 @@
 """The position controller: flies the motion of the guidance or an attitude setpoint.
 
-Motion and estimate in, demand on the attitude loop out; takeoff ramp and land detector. Knows time
-and parameters; knows no modes by name, no rules and no MAVLink. The commander
-(`simulator.autopilot.commander`) decides about modes.
+From motion and estimate it computes the demand on the attitude loop; it contains takeoff ramp and
+land detector. Knows time and parameters; knows no modes by name, no state table and no MAVLink. The
+commander (`simulator.autopilot.commander`) decides about modes.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from simulator.autopilot.values import NAN3, AttitudeSetpoint, Behaviour, Motion
 from simulator.steps import LOOP_S
 from simulator.vehicle.attitude import Demand
 
-_TILT_COSINE_MIN = 0.1  # the tilt raises the thrust to no more than ten times
-_HIGHER_M = 0.01  # a demanded place on the ground; less is the noise of the estimate
+_TILT_COSINE_MIN = 0.1  # limit of the tilt compensation: at most ten times the thrust
+_HIGHER_M = 0.01  # a demanded place is above the vehicle; less is noise of the estimate
 OFF = Demand()
 
 
@@ -32,23 +32,23 @@ class PositionController:
         self.loop = PositionLoop(parameters)
         self.detector = LandDetector(parameters)
         self._ramp = TakeoffRamp(parameters)
-        self.demand = OFF  # in force
-        self.thrust_demanded = 0.0  # before it is raised for the tilt
-        self.motion = MotionSetpoint()  # last one flown
-        self._setpoint: AttitudeSetpoint | None = None  # last one flown
+        self.demand = OFF  # present demand on the attitude loop
+        self.thrust_demanded = 0.0  # before the tilt compensation
+        self.motion = MotionSetpoint()  # last motion flown
+        self._setpoint: AttitudeSetpoint | None = None  # last attitude setpoint flown
         self._attitude = level(0.0)
         self._next_loop_s = 0.0
         self._armed_for_s = 0.0
-        self._climb_thrust = 0.0  # of an attitude setpoint with a climb rate
-        self._velocity_down_mps = 0.0  # setpoint of the velocity loop
+        self._climb_thrust = 0.0  # thrust for an attitude setpoint with a climb rate
+        self._velocity_down_mps = 0.0  # vertical setpoint of the velocity loop
 
     @property
     def landed(self) -> bool:
-        """The land detector's result."""
+        """Whether the land detector considers the vehicle landed."""
         return self.detector.landed
 
     def enter(self, behaviour: Behaviour, place_ned_m: Triple = NAN3) -> None:
-        """Begin a behaviour. `place_ned_m`: where a takeoff climbs to."""
+        """Begin a behaviour. `place_ned_m` is the place to which a takeoff climbs."""
         self._guidance.enter(behaviour, self._state.estimate, place_ned_m)
         self._next_loop_s = 0.0
         self._setpoint = None
@@ -65,12 +65,12 @@ class PositionController:
         self.loop.reset(self._state.estimate.yaw_rad)
 
     def level_off(self) -> None:
-        """The stream of attitude setpoints is lost: level attitude, present yaw and height."""
+        """Keep a level attitude, the yaw and the height, after attitude setpoints were lost."""
         self._guidance.level_off(self._state.estimate)
         self.loop.reset(self._state.estimate.yaw_rad)
 
     def step(self, armed: bool) -> Demand:
-        """Demand for the step that begins now."""
+        """Return the demand for the step that begins now."""
         if not armed:
             self.demand, self._setpoint, self.thrust_demanded = OFF, None, 0.0
             if not self.landed and self._state.estimate.on_ground:
@@ -88,7 +88,7 @@ class PositionController:
         return self.demand
 
     def _run_loop(self, setpoint: AttitudeSetpoint | None, estimate: StateEstimate) -> None:
-        """One period of the position loop."""
+        """Run one period of the position loop."""
         behaviour = self._guidance.behaviour
         if behaviour is Behaviour.LEVEL:
             thrust = self._parameters.role("stick_thrust_least")
@@ -103,7 +103,7 @@ class PositionController:
         self._detect_landing(setpoint, estimate)
 
     def _demand(self, demand: Demand) -> None:
-        """An equal demand stays the same object, which the plant does not encode again."""
+        """Set the demand. An equal one keeps the old object, which the plant has encoded already."""
         if demand != self.demand:
             self.demand = demand
 
@@ -114,7 +114,7 @@ class PositionController:
         return self._parameters.role("tilt_boost") != 0.0
 
     def _take(self, setpoint: AttitudeSetpoint) -> None:
-        """A new setpoint is flown at once."""
+        """Fly a new attitude setpoint at once, not only in the next period of the loop."""
         if self._setpoint is None:
             self._climb_thrust = self.demand.thrust
         self._setpoint = setpoint
@@ -123,7 +123,8 @@ class PositionController:
         self._fly_attitude(setpoint)
 
     def _fly_attitude(self, setpoint: AttitudeSetpoint) -> None:
-        """Its attitude or rates, and its thrust, raised for the tilt where the firmware does so."""
+        """Demand the attitude or rates of a setpoint and its thrust, divided by the cosine of the
+        tilt where the firmware does so (ATC_ANGLE_BOOST)."""
         thrust = setpoint.thrust if setpoint.climb_mps is None else self._climb_thrust
         if self._armed_for_s < self._parameters.role("setpoint_spool_s"):
             thrust = 0.0
@@ -135,7 +136,7 @@ class PositionController:
         self._demand(Demand(True, thrust, attitude, setpoint.rates_frd_radps))
 
     def _control_climb(self, climb_mps: float, estimate: StateEstimate) -> None:
-        """Thrust for a climb rate."""
+        """Compute the thrust for a climb rate with the position loop."""
         motion = MotionSetpoint(velocity_ned_mps=(math.nan, math.nan, -climb_mps))
         integrate = not estimate.on_ground
         _, self._climb_thrust, _ = self.loop.step(motion, Limits(), estimate, integrate=integrate)
@@ -171,7 +172,7 @@ class PositionController:
 
     @property
     def _limits(self) -> Limits:
-        """Limits of the motion by behaviour and takeoff ramp."""
+        """Limits of the motion, from behaviour and takeoff ramp."""
         role, guidance = self._parameters.role, self._guidance
         automatic = guidance.active.automatic
         up_mps = self._ramp.climb_limit_mps()
@@ -187,7 +188,7 @@ class PositionController:
         )
 
     def _climb_demanded(self, estimate: StateEstimate) -> bool:
-        """A higher place, a climb or an upward acceleration is demanded."""
+        """Whether a higher place, a climb or an upward acceleration is demanded."""
         motion, guidance = self.motion, self._guidance
         if guidance.active.cannot_climb:
             return False
@@ -215,7 +216,7 @@ class PositionController:
 
     @property
     def _descent_demanded(self) -> bool:
-        """A descent is demanded, or a place below where that counts as one."""
+        """Whether a descent is demanded, or (`Firmware.place_below_is_descent`) a place below."""
         sinking_mps = self._parameters.role("sinking_mps")
         if self.motion.velocity_ned_mps[2] >= sinking_mps:
             return True

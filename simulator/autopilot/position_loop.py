@@ -1,8 +1,8 @@
 """The autopilot's position loop: a motion setpoint and the estimate -> attitude and thrust.
 
-P on position, PID on velocity, as multicopter autopilots fly it: on the *estimate* and its raw
-velocity, so it wanders where the estimate does. NED, SI; NaN where nothing is demanded. Knows no
-modes.
+P on position, PID on velocity, as in multicopter autopilots. It controls the *estimated* position
+and velocity, so the vehicle drifts as the estimate does. NED, SI; NaN where nothing is demanded.
+Knows no modes.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ _VELOCITY_P = ("velocity_xy_p", "velocity_xy_p", "velocity_z_p")
 _VELOCITY_I = ("velocity_xy_i", "velocity_xy_i", "velocity_z_i")
 _VELOCITY_D = ("velocity_xy_d", "velocity_xy_d", "velocity_z_d")
 _INTEGRAL_XY_MAX_MPS2 = 4.0
-_REACHED_RAD = 0.05  # of a yaw: the rest is turned the shorter way
+_REACHED_RAD = 0.05  # a smaller yaw error is turned the shorter way, whatever the sense demanded
 _TILT_COSINE_MIN = 0.1  # least divisor of the thrust
-# The derivative of the velocity through a first-order low-pass of 5 Hz: share of the newest
+# First-order low-pass of 5 Hz for the derivative of the velocity: weight of the newest value
 _TIMES_CUTOFF = LOOP_S * 2.0 * math.pi * 5.0
 _FILTER_SHARE = _TIMES_CUTOFF / (1.0 + _TIMES_CUTOFF)
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Limits of a motion. A speed limit only lowers that of the parameters."""
+    """Limits of a motion. A speed limit applies in addition to that of the parameters."""
 
     thrust_least: float = 0.0
-    across_mps: float = math.inf
-    up_mps: float = math.inf  # below 0 it is a descent
+    across_mps: float = math.inf  # horizontal speed
+    up_mps: float = math.inf  # below 0 it forces a descent
     turn_radps: float = math.inf
-    smooth: bool = False  # accelerate and brake as in automatic flight
+    smooth: bool = False  # whether acceleration and braking are limited as in automatic flight
 
 
 class PositionLoop:
@@ -52,9 +52,9 @@ class PositionLoop:
         """Clear the integrators and the filter; hold this yaw."""
         self.yaw_rad = yaw_rad
         self._integral_mps2 = [0.0, 0.0, 0.0]
-        self._acceleration_mps2 = [0.0, 0.0, 0.0]  # of the estimate, filtered
-        self._velocity_mps = NAN3  # of the estimate in the last period
-        self._across_mps = self._down_mps = math.nan  # setpoint of the last period under `smooth`
+        self._acceleration_mps2 = [0.0, 0.0, 0.0]  # derivative of the estimated velocity, filtered
+        self._velocity_mps = NAN3  # estimated velocity in the last period
+        self._across_mps = self._down_mps = math.nan  # last speed setpoint under `Limits.smooth`
 
     def step(
         self,
@@ -64,17 +64,17 @@ class PositionLoop:
         *,
         integrate: bool = True,
     ) -> tuple[Quaternion, float, Triple]:
-        """Control of one period of LOOP_S.
+        """Run one period of LOOP_S.
 
         Args:
             motion: setpoint, NaN where nothing is demanded.
-            limits: of speed, thrust and turn rate in this period.
-            estimate: of which position and velocity are used.
+            limits: limits of speed, thrust and turn rate in this period.
+            estimate: estimated state; position and velocity are used.
             integrate: False freezes the integrators.
 
         Returns:
-            Attitude (wxyz, FRD -> NED), normalised thrust, and the velocity setpoint (NED, m/s)
-            of the velocity loop.
+            Attitude (wxyz, FRD -> NED), normalised thrust, and the setpoint (NED, m/s) of the
+            velocity loop.
         """
         velocity = estimate.velocity_ned_mps
         self._filter_acceleration(velocity)
@@ -91,7 +91,7 @@ class PositionLoop:
         return attitude(direction, self.yaw_rad), thrust, setpoint
 
     def _filter_acceleration(self, velocity: Triple) -> None:
-        """Derivative of the estimated velocity, filtered."""
+        """Differentiate the estimated velocity and filter the result."""
         before, self._velocity_mps = self._velocity_mps, velocity
         if math.isnan(before[0]):
             return
@@ -101,7 +101,7 @@ class PositionLoop:
             filtered[i] += _FILTER_SHARE * (slope - filtered[i])
 
     def _velocity_demanded(self, motion: MotionSetpoint, position: Triple) -> Triple:
-        """P on the position error plus the demanded velocity, before any limit."""
+        """Return P times the position error plus the demanded velocity, before any limit."""
         goal, speed = motion.position_ned_m, motion.velocity_ned_mps
         north, east, down = (
             speed[i]
@@ -132,8 +132,8 @@ class PositionLoop:
         return north, east, down
 
     def _smooth_mps(self, speed_mps: float, motion: MotionSetpoint, velocity: Triple) -> float:
-        """Greatest speed across the ground: limited acceleration since the last period and, on the
-        way to a place, the speed from which it can brake: v^2 = 2 a d, d = speed / gain."""
+        """Return the greatest horizontal speed: acceleration since the last period is limited and,
+        on the way to a place, the vehicle must be able to brake: v^2 = 2 a d, d = speed / gain."""
         before_mps = self._across_mps
         if math.isnan(before_mps):
             before_mps = math.hypot(velocity[0], velocity[1])
@@ -145,13 +145,14 @@ class PositionLoop:
         return most
 
     def _smooth_down_mps(self, down_mps: float, velocity_mps: float) -> float:
-        """The vertical speed with limited acceleration since the last period."""
+        """Return the vertical speed, with limited acceleration since the last period."""
         before_mps = velocity_mps if math.isnan(self._down_mps) else self._down_mps
         most = self._role("vertical_mps2") * LOOP_S
         return min(before_mps + most, max(before_mps - most, down_mps))
 
     def _acceleration(self, motion: MotionSetpoint, setpoint: Triple, velocity: Triple) -> Triple:
-        """PID on the velocity error plus the demanded acceleration; D acts on the estimate."""
+        """Return PID of the velocity error plus the demanded acceleration; D acts on the estimated
+        velocity, not on its setpoint."""
         total = [0.0, 0.0, 0.0]
         for i in range(3):
             total[i] = _or_zero(motion.acceleration_ned_mps2[i])
@@ -164,7 +165,8 @@ class PositionLoop:
     def _integrate(
         self, setpoint: Triple, velocity: Triple, thrust: float, thrust_least: float
     ) -> None:
-        """Integrate the velocity errors; the vertical one not into a saturated thrust."""
+        """Integrate the velocity errors, but the vertical one not if that saturates the thrust
+        further."""
         for i in range(3):
             error = setpoint[i] - velocity[i]
             saturated = i == 2 and (
@@ -179,7 +181,7 @@ class PositionLoop:
             self._integral_mps2[i] = min(most, max(-most, integral))
 
     def _turn(self, motion: MotionSetpoint, limits: Limits, demanded: Triple) -> None:
-        """Turn to the demanded yaw, in its sense of turn, else by the demanded yaw rate."""
+        """Turn to the demanded yaw in the demanded sense; without a yaw, at the demanded rate."""
         yaw_rad = self._yaw_demanded(motion, demanded)
         if math.isfinite(yaw_rad):
             most_rad = limits.turn_radps * LOOP_S
@@ -193,7 +195,8 @@ class PositionLoop:
             self.yaw_rad = wrap_pi(self.yaw_rad + motion.yaw_rate_radps * LOOP_S)
 
     def _yaw_demanded(self, motion: MotionSetpoint, demanded: Triple) -> float:
-        """The demanded yaw or that of the demanded velocity; not finite: keep the present one."""
+        """Return the demanded yaw, or the direction of the demanded velocity with
+        `MotionSetpoint.faces_way`; not finite: there is no demand."""
         if math.isfinite(motion.yaw_rad) or not motion.faces_way:
             return motion.yaw_rad
         if not math.hypot(demanded[0], demanded[1]) > self._role("facing_mps"):
@@ -206,8 +209,8 @@ def _or_zero(value: float) -> float:
 
 
 def thrust_direction(acceleration_ned_mps2: Triple, tilt_max_rad: float) -> Triple:
-    """Third body axis (unit, NED) for this horizontal acceleration in hover, within the tilt
-    limit; the thrust makes the vertical acceleration."""
+    """Return the third body axis (unit vector, NED) for this horizontal acceleration at hover
+    thrust, within the tilt limit. The vertical acceleration changes only the thrust."""
     north, east, _ = acceleration_ned_mps2
     lateral = math.hypot(north, east)
     lateral_max = GRAVITY_MPS2 * math.tan(tilt_max_rad)

@@ -15,16 +15,16 @@ from simulator.vehicle.plant import Plant, Truth
 
 @dataclass(frozen=True, slots=True)
 class StateEstimate:
-    """The estimator's output as plain floats (NED, FRD, SI), ground contact and range finder."""
+    """The estimate as plain floats (NED, FRD, SI), with ground contact and range finder."""
 
     time_s: float  # vehicle time since boot
     position_ned_m: Triple
     velocity_ned_mps: Triple
     attitude: Quaternion
     rates_frd_radps: Triple
-    on_ground: bool  # the ground carries the vehicle
+    on_ground: bool  # whether the ground carries the vehicle (true state)
     reset_counter: int
-    ground_m: float  # distance to the ground
+    ground_m: float  # distance to the ground from the range finder
 
     @property
     def yaw_rad(self) -> float:
@@ -42,7 +42,7 @@ class VehicleState:
 
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
-        self.steps = 0  # of STEP_S since boot
+        self.steps = 0  # number of steps of STEP_S since boot
         self._truth: Truth | None = None
         self._estimate: StateEstimate | None = None
 
@@ -57,12 +57,12 @@ class VehicleState:
         return self.steps * STEP_US
 
     def step(self) -> None:
-        """Begin the next step: the plant has moved."""
+        """Count a step, after the plant was advanced."""
         self.steps += 1
         self.invalidate()
 
     def invalidate(self) -> None:
-        """Read the plant again: its state or its estimate was changed within a step."""
+        """Discard truth and estimate of this step, because the plant was changed."""
         self._truth = self._estimate = None
 
     @property

@@ -1,6 +1,6 @@
-"""The pilot's sticks of ArduCopter: default RC input, and channels that a client overrides.
+"""Stick input of ArduCopter: default RC channels, and channels that a client overrides.
 
-Pulse widths in, stick deflection and speeds out. Knows no modes and no vehicle.
+It converts pulse widths to demanded velocities and rates. Knows no modes and no vehicle.
 """
 
 from __future__ import annotations
@@ -8,31 +8,31 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-KEEP, RELEASE = 65535, 0  # RC_CHANNELS_OVERRIDE: leave this channel, end its override
+KEEP, RELEASE = 65535, 0  # RC_CHANNELS_OVERRIDE: do not change this channel, end its override
 OVERRIDE_S = 3.0  # RC_OVERRIDE_TIME
 _CENTRE_US, _RANGE_US = 1500, 500
 _PERIOD_MIN_S, _PERIOD_MAX_S = 1e-3, 0.1  # between two calls of `demand`
 _THROTTLE_DEAD_ZONE_US = 100  # THR_DZ
-# Without RC: roll, pitch, throttle down, yaw; mode switch and other channels as SITL has them
+# Channels of SITL without RC: roll, pitch, throttle (down), yaw, mode switch (5) and others
 _DEFAULT_US = (1500, 1500, 1000, 1500, 1800, 1000, 1000, 1800)
-_CLIMB_MPS = 2.5  # PILOT_SPEED_UP, and down without throttle
+_CLIMB_MPS = 2.5  # PILOT_SPEED_UP, also of the descent with the throttle down
 _TURN_RADPS = math.radians(202.5)  # PILOT_Y_RATE
 _SPEED_MPS = 12.5  # LOIT_SPEED
-_ACCELERATION_MPS2 = 3.57  # of two thirds of ANGLE_MAX
-_BRAKING_MPS2, _BRAKING_AFTER_S = 2.5, 1.0  # LOIT_BRK_ACCEL, LOIT_BRK_DELAY: sticks centred
+_ACCELERATION_MPS2 = 3.57  # g times tangent of two thirds of ANGLE_MAX
+_BRAKING_MPS2, _BRAKING_AFTER_S = 2.5, 1.0  # with centred sticks: LOIT_BRK_ACCEL, LOIT_BRK_DELAY
 Pair = tuple[float, float]
 
 
 class Sticks:
-    """RC channels of one vehicle; times are vehicle seconds."""
+    """RC channels of one vehicle; times are seconds since boot."""
 
     def __init__(self) -> None:
-        self._overridden: dict[int, tuple[int, float]] = {}  # channel -> pulse width, until
-        self._velocity_mps = (0.0, 0.0)  # north, east
-        self._called_s = self._deflected_s = math.nan  # last call, last with a deflection
+        self._overridden: dict[int, tuple[int, float]] = {}  # channel -> pulse width, end time
+        self._velocity_mps = (0.0, 0.0)  # demanded: north, east
+        self._called_s = self._deflected_s = math.nan  # last `demand`, and last with a deflection
 
     def override(self, pulses_us: Sequence[int], now_s: float) -> None:
-        """RC_CHANNELS_OVERRIDE, from the first channel on."""
+        """Apply RC_CHANNELS_OVERRIDE; `pulses_us` begins with the first channel."""
         for channel, pulse_us in enumerate(pulses_us[: len(_DEFAULT_US)]):
             if pulse_us == RELEASE:
                 self._overridden.pop(channel, None)
@@ -40,7 +40,7 @@ class Sticks:
                 self._overridden[channel] = (pulse_us, now_s + OVERRIDE_S)
 
     def pulses_us(self, now_s: float) -> tuple[int, ...]:
-        """Pulse widths of all channels."""
+        """Return the pulse widths of all channels."""
         return tuple(
             self._overridden[channel][0]
             if now_s < self._overridden.get(channel, (0, -math.inf))[1]
@@ -49,13 +49,13 @@ class Sticks:
         )
 
     def begin(self) -> None:
-        """A mode flown by sticks begins, with no velocity demanded."""
+        """Begin a mode flown by sticks, with zero demanded velocity."""
         self._velocity_mps, self._called_s = (0.0, 0.0), math.nan
 
     def demand(self, now_s: float, yaw_rad: float) -> tuple[Pair, Pair, float, float]:
-        """Velocity and acceleration (north, east), climb rate and yaw rate; SI.
+        """Return demanded velocity and acceleration (north, east), climb rate and yaw rate; SI.
 
-        The velocity accelerates with the deflection, against a drag that limits its speed.
+        The stick deflection accelerates the velocity against a drag, which limits it to LOIT_SPEED.
         """
         roll, pitch, throttle, yaw = self.pulses_us(now_s)[:4]
         forward, right = -_deflection(pitch), _deflection(roll)
@@ -85,7 +85,7 @@ class Sticks:
 
 
 def _deflection(pulse_us: int, dead_zone_us: int = 20) -> float:
-    """-1 .. 1, with a dead zone (RCx_DZ)."""
+    """Stick deflection, -1 .. 1, with a dead zone (RCx_DZ)."""
     offset_us = min(_RANGE_US, max(-_RANGE_US, pulse_us - _CENTRE_US))
     share = max(0, abs(offset_us) - dead_zone_us) / (_RANGE_US - dead_zone_us)
     return math.copysign(share, offset_us)

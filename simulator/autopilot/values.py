@@ -63,31 +63,31 @@ def critical(text: str) -> StatusText:
 
 @dataclass(frozen=True, slots=True)
 class AttitudeSetpoint:
-    """SET_ATTITUDE_TARGET as the firmware reads it; None: keep what was demanded before."""
+    """SET_ATTITUDE_TARGET as the firmware reads it. Attitude and rates None: keep the attitude."""
 
     attitude: Quaternion | None
     rates_frd_radps: Triple | None
     thrust: float  # 0 .. 1
-    climb_mps: float | None = None  # not None: the autopilot's vertical loop makes the thrust
-    event: str = ""  # reported when the setpoint is taken: a value that should have been refused
+    climb_mps: float | None = None  # climb rate that replaces the thrust; None: `thrust` counts
+    event: str = ""  # raised when the setpoint is taken, as a value should have been refused
 
 
 @dataclass(frozen=True, slots=True)
 class MotionSetpoint:
-    """Position, velocity, acceleration (NED, SI), yaw (rad), yaw rate; NaN where not demanded."""
+    """Position, velocity, acceleration (NED, SI), yaw, yaw rate; NaN where nothing is demanded."""
 
     position_ned_m: Triple = NAN3
     velocity_ned_mps: Triple = NAN3
     acceleration_ned_mps2: Triple = NAN3
     yaw_rad: float = math.nan
     yaw_rate_radps: float = math.nan
-    faces_way: bool = False  # without yaw and yaw rate: face the direction of flight
+    faces_way: bool = False  # whether, without a yaw, the nose points in the direction of flight
     turn_radps: float = math.inf  # yaw rate limit
-    turn_sense: float = 0.0  # to the yaw: > 0 clockwise, < 0 against it, 0 the shorter way
+    turn_sense: float = 0.0  # > 0: turn to the yaw clockwise, < 0: counterclockwise, 0: shorter way
 
 
 class Behaviour(Enum):
-    """What the vehicle does in a mode; `simulator.autopilot` flies it."""
+    """What the vehicle does in a mode; several modes may have the same behaviour."""
 
     HOLD = "holds position"
     TAKEOFF = "climbs to the takeoff height"
@@ -105,20 +105,20 @@ class Mode:
     """One flight mode."""
 
     name: str
-    title: str  # in texts
+    title: str  # name in STATUSTEXTs
     custom_mode: int
     base_mode: int  # MAV_MODE_FLAG without the armed bit
     behaviour: Behaviour
-    arms: bool = True  # the vehicle may be armed in it
-    remembered: bool = True  # comes back after an automatic disarm
+    arms: bool = True  # whether the vehicle may be armed in it
+    remembered: bool = True  # whether the vehicle returns to it, for example after disarming
     needs_sticks: bool = False
     needs_position: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """What a command asks for: a mode by name, "arm" or "disarm"; empty: refused with the result
-    (None: no acknowledgement) and the text."""
+    """What a command requests: a mode by name, "arm" or "disarm". An empty name is a refusal with
+    this result (None: no acknowledgement) and this text."""
 
     name: str = ""
     refusal: Result | None = None
@@ -127,7 +127,7 @@ class Asked:
 
 @dataclass(frozen=True, slots=True)
 class MissionItem:
-    """One item as it was uploaded: x and y in 1e-7 deg, z in m, of `frame` (MAV_FRAME)."""
+    """A mission item as it was uploaded: x and y in 1e-7 deg, z in m, in `frame` (MAV_FRAME)."""
 
     frame: int
     command: int  # MAV_CMD
