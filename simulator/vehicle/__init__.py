@@ -1,1 +1,1 @@
-"""The vehicle as it truly is: airframe, air, sensors and what its estimator makes of them."""
+"""The vehicle below its autopilot: airframe, wind, battery, attitude loop, estimator errors."""

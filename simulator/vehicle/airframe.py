@@ -1,8 +1,8 @@
 """Airframe: rotors, ground contact and battery charge around the rigid body.
 
-The rigid body (mass, drag relative to the air) is `offboard.model.rigid_body`. This module adds
-what the controller's model does not have: rotor lag, loss of torque at low thrust, ground, charge
-consumed. Compiled. Knows no autopilot, no estimate and no randomness.
+The rigid body (mass, drag relative to the air) is in `offboard.model.rigid_body`. This module adds
+what the controller's model does not have: rotor lag, loss of torque at low thrust, ground, consumed
+charge. Compiled. Knows no autopilot, no estimate and no randomness.
 """
 
 from __future__ import annotations
@@ -21,26 +21,29 @@ from simulator.vehicle.conditions import Conditions
 
 Array = NDArray[np.float64]
 
-# Rotor state, beside the rigid body's 13 numbers: actual normalised collective thrust, 1 while the
-# ground carries the vehicle, charge consumed (A s), NED acceleration of the last step.
+# Indices in the rotor state, which adds to the 13 states of the rigid body: actual normalised
+# collective thrust; 1 while the ground carries the vehicle; consumed charge (A s); from 3 on the
+# NED acceleration of the last step.
 THRUST, CONTACT, CHARGE, ROTOR_SIZE = 0, 1, 2, 6
 
-# Below this share of hover thrust the torques fall to zero with the thrust.
+# Below this share of hover thrust the torques decrease with the thrust, to zero.
 _AUTHORITY_SHARE = 0.2
-# Landing gear: friction, so that wind does not move a landed vehicle, and levelling.
+# Landing gear: coefficient of friction, high enough that wind does not move a landed vehicle, and
+# time constant of levelling.
 _FRICTION = 1.5
 _LEVELLING_TIME_S = 0.1
-# Rate times substep: explicit Runge-Kutta is stable to 2.78, and every vehicle file stays below.
+# Limit of decay rate times substep; the explicit Runge-Kutta method is stable up to 2.78.
 _STIFFNESS_LIMIT = 0.5
 
 
 def build_airframe(vehicle: Vehicle, conditions: Conditions) -> tuple[Array, Array, int]:
-    """Constants of the simulated vehicle: the model that the controller has, too, with the factors
-    of the conditions on thrust and mass.
+    """Constants of the simulated vehicle: those of the controller's model, with the factors of the
+    conditions on thrust and mass.
 
-    Returns those of the body, as `offboard.model.rigid_body.pack` has them; of the rotors: thrust
-    at full throttle N, factor of the lag in a step, thrust above which torques are full, hover
-    thrust, hover current A; and the substeps of a step.
+    Returns:
+        Constants of the body, as in `offboard.model.rigid_body.pack`; of the rotors: maximum thrust
+        in N, factor by which the lag decays in a step, thrust above which torques are full, hover
+        thrust, hover current in A; and the number of substeps of a step.
     """
     body = pack(vehicle, conditions.quadratic_drag_npmps2)
     lag_s = vehicle.thrust_lag_s
@@ -61,8 +64,8 @@ def build_airframe(vehicle: Vehicle, conditions: Conditions) -> tuple[Array, Arr
 
 @kernel
 def advance_airframe(plant: Any, thrust_demand: float) -> None:
-    """One step in place of body and rotor of a `simulator.vehicle.dynamics.RECORD`, by its angular
-    acceleration `turn` and a thrust 0 .. 1."""
+    """Advance body and rotor of a `simulator.vehicle.dynamics.RECORD` by one step, in place, with
+    its angular acceleration `turn` and a thrust of 0 .. 1."""
     body, rotor, inputs = plant.body, plant.rotor, plant.inputs
     body_constants, rotor_constants = plant.body_constants, plant.rotor_constants
     before = rotor[THRUST]
@@ -70,7 +73,7 @@ def advance_airframe(plant: Any, thrust_demand: float) -> None:
     mean = 0.5 * (before + rotor[THRUST])
     north, east, down = body[7], body[8], body[9]
     inputs[0] = rotor_constants[0] * mean
-    # On the ground it does not rotate
+    # On the ground the vehicle does not rotate
     authority = 0.0 if rotor[CONTACT] > 0.5 else min(mean / rotor_constants[2], 1.0)
     _torques(body, plant.turn, authority, body_constants, inputs)
     part_s = STEP_S / plant.substeps
@@ -97,9 +100,10 @@ def advance_airframe(plant: Any, thrust_demand: float) -> None:
 
 @kernel
 def _torques(body: Array, turn: Array, authority: float, constants: Array, inputs: Array) -> None:
-    """Torque inputs 1..3 for an angular acceleration, with perfect mixing, scaled by `authority`.
+    """Write the torque inputs 1 .. 3 for an angular acceleration, scaled by `authority`.
 
-    They include the gyroscopic torque and the rotational drag, which the rigid body subtracts.
+    The mixer is perfect. The inputs compensate the gyroscopic torque and the rotational drag, which
+    the rigid body subtracts.
     """
     p, q, r = body[4], body[5], body[6]
     i_x, i_y, i_z, arm = constants[2], constants[3], constants[4], constants[5]
@@ -113,7 +117,8 @@ def _torques(body: Array, turn: Array, authority: float, constants: Array, input
 
 @kernel
 def _touch_ground(body: Array, step_s: float) -> float:
-    """Inelastic ground at down = 0 with friction; returns 1 while it carries the vehicle, or 0."""
+    """Apply an inelastic ground at down = 0 with friction. Return 1 if it carries the vehicle, or
+    0."""
     if body[12] < 0.0:
         return 0.0
     body[12] = 0.0
@@ -133,7 +138,7 @@ def _touch_ground(body: Array, step_s: float) -> float:
 
 @kernel
 def _set_level(body: Array, share: float) -> None:
-    """Rotate the attitude by this share of its tilt towards level; the heading stays."""
+    """Reduce the tilt by this share of it; the heading does not change."""
     norm = math.hypot(body[0], body[3])
     w, z = (body[0] / norm, body[3] / norm) if norm > 1e-9 else (1.0, 0.0)
     body[0] += share * (w - body[0])

@@ -1,9 +1,9 @@
 """Attitude loop of the autopilot: demands, their delays, and the angular acceleration.
 
-A cascade as in PX4: the attitude error, thrust axis first, gives a rate; the rate error gives an
-angular acceleration, which is limited per axis. Linearised, each axis has the identified response
-s'' = wn^2 (s_c(t - D) - s) - 2 z wn s'. It uses the estimated attitude, not the true one. Knows no
-modes and no MAVLink.
+A cascade as in PX4: the attitude error, first of the thrust axis, then of yaw, gives a rate; the
+rate error gives an angular acceleration, which is limited per axis. Linearised, each axis has the
+identified response s'' = wn^2 (s_c(t - D) - s) - 2 z wn s'. The loop uses the estimated attitude,
+not the true one. Knows no modes and no MAVLink.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
-# A rate demand bypasses the attitude part of the cascade. Half the identified delay reproduces
-# PX4's measured rate steps (t63: roll 0.10-0.11 s, yaw 0.45 s).
+# Delay of a rate demand as a share of the identified delay: it bypasses the attitude controller.
+# A half reproduces PX4's measured rate steps (63 % after: roll 0.10-0.11 s, yaw 0.45 s).
 _RATE_DELAY_SHARE = 0.5
 
-# One row per step of the demand history.
+# Columns of the demand history, which has one row per step; the last number is their count.
 _IS_ATTITUDE, _RATES, _THRUST, ROW_WIDTH = 0, 5, 8, 9
 
 
@@ -36,9 +36,9 @@ class Demand:
     """Demand on the attitude loop.
 
     `attitude` is a quaternion (wxyz, FRD -> NED) of any length and takes precedence over
-    `rates_frd_radps`; without either the rates are zero. `thrust` is normalised collective thrust,
-    0..1. As in PX4, a thrust of NaN is 0, and an attitude that is not finite is undefined (here:
-    zero rates).
+    `rates_frd_radps`; without both, zero rates are demanded. `thrust` is normalised collective
+    thrust, 0 .. 1. As in PX4, a thrust of NaN is 0, and an attitude that is not finite is undefined
+    (here: zero rates).
     """
 
     motors_on: bool = False
@@ -50,16 +50,16 @@ class Demand:
 def build_loop(vehicle: Vehicle) -> tuple[Array, NDArray[np.int64]]:
     """Constants of the compiled loop.
 
-    Gains (4, 3): rows attitude gain wn / 2z 1/s, rate gain 2 z wn 1/s, acceleration limit rad/s^2,
-    rate limit rad/s.
-    Delays (5,) of tilt, yaw, thrust, tilt rate and yaw rate, in steps, shortened by half a step, by
-    which holding a demand for a step delays it.
+    Returns:
+        Gains (4, 3), rows: attitude gain wn / 2z in 1/s, rate gain 2 z wn in 1/s, acceleration
+        limit in rad/s^2, rate limit in rad/s. Delays (5,) of tilt, yaw, thrust, tilt rate and yaw
+        rate in steps, less half a step, the mean delay of a demand that is held for a step.
     """
     axes = (vehicle.tilt, vehicle.tilt, vehicle.yaw)
     gains = np.array(
         [
             [axis.natural_frequency_radps / (2.0 * axis.damping) for axis in axes],
-            # a faster loop would not be stable in steps of STEP_S
+            # with a higher gain the loop would not be stable in steps of STEP_S
             [min(2.0 * axis.damping * axis.natural_frequency_radps, 1.0 / STEP_S) for axis in axes],
             vehicle.angular_acceleration_limit_radps2,
             vehicle.angular_rate_limit_radps,
@@ -78,7 +78,7 @@ def build_loop(vehicle: Vehicle) -> tuple[Array, NDArray[np.int64]]:
 
 
 def encode(demand: Demand, row: Array) -> None:
-    """Write a demand into a history row (ROW_WIDTH,), without NaN."""
+    """Write a demand into a row (ROW_WIDTH,) of the history; it has no NaN."""
     row[:] = 0.0
     thrust = demand.thrust if demand.motors_on else 0.0
     if not math.isnan(thrust):
@@ -90,7 +90,7 @@ def encode(demand: Demand, row: Array) -> None:
 
 
 def _encode_attitude(attitude: Quaternion, row: Array) -> None:
-    """Scale to unit length, without overflow; an undefined attitude is not written."""
+    """Write an attitude with unit length, without overflow; an undefined one is not written."""
     w, x, y, z = attitude
     largest = max(abs(w), abs(x), abs(y), abs(z))
     if not math.isfinite(w + x + y + z) or largest == 0.0:
@@ -102,24 +102,24 @@ def _encode_attitude(attitude: Quaternion, row: Array) -> None:
 
 @kernel
 def _delayed_row(plant: Any, step: int, delay: int) -> Array:
-    """Demand of `delay` steps ago."""
+    """Row of the demand history, `delay` steps ago."""
     row: Array = plant.history[(step - delay) % plant.history.shape[0]]
     return row
 
 
 @kernel
 def delayed_thrust(plant: Any, step: int) -> float:
-    """Normalised collective thrust, delayed."""
+    """Delayed normalised collective thrust."""
     thrust: float = _delayed_row(plant, step, plant.delays[2])[_THRUST]
     return thrust
 
 
 @kernel
 def _attitude_error(quaternion: Array, row: Array, error: Array) -> None:
-    """Attitude error (3,) in the body frame, rad: 2 sin(half angle) along the axis.
+    """Write the attitude error (3,) in the body frame, rad: 2 sin(half angle) along the axis.
 
     As in PX4's reduced attitude control, the shortest rotation of the thrust axis gives x and y
-    (swing), the remaining rotation about the demanded axis gives z (twist).
+    (swing); the remaining rotation about the demanded thrust axis gives z (twist).
     """
     w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
     dw, dx, dy, dz = row[1], row[2], row[3], row[4]
@@ -141,10 +141,10 @@ def _attitude_error(quaternion: Array, row: Array, error: Array) -> None:
 
 @kernel
 def angular_acceleration(plant: Any, step: int) -> None:
-    """Demanded angular acceleration FRD rad/s^2, into `turn` of a
+    """Write the demanded angular acceleration (FRD, rad/s^2) to `turn` of a
     `simulator.vehicle.dynamics.RECORD`.
 
-    By its *estimated* attitude and true rates. Tilt and yaw have their own delays.
+    It follows from the *estimated* attitude and the true rates. Tilt and yaw have their own delays.
     """
     delays, gains, error, out = plant.delays, plant.gains, plant.turn_error, plant.turn
     for first, last, attitude_delay, rate_delay in (

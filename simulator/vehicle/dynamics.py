@@ -1,7 +1,7 @@
-"""The equations of the vehicle below the autopilot, compiled: one step of everything, in place.
+"""Compiled functions that advance the vehicle below the autopilot, and that compute what its
+estimator and its GPS receiver report.
 
-Rows of a record in, the same rows a step later; what the estimator and the satellite receiver say
-of them. All works on a `RECORD`, which `simulator.vehicle.plant` fills.
+All of them read and change a `RECORD` in place, which `simulator.vehicle.plant` fills.
 """
 
 from __future__ import annotations
@@ -29,10 +29,11 @@ from simulator.vehicle.sensors import (
 )
 from simulator.vehicle.wind import GUST_COUNT
 
-# As typed numbers: compiled code is made once more for each plain constant that is handed on
+# Random streams. Typed numbers, because a plain constant as an argument would make Numba compile
+# the called function once more for each value
 _ERROR_LANE, _GUST_LANE, _WHITE_LANE, _RECEIVER_LANE = (np.uint64(lane) for lane in range(4))
 
-# Rows of the demand history: a power of two, more than the steps of any vehicle's longest delay
+# Rows of the demand history: a power of two, greater than any vehicle's longest delay in steps
 _HISTORY_ROWS = 128
 
 RECORD = np.dtype(
@@ -55,7 +56,7 @@ RECORD = np.dtype(
         ("lag_s", "f8"),
         ("late_gps_ps", "f8"),
         ("white_sds", "f8", WHITE_COUNT),
-        # the satellite receiver: position NED and velocity NE
+        # the GPS receiver: position NED and velocity NE
         ("fix_sds", "f8", 5),
         # the attitude loop
         ("row", "f8", ROW_WIDTH),
@@ -91,15 +92,15 @@ RECORD = np.dtype(
 
 @entry(RECORD)
 def draw_gusts(plants: Any) -> None:
-    """Write the random numbers for the first gust of a flight to `gust_normals`."""
+    """Write the random numbers for the gust at the start of a flight to `gust_normals`."""
     plant = plants[0]
     fill_normals(plant.seed, _GUST_LANE, np.int64(-1), plant.gust_normals[:])
 
 
 @entry(RECORD)
 def report_state(plants: Any) -> None:
-    """Write the estimate of the present state to `report`: truth plus errors, offsets and white
-    noise."""
+    """Write the estimate of the present state to `report`: truth, delayed by `lag_s`, plus errors,
+    offsets and white noise."""
     plant = plants[0]
     body, error, white, out = plant.body, plant.error, plant.normals, plant.report
     fill_normals(plant.seed, _WHITE_LANE, plant.step, white[:])
@@ -135,10 +136,10 @@ def receive_fix(plants: Any) -> None:
 
 @entry(int, RECORD)
 def advance_steps(count: int, plants: Any) -> None:
-    """`count` steps in place.
+    """Advance by `count` steps, in place.
 
-    Each step: store the demand, move the air, control the attitude, move the airframe, move the
-    estimator's errors.
+    Each step stores the demand in the history and then advances the wind, the attitude loop, the
+    airframe and the estimator's errors.
     """
     plant = plants[0]
     first = plant.step
@@ -155,7 +156,7 @@ def advance_steps(count: int, plants: Any) -> None:
 
 @kernel
 def _move_air(plant: Any, step: int) -> None:
-    """Next wind: the steady wind plus gusts along and across it."""
+    """Compute the wind of the next step: steady wind plus gusts along it, across it and down."""
     gust, air, wind = plant.gust, plant.air, plant.wind
     if plant.gusty:
         fill_normals(plant.seed, _GUST_LANE, step, plant.gust_normals[:])
@@ -174,7 +175,7 @@ def _move_air(plant: Any, step: int) -> None:
 
 @kernel
 def _control_attitude(plant: Any, step: int) -> None:
-    """Angular acceleration demanded by the attitude loop for the estimated attitude."""
+    """Compute the angular acceleration that the attitude loop demands at the estimated attitude."""
     error, turn_error = plant.error, plant.turn_error
     turn_error[0], turn_error[1] = -error[EAST + 2], error[NORTH + 2]
     turn_error[2] = error[YAW]
@@ -184,7 +185,8 @@ def _control_attitude(plant: Any, step: int) -> None:
 
 @kernel
 def _move_errors(plant: Any, step: int) -> None:
-    """Next errors of the estimator, which follow a process and the true velocity."""
+    """Advance the errors of the estimator: a linear process, with the true velocity as an input if
+    the GPS is late."""
     fill_normals(plant.seed, _ERROR_LANE, step, plant.normals[:])
     advance_process(
         plant.error_transition[:],

@@ -1,7 +1,8 @@
 """Random numbers and linear stochastic processes; all randomness of the vehicle is here.
 
-A normal number is a pure function of (seed, lane, step), without a state: n steps give the same
-bytes in one call or in several. Knows no vehicle.
+A normally distributed number is a pure function of (seed, lane, step) without a state, so that n
+steps give the same bytes in one call or in several. A lane is an independent random stream. Knows
+no vehicle.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from offboard.compiled import kernel
 
 Array = NDArray[np.float64]
 
-_SERIES_LENGTH = 20  # terms for full precision with a norm of 1 or less
+_SERIES_LENGTH = 20  # terms of the power series: full precision for a norm of 1 or less
 _TWO_TO_MINUS_53 = 2.0**-53
 _STEP_STRIDE = np.uint64(0x9E3779B97F4A7C15)
 _LANE_STRIDE = np.uint64(0xD1342543DE82EF95)
@@ -25,7 +26,7 @@ _PAIR_STRIDE = np.uint64(0xA24BAED4963EE407)
 
 @dataclass(frozen=True, slots=True)
 class LinearProcess:
-    """x[k+1] = transition x[k] + scale xi[k], xi standard normal; both (n, n)."""
+    """x[k+1] = transition x[k] + scale xi[k] with xi standard normal; both matrices (n, n)."""
 
     transition: Array
     scale: Array
@@ -33,7 +34,7 @@ class LinearProcess:
 
 
 def seed_word(seed: int) -> np.uint64:
-    """64-bit seed of `fill_normals` for any integer seed."""
+    """Return the 64-bit seed of `fill_normals` for any integer seed."""
     entropy = seed if seed >= 0 else (-seed << 1) | (1 << 64)
     return np.uint64(np.random.SeedSequence(entropy).generate_state(1, np.uint64)[0])
 
@@ -58,7 +59,7 @@ def discretise(drift: ArrayLike, densities: ArrayLike, step_s: float) -> LinearP
 
 
 def block_diagonal(*processes: LinearProcess) -> LinearProcess:
-    """Independent processes as one, with their states one after the other."""
+    """Return independent processes as one process, with their states one after the other."""
     sizes = [len(process.transition) for process in processes]
     ends = np.cumsum(sizes)
     joined = LinearProcess(*(np.zeros((ends[-1], ends[-1])) for _ in range(3)))
@@ -73,7 +74,7 @@ def block_diagonal(*processes: LinearProcess) -> LinearProcess:
 def _exponential(matrix: Array) -> Array:
     """Matrix exponential by scaling, power series and squaring.
 
-    SciPy has one, but importing it costs 27 MB and 0.1 s of every start.
+    SciPy has this function, but importing it costs 27 MB and 0.1 s at every start.
     """
     halvings = max(0, math.frexp(float(np.abs(matrix).sum(axis=1).max()))[1])
     scaled = matrix / 2.0**halvings
@@ -109,7 +110,7 @@ def _scramble(word: np.uint64) -> np.uint64:
 
 @kernel
 def fill_normals(seed: np.uint64, lane: np.uint64, step: int | np.int64, out: Array) -> None:
-    """Write the standard normals of this lane and step to `out` (n,), by Box-Muller."""
+    """Write the standard normal numbers of this lane and step to `out` (n,), by Box-Muller."""
     key = _scramble(seed + np.uint64(step) * _STEP_STRIDE + lane * _LANE_STRIDE)
     count = out.shape[0]
     for i in range(0, count, 2):
@@ -127,7 +128,7 @@ def fill_normals(seed: np.uint64, lane: np.uint64, step: int | np.int64, out: Ar
 def advance_process(
     transition: Array, scale: Array, gain: float, normals: Array, x: Array, work: Array
 ) -> None:
-    """One step in place of a LinearProcess with states `x` (n,).
+    """Advance a LinearProcess with states `x` (n,) by one step, in place.
 
     `gain` multiplies the noise; `work` (n,) is scratch.
     """

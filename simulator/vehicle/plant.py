@@ -1,7 +1,7 @@
 """Plant: the simulated vehicle below the autopilot, with air, attitude loop and estimator.
 
-`Plant` takes a `Demand` and a duration and gives the `Truth` and a report of the estimate. Fixed
-steps, one compiled call per `advance`. Knows no modes, no arming and no MAVLink.
+`Plant` flies a `Demand` for a duration and returns the `Truth` and a report of the estimate. It has
+fixed steps and makes one compiled call per `advance`. Knows no modes, no arming and no MAVLink.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from simulator.vehicle.wind import dryden, wind_axes
 
 Array = NDArray[np.float64]
 
-_MASS, _THRUST_MAX = 0, 0  # places in the constants of body and rotors
+_MASS, _THRUST_MAX = 0, 0  # indices in the constants of body and rotors
 
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """True state as plain floats, NED or FRD, SI."""
+    """True state as plain floats; NED or FRD, SI."""
 
     position_ned_m: Triple
     velocity_ned_mps: Triple
@@ -39,11 +39,11 @@ class Truth:
 
 
 class Plant:
-    """One vehicle, at first on the ground at the origin, level, heading north, motors off.
+    """One vehicle. At first it is on the ground at the origin, level, heading north, motors off.
 
     The estimator's errors start at zero and have a tenth of their noise while the motors are off:
     as on real vehicles, they reach their full size in the first tens of seconds of a flight. The
-    same seed gives the same bytes, whatever the durations of the calls.
+    same seed gives the same bytes, however a duration is divided into calls of `advance`.
     """
 
     def __init__(self, vehicle: Vehicle, conditions: Conditions, seed: int) -> None:
@@ -78,8 +78,8 @@ class Plant:
         self._body, self._rotor = record["body"][0], record["rotor"][0]
         self._row, self._report = record["row"][0], record["report"][0]
         self._offset_ned_m = record["offset"][0]
-        self.velocity_error_ned_mps = record["velocity_error"][0]  # by a fault
-        self.gps_healthy = True  # False while a fault takes the fix away
+        self.velocity_error_ned_mps = record["velocity_error"][0]  # set by a fault
+        self.gps_healthy = True  # False while a fault takes the GPS fix away
         self.reset_counter = 0  # estimator resets, modulo 256
         self._body[0] = 1.0
         self._rotor[CONTACT] = 1.0
@@ -90,7 +90,7 @@ class Plant:
         record["gusty"] = np.any(record["gust"] != 0.0)
 
     def advance(self, duration_s: float, demand: Demand) -> None:
-        """Hold the demand for `duration_s`, rounded to steps."""
+        """Fly the constant demand for `duration_s`, rounded to steps."""
         if demand is not self._demand:
             encode(demand, self._row)
             self.record["motors_on"] = demand.motors_on
@@ -98,12 +98,12 @@ class Plant:
         advance_steps(round(duration_s / STEP_S), self.record)
 
     def reset_estimate(self, offset_ned_m: Triple) -> None:
-        """Offset the estimate, and count an estimator reset."""
+        """Offset the position estimate, and count an estimator reset."""
         self._offset_ned_m += offset_ned_m
         self.reset_counter = (self.reset_counter + 1) % 256
 
     def drift_estimate(self, offset_ned_m: Triple) -> None:
-        """Offset the estimate without an estimator reset."""
+        """Offset the position estimate without an estimator reset."""
         self._offset_ned_m += offset_ned_m
 
     def scale_mass(self, factor: float) -> None:
@@ -134,13 +134,13 @@ class Plant:
 
     @property
     def battery(self) -> BatteryState:
-        """What a battery monitor measures."""
+        """State of the battery, as a battery monitor measures it."""
         hover_share = float(self._rotor[THRUST]) / self._hover_thrust
         return self._battery.state(float(self._rotor[CHARGE]), hover_share)
 
     def fix(self) -> list[float]:
-        """GPS fix of the present step: NED position, then velocity north and east; repeated calls
-        give the same one."""
+        """Return the GPS fix of the present step: NED position, then velocity north and east.
+        Repeated calls return the same values."""
         receive_fix(self.record)
         fix: list[float] = self.record["fix"][0].tolist()
         return fix
@@ -156,8 +156,9 @@ class Plant:
         return bool(self._rotor[CONTACT])
 
     def report(self) -> Array:
-        """Estimate of the present step as one array (REPORT_WIDTH,), with the layout of
-        `simulator.vehicle.sensors`; repeated calls give the same one and overwrite it."""
+        """Return the estimate of the present step as an array (REPORT_WIDTH,) with the layout in
+        `simulator.vehicle.sensors`. Repeated calls return the same array with the same values; a
+        call in a later step overwrites it."""
         report_state(self.record)
         seen: Array = self._report
         return seen

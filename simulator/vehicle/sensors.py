@@ -1,11 +1,11 @@
-"""Estimator: error models identified on autopilots, and the estimate made from truth and errors.
+"""Estimator errors: models identified on autopilots, and the estimate made from truth and errors.
 
 The error of an estimator is a linear process per NED axis, e = [e_p, e_v, e_b, e_r] with
-e' = A e + w, plus white noise; where the GPS is later than the estimator assumes, e_r' has a term
-of the true velocity. e_p and e_v are estimated minus true position and velocity; e_b is estimated
+e' = A e + w, plus white noise. Where the GPS is later than the estimator assumes, e_r' also depends
+on the true velocity. e_p and e_v are estimated minus true position and velocity; e_b is estimated
 minus true thrust direction; e_r is the rate of e_p where e_p is smooth. PX4's process reproduces a
-velocity that is *not* the derivative of the position, and a smooth position, which
-white noise alone does not. Knows no vehicle and no MAVLink.
+smooth position, and a velocity that is *not* its derivative, which white noise alone does not.
+Knows no vehicle and no MAVLink.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ AXIS_STRIDE = 4
 
 WHITE_COUNT = 12  # position, velocity, attitude, rates
 
-# Factor on the noise while the motors are off: the IMU has less noise then.
+# Factor on the noise while the motors are off, because the IMU then has less noise.
 STANDING_NOISE = 0.1
 
 
 class EstimatorName(StrEnum):
-    """Estimators by the autopilot whose errors they have."""
+    """Models of estimator errors, named after the autopilot on which they were identified."""
 
     PERFECT = "perfect"
     WHITE = "white"
@@ -47,8 +47,9 @@ class EstimatorName(StrEnum):
 
 
 class WhiteNoise(Parameters):
-    """Standard deviations of the `white` estimator, the same on each axis; new at each sample. The
-    minima are those of `perfect`: a position that does not change counts as none."""
+    """Standard deviations of the `white` estimator, the same on each axis, independent at each
+    sample. The minima are the values of `perfect`: the controller ignores a position that repeats.
+    """
 
     position_m: float = Field(default=0.02, ge=0.00005, le=10)
     velocity_mps: float = Field(default=0.02, ge=0.00005, le=10)
@@ -58,9 +59,9 @@ class WhiteNoise(Parameters):
 
 @dataclass(frozen=True, slots=True)
 class AxisError:
-    """Error e' = drift e + noise xi of one axis, xi white with unit density; p m, v m/s, b rad.
+    """Error e' = drift e + noise xi of one axis; xi is white with unit density; p m, v m/s, b rad.
 
-    It may have fewer states than the error state, in the same order; the others are zero.
+    The model may have fewer states than the error state, in the same order; the others are zero.
     """
 
     drift: Rows = ()
@@ -77,23 +78,24 @@ class ErrorModel:
     yaw_sd_rad: float
     yaw_time_s: float
     white: WhiteNoise
-    lag_s: float  # of position and velocity behind their time stamp
-    # e_r' of north and east per true velocity, 1/s: of a GPS later than the estimator assumes
+    lag_s: float  # delay of position and velocity behind their time stamp
+    # e_r' of north and east per true velocity, 1/s, of a GPS that is later than assumed
     late_gps_ps: float = 0.0
-    receiver: tuple[float, ...] = (0.0,) * 5  # GPS fix, new at each: position NED, velocity N, E
+    receiver: tuple[float, ...] = (0.0,) * 5  # white sd of a GPS fix: position NED, velocity N, E
 
 
 _NONE = AxisError()
 # Without any noise an estimate would repeat itself while the vehicle stands, and no real one does:
 # of 9,000 samples that PX4 1.16 and ArduCopter 4.6 sent while armed, none repeats the one before.
-# Standing armed, ArduCopter's change by medians of 6e-5 m, 6e-5 m/s, 1.3e-6 and 4e-5 rad/s.
+# Armed on the ground, ArduCopter's samples change by medians of 6e-5 m, 6e-5 m/s, 1.3e-6 and
+# 4e-5 rad/s.
 _LEAST = WhiteNoise(
     position_m=0.00005, velocity_mps=0.00005, attitude_rad=0.000001, rates_radps=(0.00004,) * 3
 )
 PERFECT = ErrorModel(_NONE, _NONE, _NONE, 0.0, 15.0, _LEAST, 0.0)
 
-# GPS noise of PX4's SIH, measured as GPS_RAW_INT minus truth at 47 deg north. SIH's noise is an
-# angle of longitude to the east, hence the smaller distance.
+# GPS noise of PX4's SIH, measured as GPS_RAW_INT minus truth at 47 deg north. SIH adds the noise to
+# latitude and longitude in degrees, so that it is smaller in metres to the east.
 SIH_RECEIVER = (0.19, 0.13, 0.52, 0.062, 0.072)
 
 # PX4 1.16 SITL with its SIH quadrotor, identified from estimate minus truth in hover and on
@@ -147,8 +149,8 @@ PX4_LIKE = ErrorModel(
 )
 
 
-# ArduCopter 4.6 EKF3, identified as PX4's. The sensors had more noise than SITL's default, as those
-# of a real vehicle have. Standard deviations N and E 0.057 m and 0.027 m/s, D 0.023 and 0.006;
+# ArduCopter 4.6 EKF3, identified as PX4's was. The sensors had more noise than SITL's default, like
+# those of a real vehicle. Standard deviations are N and E 0.057 m and 0.027 m/s, D 0.023 and 0.006,
 # correlated over 1-1.5 s. The mean rate of the position over 1 s differs from the velocity by
 # 0.05 m/s, over 4 s by 0.02.
 _ARDUPILOT_LATERAL = AxisError(
@@ -184,13 +186,13 @@ ARDUPILOT_LIKE = ErrorModel(
     receiver=SIH_RECEIVER,
 )
 
-# ArduCopter 4.6 SITL as shipped, whose sensors have no noise: its GPS is later than its EKF3
-# assumes, so that e_p follows minus that time times the true velocity, as a filter of second order.
-# Fits to estimate minus truth of nine flights give 1.3 to 1.8 rad/s, damping 0.37 to 0.69, 23 to
-# 31 ms, and leave 0.01 m. In the scenario of this name the tracking errors of hover, of lemniscates
-# of 15 and 8 s, of the latter 120 ms later each way and in wind of 0.65 m/s, and of a circle of
-# 8 m/s are 0.0009, 0.0016, 0.0050, 0.017, 0.0038 and 0.021 m; on the real autopilot 0.0009, 0.0018,
-# 0.0046, 0.014, 0.0044 and 0.018 m.
+# ArduCopter 4.6 SITL as shipped, whose sensors have no noise. Its GPS is later than its EKF3
+# assumes, so that e_p follows minus this delay times the true velocity through a second-order
+# filter. Fits to estimate minus truth of nine flights give 1.3 to 1.8 rad/s, damping 0.37 to 0.69,
+# a delay of 23 to 31 ms, and leave 0.01 m. In the scenario of this name the tracking errors are
+# 0.0009 m (hover), 0.0016 and 0.0050 (lemniscates of 15 and 8 s), 0.017 and 0.0038 (the latter with
+# 120 ms more delay each way, and in wind of 0.65 m/s) and 0.021 (circle at 8 m/s); on the real
+# autopilot they are 0.0009, 0.0018, 0.0046, 0.014, 0.0044 and 0.018 m.
 _SITL_RADPS, _SITL_DAMPING, _SITL_LATE_S = 1.6, 0.55, 0.0225
 _SITL_LATERAL = AxisError(
     drift=(
@@ -207,7 +209,7 @@ ARDUPILOT_SITL = replace(
 
 
 def error_model(name: EstimatorName, white: WhiteNoise) -> ErrorModel:
-    """Errors of the estimator of this name; only WHITE uses `white`."""
+    """Return the error model of this name; only WHITE uses `white`."""
     return {
         EstimatorName.PERFECT: PERFECT,
         EstimatorName.WHITE: ErrorModel(_NONE, _NONE, _NONE, 0.0, 15.0, white, 0.0),
@@ -218,7 +220,7 @@ def error_model(name: EstimatorName, white: WhiteNoise) -> ErrorModel:
 
 
 def error_process(model: ErrorModel, step_s: float) -> LinearProcess:
-    """Process of the error state (NORTH, EAST, DOWN, YAW) with steps of `step_s`."""
+    """Return the process of the error state (NORTH, EAST, DOWN, YAW) with steps of `step_s`."""
     sizes = ((model.north, EAST - NORTH), (model.east, DOWN - EAST), (model.down, YAW - DOWN))
     parts = [discretise(*_padded(axis, size), step_s) for axis, size in sizes]
     yaw_density = model.yaw_sd_rad * math.sqrt(2.0 / model.yaw_time_s)
@@ -227,7 +229,7 @@ def error_process(model: ErrorModel, step_s: float) -> LinearProcess:
 
 
 def _padded(axis: AxisError, size: int) -> tuple[Array, Array]:
-    """Drift and noise (size, size); states that the axis does not have decay without noise."""
+    """Drift and noise, each (size, size). States that the model does not have stay zero."""
     drift, noise = -np.eye(size), np.zeros((size, size))
     for i, (drift_row, noise_row) in enumerate(zip(axis.drift, axis.noise, strict=True)):
         drift[i, : len(drift_row)] = drift_row
@@ -236,7 +238,7 @@ def _padded(axis: AxisError, size: int) -> tuple[Array, Array]:
 
 
 def white_sds(model: ErrorModel) -> Array:
-    """Standard deviations (12,) of position, velocity, attitude error and rates."""
+    """Standard deviations (12,) of the white noise of position, velocity, attitude and rates."""
     white = model.white
     lateral = np.repeat([white.position_m, white.velocity_mps, white.attitude_rad], 3)
     return np.concatenate([lateral, white.rates_radps])
@@ -244,8 +246,8 @@ def white_sds(model: ErrorModel) -> Array:
 
 @kernel
 def turn_estimate(body: Array, error: Array, out: Array) -> None:
-    """The attitude of `body`, rotated by the small NED rotation `error` (3,) rad; unit length, into
-    `out` (4,).
+    """Write the attitude of `body`, rotated by the small NED rotation `error` (3,) rad, to `out`
+    (4,), with unit length.
 
     A rotation (-e_bE, e_bN, e_psi) changes the thrust direction of a level body by (e_bN, e_bE).
     """
@@ -260,6 +262,6 @@ def turn_estimate(body: Array, error: Array, out: Array) -> None:
         out[i] /= norm
 
 
-# Layout of a report: the estimate as one array.
+# Layout of a report, which is the estimate as one array.
 POSITION, VELOCITY, ATTITUDE, RATES = slice(0, 3), slice(3, 6), slice(6, 10), slice(10, 13)
 REPORT_WIDTH = 13

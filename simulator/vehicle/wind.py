@@ -1,6 +1,6 @@
 """Wind: steady wind and Dryden gusts (MIL-F-8785C) that pass the vehicle at a fixed speed.
 
-Data and matrices; the plant advances the process. Knows no vehicle.
+This module makes the matrices of the process; the plant advances it. Knows no vehicle.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ GUST_COUNT = 5
 
 
 class Gusts(Parameters):
-    """Dryden turbulence. Standard deviations in m/s, scale lengths in m; intensity 0 is still air.
+    """Dryden turbulence. Standard deviations in m/s, scale lengths in m; intensity 0: no gusts.
 
-    The gust field passes at `speed_mps` without changing, so the correlation times are length /
-    speed. For heights below 300 m MIL-F-8785C has the vertical length equal to the height and the
-    horizontal intensity up to 1.8 times the vertical one.
+    A frozen gust field passes at `speed_mps`, so the correlation times are length / speed. For
+    heights below 300 m, MIL-F-8785C has the vertical length equal to the height, and the horizontal
+    intensity up to 1.8 times the vertical one.
     """
 
     intensity_mps: float = Field(default=0.0, ge=0, le=15)  # sd along and across the mean wind
@@ -36,7 +36,8 @@ class Gusts(Parameters):
 
 
 def dryden(gusts: Gusts, step_s: float) -> LinearProcess:
-    """Gust process with states [u, v, v~, w, w~]; along, across and down are states 0, 1 and 3."""
+    """Return the gust process with states [u, v, v~, w, w~]: along the mean wind, across and down
+    are states 0, 1 and 3."""
     time_s = gusts.length_m / gusts.speed_mps
     down_time_s = gusts.vertical_length_m / gusts.speed_mps
     along = discretise([[-1.0 / time_s]], [gusts.intensity_mps * math.sqrt(2.0 / time_s)], step_s)
@@ -58,7 +59,7 @@ def _transverse(sd_mps: float, time_s: float, step_s: float) -> LinearProcess:
 
 
 def wind_axes(wind_ned_mps: tuple[float, float, float]) -> tuple[float, float]:
-    """(cos, sin) of the direction towards which the steady wind blows; north without wind."""
+    """Return (cos, sin) of the direction to which the steady wind blows; north without wind."""
     north, east, _ = wind_ned_mps
     speed = math.hypot(north, east)
     return (north / speed, east / speed) if speed > 1e-9 else (1.0, 0.0)
