@@ -1,6 +1,6 @@
 """Faults of a flight, part of a scenario file: what goes wrong, when, and for how long.
 
-One class is one fault: its keys, and what it does to the vehicle. A new one is listed in `Fault`.
+Each class is a fault, with its keys and its effect on the vehicle. `Fault` lists all of them.
 """
 
 from __future__ import annotations

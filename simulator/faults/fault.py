@@ -1,8 +1,9 @@
-"""What every fault has: when it begins, how long it lasts, and an effect on the vehicle; and those
-of a flight, each of which begins and ends at its time.
+"""The base class of faults, with time and duration, and `Injection`, which begins and ends the
+faults of a flight.
 
-An effect is a generator: it begins, then yields until its end. Each yield returns True at a step of
-the vehicle, the step of its beginning among them, and False when the fault ends.
+The effect of a fault is a generator. It is advanced when the fault begins and then yields until it
+ends. `yield` returns True at each step of the vehicle, including the step at which the fault
+begins, and False when the fault ends.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ ModeName = Annotated[str, AfterValidator(_flown)]  # "AUTO." may be left out
 
 
 class Moment(StrEnum):
-    """Event from which the time of a fault counts: its first occurrence."""
+    """Event from whose first occurrence the time of a fault counts."""
 
     BOOT = "boot"
     ARMED = "armed"
@@ -55,19 +56,19 @@ class Moment(StrEnum):
 
 
 class Vehicle(Protocol):
-    """What faults act on."""
+    """The part of `simulator.instance.Instance` that faults use."""
 
     autopilot: Autopilot
     view: View
     companion: Server
-    down: list[Channel]  # of the companion link's directions: telemetry, commands
-    up: list[Channel]
+    down: list[Channel]  # link faults of telemetry on the companion link
+    up: list[Channel]  # link faults of what the companion sends
 
     def reboot(self, silent_s: float) -> None: ...
 
 
 class Timed(Parameters):
-    """A fault: when it begins and how long it lasts, seconds of vehicle time; None: for good."""
+    """A fault that begins `at_s` after the event `after` and lasts `for_s` (None: for good)."""
 
     at_s: float = Field(default=0.0, ge=0, le=1e5)
     after: Moment = Moment.BOOT
@@ -75,7 +76,7 @@ class Timed(Parameters):
 
     @abstractmethod
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
-        """What it does to the vehicle, from its beginning to its end."""
+        """Change the vehicle when the fault begins, at each step, and when it ends."""
 
 
 @dataclass(slots=True)
@@ -83,20 +84,20 @@ class Running:
     """One fault of a flight and its progress."""
 
     fault: Timed
-    seed: str  # of its random numbers
-    datagrams: list[bytes] = field(default_factory=list)  # of a stranger, to be sent
-    begins_s: float | None = None  # None until the event that starts its delay
-    effect: Effect | None = None  # once it has begun
+    seed: str  # seed of its random numbers
+    datagrams: list[bytes] = field(default_factory=list)  # that a `Stranger` is to send
+    begins_s: float | None = None  # None until the event from which its time counts
+    effect: Effect | None = None  # None until it begins
 
 
 def until_the_end() -> Effect:
-    """Wait for the end of the fault."""
+    """Wait until the fault ends."""
     while (yield):
         pass
 
 
 class Injection:
-    """The faults of one flight, none begun; `unfinished` have not begun or not ended."""
+    """The faults of one flight; `unfinished` are those that have not begun or not ended."""
 
     def __init__(self, faults: Sequence[Timed], seed: int) -> None:
         self.unfinished = [Running(fault, f"{seed} {at}") for at, fault in enumerate(faults)]
@@ -104,7 +105,7 @@ class Injection:
         self._flown = False
 
     def step(self, now_s: float, vehicle: Vehicle) -> None:
-        """Begin and end the faults due at `now_s`, seconds since the start."""
+        """Begin, advance and end faults at `now_s`, seconds since the links opened."""
         self._note_moments(now_s, vehicle.autopilot)
         self.unfinished = [
             one for one in self.unfinished if self._goes_on(one, now_s + 1e-6, vehicle)
@@ -126,7 +127,7 @@ class Injection:
                 self._moments.setdefault(moment, now_s)
 
     def _goes_on(self, running: Running, now_s: float, vehicle: Vehicle) -> bool:
-        """Advance one fault; False once it is over."""
+        """Advance one fault; return False when it is over."""
         fault = running.fault
         if running.begins_s is None:
             since_s = self._moments.get(fault.after)

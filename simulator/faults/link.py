@@ -1,4 +1,4 @@
-"""Faults of the companion link and of what the vehicle sends on it; other MAVLink senders."""
+"""Faults of the companion link and of the vehicle's messages; other MAVLink senders."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from simulator.steps import STEP_S
 
 
 class LinkFault(Timed, Impairment):
-    """A bad companion link; each direction by itself, so `both` doubles the round trip.
+    """A bad companion link. With `both`, each direction has the delay, so a round trip has twice.
 
-    It does not apply to the TIMESYNC exchange of lockstep, which is the simulation's clock.
+    The fault does not apply to the TIMESYNC exchange of lockstep, the clock of the simulation.
     """
 
     fault: Literal["link"]
@@ -41,11 +41,11 @@ class LinkFault(Timed, Impairment):
                 path.append(channels[-1])
         yield from until_the_end()
         for channel in channels:
-            channel.on = False  # what is under way still arrives
+            channel.on = False  # datagrams under way still arrive
 
 
 class SilentMessage(Timed):
-    """A message that is no longer sent, on any link; with `every`, every so many are still sent."""
+    """A message that is no longer sent on any link; one in `every` is still sent."""
 
     fault: Literal["silent_message"]
     message: MessageName
@@ -58,8 +58,8 @@ class SilentMessage(Timed):
 
 
 class StuckMessage(Timed):
-    """A message that repeats its content, or only some of its `fields`; with `stamp_runs` its time
-    stamp increases."""
+    """A message that repeats its old content: `fields`; without these all fields, but with
+    `stamp_runs` not its time stamp."""
 
     fault: Literal["stuck_message"]
     message: MessageName
@@ -92,7 +92,7 @@ class ClockJump(Timed):
         jump_us, jumped = round(self.jump_s * 1e6), vehicle.autopilot
         vehicle.view.clock_offset_us += jump_us
         yield from until_the_end()
-        if vehicle.autopilot is jumped:  # a reboot sets the clock
+        if vehicle.autopilot is jumped:  # a reboot has reset the clock
             vehicle.view.clock_offset_us -= jump_us
 
 
@@ -100,18 +100,19 @@ _QUADROTOR, _ONBOARD_CONTROLLER, _NO_AUTOPILOT = 2, 18, 8  # MAV_TYPE, MAV_AUTOP
 _STANDBY, _ACTIVE, _MAVLINK = 3, 4, 3  # MAV_STATE; protocol version
 _ATTITUDE_AND_THRUST = 7  # type_mask
 _HEARTBEAT_HZ = 1.0
-_DATAGRAMS_MAX = 2000  # of a stranger, that wait
+_DATAGRAMS_MAX = 2000  # datagrams of a stranger that wait to be sent
 
 
 def _autopilot_heartbeat(sender: Encoder, firmware: Firmware) -> bytes:
-    """HEARTBEAT of an autopilot with this firmware, disarmed and in its first mode."""
+    """HEARTBEAT of an autopilot with this firmware, disarmed, in the mode after boot."""
     mode = firmware.modes[firmware.boot_mode]
     kind, state = (_QUADROTOR, firmware.mav_autopilot), (_STANDBY, _MAVLINK)
     return sender.frame("HEARTBEAT", (*kind, mode.base_mode, mode.custom_mode, *state))
 
 
 def due(rate_hz: float, step: int) -> range:
-    """As many numbers as messages of this rate are due in this step; the first is at once."""
+    """Return a range with one number for each message of this rate that is due in this step; the
+    first message is due in step 0."""
     before, now = (math.floor(n * rate_hz * STEP_S + 1e-9) for n in (step - 1, step))
     return range(now - before)
 
@@ -119,9 +120,9 @@ def due(rate_hz: float, step: int) -> range:
 class SecondSender(Timed):
     """Another companion or ground station sends to the vehicle, which obeys any source.
 
-    Level attitude setpoints at `setpoint_rate_hz` with this thrust, heading north, and a command
-    when it begins. Its HEARTBEAT with `custom_mode`, which is the phase of an `offboard`, reaches
-    the companion once a second, as an autopilot forwards it.
+    It sends a command when the fault begins, and level attitude setpoints, heading north, with this
+    thrust at `setpoint_rate_hz`. Its HEARTBEAT reaches the companion once a second, because the
+    autopilot forwards it. In the HEARTBEAT of an `offboard`, `custom_mode` is the phase.
     """
 
     fault: Literal["second_sender"]
@@ -131,7 +132,7 @@ class SecondSender(Timed):
     setpoint_rate_hz: float = Field(default=10.0, ge=0, le=250)
     thrust: float = Field(default=0.5, ge=0, le=1)
     command: int | None = Field(default=None, ge=0, le=65535)  # MAV_CMD
-    params: tuple[float, ...] = Field(default=(), max_length=7)  # param1 .. param7; the rest is 0
+    params: tuple[float, ...] = Field(default=(), max_length=7)  # param1, ...; missing ones are 0
 
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
         sender = Encoder(self.system, self.component)
@@ -173,15 +174,15 @@ class Stranger(Timed):
     """Datagrams from another port of the vehicle's host reach the companion. UDP links only."""
 
     fault: Literal["stranger"]
-    # random bytes, or those of an autopilot like the vehicle's, disarmed
+    # random bytes, or HEARTBEATs of a disarmed autopilot with the vehicle's firmware
     sends: Literal["noise", "heartbeat"] = "noise"
     rate_hz: float = Field(default=100.0, gt=0, le=100_000)
-    size_bytes: int = Field(default=64, ge=1, le=1400)  # of noise
-    system: int | None = Field(default=None, ge=1, le=255)  # None: the vehicle's own id, a spoof
+    size_bytes: int = Field(default=64, ge=1, le=1400)  # of a datagram of noise
+    system: int | None = Field(default=None, ge=1, le=255)  # None: the vehicle's id (spoofing)
     component: int = Field(default=1, ge=1, le=255)
 
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
-        """At most _DATAGRAMS_MAX datagrams wait to be sent; older ones are dropped."""
+        """Queue datagrams; if more than _DATAGRAMS_MAX wait to be sent, the oldest are dropped."""
         sender = Encoder(self.system or vehicle.view.system, self.component)
         random = Random(running.seed)
         for step in count():

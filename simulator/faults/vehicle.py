@@ -1,5 +1,5 @@
-"""Faults of motors, mass, battery, estimator and land detector; what a pilot does, what the
-autopilot refuses, and a reboot.
+"""Faults of motors, mass, battery, estimator and land detector; actions of a pilot, refusals of the
+autopilot, and its reboot.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from simulator.autopilot.values import critical
 from simulator.faults.fault import Effect, ModeName, Running, Timed, Vehicle, until_the_end
 from simulator.steps import STEP_S
 
-_NO_THRUST = 1e-9  # a factor that can be undone
+_NO_THRUST = 1e-9  # factor on the thrust; not 0, so that it can be undone
 
 
 class ThrustChange(Timed):
-    """Thrust of all motors multiplied by `thrust_scale`."""
+    """The thrust of all motors is multiplied by `thrust_scale`."""
 
     fault: Literal["thrust_change"]
     thrust_scale: float = Field(ge=0.1, le=3)
@@ -30,7 +30,7 @@ class ThrustChange(Timed):
 
 
 class MotorsCut(Timed):
-    """No motor has thrust any more, from the first time on that the vehicle is below `below_m`."""
+    """The motors have no thrust, from the first time at which the vehicle is below `below_m`."""
 
     fault: Literal["motors_cut"]
     below_m: float = Field(default=1e4, ge=0, le=1e4)  # above the ground
@@ -46,7 +46,7 @@ class MotorsCut(Timed):
 
 
 class MassChange(Timed):
-    """A load picked up or dropped: mass multiplied by `mass_scale`."""
+    """A load is picked up or dropped: the mass is multiplied by `mass_scale`."""
 
     fault: Literal["mass_change"]
     mass_scale: float = Field(ge=0.2, le=5)
@@ -58,7 +58,7 @@ class MassChange(Timed):
 
 
 class BatteryDrop(Timed):
-    """The charge of the battery drops to `remaining` of its capacity, permanently."""
+    """The charge of the battery drops to the share `remaining` of its capacity, permanently."""
 
     fault: Literal["battery_drop"]
     remaining: float = Field(ge=0, le=1)
@@ -80,8 +80,8 @@ class EstimatorJump(Timed):
 
 
 class GpsLoss(Timed):
-    """No GPS fix: the position estimate drifts to the north-east, faster and faster with
-    `drift_mps2`, and jumps back with the fix."""
+    """No GPS fix: the position estimate drifts to the north-east at `drift_mps`, with acceleration
+    `drift_mps2`, and jumps back when the fix returns."""
 
     fault: Literal["gps_loss"]
     drift_mps: float = Field(default=0.0, ge=0, le=10)
@@ -113,7 +113,7 @@ class VelocityError(Timed):
 
 
 class WrongLandedState(Timed):
-    """EXTENDED_SYS_STATE reports this state; the autopilot itself knows the true one."""
+    """EXTENDED_SYS_STATE reports this state; the autopilot itself uses the detected one."""
 
     fault: Literal["wrong_landed_state"]
     reports: Literal["on_ground", "in_air"]
@@ -134,7 +134,7 @@ class BlindLandDetector(Timed):
             vehicle.autopilot.position_controller.detector.reset()
 
 
-# requests that a fault makes the autopilot refuse: their events, and the beginning of the text
+# Requests that can be refused: events of each, and beginning of the text
 _REFUSED = {
     "arm": (("arm", "force arm"), "Arming denied"),
     "offboard": (("offboard",), "Switching to Offboard denied"),
@@ -143,7 +143,7 @@ _REFUSED = {
 
 
 class Refusal(Timed):
-    """The autopilot refuses a request, with a text."""
+    """The autopilot refuses a request and says so in a STATUSTEXT."""
 
     fault: Literal["refusal"]
     of: Literal["arm", "offboard", "takeoff"]
@@ -159,16 +159,17 @@ class Refusal(Timed):
 
 
 class PilotTakesOver(Timed):
-    """The pilot switches to a mode; after `for_s` back to the one before.
+    """The pilot switches to a mode, and after `for_s` back to the mode before.
 
-    Sticks are centred or, where they are not simulated, missing: POSCTL then descends slowly.
+    ArduCopter has the stick input of SITL without RC, throttle down, until a client overrides it.
+    PX4 has no stick input, so that in POSCTL the vehicle descends slowly.
     """
 
     fault: Literal["pilot_takes_over"]
-    mode: ModeName | None = None  # None: the one that holds position
+    mode: ModeName | None = None  # None: the mode of the firmware that holds position
 
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:
-        """Switch as by command; a mode that no command may enter, as by the pilot's switch."""
+        """Switch the mode as a command does; if it may not, as the pilot's mode switch does."""
         autopilot = vehicle.autopilot
         mode = autopilot.firmware.mode_named(self.mode or autopilot.firmware.hold_mode)
         assert mode is not None, "the scenario was checked"
@@ -191,7 +192,7 @@ class PilotDisarms(Timed):
 
 
 class Reboot(Timed):
-    """The autopilot restarts, disarmed, with its time from zero, after `for_s` of silence."""
+    """After `for_s` of silence the autopilot has restarted, disarmed, and its time begins at 0."""
 
     fault: Literal["reboot"]
     for_s: float = Field(default=2.0, gt=0, le=60)

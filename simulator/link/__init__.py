@@ -1,1 +1,1 @@
-"""Sockets of a link, and faults between its two ends."""
+"""Sockets of a link, faults of its datagrams, and their division into MAVLink frames."""

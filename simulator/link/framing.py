@@ -1,6 +1,7 @@
 """MAVLink frames in bytes: where they begin and end, and a log of them (.tlog). Knows no message.
 
-A record of the log is a big-endian uint64 of Unix microseconds, low two bits zero, then the frame.
+A record of the log is a big-endian uint64, Unix time in microseconds with the low two bits zero,
+and then the frame.
 """
 
 from __future__ import annotations
@@ -12,12 +13,12 @@ MAGIC_V1, MAGIC_V2 = 0xFE, 0xFD
 SIGNED = 0x01  # incompatibility flag: a signature follows
 SIGNATURE_LENGTH = 13
 _STAMP = struct.Struct(">Q")
-_NO_FRAME, _SETUP_SIGNING = -1, 256  # which holds the key
+_NO_FRAME, _SETUP_SIGNING = -1, 256  # ids that are not recorded: SETUP_SIGNING contains the key
 
 
 def frame_length(data: bytes | bytearray, at: int) -> int:
-    """Length of the frame that begins at `at`, also beyond the end of `data`; 0 where none begins,
-    and -1 where more bytes are needed to tell."""
+    """Return the length of the frame that begins at `at`, even if `data` ends before; 0 if no frame
+    begins there, and -1 if the length is not yet known."""
     if data[at] not in (MAGIC_V1, MAGIC_V2):
         return 0
     if len(data) - at < 3:
@@ -28,7 +29,8 @@ def frame_length(data: bytes | bytearray, at: int) -> int:
 
 
 def frames(datagram: bytes) -> list[tuple[int, bytes]]:
-    """(message id, frame) of each MAVLink 2 frame; anything else is one piece with id -1."""
+    """Return (message id, frame) of each MAVLink 2 frame; from the first other byte on, the rest is
+    one piece with id -1."""
     found: list[tuple[int, bytes]] = []
     at = 0
     while at < len(datagram):
@@ -43,7 +45,7 @@ def frames(datagram: bytes) -> list[tuple[int, bytes]]:
 
 
 def whole_frames(data: bytes | bytearray) -> int:
-    """Number of bytes before the first incomplete frame; bytes outside frames count too."""
+    """Return the number of bytes before the first incomplete frame; other bytes count too."""
     at = 0
     while at < len(data):
         length = frame_length(data, at)
@@ -54,13 +56,13 @@ def whole_frames(data: bytes | bytearray) -> int:
 
 
 class Recorder:
-    """Writes a new file without buffering, so that a killed process loses nothing."""
+    """Writes a new .tlog without buffering, so that nothing is lost if the process is killed."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("xb", buffering=0)
 
     def write(self, unix_us: int, datagrams: list[bytes]) -> None:
-        """Append the MAVLink 2 frames of datagrams, sent or received. A full disk is ignored."""
+        """Append the MAVLink 2 frames of sent or received datagrams. Write errors are ignored."""
         stamp = _STAMP.pack(unix_us & ~3)
         records = [
             stamp + frame

@@ -1,7 +1,7 @@
 """Link faults: delay, loss, duplication, reordering, corruption and limited rate of datagrams.
 
-They act on bytes, outside the MAVLink server. Time is an argument, in microseconds, and the random
-generator is passed in, so that the same seed gives the same faults.
+They act on bytes, outside the MAVLink server. Time (in microseconds) and the random generator are
+arguments, so that the same seed gives the same faults.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pydantic import Field
 from offboard.documents.parameters import Parameters
 from simulator.link.framing import frames
 
-# Answers and events, which a rate limit per message does not drop: PARAM_VALUE, MISSION_*,
+# Answers and events, which `message_rate_hz` does not drop: PARAM_VALUE, MISSION_*,
 # COMMAND_ACK, FILE_TRANSFER_PROTOCOL, TIMESYNC, AUTOPILOT_VERSION, MESSAGE_INTERVAL, STATUSTEXT
 _NOT_STREAMED = frozenset((22, *range(37, 48), 51, 73, 77, 110, 111, 148, 244, 253))
 
@@ -24,26 +24,27 @@ class Impairment(Parameters):
     """Faults of one direction of a link; probabilities are per datagram."""
 
     latency_s: float = Field(default=0.0, ge=0, le=10)
-    ramp_s: float = Field(default=0.0, ge=0, le=1e5)  # the latency grows from zero in this time
-    jitter_s: float = Field(default=0.0, ge=0, le=5)  # further delay, uniform; order is kept
+    ramp_s: float = Field(default=0.0, ge=0, le=1e5)  # the latency increases from 0 in this time
+    jitter_s: float = Field(default=0.0, ge=0, le=5)  # added delay, uniform; the order is kept
     loss: float = Field(default=0.0, ge=0, le=1)
     duplication: float = Field(default=0.0, ge=0, le=1)
     reorder: float = Field(default=0.0, ge=0, le=1)  # probability of a delay by `reorder_s`
     reorder_s: float = Field(default=0.02, ge=0, le=5)
     corruption: float = Field(default=0.0, ge=0, le=1)  # probability of one flipped bit
     rate_bytes_ps: float | None = Field(default=None, ge=100, le=1e9)
-    stalled: bool = False  # datagrams wait until the fault ends, and then arrive at once, in order
-    queue_bytes: int = Field(default=4096, ge=280, le=10_000_000)  # that wait for rate or end
-    message_rate_hz: float | None = Field(default=None, ge=0.1, le=1000)  # of each message id
+    stalled: bool = False  # datagrams wait until the fault ends and then arrive at once, in order
+    # datagrams that wait for the limited rate or the end of a stall; if it is full, they are lost
+    queue_bytes: int = Field(default=4096, ge=280, le=10_000_000)
+    message_rate_hz: float | None = Field(default=None, ge=0.1, le=1000)  # limit per message id
 
 
 class Channel:
-    """One direction of a link: `put` datagrams in, `take` those that have arrived."""
+    """One direction of a link: `put` sends a datagram, `take` returns those that have arrived."""
 
     def __init__(self, settings: Impairment, random: Random) -> None:
         self._settings = settings
         self._random = random
-        self.on = True  # datagrams already under way arrive in any case
+        self.on = True  # False: no more faults; datagrams under way still arrive
         self._under_way: list[tuple[int, int, bytes]] = []
         self._held: list[bytes] = []  # while stalled
         self._begun_us: int | None = None
@@ -82,7 +83,7 @@ class Channel:
             self._deliver(due_us, datagram)
 
     def take(self, now_us: int) -> list[bytes]:
-        """Datagrams that have arrived by `now_us`, in order."""
+        """Return the datagrams that have arrived by `now_us`, in the order of arrival."""
         if not self.on:
             self._release(now_us)
         arrived: list[bytes] = []
@@ -91,7 +92,7 @@ class Channel:
         return arrived
 
     def _latency_s(self, now_us: int) -> float:
-        """Latency, growing from the first datagram on."""
+        """Latency at this time; with `ramp_s` it increases from the first datagram on."""
         settings = self._settings
         if not settings.ramp_s:
             return settings.latency_s
@@ -113,7 +114,7 @@ class Channel:
         self._count += 1
 
     def _transmitted(self, size: int, now_us: int) -> int | None:
-        """Time at which the last byte is sent at the limited rate; None when the queue is full."""
+        """Time at which the last byte is sent at the limited rate; None if the queue is full."""
         rate = self._settings.rate_bytes_ps
         if rate is None:
             return now_us
@@ -130,7 +131,7 @@ class Channel:
         return bytes(damaged)
 
     def _thinned(self, datagram: bytes, now_us: int, rate_hz: float) -> bytes:
-        """The datagram without messages whose id was already sent in this 1/rate."""
+        """The datagram without messages whose id was already sent in this period of 1 / rate."""
         slot = int(now_us * 1e-6 * rate_hz + 1e-9)
         kept: list[bytes] = []
         for message_id, frame in frames(datagram):
@@ -143,7 +144,7 @@ class Channel:
 
 
 def carry(channels: Sequence[Channel], datagrams: list[bytes], now_us: int) -> list[bytes]:
-    """Send these datagrams through channels in series and return those that arrive now."""
+    """Send these datagrams through the channels in series; return those that arrive by now."""
     for channel in channels:
         for datagram in datagrams:
             channel.put(datagram, now_us)

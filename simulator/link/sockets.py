@@ -1,8 +1,8 @@
 """Sockets of the simulator's links, and waiting for datagrams. Bytes only; no MAVLink.
 
-udpout:HOST:PORT sends to that address from the start, udpin:HOST:PORT answers every address that
-sends to it, and tcpin:HOST:PORT accepts connections, as ArduPilot's SITL does. A TCP stream may cut
-a frame anywhere; `receive` returns whole MAVLink frames, as a datagram does.
+udpout:HOST:PORT sends to that address from the start, udpin:HOST:PORT sends to every address from
+which it has received, and tcpin:HOST:PORT accepts connections, as ArduPilot's SITL does. A TCP
+stream may divide a frame anywhere; `receive` returns whole MAVLink frames, as in a datagram.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ DATAGRAM_MAX = 65535
 Address = tuple[str, int]
 CLIENTS_MAX = 16
 READ_BYTES = 65536
-UNSENT_MAX = 1 << 20  # bytes; a client that does not read more is disconnected
-# Distance between the ports of two instances, as PX4 and ArduPilot have it
+UNSENT_MAX = 1 << 20  # bytes; a client with more unsent bytes does not read and is disconnected
+# Difference between the ports of two instances, as in PX4's and ArduPilot's SITL
 _PORTS_APART = {"udpout": 1, "udpin": 1, "tcpin": 10}
 
 
@@ -32,7 +32,7 @@ class LinkError(UserError):
 
 
 class UdpLink:
-    """One socket and its peers. Send errors lose datagrams and are otherwise ignored."""
+    """A UDP socket and its peers. A datagram is lost if it cannot be sent."""
 
     def __init__(
         self,
@@ -64,11 +64,11 @@ class UdpLink:
             for peer in self.peers:
                 try:
                     self._socket.sendto(datagram, peer)
-                except OSError:  # refused, unreachable or full: telemetry may be lost
+                except OSError:  # port closed, host unreachable or buffer full
                     continue
 
     def receive(self) -> bytes | None:
-        """One datagram, or None."""
+        """Return the next datagram, or None."""
         while True:
             try:
                 datagram, sender = self._socket.recvfrom(DATAGRAM_MAX)
@@ -92,7 +92,7 @@ class UdpLink:
 
 @dataclass(slots=True)
 class Client:
-    """One connection: bytes received of an incomplete frame, and bytes not sent yet."""
+    """A TCP connection, with received bytes of an incomplete frame and bytes not sent yet."""
 
     socket: socket.socket
     arrived: bytearray = field(default_factory=bytearray)
@@ -100,7 +100,7 @@ class Client:
 
 
 class TcpLink:
-    """A listening socket and its clients. A client that disconnects or does not read is dropped."""
+    """A listening TCP socket and its clients. A client that does not read is disconnected."""
 
     def __init__(self, listener: socket.socket) -> None:
         self._listener = listener
@@ -137,7 +137,7 @@ class TcpLink:
             self._disconnect(client)
 
     def receive(self) -> bytes | None:
-        """Whole frames of one read from one client, or None."""
+        """Return the whole frames that one client has sent, or None."""
         if not self._frames:
             for key, _ in self._selector.select(0):
                 if key.fileobj is self._listener:
@@ -192,7 +192,7 @@ Link = UdpLink | TcpLink
 
 
 def free_ports(count: int) -> list[int]:
-    """UDP ports on 127.0.0.1 that are free now."""
+    """Return UDP ports on 127.0.0.1 that are free now."""
     sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
     try:
         for sock in sockets:
@@ -204,7 +204,7 @@ def free_ports(count: int) -> list[int]:
 
 
 def wait(links: Iterable[Link], timeout_s: float) -> list[Link]:
-    """Links with a datagram to receive; returns with the first one, or after `timeout_s`."""
+    """Wait until a link has a datagram to receive, at most `timeout_s`; return all that have."""
     return select.select(links, [], [], max(0.0, timeout_s))[0]
 
 
@@ -213,7 +213,7 @@ def open_link(url: str, preferred_port: int) -> Link:
 
     Args:
         url: `udpout:HOST:PORT`, `udpin:HOST:PORT` or `tcpin:HOST:PORT`.
-        preferred_port: local port of `udpout`; any other if it is in use.
+        preferred_port: local port of `udpout`; if it is in use, any free port is taken.
 
     Raises:
         LinkError: the address is malformed, unknown or in use.
@@ -244,10 +244,10 @@ def open_link(url: str, preferred_port: int) -> Link:
 
 
 def open_beside(link: Link) -> Link:
-    """Open a link with a port of its own and the same peers, for a sender beside the vehicle.
+    """Open a link with another local port and the same peers, for a sender that is not the vehicle.
 
     Raises:
-        LinkError: the link is a connection, in which nobody else can send.
+        LinkError: `link` is a TCP link, whose connections allow no other sender.
     """
     if not isinstance(link, UdpLink):
         raise LinkError("fault stranger: it needs a UDP link, where another port can send")
@@ -258,7 +258,8 @@ def open_beside(link: Link) -> Link:
 
 
 def shifted(url: str, by: int) -> str:
-    """URL of the same link for the instance `by` numbers later. Raises LinkError."""
+    """Return the URL of this link for the instance whose number is greater by `by`. Raises
+    LinkError."""
     kind, host, port = _split(url)
     return f"{kind}:{host}:{port + by * _PORTS_APART[kind]}"
 
