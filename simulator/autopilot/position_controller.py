@@ -103,7 +103,7 @@ class PositionController:
         self._detect_landing(setpoint, estimate)
 
     def _demand(self, demand: Demand) -> None:
-        """Set the demand. An equal one keeps the old object, which the plant has encoded already."""
+        """Set the demand. Keep an equal object, which the plant then need not encode again."""
         if demand != self.demand:
             self.demand = demand
 

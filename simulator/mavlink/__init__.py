@@ -1,1 +1,1 @@
-"""MAVLink of a vehicle without sockets: telemetry, commands, parameters, missions and texts."""
+"""The vehicle's MAVLink without sockets: telemetry, commands, parameters, missions, STATUSTEXTs."""

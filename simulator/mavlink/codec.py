@@ -1,9 +1,9 @@
-"""MAVLink 2 frames to and from messages, by pymavlink; signing as the simulated autopilot does it.
+"""MAVLink 2 frames to and from messages, with pymavlink; signing as the simulated autopilots do it.
 
-A datagram is cut into frames here, so that garbage and truncated frames cannot delay or hide a
-later command; pymavlink decodes, checks, packs and signs them. Received signatures are checked
-here, apart from the companion's code. Knows no vehicle, no socket and no clock. Nothing a peer
-sends makes it raise.
+This module divides a datagram into frames, so that garbage and truncated frames cannot delay or
+hide a later command; pymavlink decodes, checks, packs and signs them. Received signatures are
+checked here, independently of the companion's code. Knows no vehicle, no socket and no clock.
+Nothing that a peer sends makes it raise.
 """
 
 from __future__ import annotations
@@ -27,46 +27,48 @@ REFUSALS = UNSIGNED, WRONG, OLD = "unsigned", "wrong signature", "old time stamp
 
 @dataclass(slots=True)
 class Keyring:
-    """Key and clock of one vehicle; without a key nothing is signed and all is accepted.
+    """Signing key and time stamps of one vehicle. Without a key nothing is signed, and every
+    message is accepted.
 
     Args:
         accepted_unsigned: ids of messages that the firmware accepts without a signature.
-        unix_us: Unix time of the vehicle's clock, in microseconds; None: stamps follow no clock.
+        unix_us: Unix time of the vehicle's clock, in microseconds; None: time stamps only count.
     """
 
     accepted_unsigned: frozenset[int] = frozenset()
     unix_us: Callable[[], int] | None = None
     key: bytes = field(default=b"", repr=False)
-    newest: int = 0  # stamp that was sent, or heard from somebody else
-    stored: int = 0  # stamp that came with the key
-    heard: dict[tuple[int, int, int], int] = field(default_factory=dict)  # system, component, link
+    newest: int = 0  # greatest time stamp that was sent or received
+    stored: int = 0  # time stamp that was set with the key
+    # newest time stamp by system, component and link
+    heard: dict[tuple[int, int, int], int] = field(default_factory=dict)
 
     def set_up(self, key: bytes, stamp: int) -> None:
-        """SETUP_SIGNING: a new key, or none if key and stamp are zero."""
+        """Apply SETUP_SIGNING: a new key, or no signing if key and time stamp are zero."""
         self.key = key if any(key) or stamp else b""
         self.stored = stamp
         self.restart()
 
     def restart(self) -> None:
-        """Boot: the stamps are forgotten, but for the one that was stored with the key."""
+        """Forget the time stamps, as at boot, except the one that was set with the key."""
         self.newest = self.stored
         self.heard.clear()
 
     def next_stamp(self) -> int:
-        """Time stamp of the next frame."""
+        """Return the time stamp of the next frame, in 10 us since 2015."""
         self.newest = min(max(self.newest + 1, self._clock()), LATEST)
         return self.newest
 
     def complaint(self, message_id: int, sender: tuple[int, int], frame: bytes | None) -> str:
-        """Why a received message is refused, empty if it is not. `frame` with its signature; None
-        for an unsigned one."""
+        """Return why a received message is refused; empty if it is accepted. `frame` is the frame
+        with its signature; None: it is unsigned."""
         if not self.key:
             return ""
         flaw = UNSIGNED if frame is None else self._flaw(sender, frame)
         return "" if message_id in self.accepted_unsigned else flaw
 
     def _flaw(self, sender: tuple[int, int], frame: bytes) -> str:
-        """What is wrong with a signature; the time stamp of a right one is noted."""
+        """Return what is wrong with a signature, or store the time stamp of a valid one."""
         if self._digest(frame[:-6]) != frame[-6:]:
             return WRONG
         link, stamp = frame[-13], int.from_bytes(frame[-12:-6], "little")
@@ -90,39 +92,39 @@ class Keyring:
 _codec = dialect.MAVLink(None)
 _BY_NAME: dict[str, Any] = {each.msgname: each for each in dialect.mavlink_map.values()}
 
-Message = Any  # pymavlink's: fields are attributes, strings without padding
+Message = Any  # a pymavlink message: its fields are attributes, its strings have no padding
 Peer = tuple[int, int]  # system, component
 
 
 def sender_of(message: Message) -> Peer:
-    """Who sent a received message."""
+    """Return the sender of a received message."""
     return message.get_srcSystem(), message.get_srcComponent()
 
 
 def target_of(message: Message) -> Peer:
-    """Whom a message is for; 0 is all, also for a message without such a field."""
+    """Return the target of a message; 0 means all, also if the message has no such field."""
     return getattr(message, "target_system", 0), getattr(message, "target_component", 0)
 
 
 def id_of(name: str) -> int | None:
-    """Id of the message called `name`, or None when the dialect has none."""
+    """Return the id of the message `name`, or None if the dialect does not have it."""
     return _BY_NAME[name].id if name in _BY_NAME else None
 
 
 def name_of(message_id: int) -> str | None:
-    """Name of message `message_id`, or None when the dialect has none."""
+    """Return the name of message `message_id`, or None if the dialect does not have it."""
     message = dialect.mavlink_map.get(message_id)
     return None if message is None else message.msgname
 
 
 def fields_of(name: str) -> list[str]:
-    """The fields of the message called `name`, in the order of the XML."""
+    """Return the names of the fields of message `name`, in the order of the XML."""
     return list(_BY_NAME[name].fieldnames)
 
 
 class Encoder:
-    """Frames of one sender. With a key of `keyring` they are signed; `link` is the number of the
-    link in the signature."""
+    """Makes the frames of one sender, signed if `keyring` has a key. `link` is the link id in the
+    signature."""
 
     def __init__(
         self, system: int, component: int, keyring: Keyring | None = None, link: int = 0
@@ -132,11 +134,10 @@ class Encoder:
         self._mavlink.signing.link_id = link
 
     def frame(self, name: str, values: Sequence[object]) -> bytes:
-        """A message as one MAVLink 2 frame with the next sequence number; `values` in the field
-        order of the XML, extensions may be left out.
+        """Return a message as a MAVLink 2 frame with the next sequence number.
 
-        Raises KeyError when the dialect has no such message, TypeError for a wrong number of
-        values.
+        `values` are in the field order of the XML; extensions may be left out. Raises KeyError if
+        the dialect has no such message, TypeError for a wrong number of values.
         """
         mavlink, key = self._mavlink, self._keyring.key
         mavlink.signing.sign_outgoing = bool(key)
@@ -150,10 +151,10 @@ class Encoder:
 
 @dataclass
 class Decoder:
-    """Datagrams -> messages. Unreadable bytes are dropped and counted by reason.
+    """Decodes the messages of datagrams. Invalid bytes are dropped and counted by reason.
 
-    A datagram holds whole frames: nothing is kept for the next one. A message that `keyring`
-    refuses is dropped.
+    A datagram has whole frames, so nothing is kept for the next one. Messages that `keyring`
+    refuses are dropped, too.
     """
 
     keyring: Keyring = field(default_factory=Keyring)
@@ -161,11 +162,11 @@ class Decoder:
 
     @property
     def refused(self) -> Counter[str]:
-        """Messages that `keyring` refused, by reason."""
+        """Number of messages that `keyring` refused, by reason."""
         return Counter({f"message refused: {why}": self.dropped[why] for why in REFUSALS})
 
     def read(self, datagram: bytes) -> list[Message]:
-        """All intact messages of `datagram`, in order, also those after garbage."""
+        """Return all intact messages of `datagram`, in order, also those after garbage."""
         messages: list[Message] = []
         at = 0
         while at < len(datagram):
@@ -176,7 +177,7 @@ class Decoder:
         return messages
 
     def _at(self, data: bytes, at: int) -> tuple[int, Message | None]:
-        """Number of bytes to skip, and the message that begins at `at`, if one does."""
+        """Return the number of bytes to skip, and the message that begins at `at`, or None."""
         left = len(data) - at
         if data[at] == MAGIC_V2 and left >= 12:
             flags, message_id = data[at + 2], int.from_bytes(data[at + 7 : at + 10], "little")
@@ -190,7 +191,8 @@ class Decoder:
         if length > left:
             return self._skip("truncated")
         if message_id not in dialect.mavlink_map:
-            # no CRC extra to verify with: taken as a frame if another, or nothing, follows
+            # Without CRC_EXTRA its checksum cannot be verified: it counts as a frame if the
+            # datagram ends or another frame begins after it
             self.dropped["unknown message"] += 1
             follows = length == left or data[at + length] in (MAGIC_V1, MAGIC_V2)
             return (length if follows else 1), None

@@ -1,4 +1,4 @@
-"""MAVLink commands (MAV_CMD): what each does, and how it is acknowledged.
+"""MAVLink commands (MAV_CMD): their effects and acknowledgements.
 
 Unused parameters of a command may be NaN or 0. Every command is acknowledged, unknown ones with
 UNSUPPORTED, except those that the real autopilot leaves unanswered (`Firmware.command_answers`).
@@ -21,27 +21,27 @@ from simulator.mavlink.outbox import Outbox
 from simulator.mavlink.telemetry import Schedule
 from simulator.mavlink.view import fit
 
-_HEIGHT_MAX_M = 83_000.0  # of home: ArduPilot's LOCATION_ALT_MAX_M
+_HEIGHT_MAX_M = 83_000.0  # greatest height of home: ArduPilot's LOCATION_ALT_MAX_M
 _RELATIVE = 3  # MAV_FRAME
 _CHANGE_MODE = 1.0  # MAV_DO_REPOSITION_FLAGS
 _MOTORS = 4
-_MISSION_PLANNER = 190  # MAV_COMPONENT, as ground stations call themselves
+_MISSION_PLANNER = 190  # MAV_COMP_ID_MISSIONPLANNER, the component id of ground stations
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """COMMAND_LONG or COMMAND_INT."""
+    """A COMMAND_LONG or COMMAND_INT."""
 
     number: int
-    params: tuple[float, ...]  # param1 .. param7, places in degrees
-    system: int  # of the sender
+    params: tuple[float, ...]  # param1 .. param7; latitude and longitude in degrees
+    system: int  # id of the sender
     component: int
-    frame: int | None = None  # MAV_FRAME of the place; None: COMMAND_LONG has none
+    frame: int | None = None  # MAV_FRAME of COMMAND_INT; None: COMMAND_LONG
 
 
 @dataclass(slots=True)
 class Commands:
-    """Commands of one link: carried out and acknowledged."""
+    """Carries out and acknowledges the commands of one link."""
 
     outbox: Outbox
     schedule: Schedule
@@ -64,7 +64,7 @@ class Commands:
             self._acknowledge(command, result)
 
     def set_mode(self, base_mode: int, custom_mode: int, sender: tuple[int, int]) -> None:
-        """SET_MODE, the deprecated message."""
+        """Carry out SET_MODE, the deprecated message."""
         firmware = self._autopilot.firmware
         asked = firmware.set_mode(base_mode, custom_mode)
         result = self._enter(asked, sender[1] == _MISSION_PLANNER)
@@ -113,7 +113,8 @@ class Commands:
         return autopilot.handle("takeoff", Request(takeoff_ned_m=(north, east, down)))
 
     def _set_home(self, autopilot: Autopilot, command: Command) -> Result:
-        """MAV_CMD_DO_SET_HOME. param1 = 1: here; else a place in degrees and AMSL metres."""
+        """MAV_CMD_DO_SET_HOME: home is the present position (param1 = 1), or a place in degrees and
+        AMSL metres."""
         latitude, longitude, height_m = command.params[4:7]
         if command.params[0] == 1.0:
             autopilot.guidance.home_ned_m = autopilot.state.estimate.position_ned_m
@@ -125,8 +126,8 @@ class Commands:
         return autopilot.handle("home")
 
     def _reposition(self, autopilot: Autopilot, command: Command) -> Result:
-        """MAV_CMD_DO_REPOSITION: fly to a place and hold there. Coordinates that are not finite
-        keep their present value."""
+        """MAV_CMD_DO_REPOSITION: fly to a place and hold it. The present position replaces
+        coordinates that are not finite."""
         strict, mode = autopilot.firmware.strict_places, autopilot.firmware.reposition_mode
         there = strict and autopilot.commander.mode.name == mode
         if command.params[1] != _CHANGE_MODE and not there:
@@ -150,7 +151,8 @@ class Commands:
         return result
 
     def go_to(self, place: tuple[float, float, float], frame: int) -> bool:
-        """Fly to a place in degrees and metres; False in a mode that does not obey setpoints."""
+        """Fly to a place (latitude and longitude in degrees, height in metres). Return False in a
+        mode that does not obey setpoints."""
         autopilot = self._autopilot
         obeys = autopilot.commander.mode.behaviour is Behaviour.SETPOINT
         if obeys and autopilot.commander.armed:
@@ -158,8 +160,8 @@ class Commands:
         return obeys
 
     def _place(self, latitude: float, longitude: float, height_m: float, frame: int) -> Triple:
-        """NED position of a place in degrees and a height of this MAV_FRAME; the present position
-        replaces coordinates that are not finite."""
+        """Return the NED position of a place in degrees, with a height in this MAV_FRAME. The
+        present position replaces coordinates that are not finite."""
         autopilot = self._autopilot
         origin, home_down_m = autopilot.firmware.origin, autopilot.guidance.home_ned_m[2]
         here = autopilot.state.estimate.position_ned_m
@@ -170,9 +172,8 @@ class Commands:
         return north, east, down if math.isfinite(down) else here[2]
 
     def _change_speed(self, autopilot: Autopilot, command: Command) -> Result:
-        """MAV_CMD_DO_CHANGE_SPEED across the ground, in automatic flight until the next mode.
-
-        A speed that is not positive restores the default.
+        """MAV_CMD_DO_CHANGE_SPEED: set the horizontal speed of automatic flight until the next
+        mode. A speed that is not positive restores the default.
         """
         kind, speed_mps = command.params[:2]
         result = autopilot.handle("speed")
@@ -185,7 +186,7 @@ class Commands:
         return Result.ACCEPTED if known else autopilot.firmware.empty_refusal
 
     def _turn(self, autopilot: Autopilot, command: Command) -> Result:
-        """MAV_CMD_CONDITION_YAW: to a yaw, or relative to the present one; degrees."""
+        """MAV_CMD_CONDITION_YAW: turn to a yaw, or by an angle from the present one; degrees."""
         yaw_deg, speed_dps, sense, relative = command.params[:4]
         result = autopilot.handle("turn")
         if result is Result.ACCEPTED:
@@ -201,7 +202,7 @@ class Commands:
         return result
 
     def _set_servo(self, autopilot: Autopilot, command: Command) -> Result:
-        """MAV_CMD_DO_SET_SERVO: an output that is no motor."""
+        """MAV_CMD_DO_SET_SERVO: set the pulse width of an output that drives no motor."""
         (number, width_us), result = command.params[:2], autopilot.handle("servo")
         if result is Result.ACCEPTED:
             if not _MOTORS + 1 <= number <= len(autopilot.outputs_us):
@@ -210,7 +211,7 @@ class Commands:
         return result
 
     def _face(self, autopilot: Autopilot, command: Command) -> Result:
-        """MAV_CMD_DO_SET_ROI and its kinds: face a place; 0, 0 is none."""
+        """MAV_CMD_DO_SET_ROI, _LOCATION and _NONE: face a place; latitude and longitude 0: none."""
         latitude, longitude = command.params[4:6]
         place = to_metres(autopilot.firmware.origin, latitude, longitude)
         autopilot.guidance.turn_to(math.nan, math.inf, 0.0)
@@ -218,7 +219,7 @@ class Commands:
         return Result.ACCEPTED
 
     def _terminate(self, autopilot: Autopilot, command: Command) -> Result:
-        """MAV_CMD_DO_FLIGHTTERMINATION: the motors stop; it cannot be withdrawn."""
+        """MAV_CMD_DO_FLIGHTTERMINATION: stop the motors; it cannot be revoked."""
         asked = command.params[0] > 0.5
         return autopilot.handle("terminate") if asked else autopilot.firmware.request_refusal
 
@@ -312,7 +313,7 @@ HANDLERS: dict[int, Callable[[Commands, Autopilot, Command], Result | None]] = {
 
 
 def message_name(number: float) -> str | None:
-    """Name of the message with this id in a float parameter; NaN is 0."""
+    """Return the name of the message whose id is in a float parameter; NaN is id 0."""
     if number != number:
         return name_of(0)
     return name_of(int(number)) if math.isfinite(number) and number >= 0 else None

@@ -1,8 +1,8 @@
 """Builders of the messages that every firmware sends.
 
-A public function builds the message of its name: its fields in the order of the XML. Those of one
-firmware are in `simulator.firmware.px4_messages` and `simulator.firmware.ardupilot_messages`.
-Knows no links, rates or sequence numbers.
+A public function builds the message of its name: it returns the fields in the order of the XML.
+The builders of one firmware only are in `simulator.firmware.px4_messages` and
+`simulator.firmware.ardupilot_messages`. Knows no links, rates or sequence numbers.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def vfr_hud(view: View) -> Sequence[Any]:
 
 
 def gps_raw_int(view: View) -> Sequence[Any]:
-    """Accuracies as PX4's SIH reports them: larger than the errors."""
+    """The reported accuracies are those of PX4's SIH, which are larger than its errors."""
     if not view.autopilot.commander.has_fix:
         return (view.time_us, 1, 0, 0, 0, 65535, 65535, 65535, 65535, 0, *(0,) * 6)
     north, east, down, v_north, v_east = view.autopilot.plant.fix()
@@ -103,7 +103,7 @@ def attitude_target(view: View) -> Sequence[Any]:
 
 
 def position_target_local_ned(view: View) -> Sequence[Any]:
-    """The motion that is flown in MAV_FRAME 1; NaN where nothing is demanded."""
+    """The motion that is flown, in MAV_FRAME 1; NaN where nothing is demanded."""
     motion = view.autopilot.position_controller.motion
     return (
         view.time_ms, 1, 0, *motion.position_ned_m, *motion.velocity_ned_mps,
@@ -112,7 +112,7 @@ def position_target_local_ned(view: View) -> Sequence[Any]:
 
 
 def position_target_global_int(view: View) -> Sequence[Any]:
-    """The place that is flown to, AMSL; its bits of the type_mask are set where there is none."""
+    """The place that is flown to, AMSL; without one, the position bits of type_mask are set."""
     place = view.autopilot.position_controller.motion.position_ned_m
     known = all(map(math.isfinite, place))
     north, east, down = place if known else (0.0, 0.0, 0.0)
@@ -178,7 +178,7 @@ def gps_global_origin(view: View) -> Sequence[Any]:
 
 
 def mission_current(view: View) -> Sequence[Any]:
-    """Current item and number of items, 65535 without a mission; the other fields are 0 in PX4."""
+    """Current item, and number of items (65535 without a mission); PX4 leaves the rest at 0."""
     mission = view.autopilot.mission
     return (mission.current, len(mission.items) or 65535, 0, 0)
 

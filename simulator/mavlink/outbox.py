@@ -1,7 +1,7 @@
-"""Send queue of one link: messages framed, numbered and joined to datagrams; and its STATUSTEXTs.
+"""Send queue of one link: messages are framed, numbered and joined to datagrams.
 
-Knows the view that fills messages, the link's sequence numbers, and when a ground station was last
-heard on this link; knows no client and no rate.
+Knows the view that fills messages, the link's sequence numbers and STATUSTEXTs, and when a ground
+station was last heard on this link; knows no client and no rate.
 """
 
 from __future__ import annotations
@@ -15,17 +15,16 @@ from simulator.mavlink.view import View
 
 MAV_COMP_ID_AUTOPILOT = 1
 DATAGRAM_MAX = 1400
-HELD_US = 5_000_000
-FORWARDED_KEPT = 64  # frames, by which one that comes back is recognised
+HELD_US = 5_000_000  # age up to which a STATUSTEXT waits for a ground station
+FORWARDED_KEPT = 64  # newest forwarded frames; a received one that is among them has come back
 TEXT_LENGTH = 50  # STATUSTEXT.text
 
 
 class Outbox:
-    """Send queue. STATUSTEXTs are cut into chunks and, by PX4, held back until a ground station is
-    there.
+    """Send queue. STATUSTEXTs are divided into chunks; in PX4 they wait for a ground station.
 
-    `keyring`: of the vehicle; `link`: number of the link in signatures; `connected`: anything was
-    received on the link.
+    `keyring` is the vehicle's; `link` is the link id in signatures; `connected`: whether any
+    message was received on the link.
     """
 
     def __init__(self, view: View, keyring: Keyring, link: int) -> None:
@@ -37,18 +36,18 @@ class Outbox:
         self.restart()
 
     def restart(self) -> None:
-        """As after boot: frames are numbered from 0; texts already sent are not repeated."""
+        """Reset as after boot: frames are numbered from 0. Texts already sent are not repeated."""
         self._encoder = Encoder(self.view.system, MAV_COMP_ID_AUTOPILOT, self._keyring, self._link)
-        self._ground_station_us = -math.inf  # its last heartbeat
+        self._ground_station_us = -math.inf  # time of its last heartbeat
         self._held: list[tuple[int, StatusText]] = []
         self._text_number = 0
 
     def send(self, name: str, *values: object) -> None:
-        """Queue one message; `values` in the field order of the XML."""
+        """Queue one message; `values` are in the field order of the XML."""
         self._frames.append(self._encoder.frame(name, values))
 
     def send_now(self, name: str) -> None:
-        """Queue a message with its contents of now, filled by the view, unless a fault stops it."""
+        """Queue a message with its present content from the view, unless a fault stops it."""
         if name not in self.view.silent or self._passes(name):
             self._frames.append(self._encoder.frame(name, self.view.fields(name)))
 
@@ -58,13 +57,14 @@ class Outbox:
         self._frames.append(frame)
 
     def _passes(self, name: str) -> bool:
-        """Whether a message that a fault stops is one of those that are still sent."""
+        """Whether a message that a fault stops is sent this time."""
         every = self.view.silent[name]
         self._suppressed[name] += 1
         return every > 0 and self._suppressed[name] % every == 0
 
     def drain(self) -> list[bytes]:
-        """Remove everything queued, as datagrams of whole frames, at most DATAGRAM_MAX bytes."""
+        """Empty the queue and return it as datagrams of whole frames, each of at most DATAGRAM_MAX
+        bytes."""
         datagrams: list[bytes] = []
         waiting: list[bytes] = []
         size = 0
@@ -80,7 +80,7 @@ class Outbox:
     # -- texts ---------------------------------------------------------------------------------
 
     def send_text(self, text: StatusText) -> None:
-        """Queue a text, or hold it back until a ground station is there (PX4)."""
+        """Queue a text, or hold it back until a ground station is connected (PX4)."""
         firmware = self.view.autopilot.firmware
         if firmware.text_to_ground_stations_only and not self._has_ground_station:
             self._held.append((self._now_us, text))
@@ -94,7 +94,7 @@ class Outbox:
         self._text_number = (self._text_number + 1) & 0xFFFF
 
     def note_ground_station(self) -> None:
-        """A ground station sent a heartbeat: send the texts held back for at most HELD_US."""
+        """Note a heartbeat of a ground station; send the texts held back for at most HELD_US."""
         self._ground_station_us = self._now_us
         held, self._held = self._held, []
         for at_us, text in held:

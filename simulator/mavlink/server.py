@@ -1,4 +1,4 @@
-"""MAVLink server of one link, without I/O: received messages and the part that handles each.
+"""MAVLink server of one link, without I/O: it handles received messages and sends telemetry.
 
 Each link has its own sequence numbers, rates and clients. Answers and telemetry wait in order in
 the `outbox`. Knows no socket and no clock: time is the autopilot's.
@@ -19,11 +19,11 @@ from simulator.mavlink.transfers import MissionTransfer, ParameterTransfer
 from simulator.mavlink.view import View
 
 _GUIDED = 2  # `current` of a mission item that is a place to fly to now
-_AXIS_NOT_USED = 2**15 - 1  # of MANUAL_CONTROL
-_NO_PLACE = 2**31 - 1  # in x and y of COMMAND_INT
-_OF_ALL = (519, 520)  # MAV_CMD: requests of the protocol and the version, which all systems answer
+_AXIS_NOT_USED = 2**15 - 1  # value of an axis of MANUAL_CONTROL
+_NO_PLACE = 2**31 - 1  # value of x and y of COMMAND_INT
+_OF_ALL = (519, 520)  # MAV_CMD: requests of protocol and version, answered if sent to all systems
 _SEEN_MAX = 16  # MAX_REMOTE_COMPONENTS of PX4
-_NOT_FORWARDED = ("TIMESYNC", "SETUP_SIGNING")  # the clock of lockstep; a key
+_NOT_FORWARDED = ("TIMESYNC", "SETUP_SIGNING")  # clock of lockstep; contains a key
 _FTP_NAK, _FTP_ERROR_NOT_FOUND = 128 + 1, 10
 
 
@@ -32,12 +32,13 @@ class Server:
 
     Args:
         view: contents of the messages.
-        rates_hz: messages sent without a request.
-        keyring: signing, of the vehicle.
-        number: of the link.
-        barrier: leave TIMESYNC requests to `send_barrier`: in lockstep they are the clock.
+        rates_hz: rates of the messages sent without a request.
+        keyring: signing key of the vehicle.
+        number: link id in signatures.
+        barrier: whether TIMESYNC requests are sent by `send_barrier` only, as the clock of
+            lockstep.
 
-    `others`: the vehicle's other links, to which messages for others are forwarded.
+    `others` are the vehicle's other links, to which messages are forwarded.
     """
 
     def __init__(
@@ -59,7 +60,7 @@ class Server:
         self._begin()
 
     def _begin(self) -> None:
-        """As after boot: default rates, nothing under way."""
+        """Set the default rates, without known peers or transfers, as after boot."""
         self.schedule = Schedule(self.view, self._rates_hz)
         self._seen: list[Peer] = []
         self._commands = Commands(self.outbox, self.schedule)
@@ -67,25 +68,25 @@ class Server:
         self._missions = MissionTransfer(self.outbox)
 
     def restart(self) -> None:
-        """Reset as after boot: default rates, no known client."""
+        """Reset as after boot."""
         self.outbox.restart()
         self._begin()
 
     def step(self) -> None:
-        """Queue what is due at this step: missions, lists of parameters, telemetry."""
+        """Queue the messages due at this step: mission requests, parameter lists, telemetry."""
         self._missions.step()
         self._parameters.step()
         for name in self.schedule.take_due():
             self.outbox.send_now(name)
 
     def send_barrier(self, stamp_ns: int) -> None:
-        """Queue a TIMESYNC request."""
+        """Queue the TIMESYNC request of a barrier."""
         self.outbox.send("TIMESYNC", 0, stamp_ns)
 
     # -- received messages -------------------------------------------------------------------
 
     def receive(self, datagram: bytes) -> None:
-        """Handle all messages of one datagram; no bytes make this raise."""
+        """Handle all messages of one datagram; it never raises, whatever the bytes."""
         for message in self.decoder.read(datagram):
             self.outbox.connected = True
             self._forward(message)
@@ -95,9 +96,9 @@ class Server:
                 handler(self, message)
 
     def _forward(self, message: Message) -> None:
-        """Forward a message, unless it is for the autopilot alone, to each other link on which its
-        target was seen, or anybody where it is for all: as PX4's SITL and ArduPilot do. Not what
-        comes back, as through a router that has both links."""
+        """Forward a message to each other link on which its target was seen (anybody, if it is for
+        all), as PX4's SITL and ArduPilot do. Messages for the autopilot alone are not forwarded,
+        nor frames that come back, for example through a router that is connected to both links."""
         sender, target, frame = sender_of(message), target_of(message), bytes(message.get_msgbuf())
         ours = self.view.system, MAV_COMP_ID_AUTOPILOT
         if sender == ours or frame in self.outbox.forwarded:
@@ -111,7 +112,8 @@ class Server:
                 link.outbox.forward(frame)
 
     def _is_for_us(self, message: Message) -> bool:
-        """Whether its target is this system and its autopilot, or all."""
+        """Whether the autopilot has to handle this message: it or all are the target, and the
+        firmware obeys the sender."""
         firmware, ours = self.view.autopilot.firmware, self.view.system
         system, component = target_of(message)
         kind = message.get_type().partition("_")[0]
@@ -163,20 +165,20 @@ class Server:
             self.answered_ns = message.ts1
 
     def _ping(self, message: Message) -> None:
-        """Answer a request; those with a target are answers."""
+        """Answer a PING request; a PING with a target is an answer."""
         if not message.target_system:
             self.outbox.send("PING", message.time_usec, message.seq, *sender_of(message))
 
     def _set_origin(self, _: Message) -> None:
-        """There is an origin; it is sent."""
+        """Send the origin, which SET_GPS_GLOBAL_ORIGIN does not change."""
         self.outbox.send_now("GPS_GLOBAL_ORIGIN")
 
     def _rc_channels_override(self, message: Message) -> None:
         self._sticks(message, [getattr(message, f"chan{i}_raw") for i in range(1, 9)])
 
     def _manual_control(self, message: Message) -> None:
-        """Joystick axes -1000 .. 1000, throttle 0 .. 1000, as pulse widths; an axis that is not
-        used is released."""
+        """Convert joystick axes (-1000 .. 1000, throttle 0 .. 1000) to pulse widths; an unused axis
+        is released."""
         if message.target != self.view.system:
             return
         pitch, roll, throttle, yaw = message.x, message.y, message.z, message.r
@@ -193,7 +195,8 @@ class Server:
         self._sticks(message, pulses if throttle >= 0 else ())
 
     def _sticks(self, message: Message, widths_us: Sequence[int]) -> None:
-        """Stick positions; only the ground station may send them, and is heard by them."""
+        """Apply stick positions. Only the ground station may send them; they count as its
+        heartbeat, too."""
         autopilot, system = self.view.autopilot, message.get_srcSystem()
         if autopilot.guidance.sticks is None:
             return
@@ -202,12 +205,12 @@ class Server:
             autopilot.health.ground_station_heard(autopilot.state.time_s)
 
     def _setup_signing(self, message: Message) -> None:
-        """A new signing key; not while armed."""
+        """Take a new signing key, but not while armed."""
         if not self.view.autopilot.commander.armed:
             self.keyring.set_up(bytes(message.secret_key), message.initial_timestamp)
 
     def _log_request_list(self, _: Message) -> None:
-        """There are no logs."""
+        """Answer that there are no logs."""
         self.outbox.send("LOG_ENTRY", 0, 0, 0, 0, 0)
 
     def _request_data_stream(self, message: Message) -> None:
@@ -228,7 +231,7 @@ def _matches(target: Peer, peer: Peer) -> bool:
     return system == 0 or (system == peer[0] and component in (0, peer[1]))
 
 
-# Handler by message name. A message with a target is handled only if that is this vehicle, or all
+# Handlers by message name. They are called only if this vehicle, or all, is the message's target
 HANDLERS: dict[str, Callable[[Server, Message], None]] = {
     "HEARTBEAT": Server._heartbeat,
     "COMMAND_LONG": Server._command_long,

@@ -1,6 +1,6 @@
-"""Telemetry: which messages a firmware can send, and when those of one link are due.
+"""Telemetry: the messages that a firmware can send, and when those of one link are due.
 
-Knows no client and no frame; `simulator.mavlink.outbox` fills and frames what is due.
+Knows no client and no frame; `simulator.mavlink.outbox` fills and frames the messages.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ Builder = Callable[[View], Sequence[Any]]
 ON_POSITION_GRID = frozenset(
     {"LOCAL_POSITION_NED", "ODOMETRY", "GLOBAL_POSITION_INT", "HIL_STATE_QUATERNION"}
 )
-LEAST_INTERVAL_US = {"GPS_RAW_INT": 125_000.0}  # a receiver gives eight fixes a second
+LEAST_INTERVAL_US = {"GPS_RAW_INT": 125_000.0}  # the GPS receiver has eight fixes a second
 INTERVAL_MAX_US = 2.0**31 - 1  # MESSAGE_INTERVAL.interval_us is an int32
 
 
 def _builders_in(module: ModuleType) -> dict[str, Builder]:
-    """The public functions of a module, by the message that each builds."""
+    """Return the public functions of a module, by the name of the message that each builds."""
     return {
         name.upper(): function
         for name, function in vars(module).items()
@@ -38,47 +38,44 @@ def _builders_in(module: ModuleType) -> dict[str, Builder]:
 
 
 def builders(firmware: Firmware) -> dict[str, Builder]:
-    """All messages of this firmware, with their builders."""
+    """Return the builders of all messages of this firmware, by message name."""
     return {**_builders_in(messages), **_builders_in(firmware.messages)}
 
 
 @dataclass(slots=True)
 class Stream:
-    """One message sent periodically: interval and next time, microseconds of vehicle time.
-
-    It is sent at multiples of `grid_us` only.
-    """
+    """A message that is sent periodically; times are vehicle time since boot."""
 
     interval_us: int
     due_us: int
-    grid_us: int
-    version: Callable[[View], Hashable] | None  # None: it does not wait for a new content
-    sent: Hashable  # version of the content sent last
+    grid_us: int  # it is sent at multiples of this only
+    version: Callable[[View], Hashable] | None  # None: it does not wait for new content
+    sent: Hashable  # version of the content that was sent last
 
     def next_after(self, now_us: int) -> None:
-        """Due at the next multiple of the interval, so that the mean rate is exact."""
+        """Make it due at the next multiple of the interval, so that the mean rate is exact."""
         self.due_at((now_us // self.interval_us + 1) * self.interval_us)
 
     def due_at(self, time_us: int) -> None:
-        """Due at this time, or at the next grid point."""
+        """Make it due at this time, or at the next multiple of `grid_us`."""
         self.due_us = -(-time_us // self.grid_us) * self.grid_us
 
 
 @dataclass(slots=True)
 class Schedule:
-    """Streams of one link. `rates_hz`: what is sent without being requested."""
+    """Streams of one link. `rates_hz` are the rates of the messages sent without a request."""
 
     view: View
     rates_hz: Mapping[str, float]
     streams: dict[str, Stream] = field(default_factory=dict)
-    _next_us: float = 0.0  # no stream is due before
+    _next_us: float = 0.0  # before this time no stream is due
 
     def __post_init__(self) -> None:
         for name, rate_hz in self.rates_hz.items():
             self._start(name, round(1e6 / rate_hz)).due_at(STEP_US)
 
     def _start(self, name: str, interval_us: int) -> Stream:
-        """A stream of message `name`; in its old place if there was one."""
+        """Make a stream of message `name`, in the place of an older one in `streams`."""
         steps = self.view.autopilot.firmware.position_grid_steps
         grid_us = STEP_US * (steps if name in ON_POSITION_GRID else 1)
         version = self.view.autopilot.firmware.message_versions.get(name)
@@ -88,7 +85,8 @@ class Schedule:
         return stream
 
     def take_due(self) -> list[str]:
-        """Names of the messages due now, in the order of the streams; each is due again later."""
+        """Return the names of the messages due now, in the order of the streams, and set the time
+        at which each is due next."""
         view, now_us = self.view, self.view.autopilot.state.time_us
         if now_us < self._next_us:
             return []
@@ -105,14 +103,15 @@ class Schedule:
         return due
 
     def _is_new(self, stream: Stream) -> bool:
-        """Whether the message has a content that was not sent yet."""
+        """Whether the content of the message was not sent yet; it then counts as sent."""
         assert stream.version is not None
         newest = stream.version(self.view)
         new, stream.sent = newest != stream.sent, newest
         return new
 
     def set_interval(self, name: str, interval_us: float) -> bool:
-        """0 restores the default, < 0 stops; False when the message has no settable rate."""
+        """Set the interval of a message; 0 restores the default, < 0 stops it. Return False if the
+        message has no settable interval."""
         if name not in self.view.builders or name in self.view.autopilot.firmware.fixed_streams:
             return False
         if interval_us == 0:
@@ -127,6 +126,6 @@ class Schedule:
         return True
 
     def set_group(self, group: int, rate_hz: float) -> None:
-        """REQUEST_DATA_STREAM of a MAV_DATA_STREAM, which is not acknowledged; 0 stops it."""
+        """Apply REQUEST_DATA_STREAM to a MAV_DATA_STREAM; 0 stops its messages."""
         for name in self.view.autopilot.firmware.stream_groups.get(group, ()):
             self.set_interval(name, 1e6 / rate_hz if rate_hz else -1.0)

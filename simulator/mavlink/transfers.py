@@ -1,8 +1,8 @@
 """Parameter and mission protocol of one link.
 
-Knows messages; values and their ranges are in `simulator.autopilot.parameters`, the flight of a
-mission in `simulator.autopilot.mission`, and which items of a mission a firmware takes in its
-`mission_refusal`. Fences and rally points are kept as they are, without effect.
+Knows messages. Values and their ranges are in `simulator.autopilot.parameters`, the flight of a
+mission is in `simulator.autopilot.mission`, and `Firmware.mission_refusal` decides which items are
+accepted. Fences and rally points are stored without effect.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from simulator.autopilot.values import MissionItem
 from simulator.mavlink.codec import Message, Peer, sender_of
 from simulator.mavlink.outbox import Outbox
 
-PER_STEP = 4  # parameters of a list
-NO_INDEX = 65535  # PARAM_VALUE.param_index of an answer without one
+PER_STEP = 4  # parameters of a list that are sent at each step
+NO_INDEX = 65535  # PARAM_VALUE.param_index of an answer without index
 
 
 @dataclass(slots=True)
@@ -36,7 +36,7 @@ class ParameterTransfer:
         del self._due[:PER_STEP]
 
     def _answer(self, name: str, *, listed: bool = False) -> None:
-        """Queue PARAM_VALUE; `listed`: as part of a list or requested by index."""
+        """Queue PARAM_VALUE. `listed`: whether it is part of a list or was requested by index."""
         autopilot = self.outbox.view.autopilot
         if name == HASH:
             head = (HASH.encode(), autopilot.parameters.hash_on_wire, MAV_PARAM_TYPE_UINT32)
@@ -49,7 +49,7 @@ class ParameterTransfer:
         self.outbox.send("PARAM_VALUE", name.encode(), value, kind, len(names), index)
 
     def request_read(self, message: Message) -> None:
-        """PARAM_REQUEST_READ, by index or by name."""
+        """Handle PARAM_REQUEST_READ, by index or by name."""
         names = self.outbox.view.autopilot.parameters.names
         if message.param_index >= 0:
             if message.param_index < len(names):
@@ -61,14 +61,14 @@ class ParameterTransfer:
         return name == HASH and self.outbox.view.autopilot.firmware.parameters_hashed
 
     def request_list(self, _: Message) -> None:
-        """PARAM_REQUEST_LIST; if a list is being sent, it starts again, without _HASH_CHECK."""
+        """Handle PARAM_REQUEST_LIST. A list under way starts again, without _HASH_CHECK."""
         hashed = (HASH,) if self._is_hash(HASH) and not self._due else ()
         self._due = [*hashed, *self.outbox.view.autopilot.parameters.names]
 
     def set(self, message: Message) -> None:
-        """PARAM_SET; the answer holds the parameter's present value."""
+        """Handle PARAM_SET; the answer contains the parameter's value after it."""
         table = self.outbox.view.autopilot.parameters
-        if self._is_hash(message.param_id):  # the client has the whole list already
+        if self._is_hash(message.param_id):  # the client has the whole list and wants no more
             self._due = []
         if table.set_from_wire(message.param_id, message.param_value, message.param_type):
             self._answer(message.param_id)
@@ -91,15 +91,14 @@ class Ack(IntEnum):
 
 @dataclass(slots=True)
 class Upload:
-    """An upload in progress: sender, what of (MAV_MISSION_TYPE), items received, times of the last
-    progress and request."""
+    """An upload in progress."""
 
     peer: Peer
-    kind: int
+    kind: int  # MAV_MISSION_TYPE
     count: int
-    items: list[MissionItem]
-    begun_s: float
-    requested_s: float
+    items: list[MissionItem]  # received so far
+    begun_s: float  # time since boot of the last progress
+    requested_s: float  # time since boot of the last request
 
 
 class MissionTransfer:
@@ -110,15 +109,15 @@ class MissionTransfer:
         autopilot = outbox.view.autopilot
         self.mission, self._firmware = autopilot.mission, autopilot.firmware
         self._upload: Upload | None = None
-        self._taken = (0, 0)  # kind and count of the last upload
-        self._whole = False  # the peer uses the _INT messages, in 1e-7 degrees
+        self._taken = (0, 0)  # kind and count of the last complete upload
+        self._whole = False  # whether the peer uses the _INT messages, in 1e-7 degrees
 
     @property
     def _now_s(self) -> float:
         return self.outbox.view.autopilot.state.time_us * 1e-6
 
     def step(self) -> None:
-        """Request a missing item again, and give up after a while."""
+        """Request a missing item again after REPEAT_S; cancel the upload after GIVE_UP_S."""
         upload = self._upload
         if upload is None:
             return
@@ -132,7 +131,7 @@ class MissionTransfer:
     # -- up ----------------------------------------------------------------------------------
 
     def count(self, message: Message) -> None:
-        """MISSION_COUNT: an upload begins."""
+        """Handle MISSION_COUNT: begin an upload."""
         peer, kind = sender_of(message), message.mission_type
         if kind not in self.mission.stored:
             self._acknowledge(peer, Ack.UNSUPPORTED, kind)
@@ -152,10 +151,12 @@ class MissionTransfer:
         self.outbox.send(name, *upload.peer, len(upload.items), upload.kind)
 
     def item(self, message: Message) -> None:
-        """MISSION_ITEM or MISSION_ITEM_INT of an upload."""
+        """Handle MISSION_ITEM or MISSION_ITEM_INT of an upload."""
         self._whole = message.get_type() == "MISSION_ITEM_INT"
         upload, peer, kind = self._upload, sender_of(message), message.mission_type
-        if upload is None:  # the last one again, whose answer was lost, or one without an upload
+        if (
+            upload is None
+        ):  # the last item again, as its MISSION_ACK was lost; or there is no upload
             last = (kind, message.seq + 1) == self._taken
             self._acknowledge(peer, Ack.ACCEPTED if last else Ack.ERROR, kind)
             return
@@ -183,7 +184,7 @@ class MissionTransfer:
             self.outbox.send_text(self._firmware.mission_text)
 
     def ack(self, message: Message) -> None:
-        """MISSION_ACK of the peer: it wants the other kind of request, or cancels."""
+        """Handle MISSION_ACK of the peer: it wants the other kind of request, or cancels."""
         upload = self._upload
         if upload is None or upload.peer != sender_of(message):
             return
@@ -199,13 +200,13 @@ class MissionTransfer:
     # -- down, and the rest ------------------------------------------------------------------
 
     def request_list(self, message: Message) -> None:
-        """MISSION_REQUEST_LIST."""
+        """Handle MISSION_REQUEST_LIST."""
         kind = message.mission_type
         count = len(self.mission.stored.get(kind, ()))
         self.outbox.send("MISSION_COUNT", *sender_of(message), count, kind)
 
     def request(self, message: Message) -> None:
-        """MISSION_REQUEST or MISSION_REQUEST_INT of a download."""
+        """Handle MISSION_REQUEST or MISSION_REQUEST_INT of a download."""
         peer, kind = sender_of(message), message.mission_type
         items = self.mission.stored.get(kind, ())
         self._whole = whole = message.get_type() == "MISSION_REQUEST_INT"
@@ -222,27 +223,27 @@ class MissionTransfer:
         self.outbox.send(name, *head, current, 1, *item.params, *places, item.z, kind)
 
     def _home(self) -> MissionItem:
-        """Home as an item of a mission."""
+        """Home as a mission item."""
         view = self.outbox.view
         north_m, east_m, down_m = view.autopilot.guidance.home_ned_m
         place = view.geodetic(north_m, east_m)
         return MissionItem(0, Kind.WAYPOINT, (0.0,) * 4, *place, view.altitude_mm(down_m) * 1e-3)
 
     def clear_all(self, message: Message) -> None:
-        """MISSION_CLEAR_ALL."""
+        """Handle MISSION_CLEAR_ALL."""
         for kind in self.mission.stored:
             if message.mission_type in (kind, ALL_KINDS):
                 self.mission.store((), kind)
         self._acknowledge(sender_of(message), Ack.ACCEPTED, message.mission_type)
 
     def set_current(self, message: Message) -> None:
-        """MISSION_SET_CURRENT."""
+        """Handle MISSION_SET_CURRENT."""
         if self.mission.go_to(message.seq):
             self.outbox.send_now("MISSION_CURRENT")
 
 
 def _read(message: Message) -> MissionItem:
-    """MISSION_ITEM_INT, or MISSION_ITEM with its places in degrees."""
+    """Read MISSION_ITEM_INT, or MISSION_ITEM, which has x and y in degrees."""
     x, y = message.x, message.y
     if message.get_type() == "MISSION_ITEM":
         x, y = (_integer(value * 1e7) for value in (x, y))

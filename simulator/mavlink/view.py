@@ -1,5 +1,5 @@
-"""Contents of all messages of one vehicle: its autopilot, with the faults that change telemetry,
-and the conversion of SI values to fields of messages: scaled, rounded, limited to their range.
+"""Contents of all messages of one vehicle: values of its autopilot, faults that change telemetry,
+and the conversion of SI values to message fields, which are scaled, rounded and limited.
 
 Knows no links, rates or sequence numbers.
 """
@@ -21,7 +21,7 @@ _GPS, _PREARM = 0x20, 0x10000000  # MAV_SYS_STATUS_SENSOR
 
 @dataclass(slots=True)
 class Stuck:
-    """A message whose fields with these `indices` keep their values."""
+    """A fault by which the fields of a message with these `indices` keep their values."""
 
     indices: Sequence[int]
     kept: Sequence[Any] | None = None
@@ -35,7 +35,8 @@ class Stuck:
 class View:
     """Input of the message builders: the autopilot, and values that several messages need.
 
-    `silent` and `stuck`: messages that a fault stops, but for every so many (0: all), or freezes.
+    `silent`: messages that a fault stops, each with a number n: each n-th is still sent (0: none).
+    `stuck`: messages of which a fault freezes fields.
     """
 
     autopilot: Autopilot
@@ -43,10 +44,10 @@ class View:
     epoch_us: int  # Unix time of boot
     builders: dict[str, Callable[[View], Sequence[Any]]]  # fields by message
     clock_rate: float = 1.0
-    # changed by faults
+    # Changed by faults
     clock_offset_us: int = 0
     silent: dict[str, int] = field(default_factory=dict)
-    wrong_landed_state: int | None = None  # reported in place of the true one
+    wrong_landed_state: int | None = None  # reported instead of the detected one
     stuck: dict[str, Stuck] = field(default_factory=dict)
 
     def withheld(self, name: str) -> bool:
@@ -56,18 +57,18 @@ class View:
         return event is not None and event not in autopilot.health.reached
 
     def fields(self, name: str) -> Sequence[Any]:
-        """Fields of message `name` now."""
+        """Return the present fields of message `name`."""
         values = self.builders[name](self)
         return self.stuck[name].instead_of(values) if name in self.stuck else values
 
     def heartbeat(self, base_mode: int, state: int) -> tuple[int, ...]:
-        """Fields of HEARTBEAT of a quadrotor; the armed bit is added. `state`: MAV_STATE."""
+        """Return the fields of HEARTBEAT of a quadrotor, with the armed bit. `state`: MAV_STATE."""
         commander, firmware = self.autopilot.commander, self.autopilot.firmware
         base_mode |= 128 if commander.armed else 0
         return (2, firmware.mav_autopilot, base_mode, commander.mode.custom_mode, state, 3)
 
     def restart(self, autopilot: Autopilot) -> None:
-        """Show another autopilot, after a reboot."""
+        """Show the autopilot after a reboot."""
         self.autopilot = autopilot
         self.clock_offset_us = 0
 
@@ -111,7 +112,7 @@ class View:
 
     @property
     def time_us(self) -> int:
-        """Vehicle time of the time stamps, microseconds."""
+        """Time since boot of the vehicle's clock, which all time stamps contain."""
         return max(0, int(self.autopilot.state.time_us * self.clock_rate) + self.clock_offset_us)
 
     def geodetic(self, north_m: float, east_m: float) -> tuple[int, int]:
@@ -120,7 +121,7 @@ class View:
         return fit(latitude * 1e7, 32), fit(longitude * 1e7, 32)
 
     def altitude_mm(self, down_m: float) -> int:
-        """AMSL, mm."""
+        """Height above mean sea level, mm."""
         return fit((self.autopilot.firmware.origin[2] - down_m) * 1e3, 32)
 
 
@@ -134,7 +135,7 @@ _RANGES = {
 
 
 def fit(value: float, bits: int, *, signed: bool = True) -> int:
-    """`value` rounded and limited to an integer of `bits`; 0 if it is not finite."""
+    """`value`, rounded and limited to the range of an integer of `bits`; 0 if it is not finite."""
     if value - value != 0.0:  # infinite or not a number
         return 0
     low, high = _RANGES[bits, signed]
