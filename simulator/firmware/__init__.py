@@ -1,4 +1,4 @@
-"""The firmwares by name. An autopilot is handed one, and never asks which it is."""
+"""The firmwares by name. An autopilot is given one of them and never compares its name."""
 
 from __future__ import annotations
 

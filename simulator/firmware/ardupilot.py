@@ -1,4 +1,4 @@
-"""ArduCopter 4.6: how it reads commands and setpoints, checks, fails and flies.
+"""ArduCopter 4.6: how it interprets commands, setpoints, missions and battery levels.
 
 Measured on ArduCopter 4.6.3 SITL where MAVLink shows it. Modes, parameters and the
 state table are in `simulator.firmware.ardupilot_tables`, telemetry in
@@ -32,7 +32,7 @@ from simulator.vehicle.conditions import BatteryState
 
 _CUSTOM_MODE_ENABLED = 1
 _BY_NUMBER = {mode.custom_mode: mode.name for mode in MODES.values()}
-# Modes that it has and does not enter in the simulator
+# Modes of ArduCopter that the simulator does not enter, with the end of the text
 _NOT_ENTERED = {
     14: "FLIP failed: init failed",
     15: "AUTOTUNE failed: init failed",
@@ -42,7 +42,8 @@ _NOT_ENTERED = {
     27: "AUTO RTL failed: No return path or landing sequence found",
     28: "TURTLE failed: init failed",
 }
-# MAV_CMD accepted without an effect that the simulator shows, and failed without their devices
+# MAV_CMDs that are accepted without effect in the simulator, and those that fail because their
+# devices are missing
 _TAKEN = (181, 203, 206, 207, 208, 209, 2001, 5300, 42001, 42003, 42424, 42428)
 _FAILED = (84, 184, 189, 193, 205, 211, 218, 500, 2000, 2500)
 
@@ -52,16 +53,16 @@ _POSITION, _VELOCITY, _ACCELERATION, _FORCE, _YAW, _YAW_RATE = 0o007, 0o070, 0o7
 _NORM_TOLERANCE = 0.0005
 _THRUST_IS_THRUST = 8  # GUID_OPTIONS
 _STOP = MotionSetpoint(velocity_ned_mps=(0.0, 0.0, 0.0))
-_RATE_LEAD_S = 0.175  # rates beside an attitude: 0.3 rad/s move the equilibrium by 3 degrees
+_RATE_LEAD_S = 0.175  # rates that come with an attitude offset it: 0.3 rad/s by 3 degrees
 _LOCAL_NED, _LOCAL_OFFSET_NED, _BODY_NED, _BODY_OFFSET_NED = 1, 7, 8, 9  # MAV_FRAME
 _OFFSET = frozenset({_LOCAL_OFFSET_NED, _BODY_NED, _BODY_OFFSET_NED})
 _BODY = frozenset({_BODY_NED, _BODY_OFFSET_NED})
 
 _UNSUPPORTED_FRAME, _UNSUPPORTED, _INVALID_PARAM1 = 2, 3, 6  # MAV_MISSION_RESULT
 _PLACE_FRAMES = frozenset({0, 3, 5, 6, 10, 11})
-_ITEM_FRAMES = {2: 0, 5: 0, 6: 3, 11: 10}  # of a downloaded item, by the uploaded one
-_PLACES = frozenset({16, 17, 18, 19, 21, 22, 31, 82, 201})  # MAV_CMD of missions that have a place
-_YAWED = frozenset({16, 17, 21, 22})  # their fourth parameter may be NaN
+_ITEM_FRAMES = {2: 0, 5: 0, 6: 3, 11: 10}  # frame of an uploaded item -> of the downloaded one
+_PLACES = frozenset({16, 17, 18, 19, 21, 22, 31, 82, 201})  # MAV_CMDs of items with a place
+_YAWED = frozenset({16, 17, 21, 22})  # items whose param4 may be NaN
 _ACTS = frozenset({
     20, 30, 83, 84, 85, 92, 93, 94, 112, 114, 115, 177, 178, 179, 181, 182, 183, 184, 188, 189,
     191, 193, 194, 195, 197, 202, 203, 205, 206, 207, 208, 210, 211, 212, 213, 215, 216, 217, 218,
@@ -89,7 +90,7 @@ class ArduCopter(Firmware):
         return self.command_mode((base_mode, custom_mode))
 
     def arm_request(self, param: float) -> Asked:
-        """1 arms, 0 disarms, anything else is not supported."""
+        """param1 1 arms, 0 disarms, any other value is UNSUPPORTED."""
         if param in (0.0, 1.0):
             return Asked("arm" if param else "disarm")
         return Asked(refusal=Result.UNSUPPORTED)
@@ -99,10 +100,10 @@ class ArduCopter(Firmware):
     ) -> AttitudeSetpoint | MotionSetpoint | None:
         """SET_ATTITUDE_TARGET as ArduCopter reads it; None: ignored without an answer.
 
-        Ignored: a message without thrust, a quaternion that is not of unit length. With some of
-        the rates ignored the vehicle holds its position. A thrust that is NaN counts as zero, and
-        latches an internal error (the real SITL stops at a NaN quaternion; a flight controller
-        ignores it).
+        A message without thrust, with rates that are not finite, or with a quaternion that does not
+        have unit length, is ignored (the real SITL stops at a NaN quaternion; a flight controller
+        ignores it). If some of the rates are ignored, but not all, the vehicle stops. A thrust of
+        NaN counts as zero or, as a climb rate, as no climb, and latches an internal error.
         """
         mask = values["type_mask"]
         ignored = mask & _RATES_IGNORED
@@ -131,9 +132,10 @@ class ArduCopter(Firmware):
         return AttitudeSetpoint(ahead, None, thrust, climb_mps, event)
 
     def motion_setpoint(self, values: Mapping[str, Any]) -> MotionSetpoint | None:
-        """A vector with one ignored component is ignored.
+        """SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME 1. A vector with one ignored component is
+        ignored.
 
-        The vehicle stops at a setpoint that it cannot fly: an unknown frame, no demand, a position
+        The vehicle stops if it cannot fly the setpoint: an unknown frame, no demand, a position
         with an acceleration and no velocity, a velocity that is not finite. None (ignored without
         an answer): a force, and other values that are not finite.
         """
@@ -167,7 +169,8 @@ class ArduCopter(Firmware):
     def in_local_frame(
         self, values: Mapping[str, Any], estimate: StateEstimate
     ) -> Mapping[str, Any]:
-        """Offset frames are relative to the position; body frames also to the yaw."""
+        """Convert offset frames, which are relative to the position, and body frames, which are
+        relative to the yaw, too."""
         frame = values["coordinate_frame"]
         if frame not in _OFFSET:
             return values
@@ -193,11 +196,12 @@ class ArduCopter(Firmware):
         return None
 
     def obeys_system(self, sender: int, own: int, parameters: ParameterValues) -> bool:
-        """All systems; with SYSID_ENFORCE the ground station and its own components only."""
+        """Every system; with SYSID_ENFORCE only the ground station and the vehicle itself."""
         return not parameters["SYSID_ENFORCE"] or sender in (own, parameters["SYSID_MYGCS"])
 
     def battery_level(self, battery: BatteryState, parameters: ParameterValues) -> int:
-        """By voltage or by remaining charge; a threshold of 0 disables the check."""
+        """Return 2 (critical), 1 (low) or 0, from voltage and remaining charge; a threshold of 0
+        disables its check."""
 
         def below(kind: str) -> bool:
             left_mah = battery.remaining * parameters["BATT_CAPACITY"]
@@ -207,13 +211,13 @@ class ArduCopter(Firmware):
         return 2 if below("CRT") else int(below("LOW"))
 
     def return_height_m(self, distance_m: float, parameters: ParameterValues) -> float:
-        """Height of a return above home: under a cone near home (RTL_CONE_SLOPE)."""
+        """Return the height of a return above home, limited by a cone (RTL_CONE_SLOPE)."""
         highest_m, slope = parameters["RTL_ALT"] * 0.01, parameters["RTL_CONE_SLOPE"]
         return min(highest_m, max(distance_m * slope, _RETURN_LEAST_M)) if slope > 0 else highest_m
 
 
 def _vertical(thrust: float, parameters: ParameterValues) -> tuple[float, float | None, str]:
-    """Thrust, climb rate (None: the field is a thrust) and the event of a NaN."""
+    """Return thrust, climb rate (None: the field is a thrust), and the event that a NaN raises."""
     by_thrust = int(parameters["GUID_OPTIONS"]) & _THRUST_IS_THRUST
     event = ""
     if math.isnan(thrust):
@@ -263,7 +267,7 @@ ARDUPILOT = ArduCopter(
     ground_rates_hz=telemetry.GROUND_RATES_HZ,
     messages=telemetry,
     ground_station_parameter="SYSID_MYGCS",
-    ignored=frozenset({"PING", "SET_GPS_GLOBAL_ORIGIN"}),  # it has an origin
+    ignored=frozenset({"PING", "SET_GPS_GLOBAL_ORIGIN"}),  # its origin is set already
     withheld_until={
         "LOCAL_POSITION_NED": "position",
         "GPS_GLOBAL_ORIGIN": "origin",
@@ -283,9 +287,9 @@ ARDUPILOT = ArduCopter(
     interval_refusal_text="No ap_message for mavlink id ({id})",
     too_fast_text="Requested rate for message ID {id} too fast. Increase SCHED_LOOP_RATE",
     request_refusal=Result.FAILED,
-    # RADIO_STATUS, RADIO; on USB, which is not simulated, all
+    # RADIO_STATUS, RADIO; on USB, which is not simulated, every message
     accepted_unsigned=frozenset({109, 166}),
-    stamps_follow_clock=True,  # GPS
+    stamps_follow_clock=True,  # GPS time
     boot_events_s={
         "initialised": 2.47,
         "aligning": 5.40,

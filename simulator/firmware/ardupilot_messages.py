@@ -1,4 +1,4 @@
-"""Telemetry of ArduCopter: rates, and builders of messages that only it sends."""
+"""Telemetry of ArduCopter: rates, and builders of the messages that only ArduCopter sends."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ NEVER_SENT = frozenset({
     259, 260, 262, 269, 271, 277, 280, 281, 285, 286, 295, 301, 373, 376, 9005,
 })  # fmt: skip
 
-# EKF_STATUS_FLAGS from a boot event on
+# EKF_STATUS_FLAGS after a boot event; the first event that was reached counts
 _EKF_FLAGS = (("position", 831), ("attitude", 167), ("aligning", 0))
 _EKF_UNINITIALISED = 1024
 
 
 def heartbeat(view: View) -> Sequence[Any]:
-    """MAV_STATE: 1 booting, 3 on the ground, 4 in the air, 5 in trouble."""
+    """MAV_STATE: 1 booting, 3 on the ground, 4 in the air, 5 in a failsafe or a latched error."""
     autopilot, commander = view.autopilot, view.autopilot.commander
     if "initialised" not in autopilot.health.reached:
         return view.heartbeat(BY_POSITION, 1)
@@ -52,7 +52,7 @@ def heartbeat(view: View) -> Sequence[Any]:
 
 
 def sim_state(view: View) -> Sequence[Any]:
-    """True state without time stamp; latitude and longitude have a resolution of 1 cm."""
+    """True state, without time stamp; latitude and longitude have a resolution of 1 cm."""
     truth = view.autopilot.state.truth
     north, east, down = truth.position_ned_m
     latitude, longitude = view.geodetic(north, east)
@@ -73,7 +73,7 @@ def sim_state(view: View) -> Sequence[Any]:
 
 
 def ekf_status_report(view: View) -> Sequence[Any]:
-    """Flags by the boot events so far; variances of a good estimate, but for a wrong velocity."""
+    """Flags from the boot events so far; variances of a good estimate, except the velocity's."""
     reached = view.autopilot.health.reached
     if view.autopilot.health.position_lost:
         reached -= {"position"}
@@ -98,7 +98,7 @@ def raw_imu(view: View) -> Sequence[Any]:
 
 
 def servo_output_raw(view: View) -> Sequence[Any]:
-    """Four equal motors: MOT_THST_EXPO and MOT_SPIN_MIN to MOT_SPIN_MAX (0.15 to 0.95)."""
+    """Four equal motors, with MOT_THST_EXPO and MOT_SPIN_MIN to MOT_SPIN_MAX (0.15 to 0.95)."""
     demand = view.autopilot.position_controller.demand
     bend = max(1e-3, view.autopilot.parameters["MOT_THST_EXPO"])
     root = math.sqrt(max(0.0, (1.0 - bend) ** 2 + 4.0 * bend * demand.thrust))
@@ -108,7 +108,7 @@ def servo_output_raw(view: View) -> Sequence[Any]:
 
 
 def nav_controller_output(view: View) -> Sequence[Any]:
-    """Demanded roll and pitch, yaw, and the way to the place that is flown to, 0 without one."""
+    """Demanded roll and pitch, yaw, and distance to the place that is flown to, 0 without one."""
     autopilot = view.autopilot
     motion, here = autopilot.position_controller.motion, autopilot.state.estimate.position_ned_m
     north, east, down = (
@@ -130,7 +130,7 @@ _NO_MISSION, _NOT_STARTED, _ACTIVE, _PAUSED, _COMPLETE = range(1, 6)  # MISSION_
 
 
 def mission_current(view: View) -> Sequence[Any]:
-    """Number of items without home; before the start the current item is home (0)."""
+    """The number of items is without home; before the start, the current item is home (0)."""
     mission = view.autopilot.mission
     begun = mission.under_way or mission.reached >= 0 or mission.current > mission.first
     state = _NO_MISSION

@@ -1,8 +1,8 @@
-"""Tables of ArduCopter: its flight modes, its parameters (those that clients read or the vehicle
-obeys), and its state table: events, and what follows from them.
+"""Tables of ArduCopter: its flight modes, its parameters (those that clients read or that have an
+effect), and its state table, which decides about events.
 
-ArduCopter takes values outside the documented range, so the limits are those of the type, but for
-values that it raises itself or refuses to arm with.
+ArduCopter uses values outside the documented range, so the limits are those of the type, except for
+values that it raises itself or with which it refuses to arm.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from simulator.autopilot.firmware import RANGES, ByParameter, ParameterSpec, Rol
 from simulator.autopilot.values import Behaviour, Mode, Result, StatusText, critical, info, warning
 from simulator.geodesy import GRAVITY_MPS2
 
-# MAV_MODE_FLAG: 1 custom mode, 8 guided, 16 stabilise, 64 manual input. "Guided" shows whether
-# the position controller runs, not the mode.
+# MAV_MODE_FLAG: 1 custom mode, 8 guided, 16 stabilise, 64 manual input. "Guided" does not mean the
+# mode, but that the position controller runs.
 BY_POSITION, BY_HAND = 89, 81
 
 
@@ -66,7 +66,9 @@ def _int32(name: str, default: int) -> ParameterSpec:
 
 PARAMETERS = (
     _int8("AHRS_EKF_TYPE", 3),  # estimator, 3 EKF3; without effect
-    ParameterSpec("ANGLE_MAX", "int16", 3000, 1000, 8000),  # cdeg, greatest tilt it flies by itself
+    ParameterSpec(
+        "ANGLE_MAX", "int16", 3000, 1000, 8000
+    ),  # cdeg, greatest tilt of position control
     _int32("ARMING_CHECK", 1),  # pre-arm checks, 1 all
     _real("ATC_ACCEL_P_MAX", 110000.0),  # cdeg/s^2 of pitch
     _real("ATC_ACCEL_R_MAX", 110000.0),  # cdeg/s^2 of roll
@@ -90,7 +92,7 @@ PARAMETERS = (
     _int8("COMPASS_USE", 1),  # without effect
     _int8("DISARM_DELAY", 10),  # s armed on the ground until disarming, 0 never
     _int8("EK3_ENABLE", 1),  # without effect
-    _int8("FENCE_ENABLE", 0),  # there is no fence: without effect
+    _int8("FENCE_ENABLE", 0),  # without effect: there is no fence
     _int8("FLTMODE_CH", 5),  # channel of the mode switch
     _int8("FRAME_CLASS", 1),  # 1 quadrotor
     _int8("FRAME_TYPE", 0),  # 0 plus
@@ -105,7 +107,7 @@ PARAMETERS = (
     _int16("LAND_ALT_LOW", 1000),  # cm below which it lands with LAND_SPEED
     _int16("LAND_SPEED", 50),  # cm/s near the ground
     _int16("LAND_SPEED_HIGH", 0),  # cm/s higher up, 0 WPNAV_SPEED_DN
-    _int32("LOG_BITMASK", 180222),  # there is no log: without effect
+    _int32("LOG_BITMASK", 180222),  # without effect: there is no log
     _real("LOIT_SPEED", 1250.0),  # cm/s of stick flight; without effect
     _int8("MIS_RESTART", 0),  # AUTO: 0 resumes the mission, 1 restarts it
     _int16("MIS_TOTAL", 0),  # items of the mission
@@ -126,19 +128,19 @@ PARAMETERS = (
     _int8("SYSID_ENFORCE", 0),  # 1: obey SYSID_MYGCS only
     _int16("SYSID_MYGCS", 255),  # system id of the ground station
     _int16("SYSID_THISMAV", 1),  # system id
-    _real("WPNAV_ACCEL", 250.0, 1.0),  # cm/s^2 across the ground
-    _real("WPNAV_RADIUS", 200.0, 5.0),  # cm, a waypoint is reached
-    _real("WPNAV_SPEED", 1000.0, 10.0),  # cm/s of automatic flight
+    _real("WPNAV_ACCEL", 250.0, 1.0),  # cm/s^2, horizontal
+    _real("WPNAV_RADIUS", 200.0, 5.0),  # cm from a waypoint, within which it is reached
+    _real("WPNAV_SPEED", 1000.0, 10.0),  # cm/s, horizontal in automatic flight
     _real("WPNAV_SPEED_DN", 150.0),  # cm/s of descent
     _real("WPNAV_SPEED_UP", 250.0),  # cm/s of climb
     _int8("WP_YAW_BEHAVIOR", 2),  # yaw: 0 unchanged, 1 to the waypoint, 2 the same except in RTL
 )
 
 _CENTI = 0.01
-# What they mean is said in `simulator.firmware.px4_tables`
+# `simulator.firmware.px4_tables` explains the roles
 ROLES: dict[str, Role] = {
     "stream_timeout_s": "GUID_TIMEOUT",
-    "velocity_ratio_most": "FS_EKF_THRESH",  # to arm, as the failsafe in flight; 0: not checked
+    "velocity_ratio_most": "FS_EKF_THRESH",  # limit of the failsafe, also for arming; 0: no check
     "disarm_landed_s": 0.45,
     "disarm_idle_s": "DISARM_DELAY",
     "takeoff_height_m": 0.0,  # the command always has a height
@@ -169,7 +171,7 @@ ROLES: dict[str, Role] = {
     "reached_height_m": 1.0,
     "position_without_fix_s": 8.0,
     "return_waits_s": ("RTL_LOIT_TIME", 1e-3),
-    "return_settles_s": 1.8,  # brakes and turns before
+    "return_settles_s": 1.8,  # before the wait the vehicle brakes and turns
     # position loop: P on position, PID on velocity (acceleration out), and limits
     "position_xy_p": "PSC_POSXY_P",
     "position_z_p": "PSC_POSZ_P",
@@ -188,7 +190,7 @@ ROLES: dict[str, Role] = {
     "speed_down_mps": 2.5,
     "tilt_max_rad": lambda parameters: math.radians(parameters["ANGLE_MAX"] * _CENTI),
     "thrust_max": 1.0,
-    # of automatic flight; braking is lower, as the jerk is limited
+    # automatic flight; the mean braking is lower than the limit, as the jerk is limited
     "turn_radps": lambda parameters: math.radians(parameters["ATC_SLEW_YAW"] * _CENTI),
     "speeding_mps2": ("WPNAV_ACCEL", _CENTI),
     "braking_mps2": ("WPNAV_ACCEL", 0.5 * _CENTI),
@@ -196,7 +198,7 @@ ROLES: dict[str, Role] = {
     "facing_mps": lambda parameters: (
         0.05 * (parameters["WPNAV_SPEED"] * _CENTI) if parameters["WP_YAW_BEHAVIOR"] else math.inf
     ),
-    # land detector; shares are between the least and the hover thrust
+    # land detector
     "low_thrust_share": 1.0,
     "idle_thrust_share": math.inf,
     "sinking_mps": 0.1,
@@ -235,7 +237,7 @@ _FAILSAFE = {
 def _failsafe(
     event: str, parameter: str, modes: Mapping[int, str], do: tuple[str, ...] = ("failsafe",)
 ) -> Rule:
-    """A failsafe without delay: to the mode that the parameter selects, when armed."""
+    """A failsafe without delay: an armed vehicle enters the mode that the parameter selects."""
     to, texts = ByParameter(parameter, modes), _FAILSAFE[event]
     return Rule(event, when=("armed",), to=to, do=do, texts=texts, send=_HEARTBEAT)
 
@@ -247,7 +249,8 @@ _GROUND_MODES = {**_BATTERY_MODES, 1: "RTL", 5: "LAND"}
 
 
 def _refusals(event: str, prefix: str, result: Result) -> list[Rule]:
-    """Rows that refuse arming, or (MAV_CMD_RUN_PREARM_CHECKS) say what would; but for the mode."""
+    """Rows that refuse arming (event "arm"), or rows that report what would refuse it, except the
+    mode (event "checks", of MAV_CMD_RUN_PREARM_CHECKS)."""
 
     def refuses(*texts: str, when: tuple[str, ...], mode: str = "*") -> Rule:
         said = tuple(critical(f"{prefix}: {text}") for text in texts)
@@ -272,7 +275,7 @@ def _refusals(event: str, prefix: str, result: Result) -> list[Rule]:
 
 
 def _entries(event: str) -> list[Rule]:
-    """Rows that enter the requested mode, while armed only if it can start."""
+    """Rows that enter the requested mode; while armed, only if the mode can start."""
 
     def refuses(*when: str, texts: tuple[StatusText, ...]) -> Rule:
         return Rule(event, when=when, result=_FAILED, texts=texts)
@@ -291,7 +294,7 @@ def _entries(event: str) -> list[Rule]:
 
 
 RULES = (
-    # A mode requested before was acknowledged and is lost
+    # A mode requested before this event was acknowledged, but is not kept
     Rule("initialised", to="STABILIZE", texts=(info("ArduPilot Ready"),)),
     Rule("origin", send=_ORIGIN_AND_HOME),
     Rule(
@@ -312,7 +315,7 @@ RULES = (
     *_entries("mission"),
     Rule("mission progress", send=("MISSION_CURRENT",)),
     Rule("item reached", send=("MISSION_ITEM_REACHED",)),
-    Rule("mission return", "AUTO", do=("return",)),  # within the mode
+    Rule("mission return", "AUTO", do=("return",)),  # the mode does not change
     Rule("mission finished", when=("landed",), do=("disarm",), texts=(_DISARMING,)),
     Rule("takeoff", "GUIDED", when=("armed", "landed", "climb requested"), do=("take off",)),
     Rule("takeoff", result=_FAILED),
@@ -336,7 +339,7 @@ RULES = (
     Rule("force disarm", do=("disarm",), texts=(_DISARMING,)),
     Rule("terminate", when=("not armed",)),
     Rule("terminate", do=("disarm",), texts=(_DISARMING,)),
-    # No failsafe and no text: level with constant height, or standing still; the mode stays GUIDED
+    # No failsafe and no text: the vehicle levels and keeps its height, or stops; it stays in GUIDED
     Rule("stream lost", when=("attitude setpoint",), do=("level",)),
     Rule("stream lost", when=("velocity setpoint",), do=("hold",)),
     Rule(
@@ -352,7 +355,7 @@ RULES = (
         texts=(warning("GCS Failsafe - Continuing Pilot Control"),),
     ),
     _failsafe("ground station lost", "FS_GCS_ENABLE", _GROUND_MODES),
-    Rule(  # it looks for a landing sequence in the mission first
+    Rule(  # ArduCopter first looks for a landing sequence in the mission
         "ground station lost",
         when=("armed", "FS_GCS_ENABLE=6"),
         to="RTL",

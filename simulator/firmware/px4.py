@@ -1,4 +1,4 @@
-"""PX4 1.16 multicopter: how it reads commands and setpoints, checks, fails and flies.
+"""PX4 1.16 multicopter: how it interprets commands, setpoints, missions and battery levels.
 
 Measured on PX4 1.16.1 SITL where MAVLink shows it, including messages that it should refuse.
 Modes, parameters and the state table are in `simulator.firmware.px4_tables`, telemetry in
@@ -29,7 +29,7 @@ from simulator.firmware import px4_messages as telemetry
 from simulator.firmware.px4_tables import MODES, PARAMETERS, ROLES, RULES
 from simulator.vehicle.conditions import BatteryState
 
-# By PX4_CUSTOM_MAIN_MODE and PX4_CUSTOM_SUB_MODE_AUTO
+# Modes by PX4_CUSTOM_MAIN_MODE and PX4_CUSTOM_SUB_MODE_AUTO
 _BY_NUMBER = {
     (mode.custom_mode >> 16 & 0xFF, mode.custom_mode >> 24): mode.name
     for mode in MODES.values()
@@ -37,11 +37,11 @@ _BY_NUMBER = {
 }
 _AUTO = 4  # main mode
 _CUSTOM_MODE_ENABLED = 1
-# By MAV_MODE_FLAG, where the base mode alone is asked for; the first that fits
+# Modes by MAV_MODE_FLAG, if only the base mode is requested; the first match counts
 _BY_FLAGS = ((4, "AUTO.MISSION"), (64 | 8, "POSCTL"), (64 | 16, "STABILIZED"), (64, "MANUAL"))
 _NO_AUTO_MODE = critical("Unsupported auto mode")
 
-# MAV_CMD accepted without an effect that the simulator shows, and not acknowledged at all
+# MAV_CMDs that are accepted without effect in the simulator, and those that are not acknowledged
 _TAKEN = (80, 187, 191, 195, 197, 201, 245, 519, 525, 528)
 _UNANSWERED = (
     1, 93, 203, 204, 205, 206, 214, 220, 242, 243, 260, 310, 420, 500, 521, 530, 531, 532, 3000
@@ -55,7 +55,7 @@ _UNSUPPORTED_FRAME, _UNSUPPORTED = 2, 3  # MAV_MISSION_RESULT
 _COMMAND_FRAME = 2  # MAV_FRAME_MISSION: no place
 _PLACE_FRAMES = frozenset({0, 3, 5, 6})  # MAV_FRAME: GLOBAL, GLOBAL_RELATIVE_ALT, both with _INT
 _INVALID = critical("IGN MISSION_ITEM: Invalid item")
-# MAV_CMD of missions with a place, and without one
+# MAV_CMDs of mission items with a place, and without one
 _PLACES = frozenset({16, 17, 19, 21, 22, 31, 80, 84, 85, 195, 201, 4501})
 _ACTS = frozenset({
     20, 80, 93, 112, 114, 177, 178, 179, 187, 189, 196, 197, 200, 201, 203, 204, 205, 206, 211, 214,
@@ -87,7 +87,7 @@ class Px4(Firmware):
         return self.command_mode((base_mode, custom_mode >> 16 & 0xFF, custom_mode >> 24))
 
     def arm_request(self, param: float) -> Asked:
-        """param1 rounded; one that is not finite disarms."""
+        """param1 is rounded: 1 arms, 0 disarms; a value that is not finite disarms."""
         number = math.floor(param + 0.5) if math.isfinite(param) else 0
         if number in (0, 1):
             return Asked("arm" if number else "disarm")
@@ -97,11 +97,11 @@ class Px4(Firmware):
     def attitude_setpoint(
         self, values: Mapping[str, Any], parameters: ParameterValues
     ) -> AttitudeSetpoint | None:
-        """SET_ATTITUDE_TARGET as PX4 reads it; None when it demands nothing (mask 135).
+        """SET_ATTITUDE_TARGET as PX4 reads it; None if it demands nothing (type_mask 135).
 
-        Only the roll and pitch bits of type_mask ignore the rates. A thrust that is ignored or NaN
-        is zero thrust. A quaternion may have any length; one without direction keeps the last
-        attitude.
+        Rates are ignored if the roll or the pitch bit of type_mask is set, whatever the yaw bit. A
+        thrust that is ignored or NaN is zero. A quaternion may have any length; with a zero or
+        invalid one, the vehicle keeps the last attitude.
         """
         mask = values["type_mask"]
         attitude_given = not mask & _ATTITUDE_IGNORED
@@ -121,7 +121,7 @@ class Px4(Firmware):
         return AttitudeSetpoint(None, (p, q, r), thrust)
 
     def motion_setpoint(self, values: Mapping[str, Any]) -> MotionSetpoint | None:
-        """SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME 1; None when nothing is demanded."""
+        """SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME 1; None if it demands nothing."""
         if values["coordinate_frame"] != _LOCAL_NED:
             return None
         mask = values["type_mask"]
@@ -150,9 +150,9 @@ class Px4(Firmware):
     def in_local_frame(
         self, values: Mapping[str, Any], estimate: StateEstimate
     ) -> Mapping[str, Any]:
-        """BODY_NED: velocity rotated by yaw, acceleration by attitude, no position.
+        """Convert MAV_FRAME_BODY_NED: velocity by the yaw, acceleration by the attitude.
 
-        A vector with one ignored component is ignored.
+        A position is ignored, and a vector with one ignored component is ignored.
         """
         if values["coordinate_frame"] != _BODY_NED:
             return values
@@ -176,7 +176,7 @@ class Px4(Firmware):
         }
 
     def setpoint_rejection(self, message: str, frame: int | None) -> StatusText:
-        """Text about a setpoint in an unknown frame, or (None) one that demands nothing."""
+        """Text about a setpoint in an unknown frame, or (`frame` None) with no demand."""
         if frame is None:
             return critical(f"{message} invalid")
         if message.endswith("GLOBAL_INT"):
@@ -194,11 +194,12 @@ class Px4(Firmware):
         return None
 
     def battery_level(self, battery: BatteryState, parameters: ParameterValues) -> int:
-        """By the remaining share."""
+        """Return the number of thresholds that the remaining share is below."""
         return sum(battery.remaining < parameters[name] for name in _BATTERY_THRESHOLDS)
 
     def return_height_m(self, distance_m: float, parameters: ParameterValues) -> float:
-        """Height of a return above home: under a cone near home (RTL_CONE_ANG)."""
+        """Return the height of a return above home: near home it is limited by a cone
+        (RTL_CONE_ANG)."""
         highest_m, accepted_m = parameters["RTL_RETURN_ALT"], parameters["NAV_ACC_RAD"]
         if distance_m <= accepted_m:
             return min(2.0 * distance_m, highest_m)
@@ -217,7 +218,7 @@ PX4 = Px4(
     version=0x011001FF,  # 1.16.1, release
     # float parameters, missions and commands in integers, bytewise parameters, targets of attitude
     # and local position, termination, MAVLink 2, fences, rally points
-    capabilities=0xE8DF,  # of 1.16.1, without FTP
+    capabilities=0xE8DF,  # those of 1.16.1 without FTP
     origin=(47.397742, 8.545594, 489.4),
     modes=MODES,
     boot_mode="AUTO.LOITER",
@@ -237,7 +238,7 @@ PX4 = Px4(
         **dict.fromkeys(_UNANSWERED),
         189: Result.CANCELLED,
         211: Result.DENIED,
-        224: Result.UNSUPPORTED,  # MISSION_SET_CURRENT does it
+        224: Result.UNSUPPORTED,  # clients use the message MISSION_SET_CURRENT
     },
     global_frames=frozenset({5, 6, 11}),
     setpoint_mode_needs_stream=True,
@@ -263,10 +264,10 @@ PX4 = Px4(
     parameters_bytewise=True,
     parameters_hashed=True,
     parameters_numbered=True,
-    # of 1.17, as 1.16 has no signing: HEARTBEAT, RADIO_STATUS, ADSB_VEHICLE, COLLISION
+    # those of 1.17, as 1.16 has no signing: HEARTBEAT, RADIO_STATUS, ADSB_VEHICLE, COLLISION
     accepted_unsigned=frozenset({0, 109, 246, 247}),
     # gyro, accelerometer, magnetometer, absolute pressure, GPS; battery, AHRS; the health bits
-    # include the geofence, or MAVProxy reports a breach
+    # include the geofence, as otherwise MAVProxy reports a breach
     sensor_bits=(0x0300402F, 0x0301402F, 0x0330C83F),
     boot_events_s={"fix": 3.0, "ready": 4.0, "ready without position": 4.0},
     fails_where_unarmable=True,

@@ -1,4 +1,4 @@
-"""Telemetry of PX4: rates, and builders of messages that only it sends."""
+"""Telemetry of PX4: rates, and builders of the messages that only PX4 sends."""
 
 from __future__ import annotations
 
@@ -80,8 +80,8 @@ _STANDARD_MODES = {
 
 
 def heartbeat(view: View) -> Sequence[Any]:
-    """In Offboard base_mode shows which control loops run: none before the first setpoint, the rate
-    loop only for rate setpoints."""
+    """In OFFBOARD, base_mode shows which control loops run: none before the first setpoint, only
+    the rate loop with rate setpoints."""
     commander, setpoint = view.autopilot.commander, view.autopilot.guidance.newest
     base_mode = commander.mode.base_mode
     if commander.mode.behaviour is Behaviour.SETPOINT:
@@ -94,7 +94,7 @@ def heartbeat(view: View) -> Sequence[Any]:
 
 
 def current_mode(view: View) -> Sequence[Any]:
-    """The mode in force, and the one that was chosen: they differ in a failsafe."""
+    """The present mode and the one that was chosen; they differ in a failsafe."""
     commander = view.autopilot.commander
     standard = _STANDARD_MODES.get(commander.mode.name, 0)
     return (standard, commander.mode.custom_mode, commander.intended.custom_mode)
@@ -128,20 +128,20 @@ def altitude(view: View) -> Sequence[Any]:
 
 
 def distance_sensor(view: View) -> Sequence[Any]:
-    """The range finder of SIH, which looks down, in cm."""
+    """The range finder of PX4's SIH, which points down; cm."""
     range_cm = fit(view.autopilot.state.estimate.ground_m * 100.0, 16, signed=False)
     return (view.time_ms, 0, 10_000, range_cm, 0, 0, 25, 0)
 
 
 def servo_output_raw(view: View) -> Sequence[Any]:
-    """Four equal motors; 900 us for those that stand."""
+    """Four equal motors; a motor that is off has 900 us."""
     demand = view.autopilot.position_controller.demand
     width_us = fit(1000.0 + 1000.0 * demand.thrust if demand.motors_on else 900, 16, signed=False)
     return (view.time_us & 0xFFFFFFFF, 0, *(width_us,) * 4, *(900,) * 12)
 
 
 def highres_imu(view: View) -> Sequence[Any]:
-    """True specific force in body axes, estimated rates; pressure in Pa, as PX4 sends it."""
+    """True specific force in body axes and estimated rates; PX4 sends the pressure in Pa."""
     nav = view.autopilot.state.estimate
     height = view.autopilot.firmware.origin[2] + view.autopilot.plant.height_m
     return (
@@ -183,7 +183,8 @@ def estimator_status(view: View) -> Sequence[Any]:
     if autopilot.health.position_lost:
         flags = 229
     velocity_ratio = max(0.12, autopilot.commander.velocity_ratio)
-    # PX4 1.16 SIH without GPS: 0.5 m after 1.7 s, 1.0 after 3.7, 2.2 after 6.7, 4.9 after 10.8
+    # Accuracy of PX4 1.16 SIH without GPS: 0.5 m after 1.7 s, 1.0 m after 3.7 s, 2.2 m after 6.7 s,
+    # 4.9 m after 10.8 s
     passed_s = autopilot.health.without_fix_s(autopilot.state.time_s)
     accuracy_m = 0.3 + (0.05 * passed_s + 0.035 * passed_s**2 if math.isfinite(passed_s) else 0.0)
     return (
@@ -195,7 +196,7 @@ _STATUS_STEPS = 125  # 0.5 s
 
 
 def _vehicle_status(view: View) -> Hashable:
-    """Version of the topic vehicle_status: new twice a second, and at once when it changes."""
+    """Version of the topic vehicle_status, published twice a second and when it changes."""
     commander, state = view.autopilot.commander, view.autopilot.state
     modes = (commander.mode, commander.intended)
     return (state.steps // _STATUS_STEPS, modes, commander.armed, commander.failsafe)

@@ -1,5 +1,5 @@
-"""Tables of PX4: its flight modes, its parameters (those that clients read or the vehicle obeys),
-and its state table: events, and what follows from them.
+"""Tables of PX4: its flight modes, its parameters (those that clients read or that have an effect),
+and its state table, which decides about events.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def _by_sticks(name: str, title: str, number: int, behaviour: Behaviour) -> Mode
 
 
 def _ends(name: str, title: str, number: int, behaviour: Behaviour) -> Mode:
-    """A mode that ends on the ground: none to arm in or to come back to."""
+    """A mode that ends on the ground: the vehicle is not armed in it and does not return to it."""
     return Mode(name, title, number, AUTO, behaviour, arms=False, remembered=False)
 
 
@@ -65,7 +65,7 @@ def _int(name: str, default: int, low: int, high: int) -> ParameterSpec:
 PARAMETERS = (
     _int("BAT1_N_CELLS", 4, 1, 16),  # cells of the battery
     _real("BAT_CRIT_THR", 0.07, 0.05, 0.5),  # remaining share at which the battery is critical
-    _real("BAT_EMERGEN_THR", 0.05, 0.03, 0.5),  # remaining share that is an emergency
+    _real("BAT_EMERGEN_THR", 0.05, 0.03, 0.5),  # remaining share at which it is an emergency
     _real("BAT_LOW_THR", 0.15, 0.12, 0.5),  # remaining share at which the battery is low
     _int("CAL_ACC0_ID", 1310988, 0, 2147483647),  # calibrated accelerometer
     _int("CAL_GYRO0_ID", 1310988, 0, 2147483647),  # calibrated gyroscope
@@ -75,7 +75,7 @@ PARAMETERS = (
     _real("COM_DISARM_LAND", 2.0, -1, 20),  # s from landing to disarming, < 0 never
     _real("COM_DISARM_PRFLT", 10.0, -1, 100),  # s armed without takeoff until disarming, < 0 never
     _int("COM_DL_LOSS_T", 10, 5, 300),  # s without ground station until it is lost
-    _real("COM_FAIL_ACT_T", 5.0, 0, 25),  # s of hold before a failsafe acts
+    _real("COM_FAIL_ACT_T", 5.0, 0, 25),  # s in Hold before the action of a failsafe
     _int("COM_LOW_BAT_ACT", 3, 0, 3),  # battery: 0 warning, 1 return, 2 land, 3 return or land
     _int("COM_OBL_RC_ACT", 0, 0, 5),  # offboard lost: POSCTL ALTCTL STABILIZED RTL LAND LOITER
     _real("COM_OF_LOSS_T", 1.0, 0, 60),  # s without setpoint until offboard is lost
@@ -96,8 +96,8 @@ PARAMETERS = (
     _real("MIS_DIST_1WP", 10000.0, -1, 100000),  # m to the first waypoint; without effect
     _real("MIS_TAKEOFF_ALT", 2.5, 0, 80),  # m, takeoff height
     _int("MIS_TKO_LAND_REQ", 0, 0, 4),  # what a mission must have
-    _real("MPC_ACC_DOWN_MAX", 3.0, 2, 15),  # m/s^2 downwards of automatic flight
-    _real("MPC_ACC_HOR", 3.0, 2, 15),  # m/s^2 across of automatic flight
+    _real("MPC_ACC_DOWN_MAX", 3.0, 2, 15),  # m/s^2, downwards in automatic flight
+    _real("MPC_ACC_HOR", 3.0, 2, 15),  # m/s^2, horizontal in automatic flight
     _real("MPC_LAND_ALT1", 10.0, 0, 122),  # m below which a descent slows down
     _real("MPC_LAND_ALT2", 5.0, 0, 122),  # m below which the speed is MPC_LAND_SPEED
     _real("MPC_LAND_ALT3", 1.0, 0, 122),  # m above ground, below which MPC_LAND_CRWL applies
@@ -111,7 +111,7 @@ PARAMETERS = (
     _real("MPC_TKO_RAMP_T", 3.0, 0, 5),  # s until the climb rate of a takeoff is reached
     _real("MPC_TKO_SPEED", 1.5, 1, 5),  # m/s of climb at takeoff
     _int("MPC_USE_HTE", 1, 0, 1),  # estimate the hover thrust
-    _real("MPC_XY_CRUISE", 5.0, 3, 20),  # m/s of automatic flight
+    _real("MPC_XY_CRUISE", 5.0, 3, 20),  # m/s, horizontal in automatic flight
     _real("MPC_XY_P", 0.95, 0, 2),  # 1/s
     _real("MPC_XY_VEL_D_ACC", 0.2, 0.1, 2),  # -
     _real("MPC_XY_VEL_I_ACC", 0.4, 0, 60),  # 1/s^2
@@ -127,14 +127,14 @@ PARAMETERS = (
     _real("MPC_Z_VEL_P_ACC", 4.0, 2, 15),  # 1/s
     _real("MPC_Z_V_AUTO_DN", 1.5, 0.5, 4),  # m/s of automatic descent
     _real("MPC_Z_V_AUTO_UP", 3.0, 0.5, 8),  # m/s of automatic climb
-    _real("NAV_ACC_RAD", 2.0, 0.05, 200),  # m, a waypoint is reached
+    _real("NAV_ACC_RAD", 2.0, 0.05, 200),  # m from a waypoint, within which it is reached
     _int("NAV_DLL_ACT", 0, 0, 6),  # ground station lost: 0 nothing, 1 hold, 2 return, 3 land
-    _real("NAV_MC_ALT_RAD", 0.8, 0.05, 200),  # m, a height is reached
+    _real("NAV_MC_ALT_RAD", 0.8, 0.05, 200),  # m from a height, within which it is reached
     _int("NAV_RCL_ACT", 2, 1, 6),  # sticks lost: 2 return
     _int("RC_MAP_THROTTLE", 0, 0, 18),  # channel of the throttle stick
     _int("RTL_CONE_ANG", 45, 0, 90),  # deg, of the cone above home within RTL_MIN_DIST
-    _real("RTL_DESCEND_ALT", 10.0, 0, 100),  # m above home, where a return loiters
-    _real("RTL_LAND_DELAY", 0.0, -1, 600),  # s of loiter there, < 0 without end
+    _real("RTL_DESCEND_ALT", 10.0, 0, 100),  # m above home, height at which a return loiters
+    _real("RTL_LAND_DELAY", 0.0, -1, 600),  # s of loiter at that height, < 0 without end
     _real("RTL_MIN_DIST", 10.0, 0.5, 100),  # m from home, within which RTL_CONE_ANG applies
     _real("RTL_RETURN_ALT", 30.0, 0, 150),  # m above home while returning
     _int("RTL_TYPE", 0, 0, 5),  # 0 home or rally point
@@ -143,23 +143,23 @@ PARAMETERS = (
     _int("SYS_HAS_GPS", 1, 0, 1),  # 1: has GPS
 )
 
-# Names end with the unit. What is not clear by name is said here, for both firmwares
+# Names end with the unit. The comments explain roles for both firmwares, if the name does not
 ROLES: dict[str, Role] = {
     "stream_timeout_s": "COM_OF_LOSS_T",
-    # innovation ratio of the velocity from which it does not arm, 0 any: EKF2's before take-off
+    # velocity innovation test ratio at which arming is refused, 0: no check; EKF2's before takeoff
     "velocity_ratio_most": 0.5,
     "disarm_landed_s": "COM_DISARM_LAND",
     "disarm_idle_s": "COM_DISARM_PRFLT",
     "takeoff_height_m": "MIS_TAKEOFF_ALT",
     "takeoff_speed_mps": "MPC_TKO_SPEED",
     "land_speed_mps": "MPC_LAND_SPEED",
-    "descent_speed_mps": "MPC_Z_V_AUTO_DN",  # of a landing, far from the ground
+    "descent_speed_mps": "MPC_Z_V_AUTO_DN",  # during a landing, far from the ground
     "cruise_speed_mps": "MPC_XY_CRUISE",
     "hover_thrust": "MPC_THR_HOVER",
     "tilt_boost": 0.0,  # not 0: the thrust of a setpoint is divided by the cosine of the tilt
     "ground_station_timeout_s": "COM_DL_LOSS_T",
-    "ground_station_needed": "NAV_DLL_ACT",  # to arm
-    "battery_patience_s": 0.0,  # that a worse level lasts until it is reported
+    "ground_station_needed": "NAV_DLL_ACT",  # greater than 0: arming needs a ground station
+    "battery_patience_s": 0.0,  # duration of a battery level after which it is reported
     "failsafe_delay_s": "COM_FAIL_ACT_T",
     "spool_up_s": "COM_SPOOLUP_TIME",
     "takeoff_ramp_s": "MPC_TKO_RAMP_T",
@@ -195,27 +195,28 @@ ROLES: dict[str, Role] = {
     "speed_down_mps": "MPC_Z_VEL_MAX_DN",
     "tilt_max_rad": ("MPC_TILTMAX_AIR", math.radians(1.0)),
     "thrust_max": "MPC_THR_MAX",
-    # of automatic flight; jerk is limited in the real one (MPC_JERK_AUTO), which lowers both
-    # horizontal accelerations on average
+    # automatic flight; PX4 limits the jerk (MPC_JERK_AUTO), which on average lowers both horizontal
+    # accelerations
     "turn_radps": ("MPC_YAWRAUTO_MAX", math.radians(1.0)),
     "speeding_mps2": ("MPC_ACC_HOR", 0.7),
     "braking_mps2": ("MPC_ACC_HOR", 0.5),
     "vertical_mps2": ("MPC_ACC_DOWN_MAX", 0.5),
-    # demanded speed from which it faces the direction of flight
+    # demanded speed above which the nose points in the direction of flight
     "facing_mps": lambda parameters: parameters["MPC_XY_P"] * parameters["NAV_ACC_RAD"],
-    # land detector; shares are between the least and the hover thrust
-    # no more than this can be a landing, also where estimates drift on the ground
+    # land detector; thrust shares go from 0, the least thrust, to 1, the hover thrust
+    # greatest thrust of a landing; so high because estimates may drift on the ground
     "low_thrust_share": 0.95,
-    "idle_thrust_share": 0.1,  # more than this is a take-off
-    "sinking_mps": 0.09,  # a demand to descend at this speed is one to land
-    # still_*: greatest estimated motion of a vehicle that stands
+    "idle_thrust_share": 0.1,  # more thrust than this is a takeoff
+    "sinking_mps": 0.09,  # a demanded descent at this speed may be a landing
+    # still_*: greatest estimated motion of a vehicle on the ground
     "still_down_mps": 0.2,
     "still_across_mps": 1.5,  # LNDMC_XY_VEL_MAX
     "still_radps": math.radians(20.0),  # LNDMC_ROT_MAX
     "stick_descent_mps": 0.6,  # in a manual mode without stick input
-    "setpoint_spool_s": 0.0,  # from arming until the thrust of a setpoint acts
-    "stream_reaction_s": 0.036,  # from the time-out of the stream until it counts as lost
-    "ground_station_stays_s": 2.5,  # the same of a ground station, whose HEARTBEATs are missing
+    "setpoint_spool_s": 0.0,  # from arming until the thrust of an attitude setpoint is applied
+    "stream_reaction_s": 0.036,  # from the time-out of the setpoints until they count as lost
+    # time for which a ground station counts as connected after a HEARTBEAT; the time-out follows
+    "ground_station_stays_s": 2.5,
 }
 
 
@@ -238,8 +239,8 @@ _WARNINGS = {
 
 
 def _delayed(event: str, parameter: str, modes: Mapping[int, str]) -> tuple[Rule, ...]:
-    """Rows of a failsafe with delay: Hold first, so that a pilot can take over, then the mode that
-    the parameter selects. A second failsafe during the delay changes that mode only."""
+    """Rows of a failsafe with delay: first Hold, so that a pilot can take over, then the mode that
+    the parameter selects. A second failsafe during the delay changes only that mode."""
     values = ",".join(map(str, modes))
     hold = critical("Failsafe activated: entering Hold for {delay_s:.0f} seconds")
     return (
@@ -274,7 +275,7 @@ def _says(
 
 
 def _disarms(event: str, *texts: str, when: tuple[str, ...] = ()) -> Rule:
-    """A row that disarms; the mode chosen last comes back."""
+    """A row that disarms and returns to the mode chosen last."""
     return Rule(event, when=when, do=("disarm",), to="remembered", texts=tuple(map(info, texts)))
 
 
@@ -313,7 +314,7 @@ RULES = (
     Rule("stream found", when=("since stream lost",), to="remembered", do=("recover",)),
     *_delayed("battery critical", "COM_LOW_BAT_ACT", {1: _RTL, 2: _LAND, 3: _RTL}),
     *_delayed("battery emergency", "COM_LOW_BAT_ACT", {1: _RTL, 2: _LAND, 3: _LAND}),
-    # a landing goes on
+    # the vehicle continues a landing
     Rule(
         "ground station lost", "AUTO.LAND AUTO.PRECLAND", texts=(_WARNINGS["ground station lost"],)
     ),
@@ -345,7 +346,7 @@ RULES = (
     Rule("mission finished", texts=(info("Mission finished, loitering"),)),
     Rule("home"),
     Rule("speed"),
-    Rule("reboot", result=Result.DENIED),  # as SITL does, which cannot
+    Rule("reboot", result=Result.DENIED),  # as in PX4's SITL, which cannot reboot
     Rule("took off", texts=(info("Takeoff detected"),)),
     Rule("landed", texts=(info("Landing detected"),)),
     _disarms("settled", "Disarmed by landing"),
