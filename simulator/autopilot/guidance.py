@@ -1,6 +1,6 @@
 """Guidance: the motion that the vehicle flies, according to the behaviour of its mode.
 
-Home, the place to hold and a client's setpoint are kept when the mode changes; every behaviour
+Home, the place to hold and a client's setpoint do not belong to one behaviour: every behaviour
 (`simulator.autopilot.behaviours`) reads and changes them here. NED, SI. Knows no modes by name, no
 thrust and no attitude loop: the position controller flies the motion.
 """
