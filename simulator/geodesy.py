@@ -7,7 +7,7 @@ import math
 
 GRAVITY_MPS2 = 9.80665
 EARTH_RADIUS_M = 6_371_000.0
-DEGREES_PER_M = math.degrees(1.0 / EARTH_RADIUS_M)  # northwards
+DEGREES_PER_M = math.degrees(1.0 / EARTH_RADIUS_M)  # degrees of latitude per metre
 Origin = tuple[float, float, float]  # latitude, longitude deg, AMSL m
 RELATIVE_FRAMES = frozenset((3, 6))  # MAV_FRAMEs with the height above home
 TERRAIN_FRAMES = frozenset((10, 11))  # MAV_FRAMEs with the height above the terrain

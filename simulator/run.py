@@ -39,8 +39,8 @@ class Endpoint:
     instance: Instance
     companion: Link
     ground: Link | None = None
-    recorder: Recorder | None = None  # of the companion link
-    strangers: tuple[Link, ...] = ()  # for `Instance.strangers`, in its order
+    recorder: Recorder | None = None  # log of the companion link
+    strangers: tuple[Link, ...] = ()  # ports of the senders in `Instance.strangers`, in this order
 
     @property
     def links(self) -> list[Link]:
@@ -93,7 +93,8 @@ class Endpoint:
 
 @dataclass(slots=True)
 class Punctuality:
-    """Counts of steps that missed their deadline in real time: that ended when the next was due."""
+    """Deadlines of a run in real time: a step missed its deadline if it ended after the next one
+    was due."""
 
     steps: int = 0
     missed: int = 0
@@ -168,7 +169,7 @@ class Runner:
                 endpoint.send()
 
     def _serve_until(self, deadline_s: float, owners: Mapping[Link, Endpoint]) -> None:
-        """Handle the datagrams that arrive before the deadline; look at least once."""
+        """Handle the datagrams that arrive before the deadline; read the links at least once."""
         while True:
             remaining_s = deadline_s - monotonic_s()
             ready = wait(owners, min(remaining_s, POLL_S))
@@ -190,7 +191,7 @@ class Runner:
                 has sent anything, then ANSWER_TIMEOUT_S.
 
         Returns:
-            A sentence that no companion answers; empty if the run ended or was stopped.
+            A sentence about a missing answer; empty if the run was stopped or reached its end.
         """
         (endpoint,) = self.endpoints
         instance = endpoint.instance

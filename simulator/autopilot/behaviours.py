@@ -116,7 +116,7 @@ class Return(ActiveBehaviour):
         return MotionSetpoint(guidance.hold_ned_m, faces_way=guidance.firmware.return_faces_way)
 
     def _advance(self, estimate: StateEstimate) -> None:
-        """Go on to the next stages as far as stages are complete."""
+        """Go on to the next stage if the present one is complete, and so on."""
         guidance, z = self.guidance, estimate.position_ned_m[2]
         home_x, home_y, home_z = guidance.home_ned_m
         role, target_z = guidance.parameters.role, guidance.hold_ned_m[2]
@@ -166,8 +166,8 @@ class FlyMission(ActiveBehaviour):
 
 
 class FlyBySticks(ActiveBehaviour):
-    """ArduCopter LOITER, ALT_HOLD and POSHOLD; PX4 POSCTL and ALTCTL, which have no stick input
-    here: the vehicle descends slowly."""
+    """ArduCopter LOITER, ALT_HOLD and POSHOLD; PX4 POSCTL and ALTCTL, in which the vehicle descends
+    slowly, because PX4's stick input is not simulated."""
 
     lifts_off = True
 

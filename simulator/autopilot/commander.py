@@ -106,7 +106,7 @@ class Commander:
 
     @property
     def intended(self) -> Mode:
-        """The mode chosen last by anything but a failsafe, which may fly another mode."""
+        """The mode that was chosen; in a failsafe the vehicle flies another one."""
         return self._firmware.modes[self._intended]
 
     # -- events ------------------------------------------------------------------------------

@@ -1,5 +1,5 @@
-"""What the simulator has to know of a firmware: data as fields; how it interprets messages as
-methods.
+"""What the simulator has to know about a firmware: fields with data, and methods that interpret
+messages.
 
 The autopilot and the MAVLink server never compare firmware names; they read one `Firmware`. Its
 subclasses are in `simulator.firmware.px4` and `simulator.firmware.ardupilot`. Knows the state
@@ -101,7 +101,7 @@ class Firmware(ABC):
     mav_autopilot: int
     version: int  # AUTOPILOT_VERSION.flight_sw_version
     capabilities: int  # MAV_PROTOCOL_CAPABILITY
-    origin: Triple  # of the local frame: latitude, longitude deg, AMSL m
+    origin: Triple  # origin of the local frame: latitude, longitude deg, AMSL m
     modes: Mapping[str, Mode]
     boot_mode: str
     hold_mode: str  # mode in which the vehicle stops and holds its position
@@ -135,7 +135,7 @@ class Firmware(ABC):
     setpoints_imply_flight: bool = False  # an attitude setpoint with thrust ends the landed state
 
     # missions
-    requests_kind_of_peer: bool = False  # items of an upload, with or without _INT as the peer
+    requests_kind_of_peer: bool = False  # requests items with or without _INT, as the peer last did
     # MAV_FRAME of a downloaded item, by its message and the MAV_FRAME of the upload
     item_frames: Mapping[str, Mapping[int, int]]
     home_item_first: bool = False  # item 0 of a mission is home
@@ -146,9 +146,9 @@ class Firmware(ABC):
     turning_items: frozenset[int] = frozenset()  # MAV_CMDs of items whose param4 is a yaw
 
     # telemetry
-    companion_rates_hz: Mapping[str, float]  # of the messages sent without a request, by link
+    companion_rates_hz: Mapping[str, float]  # rates of the messages sent without a request
     ground_rates_hz: Mapping[str, float]
-    messages: ModuleType  # builders that add to those of `simulator.mavlink.messages`, or replace
+    messages: ModuleType  # builders in addition to `simulator.mavlink.messages`, or in their place
     withheld_until: Mapping[str, str] = field(default_factory=dict)  # message -> boot event
     # message -> function that returns the version of its content; a message that is due waits
     # until the version is a new one
@@ -157,29 +157,27 @@ class Firmware(ABC):
     position_grid_steps: int  # number of steps from one new position estimate to the next
     fixed_streams: frozenset[str]  # messages whose interval cannot be changed
     not_on_request: frozenset[str]  # messages that MAV_CMD_REQUEST_MESSAGE refuses
-    never_sent: frozenset[
-        int
-    ]  # ids of messages that are never sent, but whose interval is settable
+    never_sent: frozenset[int]  # ids of messages that are not sent, but accept an interval
     stream_groups: Mapping[int, tuple[str, ...]] = field(default_factory=dict)  # by MAV_DATA_STREAM
     rate_max_hz: float = math.inf
     interval_refusal: Result
     interval_refusal_text: str = ""  # STATUSTEXT, may contain {id}; "": none
     too_fast_text: str = ""  # the same for a rate above `rate_max_hz`
-    request_refusal: Result  # of MAV_CMD_REQUEST_MESSAGE; MAV_CMD_DO_FLIGHTTERMINATION with 0
+    request_refusal: Result  # of MAV_CMD_REQUEST_MESSAGE, MAV_CMD_DO_FLIGHTTERMINATION with 0
 
     # link
-    ground_station_parameter: str = ""  # has its system id; "": its MAV_TYPE identifies it
+    ground_station_parameter: str = ""  # has its system id; "": recognised by MAV_TYPE
     target_component_checked: bool = False  # messages for another component are not handled
     ignored: frozenset[str] = frozenset()  # messages that are not handled
     # first words of the names of messages that are ignored if their target is all systems (0)
     never_to_all: frozenset[str] = frozenset()
-    text_suffix: str = ""  # of each STATUSTEXT
+    text_suffix: str = ""  # appended to each STATUSTEXT
     text_to_ground_stations_only: bool = False  # STATUSTEXTs wait for a ground station
     parameters_bytewise: bool = False  # PARAM_VALUE holds the bytes of an integer, not its value
     parameters_hashed: bool = False  # a list begins with _HASH_CHECK
     parameters_numbered: bool = False  # PARAM_VALUE.param_index is set also outside a list
     accepted_unsigned: frozenset[int]  # ids of messages that need no signature
-    stamps_follow_clock: bool = False  # False: they only count, from the newest that was received
+    stamps_follow_clock: bool = False  # of signatures; False: they only count
 
     # health
     # Seconds after boot, by event: "fix" (first GPS fix), "ready" and "ready without position"

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 KEEP, RELEASE = 65535, 0  # RC_CHANNELS_OVERRIDE: do not change this channel, end its override
 OVERRIDE_S = 3.0  # RC_OVERRIDE_TIME
 _CENTRE_US, _RANGE_US = 1500, 500
-_PERIOD_MIN_S, _PERIOD_MAX_S = 1e-3, 0.1  # between two calls of `demand`
+_PERIOD_MIN_S, _PERIOD_MAX_S = 1e-3, 0.1  # limits of the time between two `demand`s
 _THROTTLE_DEAD_ZONE_US = 100  # THR_DZ
 # Channels of SITL without RC: roll, pitch, throttle (down), yaw, mode switch (5) and others
 _DEFAULT_US = (1500, 1500, 1000, 1500, 1800, 1000, 1000, 1800)

@@ -33,7 +33,7 @@ class Result(IntEnum):
 
 
 class Severity(IntEnum):
-    """MAV_SEVERITY, those in use."""
+    """The values of MAV_SEVERITY that are used."""
 
     EMERGENCY = 0
     CRITICAL = 2

@@ -19,7 +19,7 @@ from simulator.steps import STEP_S
 
 
 class LinkFault(Timed, Impairment):
-    """A bad companion link. With `both`, each direction has the delay, so a round trip has twice.
+    """A bad companion link. With `both`, a round trip takes longer by twice `latency_s`.
 
     The fault does not apply to the TIMESYNC exchange of lockstep, the clock of the simulation.
     """
@@ -58,8 +58,8 @@ class SilentMessage(Timed):
 
 
 class StuckMessage(Timed):
-    """A message that repeats its old content: `fields`; without these all fields, but with
-    `stamp_runs` not its time stamp."""
+    """A message that repeats the old values of `fields`. Without `fields` it repeats all of them
+    or, with `stamp_runs`, all except the time stamp."""
 
     fault: Literal["stuck_message"]
     message: MessageName

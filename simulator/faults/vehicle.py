@@ -192,7 +192,7 @@ class PilotDisarms(Timed):
 
 
 class Reboot(Timed):
-    """After `for_s` of silence the autopilot has restarted, disarmed, and its time begins at 0."""
+    """The autopilot reboots: after `for_s` of silence it is disarmed, and its time begins at 0."""
 
     fault: Literal["reboot"]
     for_s: float = Field(default=2.0, gt=0, le=60)

@@ -32,7 +32,7 @@ from simulator.vehicle.conditions import BatteryState
 
 _CUSTOM_MODE_ENABLED = 1
 _BY_NUMBER = {mode.custom_mode: mode.name for mode in MODES.values()}
-# Modes of ArduCopter that the simulator does not enter, with the end of the text
+# Modes of ArduCopter that the simulator does not enter, with the end of the refusal's text
 _NOT_ENTERED = {
     14: "FLIP failed: init failed",
     15: "AUTOTUNE failed: init failed",

@@ -66,9 +66,7 @@ def _int32(name: str, default: int) -> ParameterSpec:
 
 PARAMETERS = (
     _int8("AHRS_EKF_TYPE", 3),  # estimator, 3 EKF3; without effect
-    ParameterSpec(
-        "ANGLE_MAX", "int16", 3000, 1000, 8000
-    ),  # cdeg, greatest tilt of position control
+    ParameterSpec("ANGLE_MAX", "int16", 3000, 1000, 8000),  # cdeg, tilt limit of position control
     _int32("ARMING_CHECK", 1),  # pre-arm checks, 1 all
     _real("ATC_ACCEL_P_MAX", 110000.0),  # cdeg/s^2 of pitch
     _real("ATC_ACCEL_R_MAX", 110000.0),  # cdeg/s^2 of roll

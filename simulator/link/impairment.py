@@ -33,7 +33,7 @@ class Impairment(Parameters):
     corruption: float = Field(default=0.0, ge=0, le=1)  # probability of one flipped bit
     rate_bytes_ps: float | None = Field(default=None, ge=100, le=1e9)
     stalled: bool = False  # datagrams wait until the fault ends and then arrive at once, in order
-    # datagrams that wait for the limited rate or the end of a stall; if it is full, they are lost
+    # queue for the limited rate, or until a stall ends; datagrams that do not fit are lost
     queue_bytes: int = Field(default=4096, ge=280, le=10_000_000)
     message_rate_hz: float | None = Field(default=None, ge=0.1, le=1000)  # limit per message id
 

@@ -79,7 +79,7 @@ ALL_KINDS = 255  # MAV_MISSION_TYPE
 
 
 class Ack(IntEnum):
-    """MAV_MISSION_RESULT, those in use."""
+    """The values of MAV_MISSION_RESULT that are used."""
 
     ACCEPTED = 0
     ERROR = 1

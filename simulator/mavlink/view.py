@@ -112,7 +112,7 @@ class View:
 
     @property
     def time_us(self) -> int:
-        """Time since boot of the vehicle's clock, which all time stamps contain."""
+        """Vehicle time in all time stamps: with the errors of its clock, microseconds."""
         return max(0, int(self.autopilot.state.time_us * self.clock_rate) + self.clock_offset_us)
 
     def geodetic(self, north_m: float, east_m: float) -> tuple[int, int]:

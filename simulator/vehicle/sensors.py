@@ -37,7 +37,7 @@ STANDING_NOISE = 0.1
 
 
 class EstimatorName(StrEnum):
-    """Models of estimator errors, named after the autopilot on which they were identified."""
+    """Models of estimator errors; the last three were identified on these autopilots."""
 
     PERFECT = "perfect"
     WHITE = "white"
