@@ -85,7 +85,7 @@ def _companion_link(options: Options) -> str:
 def _links(options: Options, number: int) -> tuple[Link, Link | None]:
     """Open the companion link and the ground station link of an instance.
 
-    With `--connect`, the local port is any free one: a real PX4 SITL may use its own beside ours.
+    With `--connect`, any free local port is used: a real PX4 SITL beside ours may use 14580.
     """
     port = ANY_PORT if options.connect else LOCAL_COMPANION_PORT + number
     url = shifted(_companion_link(options), number - options.numbers[0])

@@ -132,7 +132,7 @@ class Firmware(ABC):
     setpoint_mode_needs_stream: bool = False  # without a stream, its pre-arm checks fail
     setpoints_as_automatic: bool = False  # speed and turn rate limits are those of automatic flight
     setpoints_outlive_modes: bool = False  # taken in any mode, and kept when the mode changes
-    setpoints_imply_flight: bool = False  # an attitude setpoint with thrust ends the landed state
+    setpoints_imply_flight: bool = False  # attitude setpoints: thrust is flight; no land detector
 
     # missions
     requests_kind_of_peer: bool = False  # requests items with or without _INT, as the peer last did
