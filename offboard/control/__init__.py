@@ -63,8 +63,8 @@ After `pip install` of this package:
 
 A YAML file with `law: pd` and other values is given as `--controller my.yaml`. `Situation`,
 `PredictedState` and `Command` say what each value means, with frames and units. A law like this one
-is flown with the vehicle file (`--vehicle`), without identification steps; one that shall use the
-vehicle that is identified in flight also has what `Adaptive` says.
+is flown with the constants of the vehicle file (`--vehicle`), without identification steps. A law
+that is to use the constants identified in flight also implements `Adaptive`.
 """
 
 from offboard.control.base import (

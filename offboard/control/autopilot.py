@@ -1,6 +1,7 @@
-"""The law `autopilot`: the autopilot's own position loop, which is sent the reference.
+"""The law `autopilot`: sends the reference to the autopilot's own position loop.
 
-For comparison: a user can send position, velocity and acceleration without this package.
+It serves as a comparison, because position, velocity and acceleration can be sent without this
+package.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ from offboard.model.vehicle import Vehicle
 
 
 class AutopilotSettings(ControllerSettings):
-    """Settings of the law `autopilot`. The reference is sampled `lead_s` ahead of the tick, plus
-    half a period because the setpoint is held for one."""
+    """Settings of the law `autopilot`. The reference is sampled `lead_s` after the tick, plus half
+    a period because the setpoint is held for one period."""
 
     law: Literal["autopilot"] = "autopilot"
     lead_s: float = Field(default=0.0, ge=0, le=1)

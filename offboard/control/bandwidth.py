@@ -1,17 +1,17 @@
 """The highest bandwidth at which the loop is stable for every delay that the vehicle may have.
 
-A known delay is compensated by prediction and costs little; the loop becomes unstable where the
-real delay differs from the one used for the prediction. The closed loop of a lateral axis and of
-the vertical one is built with such a difference: a decision every period on the state predicted by
-replaying the commands sent, and an observer updated by position and attitude. It is stable if the
-eigenvalues of its transition matrix over one period are within the unit circle.
+A known delay is compensated by prediction and costs little; the loop becomes unstable if the real
+delay differs too much from the one used for the prediction. The closed loops of a lateral axis and
+of the vertical one are built with such a difference: a decision every period, from the state
+predicted by replaying the commands sent, and an observer updated by position and attitude. A loop
+is stable if the eigenvalues of its transition matrix over one period are within the unit circle.
 
 An attitude loop with limited angular acceleration or rate follows large commands more slowly. The
-lateral bandwidth is therefore at most the one at which the largest feedback stays within them.
+lateral bandwidth is therefore limited so that the largest feedback stays within these limits.
 
-The phase margin of the loop's frequency response (`control.stability_margins`) agrees with this to
-10 % for delays below 60 ms, but at 10 Hz and 90 to 310 ms, where the loop gain has several
-crossings near 1, it is up to 60 % too long: it is not used.
+The delay margin from the phase margin of the loop's frequency response
+(`control.stability_margins`) agrees with this to 10 % for delays below 60 ms. At 10 Hz and 90 to
+310 ms, where the loop gain crosses 1 several times, it is up to 60 % too long, so it is not used.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from offboard.model.vehicle import DelayUncertainty, Vehicle
 Array = NDArray[np.float64]
 
 NOISE = Noise()
-LEAST_MARGIN_S, SHARE_OF_DELAY = 0.04, 0.15  # jitter, which grows with the delay
+LEAST_MARGIN_S, SHARE_OF_DELAY = 0.04, 0.15  # for jitter, which grows with the delay
 STEP_RADPS, LEAST_RADPS = 0.25, 1.0
-SUBSTEPS = 10  # of a period, at which the observer is corrected
-STABLE = 1.0 - 1e-6
+SUBSTEPS = 10  # per period; the observer is corrected at each
+STABLE = 1.0 - 1e-6  # limit of the largest eigenvalue
 FEEDBACK_LIMIT = 0.3  # the default of `feedback_limit`
-# The observer: noise densities of [p v b b' d] and [z v f d], sds of measurements by index
+# Observer: noise densities of [p v b b' d] and [z v f d]; (index, sd) of each measurement
 _Q = NOISE.acceleration_mps, 1e-5, NOISE.tilt_radps, NOISE.disturbance_mps2
 LATERAL_DENSITIES, VERTICAL_DENSITIES = (1e-5, *_Q), (1e-5, *_Q[:2], _Q[3])
 LATERAL_SDS = (0, NOISE.position_sd_m), (2, NOISE.attitude_sd_rad)
@@ -47,13 +47,13 @@ VERTICAL_SDS = ((0, NOISE.position_sd_m),)
 def supported_bandwidth(
     vehicle: Vehicle, uncertainty: DelayUncertainty, period_s: float, most_radps: float
 ) -> Bandwidth:
-    """The bandwidth that each loop bears: `most_radps`, or the highest below it, in steps of
-    STEP_RADPS, with which the lateral loop is stable for a longer delay of the tilt, and the
-    vertical one for a longer or a shorter delay of the thrust (a modelled delay that is too long
-    makes it unstable, too); never below LEAST_RADPS.
+    """Return the highest bandwidth, at most `most_radps`, at which each loop stays stable: the
+    lateral loop if the delay of the tilt is longer than modelled, the vertical one if the delay of
+    the thrust is longer or shorter (a modelled delay that is too long makes it unstable, too).
 
-    The delay differs by `uncertainty`, at least 40 ms, and for the tilt 15 % of its delay. The
-    lateral one is at most `tilting_bandwidth`.
+    The delays differ by up to `uncertainty`, at least 40 ms, that of the tilt also at least 15 % of
+    itself. The lateral bandwidth is at most `tilting_bandwidth`. Below `most_radps` the search has
+    steps of STEP_RADPS; it never goes below LEAST_RADPS.
     """
     vehicle = vehicle.later_by(uncertainty.link_s)
     tilt_s = max(LEAST_MARGIN_S, SHARE_OF_DELAY * vehicle.tilt.delay_s, uncertainty.tilt_s)
@@ -78,9 +78,9 @@ def supported_bandwidth(
 
 
 def tilting_bandwidth(vehicle: Vehicle) -> tuple[float, str]:
-    """The lateral bandwidth, rad/s, at which feedback of FEEDBACK_LIMIT needs the greatest angular
-    acceleration or the greatest angular rate of the tilt, whichever is lower, and the sentence that
-    says which it is. The limits are those of the vehicle file or of the autopilot's parameters."""
+    """Return the lateral bandwidth, rad/s, at which feedback of FEEDBACK_LIMIT reaches the limit of
+    the tilt's angular acceleration or rate, whichever comes first, and a sentence that names this
+    limit. Limits are from the vehicle file or the autopilot's parameters."""
     most_radps2 = min(vehicle.angular_acceleration_limit_radps2[:2])
     most_radps = min(vehicle.angular_rate_limit_radps[:2])
     acceleration = f"the autopilot limits the angular acceleration of the tilt to {most_radps2:.1f}"
@@ -93,7 +93,7 @@ def tilting_bandwidth(vehicle: Vehicle) -> tuple[float, str]:
 
 
 def _highest(bears: Callable[[float], bool], most_radps: float) -> float:
-    """The highest bandwidth that is borne."""
+    """Return the highest bandwidth at which the loop is stable: for which `bears` is true."""
     if most_radps <= LEAST_RADPS or bears(most_radps):
         return most_radps
     low, high = 0, math.ceil((most_radps - LEAST_RADPS) / STEP_RADPS)
@@ -104,8 +104,8 @@ def _highest(bears: Callable[[float], bool], most_radps: float) -> float:
 
 
 class _Loop:
-    """One axis, SUBSTEPS samples per period: the plant `model`, [p v b b'] or [z v f], and the
-    observer, which has a disturbance d of v' beside that."""
+    """Closed loop of one axis, sampled SUBSTEPS times per period: the plant `model`, [p v b b'] or
+    [z v f], and the observer, whose state also has a disturbance d of v'."""
 
     def __init__(
         self,
@@ -149,12 +149,12 @@ class _Loop:
 
 
 def _in_force(sent: Array, substep: int) -> Array:
-    """The command that acts in `substep` < 0, counted back from the end of the newest period."""
+    """Return the command that acts in `substep` < 0, counted from the end of the newest period."""
     row: Array = sent[-(substep // SUBSTEPS) - 1]
     return row
 
 
-@lru_cache(maxsize=32)  # of the vehicle alone: the same for all bandwidths and delays
+@lru_cache(maxsize=32)  # depends on the vehicle only, not on bandwidth or delays
 def _observer(
     dynamics: bytes,
     input_map: bytes,
@@ -162,8 +162,8 @@ def _observer(
     sds: tuple[tuple[int, float], ...],
     step_s: float,
 ) -> tuple[LinearModel, Array]:
-    """The model of the observer, sampled per substep, and its correction (n, m)."""
-    import control  # takes a second: only where something is designed
+    """Return the model of the observer, sampled per substep, and its gain (n, m)."""
+    import control  # takes a second: imported only to design an observer
 
     size = len(densities)
     flow = np.frombuffer(dynamics).reshape(size, size)

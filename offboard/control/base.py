@@ -23,13 +23,13 @@ class Situation:
     """Everything a controller knows at one control tick.
 
     Attributes:
-        time_s: Vehicle time of the tick (`time_boot_ms` of the telemetry), s; later by what the
-            link has added to its delay since take-off.
-        state: The state predicted for the time at which a command sent now takes effect; that time
-            is `state.time_s`.
+        time_s: Vehicle time of the tick (`time_boot_ms` of the newest telemetry) plus the increase
+            of the link's delay since take-off, s.
+        state: The state predicted for the time at which a command sent now takes effect,
+            `state.time_s`.
         reference: The trajectory to follow. Its time axis is vehicle time, its positions are in
             the same local NED frame as `state`.
-        previous: The attitude command in force, that is the last one sent.
+        previous: The last attitude command sent, which is still in force.
         remaining_s: Returns how many seconds of the time budget of this decision are left,
             negative once it is exceeded. None in lockstep, where the vehicle waits.
         origin_ned_m: The take-off point. References and keep-out volumes are configured relative
@@ -48,7 +48,7 @@ class Situation:
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """Quality of a decision, logged with it; NaN for a figure that the controller does not have.
+    """Quality of a decision, logged with it; NaN for a value that the controller does not have.
 
     Attributes:
         cost: Cost J of the chosen input or plan.
@@ -57,7 +57,7 @@ class Certificate:
         spread: Mean distance of the particles from the best one, epsilon of Eq. 29.
         iterations: Iterations of the search.
         cut_short: Whether the search stopped because no time was left.
-        at_bound: Whether any input rests on its bound.
+        at_bound: Whether any input is at one of its bounds.
         seed_cost: Cost J of the best plan that the search started from.
     """
 
@@ -86,24 +86,24 @@ class Decision:
 class DecisionError(ArithmeticError):
     """`Controller.decide` found no command, for example because the state is not finite.
 
-    The flight sends level attitude instead and lands after `limits.missed_decisions` in a row.
+    The flight sends a level attitude instead, and lands after `limits.missed_decisions` in a row.
     """
 
 
 class Controller(Protocol):
     """A control law. The flight calls these two methods, and those of `Adaptive` if it has them.
 
-    Before take-off `decide` is called a few times on a vehicle at rest, so that everything is
-    compiled and loaded, then `reset` once; an exception then ends the program before anything is
-    sent. In flight `decide` is called at every control tick from
-    the climb to the landing.
+    Before take-off `decide` is called a few times for a vehicle at rest, so that everything is
+    compiled and loaded, and `reset` once after that; an exception in one of these calls ends the
+    program before anything is sent. In flight `decide` is called at every control tick from the
+    climb to the landing.
     """
 
     def decide(self, situation: Situation) -> Decision:
         """Return the command for this tick.
 
-        Raises DecisionError where there is none. Any other exception, and a command that is not
-        finite or whose thrust direction is not a unit vector, counts as no decision too.
+        Raises DecisionError if there is none. Any other exception, and a command that is not finite
+        or whose thrust direction is not a unit vector, counts as a missing decision too.
         """
         ...
 
@@ -113,8 +113,8 @@ class Controller(Protocol):
 
 
 class ControllerSettings(Parameters, ABC):
-    """Base class of a controller's settings: what a file in `config/controllers` or
-    `--set controller.KEY=VALUE` may set, and how the controller is made from it.
+    """Base class of a controller's settings: the keys that a file in `config/controllers` or
+    `--set controller.KEY=VALUE` may set, and `build`, which makes the controller from them.
 
     A subclass declares `law: Literal["name"] = "name"` and its fields with defaults and ranges.
     Unknown keys and values out of range are refused with a sentence that names them.
@@ -129,19 +129,19 @@ class ControllerSettings(Parameters, ABC):
         Args:
             vehicle: What is known of the vehicle before the flight.
             period_s: Time between two decisions, s of vehicle time.
-            seed: Seed of whatever the controller draws at random; the same seed must give the
-                same decisions.
+            seed: Seed of the controller's random numbers; the same seed must give the same
+                decisions.
         """
 
     def refusal(self, reference: Reference) -> str | None:
-        """Why these settings cannot fly `reference`, given relative to the take-off point; None
-        if they can. Asked before anything is sent."""
+        """Return why these settings cannot fly `reference`, or None if they can. `reference` is
+        relative to the take-off point. Called before anything is sent."""
         return None
 
 
 class Bandwidth(NamedTuple):
-    """Bandwidth of the lateral axes, limited by the delay of the tilt, and of the height, limited
-    by that of the thrust."""
+    """Bandwidth of the lateral axes, limited by the delay of the tilt, and bandwidth of the
+    height, limited by the delay of the thrust."""
 
     lateral_radps: float
     vertical_radps: float
@@ -153,7 +153,7 @@ class Bandwidth(NamedTuple):
 
 @runtime_checkable
 class Adaptive(Protocol):
-    """A controller that can continue with the constants identified in flight. Optional."""
+    """Optional methods of a controller that can use the constants identified in flight."""
 
     @property
     def configured_radps(self) -> float:
@@ -167,5 +167,6 @@ class Adaptive(Protocol):
 
     def set_vehicle(self, vehicle: Vehicle, uncertainty: DelayUncertainty) -> None:
         """Use `vehicle` from the next decision on, at no more than the bandwidth that its delays
-        and their `uncertainty` support (`control.bandwidth`). Called when a setpoint has left."""
+        and their `uncertainty` support (`control.bandwidth`). Called before the first decision,
+        and in flight after a setpoint was sent."""
         ...

@@ -2,8 +2,8 @@
 
 A controller file (`config/controllers/*.yaml`) holds the settings of one law, named by `law`. A
 package adds a law with an entry point in the group `pso_offboard.controllers`: its name is that of
-the law, its object the law's `ControllerSettings`. The paper's law is added that way too. A law is
-imported when it is asked for, so that a flight loads and compiles only what it needs.
+the law, its object is the law's `ControllerSettings`. The paper's law is added that way too. A law
+is imported when it is requested, so that a flight loads and compiles only what it needs.
 """
 
 from __future__ import annotations
@@ -29,15 +29,17 @@ BUILT_IN = EntryPoints(
 
 
 def names() -> list[str]:
-    """All law names: built in, then those of installed packages. Imports none of them."""
+    """Return all law names, first the built-in ones, then those of installed packages, without
+    importing any of them."""
     installed = sorted(entry_points(group=GROUP).names)
     return list(dict.fromkeys((*(entry.name for entry in BUILT_IN), *installed)))
 
 
 def settings_of(law: str) -> type[ControllerSettings]:
-    """The settings class of one of `names`. A built-in law cannot be replaced.
+    """Return the settings class of `law`, one of `names`. A built-in law cannot be replaced.
 
-    Raises DocumentError where an entry point cannot be used, with one sentence that names it.
+    Raises DocumentError, with one sentence that names the entry point, if the law is unknown, is
+    defined twice, or cannot be used.
     """
     found = BUILT_IN.select(name=law) or entry_points(group=GROUP, name=law)
     if not found:

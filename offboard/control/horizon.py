@@ -1,10 +1,11 @@
 """The law `horizon`: the swarm over N decisions of nonlinear roll-outs, around keep-out volumes.
 
-A plan is a base (inputs and the states they lead to) that the feedback of the closed form follows,
-plus a few knots interpolated over its steps. Bases are the better of the closed form's plan and the
-previous one, and, where they are cheaper than that, the exact plan of the linear problem (`mpc`),
-the ways past each side of each volume, and the reference flown no faster than a speed limit. The
-swarm searches the knots about the best of them; the answer is never worse than any base.
+A plan is a base (inputs and the states they lead to), which the feedback of the closed form
+follows, plus a few knots of the inputs, interpolated over its steps. The first base is the cheaper
+of the closed form's plan and the previous plan. Cheaper ones among the following are bases too: the
+exact plan of the linear problem (`mpc`), the ways past each side of each volume, and the reference
+flown no faster than a speed limit. The swarm searches for the best knots about the cheapest bases;
+the result never costs more than any of these.
 """
 
 from __future__ import annotations
@@ -45,15 +46,15 @@ from offboard.reference.base import Reference
 Array = NDArray[np.float64]
 
 STEPS, STEPS_AROUND = 10, 20
-VERTICAL_REACH_MPS2 = 3.0  # of the knots of the vertical thrust
+VERTICAL_REACH_MPS2 = 3.0  # largest knots of the vertical thrust
 PLANNED_MARGIN_M = 0.05  # beyond the clearance: for tracking errors, and because it is a soft limit
-RIVALS = 2  # plans of other origin that are searched about too
+RIVALS = 2  # bases, besides our own plan, that the swarm also searches about
 DETOUR_M = 1.0  # volumes whose clearance is further from the reference need no detour
-COST = attrgetter("cost")  # the order of plans: infinite where a roll-out is not finite
+COST = attrgetter("cost")  # sort key of plans; infinite if a roll-out is not finite
 
-# Places of the knots as fractions of the plan: dense at its start, which is what is commanded
+# Places of the knots as fractions of the plan: dense at its start, because that is commanded
 KNOT_SHARES = (0.0, 0.15, 0.4, 0.8)
-# Axis NED and sign: a detour never passes below a volume
+# NED axis and sign of the sides that detours pass; none passes below a volume
 SIDES = ((0, 1.0), (0, -1.0), (1, 1.0), (1, -1.0), (2, -1.0))
 ROWS = ((P, V), (P + 1, V + 1), (Z, W))  # position and velocity of each axis in a state
 
@@ -61,8 +62,8 @@ ROWS = ((P, V), (P + 1, V + 1), (Z, W))  # position and velocity of each axis in
 class HorizonSettings(TrackingSettings):
     """Settings of the law `horizon`.
 
-    `steps` is the number of decisions planned (default: 10, and 20 with keep-out volumes, so that
-    the way round one fits in), `keep_out` the volumes to avoid with `clearance_m` to spare,
+    `steps` is the number of decisions planned (default: 10; with keep-out volumes 20, so that a
+    way round one fits in), `keep_out` the volumes to avoid by at least `clearance_m`,
     `speed_limit_mps` the highest speed (default: unlimited).
     """
 
@@ -75,12 +76,12 @@ class HorizonSettings(TrackingSettings):
 
     @property
     def planned(self) -> int:
-        """The number of decisions planned, as chosen or by default."""
+        """Number of decisions planned, as set or by default."""
         return self.steps or (STEPS_AROUND if self.keep_out else STEPS)
 
     @property
     def reach_m(self) -> float:
-        """Distance that plans keep from the surface of a volume."""
+        """Distance that plans keep from the surface of a volume, m."""
         return self.clearance_m + PLANNED_MARGIN_M
 
     def build(self, vehicle: Vehicle, *, period_s: float, seed: int) -> HorizonLaw:
@@ -92,7 +93,7 @@ class HorizonSettings(TrackingSettings):
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Inputs (N, 3), the states (N + 1, STATE_SIZE) they lead to, and the cost."""
+    """Inputs (N, 3), the states (N + 1, STATE_SIZE) that they lead to, and their cost."""
 
     inputs: Array
     states: Array
@@ -100,8 +101,8 @@ class Plan:
 
 
 class HorizonLaw(TrackingLaw):
-    """Particle swarm over the knots of a plan. `previous` is the last plan and the vehicle time of
-    its decision."""
+    """Particle swarm over the knots of a plan. `previous` is the vehicle time of the last decision
+    and its plan."""
 
     def __init__(
         self, vehicle: Vehicle, settings: HorizonSettings, *, period_s: float = 0.1, seed: int = 0
@@ -120,7 +121,7 @@ class HorizonLaw(TrackingLaw):
         self.previous: tuple[float, Plan] | None = None
         self._rng = np.random.default_rng(seed)
         drawn = np.random.default_rng(particles).uniform(-1.0, 1.0, (particles, self.reach.size))
-        # The first particle starts at the base, each further one scattered wider about it
+        # The first particle starts at the base, the others are scattered increasingly wide about it
         self._starts = np.linspace(0.0, 1.0, particles)[:, None] * drawn * self.reach.ravel()
 
     def reset(self) -> None:
@@ -154,7 +155,7 @@ class HorizonLaw(TrackingLaw):
         return decision(problem.quadratic.clip(problem.inputs(chosen)), certificate)
 
     def prepare(self, situation: Situation) -> TrackingProblem:
-        """Make the roll-outs ready for this situation. Returns its problem."""
+        """Prepare the roll-outs for this situation and return its problem."""
         problem, settings = self.problem(situation), self._settings
         self.outlook = look_ahead(self, situation, problem, settings.planned)
         delay_s = situation.state.time_s - situation.time_s
@@ -173,9 +174,9 @@ class HorizonLaw(TrackingLaw):
     def fly(
         self, inputs: Array, states: Array | None = None, knots: Array | None = None
     ) -> tuple[Plan, Array]:
-        """Roll out n plans: inputs (N, 3), plus the closed form's feedback towards `states`
-        (N + 1, STATE_SIZE) unless None, plus knots (n, M, 3); n is 1 without knots. Returns the
-        cheapest and the costs (n,) of all."""
+        """Roll out n plans: `inputs` (N, 3), plus the closed form's feedback towards `states`
+        (N + 1, STATE_SIZE) if given, plus `knots` (n, M, 3); n is 1 without knots. Return the
+        cheapest plan and the costs (n,) of all."""
         steps = self._settings.planned
         if knots is None:
             knots = np.zeros((1, *self.reach.shape))
@@ -192,7 +193,7 @@ class HorizonLaw(TrackingLaw):
         return Plan(chosen[first], flown[first], float(costs[first])), costs
 
     def _own_plan(self, time_s: float) -> Plan:
-        """The cheaper of the plan of the closed form and what remains of the previous plan."""
+        """Return the cheaper of the closed form's plan and the rest of the previous plan."""
         steps = self._settings.planned
         inputs, states = np.zeros((steps, INPUTS)), self._nowhere.copy()
         plan, _ = self.fly(inputs, states)
@@ -206,7 +207,7 @@ class HorizonLaw(TrackingLaw):
         return plan
 
     def _other_plans(self, problem: TrackingProblem) -> list[Plan]:
-        """The exact plan of the linear problem, and those that follow other ways."""
+        """Return the exact plan of the linear problem, and the plans that follow other ways."""
         exact = self._exact.minimise(self.quadratic.over(problem, self.outlook))
         plans = []
         if np.isfinite(exact).all():
@@ -216,9 +217,9 @@ class HorizonLaw(TrackingLaw):
         return plans
 
     def _detours(self) -> list[Array]:
-        """Ways round the volumes that are near the reference, one past each side of each, as states
-        (N + 1, STATE_SIZE) that the closed form follows. A way need not be good, the search
-        improves it; but the search alone would not find the other side of a wide volume."""
+        """Return ways round the volumes near the reference, one past each side of each volume, as
+        states (N + 1, STATE_SIZE) that the closed form follows. A way need not be good, because the
+        search improves it, but the search alone would not find the other side of a wide volume."""
         ways = []
         nodes = slice(0, 2 * self._settings.planned + 1, 2)
         places, speeds = self.outlook["positions"][0, nodes], self.outlook["velocities"][0, nodes]
@@ -239,8 +240,8 @@ class HorizonLaw(TrackingLaw):
         return ways
 
     def _slower(self) -> list[Array]:
-        """The reference from the present state on, no faster than the limit of the speed, as states
-        (N + 1, STATE_SIZE)."""
+        """Return the reference from the present position on, no faster than the speed limit, as
+        states (N + 1, STATE_SIZE); nothing without a speed limit."""
         way, limit_mps = self._nowhere.copy(), self._settings.speed_limit_mps
         if limit_mps is None:
             return []
@@ -257,8 +258,8 @@ class HorizonLaw(TrackingLaw):
     def _searched(
         self, bases: list[Plan], remaining_s: Callable[[], float] | None
     ) -> tuple[Plan, Certificate]:
-        """The best plan about any of the bases, which share the iterations. Searching about the
-        cheapest base alone ends in worse local minima than searching about our own plan as well."""
+        """Return the best plan about any of the bases, which share the iterations. A search about
+        the cheapest base alone ends in worse local minima than one about our own plan as well."""
         settings = self._settings.swarm
         share = max(1, settings.iterations // len(bases))
         each = settings.model_copy(update={"iterations": share})
@@ -268,8 +269,8 @@ class HorizonLaw(TrackingLaw):
     def _search(
         self, base: Plan, settings: SwarmSettings, remaining_s: Callable[[], float] | None
     ) -> tuple[Plan, Certificate]:
-        """The best plan whose knots are within +-`reach` (M, 3) about `base`. The first particle
-        starts at the base, so the answer is never worse."""
+        """Return the best plan with knots within +-`reach` (M, 3) about `base`. It never costs more
+        than `base`, where the first particle starts."""
         limit = self.reach.ravel()
         swarm = Swarm(settings, -limit, limit, self._rng, self._starts)
         best, late = base, False
@@ -288,7 +289,8 @@ class HorizonLaw(TrackingLaw):
 
 
 def knot_weights(steps: int) -> Array:
-    """Weights (N, M) of M knots in each step: linear between knots, constant after the last."""
+    """Return the weights (N, M) of M knots in each step, linear between knots and constant after
+    the last one."""
     places = sorted({round(share * (steps - 1)) for share in KNOT_SHARES})
     every = np.arange(steps)
     return np.column_stack([np.interp(every, places, unit) for unit in np.eye(len(places))])

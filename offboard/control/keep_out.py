@@ -1,6 +1,6 @@
-"""Keep-out volumes and the distance to them: spheres, upright cylinders, boxes, at rest or moving.
+"""Keep-out volumes (spheres, upright cylinders, boxes, at rest or moving) and the distance to them.
 
-They are given like references: metres north and east of the take-off point, and above it.
+Positions are given as in references: metres north and east of the take-off point, and above it.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ Metres = Annotated[float, Field(ge=-1000, le=1000)]
 Size = Annotated[float, Field(gt=0, le=500)]
 Speed = Annotated[float, Field(ge=-20, le=20)]
 
-CHECK_STEP_S = 0.02
+CHECK_STEP_S = 0.02  # between samples of a reference that is checked
 
-# Columns of a packed volume: centre NED, velocity NED, half sizes NED of a box; radius added on all
-# sides (sphere), and horizontally (cylinder)
+# First columns of a packed volume: centre (NED), velocity (NED), half sizes (NED) of a box, radius
+# added on all sides (sphere), radius added horizontally (cylinder)
 CENTRE, VELOCITY, HALF, ROUND, RADIUS = 0, 3, 6, 9, 10
 PACKED_SIZE = 11
 
 
 class _KeepOut(Parameters):
-    """Centre when the reference starts, and velocity from then on; before, the volume rests."""
+    """Centre at the start of the reference, and velocity from then on; before, it is at rest."""
 
     north_m: Metres
     east_m: Metres
@@ -49,7 +49,7 @@ class Sphere(_KeepOut):
 
     @property
     def sizes(self) -> tuple[float, ...]:
-        """Columns HALF to the last."""
+        """Columns from HALF to the last one of a packed volume."""
         return 0.0, 0.0, 0.0, self.radius_m, 0.0
 
 
@@ -62,7 +62,7 @@ class Cylinder(_KeepOut):
 
     @property
     def sizes(self) -> tuple[float, ...]:
-        """Columns HALF to the last."""
+        """Columns from HALF to the last one of a packed volume."""
         return 0.0, 0.0, 0.5 * self.length_m, 0.0, self.radius_m
 
 
@@ -76,7 +76,7 @@ class Box(_KeepOut):
 
     @property
     def sizes(self) -> tuple[float, ...]:
-        """Columns HALF to the last."""
+        """Columns from HALF to the last one of a packed volume."""
         return 0.5 * self.size_north_m, 0.5 * self.size_east_m, 0.5 * self.size_up_m, 0.0, 0.0
 
 
@@ -85,7 +85,7 @@ KeepOut = Annotated[Volume, Field(discriminator="shape")]
 
 
 def pack(volumes: Sequence[Volume]) -> Array:
-    """The volumes as (V, PACKED_SIZE), NED, relative to the take-off point."""
+    """Return the volumes as (V, PACKED_SIZE), NED, relative to the take-off point."""
     rows = [
         (
             *(each.north_m, each.east_m, -each.height_m),
@@ -99,8 +99,8 @@ def pack(volumes: Sequence[Volume]) -> Array:
 
 @kernel
 def distance(volume: Any, north: float, east: float, down: float) -> float:
-    """Distance of a point, given relative to the centre of a packed volume, from its surface,
-    negative inside."""
+    """Return the distance of a point from the surface of a packed volume, m, negative inside. The
+    point is given in NED relative to the volume's centre."""
     off_n, off_e, off_d = abs(north), abs(east), abs(down) - volume[HALF + 2]
     if volume[RADIUS] > 0.0:
         flat = math.sqrt(off_n * off_n + off_e * off_e) - volume[RADIUS]
@@ -115,8 +115,8 @@ def distance(volume: Any, north: float, east: float, down: float) -> float:
 
 
 def placed_at(volumes: Array, origin_ned_m: Array, track_time_s: float) -> Array:
-    """The packed volumes at a time since the start of the reference; NaN and negative times count
-    as 0."""
+    """Return the packed volumes in local NED at a time since the start of the reference; NaN and
+    negative times count as 0."""
     there = volumes.copy()
     elapsed_s = max(track_time_s, 0.0) if track_time_s == track_time_s else 0.0
     there[:, CENTRE:VELOCITY] += origin_ned_m + elapsed_s * there[:, VELOCITY:HALF]
@@ -124,8 +124,8 @@ def placed_at(volumes: Array, origin_ned_m: Array, track_time_s: float) -> Array
 
 
 def clearances(volumes: Sequence[Volume], times_s: Array, positions_ned_m: Array) -> Array:
-    """Distance to the nearest volume, (n,), at times (n,) since the start of the reference and
-    positions (n, 3) relative to the take-off point. It is inf where no volumes are given."""
+    """Return the distance (n,) to the nearest volume, m, at times (n,) since the start of the
+    reference and positions (n, 3) relative to the take-off point; inf without volumes."""
     packed, origin = pack(volumes), np.zeros(3)
     nearest = np.full(len(times_s), np.inf)
     for i, (time_s, position) in enumerate(zip(times_s, positions_ned_m, strict=True)):
@@ -136,7 +136,8 @@ def clearances(volumes: Sequence[Volume], times_s: Array, positions_ned_m: Array
 
 
 def refusal(volumes: Sequence[Volume], clearance_m: float, reference: Reference) -> str | None:
-    """Why `reference`, relative to the take-off point, conflicts with the volumes; or None."""
+    """Return why `reference`, relative to the take-off point, conflicts with the volumes, or None
+    if it does not."""
     times = np.arange(0.0, reference.duration_s + CHECK_STEP_S, CHECK_STEP_S)
     path = reference.sample(times).position_ned_m
     for number, volume in enumerate(volumes):

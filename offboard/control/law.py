@@ -1,34 +1,37 @@
-"""The tracking law. Every law of this package decides
+"""The tracking law. Every law of this package, except `autopilot`, commands
 
     u = clip(u_ff - K (x_predicted - x_ref))
 
-or, where the bounds or a horizon couple the inputs, the u that minimises the same cost J.
+or, where bounds or a horizon couple the inputs, the u that minimises the same cost J.
 
-    u            [T, b_cx, b_cy, heading]: thrust per unit of mass, north and east of the commanded
-                 thrust direction (third body axis, NED), commanded heading
-    x_predicted  the state at the time when this command will begin to act: the observer's, carried
-                 there by replaying the commands already sent (`offboard.estimation`)
-    x_ref        what the reference asks for at that time, by differential flatness from its
-                 position and derivatives, drag and the estimated disturbance (`TrackingLaw.target`)
-    u_ff         what follows the reference without an error: half a period later, because a command
-                 is held for one period and acts on average in its middle, and led through the
-                 response of attitude and thrust, so that these arrive in time
+    u            [T, b_cx, b_cy, heading]: thrust per unit of mass, north and east component of the
+                 commanded thrust direction (third body axis, NED), commanded heading
+    x_predicted  the state at the time when this command begins to act, predicted by the observer,
+                 which replays the commands already sent (`offboard.estimation`)
+    x_ref        the state of a vehicle that follows the reference at that time, by differential
+                 flatness from the derivatives of the reference's position, from drag and from the
+                 estimated disturbance (`TrackingLaw.target`)
+    u_ff         the feed-forward: the input of a vehicle that follows the reference half a period
+                 later, because a command is held for one period and acts on average in its middle.
+                 It leads by the response of attitude and thrust, so that these are reached in time
     K            gain of the linear-quadratic regulator of each axis for one bandwidth (`gains`)
-    clip         thrust, tilt, and the feedback about u_ff (`TrackingLaw._problem_of`)
+    clip         limits thrust, tilt, and the feedback about u_ff (`TrackingLaw._problem_of`)
 
-In NED, acceleration = g e3 - T b - c v + d: written in b, the lateral axes [p, v, b, b'], the
-vertical [z, v_z, T b_z] and the heading decouple, and no heading frame is needed. K is that of a
-vehicle that hovers, where a change of b accelerates by g. At thrust T and a tilted b, with T b_z
-kept, it accelerates by T (1 + b b^T/b_z^2): position and velocity enter as what they would be in
-hover, for the same answer (`Target.to_hover`). Otherwise the loop gain at 45 degrees is 2.8 times
-that of hover, and ends in a limit cycle.
+In NED, acceleration = g e3 - T b - c v + d, with drag c and disturbance d. Written in the thrust
+direction b, the lateral axes [p, v, b, b'], the vertical axis [z, v_z, T b_z] and the heading
+decouple, and no heading frame is needed. K is designed for hover, where the acceleration is g
+times the change of b. At thrust T and a tilted b, if T b_z is kept, it is T (1 + b b^T/b_z^2) times
+the change of b. Position and velocity errors are therefore scaled to those that need the same
+change of b in hover (`Target.to_hover`). Without this scaling, the loop gain at 45 degrees of tilt
+is 2.8 times that of hover, which ends in a limit cycle.
 
     J(u) = x'Qx + u'Ru + x(k+1)'P x(k+1) = 1/2 (u - u*)'H(u - u*) + x'P x,  lower <= u <= upper
 
-with u* = u_ff - K x. H is diagonal, so that u = clip(u*) is its exact minimum. `lqr` computes just
-that; `pso` lets the swarm search, which needs neither a diagonal nor a quadratic; `mpc` and
-`horizon` minimise the sum over N decisions; `pid` replaces K by the gains of two cascades. Knows no
-autopilot, no clock.
+with the deviation x = x_predicted - x_ref, and u* = u_ff - K x; u'Ru counts u from u_ff. H is
+diagonal, so that u = clip(u*) is the exact minimum. `lqr` computes this formula; `pso` searches for
+the minimum with the swarm, which needs neither a diagonal H nor a quadratic cost; `mpc` and
+`horizon` minimise the sum over N decisions; `pid` replaces K by the gains of two cascades. This
+module knows no autopilot and no clock.
 """
 
 from __future__ import annotations
@@ -62,26 +65,27 @@ from offboard.reference.flatness import FlatState, flat_state
 
 Array = NDArray[np.float64]
 
-HEADING_BOX_RAD = 0.5  # about the feed-forward: the autopilot closes the yaw loop
-HEADING_CURVATURE = 1.0
-# Limits of the heading acceleration in the feed-forward. Noisy rows ask for more, which saturates
-# motors, so that thrust exceeds the command
+HEADING_BOX_RAD = 0.5  # bounds about the feed-forward; the autopilot closes the yaw loop
+HEADING_CURVATURE = 1.0  # any positive value gives the same minimum, the feed-forward
+# Limits of the reference's heading acceleration in the feed-forward. Noisy rows of a table demand
+# more, which saturates the motors: the thrust then exceeds the command
 HEADING_ACCELERATION_RADPS2 = -5.0, 5.0
-# Times at which `TrackingLaw.target` samples the reference: when the command begins to act on the
-# tilt, and half a period later, in the middle of its hold; the same of the thrust and the heading
+# Indices of the times at which `TrackingLaw.target` samples the reference: when the command begins
+# to act on tilt or thrust, and half a period later, in the middle of its hold (also of the heading)
 TILT_BEGINS, TILT_HELD, THRUST_BEGINS, THRUST_HELD, HEADING_HELD = range(5)
 
 
 class TrackingSettings(ControllerSettings):
-    """One number, the bandwidth wc, sets the law: weights 1 on position, g^2 / wc^4 on b_c and
-    1 / wc^4 on the vertical thrust.
+    """Settings of the tracking laws. One number, the bandwidth wc, sets all gains: the weights are
+    1 on position, g^2 / wc^4 on b_c and 1 / wc^4 on the vertical thrust.
 
-    On PX4 and ArduCopter the error falls quickly up to 5 rad/s and slowly beyond. More than 5 rad/s
-    needs a known delay: until it is identified in flight, `supported_bandwidth` is lower.
+    On PX4 and ArduCopter the tracking error falls quickly with wc up to 5 rad/s and slowly above.
+    More than 5 rad/s needs a known delay: until the delay is identified in flight, the bandwidth
+    in use is lower (`supported_bandwidth`).
 
-    `feedback_limit` bounds each lateral component of b_c about its feed-forward: a swing from one
-    tilt limit to the other would run into the acceleration limit of the attitude loop and end in a
-    limit cycle.
+    `feedback_limit` bounds the distance of each lateral component of b_c from its feed-forward: a
+    swing from one tilt limit to the other would reach the angular acceleration limit of the
+    attitude loop and end in a limit cycle.
     """
 
     bandwidth_radps: float = Field(default=7.0, ge=0.5, le=20)
@@ -90,14 +94,14 @@ class TrackingSettings(ControllerSettings):
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """x_ref and u_ff: what the reference asks for when the command acts. NED, SI.
+    """x_ref and u_ff: state and input that follow the reference when the command acts. NED, SI.
 
-    `lateral` (4, 2), [p, v, b, b'] x [north, east], at the time of the predicted state; `vertical`
-    (3,), [z, v_z, T b_z], when the thrust acts; both with the ripple of held commands
+    `lateral` (4, 2) is [p, v, b, b'] x [north, east] at the time of the predicted state, `vertical`
+    (3,) is [z, v_z, T b_z] when the thrust acts; both include the ripple of held commands
     (`gains.hold_ripple`). `feedforward` (3,), b_c north, b_c east and T b_z, and `heading_rad` are
-    taken half a period after their own delays and led through their own responses. `to_hover`
-    (2, 2), (T_hover / T) (1 - b b^T), turns lateral deviations into those of a hovering vehicle
-    that needs the same change of b.
+    taken half a period after the delay of their own axis and lead by its response. `to_hover`
+    (2, 2), (T_hover / T) (1 - b b^T), turns lateral deviations into those that need the same
+    change of b in hover.
     """
 
     lateral: Array
@@ -109,9 +113,10 @@ class Target:
 
 @dataclass(frozen=True, slots=True)
 class TrackingProblem:
-    """What one decision minimises: `lateral` (4, 2) and `vertical` (3,) are the deviations of the
-    predicted state from the target, `at_hover` (4, 2) is `lateral` with `Target.to_hover`, `b_z` is
-    that of its thrust direction, `quadratic` the cost of u (4,) and its bounds."""
+    """The problem of one decision: `lateral` (4, 2) and `vertical` (3,) are the deviations of the
+    predicted state from the target, `at_hover` (4, 2) is `lateral` scaled by `Target.to_hover`,
+    `b_z` is the down component of the predicted thrust direction, and `quadratic` is the cost of
+    u (4,) with its bounds."""
 
     target: Target
     lateral: Array
@@ -121,7 +126,7 @@ class TrackingProblem:
     quadratic: BoxQuadratic
 
     def inputs(self, deviation: Array) -> Array:
-        """u (4,), not clipped, for a deviation (3,) from the feed-forward."""
+        """Return u (4,), not clipped, for a `deviation` (3,) from the feed-forward."""
         north, east, down_mps2 = self.target.feedforward + deviation
         return np.array([down_mps2 / self.b_z, north, east, self.target.heading_rad])
 
@@ -130,8 +135,8 @@ class TrackingLaw:
     """Base class of the laws: makes the `TrackingProblem` of each decision, for the vehicle and the
     bandwidth in use, which `set_vehicle` sets.
 
-    `vehicle` is the one in use; `lateral` and `vertical` are models of its axes, each with the
-    optimal cost that follows one held input.
+    `vehicle` is the vehicle model in use; `lateral` and `vertical` are its sampled axes with their
+    gains and costs (`gains.CostToGo`).
     """
 
     def __init__(self, vehicle: Vehicle, settings: TrackingSettings, period_s: float = 0.1) -> None:
@@ -146,7 +151,7 @@ class TrackingLaw:
         self.set_vehicle(self._vehicle_file)
 
     def set_vehicle(self, vehicle: Vehicle, uncertainty: DelayUncertainty | None = None) -> None:
-        """See `base.Adaptive`; without an uncertainty the bandwidth is the configured one."""
+        """See `base.Adaptive`. Without an `uncertainty`, the configured bandwidth is used."""
         self.vehicle = vehicle
         self._tilt_ripple = hold_ripple(lateral_model(vehicle), self.period_s)
         (self._thrust_ripple,) = hold_ripple(vertical_model(vehicle), self.period_s)
@@ -157,7 +162,7 @@ class TrackingLaw:
         configured = self.configured_radps
         if uncertainty is None:
             self.bandwidth = Bandwidth(configured, configured)
-        elif limits != self._bandwidth_found_for:  # another drag alone changes no bandwidth
+        elif limits != self._bandwidth_found_for:  # drag alone changes no bandwidth
             self.bandwidth = supported_bandwidth(vehicle, uncertainty, self.period_s, configured)
         self._bandwidth_found_for = limits
         self._use_gains()
@@ -168,7 +173,7 @@ class TrackingLaw:
         self.vertical = vertical_gain(self.vehicle, vertical_radps, self.period_s)
 
     def problem(self, situation: Situation) -> TrackingProblem:
-        """The problem of this tick. Raises DecisionError where its cost is not finite."""
+        """Return the problem of this tick. Raises DecisionError if its cost is not finite."""
         state = situation.state
         target = self.target(situation.reference, situation.time_s, state)
         motion = (
@@ -190,8 +195,8 @@ class TrackingLaw:
         return problem
 
     def target(self, reference: Reference, time_s: float, state: PredictedState) -> Target:
-        """The target of a decision at `time_s`, for the state predicted to the time when its tilt
-        begins to act. The estimated disturbance is compensated in it."""
+        """Return the target of a decision at `time_s`. `state` is predicted to the time when the
+        commanded tilt begins to act; the target compensates the disturbance estimated in it."""
         vehicle, half_s = self.vehicle, 0.5 * self.period_s
         vertical_s = vertical_of(state).time_s
         heading_s = time_s + vehicle.yaw.delay_s + half_s
@@ -232,13 +237,14 @@ class TrackingLaw:
         )
 
     def feedforward(self, flat: FlatState, tilt: Any, thrust: Any) -> Array:
-        """b_c north, b_c east and T b_z (..., 3) that follow a reference: of the samples `tilt` and
-        `thrust` of `flat`, in the middle of a hold, led through the responses of the vehicle, less
-        the second-order difference between a curved command and its mean over the hold."""
+        """Return b_c north, b_c east and T b_z (..., 3) that follow the reference. `tilt` and
+        `thrust` index the samples of `flat` in the middle of a hold. The values lead by the
+        response of the vehicle (`model.axes.lead`), minus the second-order difference between a
+        curved command and its mean over the hold."""
         b, rate = flat.thrust_direction_ned[tilt, :2], flat.thrust_direction_rate_ned_ps[tilt, :2]
         bend = flat.thrust_direction_acceleration_ned_ps2[tilt, :2]
         led_tilt = lead(b, rate, bend, self.vehicle.tilt) - self.period_s**2 / 24.0 * bend
-        # T lags, b_z does not
+        # Only T has this lag, not b_z
         led_thrust = flat.thrust_mps2 + self.vehicle.thrust_lag_s * flat.thrust_rate_mps3
         down = (led_thrust * flat.thrust_direction_ned[:, 2])[thrust]
         return np.concatenate((led_tilt, down[..., np.newaxis]), axis=-1)
@@ -246,8 +252,8 @@ class TrackingLaw:
     def _problem_of(
         self, target: Target, lateral: Array, vertical: Array, b_z: float
     ) -> TrackingProblem:
-        """The problem of these deviations: J, whose minimum is x'P x at u_ff - K x, and the bounds
-        of u to which the law clips."""
+        """Return the problem of these deviations: the cost J, whose minimum without bounds is x'P x
+        at u_ff - K x, and the bounds of u."""
         vehicle = self.vehicle
         curvature = np.array(
             [
@@ -272,16 +278,17 @@ class TrackingLaw:
         return TrackingProblem(target, lateral, at_hover, vertical, b_z, quadratic)
 
     def tilt_bounds(self, nominal: Array) -> tuple[Array, Array]:
-        """Lower and upper b_c (..., 2): |b_c| and |b_c - b_ff| per axis for feed-forwards (..., 2);
-        one beyond the tilt limit counts as being at the limit."""
+        """Return the lower and upper bounds of b_c (..., 2) for feed-forwards `nominal` (..., 2):
+        per axis, the tilt limits |b_c| and `feedback_limit` limits |b_c - b_ff|. A feed-forward
+        beyond the tilt limit is taken as that limit."""
         limit = math.sin(self.vehicle.tilt_max_rad)
         centre, reach = np.clip(nominal, -limit, limit), self.settings.feedback_limit
         return np.maximum(centre - reach, -limit), np.minimum(centre + reach, limit)
 
 
 def vertical_of(state: PredictedState) -> PredictedVertical:
-    """The predicted vertical motion when the thrust acts, or at `state.time_s` if it was not
-    predicted separately."""
+    """Return the predicted vertical motion when the thrust acts, or that at `state.time_s` if it
+    was not predicted separately."""
     return state.vertical or PredictedVertical(
         time_s=state.time_s,
         position_down_m=float(state.position_ned_m[2]),
@@ -291,8 +298,9 @@ def vertical_of(state: PredictedState) -> PredictedVertical:
 
 
 def to_hover(b: Array, thrust_mps2: Array, state: PredictedState, vehicle: Vehicle) -> Array:
-    """`Target.to_hover` (..., 2, 2) at directions b (..., 3) and thrusts (...). T_hover carries the
-    estimated vertical disturbance too, which is nearly always a wrong hover thrust or mass."""
+    """Return `Target.to_hover` (..., 2, 2) at directions b (..., 3) and thrusts (...). T_hover
+    includes the estimated vertical disturbance, because the cause of that is nearly always a wrong
+    hover thrust or mass."""
     hovering_mps2 = vehicle.gravity_mps2 + state.disturbance_ned_mps2[2]
     share = hovering_mps2 / np.maximum(thrust_mps2, vehicle.thrust_min_mps2)
     lateral = b[..., :2]
@@ -302,8 +310,8 @@ def to_hover(b: Array, thrust_mps2: Array, state: PredictedState, vehicle: Vehic
 
 
 def decision(inputs: Array, certificate: Certificate) -> Decision:
-    """The decision for u (4,). Both lateral components of b_c may be at their bounds at once: then
-    the setpoint check turns it back to the tilt limit (`flight.outbox.clamp`)."""
+    """Return the decision for u (4,). With both lateral components of b_c at their bounds the tilt
+    exceeds its limit; `flight.outbox.clamp` then reduces it to the limit."""
     thrust, north, east, heading = (float(value) for value in inputs)
     lateral = max(1.0, math.hypot(north, east))
     north, east = north / lateral, east / lateral
@@ -321,7 +329,7 @@ class LqrSettings(TrackingSettings):
 
 
 class LqrLaw(TrackingLaw):
-    """The exact minimum of a cost whose H is diagonal, clip(-f / H)."""
+    """Commands clip(-f / H), the exact minimum of a cost whose H is diagonal."""
 
     def decide(self, situation: Situation) -> Decision:
         problem = self.problem(situation).quadratic
@@ -342,7 +350,7 @@ class PsoSettings(TrackingSettings):
 
 
 class PsoLaw(TrackingLaw):
-    """The minimum that the swarm finds, certified against the exact one."""
+    """Commands the minimum that the swarm finds, and certifies it against the exact one."""
 
     def __init__(
         self, vehicle: Vehicle, settings: PsoSettings, period_s: float = 0.1, seed: int = 0

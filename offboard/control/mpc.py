@@ -1,8 +1,8 @@
 """The law `mpc`: the cost of the tracking laws over N decisions within their bounds, by daqp.
 
-Where no later bound is active it equals `lqr`; where one is, it plans for it. It avoids no keep-out
-volume. `horizon` shares what the reference asks for over N decisions (`look_ahead`) and the
-problem for the linear plant as one quadratic in all inputs (`HorizonQuadratic`).
+If no later bound is active, its command equals that of `lqr`; otherwise it plans for the bound. It
+avoids no keep-out volume. `horizon` also uses the reference over N decisions (`look_ahead`) and the
+linear problem as one quadratic in all inputs (`HorizonQuadratic`).
 """
 
 from __future__ import annotations
@@ -34,22 +34,22 @@ MOST_STEPS = 40
 _NODES = 2 * MOST_STEPS + 1
 OUTLOOK = np.dtype(
     [
-        # at the nodes, NED: p, v and b, each axis at its own times; T when tilt and when thrust
-        # act; b_z when the thrust acts
+        # at the nodes, NED: p, v (each axis at its own times) and b; T when the tilt acts and when
+        # the thrust acts; b_z when the thrust acts
         ("positions", "f8", (_NODES, 3)),
         ("velocities", "f8", (_NODES, 3)),
         ("directions", "f8", (_NODES, 3)),
         ("thrusts_tilt", "f8", _NODES),
         ("thrusts_vertical", "f8", _NODES),
         ("b_z", "f8", _NODES),
-        # of each hold: b_c north and east and the vertical thrust in its middle, led; the bounds
-        # of the deviations from them
+        # of each hold: feed-forward of b_c north and east and of the vertical thrust, in the middle
+        # of the hold; bounds of the deviations from it
         ("feedforward", "f8", (MOST_STEPS, 3)),
         ("lower", "f8", (MOST_STEPS, 3)),
         ("upper", "f8", (MOST_STEPS, 3)),
         ("to_hover", "f8", (MOST_STEPS, 2, 2)),  # `law.Target.to_hover` at the start of each hold
         # A steady vertical disturbance is nearly always a wrong hover thrust or mass: the lateral
-        # force of the tilted thrust is taken as this share of the modelled one
+        # force of the tilted thrust is multiplied by this share
         ("thrust_share", "f8"),
     ],
     align=True,
@@ -63,8 +63,8 @@ response of the attitude loop: a plan of zeros flies the reference."""
 def look_ahead(
     law: TrackingLaw, situation: Situation, problem: TrackingProblem, steps: int
 ) -> NDArray[np.void]:
-    """One `OUTLOOK` over `steps` holds, from the times at which a command sent now takes effect:
-    lateral axes when the tilt acts, the vertical one when the thrust acts."""
+    """Return one `OUTLOOK` (1,) over `steps` holds. It begins when a command sent now takes effect:
+    in the lateral axes when the tilt acts, in the vertical one when the thrust acts."""
     vehicle, state, period_s = law.vehicle, situation.state, law.period_s
     nodes_s = 0.5 * period_s * np.arange(2 * steps + 1)
     times = np.concatenate((state.time_s + nodes_s, vertical_of(state).time_s + nodes_s))
@@ -101,9 +101,9 @@ def look_ahead(
 
 
 class HorizonQuadratic:
-    """J of N held inputs and the cost-to-go that follows them, for the gains of `law`; `problem`
-    fills in the state. Inputs are deviations from the `OUTLOOK`: N of b_c north, N of b_c east, N
-    of vertical thrust. The axes do not couple."""
+    """J of N held inputs and of the cost-to-go after them, for the gains of `law`; `over` adds the
+    state. Inputs are deviations from the feed-forward of the `OUTLOOK`: N of b_c north, N of b_c
+    east, N of vertical thrust. The axes do not couple."""
 
     def __init__(self, law: TrackingLaw, steps: int) -> None:
         self.steps = steps
@@ -112,7 +112,7 @@ class HorizonQuadratic:
         self._hessian: Array = block_diag(*(axis[0] for axis in self._axes))
 
     def over(self, problem: TrackingProblem, outlook: NDArray[np.void]) -> BoxQuadratic:
-        """The quadratic in (3 N,) from the deviations of `problem`."""
+        """Return the quadratic in (3 N,) inputs that begins at the deviations of `problem`."""
         starts = (*problem.at_hover.T, problem.vertical)
         axes = list(zip(starts, self._axes, strict=True))
         gradient = np.concatenate([start @ axis[1] for start, axis in axes])
@@ -121,14 +121,15 @@ class HorizonQuadratic:
         return BoxQuadratic(self._hessian, gradient, rest, *bounds)
 
     def plan(self, stacked: Array) -> Array:
-        """Inputs (3 N,) of the problem as (N, 3), one row per step."""
+        """Return the inputs (3 N,) of the quadratic as (N, 3), one row per step."""
         return stacked.reshape(3, self.steps).T
 
 
 def _condense(to_go: CostToGo, steps: int, period_s: float) -> tuple[Array, Array, Array]:
-    """J = 1/2 u' H u + x' F u + x' G x of u (N,) from the state x (n,): H, F (n, N), G (n, n)."""
+    """Return H (N, N), F (n, N) and G (n, n) of J = 1/2 u' H u + x' F u + x' G x, for inputs u (N,)
+    from the state x (n,)."""
     size = len(to_go.transition)
-    at = np.eye(size, size + steps)  # the state, as a function of the first one and the inputs
+    at = np.eye(size, size + steps)  # each state as a function of the first one and the inputs
     total = np.zeros((size + steps, size + steps))
     for held in np.eye(size + steps)[size:, None]:
         total += period_s * at[:1].T @ at[:1] + to_go.effort * held.T @ held

@@ -1,7 +1,7 @@
-"""The law `pid`: cascaded loops as most multirotors fly them, with our observer and feed-forward.
+"""The law `pid`: cascaded loops as on most multirotors, with our observer and feed-forward.
 
-The position error asks for a velocity, the velocity error for an acceleration; an integral takes
-out what the estimated disturbance leaves.
+The position loop commands a velocity, the velocity loop an acceleration; an integral removes the
+steady error that the compensation of the estimated disturbance leaves.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ Array = NDArray[np.float64]
 
 
 class PidSettings(TrackingSettings):
-    """Settings of the law `pid`: the gains of the two cascades, the best of a grid on the PX4-like
-    vehicle.
+    """Settings of the law `pid`: the gains of the two cascades. The defaults are the best of a grid
+    search on the PX4-like vehicle.
 
     `position_gain_ps` turns m into m/s, `velocity_gain_ps` m/s into m/s^2, `integral_gain_ps3` m s
-    into m/s^2; `integral_limit_mps2` bounds the part of the integral. `bandwidth_radps` is the
-    bandwidth of the loop with these gains: where the delay supports less, all are lowered with it.
+    into m/s^2; `integral_limit_mps2` bounds the integral. `bandwidth_radps` is the bandwidth of the
+    loop with these gains; if the delay supports only a lower one, all gains are lowered with it.
     """
 
     law: Literal["pid"] = "pid"
@@ -57,7 +57,7 @@ class PidLaw(TrackingLaw):
         lateral, vertical = problem.at_hover, problem.vertical
         north_east_mps = lateral[1] + slower * gains.position_gain_ps * lateral[0]
         climb_mps = vertical[1] + slower_climb * gains.height_gain_ps * vertical[0]
-        asked = np.empty(3)  # acceleration against the error, m/s^2, NED; lateral as in hover
+        asked = np.empty(3)  # acceleration against the error, NED; lateral as in hover
         asked[:2] = slower * gains.velocity_gain_ps * north_east_mps
         asked[2] = slower_climb * gains.climb_gain_ps * climb_mps
         asked[:2] += self._integral[:2] @ problem.target.to_hover
@@ -75,12 +75,12 @@ class PidLaw(TrackingLaw):
 
     @property
     def _slower(self) -> tuple[float, float]:
-        """Factors on the lateral gains and on those of the height, for the delay."""
+        """Factors of the lateral gains and of those of the height, because of the delay."""
         lateral_radps, vertical_radps = self.bandwidth
         return lateral_radps / self.configured_radps, vertical_radps / self.configured_radps
 
     def _integrate(self, off_ned_m: Array, free: NDArray[np.bool_]) -> None:
-        """Add the error of the axes whose command is not at its bound: no wind-up."""
+        """Integrate the error of the axes whose command is not at its bound (anti-windup)."""
         gains, (slower, slower_climb) = self._gains, self._slower
         lateral = slower**3 * gains.integral_gain_ps3
         rates = np.array((lateral, lateral, slower_climb**3 * gains.height_integral_gain_ps3))

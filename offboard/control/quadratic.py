@@ -1,7 +1,7 @@
 """A quadratic cost within bounds, which the laws minimise, and its exact minimum.
 
-daqp finds the minimum, a dual active-set method that shares no code with the swarm. Knows not what
-the inputs mean.
+The minimum is found by daqp, a dual active-set method that shares no code with the swarm. This
+module does not know the meaning of the inputs.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-BOUND_FRACTION = 1e-6  # times the distance between the bounds
+BOUND_FRACTION = 1e-6  # of the distance between the bounds: this near counts as at a bound
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,25 +32,25 @@ class BoxQuadratic:
     upper: Array
 
     def __call__(self, inputs: Array) -> Array:
-        """J of inputs (..., n), shape (...)."""
+        """Return J (...) of inputs (..., n)."""
         quadratic: Array = np.einsum("...i,ij,...j->...", inputs, self.hessian, inputs)
         return 0.5 * quadratic + inputs @ self.gradient + self.constant
 
     def clip(self, inputs: Array) -> Array:
-        """The nearest inputs (..., n) within the bounds."""
+        """Return the nearest inputs (..., n) within the bounds."""
         clipped: Array = np.clip(inputs, self.lower, self.upper)
         return clipped
 
 
 def at_bound(problem: BoxQuadratic, inputs: Array) -> bool:
-    """Whether any input (n,) rests on a bound; inputs fixed by equal bounds do not count."""
+    """Whether any input (n,) is at a bound; inputs fixed by equal bounds do not count."""
     width = problem.upper - problem.lower
     distance = np.minimum(inputs - problem.lower, problem.upper - inputs)
     return bool(np.any((distance <= BOUND_FRACTION * width) & (width > 0)))
 
 
 class ExactMinimum:
-    """Exact minimum of quadratics in `dimensions` inputs; daqp's workspace is made once."""
+    """Finds the exact minimum of quadratics in `dimensions` inputs; daqp's workspace is reused."""
 
     def __init__(self, dimensions: int) -> None:
         self._dimensions = dimensions
@@ -62,9 +62,8 @@ class ExactMinimum:
         )
 
     def minimise(self, problem: BoxQuadratic) -> Array:
-        """The minimiser (n,) within the bounds; NaN if the problem is not finite or not solved.
-
-        A singular Hessian has many minimisers: daqp returns one of them.
+        """Return the minimiser (n,) within the bounds; NaN if the problem is not finite or daqp
+        does not solve it. With a singular Hessian, daqp returns one of many minimisers.
         """
         unsolved = np.full(self._dimensions, np.nan)
         if not (np.isfinite(problem.hessian).all() and np.isfinite(problem.gradient).all()):

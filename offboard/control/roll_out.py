@@ -1,10 +1,10 @@
-"""Roll-outs of plans over N decisions, compiled: what `horizon` searches with.
+"""Compiled roll-outs of plans over N decisions, by which `horizon` evaluates them.
 
 States and inputs are deviations from the reference (`mpc.OUTLOOK`). The motion is that of the
 tracking laws' linear model, sampled exactly, plus the nonlinear part of thrust times direction,
-integrated over start, middle and end of each hold (Simpson). A plan of zeros flies the reference
-exactly, and for small deviations from hover cost and motion are those of the closed form. Exceeding
-a soft limit (speed, tilt, the ground, keep-out volumes) is penalised.
+integrated from start, middle and end of each hold (Simpson's rule). A plan of zeros flies the
+reference exactly; for small deviations from hover, cost and motion equal those of the closed form.
+Exceeding a soft limit (speed, tilt, the ground, keep-out volumes) is penalised.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from offboard.model.axes import SHORTEST_THRUST_LAG_S, b_z_of, lateral_model
 
 Array = NDArray[np.float64]
 
-# A state: position, velocity, b, b', each north and east; then z, v_z, T b_z; T
+# Indices of a state: position, velocity, b, b', each north and east; then z, v_z, T b_z; T
 P, V, B, R, Z, W, F, T = 0, 2, 4, 6, 8, 9, 10, 11
 STATE_SIZE = 12
 INPUTS = 3  # b_c north and east, vertical thrust
 
-# Penalty of an exceeded limit per second: per metre (or m/s, or unit of b), and per its square
+# Penalty per second for exceeding a limit: per m (or m/s, or unit of b), and per square of that
 SLOPE, CURVATURE = 20.0, 200.0
 
 PLANT = np.dtype(
@@ -43,18 +43,18 @@ PLANT = np.dtype(
         ("vertical_effort", "f8"),
         ("vertical_terminal", "f8", (3, 3)),
         ("vertical_gain", "f8", 3),
-        ("tilt_half", "f8", 3),  # b after half a hold, of [b, b', input]
+        ("tilt_half", "f8", 3),  # b after half a hold = tilt_half . [b, b', input]
         ("hold_s", "f8"),
         ("gravity_mps2", "f8"),
-        # share of a thrust error that is left after half a hold and a whole one
+        # share of a thrust error that is left after half a hold and after a whole one
         ("lag_half", "f8"),
         ("lag_full", "f8"),
         ("thrust_least_mps2", "f8"),
         ("thrust_most_mps2", "f8"),
-        ("tilt_most", "f8"),  # sine
+        ("tilt_most", "f8"),  # sine of the tilt limit
         ("speed_most_mps", "f8"),
         ("clearance_m", "f8"),
-        # velocity and position after a hold per acceleration at its start, middle and end
+        # velocity and position after a hold, per acceleration at its start, middle and end
         ("push_velocity", "f8", 3),
         ("push_position", "f8", 3),
     ],
@@ -64,12 +64,12 @@ PLANT = np.dtype(
 
 
 def plant_of(law: TrackingLaw, *, speed_limit_mps: float, clearance_m: float) -> NDArray[np.void]:
-    """One `PLANT`, for the vehicle and the gains of `law`."""
+    """Return one `PLANT` (1,) for the vehicle and the gains of `law`."""
     vehicle, period_s, drag = law.vehicle, law.period_s, law.vehicle.drag_per_mass_ps
     half = lateral_model(vehicle).sampled(0.5 * period_s)
     lag_s = max(vehicle.thrust_lag_s, SHORTEST_THRUST_LAG_S)
     simpson, left_s = period_s / np.array([6.0, 1.5, 6.0]), period_s * np.array([1.0, 0.5, 0.0])
-    carried = -np.expm1(-drag * left_s) / drag if drag > 0 else left_s  # by a velocity of 1
+    carried = -np.expm1(-drag * left_s) / drag if drag > 0 else left_s  # m per m/s
     constants = {
         "tilt_half": [*half.dynamics[2, 2:], half.input_map[2, 0]],
         "hold_s": period_s,
@@ -118,10 +118,10 @@ def roll_out(
     """Compute costs (n,), states (n, N + 1, STATE_SIZE) and inputs (n, N, 3) of n plans.
 
     The input of a step is base_inputs (N, 3) + weights (N, M) @ knots (n, M, 3) + `feedback` times
-    the closed form's answer to the deviation of the state from base_states (N + 1, STATE_SIZE),
-    clipped to the bounds. `start` (STATE_SIZE,) is the first state, `volumes` (V, PACKED_SIZE) are
-    the keep-out volumes where they are then, `floor_down_m` (NED) is the height below which no plan
-    leads, where the reference does not.
+    the closed form's feedback for the deviation of the state from base_states (N + 1, STATE_SIZE),
+    clipped to the bounds. `start` (STATE_SIZE,) is the first state, and `volumes` (V, PACKED_SIZE)
+    are the keep-out volumes at that time. With volumes, a plan is penalised for being below
+    `floor_down_m` (NED), or below the reference if that is lower.
     """
     plant, ahead = plants[0], outlooks[0]
     for n in range(costs.shape[0]):
@@ -135,7 +135,7 @@ def roll_out(
                     chosen[axis] += weights[k, m] * knots[n, m, axis]
             for row in range(Z):
                 off = feedback * (before[row] - base_states[k, row])
-                if row < B:  # position and velocity count as in hover
+                if row < B:  # position and velocity are scaled as in `law.to_hover`
                     north, east = ahead.to_hover[k, 0, row % 2], ahead.to_hover[k, 1, row % 2]
                     chosen[0] -= plant.lateral_gain[row // 2] * north * off
                     chosen[1] -= plant.lateral_gain[row // 2] * east * off
@@ -156,7 +156,7 @@ def roll_out(
 
 @kernel
 def _hold(plant: Any, before: Array, chosen: Array, after: Array) -> float:
-    """One hold: the state after it by the linear model, and its cost."""
+    """Compute the state after one hold by the linear model, and return the cost of the hold."""
     a, b = plant.lateral_transition, plant.lateral_input
     cost = 0.0
     for axis in range(2):
@@ -185,7 +185,7 @@ def _add_nonlinear_part(
     for node in range(3):
         i = 2 * k + node
         ref_n, ref_e, down = ahead.directions[i, 0], ahead.directions[i, 1], ahead.b_z[i]
-        # b north and east, T and T b_z as the linear model has it
+        # deviations of b north and east and of T, and T b_z of the linear model
         if node == 0:
             off_n, off_e, linear = before[B], before[B + 1], before[F]
         elif node == 1:
@@ -202,7 +202,7 @@ def _add_nonlinear_part(
             led = ahead.feedforward[k, 2]
             asked = (led + w) / max(down + down_error, 0.1)
             asked = min(max(asked, plant.thrust_least_mps2), plant.thrust_most_mps2) - led / down
-        # accelerations: -(T b - T_r b_r) minus those of the linear model
+        # accelerations -(T b - T_r b_r), minus those of the linear model
         thrust = ahead.thrusts_tilt[i] + thrust_error
         north = plant.gravity_mps2 * off_n - share * (thrust * off_n + thrust_error * ref_n)
         east = plant.gravity_mps2 * off_e - share * (thrust * off_e + thrust_error * ref_e)
@@ -220,7 +220,7 @@ def _add_nonlinear_part(
 
 @kernel
 def _cost_to_go(plant: Any, last: Array) -> float:
-    """That of the last state."""
+    """Return the cost-to-go of the last state."""
     lateral, vertical = plant.lateral_terminal, plant.vertical_terminal
     cost = 0.0
     for i in range(4):
@@ -243,7 +243,8 @@ def _penalties(
     before: Array,
     after: Array,
 ) -> float:
-    """For exceeding limits in hold k; each volume counts at the middle of the hold and its end."""
+    """Return the penalties of hold k. Volumes count at its middle and end, other limits at its
+    end."""
     hold, end = plant.hold_s, 2 * k + 2
     b, v = ahead.directions[end], ahead.velocities[end]
     paid = hold * _penalty(math.hypot(b[0] + after[B], b[1] + after[B + 1]) - plant.tilt_most)
@@ -254,7 +255,7 @@ def _penalties(
     if volumes.shape[0] > 0:
         room = max(floor_down_m - ahead.positions[end, 2], 0.0)
         paid += hold * _penalty(after[Z] - room)
-    # the middle, from position and velocity at both ends
+    # position in the middle of the hold, from position and velocity at both ends
     bow = 0.125 * hold
     middle_n = 0.5 * (before[P] + after[P]) + bow * (before[V] - after[V])
     middle_e = 0.5 * (before[P + 1] + after[P + 1]) + bow * (before[V + 1] - after[V + 1])
@@ -278,5 +279,5 @@ def _penalties(
 
 @kernel
 def _penalty(over: float) -> float:
-    """Per second, for exceeding a limit by `over`."""
+    """Return the penalty per second for exceeding a limit by `over`."""
     return max(over, 0.0) * (SLOPE + CURVATURE * max(over, 0.0))

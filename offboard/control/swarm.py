@@ -5,10 +5,10 @@
         swarm.tell(cost(swarm.ask()))
     answer = swarm.result()
 
-With ask/tell the caller owns loop, evaluation and deadline, for any cost. `minimise` searches the
-minimum of a quadratic entirely in compiled code, and `certify` says how far its answer is from the
-exact minimum. Both move their particles by the same compiled functions. Knows no model, no
-reference and no clock.
+With ask/tell the caller has loop, evaluation and deadline, and any cost can be minimised.
+`minimise` searches for the minimum of a quadratic entirely in compiled code, with the same compiled
+functions. `certify` computes how far its result is from the exact minimum. This module knows no
+model, no reference and no clock.
 """
 
 from __future__ import annotations
@@ -32,16 +32,17 @@ Generator = np.random.Generator
 EVALUATIONS_MOST = 500_000  # a search of 0.5 s with `pso`, of some seconds with `horizon`
 FIRST_VELOCITY = 0.5  # bound of the first velocities, times the distance between the bounds
 GAP_FLOOR = 1e-6  # of `certify`, times the variation of the cost within the bounds
-CHUNK_ITERATIONS = 25  # of `minimise` between two looks at the time that is left, about 0.1 ms
+CHUNK_ITERATIONS = 25  # `minimise` checks the time that is left after so many, about every 0.1 ms
 
 
 class SwarmSettings(Parameters):
     """The swarm of the paper's section 4.1 with the damping of Table 2.
 
     `inertia`, `personal` and `social` are w, c1 and c2 of Eq. 19, `damping` is lambda of Eq. 30 (1
-    gives Eq. 19). `rebound` is the share of the velocity with which a particle is reflected at a
+    gives Eq. 19). `rebound` is the share of its velocity with which a particle is reflected at a
     bound: with 0 one search in a hundred misses a minimum on the bounds, with 0.5 one in ten
-    thousand (40 x 150); but only with 0 epsilon at lambda = 1 equals the paper's.
+    thousand (40 particles, 150 iterations). But only with 0 does epsilon at lambda = 1 equal that
+    of the paper.
     """
 
     particles: int = Field(default=40, ge=2, le=10_000)
@@ -67,8 +68,8 @@ class SwarmResult:
     """The result of one search.
 
     `best` (n,) is always finite and within the bounds; `cost` is inf if no particle had a finite
-    cost. `spread` is epsilon of Eq. 29 in the last iteration, `cut_short` whether the time ran
-    out.
+    cost. `spread` is epsilon of Eq. 29 in the last iteration, `cut_short` whether the search ended
+    early because no time was left.
     """
 
     best: Array
@@ -87,17 +88,17 @@ SEARCH = np.dtype(
 
 _NO_HESSIAN, _NO_GRADIENT = np.empty((0, 0)), np.empty(0)
 
-# Compiled: the particles are (3, n, particles), their positions, velocities and personal bests;
-# `bounds` (2, n) lower and upper; `best` (n,) the best position of all; `costs` (2, particles) the
-# newest and the least of each particle. Inner loops run over the particles, which are adjacent in
-# memory: the compiler makes vector instructions of them.
+# Arguments of the compiled functions: `particles` (3, n, particles) are positions, velocities and
+# personal bests; `bounds` (2, n) lower and upper bounds; `best` (n,) the best position of all;
+# `costs` (2, particles) the newest and the lowest cost of each particle. Inner loops run over the
+# particles, which are adjacent in memory, so that the compiler vectorises them.
 
 
 @kernel
 def _evaluate(
     positions: Array, hessian: Array, gradient: Array, constant: float, costs: Array
 ) -> None:
-    """J = 1/2 u'Hu + f'u + c of each particle."""
+    """Compute `costs` (particles,), J = 1/2 u'Hu + f'u + c of each particle."""
     costs[:] = constant
     for j in range(len(gradient)):
         here = positions[j]
@@ -110,8 +111,8 @@ def _evaluate(
 
 @kernel
 def _remember(search: Any, particles: Array, best: Array, costs: Array) -> None:
-    """Update the bests from the newest costs. Of equal costs the first one found stays the best; a
-    cost that is not finite never becomes a best."""
+    """Update the bests from the newest costs. Of equal costs the first one found stays the best;
+    NaN and infinite costs are ignored."""
     for i in range(costs.shape[1]):
         cost = costs[0, i]
         if -np.inf < cost < costs[1, i]:
@@ -125,11 +126,12 @@ def _remember(search: Any, particles: Array, best: Array, costs: Array) -> None:
 
 @kernel
 def _move(search: Any, random: Array, bounds: Array, particles: Array, best: Array) -> None:
-    """Eqs. 30 and 20 with a random number per dimension; Eq. 22 by clamping.
+    """Move the particles by Eqs. 30 and 20, with random numbers per dimension, and clamp them to
+    the bounds (Eq. 22).
 
-    Where a particle is clamped its velocity is reversed and multiplied by `rebound`. If it were
-    kept, the particle would stay at the bound; if it were set to zero, all particles could come to
-    rest beside the best one in this dimension.
+    If a particle is clamped, its velocity is reversed and multiplied by `rebound`. An unchanged
+    velocity would keep the particle at the bound; with a velocity of zero all particles could come
+    to rest beside the best one in this dimension.
     """
     inertia, damping, rebound = search.inertia, search.damping, search.rebound
     personal, social = search.personal, search.social
@@ -150,7 +152,7 @@ def _move(search: Any, random: Array, bounds: Array, particles: Array, best: Arr
 
 @kernel
 def _spread(positions: Array, best: Array) -> float:
-    """Mean distance of the particles from the best position (Eqs. 28-29)."""
+    """Return the mean distance of the particles from the best position (Eqs. 28-29)."""
     total = 0.0
     for i in range(positions.shape[1]):
         squared = 0.0
@@ -176,9 +178,9 @@ def iterate(
     constant: float,
     iterations: int,
 ) -> None:
-    """Iterate with the costs of a quadratic, or, where the gradient is empty, with the newest of
-    `costs`. After each iteration `random` (moves, n, particles, 2) moves the particles for the next
-    one; after the last one of a search they stay."""
+    """Iterate with the costs of a quadratic or, if the gradient is empty, with the newest `costs`.
+    After each iteration the particles are moved with `random` (moves, n, particles, 2), except
+    after the last iteration of a search."""
     search = searches[0]
     for k in range(iterations):
         if len(gradient) > 0:
@@ -192,8 +194,8 @@ def iterate(
 
 class Swarm:
     """One search within `lower` and `upper`, each (n,); equal bounds fix a dimension. The first
-    particles start from `seeds` (k, n), within the bounds: the answer is never worse than the best
-    of them.
+    particles start from `seeds` (k, n), clipped to the bounds; the result is never worse than the
+    best of them.
 
     Raises ValueError for bounds that are not finite and ordered vectors of one length.
     """
@@ -225,7 +227,7 @@ class Swarm:
         self._search["cost"] = self._search["spread"] = np.inf
 
     def ask(self) -> Array:
-        """Inputs to evaluate, (particles, n); the same until `tell` is called."""
+        """Return the inputs to evaluate, (particles, n); they are the same until `tell`."""
         positions: Array = self._particles[0].T.copy()
         return positions
 
@@ -241,7 +243,7 @@ class Swarm:
         self._iterate(_NO_HESSIAN, _NO_GRADIENT, 0.0, 1)
 
     def tell_all(self, problem: BoxQuadratic, iterations: int) -> None:
-        """`tell` the costs of `problem` so many times."""
+        """Do `iterations` of ask and tell with the costs of `problem`."""
         hessian = np.ascontiguousarray(problem.hessian, np.float64)
         gradient = np.ascontiguousarray(problem.gradient, np.float64)
         self._iterate(hessian, gradient, float(problem.constant), iterations)
@@ -256,7 +258,7 @@ class Swarm:
         )  # fmt: skip
 
     def result(self, cut_short: bool = False) -> SwarmResult:
-        """The best input so far."""
+        """Return the result so far."""
         search = self._search[0]
         return SwarmResult(
             self._best.copy(),
@@ -273,10 +275,10 @@ def minimise(
     rng: Generator,
     remaining_s: Callable[[], float] | None = None,
 ) -> SwarmResult:
-    """The best input found within the bounds of a quadratic.
+    """Search for the minimum of a quadratic within its bounds.
 
-    `remaining_s` returns how many seconds are left; when none are, the search ends with the best so
-    far, after one chunk of iterations at the earliest. Raises ValueError for bounds that are not
+    `remaining_s` returns how many seconds are left; when none are, the search ends with the best
+    input so far, after CHUNK_ITERATIONS at the earliest. Raises ValueError for bounds that are not
     finite and ordered.
     """
     swarm, left = Swarm(settings, problem.lower, problem.upper, rng), settings.iterations
@@ -289,7 +291,7 @@ def minimise(
 
 
 def _bounds(lower: ArrayLike, upper: ArrayLike) -> Array:
-    """Lower and upper, (2, n)."""
+    """Return the checked lower and upper bounds, (2, n)."""
     low, high = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
     if low.ndim != 1 or low.shape != high.shape or not low.size:
         raise ValueError(f"bounds must be two equal vectors, got {low.shape} and {high.shape}")
@@ -301,13 +303,13 @@ def _bounds(lower: ArrayLike, upper: ArrayLike) -> Array:
 def certify(
     problem: BoxQuadratic, result: SwarmResult, exact: ExactMinimum | None = None
 ) -> Certificate:
-    """The certificate of `result`, the answer to `problem`. Pass `exact` to reuse its workspace.
+    """Return the certificate of `result` for `problem`. Pass `exact` to reuse its workspace.
 
     The gap is (J - J*) / max(|J*|, floor). J - J* is not computed as the difference of two costs,
-    which near the optimum would be rounding errors only, but from the expansion about the
+    which near the optimum would consist of rounding errors, but from the expansion about the
     minimiser: g*'d + 1/2 d'Hd with d = u - u* and g* = Hu* + f. A negative value (the swarm is
     better than daqp's tolerance) counts as 0. The floor is a millionth of the variation of J within
-    the bounds; it keeps the gap meaningful exactly on the reference, where J* vanishes.
+    the bounds; it keeps the gap meaningful exactly on the reference, where J* is zero.
     """
     exact = exact or ExactMinimum(len(problem.gradient))
     best = exact.minimise(problem)
