@@ -1,1 +1,1 @@
-"""From telemetry and the commands sent to the state at the time when a command acts."""
+"""Estimates the state at the time when a command acts, from telemetry and the commands sent."""

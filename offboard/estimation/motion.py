@@ -2,8 +2,8 @@
 
 The state x has `STATE_SIZE` numbers at the indices below (NED, SI): position, velocity, thrust
 direction b (north and east) and its rate, disturbance, bias of the reported velocity, collective
-thrust after its lag, heading and its rate. Runge-Kutta steps end when a command takes effect.
-Loops over single numbers, because array expressions compile for seconds.
+thrust after its lag, heading and its rate. Runge-Kutta steps end when a command takes effect. The
+code has loops over single numbers, because array expressions take seconds to compile.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ PLANT = np.dtype(
 )  # fmt: skip
 """The constants of a vehicle that its motion needs."""
 
-# Columns of the commands sent, oldest row first.
+# Columns of the commands sent; the first row is the oldest
 SENT_AT = 0
 SENT_TILT = 1
 SENT_THRUST = 3
@@ -52,12 +52,12 @@ SENT_HEADING = 4
 COMMAND_SIZE = 5
 
 LONGEST_STEP_S = 0.01
-BIAS_TIME_CONSTANT_S = 10.0  # with which the bias of the reported velocity is forgotten
+BIAS_TIME_CONSTANT_S = 10.0  # with which the bias of the reported velocity decays
 SAME_TIME_S = 1e-9
 
 
 def plant_of(vehicle: Vehicle) -> Any:
-    """The PLANT (1,) of `vehicle`."""
+    """Return the PLANT (1,) of `vehicle`."""
     tilt, yaw = vehicle.tilt, vehicle.yaw
     constants = (
         vehicle.gravity_mps2, vehicle.drag_per_mass_ps,
@@ -100,7 +100,8 @@ def propagate(state: Array, plants: Any, sent: Array, start_s: float, end_s: flo
 
 @kernel
 def _in_force(sent: Array, time_s: float, delay_s: float) -> tuple[int, float]:
-    """Row of the command acting at `time_s` (-1: none yet) and the time when the next one acts."""
+    """Return the row of the command acting at `time_s` (-1: none yet) and the time when the next
+    one begins to act."""
     row, following = sent.shape[0] - 1, math.inf
     while row >= 0 and sent[row, SENT_AT] + delay_s > time_s + SAME_TIME_S:
         following = sent[row, SENT_AT] + delay_s
@@ -110,7 +111,7 @@ def _in_force(sent: Array, time_s: float, delay_s: float) -> tuple[int, float]:
 
 @kernel
 def _step(state: Array, h: float, command: tuple[float, float, float, float], plant: Any) -> None:
-    """One Runge-Kutta step of fourth order; the thrust's lag is integrated exactly."""
+    """Do one fourth-order Runge-Kutta step; the thrust's lag is integrated exactly."""
     rate, total = np.zeros(STATE_SIZE), np.zeros(STATE_SIZE)
     at, thrust = np.empty(STATE_SIZE), command[2]
     for share, weight in ((0.0, 1.0), (0.5, 2.0), (0.5, 2.0), (1.0, 1.0)):
@@ -135,7 +136,7 @@ def _differentiate(
     plant: Any,
     rate: Array,
 ) -> None:
-    """Right-hand side x' at collective thrust `thrust` and the commands now in force: thrust
+    """Compute `rate`, x' at collective thrust `thrust` and the `command` now in force: thrust
     direction north and east, thrust, heading."""
     gravity = (0.0, 0.0, plant.gravity)
     direction = (state[TILT], state[TILT + 1], b_z_of(state[TILT], state[TILT + 1]))

@@ -1,11 +1,12 @@
 """Noise of telemetry (R) and drift of the disturbance (Q), estimated in flight.
 
-White noise shows in differences of successive measurements in which motion cancels, whatever the
-filter makes of them. Innovations that are correlated over a fifth of a second (R. Mehra, 1970) show
-a disturbance that drifts faster than configured (gusts); the estimators of PX4 and ArduCopter drift
-too, but their innovations are correlated for less. Without noise, those of ArduCopter's EKF3 repeat
-with its GPS, at 5 Hz: there the drift grows in calm air too, where a fast one does no harm. Both
-estimates are slow, bounded, and never below the configured values.
+White noise is measured by differences of successive measurements in which motion cancels, so that
+it does not depend on the filter. Innovations that are correlated over a fifth of a second (R.
+Mehra, 1970) show that the disturbance drifts faster than configured (gusts). The estimators of PX4
+and ArduCopter drift too, but the innovations from that are correlated for a shorter time. Without
+noise, innovations from ArduCopter's EKF3 repeat with its GPS at 5 Hz, so that the estimated drift
+grows in calm air too, where a large value does no harm. Both estimates change slowly, are bounded,
+and are never below the configured values.
 """
 
 from __future__ import annotations
@@ -18,25 +19,28 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-NOISE_TIME_S = 3.0
-NOISE_OUTLIER = 25.0  # limit of a single square, in variances
+NOISE_TIME_S = 3.0  # time constant of the noise estimate
+NOISE_OUTLIER = 25.0  # upper limit of a single squared difference, in variances
 START_SDS = 0.002, 0.005  # of position (m) and velocity (m/s)
-# Innovations are averaged over SPAN_S and correlated with those two spans earlier.
+# Innovations are averaged over SPAN_S and correlated with the average two spans earlier, with the
+# time constant DRIFT_TIME_S
 SPAN_S, LONGEST_SPAN_S, DRIFT_TIME_S = 0.1, 0.3, 3.0
-CORRELATED = 0.25  # correlation above which the density grows, by e per second for each 1 above
+# The drift grows if the correlation is greater than this: its logarithm by the excess per second
+CORRELATED = 0.25
 VISIBLE_M = 1e-5  # smaller innovations do not count
-# A density of 0.5 to 1.0 after each change of the model was tried. Without noise the error of a
+# A drift of 0.5 to 1.0 after each change of the model was tried. Without noise the error of a
 # flight was half as large. With 30 % loss the disturbance followed lost setpoints, and the largest
 # error of 50 flights was twice as large.
 
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """Q by densities per root second, R by standard deviations. Half or twice the values made no
-    visible difference on PX4 and ArduCopter, but for the position, which both report with 2e-5 m of
-    white noise: with 2 mm predictions from logs of a real PX4 are 6 to 10 % worse, with 0.1 mm
-    commands chatter. Noise of position and velocity and drift of the disturbance are estimated in
-    flight too, and never less than these; the drift at most `disturbance_limit_mps2`."""
+    """Q as noise densities per root second, R as standard deviations. Half or twice these values
+    made no visible difference on PX4 and ArduCopter, except for the position, which both report
+    with 2e-5 m of white noise: with 2 mm, predictions from logs of a real PX4 are 6 to 10 % worse;
+    with 0.1 mm, commands chatter. Noise of position and velocity and drift of the disturbance are
+    also estimated in flight. Estimates are at least the values here, the drift at most
+    `disturbance_limit_mps2`."""
 
     acceleration_mps: float = 0.2
     disturbance_mps2: float = 0.15
@@ -50,10 +54,10 @@ class Noise:
 
 
 class NoiseEstimate:
-    """R of position and velocity, and the drift in Q, from one message after the other.
+    """Estimate of R of position and velocity and of the drift in Q, updated with each message.
 
-    `drift_mps2` (2,): drift of the disturbance per root second, lateral and vertical. The vertical
-    one is as configured until `permit_vertical_drift`.
+    `drift_mps2` (2,) is the drift of the disturbance per root second, lateral and vertical. The
+    vertical one keeps its configured value until `permit_vertical_drift`.
     """
 
     def __init__(self, noise: Noise) -> None:
@@ -63,7 +67,8 @@ class NoiseEstimate:
         self._least_drift = noise.disturbance_mps2
         self._drift_limit = max(noise.disturbance_mps2, noise.disturbance_limit_mps2)
         self._drift_limits = np.array([self._drift_limit, noise.disturbance_mps2])
-        # mean product of span means two spans apart, and their mean square: lateral, vertical
+        # averages of the product of span means two spans apart, and of their squares: lateral,
+        # vertical
         self._product, self._square = np.zeros(2), np.zeros(2)
         self.interrupt()
 
@@ -77,19 +82,19 @@ class NoiseEstimate:
         self._drift_limits[1] = self._drift_limit
 
     def interrupt(self) -> None:
-        """After a jump, a gap or a restart: do not compare the next message with the last."""
+        """Do not compare the next message with the last one: after a jump, gap or restart."""
         self._last_s = self._began_s = -np.inf
-        self._measured: Array | None = None  # of the last message
+        self._measured: Array | None = None  # in the last message
         self._rates: tuple[Array, float] | None = None  # see `_estimate_noise`
         self._total, self._messages = np.zeros(3), 0  # innovations of position since `_began_s`
-        self._means: deque[Array] = deque(maxlen=3)  # of the last spans
+        self._means: deque[Array] = deque(maxlen=3)  # mean innovations of the last spans
 
     def update(self, time_s: float, innovation: Array, measured: Array) -> None:
-        """Use one message of `time_s`: measured less predicted, and measured position (m) and
-        velocity (m/s), each (6,), NED."""
+        """Use a message of `time_s`. `measured` (6,) is position (m) and velocity (m/s), NED,
+        `innovation` (6,) is `measured` minus the prediction."""
         if self._measured is None:
             self._began_s = time_s
-        elif time_s > self._last_s:  # else a newer attitude has overtaken both
+        elif time_s > self._last_s:  # if not, a newer attitude has arrived before both
             self._estimate_noise(time_s - self._last_s, measured, self._measured)
         self._measured, self._last_s = measured, time_s
         self._total += innovation[:3]
@@ -103,8 +108,9 @@ class NoiseEstimate:
             self._estimate_drift(min(span_s, LONGEST_SPAN_S), self._means[2], self._means[0])
 
     def _estimate_noise(self, interval_s: float, now: Array, before: Array) -> None:
-        """The rates of change from one message to the next, of the position less the mean reported
-        velocity, differ from the rates before by white noise alone, of three messages."""
+        """Update the noise variances. Rates of change from one message to the next (those of the
+        position minus the mean reported velocity) differ from the rates before only by the white
+        noise of three messages."""
         rates = (now - before) / interval_s
         rates[:3] -= 0.5 * (now[3:] + before[3:])
         last, self._rates = self._rates, (rates, 1.0 / interval_s)
@@ -117,7 +123,7 @@ class NoiseEstimate:
         self._variances += min(interval_s / NOISE_TIME_S, 0.1) * (found - self._variances)
 
     def _estimate_drift(self, span_s: float, now: Array, before: Array) -> None:
-        """Update the drift densities from the mean innovations of two spans, (3,) each."""
+        """Update the drift from the mean innovations of two spans, (3,) each."""
         share = span_s / DRIFT_TIME_S
         self._product += share * (_by_axis(now * before) - self._product)
         self._square += share * (_by_axis(0.5 * (now**2 + before**2)) - self._square)
@@ -127,5 +133,5 @@ class NoiseEstimate:
 
 
 def _by_axis(ned: Array) -> Array:
-    """Lateral mean and vertical value of a (3,) in NED."""
+    """Return the mean of north and east, and down, of a vector (3,) in NED."""
     return np.array([0.5 * (ned[0] + ned[1]), ned[2]])

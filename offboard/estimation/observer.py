@@ -1,4 +1,5 @@
-"""The observer: a Kalman filter of the vehicle's state, now and when a command sent now acts.
+"""The observer: a Kalman filter that estimates the vehicle's state now and predicts it for the time
+when a command sent now acts.
 
     predict   x(t + h) = f(x(t), commands sent)      `motion`, with the delay of each axis
               P <- F P F' + Q                        F = exp(A h), f linearised about hover
@@ -7,14 +8,14 @@
     reset     on the ground, after a long gap, and after a jump of the vehicle's own estimate
 
 The state x (indices in `motion`, NED, SI) is position, velocity, thrust direction b and its rate,
-disturbance acceleration d, bias of the reported velocity, thrust, heading and its rate. d stands
-for wind and for errors of thrust and mass, so that it contains the hover thrust. R of position and
+disturbance acceleration d, bias of the reported velocity, thrust, heading and its rate. d contains
+wind and errors of thrust and mass, so that the hover thrust follows from it. R of position and
 velocity, and the drift of d in Q, are estimated as well (`noise`).
 
 The velocity that an autopilot reports need not be the derivative of the position that it reports
-(PX4: wrong by 0.2 to 0.3 m/s for seconds), so velocity comes from the position and from the
-commands *sent*; the reported velocity is used with a bias that changes slowly. All times are
-vehicle time.
+(PX4: wrong by 0.2 to 0.3 m/s for seconds). The observer therefore estimates velocity from the
+position and the commands *sent*, and models the reported velocity with a bias that changes slowly.
+All times are vehicle time.
 """
 
 from __future__ import annotations
@@ -57,21 +58,21 @@ Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
-LATEST_S = 0.1  # telemetry that is older than this when newer has arrived is dropped
-LONGEST_GAP_S = 1.0  # a longer gap or a step back in time restarts; a gap keeps the disturbance
-# A measurement is a jump of the vehicle's estimate if it is further off than so many standard
-# deviations of its innovation and a distance: position (m), velocity (m/s)
+LATEST_S = 0.1  # telemetry that is this much older than the newest is dropped
+LONGEST_GAP_S = 1.0  # a longer gap or step back in time restarts the filter
+# A measurement counts as a jump of the vehicle's estimate if its innovation exceeds GATE_SDS
+# standard deviations plus a distance: position (m), velocity (m/s)
 GATE_SDS, GATES = 3.0, (0.3, 0.5)
 DISTURBANCE_LIMIT_MPS2 = 8.0
 COMMANDS_REPLAYED = 128  # at most
-FARTHEST_S = 5.0  # of a prediction: no limits let a link and a vehicle be later than that
+FARTHEST_S = 5.0  # longest prediction; the limits on link and vehicle allow no longer delay
 
 # H of position and reported velocity (6, 19), and of attitude (3, 19): thrust direction, heading
 H_POSITION, H_ATTITUDE = np.zeros((6, STATE_SIZE)), np.zeros((3, STATE_SIZE))
 H_POSITION[:, POSITION : VELOCITY + 3] = np.eye(6)
 H_POSITION[3:, BIAS : BIAS + 3] = np.eye(3)
 H_ATTITUDE[range(3), (TILT, TILT + 1, HEADING)] = 1.0
-# Rows of H_POSITION that jump together: position north and east, down, and velocity alike
+# Rows of H_POSITION that are reset together: position north and east, down; the same of velocity
 TOGETHER = ((0, 2), (2, 3), (3, 5), (5, 6))
 
 # Standard deviations at the first telemetry, which sets position, velocity and attitude;
@@ -81,8 +82,8 @@ START_SDS = np.array([0.1] * 3 + [0.3] * 3 + [0.02] * 2 + [0.3] * 2 + [1.0, 1.0,
 
 
 def dynamics_of(vehicle: Vehicle) -> Array:
-    """A (19, 19) of x' = A x: f linearised about hover, where the acceleration per error of the
-    thrust direction is g, without the lag of the thrust."""
+    """Return A (19, 19) of x' = A x: f linearised about hover, where an error of the thrust
+    direction accelerates by g times that error, without the lag of the thrust."""
     dynamics = np.zeros((STATE_SIZE, STATE_SIZE))
     for i in range(3):
         dynamics[POSITION + i, VELOCITY + i] = dynamics[VELOCITY + i, DISTURBANCE + i] = 1.0
@@ -98,7 +99,7 @@ def dynamics_of(vehicle: Vehicle) -> Array:
 
 
 def densities_of(noise: Noise) -> Array:
-    """Process noise (19,) per root second."""
+    """Return the process noise (19,) per root second."""
     densities = np.zeros(STATE_SIZE)
     densities[VELOCITY : VELOCITY + 3] = noise.acceleration_mps
     densities[TILT_RATE : TILT_RATE + 2] = noise.tilt_radps
@@ -112,14 +113,14 @@ def densities_of(noise: Noise) -> Array:
 def predict_covariance(
     covariance: Array, dynamics: Array, densities: Array, interval_s: float, longest_s: float
 ) -> None:
-    """P <- F P F' + Q over `interval_s`, in place, in steps of at most `longest_s`."""
+    """Do P <- F P F' + Q over `interval_s`, in place, in steps of at most `longest_s`."""
     steps = math.ceil(interval_s / longest_s - 1e-6)
     if steps <= 0:
         return
     h, size = interval_s / steps, covariance.shape[0]
     half, moved = np.eye(size), np.empty((size, size))
     transition, noise = np.empty((size, size)), np.zeros((size, size))
-    # F = exp(A h / 2) to fourth order, by Horner's rule, squared
+    # F = exp(A h / 2)^2, with the exponential to fourth order by Horner's rule
     for order in (4, 3, 2, 1):
         _multiply(dynamics, half, moved)
         for i in range(size):
@@ -149,7 +150,7 @@ def predict_covariance(
 
 @kernel
 def _multiply(left: Array, right: Array, out: Array) -> None:
-    """out = left @ right, of which `left` is sparse; compiles in a tenth of the time of `@`."""
+    """Do out = left @ right for a sparse `left`; compiles in a tenth of the time of `@`."""
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
             out[i, j] = 0.0
@@ -163,9 +164,9 @@ def _multiply(left: Array, right: Array, out: Array) -> None:
 def update(
     state: Array, covariance: Array, h: Array, measured: Array, variance: float, gate: float
 ) -> bool:
-    """Update state (19,) and covariance by `measured` (m,) with H `h` (m, 19) and R = `variance`
-    times the identity: one number after the other, so that S is a number. Returns False, and
-    changes nothing, if one is beyond its gate."""
+    """Update state (19,) and covariance with `measured` (m,), H = `h` (m, 19) and R = `variance`
+    times the identity, one measurement after the other, so that S is a scalar. Return False, and
+    change nothing, if the innovation of any is beyond `gate` plus GATE_SDS."""
     size, projected = state.shape[0], np.empty_like(state)
     for row in range(h.shape[0]):
         innovation, total = _innovation(state, covariance, h[row], measured[row], projected)
@@ -188,7 +189,7 @@ def update(
 def _innovation(
     state: Array, covariance: Array, row: Array, measured: float, projected: Array
 ) -> tuple[float, float]:
-    """z - H x and H P H' of one `row` of H; `projected` becomes P H'."""
+    """Return z - H x and H P H' of one `row` of H; `projected` becomes P H'."""
     innovation, total = measured, 0.0
     for i in range(len(state)):
         projected[i] = 0.0
@@ -205,18 +206,18 @@ def _innovation(
 class Observer:
     """State estimate of one vehicle.
 
-    Give it every attitude and position that arrives (`on_attitude`, `on_position`) and every
-    command that is sent (`on_command`); `predict` gives the state that a decision needs.
+    It needs every attitude and position that arrives (`on_attitude`, `on_position`) and every
+    command that is sent (`on_command`); `predict` returns the state that a decision needs.
 
     Args:
         vehicle: constants of the vehicle.
-        noise: of telemetry and disturbance.
+        noise: noise of telemetry and of the disturbance.
     """
 
     def __init__(self, vehicle: Vehicle, noise: Noise | None = None) -> None:
         self._noise = noise or Noise()
         self._time_s = -math.inf  # vehicle time of the state
-        self._position_at: float | None = None  # time of the newest
+        self._position_at: float | None = None  # vehicle time of the newest one
         self._attitude_at: float | None = None
         self._set_vehicle(vehicle)
         self.reset()
@@ -232,10 +233,10 @@ class Observer:
         self._restart()
 
     def set_vehicle(self, vehicle: Vehicle) -> None:
-        """Continue with another vehicle model, as identified in flight: thrust and disturbance
-        change to what they mean with it, the motion does not. From now on the vertical drift is
-        estimated too: before the thrust is identified, an error of its delay looks like drift, and
-        a faster correction would make the vehicle oscillate."""
+        """Continue with another vehicle model, as identified in flight. Thrust and disturbance are
+        converted to the new model; the motion stays. From now on the vertical drift is estimated
+        too: before the thrust is identified, an error of its delay looks like drift, and a faster
+        correction would make the vehicle oscillate."""
         before = self._vehicle
         scale = before.hover_thrust / vehicle.hover_thrust
         self._sent[:, SENT_THRUST] *= scale
@@ -257,21 +258,21 @@ class Observer:
 
     @property
     def hover_thrust_estimate(self) -> float:
-        """Normalised hover thrust, u_h (1 + d_z / g); right within 3 % five seconds after
-        take-off."""
+        """Normalised hover thrust, u_h (1 + d_z / g); within 3 % of the true value five seconds
+        after take-off."""
         down = float(self._state[DISTURBANCE + 2])
         return self._vehicle.hover_thrust * (1.0 + down / self._vehicle.gravity_mps2)
 
     def freeze(self, frozen: bool) -> None:
-        """Stop or resume estimating. Frozen, on the ground or while the vehicle does not follow our
-        commands, the state is the reported velocity and the measured thrust direction, without a
-        disturbance; the filter starts from there."""
+        """Stop or resume the filter. It is frozen on the ground and while the vehicle does not
+        follow our commands. The state then consists of the reported position and velocity and the
+        measured attitude, without a disturbance; the filter resumes from there."""
         if frozen != self._frozen:
             self._forget_errors()
         self._frozen = frozen
 
     def on_command(self, time_s: float, command: Command) -> None:
-        """A command sent when the newest telemetry had vehicle time `time_s`."""
+        """Store a command that was sent when the newest telemetry had vehicle time `time_s`."""
         north, east, _ = command.thrust_direction_ned
         if len(self._sent):
             time_s = max(time_s, float(self._sent[-1, SENT_AT]))
@@ -279,7 +280,7 @@ class Observer:
         self._sent = np.vstack((self._sent[1 - COMMANDS_REPLAYED :], row))
 
     def on_attitude(self, time_s: float, q: Quaternion, rates: Triple) -> None:
-        """Attitude quaternion (FRD to NED, w first) and body rates (rad/s, FRD) at `time_s`."""
+        """Use an attitude: quaternion (FRD to NED, w first) and body rates (rad/s, FRD)."""
         if not self._accepts(time_s, self._attitude_at):
             return
         north, east, _ = thrust_direction_from_quaternion(q).tolist()
@@ -303,7 +304,7 @@ class Observer:
         self._attitude_at = time_s
 
     def on_position(self, time_s: float, position_ned_m: Triple, velocity_ned_mps: Triple) -> None:
-        """Reported position and velocity at `time_s`."""
+        """Use the position and velocity reported for `time_s`."""
         if not self._accepts(time_s, self._position_at):
             return
         if self._position_at is None or self._frozen:
@@ -319,7 +320,7 @@ class Observer:
         self._position_at = time_s
 
     def _motion(self) -> Array:
-        """Velocity and acceleration (6,) now, by the model."""
+        """Return the velocity and acceleration (6,) of the model at the time of the state."""
         state, gravity = self._state, np.array([0.0, 0.0, self._vehicle.gravity_mps2])
         north, east = state[TILT : TILT + 2].tolist()
         velocity, disturbance = state[VELOCITY:TILT], state[DISTURBANCE:BIAS]
@@ -329,7 +330,7 @@ class Observer:
         return np.concatenate((velocity, accelerated))
 
     def _update_by_position(self, measured: Array) -> None:
-        """Update by the present position and velocity (6,); reset what jumped beyond its gate."""
+        """Update with the present position and velocity (6,); reset those beyond their gates."""
         state, estimated = self._state, self.estimated
         innovation = measured - H_POSITION @ state
         variances, jumped = estimated.variances, False
@@ -348,8 +349,8 @@ class Observer:
         self._densities[DISTURBANCE + 2] = estimated.drift_mps2[1]
 
     def _reset(self, row: int, measured: float, variance: float) -> None:
-        """After a jump, by the `row` of H_POSITION: take the position as measured, or add the jump
-        of the reported velocity to its bias. The other states stay."""
+        """Reset one `row` of H_POSITION after a jump: set the position to the measured one, or the
+        bias to the reported minus the estimated velocity. The other states stay."""
         state, covariance = self._state, self._covariance
         if row < 3:
             state[POSITION + row] = measured
@@ -363,10 +364,9 @@ class Observer:
         covariance[bias, bias] = covariance[velocity, velocity] + variance
 
     def predict(self, time_s: float) -> PredictedState:
-        """The state when the tilt of a command sent at `time_s` begins to act, after the tilt's
-        delay, with the commands sent replayed; `vertical` is the vertical motion after the
-        delay of the thrust.
-        Valid once `ready`."""
+        """Return the state when the tilt of a command sent at `time_s` begins to act, after the
+        delay of the tilt; the commands sent until then are replayed. `vertical` is the vertical
+        motion after the delay of the thrust. Valid once `ready`."""
         tilt_s = time_s + self._vehicle.tilt.delay_s
         thrust_s = time_s + self._vehicle.thrust_delay_s
         numbers = self._propagated(thrust_s).tolist()
@@ -395,7 +395,7 @@ class Observer:
         )
 
     def _propagated(self, time_s: float) -> Array:
-        """A copy of the state, propagated to `time_s`."""
+        """Return a copy of the state, propagated to `time_s`."""
         state = self._state.copy()
         ahead_s = min(max(time_s - self._time_s, 0.0), FARTHEST_S)
         if self._frozen:
@@ -405,8 +405,8 @@ class Observer:
         return state
 
     def _go_to(self, time_s: float, *, complete: bool) -> None:
-        """Propagate state and covariance to `time_s`, or leave them if they are newer. `complete`:
-        position and attitude have arrived, so that the commands can be replayed."""
+        """Propagate state and covariance to `time_s`, unless they are newer. `complete`: whether
+        position and attitude have both arrived, so that commands can be replayed."""
         if time_s <= self._time_s:
             return
         if complete:
@@ -425,21 +425,21 @@ class Observer:
         self._longest_s = min(0.02, 0.25 / (2.0 * damping * frequency))
 
     def _restart(self) -> None:
-        """Take the next attitude and position as they are."""
+        """Restart the filter: the next attitude and position set the state."""
         self._time_s = -math.inf
         self._position_at = self._attitude_at = None
         self._state[THRUST] = self._vehicle.gravity_mps2
         self._forget_errors()
 
     def _forget_errors(self) -> None:
-        """Covariance, disturbance and bias as at the first message."""
+        """Set covariance, disturbance and bias to their values at the first message."""
         self._covariance: Array = np.diag(START_SDS**2)
         self._state[DISTURBANCE : BIAS + 3] = 0.0
         self.estimated.interrupt()
 
     def _accepts(self, time_s: float, last_s: float | None) -> bool:
-        """Whether to use a message of `time_s`, the last of its kind having been of `last_s`;
-        restarts after a long gap."""
+        """Whether to use a message of `time_s`; `last_s` is the time of the last message of its
+        kind. Restarts the filter after a long gap, and keeps the disturbance."""
         now_s = self._time_s
         if abs(time_s - now_s) > LONGEST_GAP_S:
             if time_s < now_s:
