@@ -1,9 +1,9 @@
 """Delay, natural frequency and damping of tilt and yaw from commanded and measured attitude.
 
 The model is s'' = wn^2 (c(t - delay) - s) - 2 z wn s' (`AxisResponse`). A bounded least-squares
-search finds its three parameters; the unknown state at the start and a constant offset are
-projected out. A link loses commands, which makes outliers, so residuals are taken for Student's t
-(Lange, Little and Taylor, 1989). Times in s, tilt in parts of a unit vector, yaw in rad.
+search finds its three parameters; the unknown initial state and a constant offset are projected
+out. Commands lost by the link cause outliers, so residuals are modelled as Student's t (Lange,
+Little and Taylor, 1989). Times are in s, tilt is in components of a unit vector, yaw in rad.
 """
 
 from __future__ import annotations
@@ -49,26 +49,27 @@ from offboard.model.vehicle import (
 
 Array = NDArray[np.float64]
 
-# Parameters in this order, with their bounds and the scale of a step of the search.
+# Indices of the parameters, their bounds, and their scales in the search
 DELAY, FREQUENCY, DAMPING = 0, 1, 2
 LOWER, UPPER = np.array((DELAY_LIMITS_S, FREQUENCY_LIMITS_RADPS, DAMPING_LIMITS)).T
 STEP_SCALES = np.array([0.03, 5.0, 0.3])
-# Start points: the search goes on from the one that explains most.
+# Start points: the search begins at the one with the smallest residuals
 STARTS = np.array(
     [(delay_s, frequency, 0.7) for delay_s in (0.02, 0.08, 0.16, 0.3) for frequency in (4.0, 11.0)]
 )
-# Evaluations of one least-squares search, how often residual weights are computed anew, and the
-# relative change of the cost that ends a search: the weights change more than a finer search.
+# Evaluations of one least-squares search, number of searches with new residual weights, and the
+# relative change of the cost that ends a search (a finer search changes less than the weights do)
 STEPS, ROUNDS, TOLERANCE = 10, 4, 1e-3
-FITTED = 5  # parameters and free motion, of each axis
+FITTED = 5  # fitted numbers per axis: three parameters and two of the free motion
 RELATED_S = 0.3  # time over which an attitude estimator's errors are autocorrelated
-# Model error that no residual shows, as sd of delay (s), frequency (relative) and damping: PX4's
-# loop is not of second order and gives values this far apart for steps, swings and hover.
+# Model error that residuals do not show, as sd of delay (s), frequency (relative) and damping:
+# PX4's loop is not of second order; fits to steps, swings and hover differ this much
 MODEL_SDS = (0.002, 0.025, 0.025)
-# Limits on the motion that the current estimate leaves unexplained: rad, share of the commanded.
+# Limits of the motion that the response in use leaves unexplained: rad, share of the commanded
 UNEXPLAINED, UNEXPLAINED_SHARE = 0.008, 0.3
-OVERDAMPED = 1.5  # least damping
-# Of the delay of an overdamped response: three sd stay below the 0.4 s of a delay that is unknown
+OVERDAMPED = 1.5  # a response with more damping counts as overdamped
+# Largest sd of the delay of an overdamped response: three sd are less than the uncertainty of an
+# unknown delay, 0.4 s
 DELAY_SD_MOST_S = 0.13
 
 
@@ -78,8 +79,8 @@ EXPLAINED = 0.6  # least share of the commanded motion that the fitted response 
 
 @dataclass(frozen=True, slots=True)
 class Unexplained:
-    """What a response leaves unexplained: rms without outliers, and rms of the command about its
-    mean; both in the unit of the signal."""
+    """The part of a signal that a response does not explain: its rms without outliers, and for
+    comparison the rms of the command about its mean; both in the unit of the signal."""
 
     rms: float
     commanded_rms: float
@@ -90,13 +91,13 @@ class Unexplained:
 
     @property
     def contradicts(self) -> bool:
-        """Whether telemetry contradicts the response, of the tilt."""
+        """Whether telemetry contradicts the response (used for the tilt)."""
         return self.rms > self.limit
 
 
 @dataclass(frozen=True, slots=True)
 class ResponseFit:
-    """An identified axis, its lag 2 z / wn, and what it leaves unexplained."""
+    """The identified response of an axis, its lag 2 z / wn, and what it leaves unexplained."""
 
     delay_s: Estimate
     natural_frequency_radps: Estimate
@@ -106,13 +107,14 @@ class ResponseFit:
 
     @property
     def overdamped(self) -> bool:
-        """Whether it is two lags, of 2 z / wn and of about 1 / (2 z wn)."""
+        """Whether the response equals two lags, of about 2 z / wn and 1 / (2 z wn)."""
         return self.damping.value > OVERDAMPED
 
     @property
     def shown(self) -> dict[str, Estimate]:
-        """The constants that the flight shows, by name. Of an overdamped response natural frequency
-        and damping may be at the limits of the search, as little but their ratio shows."""
+        """The constants that the flight determines, by name. It hardly determines more than the
+        ratio of natural frequency and damping of an overdamped response, so that both may be at the
+        limits of the search."""
         if self.overdamped:
             return {"delay_s": self.delay_s, "lag_s": self.lag_s}
         return {
@@ -131,14 +133,16 @@ class ResponseFit:
 
 
 def tilt_signals(trace: Trace) -> tuple[Array, Array, Array, Array]:
-    """Times (N,), thrust directions (N, 2), and when (M,) which (M, 2) were commanded."""
+    """Return times (N,), thrust directions north and east (N, 2), and times (M,) and thrust
+    directions (M, 2) of commands."""
     signals = trace.attitude[:, NORTH : NORTH + 2]
     commands = trace.commands[:, SENT_NORTH : SENT_NORTH + 2]
     return trace.attitude[:, STAMP], signals, trace.commands[:, SENT_AT], commands
 
 
 def yaw_signals(trace: Trace) -> tuple[Array, Array, Array, Array]:
-    """Times (N,), headings (N, 1), and when (M,) which (M, 1) were commanded; rad, unwrapped."""
+    """Return times (N,), headings (N, 1), and times (M,) and headings (M, 1) of commands; rad,
+    unwrapped."""
     signals = np.unwrap(trace.attitude[:, HEADING])[:, None]
     commands = np.unwrap(trace.commands[:, SENT_HEADING])[:, None]
     return trace.attitude[:, STAMP], signals, trace.commands[:, SENT_AT], commands
@@ -146,10 +150,10 @@ def yaw_signals(trace: Trace) -> tuple[Array, Array, Array, Array]:
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """Least commanded motion (rad rms), and the greatest accepted sd of delay (s), natural
-    frequency (relative) and damping. Where the response is overdamped, the limit of the delay is
-    multiplied by the damping, up to DELAY_SD_MOST_S, the second limit is of the lag 2 z / wn, and
-    the third is not used."""
+    """An axis, with the least commanded motion (rad rms) and `sd_limits`, the greatest accepted sd
+    of delay (s), natural frequency (relative) and damping. For an overdamped response the limit of
+    the delay is multiplied by the damping, up to DELAY_SD_MOST_S, the second limit applies to the
+    lag 2 z / wn, and the third is not used."""
 
     name: str
     signals: Callable[[Trace], tuple[Array, Array, Array, Array]]
@@ -165,9 +169,9 @@ YAW = Axis("yaw", yaw_signals, 0.008, (0.04, 0.15, 0.2), wanders=True)
 def fit_axis(
     axis: Axis, trace: Trace, refusals: dict[str, str], delay: Estimate | None = None
 ) -> Generator[None, None, ResponseFit | None]:
-    """The response of TILT (both components of the thrust direction) or YAW, in pieces of some
-    milliseconds. Returns None, and the reason in `refusals` under the axis's name, if `trace` does
-    not determine it. `delay` is what is known of the delay beforehand."""
+    """Fit the response of TILT (both components of the thrust direction) or YAW, in pieces of some
+    milliseconds. Return None, and set the reason in `refusals` under the axis's name, if `trace`
+    does not determine it. `delay` is the prior estimate of the delay."""
     attitudes, commands = len(trace.attitude), len(trace.commands)
     if attitudes < 50 or commands < 3:
         refusals[axis.name] = f"{attitudes} attitudes and {commands} commands are too few"
@@ -188,7 +192,7 @@ def fit_axis(
 
 
 def _refusal(fit: ResponseFit, sd_limits: tuple[float, float, float]) -> str:
-    """Why a fit is rejected, or empty."""
+    """Return why a fit is rejected; empty if it is accepted."""
     left = fit.left
     if left.rms > (1.0 - EXPLAINED) * left.commanded_rms:
         return (
@@ -196,7 +200,7 @@ def _refusal(fit: ResponseFit, sd_limits: tuple[float, float, float]) -> str:
             f"{1e3 * left.commanded_rms:.1f} commanded are unexplained"
         )
     delay_sd_s, frequency_sd, damping_sd = sd_limits
-    if fit.overdamped:  # the delay is hardly told from the lag of 1 / (2 z wn)
+    if fit.overdamped:  # the delay can hardly be distinguished from the lag of 1 / (2 z wn)
         delay_sd_s = min(delay_sd_s * fit.damping.value, DELAY_SD_MOST_S)
     margins = 1e-3 * (UPPER - LOWER)
     least, most = (LOWER + margins).tolist(), (UPPER - margins).tolist()
@@ -220,7 +224,7 @@ def _refusal(fit: ResponseFit, sd_limits: tuple[float, float, float]) -> str:
 
 
 def unexplained(trace: Trace, response: AxisResponse) -> Unexplained:
-    """Tilt in `trace` that `response` does not explain."""
+    """Return the tilt in `trace` that `response` does not explain; zero for a short trace."""
     if len(trace.attitude) < 20 or len(trace.commands) < 3:
         return Unexplained(0.0, 0.0)
     parameters = (response.delay_s, response.natural_frequency_radps, response.damping)
@@ -230,8 +234,8 @@ def unexplained(trace: Trace, response: AxisResponse) -> Unexplained:
 def fit_response(
     problem: ResponseProblem, delay: Estimate | None = None
 ) -> Generator[None, None, ResponseFit]:
-    """The response that explains the signals, at least 50, in two pieces. `delay` is what is known
-    of the delay beforehand."""
+    """Fit the response to the signals, at least 50, in two pieces. `delay` is the prior estimate of
+    the delay."""
     start = problem.search()
     yield
     best, weights, scale = problem.refine(start)
@@ -257,12 +261,12 @@ def fit_response(
 
 
 class ResponseProblem:
-    """Least-squares problem of the measured `signals` (N, axes) at `times` (N,) under `commands`
-    (M, axes) sent at `sent_at` (M,). `commanded_rms`: of the commands that acted within these
-    times, about their mean.
+    """Least-squares problem of the measured `signals` (N, axes) at `times` (N,) with `commands`
+    (M, axes) sent at `sent_at` (M,). `commanded_rms` is the rms about their mean of the commands
+    that acted within these times.
 
-    With `wanders` the errors of the measurement are a random walk, as those of an estimated heading
-    are: their steps are independent, and take the place of the residuals.
+    With `wanders`, the errors of the measurement are a random walk, as those of an estimated
+    heading are. Their steps are independent, so the steps of the residuals are fitted instead.
     """
 
     def __init__(
@@ -286,8 +290,8 @@ class ResponseProblem:
         self.commanded_rms = float(np.sqrt(np.mean(away**2)))
 
     def residual(self, parameters: Array, weights: Array) -> Array:
-        """Signals less response (N, axes), with free motion and a constant offset projected out
-        under `weights` (N,); or their N - 1 steps."""
+        """Return signals minus response (N, axes), or with `wanders` their N - 1 steps. Free motion
+        and a constant offset are projected out with `weights` (N,)."""
         left, basis = self._left_and_basis(parameters)
         if self.wanders:
             left = np.diff(left, axis=0) / self._root_steps
@@ -295,13 +299,13 @@ class ResponseProblem:
         return _projected(left, basis, weights)
 
     def unexplained(self, parameters: Array) -> Unexplained:
-        """What the response leaves of the signals."""
+        """Return the part of the signals that the response does not explain."""
         left, basis = self._left_and_basis(parameters)
         rms = scale_of(_projected(left, basis, np.ones(len(left))))
         return Unexplained(rms, self.commanded_rms)
 
     def _left_and_basis(self, parameters: Array) -> tuple[Array, Array]:
-        """Signals less response (N, axes); free motion and a constant (N, 3)."""
+        """Return signals minus response (N, axes), and free motion and a constant (N, 3)."""
         delay_s, frequency, damping = parameters
         left = self._signals - second_order(
             self._times, self._sent_at, self._commands, delay_s, frequency, damping
@@ -311,13 +315,14 @@ class ResponseProblem:
         return left, basis
 
     def search(self) -> Array:
-        """Parameters (3,) of least squares from the best of STARTS, all samples alike."""
+        """Return the parameters (3,) of least squares with equal weights, searched from the best
+        of STARTS."""
         costs = [np.sum(self.residual(start, self.even_weights) ** 2) for start in STARTS]
         return self._least_squares(STARTS[np.argmin(costs)], self.even_weights)
 
     def refine(self, parameters: Array) -> tuple[Array, Array, float]:
-        """The best parameters (3,) for Student's t residuals, their weights (N,) and scale, which
-        are computed ROUNDS times from the residuals reached."""
+        """Return the best parameters (3,) for Student's t residuals, and the weights (N,) and scale
+        of these, which are computed from the latest residuals in each of ROUNDS searches."""
         weights, loss = self.even_weights, partial(student_t_loss, axes=self._signals.shape[1])
         for _ in range(ROUNDS):
             left = self.residual(parameters, weights)
@@ -341,8 +346,8 @@ class ResponseProblem:
         return found
 
     def covariance(self, best: Array, weights: Array, scale: float) -> Array:
-        """Covariance (3, 3) of an M-estimate (Huber, 1967) with autocorrelated residuals; of least
-        squares for the independent steps of a measurement that wanders."""
+        """Return the covariance (3, 3) of an M-estimate (Huber, 1967) with autocorrelated
+        residuals, or with `wanders` that of least squares with independent residuals."""
         left = self.residual(best, weights)
         count, axes = left.shape
         slopes = approx_fprime(
@@ -365,7 +370,7 @@ class ResponseProblem:
 
 
 def _projected(left: Array, basis: Array, weights: Array) -> Array:
-    """`left` (N, axes) without its parts along `basis` (N, k), under `weights` (N,)."""
+    """Return `left` (N, axes) with `basis` (N, k) projected out, with `weights` (N,)."""
     weighted = basis.T * weights
     gram = weighted @ basis
     gram += np.diag(1e-12 + 1e-9 * np.diag(gram))

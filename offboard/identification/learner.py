@@ -1,15 +1,16 @@
-"""Identification in flight: the steps that show the responses, and one piece of work after each
+"""Identification in flight: the steps that excite the responses, and one piece of work after each
 setpoint.
 
-The flight gives the `Learner` what arrives, what is sent, and the stage that it has entered. After
-each setpoint has left, `learn` does one piece of work of 10 to 20 ms at most:
+The flight passes telemetry, commands and the stage that it has entered to the `Learner`. After each
+setpoint was sent, `learn` does one piece of work of 10 to 20 ms at most:
 
-- the first identification: everything, from the climb and the steps that are flown for it, which
-  are repeated while they do not show the tilt's response;
-- in motion: drag, tilt response and hover thrust, adopted if they are more certain or differ;
-- the tilt of the last seconds is compared with its prediction; see `vehicle_estimate`.
+- First it identifies all constants, from the climb and the steps that are flown for this purpose.
+  The steps are repeated if they do not determine the tilt's response.
+- In motion it identifies drag, tilt response, delay and lag of the thrust, and hover thrust, and
+  adopts those that are more certain or differ from those in use.
+- It compares the tilt of the last seconds with its prediction; see `vehicle_estimate`.
 
-What is new is returned as a `VehicleUpdate`. Times are vehicle time.
+New results are returned as a `VehicleUpdate`. Times are vehicle time.
 """
 
 from __future__ import annotations
@@ -55,8 +56,8 @@ from offboard.model.frames import (
 )
 from offboard.model.vehicle import DelayUncertainty, Vehicle
 
-# Steps are + - - + in four equal parts, so that the vehicle ends where it began, first north, then
-# east; thrust and heading alike: (start, length of one of the four parts), s
+# A step is + - - + in four equal parts, so that the vehicle ends where it began. Each is given as
+# (start, length of one of the four parts), s
 NORTH_S = ((0.0, 0.3), (2.4, 0.2))
 EAST_S = ((1.2, 0.3), (3.2, 0.2))
 THRUST_S = ((0.2, 0.3), (2.2, 0.3))
@@ -64,51 +65,55 @@ HEADING_S = ((0.0, 1.0),)
 LENGTH_S = 4.0
 TILT_RAD = math.radians(2.0)
 THRUST_SHARE = 0.05
-MOST_ROUNDS = 3  # of steps, while the delay that they show has a greater sd than this
+# Steps are flown at most so many times, until the sd of the tilt's delay is at most CERTAIN_S
+MOST_ROUNDS = 3
 CERTAIN_S = 0.01
 
 LIFTED_OFF_S = 0.5  # after this the ground has no effect on the thrust
-SETTLE_S = 1.0  # after an adoption the observer settles
-# Drag: when it is identified first, how often, from how much flight; a smaller change (1/s) is none
+SETTLE_S = 1.0  # the observer needs this time after an adoption
+# Drag: first fit after the start of the motion, interval, length of flight that is fitted, and
+# smallest change (1/s) that is adopted
 DRAG_FIRST_S, DRAG_EVERY_S, DRAG_OVER_S, DRAG_NEWS_PS = 3.0, 0.5, 25.0, 0.03
-# Hover thrust, by the observer: how often it is looked at, and its mean over how long. One that
-# differs by less, as a share and in sds, is not adopted: gusts of 1 m/s move it by 6 %
+# Hover thrust of the observer: interval, length of flight that is averaged, and smallest change, as
+# a share and in sds, that is adopted: gusts of 1 m/s change the hover thrust by 6 %
 HOVER_EVERY_S, HOVER_OVER_S, HOVER_NEWS, HOVER_SDS = 1.0, 6.0, 0.06, 3.0
 HOVER_RELATED_S = 2.0  # time over which its errors are autocorrelated
-# Tilt: identified again while its delay is in doubt or its sd is greater than this
+# Tilt: fitted again while its delay is in doubt or has a greater sd than WELL_KNOWN_S; interval and
+# length of flight
 WELL_KNOWN_S, TILT_EVERY_S, TILT_OVER_S = 0.004, 2.0, 12.0
-# Thrust: first fit after the reference begins, interval; over TILT_OVER_S of flight
+# Thrust: first fit after the start of the motion, interval; from TILT_OVER_S of flight
 THRUST_FIRST_S, THRUST_EVERY_S = 6.0, 2.0
-# Prediction: how often and over how much flight it is compared with the tilt. After two
-# contradictions in a row the vehicle is in doubt
+# Comparison of tilt and prediction: interval and length of flight. Two contradictions in a row put
+# the vehicle in doubt
 COMPARE_EVERY_S, COMPARE_OVER_S = 0.5, 2.0
 
 Work = Generator[None, None, None]
 
 
 class IdentifySettings(Parameters):
-    """Identification in flight."""
+    """Settings of the identification in flight."""
 
     online: bool = True
     excite: bool = True  # False: no steps, identify from climb and reference alone
-    box_m: float = Field(default=0.6, ge=0.1, le=5)  # further from the start the steps end
+    box_m: float = Field(default=0.6, ge=0.1, le=5)  # steps end at this distance from their start
 
 
 class Stage(Enum):
-    """What the flight does, as far as the identification distinguishes it."""
+    """Stage of the flight, as far as the identification distinguishes it."""
 
     OTHER = auto()
-    CLIMB = auto()  # it leaves the ground, or was taken over: what it does from now on counts
+    CLIMB = auto()  # the vehicle lifts off or was taken over; data are collected from here on
     STEPS = auto()
-    MOTION = auto()  # it follows the reference
+    MOTION = auto()  # the vehicle follows the reference
 
 
 @dataclass(frozen=True, slots=True)
 class VehicleUpdate:
-    """What to fly with from the next tick on.
+    """The constants to fly with from the next tick on.
 
-    `vehicle` goes to controller and observer, `uncertainty` to the controller, `cause` says why it
-    is that; `sentences` are for log and user, `record` for the log (empty: nothing new).
+    `vehicle` is for controller and observer, `uncertainty` for the controller; `cause` is the
+    reason for this uncertainty. `sentences` are for log and user, `record` for the log (empty if
+    nothing is new).
     """
 
     vehicle: Vehicle
@@ -119,13 +124,13 @@ class VehicleUpdate:
 
 
 class Learner(VehicleEstimate):
-    """The estimate of one vehicle that is improved during one flight. It is told what arrives and
-    what is sent (`on_...`), and `learn` is called once per tick.
+    """The estimate of one vehicle, improved during one flight. It needs all telemetry and commands
+    (`on_...`); `learn` is called once per tick.
 
     Args:
         vehicle: constants of the vehicle file.
         settings: see `IdentifySettings`.
-        known: what an earlier flight has identified; then no steps are flown.
+        known: the constants that an earlier flight has identified; then no steps are flown.
     """
 
     def __init__(
@@ -143,7 +148,7 @@ class Learner(VehicleEstimate):
         )
         self.identified = self.delay.known
         self._settings = settings
-        # What to fly with as was told last, and whether that was in the turn before
+        # The last update returned, and whether the last call of `learn` returned it
         self._told = VehicleUpdate(self.vehicle, self.uncertainty)
         self._has_told = False
         if not self.identified:
@@ -168,7 +173,7 @@ class Learner(VehicleEstimate):
     # ------------------------------------------------------------------ events
 
     def on_attitude(self, time_s: float, q: tuple[float, float, float, float]) -> None:
-        """An attitude received (ATTITUDE_QUATERNION: body to NED, w first)."""
+        """Store an attitude received (ATTITUDE_QUATERNION: body to NED, w first)."""
         if time_s >= self._climb_s:
             north, east, _ = thrust_direction_from_quaternion(q)
             self._attitudes.add(time_s, north, east, float(heading_from_quaternion(q)))
@@ -179,17 +184,17 @@ class Learner(VehicleEstimate):
         position_ned_m: tuple[float, float, float],
         velocity_ned_mps: tuple[float, float, float],
     ) -> None:
-        """A position received (LOCAL_POSITION_NED)."""
+        """Store a position received (LOCAL_POSITION_NED)."""
         if time_s >= self._climb_s:
             self._positions.add(time_s, *position_ned_m, *velocity_ned_mps)
 
     def on_command(self, time_s: float, command: Command, thrust: float) -> None:
-        """A command sent, and its thrust as a fraction of full throttle."""
+        """Store a command sent; `thrust` is its thrust as a fraction of full throttle."""
         north, east, _ = command.thrust_direction_ned
         self._commands.add(time_s, north, east, thrust, command.heading_rad)
 
     def on_stage(self, stage: Stage, time_s: float) -> None:
-        """The flight has entered `stage`."""
+        """Note that the flight has entered `stage`."""
         self._stage = stage
         if stage is Stage.CLIMB:
             self._climb_s, self.motion_s = time_s, math.inf  # each lap has its own motion
@@ -206,12 +211,13 @@ class Learner(VehicleEstimate):
         return self._settings.online and self._settings.excite and not self.identified
 
     def excited(self, command: Command, time_s: float, error_m: float) -> Command:
-        """In the steps: `command` with its step, until the vehicle leaves the box."""
+        """Return `command` with the step of this time added, unless the vehicle has left the box:
+        unless its distance `error_m` from the reference has exceeded `box_m`."""
         self._left_box = self._left_box or error_m > self._settings.box_m
         return command if self._left_box else excited(command, time_s - self._steps_s)
 
     def finished(self, time_s: float) -> bool:
-        """Whether the steps are over and the observer has settled on what they showed."""
+        """Whether the steps are over and the observer has settled with the new constants."""
         settled = time_s >= self.adopted_s + SETTLE_S
         return self._gave_up or (self.identified and settled)
 
@@ -222,8 +228,8 @@ class Learner(VehicleEstimate):
     # ------------------------------------------------------------------ work, in pieces
 
     def learn(self, time_s: float, hover_thrust: float) -> VehicleUpdate | None:
-        """What to fly with from the next tick on; where nothing is new, do one piece of work and
-        return None. `hover_thrust`: the observer's estimate.
+        """Return the constants to fly with from the next tick on. If nothing is new, do one piece
+        of work and return None. `hover_thrust` is the observer's estimate.
 
         While the link's delay changes with each tick, every other call does a piece of work.
         """
@@ -246,7 +252,7 @@ class Learner(VehicleEstimate):
         return None
 
     def _due(self) -> Work | None:
-        """The work to begin now, if it has several pieces; a single piece is done at once."""
+        """Return the work to begin now if it has several pieces; do work of one piece at once."""
         if not self.identified:
             flown = self._stage is Stage.MOTION and not self._settings.excite
             if self._stage is Stage.STEPS:
@@ -283,14 +289,14 @@ class Learner(VehicleEstimate):
         return known.between(begin_s, self._time_s)
 
     def _identify_all(self) -> Work:
-        """Identify everything from climb and steps, which are repeated if they do not show the
+        """Identify everything from climb and steps. Repeat the steps if they do not determine the
         tilt's response."""
         trace = self._flown_since(self._climb_s + LIFTED_OFF_S)
         found = yield from identify_in_pieces(trace, self.file)
         refusal = found.refusals.get("tilt")
         if found.tilt and found.tilt.delay_s.sd > CERTAIN_S:
             refusal = f"its delay is uncertain: {in_ms(found.tilt.delay_s)}"
-        if refusal and self._settings.excite:  # steps are flown already
+        if refusal and self._settings.excite:  # the advice is useless: steps are flown
             refusal = refusal.removesuffix(FLY_STEPS)
         may_repeat = self._stage is Stage.STEPS and self._rounds < MOST_ROUNDS
         if refusal is not None and may_repeat:
@@ -316,8 +322,8 @@ class Learner(VehicleEstimate):
         self.review_thrust(found, self._time_s)
 
     def _identify_tilt(self) -> Work:
-        """Identify the tilt from the last seconds, without the lift-off and what came before a
-        contradiction, and adopt it if it is better."""
+        """Identify the tilt from the last seconds, without the lift-off and the flight before a
+        contradiction, and adopt the fit if it is better."""
         over_s = self._time_s - TILT_OVER_S
         trace = self._flown_since(max(self._climb_s + LIFTED_OFF_S, over_s, self._doubted_from_s))
         tilt = yield from fit_axis(TILT, trace, {})
@@ -325,7 +331,7 @@ class Learner(VehicleEstimate):
         self.review_tilt(found, unexplained(trace, self.vehicle.tilt), self._time_s)
 
     def _compare_with_prediction(self) -> None:
-        """Compare the tilt of the last seconds with what the constants predict."""
+        """Compare the tilt of the last seconds with the prediction by the constants in use."""
         begin_s = self._time_s - COMPARE_OVER_S
         trace = self._flown_since(begin_s)
         now = unexplained(trace, self.vehicle.tilt)
@@ -335,7 +341,7 @@ class Learner(VehicleEstimate):
 
     def _review_hover(self) -> None:
         """Adopt the mean of the observer's hover thrust if it differs from the one in use twice in
-        a row: mass or battery has changed. A value beyond the bounds is ignored."""
+        a row, because mass or battery has changed. A value out of bounds is ignored."""
         while self._hover[0][0] < self._time_s - HOVER_OVER_S:
             self._hover.popleft()
         if self._hover[0][0] > self._time_s - HOVER_OVER_S + HOVER_EVERY_S:
@@ -353,9 +359,9 @@ class Learner(VehicleEstimate):
 
 
 def excited(command: Command, time_s: float) -> Command:
-    """`command` with the steps at `time_s` since their beginning: tilt by TILT_RAD, heading by
-    twice that, thrust by THRUST_SHARE of itself. A command tilted by more than 64 degrees is
-    returned as it is."""
+    """Return `command` with the steps added, at `time_s` since their start: TILT_RAD in tilt, twice
+    that in heading, THRUST_SHARE of itself in thrust. A command that would be tilted by more than
+    64 degrees is returned unchanged."""
     north, east, _ = command.thrust_direction_ned
     north += math.sin(TILT_RAD) * _step_sign(time_s, NORTH_S)
     east += math.sin(TILT_RAD) * _step_sign(time_s, EAST_S)
@@ -370,7 +376,7 @@ def excited(command: Command, time_s: float) -> Command:
 
 
 def _step_sign(time_s: float, steps: tuple[tuple[float, float], ...]) -> float:
-    """+1, -1, -1, +1 in the four parts of each step, else 0."""
+    """Return +1, -1, -1, +1 in the four parts of each step, else 0."""
     for begin_s, part_s in steps:
         part = math.floor((time_s - begin_s) / part_s + 1e-6)
         if 0 <= part < 4:

@@ -1,10 +1,10 @@
 """Drag, hover thrust, thrust lag and thrust delay from positions, attitudes and commanded thrust.
 
-A Kalman filter per axis follows the reported position under the acceleration that attitude and
-thrust give. It allows for an estimator that wanders and for a disturbance that drifts; its
-innovations are white for the right constants, and least squares on them finds these (maximum
-likelihood; Ljung, System Identification, 1999, 7.4). The reported velocity is not used: on PX4 it
-is not the derivative of the reported position. SI, NED.
+A Kalman filter per axis follows the reported position, with the acceleration that attitude and
+thrust cause. It models an estimator error that wanders and a disturbance that drifts. With the
+right constants its innovations are white; least squares of the innovations finds these constants
+(maximum likelihood; Ljung, System Identification, 1999, 7.4). The reported velocity is not used,
+because on PX4 it is not the derivative of the reported position. SI, NED.
 """
 
 from __future__ import annotations
@@ -37,25 +37,25 @@ from offboard.identification.uncertainty import (
 Array = NDArray[np.float64]
 
 LEAST_NOISE_M = 0.001
-COARSE_SPACING_S = 0.036  # in place of SPACING_S in flight
+COARSE_SPACING_S = 0.036  # used in flight instead of SPACING_S
 SPEED_OVER_S = 0.5  # time over which a speed is measured
 RELATED_S = 2.0  # time over which innovations of a wandering estimator are autocorrelated
-# Time constant of the rate at which the estimated position wanders: estimators smooth it. Taken for
-# white, it added 30 ms to the delay of the thrust, as feedback answers it
+# Time constant of the rate at which the estimated position wanders: estimators smooth it. A model
+# with a white rate added 30 ms to the delay of the thrust, because feedback responds to the wander
 WANDER_S = 0.4
 
 DRAG_UPPER_PS = 5.0
 # Least start values of inverse hover thrust, delay (s), lag (s) and drag (1/s): without a lag the
-# thrust jumps between samples and has no slope.
+# thrust jumps between samples, and its derivative with respect to the delay is zero
 STARTED_FROM = (1.01, 0.005, 0.03, 0.01)
 LAG_UPPER_S, THRUST_DELAY_UPPER_S = 0.4, 0.5
 
 
 class Motion:
-    """Positions of a trace with the attitude at their times, at least `spacing_s` apart.
+    """Positions of a trace, at least `spacing_s` apart, with the attitude at their times.
 
     `times` (N,), `positions` (3, N) NED in m, `direction_ne` (2, N) thrust direction north and
-    east, `b_z` (N,) its part down.
+    east, `b_z` (N,) its down component.
     """
 
     def __init__(self, trace: Trace, spacing_s: float = SPACING_S) -> None:
@@ -72,7 +72,7 @@ class Motion:
         self._sent_thrust = trace.commands[:, SENT_THRUST, None]
 
     def thrust(self, delay_s: float, lag_s: float) -> Array:
-        """Thrust (N,) as a fraction of full throttle, after delay and first-order lag."""
+        """Return the thrust (N,), a fraction of full throttle, after delay and first-order lag."""
         return first_order(self.times, self._sent_at, self._sent_thrust, delay_s, lag_s)[:, 0]
 
     @property
@@ -94,8 +94,8 @@ class Motion:
         return float(np.sqrt(np.mean(np.sum(np.square(moved), axis=0)))) / SPEED_OVER_S
 
     def noise_m(self, axes: slice) -> float:
-        """Sd of the white noise of positions, by third differences, in which motion cancels; at
-        least LEAST_NOISE_M."""
+        """Return the sd of the white noise of positions, from third differences, in which motion
+        cancels; at least LEAST_NOISE_M."""
         third = np.diff(self.positions[axes], n=3)
         return max(scale_of(third) / math.sqrt(20.0), LEAST_NOISE_M)
 
@@ -112,11 +112,11 @@ class Motion:
 # ---------------------------------------------------------------------- Kalman filter
 
 
-# What the filter allows for: wander of the position over times longer than WANDER_S (m) and
-# acceleration that is not modelled (m/s), per root second; sd of the velocity at the start (m/s)
+# Noise of the filter, per root second: wander of the position over times longer than WANDER_S (m)
+# and acceleration that is not modelled (m/s). Sd of the velocity at the start (m/s)
 WANDER_M, ACCELERATION_MPS, START_VELOCITY_MPS = 0.12, 0.1, 3.0
 # Disturbance: drift per root second (m/s^2; PX4: tilt error times g, 0.1), and sd at the start
-# (m/s^2). The vertical one is a part of the hover thrust that is sought.
+# (m/s^2), which is small vertically, because the hover thrust that is fitted contains it
 LATERAL, VERTICAL = (0.08, 0.5), (0.03, 0.001)
 
 
@@ -124,9 +124,9 @@ class PositionFilter:
     """Kalman filter of position, velocity, disturbance and rate of the wander [p, v, d, w], with
     p' = v + w, v' = a - drag v + d, w' = -w / WANDER_S.
 
-    Its gains are those for `drag_ps`, where a search begins; they hardly depend on it. With fixed
+    Its gains are computed for `drag_ps`, where a search begins, and hardly depend on it. With fixed
     gains the variance of the innovations is fixed too, so their sum of squares is a likelihood.
-    `noise_m`: sd of the white noise of positions; `disturbance`: LATERAL or VERTICAL.
+    `noise_m` is the sd of the white noise of positions, `disturbance` is LATERAL or VERTICAL.
     """
 
     def __init__(
@@ -136,7 +136,7 @@ class PositionFilter:
         wander, (drift, start_disturbance) = WANDER_M / WANDER_S, disturbance
         growth = np.diag(np.square((0.0, ACCELERATION_MPS, drift, wander)))
         variance = noise_m**2
-        start_wander = wander**2 * WANDER_S / 2.0  # as it is in the long run
+        start_wander = wander**2 * WANDER_S / 2.0  # stationary variance
         covariance = np.diag((variance, START_VELOCITY_MPS**2, start_disturbance**2, start_wander))
         self._gains = np.empty((len(self._steps_s), 4))
         self._sds = np.empty(len(self._steps_s))
@@ -149,11 +149,11 @@ class PositionFilter:
             self._gains[i], self._sds[i] = gain, math.sqrt(innovation_variance)
 
     def innovations(self, positions: Array, accelerations: Array, drag_ps: float) -> Array:
-        """Normalised innovations (axes, N - 1) for `positions` (axes, N) under `accelerations`
-        (axes, N) without drag, joined by straight lines."""
+        """Return normalised innovations (axes, N - 1) for `positions` (axes, N) and `accelerations`
+        (axes, N) without drag, which are interpolated linearly."""
         transitions = motion_transitions(self._steps_s, drag_ps)
         mean = 0.5 * (accelerations[:, 1:] + accelerations[:, :-1]).T[:, None]
-        # A mean acceleration over a step acts as a disturbance, but does not stay
+        # The mean acceleration over a step acts like a disturbance of this step only
         driven = transitions[:, :, 2:3] * mean
         driven[:, 2] = 0.0
         kept = np.eye(4) - self._gains[:, :, None] * np.array((1.0, 0.0, 0.0, 0.0))
@@ -167,8 +167,8 @@ class PositionFilter:
 
 
 def motion_transitions(steps_s: Array, drag_ps: float) -> Array:
-    """Transitions (N, 4, 4) of [p, v, d, w] with p' = v + w, v' = d - drag v, d' = 0,
-    w' = -w / WANDER_S over `steps_s`."""
+    """Return transitions (N, 4, 4) of [p, v, d, w] over `steps_s` (N,), with p' = v + w,
+    v' = d - drag v, d' = 0, w' = -w / WANDER_S."""
     drag_ps = max(drag_ps, 1e-6)
     transitions = np.zeros((len(steps_s), 4, 4))
     transitions[:, 0, 0] = transitions[:, 2, 2] = 1.0
@@ -184,8 +184,8 @@ def motion_transitions(steps_s: Array, drag_ps: float) -> Array:
 
 
 def fit_drag(motion: Motion, thrust_mps2: Array, start_ps: float) -> Estimate:
-    """Lateral drag per unit of mass, 1/s, searched from `start_ps`; `thrust_mps2` (N,) at the
-    motion's times."""
+    """Fit the lateral drag per unit of mass, 1/s; the search begins at `start_ps`. `thrust_mps2`
+    (N,) is the thrust at the motion's times."""
     start_ps = min(max(start_ps, STARTED_FROM[3]), 0.9 * DRAG_UPPER_PS)
     accelerations = -thrust_mps2 * motion.direction_ne
     lateral = PositionFilter(motion.times, start_ps, motion.noise_m(slice(2)), LATERAL)
@@ -216,9 +216,9 @@ def fit_vertical(
     lag_s: Estimate,
     drag_ps: Estimate,
 ) -> dict[str, Estimate]:
-    """Hover thrust, and delay and lag of the thrust, given where the search for the hover thrust
-    begins and what is known of the others and of the vertical drag beforehand. By name;
-    `thrust_effect_s`, the sum of delay and lag, is better known than its parts."""
+    """Fit hover thrust, and delay and lag of the thrust. The search begins at `hover_thrust`; the
+    other arguments are prior estimates. Return estimates by name. `thrust_effect_s`, the sum of
+    delay and lag, is better determined than its parts."""
     known = (delay_s, lag_s, drag_ps)
     means = np.array([each.value for each in known])
     sds = np.array([each.sd for each in known])
@@ -234,7 +234,7 @@ def fit_vertical(
         surprises: Array = vertical.innovations(heights, only, drag)[0]
         return surprises
 
-    # What is known counts as one innovation of the size that they have
+    # Each prior counts as one innovation; its weight follows the rms of the innovations
     scale = min(float(np.sqrt(np.mean(innovations(start) ** 2))), 1.0)
     found = least_squares(
         lambda x: np.concatenate((innovations(x), scale * (x[1:] - means) / sds)),

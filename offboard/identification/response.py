@@ -1,8 +1,8 @@
 """Exact responses of first- and second-order loops to commands that are held until the next one.
 
 Between two commands the loop decays freely towards the command in force, so the matrix exponential
-takes its state from one command to the next and from there to any sample (zero-order hold). Times
-in s, signals in any unit.
+propagates its state from one command to the next, and from there to any sample (zero-order hold).
+Times are in s, signals in any unit.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ Transition = Callable[[Array], Array]  # times (N,) to matrix exponentials (N, n
 
 
 def linear_recursion(transitions: Array, inputs: Array) -> Array:
-    """States x (N, n, k) with x[0] = b[0] and x[i + 1] = A[i] x[i] + b[i + 1].
+    """Return states x (N, n, k) with x[0] = b[0] and x[i + 1] = A[i] x[i] + b[i + 1].
 
-    `transitions` (N - 1, n, n) are the A, `inputs` (N, n, k) the b. All equations are solved at
-    once, as one banded triangular system.
+    `transitions` (N - 1, n, n) are the A, `inputs` (N, n, k) the b. All equations are solved
+    together, as one banded triangular system.
     """
     count, n = inputs.shape[:2]
     bands = np.zeros((2 * n, n * count))
@@ -36,10 +36,10 @@ def linear_recursion(transitions: Array, inputs: Array) -> Array:
 def held_response(
     times: Array, sent_at: Array, commands: Array, delay_s: float, transition: Transition
 ) -> Array:
-    """Response (N, axes) at `times` (N,) to `commands` (M, axes) sent at `sent_at` (M,).
+    """Return the response (N, axes) at `times` (N,) to `commands` (M, axes) sent at `sent_at` (M,).
 
-    Each command acts `delay_s` after it was sent; the loop is at rest on the first one. The state
-    is the distance from the command in force and its derivatives, which decay by `transition`.
+    Each command acts `delay_s` after it was sent; the loop starts at rest at the first command. The
+    state, the difference from the command in force and its derivatives, decays by `transition`.
     """
     decays = transition(np.diff(sent_at))
     steps = np.zeros((len(sent_at), decays.shape[1], commands.shape[1]))
@@ -55,7 +55,7 @@ def held_response(
 def first_order(
     times: Array, sent_at: Array, commands: Array, delay_s: float, lag_s: float
 ) -> Array:
-    """Response (N, axes) of s' = (c(t - delay) - s) / lag."""
+    """Return the response (N, axes) of s' = (c(t - delay) - s) / lag."""
     rate = 1.0 / max(lag_s, 1e-6)
     return held_response(
         times, sent_at, commands, delay_s, lambda h: np.exp(-rate * h)[:, None, None]
@@ -65,14 +65,14 @@ def first_order(
 def second_order(
     times: Array, sent_at: Array, commands: Array, delay_s: float, frequency: float, damping: float
 ) -> Array:
-    """Response (N, axes) of s'' = wn^2 (c(t - delay) - s) - 2 z wn s'."""
+    """Return the response (N, axes) of s'' = wn^2 (c(t - delay) - s) - 2 z wn s'."""
     return held_response(
         times, sent_at, commands, delay_s, lambda h: free_motion(h, frequency, damping)
     )
 
 
 def free_motion(times: Array, frequency: float, damping: float) -> Array:
-    """exp(A t) (N, 2, 2) of A = [[0, 1], [-wn^2, -2 z wn]], as f0 I + f1 A."""
+    """Return exp(A t) (N, 2, 2) for A = [[0, 1], [-wn^2, -2 z wn]], as f0 I + f1 A."""
     decay = damping * frequency
     root = frequency * np.sqrt(max(abs(damping**2 - 1.0), 1e-14))
     if damping < 1.0:

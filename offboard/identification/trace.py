@@ -1,7 +1,7 @@
 """A stretch of flight as arrays: commands sent, attitudes and positions received.
 
 All times are vehicle time in s; the stamp of a command is that of the newest telemetry when it was
-sent. Shapes: N samples or M commands in the order of their stamps. NED, SI.
+sent. Arrays have N samples or M commands, in the order of their stamps. NED, SI.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# Columns.
+# Columns of commands, attitudes and positions, and their number
 SENT_AT, SENT_NORTH, SENT_THRUST, SENT_HEADING, COMMAND_WIDTH = 0, 1, 3, 4, 5
 STAMP, NORTH, EAST, HEADING, ATTITUDE_WIDTH = 0, 1, 2, 3, 4
 POSITION, VELOCITY, POSITION_WIDTH = slice(1, 4), slice(4, 7), 7
@@ -54,7 +54,7 @@ class Trace:
         return max(seconds, 0.0) if math.isfinite(seconds) else 0.0
 
     def between(self, begin_s: float, end_s: float) -> Trace:
-        """Telemetry from `begin_s` to `end_s`, and all commands sent until `end_s`."""
+        """Return the telemetry from `begin_s` to `end_s`, and all commands sent until `end_s`."""
         return Trace(
             self.commands[self.commands[:, SENT_AT] <= end_s],
             *(
@@ -65,8 +65,9 @@ class Trace:
 
 
 def clean(commands: Array, attitude: Array, position: Array) -> Trace:
-    """A Trace from rows in the order of arrival. Rows that are not finite or not newer than the one
-    before are left out; of commands with one stamp the last is kept."""
+    """Return a Trace of rows in the order of arrival. Rows that are not finite, telemetry that is
+    not newer and commands that are older than those before are omitted; of commands with the same
+    stamp the last is kept."""
     commands, attitude, position = (
         rows[np.isfinite(rows).all(axis=1)] for rows in (commands, attitude, position)
     )
@@ -76,17 +77,17 @@ def clean(commands: Array, attitude: Array, position: Array) -> Trace:
 
 
 def _newer(rows: Array) -> Array:
-    """Rows that are newer than all before."""
+    """Return the rows that are newer than all before."""
     newest = np.maximum.accumulate(rows[:, STAMP])
     newer: Array = rows[rows[:, STAMP] > np.append(-np.inf, newest)[: len(rows)]]
     return newer
 
 
-SPACING_S = 0.018  # closer samples are left out: motion and responses are slower
+SPACING_S = 0.018  # closer samples are omitted, because motion and responses are slower
 
 
 def thinned(stamps: Array, spacing_s: float) -> NDArray[np.intp]:
-    """Indices of rows at least `spacing_s` apart."""
+    """Return the indices of rows at least `spacing_s` apart."""
     kept: list[int] = []
     last = -math.inf
     for row, stamp in enumerate(stamps.tolist()):
@@ -97,7 +98,7 @@ def thinned(stamps: Array, spacing_s: float) -> NDArray[np.intp]:
 
 
 class Rows:
-    """The last `capacity` to twice `capacity` rows of `width` numbers."""
+    """Keeps the last rows of `width` numbers: at least `capacity`, at most twice as many."""
 
     def __init__(self, width: int, capacity: int = 3750) -> None:  # 30 s at 125 Hz
         self._capacity = capacity

@@ -1,9 +1,9 @@
-"""An identified constant with its standard deviation, and the statistics of residuals behind it.
+"""An identified constant with its standard deviation, and the statistics of residuals for it.
 
-Residuals are autocorrelated over the time in which an estimator's error wanders, so the covariance
-of a fit is the sandwich of Newey and West (1987): the curvature of the cost around the long-run
-covariance of its gradient. Where residuals have outliers, they are taken for Student's t (Lange,
-Little and Taylor, 1989), with one weight for all axes of a sample.
+Residuals are autocorrelated because the error of an estimator wanders slowly. The covariance of a
+fit is therefore the sandwich of Newey and West (1987): inverse curvature of the cost, long-run
+covariance of its gradient, inverse curvature. Residuals with outliers are modelled as Student's t
+(Lange, Little and Taylor, 1989), with one weight for all axes of a sample.
 """
 
 from __future__ import annotations
@@ -22,29 +22,29 @@ LEAST_SCALE = 2e-4  # of residuals: smaller ones all have the same weight
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A value and its standard deviation, both in the unit that the field's name ends with; the
-    latter is infinite where nothing is known."""
+    """A value and its standard deviation, both in the unit at the end of the name of a variable or
+    field; the latter is infinite if nothing is known."""
 
     value: float
     sd: float
 
     @property
     def known(self) -> bool:
-        """Whether it is known at all."""
+        """Whether the standard deviation is finite."""
         return math.isfinite(self.sd)
 
 
 def lag_count(related_s: float, spacing_s: float, samples: int) -> int:
-    """Number of lags over which samples `spacing_s` apart count as autocorrelated."""
+    """Return the number of lags over which samples `spacing_s` apart count as autocorrelated."""
     return min(max(round(related_s / max(spacing_s, 1e-4)), 1), samples // 4)
 
 
 def long_run_covariance(scores: Array, lags: int) -> Array:
-    """Covariance (k, k) of the sum of an autocorrelated series `scores` (N, k), with Bartlett
-    weights that fall to zero after `lags`.
+    """Return the covariance (k, k) of the sum of an autocorrelated series `scores` (N, k), with
+    Bartlett weights that fall to zero after `lags`.
 
-    A fit has made the sum of `scores` zero, which hides as large a share of the covariance as the
-    weights are on average; it is restored (Kiefer and Vogelsang, 2005).
+    A fit makes the sum of `scores` zero. This reduces the covariance by a share that equals the
+    mean of the weights; the result is corrected for it (Kiefer and Vogelsang, 2005).
     """
     count = len(scores)
     covariance, weights = scores.T @ scores, float(count)
@@ -58,20 +58,20 @@ def long_run_covariance(scores: Array, lags: int) -> Array:
 
 
 def sandwich(curvature: Array, scores_covariance: Array) -> Array:
-    """Covariance (k, k) of estimates from the curvature J'J of their cost and the covariance of
-    its gradient."""
+    """Return the covariance (k, k) of estimates from the curvature J'J of their cost and the
+    covariance of its gradient."""
     inverse = np.linalg.pinv(curvature)
     covariance: Array = inverse @ scores_covariance @ inverse
     return covariance
 
 
 def scale_of(residuals: Array) -> float:
-    """Standard deviation without outliers, from the median of the magnitudes."""
+    """Return the standard deviation without outliers, from the median of the magnitudes."""
     return max(float(np.median(np.abs(residuals))) / 0.6745, LEAST_SCALE)
 
 
 def student_t_weights(residuals: Array, scale: float) -> Array:
-    """Weights (N,) of `residuals` (N, axes)."""
+    """Return the weights (N,) of `residuals` (N, axes)."""
     axes = residuals.shape[1]
     far = FREEDOM + np.sum(residuals**2, axis=1) / scale**2
     weights: Array = (FREEDOM + axes) / far
@@ -79,8 +79,8 @@ def student_t_weights(residuals: Array, scale: float) -> Array:
 
 
 def student_t_loss(squares: Array, axes: int) -> Array:
-    """`loss` of scipy.optimize.least_squares: loss and its two derivatives (3, N axes) for squares
-    (N axes,) of scaled residuals."""
+    """The `loss` function for scipy.optimize.least_squares: return the loss and its two derivatives
+    (3, N axes) for `squares` (N axes,) of scaled residuals."""
     far = FREEDOM + squares.reshape(-1, axes).sum(axis=1)
     slope = (FREEDOM + axes) / far
     loss = (FREEDOM + axes) / axes * np.log(far / FREEDOM)

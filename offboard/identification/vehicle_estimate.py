@@ -1,10 +1,10 @@
-"""What one vehicle is, and how sure of its delays: the estimate that fits and the link change.
+"""The constants of one vehicle and the uncertainty of its delays, updated by fits and by the link.
 
-It begins with the vehicle file, or with what an earlier flight has identified. A fit is adopted if
-it is within bounds, and more certain than the value in use or confirmed to differ from it; of the
-drag also one that is nearly as certain. Telemetry that contradicts the constants in use makes the
-delay uncertain at once, until a fit explains the flight. `vehicle` and `uncertainty` are the
-result. It knows no control law. Times are vehicle time.
+The estimate begins with the vehicle file, or with the constants that an earlier flight has
+identified. A fit is adopted if it is within bounds and either more certain than the value in use or
+confirmed to differ from it; a drag also if it is nearly as certain. If telemetry contradicts the
+constants in use, the delay becomes uncertain at once, until a fit explains the flight. `vehicle`
+and `uncertainty` are the result. This module knows no control law. Times are vehicle time.
 """
 
 from __future__ import annotations
@@ -27,34 +27,34 @@ from offboard.identification.vehicle_fit import (
 )
 from offboard.model.vehicle import DelayUncertainty, Vehicle
 
-# What a delay may be wrong by: of a vehicle file in general, where a response that is slower counts
-# as a delay, too
+# Uncertainty of a delay: that of a vehicle file before identification, which also has to cover a
+# response slower than the file's
 UNKNOWN_DELAY_S = 0.4
-FILE_DELAY_S = 0.13  # of a vehicle file that is flown as it is
-DOUBTED_DELAY_S = 0.28  # of a tilt that was fitted or flown, and that telemetry contradicts
-SDS = 3.0  # standard deviations by which an identified delay may be wrong
-THRUST_SD_S = math.hypot(THRUST_DELAY_SD_S, THRUST_LAG_SD_S)  # before a fit
-DIRECT_LINK_S = 0.004  # link delay without a slow link: age of telemetry
-LINK_DIGITS = 2  # of seconds: a smaller change of the link is ignored
+FILE_DELAY_S = 0.13  # that of a vehicle file that is flown without identification
+DOUBTED_DELAY_S = 0.28  # that of a tilt which was fitted or flown and which telemetry contradicts
+SDS = 3.0  # that of an identified delay, in standard deviations
+THRUST_SD_S = math.hypot(THRUST_DELAY_SD_S, THRUST_LAG_SD_S)  # of delay plus lag, before a fit
+DIRECT_LINK_S = 0.004  # delay of a fast link: age of telemetry
+LINK_DIGITS = 2  # delays of the link are rounded to 10 ms: smaller changes are ignored
 # After so many contradictions the delay stays uncertain until nothing contradicts for CALM_S
 MOST_CONTRADICTIONS, CALM_S = 2, 20.0
 # A new tilt fit replaces the old one if its delay's sd, or in doubt the tilt that it leaves
 # unexplained, is less than this share of the old one's
 BETTER = 0.7
-VAGUE = 2.0  # an sd is itself known to within this factor
-LINK_CHANGE_S = 0.1  # a link that changed by more explains a tilt that is not as predicted
+VAGUE = 2.0  # uncertainty of an sd, as a factor
+LINK_CHANGE_S = 0.1  # a larger change of the link's delay explains a tilt that is not as predicted
 LEAST_JUMP_S, JUMP_SDS = 0.015, 4.0  # delays that differ by more contradict each other
 FACTOR = 4.0  # greatest ratio, either way, of an identified constant to the vehicle file's
-DECISIVE = ("tilt", "hover_thrust")  # out of bounds, these end the flight
-LINKED = ("yaw", "thrust_delay_s")  # changed with the tilt's delay where not identified themselves
+DECISIVE = ("tilt", "hover_thrust")  # if one of these is out of bounds, the flight ends
+LINKED = ("yaw", "thrust_delay_s")  # changed with the tilt's delay if not identified themselves
 
 
 @dataclass(frozen=True, slots=True)
 class IdentifiedVehicle:
-    """What a flight has identified, for the next one of the same vehicle. The delays of `vehicle`
-    contain the link's delay of then, `link_s` (telemetry and setpoint together; 0 if it was not
-    measured). `delay_sd_s` is the standard deviation of the tilt's delay; `thrust_sd_s` that of
-    delay and lag of the thrust together, infinite where no fit was adopted."""
+    """The constants identified by a flight, for the next flight of the same vehicle. The delays of
+    `vehicle` contain the link's delay in that flight, `link_s` (telemetry and setpoint together; 0
+    if it was not measured). `delay_sd_s` is the standard deviation of the tilt's delay,
+    `thrust_sd_s` that of the thrust's delay plus lag, infinite if no fit was adopted."""
 
     vehicle: Vehicle
     delay_sd_s: float
@@ -63,18 +63,17 @@ class IdentifiedVehicle:
 
 
 class VehicleEstimate:
-    """One vehicle during one flight.
+    """The estimate of one vehicle during one flight.
 
     Args:
         file: constants of the vehicle file.
-        delay_error_s: what its delays may be wrong by.
-        known: what an earlier flight has identified.
+        delay_error_s: uncertainty of its delays.
+        known: the constants that an earlier flight has identified.
 
-    `vehicle` are the constants to fly with.
-    `sentences` for the user and `record` for the log are what is new; who reads them empties them.
-    `cause` is why the uncertainty of the delay is what it is; empty where a sentence says it.
-    `contradiction` says why the vehicle file must not be flown with, or is empty. `adopted_s`: time
-    of the newest adoption.
+    `vehicle` has the constants to fly with. `sentences` for the user and `record` for the log
+    collect news; their reader empties them. `cause` is the reason for the present uncertainty of
+    the delay, empty if a sentence says it. `contradiction` is the reason why the vehicle file must
+    not be flown, or empty. `adopted_s` is the time of the newest adoption.
     """
 
     def __init__(
@@ -87,23 +86,23 @@ class VehicleEstimate:
         self.cause = self.contradiction = ""
         self.adopted_s = -math.inf
         self._unknown_s = delay_error_s
-        # Standard deviations of what is in use, infinite until it is identified: the tilt's delay,
-        # the thrust's delay and lag together, and the drag by the surest fit of it
+        # Standard deviations of the values in use, infinite until they are identified: the tilt's
+        # delay, the thrust's delay plus lag, and the drag (that of its most certain fit)
         self._delay_sd_s, self._thrust_sd_s = known.delay_sd_s, known.thrust_sd_s
         self._drag_sd_ps = math.inf
-        self._link_s = known.link_s  # the link's, which `vehicle` contains
-        self._link = (0.0, 0.0)  # added since take-off, and changed lately
-        self._doubt_s = 0.0  # what the delay may be wrong by because telemetry contradicts it
+        self._link_s = known.link_s  # delay of the link that `vehicle` contains
+        self._link = (0.0, 0.0)  # increase of the link's delay since take-off, and recent change
+        self._doubt_s = 0.0  # uncertainty of the delay because telemetry contradicts it
         self._contradictions = 0
-        self._calm_from_s = -math.inf  # the time of the last
-        self._other_delay: Estimate | None = None  # seen once, contradicts the one in use
+        self._calm_from_s = -math.inf  # the time of the last contradiction
+        self._other_delay: Estimate | None = None  # fitted once, contradicts the one in use
         self._differed: set[str] = set()  # constants whose newest fit differs from the one in use
         self._replaced: dict[str, Any] = {}  # tilt constants before the last adoption
         self._rejected_drag_ps = math.inf
 
     @property
     def uncertainty(self) -> DelayUncertainty:
-        """What is not known of the delays of `vehicle`."""
+        """The uncertainty of the delays of `vehicle`."""
         added_s, changed_s = self._link
         known_s = SDS * self._delay_sd_s if self.delay.known else self._unknown_s
         thrust_s = SDS * THRUST_SD_S if self.delay.known else self._unknown_s
@@ -114,12 +113,12 @@ class VehicleEstimate:
 
     @property
     def delay(self) -> Estimate:
-        """Delay of the tilt."""
+        """The delay of the tilt."""
         return Estimate(self.vehicle.tilt.delay_s, self._delay_sd_s)
 
     @property
     def _thrust(self) -> Estimate:
-        """Delay and lag of the thrust together."""
+        """The sum of delay and lag of the thrust."""
         effect_s = self.vehicle.thrust_delay_s + self.vehicle.thrust_lag_s
         return Estimate(effect_s, self._thrust_sd_s)
 
@@ -130,7 +129,7 @@ class VehicleEstimate:
 
     @property
     def link_changed(self) -> bool:
-        """Whether the link's delay has just changed: the times of commands before were wrong."""
+        """Whether the link's delay has just changed: times of earlier commands are then wrong."""
         return self._link[1] > LINK_CHANGE_S
 
     @property
@@ -140,7 +139,8 @@ class VehicleEstimate:
 
     @property
     def result(self) -> IdentifiedVehicle | None:
-        """What the next flight may begin with; None if nothing was identified, or in doubt."""
+        """The constants with which the next flight may begin; None if they are not identified or
+        were contradicted."""
         if not self.delay.known or self.contradicted:
             return None
         return IdentifiedVehicle(self.vehicle, self._delay_sd_s, self._link_s, self._thrust_sd_s)
@@ -153,9 +153,9 @@ class VehicleEstimate:
     # ------------------------------------------------------------------ link and take-over
 
     def on_link_delay(self, link: Estimate | None) -> None:
-        """The link's delay, measured before lift-off; None if the vehicle did not answer. It is in
-        every delay of the vehicle. What remains unknown is the vehicle's own delay and the link's
-        scatter."""
+        """Add the link's delay, measured before lift-off, to every delay of the vehicle; None if
+        the vehicle did not answer. The vehicle's own delay and the scatter of the link's delay
+        remain unknown."""
         if link is None:
             return
         if self.delay.known:
@@ -169,7 +169,7 @@ class VehicleEstimate:
         self._unknown_s += JUMP_SDS * link.sd
 
     def _on_other_link(self, link: Estimate) -> None:
-        """Adapt delays of an earlier flight to the present delay of the link."""
+        """Change delays identified in an earlier flight by the change of the link's delay."""
         link_s = max(self._link_s, DIRECT_LINK_S)
         changed_s = link.value - link_s
         changed_s = max(changed_s, -self.vehicle.tilt.delay_s, -self.vehicle.yaw.delay_s)
@@ -182,8 +182,8 @@ class VehicleEstimate:
         )
 
     def on_link_growth(self, added_s: float, changed_s: float) -> None:
-        """The link has added `added_s` to its delay since take-off, which the times of commands
-        contain, and has changed by `changed_s` lately: the delay is not known better."""
+        """Note that the link's delay has grown by `added_s` since take-off, which the times of
+        commands contain, and has recently changed by `changed_s`, which makes it so uncertain."""
         link = round(added_s, LINK_DIGITS), round(changed_s, LINK_DIGITS)
         if self._link == link:
             return
@@ -196,17 +196,17 @@ class VehicleEstimate:
         self.cause = f"the link's delay {of_link}, the tilt's {of_tilt}"
 
     def on_shown(self, constants: Mapping[str, Any]) -> None:
-        """Use constants that the vehicle reports."""
+        """Use `constants` that the vehicle reports, by name."""
         self.vehicle = self.vehicle.model_copy(update=constants)
 
     # ------------------------------------------------------------------ fits
 
     def within_bounds(self, found: Identified) -> tuple[Identified, list[str]]:
-        """What may be adopted, and a sentence about each constant that may not."""
+        """Return what may be adopted, and a sentence about each constant that may not."""
         return within_bounds(found, self.file, FACTOR)
 
     def adopt(self, found: Identified, time_s: float) -> None:
-        """Use what is within bounds from now on."""
+        """Use the constants of `found` that are within bounds from now on."""
         within, sentences = self.within_bounds(found)
         if any(getattr(found, name) and not getattr(within, name) for name in DECISIVE):
             self.contradiction = "; ".join(sentences)
@@ -231,10 +231,9 @@ class VehicleEstimate:
         self.record = found.estimates
 
     def review_drag(self, found: Identified, least_ps: float, time_s: float) -> None:
-        """Adopt a drag (1/s) that differs from the one in use, and from the one that was out of
-        bounds, by more than its sd and `least_ps`. One that is clearly less certain than the drag
-        in use is adopted only if it contradicts that, and the fit before did. `time_s`: vehicle
-        time."""
+        """Adopt a drag (1/s) that differs by more than its sd and `least_ps` from the drag in use,
+        and from the last one that was out of bounds. A drag that is clearly less certain than the
+        one in use is adopted only if it contradicts that, and the fit before did, too."""
         new = found.drag_ps
         if new is None:
             return
@@ -252,7 +251,7 @@ class VehicleEstimate:
             self.adopt(found, time_s)
 
     def _again(self, constant: str, differs: bool) -> bool:
-        """Whether this fit of a constant `differs` from the one in use, and the one before did."""
+        """Whether this fit of a constant `differs` from the value in use, and the last one did."""
         again = differs and constant in self._differed
         if differs and not again:
             self._differed.add(constant)
@@ -261,9 +260,9 @@ class VehicleEstimate:
         return again
 
     def review_thrust(self, found: Identified, time_s: float) -> None:
-        """Adopt a later fit of the thrust that is clearly more certain, or the second in a row that
-        differs from the one in use. During the steps the estimated height drifts, and feedback
-        against it hides a part of the response."""
+        """Adopt a later fit of the thrust if it is clearly more certain, or if it is the second in
+        a row that differs from the values in use. Later fits are better than the first one, because
+        during the steps the estimated height drifts, and feedback hides a part of the response."""
         new, known = found.thrust_effect_s, self._thrust
         if new is None or self.within_bounds(found)[1]:
             return
@@ -276,7 +275,7 @@ class VehicleEstimate:
 
     def review_tilt(self, found: Identified, now: Unexplained, time_s: float) -> None:
         """Compare a later fit of the tilt with the constants in use, and adopt it if it is better.
-        `now` is what these leave unexplained in the same stretch of flight."""
+        `now` is the tilt that the latter leave unexplained in the same stretch of flight."""
         tilt = found.tilt
         if now.contradicts:
             self._calm_from_s = time_s
@@ -301,7 +300,7 @@ class VehicleEstimate:
             self.explain()
 
     def explain(self, refusal: str = "") -> None:
-        """Set `cause` for the delay as identified so far; `refusal`: why it was not identified."""
+        """Set `cause` to the identified delay, or to `refusal`, why it is not identified."""
         if not self.delay.known:
             self.cause = f"tilt response not identified, {refusal}"
             return
@@ -309,8 +308,8 @@ class VehicleEstimate:
         self.cause = f"identified delay of the tilt {in_ms(self.delay)}{thrust}"
 
     def _confirmed(self, tilt: ResponseFit, now: Unexplained) -> bool:
-        """Whether something besides this fit shows a changed delay: an earlier fit that agrees, or
-        a contradiction that this fit explains."""
+        """Whether something else than this fit shows a changed delay: an earlier fit that agrees,
+        or a contradiction that this fit explains."""
         if self._other_delay is not None:
             return not _apart(tilt.delay_s, self._other_delay, JUMP_SDS)
         once = 0 < self._contradictions < MOST_CONTRADICTIONS
@@ -323,9 +322,9 @@ class VehicleEstimate:
         self.sentences.append(f"tilt delay {in_ms(seen)} contradicts the identified {in_ms(known)}")
 
     def on_contradiction(self, now: Unexplained, before: Unexplained, time_s: float) -> None:
-        """The tilt does not respond as predicted: its delay may be anything. `now` and `before` are
-        what the constants in use and the ones before them leave unexplained; the latter are used
-        again if they explain more."""
+        """Doubt the delay of the tilt, because the tilt does not respond as predicted. `now` and
+        `before` are the tilt left unexplained by the constants in use and by those before them;
+        the latter are used again if they explain more."""
         self._doubt_s, self.cause = max(self._doubt_s, DOUBTED_DELAY_S), ""
         self._contradictions += 1
         self._calm_from_s = time_s
@@ -344,7 +343,7 @@ class VehicleEstimate:
 
 
 def _apart(one: Estimate, other: Estimate, sds: float) -> bool:
-    """Whether two delays contradict each other, by so many standard deviations."""
+    """Whether two delays differ by more than `sds` standard deviations and LEAST_JUMP_S."""
     allowed_s = max(LEAST_JUMP_S, sds * math.hypot(one.sd, other.sd))
     return abs(one.value - other.value) > allowed_s
 

@@ -1,8 +1,8 @@
 """All constants of one vehicle that a stretch of its flight determines, each with its uncertainty.
 
-What the flight does not determine stays None, and a sentence says why: a hover without steps shows
-no attitude response, drag needs motion, and the thrust's lag needs a thrust that varies. The fits
-run in pieces of some milliseconds, so that each can be done between two control ticks.
+Constants that the flight does not determine stay None, with a sentence that says why: the attitude
+response needs steps, the drag needs motion, and the thrust's lag needs a thrust that varies. The
+fits run in pieces of some milliseconds, so that each piece can be done between two control ticks.
 """
 
 from __future__ import annotations
@@ -36,20 +36,22 @@ Result = TypeVar("Result")
 Pieces = Generator[None, None, Result]
 
 LEAST_SECONDS = 2.0
-# Least motion: horizontal speed, rms; change of thrust, rms, as a fraction of the hover thrust.
+# Least motion: horizontal speed, rms; change of thrust, rms, as a fraction of the hover thrust
 LEAST_SPEED_MPS, LEAST_THRUST_CHANGE = 0.4, 0.015
-# Greatest accepted standard deviations; of the hover thrust as a fraction of it.
+# Greatest accepted standard deviations; that of the hover thrust is relative
 DRAG_SD_PS, HOVER_SD, EFFECT_SD_S = 0.2, 0.02, 0.1
 DRAG_PRIOR_PS = Estimate(0.6, 0.4)
 THRUST_EFFECT = ("thrust_lag_s", "thrust_delay_s", "thrust_effect_s")  # accepted together
-# A link adds the same to all delays. These are the sd of what remains of the delays of yaw and
-# thrust, of the thrust's lag, and of the link's delay while the tilt is not identified.
+# A link adds the same to all delays. Prior sd of the delays of yaw and thrust without the link, of
+# the thrust's lag, and of the link's delay while the tilt is not identified
 YAW_DELAY_SD_S, THRUST_DELAY_SD_S, THRUST_LAG_SD_S, LINK_SD_S = 0.1, 0.03, 0.05, 0.15
 
-LAG_MOST_S = 1.5  # of an overdamped response, or the factor; ArduCopter with ATC_INPUT_TC 1 has 1 s
-DELAY_SLACK_S = 0.4  # allowed in addition to the factor: a link may be slow
-DRAG_SLACK_PS = 0.3  # a heavy vehicle may have next to none
-LINK_S = 0.03  # a smaller difference of delays is the vehicle's own, not the link's
+# Greatest lag of an overdamped response if the factor allows no more; ArduCopter with ATC_INPUT_TC
+# 1 has 1 s
+LAG_MOST_S = 1.5
+DELAY_SLACK_S = 0.4  # allowed in addition to the factor, because a link may be slow
+DRAG_SLACK_PS = 0.3  # allowed in addition to the factor: a heavy vehicle may have hardly any drag
+LINK_S = 0.03  # smaller differences of delays are attributed to the vehicle, not to the link
 AXES = ("tilt", "yaw")
 AXIS_BOUNDS = {
     "delay_s": (DELAY_LIMITS_S, DELAY_SLACK_S),
@@ -66,7 +68,7 @@ BOUNDS = {f"{axis}_{name}": AXIS_BOUNDS[name] for axis in AXES for name in AXIS_
 
 
 def _constant(of: Any, name: str) -> Any:
-    """The constant `name` of BOUNDS of a vehicle, or the estimate of it in what was identified."""
+    """Return the constant `name` of BOUNDS of a vehicle, or its estimate of an `Identified`."""
     axis, _, rest = name.partition("_")
     if axis not in AXES:
         return getattr(of, name)
@@ -76,11 +78,11 @@ def _constant(of: Any, name: str) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Identified:
-    """Constants identified from `seconds` of flight. What could not be identified is None, and
-    `refusals` has the reason under the field's name.
+    """Constants identified from `seconds` of flight. A constant that could not be identified is
+    None, and `refusals` has the reason under the field's name.
 
-    Delays run from the vehicle time of the newest telemetry when a command is sent to its effect.
-    `thrust_effect_s`, the sum of the thrust's delay and lag, is better known than its parts.
+    Delays count from the vehicle time of the newest telemetry when a command is sent to its effect.
+    `thrust_effect_s`, the sum of the thrust's delay and lag, is better determined than its parts.
     """
 
     seconds: float
@@ -95,7 +97,7 @@ class Identified:
 
     @property
     def estimates(self) -> dict[str, Estimate | None]:
-        """By the names of `BOUNDS`."""
+        """The estimates by the names of `BOUNDS`."""
         return {name: _constant(self, name) for name in BOUNDS}
 
     @property
@@ -104,7 +106,7 @@ class Identified:
         return any(self.estimates.values())
 
     def applied_to(self, vehicle: Vehicle) -> Vehicle:
-        """`vehicle` with the identified constants; the others stay as they are."""
+        """Return `vehicle` with the identified constants; the others stay as they are."""
         found = {axis: fit.response for axis in AXES if (fit := getattr(self, axis))}
         for name in ("hover_thrust", "thrust_lag_s", "thrust_delay_s"):
             if estimate := getattr(self, name):
@@ -123,8 +125,8 @@ def identify(trace: Trace, vehicle: Vehicle) -> Identified:
             delays of tilt, yaw and thrust differ from each other.
 
     Returns:
-        The constants with standard deviations, and the reasons for those that are missing. Nothing
-        is raised, whatever the flight contains.
+        The constants with standard deviations, and the reasons for those that are missing. No
+        flight data raises an exception.
 
     Example:
         found = identify(clean(commands, attitude, position), vehicle)
@@ -134,7 +136,7 @@ def identify(trace: Trace, vehicle: Vehicle) -> Identified:
 
 
 def completed(pieces: Pieces[Result]) -> Result:
-    """The result of work in pieces, done at once."""
+    """Do all pieces at once and return the result."""
     while True:
         try:
             next(pieces)
@@ -144,7 +146,7 @@ def completed(pieces: Pieces[Result]) -> Result:
 
 
 def identify_in_pieces(trace: Trace, vehicle: Vehicle) -> Pieces[Identified]:
-    """`identify`, some milliseconds of work at each step."""
+    """Do `identify` in pieces, with some milliseconds of work in each."""
     refusals: dict[str, str] = {}
     seconds = trace.seconds
     if seconds < LEAST_SECONDS:
@@ -183,8 +185,8 @@ def _thrust(motion: Motion, vertical: dict[str, Estimate]) -> Array:
 
 
 def identify_drag(trace: Trace, vehicle: Vehicle) -> Identified:
-    """The drag alone, given the other constants of `vehicle`; some milliseconds for 25 s of
-    flight."""
+    """Identify the drag alone, with the other constants of `vehicle`. This takes some milliseconds
+    for 25 s of flight."""
     motion, found = _coarse_motion(trace), Identified(trace.seconds)
     if motion is None:
         return found
@@ -194,9 +196,9 @@ def identify_drag(trace: Trace, vehicle: Vehicle) -> Identified:
 
 
 def identify_thrust(trace: Trace, vehicle: Vehicle, delay: Estimate, file: Vehicle) -> Identified:
-    """Delay and lag of the thrust alone, given the drag of `vehicle`; the hover thrust is fitted
-    with them, and not returned. `delay`: that of the tilt, which shows what the link adds to the
-    delays of the vehicle `file`."""
+    """Identify delay and lag of the thrust alone, with the drag of `vehicle`. The hover thrust is
+    fitted too, but not returned. `delay` is that of the tilt, which shows by how much the link
+    increases the delays of the vehicle `file`."""
     motion, found = _coarse_motion(trace), Identified(trace.seconds)
     if motion is None:
         return found
@@ -207,7 +209,7 @@ def identify_thrust(trace: Trace, vehicle: Vehicle, delay: Estimate, file: Vehic
 
 
 def _coarse_motion(trace: Trace) -> Motion | None:
-    """The motion of a stretch of flight; None where it is too short for a fit."""
+    """Return the motion of a stretch of flight, or None if it is too short for a fit."""
     if trace.seconds < LEAST_SECONDS:
         return None
     motion = Motion(trace, COARSE_SPACING_S)
@@ -226,7 +228,7 @@ def _known_drag(drag_ps: float, sd_ps: float = 0.0) -> Estimate:
 
 
 def _of_link(delay: Estimate, vehicle_file: Vehicle) -> Estimate:
-    """Delay that the link adds to those of the vehicle file, by the tilt's delay."""
+    """Return the delay that the link adds to those of the vehicle file, from the tilt's `delay`."""
     sd_s = delay.sd if delay.known else LINK_SD_S
     return Estimate(delay.value - vehicle_file.tilt.delay_s, sd_s)
 
@@ -238,7 +240,8 @@ def _with_link(delay_s: float, own_sd_s: float, link: Estimate) -> Estimate:
 def _drag(
     motion: Motion, thrust_mps2: Array, start_ps: float, refusals: dict[str, str]
 ) -> Estimate | None:
-    """The drag, if the vehicle moved fast enough to show it."""
+    """Return the drag, or None and the reason in `refusals`, for example if the vehicle moved too
+    slowly."""
     speed_mps = motion.speed_mps
     if speed_mps < LEAST_SPEED_MPS:
         refusals["drag_ps"] = (
@@ -259,7 +262,7 @@ def _drag(
 def _accepted_vertical(
     motion: Motion, fit: dict[str, Estimate], refusals: dict[str, str]
 ) -> dict[str, Any]:
-    """Hover thrust, thrust lag and thrust delay, by name, as far as they are certain enough."""
+    """Return hover thrust, thrust lag and thrust delay, by name, if they are certain enough."""
     accepted: dict[str, Any] = {}
     hover, effect = fit["hover_thrust"], fit["thrust_effect_s"]
     if 0.02 < hover.value < 0.95 and hover.sd <= HOVER_SD * hover.value:
@@ -290,8 +293,8 @@ def _accepted_vertical(
 def within_bounds(
     found: Identified, vehicle_file: Vehicle, factor: float
 ) -> tuple[Identified, list[str]]:
-    """`found` without constants that are outside BOUNDS or differ from the vehicle file's by more
-    than `factor`, and a sentence about each of those."""
+    """Return `found` without constants that are outside BOUNDS or differ from the vehicle file's by
+    more than `factor`, and a sentence about each of these."""
     sentences: list[str] = []
     rejected: dict[str, Any] = {}
     for name, estimate in found.estimates.items():
@@ -306,7 +309,7 @@ def within_bounds(
         high = min(greatest, expected * factor + slack)
         response = getattr(found, axis) if axis in AXES else None
         if response and response.overdamped and not name.endswith("delay_s"):
-            # little but the ratio of frequency and damping shows
+            # hardly more than the ratio of frequency and damping is determined
             file = getattr(vehicle_file, axis)
             name, estimate = f"{axis}_lag_s", response.lag_s
             expected = 2.0 * file.damping / file.natural_frequency_radps
@@ -321,15 +324,16 @@ def within_bounds(
 
 
 def _in_words(name: str) -> str:
-    """`tilt frequency` of `tilt_natural_frequency_radps`."""
+    """Return `tilt frequency` for `tilt_natural_frequency_radps`, for example."""
     return " ".join(word for word in name.split("_") if word not in ("natural", "radps", "s", "ps"))
 
 
 def with_link_delay(
     found: Identified, target: Vehicle, vehicle_file: Vehicle, *, thrust_known: bool
 ) -> Vehicle:
-    """`target`, its delays of thrust and heading increased by what the link adds to the tilt's,
-    unless they were identified themselves. `thrust_known`: that of the thrust was."""
+    """Return `target` with its delays of thrust and yaw increased by the delay that the link adds
+    to the tilt, unless they were identified themselves. `thrust_known`: whether that of the thrust
+    was."""
     if found.tilt is None:
         return target
     added_s = found.tilt.delay_s.value - vehicle_file.tilt.delay_s
@@ -344,7 +348,7 @@ def with_link_delay(
 
 
 def summary(found: Identified) -> str:
-    """The identified constants in one line for the user."""
+    """Return the identified constants in one line for the user."""
     parts = []
     for name, fit in (("tilt", found.tilt), ("yaw", found.yaw)):
         if fit is not None:
