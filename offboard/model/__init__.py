@@ -1,1 +1,1 @@
-"""The vehicle as mathematics: frames, states, parameters and dynamics. Arrays only."""
+"""Mathematical model of the vehicle: frames, states, parameters and dynamics. Arrays only."""

@@ -1,4 +1,4 @@
-"""The attitude interface as values: the state when a command takes effect, and the commands."""
+"""Data types of the setpoints: the state when a command takes effect, and the commands."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 @dataclass(frozen=True, slots=True)
 class PredictedVertical:
     """The vertical motion at `time_s` (vehicle time), when the thrust of a command sent now takes
-    effect. Down is positive; `thrust_down_mps2` is the vertical part T b_z of the thrust."""
+    effect. Down is positive; `thrust_down_mps2` is T b_z with the thrust T per unit of mass."""
 
     time_s: float
     position_down_m: float
@@ -28,19 +28,19 @@ class PredictedState:
     Acceleration = g e3 - T b - c v + d, with thrust T, direction b, drag c and disturbance d.
 
     Attributes:
-        time_s: Vehicle time, s: the tick plus the delay of the tilt.
+        time_s: Vehicle time, s: that of the tick plus the delay of the tilt.
         position_ned_m: (3,), in the autopilot's local NED frame.
         velocity_ned_mps: (3,).
         thrust_direction_ned: (3,), unit vector b: the body's down axis in NED, (0, 0, 1) if level.
         thrust_direction_rate_ned_ps: (3,), derivative of b, 1/s.
         heading_rad: Heading of the nose, 0 = north, clockwise, -pi .. pi.
         heading_rate_radps: Its derivative.
-        thrust_mps2: Thrust per unit of mass T that acts, after its lag.
-        disturbance_ned_mps2: (3,), estimated d: wind, wrong mass or hover thrust.
+        thrust_mps2: Thrust per unit of mass T, after its lag.
+        disturbance_ned_mps2: (3,), estimated d, caused by wind or a wrong mass or hover thrust.
         rates_frd_radps: (3,), body rates p, q, r.
-        vertical: The vertical motion at its own time. Thrust acts sooner than tilt; a vertical loop
-            closed on `time_s` would wait for the tilt and, from a difference of about 0.1 s on,
-            oscillate. None: not predicted separately.
+        vertical: The vertical motion at the time when the thrust acts, which is earlier than that
+            of the tilt. A vertical loop that used the state at `time_s` would oscillate if this
+            difference were about 0.1 s or more. None: not predicted separately.
     """
 
     time_s: float
@@ -65,9 +65,9 @@ class Command:
 
     Attributes:
         thrust_mps2: Collective thrust per unit of mass, m/s^2, 0 .. `Vehicle.thrust_max_mps2`;
-            gravity hovers.
+            in hover it equals gravity.
         thrust_direction_ned: Direction of the body's down axis (third axis, FRD) in NED, a unit
-            vector; (0, 0, 1) is level. The thrust acts against it: acceleration =
+            vector; (0, 0, 1) is level. The thrust acts in the opposite direction: acceleration =
             gravity - thrust_mps2 * thrust_direction_ned.
         heading_rad: Heading of the nose, rad, 0 = north, positive clockwise seen from above.
 
@@ -95,6 +95,6 @@ class PositionCommand:
     heading_rate_radps: float
 
     def numbers(self) -> tuple[float, ...]:
-        """All eleven, in this order, which is MAVLink's."""
+        """Return all eleven numbers in this order, which is that of the MAVLink message."""
         vectors = (*self.position_ned_m, *self.velocity_ned_mps, *self.acceleration_ned_mps2)
         return (*vectors, self.heading_rad, self.heading_rate_radps)

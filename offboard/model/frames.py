@@ -1,7 +1,7 @@
 """Rotations between NED and the body (FRD): quaternions, Euler angles, the thrust direction.
 
-A quaternion is [w, x, y, z], Hamilton, unit, and turns FRD components into NED components (the
-convention of ATTITUDE_QUATERNION and SET_ATTITUDE_TARGET). Euler angles are Z-Y-X (yaw psi, pitch
+A quaternion is [w, x, y, z], Hamilton, of unit length, and turns FRD components into NED components
+(as in ATTITUDE_QUATERNION and SET_ATTITUDE_TARGET). Euler angles are Z-Y-X (yaw psi, pitch
 theta, roll phi), rad. The thrust direction b is the third body axis in NED, (0, 0, 1) when level.
 
 All functions are pure and broadcast over leading axes. A single rotation is computed with Python
@@ -85,8 +85,9 @@ def thrust_direction_from_quaternion(quaternion: ArrayLike) -> Array:
 def quaternion_from_thrust_direction(direction_ned: ArrayLike, heading_rad: Any) -> Array:
     """Third body axis b (..., 3) of any length and heading psi (...) -> quaternion (..., 4).
 
-    The body y axis is normal to the plane of b and the heading, hence Euler psi is the heading
-    (also upside down); for b along the y axis of the heading the roll is +-pi/2.
+    The body y axis is normal to the plane of b and the heading direction, so that Euler psi equals
+    the heading, upside down too. If b is normal to the vertical plane of the heading, the roll is
+    +-pi/2.
     """
     north, east, down = _components(direction_ned)
     ahead = north * np.cos(heading_rad) + east * np.sin(heading_rad)
@@ -98,14 +99,15 @@ def quaternion_from_thrust_direction(direction_ned: ArrayLike, heading_rad: Any)
 
 
 def enu(ned: ArrayLike) -> Array:
-    """Vectors (..., 3) in ENU (east, north, up; REP 103), from NED."""
+    """Vectors (..., 3) in NED -> in ENU (east, north, up; REP 103)."""
     north, east, down = _components(ned)
     return _stack(east, north, -down)
 
 
 def flu_in_enu(quaternion: ArrayLike) -> Array:
-    """Quaternion (..., 4) -> that of the FLU body (forward, left, up; REP 103) in ENU: half a turn
-    about the axis between north and east before, and about the forward axis after."""
+    """Quaternion (..., 4) -> quaternion that turns FLU body components (forward, left, up; REP 103)
+    into ENU components: it is multiplied by half a turn about the axis midway between north and
+    east on the left, and by half a turn about the forward axis on the right."""
     w, x, y, z = _components(quaternion)
     half = math.sqrt(0.5)
     return _stack(-half * (w + z), -half * (x + y), half * (y - x), half * (z - w))
@@ -119,7 +121,7 @@ def _half_sine_cosine(angle_rad: Any) -> tuple[Any, Any]:
 
 
 def _components(vectors: ArrayLike) -> Any:
-    """The elements of the last axis: Python floats for a single vector, views (...) for many."""
+    """Return the elements of the last axis: Python floats of one vector, views (...) of many."""
     if isinstance(vectors, tuple) and isinstance(vectors[0], float):
         return vectors
     array = np.asarray(vectors, dtype=np.float64)

@@ -1,7 +1,7 @@
 """Latitude, longitude and altitude <-> metres in the local NED frame of an origin.
 
-The azimuthal equidistant projection on a sphere (J. P. Snyder, Map Projections, 1987, section 25):
-distances from the origin are true, as in PX4's local frame; ArduPilot's are 0.11 % longer.
+Uses the azimuthal equidistant projection on a sphere (J. P. Snyder, Map Projections, 1987, section
+25): distances from the origin are true, as in PX4's local frame; ArduPilot's are 0.11 % longer.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Triple = tuple[float, float, float]
 
 
 class Geodetic(NamedTuple):
-    """A point: degrees, and metres above mean sea level."""
+    """A point: latitude and longitude in degrees, altitude in metres above mean sea level."""
 
     latitude_deg: float
     longitude_deg: float
@@ -25,8 +25,8 @@ class Geodetic(NamedTuple):
 
 
 def position_ned_m(places: ArrayLike, origin: Geodetic) -> NDArray[np.float64]:
-    """North, east and down (..., 3) in m of `places` (..., 3), as in `Geodetic`, relative to
-    `origin`."""
+    """Return north, east and down (..., 3) in m, relative to `origin`, of `places` (..., 3), which
+    are in the units of `Geodetic`."""
     latitude_deg, longitude_deg, altitude_m = np.moveaxis(np.asarray(places, np.float64), -1, 0)
     latitude, reference = np.radians(latitude_deg), math.radians(origin.latitude_deg)
     turn = np.radians(longitude_deg - origin.longitude_deg)
@@ -39,7 +39,7 @@ def position_ned_m(places: ArrayLike, origin: Geodetic) -> NDArray[np.float64]:
 
 
 def origin_of(place: Geodetic, known_ned_m: Triple) -> Geodetic:
-    """The origin relative to which `place` is at `known_ned_m`."""
+    """Return the origin of the local NED frame in which `place` is at `known_ned_m`."""
     metres = math.radians(1.0) * EARTH_RADIUS_M
     shrink = max(math.cos(math.radians(place.latitude_deg)), 1e-6)
     latitude, longitude, altitude = place

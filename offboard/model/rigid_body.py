@@ -1,15 +1,15 @@
-"""The nonlinear rigid body of Eqs. 1-8, forces and torques in, motion out, and its linear model at
+"""The nonlinear rigid body of Eqs. 1-8, which forces and torques move, and its linear model at
 hover, Eqs. 8-18.
 
-One function, `body_accelerations`, holds the physics (Newton-Euler with linear drag); two charts
-around it hold only kinematics: the paper's 12 states (Eq. 5, Euler angles, body velocity) and 13
-states with a quaternion and NED velocity, without singularity, which the simulator integrates. The
-length of the state tells which. A state is an array (..., 12) or (..., 13), inputs (Eq. 6) are
-(..., 4) and total: hover is [m g, 0, 0, 0].
+One function, `body_accelerations`, contains the physics (Newton-Euler with drag). Two charts add
+the kinematics: the paper's 12 states (Eq. 5, Euler angles, body velocity), and 13 states with a
+quaternion and NED velocity, without singularity, which the simulator integrates. The length of the
+state selects the chart. A state is an array (..., 12) or (..., 13), inputs (Eq. 6) are (..., 4) and
+total: hover is [m g, 0, 0, 0].
 
-The simulator, the paper's plant and the linearisation all run this code: compiled, where compiled
-code calls it, and on numpy's arrays, also complex ones for differentiation by complex step, where
-Python does. For attitude setpoints instead of torques, see `axes`. Knows no rotors, ground, sensors
+The simulator, the paper's plant and the linearisation all use this code. Compiled code calls it
+compiled; Python calls it with numpy arrays, also complex ones for differentiation by complex step.
+For attitude setpoints instead of torques, see `axes`. This module knows no rotors, ground, sensors
 or randomness.
 """
 
@@ -38,7 +38,7 @@ INPUT_SIZE: Final = 4
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """The parts of a state along its last axis."""
+    """The layout of a state: the slices of its last axis."""
 
     size: int
     attitude: slice
@@ -60,8 +60,8 @@ _STILL_AIR = np.zeros(3)
 
 def pack(vehicle: Vehicle, quadratic_drag_npmps2: float = 0.0) -> Array:
     """Vehicle -> (13,) parameters of the compiled functions, SI:
-    [mass, gravity, I_x, I_y, I_z, arm, D_t (3), D_r (3), quadratic drag], the last of each body
-    axis by itself, beside the linear D_t.
+    [mass, gravity, I_x, I_y, I_z, arm, D_t (3), D_r (3), quadratic drag], where the quadratic drag
+    acts on each body axis separately, in addition to the linear drag D_t.
     """
     return np.array(
         [
@@ -103,12 +103,12 @@ def derivative(
 
 @kernel
 def body_accelerations(air_velocity: Any, rates: Any, inputs: Any, parameters: Any) -> Any:
-    """Newton and Euler in body axes: the one place where forces and torques are.
+    """Newton-Euler equations in body axes: the only function that computes forces and torques.
 
     `air_velocity` is the velocity relative to the air in body axes, (u, v, w); `rates` (p, q, r).
-    Returns six scalars: specific force (what an accelerometer feels, m/s^2) and angular
+    Returns six scalars: specific force (which an accelerometer measures, m/s^2) and angular
     acceleration (rad/s^2). Lift acts along -z, drag D_t (Eq. 3) on the velocity relative to the
-    air, D_r (Eq. 4) on the rates; quadratic drag acts on each axis by itself.
+    air, D_r (Eq. 4) on the rates; quadratic drag acts on each axis separately.
     """
     u, v, w = air_velocity
     p, q, r = rates
@@ -204,8 +204,8 @@ def quaternion_into(state: Any, inputs: Any, wind_ned: Any, parameters: Any, out
 
 @kernel
 def derivative_into(state: Any, inputs: Any, wind_ned: Any, parameters: Any, out: Any) -> None:
-    """One state (12,) or (13,), inputs (4,), wind (3,) m/s, `pack`ed parameters -> `out`; in Python
-    also many, along further axes."""
+    """One state (12,) or (13,), inputs (4,), wind (3,) m/s, parameters of `pack` -> `out`. In
+    Python, arrays may have further axes, for many states."""
     if state.shape[0] == 12:
         _euler_into(state, inputs, wind_ned, parameters, out)
     else:
@@ -223,8 +223,8 @@ def rk4_into(
     scratch: Any,
     out: Any,
 ) -> None:
-    """One RK4 step of one state into `out`, which may be `state`. `derivative` is
-    `derivative_into`, or `quaternion_into` where only states of 13 numbers come; `scratch` is
+    """Do one RK4 step of one state into `out`, which may be `state`. `derivative` is
+    `derivative_into`, or `quaternion_into` if all states have 13 numbers; `scratch` is
     (3, state size)."""
     slope, total, probe = scratch[0], scratch[1], scratch[2]
     derivative(state, inputs, wind_ned, parameters, total)
@@ -246,9 +246,10 @@ def rk4_into(
 
 
 def hover_matrices(vehicle: Vehicle) -> tuple[Array, Array]:
-    """A (12, 12) and B (12, 4) of Eq. 9 at hover, level, nose north.
+    """Return A (12, 12) and B (12, 4) of Eq. 9 at hover, level, nose north.
 
-    By complex step, f'(x) = Im f(x + ih) / h: exact to rounding, exact zeros where f is decoupled.
+    Computed by complex step, f'(x) = Im f(x + ih) / h, which is exact to rounding, with exact zeros
+    where f is decoupled.
     """
     size = EULER.size
     steps = 1j * _COMPLEX_STEP * np.eye(size + INPUT_SIZE)
@@ -260,7 +261,7 @@ def hover_matrices(vehicle: Vehicle) -> tuple[Array, Array]:
 
 
 def sampled_matrices(vehicle: Vehicle, step_s: float) -> tuple[Array, Array]:
-    """A_d (12, 12) and B_d (12, 4) of Eq. 14: zero-order hold over `step_s` seconds."""
+    """Return A_d (12, 12) and B_d (12, 4) of Eq. 14: zero-order hold over `step_s` seconds."""
     sampled = LinearModel(*hover_matrices(vehicle)).sampled(step_s)
     return sampled.dynamics, sampled.input_map
 

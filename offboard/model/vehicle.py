@@ -1,7 +1,8 @@
 """Parameters of one vehicle: mass, drag, thrust and the response of its attitude loop.
 
-A vehicle file (`config/vehicles/*.yaml`) is one `Vehicle`. The controller uses it as its model; the
-simulated vehicle is made from one too, which may be another. No file is read here.
+A vehicle file (`config/vehicles/*.yaml`) has the fields of `Vehicle`. The controller uses one as
+its model; the simulated vehicle is made from one too, which may be a different one. This module
+reads no file.
 """
 
 from __future__ import annotations
@@ -21,19 +22,19 @@ NonNegativeTriple = tuple[
     Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]
 ]
 
-# Of a file, and of what identification searches and adopts in flight
+# Limits of a vehicle file, and of the constants that identification searches and adopts in flight
 HOVER_THRUST_LIMITS = (0.02, 0.95)
 DELAY_LIMITS_S = (0.0, 0.5)
 FREQUENCY_LIMITS_RADPS = (0.5, 60.0)
 DAMPING_LIMITS = (0.1, 6.0)
-DRAG_PER_MASS_MOST_PS = 100.0  # falls at 0.1 m/s: nothing is left to control
+DRAG_PER_MASS_MOST_PS = 100.0  # terminal velocity 0.1 m/s: no vehicle that can be controlled
 
 
 class AxisResponse(Parameters):
     """Closed attitude loop of one axis: s'' = wn^2 (s_c(t - D) - s) - 2 z wn s'.
 
-    The delay D is the time from the vehicle time of the newest telemetry at the decision to the
-    effect of the command: age of the telemetry, transport and attitude loop in one number.
+    The delay D is the time from the stamp (vehicle time) of the newest telemetry at the decision to
+    the effect of the command: the sum of the delays of telemetry, setpoint and attitude loop.
     """
 
     delay_s: float = Field(ge=DELAY_LIMITS_S[0], le=DELAY_LIMITS_S[1])
@@ -44,13 +45,13 @@ class AxisResponse(Parameters):
 
 
 class Vehicle(Parameters):
-    """Parameters of one multirotor, or, as far as setpoints serve it, of one helicopter. SI units,
+    """Parameters of one multirotor, or of one helicopter as far as setpoints need them. SI units,
     body axes FRD.
 
     A tracking law needs `hover_thrust`, `tilt`, `yaw`, the thrust's delay and lag, the drag and
-    the limits; identification in flight refines them. Inertia and `arm_m` serve the simulator and
-    the paper's law: its inputs (Eq. 6) are [f_t, tau_x, tau_y, tau_z], where roll and pitch are
-    differential forces in N at `arm_m`, or torques in N m with an `arm_m` of 1.
+    the limits; identification in flight refines them. Inertia and `arm_m` are used by the simulator
+    and by the paper's law, whose inputs (Eq. 6) are [f_t, tau_x, tau_y, tau_z]: roll and pitch
+    inputs are differential forces in N at `arm_m`, or torques in N m if `arm_m` is 1.
     """
 
     name: str = Field(min_length=1, max_length=40)
@@ -73,7 +74,7 @@ class Vehicle(Parameters):
     tilt_max_rad: float = Field(default=0.7, ge=0.05, le=1.4)
 
     def later_by(self, delay_s: float) -> Vehicle:
-        """This vehicle behind a link that adds `delay_s` to each of its delays, within their
+        """Return this vehicle with `delay_s` of a link added to each of its delays, within their
         limits."""
         least_s, most_s = DELAY_LIMITS_S
 
@@ -88,7 +89,7 @@ class Vehicle(Parameters):
 
     @property
     def drag_per_mass_ps(self) -> float:
-        """Lateral linear drag per unit of mass, 1/s: c of acceleration = ... - c v."""
+        """Lateral linear drag per unit of mass, 1/s: c in acceleration = ... - c v."""
         return (
             0.5 * (self.drag_translation_npmps[0] + self.drag_translation_npmps[1]) / self.mass_kg
         )
@@ -103,7 +104,8 @@ class Vehicle(Parameters):
 
     @property
     def thrust_min_mps2(self) -> float:
-        """Least collective thrust per unit of mass that is sent in the air, a third of hover."""
+        """Least collective thrust per unit of mass that is sent in the air, m/s^2: a third of that
+        in hover."""
         return self.gravity_mps2 / 3.0
 
     @property
@@ -114,10 +116,10 @@ class Vehicle(Parameters):
 
 @dataclass(frozen=True, slots=True)
 class DelayUncertainty:
-    """What is not known of a vehicle's delays, s.
+    """Uncertainty of a vehicle's delays, s.
 
-    `tilt_s` and `thrust_s`: by how much the true delay may differ, of an identified one three
-    standard deviations. `link_s`: what the link adds to all delays since take-off, which is known
+    `tilt_s` and `thrust_s` are the largest expected errors of the delays, three standard deviations
+    of an identified one. `link_s` is the increase of the link's delay since take-off; it is known
     and compensated by prediction.
     """
 
