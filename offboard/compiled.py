@@ -1,5 +1,5 @@
-"""Compilation by numba: `@kernel` for functions that compiled code calls, `@entry` for those that
-Python calls.
+"""Compilation by numba: `@kernel` for functions that compiled code calls, `@entry` for functions
+that Python calls.
 
     PAIR = np.dtype([("total", "f8"), ("count", "i8")], align=True)
 
@@ -17,9 +17,10 @@ Python calls.
 
     add(np.zeros(1, PAIR), np.ones(3))
 
-The first call of an entry loads its machine code from disk or compiles it, for up to some seconds;
-`prepare` does so before anything that must not wait. Importing a module imports no numba. With
-NUMBA_DISABLE_JIT=1 all run as Python, slowly, and a debugger can step through them.
+The first call of an entry loads its machine code from disk or compiles it, which takes up to some
+seconds; `prepare` does this in advance for all entries. Importing a module with entries does not
+import numba. With NUMBA_DISABLE_JIT=1 all functions run as Python, slowly, and a debugger can step
+through them.
 """
 
 from __future__ import annotations
@@ -46,30 +47,31 @@ Parameter = type[int | float] | np.dtype[Any] | tuple[int, np.dtype[Any]]
 """A number, the dtype of an array of one record, or the dimensions and dtype of an array."""
 
 defined: list[Entry[Any, Any]] = []  # the entries of the modules imported so far
-_kernels: list[Callable[..., Any]] = []  # not yet registered with numba
+_kernels: list[Callable[..., Any]] = []  # kernels not yet registered with numba
 _COMPILES = re.compile(rb"^from offboard\.compiled import .*\b(?:entry|kernel)\b", re.M)
 _IMPORT = re.compile(rb"^from ((?:offboard|simulator)[.\w]+) import", re.M)
 
 
 def kernel(function: F) -> F:
-    """Decorator of a function that entries and other kernels call; from Python it is Python."""
+    """Decorator of a function that entries and other kernels call. Called from Python, it runs as
+    Python."""
     _kernels.append(function)
     return function
 
 
 def array(dimensions: int, dtype: str | np.dtype[Any] = "f8") -> Parameter:
-    """Parameter of an entry: a C-contiguous array."""
+    """Return the parameter of an entry that is a C-contiguous array."""
     return dimensions, np.dtype(dtype)
 
 
 def entry(*parameters: Parameter) -> Callable[[Callable[P, R]], Entry[P, R]]:
-    """Decorator of a function that Python calls. There is one parameter per argument."""
+    """Decorator of a function that Python calls; `parameters` has one for each argument."""
     return lambda function: Entry(function, parameters)
 
 
 class Entry(Generic[P, R]):
-    """A compiled function. Calling it with arguments of other types raises TypeError: in flight
-    nothing is compiled."""
+    """A compiled function. Calling it with arguments of other types raises TypeError, so that
+    nothing is compiled in flight."""
 
     def __init__(self, function: Callable[P, R], parameters: tuple[Parameter, ...]) -> None:
         self.name = f"{function.__module__}.{function.__name__}"
@@ -83,11 +85,11 @@ class Entry(Generic[P, R]):
 
     @property
     def is_compiled(self) -> bool:
-        """Whether its machine code is on disk."""
+        """Whether the machine code is loaded or on disk."""
         return self.machine_code is not None or (directory() / self.name).exists()
 
     def load(self) -> Callable[P, R]:
-        """The machine code, from disk or compiled now."""
+        """Load the machine code from disk, or compile it, and return it."""
         import numba  # takes half a second
         from numba.extending import register_jitable
 
@@ -108,7 +110,7 @@ class Entry(Generic[P, R]):
         return self.machine_code
 
     def _interpreted(self, *args: P.args, **kwargs: P.kwargs) -> R:
-        """The function as Python: a record has its fields as attributes there, too."""
+        """Run the function as Python, with the fields of records as attributes, as in numba."""
         views: Any = (
             each.view(np.recarray) if isinstance(each, np.ndarray) and each.dtype.names else each
             for each in args
@@ -126,8 +128,8 @@ def _numba_type(parameter: Parameter) -> Any:
 
 
 def prepare(tell: Callable[[str], None] = lambda sentence: None) -> None:
-    """Load the entries of all imported modules. `tell` is called with a sentence for the user
-    before they are compiled."""
+    """Load the entries of all imported modules. If any has to be compiled, `tell` is called before
+    with a sentence for the user."""
     if not all(each.is_compiled for each in defined):
         tell("first flight with this code: compiling it to machine code once, about 10 s")
     for each in defined:
@@ -137,13 +139,13 @@ def prepare(tell: Callable[[str], None] = lambda sentence: None) -> None:
 
 @functools.cache
 def directory() -> Path:
-    """Where machine code is kept: below the first of NUMBA_CACHE_DIR, XDG_CACHE_HOME and ~/.cache
-    that is absolute (as the XDG standard requires) and can be written, or in the directory for
-    temporary files.
+    """Return the directory of the machine code: below the first of NUMBA_CACHE_DIR, XDG_CACHE_HOME
+    and ~/.cache that is absolute (as the XDG standard requires) and writable, or else in the
+    directory for temporary files.
 
-    It is named after this installation and version of numba, and after the sources with compiled
-    functions and the modules that these import, because numba compiles an entry again when its own
-    file has changed, but not when that of a kernel or a constant has.
+    Its name is a hash of this installation, the version of numba, the sources with compiled
+    functions and the modules that these import. Numba itself compiles an entry again only if the
+    file of the entry has changed, not if that of a kernel or a constant has.
     """
     root = Path(__file__).parents[1]
     packages = (root / package for package in ("offboard", "simulator"))
@@ -160,7 +162,7 @@ def directory() -> Path:
         if _writable(place := Path(cache) / "pso-offboard" / name):
             return place
     place = Path(tempfile.gettempdir()) / f"pso-offboard-{os.getuid()}-{name}"
-    # everybody writes there: machine code of others is not run
+    # all users can write there: machine code of another user must not be run
     ours = _writable(place) and place.lstat().st_uid == os.getuid()
     return place if ours else Path(tempfile.mkdtemp())
 

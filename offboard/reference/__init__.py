@@ -1,1 +1,1 @@
-"""Trajectories to follow: time -> position, heading and their derivatives -> state and input."""
+"""Reference trajectories: time -> position, heading and derivatives -> state and input."""

@@ -1,4 +1,4 @@
-"""The contract of every reference: position and heading with their derivatives (flat outputs)."""
+"""Interface of every reference: position and heading with their derivatives (flat outputs)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class FlatSample(NamedTuple):
     """A reference at one or several times. NED, SI. The leading shape (...) is that of the time.
 
     Attributes:
-        position_ned_m ... snap_ned_mps4: (..., 3), position and its first four derivatives.
+        position_ned_m ... snap_ned_mps4: (..., 3), position and its first four derivatives by time.
         heading_rad: (...), heading of the nose: 0 = north, clockwise. Continuous along a reference,
             so it may leave -pi .. pi.
         heading_rate_radps, heading_acceleration_radps2: (...), its derivatives.
@@ -32,7 +32,7 @@ class FlatSample(NamedTuple):
     heading_acceleration_radps2: Array
 
     def setpoint(self) -> PositionCommand:
-        """At one time: as a setpoint of the autopilot's position loop."""
+        """Return the setpoint of the autopilot's position loop; for a sample of a single time."""
         position, velocity, acceleration = (
             (float(vector[0]), float(vector[1]), float(vector[2])) for vector in self[:3]
         )
@@ -41,7 +41,7 @@ class FlatSample(NamedTuple):
 
 
 class Reference(Protocol):
-    """A trajectory from time 0 to `duration_s`; before and after it rests at its ends.
+    """A trajectory from time 0 to `duration_s`; before and after that it is at rest at its ends.
 
     Example:
         sample = reference.sample(np.array([0.0, 0.1]))
@@ -50,9 +50,9 @@ class Reference(Protocol):
 
     @property
     def duration_s(self) -> float:
-        """The time at which it comes to rest, s."""
+        """The time at which the trajectory comes to rest, s."""
         ...
 
     def sample(self, time_s: float | Array) -> FlatSample:
-        """Evaluate at `time_s`, a scalar or an array of any shape."""
+        """Return the sample at `time_s`, a scalar or an array of any shape."""
         ...

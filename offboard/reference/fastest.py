@@ -1,9 +1,9 @@
 """The fastest smooth path through given points: the times at which it passes them.
 
-The path between the points is the spline of `path.through`; SLSQP of SciPy chooses the durations of
-its legs with the least sum for which thrust, tilt, its rate and speed stay within limits. Where the
-limits bind on a leg they bind at a moment, not throughout: a path that is as smooth as an attitude
-loop can follow is slower than a bang-bang one.
+The path between the points is the spline of `path.through`. SciPy's SLSQP minimises the sum of the
+durations of its legs, with the constraint that thrust, tilt, tilt rate and speed stay within
+limits. On each leg a limit is reached only at single times, not throughout: a path that is smooth
+enough for an attitude loop is slower than a bang-bang one.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from offboard.reference.path import Smoothness, Spline, Triple, through, times_f
 Array = NDArray[np.float64]
 
 GRAVITY_MPS2 = 9.80665
-SAMPLES = 16  # a leg; of the optimiser, and four times as many of the result
-QUICKEST, SLOWEST = 1e-3, 1e4  # times the durations at 1 m/s: bounds of the first guess
-POINTS_MOST = 40  # two seconds of search, which grow with the square of this number
+SAMPLES = 16  # per leg in the optimiser; the result is checked at four times as many
+QUICKEST, SLOWEST = 1e-3, 1e4  # bounds of the first guess, times the durations at 1 m/s
+POINTS_MOST = 40  # two seconds of search; the time grows with the square of this number
 
 
 class PathLimits(Parameters):
-    """What the path may ask for, of a vehicle with this drag (linear, per unit of mass): speed,
-    thrust per unit of mass, tilt, and how fast the thrust direction turns. What the vehicle has
-    beyond them is left to feedback."""
+    """Limits of the path, for a vehicle with this drag (linear, per unit of mass): speed, thrust
+    per unit of mass, tilt, and the rate at which the thrust direction turns. The vehicle's own
+    limits should be greater, so that feedback has a reserve."""
 
     speed_mps: float = Field(default=10.0, ge=0.1, le=30)
-    thrust_mps2: float = Field(default=14.0, ge=10, le=100)  # just above g a path takes hours
+    thrust_mps2: float = Field(default=14.0, ge=10, le=100)  # just above g, paths last hours
     tilt_deg: float = Field(default=35.0, ge=1, le=80)
     tilt_rate_dps: float = Field(default=150.0, ge=5, le=1000)
     drag_per_mass_ps: float = Field(default=0.3, ge=0, le=2)
@@ -44,11 +44,11 @@ class PathLimits(Parameters):
 def fastest_times(
     points_m: tuple[Triple, ...], smoothness: Smoothness, limits: PathLimits
 ) -> tuple[float, ...]:
-    """Times (N,), s from 0, at which the fastest path passes `points_m`, N of [north, east, up] in
-    m. Each leg takes whole milliseconds; the last ones depend on the computer.
+    """Return the times (N,), s from 0, at which the fastest path passes the N `points_m`, [north,
+    east, up] in m. Each leg takes whole milliseconds; the last digits depend on the computer.
 
-    Raises ValueError like `path.through`, where two neighbours coincide, for more than POINTS_MOST
-    points, and where no durations keep the limits."""
+    Raises ValueError like `path.through`, and if two neighbours coincide, if there are more than
+    POINTS_MOST points, or if no durations keep the limits."""
     if len(points_m) > POINTS_MOST:
         raise ValueError(f"fastest takes at most {POINTS_MOST} points, not {len(points_m)}")
     points = np.array(points_m) * (1.0, 1.0, -1.0)
@@ -59,7 +59,7 @@ def fastest_times(
         return 1.0 - demands(path, limits, samples)
 
     def slowed(durations_s: Array) -> Array:
-        """The same path, as fast as a common factor of its durations allows."""
+        """Return `durations_s` times the smallest common factor that keeps the limits."""
 
         def least(factor: float) -> float:
             return float(room(factor * durations_s, 4 * SAMPLES).min())
@@ -80,15 +80,15 @@ def fastest_times(
         options={"maxiter": 200, "ftol": 1e-5},
     )
     best_s = start_s
-    if np.isfinite(found.x).all():  # without success it may still be better
+    if np.isfinite(found.x).all():  # also without success the result may be better
         best_s = min((start_s, slowed(found.x * start_s)), key=np.sum)
     times_s = np.append(0.0, np.cumsum(np.ceil(1e3 * best_s))) / 1e3
     return tuple(times_s.tolist())
 
 
 def demands(path: Spline, limits: PathLimits, samples: int) -> Array:
-    """The greatest share (legs x 4,) of each limit that the path needs on each leg, at `samples`
-    places of a leg."""
+    """Return the greatest share (legs x 4,) of each limit that the path needs on each leg, among
+    `samples` points of the leg."""
     breaks_s = path.breaks_s
     shares = np.linspace(0.0, 1.0, samples)
     s = (breaks_s[:-1, None] + np.diff(breaks_s)[:, None] * shares).ravel()

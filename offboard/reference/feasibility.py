@@ -1,4 +1,4 @@
-"""Whether a vehicle can fly a reference: checked before anything is sent."""
+"""Checks, before anything is sent, whether a vehicle can fly a reference."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from offboard.reference.track import Track
 Array = NDArray[np.float64]
 
 HEIGHT_MIN_M, DISTANCE_MAX_M, SPEED_MAX_MPS = 0.3, 2000.0, 12.0
-# shares of the vehicle's limits; the rest is reserved for feedback
+# Shares of the vehicle's limits that a reference may use; the rest is reserved for feedback
 THRUST_SHARE_MIN, THRUST_SHARE_MAX, TILT_SHARE_MAX = 0.05, 0.95, 0.9
 _STEP_S = 0.01
 _CHUNK = 20_000
 
 
 class Envelope(NamedTuple):
-    """The greatest tilt, height and horizontal distance from the take-off point."""
+    """The greatest tilt, height above, and horizontal distance from the take-off point."""
 
     tilt_rad: float
     height_m: float
@@ -32,7 +32,7 @@ class Envelope(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Demand:
-    """One quantity over time and its limit; `sign` is -1 for a lower limit."""
+    """One quantity over time and its limit; `sign` is -1 if that is a lower limit."""
 
     what: str
     unit: str
@@ -43,11 +43,11 @@ class _Demand:
 
 
 def check(reference: Reference, vehicle: Vehicle) -> Envelope:
-    """Check that a vehicle can fly a reference without wind; return what it reaches.
+    """Check that a vehicle can fly a reference without wind, and return its envelope.
 
-    The reference, relative to the take-off point, is sampled every 10 ms. Raises
-    ValueError for a path that is too low or too far away, otherwise for the limit that is
-    exceeded first; of a track it names the path's own time, as a table has it.
+    The reference, relative to the take-off point, is sampled every 10 ms. Raises ValueError for a
+    path that is too low or too far away, otherwise for the limit that is exceeded first. Times in
+    the error are those of the path if the reference is a `Track`, as in the rows of a table.
     """
     count = int(np.ceil(reference.duration_s / _STEP_S)) + 1
     times = np.linspace(0.0, reference.duration_s, count)
@@ -62,13 +62,13 @@ def _envelope(reference: Reference, vehicle: Vehicle, times: Array) -> Envelope:
     tilt = np.arccos(np.clip(state.thrust_direction_ned[:, 2], -1.0, 1.0))
     broken: list[tuple[int, _Demand]] = []
     for demand in _demands(sample, state, tilt, vehicle):
-        # in this form NaN exceeds the limit
+        # written so that NaN exceeds the limit
         within = demand.sign * demand.values <= demand.sign * demand.limit
         if not within.all():
             broken.append((int(np.argmin(within)), demand))
     if broken:
         first, demand = min(broken, key=lambda item: (not item[1].of_path, item[0]))
-        worst = int(np.argmax(demand.sign * demand.values))  # or the first NaN
+        worst = int(np.argmax(demand.sign * demand.values))  # argmax returns the first NaN, if any
         worst_s, first_s = float(times[worst]), float(times[first])
         if isinstance(reference, Track):
             worst_s, first_s = map(reference.path_time_s, (worst_s, first_s))

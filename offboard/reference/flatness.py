@@ -1,4 +1,4 @@
-"""Differential flatness: from position and heading to the full state and the input.
+"""Differential flatness: computes the full state and the input from position and heading.
 
 The plant is a = g e3 - T b - c v + d (NED; thrust T per unit of mass, third body axis b, linear
 drag c, constant disturbance d), so that T b = g e3 - a - c v + d =: f. Attitude, body rates and
@@ -18,14 +18,14 @@ from offboard.reference.base import FlatSample
 Array = NDArray[np.float64]
 
 _THRUST_FLOOR_MPS2 = 1e-3
-_LEVEL_FLOOR = 1e-3  # least b_z and least |y_C x b| that the body rates are divided by
+_LEVEL_FLOOR = 1e-3  # least divisor of the body rates, for b_z and |y_C x b|
 _NO_DISTURBANCE = np.zeros(3)
 _LEVEL = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, slots=True)
 class FlatState:
-    """State and input that fly a `FlatSample`; leading shape (...) is the sample's.
+    """State and input that follow a `FlatSample`; the leading shape (...) is that of the sample.
 
     thrust_mps2, thrust_rate_mps3 (...): T and T'. thrust_direction_ned, _rate_ned_ps,
     _acceleration_ned_ps2 (..., 3): b, b', b''; without thrust b is (0, 0, 1).
@@ -44,9 +44,9 @@ def flat_state(
     drag_per_mass_ps: float,
     disturbance_ned_mps2: Array = _NO_DISTURBANCE,
 ) -> FlatState:
-    """The full state and input of a sample; the disturbance (3,) is constant in time.
+    """Return the full state and input of a sample; the disturbance (3,) is constant in time.
 
-    Always finite: where f vanishes (free fall) b is (0, 0, 1)."""
+    The result is always finite: where f is zero (free fall) b is (0, 0, 1)."""
     drag, gravity = drag_per_mass_ps, np.array([0.0, 0.0, gravity_mps2])
     f = acceleration(
         gravity, sample.acceleration_ned_mps2, drag, sample.velocity_ned_mps, disturbance_ned_mps2
@@ -71,19 +71,19 @@ def flat_state(
 
 
 def _dot(left: Array, right: Array) -> Array:
-    """Dot product over the last axis, (..., 1)."""
+    """Return the dot product over the last axis, (..., 1)."""
     product: Array = (left * right).sum(axis=-1, keepdims=True)
     return product
 
 
 def body_rates(sample: FlatSample, state: FlatState) -> Array:
-    """Body rates p, q, r (..., 3), rad/s, of a body whose third axis is b and whose Euler yaw is
-    the heading: b' = R (omega x e3) gives p and q, the yaw's kinematics psi' = (q sin phi +
-    r cos phi) / cos theta give r."""
+    """Return the body rates p, q, r (..., 3), rad/s, of a body whose third axis is b and whose
+    Euler yaw is the heading: p and q follow from b' = R (omega x e3), r from the kinematics of the
+    yaw, psi' = (q sin phi + r cos phi) / cos theta."""
     b, b1 = state.thrust_direction_ned, state.thrust_direction_rate_ned_ps
     cosine, sine, down = np.cos(sample.heading_rad), np.sin(sample.heading_rad), b[..., 2]
     x = np.stack([cosine * down, sine * down, -cosine * b[..., 0] - sine * b[..., 1]], axis=-1)
-    # y_C x b, y_C = (-sin, cos, 0); the nose leads, upside down too
+    # y_C x b, y_C = (-sin, cos, 0); the sign keeps the nose along the heading upside down too
     x /= np.copysign(np.maximum(np.sqrt(_dot(x, x)), _LEVEL_FLOOR), b[..., 2:])
     y = np.cross(b, x)
     p, q = -_dot(y, b1)[..., 0], _dot(x, b1)[..., 0]

@@ -1,8 +1,8 @@
-"""The references by name: one class per shape, with its settings and its path.
+"""The shapes of references: one class per shape, with its settings and its path.
 
 A reference file (`config/references/*.yaml`) holds the settings of one shape, named by `shape`.
-Heights are metres above the take-off point, positive up; everything else is north and east of it.
-A new shape is a class here, a row in `SHAPES` and a file. Reads no file.
+Heights are metres above the take-off point, positive up; other coordinates are metres north and
+east of it. A new shape is a class here, a row in `SHAPES` and a file. This module reads no file.
 """
 
 from __future__ import annotations
@@ -48,10 +48,9 @@ Term = tuple[
 
 
 class Shape(Parameters, ABC):
-    """What every shape has. Its origin is `height_m` above the ground, and north and east of the
-    take-off point; `course_deg` is the fixed heading, clockwise from north.
-
-    Speed is gained within `run_in_s` and lost within `run_out_s`; see `Track`.
+    """Settings of every shape. Its origin is `height_m` above the take-off point, and
+    `origin_north_m` and `origin_east_m` from it; `course_deg` is the fixed heading, clockwise from
+    north. The vehicle accelerates during `run_in_s` and brakes during `run_out_s`; see `Track`.
     """
 
     shape: str
@@ -65,14 +64,14 @@ class Shape(Parameters, ABC):
 
     @abstractmethod
     def path(self) -> Path:
-        """The path at full speed, NED relative to the origin.
+        """Return the path at full speed, NED relative to the origin.
 
-        Raises ValueError with one sentence where these settings make none.
+        Raises ValueError with one sentence if these settings make no path.
         """
 
     def track(self) -> Track:
-        """The reference, NED relative to the take-off point. Raises ValueError like `path`, and
-        where the runs do not fit (see `Track`)."""
+        """Return the reference, NED relative to the take-off point. Raises ValueError like `path`,
+        and if the runs do not fit (`Track.check_runs`)."""
         path, fixed_rad = self.path(), math.radians(self.course_deg)
         origin_ned_m = (self.origin_north_m, self.origin_east_m, -float(self.height_m))
         track = Track(path, fixed_rad, self.run_in_s, self.run_out_s, origin_ned_m)
@@ -83,12 +82,12 @@ class Shape(Parameters, ABC):
 
     @property
     def title(self) -> str:
-        """What errors call it."""
+        """Name of the reference in errors."""
         return self.shape
 
 
 class Hover(Shape):
-    """Rest at the origin."""
+    """At rest at the origin."""
 
     shape: Literal["hover"] = "hover"
     duration_s: Annotated[float, Field(ge=0.1, le=3600)] = 15.0
@@ -100,7 +99,8 @@ class Hover(Shape):
 
 
 class Line(Shape):
-    """Straight from the origin to a point relative to it, at constant speed between the runs."""
+    """A straight line from the origin to a point relative to it, at constant speed between run-in
+    and run-out."""
 
     shape: Literal["line"] = "line"
     to_north_m: Coordinate = 10.0
@@ -120,7 +120,8 @@ class Line(Shape):
 
 
 class Helix(Shape):
-    """Round the origin, clockwise seen from above, from its north, climbing from `height_m`."""
+    """A circle round the origin, clockwise seen from above, that begins north of it at `height_m`
+    and climbs."""
 
     shape: Literal["helix"] = "helix"
     radius_m: Size = 1.5
@@ -144,7 +145,7 @@ class Helix(Shape):
 
 
 class Circle(Shape):
-    """Level round the origin, clockwise seen from above, from its north."""
+    """A level circle round the origin, clockwise seen from above, that begins north of it."""
 
     shape: Literal["circle"] = "circle"
     radius_m: Size = 2.0
@@ -176,8 +177,8 @@ class Lemniscate(Shape):
 
 
 class Sines(Shape):
-    """A closed curve about the origin, each of whose axes is a sum of sines: an entry [amplitude in
-    m, cycles per period, phase in deg] adds amplitude sin(2 pi cycles s / period + phase)."""
+    """A closed curve about the origin, in each axis a sum of sines. An entry [amplitude in m,
+    cycles per period, phase in deg] adds amplitude sin(2 pi cycles s / period + phase)."""
 
     shape: Literal["sines"] = "sines"
     north: Annotated[tuple[Term, ...], Field(max_length=10)] = ()
@@ -204,8 +205,8 @@ class Sines(Shape):
 
 
 class Waypoints(Shape):
-    """A smooth path from rest to rest through points [north, east, up] m, relative to the origin;
-    at `times_s`, at a mean speed, or as fast as the limits of `fastest` allow."""
+    """A smooth path from rest to rest through points [north, east, up] m, relative to the origin,
+    at `times_s`, at a mean speed `speed_mps`, or as fast as the limits of `fastest` allow."""
 
     shape: Literal["waypoints"] = "waypoints"
     points_m: Annotated[
@@ -226,7 +227,8 @@ class Waypoints(Shape):
         return self
 
     def times(self) -> NDArray[np.float64]:
-        """When the path passes the points (N,), s from its start. Raises ValueError like `path`."""
+        """Return the times (N,) at which the path passes the points, s from its start. Raises
+        ValueError like `path`."""
         if self.fastest is not None:
             return np.array(fastest_times(self.points_m, self.minimise, self.fastest))
         if self.speed_mps is not None:
@@ -239,11 +241,11 @@ class Waypoints(Shape):
 
 
 class FromTable(Shape):
-    """A CSV table (see `table`); positions relative to the take-off point, heights as written.
+    """A CSV table (see `table`). Positions and heights are relative to the take-off point.
 
-    `course: table` takes the column course_deg, and the fixed `course_deg` where there is none.
-    `knot_spacing_s` > 0 smooths rounded or noisy rows. `text` is the content of `file`, filled in
-    by the reader of the file, so that a recorded configuration is complete.
+    `course: table` uses the column course_deg, or the fixed `course_deg` if the table has no such
+    column. `knot_spacing_s` > 0 smooths rounded or noisy rows. `text` is the content of `file`,
+    filled in by the reader of the file, so that a recorded configuration is complete.
     """
 
     shape: Literal["table"] = "table"

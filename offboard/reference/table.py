@@ -1,8 +1,8 @@
 """A CSV table of positions over time.
 
-Its columns, named in the first row, in any order: `time_s`; `north_m` or `x`, `x_m`;
-`east_m` or `y`, `y_m`; `down_m` or `z`, `z_m` (positive down), or `altitude_m` (positive up);
-optionally `course_deg` (heading, clockwise from north). Other columns are refused.
+The first row names the columns, in any order: `time_s`; `north_m` (or `x`, `x_m`); `east_m` (or
+`y`, `y_m`); `down_m` (or `z`, `z_m`; positive down) or `altitude_m` (positive up); optionally
+`course_deg` (heading, clockwise from north). Other columns are refused.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 ROWS_MIN = 4
-DURATION_MAX_S = 3600.0  # as that of a hover
+DURATION_MAX_S = 3600.0  # the same as for the shape `hover`
 _NAMES = {
     "time_s": "time_s",
     "north_m": "north_m", "x": "north_m", "x_m": "north_m",
@@ -31,7 +31,8 @@ _NAMES = {
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """The rows: times_s (N,) from 0, points_ned_m (N, 3), heading_rad (N,) unwrapped, or None."""
+    """Rows as arrays: times_s (N,) from 0, points_ned_m (N, 3), heading_rad (N,), unwrapped, or
+    None without that column."""
 
     times_s: Array
     points_ned_m: Array
@@ -41,7 +42,7 @@ class Table:
 def parse(text: str, name: str) -> Table:
     """Parse CSV text. Times are shifted to begin at 0.
 
-    Raises ValueError; it calls the table `name` and counts rows from 1, the header."""
+    Raises ValueError, whose text names the table `name` and counts rows from 1, the header."""
     rows = [
         (number, row)
         for number, row in enumerate(_rows(text, name), start=1)

@@ -1,10 +1,10 @@
 """References in time: a path flown from rest to rest, and references moved, delayed and paused.
 
 A `Track` has a run-in, a scored part at full speed and a run-out. On an unbounded path (circle,
-lemniscate, helix) the run-in covers the first run_in_s / 2 of it, then come exactly the laps, and
-the run-out continues along it for run_out_s / 2. On a bounded path (line, waypoints, table) both
-runs lie within its ends: only the part between is flown at full speed and scored. A hover has no
-runs and is scored throughout.
+lemniscate, helix) the run-in covers the first run_in_s / 2 of the path; exactly the laps follow,
+and the run-out continues along the path for run_out_s / 2. On a bounded path (line, waypoints,
+table) both runs lie within its ends, and only the part between them is flown at full speed and
+scored. A hover has no runs and is scored throughout.
 """
 
 from __future__ import annotations
@@ -20,17 +20,18 @@ from offboard.reference.path import HEADING, AlongVelocity, Harmonic, Path, Trip
 
 Array = NDArray[np.float64]
 
-STOP_S = 2.5  # of a pause, from full speed to rest, and back; about that of a run-out
-_BEFORE_S = 1e6  # of undisturbed time, more than a flight lasts
-_REST_SPEED_MPS = 1e-3
+STOP_S = 2.5  # duration of the stop of a pause, and of the start after it; similar to a run-out
+_BEFORE_S = 1e6  # longer than any flight: full speed before a stop and after a start
+_REST_SPEED_MPS = 1e-3  # slower counts as at rest
 
 
 def warp(time_s: Array, run_in_s: float, cruise_s: float, run_out_s: float) -> Array:
-    """A smooth start and stop on a path: its time s(t) and four derivatives, (5, N), for t (N,).
+    """Return the path's time s(t) of a smooth start and stop, with four derivatives, (5, N), for t
+    (N,).
 
-    ds/dt rises from 0 to 1 within `run_in_s`, stays for `cruise_s`, falls to 0 within
-    `run_out_s`, along the smoothstep of degree 9: four derivatives of ds/dt vanish at every
-    joint. A run of duration R covers R / 2 of the path. Outside, s rests at its ends.
+    ds/dt rises from 0 to 1 within `run_in_s`, is 1 for `cruise_s`, and falls to 0 within
+    `run_out_s`. It follows the smoothstep of degree 9: four derivatives of ds/dt are zero at every
+    joint. A run of duration R covers R / 2 of the path. Before and after, s is constant.
     """
     out = np.zeros((5, time_s.size))
     cruise_end_s = run_in_s + cruise_s
@@ -49,9 +50,8 @@ def warp(time_s: Array, run_in_s: float, cruise_s: float, run_out_s: float) -> A
 
 
 def _ramp(x: Array, duration_s: float, direction: float) -> Array:
-    """The smoothstep of degree 9 at x (N,) in [0, 1]: s and four derivatives by time (5, N).
-
-    direction -1 runs backwards in time: s and its even derivatives change sign.
+    """Return s, whose rate is the smoothstep of degree 9, and four derivatives by time (5, N), at
+    x (N,) in [0, 1]. A `direction` of -1 reverses time: s and its even derivatives change sign.
     """
     u = x * (1.0 - x)
     shape = 21.0 + x * (-60.0 + x * (67.5 + x * (-35.0 + 7.0 * x)))
@@ -68,9 +68,9 @@ def _ramp(x: Array, duration_s: float, direction: float) -> Array:
 
 
 def _composed(clock: Array, jet: Array, shape: tuple[int, ...]) -> FlatSample:
-    """The sample of leading shape `shape` of a jet (5, N, 4), by s, [north, east, down, heading],
-    at s(t) with its derivatives, `clock` (5, N): the chain rule to the fourth derivative (Faa di
-    Bruno)."""
+    """Return the sample, of leading shape `shape`, of a path at s(t), by the chain rule to the
+    fourth derivative (Faa di Bruno). `clock` (5, N) is s(t) with its derivatives by time, `jet`
+    (5, N, 4) is [north, east, down, heading] with its derivatives by s."""
     s1, s2, s3, s4 = clock[1:, :, np.newaxis]
     p0, p1, p2, p3, p4 = jet
     by_time = np.array(
@@ -88,10 +88,10 @@ def _composed(clock: Array, jet: Array, shape: tuple[int, ...]) -> FlatSample:
 @dataclass(frozen=True, slots=True)
 class Track:
     """A `Reference` from rest to rest, continuous to snap in position and to acceleration in
-    heading (without a run, at that end, as continuous as the path is there).
+    heading (at an end without run-in or run-out, as continuous as the path is there).
 
     Time 0 is the start of the run-in; positions are NED relative to the take-off point. `heading`
-    is a constant one, rad, or along the velocity; a path with a fourth column has its own.
+    is constant, rad, or along the velocity; it is not used if the path has a fourth column.
     """
 
     path: Path
@@ -101,8 +101,8 @@ class Track:
     origin_ned_m: Triple = (0.0, 0.0, 0.0)
 
     def check_runs(self) -> None:
-        """Raise ValueError where the runs do not fit in a bounded path, or a run is zero and the
-        path moves at that end."""
+        """Raise ValueError if the runs do not fit in a bounded path, or if a run is zero although
+        the path moves at that end."""
         if self.cruise_s <= 0.0:
             raise ValueError(
                 f"run-in and run-out ({self.run_in_s:g} s and {self.run_out_s:g} s) take half "
@@ -150,11 +150,12 @@ class Track:
         return self.track_end_s + self.run_out_s
 
     def path_time_s(self, time_s: float) -> float:
-        """The path's own time at `time_s`: of a table, the time in its rows, from the first."""
+        """Return the path's own time at `time_s`, for a table the time since its first row."""
         return float(self._clock(np.array([time_s]))[0, 0])
 
     def sample(self, time_s: float | Array) -> FlatSample:
-        """Flat outputs at `time_s`, a scalar or an array of any shape; at rest outside [0, end]."""
+        """Return the sample at `time_s`, a scalar or an array of any shape; before the start and
+        after the end it is at rest."""
         time = np.asarray(time_s, dtype=np.float64)
         clock = self._clock(time.reshape(-1))
         jet = np.zeros((5, time.size, 4))
@@ -172,22 +173,22 @@ class Track:
 
 
 def hold(position_ned_m: Triple, heading_rad: float) -> Track:
-    """Rest at a point (NED, m) with a heading (rad)."""
+    """Return a reference at rest at a point (NED, m) with a heading (rad)."""
     return Track(Harmonic(0.0, bounded=True, offset_ned_m=position_ned_m), heading_rad)
 
 
 @dataclass(frozen=True, slots=True)
 class Moved:
-    """A reference on another time axis and at another place, which may be paused: its own time
-    then slows down to a stop within `STOP_S`, and later runs again. The path stays the same, its
-    derivatives remain continuous to snap.
+    """A reference moved to another time axis and place, which may be paused. Its own time then
+    slows down to a stop within `STOP_S`, and later runs again. The path stays the same and
+    continuous to snap.
 
     Args:
-        reference: on its own axes.
+        reference: the reference in its own time and frame.
         start_s: its time 0 on the new axis, such as vehicle time.
-        origin_ned_m: its origin, such as the take-off point, in the new frame.
-        paused_s: when it begins to stop, on the new axis.
-        resumed_s: when it begins to run again, not before it is at rest.
+        origin_ned_m: its origin in the new frame, such as the take-off point.
+        paused_s: time on the new axis at which the stop begins.
+        resumed_s: time on the new axis at which the start begins, at the earliest when at rest.
     """
 
     reference: Reference
@@ -198,27 +199,27 @@ class Moved:
 
     @property
     def duration_s(self) -> float:
-        """The end, on the new axis; infinite while it is paused."""
+        """The end on the new axis; infinite while the reference is paused."""
         end_s = self.start_s + self.reference.duration_s
         if self.paused_s == math.inf:
             return end_s
-        return end_s + self.resumed_s - self.paused_s  # a stop and a start cover half their time
+        return end_s + self.resumed_s - self.paused_s  # stop and start each cover half their time
 
     def resumed(self, time_s: float) -> Moved:
-        """Running again from `time_s`, or from the moment when it has come to rest."""
+        """Return this reference, resumed at `time_s` or when it comes to rest, if that is later."""
         return replace(self, resumed_s=max(time_s, self.paused_s + STOP_S))
 
     def at_full_speed(self, time_s: float) -> bool:
-        """Whether it runs as fast as before a pause, from `time_s` on."""
+        """Whether the reference runs at full speed at `time_s`: before a pause or after it."""
         return time_s < self.paused_s or time_s >= self.resumed_s + STOP_S
 
     def own_s(self, time_s: float) -> float:
-        """The time at `time_s` of the reference that is moved, however often it is."""
+        """Return the own time, at `time_s`, of the reference that was moved, once or repeatedly."""
         own_s = float(self._clock(np.array([time_s]))[0, 0])
         return self.reference.own_s(own_s) if isinstance(self.reference, Moved) else own_s
 
     def sample(self, time_s: float | Array) -> FlatSample:
-        """Flat outputs at `time_s`, a scalar or an array of any shape."""
+        """Return the sample at `time_s`, a scalar or an array of any shape."""
         time = np.asarray(time_s, dtype=np.float64)
         if self.paused_s == math.inf:
             sample = self.reference.sample(time - self.start_s)
@@ -231,7 +232,7 @@ class Moved:
         return sample._replace(position_ned_m=sample.position_ned_m + np.array(self.origin_ned_m))
 
     def _clock(self, time_s: Array) -> Array:
-        """The reference's own time and its first four derivatives (5, N) at `time_s` (N,)."""
+        """Return the reference's own time and four derivatives (5, N) at `time_s` (N,)."""
         if self.paused_s == math.inf:
             clock = np.zeros((5, time_s.size))
             clock[0], clock[1] = time_s, 1.0

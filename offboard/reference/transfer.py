@@ -1,5 +1,5 @@
-"""Flights from a start, at rest or moving, to rest at a target: the climb after take-off, and the
-way back after a jump of the estimate.
+"""Flights from a start, at rest or moving, to rest at a target: used for the climb after take-off
+and for the way back after a jump of the estimate.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ Vector = Array | Iterable[float]
 
 _DURATION_MIN_S = 0.5
 _GROWTH = 1.08
-_CRUISE_FROM_S = 15.0  # a transfer that takes longer in one piece is flown in three
-_RAMPS_SHARE = 0.6  # of the distance: most that gaining and losing speed may take
-_SMOOTH_PEAK = 35.0 / 16.0  # slope of the smoothstep of degree 7
+_CRUISE_FROM_S = 15.0  # a transfer that takes longer with one polynomial is flown in three legs
+_RAMPS_SHARE = 0.6  # greatest share of the distance for acceleration and braking
+_SMOOTH_PEAK = 35.0 / 16.0  # greatest slope of the smoothstep of degree 7
 _BRAKE_MIN_S = 1.5
-_CREEP_MPS = 0.5  # a start that is no faster needs no braking
-_AHEAD = 0.7  # least cosine between a start's velocity and the direction of the target
+_CREEP_MPS = 0.5  # up to this speed a start needs no braking
+_AHEAD = 0.7  # least cosine between the start's velocity and the direction of the target
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,14 +42,14 @@ class Limits:
 
 
 def stopping_place(position_ned_m: Vector, velocity_ned_mps: Vector) -> Array:
-    """Where a vehicle at this position (3,), with this velocity (3,), NED, comes to rest if it is
-    braked smoothly within the usual limits."""
+    """Return where a vehicle at this position (3,), with this velocity (3,), NED, comes to rest if
+    it brakes smoothly within the default `Limits`."""
     velocity = np.asarray(list(velocity_ned_mps), dtype=np.float64)
     return np.asarray(list(position_ned_m)) + velocity * (_brake_s(velocity, Limits()) / 2.0)
 
 
 def _brake_s(velocity: Array, limits: Limits) -> float:
-    """Duration of a smooth stop within the limit of acceleration."""
+    """Return the duration of a smooth stop within the limit of acceleration."""
     return _SMOOTH_PEAK * float(np.linalg.norm(velocity)) / limits.acceleration_mps2
 
 
@@ -62,13 +62,14 @@ def transfer(
     *,
     start_velocity_ned_mps: Vector = (0.0, 0.0, 0.0),
 ) -> Track:
-    """From a start (3,), NED, to rest at a target (3,), about as fast as the limits allow.
+    """Return the flight from a start (3,), NED, to rest at a target (3,), about as fast as the
+    limits allow.
 
-    The heading turns the short way: it ends at `target_heading_rad` plus the whole turns that are
-    nearest to the start. A start that is too fast, or does not move towards the target, is first
-    braked to rest in the direction of its motion (the ground is not considered). A long transfer is
-    flown straight, at constant speed between gaining and losing it. Raises ValueError for anything
-    that is not finite.
+    The heading turns the shorter way: it ends at `target_heading_rad` plus the number of whole
+    turns that is nearest to the start. If the start is too fast, or does not move towards the
+    target, the vehicle first brakes to rest in the direction of its motion (the ground is not
+    considered). A long transfer is straight, at constant speed between acceleration and braking.
+    Raises ValueError if any argument is not finite.
     """
     start, target, velocity = (
         np.asarray(list(vector), dtype=np.float64)
@@ -102,7 +103,8 @@ def transfer(
 
 
 def _moves_well(begin: Array, end: Array, limits: Limits) -> bool:
-    """Whether the start needs no braking: slow, or towards the target within the speed limit."""
+    """Whether the start needs no braking: it is slow, or within the speed limit and towards the
+    target."""
     velocity, way = begin[1, :3], end[0, :3] - begin[0, :3]
     speed_mps = float(np.linalg.norm(velocity))
     ahead = float(velocity @ way) >= _AHEAD * speed_mps * float(np.linalg.norm(way))
@@ -116,10 +118,11 @@ def _at_rest(place: Array) -> Array:
 
 
 def _shortest(begin: Array, end: Array, limits: Limits) -> Spline:
-    """The shortest single polynomial within the limits; none is tried beyond _CRUISE_FROM_S."""
+    """Return the shortest single polynomial within the limits, or one longer than _CRUISE_FROM_S,
+    which may exceed them."""
     distance_m = float(np.linalg.norm(end[0, :3] - begin[0, :3]))
     turn_rad = abs(float(end[0, 3] - begin[0, 3]))
-    # no polynomial is faster than the mean speed or turn rate
+    # the mean speed and turn rate of a polynomial cannot exceed their limits
     duration_s = max(
         _DURATION_MIN_S, distance_m / limits.speed_mps, turn_rad / limits.heading_rate_radps
     )
@@ -131,8 +134,8 @@ def _shortest(begin: Array, end: Array, limits: Limits) -> Spline:
 
 
 def _cruise(start: Array, target: Array, limits: Limits) -> list[tuple[float, Array]]:
-    """Duration and end of three legs from rest to rest, (4,) in position and heading: gaining
-    speed, keeping it, losing it."""
+    """Return duration and end of three legs from rest to rest: acceleration, constant speed,
+    braking. `start` and `target` (4,) are position and heading."""
     way = target - start
     speed_mps = _cruise_mps(way, limits)
     ramp_s = _SMOOTH_PEAK * speed_mps / limits.acceleration_mps2
@@ -149,7 +152,8 @@ def _length_m(way: Array) -> float:
 
 
 def _cruise_mps(way: Array, limits: Limits) -> float:
-    """Speed along a way (4,) in position and heading; a short one is mostly ramps."""
+    """Return the constant speed on a way (4,) in position and heading; it is less on a short way,
+    because of the share of acceleration and braking."""
     distance_m = _length_m(way)
     return min(
         max(limits.cruise_mps, limits.speed_mps),
@@ -160,7 +164,7 @@ def _cruise_mps(way: Array, limits: Limits) -> float:
 
 
 def _excess(curve: Spline, limits: Limits) -> float:
-    """The largest ratio of a peak to its limit."""
+    """Return the largest ratio of a peak to its limit."""
     times_s = [np.linspace(*piece, 101) for piece in itertools.pairwise(curve.breaks_s)]
     jet = curve.jet(np.concatenate(times_s))
     return max(
