@@ -1,1 +1,1 @@
-"""The paper: its law as a controller, its plant, and the study of its tables and figures."""
+"""The paper's law as a controller, its plants, and the study of its tables and figures."""

@@ -1,9 +1,10 @@
-"""One flight of the paper's loop: reference, law and plant, with a certificate for every step.
+"""One flight of the paper's closed loop: reference, law and plant, with a certificate for every
+step.
 
 The plants are the paper's linear model (Eq. 14) and its nonlinear one (Eq. 7); inputs are
 deviations from hover, held for one step of 0.1 s. The paper draws its path (Figs. 5 and 6) without
-numbers; this one is similar: about 100 s at some 3 m/s through turns and changes of height, minimum
-snap from rest to rest, the nose along the path.
+numbers. The path here is similar: about 100 s at some 3 m/s through turns and changes of height,
+minimum snap from rest to rest, with the nose along the path.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ TOUR = Waypoints(
         (-15.0, 30.0, 6.0), (-25.0, 0.0, 4.0), (-10.0, -30.0, 4.0), (20.0, -40.0, 3.0),
         (45.0, -20.0, 2.0), (50.0, 10.0, 2.0),
     ),
-    speed_mps=2.8,  # mean of an inner leg
+    speed_mps=2.8,  # mean speed of inner legs
     minimise=Smoothness.SNAP,
     course="along_velocity",
 )  # fmt: skip
@@ -69,8 +70,8 @@ _SUBSTEPS = 10
 
 @cache
 def reference_states(hover: bool, steps: int) -> Array:
-    """States (steps + 1, 12) of Eq. 27, of a hover or of Figs. 5-6: zero except psi, u, v, w, x, y,
-    z, with velocities in NED as on the linear plant."""
+    """Return the reference states (steps + 1, 12) of Eq. 27 for a hover or the path of Figs. 5-6:
+    zero except psi, u, v, w, x, y, z, with velocities in NED as on the linear plant."""
     samples = (HOVER if hover else TOUR).track().sample(PAPER_STEP_S * np.arange(steps + 1.0))
     tracked = np.zeros((steps + 1, 12))
     tracked[:, PSI] = samples.heading_rad
@@ -84,7 +85,7 @@ def reference_states(hover: bool, steps: int) -> Array:
 
 @cache
 def paper_model() -> tuple[Array, Array]:
-    """A_d (12, 12) and B_d (12, 4) of Eq. 14, sampled with the 0.1 s that Eq. 16 is sampled with.
+    """Return A_d (12, 12) and B_d (12, 4) of Eq. 14, sampled with 0.1 s, as Eq. 16 is.
 
     All callers share the arrays, which are read-only.
     """
@@ -94,7 +95,7 @@ def paper_model() -> tuple[Array, Array]:
 
 
 class PlantKind(StrEnum):
-    """Eqs. 14-18, or the rigid body of Eqs. 1-8."""
+    """The linear model of Eqs. 14-18, or the nonlinear rigid body of Eqs. 1-8."""
 
     LINEAR = "linear"
     NONLINEAR = "nonlinear"
@@ -104,8 +105,8 @@ Plant = Callable[[Array, Array], Array]  # x(k+1) (12,) from x(k) (12,) and u(k)
 
 
 def linear_plant(wind_ned_mps: Array, thrust_loss: float) -> Plant:
-    """Eq. 14 with C = I. A constant wind (3,) acts as a force through the drag, sampled exactly;
-    `thrust_loss` is the missing fraction of the total thrust, 0 to 1."""
+    """Return the plant of Eq. 14 with C = I. A constant wind (3,) acts as a force through the drag,
+    sampled exactly; `thrust_loss` is the missing fraction of the total thrust, 0 to 1."""
     vehicle = paper_vehicle()
     motion, _ = hover_matrices(vehicle)
     force = np.zeros((len(motion), 1))
@@ -123,9 +124,8 @@ def linear_plant(wind_ned_mps: Array, thrust_loss: float) -> Plant:
 
 
 def nonlinear_plant(wind_ned_mps: Array, thrust_loss: float) -> Plant:
-    """Eq. 7, integrated by RK4 in ten substeps; the total thrust is never negative.
-
-    Arguments as of `linear_plant`; velocities u, v, w are in body axes.
+    """Return the plant of Eq. 7, integrated by RK4 in ten substeps; the total thrust is never
+    negative. The arguments are those of `linear_plant`; velocities u, v, w are in body axes.
     """
     hover, parameters = hover_input(paper_vehicle()), pack(paper_vehicle())
     wind, scratch = np.array(wind_ned_mps, np.float64), np.empty((RK4_SCRATCH_ROWS, EULER.size))
@@ -150,13 +150,13 @@ def follow(
     steps: int,
     scratch: Array,
 ) -> None:
-    """`steps` RK4 steps of held inputs and wind, in place; shapes as in `rk4_into`."""
+    """Do `steps` RK4 steps with held inputs and wind, in place; shapes as in `rk4_into`."""
     for _ in range(steps):
         rk4_into(derivative_into, state, inputs, wind_ned, parameters, step_s, scratch, state)
 
 
 def _delivered(inputs: Array, thrust_loss: float) -> Array:
-    """Inputs (4,) that the rotors deliver: a fraction of the total thrust is missing."""
+    """Return the inputs (4,) that the rotors deliver, with a fraction of the total thrust lost."""
     delivered = inputs.copy()
     delivered[THRUST] -= thrust_loss * (hover_input(paper_vehicle())[THRUST] + inputs[THRUST])
     return delivered
@@ -167,10 +167,12 @@ def _delivered(inputs: Array, thrust_loss: float) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class FlightTask:
-    """`hover`: instead of the path of Figs. 5-6. `cost_to_go`: the Riccati solution replaces Q of
-    Eq. 21; for a hover, as no moving reference is what the model itself would do. `start_offset_m`
-    is the start relative to the reference's start, NED; `thrust_loss` the missing fraction of the
-    total thrust."""
+    """A flight to be computed.
+
+    `hover`: whether a hover is flown instead of the path of Figs. 5-6. `cost_to_go`: whether the
+    Riccati solution replaces Q of Eq. 21; only for a hover, because the model would not follow a
+    moving reference by itself. `start_offset_m` is the start relative to that of the reference,
+    NED; `thrust_loss` is the missing fraction of the total thrust."""
 
     settings: PaperSettings
     plant: PlantKind = PlantKind.LINEAR
@@ -185,9 +187,9 @@ class FlightTask:
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """K steps. `states` and the reference `tracked` (K + 1, 12) with velocities u, v, w in NED;
-    `inputs` (K, 4) relative to hover. Per step (K,): `costs` J and their part weighed by R and
-    R_du, `spreads` epsilon, `gaps` to the exact optimum, `solve_s`.
+    """A computed flight of K steps. `states` and the reference `tracked` (K + 1, 12) have
+    velocities u, v, w in NED; `inputs` (K, 4) are relative to hover. Per step (K,): `costs` J and
+    their part weighted by R and R_du, `spreads` epsilon, `gaps` to the exact optimum, `solve_s`.
     """
 
     states: Array
@@ -220,7 +222,7 @@ class Flight:
 
 
 def fly(task: FlightTask) -> Flight:
-    """Fly `task`; the same task gives the same flight, except for the solve times."""
+    """Compute the flight of `task`. The same task gives the same flight, except for solve times."""
     settings, nonlinear = task.settings, task.plant is PlantKind.NONLINEAR
     plant = (nonlinear_plant if nonlinear else linear_plant)(
         np.array(task.wind_ned_mps), task.thrust_loss
@@ -258,7 +260,7 @@ def fly(task: FlightTask) -> Flight:
 
 
 def _in_heading_frame(state: Array, target: Array) -> tuple[Array, Array]:
-    """State of the nonlinear plant and reference (12,) as `heading_frame` gives them."""
+    """Return state and reference (12,) of the nonlinear plant in the frame of `heading_frame`."""
     rotation = rotation_from_quaternion(quaternion_from_euler(*state[EULER.attitude]))
     still = np.zeros(3)
     predicted = PredictedState(
@@ -274,8 +276,8 @@ def _in_heading_frame(state: Array, target: Array) -> tuple[Array, Array]:
 
 
 def cost_to_go(settings: PaperSettings) -> Array:
-    """P (12, 12) of the infinite horizon (Riccati) with Q and R of `settings`."""
-    import control  # takes a second: only where something is designed
+    """Return P (12, 12) of the infinite horizon (Riccati) with Q and R of `settings`."""
+    import control  # takes a second: imported only for a design
 
     weights = np.diag(settings.fitness), np.diag(settings.energy)
     solution: Array = control.dlqr(*paper_model(), *weights)[1]
@@ -283,14 +285,14 @@ def cost_to_go(settings: PaperSettings) -> Array:
 
 
 def damped(damping: float, **swarm: float) -> PaperSettings:
-    """The first configuration (section 4.1) with this lambda, and other settings of the swarm."""
+    """Return the first configuration (section 4.1) with this lambda and the settings `swarm`."""
     changes = {"swarm": FIRST.swarm.model_copy(update={"damping": damping, **swarm})}
     return FIRST.model_copy(update=changes)
 
 
 class Flights:
-    """The flights of one run of the study, each flown once; `on_flight` is called after each with
-    their number. `seeds`: flights per row of a table."""
+    """The flights of one run of the study; each is computed once. `seeds` is the number of flights
+    per row of a table; `on_flight` is called after each flight with the number of flights."""
 
     def __init__(self, seeds: int = 1, on_flight: Callable[[int], None] = lambda _: None) -> None:
         self.seeds = seeds
@@ -298,7 +300,7 @@ class Flights:
         self._flown: dict[FlightTask, Flight] = {}
 
     def __call__(self, task: FlightTask) -> Flight:
-        """The flight of `task`."""
+        """Return the flight of `task`."""
         if task not in self._flown:
             self._flown[task] = fly(task)
             self._on_flight(len(self._flown))
@@ -307,6 +309,6 @@ class Flights:
     def by_seed(
         self, settings: PaperSettings, plant: PlantKind = PlantKind.LINEAR, most: int = 10_000
     ) -> list[Flight]:
-        """One flight on the path per seed, at most `most`."""
+        """Return one flight on the path per seed, at most `most` flights."""
         count = min(self.seeds, most)
         return [self(FlightTask(settings, plant, seed=seed)) for seed in range(count)]

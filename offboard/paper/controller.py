@@ -1,7 +1,7 @@
-"""The law `paper`: the paper's law, one step ahead on [f_t, tau], with attitude setpoints.
+"""The law `paper`: the paper's law, one step ahead with inputs [f_t, tau], by attitude setpoints.
 
-The swarm searches the inputs of Eq. 6 on the hover model (Eqs. 14, 21, 26). Instead of the torques
-the attitude that the model predicts for k+1 is sent; the autopilot's attitude loop realises it.
+The swarm searches for the inputs of Eq. 6 on the hover model (Eqs. 14, 21, 26). Instead of torques,
+the attitude that the model predicts for k+1 is sent; the autopilot's attitude loop controls it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 
 
 class PaperControllerSettings(PaperSettings, ControllerSettings):
-    """Settings of the law `paper`; registered as an entry point like that of any other package."""
+    """Settings of the law `paper`, registered as an entry point, as those of other packages are."""
 
     law: Literal["paper"] = "paper"
 
@@ -41,9 +41,9 @@ class PaperControllerSettings(PaperSettings, ControllerSettings):
 
 
 class PaperController:
-    """`PaperLaw` between a predicted state and a command.
+    """Controller that computes a command from the predicted state by `PaperLaw`.
 
-    Raises ValueError where the settings' state limits cannot be kept by this vehicle.
+    Raises ValueError if this vehicle cannot keep the state limits of the settings.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class PaperController:
         self._law.reset()
 
     def _error(self, situation: Situation) -> Array:
-        """The present error (4,) of position (NED) and heading."""
+        """Return the present error (4,) of position (NED) and heading."""
         state, now = situation.state, situation.reference.sample(situation.state.time_s)
         heading = wrap_pi(state.heading_rad - float(now.heading_rad))
         return np.append(state.position_ned_m - now.position_ned_m, heading)
@@ -101,13 +101,13 @@ class PaperController:
 
 @cache
 def paper_vehicle() -> Vehicle:
-    """Table 1 and the arm that Eq. 16 requires: the shipped vehicle file `paper`."""
+    """Return the vehicle of Table 1 with the arm that Eq. 16 requires: the vehicle file `paper`."""
     return load_document("paper", "vehicle", Vehicle)[0]
 
 
 def input_scale(vehicle: Vehicle) -> Array:
-    """Factor (4,) from inputs of the paper's vehicle (Eq. 6) to those of `vehicle` that cause the
-    same accelerations, in translation and in rotation."""
+    """Return the factors (4,) from inputs of the paper's vehicle (Eq. 6) to those of `vehicle` that
+    cause the same accelerations, in translation and in rotation."""
     paper = paper_vehicle()
     arms = np.array([vehicle.arm_m / paper.arm_m, vehicle.arm_m / paper.arm_m, 1.0])
     inertia = np.array(vehicle.inertia_kgm2) / np.array(paper.inertia_kgm2)
@@ -115,8 +115,8 @@ def input_scale(vehicle: Vehicle) -> Array:
 
 
 def flyable_box(vehicle: Vehicle, settings: PaperSettings) -> tuple[Array, Array]:
-    """Lower and upper (4,) of the settings, with f_t limited to a total thrust between 0 and the
-    vehicle's maximum (cf. Eq. 26)."""
+    """Return the lower and upper bounds (4,) of the settings, with f_t limited to a total thrust
+    between 0 and the vehicle's maximum (cf. Eq. 26)."""
     lower, upper = np.array(settings.lower), np.array(settings.upper)
     hover, mass_kg = vehicle.gravity_mps2, paper_vehicle().mass_kg
     lower[THRUST] = max(lower[THRUST], -mass_kg * hover)
@@ -125,11 +125,11 @@ def flyable_box(vehicle: Vehicle, settings: PaperSettings) -> tuple[Array, Array
 
 
 def heading_frame(state: PredictedState, target: FlatSample) -> tuple[Array, Array]:
-    """State and reference (12,) of Eqs. 5 and 27, rotated by -psi and relative to the target.
+    """Return state and reference (12,) of Eqs. 5, 27, rotated by -psi and relative to the target.
 
-    The hover model is valid for a heading of north only; in axes along and across the nose it is
-    valid for every heading. Positions and heading are relative to the target; velocities stay
-    absolute because drag acts on them.
+    The hover model is valid for a heading of north only, but in axes along and across the nose for
+    every heading. Positions and heading are relative to the target; velocities stay absolute,
+    because drag depends on them.
     """
     cosine, sine = math.cos(state.heading_rad), math.sin(state.heading_rad)
     to_heading = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])

@@ -1,8 +1,8 @@
-"""Beyond the paper: longer horizons than one step, and the integral term and the state limits that
-its conclusions propose.
+"""Extensions of the paper: horizons longer than one step, and the integral term and state limits
+that its conclusions propose.
 
-The law of each objective is linear while no input is at its bound; the slowest eigenvalue of its
-closed loop gives the time an error lasts.
+The law of each objective is linear while no input is at its bound. The slowest eigenvalue of its
+closed loop determines how long an error lasts.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Complexes = NDArray[np.complex128]
 
 LONGEST = 20
 ONE_STEP = "one step, Eqs. 33-35"
-# The time constant of Eq. 33's position weights, 39 s, leaves no bandwidth for an integral
+# The time constant with Eq. 33's position weights, 39 s, is too long for an integral term
 RAISED = PaperSettings(fitness=(1, 1, 25, 1, 1, 1, 20, 20, 5, 150, 150, 20))
 INTEGRAL = RAISED.model_copy(update={"integral": IntegralSettings()})
 LAWS = {"Eqs. 33-35": PaperSettings(), "position weights raised": RAISED, "integral": INTEGRAL}
@@ -44,7 +44,7 @@ CASES: dict[str, dict[str, Any]] = {
 LIMITS = StateLimits(
     tilt_rad=0.35, tilt_rate_radps=0.4, yaw_rate_radps=0.5, speed_mps=2.5, climb_mps=0.5
 )
-MARGIN = 0.05  # on the nonlinear plant, for what the linear model neglects
+MARGIN = 0.05  # for errors of the linear model on the nonlinear plant
 _STEADY_STEPS, _LAST_STEPS = 1500, 100
 
 
@@ -57,19 +57,20 @@ def receding(
     steps: int | None = None,
     terminal: Array | None = None,
 ) -> Complexes:
-    """Eigenvalues of the loop closed by the first input of the optimum over `steps` steps, largest
-    magnitude first.
+    """Return the eigenvalues of the loop that is closed by the first input of the optimum over
+    `steps` steps, the largest magnitude first.
 
-    Eq. 21 at each step: fitness (n, n) weighs x(k+1) ... x(k+N), `terminal` replaces it at the
-    last; energy, rate (m, m). Without `steps` the horizon is infinite. The state is z = [x, u(k-1)]
-    because R_du weighs u(k) - u(k-1): a stage costs z'Wz + u'(R + R_du)u + 2 z'Su.
+    Each step costs Eq. 21: fitness (n, n) weights x(k+1) ... x(k+N), `terminal` replaces it at the
+    last step; energy, rate (m, m). Without `steps` the horizon is infinite. The state is
+    z = [x, u(k-1)], because R_du weights u(k) - u(k-1): a stage costs
+    z'Wz + u'(R + R_du)u + 2 z'Su.
     """
     n, m = inputs.shape
     a, b = block_diag(dynamics, np.zeros((m, m))), np.vstack([inputs, np.eye(m)])
     weight, effort = block_diag(fitness, rate), energy + rate
     cross = np.vstack([np.zeros((n, m)), -rate])
     if steps is None:
-        import control  # takes a second: only where something is designed
+        import control  # takes a second: imported only for a design
 
         to_go = control.dlqr(a, b, weight, effort, cross)[1]
     else:
@@ -85,13 +86,14 @@ def receding(
 
 
 def time_constant_s(modes: Complexes) -> float:
-    """Time constant of the slowest mode; infinite where it does not decay."""
+    """Return the time constant of the slowest mode; infinite if it does not decay."""
     slowest = float(abs(modes[0]))
     return -PAPER_STEP_S / math.log(slowest) if slowest < 1 else math.inf
 
 
 def modes_by_law() -> dict[str, Complexes]:
-    """One step with both of the paper's weights, without R and R_du, cost-to-go, N = 1 ... 20."""
+    """Return eigenvalues by law: one step with the paper's first and final weights, one step
+    without R and R_du, cost-to-go, N = 1 ... 20, and the infinite horizon."""
     final = PaperSettings()
     a, b = paper_model()
     q, r, s = (np.diag(part) for part in (final.fitness, final.energy, final.rate))
@@ -107,7 +109,7 @@ def modes_by_law() -> dict[str, Complexes]:
 
 
 def horizon_table(_: Flights) -> Table:
-    """Slowest eigenvalues and time constants of the closed loops."""
+    """Make the table of slowest eigenvalues and time constants of the closed loops."""
     return Table(
         "Closed loop by objective and horizon",
         [
@@ -125,7 +127,7 @@ def horizon_table(_: Flights) -> Table:
 
 
 def laws_figure(flights: Flights) -> Figure:
-    """One step and cost-to-go, flown from 1 m off at hover: position errors."""
+    """Make the figure of position errors of one step and cost-to-go, from 1 m off at hover."""
     drawing = panels(["1 m off at hover: position error, m"], "t, s", panel_px=300)
     for law, colour in (("one step", RED), ("cost-to-go", BLUE)):
         for plant in PlantKind:
@@ -152,7 +154,8 @@ def laws_figure(flights: Flights) -> Figure:
 
 
 def integral_table(flights: Flights) -> Table:
-    """Steady and greatest position errors of a hover of 150 s in wind or with weak thrust."""
+    """Make the table of steady and greatest position errors of a hover of 150 s in wind or with
+    weak thrust."""
     rows: list[Row] = []
     for case, disturbance in CASES.items():
         for plant in PlantKind:
@@ -178,8 +181,8 @@ def integral_table(flights: Flights) -> Table:
 
 
 def limits_table(flights: Flights) -> Table:
-    """The greatest value of each limited state, and the number of samples above its limit, along
-    the path of Figs. 5-6."""
+    """Make the table of the greatest value of each limited state, and the number of samples above
+    its limit, along the path of Figs. 5-6."""
     rows: list[Row] = []
     for plant in PlantKind:
         margin = MARGIN if plant is PlantKind.NONLINEAR else 0.0
@@ -209,7 +212,7 @@ def limits_table(flights: Flights) -> Table:
 
 
 def _limited_states(flight: Flight, plant: PlantKind) -> dict[str, Array]:
-    """Field of `StateLimits` -> greatest magnitude of the states that it limits, (K + 1,)."""
+    """Return field of `StateLimits` -> greatest magnitude of the states it limits, (K + 1,)."""
     states = flight.states
     north, east = states[:, U], states[:, V]
     heading = states[:, PSI] if plant is PlantKind.NONLINEAR else np.zeros(len(states))

@@ -1,4 +1,4 @@
-"""Figures 4 to 17 of the paper, from flights and searches computed here."""
+"""Figures 4 to 17 of the paper, drawn from flights and searches that are computed here."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ _PANELS = {
     _SPREADS: ("ε",),
 }
 _UNDAMPED, _BEST = TABLE_2[UNDAMPED], TABLE_2[BEST_DAMPING]
-# Number -> flight (on both plants), what is shown of it, caption
+# Number -> flight (on both plants), panels that are shown, caption
 FLOWN = {
     7: (UNDAMPED_FLIGHT, _CONTROLS, "The distortion that the paper describes: the undamped swarm "
         "ends anywhere in a flat valley of the cost."),
@@ -74,7 +74,7 @@ FLOWN = {
 
 
 def search_motion(_: Flights) -> Figure:
-    """Fig. 4: the particles in [f_t, tau_x], one row per lambda, four iterations each."""
+    """Draw Fig. 4: the particles in [f_t, tau_x], one row per lambda, four iterations each."""
     dampings = (BEST_DAMPING, UNDAMPED, LEAST_DAMPING)
     titles = [f"λ = {damping:g}, iteration {n}" for damping in dampings for n in SHOWN_ITERATIONS]
     drawing = make_subplots(
@@ -96,8 +96,8 @@ def search_motion(_: Flights) -> Figure:
 
 
 def _search(settings: PaperSettings) -> Iterator[list[go.Scatter]]:
-    """The search midway along the path of Figs. 5-6, drawn at each of SHOWN_ITERATIONS: the box,
-    the particles and the exact optimum."""
+    """Yield the drawing of a search midway along the path of Figs. 5-6, at each of
+    SHOWN_ITERATIONS: the bounds, the particles and the exact optimum."""
     tracked = closed_loop.reference_states(hover=False, steps=1000)
     law = PaperLaw(*paper_model(), settings)
     state = tracked[0]
@@ -122,7 +122,7 @@ def _search(settings: PaperSettings) -> Iterator[list[go.Scatter]]:
 
 
 def reference_states(_: Flights) -> Figure:
-    """Fig. 5."""
+    """Draw Fig. 5: the reference of position, heading and velocity over time."""
     tracked = closed_loop.reference_states(hover=False, steps=1000)
     drawing = panels(_PANELS[_POSITIONS] + _PANELS[_VELOCITIES], "t, s", panel_px=100)
     columns, times_s = _columns(tracked), PAPER_STEP_S * np.arange(len(tracked))
@@ -134,7 +134,7 @@ def reference_states(_: Flights) -> Figure:
 
 
 def reference_path(flights: Flights) -> Figure:
-    """Fig. 6: the path in space, with the flights by their names."""
+    """Draw Fig. 6: the path in space, with two flights and their names."""
     tracked = closed_loop.reference_states(hover=False, steps=1000)
     drawing = go.Figure()
     lines = [("reference", tracked, INK, 4)]
@@ -158,13 +158,13 @@ def reference_path(flights: Flights) -> Figure:
 
 
 def _in_space(states: Array) -> dict[str, NDArray[np.float32]]:
-    """North, east and height of states (N, 12)."""
+    """Return north, east and height of states (N, 12)."""
     x, y, z = (coordinates(column) for column in (states[:, X : X + 3] * (1, 1, -1)).T)
     return {"x": x, "y": y, "z": z}
 
 
 def flown_figure(number: int, flights: Flights) -> Figure:
-    """Figs. 7 to 17, `FLOWN`: the flight on both plants, beside its reference if it has one."""
+    """Draw one of Figs. 7 to 17 (`FLOWN`): a flight on both plants and the reference of states."""
     name, shown, caption = FLOWN[number]
     flown = {plant: flights(FlightTask(SETTINGS[name], plant)) for plant in PlantKind}
     drawing = panels(_PANELS[shown], "t, s", 300 if shown == _SPREADS else 150)

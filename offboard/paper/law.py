@@ -2,10 +2,11 @@
 
 J(u) = e'Qe + u'Ru + (u - u(k-1))'R_du(u - u(k-1)),  e = x_ref(k+1) - A x - B u
 
-is Eq. 21, a quadratic in u; the swarm searches its minimum within the bounds of Eq. 22. Two
-extensions that the conclusions propose leave a quadratic in four bounded inputs. Integral term: the
-state of Eq. 5 is extended by xi, the tracking error of [x y z psi] summed over time, and xi(k+1) is
-weighted like any other state. State limits: see `LimitedBox`. Knows no vehicle and no autopilot.
+is Eq. 21, a quadratic in u; the swarm searches for its minimum within the bounds of Eq. 22. With
+two extensions that the conclusions propose, J stays a quadratic in four bounded inputs. Integral
+term: the state of Eq. 5 is extended by xi, the tracking error of [x y z psi] summed over time, and
+xi(k+1) is weighted like any other state. State limits: see `LimitedBox`. This module knows no
+vehicle and no autopilot.
 """
 
 from __future__ import annotations
@@ -33,25 +34,26 @@ TwelveWeights = tuple[
     Weight, Weight, Weight, Weight, Weight, Weight, Weight, Weight, Weight, Weight, Weight, Weight
 ]
 
-PAPER_STEP_S = 0.1  # with which Eq. 16 is reproduced; the paper prints 0.05
+PAPER_STEP_S = 0.1  # sampling time that reproduces Eq. 16; the paper prints 0.05
 
 INTEGRATED = (X, X + 1, Z, PSI)  # indices in Eq. 5
-_MOVING = [PHI, THETA, P, Q, R, U, V, W]  # in the hover model independent of position and heading
+# States that in the hover model do not depend on position and heading
+_MOVING = [PHI, THETA, P, Q, R, U, V, W]
 _LOOK_AHEAD = 80  # steps of the regulator, after which all motion has ended
-_SLIGHT = 1e-9  # of an input's greatest influence on any condition: counts as none
+_SLIGHT = 1e-9  # a smaller share of an input's greatest influence counts as no influence
 _REACH = 3.0  # the regulator uses a third of the input bounds at the limit of a state
 
 
 class IntegralSettings(Parameters):
-    """`weights` of the squared summed errors of x, y, z (m s) and psi (rad s); each sum is kept
-    within +-`limits`."""
+    """Settings of the integral term: `weights` of the squared summed errors of x, y, z (m s) and
+    psi (rad s). Each sum is kept within +-`limits`."""
 
     weights: FourWeights = (80.0, 80.0, 15.0, 0.0)
     limits: tuple[Limit, Limit, Limit, Limit] = (200.0, 200.0, 200.0, 5.0)
 
 
 class StateLimits(Parameters):
-    """Largest magnitudes; None: not limited. Speeds are per axis of the heading frame.
+    """Largest magnitudes of states; None: not limited. Speeds are per axis of the heading frame.
 
     `margin` is the fraction of every limit that is reserved for errors of the linear model.
     """
@@ -64,7 +66,7 @@ class StateLimits(Parameters):
     margin: float = Field(default=0.0, ge=0, lt=1)
 
     def per_state(self) -> dict[int, float]:
-        """{index in Eq. 5: largest magnitude}, reduced by the margin."""
+        """Return {index in Eq. 5: largest magnitude reduced by the margin}."""
         tilt, rate, speed = self.tilt_rad, self.tilt_rate_radps, self.speed_mps
         each = (tilt, tilt, rate, rate, self.yaw_rate_radps, speed, speed, self.climb_mps)
         given = zip(_MOVING, each, strict=True)
@@ -76,8 +78,8 @@ class PaperSettings(Parameters):
 
     States are in the order of Eq. 5, SI (psi in radians). Inputs are those of the paper's vehicle,
     relative to hover. For another vehicle they are scaled so that the same numbers cause the same
-    accelerations, and bounds and weights keep their meaning; f_t is limited further where the total
-    thrust would be negative or above the vehicle's maximum.
+    accelerations, and bounds and weights keep their meaning; f_t is limited further so that the
+    total thrust is neither negative nor above the vehicle's maximum.
 
     `integral` adds the summed position and heading error to the cost, `limits` keeps tilt, rates
     and speeds within bounds; without them the law is the paper's.
@@ -88,15 +90,15 @@ class PaperSettings(Parameters):
     rate: FourWeights = (1, 1, 1, 1)  # diag R_du, Eqs. 25 and 35
     lower: Four = (-4.0, -0.2, -0.2, -0.1)  # N, N, N, N m, Eq. 26
     upper: Four = (3.942, 0.2, 0.2, 0.1)  # Eq. 26
-    keep_constant: bool = True  # the constant of J: its rounding makes epsilon of Eq. 29
+    keep_constant: bool = True  # the constant of J; its rounding determines epsilon of Eq. 29
     integral: IntegralSettings | None = None
     limits: StateLimits | None = None
     swarm: SwarmSettings = SwarmSettings()
 
     @classmethod
     def first_configuration(cls) -> PaperSettings:
-        """Section 4.1: Q = I (Eq. 23 is lost; I gives the paper's magnitudes), R of Eq. 24, no
-        damping, and no rebound, which gives the paper's epsilon."""
+        """Return the settings of section 4.1: Q = I (the paper does not print Eq. 23; I gives its
+        magnitudes), R of Eq. 24, no damping, and no rebound, which gives the paper's epsilon."""
         return cls(
             fitness=(1,) * 12,
             energy=(0.0057, 1.25, 1.25, 5.0),
@@ -106,7 +108,7 @@ class PaperSettings(Parameters):
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """The inputs u(k) (4,), the state (12,) they lead to, and how they were found."""
+    """The inputs u(k) (4,), the state x(k+1) (12,) that follows, the problem and its result."""
 
     inputs: Array
     following: Array
@@ -117,10 +119,10 @@ class Move:
 class PaperLaw:
     """The law on any plant of Eq. 14: dynamics (12, 12), inputs (12, 4), lower and upper (4,).
 
-    Remembers the last input (for R_du), the summed error and the random stream; `reset` forgets
-    them. `terminal` (12, 12) replaces diag(Q): with the Riccati solution of the same weights the
-    minimum is optimal over an infinite horizon. Raises ValueError where this plant cannot keep the
-    limits of the settings.
+    Its memory is the last input (for R_du), the summed error and the random stream; `reset` clears
+    it. `terminal` (12, 12) replaces diag(Q): with the Riccati solution of the same weights the
+    minimum is optimal over an infinite horizon. Raises ValueError if this plant cannot keep the
+    state limits of the settings.
     """
 
     def __init__(
@@ -153,7 +155,7 @@ class PaperLaw:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the last input and the summed error, and start the random stream anew."""
+        """Forget the last input and the summed error, and restart the random stream."""
         self._previous = np.zeros(len(self._lower))
         self._summed = np.zeros(len(INTEGRATED))
         self._held = False  # whether the last input was at its bound
@@ -168,10 +170,10 @@ class PaperLaw:
         error: Array | None = None,
         heading_rad: float = 0.0,
     ) -> Move:
-        """u(k) for the state x(k) (12,) towards x_ref(k+1) (12,), Eq. 27.
+        """Return u(k) for the state x(k) (12,) and the reference x_ref(k+1) (12,), Eq. 27.
 
-        `error` (4,) is the present one of `INTEGRATED`, NED, which is summed where the settings
-        weigh its sum; `heading_rad` is that of the axes of `state`. `remaining_s` as in
+        `error` (4,) is the present error of `INTEGRATED`, NED, which the integral term sums;
+        `heading_rad` is the heading of the axes of `state`; `remaining_s` is that of
         `swarm.minimise`.
         """
         bounds = self._limits.narrow(state) if self._limits else (self._lower, self._upper)
@@ -188,15 +190,16 @@ class PaperLaw:
         return Move(result.best, following[: len(state)], problem, result)
 
     def _sum(self, error: Array | None, settings: IntegralSettings) -> None:
-        """Add the error (4,) of this step. While the input is at its bound the sum stops: it could
-        not be acted upon and would have to be unwound later."""
+        """Add the error (4,) of this step to the sum, but not while the input is at its bound
+        (anti-windup)."""
         if error is not None and not self._held and np.isfinite(error).all():
             limits = np.array(settings.limits)
             self._summed = np.clip(self._summed + self._step_s * error, -limits, limits)
 
     def _slope(self, state: Array, reference_next: Array) -> tuple[Array, float]:
-        """Gradient (4,) and constant of Eq. 21 at u = 0. The constant does not move the minimum,
-        but its rounding limits epsilon of Eq. 29: only with it is epsilon the paper's."""
+        """Return gradient (4,) and constant of Eq. 21 at u = 0. The constant does not move the
+        minimum, but its rounding limits epsilon of Eq. 29: only with it does epsilon equal that of
+        the paper."""
         error = self._dynamics @ state - reference_next
         weighed, pull = self._weight @ error, self._rate @ self._previous
         gradient = 2.0 * (self._inputs.T @ weighed - pull)
@@ -206,15 +209,15 @@ class PaperLaw:
 
 
 def along_heading(summed: Array, heading_rad: float) -> Array:
-    """A sum (4,) in axes along and across the nose; errors are summed in NED, in which a wind is
-    constant."""
+    """Return a summed error (4,) in axes along and across the nose. Errors are summed in NED,
+    because a wind is constant there."""
     cosine, sine = np.cos(heading_rad), np.sin(heading_rad)
     north, east, down, heading = summed
     return np.array([cosine * north + sine * east, cosine * east - sine * north, down, heading])
 
 
 def with_error_sum(dynamics: Array, inputs: Array, step_s: float) -> tuple[Array, Array, Array]:
-    """A (16, 16) and B (16, 4) of [x, xi] from those of Eq. 14, and E (16, 12) of its reference.
+    """Return A (16, 16) and B (16, 4) of [x, xi] from those of Eq. 14, and E (16, 12).
 
     xi(k+1) = xi(k) + step_s S (x(k+1) - x_ref(k+1)), where S selects `INTEGRATED`; the reference of
     [x, xi] is E x_ref(k+1).
@@ -231,18 +234,18 @@ class LimitedBox:
     """The bounds of Eq. 22, narrowed at each state to inputs after which all limits can be kept.
 
     An input is allowed only if a linear regulator could stop the vehicle from x(k+1) on within all
-    limits and its own bounds (a maximal output admissible set, Gilbert and Tan 1991), so on the
-    linear model limits once kept are always kept. In the hover model each of these conditions
-    depends on one input only and narrows a bound of Eq. 22.
+    limits and its own bounds (a maximal output admissible set, Gilbert and Tan 1991). On the linear
+    model, limits that are kept once are therefore always kept. In the hover model each of these
+    conditions depends on one input only and narrows a bound of Eq. 22.
 
-    dynamics (12, 12), inputs (12, 4): Eq. 14; lower < 0 < upper (4,). Raises ValueError where a
+    dynamics (12, 12), inputs (12, 4): Eq. 14; lower < 0 < upper (4,). Raises ValueError if a
     condition depends on several inputs.
     """
 
     def __init__(
         self, dynamics: Array, inputs: Array, limits: StateLimits, lower: Array, upper: Array
     ) -> None:
-        import control  # takes a second: only where something is designed
+        import control  # takes a second: imported only for a design
 
         a, b = dynamics[np.ix_(_MOVING, _MOVING)], inputs[_MOVING]
         self._lower, self._upper = lower, upper
@@ -253,7 +256,7 @@ class LimitedBox:
         limited = np.eye(len(_MOVING))[[_MOVING.index(index) for index in most]]
         once = np.vstack([limited, -limited, -self._gain, self._gain])
         ceiling = np.concatenate([[*most.values()] * 2, upper, -lower])
-        # x(k+1) is safe if rows @ x(k+1) <= ceiling, `_LOOK_AHEAD` times
+        # x(k+1) is safe if rows @ x(k+1) <= ceiling, for each step of the look-ahead
         closed, rows = a - b @ self._gain, [once]
         power = np.eye(len(a))
         for _ in range(_LOOK_AHEAD - 1):
@@ -271,8 +274,8 @@ class LimitedBox:
         self._ceiling = np.tile(ceiling, _LOOK_AHEAD)[kept]
 
     def narrow(self, state: Array) -> tuple[Array, Array]:
-        """Lower and upper (4,) at the state x(k) (12,). Where no input keeps the limits (after a
-        gust, or a start outside of them), both are the input of the regulator."""
+        """Return lower and upper bounds (4,) at the state x(k) (12,). If no input keeps the limits
+        (after a gust, or a start outside of them), both equal the input of the regulator."""
         inside = state[_MOVING]
         edges = (self._ceiling - self._free @ inside) / self._slope
         lower, upper = self._lower.copy(), self._upper.copy()

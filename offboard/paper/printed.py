@@ -1,6 +1,6 @@
-"""What the paper prints (doi 10.1117/12.2565129): its tables and Eq. 16, as data.
+"""Tables and Eq. 16 as printed in the paper (doi 10.1117/12.2565129), as data.
 
-Numbers as printed, errors included; `tables.errata_table` lists the errors.
+Numbers are as printed, including errors; `tables.errata_table` lists the errors.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ DOI: Final = "10.1117/12.2565129"
 
 
 class PrintedSpread(NamedTuple):
-    """One row of Table 2: epsilon mean, least, greatest, and J_c1 - J_c(lambda)."""
+    """One row of Table 2: mean, least and greatest epsilon, and J_c1 - J_c(lambda)."""
 
     mean: float
     least: float
@@ -19,7 +19,7 @@ class PrintedSpread(NamedTuple):
     gain: float
 
 
-# The text above Table 2 gives lambda = 1, and its J_c1 = 8.5574e5
+# The row lambda = 1 is from the text above Table 2, which also states J_c1 = 8.5574e5
 UNDAMPED: Final = 1.0
 UNDAMPED_COST: Final = 8.5574e5
 TABLE_2: Final[dict[float, PrintedSpread]] = {
@@ -56,8 +56,8 @@ RATIO_REWEIGHTED: Final[Eight] = (0.0450, 0.0538, 0.6615, 0.0442, 0.0486, 0.0911
 
 
 STATE_NAMES: Final = ("phi", "theta", "psi", "p", "q", "r", "u", "v", "w", "x", "y", "z")
-# The non-zeros of Eq. 16 by the state that each must be of, and the input (f_t, tau_x, tau_y,
-# tau_z: 0 to 3). The rows are printed in this order, not in that of Eq. 5; the twelfth, y, is not
+# The non-zeros of Eq. 16 by the state to which each must belong, and the input (f_t, tau_x, tau_y,
+# tau_z: 0 to 3). Rows are printed in this order, not in that of Eq. 5; the twelfth, y, is missing
 EQ_16: Final[dict[tuple[str, int], float]] = {
     ("phi", 1): 0.0488, ("p", 1): 0.8992, ("psi", 3): 0.1676, ("r", 3): 3.1531,
     ("theta", 2): 0.0488, ("q", 2): 0.8992, ("x", 2): -0.0004, ("u", 2): -0.0161,

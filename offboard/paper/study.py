@@ -1,7 +1,7 @@
-"""`offboard paper`: every table and figure of the study, written one after another, and their page.
+"""`offboard paper`: writes every table and figure of the study, one after another, and their page.
 
-The run is serial; each table and figure takes its flights from one `Flights`, which flies each
-flight once. An interrupted run keeps the tables and figures that it has written.
+Each table and figure gets its flights from one `Flights`, which computes each flight once. An
+interrupted run keeps the tables and figures that it has written.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from offboard.paper.tables import Table, shown
 
 PAGE = "paper.html"
 TITLE = "Linear controller design with PSO for UAV trajectory tracking: printed and computed"
-# Section of the page -> its tables and figures in reading order, and what makes each
+# Section of the page -> its tables and figures in reading order, and the function that makes each
 SECTIONS: dict[str, dict[str, Callable[[Flights], Table | Figure]]] = {
     "Tables of the paper": {
         "table 2": tables.table_2, "table 3": tables.table_3, "table 4": tables.table_4,
@@ -51,7 +51,7 @@ def reproduce(
 
     Args:
         out: output directory; created if absent, else empty.
-        labels: what to make, for example "table 2" or "figure laws"; empty: everything.
+        labels: tables and figures to make, such as "table 2" or "figure laws"; empty: all.
         seeds: flights per row of a table.
 
     Writes table_NAME.csv, figure_NAME.json and paper.html to `out`. Returns tables and figures by

@@ -1,7 +1,7 @@
-"""The tables: 2, 3 and 4 of the paper beside the computed ones, and the errata.
+"""Tables 2, 3 and 4 of the paper beside the computed numbers, and the table of errata.
 
-Each row of Tables 2 to 4 carries a mark for how far it can be compared: the paper prints neither
-its path nor Q of its first configuration.
+A mark in each row of Tables 2 to 4 says to what extent its numbers are comparable, because the
+paper prints neither its path nor Q of its first configuration.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ _MARKS = (
     "+ not in the paper, which flies its linear plant and computes no exact optimum.",
 )
 
-REBOUND = 0.5  # share of the speed; the particles of the paper stop at the box
-FEW = 3  # flights where one number per row is enough
+REBOUND = 0.5  # share of the speed; the particles of the paper stop at the bounds
+FEW = 3  # number of flights for numbers that need only a mean
 
 
 class Table:
@@ -42,8 +42,8 @@ class Table:
 
     Args:
         title: heading on the page.
-        rows: cell by the heading of its column, the same headings in all rows.
-        notes: what may be compared with what, and what the table shows.
+        rows: cells by the headings of their columns, the same headings in all rows.
+        notes: sentences below the table: which numbers are comparable, what the table shows.
     """
 
     def __init__(self, title: str, rows: Sequence[Row], *notes: str) -> None:
@@ -58,7 +58,7 @@ class Table:
 
 
 def shown(cell: Cell) -> str:
-    """A cell as text: four significant digits, a dash for nothing."""
+    """Return a cell as text: four significant digits, a dash for None."""
     if cell is None:
         return "–"
     if isinstance(cell, str):
@@ -69,7 +69,7 @@ def shown(cell: Cell) -> str:
 
 
 def _over_seeds(heading: str, values: Sequence[float] | Array) -> Row:
-    """Mean and standard deviation of one value per seed, empty for a single seed."""
+    """Return mean and standard deviation of one value per seed; the latter is None for one seed."""
     spread = float(np.std(values, ddof=1)) if len(values) > 1 else None
     return {heading: float(np.mean(values)), f"{heading} ±": spread}
 
@@ -78,7 +78,7 @@ def _over_seeds(heading: str, values: Sequence[float] | Array) -> Row:
 
 
 def table_2(flights: Flights) -> Table:
-    """Table 2 on the linear plant, and three of its lambdas on the nonlinear one."""
+    """Make Table 2 on the linear plant, and three of its lambdas on the nonlinear one."""
     few = (printed.UNDAMPED, printed.LEAST_DAMPING, printed.BEST_DAMPING)
     rows = []
     for plant in PlantKind:
@@ -121,7 +121,7 @@ def _damping_row(
 
 
 def table_3(flights: Flights) -> Table:
-    """The errors of Eq. 32 beside the printed ones, at lambda = 1 and 0.65."""
+    """Make Table 3: errors of Eq. 32 beside the printed ones, at lambda = 1 and 0.65."""
     return _errors_table(
         "Table 3: λ = 1 and λ = 0.65, first weights",
         ("λ = 1", printed.ERRORS_UNDAMPED, flights.by_seed(damped(1.0))),
@@ -133,7 +133,7 @@ def table_3(flights: Flights) -> Table:
 
 
 def table_4(flights: Flights) -> Table:
-    """The same at lambda = 0.65, with the first weights and with those of Eqs. 33-35."""
+    """Make Table 4: the same at lambda = 0.65, with first weights and those of Eqs. 33-35."""
     return _errors_table(
         "Table 4: first weights and those of Eqs. 33-35, λ = 0.65",
         ("R_0", printed.ERRORS_DAMPED, flights.by_seed(damped(0.65))),
@@ -174,16 +174,16 @@ def _errors_table(
 
 
 def errata_table(flights: Flights) -> Table:
-    """Errors and omissions of the paper, each with the computed number that shows it; flights are
-    those on the linear plant."""
+    """Make the table of errors and omissions of the paper, each with a computed number that proves
+    it, from flights on the linear plant."""
     columns = ("where", "printed", "correct", "evidence")
     every = (*_model_errata(), *_swarm_errata(flights), *_error_errata(flights))
     return Table("Errata", [dict(zip(columns, each, strict=True)) for each in every])
 
 
 def eq_16(step_s: float, arm_m: float | None = None) -> dict[tuple[str, int], float]:
-    """B_d of Eq. 16 from Table 1, by name of the state and input; with an arm of 1 m tau_x and
-    tau_y are torques."""
+    """Return B_d of Eq. 16, computed from Table 1, by name of the state and number of the input.
+    With an arm of 1 m, tau_x and tau_y are torques."""
     vehicle = paper_vehicle()
     if arm_m:
         vehicle = vehicle.model_copy(update={"arm_m": arm_m})
