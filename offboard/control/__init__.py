@@ -1,4 +1,4 @@
-"""Controllers: from a predicted state and a reference to a command.
+"""Controllers, which compute a command from a predicted state and a reference.
 
 Your own controller is a class with `decide` and `reset`, and a settings class that makes it. Put
 both into a package and register the settings class as an entry point:

@@ -73,7 +73,7 @@ class Certificate:
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What `Controller.decide` returns: the command, and optionally how good it is.
+    """The result of `Controller.decide`: the command, and optionally its certificate.
 
     A `Command` is sent as SET_ATTITUDE_TARGET, after its thrust and tilt are limited to those of
     the vehicle; a `PositionCommand` as SET_POSITION_TARGET_LOCAL_NED.
@@ -127,7 +127,7 @@ class ControllerSettings(Parameters, ABC):
         """Make the controller.
 
         Args:
-            vehicle: What is known of the vehicle before the flight.
+            vehicle: The constants of the vehicle that are known before the flight.
             period_s: Time between two decisions, s of vehicle time.
             seed: Seed of the controller's random numbers; the same seed must give the same
                 decisions.

@@ -13,17 +13,17 @@ or, where bounds or a horizon couple the inputs, the u that minimises the same c
                  estimated disturbance (`TrackingLaw.target`)
     u_ff         the feed-forward: the input of a vehicle that follows the reference half a period
                  later, because a command is held for one period and acts on average in its middle.
-                 It leads by the response of attitude and thrust, so that these are reached in time
+                 It compensates the response of attitude and thrust, so that both are in time
     K            gain of the linear-quadratic regulator of each axis for one bandwidth (`gains`)
     clip         limits thrust, tilt, and the feedback about u_ff (`TrackingLaw._problem_of`)
 
 In NED, acceleration = g e3 - T b - c v + d, with drag c and disturbance d. Written in the thrust
 direction b, the lateral axes [p, v, b, b'], the vertical axis [z, v_z, T b_z] and the heading
-decouple, and no heading frame is needed. K is designed for hover, where the acceleration is g
-times the change of b. At thrust T and a tilted b, if T b_z is kept, it is T (1 + b b^T/b_z^2) times
-the change of b. Position and velocity errors are therefore scaled to those that need the same
-change of b in hover (`Target.to_hover`). Without this scaling, the loop gain at 45 degrees of tilt
-is 2.8 times that of hover, which ends in a limit cycle.
+decouple, and no heading frame is needed. K is designed for hover, where a change db of b changes
+the acceleration by -g db. At thrust T and a tilted b, with T b_z kept, db changes the acceleration
+by -T (1 + b b^T/b_z^2) db. Position and velocity errors are therefore scaled to those that need the
+same db in hover (`Target.to_hover`). Without this scaling, the loop gain at 45 degrees of tilt is
+2.8 times that of hover, which ends in a limit cycle.
 
     J(u) = x'Qx + u'Ru + x(k+1)'P x(k+1) = 1/2 (u - u*)'H(u - u*) + x'P x,  lower <= u <= upper
 
@@ -71,7 +71,7 @@ HEADING_CURVATURE = 1.0  # any positive value gives the same minimum, the feed-f
 # more, which saturates the motors: the thrust then exceeds the command
 HEADING_ACCELERATION_RADPS2 = -5.0, 5.0
 # Indices of the times at which `TrackingLaw.target` samples the reference: when the command begins
-# to act on tilt or thrust, and half a period later, in the middle of its hold (also of the heading)
+# to act on tilt or thrust, and half a period later, in the middle of its hold (heading: the latter)
 TILT_BEGINS, TILT_HELD, THRUST_BEGINS, THRUST_HELD, HEADING_HELD = range(5)
 
 
@@ -99,7 +99,7 @@ class Target:
     `lateral` (4, 2) is [p, v, b, b'] x [north, east] at the time of the predicted state, `vertical`
     (3,) is [z, v_z, T b_z] when the thrust acts; both include the ripple of held commands
     (`gains.hold_ripple`). `feedforward` (3,), b_c north, b_c east and T b_z, and `heading_rad` are
-    taken half a period after the delay of their own axis and lead by its response. `to_hover`
+    taken half a period after the delay of their own axis and compensate its response. `to_hover`
     (2, 2), (T_hover / T) (1 - b b^T), turns lateral deviations into those that need the same
     change of b in hover.
     """
@@ -143,7 +143,7 @@ class TrackingLaw:
         self.period_s = period_s
         self.configured_radps = settings.bandwidth_radps
         self.settings, self._vehicle_file = settings, vehicle
-        self._bandwidth_found_for: object = None  # delays, their uncertainty, and limits
+        self._bandwidth_found_for: object = None  # delays, uncertainty and limits of `bandwidth`
         self.set_vehicle(vehicle)
 
     def reset(self) -> None:
@@ -238,9 +238,9 @@ class TrackingLaw:
 
     def feedforward(self, flat: FlatState, tilt: Any, thrust: Any) -> Array:
         """Return b_c north, b_c east and T b_z (..., 3) that follow the reference. `tilt` and
-        `thrust` index the samples of `flat` in the middle of a hold. The values lead by the
-        response of the vehicle (`model.axes.lead`), minus the second-order difference between a
-        curved command and its mean over the hold."""
+        `thrust` index the samples of `flat` in the middle of a hold. The response of the vehicle is
+        compensated (`model.axes.lead`), and so is, to second order, the difference between a curved
+        command and its mean over the hold."""
         b, rate = flat.thrust_direction_ned[tilt, :2], flat.thrust_direction_rate_ned_ps[tilt, :2]
         bend = flat.thrust_direction_acceleration_ned_ps2[tilt, :2]
         led_tilt = lead(b, rate, bend, self.vehicle.tilt) - self.period_s**2 / 24.0 * bend

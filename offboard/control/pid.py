@@ -62,7 +62,7 @@ class PidLaw(TrackingLaw):
         asked[2] = slower_climb * gains.climb_gain_ps * climb_mps
         asked[:2] += self._integral[:2] @ problem.target.to_hover
         asked[2] += self._integral[2]
-        asked[:2] /= self.vehicle.gravity_mps2  # as tilt
+        asked[:2] /= self.vehicle.gravity_mps2  # converted to tilt
         inputs = problem.inputs(asked)
         clipped = problem.quadratic.clip(inputs)
         self._integrate(np.append(problem.lateral[0], vertical[0]), (clipped == inputs)[[1, 2, 0]])

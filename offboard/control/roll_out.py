@@ -151,7 +151,7 @@ def roll_out(
             costs[n] += _penalties(plant, ahead, volumes, floor_down_m, k, before, after)
         costs[n] += _cost_to_go(plant, states[n, inputs.shape[1]])
         if not math.isfinite(costs[n]):
-            costs[n] = math.inf  # a NaN would win an argmin
+            costs[n] = math.inf  # argmin would select a NaN
 
 
 @kernel

@@ -29,7 +29,7 @@ from offboard.documents.parameters import Parameters
 Array = NDArray[np.float64]
 Generator = np.random.Generator
 
-EVALUATIONS_MOST = 500_000  # a search of 0.5 s with `pso`, of some seconds with `horizon`
+EVALUATIONS_MOST = 500_000  # take 0.5 s with `pso` and some seconds with `horizon`
 FIRST_VELOCITY = 0.5  # bound of the first velocities, times the distance between the bounds
 GAP_FLOOR = 1e-6  # of `certify`, times the variation of the cost within the bounds
 CHUNK_ITERATIONS = 25  # `minimise` checks the time that is left after so many, about every 0.1 ms

@@ -3,7 +3,7 @@ when a command sent now acts.
 
     predict   x(t + h) = f(x(t), commands sent)      `motion`, with the delay of each axis
               P <- F P F' + Q                        F = exp(A h), f linearised about hover
-    update    S = H P H' + R,  K = P H' / S          by each attitude and position that arrives
+    update    S = H P H' + R,  K = P H' / S          with each attitude and position that arrives
               x <- x + K (z - H x),  P <- P - K S K'
     reset     on the ground, after a long gap, and after a jump of the vehicle's own estimate
 

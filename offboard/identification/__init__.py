@@ -1,1 +1,1 @@
-"""From a log or a flight to the vehicle: delay, attitude response, thrust and drag."""
+"""Identifies delay, attitude response, thrust and drag of a vehicle, from a log or in flight."""

@@ -197,7 +197,7 @@ class Learner(VehicleEstimate):
         """Note that the flight has entered `stage`."""
         self._stage = stage
         if stage is Stage.CLIMB:
-            self._climb_s, self.motion_s = time_s, math.inf  # each lap has its own motion
+            self._climb_s, self.motion_s = time_s, math.inf  # a repeated reference has its own
         elif stage is Stage.STEPS:
             self._steps_s = time_s
         elif stage is Stage.MOTION:
@@ -296,7 +296,7 @@ class Learner(VehicleEstimate):
         refusal = found.refusals.get("tilt")
         if found.tilt and found.tilt.delay_s.sd > CERTAIN_S:
             refusal = f"its delay is uncertain: {in_ms(found.tilt.delay_s)}"
-        if refusal and self._settings.excite:  # the advice is useless: steps are flown
+        if refusal and self._settings.excite:  # no advice is needed: steps are flown
             refusal = refusal.removesuffix(FLY_STEPS)
         may_repeat = self._stage is Stage.STEPS and self._rounds < MOST_ROUNDS
         if refusal is not None and may_repeat:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 FREEDOM = 3.0  # degrees of freedom of Student's t
-LEAST_SCALE = 2e-4  # of residuals: smaller ones all have the same weight
+LEAST_SCALE = 2e-4  # least scale of residuals: all smaller residuals have similar weights
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,12 +27,12 @@ from offboard.identification.vehicle_fit import (
 )
 from offboard.model.vehicle import DelayUncertainty, Vehicle
 
-# Uncertainty of a delay: that of a vehicle file before identification, which also has to cover a
-# response slower than the file's
+# Uncertainties of delays. Vehicle file before identification; includes that the response may be
+# slower than the file's:
 UNKNOWN_DELAY_S = 0.4
-FILE_DELAY_S = 0.13  # that of a vehicle file that is flown without identification
-DOUBTED_DELAY_S = 0.28  # that of a tilt which was fitted or flown and which telemetry contradicts
-SDS = 3.0  # that of an identified delay, in standard deviations
+FILE_DELAY_S = 0.13  # vehicle file that is flown without identification
+DOUBTED_DELAY_S = 0.28  # tilt, fitted or flown before, that telemetry contradicts
+SDS = 3.0  # identified delay, in standard deviations
 THRUST_SD_S = math.hypot(THRUST_DELAY_SD_S, THRUST_LAG_SD_S)  # of delay plus lag, before a fit
 DIRECT_LINK_S = 0.004  # delay of a fast link: age of telemetry
 LINK_DIGITS = 2  # delays of the link are rounded to 10 ms: smaller changes are ignored
@@ -153,9 +153,9 @@ class VehicleEstimate:
     # ------------------------------------------------------------------ link and take-over
 
     def on_link_delay(self, link: Estimate | None) -> None:
-        """Add the link's delay, measured before lift-off, to every delay of the vehicle; None if
-        the vehicle did not answer. The vehicle's own delay and the scatter of the link's delay
-        remain unknown."""
+        """Add the link's delay, measured before lift-off, or its change since an earlier flight, to
+        every delay of the vehicle. The vehicle's own delay and the scatter of the link's delay
+        remain unknown. `link` is None if the vehicle did not answer."""
         if link is None:
             return
         if self.delay.known:
@@ -182,8 +182,8 @@ class VehicleEstimate:
         )
 
     def on_link_growth(self, added_s: float, changed_s: float) -> None:
-        """Note that the link's delay has grown by `added_s` since take-off, which the times of
-        commands contain, and has recently changed by `changed_s`, which makes it so uncertain."""
+        """Use the growth `added_s` of the link's delay since take-off, which the times of commands
+        contain, and its recent change `changed_s`, by which the delay is uncertain at least."""
         link = round(added_s, LINK_DIGITS), round(changed_s, LINK_DIGITS)
         if self._link == link:
             return

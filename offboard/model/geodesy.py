@@ -44,7 +44,7 @@ def origin_of(place: Geodetic, known_ned_m: Triple) -> Geodetic:
     shrink = max(math.cos(math.radians(place.latitude_deg)), 1e-6)
     latitude, longitude, altitude = place
     altitude += known_ned_m[2]
-    for _ in range(3):  # each pass leaves a millionth of the error for every few metres
+    for _ in range(3):  # a pass leaves 1e-6 of the error per few metres from the origin
         found = position_ned_m(place, Geodetic(latitude, longitude, altitude))
         north, east, _down = found.tolist()
         latitude += (north - known_ned_m[0]) / metres

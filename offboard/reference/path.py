@@ -165,7 +165,7 @@ def interpolate(times_s: Array, values: Array, knot_spacing_s: float = 0.0) -> S
     """
     rows = times_s.size
     intervals = int(times_s[-1] / knot_spacing_s) if knot_spacing_s > 0.0 else rows
-    if intervals + _DEGREE >= rows:  # a fit would have no fewer coefficients than rows
+    if intervals + _DEGREE >= rows:  # a fit would not have fewer coefficients than rows
         natural = [(order, np.zeros(values.shape[1:])) for order in (3, 4)]
         return Spline(make_interp_spline(times_s, values, k=_DEGREE, bc_type=(natural, natural)))
     # knots at rows, with equal numbers of rows between, so that each span has data

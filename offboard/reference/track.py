@@ -146,7 +146,7 @@ class Track:
 
     @property
     def duration_s(self) -> float:
-        """The time at which it comes to rest."""
+        """The time at which the track comes to rest."""
         return self.track_end_s + self.run_out_s
 
     def path_time_s(self, time_s: float) -> float:
