@@ -2,10 +2,10 @@
 
 A plan is a base (inputs and the states they lead to), which the feedback of the closed form
 follows, plus a few knots of the inputs, interpolated over its steps. The first base is the cheaper
-of the closed form's plan and the previous plan. Cheaper ones among the following are bases too: the
-exact plan of the linear problem (`mpc`), the ways past each side of each volume, and the reference
-flown no faster than a speed limit. The swarm searches for the best knots about the cheapest bases;
-the result never costs more than any of these.
+of the closed form's plan and the previous plan. The cheapest of the following are bases too, if
+they cost less: the exact plan of the linear problem (`mpc`), the ways past each side of each
+volume, and the reference flown no faster than a speed limit. The swarm searches for the best knots
+about each base; the result never costs more than any of these.
 """
 
 from __future__ import annotations

@@ -25,8 +25,7 @@ START_SDS = 0.002, 0.005  # of position (m) and velocity (m/s)
 # Innovations are averaged over SPAN_S and correlated with the average two spans earlier, with the
 # time constant DRIFT_TIME_S
 SPAN_S, LONGEST_SPAN_S, DRIFT_TIME_S = 0.1, 0.3, 3.0
-# The drift grows if the correlation is greater than this: its logarithm by the excess per second
-CORRELATED = 0.25
+CORRELATED = 0.25  # the logarithm of the drift grows by correlation minus this per second
 VISIBLE_M = 1e-5  # smaller innovations do not count
 # A drift of 0.5 to 1.0 after each change of the model was tried. Without noise the error of a
 # flight was half as large. With 30 % loss the disturbance followed lost setpoints, and the largest

@@ -166,7 +166,7 @@ def update(
 ) -> bool:
     """Update state (19,) and covariance with `measured` (m,), H = `h` (m, 19) and R = `variance`
     times the identity, one measurement after the other, so that S is a scalar. Return False, and
-    change nothing, if the innovation of any is beyond `gate` plus GATE_SDS."""
+    change nothing, if an innovation exceeds `gate` plus GATE_SDS standard deviations."""
     size, projected = state.shape[0], np.empty_like(state)
     for row in range(h.shape[0]):
         innovation, total = _innovation(state, covariance, h[row], measured[row], projected)

@@ -34,7 +34,7 @@ _MARKS = (
 )
 
 REBOUND = 0.5  # share of the speed; the particles of the paper stop at the bounds
-FEW = 3  # number of flights for numbers that need only a mean
+FEW = 3  # most flights for a mean that is only compared in the errata
 
 
 class Table:

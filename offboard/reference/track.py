@@ -91,7 +91,7 @@ class Track:
     heading (at an end without run-in or run-out, as continuous as the path is there).
 
     Time 0 is the start of the run-in; positions are NED relative to the take-off point. `heading`
-    is constant, rad, or along the velocity; it is not used if the path has a fourth column.
+    is constant, rad, or along the velocity. A fourth column of the path replaces a constant one.
     """
 
     path: Path
