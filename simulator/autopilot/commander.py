@@ -94,9 +94,8 @@ class Commander:
 
     @property
     def velocity_ratio(self) -> float:
-        """Innovation test ratio of the estimator's velocity, as the firmware reports it."""
-        ratio = math.hypot(*self._state.plant.velocity_error_ned_mps) / _GATE_MPS
-        return ratio**2 if self._firmware.velocity_ratio_squared else ratio
+        """Innovation test ratio of the estimator's velocity."""
+        return math.hypot(*self._state.plant.velocity_error_ned_mps) / _GATE_MPS
 
     @property
     def rejects_velocity(self) -> bool:

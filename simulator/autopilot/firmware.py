@@ -186,7 +186,6 @@ class Firmware(ABC):
     boot_events_s: Mapping[str, float]
     sensor_bits: tuple[int, int, int]  # SYS_STATUS with a fix: present, enabled, healthy
     fails_where_unarmable: bool = False  # while disarmed, checks fail in a mode that does not arm
-    velocity_ratio_squared: bool = False  # the velocity innovation ratio is reported squared
     battery_events: tuple[str, ...]  # events of the battery levels 1, 2, ...
 
     # flight

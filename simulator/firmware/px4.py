@@ -271,7 +271,6 @@ PX4 = Px4(
     sensor_bits=(0x0300402F, 0x0301402F, 0x0330C83F),
     boot_events_s={"fix": 3.0, "ready": 4.0, "ready without position": 4.0},
     fails_where_unarmable=True,
-    velocity_ratio_squared=True,
     battery_events=("battery low", "battery critical", "battery emergency"),
     return_faces_way=True,
     integrates_on_ramp=True,

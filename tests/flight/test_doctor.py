@@ -292,9 +292,9 @@ FOUND: list[tuple[Any, ...]] = [
     ({"mode": "OFFBOARD"},
      ("prearm", WARN, "its pre-arm checks pass in OFFBOARD only while setpoints arrive. "
        "Fix: select AUTO.LOITER, as `offboard fly` does first")),
-    # its estimator: 3 m/s are two of the gates of 1.5 m/s; PX4's ratios are squared
+    # its estimator: 3 m/s are two of the gates of 1.5 m/s
     ({"faults": [REJECTED]},
-     ("estimator", BLOCKS, r"rejects GPS velocity \(innovation ratio 4.00, limit 1\)"),
+     ("estimator", BLOCKS, r"rejects GPS velocity \(innovation ratio 2.00, limit 1\)"),
      ("prearm", WAIT, "unhealthy by SYS_STATUS: RC_RECEIVER")),
     ({"firmware": ARDUPILOT, "faults": [REJECTED]},
      ("estimator", BLOCKS, r"rejects GPS velocity \(innovation ratio 2.00, limit 1\)"),
