@@ -28,8 +28,8 @@ PATIENCE = (
     "With --lockstep: longest wait for the companion.  [default: 180 for its first message, then 5]"
 )
 EXIT_CODES = (
-    "Exit codes: 0 stopped; 2 usage or configuration error; 3 no companion, or it fell silent "
-    "(--lockstep)."
+    "Exit codes: 0 stopped; 2 usage or configuration error; 3 (--lockstep) no companion answered, "
+    "or it stopped answering."
 )
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
@@ -59,7 +59,9 @@ def simulate(
     duration: Annotated[
         float | None, option("SECONDS", "Stop after this vehicle time.", min=0.0)
     ] = None,
-    instance: Annotated[int, option("N", "Added to system id, default ports.", min=0, max=249)] = 0,
+    instance: Annotated[
+        int, option("N", "Number of the first vehicle: for system id and ports.", min=0, max=249)
+    ] = 0,
     instances: Annotated[int, option("N", "Number of vehicles.", min=1, max=100)] = 1,
     patience: Annotated[float | None, option("SECONDS", PATIENCE, min=0.1, max=600.0)] = None,
     signing_key: Annotated[

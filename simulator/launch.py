@@ -30,7 +30,9 @@ def launch(options: Options, stopping: Stop) -> int:
     """
     firmware = FIRMWARES.get(options.firmware)
     if firmware is None:
-        raise UserError(f"--firmware {options.firmware}: unknown; there is {', '.join(FIRMWARES)}")
+        raise UserError(
+            f"--firmware {options.firmware} is unknown; known are {', '.join(FIRMWARES)}"
+        )
     flown = config.scenario(options.scenario or firmware.scenario)
     config.check_for(flown, firmware, lockstep=options.lockstep)
     vehicle = config.vehicle(options.vehicle or firmware.vehicle)

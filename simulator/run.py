@@ -28,7 +28,7 @@ FIRST_ANSWER_TIMEOUT_S = 180.0  # a companion may compile first, perhaps on a bu
 WARM_UP_S = 0.2  # vehicle time in which every frequent message is sent at least once
 SPIN_S = 50e-6  # poll so long without sleeping: most answers come before a core would wake up
 POLL_S = 0.05  # longest wait in a system call, so that a request to stop is noticed
-BEHIND = "the simulator was {most:.1f} s behind real time{times}: not catching up"
+BEHIND = "the simulator was {most:.1f} s behind real time{times} and does not catch up"
 BEHIND_S = 0.5  # a greater lag behind real time is not caught up
 
 

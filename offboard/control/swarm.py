@@ -84,7 +84,7 @@ SEARCH = np.dtype(
     + [("iterations", "i8"), ("done", "i8"), ("cost", "f8"), ("spread", "f8")],
     align=True,
 )
-"""Settings and progress of one search: iterations done, cost of the best, spread (Eqs. 28-29)."""
+"""Settings and progress of one search: iterations done, lowest cost, spread (Eqs. 28-29)."""
 
 _NO_HESSIAN, _NO_GRADIENT = np.empty((0, 0)), np.empty(0)
 

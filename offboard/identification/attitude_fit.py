@@ -179,7 +179,7 @@ def fit_axis(
     problem = ResponseProblem(*axis.signals(trace), wanders=axis.wanders)
     if problem.commanded_rms < axis.least_command_rad:
         refusals[axis.name] = (
-            f"its command moved by {1e3 * problem.commanded_rms:.1f} mrad rms, "
+            f"its command changed by only {1e3 * problem.commanded_rms:.1f} mrad rms, "
             f"{1e3 * axis.least_command_rad:.0f} mrad are needed: fly steps"
         )
         return None

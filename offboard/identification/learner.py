@@ -302,7 +302,7 @@ class Learner(VehicleEstimate):
         if refusal is not None and may_repeat:
             self._rounds += 1
             self._steps_s = self._time_s
-            again = "more flight is awaited" if self._left_box else "repeating the steps"
+            again = "waiting for more flight" if self._left_box else "repeating the steps"
             self.sentences.append(f"{again}, tilt not identified: {refusal}")
             return
         self.identified = True

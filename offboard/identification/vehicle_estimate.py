@@ -178,7 +178,8 @@ class VehicleEstimate:
         self.vehicle, self._link_s = self.vehicle.later_by(changed_s), link_s + changed_s
         self._delay_sd_s = math.hypot(self._delay_sd_s, link.sd)
         self.sentences.append(
-            f"the link delays by {1e3 * changed_s:+.0f} ms since the vehicle was identified"
+            f"the link's delay has changed by {1e3 * changed_s:+.0f} ms since the vehicle was "
+            "identified"
         )
 
     def on_link_growth(self, added_s: float, changed_s: float) -> None:
@@ -189,7 +190,9 @@ class VehicleEstimate:
             return
         self._link = link
         grown_ms, lately_ms = (round(1e3 * each) for each in link)
-        of_link = f"has changed by {lately_ms} ms lately" if lately_ms else "is that of take-off"
+        of_link = (
+            f"has changed by {lately_ms} ms lately" if lately_ms else "is the same as at take-off"
+        )
         if grown_ms > 0:
             of_link = f"has grown by {grown_ms} ms"
         of_tilt = f"is {in_ms(self.delay)}" if self.delay.known else "is not identified yet"
@@ -330,7 +333,7 @@ class VehicleEstimate:
         self._calm_from_s = time_s
         vehicle = "identified vehicle" if self.vehicle != self.file else "vehicle file"
         sentence = (
-            f"the {vehicle} contradicts telemetry: {1e3 * now.rms:.0f} mrad of tilt unexplained "
+            f"telemetry contradicts the {vehicle}: {1e3 * now.rms:.0f} mrad of tilt unexplained "
             f"(limit {1e3 * now.limit:.0f}, commanded {1e3 * now.commanded_rms:.0f})"
         )
         if before.rms < BETTER * now.rms:

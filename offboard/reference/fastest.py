@@ -69,7 +69,7 @@ def fastest_times(
     try:
         start_s = slowed(legs_s)
     except ValueError:
-        raise ValueError("no times of these points keep the limits of fastest") from None
+        raise ValueError("no flight through these points keeps the limits of fastest") from None
     found = minimize(
         lambda scale: scale @ start_s / start_s.sum(),
         np.ones(len(start_s)),

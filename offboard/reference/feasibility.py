@@ -74,7 +74,7 @@ def _envelope(reference: Reference, vehicle: Vehicle, times: Array) -> Envelope:
             worst_s, first_s = map(reference.path_time_s, (worst_s, first_s))
         side = "below" if demand.sign < 0.0 else "beyond"
         raise ValueError(
-            f"the reference asks for {demand.what} {demand.values[worst]:.3g} {demand.unit} at "
+            f"the reference requires {demand.what} {demand.values[worst]:.3g} {demand.unit} at "
             f"{worst_s:.2f} s, {side} the limit of {demand.limit:.3g} {demand.unit} "
             f"(first at {first_s:.2f} s)"
         )

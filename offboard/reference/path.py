@@ -132,7 +132,7 @@ def times_from_speed(points_ned_m: Array, speed_mps: float) -> Array:
     legs_m = np.linalg.norm(np.diff(points_ned_m, axis=0), axis=1)
     for index, leg_m in enumerate(legs_m):
         if leg_m < 1e-3:
-            raise ValueError(f"points {index + 1} and {index + 2} are the same place")
+            raise ValueError(f"points {index + 1} and {index + 2} are at the same place")
     legs_s = legs_m / speed_mps
     legs_s[0] *= _REST_LEG_STRETCH
     if len(legs_s) > 1:

@@ -102,7 +102,7 @@ class Simulated:
         """Check the names and files, before anything is compiled. Raises DocumentError."""
         if self.firmware not in OWN_VEHICLES:
             known = ", ".join(OWN_VEHICLES)
-            raise DocumentError(f"--firmware {self.firmware}: unknown; there is {known}")
+            raise DocumentError(f"--firmware {self.firmware} is unknown; known are {known}")
         if self.scenario is not None:
             check_scenario_named(self.scenario)
         if self.vehicle is not None:

@@ -30,7 +30,9 @@ class LinkFault(Timed, Impairment):
     @model_validator(mode="after")
     def _ends(self) -> LinkFault:
         if self.stalled and self.for_s is None:
-            raise ValueError("a stalled link needs for_s: what waits arrives when the fault ends")
+            raise ValueError(
+                "a stalled link needs for_s: the waiting datagrams arrive when the fault ends"
+            )
         return self
 
     def effect(self, vehicle: Vehicle, running: Running) -> Effect:

@@ -250,7 +250,7 @@ def open_beside(link: Link) -> Link:
         LinkError: `link` is a TCP link, whose connections allow no other sender.
     """
     if not isinstance(link, UdpLink):
-        raise LinkError("fault stranger: it needs a UDP link, where another port can send")
+        raise LinkError("fault stranger needs a UDP link: nobody else can send on a TCP connection")
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sock.setblocking(False)
     sock.bind((link.address[0], 0))

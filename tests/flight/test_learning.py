@@ -269,7 +269,7 @@ def test_attitude_loop_that_slows_is_noticed_and_flown() -> None:
     pair.at.append((in_phase(Phase.TRACK, 3.0), slows))
     pair.track()
     text = " | ".join(pair.companion.announced)
-    doubt = text.index("the identified vehicle contradicts telemetry")
+    doubt = text.index("telemetry contradicts the identified vehicle")
     known = text.index("identified tilt delay", doubt)
     assert "bandwidth limited to 3.0 rad/s" in text[doubt:known]  # the lowest, until it is known
     said = text[known:].split()

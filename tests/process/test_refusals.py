@@ -39,7 +39,7 @@ SPHERE = {"shape": "sphere", "north_m": 0, "east_m": 0, "height_m": 3, "radius_m
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ("--firmware frog", "--firmware frog: unknown; there is px4, ardupilot"),
+        ("--firmware frog", "--firmware frog is unknown; known are px4, ardupilot"),
         ("--connect tcp:127.0.0.1:1", "--sitl starts its own simulator: use --sitl or --connect"),
     ],
 )
@@ -169,7 +169,7 @@ CSV = "time_s,north_m,east_m,altitude_m\n0,0,0,3\n3,2,0,3\n6,2,{east},4\n9,0,0,3
         ("flight.yaml", "# nothing yet", "flight.yaml: no key says what it is"),
         ("mine.yaml", "mass_kg: 1\nhover_trust: 1", "did you mean hover_thrust?"),
         ("mine.yaml", "hover_thrust: 0.5", "no key says what it is: a vehicle has mass_kg, a"),
-        ("path.csv", CSV.format(east=90), "reference path.csv: the reference asks for"),
+        ("path.csv", CSV.format(east=90), "reference path.csv: the reference requires"),
         ("path.csv", CSV.format(east=1e300), "a distance of inf m at"),
         ("circle.yaml", "shape: circle\nperiod_s: 0", "circle.yaml, line 2, column 1: period_s: 0"),
         ("storm.yaml", "name: s\nconditions: {thrust_scale: 9}",

@@ -205,8 +205,8 @@ def test_constant_that_the_flight_does_not_determine_is_refused():
     """Hovering without steps determines the hover thrust alone."""
     found = identify(flown(tilt=0.0, heading=0.0, thrust_step=0.0), VEHICLE_FILE)
     for name, words in (
-        ("tilt", "moved by 0.0 mrad rms"),
-        ("yaw", "moved by 0.0 mrad rms"),
+        ("tilt", "changed by only 0.0 mrad rms"),
+        ("yaw", "changed by only 0.0 mrad rms"),
         ("thrust_lag_s", "the thrust changed by 0.0 %"),
         ("drag_ps", "drag needs motion"),
     ):

@@ -316,7 +316,7 @@ def test_learner_announces_what_is_new_in_motion(monkeypatch: pytest.MonkeyPatch
 
     assert not flown(CONTRADICTS, AGREES, shown=0.42)[0].contradicted
     learner, said = flown(CONTRADICTS, shown=0.42)
-    contradictions = [sentence for sentence in said if "contradicts telemetry" in sentence]
+    contradictions = [sentence for sentence in said if "telemetry contradicts" in sentence]
     assert len(contradictions) == 2
     assert contradictions[1].endswith("until nothing contradicts for 20 s")
     assert learner.uncertainty.tilt_s == DOUBTED_DELAY_S

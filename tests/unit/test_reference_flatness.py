@@ -158,7 +158,7 @@ def test_refused_with_time_value_and_limit(
     with pytest.raises(ValueError, match=f"{side} the limit of {re.escape(limit)}") as caught:
         check(flown, vehicle(tilt_max_rad=0.4 / 0.9))
     sentence = str(caught.value)
-    found = re.match(rf"the reference asks for {what} (-?[\d.e+]+) \S+ at ([\d.]+) s, ", sentence)
+    found = re.match(rf"the reference requires {what} (-?[\d.e+]+) \S+ at ([\d.]+) s, ", sentence)
     assert found, sentence
     assert 0.0 < float(found[2]) <= flown.duration_s + 0.005
 

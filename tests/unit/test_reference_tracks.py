@@ -220,7 +220,7 @@ def test_waypoints_minimise_what_they_say(minimise: str, order: int) -> None:
         ({"shape": "waypoints", "points_m": POINTS}, "one of speed_mps, times_s and fastest"),
         (
             {"shape": "waypoints", "points_m": [[0, 0, 0], [0, 0, 0]], "speed_mps": 1},
-            "points 1 and 2 are the same place",
+            "points 1 and 2 are at the same place",
         ),
         (
             {"shape": "waypoints", "points_m": [[0, 0, 0], [1, 0, 0]], "times_s": [0, 0]},
