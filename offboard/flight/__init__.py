@@ -1,1 +1,1 @@
-"""One flight, without I/O: state, phases, limits, decisions, and what leaves."""
+"""One flight, without I/O: state, phases, limits, decisions, and what is sent."""

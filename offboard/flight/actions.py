@@ -17,30 +17,30 @@ from offboard.mavlink.outgoing import CommandLong
 from offboard.model.command import Command
 
 HEARTBEAT, AUTOPILOT_VERSION = 0, 148  # message ids
-# PX4 sends one a second; a link that loses several may lose all reports of mode and arming. Where
-# no CURRENT_MODE shows the mode (PX4 1.14), a pilot might leave and return between two of them
+# PX4 sends one HEARTBEAT a second: with several of them a link may lose all reports of mode and
+# arming. Without CURRENT_MODE (PX4 1.14), a pilot might leave and return between two HEARTBEATs
 HEARTBEAT_DUE_S, HEARTBEAT_ALONE_DUE_S, HEARTBEAT_EVERY_S = 1.3, 0.2, 0.15
 MODE_REPORTED_S = 3.0  # PX4 1.15 sends CURRENT_MODE twice a second, and when it changes
 FIT_EVERY_S = 4.0  # between two reductions of the telemetry: a backlog must drain first
 SPOOL_UP_PER_S = 0.7  # thrust ramp before lift-off, in units of gravity
 SPOOL_MAX = 2.0
-SPOOL_UNSEEN = 0.9  # without a new position nothing must lift off, or climb
-SPOOL_KNOWN_S = 0.2  # age of a position that shows the height
-# Of an autopilot's own take-off, which setpoints replace on the way: the height of the reference,
-# but above the height that shows lift-off, and no higher than needed
+SPOOL_UNSEEN = 0.9  # less than hover: without a new position the vehicle must not lift off or climb
+SPOOL_KNOWN_S = 0.2  # greatest age of a position that shows the height
+# Least and greatest height of an autopilot's own take-off, which setpoints replace on the way:
+# above the height that shows lift-off, and no higher than needed
 TAKEOFF_HEIGHTS_M = 1.5, 3.0
 DISARMING = (
     f"disarming: {STANDING_S:.0f} s without motion on the ground, and the vehicle does not disarm "
     "by itself"
 )
-# If the landing is refused, setpoints stop and the autopilot's failsafe lands; a link that loses
-# some may need several requests, one a second
+# Setpoints go on for this time while land is requested: a link that loses messages may need several
+# requests, one a second. If land is refused, they stop then, and the autopilot's failsafe lands
 LAND_STREAM_S = 5.0
 
 
 def act(flight: FlightState) -> None:
-    """Send the requests of the phase, at most one setpoint, and requests of the vehicle's time and
-    of a HEARTBEAT that is missing."""
+    """Send the requests of the phase, at most one setpoint, a TIMESYNC request, and a request for a
+    missing HEARTBEAT."""
     if flight.in_end_phase:
         return
     time_s, flight.newest_setpoint = flight.time_s, None  # an older one is not repeated
@@ -60,7 +60,7 @@ def act(flight: FlightState) -> None:
 
 
 def _request_heartbeat(flight: FlightState) -> None:
-    """Request a HEARTBEAT that is due. It changes nothing on the vehicle, whoever has it."""
+    """Request a HEARTBEAT that is overdue. The request changes nothing on the vehicle."""
     request = CommandLong.message(HEARTBEAT)
     alone = flight.vehicle.age_s(ModeReport) > MODE_REPORTED_S
     due_s = HEARTBEAT_ALONE_DUE_S if alone else HEARTBEAT_DUE_S
@@ -70,7 +70,7 @@ def _request_heartbeat(flight: FlightState) -> None:
 
 
 def act_without_telemetry(flight: FlightState, time_s: float) -> None:
-    """Send what needs no telemetry: level setpoints, and the request that ends the flight."""
+    """Send what needs no telemetry: level setpoints, and the requests that end the flight."""
     phase, command = flight.phase, _level(flight)
     if phase is Phase.STAND_DOWN:
         outbox.request(flight, CommandLong.disarm())
@@ -81,7 +81,7 @@ def act_without_telemetry(flight: FlightState, time_s: float) -> None:
             return
     elif phase is not Phase.TAKEOFF and phase not in TRACKING:
         return
-    # Until setpoints have replaced an autopilot's own take-off, none must be sent
+    # Send none until the first decision has replaced the autopilot's own take-off
     if math.isfinite(flight.setpoint_s):
         outbox.send_level(flight, time_s, command)
 
@@ -95,7 +95,7 @@ def _end(flight: FlightState) -> None:
     mode = dialect.hold_mode if holds else dialect.land_mode
     fails = authority.standing is Standing.FAILSAFE
     if fails and authority.mode == dialect.return_mode:
-        return  # the owner's choice for missing setpoints: it lands where it took off
+        return  # the owner has chosen this for missing setpoints: it lands where it took off
     if authority.mode != mode:
         if outbox.request(flight, dialect.hold() if holds else CommandLong.land()):
             authority.request(mode)
@@ -104,8 +104,8 @@ def _end(flight: FlightState) -> None:
 
 
 def _await_link(flight: FlightState) -> None:
-    """Say once that the link is awaited; when the vehicle is heard again, an answer from before
-    does not count any more."""
+    """Announce once that the landing waits for the link. When the vehicle is heard again, forget
+    earlier acknowledgements, so that land is requested again."""
     unreached_s, limits = flight.unreached_s, flight.limits
     waited, flight.awaits_link = flight.awaits_link, unreached_s > 2.0 * limits.silence_s
     if flight.awaits_link and not waited:
@@ -123,8 +123,8 @@ def _await_link(flight: FlightState) -> None:
 
 def _disarm_if_standing(flight: FlightState) -> None:
     """Ask a vehicle that stands on the ground and stays armed to disarm; never by force, so that
-    the autopilot refuses in the air. While its land detector reports flight, it must be disarmed
-    by the user, who is told so. It may have stood before the landing, as without a lift-off."""
+    the autopilot refuses in the air. If its land detector reports flight, tell the user to disarm
+    it instead. Wait first, because without a lift-off it has stood since before the landing."""
     contact = flight.contact
     if not contact.stands or flight.in_phase_s < min(STANDING_S, 0.5 * flight.limits.land_s):
         return
@@ -146,7 +146,7 @@ def _prepare(flight: FlightState, time_s: float) -> None:
         outbox.request(flight, _dialect(flight).engage())
     elif flight.phase is Phase.ARM:
         outbox.request(flight, CommandLong.arm())
-    # On the ground without thrust; in the air with the thrust that hovers
+    # On the ground without thrust, in the air with hover thrust
     flying = flight.contact.in_the_air
     if flight.takes_off_by_command and not flying:
         return
@@ -156,9 +156,10 @@ def _prepare(flight: FlightState, time_s: float) -> None:
 
 
 def _stand_by(flight: FlightState, time_s: float) -> None:
-    """PX4 accepts OFFBOARD only while setpoints arrive, so stream setpoints that change nothing: on
-    the ground no thrust, in the air the vehicle's own attitude and thrust. None in the air in a
-    failsafe, after which PX4 would return to OFFBOARD by itself, or while another program sends."""
+    """Stream setpoints that change nothing, because PX4 accepts OFFBOARD only while setpoints
+    arrive: on the ground without thrust, in the air with the vehicle's own attitude and thrust.
+    Send none in the air in a failsafe or just after it, because PX4 would return to OFFBOARD by
+    itself, none while another program sends setpoints, and none on old telemetry."""
     on_ground, vehicle = flight.contact.on_ground, flight.vehicle
     command = Command(0.0, LEVEL_DIRECTION, vehicle.heading_rad) if on_ground else _flown(flight)
     quiet = bool(flight.takes_off_by_command or telemetry_old(flight) or other_sender(flight))
@@ -173,7 +174,7 @@ def _stand_by(flight: FlightState, time_s: float) -> None:
 
 
 def _flown(flight: FlightState) -> Command:
-    """The attitude that the vehicle has, with the thrust that its autopilot reports."""
+    """Return the attitude that the vehicle has, with the thrust that its autopilot reports."""
     model, share = flight.model, flight.hover.thrust(flight.time_s)
     north, east, down = flight.vehicle.thrust_direction_ned.tolist()
     thrust_mps2 = (1.0 if share is None else share / model.hover_thrust) * model.gravity_mps2
@@ -181,7 +182,7 @@ def _flown(flight: FlightState) -> Command:
 
 
 def request_parameters(flight: FlightState) -> None:
-    """In HEALTH: ask what decides whether the vehicle can be flown; it needs no telemetry."""
+    """In HEALTH, request what decides whether the vehicle can be flown. It needs no telemetry."""
     due = flight.reading.due(_dialect(flight), flight.vehicle)
     outbox.send(flight, *due)
     if flight.service:
@@ -194,8 +195,8 @@ def request_parameters(flight: FlightState) -> None:
 
 
 def _fit_telemetry(flight: FlightState) -> None:
-    """Request less telemetry while the link delays by more than can be flown: it may be
-    saturated."""
+    """Request less telemetry while the delay of the link is too great to fly, because the link may
+    be saturated."""
     link, limits = flight.clock.delay, flight.limits
     if link is None or flight.host_s - flight.clock.began_s < FIT_EVERY_S:
         return
@@ -221,9 +222,11 @@ def _take_off(flight: FlightState, time_s: float) -> None:
 
 
 def _request_takeoff(flight: FlightState, time_s: float) -> None:
-    """The autopilot takes off. No setpoint is sent: without thrust it would cancel that.
+    """Request the autopilot's own take-off. No setpoint is sent, because one without thrust would
+    cancel it.
 
-    The autopilot's thrust is close to hover thrust; the observer needs it for the take-over.
+    Give the observer hover thrust as the command in force, which the autopilot's thrust is close
+    to; the observer needs it when setpoints take over.
     """
     least_m, most_m = TAKEOFF_HEIGHTS_M
     height_m = -float(flight.plan.track.sample(0.0).position_ned_m[2])
@@ -233,8 +236,8 @@ def _request_takeoff(flight: FlightState, time_s: float) -> None:
 
 
 def _level(flight: FlightState) -> Command:
-    """Level, with the thrust that hovers. Before lift-off is seen, with the thrust reached, but
-    less than lifts."""
+    """Return a level command with hover thrust. Before lift-off is seen, it has the thrust that the
+    ramp has reached, but less than lifts the vehicle."""
     reached_mps2, gravity_mps2 = flight.command.thrust_mps2, flight.model.gravity_mps2
     thrust_mps2 = min(reached_mps2, SPOOL_UNSEEN * gravity_mps2)
     if flight.plan.reference is not None:

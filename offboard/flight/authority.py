@@ -1,13 +1,13 @@
-"""Authority: whether the vehicle is ours to command, from the modes that it reports.
+"""Authority: whether the vehicle is ours to command, according to the modes that it reports.
 
-It is ours from the moment when it shows the mode that we asked for until it shows another one that
-we did not ask for; that is final. What a pilot, a ground station or a failsafe has chosen is never
-changed. A report has an age: without a recent one nothing is sent.
+The vehicle is ours from the moment when it reports the mode that we requested until it reports
+another mode that we did not request. This loss is final: a mode that a pilot, a ground station or a
+failsafe has chosen is never changed. No setpoint or command is sent without a recent report.
 
-The mode of the autopilot's own failsafe for missing setpoints is an exception, as nobody chose it:
-the vehicle may be asked to land from it, unless it receives a pilot's sticks.
+The exception is the mode of the autopilot's own failsafe for missing setpoints, which nobody chose:
+from this mode the vehicle may be asked to land, unless it receives a pilot's sticks.
 
-While it is not ours, `PilotSwitch` says whether the pilot of the service has engaged us.
+While the vehicle is not ours, `PilotSwitch` says whether the pilot has engaged the service.
 """
 
 from __future__ import annotations
@@ -19,11 +19,13 @@ from enum import Enum
 from offboard.mavlink.dialects.base import NEVER, SetpointLoss
 from offboard.mavlink.events import MODE_KNOWN_S
 
-JUST_S = 0.6  # PX4 sends CURRENT_MODE twice a second, and at once when the mode changes
+# Age of a report that still counts after a short pause (`Authority.doubt`): PX4 sends CURRENT_MODE
+# twice a second, and at once when the mode changes
+JUST_S = 0.6
 
 
 class Standing(Enum):
-    """What the reported modes, in their order, say."""
+    """Whether the vehicle is ours, according to the sequence of the modes that it has reported."""
 
     FREE = "not asked for yet"
     ASKED = "asked for"
@@ -35,8 +37,8 @@ class Standing(Enum):
 
 @dataclass(slots=True)
 class Authority:
-    """Whether one vehicle is ours; `engage_mode` is empty until it has reported a mode. Times are
-    `Session.link_time_s`; `arrived_s` is host time.
+    """Whether one vehicle is ours. `engage_mode` is the mode in which it follows our setpoints; it
+    is empty until the vehicle has reported a mode. Times are link time, except `arrived_s`.
 
     Example:
         >>> authority = Authority("OFFBOARD")
@@ -61,10 +63,10 @@ class Authority:
     setpoint_loss: SetpointLoss = NEVER  # what the autopilot does without setpoints
     arrived_s: float = -math.inf  # host time of the arrival of the newest report
     _asked_in: str = ""  # the mode reported when we asked for `engage_mode`
-    # modes that we asked for to end the flight, oldest first; those before the one that it shows
-    # are dropped
+    # modes that we requested to end the flight, oldest first; when the vehicle shows one of them,
+    # those requested before it are dropped
     _requested: list[str] = field(default_factory=list)
-    _failsafe_shown: bool = False  # a HEARTBEAT shows what `Standing.FAILSAFE` supposes
+    _failsafe_shown: bool = False  # whether a HEARTBEAT has confirmed `Standing.FAILSAFE`
     _counts_from_s: float = -math.inf  # host time: reports that arrived earlier do not count
 
     def on_mode(
@@ -78,12 +80,13 @@ class Authority:
         setpoints_missing: bool = False,
         sticks: bool | None = False,
     ) -> None:
-        """The vehicle reports `mode`. A failsafe may interrupt a landing that we asked for.
+        """Update the standing with a report of the mode. A failsafe may interrupt a landing that we
+        requested.
 
-        `failsafe`: the newest HEARTBEAT shows one; `heartbeat`: it is this report.
-        `setpoints_missing`: it may have been without setpoints for so long that its failsafe acts;
-        `sticks`: it receives those of a pilot, who may fly it in that failsafe, None: that is not
-        known.
+        `failsafe`: whether the newest HEARTBEAT shows a failsafe; `heartbeat`: whether this report
+        is a HEARTBEAT; `setpoints_missing`: whether the vehicle may have been without setpoints for
+        so long that its failsafe acts; `sticks`: whether it receives a pilot's sticks, with which
+        the pilot may fly it in that failsafe (None: not known).
         """
         before, self.mode = self.mode, mode
         self.heard_s, self.arrived_s = now_s, arrived_s
@@ -118,8 +121,8 @@ class Authority:
     def _on_failsafe(
         self, before: str, now_s: float, failsafe: bool, *, heartbeat: bool, sticks: bool | None
     ) -> None:
-        """The vehicle left the mode `before` for one that its failsafe for missing setpoints may
-        have chosen. Only HEARTBEAT (MAV_STATE) tells that from a pilot's choice."""
+        """The vehicle has left the mode `before` for a mode that its failsafe for missing setpoints
+        may have chosen. Only HEARTBEAT (MAV_STATE) distinguishes that from a pilot's choice."""
         left = f"the vehicle left {self.engage_mode} for {self.mode}"
         if heartbeat and not failsafe:
             self.lose(left, now_s, heartbeat)
@@ -134,12 +137,14 @@ class Authority:
             self._failsafe_shown = shown or (heartbeat and counts and sticks is not None)
 
     def _hand_over(self, mode: str) -> None:
-        """It shows a mode that we requested; those requested before it do not count any more."""
+        """Note that the vehicle shows `mode`, which we requested; earlier requests do not count any
+        more."""
         self.standing = Standing.HANDED
         del self._requested[: self._requested.index(mode)]
 
     def renewed(self) -> Authority:
-        """For another flight of this vehicle: its reports of the mode, and nothing asked for."""
+        """Return the authority for the next flight of this vehicle: it has the same reports of the
+        mode, and nothing was requested."""
         return replace(
             self,
             standing=Standing.FREE,
@@ -150,33 +155,35 @@ class Authority:
         )
 
     def ask(self) -> None:
-        """We ask for the mode in which the vehicle follows our setpoints."""
+        """Note that we request the mode in which the vehicle follows our setpoints."""
         if self.standing is Standing.FREE:
             self._asked_in = self.mode
             already = self.mode == self.engage_mode
             self.standing = Standing.OURS if already else Standing.ASKED
 
     def request(self, mode: str) -> None:
-        """We ask for `mode` as the end of the flight."""
+        """Note that we request `mode` to end the flight."""
         self._requested.append(mode)
 
     def doubt(self, host_s: float, paused_s: float) -> None:
-        """After a pause of our own of `paused_s` that ended at `host_s`: only reports that arrive
-        later count, or that have arrived just before if the pause was too short for the vehicle's
-        failsafe to have acted in it."""
+        """Distrust the reports of the mode after this process has paused for `paused_s` until host
+        time `host_s`: only later reports count. If the pause was too short for the vehicle's
+        failsafe to have acted, reports that arrived within the last JUST_S count as well."""
         self._counts_from_s = host_s - (JUST_S if paused_s < self.setpoint_loss.after_s else 0.0)
         self._failsafe_shown = False
         if self.arrived_s < self._counts_from_s:
             self.reported_s = -math.inf
 
     def forget(self, now_s: float) -> None:
-        """The vehicle was rebooted: its standing is shown by the next report of the mode."""
-        self.heard_s, self.reported_s = now_s, -math.inf  # no report counts as unheard before now
+        """Forget the reports of the mode, because the vehicle was rebooted. Only the next report
+        shows whether a vehicle that was ours has changed its mode."""
+        self.heard_s, self.reported_s = now_s, -math.inf
         if self.is_ours:
             self.standing = Standing.OURS
 
     def lose(self, reason: str, now_s: float, heartbeat: bool) -> None:
-        """The vehicle is not ours any more, for good; `heartbeat`: HEARTBEAT shows it."""
+        """Note that the vehicle is no longer ours, which is final. `heartbeat`: whether a HEARTBEAT
+        shows it."""
         if self.standing is not Standing.LOST:
             self.standing, self.lost_reason = Standing.LOST, reason
             self.lost_s = -math.inf if heartbeat else now_s
@@ -186,36 +193,39 @@ class Authority:
         return now_s - self.reported_s <= MODE_KNOWN_S
 
     def heard(self, now_s: float) -> bool:
-        """Whether reports arrive, even if none counts yet."""
+        """Whether reports of the mode arrive, even if none counts yet."""
         return now_s - self.heard_s <= MODE_KNOWN_S
 
     def unheard_s(self, now_s: float) -> float:
-        """Time since the newest report, if that is longer than usual; else 0."""
+        """Time since the newest report of the mode if it is longer than MODE_KNOWN_S; else 0."""
         return 0.0 if self.heard(now_s) else now_s - self.heard_s
 
     def permits_setpoint(self, now_s: float) -> bool:
-        """Whether a setpoint may leave: to a vehicle that follows it, or as the stream that PX4
+        """Whether a setpoint may be sent: to a vehicle that follows it, or for the stream that PX4
         needs before it accepts the mode."""
         beginning = self.standing in (Standing.FREE, Standing.ASKED)
         return self._known(now_s) and (beginning or self.standing is Standing.OURS)
 
     def permits_command(self, now_s: float) -> bool:
-        """Whether a command may leave."""
+        """Whether a command may be sent."""
         handed = self.standing is Standing.HANDED and self.mode in self._requested
         fallen = self.standing is Standing.FAILSAFE and self._failsafe_shown
         return self.permits_setpoint(now_s) or (self._known(now_s) and (handed or fallen))
 
     @property
     def is_ours(self) -> bool:
-        """Nobody else has chosen its mode since it followed us, however old the report is."""
+        """Whether nobody else has changed the mode since the vehicle followed us, however old the
+        newest report is."""
         return self.standing in (Standing.OURS, Standing.FAILSAFE, Standing.HANDED)
 
 
 class PilotSwitch(Enum):
-    """How the vehicle came to the mode of setpoints, or whether it is in another one, by its
-    reports. The pilot of the service, which does not ask for that mode, engages by a switch to it,
-    in the air, from a mode that was shown without a failsafe: after a failsafe PX4 returns to
-    OFFBOARD by itself as soon as setpoints arrive.
+    """Whether the pilot has engaged the service, according to the modes that the vehicle reports;
+    "it" in the texts is the mode of setpoints (OFFBOARD or GUIDED).
+
+    While it waits, the service does not request this mode. The pilot engages it by a switch to this
+    mode in the air, from a mode that a HEARTBEAT has shown without a failsafe: after a failsafe PX4
+    returns to OFFBOARD by itself as soon as setpoints arrive.
     """
 
     FOUND = "in it, in the air, in every report since the service began or the vehicle rebooted"
@@ -228,9 +238,9 @@ class PilotSwitch(Enum):
     def after(
         self, *, in_engage_mode: bool, in_the_air: bool, flies: bool, failsafe: bool | None
     ) -> PilotSwitch:
-        """After a report of the mode. Only a vehicle that `flies` by every sign
-        (`GroundContact.flies`) is engaged. `failsafe`: whether HEARTBEAT shows one, None if the
-        report is none."""
+        """Return the state after a report of the mode. Only a vehicle that `flies` for certain
+        (`GroundContact.flies`) is engaged. `failsafe`: whether the report, if it is a HEARTBEAT,
+        shows a failsafe; None for any other report."""
         shown = PilotSwitch
         if self is shown.FOUND and in_engage_mode and in_the_air:
             return self

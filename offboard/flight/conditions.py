@@ -11,19 +11,19 @@ from offboard.flight.state import FlightState
 
 OPERATOR = "{flight.stop_cause}"  # the cause of a row for `stop_requested`
 REBOOTED = "the vehicle restarted"
-# A function of the flight that changes nothing: false (or an empty text) while it does not hold; a
-# text says why it holds
+# A function that reads the flight and changes nothing. It returns False or an empty text while it
+# does not hold, and True or a text that says why while it does
 Condition = Callable[[FlightState], str | bool]
 
 
 @dataclass(frozen=True, slots=True)
 class Transition:
-    """A row of the phase table: from each of `phases`, when `condition` holds, to `target`.
+    """A row of the phase table: if `condition` holds in one of `phases`, `target` is entered.
 
     `exit_code` is set if this row decides the result; a later row can only make it more severe.
-    `cause` is a word for what ended a flight that the row ends (see `analysis.verdict`). `reason`
-    is the sentence, where the condition does not say it. Texts may have values of the flight in
-    braces.
+    `cause` is a word for what ended the flight, if the row ends it (`ended_by` of the score).
+    `reason` is the sentence that says why; if it is empty, the text of the condition says it. Both
+    texts may contain values of the flight in braces.
     """
 
     phases: Set[Phase]
@@ -75,17 +75,17 @@ def rebooted(flight: FlightState) -> str:
 
 
 def authority_lost(flight: FlightState) -> str:
-    """Another has taken control of the vehicle."""
+    """A pilot, a ground station or a failsafe has taken control of the vehicle."""
     return flight.authority.lost_reason
 
 
 def authority_lost_armed(flight: FlightState) -> str:
-    """Another has changed the mode of a vehicle that stays armed."""
+    """Someone else has changed the mode, and a HEARTBEAT since then shows the vehicle armed."""
     return authority_lost(flight) if flight.shown_since_lost and flight.vehicle.armed else ""
 
 
 def in_own_failsafe(flight: FlightState) -> str:
-    """Setpoints were missing, and the autopilot's failsafe flies the vehicle."""
+    """The vehicle received no setpoints, and the autopilot's failsafe flies it."""
     if flight.authority.standing is not Standing.FAILSAFE:
         return ""
     mode = flight.vehicle.mode
@@ -97,7 +97,8 @@ def stop_requested(flight: FlightState) -> str:
 
 
 def longer_than(limit: str, says: Condition = lambda flight: True) -> Condition:
-    """Holds once the phase has lasted longer than the limit of this name; `says` why then."""
+    """Make a condition that holds once the phase has lasted longer than the field `limit` of
+    `Limits` and `says`, which returns the reason, holds too."""
 
     def too_long(flight: FlightState) -> str | bool:
         return flight.in_phase_s > getattr(flight.limits, limit) and says(flight)

@@ -1,7 +1,7 @@
 """The decision of one tick: predict the state, call the control law, and send its command.
 
-Once the setpoint has left, log the decision and identify the vehicle. Failures of the law are
-counted, never raised: the vehicle is in the air.
+After the setpoint was sent, log the decision and identify the vehicle. Failures of the law are
+counted and never raised, because the vehicle is in the air.
 """
 
 from __future__ import annotations
@@ -33,18 +33,19 @@ from offboard.model.command import Command
 
 DECISION_MISSED = "decision missed: "
 NOTICEABLE_RADPS = 0.5  # a smaller change of the bandwidth is not announced
-# in a word -> what a missed decision is ascribed to
+# why a decision was missed: in a word -> in a clause
 _BY = {
     "controller": "the controller failed",
     "link": "telemetry was too old for a setpoint",
     "computer": "this computer was too busy",
 }
-# of a law that answered within a period
+# cause of a refusal that is not the fault of a law that decided within a period
 _NOT_OF_THE_LAW: dict[int, str] = {Refusal.STALE: "link", Refusal.LATE: "computer"}
 
 
 def begin(flight: FlightState) -> None:
-    """Before the first decision: the vehicle is not identified yet."""
+    """Give the controller the vehicle model, with the uncertainty that it has before it is
+    identified. Call this before the first decision."""
     if flight.identification and isinstance(flight.controller, Adaptive):
         flight.controller.set_vehicle(flight.model, flight.identification.uncertainty)
         flight.told_radps = 2 * (flight.controller.configured_radps,)
@@ -53,10 +54,10 @@ def begin(flight: FlightState) -> None:
 def decide(flight: FlightState) -> bool:
     """Decide, and queue the setpoint.
 
-    Returns False, and increases `missed`, if the decision failed or was refused; then
-    nothing is sent. Telemetry that was too old before the decision began does not count: the
-    failsafe has a row for it. Nothing is missed either while the observer has no position or no
-    attitude yet: a service may be engaged again at once after a flight.
+    Returns False, and increases `missed`, if the decision failed or was refused; then nothing is
+    sent. Two cases return False and do not increase `missed`: telemetry that was too old before the
+    decision began, for which the failsafe has a row, and an observer that has no position or no
+    attitude yet, because a service may be engaged again right after a flight.
     """
     if not flight.observer.ready:
         return False
@@ -80,13 +81,13 @@ def decide(flight: FlightState) -> bool:
 
 
 def finish(flight: FlightState, sent_s: float) -> None:
-    """After the setpoint was sent, at host time `sent_s`: log the decision and identify."""
+    """Log the decision and identify the vehicle. The setpoint was sent at host time `sent_s`."""
     decided, flight.decided = flight.decided, None
     if decided is None:
         return
     try:
         _record(flight, decided, sent_s - flight.telemetry_arrived_s)
-    except Exception as error:  # the certificate is the law's
+    except Exception as error:  # the certificate comes from the law and may be unusable
         _miss(flight, located(error), "controller", DECISION_FAILED)
         return
     if not decided.refused:
@@ -102,7 +103,8 @@ def _miss(flight: FlightState, failure: str, cause: str, begins: str = DECISION_
 
 
 def _send(flight: FlightState, decided: Decided) -> None:
-    """Send the command, if it is admitted; age and lateness are measured now, in host time."""
+    """Send the command if `outbox.admit` allows it. Its age and lateness are measured now, in host
+    time."""
     command, host_s, late_s = decided.decision.command, flight.host_s, 0.0
     if flight.deadline_s is not None:
         host_s = flight.stopwatch()
@@ -168,7 +170,7 @@ def _set_vehicle(flight: FlightState, update: VehicleUpdate) -> None:
 def _with_bandwidth(
     flight: FlightState, update: VehicleUpdate, controller: Adaptive
 ) -> tuple[str, ...]:
-    """The sentences for the user, and the bandwidth in use if it has changed noticeably."""
+    """Return the sentences for the user, with the bandwidth in use if it has changed noticeably."""
     used, configured_radps = controller.bandwidth, controller.configured_radps
     changed_radps = max(map(abs, map(sub, used, flight.told_radps)))
     as_configured = set(used) == {configured_radps}
@@ -196,7 +198,7 @@ def _record(flight: FlightState, decided: Decided, answer_s: float) -> None:
 
 
 def tick_record(flight: FlightState, decided: Decided, answer_s: float) -> TickRecord:
-    """The record of a tick. The certificate counts if the setpoint was sent as decided."""
+    """Return the record of a tick, with the certificate only if the setpoint was sent unchanged."""
     sent, state = decided.sent, decided.state
     # with a position setpoint, the autopilot chooses thrust and direction
     attitude = sent if isinstance(sent, Command) else None

@@ -1,5 +1,5 @@
-"""What users and displays read of a flight beside its phases: what is waited for, a computer that
-is late, and the values of a moment.
+"""What users and displays are told about a flight beside its phases: what it waits for, pauses of
+this computer, and the present values.
 """
 
 from __future__ import annotations
@@ -17,26 +17,25 @@ MESSAGES_DROPPED = (
     "{total:.0f} of our messages to the vehicle dropped: this computer was too busy, and they "
     "became too old"
 )
-# In a phase, before the first reason: telemetry has only just been requested, checks are running,
-# the vehicle has not said yet which one it is
+# Time in a phase before the first reason is announced: telemetry has only just been requested,
+# checks are running, the vehicle has not reported its hardware number yet
 FIRST_S = {Phase.CONNECT: 2.5, Phase.HEALTH: 5.0, Phase.STANDBY: 1.0}
-HELD_S = 0.5  # a reason that holds for less is not told: a new message is slow at first
-AGAIN_S = 10.0  # the same reason, in other figures too
+HELD_S = 0.5  # a reason that holds for less is not announced: a new message is slow at first
+AGAIN_S = 10.0  # interval at which the same reason is announced again, with new figures
 
 
 class News:
     """Announcements of one flight beside its phases: pauses of this process and dropped messages
-    (`add` them), each at most once a second, and why the flight does not begin yet. A reason
-    of a found vehicle is repeated every ten seconds with new figures; that no vehicle is heard is
-    said once."""
+    (`add` reports one), each at most once a second, and why the flight does not begin yet. In
+    HEALTH the reason is repeated every AGAIN_S; in CONNECT and STANDBY it is announced once."""
 
     def __init__(self) -> None:
         self.paused, self.dropped = Repeated(PAUSED), Repeated(MESSAGES_DROPPED)
-        self._kind = self._said = ""  # of reasons, without figures: the present, the newest told
+        self._kind = self._said = ""  # present reason and newest announced, without figures
         self._since_s = self._said_s = -math.inf
 
     def due(self, state: FlightState, now_s: float) -> list[str]:
-        """The sentences to announce now, at host time `now_s`."""
+        """Return the sentences to announce now, at host time `now_s`."""
         told = [self.paused.news(now_s), self.dropped.news(now_s), self._waiting(state)]
         return list(filter(None, told))
 
@@ -60,7 +59,8 @@ class News:
 
 
 def _left_alone(state: FlightState) -> str:
-    """That a vehicle is in the mode of setpoints, which this service did not ask for."""
+    """The sentence that the vehicle was found in the mode of setpoints and is left alone; empty if
+    it was not found so."""
     if state.left_engaged or not found_engaged(state):
         return ""
     return (
@@ -70,7 +70,7 @@ def _left_alone(state: FlightState) -> str:
 
 
 def _unheard(state: FlightState) -> str:
-    """What is heard instead of a vehicle."""
+    """The sentence that says what is received instead of a vehicle."""
     session, received = state.session, state.session.splitter
     if not received.bytes_received:
         return "nothing is heard on this link"
@@ -84,11 +84,11 @@ TEXTS_KEPT = 8
 
 
 class Snapshot:
-    """For displays outside the loop (terminal, live page, metrics): values only, safe to pass to
-    another thread. SI, NED, vehicle time; NaN or None for what is not known yet. The attributes are
-    the fields of the JSON objects.
+    """The present values of a flight, for displays outside the loop (terminal, live page, metrics).
+    It has no references to the flight, so that it can be passed to another thread. SI, NED, vehicle
+    time; NaN or None for what is not known yet. The attributes are the fields of the JSON objects.
 
-    `flights`: that the service has begun.
+    `flights`: number of flights that the service has begun.
     """
 
     def __init__(self, state: FlightState, flights: int = 0) -> None:
@@ -103,18 +103,18 @@ class Snapshot:
         self.phase = state.phase.value
         self.in_phase_s = state.in_phase_s
         self.track_time_s = state.track_time_s  # since the start of the track
-        self.mode = vehicle.mode  # that the vehicle shows
+        self.mode = vehicle.mode  # reported by the vehicle
         self.armed = vehicle.armed
         # a name of `authority.Standing` in lower case; "unknown" before the first mode
         self.authority = (
             state.authority.standing.name.lower() if state.authority.engage_mode else "unknown"
         )
         self.failsafe = state.failsafe.action.name.lower()
-        self.failsafe_row = state.failsafe.row  # that the action follows from
+        self.failsafe_row = state.failsafe.row  # the row that demands this action
         self.position_ned_m = position.position_ned_m if position else None
         self.velocity_ned_mps = position.velocity_ned_mps if position else None
         self.attitude = attitude.attitude if attitude else None  # (w, x, y, z), NED to FRD
-        # from the climb to the landing, as is the error
+        # reference and error are known from the climb to the landing
         self.reference_ned_m = sample.position_ned_m.tolist() if sample else None
         self.position_error_m = state.position_error_m if sample else math.nan
         self.thrust_mps2 = command.thrust_mps2  # of the command in force, as are the next two
@@ -128,8 +128,8 @@ class Snapshot:
         self.link_growth_s = state.clock.growth.added_s  # since take-off
         self.missed_decisions = state.missed  # in a row
         self.skipped_ticks = state.busyness.skipped  # in pauses of this process, since take-off
-        self.computer = state.busyness.sentence  # that it is too busy; empty if it keeps up
-        self.battery = math.nan if charge is None else charge  # remaining, of 1
+        self.computer = state.busyness.sentence  # if it is too busy; empty if it keeps up
+        self.battery = math.nan if charge is None else charge  # remaining charge, 0 .. 1
         self.other_datagrams = state.other_datagrams  # of other senders, since the start
         # frames that signing refused, since the start
         self.forged = state.session.senders.forged.total()

@@ -1,17 +1,17 @@
-"""What successive reports of the vehicle show: what the position estimate has lost since the
-beginning of the flight, its jumps and drift, and the thrust that hovers.
+"""What successive reports of the vehicle show: what its position estimate has lost since the
+beginning of the flight, the jumps and drift of this estimate, and the hover thrust.
 
-PX4 goes on under attitude setpoints when its GPS is lost, and reports a position that drifts away:
-0.5 m in the first second, 10 m in fifteen. Only what was there at the beginning can be lost: a
-vehicle may fly by motion capture or optical flow, without GPS.
+PX4 continues to follow attitude setpoints when its GPS is lost, and reports a position that drifts
+away: by 0.5 m in the first second, 10 m in 15 s. Only what was there at the beginning can be lost,
+because a vehicle may fly by motion capture or optical flow, without GPS.
 
-Jumps are resets of the vehicle's estimator. No message is needed for them
-(ODOMETRY.reset_counter: PX4 only): on any autopilot, two positions some milliseconds apart that
-are too far from each other for any motion show one.
+Jumps are resets of the vehicle's estimator. They are found without a message about them
+(ODOMETRY.reset_counter exists on PX4 only): two positions some milliseconds apart that are too far
+from each other for any motion show a jump.
 
-Before setpoints replace an autopilot's own take-off, or its mode of a vehicle found in the air,
-the thrust that it reports (ATTITUDE_TARGET) and its acceleration show the thrust that hovers,
-whatever the vehicle file says and however fast it climbs.
+Before our setpoints replace the autopilot's own take-off, or its own mode in the air, the thrust
+that it reports (ATTITUDE_TARGET) and the acceleration of the vehicle show the hover thrust,
+whatever the vehicle file says and however fast the vehicle climbs.
 """
 
 from __future__ import annotations
@@ -34,23 +34,24 @@ from offboard.model.vehicle import HOVER_THRUST_LIMITS, Vehicle
 
 Array = NDArray[np.float64]
 
-KNOWN_S = 2.5  # age of a report that counts when the flight begins
-SILENT_S, SILENT_MESSAGES = 2.0, 10.0  # missing in a row: more than a lossy link loses
-WORSE = 2.0  # times the accuracy of the beginning, where that was no better than the limit
+KNOWN_S = 2.5  # greatest age of a report that counts when the flight begins
+SILENT_S, SILENT_MESSAGES = 2.0, 10.0  # time and messages missing: more than a lossy link loses
+WORSE = 2.0  # an accuracy that is worse than at the beginning by up to this factor is no loss
 
 
 @dataclass(slots=True)
 class Positioning:
-    """What the position estimate had when the flight began; nothing before that."""
+    """What the position estimate had when the flight began, and what of it is lost. Before the
+    flight nothing counts as lost."""
 
     had_fix: bool = False
     report: EstimatorReport | None = None
-    fixes_silent_s: float = math.inf  # so long without fixes their messages are missing
-    reports_silent_s: float = math.inf
+    fixes_silent_s: float = math.inf  # GPS_RAW_INT is missing after this time without a fix
+    reports_silent_s: float = math.inf  # the same for EstimatorReport
 
     def begin(self, vehicle: VehicleState, rates_hz: Mapping[str, float], estimator: str) -> None:
-        """The flight begins. `rates_hz` of the messages that arrive, `estimator` the name of the
-        one that becomes an EstimatorReport."""
+        """Note what there is when the flight begins. `rates_hz` are the rates of the messages that
+        arrive, by name; `estimator` is the name of the one that becomes an EstimatorReport."""
         self.had_fix = vehicle.age_s(GpsFix) < KNOWN_S
         self.fixes_silent_s = _silent_s(rates_hz.get("GPS_RAW_INT", 0.0))
         if vehicle.age_s(EstimatorReport) < KNOWN_S:
@@ -85,26 +86,26 @@ def _silent_s(rate_hz: float) -> float:
 
 # ---------------------------------------------------------------------- jumps
 
-LEAST_JUMP_M = GATES[0]  # a smaller one is corrected as an error
-ACCELERATION_MPS2 = 20.0  # of a motion between two reports, which their velocities do not show
+LEAST_JUMP_M = GATES[0]  # the observer corrects a smaller one as an error
+ACCELERATION_MPS2 = 20.0  # greatest acceleration between two reports that their velocities hide
 LONGEST_GAP_S = 0.5  # after a longer one nothing is concluded
 RECENT_S = 10.0
-NOISES = 6.0  # times the mean difference of successive positions; less is no jump, but noise
-NOISE_SHARE = 0.01  # of the newest difference in this mean
+NOISES = 6.0  # times the mean difference of successive positions: less is noise, not a jump
+NOISE_SHARE = 0.01  # weight of the newest difference in this mean
 DRIFT_S = 1.0  # time constant; real PX4 drifts by 0.7 m at most, without a fix by 14 m
 
 
 class PositionJumps:
-    """Finds the jumps between successive positions. `drift_m`: by how much positions, without the
-    jumps, and velocities of the last second contradict each other.
+    """Finds the jumps between successive positions. `drift_m` is the difference between the motion
+    by the positions, without jumps, and the motion by the velocities, over the last second.
 
-    The vehicle does not move with a jump: a place on the ground is kept without the jumps before
-    it, and compared with positions without theirs."""
+    The vehicle does not move with a jump. A `place` is a position from which all jumps before it
+    are subtracted: places from before and after a jump can be compared."""
 
     def __init__(self) -> None:
         self._newest: LocalPosition | None = None
         self._jumps: deque[tuple[float, float]] = deque()  # when, by how many metres
-        self._noise_m = 0.0  # mean distance between a position and what the one before leads to
+        self._noise_m = 0.0  # mean distance of a position from its prediction by the one before
         self._total_ned_m = (0.0, 0.0, 0.0)  # sum of all
         self._drift_ned_m = (0.0, 0.0, 0.0)
 
@@ -144,12 +145,12 @@ class PositionJumps:
         return np.array(jump_m)
 
     def without(self, reported_ned_m: Triple) -> Triple:
-        """The place of a position that is reported now."""
+        """Return the place of a position that is reported now."""
         north, east, down = map(operator.sub, reported_ned_m, self._total_ned_m)
         return north, east, down
 
     def reported(self, place_ned_m: Triple) -> Triple:
-        """The position that a vehicle at this place would report now."""
+        """Return the position that a vehicle at this place would report now."""
         north, east, down = map(operator.add, place_ned_m, self._total_ned_m)
         return north, east, down
 
@@ -160,44 +161,45 @@ class PositionJumps:
         return sum(size_m for _, size_m in self._jumps)
 
     def forget(self) -> None:
-        """Drop the jumps so far: those on the ground do not count for the flight."""
+        """Forget the jumps so far, because those on the ground do not count for the flight."""
         self._jumps.clear()
 
 
 # ---------------------------------------------------------------------- hover thrust
 
 WINDOW_S, KEPT_S = 0.5, 1.5
-GROUND_M = 0.2  # lower, the ground may carry it
+GROUND_M = 0.2  # below this height the ground may carry the vehicle
 LEAST_THRUSTS, LEAST_SPEEDS, LEAST_S = 3, 4, 0.25  # in the window; 10 Hz must suffice
-LEAST_LIFT = 0.3  # of the weight: less shows too little of the thrust
+LEAST_LIFT = 0.3  # of the weight: less lift shows too little of the thrust
 
 
 class HoverEstimate:
-    """Thrust reported and vertical speed of the last KEPT_S, by vehicle time."""
+    """The hover thrust, from the reported thrust and the vertical speed of the last KEPT_S."""
 
     def __init__(self) -> None:
         self._thrusts: deque[tuple[float, ...]] = deque()  # time, thrust, its vertical part
         self._speeds: deque[tuple[float, ...]] = deque()  # time, speed down
 
     def on_thrust(self, time_s: float, thrust: float, lift: float) -> None:
-        """The autopilot reports its collective thrust, 0 .. 1; `lift` is its vertical part."""
+        """Take the collective thrust that the autopilot reports, 0 .. 1; `lift` is its vertical
+        part."""
         _append(self._thrusts, (time_s, thrust, lift))
 
     def on_position(self, time_s: float, height_m: float, down_mps: float) -> None:
-        """Height above the ground, and vertical velocity, positive down."""
+        """Take the height above the ground, and the vertical velocity, positive down."""
         if height_m < GROUND_M:
             self._speeds.clear()
             return
         _append(self._speeds, (time_s, down_mps))
 
     def thrust(self, time_s: float) -> float | None:
-        """Mean of the thrust that was reported in the WINDOW_S before `time_s`; None without."""
+        """Mean of the thrust that was reported in the WINDOW_S before `time_s`, or None."""
         thrusts = _within(self._thrusts, time_s - WINDOW_S, time_s)
         return float(np.mean(thrusts[:, 1])) if len(thrusts) else None
 
     def hover_thrust(self, vehicle: Vehicle, time_s: float) -> float | None:
-        """The normalised thrust that holds the weight, from the WINDOW_S before `time_s`; None if
-        too little was reported in it, or the vehicle falls. Delay, lag and drag are `vehicle`'s:
+        """The hover thrust (normalised), from the WINDOW_S before `time_s`; None if too little was
+        reported in it, or the vehicle falls. Delay, lag and drag are those of `vehicle`:
         a_down = g (1 - u_lift / u_h) - c v_down."""
         speeds = _within(self._speeds, time_s - WINDOW_S, time_s)
         if len(speeds) < LEAST_SPEEDS or speeds[-1, 0] - speeds[0, 0] < LEAST_S:

@@ -1,4 +1,4 @@
-"""Failsafe: what follows when a limit is exceeded in flight. One row for each condition."""
+"""The failsafe: what the flight does when a limit is exceeded. One row for each condition."""
 
 from __future__ import annotations
 
@@ -17,13 +17,15 @@ from offboard.flight.state import COMMANDS_KEPT, FlightState
 from offboard.flight.timing import JUMP_S
 from offboard.mavlink.events import MODE_KNOWN_S, ThrustReport
 
-RECOVERY = 0.25  # seconds by which a held time decreases in one without the condition
-STEP_MAX_S = 0.2  # what one sample counts for, also after a gap of telemetry
-SINK_MPS = 0.3  # that full thrust stops within the delay, on a vehicle that can be flown
+RECOVERY = 0.25  # s by which the held time decreases in each second without the condition
+STEP_MAX_S = 0.2  # most by which one call of `judge` increases a held time, also after a gap
+SINK_MPS = 0.3  # full thrust stops this sink within the delay, on a vehicle that can be flown
 FULL_THRUST = 0.99
-LOW_THRUST = 0.5  # of the hover thrust: no updraft, and hardly a payload, makes such a difference
-STANDS_BELOW_M = 0.25  # references are at least 0.5 m above the take-off point
-THRUST_REPORT_S = 1.0  # age of a ThrustReport that counts
+# Share of the hover thrust at the start: an updraft never, and a lost payload hardly ever, reduces
+# the thrust so far
+LOW_THRUST = 0.5
+STANDS_BELOW_M = 0.25  # below the reference, which is at least 0.5 m above the take-off point
+THRUST_REPORT_S = 1.0  # greatest age of a ThrustReport that counts
 
 
 # ---------------------------------------------------------------------- conditions of the failsafe
@@ -50,7 +52,7 @@ def late_link(flight: FlightState) -> str:
 
 
 def unanswered(flight: FlightState) -> str:
-    """Requests of TIMESYNC in a row without the answer that was due, times their period."""
+    """Number of TIMESYNC requests in a row whose reply is overdue, times their period."""
     requests = flight.clock.overdue(flight.host_s)
     if requests * flight.period_s <= flight.limits.silence_s:
         return ""
@@ -58,12 +60,12 @@ def unanswered(flight: FlightState) -> str:
 
 
 def decision_missed(flight: FlightState) -> str:
-    """A decision failed, came too late, or was not fit to be sent."""
+    """A decision failed, came too late, or was refused by the last check of the setpoint."""
     return flight.failure if flight.missed else ""
 
 
 def decisions_missed(flight: FlightState) -> str:
-    """Decisions missed in a row."""
+    """Number of decisions missed in a row."""
     return flight.failure if flight.missed >= flight.limits.missed_decisions else ""
 
 
@@ -77,10 +79,10 @@ def tilted(flight: FlightState) -> str:
 
 
 def away_from_commands(flight: FlightState) -> str:
-    """Angle between the thrust direction and that of the nearest of the newest 7 setpoints, if all
-    of them had an attitude."""
+    """Angle between the thrust direction of the vehicle and the nearest of those of the newest 7
+    setpoints, if all 7 are attitude setpoints."""
     vehicle, commands = flight.vehicle, flight.commands
-    # a position setpoint empties `thrusts`: fewer are newer than it
+    # a position setpoint empties `thrusts`, so that it holds only the thrusts sent since then
     if vehicle.attitude is None or len(flight.thrusts) < COMMANDS_KEPT:
         return ""
     flown = vehicle.thrust_direction_ned
@@ -103,7 +105,7 @@ def away_from_reference(flight: FlightState) -> str:
 
 
 def away_from_prediction(flight: FlightState) -> str:
-    """Distance from the position that the decision before predicted."""
+    """Distance from the position that a decision has predicted for this time."""
     position = flight.vehicle.position
     if position is None:
         return ""
@@ -118,7 +120,8 @@ def away_from_prediction(flight: FlightState) -> str:
 
 
 def estimate_contradicts(flight: FlightState) -> str:
-    """Jumps of the position in the last 10 s, or its difference from the velocity in one second."""
+    """Sum of the position jumps of the last 10 s, or difference between position and integrated
+    velocity over one second."""
     jumped_m, drift_m = flight.jumps.recent_m(flight.time_s), flight.jumps.drift_m
     if jumped_m > flight.limits.position_jump_m:
         return f"the estimated position jumped by {jumped_m:.1f} m"
@@ -128,12 +131,13 @@ def estimate_contradicts(flight: FlightState) -> str:
 
 
 def positioning_lost(flight: FlightState) -> str:
-    """GPS fix, validity and accuracy of the estimate, their messages: lost since take-off."""
+    """Loss, since take-off, of the GPS fix, of a valid or accurate position estimate, or of the
+    messages that report them."""
     return flight.positioning.lost(flight.vehicle, flight.limits)
 
 
 def outside_volume(flight: FlightState) -> str:
-    """Height and distance from the take-off point."""
+    """Height above the take-off point, and horizontal distance from it."""
     north_m, east_m, height_m = flight.from_takeoff_m
     distance_m = math.hypot(north_m, east_m)
     if not (height_m > flight.limits.ceiling_m or distance_m > flight.limits.radius_m):
@@ -142,13 +146,13 @@ def outside_volume(flight: FlightState) -> str:
 
 
 def battery_empty(flight: FlightState) -> str:
-    """Remaining charge."""
+    """Remaining charge of the battery."""
     charge = flight.vehicle.battery
     return f"the battery holds {100.0 * charge:.0f} %" if charge < flight.limits.battery else ""
 
 
 def no_thrust_reserve(flight: FlightState) -> str:
-    """Normalised thrust that hovers now, as setpoints that are followed show it."""
+    """Present hover thrust (normalised), estimated by the observer."""
     thrust = flight.observer.hover_thrust_estimate
     if flight.phase not in TRACKING or not thrust > flight.limits.hover_thrust:
         return ""
@@ -156,9 +160,10 @@ def no_thrust_reserve(flight: FlightState) -> str:
 
 
 def sinks_with_full_thrust(flight: FlightState) -> str:
-    """Downward speed while the newest setpoint demands the full thrust.
+    """Downward speed while the newest setpoint demands full thrust.
 
-    Other rows act on an old position (blind) and on missing setpoints (decisions)."""
+    The age of the position and missing setpoints need no check here: the rows "blind" and
+    "decisions" act on them."""
     position, thrusts = flight.vehicle.position, flight.thrusts
     if flight.phase not in TRACKING or position is None or not thrusts:
         return ""
@@ -170,7 +175,7 @@ def sinks_with_full_thrust(flight: FlightState) -> str:
 def stands_on_ground(flight: FlightState) -> str:
     """Height of the reference above a vehicle that has stood at its take-off height for 1 s.
 
-    Not in the climb: a weak vehicle may be slow to leave the ground."""
+    Does not apply in the climb, because a weak vehicle may be slow to leave the ground."""
     position, flies = flight.vehicle.position, flight.phase in TRACKING - {Phase.CLIMB}
     if position is None or not (flies and flight.contact.stood_for(STOOD_S)):
         return ""
@@ -182,9 +187,10 @@ def stands_on_ground(flight: FlightState) -> str:
 
 
 def low_thrust(flight: FlightState) -> str:
-    """Normalised hover thrust, divided by that at the start of the reference.
+    """Present hover thrust, divided by the hover thrust at the start of the reference.
 
-    The vehicle stands on something, though its estimated height says that it flies."""
+    It is low if the vehicle stands on something although its estimated height says that it flies.
+    """
     thrust, before = flight.observer.hover_thrust_estimate, flight.start_hover_thrust
     begun = flight.phase in TRACKING - {Phase.CLIMB, Phase.EXCITE}
     if not begun or not thrust < LOW_THRUST * before:
@@ -196,9 +202,11 @@ def low_thrust(flight: FlightState) -> str:
 
 
 def follows_others(flight: FlightState) -> str:
-    """Thrust of the setpoint that PX4 follows (ATTITUDE_TARGET): none of our newest 40.
+    """Difference between the thrust that PX4 follows (ATTITUDE_TARGET) and the nearest of those of
+    our newest 40 setpoints.
 
-    The vehicle follows setpoints of another program in the mode that we asked for."""
+    A difference shows that the vehicle follows the setpoints of another program, in the mode that
+    we requested."""
     reported = flight.vehicle.age_s(ThrustReport) < THRUST_REPORT_S
     followed = flight.follows_others and reported and flight.phase in TRACKING
     if not followed or not flight.in_engage_mode or flight.limits.begin_with_other_sender:
@@ -207,7 +215,7 @@ def follows_others(flight: FlightState) -> str:
 
 
 def _other_companion(flight: FlightState) -> str:
-    """Ends the sentence: which other companion computer is on the link, if there is one."""
+    """The end of the sentence: which other companion computer is on the link; empty for none."""
     other = flight.vehicle.other_companion
     if other is None:
         return ""
@@ -224,7 +232,7 @@ def clock_jumped(flight: FlightState) -> str:
 
 
 def contradicted(flight: FlightState) -> str:
-    """Identified constants out of bounds."""
+    """Identified constants that are out of bounds."""
     return flight.identification.contradiction if flight.identification else ""
 
 
@@ -233,9 +241,10 @@ def contradicted(flight: FlightState) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """`action` is taken when `condition`, which says why it holds, has held for `held_s`. `cause`
-    is as in `conditions.Transition`. `limit`: the settings that have it, or its value. The first
-    line of the condition's docstring says in the documentation what is measured."""
+    """A row of the failsafe: `action` is taken once `condition` has held for `held_s`. `cause` has
+    the meaning that it has in `conditions.Transition`. `limit` names the settings of the limit, or
+    is its value as a text. The first sentence of the condition's docstring says in the README what
+    is measured."""
 
     name: str
     condition: Condition
@@ -245,7 +254,7 @@ class Row:
     cause: str = "limit"
 
     def settings(self, limits: Limits) -> str:
-        """The end of the sentence: which settings have the limit, and their values."""
+        """The end of the sentence: the names and values of the settings of the limit."""
         keys = re.findall(r"limits\.(\w+)", self.limit)
         named = ", ".join(f"limits.{key} is {getattr(limits, key):g}" for key in keys)
         return named and f" ({named})"
@@ -256,7 +265,7 @@ MISSED = "{flight.failure_cause}"
 LATE = "limits.link_growth_s, limits.setpoint_age_s"
 UNIDENTIFIED = "BOUNDS of identification"
 ROWS = (
-    # of `authority` nothing is asked before the mode is known again
+    # after the row "authority" nothing is requested until the mode is known again
     Row("authority", another_may_control, f"{MODE_KNOWN_S:g} s", LAND, cause="link"),
     Row("silence", silent, "limits.silence_s", LAND, cause="link"),
     Row("blind", blind, f"{Limits.blind_s:g} s", LAND, cause="link"),
@@ -280,7 +289,7 @@ ROWS = (
     Row("ground", stands_on_ground, f"{STANDS_BELOW_M:g} m", LAND, cause="ground contact"),
     Row("low thrust", low_thrust, f"{LOW_THRUST:g}", LAND, 1.0, "ground contact"),
     Row("second sender", other_sender, "one message", HOLD, cause="second sender"),
-    # within this time a pilot's change of the mode is seen, or the row "authority" acts
+    # within this time a pilot's change of the mode is reported, or the row "authority" acts
     Row("other setpoints", follows_others, "1e-5", HOLD, MODE_KNOWN_S, "second sender"),
     Row("clock", clock_jumped, f"{JUMP_S:g} s", LAND, cause=""),
     Row("contradiction", contradicted, UNIDENTIFIED, LAND, cause=""),
@@ -291,8 +300,8 @@ ROWS = (
 
 
 def judge(flight: FlightState, rows: Sequence[Row] = ROWS) -> None:
-    """Measure for how long each condition has held by now, and note the worst row that is active,
-    the first of those that are equally bad."""
+    """Update for how long each condition has held. Store in `flight.failsafe` the active row with
+    the most severe action, the first one of several."""
     known = flight.failsafe
     step_s = min(max(flight.now_s - known.judged_s, 0.0), STEP_MAX_S)
     known.judged_s = flight.now_s

@@ -1,4 +1,4 @@
-"""One flight on the companion computer, without I/O: received bytes and times in, frames out."""
+"""One flight on the companion computer. No I/O: received bytes and times go in, frames come out."""
 
 from __future__ import annotations
 
@@ -27,33 +27,35 @@ from offboard.mavlink.session import ACTIVE
 from offboard.supervisor.recovery import Supervised
 
 STATE_STANDBY = 3  # MAV_STATE
-BRIDGED_SHARE = 0.3  # of `Limits.silence_s`; after it, level setpoints replace the control law
+# Share of `Limits.silence_s` without telemetry, after which level setpoints replace the control law
+BRIDGED_SHARE = 0.3
 
 
 class Flight(FlightState):
-    """The state of the flight, and its turn. With `before`, a flight of the same
-    session that has ended or waits, it begins with what that one knows of vehicle and link."""
+    """The state of one flight, and the turn that the loop calls. If `before` is given, a flight of
+    the same session that has ended or waits, this flight begins with what `before` knows about
+    the vehicle and the link."""
 
     def __post_init__(self, before: FlightState | None) -> None:
         super().__post_init__(before)
         self._inputs = InputRecorder(self.session.settings, kept=self.service is None)
         self.stopwatch = self._inputs.watch(self.stopwatch)
-        self._tick = -1  # number of the newest
+        self._tick = -1  # number of the newest tick; -1 before the first
         self._recorded_others = self.other_datagrams
         self._news = News()
-        self._logged: list[bytes] = []  # frames since the newest `finish_turn`
-        self._ticked = self._heard = False  # in this turn
-        self._setpoint_before_s = self.setpoint_s  # this turn
+        self._logged: list[bytes] = []  # frames for the log since the newest `finish_turn`
+        self._ticked = self._heard = False  # whether this turn had a tick, and telemetry
+        self._setpoint_before_s = self.setpoint_s  # its value before this turn
 
     # ------------------------------------------------------------------ the turn
 
     def turn(self, chunks: Sequence[Chunk], host_now_s: float) -> tuple[bytes, ...]:
-        """Process all that has arrived, then act once if a tick is due. Returns the frames to
-        send.
+        """Process all that has arrived, then act once if a control tick is due. Returns the frames
+        to send.
 
         Call it at least every 50 ms, and `finish_turn` after the frames were sent. `host_now_s` is
-        host time. In lockstep a turn without chunks does nothing: how many there are between two
-        barriers depends on the load of the machine.
+        host time. In lockstep a turn without chunks does nothing, because the number of such turns
+        between two barriers depends on the load of the machine.
         """
         self._ticked = self._heard = False
         self._setpoint_before_s = self.setpoint_s
@@ -84,10 +86,11 @@ class Flight(FlightState):
         return frames
 
     def finish_turn(self, sent_s: float) -> list[bytes]:
-        """Do what no setpoint waits for: identify the vehicle, and encode the log's records.
+        """Do the work that must not delay a setpoint: identify the vehicle, and encode the records.
 
-        `sent_s`: host time at which the last frame of the turn was sent. Returns the frames for the
-        log: received, sent, records. Sentences of the identification leave with the next turn.
+        `sent_s` is the host time at which the last frame of the turn was sent. Returns the frames
+        for the log: received frames, sent frames and records. Announcements of the identification
+        are sent in the next turn.
         """
         decision.finish(self, sent_s)
         pieces = self._inputs.pieces(all_of_it=self._ticked or self.has_ended())
@@ -109,7 +112,7 @@ class Flight(FlightState):
         self.busyness.on_turn(paused_s)
 
     def _receive(self, chunk: Chunk, host_now_s: float) -> Sequence[Outgoing]:
-        """Take what a chunk reports, in order. Returns replies of the session."""
+        """Process the events in a chunk, in order. Returns the replies of the session."""
         arrived_s = self._inputs.arrived_s(chunk)
         reception = self.session.receive(chunk.data, chunk.peer, arrived_s)
         self._inputs.chunk(chunk, reception)
@@ -128,15 +131,16 @@ class Flight(FlightState):
             self._tick = -1
 
     def _ends_silence(self, event: Event) -> bool:
-        """Whether the event is telemetry. Once position and attitude are received only they are:
-        without them vehicle time stands still and nothing is decided. After a reboot in flight both
-        must be received again."""
+        """Whether the event counts as telemetry, which ends a silence. On the ground any event
+        counts until both position and attitude were received. From then on only these two count,
+        because without them vehicle time does not advance and nothing is decided. After a reboot in
+        flight nothing counts until both were received again."""
         if not self.vehicle.has_state:
             return self.phase in BEFORE_FLIGHT and not isinstance(event, ClockBehind)
         return isinstance(event, (Attitude, LocalPosition))
 
     def _poll(self, host_now_s: float, before_s: float) -> Sequence[Outgoing]:
-        """The time at which this turn acts; returns what the session sends by itself."""
+        """Set the link time of this turn. Returns the messages that the session sends by itself."""
         session = self.session
         news = session.senders.news()
         if news:
@@ -144,7 +148,8 @@ class Flight(FlightState):
         due = session.poll(host_now_s, self._status())
         self.vehicle.now_s = session.link_time_s
         if self.phase is Phase.LAND and self.unreached_s:
-            self.began_s += self.now_s - before_s  # a landing that is not seen takes no time
+            # `limits.land_s` does not run while the vehicle is not heard
+            self.began_s += self.now_s - before_s
         if self._heard:
             self.heard_s = session.elapsed_s(host_now_s)
             self.bridged_s = 0.0
@@ -165,15 +170,16 @@ class Flight(FlightState):
         return True
 
     def _follow_link(self) -> None:
-        """The link may have become later: prediction and bandwidth take that into account."""
+        """Measure the growth of the link's delay, for the prediction and the bandwidth."""
         growth, growth_s = self.clock.growth, max(self.clock.delay_growth_s, self.age_s)
         changed = self.phase in FLYING and growth.step(self.time_s, growth_s)
         if changed and self.identification:
             self.identification.on_link_growth(growth.added_s, growth.changed_s)
 
     def _go_on_without_telemetry(self) -> None:
-        """What is due whether or not telemetry arrives: transitions, requests, and level setpoints,
-        one in each period of host time until a transition."""
+        """Do what is due without telemetry: transitions, requests for parameters, and after
+        BRIDGED_SHARE of `limits.silence_s` the requests and level setpoints of
+        `actions.act_without_telemetry`, once in each control period of host time."""
         silence_s, limits, unknown = self.silence_s, self.limits, not self.vehicle.has_state
         silent = silence_s > min(limits.silence_s, limits.connect_s)
         if unknown or self.stop_reason or silent:
@@ -189,8 +195,8 @@ class Flight(FlightState):
 
     @property
     def supervised(self) -> Supervised | None:
-        """For the supervisor: whether it has to act, should this process fail. None before the
-        vehicle is found."""
+        """What the supervisor must know to decide whether it acts if this process fails. None
+        before the vehicle is found."""
         found, health, authority = self.session.vehicle, self.vehicle.health, self.authority
         if found is None:
             return None
@@ -217,20 +223,21 @@ class Flight(FlightState):
 
     @property
     def current(self) -> Flight:
-        """This flight, as the service has several."""
+        """This flight. The loop reads the same property of the service, which has several."""
         return self
 
     def has_ended(self) -> bool:
-        """Whether the flight is over. After another has taken the vehicle, its next HEARTBEAT is
-        awaited, as the log must have what it shows; nothing is sent to it any more."""
+        """Whether the flight is over. If someone else has taken the vehicle, the flight first waits
+        for the next HEARTBEAT, so that it is in the log; nothing is sent to the vehicle any more.
+        """
         return self.in_end_phase and not self.awaits_heartbeat
 
     def snapshot(self, flights: int = 0) -> Snapshot:
-        """The flight at this moment, for displays; `flights` that the service has begun."""
+        """The present values, for displays. `flights`: how many the service has begun."""
         return Snapshot(self, flights)
 
     def request_stop(self, why: str = OPERATOR_STOP) -> None:
-        """Land, or do not take off; takes effect at the next turn."""
+        """Land, or do not take off. This takes effect at the next turn."""
         if not self.stop_reason:
             self._inputs.call("request_stop", why)
             self.stop_reason = why
@@ -243,20 +250,20 @@ class Flight(FlightState):
         outbox.announce(self, sentence)
 
     def guard(self, guarded: bool) -> None:
-        """Whether a supervisor would land the vehicle if this process ended."""
+        """Note whether a supervisor would land the vehicle if this process ended."""
         if guarded is not self.guarded:
             self._inputs.call("guard", guarded)
             self.guarded = guarded
 
     def on_dropped(self, frames: int) -> None:
-        """The last frames of the newest turn were not sent: they became too old."""
+        """Note that the last `frames` frames of the newest turn were too old and were not sent."""
         self._inputs.note(DROPPED, frames)
         self.setpoint_s, self.newest_setpoint = self._setpoint_before_s, None
         self._news.dropped.add(frames)
 
     def overhear(self, datagrams: Sequence[bytes]) -> None:
-        """Datagrams from other addresses than the vehicle's: on the ground, they may show that
-        several vehicles send to us."""
+        """Look for autopilots in datagrams from other addresses than the vehicle's. On the ground
+        they show whether several vehicles send to us."""
         senders = self.session.senders
         if self.phase in BEFORE_FLIGHT:
             for datagram in datagrams:
@@ -264,5 +271,6 @@ class Flight(FlightState):
                     self._inputs.call("note_autopilot", system_id)
 
     def note_autopilot(self, system_id: int) -> None:
-        """Another address shows the autopilot of this system, for a replay."""
+        """Note that another address sends as an autopilot with this system id. A replay calls it in
+        place of `overhear`."""
         self.session.senders.hear_elsewhere(system_id, self.session.link_time_s)

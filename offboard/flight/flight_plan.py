@@ -14,10 +14,10 @@ from offboard.reference.track import Moved, Track
 from offboard.reference.transfer import Limits, stopping_place, transfer
 
 Array = NDArray[np.float64]
-# after a jump of the estimate
+# limits of the reference while it returns after a jump of the estimate
 RETURN = Limits(speed_mps=0.5, acceleration_mps2=0.5, cruise_mps=0.5, cruise_vertical_mps=0.5)
-CLEAR_M = 0.5  # above the ground, of a track that is placed in the air
-SAMPLED_S = 0.1
+CLEAR_M = 0.5  # least height above the ground of a track that is placed in the air
+SAMPLED_S = 0.1  # interval at which the height of the track is sampled
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,8 @@ class Offset:
 
 
 class FlightPlan:
-    """The reference in force: none on the ground, then by `start_climb` and `start_track`.
+    """The reference in force: none on the ground, the climb after `start_climb`, and the track
+    after `start_track`.
 
     `origin_ned_m` is the take-off point; the track's positions are relative to it.
     """
@@ -48,7 +49,7 @@ class FlightPlan:
         self.origin_ned_m = (0.0, 0.0, 0.0)
         self._arrival_s = math.nan
         self._planned: Moved | None = None
-        self._tracks = False  # `_planned` is the track, not the climb
+        self._tracks = False  # whether `_planned` is the track, not the climb
         self._offset: Reference | None = None  # since a jump of the estimate
 
     @property
@@ -79,9 +80,9 @@ class FlightPlan:
         self._planned, self._tracks = Moved(self.track, time_s, self.origin_ned_m), True
 
     def follow_jump(self, time_s: float, jump_ned_m: Array) -> float:
-        """The estimated position has jumped by `jump_ned_m` (3,), not the vehicle: move the
-        reference by as much, and from there back to its place at up to RETURN.speed_mps. Returns
-        the duration of the way back, s."""
+        """Move the reference by a jump `jump_ned_m` (3,) of the estimated position, with which the
+        vehicle has not moved, and from there back to its place at up to RETURN.speed_mps. Returns
+        the duration of the return, s."""
         velocity = np.zeros(3)
         if self._offset is not None:
             before = self._offset.sample(time_s)
@@ -92,11 +93,11 @@ class FlightPlan:
         return back.duration_s
 
     def pause(self, time_s: float) -> None:
-        """Come to rest on the track, which has begun."""
+        """Bring the reference to rest on the track, which must have begun."""
         planned = self._planned
         assert planned is not None
         was_paused = math.isfinite(planned.paused_s)
-        if was_paused and time_s < planned.resumed_s:  # it still stops: it does not run again
+        if was_paused and time_s < planned.resumed_s:  # still stopping: cancel `resume`
             self._planned = planned.resumed(math.inf)
             return
         if was_paused and planned.at_full_speed(time_s):
@@ -111,15 +112,15 @@ class FlightPlan:
     def place_start(
         self, position_ned_m: Triple, velocity_ned_mps: Triple, ground_down_m: float | None
     ) -> float:
-        """Place the track so that it starts where a vehicle at this position, with this velocity,
-        comes to rest, or as far above it as its lowest point needs to stay `CLEAR_M` above the
-        ground, or not to be lower than the vehicle where the ground is not known (None); returns by
-        how much."""
+        """Place the track so that it starts where a vehicle with this position and velocity can
+        come to rest. Raise it until its lowest point is at least `CLEAR_M` above the ground, or not
+        below the vehicle if the ground is not known (None). Returns by how much it was raised, m.
+        """
         times_s = np.arange(0.0, self.track.duration_s + SAMPLED_S, SAMPLED_S)
         places = self.track.sample(times_s).position_ned_m
         origin = stopping_place(position_ned_m, velocity_ned_mps) - places[0]
         lowest_m = float(origin[2]) + float(places[:, 2].max())
-        # a vehicle that is lower itself decides how low is safe
+        # if the vehicle itself is nearer to the ground, its height is allowed
         clear_m = -math.inf if ground_down_m is None else ground_down_m - CLEAR_M
         least_m = max(clear_m, position_ned_m[2])
         above_m = max(lowest_m - least_m, 0.0)
@@ -127,7 +128,7 @@ class FlightPlan:
         return above_m
 
     def track_time_s(self, time_s: float) -> float:
-        """Time since the start of the track, without pauses; NaN before it."""
+        """Time since the start of the track, not counting pauses; NaN before it."""
         return self._planned.own_s(time_s) if self._planned and self._tracks else math.nan
 
     def overdue_s(self, time_s: float) -> float:

@@ -36,14 +36,14 @@ from offboard.flight.state import FlightState
 from offboard.flight.vehicle_state import ARMED_KNOWN_S, DISARMED_S
 from offboard.mavlink.events import Heartbeat
 
-TAKE_OVER_HEIGHT_M = 1.0  # where setpoints replace the autopilot's own take-off
-DETECTOR_S = 1.0  # EXTENDED_SYS_STATE is requested at 5 Hz
-# s after the planned end of the climb, when the vehicle is identified though it is not at rest
+TAKE_OVER_HEIGHT_M = 1.0  # height at which setpoints replace the autopilot's own take-off
+DETECTOR_S = 1.0  # time for the land detector to report: EXTENDED_SYS_STATE is requested at 5 Hz
+# Time after the planned end of the climb, when the vehicle is identified though it is not at rest
 RESTLESS_S = 5.0
-SETTLED_DISTANCE_M, SETTLED_SPEED_MPS = 0.3, 0.3  # at the start
-NEAR_M = 0.6  # from the start
+SETTLED_DISTANCE_M, SETTLED_SPEED_MPS = 0.3, 0.3  # below both, it hovers at the start
+NEAR_M = 0.6  # below this distance, it is near the start
 REST_S = 0.5  # after the end of the reference
-# Relative error of hover_thrust; a smaller one does not keep a vehicle from the start
+# Relative error of hover_thrust; a smaller one does not keep a vehicle from reaching the start
 WRONG_THRUST = 0.1
 
 
@@ -54,7 +54,7 @@ def lifted_off(flight: FlightState) -> bool:
 
 
 def at_start(flight: FlightState) -> bool:
-    """The planned climb is over, and the vehicle hovers at its end."""
+    """Whether the planned climb is over and the vehicle hovers at its end."""
     near = flight.position_error_m < SETTLED_DISTANCE_M
     if not (near and flight.plan.overdue_s(flight.time_s) >= 0.0):
         return False
@@ -69,8 +69,8 @@ def at_start_to_excite(flight: FlightState) -> bool:
 
 
 def restless(flight: FlightState) -> str:
-    """The vehicle did not come to rest at the start in time; its oscillation also shows the
-    response."""
+    """The vehicle did not come to rest at the start in time. It is identified all the same, because
+    its oscillation shows the response, too."""
     identification, overdue_s = flight.identification, flight.plan.overdue_s(flight.time_s)
     wanted = identification is not None and identification.wants_excitation
     if not (wanted and overdue_s > RESTLESS_S):
@@ -107,8 +107,8 @@ def no_lift_off(flight: FlightState) -> str:
 
 
 def identified(flight: FlightState) -> bool:
-    """The identification has finished and the vehicle is near the start, or hovers there if its
-    delay is still not known."""
+    """Whether the identification has finished and the vehicle is near the start; if its delay is
+    still not known, it must hover there."""
     identification = flight.identification
     if identification is None or not identification.finished(flight.time_s):
         return False
@@ -141,8 +141,8 @@ def rebooted_in_flight(flight: FlightState) -> str:
 
 
 def disarmed(flight: FlightState) -> str:
-    """Disarmed by HEARTBEAT. One may be wrong: in flight the land detector or a second HEARTBEAT
-    must confirm it."""
+    """HEARTBEAT shows the vehicle disarmed. A single HEARTBEAT may be wrong: in TAKEOFF, and while
+    the land detector reports flight, a second one must confirm it."""
     flies = flight.contact.detects_flight or flight.phase is Phase.TAKEOFF
     if flight.vehicle.armed or (flies and flight.vehicle.disarmed_s < DISARMED_S):
         return ""
@@ -176,15 +176,15 @@ def rebooted_disarmed(flight: FlightState) -> bool:
 
 
 def disarmed_not_landed(flight: FlightState) -> str:
-    """Disarmed, but not landed; the land detector has had time to report, and the vehicle was asked
-    to land, as HEARTBEAT may be wrong."""
+    """The vehicle is disarmed but has not landed. The wait leaves time for the land detector to
+    report and, in case HEARTBEAT is wrong, for a request to land."""
     known = flight.vehicle.disarmed_s > DISARMED_S + DETECTOR_S
     missing = flight.not_landed() if known else ""
     return f"disarmed, landing not confirmed: {missing}" if missing else ""
 
 
 def unheard_on_ground(flight: FlightState) -> bool:
-    """It has landed, and no HEARTBEAT shows whether it is armed."""
+    """Whether the vehicle has landed, and no HEARTBEAT shows whether it is armed."""
     return bool(mode_unknown(flight)) and not flight.not_landed()
 
 
@@ -210,7 +210,7 @@ def not_disarmed(flight: FlightState) -> str:
 
 
 def requested(request: Request) -> Condition:
-    """A condition: the ground station has requested this."""
+    """Make the condition that the ground station has sent this request."""
 
     def wanted(flight: FlightState) -> bool:
         return flight.request is request
@@ -233,8 +233,8 @@ RESTARTED = f"{REBOOTED} and is disarmed"
 
 
 def ends_early(*, serves: bool) -> tuple[Transition, ...]:
-    """Rows that end a flight in the air early. A stop makes `fly` land and the service hold; in the
-    service a change of mode by the pilot is the usual end."""
+    """Return the rows that end a flight in the air early. When it is stopped, `fly` lands and the
+    service holds. The usual end of a flight of the service is that the pilot changes the mode."""
     flown = FLYING if serves else FLYING - SERVICE_ONLY
     followed = TRACKING if serves else frozenset[Phase]()
     handed = flown & {HAND_BACK}
@@ -242,7 +242,7 @@ def ends_early(*, serves: bool) -> tuple[Transition, ...]:
     return (
         Transition(handed, in_requested_mode, YIELDED),
         Transition(flown, rebooted_in_flight, LAND, ABORTED, "restart"),
-        # HEARTBEAT may be wrong: what still flies is to land
+        # to LAND, because HEARTBEAT may be wrong and the vehicle still fly
         Transition(flown, disarmed, LAND, ABORTED, "disarmed in flight"),
         Transition(taken, authority_lost, YIELDED, FLOWN, "mode change"),
         Transition(flown - taken, authority_lost, YIELDED, ABORTED, "mode change"),

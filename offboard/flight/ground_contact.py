@@ -1,8 +1,8 @@
 """Whether the vehicle is on the ground, from several signs with ages. In doubt it is in the air.
 
-Signs: disarmed (HEARTBEAT), the land detector (EXTENDED_SYS_STATE), and height and vertical speed
-(LOCAL_POSITION_NED) since it was last known to rest. `Touchdown` says whether a landing has ended;
-the score uses it too, so that both give the same verdict.
+The signs are: HEARTBEAT (disarmed), the land detector (EXTENDED_SYS_STATE), and height and vertical
+speed (LOCAL_POSITION_NED) since the vehicle was last known to rest. `Touchdown` says whether a
+landing has ended; the score uses it too, so that both give the same verdict.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from offboard.flight.vehicle_state import VehicleState
 from offboard.mavlink.events import Landed, Triple
 
 DETECTOR_KNOWN_S = 1.5  # EXTENDED_SYS_STATE is requested at 5 Hz
-RESTING_HEIGHT_M = 0.75  # errors of an estimate on the ground
+RESTING_HEIGHT_M = 0.75  # error of the estimated height on the ground
 LIFTED_HEIGHT_M, LIFTED_CLIMB_MPS, LIFTED_SAMPLES = 0.15, 0.4, 3
-GROUND_SPEED_MPS = 0.5  # as an estimate on the ground may show
+GROUND_SPEED_MPS = 0.5  # vertical speed that the estimate may show on the ground
 STOOD_WITHIN_M, STOOD_HEIGHT_M, STOOD_S = 0.1, 0.3, 1.0
 KEPT_S = 20.0
-STANDING_S = 15.0  # at one height: it stands, and does not hover
-POSITION_KNOWN_S = 1.0  # age of a position that shows where it is
+STANDING_S = 15.0  # a vehicle that stays at one height for so long stands, and does not hover
+POSITION_KNOWN_S = 1.0  # greatest age of a position that shows the height
 STILL_ARMED = (
     f"it has stood still for {STANDING_S:.0f} s and is armed: its land detector reports that it "
     "flies; disarm it with the transmitter or a ground station"
@@ -29,27 +29,27 @@ STILL_ARMED = (
 
 # of a landing
 HARD_MPS = 2.0  # faster than any landing; reached after a fall of 0.2 m
-REST_S = 0.5  # at rest: for so long the height stays
+REST_S = 0.5  # the vehicle is at rest if its height stays for this time
 REST_M = 0.15  # within this range; a single estimated speed is too noisy
-BEFORE_S = 1.0  # a fall of 5 m
+BEFORE_S = 1.0  # time before the rest in which the greatest speed is taken: a fall of 5 m
 BOUNCE_M = 0.3
-ABOVE_TAKEOFF_M = 1.5  # for the drift of the estimated height
-SLOPE = 0.1  # of the terrain
+ABOVE_TAKEOFF_M = 1.5  # a landing may be higher than the take-off: drift of the estimate
+SLOPE = 0.1  # and, by this share of the distance, slope of the terrain
 
 
 @dataclass(slots=True)
 class GroundContact:
-    """Updated with every position; `vehicle` holds the other signs. Places are without the jumps of
-    the estimate (`estimates.PositionJumps`)."""
+    """Whether the vehicle stands. It is updated with every position; `vehicle` holds the other
+    signs. Places are positions without the jumps of the estimate (`estimates.PositionJumps`)."""
 
     vehicle: VehicleState
     rest_ned_m: Triple | None = None  # where it last rested; None if it has not been seen at rest
     _down_m: float = math.nan  # of the newest place
-    _lifted: int = 0  # samples in a row
-    _heights: deque[tuple[float, float]] = field(default_factory=deque)  # when, and how high
+    _lifted: int = 0  # number of places in a row that are above the ground
+    _heights: deque[tuple[float, float]] = field(default_factory=deque)  # vehicle time, height
 
     def on_position(self, time_s: float, place_ned_m: Triple, down_mps: float) -> None:
-        """The newest place, and the downward component of the velocity."""
+        """Take the newest place, and the downward component of the velocity."""
         self._down_m = place_ned_m[2]
         if self.vehicle.disarmed and abs(down_mps) < GROUND_SPEED_MPS:
             self.rest_ned_m = place_ned_m
@@ -62,8 +62,8 @@ class GroundContact:
 
     @property
     def rest_down_m(self) -> float:
-        """The height of the last rest, positive down, m. Without one that of the local origin,
-        which autopilots set where they boot."""
+        """The down coordinate of the place where the vehicle last rested. If it was not seen at
+        rest, that of the local origin, which autopilots set where they boot."""
         return self.rest_ned_m[2] if self.rest_ned_m else 0.0
 
     @property
@@ -73,35 +73,37 @@ class GroundContact:
 
     @property
     def position_known(self) -> bool:
-        """Positions arrive, so that the height is known."""
+        """Whether positions arrive, so that the height is known."""
         return self.vehicle.position_age_s < POSITION_KNOWN_S
 
     @property
     def stands(self) -> bool:
-        """It has stood for so long, by positions that still arrive, that it does not hover."""
+        """Whether the vehicle has stayed at the height of its last rest for so long, by positions
+        that still arrive, that it stands and does not hover."""
         return self.position_known and self.stood_for(STANDING_S)
 
     @property
     def detected(self) -> str:
-        """What the land detector reports (`Landed`); "unknown" without a recent report."""
+        """The report of the land detector (`Landed`); "unknown" without a recent report."""
         known = self.vehicle.age_s(Landed) <= DETECTOR_KNOWN_S
         return self.vehicle.landed if known else "unknown"
 
     @property
     def detects_flight(self) -> bool:
-        """The land detector reports that the vehicle is not on the ground."""
+        """Whether the land detector reports that the vehicle is not on the ground."""
         return self.detected not in ("on_ground", "unknown")
 
     @property
     def flies(self) -> bool:
-        """Armed, the land detector reports flight, and the height has not stayed near that of the
-        last rest for a second. Otherwise a pilot's switch does not engage: it may stand on the
-        ground."""
+        """Whether the vehicle flies for certain: it is armed, the land detector reports flight, and
+        the height has not stayed near that of the last rest for a second. A vehicle that may stand
+        on the ground is not engaged by the pilot's switch."""
         return self.in_the_air and self.detects_flight and not self.stood_for(STOOD_S)
 
     @property
     def on_ground(self) -> bool:
-        """Disarmed, or land detector, height and vertical speed all say that it stands."""
+        """Whether the vehicle is disarmed, or its land detector, height and vertical speed all show
+        that it stands."""
         if self.vehicle.disarmed:
             return True
         position = self.vehicle.position
@@ -114,16 +116,16 @@ class GroundContact:
 
     @property
     def in_the_air(self) -> bool:
-        """The vehicle is armed and any sign says that it flies."""
+        """Whether the vehicle is armed and any sign shows that it flies."""
         return self.vehicle.armed and not self.on_ground
 
     @property
     def lifted_off(self) -> bool:
-        """Several positions in a row are above the ground."""
+        """Whether several positions in a row show the vehicle above the ground."""
         return self._lifted >= LIFTED_SAMPLES
 
     def stood_for(self, for_s: float) -> bool:
-        """At the height of the last rest, and no higher or lower during `for_s`."""
+        """Whether the vehicle has kept its height for `for_s`, near that of the last rest."""
         if not self._heights or abs(self.height_m) >= STOOD_HEIGHT_M:
             return False
         newest_s = self._heights[-1][0]
@@ -139,9 +141,9 @@ class Touchdown:
     """One landing. Give it each position from the beginning of the landing on, without the jumps of
     the estimate (`estimates.PositionJumps`).
 
-    `takeoff_ned_m` is the take-off point; None if unknown, then the height is not judged.
-    `speed_mps` is the largest downward speed within a second before the vehicle came to rest where
-    it is, NaN before it has. It may bounce there.
+    `takeoff_ned_m` is the take-off point. If it is None, the height is not judged. `speed_mps` is
+    the greatest downward speed in the second before the vehicle came to rest where it is; NaN
+    before it has come to rest. A bounce of up to BOUNCE_M does not end the rest.
     """
 
     def __init__(self, takeoff_ned_m: Triple | None) -> None:
@@ -152,9 +154,9 @@ class Touchdown:
         self.speed_mps = math.nan
 
     def on_position(self, time_s: float, position_ned_m: Triple, down_mps: float) -> None:
-        """A position, and the downward component of the velocity."""
+        """Take a position, and the downward component of the velocity."""
         if (position_ned_m, down_mps) == self._reported:
-            return  # no estimator reports the same twice: it has stopped
+            return  # no estimator reports the same twice: this one has stopped
         self._reported = position_ned_m, down_mps
         newest, down_m = self._newest, position_ned_m[2]
         newest.append((time_s, down_m, down_mps))
@@ -174,8 +176,8 @@ class Touchdown:
         return known and max(downs) - min(downs) <= REST_M
 
     def not_landed(self, *, on_ground: bool) -> str:
-        """Why the vehicle has not landed; empty if it has. `on_ground`: its land detector says so,
-        in a report younger than the touch-down."""
+        """Why the vehicle has not landed; empty if it has. `on_ground`: whether its land detector
+        has reported the ground since the touch-down."""
         fastest_mps = max((speed for _, _, speed in self._newest), default=0.0)
         if self.speed_mps > HARD_MPS or fastest_mps > HARD_MPS:
             return f"fell at up to {max(fastest_mps, self.speed_mps):.1f} m/s"

@@ -1,9 +1,9 @@
-"""All that leaves: setpoints with their last check, requests, texts, and the queue of all messages.
+"""Everything that is sent: setpoints with their last check, requests, texts, and their queue.
 
 PX4 flies any setpoint it receives. Every setpoint passes `admit`, which is independent of the
-control laws and of their limits, and is then given to the observer and the identification, which
-predict with the commands that were sent. `flush` encodes what is to be sent, `log` what is only
-logged, after that. Decides nothing; owns no socket or file.
+control laws and of their limits. It is then given to the observer and the identification, which
+predict with the commands that were sent. `flush` encodes the messages to send; later, `log` encodes
+the records, which are only logged. This module makes no decision and has no socket or file.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ from offboard.model.vehicle import Vehicle
 INFO = 6  # MAV_SEVERITY
 TEXT_ID_MAX = 65535  # STATUSTEXT.id; 0 is for texts of one chunk
 ANNOUNCED_KEPT = 200
-NEVER = -math.inf, -math.inf
-ANSWERS_S = 10.0  # since the newest reply of TIMESYNC: after this none is awaited
-REPEAT_S = 1.0  # after this a request that was refused, or not answered, is sent again
+NEVER = -math.inf, -math.inf  # link time and host time
+ANSWERS_S = 10.0  # after this time without a reply to TIMESYNC requests, no reply is awaited
+REPEAT_S = 1.0  # after this time a request that was refused, or not answered, is sent again
 LOSES = f"more than {LOSSY:.0%} of TIMESYNC requests have no reply: each setpoint is sent twice"
 _LENGTH_TOLERANCE = 0.01
 
 
 class Refused(Exception):
-    """A setpoint that must not leave; the message is the reason, `why` its number."""
+    """A setpoint must not be sent. The message is the reason, `why` its number in the log."""
 
     def __init__(self, why: Refusal, reason: str) -> None:
         super().__init__(reason)
@@ -58,16 +58,16 @@ def admit(
     age_limit_s: float,
     late_s: float,
 ) -> Command | PositionCommand:
-    """The setpoint that may leave: `command` within the limits of `vehicle`.
+    """Return the setpoint that may be sent: `command` within the limits of `vehicle`.
 
     Args:
-        ours: the vehicle is ours to command (`Authority.permits_setpoint`).
-        on_ground: it stands on the ground by every sign (`GroundContact.on_ground`).
+        ours: whether the vehicle is ours to command (`Authority.permits_setpoint`).
+        on_ground: whether it certainly stands on the ground (`GroundContact.on_ground`).
         age_s: age of the telemetry that the setpoint was computed from, beyond the least delay of
             the link; 0 for a setpoint that needs none.
-        age_limit_s: the greatest age that may leave.
+        age_limit_s: the greatest age of telemetry that is allowed.
         late_s: time by which the setpoint is ready later than one control period after the arrival
-            of its telemetry; 0 if it is not later.
+            of its telemetry; not positive if it is ready in time.
 
     Raises Refused if the vehicle is not ours, the telemetry was too old, the decision too late, or
     a value cannot be sent.
@@ -86,8 +86,8 @@ def admit(
 
 
 def usable(command: Command | PositionCommand) -> bool:
-    """Whether all values can be sent, as float32, and the thrust direction is a unit vector, as a
-    tuple: commands are compared with ==."""
+    """Whether float32 can hold all values and the thrust direction is a unit vector. It must be a
+    tuple, because commands are compared with ==."""
     if isinstance(command, PositionCommand):
         return all(abs(value) <= FLOAT32_MAX for value in command.numbers())
     direction: object = command.thrust_direction_ned
@@ -100,7 +100,7 @@ def usable(command: Command | PositionCommand) -> bool:
 
 
 def clamp(command: Command, vehicle: Vehicle, *, on_ground: bool) -> Command:
-    """`command` limited to the vehicle's thrust and tilt.
+    """Return `command` limited to the vehicle's thrust and tilt.
 
     A direction tilted by more than `tilt_max_rad` is turned back to that tilt in its own vertical
     plane. In the air, thrust is at least a third of hover.
@@ -110,7 +110,7 @@ def clamp(command: Command, vehicle: Vehicle, *, on_ground: bool) -> Command:
     north, east, down = command.thrust_direction_ned
     lateral = math.hypot(north, east)
     if math.atan2(lateral, down) > vehicle.tilt_max_rad:
-        # an exactly inverted one is turned to the north (atan2 of zeros)
+        # the direction of an exactly inverted vehicle is turned to the north (atan2 of zeros)
         towards_rad, scale = math.atan2(east, north), math.sin(vehicle.tilt_max_rad)
         north, east = scale * math.cos(towards_rad), scale * math.sin(towards_rad)
         down = math.cos(vehicle.tilt_max_rad)
@@ -152,14 +152,14 @@ def send_setpoint(
 
 
 def send_level(flight: FlightState, time_s: float, command: Command) -> None:
-    """Send a setpoint that no decision was needed for, if the vehicle is ours."""
+    """Send a setpoint that needs no decision, if the vehicle is ours."""
     with suppress(Refused):
         send_setpoint(flight, time_s, command)
 
 
 def repeat_setpoint(flight: FlightState) -> None:
-    """Where the link loses setpoints, send the newest once more, half a period after it: a lost one
-    leaves the one before in force for a whole period."""
+    """If the link loses messages, send the newest setpoint once more, half a period after it: a
+    lost setpoint leaves the one before in force for a whole period."""
     newest = flight.newest_setpoint
     if newest is None or flight.time_s < newest.time_s + 0.5 * flight.period_s - 1e-6:
         return
@@ -193,8 +193,8 @@ def _send_attitude(
 
 
 def _send_position(flight: FlightState, time_s: float, command: PositionCommand) -> None:
-    """The attitude that the autopilot's position loop commands is unknown, therefore the observer
-    stops predicting with commands."""
+    """Send a position setpoint. The attitude that the autopilot's position loop commands is not
+    known, so the observer stops predicting with commands."""
     flight.observer.freeze(True)
     flight.thrusts.clear()  # the autopilot chooses the thrust
     flight.command = Command(flight.model.gravity_mps2, LEVEL_DIRECTION, command.heading_rad)
@@ -203,7 +203,7 @@ def _send_position(flight: FlightState, time_s: float, command: PositionCommand)
 
 
 def hover_mps2(flight: FlightState) -> float:
-    """Thrust that holds the weight, by the observer's estimate of the hover thrust."""
+    """Thrust that holds the weight, by the observer's estimate of the hover thrust, m/s^2."""
     model = flight.model
     share = flight.observer.hover_thrust_estimate / model.hover_thrust
     return (share if math.isfinite(share) else 1.0) * model.gravity_mps2
@@ -213,18 +213,18 @@ def hover_mps2(flight: FlightState) -> float:
 
 
 def request(flight: FlightState, request: CommandLong) -> bool:
-    """Send a command if the vehicle is ours; returns whether it was sent.
+    """Send a command if the vehicle is ours. Returns whether it was sent.
 
     Each command is sent once in a phase. It is sent again only if it was refused or not answered
-    for REPEAT_S, and the vehicle has reported its mode since: a pilot may have changed it. The link
-    may be late in both directions, so that a report counts only if it arrives after the reply to
-    the TIMESYNC request that left with the command, or to a later one. Without telemetry for a
-    second, or without such a reply for ANSWERS_S, every report that has arrived since counts.
+    for REPEAT_S, and the vehicle has reported its mode since then, because a pilot may have changed
+    it. The link may be late in both directions. Therefore a report counts only if it arrives after
+    the reply to the TIMESYNC request that was sent with the command, or to a later one. Without
+    telemetry for a second, or without such a reply for ANSWERS_S, every later report counts.
     """
     result = flight.vehicle.results.get(request.command)
     requested_s, host_s = flight.requested_s.get(request, NEVER)
     waits = flight.now_s - requested_s < REPEAT_S - 1e-6 or flight.authority.heard_s < requested_s
-    # A TIMESYNC request leaves at each tick, and without telemetry there is none
+    # A TIMESYNC request is sent at each tick, and without telemetry there are no ticks
     has_ticks = flight.vehicle.has_state and flight.silence_s < REPEAT_S
     is_answered = has_ticks and flight.clock.unanswered_s(flight.host_s) < ANSWERS_S
     waits = waits or (is_answered and flight.reported_s < host_s)
@@ -237,13 +237,14 @@ def request(flight: FlightState, request: CommandLong) -> bool:
 
 
 def send_request(flight: FlightState, request: CommandLong) -> None:
-    """Send a request, and note when: in link time and in host time, s."""
+    """Send a request, and note the link time and the host time."""
     flight.requested_s[request] = flight.now_s, flight.host_s
     send(flight, request)
 
 
 def announce(flight: FlightState, sentence: str, *, once: bool = False) -> None:
-    """Report to the user, the ground station and the log; `once`: unless this flight has."""
+    """Report a sentence to the user, the ground station and the log. `once`: whether to report it
+    only once in this flight."""
     if once and sentence in flight.told:
         return
     if once:
@@ -253,7 +254,7 @@ def announce(flight: FlightState, sentence: str, *, once: bool = False) -> None:
 
 
 def announce_phase(flight: FlightState, reason: str, cause: str) -> None:
-    """Report that the phase begins; `cause` is a word for the log, empty without one."""
+    """Report that the phase begins. `cause` is a word for the log; it may be empty."""
     flown = flight.outcome is not None and flight.outcome.exit_code == ExitCode.FLOWN
     name = "ended" if flight.phase is Phase.FAILED and flown else flight.phase.value
     sentence = f"{name}: {reason}"
@@ -262,12 +263,12 @@ def announce_phase(flight: FlightState, reason: str, cause: str) -> None:
 
 
 def warn(flight: FlightState, sentence: str) -> None:
-    """Report to the ground station and the log."""
+    """Report a sentence to the ground station and the log, but not to the user."""
     _say(flight, WARNING, EventRecord(sentence))
 
 
 def _show(flight: FlightState, sentence: str) -> None:
-    """To the user. A vehicle may wait for weeks: only the newest sentences are kept."""
+    """Report to the user. Only the newest sentences are kept: a vehicle may wait for weeks."""
     flight.announcements += 1
     flight.announced.append(sentence)
     del flight.announced[:-ANNOUNCED_KEPT]
@@ -291,7 +292,7 @@ def send(flight: FlightState, *messages: Outgoing) -> None:
 
 def flush(flight: FlightState) -> tuple[bytes, ...]:
     """Encode what is to be sent."""
-    queue, flight.queue = flight.queue, []  # empty, should one of them not be encodable
+    queue, flight.queue = flight.queue, []  # emptied first: one of them may not be encodable
     return tuple(map(flight.session.encode, queue))
 
 

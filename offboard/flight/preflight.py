@@ -1,7 +1,8 @@
-"""The preflight list: what must be true of a vehicle before it is flown, one row a condition.
+"""The preflight list: what must be true of a vehicle before it is flown, one row for a condition.
 
-`fly` and `daemon` decide by it on the ground, `doctor` prints it. Sans-I/O: a row is a function of
-a `Ground`. What an autopilot requires of its parameters is in its dialect; each is a row too.
+`fly` and `daemon` decide by it on the ground, and `doctor` prints it. Nothing here does I/O: a row
+is a function of a `Ground`. What an autopilot requires of its parameters is in its dialect;
+`findings` adds it to the list.
 """
 
 from __future__ import annotations
@@ -25,12 +26,12 @@ TELEMETRY = ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED")
 MINIMUM_TELEMETRY_HZ = 10.0
 REPEAT_S = 0.5  # between two requests for a parameter
 REPLY_TIMEOUT_S = 2.0  # for parameters
-STARTING_S = 90.0  # of vehicle time: ArduCopter uses a GPS 30 s after its first 3D fix
-UNANSWERED_S = 3.0  # requests of TIMESYNC, ten a second
+STARTING_S = 90.0  # vehicle time after boot: ArduCopter uses a GPS 30 s after its first 3D fix
+UNANSWERED_S = 3.0  # without a reply to TIMESYNC requests, which are sent ten times a second
 
 
 class Level(IntEnum):
-    """From harmless to severe. `WAIT` may clear by itself; `BLOCKS`: `offboard fly` refuses it."""
+    """How severe a finding is. WAIT may clear by itself; BLOCKS prevents a flight."""
 
     OK = 0
     WARN = 1
@@ -40,8 +41,8 @@ class Level(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """`found` is what was observed, `hint` what to do about it: apart, so that a program can use
-    either. `about`: a parameter, where it is not only the check."""
+    """`found` is what was observed and `hint` is what to do about it; they are separate, so that a
+    program can use either. `about` is the parameter that the finding is about, if there is one."""
 
     level: Level
     found: str
@@ -57,7 +58,7 @@ class Finding:
 class ParameterReading:
     """Progress of reading the watched parameters of one vehicle.
 
-    `advice`: also those that are only for the advice of `doctor`."""
+    `advice`: whether to read also the parameters that only `doctor` gives advice on."""
 
     def __init__(self, *, advice: bool = False) -> None:
         self._advice = advice
@@ -65,7 +66,7 @@ class ParameterReading:
         self._requested_s = -math.inf
 
     def due(self, dialect: Dialect, vehicle: VehicleState) -> list[ParamRead]:
-        """Requests to send now, for every watched parameter without a reply."""
+        """Return the requests to send now, one for every watched parameter without a reply."""
         if math.isnan(self._began_s):
             self._began_s = vehicle.now_s
         if vehicle.now_s - self._requested_s < REPEAT_S - 1e-6:
@@ -74,7 +75,7 @@ class ParameterReading:
         return [ParamRead(name) for name in self._missing(dialect, vehicle)]
 
     def complete(self, dialect: Dialect, vehicle: VehicleState) -> bool:
-        """Every parameter has a reply, or had time enough for one."""
+        """Whether every parameter has a reply, or there was time enough for one."""
         timeout = vehicle.now_s - self._began_s >= REPLY_TIMEOUT_S
         return timeout or not self._missing(dialect, vehicle)
 
@@ -85,18 +86,18 @@ class ParameterReading:
 
 @dataclass(slots=True, kw_only=True)
 class Ground:
-    """What is known of a vehicle on the ground, by the listening of `doctor`, or by a flight, which
-    is one. `model` is the vehicle model in use: it scales the thrust of setpoints."""
+    """What is known about a vehicle on the ground, by `doctor` or by a flight (`FlightState` is a
+    subclass). `model` is the vehicle model in use, which scales the thrust of setpoints."""
 
     limits: Limits
     session: Session
     model: Vehicle
     vehicle: VehicleState = field(default_factory=VehicleState)
     clock: VehicleClock = field(default_factory=VehicleClock)
-    host_s: float = math.nan  # monotonic time of this computer at the present turn
-    guarded: bool = True  # a supervisor lands the vehicle if this process ends
-    rates_requested: bool = True  # of telemetry: only then slow ones count
-    service: ServiceOptions | None = None  # of `daemon`, whose pilot arms it and engages
+    host_s: float = math.nan  # host time of the present turn; in lockstep simulated time
+    guarded: bool = True  # whether a supervisor lands the vehicle if this process ends
+    rates_requested: bool = True  # whether telemetry rates were requested; else slow ones are fine
+    service: ServiceOptions | None = None  # of `daemon`, for which the pilot arms and engages
     reading: ParameterReading = field(default_factory=ParameterReading)
 
     @property
@@ -106,21 +107,21 @@ class Ground:
 
     @property
     def in_the_air(self) -> bool:
-        """Whether it may fly; in doubt it does."""
+        """Whether the vehicle may be in the air; True in doubt."""
         return self.vehicle.armed
 
     @property
     def origin_missing(self) -> bool:
-        """The reference is relative to a take-off point that is not known."""
+        """Whether the reference is relative to a take-off point that is not known."""
         return False
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One condition: `problem` says what is wrong, empty if nothing is, `fix` what to do.
+    """One condition: `problem` returns what is wrong, empty if nothing is; `fix` says what to do.
 
-    `at_once`: `fly` does not wait `limits.health_s` for it to clear. `fly_only`: `daemon`, which
-    waits for its pilot, does not judge it."""
+    `at_once`: whether `fly` refuses without waiting `limits.health_s` for the problem to clear.
+    `fly_only`: whether `daemon`, which waits for its pilot, leaves the condition out."""
 
     check: str
     level: Level | Callable[[Ground], Level]
@@ -131,8 +132,9 @@ class Row:
 
 
 def findings(ground: Ground) -> Iterator[tuple[str, bool, Finding]]:
-    """What is wrong, in the order of the list, and last what the autopilot requires of its
-    parameters: the name of the check, whether `fly` refuses it at once, and the finding."""
+    """Yield what is wrong, in the order of the list, and then what is wrong with the autopilot's
+    parameters. A problem is the name of the check, whether `fly` refuses it at once, and the
+    finding."""
     for row in PREFLIGHT:
         found = "" if row.fly_only and ground.service else row.problem(ground)
         if found:
@@ -150,7 +152,7 @@ def findings(ground: Ground) -> Iterator[tuple[str, bool, Finding]]:
 
 
 def refusals(ground: Ground) -> list[str]:
-    """Why this vehicle is not flown, whatever else changes: a sentence for each reason."""
+    """Why this vehicle is refused at once: a sentence for each reason."""
     return [found.sentence for _, at_once, found in findings(ground) if at_once]
 
 
@@ -173,7 +175,7 @@ def unfit_type(ground: Ground) -> str:
 
 
 def armed_already(ground: Ground) -> str:
-    """It is armed already, and the limits refuse such a vehicle."""
+    """The vehicle is armed already, and `limits.begin_armed` is False."""
     armed = ground.vehicle.armed and not ground.limits.begin_armed
     return "the vehicle is armed already, by another controller or a pilot" if armed else ""
 
@@ -228,7 +230,8 @@ def twin(ground: Ground) -> str:
 
 
 def other_vehicle(ground: Ground) -> str:
-    """Several vehicles are heard, and none was chosen with --system, or none can be."""
+    """Several vehicles are heard and none was chosen with --system, or two of them have the same
+    system id."""
     return _same_system_id(ground) or _several_vehicles(ground)
 
 
@@ -240,7 +243,7 @@ def _no_telemetry(ground: Ground) -> str:
         missing.append("HEARTBEAT")
     if not missing:
         return ""
-    silent = "HEARTBEAT" in missing  # then what it has reported before explains nothing
+    silent = "HEARTBEAT" in missing  # then earlier reports explain nothing
     problem = vehicle.estimator.problem if vehicle.estimator and not silent else ""
     why = (problem and f": {problem}") + vehicle.explanation(dialect.unsaid if dialect else "")
     return f"no {' and no '.join(missing)} arrives{why}"
@@ -314,7 +317,8 @@ def _no_estimate(ground: Ground) -> str:
 
 
 def _estimate_level(ground: Ground) -> Level:
-    """What is missing may come while the vehicle starts; what is rejected is wrong."""
+    """WAIT while the vehicle starts, because a missing part of the estimate may come; BLOCKS later,
+    or if the estimator rejects a measurement."""
     vehicle = ground.vehicle
     fixed = vehicle.age_s(GpsFix) < vehicle.age_s(NoFix)
     starts = not fixed or vehicle.time_s < STARTING_S
@@ -330,7 +334,7 @@ def _empty_battery(ground: Ground) -> str:
 
 
 def unanswered(for_s: float) -> str:
-    """The sentence for TIMESYNC that was not answered for `for_s`; empty for a short time."""
+    """The sentence that no TIMESYNC request was answered for `for_s`; empty for a short time."""
     if for_s < UNANSWERED_S:
         return ""
     return f"TIMESYNC is not answered for {for_s:.0f} s: does the vehicle receive what is sent?"

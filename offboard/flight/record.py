@@ -1,15 +1,16 @@
-"""Records of a flight in its log, beside the frames that were received and sent: of each control
-tick, of the configuration and the vehicle, and what the turns were given, so that `offboard replay`
-can give it the same again.
+"""Records in the log of a flight, beside the frames that were received and sent: each control tick,
+what was identified, the configuration, the vehicle, and the inputs of each turn, from which
+`offboard replay` repeats the flight.
 
-The fields of `TickRecord` are the layout of DEBUG_FLOAT_ARRAY.data (name "pso"; array_id: their
-number) in the .tlog; the analysis reads the log with the same class.
+A tick is a DEBUG_FLOAT_ARRAY (name "pso"; array_id: the number of fields) whose data are the fields
+of `TickRecord`; the analysis reads the log with the same class. What was identified is another
+DEBUG_FLOAT_ARRAY.
 
-All others are TUNNEL messages of our record component. The configuration is a text, compressed and
-in numbered pieces, the first entries of the log. The inputs (README.md) are JSON texts, one in a
-line, compressed by zlib and cut into pieces: an object, or for a turn `[time, chunks, readings]` in
-whole microseconds, with the time since the turn before, and in its chunks and readings since its
-own time.
+The other records here are TUNNEL messages of our record component. The configuration is a
+compressed text in numbered pieces, the first entries of the log. The inputs (README.md) are lines
+of JSON, compressed by zlib and cut into pieces. A line is an object, or for a turn the list
+`[time, chunks, readings]`, in whole microseconds: `time` since the turn before, and the times in
+`chunks` and `readings` relative to the turn.
 """
 
 from __future__ import annotations
@@ -41,26 +42,26 @@ IDENTIFIED = (  # value and standard deviation of each, in this order
     *("yaw_delay_s", "yaw_natural_frequency_radps", "yaw_damping"),
     *("hover_thrust", "thrust_lag_s", "thrust_delay_s", "drag_ps"),
 )
-# How the text of a decision that raised an error begins. It has no record of its tick: the analysis
-# counts the texts
+# Beginning of the text about a decision that raised an error. There is no record of such a tick, so
+# the analysis counts these texts
 DECISION_FAILED = "decision failed: "
 
 
 class Refusal(IntFlag):
-    """Why a setpoint was not sent, as the log has it."""
+    """Why a setpoint was not sent; the numbers are those in the log."""
 
     LATE = 1  # decided after its deadline
     STALE = 2  # the telemetry that it was made for is too old
-    NOT_OURS = 4  # the vehicle does not, or may not, follow us
-    UNUSABLE = 8  # not finite, or beyond the numbers of the wire
+    NOT_OURS = 4  # the vehicle does not follow us, or it is not known whether it does
+    UNUSABLE = 8  # a value is not finite, or MAVLink cannot hold it
 
 
 class TickRecord(NamedTuple):
-    """All floats, SI, NED, vehicle time; NaN for what the control law does not have.
+    """One control tick: floats in SI, NED and vehicle time; NaN for what the law does not provide.
 
     Thrust, direction and heading are those of the setpoint that was sent. The certificate, from
-    `cost` to `at_bound` and `seed_cost`, is of this setpoint too: NaN where it is not the one that
-    the control law certified, because excitation or the limits changed it or it was not sent.
+    `cost` to `at_bound` and `seed_cost`, belongs to this setpoint too. It is NaN if the control law
+    certified another one, because excitation or the limits changed it, or if none was sent.
     """
 
     phase: float  # of flight.phases.Phase
@@ -93,8 +94,8 @@ class TickRecord(NamedTuple):
     seed_cost: float  # cost of the best plan that the search started from
     age_s: float  # of the telemetry when the setpoint was sent, vehicle time
     refused: float  # flags of `Refusal`; 0 for a setpoint that was sent
-    other_datagrams: float  # datagrams of other senders since the previous record
-    pause_s: float  # longest pause of this process since the previous tick; 0 below a period
+    other_datagrams: float  # and forged frames, since the previous record
+    pause_s: float  # longest pause of this process since the previous tick; 0 if below a period
 
 
 FIELDS = TickRecord._fields
@@ -103,7 +104,7 @@ RECORD_ID = len(FIELDS)
 
 @dataclass(slots=True)
 class Decided:
-    """A decision, the predicted state it was made for, and what became of it."""
+    """A decision, the predicted state it was made for, and whether it was sent."""
 
     phase: Phase
     state: PredictedState
@@ -129,23 +130,23 @@ def identified_record(time_s: float, found: Mapping[str, Estimate | None]) -> So
 # TUNNEL.payload_type; numbers above 32767 need no registration
 CONFIGURATION_TYPE, VEHICLE_TYPE, INPUTS_TYPE = 0xC0F1, 0xC0F3, 0xC0F5
 _NUMBERED = struct.Struct("<HH")  # index of the piece, number of pieces of a configuration
-TEXT_MOST = 4_000_000  # bytes: eight of the longest configuration files; a log may be anybody's
-_HEAD = struct.Struct("<I")  # number of the piece
+TEXT_MOST = 4_000_000  # bytes, eight times the longest configuration: a log may be hostile
+_HEAD = struct.Struct("<I")  # number of the piece of the inputs
 _PIECE_BYTES = PIECE_BYTES - _HEAD.size
-# what an object holds: the name and the arguments of a call of the flight, or the total of others'
-# datagrams, a number of frames that were not sent, a checksum
+# Keys of an object: name and arguments of a call of the flight; total number of datagrams of
+# others; number of frames that were not sent; checksum of the received frames
 CALL, OTHERS, DROPPED, CHECK = "call", "others", "dropped", "crc"
-SETTINGS = "settings"  # the first call: how the session was set
+SETTINGS = "settings"  # the first call: the settings of the session
 RECORDED_SETTINGS = ("system_id", "lockstep", "stream", "sends_first", "capacity_bytes_ps")
 
 
 def vehicle_record(vehicle: VehicleFound) -> ConfigurationRecord:
-    """The record that says which vehicle is flown."""
+    """Return the record that says which vehicle is flown."""
     return ConfigurationRecord(json.dumps(asdict(vehicle)).encode(), VEHICLE_TYPE)
 
 
 def vehicle_of(payload: bytes) -> VehicleFound | None:
-    """The vehicle in the payload of such a record; None if it is damaged."""
+    """Return the vehicle in the payload of a `vehicle_record`; None if it is damaged."""
     try:
         return VehicleFound(**json.loads(payload))
     except (ValueError, TypeError):
@@ -153,20 +154,20 @@ def vehicle_of(payload: bytes) -> VehicleFound | None:
 
 
 def configuration_pieces(text: str) -> list[ConfigurationRecord]:
-    """Records that hold `text`, in order."""
+    """Return the records that hold `text`, in order."""
     return numbered(zlib.compress(text.encode("utf-8"), 9), _NUMBERED, CONFIGURATION_TYPE)
 
 
 def joined_configuration(payloads: Iterable[bytes]) -> str | None:
-    """The text in the payloads of TUNNEL messages; None if a piece is missing or damaged. Raises
-    ValueError for a text of more than TEXT_MOST bytes."""
+    """Return the text in the payloads of TUNNEL messages, or None if a piece is missing or damaged.
+    Raises ValueError for a text of more than TEXT_MOST bytes."""
     parts: dict[int, bytes] = {}
     count = 0
     for payload in payloads:
         if len(payload) > _NUMBERED.size:
             index, count = _NUMBERED.unpack_from(payload)
             parts[index] = payload[_NUMBERED.size :]
-        if len(parts) == count > 0:  # they are the first entries of a log
+        if len(parts) == count > 0:  # complete: its pieces are the first entries of a log
             break
     if not count or sorted(parts) != list(range(count)):
         return None
@@ -186,8 +187,8 @@ def joined_configuration(payloads: Iterable[bytes]) -> str | None:
 
 
 class InputRecorder:
-    """Records the inputs of one `Flight`; see the module. With `kept` False nothing: a flight of
-    a service goes on with what was known before, which its log does not hold."""
+    """Records the inputs of one `Flight`; see the module. With `kept` False it records nothing: a
+    flight of the service begins with earlier knowledge that its log does not hold."""
 
     def __init__(self, settings: SessionSettings, *, kept: bool = True) -> None:
         self._kept = kept
@@ -204,7 +205,7 @@ class InputRecorder:
         self.call(SETTINGS, {name: getattr(settings, name) for name in RECORDED_SETTINGS})
 
     def begin(self, now_s: float, other_datagrams: int) -> float:
-        """A turn begins. Returns its time as it is recorded."""
+        """Begin a turn. Returns its host time as recorded, rounded to microseconds."""
         if other_datagrams != self._other_datagrams:
             self.note(OTHERS, other_datagrams)
             self._other_datagrams = other_datagrams
@@ -213,11 +214,11 @@ class InputRecorder:
         return self._now_us / 1e6
 
     def arrived_s(self, chunk: Chunk) -> float:
-        """The time of arrival of a chunk as it is recorded."""
+        """Return the time of arrival of a chunk as recorded, rounded to microseconds."""
         return round(chunk.arrived_s * 1e6) / 1e6
 
     def chunk(self, chunk: Chunk, reception: Reception) -> None:
-        """A chunk of this turn, and what was found in it."""
+        """Record a chunk of this turn, and what was found in it."""
         for frame in reception.frames:
             self._crc = zlib.crc32(frame, self._crc)
         unlogged = [(place, frame.hex()) for place, frame in reception.unlogged]
@@ -225,7 +226,7 @@ class InputRecorder:
         self._chunks.append([self._peer(chunk.peer), arrived_us, len(reception.frames), *unlogged])
 
     def watch(self, stopwatch: Callable[[], float]) -> Callable[[], float]:
-        """The same stopwatch, whose readings are recorded."""
+        """Return the same stopwatch with readings that are recorded."""
 
         def read() -> float:
             read_us = round(stopwatch() * 1e6)
@@ -236,21 +237,22 @@ class InputRecorder:
         return read
 
     def end(self) -> None:
-        """The turn ends. In lockstep one in which nothing arrived changes nothing."""
+        """End the turn. In lockstep, a turn in which nothing arrived changes nothing and is not
+        recorded."""
         if self._timed or self._chunks:
             step_us = self._now_us - self._before_us if self._timed else 0
             self._write([step_us, self._chunks, self._readings_us])
 
     def call(self, name: str, *arguments: object) -> None:
-        """A method of the flight was called between two turns."""
+        """Record that a method of the flight was called between two turns."""
         self.note(CALL, [name, *arguments])
 
     def note(self, kind: str, value: object) -> None:
-        """Something beside the turns: one of CALL, OTHERS, DROPPED, CHECK."""
+        """Record something beside the turns: one of CALL, OTHERS, DROPPED, CHECK."""
         self._write({kind: value})
 
     def pieces(self, *, all_of_it: bool) -> list[ConfigurationRecord]:
-        """Records for the log: the full ones, or all that there is."""
+        """Return records for the log: the full pieces, or with `all_of_it` everything so far."""
         if not self._kept:
             return []
         if all_of_it:
@@ -271,8 +273,8 @@ class InputRecorder:
             self._data += self._compressor.compress(line.encode())
 
     def _peer(self, peer: Hashable) -> Hashable:
-        """In lockstep its number: the simulator's port differs from run to run, and does not
-        matter."""
+        """Return the address as recorded: in lockstep a number, because the simulator's port
+        differs from run to run."""
         if self._timed:
             return peer
         if peer not in self._peers:
@@ -281,13 +283,13 @@ class InputRecorder:
 
 
 class InputsError(ValueError):
-    """The record is damaged or not complete; the text says how."""
+    """The record of the inputs is damaged or not complete; the message says how."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChunkInput:
-    """A chunk: how many of the logged frames it held, and which others, each with the number of
-    logged frames before it."""
+    """A chunk: `frames` is the number of logged frames in it, `unlogged` are its other frames, each
+    with the number of logged frames before it."""
 
     peer: Hashable
     arrived_s: float
@@ -306,8 +308,8 @@ class TurnInput:
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """What came between two turns, see `InputRecorder.note`: of a CALL the name of the method and
-    its arguments, of the others one number."""
+    """An entry beside the turns, see `InputRecorder.note`. `values` are the name of the method and
+    its arguments for a CALL, and one number for the others."""
 
     kind: str
     values: tuple[Any, ...]
@@ -317,8 +319,8 @@ Entry = TurnInput | Note
 
 
 def entries(payloads: Iterable[bytes]) -> Iterator[Entry]:
-    """The entries in the payloads of TUNNEL messages, in order. Ends within the last one if the log
-    does. Raises InputsError where a piece is missing or damaged."""
+    """Yield the entries in the payloads of TUNNEL messages, in order. An entry that the end of the
+    log cuts off is left out. Raises InputsError where a piece is missing or damaged."""
     now_us = 0
     for line in _lines(payloads):
         try:

@@ -1,4 +1,4 @@
-"""The phase table on the ground: from the connection to lift-off, and the service that waits."""
+"""The phase table on the ground: from the connection to lift-off, and while the service waits."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from offboard.mavlink.events import Heartbeat
 
 ARM_DISARM = 400  # MAV_CMD_COMPONENT_ARM_DISARM
 ARMING_SHOWN_S = 2.5  # HEARTBEAT, at 1 Hz, shows an accepted arming within this time
-OTHER_VEHICLE_S = 5.0  # what is heard after that may be another vehicle
-LISTENED_S = 0.5  # to hear another sender: PX4 leaves OFFBOARD below 2 Hz
+OTHER_VEHICLE_S = 5.0  # after a longer silence another vehicle may be on the link
+LISTENED_S = 0.5  # time to hear another sender of setpoints: PX4 leaves OFFBOARD below 2 Hz
 
 
 def vehicle_found(flight: FlightState) -> str:
@@ -46,7 +46,7 @@ def silent_on_ground(flight: FlightState) -> str:
 
 
 def silent_for_another(flight: FlightState) -> str:
-    """HEALTH begins anew, but only if something was heard in it."""
+    """After this silence HEALTH begins again, but only if something was heard in it."""
     heard = flight.phase is not HEALTH or flight.in_phase_s > flight.silence_s
     return silent_for(flight, OTHER_VEHICLE_S) if heard else ""
 
@@ -57,7 +57,8 @@ def refused(flight: FlightState) -> str:
 
 
 def unfit(flight: FlightState) -> str:
-    """What the preflight list refuses, and the first that it waits for; empty for neither."""
+    """What the preflight list refuses at once, and the first problem that it waits for; empty if
+    there is neither."""
     return "; ".join(filter(None, [*preflight.refusals(flight), preflight.not_ready(flight)]))
 
 
@@ -72,11 +73,12 @@ def not_ready(flight: FlightState) -> str:
 # ---------------------------------------------------------------------- the service waits
 
 
-PREVENTED = other_sender, mode_unknown, silent, blind  # what prevents that a vehicle is taken over
+PREVENTED = other_sender, mode_unknown, silent, blind  # they prevent a take-over
 
 
 def can_take_over(flight: FlightState) -> bool:
-    """It flies in the mode of setpoints, without a failsafe, and no other program controls it."""
+    """Whether the vehicle is of a fit type and flies in the mode of setpoints without a failsafe,
+    its telemetry is recent, and no other program controls it."""
     if flight.vehicle.in_failsafe or not engaged_in_the_air(flight):
         return False
     return not any(each(flight) for each in (*PREVENTED, unfit_type))
@@ -94,19 +96,22 @@ def engaged_but_unfit(flight: FlightState) -> str:
 
 
 def engaged_too_soon(flight: FlightState) -> bool:
-    """It left the mode of setpoints and returned so soon that a failsafe may have done it."""
+    """Whether the vehicle left the mode of setpoints and returned so soon that this may have been a
+    failsafe."""
     too_soon = flight.pilot is PilotSwitch.TOO_SOON and flight.in_phase_s > LISTENED_S
     return too_soon and can_take_over(flight)
 
 
 def found_engaged(flight: FlightState) -> bool:
-    """It was found in the air in the mode of setpoints: another program may fly it."""
+    """Whether the vehicle was found in the air in the mode of setpoints: another program may fly
+    it."""
     found = flight.pilot is PilotSwitch.FOUND and flight.vehicle.landed != "unknown"
     return found and flight.in_phase_s > LISTENED_S and bool(engaged_in_the_air(flight))
 
 
 def abandoned(flight: FlightState) -> bool:
-    """A flight of this service was cut short and left it engaged; no other program flies it."""
+    """Whether a flight of this service was cut short and left the vehicle engaged, and no other
+    program flies it."""
     left = flight.left_engaged and not other_vehicle(flight)
     return left and found_engaged(flight) and can_take_over(flight)
 
@@ -121,8 +126,8 @@ def started_on_the_ground(flight: FlightState) -> bool:
 
 
 def not_started(flight: FlightState) -> str:
-    """Why the vehicle that waits is not started on request; empty if it is. In the air, as by a
-    pilot's switch, only where every sign says that it flies."""
+    """Why a request to start is refused while the service waits; empty if it is not refused. In the
+    air the vehicle must fly for certain, as it must for a pilot's switch."""
     vehicle, service = flight.vehicle, flight.service
     if not flight.in_the_air:
         if service is None or not service.arms:
@@ -172,9 +177,9 @@ def armed(flight: FlightState) -> str:
 
 
 def disarmed_again(flight: FlightState) -> bool:
-    """A HEARTBEAT that is newer than the acceptance, in this phase, shows it disarmed when it
-    should be armed. On a lossy link the acceptance may come long after the first request, and a
-    HEARTBEAT be missing."""
+    """Whether the vehicle accepted the request to arm in this phase, more than ARMING_SHOWN_S ago,
+    and a HEARTBEAT since then shows it disarmed. On a lossy link the acceptance may come long after
+    the first request, and a HEARTBEAT may be missing."""
     vehicle = flight.vehicle
     accepted = vehicle.results.get(ARM_DISARM) == "ACCEPTED"
     since_s = flight.now_s - vehicle.answered_s.get(ARM_DISARM, flight.now_s)
@@ -183,20 +188,21 @@ def disarmed_again(flight: FlightState) -> bool:
 
 
 def stop_requested_on_ground(flight: FlightState) -> str:
-    """A stop is requested while the vehicle is armed and stands on the ground by every sign."""
+    """A stop is requested while the vehicle is armed and certainly stands on the ground."""
     stands = flight.vehicle.armed and not flight.contact.in_the_air
     stopped = flight.stop_reason and stands and not authority_lost(flight)
     return f"{flight.stop_reason} before lift-off" if stopped else ""
 
 
 def rises(flight: FlightState) -> bool:
-    """Positions or the land detector show flight: an autopilot refuses to disarm then. PX4's
-    detector reports flight while the thrust is still well below hover."""
+    """Whether positions or the land detector show flight, in which an autopilot refuses to disarm.
+    PX4's land detector reports flight while the thrust is still well below hover."""
     return flight.contact.lifted_off or flight.contact.detects_flight
 
 
 def disarmed_for_good(flight: FlightState) -> bool:
-    """A HEARTBEAT of this phase shows it; it may have been arming before."""
+    """Whether a HEARTBEAT of this phase shows the vehicle disarmed, DISARMED_S after the beginning
+    of the phase: before that it may still have been arming."""
     shown = flight.vehicle.disarmed and flight.vehicle.age_s(Heartbeat) < flight.in_phase_s
     return shown and flight.in_phase_s > DISARMED_S
 
@@ -245,7 +251,7 @@ SERVICE_BEGINS = (
     Transition({CONNECT}, vehicle_found, HEALTH),
     Transition({STANDBY}, rebooted, FAILED, FLOWN, "restart"),
     Transition({HEALTH, STANDBY}, silent_for_another, HEALTH),
-    # before a stop: what has just been engaged is handed back
+    # before the row of a stop, so that a vehicle that was engaged just now is handed back
     Transition({HEALTH, STANDBY}, abandoned, HAND_BACK, FLOWN, reason=ABANDONED),
     Transition({STANDBY}, engaged_by_pilot, CLIMB, FLOWN),
     Transition({HEALTH, STANDBY}, engaged_but_unfit, HAND_BACK, REFUSED),
@@ -256,7 +262,7 @@ SERVICE_BEGINS = (
     Transition({STANDBY}, started_on_the_ground, STREAM, reason="start requested"),
 )
 STARTING = (
-    # first: from then on it is ours, and whatever ends the flight must ask for hold or land
+    # first, because the vehicle is ours then: whatever ends the flight must request hold or land
     Transition(STREAMING, engaged_in_the_air, CLIMB),
     Transition(STREAMING, rebooted, FAILED, REFUSED, "restart"),
     Transition(STREAMING, armed_already, FAILED, REFUSED),

@@ -1,8 +1,10 @@
-"""Flight state: all that one flight knows. `Flight` owns it; the functions of the other
-modules take it.
+"""Flight state: everything that one flight knows. `Flight` is a subclass of it; the functions of
+the other modules take it as an argument.
 
-Facts come in by `VehicleState`, `Authority`, `GroundContact` and `VehicleClock`, each with the
-time when it was heard. What follows from them is in `transitions` and `failsafe`.
+`VehicleState`, `Authority`, `GroundContact` and `VehicleClock` hold what was received, with its
+time. `transitions` and `failsafe` hold what follows from it. There are three times: vehicle time
+(`time_boot_ms`), host time (`Session.elapsed_s`, which in lockstep is simulated time) and link time
+(`Session.link_time_s`, which follows vehicle time, or host time while telemetry is missing).
 """
 
 from __future__ import annotations
@@ -43,17 +45,17 @@ from offboard.mavlink.outgoing import (
 )
 from offboard.model.command import Command, PredictedState
 
-LEVEL_DIRECTION = (0.0, 0.0, 1.0)  # of the thrust: the third body axis in NED
-COMMANDS_KEPT = 7  # as long as an attitude may take to follow
-THRUSTS_KEPT = 40  # as long as a setpoint may be on its way, or the next ones be lost
-# Setpoints count as missing so long before the autopilot's timeout, at most a third of it: the
-# newest may be on its way or lost
+LEVEL_DIRECTION = (0.0, 0.0, 1.0)  # thrust direction of level flight: third body axis in NED
+COMMANDS_KEPT = 7  # the attitude may still follow the oldest of them
+THRUSTS_KEPT = 40  # the vehicle may still follow the oldest: later ones are on their way or lost
+# Setpoints count as missing this long before the autopilot's timeout, but at most a third of it,
+# because the newest one may be on its way or lost
 MISSING_EARLY_S = 0.3
-HEARTBEAT_AWAITED_S = 1.2  # HEARTBEAT comes at 1 Hz
-MISSING_KNOWN_S = 3.0  # HEARTBEAT, at 1 Hz, shows the failsafe
+HEARTBEAT_AWAITED_S = 1.2  # longest wait for a HEARTBEAT, which comes at 1 Hz
+MISSING_KNOWN_S = 3.0  # time in which HEARTBEAT, at 1 Hz, shows the failsafe for missing setpoints
 
 
-# of the flight before, with the same vehicle
+# attributes that continue those of the flight before, with the same vehicle
 KEPT = (
     "vehicle", "contact", "clock", "hover", "jumps", "reading", "other_datagrams", "host_s",
     "heard_s", "guarded", "announced", "announcements",
@@ -63,22 +65,22 @@ KEPT = (
 @dataclass(slots=True)
 class Failsafe:
     """For how long the conditions of `failsafe.ROWS` have held, by the name of the row, and the
-    worst row that is active."""
+    active row with the most severe action."""
 
     held_s: dict[str, float] = field(default_factory=dict)
-    judged_s: float = math.inf  # when, on `Session.link_time_s`; infinite before the first time
+    judged_s: float = math.inf  # link time of the newest judgement; infinite before the first
     row: str = ""
     action: Action = Action.FLY
-    reason: str = ""  # why the action is taken, as a sentence, and its cause in a word
-    cause: str = ""
+    reason: str = ""  # why the action is taken, in a sentence
+    cause: str = ""  # the same in a word
 
 
 @dataclass(slots=True, kw_only=True)
 class FlightState(Ground):
-    """One flight. `stopwatch` reads host time. `deadline_s` is the wall time that one decision may
-    take, None where the vehicle waits for each decision, so that none is late.
-    `identification` is None with a controller that cannot use it, `service` in a flight of `fly`.
-    """
+    """The state of one flight. `stopwatch` returns monotonic host time. `deadline_s` is the host
+    time that one decision may take; it is None if the vehicle waits for each decision, so that none
+    is late. `identification` is None with a controller that cannot use it, and `service` is None in
+    a flight of `fly`."""
 
     plan: FlightPlan
     observer: Observer
@@ -94,50 +96,51 @@ class FlightState(Ground):
     failsafe: Failsafe = field(default_factory=Failsafe)
     contact: GroundContact = field(init=False)
     pilot: PilotSwitch = PilotSwitch.FOUND
-    # the ground where the flight began, without the jumps of the estimate before that
+    # take-off point, or the ground below a vehicle that was found in the air; the jumps of the
+    # position estimate before that are removed
     home_ned_m: Triple = (0.0, 0.0, 0.0)
-    took_off: bool = False  # from there; a vehicle that was found in the air has not
+    took_off: bool = False  # in this flight; a vehicle that was found in the air did not
     touchdown: Touchdown | None = None  # of the landing
     authority: Authority = field(default_factory=Authority)
-    other_datagrams: int = 0  # of other senders, for the log
+    other_datagrams: int = 0  # number of those from other senders, for the log
 
     phase: Phase = Phase.CONNECT
-    began_s: float = 0.0  # of the phase, on `Session.link_time_s`
-    setpoint_s: float = math.inf  # when the newest setpoint left; infinite before the first
-    setpoints_missed_s: float = -math.inf  # when setpoints may have been missing for long
+    began_s: float = 0.0  # link time at which the phase began
+    setpoint_s: float = math.inf  # host time of the newest setpoint; infinite before the first
+    setpoints_missed_s: float = -math.inf  # newest host time at which they may have been missing
     rebooted: bool = False
-    left_engaged: bool = False  # a flight that was cut short has left the vehicle engaged
-    request: Request = Request.NONE  # of the ground station, while it is judged
-    obeyed: Request = Request.NONE  # the newest one that changed the phase
-    refused_s: float = -math.inf  # when the user was told of one that was refused
-    stop_reason: str = ""  # why the flight shall end; empty while it shall not
+    left_engaged: bool = False  # whether an earlier flight was cut short and left it engaged
+    request: Request = Request.NONE  # of the ground station, while `transitions.obey` runs
+    obeyed: Request = Request.NONE  # the newest request that changed the phase
+    refused_s: float = -math.inf  # link time of the newest announcement of a refused request
+    stop_reason: str = ""  # why a stop was requested; empty without a request
     outcome: Outcome | None = None
 
     busyness: Busyness = field(init=False)  # of this computer
-    heard_s: float = math.nan  # host time of the newest telemetry, as `Session.elapsed_s`
-    telemetry_arrived_s: float = 0.0  # host time at which it arrived
+    heard_s: float = math.nan  # host time of the turn in which the newest telemetry arrived
+    telemetry_arrived_s: float = 0.0  # monotonic host time of its arrival, in lockstep too
     reported_s: float = -math.inf  # `clock.answered_s` when the newest mode was reported
     bridged_s: float = 0.0  # `silence_s` at the newest setpoint that was sent without telemetry
     ignored: int = 0  # datagrams of others and forged frames between the two newest ticks
     command: Command = field(default_factory=lambda: Command(0.0, LEVEL_DIRECTION, 0.0))  # in force
-    newest_setpoint: AttitudeTarget | PositionTarget | None = None  # until it is repeated
-    decided: Decided | None = None  # in this turn
-    told_radps: tuple[float, ...] = (math.nan, math.nan)  # bandwidth, as the user knows it
-    missed: int = 0  # decisions in a row that were not sent
+    newest_setpoint: AttitudeTarget | PositionTarget | None = None  # None once it was repeated
+    decided: Decided | None = None  # the decision of this turn
+    told_radps: tuple[float, ...] = (math.nan, math.nan)  # the bandwidth that was announced last
+    missed: int = 0  # number of decisions in a row that were not sent
     failure: str = ""  # what prevented the newest of them
     failure_cause: str = ""  # in a word: controller, link or computer
     commands: deque[Command] = field(default_factory=lambda: deque(maxlen=COMMANDS_KEPT))
     thrusts: deque[float] = field(default_factory=lambda: deque(maxlen=THRUSTS_KEPT))
-    announced: list[str] = field(default_factory=list)  # newest for the user, oldest first
-    announcements: int = 0  # how many there were
-    told: set[str] = field(default_factory=set)  # of those that are announced once in a flight
+    announced: list[str] = field(default_factory=list)  # newest sentences, oldest first
+    announcements: int = 0  # number of all sentences announced so far
+    told: set[str] = field(default_factory=set)  # sentences that are not announced again
     queue: list[Outgoing] = field(default_factory=list)  # to be sent
     records: list[Record] = field(default_factory=list)  # to be logged
-    # requests of this phase: link time (`now_s`) and host time at which each was sent
+    # requests of this phase: link time and host time at which each was sent
     requested_s: dict[CommandLong, tuple[float, float]] = field(default_factory=dict)
     text_id: int = 0
-    awaits_link: bool = False  # while landing
-    follows_others: bool = False  # the newest ThrustReport is of none of `thrusts`
+    awaits_link: bool = False  # whether a landing waits until the vehicle is heard again
+    follows_others: bool = False  # whether the newest ThrustReport equals none of `thrusts`
     start_hover_thrust: float = math.nan  # normalised; the greatest at a start of the reference
     predictions: deque[PredictedState] = field(default_factory=lambda: deque(maxlen=8))
 
@@ -148,16 +151,16 @@ class FlightState(Ground):
             self._follow(before)
 
     def _follow(self, before: FlightState) -> None:
-        """Continue after another flight with the same vehicle: what is known of vehicle and link
-        stays. It begins in STANDBY, or anew while the vehicle is not known well enough: after a
-        reboot its parameters are read again."""
+        """Take over what `before`, a flight with the same vehicle, knows about vehicle and link. If
+        `before` has ended, this flight begins in STANDBY, or in CONNECT after a reboot, so that the
+        parameters of the vehicle are read again."""
         for name in KEPT:
             setattr(self, name, getattr(before, name))
         self.clock.growth = LinkGrowth()
-        # of a taken vehicle nothing was asked: no reply is missing in `note_missing_setpoints`
+        # an ended flight requests no TIMESYNC: an old reply shows no missing setpoints
         self.vehicle.heard_s.pop(TimesyncReply, None)
         self.authority = before.authority.renewed()
-        if not before.in_end_phase:  # nothing was flown: what the pilot did before counts
+        if not before.in_end_phase:  # it has only waited: what the pilot did meanwhile counts
             self.pilot, self.phase, self.began_s = before.pilot, before.phase, before.began_s
             return
         prepared = before.phase not in (Phase.CONNECT, Phase.HEALTH) and not before.rebooted
@@ -167,20 +170,20 @@ class FlightState(Ground):
         if before.ends_engaged:
             self.pilot = PilotSwitch.FOUND
         elif before.pilot is PilotSwitch.ENGAGED:
-            # a switch while the flight ended is answered by hold
+            # a vehicle that was taken and is engaged again already is put on hold (TOO_SOON)
             self.pilot = PilotSwitch.TOO_SOON if before.taken else PilotSwitch.IDLE
         elif before.pilot is PilotSwitch.FOUND:
             self.pilot = PilotSwitch.IDLE
 
     @property
     def now_s(self) -> float:
-        """`Session.link_time_s` at the newest event, or at the present turn."""
+        """Link time at the newest event, or at the present turn."""
         return self.vehicle.now_s
 
     @property
     def silence_s(self) -> float:
-        """Host time since the newest telemetry; 0 before the first turn. In lockstep the turn in
-        which some arrives is later than `host_s`, its beginning."""
+        """Host time since the newest telemetry; 0 before the first turn. In lockstep `heard_s` may
+        be later than `host_s`, because simulated time advances within the turn."""
         return max(0.0, self.host_s - self.heard_s)
 
     @property
@@ -208,12 +211,12 @@ class FlightState(Ground):
 
     @property
     def in_engage_mode(self) -> bool:
-        """The vehicle shows the mode in which it follows setpoints."""
+        """Whether the vehicle shows the mode in which it follows setpoints."""
         return self.authority.mode == self.authority.engage_mode
 
     @property
     def track_time_s(self) -> float:
-        """Time since the start of the track, without pauses; NaN before it."""
+        """Time since the start of the track, not counting pauses; NaN before it."""
         return self.plan.track_time_s(self.time_s)
 
     @property
@@ -229,7 +232,7 @@ class FlightState(Ground):
 
     @property
     def position_error_m(self) -> float:
-        """Distance of the reported position from the reference; NaN without one of them."""
+        """Distance of the reported position from the reference; NaN if either is missing."""
         position = self.vehicle.position
         sample = self.plan.sample(position.time_s) if position else None
         if position is None or sample is None:
@@ -238,28 +241,29 @@ class FlightState(Ground):
 
     @property
     def taken(self) -> bool:
-        """Someone else changed the vehicle's mode, and that ended the flight in the air."""
+        """Whether the flight ended in the air because someone else changed the vehicle's mode."""
         return self.authority.standing is Standing.LOST and self.phase is Phase.YIELDED
 
     @property
     def shown_since_lost(self) -> bool:
-        """A HEARTBEAT has come since the vehicle was lost: only it shows whether a failsafe took
-        it, and whether it is armed. PX4 shows the mode by CURRENT_MODE up to a second earlier, and
-        leaves its landing mode when it disarms."""
+        """Whether a HEARTBEAT has arrived since authority was lost. Only HEARTBEAT shows whether a
+        failsafe took the vehicle and whether it is armed. PX4 shows the mode in CURRENT_MODE up to
+        a second earlier, and leaves its landing mode when it disarms."""
         return self.now_s - self.vehicle.age_s(Heartbeat) > self.authority.lost_s
 
     @property
     def awaits_heartbeat(self) -> bool:
-        """The vehicle was taken, and no HEARTBEAT since then shows whether by a failsafe. False
-        while it shows the mode of setpoints again: the pilot may want the next flight."""
+        """Whether the vehicle was taken, and the HEARTBEAT that shows whether a failsafe took it is
+        awaited, for at most HEARTBEAT_AWAITED_S. False if the vehicle shows the mode of setpoints
+        again, because the pilot may want the next flight."""
         if not self.taken or self.in_engage_mode:
             return False
         return not self.shown_since_lost and self.in_phase_s < HEARTBEAT_AWAITED_S
 
     @property
     def ends_engaged(self) -> bool:
-        """Whether the flight ends with a vehicle that nobody has seen in another mode than that of
-        setpoints: it was not heard any more, or has rebooted."""
+        """Whether the flight ends with a vehicle that may still be in the mode of setpoints: no
+        other mode was reported before the vehicle was lost, or since it was rebooted."""
         unheard = self.authority.standing is Standing.OURS
         return unheard or (self.rebooted and self.pilot is PilotSwitch.FOUND)
 
@@ -270,18 +274,19 @@ class FlightState(Ground):
 
     @property
     def takes_off_by_command(self) -> bool:
-        """The autopilot takes off on a command, without setpoints."""
+        """Whether the autopilot takes off on a command, without setpoints."""
         return self.dialect is not None and self.dialect.takes_off_by_command
 
     @property
     def unreached_s(self) -> float:
-        """For how long no telemetry, or no report of the mode, has arrived; 0 while both do."""
+        """Time without telemetry, or without a report of the mode; 0 while both arrive."""
         silent_s = self.silence_s if self.silence_s > self.limits.silence_s else 0.0
         return max(silent_s, self.authority.unheard_s(self.now_s))
 
     def note_missing_setpoints(self) -> None:
-        """Note when the vehicle may have been without setpoints for so long that its failsafe acts:
-        none was sent, nothing was heard, or no TIMESYNC was answered."""
+        """Set `setpoints_missed_s` if the vehicle may have been without setpoints for so long that
+        its failsafe acts, because none was sent, no telemetry arrived, or no TIMESYNC request was
+        answered."""
         unanswered_s = self.vehicle.age_s(TimesyncReply)
         gap_s = max(
             self.host_s - self.setpoint_s,
@@ -294,7 +299,7 @@ class FlightState(Ground):
 
     @property
     def setpoints_missing(self) -> bool:
-        """Whether `note_missing_setpoints` found this within the last MISSING_KNOWN_S."""
+        """Whether setpoints may have been missing within the last MISSING_KNOWN_S."""
         return self.host_s - self.setpoints_missed_s < MISSING_KNOWN_S
 
     def not_landed(self) -> str:
@@ -306,8 +311,9 @@ class FlightState(Ground):
         return self.touchdown.not_landed(on_ground=self.contact.detected == "on_ground")
 
     def delays_begin_s(self, time_s: float) -> float:
-        """The vehicle time at which the vehicle model's delays begin for a command of the tick
-        `time_s`: later by what the link has added to its delay since take-off."""
+        """Return the vehicle time from which the delays of the vehicle model count for a command of
+        the tick `time_s`. It is later than `time_s` by the growth of the link's delay since
+        take-off."""
         return time_s + self.clock.growth.added_s
 
     @property

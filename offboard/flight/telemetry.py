@@ -1,8 +1,8 @@
-"""What each received message changes in a flight. Sends nothing but answers.
+"""What each received message changes in a flight. Only replies and announcements are sent.
 
-A ground station may ask our component for these, in the service: MAV_CMD_MISSION_START starts the
-reference, MAV_CMD_DO_PAUSE_CONTINUE pauses and continues it, MAV_CMD_DO_SET_MODE, with any
-parameters, hands the vehicle back.
+In the service, a ground station may send these commands to our component: MAV_CMD_MISSION_START
+starts the reference, MAV_CMD_DO_PAUSE_CONTINUE pauses and continues it, and MAV_CMD_DO_SET_MODE,
+with any parameters, hands the vehicle back.
 """
 
 from __future__ import annotations
@@ -57,8 +57,9 @@ DISARMED_SHOWN = "a HEARTBEAT shows the vehicle disarmed: it is wrong, or its mo
 
 
 def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: float) -> bool:
-    """`arrived_s` is the host time of the event's arrival, `turned_s` that of the turn. False if
-    the event is no news (see `VehicleState.update`)."""
+    """Update the flight with one event. `arrived_s` is the host time at which the event arrived,
+    `turned_s` is the host time of the turn. Returns False if the event only repeats an earlier one
+    (see `VehicleState.update`)."""
     if isinstance(event, Parameter):
         _announce_change(flight, event)
     if not flight.vehicle.update(event, flight.session.link_time_s):
@@ -90,7 +91,7 @@ def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: flo
         case OtherCompanion(system, component):
             sentence = OTHER_COMPANION.format(system=system, component=component)
             outbox.announce(flight, sentence, once=True)
-        case ClockBehind(system_id, _):  # its time stamps follow ours once it has heard us
+        case ClockBehind(system_id, _):  # it sets its time stamp to ours when it hears us
             sentence = f"the signing time of system {system_id} is behind: sending ours"
             outbox.announce(flight, sentence, once=True)
         case Rebooted():
@@ -99,7 +100,8 @@ def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: flo
 
 
 def _announce_change(flight: FlightState, parameter: Parameter) -> None:
-    """A watched parameter has changed; the hover thrust that ArduCopter learns does not count."""
+    """Announce a watched parameter that has changed, except the hover thrust that ArduCopter learns
+    in flight."""
     name, now, dialect = parameter.name, parameter.value, flight.dialect
     before = flight.vehicle.parameters.get(name, now)
     if before == now or dialect is None or name == dialect.hover_parameter:
@@ -111,8 +113,8 @@ def _announce_change(flight: FlightState, parameter: Parameter) -> None:
 
 
 def is_of_another(flight: FlightState, event: Event) -> bool:
-    """Whether a vehicle that waits is another one than before, by its hardware number. Nothing that
-    was known is of it, as after a reboot."""
+    """Whether the hardware number shows, while the flight waits, that this is not the same vehicle
+    as before. Then everything that was known is forgotten, as after a reboot."""
     known = flight.vehicle.uid
     differs = isinstance(event, VehicleIdentity) and known is not None and event.uid != known
     return differs and flight.phase in WAITING
@@ -130,8 +132,8 @@ def _reports_thrust(flight: FlightState) -> bool:
 
 
 def _lifting_share(flight: FlightState) -> float:
-    """Vertical part of the thrust that the autopilot reports: the cosine of the tilt, unless it
-    reports it before it is raised for the tilt."""
+    """Vertical part of a unit of the thrust that the autopilot reports: the cosine of the tilt, but
+    1 for ArduCopter, which reports the thrust before it is raised for the tilt."""
     if flight.vehicle.attitude is None or not _reports_thrust(flight):
         return 1.0
     return float(flight.vehicle.thrust_direction_ned[2])
@@ -139,7 +141,7 @@ def _lifting_share(flight: FlightState) -> float:
 
 def _on_telemetry(flight: FlightState, stamp_s: float, arrived_s: float, turned_s: float) -> None:
     flight.telemetry_arrived_s = arrived_s
-    # Of a stream only the earliest time of arrival is known, which is wrong after a pause of ours
+    # On a stream, only the earliest possible time of arrival is known: useless after our own pause
     host_s = turned_s if flight.session.settings.stream else arrived_s
     flight.clock.on_telemetry(stamp_s, flight.session.elapsed_s(host_s))
 
@@ -158,7 +160,7 @@ def _on_position(flight: FlightState, event: LocalPosition) -> None:
 
 
 def _follow_jump(flight: FlightState, event: LocalPosition) -> None:
-    """The position estimate has jumped, not the vehicle: move the reference, too."""
+    """If the position estimate has jumped, move the reference too: the vehicle did not move."""
     jump_ned_m = flight.jumps.on_position(event)
     if flight.phase not in FLYING:
         flight.jumps.forget()
@@ -178,7 +180,7 @@ def _on_mode(
     assert dialect is not None
     boots = isinstance(event, Heartbeat) and event.system_status == BOOTS
     if boots and not flight.rebooted and flight.phase in FLYING | {Phase.LAND}:
-        _on_reboot(flight)  # before the mode that it shows counts as a pilot's
+        _on_reboot(flight)  # first, or the mode that it shows would count as a pilot's choice
     if not flight.authority.engage_mode:
         flight.authority = Authority(dialect.engage_mode)
     vehicle, authority = flight.vehicle, flight.authority
@@ -194,7 +196,7 @@ def _on_mode(
         sticks=vehicle.sticks,
     )
     if isinstance(event, Heartbeat) and not event.armed and flight.phase in FLYING:
-        outbox.announce(flight, DISARMED_SHOWN, once=True)  # one ends no flight
+        outbox.announce(flight, DISARMED_SHOWN, once=True)  # one does not end a flight
     switched = flight.pilot is PilotSwitch.READY and flight.in_engage_mode
     in_the_air, flies, why = flight.in_the_air, flight.contact.flies, ""
     flight.pilot = flight.pilot.after(
@@ -212,17 +214,17 @@ def _on_mode(
 
 
 def _on_reboot(flight: FlightState) -> None:
-    """The vehicle was rebooted: forget what was known of vehicle and link. This ends the flight,
-    except while telemetry is awaited. A landing goes on, but the flight is none that was flown to
-    its end."""
+    """Forget what was known about vehicle and link, because the vehicle was rebooted. This ends the
+    flight, unless it is still in CONNECT or HEALTH. A landing continues, but the flight counts as
+    aborted."""
     flight.observer.reset()
     flight.contact, flight.clock = GroundContact(flight.vehicle), VehicleClock()
     flight.hover, flight.jumps = HoverEstimate(), PositionJumps()
     flight.reading = ParameterReading()
-    flight.took_off = False  # the local frame begins elsewhere
+    flight.took_off = False  # the local frame has another origin now
     if flight.phase in BEFORE_FLIGHT:
         flight.authority = Authority()
-    flight.authority.forget(flight.now_s)  # the age of its report counts from now
+    flight.authority.forget(flight.now_s)  # the time without a report counts from now
     flight.rebooted = flight.phase not in (Phase.CONNECT, Phase.HEALTH)
     flight.pilot = PilotSwitch.FOUND
     if flight.phase is Phase.LAND:
@@ -234,8 +236,9 @@ def _on_reboot(flight: FlightState) -> None:
 
 
 def _answer(flight: FlightState, asked: CommandRequest) -> None:
-    """Do what a command to us asks for, and acknowledge it. One that is being obeyed is accepted
-    again: a ground station that missed the answer repeats it."""
+    """Obey a command to our component if possible, and acknowledge it. A command that is being
+    obeyed already is accepted again, because a ground station that missed the acknowledgement
+    repeats it."""
     request, result = Request.NONE, UNSUPPORTED
     if flight.service:
         request = {START: Request.START, SET_MODE: Request.HAND_BACK}.get(asked.command, request)

@@ -1,12 +1,12 @@
 """Times: the vehicle's clock, the age of telemetry and the delay of the link; and whether this
 computer keeps up with the control ticks.
 
-The vehicle's clock is a line over host time, whose offset and rate are estimated together. Two
-measures enclose it (README.md): telemetry arrives after the time of its stamp, and a request of
-TIMESYNC arrives after it was sent. That request is stamped with the vehicle time of the newest
-telemetry and sent with a setpoint; the reply holds this stamp and the vehicle time at which the
-request arrived. The difference is the delay of both directions together, whatever the clock of this
-computer and the way of the reply.
+The vehicle's clock is modelled as a line over host time, with an offset and a rate. It has two
+bounds (README.md): telemetry arrives after the time of its stamp, and a TIMESYNC request arrives
+after it was sent. The request holds the stamp of the newest telemetry and is sent with a setpoint;
+the reply holds this stamp and the vehicle time at which the request arrived. Their difference is
+the delay of telemetry and setpoint together. It depends neither on the clock of this computer nor
+on the delay of the reply.
 """
 
 from __future__ import annotations
@@ -20,25 +20,26 @@ from offboard.mavlink.events import TimesyncReply
 from offboard.mavlink.outgoing import Timesync
 
 REPLIES_MIN, REPLIES_MAX, REPLIES_NEWEST = 5, 40, 5
-REPLIES_MEASURED = 20  # two seconds: a link that saturates has shown it
-DELAY_MAX_S = 10.0  # a larger difference belongs to another clock
-REQUESTS_MAX = 6100  # of the longest `Limits.silence_s`, at the shortest period
+REPLIES_MEASURED = 20  # 2 s of replies: enough to notice a link that saturates
+DELAY_MAX_S = 10.0  # a larger difference is not a delay: the reply is from another clock
+REQUESTS_MAX = 6100  # those of the longest `Limits.silence_s` at the shortest control period
 NORMAL = 1.4826  # standard deviation of a normal distribution / median absolute deviation
 WINDOW_S, BIN_S = 5.0, 0.1
-RATE_OVER_S, RATE_EVERY_S = 1.0, 1.0  # the rate: from how much at least, and how often
-REAL_TIME = 0.05  # a rate that differs from 1 by less is that of a vehicle in real time
-LOSS_OVER, LOSSY = 50, 0.05  # of so many requests, a share without reply from which a link loses
+RATE_OVER_S, RATE_EVERY_S = 1.0, 1.0  # the rate: least time to measure it over, and interval
+REAL_TIME = 0.05  # a vehicle whose rate differs from 1 by less runs in real time
+LOSS_OVER, LOSSY = 50, 0.05  # a link loses if more than this share of requests has no reply
 BOUNDS_S = 1.0  # replies to older requests do not bound the vehicle time
 LEAST_GROWTH_S, STEADY_S = 0.01, 5.0  # see `LinkGrowth`
-JUMP_S = 0.5  # a stamp further ahead of the vehicle time now shows a jump of the clock
+JUMP_S = 0.5  # a stamp that is further ahead of the vehicle time shows a jump of the clock
 
 
 class VehicleClock:
-    """See the module. All stamps are vehicle time, all `host_s` monotonic time of this computer.
+    """The vehicle's clock and the delay of the link; see the module. Stamps are vehicle time, and
+    `host_s` and `arrived_s` are host time.
 
-    `jumped_s` is by how much the clock has jumped forward since `settle`; `growth` is what the link
-    has added to its delay since then. `answered_s` is the host time of the newest request with a
-    reply.
+    `jumped_s` is by how much the clock has jumped forward since `settle`; `growth` is the growth of
+    the link's delay since then. `answered_s` is the host time at which the newest request that has
+    a reply was sent.
     """
 
     def __init__(self) -> None:
@@ -49,25 +50,25 @@ class VehicleClock:
 
     def _reset_line(self) -> None:
         self._telemetry, self._replies = Edge(1.0), Edge(-1.0)
-        self._least_s = math.inf  # delay of both directions
+        self._least_s = math.inf  # least delay of both directions together
         self._settled = False
         self._measured_s = -math.inf  # host time of the newest measurement of the rate
         self._rate = 1.0
         self.jumped_s = 0.0
 
     def measure_delay_again(self) -> None:
-        """The link is loaded otherwise from now on: forget its delay."""
+        """Forget the measured delay, because the load on the link changes now."""
         self._requests.clear()
-        self._asked_s: deque[float] = deque(maxlen=LOSS_OVER + 1)  # host times of the newest
+        self._asked_s: deque[float] = deque(maxlen=LOSS_OVER + 1)  # host times of the newest ones
         self._delays_s: deque[float] = deque(maxlen=REPLIES_MAX)
         self.began_s = math.inf  # host time of the first request
         self.answered_s = -math.inf
         self._settled_delay_s = math.nan
 
     def settle(self) -> None:
-        """The flight begins: its control law takes the present delay into account. From now on
-        jumps of the clock count, once its rate was measured, and the rate of a vehicle without
-        replies stays 1 if it is."""
+        """Begin the flight. The control law takes the present delay into account, so its growth
+        counts from now on. Jumps of the clock count from now on too, once the rate was measured. A
+        rate of 1 now stays 1 as long as there are no replies."""
         delay = self.delay
         self._settled_delay_s = delay.value if delay else math.nan
         self._settled = True
@@ -76,7 +77,7 @@ class VehicleClock:
     # --- what arrives ---
 
     def on_telemetry(self, stamp_s: float, arrived_s: float) -> None:
-        """A message with the stamp `stamp_s` arrived at host time `arrived_s`."""
+        """Take the stamp `stamp_s` of a message that arrived at host time `arrived_s`."""
         ahead_s = stamp_s - self.now_s(arrived_s)
         if math.isfinite(self._measured_s) and ahead_s > JUMP_S:
             if not self._settled:
@@ -89,8 +90,8 @@ class VehicleClock:
             self._measure_rate(arrived_s)
 
     def request(self, stamp_s: float, host_s: float) -> Timesync:
-        """The request to send with a setpoint at host time `host_s`. `stamp_s`: of the newest
-        telemetry."""
+        """Return the request to send with a setpoint at host time `host_s`. `stamp_s` is the stamp
+        of the newest telemetry."""
         stamp_ns = round(stamp_s * 1e9)
         self._requests.append((stamp_ns, host_s))
         self._asked_s.append(host_s)
@@ -105,7 +106,7 @@ class VehicleClock:
         self._requests.remove(asked)  # a duplicate must not count again
         self.answered_s = max(self.answered_s, asked[1])
         while self._requests and self._requests[0][1] < self.answered_s - DELAY_MAX_S:
-            self._requests.popleft()  # lost
+            self._requests.popleft()  # this request or its reply was lost
         delay_s = (reply.vehicle_ns - reply.request_ns) * 1e-9
         if 0.0 <= delay_s <= DELAY_MAX_S:
             self._delays_s.append(delay_s)
@@ -140,14 +141,15 @@ class VehicleClock:
 
     @property
     def telemetry_rate(self) -> float | None:
-        """Vehicle time per host time, by the stamps of the last seconds; None before one second."""
+        """Vehicle time per host time over the last WINDOW_S of stamps; None before RATE_OVER_S."""
         return self._telemetry.rate
 
     # --- delay of both directions ---
 
     @property
     def delay(self) -> Estimate | None:
-        """Median and standard deviation (s) of the newest replies, or None before five."""
+        """Delay of telemetry and setpoint together: median and standard deviation (s) of the newest
+        replies. None before five replies."""
         if len(self._delays_s) < REPLIES_MIN:
             return None
         median_s = statistics.median(self._delays_s)
@@ -155,30 +157,30 @@ class VehicleClock:
         return Estimate(median_s, NORMAL * deviation_s)
 
     def delay_is_measured(self, host_s: float) -> bool:
-        """Whether `delay` is reliable at host time `host_s`, or the vehicle answers nothing."""
+        """Whether `delay` is reliable at host time `host_s`, or the vehicle answers no request."""
         unanswered = not self._delays_s and host_s - self.began_s > DELAY_MAX_S
         return len(self._delays_s) >= REPLIES_MEASURED or unanswered
 
     def unanswered_s(self, host_s: float) -> float:
-        """For how long at host time `host_s` no request has been answered; 0 before the first."""
+        """Time since the newest answered request, or the first one, was sent; 0 before that."""
         return max(host_s - max(self.began_s, self.answered_s), 0.0)
 
     def overdue(self, host_s: float) -> int:
-        """Number of requests since the newest one with a reply that should have one at host time
-        `host_s`: a reply takes at most one way more than `delay`. 0 while no delay is known."""
+        """Number of requests sent after the newest answered one whose reply is overdue at host time
+        `host_s`. A reply is overdue after twice `delay`. 0 while no delay is known."""
         return self._unanswered(self.answered_s, host_s)
 
     def loses(self, host_s: float) -> bool:
-        """Whether more than LOSSY of the newest requests have no reply at host time `host_s`,
-        although it was due, and one that was sent later has been answered: on a link that has
-        become later, replies come in their order."""
+        """Whether more than the share LOSSY of the newest LOSS_OVER requests are lost at host time
+        `host_s`. A request is lost if its reply is overdue and a later request was answered: on a
+        link that only became slower, replies arrive in order."""
         if len(self._asked_s) <= LOSS_OVER:
             return False
         lost = self._unanswered(self._asked_s[0], host_s) - self.overdue(host_s)
         return lost > LOSSY * LOSS_OVER
 
     def _unanswered(self, since_s: float, host_s: float) -> int:
-        """Number of requests sent after `since_s` whose reply was due at `host_s`."""
+        """Number of requests sent after `since_s` whose reply is overdue at `host_s`."""
         delay = self.delay
         if delay is None:
             return 0
@@ -187,7 +189,8 @@ class VehicleClock:
 
     @property
     def delay_growth_s(self) -> float:
-        """Median of the newest replies less the delay at `settle`; 0 while either is unknown."""
+        """Median delay of the newest replies minus the delay at `settle`; 0 while either is not
+        known."""
         newest = list(self._delays_s)[-REPLIES_NEWEST:]
         if math.isnan(self._settled_delay_s) or len(newest) < REPLIES_NEWEST:
             return 0.0
@@ -195,18 +198,18 @@ class VehicleClock:
 
 
 class LinkGrowth:
-    """What the link has added to its delay since take-off, for prediction and bandwidth.
+    """Growth of the link's delay since take-off, for the prediction and the bandwidth.
 
-    `added_s` follows changes of more than LEAST_GROWTH_S. `changed_s` is by how much it changed
-    within the last STEADY_S: a delay that changes is not known better than that.
+    `added_s` is the growth; it follows changes of more than LEAST_GROWTH_S. `changed_s` is the
+    range of `added_s` in the last STEADY_S: a delay that changes is not known better than that.
     """
 
     def __init__(self) -> None:
         self.added_s = self.changed_s = 0.0
-        self._history: deque[tuple[float, float]] = deque(((-math.inf, 0.0),))  # from when, added_s
+        self._history: deque[tuple[float, float]] = deque(((-math.inf, 0.0),))  # time, added_s
 
     def step(self, time_s: float, growth_s: float) -> bool:
-        """Take the growth at vehicle time `time_s`; returns whether anything changed."""
+        """Take the growth measured at vehicle time `time_s`. Returns whether anything changed."""
         before = self.added_s, self.changed_s
         if abs(growth_s - self.added_s) > LEAST_GROWTH_S:
             self.added_s = growth_s
@@ -219,13 +222,13 @@ class LinkGrowth:
 
 
 class Edge:
-    """Points of host and vehicle time, over WINDOW_S of host time: of each BIN_S the one that is
-    most ahead, or with `sign` -1 the one that is most behind."""
+    """Points (host time, vehicle time) of the last WINDOW_S of host time: of each BIN_S the point
+    at which vehicle time is most ahead of host time, or with `sign` -1 most behind."""
 
     def __init__(self, sign: float) -> None:
         self._sign = sign
         self._points: deque[tuple[float, float]] = deque()
-        self._bin_s = 0.0  # host time of the first of the newest bin
+        self._bin_s = 0.0  # host time of the first point of the newest bin
 
     def add(self, host_s: float, vehicle_s: float, rate: float) -> None:
         points = self._points
@@ -243,15 +246,15 @@ class Edge:
         self._points.clear()
 
     def at(self, host_s: float, rate: float, over_s: float = math.inf) -> float | None:
-        """Vehicle time at `host_s` by the point that is most ahead, or behind, of those that are at
-        most `over_s` old; None without any."""
+        """Vehicle time at `host_s`, extrapolated at `rate` from the point of the last `over_s` that
+        is most ahead, or most behind; None without points."""
         since_s, sign = host_s - over_s, self._sign
         ahead_s = [sign * (v - rate * h) for h, v in self._points if h >= since_s]
         return rate * host_s + sign * max(ahead_s) if ahead_s else None
 
     @property
     def rate(self) -> float | None:
-        """Slope of the least-squares line; None for less than RATE_OVER_S."""
+        """Slope of the least-squares line; None if the points cover less than RATE_OVER_S."""
         points = self._points
         if not points or points[-1][0] - points[0][0] < RATE_OVER_S:
             return None
@@ -260,12 +263,12 @@ class Edge:
 
 # ---------------------------------------------------------------------- this computer
 
-SHARE = 0.05  # of the ticks skipped, from which a computer is too busy
-PAUSE_S = 0.3  # or one pause; after it, what was known before is not known any more
+SHARE = 0.05  # a computer is too busy if it skips more than this share of the ticks
+PAUSE_S = 0.3  # or pauses for longer once; after that, earlier reports of the mode are doubted
 
 
 def too_busy(skipped: float, ticks: float, pause_s: float) -> str:
-    """A sentence if this computer was too busy to fly; else empty.
+    """Return a sentence if this computer was too busy to fly; else an empty text.
 
     `skipped` of `ticks` control ticks fell into pauses of this process; `pause_s` is the longest.
     """
@@ -278,10 +281,11 @@ def too_busy(skipped: float, ticks: float, pause_s: float) -> str:
 
 
 class Busyness:
-    """Counts in the air. `period_s`: of control; a shorter gap between two turns skips no tick.
+    """Counts skipped ticks and pauses of this process in flight. `period_s` is the control period;
+    a shorter gap between two turns skips no tick.
 
-    `missed` is the number of ticks between the newest one and that before it, `paused_s` the pause
-    that it came after, 0 without one."""
+    `missed` is the number of ticks skipped before the newest one, and `paused_s` the length of the
+    pause before it, 0 without a pause."""
 
     def __init__(self, period_s: float) -> None:
         self._period_s = period_s
@@ -290,11 +294,11 @@ class Busyness:
         self.pause_s = self.paused_s = 0.0
 
     def on_turn(self, gap_s: float) -> None:
-        """A turn begins `gap_s` after the one before it, host time."""
+        """Note that a turn begins `gap_s` of host time after the one before it."""
         self._gap_s = max(self._gap_s, gap_s)
 
     def on_tick(self, missed: int, *, flying: bool) -> None:
-        """A tick, `missed` ticks after the previous one."""
+        """Count a tick, before which `missed` ticks were skipped."""
         self.missed = missed
         self.paused_s, self._gap_s = self._gap_s if self._gap_s > self._period_s else 0.0, 0.0
         if flying:

@@ -1,5 +1,6 @@
-"""The phase table: which condition leads from which phases to which. The first row that holds is
-taken, and begins its phase. `actions` has what is sent in a phase.
+"""The phase table: which condition leads from which phases to which phase. The first row whose
+condition holds is taken, and the flight enters its target. `actions` defines what is sent in a
+phase.
 """
 
 from __future__ import annotations
@@ -28,10 +29,10 @@ from offboard.flight.state import FlightState
 from offboard.identification.learner import Learner, Stage
 from offboard.mavlink.events import LocalPosition
 
-DIFFERENT = 0.1  # of the hover thrust: a smaller difference is left to the observer
-REFUSALS_EVERY_S = 1.0
+DIFFERENT = 0.1  # relative error of the hover thrust; a smaller one is left to the observer
+REFUSALS_EVERY_S = 1.0  # interval between announcements of a refused request
 RAISED_M = 0.05  # a reference that is raised by less is not announced
-SETTLED = 0.02  # the same, of a vehicle that has flown by itself for long
+SETTLED = 0.02  # as DIFFERENT, for a vehicle that its own autopilot has flown for long
 TAKEN = "a failsafe of the vehicle has it, as its HEARTBEAT shows"
 STAGES = {
     Phase.CLIMB: Stage.CLIMB,
@@ -44,7 +45,7 @@ PROCEEDS = BEFORE_FLIGHT | TRACKING | {Phase.TAKEOFF}  # phases of a flight that
 
 @cache
 def table(service: ServiceOptions | None = None) -> tuple[Transition, ...]:
-    """The phase table of the service with these options; without them that of `fly`."""
+    """Return the phase table of the service with these options; without options, that of `fly`."""
     serves = service is not None
     rows = (
         *(starting.SERVICE_BEGINS if serves else starting.FLY_BEGINS),
@@ -58,7 +59,7 @@ def table(service: ServiceOptions | None = None) -> tuple[Transition, ...]:
 
 
 def next_row(flight: FlightState) -> Transition | None:
-    """The first row of the flight's phase whose condition holds, or None to stay."""
+    """Return the first row of the flight's phase whose condition holds, or None to stay in it."""
     rows = _by_phase(flight.service)[flight.phase]
     return next((row for row in rows if row.condition(flight)), None)
 
@@ -73,7 +74,7 @@ def _by_phase(service: ServiceOptions | None) -> dict[Phase, tuple[Transition, .
 
 
 def advance(flight: FlightState) -> None:
-    """Make every transition whose guard holds."""
+    """Take one row after another until the condition of none holds in the phase."""
     while not flight.in_end_phase:
         if flight.phase in FLYING:
             failsafe.judge(flight)
@@ -85,9 +86,10 @@ def advance(flight: FlightState) -> None:
 
 
 def obey(flight: FlightState, request: Request, sender: str) -> bool:
-    """Take the row that this request of a ground station leads to now, after what is due without
-    it; whether there is one, or the flight obeys it already. A refusal says why, once a second at
-    most: a ground station may repeat what it asks for."""
+    """Obey a request of a ground station: take the row whose condition holds with it, after all
+    transitions that are due without it. Returns whether there is such a row, or the flight obeys
+    the request already. The reason of a refusal is announced, but at most once a second, because a
+    ground station may repeat its request."""
     advance(flight)
     flight.request = request
     row = next_row(flight)
@@ -107,7 +109,8 @@ def obey(flight: FlightState, request: Request, sender: str) -> bool:
 
 
 def _note_spoiled(flight: FlightState) -> None:
-    """A landing is awaited, but it is not ours: the score must know it, too."""
+    """Record as the outcome that a landing was interrupted by the vehicle's own failsafe or by a
+    reboot. The announcement tells it to the score."""
     if flight.phase is not Phase.LAND or flight.outcome is not None:
         return
     if in_own_failsafe(flight):
@@ -121,7 +124,8 @@ def _note_spoiled(flight: FlightState) -> None:
 
 
 def name_failsafe(flight: FlightState) -> None:
-    """Say that a failsafe, and no pilot, has taken the vehicle: its newest HEARTBEAT shows one."""
+    """Announce that a failsafe, and not a pilot, has taken the vehicle, if the newest HEARTBEAT
+    shows it."""
     before = flight.outcome
     if flight.taken and flight.vehicle.in_failsafe and before is not None:
         sentence = TAKEN + _explanation(flight)
@@ -151,13 +155,13 @@ def _enter(flight: FlightState, row: Transition) -> None:
             if limits := shown_limits(flight, flight.identification):
                 flight.model = flight.model.model_copy(update=limits)
                 flight.identification.on_shown(limits)
-        if source is Phase.ARM:  # on the ground the time that it takes does no harm
+        if source is Phase.ARM:  # on the ground, where the time that this takes does no harm
             decision.begin(flight)
     if flight.identification:
         stage = STAGES.get(row.target, Stage.OTHER)
         flight.identification.on_stage(stage, flight.time_s)
     if row.target is Phase.ENGAGE:
-        # here, not with the request: a vehicle that shows the mode already passes without one
+        # here and not with the request, because a vehicle that shows the mode already gets none
         flight.authority.ask()
         _set_hover_thrust(flight)
     elif row.target is Phase.HEALTH:  # it may be another vehicle, or have other parameters
@@ -185,7 +189,8 @@ def _enter(flight: FlightState, row: Transition) -> None:
 
 
 def _conclude(flight: FlightState, row: Transition, reason: str) -> None:
-    """The most severe exit code counts; later reasons are added to the first sentence."""
+    """Update the outcome: the most severe exit code counts, and later reasons are added to the
+    first sentence."""
     if row.exit_code is not None:
         if flight.outcome is None:
             said = _explanation(flight)
@@ -204,11 +209,12 @@ def _explanation(flight: FlightState) -> str:
 
 
 def _begin_climb(flight: FlightState, source: Phase) -> None:
-    """To the start of the reference, after the take-off, in the air, or once more."""
+    """Plan the climb to the start of the reference: after take-off, after the pilot has engaged in
+    the air, or for one more flight of the reference."""
     position = flight.vehicle.position
     assert position is not None
     flown = flight.plan.sample(flight.time_s)
-    if flown is not None:  # from where the reference is: the vehicle follows it
+    if flown is not None:  # begin at the reference, because the vehicle follows it
         heading_rad = float(flown.heading_rad)
         flight.plan.start_climb(
             flight.time_s, flown.position_ned_m, flown.velocity_ned_mps, heading_rad
@@ -232,8 +238,8 @@ def _begin_climb(flight: FlightState, source: Phase) -> None:
 
 
 def _place_reference(flight: FlightState, position: LocalPosition) -> None:
-    """Place the reference of a vehicle that was found in the air. A take-off point that was not
-    seen is below it, at the height of its last rest."""
+    """Place the reference of a vehicle that was found in the air. `home_ned_m` is below the
+    vehicle, at the height of its last rest."""
     contact, jumps = flight.contact, flight.jumps
     flight.home_ned_m = (*jumps.without(position.position_ned_m)[:2], contact.rest_down_m)
     rest = contact.rest_ned_m and jumps.reported(contact.rest_ned_m)
@@ -253,8 +259,9 @@ def _place_reference(flight: FlightState, position: LocalPosition) -> None:
 
 
 def shown_limits(flight: FlightState, learner: Learner) -> dict[str, tuple[float, ...]]:
-    """The angular acceleration and rate of the vehicle file, or those to which the autopilot's
-    parameters limit the tilt; those without a parameter are missing."""
+    """Return the limits of angular acceleration and angular rate by their names in `Vehicle`: for
+    roll and pitch the lower of the vehicle file and the autopilot's parameters, for yaw that of the
+    vehicle file. A limit for which no parameter was read is left out."""
     read, shown = flight.vehicle.parameters, defaultdict[str, list[float]](list)
     for name, (limit, unit) in flight.dialect.tilting_parameters.items() if flight.dialect else ():
         if name in read:
@@ -267,7 +274,8 @@ def shown_limits(flight: FlightState, learner: Learner) -> dict[str, tuple[float
 
 
 def _set_hover_thrust(flight: FlightState, least: float = DIFFERENT) -> None:
-    """Fly with the hover thrust measured before the take-over, if it differs from the model's."""
+    """Fly with the hover thrust measured before the take-over, if it differs from the model's by
+    more than the share `least`."""
     model = flight.model
     shown = flight.hover.hover_thrust(model, flight.time_s)
     if shown is None or abs(shown / model.hover_thrust - 1.0) <= least:

@@ -1,6 +1,6 @@
-"""Vehicle state: the newest telemetry of each kind, when it was heard, and what follows from it.
+"""Vehicle state: the newest telemetry of each kind, the time of its arrival, and derived values.
 
-No decisions. Ages are seconds of `Session.link_time_s`, which is given as `now_s`.
+Nothing is decided here. Ages are in seconds of link time, which is given as `now_s`.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ from offboard.mavlink.events import (
 from offboard.mavlink.session import COMPONENT_ID
 from offboard.model.frames import heading_from_quaternion, thrust_direction_from_quaternion
 
-HEALTH_S = 1.5  # SYS_STATUS is requested at 2 Hz
-DISARMED_S = 1.5  # longer than a period of HEARTBEAT: arming may have been in progress
-ARMED_KNOWN_S = 3.0  # PX4 reports it in HEARTBEAT alone, at 1 Hz
+HEALTH_S = 1.5  # age up to which SYS_STATUS counts; it is requested at 2 Hz
+DISARMED_S = 1.5  # longer than the period of HEARTBEAT, in which arming may have been in progress
+ARMED_KNOWN_S = 3.0  # age up to which a HEARTBEAT counts; only it shows whether PX4 is armed
 REPEATED_S = 0.05  # PX4 and ArduCopter repeat a component of the position for 0.03 s at most
 OUTAGE_S = 0.3  # a longer gap of all telemetry is an outage of the link
-OTHER_SENDER_S = 5.0  # a second sender is there for so long after its newest frame
+OTHER_SENDER_S = 5.0  # a second sender counts as present for this time after its newest frame
 MESSAGES_MAX = 12  # texts and refusals kept for the sentence that explains a failure
-# MAV_CMD SET_MESSAGE_INTERVAL, REQUEST_MESSAGE: a message that is refused explains no failure
+# MAV_CMD SET_MESSAGE_INTERVAL, REQUEST_MESSAGE: their refusal explains no failure
 MESSAGE_COMMANDS = frozenset({511, 512})
 
 
@@ -59,20 +59,20 @@ class VehicleState:
     landed: str = "unknown"
     position: LocalPosition | None = None
     attitude: Attitude | None = None
-    uid: int | None = None  # of the hardware; 0: it has none
+    uid: int | None = None  # unique number of the hardware; 0: it has none
     parameters: dict[str, float] = field(default_factory=dict)
     texts: deque[str] = field(default_factory=lambda: deque(maxlen=MESSAGES_MAX))
     refusals: deque[str] = field(default_factory=lambda: deque(maxlen=MESSAGES_MAX))
-    results: dict[int, str] = field(default_factory=dict)  # newest, by MAV_CMD number
-    answered_s: dict[int, float] = field(default_factory=dict)  # when it was heard, by MAV_CMD
+    results: dict[int, str] = field(default_factory=dict)  # newest MAV_RESULT, by MAV_CMD number
+    answered_s: dict[int, float] = field(default_factory=dict)  # link time of that, by MAV_CMD
     mode: str = "unknown"
     other_sender: OtherSender | None = None
     other_companion: OtherCompanion | None = None
-    armed_changed_s: float = -math.inf  # before it was first seen armed
+    armed_changed_s: float = -math.inf  # link time; infinite until it was first seen armed
     resumed_s: float = -math.inf  # vehicle time of the first telemetry after an outage
     now_s: float = 0.0
-    heard_s: dict[type, float] = field(default_factory=dict)  # by type of event
-    # components of position and velocity, each with the stamp from which on it is the same
+    heard_s: dict[type, float] = field(default_factory=dict)  # link time, by type of event
+    # components of position and velocity, each with the stamp since which it has not changed
     _same_since: tuple[tuple[float, float], ...] = ((math.nan, math.inf),) * 6
 
     @property
@@ -89,12 +89,12 @@ class VehicleState:
 
     @property
     def attitude_age_s(self) -> float:
-        """As `position_age_s`, for the attitude."""
+        """The same as `position_age_s`, for the attitude."""
         return self._age_s(self.attitude)
 
     @property
     def disarmed_s(self) -> float:
-        """Time since it was reported disarmed; 0 while it is armed."""
+        """Time since the vehicle was first reported disarmed; 0 while it is armed."""
         return 0.0 if self.armed else self.now_s - self.armed_changed_s
 
     def age_s(self, kind: type) -> float:
@@ -107,22 +107,23 @@ class VehicleState:
 
     @property
     def disarmed(self) -> bool:
-        """A recent HEARTBEAT says that the vehicle is disarmed."""
+        """Whether a recent HEARTBEAT shows the vehicle disarmed."""
         return not self.armed and self.age_s(Heartbeat) < ARMED_KNOWN_S
 
     @property
     def in_failsafe(self) -> bool:
-        """The newest HEARTBEAT shows MAV_STATE critical or emergency."""
+        """Whether the newest HEARTBEAT shows MAV_STATE critical or emergency."""
         return self.heartbeat is not None and self.heartbeat.system_status >= CRITICAL
 
     @property
     def sticks(self) -> bool | None:
-        """Whether it receives a pilot's sticks; None while that is not known."""
+        """Whether the vehicle receives a pilot's sticks; None while that is not known."""
         return self.health.radio_ok if self.health and self.age_s(SystemHealth) < HEALTH_S else None
 
     @property
     def other_sender_named(self) -> str:
-        """That another program controls the vehicle, and which; empty if none was heard lately."""
+        """A sentence that names another program that controls the vehicle; empty if none was heard
+        in the last OTHER_SENDER_S."""
         other = self.other_sender
         if other is None or self.age_s(OtherSender) >= OTHER_SENDER_S:
             return ""
@@ -134,13 +135,13 @@ class VehicleState:
 
     @property
     def battery(self) -> float:
-        """Remaining charge, of 1; 1 while it is not known."""
+        """Remaining charge, 0 .. 1; 1 while it is not known."""
         charge = self.health.battery_remaining if self.health else None
         return 1.0 if charge is None else charge
 
     @property
     def has_state(self) -> bool:
-        """Position and attitude have been received."""
+        """Whether position and attitude have been received."""
         return self.position is not None and self.attitude is not None
 
     @property
@@ -157,12 +158,12 @@ class VehicleState:
 
     @property
     def prearm_ok(self) -> bool:
-        """SYS_STATUS reports that the vehicle's pre-arm checks pass."""
+        """Whether SYS_STATUS reports that the vehicle's pre-arm checks pass."""
         return self.health is not None and self.health.prearm_ok
 
     def update(self, event: Event, now_s: float) -> bool:
-        """Store what one event reports. False if it repeats the one of its kind before: it is no
-        measurement."""
+        """Store what one event reports. Returns False if it repeats an earlier event of its kind,
+        which makes it no measurement."""
         self.now_s = now_s
         if self._repeats(event) and math.isfinite(self.armed_changed_s):
             return False
@@ -197,7 +198,7 @@ class VehicleState:
                 self.uid, self.version = uid, version
             case Parameter(name, value):
                 self.parameters[name] = value
-            case StatusText(severity, text) if severity <= NOTICE:  # as a fence breach
+            case StatusText(severity, text) if severity <= NOTICE:  # e.g. a fence breach
                 self.texts.append(text)
             case CommandAck(command, result) if command not in MESSAGE_COMMANDS:
                 self.results[command], self.answered_s[command] = result, now_s
@@ -208,9 +209,9 @@ class VehicleState:
         return True
 
     def _repeats(self, event: Event) -> bool:
-        """Whether position and velocity on one axis, or an attitude, are those of the message
-        before, or one component of them has been the same for REPEATED_S, whatever the stamps. No
-        estimator repeats itself once motors have run, not even on the ground."""
+        """Whether the event only repeats earlier values, whatever its stamp: an attitude and its
+        rates, position and velocity on one axis, or one of these components for REPEATED_S. Once
+        motors have run no estimator repeats itself, not even on the ground."""
         match event:
             case LocalPosition(time_s, position, velocity):
                 since_s = [
@@ -232,8 +233,8 @@ class VehicleState:
         return False
 
     def _detect_outage(self, time_s: float) -> None:
-        """After an outage, a new one is accepted only once both streams have resumed: a slow
-        stream must not hide that the other has stopped."""
+        """Set `resumed_s` after an outage of all telemetry. The next outage counts only once both
+        streams have resumed, because a slow stream must not hide that the other has stopped."""
         stamps_s = [newest.time_s for newest in (self.position, self.attitude) if newest]
         if time_s > self.time_s + OUTAGE_S and all(each >= self.resumed_s for each in stamps_s):
             self.resumed_s = time_s
@@ -244,7 +245,8 @@ class VehicleState:
         return self.time_s - max(newest.time_s, self.resumed_s)
 
     def _reset(self) -> None:
-        """After a reboot: forget all but that it was armed, until HEARTBEAT says otherwise."""
+        """Forget the telemetry after a reboot, except whether the vehicle was armed, until the next
+        HEARTBEAT."""
         self.health = self.estimator = self.position = self.attitude = None
         self.landed = self.mode = "unknown"
         self.heard_s.clear()
@@ -253,19 +255,20 @@ class VehicleState:
         self.parameters.clear()
 
     def explanation(self, unsaid: str) -> str:
-        """The newest texts of the vehicle, or its refusals and what SYS_STATUS says, to end a
-        sentence with; may be empty. `unsaid`: where the reason of a refusal is found."""
+        """The end of a sentence: the newest texts of the vehicle, or if there are none its refusals
+        and what SYS_STATUS reports; may be empty. `unsaid` says where the reason of a refusal can
+        be found."""
         messages = list(dict.fromkeys(self.texts or self.refusals))[-3:]
         said = "; the vehicle said: " + " | ".join(messages) if messages else ""
         refused = messages and not self.texts
         return f"{said}{self.unhealthy()} ({unsaid})" if refused else said
 
     def unhealthy(self) -> str:
-        """What SYS_STATUS reports as not healthy, to end a sentence with; may be empty."""
+        """The end of a sentence: what SYS_STATUS reports as not healthy; may be empty."""
         names = self.health.unhealthy if self.health else ()
         return f"; unhealthy by SYS_STATUS: {', '.join(names)}" if names else ""
 
     def clear_messages(self) -> None:
-        """Forget texts and acknowledgements: they do not explain what happens later."""
+        """Forget texts and refusals, because they do not explain what happens later."""
         self.texts.clear()
         self.refusals.clear()
