@@ -1,7 +1,7 @@
-"""The process of the supervisor: it takes the controller's place if its beats stop.
+"""The process of the supervisor: it takes the controller's place if the controller's beats stop.
 
 It imports only what it needs, so that it is ready at once and stays small. Its standard input is
-the controller's end of the channel, see `supervisor`.
+its end of the channel to the controller, see `supervisor`.
 """
 
 from __future__ import annotations
@@ -36,34 +36,35 @@ from offboard.supervisor.recovery import Recovery, Supervised
 from offboard.supervisor.supervisor import READY
 
 POLL_S = 0.02
-PAUSE_MAX_S = 0.1  # of a turn that counts as the controller's silence: the rest was a pause of ours
-BACKLOG_MAX = 20  # batches of the link that are read before the first request
+PAUSE_MAX_S = 0.1  # most of a turn that counts as silence: the rest was a pause of this process
+BACKLOG_MAX = 20  # most batches that are read from the link before the first request
 CLOSE_S = 2.0
-LANDING = 10  # custom_mode, `flight.phases.Phase`: no other `offboard` begins a flight now
+LANDING = 10  # custom_mode (`flight.phases.Phase`): it keeps other `offboard` from flying
 DIED = "the controller ended in flight"
 HANGS = "the controller has not answered for {silent_s:g} s"
 
 
 class Watch:
-    """The controller's beats, and what is needed to take over."""
+    """Receives the controller's beats, and keeps what is needed to take over."""
 
     def __init__(self, channel: socket.socket) -> None:
         self._channel = channel
         self._channel.setblocking(False)
         self._received = b""
         self._silent_s = 0.0
-        self.newest: dict[str, Any] = {}  # beat
+        self.newest: dict[str, Any] = {}  # the newest beat
         self.descriptors: list[int] = []  # of the link, then of the log
-        self.ended = False
+        self.ended = False  # whether the controller has ended
 
     def turn(self, elapsed_s: float) -> str:
-        """Read what has arrived, and answer it. Why to take over; empty if there is no reason."""
+        """Read the beats that have arrived, and answer them. `elapsed_s`: time since the last call.
+        Returns why to take over; empty if there is no reason."""
         self._silent_s += min(elapsed_s, PAUSE_MAX_S)
         with suppress(BlockingIOError):
             while not self.ended:
                 self._read()
         if not self._silent_s:
-            with suppress(OSError):  # it is stopped, or has ended
+            with suppress(OSError):  # the controller is stopped, or has ended
                 self._channel.send(b'""\n')
         known = self.known
         if not (known and known.ours and known.flying):
@@ -75,13 +76,13 @@ class Watch:
 
     @property
     def known(self) -> Supervised | None:
-        """What the newest beat says; None before the first."""
+        """What the newest beat reports; None before the first."""
         return _known(**self.newest["known"]) if self.newest else None
 
     def _read(self) -> None:
         data = b""
         descriptors: list[int] = []
-        with suppress(ConnectionResetError):  # it has ended, and left answers unread
+        with suppress(ConnectionResetError):  # the controller has ended and left answers unread
             data, descriptors, _, _ = socket.recv_fds(self._channel, 65536, 8)
         self.ended = not data
         if descriptors:
@@ -90,12 +91,12 @@ class Watch:
             self.descriptors = descriptors
         *lines, self._received = (self._received + data).split(b"\n")
         for line in lines:
-            with suppress(ValueError):  # only a part of it did fit into the buffer
+            with suppress(ValueError):  # only a part of the line did fit into the buffer
                 self.newest, self._silent_s = json.loads(line), 0.0
 
 
 class TakeOver:
-    """Takes the controller's place: sends on its link what `Recovery` asks for, and logs it."""
+    """Takes the controller's place: sends on its link what `Recovery` demands, and logs it."""
 
     def __init__(self, watch: Watch, known: Supervised, tell: BackgroundWriter[str]) -> None:
         beat = watch.newest
@@ -116,7 +117,7 @@ class TakeOver:
         self._text_id = 0
 
     def run(self, reason: str) -> None:
-        """Take over for `reason`, until the vehicle is disarmed or another has changed its mode."""
+        """Take over for `reason`, until `Recovery` ends, for example with a disarmed vehicle."""
         for _ in range(BACKLOG_MAX):  # the mode may have been left since the last beat
             if not self._receive():
                 break
@@ -129,7 +130,7 @@ class TakeOver:
         self._log.close(CLOSE_S)
 
     def _receive(self) -> bool:
-        """Process one batch; whether there was any."""
+        """Process one batch from the link. Returns whether there was any."""
         chunks = self._link.receive()
         for chunk in chunks:
             reception = self._session.receive(chunk.data, chunk.peer, chunk.arrived_s)
@@ -157,12 +158,12 @@ class TakeOver:
             self._say(self._recovery.news.pop(0))
 
     def _say(self, sentence: str) -> None:
-        """To the controller or its terminal, to the ground station and to the log."""
+        """Report to the controller or its terminal, the ground station and the log."""
         self._tell.put(sentence)
         self._text(sentence)
 
     def _text(self, sentence: str) -> None:
-        """To the ground station, and to the log as a record."""
+        """Send a sentence to the ground station, and write it to the log as a record."""
         self._text_id += 1
         text = f"supervisor: {sentence}"
         self._send(*texts.chunks(WARNING, text, self._text_id))
@@ -181,7 +182,7 @@ class TakeOver:
 
 
 def _known(vehicle: Mapping[str, Any], setpoint_loss: Mapping[str, Any], **more: Any) -> Supervised:
-    """From JSON."""
+    """Make a `Supervised` of the JSON of a beat."""
     modes = tuple(setpoint_loss["modes"])
     return Supervised(
         VehicleFound(**vehicle), setpoint_loss=SetpointLoss(setpoint_loss["after_s"], modes), **more
@@ -189,9 +190,9 @@ def _known(vehicle: Mapping[str, Any], setpoint_loss: Mapping[str, Any], **more:
 
 
 def _link(descriptors: list[int], stream: str, *, listens: bool) -> Link:
-    """The link that has these descriptors, of which the first one may listen for others than the
-    vehicle. `stream`: the name of a stream, empty for UDP. Without the vehicle's own descriptor
-    nothing can be asked of it until it connects again."""
+    """Return the link that has these descriptors. `stream`: the name of a stream, empty for UDP.
+    `listens`: whether the first descriptor listens for others than the vehicle. Without another one
+    nothing can be sent to the vehicle until it connects again."""
     listening = socket.socket(fileno=descriptors[0]) if listens else None
     vehicle = descriptors[listens] if len(descriptors) > listens else None
     if not stream:
@@ -201,12 +202,12 @@ def _link(descriptors: list[int], stream: str, *, listens: bool) -> Link:
 
 
 def main() -> None:
-    """Watch until the controller ends, and take its place if the vehicle flies for it."""
+    """Watch until the controller ends or hangs, and take its place if the vehicle flies for it."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)  # they are meant for the controller
+        signal.signal(number, signal.SIG_IGN)  # these signals are meant for the controller
     channel = socket.socket(fileno=os.dup(sys.stdin.fileno()))
     watch = Watch(channel)
-    with suppress(OSError):  # it has ended already
+    with suppress(OSError):  # the controller has ended already
         _say_to(channel, READY)
     reason, before_s = "", clock.monotonic_s()
     while not (reason or watch.ended):
@@ -215,20 +216,20 @@ def main() -> None:
         reason, before_s = watch.turn(now_s - before_s), now_s
     if reason and watch.known:
         tell = BackgroundWriter[str](lambda said: _tell(channel, said), 1000)
-        try:  # the controller, if it is alive, must know it before the vehicle does
+        try:  # a controller that still runs must know it before anything is sent to the vehicle
             _say_to(channel, f"taking over: {reason}")
         except OSError:
             tell.put(f"taking over: {reason}")
         TakeOver(watch, watch.known, tell).run(reason)
         tell.close(CLOSE_S)
         log, watch.descriptors = watch.descriptors[-1], []  # those of the link are closed
-        watch.turn(0.0)  # it may have been killed in the meantime
+        watch.turn(0.0)  # the controller may have been killed in the meantime
         if watch.ended:
             _score(log)
 
 
 def _score(log: int) -> None:
-    """In place of the controller."""
+    """Score the flight in place of the controller. `log`: descriptor of the log."""
     with suppress(OSError):
         path = Path(f"/proc/self/fd/{log}").readlink()
         if path.name == "flight.tlog":
@@ -240,7 +241,7 @@ def _say_to(channel: socket.socket, sentence: str) -> None:
 
 
 def _tell(channel: socket.socket, sentences: list[str]) -> None:
-    """To the controller; if it is gone, to the terminal, which may wait."""
+    """Report to the controller; if it has ended, to the terminal, which may block."""
     for sentence in sentences:
         try:
             _say_to(channel, sentence)

@@ -1,9 +1,11 @@
-"""Recovery: what the supervisor asks of a vehicle that has lost its controller. No I/O, no clock.
+"""Recovery: what the supervisor requests of a vehicle that has lost its controller. No I/O, no
+clock.
 
-Hold, and after some seconds land; at once land, if the controller was landing it. README.md has the
-modes in which, and which of them are a pilot's. The failsafe for missing setpoints acts because the
-controller has ended: it is recognised by its mode, its time and HEARTBEAT.system_status, which a
-pilot's choice clears.
+It requests hold, and after some seconds land; if the controller was landing the vehicle, it
+requests land at once. README.md lists in which modes it does so, and which modes are a pilot's
+choice. The autopilot's failsafe for missing setpoints may act, too, because the controller has
+ended. It is recognised by its mode, its time and HEARTBEAT.system_status, which a pilot's choice
+clears.
 """
 
 from __future__ import annotations
@@ -27,27 +29,28 @@ from offboard.mavlink.events import (
 from offboard.mavlink.outgoing import CommandLong
 
 REPEAT_S = 0.3  # between two requests
-UNHEARD_MAX = 3  # requests to a vehicle of which nothing is heard
-HOLD_S = 5.0  # then land
-ACKNOWLEDGED_S = 3.0  # after hold is reported; it is asked for again until then
+UNHEARD_MAX = 3  # most requests to a vehicle of which nothing is heard
+HOLD_S = 5.0  # from hold to land
+ACKNOWLEDGED_S = 3.0  # from the first report of hold to its acknowledgement, at most
 LONGEST_S = 300.0
-EARLY_S = 0.3  # the newest setpoint left before the newest beat, and may have been lost
-SINK_MPS = 0.2  # downward speed of a vehicle that lands, within SINK_S
-SINK_S = 3.0  # COM_DISARM_LAND is 2 s
-# Without beats the supervisor acts after this time: before the autopilot's own failsafe, so that
-# only one of them does, if that gives a busy computer time enough
+EARLY_S = 0.3  # the newest setpoint was sent before the newest beat, and may have been lost
+SINK_MPS = 0.2  # a vehicle lands if it has had this downward speed within SINK_S
+SINK_S = 3.0  # longer than COM_DISARM_LAND, 2 s, after which it is disarmed
+# Without beats the supervisor acts EARLIER_S before the autopilot's own failsafe, so that only one
+# of them acts, but not before SILENT_MIN_S, which a busy computer needs, nor after SILENT_MAX_S
 EARLIER_S, SILENT_MIN_S, SILENT_MAX_S = 0.4, 0.4, 0.9
 
 
 @dataclass(frozen=True, slots=True)
 class Supervised:
-    """What the controller tells, and the supervisor must know before it may act.
+    """What the controller reports, and the supervisor must know before it may act.
 
-    `ours`: the vehicle is in the mode of our setpoints, or in one that we asked for, by a report
-    that arrived at `reported_s` (`clock.monotonic_s`), whose age the supervisor judges. `flying`:
-    it is armed. `holding`: it was asked to hold, so that this mode is ours, too; `landing`: to
-    land. `setpoint_loss`: what its autopilot does without setpoints; `sticks`: it receives those of
-    a pilot; `setpoints_missing`: they were missing already, or its failsafe for that flies it."""
+    `ours`: whether the vehicle shows the mode of our setpoints, or one that we requested, in a
+    report that arrived at `reported_s` (`clock.monotonic_s`); the supervisor judges its age.
+    `flying`: whether the vehicle is armed. `holding`: whether hold was requested, so that the mode
+    hold is ours, too. `landing`: whether land was requested. `setpoint_loss`: what the autopilot
+    does without setpoints. `sticks`: whether it receives a pilot's sticks. `setpoints_missing`:
+    whether setpoints were missing already, or the failsafe for that flies the vehicle."""
 
     vehicle: VehicleFound
     ours: bool
@@ -66,9 +69,11 @@ class Supervised:
 
 
 class Recovery:
-    """Begins at `began_s`; the newest beat of the controller left at `beat_s`, and said `known`.
+    """One recovery, which begins at `began_s`. The controller sent its newest beat at `beat_s`, and
+    reported `known`. Times are those of `clock.monotonic_s`.
 
-    `end_reason` says how it ended, empty until then; `news` are sentences for the user."""
+    `end_reason` says how the recovery ended, empty until then; `news` are sentences for the user.
+    """
 
     def __init__(self, dialect: Dialect, known: Supervised, began_s: float, beat_s: float) -> None:
         self._dialect, self._known = dialect, known
@@ -80,25 +85,25 @@ class Recovery:
         self._mode: str | None = None
         self._before: str | None = None  # the mode before it
         self._reported_s = known.reported_s
-        self._fallen_s = math.inf  # since when its own failsafe flies it
-        self._fallen_shown = False  # by HEARTBEAT
-        self._sank_s = -math.inf  # when it was last seen to sink
+        self._fallen_s = math.inf  # since when the vehicle's own failsafe flies it
+        self._fallen_shown = False  # whether a HEARTBEAT shows that
+        self._sank_s = -math.inf  # when the vehicle was last seen to sink
         self._armed = True
-        self._begun = False  # all messages that had arrived before were processed
+        self._begun = False  # whether all messages from before the recovery were processed
         self._first_s = math.inf  # time of the first request
-        self._asked_s = -math.inf
+        self._asked_s = -math.inf  # time of the newest request
         self._acknowledged = False
-        self._landing = known.landing  # or the landing mode was shown
+        self._landing = known.landing  # True also once the vehicle has shown the landing mode
         self._left_for = ""  # the mode that neither controller nor supervisor has requested
         self._left_s = -math.inf
         self._heartbeat_s = -math.inf
         self._requests = 0
-        self._held_s = math.inf  # since when it holds
+        self._held_s = math.inf  # since when the vehicle holds
         self.news: list[str] = []
         self.end_reason = ""
 
     def see(self, event: Event, at_s: float) -> None:
-        """An event of the vehicle that arrived at `at_s` at the latest, which may be before
+        """Process an event of the vehicle. It arrived at `at_s` or earlier, which may be before
         `began_s`."""
         match event:
             case Heartbeat(mode, armed, status):
@@ -116,7 +121,8 @@ class Recovery:
                 self._acknowledged |= at_s > self._first_s
 
     def _on_mode(self, mode: str, at_s: float, *, failsafe: bool | None) -> None:
-        """`failsafe` None: the report does not say."""
+        """Process a report of the mode. `failsafe`: whether it shows a failsafe; None if it does
+        not say."""
         if mode != self._mode:
             self._before = self._mode
         self._mode, self._reported_s = mode, at_s
@@ -137,7 +143,7 @@ class Recovery:
         self._fallen_s, self._fallen_shown = math.inf, False
         if not ours and not self._left_for:
             self._left_for, self._left_s = mode, at_s
-        elif ours and not self._begun:  # of the reports that have waited the newest decides
+        elif ours and not self._begun:  # the newest report from before the recovery decides
             self._left_for = ""
 
     def _explains(self, mode: str, at_s: float) -> bool:
@@ -153,7 +159,7 @@ class Recovery:
         )
 
     def due(self, now_s: float) -> CommandLong | None:
-        """What to ask for now."""
+        """Return the request to send now, or None."""
         self._begun = True
         self._conclude(now_s)
         if self.end_reason or self._left_for or now_s - self._asked_s < REPEAT_S:
@@ -165,11 +171,11 @@ class Recovery:
         return request
 
     def _conclude(self, now_s: float) -> None:
-        """Note since when it holds, and whether the recovery has ended."""
+        """Note since when the vehicle holds, and whether the recovery has ended."""
         holds = self._mode == self._dialect.hold_mode and self._fallen_s == math.inf
         self._held_s = min(self._held_s, now_s) if holds else math.inf
         ours = self._known.holding or self._acknowledged
-        # PX4 leaves its landing mode when it disarms, which HEARTBEAT shows later
+        # PX4 leaves its landing mode when it disarms; HEARTBEAT shows the disarming later
         shown = not self._landing or self._heartbeat_s >= self._left_s
         if not self._armed:
             self.end_reason = "the vehicle is disarmed"
@@ -201,5 +207,5 @@ class Recovery:
         if self._mode == self._dialect.engage_mode:
             return first
         if not (self._known.holding or self._acknowledged):
-            return hold  # it holds, but the acknowledgement may have been lost
+            return hold  # the vehicle holds, but its acknowledgement may have been lost
         return land if now_s - self._held_s >= HOLD_S else None

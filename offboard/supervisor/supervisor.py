@@ -1,8 +1,8 @@
-"""The supervisor, as the controller sees it: a process that outlives it.
+"""The controller's side of the supervisor, a process that outlives the controller.
 
-From the moment when it takes over the controller must not send. Beats are JSON lines on a socket
-pair, and so are the answers; an empty one says that it has read what we sent. The descriptors of
-link and log go along when they change.
+From the moment when the supervisor takes over, the controller must not send. The controller sends
+beats as JSON lines on a socket pair, and with them the descriptors of link and log when these
+change. The answers are JSON lines, too; an empty one means that the supervisor has read the beats.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from offboard.link.interface import Link
 from offboard.mavlink.signing import Signing
 from offboard.supervisor.recovery import Supervised
 
-START_S = 20.0  # on a busy machine
+START_S = 20.0  # longest time to start, on a busy machine
 END_S = 1.0
-ANSWER_S = 1.0  # a beat that was not answered for so long: it is stopped
+ANSWER_S = 1.0  # a supervisor that has not answered a beat for this time does not run
 READY = "ready"
 NOT_STARTED = "the supervisor, which lands the vehicle if this process dies, does not start"
 
 
 class Supervisor:
-    """Context manager around the process. With `signing` it continues our signatures.
+    """Context manager around the process. With `signing` the process continues our signatures.
 
-    `lost`: it has ended although the flight goes on, and nobody will take over.
+    `lost`: whether the process has ended although the flight goes on: nobody will take over.
     """
 
     def __init__(self, signing: Signing | None = None) -> None:
@@ -43,7 +43,7 @@ class Supervisor:
     def __enter__(self) -> Supervisor:
         self._received = b""
         self._lines: list[str] = []  # first READY, then why it took over and what it did
-        self._passed: object = None  # the descriptors that it has
+        self._passed: object = None  # the descriptors that the process has
         self._unanswered_s = math.inf  # time of the first beat since the newest answer
         self._channel, theirs = socket.socketpair()
         self._channel.setblocking(False)
@@ -63,7 +63,7 @@ class Supervisor:
 
     @property
     def said(self) -> list[str]:
-        """Its sentences: why it took over, and what it did."""
+        """The sentences of the process: why it took over, and what it did."""
         return self._lines[1:]
 
     @property
@@ -73,7 +73,7 @@ class Supervisor:
 
     @property
     def guards(self) -> bool:
-        """Whether it would take over: it runs, and has answered within the last second."""
+        """Whether the process would take over: it runs, and has answered within the last second."""
         waited_s = clock.monotonic_s() - self._unanswered_s
         return bool(self._lines) and not self.lost and waited_s < ANSWER_S
 
@@ -91,7 +91,8 @@ class Supervisor:
                 raise Unavailable(NOT_STARTED)
 
     def beat(self, vehicle: Supervised, peer: Hashable, link: Link, log_descriptor: int) -> None:
-        """Show that the controller lives. The vehicle sends from `peer`. Never waits."""
+        """Send a beat, which shows that the controller runs. `peer` is the address that the vehicle
+        sends from. Never waits."""
         if not self._lines:  # it has not loaded yet
             return
         now_s = clock.monotonic_s()
@@ -101,7 +102,7 @@ class Supervisor:
             "peer": peer,
             "stream": link.is_stream,
             "listens": link.listens,
-            # the key, too: not in arguments or environment, which others can read
+            # has the key: others could read it in the arguments or the environment of the process
             "signing": self._signing.state() if self._signing else None,
         }
         line = json.dumps(beat).encode() + b"\n"
@@ -112,17 +113,17 @@ class Supervisor:
             socket.send_fds(self._channel, [line], [] if passed == self._passed else descriptors)
             self._passed = passed
         except BlockingIOError:
-            pass  # it is stopped or very late; the next beat says the same
+            pass  # the process is stopped or very late; the next beat says the same
         except OSError:
             self.lost = not self.has_taken_over()
 
     def has_taken_over(self) -> bool:
-        """Whether it sends in our place: then nothing may be sent or received, for good."""
+        """Whether the process sends in our place. From then on we must neither send nor receive."""
         self._receive()
         return len(self._lines) > 1
 
     def _receive(self) -> bool:
-        """Read what it says. False if there is nothing, or if it has ended."""
+        """Read the answers of the process. Returns False if there are none, or if it has ended."""
         try:
             data = self._channel.recv(65536)
         except OSError:
@@ -136,7 +137,7 @@ class Supervisor:
         return bool(data)
 
     def await_end(self, timeout_s: float) -> bool:
-        """Wait at most `timeout_s` for its next sentence; whether it has ended."""
+        """Wait at most `timeout_s` for the next sentence. Returns whether the process has ended."""
         select.select([self._channel], [], [], timeout_s)
         self._receive()
         return self.process.poll() is not None
@@ -144,5 +145,5 @@ class Supervisor:
     def __exit__(self, *_: object) -> None:
         """Close the channel: the process ends, or takes over if the last beat says so."""
         self._channel.close()
-        with suppress(subprocess.TimeoutExpired):  # it holds the link's port
+        with suppress(subprocess.TimeoutExpired):  # until then it holds the link's port
             self.process.wait(END_S)
