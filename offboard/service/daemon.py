@@ -1,8 +1,8 @@
-"""The service as a process: lock, monitor, configuration, link, supervisor, and the loop; and as a
-unit of systemd, from the template beside this module.
+"""The process of the service: locks, page of metrics, configuration, link, supervisor, and loop;
+and its systemd unit, from the template beside this module.
 
-The unit runs as a user of its own, which can read what everybody can, and write only below its
-state directory.
+The unit runs as a user of its own, which can read only what all users can read, and write only
+below its state directory.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ from offboard.supervisor.supervisor import Supervisor
 LINK_EVERY_S = 2.0  # between two attempts to open the link
 WATCHDOG_EVERY_S = 1.0
 TEMPLATE = Path(__file__).with_name("offboard.service.j2")
-PRIVATE = (Path("/tmp"), Path("/var/tmp"))  # the unit has its own
-OTHERS_READ, OTHERS_ENTER = 0o4, 0o1
+PRIVATE = (Path("/tmp"), Path("/var/tmp"))  # the unit has directories of its own in their place
+OTHERS_READ, OTHERS_ENTER = 0o4, 0o1  # permission bits
 STOPPED_EARLY = "stopped before the link was open"
 UNSCORED = "{number} of the earlier flights without a score: `{command}` makes it"
 
@@ -58,10 +58,11 @@ def run(
 ) -> Outcome:
     """Serve until a stop is requested.
 
-    `load` resolves the configuration, which is read again between flights; `directory` holds those
-    of the flights. `metrics`: HOST:PORT; `report`: write one after each flight. `tell` is called
-    with sentences about the preparation, `show` often, to show what the flights announce; neither
-    may wait. Raises UserError before anything is sent.
+    `load` resolves the configuration, which is read again between flights; `directory` holds the
+    directories of the flights. `metrics`: HOST:PORT of the page of metrics; `report`: whether to
+    write a report after each flight. `tell` is called with sentences about the preparation, and
+    `show` is called often, to show what the flights announce; neither may wait. Raises UserError
+    before anything is sent.
     """
     with ExitStack() as stack:
         stack.enter_context(connection_lock(vehicle.address))
@@ -124,8 +125,8 @@ def run(
 def opened(
     connection: str, stops: StopRequests, tell: Callable[[str], None], manager: Manager
 ) -> Link | None:
-    """The link, when it can be opened: a port may be in use, a device not plugged in yet. None if a
-    stop was requested before. Raises UserError for an address that nothing can be."""
+    """Open the link, and try again while a port is in use or a device is not plugged in. Returns
+    None if a stop was requested before it was open. Raises UserError for an invalid address."""
     told = ""
     pause = threading.Event()
     while not stops.requested:
@@ -143,8 +144,8 @@ def opened(
 
 
 class Manager:
-    """The service manager (systemd), if there is one. Does not wait for it: a notice for which it
-    has no room is dropped; that the service is ready, watchdog and status are told every second."""
+    """The service manager (systemd), if there is one. A notice never waits; if the manager has no
+    room for it, it is dropped. Readiness, watchdog and status are therefore sent every second."""
 
     def __init__(self) -> None:
         self._notifier = SystemdNotifier()  # raises nothing
@@ -158,7 +159,7 @@ class Manager:
         self._notifier.notify(notice)
 
     def alive(self, now_s: float, status: str = "") -> None:
-        """The loop runs: once a second, and with a new status, to watchdog and status."""
+        """Tell systemd that the loop runs, and the status: once a second, and if it is new."""
         if now_s - self._told_s >= WATCHDOG_EVERY_S or status != self._status:
             self._told_s, self._status = now_s, status
             self.tell(f"READY=1\nWATCHDOG=1\nSTATUS={status}")
@@ -168,8 +169,8 @@ class Manager:
 
 
 def unit(arguments: Sequence[str], connection: str, signing_key: Path | None = None) -> str:
-    """The text of a unit that runs `offboard daemon` with these arguments, which name neither
-    the key nor, for the state directory, `--out`."""
+    """Return the text of a unit that runs `offboard daemon` with these arguments. They do not
+    contain the key. Without `--out` among them, flights are written to the state directory."""
     template = Environment(undefined=StrictUndefined, keep_trailing_newline=True).from_string(
         TEMPLATE.read_text(encoding="utf-8")
     )
@@ -177,7 +178,7 @@ def unit(arguments: Sequence[str], connection: str, signing_key: Path | None = N
     words = [quoted(word) for word in command]
     if not any(word.startswith("--out") for word in arguments):
         words += ["--out", "%S/offboard"]
-    if signing_key:  # not %d, which systemd knows from 251 on
+    if signing_key:  # not %d, which needs systemd 251
         words += ["--signing-key", "${CREDENTIALS_DIRECTORY}/signing-key"]
     return template.render(
         command=" ".join(words),
@@ -203,7 +204,7 @@ def unreadable(path: Path) -> str:
 
 
 def quoted(word: str) -> str:
-    """A word of ExecStart=, in which systemd replaces nothing."""
+    """Return a word for ExecStart=, quoted and escaped so that systemd replaces nothing in it."""
     escaped = word.replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%").replace("$", "$$")
     plain = escaped and not any(c.isspace() or c in "\"'\\;" for c in escaped)
     return escaped if plain else f'"{escaped}"'

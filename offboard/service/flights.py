@@ -1,8 +1,8 @@
 """The flights of the service on one link: one waits or flies; when it has ended, the next waits.
 
-`Flights` takes the place of one companion in the loop. Each flight has a new `Flight` on the
-same session, so that authority, failsafe, plan and identification are new, and what is known of
-vehicle and link stays. Nothing in it waits: `Recorder` and `VehicleFiles` write in threads.
+`Flights` takes the place of a single `Flight` in the loop. Each flight is a new `Flight` on the
+same session: authority, failsafe, plan and identification are new, and what is known about vehicle
+and link is kept. Nothing here waits for a disk: `Recorder` and `VehicleFiles` write in threads.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from offboard.service.record import Recorder
 
 
 class Flights:
-    """See the module. `stopwatch` reads host time.
+    """See the module. `stopwatch` returns host time.
 
-    `current` is the flight that waits or flies. `engagements` counts the flights that have begun.
-    """
+    `current` is the flight that waits or flies. `engagements` is the number of flights that have
+    begun."""
 
     def __init__(
         self,
@@ -48,10 +48,10 @@ class Flights:
         self._recording = False
         self.engagements = 0
         self._prepared = source.newest
-        self._known: IdentifiedVehicle | None = None  # that the present flight began with
+        self._known: IdentifiedVehicle | None = None  # what the present flight began with
         self.current = self._companion(None)
 
-    # ------------------------------------------------------------------ as a companion
+    # ------------------------------------------------------------------ in place of a flight
 
     @property
     def phase(self) -> Phase:
@@ -65,8 +65,8 @@ class Flights:
         return self._stopping and self.current.has_ended()
 
     def request_stop(self, why: str = OPERATOR_STOP) -> None:
-        """Stop the service, after the vehicle was handed back. For another reason than the
-        operator's, only the present flight ends."""
+        """Stop the service, after the vehicle was handed back. If `why` is any other reason than
+        OPERATOR_STOP, only the present flight ends."""
         self._stopping |= why == OPERATOR_STOP
         if self._stopping or self.phase not in WAITING:
             self.current.request_stop(why)
@@ -74,7 +74,7 @@ class Flights:
             self.current.announce(why)
 
     def turn(self, chunks: Sequence[Chunk], now_s: float) -> tuple[bytes, ...]:
-        """Process all that has arrived; begin the next flight where the last one has ended."""
+        """Process all that has arrived; begin the next flight if the last one has ended."""
         if self.current.has_ended() and not self._stopping:
             self.close()
             self._follow(self._source.newest)
@@ -94,7 +94,8 @@ class Flights:
     # ------------------------------------------------------------------ one flight after another
 
     def _renew_if_changed(self) -> None:
-        """Continue to wait with a changed configuration or a remembered vehicle."""
+        """While waiting, use a configuration that has changed, or a vehicle that was identified
+        before and is recognised now."""
         newest = self._source.newest
         changed = newest is not self._prepared or self._remembered(newest) is not self._known
         if changed and not self._stopping:
@@ -103,7 +104,7 @@ class Flights:
             self.current.announce(sentence)
 
     def _follow(self, prepared: Prepared) -> None:
-        """Continue with a new companion where the present one has ended or waits."""
+        """Replace the present flight, which has ended or waits, by a new one."""
         self._prepared, self._known = prepared, self._remembered(prepared)
         self.current = self._companion(self.current)
 
@@ -132,14 +133,14 @@ class Flights:
             )
 
     def close(self) -> None:
-        """The present flight has ended, or the service does."""
+        """Close the record of the present flight, because the flight or the service ends."""
         if self._recording:
             self._recording = False
             self._keep_identified(ended=True)
             self._record.end(engaged=self.current.ends_engaged)
 
     def _look_for_left(self) -> None:
-        """Note whether a flight that was cut short left this vehicle engaged; no longer once the
+        """Note whether a flight that was cut short left this vehicle engaged. Forget that once the
         vehicle was seen in another mode or on the ground."""
         state, left = self.current, self._record.left
         state.left_engaged = bool(left) and left == self._identity
@@ -150,22 +151,23 @@ class Flights:
 
     @property
     def _identity(self) -> str:
-        """Autopilot, system id and the hardware's number, 0 where it has none; empty until they
-        are known."""
+        """Autopilot, system id and hardware number (0 if it has none) of the vehicle; empty until
+        they are known."""
         found, uid = self._session.vehicle, self.current.vehicle.uid
         return f"{found.autopilot}-{found.system_id}-{uid:x}" if found and uid is not None else ""
 
     @property
     def _key(self) -> str:
-        """The vehicle; empty for one without a number, which cannot be told from others."""
+        """The name of the vehicle's file; empty for a vehicle without a hardware number, which
+        cannot be distinguished from others."""
         return self._identity if self.current.vehicle.uid else ""
 
     def _remembered(self, prepared: Prepared) -> IdentifiedVehicle | None:
         return self._memory.get(self._key, prepared) if self._key else None
 
     def _keep_identified(self, *, ended: bool = False) -> None:
-        """What the first flight identifies is kept at once, what a flight improves later at its
-        end."""
+        """Keep what was identified: the first result of a vehicle at once, an improved one at the
+        end of the flight. Discard what was contradicted."""
         identification = self.current.identification
         if identification is None or not self._key:
             return

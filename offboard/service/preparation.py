@@ -1,8 +1,9 @@
 """What the service's next flight begins with: the configuration, read again while the service
-waits, and what earlier flights have identified of the vehicle.
+waits, and the vehicle as earlier flights have identified it.
 
-`DIR/vehicles/KEY.yaml` holds an identified vehicle, the delay of its tilt, and the vehicle file
-that it was identified from: for another vehicle file it is not used.
+`DIR/vehicles/KEY.yaml` holds an identified vehicle, the uncertainty of its delays, the delay of the
+link, and a digest of the vehicle file that the identification began with. With another vehicle file
+it is not used.
 """
 
 from __future__ import annotations
@@ -29,33 +30,33 @@ from offboard.model.vehicle import Vehicle
 from offboard.run.configuration import FlightConfig, dump
 from offboard.run.flight import Prepared, build, rehearse
 
-EVERY_S = 2.0
+EVERY_S = 2.0  # between two readings of the configuration
 
 
 class Preparation:
-    """`newest`: the newest usable configuration of those that `load` returns. A thread calls it
-    every `EVERY_S` while it is `allowed`: not while the vehicle is armed. One that has changed is
-    built and called once, so that nothing is compiled in flight. Raises DocumentError if the first
-    configuration cannot be used."""
+    """Keeps the newest usable configuration that `load` has returned in `newest`. A thread calls
+    `load` every EVERY_S while this is `allowed`, which it is not while the vehicle is armed. A
+    changed configuration is built, and its controller called, so that nothing is compiled in
+    flight. Raises DocumentError if the first configuration cannot be used."""
 
     def __init__(self, load: Callable[[], FlightConfig]) -> None:
         self._load = load
         self.newest = self._ready(load())
-        self._refused = ""  # the text of the newest that was refused, or why it has none
+        self._refused = ""  # text of the newest refused one, or why it has no text
         self._news: deque[str] = deque()
         self.allowed = True
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True, name="configuration")
 
     def start(self) -> None:
-        """Begin to watch."""
+        """Begin to watch the configuration."""
         self._thread.start()
 
     def close(self) -> None:
         self._ended.set()
 
     def news(self) -> list[str]:
-        """Sentences about configurations since the last call."""
+        """Return the sentences about configurations since the last call."""
         return [self._news.popleft() for _ in range(len(self._news))]
 
     def _run(self) -> None:
@@ -64,8 +65,8 @@ class Preparation:
                 self.look()
 
     def look(self) -> None:
-        """Read the configuration again, and use it if it has changed. One that is refused is tried
-        again, since the computer may have been too busy for it, but named only once."""
+        """Read the configuration again, and use it if it has changed. A refused one is tried again,
+        because the computer may have been too busy for it, but it is announced only once."""
         text = ""
         try:
             config = self._load()
@@ -91,7 +92,7 @@ class Preparation:
 
 
 class Document(Parameters):
-    """The content of a file."""
+    """The content of a file of an identified vehicle."""
 
     identified_from: str  # digest of the vehicle file
     tilt_delay_sd_s: float = Field(gt=0, le=1)
@@ -101,8 +102,8 @@ class Document(Parameters):
 
 
 class VehicleFiles:
-    """The files in `directory`, read at the start; written by a thread. `tell` is called with
-    sentences about files that cannot be used."""
+    """The files of identified vehicles in `directory`. They are read at the start, and written by a
+    thread. `tell` is called with sentences about files that cannot be used."""
 
     def __init__(self, directory: Path, tell: Callable[[str], None]) -> None:
         self._directory = directory
@@ -115,7 +116,7 @@ class VehicleFiles:
                 tell(f"{path} is not used: {error}")
 
     def get(self, key: str, prepared: Prepared) -> IdentifiedVehicle | None:
-        """What is known of this vehicle, if it was identified from the same vehicle file."""
+        """What is known about this vehicle if it was identified from the same vehicle file."""
         source, identified = self._known.get(key, ("", None))
         return identified if source == _digest(prepared.config.vehicle) else None
 

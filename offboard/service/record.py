@@ -5,8 +5,8 @@ A flight's log begins with its configuration, with what the vehicle sends only o
 last seconds before the flight, so that it is complete by itself. Files are opened, written and
 closed by threads: the loop waits for none of them.
 
-Until the vehicle was handed back, a file `engaged` in the directory of a flight holds its key: it
-tells the next start of a service that was killed.
+Until the vehicle was handed back, a file `engaged` in the directory of a flight holds the key of
+the vehicle. If the service was killed, it tells the next start that this vehicle was left engaged.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from offboard.mavlink.session import Session
 
 ROLLING_BYTES = 16 * 2**20
 ROLLING_NAMES = ("standby.1.tlog", "standby.2.tlog")
-BEFORE_US = 5_000_000  # of the time before a flight that its log holds
-BEFORE_MAX = 20_000  # frames of it
+BEFORE_US = 5_000_000  # time before a flight, in microseconds, that its log holds too
+BEFORE_MAX = 20_000  # most frames of this time
 PARAM_VALUE = 22
 SENT_ONCE = {PARAM_VALUE, 49, 148, 242}  # GPS_GLOBAL_ORIGIN, AUTOPILOT_VERSION, HOME_POSITION
 PARAM_ID = slice(8, 24)  # in the payload of PARAM_VALUE
-KEPT_MAX = 100
+KEPT_MAX = 100  # most parameters whose newest PARAM_VALUE is kept
 ENGAGED = "engaged"  # file of a flight, see the module
-ENGAGED_MAX_S = 600.0  # after the end of its log: a vehicle that was left longer ago has landed
+ENGAGED_MAX_S = 600.0  # after the end of the log: a vehicle that was left longer ago has landed
 
 
 class RollingLog:
-    """Two files in `directory` that are never closed, so that another process may have their
+    """Two files in `directory` that stay open until `close`, so that another process can have their
     descriptors. Raises LogError."""
 
     def __init__(self, directory: Path) -> None:
@@ -57,7 +57,7 @@ class RollingLog:
 
     @property
     def descriptor(self) -> int:
-        """The file that is written."""
+        """Descriptor of the file that is being written."""
         return self._descriptors[0]
 
     def write(self, unix_us: int, frame: bytes) -> None:
@@ -90,14 +90,17 @@ class FlightRecord(FlightLog):
 
     def _open(self) -> None:
         self.directory.mkdir(parents=True, exist_ok=True)
-        (self.directory / ENGAGED).write_text(self.vehicle, encoding="utf-8")  # whatever fails then
+        (self.directory / ENGAGED).write_text(
+            self.vehicle, encoding="utf-8"
+        )  # before anything fails
         super()._open()
 
 
 class Recorder:
-    """The log of the loop, and the directories of the flights, below `directory`. No method but
-    `close` waits. `score` hands a flight to the process that scores it, and outlives this one; a
-    failure is ignored. `unscored`: the flights of earlier services that have no score."""
+    """The log for the loop, and the directories of the flights, below `directory`. No method except
+    `close` waits. `score` gives a flight to the process that scores it and outlives this one; a
+    failure is ignored. `unscored`: the directories of flights of earlier services without a score.
+    """
 
     def __init__(self, directory: Path, *, score: Callable[[Path], object]) -> None:
         self._directory = directory
@@ -112,20 +115,20 @@ class Recorder:
         self._left, self._left_until_s = _left(self._engaged)
         logs = sorted(directory.glob("*/flight.tlog"))
         self.unscored = [log.parent for log in logs if not (log.parent / "score.json").exists()]
-        # read once: in flight the file system may keep its caller waiting
+        # read only once, because in flight the file system may make its caller wait
         self._taken = {path.name for path in directory.iterdir()}
 
     # ------------------------------------------------------------------ the loop's log
 
     @property
     def descriptor(self) -> int:
-        """The file that is written now."""
+        """Descriptor of the file that is being written."""
         flight = self._flight
         return flight.descriptor if flight and flight.descriptor >= 0 else self._rolling.descriptor
 
     @property
     def problem(self) -> str:
-        """What of the present flight's log is lost; the rolling log may lose what it likes."""
+        """What the log of the present flight has lost. Losses of the rolling log do not count."""
         return self._flight.problem if self._flight else ""
 
     @property
@@ -150,7 +153,7 @@ class Recorder:
     # ------------------------------------------------------------------ flights
 
     def begin(self, session: Session, configuration: str, vehicle: str) -> str:
-        """A log of its own for a flight of `vehicle` that begins. Returns its directory."""
+        """Begin the log of a flight of `vehicle`, given by its key. Returns its directory."""
         self.settle()
         directory = self._new_directory()
         self._engaged = [directory]
@@ -168,7 +171,8 @@ class Recorder:
         return str(directory)
 
     def _new_directory(self) -> Path:
-        """Two flights of one second have different names; a directory that is there is left."""
+        """Return a name that is not taken: flights may begin in the same second, and an existing
+        directory is not overwritten."""
         stamp = clock.local_stamp()
         names = chain([stamp], (f"{stamp}-{number}" for number in count(2)))
         name = next(each for each in names if each not in self._taken)
@@ -176,8 +180,8 @@ class Recorder:
         return self._directory / name
 
     def end(self, *, engaged: bool) -> None:
-        """Close the flight's log and score it, in another thread. `engaged`: the vehicle may still
-        be in the mode of setpoints."""
+        """Close the flight's log and score it, in another thread. `engaged`: whether the vehicle
+        may still be in the mode of setpoints."""
         vehicle = self._flight.vehicle if self._flight else ""
         self._close_flight()
         if engaged:
@@ -197,12 +201,12 @@ class Recorder:
 
     @property
     def left(self) -> str:
-        """Key of the vehicle that the flight before has left engaged, as where the service was
-        killed; empty if there is none."""
+        """Key of the vehicle that the previous flight left engaged, for example because the service
+        was killed; empty if there is none."""
         return self._left if clock.monotonic_s() < self._left_until_s else ""
 
     def settle(self) -> None:
-        """No vehicle is left engaged any more."""
+        """Note that no vehicle is left engaged any more."""
         files = [directory / ENGAGED for directory in self._engaged]
         self._left, self._engaged = "", []
         if self._closed:
@@ -221,13 +225,13 @@ class Recorder:
 
 
 def _left(engaged: list[Path]) -> tuple[str, float]:
-    """The vehicle of the newest flight, and until which monotonic time it may be engaged."""
+    """Key of the vehicle of the newest flight, and monotonic time until which it may be engaged."""
     with suppress(IndexError, OSError, ValueError):
         ended_us = (engaged[-1] / "flight.tlog").stat().st_mtime_ns // 1000
         passed_s = 1e-6 * (clock.unix_us() - ended_us)
         if passed_s < ENGAGED_MAX_S:
             vehicle = (engaged[-1] / ENGAGED).read_text(encoding="utf-8")
-            # negative: after a boot the wall clock is behind until it is set
+            # it is negative if the wall clock is behind, as after a boot until it is set
             return vehicle, clock.monotonic_s() + ENGAGED_MAX_S - max(passed_s, 0.0)
     return "", 0.0
 
