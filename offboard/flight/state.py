@@ -102,14 +102,14 @@ class FlightState(Ground):
     took_off: bool = False  # in this flight; a vehicle that was found in the air did not
     touchdown: Touchdown | None = None  # of the landing
     authority: Authority = field(default_factory=Authority)
-    other_datagrams: int = 0  # number of those from other senders, for the log
+    other_datagrams: int = 0  # number of datagrams from other senders, for the log
 
     phase: Phase = Phase.CONNECT
     began_s: float = 0.0  # link time at which the phase began
     setpoint_s: float = math.inf  # host time of the newest setpoint; infinite before the first
-    setpoints_missed_s: float = -math.inf  # newest host time at which they may have been missing
+    setpoints_missed_s: float = -math.inf  # newest host time with setpoints possibly missing
     rebooted: bool = False
-    left_engaged: bool = False  # whether an earlier flight was cut short and left it engaged
+    left_engaged: bool = False  # whether an earlier flight, cut short, left the vehicle engaged
     request: Request = Request.NONE  # of the ground station, while `transitions.obey` runs
     obeyed: Request = Request.NONE  # the newest request that changed the phase
     refused_s: float = -math.inf  # link time of the newest announcement of a refused request
@@ -118,7 +118,7 @@ class FlightState(Ground):
 
     busyness: Busyness = field(init=False)  # of this computer
     heard_s: float = math.nan  # host time of the turn in which the newest telemetry arrived
-    telemetry_arrived_s: float = 0.0  # monotonic host time of its arrival, in lockstep too
+    telemetry_arrived_s: float = 0.0  # monotonic host time of that arrival, in lockstep too
     reported_s: float = -math.inf  # `clock.answered_s` when the newest mode was reported
     bridged_s: float = 0.0  # `silence_s` at the newest setpoint that was sent without telemetry
     ignored: int = 0  # datagrams of others and forged frames between the two newest ticks
