@@ -17,8 +17,8 @@ from offboard.mavlink.outgoing import CommandLong
 from offboard.model.command import Command
 
 HEARTBEAT, AUTOPILOT_VERSION = 0, 148  # message ids
-# PX4 sends one HEARTBEAT a second: with several of them a link may lose all reports of mode and
-# arming. Without CURRENT_MODE (PX4 1.14), a pilot might leave and return between two HEARTBEATs
+# PX4 sends HEARTBEAT at 1 Hz. A link that loses several may lose all reports of mode and arming;
+# without CURRENT_MODE (PX4 1.14), a pilot might leave the mode and return between two of them
 HEARTBEAT_DUE_S, HEARTBEAT_ALONE_DUE_S, HEARTBEAT_EVERY_S = 1.3, 0.2, 0.15
 MODE_REPORTED_S = 3.0  # PX4 1.15 sends CURRENT_MODE twice a second, and when it changes
 FIT_EVERY_S = 4.0  # between two reductions of the telemetry: a backlog must drain first
@@ -225,8 +225,8 @@ def _request_takeoff(flight: FlightState, time_s: float) -> None:
     """Request the autopilot's own take-off. No setpoint is sent, because one without thrust would
     cancel it.
 
-    Give the observer hover thrust as the command in force, which the autopilot's thrust is close
-    to; the observer needs it when setpoints take over.
+    Give the observer hover thrust as the command in force. The autopilot's thrust is close to it,
+    and the observer needs a command when setpoints take over.
     """
     least_m, most_m = TAKEOFF_HEIGHTS_M
     height_m = -float(flight.plan.track.sample(0.0).position_ned_m[2])

@@ -113,7 +113,7 @@ class Snapshot:
         self.failsafe_row = state.failsafe.row  # the row that demands this action
         self.position_ned_m = position.position_ned_m if position else None
         self.velocity_ned_mps = position.velocity_ned_mps if position else None
-        self.attitude = attitude.attitude if attitude else None  # (w, x, y, z), NED to FRD
+        self.attitude = attitude.attitude if attitude else None  # (w, x, y, z), FRD to NED
         # reference and error are known from the climb to the landing
         self.reference_ned_m = sample.position_ned_m.tolist() if sample else None
         self.position_error_m = state.position_error_m if sample else math.nan

@@ -233,7 +233,7 @@ RESTARTED = f"{REBOOTED} and is disarmed"
 
 
 def ends_early(*, serves: bool) -> tuple[Transition, ...]:
-    """Return the rows that end a flight in the air early. When it is stopped, `fly` lands and the
+    """Return the rows that end a flight in the air early. On a request to stop, `fly` lands and the
     service holds. The usual end of a flight of the service is that the pilot changes the mode."""
     flown = FLYING if serves else FLYING - SERVICE_ONLY
     followed = TRACKING if serves else frozenset[Phase]()

@@ -25,26 +25,26 @@ class Phase(Enum):
         phase._value_, phase.code = name, code
         return phase
 
-    CONNECT = "connect", 0
-    HEALTH = "health", 1
-    STANDBY = "standby", 17
-    STREAM = "stream", 2
-    ENGAGE = "engage", 3
-    ARM = "arm", 4
-    TAKEOFF = "takeoff", 5
-    CLIMB = "climb", 6
-    EXCITE = "excite", 14
-    JOIN = "join", 7
-    TRACK = "track", 8
-    PAUSE = "pause", 18
-    HOVER = "hover", 9
-    HAND_BACK = "hand back", 19
-    HOLD = "hold", 16
-    STAND_DOWN = "stand down", 15
-    LAND = "land", 10
-    DISARMED = "disarmed", 11
-    YIELDED = "yielded", 12
-    FAILED = "failed", 13
+    CONNECT = "connect", 0  # waits for the HEARTBEAT of an autopilot
+    HEALTH = "health", 1  # waits until the vehicle can be flown (`preflight`)
+    STANDBY = "standby", 17  # waits for the pilot, or for a request to start
+    STREAM = "stream", 2  # sends setpoints, which PX4 requires before OFFBOARD
+    ENGAGE = "engage", 3  # requests the mode of setpoints: OFFBOARD or GUIDED
+    ARM = "arm", 4  # requests arming
+    TAKEOFF = "takeoff", 5  # increases the thrust, or requests the autopilot's own take-off
+    CLIMB = "climb", 6  # flies to the start of the reference
+    EXCITE = "excite", 14  # flies small steps there, to identify the vehicle
+    JOIN = "join", 7  # flies the run-in of the reference
+    TRACK = "track", 8  # flies the reference at full speed; this part is scored
+    PAUSE = "pause", 18  # stops on the reference
+    HOVER = "hover", 9  # flies the run-out, and hovers at the end of the reference
+    HAND_BACK = "hand back", 19  # requests hold, with which the flight ends
+    HOLD = "hold", 16  # requests hold, with which the failsafe begins; land follows
+    STAND_DOWN = "stand down", 15  # requests disarming on the ground
+    LAND = "land", 10  # requests land
+    DISARMED = "disarmed", 11  # has landed
+    YIELDED = "yielded", 12  # someone else has the vehicle
+    FAILED = "failed", 13  # was refused, or did not end with a landing
 
 
 class Action(IntEnum):

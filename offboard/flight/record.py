@@ -94,7 +94,7 @@ class TickRecord(NamedTuple):
     seed_cost: float  # cost of the best plan that the search started from
     age_s: float  # of the telemetry when the setpoint was sent, vehicle time
     refused: float  # flags of `Refusal`; 0 for a setpoint that was sent
-    other_datagrams: float  # and forged frames, since the previous record
+    other_datagrams: float  # of other senders, and forged frames, since the last record
     pause_s: float  # longest pause of this process since the previous tick; 0 if below a period
 
 

@@ -46,7 +46,7 @@ def silent_on_ground(flight: FlightState) -> str:
 
 
 def silent_for_another(flight: FlightState) -> str:
-    """After this silence HEALTH begins again, but only if something was heard in it."""
+    """After OTHER_VEHICLE_S of silence HEALTH begins again, if anything was heard in it."""
     heard = flight.phase is not HEALTH or flight.in_phase_s > flight.silence_s
     return silent_for(flight, OTHER_VEHICLE_S) if heard else ""
 

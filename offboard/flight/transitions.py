@@ -74,7 +74,7 @@ def _by_phase(service: ServiceOptions | None) -> dict[Phase, tuple[Transition, .
 
 
 def advance(flight: FlightState) -> None:
-    """Take one row after another until the condition of none holds in the phase."""
+    """Take rows until no condition of the present phase holds, or the flight has ended."""
     while not flight.in_end_phase:
         if flight.phase in FLYING:
             failsafe.judge(flight)
@@ -238,8 +238,9 @@ def _begin_climb(flight: FlightState, source: Phase) -> None:
 
 
 def _place_reference(flight: FlightState, position: LocalPosition) -> None:
-    """Place the reference of a vehicle that was found in the air. `home_ned_m` is below the
-    vehicle, at the height of its last rest."""
+    """Place the reference of a vehicle that was found in the air. `home_ned_m` is set below the
+    vehicle, at the height of its last rest. With the anchor "here" the reference starts where the
+    vehicle stops; with "origin" it is relative to the last rest, or as in `fly` to `home_ned_m`."""
     contact, jumps = flight.contact, flight.jumps
     flight.home_ned_m = (*jumps.without(position.position_ned_m)[:2], contact.rest_down_m)
     rest = contact.rest_ned_m and jumps.reported(contact.rest_ned_m)

@@ -94,7 +94,7 @@ class VehicleState:
 
     @property
     def disarmed_s(self) -> float:
-        """Time since the vehicle was first reported disarmed; 0 while it is armed."""
+        """Time since the vehicle was reported disarmed; 0 while armed, infinite if it never was."""
         return 0.0 if self.armed else self.now_s - self.armed_changed_s
 
     def age_s(self, kind: type) -> float:

@@ -48,7 +48,7 @@ class Flights:
         self._recording = False
         self.engagements = 0
         self._prepared = source.newest
-        self._known: IdentifiedVehicle | None = None  # what the present flight began with
+        self._known: IdentifiedVehicle | None = None  # with which the present flight began
         self.current = self._companion(None)
 
     # ------------------------------------------------------------------ in place of a flight

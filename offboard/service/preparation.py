@@ -35,9 +35,9 @@ EVERY_S = 2.0  # between two readings of the configuration
 
 class Preparation:
     """Keeps the newest usable configuration that `load` has returned in `newest`. A thread calls
-    `load` every EVERY_S while this is `allowed`, which it is not while the vehicle is armed. A
-    changed configuration is built, and its controller called, so that nothing is compiled in
-    flight. Raises DocumentError if the first configuration cannot be used."""
+    `load` every EVERY_S while `allowed` is True; it is False while the vehicle is armed. A changed
+    configuration is built, and its controller is called, so that nothing is compiled in flight.
+    Raises DocumentError if the first configuration cannot be used."""
 
     def __init__(self, load: Callable[[], FlightConfig]) -> None:
         self._load = load

@@ -90,9 +90,8 @@ class FlightRecord(FlightLog):
 
     def _open(self) -> None:
         self.directory.mkdir(parents=True, exist_ok=True)
-        (self.directory / ENGAGED).write_text(
-            self.vehicle, encoding="utf-8"
-        )  # before anything fails
+        # written first, whatever fails afterwards
+        (self.directory / ENGAGED).write_text(self.vehicle, encoding="utf-8")
         super()._open()
 
 
