@@ -23,7 +23,7 @@ HEARTBEAT_DUE_S, HEARTBEAT_ALONE_DUE_S, HEARTBEAT_EVERY_S = 1.3, 0.2, 0.15
 MODE_REPORTED_S = 3.0  # PX4 1.15 sends CURRENT_MODE twice a second, and when it changes
 FIT_EVERY_S = 4.0  # between two reductions of the telemetry: a backlog must drain first
 SPOOL_UP_PER_S = 0.7  # thrust ramp before lift-off, in units of gravity
-SPOOL_MAX = 2.0
+SPOOL_MAX = 2.0  # where the ramp ends, in units of gravity
 SPOOL_UNSEEN = 0.9  # less than hover: without a new position the vehicle must not lift off or climb
 SPOOL_KNOWN_S = 0.2  # greatest age of a position that shows the height
 # Least and greatest height of an autopilot's own take-off, which setpoints replace on the way:

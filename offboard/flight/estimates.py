@@ -89,7 +89,7 @@ def _silent_s(rate_hz: float) -> float:
 LEAST_JUMP_M = GATES[0]  # the observer corrects a smaller one as an error
 ACCELERATION_MPS2 = 20.0  # greatest acceleration between two reports that their velocities hide
 LONGEST_GAP_S = 0.5  # after a longer one nothing is concluded
-RECENT_S = 10.0
+RECENT_S = 10.0  # see `recent_m`
 NOISES = 6.0  # times the mean difference of successive positions: less is noise, not a jump
 NOISE_SHARE = 0.01  # weight of the newest difference in this mean
 DRIFT_S = 1.0  # time constant; real PX4 drifts by 0.7 m at most, without a fix by 14 m
@@ -167,7 +167,7 @@ class PositionJumps:
 
 # ---------------------------------------------------------------------- hover thrust
 
-WINDOW_S, KEPT_S = 0.5, 1.5
+WINDOW_S, KEPT_S = 0.5, 1.5  # see `HoverEstimate`
 GROUND_M = 0.2  # below this height the ground may carry the vehicle
 LEAST_THRUSTS, LEAST_SPEEDS, LEAST_S = 3, 4, 0.25  # in the window; 10 Hz must suffice
 LEAST_LIFT = 0.3  # of the weight: less lift shows too little of the thrust

@@ -20,11 +20,11 @@ from offboard.mavlink.events import MODE_KNOWN_S, ThrustReport
 RECOVERY = 0.25  # s by which the held time decreases in each second without the condition
 STEP_MAX_S = 0.2  # most by which one call of `judge` increases a held time, also after a gap
 SINK_MPS = 0.3  # full thrust stops this sink within the delay, on a vehicle that can be flown
-FULL_THRUST = 0.99
+FULL_THRUST = 0.99  # normalised
 # Share of the hover thrust at the start: an updraft never, and a lost payload hardly ever, reduces
 # the thrust so far
 LOW_THRUST = 0.5
-STANDS_BELOW_M = 0.25  # below the reference, which is at least 0.5 m above the take-off point
+STANDS_BELOW_M = 0.25  # below the reference, which is at least 0.3 m above the take-off point
 THRUST_REPORT_S = 1.0  # greatest age of a ThrustReport that counts
 
 

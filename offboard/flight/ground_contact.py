@@ -16,10 +16,10 @@ from offboard.mavlink.events import Landed, Triple
 
 DETECTOR_KNOWN_S = 1.5  # EXTENDED_SYS_STATE is requested at 5 Hz
 RESTING_HEIGHT_M = 0.75  # error of the estimated height on the ground
-LIFTED_HEIGHT_M, LIFTED_CLIMB_MPS, LIFTED_SAMPLES = 0.15, 0.4, 3
+LIFTED_HEIGHT_M, LIFTED_CLIMB_MPS, LIFTED_SAMPLES = 0.15, 0.4, 3  # see `lifted_off`
 GROUND_SPEED_MPS = 0.5  # vertical speed that the estimate may show on the ground
-STOOD_WITHIN_M, STOOD_HEIGHT_M, STOOD_S = 0.1, 0.3, 1.0
-KEPT_S = 20.0
+STOOD_WITHIN_M, STOOD_HEIGHT_M, STOOD_S = 0.1, 0.3, 1.0  # see `stood_for`
+KEPT_S = 20.0  # heights of this time are kept
 STANDING_S = 15.0  # a vehicle that stays at one height for so long stands, and does not hover
 POSITION_KNOWN_S = 1.0  # greatest age of a position that shows the height
 STILL_ARMED = (
@@ -32,7 +32,7 @@ HARD_MPS = 2.0  # faster than any landing; reached after a fall of 0.2 m
 REST_S = 0.5  # the vehicle is at rest if its height stays for this time
 REST_M = 0.15  # within this range; a single estimated speed is too noisy
 BEFORE_S = 1.0  # time before the rest in which the greatest speed is taken: a fall of 5 m
-BOUNCE_M = 0.3
+BOUNCE_M = 0.3  # a greater change of the height ends the rest
 ABOVE_TAKEOFF_M = 1.5  # a landing may be higher than the take-off: drift of the estimate
 SLOPE = 0.1  # and, by this share of the distance, slope of the terrain
 

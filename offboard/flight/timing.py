@@ -19,12 +19,12 @@ from offboard.identification.uncertainty import Estimate
 from offboard.mavlink.events import TimesyncReply
 from offboard.mavlink.outgoing import Timesync
 
-REPLIES_MIN, REPLIES_MAX, REPLIES_NEWEST = 5, 40, 5
+REPLIES_MIN, REPLIES_MAX, REPLIES_NEWEST = 5, 40, 5  # for `delay`: least, most; for its growth
 REPLIES_MEASURED = 20  # 2 s of replies: enough to notice a link that saturates
 DELAY_MAX_S = 10.0  # a larger difference is not a delay: the reply is from another clock
 REQUESTS_MAX = 6100  # those of the longest `Limits.silence_s` at the shortest control period
 NORMAL = 1.4826  # standard deviation of a normal distribution / median absolute deviation
-WINDOW_S, BIN_S = 5.0, 0.1
+WINDOW_S, BIN_S = 5.0, 0.1  # see `Edge`
 RATE_OVER_S, RATE_EVERY_S = 1.0, 1.0  # the rate: least time to measure it over, and interval
 REAL_TIME = 0.05  # a vehicle whose rate differs from 1 by less runs in real time
 LOSS_OVER, LOSSY = 50, 0.05  # a link loses if more than this share of requests has no reply

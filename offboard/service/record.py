@@ -170,8 +170,8 @@ class Recorder:
         return str(directory)
 
     def _new_directory(self) -> Path:
-        """Return a name that is not taken: flights may begin in the same second, and an existing
-        directory is not overwritten."""
+        """Return a directory with a name that is not taken yet: flights may begin in the same
+        second, and an existing directory is not overwritten."""
         stamp = clock.local_stamp()
         names = chain([stamp], (f"{stamp}-{number}" for number in count(2)))
         name = next(each for each in names if each not in self._taken)
