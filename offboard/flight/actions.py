@@ -204,7 +204,7 @@ def _fit_telemetry(flight: FlightState) -> None:
     if late and flight.session.telemetry.thin():
         flight.clock.measure_delay_again()
         delay = f"{1e3 * link.value:.0f} +- {1e3 * link.sd:.0f} ms"
-        outbox.announce(flight, f"the link delays by {delay}: less telemetry is requested")
+        outbox.announce(flight, f"the delay of the link is {delay}: less telemetry is requested")
 
 
 def _take_off(flight: FlightState, time_s: float) -> None:

@@ -12,10 +12,13 @@ from offboard.flight.phases import TRACKING, Phase
 from offboard.flight.starting import found_engaged, unfit
 from offboard.flight.state import FlightState
 
-PAUSED = "this computer paused for {most:.2f} s{times}: no setpoint before the mode is reported"
+PAUSED = (
+    "this computer paused for {most:.2f} s{times}: no setpoint until the vehicle reports its mode "
+    "again"
+)
 MESSAGES_DROPPED = (
-    "{total:.0f} of our messages to the vehicle dropped: this computer was too busy, and they "
-    "became too old"
+    "{total:.0f} of our messages to the vehicle were not sent: this computer was too busy, and "
+    "they became too old"
 )
 # Time in a phase before the first reason is announced: telemetry has only just been requested,
 # checks are running, the vehicle has not reported its hardware number yet

@@ -56,7 +56,10 @@ def unanswered(flight: FlightState) -> str:
     requests = flight.clock.overdue(flight.host_s)
     if requests * flight.period_s <= flight.limits.silence_s:
         return ""
-    return f"{requests} requests of TIMESYNC are not answered: does it receive setpoints?"
+    return (
+        f"{requests} TIMESYNC requests in a row were not answered: does the vehicle receive "
+        "setpoints?"
+    )
 
 
 def decision_missed(flight: FlightState) -> str:

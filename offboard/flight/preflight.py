@@ -337,7 +337,7 @@ def unanswered(for_s: float) -> str:
     """The sentence that no TIMESYNC request was answered for `for_s`; empty for a short time."""
     if for_s < UNANSWERED_S:
         return ""
-    return f"TIMESYNC is not answered for {for_s:.0f} s: does the vehicle receive what is sent?"
+    return f"no TIMESYNC request was answered for {for_s:.0f} s: does the vehicle receive them?"
 
 
 def _measuring(ground: Ground) -> str:
@@ -352,7 +352,7 @@ def _late(ground: Ground) -> str:
     if delay is None or (delay.value <= limits.link_delay_s and delay.sd <= limits.link_jitter_s):
         return ""
     return (
-        f"the link delays by {1e3 * delay.value:.0f} +- {1e3 * delay.sd:.0f} ms, at most "
+        f"the delay of the link is {1e3 * delay.value:.0f} +- {1e3 * delay.sd:.0f} ms, at most "
         f"{1e3 * limits.link_delay_s:.0f} +- {1e3 * limits.link_jitter_s:.0f} ms can be flown "
         "(limits.link_delay_s, limits.link_jitter_s)"
     )

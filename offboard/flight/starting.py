@@ -226,14 +226,14 @@ def still_armed(flight: FlightState) -> str:
  HAND_BACK, HOLD, STAND_DOWN, LAND, DISARMED, YIELDED, FAILED) = Phase  # fmt: skip
 FLOWN, REFUSED, ABORTED = ExitCode.FLOWN, ExitCode.REFUSED, ExitCode.ABORTED
 STREAMING = {STREAM, ENGAGE}
-ABANDONED = "{flight.vehicle.mode} in the air, and nobody flies the vehicle: a flight was cut short"
+ABANDONED = "{flight.vehicle.mode} in the air, and nobody flies it: an earlier flight was cut short"
 TOO_SOON = (
     "not engaged: {flight.vehicle.mode} again before a HEARTBEAT has shown another mode, or while "
     "a flight ended; switch again"
 )
 BEFORE_TAKEOFF = "{flight.stop_reason} before take-off"
 DISARMED_AGAIN = "the vehicle was disarmed just after it had armed"
-FLIGHT_DETECTED = "flight is detected as it was to disarm"
+FLIGHT_DETECTED = "flight was detected while it was asked to disarm"
 LOST_AS_IT_ARMED = "{flight.authority.lost_reason} as it armed"
 
 FLY_BEGINS = (

@@ -163,8 +163,8 @@ class FlightState(Ground):
         if not before.in_end_phase:  # it has only waited: what the pilot did meanwhile counts
             self.pilot, self.phase, self.began_s = before.pilot, before.phase, before.began_s
             return
-        prepared = before.phase not in (Phase.CONNECT, Phase.HEALTH) and not before.rebooted
-        self.phase = Phase.STANDBY if prepared and self.authority.engage_mode else Phase.CONNECT
+        known = self.authority.engage_mode and not before.rebooted
+        self.phase = Phase.STANDBY if known else Phase.CONNECT
         self.began_s = before.now_s
         self.pilot = before.pilot
         if before.ends_engaged:
@@ -307,7 +307,7 @@ class FlightState(Ground):
         if self.touchdown is None:
             return "it was not told to land"
         if not self.contact.position_known:
-            return "no LOCAL_POSITION_NED shows it"
+            return "no LOCAL_POSITION_NED arrives to show it"
         return self.touchdown.not_landed(on_ground=self.contact.detected == "on_ground")
 
     def delays_begin_s(self, time_s: float) -> float:

@@ -53,7 +53,9 @@ OTHER_COMPANION = (
     "another companion computer is on the link: system {system} component {component}; only one of "
     "them may send setpoints"
 )
-DISARMED_SHOWN = "a HEARTBEAT shows the vehicle disarmed: it is wrong, or its motors have stopped"
+DISARMED_SHOWN = (
+    "a HEARTBEAT shows the vehicle disarmed: either it is wrong, or the motors have stopped"
+)
 
 
 def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: float) -> bool:

@@ -287,6 +287,6 @@ def _set_hover_thrust(flight: FlightState, least: float = DIFFERENT) -> None:
         flight.identification.on_shown({"hover_thrust": shown})
     outbox.announce(
         flight,
-        f"hover thrust {shown:.3f} by thrust and acceleration before the take-over, "
-        f"not {model.hover_thrust:.3f}",
+        f"hover thrust {shown:.3f} instead of {model.hover_thrust:.3f}, measured before the "
+        "take-over",
     )

@@ -309,8 +309,8 @@ FOUND: list[tuple[Any, ...]] = [
      ("senders", OK, "other senders: ground station 255/190")),
     (beside(TIME, 255, 190, 2.0), ("clock", WARN, "another time master: component 255/190")),
     # the link
-    (link(latency_s=0.3), ("delay", BLOCKS, "the link delays by")),
-    (link(jitter_s=0.8, direction="up"), ("delay", BLOCKS, "the link delays by")),
+    (link(latency_s=0.3), ("delay", BLOCKS, "the delay of the link is")),
+    (link(jitter_s=0.8, direction="up"), ("delay", BLOCKS, "the delay of the link is")),
     (link(corruption=0.2, direction="down"), ("loss", WARN, "of the bytes damaged")),
     # half of the vehicle's sequence numbers are its camera's, and no frame is lost
     ({"down": shared_counter}, ("loss", OK, "0.0% of the frames lost")),

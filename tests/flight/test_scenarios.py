@@ -392,7 +392,7 @@ ROWS = {
         down=faults.without(faults.EXTENDED_SYS_STATE), limits=SOON,
     ),
     "it receives nothing any more": refusal(
-        "not ready: TIMESYNC is not answered for 5 s: does the vehicle receive what is sent?",
+        "not ready: no TIMESYNC request was answered for 5 s: does the vehicle receive them?",
         nothing_sent, at=then(Phase.HEALTH, 0.2, deafen), limits=SOON,
     ),
     "no HEARTBEAT from the request for the mode on": aborts(
@@ -597,7 +597,8 @@ ROWS = {
     ),
     # ArduCopter shows nothing: what was commanded meanwhile would have dropped it as it received it
     "it does not receive setpoints": ends(
-        "15 requests of TIMESYNC are not answered: does it receive setpoints", held_soon,
+        "15 TIMESYNC requests in a row were not answered: does the vehicle receive setpoints",
+        held_soon,
         fly=COPTER_HOVERS, failsafes=["uplink"], fall_mps=1.6, top_m=3.5,
         at=tracking(faults.cut(3.0, ways=["up"])),
     ),
