@@ -1,8 +1,7 @@
-"""Columns of a log: which values of which messages are kept, as arrays of rows, and what is
-computed from them.
+"""The columns of a log: which fields of which messages are kept, and what is computed from them.
 
-The rows of a message are the bytes of its payloads as they are in the log, after their times; only
-those that are used are kept.
+A row is one message: its times, then the bytes of its payload as they are in the log, from the
+first to the last field that is used.
 """
 
 from __future__ import annotations
@@ -30,11 +29,11 @@ from offboard.model.geodesy import Geodetic, position_ned_m
 Array = NDArray[np.float64]
 Rows = NDArray[np.void]
 Kind = TypeVar("Kind", bound=np.generic)
-# Columns of a message: name -> the first of its fields, number of values, and in an array the index
-# of the first
+# Columns of a message: name -> its first field, the number of values and, if that field is an
+# array, the index of the first value
 Columns = Mapping[str, tuple[str, int] | tuple[str, int, int]]
 
-ARRAY = "DEBUG_FLOAT_ARRAY"  # those of ours, with their array_id
+ARRAY = "DEBUG_FLOAT_ARRAY"  # array_id tells our two kinds apart
 RECORDS, IDENTIFIED = f"{ARRAY} {record.RECORD_ID}", f"{ARRAY} {record.IDENTIFIED_ID}"
 _MOTION: Columns = {"position_ned_m": ("x", 3), "velocity_ned_mps": ("vx", 3)}
 _SETPOINT: Columns = {"quaternion": ("q", 4), "thrust": ("thrust", 1)}
@@ -49,7 +48,7 @@ THEIRS: dict[str, Columns] = {
     # true positions of a simulated vehicle
     "HIL_STATE_QUATERNION": {"place": ("lat", 2), "altitude": ("alt", 1)},
     "SIM_STATE": {"place": ("lat_int", 2), "altitude": ("alt", 1)},
-    # what ground stations record instead
+    # used if the log of a ground station lacks the messages of _INSTEAD_OF (history.py)
     "ATTITUDE": {"angles": ("roll", 3), "rates_radps": ("rollspeed", 3)},
     "GLOBAL_POSITION_INT": {"place": ("lat", 3), "velocity": ("vx", 3)},
     "ATTITUDE_TARGET": _SETPOINT,
@@ -65,7 +64,7 @@ OURS: dict[str, Columns] = {
 }  # fmt: skip
 _TIMES = ("time_s", "unix_s")
 _TRUTH = {"HIL_STATE_QUATERNION": 1e3, "SIM_STATE": 1.0}  # altitude units per metre
-_NO_VOLTAGE, _NO_PERCENTAGE = 0xFFFF, -1  # of SYS_STATUS
+_NO_VOLTAGE, _NO_PERCENTAGE = 0xFFFF, -1  # in SYS_STATUS: the autopilot does not send the value
 _LIMITS = {
     "position_ned_m": POSITION_LIMIT_M,
     "velocity_ned_mps": VELOCITY_LIMIT_MPS,
@@ -78,8 +77,8 @@ class Samples:
 
     Args:
         kind: name of the message in pymavlink; what follows a space is ignored.
-        columns: what is kept of it.
-        unix_times: whether the time of its entry in the log is kept, too.
+        columns: the columns to keep.
+        unix_times: whether to keep the Unix time of the log entry, too.
     """
 
     def __init__(self, kind: str, columns: Columns, *, unix_times: bool) -> None:
@@ -105,7 +104,7 @@ class Samples:
         self.data = bytearray()
 
     def stamp_ms(self, payload: bytes) -> float | None:
-        """The stamp of a message, None without one."""
+        """Return `time_boot_ms`, or a `time_usec` other than 0, in ms; None without either."""
         if self._stamp == "time_boot_ms":
             return int.from_bytes(payload[:4], "little")
         if self._stamp == "time_usec" and any(payload[:8]):
@@ -113,19 +112,19 @@ class Samples:
         return None
 
     def add(self, payload: bytes, time_s: float, unix_s: float) -> None:
-        """A message with its vehicle time, and that of its entry in the log."""
+        """Add a message, its vehicle time and the Unix time of its log entry."""
         self.data += struct.pack("<2d", time_s, unix_s)[: self._times_size]
         self.data += payload[self._begin : self._end].ljust(self._end - self._begin, b"\0")
 
     def rows(self) -> Rows:
-        """All rows. Nothing can be added after."""
+        """Return all rows. Nothing can be added afterwards."""
         return np.frombuffer(self.data, self._dtype)
 
 
 def _place(
     message: np.dtype[np.void], field: str, count: int, first: int = 0
 ) -> tuple[int, np.dtype[Any]]:
-    """Where in the payload values begin, and their type."""
+    """Return the offset in bytes at which a column begins in the payload, and its type."""
     assert message.fields is not None
     kind, at = message.fields[field][:2]
     base = kind.base
@@ -133,7 +132,7 @@ def _place(
 
 
 def table(rows: Rows, **columns: Any) -> Rows:
-    """Rows with these columns (N, ...) and the times of other `rows`."""
+    """Return rows with the times of `rows` and the given columns (N, ...)."""
     times = {name: rows[name] for name in _TIMES if name in (rows.dtype.names or ())}
     values = {name: np.asarray(column) for name, column in (times | columns).items()}
     made = np.empty(
@@ -145,21 +144,22 @@ def table(rows: Rows, **columns: Any) -> Rows:
 
 
 def parts(values: NDArray[Any]) -> list[NDArray[Any]]:
-    """Parts of about 8192 rows. What is computed of a part needs little memory: a log may last
-    many hours."""
+    """Split `values` into parts of about 8192 rows, so that computations on a log of many hours
+    need little memory."""
     return np.array_split(values, 1 + len(values) // 8192)
 
 
 def in_parts(function: Callable[..., NDArray[Kind]], rows: Rows, *more: Any) -> NDArray[Kind]:
-    """`function` of all rows, (N, ...), and of `more`."""
+    """Return `function(rows, *more)`, (N, ...), computed part by part."""
     return np.concatenate([function(part, *more) for part in parts(rows)])
 
 
-# ---------------------------------------------------------------------- of rows of messages
+# ---------------------------------------------------------------------- computed from messages
 
 
 def truth(rows: Mapping[str, Rows], origin: Geodetic | None) -> Rows:
-    """True positions of a simulated vehicle; empty without those, or without an origin."""
+    """Return the true positions of a simulated vehicle; no rows if the log has none, or without an
+    origin."""
     kind, unit = next((each for each in _TRUTH.items() if len(rows[each[0]])), ("SIM_STATE", 1.0))
     known = rows[kind] if origin else rows[kind][:0]
     placed = known["place"].any(axis=1)  # in MAVLink 1 SIM_STATE has no lat_int and lon_int
@@ -170,13 +170,13 @@ def truth(rows: Mapping[str, Rows], origin: Geodetic | None) -> Rows:
 
 
 def _true_position(rows: Rows, unit: float, origin: Geodetic) -> Array:
-    """NED in m (N, 3), as float32. `unit` of the altitude in a metre."""
+    """Return positions NED in m (N, 3), as float32. `unit`: units of the altitude per metre."""
     places = np.column_stack((rows["place"] / 1e7, rows["altitude"] / unit))
     return position_ned_m(places, origin).astype(np.float32)
 
 
 def position_of_global(rows: Rows) -> Rows:
-    """Positions of GLOBAL_POSITION_INT relative to the first. 1e-7 deg, mm, cm/s."""
+    """Convert GLOBAL_POSITION_INT (1e-7 deg, mm, cm/s) to NED, relative to the first position."""
     places = rows["place"] / (1e7, 1e7, 1e3)
     position = position_ned_m(places, Geodetic(*places[0].tolist())) if len(rows) else places
     return table(
@@ -194,14 +194,18 @@ def attitude_of_angles(rows: Rows) -> Rows:
 
 
 def battery(rows: Rows) -> Rows:
-    """Values of SYS_STATUS; NaN for what the vehicle does not know."""
+    """Return voltage and remaining charge from SYS_STATUS; NaN where the autopilot sends none."""
     voltage, remaining = (rows[name].astype(np.float32) for name in THEIRS["SYS_STATUS"])
     voltage[voltage == _NO_VOLTAGE] = remaining[remaining == _NO_PERCENTAGE] = math.nan
     return table(rows, voltage_mv=voltage, remaining=remaining)
 
 
 def link_delay(ours: Rows, theirs: Rows) -> Rows:
-    """From the vehicle's replies to our requests: TIMESYNC messages, tc1 of a request is 0."""
+    """Return the delays of the link from the vehicle's replies to our TIMESYNC requests.
+
+    A request (tc1 = 0) has in ts1 the stamp of the newest telemetry; the reply returns ts1 and has
+    in tc1 the vehicle time at which the request arrived.
+    """
     replies = theirs[theirs["answered_ns"] != 0]
     asked_ns = ours["asked_ns"][ours["answered_ns"] == 0]
     replies = replies[np.isin(replies["asked_ns"], asked_ns)]
@@ -210,7 +214,8 @@ def link_delay(ours: Rows, theirs: Rows) -> Rows:
 
 
 def plausible(rows: Rows) -> Rows:
-    """Without those that the flight refuses, too; without a copy if there are none."""
+    """Return the rows with values within the limits of `mavlink.decode`, beyond which the flight
+    ignores a message, too. Makes no copy if these are all rows."""
     kept = in_parts(_within_limits, rows)
     return rows if kept.all() else rows[kept]
 

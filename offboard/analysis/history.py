@@ -1,7 +1,7 @@
 """One flight as columns and events, read once from its .tlog.
 
-Times are vehicle time in seconds, continued where `time_boot_ms` begins again at zero. Positions
-are NED in metres relative to the estimator's origin.
+Times are vehicle time in seconds, which continues where `time_boot_ms` wraps to zero. Positions are
+NED in metres relative to the estimator's origin.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from offboard.model.geodesy import Geodetic, origin_of
 
 OUR_COMPONENTS = (COMPONENT_ID, RECORD_COMPONENT_ID)
 TELEMETRY = (31, 32)  # ATTITUDE_QUATERNION, LOCAL_POSITION_NED
-_SUBSTITUTES = (30, 33)  # ATTITUDE, GLOBAL_POSITION_INT: the clock of logs without these
+_SUBSTITUTES = (30, 33)  # ATTITUDE, GLOBAL_POSITION_INT: the clock of logs without TELEMETRY
 _INSTEAD_OF = {
     "ATTITUDE": "ATTITUDE_QUATERNION",
     "GLOBAL_POSITION_INT": "LOCAL_POSITION_NED",
@@ -39,14 +39,16 @@ _INSTEAD_OF = {
 }
 _TUNNEL = 385  # message id
 PHASES: dict[int | None, str] = {phase.code: phase.value for phase in Phase}
-_NO_ATTITUDE = struct.pack("<8f", *(math.nan,) * 8)  # of a setpoint, after its stamp
+_NO_ATTITUDE = struct.pack("<8f", *(math.nan,) * 8)  # follows the stamp of SET_ATTITUDE_TARGET
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """A phase, a mode or a text: vehicle time (NaN before telemetry), sender, and what. `phase`:
-    the one that begins, empty for another event; `cause`: a word for what caused it, or empty;
-    `unix_s`: its time in the log."""
+    """A phase that begins, a change of mode or a text.
+
+    `time_s` is vehicle time, NaN before the first telemetry; `unix_s` is the time of the log entry.
+    `phase` is the phase that begins, empty for other events; `cause` is one word or empty.
+    """
 
     time_s: float
     who: str
@@ -57,41 +59,43 @@ class Event:
 
     @property
     def stamp(self) -> str:
-        """Its vehicle time, empty before telemetry."""
+        """Vehicle time as text, empty before the first telemetry."""
         return "" if math.isnan(self.time_s) else f"{self.time_s:.2f}"
 
     @property
     def reason(self) -> str:
-        """Why its phase begins."""
+        """Why the phase begins."""
         return self.what.removeprefix(f"{self.phase}: ")
 
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """Structured arrays (N,) in the order of arrival, and events. Each has `time_s`, `unix_s` (the
-    time in the log; `gather` keeps only that of setpoints unless told otherwise), and:
+    """Structured arrays (N,) in the order of arrival, and events. Each array has the fields
+    `time_s`, `unix_s` (time of the log entry: in `setpoint`, and in the others if `gather` is told
+    to keep it), and:
 
-    position: position_ned_m, velocity_ned_mps (LOCAL_POSITION_NED, or GLOBAL_POSITION_INT, then
-        relative to the first one)
+    position: position_ned_m, velocity_ned_mps (LOCAL_POSITION_NED, or GLOBAL_POSITION_INT with
+        positions relative to the first one)
     attitude: quaternion (w, x, y, z), rates_radps (ATTITUDE_QUATERNION, or ATTITUDE)
-    truth: position_ned_m (HIL_STATE_QUATERNION or SIM_STATE; empty without)
+    truth: position_ned_m (HIL_STATE_QUATERNION or SIM_STATE; no rows if the log has neither)
     reference: position, velocity and acceleration, heading_rad (POSITION_TARGET_LOCAL_NED)
-    setpoint: quaternion, thrust (SET_ATTITUDE_TARGET); the last two NaN for a setpoint of
-        the autopilot's own position loop (SET_POSITION_TARGET_LOCAL_NED)
-    commanded: the same, or in a log without ours what the vehicle reports (ATTITUDE_TARGET)
+    setpoint: quaternion, thrust (SET_ATTITUDE_TARGET); both are NaN for a setpoint of the
+        autopilot's own position loop (SET_POSITION_TARGET_LOCAL_NED)
+    commanded: as `setpoint`; in a log without setpoints what the vehicle reports (ATTITUDE_TARGET)
     identified: value and sd of each constant of `flight.record.IDENTIFIED`
-    link_delay: delay_s, at the telemetry that a TIMESYNC request followed
+    link_delay: delay_s, at the stamp of the telemetry after which the TIMESYNC request was sent
     heartbeat: armed (1 or 0), system_status (MAV_STATE)
     battery: voltage_mv, remaining in percent; NaN where it is not known (SYS_STATUS)
     landed: state (MAV_LANDED_STATE of EXTENDED_SYS_STATE)
     records: the fields of `flight.record.TickRecord`
 
-    `phases` and `announcements` are our own, by their records; `modes` and `vehicle_messages`
-    (STATUSTEXT, refused commands) the vehicle's. `vehicle` is the one that our record of it
-    names, else the first autopilot that was heard; only its messages, and ours, are used. `vehicle`
-    is None without one, `dialect` also for an autopilot that is not known. `substitutes` are the
-    messages that take the place of others in the log of a ground station. `damage` says what could
-    not be read, `damage_s` is the time of the telemetry before the first damage, NaN without.
+    `phases` and `announcements` are read from our event records, `modes` (HEARTBEAT) and
+    `vehicle_messages` (STATUSTEXT, refused commands) from the vehicle's messages. `vehicle` is the
+    one that our vehicle record names, or else the first autopilot in the log, or None; only its
+    messages and ours are used. `dialect` is None also for an unknown autopilot. `substitutes` are
+    the messages that took the place of missing ones, as in the log of a ground station. `damage`
+    says what could not be read; `damage_s` is the time of the newest telemetry before the first
+    damaged entry, or NaN.
     """
 
     position: Rows
@@ -119,21 +123,21 @@ class History:
     damage_s: float = math.nan
 
     def estimates(self, constant: str) -> tuple[Array, Array]:
-        """Times (N,) at which a constant was identified, and its value and sd (N, 2)."""
+        """Return the times (N,) at which a constant was identified, its values and sd (N, 2)."""
         known = self.identified[np.isfinite(self.identified[constant][:, 0])]
         return known["time_s"], known[constant].astype(np.float64)
 
     def events(self) -> list[Event]:
-        """Phases, announcements, modes and messages of the vehicle in the order of time; what came
-        before any telemetry first."""
+        """Return phases, announcements, modes and messages of the vehicle in the order of time;
+        events before the first telemetry come first."""
         modes = (replace(event, what=f"mode {event.what}") for event in self.modes)
         every = (*self.phases, *self.announcements, *modes, *self.vehicle_messages)
         return sorted(every, key=lambda e: -math.inf if math.isnan(e.time_s) else e.time_s)
 
 
 def gather(log: Tlog, *, unix_times: bool = False) -> History:
-    """Sort a log's messages into a History. A log without a vehicle gives empty arrays.
-    `unix_times`: keep the time in the log of every message."""
+    """Read a log into a History. A log without a vehicle gives empty arrays. `unix_times`: whether
+    to keep the time of the log entry of every message, not only of setpoints."""
     collector = _Collector(*_vehicle(log), unix_times=unix_times)
     for entry in log:
         if log.damaged and math.isnan(collector.damage_s):
@@ -143,8 +147,8 @@ def gather(log: Tlog, *, unix_times: bool = False) -> History:
 
 
 def configuration(log: Tlog) -> str | None:
-    """The configuration of the flight as YAML (see `run.configuration.flown`), None without.
-    Raises UserError."""
+    """Return the configuration of the flight as YAML (see `run.configuration.flown`), None if the
+    log has none. Raises UserError."""
     pieces = (entry.tunnelled for entry in log if record_type(entry) == record.CONFIGURATION_TYPE)
     try:
         return record.joined_configuration(pieces)
@@ -153,14 +157,14 @@ def configuration(log: Tlog) -> str | None:
 
 
 def record_type(entry: LoggedMessage) -> int | None:
-    """TUNNEL.payload_type of one of our records, None for any other message."""
+    """Return TUNNEL.payload_type of one of our records, None for any other message."""
     if entry.frame.message_id != _TUNNEL or entry.component_id not in OUR_COMPONENTS:
         return None
     return int.from_bytes(entry.frame.payload[:2], "little")
 
 
 class _Collector:
-    """Collects the messages of this vehicle and those of `offboard`, which has its system id."""
+    """Collects the messages of one vehicle, and those of `offboard`, which has its system id."""
 
     def __init__(
         self, vehicle: Address | None, dialect: Dialect | None, *, unix_times: bool
@@ -175,7 +179,7 @@ class _Collector:
         )
         self._origin: Geodetic | None = None  # of the local frame
         self._assembler = TextAssembler()
-        self._texts: list[Event] = []  # of the vehicle
+        self._texts: list[Event] = []  # STATUSTEXT and refused commands
         self._modes: list[Event] = []
         self._event_records: list[tuple[float, float, bytes]] = []
         self._counts: Counter[str] = Counter()
@@ -183,7 +187,7 @@ class _Collector:
         self._clocks: tuple[int, ...] = TELEMETRY + _SUBSTITUTES
         self._time = VehicleTime()
         self.now_s = math.nan  # vehicle time of the newest telemetry
-        self.damage_s = math.nan  # time of the newest one before the first damage
+        self.damage_s = math.nan  # vehicle time of the newest telemetry before the first damage
 
     def add(self, entry: LoggedMessage) -> None:
         frame, vehicle = entry.frame, self._vehicle
@@ -201,26 +205,27 @@ class _Collector:
             self._add_theirs(entry, payload, unix_s)
 
     def _is_of_another(self, entry: LoggedMessage) -> bool:
-        """The HEARTBEAT of another program with the vehicle's ids, which the flight has ignored."""
+        """Whether this is a HEARTBEAT of another program with the ids of the vehicle; the flight
+        has ignored it, too."""
         if entry.frame.message_id != HEARTBEAT or not self._dialect:
             return False
         return dialect_of(entry.message) is not self._dialect
 
     def _keep(self, samples: Samples | None, payload: bytes, unix_s: float) -> None:
-        """A message without a stamp has that of the telemetry before it."""
+        """Add a message; one without a time stamp has the vehicle time of the telemetry before."""
         if samples:
             stamp_ms = samples.stamp_ms(payload)
             time_s = self.now_s if stamp_ms is None else self._continued_s(stamp_ms)
             samples.add(payload, time_s, unix_s)
 
     def _continued_s(self, stamp_ms: float) -> float:
-        """Vehicle time of a stamp, which begins again at zero after 2^32 ms. Those that do not
-        are put on the same clock."""
+        """Return the vehicle time of a stamp, which wraps to zero after 2^32 ms. A stamp that does
+        not wrap (`time_usec`) gives the same time."""
         return (stamp_ms + 1e3 * self._time.wrapped_s(stamp_ms / 1e3)) / 1e3
 
     def _follow(self, kind: int, payload: bytes) -> bool:
-        """Follow the vehicle's clock, also to its beginning after a restart. False for telemetry
-        with a stamp so far ahead that the flight has refused it, too."""
+        """Update the vehicle time, also after a reboot. Return False for telemetry with a stamp so
+        far ahead that the flight has refused it, too."""
         if kind not in self._clocks:
             return True
         if kind in TELEMETRY:
@@ -261,32 +266,33 @@ class _Collector:
                 self._say(self._modes, mode, unix_s)
         instead = _INSTEAD_OF.get(kind, "")
         usual = self._theirs.get(instead) or self._ours.get(instead)
-        if not (usual and usual.data):  # else only memory
+        if not (usual and usual.data):  # a substitute beside the usual message would waste memory
             self._keep(self._theirs.get(kind), payload, unix_s)
 
     def _say(self, events: list[Event], what: str, unix_s: float) -> None:
         events.append(Event(self.now_s, "vehicle", what, unix_s=unix_s))
 
     def _forget_before_flight(self) -> None:
-        """The vehicle was rebooted, and its time begins anew: if no setpoint was sent yet, what it
-        reported before does not belong to the flight."""
+        """After a reboot, discard the messages before it if no setpoint was sent yet: they do not
+        belong to the flight."""
         if not self._ours["SET_ATTITUDE_TARGET"].data:
             for samples in self._theirs.values():
                 samples.data.clear()
 
     def _add_origin(self, entry: LoggedMessage) -> None:
-        """HOME_POSITION gives one point in both frames. An origin that is moved after the first
-        decision is not the one of the positions until then."""
+        """Set the origin of the local frame. HOME_POSITION gives one point in global and in local
+        coordinates. An origin that moves after the first decision is ignored: the positions before
+        are relative to the old one."""
         at = entry.message
         place = Geodetic(at.latitude / 1e7, at.longitude / 1e7, at.altitude / 1e3)
         if entry.name == "GPS_GLOBAL_ORIGIN":
             if self._origin is None or not self._ours[columns.RECORDS].data:
                 self._origin = place
-        elif self._origin is None:  # else of no use: ArduCopter's x, y and z are zero
+        elif self._origin is None:  # GPS_GLOBAL_ORIGIN is better: ArduCopter sends x, y, z = 0
             self._origin = origin_of(place, (at.x, at.y, at.z))
 
     def history(self, damage: str) -> History:
-        """All that was added."""
+        """Return all messages that were added."""
         theirs, ours = (
             {kind: samples.rows() for kind, samples in kinds.items()}
             for kinds in (self._theirs, self._ours)
@@ -296,7 +302,8 @@ class _Collector:
         position = columns.plausible(theirs["LOCAL_POSITION_NED"])
         attitude = columns.plausible(theirs["ATTITUDE_QUATERNION"])
         substitutes = []
-        if not len(position) and not len(ours["POSITION_TARGET_LOCAL_NED"]):  # of another origin
+        # The reference of `offboard` has the local origin, and GLOBAL_POSITION_INT another one
+        if not len(position) and not len(ours["POSITION_TARGET_LOCAL_NED"]):
             position = columns.position_of_global(theirs["GLOBAL_POSITION_INT"])
             substitutes.append("GLOBAL_POSITION_INT")
         if not len(attitude):
@@ -337,7 +344,7 @@ class _Collector:
 
 
 def _vehicle(log: Tlog) -> tuple[Address | None, Dialect | None]:
-    """The vehicle that its record in the log names, else the first autopilot that was heard."""
+    """Return the vehicle that our vehicle record names, or else the first autopilot in the log."""
     first: tuple[Address | None, Dialect | None] = (None, None)
     for entry in log:
         kind = entry.frame.message_id

@@ -1,6 +1,7 @@
 """Identifies the vehicle of a log and the noise of its estimator, and writes the vehicle file.
 
-The flight may be one of another program, if it sent SET_ATTITUDE_TARGET.
+The flight may be that of another program, if it sent SET_ATTITUDE_TARGET with the vehicle's system
+id and component id 191, as `offboard` does.
 """
 
 from __future__ import annotations
@@ -31,26 +32,25 @@ _KEPT = (
     "mass_kg", "inertia_kgm2", "arm_m", "drag_rotation_nmpradps",
     "angular_acceleration_limit_radps2", "angular_rate_limit_radps",
 )  # fmt: skip
-_UNITS = {"s": "s", "radps": "rad/s", "ps": "1/s"}  # by the end of a constant's name
-_KEYS = {"drag_ps": "drag_translation_npmps"}  # in a vehicle file, where they differ
-_REASONS = {"thrust_delay_s": "thrust_lag_s"}  # identified, or not, with this constant
+_UNITS = {"s": "s", "radps": "rad/s", "ps": "1/s"}  # suffix of a constant's name -> unit
+_KEYS = {"drag_ps": "drag_translation_npmps"}  # constant -> another key in a vehicle file
+_REASONS = {"thrust_delay_s": "thrust_lag_s"}  # both are identified together, or neither is
 DIGITS = 6  # of the values in a vehicle file
 LINE_WIDTH = 80
 MEAN_OVER_S = 0.5  # time over which reported velocity and position are compared
 
 
 def identify_flight(history: History, vehicle: Vehicle) -> tuple[Identified, Trace]:
-    """Identify the vehicle of a log.
+    """Identify the vehicle of a log, starting from the constants of `vehicle`.
 
-    The search starts at the constants of `vehicle`. Returns the identified constants and the part
-    of the flight that they were identified from.
+    Returns the identified constants and the part of the flight from which they were identified.
     """
     trace = _trace(history)
     return identify(trace, vehicle), trace
 
 
 def _trace(history: History) -> Trace:
-    """The part of a log in the air; the whole log if it has no phases of `offboard`."""
+    """Return the airborne part of a log; the whole log if it has no phases of `offboard`."""
     setpoint, attitude = history.setpoint, history.attitude
     position = history.position
     commanded = thrust_direction_from_quaternion(setpoint["quaternion"])
@@ -78,8 +78,8 @@ def _flown(history: History) -> tuple[float, float]:
 
 
 def constants(found: Identified) -> dict[str, list[Row]]:
-    """Name, estimate, unit, and reason without one of every constant that can be identified, by
-    their key in a vehicle file."""
+    """Return every constant that can be identified, by its key in a vehicle file: its name, its
+    estimate or None, its unit, and the reason why it was not identified."""
     by_key: dict[str, list[Row]] = {}
     for constant, estimate in found.estimates.items():
         *words, last = constant.split("_")
@@ -92,10 +92,10 @@ def constants(found: Identified) -> dict[str, list[Row]]:
 
 
 def vehicle_file(found: Identified, prior: Vehicle, flight: str) -> str:
-    """YAML of a vehicle file from an identification.
+    """Return a vehicle file (YAML) from an identification. `flight` names the log.
 
-    Identified constants have their standard deviation as comment. The other constants are those of
-    `prior`, with the reason why they were not identified. `flight` names the log.
+    Identified constants have their standard deviation as a comment. The other constants are those
+    of `prior`; the comment says why they were not identified.
     """
     comments = dict.fromkeys(_KEPT, "not identifiable from telemetry")
     comments |= {key: _comment(rows) for key, rows in constants(found).items()}
@@ -112,7 +112,7 @@ def vehicle_file(found: Identified, prior: Vehicle, flight: str) -> str:
 
 
 def _comment(rows: Sequence[Row]) -> str:
-    """Standard deviations of the constants of one key, or why there are none."""
+    """Return the standard deviations of the constants of one key, or why there are none."""
     known = [(estimate.sd, unit) for _, estimate, unit, _ in rows if estimate]
     if not known:
         return f"not identified: {rows[0][-1]}"
@@ -120,7 +120,7 @@ def _comment(rows: Sequence[Row]) -> str:
 
 
 def _line(entry: str, comment: str) -> str:
-    """An entry with its comment, on lines above it if one line is too short for both."""
+    """Return an entry followed by its comment; the comment is above it if the line is too long."""
     line = f"{entry}  # {comment}" if comment else entry
     if len(line) <= LINE_WIDTH:
         return line
@@ -134,11 +134,11 @@ def _line(entry: str, comment: str) -> str:
 
 
 def estimator_noise(trace: Trace) -> tuple[float, float, float, float]:
-    """Noise of the vehicle's estimator in a stretch of flight.
+    """Return the noise of the vehicle's estimator as four standard deviations.
 
-    Standard deviations; NaN where the trace is too short. The first three are white noise of
-    position (m), reported velocity (m/s) and thrust direction (rad); the last one is reported
-    velocity less the derivative of reported position (m/s), as means over MEAN_OVER_S."""
+    The first three are the white noise of position (m), velocity (m/s) and thrust direction (rad).
+    The fourth is that of the reported velocity minus the derivative of the reported position (m/s),
+    both averaged over MEAN_OVER_S. A value is NaN if the trace is too short for it."""
     stamps, velocity = trace.position[:, STAMP], trace.position[:, VELOCITY]
     direction = trace.attitude[:, NORTH : NORTH + 2]
     return (
@@ -150,9 +150,11 @@ def estimator_noise(trace: Trace) -> tuple[float, float, float, float]:
 
 
 def _white_sd(stamps: Array, signals: Array) -> float:
-    """Sd of white noise in `signals` (N, axes): each sample less the cubic through its two
-    neighbours on either side, which follows any motion; by the median, so that jumps do not
-    count."""
+    """Return the sd of the white noise in `signals` (N, axes).
+
+    The noise of a sample is its difference from the cubic through its two neighbours on either
+    side, which follows the motion. The sd is computed from the median, which ignores jumps.
+    """
     if len(signals) < 10:
         return math.nan
     away = np.stack([stamps[i : len(stamps) - 4 + i] - stamps[2:-2] for i in (0, 1, 3, 4)])
@@ -164,7 +166,7 @@ def _white_sd(stamps: Array, signals: Array) -> float:
     around = np.stack([signals[i : len(signals) - 4 + i] for i in (0, 1, 3, 4)])
     residual = signals[2:-2] - np.einsum("kn,kna->na", weights, around)
     white = residual / np.sqrt(1.0 + np.sum(weights**2, axis=0))[:, None]
-    return float(np.median(np.abs(white))) / 0.6745  # of a normal distribution
+    return float(np.median(np.abs(white))) / 0.6745  # median / sd of a normal distribution
 
 
 def _velocity_contradiction(trace: Trace) -> float:

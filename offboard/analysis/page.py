@@ -1,8 +1,9 @@
 """HTML pages from Jinja2 templates, and their plotly figures: one style for light and dark.
 
-A page is one self-contained file, plotly.js inside, no network. A template is named by its path in
-this package: "campaign/templates/campaign.html". Templates extend "analysis/templates/page.html"
-and draw figures and notes with the macros of "parts.html". Values are escaped.
+A page is one file that contains plotly.js and loads nothing from the network. A template is named
+by its path below `offboard`: "campaign/templates/campaign.html". Templates extend
+"analysis/templates/page.html" and draw figures and notes with the macros of "parts.html". Values
+are escaped.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ INK, MUTED, GRID, SURFACE, BACKGROUND = "#1f2933", "#52606d", "#e4e7eb", "#fffff
 BLUE, RED, GREEN, ORANGE, PURPLE, GREY = (
     "#2b6cb0", "#c53030", "#2f855a", "#c05621", "#6b46c1", "#617488",
 )  # fmt: skip
-# backgrounds of bands with text on them
+# Backgrounds of bands with text on them
 BLUE_BAND, ORANGE_BAND, GREY_BAND = "#cfe0f3", "#f6d9bd", "#dfe3e8"
 TEAL, PINK, BROWN, SLATE, YELLOW = "#0f766e", "#b83280", "#744210", "#4a5568", "#b7791f"
 PALETTE = (BLUE, RED, GREEN, ORANGE, PURPLE, TEAL, PINK, BROWN, SLATE, YELLOW)
@@ -37,10 +38,11 @@ DARK = {
 }  # fmt: skip
 
 _TOP_PX, _BOTTOM_PX, _PANEL_PX, _GAP_PX = 48, 90, 150, 36
-_FEW_DECADES = 2  # of a logarithmic axis with ticks at 2 and 5
-_MOST_DECADES = 3  # of one with a tick at each
-_FEW_VALUES, _FLATTENED = 50, 4.0  # of `without_outliers`
-_MARGIN = 0.02  # of its decades, beside its outermost ticks
+_FEW_DECADES = 2  # a logarithmic axis of so many decades or fewer has ticks at 2 and 5, too
+_MOST_DECADES = 3  # an axis of more decades does not have a tick at each
+# `without_outliers` applies from so many values on, if their range is more than 4 times that of 99 %
+_FEW_VALUES, _FLATTENED = 50, 4.0
+_MARGIN = 0.02  # margin of a logarithmic axis at either end, as a share of its decades
 _AXIS = {
     "gridcolor": GRID, "zerolinecolor": GRID, "linecolor": GREY, "showline": True,
     "ticks": "outside", "tickcolor": GREY, "automargin": True, "exponentformat": "power",
@@ -71,7 +73,7 @@ _COLOURS = {  # names of the CSS variables
 
 
 def render(template: str, **values: object) -> str:
-    """The page that `template` makes of `values`, as the text of an HTML file."""
+    """Return an HTML page: `template` filled with `values`."""
     return _TEMPLATES.get_template(template).render(
         plotly_js=get_plotlyjs(),
         colours=_COLOURS,
@@ -94,9 +96,9 @@ class Figure:
     width_px: int = 0
 
     def to_json(self, *, styled: bool = True) -> str:
-        """Title, caption, and the figure as plotly's own JSON (`plotly.io.read_json` reads it).
+        """Return title, caption and figure as plotly's own JSON (`plotly.io.read_json` reads it).
 
-        Without its style for a page, which contains `STYLE` once.
+        `styled`: whether the JSON contains `STYLE`; a page contains it once for all figures.
         """
         drawing = json.loads(self.drawing.to_json())
         if not styled:
@@ -106,7 +108,7 @@ class Figure:
 
 
 def panels(titles: Sequence[str], x_title: str, panel_px: int = _PANEL_PX) -> go.Figure:
-    """An empty figure with one panel per title, one above the other, that share their x axis."""
+    """Return an empty figure with one panel per title, stacked, with a common x axis."""
     inner_px = panel_px * len(titles) + _GAP_PX * (len(titles) - 1)
     figure = make_subplots(
         rows=len(titles), shared_xaxes=True, subplot_titles=titles,
@@ -119,8 +121,8 @@ def panels(titles: Sequence[str], x_title: str, panel_px: int = _PANEL_PX) -> go
 
 
 def without_outliers(values: NDArray[np.float64]) -> list[float] | None:
-    """The range of an axis that shows 99 % of the values, where it would flatten them to show all;
-    None where it would not."""
+    """Return the range of an axis that shows 99 % of the values, if outliers would flatten them;
+    else None."""
     known = values[np.isfinite(values)]
     if len(known) < _FEW_VALUES:
         return None
@@ -132,8 +134,8 @@ def without_outliers(values: NDArray[np.float64]) -> list[float] | None:
 
 
 def logarithmic(values: Iterable[float]) -> dict[str, Any]:
-    """A logarithmic axis around the positive values. Up to two decades have ticks at 1, 2 and 5;
-    more decades have about three, at powers of ten."""
+    """Return a logarithmic axis around the positive values. Up to two decades have ticks at 1, 2
+    and 5; more decades have about three ticks, at powers of ten."""
     known = [value for value in values if 0.0 < value < math.inf]
     least, greatest = min(known, default=1.0), max(known, default=1.0)
     low, high = math.floor(math.log10(least)), math.ceil(math.log10(greatest))
@@ -164,5 +166,5 @@ def curve(
 
 
 def coordinates(values: ArrayLike) -> NDArray[np.float32]:
-    """Seven significant digits: more than a screen shows. Plotly writes arrays in base64."""
+    """Round to float32, which has more digits than a screen shows. Plotly writes it in base64."""
     return np.asarray(values, np.float32)

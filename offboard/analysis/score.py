@@ -1,7 +1,7 @@
 """The metrics of one flight, its verdict, requirements on it, and score.json.
 
 Tracking, activity and telemetry are scored during the phase TRACK, setpoints from the first one to
-the landing, decisions over the whole flight. A metric that the log does not hold is NaN.
+the landing, decisions over the whole flight. A metric for which the log has no data is NaN.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ Array = NDArray[np.float64]
 
 
 def _metric(meaning: str, unit: str = "", *, wall: bool = False) -> float:
-    """`wall`: measured with this computer's clock, so that it differs between runs of the same
-    flight."""
+    """Declare a metric. `wall`: whether it is measured with this computer's clock, and so differs
+    between runs of the same flight."""
     about = {"meaning": meaning, "unit": unit, "wall": wall}
     value: float = field(default=math.nan, metadata=about)
     return value
@@ -42,21 +42,21 @@ def _metric(meaning: str, unit: str = "", *, wall: bool = False) -> float:
 class Score:
     """All metrics of a flight, by the names that --require takes, and what ended it.
 
-    `completed` is 1 if the whole reference was tracked in the air, the vehicle landed by its land
-    detector, height and speed, and it was disarmed; else 0, and `ended_by` says why not in a word
-    or a few, `reason` in the sentence that the flight announced, if it announced one.
+    `completed` is 1 if the whole reference was tracked in the air, the vehicle landed according to
+    its land detector, height and speed, and it was disarmed; else 0. Then `ended_by` says in a few
+    words why, and `reason` is the sentence that the flight announced, or empty.
 
-    Errors are relative to the reference, during the phase TRACK: `position` as the vehicle
-    estimates it (LOCAL_POSITION_NED), `truth` as it is in the simulator (HIL_STATE_QUATERNION or
-    SIM_STATE). RMSE, mean, sd and percentiles of errors and motion are weighted by the time of the
-    reference: each sample stands for half of the interval before it and half of the one after it,
-    so that telemetry which is thinned or lost counts with the mean of what surrounds it
-    (`analysis.tracking`). Rates and gaps of the telemetry are of TRACK, too. The metrics of the
-    certificate are of the decisions that were sent as they were certified, a share
-    `certified_share` of all. A tick counts as one of `decisions`, `failed_decisions` or
+    Errors are relative to the reference, during the phase TRACK: `position` is the vehicle's own
+    estimate (LOCAL_POSITION_NED), `truth` the true position in the simulator (HIL_STATE_QUATERNION
+    or SIM_STATE). RMSE, mean, sd and percentiles of errors and motion are weighted by the time of
+    the reference: each sample stands for half of the interval before it and half of the one after
+    it, so that a gap in the telemetry counts with the mean of the samples around it
+    (`analysis.tracking`). Rates and gaps of the telemetry are those in TRACK, too. The metrics of
+    the certificate are computed from the decisions that were sent as they were certified, which are
+    the share `certified_share` of all. A tick counts as one of `decisions`, `failed_decisions` or
     `missed_ticks`; `refused_setpoints` are among `decisions`. The distance to keep-out volumes is
-    no metric, but the margin `clearance` of a campaign. Times are vehicle time. A metric that the
-    log does not hold is NaN.
+    no metric; it is the margin `clearance` of a campaign. Times are vehicle time. A metric for
+    which the log has no data is NaN.
 
     Example, with the pytest fixture `fly`:
 
@@ -156,7 +156,7 @@ def score(flown: History) -> Score:
 def score_flight(flight: Path) -> tuple[Score, History]:
     """Score a flight from its log alone.
 
-    `flight` is a flight directory or a .tlog file. Returns the values, and columns and events of
+    `flight` is a flight directory or a .tlog file. Returns the score and the columns and events of
     the log. Raises UserError.
 
     Example:
@@ -169,15 +169,15 @@ def score_flight(flight: Path) -> tuple[Score, History]:
 
 
 def judged(outcome: Outcome, score: Score) -> Outcome:
-    """The outcome of a flight by what its log shows: one that is not completed was aborted."""
+    """Return `outcome`, or ABORTED for a flown flight that is not completed by its log."""
     if outcome.exit_code != ExitCode.FLOWN or score.completed == 1.0:
         return outcome
     return Outcome(ExitCode.ABORTED, f"{outcome.sentence}, but not completed: {score.ended_by}")
 
 
 def keep_score(directory: Path, score: Score, flown: History) -> None:
-    """Write score.json into a flight directory; a score that is there stays until the new one is
-    complete. Raises LogError."""
+    """Write score.json into a flight directory. An older score.json is replaced only when the new
+    one is complete. Raises LogError."""
     path = directory / "score.json"
     try:
         replace_file(path, as_text(score, flown))
@@ -186,8 +186,8 @@ def keep_score(directory: Path, score: Score, flown: History) -> None:
 
 
 def as_text(score: Score, history: History) -> str:
-    """All metrics, the events and the number of messages as JSON text; a metric that the log does
-    not hold is null."""
+    """Return all metrics, the events and the number of messages as JSON text; a metric that is NaN
+    becomes null."""
     document = {
         "ended_by": score.ended_by,
         "reason": score.reason,
@@ -241,11 +241,11 @@ class Requirement:
         return cls(metric, comparison, float(number))
 
     def met(self, metrics: Mapping[str, float]) -> bool:
-        """Whether the metric is as required. One that the log does not hold (NaN) is not."""
+        """Whether the metric is as required. A metric without data in the log (NaN) is not."""
         return _OPERATORS[self.comparison](metrics[self.metric], self.limit)
 
     def sentence(self, metrics: Mapping[str, float]) -> str:
-        """The metric beside what is required: `rmse_position_m is 0.031 (required < 0.05)`."""
+        """Return for example `rmse_position_m is 0.031 (required < 0.05)`."""
         value = metrics[self.metric]
         found = "not in this log" if math.isnan(value) else f"{value:.4g}"
         return f"{self.metric} is {found} (required {self.comparison} {self.limit:g})"
@@ -257,7 +257,7 @@ _PERCENT = {"p50": 50, "median": 50, "p99": 99, "max": 100}
 
 
 def decision_metrics(flown: History) -> dict[str, float]:
-    """Values of a Score; empty without decisions."""
+    """Return the values of a Score for decisions; without decisions at most `failed_decisions`."""
     columns = flown.records
     failed = float(sum(event.what.startswith(DECISION_FAILED) for event in flown.announcements))
     if not len(columns):
@@ -268,7 +268,8 @@ def decision_metrics(flown: History) -> dict[str, float]:
         values = columns[name].astype(np.float64)
         return values[np.isfinite(values)]
 
-    # A setpoint without certificate was changed by the gate, in EXCITE perhaps by a step
+    # A setpoint without certificate was changed by the limits of the last check or, in EXCITE,
+    # perhaps by an identification step
     changed = np.isnan(columns["at_bound"]) & np.isfinite(columns["thrust_mps2"])
     limited = changed & (columns["phase"] != Phase.EXCITE.code)
     at_bound = np.where(limited, 1.0, columns["at_bound"])
@@ -298,7 +299,8 @@ def decision_metrics(flown: History) -> dict[str, float]:
 
 
 def link_metrics(flown: History, track: Track | None) -> dict[str, float]:
-    """Values of a Score. Without `track` rates and gaps of the telemetry stay NaN."""
+    """Return the values of a Score for setpoints, link and telemetry. Without `track` the rates and
+    gaps of the telemetry stay NaN."""
     begun = begin_times(flown.phases)
     last_s = float(flown.position["time_s"][-1]) if len(flown.position) else math.nan
     sent = flown.setpoint[flown.setpoint["time_s"] < begun.get("land", math.inf)]
@@ -316,7 +318,7 @@ def link_metrics(flown: History, track: Track | None) -> dict[str, float]:
         return values
     for name, rows in (("position", flown.position), ("attitude", flown.attitude)):
         stamps = rows["time_s"][track.holds(rows["time_s"])]
-        intervals = np.diff(np.maximum.accumulate(stamps))  # repeated and late ones: zero
+        intervals = np.diff(np.maximum.accumulate(stamps))  # 0 for a repeated or late message
         span_s = float(np.ptp(stamps)) if len(stamps) else 0.0
         count = len(np.unique(stamps))
         values[f"{name}_hz"] = (count - 1) / span_s if span_s > 0.0 else math.nan
@@ -327,8 +329,8 @@ def link_metrics(flown: History, track: Track | None) -> dict[str, float]:
 
 
 def _named(pattern: str, kinds: str, values: Array) -> dict[str, float]:
-    """Percentiles of the values by name: `pattern` with each of `kinds` in it; empty without
-    values."""
+    """Return percentiles of the values by name, which is `pattern` with each of `kinds` inserted;
+    empty without values."""
     known = kinds.split() if len(values) else ()
     return {pattern.format(kind): float(np.percentile(values, _PERCENT[kind])) for kind in known}
 

@@ -1,4 +1,4 @@
-"""A score as text for the terminal: the rows that end `fly`, and the tables of `score`."""
+"""A score as text for the terminal: the last rows that `fly` prints, and the tables of `score`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from offboard.analysis.history import History
 from offboard.analysis.score import METRICS, Score
 from offboard.flight.timing import too_busy
 
-# the metric that begins a section -> its title
+# first metric of a section -> title of the section
 SECTIONS = {
     "completed": "verdict",
     "rmse_position_m": "tracking",
@@ -24,12 +24,12 @@ SECTIONS = {
     "delay_ms": "vehicle",
 }
 
-AT_LIMIT_SHARE = 0.2  # of the decisions, from which a summary says so
+AT_LIMIT_SHARE = 0.2  # share of decisions at a limit from which the summary mentions it
 
 
 def summary(score: Score, history: History) -> dict[str, str]:
-    """What a person wants to know after a flight: text by label. Metrics that the log does not hold
-    are left out."""
+    """Return the main results of a flight, text by label. Metrics without data in the log are left
+    out."""
     rows: dict[str, str] = {}
     if math.isfinite(score.rmse_position_m):
         error = f"{score.rmse_position_m:.3f} m RMSE, {score.max_position_m:.3f} m maximum"
@@ -60,7 +60,7 @@ def summary(score: Score, history: History) -> dict[str, str]:
 
 
 def verdict(score: Score) -> str:
-    """Whether the flight was completed, and what ended it."""
+    """Return whether the flight was completed, and else what ended it, as text."""
     if math.isnan(score.completed):
         return score.ended_by
     if score.completed:
@@ -72,7 +72,8 @@ def verdict(score: Score) -> str:
 
 
 def _identified(history: History) -> str:
-    """The last value of the main constants that the flight identified, empty without one."""
+    """Return the last values of the main constants that the flight identified, as text; empty if
+    there are none."""
     texts = []
     for constant, text in (
         ("tilt_delay_s", "delay {:.0f} ms"),
@@ -87,7 +88,7 @@ def _identified(history: History) -> str:
 
 
 def show(console: Console, score: Score, history: History) -> None:
-    """Print the verdict, what happened in the order of time, and every metric of the log."""
+    """Print the verdict, the events in the order of time, and every metric that is not NaN."""
     console.print(Text(verdict(score)))
     story = Table(box=None, pad_edge=False)
     story.add_column("t [s]", justify="right")

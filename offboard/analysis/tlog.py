@@ -1,9 +1,9 @@
 """Reads a .tlog: frames with their times, one after the other, in bounded memory.
 
-An entry is a big-endian uint64 of Unix microseconds, then one unchanged MAVLink frame. A log that
-ends inside an entry (after a crash) is read up to it. Damaged entries are skipped and counted: the
-next one is where a time stamp is followed by a frame with a correct checksum. A file without any
-entry is refused.
+An entry is a big-endian uint64 of Unix microseconds, then one unchanged MAVLink frame. If the log
+ends inside an entry (after a crash), the entries before are read. Damaged entries are skipped and
+counted: reading continues where a time stamp is followed by a frame with a correct checksum. A file
+without any entry is refused.
 """
 
 from __future__ import annotations
@@ -22,15 +22,16 @@ from offboard.documents.errors import UserError, abridged
 from offboard.mavlink.framing import V1, V2, Frame, frame_size, parse
 
 _STAMP = struct.Struct(">Q")
-_YEAR_2100_US = 4_102_444_800_000_000  # a computer without a clock begins in 1970
+# Greatest plausible stamp. No least one: a computer without a battery-backed clock starts in 1970
+_YEAR_2100_US = 4_102_444_800_000_000
 _MARKER = re.compile(rb"[\xfd\xfe]")  # the first byte of a frame
-_LONGEST = 8 + 280  # bytes of an entry: a signed MAVLink 2 frame
+_LONGEST = 8 + 280  # bytes of the longest entry, with a signed MAVLink 2 frame
 _BLOCK = 1 << 20
 _TUNNEL_BYTES = 133  # payload_type, target system and component, payload_length, 128 of data
 
 
 class LoggedMessage(NamedTuple):
-    """One frame and the time at which it was sent or received."""
+    """One frame and the Unix time at which it was sent or received."""
 
     unix_us: int
     frame: Frame
@@ -55,16 +56,17 @@ class LoggedMessage(NamedTuple):
 
     @property
     def tunnelled(self) -> bytes:
-        """The data of a TUNNEL message, without the zeros that fill it up."""
+        """The data of a TUNNEL message, without padding."""
         payload = self.frame.payload.ljust(_TUNNEL_BYTES, b"\0")
         return payload[5 : 5 + payload[4]]
 
 
 class Tlog:
-    """A log to iterate over, as often as needed: its messages in order.
+    """The messages of a log in order. It can be iterated over repeatedly.
 
-    After each iteration `damaged` is the number of places where entries were skipped,
-    `first_damage` the first of them in bytes, `truncated` the bytes after the last entry.
+    After an iteration `damaged` is the number of places where entries were skipped, `first_damage`
+    the offset of the first place in bytes, and `truncated` the number of bytes after the last
+    entry.
     """
 
     def __init__(self, path: Path) -> None:
@@ -73,7 +75,7 @@ class Tlog:
 
     @property
     def damage(self) -> str:
-        """One sentence on what could not be read; empty if all could."""
+        """One sentence that says what could not be read; empty if everything could."""
         if not self.damaged:
             return ""
         entries = f"{self.damaged} damaged entr{'ies were' if self.damaged > 1 else 'y was'}"
@@ -88,13 +90,13 @@ class Tlog:
             raise UserError(f"{self.path} cannot be read: {error.strerror}") from None
 
     def _messages(self, file: BinaryIO) -> Iterator[LoggedMessage]:
-        data, at, before = b"", 0, 0  # `before`: bytes of the file before `data`
-        lost: int | None = None  # where the search for the next entry began
-        found = cut = False  # `cut`: the file ends within the entry there, if its length is right
+        data, at, before = b"", 0, 0  # `before`: offset of `data` in the file
+        lost: int | None = None  # offset at which the search for the next entry began, None: none
+        found = cut = False  # `cut`: whether the length of the entry at `lost` exceeds the file
         while True:
             if at + _LONGEST + 9 > len(data) and (block := file.read(_BLOCK)):
                 before, data, at = before + at, data[at:] + block, 0
-                continue  # an entry, and the head of the next one
+                continue  # `data` holds one whole entry and the head of the next one
             if len(data) - at < 8 + 3:  # no entry can begin here
                 break
             entry = _entry(data, at, certain=lost is not None)
@@ -125,8 +127,11 @@ class Tlog:
 
 
 def _entry(data: bytes, at: int, *, certain: bool) -> LoggedMessage | None:
-    """The entry that begins at `at`, None without. `certain`: its checksum must be known; else a
-    message that pymavlink does not know is taken if an entry follows."""
+    """Return the entry at `at`, None if there is none.
+
+    `certain`: whether the checksum must be verified. If not, a message that pymavlink does not know
+    is accepted if another entry follows.
+    """
     end = _end(data, at)
     if not _begins(data, at) or end > len(data):
         return None
@@ -137,13 +142,13 @@ def _entry(data: bytes, at: int, *, certain: bool) -> LoggedMessage | None:
 
 
 def _end(data: bytes, at: int) -> int:
-    """Where the entry that begins at `at` ends; beyond the end of `data` if the entry is
-    incomplete."""
+    """Return where the entry at `at` ends; beyond the end of `data` if it is incomplete."""
     return at + 8 + frame_size(data, at + 8)
 
 
 def _begins(data: bytes, at: int) -> bool:
-    """Whether a time stamp and the first byte of a frame are at `at`, as far as the data go."""
+    """Whether an entry may begin at `at`: a time stamp and the first byte of a frame. True if
+    `data` ends before that byte."""
     if at + 9 > len(data):
         return True
     (stamp,) = _STAMP.unpack_from(data, at)
@@ -151,7 +156,7 @@ def _begins(data: bytes, at: int) -> bool:
 
 
 def find(flight: Path) -> Path:
-    """The .tlog of a flight, given as flight directory or as file. Raises UserError."""
+    """Return the .tlog of a flight. `flight` is its directory or the file. Raises UserError."""
     path = flight / "flight.tlog" if flight.is_dir() else flight
     if not path.is_file():
         problem = "is not a regular file" if path.exists() else "does not exist"
@@ -160,8 +165,8 @@ def find(flight: Path) -> Path:
 
 
 def read(flight: Path) -> Tlog:
-    """The log of a flight to iterate over, given as for `find`. Raises UserError, also where the
-    file is no .tlog or cannot be read."""
+    """Open the log of a flight. `flight` is as for `find`. Raises UserError, also if the file is no
+    .tlog or cannot be read."""
     log = Tlog(find(flight))
     next(iter(log))
     return log
@@ -169,14 +174,14 @@ def read(flight: Path) -> Tlog:
 
 @cache
 def name_of(message_id: int) -> str:
-    """The name of a message id in pymavlink, UNKNOWN_<id> without one."""
+    """Return the name of a message id in pymavlink, or UNKNOWN_<id>."""
     kind = dialect.mavlink_map.get(message_id)
     return kind.msgname if kind else f"UNKNOWN_{message_id}"
 
 
 @cache
 def layout(name: str) -> np.dtype[np.void]:
-    """The layout of the payload on the wire, from pymavlink's definition of the message."""
+    """Return the layout of a message's payload on the wire, from pymavlink's definition."""
     kind = getattr(dialect, f"MAVLink_{name.lower()}_message")
     formats = kind.native_format.decode().lstrip("<")
     return np.dtype(

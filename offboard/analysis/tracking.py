@@ -1,8 +1,8 @@
 """Metrics of the phase TRACK: errors, fitness, activity, truth.
 
-Errors and motion are weighted by the time of the reference (see `Track.shares`): a metric depends
-neither on the rate of the telemetry nor on jumps of the vehicle's clock. Sums of the paper's
-fitness are over the control ticks, as in its Eq. 32.
+Errors and motion are weighted by the time of the reference (see `Track.shares`), so that a metric
+depends neither on the rate of the telemetry nor on jumps of the vehicle's clock. The paper's
+fitness is a sum over the control ticks, as in its Eq. 32.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from offboard.model.frames import (
 
 Array = NDArray[np.float64]
 
-GAP_S = 0.5  # without a record of the reference for longer there is none
-SKIPPED_S = 1.5  # without a decision for longer, the reference was not tracked meanwhile
-_KNOWN = [(end, order) for end in (0, 1) for order in range(3)]  # of a quintic over 0 .. 1
-# coefficients of s^5 .. s^0 from the derivatives of these orders at these ends
+GAP_S = 0.5  # the reference is unknown in a longer gap between its records
+SKIPPED_S = 1.5  # the reference was not tracked in a longer gap between decisions
+_KNOWN = [(end, order) for end in (0, 1) for order in range(3)]  # given derivatives of a quintic
+# Coefficients of s^5 .. s^0 for each of _KNOWN: the derivative of this order at s = 0 or s = 1
 _QUINTIC = np.linalg.inv(
     [
         [
@@ -46,9 +46,9 @@ _FITNESS = ("e_u", "e_v", "e_w", "e_x", "e_y", "e_z", "e_psi")
 class Track:
     """The phase TRACK of a flight: the times of its control ticks, and the reference.
 
-    Time of the reference passes from tick to tick, `tracked_s` in all, and `skipped_s` without a
-    decision. It stands still from the end of the reference to where it is flown again from its
-    start.
+    `tracked_s` is the time of the reference that passed from tick to tick, `skipped_s` the time in
+    gaps between decisions of more than SKIPPED_S. If the reference is repeated, the time from its
+    end to its next start does not count.
     """
 
     def __init__(self, times: Array, track_s: Array, reference: Reference) -> None:
@@ -63,7 +63,8 @@ class Track:
 
     @classmethod
     def of(cls, flown: History) -> Track | None:
-        """None where the reference or a signal has less than two samples in it."""
+        """Return the phase TRACK of a flight; None if the reference, position, attitude or setpoint
+        has fewer than two samples in it."""
         ticks = flown.records["phase"] == Phase.TRACK.code
         reference = Reference.of(flown)
         if ticks.sum() < 2 or reference is None:
@@ -74,23 +75,24 @@ class Track:
         return track if all(track.holds(each["time_s"]).sum() > 1 for each in signals) else None
 
     def holds(self, times: Array) -> NDArray[np.bool_]:
-        """Which of the times (N,) are in it."""
+        """Whether each of the times (N,) is in the phase."""
         inside: NDArray[np.bool_] = (times >= self.begin_s) & (times <= self.end_s)
         return inside
 
     def within(self, rows: Rows) -> Rows:
-        """The rows in it, sorted, each time once."""
+        """Return the rows in the phase, sorted by time, without repeated times."""
         once = each_once(rows)
         ends = self.begin_s, np.nextafter(self.end_s, math.inf)
         begin, end = np.searchsorted(once["time_s"], ends)
         return once[begin:end]
 
     def shares(self, times: Array) -> Array:
-        """Time (N,) in s for which each sample stands; `times` (N,) must not decrease.
+        """Return the weight (N,) of each sample: the time of the reference in s for which it
+        stands. `times` (N,) must not decrease.
 
-        Between two samples a signal is taken to change linearly: each stands for half of the
-        interval before it and half of the one after it (the trapezoidal rule). So a metric does not
-        depend on how often the signal was sampled, and a gap counts with its length.
+        By the trapezoidal rule a sample stands for half of the interval before it and half of the
+        one after it. So a metric does not depend on how often the signal was sampled, and a gap
+        counts with its length.
         """
         halves = np.diff(np.interp(times, self.times, self._passed_s))
         halves *= 0.5
@@ -101,8 +103,8 @@ class Track:
 
 
 class Reference:
-    """The reference as a function of vehicle time (N,): between two records the quintic through
-    their positions, velocities and accelerations."""
+    """The reference as a function of vehicle time. Between two records it is the quintic polynomial
+    that has their positions, velocities and accelerations."""
 
     def __init__(self, rows: Rows) -> None:
         self._rows, self._times = rows, rows["time_s"]
@@ -110,13 +112,13 @@ class Reference:
 
     @classmethod
     def of(cls, flown: History) -> Reference | None:
-        """None without two records, later ones with later stamps."""
+        """Return the recorded reference of a flight; None if it has fewer than two records."""
         newest = np.maximum.accumulate(flown.reference["time_s"])
         rows = flown.reference[np.diff(newest, prepend=-math.inf) > 0.0]
         return cls(rows) if len(rows) > 1 else None
 
     def position(self, times: Array, derivative: int = 0) -> Array:
-        """(N, 3) position NED in m, or a derivative of it."""
+        """Return the position NED (N, 3) in m at `times` (N,), or its derivative of this order."""
         begins = np.clip(np.searchsorted(self._times, times, "right"), 1, len(self._times) - 1) - 1
         length_s = self._times[begins + 1] - self._times[begins]
         share = (times - self._times[begins]) / length_s
@@ -128,7 +130,7 @@ class Reference:
         return found
 
     def errors(self, rows: Rows, column: str, derivative: int = 0) -> Array:
-        """(N, 3) of a column of `rows`: how far it is from the position or a derivative of it."""
+        """Return a column of `rows` minus the reference position or its derivative, (N, 3)."""
         errors: Array = rows[column] - self.position(rows["time_s"], derivative)
         return errors
 
@@ -136,7 +138,7 @@ class Reference:
         return np.interp(times, self._times, self._heading)
 
     def is_near(self, times: Array) -> NDArray[np.bool_]:
-        """Whether each of the times (N,) is between two records that follow each other."""
+        """Whether each of the times (N,) is between two records that are at most GAP_S apart."""
         place = np.searchsorted(self._times, times)
         gaps_s = np.diff(self._times, prepend=-math.inf, append=math.inf)
         near: NDArray[np.bool_] = gaps_s[place] <= GAP_S
@@ -144,7 +146,7 @@ class Reference:
 
 
 def each_once(rows: Rows) -> Rows:
-    """Rows sorted by time, the first one of equal times."""
+    """Return the rows sorted by time, of rows with equal times only the first."""
     if (np.diff(rows["time_s"]) > 0.0).all():
         return rows
     return rows[np.unique(rows["time_s"], return_index=True)[1]]
@@ -153,11 +155,11 @@ def each_once(rows: Rows) -> Rows:
 # ---------------------------------------------------------------------- the metrics
 
 Measure = Callable[[Rows, Reference], Array]
-Measured = tuple[str, str, Measure]  # pattern of the names, the kinds that take its place
+Measured = tuple[str, str, Measure]  # see `_named`: pattern of the names, kinds; signal
 
 
 def _away(column: str, derivative: int = 0) -> Measure:
-    """Distance from the reference, or from a derivative of it."""
+    """Return a function that computes the distance (N,) from the reference or its derivative."""
     return lambda rows, reference: np.asarray(
         np.linalg.norm(reference.errors(rows, column, derivative), axis=1)
     )
@@ -177,7 +179,7 @@ def _rate(axis: int) -> Measure:
     return lambda rows, _: rows["rates_radps"][:, axis].astype(np.float64)
 
 
-# by array of History
+# array of History -> metrics that are computed from it
 _MEASURED: dict[str, tuple[Measured, ...]] = {
     "position": (
         ("{}_position_m", "rmse mean p95 max", _away("position_ned_m")),
@@ -195,7 +197,7 @@ _MEASURED: dict[str, tuple[Measured, ...]] = {
 
 
 def tracking_metrics(flown: History, track: Track) -> dict[str, float]:
-    """Values of a Score, of the samples in TRACK."""
+    """Return the values of a Score that are computed from the samples in TRACK."""
     fitness = _fitness(flown, track)
     found = fitness | {"mu_e": sum(fitness.values()), "tracked_s": track.tracked_s}
     for array, measures in _MEASURED.items():
@@ -216,7 +218,8 @@ def _measured(rows: Rows, track: Track, measures: Iterable[Measured]) -> dict[st
 
 
 def _fitness(flown: History, track: Track) -> dict[str, float]:
-    """Eqs. 31-32: velocities in the body frame, heading in degrees."""
+    """Return the terms of the paper's fitness, Eqs. 31-32: velocities in the body frame, heading in
+    degrees."""
     ticks, reference = track.times, track.reference
     quaternion = flown.attitude["quaternion"][_nearest(flown.attitude["time_s"], ticks)]
     body = rotation_from_quaternion(quaternion).swapaxes(-1, -2)
@@ -232,10 +235,11 @@ def _fitness(flown: History, track: Track) -> dict[str, float]:
 
 
 def _agitation(flown: History, track: Track) -> dict[str, float]:
-    """Motion beside that of the reference: thrust direction and rates minus their linear fit by
-    the reference's velocity, acceleration and jerk. The fit needs no model of drag and lag.
+    """Return the RMS of the motion that the reference does not explain.
 
-    The factor R of the samples has their residuals.
+    It is what remains of thrust direction and body rates after a linear fit by the reference's
+    velocity, acceleration and jerk. The fit needs no model of drag and lag. Residuals come from the
+    factor R of a QR decomposition of the samples, updated part by part to save memory.
     """
     attitude, reference = track.within(flown.attitude), track.reference
     weights = track.shares(attitude["time_s"])
@@ -265,9 +269,9 @@ def _nearest(stamps: Array, times: Array) -> NDArray[np.intp]:
 
 
 def _named(pattern: str, kinds: str, values: Array, weights: Array) -> dict[str, float]:
-    """Metrics of samples (N,) with the time (N,) for which each stands, by name: `pattern` with
-    each of `kinds` in it. `p95` is not exceeded for 95 % of the time. Samples that stand for no
-    time do not count; empty without others."""
+    """Return metrics of `values` (N,) with `weights` (N,) by name, which is `pattern` with each of
+    `kinds` inserted. `p95` is not exceeded for 95 % of the time. Samples of weight 0 do not count;
+    empty if there are no others."""
     total = float(weights.sum())
     if not total:
         return {}

@@ -1,8 +1,9 @@
-"""The verdict on a flight, from its log alone: was all of it flown, and what ended it.
+"""The verdict on a flight, from its log alone: whether it was completed, and what ended it.
 
-A flight is completed if the whole reference was tracked and the vehicle did not come down to the
-ground meanwhile, nothing else ended it, the vehicle landed, and it was disarmed; one that the pilot
-engaged in the air also if it was given back while it hovered at the end of the reference.
+A flight is completed if the whole reference was tracked, the vehicle did not come down to the
+ground before its landing, nothing ended the flight early, the vehicle landed, and it was disarmed.
+A flight that the pilot engaged in the air is also completed if the pilot took the vehicle back
+while it hovered at the end of the reference.
 """
 
 from __future__ import annotations
@@ -28,13 +29,16 @@ Array = NDArray[np.float64]
 REFERENCE_OVER = "reference over"
 NO_FLIGHT = "no flight of offboard in this log"
 _ON_GROUND = 1  # MAV_LANDED_STATE
-_LOWEST_M = 0.05  # above the take-off point; references are at least 0.3 m above it
+_LOWEST_M = 0.05  # least height above the take-off point; references are at least 0.3 m above it
 _LANDING_ENDS = {"disarmed", "failed", "yielded"}
 
 
 def landing(flown: History) -> tuple[str, float]:
-    """Why the vehicle has not landed, or that it came down to the ground before that, after the
-    climb of a flight with a take-off; empty for neither. And the downward speed at touch-down."""
+    """Return what is wrong with the landing, and the downward speed at touch-down (m/s, or NaN).
+
+    The text says why the vehicle has not landed, or that it came down to the ground between the
+    climb and the landing of a flight with a take-off. It is empty if nothing is wrong.
+    """
     begun, first = begin_times(flown.phases), begin_times(flown.phases[::-1])
     takes_off_s, lands_s = (begun.get(phase, math.inf) for phase in ("takeoff", "land"))
     climbed_s = first.get("join", math.inf)
@@ -46,7 +50,7 @@ def landing(flown: History) -> tuple[str, float]:
         if position.time_s <= takes_off_s:
             takeoff, from_down_m = place, down_m
         elif takeoff and climbed_s <= position.time_s <= lands_s:
-            # a jump may be an error of the estimate, or its correction: the higher one counts
+            # A jump of the estimate may be an error or a correction: the greater height counts
             lowest_m = min(lowest_m, max(takeoff[2] - place[2], from_down_m - down_m))
         if position.time_s <= lands_s:
             continue
@@ -63,7 +67,7 @@ def landing(flown: History) -> tuple[str, float]:
 
 
 def _positions(flown: History) -> Iterator[LocalPosition]:
-    """In the order of time."""
+    """Iterate over the positions in the order of time."""
     order = np.argsort(flown.position["time_s"], kind="stable")
     for part in parts(order):
         for time_s, *_, place, velocity in flown.position[part].tolist():
@@ -71,16 +75,16 @@ def _positions(flown: History) -> Iterator[LocalPosition]:
 
 
 def begin_times(phases: tuple[Event, ...]) -> dict[str, float]:
-    """Vehicle time at which each phase began, the last time of several."""
+    """Return the vehicle time at which each phase began; for a repeated phase the last time."""
     return {event.phase: event.time_s for event in phases}
 
 
 def verdict_metrics(flown: History, skipped_s: float) -> dict[str, Any]:
-    """Values of a Score. `skipped_s`: time of the reference for which nothing was decided.
+    """Return these values of a Score. `skipped_s`: time of the reference without decisions.
 
     completed: 1 or 0, NaN for a log without a flight of `offboard`
-    ended_by: a word or a few
-    touchdown_mps: downward speed before the ground was reached, NaN if it was not
+    ended_by: a few words
+    touchdown_mps: downward speed at touch-down, NaN if the vehicle has not come to rest
     reason: what the flight announced when it left its regular phases, else empty
     """
     names = [event.phase for event in flown.phases]
@@ -106,8 +110,8 @@ def verdict_metrics(flown: History, skipped_s: float) -> dict[str, Any]:
 
 
 def _ended_early(flown: History) -> tuple[str, str]:
-    """What ended the flight, by its phases, and the sentence that announced it; REFERENCE_OVER if
-    they were all gone through."""
+    """Return what ended the flight early, and the sentence that announced it. Without an early end,
+    return REFERENCE_OVER, or the last phase if the reference was never tracked."""
     names = [event.phase for event in flown.phases]
     for event in irregular(flown.phases):
         taken = event.cause == "mode change" and _critical(flown)
@@ -115,7 +119,7 @@ def _ended_early(flown: History) -> tuple[str, str]:
     took_over = [event.what for event in flown.announcements if event.cause == SUPERVISOR]
     if took_over:
         return SUPERVISOR, took_over[0]
-    # what a service has waited for comes before its flight
+    # The log of a service may begin with phases in which it waited
     flight = names[names.index("climb") :] if "climb" in names else []
     if "health" in flight or not _LANDING_ENDS.isdisjoint(flight[:-1]):
         return "the log holds several flights", ""
@@ -125,7 +129,7 @@ def _ended_early(flown: History) -> tuple[str, str]:
 
 
 def irregular(phases: tuple[Event, ...]) -> list[Event]:
-    """The phases in which a flight was ended early, or that followed from it."""
+    """Return the phases with which a flight was ended early, and those that followed from it."""
     if _given_back([event.phase for event in phases]):
         return []
     return [
@@ -138,13 +142,13 @@ def irregular(phases: tuple[Event, ...]) -> list[Event]:
 
 
 def _given_back(names: list[str]) -> bool:
-    """Whether the pilot engaged it in the air, and had the vehicle again, by a mode change or
-    handed back, while it hovered at the end of the reference."""
+    """Whether the pilot engaged the flight in the air and took the vehicle back, by a mode change
+    or after "hand back", while it hovered at the end of the reference."""
     ends = (["hover", "yielded"], ["hover", "hand back", "yielded"])
     return "engage" not in names and any(names[-len(end) :] == end for end in ends)
 
 
 def _critical(flown: History) -> bool:
-    """Whether the newest HEARTBEAT shows a failsafe or an emergency. A flight whose vehicle was
-    taken ends with the first HEARTBEAT since."""
+    """Whether the newest HEARTBEAT shows a failsafe or an emergency. If a mode change ended the
+    flight, the log goes on until the next HEARTBEAT."""
     return bool(len(flown.heartbeat)) and bool(flown.heartbeat["system_status"][-1] >= CRITICAL)
