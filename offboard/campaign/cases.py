@@ -1,6 +1,7 @@
-"""The cases of a campaign: one flight each, as values that a worker anywhere can fly.
+"""The cases of a campaign. A case is one flight as plain values, which a worker on any computer can
+fly.
 
-A case has a key: the hash of all that decides its flight, beside the code.
+The key of a case is a hash of everything except the code that decides its flight.
 """
 
 from __future__ import annotations
@@ -28,21 +29,22 @@ from offboard.documents.reading import override, read
 from offboard.run.configuration import FlightConfig, load
 from offboard.run.flight import Simulated
 
-SEED = "seed"  # a range of this name is that of the flight's seed: noise, and the phase of gusts
-SCENARIO = "scenario."  # of a key of the scenario
-CONNECTED = "connected"  # the scenario of the vehicle at a link
-OWN_SCENARIOS = {"px4": "px4_like", "ardupilot": "ardupilot_like"}  # where a file names none
+SEED = "seed"  # a range of this name is a range of the flight's seed, which decides noise and gusts
+SCENARIO = "scenario."  # prefix of a key of the scenario
+CONNECTED = "connected"  # name of the scenario in tables if a vehicle at a link is flown
+OWN_SCENARIOS = {"px4": "px4_like", "ardupilot": "ardupilot_like"}  # if a file names none
 FILES = ("config", "controller", "reference", "vehicle", "sim_vehicle", "scenario")
-DIGITS = 5  # of a drawn or searched value, so that files and commands stay short
+DIGITS = 5  # significant digits of a drawn or searched value, to keep files and commands short
 Values = tuple[tuple[str, Any], ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One flight of a campaign. None: the default of `config`, or of the firmware.
+    """One flight of a campaign. A name that is None is the default of `config` or of the firmware.
 
-    `values` are what parameters and draws set, by key; `files` holds a hash of every file that is
-    not shipped. With `link` (an address), the vehicle at it is flown instead of the simulator.
+    `values` are the values that parameters and draws set, by key; `files` holds a hash of every
+    file that is not shipped. If `link` (an address) is given, the vehicle there is flown instead of
+    the simulator.
     """
 
     config: str
@@ -65,7 +67,7 @@ class Case:
 
     @property
     def assignments(self) -> tuple[str, ...]:
-        """What `--set` sets."""
+        """The arguments of `--set`."""
         return tuple(
             f"{key}={json.dumps(value)}"
             for key, value in self.values
@@ -81,21 +83,21 @@ class Case:
 
     @property
     def scenario_text(self) -> str:
-        """YAML of the scenario with what `values` set in it; empty where they set nothing. Raises
-        DocumentError."""
+        """YAML of the scenario with the changes that `values` make to it; empty if they change
+        nothing. Raises DocumentError."""
         changes = [(key, value) for key, value in self.values if key.startswith(SCENARIO)]
         return _changed(self.scenario, json.dumps(changes)) if changes else ""
 
     @property
     def scenario_file(self) -> str:
-        """Name of the file that holds `scenario_text`, by its content; empty without one."""
+        """Name of the file for `scenario_text`, with a hash of the text; empty without text."""
         text = self.scenario_text
         return f"scenarios/{Path(self.scenario).stem}-{_hash(text)[:10]}.yaml" if text else ""
 
     @property
     def line(self) -> str:
-        """The command that flies the case again, from the directory of the campaign; at a link with
-        the same --system and --signing-key, which are no part of the case."""
+        """The command that flies the case again, from the directory of the campaign. At a link it
+        also needs the same --system and --signing-key, which are no part of the case."""
         named = {
             "config": self.config if self.config != "flight" else None,
             "controller": self.controller,
@@ -114,8 +116,8 @@ class Case:
         return shlex.join([*words, "--seed", str(self.seed)])
 
     def load(self) -> FlightConfig:
-        """What is flown. At a link, an armed vehicle is refused unless a value sets
-        limits.begin_armed: somebody else is flying it. Raises DocumentError."""
+        """Return the configuration of the flight. At a link an armed vehicle, which somebody else
+        is flying, is refused unless a value sets limits.begin_armed. Raises DocumentError."""
         disarmed = ("limits.begin_armed=false",) if self.link else ()
         return load(
             self.config,
@@ -126,13 +128,13 @@ class Case:
         )
 
     def simulated(self, scenario: str | None = None) -> Simulated:
-        """The simulated vehicle of the case, in `scenario`. Raises DocumentError."""
+        """Return the simulated vehicle of the case in `scenario`. Raises DocumentError."""
         return Simulated(self.firmware, scenario, self.sim_vehicle)
 
 
 def expand(file: CampaignFile, link: str | None = None) -> list[Case]:
-    """All cases of a campaign, in the order of its table; with `link`, at that address. Raises
-    DocumentError."""
+    """Return all cases of a campaign in the order of its table. `link`: address of the vehicle to
+    fly instead of the simulator. Raises DocumentError."""
     if SEED in file.parameters:
         raise DocumentError("parameters.seed: give the seeds with seeds")
     columns = [[(key, value) for value in values] for key, values in file.parameters.items()]
@@ -153,7 +155,8 @@ def expand(file: CampaignFile, link: str | None = None) -> list[Case]:
 
 
 def base_cases(file: CampaignFile, link: str | None = None) -> Iterator[Case]:
-    """Every combination of names, without parameters, with the first seed. Raises DocumentError."""
+    """Iterate over every combination of names, without parameters and with the first seed. Raises
+    DocumentError."""
     for firmware in file.firmwares:
         for reference, scenario, controller, vehicle, sim_vehicle in itertools.product(
             file.references or (None,),
@@ -170,15 +173,15 @@ def base_cases(file: CampaignFile, link: str | None = None) -> Iterator[Case]:
 
 
 def drawn(sample: Sample) -> list[Values]:
-    """The points of a sample."""
+    """Return the points of a sample."""
     cube = qmc.LatinHypercube(len(sample.ranges), rng=np.random.default_rng(sample.seed))
     points = qmc.scale(cube.random(sample.draws), *zip(*sample.ranges.values(), strict=True))
     return [tuple(zip(sample.ranges, plain(each, DIGITS), strict=True)) for each in points.tolist()]
 
 
 def _digests(case: Case) -> tuple[tuple[str, str], ...]:
-    """A hash of each file that the case names, and of the flight that files make, which may name
-    files in turn. Raises DocumentError for one that is missing."""
+    """Return a hash of each file that the case names. If there are any, add a hash of the resolved
+    configuration, because files may name other files. Raises DocumentError for a missing file."""
     found = []
     for part in FILES:
         name = getattr(case, part)
@@ -192,7 +195,7 @@ def _digests(case: Case) -> tuple[tuple[str, str], ...]:
             if name not in laws:
                 shipped.locate(name, kind, laws)
     if found:
-        with suppress(DocumentError):  # of a flight that cannot be flown: it becomes a row
+        with suppress(DocumentError):  # a case that cannot be flown becomes a row of the table
             found.append(("flight", _hash(case.load().model_dump_json())))
     return tuple(found)
 
@@ -208,7 +211,7 @@ def _hash(text: str) -> str:
 
 @cache
 def _changed(scenario: str, changes: str) -> str:
-    """The YAML of a scenario with values by key, which are given as JSON."""
+    """Return the YAML of a scenario with `changes`, a JSON list of keys and values."""
     text = shipped.read_text(shipped.locate(scenario, "scenario"))
     raw = read(text, f"scenario {scenario}")
     for key, value in json.loads(changes):

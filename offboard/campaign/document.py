@@ -1,12 +1,11 @@
-"""The file of a campaign: what is flown, as a grid, a sample of declared ranges, or both.
+"""The file of a campaign: which flights are flown, as a grid, a sample of ranges, or both.
 
     controllers: [pso, lqr]
     references: [lemniscate]
     scenarios: [calm, px4_like]
     seeds: 5
 
-A key of `parameters` and of ranges is that of `--set`; after `scenario.` it is a key of the
-scenario.
+Keys of `parameters` and ranges are those of `--set`; `scenario.KEY` is a key of the scenario.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ def _requirement(text: str) -> str:
 
 
 def _counted(seeds: Any) -> Any:
-    """1 .. N of a number N."""
+    """Return the seeds 1 to N for a number N; a list as it is."""
     if type(seeds) is not int:
         return tuple(seeds) if isinstance(seeds, list) else seeds
     if not 1 <= seeds <= SEEDS_MOST:
@@ -62,7 +61,7 @@ Ranges = Annotated[dict[Key, Ends], Field(min_length=1)]
 
 
 class Promises(Parameters):
-    """Limits that a flight must keep; see `flight` for the margin to each."""
+    """Limits that a flight must keep. `campaign.flight` defines the margin to each of them."""
 
     error_m: float = Field(default=0.5, gt=0, le=100)
     tilt_deg: float = Field(default=60.0, gt=0, le=90)
@@ -73,7 +72,7 @@ class Promises(Parameters):
 
 
 class Sample(Parameters):
-    """`draws` points of the ranges (Latin hypercube), drawn with `seed`."""
+    """A sample of `draws` points within `ranges`, drawn as a Latin hypercube with `seed`."""
 
     draws: int = Field(ge=1, le=100_000)
     seed: Seed = 1
@@ -81,11 +80,12 @@ class Sample(Parameters):
 
 
 class Search(Parameters):
-    """Search for failures (`--worst`) over `ranges`: `flights` for the search, with `seed`.
+    """A search for failures (`--worst`) within `ranges`, with `flights` flights and `seed`.
 
-    `defaults` are the values of an undisturbed flight, to which a failure is reduced; without one,
-    0 if it is within the range, else its middle. A range named `seed` is that of the flight's seed:
-    noise, and the phase of gusts. Each failure is flown again with `seeds` seeds.
+    `defaults` are the values of an undisturbed flight, to which the values of a failure are reset
+    one by one. A default that is not given is 0 if that is within the range, else the middle of the
+    range. A range named `seed` is a range of the flight's seed, which decides noise and gusts. Each
+    failure is flown again with `seeds` other seeds.
     """
 
     ranges: Ranges
@@ -106,11 +106,11 @@ class Search(Parameters):
 
 
 class CampaignFile(Parameters):
-    """A campaign. Lists are combined, every combination with every draw and every seed.
+    """A campaign. It flies every combination of the lists with every draw and every seed.
 
     Without controllers, references or vehicles, those of `config` are flown; without scenarios, the
-    firmware's own. `require` is what a flight must meet beside being completed, `promises` what the
-    margin is measured against; `keep` keeps the log of each flight.
+    firmware's own. `require` are the requirements that a completed flight must meet, `promises` the
+    limits to which the margin is measured. `keep`: whether to keep the log of each flight.
     """
 
     config: Name = "flight"

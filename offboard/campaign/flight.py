@@ -1,19 +1,19 @@
-"""One case flown in a worker: in memory, in lockstep, scored from its log.
+"""Flies one case in a worker, in memory and in lockstep, and scores it from its log.
 
-The flight is that of `offboard fly --sitl` with the same options, byte for byte. A record of any
-other flight is made in the same way (`recorded`).
+The flight is the same as that of `offboard fly --sitl` with the same options, byte for byte. The
+record of a flight at a link is made in the same way (`recorded`).
 
-The robustness margin of a flight: how far it stayed from breaking a promise. Each term is 1 where
-nothing of its limit was used, 0 at the limit, and negative beyond it. The margin is the least of
-them; it is at most `NOT_COMPLETED` for a flight that was not completed (landed early, handed back,
-crashed).
+The robustness margin of a flight says how far it stayed from breaking a promise. Each term is 1 if
+none of its limit was used (clearance: at twice the limit), 0 at the limit, and negative beyond it.
+The margin is the smallest term. It is at most `NOT_COMPLETED` if the flight was not completed
+(landed early, handed back, crashed).
 
-| term | of | limit |
+| term | measured value | limit |
 |---|---|---|
 | error | largest position error while tracking, as the vehicle estimates it | `error_m` |
 | tilt | largest tilt while tracking | `tilt_deg` |
 | clearance | least true distance to the controller's keep-out volumes | `clearance_m` |
-| age | age of telemetry while tracking (link delay, 99th percentile) | `age_s` |
+| age | round-trip delay of the link (TIMESYNC) in the whole flight, 99th percentile | `age_s` |
 | authority | share of decisions at a limit of control law or vehicle | `at_bound` |
 | touchdown | downward speed at touch-down | `touchdown_mps` |
 """
@@ -46,15 +46,15 @@ from offboard.run.flight import fly
 from offboard.run.sitl import InMemorySimulator
 
 NOT_COMPLETED = -1.0
-NOT_FLOWN = -2.0  # no log, or a flight that never began
-LOWEST = -9.0  # terms are cut here, so that a divergence does not hide all others
+NOT_FLOWN = -2.0  # margin of a case that could not be flown, or whose process crashed
+LOWEST = -9.0  # terms are limited to this, so that one diverged flight does not hide all others
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A case with what its worker needs. `code` is the campaign's; `kept`: the directory for the
-    log, which is otherwise deleted. It appears when the flight is complete, and stays if it exists
-    already."""
+    """A case and what its worker needs to fly it. `code` is the hash of the campaign's code. `kept`
+    is the directory for the log; without it the log is deleted. The directory is created when the
+    flight is complete; one that exists already is not changed."""
 
     case: Case
     promises: Promises
@@ -63,7 +63,7 @@ class Job:
 
 
 def fly_job(job: Job) -> Record:
-    """Fly a case. A flight that fails is a record too. Raises UserError."""
+    """Fly a case and return its record, also if the flight fails. Raises UserError."""
     if code_hash() != job.code:
         raise UserError(
             f"a worker runs other code ({code_hash()}) than this campaign ({job.code}); install "
@@ -84,11 +84,11 @@ def fly_job(job: Job) -> Record:
 
 
 def recorded(job: Job, directory: Path, fly: Callable[[FlightConfig, Path], Outcome]) -> Record:
-    """The record of a flight from its log, with score.json beside the log.
+    """Fly a case by `fly`, score its log, write score.json beside the log, and return the record.
 
-    `fly` flies the configuration of the case, and logs it in `directory`. A flight that fails is a
-    record too. Raises UserError where none can be flown or recorded now, for example for lack of
-    memory, or of the link.
+    `fly` flies a configuration and writes its log into a directory. A flight that fails has a
+    record, too. Raises UserError if no flight can be flown or recorded at present, for example for
+    lack of memory or of the link.
     """
     try:
         config = job.case.load()
@@ -98,7 +98,7 @@ def recorded(job: Job, directory: Path, fly: Callable[[FlightConfig, Path], Outc
         raise UserError(f"no flight can be flown here: {str(error) or 'out of memory'}") from None
     except UserError as error:
         if not (isinstance(error, DocumentError) and error.code == DocumentError.code):
-            raise  # it is not the case that is wrong
+            raise  # the cause is not the case, so that no other case could be flown either
         sentence = " ".join(str(error).split())
         return Record(ExitCode.USAGE, sentence, NOT_FLOWN, INFEASIBLE)
     except Exception as error:
@@ -129,7 +129,7 @@ def _fly(case: Case, scratch: Path, config: FlightConfig, directory: Path) -> Ou
         directory,
         case.simulated(scenario),
         simulator=InMemorySimulator(),
-        stops=StopRequests(),  # not entered: signals are the main process's
+        stops=StopRequests(),  # not entered: only the main process handles signals
     )
     if outcome.log_problem:
         raise LogError(outcome.log_problem)
@@ -142,7 +142,7 @@ def terms(
     flown: History,
     controller: ControllerSettings,
 ) -> dict[str, float]:
-    """The terms by name; without those that the log does not hold."""
+    """Return the terms of the margin by name, without those for which the log has no data."""
     used = {
         "error": metrics["max_position_m"] / promises.error_m,
         "tilt": metrics["tilt_max_deg"] / promises.tilt_deg,
@@ -162,7 +162,8 @@ def terms(
 
 
 def _clearance(flown: History, controller: ControllerSettings) -> float:
-    """Least true distance to a keep-out volume in metres, NaN without volumes or positions."""
+    """Return the least distance to a keep-out volume in metres since TRACK began; NaN without
+    volumes or positions. By true positions, or estimated ones if the log has no true ones."""
     volumes = getattr(controller, "keep_out", ())
     begun_s = begin_times(flown.phases[::-1]).get("track")
     path = flown.truth if len(flown.truth) else flown.position

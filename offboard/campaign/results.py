@@ -1,5 +1,5 @@
 """The results of a campaign: one JSON file per finished flight, DIR/results/CODE/CASE.json. CODE is
-a hash of the code that flies: results of other code are never mixed with ours."""
+a hash of the code that flies, so that results of different code are never mixed."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from offboard.documents.errors import UserError
 from offboard.link.log import replace_file
 from offboard.run.sitl import registered
 
-# of plans, whose flights are hashed case by case
+# Folders of campaign and tuning files, which are not part of the code: each case has its own hash
 PLANS = {shipped.folder(kind).name for kind in ("campaign", "tuning")}
 PACKAGES = ("numpy", "scipy", "numba", "pymavlink", "daqp", "control")
 INFEASIBLE = "infeasible"
@@ -25,8 +25,8 @@ INFEASIBLE = "infeasible"
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """The end of a flight. `margin` and its smallest term are those of `campaign.flight`;
-    `figures` are the metrics of the score, without NaN."""
+    """The result of a flight. `margin` and the name of its smallest term, `weakest`, are defined in
+    `campaign.flight`; `figures` are the metrics of the score, without NaN."""
 
     exit_code: int
     sentence: str
@@ -40,7 +40,7 @@ class Record:
 
     @property
     def infeasible(self) -> bool:
-        """Nothing was flown: the configuration cannot be."""
+        """Whether nothing was flown because the configuration cannot be flown."""
         return self.weakest == INFEASIBLE
 
     @property
@@ -49,9 +49,9 @@ class Record:
 
 
 class Results:
-    """The results of one code in a directory.
+    """The results in a directory that were flown by one code, given by its hash.
 
-    Opening them raises UserError where the directory cannot be written, or holds the results of
+    The constructor raises UserError if the directory cannot be written, or holds the results of
     other code.
     """
 
@@ -72,7 +72,7 @@ class Results:
             ) from None
 
     def get(self, key: str) -> Record | None:
-        """The record of a finished case, else None."""
+        """Return the record of a finished case, else None."""
         try:
             raw = json.loads((self._folder / f"{key}.json").read_text(encoding="utf-8"))
             return Record(**raw)
@@ -84,11 +84,11 @@ class Results:
         self.write(self._folder / f"{key}.json", json.dumps(asdict(record), sort_keys=True))
 
     def finished(self) -> int:
-        """The number of finished flights in the folder."""
+        """Return the number of finished flights in the folder."""
         return sum(1 for _ in self._folder.glob("*.json"))
 
     def write(self, path: Path, text: str) -> None:
-        """Write a file of the campaign, whole or not at all. Raises UserError."""
+        """Write a file of the campaign, either completely or not at all. Raises UserError."""
         try:
             replace_file(path, text)
         except OSError as error:
@@ -99,8 +99,8 @@ class Results:
 
 @cache
 def code_hash() -> str:
-    """Hash of the sources of controller and simulator, of the shipped configuration and of the
-    versions of what computes; 12 hexadecimal digits."""
+    """Return a hash of the sources of controller and simulator, the shipped configuration, and the
+    versions of Python and of the packages in PACKAGES; 12 hexadecimal digits."""
     digest = hashlib.sha256(platform.python_version().encode())
     for package in PACKAGES:
         digest.update(f" {package} {version(package)}".encode())

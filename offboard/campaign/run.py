@@ -1,6 +1,6 @@
-"""A campaign flown: plan, fly what is not finished, write table and page from the folder of results
-alone, in the order of the plan. `compare`, `--worst` and `tune` fly their cases in the same way
-(`flying`)."""
+"""Flies a campaign: plans the cases, flies those that are not finished, and writes table and page
+from the folder of results alone, in the order of the plan. `compare`, `--worst` and `tune` fly
+their cases by the same function (`flying`)."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ from offboard.link.stop import StopRequests
 from offboard.run.flight import build
 from offboard.run.sitl import check_scenario
 
-TABLES = ("campaign.csv", "campaign.html", "worst.csv")  # that are replaced as flights end
+TABLES = ("campaign.csv", "campaign.html", "worst.csv")  # files that a campaign overwrites
 KEPT = "flights"  # directory of the logs that are kept
 KEPT_FILES = {"report": "report.html", "log": "flight.tlog"}
-TABLE_S = 5.0  # at least, from one table to the next
-TABLE_SHARE = 0.02  # of the time is for tables while it flies
+TABLE_S = 5.0  # least time between two tables while flights run
+TABLE_SHARE = 0.02  # greatest share of the time that is spent on tables while flights run
 INTERRUPTED = "interrupted: flights in the air are finished; interrupt again to exit at once"
 LINES = 20
 Fly = Callable[[Sequence[Case]], list[Record]]  # see `flying`
 
 
 class Incomplete(UserError):
-    """No further flight begins, for this `reason`, and the same command may go on."""
+    """No further flight begins, for this `reason`; the same command can continue later."""
 
     def __init__(self, reason: str = "interrupted") -> None:
         super().__init__(f"{reason}: run the same command again to go on", 4)
@@ -45,9 +45,9 @@ class Incomplete(UserError):
 
 
 class Progress(Status):
-    """Context manager that shows how many of at most `planned` flights have ended, how fast, and
-    how long the rest takes: one line in place on a terminal, else a line at the beginning and for
-    every twentieth of them."""
+    """Context manager that shows how many of at most `planned` flights have ended, the rate, and
+    the time left. On a terminal this is one line that is updated; otherwise a line is printed at
+    the beginning and after each twentieth part of the flights."""
 
     def __init__(self, console: Console, planned: int = 0) -> None:
         super().__init__("", console=console)
@@ -57,14 +57,14 @@ class Progress(Status):
         self._known = self._flown = 0
 
     def begin(self, known: int) -> None:
-        """`known` further flights have been flown by an earlier run."""
+        """Add `known` flights that an earlier run has flown."""
         self._known += known
         if not self._flown:
             already = f", {self._known} already flown" if self._known else ""
             self._show(f"{counted(self.planned, 'flight')}{already}")
 
     def flight_ended(self) -> None:
-        """A flight has ended."""
+        """Count a flight that has ended, and update the line."""
         self._flown += 1
         done = self._known + self._flown
         self.planned = max(self.planned, done)
@@ -74,7 +74,7 @@ class Progress(Status):
             self._show(f"{done} of {self.planned} flights, {rate:.0f} a minute, {left} left")
 
     def ending(self, stops: StopRequests) -> bool:
-        """Whether a stop was requested, which is then said, once."""
+        """Return whether a stop was requested. The first time, print that it was."""
         if stops.requested and not self._announced:
             self._announced = True
             self.console.print(INTERRUPTED)
@@ -88,7 +88,7 @@ class Progress(Status):
 
 
 def remaining(seconds: float) -> str:
-    """A duration in the largest unit that gives two figures."""
+    """Return a duration as text, in the largest unit of s, min and h that gives two digits."""
     if seconds < 100.0:
         return f"{seconds:.0f} s"
     minutes = seconds / 60.0
@@ -105,18 +105,20 @@ def flying(
     keep: Path | None = None,
     written: Callable[[], None] = lambda: None,
 ) -> Iterator[Fly]:
-    """A function that flies cases: what is in the folder of results is not flown again.
+    """Context manager that gives a function which flies cases.
 
-    It returns their records in their order. It raises Incomplete when one is missing, and UserError
-    where no flight can begin. `open_flyer` is entered when the first case is missing. With `keep`,
-    a directory, the log of each flight is kept in it. `written` is called after each flight.
+    The function flies the cases that are not in the folder of results yet, and returns the records
+    of all in their order. It raises Incomplete if one is missing, and UserError if no flight can
+    begin. `open_flyer` is entered when the first flight is needed. `keep` is a directory in which
+    the log of each flight is kept. `written` is called after each flight.
     """
     folder = keep.absolute() if keep else None
     opened: list[Flyer] = []
-    seen: set[str] = set()  # keys
+    seen: set[str] = set()  # keys of the cases of earlier calls
 
     def is_done(case: Case, record: Record | None) -> bool:
-        """With its log where logs are kept; the same seed gives the same flight again."""
+        """Whether a case need not be flown. If logs are kept, a flight without its log is flown
+        again; the same seed gives the same flight. A case that was never flown has no log."""
         if record is None or folder is None or not record.figures:
             return record is not None
         return (folder / case.folder).exists()
@@ -154,8 +156,9 @@ def flying(
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """The state of a campaign. `mine_missing` of this shard; `stopped`: why no further flight
-    began, empty if all did; `kept`: the directories of the flights whose logs are kept."""
+    """The state of a campaign. `mine_missing` is the number of missing flights of this shard;
+    `stopped` says why no further flight began, empty if all did; `kept` are the directories of the
+    flights whose logs are kept."""
 
     planned: int
     rows: Sequence[Row]
@@ -173,10 +176,10 @@ class Summary:
 
 
 class Campaign:
-    """The campaign of a file in a directory, on the simulator or at `link`.
+    """A campaign with its directory, flown on the simulator or at `link`. `source` names the file.
 
-    Raises DocumentError where nothing of it can be flown and UserError for a directory that cannot
-    be used, before the first flight.
+    The constructor raises DocumentError if no case can be flown, and UserError if the directory
+    cannot be used.
     """
 
     def __init__(
@@ -203,15 +206,15 @@ class Campaign:
         self._next_table_s = 0.0
 
     def flying(self, open_flyer: OpenFlyer, progress: Progress) -> AbstractContextManager[Fly]:
-        """What flies cases for this campaign, and writes table and page while it does."""
+        """Return `flying` for this campaign; it also writes table and page while flights run."""
         keep = self.directory / KEPT if self.file.keep else None
         return flying(
             self.results, self.file.promises, open_flyer, progress, keep=keep, written=self._written
         )
 
     def fly(self, open_flyer: OpenFlyer, console: Console, shard: slice = slice(None)) -> Summary:
-        """Fly what is not finished and write the table. `shard`: the cases that are flown here.
-        Raises UserError where no worker can be had."""
+        """Fly the cases that are not finished, and write table and page. `shard` selects the cases
+        that this process flies. Raises UserError if no worker can be started."""
         mine = self.cases[shard]
         stopped = ""
         try:
@@ -221,7 +224,8 @@ class Campaign:
             stopped = error.reason
         finished = -1
         try:
-            while finished != self.results.finished():  # another shard may have ended meanwhile
+            # again if another shard has finished flights in the meantime
+            while finished != self.results.finished():
                 finished = self.results.finished()
                 rows = self.rows()
                 self.write(rows, stopped)
@@ -234,19 +238,19 @@ class Campaign:
         return Summary(len(self.cases), rows, missing, stopped, kept)
 
     def rows(self) -> list[Row]:
-        """The finished flights of all shards, in the order of the plan."""
+        """Return the finished flights of all shards, in the order of the plan."""
         found = ((case, self.results.get(case.key)) for case in self.cases)
         return [row_of(case, record, self._requirements) for case, record in found if record]
 
     @property
     def drawn(self) -> frozenset[str]:
-        """The keys whose values are drawn or searched: they make no groups."""
+        """The keys whose values are drawn or searched; flights are not grouped by them."""
         parts = (self.file.sample, self.file.search)
         keys = frozenset(key for part in parts if part for key in part.ranges)
         return keys - self.file.parameters.keys()
 
     def write(self, rows: Sequence[Row], stopped: str = "") -> None:
-        """Write table and page."""
+        """Write table, page and changed scenarios."""
         write = self.results.write
         for case in self.cases:
             if (name := case.scenario_file) and not (path := self.directory / name).exists():
@@ -259,13 +263,13 @@ class Campaign:
         write(self.directory / "campaign.html", text)
 
     def _links(self, row: Row) -> dict[str, str]:
-        """Files of a kept flight by name, relative to the page."""
+        """Return the files of a kept flight by name; paths are relative to the page."""
         folder = Path(KEPT, row.case.folder)
         paths = {name: folder / file for name, file in KEPT_FILES.items()}
         return {name: str(path) for name, path in paths.items() if (self.directory / path).exists()}
 
     def _written(self) -> None:
-        """Write what is known, rarely enough that it does not delay the flights."""
+        """Write table and page, but rarely enough not to delay the flights."""
         now_s = clock.monotonic_s()
         if now_s >= self._next_table_s:
             self.write(self.rows())
@@ -274,8 +278,8 @@ class Campaign:
 
 
 def check(cases: Sequence[Case]) -> None:
-    """Raise DocumentError if none of the cases can be flown, with what is wrong. A single one that
-    cannot is no error: it becomes a row with its reason."""
+    """Raise DocumentError with all problems if none of the cases can be flown. If only some cannot,
+    that is no error: each becomes a row with its reason."""
     distinct: dict[object, Case] = {}
     for case in cases:
         names = replace(case, values=(), seed=0)

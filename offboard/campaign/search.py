@@ -1,10 +1,10 @@
 """Search over cases: the study behind `--worst` and `tune`, and the failures that `--worst` finds.
 
-Failures: flights that break a promise, differ, and are as simple as possible. The budget is spent
-in rounds; a round is kept away from the failures of the rounds before it. Of the flights with a
-negative margin, worst first, each is reduced: values return to their defaults one by one, as long
-as the flight still fails. What remains is its kind: the weakest term and the values that had to be
-changed. The first K kinds are flown at more seeds.
+`--worst` searches for flights that break a promise, in different ways and by as few changed values
+as possible. The flights are divided into rounds; a penalty keeps a round away from the failures of
+earlier rounds. Then flights with a negative margin are reduced, the worst ones first: each value is
+reset to its default, and stays there if the flight still fails. The weakest term and the values
+that remain changed are the kind of the failure. The first K kinds are flown with more seeds.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from offboard.documents.errors import DocumentError, UserError, install, naming,
 if TYPE_CHECKING:
     import optuna
 
-Point = Mapping[str, float]  # a value within each range
-BATCH = 20  # flights between two answers of the study
+Point = Mapping[str, float]  # key of a range -> value within it
+BATCH = 20  # flights asked of the study before it is told their costs
 ROUNDS = 4
-AVOIDED = 6  # failures that a round is kept away from
-NEAR = 0.25  # of a range (root mean square): values that are nearer to a failure are penalised
-PENALTY = 2.0
-NO_FAILURE = 1.0  # greatest margin: of values that cannot be flown, which are no failure
-CANDIDATES = 3  # failures that are reduced, per failure that is wanted
+AVOIDED = 6  # number of failures that a round avoids
+NEAR = 0.25  # distance to a failure below which values are penalised (RMS of shares of the ranges)
+PENALTY = 2.0  # added to the cost at the failure, less with distance
+NO_FAILURE = 1.0  # cost of values that cannot be flown, which are no failure: the greatest margin
+CANDIDATES = 3  # failures that are reduced per failure that is wanted
 
 
 def study_of(seed: int) -> optuna.Study:
-    """A study of optuna, which minimises. Raises UserError without optuna."""
+    """Create a study of optuna that minimises. Raises UserError without optuna."""
     try:
         import optuna
     except ImportError:
@@ -46,8 +46,8 @@ def study_of(seed: int) -> optuna.Study:
 
 
 def ask(study: optuna.Study, ranges: Mapping[str, Ends]) -> tuple[optuna.Trial, dict[str, float]]:
-    """The next values to try within `ranges` (key -> lowest, highest), and the trial that is to be
-    told what they cost."""
+    """Return the trial and the values to try next, within `ranges` (key -> lowest, highest). The
+    caller tells the study the cost of the trial."""
     trial = study.ask()
     asked = {key: trial.suggest_float(key, *ends) for key, ends in ranges.items()}
     return trial, plain(asked, DIGITS)
@@ -55,7 +55,7 @@ def ask(study: optuna.Study, ranges: Mapping[str, Ends]) -> tuple[optuna.Trial, 
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """A failure that was reduced. `changed` holds its values that are not defaults; `failing` of
+    """A reduced failure. `changed` are the values that differ from their defaults; `failing` of
     `seeds` flights with other seeds fail, too."""
 
     case: Case
@@ -70,10 +70,10 @@ class Failure:
 
 
 class FailureSearch:
-    """The search of a campaign, whose file is `source`, around its one combination.
+    """A search for failures around the only combination of a campaign. `source` names its file.
 
-    Raises DocumentError where the file declares no search, or more than one combination, and
-    UserError without optuna.
+    The constructor raises DocumentError if the file declares no search or more than one
+    combination, and UserError without optuna.
     """
 
     def __init__(self, campaign: Campaign, source: str) -> None:
@@ -88,15 +88,15 @@ class FailureSearch:
         self._campaign = campaign
         self._base, self._search = campaign.cases[0], campaign.file.search
         ranges, seed = self._search.ranges, self._search.seed
-        # all before the first flight: a study needs a package
+        # created before the first flight, so that a missing optuna is reported at once
         self._studies = [study_of(seed + 1000 * n) for n in range(ROUNDS)]
         middle = {key: (low + high) / 2 for key, (low, high) in ranges.items()}
         with naming(source):
             check([self._case(plain(middle, DIGITS))])
 
     def find(self, count: int, fly_cases: Fly) -> list[Failure]:
-        """The `count` worst failures that differ; writes worst.csv, and table and page of all
-        flights. Raises Incomplete, or UserError."""
+        """Return the worst failures of up to `count` different kinds. Writes worst.csv, and table
+        and page of all flights. Raises Incomplete or UserError."""
         campaign, flown = self._campaign, dict[str, Case]()
 
         def fly(cases: Sequence[Case]) -> list[Record]:
@@ -113,13 +113,13 @@ class FailureSearch:
         return found
 
     def flights_most(self, count: int) -> int:
-        """The flights that `find` takes at most."""
+        """Return the greatest number of flights that `find` needs."""
         ranges, seeds = len(self._search.ranges), self._search.seeds
         return self._search.flights + count * (CANDIDATES * (1 + ranges) + seeds)
 
     def _flown(self, fly: Fly) -> list[tuple[Point, Record]]:
-        """All values that are flown, with their records. Each round has a study of its own and is
-        kept away from the failures of the rounds before it."""
+        """Fly all rounds of the search, each with its own study, and return the values with their
+        records."""
         flown: list[tuple[Point, Record]] = []
         for study in self._studies:
             failures = self._worst(flown, AVOIDED)
@@ -133,7 +133,8 @@ class FailureSearch:
         return flown
 
     def _worst(self, flown: Sequence[tuple[Point, Record]], count: int) -> list[Point]:
-        """The worst failures that are not near each other."""
+        """Return the worst failures. Of failures with the same weakest term that are near each
+        other, return only the worst."""
         chosen: list[tuple[Point, Record]] = []
         for values, record in sorted(flown, key=lambda each: each[1].margin):
             near = any(
@@ -145,12 +146,12 @@ class FailureSearch:
         return [values for values, _ in chosen]
 
     def _share(self, key: str, change: float) -> float:
-        """A change of a value as a share of its range."""
+        """Return a change of a value as a share of its range."""
         low, high = self._search.ranges[key]
         return change / (high - low)
 
     def _distance(self, values: Point, other: Point) -> float:
-        """Root mean square of the differences, as shares of the ranges."""
+        """Return the root mean square of the differences, as shares of the ranges."""
         shares = [self._share(key, value - other[key]) for key, value in values.items()]
         return math.hypot(*shares) / math.sqrt(len(shares))
 
@@ -159,8 +160,8 @@ class FailureSearch:
         return PENALTY * max(0.0, 1.0 - nearest / NEAR)
 
     def _reduced(self, points: Sequence[Point], fly: Fly) -> list[Failure]:
-        """The failures at `points`, reduced side by side: values return to their defaults, those
-        that are nearest to them first, as long as the flight still fails."""
+        """Reduce the failures at `points`, all in parallel: reset one value after the other to its
+        default, those nearest to it first, and keep the default if the flight still fails."""
         defaults, reduced = self._defaults(), [*points]
 
         def order(point: Point) -> list[str]:
@@ -182,7 +183,7 @@ class FailureSearch:
         return found
 
     def _at_seeds(self, failures: Sequence[Failure], fly: Fly) -> list[Failure]:
-        """The failures, each flown at `seeds` more seeds."""
+        """Fly each failure with further seeds, and return the failures with the results."""
         found = []
         for failure in failures:
             case = failure.case
@@ -209,7 +210,7 @@ class FailureSearch:
 
 
 def as_csv(failures: Sequence[Failure]) -> str:
-    """The failures as CSV, the worst first."""
+    """Return the failures as CSV, the worst first."""
     return csv_of(
         {
             "margin": [each.record.margin for each in failures],

@@ -1,8 +1,10 @@
 """The table of a campaign: one row per flight as CSV, and groups of flights for the terminal and
-for the page, which has plots by block, a table, and the worst flights.
+for the page. The page has plots by block, a table, and the worst flights.
 
-The CSV has no metric that a clock decides: it is the same bytes however the flights were flown.
-A group is the flights of one combination: they differ in seed and draw only.
+The CSV leaves out the metrics that are measured with this computer's clock, so that it is the same,
+byte for byte, however the flights were flown. A group consists of the flights of one combination,
+which differ only in seed and draw. A block consists of the groups that are compared: they have the
+same reference, scenario, vehicles and firmware.
 """
 
 from __future__ import annotations
@@ -35,12 +37,12 @@ CASE_COLUMNS = ("controller", "reference", "scenario", "vehicle", "sim_vehicle",
 METRIC_COLUMNS = tuple(name for name, about in METRICS.items() if not about["wall"])
 CONFIDENCE = 0.95
 ERROR = "rmse_position_m"
-EQUAL_SHARE = 0.01  # medians that are closer than this share of the best are equal
+EQUAL_SHARE = 0.01  # medians within this share of the best one count as equal
 BEST = (
     "* best: lowest median RMSE of its block; or a median within the range of the best, or within "
     f"{EQUAL_SHARE:.0%} of its median."
 )
-# metric of the score, its title in the terminal
+# metric of the score, title of its column in the terminal
 SHOWN = (
     (ERROR, "RMSE\n[m]"),
     ("max_position_m", "maximum\n[m]"),
@@ -48,7 +50,7 @@ SHOWN = (
     ("rate_agitation_radps", "rates\n[rad/s]"),
     ("solve_time_p99_ms", "decision\n[ms]"),
 )
-DEFAULT_WIDTH = 80  # of a terminal
+DEFAULT_WIDTH = 80  # columns of a terminal
 LEGEND = (
     "RMSE, maximum: position error, medians of all flights [lowest\N{EN DASH}highest]. "
     "tilt, rates: motion not due to the reference, RMS. decision: 99th percentile of its time.",
@@ -57,14 +59,14 @@ LEGEND = (
 WORST_SHOWN = 20
 NARROWEST_PX = 960
 _ROW_PX, _TOP_PX = 22, 120  # _TOP_PX: tool bar, titles and numbers of the axes
-# metric of the score, the title of its panel
+# metric of the score -> title of its panel on the page
 PANELS = {
     ERROR: "position error<br>RMSE [m]",
     "margin": "margin",
     "tilt_agitation_deg": "excess tilt<br>RMS [deg]",
     "rate_agitation_radps": "excess rates<br>RMS [rad/s]",
 }
-# of the table of the page
+# columns of the table on the page
 TABLE_METRICS = (
     ERROR, "max_position_m", "margin", "rmse_truth_m", "tilt_agitation_deg",
     "rate_agitation_radps", "rmse_heading_deg",
@@ -79,7 +81,7 @@ CAPTION = (
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A finished flight. `failed` says why it does not count as a success, empty if it does."""
+    """A finished flight. `failed` says why the flight is no success; empty if it is one."""
 
     case: Case
     record: Record
@@ -87,7 +89,7 @@ class Row:
 
 
 def row_of(case: Case, record: Record, requirements: Sequence[Requirement]) -> Row:
-    """The row of a finished flight: completed, with all requirements met, or why not."""
+    """Return the row of a finished flight, a success if completed with all requirements met."""
     if not record.completed:
         return Row(case, record, record.sentence)
     metrics = {name: record.figures.get(name, math.nan) for name in METRICS}
@@ -96,7 +98,7 @@ def row_of(case: Case, record: Record, requirements: Sequence[Requirement]) -> R
 
 
 def columns(rows: Sequence[Row]) -> dict[str, list[Any]]:
-    """The table by columns; what a flight does not have is None."""
+    """Return the table by columns. A value that a flight does not have is None."""
     values = [dict(row.case.values) for row in rows]
     keys = dict.fromkeys(itertools.chain.from_iterable(values))
     return {
@@ -121,7 +123,7 @@ def _scalar(value: Any) -> Any:
 
 
 def as_csv(table: Mapping[str, Sequence[Any]]) -> str:
-    """The table as CSV; numbers with all digits."""
+    """Return the table as CSV; numbers with all digits."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(table)
@@ -131,8 +133,8 @@ def as_csv(table: Mapping[str, Sequence[Any]]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Flights of one combination: `name` is controller and values, `block` the rest; `best`: see
-    `groups`."""
+    """Flights of one combination. `name` is the controller and the values that differ, `block` the
+    rest of the combination; `best` is explained at `groups`."""
 
     name: str
     block: str
@@ -153,13 +155,13 @@ class Group:
 
     @property
     def interval(self) -> Any:
-        """`low` and `high` of the success rate: Wilson's score, CONFIDENCE."""
+        """Wilson's score interval of the success rate at CONFIDENCE, with fields `low`, `high`."""
         counted = stats.binomtest(self.successes, self.flights)
         return counted.proportion_ci(CONFIDENCE, method="wilson")
 
     @property
     def reasons(self) -> dict[str, list[int]]:
-        """Why flights failed, with their seeds."""
+        """The reasons why flights failed, each with the seeds of those flights."""
         found: dict[str, list[int]] = {}
         for row in self.rows:
             if row.failed:
@@ -167,31 +169,31 @@ class Group:
         return found
 
     def values(self, metric: str) -> list[float]:
-        """One metric of every completed flight; `margin` of every flight."""
+        """Return a metric of all completed flights, or `margin` of all flights."""
         if metric == "margin":
             return [row.record.margin for row in self.rows]
         completed = (row.record for row in self.rows if row.record.completed)
         return [r.figures[metric] for r in completed if metric in r.figures]
 
     def spread(self, metric: str) -> tuple[float, float, float]:
-        """Lowest, median and highest value; NaN without values."""
+        """Return the lowest, median and highest value of a metric; NaN without values."""
         values = self.values(metric)
         if not values:
             return math.nan, math.nan, math.nan
         return min(values), float(np.median(values)), max(values)
 
     def shown(self, metric: str) -> str:
-        """Median and range of a metric as text, empty without values."""
+        """Return median and range of a metric as text; empty without values."""
         low, middle, high = map(digits, self.spread(metric))
         return middle if low == high else f"{middle} [{low}\N{EN DASH}{high}]"
 
 
 def groups(rows: Sequence[Row], drawn: frozenset[str] = frozenset()) -> list[Group]:
-    """The groups in the order of the table, with the best of each block marked. Their names have
-    the values that differ, without those `drawn` (keys of a sample).
+    """Return the groups in the order of the table, with the best of each block marked. Their names
+    contain the values that differ, except those of the keys `drawn` (of a sample).
 
-    The best have no failed flight, and their median position error is the lowest, or within the
-    range of that one's flights, or within EQUAL_SHARE of its median.
+    Best is a group without failed flights whose median position error is the lowest of the block,
+    or within the range of the flights of that group, or within EQUAL_SHARE of its median.
     """
     blocks: dict[str, dict[str, list[Row]]] = {}
     distinct = set(itertools.chain.from_iterable(_values(row.case) for row in rows))
@@ -213,7 +215,7 @@ def groups(rows: Sequence[Row], drawn: frozenset[str] = frozenset()) -> list[Gro
 
 
 def _error(group: Group) -> tuple[float, float]:
-    """Median and highest position error, infinite where a flight failed."""
+    """Return the median and highest position error; infinite if a flight failed."""
     _, median, highest = group.spread(ERROR)
     return (math.inf, math.inf) if group.failed or math.isnan(median) else (median, highest)
 
@@ -234,7 +236,7 @@ def _values(case: Case) -> list[tuple[str, Any]]:
 
 
 def digits(value: float) -> str:
-    """Three significant digits, empty for what is not finite."""
+    """Return a number with three significant digits; empty if it is not finite."""
     if not math.isfinite(value):
         return ""
     value = float(f"{value:.3g}")
@@ -243,7 +245,7 @@ def digits(value: float) -> str:
 
 
 def show(console: Console, flown: Sequence[Group]) -> None:
-    """Print the groups, a block below each other, the legend and why flights failed."""
+    """Print the groups block by block, the legend, and why flights failed."""
     table = Table(box=None, pad_edge=False)
     separator = " " if console.width > DEFAULT_WIDTH else "\n"
     table.add_column("controller", overflow="fold")
@@ -275,8 +277,8 @@ def page(
     missing: Sequence[str] = (),
     links: Callable[[Row], Mapping[str, str]] = lambda row: {},
 ) -> str:
-    """The page of a campaign as text. `missing`: what is not flown; `links`: the files of a kept
-    flight by name, relative to the page."""
+    """Return the page of a campaign as HTML. `missing` says what is not flown; `links` returns the
+    files of a kept flight by name, with paths relative to the page."""
     rows = [row for group in groups for row in group.rows]
     return render(
         "campaign/templates/campaign.html",
@@ -297,14 +299,14 @@ def page(
 
 
 def described(row: Row) -> str:
-    """What a flight was: names, values, seed."""
+    """Return a description of a flight: its names, values and seed."""
     names = [name for column in CASE_COLUMNS if (name := getattr(row.case, column))]
     values = [f"{key}={value}" for key, value in row.case.values]
     return ", ".join([*names, *values, f"seed {row.case.seed}"])
 
 
 def _figure(groups: Sequence[Group]) -> Figure:
-    """Panels side by side, one line per group, a heading above each block."""
+    """Draw the panels side by side, one line per group, with a heading above each block."""
     lines: list[Group | str] = []
     for block, members in itertools.groupby(groups, lambda group: group.block):
         lines += [block, *members]
@@ -340,7 +342,7 @@ def _label(line: Group | str) -> str:
 
 
 def _box(at: int, group: Group, name: str, colour: str) -> go.Box:
-    """Quartiles, and single flights outside."""
+    """Draw the quartiles of a group, and its outliers as dots."""
     return go.Box(
         x=coordinates(group.values(name)), y0=at, orientation="h", width=0.6, name=group.name,
         line={"color": colour, "width": 1.4}, marker={"color": colour, "size": 3},

@@ -1,5 +1,5 @@
-"""Tuning: parameters that lower a metric on training flights, judged on validation flights, pair by
-pair (same scenario, same seed), with confidence.
+"""Tuning: finds parameters that lower a metric on training flights, and tests on validation flights
+whether they are better. The test compares pairs of flights with the same scenario and seed.
 
     ranges:
       controller.bandwidth_radps: [3, 9]
@@ -53,8 +53,8 @@ class Flights(Parameters):
 
 
 class TuneFile(Parameters):
-    """A tuning. `objective` is the metric that is minimised, averaged over the flights; a flight
-    that is not completed costs `failure`."""
+    """A tuning. `objective` is the metric whose mean over the flights is minimised; a flight that
+    is not completed counts as `failure`."""
 
     config: Name = "flight"
     controller: Name | None = None
@@ -70,8 +70,9 @@ class TuneFile(Parameters):
 
 @dataclass(frozen=True, slots=True)
 class Tuned:
-    """The best parameters found, and mean costs of the validation flights without and with them.
-    `p_value` is that of Wilcoxon's signed-rank test, one-sided."""
+    """The best parameters found (`values`), and the mean cost of the validation flights without
+    (`base`) and with them (`candidate`). `p_value` is that of Wilcoxon's one-sided signed-rank
+    test."""
 
     values: Values
     flights: int
@@ -81,7 +82,7 @@ class Tuned:
 
     @property
     def better(self) -> bool:
-        """The mean is lower, and the test says that it is no chance."""
+        """Whether the mean is lower, and significantly so at CONFIDENCE."""
         return self.candidate < self.base and self.p_value < 1.0 - CONFIDENCE
 
     def __str__(self) -> str:
@@ -92,7 +93,7 @@ class Tuned:
 
 
 def judge(base: Sequence[float], candidate: Sequence[float], values: Values = ()) -> Tuned:
-    """Compare costs of paired flights (same scenario, same seed)."""
+    """Compare the costs of paired flights (same scenario, same seed)."""
     before, after = np.asarray(base, float), np.asarray(candidate, float)
     p_value = 1.0
     if np.any(after != before):
@@ -101,8 +102,8 @@ def judge(base: Sequence[float], candidate: Sequence[float], values: Values = ()
 
 
 class Tuning:
-    """Finds and judges parameters. Raises DocumentError for what cannot be flown, and UserError
-    without optuna."""
+    """Finds and tests parameters. The constructor raises DocumentError if the flights cannot be
+    flown, and UserError without optuna."""
 
     def __init__(self, file: TuneFile, source: str) -> None:
         self.file = file
@@ -113,17 +114,18 @@ class Tuning:
 
     @property
     def flights(self) -> int:
-        """The flights that a tuning takes."""
+        """The number of flights of the tuning."""
         return self.file.trials * len(self._training) + 2 * len(self._validation)
 
     def run(self, fly: Fly, progress: Callable[[int, float], None]) -> Tuned:
-        """Search, then fly the validation set with and without what was found.
+        """Search on the training flights, then fly the validation flights without and with the
+        parameters found.
 
         `progress` gets the number of trials and the lowest cost so far. Raises what `fly` raises.
         """
         study, ranges = self._study, self.file.ranges
         within = {k: v for k, v in self._defaults.items() if ranges[k][0] <= v <= ranges[k][1]}
-        study.enqueue_trial(within)  # the present values first
+        study.enqueue_trial(within)  # the first trial has the present values
         for number in range(1, self.file.trials + 1):
             trial, values = ask(study, ranges)
             costs = self._costs(fly, self._training, tuple(values.items()))
@@ -140,8 +142,8 @@ class Tuning:
 
 
 def planned(file: TuneFile) -> tuple[list[Case], list[Case], dict[str, float]]:
-    """The flights of training and of validation, and the present values of the parameters. Raises
-    DocumentError."""
+    """Return the training flights, the validation flights and the present values of the parameters.
+    Raises DocumentError."""
     training, validation = _cases(file, file.training), _cases(file, file.validation)
     if shared := len(set(training) & set(validation)):
         raise DocumentError(
@@ -164,7 +166,7 @@ def _cases(file: TuneFile, flights: Flights) -> list[Case]:
 
 
 def _defaults(case: Case, file: TuneFile) -> dict[str, float]:
-    """The present values of the parameters. Raises DocumentError for one that is no number."""
+    """Return the present values of the parameters. Raises DocumentError if one is no number."""
     resolved = case.load().model_dump(mode="json")
     found: dict[str, float] = {}
     for key in file.ranges:
@@ -178,7 +180,7 @@ def _defaults(case: Case, file: TuneFile) -> dict[str, float]:
 
 
 def profile(file: TuneFile, tuned: Tuned) -> str:
-    """The configuration with the tuned values, as `fly --config` takes it."""
+    """Return the configuration with the tuned values as YAML for `fly --config`."""
     raw = read(read_text(locate(file.config, "configuration")), file.config)
     if file.controller:
         raw["controller"] = file.controller

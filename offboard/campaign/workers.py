@@ -1,7 +1,7 @@
-"""Where flights are flown: worker processes of this computer, a dask cluster by its address, or one
+"""Where flights are flown: in worker processes of this computer, on a dask cluster, or by one
 vehicle at a link.
 
-The first two are executors of `concurrent.futures`. A worker loads its code once and stays.
+The first two are executors of `concurrent.futures`. A worker loads its code once, for all flights.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ from offboard.flight.phases import OPERATOR_STOP, ExitCode
 from offboard.link.log import free_name
 from offboard.run.flight import Connection, fly
 
-CONNECT_S = 5.0
-POLL_S = 0.2
-QUEUED = 2  # flights per thread of a cluster, so that none waits for us
+CONNECT_S = 5.0  # time for a dask scheduler to answer
+POLL_S = 0.2  # longest time until a stop request is noticed
+QUEUED = 2  # flights submitted per thread of a cluster, so that no thread waits for the next one
 ORPHANED = 1  # exit code of a worker whose parent has ended
-# as its worker cannot tell
+# Record of a flight whose worker died, and so could not return one
 DIED = Record(ExitCode.ABORTED, "the process that flew it ended, twice", NOT_FLOWN, "crash")
 
 
 class Flyer(Protocol):
-    """Flies jobs and yields each with its record when it ends; when `ending` is true, no further
-    flight begins. Raises UserError; what has not ended is then lost."""
+    """Flies jobs, and yields each with its record when its flight ends. Once `ending` returns True,
+    no further flight begins. After a UserError the flights that have not ended are lost."""
 
     def fly(
         self, jobs: Sequence[Job], ending: Callable[[], bool]
@@ -56,10 +56,10 @@ OpenFlyer = Callable[[], AbstractContextManager[Flyer]]
 
 
 class Workers:
-    """An open set of `width` workers.
+    """Executor that flies up to `width` jobs at a time.
 
-    `open_pool` makes their executor, and a new one after a worker has died. `lost`: the sentence
-    for a cluster that is gone.
+    `open_pool` creates the pool of workers, and a new one after a worker has died. `lost` is the
+    error text if the cluster is lost.
     """
 
     def __init__(self, width: int, open_pool: Callable[[], Executor], lost: str = "") -> None:
@@ -69,10 +69,10 @@ class Workers:
         self._pool = open_pool()
 
     def fly(self, jobs: Sequence[Job], ending: Callable[[], bool]) -> Iterator[tuple[Job, Record]]:
-        """Fly jobs, as a `Flyer` does, in any order.
+        """Fly jobs as described by `Flyer`, in any order.
 
-        A worker that dies takes the flights of all workers with it. Each of them is flown again,
-        alone; `DIED` is the record of one whose worker dies again.
+        If a worker dies, the flights of all workers are lost. Each of them is flown again, alone;
+        if its worker dies again, its record is `DIED`.
         """
         again: list[Job] = []
         for job, record in self._run(jobs, ending):
@@ -87,7 +87,7 @@ class Workers:
     def _run(
         self, jobs: Sequence[Job], ending: Callable[[], bool]
     ) -> Iterator[tuple[Job, Record | None]]:
-        """Fly jobs side by side; without a record where a worker died."""
+        """Fly jobs in parallel. The record is None if a worker died."""
         waiting = deque(jobs)
         busy: dict[Future[Record], Job] = {}
         while busy or waiting:
@@ -113,14 +113,15 @@ class Workers:
             raise UserError(self._lost) from None
         except Exception as error:
             died = isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker"
-            if died:  # the latter is dask's
+            if died:  # KilledWorker is an exception of dask
                 return None
             raise
 
 
 def _masked(pool: Executor, job: Job) -> Future[Record]:
-    """Submit a job. A process that starts for it inherits the mask: Ctrl-C is for the main process
-    alone. Not around the pool's creation: multiprocessing's tracker, begun there, ends the mask."""
+    """Submit a job while SIGINT is blocked. A process that starts for it inherits the signal mask,
+    so that Ctrl-C reaches only the main process. The pool must be created without the mask, because
+    multiprocessing's resource tracker, which starts then, unblocks SIGINT."""
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         return pool.submit(fly_job, job)
@@ -130,18 +131,18 @@ def _masked(pool: Executor, job: Job) -> Future[Record]:
 
 @dataclass(frozen=True, slots=True)
 class ConnectedVehicle:
-    """The vehicle at the link of its cases, a real one perhaps. Its flights follow each other in
-    this process; after one that was refused, aborted or ended by a change of mode, nothing more is
-    flown.
+    """The vehicle at the link of its cases, which may be a real one. This process flies the cases
+    one after the other. If a flight is refused, aborted or ended by a change of mode, no further
+    one is flown.
     """
 
     system_id: int | None = None
     signing_key: Path | None = None
 
     def fly(self, jobs: Sequence[Job], ending: Callable[[], bool]) -> Iterator[tuple[Job, Record]]:
-        """Fly jobs, as a `Flyer` does. A flight that the operator stops, or the vehicle refuses,
-        has no record, and is flown by the next run. Raises UserError after one that was refused or
-        aborted."""
+        """Fly jobs as described by `Flyer`. A flight that the operator stops or that is refused has
+        no record, and the next run flies it again. Raises UserError after a flight that was refused
+        or aborted."""
         for job in jobs:
             if ending():
                 return
@@ -159,7 +160,7 @@ class ConnectedVehicle:
 
     def _record(self, job: Job) -> Record:
         assert job.kept is not None
-        if job.kept.exists():  # the log of a flight that has no record: it is flown again
+        if job.kept.exists():  # log of a flight without a record: keep it under another name
             job.kept.rename(free_name(job.kept))
         assert job.case.link is not None
         vehicle = Connection(job.case.link, self.system_id, self.signing_key)
@@ -168,14 +169,14 @@ class ConnectedVehicle:
 
 @contextmanager
 def local_workers(count: int | None) -> Iterator[Workers]:
-    """Worker processes of this computer, each started when it is first needed."""
+    """Open worker processes on this computer. Each is started when it is first needed."""
     width = count or processors()
     with ExitStack() as stack:
         yield Workers(width, lambda: stack.enter_context(_processes(width)))
 
 
 def processors() -> int:
-    """The number of processors that this process may use (Linux), or that there are."""
+    """Return the number of processors that this process may use (Linux), or else of all."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -183,12 +184,12 @@ def processors() -> int:
 
 @contextmanager
 def _processes(width: int) -> Iterator[Executor]:
-    """An executor of processes. An exception in the block kills them; otherwise they end when their
-    work is done."""
-    # spawn: a forked child would share compiled code and threads in unknown states
+    """Open an executor of processes. An exception in the block kills them; otherwise they end when
+    their work is done."""
+    # spawn, because a forked child would share compiled code and threads in unknown states
     context = multiprocessing.get_context("spawn")
-    os.environ["PYTHONSAFEPATH"] = "1"  # of the child: as `python -P`
-    # of multiprocessing's tracker: it deletes the semaphores of a killed process, and warns of it
+    os.environ["PYTHONSAFEPATH"] = "1"  # for the workers, as `python -P`
+    # The resource tracker deletes the semaphores of a killed process and would warn about it
     os.environ.setdefault("PYTHONWARNINGS", "ignore::UserWarning:multiprocessing.resource_tracker")
     pool = ProcessPoolExecutor(width, mp_context=context, initializer=_start)
     try:
@@ -202,7 +203,7 @@ def _processes(width: int) -> Iterator[Executor]:
 
 
 def _start() -> None:
-    """In the worker: leave the terminal's process group, and end when the parent ends."""
+    """Initialise a worker: leave the terminal's process group, and end when the parent ends."""
     os.setpgrp()
     parent = multiprocessing.parent_process()
     assert parent is not None
@@ -216,15 +217,15 @@ def _start() -> None:
 
 @contextmanager
 def cluster_workers(address: str) -> Iterator[Workers]:
-    """The workers of a dask scheduler, for example at "tcp://127.0.0.1:8786".
+    """Open the workers of a dask scheduler, for example at "tcp://127.0.0.1:8786".
 
-    Raises UserError where none answers, or dask is not installed.
+    Raises UserError if no scheduler answers, if it has no workers, or if dask is not installed.
     """
     try:
         from distributed import Client
     except ImportError:
         raise UserError(f"--scheduler needs dask: {install('cluster')}") from None
-    for logger in ("distributed", "distributed.client"):  # a scheduler that is lost is our sentence
+    for logger in ("distributed", "distributed.client"):  # we report a lost scheduler ourselves
         logging.getLogger(logger).setLevel(logging.CRITICAL)
     if not re.fullmatch(r"(tcp|tls)://\S+:[0-9]{1,5}", address):
         raise UserError(f"--scheduler {shown(address)}: give tcp://HOST:PORT, or tls://HOST:PORT")
