@@ -40,7 +40,7 @@ DARK = {
 _TOP_PX, _BOTTOM_PX, _PANEL_PX, _GAP_PX = 48, 90, 150, 36
 _FEW_DECADES = 2  # a logarithmic axis of so many decades or fewer has ticks at 2 and 5, too
 _MOST_DECADES = 3  # an axis of more decades does not have a tick at each
-# `without_outliers` applies from so many values on, if their range is more than 4 times that of 99 %
+# `without_outliers` applies to at least 50 values whose range is over 4 times that of 99 % of them
 _FEW_VALUES, _FLATTENED = 50, 4.0
 _MARGIN = 0.02  # margin of a logarithmic axis at either end, as a share of its decades
 _AXIS = {
