@@ -1,5 +1,5 @@
-"""Figures of a report, of one flight or of several: path, timeline (phases and modes as bands,
-steps of the failsafe and texts as marks), and panels.
+"""The figures of a report of one flight or of several: path, timeline (phases and modes as bands,
+actions of the failsafe and texts as marks), and panels.
 """
 
 from __future__ import annotations
@@ -45,21 +45,21 @@ from offboard.mavlink.event_record import SUPERVISOR
 from offboard.report.flight import Flight
 from offboard.report.panels import GROUPS, LEAST_SHOWN, Curve, Panel, Points, thinned
 
-# of flights that share a figure, in an order that colour-blind people can tell apart
+# Colours of the flights in a figure, in an order that colour-blind people can distinguish
 COLOURS = (BLUE, ORANGE, GREEN, GREY, PINK, BROWN)
 DASHES = ("solid", "dash", "dot", "dashdot")
 PATH_POINTS = 1500
 PANEL_PX = 120
-LEFT_PX = 75  # beside the panels, the same in all figures: their time axes stand below each other
-ROW_PX = 34  # of the timeline
-# phases in which a flight was ended early: orange
+LEFT_PX = 75  # left margin, the same in all figures so that their time axes are aligned
+ROW_PX = 34  # height of a row of the timeline
+# Phases after an early end of the flight, drawn in orange
 _ENDED_EARLY = {"hold", "stand down", "yielded", "failed", SUPERVISOR}
 _CUT = "Single values far from all others are outside; two clicks on the figure show them."
 
 
 def side_by_side(flights: Sequence[Flight]) -> Sequence[Flight]:
-    """One flight keeps its vehicle time. Several have a letter (A, B ... Z, then numbers), a colour
-    and a dash, and begin their tracks at zero."""
+    """Prepare flights for one report. A single flight keeps its vehicle time. Several get a letter
+    (A, B ... Z, then numbers), a colour and a dash, and time zero is when their track begins."""
     if len(flights) == 1:
         return flights
     styles = itertools.cycle(zip(COLOURS, itertools.cycle(DASHES), strict=False))
@@ -76,8 +76,8 @@ def side_by_side(flights: Sequence[Flight]) -> Sequence[Flight]:
 
 
 def figures(flights: Sequence[Flight]) -> dict[str, Figure]:
-    """All figures that the logs have data for, by name: path, timeline, and those of GROUPS.
-    `flights`: of `side_by_side`."""
+    """Return the figures for which the logs have data, by name: path, timeline, and the groups of
+    GROUPS. `flights` are those that `side_by_side` returned."""
     found = {"path": _path(flights), "timeline": _timeline(flights)}
     for name, (title, group) in GROUPS.items():
         found[name] = _panels(title, group, flights)
@@ -114,7 +114,7 @@ def _path(flights: Sequence[Flight]) -> Figure | None:
 def _path_of(name: str, rows: Rows, colour: str, dash: str) -> go.Scatter3d:
     chosen = rows[np.linspace(0, len(rows) - 1, min(len(rows), PATH_POINTS)).astype(int)]
     north, east, down = chosen["position_ned_m"].T
-    return go.Scatter3d(  # east, north, up: right-handed, as plotly draws them
+    return go.Scatter3d(  # east, north, up, because plotly's axes are right-handed
         x=coordinates(east), y=coordinates(north), z=coordinates(-down), mode="lines",
         name=html.escape(name), line={"color": colour, "width": 4, "dash": dash},
     )  # fmt: skip
@@ -125,7 +125,8 @@ def _path_of(name: str, rows: Rows, colour: str, dash: str) -> go.Scatter3d:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A band from `begin_s` to `end_s` with a label, or a mark at `begin_s`; `text` in full."""
+    """A band from `begin_s` to `end_s` with a label, or a mark at `begin_s`. `text` is shown when
+    the user points at it."""
 
     row: str
     begin_s: float
@@ -136,7 +137,8 @@ class Entry:
 
 
 def bands(flight: Flight) -> list[Entry]:
-    """Phases of offboard, and modes of the vehicle; the mode of its setpoints is blue."""
+    """Return phases of offboard and modes of the vehicle; the mode in which it follows setpoints is
+    blue."""
     found = [
         Entry("phase", begin_s, event.what, end_s, event.phase, _colour(event.phase))
         for event, begin_s, end_s in phases(flight)
@@ -150,7 +152,7 @@ def bands(flight: Flight) -> list[Entry]:
 
 
 def marks(flight: Flight) -> list[Entry]:
-    """Steps of the failsafe, and texts of both sides."""
+    """Return actions of the failsafe, setpoints not sent, and texts of controller and vehicle."""
     flown = flight.history
     found = [Entry("failsafe", event.time_s, event.what) for event in irregular(flown.phases)]
     refused = flown.records["refused"].astype(int)
@@ -167,17 +169,18 @@ def marks(flight: Flight) -> list[Entry]:
 
 
 def phases(flight: Flight) -> list[tuple[Event, float, float]]:
-    """The spans of the phases of offboard; the last one ends where the supervisor takes over."""
+    """Return the spans of the phases; after them that of the supervisor, if it took over."""
     said = [event for event in flight.history.announcements if event.cause == SUPERVISOR]
     took_over = [replace(event, phase=SUPERVISOR) for event in said[:1]]
     return spans([*flight.history.phases, *took_over], flight)
 
 
 def spans(events: Sequence[Event], flight: Flight) -> list[tuple[Event, float, float]]:
-    """Each event until the next one; the first may be older than telemetry."""
+    """Return each event with its begin and its end, which is the begin of the next event. An event
+    before the first telemetry begins with the first sample."""
     begins = [flight.begin_s if math.isnan(e.time_s) else e.time_s for e in events]
     ends = [*begins[1:], flight.end_s]
-    rows = zip(events, begins, ends, strict=False)  # without events there is an end too many
+    rows = zip(events, begins, ends, strict=False)  # without events there is one end too many
     return [(event, begin_s, max(end_s, begin_s)) for event, begin_s, end_s in rows]
 
 
@@ -193,7 +196,7 @@ def _timeline(flights: Sequence[Flight]) -> Figure | None:
     for one in flights:
         prefix = f"{one.letter} " if one.letter else ""
         entries = [*bands(one), *marks(one)]
-        if one.label:  # of several flights only what differs most
+        if one.label:  # of several flights, show only the rows that differ most
             entries = [each for each in entries if each.row in ("phase", "failsafe")]
         for row in dict.fromkeys(each.row for each in entries):
             rows.append(prefix + row)
@@ -244,7 +247,7 @@ def _marks(marks: Sequence[Entry], row: str, zero_s: float) -> go.Scatter:
 
 
 def _panels(title: str, group: Sequence[Panel], flights: Sequence[Flight]) -> Figure | None:
-    """A group of panels, in each the curves that the flights have."""
+    """Draw a group of panels with the curves for which the flights have data."""
     shown = [(panel, curves) for panel in group if (curves := _known(panel, flights))]
     if not shown:
         return None
@@ -270,7 +273,7 @@ def _panels(title: str, group: Sequence[Panel], flights: Sequence[Flight]) -> Fi
 
 
 def _known(panel: Panel, flights: Sequence[Flight]) -> list[tuple[Flight, Curve, Points]]:
-    """The curves of a panel that have values; of several flights only the main ones."""
+    """Return the curves of a panel that have values; of several flights only the main curves."""
     shown = ((one, each) for one in flights for each in panel.curves if each.main or not one.label)
     found = []
     for one, each in shown:
@@ -302,7 +305,7 @@ def _draw(
 
 
 def _phase_shapes(flight: Flight) -> list[dict[str, Any]]:
-    """A band where the track was flown, and a line where each phase begins."""
+    """Return a band for the phase TRACK, and a line at the begin of each phase."""
     shapes: list[dict[str, Any]] = []
     for event, begin_s, end_s in phases(flight):
         place = {"xref": "x", "yref": "paper", "x0": begin_s, "y0": 0, "y1": 1, "layer": "below"}
@@ -320,7 +323,7 @@ def _axis_title(flights: Sequence[Flight]) -> str:
 
 
 def _extent(flights: Sequence[Flight]) -> list[float]:
-    """From the first sample of all flights to the last one."""
+    """Return the times of the first and the last sample of all flights."""
     begin = min(one.begin_s - one.zero_s for one in flights)
     end = max(one.end_s - one.zero_s for one in flights)
     return [round(begin, 2), round(end, 2)]

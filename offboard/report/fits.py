@@ -22,13 +22,13 @@ SHOWN_S = 20.0  # the figures show the end of the flight; a longer part is too d
 
 
 def fits(found: Identified, trace: Trace, prior: Vehicle) -> dict[str, Any]:
-    """The constants of an identification, and how well they reproduce the end of the flight: what
-    the page shows of them.
+    """Return what the page shows of an identification: the constants, and how well they reproduce
+    the end of the flight.
 
     Args:
-        found: what was identified.
-        trace: the part of the log that it was identified from.
-        prior: the vehicle before the identification; supplies what was not identified.
+        found: the identified constants.
+        trace: the part of the log from which they were identified.
+        prior: the vehicle before the identification; it supplies the other constants.
     """
     vehicle = found.applied_to(prior)
     last = trace.between(max(trace.begin_s, trace.end_s - SHOWN_S), trace.end_s)
@@ -64,7 +64,7 @@ def _response(
     response: AxisResponse,
     scale: float = 1.0,
 ) -> Figure:
-    """Commanded, measured and modelled signals, one panel per axis, times `scale`."""
+    """Draw commanded, estimated and modelled signals multiplied by `scale`, one panel per axis."""
     times, measured, sent_at, sent = signals
     constants = response.delay_s, response.natural_frequency_radps, response.damping
     modelled = second_order(times, sent_at, sent, *constants)

@@ -1,4 +1,4 @@
-"""What a report has of one log: arrays, events, score, configuration, and what is missing."""
+"""The data of one log for a report: arrays, events, score, configuration, and what is missing."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from offboard.analysis.page import BLUE
 from offboard.analysis.score import Score, score
 from offboard.analysis.verdict import begin_times
 
-_PARTS = {"controller": "law", "reference": "shape", "vehicle": "name"}  # key that names each
+_PARTS = {"controller": "law", "reference": "shape", "vehicle": "name"}  # part -> key of its name
 _NO_HEARTBEAT = "no HEARTBEAT of an autopilot: no telemetry used"
 _NO_RECORDS = (
     "no records of offboard: no reference, decisions, identification or metrics of the score"
 )
-# array of History, what it is, its message, what takes its place, and how
+# array of History, what it contains, usual message, substitute message, remark on the substitute
 _TELEMETRY = (
     ("attitude", "attitude", "ATTITUDE_QUATERNION", "ATTITUDE", ""),
     ("position", "position", "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT",
@@ -33,9 +33,10 @@ _TELEMETRY = (
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """One log. `facts` are name and value; `missing` has a sentence for each thing that the log
-    lacks; `configuration`: see `history.configuration`. Beside others it is drawn with a letter, a
-    colour and a dash, and `zero_s` is the vehicle time that is zero on its axis."""
+    """One log. `facts` are rows of name and value; `missing` has a sentence for each kind of data
+    that the log lacks; `configuration` is that of `history.configuration`. `letter`, `colour` and
+    `dash` distinguish it from other flights of the same report; `zero_s` is the vehicle time at
+    zero of the time axis."""
 
     name: str
     history: History
@@ -50,13 +51,13 @@ class Flight:
 
     @property
     def label(self) -> str:
-        """Letter and name, empty for a flight alone."""
+        """Letter and name; empty if the report has only this flight."""
         return f"{self.letter}: {self.name}" if self.letter else ""
 
     @property
     def track_s(self) -> float:
-        """Vehicle time at which the track first began; otherwise of the take-off, or of the first
-        sample."""
+        """Vehicle time at which TRACK first began; without it that of the take-off, or else of the
+        first sample."""
         begun = begin_times(self.history.phases[::-1])
         return begun.get("track", begun.get("takeoff", self.begin_s))
 
@@ -105,7 +106,8 @@ def read(path: Path) -> Flight:
 
 
 def _configured(text: str | None) -> dict[str, str]:
-    """Names of the parts, from the configuration in the log; of a table that of its file."""
+    """Return the names of controller, reference and vehicle from the configuration in the log. The
+    name of a reference given as a table is that of its file."""
     try:
         document: Any = yaml.safe_load(text or "")
         parts = ((part, document[part], key) for part, key in _PARTS.items())

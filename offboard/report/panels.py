@@ -1,4 +1,4 @@
-"""What the panels of a report show: a table of curves over vehicle time, in groups."""
+"""The panels of a report: a table of curves over vehicle time, in groups."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from offboard.analysis.tracking import Reference, each_once
 from offboard.model.frames import euler_from_quaternion
 
 Array = NDArray[np.float64]
-Points = tuple[Array, ...]  # times and values (N,), and their standard deviations where known
+Points = tuple[Array, ...]  # times and values (N,), and standard deviations (N,) if there are any
 Source = Callable[[History], Points]
 
-BINS = 1500  # of a curve, see `thinned`
-LEAST_SHOWN = 1e-16  # of a logarithmic axis: zero is drawn there
+BINS = 1500  # per curve, see `thinned`
+LEAST_SHOWN = 1e-16  # smaller values, such as 0, are drawn here on a logarithmic axis
 ESTIMATED, TRUE, COMMANDED = "estimated", "true (simulator)", "commanded"
 AXES = (("north", GREEN, "solid"), ("east", PINK, "dash"), ("down", INK, "dot"))
 
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """A curve of one flight. `main` ones are also drawn where several flights share a panel.
-    `style`: "line", "steps" or "dots"; dots may have a standard deviation."""
+    """A curve of one flight. `main`: whether it is drawn also in a report of several flights.
+    `style`: "line", "steps" or "dots"; dots may have error bars of one standard deviation."""
 
     name: str
     source: Source
@@ -57,7 +57,7 @@ def _column(array: str, column: str, scale: float = 1.0, axis: int | None = None
 
 
 def _away(array: str, axis: int | None = None) -> Source:
-    """Distance from the reference, or its component along an axis; NaN where there is none."""
+    """Distance from the reference, or its component along an axis; NaN without a reference."""
 
     def samples(flown: History) -> Points:
         rows, reference = each_once(getattr(flown, array)), Reference.of(flown)
@@ -77,7 +77,7 @@ def _speed(flown: History) -> Points:
 
 
 def _euler_deg(array: str, axis: int) -> Source:
-    """Roll, pitch or heading to 1e-4 deg, with a gap where it wraps."""
+    """Roll, pitch or heading, rounded to 1e-4 deg, with a gap where the angle wraps."""
 
     def samples(flown: History) -> Points:
         rows = getattr(flown, array)
@@ -190,8 +190,12 @@ GROUPS: dict[str, tuple[str, tuple[Panel, ...]]] = {
 
 
 def thinned(values: Array, bins: int = BINS) -> NDArray[np.intp]:
-    """Indices of `values` (N,) to draw: all, or the least and the greatest of each bin of equally
-    many samples, and its first value that is not finite, which is a gap of the curve."""
+    """Return the indices of the `values` (N,) to draw.
+
+    These are all, if there are few. Else the values are divided into bins of equally many samples,
+    and from each bin the least, the greatest and the first value that is not finite are drawn. The
+    last of these is a gap of the curve.
+    """
     count = len(values)
     if count <= 2 * bins:
         return np.arange(count)

@@ -1,4 +1,4 @@
-"""The page of a report: verdict first, then path, timeline and panels, events and metrics."""
+"""The page of a report: verdict, then path, timeline and panels, events and metrics."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ _SIGNS = {1.0: ("good", "✓"), 0.0: ("bad", "✗")}
 
 
 def page(flights: Sequence[Flight], fits: Mapping[str, Any] | None = None) -> str:
-    """The page of one flight or of several, as the text of an HTML file. `fits`: what was
-    identified from the flight, by `fits.fits`."""
+    """Return the HTML page of one flight or of several. `fits` is the result of `fits.fits`, or
+    None without an identification."""
     flights, alone = side_by_side(flights), len(flights) == 1
     title = f"Flight {flights[0].name}" if alone else f"{len(flights)} flights side by side"
     return render(
@@ -46,7 +46,7 @@ def _verdict(flight: Flight) -> dict[str, object]:
 
 
 def rows(flights: Sequence[Flight]) -> dict[str, tuple[str, ...]]:
-    """Every metric that a log holds, by name, for each flight as text."""
+    """Return each metric that is known of any flight, by name, with a text for each flight."""
     scores = [flight.score.metrics() for flight in flights]
     return {
         name: tuple(f"{each:.4g}" if math.isfinite(each) else "–" for each in values)
