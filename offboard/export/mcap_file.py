@@ -1,7 +1,7 @@
-"""MCAP: Foxglove's schemas in protobuf, for Foxglove, Lichtblick, Rerun and PlotJuggler.
+"""MCAP with Foxglove's protobuf schemas, for Foxglove, Lichtblick, Rerun and PlotJuggler.
 
-Poses, paths and velocity are in the frame `map` (ENU, metres) and the body `base_link` (FLU). Every
-series is also a channel of JSON messages with the columns of the tables, in NED, as `/table/NAME`.
+Poses, paths and velocity are in the frame `map` (ENU, metres); the body frame is `base_link` (FLU).
+Each series is also a channel `/table/NAME` of JSON messages with the columns of `series.py`, NED.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from offboard.model.frames import enu, flu_in_enu
 
 MAP, BODY = "map", "base_link"  # frames: east, north, up; and forward, left, up
 LINE_M = 0.02  # thickness of a path
-COLOURS = {"flown": (0.12, 0.47, 0.71, 1.0), "reference": (1.0, 0.5, 0.05, 1.0)}  # by path, RGBA
+COLOURS = {"flown": (0.12, 0.47, 0.71, 1.0), "reference": (1.0, 0.5, 0.05, 1.0)}  # RGBA
 Stamped = tuple[int, str, Any]  # time in ns, topic, protobuf message or dict
-Stamps = Callable[[Array], list[int]]  # vehicle times in s to stamps of the file in ns
+Stamps = Callable[[Array], list[int]]  # converts vehicle times in s to stamps of the file in ns
 
 
 def write_mcap(flown: History, path: Path) -> None:
@@ -111,7 +111,7 @@ def _rows(name: str, rows: Rows, stamps: Stamps) -> Iterator[Stamped]:
 
 
 def _motion(position: Rows, attitude: Rows, stamps: Stamps) -> Iterator[Stamped]:
-    """At each position the velocity, and the pose with the newest attitude."""
+    """Yield the velocity at each position, and the pose with the newest attitude."""
     vector, pose_in_frame = _message("Vector3"), _message("PoseInFrame")
     transform = _message("FrameTransform")
     newest = np.searchsorted(attitude["time_s"], position["time_s"], side="right") - 1
@@ -138,7 +138,7 @@ def _motion(position: Rows, attitude: Rows, stamps: Stamps) -> Iterator[Stamped]
 
 
 def _path(rows: Rows, topic: str, stamps: Stamps) -> Iterator[Stamped]:
-    """The whole path as a line, at its beginning."""
+    """Yield the whole path as one line, stamped with its begin."""
     (first_ns,) = stamps(rows["time_s"][:1])
     update = _message("SceneUpdate")()
     entity = update.entities.add(id=topic, frame_id=MAP)
@@ -154,7 +154,7 @@ def _path(rows: Rows, topic: str, stamps: Stamps) -> Iterator[Stamped]:
 
 
 def _message(name: str) -> Any:
-    """A message class of Foxglove's schemas."""
+    """Return a message class of Foxglove's schemas."""
     module = _library(f"foxglove_schemas_protobuf.{name}_pb2")
     return getattr(module, name)
 

@@ -1,7 +1,7 @@
-"""Series: a flight as named columns over vehicle time, with the unit in each name; and CSV.
+"""A flight as series of named columns over vehicle time, with the unit in each name; and CSV.
 
-The frame is NED, the body's is FRD, quaternions are w, x, y, z from NED to FRD, thrust without a
-unit is normalised.
+The world frame is NED, the body frame FRD. Quaternions are w, x, y, z from NED to FRD. Thrust
+without a unit is normalised (0 .. 1).
 """
 
 from __future__ import annotations
@@ -53,13 +53,13 @@ COLUMNS = {
     "decision": tuple(f"decision_{name}" for name in FIELDS),
     "heartbeat": ("armed", "system_status"),
 }
-_ARRAYS = {"decision": "records"}  # of History, where they have another name
+_ARRAYS = {"decision": "records"}  # series -> array of History, if its name differs
 EVENT = "event"  # source and column of texts
-PHASE = "decision_phase"  # whose numbers tables show as names
+PHASE = "decision_phase"  # column of phase codes, which tables show as names
 
 
 def read(path: Path) -> History:
-    """The flight in a directory or .tlog. Raises UserError, also without telemetry."""
+    """Read a flight directory or a .tlog file. Raises UserError, also without telemetry."""
     log = tlog.read(path)
     flown = gather(log, unix_times=True)
     if not any(map(len, (flown.position, flown.attitude))):
@@ -68,26 +68,27 @@ def read(path: Path) -> History:
 
 
 def series_of(flown: History) -> dict[str, Rows]:
-    """Its samples of each kind, by the names of COLUMNS, where there are any; without those from
-    before any telemetry, whose time is NaN."""
+    """Return the series of a flight that have samples, by their names in COLUMNS. Samples before
+    the first telemetry are left out, as they have no vehicle time."""
     arrays = {name: getattr(flown, _ARRAYS.get(name, name)) for name in COLUMNS}
     known = {name: rows[np.isfinite(rows["time_s"])] for name, rows in arrays.items()}
     return {name: rows for name, rows in known.items() if len(rows)}
 
 
 def events_of(flown: History) -> list[Event]:
-    """Its events that have a time."""
+    """Return the events of a flight that have a vehicle time."""
     return [event for event in flown.events() if math.isfinite(event.time_s)]
 
 
 def values_of(rows: Rows) -> Array:
-    """Values (N, columns), in the order of COLUMNS."""
+    """Return the values (N, columns) of a series, in the order of COLUMNS."""
     names = [name for name in rows.dtype.names or () if name not in ("time_s", "unix_s")]
     return np.column_stack([rows[name] for name in names]).astype(np.float64)
 
 
 def samples(name: str, rows: Rows) -> Iterator[tuple[float, float, dict[str, Any]]]:
-    """Both times of each sample, and what is known of it, by column; a phase by its name."""
+    """Yield the vehicle time and the Unix time of each sample, and its finite values by column; a
+    phase is given by its name."""
     times = rows["time_s"].tolist(), rows["unix_s"].tolist()
     for time_s, unix_s, values in zip(*times, values_of(rows).tolist(), strict=True):
         known = {
@@ -99,11 +100,11 @@ def samples(name: str, rows: Rows) -> Iterator[tuple[float, float, dict[str, Any
 
 
 def write_csv(flown: History, path: Path) -> None:
-    """Write a CSV file, UTF-8, with a line of column names. Raises UserError.
+    """Write a CSV file in UTF-8 with a line of column names. Raises UserError.
 
-    One row for each sample, in the order of vehicle time. `source` is the name of its series;
-    columns of the other series are empty. Rows with the source `event` have a text in the column
-    `event`.
+    It has one row for each sample, in the order of vehicle time. `source` is the name of the
+    series; columns of other series are empty. Rows with the source `event` have a text in the
+    column `event`.
     """
     found = series_of(flown)
     columns = [column for name in found for column in COLUMNS[name]]
@@ -118,7 +119,7 @@ def write_csv(flown: History, path: Path) -> None:
 
 
 def _csv_rows(name: str, rows: Rows) -> Iterator[dict[str, Any]]:
-    """One for each sample, in the order of time."""
+    """Yield one row for each sample, in the order of time."""
     for time_s, unix_s, known in samples(name, rows[np.argsort(rows["time_s"], kind="stable")]):
         yield _row(time_s, unix_s, name, known)
 

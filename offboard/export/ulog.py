@@ -1,7 +1,7 @@
-"""ULog: PX4's log format, with PX4's topic names and fields, for its tools.
+"""ULog: PX4's log format, with PX4's topic names and fields, for PX4's tools.
 
-Written here: pyulog can only write back what it has read. The format is that of PX4's developer
-guide, "ULog File Format". Stamps are microseconds of vehicle time.
+This module writes the format itself, because pyulog can only write files that it has read. Source:
+PX4's developer guide, "ULog File Format". Stamps are microseconds of vehicle time.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ DECISION = "offboard_decision"
 
 
 def _attitude_setpoint(setpoint: Rows) -> Array:
-    """Thrust is along the body's -z axis, as PX4 has it."""
+    """Return the fields of vehicle_attitude_setpoint. Thrust is along the body's -z axis."""
     attitude, thrust = setpoint["quaternion"], setpoint["thrust"]
     yaw = heading_from_quaternion(attitude)
     nothing = np.zeros_like(thrust)
     return np.column_stack((yaw, attitude, nothing, nothing, -thrust))
 
 
-# series of the flight, its topic, the format of its fields, and their values
+# series of the flight, PX4's topic, format of its fields, function that returns their values
 _TOPICS: tuple[tuple[str, str, str, Callable[[Rows], Array]], ...] = (
     ("position", "vehicle_local_position", "float x;float y;float z;float vx;float vy;float vz;",
      values_of),
@@ -48,7 +48,7 @@ _TOPICS: tuple[tuple[str, str, str, Callable[[Rows], Array]], ...] = (
     ("decision", DECISION, "".join(f"float {name};" for name in FIELDS), values_of),
     ("heartbeat", "actuator_armed", "uint8_t armed;", itemgetter("armed")),
 )  # fmt: skip
-_AUTOPILOTS = {"px4": "PX4", "ardupilot": "ArduPilot"}  # as PX4's tools name them
+_AUTOPILOTS = {"px4": "PX4", "ardupilot": "ArduPilot"}  # names that PX4's tools use
 
 
 def write_ulog(flown: History, path: Path) -> None:

@@ -152,7 +152,7 @@ def bands(flight: Flight) -> list[Entry]:
 
 
 def marks(flight: Flight) -> list[Entry]:
-    """Return actions of the failsafe, setpoints not sent, and texts of controller and vehicle."""
+    """Return phases of an early end, setpoints not sent, and texts of controller and vehicle."""
     flown = flight.history
     found = [Entry("failsafe", event.time_s, event.what) for event in irregular(flown.phases)]
     refused = flown.records["refused"].astype(int)
