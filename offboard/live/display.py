@@ -1,5 +1,5 @@
-"""What all displays of a flight have in common: a thread that writes, announcements each once,
-snapshots when they are due, and both as JSON.
+"""The base of all displays of a flight: a thread that writes each announcement once and snapshots
+when they are due, and the JSON text of both.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING, Any, Protocol
 from offboard.documents.errors import plain
 from offboard.link.background import BackgroundWriter
 
-if TYPE_CHECKING:  # the process that serves clients starts without the controller
+if TYPE_CHECKING:  # not imported at run time: the server of the page does not load the controller
     from offboard.flight.display import Snapshot
     from offboard.flight.flight import Flight
 
-DIGITS = 9  # of a float
-CLOSE_S = 2.0  # for what is queued, after the flight
+DIGITS = 9  # significant digits of a float
+CLOSE_S = 2.0  # time to write what is queued after the flight
 
 
 class Shown(Protocol):
-    """A companion, or the flights of a service."""
+    """What a display shows: a `Flight`, or the flights of a service."""
 
     @property
     def current(self) -> Flight: ...
@@ -31,17 +31,18 @@ class Shown(Protocol):
 
 class Display:
     """Shows a flight. A thread gives texts and snapshots in batches to `write`, so that the loop
-    waits for no terminal, pipe or client; at most `size` wait, what does not fit is dropped."""
+    never waits for a terminal, pipe or client. At most `size` items wait; further ones are dropped.
+    """
 
-    LOST = ""  # the sentence on what was dropped, with its number as {}
+    LOST = ""  # sentence about dropped items; {} is their number
 
     def __init__(self, write: Callable[[list[str | Snapshot]], object], size: int) -> None:
         self._writer = BackgroundWriter["str | Snapshot"](write, size)
-        self._seen = 0  # announcements
-        self._due_s = -math.inf  # of the next snapshot
+        self._seen = 0  # number of announcements that were queued
+        self._due_s = -math.inf  # time of the next snapshot
 
     def show(self, shown: Shown) -> None:
-        """Queue what is new. Called in every turn of the loop."""
+        """Queue new announcements, and a snapshot if due. Called in every turn of the loop."""
         flight = shown.current
         new, self._seen = flight.announcements - self._seen, flight.announcements
         for sentence in flight.announced[-new:] if new else []:
@@ -50,17 +51,17 @@ class Display:
             self._writer.put(shown.snapshot())
 
     def tell(self, sentence: str) -> None:
-        """A sentence about the preparation, or the service."""
+        """Queue a sentence about the preparation, or about the service."""
         self._writer.put(self.text(sentence))
 
     def text(self, sentence: str, flight: Flight | None = None) -> str:
-        """What is written of a sentence, which `flight` may have announced."""
+        """Return the text to write for a sentence, which `flight` has announced unless None."""
         if flight is None:
             return line("preparation", text=sentence)
         return line("announcement", time_s=round(flight.time_s, 3), text=sentence)
 
     def is_due(self, shown: Shown) -> bool:
-        """Whether to write a snapshot now; the next one is then due later."""
+        """Whether to write a snapshot now. If so, also set when the next one is due."""
         raise NotImplementedError
 
     def close(self) -> None:
@@ -69,19 +70,19 @@ class Display:
 
     @property
     def lost(self) -> str:
-        """A sentence on what was not shown, empty if all was."""
-        dropped = 0 if self._writer.error else self._writer.dropped  # nobody misses a closed pipe
+        """A sentence that says what was not shown; empty if all was."""
+        # after an error, such as a closed pipe, nobody reads the items
+        dropped = 0 if self._writer.error else self._writer.dropped
         return self.LOST.format(dropped) if dropped else ""
 
 
 def line(kind: str, **values: Any) -> str:
-    """One JSON object, without line break; its key `type` says what it is."""
+    """Return a JSON object with the key `type` set to `kind`, without line break."""
     return json.dumps({"type": kind} | values, allow_nan=False, separators=(",", ":"))
 
 
 def json_lines(items: list[str | Snapshot]) -> str:
-    """Lines of JSON: texts as they are, the fields of a snapshot; what is not known (NaN) is
-    null."""
+    """Return lines of JSON: texts unchanged, snapshots as their fields with null for NaN."""
     lines = (
         item if isinstance(item, str) else line("snapshot", **plain(vars(item), DIGITS))
         for item in items

@@ -1,4 +1,4 @@
-"""The flight as lines: on a terminal with a status line in place, or for a machine."""
+"""The flight as lines of text: on a terminal with a status line, or as JSON for programs."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from offboard.flight.flight import Flight
 from offboard.link import clock
 from offboard.live.display import Display, Shown, json_lines
 
-LINES_MAX = 1000  # that wait to be written
-STATUS_S = 0.2  # between two status lines, host time
-SNAPSHOT_S = 1.0  # between two JSON snapshots, vehicle time
+LINES_MAX = 1000  # greatest number of lines that wait to be written
+STATUS_S = 0.2  # period of the status line, host time
+SNAPSHOT_S = 1.0  # period of JSON snapshots, vehicle time
 
 
 class Terminal(Display):
-    """Prints announcements with `show_line`; below them, where the console is a terminal that can
-    do it, one status line in place."""
+    """Prints announcements by `show_line`. Below them, a terminal that can move its cursor has one
+    status line, which is updated in place."""
 
     LOST = "{} lines of the flight are missing above: the terminal was stopped"
 
@@ -35,7 +35,7 @@ class Terminal(Display):
                 redirect_stderr=False,
             )  # fmt: skip
         self._show_line = show_line
-        self._waits = False  # a status is queued: no second one
+        self._waits = False  # whether a status is queued, so that no second one is
         super().__init__(self._write, LINES_MAX)
 
     def text(self, sentence: str, flight: Flight | None = None) -> str:
@@ -66,7 +66,8 @@ class Terminal(Display):
 
 
 def status(now: Snapshot) -> str:
-    """Time, phase, error, link age, mode and failsafe in one line, as far as they are known."""
+    """Return vehicle time, phase, position error, age of telemetry, mode and failsafe as one line,
+    as far as they are known."""
     parts = [f"{_stamp(now.time_s)}  {now.phase}"]
     if math.isfinite(now.position_error_m):
         parts.append(f"error {now.position_error_m:.3f} m")
@@ -80,12 +81,12 @@ def status(now: Snapshot) -> str:
 
 
 def _stamp(time_s: float) -> str:
-    """Vehicle time; 0 before the first telemetry."""
+    """Return vehicle time as text, "--" before the first telemetry (`time_s` is 0)."""
     return f"{time_s:8.2f} s" if time_s else f"{'--':>8} s"
 
 
 class JsonLines(Display):
-    """Writes one JSON object a line: snapshots once a second of vehicle time, announcements."""
+    """Writes one JSON object per line: announcements, and a snapshot per second of vehicle time."""
 
     LOST = "{} lines were not written: nobody read them"
 
@@ -94,14 +95,15 @@ class JsonLines(Display):
 
     def is_due(self, shown: Shown) -> bool:
         time_s = shown.current.time_s
-        if self._due_s - SNAPSHOT_S <= time_s < self._due_s:  # else the clock may have jumped back
+        # due also after a jump of the vehicle's clock backwards
+        if self._due_s - SNAPSHOT_S <= time_s < self._due_s:
             return False
         self._due_s = math.floor(time_s / SNAPSHOT_S + 1.0) * SNAPSHOT_S
         return True
 
 
 class JsonLog(JsonLines):
-    """Writes one JSON object a line, as log collectors read them: sentences with their UTC."""
+    """Writes one JSON object per line for log collectors: each sentence with its time (UTC)."""
 
     def text(self, sentence: str, flight: Flight | None = None) -> str:
         entry: dict[str, object] = {"time": clock.utc(), "level": "info", "phase": "service"}

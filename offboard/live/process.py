@@ -1,5 +1,5 @@
-"""Feeds a display in a process of its own, by a queue and a pipe of JSON lines, so that the loop
-never waits for its clients. The process ends when the pipe closes."""
+"""Feeds the live page, which runs in a process of its own. Snapshots go through a queue and a pipe
+of JSON lines, so that the loop never waits for clients. The process ends when the pipe closes."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ if TYPE_CHECKING:
     from offboard.live.lines import JsonLines, Terminal
 
 SERVER = "offboard.live.server"
-PERIOD_S = 0.1  # between two snapshots, host time
-QUEUED_MAX = 50  # snapshots that wait for the pipe, which holds about as many
-CLOSE_S = 1.0  # for what is queued, and again for the end of the process
+PERIOD_S = 0.1  # least time between two snapshots, host time
+QUEUED_MAX = 50  # greatest number of snapshots in the queue; the pipe holds about as many
+CLOSE_S = 1.0  # time to write what is queued, and again for the process to end
 
 
 class LiveProcess(Display):
-    """The page, served by a process of its own that is started at once.
+    """Display that feeds the page. The constructor starts the process that serves the page.
 
-    The process prints one JSON line when it listens, {"url": ...}, or says why not, {"error": ...}.
+    The process prints one JSON line: {"url": ...} once it listens, or {"error": ...} if it cannot.
     """
 
     def __init__(self, option: str, address: str) -> None:
@@ -45,7 +45,7 @@ class LiveProcess(Display):
         super().__init__(self._write, QUEUED_MAX)
 
     def await_ready(self) -> str:
-        """Wait until it listens; return its address. Raises Unavailable."""
+        """Wait until the process listens, and return its address. Raises Unavailable."""
         assert self._process.stdout is not None
         with self._process.stdout as output:
             said = output.readline()
@@ -55,7 +55,7 @@ class LiveProcess(Display):
         return str(answer["url"])
 
     def head(self, **values: str) -> None:
-        """What the page says above its values: `title`, or at the end `verdict` and `report`."""
+        """Set texts of the page: `title`, or after the flight `verdict` and `report`."""
         self._writer.put(line("flight", **values))
 
     def is_due(self, shown: Shown) -> bool:
@@ -91,8 +91,9 @@ class LiveProcess(Display):
 
 
 class Displays:
-    """The lines of a flight, and the processes that serve clients. Their `show` is called in every
-    turn of the loop and must not wait; one whose `show` raises is not called again."""
+    """All displays of a flight: its lines, and the pages in processes of their own. `show` is
+    called in every turn of the loop and must not wait. A display whose `show` raises is not called
+    again."""
 
     def __init__(self, lines: Terminal | JsonLines, pages: Sequence[LiveProcess] = ()) -> None:
         self._lines, self._pages = lines, pages
@@ -100,18 +101,18 @@ class Displays:
         self._working = list(self._parts)
 
     def tell(self, sentence: str) -> None:
-        """A sentence about the preparation."""
+        """Write a sentence about the preparation."""
         self._lines.tell(sentence)
 
     def begin(self, title: str) -> None:
-        """Wait until the pages are served, tell where, and give them their title: what is flown.
-        Raises UserError."""
+        """Wait until the pages are served, write their addresses, and set their title. Raises
+        UserError."""
         for page in self._pages:
             self.tell(f"live: {page.await_ready()}")
             page.head(title=title)
 
     def conclude(self, verdict: str, report: str) -> None:
-        """How the flight ended, and where its report will be, for the pages."""
+        """Tell the pages how the flight ended, and where its report will be."""
         for page in self._pages:
             page.head(verdict=verdict, report=report)
 
@@ -119,7 +120,7 @@ class Displays:
         for part in tuple(self._working):
             try:
                 part.show(companion)
-            except (Exception, SystemExit):  # rich ends the program on a closed pipe
+            except (Exception, SystemExit):  # rich raises SystemExit on a closed pipe
                 self._working.remove(part)
 
     def close(self) -> None:
@@ -129,5 +130,5 @@ class Displays:
 
     @property
     def lost(self) -> list[str]:
-        """Sentences on what was not shown."""
+        """Sentences that say what was not shown."""
         return [part.lost for part in self._parts if part.lost]

@@ -1,7 +1,8 @@
-"""What serves clients: `python -m offboard.live.server HOST PORT`, snapshots as JSON on stdin.
+"""The server of the live page: `python -m offboard.live.server HOST PORT`. It reads snapshots as
+JSON lines from stdin.
 
-The number of connections is limited, and so is the life of each but those of /events: slow or idle
-ones use up neither descriptors nor memory.
+The number of connections is limited, and so is the duration of each except those of /events, so
+that slow or idle clients use up neither file descriptors nor memory.
 """
 
 from __future__ import annotations
@@ -28,24 +29,24 @@ from offboard.link import clock
 from offboard.link.interface import peer_name
 from offboard.live.display import line
 
-STALE_S = 2.0  # the loop hands over ten snapshots a second
-HEALTHY_AGE_S = 2.0  # of telemetry
-STATES = ("phase", "mode", "authority", "failsafe")  # texts of a snapshot that are labels
+STALE_S = 2.0  # age of the newest snapshot from which the loop counts as stopped; it sends 10 a s
+HEALTHY_AGE_S = 2.0  # greatest age of telemetry of a healthy service
+STATES = ("phase", "mode", "authority", "failsafe")  # texts of a snapshot, labels for Prometheus
 COUNTER = "flights"
-KEPT = 3000  # snapshots, five minutes
-TEXTS_KEPT = 100
+KEPT = 3000  # snapshots that a new client gets: five minutes
+TEXTS_KEPT = 100  # announcements that a new client gets
 CLIENTS_MAX = 20
-CLIENT_QUEUE = 50  # snapshots that a client may be late
-CLIENT_S = 10.0  # in which a client must take one
-CONNECTIONS_MAX = 60  # those of clients that watch included
-CONNECTION_S = 5.0  # from its beginning to its end, unless the client watches
+CLIENT_QUEUE = 50  # snapshots that may wait for a client
+CLIENT_S = 10.0  # time in which a client must accept a snapshot
+CONNECTIONS_MAX = 60  # including those of clients that watch
+CONNECTION_S = 5.0  # longest duration of a connection, except of a client that watches
 _NICENESS = 5
 _TRACE = ("time_s", "position_ned_m", "reference_ned_m", "position_error_m", "telemetry_age_s")
 
 
 class Broadcast(Collector):
-    """Passes each snapshot on to all clients, and keeps what the curves of the page and a monitor
-    need: the `newest` is as it is in JSON."""
+    """Sends each snapshot to all clients, and keeps those that a new client, /health and /metrics
+    need. `newest` is the newest snapshot as a JSON object."""
 
     def __init__(self) -> None:
         self.newest: dict[str, Any] = {}
@@ -56,7 +57,8 @@ class Broadcast(Collector):
         self._flight: dict[str, Any] = {}
 
     def health(self) -> dict[str, Any]:
-        """`healthy` if the loop runs and the vehicle is heard, else the `reason`; the snapshot."""
+        """Return `healthy` (whether the loop runs and telemetry arrives), the `reason` if not, and
+        the newest snapshot."""
         age_s, reason = self.newest.get("telemetry_age_s"), ""
         if clock.monotonic_s() - self._shown_s > STALE_S:
             reason = "the loop does not run"
@@ -65,7 +67,7 @@ class Broadcast(Collector):
         return {"healthy": not reason, "reason": reason} | self.newest
 
     def collect(self) -> Iterator[Metric]:
-        """The metrics of the newest snapshot, for Prometheus."""
+        """Yield the metrics of the newest snapshot for Prometheus."""
         now = self.newest
         if not now:
             return
@@ -73,14 +75,14 @@ class Broadcast(Collector):
         yield GaugeMetricFamily("offboard_snapshot_age_seconds", "Age of these values.", age_s)
         yield CounterMetricFamily("offboard_flights", "Flights begun.", now[COUNTER])
         for name, value in sorted(now.items()):
-            if isinstance(value, int | float) and name != COUNTER:  # which are known
+            if isinstance(value, int | float) and name != COUNTER:  # not null: known
                 told = f"{name} of the present flight."
                 yield GaugeMetricFamily(f"offboard_{name}", told, float(value))
         states = {name: str(now[name]) for name in STATES}
         yield InfoMetricFamily("offboard_state", "State of the present flight.", states)
 
     def publish(self, text: str) -> None:
-        """A snapshot, an announcement, or what is known of the flight, as JSON text."""
+        """Send a JSON text to all clients: a snapshot, an announcement, or texts of the page."""
         message = json.loads(text)
         if message["type"] == "snapshot":
             self.newest, self._shown_s = message, clock.monotonic_s()
@@ -92,7 +94,7 @@ class Broadcast(Collector):
         self._put(text)
 
     def end(self) -> None:
-        """The flight is over."""
+        """Tell all clients that the flight is over."""
         self._put(None)
 
     def _put(self, text: str | None) -> None:
@@ -102,7 +104,7 @@ class Broadcast(Collector):
             queue.put_nowait(text)
 
     async def events(self, request: web.Request) -> web.StreamResponse:
-        """The stream of one client, until it leaves or the flight ends."""
+        """Serve the stream of one client until it disconnects or the flight ends."""
         if len(self._clients) >= CLIENTS_MAX:
             raise web.HTTPServiceUnavailable(text=f"{CLIENTS_MAX} clients are watching already")
         response = web.StreamResponse(
@@ -121,7 +123,8 @@ class Broadcast(Collector):
         return response
 
     def connection(self, server: web.Server) -> asyncio.Protocol:
-        """What handles a new connection to `server`: nothing, if there are too many."""
+        """Return the protocol for a new connection to `server`; it closes the connection at once if
+        there are too many."""
         if len(server.connections) >= CONNECTIONS_MAX:
             return _Refused()
         handler = server()
@@ -140,7 +143,7 @@ class _Refused(asyncio.Protocol):
 
 
 def page() -> str:
-    """The live page as text: figures without points, which its script fills from the events."""
+    """Return the live page as HTML. Its figures are empty; its script adds points from events."""
     return render(
         "live/templates/live.html", title="Live flight",
         figures={"plan": _plan(), "curves": _curves()},
@@ -158,7 +161,7 @@ def _plan() -> Figure:
     figure.add_trace(
         go.Scatter(x=[], y=[], mode="markers", showlegend=False, marker={"color": BLUE, "size": 10})
     )
-    # a vehicle at rest has no axis of millimetres
+    # invisible points keep the axes at least 2 m long, so that a vehicle at rest shows no noise
     unseen = {"mode": "markers", "opacity": 0, "hoverinfo": "skip", "showlegend": False}
     figure.add_trace(go.Scatter(x=[-1, 1], y=[-1, 1], **unseen))
     figure.update_layout(template=STYLE, height=560)
@@ -178,7 +181,7 @@ def _curves() -> Figure:
 
 
 def application(broadcast: Broadcast) -> web.Application:
-    """The pages by their paths."""
+    """Create the web application with its routes."""
     shown = page()
 
     async def index(request: web.Request) -> web.Response:
@@ -221,9 +224,9 @@ async def serve(host: str, port: int) -> None:
             broadcast.publish(text.rstrip("\n"))
         server.close()
         broadcast.end()
-        await asyncio.sleep(0.1)  # the clients take their last event
+        await asyncio.sleep(0.1)  # time to send the last event to the clients
     except OSError as error:
-        number = error.errno or 0  # negative: of the name service
+        number = error.errno or 0  # negative for errors of the name service (getaddrinfo)
         why = os.strerror(number) if number >= 0 else error.strerror
         reason = f"{peer_name((host, port))} cannot be listened on ({why})"
         print(json.dumps({"error": f"{reason}; choose another address"}), flush=True)
@@ -232,6 +235,6 @@ async def serve(host: str, port: int) -> None:
 
 
 if __name__ == "__main__":
-    os.nice(_NICENESS)  # the controller goes first
-    logging.disable()  # what a client does wrong is no line on the terminal
+    os.nice(_NICENESS)  # lower priority than the controller
+    logging.disable()  # errors of clients are not printed on the terminal
     asyncio.run(serve(sys.argv[1], int(sys.argv[2])))
