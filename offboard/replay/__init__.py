@@ -1,1 +1,1 @@
-"""Replay: gives the companion the inputs of a recorded flight again, and compares what it sends."""
+"""Replay: gives the controller the inputs of a recorded flight again, and compares its output."""

@@ -1,5 +1,5 @@
-"""Difference: the setpoints and commands of two runs of the same flight, side by side, and what
-preceded the first difference.
+"""Compares the setpoints and commands of two runs of the same flight, and shows the input before
+the first difference.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from offboard.mavlink.framing import SETPOINTS
 from offboard.mavlink.senders import COMMANDS
 from offboard.replay.replaying import Recording, Replay, Sent
 
-# Of a field, relative to its value or to 1: another processor or library rounds differently, by up
-# to 1e-8 rad and 6e-8 of thrust between two x86-64 processors
+# Greatest difference of a field that counts as rounding, relative to its value or to 1. Two x86-64
+# processors differed by up to 1e-8 rad and 6e-8 of thrust
 ROUNDING = 1e-6
-_UNSTAMPED = ("time_boot_ms", "target_system", "target_component")
-FIELDS_MAX = 8  # that are shown of a difference
-TOLD_EVERY = 500  # turns
-Key = tuple[float, int, bytes, int]
+_UNSTAMPED = ("time_boot_ms", "target_system", "target_component")  # fields that are not compared
+FIELDS_MAX = 8  # greatest number of fields that are shown of a difference
+TOLD_EVERY = 500  # turns between two sentences about the progress
+Key = tuple[float, int, bytes, int]  # see `_by_key`
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """A message that differs; None on the side that has not sent it."""
+    """A message that differs. `expected` or `actual` is None if that run has not sent it."""
 
     expected: Sent | None
     actual: Sent | None
 
     @property
     def time_s(self) -> float:
-        """Vehicle time of the newest telemetry before it."""
+        """Vehicle time of the newest telemetry before the message."""
         return self._either.time_s
 
     @property
@@ -44,7 +44,7 @@ class Difference:
         return name_of(self._either.message_id)
 
     def fields(self) -> list[tuple[str, float, float, float]]:
-        """Name, expected value, actual value and difference of each field that differs."""
+        """Return name, expected value, actual value and difference of each field that differs."""
         if self.expected is None or self.actual is None:
             return []
         before, after = _fields(self.expected), _fields(self.actual)
@@ -55,7 +55,7 @@ class Difference:
         ]
 
     def is_rounding(self) -> bool:
-        """Whether the same setpoint was only rounded differently, see `ROUNDING`."""
+        """Whether the setpoints differ only by rounding, see `ROUNDING`."""
         fields = self.fields()
         return (
             self._either.message_id in SETPOINTS
@@ -72,7 +72,7 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """`compared` counts messages by id; `differences` are in the order of time."""
+    """`compared` counts the compared messages by id; `differences` are in the order of time."""
 
     compared: Counter[int]
     differences: tuple[Difference, ...]
@@ -91,7 +91,7 @@ class Comparison:
         return tuple(each for each in self.differences if not each.is_rounding())
 
     def sentence(self) -> str:
-        """What was compared, and how much differs."""
+        """Return a sentence that says what was compared and how much differs."""
         total = f"{self.setpoints} setpoints and {self.commands} commands"
         if not self.differences:
             return f"{total}: all identical"
@@ -108,8 +108,8 @@ class Comparison:
 
 
 def compare(expected: Iterable[Sent], actual: Iterable[Sent]) -> Comparison:
-    """Compare the payloads of setpoints and commands. A message is compared with the one of the
-    same kind and stamp that was sent at the same vehicle time."""
+    """Compare the payloads of setpoints and commands. Messages of both runs are matched by message
+    id, time stamp and the vehicle time at which they were sent (see `_by_key`)."""
     first, second = _by_key(expected), _by_key(actual)
     keys = sorted(first.keys() | second.keys())
     differences = tuple(
@@ -121,7 +121,8 @@ def compare(expected: Iterable[Sent], actual: Iterable[Sent]) -> Comparison:
 
 
 def _by_key(sent: Iterable[Sent]) -> dict[Key, Sent]:
-    """By vehicle time, kind, stamp of a setpoint or number of a command, and how many of them."""
+    """Return messages by key: vehicle time, message id, time stamp of a setpoint or number of a
+    command (MAV_CMD), and the number of messages before that are equal in all of these."""
     found: dict[Key, Sent] = {}
     counts: defaultdict[tuple[float, int, bytes], int] = defaultdict(int)
     for each in sent:
@@ -144,12 +145,12 @@ def _fields(sent: Sent) -> dict[str, float]:
     }
 
 
-# ------------------------------------------------------------------ of a replay and its log
+# ------------------------------------------------------------------ a replay and its log
 
 
 def verdict(replay: Replay, tell: Callable[[str], object] = str) -> Comparison:
-    """Replay a flight to its end and compare it with its log. `tell` is called with sentences about
-    the progress. Raises UserError if nothing can be compared."""
+    """Replay a flight to its end, and compare it with its log. `tell` is called with a sentence
+    about the progress from time to time. Raises UserError if nothing can be compared."""
     for _ in replay.turns():
         if replay.count % TOLD_EVERY == 0:
             tell(f"replayed up to {replay.ended_s:.0f} s of vehicle time")
@@ -161,7 +162,7 @@ def verdict(replay: Replay, tell: Callable[[str], object] = str) -> Comparison:
 
 
 def explained(recording: Recording, difference: Difference) -> list[str]:
-    """What differs, field by field, and the input that preceded it; one line each."""
+    """Return lines that show a difference field by field, and the input of the turn before it."""
     name = f"{difference.name} at {difference.time_s:.3f} s"
     if difference.expected is None:
         lines = [f"{name} was not sent in the recorded flight"]
@@ -177,7 +178,8 @@ def explained(recording: Recording, difference: Difference) -> list[str]:
 
 
 def _input(recording: Recording, difference: Difference) -> list[str]:
-    """The turn that decided it: replayed once more up to there."""
+    """Return lines that show the input of the turn that sent the differing message. For that the
+    flight is replayed again up to this turn."""
     replay = Replay(recording)
     number = difference.actual.turn if difference.actual else None
     for turn in replay.turns():
@@ -191,7 +193,7 @@ def _input(recording: Recording, difference: Difference) -> list[str]:
 
 
 def _received(given: TurnInput, received: Sequence[LoggedMessage]) -> list[tuple[str, str]]:
-    """The messages that a turn was given, and how long before it they arrived."""
+    """Return the messages that a turn was given, and how long before it they arrived."""
     frames = iter(received)
     rows: list[tuple[str, str]] = []
     for chunk in given.chunks:

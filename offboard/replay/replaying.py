@@ -1,5 +1,5 @@
-"""Replaying: what a replay needs of a .tlog (configuration, the inputs of each turn, frames), a
-companion as in the recorded flight, and its turns with the recorded inputs.
+"""Replays a flight: reads configuration, inputs of each turn and frames from a .tlog, creates the
+`Flight` of the recording (`companion`), and runs its turns with the recorded inputs.
 """
 
 from __future__ import annotations
@@ -36,30 +36,31 @@ from offboard.mavlink.signing import Signing
 from offboard.run.configuration import flown
 from offboard.run.flight import Prepared, build
 
-CALLS = ("request_stop", "announce", "note_autopilot", "guard")  # methods of the companion
+CALLS = ("request_stop", "announce", "note_autopilot", "guard")  # methods of `Flight` to replay
 
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """`settings` are the RECORDED_SETTINGS (`flight.record`) of the session."""
+    """What a replay needs of a log. `settings` are the RECORDED_SETTINGS of the session, `inputs`
+    the pieces of the recorded inputs (both in `flight.record`)."""
 
     log: Tlog
     configuration: str
     settings: dict[str, object]
-    inputs: tuple[bytes, ...]  # the pieces of `flight.record`
+    inputs: tuple[bytes, ...]
 
     @property
     def signed(self) -> bool:
-        """Whether the link was signed: then what we sent is, too."""
+        """Whether the link was signed; then the frames that we sent are signed, too."""
         return any(m.frame.signed for m in self.log if m.component_id == COMPONENT_ID)
 
     def entries(self) -> Iterator[Entry]:
-        """The inputs in order. Raises InputsError where they are damaged."""
+        """Iterate over the inputs in order. Raises InputsError at the first damaged one."""
         return record.entries(self.inputs)
 
 
 def read(flight: Path) -> Recording:
-    """The recording in a flight directory or .tlog. Raises UserError."""
+    """Read the recording of a flight directory or a .tlog file. Raises UserError."""
     path = tlog.find(flight)
     log = tlog.read(path)
     configuration = history.configuration(log)
@@ -89,8 +90,8 @@ def _settings(path: Path, recorded: tuple[bytes, ...]) -> dict[str, object]:
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """A frame that our component sent. `time_s`: vehicle time of the newest telemetry before it;
-    `turn` is None for a frame of the log."""
+    """A frame that our component sent. `time_s` is the vehicle time of the newest telemetry before
+    it; `turn` is the number of the turn that sent it, None for a frame of the log."""
 
     time_s: float
     message_id: int
@@ -98,11 +99,12 @@ class Sent:
     turn: int | None = None
 
 
-Turn = tuple[TurnInput, list[LoggedMessage]]  # what it was given, and the messages in that
+Turn = tuple[TurnInput, list[LoggedMessage]]  # input of a turn, and the messages in its chunks
 
 
 class Accepted(Signing):
-    """The signing of a replayed flight: a log holds no key, and only frames that were accepted."""
+    """Signing for a replay. It accepts every frame, because the log has no key, and only frames
+    that were accepted in flight."""
 
     def refusal(self, frame: Frame, *, note: bool = True) -> None:
         return None
@@ -111,10 +113,10 @@ class Accepted(Signing):
 class Replay:
     """Replays one flight.
 
-    `turns` gives all turns in order; `count` is the number of those given so far, `ended_s` the
-    vehicle time of the newest telemetry that was replayed. `recorded` and `replayed` then hold what
-    the log says was sent and what the companion has sent. `stopped` says why the replay ended
-    before the recording; empty if it did not.
+    `turns` runs all turns in order. `count` is the number of turns so far, `ended_s` the vehicle
+    time of the newest telemetry that was replayed. `recorded` are the frames that were sent
+    according to the log, `replayed` those of the replay. `stopped` says why the replay ended before
+    the end of the recording; empty if it did not.
     """
 
     def __init__(self, recording: Recording) -> None:
@@ -144,13 +146,14 @@ class Replay:
 
     @property
     def incomplete(self) -> str:
-        """Up to where the recording was replayed, and why no further; empty if all of it was."""
+        """A sentence that says up to when the recording was replayed, and why no further; empty if
+        all of it was replayed."""
         if not self.stopped:
             return ""
         return f"replayed up to {self.ended_s:.1f} s of vehicle time: {self.stopped}"
 
     def turns(self) -> Iterator[Turn]:
-        """Replay turn by turn."""
+        """Replay the flight turn by turn."""
         try:
             for entry in self.recording.entries():
                 match entry:
@@ -168,9 +171,9 @@ class Replay:
             self._cut()
 
     def _obey(self, kind: str, value: Any, *arguments: Any) -> None:
-        """What came between two turns."""
+        """Replay an entry between two turns."""
         if kind == DROPPED:
-            del self.replayed[len(self.replayed) - value :]  # they are of the newest turn
+            del self.replayed[len(self.replayed) - value :]  # the newest turn has encoded them
             self.companion.on_dropped(value)
         elif kind == OTHERS:
             self.companion.other_datagrams = value
@@ -203,17 +206,17 @@ class Replay:
         self.ended_s = self.companion.time_s
         if frames is not None:
             self.replayed += map(self._sent, frames)
-            self.companion.finish_turn(math.nan)  # it was not sent
+            self.companion.finish_turn(math.nan)  # a replay sends nothing, at no time
         return given, received
 
     def _frames(self, chunks: list[Chunk], now_s: float) -> tuple[bytes, ...] | None:
         try:
             return self.companion.turn(chunks, now_s)
-        except (Exception, SystemExit):  # as the loop, which then requests the landing
+        except (Exception, SystemExit):  # the loop did the same, and then requested the landing
             return None
 
     def _stopwatch(self) -> float:
-        """The next recorded reading; after the last one it stands still."""
+        """Return the next recorded reading; after the last one, always the same."""
         self._read_s = next(self._readings, self._read_s)
         return self._read_s
 
@@ -224,7 +227,7 @@ class Replay:
     # ------------------------------------------------------------------ the log
 
     def _take(self, count: int) -> list[LoggedMessage] | None:
-        """The next received messages; None if the log ends before."""
+        """Return the next `count` received messages; None if the log ends before."""
         taken: list[LoggedMessage] = []
         while len(taken) < count:
             message = next(self._messages, None)
@@ -235,7 +238,7 @@ class Replay:
         return taken
 
     def _note(self, message: LoggedMessage) -> bool:
-        """Note what we sent; returns whether it was ours."""
+        """Store a message of the log if we sent it. Return whether it is one of ours."""
         if message.system_id != self.companion.session.senders.own.system_id:
             return False
         if message.component_id == RECORD_COMPONENT_ID:
@@ -248,7 +251,8 @@ class Replay:
         return True
 
     def _note_thrust(self, message: LoggedMessage) -> None:
-        """The recorded vehicle reports the thrust of recorded setpoints, whatever is sent now."""
+        """Store the thrust of a recorded setpoint: the vehicle reports this thrust in the recorded
+        telemetry, whatever the replay sends."""
         thrusts = self.companion.thrusts
         if message.name == "SET_ATTITUDE_TARGET":
             thrusts.append(message.message.thrust)
@@ -256,12 +260,12 @@ class Replay:
             thrusts.clear()
 
     def _drain(self) -> None:
-        """Note what the last turns have sent."""
+        """Store the messages in the log that the last turns sent."""
         for message in self._messages:
             if not self._note(message):
                 return
 
     def _cut(self) -> None:
-        """The log is not complete: only what was sent before the newest check counts."""
+        """Keep only messages before the newest valid checksum, because the log is not complete."""
         for sent in (self.recorded, self.replayed):
             sent[:] = [each for each in sent if each.time_s < self._checked_s]
