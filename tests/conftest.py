@@ -1,4 +1,4 @@
-"""Before any test: bytecode and machine code are compiled, so that no test waits for it."""
+"""Compiles bytecode and machine code before the first test, so that no test waits for it."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ COMPILED = (
     "simulator.vehicle.dynamics",
 )
 
-# Ignored signals are inherited: started in the background or under nohup, the processes of the
-# tests would not hear the Ctrl-C that they are sent
+# Restore the handlers of ignored signals. Processes inherit them: if pytest runs in the background
+# or under nohup, the processes that tests start would ignore the Ctrl-C that the tests send
 for _number, _handler in (
     (signal.SIGINT, signal.default_int_handler),
     (signal.SIGHUP, signal.SIG_DFL),
@@ -31,20 +31,22 @@ for _number, _handler in (
     if signal.getsignal(_number) is signal.SIG_IGN:
         signal.signal(_number, _handler)
 
-# Waits of processes first; the many small modules at the end keep all workers busy to the last
+# Tests of processes first, because they wait long; the many short ones at the end keep all workers
+# busy until the end
 ORDER = ("tests", "process", "clients", "wire", "flight", "replay", "export", "physics", "unit")
 
 PACKAGES = (Path(__file__).parent.parent / name for name in ("offboard", "simulator"))
 
-# Tests that limit the size of files would leave truncated bytecode, on which later imports fail:
-# all bytecode is written before the first test, that of the test modules while they are collected
+# All bytecode is written before the first test, that of the test modules while they are collected.
+# Tests that limit the size of files would write truncated bytecode, with which later imports fail
 sys.dont_write_bytecode = False
 os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
 os.environ["OFFBOARD_REPORT"] = "0"  # flights of tests write no report
 
 
 def pytest_xdist_auto_num_workers() -> int:
-    """`-n auto`: one more than processors, since many tests wait for a vehicle in real time."""
+    """Return the number of workers for `-n auto`: one more than there are processors, because many
+    tests wait for a vehicle in real time."""
     return (os.cpu_count() or 1) + 1
 
 
@@ -63,5 +65,5 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """The modules of the tests are imported: their bytecode is written."""
+    """Stop writing bytecode; that of the test modules was written when they were imported."""
     sys.dont_write_bytecode = True

@@ -38,7 +38,7 @@ DARK = {
 }  # fmt: skip
 
 _TOP_PX, _BOTTOM_PX, _PANEL_PX, _GAP_PX = 48, 90, 150, 36
-_FEW_DECADES = 2  # a logarithmic axis of so many decades or fewer has ticks at 2 and 5, too
+_FEW_DECADES = 2  # a logarithmic axis of at most this many decades has ticks at 2 and 5, too
 _MOST_DECADES = 3  # an axis of more decades does not have a tick at each
 # `without_outliers` applies to at least 50 values whose range is over 4 times that of 99 % of them
 _FEW_VALUES, _FLATTENED = 50, 4.0

@@ -28,7 +28,7 @@ Action = Callable[[Pair], None]
 
 
 def refusing(event: str, text: str) -> Firmware:
-    """A vehicle that refuses one thing, with its reason."""
+    """A vehicle that refuses one event, for the reason `text`."""
     texts = (StatusText(Severity.CRITICAL, text),)
     rule = Rule(event, result=Result.TEMPORARILY_REJECTED, texts=texts)
     return replace(LEAN, rules=(rule, *LEAN.rules))
@@ -46,7 +46,8 @@ def with_default(name: str, value: float) -> Firmware:
 
 
 def delivering(delays_s: Callable[[float, bytes], Sequence[float]]) -> Filter:
-    """A link that delivers each datagram after each of these delays, in the order of arrival."""
+    """A link that delivers each datagram once after each of its delays. Datagrams that are due
+    in the same step keep the order in which they were sent."""
     under_way: list[tuple[float, bytes]] = []
 
     def arriving(time_s: float, datagrams: Bytes) -> Bytes:
@@ -60,7 +61,7 @@ def delivering(delays_s: Callable[[float, bytes], Sequence[float]]) -> Filter:
 
 
 def losing(share: float, seed: int = 3) -> Filter:
-    """A link that loses datagrams."""
+    """A link that loses a share of the datagrams."""
     chance = random.Random(seed)
     return lambda _, datagrams: [d for d in datagrams if chance.random() >= share]
 
@@ -81,8 +82,8 @@ def repeating(again_s: float) -> Filter:
 
 
 def shuffling() -> Filter:
-    """A link that delays one datagram in five by 20 ms, some that have a time stamp by 2.5 s, and
-    duplicates another one in five."""
+    """A link that delays one datagram in five by 20 ms, duplicates another one in five, and delays
+    one attitude or position in a hundred by 2.5 s."""
     chance = random.Random(5)
 
     def delays_s(_: float, datagram: bytes) -> Sequence[float]:
@@ -95,12 +96,12 @@ def shuffling() -> Filter:
 
 
 def noisy(_: float, datagrams: Bytes) -> Bytes:
-    """The vehicle's datagrams between garbage."""
+    """A link that adds garbage before and after each datagram."""
     return [part for d in datagrams for part in (b"\xfd\x09garbage", d, b"\x00" * 7)]
 
 
 def both(first: Filter, second: Filter) -> Filter:
-    """A link with two faults."""
+    """A link with two faults, one after the other."""
     return lambda time_s, datagrams: second(time_s, first(time_s, datagrams))
 
 
@@ -137,7 +138,7 @@ def heartbeats(**changed: int) -> Filter:
 
 
 def disarmed(most: float = math.inf) -> Filter:
-    """A link on which so many heartbeats show the vehicle disarmed, wrongly."""
+    """A link on which the first `most` heartbeats wrongly show the vehicle disarmed."""
     wrong: list[Any] = []
 
     def change(message: Any) -> None:
@@ -149,8 +150,8 @@ def disarmed(most: float = math.inf) -> Filter:
 
 
 def restamped(less_s: float) -> Filter:
-    """A link on which positions and attitudes are stamped as by a vehicle that booted so much
-    later."""
+    """A link on which the time stamps of positions and attitudes are reduced by `less_s`, as if the
+    vehicle had booted that much later."""
 
     def change(message: Any) -> None:
         message.time_boot_ms -= round(1e3 * less_s)
@@ -166,13 +167,13 @@ def stop(pair: Pair) -> None:
 
 
 def restart(pair: Pair) -> None:
-    """The vehicle boots: on the ground, disarmed, its time from zero."""
+    """Reboot the vehicle: it is on the ground and disarmed, and its time begins at zero."""
     conditions = config.scenario("calm").conditions
     pair.instance = Instance(LEAN, config.vehicle("px4_sih"), conditions, 7)
 
 
 def downlink(fault: Filter) -> Action:
-    """From now on telemetry comes through `fault`."""
+    """Apply `fault` to the telemetry from now on."""
 
     def change(pair: Pair) -> None:
         pair.down = fault
@@ -181,7 +182,8 @@ def downlink(fault: Filter) -> Action:
 
 
 def cut(for_s: float, *kinds: int, ways: Sequence[str] = ("down", "up")) -> Action:
-    """From now on nothing passes for so long, or nothing of these kinds, in these directions."""
+    """Drop all datagrams in these directions for `for_s` from now on; with `kinds`, only messages
+    with these ids."""
 
     def change(pair: Pair) -> None:
         ends_s, rest = pair.time_s + for_s, without(*kinds)
@@ -203,7 +205,7 @@ def cut(for_s: float, *kinds: int, ways: Sequence[str] = ("down", "up")) -> Acti
 def failing(
     fail: Callable[[Situation], Decision], times: float = math.inf, after: int = 30
 ) -> Callable[[Controller], Controller]:
-    """A controller that fails after so many decisions, for `times` decisions."""
+    """Make a controller fail in `times` decisions after the first `after` ones."""
 
     def wrap(law: Controller) -> Controller:
         decide, numbers = law.decide, count(1)

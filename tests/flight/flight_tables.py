@@ -1,6 +1,6 @@
-"""The tables in offboard/flight/README.md: the failsafe, and all exits from the air.
+"""Generates the tables in offboard/flight/README.md: the failsafe, and all exits from the air.
 
-`python tests/flight/flight_tables.py` writes them.
+`python tests/flight/flight_tables.py` writes them into the README.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ IN_THE_AIR = FLYING | {Phase.LAND}
 
 
 def asked(row: Transition, source: Phase) -> str:
-    """What is asked of the autopilot where `row` leaves the phase `source`, in the air; empty:
-    nothing, and without a reason."""
+    """Return what is asked of the autopilot if `row` leaves the phase `source` in the air. Empty if
+    nothing is asked although the vehicle is armed and nobody else has it."""
     if row.target in _ASKED:
         return _ASKED[row.target]
     if row.cause == "mode change":
@@ -44,15 +44,15 @@ def asked(row: Transition, source: Phase) -> str:
 
 
 def exits(service: ServiceOptions | None) -> list[tuple[Transition, Phase]]:
-    """The rows that leave the air, or the phases that fly by setpoints for those that end it, with
-    each phase that they leave."""
+    """Return the rows of the phase table that lead from a phase in the air to an end phase, or to
+    one of _ASKED, each with the phase that it leaves."""
     leaving = ENDS | _ASKED.keys()
     rows = [row for row in table(service) if row.target in leaving]
     return [(row, phase) for row in rows for phase in row.phases if phase in IN_THE_AIR]
 
 
 def exits_markdown() -> str:
-    """The table of all exits from the air, for the README of `flight/`."""
+    """Return the table of all exits from the air."""
     lines = ["| condition | in the phases | then | asked of the autopilot |", "|---|---|---|---|"]
     sources: dict[tuple[str, str, str], set[Phase]] = {}
     for row, phase in (*exits(None), *exits(ServiceOptions(then="land"))):
@@ -66,12 +66,12 @@ def exits_markdown() -> str:
 
 
 def with_default(setting: re.Match[str]) -> str:
-    """The name of a setting of `Limits`, and its default."""
+    """Return the name of a setting of `Limits`, followed by its default."""
     return f"{setting[0]}: {getattr(Limits(), setting[1]):g}"
 
 
 def failsafe_markdown() -> str:
-    """The table for the README of `flight/`."""
+    """Return the table of the failsafe."""
     lines = ["| row | what is measured | limit | held for | then |", "|---|---|---|---|---|"]
     for row in ROWS:
         then = row.action.name.lower()
@@ -82,7 +82,7 @@ def failsafe_markdown() -> str:
 
 
 def with_tables(text: str) -> str:
-    """The same page with the tables of the code between their markers."""
+    """Return the README with the tables replaced between their markers."""
     for name, rows in (("failsafe", failsafe_markdown()), ("exits", exits_markdown())):
         begin, end = f"<!-- {name}:begin -->\n", f"<!-- {name}:end -->"
         before, _, rest = text.partition(begin)

@@ -1,12 +1,13 @@
-"""Flight and simulated vehicle joined byte by byte in vehicle time, without socket or clock.
+"""A `Flight` (the companion) and a simulated vehicle that exchange bytes in memory and in vehicle
+time, without socket or clock.
 
-`Pair.fly` steps the vehicle by 4 ms and hands every datagram over at once, through faults that a
-test puts on the two directions. Host time runs with vehicle time but from another zero, so that
-code which mixes them up fails.
+`Pair.fly` steps the vehicle by 4 ms and delivers each datagram at once, through the faults that a
+test applies to either direction. Host time advances with vehicle time but from another zero, so
+that code which confuses them fails.
 
-As in `offboard.run.loop`, a turn has all datagrams that have arrived, or none after 20 ms. The
-companion may take time: a law that calls `HostClock.spend`, or `Pair.pause`. Meanwhile the vehicle
-goes on, and what it sends waits, with the times of its arrival, for the next turn.
+As in `offboard.run.loop`, a turn gets all datagrams that have arrived, or none after 20 ms. A
+control law that calls `HostClock.spend`, or `Pair.pause`, makes the companion take time. Meanwhile
+the vehicle goes on; its datagrams wait for the next turn with their times of arrival.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ from simulator.steps import STEP_S
 HOST_EPOCH_S = 5000.0
 POLL_STEPS = 5
 UNIX_EPOCH_US = 1_767_225_600_000_000
-LONGEST_S = 350.0  # of which a vehicle that is not heard any more is awaited for 300 s
+LONGEST_S = 350.0  # longest flight; includes 300 s of waiting for a vehicle that is not heard
 QUICK_LANDING = {"MPC_LAND_SPEED": 1.2, "MPC_LAND_CRWL": 0.7, "COM_DISARM_LAND": 0.5}
 LOITER = 3  # sub mode of PX4's AUTO
 COMMAND_LONG, ATTITUDE_TARGET = 76, 82  # message ids
@@ -58,8 +59,8 @@ NEEDED = ("HEARTBEAT", "SYS_STATUS", "EXTENDED_SYS_STATE", "HOME_POSITION")
 
 
 def with_rate(firmware: Firmware, rate_hz: float, *more: str) -> Firmware:
-    """A vehicle that sends position and attitude at `rate_hz`, whatever rate is requested, and else
-    what a flight needs and `more`; the simulated truth is not on the wire."""
+    """Return a firmware that sends position and attitude at `rate_hz`, whatever rate is requested.
+    Of other messages it sends only those of NEEDED and `more`, and no true positions."""
     fixed = dict.fromkeys(("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED"), rate_hz)
     known_hz = firmware.companion_rates_hz
     return replace(
@@ -70,9 +71,9 @@ def with_rate(firmware: Firmware, rate_hz: float, *more: str) -> Firmware:
     )
 
 
-# As many telemetry links: a fifth of the traffic that is requested, and half of the time of a test
+# 50 Hz, as on many telemetry links: a fifth of the requested traffic, and half the time of a test
 LEAN, LEAN_COPTER = with_rate(PX4, 50.0), with_rate(ARDUPILOT, 50.0)
-# One that obeys requests for rates, which are 100 Hz
+# A firmware that sends the requested rates, which are 100 Hz
 OBEDIENT = replace(with_rate(PX4, 100.0), fixed_streams=PX4.fixed_streams)
 
 
@@ -91,16 +92,17 @@ class HostClock:
         return self.now_s
 
     def spend(self, seconds: float) -> None:
-        """Compute for so long."""
+        """Let a computation of the companion take this time."""
         self.now_s += seconds
 
 
 @dataclass
 class Pair:
-    """One flight. `at` maps moments to actions: each is done once, when its test first holds.
+    """One flight. `at` has pairs of a condition and an action, which is done once, when the
+    condition first holds.
 
-    `down` and `up` see all datagrams (frames, up) with the vehicle time and return those that
-    arrive. With `dead` set the vehicle's process is gone while time goes on.
+    `down` and `up` get all datagrams (`up`: frames) with the vehicle time, and return those that
+    arrive. While `dead` is set, the vehicle neither sends nor receives, and time goes on.
     """
 
     companion: Flight
@@ -112,19 +114,19 @@ class Pair:
     dead: bool = False
     time_s: float = 0.0
     steps: int = 0
-    turned: int = 0  # steps at the newest turn
-    sent: list[tuple[float, Phase, bytes]] = field(default_factory=list)  # by the companion
+    turned: int = 0  # value of `steps` at the newest turn
+    sent: list[tuple[float, Phase, bytes]] = field(default_factory=list)  # frames of the companion
     logged: Bytes = field(default_factory=list)
     phases: list[tuple[float, Phase]] = field(default_factory=list)
     failsafes: dict[str, Action] = field(default_factory=dict)  # rows that were active
     looks: list[tuple[int, Callable[[Pair], object]]] = field(default_factory=list)
-    watch: Any = None  # what `watch.watched` has noted
-    waiting: list[Chunk] = field(default_factory=list)  # that the companion has not read yet
-    leaving: Bytes = field(default_factory=list)  # what the turn in progress sends at its end
-    lingers: bool = False  # the companion is kept alive after the end of its flight
+    watch: Any = None  # the `watch.Watch` of this flight
+    waiting: list[Chunk] = field(default_factory=list)  # chunks that the companion has not read yet
+    leaving: Bytes = field(default_factory=list)  # frames that leave when the present turn ends
+    lingers: bool = False  # whether turns go on after the end of the flight
 
     def fly(self, longest_s: float = LONGEST_S) -> Outcome:
-        """To the end of the flight, which must come within `longest_s`."""
+        """Fly to the end of the flight, which must come within `longest_s`."""
         while not self.companion.has_ended():
             assert self.time_s < longest_s, f"no end after {longest_s} s: {self.companion.phase}"
             self.advance()
@@ -132,7 +134,7 @@ class Pair:
         return self.companion.outcome
 
     def track(self) -> None:
-        """To the end of the reference, without the landing that follows."""
+        """Fly to the end of the reference, without the landing that follows."""
         while self.companion.phase is not Phase.LAND:
             outcome = self.companion.outcome
             assert outcome is None, outcome
@@ -140,7 +142,7 @@ class Pair:
         assert "land: at rest" in self.companion.announced, self.companion.announced
 
     def advance(self) -> None:
-        """One step of the vehicle, then a turn of the companion with all that has arrived."""
+        """Step the vehicle once, then run a turn of the companion if one is due."""
         self.steps += 1
         self.time_s = self.steps * STEP_S
         now_s = self.host_s
@@ -182,13 +184,13 @@ class Pair:
                 self.instance.feed(frame)
 
     def every(self, steps: int, see: Callable[[Pair], object]) -> None:
-        """Show the flight to `see` once in so many steps."""
+        """Call `see` with this flight every `steps` steps."""
         self.looks.append((steps, see))
 
     # -- what a test may do to the vehicle ------------------------------------------------------
 
     def ground(self, number: int, *params: float) -> None:
-        """A command of the ground station, on its own link."""
+        """Send a command of the ground station to the vehicle, on a link of its own."""
         self.instance.feed_ground(command_of_ground(1, number, *params))
 
     def pilot_takes_over(self) -> None:
@@ -200,19 +202,19 @@ class Pair:
         return HOST_EPOCH_S + self.time_s
 
     def pause(self, seconds: float) -> None:
-        """The process of the companion is stopped, as by SIGSTOP."""
+        """Stop the process of the companion for this time, as SIGSTOP does."""
         self.clock.spend(seconds)
 
     @property
     def heard_s(self) -> float:
-        """Time of the newest telemetry."""
+        """Time at which the newest telemetry arrived, on the scale of `time_s`."""
         return self.time_s - self.companion.current.silence_s
 
     # -- what a test may ask afterwards -----------------------------------------------------------
 
     @property
     def setpoints(self) -> list[tuple[float, Phase, Any]]:
-        """Time, phase and decoded SET_ATTITUDE_TARGET."""
+        """Time, phase and message of every SET_ATTITUDE_TARGET."""
         return [
             (at_s, phase, decode(frame))
             for at_s, phase, frame in self.sent
@@ -225,7 +227,7 @@ class Pair:
         return [frame[10:-2] for _, _, frame in self.sent if frame_id(frame) == ATTITUDE_TARGET]
 
     def commands(self, number: int) -> list[Any]:
-        """Every COMMAND_LONG with this MAV_CMD."""
+        """Return every COMMAND_LONG with this MAV_CMD."""
         decoded = (decode(frame) for *_, frame in self.sent if frame_id(frame) == COMMAND_LONG)
         return [message for message in decoded if message.command == number]
 
@@ -241,7 +243,7 @@ class Pair:
 
     @property
     def armings(self) -> list[float]:
-        """What was asked by MAV_CMD_COMPONENT_ARM_DISARM: 1 to arm, 0 to disarm."""
+        """First parameters of the MAV_CMD_COMPONENT_ARM_DISARM sent: 1 to arm, 0 to disarm."""
         return [message.param1 for message in self.commands(400)]
 
     @property
@@ -257,7 +259,7 @@ class Pair:
         return any(flown is phase for _, flown in self.phases)
 
     def log(self, directory: Path) -> tlog.Tlog:
-        """The log that this flight would have left."""
+        """Write the log of this flight into a directory, and open it."""
         log = FlightLog(directory, "")
         with log:
             for index, frame in enumerate(self.logged):
@@ -265,17 +267,17 @@ class Pair:
         return tlog.read(log.path)
 
     def history(self) -> History:
-        """What that log holds."""
+        """Return the history that is read from the log."""
         with TemporaryDirectory() as temporary:
             return history.gather(self.log(Path(temporary)))
 
     def score(self) -> Score:
-        """The score of `history`."""
+        """Return the score of `history`."""
         return score(self.history())
 
 
 def command_of_ground(component: int, number: int, *params: float) -> bytes:
-    """A ground station's command to a component of the vehicle's system."""
+    """Return a ground station's command to a component of the vehicle's system."""
     codec = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
     filled = (*params, *(0.0,) * (7 - len(params)))
     message = mavlink.MAVLink_command_long_message(1, component, number, 0, *filled)
@@ -283,7 +285,7 @@ def command_of_ground(component: int, number: int, *params: float) -> bytes:
 
 
 def level_setpoint(thrust: float, system: int, component: int) -> bytes:
-    """The setpoint of another program."""
+    """Return a level setpoint of another program."""
     codec = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
     level = (1.0, 0.0, 0.0, 0.0)
     message = mavlink.MAVLink_set_attitude_target_message(0, 1, 1, 7, level, 0, 0, 0, thrust)
@@ -291,7 +293,7 @@ def level_setpoint(thrust: float, system: int, component: int) -> bytes:
 
 
 def another_vehicle(system: int) -> bytes:
-    """A HEARTBEAT of another vehicle."""
+    """Return a HEARTBEAT of another vehicle."""
     codec = mavlink.MAVLink(None, srcSystem=system, srcComponent=1)
     return bytes(mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 3, 3).pack(codec))
 
@@ -305,7 +307,7 @@ def frame_id(frame: bytes) -> int:
 
 
 def frames_of(datagram: bytes) -> Iterable[bytes]:
-    """The MAVLink 2 frames of a datagram, unsigned."""
+    """Yield the frames of a datagram of unsigned MAVLink 2 frames."""
     at = 0
     while at < len(datagram):
         size = 12 + datagram[at + 1]
@@ -314,7 +316,7 @@ def frames_of(datagram: bytes) -> Iterable[bytes]:
 
 
 def in_phase(phase: Phase, for_s: float = 0.0) -> Callable[[Pair], bool]:
-    """The moment when the companion has been in `phase` for `for_s`."""
+    """Return the condition that the companion has been in `phase` for `for_s`."""
 
     def now(pair: Pair) -> bool:
         return (
@@ -348,11 +350,11 @@ def make(
     aloft: bool = False,
     **options: Any,
 ) -> Pair:
-    """A pair as `offboard fly --sitl` makes it. `flies` is the simulated vehicle, `believed` the
-    controller's model of it, `learning` the settings of the identification. With `deadline_s` the
-    companion does not wait for slow decisions. The vehicle starts and lands faster than by default:
-    what most tests prove depends on neither. With `aloft` it hovers at the height of the reference
-    when its links open, unless the scenario has a start of its own."""
+    """Return a pair with the settings of `offboard fly --sitl`. `flies` is the simulated vehicle,
+    `believed` the controller's model of it, `learning` the settings of the identification. With
+    `deadline_s` the companion does not wait for slow decisions. The vehicle starts and lands faster
+    than by default, because few tests depend on either. With `aloft` it hovers at the height of the
+    reference when its links open, unless the scenario has a start of its own."""
     named = {"reference": reference, "vehicle": vehicle}
     choices = {part: chosen for part, chosen in named.items() if chosen}
     clock = clock or HostClock()
@@ -398,7 +400,7 @@ def make(
 
 
 def on_arducopter(*assignments: str, firmware: Firmware = LEAN_COPTER, **options: Any) -> Pair:
-    """A flight on ArduCopter, whose start is ten times as fast as the real one's 42 s."""
+    """Return a flight on ArduCopter, which boots in a tenth of the 42 s of the real one."""
     pair = make(*assignments, vehicle="arducopter", firmware=firmware, boot_scale=0.1, **options)
     pair.instance.autopilot.parameters.set("GUID_OPTIONS", 8.0)
     return pair
@@ -408,13 +410,13 @@ SHORT = ("reference.height_m=1.0", "reference.duration_s=3.0")
 
 
 def hover(*assignments: str, **options: Any) -> Pair:
-    """A flight of 20 s: up to 1 m, three seconds of hover, down."""
+    """Return a flight of 20 s: up to 1 m, three seconds of hover, down."""
     return make(*SHORT, *assignments, reference="hover", **options)
 
 
 @cache
 def calm_hover() -> Pair:
-    """`hover` without options, flown: for all tests that only look at it."""
+    """Return a finished flight of `hover` without options, for all tests that only read it."""
     pair = hover()
     assert pair.fly().exit_code == 0
     return pair

@@ -1,8 +1,8 @@
-"""An independent observer of the service: what leaves, against what the vehicle and the pilot do.
+"""An independent observer of the service: checks what it sends against what vehicle and pilot do.
 
 It decodes the bytes on the three links (vehicle to service, service to vehicle, ground station to
-vehicle) with pymavlink, looks at the simulated vehicle itself, and uses nothing of the service.
-What must never happen is kept in `unsafe`.
+vehicle) with pymavlink, reads the state of the simulated vehicle, and uses no code of the service.
+It stores in `unsafe` whatever must never happen.
 """
 
 from __future__ import annotations
@@ -23,51 +23,51 @@ COMMANDS, SETPOINTS = {75, COMMAND_LONG}, {ATTITUDE_TARGET, 84, 86}
 # HEARTBEAT, PARAM_REQUEST_READ, COMMAND_ACK, TIMESYNC, STATUSTEXT
 HARMLESS = {HEARTBEAT, 20, 77, 111, 253}
 QUESTIONS = {511, 512}  # MAV_CMD_SET_MESSAGE_INTERVAL, _REQUEST_MESSAGE
-US, VEHICLE = (1, 191), (1, 1)  # system and component
-CRITICAL = 5  # MAV_STATE; what is above it is worse
+US, VEHICLE = (1, 191), (1, 1)  # system and component id
+CRITICAL = 5  # MAV_STATE; greater values are worse
 ENGAGE = {"px4": "OFFBOARD", "ardupilot": "GUIDED"}
 HOLD = {"px4": "AUTO.LOITER", "ardupilot": "BRAKE"}
 LANDS = {"px4": "AUTO.LAND", "ardupilot": "LAND"}
 HOLD_PARAMETERS = {"px4": (4, 3), "ardupilot": (17, 0)}
 ALOFT_M = 0.3
-REPORTED_S = 0.5  # EXTENDED_SYS_STATE at 5 Hz, and what decides on it
-ANSWERED_S = 0.3  # a command of the pilot, by the vehicle
-KNOWN_S = 2.6  # age of the newest report of the mode
-TOUCHED_S = 1.5  # since it has left the ground last: it may jump
-OTHER_S = 4.9  # another sender is there for so long; 5 s by the service
-LIKE_NOW_RAD = 0.2  # attitude of the stream in the air against the vehicle's
-TILT_RAD = math.radians(46.0)
-LEAST_SHARE, FALLING_MPS = 0.32, 3.5
-UNFLOWN_S = 2.5
+REPORTED_S = 0.5  # time until the service knows of a landing: EXTENDED_SYS_STATE comes at 5 Hz
+ANSWERED_S = 0.3  # longest time from a command of the pilot to the vehicle's change of mode
+KNOWN_S = 2.6  # greatest age of the newest report of the mode for setpoints and commands
+TOUCHED_S = 1.5  # time for which a vehicle that touches the ground, as in a jump, counts as off it
+OTHER_S = 4.9  # time for which another sender counts as present; 5 s in the service
+LIKE_NOW_RAD = 0.2  # greatest angle between the vehicle's attitude and a setpoint in another mode
+TILT_RAD = math.radians(46.0)  # greatest tilt of a setpoint
+LEAST_SHARE, FALLING_MPS = 0.32, 3.5  # least thrust / hover thrust in the air; greatest sink rate
+UNFLOWN_S = 2.5  # longest time in the air without setpoint or command of the service
 
 
 class Report(NamedTuple):
-    """The vehicle's mode as it left the vehicle."""
+    """A report of the mode that the vehicle has sent, and the truth at that time."""
 
     time_s: float
     mode: str
-    engaged: bool  # and a pilot had switched to it, in the air
+    engaged: bool  # whether a pilot had switched to the mode in the air
     failsafe: bool
 
 
 @dataclass
 class Wire:
-    """Watches `pair` from now on. `arms`: the service may arm."""
+    """Watches `pair` from now on. `arms`: whether the service may arm."""
 
     pair: Serving
     arms: bool = False
     unsafe: list[str] = field(default_factory=list)
-    mode: str = ""  # of the vehicle
-    changed_s: float = -math.inf  # when the vehicle took it
-    engaged: bool = False  # by the pilot, and the mode was not left since
-    left: bool = False  # in that mode, by a service that flew it and was ended
-    asked: set[str] = field(default_factory=set)  # modes that the service asked for
-    known: Report | None = None  # the newest one that the service has got
+    mode: str = ""  # mode of the vehicle
+    changed_s: float = -math.inf  # when the vehicle changed to this mode
+    engaged: bool = False  # whether the pilot engaged, and the vehicle is still in the mode
+    left: bool = False  # whether a service that flew the vehicle was ended in that mode
+    asked: set[str] = field(default_factory=set)  # modes that the service has requested
+    known: Report | None = None  # the newest report that the service has received
 
     def __post_init__(self) -> None:
         self._wish_s = self._other_s = self._off_ground_s = -math.inf
-        self._sent: deque[Report] = deque()  # on their way to the service
-        self._followed = False  # our setpoints, since it was engaged
+        self._sent: deque[Report] = deque()  # reports on their way to the service
+        self._followed = False  # whether the service has sent setpoints since the pilot engaged
         self._served_s = self._apart_s = self._flying_s = self.pair.time_s
         self._deliver = self.pair.down
         self.pair.down = self._delivered
@@ -77,12 +77,12 @@ class Wire:
         self.wrap()
 
     def wrap(self) -> None:
-        """Watch the present service; again after its restart, which ends an engagement."""
+        """Watch the present service. Called again after its restart, which ends an engagement."""
         service = self.pair.companion
         turn = service.turn
         self.left = self.engaged and self._followed
         self.engaged, self.known = False, None
-        self._other_s = -math.inf  # what was sent before it began it cannot know
+        self._other_s = -math.inf  # the service cannot know what was sent before it began
         self._sent.clear()
         self.asked.clear()
 
@@ -99,7 +99,7 @@ class Wire:
     # ------------------------------------------------------------------ to the vehicle and from it
 
     def _asked(self, frame: bytes) -> None:
-        """What the pilot asks of the vehicle."""
+        """Note a command of the pilot to the vehicle."""
         if frame_id(frame) == COMMAND_LONG:
             message = decode(frame)
             asked = (message.command, message.param1, message.param2, message.param3)
@@ -108,7 +108,7 @@ class Wire:
         self._feed(frame)
 
     def _delivered(self, time_s: float, datagrams: list[bytes]) -> list[bytes]:
-        """The vehicle at this step, and which reports of its mode are on their way."""
+        """Look at the vehicle, and note the reports of its mode that will reach the service."""
         self._look(time_s)
         arriving = self._deliver(time_s, datagrams)
         for frame in (frame for datagram in arriving for frame in frames_of(datagram)):
@@ -123,13 +123,14 @@ class Wire:
         return arriving
 
     def _look(self, time_s: float) -> None:
-        """At the vehicle itself."""
+        """Look at the state of the simulated vehicle."""
         mode, ours = self.pair.mode, ENGAGE[self.pair.firmware]
         if mode != self.mode:
             self.left = self._followed = False
             if mode == ours:
                 self.asked.clear()
-                alone = time_s - self._other_s > OTHER_S  # else it is switched for the other
+                # beside another sender the pilot switches to the mode for that sender
+                alone = time_s - self._other_s > OTHER_S
                 self.engaged = alone and time_s - self._wish_s < ANSWERED_S and self._off_ground
             else:
                 self.engaged = False
@@ -138,7 +139,7 @@ class Wire:
             self.mode, self.changed_s = mode, time_s
         unheard, autopilot = self.pair.lost_down or self.pair.paused, self.pair.instance.autopilot
         idle = not autopilot.commander.armed and autopilot.position_controller.landed
-        if unheard or not idle:  # on the ground, as the service may know
+        if unheard or not idle:  # the service may not know that the vehicle is on the ground
             self._flying_s = time_s
         if not autopilot.plant.on_ground:
             self._off_ground_s = time_s
@@ -161,7 +162,7 @@ class Wire:
         return bool(-self.pair.place[2] > ALOFT_M) and self.pair.armed
 
     def _take(self, datagram: bytes) -> None:
-        """What the service gets."""
+        """Note what arrives at the service."""
         for frame in frames_of(datagram):
             number, sender = frame_id(frame), (frame[5], frame[6])
             if sender == VEHICLE and number in (HEARTBEAT, CURRENT_MODE):
@@ -221,7 +222,8 @@ class Wire:
             self._note(f"setpoint in {known.mode}, to which no pilot has switched in the air")
 
     def _judge_stream(self, message: Any, known: Report) -> None:
-        """PX4's, in the air and in another mode: it must change nothing."""
+        """Judge a setpoint to a PX4 vehicle that flies in another mode. PX4 wants such setpoints
+        before OFFBOARD; they must be close to its present attitude."""
         if known.failsafe:
             self._note(f"setpoint in {known.mode}, a failsafe")
         if self.pair.time_s - self._other_s < OTHER_S:
@@ -246,7 +248,7 @@ class Wire:
         if self._is_unknown(self.known):
             self._note(f"command {command} without a recent report of the mode")
         elif command == LAND and self._starved:
-            pass  # its own failsafe for missing setpoints flies it, and nobody else
+            pass  # the vehicle's own failsafe for missing setpoints flies it, and no pilot
         elif self.known.mode not in self.asked | {ENGAGE[on]}:  # type: ignore[union-attr]
             self._note(f"command {command} in {self.mode}")
         elif self.known.mode == ENGAGE[on]:  # type: ignore[union-attr]

@@ -1,4 +1,5 @@
-"""The service and a simulated vehicle joined in memory: `Pair` with `Flights` as its companion."""
+"""The service and a simulated vehicle that exchange bytes in memory: `Pair` with `Flights` as its
+companion."""
 
 from __future__ import annotations
 
@@ -35,7 +36,7 @@ from simulator.instance import Instance
 ARM, TAKEOFF, SET_MODE, LAND = 400, 22, 176, 21  # MAV_CMD
 START, PAUSE_CONTINUE = 300, 193
 NAN = float("nan")
-HOVER = {"px4": 0.489, "ardupilot": 0.366}  # thrust
+HOVER = {"px4": 0.489, "ardupilot": 0.366}  # hover thrust
 MODES = {  # parameters of MAV_CMD_DO_SET_MODE
     "px4": {"engage": (1, 6, 0), "pilot": (1, 4, LOITER), "land": (1, 4, 6)},
     "ardupilot": {"engage": (1, 4, 0), "pilot": (1, 17, 0), "land": (1, 9, 0)},
@@ -56,7 +57,8 @@ class Settings:
 
 @dataclass
 class Logs:
-    """A `Recorder` that notes when each flight began and ended. It survives a restart, as files."""
+    """A `Recorder` that stores when each flight began and ended. As files do, it outlasts a restart
+    of the service."""
 
     clock: HostClock
     begun: list[float] = field(default_factory=list)
@@ -83,14 +85,14 @@ def prepared(*assignments: str, **choices: str) -> Prepared:
 
 @dataclass
 class Serving(Pair):
-    """A pair whose companion is a service. The pilot commands on a link of his own."""
+    """A pair whose companion is the service. The pilot commands the vehicle on another link."""
 
     firmware: str = "px4"
     source: Any = None
     logs: Any = None
     memory: Any = None  # its `VehicleFiles`
     again: Callable[[Any], Flights] | None = None
-    restarted: Callable[[], object] = lambda: None  # of an observer
+    restarted: Callable[[], object] = lambda: None  # called after `restart`
 
     @property
     def state(self) -> Any:
@@ -98,7 +100,7 @@ class Serving(Pair):
 
     @property
     def remembered(self) -> IdentifiedVehicle | None:
-        """What the service knows of the vehicle."""
+        """The vehicle constants that the service has stored."""
         known: IdentifiedVehicle | None = self.memory.get(
             f"{self.firmware}-1-1", self.source.newest
         )
@@ -128,7 +130,7 @@ class Serving(Pair):
 
     @property
     def paused(self) -> bool:
-        """The process of the service is stopped."""
+        """Whether the process of the service is stopped."""
         return self.clock.now_s > HOST_EPOCH_S + self.time_s
 
     @property
@@ -139,12 +141,12 @@ class Serving(Pair):
         self.ground(SET_MODE, *MODES[self.firmware][to])
 
     def engage(self) -> None:
-        """The pilot switches to our mode, and we fly."""
+        """Let the pilot switch to the mode of our setpoints, and wait until the service flies."""
         self.switch("engage")
         self.until(lambda: self.phase in TRACKING, 3.0)
 
     def fly_up(self, height_m: float = 3.0) -> None:
-        """The pilot takes off and holds; the service waits."""
+        """Let the pilot take off and hold, while the service waits."""
         self.until(lambda: self.phase is Phase.STANDBY)
         commander = self.instance.autopilot.commander
         if self.firmware == "px4":
@@ -166,7 +168,7 @@ class Serving(Pair):
         return bool(commander.armed)
 
     def command(self, number: int, *params: float) -> None:
-        """A command to our component, which the vehicle forwards on our link."""
+        """Send a command to our component; the vehicle forwards it on our link."""
         self.forwarded.append(command_of_ground(191, number, *params))
 
     forwarded: list[bytes] = field(default_factory=list)
@@ -174,7 +176,7 @@ class Serving(Pair):
     lost_up: bool = False
 
     def deliver(self, _: float, datagrams: list[bytes]) -> list[bytes]:
-        """The way down: with what others send to us, unless it is lost."""
+        """Return what arrives at the service: the vehicle's datagrams, and those of others."""
         extra, self.forwarded = self.forwarded, []
         return [] if self.lost_down else datagrams + extra
 
@@ -182,7 +184,7 @@ class Serving(Pair):
         return [] if self.lost_up else frames
 
     def other_setpoint(self) -> None:
-        """A setpoint that another program sends, as a router shows it to us."""
+        """Let a setpoint of another program arrive at the service, as from a router."""
         self.forwarded.append(level_setpoint(0.5, 42, 190))
 
     def restart(self) -> None:
@@ -192,7 +194,7 @@ class Serving(Pair):
 
     @property
     def acks(self) -> list[tuple[int, int]]:
-        """Command and result of each acknowledgement that left."""
+        """Command and result of each COMMAND_ACK that was sent."""
         decoded = (decode(frame) for _, _, frame in self.sent if frame[7] == 77)
         return [(message.command, message.result) for message in decoded]
 
@@ -207,13 +209,13 @@ def serve(
     known: IdentifiedVehicle | None = None,
     aloft: bool = False,
 ) -> Serving:
-    """A service with a vehicle that stands on the ground, and boots; with `aloft` one that its
-    pilot holds at 3 m. What is `known` of it was identified before."""
+    """Return a service and a vehicle, which is booting on the ground, or with `aloft` holds at 3 m
+    by its pilot. `known` are constants of it that an earlier flight identified."""
     vehicle = "px4_sih" if on == "px4" else "arducopter"
     clock = HostClock()
     short = SHORT if reference == "hover" else ()
     source = Settings(prepared(*short, *assignments, reference=reference, vehicle=vehicle))
-    logs, memory = Logs(clock), VehicleFiles(Path("/dev/null"), print)  # of which none is written
+    logs, memory = Logs(clock), VehicleFiles(Path("/dev/null"), print)  # writes no file
     if known:
         memory.keep(f"{on}-1-1", source.newest, known)
 

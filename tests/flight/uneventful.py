@@ -31,7 +31,7 @@ ELSEWHERE = (Phase.HEALTH, Phase.STANDBY, Phase.STREAM, Phase.ENGAGE)
 
 
 def hear(flight: FlightState, event: Event) -> None:
-    """The vehicle reports this now."""
+    """Give the flight a report of the vehicle with the present time."""
     flight.vehicle.update(event, flight.now_s)
 
 
@@ -48,14 +48,14 @@ def position(flight: FlightState, down_m: float, down_mps: float = 0.0) -> None:
 
 
 def lift(flight: FlightState) -> None:
-    """The vehicle flies, by every sign."""
+    """Make the vehicle fly according to HEARTBEAT and land detector."""
     heartbeat(flight, armed=True)
     hear(flight, Landed("in_air"))
 
 
 def uneventful(phase: Phase = Phase.TRACK, service: ServiceOptions | None = None) -> FlightState:
-    """In `phase`, which has just begun. A vehicle that stands on the ground, so that it can lift
-    off, land or be taken over."""
+    """Return the state of a flight whose `phase` has just begun. The vehicle stands on the ground,
+    so that a test can make it lift off, land or be taken over."""
     session: Any = SimpleNamespace(
         senders=SimpleNamespace(
             candidates=lambda now_s: "",

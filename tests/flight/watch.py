@@ -1,4 +1,4 @@
-"""What the vehicle really did in a flight, and how the flight must have ended."""
+"""Records what the simulated vehicle truly did in a flight, and checks how the flight ended."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ LANDED = "flown and landed$"
 REACTION_S = 0.13  # a report of the mode at 10 Hz, and a turn
 WATCHED_STEPS = 5  # 20 ms
 LAP = ("reference.height_m=1.0", "reference.laps=1", "reference.run_in_s=2.0",
-       "reference.run_out_s=1.0")  # fmt: skip  # low: a short climb and landing
+       "reference.run_out_s=1.0")  # fmt: skip  # low, so that climb and landing are short
 
 
 @dataclass(frozen=True)
 class Vehicle:
-    """Makes flights of one firmware."""
+    """Creates flights of one firmware."""
 
     name: str
     make: Callable[..., Pair]
 
     def lap(self, *assignments: str, **options: Any) -> Pair:
-        """One lap of a lemniscate, by a vehicle that hovers when its links open."""
+        """Create a flight of one lap of a lemniscate. The vehicle hovers when its links open."""
         return self.make(*LAP, *assignments, **{"aloft": True} | options)
 
     def hover(self, *assignments: str, **options: Any) -> Pair:
-        """A hover of three seconds at 1 m, by a vehicle that hovers when its links open."""
+        """Create a hover of three seconds at 1 m. The vehicle hovers when its links open."""
         return self.hop(*assignments, **{"aloft": True} | options)
 
     def hop(self, *assignments: str, **options: Any) -> Pair:
-        """The same hover after a take-off of its own."""
+        """Create the same hover with a take-off."""
         return self.make(*SHORT, *assignments, reference="hover", **options)
 
     def __str__(self) -> str:
@@ -59,7 +59,8 @@ BOTH = pytest.mark.parametrize("on", [px4, copter], ids=str)
 
 @dataclass(frozen=True)
 class Moment:
-    """The truth. `error_m` is the distance from the reference while it is tracked, else NaN."""
+    """The true state of the vehicle. `error_m` is the distance from the reference in the phases
+    from climb to hover, else NaN."""
 
     time_s: float
     phase: Phase
@@ -72,7 +73,7 @@ class Moment:
 
 @dataclass
 class Watch:
-    """Notes the truth every 20 ms."""
+    """Records the true state every 20 ms."""
 
     moments: list[Moment] = field(default_factory=list)
 
@@ -95,7 +96,7 @@ class Watch:
 
     @property
     def error_m(self) -> float:
-        """Largest true distance from the reference while it was tracked."""
+        """Largest true distance from the reference from climb to hover."""
         return max((moment.error_m for moment in self.during(*TRACKING)), default=0.0)
 
     @property
@@ -104,7 +105,7 @@ class Watch:
 
     @property
     def height_m(self) -> float:
-        """The newest."""
+        """Height now."""
         return -float(self.moments[-1].position_ned_m[2])
 
     @property
@@ -113,7 +114,7 @@ class Watch:
         return max((moment.down_mps for moment in self.moments), default=0.0)
 
     def left_s(self, mode: str) -> float:
-        """When the vehicle first left `mode`."""
+        """Return the time at which the vehicle first left `mode`."""
         modes = [(moment.time_s, moment.mode) for moment in self.moments]
         return next(at_s for (_, before), (at_s, now) in pairwise(modes) if before == mode != now)
 
@@ -136,13 +137,14 @@ def flown(
     top_m: float = math.inf,
     fall_mps: float = math.inf,
 ) -> Watch:
-    """Fly `pair` to its end. Its exit code must be `code` (None: any), its sentence must begin with
-    `says` (a regular expression), the rows of the failsafe be `failsafes`, the score's reason
-    `ended_by`, and the truth stay within the limits.
+    """Fly `pair` to its end and check it. The exit code must be `code` (None: any). The outcome's
+    sentence must begin with `says`, a regular expression. The active rows of the failsafe must be
+    `failsafes`, and `ended_by` that of the score. The true state must stay within the limits.
 
-    What holds in every flight: setpoints are finite and valid, and none leaves after the end. One
-    that was flown is on the ground, disarmed, and needed no failsafe worse than a level setpoint.
-    One that was refused has asked for no landing; the vehicle is where it was.
+    In every flight, setpoints must be finite and valid, and none may be sent after the end. After a
+    flown flight the vehicle must be on the ground and disarmed, and no failsafe action may have
+    been worse than LEVEL. After a refusal no landing may have been requested, and the vehicle must
+    be where it was.
     """
     watch = watched(pair)
     outcome = pair.fly()
@@ -176,17 +178,18 @@ def flown(
 
 
 def refused(pair: Pair, says: str = "", **more: Any) -> Watch:
-    """`flown`, and refused on the ground with this sentence."""
+    """Check as `flown` that the flight is refused on the ground with this sentence."""
     return flown(pair, ExitCode.REFUSED, says, **more)
 
 
 def aborted(pair: Pair, says: str = "", **more: Any) -> Watch:
-    """`flown`, and ended early with this sentence."""
+    """Check as `flown` that the flight is ended early with this sentence."""
     return flown(pair, ExitCode.ABORTED, says, **more)
 
 
 def verdict(pair: Pair) -> tuple[Any, ...]:
-    """What the score of the log says of its end, and its events; a NaN does not equal itself."""
+    """Return what the score of the log says about the end of the flight, and the events of the log.
+    Numbers that may be NaN are given as text, because NaN does not equal itself."""
     logged = pair.history()
     judged = score(logged)
     ended = (judged.completed, judged.ended_by, judged.reason)
@@ -195,7 +198,7 @@ def verdict(pair: Pair) -> tuple[Any, ...]:
 
 
 def without_texts(pair: Pair) -> Pair:
-    """The same log without any STATUSTEXT of ours, which the verdict does not need."""
+    """Return the same flight with a log without our STATUSTEXT, which the verdict does not need."""
     ours = [
         frame
         for frame in pair.logged
@@ -216,7 +219,7 @@ def engage_mode(pair: Pair) -> str:
 
 
 def sent_after(pair: Pair, time_s: float) -> list[str]:
-    """Setpoints and commands, but requests for messages, that left after `time_s`."""
+    """Return setpoints and commands sent after `time_s`, except requests for messages."""
     frames = [(at_s, decode(frame)) for at_s, _, frame in pair.sent if at_s > time_s]
     return [
         f"{message.get_type()} at {at_s:.2f}"
@@ -227,7 +230,7 @@ def sent_after(pair: Pair, time_s: float) -> list[str]:
 
 
 def begun_s(pair: Pair, phase: Phase) -> float:
-    """When this phase began first."""
+    """Return the time at which this phase first began."""
     return next(at_s for at_s, flown in pair.phases if flown is phase)
 
 
@@ -236,12 +239,13 @@ def said(pair: Pair, words: str) -> bool:
 
 
 def scenario_of(*faults: dict[str, Any], **more: Any) -> Scenario:
-    """A scenario with these faults."""
+    """Return a scenario with these faults."""
     return Scenario.model_validate({"name": "test", "faults": faults, **more})
 
 
 def early(name: str, at_s: float = 7.0) -> Scenario:
-    """A shipped scenario whose faults in track begin in the first lap of a vehicle that hovered."""
+    """Return a shipped scenario whose first fault is moved to `at_s`, and the others with it, so
+    that they occur in the first lap of a vehicle that begins in a hover."""
     scenario = simulated.scenario(name)
     first_s = min(fault.at_s for fault in scenario.faults)
     earlier = [
@@ -254,15 +258,15 @@ def early(name: str, at_s: float = 7.0) -> Scenario:
 
 Check = Callable[[Pair], object]
 Row = tuple[Callable[[], Pair], Phase, bool, tuple[Check, ...], dict[str, Any]]
-JUDGED = {"ended_by", "failsafes", "error_m", "top_m", "fall_mps"}  # by `flown`
+JUDGED = {"ended_by", "failsafes", "error_m", "top_m", "fall_mps"}  # arguments of `flown`
 
 
 def row(
     code: int | None, end: Phase, says: str, *checks: Check, fly: Callable[..., Pair] = px4.hop,
     armed: bool = False, **options: Any,
 ) -> Row:  # fmt: skip
-    """A flight by `fly` with these options, and what `flown` demands of it. It ends in the phase
-    `end`; then the vehicle is `armed`, and the checks hold."""
+    """Return a test case: a flight by `fly` with these options, and the arguments of `flown`. It
+    must end in the phase `end` with the vehicle `armed` or not, and the checks must then hold."""
     expected = {name: options.pop(name) for name in JUDGED & options.keys()}
     return partial(fly, **options), end, armed, checks, {"code": code, "says": says, **expected}
 
@@ -274,7 +278,7 @@ ends = partial(aborts, Phase.DISARMED)
 
 
 def judged(flight: Row) -> None:
-    """Fly a row. All that was to happen to it has happened."""
+    """Fly a row and check it. All actions of `Pair.at` must have been done."""
     fly, end, armed, checks, expected = flight
     pair = fly()
     flown(pair, **expected)
@@ -286,7 +290,7 @@ def judged(flight: Row) -> None:
 
 
 def then(phase: Phase, for_s: float, act: Callable[[Pair], object]) -> list[Any]:
-    """This happens to the flight once it has been in `phase` for so long."""
+    """Return `act` for `Pair.at`, to be done once the flight has been in `phase` for `for_s`."""
     return [(in_phase(phase, for_s), act)]
 
 
@@ -295,6 +299,6 @@ def tracking(act: Callable[[Pair], object]) -> list[Any]:
 
 
 def landed(pair: Pair) -> None:
-    """On the ground, by a landing that was asked for."""
+    """Check that the vehicle is on the ground, after a landing that was requested."""
     assert pair.instance.autopilot.position_controller.landed
     assert pair.landings

@@ -1,4 +1,5 @@
-"""A companion in memory for tests of the simulator: pymavlink on one side, an Instance behind."""
+"""A companion for tests of the simulator: exchanges pymavlink messages with an `Instance` in
+memory."""
 
 from __future__ import annotations
 
@@ -21,13 +22,13 @@ from simulator.vehicle.sensors import EstimatorName
 
 OFFBOARD, LOITER, POSCTL = 0x00060000, 0x03040000, 0x00030000
 LAND, RTL = 0x06040000, 0x05040000
-HOVER = 0.4895  # of PX4's vehicle
+HOVER = 0.4895  # hover thrust of the default PX4 vehicle
 NAN = math.nan
 STEPS_PER_HEARTBEAT = 250
 
 
 class Bench:
-    """One instance and what its companion link has sent so far, as (vehicle time, message)."""
+    """One simulated vehicle, and the messages of its companion link as (vehicle time, message)."""
 
     def __init__(
         self,
@@ -73,7 +74,7 @@ class Bench:
 
     @property
     def place(self) -> tuple[float, ...]:
-        """Where it is: north, east, down, m."""
+        """True position NED, m."""
         return self.instance.autopilot.state.truth.position_ned_m
 
     @property
@@ -101,7 +102,7 @@ class Bench:
             self.send(mavlink.MAVLink_heartbeat_message(self.heartbeat_type, 8, 0, 0, 4, 3))
 
     def command(self, number: int, *params: float) -> list[int]:
-        """Send COMMAND_LONG, let a moment pass and return the results of its acks."""
+        """Send COMMAND_LONG, let 20 ms pass, and return the results of its COMMAND_ACKs."""
         filled = (*params, *(0.0,) * (7 - len(params)))
         self.send(mavlink.MAVLink_command_long_message(self.system, 1, number, 0, *filled))
         since_s = self.time_s
@@ -130,7 +131,7 @@ class Bench:
     def run(
         self, duration_s: float, each: Callable[[], None] | None = None, period_s: float = 0.05
     ) -> None:
-        """Let vehicle time pass; `each` is called at once and then every `period_s`."""
+        """Let vehicle time pass. `each` is called at once and then every `period_s`."""
         every = round(period_s / STEP_S)
         for step in range(round(duration_s / STEP_S)):
             if each is not None and step % every == 0:
@@ -143,7 +144,7 @@ class Bench:
                 self._unread.append((self.time_s, datagram))
 
     def run_until(self, reached: Callable[[], bool], limit_s: float) -> float:
-        """Let vehicle time pass until `reached`; return that time, fail after `limit_s`."""
+        """Let vehicle time pass until `reached`, and return that time. Fail after `limit_s`."""
         begun_s = self.time_s
         while not reached():
             assert self.time_s - begun_s < limit_s, f"not reached within {limit_s} s"
@@ -154,7 +155,8 @@ class Bench:
 
     @property
     def received(self) -> list[tuple[float, Any]]:
-        """Everything so far; decoded only when somebody looks, which is half of a test's time."""
+        """All messages so far. They are decoded only when a test reads them, because decoding takes
+        half of the time of a test."""
         for at_s, datagram in self._unread:
             for message in self._parser.parse_buffer(datagram) or []:
                 self._received.append((at_s, message))
@@ -162,7 +164,7 @@ class Bench:
         return self._received
 
     def received_of(self, ids: frozenset[int]) -> Iterator[tuple[float, Any]]:
-        """Messages with these ids alone, of those that nobody has looked at; the rest is lost."""
+        """Yield the messages with these ids that were not read yet; discard the others."""
         for at_s, datagram in self._unread:
             at = 0
             while at < len(datagram):
@@ -180,7 +182,7 @@ class Bench:
         ]
 
     def texts(self, since_s: float = 0.0) -> list[str]:
-        """STATUSTEXTs since then, chunks joined, without their trailing tab."""
+        """Return the STATUSTEXTs since `since_s`, with chunks joined and without trailing tab."""
         joined: dict[int, str] = {}
         for _, message in self.of("STATUSTEXT", since_s):
             joined[message.id] = joined.get(message.id, "") + message.text
@@ -188,12 +190,12 @@ class Bench:
 
     @property
     def mode(self) -> int:
-        """custom_mode as the next heartbeat will show it."""
+        """`custom_mode` of the next HEARTBEAT."""
         return self.instance.autopilot.commander.mode.custom_mode
 
     @property
     def system_status(self) -> int:
-        """MAV_STATE as the next heartbeat will show it."""
+        """MAV_STATE of the next HEARTBEAT."""
         view = self.instance.view
         return int(view.builders["HEARTBEAT"](view)[4])
 
@@ -204,7 +206,7 @@ class Bench:
     # -- scripts -----------------------------------------------------------------------------
 
     def fly_offboard(self, height_m: float = 3.0) -> None:
-        """Boot, stream, engage, arm and climb by position setpoints; the stream then ends."""
+        """Boot, stream position setpoints, engage, arm and climb. The stream then ends."""
         self.run(5.6, lambda: self.position(0, 0, -height_m))
         assert self.ask_mode(OFFBOARD) == [0, 0]
         assert self.command(400, 1) == [0]
@@ -215,7 +217,7 @@ class Bench:
 
 
 def degrees(bench: Bench, north_m: float, east_m: float) -> tuple[float, float]:
-    """Latitude and longitude, so many metres from the origin of the local frame."""
+    """Return latitude and longitude of a point, given relative to the origin of the local frame."""
     latitude, longitude, _ = bench.instance.autopilot.firmware.origin
     shrink = math.cos(math.radians(latitude))
     north_deg, east_deg = (math.degrees(way / EARTH_RADIUS_M) for way in (north_m, east_m))
@@ -229,15 +231,16 @@ def aloft(
     mode: str | None = None,
     **more: Any,
 ) -> Bench:
-    """A vehicle that hovers; faults count from there. `more` are further parts of the scenario."""
+    """Return a vehicle that hovers from the start, which is time zero of the faults. `more` are
+    further keys of the scenario."""
     content = {"start": {"height_m": height_m, "mode": mode}, "faults": faults, **more}
     bench = Bench(firmware=firmware, scenario=Scenario.model_validate({"name": "test", **content}))
-    bench._parser.robust_parsing = True  # damage is part of the deal
+    bench._parser.robust_parsing = True  # some faults damage frames
     return bench
 
 
 def engaged(*faults: dict[str, Any], firmware: Firmware = PX4) -> Bench:
-    """The same, obeying setpoints; faults count from there."""
+    """Return a vehicle that hovers and follows setpoints; then time zero of the faults begins."""
     counted = ({"after": "engaged", **fault} for fault in faults)
     if firmware is not PX4:
         return aloft(*counted, firmware=firmware, mode="GUIDED")
@@ -248,5 +251,5 @@ def engaged(*faults: dict[str, Any], firmware: Firmware = PX4) -> Bench:
 
 
 def hold(bench: Bench, duration_s: float, height_m: float = 8.0) -> None:
-    """By position setpoints."""
+    """Hold the position by position setpoints."""
     bench.run(duration_s, lambda: bench.position(0, 0, -height_m), 0.1)
