@@ -1,5 +1,5 @@
-"""The loop, the log and its background writer under failures of terminal, pipe, disk and
-supervisor, and under signals: they stop no caller, and what is lost is counted."""
+"""The loop, the log and its background writer when terminal, pipe, disk or supervisor fails, and
+under signals. No failure blocks the caller, and lost entries are counted."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ LONG_S = 20.0
 
 
 class Silent:
-    """Whatever is called returns nothing."""
+    """An object on which every method call returns nothing."""
 
     def __getattr__(self, name: str) -> Any:
         return lambda *arguments: ()
 
 
 class Wire(Silent):
-    """A link without traffic from the vehicle; `sent` is what left, `waits` what happens while it
-    waits for telemetry, `read` how often it was read."""
+    """A link without traffic from the vehicle. `sent` are the frames that were sent; `waits` is
+    called while the loop waits for telemetry; `read` counts how often the link was read."""
 
     is_stream, read = False, 0
 
@@ -61,8 +61,8 @@ class Wire(Silent):
 
 
 class Brief(Silent):
-    """A companion whose flight lasts `turns`, in each of which `during` happens, and which counts
-    stop requests. `sends` are the frames of the turn in progress, `log` what it logs."""
+    """A companion whose flight lasts `turns` turns, and which counts stop requests. `during` is
+    called in each turn; `sends` are the frames that a turn sends, `log` those that it logs."""
 
     session, outcome = SimpleNamespace(peer=None), None
     in_end_phase = False
@@ -110,7 +110,7 @@ class Brief(Silent):
 
 
 class Watcher(Silent):
-    """A supervisor that takes over, or does not answer, when it is told to."""
+    """A supervisor that takes over if `taken` is set, and does not answer if `answers` is unset."""
 
     loaded, taken, lost, answers, restarts = True, False, False, True, 0
     said = ("taking over: the controller has not answered for 0.6 s", "it is disarmed")
@@ -156,7 +156,7 @@ def fly(
 
 @pytest.fixture
 def now_s(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """The monotonic time, which stands still unless its one item is changed."""
+    """Monotonic time, which stands still until the test changes the only item of this list."""
     now = [100.0]
     monkeypatch.setattr(clock, "monotonic_s", lambda: now[0])
     return now
@@ -190,7 +190,7 @@ def test_a_closed_terminal_does_not_end_the_flight(tmp_path: Path, failure: Base
 def test_two_signals(
     number: int, apart_s: float, turns_left: int, tmp_path: Path, now_s: list[float]
 ) -> None:
-    """The first one lands, a second one after a second exits immediately, except SIGHUP."""
+    """The first signal lands. A second one a second later exits at once, except SIGHUP."""
 
     def signalled(left: int) -> None:
         if left >= 3:
@@ -229,7 +229,7 @@ def test_a_third_signal_interrupts_a_law_that_hangs(
             now_s[0] += 1.1
         pytest.fail("it is not interrupted")
 
-    def close(log: FlightLog) -> None:  # another one, while what was flown is written
+    def close(log: FlightLog) -> None:  # another signal arrives while the log is written
         monkeypatch.setattr(FlightLog, "close", ended)
         os.kill(os.getpid(), signal.SIGINT)
         log.close()
@@ -255,8 +255,8 @@ def test_an_ignored_sighup_stays_ignored(tmp_path: Path) -> None:
 
 
 def test_what_a_turn_decided_is_dropped_when_it_became_too_old(tmp_path: Path) -> None:
-    """As when the process is stopped between the decision and its sending. What was announced is in
-    the log as an event record, which is never sent."""
+    """This happens if the process is stopped between the decision and sending. A dropped text stays
+    in the log as an event record, which is never sent."""
 
     def decide(left: int) -> None:
         flight.sends = flight.log = (setpoint(left), said(left))
@@ -267,13 +267,13 @@ def test_what_a_turn_decided_is_dropped_when_it_became_too_old(tmp_path: Path) -
     fly(flight, tmp_path, link=link, supervisor=Watcher())
     assert link.sent == [setpoint(2), said(2), setpoint(0), said(0)]
     assert flight.dropped == 2
-    assert flight.announced == []  # the companion sums them up
+    assert flight.announced == []  # the companion announces the total of dropped messages
     logged = (tmp_path / "flight" / "flight.tlog").read_bytes()
     assert (logged.count(setpoint(1)), logged.count(said(1))) == (0, 0)
 
 
 def test_what_a_turn_decided_does_not_leave_after_a_take_over(tmp_path: Path) -> None:
-    """The process was stopped within the turn, and the supervisor has the vehicle."""
+    """The process was stopped during the turn, and the supervisor has taken over."""
 
     def decide(left: int) -> None:
         flight.sends = (setpoint(left),)
@@ -286,8 +286,8 @@ def test_what_a_turn_decided_does_not_leave_after_a_take_over(tmp_path: Path) ->
 
 
 def test_a_stopped_controller_leaves_the_answers_to_the_supervisor(tmp_path: Path) -> None:
-    """It was stopped while it waited for telemetry. Both processes read the same link: it must not
-    read the acknowledgements of what the supervisor has asked."""
+    """The controller was stopped while it waited for telemetry. Both processes read the same link:
+    the controller must not take the COMMAND_ACKs for the supervisor's commands."""
 
     def stopped() -> None:
         watcher.taken = link.read == 2
@@ -329,7 +329,7 @@ def test_a_supervisor_that_does_not_answer_is_announced_once_and_when_it_does(
 def test_another_supervisor_is_started_but_not_in_flight(
     phase: Phase, restarts: list[float], tmp_path: Path, now_s: list[float]
 ) -> None:
-    """Every ten seconds, until it succeeds."""
+    """A start is tried every ten seconds until it succeeds."""
     restarted_s: list[float] = []
 
     class Starting(Watcher):
@@ -353,7 +353,7 @@ def test_another_supervisor_is_started_but_not_in_flight(
 def test_a_log_that_cannot_be_written_is_said_at_once(
     lands: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """`limits.log_lost`: a full disk in flight."""
+    """The disk becomes full in flight, with either value of `limits.log_lost`."""
 
     def full(descriptor: int, entries: list[bytes]) -> None:
         raise OSError(28, "No space left on device")
@@ -381,7 +381,8 @@ def test_a_log_that_cannot_be_written_is_said_at_once(
 def test_an_exception_lands_and_ends_with_4(
     error: BaseException, phase: Phase, tmp_path: Path
 ) -> None:
-    """Unless the service waits again: the flight that it ended has its own exit code."""
+    """Except if the service is in standby again: the flight that the exception ended has an exit
+    code of its own."""
 
     def fails(left: int) -> None:
         if left in (3, 4):
@@ -402,7 +403,8 @@ def test_an_exception_lands_and_ends_with_4(
 def test_an_exception_in_every_turn_ends_in_silence(
     simulator: object, turns: int, tmp_path: Path, now_s: list[float]
 ) -> None:
-    """At once with the simulator: in lockstep it waits for the answer to that turn."""
+    """With the simulator the flight ends at once: in lockstep the simulator waits for the answer to
+    the failed turn."""
 
     def fails(left: int) -> None:
         now_s[0] += 0.04
@@ -418,7 +420,7 @@ def test_an_exception_in_every_turn_ends_in_silence(
 
 
 class Disk:
-    """Takes nothing until it is `free`."""
+    """A disk that writes nothing until `free` is set."""
 
     def __init__(self) -> None:
         self.free, self.asked = threading.Event(), threading.Event()
@@ -441,7 +443,7 @@ def test_in_lockstep_it_waits_and_loses_nothing() -> None:
 
 
 def test_a_failure_is_kept_and_ends_the_writing() -> None:
-    """Of a display: rich ends the program where nobody reads its pipe."""
+    """For example of a display: rich raises SystemExit if nobody reads its pipe."""
     failure = SystemExit(1)
 
     def write(_: list[int]) -> None:

@@ -1,7 +1,7 @@
-"""The failsafe: how long a condition must hold, how it is forgotten, and which row counts.
+"""The failsafe: how long a condition must hold, how this time decreases, and which row counts.
 
-Steps of 1/8 s, which add up exactly. Row "link" holds after 0.5 s, "tilt error" lands after 0.5 s,
-"battery" after 2 s; "authority" lands at once.
+Steps are 1/8 s, which add up without rounding. Row "link" asks for hold after 0.5 s, "tilt error"
+for a landing after 0.5 s, "battery" after 2 s, "authority" at once.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ BY_NAME = {row.name: row for row in ROWS}
 
 
 def actions(*moments: Sequence[str]) -> list[Action]:
-    """The action at each moment, of which each has the names of the rows whose condition holds."""
+    """Return the action at each moment. A moment is given by the names of the rows whose condition
+    holds."""
     holding: set[str] = set()
     driven = [replace(row, condition=lambda _, name=row.name: name in holding) for row in ROWS]
     flight, seen = uneventful(), []
@@ -58,11 +59,12 @@ def test_a_condition_counts_once_it_has_held_and_is_forgotten_slowly() -> None:
     assert actions(*[LINK] * 6) == [FLY] * 4 + [HOLD] * 2
     assert actions(NOTHING, *[BATTERY] * 17)[-3:] == [FLY, LAND, LAND]
     assert actions(*[LINK] * 5, NOTHING)[-2:] == [HOLD, FLY]
-    # at a quarter of the speed: four steps of condition, a pause, and so many steps again
+    # the time counted decreases at a quarter of the speed: four steps with the condition, a pause,
+    # and then `again` steps until the row acts
     for pause, again in ((1, 1), (4, 1), (8, 2), (16, 4), (100, 4)):
         seen = actions(NOTHING, *[LINK] * 4, *[NOTHING] * pause, *[LINK] * 8)
         assert seen[5 + pause :].index(HOLD) + 1 == again
-    # one that comes and goes: half of the time it gains 3/32 s in two steps, a fifth nothing
+    # a condition that holds in every other step gains 3/32 s in two steps; in every fifth, nothing
     assert actions(NOTHING, *[LINK, NOTHING] * 40).index(HOLD) == 9
     assert HOLD not in actions(NOTHING, *[LINK, *[NOTHING] * 4] * 100)
 
@@ -75,7 +77,7 @@ def test_the_worst_active_row_counts() -> None:
 
 
 def test_of_equally_bad_rows_the_report_of_the_mode_is_named() -> None:
-    """Without it no other row has an effect."""
+    """Without a report of the mode no other row has an effect."""
     flight = uneventful()
     assert flight.authority is not None
     flight.authority.heard_s = -np.inf
@@ -108,7 +110,7 @@ def hears_another(flight: FlightState, since_s: float) -> None:
 
 
 def holding(**values: Callable[[Any], Any]) -> Measure:
-    """Gives the flight these attributes, made of the value."""
+    """Return a function that sets attributes of the flight, each computed from the value."""
 
     def measure(flight: FlightState, value: Any) -> None:
         for name, make in values.items():
@@ -170,8 +172,8 @@ def valid(flight: FlightState, estimates: frozenset[str]) -> None:
 
 
 def accuracy(flight: FlightState, accuracies_m: tuple[float | None, float | None]) -> None:
-    """At the beginning and now. PX4 reports none as NaN; one that was never reported is not
-    missed."""
+    """Report two accuracies: one at the beginning of the flight, and one now. PX4 reports NaN if it
+    has none; an accuracy that was never reported is not missed."""
     reported = EstimatorReport(frozenset(ESTIMATE), (), 0.5)
     hear(flight, replace(reported, accuracy_m=accuracies_m[0]))
     flight.positioning.begin(flight.vehicle, {}, "ESTIMATOR_STATUS")
@@ -190,7 +192,7 @@ def sinks(flight: FlightState, sink_mps: float) -> None:
 
 
 def stands(flight: FlightState, height_m: float) -> None:
-    """For 1.2 s; the reference is 3 m high."""
+    """Let the vehicle stand at this height for 1.2 s; the reference is 3 m high."""
     for step in range(1, 13):
         reported = LocalPosition(NOW_S + 0.1 * step, (0.0, 0.0, -height_m), (0.0, 0.0, 0.0))
         flight.vehicle.position = reported
@@ -216,18 +218,19 @@ hovers = holding(observer=lambda share: SimpleNamespace(hover_thrust_estimate=sh
 
 
 def unanswered(flight: FlightState, requests: int, delay_s: float = 0.01) -> None:
-    """So many requests, of one tick each, were sent since one that was answered; the newest of them
-    so long ago that a reply was due."""
+    """Send `requests` TIMESYNC requests, one per tick, after an answered one. The reply to the
+    newest of them is overdue."""
     sent_s = flight.host_s - 2.0 * delay_s - 0.1 * requests
     for number in range(REPLIES_MIN):
         request = flight.clock.request(float(number), sent_s)
         vehicle_ns = request.ts1_ns + round(1e9 * delay_s)
         flight.clock.on_reply(TimesyncReply(request.ts1_ns, vehicle_ns))
-    for number in range(1, requests + 1 + round(20.0 * delay_s)):  # and some that are on their way
+    # further requests were sent so recently that their replies are not due yet
+    for number in range(1, requests + 1 + round(20.0 * delay_s)):
         flight.clock.request(100.0 + number, sent_s + 0.1 * number - 1e-3)
 
 
-# row: how to set what it measures, a value that it allows, and one that it does not
+# name of a row, function that sets its measured value, an allowed value, a value beyond the limit
 MEASURED: list[tuple[str, Measure, Any, Any]] = [
     ("authority", lambda flight, age_s: setattr(flight.authority, "heard_s", NOW_S - age_s),
      2.5, 2.6),

@@ -1,6 +1,6 @@
-"""Faults of a flight, one row each: exit code, last phase, sentence, checks, and the fault.
+"""Faults in flight, one row each: exit code, last phase, sentence, checks, and the fault.
 
-What holds in every flight is in `watch.flown`.
+`watch.flown` also checks what must hold in every flight.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def asked_to_disarm(pair: Pair) -> None:
 
 
 def stayed_down(pair: Pair) -> None:
-    """Stopped before lift-off: disarmed at once, and no setpoint asks for more thrust."""
+    """After a stop before lift-off, the vehicle is disarmed at once without more thrust."""
     assert pair.armings == [1.0, 0.0]
     reached = [s.thrust for _, phase, s in pair.setpoints if phase is Phase.TAKEOFF][-1]
     assert 0.0 < reached < 0.3
@@ -121,7 +121,7 @@ def whole(pair: Pair) -> None:
 
 
 def without_a_gap(pair: Pair) -> None:
-    """From the first setpoint to the landing, also while phases change."""
+    """No gap of setpoints from the first one to the landing, also while phases change."""
     whole(pair)
     times = [at_s for at_s, phase, _ in pair.setpoints if phase is not Phase.LAND]
     assert max(after - before for before, after in pairwise(times)) < 0.2
@@ -132,7 +132,8 @@ def level(setpoints: list[Any]) -> bool:
 
 
 def unheard(pair: Pair) -> list[float]:
-    """Times since the newest telemetry of the setpoints after it, which are level and hover."""
+    """Return the times of the setpoints after the newest telemetry, in s since then. They must be
+    level and have hover thrust."""
     late = [(at_s - pair.heard_s, s) for at_s, _, s in pair.setpoints if at_s > pair.heard_s + 0.2]
     assert level([setpoint for _, setpoint in late])
     hover_thrust = pair.companion.model.hover_thrust
@@ -141,7 +142,7 @@ def unheard(pair: Pair) -> list[float]:
 
 
 def soft_landing(pair: Pair) -> None:
-    """Landed, and the setpoints after the fault were level ones."""
+    """The vehicle has landed, and the setpoints in LAND were level."""
     landed(pair)
     after = [setpoint for _, phase, setpoint in pair.setpoints if phase is Phase.LAND]
     assert after
@@ -153,7 +154,7 @@ def not_completed(pair: Pair) -> None:
 
 
 def held_then_silent(pair: Pair) -> None:
-    """Level while the mode is known, landing requests, then nothing."""
+    """Level setpoints while the mode is known, requests to land, then nothing."""
     after_s = unheard(pair)
     assert 15 <= len(after_s) <= 25
     assert after_s[-1] < 2.6
@@ -161,7 +162,7 @@ def held_then_silent(pair: Pair) -> None:
 
 
 def landing_requested(pair: Pair) -> None:
-    """Level setpoints without telemetry; the first follows within 0.5 s. The vehicle lands."""
+    """Without telemetry, level setpoints begin within 0.5 s. The vehicle lands."""
     assert abs(pair.instance.autopilot.plant.height_m) < 0.05
     after_s = unheard(pair)
     assert len(after_s) >= 5
@@ -169,7 +170,7 @@ def landing_requested(pair: Pair) -> None:
 
 
 def landed_by_its_failsafe(pair: Pair) -> None:
-    """After a refused landing the setpoints stop, so that the vehicle's failsafe acts."""
+    """After refused requests to land the setpoints stop, so that the vehicle's failsafe acts."""
     assert pair.went_through(Phase.HOVER)
     assert 45 <= sum(phase is Phase.LAND for _, phase, _ in pair.setpoints) <= 52
     assert len(pair.landings) > 3
@@ -180,7 +181,8 @@ def the_pilots(pair: Pair) -> None:
 
 
 def the_pilots_while_landing(pair: Pair) -> None:
-    """No request or setpoint once the heartbeat, at 1 Hz, has shown the pilot's mode."""
+    """Nothing is requested, and no setpoint sent, once a HEARTBEAT (1 Hz) has shown the pilot's
+    mode."""
     the_pilots(pair)
     since_s = begun_s(pair, Phase.LAND) + 2.6
     assert sum(at_s > since_s for at_s, _, _ in pair.sent) > 10
@@ -188,7 +190,7 @@ def the_pilots_while_landing(pair: Pair) -> None:
 
 
 def bridged(pair: Pair) -> None:
-    """Two missed decisions are bridged with level setpoints; the next good one resets their
+    """Level setpoints take the place of two missed decisions; the next good decision resets the
     count."""
     whole(pair)
     texts = (b"decision missed", b"decision failed")
@@ -203,7 +205,7 @@ def bridged(pair: Pair) -> None:
 
 
 def took_off_by_command(pair: Pair) -> None:
-    """ArduCopter in GUIDED, by one command to at least 1.5 m, without setpoints."""
+    """ArduCopter takes off in GUIDED by one command to 1.5 m, without setpoints."""
     whole(pair)
     assert {(m.param1, m.param2) for m in pair.modes} == {(1.0, 4)}
     (takeoff,) = pair.commands(TAKEOFF)
@@ -222,7 +224,7 @@ def asks_again(pair: Pair) -> None:
 
 
 def asks_each_second(pair: Pair) -> None:
-    """The first requests to land are lost for 2.5 s; one that was accepted is not repeated."""
+    """Requests to land that are lost are repeated each second; an accepted one is not repeated."""
     assert len(pair.landings) == 4
 
 
@@ -248,8 +250,8 @@ def keeps_posctl(pair: Pair) -> None:
 
 
 def listens(pair: Pair) -> None:
-    """From 2.5 s without a report of the mode until it is reported again nothing is sent; then a
-    landing is asked for, unless a pilot has it."""
+    """Nothing is sent from 2.5 s without a report of the mode until the next report. Then a landing
+    is requested, unless a pilot has taken the vehicle."""
     lost_s = begun_s(pair, Phase.TRACK) + 1.0
     assert sent_after(pair, lost_s + 2.6) == sent_after(pair, lost_s + 8.99)
     assert bool(pair.landings) is not pair.armed
@@ -265,7 +267,7 @@ def asked_to_disarm_without_force(pair: Pair) -> None:
 
 
 def disarmed_by_itself(pair: Pair) -> None:
-    """It has stood for 15 s soon after it is asked to land."""
+    """The vehicle disarms by itself soon after it was asked to land, and need not be disarmed."""
     assert pair.armings[1:] == []
     assert not said(pair, "15 s")
 
@@ -283,7 +285,7 @@ def arm(pair: Pair) -> None:
 
 
 def engage(pair: Pair) -> None:
-    """The pilot selects OFFBOARD."""
+    """Let the pilot select OFFBOARD."""
     pair.ground(176, 1, 6)
 
 
@@ -305,7 +307,7 @@ def of_type(kind: int, says: str, checks: Check = nothing_sent, **options: Any) 
 
 
 def switches(mode: str) -> Callable[[Pair], object]:
-    """A pilot takes it."""
+    """Let a pilot switch the vehicle to `mode`."""
     return lambda pair: pair.instance.autopilot.commander.switch(mode)
 
 
@@ -315,7 +317,7 @@ def begins_to_arrive(kind: int, at_s: float) -> Filter:
 
 
 def lose_two_heartbeats(pair: Pair) -> None:
-    """And CURRENT_MODE for good, from the next HEARTBEAT on."""
+    """Lose two HEARTBEATs after the next one, and from now on every CURRENT_MODE."""
     pair.down = faults.without(faults.CURRENT_MODE)
     pair.at.append((just_after_a_beat, faults.cut(2.2, faults.HEARTBEAT, ways=["down"])))
 
@@ -348,15 +350,15 @@ def complain(pair: Pair) -> None:
 
 
 STOPPED = "stop requested by the operator"
-BOOTING = faults.heartbeats(system_status=1, base_mode=81, custom_mode=0)  # in STABILIZE
+BOOTING = faults.heartbeats(system_status=1, base_mode=81, custom_mode=0)  # disarmed, STABILIZE
 BOOTING_ARMED = faults.heartbeats(system_status=1, base_mode=209, custom_mode=0)
 HELICOPTER = config.vehicle("px4_sih").model_copy(update={"airframe": "helicopter"})
 SOON, LATER = {"health_s": 5.0}, {"health_s": 8.0}
 NO_TAKEOFF = Rule("takeoff", result=Result.FAILED)
 LONG = (HIGH, "reference.duration_s=6.0")
 PX4_HOVERS, COPTER_HOVERS = partial(px4.hover, *LONG), partial(copter.hover, *LONG)
-HOLDS = faults.with_default("COM_OBL_RC_ACT", 5.0)  # AUTO.LOITER without setpoints, not POSCTL
-SILENT = r"no telemetry for 1.0 s \(limits.silence_s is 1\)$"  # no pilot is named
+HOLDS = faults.with_default("COM_OBL_RC_ACT", 5.0)  # without setpoints AUTO.LOITER, not POSCTL
+SILENT = r"no telemetry for 1.0 s \(limits.silence_s is 1\)$"  # does not mention a pilot
 MODES = (faults.HEARTBEAT, faults.CURRENT_MODE)
 REJECTED = r"; the vehicle said: command {} TEMPORARILY_REJECTED; unhealthy by SYS_STATUS: RC_"
 ROWS = {
@@ -373,7 +375,7 @@ ROWS = {
         f"{STOPPED} before lift-off; no HEARTBEAT shows whether it is armed after 5 s",
         asked_to_disarm, armed=True, at=then(Phase.TAKEOFF, 0.3, stop_unheard),
     ),
-    # its land detector reports flight before it lifts off
+    # the land detector reports flight before the vehicle lifts off
     "stop as it lifts off": ends(STOPPED, landed, at=then(Phase.TAKEOFF, 0.5, faults.stop)),
     "stop after the pilot has engaged it in the air, before we ask": ends(
         STOPPED, landed, fly=px4.hover, ended_by="operator",
@@ -410,7 +412,7 @@ ROWS = {
         + REJECTED.format(176), on_the_ground,
         firmware=faults.refusing("mode", "Switching to Offboard is not available"),
     ),
-    "parameter wrong": refusal(  # said before the vehicle has a position
+    "parameter wrong": refusal(  # reported before the vehicle has a position
         "COM_OF_LOSS_T is 30: seconds without setpoints before the failsafe. "
         "Fix: param set COM_OF_LOSS_T 1",
         nothing_sent, firmware=faults.with_default("COM_OF_LOSS_T", 30.0),
@@ -420,7 +422,7 @@ ROWS = {
         "not ready: no reply for parameter GUID_OPTIONS", nothing_sent, fly=copter.hop,
         down=faults.without(faults.PARAM_VALUE), limits=LATER,
     ),
-    # which vehicles are flown, by the MAV_TYPE in their HEARTBEAT
+    # the MAV_TYPE in HEARTBEAT decides which vehicles are flown
     "a plane": of_type(1, "the vehicle is a FIXED_WING; offboard flies multirotors"),
     "a helicopter": of_type(4, r".*\(airframe: helicopter in its vehicle file flies it\)"),
     "a hexarotor that is no helicopter": of_type(
@@ -449,7 +451,7 @@ ROWS = {
     "its land detector knows the ground, and it does not disarm by itself": flies(
         asked_to_disarm_without_force, fly=hover_without_disarming
     ),
-    # only its land detector says whether it flies: it is not disarmed, and the user is told
+    # only the land detector shows whether it flies: it is not disarmed, and the user is told
     "its land detector does not see the ground": aborts(
         Phase.FAILED, f".*not landed and disarmed after 24 s; {STILL_ARMED}", left_to_the_user,
         fly=copter.hover, armed=True, scenario="never_landed", limits={"land_s": 24.0},
@@ -515,7 +517,7 @@ ROWS = {
         Phase.FAILED, "the vehicle restarted in flight; the vehicle restarted and is disarmed",
         fly=px4.lap, at=tracking(faults.restart),
     ),
-    # its first HEARTBEAT shows another mode, and is heard before any of its time stamps
+    # the first HEARTBEAT after the restart shows another mode, and arrives before any time stamp
     "restart in flight of ArduCopter": aborts(
         Phase.FAILED, "the vehicle restarted in flight; the vehicle restarted and is disarmed",
         fly=copter.lap, armed=True, ended_by="restart",
@@ -557,7 +559,7 @@ ROWS = {
             *then(Phase.LAND, 0.5, faults.downlink(faults.restamped(8.0))),
         ],
     ),
-    # outages: nothing passes for a time. PX4's own failsafe comes meanwhile, after 1.0 s
+    # outages of the link in both directions. PX4's own failsafe acts meanwhile, after 1.0 s
     "an outage of 1.6 s": ends(
         SILENT, landed, asks_once, fly=PX4_HOVERS, at=tracking(faults.cut(1.6))
     ),
@@ -567,21 +569,21 @@ ROWS = {
     "an outage of 10 s": ends(
         SILENT, landed, asks_again, fly=COPTER_HOVERS, at=tracking(faults.cut(10.0))
     ),
-    # its rate is that of two seconds. A booting ArduCopter sends no position for 40 s
+    # a rate is measured over two seconds. A booting ArduCopter sends no position for 40 s
     "a message that has just begun to arrive is not called slow": flies(
         waits_for_position_and_delay, down=begins_to_arrive(faults.POSITION, 12.0)
     ),
-    # 0.36 s there and back. While nothing is heard nothing is asked, and no answer is missing
+    # round trip of 0.36 s. Without telemetry no TIMESYNC request is sent, so none is unanswered
     "a gap of telemetry on a late link": flies(
         fly=partial(COPTER_HOVERS, "controller.bandwidth_radps=1.5"), error_m=2.0,
         down=faults.late(0.18), up=faults.late(0.18), at=tracking(faults.cut(0.98, ways=["down"])),
     ),
-    # in the mode of PX4's own failsafe, which HEARTBEAT does not show then
+    # the pilot takes over in the mode of PX4's own failsafe; HEARTBEAT then shows no failsafe
     "a pilot takes over in an outage": aborts(
         Phase.YIELDED, ".*for POSCTL", keeps_posctl, fly=PX4_HOVERS, armed=True,
         at=[*tracking(faults.cut(4.0)), *then(Phase.LAND, 1.5, switches("POSCTL"))],
     ),
-    # what it sends is lost, and a pilot takes it after the first request
+    # its telemetry is lost, and a pilot takes over after the first request to land
     "landing is not asked again of a vehicle that is not heard": aborts(
         Phase.YIELDED, ".*left GUIDED for LOITER", not_asked_again, fly=COPTER_HOVERS, armed=True,
         at=[*tracking(faults.cut(4.0, ways=["down"])), *then(Phase.LAND, 0.6, switches("LOITER"))],
@@ -595,28 +597,29 @@ ROWS = {
         at=[*tracking(faults.cut(9.0, *MODES, ways=["down"])),
             *then(Phase.LAND, 1.0, switches("BRAKE"))],
     ),
-    # ArduCopter shows nothing: what was commanded meanwhile would have dropped it as it received it
+    # ArduCopter does not report it. Setpoints decided meanwhile would have made it fall when they
+    # arrived
     "it does not receive setpoints": ends(
         "15 TIMESYNC requests in a row were not answered: does the vehicle receive setpoints",
         held_soon,
         fly=COPTER_HOVERS, failsafes=["uplink"], fall_mps=1.6, top_m=3.5,
         at=tracking(faults.cut(3.0, ways=["up"])),
     ),
-    # a HEARTBEAT that is missing is requested: the next one, 3 s after the newest, is too late
+    # a missing HEARTBEAT is requested, because the next one, 3 s after the newest, is too late
     "two heartbeats are lost and no CURRENT_MODE arrives": flies(
         fly=PX4_HOVERS, at=tracking(lose_two_heartbeats)
     ),
-    # a HEARTBEAT from before the outage said that it was disarmed, and it was left armed
+    # regression: by a HEARTBEAT from before the outage it was disarmed, and so it was left armed
     "an outage as it arms": refusal(
         "no telemetry for 1.0 s$", at=[(lambda pair: pair.armed, faults.cut(2.3))]
     ),
-    # by 35 s, which is beyond the end of the reference
+    # a jump by 35 s, beyond the end of the reference
     "a jump of its clock": ends(
         "the clock of the vehicle jumped by 35.0 s$", soft_landing, not_completed,
         fly=copter.lap,
         scenario=early("clock_jump_35s"), deadline_s=0.05,
     ),
-    # a vehicle that is heavier meanwhile
+    # the scenario also makes the vehicle heavier
     "every tenth position": flies(
         fly=copter.lap, scenario=early("thin_telemetry", 5.0), failsafes=(), error_m=0.3
     ),

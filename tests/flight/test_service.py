@@ -1,4 +1,4 @@
-"""The service in lockstep with both simulated autopilots: engaged, handed back, engaged again."""
+"""The service with both simulated autopilots in lockstep: engaged, handed back, engaged again."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ from offboard.identification.vehicle_estimate import IdentifiedVehicle
 from simulator import config as simulated
 
 BOTH = pytest.mark.parametrize("on", ["px4", "ardupilot"])
-REPOSITION, LOITER = 192, 5  # MAV_CMD; ArduCopter's mode
+REPOSITION, LOITER = 192, 5  # a MAV_CMD; a mode of ArduCopter
 ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED = range(4)  # MAV_RESULT
 
 
 class Served:
-    """Makes services whose vehicles an independent observer of the wire watches."""
+    """Creates services, each of which an independent observer (`service_wire.Wire`) watches."""
 
     def __init__(self) -> None:
         self.wires: list[Wire] = []
@@ -49,14 +49,14 @@ class Served:
         return pair
 
     def aloft(self, on: str = "px4", **options: Any) -> Serving:
-        """A service that waits, of a vehicle that its pilot holds in the air."""
+        """Return a service that waits, with a vehicle that its pilot holds in the air."""
         pair = self(on, aloft=True, **options)
         pair.until(lambda: pair.phase is Phase.STANDBY)
         pair.run(2.0)
         return pair
 
     def engaged(self, on: str = "px4", **options: Any) -> Serving:
-        """The same, which the pilot has just engaged."""
+        """Return a service that the pilot has just engaged."""
         pair = self.aloft(on, **options)
         pair.engage()
         return pair
@@ -64,7 +64,7 @@ class Served:
 
 @pytest.fixture
 def served() -> Iterator[Served]:
-    """Nothing unsafe may have happened in the end."""
+    """Create services. At the end of the test nothing unsafe may have happened."""
     served = Served()
     yield served
     assert [wire.unsafe for wire in served.wires] == [[] for _ in served.wires]
@@ -80,12 +80,12 @@ def commanded(pair: Serving, since_s: float) -> list[str]:
 
 @BOTH
 def test_engaged_handed_back_and_engaged_again(served: Served, on: str) -> None:
-    """In the first flight the process of the service is stopped for half a second: the sentence
-    after it counts the ticks of 0.1 s. A service that is stopped hands back first."""
+    """In the first flight the service's process is paused for half a second; the sentence after the
+    flight counts the skipped ticks of 0.1 s. On a stop request the service hands back first."""
     pair = served.aloft(on)
     pair.run(2.0)
     standby = thrusts(pair, pair.time_s - 1.0)
-    if on == "px4":  # streams what the vehicle flies
+    if on == "px4":  # in standby, setpoints repeat what the vehicle flies
         assert len(standby) >= 9
         assert max(abs(u / HOVER[on] - 1.0) for u in standby) < 0.05
     else:
@@ -119,7 +119,7 @@ def test_engaged_handed_back_and_engaged_again(served: Served, on: str) -> None:
     assert re.fullmatch(rf"{counted}skipped, pauses up to 0\.5[0-9] s", busy)
     assert len(pair.logs.begun) == len(pair.logs.ended) == 2
     known = r"this vehicle was identified before: tilt delay \d+ ms; no identification steps"
-    assert any(re.fullmatch(known, text) for text in announced(pair))  # no hover thrust
+    assert any(re.fullmatch(known, text) for text in announced(pair))  # without hover thrust
     pair.engage()
     pair.run(1.0)
     pair.service.request_stop()
@@ -131,7 +131,7 @@ def test_engaged_handed_back_and_engaged_again(served: Served, on: str) -> None:
 
 
 def test_a_pilot_may_take_a_vehicle_that_is_handed_back(served: Served) -> None:
-    """The service was stopped, and the vehicle has not shown hold yet."""
+    """The service is being stopped, and the vehicle has not shown its hold mode yet."""
     pair = served.engaged()
     pair.service.request_stop()
     pair.until(lambda: pair.phase is Phase.HAND_BACK, 0.5)
@@ -143,7 +143,7 @@ def test_a_pilot_may_take_a_vehicle_that_is_handed_back(served: Served) -> None:
 
 
 def fly_north(pair: Serving, speed_mps: float) -> None:
-    """The pilot flies north, faster than `speed_mps`; with ArduCopter by the sticks."""
+    """Let the pilot fly north until the speed is 97 % of `speed_mps`; ArduCopter by the sticks."""
 
     def push(pitch_us: int) -> None:
         sticks = (1500, pitch_us, 1500, 1500, *(65535,) * 4)
@@ -165,8 +165,8 @@ def fly_north(pair: Serving, speed_mps: float) -> None:
 
 @BOTH
 def test_engaged_again_at_once(served: Served, on: str) -> None:
-    """The next flight has not got a position yet: it took the vehicle to be at the origin, and
-    demanded full thrust."""
+    """Regression: before its first position the second flight assumed the vehicle at the origin,
+    and demanded full thrust."""
     pair = served.engaged(on)
     since_s = pair.time_s
     pair.switch("pilot")
@@ -181,7 +181,8 @@ def test_engaged_again_at_once(served: Served, on: str) -> None:
 
 @BOTH
 def test_engaged_in_motion(served: Served, on: str) -> None:
-    """What the thrust lifts, and the position, are continuous; the tilt is that of the motion."""
+    """The vertical thrust stays that of hover although the vehicle is tilted, and the reference
+    begins at the vehicle's position."""
     pair = served.aloft(on)
     fly_north(pair, 3.8)
     began_s = pair.time_s
@@ -196,7 +197,7 @@ def test_engaged_in_motion(served: Served, on: str) -> None:
         place = np.array(state.vehicle.position.position_ned_m)
         off_m.append(float(np.linalg.norm(place - state.plan.sample(state.time_s).position_ned_m)))
         assert pair.time_s < began_s + 10.0
-    lifts = [  # ArduCopter divides by the cosine
+    lifts = [  # ArduCopter itself divides the thrust by the cosine
         setpoint.thrust / HOVER[on] * (tilt_cosines[at_s] if on == "px4" else 1.0)
         for at_s, _, setpoint in pair.setpoints
         if at_s in tilt_cosines
@@ -207,7 +208,7 @@ def test_engaged_in_motion(served: Served, on: str) -> None:
 
 
 def test_a_contradicted_vehicle_is_identified_again(served: Served) -> None:
-    """What was remembered is of another vehicle: its tilt responds three times as late."""
+    """The stored constants are those of a vehicle whose tilt responds three times as late."""
     true = simulated.vehicle("px4_sih")
     late = {"delay_s": 0.2, "natural_frequency_radps": 6.0}
     wrong = true.model_copy(update={"tilt": true.tilt.model_copy(update=late)})
@@ -221,7 +222,7 @@ def test_a_contradicted_vehicle_is_identified_again(served: Served) -> None:
 
 
 def test_what_is_identified_in_motion_is_remembered(served: Served) -> None:
-    """Also of a vehicle that was known: its drag is 2.5 times what was remembered."""
+    """Also if the vehicle was identified before: here its drag is 2.5 times the stored value."""
     true = simulated.vehicle("px4_sih")
     known = true.model_copy(update={"drag_translation_npmps": (0.4 * true.mass_kg,) * 3})
     before = IdentifiedVehicle(known, 0.002, 0.008)
@@ -234,7 +235,7 @@ def test_what_is_identified_in_motion_is_remembered(served: Served) -> None:
 
 
 def test_a_limit_of_the_autopilot_is_read_anew(served: Served) -> None:
-    """The vehicle was remembered with a lower angular acceleration than is allowed now."""
+    """The stored vehicle has a lower limit of the angular acceleration than the autopilot now."""
     copter = simulated.vehicle("arducopter")
     slow = copter.model_copy(update={"angular_acceleration_limit_radps2": (2.3, 2.3, 2.2)})
     known = IdentifiedVehicle(slow, 0.002, 0.008)
@@ -253,10 +254,10 @@ def test_a_limit_of_the_autopilot_is_read_anew(served: Served) -> None:
 def test_a_restarted_service_holds_what_it_has_engaged_and_nothing_else(
     served: Served, on: str, left: str
 ) -> None:
-    """Then it waits for the pilot. Else another companion computer flies the vehicle, on a link
-    that we do not hear; or a flight with another vehicle was cut short."""
+    """Afterwards it waits for the pilot. In the other two cases a flight with another vehicle was
+    cut short, or another companion computer flies the vehicle on a link that we do not hear."""
     pair = served.engaged(on)
-    if on == "px4":  # its own failsafe is later
+    if on == "px4":  # delay its own failsafe
         pair.instance.autopilot.parameters.set("COM_OF_LOSS_T", 5.0)
     assert pair.logs.left == f"{on}-1-1"
     pair.logs.left = left
@@ -278,7 +279,7 @@ def test_a_restarted_service_holds_what_it_has_engaged_and_nothing_else(
 
 
 def test_a_take_off_point_that_was_not_seen_is_no_origin(served: Served) -> None:
-    """A service that is started in the air with --anchor origin engages after the next landing."""
+    """A service that starts in the air with --anchor origin engages only after the next landing."""
     pair = served("ardupilot", anchor="origin")
     pair.fly_up()
     pair.engage()
@@ -309,17 +310,18 @@ def test_without_its_supervisor_a_flight_goes_on_and_none_begins(served: Served)
 
 
 def test_another_controller_is_left_alone(served: Served) -> None:
-    """Its setpoints are on the link: nothing of ours leaves, and nothing is asked for."""
+    """While its setpoints are on the link, the service sends no setpoint and no command."""
     pair = served.aloft()
     pair.other_setpoint()
     pair.run(0.3)
     heard_s = pair.time_s
-    pair.instance.autopilot.parameters.set("COM_OF_LOSS_T", 60.0)  # as others reach the vehicle
+    # in place of the other program's setpoints, which do not reach the simulated vehicle
+    pair.instance.autopilot.parameters.set("COM_OF_LOSS_T", 60.0)
     pair.switch("engage")
     for _ in range(4):
         pair.other_setpoint()
         pair.run(0.3)
-    pair.run(6.0)  # it is silent, and has not been switched for us
+    pair.run(6.0)  # the other program is silent, but the pilot has not switched for the service
     assert pair.mode == "OFFBOARD"
     assert sent_after(pair, heard_s) == []
     assert pair.phase is Phase.STANDBY
@@ -329,8 +331,8 @@ def test_another_controller_is_left_alone(served: Served) -> None:
 def test_engaged_while_it_lands_or_stands_it_is_not_flown_and_the_pilot_is_told(
     served: Served,
 ) -> None:
-    """ArduCopter was left in GUIDED, with nobody to send setpoints, without a word. Its land
-    detector does not see that it stands in BRAKE, nor is it started there."""
+    """Regression: ArduCopter stayed in GUIDED without setpoints, and the pilot was not told. In
+    BRAKE its land detector does not detect the ground; a start by command is rejected then, too."""
     pair = served.engaged("ardupilot", then="land")
     pair.until(lambda: pair.phase is Phase.LAND, 30.0)
     pair.run(1.0)
@@ -359,9 +361,9 @@ def test_engaged_while_it_lands_or_stands_it_is_not_flown_and_the_pilot_is_told(
 
 
 def test_without_arms_it_stays_on_the_ground(served: Served) -> None:
-    """Another vehicle passed by, which prevents standby for 10 s. A start is rejected; armed in
-    OFFBOARD it is not lifted. A flight that was cut short counts as ended there: who engages the
-    vehicle later is another."""
+    """Another vehicle is heard once, which prevents standby for 10 s. A start is rejected, and a
+    vehicle that is armed in OFFBOARD does not lift off. On the ground, a flight that was cut short
+    counts as ended: whoever engages the vehicle later is another controller."""
     pair = served()
     pair.run(0.5)
     pair.forwarded.append(another_vehicle(9))
@@ -392,8 +394,8 @@ def test_without_arms_it_stays_on_the_ground(served: Served) -> None:
 
 
 def test_with_arms_a_start_takes_off_and_flies(served: Served) -> None:
-    """Also after one that was stopped as it armed: each later one was stood down at once, as the
-    answer to the first arming was taken for its own."""
+    """Regression: after a start that was stopped while arming, each later start stood down at once,
+    because the answer to the first arming command was taken for its own."""
     pair = served(arms=True, then="land")
     pair.until(lambda: pair.phase is Phase.STANDBY)
     pair.run(10.0)
@@ -423,7 +425,7 @@ def test_a_reboot_between_two_flights(served: Served) -> None:
     pair.instance.reboot(1.0)
     pair.until(lambda: said(pair, "the vehicle restarted"), 10.0)
     pair.fly_up()
-    pair.until(lambda: pair.state.time_s > before_s + 0.1)  # vehicle time repeats
+    pair.until(lambda: pair.state.time_s > before_s + 0.1)  # the same vehicle time comes again
     assert pair.state.hover.thrust(pair.state.time_s) == pytest.approx(HOVER["px4"], rel=0.05)
     pair.switch("engage")
     pair.until(lambda: pair.phase is Phase.HOVER, 40.0)
@@ -431,9 +433,9 @@ def test_a_reboot_between_two_flights(served: Served) -> None:
 
 @BOTH
 def test_after_an_outage_it_is_landed(served: Served, on: str) -> None:
-    """ArduCopter, unheard for 4 s, has waited in GUIDED without anybody who flies it. PX4 returns
-    to OFFBOARD from its failsafe by itself when setpoints arrive again: none is sent, and no pilot
-    has switched."""
+    """ArduCopter, not heard for 4 s, has stayed in GUIDED without setpoints. PX4 would return from
+    its failsafe to OFFBOARD when setpoints arrive again, although no pilot has switched; so none is
+    sent."""
     pair = served.engaged(on)
     pair.run(1.0)
     pair.lost_up, pair.lost_down = True, on == "ardupilot"
@@ -447,8 +449,8 @@ def test_after_an_outage_it_is_landed(served: Served, on: str) -> None:
 
 
 def test_requests_over_mavlink(served: Served) -> None:
-    """A ground station that missed an answer repeats its command, which is accepted again; but it
-    is not told that a vehicle that is handed back, or lands, will pause."""
+    """A command that is repeated, as by a ground station that missed the answer, is accepted again.
+    A pause is rejected while the vehicle is handed back."""
     pair = served.engaged("ardupilot", reference="lemniscate")
     pair.until(lambda: pair.phase is Phase.TRACK, 30.0)
     expected: list[tuple[int, int]] = []
@@ -496,7 +498,7 @@ def test_requests_over_mavlink(served: Served) -> None:
 
 
 def test_requests_within_one_tick(served: Served) -> None:
-    """A start is cancelled, and nothing cancels that the vehicle is to be given back."""
+    """A hand-back cancels a start of the same tick; a start does not cancel a hand-back."""
     pair = served("ardupilot", arms=True)
     pair.until(lambda: pair.phase is Phase.STANDBY)
     pair.command(START)
@@ -512,16 +514,17 @@ def test_requests_within_one_tick(served: Served) -> None:
 
 
 def test_a_pilot_takes_a_vehicle_whose_own_failsafe_acts_soon(served: Served) -> None:
-    """With the least COM_OF_LOSS_T setpoints seemed to be missing always, and this its failsafe.
-    And he engages it and takes it again at once: on a real PX4 it was asked to land, as no TIMESYNC
-    was asked for while the HEARTBEAT after the first switch was awaited."""
+    """Regression: with COM_OF_LOSS_T of 0.3 s setpoints always seemed to be missing, and the
+    pilot's mode was taken for the vehicle's failsafe. Then the pilot engages and takes over again
+    at once: a real PX4 was asked to land, because no TIMESYNC request was sent while the HEARTBEAT
+    after the first switch was awaited."""
     pair = served.aloft()
     pair.instance.autopilot.parameters.set("COM_OF_LOSS_T", 0.3)
-    pair.state.vehicle.parameters["COM_OF_LOSS_T"] = 0.3  # as it reports a change
+    pair.state.vehicle.parameters["COM_OF_LOSS_T"] = 0.3  # as if the vehicle had reported it
     pair.engage()
     heard = pair.state.vehicle.heartbeat
     pair.until(lambda: pair.state.vehicle.heartbeat is not heard, 1.5)
-    pair.run(0.3)  # CURRENT_MODE shows it first, which does not tell a pilot from a failsafe
+    pair.run(0.3)  # CURRENT_MODE comes first, and does not show whether it is a failsafe
     pair.switch("pilot")
     pair.until(lambda: pair.phase is Phase.STANDBY, 2.0)
     yielded, waits = pair.service.current.announced[-2:]
@@ -539,8 +542,8 @@ def test_a_pilot_takes_a_vehicle_whose_own_failsafe_acts_soon(served: Served) ->
 
 
 def test_where_heartbeat_alone_shows_the_mode_a_switch_is_seen_soon(served: Served) -> None:
-    """PX4 1.14 has no CURRENT_MODE and one HEARTBEAT a second, in which it would fly setpoints that
-    only repeat its attitude."""
+    """PX4 1.14 sends no CURRENT_MODE, and one HEARTBEAT a second. If the service waited for that,
+    the vehicle would meanwhile follow setpoints that only repeat its attitude."""
     pair = served.aloft()
     pair.instance.view.silent["CURRENT_MODE"] = 0
     pair.run(3.5)
@@ -554,7 +557,7 @@ def test_where_heartbeat_alone_shows_the_mode_a_switch_is_seen_soon(served: Serv
 
 
 def silence(pair: Serving, options: float) -> None:
-    """After which the vehicle has these GUID_OPTIONS."""
+    """Interrupt the link for 6 s, after which the vehicle has these GUID_OPTIONS."""
     asked = len(pair.commands(512))
     pair.lost_down = pair.lost_up = True
     pair.run(6.0)
@@ -566,9 +569,9 @@ def silence(pair: Serving, options: float) -> None:
 
 
 def test_what_is_heard_after_a_silence_may_be_another_vehicle(served: Served) -> None:
-    """With the same system id, on the same radio, switched on earlier: parameters
-    and hardware number are read again. It was flown with those of the one before, its thrust taken
-    for a climb rate."""
+    """It may have the same system id, use the same radio, and have booted earlier. So parameters
+    and hardware number are read again. Regression: it was flown with the parameters of the vehicle
+    before, and took thrust for a climb rate."""
     pair = served.engaged("ardupilot")
     pair.switch("pilot")
     pair.run(2.0)
@@ -580,7 +583,7 @@ def test_what_is_heard_after_a_silence_may_be_another_vehicle(served: Served) ->
     pair.until(lambda: pair.mode == "BRAKE", 3.0)
     assert said(pair, "not engaged: GUID_OPTIONS is 0: without bit 3")
     pair.run(2.0)
-    pair.state.vehicle.uid = 7  # of the one that was heard until now
+    pair.state.vehicle.uid = 7  # as if another vehicle had been heard until now
     silence(pair, 8.0)
     pair.until(lambda: pair.phase is Phase.STANDBY, 5.0)
     assert said(pair, "another vehicle answers")
@@ -588,7 +591,8 @@ def test_what_is_heard_after_a_silence_may_be_another_vehicle(served: Served) ->
 
 
 def test_a_request_in_the_tick_of_a_transition_is_obeyed(served: Served) -> None:
-    """It was acknowledged, and forgotten: it arrives in the last step before the phase changes."""
+    """Regression: a request in the last step before the phase changes was acknowledged, but
+    forgotten."""
 
     def begun(phase: Phase) -> Any:
         pair = served(reference="hover", arms=True)
@@ -620,7 +624,8 @@ def test_a_vehicle_that_is_engaged_as_the_service_stops_is_held(served: Served) 
 
 
 def test_the_reference_is_repeated_with_the_newest_configuration(served: Served) -> None:
-    """Which is used by the next flight. What is announced is bounded: it may wait for weeks."""
+    """The repeats are one flight with its own configuration; the next flight uses the newest one.
+    The number of stored announcements is limited, because a service may run for weeks."""
     pair = served.engaged(then="repeat")
     model = pair.service.current
     assert model.limits.log_lost == "land"
@@ -649,7 +654,7 @@ def test_the_reference_is_repeated_with_the_newest_configuration(served: Served)
     assert float(pair.state.plan.track.sample(0.0).position_ned_m[2]) == -1.5
     assert pair.service.current.limits.log_lost == "go_on"
     ticks = thrusts(pair, pair.time_s - 1.0)
-    assert len(ticks) == 5  # by the new period, which counts from another tick
+    assert len(ticks) == 5  # with the new period of 0.2 s
 
 
 # --- anything, in any order -----------------------------------------------------------------------
@@ -657,13 +662,13 @@ def test_the_reference_is_repeated_with_the_newest_configuration(served: Served)
 
 def up(pair: Serving, _: float) -> None:
     if pair.place[2] > -0.5 and not pair.armed:
-        with suppress(AssertionError):  # a vehicle that does not arm now
+        with suppress(AssertionError):  # the vehicle may not be able to arm now
             pair.fly_up()
         pair.switch("pilot")
 
 
 def engage(pair: Serving, for_s: float) -> None:
-    """The pilot switches from a mode of his own, as one who looks does."""
+    """Let the pilot hold in another mode for 1.5 s, and then engage."""
     up(pair, for_s)
     if pair.phase not in TRACKING:
         pair.switch("pilot")
@@ -682,7 +687,7 @@ def lose(direction: str) -> Callable[[Serving, float], None]:
 
 
 def stop(pair: Serving, _: float) -> None:
-    """SIGTERM, and started again by the service manager."""
+    """Stop the service as by SIGTERM, and start it again as a service manager does."""
     pair.service.request_stop()
     end_s = pair.time_s + 10.0
     while not pair.service.has_ended() and pair.time_s < end_s:
@@ -692,7 +697,7 @@ def stop(pair: Serving, _: float) -> None:
 
 
 def reboot(pair: Serving, _: float) -> None:
-    """With another battery."""
+    """Reboot a disarmed vehicle with a full battery."""
     if not pair.armed:
         pair.instance.autopilot.plant.set_battery(1.0)
         pair.instance.reboot(1.0)
@@ -723,7 +728,7 @@ EVENTS: dict[str, Callable[[Serving, float], object]] = {
 @pytest.mark.slow
 @pytest.mark.timeout(0)
 def test_nothing_unsafe_in_a_day(served: Served, on: str) -> None:
-    """Of OFFBOARD_DAY_S seconds: every event once, then any, engaged again and again."""
+    """Each event happens once, then random ones, until OFFBOARD_DAY_S seconds have passed."""
     pair = served(on)
     chance = random.Random(int(os.environ.get("OFFBOARD_DAY_SEED", "1")))
     drawn = (chance.choice(["engage", *EVENTS]) for _ in repeat(None))
