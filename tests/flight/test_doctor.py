@@ -1,5 +1,5 @@
-"""`offboard doctor` finds what is wrong with a vehicle, its link and this computer, and what it
-prints makes it right."""
+"""`offboard doctor` finds what is wrong with a vehicle, its link and this computer, and the lines
+that it prints fix it."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ COUNTED = mavlink.MAVLink(None, srcSystem=1)
 KEY = bytes(range(32))
 BOOT_S = {PX4.name: 6.0, ARDUPILOT.name: 5.0}
 BOOT_SCALE = {PX4.name: 1.0, ARDUPILOT.name: 0.1}
-# What a vehicle has that was set up as the doctor advises
+# Parameters of a vehicle that was set up as the doctor advises
 GOOD = {
     PX4.name: {"COM_OBL_RC_ACT": 4.0, "COM_RCL_EXCEPT": 4.0},
     ARDUPILOT.name: {
@@ -65,16 +65,16 @@ GOOD = {
 }  # fmt: skip
 PARAMETER = re.compile(r"param set (\w+) (\S+)")
 PERMITTED = {"TIMESYNC", "PARAM_REQUEST_READ", "COMMAND_LONG"}
-DOCTOR_ID = 193  # not that of a flight
+DOCTOR_ID = 193  # component id of the doctor, which differs from that of a flight
 COMMANDS = {401, 511, 512}  # RUN_PREARM_CHECKS, SET_MESSAGE_INTERVAL, REQUEST_MESSAGE
-BUSY = {check.__name__ for check in OF_COMPUTER}  # with other tests
+BUSY = {check.__name__ for check in OF_COMPUTER}  # not checked: other tests keep the computer busy
 REJECTED = {"fault": "velocity_error", "offset_ned_mps": (3.0, 0.0, 0.0), "for_s": 12.0}
 
 
 @dataclass
 class Bench:
-    """`before` is called with the vehicle time at each step and returns further chunks; `down` and
-    `up` see the datagrams of each direction."""
+    """A vehicle that the doctor examines. `before` is called at each step with the vehicle time and
+    returns further chunks; `down` and `up` filter the datagrams of each direction."""
 
     instance: Instance
     config: FlightConfig
@@ -96,7 +96,7 @@ class Bench:
         return (heard if self.has_vehicle else []) + self.before(self.instance.time_s)
 
     def run_to(self, time_s: float) -> None:
-        """Nobody listens meanwhile."""
+        """Step the vehicle to `time_s` while nobody listens."""
         while self.instance.time_s < time_s:
             self.step()
 
@@ -115,14 +115,14 @@ class Bench:
         return seen
 
     def check(self, *names: str) -> Rows:
-        """The rows of a check now, by name."""
+        """Examine the vehicle now, and return the rows by the name of the check."""
         seen = self.listen()
         assert_read_only(self.sent)
         chosen = run.chosen(names).items()
         return examine({name: check for name, check in chosen if name not in BUSY}, seen)
 
     def follow(self, row: list[Finding]) -> None:
-        """Do what the hints of a row say: set the parameters that they name."""
+        """Follow the hints of a row: set the parameters that they name."""
         lines = [line for finding in row for line in PARAMETER.findall(finding.hint)]
         assert lines, row
         for name, value in lines:
@@ -130,7 +130,7 @@ class Bench:
 
 
 def assert_read_only(sent: Sequence[Any]) -> None:
-    """Nothing but what the command's help promises."""
+    """Check that only the messages were sent that the help of the command names."""
     assert {message.get_type() for message in sent} <= PERMITTED
     assert {message.get_srcComponent() for message in sent} <= {DOCTOR_ID}
     commands = {message.command for message in sent if message.get_type() == "COMMAND_LONG"}
@@ -149,8 +149,8 @@ def bench(
     boot_s: float = 0.0,
     **options: Any,
 ) -> Bench:
-    """A vehicle that has booted and that nothing is wrong with, but for what is given. Times of
-    `faults` count from the boot, see BOOT_S."""
+    """Return a vehicle that has booted. Nothing is wrong with it except what the arguments change.
+    Times of `faults` count from the boot, which takes BOOT_S."""
     conditions = Conditions(boot_scale=BOOT_SCALE[firmware.name], battery=Battery(remaining=charge))
     instance = Instance(
         firmware,
@@ -170,7 +170,7 @@ def bench(
 
 
 def said(rows: Rows) -> dict[str, tuple[Finding, ...]]:
-    """The findings that are not ok, by check."""
+    """Return the findings that are not OK, by check."""
     return {
         name: tuple(finding for finding in row if finding.level is not Level.OK)
         for name, row in rows.items()
@@ -181,7 +181,7 @@ def said(rows: Rows) -> dict[str, tuple[Finding, ...]]:
 def from_others(
     message: Any, system: int, component: int, rate_hz: float = 10.0, place: Hashable = ELSEWHERE
 ) -> Callable[[float], list[Chunk]]:
-    """For `Bench.before`: another sender on the link."""
+    """Return a function for `Bench.before` that is another sender on the link."""
     codec = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
     every = round(1.0 / (rate_hz * STEP_S))
 
@@ -195,22 +195,23 @@ def from_others(
 
 
 def link(**fault: Any) -> dict[str, Any]:
-    """A fault of both directions, after the vehicle has booted."""
+    """Return options for a link fault that begins when the vehicle has booted, in both directions
+    by default."""
     return {"faults": [{"fault": "link", "at_s": 5.9} | fault]}
 
 
 def beside(*other: Any, **options: Any) -> dict[str, Any]:
-    """Another sender on the link."""
+    """Return options for another sender beside the vehicle."""
     return {"before": from_others(*other, **options)}
 
 
 def alone(*other: Any) -> dict[str, Any]:
-    """A sender, and no vehicle."""
+    """Return options for another sender without a vehicle."""
     return {"has_vehicle": False} | beside(*other)
 
 
 def shared_counter(datagrams: Bytes) -> Bytes:
-    """Each frame of the vehicle is followed by one of its camera, with the next sequence number."""
+    """Add a frame of the camera, with the next sequence number, after each frame of the vehicle."""
     sent = []
     for frame in (each for datagram in datagrams for each in frames_of(datagram)):
         known = [] if decode(frame).get_type().startswith("UNKNOWN") else [(decode(frame), 1)]
@@ -221,13 +222,13 @@ def shared_counter(datagrams: Bytes) -> Bytes:
 
 
 def test_nothing_is_said_of_a_good_vehicle() -> None:
-    """That a PX4 is good is the end of other tests."""
+    """The vehicle is an ArduCopter; other tests end with a PX4 with which nothing is wrong."""
     tested = bench(ARDUPILOT)
     began_s = tested.instance.time_s
     rows = tested.check()
     assert said(rows) == {}
     assert len(rows) == 17
-    assert tested.instance.time_s - began_s < 6.0  # 8 s with what comes before and after
+    assert tested.instance.time_s - began_s < 6.0  # the whole command takes 8 s
 
 
 def test_limits_of_the_angular_acceleration_have_their_units() -> None:
@@ -259,8 +260,8 @@ def test_parameters_of_another_release_are_not_awaited(replies: str) -> None:
     }  # fmt: skip
 
 
-# What is wrong with a vehicle that has booted, and what is found, by check. Lines that are printed
-# for parameters mend them
+# What is wrong with a vehicle that has booted, and the expected findings: check, level, pattern. If
+# a hint sets parameters, following it must fix the finding
 FOUND: list[tuple[Any, ...]] = [
     ({"parameters": {"COM_OF_LOSS_T": 0.5, "COM_OBL_RC_ACT": 0.0, "COM_RCL_EXCEPT": 0.0,
                      "MPC_TILTMAX_AIR": 20.0},
@@ -282,17 +283,17 @@ FOUND: list[tuple[Any, ...]] = [
      ("parameters", BLOCKS, "param set GUID_OPTIONS 10$"),
      ("parameters", BLOCKS, "param set ATC_ANGLE_BOOST 1$")),
     ({"assignments": ["reference.period_s=1.2"]}, ("configuration", BLOCKS, "reference")),
-    # as 4.6.3 says it
+    # in the words of ArduCopter 4.6.3
     ({"firmware": ARDUPILOT, "mode": "GUIDED", "boot_s": 9.0,
       "faults": [{"fault": "gps_loss", "at_s": 0.1, "for_s": 30.0}]},
      ("prearm", WAIT, "do not pass in GUIDED; the vehicle said: PreArm: Need Position")),
     ({"start": Start(height_m=5.0, mode="AUTO.LOITER", by_failsafe=True)},
      ("state", BLOCKS, "a failsafe flies the vehicle, in AUTO.LOITER")),
-    # which is not blamed on the radio, which nobody needs
+    # the missing transmitter, which is not needed, is not given as the cause
     ({"mode": "OFFBOARD"},
      ("prearm", WARN, "its pre-arm checks pass in OFFBOARD only while setpoints arrive. "
        "Fix: select AUTO.LOITER, as `offboard fly` does first")),
-    # its estimator: 3 m/s are two of the gates of 1.5 m/s
+    # its estimator: 3 m/s are twice the gate of 1.5 m/s
     ({"faults": [REJECTED]},
      ("estimator", BLOCKS, r"rejects GPS velocity \(innovation ratio 2.00, limit 1\)"),
      ("prearm", WAIT, "unhealthy by SYS_STATUS: RC_RECEIVER")),
@@ -312,13 +313,13 @@ FOUND: list[tuple[Any, ...]] = [
     (link(latency_s=0.3), ("delay", BLOCKS, "the delay of the link is")),
     (link(jitter_s=0.8, direction="up"), ("delay", BLOCKS, "the delay of the link is")),
     (link(corruption=0.2, direction="down"), ("loss", WARN, "of the bytes damaged")),
-    # half of the vehicle's sequence numbers are its camera's, and no frame is lost
+    # half of the sequence numbers are those of its camera, and no frame is lost
     ({"down": shared_counter}, ("loss", OK, "0.0% of the frames lost")),
     (link(message_rate_hz=30.0, direction="down"),
      ("rates", WARN, "LOCAL_POSITION_NED 30.0 of 100 Hz")),
     (link(message_rate_hz=5.0, direction="down", for_s=20.0),
      ("rates", BLOCKS, "at least 10 Hz are needed.*MAV_x_RATE")),
-    # what it asks for is thinned to fit; 38400 baud do not carry the least of it
+    # requested rates are reduced to fit the link; 38400 baud cannot carry the lowest ones
     ({"capacity_bytes_ps": 3840.0}, ("bandwidth", WARN, "use at least 115200 baud$")),
     ({"capacity_bytes_ps": 11520.0}, ("bandwidth", OK, "the link can carry")),
     ({"faults": [{"fault": "clock_jump", "at_s": 9.0, "jump_s": 30.0}]},
@@ -337,7 +338,7 @@ FOUND: list[tuple[Any, ...]] = [
      ("vehicle", BLOCKS, "but no autopilot: ground station 255/190")),
     (alone(UNKNOWN_HEARTBEAT, 1, 50, 1.0),
      ("vehicle", BLOCKS, "autopilot 1/50 is neither PX4 nor ArduCopter")),
-    # as `fly` says it
+    # the same words as those of `fly`
     (alone(AUTOPILOT_HEARTBEAT, 1, 50, 1.0), ("vehicle", BLOCKS,
        "heard as component 50, but only component 1 is flown: set its component id to 1")),
 ]  # fmt: skip
@@ -349,7 +350,7 @@ def test_what_is_found_and_what_mends_it(case: tuple[Any, ...]) -> None:
     tested = bench(**options)
     began_s = tested.instance.time_s
     rows = tested.check(*dict.fromkeys(check for check, _, _ in expected))
-    assert tested.instance.time_s - began_s < LONGEST_S + 1.1  # 15 s with the rest
+    assert tested.instance.time_s - began_s < LONGEST_S + 1.1  # the whole command takes 15 s
     for check, level, found in expected:
         row = rows[check]
         assert row[0].level is level
@@ -397,7 +398,7 @@ def test_two_that_send_as_one_lose_no_frames() -> None:
 
 
 def test_armed_vehicle_is_left_alone() -> None:
-    """No rates or pre-arm checks."""
+    """No rates and no pre-arm checks are requested."""
     flying = bench(start=Start(height_m=5.0, mode="AUTO.LOITER"))
     rows = flying.check()
     kinds = {message.get_type() for message in flying.sent}
@@ -441,7 +442,8 @@ def test_nothing_is_heard() -> None:
 
 
 def test_an_armed_vehicle_whose_signing_time_is_behind_does_not_hear_ours() -> None:
-    """By ten minutes. One that is disarmed does: `test_good_vehicle_over_udp`."""
+    """The time is behind by ten minutes. A disarmed vehicle would accept our frames, as
+    `test_good_vehicle_over_udp` shows."""
     tested = bench(signing=Signing(KEY, 100 * 60 * UNITS_PER_S), start=Start(height_m=5.0))
     tested.instance.keyring.set_up(KEY, 90 * 60 * UNITS_PER_S)
     rows = tested.check()
@@ -480,8 +482,8 @@ def test_flood_of_addresses_and_ids_is_bounded() -> None:
 def test_checks_of_other_packages_are_rows_and_broken_ones_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The one that the README shows; one that cannot be imported, and two that end the program; one
-    named as one of ours."""
+    """The checks are the example of the README, one that cannot be imported, two that raise
+    SystemExit, and one with the name of a check of `offboard`."""
     (code,) = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
     (tmp_path / "site_checks.py").write_text(code)
     (tmp_path / "exiting.py").write_text("raise SystemExit(3)\n")
@@ -500,7 +502,7 @@ def test_checks_of_other_packages_are_rows_and_broken_ones_too(
 def test_the_command_ends_in_time_although_nothing_of_it_does(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A link that does not open, and a look at the computer without end."""
+    """The link does not open, and the examination of the computer never ends."""
     never = threading.Event()
     monkeypatch.setattr(run, "OPEN_S", 0.1)
     monkeypatch.setattr(run, "LOOK_S", 0.4)
@@ -516,7 +518,7 @@ def test_the_command_ends_in_time_although_nothing_of_it_does(
 
 
 def test_what_is_wrong_with_this_computer(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A full disk, a slow decision, and late waking up."""
+    """The disk is full, a decision is slow, and the process wakes up late."""
     monkeypatch.setattr(computer, "LEAST_FREE_BYTES", 10**18)
     monkeypatch.setattr(computer, "_not_compiled", lambda: 0)
     monkeypatch.setattr(computer, "rehearse", lambda prepared, keeps_deadline: 0.04)

@@ -1,4 +1,4 @@
-"""Identification in flight and from a flight's log, of vehicles unlike the vehicle file."""
+"""Identification in flight, and from the log, of vehicles that differ from the vehicle file."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ SLOW = {"delay_s": 0.09, "natural_frequency_radps": 14.0, "damping": 1.1}
 
 
 def learning(*assignments: str, **options: Any) -> Pair:
-    """A flight with identification, of PX4's vehicle with the vehicle file `neutral`."""
+    """Return a flight with identification: PX4's vehicle with the vehicle file `neutral`."""
     usual = {"vehicle": "neutral", "scenario": "px4_like", "aloft": True}
     return make(*assignments, learning=IDENTIFY, **usual | options)
 
@@ -63,7 +63,7 @@ def unseen(tilt: dict[str, float], drag_ps: float, hover: float) -> Vehicle:
     ],
 )
 def test_unseen_vehicle_is_identified_in_flight_and_from_its_log(true: Vehicle) -> None:
-    """The steps stay in their box, and what they show is announced and recorded."""
+    """The identification steps stay in their box, and the results are announced and recorded."""
     pair = learning(reference="identify", flies=true, aloft=False)
     away_m: list[float] = []
 
@@ -104,8 +104,8 @@ def test_unseen_vehicle_is_identified_in_flight_and_from_its_log(true: Vehicle) 
 
 @pytest.mark.slow
 def test_slow_thrust_is_identified() -> None:
-    """From the steps, which leave it uncertain: it is found shorter than it is, and the height is
-    flown with less bandwidth. Otherwise it is 0.5 to 1.2 m off."""
+    """The steps identify a lag that is too short and uncertain, and so the height is flown with
+    less bandwidth. Without this the error is 0.5 to 1.2 m."""
     flies = TRUE.model_copy(update={"thrust_lag_s": 0.5})
     pair = learning(ONE_LAP, flies=flies, seed=3, aloft=False)
     pair.track()
@@ -131,8 +131,8 @@ def test_slow_thrust_is_identified() -> None:
     ],
 )
 def test_vehicle_of_unknown_delays_is_held_until_they_are_identified(true: dict[str, Any]) -> None:
-    """Otherwise its height oscillates by 1 m, or it is lost at 5 m, before the steps. One that
-    swings there is identified from that."""
+    """The vehicle hovers with little bandwidth. Otherwise its height would oscillate by 1 m, or it
+    would reach the limit of 5 m, before the steps. If it oscillates, it is identified from that."""
     flies = unseen(QUICK, 0.15, 0.5).model_copy(update=true)
     pair = learning(ONE_LAP, flies=flies, seed=3, aloft=False)
     pair.track()
@@ -140,7 +140,8 @@ def test_vehicle_of_unknown_delays_is_held_until_they_are_identified(true: dict[
 
 
 def test_thrust_that_gusts_leave_uncertain_is_adopted_as_such() -> None:
-    """Otherwise that of the file counts as known, and the height oscillates: 0.5 m."""
+    """The uncertainty is taken over, too. Otherwise the constants of the file would count as known,
+    and the height would oscillate by 0.5 m."""
     gusts = {"intensity_mps": 4.0, "speed_mps": 12.0}
     windy = {"estimator": "px4_like", "wind_ned_mps": (12.0, 0.0, 0.0), "gusts": gusts}
     tilt = {"delay_s": 0.016, "natural_frequency_radps": 11.7, "damping": 0.48}
@@ -155,8 +156,8 @@ def test_thrust_that_gusts_leave_uncertain_is_adopted_as_such() -> None:
 
 
 def test_thrust_that_the_steps_do_not_show_is_identified_in_motion() -> None:
-    """In the steps, delay plus lag of 0.27 s look like 0.14 +- 0.02 s, as the estimated height
-    drifts; flown with that, the height is off: 0.09 m."""
+    """From the steps, a delay plus lag of 0.27 s is identified as 0.14 +- 0.02 s, because the
+    estimated height drifts. Flown with that value, the error is 0.09 m."""
     slow = AxisResponse(delay_s=0.17, natural_frequency_radps=4.8, damping=0.57)
     thrust = {"thrust_lag_s": 0.163, "thrust_delay_s": 0.11, "hover_thrust": 0.6}
     flies = TRUE.model_copy(update={"tilt": slow} | thrust)
@@ -174,8 +175,9 @@ def test_thrust_that_the_steps_do_not_show_is_identified_in_motion() -> None:
 def test_slow_attitude_is_identified(
     frequency_radps: float, damping: float, error_m: float
 ) -> None:
-    """Before the reference, though the steps leave the delay of the first one uncertain. Otherwise
-    0.27, 0.70 and 1.00 m; the last one is nearly that of an ArduCopter with ATC_INPUT_TC 1."""
+    """It is identified before the reference, although the steps leave the delay of the first one
+    uncertain. Without that the errors are 0.27, 0.70 and 1.00 m. The last one is nearly an
+    ArduCopter with ATC_INPUT_TC 1."""
     slow = AxisResponse(delay_s=0.057, natural_frequency_radps=frequency_radps, damping=damping)
     pair = learning(ONE_LAP, flies=TRUE.model_copy(update={"tilt": slow}), seed=3, aloft=False)
     pair.track()
@@ -191,8 +193,8 @@ def test_slow_attitude_is_identified(
 
 
 def test_tilt_that_the_autopilot_accelerates_slowly_is_flown() -> None:
-    """Without the limit, feedback needs more angular acceleration than the autopilot allows, and
-    the vehicle is lost at 5 m."""
+    """Without the limit of the bandwidth, feedback needs more angular acceleration than the
+    autopilot allows, and the flight ends at an error of 5 m."""
     cdeg = 13000.0
     slow = (math.radians(0.01 * cdeg),) * 2 + (2.2,)
     copter = simulated.vehicle("arducopter")
@@ -213,8 +215,9 @@ def test_tilt_that_the_autopilot_accelerates_slowly_is_flown() -> None:
 
 
 def test_tilt_that_the_autopilot_turns_slowly_is_flown() -> None:
-    """PX4 with 60 instead of 220 deg/s, behind a link of 120 ms each way. Somebody changes its
-    parameters in flight. Without the limit of the bandwidth 0.33 m."""
+    """PX4 allows 60 instead of 220 deg/s, after a ground station has changed its parameters in
+    flight, and the link delays by 120 ms each way. Without the limit of the bandwidth the error is
+    0.33 m."""
     slow, noise = (math.radians(60.0),) * 2 + (3.49,), {"estimator": "px4_like"}
     pair = learning(
         ONE_LAP, seed=3, aloft=False,
@@ -237,14 +240,14 @@ def test_tilt_that_the_autopilot_turns_slowly_is_flown() -> None:
 
 
 def test_white_noise_of_positions_is_no_delay_of_the_thrust() -> None:
-    """Noise of 2 cm; 0.07 m where the identification does not allow for it."""
+    """The noise is 2 cm. The error is 0.07 m if the identification does not allow for it."""
     pair = learning(ONE_LAP, scenario="noise", seed=1, aloft=False)
     pair.track()
     assert pair.score().rmse_position_m < 0.05
 
 
 def test_vehicle_file_that_telemetry_contradicts_ends_the_flight() -> None:
-    """The reason has both figures, and the vehicle lands."""
+    """The reason names both values, and the vehicle lands."""
     wrong = TRUE.tilt.model_copy(update={"natural_frequency_radps": 2.5})
     pair = learning(FIVE_S, reference="hover", believed=TRUE.model_copy(update={"tilt": wrong}))
     outcome = pair.fly()
@@ -258,7 +261,8 @@ def test_vehicle_file_that_telemetry_contradicts_ends_the_flight() -> None:
 
 @pytest.mark.slow
 def test_attitude_loop_that_slows_is_noticed_and_flown() -> None:
-    """From 11.4 to 5 rad/s with the same delay. Unnoticed, it is 0.98 m off."""
+    """The natural frequency falls from 11.4 to 5 rad/s with the same delay. If this is not noticed,
+    the error is 0.98 m."""
     pair = learning()
     slow = TRUE.tilt.model_copy(update={"natural_frequency_radps": 5.0})
     gains, _ = build_loop(TRUE.model_copy(update={"tilt": slow}))
@@ -271,7 +275,8 @@ def test_attitude_loop_that_slows_is_noticed_and_flown() -> None:
     text = " | ".join(pair.companion.announced)
     doubt = text.index("telemetry contradicts the identified vehicle")
     known = text.index("identified tilt delay", doubt)
-    assert "bandwidth limited to 3.0 rad/s" in text[doubt:known]  # the lowest, until it is known
+    # the lowest bandwidth until the response is identified again
+    assert "bandwidth limited to 3.0 rad/s" in text[doubt:known]
     said = text[known:].split()
     assert float(said[7]) == pytest.approx(5.0, rel=0.05)
     assert "bandwidth 7.0 rad/s as configured" in " ".join(said)
@@ -280,7 +285,7 @@ def test_attitude_loop_that_slows_is_noticed_and_flown() -> None:
 
 
 def test_mass_that_changes_in_flight_is_followed() -> None:
-    """A load that is picked up while the reference is flown."""
+    """A load is picked up while the reference is flown."""
     pair = learning()
 
     def change(flying: Pair) -> None:
@@ -298,7 +303,7 @@ def test_mass_that_changes_in_flight_is_followed() -> None:
 @pytest.mark.parametrize(
     ("most_s", "said"),
     [
-        # without "fly steps": they are flown
+        # the sentence does not advise to fly steps, because these were flown
         (0.38, ["repeating the steps, tilt not identified: .* is uncertain: sd 0.038, limit 0.03$",
                 "repeating the steps, tilt not identified: its delay is uncertain: "]),
         (0.6, [".*; tilt response not identified, it does not follow its command: "]),
@@ -324,9 +329,9 @@ def test_steps_are_repeated_while_the_delay_is_uncertain(most_s: float, said: li
 def test_twice_the_thrust_of_the_file_is_found_before_the_take_over(
     fly: Callable[..., Pair],
 ) -> None:
-    """While it climbs. Without, ArduCopter is 8 m too high with four times the thrust. A PX4 that
-    is found in the air has not found its own hover thrust yet, and climbs until it is taken over.
-    """
+    """It is found while the vehicle climbs. Otherwise ArduCopter is 8 m too high with four times
+    the thrust. PX4 starts in the air, has not estimated its own hover thrust yet, and climbs until
+    the take-over."""
     scenario = scenario_of(conditions={"estimator": "perfect", "thrust_scale": 2.0})
     hover = ("reference.height_m=3.0", "reference.duration_s=3.0")
     pair = fly(*hover, reference="hover", scenario=scenario, learning=IDENTIFY, seed=1)
@@ -347,10 +352,11 @@ VEHICLE = simulated.vehicle("arducopter").model_copy(
 @settings(max_examples=20, derandomize=True, deadline=None)
 @given(st.floats(0.2, 0.7), st.floats(-1.0, 3.3), st.sampled_from((1, 10)))
 def test_hover_thrust_of_an_accelerated_climb(true: float, climb_mps: float, every: int) -> None:
-    """Against the closed-form speed v(t) under constant thrust and linear drag; at 100, 10 Hz."""
+    """The oracle is the closed-form speed v(t) for constant thrust and linear drag. Positions
+    arrive at 100 or 10 Hz."""
     gravity, drag = VEHICLE.gravity_mps2, VEHICLE.drag_per_mass_ps
     thrust = 1.15 * true
-    final = (gravity - gravity * thrust / true) / drag  # down
+    final = (gravity - gravity * thrust / true) / drag  # final speed, positive down
     hover, rng = HoverEstimate(), np.random.default_rng(5)
     for step in range(101):
         time_s = 0.01 * step
@@ -370,4 +376,4 @@ def test_no_hover_thrust_from_too_little_or_on_the_ground_or_while_it_falls() ->
             hover.on_position(0.01 * step, height_m, fall_mps2 * 0.01 * step)
             hover.on_thrust(0.01 * step, thrust, thrust)
         assert hover.hover_thrust(TRUE, 0.59) is None
-        assert hover.hover_thrust(TRUE, 2.0) is None  # reported too long ago
+        assert hover.hover_thrust(TRUE, 2.0) is None  # the reports are too old

@@ -1,5 +1,5 @@
-"""Links on real sockets and pseudo-terminals: arrival stamps, other senders, a vehicle that changes
-its port, streams that are full, links that break and come back, addresses of IPv6."""
+"""Links on real sockets and pseudo-terminals: times of arrival, other senders, a vehicle that
+changes its port, full streams, links that break and return, IPv6 addresses."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from offboard.mavlink.senders import PEER_SILENT_S
 
 LOCAL = "127.0.0.1"
 LONG_S = 10.0
-TURN_S = 1.0  # for one turn of the loop, whatever the link does, on a busy machine
+TURN_S = 1.0  # longest turn of the loop on a busy machine, whatever the link does
 Udp = tuple[UdpLink, socket.socket, socket.socket]
 IPV6 = socket.has_ipv6 and Path("/proc/net/if_inet6").exists()
 
@@ -61,7 +61,8 @@ def listening(ends: ExitStack, port: int = 0) -> socket.socket:
 
 
 def plugged(ends: ExitStack) -> tuple[int, str, Callable[[], object]]:
-    """A serial device: the descriptor of its other end, its path, and what unplugs it."""
+    """Create a serial device. Return the descriptor of its other end, its path, and a function that
+    unplugs it."""
     ours, theirs = pty.openpty()
     tty.setraw(theirs)
     unplugs = ends.enter_context(ExitStack())
@@ -76,7 +77,8 @@ def port(link: Link) -> int:
 
 
 def turns(link: Link, until: Callable[[bytes], object]) -> bytes:
-    """Turns of the loop until `until` holds for all that was received; none of them may wait."""
+    """Run turns of the loop until `until` holds for the bytes received, and return these. No turn
+    may block."""
     received, deadline_s = b"", time.monotonic() + LONG_S
     while not until(received):
         began_s = time.monotonic()
@@ -102,7 +104,7 @@ def run_until_it_breaks(link: Link) -> None:
 
 @pytest.fixture
 def udp() -> Iterator[Udp]:
-    """A link that listens, the socket of a vehicle, and that of another program."""
+    """A listening link, the socket of a vehicle, and the socket of another program."""
     link = open_link(f"udpin:{LOCAL}:{free_port()}")
     assert isinstance(link, UdpLink)
     with (
@@ -134,9 +136,9 @@ def data(chunks: list[Chunk]) -> list[bytes]:
 
 
 def test_a_datagram_has_the_time_of_its_arrival_not_of_its_reading(udp: Udp) -> None:
-    """On a busy machine the time may be too old by as long as this process is interrupted."""
+    """If this process is interrupted, the time may be too old by the length of the interruption."""
     link, vehicle, _ = udp
-    for _ in range(5):  # again if the computer's clock was set meanwhile
+    for _ in range(5):  # repeat if the computer's clock was set in the meantime
         before_s, offset_s = time.monotonic(), clock.monotonic_less_unix_s()
         vehicle.send(b"first")
         time.sleep(0.5)
@@ -154,7 +156,7 @@ def test_a_datagram_has_the_time_of_its_arrival_not_of_its_reading(udp: Udp) -> 
 def test_a_clock_that_is_set_does_not_move_arrivals(
     jump_s: float, udp: Udp, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Unix time jumps between the arrival and its reading."""
+    """Unix time jumps between the arrival of a datagram and its reading."""
     link, vehicle, _ = udp
     assert link.receive() == []
     empty_s, right = time.monotonic(), clock.monotonic_less_unix_s
@@ -198,15 +200,15 @@ def test_other_senders_are_counted_and_neither_delay_nor_displace_the_vehicle(ud
         time.sleep(LOOK_EVERY_S)
         assert set(data(received(link))) == {b"v"}
         looks += 1
-    assert 64 * 22 > link.report.ignored > 500  # of those that fit into the buffer
+    assert 64 * 22 > link.report.ignored > 500  # datagrams that fitted into the buffer
     name = f" from {LOCAL}:{other.getsockname()[1]}, which is not the vehicle, "
     assert all(name in sentence for sentence in link.report.news())
     assert link.report.news() == []
 
 
 def test_frames_reach_the_vehicle_before_and_after_it_is_followed(udp: Udp) -> None:
-    """And no other program gets the port: with pymavlink's SO_REUSEADDR it would take the vehicle's
-    datagrams."""
+    """No other program can bind the port: by SO_REUSEADDR, as pymavlink sets it, it would get the
+    vehicle's datagrams."""
     link, vehicle, _ = udp
     link.send(b"nobody", None)
     for sent in (b"one", b"two"):
@@ -231,8 +233,8 @@ def test_another_port_is_said_as_the_user_writes_it() -> None:
 def test_another_port_is_heard_after_a_silence_that_was_observed(
     udp: Udp, now_s: list[float]
 ) -> None:
-    """A pause of ours is none, of 3 s here: the vehicle's datagrams wait, but a flood may have
-    dropped the newest."""
+    """A pause of this process, here of 3 s, is not a silence of the vehicle: its datagrams wait, or
+    other senders have filled the buffer so that the newest were dropped."""
     link, vehicle, other = udp
     link.follow(vehicle.getsockname())
     for passed_s in (0.4, 0.4, 0.4, 1.5):
@@ -240,7 +242,7 @@ def test_another_port_is_heard_after_a_silence_that_was_observed(
         vehicle.send(b"v")
         other.send(b"no")
         assert data(received(link)) == [b"v"]
-    # what has sent beside the vehicle is another, of the same system id perhaps
+    # whoever has sent while the vehicle did is another program, perhaps with the same system id
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as restarted:
         restarted.connect(other.getpeername())
         for silent_s, heard in ((0.9, []), (0.2, [b"moved"])):
@@ -266,7 +268,7 @@ def test_another_port_is_heard_after_a_silence_that_was_observed(
                 link.follow(sender.getsockname())
                 sender.send(b"v")
                 assert data(received(link)) == [b"v"]
-        # two that have overlapped: the later one is heard in the end
+        # after a long silence also a sender is heard that has sent while the vehicle did
         for passed_s, heard in ((50.0, []), (15.0, [b"late"])):
             now_s[0] += passed_s
             other.send(b"late")
@@ -274,8 +276,8 @@ def test_another_port_is_heard_after_a_silence_that_was_observed(
 
 
 def test_udpout_hears_only_its_peer() -> None:
-    """A refused datagram does not cost the next one: a connected socket reports the ICMP message
-    of the one before instead of sending."""
+    """After a refused datagram the next one is sent nevertheless. A connected socket would instead
+    report the ICMP message for the datagram before."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind((LOCAL, 0))
         place = probe.getsockname()
@@ -316,7 +318,7 @@ def test_senders_are_named_at_powers_of_ten_and_bounded_in_number() -> None:
 
 @pytest.mark.parametrize(
     ("kind", "count"), [("tcp", 20_000), ("serial", 5_000)]
-)  # 1 MB and 250 kB, more than the buffers hold
+)  # 1 MB and 250 kB exceed the buffers
 def test_a_full_stream_does_not_block_and_sends_the_newest_setpoint(
     kind: str, count: int, ends: ExitStack
 ) -> None:
@@ -339,7 +341,7 @@ def test_a_full_stream_does_not_block_and_sends_the_newest_setpoint(
     else:
         theirs, path, _ = plugged(ends)
         link = opened(f"serial:{path}:57600", ends)
-    for each in setpoints[:-1]:  # TCP breaks 5 s after the first byte that nobody reads
+    for each in setpoints[:-1]:  # a TCP link breaks 5 s after the first byte that is not read
         link.send(each, None)
     link.send(heartbeat, None)
     link.send(setpoints[-1], None)
@@ -380,7 +382,7 @@ def test_a_tcp_peer_that_goes_and_returns_is_connected_again(ends: ExitStack) ->
     assert link.report.news() == [RENEWED]
     assert link.opened > before
     after = peer.recv(65536)
-    assert len(after) < 12 * 30  # what was sent meanwhile was dropped, not queued
+    assert len(after) < 12 * 30  # frames sent during the outage were dropped, not queued
     assert b"old" not in after
 
 
@@ -404,7 +406,7 @@ def test_tcpin_takes_one_client_and_the_next_one_when_it_is_silent(ends: ExitSta
         turns(link, refused)
         assert other.recv(10) == b""  # closed
     run(link, 0.6)
-    with socket.create_connection(place) as back:  # and the first one has gone silently
+    with socket.create_connection(place) as back:  # the first client has gone without closing
         back.sendall(b"two")
         turns(link, lambda data: data.endswith(b"two"))
         while vehicle.recv(65536):
@@ -413,7 +415,7 @@ def test_tcpin_takes_one_client_and_the_next_one_when_it_is_silent(ends: ExitSta
 
 
 def test_a_serial_device_that_is_unplugged_and_back(tmp_path: Path, ends: ExitStack) -> None:
-    """Nobody else opens it meanwhile: two readers would each get a part of the telemetry."""
+    """No other program can open the device: two readers would each get a part of the telemetry."""
     device = tmp_path / "ttyACM0"
     other_end, path, unplug = plugged(ends)
     device.symlink_to(path)
@@ -425,7 +427,7 @@ def test_a_serial_device_that_is_unplugged_and_back(tmp_path: Path, ends: ExitSt
     unplug()
     device.unlink()
     run_until_it_breaks(link)
-    assert link.descriptors() == ()  # else the device would come back under another name
+    assert link.descriptors() == ()  # an open descriptor would give the device another name
     other_end, path, _ = plugged(ends)
     device.symlink_to(path)
     turns(link, lambda _: link.descriptors())
@@ -435,7 +437,8 @@ def test_a_serial_device_that_is_unplugged_and_back(tmp_path: Path, ends: ExitSt
 
 @pytest.mark.parametrize("kind", ["tcp", "serial", "udp"])
 def test_what_arrives_while_it_waits_is_not_read(kind: str, ends: ExitStack) -> None:
-    """The supervisor has the same descriptors, and must find what the controller has waited for."""
+    """The supervisor has the same descriptors, and must find the data for which the controller
+    waited."""
     link, send = joined(kind, ends)
     descriptor = link.descriptors()[-1]
     assert waiting_bytes(descriptor) == 0
@@ -461,7 +464,7 @@ def test_what_arrives_while_it_waits_is_not_read(kind: str, ends: ExitStack) -> 
 
 
 def joined(kind: str, ends: ExitStack) -> tuple[Link, Callable[[bytes], object]]:
-    """A link, and what sends on its other end."""
+    """Return a link, and a function that sends on its other end."""
     if kind == "serial":
         other_end, path, _ = plugged(ends)
         return opened(f"serial:{path}:57600", ends), partial(os.write, other_end)
@@ -477,14 +480,14 @@ def joined(kind: str, ends: ExitStack) -> tuple[Link, Callable[[bytes], object]]
 
 
 def waiting_bytes(descriptor: int) -> int:
-    """That nobody has read yet."""
+    """Return the number of received bytes that were not read yet."""
     return int.from_bytes(fcntl.ioctl(descriptor, termios.FIONREAD, bytes(4)), sys.byteorder)
 
 
 def test_localhost_is_the_same_for_link_and_vehicle(
     ends: ExitStack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where /etc/hosts has ::1 alone, glibc tells 127.0.0.1 who asks for IPv4."""
+    """If /etc/hosts has only ::1 for localhost, glibc answers 127.0.0.1 to a request for IPv4."""
     asked = socket.getaddrinfo
 
     def told(host: str, port: int, family: int = 0, type: int = 0) -> Any:
@@ -524,7 +527,7 @@ def test_ipv6_addresses(ends: ExitStack) -> None:
 
 
 def test_a_simulator_without_a_loopback_interface(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A socket can be bound there, and nothing arrives: it is not waited for."""
+    """Without it a socket can be bound, but nothing arrives. This is reported at once."""
 
     class Unreachable(socket.socket):
         def connect(self, _address: object, /) -> None:

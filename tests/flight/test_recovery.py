@@ -1,7 +1,7 @@
 """Recovery: what the supervisor asks of a vehicle without controller.
 
-First against scripts of what the vehicle shows, then of a simulated PX4, whose own failsafe for
-missing setpoints acts, too. The process and its sockets are in `test_supervisor.py`.
+The first tests use scripts of what the vehicle reports; the others a simulated PX4, whose own
+failsafe for missing setpoints acts, too. `test_supervisor.py` tests the process and its sockets.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ ACCEPTED = (0.05, CommandAck(HOLD, "ACCEPTED"))
 def asked(
     dialect: Dialect, *events: Timed, shown: str = "", known: Supervised = OURS
 ) -> tuple[list[tuple[float, int]], str]:
-    """What is asked, and when, of a vehicle that has shown the mode `shown` 0.4 s before the
-    recovery begins at 0 s, and reports these `events` at these times; and how it ended."""
+    """Run a recovery that begins at 0 s, with a vehicle that showed the mode `shown` 0.4 s before
+    and reports `events`. Return the times and numbers of the commands, and why it ended."""
     recovery, waiting = Recovery(dialect, known, 0.0, 0.0), sorted(events, key=lambda each: each[0])
     if shown:
         recovery.see(Heartbeat(shown, True, 4, 2), -0.4)
@@ -56,7 +56,7 @@ def asked(
 
 
 def beats(mode: str, first_s: float, last_s: float, *, armed: bool = True) -> list[Timed]:
-    """HEARTBEAT shows this mode once a second."""
+    """Return HEARTBEATs that show this mode, one per second."""
     count = math.floor(last_s - first_s) + 1
     return [(first_s + number, Heartbeat(mode, armed, 4, 2)) for number in range(count)]
 
@@ -68,7 +68,7 @@ def words(commands: list[tuple[float, int]]) -> list[int]:
 @FIRMWARES
 @pytest.mark.parametrize("answered_s", [0.05, 0.55], ids=["at once", "the second request"])
 def test_hold_at_once_then_land_until_disarmed(dialect: Dialect, answered_s: float) -> None:
-    """Also if the first acknowledgement is lost: on a real PX4 the controller had read it."""
+    """Also if the first COMMAND_ACK is missing: of a real PX4, the controller had read it."""
     commands, ended = asked(
         dialect,
         (answered_s, CommandAck(HOLD, "ACCEPTED")),
@@ -87,8 +87,8 @@ def test_hold_at_once_then_land_until_disarmed(dialect: Dialect, answered_s: flo
 
 @FIRMWARES
 def test_only_what_is_ours_is_asked_for_more(dialect: Dialect) -> None:
-    """Hold that the vehicle has not acknowledged, or that it showed before, is somebody's choice;
-    one that the controller had asked for is ours."""
+    """A hold mode that the vehicle has not acknowledged, or showed before, was chosen by somebody
+    else. A hold that the controller had requested is ours."""
     holds = beats(dialect.hold_mode, 0.5, 20.5)
     commands, ended = asked(dialect, *holds, shown=dialect.engage_mode)
     assert set(words(commands)) == {HOLD}
@@ -104,7 +104,8 @@ def test_only_what_is_ours_is_asked_for_more(dialect: Dialect) -> None:
 
 @FIRMWARES
 def test_a_landing_goes_on(dialect: Dialect) -> None:
-    """It was interrupted for 5 s of hold, and a hold that a pilot chose was taken for an answer."""
+    """Regression: a landing was interrupted by 5 s of hold, and a pilot's hold was taken for the
+    answer."""
     landing = replace(OURS, landing=True)
     down = beats(dialect.land_mode, 8.5, 8.5, armed=False)
     for mode in (dialect.land_mode, dialect.engage_mode):
@@ -117,7 +118,7 @@ def test_a_landing_goes_on(dialect: Dialect) -> None:
 
 @FIRMWARES
 def test_a_vehicle_that_is_not_heard_or_does_not_obey(dialect: Dialect) -> None:
-    """Three requests if nothing at all is heard; else one for each report, at last to land."""
+    """If nothing at all is heard, three requests are sent; else one per report, at last to land."""
     commands, ended = asked(dialect)
     assert (words(commands), ended) == ([HOLD] * 3, TOO_LONG)
     commands, ended = asked(dialect, *beats(dialect.engage_mode, 0.5, LONGEST_S + 1.0))
@@ -130,7 +131,8 @@ def test_a_vehicle_that_is_not_heard_or_does_not_obey(dialect: Dialect) -> None:
 @FIRMWARES
 @pytest.mark.parametrize("pilot_s", [0.2, 3.5, 12.5])
 def test_a_pilot_is_never_overridden(dialect: Dialect, pilot_s: float) -> None:
-    """Nothing is asked after the first report of his mode, before, in hold and in the landing."""
+    """Nothing is requested after the first report of the pilot's mode: before hold, in hold, and in
+    the landing."""
     mode = {"px4": "POSCTL", "ardupilot": "LOITER"}[dialect.name]
     obeyed = [*beats(dialect.hold_mode, 0.5, 5.5), *beats(dialect.land_mode, 6.5, 13.5)]
     before = [(at_s, event) for at_s, event in obeyed if at_s < pilot_s]
@@ -146,7 +148,7 @@ IN_LANDING = [*HOLDS[:10], *((5.9 + 0.5 * n, ModeReport(PX4.land_mode)) for n in
 @pytest.mark.parametrize(
     ("commands", "reports"),
     [
-        # between our request and its effect, although the vehicle has acknowledged it
+        # another mode between our request and its effect, which the vehicle has acknowledged
         *(([HOLD], [(s, ModeReport("POSCTL")), *HOLDS]) for s in (0.01, 0.31, 3.1)),
         # hold that arrived before the request left, and was read after it
         ([HOLD], [(-0.01, ModeReport(PX4.hold_mode)), *HOLDS]),
@@ -155,7 +157,7 @@ IN_LANDING = [*HOLDS[:10], *((5.9 + 0.5 * n, ModeReport(PX4.land_mode)) for n in
     ],
 )
 def test_a_mode_that_was_not_asked_for_is_final(commands: list[int], reports: list[Timed]) -> None:
-    """Whatever is reported after it."""
+    """It is final whatever is reported afterwards."""
     beat = [(12.1, Heartbeat(reports[-1][1].mode, True, 4, 2))]  # type: ignore[attr-defined]
     done, ended = asked(PX4, ACCEPTED, *reports, *beat, shown=PX4.engage_mode)
     assert words(done) == commands
@@ -163,7 +165,7 @@ def test_a_mode_that_was_not_asked_for_is_final(commands: list[int], reports: li
 
 
 def test_the_failsafe_for_missing_setpoints_may_act_a_little_early() -> None:
-    """The newest setpoint left before the newest beat, and may have been lost."""
+    """The newest setpoint was sent before the controller's newest beat, and may have been lost."""
     loss = PX4.setpoint_loss({"COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": POSCTL})
     for at_s, end in ((0.6, "the vehicle shows POSCTL"), (0.8, DISARMED)):
         falls = [(at_s, Heartbeat("POSCTL", True, 5, 2)), *beats("POSCTL", 2.0, 2.0, armed=False)]
@@ -173,7 +175,8 @@ def test_the_failsafe_for_missing_setpoints_may_act_a_little_early() -> None:
 
 
 def test_from_hold_even_the_mode_of_that_failsafe_is_a_pilots_choice() -> None:
-    """The controller has asked for hold; HEARTBEAT shows another failsafe, as an empty battery."""
+    """The controller has requested hold. HEARTBEAT shows another failsafe, such as an empty
+    battery."""
     loss = PX4.setpoint_loss({"COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": POSCTL})
     switched = [(2.0 + n, Heartbeat("POSCTL", True, 5, 2)) for n in range(10)]
     known = replace(OURS, setpoint_loss=loss, holding=True)
@@ -203,7 +206,7 @@ STREAM_S = 1.5
 
 @dataclass
 class Recovered:
-    """How a recovery ended, and what was asked until then: time, command, height."""
+    """How a recovery ended, and its commands: time, number, height of the vehicle."""
 
     ended: str = ""
     armed: bool = True
@@ -216,8 +219,9 @@ def recovered(
     arrives: Callable[[int], bool] = lambda command: True,
     pilot: tuple[float, str] = (math.inf, ""),
 ) -> Recovered:
-    """A PX4 that hovers at 4 m in OFFBOARD; its newest setpoint leaves at 0 s, and the supervisor
-    acts at `silent_s`. Its commands arrive if `arrives` says so; a `pilot` switches the mode."""
+    """Run a recovery of a PX4 that hovers at 4 m in OFFBOARD. The last setpoint is sent at 0 s, and
+    the supervisor acts at `silent_s`. Its commands arrive if `arrives` returns True. `pilot` is the
+    time and the mode of a pilot's switch."""
     start = scenario_of(start={"height_m": 4.0, "mode": "OFFBOARD"})
     vehicle, conditions = config.vehicle("px4_sih"), start.conditions
     instance = Instance(LEAN, vehicle, conditions, 3, ground_link=False, start=start.start)
@@ -263,8 +267,8 @@ def recovered(
 def test_before_the_failsafe_and_in_a_race_with_it_it_is_landed(
     after_s: float, fallback: int
 ) -> None:
-    """The supervisor acts so long after the failsafe, by itself 0.4 s before it; it took that mode
-    for a pilot's and gave up."""
+    """The supervisor acts `after_s` after the failsafe; by itself it acts 0.4 s before. Regression:
+    it took the mode of the failsafe for a pilot's, and gave up."""
     loss = PX4.setpoint_loss({"COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": fallback})
     assert replace(OURS, setpoint_loss=loss).silent_s == pytest.approx(0.6)
     result = recovered(fallback, 1.0 + after_s)
@@ -275,7 +279,7 @@ def test_before_the_failsafe_and_in_a_race_with_it_it_is_landed(
 def test_in_the_failsafe_it_is_watched_and_landed_if_it_does_not(
     fallback: int, silent_s: float
 ) -> None:
-    """Every request to hold is lost. POSCTL without sticks sinks by itself."""
+    """Every request to hold is lost. In POSCTL without sticks the vehicle sinks by itself."""
     result = recovered(fallback, silent_s, arrives=lambda command: command != HOLD)
     assert (result.ended, result.armed) == (DISARMED, False)
     landings_s = [at_s for at_s, command, height_m in result.asked
@@ -286,8 +290,8 @@ def test_in_the_failsafe_it_is_watched_and_landed_if_it_does_not(
 
 @pytest.mark.parametrize(("mode", "pilot_s"), [("POSCTL", 0.5), ("POSCTL", 3.0), ("ALTCTL", 1.3)])
 def test_a_pilots_choice_is_final_before_the_failsafe_and_in_it(mode: str, pilot_s: float) -> None:
-    """POSCTL is also the mode of the failsafe: HEARTBEAT shows none once it was chosen. Nothing
-    that is asked arrives."""
+    """POSCTL is also the mode of the failsafe, but HEARTBEAT shows no failsafe once a pilot has
+    chosen it. No command arrives."""
     result = recovered(POSCTL, 1.2, arrives=lambda command: False, pilot=(pilot_s, mode))
     assert result.ended == f"the vehicle shows {mode}: its pilot or its failsafe has it"
     assert all(at_s < max(pilot_s, 1.2) + 1.1 for at_s, _, _ in result.asked)

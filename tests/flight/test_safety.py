@@ -1,6 +1,6 @@
-"""Safety: whose the vehicle is, and what must not happen to it in the air.
+"""Safety: who controls the vehicle, and what must not happen to it in the air.
 
-Faults that were seen on real autopilots, each flown with the fault of a scenario.
+These faults were seen on real autopilots; each test flies with the fault of a scenario.
 """
 
 from __future__ import annotations
@@ -51,13 +51,13 @@ WITH_GPS = with_rate(PX4, 50.0, "GPS_RAW_INT", "ESTIMATOR_STATUS")
 
 
 def another_companion(**fault: Any) -> Any:
-    """A second `offboard fly` that tracks: our own ids."""
+    """Return a scenario with a second `offboard fly`, which tracks and has our ids."""
     tracks = {"system": 1, "component": 191, "custom_mode": Phase.TRACK.code}
     return scenario_of({"fault": "second_sender", **tracks, **fault})
 
 
 def jump(*offset_ned_m: float, after: str = "engaged", at_s: float = 1.5) -> dict[str, Any]:
-    """The estimate is reset by so much."""
+    """Return a fault that resets the position estimate by this offset."""
     return {"fault": "estimator_jump", "offset_ned_m": offset_ned_m, "after": after, "at_s": at_s}
 
 
@@ -65,7 +65,7 @@ def jump(*offset_ned_m: float, after: str = "engaged", at_s: float = 1.5) -> dic
 
 
 def overload(pair: Pair) -> None:
-    """Hover would need 1.1 of the thrust."""
+    """Make the vehicle so heavy that hover would need 110 % of the full thrust."""
     scale = 1.1 / pair.companion.model.hover_thrust
     pair.instance.autopilot.plant.scale_mass(scale)
 
@@ -78,7 +78,7 @@ def overloaded_twice() -> Pair:
 
 
 def too_heavy(pair: Pair) -> None:
-    """It falls at once, with full thrust."""
+    """Make the vehicle so heavy that it falls at once in spite of full thrust."""
     pair.instance.autopilot.plant.scale_mass(4.0)
 
 
@@ -99,7 +99,7 @@ def says_nobody_is_on_the_link(pair: Pair) -> None:
 
 
 def soon(since: Phase, within_s: float) -> Check:
-    """The landing begins so soon after this phase."""
+    """Return a check that the landing begins within this time after the begin of a phase."""
 
     def check(pair: Pair) -> None:
         assert begun_s(pair, Phase.LAND) < begun_s(pair, since) + within_s
@@ -108,7 +108,7 @@ def soon(since: Phase, within_s: float) -> Check:
 
 
 def held_for(name: str) -> Check:
-    """It holds first, for this row of the failsafe."""
+    """Return a check that the vehicle first holds because of this row of the failsafe."""
 
     def check(pair: Pair) -> None:
         assert pair.failsafes[name] is Action.HOLD
@@ -118,7 +118,7 @@ def held_for(name: str) -> Check:
 
 
 def flies_and_lands(pair: Pair) -> None:
-    """One that only says that it is disarmed still flies."""
+    """The vehicle, which only reports that it is disarmed, flies on until it has landed."""
     steps = (pair.instance.step() for _ in range(3000) if pair.armed)
     list(steps)
     assert not pair.armed
@@ -126,13 +126,14 @@ def flies_and_lands(pair: Pair) -> None:
 
 
 def heavy() -> Pair:
-    """An earlier flight has identified the vehicle with a load that it does not carry any more."""
+    """The vehicle file has the hover thrust of an earlier flight with a load, which is gone now."""
     file = px4.hop().companion.model
     return px4.hop(believed=file.model_copy(update={"hover_thrust": 0.93}))
 
 
 def one_wrong_heartbeat(on: Vehicle, phase: Phase) -> Row:
-    """It shows it disarmed: it was left in the air, or in its own take-off."""
+    """One HEARTBEAT wrongly shows the vehicle disarmed. Regression: the vehicle was then left alone
+    in the air, or in its own take-off."""
     wrong = then(phase, 0.3, downlink(disarmed(most=1)))
 
     def told(pair: Pair) -> None:
@@ -146,7 +147,7 @@ def says_that_it_lands(pair: Pair) -> None:
 
 
 def taken(on: Vehicle, scenario: Any, says: str = "", **more: Any) -> Row:
-    """Another takes it, and is not overridden."""
+    """Return a flight in which a pilot or a failsafe takes the vehicle, and is not overridden."""
     says = f"the vehicle left (OFFBOARD|GUIDED) for{says}"
     return aborts(
         Phase.YIELDED, says, not_overridden, fly=on.lap, armed=True, scenario=scenario, **more
@@ -154,7 +155,7 @@ def taken(on: Vehicle, scenario: Any, says: str = "", **more: Any) -> Row:
 
 
 def not_overridden(pair: Pair) -> None:
-    """Nothing leaves after the report of the other mode, and ours was asked for once."""
+    """Nothing is sent after the report of the other mode, and our mode was requested once."""
     left_s = pair.watch.left_s(engage_mode(pair))
     assert len(pair.modes) == 1
     assert pair.landings == []
@@ -163,7 +164,7 @@ def not_overridden(pair: Pair) -> None:
 
 
 def of_another(on: Vehicle, scenario: Any, says: str) -> Row:
-    """A vehicle that another has."""
+    """Return a flight that is refused because another controller has the vehicle."""
     return refusal(says, nothing_sent, fly=on.lap, armed=True, scenario=scenario)
 
 
@@ -182,25 +183,25 @@ NO_GPS = scenario_of({"fault": "silent_message", "message": "GPS_RAW_INT"})
 WAITS = another_companion(setpoint_rate_hz=0, custom_mode=Phase.HEALTH.code)
 FLIES_ANOTHER = another_companion(system=2, setpoint_rate_hz=0)
 ROWS = {
-    # flights that end early. Before this row a real PX4 and a real ArduCopter were flown into the
-    # ground, at 45 degrees
+    # flights that end early. Before this row existed, a real PX4 and a real ArduCopter (in SITL)
+    # flew into the ground at 45 degrees
     "a load that full thrust does not carry": aborts(
         Phase.FAILED, r"the vehicle sinks at [1-3]\.[0-9] m/s with full thrust", landed,
         soon(Phase.TRACK, 3.0), fly=partial(copter.lap, HIGH), at=tracking(overload),
         failsafes=["full thrust"],
     ),
-    # by 5 %, of which half when it is identified and half in track (`limits.hover_thrust`: 0.9)
+    # hover needs 95 % of the thrust, where 90 % are allowed; half of the load is added in track
     "a load that leaves no thrust reserve": aborts(
         Phase.FAILED, r".*% of its thrust \(limits\.hover_thrust is 0\.9\)", landed,
         fly=overloaded_twice, failsafes=["thrust reserve"],
     ),
-    # "flown and landed" before, after 20 s on the ground
+    # the result was once "flown and landed", after 20 s on the ground
     "it has fallen to the ground": ends(
         r"the vehicle stands on the ground, [0-9.]+ m below the reference", landed,
         soon(Phase.TRACK, 4.0), fly=copter.hover, at=tracking(too_heavy), failsafes=["ground"],
         ended_by="ground contact",
     ),
-    # "flown and landed" before: by its estimate it was 3 m high
+    # the result was once "flown and landed", because the estimated height was 3 m
     "it has sunk to the ground, and its estimate has not": ends(
         r"the vehicle needs [0-9]+ % of its thrust instead of [0-9]+ %: it stands on", landed,
         fly=partial(copter.hover, "reference.duration_s=10.0"),
@@ -221,7 +222,7 @@ ROWS = {
         held_for("second sender"), fly=copter.lap, scenario=OTHER, error_m=0.3,
         ended_by="second sender",
     ),
-    # setpoints that are not on our link: the vehicle no longer follows ours
+    # the other setpoints are not on our link, but the vehicle does not follow ours any more
     "another companion that is not heard": ends(
         AWAY + NAMED, landed, fly=partial(copter.lap, HIGH), scenario=early("second_sender"),
         error_m=5.0,
@@ -235,7 +236,7 @@ ROWS = {
         "the estimated position jumped by 3.0 m", landed, held_for("estimator"), fly=px4.hover,
         scenario=scenario_of(jump(0.0, 3.0, 0.0)),
     ),
-    # PX4 does not intervene, and ArduCopter late: its estimate drifts away meanwhile
+    # the estimate drifts away; PX4 does not intervene, and ArduCopter does so late
     "GPS has no fix": ends(
         "GPS has no fix for 1.5 s", landed, soon(Phase.CLIMB, 9.0), fly=copter.lap,
         scenario=scenario_of(GPS_LOST), error_m=1.2, ended_by="positioning",
@@ -249,13 +250,13 @@ ROWS = {
         "stop requested by the operator", fly=copter.lap, scenario="in_failsafe",
         limits={"begin_in_failsafe": True}, at=then(Phase.CLIMB, 1.0, stop),
     ),
-    # whose it is
+    # who controls the vehicle
     "a pilot just after engaging": taken(px4, "pilot_refuses", ended_by="mode change"),
     "a pilot in track, who is back after 0.6 s, too late": taken(
         copter, early("pilot_comes_back"), ended_by="mode change"
     ),
     "a pilot whom CURRENT_MODE shows": taken(px4, early("lost_heartbeat")),
-    # the HEARTBEAT that shows a failsafe comes after CURRENT_MODE
+    # the HEARTBEAT that shows the failsafe arrives after CURRENT_MODE
     "a failsafe": taken(
         px4, early("empty_battery"), ".*; a failsafe of the vehicle has it", ended_by="failsafe"
     ),
@@ -268,7 +269,7 @@ ROWS = {
     "one wrong heartbeat in track": one_wrong_heartbeat(px4, Phase.TRACK),
     "one wrong heartbeat in the take-off": one_wrong_heartbeat(copter, Phase.TAKEOFF),
     "one wrong heartbeat in the landing": one_wrong_heartbeat(px4, Phase.LAND),
-    # as `offboard fly` does it: nothing known of the vehicle, identified in flight
+    # as by `offboard fly`: nothing is known of the vehicle, which is identified in flight
     "all disturbances together": flies(
         fly=px4.lap, aloft=False, scenario="all_together", seed=1, deadline_s=0.05,
         believed=simulated.vehicle("neutral"), learning=IdentifySettings(),
@@ -279,11 +280,11 @@ ROWS = {
     "no GPS from the beginning, by motion capture": flies(
         fly=px4.hover, firmware=WITH_GPS, scenario=NO_GPS, failsafes=()
     ),
-    # by mistake, on another port: it has our ids, and is refused, see below
+    # started by mistake on another port, with our ids; it is refused itself, as in other rows
     "a second flight that waits": flies(
         says_who_is_on_the_link, fly=copter.hover, scenario=WAITS, failsafes=()
     ),
-    # its HEARTBEAT, which a router forwards, was taken for a second controller of our vehicle
+    # regression: its HEARTBEAT, forwarded by a router, was taken for a second controller of ours
     "an offboard that flies another vehicle on the link": flies(
         says_nobody_is_on_the_link, fly=px4.hover, scenario=FLIES_ANOTHER, system_id=1,
         failsafes=(),
@@ -300,7 +301,8 @@ def test_flight(title: str) -> None:
 
 @pytest.mark.parametrize(("scenario", "on"), [("landed_wrong", px4), ("landed_lost", copter)])
 def test_in_the_air_it_never_falls(scenario: str, on: Vehicle) -> None:
-    """The land detector says ground: never less than a third of hover, never fast downwards."""
+    """The land detector wrongly reports the ground. Thrust stays above a third of hover thrust, and
+    the vehicle never sinks fast."""
     start = Start(height_m=5.0)  # instead of 10 m and 18 m
     low = simulated.scenario(scenario).model_copy(update={"start": start})
     pair = on.hop(HIGH, scenario=low)
@@ -312,7 +314,8 @@ def test_in_the_air_it_never_falls(scenario: str, on: Vehicle) -> None:
 
 
 def test_the_vehicle_does_not_step_with_its_estimate() -> None:
-    """A reset by 1.5 m in a hover: it moves to its place in the new frame at up to 0.5 m/s."""
+    """After a reset of the estimate by 1.5 m in a hover, the vehicle moves to the reference in the
+    new frame at up to 0.5 m/s."""
     pair = copter.hover("reference.duration_s=8.0", scenario=scenario_of(jump(0.0, 1.5, 0.0)))
     watch = flown(pair, failsafes=())
     assert said(pair, "the estimated position jumped by 1.50 m: the reference jumps with it")
@@ -329,8 +332,9 @@ IN_LANDING = jump(0.0, 0.0, -1.9, after="landing", at_s=0.5)
 
 @pytest.mark.parametrize("resets", [[IN_TRACK], [IN_TAKEOFF, IN_LANDING]])
 def test_resets_of_the_estimate_move_its_place_and_the_ground(resets: list[dict[str, Any]]) -> None:
-    """By 1.5 m before lift-off: it flew to the old place, 1.5 m away, at once. Later the estimated
-    height jumps up, and with it the ground: for the flight and for the score."""
+    """Regression: after a reset by 1.5 m before lift-off it flew at once to the old place, 1.5 m
+    away. Later the estimated height jumps up, and with it the height of the ground, for the flight
+    and for the score."""
     pair = px4.hop(scenario=scenario_of(*resets))
     watch = flown(pair, ended_by="reference over", top_m=2.2)
     assert max(math.hypot(*m.position_ned_m[:2]) for m in watch.moments) < 0.3
@@ -339,7 +343,8 @@ def test_resets_of_the_estimate_move_its_place_and_the_ground(resets: list[dict[
 
 @BOTH
 def test_while_another_address_sends_with_its_ids_a_vehicle_is_not_armed(on: Vehicle) -> None:
-    """The first one heard was flown, whichever was meant. It flies once the other has gone."""
+    """The first one heard was once flown, whichever was meant. Now it flies once the other has
+    gone."""
     pair, twin = on.hop(), on.hop(seed=8).instance
 
     def beside(time_s: float, datagrams: Bytes) -> Bytes:
@@ -369,9 +374,10 @@ def test_another_address_that_sends_with_its_ids_before_it_is_armed_ends_the_sta
 
 @BOTH
 def test_of_two_vehicles_with_the_same_ids_on_one_radio_none_is_armed(on: Vehicle) -> None:
-    """Both obey: the other one was flown too, by setpoints that were not made for it."""
+    """Both follow what is sent. Regression: the other one was flown, too, by setpoints that were
+    not made for it."""
     pair, twin = on.hop(), on.hop(seed=8).instance
-    for _ in range(int(5.0 / STEP_S)):  # it was switched on earlier
+    for _ in range(int(5.0 / STEP_S)):  # it booted earlier
         twin.step()
 
     def obeyed_by_both(_: float, frames: Bytes) -> Bytes:

@@ -1,7 +1,7 @@
 """Safety: old telemetry, slow decisions, pauses of the computer, clocks.
 
-A setpoint is never older than `limits.setpoint_age_s` beyond the delay of the link, and a control
-period, when it reaches the vehicle.
+When a setpoint reaches the vehicle, its telemetry is never older than the delay of the link plus
+`limits.setpoint_age_s` plus one control period.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ IN_TRACK = in_phase(Phase.TRACK, 2.0)
 
 
 def oldest_s(pair: Pair) -> float:
-    """The greatest age of a setpoint's telemetry when it reached the vehicle."""
+    """Return the greatest age of the telemetry of a setpoint when it reached the vehicle."""
     offset_s = 1e-6 * pair.instance.view.clock_offset_us
     return max(at_s + offset_s - 1e-3 * m.time_boot_ms for at_s, _, m in pair.setpoints)
 
@@ -70,7 +70,7 @@ def test_a_link_that_becomes_late_ends_in_hold_and_landing(scenario: str, on: Ve
     assert pair.failsafes == {"age": Action.LEVEL, "link": Action.HOLD}
     dialect = pair.companion.current.dialect
     assert dialect is not None
-    hold = (*dialect.hold().parameters, 0.0)[1:3]  # what is not given is sent as 0
+    hold = (*dialect.hold().parameters, 0.0)[1:3]  # a missing parameter is sent as 0
     assert hold in [(m.param2, m.param3) for m in pair.modes]
     assert pair.landings
     began, *after = watch.during(Phase.HOLD, Phase.LAND)
@@ -85,7 +85,8 @@ NO_POSITION, NOT_SHOWN = (
     "no new LOCAL_POSITION_NED for 0.[56] s",
     "disarmed, landing not confirmed: no LOCAL_POSITION_NED arrives to show it",
 )
-STUCK = {  # on which vehicle, which fields of which message (none: all), after what, what is said
+# vehicle, message, its fields that repeat (none: all), event and time of the fault, sentence
+STUCK = {
     "height": (px4, POSITION, ["z"], ("armed", 0.1), NO_POSITION),
     "height and its velocity": (copter, POSITION, ["z", "vz"], ("armed", 2.5), NO_POSITION),
     "position in the landing": (px4, POSITION, [], ("landing", 0.5), NOT_SHOWN),
@@ -95,8 +96,8 @@ STUCK = {  # on which vehicle, which fields of which message (none: all), after 
 
 @pytest.mark.parametrize("case", STUCK)
 def test_telemetry_that_repeats_itself_is_none(case: str) -> None:
-    """With new stamps and for good. Thrust is twice what the file says; the vehicle stays within
-    3 m of the height that was seen last, and is never disarmed in the air."""
+    """Values repeat with new stamps, until the end. Thrust is twice that of the vehicle file. The
+    vehicle climbs at most 3 m above the last correct height, and is never disarmed in the air."""
     on, message, fields, (after, at_s), says = STUCK[case]
     stuck = {"fault": "stuck_message", "message": message, "fields": fields}
     scenario = scenario_of(
@@ -121,7 +122,7 @@ def test_telemetry_that_repeats_itself_is_none(case: str) -> None:
 
 
 def slowly(function: Any, clock: HostClock, seconds: float, after: int = 0) -> Callable[..., Any]:
-    """The same function, which takes so long after so many calls."""
+    """Return the function with a duration of `seconds`, which begins after `after` calls."""
     numbers = count(1)
 
     def later(*given: Any) -> Any:
@@ -174,7 +175,7 @@ def test_a_law_that_needs_most_of_the_period_is_flown_and_a_slower_one_landed(
 def test_a_slow_prediction_is_no_failure_of_the_law(
     slow_s: float, says: str, cause: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The time is over before the law is asked, which then decides at once."""
+    """The time is exceeded before the law is called, which then decides at once."""
     clock = HostClock()
     predict = slowly(Observer.predict, clock, slow_s)
     pair = copter.lap(deadline_s=DEADLINE_S, clock=clock)
@@ -184,7 +185,7 @@ def test_a_slow_prediction_is_no_failure_of_the_law(
 
 
 def test_no_setpoint_waits_for_the_identification(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each of its pieces takes 60 ms, and the decision 2 ms."""
+    """Each piece of the identification takes 60 ms, and a decision 2 ms."""
     clock = HostClock()
     monkeypatch.setattr(Learner, "learn", slowly(Learner.learn, clock, 0.06))
     law = slow_law(clock, 0.002)
@@ -192,13 +193,13 @@ def test_no_setpoint_waits_for_the_identification(monkeypatch: pytest.MonkeyPatc
     pair.track()
     result = pair.score()
     assert result.answer_p50_ms == pytest.approx(2.0, abs=0.01)
-    assert result.answer_max_ms < 8.0  # with a step of the simulation
+    assert result.answer_max_ms < 8.0  # includes a step of the simulation
     assert result.missed_ticks == 0
 
 
 def test_at_lift_off_no_gain_is_computed_any_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On the ground a turn may take long. The vehicle's drag is one that no other test has, so that
-    nothing is known of it before."""
+    """On the ground a turn may take long. No other test uses this drag, so that no gain of this
+    vehicle has been computed before."""
     drag = {"drag_translation_npmps": (0.777, 0.777, 0.777)}
     believed = simulated.vehicle("px4_sih").model_copy(update=drag)
     pair = hover(learning=IdentifySettings(), believed=believed, down=late(0.03), up=late(0.03))
@@ -222,8 +223,8 @@ def paused(
     when: Callable[[Pair], bool] = IN_TRACK,
     **options: Any,
 ) -> tuple[Pair, Watch, float]:
-    """The process is stopped, two seconds into the track, where it accelerates little; the end of
-    the stop."""
+    """Fly, and pause the process two seconds into the track, where the acceleration is small.
+    Return the pair, the watch, and the time of the end of the pause."""
     pair = on.lap("reference.run_in_s=4.0", deadline_s=DEADLINE_S, **options)
     ends_s: list[float] = []
 
@@ -237,26 +238,26 @@ def paused(
 
 @pytest.mark.parametrize(("seconds", "on"), [(0.9, px4), (3.0, copter)])
 def test_after_a_pause_one_setpoint_leaves(seconds: float, on: Vehicle) -> None:
-    """From the newest telemetry; the pause is announced and counted. After 3 s the supervisor would
-    have taken over; this is without it."""
+    """The setpoint is decided from the newest telemetry. The pause is announced and counted. There
+    is no supervisor here; it would have taken over in the pause of 3 s."""
     pair, watch, end_s = paused(on, seconds)
     within = [at_s for at_s, _, _ in pair.setpoints if end_s - seconds < at_s < end_s + 0.05]
     assert len(within) <= 1
     assert oldest_s(pair) < 0.03
     assert said(pair, f"this computer paused for {seconds:.2f} s")
-    assert watch.error_m < 0.8 or seconds > 1.0  # the last attitude is kept meanwhile
+    assert watch.error_m < 0.8 or seconds > 1.0  # the vehicle keeps its last attitude meanwhile
     logged = pair.history()
     skipped = round(seconds / PERIOD_S) - 1
     assert score(logged).missed_ticks == skipped
     told = summary(replace(score(logged), at_bound_share=0.5), logged)
-    assert "at a limit" not in told  # whose cause is this computer
+    assert "at a limit" not in told  # because this computer is the cause
     for busy in (told["computer"], pair.companion.snapshot().computer):
         assert busy.startswith(f"this computer was too busy: {skipped} of ")
         assert busy.endswith(f" ticks were skipped, pauses up to {seconds:.2f} s")
 
 
 def test_what_happens_often_is_told_once_a_second_and_summed_up() -> None:
-    """Ten times within 1.3 s messages are dropped, and this process pauses three times."""
+    """Messages are dropped ten times within 1.3 s, and this process pauses three times."""
     pair = px4.hover("reference.duration_s=5", deadline_s=DEADLINE_S)
     for number in range(10):
         when = in_phase(Phase.TRACK, 2.0 + 0.13 * number)
@@ -282,13 +283,14 @@ def test_after_three_seconds_a_px4_in_its_failsafe_is_landed_without_a_setpoint(
 
 
 def test_setpoints_that_were_dropped_between_two_pauses_are_missing() -> None:
-    """0.5 and 0.55 s, 50 ms apart: PX4 holds by its own failsafe, and is landed from it."""
+    """After pauses of 0.5 and 0.55 s, 50 ms apart, PX4 holds by its own failsafe, and is landed
+    from there."""
     pair = px4.lap("reference.run_in_s=4.0", deadline_s=DEADLINE_S)
     pair.instance.autopilot.parameters.set("COM_OBL_RC_ACT", 5.0)
     turn, resumes_s = pair.companion.turn, [math.inf]
 
     def dropping(chunks: Sequence[Chunk], now_s: float) -> tuple[bytes, ...]:
-        """As the loop, where it was stopped between a turn and its sending."""
+        """Drop the frames of a turn, as the loop does after a pause between turn and sending."""
         frames = turn(chunks, now_s)
         if pair.time_s < resumes_s[0]:
             return frames
@@ -313,8 +315,8 @@ def test_setpoints_that_were_dropped_between_two_pauses_are_missing() -> None:
 
 
 def test_after_a_pause_a_report_of_the_mode_is_awaited() -> None:
-    """A PX4 with HEARTBEAT alone, at 1 Hz, to which no request of another one arrives: one that
-    arrived more than 0.6 s ago does not count."""
+    """A PX4 sends only HEARTBEAT, at 1 Hz, and receives no request for another one. A HEARTBEAT
+    from before the pause is too old: 0.6 s are allowed."""
     beats_s: list[float] = []
     rest = without(CURRENT_MODE)
 
@@ -338,7 +340,8 @@ def test_after_a_pause_a_report_of_the_mode_is_awaited() -> None:
 
 
 def test_after_a_pause_telemetry_of_a_stream_is_not_late() -> None:
-    """What has arrived meanwhile may have arrived at any time since the turn before."""
+    """Bytes of a stream that are read after a pause may have arrived at any time since the turn
+    before."""
     pair = px4.hover(at=[(in_phase(Phase.TRACK, 0.5), lambda pair: pair.pause(0.45))])
     session, turn, before_s = pair.companion.session, pair.companion.turn, 0.0
     session.settings = replace(session.settings, stream=True)
