@@ -1,9 +1,10 @@
-"""The gate, with the authority before it: flights of one tick, drawn by Hypothesis.
+"""The last check of a setpoint (`outbox.admit`) and the authority: flights of one tick, drawn by
+Hypothesis.
 
-Each is a history of reports, requests and pauses, then one setpoint. The oracle restates the rules
-as a pattern over the modes that were shown, and as numbers; it calls neither module.
+A flight is a history of reports, requests and pauses, followed by one setpoint. The oracle states
+the rules as a pattern over the reported modes, and as numbers; it calls neither module.
 
-OFFBOARD_GATE_TICKS=100000 draws that many instead of the default number.
+OFFBOARD_GATE_TICKS=100000 draws that many flights instead of the default number.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ TICKS = int(os.environ.get("OFFBOARD_GATE_TICKS", "400"))
 MANY = settings(
     max_examples=TICKS, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck)
 )
-FRESH_S = 2.5  # the longest age of a report of the mode
-BEFORE_PAUSE_ENDS_S = 0.6  # a report may have arrived so long before the end of a pause
+FRESH_S = 2.5  # greatest age of a report of the mode
+BEFORE_PAUSE_ENDS_S = 0.6  # longest time from the arrival of a report to the end of a pause
 VEHICLE = config.vehicle("px4_sih")
 LEAST_MPS2, MOST_MPS2 = VEHICLE.gravity_mps2 / 3.0, VEHICLE.gravity_mps2 / VEHICLE.hover_thrust
 FLOAT32_MAX = float(np.finfo(np.float32).max)
@@ -43,14 +44,14 @@ FLOAT32_MAX = float(np.finfo(np.float32).max)
 
 @dataclass(frozen=True)
 class Occurrence:
-    """One event of the history, `after_s` the one before it. Modes: E follows setpoints, H and L
-    hold and land, B and O are others."""
+    """One event of the history, `after_s` after the event before. In mode E the vehicle follows
+    setpoints, in H and L it holds and lands; B and O are other modes."""
 
     kind: str  # report, ask, request, pause, lose
     after_s: float = 0.1
     mode: str = ""
     failsafe: bool = False
-    waited_s: float = 0.0  # of a report, between its arrival and its processing
+    waited_s: float = 0.0  # time from the arrival of a report to its processing
 
 
 def occurrences(kinds: list[str], modes: str = "-") -> st.SearchStrategy[Occurrence]:
@@ -60,7 +61,7 @@ def occurrences(kinds: list[str], modes: str = "-") -> st.SearchStrategy[Occurre
     return st.builds(Occurrence, *drawn)
 
 
-# A flight as it should be, cut off anywhere, and anything at all inserted anywhere
+# A regular flight; it is cut at any place, and any event is inserted at any place
 FLIGHT = [
     Occurrence({"?": "ask", "+": "request"}.get(each[0], "report"), mode=each[-1])
     for each in ("B", "?", "E", "E", "+H", "H", "H", "+L", "L")
@@ -86,7 +87,7 @@ HISTORY = st.builds(
 
 
 def replayed(history: list[Occurrence], *, failsafes: bool = True) -> tuple[Authority, float]:
-    """The authority after the history, and the time of its end."""
+    """Return the authority after the history, and the time of its end."""
     authority, now_s = Authority("E"), 100.0
     for each in history:
         now_s += each.after_s
@@ -105,7 +106,8 @@ def replayed(history: list[Occurrence], *, failsafes: bool = True) -> tuple[Auth
 
 
 def since_asked(history: list[Occurrence]) -> str | None:
-    """The modes shown since we asked first, after the one in which we did; None if we never did."""
+    """Return the modes reported since our first request, after the mode in which it was made; None
+    without a request."""
     shown, asked, letters = "?", False, ""
     for each in history:
         if each.kind == "report":
@@ -117,7 +119,7 @@ def since_asked(history: list[Occurrence]) -> str | None:
 
 
 def may_set(history: list[Occurrence]) -> bool:
-    """Nothing but the mode in which we asked, then nothing but ours."""
+    """Whether only the mode in which we asked, and after it only ours was reported."""
     letters = since_asked(history)
     if any(each.kind == "lose" for each in history):
         return False
@@ -125,7 +127,7 @@ def may_set(history: list[Occurrence]) -> bool:
 
 
 def may_command(history: list[Occurrence]) -> bool:
-    """As for a setpoint, and in a mode that we asked for later than for the one before it."""
+    """Whether a setpoint is allowed, or each later mode was requested after the one before it."""
     if may_set(history):
         return True
     letters = since_asked(history)
@@ -150,7 +152,7 @@ def may_command(history: list[Occurrence]) -> bool:
 
 
 def is_fresh(history: list[Occurrence], late_s: float) -> bool:
-    """The newest report that counts is at most 2.5 s old, `late_s` after the end."""
+    """Whether, `late_s` after the end, the newest report that counts is at most 2.5 s old."""
     now_s, newest_s, arrived_s, counts_from_s = 100.0, -math.inf, -math.inf, -math.inf
     for each in history:
         now_s += each.after_s
@@ -189,7 +191,7 @@ SETPOINT = st.one_of(
 
 
 def is_usable(command: Command | PositionCommand) -> bool:
-    """Every number fits the wire, which is float32, and a direction has the length 1."""
+    """Whether every number fits into float32, as in messages, and a direction has the length 1."""
     numbers = np.hstack([getattr(command, name) for name in vars(type(command))["__match_args__"]])
     if not (np.abs(numbers.astype(float)) <= FLOAT32_MAX).all():
         return False
@@ -219,7 +221,8 @@ def judge(
     age_limit_s: float = 0.25,
     late_s: float = 0.0,
 ) -> Command | PositionCommand | None:
-    """One tick: refused (None) for a reason that the oracle knows, or sent within the limits."""
+    """Run one tick. Return the setpoint that is sent, within the limits; None if it is refused, for
+    a reason that the oracle expects."""
     authority, end_s = replayed(history)
     reasons = {
         Refusal.NOT_OURS: not (may_set(history) and is_fresh(history, later_s)),
@@ -252,7 +255,7 @@ def judge(
     assert tilt_of(sent) <= VEHICLE.tilt_max_rad + 1e-9
     if tilt_of(command) <= VEHICLE.tilt_max_rad - 1e-9:
         assert sent.thrust_direction_ned == command.thrust_direction_ned
-    else:  # turned back in its own vertical plane
+    else:  # the tilt is reduced within the vertical plane of the direction
         (north, east, _), (n, e, _) = command.thrust_direction_ned, sent.thrust_direction_ned
         assert north * e == pytest.approx(east * n, abs=1e-9)
         assert north * n + east * e >= 0.0
@@ -269,7 +272,7 @@ WAITED = [*PAUSED, Occurrence("report", mode="E", waited_s=0.8)]
 
 
 @MANY
-@example((WAITED, HOVER, 0.0, False, 0.0, 1.0, 0.0))  # it arrived before or within the pause
+@example((WAITED, HOVER, 0.0, False, 0.0, 1.0, 0.0))  # the report arrived before the pause ended
 @given(st.tuples(HISTORY, SETPOINT, LATER, st.booleans(), TIME, st.floats(0.1, 2.0), LATE))
 def test_flights_of_one_tick(tick: Any) -> None:
     judge(*tick)
@@ -294,9 +297,9 @@ def test_a_command_needs_authority(history: list[Occurrence], later_s: float) ->
         (HOVER, {"later_s": 2.51}, False),
         (Command(math.nan, LEVEL, 0.0), {}, False),
         (Command(9.8, (0.0, 0.0, 0.0), 0.0), {}, False),
-        (Command(9.8, LEVEL, 1e39), {}, False),  # encoding it would raise, after the gate
+        (Command(9.8, LEVEL, 1e39), {}, False),  # encoding it would raise after the check
         (PositionCommand((0.0, 1e39, 0.0), (0.0,) * 3, (0.0,) * 3, 0.0, 0.0), {}, False),
-        # the length of (5e-324, 5e-324) is rounded to 5e-324: two whole parts instead of one
+        # the length of (5e-324, 5e-324) is rounded to 5e-324, so that both components become 1
         (Command(9.8, (5e-324, 5e-324, -1.0), 0.0), {}, True),
     ],
 )
@@ -318,7 +321,7 @@ HELD = [Occurrence("report", mode="E"), Occurrence("ask"), *FLIGHT[4:6]]
 @pytest.mark.parametrize(
     ("shown", "standing", "commands"),
     [
-        ("O!", Standing.HANDED, False),  # a failsafe may interrupt; nothing meanwhile
+        ("O!", Standing.HANDED, False),  # a failsafe may interrupt; no command meanwhile
         ("O! H!", Standing.HANDED, True),
         ("O! H! O", Standing.LOST, False),
         ("E", Standing.LOST, False),
@@ -334,12 +337,12 @@ def test_a_failsafe_may_interrupt_a_mode_that_we_asked_for(
     assert authority.standing is standing
     assert authority.permits_command(now_s) is commands
     assert replayed([*HELD[:2], *reports])[0].standing is (
-        Standing.OURS if shown == "E" else Standing.LOST  # it follows us: any failsafe takes it
+        Standing.OURS if shown == "E" else Standing.LOST  # in mode E any failsafe takes the vehicle
     )
 
 
 def test_a_failsafe_that_was_shown_within_a_pause_permits_nothing() -> None:
-    """A pilot may have taken it since, in the same mode."""
+    """A pilot may have taken the vehicle since, in the same mode."""
     authority, _ = replayed(HELD[:2])
     authority.setpoint_loss = SetpointLoss(1.0, ("POSCTL",))
 
@@ -359,7 +362,7 @@ def test_a_failsafe_that_was_shown_within_a_pause_permits_nothing() -> None:
     authority.doubt(250.0, 1.3)
     reports = ((True, 249.8), (False, 250.3), (True, 250.8), (False, 251.3))
     assert [permits(*report) for report in reports] == [False, False, True, True]
-    authority.forget(207.5)  # it has restarted, and flies in this mode without a failsafe of ours
+    authority.forget(207.5)  # after a restart the same mode is not the failsafe of our flight
     authority.on_mode("POSCTL", 208.0, failsafe=True, heartbeat=False)
     assert authority.standing is Standing.LOST
 
@@ -368,5 +371,5 @@ def test_the_first_loss_is_the_one_that_is_told() -> None:
     authority, _ = replayed([*HELD[:2], Occurrence("report", mode="B")])
     authority.lose("the supervisor has it", 109.0, heartbeat=True)
     assert authority.lost_reason == "the vehicle left E for B"
-    assert authority.lost_s == -math.inf  # HEARTBEAT has shown it
+    assert authority.lost_s == -math.inf  # reported by a HEARTBEAT
     assert math.isinf(Authority("E").lost_s)

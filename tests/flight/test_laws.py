@@ -1,5 +1,5 @@
-"""Laws in whole flights: every one of the table, volumes that are kept clear of, every heading, and
-the ranking that was measured on a real PX4."""
+"""Control laws in whole flights: every law of the table, keep-out volumes, every heading, and the
+ranking of bandwidths that was measured on a real PX4."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from offboard.control.catalogue import names
 from offboard.control.keep_out import KeepOut, clearances
 from offboard.flight.phases import Phase
 
-# RMSE in m that is to be undercut in calm; the paper's law has a time constant of 39 s
+# greatest RMSE in m in the scenario `calm`; the paper's law has a time constant of 39 s
 MOST_M = dict.fromkeys(names(), 0.01) | {"paper": 2.5}
 SHORT = ("reference.laps=1", "reference.period_s=6", "reference.half_length_m=1",
          "reference.height_m=1")  # fmt: skip
 
 
 def flying(controller: str, tmp_path: Path, *assignments: str, **options: object) -> Pair:
-    """A pair that flies the shipped `controller`."""
+    """Return a pair that flies the shipped `controller`."""
     chosen = tmp_path / "chosen.yaml"
     chosen.write_text(f"vehicle: px4_sih\ncontroller: {controller}\nreference: lemniscate\n")
     return make(*assignments, name=str(chosen), **options)
@@ -35,8 +35,7 @@ def flying(controller: str, tmp_path: Path, *assignments: str, **options: object
 
 @pytest.mark.parametrize("law", sorted({*names()} - {"pso", "lqr", "autopilot"}))
 def test_flies_a_short_lemniscate(law: str, tmp_path: Path) -> None:
-    """`pso` on PX4 is flown by most other tests, `lqr` by test_link_figures, and `autopilot`
-    below."""
+    """Other laws: most tests fly `pso` on PX4, test_link_figures `lqr`, a test below `autopilot`."""
     pair = flying(law, tmp_path, *SHORT, aloft=True)
     pair.track()
     score = pair.score()
@@ -45,7 +44,8 @@ def test_flies_a_short_lemniscate(law: str, tmp_path: Path) -> None:
 
 
 def test_arducopter_flies_a_short_lemniscate_and_lands() -> None:
-    """1 cm needs that u_h T b_z / g with the predicted b_z is what its tilt boost undoes."""
+    """An RMSE of 1 cm needs that the thrust u_h T b_z / g, with the predicted b_z, cancels the
+    autopilot's thrust compensation for tilt (ATC_ANGLE_BOOST)."""
     pair = on_arducopter(*SHORT)
     watch = watched(pair)
     outcome = pair.fly()
@@ -58,8 +58,8 @@ def test_arducopter_flies_a_short_lemniscate_and_lands() -> None:
 
 
 def test_autopilot_gets_positions_while_tracking_and_attitudes_before(tmp_path: Path) -> None:
-    """And may tilt as its position loop needs, by 34 deg: none of the attitudes that were commanded
-    before the reference is near."""
+    """Its position loop may tilt by 34 deg, although no attitude that was commanded before the
+    reference is near that (row "tilt error" of the failsafe)."""
     fast = ("reference.half_length_m=6", "reference.period_s=7", "reference.laps=1")
     pair = flying("autopilot", tmp_path, *fast)
     outcome = pair.fly()
@@ -107,7 +107,7 @@ def nearest_m(volumes: list[dict[str, Any]], times: list[float], places: list[An
     ],
 )
 def test_volumes_are_kept_clear_of(volumes: list[dict[str, Any]], tmp_path: Path) -> None:
-    """Each one, by the true position from the climb to the landing; the reference crosses it."""
+    """The reference crosses each volume; the true position stays clear from climb to landing."""
     keep_out = f"controller.keep_out={json.dumps(volumes)}"
     pair = flying("horizon", tmp_path, "reference.laps=1", keep_out, aloft=True)
     plan = pair.companion.plan
@@ -137,13 +137,13 @@ TURNING = ("reference.course=along_velocity", "reference.laps=1", "reference.per
 
 
 def on_a_helix(climb_mps: float, height_m: float) -> Pair:
-    """One lap with the nose ahead: from east through south, west and north to east again."""
+    """Return one lap with the nose ahead: from east through south, west and north back to east."""
     climb = f"reference.climb_mps={climb_mps}"
     return make(*TURNING, climb, f"reference.height_m={height_m}", reference="helix", aloft=True)
 
 
 def test_turning_through_all_headings() -> None:
-    """Descending; and facing south, where the reported heading jumps across the wrap."""
+    """One flight descends; the other faces south, where the reported heading wraps."""
     south = make("reference.course_deg=180", "reference.laps=1", scenario="px4_like", aloft=True)
     for pair, rmse_m in ((on_a_helix(-0.4, 7.0), 0.01), (south, 0.05)):
         pair.track()
@@ -153,8 +153,8 @@ def test_turning_through_all_headings() -> None:
 
 
 def test_a_swapped_heading_is_scored() -> None:
-    """About the thrust axis, whose direction does not depend on it: a climb with targets of the
-    opposite heading on the wire."""
+    """The flight climbs, and the targets on the link have the opposite heading, by a rotation about
+    the thrust axis, which does not change its direction."""
 
     def edit(message: Any) -> None:
         q = Rotation.from_quat(np.roll(message.q, -1))
@@ -172,8 +172,8 @@ def test_a_swapped_heading_is_scored() -> None:
 
 @pytest.mark.slow
 def test_ranking_of_bandwidths() -> None:
-    """As measured on a real PX4 (1.16 SITL, SIH), in `px4_like`: one lap in 8 s, mean of two seeds
-    by the vehicle's estimate. White noise on the estimate would rank them the other way round."""
+    """The ranking is that of a real PX4 (1.16 SITL, SIH): one lap in 8 s in `px4_like`, mean of two
+    seeds, by the vehicle's estimate. White noise on the estimate would reverse the ranking."""
     lap = ("controller={law: lqr, feedback_limit: 0.6}", "reference.laps=1", "reference.height_m=1",
            "reference.run_in_s=2", "reference.run_out_s=1")  # fmt: skip
 

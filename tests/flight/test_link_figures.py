@@ -1,5 +1,5 @@
-"""Links that are late, lossy or repeat themselves, and vehicles whose clock is slow: what the score
-says of them, and how they are flown. The oracle is the parameter of the fault."""
+"""Links that delay, lose or repeat messages: which metrics of the score show this, and how well the
+vehicle is flown. The oracle is the parameter of the fault."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from offboard.flight.phases import Phase
 from offboard.identification.learner import IdentifySettings
 
 LAP = ("controller={law: lqr}", "reference.laps=1", "reference.height_m=1.0")
-PLAIN_DELAY_MS = 57.0  # of the vehicle itself
+PLAIN_DELAY_MS = 57.0  # delay of the vehicle itself
 SENT_HZ = 50.0
 
 
@@ -44,14 +44,14 @@ def test_delay_and_duplicates_are_measured(
     assert 0.0 < score.delay_sd_ms < 10.0
     assert score.link_delay_p50_ms == pytest.approx(later_ms, abs=5.0)
     assert score.rmse_position_m < rmse_m
-    assert score.setpoint_hz == pytest.approx(10.0, rel=0.1)  # none is sent twice
+    assert score.setpoint_hz == pytest.approx(10.0, rel=0.1)  # no setpoint is sent twice
     assert score.position_hz == pytest.approx(SENT_HZ, rel=0.02)
     assert score.position_gap_max_s == pytest.approx(1.0 / SENT_HZ, abs=0.007)
 
 
 def test_setpoints_are_sent_twice_where_some_are_lost() -> None:
-    """Each once more after half a period. Sent once, this lap has 0.20 m; of ten seeds nine have
-    0.035 to 0.049 m."""
+    """Each setpoint is sent again after half a period. The RMSE of this lap is 0.20 m if they are
+    sent once; with the repeats it is 0.035 to 0.049 m for nine of ten seeds."""
     pair = over(through)
     pair.up = losing(0.3, seed=5)
     pair.track()
@@ -66,7 +66,7 @@ def test_setpoints_are_sent_twice_where_some_are_lost() -> None:
 
 # -- a link that becomes later in flight: TIMESYNC and the age of telemetry show it ----------------
 
-CHANGED_S, BACK_S = 2.0, 8.0  # in track
+CHANGED_S, BACK_S = 2.0, 8.0  # times since the begin of TRACK
 CONFIGURED_RADPS = 7.0
 
 
@@ -74,10 +74,10 @@ CONFIGURED_RADPS = 7.0
     ("direction", "most_m"), [("down", 0.15), pytest.param("up", 0.2, marks=pytest.mark.slow)]
 )
 def test_late_link_is_noticed_and_flown(direction: str, most_m: float) -> None:
-    """It becomes late in flight, and prompt again. With its delay taken for that at take-off, 0.2 s
-    more take the vehicle 2.1 m off."""
+    """The link becomes late in flight, and later prompt again. If the delay were assumed to be that
+    at take-off, 0.2 s more would cause an error of 2.1 m."""
     pair = over(through, "reference.height_m=3.0", aloft=False, boot_scale=1.0)
-    limits: list[tuple[float, float]] = []  # of the bandwidth, and since when
+    limits: list[tuple[float, float]] = []  # begin, and limit of the bandwidth
 
     def note(flying: Pair) -> None:
         limit = flying.companion.controller.bandwidth.lateral_radps

@@ -1,5 +1,5 @@
-"""What shows a flight while it happens: clients of the live page, JSON lines, the terminal, and the
-snapshots that all of them show."""
+"""The displays of a flight while it happens: clients of the live page, JSON lines, the terminal,
+and the snapshots that all of them show."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def serving() -> Iterator[tuple[LiveProcess, str]]:
 
 
 def shown_by(show: Callable[[Pair], object], every: int = 1) -> Pair:
-    """A flight that is shown at every step, as the loop does at every turn, or at fewer."""
+    """Return a flight for which `show` is called at every step, or at every `every`-th one."""
     pair = hover()
     pair.every(every, show)
     return pair
@@ -52,19 +52,19 @@ def shown_by(show: Callable[[Pair], object], every: int = 1) -> Pair:
 
 
 def test_no_client_of_the_live_page_changes_a_setpoint() -> None:
-    """Nor does it take anything from another client, which sees the flight to its end."""
+    """Nor does a client affect another one, which sees the flight to its end."""
     with serving() as (process, url):
         address = (urlsplit(url).hostname, urlsplit(url).port)
         reading = urlopen(f"{url}/events", timeout=20)
         deaf = socket.create_connection(address)
-        deaf.sendall(EVENTS)  # and reads nothing
+        deaf.sendall(EVENTS)  # this client reads nothing
         flooding = socket.create_connection(address)
         flooding.setblocking(False)
 
         def show(flying: Pair) -> None:
             process.show(flying.companion)
             if flying.steps % 50 == 0:
-                with suppress(BlockingIOError, ConnectionError):  # it may be closed
+                with suppress(BlockingIOError, ConnectionError):  # the server may have closed it
                     flooding.send(FLOOD)
             if flying.steps % 500 == 0:
                 with socket.create_connection(address) as leaving:
@@ -89,11 +89,11 @@ def test_no_client_of_the_live_page_changes_a_setpoint() -> None:
 
 
 def test_what_nobody_reads_delays_nothing_and_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A server that stands still, and a pipe that is full."""
-    monkeypatch.setattr("offboard.live.process.PERIOD_S", 0.0)  # a thousand snapshots
+    """The server is stopped, and the pipe of the JSON lines is full."""
+    monkeypatch.setattr("offboard.live.process.PERIOD_S", 0.0)  # gives a thousand snapshots
     monkeypatch.setattr("offboard.live.display.CLOSE_S", 0.2)
     unread, full = os.pipe()
-    lines = JsonLines(lambda text: os.write(full, text.encode() * 400))  # more than it holds
+    lines = JsonLines(lambda text: os.write(full, text.encode() * 400))  # exceeds the pipe's buffer
     slowest_s = 0.0
     with serving() as (process, _):
         os.kill(process._process.pid, signal.SIGSTOP)
@@ -165,7 +165,7 @@ class Shown:
     lines: list[dict[str, Any]]
     terminal: str
     pipe: str
-    seen: list[tuple[float, Snapshot]]  # with the true height, every 0.1 s
+    seen: list[tuple[float, Snapshot]]  # true height and snapshot, every 0.1 s
     page: Opened
 
 
@@ -242,7 +242,7 @@ def test_the_terminal_has_its_lines_and_one_status_in_place(shown: Shown) -> Non
     for sentence in shown.pair.companion.announced:
         assert plain.count(f" s  {sentence}") == shown.pipe.count(f" s  {sentence}") == 1
     assert "\x1b" not in shown.pipe
-    assert "\x1b[2K" in shown.terminal  # a line erased to be written again
+    assert "\x1b[2K" in shown.terminal  # a line is erased before it is written again
     assert re.search(r"s  track  error 0\.0\d\d m  link age \d+ ms  OFFBOARD", plain)
     shows_cursor, hides_cursor = "\x1b[?25h", "\x1b[?25l"
     assert shown.terminal.rindex(shows_cursor) > shown.terminal.rindex(hides_cursor)

@@ -1,4 +1,5 @@
-"""What is found out before a flight, the rehearsal, the manifest, and the records in the log."""
+"""The rehearsal before a flight, the reading of parameters, the record of the configuration, and
+the queue of messages."""
 
 from __future__ import annotations
 
@@ -32,7 +33,7 @@ LEVEL = Command(9.8, (0.0, 0.0, 1.0), 0.0)
 
 
 def without_cost(_: Situation) -> Decision:
-    """A certificate that the log cannot hold."""
+    """Return a decision with a certificate that the log cannot hold."""
     return Decision(LEVEL, Certificate(cost=None))  # type: ignore[arg-type]
 
 
@@ -41,7 +42,7 @@ def with_an_array(_: Situation) -> Decision:
 
 
 def changing_its_input(situation: Situation) -> Decision:
-    """The error from the reference, computed in place."""
+    """Compute the error from the reference in place, which changes the state."""
     position_ned_m = situation.state.position_ned_m
     position_ned_m -= situation.reference.sample(situation.time_s).position_ned_m
     return Decision(LEVEL)
@@ -106,7 +107,7 @@ def test_a_law_that_fails_when_it_is_cut_short_is_found_before_the_flight(
 def test_a_law_that_other_programs_make_late_may_be_flown_later(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Wall time passes between two readings, and none of the processor's."""
+    """Wall time passes between two readings, but no processor time."""
     prepared = build(config.load("flight", known_vehicle="px4_sih"))
     monkeypatch.setattr(clock, "monotonic_s", map(float, itertools.count()).__next__)
     with pytest.raises(DocumentError, match="this computer is too busy: a decision") as late:
@@ -115,7 +116,7 @@ def test_a_law_that_other_programs_make_late_may_be_flown_later(
 
 
 def test_a_decision_must_be_ready_within_a_period(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever the deadline: a setpoint that is later is not sent."""
+    """This holds whatever the deadline is, because a later setpoint is not sent."""
     prepared = build(config.load("flight", assignments=["deadline_s=0.2"], known_vehicle="px4_sih"))
     for name in ("monotonic_s", "thread_s"):
         monkeypatch.setattr(clock, name, itertools.count(step=0.15).__next__)
@@ -137,7 +138,7 @@ def test_parameters_are_requested_until_they_are_answered() -> None:
 def test_what_a_horizon_calls_near_a_volume_was_loaded_at_the_rehearsal(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Or it might be compiled in flight, for seconds."""
+    """Otherwise it might be compiled in flight, which takes seconds."""
     volume = "{shape: sphere, north_m: 6, east_m: 0.5, height_m: 3, radius_m: 0.4}"
     chosen = {"controller": "horizon", "reference": "line"}
     parts = build(
@@ -160,7 +161,8 @@ def test_what_a_horizon_calls_near_a_volume_was_loaded_at_the_rehearsal(
 
 
 def test_the_manifest_is_read_back_or_is_none() -> None:
-    """As DEBUG_FLOAT_ARRAY, of any length; damaged, it is none."""
+    """The configuration in the log may have any length. If a piece is missing or damaged, None is
+    returned."""
     source = random.Random(1)
     for length in (0, 1, 124, 20_000):
         text = "".join(chr(source.randrange(32, 500)) for _ in range(length))
@@ -177,7 +179,7 @@ def test_the_manifest_is_read_back_or_is_none() -> None:
 
 
 def test_a_message_that_cannot_be_encoded_does_not_stop_the_later_ones() -> None:
-    """Here a command without a vehicle. The loop then asks for a landing."""
+    """The message is a command without a vehicle. After the error the loop requests a landing."""
     flight = hover().companion
     outbox.send(flight, CommandLong.arm())
     with pytest.raises(ValueError, match="no vehicle"):

@@ -147,7 +147,7 @@ def _identify(**values: Any) -> Setup:
     return lambda flight: vars(flight.identification).update(values)
 
 
-# what makes each condition hold
+# condition -> function that makes it hold
 EVENTS: dict[str, Setup] = {
     "vehicle_found": lambda flight: vars(flight.session).update(vehicle=VehicleFound(1, 1, "px4")),
     "usable": _fit,
@@ -214,7 +214,7 @@ EVENTS: dict[str, Setup] = {
 
 @pytest.fixture(autouse=True)
 def preflight_list(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The preflight list finds what `EVENTS` says."""
+    """Let the preflight list find what `EVENTS` sets."""
 
     def not_ready(ground: Any) -> str:
         return "" if vars(ground.session).get("ready") else "not yet"
@@ -235,7 +235,8 @@ def event_of(row: Transition) -> Setup:
 
 @BOTH
 def test_every_row_is_taken_when_its_condition_holds(service: ServiceOptions | None) -> None:
-    """In each of its phases: no row before it takes all of its cases. Its reason is complete."""
+    """This holds in each phase of the row, so that no row above takes all of its cases. The reason
+    must be complete."""
     for row in table(service):
         for phase in row.phases:
             flight = uneventful(phase, service)
@@ -276,9 +277,9 @@ def test_every_wait_is_limited() -> None:
         flight = uneventful(phase)
         later = _track_for(1e4) if phase in ON_TRACK else _since(1e4)
         if phase is Phase.CLIMB:
-            later = _climb_late  # after the way that was planned
+            later = _climb_late  # counts from the end of the planned climb
         if phase is Phase.CONNECT:
-            later = _set(heard_s=-1e4)  # only the wall clock runs before there is telemetry
+            later = _set(heard_s=-1e4)  # before telemetry, only the host's clock runs
         later(flight)
         assert next_row(flight) is not None
 
@@ -290,7 +291,8 @@ def test_the_service_waits_for_ever() -> None:
             flight = uneventful(phase, service)
             flight.began_s, flight.heard_s = -1e6, -2e6 if silent else 0.0
             assert next_row(flight) is None
-        heard = uneventful(Phase.HEALTH, service)  # and then nothing: it may be another vehicle
+        # a vehicle that is heard again after a silence may be another one
+        heard = uneventful(Phase.HEALTH, service)
         EVENTS["silent_for_another"](heard)
         row = next_row(heard)
         assert row is not None
@@ -305,8 +307,8 @@ def test_the_service_waits_for_ever() -> None:
 
 
 def test_every_phase_but_the_ends_has_rows_and_each_leads_to_a_later_one() -> None:
-    """Only the first holds in the service, which flies again; the only way to the phases that arm
-    is a request on the ground."""
+    """In the service only the first statement holds, because it flies again; and only a request on
+    the ground leads to the phases that arm."""
     order = {phase: index for index, phase in enumerate(Phase)}
     unended = {phase for phase in Phase if phase not in ENDS}
     assert {phase for row in table() for phase in row.phases} == unended - SERVICE_ONLY
@@ -319,7 +321,8 @@ def test_every_phase_but_the_ends_has_rows_and_each_leads_to_a_later_one() -> No
 
 
 def test_every_abnormal_end_has_an_exit_code() -> None:
-    """Its own, or that of each way into its phase. No flight in the air ends as refused."""
+    """The row has one itself, or each row that leads into its phase has one. No flight in the air
+    ends as refused."""
     rows = table()
     for row in rows:
         if row.target in (Phase.FAILED, Phase.YIELDED) and row.exit_code is None:
@@ -353,9 +356,9 @@ def test_reasons_against_an_engagement_are_apart() -> None:
 
 @BOTH
 def test_no_way_out_of_the_air_leaves_the_vehicle_unasked(service: ServiceOptions | None) -> None:
-    """Each row that ends a flight in the air is in a phase that asks for hold or land, or leads to
-    one; or the vehicle is disarmed, or not ours any more. From the moment when it is ours, it is
-    in such a phase."""
+    """Each row that ends a flight in the air belongs or leads to a phase that asks for hold or
+    land, unless the vehicle is disarmed or not ours any more. A flight that ends just after the
+    vehicle became ours in the air leads to such a phase, too."""
     left = exits(service)
     flown = {phase for row in table(service) for phase in row.phases} & (FLYING | {Phase.LAND})
     assert {phase for _, phase in left} == flown
@@ -371,8 +374,8 @@ def test_no_way_out_of_the_air_leaves_the_vehicle_unasked(service: ServiceOption
 
 
 def test_a_vehicle_that_does_not_climb_is_told_of_settings_that_it_has() -> None:
-    """The hint names hover_thrust if the flight shows another value, else the bandwidth; a law
-    without bandwidth gets no hint."""
+    """The hint names hover_thrust if the flight shows another value, else the bandwidth. There is
+    no hint for a law without bandwidth."""
     bandwidth = "; is the vehicle fast enough for controller.bandwidth_radps?"
     for law, shown, hint in (
         ("pso", 0.7, "; the flight shows a hover thrust of 0.70, it is flown with"),
@@ -388,7 +391,8 @@ def test_a_vehicle_that_does_not_climb_is_told_of_settings_that_it_has() -> None
 
 
 def test_a_vehicle_that_reboots_as_it_arms_counts_as_unheard_from_then_on() -> None:
-    """Not for ever: a landing that follows at once waits for its HEARTBEAT."""
+    """It counts from the reboot, not as never heard, so that a landing at once waits for its
+    HEARTBEAT."""
     flight = uneventful(Phase.ARM)
     flight.identification = None
     flight.session.link_time_s, flight.observer.reset = NOW_S, lambda: None  # type: ignore[misc]
@@ -398,7 +402,7 @@ def test_a_vehicle_that_reboots_as_it_arms_counts_as_unheard_from_then_on() -> N
 
 
 def test_only_a_heartbeat_newer_than_the_acceptance_shows_a_disarming() -> None:
-    """On a lossy link arming may be accepted late, and the next HEARTBEAT be lost."""
+    """On a lossy link the acceptance of arming may arrive late, and the next HEARTBEAT be lost."""
     flight = uneventful(Phase.ARM)
     flight.vehicle.now_s = NOW_S + 0.1
     hear(flight, CommandAck(400, "ACCEPTED"))

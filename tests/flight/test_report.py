@@ -39,7 +39,7 @@ ARDUCOPTER = RECORDINGS / "arducopter-4.6.3-guided.tlog"
 PX4 = RECORDINGS / "px4-1.16.1-offboard.tlog"
 FIGURES = ["path", "timeline", "tracking", "attitude", "thrust", "decisions", "link"]
 MOST_BYTES = 8_000_000
-STAMP = (1_700_000_000_000_000).to_bytes(8, "big")  # of an entry of a log
+STAMP = (1_700_000_000_000_000).to_bytes(8, "big")  # time of a log entry
 # [x, y] of a curve as the page draws it
 CURVE = """([figure, name]) => {
   const trace = document.getElementById(figure)._fullData.find((each) => each.name === name);
@@ -57,7 +57,7 @@ class Flown:
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
-    """A flight that a pilot ends."""
+    """A flight that a pilot ends in the phase HOVER."""
     pair = hover(at=[(in_phase(Phase.HOVER), Pair.pilot_takes_over)])
     pair.fly()
     directory = tmp_path_factory.mktemp("flights") / "a <b>"
@@ -67,7 +67,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
 
 @pytest.fixture(scope="module")
 def recorded() -> Flight:
-    """Of a real PX4."""
+    """A log of a real PX4."""
     return read(PX4)
 
 
@@ -80,7 +80,7 @@ def opened(flown: Flown) -> Iterator[Opened]:
 
 
 def test_the_page_is_readable_in_both_schemes_and_widths(opened: Opened) -> None:
-    """And begins with the verdict."""
+    """It begins with the verdict."""
     for width, scheme in ((400, "dark"), (1280, "light")):
         opened.resize(width)
         opened.switch(scheme)
@@ -119,7 +119,7 @@ def test_the_path_is_no_mirror_image(recorded: Flight) -> None:
     north, east, down = recorded.history.position["position_ned_m"][[0, -1]].T
     ends = [[axis[0], axis[-1]] for axis in (curve.x, curve.y, curve.z)]
     assert np.array(ends) == pytest.approx(np.array([east, north, -down]))
-    assert figures([recorded])["tracking"].caption == ""  # which has no reference
+    assert figures([recorded])["tracking"].caption == ""  # the recording has no reference
 
 
 def test_bands_are_the_phases_that_were_flown(flown: Flown) -> None:
@@ -134,7 +134,7 @@ def test_bands_are_the_phases_that_were_flown(flown: Flown) -> None:
 
 
 def of_phases(flight: Flight, *names: str) -> Flight:
-    """The flight as if these phases had begun, each 2 s after the one before."""
+    """Return the flight as if these phases had begun, each 2 s after the one before."""
     phases = tuple(
         Event(flight.begin_s + 2.0 * number, "offboard", name, name)
         for number, name in enumerate(names)
@@ -169,7 +169,7 @@ def test_the_track_ends_where_the_supervisor_takes_over(flown: Flown) -> None:
 
 
 def test_the_metrics_on_the_page_are_those_of_the_score(flown: Flown, recorded: Flight) -> None:
-    """Of several flights beside each other."""
+    """This also holds for several flights on one page."""
     shown = {name: values[0] for name, values in report_page.rows([flown.flight]).items()}
     finite = {name: v for name, v in flown.score.metrics().items() if math.isfinite(v)}
     assert shown == {name: f"{value:.4g}" for name, value in finite.items()}
@@ -179,7 +179,7 @@ def test_the_metrics_on_the_page_are_those_of_the_score(flown: Flown, recorded: 
 
 
 def of_kinds(log: Path, without: set[int]) -> bytes:
-    """The log without the messages of some kinds, byte by byte."""
+    """Return the bytes of a log without the messages with these ids."""
     return b"".join(
         entry.unix_us.to_bytes(8, "big") + bytes(entry.frame.raw)
         for entry in tlog.read(log)
@@ -216,7 +216,7 @@ def test_a_log_of_another_program_gives_what_it_holds(tmp_path: Path, recorded: 
 def test_a_flight_of_ours_is_not_shown_in_the_frame_of_another_message(
     tmp_path: Path, flown: Flown
 ) -> None:
-    """Its reference is in the frame of LOCAL_POSITION_NED; GLOBAL_POSITION_INT has another."""
+    """Its reference has the origin of LOCAL_POSITION_NED; GLOBAL_POSITION_INT has another one."""
     bare = tmp_path / "bare.tlog"
     codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     place = codec.global_position_int_encode(60_000, 470_000_000, 80_000_000, 0, 0, 0, 0, 0, 0)
@@ -234,9 +234,9 @@ def test_a_flight_of_ours_is_not_shown_in_the_frame_of_another_message(
 def test_a_home_position_is_the_origin_only_without_another(
     tmp_path: Path, origin: bool, moved: bool, north_m: float
 ) -> None:
-    """ArduCopter's HOME_POSITION has zeros for the local frame wherever home is. A thousandth of a
-    degree of latitude is 111.195 m on a sphere of 6371 km. An origin that a ground station moves in
-    flight counts from then on alone."""
+    """ArduCopter's HOME_POSITION has zeros as local position wherever home is. 0.001 degrees of
+    latitude are 111.195 m on a sphere of 6371 km. An origin that a ground station sets in flight is
+    ignored, because the positions before it are relative to the old one."""
     codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     ours = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
     home = 470_010_000, 80_000_000
@@ -246,7 +246,7 @@ def test_a_home_position_is_the_origin_only_without_another(
         codec.home_position_encode(*home, 500_000, 0.0, 0.0, 0.0, [1.0, 0.0, 0.0, 0.0], 0, 0, 0),
         codec.local_position_ned_encode(1000, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
         codec.sim_state_encode(1.0, *[0.0] * 14, 500.0, *[0.0] * 5, *home),
-        codec.sim_state_encode(1.0, *[0.0] * 14, 500.0, *[0.0] * 5, 0, 0),  # of MAVLink 1
+        codec.sim_state_encode(1.0, *[0.0] * 14, 500.0, *[0.0] * 5, 0, 0),  # as in MAVLink 1
     ]
     decided = ours.debug_float_array_encode(10**6, b"pso", RECORD_ID, [0.0] * 58)
     elsewhere = codec.gps_global_origin_encode(480_000_000, 80_000_000, 500_000)
@@ -328,7 +328,7 @@ def test_the_command_replaces_nothing_and_refuses_what_is_no_log(
     assert "<html" in (tmp_path / "report-2.html").read_text(encoding="utf-8")
     assert "exists already; choose another file" in invoke(log, "-o", log)[1]
 
-    def no_links(*_: object) -> None:  # as exFAT on macOS
+    def no_links(*_: object) -> None:  # as on exFAT with macOS
         raise OSError(errno.ENOTSUP, os.strerror(errno.ENOTSUP))
 
     monkeypatch.setattr(os, "link", no_links)

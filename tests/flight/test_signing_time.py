@@ -1,4 +1,4 @@
-"""Time stamps of signing on disk, and whole flights over a signed link."""
+"""The time stamp of signing that is kept on disk, and whole flights over a signed link."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_stamps_do_not_go_back_with_the_clock_or_after_a_crash(
     home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What is used in an hour is kept ahead of using it."""
+    """Stamps are reserved in the file before they are used, here during an hour per clock."""
     now_s, newest = clock.monotonic_s(), 0
     monkeypatch.setattr(clock, "monotonic_s", lambda: now_s)
     for unix_s in (1_800_000_000, 1_800_000_010, 1_700_000_000, 0, 1_900_000_000):
@@ -59,7 +59,7 @@ def test_keys_have_files_of_their_own_that_do_not_show_them(
     names = [file.name for file in home.iterdir()]
     assert len(names) == 2
     assert not any(KEY.hex()[:8] in name for name in names)
-    monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/a:/var/lib/b")  # of a service
+    monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/a:/var/lib/b")  # set by systemd for a service
     assert state_directory() == Path("/var/lib/a")
 
 
@@ -82,14 +82,14 @@ def test_a_damaged_file_and_a_directory_that_cannot_be_written_are_refused(home:
 
 
 def signed_hover(**options: Any) -> Pair:
-    """`hover` over a signed link."""
+    """Return `hover` over a signed link."""
     pair = hover(key=KEY, **options)
     pair.instance.keyring.set_up(KEY, 1)
     return pair
 
 
 def test_forged_frames_in_flight_change_nothing_and_are_counted(tmp_path: Path) -> None:
-    """An attacker sends, unsigned or replayed, that the pilot has switched or the vehicle moved."""
+    """An attacker sends an unsigned HEARTBEAT in another mode, and replays earlier frames."""
     stop = Session(SessionSettings()).encode(Heartbeat(2))
     chance = random.Random(3)
     captured: list[bytes] = []
@@ -108,7 +108,7 @@ def test_forged_frames_in_flight_change_nothing_and_are_counted(tmp_path: Path) 
     assert any("frames refused by signing" in line for line in attacked.companion.announced)
     assert not attacked.failsafes
     log = attacked.log(tmp_path)
-    for component, least in ((191, 300), (1, 1000)):  # ours, the vehicle's
+    for component, least in ((191, 300), (1, 1000)):  # frames of ours and of the vehicle
         frames = [each.frame for each in log if each.component_id == component]
         assert sum(frame.signed for frame in frames) > least
     scored = score(history.gather(log))

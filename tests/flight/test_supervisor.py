@@ -1,7 +1,7 @@
 """The supervisor on a real link to a vehicle that only listens: when it acts, and when not.
 
-What it asks for is in test_recovery.py; a flight that it saves in
-tests/process/test_ended_flights.py; what the loop makes of it in test_edges.py.
+test_recovery.py tests what it asks for, tests/process/test_ended_flights.py a flight that it lands,
+and test_edges.py how the loop uses it.
 """
 
 from __future__ import annotations
@@ -82,12 +82,12 @@ class Rig:
         self.supervisor = Supervisor(self.signing)
 
     def beat(self, guard: Supervised) -> None:
-        """The vehicle has just reported its mode."""
+        """Send a beat of the controller. The vehicle has just reported its mode."""
         known = replace(guard, reported_s=clock.monotonic_s())
         self.supervisor.beat(known, self.peer, self.link, self.log.descriptor)
 
     def abandon(self) -> None:
-        """End as a controller that is killed: the kernel closes its descriptors."""
+        """End as a killed controller does, whose descriptors the kernel closes."""
         self.supervisor._channel.close()
         self.link.close()
 
@@ -95,19 +95,19 @@ class Rig:
         self.supervisor.process.wait(LONG_S)
 
     def next_message(self, kind: str = "COMMAND_LONG") -> Any:
-        """The next message of this kind that the vehicle receives."""
+        """Return the next message of this kind that the vehicle receives."""
         while True:
             for message in self.codec.parse_buffer(self.vehicle.recv(65536)) or []:
                 if message.get_type() == kind:
                     return message
 
     def report(self, mode: int, *, armed: bool = True, status: int = 4, codec: Any = None) -> None:
-        """The vehicle reports its mode, as custom mode of PX4, and its MAV_STATE."""
+        """Let the vehicle report its mode (`custom_mode` of PX4) and its MAV_STATE."""
         message = mavlink.MAVLink_heartbeat_message(2, 12, 129 if armed else 1, mode, status, 3)
         self.vehicle.send(message.pack(codec or self.codec))
 
     def disarm(self) -> None:
-        """The vehicle reports that it is down, which ends the supervisor."""
+        """Let the vehicle report that it is disarmed, which ends the supervisor."""
         self.report(LANDING, armed=False)
 
 
@@ -127,7 +127,7 @@ def rig(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Rig]:
 
 @over("tcpin")
 def test_it_asks_the_vehicle_that_connected_last(rig: Rig) -> None:
-    """A connection has ended, and one begins after the controller has."""
+    """One connection has ended, and another one begins after the controller has ended."""
     rig.beat(OURS)
     rig.vehicle.close()
     while len(rig.link.descriptors()) > 1:
@@ -142,7 +142,7 @@ def test_it_asks_the_vehicle_that_connected_last(rig: Rig) -> None:
 
 @over("udpin")
 def test_it_asks_a_vehicle_that_sends_from_a_new_port(rig: Rig) -> None:
-    """A router restarts as the controller dies."""
+    """A router restarts when the controller is killed."""
     rig.beat(OURS)
     rig.vehicle.close()
     rig.abandon()
@@ -176,7 +176,7 @@ def test_it_signs_with_stamps_that_follow_ours(rig: Rig) -> None:
     assert command.get_signed()
     forged = mavlink.MAVLink(None, srcSystem=7, srcComponent=1)
     rig.report(LANDING, armed=False, codec=forged)
-    assert rig.next_message().command == 176  # it does not believe that
+    assert rig.next_message().command == 176  # it ignores the unsigned report
     rig.disarm()
     rig.await_end()
     assert all(each.frame.signed for each in tlog.read(rig.log.path) if each.name != "TUNNEL")
@@ -199,7 +199,7 @@ def test_it_takes_over_when_the_beats_stop_and_says_so_first(rig: Rig) -> None:
 
 
 def test_a_controller_that_hangs_and_is_then_killed_is_scored(rig: Rig) -> None:
-    """As by the watchdog of a service manager."""
+    """The watchdog of a service manager does this."""
     for entry in tlog.read(RECORDING):
         rig.log.write(entry.unix_us, entry.frame.raw)
     rig.beat(OURS)
@@ -211,7 +211,7 @@ def test_a_controller_that_hangs_and_is_then_killed_is_scored(rig: Rig) -> None:
 
 
 def beat_until(rig: Rig, guards: bool, guard: Supervised) -> float:
-    """Beat until it guards, or does not; how long that took."""
+    """Send beats until `Supervisor.guards` has this value. Return how long that took, in s."""
     began_s = clock.monotonic_s()
     while rig.supervisor.guards is not guards:
         assert clock.monotonic_s() < began_s + LONG_S
@@ -222,8 +222,9 @@ def beat_until(rig: Rig, guards: bool, guard: Supervised) -> float:
 
 
 def test_one_that_is_stopped_does_not_guard_until_it_continues(rig: Rig) -> None:
-    """Within two seconds, on the ground and in flight. A pause of its own is no silence of the
-    controller: it does not take over as it continues, but once the beats stop."""
+    """This shows within two seconds, on the ground and in flight. The supervisor does not take its
+    own pause for a silence of the controller: it takes over not when it continues, but when beats
+    stop."""
     for guard in (ON_GROUND, OURS):
         beat_until(rig, True, guard)
         os.kill(rig.supervisor.process.pid, signal.SIGSTOP)
@@ -242,8 +243,8 @@ def test_one_that_is_stopped_does_not_guard_until_it_continues(rig: Rig) -> None
 
 
 def test_stopped_while_the_controller_ends_it_knows_the_failsafe_of_the_vehicle(rig: Rig) -> None:
-    """Beats have the time at which they were sent. By the time at which they are read the failsafe
-    came too early, and seemed to be a pilot's choice."""
+    """Beats contain the time at which they were sent. Regression: counted from the time of reading,
+    the failsafe seemed too early and so to be a pilot's choice."""
     rig.beat(replace(OURS, setpoint_loss=SetpointLoss(1.0, ("AUTO.LOITER",))))
     os.kill(rig.supervisor.process.pid, signal.SIGSTOP)
     rig.abandon()
@@ -259,8 +260,8 @@ def test_stopped_while_the_controller_ends_it_knows_the_failsafe_of_the_vehicle(
 
 @over("udpin", "udpout")
 def test_the_report_of_the_mode_may_be_old_and_is_awaited_then(rig: Rig) -> None:
-    """As after a pause of the controller, or in an outage: nothing is asked of a vehicle of which
-    no report is fresh, and hold as soon as it shows our mode."""
+    """This happens after a pause of the controller, or in an outage. Without a fresh report nothing
+    is requested; hold is requested as soon as the vehicle shows our mode."""
     old = replace(OURS, reported_s=clock.monotonic_s() - 3.0)
     rig.supervisor.beat(old, rig.peer, rig.link, rig.log.descriptor)
     rig.abandon()
@@ -277,7 +278,8 @@ def test_the_report_of_the_mode_may_be_old_and_is_awaited_then(rig: Rig) -> None
 def test_a_vehicle_that_is_not_ours_or_on_the_ground_is_left_alone(
     guard: Supervised, rig: Rig
 ) -> None:
-    """By the newest beat; or by the newest report, which has waited behind more than a batch."""
+    """This is known from the newest beat; or from the newest report, which is read last, after more
+    than one batch of datagrams."""
     rig.beat(OURS)
     rig.beat(guard)
     for mode in [OFFBOARD] * (BATCH_MAX + 50) + [POSCTL] if guard is OURS else []:
@@ -319,7 +321,7 @@ def test_it_ends_in_silence_with_a_controller_that_ends_before_it_has_started() 
 
 
 def test_a_supervisor_that_cannot_be_started_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As with too many processes; nothing is left open."""
+    """For example if there are too many processes. No descriptor is left open."""
     monkeypatch.setattr(sys, "executable", "/no/such/python")
     supervisor = Supervisor()
     before = os.listdir("/proc/self/fd")

@@ -1,9 +1,9 @@
-"""A pilot takes the vehicle, at random moments of whole flights, on both firmwares.
+"""A pilot takes the vehicle at random moments of whole flights, on both firmwares.
 
-From the arrival of the first report of a mode that is not ours nothing may leave that moves the
-vehicle. `Judge` reads that from the bytes that cross the link.
+Once the first report of a mode that is not ours has arrived, nothing that moves the vehicle may be
+sent. `Judge` checks this on the bytes on the link.
 
-OFFBOARD_TAKEOVERS=200 flies 200 instead of the default number.
+OFFBOARD_TAKEOVERS=200 flies 200 flights instead of the default number.
 """
 
 from __future__ import annotations
@@ -22,30 +22,30 @@ from offboard.flight.phases import ENDS, ExitCode, Phase
 from offboard.link.interface import Chunk
 
 SET_MODE, ARM, LAND = 176, 400, 21  # MAV_CMD
-QUICK = 4  # in every run; the others by `-m slow`
+QUICK = 4  # flights of every run; the others need `-m slow`
 FLIGHTS = int(os.environ.get("OFFBOARD_TAKEOVERS", "16"))
 MOVING = {11, 75, 76, 82, 84, 86}  # SET_MODE, COMMAND_INT, COMMAND_LONG and all setpoints
-LINGER_S = 2.5  # the companion is kept alive after the end of its flight
+LINGER_S = 2.5  # time for which turns go on after the end of the flight
 
-# The modes that a flight asks for, as both autopilots document their numbers on the wire
+# `custom_mode` of the modes that a flight requests, from the documentation of both autopilots
 OURS = {"px4": {6 << 16, 4 << 16 | 3 << 24, 4 << 16 | 6 << 24}, "ardupilot": {4, 17, 9}}
-CHOSEN = {  # what the pilot takes
+CHOSEN = {  # modes that the pilot selects
     "px4": ("POSCTL", "AUTO.LOITER", "AUTO.LAND", "AUTO.RTL", "STABILIZED"),
     "ardupilot": ("LOITER", "BRAKE", "LAND", "RTL", "ALT_HOLD"),
 }
 
 
 class Judge:
-    """Reads both directions of a pair's link. `gone_s` is when a report of a mode arrived that no
-    flight asks for, after ours was asked for; `wrong` what left after it. Hold and land may be ours
-    or the pilot's: `test_gate.py`."""
+    """Reads both directions of a pair's link. `gone_s` is the time at which, after our request for
+    the mode, a report of a mode arrived that no flight requests; `wrong` are the messages sent
+    after that. Hold and land may be ours or the pilot's; `test_gate.py` tests these."""
 
     def __init__(self, pair: Pair, on: Vehicle) -> None:
         self.gone_s: float | None = None
         self.wrong: list[str] = []
-        self.asked_s: dict[int, float] = {}  # when each command left first
+        self.asked_s: dict[int, float] = {}  # when each command was first sent
         self._pair, self._turn, self._ours = pair, pair.companion.turn, OURS[on.name]
-        self._before: int | None = None  # the mode in which ours was asked for, until it is left
+        self._before: int | None = None  # the mode before our request, until it is left
         pair.companion.turn = self.turn  # type: ignore[method-assign]
 
     def turn(self, chunks: list[Chunk], now_s: float) -> tuple[bytes, ...]:
@@ -71,7 +71,7 @@ class Judge:
 
 
 def asked(judge: Judge, command: int, after_s: float) -> Callable[[Pair], bool]:
-    """So long after this command left first."""
+    """Return the condition that `after_s` have passed since this command was first sent."""
     return lambda pair: pair.time_s >= judge.asked_s.get(command, 1e9) + after_s
 
 
@@ -80,8 +80,8 @@ def asked(judge: Judge, command: int, after_s: float) -> Callable[[Pair], bool]:
     [*range(QUICK), *(pytest.param(n, marks=pytest.mark.slow) for n in range(QUICK, FLIGHTS))],
 )
 def test_nothing_leaves_after_a_take_over(seed: int) -> None:
-    """After a request of ours or in a phase the pilot chooses a mode, or disarms, and may change
-    his mind; some links lose one datagram in twenty."""
+    """After a request of ours, or in a phase, the pilot selects a mode or disarms, and perhaps
+    switches back. Some links lose one datagram in twenty."""
     chance, on = random.Random(seed), (px4, copter)[seed % 2]
     pair = on.hop(seed=seed)
     judge = Judge(pair, on)
@@ -123,7 +123,7 @@ def test_nothing_leaves_after_a_take_over(seed: int) -> None:
 
 
 def test_a_hold_that_was_asked_for_on_the_ground_is_asked_for_again_in_flight() -> None:
-    """PX4 in OFFBOARD since its last landing; in flight another program sends setpoints."""
+    """PX4 is in OFFBOARD since its last landing. In flight another program sends setpoints."""
     pair = px4.hop()
     setpoint = level_setpoint(0.5, 1, 195)
     tracking, switch = in_phase(Phase.TRACK, 1.0), pair.instance.autopilot.commander.switch
@@ -137,7 +137,7 @@ def test_a_hold_that_was_asked_for_on_the_ground_is_asked_for_again_in_flight() 
 
 
 def test_a_pilot_who_switches_back_between_two_heartbeats_is_not_asked_again() -> None:
-    """A PX4 without CURRENT_MODE: neither OFFBOARD nor the way back may be shown."""
+    """PX4 sends no CURRENT_MODE, so that neither OFFBOARD nor the switch back may be reported."""
     pair = px4.hop(down=without(CURRENT_MODE))
     commander, judge = pair.instance.autopilot.commander, Judge(pair, px4)
     before = commander.mode.name

@@ -1,5 +1,5 @@
-"""The score of a flight: what the default flight must achieve, the verdict (completed only if all
-was tracked, landed and disarmed; else why not), and what neither may depend on."""
+"""The score of a flight: what the default flight must achieve; the verdict (completed only if the
+whole reference was tracked, landed and disarmed; else why not); what must not influence either."""
 
 from __future__ import annotations
 
@@ -45,7 +45,8 @@ def flown() -> History:
 
 
 def default_flight(scenario: str) -> Pair:
-    """Of a vehicle of which nothing is known: it is identified in flight."""
+    """Return a finished default flight. Nothing is known of the vehicle before its identification
+    in flight."""
     neutral = simulated.vehicle("neutral")
     pair = make(scenario=scenario, believed=neutral, learning=IdentifySettings(), deadline_s=0.05,
                 firmware=PX4)  # fmt: skip
@@ -60,7 +61,7 @@ def px4_like() -> Pair:
 
 
 def achieves(pair: Pair, most_m: float) -> None:
-    """What a flight must achieve, in numbers."""
+    """Check what a flight must achieve."""
     scored = pair.score()
     assert scored.rmse_position_m <= most_m
     assert scored.tracked_s == pytest.approx(16.0, abs=0.3)
@@ -91,12 +92,12 @@ def test_default_flight(px4_like: Pair) -> None:
     ],
 )
 def test_default_flight_in_other_scenarios(scenario: str, most_m: float) -> None:
-    """One profile for all rows."""
+    """All scenarios are flown with the same configuration."""
     achieves(default_flight(scenario), most_m)
 
 
 def test_decisions_at_the_tilt_limit_are_counted_and_reported() -> None:
-    """The wind of `wind_light` needs more than 45 degrees of tilt, to which the gate turns back."""
+    """The wind of `wind_light` needs more than 45 degrees of tilt; setpoints are limited to 45."""
     pair = make("reference.laps=1", reference="lemniscate", vehicle="neutral",
                 scenario="wind_light", seed=2, aloft=True)  # fmt: skip
     pair.track()
@@ -141,8 +142,8 @@ def test_a_flight_is_not_completed_that_is_not_tracked_landed_and_disarmed(flown
 
 
 def test_a_flight_that_was_at_the_ground_in_between_is_not_completed() -> None:
-    """Without thrust for 0.9 s it falls 3 m, bounces, and flies on: no row of the failsafe acts in
-    so short a time, and it was "flown and landed"."""
+    """Without thrust for 0.9 s the vehicle falls 3 m, bounces, and flies on. The time is too short
+    for any row of the failsafe, and the outcome is "flown and landed"."""
     fault = {"fault": "motors_cut", "after": "engaged", "at_s": 10.0, "for_s": 0.9}
     pair = hover("reference.height_m=3", "reference.duration_s=8", scenario=scenario_of(fault))
     assert pair.fly() == Outcome(0, "flown and landed")
@@ -152,8 +153,8 @@ def test_a_flight_that_was_at_the_ground_in_between_is_not_completed() -> None:
 
 
 def test_a_restart_before_the_flight_is_none_of_it() -> None:
-    """What it had reported before, in the air, has stamps that come again in the flight: both were
-    mixed, and by its score a flight was 3.3 m above the take-off point in the end."""
+    """The stamps of its reports before the restart, in the air, occur again in the flight.
+    Regression: both were mixed, and by the score a flight ended 3.3 m above the take-off point."""
     restarts = {"fault": "reboot", "after": "boot", "at_s": 1.0}
     scenario = scenario_of(restarts, conditions={"clock_start_s": 12.0})
     pair = hover(scenario=scenario, aloft=True)
@@ -175,7 +176,7 @@ def test_a_log_with_parts_missing_is_scored_as_far_as_it_goes(flown: History) ->
 
 
 def test_a_reference_that_stands_still_explains_no_motion(flown: History) -> None:
-    """Before, rounding in its derivatives explained some, depending on its position."""
+    """Regression: rounding in its derivatives explained some motion, depending on its position."""
     moved = flown.reference.copy()
     moved["position_ned_m"] += 1 / 3
     told = [score(each).tilt_agitation_deg for each in (flown, replace(flown, reference=moved))]
@@ -183,9 +184,10 @@ def test_a_reference_that_stands_still_explains_no_motion(flown: History) -> Non
 
 
 def test_others_on_the_link_and_impossible_values_have_no_effect(flown: History) -> None:
-    """Another autopilot, heard first, its companion with our component id, a ground station with
-    the vehicle's ids, and a camera of the same system: none of them is what `--system 1` flies. Nor
-    do frames of the vehicle with a right checksum and impossible values, each before a true one."""
+    """With `--system 1` these senders are ignored: another autopilot, heard first; its companion
+    with our component id; a ground station with the vehicle's ids; a camera of the same system. So
+    are frames of the vehicle with a correct checksum and impossible values, each before a true one.
+    """
     text = mavlink.MAVLink_statustext_message(4, b"offboard: land: the battery holds 9 %")
     place = mavlink.MAVLink_local_position_ned_message(10, 9, 9, -9, 9, 9, 9)
     others = [
@@ -227,8 +229,8 @@ def test_others_on_the_link_and_impossible_values_have_no_effect(flown: History)
 
 
 def test_a_requirement_on_a_cut_log_is_missed(tmp_path: Path) -> None:
-    """In the middle of the track, as after a crash of the machine; without a requirement it is
-    scored."""
+    """The log ends in the middle of the track, as after a crash of the computer. Without a
+    requirement it is scored."""
     frames = calm_hover().logged
     track = next(n for n, frame in enumerate(frames) if b"offboard: track" in frame)
     with FlightLog(tmp_path / "cut", "") as log:
@@ -245,12 +247,13 @@ def test_a_requirement_on_a_cut_log_is_missed(tmp_path: Path) -> None:
 def touchdown(
     fall_m: float = 0.0, rests_s: float = 2.0, noise_mps: float = 1e-4, before_mps: float = 0.7
 ) -> Touchdown:
-    """From 3 m at 0.7 m/s, faster above, a fall from `fall_m`, then the ground; 50 Hz."""
+    """Return a landing that was reported at 50 Hz: from 3 m at 0.7 m/s (`before_mps` above that), a
+    fall from `fall_m` on, and `rests_s` on the ground."""
     landing, rng = Touchdown((0.0, 0.0, 0.0)), np.random.default_rng(5)
     landing.on_position(-0.02, (0.0, 0.0, -3.1), before_mps)
     time_s, height, down_mps, end_s = 0.0, 3.0, 0.7, math.inf
     while time_s < end_s:
-        noise = rng.normal(0.0, noise_mps)  # no estimator repeats itself
+        noise = rng.normal(0.0, noise_mps)  # an estimator never reports the same value twice
         landing.on_position(time_s, (0.0, 0.0, -height), down_mps + noise)
         time_s += 0.02
         if height > 0.0:
@@ -262,7 +265,7 @@ def touchdown(
 
 
 def reporting(height_m: float, down_mps: float, changing_mps: float) -> Touchdown:
-    """Two seconds of reports of the same place."""
+    """Return a landing with two seconds of reports of the same place."""
     landing = Touchdown((0.0, 0.0, 0.0))
     for tick in range(100):
         landing.on_position(
@@ -272,7 +275,7 @@ def reporting(height_m: float, down_mps: float, changing_mps: float) -> Touchdow
 
 
 def test_landings_and_falls() -> None:
-    """Speeds by sqrt(v^2 + 2 g h)."""
+    """The expected speed is sqrt(v^2 + 2 g h)."""
     soft, hard = touchdown(noise_mps=0.15), touchdown(2.8)
     assert soft.speed_mps == pytest.approx(0.7, abs=0.5)
     assert hard.speed_mps == pytest.approx(math.sqrt(0.7**2 + 2 * 9.81 * 2.8), rel=0.05)
@@ -289,7 +292,7 @@ def test_landings_and_falls() -> None:
 
 
 def test_the_outcome_follows_the_log(flown: History) -> None:
-    """`fly`, `compare` and the fixture: an exit code of 0 needs a completed flight."""
+    """For `fly`, `compare` and the fixture, exit code 0 needs a completed flight."""
     landed, refused = Outcome(0, "flown and landed"), Outcome(3, "not ready")
     completed, fallen = score(flown), Score(completed=0.0, ended_by="fell at up to 5.1 m/s")
     assert judged(landed, completed) == landed
@@ -301,7 +304,7 @@ def test_the_outcome_follows_the_log(flown: History) -> None:
 
 
 def test_a_record_says_what_was_sent(px4_like: Pair) -> None:
-    """Identification steps change the command after the decision: no certificate then."""
+    """Identification steps change the command after the decision, which then has no certificate."""
     flown = px4_like.history()
     excited = flown.records["phase"] == Phase.EXCITE.code
     certified = np.isfinite(flown.records["gap"])
@@ -309,7 +312,7 @@ def test_a_record_says_what_was_sent(px4_like: Pair) -> None:
     assert certified[~excited].all()
     assert 0.0 < certified[excited].mean() < 0.9
     assert score(flown).certified_share == pytest.approx(certified.mean())
-    assert score(flown).at_bound_share < 0.01  # steps are none of the law's
+    assert score(flown).at_bound_share < 0.01  # steps do not count as decisions at a limit
     rows = np.searchsorted(flown.setpoint["time_s"], flown.records["time_s"])
     sent = thrust_direction_from_quaternion(flown.setpoint["quaternion"][rows])
     recorded = [flown.records[f"thrust_direction_{axis}"] for axis in ("north", "east", "down")]
@@ -318,7 +321,7 @@ def test_a_record_says_what_was_sent(px4_like: Pair) -> None:
 
 
 def beside(flown: History, offset_m: Callable[[np.ndarray], np.ndarray]) -> History:
-    """The flight as if the vehicle had been on the reference but for an offset to the north."""
+    """Return the flight as if the vehicle had been on the reference plus an offset to the north."""
     position = flown.position.copy()
     times, reference = position["time_s"], flown.reference
     for axis in range(3):
@@ -335,8 +338,9 @@ def track_begin_s(flown: History) -> float:
 
 
 def test_thinned_telemetry_does_not_lower_the_error(flown: History) -> None:
-    """1 m off for 0.5 of 3 s: sqrt(1/6) m; with one sample in ten meanwhile, per sample it would be
-    0.14 m. A gap of 0.4 s while the error falls from 1 m to 0 counts with its length."""
+    """An error of 1 m for 0.5 of 3 s is an RMSE of sqrt(1/6) m. If only one sample in ten is kept
+    meanwhile, the RMSE per sample would be 0.14 m. A gap of 0.4 s while the error falls from 1 m to
+    0 counts with its length."""
     off = beside(flown, lambda t: np.where((t >= 1.0) & (t < 1.5), 1.0, 0.0))
     in_track_s = off.position["time_s"] - track_begin_s(off)
     expected_m = math.sqrt(0.5 / score(off).tracked_s)
