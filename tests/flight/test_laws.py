@@ -35,7 +35,7 @@ def flying(controller: str, tmp_path: Path, *assignments: str, **options: object
 
 @pytest.mark.parametrize("law", sorted({*names()} - {"pso", "lqr", "autopilot"}))
 def test_flies_a_short_lemniscate(law: str, tmp_path: Path) -> None:
-    """Other laws: most tests fly `pso` on PX4, test_link_figures `lqr`, a test below `autopilot`."""
+    """Other tests fly the rest: most fly `pso`, test_link_figures `lqr`, one below `autopilot`."""
     pair = flying(law, tmp_path, *SHORT, aloft=True)
     pair.track()
     score = pair.score()
