@@ -47,7 +47,7 @@ class Event:
     """A phase that begins, a change of mode or a text.
 
     `time_s` is vehicle time, NaN before the first telemetry; `unix_s` is the time of the log entry.
-    `phase` is the phase that begins, empty for other events; `cause` is one word or empty.
+    `phase` is the phase that begins, empty for other events; `cause` is a word or two, or empty.
     """
 
     time_s: float

@@ -35,7 +35,7 @@ _KEPT = (
 _UNITS = {"s": "s", "radps": "rad/s", "ps": "1/s"}  # suffix of a constant's name -> unit
 _KEYS = {"drag_ps": "drag_translation_npmps"}  # constant -> another key in a vehicle file
 _REASONS = {"thrust_delay_s": "thrust_lag_s"}  # both are identified together, or neither is
-DIGITS = 6  # of the values in a vehicle file
+DIGITS = 6  # significant digits of the values in a vehicle file
 LINE_WIDTH = 80
 MEAN_OVER_S = 0.5  # time over which reported velocity and position are compared
 

@@ -65,7 +65,7 @@ _TEMPLATES = Environment(
     loader=PackageLoader("offboard", ""), autoescape=True, undefined=StrictUndefined,
     trim_blocks=True, lstrip_blocks=True,
 )  # fmt: skip
-_COLOURS = {  # names of the CSS variables
+_COLOURS = {  # name of the CSS variable -> colour
     "ink": INK, "muted": MUTED, "grid": GRID, "surface": SURFACE,
     "background": BACKGROUND, "link": BLUE, "failed": RED,
     "warning": YELLOW, "printed": GREY,

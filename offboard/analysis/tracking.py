@@ -112,7 +112,7 @@ class Reference:
 
     @classmethod
     def of(cls, flown: History) -> Reference | None:
-        """Return the recorded reference of a flight; None if it has fewer than two records."""
+        """Return the recorded reference of a flight; None without two records of rising stamps."""
         newest = np.maximum.accumulate(flown.reference["time_s"])
         rows = flown.reference[np.diff(newest, prepend=-math.inf) > 0.0]
         return cls(rows) if len(rows) > 1 else None

@@ -1,7 +1,7 @@
 """The cases of a campaign. A case is one flight as plain values, which a worker on any computer can
 fly.
 
-The key of a case is a hash of everything except the code that decides its flight.
+The key of a case is a hash of everything that decides its flight, except the code.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from offboard.documents.reading import override, read
 from offboard.run.configuration import FlightConfig, load
 from offboard.run.flight import Simulated
 
-SEED = "seed"  # a range of this name is a range of the flight's seed, which decides noise and gusts
+SEED = "seed"  # name of a range of the flight's seed: of noise, and of the phase of gusts
 SCENARIO = "scenario."  # prefix of a key of the scenario
 CONNECTED = "connected"  # name of the scenario in tables if a vehicle at a link is flown
 OWN_SCENARIOS = {"px4": "px4_like", "ardupilot": "ardupilot_like"}  # if a file names none

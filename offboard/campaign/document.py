@@ -84,8 +84,8 @@ class Search(Parameters):
 
     `defaults` are the values of an undisturbed flight, to which the values of a failure are reset
     one by one. A default that is not given is 0 if that is within the range, else the middle of the
-    range. A range named `seed` is a range of the flight's seed, which decides noise and gusts. Each
-    failure is flown again with `seeds` other seeds.
+    range. A range named `seed` is a range of the flight's seed, which decides noise and the phase
+    of gusts. Each failure is flown again with `seeds` other seeds.
     """
 
     ranges: Ranges

@@ -55,7 +55,7 @@ class Display:
         self._writer.put(self.text(sentence))
 
     def text(self, sentence: str, flight: Flight | None = None) -> str:
-        """Return the text to write for a sentence, which `flight` has announced unless None."""
+        """Return the text to write for a sentence. `flight` has announced it, or is None."""
         if flight is None:
             return line("preparation", text=sentence)
         return line("announcement", time_s=round(flight.time_s, 3), text=sentence)

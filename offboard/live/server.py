@@ -75,7 +75,7 @@ class Broadcast(Collector):
         yield GaugeMetricFamily("offboard_snapshot_age_seconds", "Age of these values.", age_s)
         yield CounterMetricFamily("offboard_flights", "Flights begun.", now[COUNTER])
         for name, value in sorted(now.items()):
-            if isinstance(value, int | float) and name != COUNTER:  # not null: known
+            if isinstance(value, int | float) and name != COUNTER:  # a known number
                 told = f"{name} of the present flight."
                 yield GaugeMetricFamily(f"offboard_{name}", told, float(value))
         states = {name: str(now[name]) for name in STATES}

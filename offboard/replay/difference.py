@@ -21,7 +21,7 @@ from offboard.replay.replaying import Recording, Replay, Sent
 # Greatest difference of a field that counts as rounding, relative to its value or to 1. Two x86-64
 # processors differed by up to 1e-8 rad and 6e-8 of thrust
 ROUNDING = 1e-6
-_UNSTAMPED = ("time_boot_ms", "target_system", "target_component")  # fields that are not compared
+_UNSTAMPED = ("time_boot_ms", "target_system", "target_component")  # not shown as differing fields
 FIELDS_MAX = 8  # greatest number of fields that are shown of a difference
 TOLD_EVERY = 500  # turns between two sentences about the progress
 Key = tuple[float, int, bytes, int]  # see `_by_key`
@@ -162,7 +162,7 @@ def verdict(replay: Replay, tell: Callable[[str], object] = str) -> Comparison:
 
 
 def explained(recording: Recording, difference: Difference) -> list[str]:
-    """Return lines that show a difference field by field, and the input of the turn before it."""
+    """Return lines that show a difference field by field, and the input of its turn."""
     name = f"{difference.name} at {difference.time_s:.3f} s"
     if difference.expected is None:
         lines = [f"{name} was not sent in the recorded flight"]

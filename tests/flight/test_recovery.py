@@ -68,7 +68,7 @@ def words(commands: list[tuple[float, int]]) -> list[int]:
 @FIRMWARES
 @pytest.mark.parametrize("answered_s", [0.05, 0.55], ids=["at once", "the second request"])
 def test_hold_at_once_then_land_until_disarmed(dialect: Dialect, answered_s: float) -> None:
-    """Also if the first COMMAND_ACK is missing: of a real PX4, the controller had read it."""
+    """Also if the first COMMAND_ACK is missing; with a real PX4 the controller had read it."""
     commands, ended = asked(
         dialect,
         (answered_s, CommandAck(HOLD, "ACCEPTED")),

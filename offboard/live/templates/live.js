@@ -7,7 +7,7 @@ const $ = (name) => document.getElementById(name);
 const number = (value, digits, unit, scale = 1) =>
   value === null ? "–" : `${(scale * value).toFixed(digits)} ${unit}`;
 
-// Label, which with "_" for spaces is the id of its element, and text in a snapshot
+// Label of a value -> its text from a snapshot. The id of its element is the label with "_" for " "
 const VALUES = {
   phase: (now) => `${now.phase}, ${number(now.in_phase_s, 1, "s")}`,
   time: (now) => number(now.time_s, 1, "s"),
@@ -46,7 +46,7 @@ function tellFlight() {
   if (flight.report) $("report").textContent = `report, in some seconds: ${flight.report}`;
 }
 
-// in tenths of a millimetre: a vehicle at rest has no axis of nanometres
+// rounded to 0.1 mm, so that the axis of a vehicle at rest does not show nanometres
 const column = (name, axis) => rows.map((row) =>
   row[name] ? Math.round(1e4 * row[name][axis]) / 1e4 : null);
 function redraw() {
