@@ -442,7 +442,7 @@ def test_nothing_is_heard() -> None:
 
 
 def test_an_armed_vehicle_whose_signing_time_is_behind_does_not_hear_ours() -> None:
-    """The time is behind by ten minutes. Only a disarmed vehicle is sent the right time, by a signed
+    """The time is behind by ten minutes. Only a disarmed vehicle is sent the right time by a signed
     frame: `test_good_vehicle_over_udp`."""
     tested = bench(signing=Signing(KEY, 100 * 60 * UNITS_PER_S), start=Start(height_m=5.0))
     tested.instance.keyring.set_up(KEY, 90 * 60 * UNITS_PER_S)
