@@ -24,7 +24,7 @@ from simulator.firmware import FIRMWARES
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "simulator" / "README.md"
-# What the code names outside the tables: among it the events that it raises
+# All strings in the code except the tables; among them are the events that it raises
 NAMED = frozenset(
     node.value
     for path in (ROOT / "simulator").rglob("*.py")
@@ -36,7 +36,7 @@ HEAD = ("event", "in mode", "if", "next mode", "answer and texts")
 
 
 def table(firmware: Firmware) -> str:
-    """The state table of one firmware in Markdown."""
+    """Return the state table of one firmware as Markdown."""
     rows = [HEAD, ("---",) * len(HEAD)]
     for rule in firmware.rules:
         mode, to = ("any" if rule.mode == "*" else rule.mode), target(rule)
@@ -47,7 +47,7 @@ def table(firmware: Firmware) -> str:
 
 
 def target(rule: Rule) -> str:
-    """The next mode of a row as the table shows it."""
+    """Return the next mode of a row as text for the table."""
     if isinstance(rule.to, ByParameter):
         modes = ", ".join(f"{value} {mode}" for value, mode in sorted(rule.to.modes.items()))
         return f"by {rule.to.parameter}: {modes}"
@@ -55,7 +55,7 @@ def target(rule: Rule) -> str:
 
 
 def with_tables(text: str) -> str:
-    """The same page with the tables of the code between its markers."""
+    """Return the README with the tables replaced between their markers."""
     for name, firmware in FIRMWARES.items():
         begin, end = f"<!-- {name}:begin -->\n", f"<!-- {name}:end -->"
         before, _, rest = text.partition(begin)
@@ -86,7 +86,7 @@ def test_every_fault_is_in_the_table_with_its_keys_and_scenarios_that_have_it() 
 
 
 def unknown(firmware: Firmware, rule: Rule) -> Iterator[str]:
-    """What a row names that does not exist."""
+    """Yield the names in a row that do not exist."""
     known = NAMED.union((event + AFTER_DELAY for event in NAMED), firmware.boot_events_s)
     yield from {rule.event} - known
     yield from set(rule.mode.split()) - {*firmware.modes, "*"}

@@ -1,7 +1,7 @@
-"""A pilot's session by MAVSDK: connect, two flights, one row of JSON per step on stdout.
+"""A pilot's session by MAVSDK: connects, flies twice, and prints one line of JSON per step.
 
-Knows no simulator: `python mavsdk_session.py udpin://127.0.0.1:14540` flies a real PX4 SITL too.
-With `--short` it only takes off and lands.
+It does not depend on our simulator: `python mavsdk_session.py udpin://127.0.0.1:14540` flies a real
+PX4 SITL, too. With `--short` it only takes off and lands.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def say(step: str, *values: Any) -> None:
 
 
 async def until(updates: AsyncGenerator[Any, None], holds: Callable[[Any], bool], s: float) -> Any:
-    """The first update for which `holds`, within `s` seconds."""
+    """Return the first update for which `holds` is true, within `s` seconds."""
 
     async def first() -> Any:
         async for update in updates:
@@ -117,7 +117,7 @@ class Session:
         say("landed and disarmed")
 
     async def fly_mission(self) -> None:
-        """A second flight on the same process: upload, download, fly two points, come home."""
+        """Fly again in the same process: upload and download a mission, fly two points, return."""
         home = await self.telemetry.home()
         items = [
             MissionItem(

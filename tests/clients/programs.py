@@ -22,12 +22,13 @@ MAVPROXY = Path(sys.executable).with_name("mavproxy.py")
 
 @contextmanager
 def vehicle(*options: str) -> Iterator[int]:
-    """Yield the port that it sends to; the process is gone when the block ends."""
+    """Start a simulator, and yield the port to which it sends. It is killed at the end of the
+    block."""
     port = free_port()
     with simulator("--connect", f"udpout:127.0.0.1:{port}", "--gcs", "none", *options) as process:
         assert process.stdout is not None
         ready = process.stdout.readline()
-        while ready.startswith("simulator: "):  # compiling, the first time
+        while ready.startswith("simulator: "):  # the first time it compiles
             ready = process.stdout.readline()
         assert f"127.0.0.1:{port}" in ready, ready
         yield port
@@ -35,7 +36,7 @@ def vehicle(*options: str) -> Iterator[int]:
 
 
 class Terminal:
-    """MAVProxy until the block ends: type a line, wait for what it prints. `shown` is all of it."""
+    """MAVProxy on a terminal, until the end of the block. `shown` is all that it has printed."""
 
     def __init__(self, directory: Path, port: int, *options: str) -> None:
         self._master, slave = pty.openpty()
@@ -65,7 +66,7 @@ class Terminal:
         os.write(self._master, line.encode() + b"\n")
 
     def expect(self, pattern: str, timeout_s: float = 15.0) -> re.Match[str]:
-        """The first match in what it prints behind the last match."""
+        """Wait for text that matches after the last match, and return the match."""
         deadline_s = time.monotonic() + timeout_s
         while (found := re.compile(pattern).search(self.shown, self._seen)) is None:
             remaining_s = deadline_s - time.monotonic()
@@ -75,14 +76,14 @@ class Terminal:
         return found
 
     def talk(self, *lines: tuple[str, str]) -> None:
-        """Types each line, unless it is empty, and waits for what it must print."""
+        """Type each line, unless it is empty, and wait for the text that it must print."""
         for typed, shown in lines:
             if typed:
                 self.type(typed)
             self.expect(shown, 20.0)
 
     def read(self, timeout_s: float) -> bool:
-        """Whether it is still there."""
+        """Read what MAVProxy prints within `timeout_s`. Return whether it still runs."""
         if select.select([self._master], [], [], timeout_s)[0]:
             try:
                 self.shown += os.read(self._master, 65536).decode("utf-8", "replace")

@@ -1,4 +1,4 @@
-"""Flights the simulator tests start from: a settled hover, a recorded response."""
+"""Flights for tests of the simulated plant: a settled hover, and the response to a demand."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ def attitude(roll_deg: float = 0.0, pitch_deg: float = 0.0, yaw_deg: float = 0.0
 
 
 def hovering(vehicle: Vehicle, conditions: Conditions = CALM, seed: int = 1) -> Plant:
-    """At rest (1 mm/s by truth, if the air is calm) some metres up, level, nose north."""
+    """Return a plant that hovers at a height of some metres, level, with the nose to the north. Its
+    true speed is 1 mm/s in calm air."""
     plant = Plant(vehicle, conditions, seed)
     plant.advance(1.5, Demand(True, 1.4 * vehicle.hover_thrust, attitude()))
     for _ in range(500):
@@ -35,7 +36,7 @@ def hovering(vehicle: Vehicle, conditions: Conditions = CALM, seed: int = 1) -> 
 
 
 def estimate_of(plant: Plant) -> SimpleNamespace:
-    """The estimate, with names as in `Truth`."""
+    """Return the estimate, with names as in `Truth`."""
     seen = plant.report().copy()
     return SimpleNamespace(
         position_ned_m=seen[POSITION],
@@ -46,7 +47,7 @@ def estimate_of(plant: Plant) -> SimpleNamespace:
 
 
 def response(plant: Plant, demand: Demand, duration_s: float, read) -> tuple:
-    """Times since the demand and what `read(truth)` says, at every step."""
+    """Apply a demand. Return the time since then and `read(truth)` at every step."""
     values = []
     for _ in range(round(duration_s / STEP_S)):
         plant.advance(STEP_S, demand)
@@ -59,7 +60,7 @@ def euler_deg(truth) -> np.ndarray:
 
 
 def crossing(times, values, level: float) -> float:
-    """First time at which the response passes `level` (interpolated)."""
+    """Return the first time at which the response exceeds `level` (interpolated)."""
     i = int(np.argmax(values > level))
     before = values[i - 1] if i else 0.0
     start = times[i - 1] if i else 0.0

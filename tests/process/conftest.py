@@ -1,4 +1,4 @@
-"""Fixtures of the tests of commands, as processes or called in this one."""
+"""Fixtures that run commands, as processes or in this process."""
 
 from __future__ import annotations
 
@@ -18,13 +18,14 @@ from offboard.cli.shared import out
 from offboard.run import sitl
 from simulator import cli as simulator_cli
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # which commands handle
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # signals that commands handle
 
 
 @pytest.fixture
 def spawn(tmp_path: Path) -> Iterator[Spawn]:
-    """`spawn("offboard", ...)` starts a command in `tmp_path`, `more` environment added. The
-    directory has modules that end every process that imports them."""
+    """`spawn("offboard", ...)` starts a command in `tmp_path` with the further environment `more`.
+    The directory contains modules that end any process that imports them. The processes are killed
+    after the test."""
     running: list[subprocess.Popen[str]] = []
     for module in ("json", "pickle"):
         (tmp_path / f"{module}.py").write_text("import os\nos._exit(99)\n")
@@ -60,8 +61,8 @@ def spawn(tmp_path: Path) -> Iterator[Spawn]:
 def called(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> Called:
-    """`called("offboard fly", ...)`, in this process -> exit code, stdout, stderr. The word PORT
-    in an argument becomes the number of a free port."""
+    """`called("offboard fly", ...)` runs a command in this process, and returns exit code, stdout
+    and stderr. PORT in an argument is replaced by a free port."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
 
@@ -70,7 +71,7 @@ def called(
         words = [*command.split(), *map(str, arguments)]
         words = [word.replace(":PORT", f":{free_port()}") for word in words]
         monkeypatch.setattr(sys, "argv", words)
-        with out.capture():  # drops what an earlier call could not write
+        with out.capture():  # discards what an earlier call could not write
             pass
         handlers = {number: signal.getsignal(number) for number in SIGNALS}
         try:
@@ -87,8 +88,8 @@ def called(
 
 @pytest.fixture
 def refused(called: Called, tmp_path: Path) -> Callable[..., str]:
-    """`refused("offboard fly", ...)` -> its one sentence: the exit code is 2, and no file in the
-    working directory was made or changed."""
+    """`refused("offboard fly", ...)` runs a command that must print one sentence and exit with 2,
+    without creating or changing a file in the working directory. It returns the sentence."""
 
     def files() -> dict[Path, tuple[int, int]]:
         found = {path: path.lstat() for path in tmp_path.rglob("*")}
@@ -106,5 +107,5 @@ def refused(called: Called, tmp_path: Path) -> Callable[..., str]:
 
 @pytest.fixture
 def in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    """`fly --sitl` flies the same vehicle without a process of its own."""
+    """Let `fly --sitl` run the simulator in this process."""
     monkeypatch.setattr(sitl, "SimulatorProcess", lambda: nullcontext(sitl.InMemorySimulator()))

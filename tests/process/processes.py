@@ -1,4 +1,4 @@
-"""Our commands as real processes, each ended with its test whatever becomes of the test."""
+"""Helpers for tests that run our commands as real processes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ RECORDING = Path(__file__).parents[1] / "wire" / "recordings" / "px4-1.16.1-offb
 CONFIG = Path(__file__).parents[2] / "config"
 SIGNING_EPOCH_S = 1_420_070_400  # 2015-01-01
 NO_VEHICLE = "offboard fly --connect udpin:127.0.0.1:PORT --set limits.connect_s=0.3 --out x"
-LONG_S = 60.0  # for what takes a moment on an idle machine
+LONG_S = 60.0  # timeout on a busy machine for what takes a moment on an idle one
 HOVERS = """name: hovers
 description: A vehicle that hovers when its links open, and is healthy a second later.
 conditions: {boot_scale: 0.1}
@@ -35,8 +35,8 @@ _PORTS = itertools.count(20_000 + 200 * int(os.environ.get("PYTEST_XDIST_WORKER"
 
 
 def free_port() -> int:
-    """A UDP and TCP port that is given once: below those that the system gives to others, and from
-    a range of this worker's own."""
+    """Return a free UDP and TCP port. Each is returned only once. Ports are below those that the
+    system assigns, and from a range that only this pytest worker uses."""
     for port in _PORTS:
         with (
             socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as datagrams,
@@ -50,7 +50,7 @@ def free_port() -> int:
 
 
 def register(site: Path, package: str, group: str, **points: str) -> None:
-    """Metadata of an installed package with these entry points."""
+    """Write the metadata of an installed package with these entry points into `site`."""
     metadata = site / f"{package}-1.0.dist-info"
     metadata.mkdir()
     (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
@@ -59,14 +59,14 @@ def register(site: Path, package: str, group: str, **points: str) -> None:
 
 
 def hovering(directory: Path, height_m: float) -> tuple[str, ...]:
-    """Options of a simulator whose vehicle hovers at `height_m` when its links open."""
+    """Return options of a simulator whose vehicle hovers at `height_m` when its links open."""
     path = directory / "hovers.yaml"
     path.write_text(HOVERS % height_m)
     return ("--scenario", str(path))
 
 
 def children(pid: int) -> list[int]:
-    """Process ids of the children of `pid`."""
+    """Return the process ids of the children of `pid`."""
     try:
         listing = Path(f"/proc/{pid}/task/{pid}/children").read_text()
     except OSError:
@@ -75,7 +75,7 @@ def children(pid: int) -> list[int]:
 
 
 def ended(pid: int) -> bool:
-    """Whether a process has ended; one that nobody waits for has too."""
+    """Whether a process has ended. A zombie counts as ended."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
     except OSError:
@@ -91,7 +91,7 @@ def eventually(holds: Callable[[], object]) -> None:
 
 @contextmanager
 def full_disk(holds_bytes: int) -> Iterator[None]:
-    """A limit of the size of files stands for it."""
+    """Simulate a full disk by a limit of the size of files."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (holds_bytes, limits[1]))
     try:
@@ -101,7 +101,7 @@ def full_disk(holds_bytes: int) -> Iterator[None]:
 
 
 def signing(system: int, component: int, key: bytes) -> Any:
-    """A codec that signs, with stamps of the computer's time."""
+    """Return a codec that signs with time stamps from this computer's clock."""
     codec = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
     codec.signing.secret_key, codec.signing.sign_outgoing = key, True
     codec.signing.timestamp = int((time.time() - SIGNING_EPOCH_S) * 1e5)

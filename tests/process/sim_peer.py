@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 @contextmanager
 def simulator(*options: str) -> Iterator[subprocess.Popen[str]]:
-    """`python -m simulator` with its output, gone at the end of the block."""
+    """Run `python -m simulator` with its output in pipes. It is killed at the end of the block."""
     process = subprocess.Popen(
         [sys.executable, "-m", "simulator", *options],
         stdin=subprocess.DEVNULL,
@@ -31,7 +31,7 @@ def simulator(*options: str) -> Iterator[subprocess.Popen[str]]:
 
 
 class Peer:
-    """A bound UDP socket that keeps the newest message of each kind."""
+    """A UDP socket that stores the newest message of each kind."""
 
     def __init__(self) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

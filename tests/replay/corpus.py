@@ -1,8 +1,9 @@
-"""The corpus: small recorded flights, and what the present code answers to them.
+"""The corpus: small recorded flights, and what the present code sends when they are replayed.
 
-A flight is recordings/NAME.tlog.xz, of which a replay needs telemetry, the inputs of each turn, and
-the setpoints and commands as flown. recordings/NAME.sent has those that are expected, one in a
-line: vehicle time in s, message id, payload. `python tests/replay/corpus.py FLIGHT NAME` adds one.
+A flight is recordings/NAME.tlog.xz; a replay needs its telemetry, the inputs of each turn, and the
+setpoints and commands that were sent in flight. recordings/NAME.sent has the expected ones, one per
+line: vehicle time in s, message id, payload. `python tests/replay/corpus.py FLIGHT NAME` adds a
+flight.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ COMPARED = frozenset((*SETPOINTS, *COMMANDS))
 
 @contextmanager
 def unpacked(name: str) -> Iterator[Recording]:
-    """The recording of a flight of the corpus."""
+    """Unpack a flight of the corpus, and yield its recording."""
     with tempfile.TemporaryDirectory() as directory:
         path = Path(directory) / f"{name}.tlog"
         path.write_bytes(lzma.decompress((FLIGHTS / f"{name}.tlog.xz").read_bytes()))
@@ -36,7 +37,7 @@ def names() -> list[str]:
 
 
 def replayed(recording: Recording) -> Replay:
-    """The flight, replayed to its end."""
+    """Replay a flight to its end."""
     replay = Replay(recording)
     for _ in replay.turns():
         pass
@@ -66,7 +67,7 @@ def write_expected(name: str, sent: Iterable[Sent]) -> None:
 
 
 def add(flight: Path, name: str) -> None:
-    """Keep the log of a flight, compressed."""
+    """Add the log of a flight, compressed, with the setpoints and commands sent in flight."""
     recording = read(flight)
     replay = replayed(recording)
     packed = lzma.compress(recording.log.path.read_bytes(), preset=9 | lzma.PRESET_EXTREME)

@@ -13,7 +13,7 @@ import pytest
 from playwright.sync_api import Page, sync_playwright
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-# WebGL (Fig. 6) in software: a machine that runs tests has no graphics card
+# WebGL (Fig. 6) is rendered in software, because a computer for tests may have no graphics card
 FLAGS = (
     "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--use-gl=angle",
     "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
@@ -21,7 +21,7 @@ FLAGS = (
 DRAWN = """scheme => [...document.querySelectorAll(".figure")].every((figure) =>
   figure.dataset.drawn === scheme &&
   Math.abs(figure.querySelector(".svg-container").clientWidth - figure.clientWidth) <= 1)"""
-# For each text of the page and its figures: contrast by WCAG 2.1, brightness of its background
+# For each text of the page and its figures: contrast (WCAG 2.1), scheme of its background, text
 CONTRASTS = """() => {
   const linear = (v) => v <= 10.31475 ? v / 3294.6 : ((v / 255 + 0.055) / 1.055) ** 2.4;
   const rgb = (colour) => colour.match(/[0-9.]+/g).map(Number);
@@ -54,7 +54,7 @@ TEXT_BOXES = """() => [...document.querySelectorAll(".figure")].map((figure) => 
                            box.right - frame.left, box.bottom - frame.top]);
   return [figure.id, frame.width, frame.height, boxes];
 })"""
-# Nothing has moved since the poll before: plotly draws margins and legend in several passes
+# Whether no text has moved since the last poll: plotly draws margins and legend in several passes
 SETTLED = f"""() => {{
   const [before, now] = [window.textBoxes, JSON.stringify(({TEXT_BOXES})())];
   window.textBoxes = now;
@@ -64,7 +64,7 @@ TOUCHING_PX = 3  # boxes of neighbouring lines of text overlap by this much at m
 
 
 class Opened:
-    """A page with its figures drawn, the errors it reported and what it asked the network for."""
+    """An open page with its figures drawn, the errors that it reported, and its requests."""
 
     def __init__(self, page: Page, place: Path | str) -> None:
         self.page = page
@@ -100,8 +100,8 @@ class Opened:
         self.page.wait_for_function(SETTLED, polling=300, timeout=60_000)
 
     def unreadable(self) -> list[str]:
-        """Texts on a background of the other colour scheme, or with a contrast below 4.5, the
-        least that WCAG 2.1 allows (level AA)."""
+        """Return texts on a background of the other colour scheme, or with a contrast below 4.5,
+        the minimum of WCAG 2.1 (level AA)."""
         found = self.page.evaluate(CONTRASTS)
         assert found
         return [
@@ -111,11 +111,11 @@ class Opened:
         ]
 
     def width_px(self) -> int:
-        """The width of the whole page; it exceeds the window's where something overflows."""
+        """Return the width of the page; it exceeds that of the window if something overflows."""
         return int(self.page.evaluate("document.documentElement.scrollWidth"))
 
     def colliding(self) -> list[str]:
-        """Texts of figures that are cut off, or that overlap each other or the tool bar."""
+        """Return texts of figures that are cut off, or that overlap each other or the tool bar."""
         found = []
         for figure, width, height, boxes in self.page.evaluate(TEXT_BOXES):
             for i, (text, left, top, right, bottom) in enumerate(boxes):
@@ -130,7 +130,8 @@ class Opened:
 
 @contextmanager
 def opening(place: Path | str, width: int = 1280) -> Iterator[Opened]:
-    """The page while the browser runs; fails the test where there is no browser."""
+    """Open a page in a browser, which runs until the end of the block. Fail the test without a
+    browser."""
     found = next(filter(None, map(shutil.which, BROWSERS)), None)
     if found is None:
         pytest.fail(f"the page must be opened in a browser; install one of {', '.join(BROWSERS)}")

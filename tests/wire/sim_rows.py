@@ -19,14 +19,14 @@ COMPANION_COMPONENT = 191
 # EXTENDED_SYS_STATE, STATUSTEXT
 HEARD = frozenset({0, 22, 32, 40, 44, 46, 47, 51, 77, 193, 245, 253})
 TEXT_CHUNK = 50
-BRIEF_S = 1.2  # a state shorter than that may fall between the heartbeats
+BRIEF_S = 1.2  # a shorter state may fall between two HEARTBEATs
 KINDS = ("ack", "text", "state", "landed", "filter", "param", "mission")
 
 
 @dataclass
 class Rows:
-    """One side: rows of each kind in order, as (time, what), repetitions of a state left out,
-    and where it was, as (time, position, velocity), both north, east, down."""
+    """One side of the comparison: rows of each kind in order, as (time, content), without repeated
+    states; and its path, as (time, position NED, velocity NED)."""
 
     by_kind: dict[str, list[tuple[float, str]]] = field(
         default_factory=lambda: {kind: [] for kind in KINDS}
@@ -75,7 +75,8 @@ class Rows:
 
 @dataclass(frozen=True)
 class Comparison:
-    """`equal`: count of rows; `differing`: "real ..." and "ours ..."; `late`: row, seconds."""
+    """`equal` is the number of equal rows; `differing` has rows as "real ..." or "ours ..."; `late`
+    has each equal row with the time by which ours is later, in s."""
 
     equal: int
     differing: list[str]
@@ -83,7 +84,8 @@ class Comparison:
 
 
 def compare(real: Rows, ours: Rows, kinds: Iterable[str], unheard: tuple[str, ...]) -> Comparison:
-    """Row by row of these kinds; rows that contain one of `unheard` are left out on both sides."""
+    """Compare the rows of these kinds. Rows that contain one of `unheard` are ignored on both
+    sides."""
     equal, differing, late = 0, [], []
     for kind in kinds:
         sides = [
@@ -117,7 +119,7 @@ def _lasting(side: Rows, kind: str) -> list[tuple[float, str]]:
 
 
 def _without_figures(text: str) -> str:
-    """Heights and charges are estimates, and a metre more or less."""
+    """Replace the numbers of texts about the battery, which are estimates and may differ."""
     estimated = text.startswith("Battery 1 is")
     return re.sub(r"\d+(\.\d+)?", "#", text).strip() if estimated else text.strip()
 
@@ -130,10 +132,11 @@ def ask_again(
     run_on_s: float,
     each: Callable[[Any], None] = lambda message: None,
 ) -> None:
-    """Send what the companion sent, at the same vehicle times; both sides `hear` the answers.
+    """Send the companion's recorded frames to the simulator at the same vehicle times. `real` and
+    `ours` collect the answers.
 
-    `run_on_s`: how long the simulator runs after the last request. `each` receives the messages
-    of the real autopilot, in order of time.
+    `run_on_s`: time that the simulator runs after the last request. `each` is called with the
+    messages of the real autopilot, in the order of time.
     """
     system = bench.system
     offset_s = 0.0  # vehicle time minus host time, from the newest stamp

@@ -20,8 +20,8 @@ OFFBOARD = 0x00060000
 
 
 class Sender:
-    """One component on the network, with its own sequence numbers. With a `key` pymavlink signs
-    for it, from this time stamp on."""
+    """One MAVLink component with its own sequence numbers. With a `key` pymavlink signs its frames,
+    with time stamps from `stamp` on."""
 
     def __init__(
         self, system_id: int = 1, component_id: int = 1, key: bytes = b"", stamp: int = 0
@@ -63,7 +63,7 @@ class Sender:
 
 
 def framed(message_id: int, payload: bytes, *, version_1: bool = False) -> bytes:
-    """A frame with any payload under a right checksum, from (1, 1)."""
+    """Return a frame from (1, 1) with any payload and a correct checksum."""
     ids = struct.pack("<BBBH", 7, 1, 1, message_id & 0xFFFF)
     body = bytes((len(payload), 0, 0)) + ids + bytes((message_id >> 16,)) + payload
     if version_1:
@@ -74,7 +74,7 @@ def framed(message_id: int, payload: bytes, *, version_1: bool = False) -> bytes
 
 
 def pinned(vehicle: Sender, autopilot: int = PX4, **settings: Any) -> Session:
-    """A session that has received the first heartbeat of `vehicle`."""
+    """Return a session that has received the first HEARTBEAT of `vehicle`."""
     session = Session(SessionSettings(**settings))
     reception = session.receive(vehicle.heartbeat(autopilot), PEER, 0.0)
     assert len(reception.events) == 2
@@ -83,12 +83,13 @@ def pinned(vehicle: Sender, autopilot: int = PX4, **settings: Any) -> Session:
 
 
 def understood(frame: bytes) -> Any:
-    """One of our frames, decoded by pymavlink as the autopilot would."""
+    """Return one of our frames decoded by pymavlink, as an autopilot would decode it."""
     return mavlink.MAVLink(None).decode(bytearray(frame))
 
 
 def recorded(path: Path) -> list[tuple[float, bytes, Any]]:
-    """Of a .tlog or .tlog.xz: host seconds since the first frame, frame, message by pymavlink."""
+    """Read a .tlog or .tlog.xz. Return for each entry the host time since the first one in s, the
+    frame, and the message that pymavlink decodes."""
     data, frames, at = path.read_bytes(), [], 0
     if path.suffix == ".xz":
         data = lzma.decompress(data)
