@@ -1,7 +1,7 @@
-"""A vehicle with an autopilot's attitude loop, for tests; independent of observer and control law.
+"""A vehicle behind an autopilot's attitude loop, written independently of observer and law.
 
-The tilt loop is of second order, with delay and a limit of the angular acceleration; the thrust has
-lag and delay; drag is linear. It is integrated in steps of 1 ms. Reported states have no error.
+The tilt loop is of second order with a delay and a limit on angular acceleration; the thrust has a
+delay and a first-order lag; drag is linear. Steps are 1 ms. The telemetry has no errors.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from offboard.reference.path import Harmonic, Sine
 from offboard.reference.track import Track
 
 STEP_S = 1e-3
-GAPS_S = (0.008, 0.008, 0.008, 0.016)  # intervals of PX4's telemetry
+GAPS_S = (0.008, 0.008, 0.008, 0.016)  # between messages of PX4's telemetry
 
 
 @dataclass
 class Truth:
-    """The true vehicle. `thrust_scale` is true thrust / thrust that the controller assumes."""
+    """The plant's true constants; `thrust_scale` is its thrust divided by the commanded thrust."""
 
     vehicle: Vehicle
     thrust_scale: float = 1.0
@@ -38,8 +38,8 @@ class Truth:
 
 @numba.njit(cache=True)
 def _run(x, commands, constants, wind):
-    """Integrate x = [p (3), v (3), b (2), b' (2), T, psi, psi'] in place. `commands` (n, 4) are
-    [b_n, b_e, T, heading], one row per step."""
+    """Integrate x = [p (3), v (3), b (2), b' (2), T, psi, psi'] in place, one step for each row of
+    `commands` (n, 4) = [b_n, b_e, T, heading]."""
     g, c, wn, z, lag, wy, zy, limit = constants
     h = STEP_S
     for i in range(len(commands)):
@@ -98,7 +98,7 @@ class Plant:
         self.time_s = round((self.time_s + interval_s) / STEP_S) * STEP_S
 
     def _in_force(self, times: np.ndarray) -> np.ndarray:
-        """Return the rows of `sent` in force at `times`; before the first one, the first."""
+        """Rows of `sent` that are in force at `times`; before the first command, the first row."""
         rows = np.searchsorted(self.sent[:, 0], times + 1e-9, side="right") - 1
         return self.sent[np.maximum(rows, 0)]
 
@@ -107,14 +107,14 @@ class Plant:
         return self.x[:3].copy(), self.x[3:6].copy()
 
     def attitude(self) -> np.ndarray:
-        """Return the attitude quaternion, FRD to NED."""
+        """Attitude quaternion, FRD -> NED."""
         down = np.sqrt(1.0 - self.x[6] ** 2 - self.x[7] ** 2)
         return quaternion_from_thrust_direction(np.array([*self.x[6:8], down]), self.x[11])
 
 
 def lemniscate(period_s: float, *, heading_rad: float = 0.0, vertical_m: float = 0.0) -> Track:
-    """Return a track: 2 sin wt north, 1 sin 2wt east, `vertical_m` sin 3wt about 3 m height; it
-    begins at rest, and reaches full speed after 4 s."""
+    """A track of 2 sin wt north, 1 sin 2wt east, `vertical_m` sin 3wt down about a height of 3 m.
+    It begins at rest and reaches full speed in 4 s."""
     omega = math.tau / period_s
     sine = Sine((2.0, 1.0, vertical_m), (omega, 2.0 * omega, 3.0 * omega))
     path = Harmonic(3600.0, sines=(sine,))
@@ -133,8 +133,8 @@ def fly(
     offset_ned_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
     gaps_s: tuple[float, ...] = GAPS_S,
 ) -> float:
-    """Fly `reference` from rest at its start plus `offset_ned_m`, with a decision every 0.1 s.
-    Return the RMSE in m from `score_from_s` on."""
+    """Fly `reference` from rest at its start with a decision every 0.1 s. Return the RMSE of the
+    position in m from `score_from_s` on."""
     plant, observer, start = Plant(truth), Observer(believed, noise), reference.sample(0.0)
     plant.x[:3] = start.position_ned_m + np.array(offset_ned_m)
     command = Command(believed.gravity_mps2, (0.0, 0.0, 1.0), float(start.heading_rad))

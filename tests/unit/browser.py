@@ -1,5 +1,5 @@
-"""A page of `offboard` in Chromium: a file without a network, or one that is served live. Measures
-what a reader sees."""
+"""Opens a page of `offboard` in Chromium, a file without a network or a page that is served live,
+and measures what a reader sees."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FLAGS = (
 DRAWN = """scheme => [...document.querySelectorAll(".figure")].every((figure) =>
   figure.dataset.drawn === scheme &&
   Math.abs(figure.querySelector(".svg-container").clientWidth - figure.clientWidth) <= 1)"""
-# For each text of the page and its figures: contrast (WCAG 2.1), scheme of its background, text
+# [contrast by WCAG 2.1, brightness of the background, text] of each text of page and figures
 CONTRASTS = """() => {
   const linear = (v) => v <= 10.31475 ? v / 3294.6 : ((v / 255 + 0.055) / 1.055) ** 2.4;
   const rgb = (colour) => colour.match(/[0-9.]+/g).map(Number);
@@ -54,7 +54,7 @@ TEXT_BOXES = """() => [...document.querySelectorAll(".figure")].map((figure) => 
                            box.right - frame.left, box.bottom - frame.top]);
   return [figure.id, frame.width, frame.height, boxes];
 })"""
-# Whether no text has moved since the last poll: plotly draws margins and legend in several passes
+# Whether no text has moved since the previous poll: plotly lays a figure out in several passes
 SETTLED = f"""() => {{
   const [before, now] = [window.textBoxes, JSON.stringify(({TEXT_BOXES})())];
   window.textBoxes = now;
@@ -64,7 +64,7 @@ TOUCHING_PX = 3  # boxes of neighbouring lines of text overlap by this much at m
 
 
 class Opened:
-    """An open page with its figures drawn, the errors that it reported, and its requests."""
+    """A page with its figures drawn, the errors that it reported and its network requests."""
 
     def __init__(self, page: Page, place: Path | str) -> None:
         self.page = page
@@ -111,7 +111,7 @@ class Opened:
         ]
 
     def width_px(self) -> int:
-        """Return the width of the page; it exceeds that of the window if something overflows."""
+        """The width of the whole page, which exceeds that of the window if something overflows."""
         return int(self.page.evaluate("document.documentElement.scrollWidth"))
 
     def colliding(self) -> list[str]:
@@ -130,8 +130,7 @@ class Opened:
 
 @contextmanager
 def opening(place: Path | str, width: int = 1280) -> Iterator[Opened]:
-    """Open a page in a browser, which runs until the end of the block. Fail the test without a
-    browser."""
+    """Yield the opened page; the test fails if no browser is installed."""
     found = next(filter(None, map(shutil.which, BROWSERS)), None)
     if found is None:
         pytest.fail(f"the page must be opened in a browser; install one of {', '.join(BROWSERS)}")

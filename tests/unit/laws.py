@@ -29,7 +29,7 @@ PX4 = Vehicle(
     yaw=AxisResponse(delay_s=0.148, natural_frequency_radps=3.1, damping=0.4),
 )
 LEVEL = Command(G, (0.0, 0.0, 1.0), 0.0)
-# Laws that track by themselves: not the paper's law, which is slow, nor the autopilot's own loop
+# Laws that track closely: not the paper's, which is slow, nor `autopilot`, which is PX4's own loop
 TRACKING = [name for name in names() if name not in ("paper", "autopilot")]
 
 
@@ -42,7 +42,7 @@ def pso() -> PsoLaw:
 
 
 def state_of(rng: np.random.Generator, reference: Reference, size: float) -> PredictedState:
-    """Return a random state near the reference at 5.057 s, off by about `size` in every unit."""
+    """A random state near the reference at 5.057 s: about `size` off in m and m/s."""
     sample = reference.sample(5.057)
     tilt = np.clip(0.05 * size * rng.normal(size=2), -0.6, 0.6)
     return PredictedState(
@@ -60,7 +60,7 @@ def state_of(rng: np.random.Generator, reference: Reference, size: float) -> Pre
 
 
 def on_target(state: PredictedState, target: Target) -> PredictedState:
-    """Return `state` with the position, motion and thrust of `target`."""
+    """`state` with position, velocity, tilt and thrust as `target` demands them."""
     down = math.sqrt(1.0 - target.lateral[2] @ target.lateral[2])
     position, velocity, direction, rate = target.lateral
     return replace(
@@ -79,7 +79,7 @@ def law_named(name: str) -> Controller:
 
 
 def at(position: ArrayLike, heading_rad: float) -> PredictedState:
-    """Return a state at rest and level."""
+    """A state at rest and level, `position` in NED."""
     return PredictedState(
         0.057, np.array(position), np.zeros(3), np.array([0.0, 0.0, 1.0]), np.zeros(3),
         heading_rad, 0.0, G, np.zeros(3), np.zeros(3),

@@ -1,4 +1,4 @@
-"""Campaigns against known answers: groups, best, margin, table, page, progress, one vehicle."""
+"""Campaigns with known results: groups, best law, margin, table, page, flights of one vehicle."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ERRORS_M = {
     ("pso", "calm"): (0.010, 0.012, 0.011),
     ("lqr", "calm"): (0.0109, 0.0119, 0.0121),  # within the range of pso's flights
     (LAWS[2], "calm"): (0.0125, 0.0125, 0.0125),
-    ("lost", "calm"): (0.001, 0.001, math.nan),  # the lowest, but one failed
+    ("lost", "calm"): (0.001, 0.001, math.nan),  # the lowest error, but one flight failed
     ("pso", "all_together"): (0.2, 0.2, 0.2),
     ("lqr", "all_together"): (0.201, 0.201, 0.201),  # within one per cent
     (LAWS[2], "all_together"): (0.21, 0.19, 0.21),
@@ -60,7 +60,7 @@ def flown() -> list[Group]:
 def test_best_is_the_lowest_median_of_those_that_all_flew_and_its_equals(
     flown: list[Group],
 ) -> None:
-    """Median and range are of the flights that landed."""
+    """Median and range of a group count only the flights that landed."""
     best = {(group.name, group.block.rpartition(" ")[2]) for group in flown if group.best}
     assert best == {(law, scenario) for law in ("pso", "lqr") for scenario in SCENARIOS}
     calm = {group.name: group for group in flown if group.block == "lemniscate, calm"}
@@ -161,7 +161,7 @@ def test_on_one_vehicle_nothing_is_flown_after_a_refused_or_aborted_flight(
 
 
 class Empty:
-    """A flight without positions, and a law without keep-out volumes."""
+    """The history of a flight without phases and positions."""
 
     phases = ()
     truth = position = np.empty((0, 4))
@@ -190,7 +190,7 @@ def test_margin(changes: dict[str, float], expected: tuple[str, float]) -> None:
 
 
 def test_a_case_has_a_directory_of_its_own_and_if_connected_begins_disarmed() -> None:
-    """Also of two files with one name; and unless told otherwise."""
+    """Two files of one name have two directories; a given `limits.begin_armed` is kept."""
     case = Case("flight", "lqr", "hover", None, None, "px4", "connected", 1, link="udpin::0")
     armed = replace(case, values=(("limits.begin_armed", True),))
     begins = [each.load().limits.begin_armed for each in (case, armed, replace(case, link=None))]

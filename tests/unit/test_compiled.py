@@ -71,7 +71,7 @@ def package(tmp_path: Path) -> Path:
 
 
 def answer(root: Path, code: str = CALL, **environment: str) -> str:
-    """What a new interpreter prints that has the package in `root`."""
+    """What `code` prints in a new interpreter that imports the package from `root`."""
     clean = {key: value for key, value in os.environ.items() if "CACHE" not in key}
     return subprocess.run(
         [sys.executable, "-c", code],
@@ -112,7 +112,7 @@ def test_without_compilation_the_same_functions_run_as_python(
 
 
 def test_the_directory_is_below_the_first_usable_one(package: Path, tmp_path: Path) -> None:
-    """A relative one is not, as the XDG standard says."""
+    """A relative path is not used, as the XDG standard demands."""
     code = "from offboard import compiled; print(compiled.directory())"
     first, second, home = (tmp_path / name for name in ("numba", "xdg", "home"))
     given = {"NUMBA_CACHE_DIR": str(first), "XDG_CACHE_HOME": str(second), "HOME": str(home)}
@@ -123,7 +123,7 @@ def test_the_directory_is_below_the_first_usable_one(package: Path, tmp_path: Pa
     given["XDG_CACHE_HOME"] = "here"
     assert Path(answer(package, code, **given)).parent == home / ".cache/pso-offboard"
     assert not list(package.rglob("here"))
-    nowhere = dict.fromkeys(given, str(first))  # a file: kept in the temporary directory
+    nowhere = dict.fromkeys(given, str(first))  # a file, so that the temporary directory is used
     nowhere["TMPDIR"] = str(tmp_path)
     assert answer(package, **nowhere) == "68.0\n1 [2, 10] 1"
     assert answer(package, **nowhere) == "68.0\n1 [2, 10] 0"

@@ -1,4 +1,4 @@
-"""The controllers as a table: shipped files, defaults and what all of them promise."""
+"""All control laws: their shipped files and defaults, and the properties that they share."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from offboard.run.configuration import FlightConfig, load, read_part
 from offboard.run.flight import Simulated
 
 ENDS = ("minimum", "exclusiveMinimum", "maximum")  # of a JSON schema
-# a key with a number, and the ends of the range in its comment
+# a key with a number, and the range that its comment states
 RANGED = re.compile(r"^(\w+): [-\d.]+ .*# .*?(-?[\d.]+) \.\. ([\d.]+)", re.MULTILINE)
 
 
@@ -57,7 +57,7 @@ def test_flight_yaml_states_every_setting_with_its_default_and_range() -> None:
 
 @pytest.mark.parametrize("part", shipped.PARTS)
 def test_the_ends_of_the_ranges_that_shipped_files_state_are_allowed(part: str) -> None:
-    """But a lower end of 0 may mean more than that."""
+    """A lower end of 0 may be refused, because it may mean "greater than 0"."""
     stated, refused = 0, []
     for name, side in itertools.product(shipped.names(part), (1, 2)):
         text = shipped.read_text(shipped.locate(name, part))
@@ -101,7 +101,7 @@ def test_a_state_that_is_not_finite_gives_no_decision(law: str, field: str) -> N
 
 @pytest.mark.parametrize("law", ["pso", "paper"])
 def test_the_deadline_cuts_the_swarm_short(law: str) -> None:
-    """The time left is asked for after every 25 iterations."""
+    """The swarm reads the remaining time after every 25 iterations."""
     remaining_s, reference = iter((0.002, 0.001, 0.0)), lemniscate(8.0)
     state = state_of(np.random.default_rng(0), reference, 0.1)
     situation = Situation(5.0, state, reference, LEVEL, lambda: next(remaining_s))
@@ -110,7 +110,7 @@ def test_the_deadline_cuts_the_swarm_short(law: str) -> None:
 
 
 def test_an_error_that_stays_is_answered_ever_more_by_the_integral() -> None:
-    """5 cm for 3 s: 0.03 m/s^2 more along north and east, 0.15 along the vertical."""
+    """An error of 5 cm adds in 3 s 0.03 m/s^2 along north and east, and 0.15 along the vertical."""
     for axis, off in enumerate(0.05 * np.eye(3)):
         law, situation = law_named("pid"), Situation(0.0, at(off, 0.0), hold((0, 0, 0), 0.0), LEVEL)
         first, *_, last = (law.decide(situation).command for _ in range(31))
@@ -125,7 +125,7 @@ def test_the_autopilots_loop_is_given_the_reference() -> None:
     situation = Situation(6.0, at((0, 0, -3), heading), reference, LEVEL)
     command = law_named("autopilot").decide(situation).command
     assert isinstance(command, PositionCommand)
-    sample = reference.sample(6.05)  # the middle of the time it is held for
+    sample = reference.sample(6.05)  # the middle of the period that follows
     assert command.position_ned_m == pytest.approx(tuple(sample.position_ned_m))
     assert command.velocity_ned_mps == pytest.approx(tuple(sample.velocity_ned_mps))
     assert command.acceleration_ned_mps2 == pytest.approx(tuple(sample.acceleration_ned_mps2))

@@ -1,5 +1,5 @@
-"""Configuration files: accepted values, and the exact sentence for each error; key files: what is
-made, what is refused, and that nothing shows the key."""
+"""Configuration files: accepted values, and the exact sentence for each error; key files: how
+they are made, which are refused, and that no message shows the key."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ KEYS = "circles, colour, corner, corners, named, scale, shape, tilt_rad, title, 
         ("title: x\ncircles: circle", "line 2, column 1: circles: 'circle' should be a list"),
         ("title: x\nzzz: 3", f"line 2, column 1: zzz is not a known key (known keys: {KEYS})"),
         ("title: x\ncolour: blue\ntilt_rad: 1", "d.yaml: a blue drawing is not tilted"),
-        # what is no YAML of ours
+        # YAML that is not accepted
         (
             "title: [1",
             "line 1, column 10: expected ',' or ']', but got '<stream end>'"
@@ -210,7 +210,7 @@ def written(path: Path, text: str, mode: int = 0o600) -> Path:
 
 
 def test_a_new_key_is_private_random_and_the_hash_of_its_passphrase(tmp_path: Path) -> None:
-    before = os.umask(0o777)  # as far as a umask can go
+    before = os.umask(0o777)  # the most restrictive umask
     try:
         passphrases = [create_key(tmp_path / name) for name in "ab"]
     finally:

@@ -1,4 +1,4 @@
-"""Rotations against SciPy's, on random ones and in the awkward places; places on the sphere."""
+"""Rotations against SciPy, random ones and at singularities; positions on the sphere."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_euler_angles_survive_gimbal_lock() -> None:
 
 
 def test_conversions_are_scipys_of_one_and_of_arrays() -> None:
-    """What works for one works for (5, 100); the heading is that of the nose."""
+    """One quaternion and an array (5, 100) are converted alike; the heading is that of the nose."""
     nose, many = RANDOM.apply([1.0, 0.0, 0.0]), QUATERNIONS.reshape(5, 100, 4)
     euler = RANDOM.as_euler("ZYX")[:, ::-1]
     for convert, expected in (
@@ -73,7 +73,7 @@ def test_conversions_are_scipys_of_one_and_of_arrays() -> None:
 def test_attitude_from_thrust_direction_has_both(
     azimuth: float, tilt: float, heading: float, length: float
 ) -> None:
-    """Any direction, also upside down: the third axis is b, the nose points along the heading."""
+    """For any b, also upside down, the body's z axis is b and the nose points along the heading."""
     direction = np.array(
         [math.sin(tilt) * math.cos(azimuth), math.sin(tilt) * math.sin(azimuth), math.cos(tilt)]
     )

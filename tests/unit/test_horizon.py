@@ -1,4 +1,4 @@
-"""Plans over N decisions: the quadratic, the roll-outs against SciPy, what the searches find."""
+"""Plans over N decisions: quadratic cost, roll-outs against SciPy, and what the searches find."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def about_hover(count: int, size: float) -> list[Situation]:
 
 
 def left_to_pay(law: HorizonLaw, situation: Situation) -> float:
-    """x'Px: the cost of the closed form without bounds."""
+    """x'Px: the cost to go of the closed form, which has no bounds."""
     now = law.problem(situation)
     left = np.sum(now.at_hover * (law.lateral.terminal @ now.at_hover))
     return float(left + now.vertical @ law.vertical.terminal @ now.vertical)
@@ -83,7 +83,7 @@ def test_a_plan_whose_cost_is_not_finite_never_wins() -> None:
 
 
 def test_the_quadratic_leaves_the_cost_to_go_and_has_the_bounds_of_one_decision() -> None:
-    """N optimal inputs and P behind them cost x'Px, whatever N; the first is -K x."""
+    """With terminal cost P, N optimal inputs cost x'Px for every N, and the first one is -K x."""
     law = horizon()
     for situation in situations(5, 0.3):
         first = law.prepare(situation)
@@ -98,11 +98,11 @@ def test_the_quadratic_leaves_the_cost_to_go_and_has_the_bounds_of_one_decision(
             assert inputs[0] * b_z == pytest.approx(theirs[0] * b_z, rel=1e-9)
 
 
-PUSHED_MPS2 = np.array([2.0, -1.5, 0.0])  # a disturbance, which the reference leans into
+PUSHED_MPS2 = np.array([2.0, -1.5, 0.0])  # a disturbance, against which a hover leans
 
 
 def _flown(state: PredictedState, plan: np.ndarray) -> np.ndarray:
-    """[p, v, b, b', T] (11,) after the plan from the leaning hover, by SciPy in absolute terms."""
+    """[p, v, b, b', T] (11,) after `plan`, offsets from the leaning hover, integrated by SciPy."""
     wn, z, c = PX4.tilt.natural_frequency_radps, PX4.tilt.damping, PX4.drag_per_mass_ps
     pull = np.array([0.0, 0.0, G]) + PUSHED_MPS2
     leaning = pull / np.linalg.norm(pull)
@@ -126,8 +126,8 @@ def _flown(state: PredictedState, plan: np.ndarray) -> np.ndarray:
 
 
 def test_nonlinear_roll_outs_fly_as_scipy_does() -> None:
-    """Tilts and thrusts 0.2 and 3 m/s^2 about a hover that leans by 15 degrees: 1 s later within
-    4 mm and 10 mm/s."""
+    """After 1 s of tilts up to 0.2 and thrusts up to 3 m/s^2 about a hover that leans by 15
+    degrees, position and velocity agree within 4 mm and 10 mm/s."""
     state = replace(
         at((0.2, -0.1, -3.3), 0.0),
         time_s=5.057,
@@ -176,8 +176,8 @@ def test_mpc_is_lqr_where_no_bound_is_met_and_sees_one_coming_where_it_is() -> N
 
 
 def test_law_finds_cheaper_plans_than_a_random_search() -> None:
-    """Past a moving sphere, each decision from the closed form, for about 900 roll-outs, against
-    2800 plans drawn about it: every one cheaper, and most by a half."""
+    """Past a moving sphere each plan of the law, found by about 900 roll-outs from the closed form,
+    costs less than the best of 2800 random ones about it; most cost less than half."""
     law, rng, paid = horizon(keep_out=[PASSING]), np.random.default_rng(7), []
     for situation in situations(10, 0.3, seed=7):
         law.previous = None
@@ -190,8 +190,8 @@ def test_law_finds_cheaper_plans_than_a_random_search() -> None:
 
 
 def test_a_way_below_the_clearance_to_the_ground_costs() -> None:
-    """A plan down and its mirror image up, from 0.8 m: alike but for 20 a metre and 200 a square
-    metre and second, below 0.3 m."""
+    """A plan that descends from 0.8 m costs more than its mirror image by 20 for each metre and 200
+    for each square metre below 0.3 m, times seconds."""
     law = horizon(keep_out=[IN_THE_WAY])
     law.prepare(Situation(5.0, at((5.0, 5.0, -0.8), 0.0), hold((5.0, 5.0, -0.8), 0.0), LEVEL))
     down = np.zeros((STEPS_AROUND, 3))
@@ -216,7 +216,7 @@ def test_the_deadline_ends_with_a_plan_no_worse_than_the_base() -> None:
 
 
 def test_speed_limit_slows_the_plan() -> None:
-    """The reference passes at 1.5 m/s and more: a plan limited to 1 m/s ends slower."""
+    """While the reference moves at 1.5 m/s and more, a plan with a limit of 1 m/s ends slower."""
     (situation,) = situations(1, 0.05, seed=4)
     fastest = {}
     for limit in (None, 1.0):

@@ -57,8 +57,8 @@ def fit_response(*measured, delay: Estimate | None = None, wanders=False) -> Res
 
 
 def test_innovations_of_a_matching_motion_are_white_and_of_unit_variance():
-    """Speed, disturbance and the rate of the wander are driven by the densities that the filter
-    assumes."""
+    """The simulated speed, disturbance and rate of the wander are driven by noise of the densities
+    that the filter assumes."""
     generator = np.random.default_rng(11)
     step_s, count, drag = 0.02, 20000, 0.7
     rate = 1.0 / WANDER_S
@@ -78,15 +78,15 @@ def test_innovations_of_a_matching_motion_are_white_and_of_unit_variance():
 
 
 def rms_in_sds(fits: list[ResponseFit], true) -> np.ndarray:
-    """How many standard deviations delay, frequency and damping are off, rms."""
+    """RMS errors of delay, frequency and damping (3,), each in its own standard deviations."""
     found = [(fit.delay_s, fit.natural_frequency_radps, fit.damping) for fit in fits]
     away = [[(each.value - t) / each.sd for each, t in zip(f, true, strict=True)] for f in found]
     return np.sqrt(np.mean(np.square(away), axis=0))
 
 
 def test_standard_deviations_agree_with_repeated_fits():
-    """Noise is autocorrelated over 0.2 s, as an estimator's: errors over their sd have an rms near
-    1."""
+    """With noise that is autocorrelated over 0.2 s, as an estimator's is, errors divided by their
+    sd have an RMS near 1."""
     (sent_at, values), fits = steps(6), []
     times, true = np.arange(0.3, 5.9, 0.01), (0.05, 11.0, 0.6)
     exact = simulated(values, sent_at, *true, times)
@@ -100,8 +100,8 @@ def test_standard_deviations_agree_with_repeated_fits():
 
 
 def test_standard_deviations_of_a_heading_whose_errors_wander():
-    """Sixty stretches of 5.4 s with one double step, as in the phase EXCITE; errors of PX4's
-    estimate, 16 mrad per root second. The residuals themselves would claim 40 % of the delay's."""
+    """Sixty times 5.4 s with one double step, as in the phase EXCITE; the heading's error walks as
+    PX4's, 16 mrad per root second. The residuals alone would give 40 % of the delay's true sd."""
     true, sent_at = (0.15, 3.1, 0.4), np.arange(0.0, 5.4, 0.1)
     values = 0.07 * np.where((sent_at >= 1.0) & (sent_at < 5.0), 1.0, 0.0)
     values[(sent_at >= 2.0) & (sent_at < 4.0)] = -0.07
@@ -117,7 +117,7 @@ def test_standard_deviations_of_a_heading_whose_errors_wander():
 
 
 def test_delay_known_beforehand_counts_by_its_uncertainty():
-    """An uncertain one changes nothing; a certain one decides, also on the natural frequency."""
+    """An uncertain prior changes nothing; a certain one is adopted and improves the frequency."""
     sent_at, values = steps(5)
     times = np.arange(0.3, 5.9, 0.01)
     noise = 0.004 * np.random.default_rng(1).normal(size=len(times))
@@ -138,7 +138,7 @@ def test_delay_known_beforehand_counts_by_its_uncertainty():
 def flown(
     *, tilt=0.25, heading=0.1, thrust_step=0.06, hover=0.5, drag=0.8, noise=0.0, seconds=12.0
 ) -> Trace:
-    """The plant of the other tests, swinging under open-loop commands."""
+    """Telemetry of the plant of `attitude_plant`, swinging under open-loop commands."""
     true = PX4.model_copy(
         update={
             "drag_translation_npmps": (drag,) * 3,
@@ -165,7 +165,7 @@ def flown(
     seen[:, 1:4] += noise * generator.normal(size=(len(seen), 3))
     seen[:, 7:9] += 0.2 * noise * generator.normal(size=(len(seen), 2))
     whole = Trace(commands, seen[:, [0, 7, 8, 12]], seen[:, :7])
-    return whole.between(0.5, seconds)  # what was commanded before is known
+    return whole.between(0.5, seconds)  # the commands before 0.5 s are kept
 
 
 def test_every_constant_is_identified():
@@ -191,7 +191,7 @@ def test_every_constant_is_identified():
 
 
 def test_a_velocity_that_contradicts_the_positions_is_told() -> None:
-    """Wrong by 0.4 m/s for seconds."""
+    """The reported velocity is wrong by up to 0.4 m/s for seconds."""
     true, told_mps = flown(), []
     for wrong_mps in (0.0, 0.4):
         position = true.position.copy()

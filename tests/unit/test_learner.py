@@ -1,4 +1,4 @@
-"""What contradictions, links and another mass make of vehicle and uncertainty in flight."""
+"""How contradictions, links and another mass change the identified vehicle and its uncertainty."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ FILE = PX4.model_copy(
     }
 )
 AGREES, CONTRADICTS = Unexplained(0.004, 0.1), Unexplained(0.05, 0.1)
-KNOWN_S = 3.0 * 0.002  # what a delay of `fit` may be wrong by
+KNOWN_S = 3.0 * 0.002  # three standard deviations of the delay of `fit`
 
 
 def fit(delay_s: float, frequency: float = 12.0, left: float = 0.004) -> Identified:
@@ -75,13 +75,14 @@ def test_what_a_file_may_have_is_adopted_and_nothing_else() -> None:
 
 
 def test_doubt_ends_with_what_explains_the_flight() -> None:
-    """The delay is the same; the first fit leaves too much unexplained, the second does not. Where
-    the constants explain the flight again, a fit that explains no more is not adopted."""
+    """A fit with the same delay that leaves too much unexplained is refused, the next one is
+    adopted. Once the constants in use explain the flight again, a fit that explains no more is
+    refused."""
     unknown = VehicleEstimate(FILE, delay_error_s=UNKNOWN_DELAY_S).uncertainty
     assert (unknown.tilt_s, unknown.thrust_s) == (UNKNOWN_DELAY_S, UNKNOWN_DELAY_S)
     estimate = estimate_with(fit(0.05))
     assert estimate.uncertainty.tilt_s == pytest.approx(KNOWN_S)
-    # three sd of what a fit of the thrust begins with, 30 ms of delay and 50 ms of lag
+    # three sd with which a fit of the thrust begins: 30 ms of the delay and 50 ms of the lag
     assert estimate.uncertainty.thrust_s == pytest.approx(3.0 * math.hypot(0.03, 0.05))
     estimate.on_contradiction(CONTRADICTS, CONTRADICTS, 10.0)
     assert estimate.uncertainty.tilt_s == DOUBTED_DELAY_S
@@ -91,7 +92,7 @@ def test_doubt_ends_with_what_explains_the_flight() -> None:
     estimate.review_tilt(fit(0.05, 5.0), CONTRADICTS, 14.0)
     assert estimate.sentences[1].startswith("identified tilt delay 50 +- 2 ms, 5.0 rad/s")
     assert estimate.cause == "identified delay of the tilt 50 +- 2 ms"
-    assert estimate.result is None  # the next flight begins without what was contradicted once
+    assert estimate.result is None  # what was contradicted once is not kept for the next flight
     again = estimate_with(fit(0.05))
     again.on_contradiction(CONTRADICTS, CONTRADICTS, 10.0)
     again.review_tilt(fit(0.05, 11.0), AGREES, 12.0)
@@ -130,8 +131,8 @@ def test_a_later_fit_of_the_thrust_is_adopted_if_it_is_more_certain_or_twice_ano
 
 
 def test_a_drag_is_replaced_by_a_vague_one_only_if_that_contradicts_it_twice() -> None:
-    """Circle of 8 m/s on a real PX4: a first fit in motion of 1.19 +- 0.15 took the place of 1.03
-    +- 0.02 from the climb, and the position error was 0.28 m."""
+    """On a circle of 8 m/s on a real PX4 a first fit in motion, 1.19 +- 0.15, replaced the 1.03
+    +- 0.02 of the climb, and the position error was 0.28 m."""
     estimate = estimate_with(fit(0.05))
     for found_ps, sd_ps, used_ps in (
         (1.30, 0.15, 1.30),  # the first
@@ -148,7 +149,7 @@ def test_a_drag_is_replaced_by_a_vague_one_only_if_that_contradicts_it_twice() -
         (1.50, 0.10, 1.08),
         (1.48, 0.10, 1.48),  # contradicts twice in a row
         (1.30, 0.15, 1.30),
-        (9.00, 0.01, 1.30),  # out of bounds: says nothing of the one in use
+        (9.00, 0.01, 1.30),  # out of bounds: no evidence against the one in use
         (9.00, 0.01, 1.30),
         (1.50, 0.10, 1.50),
     ):
@@ -160,7 +161,7 @@ def test_neither_tilt_nor_contradiction_changes_an_identified_thrust() -> None:
     estimate = estimate_with(fit(0.24))
     assert estimate.vehicle.thrust_delay_s == pytest.approx(FILE.thrust_delay_s + 0.2)
     estimate.review_thrust(thrust_fit(0.30), 5.0)
-    estimate.on_contradiction(CONTRADICTS, AGREES, 10.0)  # what was flown before explains more
+    estimate.on_contradiction(CONTRADICTS, AGREES, 10.0)  # the constants flown before explain more
     assert estimate.vehicle.tilt == FILE.tilt
     assert effect_s(estimate.vehicle) == pytest.approx(0.30)
     estimate.review_tilt(fit(0.45), CONTRADICTS, 12.0)
@@ -169,7 +170,7 @@ def test_neither_tilt_nor_contradiction_changes_an_identified_thrust() -> None:
 
 
 def test_another_delay_is_adopted_once_something_else_shows_it_too() -> None:
-    """A second fit, or a contradiction that this one explains; not one that it does not explain."""
+    """A new delay needs a second fit, or contradicting telemetry that the new fit explains."""
     estimate = estimate_with(fit(0.05))
     estimate.review_tilt(fit(0.25), AGREES, 10.0)
     assert estimate.vehicle.tilt.delay_s == 0.05
@@ -186,8 +187,7 @@ def test_another_delay_is_adopted_once_something_else_shows_it_too() -> None:
 
 
 def test_after_two_contradictions_the_delay_is_unknown_for_20_s_of_calm() -> None:
-    """Also where the fits that follow show another delay. A fit that the constants in use
-    contradict once more begins the time anew."""
+    """Also if later fits show another delay. A further contradiction restarts the 20 s."""
     estimate, delay_s = estimate_with(fit(0.05)), 0.09
     for begun_s in (10.0, 20.0):
         assert estimate.uncertainty.tilt_s == pytest.approx(KNOWN_S)
@@ -207,7 +207,7 @@ def test_after_two_contradictions_the_delay_is_unknown_for_20_s_of_calm() -> Non
 
 
 def test_doubt_about_the_tilt_leaves_the_other_constants() -> None:
-    """What followed the tilt's delay is restored with it; what was identified itself is not."""
+    """Delays that were set with the tilt's return to the file's; identified constants are kept."""
     tilt = fit(0.15).tilt
     found = Identified(
         10.0, tilt=tilt, hover_thrust=Estimate(0.62, 0.003), thrust_lag_s=Estimate(0.04, 0.01)
@@ -224,7 +224,7 @@ def test_doubt_about_the_tilt_leaves_the_other_constants() -> None:
         "drag_translation_npmps": (0.4, 0.4, 0.4),
     }
     assert estimate.vehicle == FILE.model_copy(update=identified)
-    assert estimate_with(fit(0.06)).vehicle.thrust_delay_s == 0.01  # the vehicle's own difference
+    assert estimate_with(fit(0.06)).vehicle.thrust_delay_s == 0.01  # 20 ms: not a link
     thrust = {"thrust_delay_s": Estimate(0.05, 0.01), "thrust_effect_s": Estimate(0.06, 0.01)}
     own = estimate_with(Identified(10.0, tilt=tilt, **thrust))
     assert own.uncertainty.thrust_s == pytest.approx(0.03)
@@ -249,8 +249,8 @@ def test_a_link_is_in_every_delay_and_its_changes_make_them_uncertain() -> None:
 
 
 def test_delays_of_a_remembered_vehicle_follow_the_link_over_many_flights() -> None:
-    """From 204 to 108 ms in steps of 24, below the 30 ms that count as a change; one flight ends
-    before the link is measured. The vehicle's own delays stay what they are."""
+    """The link's delay falls from 204 to 108 ms in steps of 24 ms, less than the 30 ms that count
+    as a change; one flight ends before it is measured. The vehicle's own delays stay the same."""
     own_s, at_s = 0.053, 0.204
     tilt = FILE.tilt.model_copy(update={"delay_s": own_s + at_s})
     delays = {"tilt": tilt, "thrust_delay_s": 0.06 + at_s}
@@ -271,8 +271,8 @@ def test_delays_of_a_remembered_vehicle_follow_the_link_over_many_flights() -> N
 
 @pytest.mark.parametrize(("from_s", "to_s"), [(0.2, 0.004), (0.004, 0.6)])
 def test_no_link_moves_a_delay_out_of_its_limits(from_s: float, to_s: float) -> None:
-    """An identified thrust delay of 190 ms behind a link of 200 ms that is gone; a file whose
-    thrust acts later than its tilt, behind a link of 600 ms. Later fits are adopted."""
+    """First a thrust delay of 190 ms was identified over a link of 200 ms, which is now 4 ms; then
+    the link has 600 ms and the file's thrust acts later than its tilt. Later fits are adopted."""
     slow = FILE.model_copy(update={"thrust_delay_s": 0.1})
     recalled = slow.later_by(from_s).model_copy(update={"thrust_delay_s": 0.19})
     known = IdentifiedVehicle(recalled, 0.002, from_s, 0.02)
@@ -287,9 +287,9 @@ def test_no_link_moves_a_delay_out_of_its_limits(from_s: float, to_s: float) -> 
 
 
 def test_learner_announces_what_is_new_in_motion(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A lasting contradiction twice, though every new fit seems to explain the flight, and one that
-    does not last not at all; another hover thrust of the observer, if it differs by more than 6 %
-    and is within bounds."""
+    """A lasting contradiction is announced twice, though every new fit seems to explain the flight,
+    a short one never. The observer's hover thrust is announced if it differs by more than 6 % and
+    is within bounds."""
 
     def in_pieces(*_):
         yield
@@ -327,7 +327,7 @@ def test_learner_announces_what_is_new_in_motion(monkeypatch: pytest.MonkeyPatch
 
 
 def test_steps_end_where_they_began_and_outside_the_box() -> None:
-    """Integrated twice, tilts by 2 degrees to either side leave the vehicle where it was."""
+    """The tilts by 2 degrees to either side, integrated twice, leave the vehicle where it was."""
     learner = Learner(FILE, IdentifySettings(box_m=0.5))
     learner.on_stage(Stage.STEPS, 10.0)
     level = Command(9.8, (0.0, 0.0, 1.0), 0.0)
@@ -341,7 +341,7 @@ def test_steps_end_where_they_began_and_outside_the_box() -> None:
     assert {round(each.thrust_mps2, 2) for each in flown} == {9.31, 9.8, 10.29}
     assert {round(each.heading_rad, 3) for each in flown} == {-0.07, 0.07}
     assert learner.excited(level, 10.1, 0.51) == level
-    assert learner.excited(level, 10.1, 0.0) == level  # for good
+    assert learner.excited(level, 10.1, 0.0) == level  # the steps have ended for this flight
 
 
 def test_without_identification_the_file_is_flown_and_nothing_is_recalled() -> None:

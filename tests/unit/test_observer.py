@@ -1,5 +1,5 @@
-"""The observer against an independent plant, SciPy's integrator and Riccati equation; noise and
-drift that it estimates, against motions and noises made with NumPy."""
+"""The observer against an independent plant, SciPy's integrator and Riccati equation; its
+estimates of noise and drift against motions and noise generated with NumPy."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def watch(observer: Observer, plant: Plant) -> None:
 
 
 def hovering(noise: Noise | None = None, until_s: float = 5.0) -> Observer:
-    """An observer after a perfect hover with telemetry every 10 ms."""
+    """An observer after a hover with exact telemetry every 10 ms."""
     observer = Observer(NO_DELAY, noise)
     observer.on_command(0.0, LEVEL)
     for i in range(round(until_s / 0.01) + 1):
@@ -55,8 +55,8 @@ def hovering(noise: Noise | None = None, until_s: float = 5.0) -> Observer:
 
 
 def test_steady_gains_are_those_of_the_riccati_equation() -> None:
-    """Lateral motion [p, v, b, b', d] by SciPy, with the velocity ignored (its sd 1 m/s), against
-    what disturbing one message by a little changes."""
+    """The gains of the lateral motion [p, v, b, b', d] by SciPy are how much the state changes if
+    one message is disturbed by 1e-6. The velocity, with an sd of 1 m/s, has no influence."""
     small, step_s, noise = 1e-6, 0.01, Noise(velocity_sd_mps=1.0)
     wn, damping, drag_ps = 11.4, 0.56, PX4.drag_per_mass_ps
     a, b = np.zeros((5, 5)), np.zeros((5, 5))
@@ -92,8 +92,8 @@ def test_steady_gains_are_those_of_the_riccati_equation() -> None:
 
 @pytest.mark.parametrize("damping", [0.56, 1.115])
 def test_replay_agrees_with_scipy(damping: float) -> None:
-    """One second under five commands, each axis with its own delay, against DOP853 restarted at
-    every switch."""
+    """The oracle for one second under five commands, each axis with its own delay, is DOP853,
+    restarted whenever a command takes effect."""
     tilt = PX4.tilt.model_copy(update={"damping": damping})
     vehicle = PX4.model_copy(update={"tilt": tilt})
     rng = np.random.default_rng(3)
@@ -130,8 +130,8 @@ def test_replay_agrees_with_scipy(damping: float) -> None:
 
 
 def test_prediction_is_exact_on_a_matching_plant() -> None:
-    """Random tilt and heading at 10 Hz, facing south: heading, its telemetry and its commands are
-    now on one side of the wrap, now on the other. After a gap of half a second the state is right
+    """Commands are random tilts and headings at 10 Hz, facing south, so that heading, telemetry and
+    commands cross the wrap at +-pi. After a gap of half a second in telemetry the state is right
     at once."""
     plant, rng = Plant(Truth(PX4)), np.random.default_rng(5)
     plant.x[11] = math.pi
@@ -176,7 +176,7 @@ def test_prediction_is_exact_on_a_matching_plant() -> None:
 
 
 def test_vertical_is_predicted_to_the_time_when_the_thrust_acts() -> None:
-    """Falling at 2 m/s with thrust delay 15 ms, tilt delay 57 ms: two times, two heights."""
+    """At 2 m/s down, delays of 15 ms (thrust) and 57 ms (tilt) give two times and heights."""
     observer, thrust = Observer(PX4), G - 1.02 * 2.0
     observer.on_command(0.0, command(0.0, 0.0, thrust))
     for i in range(301):
@@ -198,7 +198,7 @@ def test_vertical_is_predicted_to_the_time_when_the_thrust_acts() -> None:
 def test_disturbance_and_velocity_converge_at_any_rate(
     gap_s: float, velocity_sd_mps: float
 ) -> None:
-    """The velocity is reported with a bias of 0.3 m/s."""
+    """The reported velocity has a bias of up to 0.3 m/s."""
     push = np.array((0.8, -0.5, 0.4))
     truth = Truth(PX4, wind_force_ned_mps2=tuple(push))
     plant = Plant(truth)
@@ -218,7 +218,7 @@ def test_disturbance_and_velocity_converge_at_any_rate(
 
 
 def test_hover_thrust_is_estimated_from_the_disturbance() -> None:
-    """The vehicle file has a hover thrust of u_h, the plant u_h / 0.85: u_h (1 + d_z / g)."""
+    """The file says u_h, the plant hovers at u_h / 0.85; the estimate is u_h (1 + d_z / g)."""
     plant = Plant(Truth(PX4, thrust_scale=0.85))
     observer, sent = Observer(PX4), command(0.0, 0.0, G / 0.85)
     plant.x[10] = G
@@ -239,7 +239,7 @@ def test_hover_thrust_is_estimated_from_the_disturbance() -> None:
 
 
 def test_observer_goes_on_smoothly_with_another_drag() -> None:
-    """The predicted acceleration stays the same: the disturbance changes with the drag."""
+    """The disturbance changes with the drag, so that the predicted acceleration stays the same."""
     observer = Observer(PX4)
     for i in range(300):
         feed(observer, 0.01 * i, (0.02 * i, -0.01 * i, -3.0), (2.0, -1.0, 0.0))
@@ -255,7 +255,7 @@ def test_observer_goes_on_smoothly_with_another_drag() -> None:
 
 
 def test_prediction_reaches_to_its_time_on_a_link_that_is_2_s_late() -> None:
-    """A vehicle that hovers level at 1 m/s is slowed by its drag alone."""
+    """A level vehicle that moves at 1 m/s is slowed by its drag alone."""
     observer, drag_ps, ahead_s = Observer(PX4), PX4.drag_per_mass_ps, 2.5
     observer.on_command(0.0, LEVEL)
     feed(observer, 1.0, velocity=(1.0, 0.0, 0.0))
@@ -294,7 +294,7 @@ def test_old_and_repeated_messages_are_dropped() -> None:
 
 
 def test_position_older_than_the_attitude_is_used_at_its_own_time() -> None:
-    """Position stamped 8 ms before the newest attitude, at 3 m/s: no error of 24 mm."""
+    """A position stamped 8 ms before the newest attitude causes no error of 24 mm at 3 m/s."""
     observer, tilt = Observer(NO_DELAY), -1.02 * 3.0 / G
     observer.on_command(0.0, command(tilt, 0.0))
     b = quaternion_from_thrust_direction(np.array([tilt, 0.0, math.sqrt(1 - tilt**2)]), 0.0)
@@ -308,8 +308,8 @@ def test_position_older_than_the_attitude_is_used_at_its_own_time() -> None:
 
 
 def test_a_jump_is_followed_without_a_velocity_kick() -> None:
-    """A position that jumps, and a velocity, which becomes bias. The next position has little
-    effect: the jump says nothing of the velocity."""
+    """After a jump the next position has little effect on the velocity, because the jump says
+    nothing about it. A jump of the reported velocity becomes bias."""
     kicks = []
     for position in ((2.0, -1.0, 0.0), STILL):
         observer = hovering()
@@ -330,7 +330,7 @@ def test_restart_after_a_long_gap_keeps_the_disturbance_and_after_a_reboot_the_c
     observer = Observer(NO_DELAY)
     observer.on_command(0.0, LEVEL)
     assert not observer.ready
-    for i in range(600):  # a push of .5 at its terminal speed
+    for i in range(600):  # a disturbance of 0.5 m/s^2 at its terminal speed
         feed(observer, 0.01 * i, (0.005 * i / 1.02, 0.0, 0.0), (0.5 / 1.02, 0.0, 0.0))
     assert observer.ready
     observer.on_position(9.0, (7, 7, -7), (1, 0, 0))  # integers
@@ -347,7 +347,7 @@ def test_restart_after_a_long_gap_keeps_the_disturbance_and_after_a_reboot_the_c
 
 
 def test_state_is_finite_under_any_telemetry() -> None:
-    """Irregular, repeated and decreasing stamps, random values."""
+    """Time stamps are irregular, repeated and decreasing, and values are random."""
     rng, observer, time_s = np.random.default_rng(11), Observer(PX4), 0.0
     for _ in range(1500):
         time_s += rng.choice([0.0, 0.001, 0.01, 0.05, 0.4, -0.02, -0.3, 1.5, -2.0])
@@ -373,7 +373,7 @@ FIXED_DRIFT = Noise(disturbance_limit_mps2=NOISE.disturbance_mps2)
 
 @dataclass(frozen=True)
 class Hover:
-    """A level vehicle that only a disturbance moves: rows of NED at `times`."""
+    """Motion of a level vehicle that only a disturbance moves: (N, 3) in NED at `times`, SI."""
 
     times: Array
     positions: Array
@@ -382,8 +382,8 @@ class Hover:
 
 
 def hover(seconds: float, gap_s: float, seed: int, drift: float = 0.0, kicks: float = 0.0) -> Hover:
-    """v' = d - c v, d a random walk of density `drift` (m/s^2 per root second), v kicked with
-    density `kicks` (m/s per root second); per axis, steps of 1 ms."""
+    """Integrate v' = d - c v for each axis in steps of 1 ms; d is a random walk of density `drift`
+    (m/s^2 per root second), and white noise of density `kicks` (m/s per root second) drives v."""
     rng = np.random.default_rng(seed)
     steps, root = round(seconds / 1e-3), np.sqrt(1e-3)
     disturbances = np.cumsum(drift * root * rng.standard_normal((steps, 3)), axis=0)
@@ -403,8 +403,8 @@ def observe(
     white: tuple[float, float] = (0.0, 0.0),
     adopted: bool = True,
 ) -> tuple[Observer, Array, Array]:
-    """An observer after telemetry of `flown` with white noise on position and velocity; estimated
-    positions and disturbances (N, 3)."""
+    """Feed an observer with `flown` and white noise of the sds `white` on position (m) and velocity
+    (m/s). Return it with its estimates of position and disturbance (N, 3)."""
     rng = np.random.default_rng(99)
     observer = Observer(NO_DELAY, noise)
     observer.on_command(0.0, LEVEL)
@@ -422,7 +422,7 @@ def observe(
 
 
 def noise_sds(observer: Observer) -> Array:
-    """Noise of position (m) and reported velocity (m/s), as estimated (2,)."""
+    """Estimated sds of the noise of position (m) and reported velocity (m/s), (2,)."""
     return np.sqrt(observer.estimated.variances)
 
 
@@ -433,8 +433,8 @@ def rms(errors: Array) -> float:
 
 @pytest.mark.parametrize("gap_s", [0.008, 0.05])
 def test_white_noise_is_measured_and_filtered(gap_s: float) -> None:
-    """2 cm and 5 cm/s on a drifting hover, at 125 and 20 Hz: estimated within a quarter. At
-    most 0.6 cm per sample at 125 Hz is left; with R as configured, 2 mm, 1 cm."""
+    """Noise of 2 cm and 5 cm/s on a drifting hover is estimated within a quarter, at 125 and 20 Hz.
+    At 125 Hz at most 0.6 cm per sample is left; with the configured R, 2 mm, it is 1 cm."""
     flown = hover(25.0, gap_s, seed=1, drift=0.1)
     observer, adapted, _ = observe(flown, white=(0.02, 0.05))
     assert noise_sds(observer)[0] == pytest.approx(0.02, rel=0.25)
@@ -444,9 +444,9 @@ def test_white_noise_is_measured_and_filtered(gap_s: float) -> None:
 
 
 def test_estimate_that_wanders_is_neither_noise_nor_gusts() -> None:
-    """A velocity kicked as PX4's frame of reference is (0.2 m/s per root second), smooth from
-    sample to sample, on two seeds: the position has no noise, and a third of the variance of the
-    kicks, 0.0103 m/s, is taken for noise of the velocity."""
+    """The velocity walks as that of PX4's estimate (0.2 m/s per root second) and is smooth from
+    sample to sample. No noise of the position is found; a third of the variance of the walk,
+    0.0103 m/s, is taken for noise of the velocity. Two seeds."""
     for seed in (3, 4):
         observer, _, _ = observe(hover(20.0, 0.008, seed=seed, kicks=0.2))
         assert noise_sds(observer)[0] == NOISE.position_sd_m
@@ -456,9 +456,9 @@ def test_estimate_that_wanders_is_neither_noise_nor_gusts() -> None:
 
 
 def test_gusts_are_followed_faster() -> None:
-    """A disturbance drifting by 0.7 m/s^2 per root second: both densities grow, the vertical one
-    only once the thrust is identified, and fall afterwards. The estimated disturbance has less than
-    0.7 of the error that the configured density gives."""
+    """While the disturbance drifts by 0.7 m/s^2 per root second, both estimated densities grow, the
+    vertical one only once the thrust is identified; afterwards they fall. The error of the
+    disturbance is less than 0.7 of the error with the configured density."""
     flown = hover(20.0, 0.01, seed=6, drift=0.7)
     _, _, fixed = observe(flown, FIXED_DRIFT)
     early, _, _ = observe(flown, adopted=False)
@@ -473,7 +473,7 @@ def test_gusts_are_followed_faster() -> None:
 
 
 def test_jumps_are_not_noise_and_do_not_hide_gusts() -> None:
-    """Fifteen resets of the estimator's position by 2 m in 15 s of gusts."""
+    """The estimator resets its position fifteen times by 2 m in 15 s of gusts."""
     flown = hover(15.0, 0.01, seed=9, drift=0.7)
     jumps = 2.0 * np.cumsum(np.arange(len(flown.times)) % 100 == 50)[:, None]
     observer, _, _ = observe(Hover(flown.times, flown.positions + jumps, *[flown.velocities] * 2))
@@ -492,7 +492,7 @@ def test_estimates_are_bounded_and_cleared_by_a_reset() -> None:
 
 
 def test_positions_that_an_attitude_has_overtaken_leave_the_noise_finite() -> None:
-    """Two of them arrive after a newer attitude: the state has the same time at both."""
+    """Two positions arrive after a newer attitude, so that the state has the same time at both."""
     observer = Observer(NO_DELAY, NOISE)
     observer.on_command(0.0, LEVEL)
     for i in range(200):

@@ -1,4 +1,4 @@
-"""The paper's law: what it decides, and its flight over attitude setpoints."""
+"""The paper's law: its decisions, and the attitude setpoints that it sends for them."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ HOVER = Command(9.81, (0.0, 0.0, 1.0), 0.0)
 
 
 def tilted(heading: float) -> tuple[PredictedState, Straight]:
-    """The same situation, seen from the vehicle, at any heading."""
+    """A state and a reference that look the same from the vehicle at any heading."""
     turn = Rotation.from_euler("Z", heading)
     state = state_at(
         turn.apply([1.0, -2.0, 0.5]), turn.apply([0.8, 0.3, -0.2]), 0.08, -0.05, heading,
@@ -93,7 +93,7 @@ SUMMED = IntegralSettings(weights=(80.0, 80.0, 15.0, 50.0))
 
 @pytest.mark.parametrize("settings", [PaperSettings(), PaperSettings(integral=SUMMED)])
 def test_the_law_is_the_same_at_every_heading(settings: PaperSettings) -> None:
-    """Beside the wrap of the heading; with the sum of three decisions, where there is one."""
+    """The second heading is near the wrap; three decisions let an integral term accumulate."""
     controller, heading = PaperController(PAPER, settings), 3.1
     commands = []
     for seen_from in (0.0, heading):
@@ -112,7 +112,7 @@ def test_the_law_is_the_same_at_every_heading(settings: PaperSettings) -> None:
 
 
 def test_what_is_sent_is_the_attitude_of_the_next_state() -> None:
-    """On the paper's plant, by what the law decides there."""
+    """The oracle is the paper's sampled plant with the inputs that the law decides there."""
     state, reference = tilted(0.4)
     command = PaperController(PAPER).decide(Situation(0.0, state, reference, HOVER)).command
     (dynamics, inputs), settings = sampled_matrices(PAPER, 0.1), PaperSettings()
@@ -153,7 +153,7 @@ def test_rates_that_are_not_finite_and_a_cost_that_overflows_give_no_decision() 
 
 
 def test_the_summed_error_has_limits_and_waits_while_an_input_is_at_its_bound() -> None:
-    """The sum acts on the slope of the cost; at its limits a further error changes nothing."""
+    """The sum acts on the gradient of the cost; at its limits more error changes nothing."""
     narrow = SUMMED.model_copy(update={"limits": (0.1, 0.1, 0.1, 0.1)})
 
     def slopes(summed: IntegralSettings, down_m: float, *errors: float) -> list[Array]:

@@ -97,7 +97,7 @@ def test_the_cost_to_go_makes_one_step_the_lqr() -> None:
 
 
 def test_time_constant_by_horizon() -> None:
-    """A long horizon is the infinite one."""
+    """The poles of 300 steps are those of the infinite horizon."""
     for steps, time_constant_s in ((1, 39.16), (5, 5.46), (10, 1.69), (20, 1.07)):
         slowest = abs(receding(*paper_model(), Q, R, RATE, steps)[0])
         assert -0.1 / math.log(slowest) == pytest.approx(time_constant_s, rel=5e-3)
@@ -107,7 +107,7 @@ def test_time_constant_by_horizon() -> None:
 
 @pytest.mark.parametrize("plant", PlantKind)
 def test_cost_to_go_settles_a_hundred_times_closer(plant: PlantKind) -> None:
-    """1 m off at hover, after 20 s: the time constants are 39 s and about 1 s."""
+    """A hover begins 1 m off and is compared after 20 s; time constants are 39 s and about 1 s."""
     task = FlightTask(PaperSettings(), plant, hover=True, start_offset_m=(1.0, 0.0, 0.0), steps=200)
     one, best = (
         fly(replace(task, cost_to_go=cost_to_go)).position_errors_m[-1]
@@ -118,7 +118,7 @@ def test_cost_to_go_settles_a_hundred_times_closer(plant: PlantKind) -> None:
 
 
 def test_both_plants_settle_alike_in_wind_and_with_weak_thrust() -> None:
-    """A level vehicle reaches the wind's velocity, and sinks at the rate that its drag allows."""
+    """A level vehicle reaches the wind's velocity; with 10 % less thrust it sinks by its drag."""
     vehicle = paper_vehicle()
     sink = 0.1 * vehicle.mass_kg * vehicle.gravity_mps2 / vehicle.drag_translation_npmps[2]
     wind = np.array([1.5, -0.5, 0.2])
@@ -158,7 +158,7 @@ def test_the_exact_optimum_is_met_at_the_best_damping_and_missed_beside_it() -> 
     assert missed[0.65] == 0.0
     assert missed[0.3] > 0.2
     assert missed[1.0] > 0.4
-    assert mean_spread(flown(0.3)) < 1e-2 * mean_spread(flown(0.65))  # small, and worth nothing
+    assert mean_spread(flown(0.3)) < 1e-2 * mean_spread(flown(0.65))  # small, but it is missed
 
 
 def test_reweighting_takes_nearly_all_of_the_error() -> None:
@@ -191,8 +191,8 @@ def test_limits_hold_in_every_sample_of_the_path() -> None:
 
 
 def test_a_vehicle_outside_its_limits_comes_back_and_stays_within_whatever_is_done() -> None:
-    """After a gust it brakes. Then bang-bang by chance: the corner of the narrowed box, drawn anew
-    now and then, for 3000 steps."""
+    """The vehicle begins at twice its speed limit and brakes. Then its inputs are a random corner
+    of the narrowed box, drawn every 7 steps, up to 3000 steps."""
     dynamics, inputs = paper_model()
     box = LimitedBox(dynamics, inputs, TIGHT, *BOX)
     rng = np.random.default_rng(1)
@@ -240,7 +240,7 @@ Run = tuple[Path, dict[str, tables.Table | Figure]]
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Everything, with flights of 5 s."""
+    """Directory and contents of a whole study, with flights of 5 s."""
     out = tmp_path_factory.mktemp("paper")
     with pytest.MonkeyPatch.context() as short:
         short.setattr(closed_loop, "fly", lambda task: fly(replace(task, steps=50)))

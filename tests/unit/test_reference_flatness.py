@@ -1,5 +1,5 @@
-"""Flatness against the dynamics integrated and rotations by SciPy; what a vehicle cannot fly is
-refused with time, value and limit."""
+"""Differential flatness against SciPy's integrator and rotations; a reference that a vehicle cannot
+fly is refused with time, value and limit."""
 
 from __future__ import annotations
 
@@ -62,8 +62,8 @@ def test_thrust_along_b_flies_the_trajectory(flown: Track) -> None:
 
 @pytest.mark.parametrize("flown", TRACKS)
 def test_rates_turn_the_attitude(flown: Track) -> None:
-    """Body rates are the rotation vector from one attitude to the next, by SciPy; b is its z. The
-    rate of the thrust is its central difference."""
+    """Body rates agree with SciPy's rotation vector from one attitude to the next, b with its z
+    axis, and the rate of the thrust with a central difference."""
     times = np.linspace(0.1, flown.duration_s - 0.1, 400)
     half = 1e-4
     middle, before, after = (state_of(flown, times + shift) for shift in (0.0, -half, half))
@@ -109,7 +109,7 @@ def vehicle(**changes: object) -> Vehicle:
 
 
 def test_a_circle_by_hand() -> None:
-    """Its tilt, height and distance; a thrust beyond a limit that is just too low."""
+    """Tilt, height and distance are as by hand; limits below rate and thrust refuse the circle."""
     inward = (2 * math.pi / 8) ** 2 * 2.0
     flown = track(shape="circle", radius_m=2.0, period_s=8.0, run_in_s=30, run_out_s=30)
     reached = math.atan2(inward, 9.8), 3.0, 2.0
@@ -165,7 +165,7 @@ def test_refused_with_time_value_and_limit(
 
 @dataclass
 class Leap:
-    """Speed grows with time, height falls."""
+    """A reference whose speed grows and whose height falls with time."""
 
     start_down_m: float
     duration_s = 10.0
@@ -197,7 +197,7 @@ def test_what_is_not_a_number_is_refused() -> None:
 
 
 def test_long_references_are_checked_in_parts() -> None:
-    """Gentle for 500 s; what is greatest, or too brisk, at their end."""
+    """The line is gentle for 500 s and has its greatest values, or a sudden stop, at its end."""
     climb = {"shape": "line", "to_north_m": 30, "climb_m": 96, "speed_mps": 0.2, "height_m": 2.0}
     assert check(track(**climb), vehicle())[1:] == pytest.approx((98.0, 30.0))
     with pytest.raises(ValueError, match=r"a pitch rate of .* at 50\d"):

@@ -1,4 +1,4 @@
-"""Every shape and every shipped reference: derivatives, rest, broadcasting, runs, pauses."""
+"""Every shape and every shipped reference: derivatives, rest, arrays, run-in, pauses."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ def orders(sample: FlatSample) -> tuple[Array, Array]:
 
 @pytest.mark.parametrize("track", TRACKS.values(), ids=TRACKS.keys())
 def test_derivatives_rest_and_arrays_of_every_track(track: Track) -> None:
-    """By central differences, each order from the one below it; none jumps; at rest outside; arrays
-    equal loops."""
+    """Each derivative is the central difference of the order below and has no jump, the track is at
+    rest before and after, and arrays give the same as loops."""
     drawn = np.random.default_rng(3).uniform(0.12, track.duration_s - 0.12, 60)
     here, after, before = (orders(track.sample(drawn + by)) for by in (0.0, 1e-5, -1e-5))
     grid = orders(track.sample(np.linspace(-0.5, track.duration_s + 0.5, 20_001)))
@@ -107,7 +107,7 @@ def test_a_paused_reference_rests_on_its_path_and_continues_from_there() -> None
     np.testing.assert_allclose(paused.sample(again_s).position_ned_m, later, atol=1e-8)
     before = track.sample(7.0).position_ned_m + moved
     np.testing.assert_allclose(paused.sample(107.0).position_ned_m, before, atol=1e-8)
-    twice = Moved(paused, paused_s=116.0)  # while it gains speed
+    twice = Moved(paused, paused_s=116.0)  # while the reference gains speed
     assert twice.own_s(1000.0) == pytest.approx(paused.own_s(116.0 + STOP_S / 2))
     assert paused.duration_s == began_s + track.duration_s + resumed_s - paused_s
 
@@ -132,7 +132,7 @@ def test_shipped_references_are_feasible_and_have_their_peak_speeds() -> None:
 
 
 def test_published_curves_are_as_their_definitions() -> None:
-    """Those of quad_trajectories, and ours: (north, east, height) by the time at full speed."""
+    """Curves of quad_trajectories and ours, as north, east and height by time at full speed."""
     s = np.linspace(3.0, 50.0, 400)
     trefoil, w = shipped_track("trefoil"), math.tau * s / 25.0
     height_m, progress = 2.25 + 0.75 * np.sin(3 * w), 0.5 - 0.5 * np.cos(math.tau * s / 55.0)
@@ -162,7 +162,7 @@ def test_heading_along_velocity_points_along_it_and_unwraps() -> None:
     cross = nose[:, 0] * direction[:, 1] - nose[:, 1] * direction[:, 0]
     np.testing.assert_allclose(cross, 0.0, atol=1e-9)
     assert np.all(np.sum(nose * direction, axis=-1) > 0.0)
-    # clockwise round three laps and the runs: through +-pi without a jump, 3 turns and 3.5 s more
+    # three laps clockwise, run-in and run-out: no jump at +-pi; 3 turns and 3.5 s of one more
     assert np.abs(np.diff(sample.heading_rad)).max() < 0.011
     turned = sample.heading_rad[-1] - sample.heading_rad[0]
     assert turned == pytest.approx(2 * np.pi * (3 + 3.5 / 8.0), abs=1e-9)
@@ -249,8 +249,8 @@ LIMITS = PathLimits(
 
 
 def shares(path: Spline) -> tuple[float, float, float, float]:
-    """The greatest speed, thrust, tilt and turn rate of the thrust, of their limits, from positions
-    alone: by differences of a fine grid."""
+    """Greatest speed, thrust, tilt and turn rate of the thrust, each divided by its limit, from
+    positions alone, by differences on a fine grid."""
     s, step_s = np.linspace(0.0, path.length_s, 40_001, retstep=True)
     position = path.jet(s)[0]
     velocity = np.gradient(position, step_s, axis=0)[3:-3]

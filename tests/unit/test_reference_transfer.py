@@ -1,5 +1,5 @@
-"""Transfers against their limits, their ends and the closed form; CSV tables: what they mean, how
-smooth they become, and the sentence for every wrong one."""
+"""Transfers against their limits, their ends and the closed form; CSV tables: their
+meaning, how smooth they are flown, and the sentence for each error."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ def test_as_fast_as_the_limits_allow(distance_m: float) -> None:
 
 
 def test_any_start_is_braked_and_the_way_flown_within_the_limits() -> None:
-    """Climbing away, falling, sideways: without a kink, to rest at the target, not further out than
-    braking needs, and no slower than at constant acceleration with twice the time for gaining and
-    losing the speed. A long way is flown at constant speed."""
+    """From any start velocity the transfer has no kink, ends at rest at the target and goes no
+    further out than braking needs. It lasts no longer than a transfer at constant acceleration with
+    twice the time to gain and lose speed. A long way is flown at constant speed."""
     rng = np.random.default_rng(5)
     limits = Limits(cruise_mps=4.0, cruise_vertical_mps=1.5, acceleration_mps2=2.0)
     for size_m, speed_mps in itertools.product((2.0, 30.0, 500.0), (0.0, 0.5, 1.4, 3.0, 8.0)):
@@ -79,7 +79,7 @@ def table_track(text: str, **settings: object) -> Track:
 
 
 def test_passes_through_every_row_with_its_heading() -> None:
-    """Columns in any order and by any name, from any time on; rows are not at equal times."""
+    """Columns may have any order and any of their names, times any start and unequal steps."""
     times = np.delete(np.linspace(0, 12, 25), 7)
     heading = (300 + 15 * times) % 360
     rows = "".join(
@@ -103,7 +103,7 @@ def test_passes_through_every_row_with_its_heading() -> None:
 
 
 def test_knots_forgive_rounded_rows() -> None:
-    """100 Hz rows rounded to a millimetre: interpolated they cannot be flown, fitted they can."""
+    """Rows at 100 Hz rounded to a millimetre cannot be flown interpolated, but fitted they can."""
     times = np.arange(0, 10, 0.01)
     rows = "".join(
         f"{t:.2f},{2 * math.sin(0.7 * t):.3f},{math.cos(0.7 * t):.3f},3.000\n" for t in times

@@ -44,7 +44,7 @@ LIMIT = "controller.feedback_limit"
 
 
 class Known:
-    """Flights whose records are known; no more than `most` of them are flown."""
+    """Flies cases whose records are known, and no more than `most` of them."""
 
     def __init__(self, record: Callable[[Case], Record], most: float = math.inf) -> None:
         self._record = record
@@ -107,7 +107,7 @@ def test_failures_that_differ_are_found_and_reduced_to_their_causes(
 def test_values_that_cannot_be_flown_are_no_failures(
     whole_search: tuple[Campaign, list[Failure]], tmp_path: Path
 ) -> None:
-    """A third of the range of the bandwidth; the failures beside it are found as without it."""
+    """A third of the bandwidth's range cannot be flown; failures elsewhere are found as before."""
 
     def flown(case: Case) -> Record:
         if dict(case.values)[BANDWIDTH] < 4.0:
@@ -150,7 +150,7 @@ trials: 40
 
 
 def bowl(case: Case) -> Record:
-    """A flight whose error is least at 4 rad/s and 0.4, plus a number of scenario and seed."""
+    """A flight whose error is least at 4 rad/s and 0.4, plus a term for scenario and seed."""
     at = {BANDWIDTH: 7.0, LIMIT: 0.3, **dict(case.values)}
     cost = (at[BANDWIDTH] - 4.0) ** 2 / 36 + (at[LIMIT] - 0.4) ** 2
     cost += 0.01 * case.seed + 0.002 * len(case.scenario)
@@ -195,7 +195,7 @@ def test_the_minimum_is_found_and_confirmed_and_its_profile_is_a_configuration(
 def test_an_interrupted_tuning_goes_on_and_finds_the_same(
     whole: tuple[Tuned, Path], tmp_path: Path
 ) -> None:
-    """A trial is four flights; the first has the present values, also if it was interrupted."""
+    """A trial is four flights; the first has the present values, also in an interrupted tuning."""
     costs: list[float] = []
     with pytest.raises(Incomplete):
         tuned(tmp_path / "t", most=10, told=lambda number, cost: costs.append(cost))
@@ -203,7 +203,7 @@ def test_an_interrupted_tuning_goes_on_and_finds_the_same(
     costs.clear()
     found = tuned(tmp_path / "t", told=lambda number, cost: costs.append(cost))
     assert len(costs) == 40
-    assert costs[0] == pytest.approx(0.287)  # 0.26 of the present values, seeds and scenarios
+    assert costs[0] == pytest.approx(0.287)  # 0.26 by the values, the rest by seeds and scenarios
     assert found == whole[0]
 
 

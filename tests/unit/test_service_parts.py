@@ -1,4 +1,4 @@
-"""Parts of the service: records, remembered vehicles, lock, configurations that change, answers."""
+"""Parts of the service: logs, remembered vehicles, locks, changed configurations, engagement."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def recorded(directory: Path) -> tuple[Recorder, list[Path]]:
 def test_a_flight_log_begins_with_what_came_before(
     version_1: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With the home position from long ago, the last five seconds and the configuration."""
+    """It begins with the old home position, the last five seconds and the configuration."""
     monkeypatch.setattr(clock, "local_stamp", lambda: "now")
     recorder, scored = recorded(tmp_path)
     talk, began_us = session(), clock.unix_us() - 20_000_000
@@ -74,7 +74,7 @@ def test_a_flight_log_begins_with_what_came_before(
     first = Path(recorder.begin(talk, "vehicle: neutral\n", "px4-1-7"))
     recorder.write(began_us + 20_000_000, talk.encode(Heartbeat(18)))
     recorder.end(engaged=False)
-    while not scored:  # which `close` would leave to the next start
+    while not scored:  # `close` would leave the scoring to the next start
         time.sleep(0.01)
     second_flight = Path(recorder.begin(talk, "vehicle: neutral\n", "px4-1-7"))
     recorder.close()
@@ -93,8 +93,8 @@ def test_a_flight_log_begins_with_what_came_before(
 
 @pytest.mark.parametrize(("age_s", "left"), [(0, "px4-1-7"), (700, ""), (-4000, "px4-1-7")])
 def test_what_a_killed_service_has_not_done(tmp_path: Path, age_s: int, left: str) -> None:
-    """The vehicle that it had engaged is known for ten minutes. A log of the future: this computer
-    has booted, and its clock was not set since."""
+    """The next service lists the flight, and knows the engaged vehicle for ten minutes. A log with
+    a stamp in the future counts: this computer has booted, and its clock is not set yet."""
     killed, _ = recorded(tmp_path)
     cut = Path(killed.begin(session(), "", "px4-1-7"))
     killed.close()  # its threads write no more, the vehicle stays engaged
@@ -180,7 +180,7 @@ def test_an_identified_vehicle_is_kept_and_used_for_the_same_file_alone(tmp_path
 
 
 def test_the_lock_names_its_holder_and_dies_with_it(tmp_path: Path) -> None:
-    """The holder is a unit, and where possible another user."""
+    """The holder runs as a systemd unit does and, if possible, as another user."""
     code = (
         "import os, sys\n"
         "from offboard.link.lock import connection_lock\n"
@@ -236,7 +236,7 @@ def test_what_the_user_of_the_unit_cannot_read(
 
 
 def test_the_link_is_opened_when_it_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Port in use: said once, tried again until it is free. A wrong address is an error at once."""
+    """A port in use is reported once and tried until it is free. A wrong address is an error."""
     monkeypatch.setattr(daemon, "LINK_EVERY_S", 0.01)
     holder = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     holder.bind(("127.0.0.1", 0))
@@ -263,7 +263,7 @@ def test_the_link_is_opened_when_it_can_be(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_the_service_manager_is_told_and_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It reads nothing until its queue is full; what was dropped is told again."""
+    """The manager reads nothing until its queue is full; a dropped message is sent again."""
     name = f"offboard-{os.getpid()}"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(f"\0{name}")
@@ -324,16 +324,16 @@ def test_a_switch_counts_in_the_air_from_a_mode_without_failsafe() -> None:
         )  # fmt: skip
         return switch is PilotSwitch.ENGAGED
 
-    assert not shows(ours=True)  # found so
+    assert not shows(ours=True)  # in this mode from the start
     assert not shows(ours=False, failsafe=True)
-    assert not shows(ours=True)  # PX4 returns by itself
+    assert not shows(ours=True)  # PX4 returns to it by itself after the failsafe
     assert switch is PilotSwitch.IDLE
     assert not shows(ours=False)
     assert shows(ours=True)
     assert not shows(ours=False)
     assert not shows(ours=True, in_the_air=False)
     assert not shows(ours=True)  # took off in this mode
-    for flies in (True, False):  # by every sign
+    for flies in (True, False):  # it must fly by every sign
         assert not shows(ours=False)
         assert shows(ours=True, failsafe=None, flies=flies) is flies
     assert not shows(ours=False, failsafe=None)
@@ -342,7 +342,7 @@ def test_a_switch_counts_in_the_air_from_a_mode_without_failsafe() -> None:
 
 
 def test_a_reference_that_is_placed_low_stays_clear_of_the_ground() -> None:
-    """A helix that descends by 4 m."""
+    """The reference is a helix that descends by 4 m."""
     config = load(
         "flight",
         choices={"reference": "helix", "vehicle": "px4_sih"},
@@ -361,7 +361,7 @@ def test_a_reference_that_is_placed_low_stays_clear_of_the_ground() -> None:
 
 
 def test_a_pause_that_is_continued_and_paused_again_while_it_stops_is_one_pause() -> None:
-    """Each such pair made every later sample slower, until one raised RecursionError."""
+    """Each such pair once made every later sample slower, until one raised RecursionError."""
     config = load("flight", choices={"reference": "lemniscate", "vehicle": "px4_sih"})
     plan = FlightPlan(build(config).track)
     plan.start_track(100.0)
@@ -378,8 +378,8 @@ def test_a_pause_that_is_continued_and_paused_again_while_it_stops_is_one_pause(
 
 @pytest.mark.parametrize("speed_mps", [0.3, 4.0])
 def test_a_moving_vehicle_is_stopped_where_the_reference_starts(speed_mps: float) -> None:
-    """Without a way back. A smooth stop with at most 2 m/s2 needs 35/32 of a stop with a constant
-    1 m/s2."""
+    """It does not fly back. A smooth stop with at most 2 m/s^2 needs 35/32 of the way of a stop at
+    a constant 1 m/s^2."""
     config = load("flight", choices={"reference": "hover", "vehicle": "px4_sih"})
     plan = FlightPlan(build(config).track)
     velocity = (0.6 * speed_mps, -0.8 * speed_mps, 0.0)

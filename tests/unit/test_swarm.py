@@ -1,5 +1,5 @@
-"""The swarm finds known minima, by ask/tell and compiled, and keeps its promises; its certificate
-against an oracle of its own: all 81 active sets of a box in four dimensions."""
+"""The swarm finds known minima, by ask/tell and compiled, within box and deadline. The oracle of
+its certificate tries all 81 active sets of a box in four dimensions."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def furthest_misses(settings: SwarmSettings, searches: int) -> Array:
 
 
 def test_no_search_of_500_is_a_thousandth_of_the_range_off_the_closed_form() -> None:
-    """Without rebound some stay beside a minimum on the bounds."""
+    """Without rebound some searches miss a minimum on the bounds."""
     assert furthest_misses(SwarmSettings(iterations=60), 500).max() < 1e-3
     misses = furthest_misses(SwarmSettings(rebound=0.0), 500)
     assert 1 < np.sum(misses > 1e-3) < 25
@@ -127,7 +127,7 @@ def test_the_answer_comes_when_the_time_is_up() -> None:
     assert result.cut_short
     assert result.iterations == 75
     assert np.abs(result.best - minimiser).max() < 1e-3
-    for iterations, left_s in ((1000, 1.0), (25, 0.0)):  # up at the last one cuts nothing short
+    for iterations, left_s in ((1000, 1.0), (25, 0.0)):  # the last iteration is not cut short
         whole = minimise(SwarmSettings(iterations=iterations), problem, rng(10), lambda: left_s)  # noqa: B023
         assert (whole.cut_short, whole.iterations) == (False, iterations)
 
@@ -230,7 +230,7 @@ def test_the_gap_is_how_much_more_the_answer_costs_than_the_minimum_of_all_activ
 
 
 def test_the_gap_of_a_minimum_that_is_large_or_nothing() -> None:
-    """1e-6 off the minimum in each input costs 2e-12; beside 1e6, J cannot show it."""
+    """An error of 1e-6 in each input costs 2e-12, which a float cannot show beside a J of 1e6."""
     large, none = (
         BoxQuadratic(np.eye(4), np.zeros(4), c, -np.ones(4), np.ones(4)) for c in (1e6, 0)
     )

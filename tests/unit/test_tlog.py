@@ -1,4 +1,4 @@
-"""A .tlog against pymavlink, message by message, its columns, and damage in it."""
+"""Reading of a .tlog: messages and columns against pymavlink, and damaged entries."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ PX4, ARDUCOPTER = (
 
 @cache
 def recorded() -> tuple[bytes, tuple[tlog.LoggedMessage, ...], list[int]]:
-    """The first 500 entries of PX4's log: bytes, messages, and where each begins and the last one
-    ends."""
+    """The first 500 entries of PX4's log: bytes, messages, and the offsets at which they
+    begin and the last one ends (501)."""
     messages = tuple(itertools.islice(tlog.read(PX4), 500))
     at = [0, *itertools.accumulate(8 + len(entry.frame.raw) for entry in messages)]
     return PX4.read_bytes()[: at[-1]], messages, at
@@ -33,7 +33,7 @@ def recorded() -> tuple[bytes, tuple[tlog.LoggedMessage, ...], list[int]]:
 
 @pytest.mark.parametrize("path", [PX4, ARDUCOPTER])
 def test_the_layout_of_every_message_is_pymavlinks(path: Path) -> None:
-    """Of the first five messages of each name."""
+    """The first five messages of each name are compared, field by field."""
     seen: Counter[str] = Counter()
     for entry in tlog.read(path):
         seen[entry.name] += 1
@@ -58,8 +58,8 @@ DAMAGES = (
 
 
 def damaged_logs() -> Iterator[tuple[bytes, set[int], int, int | None, int]]:
-    """Bytes, which messages are lost, how many damages, where the first one is, and the bytes of an
-    entry that is cut at the end."""
+    """Damaged logs: bytes, numbers of the lost messages, count of damages, offset of the first one,
+    and size in bytes of an entry that is cut at the end."""
     data, messages, at = recorded()
     last, size = len(messages) - 1, at[-1] - at[-2]
 
@@ -74,12 +74,12 @@ def damaged_logs() -> Iterator[tuple[bytes, set[int], int, int | None, int]]:
     yield flipped(last, size - 1, 1), {last}, 1, at[-2], 0  # checksum
     yield data[:-3], {last}, 0, None, size - 3
     yield data + bytes(5000), set(), 1, at[-1], 0
-    # garbage between entries, which holds about 30 bytes that could begin a frame, a hole that cuts
-    # two, and one that cuts the last
+    # garbage between entries, with about 30 bytes that could begin a frame; a hole that cuts two
+    # entries; and a cut in the last entry
     garbage = np.random.default_rng(3).bytes(4000)
     parts = data[: at[100]], garbage, data[at[100] : at[200] + 7], data[at[203] + 5 : -7]
     yield b"".join(parts), {200, 201, 202, 203, last}, 2, at[100], size - 7
-    for short in range(12):  # an entry at the border of a block
+    for short in range(12):  # the border of a block lies within an entry
         yield bytes(1000 - short) + data, set(), 1, 0, 0
 
 
@@ -102,7 +102,7 @@ def test_damaged_entries_are_skipped_and_counted(
 
 
 def test_a_log_of_a_computer_without_a_clock_is_read(tmp_path: Path) -> None:
-    """Such a computer counts from 1970: its flights could not be scored."""
+    """Its time stamps begin in 1970, because of which its flights once could not be scored."""
     _, messages, _ = recorded()
     log = tmp_path / "1970.tlog"
     since_us = messages[0].unix_us
@@ -111,8 +111,8 @@ def test_a_log_of_a_computer_without_a_clock_is_read(tmp_path: Path) -> None:
 
 
 def test_a_story_is_told_in_vehicle_time() -> None:
-    """Every text and refusal beside the newest telemetry that lies before it in the file; a text
-    in chunks (STATUSTEXT.id) is whole once a chunk ends short of its 50 bytes."""
+    """Every text and refusal has the time of the newest telemetry before it in the file. A text in
+    chunks (STATUSTEXT.id) is complete once a chunk has fewer than 50 bytes."""
     flown = history.gather(tlog.read(PX4))
     theirs = mavutil.mavlogfile(str(PX4))
     now_s, begun, expected = math.nan, "", []

@@ -1,6 +1,6 @@
-"""The tracking law: gains flown on PX4, the cost it claims, its bounds, and flights with telemetry
-that is true; figures in brackets are those measured on PX4 itself. The delay margin against flights
-that are delayed by a little less and a little more.
+"""The tracking law: gains flown on PX4, the cost that it states, its bounds, and flights with
+telemetry without errors; figures in brackets were measured on PX4 itself. The delay margin against
+flights with a little less and a little more delay.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ def test_gains_are_those_flown_on_px4() -> None:
 
 
 def slope_of_force(reference: Reference, vehicle: Vehicle, state: PredictedState) -> np.ndarray:
-    """d(T b) / db (2, 2), by differences, at the direction that the reference asks for and with the
-    vertical force that carries the weight; symmetric."""
+    """d(T b) / db (2, 2), symmetric, by central differences at the thrust direction of the
+    reference and with the vertical force that carries the weight."""
     sample = reference.sample(state.time_s)
     force = np.array([0.0, 0.0, G]) - sample.acceleration_ned_mps2
     force += state.disturbance_ned_mps2 - vehicle.drag_per_mass_ps * sample.velocity_ned_mps
@@ -50,9 +50,9 @@ def slope_of_force(reference: Reference, vehicle: Vehicle, state: PredictedState
 
 
 def test_unconstrained_minimiser_is_the_lqr_law() -> None:
-    """u* = -f / h: b_c = b_ff - K [p, v, b, b'], T b_z = f_ff - Kz [z, v_z, f_z]; heading led.
+    """With lead in heading, b_c = b_ff - K [p, v, b, b'] and T b_z = f_ff - Kz [z, v_z, f_z].
 
-    p and v are those for which b in hover does what b does here, by the slope of the force."""
+    Errors of p and v are multiplied by g over the slope of the force, which is 1 in hover."""
     law, rng, reference = lqr(), np.random.default_rng(1), lemniscate(15.0)
     for _ in range(20):
         state = state_of(rng, reference, 0.3)
@@ -72,7 +72,7 @@ def test_unconstrained_minimiser_is_the_lqr_law() -> None:
         assert minimiser[1:3] == pytest.approx(expected_tilt, abs=1e-9)
         assert minimiser[0] == pytest.approx(force / b_z, abs=1e-9)
         assert minimiser[3] == pytest.approx(target.heading_rad)
-        # what an optimal law has left to pay is x' P x
+        # the cost to go of the optimal law is x' P x
         left = np.sum(off * (law.lateral.terminal @ off))
         left += vertical @ law.vertical.terminal @ vertical
         assert float(problem(minimiser)) == pytest.approx(left, rel=1e-9)
@@ -97,8 +97,8 @@ def test_bounds_hold_and_the_feedback_is_limited(size: float, least: int, most: 
 
 
 def test_heading_that_jumps_is_not_led_by_all_of_it() -> None:
-    """Noisy rows make it jump. Without the limit the commanded heading is 80 degrees off, which
-    saturates motors."""
+    """The heading of noisy rows jumps. Without the limit on its acceleration the commanded heading
+    was 80 degrees off, which saturates motors."""
     law, smooth = lqr(), lemniscate(15.0)
     state = state_of(np.random.default_rng(1), smooth, 0.0)
 
@@ -117,7 +117,7 @@ def test_heading_that_jumps_is_not_led_by_all_of_it() -> None:
 
 
 def test_swarm_finds_the_closed_form() -> None:
-    """The swarm of the paper on the cost-to-go: the exact optimum to a millionth of the box."""
+    """On the cost to go the paper's swarm finds the exact optimum to a millionth of the box."""
     swarm, closed = pso(), lqr()
     rng, reference = np.random.default_rng(5), lemniscate(8.0)
     for size in (0.05, 0.3, 3.0):
@@ -137,13 +137,13 @@ def test_swarm_finds_the_closed_form() -> None:
 
 
 def test_wind_and_a_wrong_hover_thrust_are_absorbed_with_position_at_thirty_hertz() -> None:
-    """On real PX4, whose estimate wanders, .032 to .037."""
+    """On a real PX4, whose estimate wanders, the RMSE was 0.032 to 0.037 m."""
     truth = Truth(PX4, thrust_scale=0.85, wind_force_ned_mps2=(2.04, 2.04, 0.0))
     assert fly(truth, lqr(), PX4, lemniscate(15.0), 23.0, gaps_s=(0.033,)) < 0.006
 
 
 def test_a_vehicle_that_leans_by_39_degrees_comes_to_rest() -> None:
-    """[circle of 8 m/s at 42 degrees: with the gain of hover a cycle of 0.05 m, without noise]"""
+    """[Circle of 8 m/s at 42 degrees: the gain of hover gave a cycle of 0.05 m without noise.]"""
     storm, still = Truth(PX4, wind_force_ned_mps2=(7.9, 0.0, 0.0)), lemniscate(1e6)
     start = {"offset_ned_m": (0.5, 0.5, 0.0), "score_from_s": 14.0}
     assert fly(storm, lqr(7.0), PX4, still, 20.0, **start) < 0.002
@@ -151,7 +151,7 @@ def test_a_vehicle_that_leans_by_39_degrees_comes_to_rest() -> None:
 
 @pytest.mark.parametrize(("vertical_m", "most_m"), [(0.0, 0.0002), (0.4, 0.0008)])
 def test_what_is_left_on_a_known_vehicle(vertical_m: float, most_m: float) -> None:
-    """Without noise, everything known: 0.8 and 1.5 mm by a law that fights its own ripple."""
+    """All is known, without noise. A law that fights its own ripple leaves 0.8 and 1.5 mm."""
     reference = lemniscate(8.0, vertical_m=vertical_m)
     assert fly(Truth(PX4), lqr(), PX4, reference, 16.0) < most_m
 
@@ -165,8 +165,8 @@ def delayed(delay_s: float) -> Vehicle:
 
 
 def delay_margin(vehicle: Vehicle, bandwidth: float, period_s: float) -> float:
-    """The least further delay of the tilt, in steps of 10 ms, that lowers the bandwidth; at least
-    what is always allowed for."""
+    """Least further delay of the tilt in s, in steps of 10 ms, for which `bandwidth` is lowered;
+    not less than the margin that is always kept."""
 
     def lowers(step: int) -> bool:
         uncertainty = DelayUncertainty(tilt_s=step / 100)
@@ -196,7 +196,7 @@ def test_margin_divides_flights_that_settle_from_those_that_do_not(delay_s, band
 
 
 def test_margins_of_the_flights_on_a_real_px4():
-    """113 ms that nobody knew of: bandwidth 5 flew, bandwidth 7 diverged, 10 was worse."""
+    """With 113 ms of unknown delay bandwidth 5 flew, 7 diverged, and 10 was worse."""
     margins = [delay_margin(PX4, bandwidth, 0.1) for bandwidth in (3.0, 5.0, 7.0, 10.0)]
     assert margins == sorted(margins, reverse=True)
     assert margins[1] > 0.113 > margins[2]
@@ -221,7 +221,7 @@ def test_bandwidth_is_lowered_until_the_margin_suffices(delay_s, sd_s):
 
 @pytest.mark.parametrize("wrong_s", [-0.09, 0.09])
 def test_bandwidth_allows_for_an_uncertain_delay_of_the_thrust(wrong_s):
-    """What the steps show of it may be too long as well as too short; at 14 rad/s the height is
+    """The delay that the steps show may be too long or too short; at 14 rad/s the height is
     unstable either way. The lateral axes do not depend on it."""
     believed = delayed(0.182).model_copy(update={"thrust_delay_s": 0.196})
     lateral, lowered = supported(believed, 9.0, 0.003, thrust_sd_s=0.03)

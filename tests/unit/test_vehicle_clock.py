@@ -16,8 +16,8 @@ from offboard.flight.timing import (
 from offboard.identification.uncertainty import Estimate
 from offboard.mavlink.events import TimesyncReply
 
-EPOCH_S = 7000.0  # of host time: not that of the vehicle
-WAY_S = 0.05
+EPOCH_S = 7000.0  # host time when vehicle time is 0
+WAY_S = 0.05  # delay of one direction
 
 
 def every(step_s: float, begin_s: float, end_s: float) -> Iterable[float]:
@@ -40,9 +40,9 @@ def fly(
     down: Callable[[float], float] = way,
     answers: bool = False,
 ) -> tuple[float, tuple[float, float]]:
-    """Telemetry of these true times; if the vehicle `answers`, of each fifth a request of TIMESYNC
-    that is as long on its way as the telemetry, and its reply. Returns the greatest age on arrival,
-    in seconds of the vehicle, and the newest stamp with its arrival."""
+    """Give `clock` telemetry of these true times with the delay `down`. If the vehicle `answers`,
+    a TIMESYNC request, on its way for WAY_S, and its reply, for `down`, follow every fifth message.
+    Return the greatest age on arrival, in s of vehicle time, and the newest (stamp, arrival)."""
     arriving: list[Any] = []
     for number, at_s in enumerate(times_s):
         newest = stamp(at_s), EPOCH_S + at_s + down(at_s)
@@ -64,7 +64,7 @@ def fly(
 
 
 def answer(clock: VehicleClock, stamp_s: float, delay_s: float) -> bool:
-    """The reply to the request with this stamp; it arrived `delay_s` after it."""
+    """Give `clock` the reply to a request that reached the vehicle `delay_s` after its stamp."""
     request_ns = round(stamp_s * 1e9)
     return clock.on_reply(TimesyncReply(request_ns, request_ns + round(delay_s * 1e9)))
 
@@ -79,8 +79,8 @@ def settled(until_s: float = 10.0, **more: Any) -> VehicleClock:
 @pytest.mark.parametrize("rate", [0.25, 0.9, 20.0])
 @pytest.mark.parametrize(("until_s", "answers"), [(0.8, False), (10.0, True)])
 def test_a_clock_of_any_rate_is_no_late_link(rate: float, until_s: float, answers: bool) -> None:
-    """A simulation on a busy computer, or one that is told to be faster; also where the vehicle is
-    engaged before its rate can be measured. Before any telemetry nothing is old."""
+    """A simulation on a busy computer is slower, one that is set so faster than real time. The rate
+    may also be unmeasured when the vehicle is engaged. Before any telemetry nothing is old."""
     assert VehicleClock().now_s(EPOCH_S) == -math.inf
     assert VehicleClock().age_s(3.0, EPOCH_S) == 0.0
     link: Any = {"stamp": lambda at_s: rate * at_s, "answers": answers}
@@ -104,7 +104,7 @@ BOOTS: tuple[tuple[Callable[[float], float], float], ...] = (  # stamps, and whe
 
 @pytest.mark.parametrize("answers", [True, False])
 def test_what_the_clock_did_at_boot_is_over(answers: bool) -> None:
-    """When the flight begins its rate is the present one, and no jump counts."""
+    """When the flight begins, the clock has its present rate; jumps before that do not count."""
     for stamp, engaged_s in BOOTS:
         clock = settled(engaged_s, stamp=stamp, answers=answers)
         now_s = clock.now_s(EPOCH_S + engaged_s + WAY_S + 1.0)
@@ -118,7 +118,7 @@ def test_what_the_clock_did_at_boot_is_over(answers: bool) -> None:
 def test_telemetry_that_becomes_later_is_as_old_as_it_is(
     added_s: float, ramp_s: float, answers: bool
 ) -> None:
-    """The clock goes on while the replies come later, too, and the age shows within a tenth."""
+    """The clock goes on although replies become later, too; the age is right within a tenth."""
 
     def down(at_s: float) -> float:
         return WAY_S + added_s * min((at_s - 12.0) / ramp_s, 1.0)
@@ -130,7 +130,7 @@ def test_telemetry_that_becomes_later_is_as_old_as_it_is(
 
 @pytest.mark.parametrize(("jump_s", "shown_s"), [(0.6, 0.6), (0.4, 0.0), (-1.0, 0.0)])
 def test_a_jump_forward_is_measured(jump_s: float, shown_s: float) -> None:
-    """Replies from before it do not count."""
+    """Replies that arrived before the jump do not count."""
     clock = VehicleClock()
     fly(clock, every(0.02, 0.0, 10.0))
     clock.request(9.94, EPOCH_S + 9.99)
@@ -143,7 +143,7 @@ def test_a_jump_forward_is_measured(jump_s: float, shown_s: float) -> None:
 
 
 def test_a_clock_that_becomes_slower_is_no_late_link() -> None:
-    """The load of the computer changes in flight. What remains is the change within one reply."""
+    """The computer's load changes in flight. An age remains only between two replies."""
 
     def stamp(at_s: float) -> float:
         return min(at_s, 20.0) + 0.93 * max(at_s - 20.0, 0.0)
@@ -167,7 +167,7 @@ def test_replies_to_others_late_and_duplicate_ones_are_ignored() -> None:
         at_s = float(number)
         own = reply(link, at_s, 0.05)
         link.on_reply(TimesyncReply(own.request_ns + 1, own.vehicle_ns))  # another sender's request
-        link.on_reply(reply(link, at_s + 0.2, -0.01))  # other clocks
+        link.on_reply(reply(link, at_s + 0.2, -0.01))  # a negative delay: of another clock
         link.on_reply(reply(link, at_s + 0.4, DELAY_MAX_S + 0.01))
         assert link.delay is None
         link.on_reply(own)
@@ -176,7 +176,8 @@ def test_replies_to_others_late_and_duplicate_ones_are_ignored() -> None:
 
 
 def test_all_requests_without_a_reply_count_in_the_longest_silence_s() -> None:
-    """At the shortest period. Before, 100 did: no uplink was lost with `silence_s` of 10 s."""
+    """The requests have the shortest period. Only 100 once counted, so that with a `silence_s` of
+    10 s a lost uplink was not noticed."""
     link = VehicleClock()
     for number in range(5):
         link.on_reply(reply(link, float(number), 0.05))
@@ -189,7 +190,7 @@ def test_all_requests_without_a_reply_count_in_the_longest_silence_s() -> None:
 def test_link_loses_where_more_than_5_percent_of_50_requests_have_no_reply(
     lost: int, late: int, loses: bool
 ) -> None:
-    """A reply to none of the newest requests is a link that has become later, not a loss."""
+    """Without replies to the newest requests the link may have become later: that is no loss."""
     link = VehicleClock()
     for number in range(5):
         link.on_reply(reply(link, float(number), 0.05))
@@ -203,8 +204,8 @@ def test_link_loses_where_more_than_5_percent_of_50_requests_have_no_reply(
 
 @pytest.mark.parametrize(("delay_s", "measured_s"), [(0.05, 2.0), (4.4, 6.3), (math.inf, 10.1)])
 def test_link_delay_is_measured_by_twenty_replies(delay_s: float, measured_s: float) -> None:
-    """Behind a full buffer of 50 kB, at 11.5 kB/s, the first one takes 4.4 s. Without any, the
-    vehicle does not answer."""
+    """Behind a full buffer of 50 kB, at 11.5 kB/s, the first reply takes 4.4 s. After 10 s without
+    any, the vehicle is taken not to answer."""
     link = VehicleClock()
     waiting: list[tuple[float, TimesyncReply]] = []
     for tick in range(120):

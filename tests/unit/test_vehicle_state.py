@@ -26,7 +26,7 @@ class Standing:
         self.vehicle.update(Heartbeat("POSCTL", armed, 4, 2), now_s)
 
     def position(self, now_s: float, height_m: float = 0.0, climb_mps: float = 0.0) -> None:
-        noise = 1e-6 * now_s  # no estimator repeats itself
+        noise = 1e-6 * now_s  # a real estimate never repeats exactly
         place = (5.0 + noise, noise - 3.0, 2.0 - height_m + noise)
         event = LocalPosition(now_s, place, (noise, noise, -climb_mps + noise))
         self.vehicle.update(event, now_s)
@@ -146,7 +146,7 @@ def attitude(time_s: float) -> Attitude:
 
 
 def test_an_outage_of_the_whole_link_does_not_count_as_age() -> None:
-    """After both streams at 10 Hz until 10 s."""
+    """Both streams arrive at 10 Hz until 10 s; the next message comes at 10.9 s."""
     state = VehicleState()
     for time_s in np.arange(1, 101) / 10.0:
         state.update(position(time_s), time_s)
@@ -156,13 +156,13 @@ def test_an_outage_of_the_whole_link_does_not_count_as_age() -> None:
     state.update(position(11.0), 11.0)
     assert state.attitude_age_s == pytest.approx(0.1)  # since the link is back
     state.update(attitude(11.0), 11.0)
-    state.update(attitude(11.9), 11.9)  # a second one
+    state.update(attitude(11.9), 11.9)  # after a second outage
     assert state.position_age_s == pytest.approx(0.0)
 
 
 def test_what_the_vehicle_says_ends_a_sentence_down_to_a_notice() -> None:
-    """ArduCopter says of a fence by NOTICE alone why it leaves the mode: it was a change of mode
-    without a reason."""
+    """ArduCopter says only by a NOTICE that it leaves the mode because of a fence; before, the
+    change of mode had no reason."""
     vehicle = VehicleState()
     for severity, text in ((6, "EKF3 IMU0 is using GPS"), (5, "Circle fence breached")):
         vehicle.update(StatusText(severity, text), 1.0)
