@@ -1,9 +1,9 @@
-"""The corpus: small recorded flights, and what the present code sends when they are replayed.
+"""The corpus: small recorded flights, and what the present code must send in them.
 
-A flight is recordings/NAME.tlog.xz; a replay needs its telemetry, the inputs of each turn, and the
-setpoints and commands that were sent in flight. recordings/NAME.sent has the expected ones, one per
-line: vehicle time in s, message id, payload. `python tests/replay/corpus.py FLIGHT NAME` adds a
-flight.
+recordings/NAME.tlog.xz is a flight, of which a replay needs telemetry, the inputs of each turn, and
+the setpoints and commands as flown. recordings/NAME.sent has the expected setpoints and commands,
+one per line: vehicle time in s, message id, payload. `python tests/replay/corpus.py FLIGHT NAME`
+adds one.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ COMPARED = frozenset((*SETPOINTS, *COMMANDS))
 
 @contextmanager
 def unpacked(name: str) -> Iterator[Recording]:
-    """Unpack a flight of the corpus, and yield its recording."""
+    """Yield the recording of a flight of the corpus."""
     with tempfile.TemporaryDirectory() as directory:
         path = Path(directory) / f"{name}.tlog"
         path.write_bytes(lzma.decompress((FLIGHTS / f"{name}.tlog.xz").read_bytes()))
@@ -67,7 +67,7 @@ def write_expected(name: str, sent: Iterable[Sent]) -> None:
 
 
 def add(flight: Path, name: str) -> None:
-    """Add the log of a flight, compressed, with the setpoints and commands sent in flight."""
+    """Add the log of a flight to the corpus; what it sent is expected."""
     recording = read(flight)
     replay = replayed(recording)
     packed = lzma.compress(recording.log.path.read_bytes(), preset=9 | lzma.PRESET_EXTREME)

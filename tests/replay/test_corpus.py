@@ -1,5 +1,5 @@
-"""Each flight of the corpus, replayed, sends what is expected, but for rounding: it was recorded on
-another computer.
+"""Each flight of the corpus, replayed, sends what is expected, except for the rounding of another
+computer, on which it was recorded.
 
 `python tests/replay/test_corpus.py` shows what an intended change has changed, then accepts it.
 """
@@ -29,7 +29,7 @@ def test_the_corpus_is_there() -> None:
 
 
 def accept() -> None:
-    """Print what has changed since it was accepted, and expect the present answers."""
+    """Print what has changed, and expect from now on what the present code sends."""
     for name in names():
         with unpacked(name) as recording:
             replay = replayed(recording)

@@ -68,7 +68,7 @@ def reason(result: Result) -> str:
 
 
 def change_the_law(monkeypatch: pytest.MonkeyPatch, more_mps2: float) -> None:
-    """A law that decides another thrust."""
+    """Make `pso` decide a thrust that is greater by `more_mps2`."""
     decide = PsoLaw.decide
 
     def changed(law: PsoLaw, situation: Situation) -> Decision:
@@ -82,7 +82,7 @@ def change_the_law(monkeypatch: pytest.MonkeyPatch, more_mps2: float) -> None:
 def test_reports_of_the_recorded_setpoints_are_no_second_sender(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Replayed to the end, beside the recorded ATTITUDE_TARGET of a real PX4."""
+    """The recorded ATTITUDE_TARGET of a real PX4 do not end the replay of a changed law."""
     change_the_law(monkeypatch, 0.1)
     with unpacked("real-px4") as recording:
         replay = replayed(recording)
@@ -96,7 +96,7 @@ def test_reports_of_the_recorded_setpoints_are_no_second_sender(
 def test_a_changed_law_is_found_at_its_first_decision(
     flight: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A thrust of 0.01 m/s2 more is 0.00043 of the whole, by the vehicle file's hover thrust."""
+    """A thrust of 0.01 m/s^2 more is 0.00043 of full thrust, by the vehicle file's hover thrust."""
     change_the_law(monkeypatch, 0.01)
     result = run(flight)
     differ = r"\d+ of \d+ setpoints and \d+ commands differ; largest difference"
@@ -149,8 +149,8 @@ def without(flight: Path, drops) -> bytes:
 
 
 def test_a_lost_message_ends_the_comparison_before_it(failed: Pair, tmp_path: Path) -> None:
-    """One LOCAL_POSITION_NED is damaged: what was sent before is still compared, in each mode of
-    the command, and it says up to where."""
+    """One LOCAL_POSITION_NED is damaged: what was sent before is still compared, and the command
+    says up to which time."""
     damaged, lost_ms = logged(failed, tmp_path / "damaged.tlog"), 10_000
     lost = next(
         m
@@ -188,7 +188,7 @@ def short_flight(key: bytes = b"", **options) -> Pair:
     if key:
         pair.instance.keyring.set_up(key, 1)
 
-    def guarded(chunks, now_s) -> tuple[bytes, ...]:  # as the loop
+    def guarded(chunks, now_s) -> tuple[bytes, ...]:  # as the loop does
         try:
             return turn(chunks, now_s)
         except Exception as error:
@@ -211,8 +211,8 @@ def logged(pair: Pair, path: Path) -> Path:
 
 
 def check(pair: Pair, tmp_path: Path, least: int) -> None:
-    """All that the companion sent in flight is what the replay sends. Frames that signing has
-    refused are not in the log: what was said of them is not said again."""
+    """The replay must send all that the companion sent in flight. Frames that signing has refused
+    are not in the log, so that texts about them are not compared."""
     replay = replayed(read(logged(pair, tmp_path / "flight.tlog")))
     comparison = compare(replay.recorded, replay.replayed)
     assert not replay.stopped
@@ -225,7 +225,7 @@ def check(pair: Pair, tmp_path: Path, least: int) -> None:
 
 
 def test_a_program_with_our_ids_a_stop_and_a_pause(tmp_path: Path) -> None:
-    """The flight ends by the frames of another program, which are not in the log as received."""
+    """Frames of another program, which the log does not hold as received, end the flight."""
     codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
     forged = mavlink.MAVLink_heartbeat_message(18, 8, 0, 8, 4, 3).pack(codec)
 
@@ -242,7 +242,7 @@ def test_a_program_with_our_ids_a_stop_and_a_pause(tmp_path: Path) -> None:
 
 def test_slow_decisions_a_stop_request_strangers_and_a_signed_link(tmp_path: Path) -> None:
     """Each ninth decision is cut short by its deadline, or too late to be sent. An attacker sends
-    a heartbeat every 40 ms."""
+    an unsigned heartbeat every 40 ms."""
     clock = HostClock()
 
     def slow(law: Controller) -> Controller:
@@ -336,7 +336,7 @@ def test_damaged_pieces_raise_nothing_else(data) -> None:
 
 
 def test_in_real_time_each_input_is_recorded() -> None:
-    """Host times to the microsecond, who sent, what the log does not hold, datagrams of others."""
+    """Recorded are microseconds of host time, senders, frames not in the log, others' datagrams."""
     recorder, clock_s = InputRecorder(SessionSettings()), [100.000_250]
     read = recorder.watch(lambda: clock_s[0])
     pieces = []

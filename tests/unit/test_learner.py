@@ -75,9 +75,8 @@ def test_what_a_file_may_have_is_adopted_and_nothing_else() -> None:
 
 
 def test_doubt_ends_with_what_explains_the_flight() -> None:
-    """A fit with the same delay that leaves too much unexplained is refused, the next one is
-    adopted. Once the constants in use explain the flight again, a fit that explains no more is
-    refused."""
+    """A fit that leaves too much unexplained is refused, the next one is adopted. Once the
+    constants in use explain the flight again, a fit that explains no more is refused."""
     unknown = VehicleEstimate(FILE, delay_error_s=UNKNOWN_DELAY_S).uncertainty
     assert (unknown.tilt_s, unknown.thrust_s) == (UNKNOWN_DELAY_S, UNKNOWN_DELAY_S)
     estimate = estimate_with(fit(0.05))

@@ -1,5 +1,4 @@
-"""A companion for tests of the simulator: exchanges pymavlink messages with an `Instance` in
-memory."""
+"""A companion in memory for tests of the simulator: it speaks to an `Instance` by pymavlink."""
 
 from __future__ import annotations
 
@@ -22,7 +21,7 @@ from simulator.vehicle.sensors import EstimatorName
 
 OFFBOARD, LOITER, POSCTL = 0x00060000, 0x03040000, 0x00030000
 LAND, RTL = 0x06040000, 0x05040000
-HOVER = 0.4895  # hover thrust of the default PX4 vehicle
+HOVER = 0.4895  # thrust at which PX4's vehicle hovers
 NAN = math.nan
 STEPS_PER_HEARTBEAT = 250
 
@@ -74,7 +73,7 @@ class Bench:
 
     @property
     def place(self) -> tuple[float, ...]:
-        """True position NED, m."""
+        """True position: north, east, down in m."""
         return self.instance.autopilot.state.truth.position_ned_m
 
     @property
@@ -155,8 +154,7 @@ class Bench:
 
     @property
     def received(self) -> list[tuple[float, Any]]:
-        """All messages so far. They are decoded only when a test reads them, because decoding takes
-        half of the time of a test."""
+        """All messages so far, decoded only when they are read: that is half of a test's time."""
         for at_s, datagram in self._unread:
             for message in self._parser.parse_buffer(datagram) or []:
                 self._received.append((at_s, message))
@@ -164,7 +162,7 @@ class Bench:
         return self._received
 
     def received_of(self, ids: frozenset[int]) -> Iterator[tuple[float, Any]]:
-        """Yield the messages with these ids that were not read yet; discard the others."""
+        """Messages with these ids among those not read yet; the others are dropped."""
         for at_s, datagram in self._unread:
             at = 0
             while at < len(datagram):
@@ -182,7 +180,7 @@ class Bench:
         ]
 
     def texts(self, since_s: float = 0.0) -> list[str]:
-        """Return the STATUSTEXTs since `since_s`, with chunks joined and without trailing tab."""
+        """STATUSTEXTs since `since_s`, chunks joined, without their trailing tab."""
         joined: dict[int, str] = {}
         for _, message in self.of("STATUSTEXT", since_s):
             joined[message.id] = joined.get(message.id, "") + message.text
@@ -217,7 +215,7 @@ class Bench:
 
 
 def degrees(bench: Bench, north_m: float, east_m: float) -> tuple[float, float]:
-    """Return latitude and longitude of a point, given relative to the origin of the local frame."""
+    """Latitude and longitude in degrees of a place relative to the origin of the local frame."""
     latitude, longitude, _ = bench.instance.autopilot.firmware.origin
     shrink = math.cos(math.radians(latitude))
     north_deg, east_deg = (math.degrees(way / EARTH_RADIUS_M) for way in (north_m, east_m))
@@ -231,16 +229,15 @@ def aloft(
     mode: str | None = None,
     **more: Any,
 ) -> Bench:
-    """Return a vehicle that hovers from the start, which is time zero of the faults. `more` are
-    further keys of the scenario."""
+    """A vehicle that starts in hover, where the faults' time begins. `more`: other keys."""
     content = {"start": {"height_m": height_m, "mode": mode}, "faults": faults, **more}
     bench = Bench(firmware=firmware, scenario=Scenario.model_validate({"name": "test", **content}))
-    bench._parser.robust_parsing = True  # some faults damage frames
+    bench._parser.robust_parsing = True  # faults may damage frames
     return bench
 
 
 def engaged(*faults: dict[str, Any], firmware: Firmware = PX4) -> Bench:
-    """Return a vehicle that hovers and follows setpoints; then time zero of the faults begins."""
+    """A hovering vehicle in OFFBOARD or GUIDED; the faults' time begins with that mode."""
     counted = ({"after": "engaged", **fault} for fault in faults)
     if firmware is not PX4:
         return aloft(*counted, firmware=firmware, mode="GUIDED")
@@ -251,5 +248,5 @@ def engaged(*faults: dict[str, Any], firmware: Firmware = PX4) -> Bench:
 
 
 def hold(bench: Bench, duration_s: float, height_m: float = 8.0) -> None:
-    """Hold the position by position setpoints."""
+    """Hold a height above the origin by position setpoints."""
     bench.run(duration_s, lambda: bench.position(0, 0, -height_m), 0.1)

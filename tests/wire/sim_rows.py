@@ -19,14 +19,14 @@ COMPANION_COMPONENT = 191
 # EXTENDED_SYS_STATE, STATUSTEXT
 HEARD = frozenset({0, 22, 32, 40, 44, 46, 47, 51, 77, 193, 245, 253})
 TEXT_CHUNK = 50
-BRIEF_S = 1.2  # a shorter state may fall between two HEARTBEATs
+BRIEF_S = 1.2  # a state that lasts less may fall between two heartbeats
 KINDS = ("ack", "text", "state", "landed", "filter", "param", "mission")
 
 
 @dataclass
 class Rows:
-    """One side of the comparison: rows of each kind in order, as (time, content), without repeated
-    states; and its path, as (time, position NED, velocity NED)."""
+    """What one autopilot sent: rows of each kind in order, as (time, text), without repeated
+    states, and its path, as (time, position, velocity), both north, east, down."""
 
     by_kind: dict[str, list[tuple[float, str]]] = field(
         default_factory=lambda: {kind: [] for kind in KINDS}
@@ -75,8 +75,8 @@ class Rows:
 
 @dataclass(frozen=True)
 class Comparison:
-    """`equal` is the number of equal rows; `differing` has rows as "real ..." or "ours ..."; `late`
-    has each equal row with the time by which ours is later, in s."""
+    """`equal`: count of equal rows; `differing`: rows of one side, "real ..." or "ours ...";
+    `late`: each equal row, and how many seconds later ours is."""
 
     equal: int
     differing: list[str]
@@ -84,8 +84,7 @@ class Comparison:
 
 
 def compare(real: Rows, ours: Rows, kinds: Iterable[str], unheard: tuple[str, ...]) -> Comparison:
-    """Compare the rows of these kinds. Rows that contain one of `unheard` are ignored on both
-    sides."""
+    """Compare rows of these kinds in order, without those that contain one of `unheard`."""
     equal, differing, late = 0, [], []
     for kind in kinds:
         sides = [
@@ -119,7 +118,7 @@ def _lasting(side: Rows, kind: str) -> list[tuple[float, str]]:
 
 
 def _without_figures(text: str) -> str:
-    """Replace the numbers of texts about the battery, which are estimates and may differ."""
+    """`text`, with # for each figure if it tells the charge, which is an estimate."""
     estimated = text.startswith("Battery 1 is")
     return re.sub(r"\d+(\.\d+)?", "#", text).strip() if estimated else text.strip()
 
@@ -132,8 +131,8 @@ def ask_again(
     run_on_s: float,
     each: Callable[[Any], None] = lambda message: None,
 ) -> None:
-    """Send the companion's recorded frames to the simulator at the same vehicle times. `real` and
-    `ours` collect the answers.
+    """Send `bench` what the recorded companion sent, at the same vehicle times; `real` and `ours`
+    `hear` what the recorded and the simulated autopilot answer.
 
     `run_on_s`: time that the simulator runs after the last request. `each` is called with the
     messages of the real autopilot, in the order of time.

@@ -1,4 +1,4 @@
-"""What the session makes of messages: contents, time stamps and texts."""
+"""The session's events: contents of messages, time stamps and texts."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ NAN, INF = math.nan, math.inf
 
 
 def received(message: Any, autopilot: int = PX4) -> Any:
-    """The event of a message of the vehicle; it is the same in a frame of MAVLink 1, before another
-    one."""
+    """The event of a message of the vehicle, which must be the same in a frame of MAVLink 1.
+    Another frame follows in the same datagram."""
     found = []
     for version_1 in (False, True)[: 1 + (message.id < 256)]:
         vehicle = Sender(7)
@@ -36,7 +36,8 @@ def received(message: Any, autopilot: int = PX4) -> Any:
 
 
 def test_implausible_contents_are_dropped_but_logged() -> None:
-    """In each field of position, velocity, attitude and rates; zero and double quaternions."""
+    """Each field of position, velocity, attitude and rates is wrong once; quaternions are not
+    unit."""
     vehicle = Sender()
     session = pinned(vehicle)
     frames = [vehicle.attitude(1000, *(0.0,) * 7)]
@@ -107,7 +108,7 @@ def test_contents(message: Any, event: events.Event) -> None:
 
 @pytest.mark.parametrize("value", [-1, 2**31 - 1, -(2**31), -8388607, 2139095041])
 def test_px4_sends_integer_parameters_as_bytes(value: int) -> None:
-    """The last two are signalling NaN as floats, which pymavlink changes: written as bytes."""
+    """The payload is packed here: pymavlink would change the last two, as floats signalling NaN."""
     session = pinned(Sender())
     payload = struct.pack("<iHH16sB", value, 1, 0, b"COM_RC_IN_MODE", 6)
     (event,) = session.receive(framed(22, payload), PEER, 1.0).events
@@ -115,7 +116,7 @@ def test_px4_sends_integer_parameters_as_bytes(value: int) -> None:
 
 
 def test_estimator_reports() -> None:
-    """Flags of recordings of PX4 1.16.1 and ArduCopter 4.6.3, before GPS and in flight."""
+    """Flags were recorded from PX4 1.16.1 and ArduCopter 4.6.3, before the fix and in flight."""
     waiting, flying, wrong = (0.0, NAN, 0.02, NAN, 0.003), (0.04, 0.03, 0.02, 0.07), (1.3, 0.1)
     unfixed = "no valid horizontal velocity, horizontal position"
     for flags, ratios, accuracy_m, problem in (
@@ -154,7 +155,7 @@ def vehicle() -> Sender:
 
 @pytest.fixture
 def session(vehicle: Sender) -> Session:
-    """It has received a minute of the vehicle's time."""
+    """A session that has received telemetry stamped 60 s."""
     session = pinned(vehicle)
     times(session, vehicle.position(60000), vehicle.attitude(60000))
     session.poll(0.0)
@@ -162,7 +163,7 @@ def session(vehicle: Sender) -> Session:
 
 
 def test_a_jump_back_is_a_reboot(session: Session, vehicle: Sender) -> None:
-    """After which the intervals are requested again."""
+    """After a reboot the message intervals are requested again."""
     assert times(session, vehicle.position(500), vehicle.attitude(510)) == []
     assert session.poll(0.0) == ()
     reboot, position = session.receive(vehicle.position(650), PEER, 0.0).events
@@ -175,8 +176,8 @@ def test_a_jump_back_is_a_reboot(session: Session, vehicle: Sender) -> None:
 def test_stamps_that_are_late_far_ahead_or_stuck_are_dropped(
     session: Session, vehicle: Sender
 ) -> None:
-    """Per message; however many come between those of the present. Several far ahead that follow
-    each other are a clock that jumped."""
+    """Stamps are compared with those of the same message, however many wrong ones come between.
+    Several far ahead that follow each other are a clock that jumped."""
     late = vehicle.position(50000) + vehicle.attitude(50001) + vehicle.position(50010)
     assert session.receive(late, PEER, 0.0).events == []
     for later_ms in range(10, 500, 10):
@@ -197,8 +198,8 @@ WRAP_MS = 2**32
 
 @pytest.mark.parametrize("turns", [0, 1])
 def test_time_goes_on_where_the_32_bits_of_its_stamp_begin_again(turns: int) -> None:
-    """First heard 30 ms before the wrap. The clock of TIMESYNC is 64 bits wide: it does not wrap,
-    and its replies stay comparable with the stamps, also on a vehicle that has run for 50 days."""
+    """The vehicle is first heard 30 ms before the wrap. TIMESYNC has 64 bits and does not wrap; its
+    replies stay comparable with the stamps, also on a vehicle that has run for 50 days."""
     vehicle = Sender()
     session = pinned(vehicle)
     before = [vehicle.position(WRAP_MS - 30), vehicle.attitude(WRAP_MS - 20)]
@@ -240,7 +241,7 @@ def texts(session: Session, *frames: bytes, now_s: float = 0.0) -> list[str]:
 def test_chunks_are_joined_in_any_order(
     order: tuple[int, ...], session: Session, vehicle: Sender
 ) -> None:
-    """Also where the chunks of two texts alternate."""
+    """The chunks of two texts may alternate."""
     frames = [vehicle.text(CHUNKS[i], text_id, i) for i in order for text_id in (8, 9)]
     assert texts(session, *frames[:-2]) == []
     assert texts(session, *frames[-2:]) == [LONG.decode()] * 2
@@ -261,7 +262,7 @@ def test_a_missing_chunk_is_marked_after_a_second_and_few_texts_wait(
 
 def test_texts_are_printable(session: Session, vehicle: Sender) -> None:
     for data, text in (
-        (b"x" * 50, "x" * 50),  # id 0: complete in itself
+        (b"x" * 50, "x" * 50),  # id 0: a text of one chunk
         (b"\x1b[31mred\x07", "[31mred"),  # no control sequences reach a terminal
         (b"\xff\xfe", "\ufffd\ufffd"),
         ("3 \u00b0 tilt".encode(), "3 \u00b0 tilt"),

@@ -1,8 +1,8 @@
 """Arbitrary input: the session finds the frames in it, and the simulated vehicle keeps running,
 sends well-formed frames only, and flies afterwards.
 
-`FUZZ_DATAGRAMS=1000000 pytest tests/wire/test_fuzz.py` sends half a million to each firmware
-and half a million more in flight, before a normal one. The same seed gives the same ones.
+`FUZZ_DATAGRAMS=1000000 pytest tests/wire/test_fuzz.py` sends half a million datagrams to each
+firmware, and half a million in flight, before a normal flight. A seed always gives the same ones.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from simulator.vehicle.conditions import Conditions
 
 COUNT = int(os.environ.get("FUZZ_DATAGRAMS", "5000"))
 PER_STEP = 20
-# What a vehicle answers or obeys, and missions; what we read of one
+# Ids of messages that a vehicle answers or obeys, and of missions; of those that we read
 OBEYED = (0, 4, 11, 20, 21, 23, 66, 75, 76, 82, 84, 86, 110, 111, 39, 40, 41, 43, 44, 45, 51, 73)
 READ = (0, 1, 2, 22, 24, 31, 32, 75, 76, 77, 83, 111, 148, 193, 230, 245, 253)
 COMMANDS = (20, 21, 22, 176, 224, 300, 400, 410, 510, 511, 512, 520)
@@ -56,7 +56,7 @@ WORDS = (
 
 
 def datagrams(seed: int, ids: tuple[int, ...]) -> Iterator[bytes]:
-    """Random bytes, mutated recordings, hostile values and lengths, MAVLink 1, by turns."""
+    """Random bytes, mutated recordings, hostile values and lengths, MAVLink 1, in random order."""
     rng = random.Random(seed)
     frames = samples(PX4_RECORDING, ARDUCOPTER_RECORDING)
     makers: tuple[Callable[[], bytes], ...] = (
@@ -73,7 +73,7 @@ def datagrams(seed: int, ids: tuple[int, ...]) -> Iterator[bytes]:
 
 @cache
 def samples(*recordings: Path) -> list[bytes]:
-    """Frames of recordings, some of each kind."""
+    """Up to 20 frames of each message and component from recordings."""
     kinds: dict[tuple[str, int], list[bytes]] = {}
     for path in recordings:
         for _, frame, message in recorded(path)[:4000]:
@@ -89,7 +89,7 @@ def garbage(rng: random.Random) -> bytes:
 
 
 def mutated(rng: random.Random, frame: bytes) -> bytes:
-    """Bytes changed, left out and put in."""
+    """`frame` with bytes changed, removed or inserted."""
     data = bytearray(frame)
     for _ in range(rng.randrange(1, 4)):
         at = rng.randrange(len(data))
@@ -99,7 +99,7 @@ def mutated(rng: random.Random, frame: bytes) -> bytes:
 
 
 def hostile(rng: random.Random, message_id: int, *, version_1: bool = False) -> bytes:
-    """Wrong values under a right checksum; every fourth has the length of a later MAVLink."""
+    """A frame of hostile values with a valid checksum; one in four has a random length."""
     kind = mavlink.mavlink_map[message_id]
     words = [rng.choice(WORDS) if rng.random() < 0.8 else rng.randbytes(4) for _ in range(64)]
     length = rng.randrange(256) if rng.random() < 0.25 else kind.unpacker.size
@@ -110,7 +110,7 @@ def hostile(rng: random.Random, message_id: int, *, version_1: bool = False) -> 
 
 
 def receive(session: Session, data: bytes) -> list[bytes]:
-    """The frames found; every number of an event is finite."""
+    """The frames found. Every number of an event must be finite."""
     reception = session.receive(data, PEER, 0.0)
     for event in reception.events:
         for name in event.__dataclass_fields__:
@@ -131,8 +131,8 @@ def floats(value: object) -> Iterator[float]:
 @pytest.mark.parametrize("autopilot", [PX4, ARDUPILOT])
 @pytest.mark.parametrize("stream", [False, True])
 def test_hostile_datagrams(autopilot: int, stream: bool) -> None:
-    """A frame of any length under a right checksum is one: a shorter payload is padded, a longer
-    one belongs to a later version of MAVLink. SETUP_SIGNING (256) holds a key and is not logged."""
+    """A frame with a valid checksum counts at any length: a shorter payload is padded, a longer one
+    is of a later version of MAVLink. SETUP_SIGNING (256) holds a key and is not logged."""
     session, found, sent = pinned(Sender(), autopilot, stream=stream), 0, 0
     before = session.splitter.bytes_received
     for datagram in itertools.islice(datagrams(3, READ), 2000):
@@ -149,8 +149,8 @@ def test_hostile_datagrams(autopilot: int, stream: bool) -> None:
 
 
 def test_a_length_in_garbage_hides_no_frame_of_the_next_read() -> None:
-    """A false start with an unknown id, whose length covers three good frames of two reads; or the
-    third but for a byte, at the end of the first read, where a frame could begin."""
+    """A false header with an unknown id and a length that covers three good frames of two reads; or
+    all but the last byte of the third, where the first read ends and a frame could begin."""
     sender = Sender(7)
     frames = [sender.heartbeat(PX4) for _ in range(6)]
     reach = sum(map(len, frames[:3]))
@@ -162,8 +162,8 @@ def test_a_length_in_garbage_hides_no_frame_of_the_next_read() -> None:
 
 
 def test_frames_that_are_unusual() -> None:
-    """Unknown incompatibility flags are refused; a signed frame includes its signature; one with an
-    unknown id needs another frame behind it, and garbage like it hides none."""
+    """Unknown incompatibility flags are refused; a signed frame includes its signature. A frame
+    with an unknown id counts only before another frame; garbage like it hides no frame."""
     session, good, outer = pinned(Sender()), Sender().position(1000), Sender().position(2000)
     for flags in (0x02, 0xFE):
         assert receive(session, good[:2] + bytes([flags]) + good[3:]) == []
@@ -180,7 +180,7 @@ def test_frames_that_are_unusual() -> None:
 
 
 def assault(instance: Instance, seed: int, count: int) -> None:
-    """Feed both links, let time pass between; everything that is sent is well formed."""
+    """Feed both links while time passes. All that the vehicle sends must be well formed."""
     reader = Decoder()
     for index, datagram in enumerate(itertools.islice(datagrams(seed, OBEYED), count)):
         (instance.feed if index % 4 else instance.feed_ground)(datagram)

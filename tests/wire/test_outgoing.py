@@ -1,4 +1,4 @@
-"""Messages and records, read back by pymavlink."""
+"""Sent messages and log records, decoded by pymavlink."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ TILTED = (0.5, 0.0, math.cos(math.pi / 6))  # 30 degrees
     ("autopilot", "thrust_mps2", "direction", "body_z_down", "expected"),
     [
         (PX4, 12.0, TILTED, 0.9, 0.489 * 12.0 / 9.81),  # the tilt is not compensated
-        # thrust that holds the height: hover thrust, since the boost divides by the cosine
+        # a thrust that holds the height: hover thrust, as ArduCopter divides it by the cosine
         (ARDUPILOT, 9.81 / TILTED[2], TILTED, None, 0.489),
         (ARDUPILOT, 12.0, TILTED, 0.9, 0.489 * 12.0 * 0.9 / 9.81),
         (PX4, 100.0, (0.0, 0.0, 1.0), None, 1.0),
@@ -104,7 +104,7 @@ def test_what_is_not_finite_or_out_of_range_is_refused() -> None:
     ],
 )
 def test_commands(command: CommandLong, number: int, leading: list[float]) -> None:
-    """Those that no flight of tests/replay has sent to a real autopilot."""
+    """These are commands that no flight of tests/replay has sent to a real autopilot."""
     message = sent(command)
     assert (message.target_system, message.target_component, message.command) == (7, 1, number)
     parameters = [getattr(message, f"param{i}") for i in range(1, 8)]
@@ -115,7 +115,7 @@ def test_commands(command: CommandLong, number: int, leading: list[float]) -> No
 
 
 def test_positions_and_references() -> None:
-    """Their stamp has 32 bits."""
+    """Their time stamp wraps at 32 bits."""
     session = pinned(Sender(7))
     for value, kind, component in (
         (POSITION, "SET_POSITION_TARGET_LOCAL_NED", 191),

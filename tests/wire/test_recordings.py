@@ -61,7 +61,7 @@ def known(frame: bytes) -> bool:
 
 
 def test_every_byte_is_framed_and_no_frame_is_lost(replay: Replay) -> None:
-    """Also of those that pymavlink does not know, as EVENT; ours are not logged."""
+    """EVENT and others that pymavlink does not know are framed, but not logged, nor are ours."""
     splitter = replay.session.splitter
     assert splitter.bytes_received == sum(len(m.get_msgbuf()) for m in replay.messages)
     assert (splitter.bytes_skipped, splitter.frames) == (0, len(replay.messages))
@@ -89,7 +89,7 @@ def test_positions_and_attitudes_are_what_pymavlink_reads(replay: Replay) -> Non
 
 
 def test_modes_answers_and_texts_are_what_pymavlink_reads(replay: Replay) -> None:
-    """Who calls PX4's AUTO.LAND LAND. A text is whole once a chunk is shorter than 50 bytes."""
+    """pymavlink calls PX4's AUTO.LAND LAND. A text ends with a chunk of fewer than 50 bytes."""
     beats = replay.of(events.Heartbeat)
     assert [(beat.mode.rpartition(".")[2], beat.armed, beat.system_status) for beat in beats] == [
         (mavutil.mode_string_v10(m), bool(m.base_mode & 128), m.system_status)

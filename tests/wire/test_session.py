@@ -21,7 +21,7 @@ RESTARTED = (PEER[0], 50123)
 
 
 def ignores(session: Session, *frames: bytes) -> None:
-    """Each frame is no event, and is logged."""
+    """Each frame must give no event and be logged."""
     for frame in frames:
         reception = session.receive(frame, PEER, 0.0)
         assert (reception.events, reception.frames) == ([], [frame])
@@ -59,7 +59,7 @@ def test_the_first_autopilot_heard_is_the_vehicle_and_no_other_one_is() -> None:
 
 
 def test_a_vehicle_that_goes_on_from_another_port_is_no_second_one() -> None:
-    """Its HEARTBEAT came from there before the old port had been silent for long enough."""
+    """Its HEARTBEAT came from the new port before the old one had been silent for long enough."""
     vehicle = Sender(1)
     session = pinned(vehicle)
     session.receive(vehicle.position(1000), PEER, 10.0)
@@ -81,7 +81,7 @@ def test_a_vehicle_that_goes_on_from_another_port_is_no_second_one() -> None:
 def test_no_other_sender_replaces_the_vehicle(
     sender: Sender, place: tuple[str, int], silence_s: float
 ) -> None:
-    """Neither beside it, nor from another host, nor another system, nor another component."""
+    """Refused are: beside the vehicle, another host, another system, another component."""
     vehicle = Sender(1)
     session = pinned(vehicle)
     session.receive(vehicle.position(1000), PEER, 10.0)
@@ -99,9 +99,8 @@ def level_setpoint(target: int) -> Any:
 
 
 def test_another_program_with_our_ids_and_a_strange_setpoint_are_seen() -> None:
-    """Another companion that uses our ids, and one that sends setpoints as another component. A
-    controller is who sends setpoints or commands a mode, from the vehicle's own system; a request
-    for a parameter or a rate is none."""
+    """A companion that uses our ids is seen, and so is a component of the vehicle's system that
+    sends setpoints or mode commands. One that requests a parameter or a rate is no controller."""
     session = pinned(Sender())
     twin, other = Sender(1, 191), Sender(1, 195)
     beat = twin.heartbeat(8, 7, vehicle_type=18)
@@ -138,7 +137,7 @@ def test_a_setpoint_for_another_vehicle_on_the_link_is_not_ours(target: int, see
 
 
 def accepted_modes(arrivals: list[tuple[float, int, bytes]], session: Session) -> list[int]:
-    """Numbers of the reports of the mode that count, of frames (time of arrival, number, bytes)."""
+    """Numbers of the accepted reports of the mode among frames (time of arrival, number, bytes)."""
     receptions = [session.receive(frame, PEER, at_s) for at_s, _, frame in sorted(arrivals)]
     heard = [event for reception in receptions for event in reception.events]
     modes = [event.mode for event in heard if isinstance(event, events.Heartbeat)]
@@ -148,8 +147,8 @@ def accepted_modes(arrivals: list[tuple[float, int, bytes]], session: Session) -
 def mode_reports(
     rng: np.random.Generator, rate_hz: float, vehicle: Sender
 ) -> list[tuple[float, int, bytes]]:
-    """20 s of frames at `rate_hz`, a HEARTBEAT with the next mode each second: when it is sent, its
-    number (-1: another message), bytes."""
+    """20 s of frames at `rate_hz`, a HEARTBEAT with the next mode each second: (time when it is
+    sent, number of the report or -1 for another message, bytes)."""
     frames, reports = [], 0
     for k in range(int(20 * rate_hz)):
         sent_s = 1.0 + k / rate_hz
@@ -163,7 +162,7 @@ def mode_reports(
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_report_of_the_mode_that_a_newer_one_has_overtaken_is_dropped(seed: int) -> None:
-    """However late it is, up to 127 frames and 1.2 s; those in order count. 5 % are lost."""
+    """It may be 127 frames and 1.2 s late. Reports in order count; 5 % of other frames are lost."""
     rng = np.random.default_rng(seed)
     vehicle = Sender(1)
     session = pinned(vehicle)
@@ -226,7 +225,7 @@ def test_acks_for_others_are_not_ours() -> None:
 
 
 def test_timesync_is_answered_also_before_the_first_heartbeat() -> None:
-    """Of a vehicle; a ground station's request is not."""
+    """Only a vehicle's request is answered, not a ground station's."""
     vehicle, session = Sender(7), Session(SessionSettings())
     request = mavlink.MAVLink_timesync_message(0, 123_456_789_012)
     for now_s in (0.0, 2.5):
@@ -242,7 +241,7 @@ def test_timesync_is_answered_also_before_the_first_heartbeat() -> None:
 
 
 def test_heartbeats_at_1_hz_of_host_or_vehicle_time_whichever_is_faster() -> None:
-    """And at once, with the system id of the vehicle, when it is found."""
+    """A further one, with the vehicle's system id, is sent as soon as the vehicle is found."""
     vehicle, session = Sender(7), Session(SessionSettings(sends_first=True))
     assert session.poll(0.0) == (Heartbeat(18),)
     session.receive(vehicle.heartbeat(), PEER, 0.5)

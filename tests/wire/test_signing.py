@@ -1,4 +1,4 @@
-"""Signing of session and simulated vehicle beside pymavlink: what is made, accepted and refused.
+"""Signing by session and simulated vehicle against pymavlink: frames sent, accepted and refused.
 
 FORGED_FRAMES=100000 is the long form of the test with forged and replayed frames.
 """
@@ -52,7 +52,7 @@ def paired() -> tuple[Session, Sender]:
 
 
 def test_none_of_many_forged_and_replayed_frames_is_accepted() -> None:
-    """Nor does a forged time stamp shut out the vehicle."""
+    """A forged time stamp does not shut out the vehicle, either."""
     ours, vehicle = paired()
     chance = random.Random(13)
     real = [vehicle.position(1000 + 20 * number) for number in range(50)]
@@ -81,14 +81,14 @@ def test_none_of_many_forged_and_replayed_frames_is_accepted() -> None:
     for _ in range(COUNT):
         reception = ours.receive(chance.choice(forgeries)(), PEER, 0.2)
         assert (reception.events, reception.frames, reception.replies) == ([], [], [])
-    # a part of the altered frames is the original, by chance: then it is a replay
+    # by chance some altered frames equal the original: they are replays
     assert ours.senders.forged.total() == COUNT
     assert {*Refusal} - {*ours.senders.forged} == {Refusal.OLD_STAMP}
     assert ours.receive(vehicle.position(3000), PEER, 0.3).events  # and the vehicle still is
 
 
 def test_only_radio_status_is_accepted_unsigned() -> None:
-    """A frame of MAVLink 1 has no signature; a setpoint with our ids is no second sender."""
+    """A frame of MAVLink 1 is refused. An unsigned setpoint with our ids is no second sender."""
     ours, _ = paired()
     radio = mavlink.MAVLink_radio_status_message(1, 1, 100, 0, 0, 0, 0)
     ours.receive(Sender(ord("3"), ord("D")).frame(radio), PEER, 0.0)
@@ -117,8 +117,8 @@ def test_why_no_vehicle_was_found() -> None:
 
 
 def test_a_vehicle_whose_clock_is_behind_hears_ours_and_is_found() -> None:
-    """PX4 begins with the stamp that came with its key, perhaps years ago. Ours follows a clock
-    that is ahead."""
+    """PX4 begins with the stamp that came with its key, perhaps years ago. Our stamps follow those
+    of a vehicle that is ahead."""
     ours, vehicle = session(), signer(stamp=NOW - TEN_MINUTES)
     reception = ours.receive(vehicle.heartbeat(), PEER, 0.0)
     assert reception.events == [events.ClockBehind(1, armed=False)]
@@ -190,7 +190,7 @@ def vehicle(firmware: Firmware = PX4, key: bytes = KEY) -> Instance:
 
 
 def station(key: bytes = KEY, stamp: int = EPOCH) -> Sender:
-    """A ground station that pymavlink signs for."""
+    """A ground station whose frames pymavlink signs."""
     return Sender(255, 190, key, stamp)
 
 
@@ -199,10 +199,10 @@ def request(client: Sender, name: bytes = b"SYS_AUTOSTART") -> bytes:
 
 
 def heard(client: Sender, instance: Instance, steps: int = 5) -> list[str]:
-    """What the vehicle sends, as far as pymavlink accepts it."""
+    """Names of the messages that the vehicle sends and pymavlink accepts."""
     data = b"".join(b"".join(instance.step()) for _ in range(steps))
     found = [message.get_type() for message in client.codec.parse_buffer(data) or []]
-    # pymavlink does not check what it does not know
+    # pymavlink does not check messages that it does not know
     return [name for name in found if name != "BAD_DATA" and not name.startswith("UNKNOWN")]
 
 
@@ -263,7 +263,7 @@ def test_a_stamp_that_is_a_minute_old_is_refused() -> None:
 
 def test_a_px4_without_clock_follows_the_stamps_that_it_hears() -> None:
     instance, client = vehicle(), station()
-    assert heard(client, instance, 100) == []  # years behind
+    assert heard(client, instance, 100) == []  # its stamps are years behind
     # signed, although a PX4 would take it unsigned
     instance.feed(client.frame(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)))
     assert heard(client, instance)

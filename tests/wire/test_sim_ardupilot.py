@@ -1,7 +1,7 @@
 """The simulated ArduCopter: its default messages, setpoints and their limits, sticks; yaw, speed
 and places in automatic flight of both autopilots.
 
-Expected values are those of ArduCopter 4.6.3 and PX4 1.16.1 SITL, asked the same."""
+ArduCopter 4.6.3 and PX4 1.16.1 SITL gave the expected values for the same requests."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ LEVEL = (1.0, 0.0, 0.0, 0.0)
 
 
 def booted(**more: Any) -> Bench:
-    """On the ground, ready to arm."""
+    """A vehicle on the ground, ready to arm."""
     bench = Bench(firmware=ARDUPILOT, boot_scale=0.1, **more)
     bench.run(4.5)
     return bench
 
 
 def guided(**options: float) -> Bench:
-    """In GUIDED 8 m up, thrust is thrust."""
+    """A vehicle in GUIDED at 8 m that takes thrust as thrust, not as a climb rate."""
     bench = aloft(firmware=ARDUPILOT, mode="GUIDED", conditions={"boot_scale": 0.1})
     for name, value in {"GUID_OPTIONS": 8, **options}.items():
         bench.set(name, value)
@@ -47,7 +47,7 @@ def roll_deg(vehicle: Bench) -> float:
 
 
 def test_without_requests_it_sends_heartbeat_timesync_and_home() -> None:
-    """And texts, once somebody spoke; origin and home when the filter has found them."""
+    """Texts follow once a client has spoken, origin and home once the EKF has found them."""
     vehicle = Bench(firmware=ARDUPILOT, boot_scale=0.1, heartbeat_type=18)
     vehicle.run(20.0)
     counts = Counter(m.get_type() for _, m in vehicle.received)
@@ -71,7 +71,7 @@ def test_the_heartbeat_after_a_mode_change_shows_it_also_in_the_step_of_the_last
 
 @pytest.mark.parametrize(("thrust", "lifts"), [(0.45, True), (0.05, False)])
 def test_takeoff_by_setpoints_alone(thrust: float, lifts: bool) -> None:
-    """.3 m after 3.3-3.9 s; any thrust is flight, even if it cannot lift."""
+    """0.3 m is reached after 3.3 to 3.9 s. Any thrust counts as flight, even if it cannot lift."""
     vehicle = booted()
     vehicle.set("GUID_OPTIONS", 8)
     vehicle.command(176, 1, GUIDED)
@@ -102,7 +102,7 @@ def test_a_heavy_vehicle_takes_off_also_after_a_takeoff_that_ended_on_the_ground
 
 
 def test_which_attitude_setpoints_are_flown() -> None:
-    """A quaternion's sign is of no account; its length is, and so are bits of the mask."""
+    """The sign of a quaternion does not matter; its length and the bits of the mask do."""
     vehicle, tilts_deg = guided(), np.array([6.0, 6.0])  # roll and pitch, small
 
     def tilted() -> bool:
@@ -131,7 +131,7 @@ def test_without_guid_options_thrust_is_a_climb_rate() -> None:
 
 
 def test_a_request_of_the_present_mode_changes_nothing_and_disarming_ends_a_takeoff() -> None:
-    """Scripts ask for GUIDED until HEARTBEAT shows it; set_mode returns at once in that mode."""
+    """Scripts request GUIDED until HEARTBEAT shows it; set_mode then returns at once."""
     vehicle = booted()
 
     def take_off(up_m: float) -> None:
@@ -156,7 +156,7 @@ def test_a_request_of_the_present_mode_changes_nothing_and_disarming_ends_a_take
 
 
 def test_modes_that_do_not_start_while_armed() -> None:
-    """Disarmed any mode is entered."""
+    """While disarmed the vehicle enters any mode."""
     vehicle = guided()
     mission = vehicle.instance.autopilot.mission
     for number, title in ((AUTO, "AUTO"), (THROW, "THROW")):
@@ -260,8 +260,9 @@ def seen(bench: Bench) -> tuple[int, ...]:
 
 
 def test_sticks_are_speeds_and_an_override_lasts_three_seconds() -> None:
-    """As the real one: throttle is a climb rate, pitch accelerates second by second and is braked
-    by letting go. Then the throttle of the feigned remote control, at its lower end, descends."""
+    """As on the real one, throttle is a climb rate, pitch accelerates, and centred sticks brake;
+    values
+    are of each second. Then the simulated remote control has its throttle low: it descends."""
     bench = loitering()
     for width, climb in ((1700, 0.63), (1300, -0.68), (1580, 0.0)):
         push(bench, 3.0, 1500, 1500, width, 1500)
@@ -321,7 +322,7 @@ RELATIVE, ABSOLUTE = 6, 5  # MAV_FRAME
 
 
 def flying(firmware: Firmware = ARDUPILOT) -> Bench:
-    """5 m up, in GUIDED or AUTO.LOITER."""
+    """A vehicle at 5 m in GUIDED or AUTO.LOITER."""
     mode = "GUIDED" if firmware is ARDUPILOT else None
     bench = aloft(firmware=firmware, height_m=5.0, mode=mode)
     bench.run(1.0)
@@ -353,7 +354,7 @@ def fastest_mps(bench: Bench, duration_s: float) -> float:
 
 
 def test_a_turn_has_the_requested_rate_and_direction() -> None:
-    """Also to a heading, so that it may be the longer way."""
+    """A turn to a heading has them, too, and so may go the longer way round."""
     bench = flying()
     for params, wanted_deg, took_s in (
         ((90, 25, 1), 90.0, 4.0),
@@ -404,7 +405,7 @@ def test_streams_show_the_goal_and_the_outputs_and_a_region_of_interest_is_follo
 
 
 def test_a_requested_speed_holds_until_a_setpoint_of_another_kind() -> None:
-    """4 m/s asked on the way, 4.1 flown."""
+    """4 m/s were requested on the way, and the real one flew 4.1."""
     bench = flying()
 
     def go(north: float) -> None:
@@ -423,7 +424,7 @@ def test_a_requested_speed_holds_until_a_setpoint_of_another_kind() -> None:
 
 
 def test_reposition_of_arducopter_accelerates_and_brakes_as_the_real_one() -> None:
-    """Metres from the start, second by second. It takes it as COMMAND_INT alone."""
+    """Expected are metres from the start after each second. Only COMMAND_INT is accepted."""
     bench = flying()
     assert bench.command(192, -1, 1, 0, NAN, 0, 0, 10) == [UNSUPPORTED]
     assert reposition(bench, 40.0, 0.0, 5.0, RELATIVE) == ACCEPTED
@@ -498,7 +499,7 @@ def test_what_arducopter_refuses(
 
 @pytest.mark.parametrize("kind", ["", "_int"])
 def test_arducopter_flies_to_a_guided_mission_item_at_once(kind: str) -> None:
-    """As DroneKit's simple_goto asks."""
+    """DroneKit's simple_goto sends such an item."""
     bench = flying()
     x, y = degrees(bench, 0.0, 20.0)
     where = (round(x * 1e7), round(y * 1e7)) if kind else (x, y)

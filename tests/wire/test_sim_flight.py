@@ -40,7 +40,7 @@ def test_without_position_automatic_flight_lands_and_attitude_setpoints_continue
 
 
 def hovering_at(hover_thrust: float) -> Bench:
-    """Another vehicle than MPC_THR_HOVER, 0.5, tells PX4; 2 m up."""
+    """A vehicle at 2 m whose hover thrust is not the 0.5 of MPC_THR_HOVER."""
     believed = config.vehicle("px4_sih")
     bench = Bench(vehicle=believed.model_copy(update={"hover_thrust": hover_thrust}))
     bench.fly_offboard(2.0)
@@ -49,7 +49,7 @@ def hovering_at(hover_thrust: float) -> Bench:
 
 @pytest.mark.parametrize("hover_thrust", [0.15, 0.8])
 def test_vehicles_far_from_the_believed_hover_thrust_hold_and_land(hover_thrust: float) -> None:
-    """The integral, of up to g, makes up for the rest."""
+    """The integral term, up to g, compensates the difference."""
     bench = hovering_at(hover_thrust)
     hold(bench, 8.0, 2.0)
     assert bench.height_m == pytest.approx(2.0, abs=0.02)
@@ -58,7 +58,7 @@ def test_vehicles_far_from_the_believed_hover_thrust_hold_and_land(hover_thrust:
 
 
 def test_a_least_thrust_that_lifts_never_lands() -> None:
-    """PX4 1.16.1's SIH that hovers at 0.1 climbed in AUTO.LAND at 1.7 .. 2.3 m/s."""
+    """With a hover thrust of 0.1, SIH of PX4 1.16.1 climbed in AUTO.LAND at 1.7 to 2.3 m/s."""
     bench = hovering_at(0.1)
     bench.command(21)
     bench.run(4.0)
@@ -102,7 +102,7 @@ def test_arming_needs_a_battery_and_with_nav_dll_act_a_ground_station() -> None:
     bench = Bench(heartbeat_type=None)
     bench.set("NAV_DLL_ACT", 1)
     bench.run(5.0)
-    assert bench.command(400, 1) == [1]  # none was ever heard
+    assert bench.command(400, 1) == [1]  # no ground station was ever heard
     bench.heartbeat_type = 6
     for remaining, result in ((0.06, 1), (0.1, 0)):
         bench.instance.autopilot.plant.set_battery(remaining)
@@ -195,7 +195,7 @@ def test_a_stuck_message_repeats_its_content_with_or_without_its_stamp() -> None
 def test_gps_loss_drifts_and_jumps_back_and_px4_loses_the_position(
     timeout_us: float, late: int
 ) -> None:
-    """After EKF2_NOAID_TOUT: the estimator's flags are those before the first fix."""
+    """PX4 does so after EKF2_NOAID_TOUT, and has then the estimator flags before the first fix."""
     lost = {"fault": "gps_loss", "at_s": 4.0, "for_s": 8.0, "drift_mps": 0.5}
     bench = Bench(scenario=scenario(lost))
     bench.set("EKF2_NOAID_TOUT", timeout_us)
@@ -250,7 +250,7 @@ def test_the_same_seed_gives_the_same_bytes_with_every_new_fault(firmware: Firmw
 
 
 def test_a_weaker_or_heavier_vehicle_accelerates_less() -> None:
-    """Level at hover thrust the vertical specific force is what the change leaves of gravity."""
+    """Level at hover thrust, the change scales the vertical specific force, which was g before."""
     sinking: tuple[tuple[dict[str, Any], float], ...] = (
         ({"fault": "thrust_change", "thrust_scale": 0.8, "at_s": 2.0}, 0.8),
         ({"fault": "mass_change", "mass_scale": 1.25, "at_s": 6.0}, 0.8),
@@ -305,7 +305,7 @@ def test_a_clock_that_is_slow_shows_in_stamps_cut_to_milliseconds() -> None:
 
 
 def test_faults_that_run_go_on_after_a_reboot_and_end_as_they_should() -> None:
-    """The clock is set by the reboot."""
+    """After the reboot the clock counts from zero, without the jump."""
     bench = Bench(
         scenario=scenario(
             {"fault": "clock_jump", "jump_s": -30.0, "for_s": 8.0},
@@ -326,6 +326,6 @@ def test_faults_that_run_go_on_after_a_reboot_and_end_as_they_should() -> None:
 
 
 def test_a_flight_may_start_as_high_as_a_scenario_says() -> None:
-    """At MPC_TKO_SPEED, 1.5 m/s, that takes PX4 more than a minute."""
+    """A takeoff to 100 m at MPC_TKO_SPEED, 1.5 m/s, takes PX4 more than a minute."""
     bench = Bench(scenario=Scenario(name="high", start=Start(height_m=100.0)))
     assert bench.instance.autopilot.plant.height_m > 99.0

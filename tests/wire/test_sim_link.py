@@ -45,7 +45,7 @@ def test_garbage_in_a_datagram_hides_no_frame(garbage: bytes) -> None:
 
 @pytest.mark.parametrize(("name", "obeyed"), [("px4", False), ("ardupilot", True)])
 def test_whether_what_is_sent_to_all_systems_is_obeyed(name: str, obeyed: bool) -> None:
-    """PX4 1.16 ignores commands, parameters and missions for system 0, but a request of its
+    """PX4 1.16 ignores commands, parameters and missions for system 0, except a request for its
     version."""
     bench = Bench(firmware=FIRMWARES[name])
     bench.run(1.0)
@@ -60,8 +60,8 @@ def test_whether_what_is_sent_to_all_systems_is_obeyed(name: str, obeyed: bool) 
 
 
 def test_messages_for_others_are_forwarded_between_the_links() -> None:
-    """As `Mavlink::forward_message` of PX4 1.16 does: to a component that was seen on the other
-    link, or to anybody there if it is for all."""
+    """As by `Mavlink::forward_message` of PX4 1.16, a message goes to the other link if its target
+    was seen there or if it is for all."""
     bench = Bench(ground_link=True)
     ground = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
 
@@ -96,7 +96,7 @@ def test_messages_for_others_are_forwarded_between_the_links() -> None:
 
 
 def test_each_link_has_the_rates_of_px4_and_its_own_sequence() -> None:
-    """In datagrams of whole frames."""
+    """Datagrams contain whole frames."""
     bench = Bench(ground_link=True)
     bench.send(mavlink.MAVLink_param_request_list_message(1, 1))
     companion, ground = (link.outbox for link in bench.instance.links)
@@ -120,7 +120,7 @@ def test_each_link_has_the_rates_of_px4_and_its_own_sequence() -> None:
 
 
 def test_an_interval_can_be_stopped_restored_and_read() -> None:
-    """Another rate of one message does not shift the others."""
+    """A change of one message's rate does not shift the others."""
     bench = Bench()
     bench.run(1.1)
     for interval_us, shown_us, expected in (
@@ -142,7 +142,7 @@ def test_an_interval_can_be_stopped_restored_and_read() -> None:
 
 
 def test_timesync_and_px4_s_ping_are_answered_and_file_transfer_is_refused() -> None:
-    """A ping with a target is an answer."""
+    """A PING with a target is itself an answer and gets none."""
     for firmware, answered in (FIRMWARES["px4"], [7]), (FIRMWARES["ardupilot"], []):
         bench = Bench(firmware=firmware)
         bench.send(mavlink.MAVLink_ping_message(5, 7, 0, 0))
@@ -176,7 +176,7 @@ def asked(bench: Bench, name: bytes) -> tuple[float, int]:
 
 
 def test_the_parameter_hash_changes_with_the_values() -> None:
-    """As QGroundControl reads it; a client that knows the hash stops the list."""
+    """QGroundControl reads the hash; a client that knows it stops the list of parameters."""
     bench = Bench()
     first = asked(bench, b"_HASH_CHECK")
     assert first[1] == 5
@@ -192,7 +192,7 @@ def test_the_parameter_hash_changes_with_the_values() -> None:
 
 
 def test_parameters_are_obeyed_within_their_range() -> None:
-    """They keep any value, as a recorded session shows."""
+    """A parameter stores any value, as a recorded session shows, but acts within its range."""
     table = Bench().instance.autopilot.parameters
     for value, obeyed in ((2.5, 2.5), (-1.0, 0.0), (100.0, 60.0), (NAN, 1.0)):
         assert table.set_from_wire("COM_OF_LOSS_T", value, 9)
@@ -219,7 +219,7 @@ def test_states_that_are_not_finite_or_out_of_range_are_sent(body: tuple[float, 
 
 @pytest.mark.parametrize("firmware", FIRMWARES.values(), ids=FIRMWARES)
 def test_every_message_is_read_by_pymavlink(firmware: Firmware) -> None:
-    """Right number, order and types of fields: each message is framed here and decoded there."""
+    """Each message has the right number, order and types of fields."""
     bench = Bench(firmware=firmware, boot_scale=0.02)
     bench.run(1.0)
     names = builders(firmware)

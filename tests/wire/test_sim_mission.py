@@ -1,4 +1,4 @@
-"""Missions: protocol and flight; a recorded session has pauses, jumps and returns."""
+"""Missions: protocol and flight. A recorded session tests pauses, jumps and returns."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def acks(bench: Bench) -> list[int]:
 
 
 def upload(bench: Bench, rows: list[Row], kind: int = 0) -> int:
-    """The answer to a whole upload, item by item as it is asked for."""
+    """The answer to a whole upload; each item is sent when it is requested."""
     send(bench, mavlink.MAVLink_mission_count_message(1, 1, len(rows), kind))
     for seq, row in enumerate(rows):
         assert asked(bench)[-1] == seq
@@ -56,7 +56,7 @@ def upload(bench: Bench, rows: list[Row], kind: int = 0) -> int:
 
 
 def asked(bench: Bench) -> list[int]:
-    """Items asked for: the first in the old kind, then as they come."""
+    """Numbers of the items that the vehicle has requested, by either message, in order."""
     kinds = ("MISSION_REQUEST", "MISSION_REQUEST_INT")
     return [m.seq for _, m in bench.received if m.get_type() in kinds]
 
@@ -113,7 +113,7 @@ def test_px4_holds_when_its_mission_is_cleared() -> None:
 
 
 def test_missing_items_are_requested_again_until_a_timeout_or_cancelled() -> None:
-    """A client may ask for the INT messages instead."""
+    """A client that does not support MISSION_REQUEST is sent MISSION_REQUEST_INT."""
     bench = Bench()
     send(bench, mavlink.MAVLink_mission_count_message(1, 1, 2), 1.0)
     assert asked(bench) == [0] * len(asked(bench))
@@ -132,8 +132,8 @@ def test_missing_items_are_requested_again_until_a_timeout_or_cancelled() -> Non
 
 @pytest.mark.parametrize("firmware", [PX4, ARDUPILOT], ids=["px4", "ardupilot"])
 def test_fences_and_rally_points_are_kept_beside_the_mission(firmware: Firmware) -> None:
-    """A fence to stay in, and a rally point: as the mission, and without effect on it. An item of
-    frame 6 is downloaded in it as MISSION_ITEM_INT of PX4 alone."""
+    """An inclusion fence and a rally point are stored as the mission is, and do not change it. Only
+    PX4 returns an item of frame 6 in that frame, as MISSION_ITEM_INT."""
     bench = Bench(firmware=firmware)
     assert upload(bench, ROUND) == 0
     kept = {1: [place(5001, n, e, 0, 3) for n, e in ((9, 9), (9, -9), (-9, 0))],
@@ -164,7 +164,7 @@ def test_fences_and_rally_points_are_kept_beside_the_mission(firmware: Firmware)
 def test_a_waypoint_is_reached_within_the_radius_of_the_parameter(
     firmware: Firmware, radius: str, wide: float
 ) -> None:
-    """2 m by default, 8 m here: of 20 m across, 12."""
+    """With 8 m instead of the default 2 m a waypoint 20 m away is reached after 12 m."""
     bench = aloft(firmware=firmware, height_m=5.0)
     bench.set(radius, wide)
     upload(bench, [place(WAYPOINT, 0, 0, 5, 0, 0), *[place(WAYPOINT, 20, 0, 5, 0, 0)] * 2])
@@ -174,7 +174,7 @@ def test_a_waypoint_is_reached_within_the_radius_of_the_parameter(
 
 
 def test_the_first_item_of_arducopter_is_home() -> None:
-    """Scripts that download an empty mission wait for it. MIS_TOTAL counts it, too."""
+    """Scripts that download an empty mission wait for home. MIS_TOTAL counts it, too."""
     bench = Bench(firmware=ARDUPILOT)
     bench.run(1.0)
     for _ in range(2):
@@ -189,7 +189,7 @@ def test_the_first_item_of_arducopter_is_home() -> None:
 
 
 def test_px4_waits_with_the_yaw_of_an_item() -> None:
-    """Its time, and speed and return of other items, are those of a recorded session."""
+    """A recorded session tests the item's time, and speed and return of other items."""
     bench = aloft(height_m=4.0)
     upload(bench, ROUND)
     assert bench.command(300) == [0]
@@ -199,7 +199,7 @@ def test_px4_waits_with_the_yaw_of_an_item() -> None:
 
 
 def test_arducopter_faces_its_direction_of_flight_and_returns_within_its_mission() -> None:
-    """The fourth parameter is no heading there; the mode is AUTO until it has landed, and after."""
+    """param4 is no heading for ArduCopter. The mode is AUTO until the landing and after it."""
     bench = Bench(firmware=ARDUPILOT, boot_scale=0.1)
     bench.run(4.5)
     rows = [
@@ -220,8 +220,8 @@ def test_arducopter_faces_its_direction_of_flight_and_returns_within_its_mission
 
 
 def test_arducopter_asked_for_home_begins_with_the_takeoff_and_does_not_descend_to_it() -> None:
-    """Scripts reset a mission with MISSION_SET_CURRENT 0. ArduCopter 4.6.3 SITL at 6 m: item 1 is
-    reached at once, and it flies level to item 2."""
+    """Scripts reset a mission with MISSION_SET_CURRENT 0. For ArduCopter 4.6.3 SITL at 6 m item 1
+    is then reached at once, and the vehicle flies level to item 2."""
     bench = aloft(firmware=ARDUPILOT, height_m=6.0, mode="GUIDED")
     home = place(WAYPOINT, 0, 0, 0, 0, 0, 0, 0)
     upload(bench, [home, place(TAKEOFF, 0, 0, 3), place(WAYPOINT, 12, 0, 6)])

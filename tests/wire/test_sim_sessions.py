@@ -1,7 +1,7 @@
-"""Recorded sessions with a real PX4 and ArduCopter, repeated; every difference is listed
-here with its reason.
+"""Recorded sessions with a real PX4 and ArduCopter, repeated with the simulator; every difference
+is listed here with its reason.
 
-Each recording is trimmed: setpoints to 5 Hz, telemetry to what tells the time and the rows.
+Recordings are trimmed: setpoints to 5 Hz, telemetry to messages that give the time or a row.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from simulator.vehicle.conditions import Battery
 from simulator.vehicle.sensors import EstimatorName
 
 NOT_OURS = (
-    "[logger]",  # its log file
-    "GPS Vertical Pos Drift",  # while it stands, which the simulator has not
+    "[logger]",  # about its log file
+    "GPS Vertical Pos Drift",  # a check on the ground, which the simulator has not
     "Calibrating barometer",  # sent before the recording begins
-    "RC7: SaveWaypoint LOW",  # a switch on the feigned remote control
-    "in-flight yaw alignment",  # ours aligns on the ground for good
-    "SIM Hit ground at",  # SITL's own remark
-    "PreArm:",  # repeated by the minute
+    "RC7: SaveWaypoint LOW",  # a switch on SITL's simulated remote control
+    "in-flight yaw alignment",  # the simulator's heading is aligned on the ground
+    "SIM Hit ground at",  # a text of SITL itself
+    "PreArm:",  # repeated every minute
     # texts that no client reads, which the simulator does not send
     "Using default takeoff altitude", "RTL: start return", "RTL: land at", "Executing Mission",
     "Climb to", "Barometer", "AHRS: DCM active", "AHRS: EKF3 active", "EKF3 IMU0 initialised",
     "EKF3 IMU1 initialised", "alignment complete", "GPS 1:", "origin set", "Field Elevation",
 )  # fmt: skip
-COMPARED = {"HEARTBEAT", "EXTENDED_SYS_STATE", "LOCAL_POSITION_NED"}  # of what comes unasked
+COMPARED = {"HEARTBEAT", "EXTENDED_SYS_STATE", "LOCAL_POSITION_NED"}  # of unrequested messages
 PROMPT_S = 0.15
 NORTH, EAST = 0, 1
-# What hangs on how estimates wander near the ground, and on the jerk of PX4's climbs and descents,
-# which the simulator does not limit
+# Tolerances in s of rows that depend on how estimates wander near the ground, and on the jerk of
+# PX4's climbs and descents, which the simulator does not limit
 FLOWN_S = {
     "text 6 Takeoff detected": 0.5,
     "landed 2": 2.6,
@@ -59,7 +59,7 @@ ESTIMATORS = {"px4": EstimatorName.PX4_LIKE, "ardupilot": EstimatorName.ARDUPILO
 
 @dataclass(frozen=True)
 class Session:
-    """`seed`: one of the estimator's, with which the landings fall near the real ones."""
+    """A recorded session. `seed`: of the estimator, such that landings are near the real ones."""
 
     name: str
     seed: int
@@ -76,9 +76,9 @@ class Session:
 
 
 SESSIONS = [
-    # A flight by attitude setpoints: refusals, arming, climb, a stream that is lost, landing
+    # A flight by attitude setpoints: refusals, arming, climb, a lost stream, landing
     Session("offboard", seed=3, equal=35),
-    # Stream lost with each COM_OBL_RC_ACT and two COM_OF_LOSS_T, resumed; at last to the ground
+    # Stream lost and resumed with each COM_OBL_RC_ACT and two COM_OF_LOSS_T, then a landing
     Session("failsafes", seed=2, equal=55),
     # Takeoff to the default height, landing; to 12 m, reposition, return from 30 m
     Session(
@@ -87,19 +87,19 @@ SESSIONS = [
         equal=38,
         flown_s=(("landed 4", 3.0), ("state", 4.6)),
     ),
-    # On the ground: 95 commands, modes, arming in each mode; a mode lasts half a second there,
-    # so that heartbeats tell nothing
+    # On the ground: 95 commands, modes, arming in each mode; a mode lasts half a second, so that
+    # heartbeats are not compared
     Session(
         "ground",
         seed=3,
         equal=220,
         kinds=("ack", "text"),
         differing=(
-            "real ack 84: 0",  # takeoff of a VTOL: its mode, on a multicopter
+            "real ack 84: 0",  # NAV_VTOL_TAKEOFF: a multicopter enters its mode
             "ours ack 84: 3",
-            "real ack 511: 0",  # an interval that is not a number, of a message that is none
+            "real ack 511: 0",  # an interval of NaN for a message that does not exist
             "ours ack 511: 4",
-            "real ack 512: 2",  # it had just sent it and had no newer one
+            "real ack 512: 2",  # PX4 had just sent the message and had no newer one
             "ours ack 512: 0",
         ),
         flown_s=(("text 6 Disarmed by auto preflight", 1.1), ("ack 512", 0.7)),
@@ -110,7 +110,7 @@ SESSIONS = [
         seed=3,
         equal=48,
         differing=(
-            # at the end of the 5 s in which a silent ground station is still sent texts
+            # at the end of the 5 s in which a silent ground station still gets texts
             "ours text 6 Connection to ground station lost",
         ),
     ),
@@ -120,25 +120,25 @@ SESSIONS = [
         seed=2,
         equal=24,
         differing=(
-            "real text 2 System does not support shutdown",  # SITL's own
-            "real text 0 Low battery",  # its battery refills while it stands disarmed
+            "real text 2 System does not support shutdown",  # a text of SITL itself
+            "real text 0 Low battery",  # SITL's battery refills while it is disarmed
         ),
-        # the thresholds by SYS_STATUS, which shows hundredths and comes each second
+        # the charge comes from SYS_STATUS, in hundredths, once a second
         flown_s=(("text 0", 1.1), ("text 2 Failsafe", 1.1), ("landed 4", 1.1)),
     ),
-    # Two missions, one that returns and one that lands, the first paused and told to jump
+    # Two missions, one that returns and one that lands, the first paused and commanded to jump
     Session(
         "mission",
         seed=2,
         equal=64,
         kinds=("ack", "text", "state", "landed", "mission"),
         differing=(
-            # downloads here in any order
+            # the simulator allows downloads in any order
             "real text 2 WPM: REJ. CMD: Req. WP was unexpected",
-            "ours state 29 0x4040000 0",  # after the recording's end: a mission, and none there
+            "ours state 29 0x4040000 0",  # MISSION without a mission, after the recording's end
             "real mission MISSION_ACK 1",
         ),
-        # its estimates tell on takeoffs and landings, by which all that follows is earlier
+        # estimates change the times of takeoffs and landings, so that later rows are earlier
         flown_s=(
             ("text 6 Returning", 3.0),
             ("text 6 Landing detected", 5.6),
@@ -151,20 +151,20 @@ SESSIONS = [
             ("mission MISSION_ITEM_REACHED", 3.0),
         ),
     ),
-    # By place, speed, acceleration, heading and its rate, in every frame that there is; by rates
+    # Setpoints of position, velocity, acceleration, yaw and yaw rate, in every frame; body rates
     Session(
         "setpoints",
         seed=2,
         equal=29,
         differing=(
-            # it lands 5 s earlier, and then the recording ends
+            # the simulator lands 5 s earlier, the real one disarms after the recording's end
             "ours text 6 Disarmed by landing",
             "ours state 17 0x60000 0",
         ),
         flown_s=(
             ("text 6 Landing detected", 5.5),
             ("landed 1", 5.5),
-            # by setpoints, of which the recording has every fourth
+            # answers to setpoints, of which the recording has every fourth
             ("text 2", 0.25),
         ),
     ),
@@ -174,17 +174,17 @@ SESSIONS = [
         seed=2,
         equal=82,
         firmware="ardupilot",
-        kinds=("ack", "text", "state"),  # it lands as it returns: seconds sooner or later
+        kinds=("ack", "text", "state"),  # landings follow returns: seconds off
         differing=(
-            "ours state 217 0x11 4",  # lasts a second there, less than tells
+            "ours state 217 0x11 4",  # lasts a second on the real one: too brief
         ),
         flown_s=(
-            ("text 4", 0.3),  # looked for three times a second
+            ("text 4", 0.3),  # ArduCopter checks three times a second
             ("text 6 Disarming motors", 6.6),
             ("state 89 0x9 5", 6.6),
         ),
     ),
-    # By place, speed, acceleration, heading and its rate, in every frame; by rates; SYSID_ENFORCE
+    # Setpoints as in the session with PX4; SYSID_ENFORCE
     Session(
         "setpoints",
         seed=2,
@@ -195,7 +195,7 @@ SESSIONS = [
             "ours state 89 0x6 3",
         ),
         flown_s=(
-            ("text 6 Disarming motors", 6.5),  # returns under no limits on acceleration and jerk
+            ("text 6 Disarming motors", 6.5),  # here returns have no limit of acceleration, jerk
             ("landed 4", 6.5),
             ("landed 1", 6.5),
         ),
@@ -208,11 +208,11 @@ SESSIONS = [
         firmware="ardupilot",
         differing=(
             "real text 6 waiting for throw",
-            "ours state 89 0x0 1",  # booted again, after the recording's end
+            "ours state 89 0x0 1",  # rebooted, after the recording's end
         ),
     ),
-    # From the start on: 42 s of it, parameters, arming, takeoff, steps of roll and pitch, a lost
-    # stream, landing
+    # From the boot, 42 s, on: parameters, arming, takeoff, steps of roll and pitch, a lost stream,
+    # landing
     Session(
         "guided",
         seed=2,
@@ -220,7 +220,7 @@ SESSIONS = [
         firmware="ardupilot",
         kinds=("ack", "text", "state", "landed", "filter"),
         flown_s=(
-            # 27 s of thrust .14 % less than the weight here: its landing begins a metre lower
+            # here 27 s of thrust are 0.14 % below the weight: the landing begins 1 m lower
             ("text 6 Disarming motors", 2.5),
             ("landed 1", 2.5),
             ("state", 2.5),
@@ -234,9 +234,9 @@ SESSIONS = [
         equal=159,
         firmware="ardupilot",
         differing=(
-            "real ack 520: 4",  # that does not ask for 1, as no client does
+            "real ack 520: 4",  # its param1 is not 1, which no client sends
             "ours ack 520: 0",
-            # why it does not
+            # texts that say why a request is refused
             "real text 4 Unable to start landing sequence",
             "real text 4 Mode change to AUTO RTL failed: No landing sequence found",
             "real text 6 Failed to pause",
@@ -245,7 +245,7 @@ SESSIONS = [
             "real text 4 No axis selected, SID_AXIS = 0",
             "real text 4 Unable to start landing sequence",
         ),
-        kinds=("ack", "text"),  # a mode lasts a fifth of a second
+        kinds=("ack", "text"),  # a mode lasts 0.2 s, too brief for heartbeats
     ),
 ]
 
@@ -257,7 +257,7 @@ def _system(recording: Path) -> int:
 
 @functools.cache
 def heard(session: Session) -> tuple[Rows, Rows]:
-    """The real one's rows and the simulator's."""
+    """Rows of the real autopilot and of the simulator."""
     real, ours, firmware = Rows(), Rows(), FIRMWARES[session.firmware]
     rates_hz = {name: hz for name, hz in firmware.companion_rates_hz.items() if name in COMPARED}
     bench = Bench(
@@ -269,8 +269,8 @@ def heard(session: Session) -> tuple[Rows, Rows]:
     )
 
     def drain(message: Any) -> None:
-        """The battery is an input of the session, as PX4's empties in a minute and as
-        ArduCopter's has the voltage that it was told to have."""
+        """Set the battery as recorded: PX4's empties within a minute, ArduCopter's has the voltage
+        that SIM_BATT_VOLTAGE sets."""
         plant, kind = bench.instance.autopilot.plant, message.get_type()
         if session.name == "battery" and kind == "SYS_STATUS":
             plant.set_battery(max(0, message.battery_remaining) / 100)
@@ -310,21 +310,22 @@ def named(name: str, firmware: str) -> Session:
 def test_parameters_are_told_as_the_real_autopilot_tells_them(
     name: str, firmware: str, equal: int
 ) -> None:
-    """Read, listed and set, with their types; of those that the simulator has, but for the ids of
-    its sensors."""
+    """Parameters that the simulator has are read, listed and set with the same types, except the
+    ids of sensors."""
     compared = compare(*heard(named(name, firmware)), ("param",), (*NOT_OURS, "CAL_"))
     assert [row for row in compared.differing if row.startswith("ours")] == []
     assert compared.equal == equal
 
 
 def at(rows: Rows, times_s: Any) -> Array:
-    """Position and velocity at these times."""
+    """Position and velocity (N, 6) at these times."""
     path = np.array(rows.path)
     return np.stack([np.interp(times_s, path[:, 0], path[:, i]) for i in range(1, 7)], axis=-1)
 
 
 def test_setpoints_lead_to_the_place_of_the_real_vehicle() -> None:
-    """At the ends of those that name one, metres; estimates of either wander half a metre."""
+    """They agree at the end of each setpoint with a place; both estimates wander by half a
+    metre."""
     ends_s = (57.2, 63.1, 66.1, 69.1, 81.0, 84.0, 87.0, 98.9, 104.8, 119.6, 134.5)
     there, here = (at(rows, ends_s)[:, :3] for rows in heard(named("setpoints", "px4")))
     assert np.linalg.norm(there - here, axis=1).max() < 1.1
@@ -340,7 +341,7 @@ def test_setpoints_lead_to_the_place_of_the_real_vehicle() -> None:
     ],
 )
 def test_steps_move_the_vehicle_alike(axis: int, begin_s: float, end_s: float) -> None:
-    """Displacements, open loop from the real one's commands, .7 to 3 m long."""
+    """Displacements under the recorded commands, in open loop, 0.7 to 3 m long, are compared."""
     real, ours = heard(named("guided", "ardupilot"))
     assert ours.path[0][0] == pytest.approx(real.path[0][0], abs=0.06)
     there_m, here_m = (np.diff(at(rows, (begin_s, end_s))[:, axis])[0] for rows in (real, ours))
@@ -355,7 +356,7 @@ def test_steps_move_the_vehicle_alike(axis: int, begin_s: float, end_s: float) -
 
 @functools.cache
 def flown(name: str) -> tuple[Rows, Rows]:
-    """The real one's flight and the simulator's, which sees itself without errors."""
+    """Rows of the real flight and of the simulator's, whose estimator has no errors."""
     real, ours = Rows(), Rows()
     bench = Bench(EstimatorName.PERFECT, heartbeat_type=None)
     ask_again(Session(name, 1, 0).recording, bench, real, ours, run_on_s=2.0)
@@ -375,7 +376,7 @@ def flown(name: str) -> tuple[Rows, Rows]:
 def test_a_leg_has_the_times_and_the_speed_of_the_real_vehicle(
     begin_s: float, end_s: float, start: tuple[float, ...], goal: tuple[float, ...]
 ) -> None:
-    """Along the straight line; when a quarter, a half and three quarters of it are behind it."""
+    """Compared are the times after a quarter, a half and three quarters of the straight line."""
     line = np.subtract(goal, start)
     times_s = np.arange(0.0, end_s - begin_s, 0.02)
     passed_s, fastest_mps = [], []
@@ -389,7 +390,7 @@ def test_a_leg_has_the_times_and_the_speed_of_the_real_vehicle(
 
 
 def test_mission_items_are_reached_at_the_time_of_the_real_vehicle() -> None:
-    """From item to item; the first, a takeoff, from the start on."""
+    """Compared are the times from item to item; the first one, a takeoff, counts from the start."""
     sides = []
     for rows in flown("legs"):
         told = [row for row in rows.by_kind["mission"] if "REACHED" in row[1]]

@@ -1,5 +1,5 @@
-"""The simulator's UDP and TCP links on loopback; lockstep without and after a companion; bad
-links: each impairment against its definition, in numbers."""
+"""The simulator's UDP and TCP links on loopback; lockstep without a companion and after its
+end; bad links: each impairment against its definition, in numbers."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_a_companion_that_does_not_answer_ends_the_run_with_code_3(
 def test_a_stranger_sends_from_another_port_of_the_same_host(
     link: UdpLink, companion: socket.socket
 ) -> None:
-    """In lockstep before each barrier: the telemetry of these 20 ms follows. Only by UDP."""
+    """In lockstep the stranger's datagrams come before the telemetry of the same 20 ms."""
     fault = Stranger.model_validate({"fault": "stranger", "rate_hz": 250.0, "size_bytes": 33})
     flown = instance(fault)
     endpoint = Endpoint(flown, link, strangers=(open_beside(link),))
@@ -140,7 +140,7 @@ def test_senders_become_peers_up_to_a_limit(link: UdpLink, companion: socket.soc
 def client(server: TcpLink) -> socket.socket:
     connected = socket.create_connection(("127.0.0.1", server.port))
     connected.settimeout(2.0)
-    assert heard(server) is None  # it is let in
+    assert heard(server) is None  # accepts the client
     return connected
 
 
@@ -182,7 +182,7 @@ def test_a_client_that_never_reads_is_disconnected(server: TcpLink) -> None:
     left = 0
     while data := idle.recv(1 << 20):
         left += len(data)
-    assert left < 15 * UNSENT_MAX  # and then the end
+    assert left < 15 * UNSENT_MAX  # then the connection was closed
     idle.close()
     other.close()
 
@@ -203,7 +203,7 @@ STEP_US = 4000
 
 
 def carried(**settings: Any) -> list[tuple[int, bytes]]:
-    """(time, datagram) of 2000 numbered datagrams of 32 bytes, one per step of 4 ms."""
+    """(arrival in us, datagram) of 2000 numbered datagrams of 32 bytes, one sent per 4 ms."""
     channel = Channel(Impairment(**settings), Random(5))
     arrived: list[tuple[int, bytes]] = []
     for step in range(3000):

@@ -29,7 +29,7 @@ def asked_hz(session: Session) -> dict[int, float]:
 
 
 class Vehicle:
-    """Sends LOCAL_POSITION_NED at a given rate. `requested_s`: when this message was requested."""
+    """Sends LOCAL_POSITION_NED at a given rate. `requested_s`: vehicle times of requests for it."""
 
     def __init__(self, speed: float = 1.0) -> None:
         self.sender = Sender()
@@ -45,7 +45,7 @@ class Vehicle:
                 self.requested_s.append(0.01 * self.ticks)
 
     def run(self, seconds: float, every_ticks: int) -> float:
-        """`every_ticks` of 10 ms of vehicle time between messages; 0: none. The rate measured."""
+        """Send it every `every_ticks` of 10 ms vehicle time (0: never). Return its rate in Hz."""
         for _ in range(round(seconds * 100)):
             self.ticks += 1
             now_s = 0.01 * self.ticks / self.speed
@@ -75,7 +75,7 @@ def test_a_message_at_its_rate_is_requested_once_until_another_program_changes_i
     assert [t - 165.0 for t in vehicle.requested_s] == pytest.approx([1.0, 4.0], abs=0.7)
     vehicle.run(10.0, 1)
     vehicle.requested_s.clear()
-    assert vehicle.run(40.0, 0) == 0.0  # one has stopped it: a flight ends after 0.5 s without
+    assert vehicle.run(40.0, 0) == 0.0  # one has stopped it: without it a flight ends after 0.5 s
     assert len(vehicle.requested_s) >= 2
     assert vehicle.requested_s[0] - 183.0 == pytest.approx(0.2, abs=0.03)
 
@@ -83,7 +83,7 @@ def test_a_message_at_its_rate_is_requested_once_until_another_program_changes_i
 @pytest.mark.parametrize(
     ("loop_hz", "default_hz", "position_from_s", "loss", "asked_hz"),
     [
-        (100, 0, 0.0, 0.0, [100, 50]),  # was not flown
+        (100, 0, 0.0, 0.0, [100, 50]),  # was not flown before
         (100, 4, 0.0, 0.0, [100, 50]),  # a ground station has set 4 Hz
         (100, 0, 25.0, 0.0, [100, 50]),  # its estimator has no origin yet
         (400, 0, 25.0, 0.0, [100]),
@@ -93,8 +93,9 @@ def test_a_message_at_its_rate_is_requested_once_until_another_program_changes_i
 def test_a_rate_that_arducopter_denies_is_halved(
     loop_hz: int, default_hz: int, position_from_s: float, loss: float, asked_hz: list[int]
 ) -> None:
-    """It denies what is above 0.8 of SCHED_LOOP_RATE, with a text, and messages that it does not
-    know, as SIM_STATE on a real vehicle. What does not arrive for another reason is not halved."""
+    """ArduCopter denies rates above 0.8 of SCHED_LOOP_RATE, with a text, and messages that it does
+    not know, as SIM_STATE on a real vehicle. If a message is missing for another reason, its rate
+    is not halved."""
     sender, session, chance = Sender(), Session(SessionSettings()), random.Random(1)
     session.receive(sender.heartbeat(autopilot=3), PEER, 0.0)
     granted_hz, asked = {31: default_hz, POSITION: default_hz}, []
@@ -138,7 +139,7 @@ def test_link_time_follows_the_vehicle_or_host_time() -> None:
     for i in range(1, 51):
         link.on_host(0.02 + 0.1 * i)
     before_s = link.seconds
-    assert before_s == pytest.approx(6.0, abs=0.01)  # all of the silence, once it is one
+    assert before_s == pytest.approx(6.0, abs=0.01)  # all of the silence, once it is recognised
     link.on_telemetry(0.5, 5.1)  # a reboot
     link.on_telemetry(0.7, 5.2)
     assert link.seconds - before_s == pytest.approx(0.2)
@@ -149,7 +150,7 @@ def test_link_time_follows_the_vehicle_or_host_time() -> None:
 
 
 def test_two_clocks_by_turns_are_two_vehicles_and_a_reboot_is_one() -> None:
-    """At 100 Hz each, of two messages. The twin is 5 s older."""
+    """Each vehicle sends two messages at 100 Hz. The clock of the second one is 5 s ahead."""
 
     def feed(began_s: float, stamps: int, *others_s: float) -> bool:
         mixed = False
@@ -172,11 +173,11 @@ def test_two_clocks_by_turns_are_two_vehicles_and_a_reboot_is_one() -> None:
 
 @pytest.mark.parametrize(
     ("baud", "attitude_hz"),
-    # 0.7 of 5,760 bytes/s less 620 for slow messages, over 84 per pair; HIL_STATE_QUATERNION too
+    # (0.68 of 5,760 bytes/s - 1,042 for slow messages) / 138 per pair and half HIL_STATE_QUATERNION
     [(57_600, 20.8), (115_200, 49.2), (921_600, 100.0)],
 )
 def test_rates_fit_a_serial_line(baud: int, attitude_hz: float) -> None:
-    """CURRENT_MODE, sent when it changes, takes little of it."""
+    """CURRENT_MODE, which is sent when it changes, takes little of the capacity."""
     rates_hz = asked_hz(started(stream=True, capacity_bytes_ps=baud / 10))
     assert rates_hz[31] == rates_hz[32] == pytest.approx(attitude_hz, rel=0.02)
     assert rates_hz[436] == pytest.approx(50.0)
@@ -195,4 +196,4 @@ def test_telemetry_of_a_saturated_link_is_halved_until_it_is_slow() -> None:
     assert rates_hz[0] == pytest.approx(47.0, abs=4.0)
     assert rates_hz[-1] == pytest.approx(20.0, abs=0.5)
     assert len(rates_hz) <= 3
-    assert asked_hz(session) == {}  # nothing anew, which would load the link further
+    assert asked_hz(session) == {}  # no new requests, which would load the link further

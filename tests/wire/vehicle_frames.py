@@ -20,8 +20,8 @@ OFFBOARD = 0x00060000
 
 
 class Sender:
-    """One MAVLink component with its own sequence numbers. With a `key` pymavlink signs its frames,
-    with time stamps from `stamp` on."""
+    """One component on the network, with its own sequence numbers. With a `key` pymavlink signs
+    its frames, from time stamp `stamp` on."""
 
     def __init__(
         self, system_id: int = 1, component_id: int = 1, key: bytes = b"", stamp: int = 0
@@ -63,7 +63,7 @@ class Sender:
 
 
 def framed(message_id: int, payload: bytes, *, version_1: bool = False) -> bytes:
-    """Return a frame from (1, 1) with any payload and a correct checksum."""
+    """A frame of system 1, component 1 with any payload and a valid checksum."""
     ids = struct.pack("<BBBH", 7, 1, 1, message_id & 0xFFFF)
     body = bytes((len(payload), 0, 0)) + ids + bytes((message_id >> 16,)) + payload
     if version_1:
@@ -88,8 +88,7 @@ def understood(frame: bytes) -> Any:
 
 
 def recorded(path: Path) -> list[tuple[float, bytes, Any]]:
-    """Read a .tlog or .tlog.xz. Return for each entry the host time since the first one in s, the
-    frame, and the message that pymavlink decodes."""
+    """Entries of a .tlog or .tlog.xz: host seconds since the first, frame, message by pymavlink."""
     data, frames, at = path.read_bytes(), [], 0
     if path.suffix == ".xz":
         data = lzma.decompress(data)
