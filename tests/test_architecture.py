@@ -1,5 +1,5 @@
-"""The house rules that no tool checks: one clock, sockets at the edges, layout. `.ci/check` checks
-format, lint, strict types and import rules."""
+"""Rules of the sources that no tool checks: one clock, sockets at the edges, layout. `.ci/check`
+checks format, lint, strict types and import rules."""
 
 from __future__ import annotations
 

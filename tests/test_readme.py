@@ -1,4 +1,4 @@
-"""The README is executable: its commands are the ones that work, and every command is named."""
+"""The README is tested: its commands and examples work, and it names every command."""
 
 from __future__ import annotations
 

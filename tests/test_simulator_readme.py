@@ -24,7 +24,7 @@ from simulator.firmware import FIRMWARES
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "simulator" / "README.md"
-# All strings in the code except the tables; among them are the events that it raises
+# Strings in the code outside the tables, among them the events that it raises
 NAMED = frozenset(
     node.value
     for path in (ROOT / "simulator").rglob("*.py")
@@ -86,7 +86,7 @@ def test_every_fault_is_in_the_table_with_its_keys_and_scenarios_that_have_it() 
 
 
 def unknown(firmware: Firmware, rule: Rule) -> Iterator[str]:
-    """Yield the names in a row that do not exist."""
+    """The names in a row that do not exist."""
     known = NAMED.union((event + AFTER_DELAY for event in NAMED), firmware.boot_events_s)
     yield from {rule.event} - known
     yield from set(rule.mode.split()) - {*firmware.modes, "*"}

@@ -1,8 +1,8 @@
-"""What a decision and a second of the simulated vehicle cost: run with `--benchmark-enable`.
+"""Time of a decision and of a second of the simulated vehicle: run with `--benchmark-enable`.
 Nothing here asserts on time.
 
-The vehicle: in memory, default rates of PX4's companion link, PX4's estimator. 1000 / (milliseconds
-per second of flight) is the ratio to real time.
+The vehicle is in memory, with PX4's estimator and the default rates of PX4's companion link. 1000 /
+(milliseconds per second of flight) is the ratio to real time.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def test_decision(law: str, steps: int | None, volumes: int, benchmark: Any) -> 
 
 
 def _fly(instance: Instance, duration_s: float) -> int:
-    """Bytes sent at the barriers of so much flight."""
+    """Fly for `duration_s`; return the bytes sent at its barriers."""
     end_s, sent = instance.time_s + duration_s, 0
     while instance.advance_to_barrier(end_s):
         sent += sum(map(len, instance.barrier()[1]))

@@ -1,7 +1,7 @@
 """A pilot's session by MAVSDK: connects, flies twice, and prints one line of JSON per step.
 
-It does not depend on our simulator: `python mavsdk_session.py udpin://127.0.0.1:14540` flies a real
-PX4 SITL, too. With `--short` it only takes off and lands.
+It does not depend on the simulator: `python mavsdk_session.py udpin://127.0.0.1:14540` flies a real
+PX4 SITL too. With `--short` it only takes off and lands.
 """
 
 from __future__ import annotations

@@ -22,8 +22,7 @@ MAVPROXY = Path(sys.executable).with_name("mavproxy.py")
 
 @contextmanager
 def vehicle(*options: str) -> Iterator[int]:
-    """Start a simulator, and yield the port to which it sends. It is killed at the end of the
-    block."""
+    """Run a simulator and yield the port to which it sends; it is killed when the block ends."""
     port = free_port()
     with simulator("--connect", f"udpout:127.0.0.1:{port}", "--gcs", "none", *options) as process:
         assert process.stdout is not None
@@ -36,7 +35,7 @@ def vehicle(*options: str) -> Iterator[int]:
 
 
 class Terminal:
-    """MAVProxy on a terminal, until the end of the block. `shown` is all that it has printed."""
+    """MAVProxy until the block ends. `shown`: all that it has printed."""
 
     def __init__(self, directory: Path, port: int, *options: str) -> None:
         self._master, slave = pty.openpty()
@@ -66,7 +65,7 @@ class Terminal:
         os.write(self._master, line.encode() + b"\n")
 
     def expect(self, pattern: str, timeout_s: float = 15.0) -> re.Match[str]:
-        """Wait for text that matches after the last match, and return the match."""
+        """Wait for the first match in what it prints after the previous match, and return it."""
         deadline_s = time.monotonic() + timeout_s
         while (found := re.compile(pattern).search(self.shown, self._seen)) is None:
             remaining_s = deadline_s - time.monotonic()
@@ -76,14 +75,14 @@ class Terminal:
         return found
 
     def talk(self, *lines: tuple[str, str]) -> None:
-        """Type each line, unless it is empty, and wait for the text that it must print."""
+        """Type each line, unless it is empty, and wait for what MAVProxy must print."""
         for typed, shown in lines:
             if typed:
                 self.type(typed)
             self.expect(shown, 20.0)
 
     def read(self, timeout_s: float) -> bool:
-        """Read what MAVProxy prints within `timeout_s`. Return whether it still runs."""
+        """Read what is printed within `timeout_s`; return whether MAVProxy still runs."""
         if select.select([self._master], [], [], timeout_s)[0]:
             try:
                 self.shown += os.read(self._master, 65536).decode("utf-8", "replace")

@@ -28,7 +28,7 @@ LATE = ("--set", "limits.silence_s=5", "--set", "limits.missed_decisions=50")
 
 
 def test_an_arducopter_takes_off_lands_and_boots_again(tmp_path: Path) -> None:
-    """Six times as fast as real time, and started in 4 s instead of 42 s."""
+    """Time runs six times as fast, and the vehicle boots in 4 s instead of 42 s."""
     starts = tmp_path / "starts.yaml"
     starts.write_text("name: starts\ndescription: Soon.\nconditions: {boot_scale: 0.1}\n")
     simulated = ("--firmware", "ardupilot", "--speed", "6", "--scenario", str(starts))
@@ -70,7 +70,7 @@ def routed(directory: Path, system: int) -> Iterator[tuple[Terminal, int, int]]:
 
 
 def fly(port: int, directory: Path, key: Path, meanwhile: Callable[[], object]) -> str:
-    """What the flight printed."""
+    """Fly, call `meanwhile` until the end, and return what was printed."""
     command = [sys.executable, "-m", "offboard", "fly", "--connect", f"udpin:127.0.0.1:{port}"]
     options = (*SHORT, *PATIENT, *LATE, "--out", str(directory), "--signing-key", str(key))
     with (directory.parent / "printed").open("w+") as printed:
@@ -92,8 +92,8 @@ def fly(port: int, directory: Path, key: Path, meanwhile: Callable[[], object]) 
 
 @pytest.mark.slow
 def test_a_signed_flight_behind_a_router_beside_a_ground_station(tmp_path: Path) -> None:
-    """MAVProxy gives the vehicle its key, as `offboard key` says, and forwards. The station hears
-    the vehicle, and acknowledgements reach who asked."""
+    """MAVProxy gives the vehicle its key, as `offboard key` says, and forwards messages. The
+    station hears the vehicle, and acknowledgements reach the sender of the command."""
     passphrase = create_key(tmp_path / "key")
     with routed(tmp_path, system=3) as (terminal, ours, station):
         terminal.expect(r"Received \d+ parameters", 30.0)
@@ -101,7 +101,7 @@ def test_a_signed_flight_behind_a_router_beside_a_ground_station(tmp_path: Path)
         terminal.type(f"signing setup {passphrase}")
         terminal.expect("Setup signing key")
         ground = mavutil.mavlink_connection(f"udpin:127.0.0.1:{station}", source_system=255)
-        assert ground.recv_match(blocking=True, timeout=20.0)  # it forgets a key set before
+        assert ground.recv_match(blocking=True, timeout=20.0)  # a key set before that would be lost
         ground.setup_signing(hashlib.sha256(passphrase.encode()).digest())
         heard = set()
 

@@ -1,4 +1,4 @@
-"""MAVSDK flies the simulator in real time: everything a pilot does by it, twice on one process."""
+"""MAVSDK flies the simulator: all that a pilot does with it, two flights with one process."""
 
 from __future__ import annotations
 

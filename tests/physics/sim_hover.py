@@ -1,4 +1,4 @@
-"""Flights for tests of the simulated plant: a settled hover, and the response to a demand."""
+"""Flights for tests of the simulated vehicle: a settled hover, the response to a demand."""
 
 from __future__ import annotations
 
@@ -24,8 +24,7 @@ def attitude(roll_deg: float = 0.0, pitch_deg: float = 0.0, yaw_deg: float = 0.0
 
 
 def hovering(vehicle: Vehicle, conditions: Conditions = CALM, seed: int = 1) -> Plant:
-    """Return a plant that hovers at a height of some metres, level, with the nose to the north. Its
-    true speed is 1 mm/s in calm air."""
+    """A level hover at some metres, nose north. In calm air its true speed is 1 mm/s at most."""
     plant = Plant(vehicle, conditions, seed)
     plant.advance(1.5, Demand(True, 1.4 * vehicle.hover_thrust, attitude()))
     for _ in range(500):
@@ -47,7 +46,7 @@ def estimate_of(plant: Plant) -> SimpleNamespace:
 
 
 def response(plant: Plant, demand: Demand, duration_s: float, read) -> tuple:
-    """Apply a demand. Return the time since then and `read(truth)` at every step."""
+    """Times since the demand in s, and `read(truth)` at every step."""
     values = []
     for _ in range(round(duration_s / STEP_S)):
         plant.advance(STEP_S, demand)

@@ -1,5 +1,5 @@
-"""The rigid body against closed forms, conservation laws and Newton in the inertial frame: in the
-chart of quaternions; that of Euler angles flies the same. The linear model, and Eq. 16."""
+"""The rigid body with quaternions against conservation laws and Newton's law in the inertial frame;
+with Euler angles it flies the same. The linear model against SciPy and Eq. 16."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def rotation(state: Array) -> Rotation:
 def step(
     state: Array, inputs: Array, parameters: Array, step_s: float, wind_ned: Array = STILL_AIR
 ) -> Array:
-    """One RK4 step by machine code."""
+    """One RK4 step by the compiled function."""
     after, scratch = state.copy(), np.empty((RK4_SCRATCH_ROWS, len(state)))
     follow(after, inputs, wind_ned, parameters, step_s, 1, scratch)
     return after
@@ -108,7 +108,7 @@ def dragless(lopsided: Vehicle) -> Vehicle:
 
 
 def test_free_spin_keeps_energy_and_angular_momentum(dragless: Vehicle) -> None:
-    """A torque-free asymmetric body near its unstable middle axis; momentum in NED."""
+    """An asymmetric body spins without torque near its unstable middle axis; momentum is in NED."""
     inertia = np.array(dragless.inertia_kgm2)
 
     def energy_and_momentum(state: Array) -> tuple[float, Array]:
@@ -162,7 +162,7 @@ def test_both_charts_fly_the_same_manoeuvre(lopsided: Vehicle, seed: int) -> Non
         quaternion = step(quaternion, inputs(k * 0.001), parameters, 0.001, wind)
         steepest = max(steepest, abs(euler[1]), abs(euler[0]))
         drift = max(drift, float(np.abs(quaternion - quaternion_state(euler))[4:].max()))
-    assert 0.2 < steepest < 1.4  # a manoeuvre worth the name, off the singularity
+    assert 0.2 < steepest < 1.4  # a large manoeuvre, away from the singularity
     assert drift < 1e-9
     turned = Rotation.from_euler("ZYX", euler[[2, 1, 0]]).inv() * rotation(quaternion)
     assert turned.magnitude() < 1e-9
@@ -212,7 +212,7 @@ def test_other_lengths_are_refused(lopsided: Vehicle) -> None:
 
 
 PAPER = load("paper")
-# Every non-zero Eq. 16 prints. Its rows are interleaved [phi p psi r theta q x u (y lost) v z w];
+# Non-zeros that Eq. 16 prints. Its rows are interleaved [phi p psi r theta q x u (y lost) v z w];
 # its v row reads -0.0161, a slip: a roll to the right accelerates to the right.
 EQ_16 = {
     (PHI, TAU_X): 0.0488,
@@ -230,7 +230,7 @@ EQ_16 = {
 
 
 def test_the_sampled_model_is_the_exponential_and_eq_16_to_four_digits() -> None:
-    """By zero-order hold, of the augmented matrix; at a tenth of a second."""
+    """The exponential is that of the augmented matrix (zero-order hold) at 0.1 s."""
     a, b = hover_matrices(PAPER)
     augmented = expm(0.1 * np.block([[a, b], [np.zeros((4, 16))]]))
     sampled_a, sampled_b = sampled_matrices(PAPER, 0.1)

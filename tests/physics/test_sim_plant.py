@@ -1,5 +1,5 @@
 """The simulated vehicle: attitude loop, rotors, ground and battery against measured responses and
-closed forms; determinism, time, and demands no sane flight stack would send."""
+closed forms; determinism, steps of time, and demands that are not finite or out of range."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_angular_acceleration_is_limited_on_a_large_step():
     acceleration = np.diff(rates) / STEP_S
     limit = vehicle.angular_acceleration_limit_radps2[0]
     assert np.abs(acceleration).max() == pytest.approx(limit, rel=5e-3)
-    assert np.sum(np.abs(acceleration) > 0.99 * limit) >= 10  # it is not grazed but sat on
+    assert np.sum(np.abs(acceleration) > 0.99 * limit) >= 10  # the limit is held, not only reached
     assert times[np.argmax(rates > 2.0)] > 2.0 / limit
 
 
@@ -94,8 +94,8 @@ def _down_velocity(truth) -> float:
     return truth.velocity_ned_mps[2]
 
 
-# Mean vertical acceleration, up, in m/s^2 from so many seconds after a step of the thrust to so
-# many. PX4: the means of its steps up and down; ArduCopter: with its drag
+# Mean upward acceleration in m/s^2 from `begin_s` to `end_s` after a step of the thrust. PX4: mean
+# of the steps up and down; ArduCopter: including its drag
 @pytest.mark.parametrize(
     ("name", "step", "measured", "begin_s", "end_s", "near"),
     [

@@ -62,12 +62,12 @@ def _rms(values: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(
     ("estimator", "quantity", "measured", "slack"),
     [
-        # PX4 .26 .21 .48 in one set of flights, .19 .24 .33 in another
+        # PX4 had 0.26 0.21 0.48 in one set of flights, 0.19 0.24 0.33 in another
         ("px4_like", "position", (0.22, 0.23, 0.38), 0.25),
         ("px4_like", "velocity", (0.17, 0.29, 0.18), 0.25),
         ("px4_like", "tilt", (0.019, 0.021), 0.25),
         ("px4_like", "yaw", (math.radians(2.5),), 0.25),
-        # ArduCopter .06 .025 and .024 .006 in one set, .057 .023 and .027 .006 in another
+        # ArduCopter had 0.06 0.025, 0.024 0.006 in one set, 0.057 0.023, 0.027 0.006 in another
         ("ardupilot_like", "position", (0.057, 0.057, 0.023), 0.15),
         ("ardupilot_like", "velocity", (0.026, 0.026, 0.006), 0.15),
         ("ardupilot_like", "tilt", (0.002, 0.002), 0.15),
@@ -79,8 +79,8 @@ def test_error_has_the_measured_standard_deviation(errors, estimator, quantity, 
 
 
 def test_px4_velocity_is_not_the_derivative_of_its_position_and_ardupilot_nearly(errors):
-    """sd of (mean reported velocity - change of reported position / time), N and E: PX4 .17-.29
-    for seconds on end; ArduCopter noisy .05-.06 over 1 s, .02 over 4 s."""
+    """Measured sd of (mean reported velocity - change of reported position / time), N and E, in
+    m/s: PX4 0.17 to 0.29 for seconds; ArduCopter, noisy, 0.05 to 0.06 over 1 s, 0.02 over 4 s."""
     found = {}
     for name, error in errors.items():
         for seconds in (1, 4):
@@ -171,7 +171,7 @@ GUSTS = {
 
 
 def _winds(count: int, step_s: float, wind_ned_mps: tuple[float, float, float]) -> np.ndarray:
-    """(count, 3) m/s, north, east, down."""
+    """Wind (count, 3) in m/s, north, east, down, a row each `step_s`."""
     plant = Plant(load("px4_sih"), Conditions(wind_ned_mps=wind_ned_mps, gusts=GUSTS), 5)
     winds = np.empty((count, 3))
     for row in winds:
@@ -182,7 +182,7 @@ def _winds(count: int, step_s: float, wind_ned_mps: tuple[float, float, float]) 
 
 def test_gusts_have_drydens_spectrum_on_all_axes_whatever_way_the_wind_blows():
     """MIL-F-8785C: u: 2 s^2 T / (1 + (T w)^2); v, w: s^2 T (1 + 3 (T w)^2) / (1 + (T w)^2)^2. The
-    wind blows east, which is along."""
+    wind blows east, so that u is east."""
     step_s = 0.05
     winds = _winds(100_000, step_s, (0.0, 6.0, 0.0))
     assert np.mean(winds, axis=0) == pytest.approx((0.0, 6.0, 0.0), abs=0.25)
@@ -200,7 +200,7 @@ def test_gusts_have_drydens_spectrum_on_all_axes_whatever_way_the_wind_blows():
 
 
 def test_gusts_are_driven_by_normals_that_are_standard_and_independent():
-    """Along the wind they are of first order, with a time constant of 2 s."""
+    """Along the wind gusts are a first-order process with a time constant of 2 s, inverted here."""
     along, kept = _winds(20_000, STEP_S, (0.0, 0.0, 0.0))[:, 0], math.exp(-STEP_S / 2.0)
     normals = (along[1:] - kept * along[:-1]) / (2.0 * math.sqrt(1.0 - kept**2))
     assert stats.kstest(normals, "norm").pvalue > 0.01

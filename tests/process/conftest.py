@@ -1,4 +1,4 @@
-"""Fixtures that run commands, as processes or in this process."""
+"""Fixtures for tests of commands, which run as processes or in the process of pytest."""
 
 from __future__ import annotations
 
@@ -23,9 +23,8 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # signals that command
 
 @pytest.fixture
 def spawn(tmp_path: Path) -> Iterator[Spawn]:
-    """`spawn("offboard", ...)` starts a command in `tmp_path` with the further environment `more`.
-    The directory contains modules that end any process that imports them. The processes are killed
-    after the test."""
+    """`spawn("offboard", ...)` starts a command in `tmp_path`, with `more` in its environment. That
+    directory has modules `json` and `pickle`, which end a process that imports them from there."""
     running: list[subprocess.Popen[str]] = []
     for module in ("json", "pickle"):
         (tmp_path / f"{module}.py").write_text("import os\nos._exit(99)\n")
@@ -61,8 +60,8 @@ def spawn(tmp_path: Path) -> Iterator[Spawn]:
 def called(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> Called:
-    """`called("offboard fly", ...)` runs a command in this process, and returns exit code, stdout
-    and stderr. PORT in an argument is replaced by a free port."""
+    """`called("offboard fly", ...)` runs a command in this process and returns exit code, stdout
+    and stderr. The word PORT in an argument becomes the number of a free port."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
 
@@ -88,8 +87,8 @@ def called(
 
 @pytest.fixture
 def refused(called: Called, tmp_path: Path) -> Callable[..., str]:
-    """`refused("offboard fly", ...)` runs a command that must print one sentence and exit with 2,
-    without creating or changing a file in the working directory. It returns the sentence."""
+    """`refused("offboard fly", ...)` runs a command and returns the one sentence that it says. Its
+    exit code must be 2, and no file in the working directory may be made or changed."""
 
     def files() -> dict[Path, tuple[int, int]]:
         found = {path: path.lstat() for path in tmp_path.rglob("*")}
@@ -107,5 +106,5 @@ def refused(called: Called, tmp_path: Path) -> Callable[..., str]:
 
 @pytest.fixture
 def in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let `fly --sitl` run the simulator in this process."""
+    """`fly --sitl` flies its simulated vehicle in this process."""
     monkeypatch.setattr(sitl, "SimulatorProcess", lambda: nullcontext(sitl.InMemorySimulator()))

@@ -1,4 +1,4 @@
-"""Helpers for tests that run our commands as real processes."""
+"""Ports, options, processes, a full disk and signing, for tests of our commands."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ RECORDING = Path(__file__).parents[1] / "wire" / "recordings" / "px4-1.16.1-offb
 CONFIG = Path(__file__).parents[2] / "config"
 SIGNING_EPOCH_S = 1_420_070_400  # 2015-01-01
 NO_VEHICLE = "offboard fly --connect udpin:127.0.0.1:PORT --set limits.connect_s=0.3 --out x"
-LONG_S = 60.0  # timeout on a busy machine for what takes a moment on an idle one
+LONG_S = 60.0  # timeout of what takes a moment on an idle machine
 HOVERS = """name: hovers
 description: A vehicle that hovers when its links open, and is healthy a second later.
 conditions: {boot_scale: 0.1}
@@ -35,8 +35,8 @@ _PORTS = itertools.count(20_000 + 200 * int(os.environ.get("PYTEST_XDIST_WORKER"
 
 
 def free_port() -> int:
-    """Return a free UDP and TCP port. Each is returned only once. Ports are below those that the
-    system assigns, and from a range that only this pytest worker uses."""
+    """A free UDP and TCP port, which is returned only once. Each pytest worker has its own range,
+    below the ports that the system assigns."""
     for port in _PORTS:
         with (
             socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as datagrams,
@@ -50,7 +50,7 @@ def free_port() -> int:
 
 
 def register(site: Path, package: str, group: str, **points: str) -> None:
-    """Write the metadata of an installed package with these entry points into `site`."""
+    """Write the metadata of an installed package with these entry points."""
     metadata = site / f"{package}-1.0.dist-info"
     metadata.mkdir()
     (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
@@ -75,7 +75,7 @@ def children(pid: int) -> list[int]:
 
 
 def ended(pid: int) -> bool:
-    """Whether a process has ended. A zombie counts as ended."""
+    """Whether a process has ended; a zombie has."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
     except OSError:
@@ -91,7 +91,7 @@ def eventually(holds: Callable[[], object]) -> None:
 
 @contextmanager
 def full_disk(holds_bytes: int) -> Iterator[None]:
-    """Simulate a full disk by a limit of the size of files."""
+    """A disk on which files can have `holds_bytes`: RLIMIT_FSIZE takes the place of a full disk."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (holds_bytes, limits[1]))
     try:

@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 @contextmanager
 def simulator(*options: str) -> Iterator[subprocess.Popen[str]]:
-    """Run `python -m simulator` with its output in pipes. It is killed at the end of the block."""
+    """Run `python -m simulator` with its output in pipes; it is killed at the end of the block."""
     process = subprocess.Popen(
         [sys.executable, "-m", "simulator", *options],
         stdin=subprocess.DEVNULL,
@@ -53,7 +53,7 @@ class Peer:
         self._socket.sendto(message.pack(self.codec), self.vehicle)
 
     def listen(self, until: Callable[[], bool], *, each: Callable[[], None] = lambda: None) -> None:
-        """Receive until `until`; `each` is called at every HEARTBEAT of the vehicle."""
+        """Receive until `until` holds; `each` is called at every HEARTBEAT of the vehicle."""
         deadline_s = time.monotonic() + 120.0
         while not until():
             self._socket.settimeout(max(deadline_s - time.monotonic(), 0.01))

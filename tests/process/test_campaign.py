@@ -1,4 +1,4 @@
-"""Campaigns: the same table however they are flown, and what goes wrong on the way."""
+"""Campaigns: however their flights are flown, the table is the same; what goes wrong on the way."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def campaign(text: str, directory: Path) -> Campaign:
 
 @contextmanager
 def inline() -> AbstractContextManager[Workers]:  # type: ignore[misc]
-    """One worker in this process, whose code is loaded."""
+    """One worker in this process, which has loaded the code already."""
     with ThreadPoolExecutor(1) as pool:
         yield Workers(1, lambda: pool)
 
@@ -88,7 +88,7 @@ def rows(directory: Path) -> list[dict[str, str]]:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A campaign that was flown at once."""
+    """Directory of a campaign that was flown without an interruption."""
     directory = tmp_path_factory.mktemp("whole") / "out"
     summary = fly(campaign(FILE, directory))
     assert (summary.missing, summary.stopped, len(summary.rows)) == (0, "", 2)
@@ -137,7 +137,7 @@ def test_the_command_of_a_row_flies_it_again(whole: Path, tmp_path: Path, called
 
 
 def await_flights(process: subprocess.Popen[str], directory: Path, count: int) -> list[Path]:
-    """The results below `directory` when there are `count` of them."""
+    """Wait until there are `count` results below `directory`, and return them."""
     deadline_s = time.monotonic() + 120.0
     while len(found := list(directory.glob("*/results/*/*.json"))) < count:
         assert time.monotonic() < deadline_s
@@ -225,7 +225,7 @@ def test_an_infeasible_case_is_a_row_with_its_reason(tmp_path: Path) -> None:
 def test_a_comparison_whose_link_does_not_open_goes_on_when_it_does(
     called: Called, tmp_path: Path
 ) -> None:
-    """The key is made and the vehicle plugged in after the first attempts."""
+    """A user makes the key and plugs in the vehicle only after the first attempts."""
     command = "offboard compare --controllers lqr --seeds 2 --out x --connect serial:usb:57600"
     for more, why in (("--signing-key none", "signing key none cannot"), ("", "usb")):
         code, output, errors = called(f"{command} {more}")
@@ -305,7 +305,7 @@ def test_a_table_of_somebody_else_is_not_replaced(tmp_path: Path, name: str) -> 
 def test_a_profile_may_have_any_name(
     called: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The folder of its flights had this one's, so that nothing could be written in the end."""
+    """The folder of flights once had the profile's name, so that the profile was not written."""
     better = Tuned((("controller.bandwidth_radps", 5.0),), 5, 2.0, 1.0, 0.01)
     monkeypatch.setattr(Tuning, "run", lambda *_: better)
     assert called("offboard tune tracking --out x.tune")[0] == 0
@@ -340,7 +340,7 @@ def test_what_is_finished_on_a_full_disk_is_kept_and_a_worker_of_its_own_flies_t
 
 
 def dies(job: Job) -> Record:
-    """Ends its worker with seed 2, after a note of it."""
+    """End the worker process in the flight with seed 2, and note that in a file."""
     if job.case.seed == 2:
         with (Path(job.code) / "deaths").open("a") as deaths:
             deaths.write("died\n")
@@ -369,7 +369,7 @@ def test_a_flight_whose_worker_dies_twice_is_a_row(
 def test_a_kept_flight_appears_when_it_is_complete(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One that ends before leaves no directory that looks like a kept flight."""
+    """A flight that ends before leaves no directory that looks like a kept flight."""
     case = campaign(FILE, tmp_path / "out").cases[0]
     kept = tmp_path / "flights" / case.key
     job = Job(case, Promises(), code_hash(), kept)
@@ -391,7 +391,7 @@ def test_a_kept_flight_appears_when_it_is_complete(
 def test_a_killed_or_interrupted_comparison_keeps_what_landed_and_goes_on(
     spawn: Spawn, tmp_path: Path
 ) -> None:
-    """As a terminal interrupts: the whole group of processes."""
+    """The interrupt goes to the whole group of processes, as from a terminal."""
     command = (
         "offboard", "compare", "--controllers", "lqr", "--reference", "hover", "--scenario", "calm",
         "--seeds", 8, "--workers", 2, "--out", "x", *SHORT,

@@ -93,8 +93,8 @@ def await_phase(service: subprocess.Popen[str], port: int, *phases: str) -> None
 
 
 def many_clients(port: int, service: int) -> list[socket.socket]:
-    """More connections than a process may have descriptors, which send half a request and wait.
-    They stay until the server ends them."""
+    """Open more connections than the service may have descriptors. Each sends half a request,
+    waits, and stays until the server ends it."""
     for pid in (service, *children(service)):
         resource.prlimit(pid, resource.RLIMIT_NOFILE, (100, 100))
     clients = [socket.create_connection(("127.0.0.1", port), timeout=20.0) for _ in range(250)]
@@ -122,8 +122,8 @@ def test_flights_are_scored_one_at_a_time_also_after_the_service(tmp_path: Path)
 def test_a_pilot_engages_and_a_stop_hands_back(
     spawn: Spawn, called: Called, pilot: Peer, tmp_path: Path
 ) -> None:
-    """In real time over UDP, signed, with monitoring and clients that use up connections, a
-    second service, another vehicle, SIGTERM in flight, and SIGKILL in the next one."""
+    """The flight is in real time over UDP and signed, with monitoring, clients that use up
+    connections, a second service and another vehicle. SIGTERM ends it, and SIGKILL the next one."""
     create_key(tmp_path / "key")
     key = read_key(tmp_path / "key")
     (early := tmp_path / "out" / "early").mkdir(parents=True)
@@ -153,12 +153,12 @@ def test_a_pilot_engages_and_a_stop_hands_back(
     pilot.listen(mode(pilot, HOLDING))
     engage(pilot)
     await_phase(service, web, *ENGAGED)
-    for client in clients:  # all were left or refused before a later one was served
+    for client in clients:  # the server had to drop or refuse all to serve a later one
         client.close()
     begun = scraped(web)
     assert begun["offboard_flights_total"] == 1.0
     end_s = time.monotonic() + 2.0
-    while time.monotonic() < end_s:  # a client that scrapes more than any real one
+    while time.monotonic() < end_s:  # scrapes more often than any real client
         values = scraped(web)
     assert values["offboard_armed"] == 1.0
     status, state = health(web)
@@ -191,10 +191,10 @@ def test_a_pilot_engages_and_a_stop_hands_back(
     await_phase(killed, web, *ENGAGED)
     killed.kill()
     pilot.listen(mode(pilot, HOLDING))
-    assert pilot.newest["HEARTBEAT"].system_status == ACTIVE  # asked by the supervisor: no failsafe
+    assert pilot.newest["HEARTBEAT"].system_status == ACTIVE  # by the supervisor, not a failsafe
     pilot.command(SET_MODE, 1, 4, 5)  # RTL, which ends the supervisor, too
     pilot.listen(mode(pilot, RETURNING))
-    eventually(lambda: len(list((tmp_path / "out").glob("*/score.json"))) == 2)  # scored by it
+    eventually(lambda: len(list((tmp_path / "out").glob("*/score.json"))) == 2)  # by the supervisor
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")

@@ -23,7 +23,7 @@ from offboard.mavlink.session import RECORD_COMPONENT_ID
 from offboard.report.flight import read
 from offboard.run import configuration as config
 
-NOW_US = 1_790_000_000_000_000  # of an entry of a log
+NOW_US = 1_790_000_000_000_000  # time stamp of the entries of a log
 
 
 def gigabytes() -> bytes:
@@ -82,8 +82,8 @@ def test_nothing_identified_is_no_vehicle_file(called: Called, tmp_path: Path) -
 
 
 def test_a_log_with_attitude_as_angles_is_identified(called: Called, tmp_path: Path) -> None:
-    """A page that is there is kept. The title of the new one is the name of the flight directory,
-    also of the working directory."""
+    """An existing page is kept. The title of the new one is the name of the flight directory, also
+    if that is the working directory."""
     log = RECORDING.with_name("arducopter-4.6.3-guided.tlog")  # has no ATTITUDE_QUATERNION
     (tmp_path / "flight.tlog").write_bytes(log.read_bytes())
     (tmp_path / "identify.html").write_text("precious")
@@ -101,7 +101,7 @@ def test_a_log_with_attitude_as_angles_is_identified(called: Called, tmp_path: P
 def test_a_vehicle_is_flown_and_then_identified(called: Called, tmp_path: Path) -> None:
     command = "offboard identify --sitl --scenario calm --set reference.laps=1 --out x -o mine.yaml"
     assert called(command)[::2] == (0, "")
-    assert read(tmp_path / "x").facts["reference"] == "lemniscate"  # of `identify`, by its shape
+    assert read(tmp_path / "x").facts["reference"] == "lemniscate"  # it has no name but its shape
     found = yaml.safe_load((tmp_path / "mine.yaml").read_text())
     assert found["hover_thrust"] == pytest.approx(0.5, abs=0.02)
     assert (tmp_path / "identify.html").exists()
@@ -181,7 +181,7 @@ def test_a_flight_whose_result_cannot_be_printed_keeps_its_exit_code(
 def test_the_log_alone_holds_what_was_flown(
     called: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Along a table whose file is gone, by a command whose output closes, which ends no flight."""
+    """The flight follows a table whose file is then deleted. The closed output does not end it."""
     reads, writes = os.pipe()
     os.close(reads)
     monkeypatch.setattr(sys, "stdout", os.fdopen(writes, "w"))

@@ -1,4 +1,4 @@
-"""`offboard doctor` over UDP: what it says of a good vehicle, and of a port that is taken."""
+"""`offboard doctor` over UDP: what it says about a good vehicle, and about a port in use."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ OF_THIS_MACHINE = {"compiled", "computer", "delay", "disk"}  # which is busy wit
 
 
 def test_good_vehicle_over_udp(called: Called, tmp_path: Path) -> None:
-    """PX4 as it is shipped, but with signed messages: its signing time begins with that of the key,
-    which is years old. Another vehicle is on the link, too."""
+    """The simulated PX4 signs; its signing time begins with that of the key, which is years old.
+    Another vehicle is on the link, too."""
     port, path = free_port(), tmp_path / "key"
     create_key(path)
     heartbeat = mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 3, 3)

@@ -1,5 +1,5 @@
-"""Flights that end otherwise than planned: signals, terminals, pipes, disks. The log, not only the
-sentence, says that the vehicle landed."""
+"""Flights that do not end as planned: signals, terminals, pipes, disks. Not only the sentence but
+also the log says that the vehicle landed."""
 
 from __future__ import annotations
 
@@ -78,12 +78,12 @@ def test_ended_before_the_flight_it_leaves_no_simulator(spawn: Spawn, tmp_path: 
         time.sleep(1.05)  # a second one within a second is the same request
     _, said = process.communicate(timeout=60)
     assert (process.returncode, said) == (130, "interrupted before anything was sent\n")
-    eventually(lambda: ended(simulator))  # hit while it started: it ends by itself, alone
+    eventually(lambda: ended(simulator))  # it was still starting and ends by itself
     assert not (tmp_path / "x").exists()
 
 
 def interrupted_while_compiling(*_: object, **__: object) -> float:
-    """A rehearsal: what is raised in a callback of the compiler goes no further than that."""
+    """A rehearsal with a signal in a callback of the compiler, which lets no exception through."""
     ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGINT))()
     return 0.0
 
@@ -114,7 +114,7 @@ def test_a_full_disk_lands(called: Called, tmp_path: Path, monkeypatch: pytest.M
     assert "flight.tlog cannot be written (File too large)" in said
     assert "land: the log x/flight.tlog cannot be written (File too large)" in shown
     assert "by the operator" not in shown
-    assert "report.html" not in shown  # the disk that is full has no room for it
+    assert "report.html" not in shown  # the full disk has no room for it
     assert sum(1 for _ in tlog.read(tmp_path / "x" / "flight.tlog")) > 1000
 
 
@@ -132,7 +132,7 @@ def test_a_flight_that_cannot_be_scored_keeps_its_outcome(
     called: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     why: str, outcome: Outcome, options: tuple[str, ...], code: int,
 ) -> None:  # fmt: skip
-    """Its log is gone, or the scoring is interrupted: 130 says that nothing was sent."""
+    """Its log is gone, or scoring is interrupted; 130 would say that nothing was sent."""
     if why == "replaced":
         (tmp_path / "x").mkdir()
         (tmp_path / "x" / "flight.tlog").write_text("of another")
@@ -180,9 +180,9 @@ def test_json_lines_end_with_the_result_and_the_live_page_is_announced(
 def test_in_lockstep_it_is_said_what_has_happened(
     called: Called, scenario: str, sentence: str
 ) -> None:
-    """And not that the vehicle did not arm, or that its mode was not reported for 36 s: answers
-    come at the same vehicle time, and nothing but the clock has jumped. A link that becomes late is
-    noticed as soon as in real time."""
+    """It is not said that the vehicle did not arm, or that its mode was not reported for 36 s:
+    answers come at the same vehicle time, and only the clock has jumped. A link that becomes late
+    is noticed as soon as in real time."""
     code, _, said = called(
         "offboard fly --sitl --reference lemniscate --set reference.laps=2 --controller lqr "
         "--set identify.online=false --out x --no-report --scenario", scenario,
@@ -227,13 +227,13 @@ def test_a_process_ends_in_order(begin: str, command: list[str], code: int, said
 
 # --- a controller that is killed: the supervisor lands the vehicle ---
 #
-# Real processes in real time. The log says what was asked of the vehicle; the simulated autopilot,
-# which is another program, that it obeyed and landed. A controller that is stopped and continues,
-# and other links: `flight/test_supervisor.py`.
+# Real processes in real time. The log shows what was asked of the vehicle, and that the simulated
+# autopilot, another program, obeyed and landed. `flight/test_supervisor.py` tests a controller that
+# is stopped and continues, and other links.
 
 HOLD, LAND = 176, 21  # MAV_CMD
 ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
-# with the longest timeout of its own: on a busy machine its failsafe would come first
+# a long COM_OF_LOSS_T: on a busy machine PX4's failsafe would act before the supervisor
 PARAMETERS = ("COM_OF_LOSS_T=5", "MPC_LAND_CRWL=0.7", "COM_DISARM_LAND=0.5")
 
 
@@ -254,7 +254,7 @@ def tracking(spawn: Spawn, directory: Path) -> subprocess.Popen[str]:
 
 
 def take_over(log: tlog.Tlog) -> list[str]:
-    """What was asked about the take-over, and that the vehicle disarmed, in order, each once."""
+    """What was asked at the take-over, hold and land, and "disarmed", in order, each once."""
     told: list[str] = []
     for entry in log:
         if entry.name == "COMMAND_LONG" and entry.message.command in (HOLD, LAND):
@@ -280,7 +280,7 @@ def test_a_killed_controller_is_survived(spawn: Spawn, tmp_path: Path) -> None:
     assert said.splitlines()[-1] == "offboard supervisor: the vehicle is disarmed"
     log = tlog.read(tmp_path / "x" / "flight.tlog")
     assert take_over(log) == ["hold", "land", "disarmed"]
-    kept = tmp_path / "x" / "score.json"  # by a process that the supervisor begins
+    kept = tmp_path / "x" / "score.json"  # written by a process that the supervisor starts
     eventually(kept.exists)
     score = json.loads(kept.read_text())
     assert (score["completed"], score["ended_by"]) == (0.0, "supervisor")

@@ -33,7 +33,7 @@ def documented_package(directory: Path) -> None:
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A directory of installed packages that has the documented one."""
+    """A directory of installed packages with the documented one."""
     source, site = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("site")
     documented_package(source)
     install = (sys.executable, "-m", "pip", "install", "--quiet", "--no-deps")
@@ -67,7 +67,7 @@ def test_documented_controller_flies(
 def test_settings_of_any_key_are_read_back_from_a_log(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """A replay decided without them. A setting that no longer exists is dropped all the same."""
+    """A replay once decided without them. A setting that no longer exists is still dropped."""
     (tmp_path / "anything.py").write_text(
         "from offboard.control.base import ControllerSettings\n\n\n"
         "class Settings(ControllerSettings, extra='allow'):\n    law: str = 'any'\n\n"

@@ -14,7 +14,7 @@ import pytest
 
 from offboard.pytest_plugin import Flight
 
-# pytester moves the home directory, where it would be compiled anew
+# pytester changes the home directory, so that everything would be compiled again
 CACHE = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
 
 
@@ -73,8 +73,8 @@ def test_argument_without_name(sitl):
 
 @pytest.mark.parametrize("workers", [0, pytest.param(2, marks=pytest.mark.slow)])
 def test_the_fixtures_as_the_readme_shows_them(workers: int, pytester: pytest.Pytester) -> None:
-    """A test that fails keeps its log and ends its vehicle, one that passes keeps none. What is
-    wrong is one sentence, without a flight."""
+    """A test that fails keeps its log and ends its vehicle, one that passes keeps none. A wrong
+    option is one sentence, without a flight."""
     (example,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     assert example.count("\ndef test_") == 2
     pytester.makepyfile(test_readme=example, test_mine=MINE)

@@ -139,7 +139,7 @@ def test_a_name_or_number_beyond_every_limit_is_refused(command: str, refused: R
 
 @pytest.mark.parametrize("app", [offboard, simulator], ids=["offboard", "simulator"])
 def test_no_value_is_empty_or_no_text(app: typer.Typer) -> None:
-    """Of no option and argument of any command, as `--connect "$LINK"` of an unset variable."""
+    """This holds for each option and argument, as in `--connect "$LINK"` with an unset variable."""
     command = typer.main.get_command(app)
     commands = getattr(command, "commands", {"": command}).values()
     values = [(each, value) for each in commands for value in each.params if value.nargs]

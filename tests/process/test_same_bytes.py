@@ -46,7 +46,7 @@ def flown(
 
 
 def frames(directory: Path) -> dict[int, list[bytes]]:
-    """Those of a log by component, but for the requests for time, which a late side repeats."""
+    """Frames of a log by component, without those of TIMESYNC, which a late side repeats."""
     found: dict[int, list[bytes]] = {}
     for entry in tlog.read(directory / "flight.tlog"):
         if entry.name != "TIMESYNC":
@@ -55,7 +55,7 @@ def frames(directory: Path) -> dict[int, list[bytes]]:
 
 
 def without_wall_times(entry: tlog.LoggedMessage) -> bytes:
-    """The frame; of a tick's record, which is never sent, the fields that no clock decides."""
+    """The frame; for the record of a tick, which is never sent, its fields without wall times."""
     if entry.name != "DEBUG_FLOAT_ARRAY" or entry.message.array_id != RECORD_ID:
         return entry.frame.raw
     kept = [value for at, value in enumerate(entry.message.data) if at not in COLUMNS]
@@ -82,8 +82,8 @@ class LateSimulator(SimulatorProcess):
 def test_over_udp_and_disturbed_every_frame_is_the_same(
     undisturbed: dict[int, list[bytes]], tmp_path: Path
 ) -> None:
-    """The simulator begins late and repeats its first barrier, for which the controller is late,
-    and one in flight, where it stalls."""
+    """The simulator begins late. It repeats its first barrier, for which the controller is late,
+    and one in flight, where the controller stalls."""
     stalls = [1.2]
 
     def progress(companion: Flight) -> None:

@@ -84,7 +84,7 @@ SHORT = ("reference.height_m=1", "identify.excite=false")
 
 @contextmanager
 def flying(pool: SimulatorProcess) -> Iterator[int]:
-    """A vehicle in lockstep that has sent something: its process id."""
+    """Launch a vehicle in lockstep; yield its process id once it has sent something."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ours:
         ours.bind(("127.0.0.1", 0))
         ours.settimeout(30.0)
@@ -108,7 +108,7 @@ def test_how_each_vehicle_ends_is_reported_and_the_next_one_flies() -> None:
             assert (ending.unusable, ending.sentence.startswith(says)) == (True, True)
             with flying(pool) as vehicle:
                 os.kill(vehicle, signal.SIGKILL)
-                assert pool.ending(10.0) == KILLED  # not the words before
+                assert pool.ending(10.0) == KILLED  # not the sentence before
         with flying(pool):
             assert pool.ending() is None
         pool.recall()

@@ -20,7 +20,7 @@ COMPILING = "first flight with this code: compiling"
 
 @pytest.mark.slow
 def test_a_pure_wheel_flies_in_two_terminals_and_in_one(spawn: Spawn, tmp_path: Path) -> None:
-    """In real time while both processes compile everything first, then with what they compiled."""
+    """The first flight, in real time, compiles everything; the second uses that machine code."""
     built = tmp_path / "dist"
     subprocess.run((*BUILD, built), cwd=ROOT, check=True, capture_output=True, timeout=60)
     (wheel,) = built.iterdir()
@@ -42,7 +42,7 @@ def test_a_pure_wheel_flies_in_two_terminals_and_in_one(spawn: Spawn, tmp_path: 
     assert simulator.poll() is None
     assert b"supervisor:" not in (tmp_path / "x" / "flight.tlog").read_bytes()
     score = json.loads((tmp_path / "x" / "score.json").read_text())
-    # Half of PX4's COM_OF_LOSS_T: on an idle machine it is 0.11 s, a shared one may stall us both
+    # half of COM_OF_LOSS_T: 0.11 s on an idle machine; a shared one may stall both processes
     assert score["setpoint_gap_wall_max_s"] < 0.5
     assert score["setpoint_gap_max_s"] < 0.5
     assert score["tracked_s"] > 1.8

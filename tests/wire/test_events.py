@@ -36,8 +36,8 @@ def received(message: Any, autopilot: int = PX4) -> Any:
 
 
 def test_implausible_contents_are_dropped_but_logged() -> None:
-    """Each field of position, velocity, attitude and rates is wrong once; quaternions are not
-    unit."""
+    """Each field of position, velocity, attitude and rates is wrong in turn. Quaternions of zero
+    and double length are wrong, too."""
     vehicle = Sender()
     session = pinned(vehicle)
     frames = [vehicle.attitude(1000, *(0.0,) * 7)]

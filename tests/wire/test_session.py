@@ -81,7 +81,7 @@ def test_a_vehicle_that_goes_on_from_another_port_is_no_second_one() -> None:
 def test_no_other_sender_replaces_the_vehicle(
     sender: Sender, place: tuple[str, int], silence_s: float
 ) -> None:
-    """Refused are: beside the vehicle, another host, another system, another component."""
+    """It sends beside the vehicle, from another host, as another system or as another component."""
     vehicle = Sender(1)
     session = pinned(vehicle)
     session.receive(vehicle.position(1000), PEER, 10.0)

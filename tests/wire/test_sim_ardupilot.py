@@ -260,9 +260,9 @@ def seen(bench: Bench) -> tuple[int, ...]:
 
 
 def test_sticks_are_speeds_and_an_override_lasts_three_seconds() -> None:
-    """As on the real one, throttle is a climb rate, pitch accelerates, and centred sticks brake;
-    values
-    are of each second. Then the simulated remote control has its throttle low: it descends."""
+    """As on the real one, throttle is a climb rate, pitch accelerates and a centred stick brakes
+    (speeds after each second). After the override the simulated remote control, throttle at its
+    lower end, makes the vehicle descend."""
     bench = loitering()
     for width, climb in ((1700, 0.63), (1300, -0.68), (1580, 0.0)):
         push(bench, 3.0, 1500, 1500, width, 1500)

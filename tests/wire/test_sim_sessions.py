@@ -324,8 +324,7 @@ def at(rows: Rows, times_s: Any) -> Array:
 
 
 def test_setpoints_lead_to_the_place_of_the_real_vehicle() -> None:
-    """They agree at the end of each setpoint with a place; both estimates wander by half a
-    metre."""
+    """Places agree at the end of each setpoint that has one; both estimates wander half a metre."""
     ends_s = (57.2, 63.1, 66.1, 69.1, 81.0, 84.0, 87.0, 98.9, 104.8, 119.6, 134.5)
     there, here = (at(rows, ends_s)[:, :3] for rows in heard(named("setpoints", "px4")))
     assert np.linalg.norm(there - here, axis=1).max() < 1.1

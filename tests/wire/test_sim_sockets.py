@@ -102,7 +102,8 @@ def test_a_companion_that_does_not_answer_ends_the_run_with_code_3(
 def test_a_stranger_sends_from_another_port_of_the_same_host(
     link: UdpLink, companion: socket.socket
 ) -> None:
-    """In lockstep the stranger's datagrams come before the telemetry of the same 20 ms."""
+    """In lockstep its datagrams come before the telemetry of the same 20 ms. Only a UDP link can
+    have a stranger."""
     fault = Stranger.model_validate({"fault": "stranger", "rate_hz": 250.0, "size_bytes": 33})
     flown = instance(fault)
     endpoint = Endpoint(flown, link, strangers=(open_beside(link),))
