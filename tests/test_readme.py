@@ -115,7 +115,7 @@ def _path(picture: str) -> np.ndarray:
     return np.array([pair.split(",") for pair in points.split()], dtype=float)
 
 
-@pytest.mark.slow  # those of README.md itself: tests/process/test_pytest_plugins.py
+@pytest.mark.slow  # README.md itself: tests/process/test_pytest_plugins.py
 @pytest.mark.parametrize("readme", sorted(_examples().keys() - {"README.md"}))
 def test_python_examples_run(readme: str, tmp_path: Path) -> None:
     blocks = _examples()[readme]

@@ -20,7 +20,7 @@ from simulator.vehicle.plant import Plant
 AXES = {"roll": 0, "pitch": 1, "yaw": 2}
 
 
-# Measured figures; the slack covers their own spread and that telemetry at 100 Hz shows a
+# Ranges about measured figures: they cover the spread, and that telemetry at 100 Hz shows a
 # crossing half a sample late. Times of 10, 63 and 90 % in s, peak in degrees
 ANGLES = [
     ("px4_sih", "roll", -10.0, (0.085, 0.105), (0.185, 0.21), (0.24, 0.265), (10.7, 11.3)),
@@ -193,7 +193,7 @@ def test_battery_empties_by_the_current_and_sags_under_load():
 
 
 def test_a_vehicle_of_almost_pure_drag_stays_finite():
-    """Explicit integration of a drag of 1000 1/s at 4 ms would explode."""
+    """Explicit integration of a drag of 1000 1/s in steps of 4 ms would diverge."""
     drag = {"drag_translation_npmps": (20.0,) * 3, "drag_rotation_nmpradps": (5.0,) * 3}
     feather = PX4.model_copy(update={"mass_kg": 0.02, "inertia_kgm2": (0.01,) * 3, **drag})
     plant = Plant(feather, Conditions(wind_ned_mps=(5.0, 0.0, 0.0)), 1)

@@ -95,9 +95,9 @@ def test_px4_velocity_is_not_the_derivative_of_its_position_and_ardupilot_nearly
     assert found["ardupilot_like", 4] == pytest.approx((0.02, 0.02), rel=0.2)
 
 
-# Estimate minus truth, change over .02 to 1 s, standard deviation in mm and mm/s, N E D. PX4 1.16
-# SITL from its own log (position 125 Hz, truth 50 Hz), hover and lemniscate, median of seven
-# flights; ArduCopter 4.6 SITL on noisy sensors, median of five: N and E alike.
+# Standard deviation of the change of (estimate - truth) over 0.02 to 1 s, mm and mm/s, N E D. PX4
+# 1.16 SITL by its own log (position 125 Hz, truth 50 Hz), hover and lemniscate, median of seven
+# flights; ArduCopter 4.6 SITL with noisy sensors, median of five, N and E alike.
 CHANGES_S = (0.02, 0.1, 0.2, 0.5, 1.0)
 CHANGES = {
     ("px4_like", "position"): (
@@ -114,7 +114,7 @@ CHANGES = {
         *((1.75, 8.1, 15.3, 33.2, 54.7),) * 2,
         (0.4, 2.1, 4.0, 9.1, 15.4),
     ),
-    ("ardupilot_like", "velocity"): (*((7.8, 17.5, 29.5),) * 2, (1.6, 3.3, 4.7)),  # from .2 s on
+    ("ardupilot_like", "velocity"): (*((7.8, 17.5, 29.5),) * 2, (1.6, 3.3, 4.7)),  # from 0.2 s on
 }
 
 

@@ -75,7 +75,7 @@ def children(pid: int) -> list[int]:
 
 
 def ended(pid: int) -> bool:
-    """Whether a process has ended; a zombie has."""
+    """Whether a process has ended; a zombie counts as ended."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
     except OSError:
@@ -91,7 +91,7 @@ def eventually(holds: Callable[[], object]) -> None:
 
 @contextmanager
 def full_disk(holds_bytes: int) -> Iterator[None]:
-    """A disk on which files can have `holds_bytes`: RLIMIT_FSIZE takes the place of a full disk."""
+    """Simulate a full disk by RLIMIT_FSIZE: no file can be longer than `holds_bytes`."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (holds_bytes, limits[1]))
     try:

@@ -369,7 +369,7 @@ def test_a_flight_whose_worker_dies_twice_is_a_row(
 def test_a_kept_flight_appears_when_it_is_complete(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A flight that ends before leaves no directory that looks like a kept flight."""
+    """A flight that ends before that leaves no directory that looks like a kept flight."""
     case = campaign(FILE, tmp_path / "out").cases[0]
     kept = tmp_path / "flights" / case.key
     job = Job(case, Promises(), code_hash(), kept)

@@ -180,9 +180,9 @@ def test_json_lines_end_with_the_result_and_the_live_page_is_announced(
 def test_in_lockstep_it_is_said_what_has_happened(
     called: Called, scenario: str, sentence: str
 ) -> None:
-    """It is not said that the vehicle did not arm, or that its mode was not reported for 36 s:
-    answers come at the same vehicle time, and only the clock has jumped. A link that becomes late
-    is noticed as soon as in real time."""
+    """The sentence does not say that the vehicle did not arm, or that its mode was not reported for
+    36 s: answers come at the same vehicle time, and only the clock has jumped. A link that becomes
+    late is noticed as soon as in real time."""
     code, _, said = called(
         "offboard fly --sitl --reference lemniscate --set reference.laps=2 --controller lqr "
         "--set identify.online=false --out x --no-report --scenario", scenario,
@@ -254,7 +254,7 @@ def tracking(spawn: Spawn, directory: Path) -> subprocess.Popen[str]:
 
 
 def take_over(log: tlog.Tlog) -> list[str]:
-    """What was asked at the take-over, hold and land, and "disarmed", in order, each once."""
+    """What was asked at the take-over ("hold", "land"), and "disarmed", in order, each once."""
     told: list[str] = []
     for entry in log:
         if entry.name == "COMMAND_LONG" and entry.message.command in (HOLD, LAND):

@@ -67,7 +67,7 @@ def test_documented_controller_flies(
 def test_settings_of_any_key_are_read_back_from_a_log(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """A replay once decided without them. A setting that no longer exists is still dropped."""
+    """A replay once decided without such settings. One that no longer exists is still dropped."""
     (tmp_path / "anything.py").write_text(
         "from offboard.control.base import ControllerSettings\n\n\n"
         "class Settings(ControllerSettings, extra='allow'):\n    law: str = 'any'\n\n"
@@ -114,5 +114,5 @@ def test_broken_controller_is_refused_only_when_it_is_asked_for(
     assert sentence.startswith(says)
     assert "\n" not in sentence
     assert not law.endswith("s") or sentence.endswith("ing.py:1)")
-    for name in ("pso", "paper"):  # built in, and the paper's
+    for name in ("pso", "paper"):  # the built-in law and the paper's
         assert load("flight", choices={"controller": name}).controller.law == name

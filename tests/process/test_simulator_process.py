@@ -108,7 +108,7 @@ def test_how_each_vehicle_ends_is_reported_and_the_next_one_flies() -> None:
             assert (ending.unusable, ending.sentence.startswith(says)) == (True, True)
             with flying(pool) as vehicle:
                 os.kill(vehicle, signal.SIGKILL)
-                assert pool.ending(10.0) == KILLED  # not the sentence before
+                assert pool.ending(10.0) == KILLED  # not the previous sentence
         with flying(pool):
             assert pool.ending() is None
         pool.recall()

@@ -29,7 +29,7 @@ PX4 = Vehicle(
     yaw=AxisResponse(delay_s=0.148, natural_frequency_radps=3.1, damping=0.4),
 )
 LEVEL = Command(G, (0.0, 0.0, 1.0), 0.0)
-# Laws that track closely: not the paper's, which is slow, nor `autopilot`, which is PX4's own loop
+# Laws that track closely: neither the paper's, which is slow, nor the autopilot's own loop
 TRACKING = [name for name in names() if name not in ("paper", "autopilot")]
 
 

@@ -190,7 +190,7 @@ def test_margin(changes: dict[str, float], expected: tuple[str, float]) -> None:
 
 
 def test_a_case_has_a_directory_of_its_own_and_if_connected_begins_disarmed() -> None:
-    """Two files of one name have two directories; a given `limits.begin_armed` is kept."""
+    """Two files of the same name get two directories; a given `limits.begin_armed` is kept."""
     case = Case("flight", "lqr", "hover", None, None, "px4", "connected", 1, link="udpin::0")
     armed = replace(case, values=(("limits.begin_armed", True),))
     begins = [each.load().limits.begin_armed for each in (case, armed, replace(case, link=None))]

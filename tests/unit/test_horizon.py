@@ -190,8 +190,8 @@ def test_law_finds_cheaper_plans_than_a_random_search() -> None:
 
 
 def test_a_way_below_the_clearance_to_the_ground_costs() -> None:
-    """A plan that descends from 0.8 m costs more than its mirror image by 20 for each metre and 200
-    for each square metre below 0.3 m, times seconds."""
+    """Below 0.3 m a plan pays 20 per metre and second, and 200 per square metre and second. A
+    descent from 0.8 m and its mirror image differ in cost by that alone."""
     law = horizon(keep_out=[IN_THE_WAY])
     law.prepare(Situation(5.0, at((5.0, 5.0, -0.8), 0.0), hold((5.0, 5.0, -0.8), 0.0), LEVEL))
     down = np.zeros((STEPS_AROUND, 3))

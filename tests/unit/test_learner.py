@@ -186,7 +186,7 @@ def test_another_delay_is_adopted_once_something_else_shows_it_too() -> None:
 
 
 def test_after_two_contradictions_the_delay_is_unknown_for_20_s_of_calm() -> None:
-    """Also if later fits show another delay. A further contradiction restarts the 20 s."""
+    """This holds if later fits show another delay, too. A further contradiction restarts it."""
     estimate, delay_s = estimate_with(fit(0.05)), 0.09
     for begun_s in (10.0, 20.0):
         assert estimate.uncertainty.tilt_s == pytest.approx(KNOWN_S)
@@ -223,7 +223,7 @@ def test_doubt_about_the_tilt_leaves_the_other_constants() -> None:
         "drag_translation_npmps": (0.4, 0.4, 0.4),
     }
     assert estimate.vehicle == FILE.model_copy(update=identified)
-    assert estimate_with(fit(0.06)).vehicle.thrust_delay_s == 0.01  # 20 ms: not a link
+    assert estimate_with(fit(0.06)).vehicle.thrust_delay_s == 0.01  # 20 ms more: not a link
     thrust = {"thrust_delay_s": Estimate(0.05, 0.01), "thrust_effect_s": Estimate(0.06, 0.01)}
     own = estimate_with(Identified(10.0, tilt=tilt, **thrust))
     assert own.uncertainty.thrust_s == pytest.approx(0.03)

@@ -55,8 +55,8 @@ def hovering(noise: Noise | None = None, until_s: float = 5.0) -> Observer:
 
 
 def test_steady_gains_are_those_of_the_riccati_equation() -> None:
-    """The gains of the lateral motion [p, v, b, b', d] by SciPy are how much the state changes if
-    one message is disturbed by 1e-6. The velocity, with an sd of 1 m/s, has no influence."""
+    """A message that is disturbed by 1e-6 changes the lateral state [p, v, b, b', d] by SciPy's
+    gains times that. The velocity, with an sd of 1 m/s, has no influence."""
     small, step_s, noise = 1e-6, 0.01, Noise(velocity_sd_mps=1.0)
     wn, damping, drag_ps = 11.4, 0.56, PX4.drag_per_mass_ps
     a, b = np.zeros((5, 5)), np.zeros((5, 5))
@@ -176,7 +176,7 @@ def test_prediction_is_exact_on_a_matching_plant() -> None:
 
 
 def test_vertical_is_predicted_to_the_time_when_the_thrust_acts() -> None:
-    """At 2 m/s down, delays of 15 ms (thrust) and 57 ms (tilt) give two times and heights."""
+    """A descent at 2 m/s, delays 15 ms (thrust) and 57 ms (tilt), gives two times and heights."""
     observer, thrust = Observer(PX4), G - 1.02 * 2.0
     observer.on_command(0.0, command(0.0, 0.0, thrust))
     for i in range(301):

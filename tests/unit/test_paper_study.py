@@ -61,7 +61,7 @@ def mean_spread(flights: list[Flight]) -> float:
 
 
 def test_the_cost_is_eq_21() -> None:
-    """The quadratic that the swarm gets, against Eq. 21 as printed; a reset forgets u(k-1)."""
+    """The quadratic that the swarm gets equals Eq. 21 as printed; a reset forgets u(k-1)."""
     a, b = paper_model()
     rng = np.random.default_rng(1)
     for keep_constant in (True, False):
@@ -107,7 +107,7 @@ def test_time_constant_by_horizon() -> None:
 
 @pytest.mark.parametrize("plant", PlantKind)
 def test_cost_to_go_settles_a_hundred_times_closer(plant: PlantKind) -> None:
-    """A hover begins 1 m off and is compared after 20 s; time constants are 39 s and about 1 s."""
+    """A hover that begins 1 m off is compared after 20 s; time constants are 39 s and about 1 s."""
     task = FlightTask(PaperSettings(), plant, hover=True, start_offset_m=(1.0, 0.0, 0.0), steps=200)
     one, best = (
         fly(replace(task, cost_to_go=cost_to_go)).position_errors_m[-1]

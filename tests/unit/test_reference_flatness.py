@@ -109,7 +109,7 @@ def vehicle(**changes: object) -> Vehicle:
 
 
 def test_a_circle_by_hand() -> None:
-    """Tilt, height and distance are as by hand; limits below rate and thrust refuse the circle."""
+    """Tilt, height and distance are closed forms; a circle beyond a limit is refused."""
     inward = (2 * math.pi / 8) ** 2 * 2.0
     flown = track(shape="circle", radius_m=2.0, period_s=8.0, run_in_s=30, run_out_s=30)
     reached = math.atan2(inward, 9.8), 3.0, 2.0

@@ -195,7 +195,7 @@ def test_the_minimum_is_found_and_confirmed_and_its_profile_is_a_configuration(
 def test_an_interrupted_tuning_goes_on_and_finds_the_same(
     whole: tuple[Tuned, Path], tmp_path: Path
 ) -> None:
-    """A trial is four flights; the first has the present values, also in an interrupted tuning."""
+    """A trial is four flights; the first trial has the present values, interrupted or not."""
     costs: list[float] = []
     with pytest.raises(Incomplete):
         tuned(tmp_path / "t", most=10, told=lambda number, cost: costs.append(cost))

@@ -57,7 +57,7 @@ def recorded(directory: Path) -> tuple[Recorder, list[Path]]:
 def test_a_flight_log_begins_with_what_came_before(
     version_1: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It begins with the old home position, the last five seconds and the configuration."""
+    """The log begins with the old home position, the last five seconds and the configuration."""
     monkeypatch.setattr(clock, "local_stamp", lambda: "now")
     recorder, scored = recorded(tmp_path)
     talk, began_us = session(), clock.unix_us() - 20_000_000
@@ -378,8 +378,8 @@ def test_a_pause_that_is_continued_and_paused_again_while_it_stops_is_one_pause(
 
 @pytest.mark.parametrize("speed_mps", [0.3, 4.0])
 def test_a_moving_vehicle_is_stopped_where_the_reference_starts(speed_mps: float) -> None:
-    """It does not fly back. A smooth stop with at most 2 m/s^2 needs 35/32 of the way of a stop at
-    a constant 1 m/s^2."""
+    """The reference does not lead back. A smooth stop with at most 2 m/s^2 needs 35/32 of the way
+    of a stop at a constant 1 m/s^2."""
     config = load("flight", choices={"reference": "hover", "vehicle": "px4_sih"})
     plan = FlightPlan(build(config).track)
     velocity = (0.6 * speed_mps, -0.8 * speed_mps, 0.0)

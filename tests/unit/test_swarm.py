@@ -139,8 +139,8 @@ def test_bounds_that_make_no_box_are_refused() -> None:
 
 
 def test_each_move_is_eq_30_then_eq_20_then_the_box() -> None:
-    """By ask/tell and compiled, against the equations in NumPy with the same random numbers. The
-    spread (Eqs. 28-29) is the mean distance of the last positions from the best."""
+    """The oracle, for ask/tell and compiled, is the equations in NumPy with the same random
+    numbers. The spread (Eqs. 28-29) is the mean distance of the last positions from the best."""
     settings = SwarmSettings(social=1.4, rebound=0.25, inertia=1.9)
     lower, upper = -np.array([0.6, 0.8, 1.0]), np.array([0.7, 0.5, 0.9])
     hessian = np.array([[1.0, 0.3, 0.0], [0.3, 2.0, -0.2], [0.0, -0.2, 3.0]])

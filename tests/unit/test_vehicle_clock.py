@@ -79,8 +79,8 @@ def settled(until_s: float = 10.0, **more: Any) -> VehicleClock:
 @pytest.mark.parametrize("rate", [0.25, 0.9, 20.0])
 @pytest.mark.parametrize(("until_s", "answers"), [(0.8, False), (10.0, True)])
 def test_a_clock_of_any_rate_is_no_late_link(rate: float, until_s: float, answers: bool) -> None:
-    """A simulation on a busy computer is slower, one that is set so faster than real time. The rate
-    may also be unmeasured when the vehicle is engaged. Before any telemetry nothing is old."""
+    """A simulation may be slower than real time, on a busy computer, or faster. The vehicle may
+    also be engaged before the rate is measured. Before any telemetry nothing is old."""
     assert VehicleClock().now_s(EPOCH_S) == -math.inf
     assert VehicleClock().age_s(3.0, EPOCH_S) == 0.0
     link: Any = {"stamp": lambda at_s: rate * at_s, "answers": answers}
@@ -143,7 +143,7 @@ def test_a_jump_forward_is_measured(jump_s: float, shown_s: float) -> None:
 
 
 def test_a_clock_that_becomes_slower_is_no_late_link() -> None:
-    """The computer's load changes in flight. An age remains only between two replies."""
+    """The computer's load changes in flight. What remains is the change between two replies."""
 
     def stamp(at_s: float) -> float:
         return min(at_s, 20.0) + 0.93 * max(at_s - 20.0, 0.0)

@@ -161,8 +161,8 @@ def test_an_outage_of_the_whole_link_does_not_count_as_age() -> None:
 
 
 def test_what_the_vehicle_says_ends_a_sentence_down_to_a_notice() -> None:
-    """ArduCopter says only by a NOTICE that it leaves the mode because of a fence; before, the
-    change of mode had no reason."""
+    """Only by a NOTICE ArduCopter says that a fence made it leave the mode; we once reported the
+    change of mode without a reason."""
     vehicle = VehicleState()
     for severity, text in ((6, "EKF3 IMU0 is using GPS"), (5, "Circle fence breached")):
         vehicle.update(StatusText(severity, text), 1.0)

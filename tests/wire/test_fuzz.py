@@ -149,8 +149,8 @@ def test_hostile_datagrams(autopilot: int, stream: bool) -> None:
 
 
 def test_a_length_in_garbage_hides_no_frame_of_the_next_read() -> None:
-    """A false header with an unknown id and a length that covers three good frames of two reads; or
-    all but the last byte of the third, where the first read ends and a frame could begin."""
+    """The length in a false header with an unknown id covers three good frames of two reads, or all
+    but the last byte of the third, where the first read ends and a frame could begin."""
     sender = Sender(7)
     frames = [sender.heartbeat(PX4) for _ in range(6)]
     reach = sum(map(len, frames[:3]))

@@ -81,7 +81,7 @@ def test_a_vehicle_that_goes_on_from_another_port_is_no_second_one() -> None:
 def test_no_other_sender_replaces_the_vehicle(
     sender: Sender, place: tuple[str, int], silence_s: float
 ) -> None:
-    """It sends beside the vehicle, from another host, as another system or as another component."""
+    """It sends while the vehicle does, from another host, or as another system or component."""
     vehicle = Sender(1)
     session = pinned(vehicle)
     session.receive(vehicle.position(1000), PEER, 10.0)
@@ -162,7 +162,7 @@ def mode_reports(
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_report_of_the_mode_that_a_newer_one_has_overtaken_is_dropped(seed: int) -> None:
-    """It may be 127 frames and 1.2 s late. Reports in order count; 5 % of other frames are lost."""
+    """It is up to 127 frames and 1.2 s late. Reports in order count; 5 % of others are lost."""
     rng = np.random.default_rng(seed)
     vehicle = Sender(1)
     session = pinned(vehicle)

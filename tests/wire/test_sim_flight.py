@@ -195,7 +195,7 @@ def test_a_stuck_message_repeats_its_content_with_or_without_its_stamp() -> None
 def test_gps_loss_drifts_and_jumps_back_and_px4_loses_the_position(
     timeout_us: float, late: int
 ) -> None:
-    """PX4 loses it after EKF2_NOAID_TOUT; estimator flags are then those before the first fix."""
+    """PX4 loses it after EKF2_NOAID_TOUT; the estimator's flags then are those before a fix."""
     lost = {"fault": "gps_loss", "at_s": 4.0, "for_s": 8.0, "drift_mps": 0.5}
     bench = Bench(scenario=scenario(lost))
     bench.set("EKF2_NOAID_TOUT", timeout_us)

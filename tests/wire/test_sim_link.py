@@ -96,7 +96,7 @@ def test_messages_for_others_are_forwarded_between_the_links() -> None:
 
 
 def test_each_link_has_the_rates_of_px4_and_its_own_sequence() -> None:
-    """Datagrams contain whole frames."""
+    """Each datagram contains whole frames."""
     bench = Bench(ground_link=True)
     bench.send(mavlink.MAVLink_param_request_list_message(1, 1))
     companion, ground = (link.outbox for link in bench.instance.links)

@@ -24,10 +24,10 @@ from simulator.vehicle.sensors import EstimatorName
 
 NOT_OURS = (
     "[logger]",  # about its log file
-    "GPS Vertical Pos Drift",  # a check on the ground, which the simulator has not
+    "GPS Vertical Pos Drift",  # a check on the ground that the simulator does not have
     "Calibrating barometer",  # sent before the recording begins
     "RC7: SaveWaypoint LOW",  # a switch on SITL's simulated remote control
-    "in-flight yaw alignment",  # the simulator's heading is aligned on the ground
+    "in-flight yaw alignment",  # the simulator aligns its heading on the ground
     "SIM Hit ground at",  # a text of SITL itself
     "PreArm:",  # repeated every minute
     # texts that no client reads, which the simulator does not send
@@ -95,7 +95,7 @@ SESSIONS = [
         equal=220,
         kinds=("ack", "text"),
         differing=(
-            "real ack 84: 0",  # NAV_VTOL_TAKEOFF: a multicopter enters its mode
+            "real ack 84: 0",  # NAV_VTOL_TAKEOFF: PX4 enters its mode, without a VTOL
             "ours ack 84: 3",
             "real ack 511: 0",  # an interval of NaN for a message that does not exist
             "ours ack 511: 4",
@@ -195,7 +195,7 @@ SESSIONS = [
             "ours state 89 0x6 3",
         ),
         flown_s=(
-            ("text 6 Disarming motors", 6.5),  # here returns have no limit of acceleration, jerk
+            ("text 6 Disarming motors", 6.5),  # ours returns without limits of acceleration, jerk
             ("landed 4", 6.5),
             ("landed 1", 6.5),
         ),
@@ -211,8 +211,7 @@ SESSIONS = [
             "ours state 89 0x0 1",  # rebooted, after the recording's end
         ),
     ),
-    # From the boot, 42 s, on: parameters, arming, takeoff, steps of roll and pitch, a lost stream,
-    # landing
+    # From boot (42 s): parameters, arming, takeoff, steps of roll and pitch, a lost stream, landing
     Session(
         "guided",
         seed=2,
