@@ -336,8 +336,7 @@ def test_damaged_pieces_raise_nothing_else(data) -> None:
 
 
 def test_in_real_time_each_input_is_recorded() -> None:
-    """That is host time in us, senders, frames not in the log, and the number of other
-    datagrams."""
+    """That is host time in us, senders, frames not in the log, and a count of other datagrams."""
     recorder, clock_s = InputRecorder(SessionSettings()), [100.000_250]
     read = recorder.watch(lambda: clock_s[0])
     pieces = []

@@ -101,8 +101,7 @@ def test_standard_deviations_agree_with_repeated_fits():
 
 def test_standard_deviations_of_a_heading_whose_errors_wander():
     """Sixty records of 5.4 s with one double step, as in the phase EXCITE; the heading's error
-    walks as PX4's, 16 mrad per root second. The residuals alone would give 40 % of the delay's
-    sd."""
+    walks as PX4's, 16 mrad per root second. The residuals alone give 40 % of the delay's sd."""
     true, sent_at = (0.15, 3.1, 0.4), np.arange(0.0, 5.4, 0.1)
     values = 0.07 * np.where((sent_at >= 1.0) & (sent_at < 5.0), 1.0, 0.0)
     values[(sent_at >= 2.0) & (sent_at < 4.0)] = -0.07
