@@ -107,7 +107,7 @@ class Score:
     pause_max_s: float = _metric("longest pause of this process", "s")
     refused_setpoints: float = _metric("setpoints not sent")
     refused_late: float = _metric("setpoints decided too late")
-    refused_stale: float = _metric("setpoints of too old telemetry")
+    refused_stale: float = _metric("setpoints from outdated telemetry")
     refused_not_ours: float = _metric("setpoints without authority")
     refused_unusable: float = _metric("setpoints not finite or beyond limits")
     decisions: float = _metric("decisions")

@@ -100,7 +100,7 @@ def show(console: Console, score: Score, history: History) -> None:
         console.print(story)
     known = {name: value for name, value in score.metrics().items() if not math.isnan(value)}
     if not known:
-        console.print("nothing was flown that could be scored")
+        console.print("the log has no flight that can be scored")
         return
     metrics = Table(box=None, pad_edge=False, show_header=False)
     metrics.add_column(no_wrap=True)

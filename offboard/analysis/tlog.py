@@ -118,7 +118,7 @@ class Tlog:
             self.truncated = before + len(data) - (before + at if lost is None else lost)
         if not found:
             raise UserError(
-                f"{self.path} is not a .tlog, or empty: it holds no time stamp and MAVLink frame"
+                f"{self.path} is empty or not a .tlog: it has no time stamp with a MAVLink frame"
             )
 
     def _count(self, place: int) -> None:

@@ -46,7 +46,7 @@ def _counted(seeds: Any) -> Any:
     if type(seeds) is not int:
         return tuple(seeds) if isinstance(seeds, list) else seeds
     if not 1 <= seeds <= SEEDS_MOST:
-        raise ValueError(f"{seeds} is no number of seeds from 1 to {SEEDS_MOST}")
+        raise ValueError(f"the number of seeds is {seeds}; it must be 1 to {SEEDS_MOST}")
     return tuple(range(1, seeds + 1))
 
 

@@ -31,7 +31,7 @@ KEPT = "flights"  # directory of the logs that are kept
 KEPT_FILES = {"report": "report.html", "log": "flight.tlog"}
 TABLE_S = 5.0  # least time between two tables while flights run
 TABLE_SHARE = 0.02  # greatest share of the time that is spent on tables while flights run
-INTERRUPTED = "interrupted: flights in the air are finished; interrupt again to exit at once"
+INTERRUPTED = "interrupted: flights in progress are finished first; interrupt again to exit at once"
 LINES = 20
 Fly = Callable[[Sequence[Case]], list[Record]]  # see `flying`
 

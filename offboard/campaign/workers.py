@@ -40,7 +40,9 @@ POLL_S = 0.2  # longest time until a stop request is noticed
 QUEUED = 2  # flights submitted per thread of a cluster, so that no thread waits for the next one
 ORPHANED = 1  # exit code of a worker whose parent has ended
 # Record of a flight whose worker died, and so could not return one
-DIED = Record(ExitCode.ABORTED, "the process that flew it ended, twice", NOT_FLOWN, "crash")
+DIED = Record(
+    ExitCode.ABORTED, "the worker process died twice during this flight", NOT_FLOWN, "crash"
+)
 
 
 class Flyer(Protocol):

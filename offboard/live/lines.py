@@ -88,7 +88,7 @@ def _stamp(time_s: float) -> str:
 class JsonLines(Display):
     """Writes one JSON object per line: announcements, and a snapshot per second of vehicle time."""
 
-    LOST = "{} lines were not written: nobody read them"
+    LOST = "{} lines were not written: their reader was too slow"
 
     def __init__(self, write: Callable[[str], object]) -> None:
         super().__init__(lambda items: write(json_lines(items)), LINES_MAX)

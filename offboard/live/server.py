@@ -61,7 +61,7 @@ class Broadcast(Collector):
         the newest snapshot."""
         age_s, reason = self.newest.get("telemetry_age_s"), ""
         if clock.monotonic_s() - self._shown_s > STALE_S:
-            reason = "the loop does not run"
+            reason = "the control loop does not run"
         elif age_s is None or age_s > HEALTHY_AGE_S:
             reason = "no telemetry"
         return {"healthy": not reason, "reason": reason} | self.newest

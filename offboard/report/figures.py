@@ -54,7 +54,7 @@ LEFT_PX = 75  # left margin, the same in all figures so that their time axes are
 ROW_PX = 34  # height of a row of the timeline
 # Phases after an early end of the flight, drawn in orange
 _ENDED_EARLY = {"hold", "stand down", "yielded", "failed", SUPERVISOR}
-_CUT = "Single values far from all others are outside; two clicks on the figure show them."
+_CUT = "Outliers are outside the axes; double-click the figure to show them."
 
 
 def side_by_side(flights: Sequence[Flight]) -> Sequence[Flight]:

@@ -362,7 +362,10 @@ def test_a_flight_whose_worker_dies_twice_is_a_row(
         ended = {job.case.seed: record for job, record in opened.fly(jobs, lambda: False)}
     assert (tmp_path / "deaths").read_text() == "died\n" * 2
     assert ended[1].exit_code == 0
-    assert (ended[2].exit_code, ended[2].sentence) == (4, "the process that flew it ended, twice")
+    assert (ended[2].exit_code, ended[2].sentence) == (
+        4,
+        "the worker process died twice during this flight",
+    )
 
 
 @pytest.mark.slow
@@ -408,7 +411,7 @@ def test_a_killed_or_interrupted_comparison_keeps_what_landed_and_goes_on(
     output, errors = process.communicate(timeout=60)
     assert process.returncode == 4
     assert (errors.count("\n"), "Traceback" in errors) == (1, False)
-    assert "interrupted: flights in the air are finished" in output
+    assert "interrupted: flights in progress are finished first" in output
     flown = rows(tmp_path / "x")
     assert 3 <= len(flown) <= 7
     assert f"interrupted: {8 - len(flown)} of 8 flights are missing; go on with" in errors

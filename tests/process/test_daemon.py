@@ -182,7 +182,7 @@ def test_a_pilot_engages_and_a_stop_hands_back(
     log = tlog.read(flight / "flight.tlog")
     sent_s = [1e-3 * e.message.time_boot_ms for e in log if e.name == "SET_ATTITUDE_TARGET"]
     ticks_s = [each_s for each_s in sent_s if 0.0 < each_s - begun["offboard_time_s"] < 2.0]
-    assert len(ticks_s) >= 16  # 10 Hz, on any machine
+    assert len(ticks_s) >= 16  # of 20 at 10 Hz: a busy machine may skip some
     names = {entry.name for entry in log}
     assert {"TUNNEL", "HEARTBEAT", "PARAM_VALUE", "SET_ATTITUDE_TARGET", "STATUSTEXT"} <= names
     killed = spawn(*command, **variables)
