@@ -40,21 +40,21 @@ class InMemoryVehicle:
         seed: int,
         parameters: Mapping[str, float],
     ) -> None:
-        personality = FIRMWARES[firmware]
-        flown = config.scenario(scenario or personality.scenario)
-        config.check_for(flown, personality, lockstep=True)
-        flyer = config.vehicle(vehicle or personality.vehicle)
+        autopilot = FIRMWARES[firmware]
+        known_scenario = config.scenario(scenario or autopilot.scenario)
+        config.check_for(known_scenario, autopilot, lockstep=True)
+        known_vehicle = config.vehicle(vehicle or autopilot.vehicle)
         prepare()
         self._instance = Instance(
-            personality,
-            flyer,
-            flown.conditions,
+            autopilot,
+            known_vehicle,
+            known_scenario.conditions,
             seed,
             lockstep=True,
             ground_link=False,
             parameters=parameters,
-            faults=flown.faults,
-            start=flown.start,
+            faults=known_scenario.faults,
+            start=known_scenario.start,
         )
         self._received: deque[bytes] = deque()
         self._stamp_ns: int | None = None  # time stamp of the barrier that is not answered yet
@@ -82,9 +82,9 @@ class InMemoryVehicle:
             return []
         instance.advance_to_barrier()
         self._stamp_ns, datagrams = instance.barrier()
-        return [*self._strange(), *((VEHICLE, datagram) for datagram in datagrams)]
+        return [*self._of_strangers(), *((VEHICLE, datagram) for datagram in datagrams)]
 
-    def _strange(self) -> list[tuple[int, bytes]]:
+    def _of_strangers(self) -> list[tuple[int, bytes]]:
         """Number and datagram of each sender that is not the vehicle, since the last call."""
         found: list[tuple[int, bytes]] = []
         for number, datagrams in enumerate(self._instance.strangers, VEHICLE + 1):

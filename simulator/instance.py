@@ -135,7 +135,7 @@ class Instance:
         return self.steps * STEP_S
 
     @property
-    def complaints(self) -> Counter[str]:
+    def refusals(self) -> Counter[str]:
         """Number of received messages that were refused because of their signature, by reason."""
         return sum((link.decoder.refused for link in self.links), Counter())
 

@@ -74,7 +74,7 @@ def launch(options: Options, stopping: Stop) -> int:
     if len(options.numbers) > 1:
         tell(f"{len(options.numbers)} vehicles: {runner.punctuality}", sys.stdout)
     for endpoint in endpoints:
-        for sentence, count in endpoint.instance.complaints.items():
+        for sentence, count in endpoint.instance.refusals.items():
             tell(f"{count} x {sentence}", sys.stdout)
     return 3 if silence else 0
 

@@ -59,7 +59,7 @@ class Keyring:
         self.newest = min(max(self.newest + 1, self._clock()), LATEST)
         return self.newest
 
-    def complaint(self, message_id: int, sender: tuple[int, int], frame: bytes | None) -> str:
+    def refusal(self, message_id: int, sender: tuple[int, int], frame: bytes | None) -> str:
         """Return why a received message is refused; empty if it is accepted. `frame` is the frame
         with its signature; None: it is unsigned."""
         if not self.key:
@@ -202,7 +202,7 @@ class Decoder:
         except dialect.MAVError:
             return self._skip("checksum")
         signed = frame if flags & SIGNED else None
-        refused = self.keyring.complaint(message_id, sender_of(message), signed)
+        refused = self.keyring.refusal(message_id, sender_of(message), signed)
         if refused:
             self.dropped[refused] += 1
             return length, None

@@ -226,7 +226,7 @@ def test_it_answers_what_is_signed_and_signs_the_answer(firmware: Firmware) -> N
     ):  # fmt: skip
         instance.feed(refused)
         assert not answers(station(stamp=0), instance)
-    assert instance.complaints == {
+    assert instance.refusals == {
         "message refused: unsigned": 1,
         "message refused: wrong signature": 2,
         "message refused: old time stamp": 1,
@@ -249,7 +249,7 @@ def test_what_is_accepted_unsigned(firmware: Firmware, accepted: list[str]) -> N
     for message in messages:
         instance = vehicle(firmware)
         instance.feed(station(b"").frame(message))
-        if not instance.complaints:
+        if not instance.refusals:
             taken.append(message.get_type())
     assert taken == accepted
 
@@ -258,7 +258,7 @@ def test_a_stamp_that_is_a_minute_old_is_refused() -> None:
     for older, refused in ((1000, {"message refused: old time stamp": 1}), (-1000, {})):
         instance = vehicle(ARDUPILOT)
         instance.feed(request(station(stamp=EPOCH - MINUTE - older)))
-        assert instance.complaints == refused
+        assert instance.refusals == refused
 
 
 def test_a_px4_without_clock_follows_the_stamps_that_it_hears() -> None:
@@ -281,7 +281,7 @@ def test_setup_signing_sets_and_removes_the_key_but_not_while_armed() -> None:
     instance.autopilot.commander.armed = False
     set_up(client, KEY, EPOCH)
     instance.feed(request(client))
-    assert instance.complaints == {"message refused: unsigned": 1}
+    assert instance.refusals == {"message refused: unsigned": 1}
     signed = station(stamp=EPOCH + 1000)
     instance.feed(request(signed))
     assert answers(signed, instance)
