@@ -221,7 +221,7 @@ def shared_counter(datagrams: Bytes) -> Bytes:
     return sent
 
 
-def test_nothing_is_said_of_a_good_vehicle() -> None:
+def test_good_vehicle_has_only_ok_findings() -> None:
     """The vehicle is an ArduCopter; other tests end with a PX4 with which nothing is wrong."""
     tested = bench(ARDUPILOT)
     began_s = tested.instance.time_s
@@ -231,7 +231,7 @@ def test_nothing_is_said_of_a_good_vehicle() -> None:
     assert tested.instance.time_s - began_s < 6.0  # the whole command takes 8 s
 
 
-def test_limits_of_the_angular_acceleration_have_their_units() -> None:
+def test_angular_acceleration_parameters_are_converted_by_release() -> None:
     """Hundredths of a degree/s^2 until ArduCopter 4.6, degree/s^2 since 4.7."""
     parameters = DIALECTS["ardupilot"].tilting_parameters
     shown = {"ATC_ACCEL_R_MAX": 11e4, "ATC_ACCEL_P_MAX": 11e4, "ATC_ACC_R_MAX": 1100.0}
@@ -345,7 +345,7 @@ FOUND: list[tuple[Any, ...]] = [
 
 
 @pytest.mark.parametrize("case", FOUND)
-def test_what_is_found_and_what_mends_it(case: tuple[Any, ...]) -> None:
+def test_doctor_finds_faults_and_its_hints_fix_them(case: tuple[Any, ...]) -> None:
     options, *expected = case
     tested = bench(**options)
     began_s = tested.instance.time_s
@@ -371,7 +371,7 @@ def test_what_is_found_and_what_mends_it(case: tuple[Any, ...]) -> None:
 
 
 @pytest.mark.parametrize("start", [None, Start(height_m=3.0)], ids=["on_the_ground", "armed"])
-def test_a_vehicle_that_falls_silent_is_not_ready_to_fly(start: Start | None) -> None:
+def test_silent_vehicle_is_not_ready_to_fly(start: Start | None) -> None:
     tested = bench(start=start)
     heard_until_s = tested.instance.time_s + 2.5
     tested.down = lambda datagrams: datagrams if tested.instance.time_s < heard_until_s else []
@@ -380,7 +380,7 @@ def test_a_vehicle_that_falls_silent_is_not_ready_to_fly(start: Start | None) ->
     assert not verdict({"rates": rates}, complete=True).startswith("ready to fly")
 
 
-def test_gps_that_is_lost_waits_and_comes_back() -> None:
+def test_gps_loss_waits_until_the_fix_returns() -> None:
     tested = bench(faults=[{"fault": "gps_loss", "at_s": 0.5, "for_s": 12.0, "drift_mps": 0.1}])
     rows = tested.check()
     levels = {name: row[0].level for name, row in rows.items() if row[0].level}
@@ -391,13 +391,13 @@ def test_gps_that_is_lost_waits_and_comes_back() -> None:
     assert said(tested.check()) == {}
 
 
-def test_two_that_send_as_one_lose_no_frames() -> None:
+def test_duplicate_system_ids_do_not_count_as_loss() -> None:
     tested = bench(**beside(AUTOPILOT_HEARTBEAT, 1, 1, 1.0))
     (finding,) = tested.check("loss")["loss"]
     assert finding == Finding(OK, "0.0% of the bytes damaged")
 
 
-def test_armed_vehicle_is_left_alone() -> None:
+def test_armed_vehicle_gets_only_read_requests() -> None:
     """No rates and no pre-arm checks are requested."""
     flying = bench(start=Start(height_m=5.0, mode="AUTO.LOITER"))
     rows = flying.check()
@@ -410,7 +410,7 @@ def test_armed_vehicle_is_left_alone() -> None:
 
 
 @pytest.mark.parametrize(("boot_s", "level"), [(33.0, WAIT), (300.0, BLOCKS)])
-def test_estimator_without_position_although_the_gps_has_a_fix(boot_s: float, level: Level) -> None:
+def test_estimator_without_position_waits_then_blocks(boot_s: float, level: Level) -> None:
     """ArduCopter 4.6.3 reports a 3D fix 10 s after its start, and a position 42 s after it."""
     starting = VehicleState(
         estimator=EstimatorReport(frozenset(ESTIMATE) - {"horizontal position"}, ratios=()),
@@ -426,7 +426,7 @@ def test_estimator_without_position_although_the_gps_has_a_fix(boot_s: float, le
 # --- the link -------------------------------------------------------------------------------------
 
 
-def test_nothing_is_heard() -> None:
+def test_silent_link_blocks_with_connection_hints() -> None:
     tested = bench(has_vehicle=False)
     began_s = tested.instance.time_s
     rows = tested.check()
@@ -441,9 +441,9 @@ def test_nothing_is_heard() -> None:
     assert said(tested.check()) == {}
 
 
-def test_an_armed_vehicle_whose_signing_time_is_behind_does_not_hear_ours() -> None:
+def test_armed_vehicle_with_old_signing_time_gets_no_frames() -> None:
     """The time is behind by ten minutes. Only a disarmed vehicle is sent the right time by a signed
-    frame: `test_good_vehicle_over_udp`."""
+    frame: `test_doctor_finds_no_fault_on_a_good_vehicle`."""
     tested = bench(signing=Signing(KEY, 100 * 60 * UNITS_PER_S), start=Start(height_m=5.0))
     tested.instance.keyring.set_up(KEY, 90 * 60 * UNITS_PER_S)
     rows = tested.check()
@@ -452,7 +452,7 @@ def test_an_armed_vehicle_whose_signing_time_is_behind_does_not_hear_ours() -> N
     assert tested.sent == []
 
 
-def test_delay_is_measured_and_lowers_the_bandwidth() -> None:
+def test_link_delay_lowers_the_advised_bandwidth() -> None:
     tested = bench(**link(latency_s=0.2))
     row = tested.check("configuration")["configuration"]
     assert row[0].level is WARN
@@ -464,7 +464,7 @@ def test_delay_is_measured_and_lowers_the_bandwidth() -> None:
     assert again.check("configuration")["configuration"][0].level is OK
 
 
-def test_flood_of_addresses_and_ids_is_bounded() -> None:
+def test_number_of_stored_senders_is_bounded() -> None:
     generator = random.Random(3)
 
     def before(time_s: float) -> list[Any]:
@@ -479,7 +479,7 @@ def test_flood_of_addresses_and_ids_is_bounded() -> None:
 # --- checks by name, and this computer ------------------------------------------------------------
 
 
-def test_checks_of_other_packages_are_rows_and_broken_ones_too(
+def test_checks_of_other_packages_get_rows_even_if_broken(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The checks are the example of the README, one that cannot be imported, two that raise
@@ -499,7 +499,7 @@ def test_checks_of_other_packages_are_rows_and_broken_ones_too(
     assert rows["gps"][0].level is Level.OK
 
 
-def test_the_command_ends_in_time_although_nothing_of_it_does(
+def test_doctor_ends_in_time_despite_hanging_checks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The link does not open, and the examination of the computer never ends."""
@@ -517,7 +517,7 @@ def test_the_command_ends_in_time_although_nothing_of_it_does(
     assert rows["computer"][0].level is Level.WAIT
 
 
-def test_what_is_wrong_with_this_computer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor_warns_of_a_full_disk_and_a_slow_computer(monkeypatch: pytest.MonkeyPatch) -> None:
     """The disk is full, a decision is slow, and the process wakes up late."""
     monkeypatch.setattr(computer, "LEAST_FREE_BYTES", 10**18)
     monkeypatch.setattr(computer, "_not_compiled", lambda: 0)

@@ -21,7 +21,7 @@ RECORDING = Path(__file__).parents[1] / "wire" / "recordings" / "px4-1.16.1-offb
 CONFIG = Path(__file__).parents[2] / "config"
 SIGNING_EPOCH_S = 1_420_070_400  # 2015-01-01
 NO_VEHICLE = "offboard fly --connect udpin:127.0.0.1:PORT --set limits.connect_s=0.3 --out x"
-LONG_S = 60.0  # timeout of what takes a moment on an idle machine
+TIMEOUT_S = 60.0  # timeout of what takes a moment on an idle machine
 HOVERS = """name: hovers
 description: A vehicle that hovers when its links open, and is healthy a second later.
 conditions: {boot_scale: 0.1}
@@ -83,7 +83,7 @@ def ended(pid: int) -> bool:
 
 
 def eventually(holds: Callable[[], object]) -> None:
-    deadline_s = time.monotonic() + LONG_S
+    deadline_s = time.monotonic() + TIMEOUT_S
     while not holds():
         assert time.monotonic() < deadline_s
         time.sleep(0.02)

@@ -95,7 +95,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
-def test_every_flight_is_a_row_with_its_figures_and_its_command(whole: Path) -> None:
+def test_campaign_table_has_a_row_per_flight(whole: Path) -> None:
     found = rows(whole)
     assert [(row["scenario"], row["seed"], row["exit_code"]) for row in found] == [
         (scenario, "1", "0") for scenario in ("calm", "px4_like")
@@ -113,7 +113,7 @@ def scenario_file(row: dict[str, str]) -> str:
     return words[words.index("--scenario") + 1]
 
 
-def test_every_combination_is_planned_with_as_many_draws(tmp_path: Path) -> None:
+def test_each_combination_gets_the_configured_number_of_draws(tmp_path: Path) -> None:
     cases = campaign(FILE.replace("draws: 1", "draws: 3"), tmp_path / "out").cases
     assert [case.scenario for case in cases] == ["calm"] * 3 + ["px4_like"] * 3
     drawn = [dict(case.values) for case in cases]
@@ -126,7 +126,9 @@ def test_every_combination_is_planned_with_as_many_draws(tmp_path: Path) -> None
 
 
 @pytest.mark.usefixtures("in_memory")
-def test_the_command_of_a_row_flies_it_again(whole: Path, tmp_path: Path, called: Called) -> None:
+def test_command_in_a_table_row_repeats_the_flight(
+    whole: Path, tmp_path: Path, called: Called
+) -> None:
     row = rows(whole)[1]
     program, *arguments = shlex.split(row["fly_again"])
     arguments[arguments.index("--scenario") + 1] = str(whole / scenario_file(row))
@@ -160,7 +162,7 @@ def continued(half: Path, directory: Path) -> Campaign:
     return campaign(FILE, directory)
 
 
-def test_shards_copied_together_are_the_same_table(whole: Path, half: Path, tmp_path: Path) -> None:
+def test_merged_shards_give_the_same_table(whole: Path, half: Path, tmp_path: Path) -> None:
     shutil.copytree(whole / "results", tmp_path / "out" / "results")
     assert fly(continued(half, tmp_path / "out"), unused).missing == 0
     assert table(tmp_path / "out") == table(whole)
@@ -179,7 +181,7 @@ def dask_cluster(workers: int) -> Any:
     )  # fmt: skip
 
 
-def test_a_dask_cluster_of_two_workers_makes_the_same_table(
+def test_dask_cluster_of_two_workers_gives_the_same_table(
     whole: Path, half: Path, tmp_path: Path
 ) -> None:
     with dask_cluster(2) as cluster:
@@ -190,9 +192,7 @@ def test_a_dask_cluster_of_two_workers_makes_the_same_table(
 
 
 @pytest.mark.slow
-def test_a_scheduler_that_is_lost_is_one_sentence_and_keeps_what_is_finished(
-    tmp_path: Path, spawn: Spawn
-) -> None:
+def test_lost_dask_scheduler_keeps_finished_flights(tmp_path: Path, spawn: Spawn) -> None:
     (tmp_path / "out.yaml").write_text(FILE.replace("draws: 1", "draws: 3"))
     with dask_cluster(1) as cluster:
         process = spawn(
@@ -208,13 +208,13 @@ def test_a_scheduler_that_is_lost_is_one_sentence_and_keeps_what_is_finished(
 
 
 @pytest.mark.slow
-def test_no_scheduler_is_a_sentence_at_once(called: Called) -> None:
+def test_unreachable_dask_scheduler_is_reported_in_one_sentence(called: Called) -> None:
     for address in ("udp://127.0.0.1:9", "tcp://127.0.0.1:9"):
         code, _, said = called("offboard campaign quick --out x --scheduler", address)
         assert (code, said.count("\n"), address in said) == (2, 1, True), said
 
 
-def test_an_infeasible_case_is_a_row_with_its_reason(tmp_path: Path) -> None:
+def test_infeasible_case_gets_a_row_with_the_reason(tmp_path: Path) -> None:
     flown = campaign(INFEASIBLE, tmp_path / "out")
     fly(flown, shard=slice(1, None, 2))  # the one at 400 m
     (row,) = rows(tmp_path / "out")
@@ -222,9 +222,7 @@ def test_an_infeasible_case_is_a_row_with_its_reason(tmp_path: Path) -> None:
     assert "landing from 400 m takes" in row["failed"]
 
 
-def test_a_comparison_whose_link_does_not_open_goes_on_when_it_does(
-    called: Called, tmp_path: Path
-) -> None:
+def test_comparison_without_a_link_says_how_to_resume(called: Called, tmp_path: Path) -> None:
     """A user makes the key and plugs in the vehicle only after the first attempts."""
     command = "offboard compare --controllers lqr --seeds 2 --out x --connect serial:usb:57600"
     for more, why in (("--signing-key none", "signing key none cannot"), ("", "usb")):
@@ -251,7 +249,7 @@ def test_a_comparison_whose_link_does_not_open_goes_on_when_it_does(
         (("[calm, px4_like]", "[calm, calm]"), "a combination is given twice"),
     ],
 )
-def test_a_file_that_cannot_be_flown_is_refused(
+def test_invalid_campaign_file_is_refused(
     change: tuple[str, str], sentence: str, tmp_path: Path
 ) -> None:
     with pytest.raises(DocumentError) as refused:
@@ -261,7 +259,7 @@ def test_a_file_that_cannot_be_flown_is_refused(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_file_that_a_file_names_decides_the_case(
+def test_case_key_depends_on_referenced_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -274,7 +272,7 @@ def test_a_file_that_a_file_names_decides_the_case(
     assert len(keys) == 2
 
 
-def test_a_lack_of_memory_is_no_record_of_the_case(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_out_of_memory_is_an_error_not_a_flight_record(monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*parts: object, **options: object) -> None:
         raise MemoryError
 
@@ -284,7 +282,7 @@ def test_a_lack_of_memory_is_no_record_of_the_case(monkeypatch: pytest.MonkeyPat
         flight.fly_job(Job(case, Promises(), code_hash()))
 
 
-def test_results_of_other_code_are_refused_and_kept(
+def test_results_of_another_code_version_are_refused_and_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     Results(tmp_path, "0123456789ab").put("case", Record(0, "flown and landed", 1.0, "error"))
@@ -295,14 +293,14 @@ def test_results_of_other_code_are_refused_and_kept(
 
 
 @pytest.mark.parametrize("name", ["campaign.csv", "campaign.html", "worst.csv"])
-def test_a_table_of_somebody_else_is_not_replaced(tmp_path: Path, name: str) -> None:
+def test_foreign_campaign_table_is_not_overwritten(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text("mine")
     with pytest.raises(UserError, match=f"{name} exists, without results of a campaign"):
         campaign(FILE, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
-def test_a_profile_may_have_any_name(
+def test_tuning_profile_may_have_any_file_name(
     called: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The folder of flights once had the profile's name, so that the profile was not written."""
@@ -312,7 +310,7 @@ def test_a_profile_may_have_any_name(
     assert "bandwidth_radps: 5.0" in (tmp_path / "x.tune").read_text()
 
 
-def test_what_is_finished_on_a_full_disk_is_kept_and_a_worker_of_its_own_flies_the_rest(
+def test_campaign_resumes_after_a_full_disk(
     whole: Path, half: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     flown = continued(half, tmp_path / "out")
@@ -349,7 +347,7 @@ def dies(job: Job) -> Record:
 
 
 @pytest.mark.slow
-def test_a_flight_whose_worker_dies_twice_is_a_row(
+def test_flight_whose_worker_dies_twice_gets_exit_code_4(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(workers, "fly_job", dies)
@@ -369,7 +367,7 @@ def test_a_flight_whose_worker_dies_twice_is_a_row(
 
 
 @pytest.mark.slow
-def test_a_kept_flight_appears_when_it_is_complete(
+def test_kept_flight_directory_appears_only_when_complete(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A flight that ends before that leaves no directory that looks like a kept flight."""
@@ -391,9 +389,7 @@ def test_a_kept_flight_appears_when_it_is_complete(
 
 
 @pytest.mark.slow
-def test_a_killed_or_interrupted_comparison_keeps_what_landed_and_goes_on(
-    spawn: Spawn, tmp_path: Path
-) -> None:
+def test_killed_or_interrupted_comparison_resumes(spawn: Spawn, tmp_path: Path) -> None:
     """The interrupt goes to the whole group of processes, as from a terminal."""
     command = (
         "offboard", "compare", "--controllers", "lqr", "--reference", "hover", "--scenario", "calm",

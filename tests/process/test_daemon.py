@@ -19,8 +19,8 @@ from typing import Any
 
 import pytest
 from processes import (
-    LONG_S,
     RECORDING,
+    TIMEOUT_S,
     Called,
     Spawn,
     children,
@@ -80,7 +80,7 @@ def health(port: int) -> tuple[int, dict[str, Any]]:
 
 
 def await_phase(service: subprocess.Popen[str], port: int, *phases: str) -> None:
-    deadline_s = time.monotonic() + LONG_S
+    deadline_s = time.monotonic() + TIMEOUT_S
     while True:
         assert service.poll() is None, service.communicate()
         try:
@@ -104,7 +104,7 @@ def many_clients(port: int, service: int) -> list[socket.socket]:
     return clients
 
 
-def test_flights_are_scored_one_at_a_time_also_after_the_service(tmp_path: Path) -> None:
+def test_flights_are_scored_singly_even_after_the_service_ends(tmp_path: Path) -> None:
     before, flights = set(children(os.getpid())), [tmp_path / f"{n}\n" for n in range(2)]
     service = OneByOne("score")
     for flight in flights:
@@ -119,7 +119,7 @@ def test_flights_are_scored_one_at_a_time_also_after_the_service(tmp_path: Path)
     assert all((flight / "score.json").exists() for flight in flights)
 
 
-def test_a_pilot_engages_and_a_stop_hands_back(
+def test_pilot_engages_the_service_and_sigterm_hands_back(
     spawn: Spawn, called: Called, pilot: Peer, tmp_path: Path
 ) -> None:
     """The flight is in real time over UDP and signed, with monitoring, clients that use up
@@ -165,7 +165,7 @@ def test_a_pilot_engages_and_a_stop_hands_back(
     assert (status, state["mode"]) == (200, "OFFBOARD")
     service.send_signal(signal.SIGTERM)
     pilot.listen(mode(pilot, HOLDING))
-    out, error = service.communicate(timeout=LONG_S)
+    out, error = service.communicate(timeout=TIMEOUT_S)
     assert (service.returncode, error) == (0, "")
     lines = [json.loads(line) for line in out.splitlines()]
     assert all({"time", "level", "event", "phase"} <= line.keys() for line in lines)
@@ -198,7 +198,7 @@ def test_a_pilot_engages_and_a_stop_hands_back(
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")
-def test_the_unit_is_valid(called: Called, tmp_path: Path) -> None:
+def test_printed_systemd_unit_is_valid(called: Called, tmp_path: Path) -> None:
     (tmp_path / "my $ %.yaml").write_text("vehicle: neutral\ncontroller: lqr\nreference: hover\n")
     create_key(tmp_path / "my %.key")
     link = ("--connect", "serial:/dev/ttyACM0:57600")

@@ -59,7 +59,7 @@ DAMAGE = "x.tlog: 1 damaged entry was skipped, the first at byte 0\n"
     ],
     ids=["empty", "foreign", "a FIFO", "gigabytes", "cut off", "damaged", "damaged, identified"],
 )
-def test_a_log_is_read_as_far_as_it_is_one(
+def test_damaged_logs_are_read_and_foreign_files_refused(
     content: bytes | None, command: str, code: int, says: str, called: Called, tmp_path: Path
 ) -> None:
     if content is None:
@@ -71,7 +71,7 @@ def test_a_log_is_read_as_far_as_it_is_one(
     assert says in said
 
 
-def test_nothing_identified_is_no_vehicle_file(called: Called, tmp_path: Path) -> None:
+def test_identify_writes_no_vehicle_file_without_a_result(called: Called, tmp_path: Path) -> None:
     kept = [each for each in tlog.read(RECORDING) if each.name != "SET_ATTITUDE_TARGET"]
     (tmp_path / "x.tlog").write_bytes(b"".join(entry(e.unix_us, e.frame.raw) for e in kept))
     code, _, said = called("offboard identify -o mine.yaml x.tlog")
@@ -81,7 +81,7 @@ def test_nothing_identified_is_no_vehicle_file(called: Called, tmp_path: Path) -
     assert (tmp_path / "identify.html").read_text().count("not identified: ") > 3
 
 
-def test_a_log_with_attitude_as_angles_is_identified(called: Called, tmp_path: Path) -> None:
+def test_identify_reads_logs_with_euler_angles(called: Called, tmp_path: Path) -> None:
     """An existing page is kept. The title of the new one is the name of the flight directory, also
     if that is the working directory."""
     log = RECORDING.with_name("arducopter-4.6.3-guided.tlog")  # has no ATTITUDE_QUATERNION
@@ -98,7 +98,7 @@ def test_a_log_with_attitude_as_angles_is_identified(called: Called, tmp_path: P
 
 
 @pytest.mark.usefixtures("in_memory")
-def test_a_vehicle_is_flown_and_then_identified(called: Called, tmp_path: Path) -> None:
+def test_identify_with_sitl_flies_and_identifies(called: Called, tmp_path: Path) -> None:
     command = "offboard identify --sitl --scenario calm --set reference.laps=1 --out x -o mine.yaml"
     assert called(command)[::2] == (0, "")
     assert read(tmp_path / "x").facts["reference"] == "lemniscate"  # it has no name but its shape
@@ -136,7 +136,7 @@ LINK = "--connect udpin:127.0.0.1:PORT --signing-key key --out x"
         (f"identify -o x.yaml {RECORDING}", 100, 2, {"key"}),
     ],
 )
-def test_where_a_disk_is_full_nothing_is_sent_and_no_file_is_cut(
+def test_commands_on_a_full_disk_leave_no_partial_file(
     command: str, holds_bytes: int, code: int, kept: set[str], called: Called, tmp_path: Path
 ) -> None:
     called("offboard key key")
@@ -151,7 +151,7 @@ def test_where_a_disk_is_full_nothing_is_sent_and_no_file_is_cut(
 
 
 @pytest.mark.parametrize("command", [("list",), ("score", str(RECORDING), "--json")])
-def test_a_full_disk_behind_the_output_is_one_sentence(command: tuple[str, ...]) -> None:
+def test_output_to_a_full_disk_is_reported_in_one_sentence(command: tuple[str, ...]) -> None:
     with Path("/dev/full").open("w") as full:
         process = [sys.executable, "-P", "-m", "offboard", *command]
         ended = subprocess.run(process, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
@@ -159,7 +159,7 @@ def test_a_full_disk_behind_the_output_is_one_sentence(command: tuple[str, ...])
     assert (ended.returncode, ended.stderr) == (2, said)
 
 
-def test_a_flight_whose_result_cannot_be_printed_keeps_its_exit_code(
+def test_exit_code_is_kept_if_the_result_cannot_be_printed(
     called: Called, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     full = Path("/dev/full").open("w", encoding="utf-8")  # noqa: SIM115
@@ -178,7 +178,7 @@ def test_a_flight_whose_result_cannot_be_printed_keeps_its_exit_code(
 
 
 @pytest.mark.usefixtures("in_memory")
-def test_the_log_alone_holds_what_was_flown(
+def test_log_contains_configuration_and_reference_table(
     called: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The flight follows a table whose file is then deleted. The closed output does not end it."""

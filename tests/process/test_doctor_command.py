@@ -21,7 +21,7 @@ GOOD_PX4 = ("--param", "COM_OBL_RC_ACT=4", "--param", "COM_RCL_EXCEPT=4")
 OF_THIS_MACHINE = {"compiled", "computer", "delay", "disk"}  # which is busy with other tests
 
 
-def test_good_vehicle_over_udp(called: Called, tmp_path: Path) -> None:
+def test_doctor_finds_no_fault_on_a_good_vehicle(called: Called, tmp_path: Path) -> None:
     """The simulated PX4 signs; its signing time begins with that of the key, which is years old.
     Another vehicle is on the link, too."""
     port, path = free_port(), tmp_path / "key"
@@ -61,17 +61,19 @@ def test_good_vehicle_over_udp(called: Called, tmp_path: Path) -> None:
     assert report["listened_s"] < 10.5
 
 
-HOLDS = """import socket, sys
+PORT_HOLDER = """import socket, sys
 held = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 held.bind(("127.0.0.1", 0))
 print(held.getsockname()[1], flush=True)
 sys.stdin.read()"""
 
 
-def test_a_taken_port_names_its_holder(called: Called, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor_names_the_process_that_holds_the_port(
+    called: Called, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(listening, "NOTHING_S", 0.1)  # where no vehicle is awaited
     with subprocess.Popen(
-        [sys.executable, "-S", "-c", HOLDS],
+        [sys.executable, "-S", "-c", PORT_HOLDER],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,

@@ -40,7 +40,7 @@ def flown(directory: Path) -> history.History:
     return history.gather(tlog.read(directory / "x" / "flight.tlog"))
 
 
-def test_ctrl_c_lands_though_ctrl_s_has_stopped_the_terminal(spawn: Spawn, tmp_path: Path) -> None:
+def test_ctrl_c_lands_while_ctrl_s_blocks_the_terminal(spawn: Spawn, tmp_path: Path) -> None:
     terminal, theirs = pty.openpty()
     process = spawn(
         "offboard", "fly", "--sitl", "--scenario", "calm", "--out", "x", *SHORT,
@@ -68,7 +68,7 @@ def test_ctrl_c_lands_though_ctrl_s_has_stopped_the_terminal(spawn: Spawn, tmp_p
     assert flown(tmp_path).phases[-1].what.startswith("disarmed")
 
 
-def test_ended_before_the_flight_it_leaves_no_simulator(spawn: Spawn, tmp_path: Path) -> None:
+def test_interrupt_before_the_flight_leaves_no_simulator(spawn: Spawn, tmp_path: Path) -> None:
     process = spawn("offboard", "fly", "--sitl", "--out", "x")
     while process.poll() is None and not children(process.pid):
         time.sleep(0.01)
@@ -88,7 +88,7 @@ def interrupted_while_compiling(*_: object, **__: object) -> float:
     return 0.0
 
 
-def test_interrupted_while_it_compiles_it_does_not_fly(
+def test_interrupt_while_compiling_prevents_the_flight(
     called: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(run, "rehearse", interrupted_while_compiling)
@@ -96,7 +96,7 @@ def test_interrupted_while_it_compiles_it_does_not_fly(
     assert not list(tmp_path.iterdir())
 
 
-def test_no_vehicle(called: Called, tmp_path: Path) -> None:
+def test_missing_vehicle_ends_fly_with_code_3(called: Called, tmp_path: Path) -> None:
     code, _, said = called(NO_VEHICLE)
     assert (code, said.count("\n")) == (3, 1)
     assert said.startswith("no vehicle heard in 0 s; is it running, and sending to this port?")
@@ -106,7 +106,9 @@ def test_no_vehicle(called: Called, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("in_memory")
-def test_a_full_disk_lands(called: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_in_flight_begins_a_landing(
+    called: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(after_flight, "begin_report", lambda _: None)
     with full_disk(380_000):
         code, shown, said = called("offboard fly --sitl --report --out x", *SHORT)
@@ -151,9 +153,7 @@ def test_a_flight_that_cannot_be_scored_keeps_its_outcome(
 
 
 @pytest.mark.usefixtures("in_memory")
-def test_json_lines_end_with_the_result_and_the_live_page_is_announced(
-    called: Called, tmp_path: Path
-) -> None:
+def test_json_lines_announce_live_page_and_end_with_result(called: Called, tmp_path: Path) -> None:
     shows = ("--json-lines", "--live", "127.0.0.1:0", "--require", "rmse_position_m<0")
     code, shown, said = called("offboard fly --sitl --scenario calm --out x", *SHORT, *shows)
     assert (code, said) == (1, "")
@@ -177,7 +177,7 @@ def test_json_lines_end_with_the_result_and_the_live_page_is_announced(
         ("link_saturates", "telemetry is 1.06 s old"),
     ],
 )
-def test_in_lockstep_it_is_said_what_has_happened(
+def test_lockstep_flights_report_the_true_cause(
     called: Called, scenario: str, sentence: str
 ) -> None:
     """The sentence does not say that the vehicle did not arm, or that its mode was not reported for
@@ -218,7 +218,9 @@ CLOSED = "import os; r, w = os.pipe(); os.close(r); os.dup2(w, 1)"
     ],
     ids=["interrupted import", "closed pipe", "closed pipe of both", "closed output"],
 )
-def test_a_process_ends_in_order(begin: str, command: list[str], code: int, said: str) -> None:
+def test_interrupts_and_closed_outputs_set_the_exit_code(
+    begin: str, command: list[str], code: int, said: str
+) -> None:
     script = f"import sys; sys.argv = {['offboard', *command]!r}\n{begin}\n"
     script += "from offboard.cli import main\nsys.exit(main())"
     answer = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
@@ -268,7 +270,7 @@ def take_over(log: tlog.Tlog) -> list[str]:
     return [text for text, before in zip(kept, ["", *kept], strict=False) if text != before]
 
 
-def test_a_killed_controller_is_survived(spawn: Spawn, tmp_path: Path) -> None:
+def test_supervisor_lands_after_the_controller_is_killed(spawn: Spawn, tmp_path: Path) -> None:
     flight = tracking(spawn, tmp_path)
     (supervisor,) = children(flight.pid)
     flight.kill()

@@ -64,7 +64,7 @@ def test_documented_controller_flies(
         load("flight", choices={"controller": str(tmp_path / "my.yaml")})
 
 
-def test_settings_of_any_key_are_read_back_from_a_log(
+def test_controller_settings_with_extra_keys_are_read_back(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """A replay once decided without such settings. One that no longer exists is still dropped."""
@@ -94,7 +94,7 @@ def test_settings_of_any_key_are_read_back_from_a_log(
         ("nowhere", "there is no controller named 'nowhere'; known are autopilot, exits,"),
     ],
 )  # fmt: skip
-def test_broken_controller_is_refused_only_when_it_is_asked_for(
+def test_broken_controller_is_refused_only_when_selected(
     law: str, says: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     site = tmp_path / "site-packages"

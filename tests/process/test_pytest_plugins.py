@@ -72,7 +72,7 @@ def test_argument_without_name(sitl):
 
 
 @pytest.mark.parametrize("workers", [0, pytest.param(2, marks=pytest.mark.slow)])
-def test_the_fixtures_as_the_readme_shows_them(workers: int, pytester: pytest.Pytester) -> None:
+def test_pytest_fixtures_work_as_in_the_readme(workers: int, pytester: pytest.Pytester) -> None:
     """A test that fails keeps its log and ends its vehicle, one that passes keeps none. A wrong
     option is one sentence, without a flight."""
     (example,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
@@ -108,7 +108,7 @@ def test_ctrl_c_in_a_flight_ends_pytest(fly: Callable[..., Flight], tmp_path: Pa
         fly(must_succeed=False)
 
 
-def test_other_test_suites_import_nothing(pytester: pytest.Pytester) -> None:
+def test_plugins_import_no_heavy_modules_in_other_suites(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(
         """
         import os, sys

@@ -43,7 +43,7 @@ SPHERE = {"shape": "sphere", "north_m": 0, "east_m": 0, "height_m": 3, "radius_m
         ("--connect tcp:127.0.0.1:1", "--sitl starts its own simulator: use --sitl or --connect"),
     ],
 )
-def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
+def test_invalid_sitl_options_are_refused_before_the_build(
     options: str, says: str, refused: Refused, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(run, "build", pytest.fail)
@@ -83,7 +83,7 @@ def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
         (f"{SLOW} --controller", "horizon", "longer than deadline_s or period_s (0.6 ms); plan"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_flown_is_refused(
+def test_invalid_fly_options_are_refused(
     options: str, value: object, says: str, refused: Refused
 ) -> None:
     assert says in refused(f"{FLY} {options}", value)
@@ -112,11 +112,13 @@ def test_what_cannot_be_flown_is_refused(
         ("--instances 20 --instance 240", "system ids end at 250"),
     ],
 )
-def test_other_commands_refuse_alike(command: str, says: str, refused: Refused) -> None:
+def test_invalid_options_of_other_commands_are_refused(
+    command: str, says: str, refused: Refused
+) -> None:
     assert says in refused(command if command.startswith("offboard") else f"{SIMULATOR} {command}")
 
 
-def test_an_unknown_option_and_one_without_its_value_are_named(called: Called) -> None:
+def test_unknown_options_and_missing_values_are_refused(called: Called) -> None:
     for command in (FLY, SIMULATOR):
         for option, says in (("--no-such-option", "No such"), ("--seed", "requires an argument")):
             code, _, said = called(command, option)
@@ -133,12 +135,12 @@ def test_an_unknown_option_and_one_without_its_value_are_named(called: Called) -
         *(f"{SIMULATOR} --log /dev/full --duration 0.1", f"{SIMULATOR} --duration nan"),
     ],
 )
-def test_a_name_or_number_beyond_every_limit_is_refused(command: str, refused: Refused) -> None:
+def test_excessive_names_and_numbers_are_refused(command: str, refused: Refused) -> None:
     assert len(refused(command)) < 600
 
 
 @pytest.mark.parametrize("app", [offboard, simulator], ids=["offboard", "simulator"])
-def test_no_value_is_empty_or_no_text(app: typer.Typer) -> None:
+def test_empty_and_non_utf8_values_are_refused(app: typer.Typer) -> None:
     """This holds for each option and argument, as in `--connect "$LINK"` with an unset variable."""
     command = typer.main.get_command(app)
     commands = getattr(command, "commands", {"": command}).values()
@@ -184,7 +186,7 @@ CSV = "time_s,north_m,east_m,altitude_m\n0,0,0,3\n3,2,0,3\n6,2,{east},4\n9,0,0,3
         ("t.yaml", TUNING % ("feedback", "calm"), "ranges.controller.feedback is no number of"),
     ],
 )  # fmt: skip
-def test_every_kind_of_file_is_checked(
+def test_check_reports_errors_in_every_kind_of_file(
     name: str, content: str, says: str, called: Called, tmp_path: Path
 ) -> None:
     (tmp_path / name).write_text(content)
@@ -199,7 +201,7 @@ def test_all_shipped_files_are_valid(called: Called) -> None:
     assert called("offboard check", *files)[::2] == (0, "")
 
 
-def test_of_many_errors_the_first_ten_are_printed(called: Called, tmp_path: Path) -> None:
+def test_check_prints_the_first_ten_of_many_errors(called: Called, tmp_path: Path) -> None:
     (tmp_path / "x.yaml").write_text("law: pid\n" + "".join(f"key_{n}: 1\n" for n in range(5000)))
     code, _, said = called("offboard check", "x.yaml")
     lines = said.splitlines()
@@ -216,7 +218,7 @@ FILES: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("kind", FILES)
-def test_only_regular_files_of_a_bounded_size_are_read(
+def test_only_regular_files_up_to_500_kb_are_read(
     kind: str, refused: Refused, tmp_path: Path
 ) -> None:
     FILES[kind](tmp_path / "x.yaml")
@@ -225,7 +227,7 @@ def test_only_regular_files_of_a_bounded_size_are_read(
         assert f"x.yaml cannot be read: {reason}" in refused(command, "x.yaml")
 
 
-def test_a_directory_with_a_flight_is_left_as_it_is(refused: Refused, tmp_path: Path) -> None:
+def test_fly_refuses_a_directory_that_holds_a_flight(refused: Refused, tmp_path: Path) -> None:
     for name in ("flight.yaml", "flight.tlog", "score.json"):
         (tmp_path / name).mkdir()
         (tmp_path / name / name).write_text("precious")
@@ -261,7 +263,7 @@ def test_no_command_overwrites_a_file(
         ("simulator", "key: " + "ab" * 32, 0o644, "k can be read or changed by other users"),
     ],
 )
-def test_a_bad_key_is_refused_and_not_shown(
+def test_bad_signing_key_is_refused_without_showing_it(
     command: str, content: str, mode: int, says: str, refused: Refused, tmp_path: Path
 ) -> None:
     (tmp_path / "k").write_text(content)
@@ -271,7 +273,7 @@ def test_a_bad_key_is_refused_and_not_shown(
     assert "ab" * 32 not in said
 
 
-def test_a_key_is_made_once_and_explained_without_showing_it(
+def test_key_command_creates_a_key_once_without_printing_it(
     called: Called, refused: Refused, tmp_path: Path
 ) -> None:
     code, said, _ = called("offboard key my.key")
@@ -298,7 +300,7 @@ def test_a_key_is_made_once_and_explained_without_showing_it(
         ("serial:/dev/nonexistent:57600", "cannot be opened: No such file or directory"),
     ],
 )
-def test_a_vehicle_that_cannot_be_reached_is_the_same_to_every_command(
+def test_fly_and_doctor_report_an_unreachable_vehicle_alike(
     address: str, says: str, called: Called
 ) -> None:
     code, _, said = called("offboard fly --connect", address)
@@ -327,7 +329,7 @@ def test_a_port_in_use_is_refused(called: Called, refused: Refused) -> None:
     assert said.startswith(f"--live: {page} cannot be listened on (Address already in use)")
 
 
-def test_a_vehicle_that_cannot_come_down_is_told(called: Called, tmp_path: Path) -> None:
+def test_simulator_warns_of_a_vehicle_too_light_to_land(called: Called, tmp_path: Path) -> None:
     light = (CONFIG / "vehicles" / "px4_sih.yaml").read_text()
     (tmp_path / "light.yaml").write_text(re.sub(r"(hover_thrust:) \S+", r"\1 0.1", light))
     flown = f"{SIMULATOR} --vehicle light.yaml --connect udpout:127.0.0.1:9 --duration 0.1"
@@ -352,7 +354,7 @@ def shipped(folder: str) -> list[Path]:
     return sorted((CONFIG / folder).glob("*.yaml"))
 
 
-def test_help_has_the_exit_codes_and_the_shipped_files() -> None:
+def test_help_lists_exit_codes_and_shipped_files() -> None:
     for command in (*COMMANDS, "simulator"):
         app, words = (simulator, []) if command == "simulator" else (offboard, [command])
         shown = CliRunner().invoke(app, [*words, "--help"], terminal_width=80).output
@@ -363,13 +365,13 @@ def test_help_has_the_exit_codes_and_the_shipped_files() -> None:
             assert {path.stem for path in shipped(folder)} <= named
 
 
-def test_without_a_command_the_commands_are_shown(called: Called) -> None:
+def test_offboard_without_arguments_lists_the_commands(called: Called) -> None:
     code, shown, said = called("offboard")
     assert (code, said) == (2, "")
     assert all(f"\n  {command} " in shown for command in COMMANDS)
 
 
-def test_every_shipped_file_is_listed_with_what_it_is(called: Called) -> None:
+def test_list_shows_every_shipped_file_with_its_description(called: Called) -> None:
     lines = CliRunner().invoke(offboard, ["list"]).output.splitlines()
     assert max(map(len, lines)) <= 80
     listed = [tuple(line.split(maxsplit=1)) for line in lines if line.startswith(" ")]

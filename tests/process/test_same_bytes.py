@@ -79,7 +79,7 @@ class LateSimulator(SimulatorProcess):
         Timer(0.1, os.killpg, (self.process.pid, signal.SIGCONT)).start()
 
 
-def test_over_udp_and_disturbed_every_frame_is_the_same(
+def test_frames_are_identical_over_udp_with_stalls(
     undisturbed: dict[int, list[bytes]], tmp_path: Path
 ) -> None:
     """The simulator begins late. It repeats its first barrier, for which the controller is late,
@@ -114,7 +114,7 @@ def divides(frames: object) -> list[tuple[int, bytes]]:
     ],
     ids=["fails", "hangs"],
 )
-def test_a_vehicle_that_fails_or_hangs_ends_the_flight_with_a_sentence(
+def test_failing_or_hanging_simulator_ends_the_flight(
     exchange: Any, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def load() -> Any:
@@ -140,7 +140,7 @@ SILENT = "no telemetry for 1.0 s (limits.silence_s is 1); not heard for 300 s wh
     ],
     ids=["restart on the ground", "telemetry lost"],
 )
-def test_time_goes_on_without_telemetry(
+def test_lockstep_time_advances_without_telemetry(
     fault: dict[str, object], code: int, sentence: str, tmp_path: Path
 ) -> None:
     file = tmp_path / "faulty.yaml"

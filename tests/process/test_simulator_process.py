@@ -28,7 +28,7 @@ from offboard.run.sitl import Ending, SimulatorProcess
 QUIET = ("--gcs", "none")
 
 
-def test_it_waits_to_be_spoken_to_shifts_its_system_and_ends_at_an_interrupt() -> None:
+def test_udpin_simulator_waits_for_a_client_and_ends_on_sigint() -> None:
     port = free_port()
     options = ("--connect", f"udpin:127.0.0.1:{port}", "--instance", "6", "--lockstep")
     with Peer() as peer, simulator(*options, *QUIET) as process:
@@ -46,7 +46,7 @@ def test_it_waits_to_be_spoken_to_shifts_its_system_and_ends_at_an_interrupt() -
     assert (process.returncode, errors) == (0, "")
 
 
-def test_the_duration_ends_it_though_nobody_listens(called: Called) -> None:
+def test_duration_ends_a_simulator_without_clients(called: Called) -> None:
     for link, does in (("udpout:127.0.0.1:9", "sending to"), ("tcpin:127.0.0.1:{}", "waiting at")):
         link = link.format(free_port())
         options = ("--connect", link, "--duration", "2", "--speed", "20")
@@ -55,7 +55,7 @@ def test_the_duration_ends_it_though_nobody_listens(called: Called) -> None:
         assert f"{does} {link.partition(':')[2]}" in said
 
 
-def test_instances_have_ports_and_systems_of_their_own_and_keep_time() -> None:
+def test_instances_have_their_own_ports_systems_and_seeds() -> None:
     ports = [free_port() for _ in range(3)]
     while ports[2] - ports[0] != 2:  # in a row
         ports = [*ports[1:], free_port()]
@@ -95,7 +95,7 @@ def flying(pool: SimulatorProcess) -> Iterator[int]:
         yield vehicle
 
 
-def test_how_each_vehicle_ends_is_reported_and_the_next_one_flies() -> None:
+def test_pool_reports_each_ended_vehicle_and_launches_the_next() -> None:
     with SimulatorProcess() as pool:
         pid = pool.process.pid
         for options, says in (
@@ -115,7 +115,7 @@ def test_how_each_vehicle_ends_is_reported_and_the_next_one_flies() -> None:
         assert (children(pool.process.pid), pool.process.pid) == ([], pid)
 
 
-def test_one_that_dies_in_flight_ends_it_and_is_replaced(tmp_path: Path) -> None:
+def test_killed_simulator_ends_the_flight_and_is_replaced(tmp_path: Path) -> None:
     lost: list[int] = []
 
     def kill(companion: Flight) -> None:

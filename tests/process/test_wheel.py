@@ -19,7 +19,7 @@ COMPILING = "first flight with this code: compiling"
 
 
 @pytest.mark.slow
-def test_a_pure_wheel_flies_in_two_terminals_and_in_one(spawn: Spawn, tmp_path: Path) -> None:
+def test_installed_wheel_flies_over_udp_and_with_sitl(spawn: Spawn, tmp_path: Path) -> None:
     """The first flight, in real time, compiles everything; the second uses that machine code."""
     built = tmp_path / "dist"
     subprocess.run((*BUILD, built), cwd=ROOT, check=True, capture_output=True, timeout=60)
