@@ -102,7 +102,7 @@ def version(number: int) -> Any:
         (version(0x011001FF), events.VehicleIdentity(77, events.FirmwareVersion(1, 16, 1, 255))),
     ],
 )
-def test_contents(message: Any, event: events.Event) -> None:
+def test_messages_are_decoded_to_events(message: Any, event: events.Event) -> None:
     assert received(message) == event
 
 
@@ -115,7 +115,7 @@ def test_px4_sends_integer_parameters_as_bytes(value: int) -> None:
     assert event.value == value  # type: ignore[union-attr]
 
 
-def test_estimator_reports() -> None:
+def test_estimator_reports_name_their_problem() -> None:
     """Flags were recorded from PX4 1.16.1 and ArduCopter 4.6.3, before the fix and in flight."""
     waiting, flying, wrong = (0.0, NAN, 0.02, NAN, 0.003), (0.04, 0.03, 0.02, 0.07), (1.3, 0.1)
     unfixed = "no valid horizontal velocity, horizontal position"
@@ -162,7 +162,7 @@ def session(vehicle: Sender) -> Session:
     return session
 
 
-def test_a_jump_back_is_a_reboot(session: Session, vehicle: Sender) -> None:
+def test_backward_time_jump_is_a_reboot(session: Session, vehicle: Sender) -> None:
     """After a reboot the message intervals are requested again."""
     assert times(session, vehicle.position(500), vehicle.attitude(510)) == []
     assert session.poll(0.0) == ()
@@ -173,9 +173,7 @@ def test_a_jump_back_is_a_reboot(session: Session, vehicle: Sender) -> None:
     assert times(session, vehicle.attitude(660), vehicle.position(660)) == [0.66, 0.66]
 
 
-def test_stamps_that_are_late_far_ahead_or_stuck_are_dropped(
-    session: Session, vehicle: Sender
-) -> None:
+def test_late_future_and_stuck_stamps_are_dropped(session: Session, vehicle: Sender) -> None:
     """Stamps are compared with those of the same message, however many wrong ones come between.
     Several far ahead that follow each other are a clock that jumped."""
     late = vehicle.position(50000) + vehicle.attitude(50001) + vehicle.position(50010)
@@ -197,7 +195,7 @@ WRAP_MS = 2**32
 
 
 @pytest.mark.parametrize("turns", [0, 1])
-def test_time_goes_on_where_the_32_bits_of_its_stamp_begin_again(turns: int) -> None:
+def test_time_continues_when_time_boot_ms_wraps(turns: int) -> None:
     """The vehicle is first heard 30 ms before the wrap. TIMESYNC has 64 bits and does not wrap; its
     replies stay comparable with the stamps, also on a vehicle that has run for 50 days."""
     vehicle = Sender()
@@ -238,7 +236,7 @@ def texts(session: Session, *frames: bytes, now_s: float = 0.0) -> list[str]:
 
 
 @pytest.mark.parametrize("order", [(2, 0, 1), (0, 1, 1, 0, 2)])
-def test_chunks_are_joined_in_any_order(
+def test_text_chunks_are_joined_in_any_order(
     order: tuple[int, ...], session: Session, vehicle: Sender
 ) -> None:
     """The chunks of two texts may alternate."""
@@ -247,9 +245,7 @@ def test_chunks_are_joined_in_any_order(
     assert texts(session, *frames[-2:]) == [LONG.decode()] * 2
 
 
-def test_a_missing_chunk_is_marked_after_a_second_and_few_texts_wait(
-    session: Session, vehicle: Sender
-) -> None:
+def test_missing_text_chunk_is_marked_after_a_second(session: Session, vehicle: Sender) -> None:
     first, last = vehicle.text(CHUNKS[0], 3, 0), vehicle.text(CHUNKS[2], 3, 2)
     assert texts(session, first, last) == []
     assert texts(session, vehicle.text(b"other"), now_s=0.9) == ["other"]

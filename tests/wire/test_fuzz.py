@@ -130,7 +130,7 @@ def floats(value: object) -> Iterator[float]:
 
 @pytest.mark.parametrize("autopilot", [PX4, ARDUPILOT])
 @pytest.mark.parametrize("stream", [False, True])
-def test_hostile_datagrams(autopilot: int, stream: bool) -> None:
+def test_session_survives_hostile_datagrams(autopilot: int, stream: bool) -> None:
     """A frame with a valid checksum counts at any length: a shorter payload is padded, a longer one
     is of a later version of MAVLink. SETUP_SIGNING (256) holds a key and is not logged."""
     session, found, sent = pinned(Sender(), autopilot, stream=stream), 0, 0
@@ -148,7 +148,7 @@ def test_hostile_datagrams(autopilot: int, stream: bool) -> None:
         assert session.splitter.bytes_skipped == 0
 
 
-def test_a_length_in_garbage_hides_no_frame_of_the_next_read() -> None:
+def test_false_length_in_garbage_hides_no_frame() -> None:
     """The length in a false header with an unknown id covers three good frames of two reads, or all
     but the last byte of the third, where the first read ends and a frame could begin."""
     sender = Sender(7)
@@ -161,7 +161,7 @@ def test_a_length_in_garbage_hides_no_frame_of_the_next_read() -> None:
         assert [*receive(session, data[:split]), *receive(session, data[split:])] == frames
 
 
-def test_frames_that_are_unusual() -> None:
+def test_unusual_frames_are_accepted_or_refused() -> None:
     """Unknown incompatibility flags are refused; a signed frame includes its signature. A frame
     with an unknown id counts only before another frame; garbage like it hides no frame."""
     session, good, outer = pinned(Sender()), Sender().position(1000), Sender().position(2000)
@@ -194,7 +194,7 @@ def assault(instance: Instance, seed: int, count: int) -> None:
 
 @pytest.mark.timeout(3000)
 @pytest.mark.parametrize("firmware", FIRMWARES.values(), ids=FIRMWARES)
-def test_nothing_raises_and_every_answer_is_well_formed(firmware: Firmware) -> None:
+def test_simulated_vehicle_survives_hostile_datagrams(firmware: Firmware) -> None:
     vehicle = config.vehicle(firmware.vehicle)
     instance = Instance(firmware, vehicle, Conditions(), 1)
     assault(instance, 5, COUNT // 2)
@@ -204,7 +204,7 @@ def test_nothing_raises_and_every_answer_is_well_formed(firmware: Firmware) -> N
 
 @pytest.mark.slow
 @pytest.mark.timeout(3000)
-def test_a_normal_flight_afterwards() -> None:
+def test_simulated_vehicle_flies_after_hostile_datagrams() -> None:
     bench = Bench(ground_link=True)
     bench.fly_offboard()
     assault(bench.instance, 6, COUNT // 2)

@@ -52,7 +52,7 @@ TILTED = (0.5, 0.0, math.cos(math.pi / 6))  # 30 degrees
         (ARDUPILOT, 9.81, (0.0, 0.0, -1.0), None, 0.0),
     ],
 )
-def test_thrust_rules(
+def test_thrust_is_scaled_for_each_autopilot(
     autopilot: int, thrust_mps2: float, direction: Any, body_z_down: Any, expected: float
 ) -> None:
     command = Command(thrust_mps2, direction, 0.0)
@@ -60,7 +60,7 @@ def test_thrust_rules(
     assert sent(value, autopilot).thrust == pytest.approx(expected, abs=1e-6)
 
 
-def test_what_is_not_finite_or_out_of_range_is_refused() -> None:
+def test_invalid_outgoing_values_are_refused() -> None:
     bad = (math.nan, math.inf, -math.inf)
     refused: list[tuple[Outgoing, str]] = [
         (replace(LEVEL, **{name: each}), "finite")  # type: ignore[arg-type]
@@ -103,7 +103,9 @@ def test_what_is_not_finite_or_out_of_range_is_refused() -> None:
         (ARDUPILOT_DIALECT.hold(), 176, [1.0, 17.0]),
     ],
 )
-def test_commands(command: CommandLong, number: int, leading: list[float]) -> None:
+def test_commands_are_encoded_with_their_parameters(
+    command: CommandLong, number: int, leading: list[float]
+) -> None:
     """These are commands that no flight of tests/replay has sent to a real autopilot."""
     message = sent(command)
     assert (message.target_system, message.target_component, message.command) == (7, 1, number)
@@ -114,7 +116,7 @@ def test_commands(command: CommandLong, number: int, leading: list[float]) -> No
 # --- the others ---
 
 
-def test_positions_and_references() -> None:
+def test_positions_and_references_are_encoded() -> None:
     """Their time stamp wraps at 32 bits."""
     session = pinned(Sender(7))
     for value, kind, component in (
@@ -133,7 +135,7 @@ def test_positions_and_references() -> None:
         assert [getattr(fields, name) for name in names] == pytest.approx(given)
 
 
-def test_numbers_for_the_log_have_sequence_numbers_of_their_own() -> None:
+def test_log_records_use_separate_sequence_numbers() -> None:
     session = pinned(Sender())
     sequence = [session.encode(Heartbeat(18))[4] for _ in range(257)]
     assert sequence == [*range(256), 0]

@@ -72,7 +72,7 @@ def test_every_byte_is_framed_and_no_frame_is_lost(replay: Replay) -> None:
     ]
 
 
-def test_positions_and_attitudes_are_what_pymavlink_reads(replay: Replay) -> None:
+def test_positions_and_attitudes_agree_with_pymavlink(replay: Replay) -> None:
     positions = [
         events.LocalPosition(m.time_boot_ms / 1000.0, (m.x, m.y, m.z), (m.vx, m.vy, m.vz))
         for m in replay.heard("LOCAL_POSITION_NED")
@@ -88,7 +88,7 @@ def test_positions_and_attitudes_are_what_pymavlink_reads(replay: Replay) -> Non
         assert attitude.rates_frd_radps == rates
 
 
-def test_modes_answers_and_texts_are_what_pymavlink_reads(replay: Replay) -> None:
+def test_modes_answers_and_texts_agree_with_pymavlink(replay: Replay) -> None:
     """pymavlink calls PX4's AUTO.LAND LAND. A text ends with a chunk of fewer than 50 bytes."""
     beats = replay.of(events.Heartbeat)
     assert [(beat.mode.rpartition(".")[2], beat.armed, beat.system_status) for beat in beats] == [
@@ -129,7 +129,7 @@ def test_parameters_are_bytewise_on_px4_and_cast_on_arducopter(
 
 
 @pytest.mark.parametrize("portion", [1, 64])
-def test_a_stream_in_any_portions_gives_the_same_events(px4: Replay, portion: int) -> None:
+def test_split_stream_gives_the_same_events(px4: Replay, portion: int) -> None:
     messages = px4.messages[:1500]
     data = b"".join(bytes(m.get_msgbuf()) for m in messages)
     whole, pieces = Session(SessionSettings()), Session(SessionSettings(stream=True))

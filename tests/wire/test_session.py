@@ -27,7 +27,7 @@ def ignores(session: Session, *frames: bytes) -> None:
         assert (reception.events, reception.frames) == ([], [frame])
 
 
-def test_the_first_autopilot_heard_is_the_vehicle_and_no_other_one_is() -> None:
+def test_only_the_first_autopilot_heard_is_the_vehicle() -> None:
     session, vehicle = Session(SessionSettings()), Sender(42)
     ignores(
         session,
@@ -58,7 +58,7 @@ def test_the_first_autopilot_heard_is_the_vehicle_and_no_other_one_is() -> None:
     assert len(session.receive(vehicle.position(1000), PEER, 0.0).events) == 1
 
 
-def test_a_vehicle_that_goes_on_from_another_port_is_no_second_one() -> None:
+def test_vehicle_on_a_new_port_is_not_a_duplicate() -> None:
     """Its HEARTBEAT came from the new port before the old one had been silent for long enough."""
     vehicle = Sender(1)
     session = pinned(vehicle)
@@ -98,7 +98,7 @@ def level_setpoint(target: int) -> Any:
     return mavlink.MAVLink_set_attitude_target_message(0, target, 1, 7, [1, 0, 0, 0], 0, 0, 0, 0.5)
 
 
-def test_another_program_with_our_ids_and_a_strange_setpoint_are_seen() -> None:
+def test_other_controllers_on_the_link_are_detected() -> None:
     """A companion that uses our ids is seen, and so is a component of the vehicle's system that
     sends setpoints or mode commands. One that requests a parameter or a rate is no controller."""
     session = pinned(Sender())
@@ -125,7 +125,7 @@ def test_another_program_with_our_ids_and_a_strange_setpoint_are_seen() -> None:
 
 
 @pytest.mark.parametrize(("target", "seen"), [(0, True), (1, True), (2, False)])
-def test_a_setpoint_for_another_vehicle_on_the_link_is_not_ours(target: int, seen: bool) -> None:
+def test_setpoints_for_another_vehicle_are_ignored(target: int, seen: bool) -> None:
     session, zeros = pinned(Sender()), (0,) * 12
     for setpoint in (
         level_setpoint(target),
@@ -161,7 +161,7 @@ def mode_reports(
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_a_report_of_the_mode_that_a_newer_one_has_overtaken_is_dropped(seed: int) -> None:
+def test_overtaken_mode_reports_are_dropped(seed: int) -> None:
     """It is up to 127 frames and 1.2 s late. Reports in order count; 5 % of others are lost."""
     rng = np.random.default_rng(seed)
     vehicle = Sender(1)
@@ -179,7 +179,7 @@ def test_a_report_of_the_mode_that_a_newer_one_has_overtaken_is_dropped(seed: in
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_every_report_of_the_mode_counts_after_outages_and_restarts(seed: int) -> None:
+def test_mode_reports_count_after_outages_and_restarts(seed: int) -> None:
     """A pilot's switch is not taken for an old report, whatever was lost before it."""
     rng = np.random.default_rng(seed)
     vehicle = Sender(1)
@@ -196,7 +196,7 @@ def test_every_report_of_the_mode_counts_after_outages_and_restarts(seed: int) -
     assert isinstance(event, events.Heartbeat)
 
 
-def test_another_companion_computer_is_seen() -> None:
+def test_another_companion_computer_is_detected() -> None:
     session = pinned(Sender(1))
     for ids, vehicle_type, autopilot, seen in (
         ((1, 192), 18, 8, True),
@@ -211,7 +211,7 @@ def test_another_companion_computer_is_seen() -> None:
         assert session.receive(beat, PEER, 1.0).events == expected, ids
 
 
-def test_acks_for_others_are_not_ours() -> None:
+def test_acks_for_other_programs_are_ignored() -> None:
     vehicle = Sender()
     session = pinned(vehicle)
     for address, ours in (
@@ -224,7 +224,7 @@ def test_acks_for_others_are_not_ours() -> None:
 # --- what is sent ---
 
 
-def test_timesync_is_answered_also_before_the_first_heartbeat() -> None:
+def test_timesync_is_answered_before_the_first_heartbeat() -> None:
     """Only a vehicle's request is answered, not a ground station's."""
     vehicle, session = Sender(7), Session(SessionSettings())
     request = mavlink.MAVLink_timesync_message(0, 123_456_789_012)
@@ -240,7 +240,7 @@ def test_timesync_is_answered_also_before_the_first_heartbeat() -> None:
     assert reception.events == [events.TimesyncReply(request_ns=2, vehicle_ns=1)]
 
 
-def test_heartbeats_at_1_hz_of_host_or_vehicle_time_whichever_is_faster() -> None:
+def test_heartbeat_rate_is_1_hz_of_the_faster_clock() -> None:
     """A further one, with the vehicle's system id, is sent as soon as the vehicle is found."""
     vehicle, session = Sender(7), Session(SessionSettings(sends_first=True))
     assert session.poll(0.0) == (Heartbeat(18),)
@@ -256,7 +256,7 @@ def test_heartbeats_at_1_hz_of_host_or_vehicle_time_whichever_is_faster() -> Non
     assert beats == 10
 
 
-def test_a_heartbeat_comes_at_once_with_another_custom_mode() -> None:
+def test_changed_custom_mode_sends_a_heartbeat_at_once() -> None:
     session = Session(SessionSettings(sends_first=True))
     status = [(3, 1), (3, 1), (4, 1), (4, 6), (4, 6), (4, 1)]
     sent = [session.poll(0.01 * i, each) for i, each in enumerate(status)]

@@ -51,7 +51,7 @@ def paired() -> tuple[Session, Sender]:
     return ours, vehicle
 
 
-def test_none_of_many_forged_and_replayed_frames_is_accepted() -> None:
+def test_forged_and_replayed_frames_are_refused() -> None:
     """A forged time stamp does not shut out the vehicle, either."""
     ours, vehicle = paired()
     chance = random.Random(13)
@@ -103,7 +103,7 @@ def test_only_radio_status_is_accepted_unsigned() -> None:
     assert isinstance(seen, events.OtherSender)
 
 
-def test_why_no_vehicle_was_found() -> None:
+def test_session_explains_why_no_vehicle_was_found() -> None:
     for ours, key, sentence in (
         (session(), OTHER_KEY, "signature does not match: it is another key's"),
         (session(), b"", "arrive unsigned: set the key on the vehicle, or omit --signing-key"),
@@ -116,7 +116,7 @@ def test_why_no_vehicle_was_found() -> None:
     assert "an autopilot is heard as component 7" in ours.senders.why_none()
 
 
-def test_a_vehicle_whose_clock_is_behind_hears_ours_and_is_found() -> None:
+def test_vehicle_whose_signing_clock_is_behind_is_found() -> None:
     """PX4 begins with the stamp that came with its key, perhaps years ago. Our stamps follow those
     of a vehicle that is ahead."""
     ours, vehicle = session(), signer(stamp=NOW - TEN_MINUTES)
@@ -132,7 +132,7 @@ def test_a_vehicle_whose_clock_is_behind_hears_ours_and_is_found() -> None:
     assert stamp_of(ahead.encode(Heartbeat(6))) >= NOW + TEN_MINUTES
 
 
-def test_another_port_needs_the_signature() -> None:
+def test_port_change_needs_a_valid_signature() -> None:
     ours, vehicle = paired()
     other = (PEER[0], PEER[1] + 1)
     for key in (b"", OTHER_KEY):
@@ -142,7 +142,7 @@ def test_another_port_needs_the_signature() -> None:
     assert len(moved) == 2  # its check did not use up the time stamp
 
 
-def test_stamps_increase_whatever_the_clock_does_and_are_reserved_first() -> None:
+def test_signing_stamps_always_increase_and_are_reserved_first() -> None:
     time_s, reserved = [100.0], []
     signing = Signing(KEY, NOW, lambda: time_s[0], reserved.append, NOW)
     stamps = []
@@ -155,7 +155,7 @@ def test_stamps_increase_whatever_the_clock_does_and_are_reserved_first() -> Non
     assert reserved[0] == stamps[0] + RESERVED
 
 
-def test_what_continues_has_later_stamps_and_refuses_older_ones() -> None:
+def test_resumed_signing_continues_stamps_and_refuses_replays() -> None:
     ours, vehicle = paired()
     frame = vehicle.position(1000)
     ours.receive(frame, PEER, 0.0)
@@ -169,7 +169,7 @@ def test_what_continues_has_later_stamps_and_refuses_older_ones() -> None:
     assert stamp_of(ours.encode(Heartbeat(6))) < stamp_of(later.encode(Heartbeat(6)))
 
 
-def test_the_key_is_not_logged_or_shown() -> None:
+def test_signing_key_is_not_logged_or_shown() -> None:
     setup = mavlink.MAVLink_setup_signing_message(1, 1, list(KEY), NOW)
     reception = Session(SessionSettings()).receive(Sender(255, 190).frame(setup), PEER, 0.0)
     assert reception.frames == []
@@ -211,7 +211,7 @@ def answers(client: Sender, instance: Instance) -> bool:
 
 
 @pytest.mark.parametrize("firmware", [PX4, ARDUPILOT], ids=["px4", "ardupilot"])
-def test_it_answers_what_is_signed_and_signs_the_answer(firmware: Firmware) -> None:
+def test_simulated_vehicle_answers_only_signed_requests(firmware: Firmware) -> None:
     instance, client = vehicle(firmware), station()
     name = firmware.parameters[0].name.encode()
     instance.feed(request(client, name))
@@ -238,7 +238,9 @@ def test_it_answers_what_is_signed_and_signs_the_answer(firmware: Firmware) -> N
     [(PX4, ["HEARTBEAT", "RADIO_STATUS", "COLLISION"]), (ARDUPILOT, ["RADIO_STATUS"])],
     ids=["px4", "ardupilot"],
 )
-def test_what_is_accepted_unsigned(firmware: Firmware, accepted: list[str]) -> None:
+def test_each_firmware_accepts_its_unsigned_messages(
+    firmware: Firmware, accepted: list[str]
+) -> None:
     messages: tuple[Any, ...] = (
         mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3),
         mavlink.MAVLink_radio_status_message(1, 1, 100, 0, 0, 0, 0),
@@ -254,14 +256,14 @@ def test_what_is_accepted_unsigned(firmware: Firmware, accepted: list[str]) -> N
     assert taken == accepted
 
 
-def test_a_stamp_that_is_a_minute_old_is_refused() -> None:
+def test_stamp_older_than_a_minute_is_refused() -> None:
     for older, refused in ((1000, {"message refused: old time stamp": 1}), (-1000, {})):
         instance = vehicle(ARDUPILOT)
         instance.feed(request(station(stamp=EPOCH - MINUTE - older)))
         assert instance.refusals == refused
 
 
-def test_a_px4_without_clock_follows_the_stamps_that_it_hears() -> None:
+def test_px4_without_a_clock_follows_received_stamps() -> None:
     instance, client = vehicle(), station()
     assert heard(client, instance, 100) == []  # its stamps are years behind
     # signed, although a PX4 would take it unsigned

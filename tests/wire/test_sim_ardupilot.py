@@ -46,7 +46,7 @@ def roll_deg(vehicle: Bench) -> float:
     return math.degrees(math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)))
 
 
-def test_without_requests_it_sends_heartbeat_timesync_and_home() -> None:
+def test_arducopter_sends_heartbeat_timesync_and_home_unrequested() -> None:
     """Texts follow once a client has spoken, origin and home once the EKF has found them."""
     vehicle = Bench(firmware=ARDUPILOT, boot_scale=0.1, heartbeat_type=18)
     vehicle.run(20.0)
@@ -60,7 +60,7 @@ def test_without_requests_it_sends_heartbeat_timesync_and_home() -> None:
     }
 
 
-def test_the_heartbeat_after_a_mode_change_shows_it_also_in_the_step_of_the_last_one() -> None:
+def test_mode_change_sends_a_heartbeat_even_just_after_one() -> None:
     vehicle = guided()
     since_s = vehicle.time_s
     while not vehicle.of("HEARTBEAT", since_s):
@@ -70,7 +70,7 @@ def test_the_heartbeat_after_a_mode_change_shows_it_also_in_the_step_of_the_last
 
 
 @pytest.mark.parametrize(("thrust", "lifts"), [(0.45, True), (0.05, False)])
-def test_takeoff_by_setpoints_alone(thrust: float, lifts: bool) -> None:
+def test_attitude_setpoints_alone_take_off(thrust: float, lifts: bool) -> None:
     """0.3 m is reached after 3.3 to 3.9 s. Any thrust counts as flight, even if it cannot lift."""
     vehicle = booted()
     vehicle.set("GUID_OPTIONS", 8)
@@ -83,7 +83,7 @@ def test_takeoff_by_setpoints_alone(thrust: float, lifts: bool) -> None:
     assert (vehicle.armed, vehicle.instance.view.landed_state) == (True, 2)
 
 
-def test_a_heavy_vehicle_takes_off_also_after_a_takeoff_that_ended_on_the_ground() -> None:
+def test_heavy_vehicle_takes_off_after_an_interrupted_takeoff() -> None:
     """The vehicle hovers at a thrust of 0.85. Only full throttle limits ArduCopter's altitude
     controller."""
     heavy = {"name": "heavy", "conditions": {"thrust_scale": 0.43, "boot_scale": 0.1}}
@@ -101,7 +101,7 @@ def test_a_heavy_vehicle_takes_off_also_after_a_takeoff_that_ended_on_the_ground
     assert vehicle.height_m == pytest.approx(6.0, abs=0.5)
 
 
-def test_which_attitude_setpoints_are_flown() -> None:
+def test_only_valid_attitude_setpoints_are_flown() -> None:
     """The sign of a quaternion does not matter; its length and the bits of the mask do."""
     vehicle, tilts_deg = guided(), np.array([6.0, 6.0])  # roll and pitch, small
 
@@ -130,7 +130,7 @@ def test_without_guid_options_thrust_is_a_climb_rate() -> None:
         assert vehicle.climb_mps == pytest.approx(climb, abs=0.1)
 
 
-def test_a_request_of_the_present_mode_changes_nothing_and_disarming_ends_a_takeoff() -> None:
+def test_repeated_mode_request_keeps_a_takeoff_and_disarming_ends_it() -> None:
     """Scripts request GUIDED until HEARTBEAT shows it; set_mode then returns at once."""
     vehicle = booted()
 
@@ -155,7 +155,7 @@ def test_a_request_of_the_present_mode_changes_nothing_and_disarming_ends_a_take
     assert vehicle.height_m == pytest.approx(0.0, abs=0.05)
 
 
-def test_modes_that_do_not_start_while_armed() -> None:
+def test_unusable_modes_are_refused_only_while_armed() -> None:
     """While disarmed the vehicle enters any mode."""
     vehicle = guided()
     mission = vehicle.instance.autopilot.mission
@@ -176,7 +176,7 @@ def test_modes_that_do_not_start_while_armed() -> None:
     assert ground.texts()[-2:] == ["Auto: Missing Takeoff Cmd", failed]
 
 
-def test_a_lost_ground_station_disarms_on_the_ground_and_leaves_the_pilot_his_mode() -> None:
+def test_lost_ground_station_disarms_only_on_the_ground() -> None:
     vehicle = loitering()
     vehicle.set("FS_GCS_ENABLE", 1)
     vehicle.heartbeat_type = None
@@ -195,7 +195,7 @@ def test_a_lost_ground_station_disarms_on_the_ground_and_leaves_the_pilot_his_mo
     assert ground.texts()[-2:] == ["Disarming motors", "GCS Failsafe - Disarming"]
 
 
-def test_a_nan_thrust_is_zero_and_prevents_arming_until_reboot() -> None:
+def test_nan_thrust_counts_as_zero_and_prevents_arming() -> None:
     vehicle = guided()
     vehicle.run(0.5, lambda: vehicle.attitude(LEVEL, NAN))
     assert vehicle.climb_mps < -2.0
@@ -236,7 +236,7 @@ def test_without_gps_the_position_is_lost_after_eight_seconds(
 # -- sticks, by RC_CHANNELS_OVERRIDE and MANUAL_CONTROL ------------------------------------------
 
 KEEP = 65535
-FEIGNED = (1500, 1500, 1000, 1500, 1800, 1000, 1000, 1800)
+SIMULATED_RC = (1500, 1500, 1000, 1500, 1800, 1000, 1000, 1800)
 MIDDLE = (1500, 1500, 1500, 1500)
 
 
@@ -259,7 +259,7 @@ def seen(bench: Bench) -> tuple[int, ...]:
     return tuple(getattr(channels, f"chan{i}_raw") for i in range(1, 9))
 
 
-def test_sticks_are_speeds_and_an_override_lasts_three_seconds() -> None:
+def test_stick_overrides_command_speeds_and_expire() -> None:
     """As on the real one, throttle is a climb rate, pitch accelerates and a centred stick brakes
     (speeds after each second). After the override the simulated remote control, throttle at its
     lower end, makes the vehicle descend."""
@@ -279,13 +279,13 @@ def test_sticks_are_speeds_and_an_override_lasts_three_seconds() -> None:
     push(bench, 3.0, 1700, 1500, 1500, 1500)
     assert bench.velocity[1] == pytest.approx(2.65, abs=0.4)
     push(bench, 3.0, *MIDDLE)
-    assert seen(bench) == (*MIDDLE, *FEIGNED[4:])
+    assert seen(bench) == (*MIDDLE, *SIMULATED_RC[4:])
     bench.run(4.5)
-    assert seen(bench) == FEIGNED
+    assert seen(bench) == SIMULATED_RC
     assert bench.climb_mps == pytest.approx(-2.4, abs=0.3)
 
 
-def test_manual_control_of_the_ground_station_alone_is_an_override_and_keeps_it_present() -> None:
+def test_manual_control_overrides_sticks_and_counts_as_presence() -> None:
     """32767 is an axis that is not used; a negative throttle, another target or sender changes
     nothing. A width of zero releases a channel."""
     bench = loitering()
@@ -304,7 +304,7 @@ def test_manual_control_of_the_ground_station_alone_is_an_override_and_keeps_it_
     assert seen(bench)[:4] == widths
     bench.codec.srcSystem = 255
     push(bench, 0.02, 0, KEEP, 0, KEEP)
-    assert seen(bench) == (1500, 1500, 1000, 1500, *FEIGNED[4:])
+    assert seen(bench) == (1500, 1500, 1000, 1500, *SIMULATED_RC[4:])
     bench.set("FS_GCS_ENABLE", 1)
     bench.heartbeat_type = None
     joystick = mavlink.MAVLink_manual_control_message(1, 0, 0, 700, 0, 0)
@@ -353,7 +353,7 @@ def fastest_mps(bench: Bench, duration_s: float) -> float:
     return max(speeds)
 
 
-def test_a_turn_has_the_requested_rate_and_direction() -> None:
+def test_turn_has_the_requested_rate_and_direction() -> None:
     """A turn to a heading has them, too, and so may go the longer way round."""
     bench = flying()
     for params, wanted_deg, took_s in (
@@ -368,7 +368,7 @@ def test_a_turn_has_the_requested_rate_and_direction() -> None:
         bench.run(2.0)
 
 
-def test_streams_show_the_goal_and_the_outputs_and_a_region_of_interest_is_followed() -> None:
+def test_arducopter_faces_a_region_of_interest_and_streams_its_goal() -> None:
     bench = flying()
     bench.send(mavlink.MAVLink_request_data_stream_message(1, 1, 0, 4, 1))
     (north, _), (_, east) = degrees(bench, 40.0, 0.0), degrees(bench, 0.0, 10.0)
@@ -423,7 +423,7 @@ def test_a_requested_speed_holds_until_a_setpoint_of_another_kind() -> None:
     assert fastest_mps(bench, 6.0) > 7.0
 
 
-def test_reposition_of_arducopter_accelerates_and_brakes_as_the_real_one() -> None:
+def test_arducopter_reposition_moves_as_on_the_real_one() -> None:
     """Expected are metres from the start after each second. Only COMMAND_INT is accepted."""
     bench = flying()
     assert bench.command(192, -1, 1, 0, NAN, 0, 0, 10) == [UNSUPPORTED]
@@ -446,7 +446,7 @@ def test_reposition_of_arducopter_accelerates_and_brakes_as_the_real_one() -> No
         (ARDUPILOT, 950_000_000, RELATIVE, DENIED),
     ],
 )
-def test_a_reposition_without_a_place_flies_nowhere(
+def test_reposition_without_a_valid_place_does_not_move(
     firmware: Firmware, x: int, frame: int, result: int
 ) -> None:
     bench = flying(firmware)
@@ -458,7 +458,7 @@ def test_a_reposition_without_a_place_flies_nowhere(
 
 @pytest.mark.parametrize("item", [False, True], ids=["command", "item"])
 @pytest.mark.parametrize(("firmware", "obeys"), [(PX4, True), (ARDUPILOT, False)])
-def test_a_climb_speed_is_one_across_for_px4_alone(
+def test_only_px4_applies_a_climb_speed_to_horizontal_flight(
     firmware: Firmware, obeys: bool, item: bool
 ) -> None:
     bench = flying(firmware)
@@ -489,7 +489,7 @@ def test_a_climb_speed_is_one_across_for_px4_alone(
         ("LOITER", 178, RELATIVE, (1.0, 3.0, 0.0, 0.0), FAILED),
     ],
 )
-def test_what_arducopter_refuses(
+def test_arducopter_answers_unusual_commands_as_the_real_one(
     mode: str, number: int, frame: int, params: tuple[float, ...], result: int
 ) -> None:
     bench = aloft(firmware=ARDUPILOT, height_m=5.0, mode=mode)
@@ -541,7 +541,7 @@ def test_px4_faces_its_goal_and_then_takes_the_requested_yaw() -> None:
     ],
     ids=["px4", "ardupilot"],
 )
-def test_a_terminated_flight_falls_and_only_px4_does_not_arm_again(
+def test_flight_termination_prevents_rearming_only_on_px4(
     firmware: Firmware, beats: tuple[int, ...], later: int, said: list[str]
 ) -> None:
     """MAV_CMD_DO_FLIGHTTERMINATION. PX4 stays in its mode until it is started again."""

@@ -21,7 +21,7 @@ from simulator.vehicle.conditions import Conditions
 PREARM_CHECK = 1 << 28  # MAV_SYS_STATUS_SENSOR
 
 
-def test_without_position_automatic_flight_lands_and_attitude_setpoints_continue() -> None:
+def test_position_loss_lands_automatic_flight_but_not_offboard() -> None:
     bench = aloft()
     autopilot = bench.instance.autopilot
     autopilot.plant.gps_healthy = False
@@ -48,7 +48,7 @@ def hovering_at(hover_thrust: float) -> Bench:
 
 
 @pytest.mark.parametrize("hover_thrust", [0.15, 0.8])
-def test_vehicles_far_from_the_believed_hover_thrust_hold_and_land(hover_thrust: float) -> None:
+def test_vehicle_with_a_wrong_hover_thrust_holds_and_lands(hover_thrust: float) -> None:
     """The integral term, up to g, compensates the difference."""
     bench = hovering_at(hover_thrust)
     hold(bench, 8.0, 2.0)
@@ -57,7 +57,7 @@ def test_vehicles_far_from_the_believed_hover_thrust_hold_and_land(hover_thrust:
     bench.run_until(lambda: not bench.armed, 16.0)
 
 
-def test_a_least_thrust_that_lifts_never_lands() -> None:
+def test_minimum_thrust_above_hover_prevents_landing() -> None:
     """With a hover thrust of 0.1, SIH of PX4 1.16.1 climbed in AUTO.LAND at 1.7 to 2.3 m/s."""
     bench = hovering_at(0.1)
     bench.command(21)
@@ -67,7 +67,7 @@ def test_a_least_thrust_that_lifts_never_lands() -> None:
     bench.run_until(lambda: not bench.armed, 60.0)
 
 
-def test_thrust_outside_its_range_is_clipped_or_zero_and_quaternions_are_not_checked() -> None:
+def test_px4_clips_thrust_and_does_not_check_quaternions() -> None:
     setpoints: tuple[tuple[dict[str, Any], float, float], ...] = (
         ({"thrust": HOVER}, -0.1, 0.1),
         ({"quaternion": (2.0, 0, 0, 0)}, -0.1, 0.1),
@@ -86,7 +86,7 @@ def test_thrust_outside_its_range_is_clipped_or_zero_and_quaternions_are_not_che
         assert low < bench.climb_mps - before_mps < high
 
 
-def test_the_least_rate_until_which_the_last_attitude_continues() -> None:
+def test_setpoints_slower_than_1_hz_trigger_the_failsafe() -> None:
     bench, half = engaged(), math.radians(1.0)
     quaternion = math.cos(half), math.sin(half), 0.0, 0.0
     for period_s in (0.8, 1 / 1.5):
@@ -114,13 +114,13 @@ def test_arming_needs_a_battery_and_with_nav_dll_act_a_ground_station() -> None:
     ("base_mode", "mode"),
     [(4, 0x04040000), (64, 0x00010000), (80, 0x00070000), (72, POSCTL), (16, LOITER)],
 )
-def test_the_flags_of_a_base_mode_alone_name_a_mode_of_px4(base_mode: int, mode: int) -> None:
+def test_px4_accepts_a_mode_given_by_base_mode_flags(base_mode: int, mode: int) -> None:
     bench = Bench()
     assert bench.command(176, base_mode) == [0, 0]
     assert bench.mode == mode
 
 
-def test_a_landing_goes_on_without_a_ground_station() -> None:
+def test_px4_landing_continues_without_a_ground_station() -> None:
     """Its pre-arm checks pass, though it could not be armed in this mode."""
     bench = aloft(height_m=30.0)
     bench.set("NAV_DLL_ACT", 2)
@@ -133,7 +133,7 @@ def test_a_landing_goes_on_without_a_ground_station() -> None:
     assert "Failsafe activated" not in "".join(bench.texts())
 
 
-def test_the_pilot_takes_over_before_the_failsafe_acts() -> None:
+def test_pilot_can_switch_modes_before_the_failsafe_acts() -> None:
     bench = aloft()
     bench.set("COM_LOW_BAT_ACT", 2)
     bench.instance.autopilot.plant.set_battery(0.06)
@@ -150,7 +150,7 @@ def scenario(*faults: dict[str, Any], **more: Any) -> Scenario:
 # -- modes and refusals ----------------------------------------------------------------------------
 
 
-def test_what_a_run_cannot_simulate_is_refused() -> None:
+def test_unsupported_scenarios_are_refused() -> None:
     switch = scenario({"fault": "pilot_takes_over", "mode": "POSCTL"})
     flood = scenario({"fault": "stranger", "rate_hz": 30_000.0})
     config.check_for(switch, PX4, lockstep=True)
@@ -163,7 +163,7 @@ def test_what_a_run_cannot_simulate_is_refused() -> None:
         scenario(start={"height_m": 3.0, "mode": "NOPE"})
 
 
-def test_refusals_with_their_texts_until_they_end() -> None:
+def test_refusal_fault_rejects_requests_with_its_text() -> None:
     requests = (
         ("arm", 400, (1.0,), "Arming denied: low battery"),
         ("offboard", 176, (1.0, 6.0), "Switching to Offboard denied: low battery"),
@@ -180,7 +180,7 @@ def test_refusals_with_their_texts_until_they_end() -> None:
         assert bench.command(number, *params)[-1] == 0
 
 
-def test_a_stuck_message_repeats_its_content_with_or_without_its_stamp() -> None:
+def test_stuck_message_repeats_its_content_and_optionally_its_stamp() -> None:
     stuck = {"fault": "stuck_message", "message": "ATTITUDE", "for_s": 0.9}
     bench = aloft({**stuck, "at_s": 1.0}, {**stuck, "at_s": 2.0, "stamp_runs": False})
     bench.run(3.0)
@@ -192,9 +192,7 @@ def test_a_stuck_message_repeats_its_content_with_or_without_its_stamp() -> None
 
 
 @pytest.mark.parametrize(("timeout_us", "late"), [(5e6, 895), (2e6, 229)])
-def test_gps_loss_drifts_and_jumps_back_and_px4_loses_the_position(
-    timeout_us: float, late: int
-) -> None:
+def test_gps_loss_drifts_the_estimate_until_the_fix_returns(timeout_us: float, late: int) -> None:
     """PX4 loses it after EKF2_NOAID_TOUT; the estimator's flags then are those before a fix."""
     lost = {"fault": "gps_loss", "at_s": 4.0, "for_s": 8.0, "drift_mps": 0.5}
     bench = Bench(scenario=scenario(lost))
@@ -212,7 +210,7 @@ def test_gps_loss_drifts_and_jumps_back_and_px4_loses_the_position(
     assert found.reset_counter == 1
 
 
-def test_a_stranger_sends_noise_or_a_spoof_with_the_ids_of_the_vehicle() -> None:
+def test_stranger_fault_sends_noise_or_spoofed_heartbeats() -> None:
     noise = {"fault": "stranger", "at_s": 1.0, "rate_hz": 1000.0, "size_bytes": 40}
     spoof = {"fault": "stranger", "at_s": 1.0, "rate_hz": 20, "sends": "heartbeat"}
     bench, decoder = Bench(scenario=scenario(noise, spoof)), Decoder()
@@ -227,7 +225,7 @@ def test_a_stranger_sends_noise_or_a_spoof_with_the_ids_of_the_vehicle() -> None
 
 
 @pytest.mark.parametrize("firmware", [PX4, ARDUPILOT], ids=lambda firmware: firmware.name)
-def test_the_same_seed_gives_the_same_bytes_with_every_new_fault(firmware: Firmware) -> None:
+def test_same_seed_gives_the_same_bytes_with_faults(firmware: Firmware) -> None:
     stalled = {"stalled": True, "queue_bytes": 100_000, "at_s": 2.0, "for_s": 0.5}
     faults: tuple[dict[str, Any], ...] = (
         {"fault": "second_sender", "at_s": 0.5},
@@ -249,7 +247,7 @@ def test_the_same_seed_gives_the_same_bytes_with_every_new_fault(firmware: Firmw
 # -- motors, mass, reboot --------------------------------------------------------------------------
 
 
-def test_a_weaker_or_heavier_vehicle_accelerates_less() -> None:
+def test_thrust_and_mass_changes_scale_the_vertical_force() -> None:
     """Level at hover thrust, the change scales the vertical specific force, which was g before."""
     sinking: tuple[tuple[dict[str, Any], float], ...] = (
         ({"fault": "thrust_change", "thrust_scale": 0.8, "at_s": 2.0}, 0.8),
@@ -270,7 +268,7 @@ def test_a_weaker_or_heavier_vehicle_accelerates_less() -> None:
         assert lift_at(fault["at_s"] + 0.24) == pytest.approx(lifted / ratio, abs=0.02)
 
 
-def test_motors_are_cut_at_a_height_in_the_landing() -> None:
+def test_motors_cut_fault_acts_below_its_height() -> None:
     bench = engaged({"fault": "motors_cut", "after": "landing", "below_m": 2.5})
     bench.command(21)
     state = bench.instance.autopilot.state
@@ -281,7 +279,7 @@ def test_motors_are_cut_at_a_height_in_the_landing() -> None:
     assert state.truth.acceleration_ned_mps2[2] > 7.0
 
 
-def test_disarmed_by_the_pilot_or_by_a_reboot_it_falls() -> None:
+def test_vehicle_disarmed_in_flight_falls() -> None:
     """After the reboot it is silent, and its time begins again."""
     bench = aloft({"fault": "pilot_disarms", "at_s": 0.5})
     bench.run(2.0)
@@ -296,7 +294,7 @@ def test_disarmed_by_the_pilot_or_by_a_reboot_it_falls() -> None:
     assert bench.of("ATTITUDE", 1.01)[0][1].time_boot_ms < 50
 
 
-def test_a_clock_that_is_slow_shows_in_stamps_cut_to_milliseconds() -> None:
+def test_slow_clock_shows_in_truncated_time_stamps() -> None:
     bench = Bench(scenario=Scenario(name="slow", conditions=Conditions(clock_rate=0.9996)))
     bench.run(6.0)
     told = [(m.time_boot_ms, math.floor(at_s * 999.6 + 1e-6)) for at_s, m in bench.of("ATTITUDE")]
@@ -304,7 +302,7 @@ def test_a_clock_that_is_slow_shows_in_stamps_cut_to_milliseconds() -> None:
     assert told[-1][0] >= 5980
 
 
-def test_faults_that_run_go_on_after_a_reboot_and_end_as_they_should() -> None:
+def test_running_faults_continue_after_a_reboot() -> None:
     """After the reboot the clock counts from zero, without the jump."""
     bench = Bench(
         scenario=scenario(
@@ -325,7 +323,7 @@ def test_faults_that_run_go_on_after_a_reboot_and_end_as_they_should() -> None:
     assert bench.of("ATTITUDE")[-1][1].time_boot_ms == pytest.approx(7540, abs=60)
 
 
-def test_a_flight_may_start_as_high_as_a_scenario_says() -> None:
+def test_flight_starts_at_the_height_of_the_scenario() -> None:
     """A takeoff to 100 m at MPC_TKO_SPEED, 1.5 m/s, takes PX4 more than a minute."""
     bench = Bench(scenario=Scenario(name="high", start=Start(height_m=100.0)))
     assert bench.instance.autopilot.plant.height_m > 99.0

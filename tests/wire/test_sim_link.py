@@ -44,7 +44,7 @@ def test_garbage_in_a_datagram_hides_no_frame(garbage: bytes) -> None:
 
 
 @pytest.mark.parametrize(("name", "obeyed"), [("px4", False), ("ardupilot", True)])
-def test_whether_what_is_sent_to_all_systems_is_obeyed(name: str, obeyed: bool) -> None:
+def test_only_arducopter_obeys_messages_to_system_zero(name: str, obeyed: bool) -> None:
     """PX4 1.16 ignores commands, parameters and missions for system 0, except a request for its
     version."""
     bench = Bench(firmware=FIRMWARES[name])
@@ -119,7 +119,7 @@ def test_each_link_has_the_rates_of_px4_and_its_own_sequence() -> None:
         assert sequence == [i % 256 for i in range(len(sequence))]
 
 
-def test_an_interval_can_be_stopped_restored_and_read() -> None:
+def test_message_interval_can_be_stopped_restored_and_read() -> None:
     """A change of one message's rate does not shift the others."""
     bench = Bench()
     bench.run(1.1)
@@ -141,7 +141,7 @@ def test_an_interval_can_be_stopped_restored_and_read() -> None:
 # -- time, files -----------------------------------------------------------------------------
 
 
-def test_timesync_and_px4_s_ping_are_answered_and_file_transfer_is_refused() -> None:
+def test_timesync_and_ping_are_answered_and_ftp_is_refused() -> None:
     """A PING with a target is itself an answer and gets none."""
     for firmware, answered in (FIRMWARES["px4"], [7]), (FIRMWARES["ardupilot"], []):
         bench = Bench(firmware=firmware)
@@ -191,7 +191,7 @@ def test_the_parameter_hash_changes_with_the_values() -> None:
     assert len(bench.of("PARAM_VALUE")) == before
 
 
-def test_parameters_are_obeyed_within_their_range() -> None:
+def test_parameters_act_within_their_range() -> None:
     """A parameter stores any value, as a recorded session shows, but acts within its range."""
     table = Bench().instance.autopilot.parameters
     for value, obeyed in ((2.5, 2.5), (-1.0, 0.0), (100.0, 60.0), (NAN, 1.0)):
@@ -207,7 +207,7 @@ def test_parameters_are_obeyed_within_their_range() -> None:
     [(np.nan,) * 13, (1.0, *(0.0,) * 9, np.nan, np.inf, -np.inf), (1.0, *(0.0,) * 11, -1e5)],
     ids=["all NaN", "no position", "above the atmosphere"],
 )
-def test_states_that_are_not_finite_or_out_of_range_are_sent(body: tuple[float, ...]) -> None:
+def test_invalid_states_are_still_sent(body: tuple[float, ...]) -> None:
     conditions = Conditions(estimator=EstimatorName.PX4_LIKE)
     instance = Instance(PX4, config.vehicle(PX4.vehicle), conditions, 7)
     instance.autopilot.plant.record["body"][0] = body

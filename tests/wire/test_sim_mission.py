@@ -161,7 +161,7 @@ def test_fences_and_rally_points_are_kept_beside_the_mission(firmware: Firmware)
 @pytest.mark.parametrize(
     ("firmware", "radius", "wide"), [(PX4, "NAV_ACC_RAD", 8.0), (ARDUPILOT, "WPNAV_RADIUS", 800.0)]
 )
-def test_a_waypoint_is_reached_within_the_radius_of_the_parameter(
+def test_waypoint_radius_follows_the_parameter(
     firmware: Firmware, radius: str, wide: float
 ) -> None:
     """With 8 m instead of the default 2 m a waypoint 20 m away is reached after 12 m."""
@@ -188,7 +188,7 @@ def test_the_first_item_of_arducopter_is_home() -> None:
     assert acks(bench)[-1] == 13
 
 
-def test_px4_waits_with_the_yaw_of_an_item() -> None:
+def test_px4_takes_the_yaw_of_a_mission_item() -> None:
     """A recorded session tests the item's time, and speed and return of other items."""
     bench = aloft(height_m=4.0)
     upload(bench, ROUND)
@@ -198,7 +198,7 @@ def test_px4_waits_with_the_yaw_of_an_item() -> None:
     assert bench.place == pytest.approx((12, 6, -6), abs=1.0)
 
 
-def test_arducopter_faces_its_direction_of_flight_and_returns_within_its_mission() -> None:
+def test_arducopter_mission_ignores_item_yaw_and_returns_in_auto() -> None:
     """param4 is no heading for ArduCopter. The mode is AUTO until the landing and after it."""
     bench = Bench(firmware=ARDUPILOT, boot_scale=0.1)
     bench.run(4.5)
@@ -219,7 +219,7 @@ def test_arducopter_faces_its_direction_of_flight_and_returns_within_its_mission
     assert math.hypot(*bench.place[:2]) < 0.5
 
 
-def test_arducopter_asked_for_home_begins_with_the_takeoff_and_does_not_descend_to_it() -> None:
+def test_arducopter_mission_restarted_in_the_air_stays_level() -> None:
     """Scripts reset a mission with MISSION_SET_CURRENT 0. For ArduCopter 4.6.3 SITL at 6 m item 1
     is then reached at once, and the vehicle flies level to item 2."""
     bench = aloft(firmware=ARDUPILOT, height_m=6.0, mode="GUIDED")

@@ -286,7 +286,7 @@ def limit_s(session: Session, row: str) -> float:
 
 
 @pytest.mark.parametrize("session", SESSIONS, ids=lambda s: f"{s.firmware}-{s.name}")
-def test_rows_are_those_of_the_real_autopilot_and_come_at_their_times(session: Session) -> None:
+def test_replayed_sessions_match_the_real_autopilot(session: Session) -> None:
     compared = compare(*heard(session), session.kinds, NOT_OURS)
     assert compared.differing == list(session.differing)
     assert compared.equal == session.equal
@@ -306,9 +306,7 @@ def named(name: str, firmware: str) -> Session:
         ("ground", "px4", 75),  # also out of range, NaN, of another type and unknown
     ],
 )
-def test_parameters_are_told_as_the_real_autopilot_tells_them(
-    name: str, firmware: str, equal: int
-) -> None:
+def test_parameter_replies_match_the_real_autopilot(name: str, firmware: str, equal: int) -> None:
     """Parameters that the simulator has are read, listed and set with the same types, except the
     ids of sensors."""
     compared = compare(*heard(named(name, firmware)), ("param",), (*NOT_OURS, "CAL_"))
@@ -322,7 +320,7 @@ def at(rows: Rows, times_s: Any) -> Array:
     return np.stack([np.interp(times_s, path[:, 0], path[:, i]) for i in range(1, 7)], axis=-1)
 
 
-def test_setpoints_lead_to_the_place_of_the_real_vehicle() -> None:
+def test_setpoints_reach_the_positions_of_the_real_vehicle() -> None:
     """Places agree at the end of each setpoint that has one; both estimates wander half a metre."""
     ends_s = (57.2, 63.1, 66.1, 69.1, 81.0, 84.0, 87.0, 98.9, 104.8, 119.6, 134.5)
     there, here = (at(rows, ends_s)[:, :3] for rows in heard(named("setpoints", "px4")))
@@ -338,7 +336,9 @@ def test_setpoints_lead_to_the_place_of_the_real_vehicle() -> None:
         (EAST, 75.0, 76.5),  # levelled by the timeout
     ],
 )
-def test_steps_move_the_vehicle_alike(axis: int, begin_s: float, end_s: float) -> None:
+def test_attitude_steps_move_the_vehicle_like_the_real_one(
+    axis: int, begin_s: float, end_s: float
+) -> None:
     """Displacements under the recorded commands, in open loop, 0.7 to 3 m long, are compared."""
     real, ours = heard(named("guided", "ardupilot"))
     assert ours.path[0][0] == pytest.approx(real.path[0][0], abs=0.06)
@@ -371,7 +371,7 @@ def flown(name: str) -> tuple[Rows, Rows]:
         (99.2, 107.0, (20, 0, -30), (0, 0, -30)),
     ],
 )
-def test_a_leg_has_the_times_and_the_speed_of_the_real_vehicle(
+def test_legs_have_the_times_and_speed_of_the_real_vehicle(
     begin_s: float, end_s: float, start: tuple[float, ...], goal: tuple[float, ...]
 ) -> None:
     """Compared are the times after a quarter, a half and three quarters of the straight line."""

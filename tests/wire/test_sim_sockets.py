@@ -37,7 +37,7 @@ from simulator.vehicle.conditions import Conditions
 
 CODEC = mavlink.MAVLink(None, srcSystem=255)
 HEARTBEAT = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3).pack(CODEC)
-OLD = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3).pack(CODEC, force_mavlink1=True)
+HEARTBEAT_V1 = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3).pack(CODEC, force_mavlink1=True)
 
 
 def bound() -> socket.socket:
@@ -82,7 +82,7 @@ def instance(*faults: Stranger) -> Instance:
         (1, "the companion stopped answering at 0.02 s"),
     ],
 )
-def test_a_companion_that_does_not_answer_ends_the_run_with_code_3(
+def test_lockstep_ends_if_the_companion_does_not_answer(
     answers: int,
     says: str,
     link: UdpLink,
@@ -150,19 +150,19 @@ def heard(server: TcpLink) -> bytes | None:
     return server.receive()
 
 
-def test_split_frames_are_joined_and_garbage_is_passed_on() -> None:
-    stream = b"x" + HEARTBEAT + OLD + HEARTBEAT
-    wholes = [0, 1, 1 + len(HEARTBEAT), 1 + len(HEARTBEAT + OLD), len(stream)]
+def test_stream_is_cut_only_between_whole_frames() -> None:
+    stream = b"x" + HEARTBEAT + HEARTBEAT_V1 + HEARTBEAT
+    wholes = [0, 1, 1 + len(HEARTBEAT), 1 + len(HEARTBEAT + HEARTBEAT_V1), len(stream)]
     for length in range(len(stream) + 1):
         assert whole_frames(stream[:length]) == max(w for w in wholes if w <= length)
 
 
-def test_clients_connect_and_disconnect(server: TcpLink) -> None:
+def test_tcp_clients_connect_and_disconnect(server: TcpLink) -> None:
     one, other = client(server), client(server)
     one.sendall(HEARTBEAT[:5])
     assert heard(server) is None
-    one.sendall(HEARTBEAT[5:] + OLD)
-    assert heard(server) == HEARTBEAT + OLD
+    one.sendall(HEARTBEAT[5:] + HEARTBEAT_V1)
+    assert heard(server) == HEARTBEAT + HEARTBEAT_V1
     server.send([b"telemetry"])
     assert one.recv(100) == other.recv(100) == b"telemetry"
     one.close()
@@ -173,7 +173,7 @@ def test_clients_connect_and_disconnect(server: TcpLink) -> None:
     other.close()
 
 
-def test_a_client_that_never_reads_is_disconnected(server: TcpLink) -> None:
+def test_tcp_client_that_never_reads_is_disconnected(server: TcpLink) -> None:
     idle, other = client(server), client(server)
     piece, count = bytes(65536), 0
     for _ in range(20 * UNSENT_MAX // len(piece)):
@@ -188,7 +188,7 @@ def test_a_client_that_never_reads_is_disconnected(server: TcpLink) -> None:
     other.close()
 
 
-def test_links_that_are_refused_and_instances_ten_ports_apart(server: TcpLink) -> None:
+def test_unusable_links_are_refused_and_instance_ports_shifted(server: TcpLink) -> None:
     with pytest.raises(LinkError, match="cannot be opened"):
         open_link(f"tcpin:127.0.0.1:{server.port}", 0)
     with pytest.raises(LinkError, match="fault stranger: it needs a UDP link"):
@@ -236,7 +236,7 @@ def test_latency_with_jitter_or_a_ramp_keeps_the_order() -> None:
     assert set(late_us[1000:]) == {800_000}
 
 
-def test_a_share_is_lost_duplicated_held_back_or_has_a_flipped_bit() -> None:
+def test_link_loses_duplicates_reorders_and_corrupts_datagrams() -> None:
     assert 1400 < len(carried(loss=0.25)) < 1600
     assert carried(loss=1.0) == []
     kept = numbers(carried(duplication=0.25))
@@ -256,7 +256,7 @@ def test_a_share_is_lost_duplicated_held_back_or_has_a_flipped_bit() -> None:
     assert 400 < sum(bits) < 600
 
 
-def test_a_narrow_link_passes_its_rate_queues_and_then_loses() -> None:
+def test_rate_limited_link_queues_and_then_drops() -> None:
     arrived = carried(rate_bytes_ps=1600.0, queue_bytes=320)
     # 50 datagrams of 32 bytes a second where 250 are sent
     assert len(arrived) == pytest.approx(2000 / 5, abs=12)
@@ -265,7 +265,7 @@ def test_a_narrow_link_passes_its_rate_queues_and_then_loses() -> None:
     assert {b - a for a, b in pairwise(times)} == {20_000}
 
 
-def test_a_rate_per_message_thins_telemetry_but_no_answers() -> None:
+def test_message_rate_limit_thins_telemetry_but_not_answers() -> None:
     codec = mavlink.MAVLink(None)
     channel = Channel(Impairment(message_rate_hz=20.0), Random(1))
     heard: dict[int, int] = {}
@@ -283,7 +283,7 @@ def test_a_rate_per_message_thins_telemetry_but_no_answers() -> None:
     assert heard == {30: 200, 32: 200, 77: 10}
 
 
-def test_after_the_end_of_a_fault_nothing_overtakes_what_is_under_way() -> None:
+def test_datagrams_keep_their_order_after_a_link_fault() -> None:
     channel = Channel(Impairment(latency_s=0.02), Random(1))
     channel.put(b"late", 0)
     channel.on = False
@@ -294,7 +294,7 @@ def test_after_the_end_of_a_fault_nothing_overtakes_what_is_under_way() -> None:
     assert channel.take(24_000) == [b"prompt"]
 
 
-def test_a_stalled_link_delivers_what_its_queue_holds_when_it_ends() -> None:
+def test_stalled_link_delivers_its_queue_when_the_stall_ends() -> None:
     channel = Channel(Impairment(stalled=True, queue_bytes=320), Random(1))
     sent = [bytes([number]) * 32 for number in range(12)]
     for number, datagram in enumerate(sent):

@@ -57,11 +57,11 @@ class Vehicle:
 
 
 @pytest.mark.parametrize(("speed", "every_ticks"), [(0.3, 1), (50.0, 10)])
-def test_rates_are_per_second_of_vehicle_time(speed: float, every_ticks: int) -> None:
+def test_telemetry_rates_are_per_second_of_vehicle_time(speed: float, every_ticks: int) -> None:
     assert Vehicle(speed).run(5.0, every_ticks) == pytest.approx(100.0 / every_ticks, rel=0.1)
 
 
-def test_a_message_at_its_rate_is_requested_once_until_another_program_changes_it() -> None:
+def test_rate_is_requested_again_only_after_a_change() -> None:
     vehicle = Vehicle()
     assert vehicle.run(30.0, 1) == pytest.approx(100.0, abs=1.0)
     assert len(vehicle.requested_s) == 1
@@ -149,7 +149,7 @@ def test_link_time_follows_the_vehicle_or_host_time() -> None:
     assert link.seconds - before_s == pytest.approx(60.0)
 
 
-def test_two_clocks_by_turns_are_two_vehicles_and_a_reboot_is_one() -> None:
+def test_alternating_clocks_are_two_vehicles_but_a_reboot_is_not() -> None:
     """Each vehicle sends two messages at 100 Hz. The clock of the second one is 5 s ahead."""
 
     def feed(began_s: float, stamps: int, *others_s: float) -> bool:
@@ -188,7 +188,7 @@ def test_rates_fit_a_serial_line(baud: int, attitude_hz: float) -> None:
     assert fitted([mode], 3000.0) == (mode,)
 
 
-def test_telemetry_of_a_saturated_link_is_halved_until_it_is_slow() -> None:
+def test_rates_on_saturated_link_are_halved_down_to_20_hz() -> None:
     session, rates_hz = started(), []
     session.poll(0.0)
     while session.telemetry.thin():
